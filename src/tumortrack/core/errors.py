@@ -1,0 +1,35 @@
+"""The one error tree. A message says what was wrong, what is allowed and what to do."""
+
+from __future__ import annotations
+
+
+class TumortrackError(Exception):
+    """Base of every error that tumortrack raises on purpose.
+
+    The command line prints its text as one line and exits with ``exit_code``; any other
+    exception is a defect of ours and keeps its traceback.
+    """
+
+    exit_code = 1
+
+
+class InputError(TumortrackError):
+    """What the user gave cannot be used: a file, a number, a combination of options."""
+
+    exit_code = 2
+
+
+class ArtifactError(InputError):
+    """A case, model or run folder is missing, damaged, or of another kind or schema."""
+
+
+class NoEstimate(TumortrackError):
+    """The input is well formed, but nothing can be said from it (too few points, no organ)."""
+
+    exit_code = 3
+
+
+class StorageError(TumortrackError):
+    """The disk refused a write; what was there before is still whole."""
+
+    exit_code = 4

@@ -1,0 +1,83 @@
+"""Rigid transforms and axes. A transform that carries frame a into frame b is ``b_from_a``."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float
+
+from tumortrack.core.errors import InputError
+
+# Patient frame, DICOM: +x Left, +y Posterior, +z Superior (LPS).
+DIRECTIONS_LPS: dict[str, tuple[float, float, float]] = {
+    "left": (1.0, 0.0, 0.0),
+    "right": (-1.0, 0.0, 0.0),
+    "posterior": (0.0, 1.0, 0.0),
+    "anterior": (0.0, -1.0, 0.0),
+    "superior": (0.0, 0.0, 1.0),
+    "inferior": (0.0, 0.0, -1.0),
+}
+
+# NIfTI is RAS+, DICOM is LPS: the first two axes change sign, and nothing else.
+RAS_FROM_LPS = np.diag([-1.0, -1.0, 1.0, 1.0])
+
+
+def transform_points(
+    b_from_a: Float[np.ndarray, "4 4"], points_a: Float[np.ndarray, "n 3"]
+) -> Float[np.ndarray, "n 3"]:
+    """Carry points (n, 3) from frame a to frame b by a 4 x 4 affine transform."""
+    return points_a @ b_from_a[:3, :3].T.astype(points_a.dtype) + b_from_a[:3, 3].astype(
+        points_a.dtype
+    )
+
+
+def rigid(
+    rotation: Float[np.ndarray, "3 3"], translation_mm: Float[np.ndarray, " 3"]
+) -> Float[np.ndarray, "4 4"]:
+    """A 4 x 4 transform from a rotation matrix and a translation in mm."""
+    b_from_a = np.eye(4)
+    b_from_a[:3, :3] = rotation
+    b_from_a[:3, 3] = translation_mm
+    return b_from_a
+
+
+def rotation_onto(
+    source: Float[np.ndarray, " 3"], target: Float[np.ndarray, " 3"]
+) -> Float[np.ndarray, "3 3"]:
+    """The smallest rotation matrix that turns the direction ``source`` onto ``target``."""
+    a = np.asarray(source, float) / np.linalg.norm(source)
+    b = np.asarray(target, float) / np.linalg.norm(target)
+    cosine = float(a @ b)
+    if cosine < -1 + 1e-12:  # opposite: half a turn about any perpendicular axis
+        axis = np.cross(a, np.eye(3)[np.argmin(np.abs(a))])
+        axis /= np.linalg.norm(axis)
+        return 2 * np.outer(axis, axis) - np.eye(3)
+    v = np.cross(a, b)
+    cross = np.array([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]])
+    return np.eye(3) + cross + cross @ cross / (1 + cosine)
+
+
+def direction_lps(text: str) -> tuple[float, float, float]:
+    """A unit vector in LPS from a name (``anterior``) or three numbers (``0,-1,0``).
+
+    Raises:
+        InputError: neither a known name nor a non-zero finite 3-vector.
+    """
+    if text.lower() in DIRECTIONS_LPS:
+        return DIRECTIONS_LPS[text.lower()]
+    try:
+        vector = np.array([float(part) for part in text.replace(",", " ").split()])
+    except ValueError:
+        vector = np.zeros(0)
+    length = float(np.linalg.norm(vector))
+    if vector.shape != (3,) or not np.isfinite(length) or length == 0:
+        raise InputError(
+            f"direction {text!r} is not understood. Allowed: {', '.join(DIRECTIONS_LPS)}, or "
+            "three numbers in LPS such as 0,-1,0."
+        )
+    x, y, z = (vector / length).tolist()
+    return (x, y, z)
+
+
+def spacing_mm(frame_from_index: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, " 3"]:
+    """Voxel edge lengths in mm along the three array axes."""
+    return np.linalg.norm(frame_from_index[:3, :3], axis=0)

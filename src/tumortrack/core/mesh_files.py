@@ -1,0 +1,77 @@
+"""Mesh files, through trimesh: PLY out, PLY/STL/OBJ in."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from tumortrack.core.errors import InputError, StorageError
+from tumortrack.core.types import Anatomy, Mesh
+
+SUFFIXES = (".ply", ".stl", ".obj")
+_LARGEST_FILE = 512 * 2**20  # bytes
+
+
+def read_mesh(path: Path) -> Mesh:
+    """Read one triangle mesh (PLY, STL or OBJ) as it is, equal vertices merged.
+
+    Raises:
+        InputError: missing, too large, not a mesh, or without triangles.
+    """
+    import trimesh
+
+    if path.suffix.lower() not in SUFFIXES:
+        raise InputError(f"{path}: unknown mesh type. Allowed: {', '.join(SUFFIXES)}.")
+    if not path.is_file():
+        raise InputError(f"{path} does not exist.")
+    if path.stat().st_size > _LARGEST_FILE:
+        raise InputError(f"{path} is larger than 512 MiB; reduce the mesh first.")
+    try:
+        loaded = trimesh.load_mesh(path, process=False)
+        vertices, faces = np.asarray(loaded.vertices), np.asarray(loaded.faces)
+    except Exception as error:  # trimesh raises anything on a damaged file
+        raise InputError(f"{path} cannot be read as a mesh: {error}.") from error
+    if faces.ndim != 2 or len(faces) == 0 or len(vertices) == 0:
+        raise InputError(f"{path} holds no triangles (an empty or damaged file).")
+    # STL repeats each corner: merge exact duplicates so that the surface can be closed.
+    unique, inverse = np.unique(vertices, axis=0, return_inverse=True)
+    faces = inverse.reshape(-1)[faces]
+    a, b, c = faces.T
+    proper = (a != b) & (b != c) & (c != a)
+        (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
+    )
+    return Mesh(unique, faces[proper])
+
+
+def write_mesh(path: Path, mesh: Mesh) -> None:
+    """Write a binary PLY (or STL, by suffix), vertices in mm, in the mesh's own frame.
+
+    Raises:
+        StorageError: the disk refused.
+    """
+    import trimesh
+
+    out = trimesh.Trimesh(mesh.vertices_mm, mesh.faces, process=False)
+    try:
+        out.export(path)
+    except OSError as error:
+        raise StorageError(f"cannot write {path}: {error.strerror}.") from error
+
+
+def write_anatomy(folder: Path, anatomy: Anatomy) -> None:
+    """kidney.ply, tumor_1.ply, ... into a folder."""
+    for name, part in zip(anatomy.names, anatomy.parts, strict=True):
+        write_mesh(folder / f"{name}.ply", part)
+
+
+def read_anatomy(folder: Path) -> Anatomy:
+    """kidney.ply and tumor_1.ply, tumor_2.ply, ... (without a gap) from a folder.
+
+    Raises:
+        InputError: no kidney.ply, or a mesh that cannot be read.
+    """
+    parts = [read_mesh(folder / "kidney.ply")]
+    while (path := folder / f"tumor_{len(parts)}.ply").exists():
+        parts.append(read_mesh(path))
+    return Anatomy(tuple(parts))

@@ -1,0 +1,166 @@
+"""Artifact folders: written aside and renamed, one JSON manifest each, checked by sha256.
+
+A manifest states kind, schema number, code version, the sha256 of every file, the inputs'
+sha256, the full configuration, units and frame. Nothing here loads pickles or runs code.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import shutil
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import tumortrack
+from tumortrack.core.errors import ArtifactError, InputError, StorageError
+
+SCHEMA = 1
+MANIFEST = "manifest.json"
+_LARGEST_MANIFEST = 16 * 2**20  # bytes: refused before it is read
+
+
+def sha256_of(path: Path) -> str:
+    """Hex digest of a file, or of a folder's files (names and contents, sorted)."""
+    if path.is_dir():
+        digest = hashlib.sha256()
+        for file in sorted(p for p in path.rglob("*") if p.is_file()):
+            digest.update(f"{file.relative_to(path)}\0{sha256_of(file)}\n".encode())
+        return digest.hexdigest()
+    with path.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
+def write_atomically(path: Path, content: bytes) -> None:
+    """Write a file so that a reader sees the old or the new content, never a part.
+
+    Raises:
+        StorageError: the disk is full or not writable; the old file is untouched.
+    """
+    aside = path.with_name(f".{path.name}.{os.getpid()}.part")
+    try:
+        with aside.open("wb") as stream:
+            stream.write(content)
+            stream.flush()
+            os.fsync(stream.fileno())
+        os.replace(aside, path)
+    except OSError as error:
+        aside.unlink(missing_ok=True)
+        raise StorageError(
+            f"cannot write {path}: {error.strerror}. Free some space or choose another place."
+        ) from error
+
+
+def write_json(path: Path, data: object) -> None:
+    """Atomically write JSON, indented, with a final newline; NaN is refused."""
+    write_atomically(path, (json.dumps(data, indent=1, allow_nan=False) + "\n").encode())
+
+
+def read_json(path: Path) -> dict:
+    """Read a JSON object.
+
+    Raises:
+        ArtifactError: missing, too large, or not a JSON object.
+    """
+    try:
+        if path.stat().st_size > _LARGEST_MANIFEST:
+            raise ArtifactError(f"{path} is larger than 16 MiB; this is no file of ours.")
+        data = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
+        raise ArtifactError(f"{path} cannot be read as JSON: {error}.") from error
+    if not isinstance(data, dict):
+        raise ArtifactError(f"{path} must hold a JSON object.")
+    return data
+
+
+def seal(folder: Path, kind: str, content: dict, frame: str) -> None:
+    """Write the folder's manifest over the files that lie in it now (sub-folders not counted)."""
+    files = {
+        p.name: sha256_of(p)
+        for p in sorted(folder.iterdir())
+        if p.is_file() and p.name != MANIFEST and not p.name.startswith(".")
+    }
+    manifest = {
+        "kind": kind,
+        "schema": SCHEMA,
+        "tumortrack": tumortrack.__version__,
+        "units": "mm",
+        "frame": frame,
+        **content,
+        "files": files,
+    }
+    write_json(folder / MANIFEST, manifest)
+
+
+@contextmanager
+def new_folder(path: Path, overwrite: bool = False) -> Iterator[Path]:
+    """Fill a folder aside, then move it to ``path`` in one step; on any error nothing appears.
+
+    Raises:
+        InputError: ``path`` exists and ``overwrite`` is False.
+        StorageError: the disk is full or not writable.
+    """
+    if path.exists() and not overwrite:
+        raise InputError(f"{path} exists already. Choose another path, or give --overwrite.")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        aside = Path(tempfile.mkdtemp(prefix=f".{path.name}.", suffix=".part", dir=path.parent))
+    except OSError as error:
+        raise StorageError(f"cannot write beside {path}: {error.strerror}.") from error
+    try:
+        yield aside
+        aside.chmod(0o755)
+        if path.exists():
+            old = aside.with_suffix(".old")
+            os.rename(path, old)
+            os.rename(aside, path)
+            _remove(old)
+        else:
+            os.rename(aside, path)
+    except OSError as error:
+        raise StorageError(f"cannot write {path}: {error.strerror or error}.") from error
+    finally:
+        _remove(aside)
+
+
+def _remove(path: Path) -> None:
+    if path.is_dir():
+        shutil.rmtree(path, ignore_errors=True)
+    else:
+        path.unlink(missing_ok=True)
+
+
+def read_manifest(folder: Path, kind: str) -> dict:
+    """The manifest of an artifact of this kind, every file's sha256 checked.
+
+    Raises:
+        ArtifactError: no such folder, another kind or schema, a file missing or changed.
+    """
+    if not (folder / MANIFEST).is_file():
+        raise ArtifactError(
+            f"{folder} is not a tumortrack {kind}: it has no {MANIFEST}. "
+            "Give the folder that the command before this one wrote."
+        )
+    manifest = read_json(folder / MANIFEST)
+    if manifest.get("kind") != kind:
+        raise ArtifactError(f"{folder} is a {manifest.get('kind')!r}; a {kind!r} is needed here.")
+    if manifest.get("schema") != SCHEMA:
+        raise ArtifactError(
+            f"{folder} has schema {manifest.get('schema')!r}; this tumortrack reads schema "
+            f"{SCHEMA}. Make it again with this version."
+        )
+    files = manifest.get("files")
+    if not isinstance(files, dict):
+        raise ArtifactError(f"{folder / MANIFEST} lists no files; make the {kind} again.")
+    for name, digest in files.items():
+        file = folder / name
+        if Path(name).name != name or not file.is_file():
+            raise ArtifactError(f"{folder} lacks its file {name!r}; make the {kind} again.")
+        if sha256_of(file) != digest:
+            raise ArtifactError(
+                f"{file} was changed after it was written (sha256 differs); make the {kind} again."
+            )
+    return manifest

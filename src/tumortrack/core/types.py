@@ -1,0 +1,218 @@
+"""The values that flow through the pipeline: frozen, arrays read-only, shapes annotated.
+
+Frames: ``lps`` is the patient's (DICOM), ``camera`` is OpenCV's (x right, y down, z forward).
+Labels: 0 outside, 1 organ, 2, 3, ... tumors; a tumor wins where parts overlap.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from functools import cached_property
+
+import numpy as np
+import numpy.typing as npt
+from jaxtyping import Float, Float32, Float64, Int32, UInt8
+
+from tumortrack.core.errors import InputError
+
+OUTSIDE, ORGAN, FIRST_TUMOR = 0, 1, 2
+
+
+def _freeze(value: object, name: str, dtype: npt.DTypeLike, shape: tuple[int | None, ...]) -> None:
+    """Convert one field to a read-only array and check its shape (None: any length)."""
+    array = np.array(getattr(value, name), dtype=dtype)  # a copy: the caller's stays writable
+    good = array.ndim == len(shape) and all(
+        want is None or want == have for want, have in zip(shape, array.shape, strict=False)
+    )
+    if not good:
+        wanted = " x ".join("n" if s is None else str(s) for s in shape)
+        raise InputError(
+            f"{type(value).__name__}.{name} has shape {array.shape}; it must be {wanted}."
+        )
+    array.flags.writeable = False
+    object.__setattr__(value, name, array)
+
+
+def _check_affine(value: object, name: str) -> None:
+    _freeze(value, name, np.float64, (4, 4))
+    affine = getattr(value, name)
+    if not np.isfinite(affine).all() or abs(np.linalg.det(affine[:3, :3])) < 1e-9:
+        raise InputError(
+            f"{type(value).__name__}.{name} is singular or has NaN; it must be an invertible "
+            "4 x 4 transform from array index to millimetres. Export the volume again."
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Volume:
+    """A CT volume. ``hu``: Hounsfield units, axes (i, j, k); ``lps_from_index``: index -> mm."""
+
+    hu: Float32[np.ndarray, "i j k"]
+    lps_from_index: Float64[np.ndarray, "4 4"]
+
+    def __post_init__(self) -> None:
+        _freeze(self, "hu", np.float32, (None, None, None))
+        _check_affine(self, "lps_from_index")
+
+
+@dataclass(frozen=True, eq=False)
+class LabelVolume:
+    """Labels on a voxel grid of the patient, axes (i, j, k)."""
+
+    labels: UInt8[np.ndarray, "i j k"]
+    lps_from_index: Float64[np.ndarray, "4 4"]
+
+    def __post_init__(self) -> None:
+        _freeze(self, "labels", np.uint8, (None, None, None))
+        _check_affine(self, "lps_from_index")
+
+
+@dataclass(frozen=True, eq=False)
+class CameraLabels:
+    """Labels on a voxel grid before the camera, axes (i, j, k)."""
+
+    labels: UInt8[np.ndarray, "i j k"]
+    camera_from_index: Float64[np.ndarray, "4 4"]
+
+    def __post_init__(self) -> None:
+        _freeze(self, "labels", np.uint8, (None, None, None))
+        _check_affine(self, "camera_from_index")
+
+
+@dataclass(frozen=True, eq=False)
+class Mesh:
+    """A triangle surface; the variable that holds it names the frame. Faces turn outward."""
+
+    vertices_mm: Float64[np.ndarray, "v 3"]
+    faces: Int32[np.ndarray, "f 3"]
+
+    def __post_init__(self) -> None:
+        _freeze(self, "vertices_mm", np.float64, (None, 3))
+        _freeze(self, "faces", np.int32, (None, 3))
+        if not np.isfinite(self.vertices_mm).all():
+            raise InputError("the mesh has NaN or infinite vertices. Export it again.")
+        if len(self.faces) and not (
+            self.faces.min() >= 0 and self.faces.max() < len(self.vertices_mm)
+        ):
+            raise InputError("the mesh has faces that name vertices it does not have.")
+
+    @cached_property
+    def volume_mm3(self) -> float:
+        """Signed volume (divergence theorem): positive where faces turn outward."""
+        a, b, c = (self.vertices_mm[self.faces[:, i]] - self.vertices_mm[0] for i in range(3))
+        return float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6)
+
+    @cached_property
+    def box_mm(self) -> Float64[np.ndarray, "2 3"]:
+        """Axis-aligned bounding box: lower and upper corner."""
+        return np.stack([self.vertices_mm.min(0), self.vertices_mm.max(0)])
+
+    def moved(self, vertices_mm: Float[np.ndarray, "v 3"]) -> Mesh:
+        """The same triangles over other vertices (a deformation or a change of frame)."""
+        return Mesh(vertices_mm, self.faces)
+
+
+@dataclass(frozen=True, eq=False)
+class Anatomy:
+    """Closed surfaces, outermost first: ``parts[0]`` is the whole organ, tumors included
+    (the union), so that it is the visible surface; ``parts[n]`` is the tumor labelled n + 1.
+    """
+
+    parts: tuple[Mesh, ...]
+
+    def __post_init__(self) -> None:
+        if len(self.parts) < 1:
+            raise InputError("an anatomy needs at least the organ's surface.")
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """``kidney``, ``tumor_1``, ``tumor_2``, ...: also the mesh files' names."""
+        return part_names(len(self.parts))
+
+    @property
+    def organ(self) -> Mesh:
+        return self.parts[0]
+
+    @property
+    def tumors(self) -> tuple[Mesh, ...]:
+        return self.parts[1:]
+
+
+def part_names(n_parts: int) -> tuple[str, ...]:
+    """Names of the parts by label 1, 2, 3, ...: kidney, tumor_1, tumor_2, ..."""
+    return ("kidney", *(f"tumor_{n}" for n in range(1, n_parts)))
+
+
+@dataclass(frozen=True)
+class Intrinsics:
+    """Pinhole camera without distortion; pixel centres at whole numbers. Lengths in pixels."""
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+
+    def __post_init__(self) -> None:
+        numbers = [float(getattr(self, f.name)) for f in fields(self)]
+        if not np.isfinite(numbers).all() or min(self.fx, self.fy) <= 0:
+            raise InputError(
+                f"intrinsics {numbers} are not usable; fx and fy must be positive pixels."
+            )
+        if not (0 < self.width <= 8192 and 0 < self.height <= 8192):
+            raise InputError("intrinsics: width and height must lie in 1..8192 pixels.")
+
+
+@dataclass(frozen=True, eq=False)
+class DepthFrame:
+    """A depth image: distance along z in mm, NaN where the sensor had no return."""
+
+    depth_mm: Float32[np.ndarray, "h w"]
+    intrinsics: Intrinsics
+    stamp_ns: int = 0
+
+    def __post_init__(self) -> None:
+        _freeze(self, "depth_mm", np.float32, (self.intrinsics.height, self.intrinsics.width))
+
+
+@dataclass(frozen=True, eq=False)
+class SensorCloud:
+    """Points seen by the sensor, camera frame, mm, float32, all finite."""
+
+    points_mm: Float32[np.ndarray, "n 3"]
+    stamp_ns: int = 0
+
+    def __post_init__(self) -> None:
+        _freeze(self, "points_mm", np.float32, (None, 3))
+        if not np.isfinite(self.points_mm).all():
+            raise InputError(
+                "the cloud has NaN or infinite points; remove them first (no return is no point)."
+            )
+
+
+@dataclass(frozen=True, eq=False)
+class OccupancySamples:
+    """Labelled training points, camera frame, mm."""
+
+    points_mm: Float32[np.ndarray, "n 3"]
+    labels: UInt8[np.ndarray, " n"]
+
+    def __post_init__(self) -> None:
+        _freeze(self, "points_mm", np.float32, (None, 3))
+        _freeze(self, "labels", np.uint8, (len(self.points_mm),))
+
+
+@dataclass(frozen=True, eq=False)
+class OccupancyCloud:
+    """The estimate as points inside the organ: label >= 1 and its probability, camera frame."""
+
+    points_mm: Float32[np.ndarray, "n 3"]
+    labels: UInt8[np.ndarray, " n"]
+    probability: Float32[np.ndarray, " n"]
+    stamp_ns: int = 0
+
+    def __post_init__(self) -> None:
+        _freeze(self, "points_mm", np.float32, (None, 3))
+        _freeze(self, "labels", np.uint8, (len(self.points_mm),))
+        _freeze(self, "probability", np.float32, (len(self.points_mm),))
