@@ -39,8 +39,6 @@ def read_mesh(path: Path) -> Mesh:
     faces = inverse.reshape(-1)[faces]
     a, b, c = faces.T
     proper = (a != b) & (b != c) & (c != a)
-        (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
-    )
     return Mesh(unique, faces[proper])
 
 
