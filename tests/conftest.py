@@ -3,10 +3,11 @@
 import pytest
 from jaxtyping import install_import_hook
 
-# Modules with numba kernels are left out: numba compiles the plain function.
+# Left out: modules with numba kernels (numba compiles the plain function), and core.types, whose
+# constructors convert and check shapes themselves, always.
 install_import_hook(
     [
-        "tumortrack.core",
+        "tumortrack.core.geometry",
         "tumortrack.imaging",
         "tumortrack.phantom",
         "tumortrack.evaluate",
