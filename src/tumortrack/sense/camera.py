@@ -1,0 +1,79 @@
+"""The pinhole depth camera: presets, pixels to points and back.
+
+Camera frame as in OpenCV: x right, y down, z forward, mm. Pixel centres lie at whole numbers,
+so the image spans -0.5 .. width - 0.5; librealsense uses the same convention.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from jaxtyping import Float, Float32, Float64, Integer
+
+from tumortrack.core.errors import InputError
+from tumortrack.core.types import DepthFrame, Intrinsics
+
+# Depth field of view of the RealSense D405 (depth module D401) at 16:9. The D400 family's
+# datasheet gives 87 x 58 degrees, +-3 degrees from lens to lens.
+D405_FOV_DEGREES = (87.0, 58.0)
+
+
+def d405(width: int = 848, height: int = 480) -> Intrinsics:
+    """A RealSense D405 with its nominal depth field of view and centred principal point.
+
+    Both nominal angles are kept, so fx and fy differ by 3 %. A device reports its own
+    intrinsics; read those for real frames.
+
+    Raises:
+        InputError: the size is not 16:9 within 1 % (other modes crop the field of view).
+    """
+    if width <= 0 or height <= 0 or abs(width / height * 9 / 16 - 1) > 0.01:
+        raise InputError(
+            f"a D405 depth image of {width} x {height} is not 16:9; choose for example "
+            "1280 x 720, 848 x 480, 640 x 360, 480 x 270 or 424 x 240."
+        )
+    half_x, half_y = (math.radians(degrees) / 2 for degrees in D405_FOV_DEGREES)
+    return Intrinsics(
+        width=width,
+        height=height,
+        fx=width / 2 / math.tan(half_x),
+        fy=height / 2 / math.tan(half_y),
+        cx=(width - 1) / 2,
+        cy=(height - 1) / 2,
+    )
+
+
+def deproject_pixels(
+    index: Integer[np.ndarray, " n"], depth_mm: Float[np.ndarray, " n"], intrinsics: Intrinsics
+) -> Float32[np.ndarray, "n 3"]:
+    """Points (n, 3) in the camera frame of pixels given by flat (row-major) index and depth."""
+    row, column = np.divmod(index, intrinsics.width)
+    points_mm = np.empty((len(index), 3), np.float32)
+    points_mm[:, 0] = (column - intrinsics.cx) * (depth_mm / intrinsics.fx)
+    points_mm[:, 1] = (row - intrinsics.cy) * (depth_mm / intrinsics.fy)
+    points_mm[:, 2] = depth_mm
+    return points_mm
+
+
+def deproject(frame: DepthFrame) -> Float32[np.ndarray, "n 3"]:
+    """All pixels with a return as points (n, 3), camera frame, mm, in row-major pixel order."""
+    depth_mm = frame.depth_mm.ravel()
+    index = np.flatnonzero(np.isfinite(depth_mm))
+    return deproject_pixels(index, depth_mm[index].astype(np.float64), frame.intrinsics)
+
+
+def project(
+    points_mm: Float[np.ndarray, "n 3"], intrinsics: Intrinsics
+) -> tuple[Float64[np.ndarray, "n 2"], Float64[np.ndarray, " n"]]:
+    """Pixel coordinates (n, 2) as (column, row), not rounded, and depth (n,) in mm.
+
+    The inverse of ``deproject``. Pixels may lie outside the image; a point at or behind the
+    camera's centre has no pixel and gets NaN.
+    """
+    points = np.asarray(points_mm, np.float64)
+    depth_mm = points[:, 2].copy()
+    before = np.where(depth_mm > 0, depth_mm, np.nan)
+    focal = np.array([intrinsics.fx, intrinsics.fy])
+    centre = np.array([intrinsics.cx, intrinsics.cy])
+    return points[:, :2] / before[:, None] * focal + centre, depth_mm

@@ -1,0 +1,127 @@
+"""Depth image -> sensor cloud: the one path, for simulation and the operating room alike."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from tumortrack.core.config import Config
+from tumortrack.core.errors import InputError, NoEstimate
+from tumortrack.core.types import DepthFrame, SensorCloud
+from tumortrack.sense.camera import deproject_pixels
+
+FEWEST_POINTS = 200  # fewer say too little about an organ's shape and pose
+
+
+class CloudConfig(Config):
+    """What of a depth image becomes the cloud: depths strictly between near and far (mm).
+
+    The defaults are the paper's: (11 cm, 15 cm) from the camera and 1000 points.
+    """
+
+    near_mm: float = 110.0
+    far_mm: float = 150.0
+    n_points: int = 1000
+
+    def __post_init__(self) -> None:
+        _check_range(self.near_mm, self.far_mm)
+        if self.n_points < FEWEST_POINTS:
+            raise InputError(f"n_points is {self.n_points}; at least {FEWEST_POINTS} are needed.")
+
+
+def cloud_from_depth(
+    frame: DepthFrame, config: CloudConfig, rng: np.random.Generator
+) -> SensorCloud:
+    """Crop by depth, draw unique random pixels, deproject them.
+
+    Returns ``n_points`` points in random order, or all of them where fewer (but at least 200)
+    lie in range.
+
+    Raises:
+        NoEstimate: fewer than 200 pixels lie in range.
+    """
+    depth_mm = frame.depth_mm.ravel()
+    index = np.flatnonzero((depth_mm > config.near_mm) & (depth_mm < config.far_mm))
+    if len(index) < FEWEST_POINTS:
+        raise NoEstimate(_too_few(len(index), depth_mm, config.near_mm, config.far_mm))
+    chosen = index[_draw(len(index), config.n_points, rng)]
+    points_mm = deproject_pixels(chosen, depth_mm[chosen].astype(np.float64), frame.intrinsics)
+    return SensorCloud(points_mm, frame.stamp_ns)
+
+
+def thin_cloud(cloud: SensorCloud, n_points: int, rng: np.random.Generator) -> SensorCloud:
+    """``n_points`` unique random points of the cloud (all of them if it has no more)."""
+    chosen = _draw(len(cloud.points_mm), n_points, rng)
+    return SensorCloud(cloud.points_mm[chosen], cloud.stamp_ns)
+
+
+def crop_cloud(cloud: SensorCloud, near_mm: float, far_mm: float) -> SensorCloud:
+    """The points with near_mm < z < far_mm, in their order.
+
+    Raises:
+        InputError: not 0 <= near < far.
+        NoEstimate: fewer than 200 points lie in range.
+    """
+    _check_range(near_mm, far_mm)
+    z = cloud.points_mm[:, 2]
+    inside = (z > near_mm) & (z < far_mm)
+    if inside.sum() < FEWEST_POINTS:
+        raise NoEstimate(_too_few(int(inside.sum()), z, near_mm, far_mm))
+    return SensorCloud(cloud.points_mm[inside], cloud.stamp_ns)
+
+
+def check_cloud(cloud: SensorCloud) -> None:
+    """Refuse a cloud from elsewhere that cannot show an organ before the camera, in mm.
+
+    Raises:
+        InputError: the unit is evidently not mm (metres, or mm read as metres).
+        NoEstimate: fewer than 200 points, or none before the camera.
+    """
+    points_mm = cloud.points_mm
+    if len(points_mm) < FEWEST_POINTS:
+        raise NoEstimate(
+            f"the cloud has {len(points_mm)} points with a return; at least {FEWEST_POINTS} "
+            "are needed. Give a denser cloud."
+        )
+    low, middle, high = np.percentile(points_mm, [1, 50, 99], axis=0)
+    extent_mm = float((high - low).max())
+    # A D405 sees nothing nearer than 40 mm, and an organ is larger than 5 mm.
+    if abs(middle[2]) < 5 and extent_mm < 5:
+        raise InputError(
+            f"the cloud is {extent_mm:.3g} wide and {middle[2]:.3g} away, which in mm is no organ: "
+            "it looks like metres. Give --unit m (millimetres are expected)."
+        )
+    if abs(middle[2]) > 20_000:
+        raise InputError(
+            f"the cloud is {middle[2]:.4g} mm away, beyond any depth camera: its numbers look like "
+            "millimetres read as metres. Leave out --unit m."
+        )
+    if not (points_mm[:, 2] > 0).any():
+        raise NoEstimate(
+            "no point of the cloud lies before the camera (z > 0). The camera frame has x right, "
+            "y down, z forward; turn the cloud into that frame."
+        )
+
+
+def _draw(available: int, wanted: int, rng: np.random.Generator) -> np.ndarray:
+    return rng.choice(available, min(available, wanted), replace=False)
+
+
+def _check_range(near_mm: float, far_mm: float) -> None:
+    if not 0 <= near_mm < far_mm < np.inf:
+        raise InputError(
+            f"the depth range {near_mm:g}..{far_mm:g} mm is empty; near must be at least 0 and "
+            "less than far."
+        )
+
+
+def _too_few(count: int, depth_mm: np.ndarray, near_mm: float, far_mm: float) -> str:
+    seen = depth_mm[np.isfinite(depth_mm)]
+    where = (
+        f"the {len(seen)} depths seen run from {seen.min():.1f} to {seen.max():.1f} mm"
+        if len(seen)
+        else "the sensor had no return at all"
+    )
+    return (
+        f"only {count} points lie between {near_mm:g} and {far_mm:g} mm ({where}); at least "
+        f"{FEWEST_POINTS} are needed. Move the camera, or choose another depth range."
+    )
