@@ -1,0 +1,236 @@
+"""The built-in kidney phantom as geometry: parameters -> labels.
+
+The organ is an implicit surface in the organ frame: axes as in LPS, origin at the centre of the
+organ's box, mm. A right kidney: long axis superior-inferior, hilum medial (+x, patient left) and
+a little anterior. Its poles differ in size and its lumps are irregular, so that no rotation or
+mirror image of it can pass for the phantom itself. Sizes follow the hydrogel phantom of the paper
+(one endophytic, one exophytic tumor); the shape is our own.
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from tumortrack.core.config import Config
+from tumortrack.core.errors import InputError
+from tumortrack.core.types import FIRST_TUMOR, ORGAN, LabelVolume
+
+_SMALLEST_GAP_MM = 3.0  # between tumors: closer ones merge in a CT's partial-volume rim
+
+
+class TumorParameters(Config):
+    """A lobulated ball. Opposite surface points lie ``diameter_mm`` apart in every direction."""
+
+    diameter_mm: float
+    center_mm: tuple[float, float, float]
+    """Organ frame (medial is +x for a right kidney; a left one is mirrored with its tumors)."""
+    lobulation: float = 0.06
+    """Largest deviation from a ball, as a share of the radius."""
+
+    def __post_init__(self) -> None:
+        if not (2 <= self.diameter_mm <= 120 and 0 <= self.lobulation <= 0.2):
+            raise InputError(
+                f"tumor of {self.diameter_mm} mm with lobulation {self.lobulation}: allowed are "
+                "2 to 120 mm and 0 to 0.2."
+            )
+
+
+class PhantomParameters(Config):
+    """Everything the phantom's shape depends on; the defaults are the paper's phantom."""
+
+    size_mm: tuple[float, float, float] = (60.0, 50.0, 110.0)
+    """The organ's box without tumors: left-right, anterior-posterior, superior-inferior."""
+    bend_mm: float = 9.0
+    """How far the poles lean medially."""
+    taper: float = 0.10
+    """How much thicker the superior pole is, and thinner the inferior one."""
+    hilum_depth_mm: float = 15.0
+    lump_mm: float = 0.7
+    shape_seed: int = 1
+    """Places the lumps of the organ and the lobes of the tumors."""
+    tumors: tuple[TumorParameters, ...] = (
+        TumorParameters(diameter_mm=38.0, center_mm=(-3.0, 1.0, 17.0)),
+        TumorParameters(diameter_mm=32.0, center_mm=(-17.0, -15.5, -22.0)),
+    )
+    side: Literal["left", "right"] = "right"
+    center_lps_mm: tuple[float, float, float] = (-62.0, 38.0, -45.0)
+
+    def __post_init__(self) -> None:
+        if not all(20 <= length <= 250 for length in self.size_mm):
+            raise InputError(f"phantom size {self.size_mm} mm: allowed are 20 to 250 mm.")
+        shape = (self.bend_mm, self.hilum_depth_mm, self.lump_mm, 100 * self.taper)
+        bounds = (25, 25, 2, 30)
+        if not all(0 <= value <= bound for value, bound in zip(shape, bounds, strict=True)):
+            raise InputError(
+                f"phantom shape (bend, hilum depth, lumps in mm, taper in %) {shape}: allowed "
+                f"are 0 to {bounds}."
+            )
+
+
+def second_phantom() -> PhantomParameters:
+    """Another kidney: three tumors, the deep one in the lower pole, one on the lateral rim."""
+    return PhantomParameters(
+        size_mm=(56.0, 47.0, 104.0),
+        bend_mm=7.0,
+        taper=0.04,
+        hilum_depth_mm=13.0,
+        shape_seed=7,
+        tumors=(
+            TumorParameters(diameter_mm=30.0, center_mm=(-3.0, 1.0, -20.0)),
+            TumorParameters(diameter_mm=26.0, center_mm=(-20.0, -12.0, 17.0)),
+            TumorParameters(diameter_mm=12.0, center_mm=(4.0, 2.0, 25.0)),
+        ),
+    )
+
+
+def phantom_labels(parameters: PhantomParameters, voxel_mm: float = 0.8) -> LabelVolume:
+    """The phantom on an isotropic voxel grid along the LPS axes.
+
+    Labels: 0 outside, 1 organ, 2 the tumor of largest diameter, 3 the next, ...; a tumor wins
+    over the organ.
+
+    Raises:
+        InputError: ``voxel_mm`` outside 0.2..4, or tumors closer than 3 mm to one another.
+    """
+    if not 0.2 <= voxel_mm <= 4:
+        raise InputError(f"voxel size {voxel_mm} mm: allowed are 0.2 to 4 mm.")
+    reach_mm = np.array(parameters.size_mm) / 2
+    lower_mm, upper_mm = -reach_mm, reach_mm
+    for tumor in parameters.tumors:
+        radius_mm = tumor.diameter_mm / 2 * (1 + tumor.lobulation)
+        lower_mm = np.minimum(lower_mm, np.array(tumor.center_mm) - radius_mm)
+        upper_mm = np.maximum(upper_mm, np.array(tumor.center_mm) + radius_mm)
+    counts = np.ceil((upper_mm - lower_mm + 8) / voxel_mm).astype(int) + 1
+    start_mm = (lower_mm + upper_mm) / 2 - (counts - 1) / 2 * voxel_mm
+    axes = [s + voxel_mm * np.arange(n) for s, n in zip(start_mm, counts, strict=True)]
+    inside = organ_mask(parameters, axes)
+    labels = np.where(inside, ORGAN, 0).astype(np.uint8)
+    for n, mask in enumerate(tumor_masks(parameters, axes)):
+        labels[mask] = FIRST_TUMOR + n
+    _refuse_touching(parameters)
+
+    lps_from_index = np.diag([voxel_mm, voxel_mm, voxel_mm, 1.0])
+    lps_from_index[:3, 3] = np.array(parameters.center_lps_mm) + start_mm
+    if parameters.side == "left":  # mirror the body, keep the axes' directions
+        labels = labels[::-1]
+        lps_from_index[0, 3] = parameters.center_lps_mm[0] - axes[0][-1]
+    return LabelVolume(labels, lps_from_index)
+
+
+def sorted_tumors(parameters: PhantomParameters) -> list[TumorParameters]:
+    """The tumors in label order: largest diameter first."""
+    return sorted(parameters.tumors, key=lambda tumor: -tumor.diameter_mm)
+
+
+def _refuse_touching(parameters: PhantomParameters) -> None:
+    tumors = sorted_tumors(parameters)
+    for n, one in enumerate(tumors):
+        for other in tumors[n + 1 :]:
+            apart_mm = np.linalg.norm(np.subtract(one.center_mm, other.center_mm))
+            radii_mm = [t.diameter_mm / 2 * (1 + t.lobulation) for t in (one, other)]
+            gap_mm = float(apart_mm - sum(radii_mm))
+            if gap_mm < _SMALLEST_GAP_MM:
+                raise InputError(
+                    f"the tumors of {one.diameter_mm} and {other.diameter_mm} mm may come within "
+                    f"{gap_mm:.1f} mm of one another; place them {_SMALLEST_GAP_MM} mm or more "
+                    "apart."
+                )
+
+
+def organ_mask(
+    parameters: PhantomParameters, axes_mm: list[Float[np.ndarray, " n"]]
+) -> Bool[np.ndarray, "i j k"]:
+    """Where the organ is, tumors aside, on the grid of three axes (organ frame, mm)."""
+    raw = [np.linspace(-r, r, 97) for r in 0.75 * np.array(parameters.size_mm)]
+    field = _organ_field(parameters, raw)
+    stretched = []
+    # Bending, hilum and lumps change the box: stretch each axis so that it has the stated size.
+    for axis, length_mm in enumerate(parameters.size_mm):
+        rest = tuple(other for other in range(3) if other != axis)
+        low, high = _crossings(raw[axis], field.min(axis=rest))
+        scale = (high - low) / length_mm
+        stretched.append(np.asarray(axes_mm[axis]) * scale + (low + high) / 2)
+    return _organ_field(parameters, stretched) < 0
+
+
+def _crossings(
+    axis_mm: Float[np.ndarray, " n"], values: Float[np.ndarray, " n"]
+) -> tuple[float, float]:
+    """First and last place where ``values`` change sign, by linear interpolation."""
+    inside = np.flatnonzero(values < 0)
+    ends = []
+    for at, beyond in ((inside[0], inside[0] - 1), (inside[-1], inside[-1] + 1)):
+        t = values[at] / (values[at] - values[beyond])
+        ends.append(float(axis_mm[at] + t * (axis_mm[beyond] - axis_mm[at])))
+    return ends[0], ends[1]
+
+
+def _organ_field(
+    parameters: PhantomParameters, axes_mm: list[Float[np.ndarray, " n"]]
+) -> Float[np.ndarray, "i j k"]:
+    """About the signed distance to the organ's raw surface in mm, negative inside."""
+    x, y, z = np.meshgrid(*axes_mm, indexing="ij", sparse=True)
+    rx, ry, rz = np.array(parameters.size_mm) / 2
+    along = z / rz
+    # Bend and thickness vary along the organ; the cubic term makes the poles differ.
+    spine_mm = parameters.bend_mm * (along**2 + 0.25 * along**3 - 0.35)
+    thickness = 1 + parameters.taper * np.tanh(1.5 * along)
+    body = _ellipsoid(
+        ((x - spine_mm) / thickness, (y + 1.5 * along) / thickness, z), (rx, ry, rz), power=2.3
+    )
+    # The renal sinus: a slot that enters from the medial side, a little from the front.
+    turn = np.deg2rad(20.0)
+    u = (x - rx - 2) * np.cos(turn) - (y + 5) * np.sin(turn)
+    v = (x - rx - 2) * np.sin(turn) + (y + 5) * np.cos(turn)
+    slot = _ellipsoid((u, v, z + 4), (parameters.hilum_depth_mm + 4, 8.0, 0.3 * rz), power=2.0)
+    carved = _smooth_max(body, -slot, 5.0)
+    return carved + _lumps(parameters, (x, y, z))
+
+
+def _ellipsoid(point: tuple[np.ndarray, ...], radii: tuple[float, ...], power: float) -> np.ndarray:
+    """Approximate signed distance to a (super)ellipsoid: value over gradient length."""
+    scaled = [np.abs(p) / r for p, r in zip(point, radii, strict=True)]
+    norm = sum(s**power for s in scaled) ** (1 / power) + 1e-9
+    gradient = [(s / norm) ** (power - 1) / r for s, r in zip(scaled, radii, strict=True)]
+    return (norm - 1) / (np.sqrt(sum(g**2 for g in gradient)) + 1e-9)
+
+
+def _smooth_max(a: np.ndarray, b: np.ndarray, width_mm: float) -> np.ndarray:
+    """Maximum with a rounded edge (polynomial smooth maximum)."""
+    blend = np.clip(width_mm - np.abs(a - b), 0, None)
+    return np.maximum(a, b) + blend**2 / (4 * width_mm)
+
+
+def _lumps(parameters: PhantomParameters, point_mm: tuple[np.ndarray, ...]) -> np.ndarray:
+    """Smooth waves of 30 to 60 mm in irregular directions, at most ``lump_mm`` in all."""
+    rng = np.random.default_rng((parameters.shape_seed, 0))
+    total = np.zeros(np.broadcast_shapes(*(p.shape for p in point_mm)))
+    for _ in range(4):
+        direction = rng.normal(size=3)
+        wave = direction / np.linalg.norm(direction) * 2 * np.pi / rng.uniform(30, 60)
+        phase = rng.uniform(0, 2 * np.pi)
+        angle = sum(w * p for w, p in zip(wave, point_mm, strict=True))
+        total += np.sin(angle + phase) * parameters.lump_mm / 4
+    return total
+
+
+def tumor_masks(
+    parameters: PhantomParameters, axes_mm: list[Float[np.ndarray, " n"]]
+) -> list[Bool[np.ndarray, "i j k"]]:
+    """Where each tumor is, in label order, on the grid of three axes (organ frame, mm)."""
+    masks = []
+    for number, tumor in enumerate(sorted_tumors(parameters)):
+        rng = np.random.default_rng((parameters.shape_seed, 1, number))
+        waves = rng.normal(size=(3, 3))
+        waves *= 4.0 / np.linalg.norm(waves, axis=1, keepdims=True)
+        offsets = [a - c for a, c in zip(axes_mm, tumor.center_mm, strict=True)]
+        x, y, z = np.meshgrid(*offsets, indexing="ij", sparse=True)
+        distance_mm = np.sqrt(x**2 + y**2 + z**2)
+        away = np.maximum(distance_mm, 1e-9)
+        # Odd in direction: what one side gains its opposite loses, so diameters stay as stated.
+        lobes = sum(np.sin((a * x + b * y + c * z) / away) for a, b, c in waves) / 3
+        masks.append(distance_mm < tumor.diameter_mm / 2 * (1 + tumor.lobulation * lobes))
+    return masks

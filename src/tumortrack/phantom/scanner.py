@@ -1,0 +1,237 @@
+"""A virtual CT scanner: any label map -> a CT volume with table and registration block.
+
+Every structure is blurred by the point-spread function and by the voxel it is averaged over, then
+correlated Gaussian noise is added. Beam hardening, scatter and streaks are left out.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float, Float32
+
+from tumortrack.core.config import Config
+from tumortrack.core.errors import InputError
+from tumortrack.core.geometry import rigid, spacing_mm
+from tumortrack.core.types import FIRST_TUMOR, ORGAN, LabelVolume, Volume
+
+AIR_HU = -1000.0
+_LOWEST_HU, _HIGHEST_HU = -1024, 3071  # the 12 bits of a clinical scanner
+_LARGEST_SCAN = 400_000_000  # voxels
+
+
+class ScannerParameters(Config):
+    """Materials, objects beside the phantom, and the scanner's resolution and noise.
+
+    Where the HU come from. Organ: 10 % PVA hydrogel attenuates as soft tissue does (Price et al.
+    2010, doi 10.1088/0031-9155/55/4/018); 40 HU is our choice. Tumors: 2.27 % BaSO4 by weight
+    is about 13 mg barium per ml; with the attenuation of barium and water at 60 keV (8.5 and
+    0.206 cm2/g, NIST XCOM) it adds some 550 HU. Block: polyoxymethylene, about 340 HU (as the
+    Delrin rod of the Catphan phantom), inside the tumor window on purpose.
+    """
+
+    organ_hu: float = 40.0
+    tumor_hu: float = 570.0
+    spacing_mm: tuple[float, float, float] = (0.6, 0.6, 0.8)
+    margin_mm: float = 12.0
+    """Air kept round the label map; the table ends where the field of view ends."""
+    tilt_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Turns the voxel grid about the patient's x, y, z axes: an oblique volume."""
+    psf_sigma_mm: float = 0.65
+    noise_hu: float = 14.0
+    noise_correlation_voxels: float = 0.7
+    table_hu: float = -80.0
+    """A thin carbon skin; 0 thickness leaves the table out."""
+    table_thickness_mm: float = 2.0
+    table_gap_mm: float = 4.0
+    """A foam pad, as good as air, between phantom and table."""
+    block_hu: float = 340.0
+    block_size_mm: tuple[float, float, float] = (22.0, 22.0, 40.0)
+    """Left-right, anterior-posterior, superior-inferior; 0 leaves the block out."""
+    block_gap_mm: float = 14.0
+    """Between the label map's box and the block, on the patient's right."""
+
+    def __post_init__(self) -> None:
+        if not all(0.2 <= length <= 10 for length in self.spacing_mm):
+            raise InputError(f"scan spacing {self.spacing_mm} mm: allowed are 0.2 to 10 mm.")
+        for name in ("organ_hu", "tumor_hu", "table_hu", "block_hu"):
+            if not AIR_HU <= getattr(self, name) <= 3000:
+                raise InputError(f"{name} = {getattr(self, name)}: allowed are -1000 to 3000.")
+        lengths = ("margin_mm", "table_thickness_mm", "table_gap_mm", "block_gap_mm")
+        blurs = ("psf_sigma_mm", "noise_hu", "noise_correlation_voxels")
+        for name in (*lengths, *blurs):
+            if not 0 <= getattr(self, name) <= 200:
+                raise InputError(f"{name} = {getattr(self, name)}: allowed are 0 to 200.")
+
+
+def scan(labels: LabelVolume, parameters: ScannerParameters, seed: int) -> Volume:
+    """Scan a label map: 1 becomes hydrogel, 2 and above contrast-loaded tumor, 0 air.
+
+    Only the box round the labels is scanned. HU are whole numbers in -1024..3071; the same seed
+    gives the same volume.
+
+    Raises:
+        InputError: no label at all, or a scan of more than 400 million voxels.
+    """
+    body, lps_from_body = _crop(labels)
+    box_mm = _corner_box(lps_from_body, body.shape)
+    objects = _objects(box_mm, parameters)
+    lps_from_index, shape = _field_of_view(box_mm, objects, parameters)
+    sigma_mm = _blur_along_axes(lps_from_index, parameters)
+
+    hu = _scan_labels(body, lps_from_body, lps_from_index, shape, parameters)
+    for lower_mm, upper_mm, object_hu in objects:
+        _add_box(hu, lps_from_index, (lower_mm, upper_mm), object_hu - AIR_HU, sigma_mm)
+    hu += _noise(shape, parameters, seed)
+    return Volume(np.clip(np.rint(hu), _LOWEST_HU, _HIGHEST_HU), lps_from_index)
+
+
+def _crop(labels: LabelVolume) -> tuple[np.ndarray, np.ndarray]:
+    """The box round all labels with one empty voxel about it, and its lps_from_index."""
+    bounds = []
+    for axis in range(3):
+        rest = tuple(other for other in range(3) if other != axis)
+        filled = np.flatnonzero(labels.labels.any(axis=rest))
+        if len(filled) == 0:
+            raise InputError("the label map is empty (0 everywhere); there is nothing to scan.")
+        bounds.append(slice(filled[0], filled[-1] + 1))
+    lps_from_crop = labels.lps_from_index.copy()
+    first = np.array([b.start - 1 for b in bounds])
+    lps_from_crop[:3, 3] += lps_from_crop[:3, :3] @ first
+    return np.pad(labels.labels[tuple(bounds)], 1), lps_from_crop
+
+
+def _corner_box(lps_from_index: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """Lower and upper corner in LPS of a grid's voxel centres."""
+    ends = np.stack(np.meshgrid(*[(0, n - 1) for n in shape]), -1).reshape(-1, 3)
+    corners = ends @ lps_from_index[:3, :3].T + lps_from_index[:3, 3]
+    return np.stack([corners.min(0), corners.max(0)])
+
+
+def _objects(
+    box_mm: np.ndarray, parameters: ScannerParameters
+) -> list[tuple[np.ndarray, np.ndarray, float]]:
+    """Table and block as (lower, upper, HU) boxes along the LPS axes."""
+    objects = []
+    table_top = box_mm[1, 1] + parameters.table_gap_mm
+    block = np.array(parameters.block_size_mm)
+    middle = box_mm.mean(0)
+    has_block = block.min() > 0
+    right_mm = box_mm[0, 0]
+    if has_block:
+        # It stands on the table's pad, beside the phantom, nearer the feet than the middle.
+        upper = np.array(
+            [right_mm - parameters.block_gap_mm, box_mm[1, 1], middle[2] - 5 + block[2] / 2]
+        )
+        objects.append((upper - block, upper, parameters.block_hu))
+        right_mm = upper[0] - block[0]
+    if parameters.table_thickness_mm > 0:
+        lower = np.array([right_mm, table_top, box_mm[0, 2]]) - parameters.margin_mm
+        upper = np.array([*(box_mm[1] + parameters.margin_mm)])
+        lower[1], upper[1] = table_top, table_top + parameters.table_thickness_mm
+        objects.append((lower, upper, parameters.table_hu))
+    return objects
+
+
+def _field_of_view(
+    box_mm: np.ndarray,
+    objects: list[tuple[np.ndarray, np.ndarray, float]],
+    parameters: ScannerParameters,
+) -> tuple[np.ndarray, tuple[int, int, int]]:
+    """lps_from_index and shape of a grid that holds everything, tilted as asked for."""
+    from scipy.spatial.transform import Rotation
+
+    lower = np.min([box_mm[0] - parameters.margin_mm, *(o[0] - 4 for o in objects)], axis=0)
+    upper = np.max([box_mm[1] + parameters.margin_mm, *(o[1] + 4 for o in objects)], axis=0)
+    rotation = Rotation.from_euler("xyz", parameters.tilt_deg, degrees=True).as_matrix()
+    middle = (lower + upper) / 2
+    half_mm = np.abs(rotation.T) @ ((upper - lower) / 2)
+    spacing = np.array(parameters.spacing_mm)
+    counts = np.ceil(2 * half_mm / spacing).astype(int) + 1
+    if counts.prod() > _LARGEST_SCAN:
+        raise InputError(
+            f"the scan would have {' x '.join(map(str, counts))} voxels; at most 400 million are "
+            "allowed. Choose a larger spacing_mm, or a label map of one organ."
+        )
+    origin = middle - rotation @ (spacing * (counts - 1) / 2)
+    lps_from_index = rigid(rotation, origin) @ np.diag([*spacing, 1.0])
+    return lps_from_index, (int(counts[0]), int(counts[1]), int(counts[2]))
+
+
+def _blur_along_axes(
+    lps_from_index: np.ndarray, parameters: ScannerParameters
+) -> Float[np.ndarray, " 3"]:
+    """Blur along the LPS axes in mm: point spread and a voxel's own extent (variance h^2/12)."""
+    voxel = (lps_from_index[:3, :3] ** 2).sum(1) / 12
+    return np.sqrt(parameters.psf_sigma_mm**2 + voxel)
+
+
+def _scan_labels(
+    body: np.ndarray,
+    lps_from_body: np.ndarray,
+    lps_from_index: np.ndarray,
+    shape: tuple[int, int, int],
+    parameters: ScannerParameters,
+) -> Float32[np.ndarray, "i j k"]:
+    """The label map's HU, blurred on its own grid and read at the scanner's voxels."""
+    from scipy import ndimage
+
+    hu_of_label = np.full(256, AIR_HU, np.float32)
+    hu_of_label[ORGAN] = parameters.organ_hu
+    hu_of_label[FIRST_TUMOR:] = parameters.tumor_hu
+    directions = lps_from_body[:3, :3] / spacing_mm(lps_from_body)
+    voxel = ((directions.T @ lps_from_index[:3, :3]) ** 2).sum(1) / 12
+    sigma_mm = np.sqrt(parameters.psf_sigma_mm**2 + voxel)
+    sigma = sigma_mm / spacing_mm(lps_from_body)
+    pad = int(np.ceil(4 * sigma.max())) + 1
+    dense = ndimage.gaussian_filter(
+        np.pad(hu_of_label[body], pad, constant_values=AIR_HU), sigma, mode="nearest"
+    )
+    body_from_index = np.linalg.inv(lps_from_body) @ lps_from_index
+    return ndimage.affine_transform(
+        dense,
+        body_from_index[:3, :3],
+        body_from_index[:3, 3] + pad,
+        output_shape=shape,
+        output=np.float32,
+        order=1,
+        mode="constant",
+        cval=AIR_HU,
+    )
+
+
+def _add_box(
+    hu: np.ndarray,
+    lps_from_index: np.ndarray,
+    corners_mm: tuple[np.ndarray, np.ndarray],
+    contrast_hu: float,
+    sigma_mm: np.ndarray,
+) -> None:
+    """Add a box along the LPS axes, exactly blurred: a product of three error functions."""
+    from scipy.special import ndtr
+
+    lower, upper = (np.asarray(c, np.float32) for c in corners_mm)
+    sigma = np.maximum(sigma_mm, 1e-6).astype(np.float32)
+    i, j = (np.arange(n, dtype=np.float32) for n in hu.shape[:2])
+    a = lps_from_index.astype(np.float32)
+    for k in range(hu.shape[2]):
+        share = np.full(hu.shape[:2], contrast_hu, np.float32)
+        for axis in range(3):
+            at = a[axis, 0] * i[:, None] + a[axis, 1] * j + (a[axis, 2] * k + a[axis, 3])
+            share *= ndtr((at - lower[axis]) / sigma[axis]) - ndtr((at - upper[axis]) / sigma[axis])
+        hu[:, :, k] += share
+
+
+def _noise(
+    shape: tuple[int, int, int], parameters: ScannerParameters, seed: int
+) -> Float32[np.ndarray, "i j k"]:
+    """Gaussian noise of the stated standard deviation, correlated between neighbours."""
+    from scipy import ndimage
+
+    noise = np.random.default_rng(seed).standard_normal(shape, dtype=np.float32)
+    width = parameters.noise_correlation_voxels
+    impulse = np.zeros(1 + 2 * int(np.ceil(5 * width)))
+    impulse[len(impulse) // 2] = 1.0
+    kernel = ndimage.gaussian_filter1d(impulse, width) if width > 0 else impulse
+    for axis in range(3):  # a kernel of unit energy keeps the standard deviation
+        noise = ndimage.correlate1d(noise, kernel / np.linalg.norm(kernel), axis, mode="wrap")
+    return noise * np.float32(parameters.noise_hu)
