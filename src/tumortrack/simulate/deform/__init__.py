@@ -1,0 +1,11 @@
+"""Deformations: one file per model.
+
+A model's configuration samples parameters from what the camera sees (``sample``); the sampled
+deformation is a value that carries any point of the CT frame to its new place (``apply``) and
+can be recorded (``record``). To add one: write its file, add its configuration to the union.
+"""
+
+from tumortrack.simulate.deform.drag import DragConfig
+from tumortrack.simulate.deform.rest import RestConfig
+
+DeformConfig = DragConfig | RestConfig

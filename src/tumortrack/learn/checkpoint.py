@@ -1,0 +1,94 @@
+"""The state of a training run in one file, written atomically: kill -9 loses the steps since."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save
+
+from tumortrack.core.errors import ArtifactError
+from tumortrack.core.store import write_atomically
+
+_FILE = "checkpoint.safetensors"
+
+
+@dataclass
+class Progress:
+    """Where a run stands. ``end`` is the step it will stop at; None while minutes decide."""
+
+    step: int = 0
+    elapsed_s: float = 0.0
+    end: int | None = None
+    best_miou: float = -1.0
+
+
+def save_checkpoint(
+    folder: Path, progress: Progress, groups: dict[str, dict[str, torch.Tensor]], identity: str
+) -> None:
+    """Write progress and tensors; ``identity`` names the run they belong to.
+
+    Raises:
+        StorageError: the disk is full; the checkpoint before this one is whole.
+    """
+    tensors = {
+        f"{group}/{name}": tensor.detach().cpu().contiguous()
+        for group, members in groups.items()
+        for name, tensor in members.items()
+    }
+    metadata = {"progress": json.dumps(asdict(progress)), "identity": identity}
+    write_atomically(folder / _FILE, save(tensors, metadata))
+
+
+def load_checkpoint(
+    folder: Path, identity: str
+) -> tuple[Progress, dict[str, dict[str, torch.Tensor]]] | None:
+    """The last checkpoint, or None where there is none.
+
+    Raises:
+        ArtifactError: it is damaged, or belongs to a run with another case, configuration or seed.
+    """
+    path = folder / _FILE
+    if not path.exists():
+        return None
+    groups: dict[str, dict[str, torch.Tensor]] = {}
+    try:
+        with safe_open(path, framework="pt") as file:
+            metadata = file.metadata() or {}
+            progress = Progress(**json.loads(metadata["progress"]))
+            for key in file.keys():  # noqa: SIM118 - safe_open is no dict
+                group, name = key.split("/", 1)
+                groups.setdefault(group, {})[name] = file.get_tensor(key)
+    except (SafetensorError, KeyError, TypeError, ValueError, OSError) as error:
+        raise ArtifactError(
+            f"{path} is damaged: {error}. Remove {folder.parent} and train again."
+        ) from error
+    if metadata.get("identity") != identity:
+        raise ArtifactError(
+            f"{folder.parent} holds a run with another case, preset, seed or option. Give the "
+            "same command to resume it, or another MODEL folder to start anew."
+        )
+    return progress, groups
+
+
+def optimizer_tensors(optimizer: torch.optim.Optimizer) -> dict[str, torch.Tensor]:
+    """Adam's moments and step counts, by parameter number."""
+    return {
+        f"{index}.{name}": value
+        for index, state in optimizer.state_dict()["state"].items()
+        for name, value in state.items()
+    }
+
+
+def restore_optimizer(
+    optimizer: torch.optim.Optimizer, tensors: dict[str, torch.Tensor]
+) -> None:
+    """Put back what ``optimizer_tensors`` took."""
+    state: dict[int, dict[str, torch.Tensor]] = {}
+    for key, value in tensors.items():
+        index, name = key.split(".", 1)
+        state.setdefault(int(index), {})[name] = value
+    optimizer.load_state_dict({**optimizer.state_dict(), "state": state})

@@ -1,0 +1,100 @@
+"""A trained network as a folder: weights.safetensors and a manifest with all it depends on."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float64
+from safetensors.torch import load, save
+
+from tumortrack.core import store
+from tumortrack.core.config import from_builtins, to_builtins
+from tumortrack.core.errors import ArtifactError, InputError
+from tumortrack.learn.config import TrainConfig
+from tumortrack.learn.network import OccupancyNetwork
+
+KIND = "model"
+_WEIGHTS = "weights.safetensors"
+
+
+@dataclass(frozen=True, eq=False)
+class Model:
+    """A network in evaluation mode and what it was trained for.
+
+    ``query_box_mm``: where the organ can lie, relative to the middle of the observed cloud's
+    bounding box, camera frame (lower and upper corner). ``provenance``: seeds, steps, hashes.
+    """
+
+    network: OccupancyNetwork
+    config: TrainConfig
+    parts: tuple[str, ...]
+    query_box_mm: Float64[np.ndarray, "2 3"]
+    provenance: dict
+
+
+def save_model(model: Model, folder: Path) -> None:
+    """Write weights and manifest into an existing folder, the manifest last."""
+    weights = {k: v.contiguous() for k, v in model.network.state_dict().items()}
+    store.write_atomically(folder / _WEIGHTS, save(weights))
+    content = {
+        "parts": list(model.parts),
+        "query_box_mm": model.query_box_mm.tolist(),
+        "provenance": model.provenance,
+        "config": to_builtins(model.config),
+    }
+    store.seal(folder, KIND, content, frame="camera")
+
+
+def is_finished(folder: Path) -> bool:
+    """Whether the folder holds a finished model (rather than a training under way)."""
+    return (folder / store.MANIFEST).is_file()
+
+
+def load_model(folder: Path, device: str = "auto") -> Model:
+    """Read a model folder.
+
+    Raises:
+        ArtifactError: missing, of another schema, damaged, or weights changed since training.
+        InputError: CUDA asked for where there is none.
+    """
+    if not is_finished(folder) and (folder / "training").is_dir():
+        raise ArtifactError(
+            f"{folder} holds a training that has not ended. Run the same `tumortrack train` "
+            "command again to go on with it."
+        )
+    manifest = store.read_manifest(folder, KIND)
+    try:
+        config = from_builtins(manifest["config"], TrainConfig, f"{folder}: config")
+        parts = tuple(manifest["parts"])
+        box = np.array(manifest["query_box_mm"], float).reshape(2, 3)
+        network = OccupancyNetwork(config.network)
+        network.load_state_dict(load((folder / _WEIGHTS).read_bytes()))
+        provenance = dict(manifest["provenance"])
+    except (KeyError, TypeError, ValueError, RuntimeError, OSError) as error:
+        raise ArtifactError(f"{folder} is not a whole model: {error}. Train it again.") from error
+    network.eval().requires_grad_(False).to(choose_device(device))
+    return Model(network, config, parts, box, provenance)
+
+
+def choose_device(device: str) -> torch.device:
+    """``auto`` takes CUDA where it is.
+
+    Raises:
+        InputError: ``cuda`` asked for, none there.
+    """
+    if device == "cuda" and not torch.cuda.is_available():
+        raise InputError("--device cuda: PyTorch sees no CUDA GPU here. Use --device cpu or auto.")
+    if device == "auto":
+        device = "cuda" if torch.cuda.is_available() else "cpu"
+    return torch.device(device)
+
+
+def has_fast_bfloat16(device: torch.device) -> bool:
+    """Whether bf16 matrix products run in hardware, and so pay."""
+    if device.type == "cuda":
+        return torch.cuda.is_bf16_supported(including_emulation=False)
+    capability = torch.cpu.get_capabilities()
+    return bool(capability.get("avx512_bf16") or capability.get("amx_bf16"))

@@ -1,0 +1,103 @@
+"""What the camera sees of a mesh: a z-buffer depth image, and which vertices are visible."""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+from jaxtyping import Bool, Float
+
+from tumortrack.core.types import DepthFrame, Intrinsics, Mesh
+
+
+def render_depth(
+    vertices_camera_mm: Float[np.ndarray, "v 3"],
+    faces: np.ndarray,
+    intrinsics: Intrinsics,
+    stamp_ns: int = 0,
+) -> DepthFrame:
+    """Depth image (mm along z, NaN where nothing is hit) of a closed mesh seen from outside.
+
+    Vertices (v, 3) in the camera frame, faces (f, 3) turned outward. Only triangles that face
+    the camera are drawn; a triangle that reaches behind the camera is left out.
+    """
+    depth = _z_buffer(
+        np.ascontiguousarray(vertices_camera_mm, np.float32),
+        np.ascontiguousarray(faces, np.int32),
+        intrinsics.width,
+        intrinsics.height,
+        intrinsics.fx,
+        intrinsics.fy,
+        intrinsics.cx,
+        intrinsics.cy,
+    )
+    return DepthFrame(depth, intrinsics, stamp_ns)
+
+
+@numba.njit(cache=True, nogil=True)
+def _z_buffer(vertices, faces, width, height, fx, fy, cx, cy):  # type: ignore[no-untyped-def]
+    n = len(vertices)
+    u = np.empty(n, np.float32)
+    v = np.empty(n, np.float32)
+    w = np.empty(n, np.float32)  # 1/z: linear in the image, unlike z
+    for i in range(n):
+        z = vertices[i, 2]
+        if z > 1.0:
+            w[i] = 1.0 / z
+            u[i] = fx * vertices[i, 0] * w[i] + cx
+            v[i] = fy * vertices[i, 1] * w[i] + cy
+        else:
+            w[i] = -1.0
+    nearest = np.zeros((height, width), np.float32)  # greatest 1/z so far
+    for f in range(len(faces)):
+        a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
+        if w[a] < 0 or w[b] < 0 or w[c] < 0:
+            continue
+        # Outward faces run clockwise in a y-down image when they face the camera.
+        area = (u[b] - u[a]) * (v[c] - v[a]) - (v[b] - v[a]) * (u[c] - u[a])
+        if area >= 0:
+            continue
+        left = max(int(np.ceil(min(u[a], u[b], u[c]))), 0)
+        right = min(int(np.floor(max(u[a], u[b], u[c]))), width - 1)
+        top = max(int(np.ceil(min(v[a], v[b], v[c]))), 0)
+        bottom = min(int(np.floor(max(v[a], v[b], v[c]))), height - 1)
+        inverse = 1.0 / area
+        for y in range(top, bottom + 1):
+            for x in range(left, right + 1):
+                wa = ((u[b] - x) * (v[c] - y) - (v[b] - y) * (u[c] - x)) * inverse
+                wb = ((u[c] - x) * (v[a] - y) - (v[c] - y) * (u[a] - x)) * inverse
+                wc = 1.0 - wa - wb
+                if wa >= -1e-5 and wb >= -1e-5 and wc >= -1e-5:
+                    here = wa * w[a] + wb * w[b] + wc * w[c]
+                    nearest[y, x] = max(nearest[y, x], here)
+    depth = np.full((height, width), np.nan, np.float32)
+    for y in range(height):
+        for x in range(width):
+            if nearest[y, x] > 0:
+                depth[y, x] = 1.0 / nearest[y, x]
+    return depth
+
+
+class Visibility:
+    """Which vertices of one fixed mesh a camera sees: exact, by ray, on a tree built once."""
+
+    _TOLERANCE_MM = 0.05  # a ray to a vertex hits the vertex's own triangles at about its length
+
+    def __init__(self, mesh: Mesh) -> None:
+        from embreex.mesh_construction import TriangleMesh
+        from embreex.rtcore_scene import EmbreeScene
+
+        self._scene = EmbreeScene()
+        self._origin = mesh.vertices_mm.mean(0)  # keep numbers small: Embree works in float32
+        corners = (mesh.vertices_mm - self._origin)[mesh.faces]
+        self._triangles = TriangleMesh(self._scene, corners.astype(np.float32))
+
+    def __call__(
+        self, points_mm: Float[np.ndarray, "n 3"], eye_mm: Float[np.ndarray, " 3"]
+    ) -> Bool[np.ndarray, " n"]:
+        """True where nothing of the mesh lies between the eye and the point (mesh's frame)."""
+        eye = (eye_mm - self._origin).astype(np.float32)
+        rays = (points_mm - self._origin).astype(np.float32) - eye
+        length = np.linalg.norm(rays, axis=1)
+        origins = np.broadcast_to(eye, rays.shape).copy()
+        hit_mm = self._scene.run(origins, rays / length[:, None], query="DISTANCE")
+        return hit_mm >= length - self._TOLERANCE_MM

@@ -1,0 +1,67 @@
+"""An endless, addressable stream of training batches."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float32, UInt8
+
+from tumortrack.core.types import Anatomy
+from tumortrack.simulate.occupancy import OccupancyPool
+from tumortrack.simulate.scene import SceneConfig, SceneRecipe, Simulator
+
+
+@dataclass(frozen=True, eq=False)
+class Batch:
+    """Scenes stacked; camera frame, mm."""
+
+    clouds_mm: Float32[np.ndarray, "b n 3"]
+    points_mm: Float32[np.ndarray, "b q 3"]
+    labels: UInt8[np.ndarray, "b q"]
+
+
+@dataclass(frozen=True, eq=False)
+class SceneStream:
+    """Batch ``i`` holds the recipes ``i * size ... i * size + size - 1``, whoever asks and
+    whenever: worker processes and resumed runs see the same data. Picklable."""
+
+    anatomy_ct: Anatomy
+    up_lps: tuple[float, float, float]
+    config: SceneConfig
+    pool: OccupancyPool
+    seed: int
+    stream: Literal["train", "validation", "test"]
+    batch_size: int
+
+    @cached_property
+    def _simulator(self) -> Simulator:  # built where it is used: ray trees do not travel
+        return Simulator(self.anatomy_ct, self.up_lps, self.config)
+
+    def __getstate__(self) -> dict:
+        return {k: v for k, v in self.__dict__.items() if k != "_simulator"}
+
+    def __setstate__(self, state: dict) -> None:
+        self.__dict__.update(state)
+
+    def batch(self, index: int) -> Batch:
+        """The batch with this number."""
+        first = index * self.batch_size
+        pairs = [
+            self._simulator.pair(SceneRecipe(self.seed, self.stream, i), self.pool)
+            for i in range(first, first + self.batch_size)
+        ]
+        n = self.config.cloud.n_points
+        return Batch(
+            np.stack([_refill(p.cloud.points_mm, n) for p in pairs]),
+            np.stack([p.samples.points_mm for p in pairs]),
+            np.stack([p.samples.labels for p in pairs]),
+        )
+
+
+def _refill(points_mm: Float32[np.ndarray, "m 3"], n: int) -> Float32[np.ndarray, "n 3"]:
+    """A cloud smaller than ``n`` repeats its points, so that clouds stack; a network that pools
+    by maximum does not notice."""
+    return points_mm[np.arange(n) % len(points_mm)]

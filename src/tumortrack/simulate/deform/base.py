@@ -1,0 +1,33 @@
+"""What every deformation model offers."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from jaxtyping import Float
+
+from tumortrack.core.types import Anatomy
+
+
+@dataclass(frozen=True)
+class View:
+    """The undeformed organ as the camera sees it: what a deformation may be sampled from."""
+
+    anatomy_ct: Anatomy
+    # visible(points_ct) -> bool each: nothing before the point, and the point in the picture
+    visible: Callable[[np.ndarray], np.ndarray]
+
+
+class Deformation(Protocol):
+    """A sampled deformation, a map of space."""
+
+    def apply(self, points_ct: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+        """New positions (float32) of points (n, 3), CT frame, mm."""
+        ...
+
+    def record(self) -> dict:
+        """The sampled parameters as JSON types."""
+        ...

@@ -1,0 +1,144 @@
+"""Where the network is asked during training, and the right answers: SortSample.
+
+Source: LOOC (IEEE Access 2025, doi 10.1109/ACCESS.2025.3543736), the improved form: per part
+draw uniformly in its box x 1.5 until at least k points lie inside and k outside, drop those in
+a thin wall about the surface, keep the k nearest of each; add 15 % far points. Points are drawn
+in the undeformed CT frame, where labels are known, and *pushed* through the deformation, which
+carries labels along exactly. Distances are those before the deformation.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+
+from tumortrack.core.config import Config
+from tumortrack.core.types import Anatomy, Mesh
+
+
+class OccupancyConfig(Config):
+    """SortSample's numbers."""
+
+    per_side: int = 256  # k: points kept inside and outside of each part
+    box_factor: float = 1.5
+    wall_mm: float = 0.2
+    far_share: float = 0.15
+    far_reach: float = 1.2  # half of the far points: a cube of +- this times the organ's diagonal
+    pool: int = 100_000  # points per part whose labels are worked out once
+
+
+@dataclass(frozen=True, eq=False)
+class PartPool:
+    """Points about one part: CT frame, distance to its surface, inside it or not, label."""
+
+    points_ct: Float[np.ndarray, "n 3"]
+    distance_mm: Float[np.ndarray, " n"]
+    inside: Bool[np.ndarray, " n"]
+    labels: UInt8[np.ndarray, " n"]
+
+
+class OccupancyPool:
+    """Labelled points of one undeformed anatomy, worked out once; every scene draws from them."""
+
+    def __init__(self, anatomy_ct: Anatomy, config: OccupancyConfig, seed: int) -> None:
+        rng = np.random.default_rng([seed, 0x5047])
+        self.config = config
+        self.parts = tuple(_part_pool(anatomy_ct, part, config, rng) for part in anatomy_ct.parts)
+        lower, upper = anatomy_ct.organ.box_mm
+        centre, half = (lower + upper) / 2, (upper - lower) / 2
+        reach = np.full(3, config.far_reach * np.linalg.norm(upper - lower) / 2)
+        n = config.pool // 2
+        near = centre + rng.uniform(-1, 1, (n, 3)) * half * config.box_factor
+        far = centre + rng.uniform(-1, 1, (n, 3)) * reach
+        points = rng.permutation(np.concatenate([near, far])).astype(np.float32)
+        self.far_points_ct, self.far_labels = points, labels_of(anatomy_ct, points)
+
+    def draw(
+        self, rng: np.random.Generator
+    ) -> tuple[Float[np.ndarray, "n 3"], UInt8[np.ndarray, " n"]]:
+        """One scene's points (CT frame, undeformed) and labels; the same number every time."""
+        points, labels = [], []
+        for part in self.parts:
+            chosen = self._sort_sample(part, rng)
+            points.append(part.points_ct[chosen])
+            labels.append(part.labels[chosen])
+        near = sum(map(len, labels))
+        n_far = round(near * self.config.far_share / (1 - self.config.far_share))
+        chosen = _window(len(self.far_labels), n_far, rng)
+        return (
+            np.concatenate([*points, self.far_points_ct[chosen]]),
+            np.concatenate([*labels, self.far_labels[chosen]]),
+        )
+
+    def draw_evenly(
+        self, rng: np.random.Generator, count: int
+    ) -> tuple[Float[np.ndarray, "n 3"], UInt8[np.ndarray, " n"]]:
+        """Points spread evenly over the organ's enlarged box: shares of them are volumes."""
+        organ = self.parts[0]
+        chosen = _window(len(organ.labels), count, rng)
+        return organ.points_ct[chosen], organ.labels[chosen]
+
+    def _sort_sample(self, part: PartPool, rng: np.random.Generator) -> np.ndarray:
+        k = self.config.per_side
+        share = part.inside.mean()
+        count = int(k / min(share, 1 - share) * 1.1)
+        while True:
+            drawn = _window(len(part.inside), count, rng)
+            inside = part.inside[drawn]
+            if min(inside.sum(), (~inside).sum()) >= k:
+                break
+            count = min(2 * count, len(part.inside))
+        return np.concatenate([_nearest(part, drawn[side], k) for side in (inside, ~inside)])
+
+
+def _nearest(part: PartPool, drawn: np.ndarray, k: int) -> np.ndarray:
+    if len(drawn) == k:
+        return drawn
+    return drawn[np.argpartition(part.distance_mm[drawn], k)[:k]]
+
+
+def _window(n: int, count: int, rng: np.random.Generator) -> np.ndarray:
+    """``count`` neighbours of a pool that is in random order: a random draw, without its cost."""
+    return (int(rng.integers(n)) + np.arange(count)) % n
+
+
+def _part_pool(
+    anatomy_ct: Anatomy, part: Mesh, config: OccupancyConfig, rng: np.random.Generator
+) -> PartPool:
+    lower, upper = part.box_mm
+    centre, half = (lower + upper) / 2, (upper - lower) / 2 * config.box_factor
+    points = (centre + rng.uniform(-1, 1, (config.pool, 3)) * half).astype(np.float32)
+    distance = surface_distance(part, points)
+    keep = distance > config.wall_mm
+    points, distance = points[keep], distance[keep]
+    return PartPool(points, distance, contains(part, points), labels_of(anatomy_ct, points))
+
+
+def contains(mesh: Mesh, points_mm: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
+    """True for points inside a closed mesh (ray parity by Embree, two directions)."""
+    import trimesh
+
+    return trimesh.Trimesh(mesh.vertices_mm, mesh.faces, process=False).contains(points_mm)
+
+
+def labels_of(anatomy: Anatomy, points_mm: Float[np.ndarray, "n 3"]) -> UInt8[np.ndarray, " n"]:
+    """Labels of points in the anatomy's frame: a tumor wins over the organ, a later tumor over
+    an earlier one."""
+    labels = np.zeros(len(points_mm), np.uint8)
+    for label, part in enumerate(anatomy.parts, start=1):
+        labels[contains(part, points_mm)] = label
+    return labels
+
+
+def surface_distance(mesh: Mesh, points_mm: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
+    """Distance to the surface in mm, by the nearest of dense surface points (within 0.1 mm or
+    so at a distance: it orders points and thins a wall, it is no metric)."""
+    from scipy.spatial import cKDTree
+
+    corners = mesh.vertices_mm[mesh.faces]
+    weights = [(1, 1, 1), (4, 1, 1), (1, 4, 1), (1, 1, 4), (1, 1, 0), (0, 1, 1), (1, 0, 1)]
+    dense = [np.einsum("fkx,k->fx", corners, np.array(w) / sum(w)) for w in weights]
+    distance, _ = cKDTree(np.concatenate([mesh.vertices_mm, *dense])).query(points_mm, workers=-1)
+    return distance.astype(np.float32)

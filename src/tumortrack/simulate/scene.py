@@ -1,0 +1,160 @@
+"""One scene from a recipe: pose, deformation, depth image, cloud, labelled points.
+
+A recipe is (seed, stream, index); with the case and the configuration it replays bit for bit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float, Float64
+
+from tumortrack.core.config import Config
+from tumortrack.core.errors import NoEstimate, TumortrackError
+from tumortrack.core.geometry import transform_points
+from tumortrack.core.types import (
+    Anatomy,
+    DepthFrame,
+    Intrinsics,
+    OccupancySamples,
+    SensorCloud,
+)
+from tumortrack.sense.camera import d405, project
+from tumortrack.sense.cloud import CloudConfig, cloud_from_depth
+from tumortrack.sense.noise import NoiseConfig, add_noise
+from tumortrack.sense.render import Visibility, render_depth
+from tumortrack.simulate.deform import DeformConfig, DragConfig
+from tumortrack.simulate.deform.base import Deformation, View
+from tumortrack.simulate.occupancy import OccupancyConfig, OccupancyPool
+from tumortrack.simulate.pose import PoseConfig, sample_pose
+
+STREAMS = ("train", "validation", "test")
+
+
+class SceneConfig(Config):
+    """How scenes are made.
+
+    A share ``free_range`` of them is seen from any distance and not cropped by depth: a cloud
+    that a user has freed of its background himself. The others follow the paper: near 15 cm,
+    cropped to 11..15 cm.
+    """
+
+    width: int = 424
+    height: int = 240
+    pose: PoseConfig = PoseConfig()
+    deform: tuple[DeformConfig, ...] = (DragConfig(),)  # each scene takes one, with equal chance
+    noise: NoiseConfig = NoiseConfig()
+    cloud: CloudConfig = CloudConfig()
+    occupancy: OccupancyConfig = OccupancyConfig()
+    free_range: float = 0.0
+    free_nearest_mm: tuple[float, float] = (80.0, 250.0)
+
+
+@dataclass(frozen=True)
+class SceneRecipe:
+    """Names one random scene: streams of the same seed never share a scene."""
+
+    seed: int
+    stream: Literal["train", "validation", "test"]
+    index: int
+
+    def generator(self, attempt: int) -> np.random.Generator:
+        return np.random.default_rng([self.seed, STREAMS.index(self.stream), self.index, attempt])
+
+
+@dataclass(frozen=True, eq=False)
+class Pair:
+    """What training needs of a scene."""
+
+    recipe: SceneRecipe
+    cloud: SensorCloud
+    samples: OccupancySamples
+
+
+@dataclass(frozen=True, eq=False)
+class Stage:
+    """A scene before points are asked for: what lies where, and what the camera gets of it."""
+
+    camera_from_ct: Float64[np.ndarray, "4 4"]
+    deformation: Deformation
+    frame: DepthFrame
+    cloud: SensorCloud
+
+    def carry(self, points_ct: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+        """Points of the undeformed CT frame at their place before the camera."""
+        return transform_points(self.camera_from_ct, self.deformation.apply(points_ct))
+
+
+class Simulator:
+    """Makes the scenes of one anatomy (CT frame, LPS mm)."""
+
+    def __init__(
+        self, anatomy_ct: Anatomy, up_lps: tuple[float, float, float], config: SceneConfig
+    ) -> None:
+        self.anatomy_ct = anatomy_ct
+        self.config = config
+        self._up_lps = up_lps
+        self._intrinsics = d405(config.width, config.height)
+        self._visibility = Visibility(anatomy_ct.organ)
+
+    def pair(self, recipe: SceneRecipe, pool: OccupancyPool) -> Pair:
+        """The scene's cloud and its labelled points, camera frame."""
+        stage, rng = self._stage(recipe)
+        points_ct, labels = pool.draw(rng)
+        return Pair(recipe, stage.cloud, OccupancySamples(stage.carry(points_ct), labels))
+
+    def stage(self, recipe: SceneRecipe) -> Stage:
+        """Pose, deformation, depth image and cloud of a recipe."""
+        return self._stage(recipe)[0]
+
+    def reference(self, stage: Stage) -> Anatomy:
+        """The anatomy as it lies in the scene, camera frame."""
+        return Anatomy(
+            tuple(part.moved(stage.carry(part.vertices_mm)) for part in self.anatomy_ct.parts)
+        )
+
+    def _stage(self, recipe: SceneRecipe) -> tuple[Stage, np.random.Generator]:
+        for attempt in range(20):
+            rng = recipe.generator(attempt)
+            try:
+                return self._attempt(rng), rng
+            except NoEstimate:  # the crop left too few points: another draw of the same recipe
+                continue
+        raise TumortrackError(
+            f"{recipe}: no pose in 20 shows enough of the organ; check the camera's range and the "
+            "distances in the scene configuration."
+        )
+
+    def _attempt(self, rng: np.random.Generator) -> Stage:
+        config, organ = self.config, self.anatomy_ct.organ
+        free = bool(rng.uniform() < config.free_range)
+        nearest = config.free_nearest_mm if free else config.pose.nearest_mm
+        camera_from_ct = sample_pose(config.pose, organ, self._up_lps, nearest, rng)
+        model = config.deform[rng.integers(len(config.deform))]
+        view = View(
+            self.anatomy_ct, _visible_from(self._visibility, self._intrinsics, camera_from_ct)
+        )
+        deformation = model.sample(view, rng)
+        vertices = transform_points(camera_from_ct, deformation.apply(organ.vertices_mm))
+        frame = add_noise(render_depth(vertices, organ.faces, self._intrinsics), config.noise, rng)
+        crop = config.cloud
+        if free:
+            crop = CloudConfig(near_mm=1.0, far_mm=1e4, n_points=crop.n_points)
+        return Stage(camera_from_ct, deformation, frame, cloud_from_depth(frame, crop, rng))
+
+
+def _visible_from(
+    visibility: Visibility, intrinsics: Intrinsics, camera_from_ct: Float64[np.ndarray, "4 4"]
+) -> Callable[[np.ndarray], np.ndarray]:
+    eye_ct = np.linalg.inv(camera_from_ct)[:3, 3]
+
+    def visible(points_ct: np.ndarray) -> np.ndarray:
+        pixels, depth = project(transform_points(camera_from_ct, points_ct), intrinsics)
+        size = np.array([intrinsics.width, intrinsics.height])
+        pictured = ((pixels > -0.5) & (pixels < size - 0.5)).all(1) & (depth > 0)
+        return pictured & visibility(points_ct, eye_ct)
+
+    return visible
