@@ -1,0 +1,169 @@
+"""One scene on disk: what the sensor saw and the truth, in files that other programs can make.
+
+cloud.ply (camera frame, mm), depth.png (16 bit, steps of 0.1 mm) with intrinsics.json, kidney.ply,
+tumor_1.ply, ... (the truth, camera frame, mm) and meta.json. Depth and meta.json may be absent.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tumortrack.core.errors import InputError
+from tumortrack.core.mesh_files import read_anatomy, write_anatomy
+from tumortrack.core.store import new_folder, read_json, write_json
+from tumortrack.core.types import Anatomy, DepthFrame, Mesh, SensorCloud
+from tumortrack.sense.files import (
+    read_cloud,
+    read_depth_png,
+    write_cloud_ply,
+    write_depth_png,
+    write_intrinsics,
+)
+
+# Our own scenes say in meta.json that kidney.ply is the whole organ, tumors included.
+_UNITED = "organ_includes_tumors"
+_STAMP = "stamp_ns"
+# Of a tumor's volume: smoothing alone lets a surface stick out by less than this.
+_STICKS_OUT = 0.02
+_ORGAN_SIZE_MM = (5.0, 1000.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """An observed cloud and the truth behind it, camera frame, mm.
+
+    ``reference.parts[0]`` is the whole organ, tumors included. ``depth`` is the image that the
+    cloud was taken from, where it is known; ``meta`` is plain JSON (recipe, origin, ...).
+    """
+
+    cloud: SensorCloud
+    reference: Anatomy
+    depth: DepthFrame | None = None
+    meta: dict = field(default_factory=dict)
+
+
+def write_scene(folder: Path, scene: Scene) -> None:
+    """Write a scene folder, all or nothing.
+
+    Raises:
+        InputError: the folder exists already.
+        StorageError: the disk refused.
+    """
+    with new_folder(folder) as aside:
+        write_cloud_ply(aside / "cloud.ply", scene.cloud.points_mm)
+        if scene.depth is not None:
+            write_depth_png(aside / "depth.png", scene.depth)
+            write_intrinsics(aside / "intrinsics.json", scene.depth.intrinsics)
+        write_anatomy(aside, scene.reference)
+        meta = {**scene.meta, "units": "mm", "frame": "camera", _STAMP: scene.cloud.stamp_ns}
+        write_json(aside / "meta.json", {**meta, _UNITED: True})
+
+
+def read_scene(folder: Path) -> Scene:
+    """Read a scene, ours or another program's.
+
+    Unless meta.json says that the kidney includes the tumors, a tumor that sticks out of
+    kidney.ply by more than 2 % of its volume is united with it.
+
+    Raises:
+        InputError: no such folder, no cloud or kidney, a file that cannot be read, surfaces that
+            are open or not in mm.
+    """
+    if not folder.is_dir():
+        raise InputError(f"{folder} is no scene folder (it does not exist).")
+    for name in ("cloud.ply", "kidney.ply"):
+        if not (folder / name).is_file():
+            raise InputError(
+                f"{folder} is no scene: it lacks {name}. A scene holds cloud.ply, kidney.ply and "
+                "tumor_1.ply, tumor_2.ply, ... in the camera frame, in mm."
+            )
+    meta = read_json(folder / "meta.json") if (folder / "meta.json").exists() else {}
+    reference = read_anatomy(folder)
+    _check_parts(folder, reference)
+    if meta.get(_UNITED) is not True:
+        reference = _united(folder, reference)
+    stamp_ns = meta.get(_STAMP, 0)
+    if not isinstance(stamp_ns, int):
+        raise InputError(f"{folder / 'meta.json'}: {_STAMP} must be a whole number of ns.")
+    cloud, _ = read_cloud(folder / "cloud.ply")
+    return Scene(SensorCloud(cloud.points_mm, stamp_ns), reference, _depth(folder), meta)
+
+
+def list_scenes(folder: Path) -> list[Path]:
+    """The scene folders (those with a kidney.ply or cloud.ply) in a folder, by name.
+
+    Raises:
+        InputError: no such folder, or no scene in it.
+    """
+    if not folder.is_dir():
+        raise InputError(f"{folder} does not exist or is no folder.")
+    scenes = sorted(
+        path
+        for path in folder.iterdir()
+        if not path.name.startswith(".")
+        and ((path / "kidney.ply").is_file() or (path / "cloud.ply").is_file())
+    )
+    if not scenes:
+        raise InputError(
+            f"{folder} holds no scenes: none of its folders has a cloud.ply and a kidney.ply. "
+            "Make some with: tumortrack simulate CASE DATASET."
+        )
+    return scenes
+
+
+def _depth(folder: Path) -> DepthFrame | None:
+    image, camera = folder / "depth.png", folder / "intrinsics.json"
+    if not image.exists():
+        return None
+    if not camera.exists():
+        raise InputError(f"{folder} has depth.png but lacks intrinsics.json, which explains it.")
+    return read_depth_png(image, camera)
+
+
+def _check_parts(folder: Path, anatomy: Anatomy) -> None:
+    last = f"tumor_{len(anatomy.tumors)}"
+    strays = {path.stem for path in folder.glob("tumor_*.ply")} - set(anatomy.names)
+    if strays:
+        raise InputError(
+            f"{folder}: {sorted(strays)[0]}.ply does not follow {last}.ply. Number the tumors "
+            "1, 2, 3, ... without a gap."
+        )
+    low, high = _ORGAN_SIZE_MM
+    size_mm = float(np.ptp(anatomy.organ.box_mm, axis=0).max())
+    if not low <= size_mm <= high:
+        raise InputError(
+            f"{folder / 'kidney.ply'} is {size_mm:.3g} wide; an organ has {low:g} to {high:g} mm. "
+            "Scale the meshes and the cloud to mm."
+        )
+
+
+def _united(folder: Path, anatomy: Anatomy) -> Anatomy:
+    """The same anatomy with every tumor that sticks out made part of the organ's surface."""
+    organ = _solid(folder / "kidney.ply", anatomy.organ)
+    sticks_out = False
+    for name, mesh in zip(anatomy.names[1:], anatomy.tumors, strict=True):
+        tumor = _solid(folder / f"{name}.ply", mesh)
+        joined = organ + tumor
+        if joined.volume() - organ.volume() > _STICKS_OUT * tumor.volume():
+            organ, sticks_out = joined, True
+    if not sticks_out:
+        return anatomy
+    out = organ.to_mesh64()
+    return Anatomy((Mesh(out.vert_properties[:, :3], out.tri_verts), *anatomy.tumors))
+
+
+def _solid(path: Path, mesh: Mesh) -> Any:
+    import manifold3d
+
+    raw = manifold3d.Mesh64(mesh.vertices_mm.copy(), mesh.faces.astype(np.uint64))
+    solid = manifold3d.Manifold(raw)
+    if solid.status() != manifold3d.Error.NoError or solid.volume() <= 0:
+        raise InputError(
+            f"{path} is not a closed surface with faces turned outward "
+            f"({solid.status().name}). Repair the mesh and try again."
+        )
+    return solid
