@@ -1,0 +1,7 @@
+"""Encoders: normalised points (B, N, 3) -> latent (B, L). One file per kind, one name here."""
+
+from tumortrack.learn.encoders.pointnet2 import PointNet2Config
+
+EncoderConfig = PointNet2Config  # a second kind: ``PointNet2Config | OtherConfig``
+
+__all__ = ["EncoderConfig"]

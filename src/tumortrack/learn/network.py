@@ -1,0 +1,154 @@
+"""The occupancy network: encode a cloud once, query many points.
+
+Both in the camera frame and in mm; inside, everything is relative to a centre taken from the
+cloud, so that nothing depends on where the camera is.
+"""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import dataclass
+
+from torch import Tensor, nn
+
+from tumortrack.core.config import Config
+from tumortrack.core.errors import InputError
+from tumortrack.learn.decoders import DecoderConfig
+from tumortrack.learn.decoders.mlp import MlpDecoderConfig
+from tumortrack.learn.encoders import EncoderConfig
+from tumortrack.learn.encoders.pointnet2 import PointNet2Config, SetAbstraction
+from tumortrack.learn.layers import Layer
+
+
+class CloudBox(Config, frozen=True, tag="cloud-box"):
+    """Centre and half the longest side of the observed cloud's bounding box (the follow-up's)."""
+
+
+class FixedScale(Config, frozen=True, tag="fixed"):
+    """Centre: the mean of the points; scale: a constant, so that size is not lost.
+
+    The mean and not the box's centre: one stray point moves it by 1 / N of its distance, the
+    box by half.
+    """
+
+    scale_mm: float
+
+    def __post_init__(self) -> None:
+        if not 0 < self.scale_mm < float("inf"):
+            raise InputError(f"scale_mm must be a positive length, not {self.scale_mm}.")
+
+
+class NetworkConfig(Config, frozen=True):
+    encoder: EncoderConfig
+    decoder: DecoderConfig
+    normalisation: CloudBox | FixedScale
+
+    def build(self) -> OccupancyNetwork:
+        """The network, with weights from torch's global generator (``torch.manual_seed``)."""
+        return OccupancyNetwork(self)
+
+
+@dataclass(frozen=True, eq=False)
+class Latent:
+    """What is known of B clouds; valid only for the weights (and the mode) that made it."""
+
+    vector: Tensor  # (B, L)
+    centre_mm: Tensor  # (B, 1, 3), camera frame
+    scale_mm: Tensor  # (B, 1, 1)
+    terms: tuple[Tensor, ...]  # the decoder's share, computed once per cloud
+
+
+class OccupancyNetwork(nn.Module):
+    """Labels of query points from one cloud (the paper, section "Localization")."""
+
+    def __init__(self, config: NetworkConfig) -> None:
+        super().__init__()
+        self.config = config
+        self.encoder = config.encoder.build()
+        self.decoder = config.decoder.build(config.encoder.latent_size)
+
+    def encode(self, points_mm: Tensor) -> Latent:
+        """Clouds (B, N, 3), camera frame, mm, float32, points in random order -> Latent."""
+        centre_mm, scale_mm = normalisation(points_mm, self.config.normalisation)
+        vector = self.encoder((points_mm - centre_mm) / scale_mm)
+        return Latent(vector, centre_mm, scale_mm, self.decoder.prepare(vector))
+
+    def query(self, latent: Latent, queries_mm: Tensor) -> Tensor:
+        """Queries (B, Q, 3), camera frame, mm, float32 -> logits (B, Q, classes)."""
+        logits: Tensor = self.decoder(
+            latent.terms, (queries_mm - latent.centre_mm) / latent.scale_mm
+        )
+        return logits
+
+    def forward(self, points_mm: Tensor, queries_mm: Tensor) -> Tensor:
+        """Both at once: (B, N, 3) and (B, Q, 3) -> logits (B, Q, classes)."""
+        return self.query(self.encode(points_mm), queries_mm)
+
+    def folded(self) -> OccupancyNetwork:
+        """A copy for inference: batch norms folded into their linear layers, no gradients."""
+        out = copy.deepcopy(self).eval().requires_grad_(False)
+        for module in out.modules():
+            if isinstance(module, Layer):
+                module.fold()
+        return out
+
+
+def normalisation(points_mm: Tensor, kind: CloudBox | FixedScale) -> tuple[Tensor, Tensor]:
+    """Centre (B, 1, 3) and scale (B, 1, 1), both mm, of clouds (B, N, 3)."""
+    if isinstance(kind, FixedScale):
+        centre_mm = points_mm.mean(dim=1, keepdim=True)
+        return centre_mm, points_mm.new_full((len(points_mm), 1, 1), kind.scale_mm)
+    low = points_mm.amin(dim=1, keepdim=True)
+    high = points_mm.amax(dim=1, keepdim=True)
+    return (low + high) / 2, ((high - low) / 2).amax(dim=2, keepdim=True).clamp_min(1e-6)
+
+
+def paper_network(n_classes: int) -> NetworkConfig:
+    """The paper's network.
+
+    From the paper: PointNet++ to a 1024-d latent; 8 hidden layers x 512, ReLU, a skip into the
+    fifth, batch norm on "the skip and the final layer": read as the fifth and the last hidden
+    layer. From the follow-up (LUDO, IEEE T-RO 2025), where the paper is silent: the levels'
+    ratios, radii, neighbours and widths, and the cloud's bounding box as normalisation. From
+    PointNet++: batch norm in the encoder. Ours: raw query coordinates (the follow-up adds
+    octaves; the paper names none) and He's start of the weights.
+    """
+    return NetworkConfig(
+        encoder=PointNet2Config(
+            levels=(
+                SetAbstraction(ratio=0.5, radius=0.2, neighbours=64, widths=(64, 64, 128)),
+                SetAbstraction(ratio=0.25, radius=0.4, neighbours=64, widths=(128, 128, 256)),
+            ),
+            widths=(256, 512, 1024),
+        ),
+        decoder=MlpDecoderConfig(
+            n_classes=n_classes, width=512, hidden_layers=8, skip_layer=5, norm_layers=(5, 8)
+        ),
+        normalisation=CloudBox(),
+    )
+
+
+def quick_network(n_classes: int, scale_mm: float) -> NetworkConfig:
+    """A slim network of the same family, for minutes of training on a CPU.
+
+    All numbers are ours, chosen for speed on one core: 256-d latent and 5 x 128 decoder as in
+    our prototype; no batch norm, whose running statistics make short runs' validation erratic;
+    strided choice, since the sensor's points come in random order. ``scale_mm``: about half the
+    organ's longest side.
+    """
+    return NetworkConfig(
+        encoder=PointNet2Config(
+            levels=(
+                SetAbstraction(ratio=0.25, radius=0.25, neighbours=16, widths=(32, 64)),
+                SetAbstraction(ratio=0.25, radius=0.6, neighbours=16, widths=(64, 128)),
+            ),
+            widths=(128, 256),
+            norm="none",
+            sampling="strided",
+            n_points=512,
+        ),
+        decoder=MlpDecoderConfig(
+            n_classes=n_classes, width=128, hidden_layers=5, skip_layer=3, octaves=(0, 1, 2)
+        ),
+        normalisation=FixedScale(scale_mm=scale_mm),
+    )
