@@ -9,6 +9,7 @@ mirror image of it can pass for the phantom itself. Sizes follow the hydrogel ph
 
 from __future__ import annotations
 
+import itertools
 from typing import Literal
 
 import numpy as np
@@ -18,16 +19,16 @@ from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError
 from tumortrack.core.types import FIRST_TUMOR, ORGAN, LabelVolume
 
-_SMALLEST_GAP_MM = 3.0  # between tumors: closer ones merge in a CT's partial-volume rim
+SMALLEST_GAP_MM = 3.0  # between tumors: closer ones merge in a CT's partial-volume rim
 
 
-class TumorParameters(Config):
+class TumorParameters(Config, frozen=True):
     """A lobulated ball. Opposite surface points lie ``diameter_mm`` apart in every direction."""
 
     diameter_mm: float
     center_mm: tuple[float, float, float]
     """Organ frame (medial is +x for a right kidney; a left one is mirrored with its tumors)."""
-    lobulation: float = 0.06
+    lobulation: float = 0.08
     """Largest deviation from a ball, as a share of the radius."""
 
     def __post_init__(self) -> None:
@@ -38,17 +39,17 @@ class TumorParameters(Config):
             )
 
 
-class PhantomParameters(Config):
+class PhantomParameters(Config, frozen=True):
     """Everything the phantom's shape depends on; the defaults are the paper's phantom."""
 
     size_mm: tuple[float, float, float] = (60.0, 50.0, 110.0)
     """The organ's box without tumors: left-right, anterior-posterior, superior-inferior."""
-    bend_mm: float = 9.0
+    bend_mm: float = 12.0
     """How far the poles lean medially."""
     taper: float = 0.10
     """How much thicker the superior pole is, and thinner the inferior one."""
     hilum_depth_mm: float = 15.0
-    lump_mm: float = 0.7
+    lump_mm: float = 1.2
     shape_seed: int = 1
     """Places the lumps of the organ and the lobes of the tumors."""
     tumors: tuple[TumorParameters, ...] = (
@@ -68,13 +69,20 @@ class PhantomParameters(Config):
                 f"phantom shape (bend, hilum depth, lumps in mm, taper in %) {shape}: allowed "
                 f"are 0 to {bounds}."
             )
+        for one, other in itertools.combinations(self.tumors, 2):
+            if gap_mm(one, other) < SMALLEST_GAP_MM:
+                raise InputError(
+                    f"the tumors of {one.diameter_mm} and {other.diameter_mm} mm may come within "
+                    f"{gap_mm(one, other):.1f} mm of one another; place them "
+                    f"{SMALLEST_GAP_MM} mm or more apart."
+                )
 
 
 def second_phantom() -> PhantomParameters:
     """Another kidney: three tumors, the deep one in the lower pole, one on the lateral rim."""
     return PhantomParameters(
         size_mm=(56.0, 47.0, 104.0),
-        bend_mm=7.0,
+        bend_mm=9.0,
         taper=0.04,
         hilum_depth_mm=13.0,
         shape_seed=7,
@@ -93,7 +101,7 @@ def phantom_labels(parameters: PhantomParameters, voxel_mm: float = 0.8) -> Labe
     over the organ.
 
     Raises:
-        InputError: ``voxel_mm`` outside 0.2..4, or tumors closer than 3 mm to one another.
+        InputError: ``voxel_mm`` outside 0.2..4, or a tumor wholly outside the organ.
     """
     if not 0.2 <= voxel_mm <= 4:
         raise InputError(f"voxel size {voxel_mm} mm: allowed are 0.2 to 4 mm.")
@@ -109,8 +117,11 @@ def phantom_labels(parameters: PhantomParameters, voxel_mm: float = 0.8) -> Labe
     inside = organ_mask(parameters, axes)
     labels = np.where(inside, ORGAN, 0).astype(np.uint8)
     for n, mask in enumerate(tumor_masks(parameters, axes)):
+        if not (mask & inside).any():
+            raise InputError(
+                f"tumor {n + 1} lies wholly outside the organ; move its center_mm inwards."
+            )
         labels[mask] = FIRST_TUMOR + n
-    _refuse_touching(parameters)
 
     lps_from_index = np.diag([voxel_mm, voxel_mm, voxel_mm, 1.0])
     lps_from_index[:3, 3] = np.array(parameters.center_lps_mm) + start_mm
@@ -125,26 +136,17 @@ def sorted_tumors(parameters: PhantomParameters) -> list[TumorParameters]:
     return sorted(parameters.tumors, key=lambda tumor: -tumor.diameter_mm)
 
 
-def _refuse_touching(parameters: PhantomParameters) -> None:
-    tumors = sorted_tumors(parameters)
-    for n, one in enumerate(tumors):
-        for other in tumors[n + 1 :]:
-            apart_mm = np.linalg.norm(np.subtract(one.center_mm, other.center_mm))
-            radii_mm = [t.diameter_mm / 2 * (1 + t.lobulation) for t in (one, other)]
-            gap_mm = float(apart_mm - sum(radii_mm))
-            if gap_mm < _SMALLEST_GAP_MM:
-                raise InputError(
-                    f"the tumors of {one.diameter_mm} and {other.diameter_mm} mm may come within "
-                    f"{gap_mm:.1f} mm of one another; place them {_SMALLEST_GAP_MM} mm or more "
-                    "apart."
-                )
+def gap_mm(one: TumorParameters, other: TumorParameters) -> float:
+    """A lower bound of the distance between two tumors' surfaces."""
+    radii_mm = [tumor.diameter_mm / 2 * (1 + tumor.lobulation) for tumor in (one, other)]
+    return float(np.linalg.norm(np.subtract(one.center_mm, other.center_mm)) - sum(radii_mm))
 
 
 def organ_mask(
     parameters: PhantomParameters, axes_mm: list[Float[np.ndarray, " n"]]
 ) -> Bool[np.ndarray, "i j k"]:
     """Where the organ is, tumors aside, on the grid of three axes (organ frame, mm)."""
-    raw = [np.linspace(-r, r, 97) for r in 0.75 * np.array(parameters.size_mm)]
+    raw = [np.linspace(-r, r, 65) for r in 0.75 * np.array(parameters.size_mm)]
     field = _organ_field(parameters, raw)
     stretched = []
     # Bending, hilum and lumps change the box: stretch each axis so that it has the stated size.
@@ -182,11 +184,11 @@ def _organ_field(
         ((x - spine_mm) / thickness, (y + 1.5 * along) / thickness, z), (rx, ry, rz), power=2.3
     )
     # The renal sinus: a slot that enters from the medial side, a little from the front.
-    turn = np.deg2rad(20.0)
-    u = (x - rx - 2) * np.cos(turn) - (y + 5) * np.sin(turn)
-    v = (x - rx - 2) * np.sin(turn) + (y + 5) * np.cos(turn)
-    slot = _ellipsoid((u, v, z + 4), (parameters.hilum_depth_mm + 4, 8.0, 0.3 * rz), power=2.0)
-    carved = _smooth_max(body, -slot, 5.0)
+    turn = np.deg2rad(32.0)
+    u = (x - rx - 2) * np.cos(turn) - (y + 8) * np.sin(turn)
+    v = (x - rx - 2) * np.sin(turn) + (y + 8) * np.cos(turn)
+    slot = _ellipsoid((u, v, z + 4), (parameters.hilum_depth_mm + 4, 9.0, 0.33 * rz), power=2.0)
+    carved = _smooth_max(body, -slot, 7.0)
     return carved + _lumps(parameters, (x, y, z))
 
 

@@ -19,7 +19,7 @@ _LOWEST_HU, _HIGHEST_HU = -1024, 3071  # the 12 bits of a clinical scanner
 _LARGEST_SCAN = 400_000_000  # voxels
 
 
-class ScannerParameters(Config):
+class ScannerParameters(Config, frozen=True):
     """Materials, objects beside the phantom, and the scanner's resolution and noise.
 
     Where the HU come from. Organ: 10 % PVA hydrogel attenuates as soft tissue does (Price et al.
