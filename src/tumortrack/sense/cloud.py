@@ -12,7 +12,7 @@ from tumortrack.sense.camera import deproject_pixels
 FEWEST_POINTS = 200  # fewer say too little about an organ's shape and pose
 
 
-class CloudConfig(Config):
+class CloudConfig(Config, frozen=True, kw_only=True):
     """What of a depth image becomes the cloud: depths strictly between near and far (mm).
 
     The defaults are the paper's: (11 cm, 15 cm) from the camera and 1000 points.

@@ -21,7 +21,7 @@ from tumortrack.core.types import DepthFrame
 REFERENCE_MM = 150.0  # the distance at which ``axial_mm`` is stated
 
 
-class NoiseConfig(Config):
+class NoiseConfig(Config, frozen=True, kw_only=True):
     """Strength of each part; zero switches it off.
 
     axial_mm: standard deviation at 150 mm; grows with z^2.
@@ -125,18 +125,18 @@ def _err_everywhere(out_mm: np.ndarray, config: NoiseConfig, seed: int) -> None:
 
     from tumortrack.sense import noise_kernels as kernels
 
-    shape = out_mm.shape
+    height, width = out_mm.shape
     if config.distortion_mm:
         rng = np.random.default_rng((seed, 1))
-        out_mm += kernels.slow_field(shape, config.distortion_mm * rng.random(), rng)
+        out_mm += kernels.slow_field((height, width), config.distortion_mm * rng.random(), rng)
     if config.axial_mm:
         relative = config.axial_mm / REFERENCE_MM**2
-        grid = kernels.normal_grid(*shape, config.correlation_px, seed + 3)
+        grid = kernels.normal_grid(height, width, config.correlation_px, seed + 3)
         kernels.jitter(
             out_mm, seed + 4, relative, config.correlated_share, grid, config.correlation_px
         )
     if config.hole_share:
-        grid = kernels.normal_grid(*shape, config.hole_px, seed + 5)
+        grid = kernels.normal_grid(height, width, config.hole_px, seed + 5)
         kernels.lose_blobs(out_mm, ndtri(config.hole_share), grid, config.hole_px)
 
 

@@ -15,13 +15,13 @@ from scipy.special import ndtri
 
 from tumortrack.core.types import Intrinsics
 
-# Quantiles of the normal distribution: a hash's low 12 bits choose one. Scaled to variance 1.
-_QUANTILES = ndtri((np.arange(4096) + 0.5) / 4096)
+# Quantiles of the normal distribution: a hash's low 14 bits choose one. Scaled to variance 1.
+_QUANTILES = ndtri((np.arange(2**14) + 0.5) / 2**14)
 _QUANTILES = (_QUANTILES / _QUANTILES.std()).astype(np.float32)
 _GOLDEN = np.uint64(0x9E3779B97F4A7C15)
 _MIX_1, _MIX_2 = np.uint64(0xBF58476D1CE4E5B9), np.uint64(0x94D049BB133111EB)
 _S27, _S30, _S31, _S32 = (np.uint64(s) for s in (27, 30, 31, 32))
-_LOW_12, _LOW_32 = np.uint64(0xFFF), np.uint64(0xFFFFFFFF)
+_LOW_14, _LOW_32 = np.uint64(0x3FFF), np.uint64(0xFFFFFFFF)
 _TO_UNIT = 2.0**-32
 
 _jit = numba.njit(cache=True, nogil=True, fastmath={"contract"})
@@ -99,7 +99,7 @@ def normal_grid(height, width, step, key):  # type: ignore[no-untyped-def]
     grid = np.empty((rows, columns), np.float32)
     for i in range(rows):
         for j in range(columns):
-            grid[i, j] = _QUANTILES[_bits(key, i * columns + j) & _LOW_12]
+            grid[i, j] = _QUANTILES[_bits(key, i * columns + j) & _LOW_14]
     return grid
 
 
@@ -139,7 +139,7 @@ def jitter(out_mm, key, relative, correlated_share, grid, step):  # type: ignore
         for u in range(width):
             z = out_mm[v, u]
             if not math.isnan(z):
-                own = _QUANTILES[_bits(key, v * width + u) & _LOW_12]
+                own = _QUANTILES[_bits(key, v * width + u) & _LOW_14]
                 noise = own_weight * own + common_weight * smooth[u]
                 out_mm[v, u] = z + np.float32(relative) * z * z * noise
 

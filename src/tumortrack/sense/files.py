@@ -1,0 +1,215 @@
+"""Clouds, depth images and intrinsics from and to files. Every failure is an InputError.
+
+Millimetres inside: metres are converted here, at the edge. Sizes claimed by a header are held
+against the file and a limit before anything is allocated; nothing here loads pickles.
+"""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from tumortrack.core.errors import InputError
+from tumortrack.core.store import read_json, write_atomically, write_json
+from tumortrack.core.types import DepthFrame, Intrinsics, SensorCloud
+from tumortrack.sense.npz import parse_npz_points
+from tumortrack.sense.pcd import parse_pcd_points
+from tumortrack.sense.ply import parse_ply_points, write_cloud_ply
+
+__all__ = [
+    "read_cloud",
+    "read_depth_png",
+    "read_intrinsics",
+    "write_cloud_ply",
+    "write_depth_png",
+    "write_intrinsics",
+]
+
+CLOUD_SUFFIXES = (".ply", ".pcd", ".npz")
+DEPTH_UNIT_MM = 0.1  # the D405's default
+LARGEST_FILE = 256 * 2**20  # bytes, also of what a compressed file unpacks to
+_DISTORTION_KEYS = (
+    *("coeffs", "distortion", "distortion_coefficients", "dist_coeffs", "D"),
+    *("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2"),
+)
+
+
+def read_cloud(path: Path, unit: Literal["mm", "m"] = "mm") -> tuple[SensorCloud, tuple[str, ...]]:
+    """A cloud in the camera frame from .ply, .pcd (all three encodings) or .npz, and notes.
+
+    An .npz holds ``points_mm``, or ``points``, or one array (n, 3) of any name. Points that
+    stand for "no return" (NaN, infinite, or exactly 0, 0, 0, as RealSense and organised clouds
+    have them) are dropped, and a note says how many. Whether the rest can be an organ in mm is
+    ``cloud.check_cloud``'s question.
+
+    Raises:
+        InputError: missing, too large, damaged, of another kind, or without any point.
+    """
+    raw = _raw_points(path, unit)
+    with np.errstate(over="ignore"):  # beyond float32 becomes infinite, and is dropped
+        points_mm = (raw * (1000.0 if unit == "m" else 1.0)).astype(np.float32)
+    kept = points_mm[np.isfinite(points_mm).all(axis=1) & (points_mm != 0).any(axis=1)]
+    dropped = len(points_mm) - len(kept)
+    if len(kept) == 0:
+        raise InputError(f"{path} holds no point with a return ({dropped} without).")
+    if not dropped:
+        return SensorCloud(kept), ()
+    note = f"dropped {dropped} of {len(points_mm)} points without return (NaN or 0, 0, 0)"
+    return SensorCloud(kept), (note,)
+
+
+def _raw_points(path: Path, unit: str) -> np.ndarray:
+    suffix = path.suffix.lower()
+    if suffix not in CLOUD_SUFFIXES:
+        raise InputError(f"{path}: unknown cloud type. Allowed: {', '.join(CLOUD_SUFFIXES)}.")
+    if unit not in ("mm", "m"):
+        raise InputError(f"unit {unit!r} is not understood. Allowed: mm, m.")
+    content = _read_bytes(path)
+    if suffix == ".ply":
+        return parse_ply_points(content, str(path))
+    if suffix == ".pcd":
+        return parse_pcd_points(content, str(path), LARGEST_FILE)
+    points, key = parse_npz_points(content, str(path), LARGEST_FILE)
+    if unit == "m" and key == "points_mm":
+        raise InputError(f"{path}: 'points_mm' is in mm by its name; leave out --unit m.")
+    return points
+
+
+def _read_bytes(path: Path) -> bytes:
+    if not path.is_file():
+        raise InputError(f"{path} does not exist or is no file.")
+    try:
+        with path.open("rb") as stream:
+            content = stream.read(LARGEST_FILE + 1)
+    except OSError as error:
+        raise InputError(f"{path} cannot be read: {error.strerror}.") from error
+    if len(content) > LARGEST_FILE:
+        raise InputError(f"{path} is larger than 256 MiB; thin it first.")
+    return content
+
+
+def read_intrinsics(path: Path) -> Intrinsics:
+    """A pinhole camera from JSON: width, height, fx, fy, cx (or ppx), cy (or ppy), in pixels.
+
+    Raises:
+        InputError: missing, not JSON, a key missing or no number, or lens distortion.
+    """
+    return _intrinsics(_read_camera_json(path), path)
+
+
+def _read_camera_json(path: Path) -> dict:
+    try:
+        return read_json(path)
+    except (ValueError, RecursionError) as error:  # numbers of thousands of digits, deep nesting
+        raise InputError(f"{path} cannot be read as JSON: {error}.") from error
+
+
+def _intrinsics(data: dict, path: Path) -> Intrinsics:
+    for key in _DISTORTION_KEYS:
+        if np.any(np.array(_numbers(data.get(key, 0), key, path)) != 0):
+            raise InputError(
+                f"{path}: {key!r} states lens distortion, which depth images here must not have. "
+                "Give the rectified depth stream (a D405's is) and its intrinsics."
+            )
+    values = {}
+    for key, other in {
+        "width": "",
+        "height": "",
+        "fx": "",
+        "fy": "",
+        "cx": "ppx",
+        "cy": "ppy",
+    }.items():
+        found = data.get(key, data.get(other))
+        if found is None or isinstance(found, list):
+            needed = "width, height, fx, fy, cx (or ppx), cy (or ppy)"
+            raise InputError(f"{path} lacks the number {key!r}; it must have {needed}, in pixels.")
+        values[key] = _numbers(found, key, path)[0]
+    for key in ("width", "height"):
+        if not values[key].is_integer():
+            raise InputError(f"{path}: {key} is {values[key]}; it must be a whole number.")
+    width, height = int(values.pop("width")), int(values.pop("height"))
+    return Intrinsics(width, height, **values)
+
+
+def _numbers(value: object, key: str, path: Path) -> list[float]:
+    """One number or a list of numbers as finite floats."""
+    try:
+        numbers = [float(v) for v in (value if isinstance(value, list) else [value])]  # type: ignore
+    except (TypeError, ValueError, OverflowError):
+        numbers = [np.nan]
+    if not np.isfinite(numbers).all():
+        raise InputError(f"{path}: {key!r} is {str(value)[:60]}; it must be a finite number.")
+    return numbers
+
+
+def write_intrinsics(
+    path: Path, intrinsics: Intrinsics, depth_unit_mm: float = DEPTH_UNIT_MM
+) -> None:
+    """intrinsics.json beside a depth.png: the pinhole and what one step of depth means.
+
+    Raises:
+        StorageError: the disk refused.
+    """
+    names = ("width", "height", "fx", "fy", "cx", "cy")
+    values = {name: getattr(intrinsics, name) for name in names}
+    write_json(path, {**values, "depth_unit_mm": depth_unit_mm})
+
+
+def read_depth_png(
+    path: Path, intrinsics_path: Path, depth_unit_mm: float | None = None
+) -> DepthFrame:
+    """A 16-bit depth image; 0 is no return.
+
+    One step is ``depth_unit_mm``, or what the intrinsics file says under that name, or 0.1 mm.
+
+    Raises:
+        InputError: not a single-channel 16-bit PNG, or of another size than the intrinsics.
+    """
+    from PIL import Image
+
+    data = _read_camera_json(intrinsics_path)
+    intrinsics = _intrinsics(data, intrinsics_path)
+    stated = data.get("depth_unit_mm", DEPTH_UNIT_MM) if depth_unit_mm is None else depth_unit_mm
+    unit_mm = _numbers(stated, "depth_unit_mm", intrinsics_path)[0]
+    if not 0 < unit_mm <= 100:
+        raise InputError(f"depth_unit_mm is {unit_mm}; it must lie in 0..100 mm per step.")
+    try:
+        image = Image.open(io.BytesIO(_read_bytes(path)), formats=["PNG"])
+        size, mode = image.size, image.mode  # from the header: nothing is decoded yet
+        good = size == (intrinsics.width, intrinsics.height) and mode.startswith("I")
+        steps = np.asarray(image, dtype=np.float32) if good else None
+    except InputError:
+        raise
+    except Exception as error:  # Pillow raises anything on a damaged file
+        raise InputError(f"{path} cannot be read as a PNG image: {error}.") from error
+    if steps is None:
+        raise InputError(
+            f"{path} is {size[0]} x {size[1]}, mode {mode}; it must be 16-bit grey and "
+            f"{intrinsics.width} x {intrinsics.height}, as {intrinsics_path} says."
+        )
+    return DepthFrame(np.where(steps > 0, steps * np.float32(unit_mm), np.nan), intrinsics)
+
+
+def write_depth_png(path: Path, frame: DepthFrame, depth_unit_mm: float = DEPTH_UNIT_MM) -> None:
+    """Write the depth as a 16-bit PNG in steps of ``depth_unit_mm``; NaN becomes 0.
+
+    Raises:
+        InputError: a depth that 16 bits of this unit cannot hold.
+        StorageError: the disk refused.
+    """
+    from PIL import Image
+
+    steps = np.rint(frame.depth_mm.astype(np.float64) / depth_unit_mm)
+    seen = np.isfinite(steps)
+    if not ((steps[seen] >= 1) & (steps[seen] <= 65535)).all():
+        raise InputError(
+            f"a depth lies outside {depth_unit_mm:g}..{65535 * depth_unit_mm:g} mm, which 16 bits "
+            f"of {depth_unit_mm:g} mm hold; choose a larger depth_unit_mm or crop the frame."
+        )
+    stream = io.BytesIO()
+    Image.fromarray(np.where(seen, steps, 0).astype(np.uint16)).save(stream, format="PNG")
+    write_atomically(path, stream.getvalue())

@@ -1,0 +1,129 @@
+"""Point clouds as PLY. Counts are held against the file's size before anything is allocated.
+
+Own code: readers of PLY at hand are either GPL or believe the header's counts.
+Format: Turk 1994, "The PLY Polygon File Format".
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from tumortrack.core.errors import InputError
+from tumortrack.core.store import write_atomically
+
+_TYPES = {
+    **{"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"},
+    **{"int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4"},
+    **{"float": "f4", "double": "f8", "float32": "f4", "float64": "f8"},
+}
+_NAMES = {"u1": "uchar", "i4": "int", "f4": "float", "f8": "double"}
+_ORDERS = {"ascii": "<", "binary_little_endian": "<", "binary_big_endian": ">"}
+_LONGEST_HEADER = 64 * 1024  # bytes
+
+
+def parse_ply_points(content: bytes, name: str) -> np.ndarray:
+    """The vertices' x, y, z as floats (n, 3), in the file's unit; faces are not looked at.
+
+    Raises:
+        InputError: not a PLY, fewer bytes than the header claims, no x, y, z.
+    """
+    end = content.find(b"end_header", 0, _LONGEST_HEADER)
+    start = content.find(b"\n", end) + 1
+    if not content.startswith(b"ply") or end < 0 or start == 0:
+        raise InputError(f"{name} is no PLY file (no header from 'ply' to 'end_header').")
+    lines = [line.split() for line in content[:end].decode("latin-1").splitlines()]
+    form = next((line[1] for line in lines if len(line) > 1 and line[0] == "format"), "missing")
+    if form not in _ORDERS:
+        raise InputError(f"{name}: PLY format {form!r}; allowed: {', '.join(_ORDERS)}.")
+    count, columns = _vertex_layout(lines, name)
+    if not {"x", "y", "z"} <= columns.keys():
+        raise InputError(f"{name}: its vertices have {list(columns)}, but no x, y and z.")
+    body = content[start:]
+    if form == "ascii":
+        return _ascii_points(body, count, list(columns), name)
+    dtype = np.dtype([(column, _ORDERS[form] + code) for column, code in columns.items()])
+    if count * dtype.itemsize > len(body):
+        raise InputError(_cut_off(name, count, len(body) // dtype.itemsize))
+    table = np.frombuffer(body, dtype, count)
+    return np.stack([table[axis].astype(np.float64) for axis in "xyz"], axis=1)
+
+
+def _vertex_layout(lines: list[list[str]], name: str) -> tuple[int, dict[str, str]]:
+    """Number of vertices, and each property's type code, in the file's order."""
+    count, columns, inside = -1, {}, False
+    for line in lines:
+        match line:
+            case ["element", "vertex", number] if number.isdecimal() and len(number) < 12:
+                count, inside = int(number), True
+            case ["element", *_] if count < 0:
+                raise InputError(f"{name}: the PLY's first element must be 'vertex n'.")
+            case ["element", *_]:
+                inside = False
+            case ["property", kind, column] if inside and kind in _TYPES and column not in columns:
+                columns[column] = _TYPES[kind]
+            case ["property", *_] if inside:
+                raise InputError(f"{name}: vertex property {' '.join(line)!r} is not understood.")
+    if count < 0:
+        raise InputError(f"{name}: the PLY has no vertices.")
+    return count, columns
+
+
+def _ascii_points(body: bytes, count: int, columns: list[str], name: str) -> np.ndarray:
+    if 2 * count * len(columns) > len(body) + 1:  # a digit and a blank each
+        raise InputError(_cut_off(name, count, len(body) // (2 * len(columns))))
+    words = body.split(None, count * len(columns))[: count * len(columns)]
+    if len(words) < count * len(columns):
+        raise InputError(_cut_off(name, count, len(words) // len(columns)))
+    try:
+        table = np.array(words, dtype="S32").astype(np.float64).reshape(count, len(columns))
+    except ValueError as error:
+        raise InputError(f"{name} holds something that is no number: {error}.") from error
+    return table[:, [columns.index(axis) for axis in "xyz"]]
+
+
+def _cut_off(name: str, claimed: int, held: int) -> str:
+    return (
+        f"{name} claims {claimed} points but has room for {held}; it is cut off or damaged. "
+        "Export it again."
+    )
+
+
+def write_cloud_ply(path: Path, points_mm: np.ndarray, **point_properties: np.ndarray) -> None:
+    """Write points (n, 3) as binary little-endian PLY, float32 mm, with further properties.
+
+    Each property is an array (n,) of uint8, int32, float32 or float64 (``label=``,
+    ``probability=``).
+
+    Raises:
+        InputError: a property of another length or type.
+        StorageError: the disk refused.
+    """
+    points = np.asarray(points_mm, "<f4")
+    columns = [(axis, points[:, i]) for i, axis in enumerate("xyz")]
+    for name, values in point_properties.items():
+        if values.shape != (len(points),) or values.dtype.str[1:] not in _NAMES:
+            raise InputError(
+                f"point property {name!r} is {values.dtype} {values.shape}; it must be one of "
+                f"uint8, int32, float32, float64, and one value for each of {len(points)} points."
+            )
+        columns.append((name, values))
+    codes = [values.dtype.str[1:] for _, values in columns]
+    table = np.empty(
+        len(points), [(name, "<" + code) for (name, _), code in zip(columns, codes, strict=True)]
+    )
+    for name, values in columns:
+        table[name] = values
+    header = [
+        "ply",
+        "format binary_little_endian 1.0",
+        "comment frame camera (x right, y down, z forward), unit mm",
+        f"element vertex {len(points)}",
+        *(
+            f"property {_NAMES[code]} {name}"
+            for (name, _), code in zip(columns, codes, strict=True)
+        ),
+        "end_header\n",
+    ]
+    write_atomically(path, "\n".join(header).encode() + table.tobytes())

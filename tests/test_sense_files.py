@@ -1,0 +1,373 @@
+"""Clouds, depth images and intrinsics from and to files: round trips and damaged input."""
+
+import io
+import json
+import math
+import struct
+import zipfile
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from tumortrack.core.errors import InputError
+from tumortrack.core.types import DepthFrame, Intrinsics
+from tumortrack.sense.camera import d405, deproject
+from tumortrack.sense.cloud import check_cloud
+from tumortrack.sense.files import (
+    read_cloud,
+    read_depth_png,
+    read_intrinsics,
+    write_cloud_ply,
+    write_depth_png,
+    write_intrinsics,
+)
+from tumortrack.sense.noise import NoiseConfig, add_noise
+
+SMALL = d405(424, 240)
+
+
+def pixels(camera):
+    return np.meshgrid(np.arange(camera.width), np.arange(camera.height))
+
+
+def dome(camera=SMALL, stamp_ns=7):
+    """A smooth dome 120..145 mm away that ends inside the image."""
+    u, v = pixels(camera)
+    r2 = ((u - camera.cx) / camera.fx / 0.45) ** 2 + ((v - camera.cy) / camera.fy / 0.25) ** 2
+    depth = np.where(r2 < 1, 145 - 25 * np.sqrt(np.clip(1 - r2, 0, 1)), np.nan)
+    return DepthFrame(depth, camera, stamp_ns)
+
+
+def wall(depth_mm, camera=SMALL):
+    return DepthFrame(np.full((camera.height, camera.width), depth_mm), camera)
+
+
+@pytest.fixture
+def points():
+    return deproject(dome())[::40].copy()
+
+
+def ply_bytes(points, form="binary_little_endian", before=(), dtype="<f4"):
+    kind = {"f4": "float", "f8": "double"}[dtype[1:]]
+    axes = "".join(f"property {kind} {axis}\n" for axis in "xyz")
+    header = f"ply\nformat {form} 1.0\n{''.join(before)}element vertex {len(points)}\n{axes}"
+    header += "element face 0\nproperty list uchar int vertex_indices\nend_header\n"
+    if form == "ascii":
+        body = "\n".join(" ".join(repr(float(x)) for x in p) for p in points).encode()
+    else:
+        body = points.astype(dtype).tobytes()
+    return header.encode() + body
+
+
+def pcd_bytes(points, encoding):
+    from pypcd4 import Encoding, PointCloud
+
+    stream = io.BytesIO()
+    PointCloud.from_xyzi_points(np.c_[points, np.arange(len(points))]).save(
+        stream, Encoding(encoding)
+    )
+    return stream.getvalue()
+
+
+def npz_bytes(compressed=False, **arrays):
+    stream = io.BytesIO()
+    (np.savez_compressed if compressed else np.savez)(stream, **arrays)
+    return stream.getvalue()
+
+
+def cloud_files(points):
+    """Every kind of cloud file: (suffix, content)."""
+    return {
+        "ply little": (".ply", ply_bytes(points)),
+        "ply big": (".ply", ply_bytes(points, "binary_big_endian", dtype=">f8")),
+        "ply ascii": (".ply", ply_bytes(points, "ascii", ["comment made by hand\n"])),
+        "pcd ascii": (".pcd", pcd_bytes(points, "ascii")),
+        "pcd binary": (".pcd", pcd_bytes(points, "binary")),
+        "pcd compressed": (".pcd", pcd_bytes(points, "binary_compressed")),
+        "npz": (".npz", npz_bytes(points=points, intensity=np.arange(len(points)))),
+        "npz deflated": (".npz", npz_bytes(True, anything=points.astype(float))),
+    }
+
+
+KINDS = list(cloud_files(np.zeros((1, 3), np.float32)))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_kind_of_cloud_file_gives_its_points(kind, points, tmp_path):
+    suffix, content = cloud_files(points)[kind]
+    path = tmp_path / f"cloud{suffix}"
+    path.write_bytes(content)
+    cloud, notes = read_cloud(path)
+    np.testing.assert_allclose(cloud.points_mm, points, rtol=1e-6)
+    assert notes == ()
+    in_metres, _ = read_cloud(path, unit="m")
+    np.testing.assert_allclose(in_metres.points_mm, 1000 * points, rtol=1e-6)
+
+
+def test_written_cloud_is_read_back_by_us_and_by_trimesh(points, tmp_path):
+    import trimesh
+
+    path = tmp_path / "cloud.ply"
+    labels = (np.arange(len(points)) % 3).astype(np.uint8)
+    probability = np.linspace(0, 1, len(points), dtype=np.float32)
+    write_cloud_ply(path, points, label=labels, probability=probability)
+    np.testing.assert_array_equal(read_cloud(path)[0].points_mm, points)
+    loaded = trimesh.load(path)
+    np.testing.assert_array_equal(loaded.vertices, points)
+    raw = loaded.metadata["_ply_raw"]["vertex"]["data"]
+    np.testing.assert_array_equal(raw["label"], labels)
+    np.testing.assert_array_equal(raw["probability"], probability)
+    with pytest.raises(InputError, match="label"):
+        write_cloud_ply(path, points, label=labels[:5])
+
+
+def test_cloud_written_by_trimesh_is_read(points, tmp_path):
+    import trimesh
+
+    for encoding in ("binary", "ascii"):
+        path = tmp_path / f"{encoding}.ply"
+        content = trimesh.exchange.ply.export_ply(trimesh.PointCloud(points), encoding=encoding)
+        path.write_bytes(content)
+        np.testing.assert_allclose(read_cloud(path)[0].points_mm, points, rtol=1e-6)
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "binary", "binary_compressed"])
+def test_organised_pcd_with_nans_loses_them_and_says_so(encoding, tmp_path):
+    frame = dome()
+    u, v = pixels(SMALL)
+    z = frame.depth_mm
+    grid = np.stack([(u - SMALL.cx) / SMALL.fx * z, (v - SMALL.cy) / SMALL.fy * z, z], -1)
+    grid[np.isnan(z) & (u % 2 == 0)] = 0  # both ways to say "no return"
+    content = pcd_bytes(grid.reshape(-1, 3).astype(np.float32), encoding)
+    content = content.replace(b"WIDTH 101760\nHEIGHT 1\n", b"WIDTH 424\nHEIGHT 240\n")
+    assert b"HEIGHT 240" in content
+    path = tmp_path / "organised.pcd"
+    path.write_bytes(content)
+    cloud, (note,) = read_cloud(path)
+    np.testing.assert_allclose(cloud.points_mm, deproject(frame), atol=1e-3)
+    assert note.startswith(f"dropped {np.isnan(z).sum()} of 101760 points")
+    check_cloud(cloud)
+
+
+@pytest.mark.parametrize(
+    ("arrays", "message"),
+    [
+        ({"a": np.ones((4, 3)), "b": np.ones((5, 3))}, "exactly one"),
+        ({"points": np.ones((4, 2))}, r"points \(4, 2\)"),
+        ({"points": np.full((4, 3), np.nan)}, "no point with a return"),
+        ({"points": np.array([{}], dtype=object)}, "cannot be read|claims"),
+        ({}, "nothing"),
+    ],
+)
+def test_npz_without_one_cloud_is_refused(arrays, message, tmp_path):
+    path = tmp_path / "cloud.npz"
+    path.write_bytes(npz_bytes(**arrays))
+    with pytest.raises(InputError, match=message):
+        read_cloud(path)
+
+
+def test_points_mm_wins_and_contradicts_metres(points, tmp_path):
+    path = tmp_path / "cloud.npz"
+    path.write_bytes(npz_bytes(points=points / 1000, points_mm=points))
+    np.testing.assert_array_equal(read_cloud(path)[0].points_mm, points)
+    with pytest.raises(InputError, match="leave out --unit m"):
+        read_cloud(path, unit="m")
+
+
+def npy_claiming(shape):
+    stream = io.BytesIO()
+    header = {"descr": "<f8", "fortran_order": False, "shape": shape}
+    np.lib.format.write_array_header_1_0(stream, header)
+    archive = io.BytesIO()
+    with zipfile.ZipFile(archive, "w") as z:
+        z.writestr("points.npy", stream.getvalue())
+    return archive.getvalue()
+
+
+def huge_compressed_pcd():
+    content = pcd_bytes(np.ones((300, 3), np.float32), "binary_compressed")
+    start = content.index(b"compressed\n") + len(b"compressed\n")
+    return content[:start] + struct.pack("<II", 16, 2**32 - 1) + content[start + 8 :]
+
+
+@pytest.mark.parametrize(
+    ("suffix", "content"),
+    [
+        (".ply", ply_bytes(np.ones((9, 3))).replace(b"vertex 9", b"vertex 4294967295")),
+        (".ply", ply_bytes(np.ones((9, 3)), "ascii").replace(b"vertex 9", b"vertex 4294967295")),
+        (".ply", ply_bytes(np.ones((9, 3)))[:-1]),
+        (".pcd", pcd_bytes(np.ones((9, 3)), "binary").replace(b"POINTS 9", b"POINTS 4294967295")),
+        (".pcd", pcd_bytes(np.ones((9, 3)), "ascii").replace(b"POINTS 9", b"POINTS 4294967295")),
+        (".pcd", huge_compressed_pcd()),
+        (".npz", npy_claiming((10**12, 3))),
+        (".npz", npy_claiming((10**30, 3))),
+    ],
+)
+def test_counts_beyond_the_file_are_refused_before_allocation(suffix, content, tmp_path):
+    path = tmp_path / f"cloud{suffix}"
+    path.write_bytes(content)
+    with pytest.raises(InputError, match="claims"):
+        read_cloud(path)
+
+
+@pytest.mark.parametrize("name", ["no.ply", "no.xyz", "folder.ply", "empty.ply", "empty.npz"])
+def test_paths_that_are_no_clouds(name, tmp_path):
+    (tmp_path / "folder.ply").mkdir()
+    (tmp_path / "empty.ply").touch()
+    (tmp_path / "empty.npz").touch()
+    with pytest.raises(InputError, match=name):
+        read_cloud(tmp_path / name)
+
+
+@st.composite
+def damaged(draw, content):
+    """The content with a few bytes overwritten, a piece removed or repeated, or cut off."""
+    data = bytearray(content)
+    for _ in range(draw(st.integers(1, 4))):
+        at = draw(st.integers(0, max(0, min(len(data), 400) - 1)))
+        kind = draw(st.sampled_from(["set", "digit", "delete", "repeat", "cut"]))
+        if kind == "set":
+            data[at : at + 1] = bytes([draw(st.integers(0, 255))])
+        elif kind == "digit":
+            data[at : at + 1] = str(draw(st.integers(-9, 10**12))).encode()
+        elif kind == "delete":
+            del data[at : at + draw(st.integers(1, 40))]
+        elif kind == "repeat":
+            data[at:at] = data[at : at + draw(st.integers(1, 40))]
+        else:
+            del data[draw(st.integers(0, len(data))) :]
+    return bytes(data)
+
+
+TINY = np.arange(1, 31, dtype=np.float32).reshape(10, 3)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@settings(
+    max_examples=80,
+    deadline=None,
+    suppress_health_check=[HealthCheck.function_scoped_fixture],
+)
+@given(data=st.data())
+@pytest.mark.filterwarnings("ignore")
+def test_damaged_clouds_give_a_cloud_or_an_input_error(kind, data, tmp_path):
+    suffix, content = cloud_files(TINY)[kind]
+    path = tmp_path / f"cloud{suffix}"
+    path.write_bytes(data.draw(damaged(content)))
+    try:
+        cloud, _ = read_cloud(path)
+    except InputError:
+        return
+    assert np.isfinite(cloud.points_mm).all()
+
+
+# depth images
+
+
+def test_depth_png_round_trip_within_half_a_unit(tmp_path):
+    frame = dome()
+    write_depth_png(tmp_path / "depth.png", frame)
+    write_intrinsics(tmp_path / "intrinsics.json", SMALL)
+    again = read_depth_png(tmp_path / "depth.png", tmp_path / "intrinsics.json")
+    assert again.intrinsics == SMALL
+    np.testing.assert_array_equal(np.isnan(again.depth_mm), np.isnan(frame.depth_mm))
+    assert np.nanmax(np.abs(again.depth_mm - frame.depth_mm)) <= 0.05001
+    finer = NoiseConfig(quantum_mm=0.1)  # a sensor's own units survive exactly
+    exact = add_noise(frame, finer, np.random.default_rng(0))
+    write_depth_png(tmp_path / "depth.png", exact)
+    again = read_depth_png(tmp_path / "depth.png", tmp_path / "intrinsics.json")
+    np.testing.assert_allclose(again.depth_mm, exact.depth_mm, rtol=1e-6)
+
+
+def test_depth_unit_comes_from_the_file_or_the_caller(tmp_path):
+    png, camera = tmp_path / "depth.png", tmp_path / "intrinsics.json"
+    write_depth_png(png, wall(130.0), depth_unit_mm=0.25)
+    write_intrinsics(camera, SMALL, depth_unit_mm=0.25)
+    assert (read_depth_png(png, camera).depth_mm == 130).all()
+    assert (read_depth_png(png, camera, depth_unit_mm=1.0).depth_mm == 520).all()
+    with pytest.raises(InputError, match="depth_unit_mm"):
+        read_depth_png(png, camera, depth_unit_mm=0)
+
+
+def test_depths_that_16_bits_cannot_hold_are_refused(tmp_path):
+    with pytest.raises(InputError, match=r"6553\.5"):
+        write_depth_png(tmp_path / "depth.png", wall(7000.0))
+    with pytest.raises(InputError, match=r"0\.1"):
+        write_depth_png(tmp_path / "depth.png", wall(-5.0))
+    assert not list(tmp_path.iterdir())
+
+
+def test_depth_png_of_another_size_or_depth_is_refused(tmp_path):
+    from PIL import Image
+
+    png, camera = tmp_path / "depth.png", tmp_path / "intrinsics.json"
+    write_intrinsics(camera, d405())
+    write_depth_png(png, wall(130.0))
+    with pytest.raises(InputError, match=r"424 x 240.*848 x 480"):
+        read_depth_png(png, camera)
+    write_intrinsics(camera, SMALL)
+    Image.fromarray(np.zeros((240, 424), np.uint8)).save(png)
+    with pytest.raises(InputError, match="16-bit"):
+        read_depth_png(png, camera)
+    png.write_bytes(b"\x89PNG not really")
+    with pytest.raises(InputError, match="PNG"):
+        read_depth_png(png, camera)
+
+
+GOOD = {"width": 848, "height": 480, "fx": 430.5, "fy": 431.0, "cx": 420.0, "cy": 239.0}
+
+
+def test_intrinsics_by_either_name_of_the_principal_point(tmp_path):
+    path = tmp_path / "intrinsics.json"
+    expected = Intrinsics(848, 480, 430.5, 431.0, 420.0, 239.0)
+    realsense = {**GOOD, "ppx": 420.0, "ppy": 239.0, "model": "x", "coeffs": [0, 0, 0, 0, 0]}
+    del realsense["cx"], realsense["cy"]
+    for data in (GOOD, realsense):
+        path.write_text(json.dumps(data))
+        assert read_intrinsics(path) == expected
+    write_intrinsics(path, expected)
+    assert read_intrinsics(path) == expected
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"coeffs": [0.1, 0, 0, 0, 0]}, "distortion"),
+        ({"k1": -0.2}, "distortion"),
+        ({"fx": "wide"}, "finite number"),
+        ({"fx": math.nan}, "finite number"),
+        ({"fx": 10**400}, "finite number"),
+        ({"fx": None}, "lacks"),
+        ({"fx": [1, 2]}, "lacks"),
+        ({"fx": -3}, "positive"),
+        ({"width": 848.5}, "whole"),
+        ({"width": 10**6}, "8192"),
+    ],
+)
+def test_unusable_intrinsics_are_explained(change, message, tmp_path):
+    path = tmp_path / "intrinsics.json"
+    path.write_text(json.dumps({**GOOD, **change}))
+    with pytest.raises(InputError, match=message):
+        read_intrinsics(path)
+
+
+@settings(
+    max_examples=80,
+    deadline=None,
+    suppress_health_check=[HealthCheck.function_scoped_fixture],
+)
+@given(data=st.data())
+@pytest.mark.filterwarnings("ignore")
+def test_damaged_depth_images_give_a_frame_or_an_input_error(data, tmp_path):
+    png, camera = tmp_path / "depth.png", tmp_path / "intrinsics.json"
+    write_depth_png(png, wall(130.0, d405(32, 18)))
+    write_intrinsics(camera, d405(32, 18))
+    victim = data.draw(st.sampled_from([png, camera]))
+    victim.write_bytes(data.draw(damaged(victim.read_bytes())))
+    try:
+        frame = read_depth_png(png, camera)
+    except InputError:
+        return
+    assert frame.depth_mm.shape == (frame.intrinsics.height, frame.intrinsics.width)
