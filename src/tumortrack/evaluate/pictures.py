@@ -1,4 +1,4 @@
-"""Pictures that a surgeon can read: the estimate over the truth, and a case for checking.
+"""Pictures that a surgeon can read: the estimate over the truth, here; a case, in ``qc``.
 
 Orange is what was estimated, blue is the truth (a pair that every colour vision tells apart).
 Nothing needs a display.
@@ -6,16 +6,26 @@ Nothing needs a display.
 
 from __future__ import annotations
 
-import io
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import Bool, Float
 
-from tumortrack.core.store import write_atomically
-from tumortrack.core.types import Mesh
-from tumortrack.evaluate.raster import voxelise
+from tumortrack.evaluate.drawing import (
+    ESTIMATED,
+    KIDNEY,
+    OBSERVED,
+    TRUE,
+    blank,
+    draw_lines,
+    new_figure,
+    save,
+    scale_bar,
+    section,
+    section_mask,
+    tint,
+)
+from tumortrack.evaluate.qc import qc_picture
 from tumortrack.evaluate.shade import (
     Frame,
     Layer,
@@ -24,18 +34,15 @@ from tumortrack.evaluate.shade import (
     pixel_centres,
     shade,
     silhouette,
+    widened,
 )
 from tumortrack.simulate.scene_folder import Scene
 from tumortrack.track.estimate import Estimate
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
-KIDNEY = (185 / 255, 102 / 255, 83 / 255)
-ESTIMATED = (230 / 255, 140 / 255, 0.0)
-TRUE = (0.0, 90 / 255, 160 / 255)
-OBSERVED = (0.25, 0.25, 0.25)
+__all__ = ["qc_picture", "scene_picture"]
 
 FROM_CAMERA = View("seen from the camera", (1, 0, 0), (0, 1, 0))
 FROM_SIDE = View("seen from the side, camera above", (1, 0, 0), (0, 0, 1))
@@ -54,12 +61,14 @@ def scene_picture(scene: Scene, estimate: Estimate | None, entry: dict, path: Pa
     tumors = scene.reference.names[1:]
     slices = [(name, view) for name in tumors for view in (FROM_CAMERA, FROM_SIDE)]
     rows = -(-len(slices) // 4)
-    figure = new_figure(14, 6.2 + 4.1 * rows)
-    outer = figure.add_gridspec(2, 1, height_ratios=[5.2, 4.1 * max(rows, 0.01)], hspace=0.16)
-    top = outer[0].subgridspec(1, 2, wspace=0.06)
+    height_in = 5.1 + 4.05 * rows
+    figure = new_figure(14, height_in)
+    figure.subplots_adjust(top=1 - 0.85 / height_in, bottom=0.15 / height_in)
+    outer = figure.add_gridspec(2, 1, height_ratios=[4.1, 3.95 * max(rows, 0.01)], hspace=0.13)
+    top = outer[0].subgridspec(1, 2, wspace=0.04)
     for column, view in enumerate((FROM_CAMERA, FROM_SIDE)):
         _solid_view(figure.add_subplot(top[column]), scene, estimate, view)
-    below = outer[1].subgridspec(max(rows, 1), 4, wspace=0.1, hspace=0.3)
+    below = outer[1].subgridspec(max(rows, 1), 4, wspace=0.06, hspace=0.2)
     for n, (name, view) in enumerate(slices):
         axes = figure.add_subplot(below[n // 4, n % 4])
         _slice_view(axes, scene, estimate, name, view)
@@ -69,7 +78,7 @@ def scene_picture(scene: Scene, estimate: Estimate | None, entry: dict, path: Pa
     figure.legend(
         handles=_legend(),
         loc="upper right",
-        ncols=3,
+        ncols=4,
         fontsize=9.5,
         frameon=False,
         bbox_to_anchor=(0.985, 0.995),
@@ -77,87 +86,14 @@ def scene_picture(scene: Scene, estimate: Estimate | None, entry: dict, path: Pa
     save(figure, path)
 
 
-def new_figure(width_in: float, height_in: float) -> Figure:
-    """A figure without display or global state."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(width_in, height_in), dpi=100, facecolor="white")
-    FigureCanvasAgg(figure)
-    figure.subplots_adjust(left=0.02, right=0.98, top=0.9, bottom=0.03)
-    return figure
-
-
-def save(figure: Figure, path: Path) -> None:
-    """Write the PNG atomically.
-
-    Raises:
-        StorageError: the disk refused.
-    """
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png")
-    write_atomically(path, buffer.getvalue())
-
-
-def section(
-    mesh: Mesh, view: View, through_mm: Float[np.ndarray, " 3"]
-) -> Float[np.ndarray, "n 2 2"]:
-    """Outline of a mesh in the view's plane through a point: segments as (right, down) mm."""
-    flat = view.project(mesh.vertices_mm)
-    side = flat[:, 2] - view.project(through_mm[None])[0, 2]
-    side = np.where(side == 0, 1e-9, side)  # no corner lies in the plane: always two crossings
-    up = side[mesh.faces] > 0
-    cut = mesh.faces[up.any(1) & ~up.all(1)]
-    ends = []
-    for a, b in ((0, 1), (1, 2), (2, 0)):
-        start, end = cut[:, a], cut[:, b]
-        gap = np.where(side[start] * side[end] < 0, side[start] - side[end], np.nan)
-        share = (side[start] / gap)[:, None]
-        ends.append(flat[start, :2] + share * (flat[end, :2] - flat[start, :2]))
-    both = np.stack(ends, axis=1)
-    return both[~np.isnan(both[:, :, 0])].reshape(-1, 2, 2)
-
-
-def draw_lines(axes: Axes, segments: Float[np.ndarray, "n 2 2"], **style: Any) -> None:
-    """Draw an outline's segments as one collection."""
-    from matplotlib.collections import LineCollection
-
-    axes.add_collection(LineCollection(list(segments), capstyle="round", **style))
-
-
-def scale_bar(axes: Axes, frame: Frame, color: str = "black") -> None:
-    """A bar of a round length in mm, in the lower left corner."""
-    width, height = frame.right - frame.left, frame.bottom - frame.top
-    length = max(n for n in (1, 2, 5, 10, 20, 50, 100) if n <= max(0.3 * width, 1))
-    x, y = frame.left + 0.05 * width, frame.bottom - 0.05 * height
-    axes.plot([x, x + length], [y, y], color=color, linewidth=3, solid_capstyle="butt")
-    axes.text(
-        x + length / 2,
-        y - 0.015 * height,
-        f"{length} mm",
-        color=color,
-        ha="center",
-        va="bottom",
-        fontsize=9,
-    )
-
-
-def blank(axes: Axes, frame: Frame, background: str = "white") -> None:
-    """Axes in mm, down pointing down, equal scales, without ticks."""
-    axes.set(xlim=(frame.left, frame.right), ylim=(frame.bottom, frame.top), aspect="equal")
-    axes.set(xticks=[], yticks=[], facecolor=background)
-    for spine in axes.spines.values():
-        spine.set_color("0.8")
-
-
 def _solid_view(axes: Axes, scene: Scene, estimate: Estimate | None, view: View) -> None:
     shown = estimate.meshes if estimate else {}
     everything = [*scene.reference.parts, *shown.values()]
     points_mm = scene.cloud.points_mm.astype(float)
-    frame = frame_around(view, np.concatenate([m.vertices_mm for m in everything]), 6)
+    frame = widened(frame_around(view, np.concatenate([m.vertices_mm for m in everything]), 6), 1.7)
     layers = [Layer(mesh, ESTIMATED) for name, mesh in shown.items() if name != "kidney"]
     if "kidney" in shown:
-        layers.append(Layer(shown["kidney"], KIDNEY, 0.3))
+        layers.append(Layer(shown["kidney"], KIDNEY, 0.36))
     axes.imshow(shade(layers, view, frame), extent=frame.extent, zorder=2, interpolation="bilinear")
     flat = view.project(points_mm)
     axes.scatter(flat[:, 0], flat[:, 1], s=2.5, color=OBSERVED, alpha=0.55, linewidths=0, zorder=3)
@@ -180,10 +116,10 @@ def _slice_view(axes: Axes, scene: Scene, estimate: Estimate | None, name: str, 
     shown = estimate.meshes if estimate else {}
     through_mm = truth[name].box_mm.mean(0)
     around = [truth[name].vertices_mm] + ([shown[name].vertices_mm] if name in shown else [])
-    frame = _square(frame_around(view, np.concatenate(around), 12))
+    frame = widened(frame_around(view, np.concatenate(around), 12), 1.0)
     for part, mesh in shown.items():
         color, width = (KIDNEY, 1.4) if part == "kidney" else (ESTIMATED, 2.4)
-        _tint(axes, section_mask(mesh, view, frame, through_mm), frame, color)
+        tint(axes, section_mask(mesh, view, frame, through_mm), frame, color)
         draw_lines(axes, section(mesh, view, through_mm), color=color, linewidth=width, zorder=3)
     for part, mesh in truth.items():
         width = 1.1 if part == "kidney" else 2.0
@@ -194,34 +130,6 @@ def _slice_view(axes: Axes, scene: Scene, estimate: Estimate | None, name: str, 
     blank(axes, frame)
     scale_bar(axes, frame)
     _axes_cross(axes, frame, view)
-
-
-def section_mask(
-    mesh: Mesh, view: View, frame: Frame, through_mm: Float[np.ndarray, " 3"]
-) -> Bool[np.ndarray, "h w"]:
-    """Pixels of a frame that lie inside a closed mesh, in the view's plane through a point."""
-    x, y = pixel_centres(frame)
-    axes = np.stack([view.down, view.right, np.cross(view.right, view.down)], axis=1).astype(float)
-    depth = view.project(through_mm[None])[0, 2]
-    data_from_index = np.eye(4)
-    data_from_index[:3, :3] = axes * [y[1] - y[0], x[1] - x[0], 1.0]
-    data_from_index[:3, 3] = axes @ [y[0], x[0], depth]
-    return voxelise(mesh, data_from_index, (len(y), len(x), 1))[:, :, 0]
-
-
-def _tint(
-    axes: Axes, mask: Bool[np.ndarray, "h w"], frame: Frame, color: tuple[float, ...]
-) -> None:
-    picture = np.empty((*mask.shape, 4))
-    picture[...] = (*color, 0.0)
-    picture[mask, 3] = 0.25
-    axes.imshow(picture, extent=frame.extent, zorder=1)
-
-
-def _square(frame: Frame) -> Frame:
-    half = max(frame.right - frame.left, frame.bottom - frame.top) / 2
-    x, y = (frame.left + frame.right) / 2, (frame.top + frame.bottom) / 2
-    return Frame(x - half, x + half, y - half, y + half)
 
 
 def _axes_cross(axes: Axes, frame: Frame, view: View) -> None:

@@ -63,6 +63,16 @@ def frame_around(view: View, points_mm: Float[np.ndarray, "n 3"], margin_mm: flo
     return Frame(float(low[0]), float(high[0]), float(low[1]), float(high[1]))
 
 
+def widened(frame: Frame, aspect: float) -> Frame:
+    """The smallest frame about the same middle with width = aspect * height that holds it."""
+    width, height = frame.right - frame.left, frame.bottom - frame.top
+    half_height = max(height, width / aspect) / 2
+    x, y = (frame.left + frame.right) / 2, (frame.top + frame.bottom) / 2
+    return Frame(
+        x - aspect * half_height, x + aspect * half_height, y - half_height, y + half_height
+    )
+
+
 def shade(
     layers: list[Layer], view: View, frame: Frame, pixel_mm: float = 0.25
 ) -> Float[np.ndarray, "h w 3"]:
