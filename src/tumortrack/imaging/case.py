@@ -1,0 +1,91 @@
+"""A case: one patient's (or phantom's) anatomy, ready for simulation, as a folder."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from tumortrack.core import store
+from tumortrack.core.errors import ArtifactError, StorageError
+from tumortrack.core.mesh_files import read_anatomy, write_anatomy
+from tumortrack.core.types import Anatomy, LabelVolume, Volume
+from tumortrack.imaging.volume import (
+    read_labels,
+    read_volume,
+    write_labels_nifti,
+    write_volume_nifti,
+)
+
+KIND = "case"
+
+
+@dataclass(frozen=True, eq=False)
+class Case:
+    """Everything later steps need of a patient; all in LPS mm.
+
+    Attributes:
+        anatomy: organ (tumors included) and tumors as closed surfaces.
+        labels: cropped round the organ with a margin.
+        up_lps: unit vector, the patient direction that faces the camera.
+        report: JSON types: volumes, smoothing, what was dropped, notes, source, options.
+        ct: the CT on the labels' crop, where the input was one.
+    """
+
+    anatomy: Anatomy
+    labels: LabelVolume
+    up_lps: tuple[float, float, float]
+    report: dict = field(default_factory=dict)
+    ct: Volume | None = None
+
+
+def save_case(case: Case, folder: Path) -> None:
+    """Write the case's files into an existing (aside) folder and seal it with its manifest.
+
+    kidney.ply, tumor_1.ply, ..., labels.nii.gz, ct.nii.gz (of a CT) and manifest.json.
+
+    Raises:
+        StorageError: the disk refused.
+    """
+    try:
+        write_anatomy(folder, case.anatomy)
+    except OSError as error:
+        raise StorageError(f"cannot write into {folder}: {error.strerror}.") from error
+    labels = case.labels
+    write_labels_nifti(folder / "labels.nii.gz", labels.labels, labels.lps_from_index, lps=True)
+    if case.ct is not None:
+        write_volume_nifti(folder / "ct.nii.gz", case.ct.hu, case.ct.lps_from_index)
+    content = {
+        "parts": list(case.anatomy.names),
+        "up_lps": list(case.up_lps),
+        "report": case.report,
+    }
+    store.seal(folder, KIND, content, frame="lps")
+
+
+def load_case(folder: Path) -> Case:
+    """Read a case folder, every file checked against its sha256.
+
+    Raises:
+        ArtifactError: not a case, of another schema, damaged or changed.
+    """
+    manifest = store.read_manifest(folder, KIND)
+    parts, up, report = (manifest.get(key) for key in ("parts", "up_lps", "report"))
+    sound = (
+        isinstance(up, list)
+        and len(up) == 3
+        and all(isinstance(x, int | float) for x in up)
+        and isinstance(report, dict)
+    )
+    if not sound:
+        raise ArtifactError(f"{folder / store.MANIFEST} is incomplete; run prepare again.")
+    anatomy = read_anatomy(folder)
+    if list(anatomy.names) != parts:
+        raise ArtifactError(f"{folder} lacks parts: {parts} expected, {list(anatomy.names)} found.")
+    ct = folder / "ct.nii.gz"
+    return Case(
+        anatomy=anatomy,
+        labels=read_labels(folder / "labels.nii.gz"),
+        up_lps=(float(up[0]), float(up[1]), float(up[2])),
+        report=report,
+        ct=read_volume(ct) if ct.exists() else None,
+    )

@@ -1,0 +1,189 @@
+"""A DICOM series as a volume: pydicom for the tags, GDCM (in SimpleITK) for the pixels.
+
+Slices are sorted by their position along the slice normal, and every gap is checked here:
+readers only warn of a missing slice and stretch the patient.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from tumortrack.core.errors import InputError
+from tumortrack.imaging.voxels import RawVolume, check_affine, check_size
+
+MIN_SLICES = 10
+_MAX_FILES = 20_000
+_TAGS = [
+    "SeriesInstanceUID", "SeriesDescription", "Modality", "ImageType", "Rows", "Columns",
+    "NumberOfFrames", "PixelSpacing", "ImagePositionPatient", "ImageOrientationPatient",
+    "SamplesPerPixel",
+]  # fmt: skip
+
+
+@dataclass(frozen=True)
+class _Slice:
+    path: Path
+    uid: str
+    description: str
+    modality: str
+    shape: tuple[int, int]  # rows, columns
+    spacing_mm: tuple[float, float]  # between rows, between columns
+    position_mm: tuple[float, ...]  # LPS, first pixel
+    orientation: tuple[float, ...]  # along a row, along a column
+
+    @property
+    def group(self) -> tuple:
+        return (self.uid, self.shape, tuple(round(c, 3) for c in self.orientation))
+
+
+def read_dicom(folder: Path, series: str | None = None) -> RawVolume:
+    """Read one CT series of a folder (sub-folders not searched).
+
+    The rule among several: the only one with modality CT and at least 10 slices of one size and
+    orientation. Otherwise ``series`` must name one: its UID or its number in the error's list.
+
+    Raises:
+        InputError: no series, several, a missing, double or stray slice, damaged pixels.
+    """
+    groups = _groups(folder)
+    slices = _choose(folder, groups, series)
+    first = slices[0]
+    row, column = np.reshape(first.orientation, (2, 3))
+    normal = np.cross(row, column)
+    if not 0.99 < np.linalg.norm(normal) < 1.01:
+        raise InputError(f"{first.path}: ImageOrientationPatient is not two unit directions.")
+    slices = sorted(slices, key=lambda s: float(np.dot(s.position_mm, normal)))
+    step = _slice_step(slices, normal)
+    lps_from_index = np.eye(4)
+    # Pixel spacing is (between rows, between columns); index i runs along a row.
+    lps_from_index[:3, 0] = row * slices[0].spacing_mm[1]
+    lps_from_index[:3, 1] = column * slices[0].spacing_mm[0]
+    lps_from_index[:3, 2] = step
+    lps_from_index[:3, 3] = slices[0].position_mm
+    shape = (first.shape[1], first.shape[0], len(slices))
+    check_size(folder, shape, 4)
+    check_affine(folder, lps_from_index)
+    return RawVolume(_pixels(folder, [s.path for s in slices], shape), lps_from_index)
+
+
+def _groups(folder: Path) -> list[list[_Slice]]:
+    """Image slices of the folder by series, size and orientation, in a fixed order."""
+    files = sorted(p for p in folder.iterdir() if p.is_file() and not p.name.startswith("."))
+    if len(files) > _MAX_FILES:
+        raise InputError(f"{folder} holds {len(files)} files; the limit is {_MAX_FILES}.")
+    found: dict[tuple, list[_Slice]] = {}
+    for file in files:
+        if (one := _read_tags(file)) is not None:
+            found.setdefault(one.group, []).append(one)
+    return [found[key] for key in sorted(found, key=lambda key: (-len(found[key]), repr(key)))]
+
+
+def _read_tags(path: Path) -> _Slice | None:
+    """The tags of one image, or None where the file is no DICOM image with a position."""
+    import pydicom
+
+    try:
+        tags = pydicom.dcmread(path, stop_before_pixels=True, specific_tags=_TAGS)
+        if "ImagePositionPatient" not in tags and int(tags.get("NumberOfFrames") or 1) == 1:
+            return None
+        if int(tags.get("NumberOfFrames") or 1) > 1:
+            raise InputError(
+                f"{path} is a multi-frame DICOM object; export classic slices, one file each, "
+                "or NIfTI."
+            )
+        return _Slice(
+            path=path,
+            uid=str(tags.get("SeriesInstanceUID") or ""),
+            description=str(tags.get("SeriesDescription") or ""),
+            modality=str(tags.get("Modality") or ""),
+            shape=(int(tags.Rows), int(tags.Columns)),
+            spacing_mm=(float(tags.PixelSpacing[0]), float(tags.PixelSpacing[1])),
+            position_mm=tuple(float(x) for x in tags.ImagePositionPatient),
+            orientation=tuple(float(x) for x in tags.ImageOrientationPatient),
+        )
+    except InputError:
+        raise
+    except Exception:  # pydicom raises anything on a foreign or damaged file: it is no slice
+        return None
+
+
+def _choose(folder: Path, groups: list[list[_Slice]], series: str | None) -> list[_Slice]:
+    if not groups:
+        raise InputError(
+            f"{folder} holds no DICOM image with a position. Give the folder that holds the CT's "
+            "slices themselves."
+        )
+    if series is not None:
+        fitting = [g for n, g in enumerate(groups, 1) if series in (g[0].uid, str(n))]
+    else:
+        fitting = [g for g in groups if g[0].modality == "CT" and len(g) >= MIN_SLICES]
+    if len(fitting) == 1:
+        return fitting[0]
+    listing = "\n".join(
+        f"  {n}: {g[0].uid or '(no UID)'}, {g[0].description or '(no description)'}, "
+        f"{g[0].modality}, {len(g)} slices of {g[0].shape[1]} x {g[0].shape[0]}"
+        for n, g in enumerate(groups, 1)
+    )
+    what = (
+        f"{len(fitting)} of them fit {series!r}"
+        if series is not None
+        else f"{len(fitting)} of them are CT with at least {MIN_SLICES} slices"
+    )
+    raise InputError(
+        f"{folder} holds these series and {what}; give --series with a UID or number:\n{listing}"
+    )
+
+
+def _slice_step(slices: list[_Slice], normal: Float[np.ndarray, " 3"]) -> Float[np.ndarray, " 3"]:
+    """The vector from one slice to the next, after checking that all slices follow it."""
+    if len({s.spacing_mm for s in slices}) > 1:
+        raise InputError(f"{slices[0].path.parent}: its slices differ in pixel spacing.")
+    if len(slices) < 2:
+        raise InputError(f"{slices[0].path.parent}: one slice is no volume.")
+    positions = np.array([s.position_mm for s in slices])
+    along = positions @ normal
+    gaps = np.diff(along)
+    usual = float(np.median(gaps))
+    for n in np.flatnonzero(np.abs(gaps - usual) > max(0.02, 0.05 * abs(usual))):
+        kind = (
+            "two slices lie at"
+            if gaps[n] < 0.5 * usual or usual < 0.01
+            else "a slice is missing after"
+        )
+        raise InputError(
+            f"{slices[n].path.parent}: {kind} position {along[n]:.2f} mm ({slices[n].path.name} to "
+            f"{slices[n + 1].path.name}: {gaps[n]:.2f} mm, usually {usual:.2f} mm). Export the "
+            "whole series again, each slice once."
+        )
+    step = (positions[-1] - positions[0]) / (len(slices) - 1)
+    stray = np.linalg.norm(
+        positions - positions[0] - np.arange(len(slices))[:, None] * step, axis=1
+    )
+    if stray.max() > max(0.1, 0.1 * abs(usual)):
+        raise InputError(
+            f"{slices[int(stray.argmax())].path}: this slice lies {stray.max():.2f} mm off the "
+            "line through the others. Export one continuous series."
+        )
+    return step
+
+
+def _pixels(folder: Path, files: list[Path], shape: tuple[int, int, int]) -> np.ndarray:
+    """Rescaled values (HU), float32, axes (column, row, slice)."""
+    import SimpleITK as sitk  # noqa: N813
+
+    sitk.ProcessObject.SetGlobalWarningDisplay(False)
+    reader = sitk.ImageSeriesReader()
+    reader.SetFileNames([str(f) for f in files])
+    reader.SetOutputPixelType(sitk.sitkFloat32)
+    try:
+        array = sitk.GetArrayFromImage(reader.Execute()).transpose(2, 1, 0)
+    except RuntimeError as error:
+        last = str(error).strip().splitlines()[-1]
+        raise InputError(f"{folder}: the slices' pixels cannot be decoded: {last}.") from error
+    if array.shape != shape:
+        raise InputError(f"{folder}: the pixels are {array.shape}, the tags say {shape}.")
+    return array

@@ -1,0 +1,172 @@
+"""Anatomy from a folder of surface meshes (STL, OBJ, PLY)."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+
+from tumortrack.core.errors import InputError
+from tumortrack.core.geometry import RAS_FROM_LPS, transform_points
+from tumortrack.core.mesh_files import SUFFIXES, read_mesh
+from tumortrack.core.types import FIRST_TUMOR, ORGAN, Anatomy, LabelVolume, Mesh, part_names
+from tumortrack.imaging.repair import closed_mesh
+from tumortrack.imaging.winding import grid_round, winding_numbers
+
+_ORGAN_WORDS, _TUMOR_WORDS = ("kidney", "organ"), ("tumor", "tumour", "lesion", "mass")
+_ORGAN_MM = (20.0, 400.0)  # plausible longest extent
+_VOXEL_MM = 1.0
+_RULE = (
+    "The rule: one file whose name contains kidney or organ is the organ; names with tumor, lesion "
+    "or mass are tumors, in order of name."
+)
+
+
+def read_mesh_folder(folder: Path, unit: str | None = None) -> tuple[Anatomy, list[str]]:
+    """Read one organ and its tumors; LPS mm unless a file's comment says ``SPACE=RAS``.
+
+    Small holes, doubled faces, inside-out surfaces and crossings are repaired with a note. The
+    organ becomes the union of organ and tumors.
+
+    Args:
+        unit: ``m`` converts metres; None or ``mm``: millimetres (metres are recognised, refused).
+
+    Returns:
+        The anatomy (LPS mm) and notes on every change.
+
+    Raises:
+        InputError: unclear names, open or damaged meshes, wrong unit, a tumor apart from the organ.
+    """
+    if not folder.is_dir():
+        raise InputError(f"{folder} is not a folder of meshes.")
+    organ_file, tumor_files = _files_by_name(folder)
+    if unit not in (None, "mm", "m"):
+        raise InputError(f"unit {unit!r} is not allowed: mm or m.")
+    notes: list[str] = []
+    scale = 1000.0 if unit == "m" else 1.0
+    organ, tumors = _read(organ_file, scale, notes), [_read(f, scale, notes) for f in tumor_files]
+    _check_unit(organ_file, organ, unit)
+    organ = closed_mesh(organ, organ_file.name, notes)
+    tumors = [closed_mesh(t, f.name, notes) for t, f in zip(tumors, tumor_files, strict=True)]
+    for tumor, file in zip(tumors, tumor_files, strict=True):
+        organ = _union(organ, tumor, file.name)
+    names = part_names(1 + len(tumors))
+    notes += [
+        f"{file.name} is {name}"
+        for file, name in zip([organ_file, *tumor_files], names, strict=True)
+    ]
+    if not tumors:
+        notes.append("no tumor in this folder")
+    return Anatomy((organ, *tumors)), notes
+
+
+def label_meshes(anatomy: Anatomy, voxel_mm: float = _VOXEL_MM) -> LabelVolume:
+    """Label the cells of an LPS-aligned grid whose centres the parts contain; tumors win."""
+    origin, shape = grid_round(anatomy.organ.box_mm, voxel_mm, 8.0)
+    labels = np.zeros(shape, np.uint8)
+    for number, part in enumerate(anatomy.parts, ORGAN):
+        labels[winding_numbers(part, origin, voxel_mm, shape) > 0] = number
+    for number in range(FIRST_TUMOR, len(anatomy.parts) + 1):
+        if not (labels == number).any():
+            raise InputError(f"tumor {number - 1} fills no {voxel_mm:g} mm cell: too small.")
+    affine = np.diag([voxel_mm] * 3 + [1.0])
+    affine[:3, 3] = origin
+    return LabelVolume(labels, affine)
+
+
+def _files_by_name(folder: Path) -> tuple[Path, list[Path]]:
+    files = sorted(p for p in folder.iterdir() if p.suffix.lower() in SUFFIXES)
+    if not files:
+        raise InputError(f"{folder} holds no meshes ({', '.join(SUFFIXES)}).")
+
+    def named(words: tuple[str, ...]) -> list[Path]:
+        return [f for f in files if any(word in f.stem.lower() for word in words)]
+
+    tumors = named(_TUMOR_WORDS)
+    organs = [f for f in named(_ORGAN_WORDS) if f not in tumors]
+    other = [f.name for f in files if f not in organs and f not in tumors]
+    # kidney_tumor.stl names both: a tumor, as long as another file is plainly the organ.
+    if len(organs) != 1 or other:
+        problem = f"{len(organs)} name an organ" + (f", {other} name neither" if other else "")
+        raise InputError(f"{folder}: of {[f.name for f in files]} {problem}. {_RULE}")
+    return organs[0], sorted(tumors, key=_natural)
+
+
+def _natural(path: Path) -> list:
+    """tumor_2 before tumor_10."""
+    return [int(p) if p.isdigit() else p for p in re.split(r"(\d+)", path.stem.lower())]
+
+
+def _read(path: Path, scale: float, notes: list[str]) -> Mesh:
+    mesh = read_mesh(path)
+    if not np.abs(mesh.vertices_mm).max() < 1e7:
+        raise InputError(f"{path} has vertices kilometres away; it is damaged or not in mm.")
+    space = _stated_space(path)
+    vertices = mesh.vertices_mm * scale
+    if space == "RAS":
+        vertices = transform_points(RAS_FROM_LPS, vertices)
+        notes.append(f"{path.name} states SPACE=RAS: converted to LPS")
+    elif space not in (None, "LPS"):
+        raise InputError(f"{path} states SPACE={space}; LPS or RAS is allowed.")
+    return mesh.moved(vertices)
+
+
+def _stated_space(path: Path) -> str | None:
+    """SPACE=... from a PLY, OBJ or STL comment, as 3D Slicer writes it."""
+    with path.open("rb") as stream:
+        head = stream.read(4096)
+    if path.suffix.lower() == ".ply":
+        head = head.partition(b"end_header")[0]
+    elif path.suffix.lower() == ".stl":
+        head = head[:80] if not head.lstrip().startswith(b"solid") else head.partition(b"\n")[0]
+    found = re.search(rb"SPACE\s*=\s*([A-Za-z]+)", head)
+    return found.group(1).decode().upper() if found else None
+
+
+def _check_unit(path: Path, organ: Mesh, unit: str | None) -> None:
+    extent = float(np.ptp(organ.box_mm, axis=0).max())
+    low, high = _ORGAN_MM
+    if low <= extent <= high:
+        return
+    if unit != "m" and low <= 1000 * extent <= high:
+        raise InputError(
+            f"{path} is {extent:.3g} mm long: it looks like metres. Give --unit m to convert."
+        )
+    raise InputError(
+        f"{path} is {extent:.4g} mm long; a kidney has {low:g} to {high:g} mm. Check its unit"
+        + (" (--unit m multiplied it by 1000)." if unit == "m" else ".")
+    )
+
+
+def _union(organ: Mesh, tumor: Mesh, name: str) -> Mesh:
+    """Organ and tumor as one closed surface; cavities that remain between them are closed."""
+    from manifold3d import Manifold
+    from manifold3d import Mesh as ManifoldMesh
+
+    def solid(mesh: Mesh, what: str) -> Manifold:
+        out = Manifold(
+            ManifoldMesh(mesh.vertices_mm.astype(np.float32), mesh.faces.astype(np.uint32))
+        )
+        if out.status().name != "NoError":
+            raise InputError(f"{what} is not a closed surface ({out.status().name}); repair it.")
+        return out
+
+    shells = (solid(organ, "the organ") + solid(tumor, name)).decompose()
+    outer = [s for s in shells if s.volume() > 0]
+    outer.sort(key=lambda s: -s.volume())
+    if not outer or (len(outer) > 1 and outer[1].volume() > 0.01 * tumor.volume_mm3):
+        raise InputError(
+            f"{name} lies apart from the organ: a tumor must lie in it or touch it. Check that "
+            "all meshes share one frame and unit."
+        )
+    mesh = outer[0].to_mesh()
+    vertices = np.asarray(mesh.vert_properties, np.float64)[:, :3]
+    return _outer_shell(Mesh(vertices, np.asarray(mesh.tri_verts, np.int32)))
+
+
+def _outer_shell(mesh: Mesh) -> Mesh:
+    """The shell of largest volume: gaps between a tumor and its bed are no part of the outside."""
+    from tumortrack.imaging.repair import shells
+
+    return max(shells(mesh), key=lambda shell: shell.volume_mm3)

@@ -1,0 +1,154 @@
+"""From what a user has to a case: DICOM, CT volume, label map or meshes."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+
+from tumortrack.core import store
+from tumortrack.core.errors import InputError
+from tumortrack.core.geometry import direction_lps, spacing_mm
+from tumortrack.core.mesh_files import SUFFIXES
+from tumortrack.core.types import ORGAN, Anatomy, LabelVolume, Volume
+from tumortrack.imaging.case import Case
+from tumortrack.imaging.grid import voxel_ml
+from tumortrack.imaging.meshes import label_meshes, read_mesh_folder
+from tumortrack.imaging.segment import KIDNEY_HU, TUMOR_HU, segment_ct
+from tumortrack.imaging.select import MIN_TUMOR_ML, select_labels
+from tumortrack.imaging.surface import surfaces
+from tumortrack.imaging.volume import is_label_map, labels_of, read_raw, volume_of
+
+
+@dataclass(frozen=True)
+class PrepareOptions:
+    """What the user may say about an input.
+
+    Attributes:
+        kidney_hu, tumor_hu: half-open HU windows [low, high) for a CT.
+        labels: the volume is a label map (recognised without this where it is plain).
+        side: the patient's ``left`` or ``right``; None takes the tumor-bearing kidney.
+        organ, tumor: label numbers; tumor None takes every label from 2 up, 0 none.
+        up: the patient direction that faces the camera: a name, or three numbers in LPS.
+        series: UID or number of one DICOM series among several.
+        unit: of meshes, ``mm`` or ``m``; None: mm, and metres are refused with an explanation.
+        min_tumor_ml: smaller tumors are reported and dropped.
+    """
+
+    kidney_hu: tuple[float, float] = KIDNEY_HU
+    tumor_hu: tuple[float, float] = TUMOR_HU
+    labels: bool = False
+    side: str | None = None
+    organ: int = ORGAN
+    tumor: int | None = None
+    up: str = "anterior"
+    series: str | None = None
+    unit: str | None = None
+    min_tumor_ml: float = MIN_TUMOR_ML
+
+    def __post_init__(self) -> None:
+        if not (np.isfinite(self.min_tumor_ml) and self.min_tumor_ml >= 0):
+            raise InputError(f"min_tumor_ml {self.min_tumor_ml} must be 0 or more (ml).")
+        if not 1 <= self.organ <= 255 or (self.tumor is not None and not 0 <= self.tumor <= 255):
+            raise InputError("label numbers must lie in 1..255 (tumor 0: none).")
+        if self.side not in (None, "left", "right"):
+            raise InputError(f"side {self.side!r} is not allowed: left or right (the patient's).")
+        if self.unit not in (None, "mm", "m"):
+            raise InputError(f"unit {self.unit!r} is not allowed: mm or m.")
+
+
+def prepare(input: Path, options: PrepareOptions | None = None) -> Case:
+    """Read any supported input and make a case of it; nothing is written.
+
+    Raises:
+        InputError: nothing usable there; the message says what was wrong and what to do.
+    """
+    options = options or PrepareOptions()
+    up = direction_lps(options.up)
+    if not input.exists():
+        raise InputError(f"{input} does not exist.")
+    if input.is_dir() and not any(p.is_file() for p in input.iterdir()):
+        raise InputError(f"{input} holds no files. Give a folder of DICOM slices or of meshes.")
+    is_meshes = input.is_dir() and any(p.suffix.lower() in SUFFIXES for p in input.iterdir())
+    if is_meshes:
+        case = _from_meshes(input, options)
+    else:
+        case = _from_volume(input, options)
+    report = {
+        **case.report,
+        "source": input.name,
+        "source_sha256": store.sha256_of(input),
+        "options": {k: list(v) if isinstance(v, tuple) else v for k, v in asdict(options).items()},
+    }
+    return Case(case.anatomy, case.labels, up, report, case.ct)
+
+
+def _from_volume(path: Path, options: PrepareOptions) -> Case:
+    raw = read_raw(path, options.series)
+    as_labels = options.labels or (path.is_file() and is_label_map(raw))
+    ct = None
+    if as_labels:
+        source, hint = labels_of(raw, path), []
+        if not options.labels:
+            hint = ["few distinct whole numbers: read as a label map, not as a CT"]
+        del raw  # the largest maps are gigabytes: one copy is enough
+        labels, notes = select_labels(
+            source, options.side, options.organ, options.tumor, options.min_tumor_ml
+        )
+        notes = hint + notes
+    else:
+        volume = volume_of(raw, path)
+        del raw
+        labels, notes = segment_ct(
+            volume, options.kidney_hu, options.tumor_hu, options.min_tumor_ml
+        )
+        ct = _crop_ct(volume, labels)
+    anatomy, surface = surfaces(labels)
+    report = {
+        "kind": "label map" if as_labels else "ct",
+        "notes": notes,
+        "volumes_ml": volumes_ml(labels),
+        "surface": {k: list(v) for k, v in asdict(surface).items()},
+        "spacing_mm": spacing_mm(labels.lps_from_index).tolist(),
+    }
+    return Case(anatomy, labels, (0.0, -1.0, 0.0), report, ct)
+
+
+def _from_meshes(folder: Path, options: PrepareOptions) -> Case:
+    anatomy, notes = read_mesh_folder(folder, options.unit)
+    labels = label_meshes(anatomy)
+    return Case(anatomy, labels, (0.0, -1.0, 0.0), _mesh_report(anatomy, labels, notes))
+
+
+def _mesh_report(anatomy: Anatomy, labels: LabelVolume, notes: list[str]) -> dict:
+    mesh_ml = [part.volume_mm3 / 1000 for part in anatomy.parts]
+    return {
+        "kind": "meshes",
+        "notes": notes,
+        "volumes_ml": volumes_ml(labels),
+        "surface": {"names": list(anatomy.names), "mesh_ml": mesh_ml},
+        "spacing_mm": spacing_mm(labels.lps_from_index).tolist(),
+    }
+
+
+def volumes_ml(labels: LabelVolume) -> dict[str, float]:
+    """Volumes by part from the labels; ``kidney`` includes its tumors."""
+    counts = np.bincount(labels.labels.ravel(), minlength=2) * voxel_ml(labels.lps_from_index)
+    tumors = {f"tumor_{n - 1}": float(counts[n]) for n in range(2, len(counts))}
+    return {"kidney": float(counts[1:].sum()), **tumors}
+
+
+def _crop_ct(volume: Volume, labels: LabelVolume) -> Volume:
+    """The CT on the labels' crop; beyond the scan's edge it is air."""
+    index_from_lps = np.linalg.inv(volume.lps_from_index)
+    start = np.rint((index_from_lps @ labels.lps_from_index)[:3, 3]).astype(int)
+    stop = start + labels.labels.shape
+    inner = tuple(
+        slice(max(0, a), min(n, b)) for a, b, n in zip(start, stop, volume.hu.shape, strict=True)
+    )
+    hu = np.full(labels.labels.shape, -1000.0, np.float32)
+    hu[tuple(slice(s.start - a, s.stop - a) for s, a in zip(inner, start, strict=True))] = (
+        volume.hu[inner]
+    )
+    return Volume(hu, labels.lps_from_index)

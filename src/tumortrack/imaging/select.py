@@ -1,0 +1,201 @@
+"""One kidney and its tumors out of a label map."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from tumortrack.core.errors import InputError
+from tumortrack.core.types import FIRST_TUMOR, ORGAN, LabelVolume
+from tumortrack.imaging.grid import bounding_box, components, cropped, moved_origin, voxel_ml
+
+MIN_TUMOR_ML = 0.2
+MIN_KIDNEY_ML, MAX_KIDNEY_ML = 10.0, 2500.0  # a polycystic kidney can pass 2 litres
+_MIDLINE_MARGIN_MM = 20.0
+
+
+@dataclass(frozen=True)
+class _Kidney:
+    piece: int
+    ml: float
+    tumor_ml: float
+    x_mm: float  # LPS: grows to the patient's left
+
+
+def select_labels(
+    label_volume: LabelVolume,
+    side: str | None = None,
+    organ: int = ORGAN,
+    tumor: int | None = None,
+    min_tumor_ml: float = MIN_TUMOR_ML,
+) -> tuple[LabelVolume, list[str]]:
+    """Keep one kidney (label 1) and its tumors (2, 3, ...), cropped with a margin.
+
+    A kidney is a connected piece of organ and tumor voxels of at least 10 ml and a tenth of the
+    largest; all smaller pieces are specks and go. A tumor is a piece of one tumor label inside
+    that kidney; smaller ones than ``min_tumor_ml`` become organ. Different tumor labels keep
+    their order; the pieces of one label follow each other, largest first.
+
+    Args:
+        side: the PATIENT's ``left`` or ``right``; None takes the kidney with most tumor.
+        organ: the organ's label.
+        tumor: the tumor's label; None takes every other label from 2 up, 0 takes none.
+
+    Returns:
+        The selected labels and notes on what was dropped or renumbered.
+
+    Raises:
+        InputError: no organ, no such tumor label, two kidneys without tumor and no ``side``.
+    """
+    labels = label_volume.labels
+    present = [int(n) for n in np.flatnonzero(np.bincount(labels.ravel(order="K"))) if n > 0]
+    tumors = _tumor_labels(present, organ, tumor)
+    wanted = np.zeros(256, bool)
+    wanted[[organ, *tumors]] = True
+    solid = wanted[labels]
+    affine = label_volume.lps_from_index
+    box = bounding_box(solid, affine, 2.0)
+    labels, solid, affine = labels[box], solid[box], moved_origin(affine, box)
+
+    pieces, counts = components(solid)
+    unit = voxel_ml(affine)
+    kidneys = _kidneys(pieces, counts, labels, affine, tumors)
+    middle = label_volume.lps_from_index @ [*(np.array(label_volume.labels.shape) / 2), 1]
+    chosen, notes = _choose_kidney(kidneys, side, float(middle[0]))
+    n_specks = len(counts) - len(kidneys)
+    if n_specks:
+        specks_ml = unit * float(counts[len(kidneys) :].sum())
+        notes.append(f"{n_specks} specks beside the kidneys dropped ({specks_ml:.2f} ml together)")
+    if not MIN_KIDNEY_ML <= chosen.ml <= MAX_KIDNEY_ML:
+        raise InputError(
+            f"label {organ} and its tumors fill {chosen.ml:.1f} ml; a kidney has "
+            f"{MIN_KIDNEY_ML:g} to {MAX_KIDNEY_ML:g} ml. Check --organ, --tumor and the spacing."
+        )
+    kidney = pieces == chosen.piece
+    box = bounding_box(kidney, affine, 2.0)
+    out, more = _number_tumors(
+        np.where(kidney, labels, 0)[box].astype(np.uint8), organ, tumors, unit, min_tumor_ml
+    )
+    return cropped(out, moved_origin(affine, box)), notes + more
+
+
+def _tumor_labels(present: list[int], organ: int, tumor: int | None) -> list[int]:
+    if not present:
+        raise InputError("the label map is empty: every voxel is 0.")
+    if organ not in present:
+        raise InputError(
+            f"the label map has no organ label {organ}; it has {present}. Give --organ N."
+        )
+    if tumor is None:
+        return [n for n in present if n >= FIRST_TUMOR and n != organ]
+    if tumor == 0:
+        return []
+    if tumor not in present or tumor == organ:
+        raise InputError(
+            f"the label map has no tumor label {tumor} besides the organ; it has {present}. "
+            "Give --tumor N, or --tumor 0 for none."
+        )
+    return [tumor]
+
+
+def _kidneys(
+    pieces: np.ndarray,
+    counts: np.ndarray,
+    labels: np.ndarray,
+    lps_from_index: Float[np.ndarray, "4 4"],
+    tumors: list[int],
+) -> list[_Kidney]:
+    """The pieces that are large enough to be a kidney, largest first."""
+    from scipy import ndimage
+
+    unit = voxel_ml(lps_from_index)
+    large = [n for n in range(1, len(counts) + 1) if counts[n - 1] >= max(1, counts[0] / 10)]
+    large = [n for n in large if n == 1 or counts[n - 1] * unit >= MIN_KIDNEY_ML]
+    is_tumor = np.zeros(256, bool)
+    is_tumor[tumors] = True
+    tumor_counts = np.bincount(pieces[is_tumor[labels]], minlength=len(counts) + 1)
+    boxes = ndimage.find_objects(pieces, max_label=len(large))
+    out = []
+    for n in large:
+        box = boxes[n - 1]
+        index = np.argwhere(pieces[box] == n).mean(0) + [s.start for s in box]
+        x_mm = float((lps_from_index @ [*index, 1])[0])
+        out.append(_Kidney(n, float(counts[n - 1] * unit), float(tumor_counts[n] * unit), x_mm))
+    return out
+
+
+def _choose_kidney(
+    kidneys: list[_Kidney], side: str | None, middle_x_mm: float
+) -> tuple[_Kidney, list[str]]:
+    def rank(kidney: _Kidney) -> tuple[float, float]:
+        return (kidney.tumor_ml, kidney.ml)
+
+    if side not in (None, "left", "right"):
+        raise InputError(f"side {side!r} is not understood. Allowed: left, right (the patient's).")
+    if len(kidneys) > 1:
+        xs = [kidney.x_mm for kidney in kidneys]
+        middle_x_mm = (min(xs) + max(xs)) / 2
+    if side is None:
+        if len(kidneys) > 1 and max(k.tumor_ml for k in kidneys) == 0:
+            raise InputError(
+                f"the label map holds {len(kidneys)} kidneys and no tumor. Give --side left or "
+                "--side right (the patient's)."
+            )
+        best = max(kidneys, key=rank)
+        if len(kidneys) == 1:
+            return best, []
+        name = "left" if best.x_mm > middle_x_mm else "right"
+        return best, [f"the patient's {name} kidney was chosen: it bears most tumor"]
+    sign = 1 if side == "left" else -1
+    # One kidney alone says nothing of the midline but the image's: near it, trust the user.
+    slack = _MIDLINE_MARGIN_MM if len(kidneys) == 1 else 0.0
+    fitting = [k for k in kidneys if sign * (k.x_mm - middle_x_mm) > -slack]
+    if not fitting:
+        raise InputError(
+            f"no kidney on the patient's {side} side in this label map; its kidney lies on the "
+            "other side. Leave out --side, or check the map's orientation."
+        )
+    notes = ["only one kidney in the map; its side was checked against the image's middle only"]
+    return max(fitting, key=rank), notes if len(kidneys) == 1 else []
+
+
+def _number_tumors(
+    labels: UInt8[np.ndarray, "i j k"],
+    organ: int,
+    tumors: list[int],
+    voxel_volume_ml: float,
+    min_tumor_ml: float,
+) -> tuple[UInt8[np.ndarray, "i j k"], list[str]]:
+    """Renumber to 1, 2, 3, ... without gaps; report what went and what changed its number."""
+    from scipy import ndimage
+
+    notes: list[str] = []
+    solid = labels > 0
+    out = np.where(ndimage.binary_fill_holes(solid), ORGAN, 0).astype(np.uint8)
+    filled_ml = float(out.sum() - solid.sum()) * voxel_volume_ml
+    if filled_ml > 0:
+        notes.append(f"holes of {filled_ml:.2f} ml inside the organ filled")
+    number = FIRST_TUMOR
+    for value in tumors:
+        pieces, counts = components(labels == value)
+        kept = [n for n in range(len(counts)) if counts[n] * voxel_volume_ml >= min_tumor_ml]
+        if lost := len(counts) - len(kept):
+            lost_ml = float(counts[len(kept) :].sum()) * voxel_volume_ml
+            notes.append(
+                f"label {value}: {lost} pieces below {min_tumor_ml:g} ml became organ "
+                f"({lost_ml:.2f} ml together)"
+            )
+        if len(kept) > 1:
+            notes.append(f"label {value} has {len(kept)} separate pieces: one tumor each")
+        for n in kept:
+            if number > 255:
+                raise InputError("more than 254 tumors; raise --min-tumor-ml or check the labels.")
+            out[pieces == n + 1] = number
+            if number != value:
+                notes.append(f"tumor label {value} is now {number}")
+            number += 1
+    if number == FIRST_TUMOR:
+        notes.append("no tumor in this kidney")
+    return out, notes
