@@ -109,6 +109,17 @@ def test_cloud_replays_from_its_seed_and_differs_with_another():
     assert (first != other).any()
 
 
+def test_what_lies_out_of_range_changes_nothing():
+    frame = dome()
+    background = np.where(np.isnan(frame.depth_mm), 200, frame.depth_mm)
+    background[:50] = np.where(background[:50] == 200, 90, background[:50])
+    alone, within = (
+        cloud_from_depth(f, CloudConfig(), np.random.default_rng(4)).points_mm
+        for f in (frame, DepthFrame(background, SMALL))
+    )
+    np.testing.assert_array_equal(alone, within)
+
+
 def test_every_point_in_range_is_drawn_equally_often():
     frame = dome()
     rng = np.random.default_rng(0)

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from tumortrack.core.errors import InputError
 from tumortrack.core.types import DepthFrame, Intrinsics
 from tumortrack.sense.camera import d405, deproject
-from tumortrack.sense.cloud import check_cloud
+from tumortrack.sense.cloud import CloudConfig, check_cloud, cloud_from_depth
 from tumortrack.sense.files import (
     read_cloud,
     read_depth_png,
@@ -279,6 +279,17 @@ def test_depth_png_round_trip_within_half_a_unit(tmp_path):
     write_depth_png(tmp_path / "depth.png", exact)
     again = read_depth_png(tmp_path / "depth.png", tmp_path / "intrinsics.json")
     np.testing.assert_allclose(again.depth_mm, exact.depth_mm, rtol=1e-6)
+
+
+def test_a_stored_frame_gives_the_same_cloud_as_the_live_one(tmp_path):
+    write_depth_png(tmp_path / "depth.png", dome())
+    write_intrinsics(tmp_path / "intrinsics.json", SMALL)
+    stored = read_depth_png(tmp_path / "depth.png", tmp_path / "intrinsics.json")
+    live, again = (
+        cloud_from_depth(frame, CloudConfig(), np.random.default_rng(9)).points_mm
+        for frame in (dome(), stored)
+    )
+    assert np.linalg.norm(live - again, axis=1).max() < 0.0501 * 1.5  # along the line of sight
 
 
 def test_depth_unit_comes_from_the_file_or_the_caller(tmp_path):

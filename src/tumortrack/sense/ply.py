@@ -6,6 +6,7 @@ Format: Turk 1994, "The PLY Polygon File Format".
 
 from __future__ import annotations
 
+import io
 from pathlib import Path
 
 import numpy as np
@@ -73,14 +74,16 @@ def _vertex_layout(lines: list[list[str]], name: str) -> tuple[int, dict[str, st
 def _ascii_points(body: bytes, count: int, columns: list[str], name: str) -> np.ndarray:
     if 2 * count * len(columns) > len(body) + 1:  # a digit and a blank each
         raise InputError(_cut_off(name, count, len(body) // (2 * len(columns))))
-    words = body.split(None, count * len(columns))[: count * len(columns)]
-    if len(words) < count * len(columns):
-        raise InputError(_cut_off(name, count, len(words) // len(columns)))
+    if count == 0:
+        return np.empty((0, 3))
+    axes = [columns.index(axis) for axis in "xyz"]
     try:
-        table = np.array(words, dtype="S32").astype(np.float64).reshape(count, len(columns))
+        points = np.loadtxt(io.BytesIO(body), comments=None, usecols=axes, max_rows=count, ndmin=2)
     except ValueError as error:
-        raise InputError(f"{name} holds something that is no number: {error}.") from error
-    return table[:, [columns.index(axis) for axis in "xyz"]]
+        raise InputError(f"{name} has a vertex that is no row of numbers: {error}.") from error
+    if len(points) < count:
+        raise InputError(_cut_off(name, count, len(points)))
+    return points
 
 
 def _cut_off(name: str, claimed: int, held: int) -> str:
