@@ -24,7 +24,9 @@ _S27, _S30, _S31, _S32 = (np.uint64(s) for s in (27, 30, 31, 32))
 _LOW_14, _LOW_32 = np.uint64(0x3FFF), np.uint64(0xFFFFFFFF)
 _TO_UNIT = 2.0**-32
 
-_jit = numba.njit(cache=True, nogil=True, fastmath={"contract"})
+_NO_RETURN = np.float32(np.nan)
+
+_jit = numba.njit(cache=True, nogil=True)  # no fast-math: a frame replays on every machine
 
 
 @numba.njit(cache=True, inline="always")
@@ -50,8 +52,11 @@ def lose_grazing(true_mm, out_mm, key, share, degrees, pinhole):  # type: ignore
             z = true_mm[v, u]
             if math.isnan(z):
                 continue
-            p = _slope(true_mm[v, max(u - 1, 0)], z, true_mm[v, min(u + 1, width - 1)])
-            q = _slope(true_mm[max(v - 1, 0), u], z, true_mm[min(v + 1, height - 1), u])
+            left = true_mm[v, u - 1] if u > 0 else _NO_RETURN
+            right = true_mm[v, u + 1] if u + 1 < width else _NO_RETURN
+            above = true_mm[v - 1, u] if v > 0 else _NO_RETURN
+            below = true_mm[v + 1, u] if v + 1 < height else _NO_RETURN
+            p, q = _slope(left, z, right), _slope(above, z, below)
             along = z + (u - cx) * p + (v - cy) * q
             normal = (fx * p) ** 2 + (fy * q) ** 2 + along**2
             sight = ((u - cx) / fx) ** 2 + ((v - cy) / fy) ** 2 + 1
