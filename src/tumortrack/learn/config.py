@@ -9,7 +9,7 @@ from tumortrack.learn.network import NetworkConfig
 from tumortrack.simulate.scene import SceneConfig
 
 
-class Schedule(Config):
+class Schedule(Config, frozen=True):
     """Learning rate over the run.
 
     ``decay``: linear warm-up, then constant, then cosine to zero over the last ``tail`` of the
@@ -24,7 +24,7 @@ class Schedule(Config):
     epoch_pairs: int = 31_000
 
 
-class TrainConfig(Config):
+class TrainConfig(Config, frozen=True):
     """Everything that decides the weights, apart from case, seed and number of steps."""
 
     network: NetworkConfig

@@ -24,8 +24,8 @@ _WEIGHTS = "weights.safetensors"
 class Model:
     """A network in evaluation mode and what it was trained for.
 
-    ``query_box_mm``: where the organ can lie, relative to the middle of the observed cloud's
-    bounding box, camera frame (lower and upper corner). ``provenance``: seeds, steps, hashes.
+    ``query_box_mm``: where the organ can lie, relative to the median of the observed points,
+    camera frame (lower and upper corner). ``provenance``: seeds, steps, hashes.
     """
 
     network: OccupancyNetwork

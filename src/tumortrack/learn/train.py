@@ -165,6 +165,7 @@ def train(run: Run, folder: Path, report: Callable[[Status], None]) -> Model:
             "training_s": round(progress.elapsed_s, 1),
             "validation_miou": round(progress.best_miou, 4),
             "device": _device_name(device),
+            "run_sha256": identity,
             "case_sha256": run.case_sha256,
             "up_lps": list(run.up_lps),
         },

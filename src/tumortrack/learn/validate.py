@@ -39,8 +39,7 @@ class ValidationSet:
             points.append(stage.carry(drawn))
             labels.append(answer)
             observed = stage.cloud.points_mm
-            middle = (observed.min(0) + observed.max(0)) / 2
-            organ = stage.carry(vertices) - middle
+            organ = stage.carry(vertices) - np.median(observed, axis=0)
             boxes.append((organ.min(0), organ.max(0)))
         n = min(map(len, clouds))
         self._clouds = torch.from_numpy(np.stack([c[:n] for c in clouds])).to(device)

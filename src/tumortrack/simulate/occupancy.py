@@ -18,7 +18,7 @@ from tumortrack.core.config import Config
 from tumortrack.core.types import Anatomy, Mesh
 
 
-class OccupancyConfig(Config):
+class OccupancyConfig(Config, frozen=True):
     """SortSample's numbers."""
 
     per_side: int = 256  # k: points kept inside and outside of each part

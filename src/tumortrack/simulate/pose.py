@@ -13,7 +13,7 @@ from tumortrack.core.geometry import rigid, rotation_onto
 from tumortrack.core.types import Mesh
 
 
-class PoseConfig(Config):
+class PoseConfig(Config, frozen=True):
     """Random poses of the organ.
 
     ``full``: every rotation, uniformly (the paper's M_full). ``limited``: any turn about the

@@ -34,7 +34,7 @@ from tumortrack.simulate.pose import PoseConfig, sample_pose
 STREAMS = ("train", "validation", "test")
 
 
-class SceneConfig(Config):
+class SceneConfig(Config, frozen=True):
     """How scenes are made.
 
     A share ``free_range`` of them is seen from any distance and not cropped by depth: a cloud

@@ -62,7 +62,7 @@ class Drags:
         }
 
 
-class DragConfig(Config, tag="drag"):
+class DragConfig(Config, frozen=True, tag="drag"):
     """Drags of vertices that the camera sees, by default the table's configuration 3."""
 
     steps: tuple[Step, ...] = CONFIGURATIONS[3]

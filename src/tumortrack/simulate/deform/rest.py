@@ -17,7 +17,7 @@ class Rest:
         return {"kind": "rest"}
 
 
-class RestConfig(Config, tag="rest"):
+class RestConfig(Config, frozen=True, tag="rest"):
     """The identity, for rigid scenes."""
 
     def sample(self, view: View, rng: np.random.Generator) -> Rest:

@@ -1,0 +1,265 @@
+"""The command line: one function a command, its types are its options."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Literal
+
+import tyro
+from tyro.conf import Positional
+
+from tumortrack.core.errors import TumortrackError
+
+
+def prepare(
+    input: Positional[Path],
+    case: Positional[Path],
+    /,
+    *,
+    kidney_hu: tuple[float, float] = (-300.0, 300.0),
+    tumor_hu: tuple[float, float] = (300.0, 1000.0),
+    labels: bool = False,
+    side: Literal["left", "right"] | None = None,
+    organ: int = 1,
+    tumor: int | None = None,
+    up: str = "anterior",
+    series: str | None = None,
+    unit: Literal["mm", "m"] | None = None,
+    min_tumor_ml: float = 0.2,
+    overwrite: bool = False,
+) -> None:
+    """Make a case from a CT, a label map or a folder of meshes.
+
+    Args:
+        input: DICOM folder, CT volume or label map (.nii, .nii.gz, .nrrd), or folder of meshes.
+        case: folder to write.
+        kidney_hu: HU window of the kidney in a CT: low (inclusive) and high.
+        tumor_hu: HU window of the tumors in a CT.
+        labels: INPUT is a label map (recognised by itself where that is plain).
+        side: the patient's kidney to take; default: the one with the largest tumor.
+        organ: label number of the kidney.
+        tumor: label number of the tumors; default: every label from 2 up. 0: none.
+        up: patient direction that faces the camera: anterior, left, ... or "x,y,z" in LPS.
+        series: which DICOM series, if the folder holds several (UID or number in the list).
+        unit: of mesh files.
+        min_tumor_ml: smaller tumors are reported and dropped.
+        overwrite: replace CASE if it exists.
+    """
+    from tumortrack.app import commands
+    from tumortrack.imaging.prepare import PrepareOptions
+
+    options = PrepareOptions(
+        kidney_hu=kidney_hu,
+        tumor_hu=tumor_hu,
+        labels=labels,
+        side=side,
+        organ=organ,
+        tumor=tumor,
+        up=up,
+        series=series,
+        unit=unit,
+        min_tumor_ml=min_tumor_ml,
+    )
+    commands.prepare(input, case, options, overwrite)
+
+
+def train(
+    case: Positional[Path],
+    model: Positional[Path],
+    /,
+    *,
+    preset: Literal["quick", "paper"] = "quick",
+    rotations: Literal["limited", "full"] = "limited",
+    minutes: float | None = None,
+    steps: int | None = None,
+    seed: int = 0,
+    device: Literal["auto", "cpu", "cuda"] = "auto",
+    workers: int | None = None,
+) -> None:
+    """Train a model for a case; the same command resumes after Ctrl-C or a crash.
+
+    Args:
+        case: folder that `prepare` wrote.
+        model: folder to write.
+        preset: network and rules of training.
+        rotations: poses to learn: any turn about the camera's axis and tilts up to 15 degrees,
+            or every rotation.
+        minutes: stop after about so long (default: the preset's end).
+        steps: stop after exactly so many steps.
+        seed: of weights and scenes.
+        device: auto takes CUDA where it is.
+        workers: processes that make scenes (default: as the machine allows).
+    """
+    from tumortrack.app import commands
+
+    commands.train(
+        case,
+        model,
+        commands.TrainOptions(preset, rotations, minutes, steps, seed, device, workers),
+    )
+
+
+def locate(
+    model: Positional[Path],
+    cloud: Positional[Path],
+    out: Positional[Path],
+    /,
+    *,
+    grid: int = 160,
+    seed: int = 0,
+    range: tuple[float, float] | None = None,
+    unit: Literal["mm", "m"] = "mm",
+    intrinsics: Path | None = None,
+    device: Literal["auto", "cpu", "cuda"] = "auto",
+    overwrite: bool = False,
+) -> None:
+    """Locate kidney and tumors in one cloud or depth image.
+
+    Args:
+        model: folder that `train` wrote.
+        cloud: .ply, .pcd or .npz in the camera frame, or a depth .png (with --intrinsics).
+        out: folder to write.
+        grid: voxels along the longest side of the labelled volume, up to 400.
+        seed: of the random points and queries.
+        range: keep depths between NEAR and FAR mm; a cloud is else used as it is, a depth image
+            cropped by the range the model was trained for.
+        unit: of the cloud's numbers.
+        intrinsics: JSON with width, height, fx, fy, cx, cy in pixels.
+        device: auto takes CUDA where it is.
+        overwrite: replace OUT if it exists.
+    """
+    from tumortrack.app import commands
+
+    commands.locate(
+        model,
+        cloud,
+        out,
+        commands.LocateOptions(grid, seed, range, unit, intrinsics, device, overwrite),
+    )
+
+
+def simulate(
+    case: Positional[Path],
+    dataset: Positional[Path],
+    /,
+    *,
+    scenes: int = 20,
+    seed: int = 0,
+    configuration: tuple[Literal[1, 2, 3, 4, 5, 6], ...] = (3,),
+    falloff: Literal["sigma", "variance"] = "sigma",
+    rotations: Literal["limited", "full"] = "limited",
+    noise: bool = True,
+) -> None:
+    """Write deformed scenes of a case with their truth: what `evaluate` reads.
+
+    Args:
+        case: folder that `prepare` wrote.
+        dataset: folder to write.
+        scenes: how many.
+        seed: of the scenes; they are never those that training sees.
+        configuration: of the paper's deformation table; several are mixed.
+        falloff: how the table's third number is read (docs/method.md).
+        rotations: poses, as in `train`.
+        noise: with the depth sensor's noise.
+    """
+    from tumortrack.app import commands
+
+    commands.simulate(
+        case,
+        dataset,
+        commands.SimulateOptions(scenes, seed, configuration, falloff, rotations, noise),
+    )
+
+
+def evaluate(
+    model: Positional[Path],
+    variants: Positional[Path],
+    report: Positional[Path],
+    /,
+    *,
+    grid: int = 160,
+    seed: int = 0,
+    device: Literal["auto", "cpu", "cuda"] = "auto",
+) -> None:
+    """Locate in every scene of a folder and compare with the truth.
+
+    Args:
+        model: folder that `train` wrote.
+        variants: folder of scene folders.
+        report: folder to write: report.json, index.html, pictures.
+        grid: voxels along the longest side of the labelled volume.
+        seed: of the random points and queries.
+        device: auto takes CUDA where it is.
+    """
+    from tumortrack.app import commands
+
+    commands.evaluate(model, variants, report, grid, seed, device)
+
+
+def demo(*, out: Path = Path("runs/demo"), minutes: float = 3.0, scenes: int = 20) -> None:
+    """The whole story on the built-in phantom, in a few minutes.
+
+    Args:
+        out: folder for everything the demo makes; what an earlier demo left there is replaced.
+        minutes: of training.
+        scenes: unseen deformed scenes to locate tumors in.
+    """
+    from tumortrack.app.demo import run_demo
+
+    run_demo(out, minutes, scenes)
+
+
+def inspect(path: Positional[Path], /) -> None:
+    """Say what a case, model, run, scene or report is.
+
+    Args:
+        path: folder or file.
+    """
+    from tumortrack.app import commands
+
+    commands.inspect(path)
+
+
+def doctor() -> None:
+    """Say what works on this machine."""
+    from tumortrack.app.doctor import examine
+
+    examine()
+
+
+COMMANDS: dict[str, Callable[..., None]] = {
+    "demo": demo,
+    "prepare": prepare,
+    "train": train,
+    "locate": locate,
+    "simulate": simulate,
+    "evaluate": evaluate,
+    "inspect": inspect,
+    "doctor": doctor,
+}
+
+
+def main() -> None:
+    """Entry point: a known error is one line and an exit code, never a traceback."""
+    try:
+        tyro.extras.subcommand_cli_from_dict(
+            COMMANDS,
+            prog="tumortrack",
+            description="Locate kidney and tumors under deformation from one depth image. "
+            "Research software, not a medical device.",
+        )
+    except TumortrackError as error:
+        print(f"tumortrack: {error}", file=sys.stderr)
+        sys.exit(error.exit_code)
+    except KeyboardInterrupt:
+        print("tumortrack: stopped.", file=sys.stderr)
+        sys.exit(130)
+    except BrokenPipeError:  # `tumortrack inspect X | head`
+        sys.stderr.close()
+        sys.exit(1)
+
+
+if __name__ == "__main__":
+    main()

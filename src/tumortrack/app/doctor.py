@@ -1,0 +1,54 @@
+"""What works on this machine."""
+
+from __future__ import annotations
+
+import os
+import platform
+import shutil
+from importlib import import_module
+from importlib.metadata import version
+from pathlib import Path
+
+from tumortrack.app.console import say
+
+_LIBRARIES = {
+    "torch": "training and locating",
+    "numba": "rendering and deforming",
+    "SimpleITK": "DICOM",
+    "nibabel": "NIfTI",
+    "embreex": "ray visibility",
+    "manifold3d": "mesh unions",
+    "skimage": "surfaces",
+    "trimesh": "mesh files",
+    "pypcd4": ".pcd clouds",
+    "plotly": "3-D page",
+}
+_DISTRIBUTIONS = {"skimage": "scikit-image"}
+
+
+def examine() -> None:
+    """Print the machine, each library by importing it, and what bf16 and CUDA offer."""
+    say(f"tumortrack {version('tumortrack')}, Python {platform.python_version()}")
+    say(f"cores: {len(os.sched_getaffinity(0))}, {platform.machine()}, {platform.system()}")
+    free = shutil.disk_usage(Path.cwd()).free / 2**30
+    say(f"free disk here: {free:.1f} GiB" + (" - little" if free < 2 else ""))
+    for name, purpose in _LIBRARIES.items():
+        try:
+            import_module(name)
+            say(f"ok       {name} {version(_DISTRIBUTIONS.get(name, name))} ({purpose})")
+        except Exception as error:  # whatever a broken installation raises is the finding
+            say(f"BROKEN   {name} ({purpose}): {error}")
+    _examine_torch()
+
+
+def _examine_torch() -> None:
+    import torch
+
+    from tumortrack.learn.model import has_fast_bfloat16
+
+    fast = has_fast_bfloat16(torch.device("cpu"))
+    say(f"CPU bf16: {'in hardware, used' if fast else 'not in hardware; fp32 is used (slower)'}")
+    if torch.cuda.is_available():
+        say(f"CUDA: {torch.cuda.get_device_name()}")
+    else:
+        say("CUDA: none; everything runs on the CPU")

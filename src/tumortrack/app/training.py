@@ -1,0 +1,46 @@
+"""Training as the user sees it: a live line on a terminal, a line now and then elsewhere."""
+
+from __future__ import annotations
+
+import time
+
+from rich.status import Status as Spinner
+
+from tumortrack.app.console import console, say
+from tumortrack.learn.train import Status
+
+_EVERY_S = 15.0  # between lines where there is no terminal
+
+
+class TrainingScreen:
+    """Shows each status it is given."""
+
+    def __init__(self) -> None:
+        self._spinner = Spinner("making labelled points, starting workers ...", console=console)
+        self._said = -_EVERY_S
+
+    def __enter__(self) -> TrainingScreen:
+        if console.is_terminal:
+            self._spinner.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._spinner.stop()
+
+    def show(self, status: Status) -> None:
+        text = _line(status)
+        if console.is_terminal:
+            self._spinner.update(text)
+        elif time.monotonic() - self._said >= _EVERY_S or status.step == status.end:
+            say(text)
+            self._said = time.monotonic()
+
+
+def _line(status: Status) -> str:
+    end = f"/{status.end}" if status.end is not None else ""
+    miou = "-" if status.miou is None else f"{status.miou:.3f}"
+    left = f"{int(status.seconds_left) // 60}:{int(status.seconds_left) % 60:02d}"
+    return (
+        f"step {status.step}{end} | {status.samples_per_s:.0f} samples/s | loss {status.loss:.4f} "
+        f"| validation mIoU {miou} | {left} left"
+    )

@@ -1,0 +1,133 @@
+"""The dense answer: labels on a voxel grid, smooth closed surfaces, and numbers per part."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from jaxtyping import Float16, Float64, UInt8
+
+from tumortrack.core.geometry import transform_points
+from tumortrack.core.types import FIRST_TUMOR, Mesh, OccupancyCloud
+
+_AT_ONCE = 2**18  # queries; bounds the memory whatever the grid
+_LARGEST_MARGIN = 30.0  # logits beyond say no more about where a surface lies
+
+
+def grid_over(
+    points_mm: np.ndarray, grid: int
+) -> tuple[Float64[np.ndarray, "4 4"], tuple[int, int, int]]:
+    """``camera_from_index`` and shape of cubic voxels over the points' box, 4 % larger, with
+    ``grid`` voxels along its longest side."""
+    lower, upper = points_mm.min(0).astype(float), points_mm.max(0).astype(float)
+    margin = 0.02 * (upper - lower).max()
+    lower, upper = lower - margin, upper + margin
+    voxel = (upper - lower).max() / grid
+    shape = np.maximum(np.ceil((upper - lower) / voxel - 1e-9).astype(int), 2)
+    camera_from_index = np.diag([voxel, voxel, voxel, 1.0])
+    camera_from_index[:3, 3] = (lower + upper) / 2 - voxel * (shape - 1) / 2
+    i, j, k = (int(n) for n in shape)
+    return camera_from_index, (i, j, k)
+
+
+def dense_margins(
+    logits_at: Callable[[np.ndarray], torch.Tensor],
+    camera_from_index: Float64[np.ndarray, "4 4"],
+    shape: tuple[int, int, int],
+) -> tuple[Float16[np.ndarray, "parts i j k"], UInt8[np.ndarray, "i j k"]]:
+    """Ask at every voxel centre; labels, and per part by how much it wins (positive inside).
+
+    The organ's margin is that of the best label inside against the outside, so that its zero
+    set is the whole organ's surface; a tumor's is against the best other label. Half precision:
+    2 bytes a voxel and part, 0.4 GB at 400^3 with two tumors.
+    """
+    i, j, k = shape
+    labels = np.empty(shape, np.uint8)
+    margins: np.ndarray | None = None
+    slabs = max(1, _AT_ONCE // (j * k))
+    plane = np.stack(np.meshgrid(np.arange(j), np.arange(k), indexing="ij"), -1).reshape(-1, 2)
+    for first in range(0, i, slabs):
+        rows = np.arange(first, min(first + slabs, i))
+        index = np.empty((len(rows), len(plane), 3))
+        index[:, :, 0], index[:, :, 1:] = rows[:, None], plane
+        points = transform_points(camera_from_index, index.reshape(-1, 3)).astype(np.float32)
+        logits = logits_at(points)
+        won = _margins(logits).clamp(-_LARGEST_MARGIN, _LARGEST_MARGIN).half().cpu().numpy()
+        if margins is None:
+            margins = np.empty((won.shape[1], *shape), np.float16)
+        block = (len(rows), j, k)
+        labels[rows] = logits.argmax(-1).to(torch.uint8).cpu().numpy().reshape(block)
+        margins[:, rows] = won.T.reshape(-1, *block)
+    assert margins is not None
+    return margins, labels
+
+
+def _margins(logits: torch.Tensor) -> torch.Tensor:
+    """(n, classes) -> (n, parts)."""
+    columns = [logits[:, 1:].amax(1) - logits[:, 0]]
+    for label in range(FIRST_TUMOR, logits.shape[1]):
+        others = torch.cat([logits[:, :label], logits[:, label + 1 :]], 1).amax(1)
+        columns.append(logits[:, label] - others)
+    return torch.stack(columns, 1)
+
+
+def part_surfaces(
+    margins: Float16[np.ndarray, "parts i j k"],
+    labels: UInt8[np.ndarray, "i j k"],
+    camera_from_index: Float64[np.ndarray, "4 4"],
+    names: tuple[str, ...],
+) -> dict[str, Mesh]:
+    """The largest piece of each part as a closed surface; parts without a voxel are left out."""
+    from scipy import ndimage
+
+    meshes = {}
+    for n, name in enumerate(names):
+        mask = labels > 0 if n == 0 else labels == n + 1
+        pieces, count = ndimage.label(mask)
+        if count == 0:
+            continue
+        largest = 1 + int(np.argmax(np.bincount(pieces.ravel())[1:]))
+        box = ndimage.find_objects(pieces)[largest - 1]
+        field = np.where(pieces[box] == largest, margins[n][box], -np.abs(margins[n][box]))
+        meshes[name] = _surface(field.astype(np.float32), camera_from_index, box)
+    return meshes
+
+
+def _surface(
+    field: np.ndarray, camera_from_index: Float64[np.ndarray, "4 4"], box: tuple[slice, ...]
+) -> Mesh:
+    from skimage import measure
+
+    outside = -max(float(np.abs(field).max()), 1e-3)
+    padded = np.pad(field, 1, constant_values=outside)  # closes what the grid's edge cuts
+    vertices, faces, _, _ = measure.marching_cubes(padded, 0.0, gradient_direction="ascent")
+    index = vertices.astype(np.float64) - 1 + [part.start for part in box]
+    mesh = Mesh(transform_points(camera_from_index, index), faces)
+    return mesh if mesh.volume_mm3 > 0 else Mesh(mesh.vertices_mm, faces[:, ::-1])
+
+
+def describe_parts(
+    names: tuple[str, ...], meshes: dict[str, Mesh], inside: OccupancyCloud
+) -> dict[str, dict]:
+    """Per part: volume, centre, box and how sure the labels inside it are (JSON types).
+
+    The kidney's numbers are those of the whole organ, tumors included.
+    """
+    parts: dict[str, dict] = {}
+    for n, name in enumerate(names):
+        mine = inside.labels > 0 if n == 0 else inside.labels == n + 1
+        if name not in meshes:
+            parts[name] = {"label": n + 1, "found": False}
+            continue
+        mesh = meshes[name]
+        parts[name] = {
+            "label": n + 1,
+            "found": True,
+            "volume_ml": mesh.volume_mm3 / 1000,
+            "center_mm": mesh.box_mm.mean(0).tolist(),
+            "box_mm": mesh.box_mm.tolist(),
+            "points": int(mine.sum()),
+            "probability": float(inside.probability[mine].mean()) if mine.any() else None,
+        }
+    return parts
