@@ -19,6 +19,9 @@ from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError
 from tumortrack.core.types import FIRST_TUMOR, ORGAN, LabelVolume
 
+# The three axes of a grid in the organ frame, mm.
+Axes = tuple[Float[np.ndarray, " i"], Float[np.ndarray, " j"], Float[np.ndarray, " k"]]
+
 SMALLEST_GAP_MM = 3.0  # between tumors: closer ones merge in a CT's partial-volume rim
 
 
@@ -48,7 +51,8 @@ class PhantomParameters(Config, frozen=True):
     """How far the poles lean medially."""
     taper: float = 0.10
     """How much thicker the superior pole is, and thinner the inferior one."""
-    hilum_depth_mm: float = 15.0
+    hilum_depth_mm: float = 18.0
+    """Of the carving tool; its rounded rim leaves a dent some 4 mm shallower."""
     lump_mm: float = 1.2
     shape_seed: int = 1
     """Places the lumps of the organ and the lobes of the tumors."""
@@ -84,7 +88,7 @@ def second_phantom() -> PhantomParameters:
         size_mm=(56.0, 47.0, 104.0),
         bend_mm=9.0,
         taper=0.04,
-        hilum_depth_mm=13.0,
+        hilum_depth_mm=16.0,
         shape_seed=7,
         tumors=(
             TumorParameters(diameter_mm=30.0, center_mm=(-3.0, 1.0, -20.0)),
@@ -113,7 +117,8 @@ def phantom_labels(parameters: PhantomParameters, voxel_mm: float = 0.8) -> Labe
         upper_mm = np.maximum(upper_mm, np.array(tumor.center_mm) + radius_mm)
     counts = np.ceil((upper_mm - lower_mm + 8) / voxel_mm).astype(int) + 1
     start_mm = (lower_mm + upper_mm) / 2 - (counts - 1) / 2 * voxel_mm
-    axes = [s + voxel_mm * np.arange(n) for s, n in zip(start_mm, counts, strict=True)]
+    x, y, z = (s + voxel_mm * np.arange(n) for s, n in zip(start_mm, counts, strict=True))
+    axes = (x, y, z)
     inside = organ_mask(parameters, axes)
     labels = np.where(inside, ORGAN, 0).astype(np.uint8)
     for n, mask in enumerate(tumor_masks(parameters, axes)):
@@ -127,7 +132,7 @@ def phantom_labels(parameters: PhantomParameters, voxel_mm: float = 0.8) -> Labe
     lps_from_index[:3, 3] = np.array(parameters.center_lps_mm) + start_mm
     if parameters.side == "left":  # mirror the body, keep the axes' directions
         labels = labels[::-1]
-        lps_from_index[0, 3] = parameters.center_lps_mm[0] - axes[0][-1]
+        lps_from_index[0, 3] = parameters.center_lps_mm[0] - x[-1]
     return LabelVolume(labels, lps_from_index)
 
 
@@ -142,11 +147,10 @@ def gap_mm(one: TumorParameters, other: TumorParameters) -> float:
     return float(np.linalg.norm(np.subtract(one.center_mm, other.center_mm)) - sum(radii_mm))
 
 
-def organ_mask(
-    parameters: PhantomParameters, axes_mm: list[Float[np.ndarray, " n"]]
-) -> Bool[np.ndarray, "i j k"]:
+def organ_mask(parameters: PhantomParameters, axes_mm: Axes) -> Bool[np.ndarray, "i j k"]:
     """Where the organ is, tumors aside, on the grid of three axes (organ frame, mm)."""
-    raw = [np.linspace(-r, r, 65) for r in 0.75 * np.array(parameters.size_mm)]
+    x, y, z = (np.linspace(-0.75 * length, 0.75 * length, 65) for length in parameters.size_mm)
+    raw = (x, y, z)
     field = _organ_field(parameters, raw)
     stretched = []
     # Bending, hilum and lumps change the box: stretch each axis so that it has the stated size.
@@ -155,7 +159,8 @@ def organ_mask(
         low, high = _crossings(raw[axis], field.min(axis=rest))
         scale = (high - low) / length_mm
         stretched.append(np.asarray(axes_mm[axis]) * scale + (low + high) / 2)
-    return _organ_field(parameters, stretched) < 0
+    x, y, z = stretched
+    return _organ_field(parameters, (x, y, z)) < 0
 
 
 def _crossings(
@@ -170,9 +175,7 @@ def _crossings(
     return ends[0], ends[1]
 
 
-def _organ_field(
-    parameters: PhantomParameters, axes_mm: list[Float[np.ndarray, " n"]]
-) -> Float[np.ndarray, "i j k"]:
+def _organ_field(parameters: PhantomParameters, axes_mm: Axes) -> Float[np.ndarray, "i j k"]:
     """About the signed distance to the organ's raw surface in mm, negative inside."""
     x, y, z = np.meshgrid(*axes_mm, indexing="ij", sparse=True)
     rx, ry, rz = np.array(parameters.size_mm) / 2
@@ -219,9 +222,7 @@ def _lumps(parameters: PhantomParameters, point_mm: tuple[np.ndarray, ...]) -> n
     return total
 
 
-def tumor_masks(
-    parameters: PhantomParameters, axes_mm: list[Float[np.ndarray, " n"]]
-) -> list[Bool[np.ndarray, "i j k"]]:
+def tumor_masks(parameters: PhantomParameters, axes_mm: Axes) -> list[Bool[np.ndarray, "i j k"]]:
     """Where each tumor is, in label order, on the grid of three axes (organ frame, mm)."""
     masks = []
     for number, tumor in enumerate(sorted_tumors(parameters)):

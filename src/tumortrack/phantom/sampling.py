@@ -9,6 +9,7 @@ import numpy as np
 from tumortrack.core.errors import NoEstimate
 from tumortrack.phantom.digital import (
     SMALLEST_GAP_MM,
+    Axes,
     PhantomParameters,
     TumorParameters,
     gap_mm,
@@ -73,7 +74,7 @@ def _random_shape(rng: np.random.Generator) -> PhantomParameters:
         ),
         bend_mm=float(rng.uniform(7, 14)),
         taper=float(rng.uniform(0.03, 0.15)),
-        hilum_depth_mm=float(rng.uniform(9, 16)),
+        hilum_depth_mm=float(rng.uniform(11, 19)),
         lump_mm=float(rng.uniform(0.5, 1.5)),
         shape_seed=int(rng.integers(2**31)),
         tumors=(),
@@ -130,10 +131,11 @@ def _replace_tumors(
     return msgspec.structs.replace(phantom, tumors=tumors)
 
 
-def _axes_round(parameters: PhantomParameters, voxel_mm: float) -> list[np.ndarray]:
+def _axes_round(parameters: PhantomParameters, voxel_mm: float) -> Axes:
     """Grid axes in the organ frame that hold organ and tumors."""
     reach_mm = np.array(parameters.size_mm) / 2 + 2 * voxel_mm
     for tumor in parameters.tumors:
         radius_mm = tumor.diameter_mm / 2 * (1 + tumor.lobulation)
         reach_mm = np.maximum(reach_mm, np.abs(tumor.center_mm) + radius_mm + voxel_mm)
-    return [np.arange(-r, r + voxel_mm, voxel_mm) for r in reach_mm]
+    x, y, z = (np.arange(-r, r + voxel_mm, voxel_mm) for r in reach_mm)
+    return x, y, z
