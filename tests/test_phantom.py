@@ -194,6 +194,14 @@ def test_refusals():
         PhantomParameters(size_mm=(0.06, 0.05, 0.11))
     with pytest.raises(InputError, match="psf_sigma_mm"):
         ScannerParameters(psf_sigma_mm=float("nan"))
+    with pytest.raises(InputError, match="50 million"):
+        phantom_labels(PhantomParameters(size_mm=(200.0, 200.0, 200.0)), 0.3)
+    with pytest.raises(InputError, match="-200 to 200"):
+        TumorParameters(diameter_mm=30.0, center_mm=(0.0, float("nan"), 0.0))
+    with pytest.raises(InputError, match="block_size_mm"):
+        ScannerParameters(block_size_mm=(-1.0, 2.0, 3.0))
+    with pytest.raises(InputError, match="tilt_deg"):
+        ScannerParameters(tilt_deg=(float("nan"), 0.0, 0.0))
     with pytest.raises(InputError, match="spacing"):
         ScannerParameters(spacing_mm=(0.0, 1.0, 1.0))
 

@@ -19,6 +19,8 @@ from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError
 from tumortrack.core.types import FIRST_TUMOR, ORGAN, LabelVolume
 
+_LARGEST_GRID = 50_000_000  # voxels
+
 # The three axes of a grid in the organ frame, mm.
 Axes = tuple[Float[np.ndarray, " i"], Float[np.ndarray, " j"], Float[np.ndarray, " k"]]
 
@@ -40,6 +42,8 @@ class TumorParameters(Config, frozen=True):
                 f"tumor of {self.diameter_mm} mm with lobulation {self.lobulation}: allowed are "
                 "2 to 120 mm and 0 to 0.2."
             )
+        if not all(abs(coordinate) <= 200 for coordinate in self.center_mm):
+            raise InputError(f"tumor at {self.center_mm} mm: allowed are -200 to 200 mm.")
 
 
 class PhantomParameters(Config, frozen=True):
@@ -105,7 +109,7 @@ def phantom_labels(parameters: PhantomParameters, voxel_mm: float = 0.8) -> Labe
     over the organ.
 
     Raises:
-        InputError: ``voxel_mm`` outside 0.2..4, or a tumor wholly outside the organ.
+        InputError: ``voxel_mm`` outside 0.2..4, more than 50 million voxels, or a tumor wholly outside the organ.
     """
     if not 0.2 <= voxel_mm <= 4:
         raise InputError(f"voxel size {voxel_mm} mm: allowed are 0.2 to 4 mm.")
@@ -116,6 +120,11 @@ def phantom_labels(parameters: PhantomParameters, voxel_mm: float = 0.8) -> Labe
         lower_mm = np.minimum(lower_mm, np.array(tumor.center_mm) - radius_mm)
         upper_mm = np.maximum(upper_mm, np.array(tumor.center_mm) + radius_mm)
     counts = np.ceil((upper_mm - lower_mm + 8) / voxel_mm).astype(int) + 1
+    if counts.prod() > _LARGEST_GRID:
+        raise InputError(
+            f"the phantom would have {' x '.join(map(str, counts))} voxels; at most 50 million are "
+            "allowed. Choose a larger voxel size."
+        )
     start_mm = (lower_mm + upper_mm) / 2 - (counts - 1) / 2 * voxel_mm
     x, y, z = (s + voxel_mm * np.arange(n) for s, n in zip(start_mm, counts, strict=True))
     axes = (x, y, z)

@@ -58,6 +58,10 @@ class ScannerParameters(Config, frozen=True):
                 raise InputError(f"{name} = {getattr(self, name)}: allowed are -1000 to 3000.")
         lengths = ("margin_mm", "table_thickness_mm", "table_gap_mm", "block_gap_mm")
         blurs = ("psf_sigma_mm", "noise_hu", "noise_correlation_voxels")
+        if not all(0 <= length <= 200 for length in self.block_size_mm):
+            raise InputError(f"block_size_mm = {self.block_size_mm}: allowed are 0 to 200 mm.")
+        if not all(-180 <= angle <= 180 for angle in self.tilt_deg):
+            raise InputError(f"tilt_deg = {self.tilt_deg}: allowed are -180 to 180 degrees.")
         for name in (*lengths, *blurs):
             if not 0 <= getattr(self, name) <= 200:
                 raise InputError(f"{name} = {getattr(self, name)}: allowed are 0 to 200.")
