@@ -109,7 +109,8 @@ def phantom_labels(parameters: PhantomParameters, voxel_mm: float = 0.8) -> Labe
     over the organ.
 
     Raises:
-        InputError: ``voxel_mm`` outside 0.2..4, more than 50 million voxels, or a tumor wholly outside the organ.
+        InputError: ``voxel_mm`` outside 0.2..4, more than 50 million voxels, or a tumor wholly
+            outside the organ.
     """
     if not 0.2 <= voxel_mm <= 4:
         raise InputError(f"voxel size {voxel_mm} mm: allowed are 0.2 to 4 mm.")

@@ -1,0 +1,20 @@
+"""Reading volumes at points of the patient, in tests."""
+
+import numpy as np
+from scipy import ndimage
+
+from tumortrack.core.geometry import transform_points
+from tumortrack.core.types import Volume
+
+
+def read_at(volume, points_lps_mm, order=0):
+    """Values of a volume at points given in LPS."""
+    values = volume.hu if isinstance(volume, Volume) else volume.labels
+    index = transform_points(np.linalg.inv(volume.lps_from_index), points_lps_mm)
+    return ndimage.map_coordinates(
+        values.astype(float), index.T, order=order, mode="constant", cval=np.nan
+    )
+
+
+def lps_of(volume, index):
+    return transform_points(volume.lps_from_index, np.asarray(index, float))
