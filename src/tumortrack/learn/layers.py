@@ -34,11 +34,14 @@ class Layer(nn.Module):
         return out
 
     def activate(self, linear_out: Tensor) -> Tensor:
-        """Batch norm and ReLU of what the linear part gave; may overwrite it."""
+        """Batch norm and ReLU of what the linear part gave; it is overwritten."""
         return functional.relu(self.normalise(linear_out), inplace=True)
 
     def forward(self, x: Tensor) -> Tensor:
-        return self.activate(self.linear(x))
+        # In rows: the output of a linear layer on more axes is a view, and overwriting a view
+        # makes autograd copy it.
+        rows = self.activate(self.linear(x.flatten(0, -2)))
+        return rows.unflatten(0, x.shape[:-1])
 
     @torch.no_grad()
     def fold(self) -> None:

@@ -148,7 +148,7 @@ def quick_network(n_classes: int, scale_mm: float) -> NetworkConfig:
             n_points=512,
         ),
         decoder=MlpDecoderConfig(
-            n_classes=n_classes, width=128, hidden_layers=5, skip_layer=3, octaves=(0, 1, 2)
+            n_classes=n_classes, width=128, hidden_layers=5, octaves=(0, 1, 2)
         ),
         normalisation=FixedScale(scale_mm=scale_mm),
     )

@@ -89,7 +89,7 @@ class MlpDecoder(nn.Module):
                 weight = layer.linear.weight[:, : n_hidden + self.query_size]
                 out = functional.linear(query, weight[:, n_hidden:]) + remaining.pop(0)
                 if hidden is not None:
-                    out = out + functional.linear(hidden, weight[:, :n_hidden])
+                    out += functional.linear(hidden, weight[:, :n_hidden])
                 hidden = layer.activate(out)
             else:
                 hidden = layer(hidden)

@@ -10,7 +10,7 @@ from torch.nn import functional
 
 from tumortrack.core.config import Config
 from tumortrack.learn.layers import Layer, Norm, stack
-from tumortrack.learn.sampling import Sampling, ball_query, choose_points, take
+from tumortrack.learn.sampling import Sampling, ball_query, choose_points, strided_points, take
 
 
 class SetAbstraction(Config, frozen=True):
@@ -30,8 +30,8 @@ class SetAbstraction(Config, frozen=True):
 class PointNet2Config(Config, frozen=True, tag="pointnet2"):
     """``levels``, then an MLP of ``widths`` on [position, feature] and its maximum: the latent.
 
-    ``n_points``: larger clouds are thinned to so many first (None: take all).
-    ``sampling``: how points and centres are chosen; ``strided`` needs points in random order.
+    ``n_points``: larger clouds are first thinned to so many, by stride (None: take all).
+    ``sampling``: how the centres are chosen. Stride needs points in random order.
     """
 
     levels: tuple[SetAbstraction, ...]
@@ -65,7 +65,7 @@ class PointNet2(nn.Module):
     def forward(self, points: Tensor) -> Tensor:
         limit = self.config.n_points
         if limit is not None and points.shape[1] > limit:
-            points = take(points, choose_points(points, limit, self.config.sampling))
+            points = take(points, strided_points(points, limit))
         features: Tensor | None = None
         for level in self.levels:
             points, features = level(points, features)
