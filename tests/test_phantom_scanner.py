@@ -105,6 +105,27 @@ def test_partial_volume_rim_has_the_width_of_the_blur():
     assert -offset / slope == pytest.approx(0, abs=0.05)  # the wall stays where it was
 
 
+def test_the_block_is_blurred_by_the_voxel_too():
+    """A tilted grid meets the block's face at every phase: the rise is that of the full blur."""
+    from scipy.special import ndtri
+
+    source = LabelVolume(np.ones((20, 20, 60)), np.eye(4))
+    parameters = ScannerParameters(
+        spacing_mm=(1.5, 0.5, 0.5), psf_sigma_mm=0.3, noise_hu=0.0, tilt_deg=(0.0, 0.0, 10.0)
+    )
+    ct = scan(source, parameters, 0)
+    points = lps_of(ct, np.indices(ct.hu.shape).reshape(3, -1).T)
+    face = -1 - parameters.block_gap_mm  # the label map's box begins one empty voxel before 0
+    near = (np.abs(points - [face, 8, 25]) < [4, 6, 10]).all(1)
+    at, share = points[near, 0] - face, (ct.hu.ravel()[near] + 1000) / 1340
+    rising = (share > 0.05) & (share < 0.95)
+    slope, offset = np.polyfit(at[rising], ndtri(share[rising]), 1)
+    cosine, sine = np.cos(np.deg2rad(10)), np.sin(np.deg2rad(10))
+    blur = np.sqrt(0.3**2 + ((1.5 * cosine) ** 2 + (0.5 * sine) ** 2) / 12)
+    assert -1 / slope == pytest.approx(blur, rel=0.03)
+    assert -offset / slope == pytest.approx(0, abs=0.03)
+
+
 def test_table_and_block_are_there_and_apart_from_the_phantom(ct, labels):
     parts, count = ndimage.label(ct.hu > -300)
     sizes = np.bincount(parts.ravel())[1:] * spacing_mm(ct.lps_from_index).prod() / 1000
