@@ -109,7 +109,8 @@ def surface_distances(
         symmetric_mm=float(max(out.max(), back.max())),
         one_sided_mm=float(out.max()),
         percentile_95_mm=max(
-            weighted_percentile(out, weights_out, 95), weighted_percentile(back, weights_back, 95)
+            weighted_percentile(out, weights_out, 95.0),
+            weighted_percentile(back, weights_back, 95.0),
         ),
         mean_mm=float(np.average(out, weights=weights_out) / 2)
         + float(np.average(back, weights=weights_back) / 2),

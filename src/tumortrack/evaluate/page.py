@@ -96,7 +96,12 @@ def thinned(mesh: Mesh, cell_mm: float) -> Mesh:
     means = [np.bincount(group, mesh.vertices_mm[:, axis]) / count for axis in range(3)]
     a, b, c = group[mesh.faces].T
     proper = (a != b) & (b != c) & (c != a)
-    return Mesh(np.stack(means, axis=1), np.stack([a, b, c], axis=1)[proper])
+    faces = np.stack([a, b, c], axis=1)[proper]
+    # A thin fold collapses onto two sheets with the same corners: drop what occurs in pairs.
+    _, kind, times = np.unique(
+        np.sort(faces, axis=1), axis=0, return_inverse=True, return_counts=True
+    )
+    return Mesh(np.stack(means, axis=1), faces[times[kind.reshape(-1)] % 2 == 1])
 
 
 def _layer(kind: str, name: str, part: str, mesh: Mesh) -> dict:

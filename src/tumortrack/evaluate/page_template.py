@@ -89,8 +89,8 @@ function trace(layer) {
            showlegend: true, visible: truth ? "legendonly" : true,
            color: truth ? "#005aa0" : kidney ? "#b96653" : tumorColors[(number - 1) % 4],
            opacity: kidney ? 0.28 : 1, flatshading: false,
-           lighting: { ambient: 0.55, diffuse: 0.6, specular: 0.3, roughness: 0.5, fresnel: 0.1 },
-           lightposition: { x: -20000, y: 10000, z: -100000 } };
+           lighting: { ambient: 0.7, diffuse: 0.5, specular: 0.2, roughness: 0.5, fresnel: 0.1 },
+           lightposition: { x: -60000, y: 100000, z: 0 } };
 }
 const axis = (title) => ({ title: { text: title }, backgroundcolor: "#fafbfc",
                            showbackground: true, gridcolor: "#dde3e9" });
@@ -98,7 +98,7 @@ const layout = {
   margin: { l: 0, r: 0, t: 0, b: 0 }, legend: { x: 0.01, y: 0.99 },
   scene: { aspectmode: "data", dragmode: "orbit",
            xaxis: axis("x mm"), yaxis: axis("y mm"), zaxis: axis("z mm"),
-           camera: { up: { x: 0, y: -0.6, z: -1 }, eye: { x: -0.3, y: 0.95, z: -1.05 } } },
+           camera: { up: { x: 0, y: -0.6, z: -1 }, eye: { x: -0.38, y: 1.2, z: -1.3 } } },
   uirevision: "one view for all scenes", paper_bgcolor: "#fff",
 };
 function show(index) {

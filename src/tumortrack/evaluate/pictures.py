@@ -6,6 +6,7 @@ Nothing needs a display.
 
 from __future__ import annotations
 
+import textwrap
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -44,8 +45,8 @@ if TYPE_CHECKING:
 
 __all__ = ["qc_picture", "scene_picture"]
 
-FROM_CAMERA = View("seen from the camera", (1, 0, 0), (0, 1, 0))
-FROM_SIDE = View("seen from the side, camera above", (1, 0, 0), (0, 0, 1))
+FROM_CAMERA = View("seen from the camera", (1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
+FROM_SIDE = View("seen from the side, camera above", (1.0, 0.0, 0.0), (0.0, 0.0, 1.0))
 _CAMERA_AXES = {FROM_CAMERA: ("x", "y", "z"), FROM_SIDE: ("x", "z", "y")}
 
 
@@ -62,7 +63,7 @@ def scene_picture(scene: Scene, estimate: Estimate | None, entry: dict, path: Pa
     slices = [(name, view) for name in tumors for view in (FROM_CAMERA, FROM_SIDE)]
     rows = -(-len(slices) // 4)
     height_in = 5.1 + 4.05 * rows
-    figure = new_figure(14, height_in)
+    figure = new_figure(14.0, height_in)
     figure.subplots_adjust(top=1 - 0.85 / height_in, bottom=0.15 / height_in)
     outer = figure.add_gridspec(2, 1, height_ratios=[4.1, 3.95 * max(rows, 0.01)], hspace=0.13)
     top = outer[0].subgridspec(1, 2, wspace=0.04)
@@ -90,7 +91,9 @@ def _solid_view(axes: Axes, scene: Scene, estimate: Estimate | None, view: View)
     shown = estimate.meshes if estimate else {}
     everything = [*scene.reference.parts, *shown.values()]
     points_mm = scene.cloud.points_mm.astype(float)
-    frame = widened(frame_around(view, np.concatenate([m.vertices_mm for m in everything]), 6), 1.7)
+    frame = widened(
+        frame_around(view, np.concatenate([m.vertices_mm for m in everything]), 6.0), 1.7
+    )
     layers = [Layer(mesh, ESTIMATED) for name, mesh in shown.items() if name != "kidney"]
     if "kidney" in shown:
         layers.append(Layer(shown["kidney"], KIDNEY, 0.36))
@@ -116,7 +119,7 @@ def _slice_view(axes: Axes, scene: Scene, estimate: Estimate | None, name: str, 
     shown = estimate.meshes if estimate else {}
     through_mm = truth[name].box_mm.mean(0)
     around = [truth[name].vertices_mm] + ([shown[name].vertices_mm] if name in shown else [])
-    frame = widened(frame_around(view, np.concatenate(around), 12), 1.0)
+    frame = widened(frame_around(view, np.concatenate(around), 12.0), 1.0)
     for part, mesh in shown.items():
         color, width = (KIDNEY, 1.4) if part == "kidney" else (ESTIMATED, 2.4)
         tint(axes, section_mask(mesh, view, frame, through_mm), frame, color)
@@ -164,8 +167,8 @@ def _distances(entry: dict, name: str) -> str:
 
 
 def _headline(entry: dict) -> str:
-    said = f"mIoU {entry['miou']:.2f}" if entry.get("failed") is None else entry["failed"]
-    return f"{entry['name']}   {said}"
+    failed = "" if entry["failed"] is None else f"   {textwrap.shorten(entry['failed'], 60)}"
+    return f"{entry['name']}   mIoU {entry['miou']:.2f}{failed}"
 
 
 def _legend() -> list:

@@ -58,9 +58,9 @@ class Plane:
 # Radiological convention: the patient's right is on the picture's left (axial seen from the feet,
 # coronal from the front); sagittal with anterior on the left.
 PLANES = (
-    Plane(View("axial", (1, 0, 0), (0, 1, 0))),
-    Plane(View("coronal", (1, 0, 0), (0, 0, -1))),
-    Plane(View("sagittal", (0, 1, 0), (0, 0, -1))),
+    Plane(View("axial", (1.0, 0.0, 0.0), (0.0, 1.0, 0.0))),
+    Plane(View("coronal", (1.0, 0.0, 0.0), (0.0, 0.0, -1.0))),
+    Plane(View("sagittal", (0.0, 1.0, 0.0), (0.0, 0.0, -1.0))),
 )
 
 
@@ -102,13 +102,14 @@ def qc_picture(case_labels: LabelVolume, ct: Volume | None, anatomy: Anatomy, pa
     """
     largest = max(anatomy.tumors or (anatomy.organ,), key=lambda mesh: abs(mesh.volume_mm3))
     through_mm = largest.box_mm.mean(0)
-    figure = new_figure(12, 10.2)
+    figure = new_figure(12.0, 10.2)
     figure.subplots_adjust(top=0.9, left=0.01, right=0.99, bottom=0.01)
     grid = figure.add_gridspec(2, 2, wspace=0.03, hspace=0.09)
     shown: LabelVolume | Volume = ct if ct is not None else case_labels
+    window = _window(shown, anatomy)
     for cell, plane in zip((grid[0, 0], grid[0, 1], grid[1, 0]), PLANES, strict=True):
         axes = figure.add_subplot(cell)
-        _qc_slice(axes, shown, anatomy, plane, through_mm)
+        _qc_slice(axes, (shown, window), anatomy, plane, through_mm)
     _qc_solid(figure.add_subplot(grid[1, 1]), anatomy)
     what = "CT" if ct is not None else "label map"
     figure.suptitle(f"Prepared case over its {what}", x=0.015, ha="left", fontweight="bold")
@@ -125,15 +126,15 @@ def qc_picture(case_labels: LabelVolume, ct: Volume | None, anatomy: Anatomy, pa
 
 def _qc_slice(
     axes: Axes,
-    shown: Volume | LabelVolume,
+    background: tuple[Volume | LabelVolume, tuple[float, float]],
     anatomy: Anatomy,
     plane: Plane,
     through_mm: Float[np.ndarray, " 3"],
 ) -> None:
-    frame = widened(frame_around(plane.view, anatomy.organ.vertices_mm, _MARGIN_MM), 1.22)
+    frame = _same_scale(plane, anatomy)
+    shown, (low, high) = background
     array = shown.hu if isinstance(shown, Volume) else shown.labels
     values = slice_volume(array, shown.lps_from_index, plane.view, frame, through_mm)
-    low, high = _window(shown)
     axes.imshow(np.ma.masked_invalid(values), cmap="gray", vmin=low, vmax=high, extent=frame.extent)
     colors = (_ORGAN_LINE, *(tumor_color(n) for n in range(len(anatomy.tumors))))
     for color, part in zip(colors, anatomy.parts, strict=True):
@@ -142,13 +143,14 @@ def _qc_slice(
     scale_bar(axes, frame, "white")
     _write_letters(axes, plane, "white")
     axis = int(np.argmax(np.abs(np.cross(plane.view.right, plane.view.down))))
-    where = f"{'LPS'[axis]} {through_mm[axis]:.1f} mm"
+    letter = ("LPS" if through_mm[axis] >= 0 else "RAI")[axis]
+    where = f"{letter} {abs(through_mm[axis]):.1f} mm"
     axes.set_title(f"{plane.view.name}, {where}", fontsize=10.5)
 
 
 def _qc_solid(axes: Axes, anatomy: Anatomy) -> None:
     plane = PLANES[1]
-    frame = widened(frame_around(plane.view, anatomy.organ.vertices_mm, 8), 1.22)
+    frame = widened(frame_around(plane.view, anatomy.organ.vertices_mm, 8.0), 1.22)
     layers = [Layer(tumor, tumor_color(n)) for n, tumor in enumerate(anatomy.tumors)]
     layers.append(Layer(anatomy.organ, KIDNEY, 0.38))
     axes.imshow(shade(layers, plane.view, frame), extent=frame.extent, interpolation="bilinear")
@@ -184,12 +186,24 @@ def tumor_color(number: int) -> tuple[float, float, float]:
     return _TUMOR_COLORS[number % len(_TUMOR_COLORS)]
 
 
-def _window(shown: Volume | LabelVolume) -> tuple[float, float]:
-    """Grey range: soft tissue, opened upwards as far as the brightest thousandth needs."""
+def _same_scale(plane: Plane, anatomy: Anatomy) -> Frame:
+    """A frame about the organ, equally large in all planes, so that lengths compare."""
+    size_mm = float(np.ptp(anatomy.organ.box_mm, axis=0).max()) + 2 * _MARGIN_MM
+    right, down, _ = plane.view.project(anatomy.organ.box_mm.mean(0)[None])[0].tolist()
+    half = size_mm / 2
+    return Frame(right - 1.22 * half, right + 1.22 * half, down - half, down + half)
+
+
+def _window(shown: Volume | LabelVolume, anatomy: Anatomy) -> tuple[float, float]:
+    """Grey range: soft tissue, opened upwards as far as the organ and its tumors need."""
     if isinstance(shown, LabelVolume):
         return 0.0, float(shown.labels.max()) * 1.6 + 1e-6
     low, high = _SOFT_TISSUE_HU
-    return low, max(high, min(float(np.percentile(shown.hu[::4, ::4, ::4], 99.5)), 900.0))
+    inner = np.concatenate([0.7 * p.vertices_mm + 0.3 * p.box_mm.mean(0) for p in anatomy.parts])
+    index = np.rint(transform_points(np.linalg.inv(shown.lps_from_index), inner)).astype(int)
+    index = index[((index >= 0) & (index < shown.hu.shape)).all(1)]
+    brightest = float(np.percentile(shown.hu[tuple(index.T)], 98)) if len(index) else high
+    return low, max(high, 1.15 * brightest)
 
 
 def _qc_legend(anatomy: Anatomy) -> list:

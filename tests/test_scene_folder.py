@@ -1,0 +1,159 @@
+"""Scenes on disk: round trip, other programs' scenes, broken ones."""
+
+import json
+
+import numpy as np
+import pytest
+import trimesh
+
+from tumortrack.core.errors import InputError
+from tumortrack.core.mesh_files import write_mesh
+from tumortrack.core.types import Anatomy, DepthFrame, Intrinsics, Mesh, SensorCloud
+from tumortrack.simulate.scene_folder import Scene, list_scenes, read_scene, write_scene
+
+
+def ball(radius_mm, center_mm):
+    solid = trimesh.creation.icosphere(4, radius_mm)
+    return Mesh(solid.vertices + np.array(center_mm), solid.faces)
+
+
+def make_scene(depth=True):
+    rng = np.random.default_rng(0)
+    intrinsics = Intrinsics(24, 16, 20.0, 21.0, 11.5, 7.5)
+    image = rng.uniform(110, 150, (16, 24))
+    image[:3] = np.nan
+    reference = Anatomy((ball(25, (1, 2, 140)), ball(8, (5, 2, 138))))
+    cloud = SensorCloud(rng.normal(0, 10, (500, 3)) + np.array([0, 0, 130]), 7_000)
+    frame = DepthFrame(image, intrinsics, 7_000) if depth else None
+    return Scene(cloud, reference, frame, {"seed": 3, "recipe": {"push_mm": 2.5}})
+
+
+def foreign_scene(folder, kidney, *tumors):
+    """As another program writes it: ASCII points, no depth, no meta.json."""
+    folder.mkdir(parents=True)
+    points = np.random.default_rng(1).normal(0, 10, (300, 3)) + np.array([0, 0, 130])
+    lines = ["ply", "format ascii 1.0", "element vertex 300", "property float x",
+             "property float y", "property float z", "end_header"]  # fmt: skip
+    lines += [" ".join(f"{v:.4f}" for v in point) for point in points]
+    (folder / "cloud.ply").write_text("\n".join(lines) + "\n")
+    write_mesh(folder / "kidney.ply", kidney)
+    for number, mesh in enumerate(tumors, start=1):
+        write_mesh(folder / f"tumor_{number}.ply", mesh)
+    return points
+
+
+def test_round_trip(tmp_path):
+    scene = make_scene()
+    write_scene(tmp_path / "a", scene)
+    again = read_scene(tmp_path / "a")
+    np.testing.assert_array_equal(again.cloud.points_mm, scene.cloud.points_mm)
+    assert again.cloud.stamp_ns == 7_000
+    assert again.reference.names == ("kidney", "tumor_1")
+    for mine, yours in zip(scene.reference.parts, again.reference.parts, strict=True):
+        assert yours.volume_mm3 == pytest.approx(mine.volume_mm3, rel=1e-5)
+        np.testing.assert_allclose(yours.box_mm, mine.box_mm, atol=1e-4)
+    np.testing.assert_allclose(again.depth.depth_mm, scene.depth.depth_mm, atol=0.0501)
+    assert again.depth.intrinsics == scene.depth.intrinsics
+    assert scene.meta.items() <= again.meta.items()
+
+
+def test_depth_is_optional(tmp_path):
+    write_scene(tmp_path / "a", make_scene(depth=False))
+    assert read_scene(tmp_path / "a").depth is None
+
+
+def test_foreign_scene_without_depth_or_meta(tmp_path):
+    kidney, inner = ball(25, (0, 0, 140)), ball(8, (5, 0, 140))
+    points = foreign_scene(tmp_path / "a", kidney, inner)
+    scene = read_scene(tmp_path / "a")
+    assert scene.depth is None
+    assert scene.meta == {}
+    np.testing.assert_allclose(scene.cloud.points_mm, points, atol=1e-3)
+    # Nothing sticks out, so the organ stays as it was given.
+    assert len(scene.reference.organ.faces) == len(kidney.faces)
+
+
+def test_a_tumor_that_sticks_out_becomes_part_of_the_organ(tmp_path):
+    kidney, tumor = ball(25, (0, 0, 140)), ball(10, (25, 0, 140))
+    foreign_scene(tmp_path / "a", kidney, tumor)
+    organ = read_scene(tmp_path / "a").reference.organ
+    # Lens common to two spheres (radii R, r, distance d between the centres).
+    R, r, d = 25.0, 10.0, 25.0
+    lens = np.pi * (R + r - d) ** 2 * (d**2 + 2 * d * (R + r) - 3 * (R - r) ** 2) / (12 * d)
+    union = 4 / 3 * np.pi * (R**3 + r**3) - lens
+    assert organ.volume_mm3 == pytest.approx(union, rel=5e-3)
+    assert organ.box_mm[1, 0] == pytest.approx(35, abs=0.1)
+
+
+def test_our_own_meta_says_that_the_organ_is_whole(tmp_path):
+    scene = make_scene(depth=False)
+    out = Scene(scene.cloud, Anatomy((scene.reference.organ, ball(10, (26, 2, 140)))))
+    write_scene(tmp_path / "a", out)
+    assert len(read_scene(tmp_path / "a").reference.organ.faces) == len(out.reference.organ.faces)
+
+
+def test_scenes_are_listed_by_name(tmp_path):
+    for name in ("scene_10", "scene_02", "scene_01"):
+        write_scene(tmp_path / name, make_scene(depth=False))
+    (tmp_path / "notes").mkdir()
+    (tmp_path / ".scene_03.x.part").mkdir()
+    (tmp_path / "readme.txt").write_text("not a scene")
+    assert [p.name for p in list_scenes(tmp_path)] == ["scene_01", "scene_02", "scene_10"]
+
+
+def test_a_failing_write_leaves_nothing(tmp_path):
+    scene = make_scene()
+    broken = Scene(scene.cloud, scene.reference, scene.depth, {"bad": float("nan")})
+    with pytest.raises(ValueError, match="JSON"):
+        write_scene(tmp_path / "a", broken)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_nothing_is_overwritten(tmp_path):
+    write_scene(tmp_path / "a", make_scene())
+    with pytest.raises(InputError, match="exists already"):
+        write_scene(tmp_path / "a", make_scene())
+
+
+def open_surface(folder):
+    kidney = ball(25, (0, 0, 140))
+    (folder / "meta.json").unlink()
+    write_mesh(folder / "kidney.ply", Mesh(kidney.vertices_mm, kidney.faces[:-40]))
+
+
+def metres(folder):
+    write_mesh(folder / "kidney.ply", ball(0.025, (0, 0, 0.14)))
+
+
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        (lambda f: (f / "cloud.ply").unlink(), r"lacks cloud\.ply"),
+        (lambda f: (f / "kidney.ply").unlink(), r"lacks kidney\.ply"),
+        (lambda f: (f / "intrinsics.json").unlink(), r"lacks intrinsics\.json"),
+        (lambda f: (f / "kidney.ply").write_bytes(b"ply\nnonsense"), "cannot be read"),
+        (lambda f: (f / "cloud.ply").write_bytes(b"\x00" * 50), "cloud"),
+        (lambda f: (f / "depth.png").write_bytes(b"no image"), "depth"),
+        (lambda f: (f / "meta.json").write_text("{"), "JSON"),
+        (lambda f: (f / "meta.json").write_text('{"stamp_ns": "now"}'), "stamp_ns"),
+        (lambda f: (f / "tumor_1.ply").rename(f / "tumor_2.ply"), "without a gap"),
+        (open_surface, "closed"),
+        (metres, "to mm"),
+    ],
+)
+def test_broken_scenes_are_refused(tmp_path, spoil, message):
+    folder = tmp_path / "scene"
+    write_scene(folder, make_scene())
+    assert json.loads((folder / "meta.json").read_text())["units"] == "mm"
+    spoil(folder)
+    with pytest.raises(InputError, match=message):
+        read_scene(folder)
+
+
+def test_folders_without_scenes_are_refused(tmp_path):
+    with pytest.raises(InputError, match="holds no scenes"):
+        list_scenes(tmp_path)
+    with pytest.raises(InputError, match="does not exist"):
+        list_scenes(tmp_path / "absent")
+    with pytest.raises(InputError, match="does not exist"):
+        read_scene(tmp_path / "absent")
