@@ -56,7 +56,7 @@ def save_case(case: Case, folder: Path) -> None:
         write_volume_nifti(folder / "ct.nii.gz", case.ct.hu, case.ct.lps_from_index)
     content = {
         "parts": list(case.anatomy.names),
-        "up_lps": list(case.up_lps),
+        "up_lps": [float(x) for x in case.up_lps],
         "report": case.report,
     }
     store.seal(folder, KIND, content, frame="lps")
@@ -70,13 +70,8 @@ def load_case(folder: Path) -> Case:
     """
     manifest = store.read_manifest(folder, KIND)
     parts, up, report = (manifest.get(key) for key in ("parts", "up_lps", "report"))
-    sound = (
-        isinstance(up, list)
-        and len(up) == 3
-        and all(isinstance(x, int | float) for x in up)
-        and isinstance(report, dict)
-    )
-    if not sound:
+    is_direction = isinstance(up, list) and [type(x) for x in up] == [float] * 3
+    if up is None or not is_direction or not isinstance(report, dict):
         raise ArtifactError(f"{folder / store.MANIFEST} is incomplete; run prepare again.")
     anatomy = read_anatomy(folder)
     if list(anatomy.names) != parts:

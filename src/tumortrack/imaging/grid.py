@@ -60,7 +60,7 @@ def cropped(
     lps_from_index: Float[np.ndarray, "4 4"],
     margin_mm: float = 8.0,
 ) -> LabelVolume:
-    """The labels round everything labelled, padded with zeros so that the margin is always whole."""
+    """The labels round everything labelled, with a margin of zeros on every side."""
     box = bounding_box(labels > 0, lps_from_index, 0)
     margin = np.ceil(margin_mm / spacing_mm(lps_from_index)).astype(int)
     affine = moved_origin(lps_from_index, box)

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int16, Num, UInt8
+from jaxtyping import Float, Num, UInt8
 
 from tumortrack.core.errors import InputError, StorageError
 from tumortrack.core.geometry import RAS_FROM_LPS
@@ -31,7 +32,7 @@ def read_nifti(path: Path) -> RawVolume:
     import nibabel
 
     try:
-        image = nibabel.load(path)
+        image: Any = nibabel.load(path)
         header = image.header
         shape = tuple(int(n) for n in header.get_data_shape())
         dtype = header.get_data_dtype()
@@ -66,11 +67,11 @@ def read_nifti(path: Path) -> RawVolume:
     return RawVolume(array, lps_from_index)
 
 
-def _lps_from_index(path: Path, header: object) -> Float[np.ndarray, "4 4"]:
+def _lps_from_index(path: Path, header: Any) -> Float[np.ndarray, "4 4"]:
     """The affine the header states; never a guess, since a guess may mirror the patient."""
     try:
-        sform, sform_code = header.get_sform(coded=True)  # type: ignore[attr-defined]
-        qform, qform_code = header.get_qform(coded=True)  # type: ignore[attr-defined]
+        sform, sform_code = header.get_sform(coded=True)
+        qform, qform_code = header.get_qform(coded=True)
     except Exception as error:
         raise InputError(f"{path}: its orientation cannot be read: {error}.") from error
     if not sform_code and not qform_code:
@@ -116,7 +117,7 @@ def write_volume_nifti(
     Raises:
         StorageError: the disk refused.
     """
-    whole: Int16[np.ndarray, "i j k"] = np.clip(np.rint(hu), -32768, 32767).astype(np.int16)
+    whole = np.clip(np.rint(hu), -32768, 32767).astype(np.int16)
     _write(
         path, whole if np.array_equal(whole, hu) else hu.astype(np.float32), lps_from_index, True
     )

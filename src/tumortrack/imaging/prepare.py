@@ -71,10 +71,7 @@ def prepare(input: Path, options: PrepareOptions | None = None) -> Case:
     if input.is_dir() and not any(p.is_file() for p in input.iterdir()):
         raise InputError(f"{input} holds no files. Give a folder of DICOM slices or of meshes.")
     is_meshes = input.is_dir() and any(p.suffix.lower() in SUFFIXES for p in input.iterdir())
-    if is_meshes:
-        case = _from_meshes(input, options)
-    else:
-        case = _from_volume(input, options)
+    case = _from_meshes(input, options) if is_meshes else _from_volume(input, options)
     report = {
         **case.report,
         "source": input.name,

@@ -46,16 +46,16 @@ def segment_ct(
     solid = (hu >= kidney_hu[0]) & (hu < tumor_hu[1])
     dense = (hu >= tumor_hu[0]) & (hu < tumor_hu[1])
     organ = find_organ(solid, dense, affine)
+    everything_ml = float(solid.sum()) * voxel_ml(affine)
 
     box = bounding_box(organ, affine, _REACH_MM)
     organ, solid, dense = organ[box], solid[box], dense[box]
     affine = moved_origin(affine, box)
     notes = []
-    everything = float(((hu >= kidney_hu[0]) & (hu < tumor_hu[1])).sum()) * voxel_ml(affine)
     organ, tumors, more = _tumors_of(organ, solid, dense, affine, min_tumor_ml)
     kept_ml = float(organ.sum()) * voxel_ml(affine)
     notes.append(
-        f"{kept_ml:.1f} ml of {everything:.1f} ml between the HU limits are the kidney; table, "
+        f"{kept_ml:.1f} ml of {everything_ml:.1f} ml between the HU limits are the kidney; table, "
         "blocks, rims and specks were dropped"
     )
     labels = _number_by_volume(organ, tumors)
@@ -89,7 +89,7 @@ def _tumors_of(
     boxes = ndimage.find_objects(pieces)
     tumors, small, beside = [], [], []
     for n, count in enumerate(counts.tolist(), 1):
-        grown = bounding_box_of(boxes[n - 1], dense.shape, np.ceil(3.5 / steps).astype(int))
+        grown = _grown_box(boxes[n - 1], dense.shape, np.ceil(3.5 / steps).astype(int))
         mask = pieces[grown] == n
         if count * unit < min_tumor_ml:
             if (mask & organ[grown]).any():
@@ -121,7 +121,7 @@ def _tumors_of(
     return organ, [t & organ for t in tumors], notes
 
 
-def bounding_box_of(
+def _grown_box(
     box: tuple[slice, ...], shape: tuple[int, ...], margin: np.ndarray
 ) -> tuple[slice, ...]:
     """A box grown by a margin in voxels, within the grid."""

@@ -151,14 +151,14 @@ def _largest_piece(
 def _boundary_distance(mesh: Mesh, mask: np.ndarray, affine: np.ndarray) -> np.ndarray:
     """Distance of each vertex to the nearest face between mask and background, in voxels.
 
-    A voxel here is the largest edge of one, in mm. Faces are stood for by points on a 3 x 3
-    raster, so the distance is at most a sixth of a voxel too long.
+    A voxel here is the largest edge of one, in mm. Faces are stood for by points on a 5 x 5
+    raster, so the distance is at most a tenth of a voxel too long.
     """
     from scipy.spatial import cKDTree
 
     box = bounding_box(mask, affine, 0.0)
     padded = np.pad(mask[box], 1)
-    raster = np.stack(np.meshgrid([-1 / 3, 0, 1 / 3], [-1 / 3, 0, 1 / 3]), -1).reshape(-1, 2)
+    raster = np.stack(np.meshgrid(*[np.linspace(-0.4, 0.4, 5)] * 2), -1).reshape(-1, 2)
     points = []
     for axis in range(3):
         low = np.argwhere(np.diff(padded.astype(np.int8), axis=axis) != 0) - 1.0

@@ -113,4 +113,4 @@ def is_label_map(raw: RawVolume) -> bool:
     labels = array.astype(np.uint8)
     if array.dtype.kind == "f" and not np.array_equal(labels, array):
         return False
-    return np.count_nonzero(np.bincount(labels.ravel(order="K"), minlength=256)) <= _MOST_LABELS
+    return int(np.count_nonzero(np.bincount(labels.ravel(order="K")))) <= _MOST_LABELS
