@@ -35,9 +35,7 @@ def ball(radius_mm, center_mm=(0.0, 0.0, 0.0), subdivisions=3):
 
 def anatomy(shift_mm=(0.0, 0.0, 0.0)):
     middle = np.array(shift_mm) + np.array([0, 0, 130])
-    return Anatomy(
-        (ball(22, shift + np.array([0, 0, 130])), ball(7, shift + np.array([6, 3, 128])))
-    )
+    return Anatomy((ball(22, middle), ball(7, middle + np.array([6, 3, -2]))))
 
 
 def scene():

