@@ -34,6 +34,8 @@ def read_mesh(path: Path) -> Mesh:
         raise InputError(f"{path} cannot be read as a mesh: {error}.") from error
     if faces.ndim != 2 or len(faces) == 0 or len(vertices) == 0:
         raise InputError(f"{path} holds no triangles (an empty or damaged file).")
+    if faces.min() < 0 or faces.max() >= len(vertices):
+        raise InputError(f"{path} has triangles that name vertices it does not have (damaged).")
     # STL repeats each corner: merge exact duplicates so that the surface can be closed.
     unique, inverse = np.unique(vertices, axis=0, return_inverse=True)
     faces = inverse.reshape(-1)[faces]

@@ -61,7 +61,7 @@ def cropped(
     margin_mm: float = 8.0,
 ) -> LabelVolume:
     """The labels round everything labelled, with a margin of zeros on every side."""
-    box = bounding_box(labels > 0, lps_from_index, 0)
+    box = bounding_box(labels > 0, lps_from_index, 0.0)
     margin = np.ceil(margin_mm / spacing_mm(lps_from_index)).astype(int)
     affine = moved_origin(lps_from_index, box)
     affine[:3, 3] -= lps_from_index[:3, :3] @ margin

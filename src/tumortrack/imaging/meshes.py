@@ -47,7 +47,8 @@ def read_mesh_folder(folder: Path, unit: str | None = None) -> tuple[Anatomy, li
     scale = 1000.0 if unit == "m" else 1.0
     organ, tumors = _read(organ_file, scale, notes), [_read(f, scale, notes) for f in tumor_files]
     _check_unit(organ_file, organ, unit)
-    organ = closed_mesh(organ, organ_file.name, notes)
+    # A bed cut out for an inner tumor is no outside: the outermost shell is the organ.
+    organ = _outer_shell(closed_mesh(organ, organ_file.name, notes))
     tumors = [closed_mesh(t, f.name, notes) for t, f in zip(tumors, tumor_files, strict=True)]
     for tumor, file in zip(tumors, tumor_files, strict=True):
         organ = _union(organ, tumor, file.name)

@@ -17,7 +17,7 @@ from tumortrack.core.types import FIRST_TUMOR, Anatomy, LabelVolume, Mesh, part_
 from tumortrack.imaging.grid import bounding_box, voxel_ml
 
 _TRIANGLES = 28_000  # aimed at for the organ
-_BLUR_VOXELS = 0.8  # enough to melt steps of one voxel, too little to lose a small tumor
+_BLUR_VOXELS = 0.9  # enough to melt steps of one voxel, too little to lose a small tumor
 _STEPS_ACROSS = 14  # cells across the thinnest extent of a small part
 
 

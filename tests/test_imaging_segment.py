@@ -1,0 +1,160 @@
+"""From a CT by HU windows, and from label maps: only the organ and its tumors remain."""
+
+import numpy as np
+import pytest
+from scipy import ndimage
+
+from imaging_objects import kidney_labels
+from tumortrack.core.errors import InputError
+from tumortrack.core.types import LabelVolume, Volume
+from tumortrack.imaging.grid import voxel_ml
+from tumortrack.imaging.segment import segment_ct, select_labels
+
+
+def volumes(labels: LabelVolume) -> np.ndarray:
+    return np.bincount(labels.labels.ravel()) * voxel_ml(labels.lps_from_index)
+
+
+def scene(*, table_mm: int, block_hu: float, gap: int = 0) -> tuple[Volume, LabelVolume]:
+    """The test kidney on a table (gel-like HU), a block beside it, blurred and noisy."""
+    truth = kidney_labels()
+    labels = np.pad(truth.labels, ((30, 60), (30, 40), (15, 15)))
+    affine = truth.lps_from_index.copy()
+    affine[:3, 3] -= [30, 30, 15]
+    hu = np.choose(labels, [-1000.0, 40.0, 570.0, 570.0])
+    bottom = int(np.flatnonzero(labels.any((0, 2)))[-1]) + 1 + gap
+    hu[12:210, bottom : bottom + table_mm, 4:-4] = 20.0
+    hu[168:198, bottom - 40 : bottom, 30:70] = block_hu
+    hu = ndimage.gaussian_filter(hu, 0.7)
+    hu += np.random.default_rng(5).normal(0, 15, hu.shape)
+    return Volume(hu, affine), LabelVolume(labels, affine)
+
+
+@pytest.mark.parametrize(
+    ("table_mm", "block_hu"), [(3, 400.0), (20, 1800.0), (3, 20.0), (20, 600.0)]
+)
+def test_table_block_and_rims_go_and_the_rest_keeps_its_place(table_mm, block_hu):
+    volume, truth = scene(table_mm=table_mm, block_hu=block_hu)
+    found, notes = segment_ct(volume)
+    assert found.labels.max() == 3, notes
+    expected, have = volumes(truth), volumes(found)
+    assert have[2:] == pytest.approx(expected[2:], rel=0.05)
+    assert have[1:].sum() == pytest.approx(expected[1:].sum(), rel=0.05)
+    for label in (2, 3):  # the same place, not only the same size
+        centres = [
+            a.lps_from_index @ [*np.argwhere(a.labels == label).mean(0), 1] for a in (truth, found)
+        ]
+        assert np.linalg.norm(centres[0] - centres[1]) < 0.3
+
+
+def test_small_bright_pieces_are_reported_and_dropped():
+    volume, truth = scene(table_mm=3, block_hu=400.0)
+    hu = volume.hu.copy()
+    middle = np.argwhere(truth.labels == 1).mean(0).astype(int)
+    hu[tuple(slice(m + 8, m + 12) for m in middle)] = 600.0  # 0.064 ml
+    found, notes = segment_ct(Volume(hu, volume.lps_from_index))
+    assert found.labels.max() == 3
+    assert any("below 0.2 ml" in note for note in notes)
+    with_it, _ = segment_ct(Volume(hu, volume.lps_from_index), min_tumor_ml=0.02)
+    assert with_it.labels.max() == 4
+
+
+def test_windows_are_half_open_and_checked():
+    truth = kidney_labels()
+    hu = np.choose(truth.labels, [-1000.0, -300.0, 300.0, 1000.0])  # the limits themselves
+    found, _ = segment_ct(Volume(hu, truth.lps_from_index))
+    # 1000 lies outside the tumor's window: a hole, filled as organ.
+    assert volumes(found)[1] == pytest.approx(volumes(truth)[[1, 3]].sum(), rel=0.01)
+    assert volumes(found)[2] == pytest.approx(volumes(truth)[2], rel=0.02)
+    for windows in [((300.0, -300.0), (300.0, 1000.0)), ((-300.0, 400.0), (300.0, 1000.0))]:
+        with pytest.raises(InputError, match="windows"):
+            segment_ct(Volume(hu, truth.lps_from_index), *windows)
+
+
+def test_an_empty_or_body_like_ct_is_refused():
+    for fill in (-1000.0, 40.0):
+        with pytest.raises(InputError, match="--labels"):
+            segment_ct(Volume(np.full((90, 90, 90), fill), np.diag([2.0, 2, 2, 1])))
+
+
+def test_a_patients_ct_is_refused_and_points_to_label_maps(shared_data):
+    from tumortrack.imaging.volume import read_volume
+
+    with pytest.raises(InputError, match="--labels"):
+        segment_ct(read_volume(shared_data / "totalsegmentator" / "example_ct.nii.gz"))
+
+
+def two_kidneys(tumor_left: int, tumor_right: int) -> LabelVolume:
+    """Spheres of 25 mm radius at x = +60 (patient's left) and -60, a tumor in each, specks."""
+    labels = np.zeros((190, 60, 60), np.uint8)
+    x, y, z = np.ogrid[-95:95, -30:30, -30:30]
+    for centre, value in ((60, tumor_left), (-60, tumor_right)):
+        labels[(x - centre) ** 2 + y**2 + z**2 < 25**2] = 1
+        labels[(x - centre) ** 2 + y**2 + (z - 20) ** 2 < 9**2] = value
+    labels[93:95, 30, 30] = 1
+    labels[93, 40:42, 30] = 2
+    affine = np.eye(4)
+    affine[0, 3] = -95
+    return LabelVolume(labels, affine)
+
+
+def centre_x(labels: LabelVolume) -> float:
+    return float((labels.lps_from_index @ [*np.argwhere(labels.labels > 0).mean(0), 1])[0])
+
+
+def test_side_is_the_patients():
+    both = two_kidneys(2, 2)
+    assert centre_x(select_labels(both, "left")[0]) == pytest.approx(60, abs=1)
+    assert centre_x(select_labels(both, "right")[0]) == pytest.approx(-60, abs=1)
+    # The same patient, array index running the other way.
+    flip = np.diag([-1.0, 1, 1, 1])
+    flip[0, 3] = both.labels.shape[0] - 1
+    mirrored = LabelVolume(both.labels[::-1], both.lps_from_index @ flip)
+    assert centre_x(select_labels(mirrored, "left")[0]) == pytest.approx(60, abs=1)
+
+
+def test_the_tumor_bearing_side_is_the_default():
+    chosen, notes = select_labels(two_kidneys(1, 2))
+    assert centre_x(chosen) == pytest.approx(-60, abs=1)
+    assert any("right kidney" in note for note in notes)
+    assert any("2 specks" in note for note in notes)
+    with pytest.raises(InputError, match="--side"):
+        select_labels(two_kidneys(1, 1))
+    alone, notes = select_labels(two_kidneys(1, 1), "left")
+    assert alone.labels.max() == 1
+    assert "no tumor in this kidney" in notes
+
+
+def test_tumor_numbers_are_kept_split_and_closed_up():
+    truth = kidney_labels()
+    large_first = volumes(truth)
+    assert large_first[2] > large_first[3]
+    kept, notes = select_labels(truth)
+    assert volumes(kept)[2:] == pytest.approx(large_first[2:])
+    assert notes == []
+    swapped = LabelVolume(np.array([0, 1, 3, 2])[truth.labels], truth.lps_from_index)
+    assert volumes(select_labels(swapped)[0])[2:] == pytest.approx(large_first[:1:-1])
+    gap = LabelVolume(np.array([0, 1, 7, 4])[truth.labels], truth.lps_from_index)
+    closed, notes = select_labels(gap)
+    assert volumes(closed)[2:] == pytest.approx(large_first[:1:-1])
+    assert "tumor label 7 is now 3" in notes
+    one = LabelVolume(np.minimum(truth.labels, 2), truth.lps_from_index)
+    split, notes = select_labels(one)
+    assert volumes(split)[2:] == pytest.approx(large_first[2:])
+    assert any("2 separate pieces" in note for note in notes)
+
+
+def test_chosen_numbers_and_missing_labels():
+    truth = kidney_labels()
+    other = LabelVolume(np.array([0, 9, 5, 6])[truth.labels], truth.lps_from_index)
+    chosen, _ = select_labels(other, organ=9, tumor=6)
+    assert volumes(chosen)[2] == pytest.approx(volumes(truth)[3])
+    assert select_labels(other, organ=9, tumor=0)[0].labels.max() == 1
+    with pytest.raises(InputError, match=r"no organ label 1; it has \[5, 6, 9\]"):
+        select_labels(other)
+    with pytest.raises(InputError, match="no tumor label 4"):
+        select_labels(other, organ=9, tumor=4)
+    with pytest.raises(InputError, match="empty"):
+        select_labels(LabelVolume(np.zeros((5, 5, 5)), np.eye(4)))
+    with pytest.raises(InputError, match=r"fill 0\.\d ml"):
+        select_labels(LabelVolume(truth.labels, np.diag([0.1, 0.1, 0.1, 1.0])))
