@@ -74,7 +74,7 @@ def widened(frame: Frame, aspect: float) -> Frame:
 
 
 def shade(
-    layers: list[Layer], view: View, frame: Frame, pixel_mm: float = 0.25
+    layers: list[Layer], view: View, frame: Frame, pixel_mm: float = 0.3
 ) -> Float[np.ndarray, "h w 3"]:
     """Paint the layers in this order, each over the ones before it (organ last).
 
