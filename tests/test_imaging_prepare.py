@@ -154,7 +154,7 @@ def read_either(path):
 )
 @settings(
     max_examples=60,
-    deadline=2000,
+    deadline=10_000,
     derandomize=True,
     suppress_health_check=[HealthCheck.function_scoped_fixture],
 )
