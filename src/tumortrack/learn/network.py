@@ -131,24 +131,24 @@ def paper_network(n_classes: int) -> NetworkConfig:
 def quick_network(n_classes: int, scale_mm: float) -> NetworkConfig:
     """A slim network of the same family, for minutes of training on a CPU.
 
-    All numbers are ours, chosen for speed on one core: 256-d latent and 5 x 128 decoder as in
-    our prototype; no batch norm, whose running statistics make short runs' validation erratic;
-    strided choice, since the sensor's points come in random order. ``scale_mm``: about half the
-    organ's longest side.
+    All numbers are ours. Width: 256-d latent and 5 x 128 decoder as in our prototype. The rest
+    by mIoU after 600 steps on a toy (dented ellipsoid, two spheres, bending, one seed each):
+    octaves 0.55 against 0.39 for raw coordinates; radii 0.4 and 0.9 0.62, farthest points as
+    well 0.63, a skip as well 0.65; batch norm lost 0.03, and its running statistics make short
+    runs' validation erratic. ``scale_mm``: about half the organ's longest side.
     """
     return NetworkConfig(
         encoder=PointNet2Config(
             levels=(
-                SetAbstraction(ratio=0.25, radius=0.25, neighbours=16, widths=(32, 64)),
-                SetAbstraction(ratio=0.25, radius=0.6, neighbours=16, widths=(64, 128)),
+                SetAbstraction(ratio=0.25, radius=0.4, neighbours=16, widths=(32, 64)),
+                SetAbstraction(ratio=0.25, radius=0.9, neighbours=16, widths=(64, 128)),
             ),
             widths=(128, 256),
             norm="none",
-            sampling="strided",
             n_points=512,
         ),
         decoder=MlpDecoderConfig(
-            n_classes=n_classes, width=128, hidden_layers=5, octaves=(0, 1, 2)
+            n_classes=n_classes, width=128, hidden_layers=5, skip_layer=3, octaves=(0, 1, 2)
         ),
         normalisation=FixedScale(scale_mm=scale_mm),
     )
