@@ -1,0 +1,36 @@
+# Bare `make` lists the targets. Everything is installed into .venv from PyPI, pinned.
+PYTHON ?= python3
+BIN := .venv/bin
+SETUP := .venv/.installed
+
+.DEFAULT_GOAL := help
+.PHONY: help setup demo test check bench clean
+
+help:  ## list the targets
+	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 10
+
+setup: $(SETUP)  ## install everything into .venv
+
+$(SETUP): pyproject.toml constraints.txt
+	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "tumortrack needs Python 3.11 or newer; give make PYTHON=python3.11")'
+	$(PYTHON) -m venv .venv
+	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
+	touch $@
+
+demo: setup  ## CT -> tumors located in unseen deformed scenes (about 8 minutes)
+	$(BIN)/tumortrack demo
+
+check: setup  ## lint, types, import order
+	$(BIN)/ruff check src tests examples bench
+	$(BIN)/ruff format --check src tests examples bench
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+test: check  ## check, then all tests
+	$(BIN)/pytest
+
+bench: setup  ## speed of the generator, training and inference, side by side with naive forms
+	$(BIN)/python bench/bench.py
+
+clean:  ## remove .venv and caches (runs/ stays)
+	rm -rf .venv .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache

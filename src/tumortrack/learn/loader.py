@@ -1,0 +1,62 @@
+"""Training batches from worker processes."""
+
+from __future__ import annotations
+
+import os
+import signal
+from collections.abc import Iterator
+
+import torch
+from torch.utils.data import DataLoader, Dataset
+
+from tumortrack.simulate.dataset import SceneStream
+
+Tensors = tuple[torch.Tensor, torch.Tensor, torch.Tensor]  # clouds, points, labels
+
+
+class _Batches(Dataset[Tensors]):
+    """A scene stream as torch's loader wants it."""
+
+    def __init__(self, stream: SceneStream, period: int) -> None:
+        self._stream = stream
+        self._period = period
+
+    def __getitem__(self, step: int) -> Tensors:
+        batch = self._stream.batch(step % self._period if self._period else step)
+        return (
+            torch.from_numpy(batch.clouds_mm),
+            torch.from_numpy(batch.points_mm),
+            torch.from_numpy(batch.labels),
+        )
+
+
+def batches(stream: SceneStream, steps: range, period: int, workers: int) -> Iterator[Tensors]:
+    """The batches of these steps, in order, whatever the number of workers; after ``period``
+    steps (0: never) they repeat."""
+    loader = DataLoader(
+        _Batches(stream, period),
+        batch_size=None,
+        sampler=steps,
+        num_workers=workers,
+        multiprocessing_context="spawn" if workers else None,
+        prefetch_factor=4 if workers else None,
+        worker_init_fn=_quiet_worker,
+    )
+    return iter(loader)
+
+
+def default_workers() -> int:
+    """Half of the cores make scenes (one at least, sixteen at most)."""
+    return max(1, min(16, available_cores() // 2))
+
+
+def available_cores() -> int:
+    """Cores that this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def _quiet_worker(_: int) -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle
+    torch.set_num_threads(1)
