@@ -46,14 +46,12 @@ def rotation_onto(
     """The smallest rotation matrix that turns the direction ``source`` onto ``target``."""
     a = np.asarray(source, float) / np.linalg.norm(source)
     b = np.asarray(target, float) / np.linalg.norm(target)
-    cosine = float(a @ b)
-    if cosine < -1 + 1e-12:  # opposite: half a turn about any perpendicular axis
-        axis = np.cross(a, np.eye(3)[np.argmin(np.abs(a))])
-        axis /= np.linalg.norm(axis)
-        return 2 * np.outer(axis, axis) - np.eye(3)
-    v = np.cross(a, b)
-    cross = np.array([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]])
-    return np.eye(3) + cross + cross @ cross / (1 + cosine)
+    middle = a + b
+    if np.linalg.norm(middle) < 1e-8:  # opposite: half a turn about any perpendicular axis
+        middle = np.cross(a, np.eye(3)[np.argmin(np.abs(a))])
+    middle /= np.linalg.norm(middle)
+    # Two reflections, a -> -a -> b: a rotation to the last digit, near opposite directions too.
+    return (np.eye(3) - 2 * np.outer(middle, middle)) @ (np.eye(3) - 2 * np.outer(a, a))
 
 
 def direction_lps(text: str) -> tuple[float, float, float]:

@@ -41,6 +41,8 @@ def read_mesh(path: Path) -> Mesh:
     faces = inverse.reshape(-1)[faces]
     a, b, c = faces.T
     proper = (a != b) & (b != c) & (c != a)
+    if not proper.any():
+        raise InputError(f"{path} holds only triangles without area (a damaged file).")
     return Mesh(unique, faces[proper])
 
 

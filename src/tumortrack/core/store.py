@@ -69,7 +69,7 @@ def read_json(path: Path) -> dict:
         if path.stat().st_size > _LARGEST_MANIFEST:
             raise ArtifactError(f"{path} is larger than 16 MiB; this is no file of ours.")
         data = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise ArtifactError(f"{path} cannot be read as JSON: {error}.") from error
     if not isinstance(data, dict):
         raise ArtifactError(f"{path} must hold a JSON object.")
@@ -116,7 +116,11 @@ def new_folder(path: Path, overwrite: bool = False) -> Iterator[Path]:
         if path.exists():
             old = aside.with_suffix(".old")
             os.rename(path, old)
-            os.rename(aside, path)
+            try:
+                os.rename(aside, path)
+            except OSError:
+                os.rename(old, path)
+                raise
             _remove(old)
         else:
             os.rename(aside, path)

@@ -20,7 +20,13 @@ OUTSIDE, ORGAN, FIRST_TUMOR = 0, 1, 2
 
 def _freeze(value: object, name: str, dtype: npt.DTypeLike, shape: tuple[int | None, ...]) -> None:
     """Convert one field to a read-only array and check its shape (None: any length)."""
-    array = np.array(getattr(value, name), dtype=dtype)  # a copy: the caller's stays writable
+    given = np.asarray(getattr(value, name))
+    array = given.astype(dtype)  # a copy: the caller's stays writable
+    if array.dtype.kind in "iu" and array.dtype != given.dtype and (array != given).any():
+        raise InputError(
+            f"{type(value).__name__}.{name} has numbers that are no {array.dtype}; give whole "
+            f"numbers in {np.iinfo(array.dtype).min}..{np.iinfo(array.dtype).max}."
+        )
     good = array.ndim == len(shape) and all(
         want is None or want == have for want, have in zip(shape, array.shape, strict=False)
     )

@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from tumortrack.core.config import Config
+from tumortrack.core.errors import InputError
 from tumortrack.core.types import Anatomy, Mesh
 
 
@@ -113,7 +114,15 @@ def _part_pool(
     distance = surface_distance(part, points)
     keep = distance > config.wall_mm
     points, distance = points[keep], distance[keep]
-    return PartPool(points, distance, contains(part, points), labels_of(anatomy_ct, points))
+    inside = contains(part, points)
+    fewest = min(inside.sum(), (~inside).sum())
+    if fewest < config.per_side:
+        raise InputError(
+            f"of a pool of {config.pool} points only {fewest} lie on one side of a part (box "
+            f"{np.ptp(part.box_mm, axis=0).round(1).tolist()} mm); {config.per_side} are needed. "
+            "Enlarge occupancy.pool, or leave out a part that small."
+        )
+    return PartPool(points, distance, inside, labels_of(anatomy_ct, points))
 
 
 def contains(mesh: Mesh, points_mm: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
