@@ -1,0 +1,42 @@
+"""Kidney and tumors in a cloud from any program: camera frame (x right, y down, z forward), mm.
+
+Run after 02 and 03: python examples/04_your_own_cloud.py [FOLDER] [MODEL] [CLOUD]
+"""
+
+import sys
+from pathlib import Path
+
+from tumortrack.core.errors import NoEstimate
+from tumortrack.learn.model import load_model
+from tumortrack.sense.cloud import crop_cloud
+from tumortrack.sense.files import read_cloud
+from tumortrack.track.files import write_estimate
+from tumortrack.track.tracker import Tracker
+
+
+def main(out: Path, model_folder: Path, cloud_file: Path) -> None:
+    cloud, notes = read_cloud(cloud_file, unit="mm")  # .ply, .pcd or .npz; "m" converts
+    print(f"{len(cloud.points_mm)} points", *notes)
+    # The cloud must show the organ alone. Where depth is enough to free it of its background:
+    cloud = crop_cloud(cloud, near_mm=50, far_mm=400)
+
+    tracker = Tracker(load_model(model_folder))  # once; then one call per cloud
+    try:
+        estimate = tracker.locate(cloud, grid=48, seed=0)
+    except NoEstimate as error:  # said aloud, never a made-up answer
+        sys.exit(f"nothing found: {error}")
+    for name, mesh in estimate.meshes.items():
+        x, y, z = mesh.box_mm.mean(0)
+        print(f"{name}: {mesh.volume_mm3 / 1000:.1f} ml at ({x:.1f}, {y:.1f}, {z:.1f}) mm")
+    write_estimate(out / "located", estimate, overwrite=True)
+    print(f"surfaces, labelled volume and report are in {out / 'located'}")
+
+
+if __name__ == "__main__":
+    given = [Path(argument) for argument in sys.argv[1:]]
+    folder = given[0] if given else Path("runs/examples")
+    main(
+        folder,
+        given[1] if len(given) > 1 else folder / "model_20",
+        given[2] if len(given) > 2 else folder / "scene" / "cloud.ply",
+    )
