@@ -1,0 +1,254 @@
+"""Artifact folders and mesh files: whole or absent, and damage is found."""
+
+import json
+import subprocess
+import sys
+import textwrap
+
+import numpy as np
+import pytest
+import trimesh
+
+from tumortrack.core import store
+from tumortrack.core.errors import ArtifactError, InputError, StorageError
+from tumortrack.core.mesh_files import read_anatomy, read_mesh, write_anatomy, write_mesh
+from tumortrack.core.types import Anatomy, Mesh
+
+
+def box(extents=(2, 3, 4), center=(0, 0, 0)):
+    solid = trimesh.creation.box(extents)
+    return Mesh(solid.vertices + np.array(center, float), solid.faces)
+
+
+# artifact folders
+
+
+def leftovers(folder):
+    return sorted(p.name for p in folder.iterdir())
+
+
+@pytest.mark.parametrize("error", [RuntimeError, OSError, KeyboardInterrupt])
+def test_new_folder_leaves_nothing_when_its_body_fails(tmp_path, error):
+    raised = StorageError if error is OSError else error
+
+    def fill():
+        with store.new_folder(tmp_path / "a" / "case") as aside:
+            (aside / "half").write_text("half")
+            raise error
+
+    with pytest.raises(raised):
+        fill()
+    assert leftovers(tmp_path / "a") == []
+
+
+def test_new_folder_appears_whole_and_at_once(tmp_path):
+    with store.new_folder(tmp_path / "case") as aside:
+        (aside / "sub").mkdir()
+        (aside / "sub" / "file").write_text("x")
+        assert not (tmp_path / "case").exists()
+    assert (tmp_path / "case" / "sub" / "file").read_text() == "x"
+    assert (tmp_path / "case").stat().st_mode & 0o777 == 0o755
+    assert leftovers(tmp_path) == ["case"]
+
+
+def test_existing_folder_is_refused_or_swapped(tmp_path):
+    for content in ("old", "new"):
+        with store.new_folder(tmp_path / "case", overwrite=True) as aside:
+            (aside / content).write_text(content)
+    assert leftovers(tmp_path / "case") == ["new"]
+    with (
+        pytest.raises(InputError, match="--overwrite"),
+        store.new_folder(tmp_path / "case") as aside,
+    ):
+        pytest.fail("the body must not run")
+    with (
+        pytest.raises(RuntimeError),
+        store.new_folder(tmp_path / "case", overwrite=True) as aside,
+    ):
+        raise RuntimeError
+    assert leftovers(tmp_path / "case") == ["new"]
+    assert leftovers(tmp_path) == ["case"]
+
+
+def test_old_folder_returns_when_the_swap_fails(tmp_path, monkeypatch):
+    (tmp_path / "case").mkdir()
+    (tmp_path / "case" / "old").write_text("old")
+    rename = store.os.rename
+
+    def refuse(source, target):
+        if str(source).endswith(".part"):
+            raise OSError(5, "Input/output error")
+        rename(source, target)
+
+    monkeypatch.setattr(store.os, "rename", refuse)
+    with (
+        pytest.raises(StorageError, match="Input/output"),
+        store.new_folder(tmp_path / "case", overwrite=True),
+    ):
+        pass
+    assert leftovers(tmp_path) == ["case"]
+    assert leftovers(tmp_path / "case") == ["old"]
+
+
+@pytest.fixture
+def sealed(tmp_path):
+    with store.new_folder(tmp_path / "case") as aside:
+        (aside / "data.bin").write_bytes(bytes(range(200)))
+        (aside / "more.txt").write_text("more")
+        store.seal(aside, "case", {"up": [0, -1, 0]}, frame="lps")
+    return tmp_path / "case"
+
+
+def test_a_sealed_folder_reads_back(sealed):
+    manifest = store.read_manifest(sealed, "case")
+    assert set(manifest["files"]) == {"data.bin", "more.txt"}
+    assert (manifest["up"], manifest["units"], manifest["frame"]) == ([0, -1, 0], "mm", "lps")
+    # sha256 of the bytes 0 ... 199, by sha256sum
+    assert manifest["files"]["data.bin"].startswith("1901da1c9f699b48")
+
+
+def edit(folder, **changes):
+    path = folder / store.MANIFEST
+    path.write_text(json.dumps({**json.loads(path.read_text()), **changes}))
+
+
+def flip_a_bit(folder):
+    data = bytearray((folder / "data.bin").read_bytes())
+    data[77] ^= 1
+    (folder / "data.bin").write_bytes(data)
+
+
+@pytest.mark.parametrize(
+    ("damage", "says"),
+    [
+        (flip_a_bit, "changed"),
+        (lambda f: (f / "data.bin").unlink(), "lacks its file 'data.bin'"),
+        (lambda f: (f / store.MANIFEST).unlink(), "no manifest"),
+        (lambda f: edit(f, kind="model"), "'model'"),
+        (lambda f: edit(f, schema=99), "99"),
+        (lambda f: edit(f, files=None), "lists no files"),
+        (lambda f: edit(f, files={"../outside": "0"}), "outside"),
+        (lambda f: edit(f, files={"": "0"}), "lacks"),
+        (lambda f: edit(f, files={"data.bin": 5}), "changed"),
+        (lambda f: (f / store.MANIFEST).write_text("{"), "JSON"),
+        (lambda f: (f / store.MANIFEST).write_text("[1]"), "JSON object"),
+        (lambda f: (f / store.MANIFEST).write_text('{"a":' * 100_000), "JSON"),
+        (lambda f: (f / store.MANIFEST).write_text('{"a":' + "1" * 9000 + "}"), "JSON"),
+        (lambda f: (f / store.MANIFEST).write_bytes(b"\xff\xfe{}"), "JSON"),
+        (lambda f: (f / store.MANIFEST).write_text(" " * (2**24 + 1)), "16 MiB"),
+    ],
+)
+def test_damage_to_a_sealed_folder_is_found(sealed, damage, says):
+    (sealed.parent / "outside").write_text("beside the folder")
+    damage(sealed)
+    with pytest.raises(ArtifactError, match=says):
+        store.read_manifest(sealed, "case")
+
+
+def test_a_folders_digest_sees_names_and_contents(tmp_path):
+    for name, files in {"a": {"x": "1", "y": "2"}, "b": {"y": "2", "x": "1"}}.items():
+        (tmp_path / name).mkdir()
+        for file, text in files.items():
+            (tmp_path / name / file).write_text(text)
+    same = store.sha256_of(tmp_path / "a")
+    assert store.sha256_of(tmp_path / "b") == same
+    (tmp_path / "b" / "x").rename(tmp_path / "b" / "z")
+    assert store.sha256_of(tmp_path / "b") != same
+
+
+def test_json_refuses_what_is_no_json(tmp_path):
+    with pytest.raises(ValueError, match="JSON"):
+        store.write_json(tmp_path / "a.json", {"x": float("nan")})
+    assert leftovers(tmp_path) == []
+
+
+def test_a_full_disk_keeps_what_was_there(tmp_path):
+    """The kernel refuses to write beyond 4 kB (EFBIG), as it does on a full disk (ENOSPC)."""
+    script = f"""
+        import resource
+        from pathlib import Path
+        import trimesh
+        from tumortrack.core import store
+        from tumortrack.core.errors import StorageError
+        from tumortrack.core.mesh_files import write_mesh
+        from tumortrack.core.types import Mesh
+
+        folder = Path({str(tmp_path)!r})
+        ball = trimesh.creation.icosphere(4)
+        store.write_atomically(folder / "file", b"old")
+        resource.setrlimit(resource.RLIMIT_FSIZE, (4096, 4096))
+
+        def fill():
+            with store.new_folder(folder / "case") as aside:
+                (aside / "small").write_bytes(b"1")
+                (aside / "big").write_bytes(bytes(9999))
+
+        for write in (
+            lambda: store.write_atomically(folder / "file", bytes(9999)),
+            fill,
+            lambda: write_mesh(folder / "ball.ply", Mesh(ball.vertices, ball.faces)),
+        ):
+            try:
+                write()
+            except StorageError as error:
+                print(error)
+    """
+    done = subprocess.run(
+        [sys.executable, "-c", textwrap.dedent(script)], capture_output=True, text=True, check=True
+    )
+    assert done.stdout.count("File too large") == 3
+    assert (tmp_path / "file").read_bytes() == b"old"
+    assert set(leftovers(tmp_path)) <= {"file", "ball.ply"}
+
+
+# mesh files
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".stl", ".obj"])
+def test_a_mesh_survives_a_file(tmp_path, suffix):
+    mesh = box((20, 30, 41), (100, -200, 33.25))
+    write_mesh(tmp_path / f"box{suffix}", mesh)
+    again = read_mesh(tmp_path / f"box{suffix}")
+    assert again.vertices_mm.shape == (8, 3)  # STL's repeated corners are one vertex again
+    assert again.volume_mm3 == pytest.approx(20 * 30 * 41, rel=1e-5)  # closed, still outward
+    np.testing.assert_allclose(again.box_mm, mesh.box_mm, atol=1e-4)
+
+
+def test_an_anatomy_survives_a_folder(tmp_path):
+    anatomy = Anatomy((box((50, 40, 30)), box((9, 8, 7), (5, 0, 0)), box((4, 5, 6), (-9, 1, 2))))
+    write_anatomy(tmp_path, anatomy)
+    assert leftovers(tmp_path) == ["kidney.ply", "tumor_1.ply", "tumor_2.ply"]
+    again = read_anatomy(tmp_path)
+    for old, new in zip(anatomy.parts, again.parts, strict=True):
+        assert new.volume_mm3 == pytest.approx(old.volume_mm3, rel=1e-5)
+        np.testing.assert_allclose(new.box_mm, old.box_mm, atol=1e-5)
+
+
+OFF = "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\n"
+OFF += "property float z\nelement face 1\nproperty list uchar int vertex_indices\nend_header\n"
+THREE = "0 0 0\n1 0 0\n0 1 0\n"
+
+
+def test_the_text_that_the_broken_ones_vary_is_read(tmp_path):
+    (tmp_path / "a.ply").write_text(OFF + THREE + "3 0 1 2\n")
+    assert read_mesh(tmp_path / "a.ply").faces.shape == (1, 3)
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        ("missing.ply", None),
+        ("mesh.vtk", "x"),
+        ("empty.ply", ""),
+        ("text.stl", "no mesh at all"),
+        ("far.ply", OFF + THREE + "3 0 1 7\n"),
+        ("line.ply", OFF + THREE + "3 0 1 1\n"),
+        ("nan.ply", OFF + "nan 0 0\n1 0 0\n0 1 0\n3 0 1 2\n"),
+        ("points.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\n"),
+    ],
+)
+def test_what_is_no_mesh_is_refused(tmp_path, name, content):
+    if content is not None:
+        (tmp_path / name).write_text(content)
+    with pytest.raises(InputError):
+        read_mesh(tmp_path / name)
