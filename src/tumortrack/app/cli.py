@@ -77,6 +77,7 @@ def train(
     seed: int = 0,
     device: Literal["auto", "cpu", "cuda"] = "auto",
     workers: int | None = None,
+    checkpoint_every: float = 30.0,
 ) -> None:
     """Train a model for a case; the same command resumes after Ctrl-C or a crash.
 
@@ -91,13 +92,16 @@ def train(
         seed: of weights and scenes.
         device: auto takes CUDA where it is.
         workers: processes that make scenes (default: as the machine allows).
+        checkpoint_every: seconds; a crash loses at most the steps since.
     """
     from tumortrack.app import commands
 
     commands.train(
         case,
         model,
-        commands.TrainOptions(preset, rotations, minutes, steps, seed, device, workers),
+        commands.TrainOptions(
+            preset, rotations, minutes, steps, seed, device, workers, checkpoint_every
+        ),
     )
 
 

@@ -49,6 +49,7 @@ class TrainOptions:
     seed: int = 0
     device: Device = "auto"
     workers: int | None = None
+    checkpoint_every_s: float = 30.0
 
 
 def train(case_folder: Path, folder: Path, options: TrainOptions) -> None:
@@ -64,6 +65,8 @@ def train(case_folder: Path, folder: Path, options: TrainOptions) -> None:
         raise InputError(f"--minutes {options.minutes} must be more than 0.")
     if options.steps is not None and options.steps < 1:
         raise InputError(f"--steps {options.steps} must be at least 1.")
+    if options.workers is not None and options.workers < 0:
+        raise InputError(f"--workers {options.workers} must be 0 or more.")
     case = load_case(case_folder)
     run = Run(
         anatomy_ct=case.anatomy,
@@ -75,6 +78,7 @@ def train(case_folder: Path, folder: Path, options: TrainOptions) -> None:
         minutes=options.minutes,
         device=options.device,
         workers=options.workers,
+        checkpoint_every_s=options.checkpoint_every_s,
     )
     if is_finished(folder):
         done = load_model(folder).provenance

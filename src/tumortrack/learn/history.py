@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+from tumortrack.core.errors import StorageError
 from tumortrack.core.store import write_atomically
 from tumortrack.learn.checkpoint import Progress
 
@@ -34,13 +35,20 @@ class History:
         self._lines.close()
 
     def write(self, progress: Progress, loss: float, miou: float) -> None:
-        """One validation's record."""
+        """One validation's record.
+
+        Raises:
+            StorageError: the disk is full.
+        """
         record = {
             "step": progress.step,
             "elapsed_s": round(progress.elapsed_s, 1),
             "loss": round(loss, 5),
             "validation_miou": round(miou, 4),
         }
-        self._lines.write(json.dumps(record) + "\n")
+        try:
+            self._lines.write(json.dumps(record) + "\n")
+        except OSError as error:
+            raise StorageError(f"cannot write {self._path}: {error.strerror}.") from error
         self._board.add_scalar("loss/train", loss, progress.step)
         self._board.add_scalar("miou/validation", miou, progress.step)

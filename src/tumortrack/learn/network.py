@@ -9,6 +9,7 @@ from __future__ import annotations
 import copy
 from dataclasses import dataclass
 
+import torch
 from torch import Tensor, nn
 
 from tumortrack.core.config import Config
@@ -38,10 +39,24 @@ class FixedScale(Config, frozen=True, tag="fixed"):
             raise InputError(f"scale_mm must be a positive length, not {self.scale_mm}.")
 
 
+class Aligned(Config, frozen=True, tag="aligned"):
+    """As ``FixedScale``, and turned about the camera's axis until the cloud's longest direction
+    across it is x, its heavier tail at +x.
+
+    Turning the organ or the camera about that axis then changes nothing, so that the network
+    need not learn it: most of what varies between ``limited`` poses is gone.
+    """
+
+    scale_mm: float
+
+    def __post_init__(self) -> None:
+        FixedScale(scale_mm=self.scale_mm)
+
+
 class NetworkConfig(Config, frozen=True):
     encoder: EncoderConfig
     decoder: DecoderConfig
-    normalisation: CloudBox | FixedScale
+    normalisation: CloudBox | FixedScale | Aligned
 
     def build(self) -> OccupancyNetwork:
         """The network, with weights from torch's global generator (``torch.manual_seed``)."""
@@ -55,6 +70,7 @@ class Latent:
     vector: Tensor  # (B, L)
     centre_mm: Tensor  # (B, 1, 3), camera frame
     scale_mm: Tensor  # (B, 1, 1)
+    turn: Tensor | None  # (2, B, 1): cosine and sine of the turn about z; None: no turn
     terms: tuple[Tensor, ...]  # the decoder's share, computed once per cloud
 
 
@@ -69,15 +85,22 @@ class OccupancyNetwork(nn.Module):
 
     def encode(self, points_mm: Tensor) -> Latent:
         """Clouds (B, N, 3), camera frame, mm, float32, points in random order -> Latent."""
-        centre_mm, scale_mm = normalisation(points_mm, self.config.normalisation)
-        vector = self.encoder((points_mm - centre_mm) / scale_mm)
-        return Latent(vector, centre_mm, scale_mm, self.decoder.prepare(vector))
+        kind = self.config.normalisation
+        centre_mm, scale_mm = normalisation(points_mm, kind)
+        points = (points_mm - centre_mm) / scale_mm
+        turn = None
+        if isinstance(kind, Aligned):
+            turn = alignment(points)
+            points = turned(points, turn)
+        vector = self.encoder(points)
+        return Latent(vector, centre_mm, scale_mm, turn, self.decoder.prepare(vector))
 
     def query(self, latent: Latent, queries_mm: Tensor) -> Tensor:
         """Queries (B, Q, 3), camera frame, mm, float32 -> logits (B, Q, classes)."""
-        logits: Tensor = self.decoder(
-            latent.terms, (queries_mm - latent.centre_mm) / latent.scale_mm
-        )
+        queries = (queries_mm - latent.centre_mm) / latent.scale_mm
+        if latent.turn is not None:
+            queries = turned(queries, latent.turn)
+        logits: Tensor = self.decoder(latent.terms, queries)
         return logits
 
     def forward(self, points_mm: Tensor, queries_mm: Tensor) -> Tensor:
@@ -93,14 +116,34 @@ class OccupancyNetwork(nn.Module):
         return out
 
 
-def normalisation(points_mm: Tensor, kind: CloudBox | FixedScale) -> tuple[Tensor, Tensor]:
+def normalisation(
+    points_mm: Tensor, kind: CloudBox | FixedScale | Aligned
+) -> tuple[Tensor, Tensor]:
     """Centre (B, 1, 3) and scale (B, 1, 1), both mm, of clouds (B, N, 3)."""
-    if isinstance(kind, FixedScale):
+    if not isinstance(kind, CloudBox):
         centre_mm = points_mm.mean(dim=1, keepdim=True)
         return centre_mm, points_mm.new_full((len(points_mm), 1, 1), kind.scale_mm)
     low = points_mm.amin(dim=1, keepdim=True)
     high = points_mm.amax(dim=1, keepdim=True)
     return (low + high) / 2, ((high - low) / 2).amax(dim=2, keepdim=True).clamp_min(1e-6)
+
+
+def alignment(points: Tensor) -> Tensor:
+    """Cosine and sine (2, B, 1) of the angle about z of the principal direction of the centred
+    points (B, N, 3) across z, pointing to their heavier tail."""
+    x, y = points[..., 0], points[..., 1]
+    angle = torch.atan2(2 * (x * y).mean(1), (x * x - y * y).mean(1)) / 2
+    direction = torch.stack([torch.cos(angle), torch.sin(angle)])[..., None]
+    along = x * direction[0] + y * direction[1]
+    return direction * torch.where((along**3).mean(1) < 0, -1.0, 1.0)[:, None]
+
+
+def turned(points: Tensor, turn: Tensor) -> Tensor:
+    """Points (B, N, 3) turned by minus the angle. Not as a matrix product: that would be rounded
+    to bf16, a tenth of a millimetre."""
+    x, y, z = points.unbind(-1)
+    cosine, sine = turn
+    return torch.stack([x * cosine + y * sine, y * cosine - x * sine, z], dim=-1)
 
 
 def paper_network(n_classes: int) -> NetworkConfig:
@@ -150,5 +193,5 @@ def quick_network(n_classes: int, scale_mm: float) -> NetworkConfig:
         decoder=MlpDecoderConfig(
             n_classes=n_classes, width=128, hidden_layers=5, skip_layer=3, octaves=(0, 1, 2)
         ),
-        normalisation=FixedScale(scale_mm=scale_mm),
+        normalisation=Aligned(scale_mm=scale_mm),
     )

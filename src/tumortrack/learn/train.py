@@ -24,6 +24,7 @@ from tumortrack.core import store
 from tumortrack.core.config import to_builtins
 from tumortrack.core.errors import StorageError, TumortrackError
 from tumortrack.core.types import Anatomy
+from tumortrack.learn.allocator import keep_freed_memory
 from tumortrack.learn.checkpoint import (
     Progress,
     load_checkpoint,
@@ -41,7 +42,6 @@ from tumortrack.learn.validate import ValidationSet
 from tumortrack.simulate.dataset import SceneStream
 from tumortrack.simulate.occupancy import OccupancyPool
 
-CHECKPOINT_EVERY_S = 30.0
 REPORT_EVERY_S = 5.0
 
 
@@ -58,6 +58,7 @@ class Run:
     minutes: float | None = None
     device: Literal["auto", "cpu", "cuda"] = "auto"
     workers: int | None = None  # processes that make scenes; None: as the machine allows
+    checkpoint_every_s: float = 30.0
 
 
 @dataclass(frozen=True)
@@ -89,6 +90,7 @@ def train(run: Run, folder: Path, report: Callable[[Status], None]) -> Model:
     config, device, work = run.config, choose_device(run.device), _work_folder(folder)
     workers = default_workers() if run.workers is None else run.workers
     if device.type == "cpu":
+        keep_freed_memory()
         torch.set_num_threads(max(1, available_cores() - workers))
     state = _State(run, device)
     state.resume(work)
@@ -112,7 +114,7 @@ def train(run: Run, folder: Path, report: Callable[[Status], None]) -> Model:
                 miou = validation.miou(state.average)
                 state.keep_if_best(miou)
                 history.write(progress, loss.item(), miou)
-            if done or settled or stopped() or clock.due("checkpoint", CHECKPOINT_EVERY_S):
+            if done or settled or stopped() or clock.due("checkpoint", run.checkpoint_every_s):
                 state.save(work)
             if done or clock.due("report", REPORT_EVERY_S):
                 report(_status(run, progress, clock.rate(progress), loss.item(), miou))

@@ -5,7 +5,9 @@ deformation is a value that carries any point of the CT frame to its new place (
 can be recorded (``record``). To add one: write its file, add its configuration to the union.
 """
 
+from tumortrack.simulate.deform.chain import ChainConfig
 from tumortrack.simulate.deform.drag import DragConfig
 from tumortrack.simulate.deform.rest import RestConfig
+from tumortrack.simulate.deform.stretch import StretchConfig
 
-DeformConfig = DragConfig | RestConfig
+DeformConfig = DragConfig | StretchConfig | ChainConfig | RestConfig

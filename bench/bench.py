@@ -1,0 +1,167 @@
+"""Speed on this machine: each part beside the naive form of it, interleaved, medians, ratio.
+
+    make bench            (about two minutes; prints a table, writes runs/bench.json)
+
+One thread throughout, so that figures are per core.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+import numpy as np
+import torch
+import trimesh
+from rich.console import Console
+from rich.table import Table
+
+from tumortrack.app.presets import paper, quick
+from tumortrack.core.geometry import transform_points
+from tumortrack.imaging.surface import surfaces
+from tumortrack.learn.allocator import keep_freed_memory
+from tumortrack.learn.config import TrainConfig
+from tumortrack.learn.model import has_fast_bfloat16
+from tumortrack.learn.network import OccupancyNetwork
+from tumortrack.phantom.digital import PhantomParameters, phantom_labels
+from tumortrack.simulate.deform.drag import Drags
+from tumortrack.simulate.occupancy import OccupancyConfig, OccupancyPool, labels_of
+from tumortrack.simulate.scene import SceneConfig, SceneRecipe, Simulator, Stage
+
+ROUNDS = 7
+UP = (0.0, -1.0, 0.0)
+CPU = torch.device("cpu")
+
+
+def medians(*versions: Callable[[], object]) -> list[float]:
+    """Median seconds of each, the versions taking turns."""
+    seconds: list[list[float]] = [[] for _ in versions]
+    for version in versions:
+        version()  # compiled, cached, warm
+    for _ in range(ROUNDS):
+        for times, version in zip(seconds, versions, strict=True):
+            start = time.perf_counter()
+            version()
+            times.append(time.perf_counter() - start)
+    return [float(np.median(times)) for times in seconds]
+
+
+def generator() -> tuple[str, float, float]:
+    """One training pair: deform 2,000 labelled points and the surface, depth at 424 x 240."""
+    anatomy, _ = surfaces(phantom_labels(PhantomParameters()))
+    config = SceneConfig(occupancy=OccupancyConfig(per_side=283))
+    pool = OccupancyPool(anatomy, config.occupancy, 0)
+    simulator = Simulator(anatomy, UP, config)
+    index = iter(range(10**9))
+
+    def ours() -> None:
+        for _ in range(20):
+            simulator.pair(SceneRecipe(0, "train", next(index)), pool)
+
+    def naive() -> None:
+        stage = simulator.stage(SceneRecipe(0, "train", next(index)))
+        assert isinstance(stage.deformation, Drags)
+        parts = [
+            part.moved(_plain_carry(stage, stage.deformation, part.vertices_mm))
+            for part in anatomy.parts
+        ]
+        _plain_depth(trimesh.Trimesh(parts[0].vertices_mm, parts[0].faces, process=False), stage)
+        lower, upper = parts[0].box_mm
+        points = np.random.default_rng(0).uniform(lower, upper, (2000, 3)).astype(np.float32)
+        labels_of(type(anatomy)(tuple(parts)), points)
+
+    mine, plain = medians(ours, naive)
+    return "generator, 2,000 labels (pairs/s)", 20 / mine, 1 / plain
+
+
+def _plain_carry(stage: Stage, drags: Drags, points_ct: np.ndarray) -> np.ndarray:
+    moved = points_ct.copy()
+    for centre, shift, sigma in zip(
+        drags.centres_ct, drags.shifts_mm, drags.sigmas_mm, strict=True
+    ):
+        square = ((moved - centre) ** 2).sum(1)
+        moved += np.exp(-0.5 * square / sigma**2)[:, None] * shift
+    return transform_points(stage.camera_from_ct, moved)
+
+
+def _plain_depth(mesh: trimesh.Trimesh, stage: Stage) -> np.ndarray:
+    k = stage.frame.intrinsics
+    u, v = np.meshgrid(np.arange(k.width), np.arange(k.height))
+    rays = np.stack([(u - k.cx) / k.fx, (v - k.cy) / k.fy, np.ones_like(u)], -1).reshape(-1, 3)
+    return mesh.ray.intersects_location(np.zeros_like(rays), rays, multiple_hits=False)[0]
+
+
+def training_step(name: str, config: TrainConfig, batch: int) -> tuple[str, float, float]:
+    """Forward, backward and Adam; naive: fp32."""
+    torch.manual_seed(0)
+    network = OccupancyNetwork(config.network)
+    optimizer = torch.optim.Adam(network.parameters(), 1e-3)
+    clouds, points = 30 * torch.randn(batch, 1000, 3), 40 * torch.randn(batch, 904, 3)
+    labels = torch.randint(0, 4, (batch * 904,))
+
+    def step(bf16: bool) -> None:
+        with torch.autocast("cpu", torch.bfloat16, enabled=bf16):
+            logits = network(clouds, points)
+        loss = torch.nn.functional.cross_entropy(logits.float().flatten(0, 1), labels)
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+
+    mine, plain = medians(lambda: step(has_fast_bfloat16(CPU)), lambda: step(False))
+    return f"training step, {name} (samples/s)", batch / mine, batch / plain
+
+
+@torch.inference_mode()
+def frame(name: str, config: TrainConfig) -> tuple[str, float, float]:
+    """1,000 points, 40,000 queries; naive: latent beside every query, fp32, in one piece."""
+    torch.manual_seed(0)
+    network = OccupancyNetwork(config.network).eval()
+    folded = network.folded()
+    cloud, queries = 30 * torch.randn(1, 1000, 3), 40 * torch.randn(1, 40_000, 3)
+
+    def ours() -> None:
+        with torch.autocast("cpu", torch.bfloat16, enabled=has_fast_bfloat16(CPU)):
+            latent = folded.encode(cloud)
+            for part in queries.split(2048, dim=1):
+                folded.query(latent, part)
+
+    def naive() -> None:
+        latent = network.encode(cloud)
+        vector = latent.vector.expand(40_000, -1)[None].contiguous()
+        terms = network.decoder.prepare(vector[0])
+        expanded = tuple(term.transpose(0, 1) for term in terms)
+        network.decoder(expanded, (queries - latent.centre_mm) / latent.scale_mm)
+
+    mine, plain = medians(ours, naive)
+    return f"frame, 40,000 queries, {name} (frames/s)", 1 / mine, 1 / plain
+
+
+def main() -> None:
+    torch.set_num_threads(1)
+    keep_freed_memory()
+    anatomy, _ = surfaces(phantom_labels(PhantomParameters(), voxel_mm=1.5))
+    rows = [
+        generator(),
+        training_step("quick", quick(anatomy), 32),
+        training_step("paper", paper(anatomy), 8),
+        frame("quick", quick(anatomy)),
+        frame("paper", paper(anatomy)),
+    ]
+    table = Table("part, one core", "tumortrack", "naive", "ratio", title=platform.processor())
+    for name, mine, plain in rows:
+        table.add_row(name, f"{mine:.1f}", f"{plain:.1f}", f"{mine / plain:.1f} x")
+    Console().print(table)
+    out = Path("runs/bench.json")
+    out.parent.mkdir(exist_ok=True)
+    keys = ("name", "tumortrack_per_s", "naive_per_s")
+    out.write_text(json.dumps([dict(zip(keys, row, strict=True)) for row in rows], indent=1))
+
+
+if __name__ == "__main__":
+    main()

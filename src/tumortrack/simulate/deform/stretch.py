@@ -1,0 +1,72 @@
+"""Global, volume-keeping deformation: squeeze along one axis, bulge across it, and bend.
+
+Ours, not the paper's: drags of single vertices never make an organ flatter or more curved as a
+whole, which is what plates, gravity and a pushing instrument do. Both maps keep every volume
+element: the stretch has determinant 1, and the bend moves points across the direction that its
+amount depends on.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Float32, Float64
+from scipy.spatial.transform import Rotation
+
+from tumortrack.core.config import Config
+from tumortrack.simulate.deform.base import View
+
+
+@dataclass(frozen=True, eq=False)
+class Stretch:
+    """x -> centre + matrix (x - centre) + sagitta ((x - centre) . along / reach)^2 across."""
+
+    centre_ct: Float64[np.ndarray, " 3"]
+    matrix: Float64[np.ndarray, "3 3"]
+    along: Float64[np.ndarray, " 3"]
+    across: Float64[np.ndarray, " 3"]  # unit, at right angles to ``along``
+    sagitta_mm: float
+    reach_mm: float
+
+    def apply(self, points_ct: Float[np.ndarray, "n 3"]) -> Float32[np.ndarray, "n 3"]:
+        offset = points_ct - self.centre_ct
+        bend = self.sagitta_mm * (offset @ self.along / self.reach_mm) ** 2
+        moved = (offset + bend[:, None] * self.across) @ self.matrix.T + self.centre_ct
+        return moved.astype(np.float32)
+
+    def record(self) -> dict:
+        return {
+            "kind": "stretch",
+            "centre_ct": self.centre_ct.tolist(),
+            "matrix": self.matrix.tolist(),
+            "along": self.along.tolist(),
+            "across": self.across.tolist(),
+            "sagitta_mm": self.sagitta_mm,
+            "reach_mm": self.reach_mm,
+        }
+
+
+class StretchConfig(Config, frozen=True, tag="stretch"):
+    """``thinnest`` and ``thickest``: smallest and largest stretch along a random axis (1 keeps
+    the length); ``sagitta_mm``: largest bend at the organ's end."""
+
+    thinnest: float = 0.78
+    thickest: float = 1.1
+    sagitta_mm: float = 8.0
+
+    def sample(self, view: View, rng: np.random.Generator) -> Stretch:
+        """Draw axes uniformly on the sphere, stretch and bend uniformly within their limits."""
+        lower, upper = view.anatomy_ct.organ.box_mm
+        axes = Rotation.random(rng=rng).as_matrix()
+        stretch = rng.uniform(self.thinnest, self.thickest)
+        matrix = axes @ np.diag([stretch, stretch**-0.5, stretch**-0.5]) @ axes.T
+        along, across, _ = Rotation.random(rng=rng).as_matrix()
+        return Stretch(
+            centre_ct=(lower + upper) / 2,
+            matrix=matrix,
+            along=along,
+            across=across,
+            sagitta_mm=float(rng.uniform(-self.sagitta_mm, self.sagitta_mm)),
+            reach_mm=float(np.max(upper - lower) / 2),
+        )

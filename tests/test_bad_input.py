@@ -1,0 +1,144 @@
+"""Bad input on the command line: one clear line, a non-zero exit code, nothing half written."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import nibabel
+import numpy as np
+import pytest
+import trimesh
+
+from stories import refusal, succeeded, tumortrack
+
+
+def _nifti(path: Path, array: np.ndarray, affine: np.ndarray) -> Path:
+    image = nibabel.Nifti1Image(array, None)
+    image.header.set_sform(affine, code=1)
+    image.header["pixdim"][1:4] = np.linalg.norm(affine[:3, :3], axis=0)
+    nibabel.save(image, path)
+    return path
+
+
+def _ball(shape: tuple[int, int, int] = (60, 60, 60), radius: float = 25.0) -> np.ndarray:
+    index = np.indices(shape) - np.array(shape)[:, None, None, None] / 2
+    return ((index**2).sum(0) < radius**2).astype(np.uint8)
+
+
+def _missing(folder: Path) -> Path:
+    return folder / "nothing.nii.gz"
+
+
+def _empty_folder(folder: Path) -> Path:
+    (folder / "empty").mkdir()
+    return folder / "empty"
+
+
+def _not_a_volume(folder: Path) -> Path:
+    path = folder / "text.nii.gz"
+    path.write_text("no volume at all")
+    return path
+
+
+def _nan_affine(folder: Path) -> Path:
+    affine = np.eye(4)
+    affine[0, 3] = np.nan
+    return _nifti(folder / "nan.nii", _ball(), affine)
+
+
+def _singular_affine(folder: Path) -> Path:
+    return _nifti(folder / "singular.nii", _ball(), np.diag([1.0, 1.0, 0.0, 1.0]))
+
+
+def _metres(folder: Path) -> Path:
+    return _nifti(folder / "metres.nii", _ball(), np.diag([0.001, 0.001, 0.001, 1.0]))
+
+
+def _detached(folder: Path) -> Path:
+    secret = folder / "secret.raw"
+    secret.write_bytes(b"x" * 27_000)
+    path = folder / "detached.nrrd"
+    path.write_text(
+        "NRRD0004\ntype: uint8\ndimension: 3\nsizes: 30 30 30\nspace: left-posterior-superior\n"
+        "space directions: (1,0,0) (0,1,0) (0,0,1)\nencoding: raw\ndata file: secret.raw\n\n"
+    )
+    return path
+
+
+def _huge_header(folder: Path) -> Path:
+    path = folder / "huge.nrrd"
+    path.write_text(
+        "NRRD0004\ntype: uint8\ndimension: 3\nsizes: 30000 30000 30000\n"
+        "space: left-posterior-superior\nspace directions: (1,0,0) (0,1,0) (0,0,1)\n"
+        "encoding: raw\n\n"
+    )
+    return path
+
+
+def _without_organ(folder: Path) -> Path:
+    return _nifti(folder / "tumor_only.nii", (2 * _ball()).astype(np.uint8), np.eye(4))
+
+
+def _huge_stl(folder: Path) -> Path:
+    (folder / "meshes").mkdir()
+    claims = np.array([2**32 - 1], np.uint32).tobytes()
+    (folder / "meshes" / "kidney.stl").write_bytes(b"\0" * 80 + claims + b"\0" * 50)
+    return folder / "meshes"
+
+
+def _open_mesh(folder: Path) -> Path:
+    (folder / "meshes").mkdir()
+    sphere = trimesh.creation.icosphere(subdivisions=3, radius=30)
+    half = trimesh.Trimesh(sphere.vertices, sphere.faces[: len(sphere.faces) // 2], process=False)
+    half.export(folder / "meshes" / "kidney.stl")
+    return folder / "meshes"
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        _missing,
+        _empty_folder,
+        _not_a_volume,
+        _nan_affine,
+        _singular_affine,
+        _metres,
+        _detached,
+        _huge_header,
+        _without_organ,
+        _huge_stl,
+        _open_mesh,
+    ],
+)
+def test_prepare_refuses(make, tmp_path):
+    source = make(tmp_path)
+    before = sorted(tmp_path.rglob("*"))
+    message = refusal(tumortrack("prepare", source, tmp_path / "case"))
+    assert len(message) > 40  # says what and what to do
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_an_existing_case_is_kept_unless_told(tmp_path):
+    source = _nifti(tmp_path / "ball.nii", _ball(), np.eye(4))
+    succeeded(tumortrack("prepare", source, tmp_path / "case"))
+    before = (tmp_path / "case" / "manifest.json").read_bytes()
+    assert "--overwrite" in refusal(tumortrack("prepare", source, tmp_path / "case"))
+    assert (tmp_path / "case" / "manifest.json").read_bytes() == before
+    succeeded(tumortrack("prepare", source, tmp_path / "case", "--up", "left", "--overwrite"))
+    assert (tmp_path / "case" / "manifest.json").read_bytes() != before
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["ball.nii", "case"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--up", "sideways"], "anterior"),
+        (["--up", "0,0,0"], "three numbers"),
+        (["--organ", "300"], "1..255"),
+        (["--kidney-hu", "300", "-300", "--no-labels"], ""),
+    ],
+)
+def test_options_out_of_range_say_what_is_allowed(arguments, words, tmp_path):
+    source = _nifti(tmp_path / "ball.nii", (1000 * _ball()).astype(np.int16) - 900, np.eye(4))
+    assert words in refusal(tumortrack("prepare", source, tmp_path / "case", *arguments))
+    assert not (tmp_path / "case").exists()

@@ -1,0 +1,187 @@
+"""From a cloud that another program rendered to tumors in the camera's frame."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import nibabel
+import numpy as np
+import pytest
+import trimesh
+
+from stories import (
+    cloud_by_rays,
+    looking_down,
+    refusal,
+    succeeded,
+    tumortrack,
+    write_phantom_case,
+)
+from tumortrack.core.errors import InputError, NoEstimate
+from tumortrack.core.geometry import transform_points
+from tumortrack.core.mesh_files import read_mesh
+from tumortrack.core.types import SensorCloud
+from tumortrack.imaging.case import load_case
+from tumortrack.learn.model import load_model
+from tumortrack.track.tracker import Tracker
+
+STEPS = 700
+
+
+@pytest.fixture(scope="module")
+def work(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("locate")
+    write_phantom_case(folder / "case")
+    succeeded(tumortrack("train", folder / "case", folder / "model", "--steps", STEPS))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def tracker(work: Path) -> Tracker:
+    return Tracker(load_model(work / "model"))
+
+
+@pytest.fixture(scope="module")
+def seen(work: Path) -> tuple[np.ndarray, np.ndarray]:
+    """A cloud and ``camera_from_ct``."""
+    case = load_case(work / "case")
+    camera_from_ct = looking_down(case)
+    return cloud_by_rays(case, camera_from_ct), camera_from_ct
+
+
+def test_tumors_are_found_within_millimetres_in_the_camera_frame(work, seen):
+    points, camera_from_ct = seen
+    trimesh.PointCloud(points).export(work / "cloud.ply")
+    out = work / "out"
+    said = succeeded(tumortrack("locate", work / "model", work / "cloud.ply", out, "--grid", 96))
+    assert "tumor_2" in said
+    report = json.loads((out / "report.json").read_text())
+    case = load_case(work / "case")
+    for name, part in zip(case.anatomy.names, case.anatomy.parts, strict=True):
+        truth = transform_points(camera_from_ct, part.vertices_mm)
+        centre = (truth.min(0) + truth.max(0)) / 2
+        assert np.linalg.norm(np.array(report["parts"][name]["center_mm"]) - centre) < 6
+        mesh = read_mesh(out / f"{name}.ply")
+        assert trimesh.Trimesh(mesh.vertices_mm, mesh.faces).is_watertight
+        assert mesh.volume_mm3 / 1000 == pytest.approx(report["parts"][name]["volume_ml"], rel=1e-3)
+        assert mesh.volume_mm3 == pytest.approx(part.volume_mm3, rel=0.3)
+
+
+def test_labels_volume_and_meshes_lie_in_the_same_place(work):
+    image = nibabel.load(work / "out" / "labels.nii.gz")
+    labels = np.asarray(image.dataobj)
+    for label, name in ((2, "tumor_1"), (3, "tumor_2")):
+        index = np.argwhere(labels == label)
+        voxels_mm = index @ image.affine[:3, :3].T + image.affine[:3, 3]
+        mesh = read_mesh(work / "out" / f"{name}.ply")
+        spacing = image.affine[0, 0]
+        assert np.abs(voxels_mm.min(0) - mesh.box_mm[0]).max() < 1.5 * spacing
+        assert np.abs(voxels_mm.max(0) - mesh.box_mm[1]).max() < 1.5 * spacing
+
+
+def test_occupancy_cloud_carries_labels_and_probabilities(work):
+    from tumortrack.sense.files import read_cloud
+
+    cloud, _ = read_cloud(work / "out" / "occupancy.ply")
+    header = (work / "out" / "occupancy.ply").read_bytes()[:400].decode("latin-1")
+    assert "property uchar label" in header
+    assert "property float probability" in header
+    assert len(cloud.points_mm) > 5000
+
+
+def test_the_same_seed_gives_the_same_answer_and_distance_does_not_matter(tracker, seen):
+    points, _ = seen
+    first = tracker.locate(SensorCloud(points), grid=32, seed=3)
+    again = tracker.locate(SensorCloud(points), grid=32, seed=3)
+    np.testing.assert_array_equal(first.cloud.points_mm, again.cloud.points_mm)
+    np.testing.assert_array_equal(first.volume.labels, again.volume.labels)
+    away = tracker.locate(SensorCloud(points + [0, 0, 200.0]), grid=32, seed=3)
+    moved = away.meshes["tumor_1"].box_mm.mean(0) - first.meshes["tumor_1"].box_mm.mean(0)
+    np.testing.assert_allclose(moved, [0, 0, 200], atol=1.5)
+
+
+def test_clouds_in_other_formats_and_units_agree(work, seen):
+    points, _ = seen
+    np.savez(work / "metres.npz", points=points / 1000)
+    message = refusal(tumortrack("locate", work / "model", work / "metres.npz", work / "no"))
+    assert "--unit m" in message
+    assert not (work / "no").exists()
+    out = work / "metres"
+    succeeded(
+        tumortrack("locate", work / "model", work / "metres.npz", out, "--unit", "m", "--grid", 32)
+    )
+    parts = json.loads((out / "report.json").read_text())["parts"]
+    before = json.loads((work / "out" / "report.json").read_text())["parts"]
+    centres = [np.array(p["tumor_1"]["center_mm"]) for p in (parts, before)]
+    assert np.linalg.norm(centres[0] - centres[1]) < 3
+
+
+@pytest.mark.parametrize(
+    ("points", "error"),
+    [
+        (np.full((199, 3), 100.0), NoEstimate),
+        (np.random.default_rng(0).uniform(-0.05, 0.05, (500, 3)) + [0, 0, 0.15], InputError),
+    ],
+)
+def test_bad_clouds_are_refused(tracker, points, error):
+    with pytest.raises(error):
+        tracker.locate(SensorCloud(points))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--range", "5", "20"], "points lie between"),
+        (["--grid", "401"], "--grid 401"),
+        (["--device", "cuda"], "no CUDA GPU"),
+    ],
+)
+def test_bad_options_say_what_is_allowed(work, arguments, words):
+    if "cuda" in arguments:
+        import torch
+
+        if torch.cuda.is_available():
+            pytest.skip("this machine has a CUDA GPU")
+    out = work / "refused"
+    message = refusal(
+        tumortrack("locate", work / "model", work / "out" / "occupancy.ply", out, *arguments)
+    )
+    assert words in message
+    assert not out.exists()
+
+
+def test_simulated_scenes_are_evaluated_against_their_truth(work):
+    succeeded(tumortrack("simulate", work / "case", work / "scenes", "--scenes", 3, "--seed", 9))
+    report = work / "report"
+    said = succeeded(tumortrack("evaluate", work / "model", work / "scenes", report, "--grid", 64))
+    assert "3 scenes" in said
+    summary = json.loads((report / "report.json").read_text())["summary"]
+    assert summary["failed"] == 0
+    assert 0.4 < summary["miou"] < 1
+    assert summary["tumor_1"]["hausdorff_mm"] >= summary["tumor_1"]["hausdorff_one_sided_mm"] > 0
+    assert (report / "index.html").stat().st_size > 10_000
+
+
+def test_depth_images_take_the_range_the_model_was_trained_for(work):
+    scene = work / "scenes" / "0000"
+    depth = ["locate", work / "model", scene / "depth.png", work / "depth"]
+    assert "--intrinsics" in refusal(tumortrack(*depth))
+    succeeded(tumortrack(*depth, "--intrinsics", scene / "intrinsics.json", "--grid", 48))
+    found = json.loads((work / "depth" / "report.json").read_text())["parts"]["tumor_1"]
+    truth = read_mesh(scene / "tumor_1.ply").box_mm.mean(0)
+    assert np.linalg.norm(np.array(found["center_mm"]) - truth) < 12
+
+
+def test_inspect_says_what_things_are(work):
+    for path, words in (
+        (work / "case", "a case"),
+        (work / "model", "a model"),
+        (work / "out", "a run"),
+        (work / "scenes", "3 scenes"),
+        (work / "scenes" / "0000", "a scene"),
+        (work / "report", "an evaluation report"),
+        (work / "cloud.ply", "points from"),
+    ):
+        assert words in succeeded(tumortrack("inspect", path))
+    refusal(tumortrack("inspect", work))

@@ -1,0 +1,79 @@
+"""The whole chain on real patients: label map and virtual CT -> case -> model -> tumors."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from stories import refusal, succeeded, tumortrack
+from tumortrack.imaging.case import load_case
+from tumortrack.imaging.volume import read_labels
+from tumortrack.phantom.dicom import write_dicom_series
+from tumortrack.phantom.scanner import ScannerParameters, scan
+
+# Volumes in ml, from the data set's own voxels: the tumor-bearing kidney and its tumor.
+PATIENTS = {"case_00000": (215.0, 7.8), "case_00002": (289.0, 35.0), "case_00003": (202.0, 10.2)}
+STEPS = 60  # enough to run the chain, not to be accurate; docs/results.md has real training
+
+
+@pytest.mark.parametrize("patient", PATIENTS)
+def test_label_map_to_located_organ(patient, shared_data, tmp_path):
+    source = shared_data / "kits19" / patient / "segmentation.nii.gz"
+    case = tmp_path / "case"
+    succeeded(tumortrack("prepare", source, case))
+    anatomy = load_case(case).anatomy
+    organ_ml, tumor_ml = PATIENTS[patient]
+    assert anatomy.organ.volume_mm3 / 1000 == pytest.approx(organ_ml, rel=0.02)
+    assert [t.volume_mm3 / 1000 for t in anatomy.tumors] == pytest.approx([tumor_ml], rel=0.02)
+    succeeded(tumortrack("train", case, tmp_path / "model", "--steps", STEPS))
+    succeeded(tumortrack("simulate", case, tmp_path / "scenes", "--scenes", 1))
+    cloud = tmp_path / "scenes" / "0000" / "cloud.ply"
+    succeeded(tumortrack("locate", tmp_path / "model", cloud, tmp_path / "out", "--grid", 48))
+    kidney = json.loads((tmp_path / "out" / "report.json").read_text())["parts"]["kidney"]
+    assert kidney["volume_ml"] == pytest.approx(organ_ml, rel=0.5)
+
+
+@pytest.mark.parametrize("patient", PATIENTS)
+def test_virtual_ct_gives_back_the_anatomy(patient, shared_data, tmp_path):
+    source = shared_data / "kits19" / patient / "segmentation.nii.gz"
+    succeeded(tumortrack("prepare", source, tmp_path / "labels_case"))
+    labels = load_case(tmp_path / "labels_case").labels
+    write_dicom_series(scan(labels, ScannerParameters(), 4), tmp_path / "dicom")
+    succeeded(tumortrack("prepare", tmp_path / "dicom", tmp_path / "ct_case"))
+    truth, found = (load_case(tmp_path / name).anatomy for name in ("labels_case", "ct_case"))
+    assert len(found.parts) == len(truth.parts)
+    for mine, theirs in zip(found.parts, truth.parts, strict=True):
+        assert mine.volume_mm3 == pytest.approx(theirs.volume_mm3, rel=0.05)
+        assert np.abs(mine.box_mm - theirs.box_mm).max() < 2.0  # in place, not mirrored
+    assert (tmp_path / "ct_case" / "qc.png").stat().st_size > 20_000
+
+
+@pytest.mark.parametrize("side", ["left", "right"])
+def test_a_kidney_without_tumor_from_a_mask(side, shared_data, tmp_path):
+    source = shared_data / "totalsegmentator" / f"kidney_{side}.nii.gz"
+    said = succeeded(tumortrack("prepare", source, tmp_path / "case"))
+    assert "tumor" in said  # told that there is none
+    anatomy = load_case(tmp_path / "case").anatomy
+    assert anatomy.names == ("kidney",)
+    labels = read_labels(source)
+    voxels = np.argwhere(labels.labels > 0) @ labels.lps_from_index[:3, :3].T
+    centre = voxels.mean(0) + labels.lps_from_index[:3, 3]
+    assert (centre[0] > 0) == (side == "left")  # +x is the patient's left
+    assert np.abs(anatomy.organ.vertices_mm.mean(0) - centre).max() < 6
+
+
+def test_a_body_ct_by_thresholds_is_refused_with_advice(shared_data, tmp_path):
+    ct = shared_data / "totalsegmentator" / "example_ct.nii.gz"
+    assert "--labels" in refusal(tumortrack("prepare", ct, tmp_path / "case"))
+    assert not (tmp_path / "case").exists()
+
+
+def test_real_compressed_dicom_is_read_and_refused_for_what_it_is(shared_data, tmp_path):
+    """20 slices of an abdomen hold no whole kidney: read, then told so; nothing is written."""
+    folder: Path = shared_data / "totalsegmentator" / "example_ct_dicom"
+    message = refusal(tumortrack("prepare", folder, tmp_path / "case"))
+    assert "kidney" in message
+    assert list(tmp_path.iterdir()) == []
