@@ -1,0 +1,223 @@
+"""Poses and drags: laws and known answers."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from scipy.stats import kstest
+
+from render_objects import anatomy, sphere
+from tumortrack.core.errors import TumortrackError
+from tumortrack.core.geometry import direction_lps, transform_points
+from tumortrack.simulate.deform.base import View
+from tumortrack.simulate.deform.drag import CONFIGURATIONS, DragConfig, Drags
+from tumortrack.simulate.deform.rest import RestConfig
+from tumortrack.simulate.pose import PoseConfig, sample_pose
+
+ANATOMY = anatomy()
+ORGAN = ANATOMY.organ
+ANTERIOR = (0.0, -1.0, 0.0)
+DRAWS = 1500
+
+
+def poses(config, up=ANTERIOR, nearest=(110.0, 125.0), draws=DRAWS, organ=ORGAN):
+    rng = np.random.default_rng(1)
+    return np.stack([sample_pose(config, organ, up, nearest, rng) for _ in range(draws)])
+
+
+# pose
+
+
+@pytest.mark.parametrize("up", [ANTERIOR, (0.0, 0.0, 1.0), direction_lps("1,-2,0.5")])
+def test_limited_poses_face_the_camera_within_their_tilt(up):
+    turns = poses(PoseConfig(tilt_deg=15.0), up, draws=400, organ=sphere(30, (0, 0, 0), 1))
+    x, y, z = (turns[:, :3, :3] @ np.array(up)).T
+    tilt_y, tilt_x = np.degrees(np.arcsin(-x)), np.degrees(np.arctan2(y, -z))
+    for tilt in (tilt_x, tilt_y):
+        assert np.abs(tilt).max() <= 15 + 1e-9
+        assert kstest(tilt, "uniform", (-15, 30)).pvalue > 1e-3
+    across = np.cross(up, (0.6, 0.0, 0.8))
+    spun = turns[:, :3, :3] @ (across / np.linalg.norm(across))
+    angle = np.degrees(np.arctan2(spun[:, 1], spun[:, 0]))
+    assert kstest(angle, "uniform", (-180, 360)).pvalue > 1e-3
+
+
+def test_full_poses_are_every_rotation_alike():
+    turns = poses(PoseConfig(rotations="full"), organ=sphere(30, (0, 0, 0), 1))[:, :3, :3]
+    for axis in np.eye(3):
+        x, y, z = (turns @ axis).T
+        assert kstest(z, "uniform", (-1, 2)).pvalue > 1e-3  # Archimedes: uniform on the sphere
+        assert kstest(np.arctan2(y, x), "uniform", (-np.pi, 2 * np.pi)).pvalue > 1e-3
+    angle = Rotation.from_matrix(turns).magnitude()
+    # The rotation angle of the uniform distribution has the density (1 - cos) / pi.
+    assert kstest(angle, lambda a: (a - np.sin(a)) / np.pi).pvalue > 1e-3
+
+
+@pytest.mark.parametrize("rotations", ["full", "limited"])
+def test_poses_are_rigid_and_honour_distance_and_offset(rotations):
+    config = PoseConfig(rotations=rotations, sideways_mm=12.0)
+    turns = poses(config, nearest=(90.0, 130.0), draws=300)
+    np.testing.assert_allclose(np.linalg.det(turns[:, :3, :3]), 1)
+    placed = [transform_points(turn, ORGAN.vertices_mm) for turn in turns]
+    nearest = np.array([p[:, 2].min() for p in placed])
+    assert kstest(nearest, "uniform", (90, 40)).pvalue > 1e-3
+    centre = np.array([(p.min(0) + p.max(0)) / 2 for p in placed])[:, :2]
+    assert np.abs(centre).max() <= 12 + 1e-6
+    assert kstest(centre.ravel(), "uniform", (-12, 24)).pvalue > 1e-3
+
+
+@pytest.mark.parametrize(
+    ("up", "axis", "end"),
+    [("left", 0, 1), ("right", 0, -1), ("anterior", 1, -1), ("inferior", 2, -1)],
+)
+def test_the_side_that_is_up_lies_nearest_the_camera(up, axis, end):
+    (turn,) = poses(PoseConfig(tilt_deg=0.0), direction_lps(up), (115.0, 115.0), draws=1)
+    depth = transform_points(turn, ORGAN.vertices_mm)[:, 2]
+    assert depth.min() == pytest.approx(115)
+    assert np.argmin(depth) == np.argmax(end * ORGAN.vertices_mm[:, axis])
+
+
+# drag
+
+
+def in_front(points_ct):
+    return points_ct[:, 1] < -10
+
+
+VIEW = View(ANATOMY, in_front)
+
+
+def one_drag(center=(0, 0, 0), shift=(3.0, -4.0, 1.0), sigma=6.0):
+    return Drags(*(np.array(v, np.float32) for v in ([center], [shift], [sigma])))
+
+
+def slow_drags(drags, points):
+    out = points.astype(float)
+    for center, shift, sigma in zip(
+        drags.centres_ct, drags.shifts_mm, drags.sigmas_mm, strict=True
+    ):
+        square = ((out - center) ** 2).sum(1, keepdims=True)
+        out = out + np.exp(-square / (2 * sigma.astype(float) ** 2)) * shift
+    return out
+
+
+def test_configurations_are_the_papers_table(shared_data):
+    papers = sorted((Path(shared_data).parent / "paper").glob("*.txt"))
+    if not papers:
+        pytest.skip("the paper's text is not beside the data")
+    text = papers[0].read_text()
+    table = text[text.index("tab:compare_deformations}\n") :].split("\\end{table}")[0]
+    for number, row in enumerate(re.findall(r"^(\d) & (.*?)\\hline", table, re.M | re.S), start=1):
+        assert int(row[0]) == number
+        triples = re.findall(r"\(([\d.]+), ([\d.]+), (\d+)\)", row[1])
+        found = tuple((float(d), float(s), int(n)) for d, s, n in triples)
+        assert found == CONFIGURATIONS[number]
+    assert number == len(CONFIGURATIONS) == 6
+
+
+def test_one_drag_moves_its_centre_by_its_shift_and_falls_off_as_a_gaussian():
+    drag = one_drag(center=(10, 20, 30))
+    distance = np.array([0, 3, 6, 12, 18, 24, 60])
+    points = np.array([10.0, 20, 30]) + distance[:, None] * np.array([0.6, 0, 0.8])
+    moved = drag.apply(points) - points
+    np.testing.assert_allclose(moved[0], [3, -4, 1], atol=1e-5)
+    expected = np.exp(-(distance**2) / (2 * 6.0**2))
+    np.testing.assert_allclose(moved @ [3, -4, 1] / 26, expected, atol=2e-6)
+    assert (moved[-1] == 0).all()
+    assert expected[2] == pytest.approx(0.60653, abs=1e-5)  # exp(-1/2) at one sigma
+
+
+@pytest.mark.parametrize("number", CONFIGURATIONS)
+def test_drags_agree_with_plain_numpy(number):
+    drags = DragConfig(steps=CONFIGURATIONS[number]).sample(VIEW, np.random.default_rng(number))
+    points = np.random.default_rng(0).uniform(-60, 60, (3000, 3))
+    moved = drags.apply(points)
+    assert moved.dtype == np.float32
+    np.testing.assert_allclose(moved, slow_drags(drags, points), atol=5e-4)  # cut below 6e-6
+    assert np.abs(moved - points).max() > 1
+
+
+@pytest.mark.parametrize("falloff", ["sigma", "variance"])
+def test_drags_start_at_visible_vertices_and_keep_to_their_steps(falloff):
+    config = DragConfig(steps=CONFIGURATIONS[3], falloff=falloff)
+    visible = ORGAN.vertices_mm[in_front(ORGAN.vertices_mm)]
+    steps = [(d, s) for d, s, times in CONFIGURATIONS[3] for _ in range(times)]
+    limit, spread = np.array(steps).T
+    shares, directions, starts = [], [], []
+    for seed in range(60):
+        drags = config.sample(VIEW, np.random.default_rng(seed))
+        np.testing.assert_allclose(
+            drags.sigmas_mm, spread if falloff == "sigma" else np.sqrt(spread), rtol=1e-6
+        )
+        shift = np.linalg.norm(drags.shifts_mm, axis=1)
+        shares.extend(shift / limit)
+        directions.extend(drags.shifts_mm / shift[:, None])
+        starts.append(drags.centres_ct[0])
+        for k in (0, 1, 9, 17):  # where a visible vertex lies after the drags before
+            earlier = Drags(drags.centres_ct[:k], drags.shifts_mm[:k], drags.sigmas_mm[:k])
+            gap = np.linalg.norm(earlier.apply(visible) - drags.centres_ct[k], axis=1)
+            assert gap.min() < 1e-4
+    assert max(shares) <= 1 + 1e-6
+    assert kstest(shares, "uniform").pvalue > 1e-3
+    assert kstest(np.array(directions)[:, 2], "uniform", (-1, 2)).pvalue > 1e-3
+    assert len(np.unique(starts, axis=0)) > 50
+
+
+def test_nothing_visible_is_an_error():
+    blind = View(ANATOMY, lambda points: np.zeros(len(points), bool))
+    with pytest.raises(TumortrackError, match="none of the organ's vertices"):
+        DragConfig().sample(blind, np.random.default_rng(0))
+
+
+def test_tumors_move_along_with_the_surface():
+    """A tumor 10 mm below the dragged vertex follows by exp(-100 / (2 * 20^2)) of the shift."""
+    tumor = sphere(1.0, (0, -18, 0), 2)
+    drag = one_drag(center=(0, -28, 0), shift=(0, 8, 0), sigma=20.0)
+    moved = (drag.apply(tumor.vertices_mm) - tumor.vertices_mm).mean(0)
+    np.testing.assert_allclose(moved, [0, 8 * np.exp(-1 / 8), 0], atol=0.02)
+
+
+def jacobian_determinants(drag, spread):
+    """By central differences, along the shift's line (where it is least) and about it."""
+    line = np.linspace(-3 * spread, 3 * spread, 601)
+    points = np.concatenate(
+        [
+            line[:, None] * [1.0, 0, 0],
+            np.random.default_rng(0).uniform(-2 * spread, 2 * spread, (2000, 3)),
+        ]
+    )
+    step = 0.05
+    columns = [
+        (drag.apply(points + h) - drag.apply(points - h)) / (2 * step) for h in step * np.eye(3)
+    ]
+    return np.linalg.det(np.stack(columns, axis=2).astype(float))
+
+
+@pytest.mark.parametrize("step", CONFIGURATIONS[3])
+def test_each_drag_of_configuration_3_keeps_space_unfolded(step):
+    distance, sigma, _ = step
+    least = jacobian_determinants(one_drag(shift=(distance, 0, 0), sigma=sigma), sigma).min()
+    assert least == pytest.approx(1 - np.exp(-0.5) * distance / sigma, abs=0.01)
+    assert least > 0.2
+
+
+def test_the_tables_numbers_read_as_variances_fold_space():
+    sigma = np.sqrt(11.7)
+    least = jacobian_determinants(one_drag(shift=(8, 0, 0), sigma=sigma), sigma).min()
+    assert least == pytest.approx(1 - np.exp(-0.5) * 8 / sigma, abs=0.02)
+    assert least < -0.4
+
+
+def test_deformations_record_what_they_did_and_rest_does_nothing():
+    drags = DragConfig().sample(VIEW, np.random.default_rng(3))
+    record = drags.record()
+    again = Drags(
+        *(np.array(record[k], np.float32) for k in ("centres_ct", "shifts_mm", "sigmas_mm"))
+    )
+    points = ORGAN.vertices_mm
+    np.testing.assert_array_equal(again.apply(points), drags.apply(points))
+    rest = RestConfig().sample(VIEW, np.random.default_rng(3))
+    np.testing.assert_array_equal(rest.apply(points), points.astype(np.float32))
+    assert rest.record() == {"kind": "rest"}
