@@ -40,7 +40,7 @@ def main(out: Path, steps: int) -> None:
         config=config,
         seed=0,
         steps=steps,
-        workers=0,  # scenes are made in this process; more pay off in longer runs
+        workers=1,  # processes that make scenes, beside the one that learns
     )
     # Begun before? Then this goes on where it stopped, and ends with the same weights.
     model = train(run, out / f"model_{steps}", show)
