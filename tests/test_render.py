@@ -97,10 +97,11 @@ def test_what_lies_behind_the_camera_is_not_drawn():
 
 
 def test_visibility_agrees_with_every_triangle_tested():
-    mesh = bumpy(30, (10, 20, 30), 3)
+    mesh = bumpy(30, (10, 20, 30), 4)
     eye = np.array([25.0, -40, -70])
-    seen = Visibility(mesh)(mesh.vertices_mm, eye)
-    rays = mesh.vertices_mm - eye
+    vertices = np.random.default_rng(0).permutation(mesh.vertices_mm)[:700]
+    seen = Visibility(mesh)(vertices, eye)
+    rays = vertices - eye
     length = np.linalg.norm(rays, axis=1)
 
     def blocked(slack, nearer_mm):
@@ -112,7 +113,7 @@ def test_visibility_agrees_with_every_triangle_tested():
     np.testing.assert_array_equal(seen[sure], ~blocked(0.0, 0.05)[sure])
     assert 0.15 < seen.mean() < 0.5
     # Some are hidden although their surface turns to the eye: a hill stands before them.
-    normals = mesh.vertices_mm - mesh.vertices_mm.mean(0)
+    normals = vertices - mesh.vertices_mm.mean(0)
     assert (~seen & (np.einsum("vk,vk->v", normals, -rays) > 0)).any()
 
 
@@ -123,7 +124,7 @@ def test_visible_part_of_a_sphere_is_the_cap_within_the_tangent_cone(distance_mm
     cosine = (distance_mm - ball.vertices_mm[:, 2]) / 25  # of the angle seen from the centre
     horizon = 25 / distance_mm
     assert seen[cosine > horizon + 0.03].all()
-    assert not seen[cosine < horizon - 0.1].any()  # 0.05 mm of tolerance at grazing rays
+    assert not seen[cosine < horizon - 0.05].any()  # a facet spans 0.07
     assert (cosine > horizon + 0.03).sum() > 500
 
 
