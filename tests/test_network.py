@@ -273,7 +273,7 @@ def test_quick_network_learns_which_side_a_point_lies() -> None:
     points_mm, queries_mm = scene(q=400)
     labels = (queries_mm[..., 2] > 150).long() + (queries_mm[..., 0] > 20).long()
     adam = torch.optim.Adam(network.parameters(), 2e-3)
-    for _ in range(40):
+    for _ in range(120):
         with torch.autocast("cpu", torch.bfloat16):
             logits = network(points_mm, queries_mm)
         loss = torch.nn.functional.cross_entropy(logits.float().flatten(0, 1), labels.flatten())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -154,6 +155,7 @@ def simulate(
     configuration: tuple[Literal[1, 2, 3, 4, 5, 6], ...] = (3,),
     falloff: Literal["sigma", "variance"] = "sigma",
     rotations: Literal["limited", "full"] = "limited",
+    squeeze: bool = False,
     noise: bool = True,
 ) -> None:
     """Write deformed scenes of a case with their truth: what `evaluate` reads.
@@ -166,6 +168,7 @@ def simulate(
         configuration: of the paper's deformation table; several are mixed.
         falloff: how the table's third number is read (docs/method.md).
         rotations: poses, as in `train`.
+        squeeze: also squeeze and bend the organ as a whole.
         noise: with the depth sensor's noise.
     """
     from tumortrack.app import commands
@@ -173,7 +176,7 @@ def simulate(
     commands.simulate(
         case,
         dataset,
-        commands.SimulateOptions(scenes, seed, configuration, falloff, rotations, noise),
+        commands.SimulateOptions(scenes, seed, configuration, falloff, rotations, squeeze, noise),
     )
 
 
@@ -247,6 +250,9 @@ COMMANDS: dict[str, Callable[..., None]] = {
 
 def main() -> None:
     """Entry point: a known error is one line and an exit code, never a traceback."""
+    # OpenMP's threads wait by spinning; where other programs want the cores that is several times
+    # slower than giving them back soon, and no faster where they don't.
+    os.environ.setdefault("GOMP_SPINCOUNT", "1000")
     try:
         tyro.extras.subcommand_cli_from_dict(
             COMMANDS,

@@ -165,22 +165,27 @@ class SimulateOptions:
     configurations: tuple[int, ...] = (3,)
     falloff: Literal["sigma", "variance"] = "sigma"
     rotations: Literal["limited", "full"] = "limited"
+    squeeze: bool = False
     noise: bool = True
 
     def scene_config(self) -> SceneConfig:
         from tumortrack.sense.noise import CLEAN, D405_NOISE
-        from tumortrack.simulate.deform.drag import CONFIGURATIONS, DragConfig
+        from tumortrack.simulate.deform import ChainConfig, DeformConfig, DragConfig, StretchConfig
+        from tumortrack.simulate.deform.drag import CONFIGURATIONS
         from tumortrack.simulate.pose import PoseConfig
         from tumortrack.simulate.scene import SceneConfig
 
+        drags = (
+            DragConfig(steps=CONFIGURATIONS[n], falloff=self.falloff) for n in self.configurations
+        )
+        deform: tuple[DeformConfig, ...] = tuple(
+            ChainConfig(links=(drag, StretchConfig())) if self.squeeze else drag for drag in drags
+        )
         return SceneConfig(
             width=848,
             height=480,
             pose=PoseConfig(rotations=self.rotations),
-            deform=tuple(
-                DragConfig(steps=CONFIGURATIONS[n], falloff=self.falloff)
-                for n in self.configurations
-            ),
+            deform=deform,
             noise=D405_NOISE if self.noise else CLEAN,
         )
 

@@ -50,12 +50,12 @@ def quick(anatomy: Anatomy, rotations: Rotations = "limited") -> TrainConfig:
             pose=PoseConfig(rotations=rotations),
             deform=(*local, *squeezed),
             noise=D405_NOISE,
-            occupancy=OccupancyConfig(per_side=128),
+            occupancy=OccupancyConfig(per_side=64),
             free_range=0.5,
         ),
-        schedule=Schedule(learning_rate=2e-3),
-        batch_size=32,
-        steps=20_000,
+        schedule=Schedule(learning_rate=3e-3),
+        batch_size=16,
+        steps=12_000,
         drop_points=0.5,
     )
 

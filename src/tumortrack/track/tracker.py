@@ -23,7 +23,7 @@ COARSE_QUERIES = 10_000
 FINE_QUERIES = 40_000
 FEWEST_INSIDE = 20  # of the coarse queries: fewer are no organ
 LARGEST_GRID = 400
-CHUNK = 2048  # queries at once: their activations stay in a core's cache
+CHUNK = 2048  # queries at once and core: their activations stay in its cache
 
 Box = Float[np.ndarray, "2 3"]
 
@@ -112,7 +112,7 @@ class Tracker:
     def _logits(self, latent: Latent, points_mm: Float32[np.ndarray, "n 3"]) -> torch.Tensor:
         """(n, classes), float32, on the model's device."""
         queries = torch.tensor(points_mm, device=self._device)[None]
-        size = CHUNK if self._device.type == "cpu" else 2**17
+        size = CHUNK * torch.get_num_threads() if self._device.type == "cpu" else 2**17
         with torch.autocast(self._device.type, torch.bfloat16, enabled=self._bf16):
             chunks = [self._network.query(latent, part)[0] for part in queries.split(size, dim=1)]
         return torch.cat(chunks).float()

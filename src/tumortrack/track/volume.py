@@ -12,6 +12,7 @@ from tumortrack.core.geometry import transform_points
 from tumortrack.core.types import FIRST_TUMOR, Mesh, OccupancyCloud
 
 _AT_ONCE = 2**18  # queries; bounds the memory whatever the grid
+_SMALLEST_MARGIN = 1e-3  # a surface exactly through a grid point would not be closed
 _LARGEST_MARGIN = 30.0  # logits beyond say no more about where a surface lies
 
 
@@ -99,8 +100,9 @@ def _surface(
 ) -> Mesh:
     from skimage import measure
 
-    outside = -max(float(np.abs(field).max()), 1e-3)
-    padded = np.pad(field, 1, constant_values=outside)  # closes what the grid's edge cuts
+    field = np.where(field > 0, 1, -1) * np.maximum(np.abs(field), _SMALLEST_MARGIN)
+    # Padding closes what the grid's edge cuts.
+    padded = np.pad(field, 1, constant_values=-float(np.abs(field).max()))
     vertices, faces, _, _ = measure.marching_cubes(padded, 0.0, gradient_direction="ascent")
     index = vertices.astype(np.float64) - 1 + [part.start for part in box]
     mesh = Mesh(transform_points(camera_from_index, index), faces)

@@ -4,9 +4,9 @@ Source: the paper, section Localization and table "compare_deformations". The ta
 third number sigma^2. Its values are 100/3, 50/3, 35/3, 30/3, 20/3 and 10/3: radii of 100 ...
 10 mm under the three-sigma rule, so they are standard deviations in mm. Read as variances, most
 of the table's drags fold space over (a drag is one-to-one only while
-exp(-1/2) * distance / sigma < 1), labels of folded points are undefined, and nothing moves
-deeper than 10 mm below the surface. ``falloff = "sigma"`` (default) takes the first reading;
-``"variance"`` takes the table's heading literally. See docs/method.md.
+exp(-1/2) * distance / sigma < 1), labels of folded points are undefined, and configuration 3
+moves next to nothing 10 mm below the surface. ``falloff = "sigma"`` (default) takes the first
+reading; ``"variance"`` takes the table's heading literally. See docs/method.md.
 """
 
 from __future__ import annotations
@@ -76,16 +76,16 @@ class DragConfig(Config, frozen=True, tag="drag"):
         sigmas = np.array([s for _, s in steps])
         if self.falloff == "variance":
             sigmas = np.sqrt(sigmas)
-        centres = _visible_vertices(view, len(steps), rng)
+        start = _visible_vertices(view, len(steps), rng).astype(np.float32)
         directions = rng.normal(size=(len(steps), 3))
         directions /= np.linalg.norm(directions, axis=1, keepdims=True)
         shifts = directions * (distances * rng.uniform(size=len(steps)))[:, None]
-        drags = Drags(
-            centres.astype(np.float32), shifts.astype(np.float32), sigmas.astype(np.float32)
-        )
-        for k in range(1, len(steps)):  # a vertex is dragged from where earlier drags left it
-            before = Drags(drags.centres_ct[:k], drags.shifts_mm[:k], drags.sigmas_mm[:k])
-            drags.centres_ct[k] = before.apply(drags.centres_ct[k : k + 1])[0]
+        drags = Drags(start[:0], shifts[:0].astype(np.float32), sigmas[:0].astype(np.float32))
+        for k in range(len(steps)):  # a vertex is dragged from where earlier drags left it
+            centres = np.concatenate([drags.centres_ct, drags.apply(start[k : k + 1])])
+            drags = Drags(
+                centres, shifts[: k + 1].astype(np.float32), sigmas[: k + 1].astype(np.float32)
+            )
         return drags
 
 
