@@ -153,6 +153,9 @@ def test_bad_options_say_what_is_allowed(work, arguments, words):
 
 def test_simulated_scenes_are_evaluated_against_their_truth(work):
     succeeded(tumortrack("simulate", work / "case", work / "scenes", "--scenes", 3, "--seed", 9))
+    again = ["simulate", work / "case", work / "scenes", "--scenes", 3]
+    succeeded(tumortrack(*again, "--seed", 9))  # nothing to do
+    assert "another case, seed" in refusal(tumortrack(*again, "--seed", 8))
     report = work / "report"
     said = succeeded(tumortrack("evaluate", work / "model", work / "scenes", report, "--grid", 64))
     assert "3 scenes" in said

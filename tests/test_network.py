@@ -14,8 +14,10 @@ from tumortrack.learn.network import (
     FixedScale,
     NetworkConfig,
     OccupancyNetwork,
+    alignment,
     paper_network,
     quick_network,
+    turned,
 )
 from tumortrack.learn.sampling import ball_query, farthest_points, strided_points, take
 
@@ -209,6 +211,31 @@ def test_nothing_depends_on_the_camera_distance(config: NetworkConfig) -> None:
         rtol=1e-3,
         atol=1e-3,
     )
+
+
+@pytest.mark.parametrize("degrees", [10.0, 90.0, 200.0])
+def test_quick_does_not_depend_on_turns_about_the_cameras_axis(degrees: float) -> None:
+    network = seeded(quick_network(4, scale_mm=60.0)).eval()
+    points_mm, queries_mm = scene()
+    angle = torch.tensor(degrees).deg2rad()
+    rows = [[angle.cos(), angle.sin(), 0.0], [-angle.sin(), angle.cos(), 0.0], [0.0, 0.0, 1.0]]
+    turn = torch.tensor(rows)
+    straight = network(points_mm, queries_mm)
+    assert straight.abs().max() > 0.1
+    torch.testing.assert_close(
+        network(points_mm @ turn, queries_mm @ turn), straight, atol=1e-3, rtol=1e-3
+    )
+    tilt = torch.tensor([[1.0, 0.0, 0.0], *[[0.0, 0.8, 0.6], [0.0, -0.6, 0.8]]])
+    assert (network(points_mm @ tilt, queries_mm @ tilt) - straight).abs().max() > 0.01
+
+
+def test_alignment_finds_the_longest_direction_and_its_heavier_tail() -> None:
+    x = torch.tensor([-1.0, -1.0, -1.0, 0.0, 3.0])
+    along = torch.stack([0.6 * x, 0.8 * x, torch.zeros(5)], dim=-1)
+    torch.testing.assert_close(alignment(along[None])[:, 0, 0], torch.tensor([0.6, 0.8]))
+    torch.testing.assert_close(alignment(-along[None])[:, 0, 0], torch.tensor([-0.6, -0.8]))
+    aligned = turned(along[None], alignment(along[None]))
+    torch.testing.assert_close(aligned[0, :, 0], x)
 
 
 def test_size_is_lost_by_the_box_and_kept_by_the_fixed_scale() -> None:

@@ -202,28 +202,44 @@ def simulate(case_folder: Path, dataset: Path, options: SimulateOptions) -> None
 
 
 def write_scenes(case: Case, dataset: Path, options: SimulateOptions) -> None:
-    """Scenes 0000, 0001, ... of the ``test`` stream; those that are there already stay."""
+    """Scenes 0000, 0001, ... of the ``test`` stream; those that are there already stay.
+
+    Raises:
+        InputError: they are not scenes of this case, seed and options.
+    """
     from tumortrack.simulate.scene import SceneRecipe, Simulator
     from tumortrack.simulate.scene_folder import Scene, write_scene
 
-    simulator = Simulator(case.anatomy, case.up_lps, options.scene_config())
-    about = {"options": asdict(options), "config": to_builtins(options.scene_config())}
+    config = options.scene_config()
+    simulator = Simulator(case.anatomy, case.up_lps, config)
+    volumes = [part.volume_mm3 for part in case.anatomy.parts]
+    about = {"case_volumes_mm3": volumes, "config": to_builtins(config)}
     with progress_bar("simulate", options.scenes) as advance:
         for index in range(options.scenes):
             folder = dataset / f"{index:04d}"
-            if not folder.exists():
-                recipe = SceneRecipe(options.seed, "test", index)
+            recipe = SceneRecipe(options.seed, "test", index)
+            made_from = {**about, "recipe": asdict(recipe)}
+            if folder.exists():
+                _check_same(folder, made_from)
+            else:
                 stage = simulator.stage(recipe)
                 meta = {
-                    **about,
-                    "recipe": asdict(recipe),
+                    **made_from,
                     "camera_from_ct": stage.camera_from_ct.tolist(),
                     "deformation": stage.deformation.record(),
                 }
-                write_scene(
-                    folder, Scene(stage.cloud, simulator.reference(stage), stage.frame, meta)
-                )
+                truth = simulator.reference(stage)
+                write_scene(folder, Scene(stage.cloud, truth, stage.frame, meta))
             advance()
+
+
+def _check_same(folder: Path, made_from: dict) -> None:
+    """Refuse to continue a dataset of another case, seed or options."""
+    meta = store.read_json(folder / "meta.json")
+    if {key: meta.get(key) for key in made_from} != made_from:
+        raise InputError(
+            f"{folder} is a scene of another case, seed or option. Choose another DATASET folder."
+        )
 
 
 def evaluate(
