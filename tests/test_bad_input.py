@@ -139,6 +139,6 @@ def test_an_existing_case_is_kept_unless_told(tmp_path):
     ],
 )
 def test_options_out_of_range_say_what_is_allowed(arguments, words, tmp_path):
-    source = _nifti(tmp_path / "ball.nii", (1000 * _ball()).astype(np.int16) - 900, np.eye(4))
+    source = _nifti(tmp_path / "ball.nii", 1000 * _ball().astype(np.int16) - 900, np.eye(4))
     assert words in refusal(tumortrack("prepare", source, tmp_path / "case", *arguments))
     assert not (tmp_path / "case").exists()

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from stories import refusal, succeeded, tumortrack
+from tumortrack.core.mesh_files import read_mesh
 from tumortrack.imaging.case import load_case
 from tumortrack.imaging.volume import read_labels
 from tumortrack.phantom.dicom import write_dicom_series
@@ -16,7 +17,7 @@ from tumortrack.phantom.scanner import ScannerParameters, scan
 
 # Volumes in ml, from the data set's own voxels: the tumor-bearing kidney and its tumor.
 PATIENTS = {"case_00000": (215.0, 7.8), "case_00002": (289.0, 35.0), "case_00003": (202.0, 10.2)}
-STEPS = 60  # enough to run the chain, not to be accurate; docs/results.md has real training
+STEPS = 120  # enough to run the chain, not to be accurate; docs/results.md has real training
 
 
 @pytest.mark.parametrize("patient", PATIENTS)
@@ -33,7 +34,8 @@ def test_label_map_to_located_organ(patient, shared_data, tmp_path):
     cloud = tmp_path / "scenes" / "0000" / "cloud.ply"
     succeeded(tumortrack("locate", tmp_path / "model", cloud, tmp_path / "out", "--grid", 48))
     kidney = json.loads((tmp_path / "out" / "report.json").read_text())["parts"]["kidney"]
-    assert kidney["volume_ml"] == pytest.approx(organ_ml, rel=0.5)
+    truth = read_mesh(cloud.with_name("kidney.ply")).box_mm.mean(0)
+    assert np.linalg.norm(np.array(kidney["center_mm"]) - truth) < 25
 
 
 @pytest.mark.parametrize("patient", PATIENTS)

@@ -20,8 +20,8 @@ C = TypeVar("C", bound=msgspec.Struct)
 
 
 def to_builtins(config: msgspec.Struct) -> dict:
-    """The configuration as plain JSON types, every key written out."""
-    return msgspec.to_builtins(config)
+    """The configuration as what JSON would give back, every key written out."""
+    return msgspec.json.decode(msgspec.json.encode(config))
 
 
 def from_builtins(data: object, kind: type[C], where: str) -> C:

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import logging
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +35,8 @@ def read_nifti(path: Path) -> RawVolume:
     import nibabel
 
     try:
-        image: Any = nibabel.load(path)
+        with _silent(nibabel.imageglobals.logger):
+            image: Any = nibabel.load(path)
         header = image.header
         shape = tuple(int(n) for n in header.get_data_shape())
         dtype = header.get_data_dtype()
@@ -65,6 +69,17 @@ def read_nifti(path: Path) -> RawVolume:
     except Exception as error:
         raise InputError(f"{path} is truncated or damaged: {error}.") from error
     return RawVolume(array, lps_from_index)
+
+
+@contextmanager
+def _silent(logger: logging.Logger) -> Iterator[None]:
+    """nibabel mends some headers and says so; what is wrong with a file, we say ourselves."""
+    level = logger.level
+    logger.setLevel(logging.CRITICAL)
+    try:
+        yield
+    finally:
+        logger.setLevel(level)
 
 
 def _lps_from_index(path: Path, header: Any) -> Float[np.ndarray, "4 4"]:

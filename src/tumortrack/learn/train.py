@@ -100,7 +100,7 @@ def train(run: Run, folder: Path, report: Callable[[Status], None]) -> Model:
         run.anatomy_ct, run.up_lps, config.scene, pool, run.seed, "train", config.batch_size
     )
     validation = ValidationSet(run.anatomy_ct, run.up_lps, config, pool, run.seed, device)
-    steps = range(state.progress.step, run.steps or config.steps)
+    steps = range(state.progress.step, state.progress.end or config.steps)
     period = config.training_pairs // config.batch_size
 
     progress, clock, miou = state.progress, _Clock(state.progress), None
@@ -109,18 +109,18 @@ def train(run: Run, folder: Path, report: Callable[[Status], None]) -> Model:
             loss = state.step(batch)
             progress.elapsed_s = clock.elapsed()
             settled = settle_end(config, progress, run.minutes)
-            done = progress.step == progress.end
+            done, stop = progress.step == progress.end, stopped()
             if done or progress.step % config.validate_every == 0:
                 miou = validation.miou(state.average)
                 state.keep_if_best(miou)
                 history.write(progress, loss.item(), miou)
-            if done or settled or stopped() or clock.due("checkpoint", run.checkpoint_every_s):
+            if done or settled or stop or clock.due("checkpoint", run.checkpoint_every_s):
                 state.save(work)
             if done or clock.due("report", REPORT_EVERY_S):
                 report(_status(run, progress, clock.rate(progress), loss.item(), miou))
             if done:
                 break
-            if stopped():
+            if stop:
                 raise Interrupted(
                     f"stopped at step {progress.step}; the state is saved in {folder}. The same "
                     "command goes on from there."

@@ -12,12 +12,18 @@ from jaxtyping import Float, Float32
 
 import tumortrack
 from tumortrack.core.errors import NoEstimate
-from tumortrack.core.types import CameraLabels, OccupancyCloud, SensorCloud, part_names
+from tumortrack.core.types import CameraLabels, OccupancyCloud, SensorCloud
 from tumortrack.learn.model import Model, has_fast_bfloat16
 from tumortrack.learn.network import Latent
 from tumortrack.sense.cloud import check_cloud, thin_cloud
 from tumortrack.track.estimate import Estimate
-from tumortrack.track.volume import dense_margins, describe_parts, grid_over, part_surfaces
+from tumortrack.track.volume import (
+    dense_margins,
+    describe_parts,
+    grid_over,
+    keep_largest_pieces,
+    part_surfaces,
+)
 
 COARSE_QUERIES = 10_000
 FINE_QUERIES = 40_000
@@ -64,8 +70,8 @@ class Tracker:
                 lambda points: self._logits(latent, points), camera_from_index, shape
             )
         with _timed(seconds, "surfaces"):
-            n_parts = len(self.model.parts)
-            meshes = part_surfaces(margins, labels, camera_from_index, part_names(n_parts))
+            labels = keep_largest_pieces(labels, len(self.model.parts))
+            meshes = part_surfaces(margins, labels, camera_from_index, self.model.parts)
         volume = CameraLabels(labels, camera_from_index)
         report = {
             "tumortrack": tumortrack.__version__,

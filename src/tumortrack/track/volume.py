@@ -6,10 +6,10 @@ from collections.abc import Callable
 
 import numpy as np
 import torch
-from jaxtyping import Float16, Float64, UInt8
+from jaxtyping import Bool, Float16, Float64, UInt8
 
 from tumortrack.core.geometry import transform_points
-from tumortrack.core.types import FIRST_TUMOR, Mesh, OccupancyCloud
+from tumortrack.core.types import FIRST_TUMOR, ORGAN, Mesh, OccupancyCloud
 
 _AT_ONCE = 2**18  # queries; bounds the memory whatever the grid
 _SMALLEST_MARGIN = 1e-3  # a surface exactly through a grid point would not be closed
@@ -73,24 +73,41 @@ def _margins(logits: torch.Tensor) -> torch.Tensor:
     return torch.stack(columns, 1)
 
 
+def keep_largest_pieces(
+    labels: UInt8[np.ndarray, "i j k"], n_parts: int
+) -> UInt8[np.ndarray, "i j k"]:
+    """One piece of each part: islands of the organ become outside, those of a tumor organ."""
+    kept = np.where(_largest_piece(labels > 0), labels, 0).astype(np.uint8)
+    for label in range(FIRST_TUMOR, n_parts + 1):
+        mask = kept == label
+        kept[mask & ~_largest_piece(mask)] = ORGAN
+    return kept
+
+
+def _largest_piece(mask: Bool[np.ndarray, "i j k"]) -> Bool[np.ndarray, "i j k"]:
+    from scipy import ndimage
+
+    pieces, count = ndimage.label(mask)
+    if count < 2:
+        return mask
+    return pieces == 1 + int(np.argmax(np.bincount(pieces.ravel())[1:]))
+
+
 def part_surfaces(
     margins: Float16[np.ndarray, "parts i j k"],
     labels: UInt8[np.ndarray, "i j k"],
     camera_from_index: Float64[np.ndarray, "4 4"],
     names: tuple[str, ...],
 ) -> dict[str, Mesh]:
-    """The largest piece of each part as a closed surface; parts without a voxel are left out."""
-    from scipy import ndimage
-
+    """Each part of labels in one piece as a closed surface; parts without a voxel are left out."""
     meshes = {}
     for n, name in enumerate(names):
         mask = labels > 0 if n == 0 else labels == n + 1
-        pieces, count = ndimage.label(mask)
-        if count == 0:
+        if not mask.any():
             continue
-        largest = 1 + int(np.argmax(np.bincount(pieces.ravel())[1:]))
-        box = ndimage.find_objects(pieces)[largest - 1]
-        field = np.where(pieces[box] == largest, margins[n][box], -np.abs(margins[n][box]))
+        index = np.nonzero(mask)
+        box = tuple(slice(int(i.min()), int(i.max()) + 1) for i in index)
+        field = np.where(mask[box], margins[n][box], -np.abs(margins[n][box]))
         meshes[name] = _surface(field.astype(np.float32), camera_from_index, box)
     return meshes
 
