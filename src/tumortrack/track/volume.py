@@ -105,8 +105,8 @@ def part_surfaces(
         mask = labels > 0 if n == 0 else labels == n + 1
         if not mask.any():
             continue
-        index = np.nonzero(mask)
-        box = tuple(slice(int(i.min()), int(i.max()) + 1) for i in index)
+        # One voxel more on each side: the surface lies between voxels of either sign.
+        box = tuple(slice(max(int(i.min()) - 1, 0), int(i.max()) + 2) for i in np.nonzero(mask))
         field = np.where(mask[box], margins[n][box], -np.abs(margins[n][box]))
         meshes[name] = _surface(field.astype(np.float32), camera_from_index, box)
     return meshes
