@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import atexit
 import os
 import signal
-from collections.abc import Iterator
+from collections.abc import Generator
 
 import torch
 from torch.utils.data import DataLoader, Dataset
@@ -30,9 +31,11 @@ class _Batches(Dataset[Tensors]):
         )
 
 
-def batches(stream: SceneStream, steps: range, period: int, workers: int) -> Iterator[Tensors]:
+def batches(
+    stream: SceneStream, steps: range, period: int, workers: int
+) -> Generator[Tensors, None, None]:
     """The batches of these steps, in order, whatever the number of workers; after ``period``
-    steps (0: never) they repeat."""
+    steps (0: never) they repeat. Close the generator to end the workers."""
     loader = DataLoader(
         _Batches(stream, period),
         batch_size=None,
@@ -42,7 +45,7 @@ def batches(stream: SceneStream, steps: range, period: int, workers: int) -> Ite
         prefetch_factor=4 if workers else None,
         worker_init_fn=_quiet_worker,
     )
-    return iter(loader)
+    yield from loader
 
 
 def default_workers() -> int:
@@ -59,4 +62,7 @@ def available_cores() -> int:
 
 def _quiet_worker(_: int) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle
+    # A worker has nothing to put in order at its end, and native libraries' threads can abort a
+    # process that is taken down piece by piece.
+    atexit.register(os._exit, 0)
     torch.set_num_threads(1)

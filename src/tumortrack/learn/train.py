@@ -11,7 +11,7 @@ import json
 import signal
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -104,8 +104,9 @@ def train(run: Run, folder: Path, report: Callable[[Status], None]) -> Model:
     period = config.training_pairs // config.batch_size
 
     progress, clock, miou = state.progress, _Clock(state.progress), None
-    with History(work, progress) as history, _ctrl_c() as stopped:
-        for batch in batches(stream, steps, period, workers):
+    source = closing(batches(stream, steps, period, workers))
+    with History(work, progress) as history, _ctrl_c() as stopped, source as loaded:
+        for batch in loaded:
             loss = state.step(batch)
             progress.elapsed_s = clock.elapsed()
             settled = settle_end(config, progress, run.minutes)
