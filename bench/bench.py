@@ -34,7 +34,7 @@ from tumortrack.simulate.deform.drag import Drags
 from tumortrack.simulate.occupancy import OccupancyConfig, OccupancyPool, labels_of
 from tumortrack.simulate.scene import SceneConfig, SceneRecipe, Simulator, Stage
 
-ROUNDS = 7
+ROUNDS = 5
 UP = (0.0, -1.0, 0.0)
 CPU = torch.device("cpu")
 
