@@ -10,6 +10,10 @@ import pytest
 import trimesh
 
 from stories import refusal, succeeded, tumortrack
+from tumortrack.app import commands
+from tumortrack.app.demo import run_demo
+from tumortrack.core.errors import InputError
+from tumortrack.imaging.prepare import PrepareOptions, prepare
 
 
 def _nifti(path: Path, array: np.ndarray, affine: np.ndarray) -> Path:
@@ -135,10 +139,88 @@ def test_an_existing_case_is_kept_unless_told(tmp_path):
         (["--up", "sideways"], "anterior"),
         (["--up", "0,0,0"], "three numbers"),
         (["--organ", "300"], "1..255"),
-        (["--kidney-hu", "300", "-300", "--no-labels"], ""),
+        (["--kidney-hu", "300", "-300"], "low < high"),
+        (["--side", "left"], "--side means nothing"),
+        (["--organ", "2", "--tumor", "0"], "--organ, --tumor means nothing"),
+        (["--unit", "m"], "--unit means nothing"),
+        (["--series", "1"], "--series means nothing"),
     ],
 )
 def test_options_out_of_range_say_what_is_allowed(arguments, words, tmp_path):
     source = _nifti(tmp_path / "ball.nii", 1000 * _ball().astype(np.int16) - 900, np.eye(4))
     assert words in refusal(tumortrack("prepare", source, tmp_path / "case", *arguments))
     assert not (tmp_path / "case").exists()
+
+
+def test_options_of_other_inputs_are_refused(tmp_path):
+    """What a label map or meshes never ask for would be ignored without a word."""
+    labels = _nifti(tmp_path / "labels.nii", _ball(), np.eye(4))
+    meshes = tmp_path / "meshes"
+    meshes.mkdir()
+    trimesh.creation.icosphere(3, 30.0).export(meshes / "kidney.stl")
+    for source, wrong in (
+        (labels, {"tumor_hu": (200.0, 900.0)}),
+        (labels, {"unit": "m"}),
+        (labels, {"series": "1"}),
+        (meshes, {"kidney_hu": (0.0, 200.0)}),
+        (meshes, {"labels": True}),
+        (meshes, {"side": "left"}),
+        (meshes, {"series": "1"}),
+        (meshes, {"min_tumor_ml": 1.0}),
+    ):
+        with pytest.raises(InputError, match="--" + next(iter(wrong)).replace("_", "-")):
+            prepare(source, PrepareOptions(**wrong))
+
+
+def test_an_unreadable_input_is_named_and_no_folder_stays(tmp_path, monkeypatch):
+    source = _nifti(tmp_path / "ball.nii", _ball(), np.eye(4))
+
+    def refuse(*_: object) -> None:
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr("tumortrack.imaging.prepare.read_raw", refuse)
+    with pytest.raises(InputError, match=r"ball\.nii cannot be read: Permission denied"):
+        commands.prepare(source, tmp_path / "new" / "dir" / "case", PrepareOptions(), False)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["ball.nii"]
+
+
+def test_train_wants_one_end(tmp_path):
+    both = commands.TrainOptions(minutes=1.0, steps=10)
+    with pytest.raises(InputError, match="--minutes and --steps"):
+        commands.train(tmp_path / "case", tmp_path / "model", both)
+
+
+@pytest.mark.parametrize(
+    ("minutes", "scenes", "words"),
+    [(0.0, 2, "--minutes"), (np.nan, 2, "--minutes"), (1.0, 0, "--scenes")],
+)
+def test_a_demo_of_nothing_is_refused_at_once(minutes, scenes, words, tmp_path):
+    with pytest.raises(InputError, match=words):
+        run_demo(tmp_path / "demo", minutes, scenes)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_demo_replaces_nothing_but_a_demo(tmp_path, monkeypatch):
+    def stop(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("tumortrack.phantom.scanner.scan", stop)
+    mine = tmp_path / "mine"
+    (mine / "case").mkdir(parents=True)
+    (mine / "case" / "dear.txt").write_text("dear")
+    (tmp_path / "file").write_text("dear")
+    before = sorted(tmp_path.rglob("*"))
+    for out, words in ((mine, "no demo wrote"), (tmp_path / "file", "is a file")):
+        with pytest.raises(InputError, match=words):
+            run_demo(out, 1.0, 1)
+    assert sorted(tmp_path.rglob("*")) == before
+    demo = tmp_path / "demo"
+    with pytest.raises(KeyboardInterrupt):
+        run_demo(demo, 1.0, 1)
+    (demo / "case").mkdir()  # what a demo that was stopped left there
+    with pytest.raises(KeyboardInterrupt):
+        run_demo(demo, 1.0, 1)
+    assert [p.name for p in demo.iterdir()] == ["demo.json"]
+    (demo / "notes.txt").write_text("dear")
+    with pytest.raises(InputError, match=r"notes\.txt"):
+        run_demo(demo, 1.0, 1)

@@ -302,3 +302,22 @@ def test_real_volumes_are_read(shared_data):
     assert slices.hu.shape == (512, 512, 20)
     assert np.allclose(spacing_mm(slices.lps_from_index), [0.9765625, 0.9765625, 2.0])
     assert slices.hu.min() == -1024
+
+
+def test_a_multi_frame_object_beside_a_series_is_left_out_with_a_note(tmp_path):
+    import pydicom
+
+    array = np.arange(12 * 10 * 11, dtype=np.int16).reshape(12, 10, 11)
+    paths = write_dicom(tmp_path / "dicom", array, np.eye(4))
+    extra = pydicom.dcmread(paths[0])
+    extra.NumberOfFrames = 2
+    extra.PixelData = extra.PixelData * 2
+    extra.save_as(tmp_path / "dicom" / "frames.dcm")
+    raw = read_raw(tmp_path / "dicom")
+    np.testing.assert_array_equal(raw.array, array)
+    assert len(raw.notes) == 1
+    assert "frames.dcm" in raw.notes[0]
+    for path in paths:
+        path.unlink()
+    with pytest.raises(InputError, match="classic slices"):
+        read_raw(tmp_path / "dicom")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import nibabel
@@ -18,6 +19,8 @@ from stories import (
     tumortrack,
     write_phantom_case,
 )
+from tumortrack.app.scenes import check_case
+from tumortrack.core import store
 from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.mesh_files import read_mesh
@@ -104,8 +107,9 @@ def test_the_same_seed_gives_the_same_answer_and_distance_does_not_matter(tracke
 def test_clouds_in_other_formats_and_units_agree(work, seen):
     points, _ = seen
     np.savez(work / "metres.npz", points=points / 1000)
-    message = refusal(tumortrack("locate", work / "model", work / "metres.npz", work / "no"))
-    assert "--unit m" in message
+    refused = ["locate", work / "model", work / "metres.npz", work / "no"]
+    for crop in ([], ["--range", "110", "150"]):  # the crop alone would find nothing in range
+        assert "--unit m" in refusal(tumortrack(*refused, *crop))
     assert not (work / "no").exists()
     out = work / "metres"
     succeeded(
@@ -134,6 +138,7 @@ def test_bad_clouds_are_refused(tracker, points, error):
     [
         (["--range", "5", "20"], "points lie between"),
         (["--grid", "401"], "--grid 401"),
+        (["--intrinsics", "camera.json"], "--intrinsics is for depth images"),
         (["--device", "cuda"], "no CUDA GPU"),
     ],
 )
@@ -159,18 +164,42 @@ def test_simulated_scenes_are_evaluated_against_their_truth(work):
     report = work / "report"
     said = succeeded(tumortrack("evaluate", work / "model", work / "scenes", report, "--grid", 64))
     assert "3 scenes" in said
-    summary = json.loads((report / "report.json").read_text())["summary"]
+    told = json.loads((report / "report.json").read_text())
+    assert told["model_sha256"] == store.sha256_of(work / "model" / store.MANIFEST)
+    assert told["model"]["case_sha256"] == store.sha256_of(work / "case" / store.MANIFEST)
+    assert (told["grid"], told["seed"], told["scenes_folder"]) == (64, 0, str(work / "scenes"))
+    summary = told["summary"]
     assert summary["failed"] == 0
     assert 0.4 < summary["miou"] < 1
     assert summary["tumor_1"]["hausdorff_mm"] >= summary["tumor_1"]["hausdorff_one_sided_mm"] > 0
     assert (report / "index.html").stat().st_size > 10_000
+    kept = sorted((work / "out").iterdir())
+    onto_a_run = ["evaluate", work / "model", work / "scenes", work / "out"]
+    assert "REPORT" in refusal(tumortrack(*onto_a_run))
+    assert sorted((work / "out").iterdir()) == kept
+
+
+def test_scenes_of_another_case_are_refused_and_unknown_ones_are_not(work):
+    scenes = sorted((work / "scenes").iterdir())
+    model = load_model(work / "model")
+    check_case(model, scenes)
+    other = replace(model, provenance={**model.provenance, "case_sha256": "0" * 64})
+    with pytest.raises(InputError, match="another case"):
+        check_case(other, scenes)
+    foreign = work / "foreign" / "0000"
+    foreign.mkdir(parents=True)
+    check_case(other, [foreign])  # no meta.json at all
+    (foreign / "meta.json").write_text('{"units": "mm"}')
+    check_case(other, [foreign])
 
 
 def test_depth_images_take_the_range_the_model_was_trained_for(work):
     scene = work / "scenes" / "0000"
     depth = ["locate", work / "model", scene / "depth.png", work / "depth"]
     assert "--intrinsics" in refusal(tumortrack(*depth))
-    succeeded(tumortrack(*depth, "--intrinsics", scene / "intrinsics.json", "--grid", 48))
+    depth += ["--intrinsics", scene / "intrinsics.json", "--grid", 48]
+    assert "depth_unit_mm" in refusal(tumortrack(*depth, "--unit", "m"))
+    succeeded(tumortrack(*depth))
     found = json.loads((work / "depth" / "report.json").read_text())["parts"]["tumor_1"]
     truth = read_mesh(scene / "tumor_1.ply").box_mm.mean(0)
     assert np.linalg.norm(np.array(found["center_mm"]) - truth) < 12

@@ -51,28 +51,67 @@ def test_new_folder_appears_whole_and_at_once(tmp_path):
     assert leftovers(tmp_path) == ["case"]
 
 
+def write_case(folder, name, kind="case"):
+    with store.new_folder(folder, overwrite=True) as aside:
+        (aside / name).write_text(name)
+        store.seal(aside, kind, {}, frame="lps")
+
+
 def test_existing_folder_is_refused_or_swapped(tmp_path):
+    (tmp_path / "case").mkdir()  # an empty one may be filled
     for content in ("old", "new"):
-        with store.new_folder(tmp_path / "case", overwrite=True) as aside:
-            (aside / content).write_text(content)
-    assert leftovers(tmp_path / "case") == ["new"]
+        write_case(tmp_path / "case", content)
+    assert leftovers(tmp_path / "case") == ["manifest.json", "new"]
     with (
         pytest.raises(InputError, match="--overwrite"),
-        store.new_folder(tmp_path / "case") as aside,
+        store.new_folder(tmp_path / "case"),
     ):
         pytest.fail("the body must not run")
     with (
         pytest.raises(RuntimeError),
-        store.new_folder(tmp_path / "case", overwrite=True) as aside,
+        store.new_folder(tmp_path / "case", overwrite=True),
     ):
         raise RuntimeError
-    assert leftovers(tmp_path / "case") == ["new"]
+    assert leftovers(tmp_path / "case") == ["manifest.json", "new"]
     assert leftovers(tmp_path) == ["case"]
 
 
+def test_overwriting_spares_what_is_not_ours(tmp_path):
+    """Only an artifact of the same kind with nothing else in it is replaced."""
+    photos, file, run, used = (tmp_path / name for name in ("photos", "file", "run", "used"))
+    photos.mkdir()
+    (photos / "holiday.jpg").write_text("dear")
+    (photos / "manifest.json").write_text('{"kind": "case"}')  # another program's
+    file.write_text("dear")
+    write_case(run, "report.json", kind="run")
+    write_case(used, "kidney.ply")
+    (used / "model").mkdir()  # trained inside the case's folder
+    before = sorted(tmp_path.rglob("*"))
+    for place in (photos, file, run, used):
+        with pytest.raises(InputError, match=r"--overwrite"):
+            write_case(place, "kidney.ply")
+        with pytest.raises(InputError, match=r"--overwrite"):
+            store.check_place(place, "case", overwrite=True)
+    with (
+        pytest.raises(InputError, match="unsealed"),
+        store.new_folder(run, overwrite=True),
+    ):
+        pass
+    assert sorted(tmp_path.rglob("*")) == before
+    store.check_place(run, "run", overwrite=True)
+
+
+def test_overwriting_a_link_keeps_what_it_points_to(tmp_path):
+    write_case(tmp_path / "real", "old")
+    (tmp_path / "link").symlink_to(tmp_path / "real")
+    write_case(tmp_path / "link", "new")
+    assert leftovers(tmp_path / "link") == ["manifest.json", "new"]
+    assert leftovers(tmp_path / "real") == ["manifest.json", "old"]
+    assert leftovers(tmp_path) == ["link", "real"]
+
+
 def test_old_folder_returns_when_the_swap_fails(tmp_path, monkeypatch):
-    (tmp_path / "case").mkdir()
-    (tmp_path / "case" / "old").write_text("old")
+    write_case(tmp_path / "case", "old")
     rename = store.os.rename
 
     def refuse(source, target):
@@ -83,11 +122,11 @@ def test_old_folder_returns_when_the_swap_fails(tmp_path, monkeypatch):
     monkeypatch.setattr(store.os, "rename", refuse)
     with (
         pytest.raises(StorageError, match="Input/output"),
-        store.new_folder(tmp_path / "case", overwrite=True),
+        store.new_folder(tmp_path / "case", overwrite=True) as aside,
     ):
-        pass
+        store.seal(aside, "case", {}, frame="lps")
     assert leftovers(tmp_path) == ["case"]
-    assert leftovers(tmp_path / "case") == ["old"]
+    assert leftovers(tmp_path / "case") == ["manifest.json", "old"]
 
 
 @pytest.fixture

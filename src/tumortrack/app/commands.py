@@ -2,23 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
 from tumortrack.app.console import console, progress_bar, say
+from tumortrack.app.scenes import SimulateOptions, check_case, write_scenes
 from tumortrack.core import store
-from tumortrack.core.config import to_builtins
 from tumortrack.core.errors import InputError
 from tumortrack.core.types import SensorCloud
 
 if TYPE_CHECKING:
-    from tumortrack.imaging.case import Case
     from tumortrack.imaging.prepare import PrepareOptions
     from tumortrack.learn.model import Model
-    from tumortrack.simulate.scene import SceneConfig
 
 Device = Literal["auto", "cpu", "cuda"]
 
@@ -26,11 +24,12 @@ Device = Literal["auto", "cpu", "cuda"]
 def prepare(source: Path, folder: Path, options: PrepareOptions, overwrite: bool) -> None:
     """`tumortrack prepare`: input -> case folder with a picture to check it by."""
     from tumortrack.evaluate.pictures import qc_picture
-    from tumortrack.imaging.case import save_case
+    from tumortrack.imaging.case import KIND, save_case
     from tumortrack.imaging.prepare import prepare as make_case
 
+    store.check_place(folder, KIND, overwrite)
+    case = make_case(source, options)
     with store.new_folder(folder, overwrite) as aside:
-        case = make_case(source, options)
         qc_picture(case.labels, case.ct, case.anatomy, aside / "qc.png")
         save_case(case, aside)
     for note in case.report.get("notes", []):
@@ -65,6 +64,8 @@ def train(case_folder: Path, folder: Path, options: TrainOptions) -> None:
         raise InputError(f"--minutes {options.minutes} must be more than 0.")
     if options.steps is not None and options.steps < 1:
         raise InputError(f"--steps {options.steps} must be at least 1.")
+    if options.minutes is not None and options.steps is not None:
+        raise InputError("--minutes and --steps both say when to stop; give one of them.")
     if options.workers is not None and options.workers < 0:
         raise InputError(f"--workers {options.workers} must be 0 or more.")
     case = load_case(case_folder)
@@ -116,8 +117,7 @@ def locate(model_folder: Path, source: Path, out: Path, options: LocateOptions) 
     from tumortrack.track.tracker import Tracker
 
     _check_grid(options.grid)
-    if out.exists() and not options.overwrite:
-        raise InputError(f"{out} exists already. Choose another path, or give --overwrite.")
+    store.check_place(out, "run", options.overwrite)
     model = load_model(model_folder, options.device)
     cloud, notes = _observed(model, source, options)
     estimate = Tracker(model).locate(cloud, options.grid, options.seed)
@@ -143,7 +143,7 @@ def _observed(
     model: Model, source: Path, options: LocateOptions
 ) -> tuple[SensorCloud, tuple[str, ...]]:
     """The cloud of a cloud file or depth image, cropped as the options say."""
-    from tumortrack.sense.cloud import CloudConfig, cloud_from_depth, crop_cloud
+    from tumortrack.sense.cloud import CloudConfig, check_cloud, cloud_from_depth, crop_cloud
     from tumortrack.sense.files import read_cloud, read_depth_png
 
     trained = model.config.scene.cloud
@@ -151,95 +151,25 @@ def _observed(
     if source.suffix.lower() == ".png":
         if options.intrinsics is None:
             raise InputError(f"{source} is a depth image: give --intrinsics FILE.json with it.")
+        if options.unit != "mm":
+            raise InputError(
+                "--unit is for clouds; a depth image's unit stands in its intrinsics file as "
+                "depth_unit_mm (mm per step)."
+            )
         frame = read_depth_png(source, options.intrinsics)
         crop = CloudConfig(near_mm=near, far_mm=far, n_points=trained.n_points)
         return cloud_from_depth(frame, crop, np.random.default_rng(options.seed)), ()
+    if options.intrinsics is not None:
+        raise InputError(f"--intrinsics is for depth images (.png); {source} is a cloud.")
     cloud, notes = read_cloud(source, options.unit)
+    check_cloud(cloud)  # before the crop, which would only say that nothing lies in range
     return (crop_cloud(cloud, near, far) if options.range_mm else cloud), notes
-
-
-@dataclass(frozen=True)
-class SimulateOptions:
-    scenes: int = 20
-    seed: int = 0
-    configurations: tuple[int, ...] = (3,)
-    falloff: Literal["sigma", "variance"] = "sigma"
-    rotations: Literal["limited", "full"] = "limited"
-    squeeze: bool = False
-    noise: bool = True
-
-    def scene_config(self) -> SceneConfig:
-        from tumortrack.sense.noise import CLEAN, D405_NOISE
-        from tumortrack.simulate.deform import ChainConfig, DeformConfig, DragConfig, StretchConfig
-        from tumortrack.simulate.deform.drag import CONFIGURATIONS
-        from tumortrack.simulate.pose import PoseConfig
-        from tumortrack.simulate.scene import SceneConfig
-
-        drags = (
-            DragConfig(steps=CONFIGURATIONS[n], falloff=self.falloff) for n in self.configurations
-        )
-        deform: tuple[DeformConfig, ...] = tuple(
-            ChainConfig(links=(drag, StretchConfig())) if self.squeeze else drag for drag in drags
-        )
-        return SceneConfig(
-            width=848,
-            height=480,
-            pose=PoseConfig(rotations=self.rotations),
-            deform=deform,
-            noise=D405_NOISE if self.noise else CLEAN,
-        )
 
 
 def simulate(case_folder: Path, dataset: Path, options: SimulateOptions) -> None:
     """`tumortrack simulate`: case -> folder of scenes, one folder each."""
-    from tumortrack.imaging.case import load_case
-
-    if options.scenes < 1:
-        raise InputError(f"--scenes {options.scenes} must be at least 1.")
-    case = load_case(case_folder)
-    write_scenes(case, dataset, options)
+    write_scenes(case_folder, dataset, options)
     say(f"{options.scenes} scenes written to {dataset}.")
-
-
-def write_scenes(case: Case, dataset: Path, options: SimulateOptions) -> None:
-    """Scenes 0000, 0001, ... of the ``test`` stream; those that are there already stay.
-
-    Raises:
-        InputError: they are not scenes of this case, seed and options.
-    """
-    from tumortrack.simulate.scene import SceneRecipe, Simulator
-    from tumortrack.simulate.scene_folder import Scene, write_scene
-
-    config = options.scene_config()
-    simulator = Simulator(case.anatomy, case.up_lps, config)
-    volumes = [part.volume_mm3 for part in case.anatomy.parts]
-    about = {"case_volumes_mm3": volumes, "config": to_builtins(config)}
-    with progress_bar("simulate", options.scenes) as advance:
-        for index in range(options.scenes):
-            folder = dataset / f"{index:04d}"
-            recipe = SceneRecipe(options.seed, "test", index)
-            made_from = {**about, "recipe": asdict(recipe)}
-            if folder.exists():
-                _check_same(folder, made_from)
-            else:
-                stage = simulator.stage(recipe)
-                meta = {
-                    **made_from,
-                    "camera_from_ct": stage.camera_from_ct.tolist(),
-                    "deformation": stage.deformation.record(),
-                }
-                truth = simulator.reference(stage)
-                write_scene(folder, Scene(stage.cloud, truth, stage.frame, meta))
-            advance()
-
-
-def _check_same(folder: Path, made_from: dict) -> None:
-    """Refuse to continue a dataset of another case, seed or options."""
-    meta = store.read_json(folder / "meta.json")
-    if {key: meta.get(key) for key in made_from} != made_from:
-        raise InputError(
-            f"{folder} is a scene of another case, seed or option. Choose another DATASET folder."
-        )
 
 
 def evaluate(
@@ -252,13 +182,25 @@ def evaluate(
     from tumortrack.track.tracker import Tracker
 
     _check_grid(grid)
-    tracker = Tracker(load_model(model_folder, device))
-    with progress_bar("evaluate", len(list_scenes(scenes))) as advance:
+    if (report / store.MANIFEST).exists():
+        raise InputError(f"{report} is a case, model or run; choose another REPORT folder.")
+    model, folders = load_model(model_folder, device), list_scenes(scenes)
+    check_case(model, folders)
+    about = {
+        "model": model.provenance,
+        "model_sha256": store.sha256_of(model_folder / store.MANIFEST),
+        "scenes_folder": str(scenes),
+        "grid": grid,
+        "seed": seed,
+    }
+    tracker = Tracker(model)
+    with progress_bar("evaluate", len(folders)) as advance:
         result = evaluate_scenes(
             lambda cloud: tracker.locate(cloud, grid, seed),
             scenes,
             report,
             lambda *_: advance(),
+            about,
         )
     console.print(summary_table(result))
     say(f"written to {report / 'report.json'}; look at {report / 'index.html'}.")

@@ -5,13 +5,16 @@ from __future__ import annotations
 import shutil
 from pathlib import Path
 
+import tumortrack
 from tumortrack.app import commands
 from tumortrack.app.console import say
-from tumortrack.core.errors import InputError
+from tumortrack.core import store
+from tumortrack.core.errors import InputError, StorageError
 
 CT_SEED, SCENE_SEED = 1, 2
 # Two of the paper's deformation configurations: the one that training uses, and a stronger one.
 CONFIGURATIONS = (2, 3)
+_MARKER = "demo.json"  # says that what lies beside it is a demo's and may be replaced
 _MINE = ("ct_dicom", "case", "model", "dataset", "scenes", "report.json", "index.html")
 
 
@@ -19,14 +22,17 @@ def run_demo(out: Path, minutes: float, scenes: int) -> None:
     """Write everything below ``out``; the report is OUT/report.json, the page OUT/index.html.
 
     Raises:
-        InputError: ``out`` holds files that no demo made.
+        InputError: ``out`` is a file or holds what no demo made; no minutes or scenes.
     """
-    from tumortrack.imaging.case import load_case
     from tumortrack.imaging.prepare import PrepareOptions
     from tumortrack.phantom.dicom import write_dicom_series
     from tumortrack.phantom.digital import PhantomParameters, phantom_labels
     from tumortrack.phantom.scanner import ScannerParameters, scan
 
+    if not 0 < minutes < float("inf"):
+        raise InputError(f"--minutes {minutes:g} must be more than 0.")
+    if scenes < 1:
+        raise InputError(f"--scenes {scenes} must be at least 1.")
     _clear(out)
     say("1/5 scanning the built-in kidney phantom (virtual CT, DICOM)")
     ct = scan(phantom_labels(PhantomParameters()), ScannerParameters(), CT_SEED)
@@ -36,27 +42,30 @@ def run_demo(out: Path, minutes: float, scenes: int) -> None:
     say(f"3/5 training for {minutes:g} minutes")
     commands.train(out / "case", out / "model", commands.TrainOptions(minutes=minutes))
     say(f"4/5 simulating {scenes} unseen deformed scenes")
-    commands.write_scenes(
-        load_case(out / "case"),
-        out / "dataset",
-        commands.SimulateOptions(scenes, SCENE_SEED, CONFIGURATIONS),
-    )
+    options = commands.SimulateOptions(scenes, SCENE_SEED, CONFIGURATIONS)
+    commands.write_scenes(out / "case", out / "dataset", options)
     say("5/5 locating kidney and tumors in each from one depth image")
     commands.evaluate(out / "model", out / "dataset", out, grid=128, seed=0, device="auto")
     say(f"open {out / 'index.html'} in a browser: estimate over truth, in 3-D, scene by scene.")
 
 
 def _clear(out: Path) -> None:
-    if not out.exists():
-        out.mkdir(parents=True)
-    foreign = sorted(p.name for p in out.iterdir() if p.name not in _MINE)
-    if foreign:
+    """Make ``out``, or empty it of an earlier demo, known by its marker."""
+    if out.exists() and not out.is_dir():
+        raise InputError(f"{out} is a file; --out must be a folder.")
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        names = sorted(p.name for p in out.iterdir())
+    except OSError as error:
+        raise StorageError(f"cannot write {out}: {error.strerror}.") from error
+    foreign = [name for name in names if name not in (*_MINE, _MARKER)]
+    if names and (foreign or _MARKER not in names):
         raise InputError(
-            f"{out} holds files that are not a demo's ({', '.join(foreign[:3])}); choose another "
-            "--out folder."
+            f"{out} holds files that no demo wrote ({', '.join((foreign or names)[:3])}); choose "
+            "another --out folder."
         )
-    for name in _MINE:
-        path = out / name
+    store.write_json(out / _MARKER, {"kind": "demo", "tumortrack": tumortrack.__version__})
+    for path in (out / name for name in _MINE):
         if path.is_dir():
             shutil.rmtree(path)
         else:

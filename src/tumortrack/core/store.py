@@ -95,12 +95,48 @@ def seal(folder: Path, kind: str, content: dict, frame: str) -> None:
     write_json(folder / MANIFEST, manifest)
 
 
+def check_place(path: Path, kind: str, overwrite: bool) -> None:
+    """Refuse to write an artifact where something lies that must stay.
+
+    ``overwrite`` replaces an empty folder or an artifact of the same kind in which nothing else
+    lies, and nothing but that: a mistyped path must not cost the user's files.
+
+    Raises:
+        InputError: something else is there, or anything without ``overwrite``.
+    """
+    if not path.exists():
+        return
+    if not overwrite:
+        raise InputError(f"{path} exists already. Choose another path, or give --overwrite.")
+    if not path.is_dir():
+        raise InputError(f"{path} is a file; --overwrite replaces only a {kind} folder.")
+    inside = [p.name for p in path.iterdir()]
+    if not inside:
+        return
+    manifest = read_json(path / MANIFEST) if MANIFEST in inside else {}
+    files = manifest.get("files")
+    if manifest.get("kind") != kind or "tumortrack" not in manifest or not isinstance(files, dict):
+        raise InputError(
+            f"{path} is no {kind} of tumortrack's, so --overwrite does not replace it. Choose "
+            "another path, or move the folder away yourself."
+        )
+    strays = [name for name in sorted(inside) if name not in (MANIFEST, *files)]
+    if strays := [name for name in strays if not name.startswith(".")]:
+        raise InputError(
+            f"{path} also holds {', '.join(strays[:3])}, which no {kind} has; --overwrite would "
+            "lose it. Move it away first, or choose another path."
+        )
+
+
 @contextmanager
 def new_folder(path: Path, overwrite: bool = False) -> Iterator[Path]:
     """Fill a folder aside, then move it to ``path`` in one step; on any error nothing appears.
 
+    What it replaces must be empty or of the kind that the new folder's manifest states: see
+    ``check_place``.
+
     Raises:
-        InputError: ``path`` exists and ``overwrite`` is False.
+        InputError: ``path`` exists and ``overwrite`` is False, or it may not be replaced.
         StorageError: the disk is full or not writable.
     """
     if path.exists() and not overwrite:
@@ -114,6 +150,9 @@ def new_folder(path: Path, overwrite: bool = False) -> Iterator[Path]:
         yield aside
         aside.chmod(0o755)
         if path.exists():
+            sealed = (aside / MANIFEST).is_file()
+            kind = str(read_json(aside / MANIFEST).get("kind")) if sealed else "unsealed folder"
+            check_place(path, kind, overwrite)
             old = aside.with_suffix(".old")
             os.rename(path, old)
             try:
@@ -131,7 +170,7 @@ def new_folder(path: Path, overwrite: bool = False) -> Iterator[Path]:
 
 
 def _remove(path: Path) -> None:
-    if path.is_dir():
+    if path.is_dir() and not path.is_symlink():
         shutil.rmtree(path, ignore_errors=True)
     else:
         path.unlink(missing_ok=True)

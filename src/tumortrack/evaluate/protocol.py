@@ -44,7 +44,11 @@ Progress = Callable[[int, int, str], None]
 
 
 def evaluate_scenes(
-    locate: Locate, scenes_dir: Path, out: Path, progress: Progress | None = None
+    locate: Locate,
+    scenes_dir: Path,
+    out: Path,
+    progress: Progress | None = None,
+    about: dict | None = None,
 ) -> dict:
     """Evaluate ``locate`` on every scene of a folder.
 
@@ -57,6 +61,7 @@ def evaluate_scenes(
         scenes_dir: folder of scene folders.
         out: report folder, made if it is not there.
         progress: called after each scene with (done, total, its name).
+        about: plain JSON that the report repeats: the model and options behind ``locate``.
 
     Returns:
         The report: ``scenes``, ``summary`` and the ``rule`` by which medians were taken.
@@ -86,6 +91,7 @@ def evaluate_scenes(
         "tumortrack": tumortrack.__version__,
         "units": "mm",
         "frame": "camera",
+        **(about or {}),
         "rule": RULE,
         "summary": summarise(entries),
         "scenes": entries,

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
@@ -17,6 +18,7 @@ from tumortrack.imaging.voxels import RawVolume, check_affine, check_size
 
 MIN_SLICES = 10
 _MAX_FILES = 20_000
+_MULTI_FRAME: Literal["multi-frame"] = "multi-frame"
 _TAGS = [
     "SeriesInstanceUID", "SeriesDescription", "Modality", "ImageType", "Rows", "Columns",
     "NumberOfFrames", "PixelSpacing", "ImagePositionPatient", "ImageOrientationPatient",
@@ -49,7 +51,7 @@ def read_dicom(folder: Path, series: str | None = None) -> RawVolume:
     Raises:
         InputError: no series, several, a missing, double or stray slice, damaged pixels.
     """
-    groups = _groups(folder)
+    groups, multi_frame = _groups(folder)
     slices = _choose(folder, groups, series)
     first = slices[0]
     row, column = np.reshape(first.orientation, (2, 3))
@@ -67,34 +69,54 @@ def read_dicom(folder: Path, series: str | None = None) -> RawVolume:
     shape = (first.shape[1], first.shape[0], len(slices))
     check_size(folder, shape, 4)
     check_affine(folder, lps_from_index)
-    return RawVolume(_pixels(folder, [s.path for s in slices], shape), lps_from_index)
+    notes: tuple[str, ...] = ()
+    if multi_frame:
+        names = multi_frame[0].name + (", ..." if len(multi_frame) > 1 else "")
+        notes = (f"{len(multi_frame)} multi-frame DICOM objects left out ({names})",)
+    return RawVolume(_pixels(folder, [s.path for s in slices], shape), lps_from_index, notes)
 
 
-def _groups(folder: Path) -> list[list[_Slice]]:
-    """Image slices of the folder by series, size and orientation, in a fixed order."""
+def _groups(folder: Path) -> tuple[list[list[_Slice]], list[Path]]:
+    """Image slices by series, size and orientation, in a fixed order; and multi-frame files.
+
+    Raises:
+        InputError: too many files, or no slice at all.
+    """
     files = sorted(p for p in folder.iterdir() if p.is_file() and not p.name.startswith("."))
     if len(files) > _MAX_FILES:
         raise InputError(f"{folder} holds {len(files)} files; the limit is {_MAX_FILES}.")
     found: dict[tuple, list[_Slice]] = {}
+    multi_frame: list[Path] = []
     for file in files:
-        if (one := _read_tags(file)) is not None:
+        one = _read_tags(file)
+        if isinstance(one, _Slice):
             found.setdefault(one.group, []).append(one)
-    return [found[key] for key in sorted(found, key=lambda key: (-len(found[key]), repr(key)))]
+        elif one == _MULTI_FRAME:
+            multi_frame.append(file)
+    if multi_frame and not found:
+        raise InputError(
+            f"{multi_frame[0]} is a multi-frame DICOM object; export classic slices, one file "
+            "each, or NIfTI."
+        )
+    if not found:
+        raise InputError(
+            f"{folder} holds no DICOM image with a position. Give the folder that holds the CT's "
+            "slices themselves."
+        )
+    groups = [found[key] for key in sorted(found, key=lambda key: (-len(found[key]), repr(key)))]
+    return groups, multi_frame
 
 
-def _read_tags(path: Path) -> _Slice | None:
-    """The tags of one image, or None where the file is no DICOM image with a position."""
+def _read_tags(path: Path) -> _Slice | Literal["multi-frame"] | None:
+    """The tags of one slice, or None where the file is no DICOM image with a position."""
     import pydicom
 
     try:
         tags = pydicom.dcmread(path, stop_before_pixels=True, specific_tags=_TAGS)
-        if "ImagePositionPatient" not in tags and int(tags.get("NumberOfFrames") or 1) == 1:
-            return None
         if int(tags.get("NumberOfFrames") or 1) > 1:
-            raise InputError(
-                f"{path} is a multi-frame DICOM object; export classic slices, one file each, "
-                "or NIfTI."
-            )
+            return _MULTI_FRAME
+        if "ImagePositionPatient" not in tags:
+            return None
         return _Slice(
             path=path,
             uid=str(tags.get("SeriesInstanceUID") or ""),
@@ -105,18 +127,11 @@ def _read_tags(path: Path) -> _Slice | None:
             position_mm=tuple(float(x) for x in tags.ImagePositionPatient),
             orientation=tuple(float(x) for x in tags.ImageOrientationPatient),
         )
-    except InputError:
-        raise
     except Exception:  # pydicom raises anything on a foreign or damaged file: it is no slice
         return None
 
 
 def _choose(folder: Path, groups: list[list[_Slice]], series: str | None) -> list[_Slice]:
-    if not groups:
-        raise InputError(
-            f"{folder} holds no DICOM image with a position. Give the folder that holds the CT's "
-            "slices themselves."
-        )
     if series is not None:
         fitting = [g for n, g in enumerate(groups, 1) if series in (g[0].uid, str(n))]
     else:

@@ -20,6 +20,11 @@ from tumortrack.imaging.select import MIN_TUMOR_ML, select_labels
 from tumortrack.imaging.surface import surfaces
 from tumortrack.imaging.volume import is_label_map, labels_of, read_raw, volume_of
 
+# Which options only one kind of input asks for.
+_OF_CT = ("kidney_hu", "tumor_hu")
+_OF_LABELS = ("labels", "side", "organ", "tumor")
+_OF_DICOM, _OF_MESHES = ("series",), ("unit",)
+
 
 @dataclass(frozen=True)
 class PrepareOptions:
@@ -71,29 +76,49 @@ def prepare(input: Path, options: PrepareOptions | None = None) -> Case:
     if input.is_dir() and not any(p.is_file() for p in input.iterdir()):
         raise InputError(f"{input} holds no files. Give a folder of DICOM slices or of meshes.")
     is_meshes = input.is_dir() and any(p.suffix.lower() in SUFFIXES for p in input.iterdir())
-    case = _from_meshes(input, options) if is_meshes else _from_volume(input, options)
+    try:
+        case = _from_meshes(input, options) if is_meshes else _from_volume(input, options)
+        source_sha256 = store.sha256_of(input)
+    except OSError as error:
+        raise InputError(f"{input} cannot be read: {error.strerror or error}.") from error
     report = {
         **case.report,
         "source": input.name,
-        "source_sha256": store.sha256_of(input),
+        "source_sha256": source_sha256,
         "options": {k: list(v) if isinstance(v, tuple) else v for k, v in asdict(options).items()},
     }
     return Case(case.anatomy, case.labels, up, report, case.ct)
 
 
+def _refuse_unused(what: str, options: PrepareOptions, unused: tuple[str, ...]) -> None:
+    """An option that this kind of input never asks for would be ignored: say so instead."""
+    usual = PrepareOptions()
+    given = [name for name in unused if getattr(options, name) != getattr(usual, name)]
+    if given:
+        names = ", ".join("--" + name.replace("_", "-") for name in given)
+        raise InputError(f"{what}, where {names} means nothing. Leave it out.")
+
+
 def _from_volume(path: Path, options: PrepareOptions) -> Case:
+    if not path.is_dir():
+        _refuse_unused(f"{path} is one file", options, _OF_DICOM)
     raw = read_raw(path, options.series)
     as_labels = options.labels or (path.is_file() and is_label_map(raw))
     ct = None
+    found = list(raw.notes)
     if as_labels:
-        source, hint = labels_of(raw, path), []
+        _refuse_unused(f"{path} is read as a label map", options, _OF_CT + _OF_MESHES)
+    else:
+        what = f"{path} is read as a CT (a label map needs --labels)"
+        _refuse_unused(what, options, _OF_LABELS + _OF_MESHES)
+    if as_labels:
+        source = labels_of(raw, path)
         if not options.labels:
-            hint = ["few distinct whole numbers: read as a label map, not as a CT"]
+            found.append("few distinct whole numbers: read as a label map, not as a CT")
         del raw  # the largest maps are gigabytes: one copy is enough
         labels, notes = select_labels(
             source, options.side, options.organ, options.tumor, options.min_tumor_ml
         )
-        notes = hint + notes
     else:
         volume = volume_of(raw, path)
         del raw
@@ -104,7 +129,7 @@ def _from_volume(path: Path, options: PrepareOptions) -> Case:
     anatomy, surface = surfaces(labels)
     report = {
         "kind": "label map" if as_labels else "ct",
-        "notes": notes,
+        "notes": found + notes,
         "volumes_ml": volumes_ml(labels),
         "surface": {k: list(v) for k, v in asdict(surface).items()},
         "spacing_mm": spacing_mm(labels.lps_from_index).tolist(),
@@ -113,6 +138,9 @@ def _from_volume(path: Path, options: PrepareOptions) -> Case:
 
 
 def _from_meshes(folder: Path, options: PrepareOptions) -> Case:
+    _refuse_unused(
+        f"{folder} holds meshes", options, (*_OF_CT, *_OF_LABELS, *_OF_DICOM, "min_tumor_ml")
+    )
     anatomy, notes = read_mesh_folder(folder, options.unit)
     labels = label_meshes(anatomy)
     return Case(anatomy, labels, (0.0, -1.0, 0.0), _mesh_report(anatomy, labels, notes))

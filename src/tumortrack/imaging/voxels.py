@@ -20,10 +20,14 @@ _GZIP_BEST = 1100  # deflate cannot compress better than 1032 : 1
 
 @dataclass(frozen=True, eq=False)
 class RawVolume:
-    """Voxels in the file's own number type; axes (i, j, k); ``lps_from_index``: index -> LPS mm."""
+    """Voxels in the file's own number type; axes (i, j, k); ``lps_from_index``: index -> LPS mm.
+
+    ``notes`` say what lay beside them and was left out.
+    """
 
     array: np.ndarray
     lps_from_index: Float[np.ndarray, "4 4"]
+    notes: tuple[str, ...] = ()
 
 
 def check_size(path: Path, shape: tuple[int, ...], bytes_per_voxel: int) -> None:
