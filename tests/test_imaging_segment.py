@@ -9,6 +9,7 @@ from tumortrack.core.errors import InputError
 from tumortrack.core.types import LabelVolume, Volume
 from tumortrack.imaging.grid import voxel_ml
 from tumortrack.imaging.segment import segment_ct, select_labels
+from tumortrack.imaging.surface import surfaces
 
 
 def volumes(labels: LabelVolume) -> np.ndarray:
@@ -158,3 +159,66 @@ def test_chosen_numbers_and_missing_labels():
         select_labels(LabelVolume(np.zeros((5, 5, 5)), np.eye(4)))
     with pytest.raises(InputError, match=r"fill 0\.\d ml"):
         select_labels(LabelVolume(truth.labels, np.diag([0.1, 0.1, 0.1, 1.0])))
+
+
+def beside(gap: int, radius_mm: float = 9.0, spacing_mm: float = 1.0) -> LabelVolume:
+    """A ball of organ (25 mm radius) and a ball of tumor, ``gap`` empty voxels between them."""
+    n = round(50 / spacing_mm)
+    x, y, z = (axis * spacing_mm for axis in np.ogrid[-n : 2 * n, -n:n, -n:n])
+    labels = (x**2 + y**2 + z**2 < 25**2).astype(np.uint8)
+    first = int(np.flatnonzero(labels.any((1, 2)))[-1]) + 1 + gap
+    reach = round(radius_mm / spacing_mm)
+    centre = (first + reach - n) * spacing_mm
+    labels[(x - centre) ** 2 + y**2 + z**2 <= (reach * spacing_mm) ** 2] = 2
+    return LabelVolume(labels, np.diag([spacing_mm] * 3 + [1.0]))
+
+
+@pytest.mark.parametrize(("gap", "radius_mm"), [(1, 9.0), (3, 9.0), (1, 16.0), (2, 5.0)])
+def test_a_tumor_behind_a_thin_gap_belongs_to_its_kidney(gap, radius_mm):
+    """Also one larger than 10 ml (radius 16 mm), which is no kidney of its own."""
+    truth = beside(gap, radius_mm)
+    before = volumes(truth)
+    found, notes = select_labels(truth)
+    after = volumes(found)
+    assert after[2] == before[2]  # the tumor is whole
+    assert 0 < after[1] - before[1] < 0.3  # and the gap is filled, no wider than it is
+    assert any(f"lies {gap:.1f} mm off" in note for note in notes), notes
+    assert ndimage.label(found.labels > 0, np.ones((3, 3, 3)))[1] == 1
+    anatomy, _ = surfaces(found)
+    assert anatomy.organ.volume_mm3 == pytest.approx(1000 * after[1:].sum(), rel=0.01)
+    assert np.ptp(anatomy.organ.box_mm[:, 0]) > 49 + gap + 2 * radius_mm - 1
+
+
+def test_a_gap_is_closed_at_fine_voxels_too_and_touching_tumors_need_none():
+    found, _ = select_labels(beside(4, 9.0, 0.7))
+    assert found.labels.max() == 2
+    touching = beside(0)
+    found, notes = select_labels(touching)
+    assert volumes(found)[1:] == pytest.approx(volumes(touching)[1:])
+    assert notes == []
+
+
+def test_a_tumor_far_off_is_refused_or_loudly_left_out():
+    far = beside(8, 16.0)
+    with pytest.raises(InputError, match=r"the only tumor \(1\d\.\d ml\) lies more than 3 mm"):
+        select_labels(far)
+    alone, _ = select_labels(far, tumor=0)
+    assert alone.labels.max() == 1
+    labels = far.labels.copy()
+    middle = np.argwhere(labels == 1).mean(0)
+    ball = ((np.indices(labels.shape) - middle[:, None, None, None]) ** 2).sum(0) < 9**2
+    labels[ball] = 2
+    found, notes = select_labels(LabelVolume(labels, far.lps_from_index))
+    assert volumes(found)[2] == pytest.approx(float(ball.sum()) / 1000)
+    assert any(note.startswith("LEFT OUT: tumor of 17.") for note in notes), notes
+
+
+def test_a_kidney_mostly_tumor_is_a_kidney_still():
+    """5 ml of organ round a tumor of 50 ml, and a speck."""
+    x, y, z = np.ogrid[-30:30, -30:30, -30:30]
+    distance = np.sqrt(x**2 + y**2 + z**2)
+    labels = np.where(distance < 22.8, 2, np.where(distance < 23.6, 1, 0)).astype(np.uint8)
+    labels[:2, :2, :2] = 1
+    found, _ = select_labels(LabelVolume(labels, np.eye(4)))
+    assert 3 < volumes(found)[1] < 10
+    assert volumes(found)[2] == pytest.approx(49.6, abs=0.5)

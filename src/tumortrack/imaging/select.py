@@ -5,11 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import UInt8
 
 from tumortrack.core.errors import InputError
 from tumortrack.core.types import FIRST_TUMOR, ORGAN, LabelVolume
 from tumortrack.imaging.grid import bounding_box, components, cropped, moved_origin, voxel_ml
+from tumortrack.imaging.pieces import GAP_MM, Pieces, attach_tumors, find_pieces
 
 MIN_TUMOR_ML = 0.2
 MIN_KIDNEY_ML, MAX_KIDNEY_ML = 10.0, 2500.0  # a polycystic kidney can pass 2 litres
@@ -33,8 +34,10 @@ def select_labels(
 ) -> tuple[LabelVolume, list[str]]:
     """Keep one kidney (label 1) and its tumors (2, 3, ...), cropped with a margin.
 
-    A kidney is a connected piece of organ and tumor voxels of at least 10 ml and a tenth of the
-    largest; all smaller pieces are specks and go. A tumor is a piece of one tumor label inside
+    A kidney is a connected piece of organ and tumor voxels with at least 10 ml of organ and a
+    tenth of the largest one's volume (where there is none, the piece with most organ). A tumor
+    within 3 mm of a kidney belongs to it: see ``pieces.attach_tumors``. One farther off is left
+    out with a note; other pieces are specks and go. A tumor is a piece of one tumor label inside
     that kidney; smaller ones than ``min_tumor_ml`` become organ. Different tumor labels keep
     their order; the pieces of one label follow each other, largest first.
 
@@ -47,36 +50,35 @@ def select_labels(
         The selected labels and notes on what was dropped or renumbered.
 
     Raises:
-        InputError: no organ, no such tumor label, two kidneys without tumor and no ``side``.
+        InputError: no organ, no such tumor label, two kidneys without tumor and no ``side``, no
+            tumor but one apart from every kidney.
     """
     labels = label_volume.labels
     present = [int(n) for n in np.flatnonzero(np.bincount(labels.ravel(order="K"))) if n > 0]
     tumors = _tumor_labels(present, organ, tumor)
-    wanted = np.zeros(256, bool)
-    wanted[[organ, *tumors]] = True
-    solid = wanted[labels]
     affine = label_volume.lps_from_index
-    box = bounding_box(solid, affine, 2.0)
-    labels, solid, affine = labels[box], solid[box], moved_origin(affine, box)
-
-    pieces, counts = components(solid)
-    unit = voxel_ml(affine)
-    kidneys = _kidneys(pieces, counts, labels, affine, tumors)
-    middle = label_volume.lps_from_index @ [*(np.array(label_volume.labels.shape) / 2), 1]
-    chosen, notes = _choose_kidney(kidneys, side, float(middle[0]))
-    n_specks = len(counts) - len(kidneys)
-    if n_specks:
-        specks_ml = unit * float(counts[len(kidneys) :].sum())
-        notes.append(f"{n_specks} specks beside the kidneys dropped ({specks_ml:.2f} ml together)")
+    box = bounding_box(np.isin(labels, [organ, *tumors]), affine, 2.0)
+    affine = moved_origin(affine, box)
+    pieces = find_pieces(labels[box], affine, organ, tumors)
+    numbers = _kidney_pieces(pieces)
+    pieces, notes, apart = attach_tumors(pieces, numbers, min_tumor_ml)
+    kidneys = _kidneys(pieces, numbers)
+    notes += _left_out(pieces, kidneys, apart, min_tumor_ml)
+    middle = label_volume.lps_from_index @ [*(np.array(labels.shape) / 2), 1]
+    chosen, more = _choose_kidney(kidneys, side, float(middle[0]))
+    notes += more
     if not MIN_KIDNEY_ML <= chosen.ml <= MAX_KIDNEY_ML:
         raise InputError(
             f"label {organ} and its tumors fill {chosen.ml:.1f} ml; a kidney has "
             f"{MIN_KIDNEY_ML:g} to {MAX_KIDNEY_ML:g} ml. Check --organ, --tumor and the spacing."
         )
-    kidney = pieces == chosen.piece
+    kidney = pieces.numbers == chosen.piece
     box = bounding_box(kidney, affine, 2.0)
     out, more = _number_tumors(
-        np.where(kidney, labels, 0)[box].astype(np.uint8), organ, tumors, unit, min_tumor_ml
+        np.where(kidney, pieces.labels, 0)[box].astype(np.uint8),
+        tumors,
+        voxel_ml(affine),
+        min_tumor_ml,
     )
     return cropped(out, moved_origin(affine, box)), notes + more
 
@@ -100,30 +102,52 @@ def _tumor_labels(present: list[int], organ: int, tumor: int | None) -> list[int
     return [tumor]
 
 
-def _kidneys(
-    pieces: np.ndarray,
-    counts: np.ndarray,
-    labels: np.ndarray,
-    lps_from_index: Float[np.ndarray, "4 4"],
-    tumors: list[int],
-) -> list[_Kidney]:
-    """The pieces that are large enough to be a kidney, largest first."""
+def _kidney_pieces(pieces: Pieces) -> list[int]:
+    """The numbers of the pieces that hold enough organ to be a kidney, largest first."""
+    whole_ml = pieces.whole_ml
+    large = [n for n in range(1, len(whole_ml)) if pieces.organ_ml[n] >= MIN_KIDNEY_ML]
+    if not large:  # a kidney nearly eaten up by its tumor, or a very small one
+        return [int(pieces.organ_ml.argmax())]
+    return [n for n in large if whole_ml[n] >= whole_ml[large].max() / 10]
+
+
+def _kidneys(pieces: Pieces, numbers: list[int]) -> list[_Kidney]:
     from scipy import ndimage
 
-    unit = voxel_ml(lps_from_index)
-    large = [n for n in range(1, len(counts) + 1) if counts[n - 1] >= max(1, counts[0] / 10)]
-    large = [n for n in large if n == 1 or counts[n - 1] * unit >= MIN_KIDNEY_ML]
-    is_tumor = np.zeros(256, bool)
-    is_tumor[tumors] = True
-    tumor_counts = np.bincount(pieces[is_tumor[labels]], minlength=len(counts) + 1)
-    boxes = ndimage.find_objects(pieces, max_label=len(large))
+    whole_ml = pieces.whole_ml
+    boxes = ndimage.find_objects(pieces.numbers, max_label=max(numbers))
     out = []
-    for n in large:
+    for n in numbers:
         box = boxes[n - 1]
-        index = np.argwhere(pieces[box] == n).mean(0) + [s.start for s in box]
-        x_mm = float((lps_from_index @ [*index, 1])[0])
-        out.append(_Kidney(n, float(counts[n - 1] * unit), float(tumor_counts[n] * unit), x_mm))
+        index = np.argwhere(pieces.numbers[box] == n).mean(0) + [s.start for s in box]
+        x_mm = float((pieces.lps_from_index @ [*index, 1])[0])
+        out.append(_Kidney(n, float(whole_ml[n]), float(pieces.tumor_ml[n]), x_mm))
     return out
+
+
+def _left_out(
+    pieces: Pieces, kidneys: list[_Kidney], apart: list[int], min_tumor_ml: float
+) -> list[str]:
+    """Notes on tumors that no kidney is near, and on specks; refused where no other tumor is."""
+    notes: list[str] = []
+    rest_ml = np.delete(pieces.whole_ml, [0, *apart, *(k.piece for k in kidneys)])
+    if n_specks := int((rest_ml > 0).sum()):
+        notes.append(
+            f"{n_specks} specks beside the kidneys dropped ({rest_ml.sum():.2f} ml together)"
+        )
+    if not apart:
+        return notes
+    text = " and ".join(f"{pieces.tumor_ml[n]:.1f} ml" for n in apart[:5])
+    if not any(k.tumor_ml > 0 and k.tumor_ml >= min_tumor_ml for k in kidneys):
+        raise InputError(
+            f"the only tumor ({text}) lies more than {GAP_MM:g} mm from every kidney. Check the "
+            "labels and --organ, or give --tumor 0 to leave it out."
+        )
+    notes.append(
+        f"LEFT OUT: tumor of {text}, more than {GAP_MM:g} mm from every kidney. If it belongs to "
+        "the kidney, close the gap in the label map"
+    )
+    return notes
 
 
 def _choose_kidney(
@@ -163,7 +187,6 @@ def _choose_kidney(
 
 def _number_tumors(
     labels: UInt8[np.ndarray, "i j k"],
-    organ: int,
     tumors: list[int],
     voxel_volume_ml: float,
     min_tumor_ml: float,
