@@ -54,13 +54,22 @@ def write_scene(folder: Path, scene: Scene) -> None:
         StorageError: the disk refused.
     """
     with new_folder(folder) as aside:
-        write_cloud_ply(aside / "cloud.ply", scene.cloud.points_mm)
-        if scene.depth is not None:
-            write_depth_png(aside / "depth.png", scene.depth)
-            write_intrinsics(aside / "intrinsics.json", scene.depth.intrinsics)
-        write_anatomy(aside, scene.reference)
-        meta = {**scene.meta, "units": "mm", "frame": "camera", _STAMP: scene.cloud.stamp_ns}
-        write_json(aside / "meta.json", {**meta, _UNITED: True})
+        write_scene_files(aside, scene)
+
+
+def write_scene_files(folder: Path, scene: Scene) -> None:
+    """A scene's files into a folder that is being filled aside.
+
+    Raises:
+        StorageError: the disk refused.
+    """
+    write_cloud_ply(folder / "cloud.ply", scene.cloud.points_mm)
+    if scene.depth is not None:
+        write_depth_png(folder / "depth.png", scene.depth)
+        write_intrinsics(folder / "intrinsics.json", scene.depth.intrinsics)
+    write_anatomy(folder, scene.reference)
+    meta = {**scene.meta, "units": "mm", "frame": "camera", _STAMP: scene.cloud.stamp_ns}
+    write_json(folder / "meta.json", {**meta, _UNITED: True})
 
 
 def read_scene(folder: Path) -> Scene:
