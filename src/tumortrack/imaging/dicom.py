@@ -6,9 +6,9 @@ readers only warn of a missing slice and stretch the patient.
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
@@ -18,7 +18,7 @@ from tumortrack.imaging.voxels import RawVolume, check_affine, check_size
 
 MIN_SLICES = 10
 _MAX_FILES = 20_000
-_MULTI_FRAME: Literal["multi-frame"] = "multi-frame"
+_NO_SLICE, _MULTI_FRAME = "no DICOM slices", "multi-frame DICOM objects"
 _TAGS = [
     "SeriesInstanceUID", "SeriesDescription", "Modality", "ImageType", "Rows", "Columns",
     "NumberOfFrames", "PixelSpacing", "ImagePositionPatient", "ImageOrientationPatient",
@@ -51,7 +51,7 @@ def read_dicom(folder: Path, series: str | None = None) -> RawVolume:
     Raises:
         InputError: no series, several, a missing, double or stray slice, damaged pixels.
     """
-    groups, multi_frame = _groups(folder)
+    groups, notes = _groups(folder)
     slices = _choose(folder, groups, series)
     first = slices[0]
     row, column = np.reshape(first.orientation, (2, 3))
@@ -69,15 +69,15 @@ def read_dicom(folder: Path, series: str | None = None) -> RawVolume:
     shape = (first.shape[1], first.shape[0], len(slices))
     check_size(folder, shape, 4)
     check_affine(folder, lps_from_index)
-    notes: tuple[str, ...] = ()
-    if multi_frame:
-        names = multi_frame[0].name + (", ..." if len(multi_frame) > 1 else "")
-        notes = (f"{len(multi_frame)} multi-frame DICOM objects left out ({names})",)
-    return RawVolume(_pixels(folder, [s.path for s in slices], shape), lps_from_index, notes)
+    return RawVolume(
+        _pixels(folder, [s.path for s in slices], shape),
+        lps_from_index,
+        notes + _other_series(groups, slices),
+    )
 
 
-def _groups(folder: Path) -> tuple[list[list[_Slice]], list[Path]]:
-    """Image slices by series, size and orientation, in a fixed order; and multi-frame files.
+def _groups(folder: Path) -> tuple[list[list[_Slice]], tuple[str, ...]]:
+    """Slices by series, size and orientation, in a fixed order; and notes on other files.
 
     Raises:
         InputError: too many files, or no slice at all.
@@ -86,14 +86,14 @@ def _groups(folder: Path) -> tuple[list[list[_Slice]], list[Path]]:
     if len(files) > _MAX_FILES:
         raise InputError(f"{folder} holds {len(files)} files; the limit is {_MAX_FILES}.")
     found: dict[tuple, list[_Slice]] = {}
-    multi_frame: list[Path] = []
+    left_out: dict[str, list[Path]] = {_NO_SLICE: [], _MULTI_FRAME: []}
     for file in files:
         one = _read_tags(file)
         if isinstance(one, _Slice):
             found.setdefault(one.group, []).append(one)
-        elif one == _MULTI_FRAME:
-            multi_frame.append(file)
-    if multi_frame and not found:
+        else:
+            left_out[one].append(file)
+    if not found and (multi_frame := left_out[_MULTI_FRAME]):
         raise InputError(
             f"{multi_frame[0]} is a multi-frame DICOM object; export classic slices, one file "
             "each, or NIfTI."
@@ -104,31 +104,50 @@ def _groups(folder: Path) -> tuple[list[list[_Slice]], list[Path]]:
             "slices themselves."
         )
     groups = [found[key] for key in sorted(found, key=lambda key: (-len(found[key]), repr(key)))]
-    return groups, multi_frame
+    notes = tuple(
+        f"{len(paths)} files are {what}: left out ({', '.join(p.name for p in paths[:3])}"
+        + (", ...)" if len(paths) > 3 else ")")
+        for what, paths in left_out.items()
+        if paths
+    )
+    return groups, notes
 
 
-def _read_tags(path: Path) -> _Slice | Literal["multi-frame"] | None:
-    """The tags of one slice, or None where the file is no DICOM image with a position."""
+def _other_series(groups: list[list[_Slice]], chosen: list[_Slice]) -> tuple[str, ...]:
+    """A note on the images that were not taken: a damaged slice may be among them."""
+    n_slices = sum(map(len, groups)) - len(chosen)
+    if not n_slices:
+        return ()
+    return (f"{n_slices} images of other series, sizes or orientations left out",)
+
+
+def _read_tags(path: Path) -> _Slice | str:
+    """The tags of one slice, or why the file is none (``_NO_SLICE``, ``_MULTI_FRAME``)."""
     import pydicom
 
     try:
-        tags = pydicom.dcmread(path, stop_before_pixels=True, specific_tags=_TAGS)
-        if int(tags.get("NumberOfFrames") or 1) > 1:
-            return _MULTI_FRAME
-        if "ImagePositionPatient" not in tags:
-            return None
-        return _Slice(
-            path=path,
-            uid=str(tags.get("SeriesInstanceUID") or ""),
-            description=str(tags.get("SeriesDescription") or ""),
-            modality=str(tags.get("Modality") or ""),
-            shape=(int(tags.Rows), int(tags.Columns)),
-            spacing_mm=(float(tags.PixelSpacing[0]), float(tags.PixelSpacing[1])),
-            position_mm=tuple(float(x) for x in tags.ImagePositionPatient),
-            orientation=tuple(float(x) for x in tags.ImageOrientationPatient),
-        )
+        with warnings.catch_warnings():  # what matters of a damaged header, we say ourselves
+            warnings.simplefilter("ignore")
+            tags = pydicom.dcmread(path, stop_before_pixels=True, specific_tags=_TAGS)
+            if int(tags.get("NumberOfFrames") or 1) > 1:
+                return _MULTI_FRAME
+            return _Slice(
+                path=path,
+                uid=_printable(tags.get("SeriesInstanceUID")),
+                description=_printable(tags.get("SeriesDescription")),
+                modality=_printable(tags.get("Modality")),
+                shape=(int(tags.Rows), int(tags.Columns)),
+                spacing_mm=(float(tags.PixelSpacing[0]), float(tags.PixelSpacing[1])),
+                position_mm=tuple(float(x) for x in tags.ImagePositionPatient),
+                orientation=tuple(float(x) for x in tags.ImageOrientationPatient),
+            )
     except Exception:  # pydicom raises anything on a foreign or damaged file: it is no slice
-        return None
+        return _NO_SLICE
+
+
+def _printable(value: object) -> str:
+    """A tag's text as it may go to a terminal."""
+    return "".join(c if c.isprintable() else "?" for c in str(value or ""))
 
 
 def _choose(folder: Path, groups: list[list[_Slice]], series: str | None) -> list[_Slice]:
