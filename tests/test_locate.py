@@ -24,7 +24,7 @@ from tumortrack.core import store
 from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.mesh_files import read_mesh
-from tumortrack.core.types import SensorCloud
+from tumortrack.core.types import Anatomy, SensorCloud
 from tumortrack.imaging.case import load_case
 from tumortrack.learn.model import load_model
 from tumortrack.track.tracker import Tracker
@@ -121,16 +121,60 @@ def test_clouds_in_other_formats_and_units_agree(work, seen):
     assert np.linalg.norm(centres[0] - centres[1]) < 3
 
 
+def random_points(low: list[float], high: list[float]) -> np.ndarray:
+    return np.random.default_rng(0).uniform(low, high, (2000, 3))
+
+
 @pytest.mark.parametrize(
-    ("points", "error"),
+    ("points", "error", "words"),
     [
-        (np.full((199, 3), 100.0), NoEstimate),
-        (np.random.default_rng(0).uniform(-0.05, 0.05, (500, 3)) + [0, 0, 0.15], InputError),
+        (np.full((300, 3), [0.0, 0, 140]), NoEstimate, "has 1 different points"),
+        (random_points([-0.05] * 3, [0.05] * 3) + [0, 0, 0.15], InputError, "--unit m"),
+        (random_points([-100, -100, 149.5], [100, 100, 150.5]), NoEstimate, "model's organ"),
+        (random_points([-50, -50, 149.5], [50, 50, 150.5]), NoEstimate, "model's organ"),
+        (random_points([-40, -40, 110], [40, 40, 190]), NoEstimate, "model's organ"),
+        (random_points([-8, -8, 130], [8, 8, 146]), NoEstimate, "model's organ"),
     ],
+    ids=["one point", "metres", "large table", "small table", "cube", "small cube"],
 )
-def test_bad_clouds_are_refused(tracker, points, error):
-    with pytest.raises(error):
-        tracker.locate(SensorCloud(points))
+def test_what_is_no_organ_is_refused(tracker, points, error, words):
+    with pytest.raises(error, match=words):
+        tracker.locate(SensorCloud(points), grid=32)
+
+
+@pytest.mark.parametrize("distance_mm", [5.0, 10.0, 15.0])
+def test_an_organ_deformed_as_never_in_training_is_not_refused(tracker, work, distance_mm):
+    """One end of the organ is pushed sideways, as a whole; scenes of training never do that."""
+    case = load_case(work / "case")
+    parts = []
+    for part in case.anatomy.parts:
+        along = part.vertices_mm[:, 2] - case.anatomy.organ.box_mm.mean(0)[2]
+        bent = part.vertices_mm.copy()
+        bent[:, 0] += distance_mm * (np.maximum(along, 0) / 55) ** 2
+        parts.append(part.moved(bent))
+    bent_case = replace(case, anatomy=Anatomy(tuple(parts)))
+    for spin in (0.0, 130.0):
+        points = cloud_by_rays(bent_case, looking_down(bent_case, spin_degrees=spin), step=0.012)
+        report = tracker.locate(SensorCloud(points), grid=32).report
+        assert all(part["found"] for part in report["parts"].values())
+        assert 0 < report["fit_mm"]["median"] < report["fit_mm"]["p95"] < 15
+
+
+@pytest.mark.parametrize(("share", "allowed_mm"), [(0.03, 2.5), (0.1, 6.0)])
+def test_background_points_move_the_answer_little(tracker, seen, share, allowed_mm):
+    points, _ = seen
+    rng = np.random.default_rng(5)
+    clean = tracker.locate(SensorCloud(points), grid=32).report["parts"]
+    low, high = points.min(0), points.max(0)
+    middle, size = (low + high) / 2, high - low
+    count = round(share / (1 - share) * len(points))
+    table = rng.uniform(middle - size, middle + size, (count, 3))
+    table[:, 2] = high[2] + 10 + 0.15 * (table[:, 0] - middle[0])
+    with_table = SensorCloud(np.concatenate([points, table]))
+    spoiled = tracker.locate(with_table, grid=32).report["parts"]
+    for name in clean:
+        apart = np.subtract(spoiled[name]["center_mm"], clean[name]["center_mm"])
+        assert np.linalg.norm(apart) < allowed_mm
 
 
 @pytest.mark.parametrize(

@@ -10,6 +10,7 @@ from tumortrack.core.errors import InputError
 from tumortrack.learn.decoders.mlp import MlpDecoder, MlpDecoderConfig, octave_features
 from tumortrack.learn.encoders.pointnet2 import PointNet2Config, SetAbstraction, _Level
 from tumortrack.learn.network import (
+    Aligned,
     CloudBox,
     FixedScale,
     NetworkConfig,
@@ -18,6 +19,7 @@ from tumortrack.learn.network import (
     paper_network,
     quick_network,
     turned,
+    without_strays,
 )
 from tumortrack.learn.sampling import ball_query, farthest_points, strided_points, take
 
@@ -238,6 +240,34 @@ def test_alignment_finds_the_longest_direction_and_its_heavier_tail() -> None:
     torch.testing.assert_close(aligned[0, :, 0], x)
 
 
+def test_strays_are_replaced_by_points_within_reach_and_the_rest_keeps_its_order() -> None:
+    points_mm, _ = scene(n=300)
+    clean = without_strays(points_mm, 80.0)
+    assert torch.equal(clean, points_mm)
+    spoiled = points_mm.clone()
+    spoiled[0, 5::10] += torch.tensor([0.0, 200.0, 300.0])  # a tenth of one cloud
+    out = without_strays(spoiled, 80.0)
+    assert torch.equal(out[1], points_mm[1])
+    kept = torch.ones(300, dtype=torch.bool)
+    kept[5::10] = False
+    assert torch.equal(out[0, :270], points_mm[0, kept])
+    assert torch.equal(out[0, 270:], points_mm[0, kept][:30])
+
+
+def test_ten_per_cent_of_background_change_quick_by_little() -> None:
+    network = seeded(quick_network(4, scale_mm=60.0)).eval()
+    points_mm, _ = scene(n=512)
+    before = network.encode(points_mm)
+    far = torch.tensor([150.0, -100.0, 120.0])
+    spoiled = torch.cat([points_mm[:, :460], points_mm[:, 460:] + far], dim=1)
+    after = network.encode(spoiled)
+    assert (after.centre_mm - before.centre_mm).norm(dim=2).max() < 1.0
+    cosine = (before.turn * after.turn).sum(0).abs()  # an ellipsoid has no heavier tail
+    assert cosine.min() > 0.999
+    plain = spoiled.mean(dim=1, keepdim=True) - points_mm.mean(dim=1, keepdim=True)
+    assert plain.norm(dim=2).min() > 10  # what the mean of all points would have done
+
+
 def test_size_is_lost_by_the_box_and_kept_by_the_fixed_scale() -> None:
     points_mm, queries_mm = scene()
     for config, lost in ((slim_paper(), True), (quick_network(4, 60.0), False)):
@@ -333,7 +363,9 @@ def test_impossible_configurations_are_refused() -> None:
     with pytest.raises(InputError, match=r"1\.\.5"):
         MlpDecoderConfig(n_classes=4, width=8, hidden_layers=5, skip_layer=6)
     with pytest.raises(InputError, match="scale_mm"):
-        FixedScale(scale_mm=0.0)
+        FixedScale(scale_mm=0.0, reach=1.0)
+    with pytest.raises(InputError, match="reach"):
+        Aligned(scale_mm=50.0, reach=-1.0)
     data = to_builtins(quick_network(4, 60.0))
     data["decoder"]["dropout"] = 0.1
     with pytest.raises(InputError, match="dropout"):

@@ -16,6 +16,7 @@ from tumortrack.sense.cloud import (
     crop_cloud,
     thin_cloud,
 )
+from tumortrack.sense.clutter import ClutterConfig, add_clutter
 from tumortrack.sense.noise import CLEAN, D405_NOISE, NoiseConfig, add_noise
 
 SMALL = d405(424, 240)
@@ -326,14 +327,76 @@ def test_distortion_is_slow_and_bounded():
 def test_scattered_points_fill_empty_pixels_only():
     frame = dome()
     seen = np.isfinite(frame.depth_mm)
-    result = noisy(frame, scatter_share=0.05, scatter_near_mm=100, scatter_far_mm=140)
+    result = noisy(frame, scatter_share=0.05, scatter_mm=15.0)
     np.testing.assert_array_equal(result[seen], frame.depth_mm[seen])
     false = result[~seen & np.isfinite(result)]
     assert len(false) == pytest.approx(0.05 * seen.sum(), rel=0.15)
-    assert false.min() >= 100
-    assert false.max() <= 140
-    assert false.mean() == pytest.approx(120, abs=2)
+    low, high = np.nanmin(frame.depth_mm) - 15, np.nanmax(frame.depth_mm) + 15
+    assert low <= false.min() < low + 1
+    assert high - 1 < false.max() <= high
+    assert false.mean() == pytest.approx((low + high) / 2, abs=2)
     assert np.isfinite(noisy(wall(130.0), scatter_share=0.05)).all()
+    assert np.isnan(noisy(wall(np.nan), scatter_share=0.05)).all()
+
+
+def test_scattered_points_follow_the_organ_away() -> None:
+    frame = dome()
+    away = DepthFrame(frame.depth_mm + 200, SMALL)
+    near, far = (noisy(f, scatter_share=0.05) for f in (frame, away))
+    np.testing.assert_allclose(far, near + 200, atol=1e-3)
+
+
+# clutter
+
+
+CLUTTER = ClutterConfig(scenes=1.0, largest_share=0.08)
+
+
+def test_clutter_fills_empty_pixels_behind_nothing_up_to_its_share():
+    frame = dome()
+    seen = np.isfinite(frame.depth_mm)
+    shares, spans = [], []
+    for seed in range(60):
+        image = add_clutter(frame, CLUTTER, np.random.default_rng(seed)).depth_mm
+        np.testing.assert_array_equal(image[seen], frame.depth_mm[seen])
+        added = image[~seen & np.isfinite(image)]
+        shares.append(len(added) / (len(added) + seen.sum()))
+        if len(added) > 50:
+            spans.append(np.percentile(added, [0, 50, 100]))
+    assert max(shares) <= 0.081
+    assert max(shares) > 0.06
+    assert np.mean(shares) == pytest.approx(0.04, abs=0.012)
+    near, middle, far = np.array(spans).T
+    assert near.min() < 120 < 145 < far.max()
+    assert 0.2 < (middle > 145).mean() < 0.9  # mostly behind the organ in many, beside it in some
+
+
+def test_clutter_looks_alike_from_near_and_far():
+    frame = dome()
+    twice = DepthFrame(frame.depth_mm * 2, SMALL)
+    for seed in range(12):
+        near, far = (
+            add_clutter(f, CLUTTER, np.random.default_rng(seed)).depth_mm for f in (frame, twice)
+        )
+        np.testing.assert_allclose(far, near * 2, rtol=1e-5)
+
+
+def test_clutter_leaves_the_generator_as_it_was_and_replays():
+    frame, share = dome(), ClutterConfig(scenes=0.5, largest_share=0.08)
+    rng, other = np.random.default_rng(3), np.random.default_rng(3)
+    images = [add_clutter(frame, share, np.random.default_rng(s)).depth_mm for s in range(100)]
+    again = [add_clutter(frame, share, np.random.default_rng(s)).depth_mm for s in range(100)]
+    assert all(np.array_equal(a, b, equal_nan=True) for a, b in zip(images, again, strict=True))
+    spoiled = sum(not np.array_equal(i, frame.depth_mm, equal_nan=True) for i in images)
+    assert 35 < spoiled < 65
+    add_clutter(frame, CLUTTER, rng)
+    assert rng.random() == other.random()
+    assert add_clutter(frame, ClutterConfig(), rng) is frame
+    empty = wall(np.nan)
+    assert add_clutter(empty, CLUTTER, rng) is empty
+    for bad in ({"scenes": 1.1}, {"largest_share": 0.6}, {"scenes": math.nan}):
+        with pytest.raises(InputError, match="clutter"):
+            ClutterConfig(**bad)
 
 
 def test_quantum_rounds_to_whole_units():
@@ -352,7 +415,7 @@ def test_noise_configuration_round_trip_and_limits():
         {"hole_share": 1.5},
         {"edge_px": 0},
         {"grazing_degrees": 90.0},
-        {"scatter_near_mm": 200.0},
+        {"scatter_mm": -1.0},
         {"distortion_mm": math.nan},
     ):
         with pytest.raises(InputError, match="noise"):

@@ -19,6 +19,7 @@ from tumortrack.core.errors import ArtifactError, InputError
 from tumortrack.learn.checkpoint import Progress
 from tumortrack.learn.config import TrainConfig
 from tumortrack.learn.model import load_model
+from tumortrack.learn.network import CloudBox
 from tumortrack.learn.schedule import learning_rate, settle_end
 
 
@@ -132,6 +133,9 @@ def test_presets_survive_json_and_refuse_unknown_keys(case):
         with pytest.raises(InputError, match="unknown"):
             from_builtins({**data, "learning_rte": 1}, TrainConfig, "here")
     assert paper(anatomy).steps == 155_000
+    assert paper(anatomy).scene.clutter.scenes == 0
+    assert quick(anatomy).scene.clutter.scenes == 0.5
+    assert isinstance(paper(anatomy).network.normalisation, CloudBox)
     assert paper(anatomy).scene.cloud.n_points == 1000
 
 

@@ -32,7 +32,7 @@ class TrainConfig(Config, frozen=True):
     schedule: Schedule
     batch_size: int
     steps: int  # the preset's end
-    drop_points: float = 0.0  # each batch loses a random share of its points, up to this
+    drop_points: float = 0.0  # each batch loses a random share, up to this, of what is encoded
     weight_decay: float = 0.0
     ema: float = 0.999  # 0: the plain weights are kept
     training_pairs: int = 0  # 0: endless; else scenes repeat after so many

@@ -14,6 +14,7 @@ from tumortrack.core import store
 from tumortrack.core.config import from_builtins, to_builtins
 from tumortrack.core.errors import ArtifactError, InputError
 from tumortrack.learn.config import TrainConfig
+from tumortrack.learn.fit import Familiar
 from tumortrack.learn.network import OccupancyNetwork
 
 KIND = "model"
@@ -25,13 +26,15 @@ class Model:
     """A network in evaluation mode and what it was trained for.
 
     ``query_box_mm``: where the organ can lie, relative to the median of the observed points,
-    camera frame (lower and upper corner). ``provenance``: seeds, steps, hashes.
+    camera frame (lower and upper corner). ``familiar``: what tells its clouds from others.
+    ``provenance``: seeds, steps, hashes.
     """
 
     network: OccupancyNetwork
     config: TrainConfig
     parts: tuple[str, ...]
     query_box_mm: Float64[np.ndarray, "2 3"]
+    familiar: Familiar
     provenance: dict
 
 
@@ -42,6 +45,7 @@ def save_model(model: Model, folder: Path) -> None:
     content = {
         "parts": list(model.parts),
         "query_box_mm": model.query_box_mm.tolist(),
+        "familiar": to_builtins(model.familiar),
         "provenance": model.provenance,
         "config": to_builtins(model.config),
     }
@@ -72,11 +76,18 @@ def load_model(folder: Path, device: str = "auto") -> Model:
         box = np.array(manifest["query_box_mm"], float).reshape(2, 3)
         network = OccupancyNetwork(config.network)
         network.load_state_dict(load((folder / _WEIGHTS).read_bytes()))
+        familiar = from_builtins(manifest["familiar"], Familiar, f"{folder}: familiar")
         provenance = dict(manifest["provenance"])
+    except InputError as error:
+        raise ArtifactError(
+            f"{error} The model was trained by another version of tumortrack; train it again."
+        ) from error
     except (KeyError, TypeError, ValueError, RuntimeError, OSError) as error:
-        raise ArtifactError(f"{folder} is not a whole model: {error}. Train it again.") from error
+        raise ArtifactError(
+            f"{folder} is not a whole model of this version: {error}. Train it again."
+        ) from error
     network.eval().requires_grad_(False).to(choose_device(device))
-    return Model(network, config, parts, box, provenance)
+    return Model(network, config, parts, box, familiar, provenance)
 
 
 def choose_device(device: str) -> torch.device:

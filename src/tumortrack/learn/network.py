@@ -19,6 +19,7 @@ from tumortrack.learn.decoders.mlp import MlpDecoderConfig
 from tumortrack.learn.encoders import EncoderConfig
 from tumortrack.learn.encoders.pointnet2 import PointNet2Config, SetAbstraction
 from tumortrack.learn.layers import Layer
+from tumortrack.learn.sampling import take
 
 
 class CloudBox(Config, frozen=True, tag="cloud-box"):
@@ -26,17 +27,20 @@ class CloudBox(Config, frozen=True, tag="cloud-box"):
 
 
 class FixedScale(Config, frozen=True, tag="fixed"):
-    """Centre: the mean of the points; scale: a constant, so that size is not lost.
+    """Scale: a constant, so that size is not lost. Centre: the mean of the points that lie
+    within ``reach`` scales of it; the others are strays, and nothing sees them.
 
-    The mean and not the box's centre: one stray point moves it by 1 / N of its distance, the
-    box by half.
+    The mean and not the box's centre: one stray point within reach moves it by 1 / N of its
+    distance, the box by half.
     """
 
     scale_mm: float
+    reach: float
 
     def __post_init__(self) -> None:
-        if not 0 < self.scale_mm < float("inf"):
-            raise InputError(f"scale_mm must be a positive length, not {self.scale_mm}.")
+        for name in ("scale_mm", "reach"):
+            if not 0 < getattr(self, name) < float("inf"):
+                raise InputError(f"{name} must be positive, not {getattr(self, name)}.")
 
 
 class Aligned(Config, frozen=True, tag="aligned"):
@@ -48,9 +52,10 @@ class Aligned(Config, frozen=True, tag="aligned"):
     """
 
     scale_mm: float
+    reach: float
 
     def __post_init__(self) -> None:
-        FixedScale(scale_mm=self.scale_mm)
+        FixedScale(scale_mm=self.scale_mm, reach=self.reach)
 
 
 class NetworkConfig(Config, frozen=True):
@@ -86,6 +91,8 @@ class OccupancyNetwork(nn.Module):
     def encode(self, points_mm: Tensor) -> Latent:
         """Clouds (B, N, 3), camera frame, mm, float32, points in random order -> Latent."""
         kind = self.config.normalisation
+        if not isinstance(kind, CloudBox):
+            points_mm = without_strays(points_mm, kind.reach * kind.scale_mm)
         centre_mm, scale_mm = normalisation(points_mm, kind)
         points = (points_mm - centre_mm) / scale_mm
         turn = None
@@ -126,6 +133,26 @@ def normalisation(
     low = points_mm.amin(dim=1, keepdim=True)
     high = points_mm.amax(dim=1, keepdim=True)
     return (low + high) / 2, ((high - low) / 2).amax(dim=2, keepdim=True).clamp_min(1e-6)
+
+
+def without_strays(points_mm: Tensor, reach_mm: float) -> Tensor:
+    """Clouds (B, N, 3) with every point that is not within reach of the others' middle replaced
+    by one that is: a repeated point changes no maximum, and is never a farthest one.
+
+    The middle is the coordinates' median, then twice the mean of the points within reach, so
+    that background moves it little (10 % of a plane behind a kidney: 0.5 mm, the mean of all by
+    5 mm). The order of the points that stay is kept.
+    """
+    middle = points_mm.median(dim=1, keepdim=True).values
+    near = points_mm
+    for _ in range(2):
+        stray = (points_mm - middle).square().sum(dim=2) > reach_mm**2
+        order = stray.to(torch.uint8).argsort(dim=1, stable=True)
+        count = (~stray).sum(dim=1, keepdim=True).clamp_min(1)
+        row = torch.arange(points_mm.shape[1], device=points_mm.device) % count
+        near = take(points_mm, order.gather(1, row))
+        middle = near.mean(dim=1, keepdim=True)
+    return near
 
 
 def alignment(points: Tensor) -> Tensor:
@@ -178,7 +205,8 @@ def quick_network(n_classes: int, scale_mm: float) -> NetworkConfig:
     by mIoU after 600 steps on a toy (dented ellipsoid, two spheres, bending, one seed each):
     octaves 0.55 against 0.39 for raw coordinates; radii 0.4 and 0.9 0.62, farthest points as
     well 0.63, a skip as well 0.65; batch norm lost 0.03, and its running statistics make short
-    runs' validation erratic. ``scale_mm``: about half the organ's longest side.
+    runs' validation erratic. ``scale_mm``: about half the organ's longest side; with a reach of
+    1.35 of it at most 0.6 % of the points of strongly deformed kidneys are strays.
     """
     return NetworkConfig(
         encoder=PointNet2Config(
@@ -193,5 +221,5 @@ def quick_network(n_classes: int, scale_mm: float) -> NetworkConfig:
         decoder=MlpDecoderConfig(
             n_classes=n_classes, width=128, hidden_layers=5, skip_layer=3, octaves=(0, 1, 2)
         ),
-        normalisation=Aligned(scale_mm=scale_mm),
+        normalisation=Aligned(scale_mm=scale_mm, reach=1.35),
     )

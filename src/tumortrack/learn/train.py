@@ -126,11 +126,13 @@ def train(run: Run, folder: Path, report: Callable[[Status], None]) -> Model:
                     f"stopped at step {progress.step}; the state is saved in {folder}. The same "
                     "command goes on from there."
                 )
+    network = state.best_network()
     model = Model(
-        state.best_network(),
+        network,
         config,
         run.anatomy_ct.names,
         validation.query_box_mm,
+        validation.familiar(network),
         _provenance(run, progress, device),
     )
     save_model(model, folder)
@@ -184,7 +186,8 @@ class _State:
         # Clouds are in random order: leaving out the last points leaves out random ones.
         rng = np.random.default_rng([self._run.seed, 0xD20, progress.step])
         share = rng.uniform(0, config.drop_points)
-        clouds = clouds[:, : max(round(clouds.shape[1] * (1 - share)), 64)]
+        encoded = min(clouds.shape[1], config.network.encoder.n_points or clouds.shape[1])
+        clouds = clouds[:, : max(round(encoded * (1 - share)), 64)]
         for group in self.optimizer.param_groups:
             group["lr"] = learning_rate(config, progress)
         self.network.train()

@@ -6,13 +6,18 @@ import numpy as np
 import torch
 from jaxtyping import Float64
 
+from tumortrack.core.errors import NoEstimate
 from tumortrack.core.types import Anatomy
 from tumortrack.learn.config import TrainConfig
-from tumortrack.learn.network import OccupancyNetwork
+from tumortrack.learn.fit import Familiar, fit_mm, spread_mm, surface_distances
+from tumortrack.learn.network import Latent, OccupancyNetwork
+from tumortrack.simulate.dataset import refill
 from tumortrack.simulate.occupancy import OccupancyPool
 from tumortrack.simulate.scene import SceneRecipe, Simulator
 
 _AT_ONCE = 32  # scenes
+_FIT_ON = 64  # scenes
+_QUERIES = 2**13  # at once: bounds the memory
 
 
 class ValidationSet:
@@ -31,22 +36,23 @@ class ValidationSet:
         simulator = Simulator(anatomy_ct, up_lps, config.scene)
         vertices = anatomy_ct.organ.vertices_mm
         clouds, points, labels, boxes = [], [], [], []
+        n = config.scene.cloud.n_points
         for index in range(config.validation_pairs):
             recipe = SceneRecipe(seed, "validation", index)
             stage = simulator.stage(recipe)
             drawn, answer = pool.draw_evenly(recipe.generator(999), config.validation_points)
-            clouds.append(stage.cloud.points_mm)
+            observed = stage.cloud.points_mm
+            clouds.append(refill(observed, n))
             points.append(stage.carry(drawn))
             labels.append(answer)
-            observed = stage.cloud.points_mm
             organ = stage.carry(vertices) - np.median(observed, axis=0)
             boxes.append((organ.min(0), organ.max(0)))
-        n = min(map(len, clouds))
-        self._clouds = torch.from_numpy(np.stack([c[:n] for c in clouds])).to(device)
+        self._clouds = torch.from_numpy(np.stack(clouds)).to(device)
         self._points = torch.from_numpy(np.stack(points)).to(device)
         self._labels = torch.from_numpy(np.stack(labels)).to(device)
         self._n_classes = len(anatomy_ct.parts) + 1
-        self.query_box_mm = _grown(np.array(boxes, float))
+        self._boxes_mm = np.array(boxes, float)
+        self.query_box_mm = _grown(self._boxes_mm)
 
     @torch.no_grad()
     def miou(self, network: OccupancyNetwork) -> float:
@@ -63,6 +69,28 @@ class ValidationSet:
         both = table.diagonal()
         either = table.sum(0) + table.sum(1) - both
         return float((both / either.clamp(min=1))[1:].mean())
+
+    @torch.no_grad()
+    def familiar(self, network: OccupancyNetwork) -> Familiar:
+        """What the clouds are like, and how far they lie from the surfaces that a network sees."""
+        network.eval()
+        spreads, fits = [], []
+        for cloud, box_mm in zip(self._clouds[:_FIT_ON], self._boxes_mm, strict=False):
+            latent = network.encode(cloud[None])
+            points_mm = cloud.cpu().numpy()
+            around = _grown(box_mm[None] + np.median(points_mm, axis=0))
+
+            def logits_at(queries_mm: np.ndarray, latent: Latent = latent) -> torch.Tensor:
+                queries = torch.from_numpy(queries_mm).to(self._clouds.device)[None]
+                parts = queries.split(_QUERIES, dim=1)
+                return torch.cat([network.query(latent, part)[0] for part in parts])
+
+            spreads.append(spread_mm(points_mm))
+            try:
+                fits.append(fit_mm(surface_distances(logits_at, around, points_mm)))
+            except NoEstimate:  # a network of a few steps sees no organ
+                fits.append(spreads[-1])
+        return Familiar(spread_mm=(min(spreads), max(spreads)), fit_mm=max(fits))
 
 
 def _grown(boxes_mm: Float64[np.ndarray, "s 2 3"]) -> Float64[np.ndarray, "2 3"]:

@@ -74,12 +74,13 @@ def check_cloud(cloud: SensorCloud) -> None:
 
     Raises:
         InputError: the unit is evidently not mm (metres, or mm read as metres).
-        NoEstimate: fewer than 200 points, or none before the camera.
+        NoEstimate: fewer than 200 different points, or none before the camera.
     """
     points_mm = cloud.points_mm
-    if len(points_mm) < FEWEST_POINTS:
+    different = _count_different(points_mm)
+    if different < FEWEST_POINTS:
         raise NoEstimate(
-            f"the cloud has {len(points_mm)} points with a return; at least {FEWEST_POINTS} "
+            f"the cloud has {different} different points with a return; at least {FEWEST_POINTS} "
             "are needed. Give a denser cloud."
         )
     low, middle, high = np.percentile(points_mm, [1, 50, 99], axis=0)
@@ -100,6 +101,15 @@ def check_cloud(cloud: SensorCloud) -> None:
             "no point of the cloud lies before the camera (z > 0). The camera frame has x right, "
             "y down, z forward; turn the cloud into that frame."
         )
+
+
+def _count_different(points_mm: np.ndarray) -> int:
+    """How many points differ; a count of 200 and more may be too small."""
+    for some in (points_mm[:2000], points_mm):  # sorting all of a large cloud takes a while
+        count = len(np.unique(some, axis=0))
+        if count >= FEWEST_POINTS:
+            break
+    return count
 
 
 def _draw(available: int, wanted: int, rng: np.random.Generator) -> np.ndarray:

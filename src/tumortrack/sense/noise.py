@@ -33,8 +33,8 @@ class NoiseConfig(Config, frozen=True, kw_only=True):
     hole_share: share of pixels lost in random blobs about ``hole_px`` wide.
     grazing_share: share lost where the surface is turned away by over ``grazing_degrees``.
     distortion_mm: largest slow depth error; each frame's peak is uniform in 0..distortion_mm.
-    scatter_share: false points per true one, in pixels without return,
-    scatter_near_mm, scatter_far_mm: their depths, uniform.
+    scatter_share: false points per true one, in pixels without return; their depths are uniform
+        from the nearest true depth to the farthest, and ``scatter_mm`` to either side.
     quantum_mm: depth unit of the sensor.
     """
 
@@ -51,8 +51,7 @@ class NoiseConfig(Config, frozen=True, kw_only=True):
     grazing_degrees: float = 75.0
     distortion_mm: float = 0.0
     scatter_share: float = 0.0
-    scatter_near_mm: float = 110.0
-    scatter_far_mm: float = 150.0
+    scatter_mm: float = 10.0
     quantum_mm: float = 0.0
 
     def __post_init__(self) -> None:
@@ -64,10 +63,8 @@ class NoiseConfig(Config, frozen=True, kw_only=True):
                 raise InputError(f"noise {name} is {value}; a share lies in 0..1.")
             if name.endswith("_px") and value < 1:
                 raise InputError(f"noise {name} is {value}; at least 1 pixel is needed.")
-        if not self.grazing_degrees < 90 or self.scatter_near_mm > self.scatter_far_mm:
-            raise InputError(
-                "noise grazing_degrees must be below 90 and scatter_near_mm at most scatter_far_mm."
-            )
+        if not self.grazing_degrees < 90:
+            raise InputError(f"noise grazing_degrees is {self.grazing_degrees}; it must be < 90.")
 
 
 CLEAN = NoiseConfig()
@@ -145,6 +142,7 @@ def _scatter(
 ) -> None:
     empty = np.flatnonzero(np.isnan(true_mm))
     count = rng.poisson(config.scatter_share * (true_mm.size - len(empty)))
-    if len(empty):
+    if len(empty) and count:
         pixels = empty[rng.integers(len(empty), size=count)]
-        out_mm.flat[pixels] = rng.uniform(config.scatter_near_mm, config.scatter_far_mm, count)
+        near_mm = max(np.nanmin(true_mm) - config.scatter_mm, 1.0)
+        out_mm.flat[pixels] = rng.uniform(near_mm, np.nanmax(true_mm) + config.scatter_mm, count)

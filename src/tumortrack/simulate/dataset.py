@@ -55,13 +55,13 @@ class SceneStream:
         ]
         n = self.config.cloud.n_points
         return Batch(
-            np.stack([_refill(p.cloud.points_mm, n) for p in pairs]),
+            np.stack([refill(p.cloud.points_mm, n) for p in pairs]),
             np.stack([p.samples.points_mm for p in pairs]),
             np.stack([p.samples.labels for p in pairs]),
         )
 
 
-def _refill(points_mm: Float32[np.ndarray, "m 3"], n: int) -> Float32[np.ndarray, "n 3"]:
+def refill(points_mm: Float32[np.ndarray, "m 3"], n: int) -> Float32[np.ndarray, "n 3"]:
     """A cloud smaller than ``n`` repeats its points, so that clouds stack; a network that pools
     by maximum does not notice."""
     return points_mm[np.arange(n) % len(points_mm)]

@@ -24,6 +24,7 @@ from tumortrack.core.types import (
 )
 from tumortrack.sense.camera import d405, project
 from tumortrack.sense.cloud import CloudConfig, cloud_from_depth
+from tumortrack.sense.clutter import ClutterConfig, add_clutter
 from tumortrack.sense.noise import NoiseConfig, add_noise
 from tumortrack.sense.render import Visibility, render_depth
 from tumortrack.simulate.deform import DeformConfig, DragConfig
@@ -46,6 +47,7 @@ class SceneConfig(Config, frozen=True):
     height: int = 240
     pose: PoseConfig = PoseConfig()
     deform: tuple[DeformConfig, ...] = (DragConfig(),)  # each scene takes one, with equal chance
+    clutter: ClutterConfig = ClutterConfig()
     noise: NoiseConfig = NoiseConfig()
     cloud: CloudConfig = CloudConfig()
     occupancy: OccupancyConfig = OccupancyConfig()
@@ -139,7 +141,9 @@ class Simulator:
         )
         deformation = model.sample(view, rng)
         vertices = transform_points(camera_from_ct, deformation.apply(organ.vertices_mm))
-        frame = add_noise(render_depth(vertices, organ.faces, self._intrinsics), config.noise, rng)
+        frame = render_depth(vertices, organ.faces, self._intrinsics)
+        frame = add_clutter(frame, config.clutter, rng)
+        frame = add_noise(frame, config.noise, rng)
         crop = config.cloud
         if free:
             crop = CloudConfig(near_mm=1.0, far_mm=1e4, n_points=crop.n_points)

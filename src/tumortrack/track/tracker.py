@@ -13,6 +13,7 @@ from jaxtyping import Float, Float32
 import tumortrack
 from tumortrack.core.errors import NoEstimate
 from tumortrack.core.types import CameraLabels, OccupancyCloud, SensorCloud
+from tumortrack.learn.fit import check_familiar, fit_mm, spread_mm, surface_distances
 from tumortrack.learn.model import Model, has_fast_bfloat16
 from tumortrack.learn.network import Latent
 from tumortrack.sense.cloud import check_cloud, thin_cloud
@@ -52,16 +53,23 @@ class Tracker:
         longest side of the dense volume.
 
         Raises:
-            NoEstimate: too few points, or no organ found in them.
+            NoEstimate: too few points, no organ found in them, or they do not show this model's.
             InputError: the cloud is in metres.
         """
         rng = np.random.default_rng(seed)
         seconds: dict[str, float] = {}
         check_cloud(cloud)
+        thinned = thin_cloud(cloud, self.model.config.scene.cloud.n_points, rng)
         with _timed(seconds, "encode"):
-            latent = self._encode(cloud, rng)
+            latent = self._encode(thinned)
         with _timed(seconds, "coarse"):
             box = self._coarse_box(latent, cloud, rng)
+        with _timed(seconds, "fit"):
+            distances = surface_distances(
+                lambda points: self._logits(latent, points), box, thinned.points_mm
+            )
+            spread = spread_mm(thinned.points_mm)
+            check_familiar(self.model.familiar, spread, fit_mm(distances))
         with _timed(seconds, "fine"):
             inside = self._fine(latent, box, cloud.stamp_ns, rng)
         with _timed(seconds, "volume"):
@@ -81,14 +89,17 @@ class Tracker:
             "seed": seed,
             "points": len(cloud.points_mm),
             "voxel_mm": float(camera_from_index[0, 0]),
+            "fit_mm": {
+                "median": float(np.median(distances)),
+                "p95": float(np.percentile(distances, 95)),
+            },
             "parts": describe_parts(self.model.parts, meshes, inside),
             "timings": {**seconds, "total": sum(seconds.values())},
         }
         return Estimate(inside, volume, meshes, report)
 
-    def _encode(self, cloud: SensorCloud, rng: np.random.Generator) -> Latent:
-        thinned = thin_cloud(cloud, self.model.config.scene.cloud.n_points, rng)
-        points = torch.tensor(thinned.points_mm, device=self._device)[None]
+    def _encode(self, cloud: SensorCloud) -> Latent:
+        points = torch.tensor(cloud.points_mm, device=self._device)[None]
         with torch.autocast(self._device.type, torch.bfloat16, enabled=self._bf16):
             return self._network.encode(points)
 

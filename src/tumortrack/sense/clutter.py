@@ -1,0 +1,135 @@
+"""What a depth image shows besides the organ: the table, tools, drapes.
+
+A user's crop rarely takes all of it away, so training shows some. Lengths are relative to the
+organ's own depths and width, so that background looks alike from near and far.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from tumortrack.core.config import Config
+from tumortrack.core.errors import InputError
+from tumortrack.core.types import DepthFrame
+
+_STEEPEST = 0.6  # slope of a plane: 30 degrees
+_LOOK_AT = 400  # pixels tell where the organ lies
+_MOST = 0.5  # share of all points
+
+
+class ClutterConfig(Config, frozen=True, kw_only=True):
+    """``scenes``: share of images with background; ``largest_share``: of all points, in those
+    images; each draws its own share uniformly up to it. Zero switches it off."""
+
+    scenes: float = 0.0
+    largest_share: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name, most in (("scenes", 1.0), ("largest_share", _MOST)):
+            value = getattr(self, name)
+            if not 0 <= value <= most:
+                raise InputError(f"clutter {name} is {value}; allowed: 0 (off) to {most:g}.")
+
+
+@dataclass(frozen=True)
+class _Organ:
+    """Where the organ lies in the image: (column, row), pixels and mm."""
+
+    middle_px: Float[np.ndarray, " 2"]
+    width_px: float
+    width_mm: float
+    near_mm: float
+    far_mm: float
+
+
+@dataclass(frozen=True)
+class _Patch:
+    """A disc of the image and the depths of what it shows."""
+
+    middle_px: Float[np.ndarray, " 2"]
+    radius_px: float
+    depth_mm: Float[np.ndarray, " n"]  # at the offsets (n, 2), in radii, that it was made for
+
+
+def add_clutter(frame: DepthFrame, config: ClutterConfig, rng: np.random.Generator) -> DepthFrame:
+    """The frame with background in some of its pixels without return.
+
+    One kind a frame, with equal chance: a piece of a tilted plane behind the organ, a ball
+    beside it, or points anywhere. What the organ covers stays covered. Background has random
+    numbers of its own: ``rng`` is left as it was, and so is the rest of the scene.
+    """
+    rng = rng.spawn(1)[0]
+    if rng.uniform() >= config.scenes:
+        return frame
+    seen = np.flatnonzero(np.isfinite(frame.depth_mm))
+    share = rng.uniform(0, config.largest_share)
+    count = round(share / (1 - share) * len(seen))
+    if count == 0:
+        return frame
+    organ = _where(frame, seen, rng)
+    radius = np.sqrt(rng.uniform(size=4 * count))  # most may lie on the organ or off the image
+    angle = rng.uniform(0, 2 * np.pi, 4 * count)
+    offsets = np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1)
+    patch = (_plane, _ball, _anywhere)[rng.integers(3)](frame, organ, offsets, rng)
+    column, row = np.rint(patch.middle_px + offsets * patch.radius_px).astype(int).T
+    camera = frame.intrinsics
+    free = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
+    free[free] &= np.isnan(frame.depth_mm[row[free], column[free]])
+    free &= patch.depth_mm > 1.0
+    chosen = np.flatnonzero(free)[:count]
+    depth_mm = frame.depth_mm.copy()
+    depth_mm[row[chosen], column[chosen]] = patch.depth_mm[chosen]
+    return DepthFrame(depth_mm, camera, frame.stamp_ns)
+
+
+def _where(frame: DepthFrame, seen: np.ndarray, rng: np.random.Generator) -> _Organ:
+    pixels = seen[rng.integers(len(seen), size=_LOOK_AT)]
+    row, column = np.divmod(pixels, frame.intrinsics.width)
+    depth_mm = frame.depth_mm.flat[pixels]
+    width_px = float(max(np.ptp(column), np.ptp(row), 1))
+    return _Organ(
+        np.array([column.mean(), row.mean()]),
+        width_px,
+        width_px * float(depth_mm.mean()) / frame.intrinsics.fx,
+        float(depth_mm.min()),
+        float(depth_mm.max()),
+    )
+
+
+def _plane(
+    frame: DepthFrame, organ: _Organ, offsets: np.ndarray, rng: np.random.Generator
+) -> _Patch:
+    """Through a point behind the organ, tilted up to 30 degrees about two axes."""
+    middle = organ.middle_px + rng.uniform(-0.5, 0.5, 2) * organ.width_px
+    radius = rng.uniform(0.3, 1.0) * organ.width_px
+    depth_mm = organ.far_mm + rng.uniform(-0.1, 0.4) * organ.width_mm
+    slope = rng.uniform(-_STEEPEST, _STEEPEST, 2)
+    tangents = offsets * (radius / frame.intrinsics.fx)
+    return _Patch(middle, radius, depth_mm / np.maximum(1 - tangents @ slope, 0.2))
+
+
+def _ball(
+    frame: DepthFrame, organ: _Organ, offsets: np.ndarray, rng: np.random.Generator
+) -> _Patch:
+    """Beside the organ, at its depths or a little behind; seen from its front."""
+    angle = rng.uniform(0, 2 * np.pi)
+    apart = rng.uniform(0.4, 1.0) * organ.width_px
+    middle = organ.middle_px + apart * np.array([np.cos(angle), np.sin(angle)])
+    radius = rng.uniform(0.05, 0.3) * organ.width_px
+    depth_mm = rng.uniform(organ.near_mm, organ.far_mm + 0.2 * organ.width_mm)
+    radius_mm = radius * depth_mm / frame.intrinsics.fx
+    bulge = np.sqrt(np.maximum(1 - (offsets**2).sum(1), 0.0))
+    return _Patch(middle, radius, depth_mm - radius_mm * bulge)
+
+
+def _anywhere(
+    frame: DepthFrame, organ: _Organ, offsets: np.ndarray, rng: np.random.Generator
+) -> _Patch:
+    """Spread over the whole image and from before the organ to behind it."""
+    size = np.array([frame.intrinsics.width, frame.intrinsics.height])
+    low = organ.near_mm - 0.2 * organ.width_mm
+    depth_mm = rng.uniform(low, organ.far_mm + 0.4 * organ.width_mm, len(offsets))
+    return _Patch((size - 1) / 2, float(np.hypot(*size)) / 2, depth_mm)
