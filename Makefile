@@ -4,7 +4,7 @@ BIN := .venv/bin
 SETUP := .venv/.installed
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test check bench clean
+.PHONY: help setup demo test check bench results clean
 
 help:  ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 10
@@ -31,6 +31,9 @@ test: check  ## check, then all tests
 
 bench: setup  ## speed of the generator, training and inference, side by side with naive forms
 	$(BIN)/python bench/bench.py
+
+results: setup  ## the tables and plots of docs/results.md (hours; ARGS=--quick: minutes)
+	$(BIN)/python bench/results.py $(ARGS)
 
 clean:  ## remove .venv and caches (runs/ stays)
 	rm -rf .venv .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache

@@ -1,0 +1,1 @@
+"""The study behind docs/results.md: what is measured, kept, tabulated and drawn."""

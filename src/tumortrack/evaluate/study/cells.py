@@ -1,0 +1,103 @@
+"""Cells: one method on one scene under one fault, measured once and kept as one JSON file.
+
+A cell's name holds the hash of everything that decides its numbers (case, scene, fault, method,
+grid), so that a study that was killed goes on where it stopped, and a cell made from other inputs
+is never taken for this one.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import platform
+from pathlib import Path
+
+import tumortrack
+from tumortrack.core import store
+from tumortrack.core.config import Config, to_builtins
+from tumortrack.core.errors import StorageError
+
+CELL_SCHEMA = 1  # raise it when a cell's metrics change their meaning
+
+
+class CellSpec(Config, frozen=True):
+    """What decides a cell's numbers, and the names under which tables find it."""
+
+    case: str
+    case_sha256: str
+    scene: str
+    scene_sha256: str
+    variant: str
+    view: str
+    method: dict  # the method's identity: name, seed, and hashes or settings
+    grid: int
+    fault: str = "none"
+    fault_seed: int = 0
+    schema: int = CELL_SCHEMA
+
+    @property
+    def digest(self) -> str:
+        """sha256 of the whole specification."""
+        return hashlib.sha256(json.dumps(to_builtins(self), sort_keys=True).encode()).hexdigest()
+
+
+class CellStore:
+    """The folder of all cells: CASE/METHOD/SCENE-FAULT-GRID-DIGEST.json."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+
+    def path(self, spec: CellSpec) -> Path:
+        method = f"{spec.method['name']}-{spec.method.get('seed', 0)}"
+        file = f"{spec.scene}-{spec.fault}-{spec.grid}-{spec.digest[:16]}.json"
+        return self.folder / spec.case / method / file
+
+    def read(self, spec: CellSpec) -> dict | None:
+        """The cell with exactly this specification, None where it has not been measured.
+
+        Raises:
+            ArtifactError: its file is damaged.
+        """
+        path = self.path(spec)
+        if not path.exists():
+            return None
+        cell = store.read_json(path)
+        return cell if cell.get("spec") == to_builtins(spec) else None
+
+    def write(self, spec: CellSpec, measured: dict) -> dict:
+        """Keep a cell, in one step.
+
+        Raises:
+            StorageError: the disk refused.
+        """
+        path = self.path(spec)
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise StorageError(f"cannot write {path.parent}: {error.strerror}.") from error
+        cell = {"spec": to_builtins(spec), **measured}
+        store.write_json(path, cell)
+        return cell
+
+
+def provenance(device: str) -> dict:
+    """Where and by what a cell is measured; ``load`` is how busy the machine was."""
+    import torch
+
+    return {
+        "tumortrack": tumortrack.__version__,
+        "device": device,
+        "cpu": cpu_name(),
+        "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 0,
+        "threads": torch.get_num_threads(),
+        "load": round(os.getloadavg()[0], 2) if hasattr(os, "getloadavg") else None,
+    }
+
+
+def cpu_name() -> str:
+    """The processor as the system names it."""
+    info = Path("/proc/cpuinfo")
+    lines = info.read_text(encoding="utf-8").splitlines() if info.exists() else []
+    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return names[0] if names else platform.processor() or platform.machine()

@@ -1,0 +1,111 @@
+"""What can be measured: something with an identity that turns a scene's cloud into an estimate."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+from jaxtyping import Float
+
+from tumortrack.core import store
+from tumortrack.learn.model import Model, load_model
+from tumortrack.simulate.scene_folder import Scene
+from tumortrack.track.estimate import Estimate
+from tumortrack.track.tracker import Tracker
+
+Carry = Callable[[Float[np.ndarray, "n 3"]], Float[np.ndarray, "n 3"]]
+
+
+LIVE_STAGES = ("encode", "coarse", "fine")  # what a live frame takes; the dense volume is extra
+
+
+@dataclass(frozen=True)
+class Answer:
+    """An estimate, what a live frame of it costs, and the map from CT points to camera points
+    where the method has one."""
+
+    estimate: Estimate
+    frame_s: float
+    carry: Carry | None = None
+
+
+class Method(Protocol):
+    """``identity`` holds ``name``, ``seed`` and everything else that decides the answers."""
+
+    @property
+    def identity(self) -> dict: ...
+
+    @property
+    def device(self) -> str: ...
+
+    @property
+    def prepare_s(self) -> float | None:
+        """Spent once for a patient, before the first frame: training, or a peer's own work."""
+        ...
+
+    @property
+    def about(self) -> dict:
+        """What else a reader wants to know of it (JSON)."""
+        ...
+
+    def locate(self, scene: Scene, grid: int) -> Answer:
+        """Raises NoEstimate or InputError where nothing can be said of the scene."""
+        ...
+
+
+@dataclass(frozen=True)
+class Network:
+    """A trained model under a name such as M_lim."""
+
+    name: str
+    folder: Path
+    want_device: str = "auto"
+    locate_seed: int = 0
+
+    @cached_property
+    def identity(self) -> dict:
+        about = self.provenance
+        return {
+            "kind": "network",
+            "name": self.name,
+            "seed": about["seed"],
+            "steps": about["steps"],
+            "locate_seed": self.locate_seed,
+            "model_sha256": store.sha256_of(self.folder / store.MANIFEST),
+        }
+
+    @property
+    def provenance(self) -> dict:
+        """The model's own: steps, seconds of training, device."""
+        return store.read_json(self.folder / store.MANIFEST)["provenance"]
+
+    @cached_property
+    def _model(self) -> Model:
+        return load_model(self.folder, self.want_device)
+
+    @cached_property
+    def _tracker(self) -> Tracker:
+        return Tracker(self._model)
+
+    @property
+    def device(self) -> str:
+        return str(next(self._model.network.parameters()).device.type)
+
+    @property
+    def prepare_s(self) -> float | None:
+        return self.about["training_s"]
+
+    @property
+    def about(self) -> dict:
+        """Of the training: seed, steps, seconds, device, validation mIoU."""
+        keys = ("seed", "steps", "training_s", "device", "validation_miou")
+        return {key: self.provenance[key] for key in keys}
+
+    def locate(self, scene: Scene, grid: int) -> Answer:
+        estimate = self._tracker.locate(scene.cloud, grid, self.locate_seed)
+        seconds = estimate.report["timings"]
+        return Answer(estimate, sum(seconds[stage] for stage in LIVE_STAGES))

@@ -1,0 +1,147 @@
+"""What the study measures: every number that decides a figure, and the jobs that follow."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
+
+from tumortrack.core.config import Config
+from tumortrack.evaluate.study.measure import Job, StudyCase, by_method
+from tumortrack.evaluate.study.methods import Method, Network
+from tumortrack.evaluate.study.models import MODELS, configuration_name
+
+VARIANTS = ("D0", "D1", "D2", "D3", "Rot90", "Rot180", "Rot270", "G1", "P1")
+VIEWS = ("clean", "noise", "shaft", "clutter")
+FAULTS = (
+    "clean", "noise", "distortion", "offset", "occlusion", "outliers", "registration", "all"
+)  # fmt: skip
+Section = Literal["accuracy", "deformation", "peers", "faults", "views"]
+SECTIONS: tuple[Section, ...] = ("accuracy", "deformation", "peers", "faults", "views")
+
+
+class StudyPlan(Config, frozen=True):
+    """Which cells there are.
+
+    ``accuracy`` (the paper's table of results) is measured at ``grid``, everything else at
+    ``coarse_grid``; networks always with every seed.
+    """
+
+    name: str
+    steps: int = 12_000
+    seeds: tuple[int, ...] = (0, 1, 2)
+    variants: tuple[str, ...] = VARIANTS
+    view: str = "noise"  # of every table but those of faults and views
+    grid: int = 400
+    coarse_grid: int = 160
+    configurations: tuple[int, ...] = (1, 2, 3, 4, 5, 6)
+    configuration_variants: tuple[str, ...] = ("D0", "D1", "D2", "D3")
+    configuration_view: str = "noise"
+    peers: tuple[str, ...] = ("rigid_bound", "rigid", "cpd", "bcpd", "elastic")
+    faults: tuple[str, ...] = FAULTS
+    fault_peers: tuple[str, ...] = ("elastic",)
+    fault_variants: tuple[str, ...] = ("D1", "D2", "D3", "G1", "P1")
+    views: tuple[str, ...] = VIEWS
+
+
+FULL = StudyPlan(name="full")
+QUICK = StudyPlan(
+    name="quick",
+    steps=800,
+    seeds=(0,),
+    variants=("D0", "D2", "G1"),
+    grid=96,
+    coarse_grid=96,
+    configurations=(1, 3),
+    configuration_variants=("D1", "D3"),
+    peers=("rigid_bound", "rigid", "elastic"),
+    faults=("clean", "noise", "offset", "all"),
+    fault_variants=("D2", "G1"),
+    views=("clean", "noise", "clutter"),
+)
+
+Peers = Callable[[str, StudyCase], Method]
+Models = Callable[[StudyCase, str, int], Network]
+
+
+@dataclass(frozen=True)
+class Methods:
+    """Where methods come from: trained models, and peers made ready for a patient."""
+
+    model: Models
+    peer: Peers
+
+
+def jobs_of(
+    plan: StudyPlan,
+    section: Section,
+    cases: tuple[StudyCase, ...],
+    methods: Methods,
+) -> list[Job]:
+    """The jobs of one section, grouped by method. Models that are not trained yet are trained.
+
+    ``cases``: for ``deformation`` the second phantom, for all others every case.
+    """
+    makers = {
+        "accuracy": _accuracy,
+        "deformation": _deformation,
+        "peers": _peers,
+        "faults": _faults,
+        "views": _views,
+    }
+    jobs = [job for case in cases for job in makers[section](plan, case, methods)]
+    return by_method(jobs)
+
+
+def _accuracy(plan: StudyPlan, case: StudyCase, methods: Methods) -> list[Job]:
+    return [
+        Job(case, model, variant, plan.view, plan.grid)
+        for name in MODELS
+        for seed in plan.seeds
+        for model in [methods.model(case, name, seed)]
+        for variant in plan.variants
+    ]
+
+
+def _deformation(plan: StudyPlan, case: StudyCase, methods: Methods) -> list[Job]:
+    return [
+        Job(case, model, variant, plan.configuration_view, plan.coarse_grid)
+        for number in plan.configurations
+        for seed in plan.seeds
+        for model in [methods.model(case, configuration_name(number), seed)]
+        for variant in plan.configuration_variants
+    ]
+
+
+def _peers(plan: StudyPlan, case: StudyCase, methods: Methods) -> list[Job]:
+    beside = [methods.peer(name, case) for name in plan.peers]
+    return [
+        Job(case, method, variant, plan.view, plan.coarse_grid)
+        for method in [*_networks(plan, case, methods), *beside]
+        for variant in plan.variants
+    ]
+
+
+def _faults(plan: StudyPlan, case: StudyCase, methods: Methods) -> list[Job]:
+    beside = [methods.peer(name, case) for name in plan.fault_peers if name in plan.peers]
+    return [
+        Job(case, method, variant, "clean", plan.coarse_grid, fault)
+        for method in [*_networks(plan, case, methods, ("M_lim",)), *beside]
+        for fault in plan.faults
+        for variant in plan.fault_variants
+    ]
+
+
+def _views(plan: StudyPlan, case: StudyCase, methods: Methods) -> list[Job]:
+    return [
+        Job(case, method, variant, view, plan.coarse_grid)
+        for method in _networks(plan, case, methods)
+        for view in plan.views
+        for variant in plan.variants
+    ]
+
+
+def _networks(
+    plan: StudyPlan, case: StudyCase, methods: Methods, names: tuple[str, ...] = tuple(MODELS)
+) -> list[Network]:
+    return [methods.model(case, name, seed) for name in names for seed in plan.seeds]
