@@ -1,0 +1,103 @@
+"""Tetrahedral meshes of closed surfaces, and points that ride on them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from jaxtyping import Float, Float64, Int, Int32
+
+from tumortrack.core.errors import InputError
+from tumortrack.core.types import Mesh
+
+_CANDIDATES = 24  # tetrahedra round a point among which its own is looked for
+
+
+@dataclass(frozen=True, eq=False)
+class TetMesh:
+    """Nodes (mm) and tetrahedra of positive volume; the variable that holds it names the frame."""
+
+    nodes_mm: Float64[np.ndarray, "n 3"]
+    tets: Int32[np.ndarray, "t 4"]
+
+    def __post_init__(self) -> None:
+        if len(self.tets) == 0 or not (self.volumes_mm3 > 0).all():
+            raise InputError("a tetrahedral mesh needs tetrahedra, all of positive volume.")
+
+    @cached_property
+    def volumes_mm3(self) -> Float64[np.ndarray, " t"]:
+        return tet_volumes(self.nodes_mm, self.tets)
+
+    def lump(self, per_tet: Float[np.ndarray, " t"]) -> Float64[np.ndarray, " n"]:
+        """Sums over the nodes of what each tetrahedron shares out to its four in equal parts."""
+        return np.bincount(self.tets.ravel(), np.repeat(per_tet / 4, 4), len(self.nodes_mm))
+
+
+def tet_volumes(
+    nodes_mm: Float[np.ndarray, "n 3"], tets: Int[np.ndarray, "t 4"]
+) -> Float64[np.ndarray, " t"]:
+    """Signed volumes, mm^3."""
+    corners = nodes_mm[tets]
+    return np.linalg.det(corners[:, 1:] - corners[:, :1]) / 6
+
+
+def tetrahedralise(surface: Mesh, edge_mm: float) -> TetMesh:
+    """Fill a closed surface with tetrahedra (Hu et al. 2020, doi 10.1145/3386569.3392385).
+
+    The mesh's own surface keeps within 0.2 % of the diagonal (about 0.3 mm on a kidney) of the
+    given one. One thread, so that the same surface gives the same mesh.
+
+    Raises:
+        InputError: nothing could be filled (an open or inverted surface).
+    """
+    import pytetwild
+
+    nodes_mm, tets = pytetwild.tetrahedralize(
+        surface.vertices_mm.copy(),  # the binding takes writable arrays of these types only
+        surface.faces.astype(np.uint32),
+        edge_length_abs=edge_mm,
+        epsilon=2e-3,
+        num_threads=1,
+        loglevel=6,
+    )
+    if len(tets) == 0:
+        raise InputError("the surface encloses nothing that tetrahedra could fill; repair it.")
+    tets = np.ascontiguousarray(tets, np.int32)
+    turned = tet_volumes(nodes_mm, tets) < 0
+    tets[turned, 2:] = tets[turned, :1:-1]
+    return TetMesh(np.ascontiguousarray(nodes_mm, np.float64), tets)
+
+
+@dataclass(frozen=True, eq=False)
+class Embedding:
+    """Points held by the four nodes of one tetrahedron each, with weights that sum to 1."""
+
+    nodes: Int32[np.ndarray, "m 4"]
+    weights: Float64[np.ndarray, "m 4"]
+
+    def carry(self, nodes_mm: Float[np.ndarray, "n 3"]) -> Float64[np.ndarray, "m 3"]:
+        """The points where the nodes lie now."""
+        return np.einsum("mi,mij->mj", self.weights, nodes_mm[self.nodes])
+
+
+def embed(mesh: TetMesh, points_mm: Float[np.ndarray, "m 3"]) -> Embedding:
+    """Find each point's tetrahedron. A point just outside the mesh (its surface is coarser than
+    the anatomy's) rides on the nearest one, its weights extrapolated."""
+    from scipy.spatial import cKDTree
+
+    corners = mesh.nodes_mm[mesh.tets]
+    inverse = np.linalg.inv((corners[:, 1:] - corners[:, :1]).transpose(0, 2, 1))
+    count = min(_CANDIDATES, len(mesh.tets))
+    near = cKDTree(corners.mean(1)).query(points_mm, k=count)[1].reshape(len(points_mm), count)
+    best = np.full(len(points_mm), -np.inf)
+    owner = near[:, 0].copy()
+    weights = np.zeros((len(points_mm), 4))
+    for column in range(count):
+        tet = near[:, column]
+        local = np.einsum("mij,mj->mi", inverse[tet], points_mm - corners[tet, 0])
+        bary = np.concatenate([1 - local.sum(1, keepdims=True), local], axis=1)
+        least = bary.min(1)
+        better = least > best
+        best[better], owner[better], weights[better] = least[better], tet[better], bary[better]
+    return Embedding(mesh.tets[owner], weights)
