@@ -299,3 +299,21 @@ def test_qc_picture_shows_outlines(tmp_path, with_ct):
     for color in ((1.0, 0.62, 0.45), (0.97, 0.88, 0.22)):
         assert (np.abs(flat - color) < 0.03).all(1).sum() > 300
     assert list(tmp_path.iterdir()) == [tmp_path / "qc.png"]
+
+
+def test_qc_picture_cuts_through_every_tumor(tmp_path):
+    """Tumors in opposite corners share no slice: each has its outline in its own row."""
+    from matplotlib.image import imread
+
+    corners = [ball(5, (-20, -20, -20)), ball(7, (20, 20, 20))]
+    parts = Anatomy((ball(48, (0, 0, 0)), *corners))
+    lps_from_index = np.diag([2.0, 2.0, 2.0, 1.0])
+    lps_from_index[:3, 3] = -60
+    labels = label_grid(parts, lps_from_index, (60, 60, 60))
+    qc_picture(LabelVolume(labels, lps_from_index), None, parts, tmp_path / "qc.png")
+    picture = imread(tmp_path / "qc.png")[..., :3]
+    top, left = picture.shape[0] // 10, int(0.74 * picture.shape[1])  # no legend, no 3-D view
+    rows = np.array_split(picture[top:, :left], 2)
+    for row, color in zip(rows, ((0.97, 0.88, 0.22), (0.34, 0.71, 0.91)), strict=True):
+        drawn = (np.abs(row - color) < 0.03).all(2)
+        assert all(part.sum() > 50 for part in np.array_split(drawn, 3, axis=1))

@@ -38,6 +38,7 @@ _ORGAN_LINE = (1.0, 0.62, 0.45)
 _TUMOR_COLORS = ((0.97, 0.88, 0.22), (0.34, 0.71, 0.91), (0.56, 0.93, 0.56), (0.85, 0.55, 0.75))
 _SOFT_TISSUE_HU = (-160.0, 240.0)
 _MARGIN_MM = 18.0
+_MOST_ROWS = 6  # tumors with slices of their own
 
 
 @dataclass(frozen=True)
@@ -92,31 +93,43 @@ def slice_volume(
 
 
 def qc_picture(case_labels: LabelVolume, ct: Volume | None, anatomy: Anatomy, path: Path) -> None:
-    """Three orthogonal slices with outlines and a 3-D view, to check a prepared case by eye.
+    """Orthogonal slices with outlines, a row through each tumor, and a 3-D view: what to check a
+    prepared case by.
 
     Args:
         case_labels: shown as grey where there is no CT; patient frame.
         ct: the CT behind it, if there is one.
-        anatomy: the prepared surfaces, in the same patient frame (LPS, mm).
+        anatomy: the prepared surfaces, in the same patient frame (LPS, mm). Of more than
+            six tumors the six largest have rows.
         path: PNG to write, atomically.
     """
-    largest = max(anatomy.tumors or (anatomy.organ,), key=lambda mesh: abs(mesh.volume_mm3))
-    through_mm = largest.box_mm.mean(0)
-    figure = new_figure(12.0, 10.2)
-    figure.subplots_adjust(top=0.9, left=0.01, right=0.99, bottom=0.01)
-    grid = figure.add_gridspec(2, 2, wspace=0.03, hspace=0.09)
+    order = sorted(range(len(anatomy.tumors)), key=lambda n: -abs(anatomy.tumors[n].volume_mm3))
+    rows = sorted(order[:_MOST_ROWS])
+    titles = [anatomy.names[n + 1].replace("_", " ") for n in rows] or ["kidney"]
+    through = [anatomy.tumors[n] for n in rows] or [anatomy.organ]
+    height = 3.85 * len(through)
+    figure = new_figure(18.0, height + 1.0)
+    figure.subplots_adjust(
+        top=height / (height + 1.0), left=0.025, right=0.99, bottom=0.05 / (height + 1.0)
+    )
+    grid = figure.add_gridspec(len(through), 4, wspace=0.03, hspace=0.12)
     shown: LabelVolume | Volume = ct if ct is not None else case_labels
     window = _window(shown, anatomy)
-    for cell, plane in zip((grid[0, 0], grid[0, 1], grid[1, 0]), PLANES, strict=True):
-        axes = figure.add_subplot(cell)
-        _qc_slice(axes, (shown, window), anatomy, plane, through_mm)
-    _qc_solid(figure.add_subplot(grid[1, 1]), anatomy)
+    for row, (title, part) in enumerate(zip(titles, through, strict=True)):
+        for column, plane in enumerate(PLANES):
+            axes = figure.add_subplot(grid[row, column])
+            _qc_slice(axes, (shown, window), anatomy, plane, part.box_mm.mean(0))
+            if column == 0:
+                axes.set_ylabel(f"through {title}", fontsize=12, fontweight="bold")
+    _qc_solid(figure.add_subplot(grid[:, 3]), anatomy)
     what = "CT" if ct is not None else "label map"
-    figure.suptitle(f"Prepared case over its {what}", x=0.015, ha="left", fontweight="bold")
+    dropped = len(order) - len(rows)
+    more = f" (slices through the {_MOST_ROWS} largest of {len(order)} tumors)" if dropped else ""
+    figure.suptitle(f"Prepared case over its {what}{more}", x=0.015, ha="left", fontweight="bold")
     figure.legend(
         handles=_qc_legend(anatomy),
         loc="upper right",
-        ncols=4,
+        ncols=6,
         frameon=False,
         fontsize=9.5,
         bbox_to_anchor=(0.99, 0.995),

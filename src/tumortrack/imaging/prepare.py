@@ -25,6 +25,8 @@ _OF_CT = ("kidney_hu", "tumor_hu")
 _OF_LABELS = ("labels", "side", "organ", "tumor")
 _OF_DICOM, _OF_MESHES = ("series",), ("unit",)
 
+_MOST_CHANGE_PERCENT = 1.0  # of a part's volume, by smoothing; more is told
+
 
 @dataclass(frozen=True)
 class PrepareOptions:
@@ -127,6 +129,12 @@ def _from_volume(path: Path, options: PrepareOptions) -> Case:
         )
         ct = _crop_ct(volume, labels)
     anatomy, surface = surfaces(labels)
+    notes += [
+        f"{name}: the surface's volume is {change:+.1f} % off its labels'; it is too thin or hangs "
+        "together by too little for a smooth surface. Look at qc.png"
+        for name, change in zip(surface.names, surface.change_percent, strict=True)
+        if abs(change) > _MOST_CHANGE_PERCENT
+    ]
     report = {
         "kind": "label map" if as_labels else "ct",
         "notes": found + notes,

@@ -6,6 +6,7 @@ al. 2003, scikit-image); the level is then chosen so that the mesh holds the lab
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,6 +20,7 @@ from tumortrack.imaging.grid import bounding_box, voxel_ml
 _TRIANGLES = 28_000  # aimed at for the organ
 _BLUR_VOXELS = 0.9  # enough to melt steps of one voxel, too little to lose a small tumor
 _STEPS_ACROSS = 14  # cells across the thinnest extent of a small part
+_MOST_MARCHES = 16  # 2 to 4 suffice where the volume is a smooth function of the level
 
 
 @dataclass(frozen=True)
@@ -87,28 +89,45 @@ def _surface(name: str, mask: np.ndarray, affine: np.ndarray, step_mm: float) ->
     cell_mm3 = abs(float(np.linalg.det(affine[:3, :3] * scale)))
     wanted_mm3 = 1000 * float(mask.sum()) * voxel_ml(affine)
 
-    mesh = None
-    # The level where that many cells lie above is close; the rest is a secant on the volume.
+    # The level where that many cells lie above is close; the rest is a search on the volume.
     level = float(-np.partition(-field.ravel(), n := int(wanted_mm3 / cell_mm3))[n])
-    tried: list[tuple[float, float]] = []
-    for _ in range(8):
+
+    def volume_error(level: float) -> tuple[Mesh, float]:
         mesh = _march(name, field, level, affine, scale, offset)
-        error = mesh.volume_mm3 / wanted_mm3 - 1
+        return mesh, mesh.volume_mm3 / wanted_mm3 - 1
+
+    return _keep_volume(volume_error, level, float(field.max()))
+
+
+def _keep_volume(
+    volume_error: Callable[[float], tuple[Mesh, float]], level: float, highest: float
+) -> Mesh:
+    """The mesh whose volume errs least: secant steps on the level, halving where they go astray.
+
+    Volume falls with the level, but may jump where a piece comes off; then no level is right.
+    """
+    too_large, too_small = 0.0, highest
+    tried: list[tuple[float, float]] = []
+    best: tuple[Mesh, float] | None = None
+    for _ in range(_MOST_MARCHES):
+        mesh, error = volume_error(level)
         tried.append((level, error))
-        if abs(error) < 2e-4:
+        if best is None or abs(error) < abs(best[1]):
+            best = (mesh, error)
+        if error > 0:
+            too_large = level
+        else:
+            too_small = level
+        if abs(error) < 2e-4 or too_small - too_large < 1e-3 * highest:
             break
-        level = _next_level(tried)
-    assert mesh is not None
-    return mesh
-
-
-def _next_level(tried: list[tuple[float, float]]) -> float:
-    """Secant step on (level, volume error), kept inside (0.05, 0.95); volume falls with level."""
-    level, error = tried[-1]
-    slope = -3.0
-    if len(tried) > 1 and tried[-2][0] != level:
-        slope = min(-0.1, (error - tried[-2][1]) / (level - tried[-2][0]))
-    return float(np.clip(level - error / slope, 0.05, 0.95))
+        slope = -3.0
+        if len(tried) > 1:
+            slope = min(-0.1, (error - tried[-2][1]) / (level - tried[-2][0]))
+        level -= error / slope
+        if len(tried) > 5 or not too_large < level < too_small:
+            level = (too_large + too_small) / 2
+    assert best is not None
+    return best[0]
 
 
 def _march(
