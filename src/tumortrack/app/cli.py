@@ -180,6 +180,31 @@ def simulate(
     )
 
 
+def twin(
+    case: Positional[Path],
+    scenes: Positional[Path],
+    /,
+    *,
+    seed: int = 0,
+    states: tuple[
+        Literal["D0", "D1", "D2", "D3", "Rot90", "Rot180", "Rot270", "G1", "P1"], ...
+    ] = (),
+    views: tuple[Literal["clean", "noise", "shaft", "clutter"], ...] = (),
+) -> None:
+    """Squeeze, turn, sink and poke a case by finite elements, and write the scenes with truth.
+
+    Args:
+        case: folder that `prepare` wrote.
+        scenes: folder to write: what `evaluate` reads. The same command resumes.
+        seed: of noise, instruments, background and target points.
+        states: which of them; default: all.
+        views: which of them; default: all.
+    """
+    from tumortrack.app.twin import write_twin
+
+    write_twin(case, scenes, seed, states, views)
+
+
 def evaluate(
     model: Positional[Path],
     variants: Positional[Path],
@@ -242,6 +267,7 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "train": train,
     "locate": locate,
     "simulate": simulate,
+    "twin": twin,
     "evaluate": evaluate,
     "inspect": inspect,
     "doctor": doctor,

@@ -18,6 +18,12 @@ def describe(path: Path) -> list[str]:
         raise InputError(f"{path} does not exist.")
     if (path / store.MANIFEST).is_file():
         return _artifact(path)
+    if (path / "twin.json").is_file():
+        made = sum((p / "cloud.ply").is_file() for p in path.iterdir())
+        return [
+            f"{path}: twin scenes that are not finished ({made} so far); the same `twin` command "
+            "resumes them."
+        ]
     if (path / "training").is_dir():
         return [f"{path}: a training that has not ended; the same `train` command resumes it."]
     if (path / "cloud.ply").is_file():
@@ -50,9 +56,24 @@ def _artifact(folder: Path) -> list[str]:
         f"{folder}: a {kind} (schema {manifest['schema']}, tumortrack {manifest['tumortrack']}); "
         f"{manifest['units']}, {manifest['frame']} frame; all files as they were written."
     ]
+    if isinstance(scenes := manifest.get("scenes"), dict):
+        return [*lines, *_sealed_scenes(folder, scenes)]
     skip = {"kind", "schema", "tumortrack", "units", "frame", "files", "config"}
     lines += [f"  {key}: {value}" for key, value in manifest.items() if key not in skip]
     return [*lines, f"  files: {', '.join(manifest['files'])}"]
+
+
+def _sealed_scenes(folder: Path, scenes: dict) -> list[str]:
+    """What became of the scenes that a manifest lists."""
+    changed = [
+        name
+        for name, digest in scenes.items()
+        if not (folder / name).is_dir() or store.sha256_of(folder / name) != digest
+    ]
+    lines = [f"  {len(scenes)} scenes: {', '.join(scenes)}"]
+    if changed:
+        return [*lines, f"  CHANGED or missing since they were sealed: {', '.join(changed)}"]
+    return [*lines, "  all as they were sealed; `tumortrack evaluate` reads them."]
 
 
 def _scene(folder: Path) -> list[str]:

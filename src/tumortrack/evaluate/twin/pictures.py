@@ -146,8 +146,8 @@ def _apparatus(axes: Axes, report: dict, view: View) -> None:
     """Plates (in section) and rod, where the state has them."""
     from matplotlib.patches import FancyBboxPatch, Polygon
 
-    if "plates_mm" in report:
-        low, high = report["plates_mm"]
+    if "plates_z_mm" in report:
+        low, high = report["plates_z_mm"]
         left, right = axes.get_xlim()
         half = report["plate_mm"] / 2 if view is FROM_FRONT else 0.46 * (right - left)
         middle = 0.0 if view is FROM_FRONT else (left + right) / 2

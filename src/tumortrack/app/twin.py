@@ -1,0 +1,50 @@
+"""`tumortrack twin`: a case -> the scenes of its digital twin, with a bar and the time left."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from rich.progress import (
+    BarColumn,
+    Progress,
+    TaskProgressColumn,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
+
+from tumortrack.app.console import console, say
+
+if TYPE_CHECKING:
+    from tumortrack.evaluate.twin.variants import View
+
+
+def write_twin(
+    case: Path, scenes: Path, seed: int, variants: Sequence[str], views: Sequence[View]
+) -> None:
+    """Make what is missing of these variants and views; empty means all.
+
+    Raises:
+        InputError: no case, unknown names, or scenes made from something else.
+    """
+    from tumortrack.evaluate.twin.dataset import Status, TwinRun, make_scenes
+    from tumortrack.evaluate.twin.variants import VARIANTS, VIEWS
+
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TaskProgressColumn(),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns, console=console, transient=True) as progress:
+        task = progress.add_task("twin", total=1.0)
+
+        def show(status: Status) -> None:
+            progress.update(task, completed=status.share, description=status.text)
+
+        run = TwinRun(case, seed=seed)
+        made = make_scenes(run, scenes, variants or tuple(VARIANTS), views or VIEWS, show)
+    say(f"{len(made)} scenes in {scenes}; look at the scene.png in each.")
