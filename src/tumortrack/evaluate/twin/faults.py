@@ -58,7 +58,8 @@ def faulty(clean: Scene, fault: str, seed: int) -> Scene:
     - all: these together.
 
     The fault's random numbers depend on seed and fault alone, and are the same in ``all``. The
-    cloud is drawn from the depth image again, by the scene's own crop.
+    cloud is drawn from the depth image again, by the scene's own crop; a scene that was read from
+    its folder has depths in steps of 0.1 mm.
 
     Raises:
         InputError: no such fault, or no clean scene of the twin with its depth image.

@@ -39,6 +39,7 @@ FROM_FRONT = View("bench from the front", (1.0, 0.0, 0.0), (0.0, 0.0, -1.0))
 FROM_END = View("bench from its end", (0.0, 1.0, 0.0), (0.0, 0.0, -1.0))
 _STEEL = (0.62, 0.65, 0.7)
 _REST = "0.35"
+_AROUND_MM = 14.0  # of the organ: background beside it shows, points far off do not
 _ROD_SHOWN_MM = 45.0
 _PLATE_SHOWN_MM = 4.0
 
@@ -111,8 +112,7 @@ def _depth_view(axes: Axes, scene: Scene) -> None:
 
 def _cloud_view(axes: Axes, scene: Scene) -> None:
     points_mm = scene.cloud.points_mm.astype(float)
-    corners = np.concatenate([scene.reference.organ.vertices_mm, points_mm])
-    frame = widened(frame_around(FROM_CAMERA, corners, 5.0), 1.6)
+    frame = widened(frame_around(FROM_CAMERA, scene.reference.organ.vertices_mm, _AROUND_MM), 1.6)
     _paint(axes, list(scene.reference.tumors), scene.reference.organ, FROM_CAMERA, frame)
     flat = FROM_CAMERA.project(points_mm)
     axes.scatter(flat[:, 0], flat[:, 1], s=2.0, color=OBSERVED, alpha=0.5, linewidths=0, zorder=3)
@@ -214,7 +214,7 @@ def _legend() -> list:
     return [
         Patch(facecolor=(*KIDNEY, 0.5), label="kidney"),
         Patch(facecolor=TRUE, label="tumor"),
-        Line2D([], [], color=_REST, linestyle="dashed", label="at rest"),
+        Line2D([], [], color=_REST, linestyle="dashed", label="undeformed"),
         Patch(facecolor=_STEEL, edgecolor="0.3", label="plate, rod"),
         Line2D([], [], color=OBSERVED, marker=".", linestyle="", label="point"),
     ]
