@@ -8,8 +8,10 @@ import torch
 import trimesh
 
 from tumortrack.core.geometry import transform_points
+from tumortrack.core.types import OccupancyCloud
 from tumortrack.track.volume import (
     dense_margins,
+    drop_islands,
     grid_over,
     keep_largest_pieces,
     part_surfaces,
@@ -98,3 +100,31 @@ def test_a_part_without_a_voxel_has_no_surface(dense):
     margins, labels, camera_from_index = dense
     only_organ = np.minimum(labels, 1)
     assert set(part_surfaces(margins, only_organ, camera_from_index, NAMES)) == {"kidney"}
+
+
+def test_points_of_dropped_islands_leave_the_cloud_too():
+    """An organ with an island outside it and a tumor with an island inside the organ."""
+    found = np.zeros((40, 30, 30), np.uint8)
+    found[5:25, 5:25, 5:25] = 1
+    found[8:12, 8:12, 8:12] = 2
+    found[20:22, 20:22, 20:22] = 2  # the tumor's island
+    found[32:36, 10:14, 10:14] = 1  # the organ's
+    kept = keep_largest_pieces(found, 2)
+    camera_from_index = np.diag([2.0, 2.0, 2.0, 1.0])
+    camera_from_index[:3, 3] = [-30.0, -20.0, 100.0]
+    rng = np.random.default_rng(0)
+    index = rng.uniform(0, 1, (30_000, 3)) * (np.array(found.shape) - 1)
+    labels = found[tuple(np.rint(index).astype(int).T)]
+    inside = labels > 0
+    points = transform_points(camera_from_index, index)[inside]
+    probability = rng.uniform(size=inside.sum())
+    cloud = OccupancyCloud(points, labels[inside], probability, 7)
+    clean = drop_islands(cloud, found, kept, camera_from_index)
+    truth = kept[tuple(np.rint(index[inside]).astype(int).T)]
+    assert (truth == 0).sum() > 10
+    assert ((truth == 1) & (cloud.labels == 2)).sum() > 3
+    np.testing.assert_array_equal(clean.labels, truth[truth > 0])
+    np.testing.assert_array_equal(clean.points_mm, cloud.points_mm[truth > 0])
+    np.testing.assert_array_equal(clean.probability, cloud.probability[truth > 0])
+    assert clean.stamp_ns == 7
+    assert drop_islands(cloud, found, found, camera_from_index) is cloud

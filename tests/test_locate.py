@@ -53,12 +53,34 @@ def seen(work: Path) -> tuple[np.ndarray, np.ndarray]:
     return cloud_by_rays(case, camera_from_ct), camera_from_ct
 
 
-def test_tumors_are_found_within_millimetres_in_the_camera_frame(work, seen):
-    points, camera_from_ct = seen
+@pytest.fixture(scope="module")
+def out(work: Path, seen: tuple[np.ndarray, np.ndarray]) -> Path:
+    """What `locate` wrote about the cloud."""
+    points, _ = seen
     trimesh.PointCloud(points).export(work / "cloud.ply")
     out = work / "out"
     said = succeeded(tumortrack("locate", work / "model", work / "cloud.ply", out, "--grid", 96))
     assert "tumor_2" in said
+    return out
+
+
+@pytest.fixture(scope="module")
+def scenes(work: Path) -> Path:
+    scenes = work / "scenes"
+    succeeded(tumortrack("simulate", work / "case", scenes, "--scenes", 3, "--seed", 9))
+    return scenes
+
+
+@pytest.fixture(scope="module")
+def evaluated(work: Path, scenes: Path) -> Path:
+    report = work / "report"
+    said = succeeded(tumortrack("evaluate", work / "model", scenes, report, "--grid", 64))
+    assert "3 scenes" in said
+    return report
+
+
+def test_tumors_are_found_within_millimetres_in_the_camera_frame(work, seen, out):
+    _, camera_from_ct = seen
     report = json.loads((out / "report.json").read_text())
     case = load_case(work / "case")
     for name, part in zip(case.anatomy.names, case.anatomy.parts, strict=True):
@@ -71,23 +93,23 @@ def test_tumors_are_found_within_millimetres_in_the_camera_frame(work, seen):
         assert mesh.volume_mm3 == pytest.approx(part.volume_mm3, rel=0.3)
 
 
-def test_labels_volume_and_meshes_lie_in_the_same_place(work):
-    image = nibabel.load(work / "out" / "labels.nii.gz")
+def test_labels_volume_and_meshes_lie_in_the_same_place(out):
+    image = nibabel.load(out / "labels.nii.gz")
     labels = np.asarray(image.dataobj)
     for label, name in ((2, "tumor_1"), (3, "tumor_2")):
         index = np.argwhere(labels == label)
         voxels_mm = index @ image.affine[:3, :3].T + image.affine[:3, 3]
-        mesh = read_mesh(work / "out" / f"{name}.ply")
+        mesh = read_mesh(out / f"{name}.ply")
         spacing = image.affine[0, 0]
         assert np.abs(voxels_mm.min(0) - mesh.box_mm[0]).max() < 1.5 * spacing
         assert np.abs(voxels_mm.max(0) - mesh.box_mm[1]).max() < 1.5 * spacing
 
 
-def test_occupancy_cloud_carries_labels_and_probabilities(work):
+def test_occupancy_cloud_carries_labels_and_probabilities(out):
     from tumortrack.sense.files import read_cloud
 
-    cloud, _ = read_cloud(work / "out" / "occupancy.ply")
-    header = (work / "out" / "occupancy.ply").read_bytes()[:400].decode("latin-1")
+    cloud, _ = read_cloud(out / "occupancy.ply")
+    header = (out / "occupancy.ply").read_bytes()[:400].decode("latin-1")
     assert "property uchar label" in header
     assert "property float probability" in header
     assert len(cloud.points_mm) > 5000
@@ -104,21 +126,40 @@ def test_the_same_seed_gives_the_same_answer_and_distance_does_not_matter(tracke
     np.testing.assert_allclose(moved, [0, 0, 200], atol=1.5)
 
 
-def test_clouds_in_other_formats_and_units_agree(work, seen):
+def test_clouds_in_other_formats_and_units_agree(work, seen, out):
     points, _ = seen
     np.savez(work / "metres.npz", points=points / 1000)
     refused = ["locate", work / "model", work / "metres.npz", work / "no"]
     for crop in ([], ["--range", "110", "150"]):  # the crop alone would find nothing in range
         assert "--unit m" in refusal(tumortrack(*refused, *crop))
     assert not (work / "no").exists()
-    out = work / "metres"
-    succeeded(
-        tumortrack("locate", work / "model", work / "metres.npz", out, "--unit", "m", "--grid", 32)
-    )
-    parts = json.loads((out / "report.json").read_text())["parts"]
-    before = json.loads((work / "out" / "report.json").read_text())["parts"]
+    other = ["locate", work / "model", work / "metres.npz", work / "metres", "--unit", "m"]
+    succeeded(tumortrack(*other, "--grid", 32))
+    parts = json.loads((work / "metres" / "report.json").read_text())["parts"]
+    before = json.loads((out / "report.json").read_text())["parts"]
     centres = [np.array(p["tumor_1"]["center_mm"]) for p in (parts, before)]
     assert np.linalg.norm(centres[0] - centres[1]) < 3
+
+
+@pytest.mark.parametrize("fast_bfloat16", [False, True])
+def test_the_answer_does_not_hang_on_half_precision(tracker, seen, monkeypatch, fast_bfloat16):
+    points, _ = seen
+    module = "tumortrack.track.tracker"
+    monkeypatch.setattr(f"{module}.has_fast_bfloat16", lambda _: fast_bfloat16)
+    forced = Tracker(tracker.model).locate(SensorCloud(points), grid=32).report
+    usual = tracker.locate(SensorCloud(points), grid=32).report
+    for name in tracker.model.parts:
+        apart = np.subtract(forced["parts"][name]["center_mm"], usual["parts"][name]["center_mm"])
+        assert np.linalg.norm(apart) < 1.0
+    assert forced["fit_mm"]["median"] == pytest.approx(usual["fit_mm"]["median"], abs=0.2)
+
+
+def test_a_negative_seed_is_refused(tracker, seen, work):
+    with pytest.raises(InputError, match="seed is -1"):
+        tracker.locate(SensorCloud(seen[0]), seed=-1)
+    simulated = ["simulate", work / "case", work / "negative", "--seed", -1]
+    assert "seed -1" in refusal(tumortrack(*simulated))
+    assert not (work / "negative").exists()
 
 
 def random_points(low: list[float], high: list[float]) -> np.ndarray:
@@ -186,50 +227,46 @@ def test_background_points_move_the_answer_little(tracker, seen, share, allowed_
         (["--device", "cuda"], "no CUDA GPU"),
     ],
 )
-def test_bad_options_say_what_is_allowed(work, arguments, words):
+def test_bad_options_say_what_is_allowed(work, out, arguments, words):
     if "cuda" in arguments:
         import torch
 
         if torch.cuda.is_available():
             pytest.skip("this machine has a CUDA GPU")
-    out = work / "refused"
-    message = refusal(
-        tumortrack("locate", work / "model", work / "out" / "occupancy.ply", out, *arguments)
-    )
-    assert words in message
-    assert not out.exists()
+    refused = work / "refused"
+    command = ["locate", work / "model", out / "occupancy.ply", refused, *arguments]
+    assert words in refusal(tumortrack(*command))
+    assert not refused.exists()
 
 
-def test_simulated_scenes_are_evaluated_against_their_truth(work):
-    succeeded(tumortrack("simulate", work / "case", work / "scenes", "--scenes", 3, "--seed", 9))
-    again = ["simulate", work / "case", work / "scenes", "--scenes", 3]
+def test_a_dataset_is_not_continued_with_another_seed(work, scenes):
+    again = ["simulate", work / "case", scenes, "--scenes", 3]
     succeeded(tumortrack(*again, "--seed", 9))  # nothing to do
     assert "another case, seed" in refusal(tumortrack(*again, "--seed", 8))
-    report = work / "report"
-    said = succeeded(tumortrack("evaluate", work / "model", work / "scenes", report, "--grid", 64))
-    assert "3 scenes" in said
-    told = json.loads((report / "report.json").read_text())
+
+
+def test_simulated_scenes_are_evaluated_against_their_truth(work, out, scenes, evaluated):
+    told = json.loads((evaluated / "report.json").read_text())
     assert told["model_sha256"] == store.sha256_of(work / "model" / store.MANIFEST)
     assert told["model"]["case_sha256"] == store.sha256_of(work / "case" / store.MANIFEST)
-    assert (told["grid"], told["seed"], told["scenes_folder"]) == (64, 0, str(work / "scenes"))
+    assert (told["grid"], told["seed"], told["scenes_folder"]) == (64, 0, str(scenes))
     summary = told["summary"]
     assert summary["failed"] == 0
     assert 0.4 < summary["miou"] < 1
     assert summary["tumor_1"]["hausdorff_mm"] >= summary["tumor_1"]["hausdorff_one_sided_mm"] > 0
-    assert (report / "index.html").stat().st_size > 10_000
-    kept = sorted((work / "out").iterdir())
-    onto_a_run = ["evaluate", work / "model", work / "scenes", work / "out"]
-    assert "REPORT" in refusal(tumortrack(*onto_a_run))
-    assert sorted((work / "out").iterdir()) == kept
+    assert (evaluated / "index.html").stat().st_size > 10_000
+    kept = sorted(out.iterdir())
+    assert "REPORT" in refusal(tumortrack("evaluate", work / "model", scenes, out))
+    assert sorted(out.iterdir()) == kept
 
 
-def test_scenes_of_another_case_are_refused_and_unknown_ones_are_not(work):
-    scenes = sorted((work / "scenes").iterdir())
+def test_scenes_of_another_case_are_refused_and_unknown_ones_are_not(work, scenes):
+    ours = sorted(scenes.iterdir())
     model = load_model(work / "model")
-    check_case(model, scenes)
+    check_case(model, ours)
     other = replace(model, provenance={**model.provenance, "case_sha256": "0" * 64})
     with pytest.raises(InputError, match="another case"):
-        check_case(other, scenes)
+        check_case(other, ours)
     foreign = work / "foreign" / "0000"
     foreign.mkdir(parents=True)
     check_case(other, [foreign])  # no meta.json at all
@@ -237,8 +274,8 @@ def test_scenes_of_another_case_are_refused_and_unknown_ones_are_not(work):
     check_case(other, [foreign])
 
 
-def test_depth_images_take_the_range_the_model_was_trained_for(work):
-    scene = work / "scenes" / "0000"
+def test_depth_images_take_the_range_the_model_was_trained_for(work, scenes):
+    scene = scenes / "0000"
     depth = ["locate", work / "model", scene / "depth.png", work / "depth"]
     assert "--intrinsics" in refusal(tumortrack(*depth))
     depth += ["--intrinsics", scene / "intrinsics.json", "--grid", 48]
@@ -249,14 +286,14 @@ def test_depth_images_take_the_range_the_model_was_trained_for(work):
     assert np.linalg.norm(np.array(found["center_mm"]) - truth) < 12
 
 
-def test_inspect_says_what_things_are(work):
+def test_inspect_says_what_things_are(work, out, scenes, evaluated):
     for path, words in (
         (work / "case", "a case"),
         (work / "model", "a model"),
-        (work / "out", "a run"),
-        (work / "scenes", "3 scenes"),
-        (work / "scenes" / "0000", "a scene"),
-        (work / "report", "an evaluation report"),
+        (out, "a run"),
+        (scenes, "3 scenes"),
+        (scenes / "0000", "a scene"),
+        (evaluated, "an evaluation report"),
         (work / "cloud.ply", "points from"),
     ):
         assert words in succeeded(tumortrack("inspect", path))

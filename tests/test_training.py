@@ -3,24 +3,36 @@
 from __future__ import annotations
 
 import json
+import os
 import resource
 import signal
 import subprocess
+import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from stories import COMMAND, environment, refusal, succeeded, tumortrack, write_phantom_case
 from tumortrack.app.presets import paper, quick
 from tumortrack.core.config import from_builtins, to_builtins
 from tumortrack.core.errors import ArtifactError, InputError
+from tumortrack.core.types import Anatomy
+from tumortrack.imaging.case import load_case
 from tumortrack.learn.checkpoint import Progress
 from tumortrack.learn.config import TrainConfig
+from tumortrack.learn.cores import available_cores
 from tumortrack.learn.model import load_model
 from tumortrack.learn.network import CloudBox
 from tumortrack.learn.schedule import learning_rate, settle_end
+from tumortrack.learn.state import Diverged, TrainingState
+from tumortrack.learn.train import Run, train
+from tumortrack.learn.work import work_folder
+
+STEPS = 100
 
 
 @pytest.fixture(scope="module")
@@ -33,27 +45,30 @@ def case(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def uninterrupted(case: Path) -> Path:
     model = case.parent / "uninterrupted"
-    succeeded(tumortrack("train", case, model, "--steps", 40, "--workers", 1, "--device", "cpu"))
+    succeeded(tumortrack(*train_command(case, model)))
     return model
 
 
+def train_command(case: Path, model: Path) -> list[object]:
+    return ["train", case, model, "--steps", STEPS, "--workers", 1, "--device", "cpu"]
+
+
 def test_a_killed_run_ends_with_the_weights_of_one_that_was_not(case, uninterrupted):
+    """Killed at once when its first checkpoint is there, long before its end."""
     model = case.parent / "killed"
-    command = ["train", case, model, "--steps", 40, "--workers", 1, "--device", "cpu"]
-    command += ["--checkpoint-every", 0.2]
+    command = [*train_command(case, model), "--checkpoint-every", 0]
     with subprocess.Popen(
         [*COMMAND, *map(str, command)], stdout=subprocess.DEVNULL, env=environment()
     ) as process:
         checkpoint = model / "training" / "checkpoint.safetensors"
-        deadline = time.monotonic() + 120
+        deadline = time.monotonic() + 300
         while not checkpoint.exists() and time.monotonic() < deadline:
-            time.sleep(0.05)
-        time.sleep(0.3)
+            time.sleep(0.005)
         process.send_signal(signal.SIGKILL)
     assert checkpoint.exists()
     assert not (model / "manifest.json").exists(), "the run ended before it was killed"
     assert "has not ended" in refusal(tumortrack("locate", model, "cloud.ply", model / "out"))
-    succeeded(tumortrack(*command))
+    succeeded(tumortrack(*train_command(case, model)))
     weights = (model / "weights.safetensors").read_bytes()
     assert weights == (uninterrupted / "weights.safetensors").read_bytes()
 
@@ -78,14 +93,17 @@ def test_ctrl_c_keeps_the_state_and_says_how_to_go_on(case):
 
 def test_the_model_says_what_it_was_made_from(case, uninterrupted):
     about = load_model(uninterrupted).provenance
-    assert about["steps"] == 40
+    assert about["steps"] == STEPS
     assert about["seed"] == 0
     lines = (uninterrupted / "training" / "history.jsonl").read_text().splitlines()
-    assert json.loads(lines[-1])["step"] == 40
+    last = json.loads(lines[-1])
+    assert last["step"] == STEPS
+    assert last["samples_per_s"] > 1
+    assert 0 < last["learning_rate"] < 1e-3  # the schedule has nearly ended
     assert list((uninterrupted / "training" / "tensorboard").iterdir())
-    again = tumortrack("train", case, uninterrupted, "--steps", 40, "--device", "cpu")
+    again = tumortrack(*train_command(case, uninterrupted))
     assert "trained already" in succeeded(again)
-    refusal(tumortrack("train", case, uninterrupted, "--steps", 41))
+    refusal(tumortrack("train", case, uninterrupted, "--steps", STEPS + 1))
 
 
 def test_a_changed_weights_file_or_schema_is_refused(uninterrupted, tmp_path):
@@ -117,14 +135,153 @@ def test_a_full_disk_stops_training_and_spares_the_last_checkpoint(case):
     assert not list((model / "training").glob("*.part"))
 
 
+HISTORY_ON_A_FULL_DISK = """
+import resource, sys
+from pathlib import Path
+from tumortrack.core.errors import InputError, StorageError
+from tumortrack.learn.checkpoint import Progress
+from tumortrack.learn.history import History, Record
+
+folder, mode = Path(sys.argv[1]), sys.argv[2]
+import torch.utils.tensorboard  # its own caches are not the point
+resource.setrlimit(resource.RLIMIT_FSIZE, (300, 300))
+import signal
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+try:
+    with History(folder, Progress()) as history:
+        if mode == "other":
+            history.write(Progress(step=1), Record(1.0, 0.5, 100.0, 1e-3))
+            raise InputError("the first error")
+        for step in range(200):
+            history.write(Progress(step=step), Record(1.0, 0.5, 100.0, 1e-3))
+except StorageError as error:
+    print("storage:", error)
+except InputError as error:
+    print("input:", error)
+"""
+
+
+@pytest.mark.parametrize(
+    ("mode", "words"),
+    [("full", "storage: cannot write the history"), ("other", "input: the first")],
+)
+def test_a_history_that_cannot_be_written_is_one_clear_error(tmp_path, mode, words):
+    done = subprocess.run(
+        [sys.executable, "-c", HISTORY_ON_A_FULL_DISK, str(tmp_path), mode],
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.startswith(words), done.stdout + done.stderr
+
+
+def a_run(case: Path, **changes: object) -> Run:
+    loaded = load_case(case)
+    config = quick(loaded.anatomy)
+    run = Run(loaded.anatomy, loaded.up_lps, "no digest", config, steps=2, workers=0)
+    return replace(run, **changes)
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"seed": -1}, "seed is -1"),
+        ({"checkpoint_every_s": float("nan")}, "--checkpoint-every is nan"),
+        ({"checkpoint_every_s": -1.0}, "--checkpoint-every is -1"),
+        ({"minutes": float("nan")}, "minutes is nan"),
+        ({"workers": -1}, "workers is -1"),
+        ({"steps": 0}, "steps is 0"),
+    ],
+)
+def test_impossible_runs_are_refused(case, changes, words):
+    with pytest.raises(InputError, match=words):
+        a_run(case, **changes)
+
+
+def test_a_refused_run_leaves_nothing_behind(case, tmp_path):
+    message = refusal(tumortrack("train", case, tmp_path / "model", "--seed", -1))
+    assert "seed is -1" in message
+    run = a_run(case)
+    needle = run.anatomy_ct.organ.vertices_mm.mean(0) + run.anatomy_ct.tumors[0].vertices_mm * 1e-4
+    needle[:, 0] *= 1e-3
+    thin = Anatomy((run.anatomy_ct.organ, run.anatomy_ct.tumors[0].moved(needle)))
+    with pytest.raises(InputError, match="points"):
+        train(replace(run, anatomy_ct=thin), tmp_path / "model", lambda _: None)
+    assert not (tmp_path / "model").exists()
+
+
+def test_two_trainings_in_one_folder_are_refused_and_a_dead_ones_lock_is_not(tmp_path):
+    model = tmp_path / "model"
+    with work_folder(model) as work:
+        (work / "something").touch()
+        with pytest.raises(InputError, match="another process is training"), work_folder(model):
+            pass
+    assert (work / "something").exists()
+    hold = (
+        "import sys, os, signal; from pathlib import Path;"
+        "from tumortrack.learn.work import work_folder\n"
+        "with work_folder(Path(sys.argv[1])): os.kill(os.getpid(), signal.SIGKILL)"
+    )
+    assert subprocess.run([sys.executable, "-c", hold, str(model)]).returncode == -signal.SIGKILL
+    assert (work / ".lock").exists()
+    with work_folder(model):
+        pass
+
+
+def test_a_diverged_run_stops_and_keeps_the_checkpoint_before(case, tmp_path):
+    state = TrainingState(a_run(case), torch.device("cpu"))
+    batch = (torch.randn(2, 300, 3) * 30, torch.randn(2, 50, 3) * 30, torch.zeros(2, 50))
+    assert state.step(batch) > 0
+    state.save(tmp_path)
+    before = (tmp_path / "checkpoint.safetensors").read_bytes()
+    clouds, points, labels = batch
+    with pytest.raises(Diverged, match="diverged at step 1"):
+        state.step((clouds, points * float("inf"), labels))
+    with torch.no_grad():
+        next(iter(state.network.parameters())).fill_(float("nan"))
+    with pytest.raises(Diverged):
+        state.save(tmp_path)
+    assert (tmp_path / "checkpoint.safetensors").read_bytes() == before
+
+
+def test_dropped_points_are_a_share_of_what_the_encoder_takes(case):
+    state = TrainingState(a_run(case), torch.device("cpu"))
+    kept = []
+    for state.progress.step in range(300):
+        kept.append(state.points_kept(1000))
+    assert 200 < min(kept) < 225
+    assert 490 < max(kept) <= 512
+    assert np.mean(kept) == pytest.approx((512 + 205) / 2, abs=15)
+
+
+@pytest.mark.parametrize(
+    ("files", "cores"),
+    [
+        ({"cpu.max": "50000 100000"}, 1),
+        ({"cpu.max": "max 100000"}, None),
+        ({"cpu/cpu.cfs_quota_us": "100000\n", "cpu/cpu.cfs_period_us": "100000\n"}, 1),
+        ({"cpu/cpu.cfs_quota_us": "-1", "cpu/cpu.cfs_period_us": "100000"}, None),
+        ({}, None),
+    ],
+)
+def test_a_containers_quota_of_cores_counts(tmp_path, monkeypatch, files, cores):
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: range(6), raising=False)
+    for name, text in files.items():
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text(text)
+    assert available_cores(tmp_path) == (cores or 6)
+    monkeypatch.delattr(os, "sched_getaffinity")  # as on macOS
+    monkeypatch.setattr(os, "cpu_count", lambda: 3)
+    assert available_cores(tmp_path) == (cores or 3)
+
+
 def test_a_case_is_needed_to_train(tmp_path):
     assert "not a tumortrack case" in refusal(tumortrack("train", tmp_path, tmp_path / "m"))
     assert not (tmp_path / "m").exists()
 
 
 def test_presets_survive_json_and_refuse_unknown_keys(case):
-    from tumortrack.imaging.case import load_case
-
     anatomy = load_case(case).anatomy
     for preset in (paper, quick):
         config = preset(anatomy)
@@ -140,8 +297,6 @@ def test_presets_survive_json_and_refuse_unknown_keys(case):
 
 
 def test_the_learning_rate_warms_up_holds_and_falls_to_a_hundredth(case):
-    from tumortrack.imaging.case import load_case
-
     config = quick(load_case(case).anatomy)
     peak = config.schedule.learning_rate
 
@@ -157,8 +312,6 @@ def test_the_learning_rate_warms_up_holds_and_falls_to_a_hundredth(case):
 
 
 def test_minutes_fix_the_last_step_once(case):
-    from tumortrack.imaging.case import load_case
-
     config = quick(load_case(case).anatomy)
     head = 1 - config.schedule.tail
     progress = Progress(step=300, elapsed_s=head * 60 - 1)

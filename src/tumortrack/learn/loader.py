@@ -10,7 +10,10 @@ from collections.abc import Generator
 import torch
 from torch.utils.data import DataLoader, Dataset
 
+from tumortrack.learn.cores import available_cores
 from tumortrack.simulate.dataset import SceneStream
+
+__all__ = ["Tensors", "available_cores", "batches", "default_workers"]
 
 Tensors = tuple[torch.Tensor, torch.Tensor, torch.Tensor]  # clouds, points, labels
 
@@ -32,7 +35,7 @@ class _Batches(Dataset[Tensors]):
 
 
 def batches(
-    stream: SceneStream, steps: range, period: int, workers: int
+    stream: SceneStream, steps: range, period: int, workers: int, device: torch.device
 ) -> Generator[Tensors, None, None]:
     """The batches of these steps, in order, whatever the number of workers; after ``period``
     steps (0: never) they repeat. Close the generator to end the workers."""
@@ -44,6 +47,7 @@ def batches(
         multiprocessing_context="spawn" if workers else None,
         prefetch_factor=4 if workers else None,
         worker_init_fn=_quiet_worker,
+        pin_memory=device.type == "cuda",  # copies then overlap with the work before
     )
     yield from loader
 
@@ -53,15 +57,9 @@ def default_workers() -> int:
     return max(1, min(16, available_cores() // 2))
 
 
-def available_cores() -> int:
-    """Cores that this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
-
-
 def _quiet_worker(_: int) -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle
+    for number in (signal.SIGINT, signal.SIGTERM):  # the parent's to handle
+        signal.signal(number, signal.SIG_IGN)
     # A worker has nothing to put in order at its end, and native libraries' threads can abort a
     # process that is taken down piece by piece.
     atexit.register(os._exit, 0)

@@ -1,6 +1,8 @@
 """One scene from a recipe: pose, deformation, depth image, cloud, labelled points.
 
-A recipe is (seed, stream, index); with the case and the configuration it replays bit for bit.
+A recipe is (seed, stream, index); with the case and the configuration it replays bit for bit on
+the same machine and the same versions. Elsewhere last digits may differ: compiled code may order
+its sums, and the exponential of a drag, as the processor likes.
 """
 
 from __future__ import annotations
@@ -13,7 +15,7 @@ import numpy as np
 from jaxtyping import Float, Float64
 
 from tumortrack.core.config import Config
-from tumortrack.core.errors import NoEstimate, TumortrackError
+from tumortrack.core.errors import InputError, NoEstimate, TumortrackError
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.types import (
     Anatomy,
@@ -62,6 +64,12 @@ class SceneRecipe:
     seed: int
     stream: Literal["train", "validation", "test"]
     index: int
+
+    def __post_init__(self) -> None:
+        if self.seed < 0 or self.index < 0:
+            raise InputError(
+                f"seed {self.seed} and index {self.index} of a scene must be 0 or more."
+            )
 
     def generator(self, attempt: int) -> np.random.Generator:
         return np.random.default_rng([self.seed, STREAMS.index(self.stream), self.index, attempt])

@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float, Float32
 
 import tumortrack
-from tumortrack.core.errors import NoEstimate
+from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.types import CameraLabels, OccupancyCloud, SensorCloud
 from tumortrack.learn.fit import check_familiar, fit_mm, spread_mm, surface_distances
 from tumortrack.learn.model import Model, has_fast_bfloat16
@@ -21,6 +21,7 @@ from tumortrack.track.estimate import Estimate
 from tumortrack.track.volume import (
     dense_margins,
     describe_parts,
+    drop_islands,
     grid_over,
     keep_largest_pieces,
     part_surfaces,
@@ -54,31 +55,34 @@ class Tracker:
 
         Raises:
             NoEstimate: too few points, no organ found in them, or they do not show this model's.
-            InputError: the cloud is in metres.
+            InputError: the cloud is in metres; the seed is negative.
         """
+        if seed < 0:
+            raise InputError(f"the seed is {seed}; it must be 0 or more.")
         rng = np.random.default_rng(seed)
         seconds: dict[str, float] = {}
         check_cloud(cloud)
         thinned = thin_cloud(cloud, self.model.config.scene.cloud.n_points, rng)
-        with _timed(seconds, "encode"):
+        with self._timed(seconds, "encode"):
             latent = self._encode(thinned)
-        with _timed(seconds, "coarse"):
+        with self._timed(seconds, "coarse"):
             box = self._coarse_box(latent, cloud, rng)
-        with _timed(seconds, "fit"):
+        with self._timed(seconds, "fit"):
             distances = surface_distances(
                 lambda points: self._logits(latent, points), box, thinned.points_mm
             )
             spread = spread_mm(thinned.points_mm)
             check_familiar(self.model.familiar, spread, fit_mm(distances))
-        with _timed(seconds, "fine"):
+        with self._timed(seconds, "fine"):
             inside = self._fine(latent, box, cloud.stamp_ns, rng)
-        with _timed(seconds, "volume"):
+        with self._timed(seconds, "volume"):
             camera_from_index, shape = grid_over(inside.points_mm, grid)
-            margins, labels = dense_margins(
+            margins, found = dense_margins(
                 lambda points: self._logits(latent, points), camera_from_index, shape
             )
-        with _timed(seconds, "surfaces"):
-            labels = keep_largest_pieces(labels, len(self.model.parts))
+        with self._timed(seconds, "surfaces"):
+            labels = keep_largest_pieces(found, len(self.model.parts))
+            inside = drop_islands(inside, found, labels, camera_from_index)
             meshes = part_surfaces(margins, labels, camera_from_index, self.model.parts)
         volume = CameraLabels(labels, camera_from_index)
         report = {
@@ -134,9 +138,10 @@ class Tracker:
             chunks = [self._network.query(latent, part)[0] for part in queries.split(size, dim=1)]
         return torch.cat(chunks).float()
 
-
-@contextmanager
-def _timed(seconds: dict[str, float], stage: str) -> Iterator[None]:
-    start = time.perf_counter()
-    yield
-    seconds[stage] = time.perf_counter() - start
+    @contextmanager
+    def _timed(self, seconds: dict[str, float], stage: str) -> Iterator[None]:
+        start = time.perf_counter()
+        yield
+        if self._device.type == "cuda":  # kernels run on behind the call
+            torch.cuda.synchronize(self._device)
+        seconds[stage] = time.perf_counter() - start

@@ -84,6 +84,32 @@ def keep_largest_pieces(
     return kept
 
 
+def drop_islands(
+    cloud: OccupancyCloud,
+    found: UInt8[np.ndarray, "i j k"],
+    kept: UInt8[np.ndarray, "i j k"],
+    camera_from_index: Float64[np.ndarray, "4 4"],
+) -> OccupancyCloud:
+    """The cloud without what ``keep_largest_pieces`` dropped from ``found``: points of an organ's
+    island are left out, those of a tumor's become organ. A point belongs to a piece if one of
+    the voxels next to it does."""
+    if np.array_equal(found, kept):
+        return cloud
+    from scipy import ndimage
+
+    index_from_camera = np.linalg.inv(camera_from_index)
+    index = np.rint(transform_points(index_from_camera, cloud.points_mm.astype(np.float64)))
+    voxel = tuple(np.clip(index.astype(int), 0, np.array(kept.shape) - 1).T)
+    near = np.ones((3, 3, 3), bool)
+    labels = cloud.labels.copy()
+    for label in np.unique(labels[labels >= FIRST_TUMOR]):
+        piece = ndimage.binary_dilation(kept == label, near)
+        labels[(labels == label) & ~piece[voxel]] = ORGAN
+    stays = ndimage.binary_dilation(kept > 0, near)[voxel]
+    points, probability = cloud.points_mm[stays], cloud.probability[stays]
+    return OccupancyCloud(points, labels[stays], probability, cloud.stamp_ns)
+
+
 def _largest_piece(mask: Bool[np.ndarray, "i j k"]) -> Bool[np.ndarray, "i j k"]:
     from scipy import ndimage
 

@@ -100,6 +100,8 @@ def _visible_vertices(view: View, count: int, rng: np.random.Generator) -> np.nd
     raise TumortrackError("the camera sees none of the organ's vertices; check the pose range.")
 
 
+# Fast math: the last digits (1e-5 mm) may depend on the processor, so that a scene replays bit for
+# bit on the machine that made it, and elsewhere to that precision.
 @numba.njit(cache=True, nogil=True, fastmath=True)
 def _drag(points, centres, shifts, sigmas):  # type: ignore[no-untyped-def]
     out = points.copy()

@@ -1,0 +1,139 @@
+"""All that changes while training: weights, their average, the optimizer, the best so far."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from tumortrack.core.errors import TumortrackError
+from tumortrack.learn.checkpoint import (
+    Progress,
+    load_checkpoint,
+    optimizer_tensors,
+    restore_optimizer,
+    save_checkpoint,
+)
+from tumortrack.learn.loader import Tensors
+from tumortrack.learn.model import has_fast_bfloat16
+from tumortrack.learn.network import OccupancyNetwork
+from tumortrack.learn.run import Run, run_identity
+from tumortrack.learn.schedule import learning_rate
+
+
+class Diverged(TumortrackError):
+    """The loss or a weight is no number any more; the last checkpoint is from before."""
+
+    def __init__(self, step: int) -> None:
+        super().__init__(
+            f"training diverged at step {step}: the loss is no finite number. The last checkpoint "
+            "is from before; a smaller learning rate or another seed may go through."
+        )
+
+
+class TrainingState:
+    """All that changes while training, and nothing else."""
+
+    def __init__(self, run: Run, device: torch.device) -> None:
+        self._run, self._device = run, device
+        self._bf16 = has_fast_bfloat16(device)
+        config = run.config
+        torch.manual_seed(run.seed)
+        self.network = OccupancyNetwork(config.network).to(device)
+        self.average = OccupancyNetwork(config.network).to(device).eval().requires_grad_(False)
+        self.average.load_state_dict(self.network.state_dict())
+        self.optimizer = torch.optim.Adam(
+            self.network.parameters(),
+            config.schedule.learning_rate,
+            weight_decay=config.weight_decay,
+        )
+        end = run.steps or (config.steps if run.minutes is None else None)
+        self.progress = Progress(end=end)
+        self._best: dict[str, Tensor] = {}
+        self.learning_rate = 0.0  # of the last step
+
+    def resume(self, work: Path) -> None:
+        """Take up the last checkpoint, if there is one."""
+        found = load_checkpoint(work, run_identity(self._run))
+        if found is None:
+            return
+        self.progress, groups = found
+        self.network.load_state_dict(groups["network"])
+        self.average.load_state_dict(groups["average"])
+        restore_optimizer(self.optimizer, groups["optimizer"])
+        self._best = groups.get("best", {})
+
+    def save(self, work: Path) -> None:
+        """Write the checkpoint.
+
+        Raises:
+            Diverged: a weight is no number; the checkpoint before stays.
+            StorageError: the disk is full; the checkpoint before stays.
+        """
+        if not all(bool(p.isfinite().all()) for p in self.network.parameters()):
+            raise Diverged(self.progress.step)
+        groups = {
+            "network": self.network.state_dict(),
+            "average": self.average.state_dict(),
+            "optimizer": optimizer_tensors(self.optimizer),
+            "best": self._best,
+        }
+        save_checkpoint(work, self.progress, groups, run_identity(self._run))
+
+    def step(self, batch: Tensors) -> float:
+        """One optimizer step; returns the loss.
+
+        Raises:
+            Diverged: the loss is no number; the weights are as they were.
+        """
+        config, progress = self._run.config, self.progress
+        clouds, points, labels = (part.to(self._device, non_blocking=True) for part in batch)
+        clouds = clouds[:, : self.points_kept(clouds.shape[1])]
+        self.learning_rate = learning_rate(config, progress)
+        for group in self.optimizer.param_groups:
+            group["lr"] = self.learning_rate
+        self.network.train()
+        with torch.autocast(self._device.type, torch.bfloat16, enabled=self._bf16):
+            logits = self.network.query(self.network.encode(clouds), points)
+        loss = nn.functional.cross_entropy(logits.float().flatten(0, 1), labels.long().flatten())
+        value = float(loss.detach())
+        if not math.isfinite(value):
+            raise Diverged(progress.step)
+        self.optimizer.zero_grad(set_to_none=True)
+        loss.backward()
+        self.optimizer.step()
+        self._follow()
+        progress.step += 1
+        return value
+
+    def points_kept(self, n_points: int) -> int:
+        """How many of a batch's points this step sees: those that the encoder takes, less a
+        random share. Clouds are in random order, so that the first ones are a random draw."""
+        config = self._run.config
+        rng = np.random.default_rng([self._run.seed, 0xD20, self.progress.step])
+        share = rng.uniform(0, config.drop_points)
+        encoded = min(n_points, config.network.encoder.n_points or n_points)
+        return max(round(encoded * (1 - share)), 64)
+
+    @torch.no_grad()
+    def _follow(self) -> None:
+        """Exponential moving average of weights and running statistics; short memory at first."""
+        decay = min(self._run.config.ema, (1 + self.progress.step) / (10 + self.progress.step))
+        pairs = zip(
+            self.average.state_dict().values(), self.network.state_dict().values(), strict=True
+        )
+        floats = [(mine, theirs) for mine, theirs in pairs if mine.is_floating_point()]
+        torch._foreach_lerp_([m for m, _ in floats], [t for _, t in floats], 1 - decay)
+
+    def keep_if_best(self, miou: float) -> None:
+        if miou > self.progress.best_miou:
+            self.progress.best_miou = miou
+            self._best = {k: v.clone() for k, v in self.average.state_dict().items()}
+
+    def best_network(self) -> OccupancyNetwork:
+        """The averaged weights of the best validation."""
+        self.average.load_state_dict(self._best)
+        return self.average
