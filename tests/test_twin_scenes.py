@@ -8,6 +8,7 @@ import multiprocessing
 import os
 import shutil
 from dataclasses import replace
+from functools import lru_cache
 from types import SimpleNamespace
 
 import numpy as np
@@ -26,7 +27,7 @@ from tumortrack.evaluate.twin import dataset
 from tumortrack.evaluate.twin.bench import State
 from tumortrack.evaluate.twin.dataset import TwinRun, draw_targets, make_scenes
 from tumortrack.evaluate.twin.faults import FAULTS, faulty
-from tumortrack.evaluate.twin.props import Rod, rod_mesh
+from tumortrack.evaluate.twin.props import Rod, rod_mesh, shaft_over
 from tumortrack.evaluate.twin.variants import (
     VARIANTS,
     VIEWS,
@@ -82,6 +83,7 @@ class StandIn:
         return points - sinking[:, None] * [0.0, 0.0, 1.0]
 
 
+@lru_cache
 def settled(state):
     case = render_objects.anatomy(4)
     bench = StandIn(case, UP, None)
@@ -193,6 +195,17 @@ def test_a_shaft_only_takes_points_away():
     share = lost.sum() / np.isfinite(before).sum()
     assert share == pytest.approx(covered.meta["seen"]["shaft_covers_share"])
     assert 0.02 < share < 0.3
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_shaft_never_touches_the_organ(seed):
+    made, _ = scene("D0")
+    rod = shaft_over(made.depth, 4.0, np.random.default_rng(seed))
+    inside = contains(rod_mesh(rod), made.reference.organ.vertices_mm)
+    assert not inside.any()
+    # And its tip is near: over the organ's middle, a few mm above it.
+    nearest = np.linalg.norm(made.cloud.points_mm - np.array(rod.tip_mm), axis=1).min()
+    assert 0.9 < nearest < 15
 
 
 def test_what_a_rod_hides_lies_behind_it():

@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Float32, Float64
+from jaxtyping import Float32, Float64
 
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import rotation_onto
@@ -20,6 +20,7 @@ from tumortrack.sense.render import render_depth
 
 SHAFT_CLEARANCE_MM = 3.0  # between a shaft's tip and the organ, towards the camera
 SHAFT_RISE_DEGREES = 30.0  # of a shaft above the image plane
+_TOUCH_MM = 1.0  # a shaft keeps this far from all of the organ that is seen
 _RING_MM = 4.0  # a rod is cut into rings: a triangle that reaches behind the camera is not drawn
 _LAST_DEPTH_MM = 5.0  # a rod that comes straight at the camera ends here
 _LUMP_SHARE = 2 / 3  # of the background; the rest is an instrument's tip
@@ -68,17 +69,34 @@ def occlude(frame: DepthFrame, rod: Rod) -> tuple[DepthFrame, float]:
 
 def shaft_over(frame: DepthFrame, radius_mm: float, rng: np.random.Generator) -> Rod:
     """A shaft that comes from any side, 30 degrees above the image plane, and ends 3 mm above a
-    random place in the middle quarter of what is seen."""
+    random place in the middle tenth of what is seen; higher where it would else touch the organ
+    on its way."""
     seen = np.flatnonzero(np.isfinite(frame.depth_mm))
     row, column = np.divmod(seen, frame.intrinsics.width)
     middle = np.median(row), np.median(column)
     inner = np.argsort(np.hypot(row - middle[0], column - middle[1]), kind="stable")
-    pixel = seen[inner[rng.integers(max(len(seen) // 4, 1))]]
-    target = _point(frame, int(pixel))
+    depth_mm = frame.depth_mm.ravel()[seen].astype(np.float64)
+    points = deproject_pixels(seen, depth_mm, frame.intrinsics).astype(np.float64)
+    target = points[inner[rng.integers(max(len(seen) // 10, 1))]]
     angle, rise = rng.uniform(0, 2 * np.pi), np.deg2rad(SHAFT_RISE_DEGREES)
-    axis = (np.cos(angle) * np.cos(rise), np.sin(angle) * np.cos(rise), -np.sin(rise))
-    tip = (float(target[0]), float(target[1]), float(target[2] - SHAFT_CLEARANCE_MM))
-    return Rod(tip, (float(axis[0]), float(axis[1]), float(axis[2])), radius_mm)
+    axis = np.array([np.cos(angle) * np.cos(rise), np.sin(angle) * np.cos(rise), -np.sin(rise)])
+    tip = target - [0, 0, SHAFT_CLEARANCE_MM]
+    while _gap_mm(points[::7], tip, axis, radius_mm) < _TOUCH_MM:
+        tip[2] -= 1.0
+    (x, y, z), (u, v, w) = tip.tolist(), axis.tolist()
+    return Rod((x, y, z), (u, v, w), radius_mm)
+
+
+def _gap_mm(
+    points_mm: Float64[np.ndarray, "n 3"],
+    tip_mm: Float64[np.ndarray, " 3"],
+    axis: Float64[np.ndarray, " 3"],
+    radius_mm: float,
+) -> float:
+    """Least distance of points to a rod's surface."""
+    offset = points_mm - (tip_mm + radius_mm * axis)
+    offset -= np.maximum(offset @ axis, 0)[:, None] * axis
+    return float(np.linalg.norm(offset, axis=1).min()) - radius_mm
 
 
 def add_background(
@@ -183,8 +201,3 @@ def _beside(
     pixel = middle + edge_px * direction - np.array([camera.cx, camera.cy])
     focal = np.array([camera.fx, camera.fy])
     return pixel * depth_mm / focal + gap_mm * direction
-
-
-def _point(frame: DepthFrame, pixel: int) -> Float[np.ndarray, " 3"]:
-    depth_mm = frame.depth_mm.ravel()[[pixel]].astype(np.float64)
-    return deproject_pixels(np.array([pixel]), depth_mm, frame.intrinsics)[0]
