@@ -40,6 +40,7 @@ from tumortrack.evaluate.study.plan import (
     Section,
     StudyPlan,
     jobs_of,
+    scenes_of,
 )
 from tumortrack.learn.train import Status as TrainStatus
 from tumortrack.phantom.digital import PhantomParameters, second_phantom
@@ -69,6 +70,8 @@ class Options:
     """Of training."""
     grid: int | None = None
     """Voxels along the longest side, in the table of accuracy."""
+    bcpd: Path = Path("runs/bcpd/bcpd")
+    """The built program of the peer BCPD; where there is none it is left out (docs/peers.md)."""
     device: str = "auto"
     """Of networks: auto, cpu or cuda."""
 
@@ -84,14 +87,15 @@ def main(options: Options) -> None:
         document = out / "results.md"
         shutil.copyfile(options.document, document)
     book = Book(document, "make results" + (" ARGS=--quick" if options.quick else ""))
-    trainer = Trainer(out / "models", quick, plan.steps, options.device, Training().show)
+    trainer = Trainer(out / "models", quick, plan.steps, options.device, report=Training().show)
     cells = CellStore(out / "cells")
     studied, second = _cases(options, out)
-    methods = Methods(cache(trainer.model), cache(peer_method))
+    bcpd = options.bcpd if options.bcpd.is_file() else None
+    methods = Methods(cache(trainer.model), cache(lambda name, case: peer_method(name, case, bcpd)))
     for section in options.sections:
         cases = (second,) if section == "deformation" else studied
         for case in cases:
-            _scenes(case)
+            _scenes(case, *scenes_of(plan, section))
         say(f"== {section}")
         jobs = jobs_of(plan, section, cases, methods)
         measured = measure(jobs, cells, Measuring(section).show)
@@ -105,6 +109,8 @@ def main(options: Options) -> None:
 
 def _plan(options: Options) -> StudyPlan:
     plan = QUICK if options.quick else FULL
+    if options.bcpd.is_file() and not options.quick:
+        plan = msgspec.structs.replace(plan, peers=(*plan.peers, "bcpd"))
     given = {"steps": options.steps, "seeds": options.seeds, "grid": options.grid}
     return msgspec.structs.replace(plan, **{k: v for k, v in given.items() if v is not None})
 
@@ -130,10 +136,11 @@ def _cases(options: Options, out: Path) -> tuple[tuple[StudyCase, ...], StudyCas
     return (phantom, *(study_case(n, f, scenes / n) for n, f in given)), second
 
 
-def _scenes(case: StudyCase) -> None:
+def _scenes(case: StudyCase, variants: tuple[str, ...], views: tuple[str, ...]) -> None:
     """The twin's scenes of a case; those that are there stay."""
     command = [sys.executable, "-m", "tumortrack.app.cli", "twin", str(case.folder)]
-    if subprocess.run([*command, str(case.scenes)], check=False).returncode != 0:
+    command += [str(case.scenes), "--states", *variants, "--views", *views]
+    if subprocess.run(command, check=False).returncode != 0:
         raise TumortrackError(f"the scenes of {case.name} could not be made (see above).")
 
 

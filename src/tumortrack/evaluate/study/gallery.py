@@ -35,11 +35,11 @@ def gallery(
         StorageError: the disk refused.
     """
     width, height = _PANEL_IN
-    total = len(scenes) * height + 0.75
+    total = len(scenes) * height + 1.0
     drawing = new_figure(width * len(methods) + 0.5, total)
     panels = drawing.subplots(len(scenes), len(methods), squeeze=False)
     drawing.subplots_adjust(
-        left=0.045, right=0.99, top=1 - 0.7 / total, bottom=0.1 / total, wspace=0.04, hspace=0.16
+        left=0.045, right=0.99, top=1 - 0.98 / total, bottom=0.1 / total, wspace=0.04, hspace=0.16
     )
     for row, (variant, view) in enumerate(scenes):
         scene = read_scene(case.scene(variant, view))

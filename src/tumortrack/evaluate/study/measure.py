@@ -198,7 +198,7 @@ class _Pace:
     def left(self) -> float:
         """Seconds; a kind that was not measured yet counts with the mean of all."""
         means = {kind: float(np.mean(s)) for kind, s in self._seconds.items()}
-        return sum(means.get(kind, self.mean()) for kind in self._left)
+        return float(sum(means.get(kind, self.mean()) for kind in self._left))
 
 
 def by_method(jobs: Iterable[Job]) -> list[Job]:

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 from jaxtyping import Float
@@ -33,32 +33,41 @@ class Answer:
     carry: Carry | None = None
 
 
-class Method(Protocol):
-    """``identity`` holds ``name``, ``seed`` and everything else that decides the answers."""
+class Method(ABC):
+    """One way to locate, for one patient. Nothing heavy is made or loaded before it is needed."""
 
     @property
-    def identity(self) -> dict: ...
+    @abstractmethod
+    def identity(self) -> dict:
+        """``kind``, ``name`` and everything else that decides the answers (JSON)."""
 
     @property
-    def device(self) -> str: ...
+    @abstractmethod
+    def device(self) -> str:
+        """What it runs on."""
 
     @property
+    @abstractmethod
     def prepare_s(self) -> float | None:
         """Spent once for a patient, before the first frame: training, or a peer's own work."""
-        ...
 
     @property
+    @abstractmethod
     def about(self) -> dict:
         """What else a reader wants to know of it (JSON)."""
-        ...
 
+    @abstractmethod
     def locate(self, scene: Scene, grid: int) -> Answer:
-        """Raises NoEstimate or InputError where nothing can be said of the scene."""
-        ...
+        """The anatomy in a scene; ``grid``: voxels along the longest side of the volume.
+
+        Raises:
+            NoEstimate: nothing can be said of the scene.
+            InputError: the cloud cannot be used.
+        """
 
 
 @dataclass(frozen=True)
-class Network:
+class Network(Method):
     """A trained model under a name such as M_lim."""
 
     name: str

@@ -12,9 +12,8 @@ from tumortrack.core.types import Anatomy
 from tumortrack.evaluate.study.measure import StudyCase
 from tumortrack.evaluate.study.methods import Network
 from tumortrack.learn.config import TrainConfig
-from tumortrack.learn.loader import available_cores
 from tumortrack.learn.model import is_finished
-from tumortrack.learn.train import Run, Status, train
+from tumortrack.learn.train import Run, Status, run_identity, train
 from tumortrack.simulate.deform import DragConfig
 from tumortrack.simulate.deform.drag import CONFIGURATIONS
 
@@ -48,10 +47,16 @@ class Trainer:
     """
 
     def __init__(
-        self, folder: Path, preset: Preset, steps: int, device: str, report: Report | None = None
+        self,
+        folder: Path,
+        preset: Preset,
+        steps: int,
+        device: str = "auto",
+        workers: int | None = None,
+        report: Report | None = None,
     ) -> None:
         self.folder, self.steps = folder, steps
-        self._preset, self._device = preset, device
+        self._preset, self._device, self._workers = preset, device, workers
         self._report = report
 
     def model(self, case: StudyCase, name: str, seed: int) -> Network:
@@ -73,10 +78,12 @@ class Trainer:
             seed=seed,
             steps=self.steps,
             device=self._device,  # type: ignore[arg-type]
+            workers=self._workers,
         )
         if not is_finished(folder) or not _same(folder, run):
+            threads = torch.get_num_threads()
             train(run, folder, lambda status: self._tell(f"{case.name} {name} seed {seed}", status))
-            torch.set_num_threads(available_cores())  # training left some to its workers
+            torch.set_num_threads(threads)  # training leaves some cores to its workers
         return Network(name, folder, self._device)
 
     def _tell(self, name: str, status: Status) -> None:
@@ -86,7 +93,5 @@ class Trainer:
 
 def _same(folder: Path, run: Run) -> bool:
     """Whether a finished model is this run's; else training refuses it with a clear text."""
-    from tumortrack.learn.train import run_identity
-
     manifest = store.read_json(folder / store.MANIFEST)
     return manifest["provenance"].get("run_sha256") == run_identity(run)

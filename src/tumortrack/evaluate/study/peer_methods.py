@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-import inspect
+import ast
+import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -15,26 +16,27 @@ from tumortrack.core import store
 from tumortrack.core.config import Config, to_builtins
 from tumortrack.core.errors import InputError
 from tumortrack.core.types import Anatomy
-from tumortrack.evaluate.peers.base import Peer, estimate_of
+from tumortrack.evaluate.peers.base import estimate_of
 from tumortrack.evaluate.study.measure import StudyCase
-from tumortrack.evaluate.study.methods import Answer
+from tumortrack.evaluate.study.methods import Answer, Method
 from tumortrack.simulate.scene_folder import Scene
 
 
 @dataclass(frozen=True)
 class PeerKind:
-    """How a peer is made: its class, its settings (None where it has none) and the packages
-    that its answers depend on."""
+    """How a peer is made: its class, its settings (None where it has none), and the packages and
+    the outside program that its answers depend on."""
 
     make: Callable[..., Any]
     config: Config | None = None
     packages: tuple[str, ...] = ()
+    program_sha256: str | None = None
 
 
 @dataclass(frozen=True, eq=False)
-class PeerMethod:
-    """A peer of one patient as a method. Its identity names settings, the peer's own source
-    file by its sha256, and the versions of the packages it rests on."""
+class PeerMethod(Method):
+    """A peer of one patient as a method. Its identity names its settings, the peers' code by its
+    sha256, and the versions of the packages it rests on."""
 
     name: str
     kind: PeerKind
@@ -43,18 +45,20 @@ class PeerMethod:
 
     @cached_property
     def identity(self) -> dict:
-        source = inspect.getsourcefile(self.kind.make)
+        settings = to_builtins(self.kind.config) if self.kind.config else {}
+        if self.kind.program_sha256:
+            settings["program"] = self.kind.program_sha256  # wherever it lies
         return {
             "kind": "peer",
             "name": self.name,
-            "settings": to_builtins(self.kind.config) if self.kind.config else {},
-            "code_sha256": store.sha256_of(Path(source)) if source else "",
+            "settings": settings,
+            "code_sha256": peers_code_sha256(),
             "versions": {package: version(package) for package in self.kind.packages},
             "tumortrack": tumortrack.__version__,
         }
 
     @cached_property
-    def _peer(self) -> Peer:
+    def _peer(self) -> Any:  # a Peer
         if self.kind.config is None:
             return self.kind.make(self._anatomy_ct)
         return self.kind.make(self._anatomy_ct, self.case.up_lps, self.kind.config)
@@ -77,25 +81,59 @@ class PeerMethod:
         return Answer(estimate, fit.seconds, fit.carry)
 
 
-def peer_method(name: str, case: StudyCase) -> PeerMethod:
-    """The peer with this name for a case.
+@cache
+def peers_code_sha256() -> str:
+    """Of all peers' code without comments and docstrings: after a change of what peers do, they
+    are measured anew; after a change of words they are not."""
+    folder = Path(__file__).parent.parent / "peers"
+    digest = hashlib.sha256()
+    for path in sorted(folder.glob("*.py")):
+        tree = ast.parse(path.read_text(encoding="utf-8"))
+        for node in ast.walk(tree):
+            if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef) and ast.get_docstring(
+                node
+            ):
+                node.body = node.body[1:]
+        digest.update(f"{path.name}\0{ast.dump(tree)}\n".encode())
+    return digest.hexdigest()
+
+
+def peer_method(name: str, case: StudyCase, bcpd: Path | None = None) -> PeerMethod:
+    """The peer with this name for a case; ``bcpd`` is the built program of that peer.
 
     Raises:
-        InputError: no such peer.
+        InputError: no such peer, or no program for ``bcpd``.
     """
-    kinds = peer_kinds()
+    kinds = peer_kinds(bcpd)
     if name not in kinds:
         raise InputError(f"peer {name!r} is unknown. Allowed: {', '.join(kinds)}.")
     return PeerMethod(name, kinds[name], case)
 
 
-def peer_kinds() -> dict[str, PeerKind]:
-    """Every peer there is."""
+def peer_kinds(bcpd: Path | None = None) -> dict[str, PeerKind]:
+    """Every peer there is; ``bcpd`` only with its program.
+
+    Raises:
+        InputError: the program does not exist.
+    """
+    from tumortrack.evaluate.peers.bcpd import Bcpd, BcpdConfig
+    from tumortrack.evaluate.peers.cpd import Cpd, CpdConfig
+    from tumortrack.evaluate.peers.elastic import Elastic, ElasticConfig
     from tumortrack.evaluate.peers.rigid import Rigid, RigidConfig
     from tumortrack.evaluate.peers.rigid_bound import RigidBound
 
-    return {
+    kinds = {
         "rigid_bound": PeerKind(RigidBound),
         "rigid": PeerKind(Rigid, RigidConfig(), ("small_gicp",)),
         "rigid_any_rotation": PeerKind(Rigid, RigidConfig(orientation="unknown"), ("small_gicp",)),
+        "cpd": PeerKind(Cpd, CpdConfig(), ("pycpd", "small_gicp")),
+        "elastic": PeerKind(Elastic, ElasticConfig(), ("pytetwild", "scipy", "small_gicp")),
     }
+    if bcpd is not None:
+        if not bcpd.is_file():
+            raise InputError(f"{bcpd} does not exist; give the built program of BCPD, or none.")
+        program = PeerKind(
+            Bcpd, BcpdConfig(program=str(bcpd)), ("small_gicp",), store.sha256_of(bcpd)
+        )
+        kinds["bcpd"] = program
+    return kinds

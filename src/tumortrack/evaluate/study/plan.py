@@ -37,7 +37,7 @@ class StudyPlan(Config, frozen=True):
     configurations: tuple[int, ...] = (1, 2, 3, 4, 5, 6)
     configuration_variants: tuple[str, ...] = ("D0", "D1", "D2", "D3")
     configuration_view: str = "noise"
-    peers: tuple[str, ...] = ("rigid_bound", "rigid", "cpd", "bcpd", "elastic")
+    peers: tuple[str, ...] = ("rigid_bound", "rigid", "cpd", "elastic")
     faults: tuple[str, ...] = FAULTS
     fault_peers: tuple[str, ...] = ("elastic",)
     fault_variants: tuple[str, ...] = ("D1", "D2", "D3", "G1", "P1")
@@ -91,6 +91,18 @@ def jobs_of(
     }
     jobs = [job for case in cases for job in makers[section](plan, case, methods)]
     return by_method(jobs)
+
+
+def scenes_of(plan: StudyPlan, section: Section) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Variants and views that a section needs; the clean view always, for it says what is
+    visible."""
+    variants = {"deformation": plan.configuration_variants, "faults": plan.fault_variants}
+    views = {
+        "deformation": (plan.configuration_view,),
+        "faults": (),
+        "views": plan.views,
+    }.get(section, (plan.view,))
+    return variants.get(section, plan.variants), tuple(dict.fromkeys(("clean", *views)))
 
 
 def _accuracy(plan: StudyPlan, case: StudyCase, methods: Methods) -> list[Job]:

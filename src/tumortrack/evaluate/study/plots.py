@@ -47,8 +47,8 @@ def error_against(cells: list[dict], key: str, path: Path) -> bool:
     curves = {name: curve for name, curve in curves.items() if len(curve[0]) >= _FEWEST}
     if not curves:
         return False
-    drawing = new_figure(8.6, 5.2)
-    axes = drawing.add_axes((0.09, 0.13, 0.58, 0.76))
+    drawing = new_figure(9.4, 4.6)
+    axes = drawing.add_axes((0.075, 0.125, 0.6, 0.8))
     for number, (method, (x, error)) in enumerate(curves.items()):
         color, marker = STYLES.get(method, _OTHER)
         at, low, middle, high = _grouped(x, error)
@@ -77,9 +77,9 @@ def error_per_variant(cells: list[dict], lies: dict[str, paper.Lie], path: Path)
     """One-sided Hausdorff distance of each tumor per variant and model, mean and spread over the
     seeds, with the paper's figures as open marks (a bar with an arrow: its upper bound)."""
     tumors, variants = tumors_of(cells), names(cells, "variant")
-    drawing = new_figure(4.6 * len(tumors) + 2.4, 4.9)
+    drawing = new_figure(4.6 * len(tumors) + 2.4, 4.6)
     panels = drawing.subplots(1, len(tumors), sharey=True, squeeze=False)[0]
-    drawing.subplots_adjust(left=0.07, right=0.985, top=0.8, bottom=0.12, wspace=0.06)
+    drawing.subplots_adjust(left=0.07, right=0.985, top=0.85, bottom=0.08, wspace=0.06)
     for axes, tumor in zip(panels, tumors, strict=True):
         models = names(cells, "method")
         for number, model in enumerate(models):
