@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -19,6 +20,8 @@ from tumortrack.app.console import console, say
 
 if TYPE_CHECKING:
     from tumortrack.evaluate.twin.variants import View
+
+_EVERY_S = 15.0  # between lines where there is no terminal
 
 
 def write_twin(
@@ -41,9 +44,14 @@ def write_twin(
     )
     with Progress(*columns, console=console, transient=True) as progress:
         task = progress.add_task("twin", total=1.0)
+        said = -_EVERY_S
 
         def show(status: Status) -> None:
+            nonlocal said
             progress.update(task, completed=status.share, description=status.text)
+            if not console.is_terminal and time.monotonic() - said >= _EVERY_S:
+                say(f"{status.share:.0%} {status.text}")
+                said = time.monotonic()
 
         run = TwinRun(case, seed=seed)
         made = make_scenes(run, scenes, variants or tuple(VARIANTS), views or VIEWS, show)

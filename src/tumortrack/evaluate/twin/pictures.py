@@ -41,7 +41,7 @@ _STEEL = (0.62, 0.65, 0.7)
 _REST = "0.35"
 _AROUND_MM = 14.0  # of the organ: background beside it shows, points far off do not
 _ROD_SHOWN_MM = 45.0
-_PLATE_SHOWN_MM = 4.0
+_PLATE_SHOWN_MM = 9.0
 
 
 def twin_picture(scene: Scene, settled: Settled, rest_organ: Mesh, path: Path) -> None:
@@ -61,8 +61,7 @@ def twin_picture(scene: Scene, settled: Settled, rest_organ: Mesh, path: Path) -
     for column, view in enumerate((FROM_FRONT, FROM_END)):
         axes = figure.add_subplot(grid[1, column])
         _bench_view(axes, settled, rest_organ, view)
-        about = {**settled.report, "plate_mm": scene.meta["bench_config"]["plate_mm"]}
-        _apparatus(axes, about, view)
+        _apparatus(axes, {**scene.meta["bench_config"], **settled.report}, view)
     figure.suptitle(
         f"{scene.meta['variant']}, {scene.meta['view']}: {_what(scene)}",
         x=0.02, y=0.985, ha="left", fontsize=13, fontweight="bold",
@@ -124,7 +123,7 @@ def _cloud_view(axes: Axes, scene: Scene) -> None:
 def _bench_view(axes: Axes, settled: Settled, rest_organ: Mesh, view: View) -> None:
     anatomy = settled.anatomy
     everything = np.concatenate([anatomy.organ.vertices_mm, rest_organ.vertices_mm])
-    everything = np.concatenate([everything, everything.mean(0)[None] * [1, 1, 0] + [0, 0, -6.0]])
+    everything = np.concatenate([everything, everything.mean(0)[None] * [1, 1, 0] + [0, 0, -12.0]])
     frame = widened(frame_around(view, everything, 8.0), 1.75)
     _paint(axes, list(anatomy.tumors), anatomy.organ, view, frame)
     x, y = np.meshgrid(*pixel_centres(frame))
@@ -143,7 +142,7 @@ def _paint(axes: Axes, tumors: list[Mesh], organ: Mesh, view: View, frame: Frame
 
 
 def _apparatus(axes: Axes, report: dict, view: View) -> None:
-    """Plates (in section) and rod, where the state has them."""
+    """Plates and rod, where the state has them; their far ends are left out."""
     from matplotlib.patches import FancyBboxPatch, Polygon
 
     if "plates_z_mm" in report:
@@ -151,11 +150,11 @@ def _apparatus(axes: Axes, report: dict, view: View) -> None:
         left, right = axes.get_xlim()
         half = report["plate_mm"] / 2 if view is FROM_FRONT else 0.46 * (right - left)
         middle = 0.0 if view is FROM_FRONT else (left + right) / 2
-        for face, thickness in ((low, -_PLATE_SHOWN_MM), (high, _PLATE_SHOWN_MM)):
-            top = -max(face, face + thickness)
+        style = f"round,pad=0,rounding_size={report['rounding_mm']}"
+        for upper in (low, high + _PLATE_SHOWN_MM):
             shape = FancyBboxPatch(
-                (middle - half, top), 2 * half, abs(thickness), boxstyle="round,pad=0,"
-                "rounding_size=1.2", facecolor=_STEEL, edgecolor="0.3", zorder=4,
+                (middle - half, -upper), 2 * half, _PLATE_SHOWN_MM, boxstyle=style,
+                facecolor=_STEEL, edgecolor="0.3", alpha=0.8, zorder=4,
             )  # fmt: skip
             axes.add_patch(shape)
     if "poke" in report:
