@@ -8,7 +8,8 @@ from imaging_objects import OBLIQUE
 from tumortrack.core.errors import InputError
 from tumortrack.core.types import Mesh
 from tumortrack.imaging.meshes import label_meshes, read_mesh_folder
-from tumortrack.imaging.winding import is_simple, winding_numbers
+from tumortrack.imaging.raster import winding_numbers
+from tumortrack.imaging.winding import is_simple
 
 
 def ball(radius, centre, stretch=(1.0, 1.0, 1.0)):
@@ -127,11 +128,17 @@ def test_a_self_crossing_mesh_is_remeshed_as_its_union(tmp_path):
 def test_winding_numbers_agree_with_an_independent_test():
     mesh = trimesh.Trimesh(ORGAN.vertices @ OBLIQUE.T, ORGAN.faces, process=False)
     ours = Mesh(mesh.vertices, mesh.faces)
-    origin, shape = mesh.bounds[0] - 3, (24, 26, 40)
-    numbers = winding_numbers(ours, origin, 2.7, shape)
-    centres = np.argwhere(np.ones(shape, bool)) * 2.7 + origin
+    frame_from_index, shape = np.diag([2.7, 2.7, 2.7, 1.0]), (24, 26, 40)
+    frame_from_index[:3, 3] = mesh.bounds[0] - 3
+    numbers = winding_numbers(ours, frame_from_index, shape)
+    centres = np.argwhere(np.ones(shape, bool)) * 2.7 + frame_from_index[:3, 3]
     assert np.array_equal(numbers.ravel() == 1, mesh.contains(centres))
     assert set(np.unique(numbers)) == {0, 1}
+    mirror = frame_from_index @ np.diag([-1.0, 1, 1, 1])
+    mirror[:3, 3] += frame_from_index[:3, 0] * (shape[0] - 1)
+    assert np.array_equal(winding_numbers(ours, mirror, shape)[::-1], numbers)
+    inside_out = winding_numbers(Mesh(mesh.vertices, mesh.faces[:, ::-1]), mirror, shape)
+    assert np.array_equal(-inside_out[::-1], numbers)
     assert is_simple(ours, 1.0)
     crossing = trimesh.util.concatenate([mesh, trimesh.creation.box((30, 30, 30), np.eye(4))])
     assert not is_simple(Mesh(crossing.vertices, crossing.faces), 1.0)

@@ -20,7 +20,7 @@ from tumortrack.evaluate.metrics import (
     triangle_distance,
     weighted_percentile,
 )
-from tumortrack.evaluate.raster import cover, voxelise
+from tumortrack.imaging.raster import cover, voxelise
 
 
 def sphere(radius_mm, center_mm=(0.0, 0.0, 0.0), subdivisions=4):

@@ -11,8 +11,8 @@ from jaxtyping import Bool, Float
 
 from tumortrack.core.store import write_atomically
 from tumortrack.core.types import Mesh
-from tumortrack.evaluate.raster import voxelise
 from tumortrack.evaluate.shade import Frame, View, pixel_centres
+from tumortrack.imaging.raster import voxelise
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -15,7 +15,7 @@ from jaxtyping import Float, Int, UInt8
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.types import Anatomy, CameraLabels, Mesh
-from tumortrack.evaluate.raster import _expand, voxelise
+from tumortrack.imaging.raster import _expand, voxelise
 
 # Vertices are sampled too, so the maximum misses at most s^2 / (8 R) where a flat piece of size s
 # lies over a surface of radius R: 0.025 mm at R = 5 mm.

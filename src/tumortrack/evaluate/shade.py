@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from tumortrack.core.types import Mesh
-from tumortrack.evaluate.raster import cover
+from tumortrack.imaging.raster import cover
 
 _LIGHT = np.array([-0.35, -0.55, -1.0]) / np.linalg.norm([-0.35, -0.55, -1.0])
 _SHARPER = 2  # pixels drawn per pixel shown, each way: smooth edges

@@ -10,9 +10,12 @@ import numpy as np
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import RAS_FROM_LPS, transform_points
 from tumortrack.core.mesh_files import SUFFIXES, read_mesh
+from tumortrack.core.solids import mesh_of, solid_of
 from tumortrack.core.types import FIRST_TUMOR, ORGAN, Anatomy, LabelVolume, Mesh, part_names
+from tumortrack.imaging.raster import winding_numbers
 from tumortrack.imaging.repair import closed_mesh
-from tumortrack.imaging.winding import grid_round, winding_numbers
+from tumortrack.imaging.shells import largest_shell
+from tumortrack.imaging.winding import grid_round
 
 _ORGAN_WORDS, _TUMOR_WORDS = ("kidney", "organ"), ("tumor", "tumour", "lesion", "mass")
 _ORGAN_MM = (20.0, 400.0)  # plausible longest extent
@@ -48,7 +51,7 @@ def read_mesh_folder(folder: Path, unit: str | None = None) -> tuple[Anatomy, li
     organ, tumors = _read(organ_file, scale, notes), [_read(f, scale, notes) for f in tumor_files]
     _check_unit(organ_file, organ, unit)
     # A bed cut out for an inner tumor is no outside: the outermost shell is the organ.
-    organ = _outer_shell(closed_mesh(organ, organ_file.name, notes))
+    organ = largest_shell(closed_mesh(organ, organ_file.name, notes))
     tumors = [closed_mesh(t, f.name, notes) for t, f in zip(tumors, tumor_files, strict=True)]
     for tumor, file in zip(tumors, tumor_files, strict=True):
         organ = _union(organ, tumor, file.name)
@@ -64,16 +67,14 @@ def read_mesh_folder(folder: Path, unit: str | None = None) -> tuple[Anatomy, li
 
 def label_meshes(anatomy: Anatomy, voxel_mm: float = _VOXEL_MM) -> LabelVolume:
     """Label the cells of an LPS-aligned grid whose centres the parts contain; tumors win."""
-    origin, shape = grid_round(anatomy.organ.box_mm, voxel_mm, 8.0)
+    lps_from_index, shape = grid_round(anatomy.organ.box_mm, voxel_mm, 8.0)
     labels = np.zeros(shape, np.uint8)
     for number, part in enumerate(anatomy.parts, ORGAN):
-        labels[winding_numbers(part, origin, voxel_mm, shape) > 0] = number
+        labels[winding_numbers(part, lps_from_index, shape) > 0] = number
     for number in range(FIRST_TUMOR, len(anatomy.parts) + 1):
         if not (labels == number).any():
             raise InputError(f"tumor {number - 1} fills no {voxel_mm:g} mm cell: too small.")
-    affine = np.diag([voxel_mm] * 3 + [1.0])
-    affine[:3, 3] = origin
-    return LabelVolume(labels, affine)
+    return LabelVolume(labels, lps_from_index)
 
 
 def _files_by_name(folder: Path) -> tuple[Path, list[Path]]:
@@ -142,18 +143,8 @@ def _check_unit(path: Path, organ: Mesh, unit: str | None) -> None:
 
 def _union(organ: Mesh, tumor: Mesh, name: str) -> Mesh:
     """Organ and tumor as one closed surface; cavities that remain between them are closed."""
-    from manifold3d import Manifold
-    from manifold3d import Mesh as ManifoldMesh
-
-    def solid(mesh: Mesh, what: str) -> Manifold:
-        out = Manifold(
-            ManifoldMesh(mesh.vertices_mm.astype(np.float32), mesh.faces.astype(np.uint32))
-        )
-        if out.status().name != "NoError":
-            raise InputError(f"{what} is not a closed surface ({out.status().name}); repair it.")
-        return out
-
-    shells = (solid(organ, "the organ") + solid(tumor, name)).decompose()
+    joined = solid_of(organ, "the organ") + solid_of(tumor, name)
+    shells = joined.decompose()
     outer = [s for s in shells if s.volume() > 0]
     outer.sort(key=lambda s: -s.volume())
     if not outer or (len(outer) > 1 and outer[1].volume() > 0.01 * tumor.volume_mm3):
@@ -161,13 +152,4 @@ def _union(organ: Mesh, tumor: Mesh, name: str) -> Mesh:
             f"{name} lies apart from the organ: a tumor must lie in it or touch it. Check that "
             "all meshes share one frame and unit."
         )
-    mesh = outer[0].to_mesh()
-    vertices = np.asarray(mesh.vert_properties, np.float64)[:, :3]
-    return _outer_shell(Mesh(vertices, np.asarray(mesh.tri_verts, np.int32)))
-
-
-def _outer_shell(mesh: Mesh) -> Mesh:
-    """The shell of largest volume: gaps between a tumor and its bed are no part of the outside."""
-    from tumortrack.imaging.repair import shells
-
-    return max(shells(mesh), key=lambda shell: shell.volume_mm3)
+    return largest_shell(mesh_of(outer[0]))

@@ -6,7 +6,8 @@ import numpy as np
 
 from tumortrack.core.errors import InputError
 from tumortrack.core.types import Mesh
-from tumortrack.imaging.winding import grid_round, is_simple, winding_numbers
+from tumortrack.imaging.raster import winding_numbers
+from tumortrack.imaging.winding import grid_round, is_simple
 
 _LARGEST_HOLE_MM = 10.0  # across; larger ones would invent anatomy
 _LARGEST_REMESH = 1.5  # change of volume that a remesh may make, as a ratio
@@ -49,22 +50,6 @@ def closed_mesh(mesh: Mesh, name: str, notes: list[str]) -> Mesh:
     if not is_simple(out, size / 80):
         out = _remesh(out, name, size)
         notes.append(f"{name}: it crossed itself; remeshed at {size / 120:.2g} mm")
-    return out
-
-
-def shells(mesh: Mesh) -> list[Mesh]:
-    """The connected pieces of a mesh."""
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
-
-    a, b, c = mesh.faces.T
-    n = len(mesh.vertices_mm)
-    graph = coo_array((np.ones(2 * len(a), np.int8), (np.r_[a, b], np.r_[b, c])), shape=(n, n))
-    _, piece = connected_components(graph, directed=False)
-    out = []
-    for number in np.unique(piece[a]):
-        used, compact = np.unique(mesh.faces[piece[a] == number], return_inverse=True)
-        out.append(Mesh(mesh.vertices_mm[used], compact.reshape(-1, 3)))
     return out
 
 
@@ -115,10 +100,8 @@ def _remesh(mesh: Mesh, name: str, size: float) -> Mesh:
     from tumortrack.imaging.surface import surfaces
 
     step = size / 120
-    origin, shape = grid_round(mesh.box_mm, step, 4 * step)
-    inside = winding_numbers(mesh, origin, step, shape) > 0
-    affine = np.diag([step, step, step, 1.0])
-    affine[:3, 3] = origin
+    affine, shape = grid_round(mesh.box_mm, step, 4 * step)
+    inside = winding_numbers(mesh, affine, shape) > 0
     if not inside.any():
         raise InputError(f"{name} crosses itself and encloses nothing; repair it first.")
     out = surfaces(LabelVolume(inside.astype(np.uint8), affine))[0].organ

@@ -10,12 +10,13 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import spacing_mm, transform_points
 from tumortrack.core.types import FIRST_TUMOR, Anatomy, LabelVolume, Mesh, part_names
 from tumortrack.imaging.grid import bounding_box, voxel_ml
+from tumortrack.imaging.shells import largest_shell
 
 _TRIANGLES = 28_000  # aimed at for the organ
 _BLUR_VOXELS = 0.9  # enough to melt steps of one voxel, too little to lose a small tumor
@@ -146,25 +147,8 @@ def _march(
     vertices_mm = transform_points(affine, vertices.astype(np.float64) * scale + offset)
     if np.linalg.det(affine[:3, :3]) < 0:
         faces = faces[:, ::-1]
-    vertices_mm, faces = _largest_piece(vertices_mm, faces)
-    mesh = Mesh(vertices_mm, faces)
-    return mesh if mesh.volume_mm3 > 0 else Mesh(vertices_mm, faces[:, ::-1])
-
-
-def _largest_piece(
-    vertices: Float[np.ndarray, "v 3"], faces: np.ndarray
-) -> tuple[Float[np.ndarray, "w 3"], np.ndarray]:
-    """The connected piece with most triangles; inner shells and specks go."""
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
-
-    a, b, c = faces.T
-    ones = np.ones(2 * len(faces), np.int8)
-    graph = coo_array((ones, (np.r_[a, b], np.r_[b, c])), shape=(len(vertices), len(vertices)))
-    _, piece = connected_components(graph, directed=False)
-    keep = piece[a] == np.bincount(piece[a]).argmax()
-    used, compact = np.unique(faces[keep], return_inverse=True)
-    return vertices[used], compact.reshape(-1, 3)
+    mesh = largest_shell(Mesh(vertices_mm, faces))
+    return mesh if mesh.volume_mm3 > 0 else Mesh(mesh.vertices_mm, mesh.faces[:, ::-1])
 
 
 def _boundary_distance(mesh: Mesh, mask: np.ndarray, affine: np.ndarray) -> np.ndarray:

@@ -8,14 +8,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from tumortrack.core.errors import InputError
 from tumortrack.core.mesh_files import read_anatomy, write_anatomy
+from tumortrack.core.solids import mesh_of, solid_of
 from tumortrack.core.store import new_folder, read_json, write_json
-from tumortrack.core.types import Anatomy, DepthFrame, Mesh, SensorCloud
+from tumortrack.core.types import Anatomy, DepthFrame, SensorCloud
 from tumortrack.sense.files import (
     read_cloud,
     read_depth_png,
@@ -152,27 +152,13 @@ def _check_parts(folder: Path, anatomy: Anatomy) -> None:
 
 def _united(folder: Path, anatomy: Anatomy) -> Anatomy:
     """The same anatomy with every tumor that sticks out made part of the organ's surface."""
-    organ = _solid(folder / "kidney.ply", anatomy.organ)
+    organ = solid_of(anatomy.organ, str(folder / "kidney.ply"))
     sticks_out = False
     for name, mesh in zip(anatomy.names[1:], anatomy.tumors, strict=True):
-        tumor = _solid(folder / f"{name}.ply", mesh)
+        tumor = solid_of(mesh, str(folder / f"{name}.ply"))
         joined = organ + tumor
         if joined.volume() - organ.volume() > _STICKS_OUT * tumor.volume():
             organ, sticks_out = joined, True
     if not sticks_out:
         return anatomy
-    out = organ.to_mesh64()
-    return Anatomy((Mesh(out.vert_properties[:, :3], out.tri_verts), *anatomy.tumors))
-
-
-def _solid(path: Path, mesh: Mesh) -> Any:
-    import manifold3d
-
-    raw = manifold3d.Mesh64(mesh.vertices_mm.copy(), mesh.faces.astype(np.uint64))
-    solid = manifold3d.Manifold(raw)
-    if solid.status() != manifold3d.Error.NoError or solid.volume() <= 0:
-        raise InputError(
-            f"{path} is not a closed surface with faces turned outward "
-            f"({solid.status().name}). Repair the mesh and try again."
-        )
-    return solid
+    return Anatomy((mesh_of(organ), *anatomy.tumors))

@@ -5,12 +5,14 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, Int16
 
+from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.types import Mesh
 
 _CHUNK = 2_000_000  # candidate pixels held at once
+_MOST_CELLS = 2**28  # of a grid
 
 
 def _expand(
@@ -78,38 +80,57 @@ def _cover_chunk(
     return tri, i, j, depth
 
 
-def voxelise(
+def winding_numbers(
     mesh: Mesh, frame_from_index: Float[np.ndarray, "4 4"], shape: tuple[int, int, int]
-) -> Bool[np.ndarray, "i j k"]:
-    """Which voxel centres (whole indices) lie inside a closed mesh.
+) -> Int16[np.ndarray, "i j k"]:
+    """The winding number at voxel centres (whole indices), by rays along the last axis.
 
-    Inside is where the winding number is not 0, so overlapping sheets of a folded surface do not
-    cut holes as plain parity would.
+    Each triangle adds +1 or -1 to every voxel behind it. A closed mesh whose faces turn outward
+    and that does not cross itself gives 0 outside and 1 inside, and nothing else.
 
     Args:
-        mesh: closed surface in some frame, mm.
+        mesh: surface in some frame, mm.
         frame_from_index: array index -> that frame; any invertible affine.
         shape: of the grid.
+
+    Raises:
+        InputError: the grid is too large.
     """
-    inside = np.zeros(shape, bool)
+    if np.prod(np.array(shape, float)) > _MOST_CELLS:
+        raise InputError(f"a grid of {' x '.join(map(str, shape))} voxels is too large.")
+    out = np.zeros(shape, np.int16)
     if len(mesh.faces) == 0:
-        return inside
+        return out
     index = transform_points(np.linalg.inv(frame_from_index), mesh.vertices_mm)
     low = np.clip(np.floor(index.min(0)), 0, shape).astype(int)
     high = np.clip(np.ceil(index.max(0)) + 1, 0, shape).astype(int)
     if (high <= low).any():
-        return inside
+        return out
+    high[2] = shape[2]  # of an open mesh the rays do not leave what they entered
     triangles = (index - low)[mesh.faces]
     sub = tuple((high - low).tolist())
     a, b = (triangles[:, n, :2] - triangles[:, 0, :2] for n in (1, 2))
-    turn = np.sign(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).astype(np.int8)
-    winding = np.zeros(sub, np.int8)
+    # A face that turns towards the rays' start (negative projected area) is entered.
+    enters = -np.sign(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).astype(np.int16)
+    if np.linalg.det(frame_from_index[:3, :3]) < 0:
+        enters = -enters
+    winding = np.zeros(sub, np.int16)
     flat = winding.reshape(-1)
     for tri, i, j, depth in cover(triangles, sub[:2]):
         k = np.maximum(np.ceil(depth), 0).astype(int)
         kept = k < sub[2]
         where = (i[kept] * sub[1] + j[kept]) * sub[2] + k[kept]
-        np.add.at(flat, where, turn[tri[kept]])
-    np.cumsum(winding, axis=2, dtype=np.int8, out=winding)
-    inside[low[0] : high[0], low[1] : high[1], low[2] : high[2]] = winding != 0
-    return inside
+        np.add.at(flat, where, enters[tri[kept]])
+    np.cumsum(winding, axis=2, dtype=np.int16, out=winding)
+    out[low[0] : high[0], low[1] : high[1], low[2] : high[2]] = winding
+    return out
+
+
+def voxelise(
+    mesh: Mesh, frame_from_index: Float[np.ndarray, "4 4"], shape: tuple[int, int, int]
+) -> Bool[np.ndarray, "i j k"]:
+    """Which voxel centres lie inside a closed mesh: where its winding number is not 0.
+
+    Overlapping sheets of a folded surface so cut no holes, as plain parity would.
+    """
+    return winding_numbers(mesh, frame_from_index, shape) != 0
