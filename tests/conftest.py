@@ -1,17 +1,21 @@
 """Runs every test with array shapes checked: jaxtyping's annotations are executed by beartype."""
 
+from pathlib import Path
+
 import pytest
 from jaxtyping import install_import_hook
+
+SOURCE = Path(__file__).parents[1] / "src"
+CHECKED = ("core/geometry.py", "imaging/*.py", "phantom/*.py", "evaluate/**/*.py", "track/*.py")
 
 # Left out: modules with numba kernels (numba compiles the plain function), and core.types, whose
 # constructors convert and check shapes themselves, always.
 install_import_hook(
     [
-        "tumortrack.core.geometry",
-        "tumortrack.imaging",
-        "tumortrack.phantom",
-        "tumortrack.evaluate",
-        "tumortrack.track",
+        ".".join(path.relative_to(SOURCE).with_suffix("").parts)
+        for pattern in CHECKED
+        for path in (SOURCE / "tumortrack").glob(pattern)
+        if path.name != "__init__.py" and "import numba" not in path.read_text(encoding="utf-8")
     ],
     "beartype.beartype",
 )
@@ -20,8 +24,6 @@ install_import_hook(
 @pytest.fixture(scope="session")
 def shared_data():
     """Real patients' anatomy beside the checkout; tests that need it skip where it is absent."""
-    from pathlib import Path
-
     folder = Path(__file__).parents[2] / "shared" / "data"
     if not folder.is_dir():
         pytest.skip(f"real data not found at {folder}")

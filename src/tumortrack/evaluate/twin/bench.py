@@ -158,7 +158,7 @@ def _tumor_share(mesh: TetMesh, anatomy: Anatomy) -> Float64[np.ndarray, " t"]:
     """Share of each tetrahedron that lies in a tumor, by a voxel grid of 1 mm."""
     low = np.floor(anatomy.organ.box_mm[0]) - 1
     shape = np.ceil(anatomy.organ.box_mm[1] - low).astype(int) + 2
-    labels = label_grid(anatomy, rigid(np.eye(3), low), (shape[0], shape[1], shape[2]))
+    labels = label_grid(anatomy, rigid(np.eye(3), low), tuple(shape.tolist()))
     # Fixed points spread over a tetrahedron: corners, edges' middles and centre, pulled inwards.
     spread = np.concatenate(
         [np.eye(4), (np.eye(4)[[0, 0, 0, 1, 1, 2]] + np.eye(4)[[1, 2, 3, 2, 3, 3]]) / 2]

@@ -7,7 +7,7 @@ tetrahedra: a penalty of stiffness x depth^2 / 2 per area (kPa/mm). What sinks i
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float64
@@ -21,6 +21,7 @@ Points = Float64[np.ndarray, "n 3"]
 Distances = Float64[np.ndarray, " n"]
 
 
+@runtime_checkable
 class Obstacle(Protocol):
     """A rigid body; frame and unit are the bench's (mm)."""
 
