@@ -16,6 +16,7 @@ import pytest
 import trimesh
 
 import render_objects
+from tumortrack.app import cli
 from tumortrack.app.inspection import describe
 from tumortrack.core import store
 from tumortrack.core.errors import ArtifactError, InputError
@@ -529,6 +530,20 @@ def test_other_scenes_other_files_and_unknown_names_are_refused(
     with pytest.raises(InputError, match="'D7' is not known; allowed: D0, D1"):
         make_scenes(run, tmp_path / "x", ("D7",), ("clean",))
     assert not (tmp_path / "x").exists()
+
+
+def test_the_command_passes_its_options_on(no_pictures, case_folder, tmp_path, monkeypatch, capsys):
+    def run(case, seed):
+        return TwinRun(case, view=SMALL, seed=seed, build=StandIn, solve=StandIn.solve)
+
+    out = tmp_path / "scenes"
+    monkeypatch.setattr(dataset, "TwinRun", run)
+    options = ["--states", "D1", "P1", "--views", "shaft", "--seed", "3"]
+    monkeypatch.setattr("sys.argv", ["tumortrack", "twin", str(case_folder), str(out), *options])
+    cli.main()
+    assert [p.name for p in list_scenes(out)] == ["D1-shaft", "P1-shaft"]
+    assert store.read_json(out / "twin.json")["seed"] == 3
+    assert "2 scenes in" in capsys.readouterr().out
 
 
 def test_a_damaged_state_is_named(made, no_pictures, case_folder, tmp_path):

@@ -73,7 +73,7 @@ def twin_picture(scene: Scene, settled: Settled, rest_organ: Mesh, path: Path) -
         ncols=5,
         fontsize=9.5,
         frameon=False,
-        bbox_to_anchor=(0.99, 0.95),
+        bbox_to_anchor=(0.99, 1.0),
     )
     save(figure, path)
 
