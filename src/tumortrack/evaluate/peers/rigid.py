@@ -25,6 +25,8 @@ from tumortrack.sense.render import Visibility
 from tumortrack.simulate.scene_folder import Scene
 
 _TOWARDS_CAMERA = np.array([0.0, 0.0, -1.0])
+CROP_PERCENT = 98.0  # of the cloud's depths: beyond, nothing was kept (or it is noise)
+_ALIKE_DEG, _ALIKE_MM = 8.0, 5.0
 _FEWEST_POINTS = 20
 _GOLDEN_ANGLE = np.pi * (3 - np.sqrt(5))
 
@@ -101,13 +103,13 @@ class PoseSearch:
         middle_from_ct = np.linalg.inv(self._ct_from_middle)
         points = transform_points(middle_from_ct, self.surface.points_mm)
         self._target = small_gicp.PointCloud(points)
-        self._target.normals()[:, :3] = self.surface.normals
         self._target_tree = small_gicp.KdTree(self._target)
+        small_gicp.estimate_normals(self._target, self._target_tree, 10)
         self._tree = cKDTree(self.surface.points_mm)
         self._starts = [self._start(turn) for turn in _rotations(config, np.array(up_lps))]
 
     def poses(self, cloud: SensorCloud) -> list[Pose]:
-        """The refined poses, best first.
+        """The refined poses, best first, no two alike.
 
         Raises:
             NoEstimate: fewer than 20 points.
@@ -127,12 +129,13 @@ class PoseSearch:
             coarse.append(Pose(camera_from_ct, self.error_mm(few, camera_from_ct), number))
         coarse.sort(key=lambda pose: pose.error_mm)
         fine = []
-        for pose in coarse[: self.config.refined]:
+        for pose in _distinct(coarse, self._ct_from_middle[:3, 3])[: self.config.refined]:
             camera_from_ct = pose.camera_from_ct
             for reach_mm in then:
                 camera_from_ct = self._icp(points, camera_from_ct, reach_mm)
             fine.append(Pose(camera_from_ct, self.error_mm(points, camera_from_ct), pose.start))
-        return sorted(fine, key=lambda pose: pose.error_mm)
+        fine.sort(key=lambda pose: pose.error_mm)
+        return _distinct(fine, self._ct_from_middle[:3, 3])
 
     def error_mm(
         self, points: Float64[np.ndarray, "n 3"], camera_from_ct: Float64[np.ndarray, "4 4"]
@@ -141,15 +144,22 @@ class PoseSearch:
         of the surface to the cloud: a cloud alone may hide anywhere in a larger flat side."""
         points_ct = transform_points(np.linalg.inv(camera_from_ct), points)
         out = self._tree.query(points_ct)[0]
-        seen_ct = self.surface.points_mm[seen_from(self.visibility, self.surface, camera_from_ct)]
-        depth = transform_points(camera_from_ct, seen_ct)[:, 2]
-        seen_ct = seen_ct[depth < np.percentile(points[:, 2], 98)]
+        seen_ct = transform_points(np.linalg.inv(camera_from_ct), self.seen(points, camera_from_ct))
         if len(seen_ct) == 0:
             return float("inf")
         back = cKDTree(points_ct).query(seen_ct)[0]
         return trimmed_mean(out, self.config.cloud_share) + trimmed_mean(
             back, self.config.seen_share
         )
+
+    def seen(
+        self, points: Float64[np.ndarray, "n 3"], camera_from_ct: Float64[np.ndarray, "4 4"]
+    ) -> Float64[np.ndarray, "m 3"]:
+        """The surface that the camera should see above the depth where the cloud was cropped,
+        camera frame, for the organ as it was in the CT."""
+        seen = seen_from(self.visibility, self.surface, camera_from_ct)
+        placed = transform_points(camera_from_ct, self.surface.points_mm[seen])
+        return placed[placed[:, 2] < np.percentile(points[:, 2], CROP_PERCENT)]
 
     def _start(
         self, rotation: Float64[np.ndarray, "3 3"]
@@ -186,6 +196,21 @@ class PoseSearch:
         )
         ct_from_camera = self._ct_from_middle @ result.T_target_source @ middle_from_camera
         return np.linalg.inv(ct_from_camera)
+
+
+def _distinct(ordered: list[Pose], middle_ct: Float64[np.ndarray, " 3"]) -> list[Pose]:
+    """Without those that lie within 8 degrees and 5 mm of an earlier one."""
+    kept: list[Pose] = []
+    for pose in ordered:
+        for other in kept:
+            ct_from_ct = np.linalg.inv(other.camera_from_ct) @ pose.camera_from_ct
+            turn = Rotation.from_matrix(ct_from_ct[:3, :3]).magnitude()
+            shift = transform_points(ct_from_ct, middle_ct[None])[0] - middle_ct
+            if np.degrees(turn) < _ALIKE_DEG and np.linalg.norm(shift) < _ALIKE_MM:
+                break
+        else:
+            kept.append(pose)
+    return kept
 
 
 def _anchor(points: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, " 3"]:

@@ -18,6 +18,10 @@ class SurfacePoints:
     points_mm: Float64[np.ndarray, "n 3"]
     normals: Float64[np.ndarray, "n 3"]
 
+    def faces(self, eye_mm: Float64[np.ndarray, " 3"]) -> Bool[np.ndarray, " n"]:
+        """Which points are turned towards an eye."""
+        return np.einsum("ij,ij->i", self.normals, eye_mm - self.points_mm) > 0
+
 
 def vertex_normals(mesh: Mesh) -> Float64[np.ndarray, "v 3"]:
     """Outward unit normals, each the mean of its triangles' by area."""
@@ -42,7 +46,7 @@ def seen_from(
 ) -> Bool[np.ndarray, " n"]:
     """Which surface points the camera sees: turned towards it and not hidden by the organ."""
     eye_ct = np.linalg.inv(camera_from_ct)[:3, 3]
-    towards = np.einsum("ij,ij->i", surface.normals, eye_ct - surface.points_mm) > 0
+    towards = surface.faces(eye_ct)
     seen = np.zeros(len(towards), bool)
     seen[towards] = visibility(surface.points_mm[towards], eye_ct)
     return seen
