@@ -5,24 +5,17 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
+from phantom_objects import FIRST, QUICK_SCAN, VOXEL, first_labels
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import spacing_mm
 from tumortrack.core.types import LabelVolume
-from tumortrack.phantom.digital import (
-    PhantomParameters,
-    phantom_labels,
-)
 from tumortrack.phantom.scanner import ScannerParameters, scan
 from volume_points import lps_of, read_at
-
-VOXEL = 1.0
-FIRST = PhantomParameters()
-QUICK_SCAN = ScannerParameters(spacing_mm=(1.0, 1.1, 1.3), tilt_deg=(12.0, -8.0, 20.0))
 
 
 @pytest.fixture(scope="module")
 def labels():
-    return phantom_labels(FIRST, VOXEL)
+    return first_labels()
 
 
 @pytest.fixture(scope="module")

@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 
+from depth_objects import SMALL, dome, pixels, wall
 from tumortrack.core.config import from_builtins, to_builtins
 from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.types import DepthFrame, Intrinsics, SensorCloud
@@ -18,24 +19,6 @@ from tumortrack.sense.cloud import (
 )
 from tumortrack.sense.clutter import ClutterConfig, add_clutter
 from tumortrack.sense.noise import CLEAN, D405_NOISE, NoiseConfig, add_noise
-
-SMALL = d405(424, 240)
-
-
-def pixels(camera):
-    return np.meshgrid(np.arange(camera.width), np.arange(camera.height))
-
-
-def dome(camera=SMALL, stamp_ns=7):
-    """A smooth dome 120..145 mm away that ends inside the image."""
-    u, v = pixels(camera)
-    r2 = ((u - camera.cx) / camera.fx / 0.45) ** 2 + ((v - camera.cy) / camera.fy / 0.25) ** 2
-    depth = np.where(r2 < 1, 145 - 25 * np.sqrt(np.clip(1 - r2, 0, 1)), np.nan)
-    return DepthFrame(depth, camera, stamp_ns)
-
-
-def wall(depth_mm, camera=SMALL):
-    return DepthFrame(np.full((camera.height, camera.width), depth_mm), camera)
 
 
 def rows(points):

@@ -11,8 +11,9 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from depth_objects import SMALL, dome, pixels, wall
 from tumortrack.core.errors import InputError
-from tumortrack.core.types import DepthFrame, Intrinsics
+from tumortrack.core.types import Intrinsics
 from tumortrack.sense.camera import d405, deproject
 from tumortrack.sense.cloud import CloudConfig, check_cloud, cloud_from_depth
 from tumortrack.sense.files import (
@@ -24,24 +25,6 @@ from tumortrack.sense.files import (
     write_intrinsics,
 )
 from tumortrack.sense.noise import NoiseConfig, add_noise
-
-SMALL = d405(424, 240)
-
-
-def pixels(camera):
-    return np.meshgrid(np.arange(camera.width), np.arange(camera.height))
-
-
-def dome(camera=SMALL, stamp_ns=7):
-    """A smooth dome 120..145 mm away that ends inside the image."""
-    u, v = pixels(camera)
-    r2 = ((u - camera.cx) / camera.fx / 0.45) ** 2 + ((v - camera.cy) / camera.fy / 0.25) ** 2
-    depth = np.where(r2 < 1, 145 - 25 * np.sqrt(np.clip(1 - r2, 0, 1)), np.nan)
-    return DepthFrame(depth, camera, stamp_ns)
-
-
-def wall(depth_mm, camera=SMALL):
-    return DepthFrame(np.full((camera.height, camera.width), depth_mm), camera)
 
 
 @pytest.fixture

@@ -1,4 +1,4 @@
-"""NIfTI files through nibabel. NIfTI is RAS+; it becomes LPS, and back, here and nowhere else."""
+"""NIfTI files through nibabel. NIfTI is RAS+; it becomes LPS here (and back in core.nifti)."""
 
 from __future__ import annotations
 
@@ -12,8 +12,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Num, UInt8
 
-from tumortrack.core.errors import InputError, StorageError
+from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import RAS_FROM_LPS
+from tumortrack.core.nifti import write_nifti
 from tumortrack.imaging.voxels import (
     RawVolume,
     check_affine,
@@ -121,7 +122,7 @@ def write_labels_nifti(
     Raises:
         StorageError: the disk refused.
     """
-    _write(path, labels, frame_from_index, lps)
+    write_nifti(path, labels, frame_from_index, lps)
 
 
 def write_volume_nifti(
@@ -133,25 +134,5 @@ def write_volume_nifti(
         StorageError: the disk refused.
     """
     whole = np.clip(np.rint(hu), -32768, 32767).astype(np.int16)
-    _write(
-        path, whole if np.array_equal(whole, hu) else hu.astype(np.float32), lps_from_index, True
-    )
-
-
-def _write(path: Path, array: np.ndarray, frame_from_index: np.ndarray, lps: bool) -> None:
-    import nibabel
-
-    affine = RAS_FROM_LPS @ frame_from_index if lps else frame_from_index
-    image = nibabel.Nifti1Image(array, affine)
-    image.header.set_xyzt_units("mm")
-    image.set_sform(affine, code=1)
-    image.set_qform(affine, code=1 if _is_orthogonal(affine) else 0, strip_shears=True)
-    try:
-        nibabel.save(image, path)
-    except OSError as error:
-        raise StorageError(f"cannot write {path}: {error.strerror or error}.") from error
-
-
-def _is_orthogonal(affine: np.ndarray) -> bool:
-    axes = affine[:3, :3] / np.linalg.norm(affine[:3, :3], axis=0)
-    return bool(np.allclose(axes.T @ axes, np.eye(3), atol=1e-4))
+    exact = whole if np.array_equal(whole, hu) else hu.astype(np.float32)
+    write_nifti(path, exact, lps_from_index, lps=True)

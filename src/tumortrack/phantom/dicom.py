@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import gzip
 import hashlib
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from tumortrack.core import nifti as core_nifti
 from tumortrack.core.errors import InputError
-from tumortrack.core.geometry import RAS_FROM_LPS, spacing_mm
-from tumortrack.core.store import new_folder, write_atomically
+from tumortrack.core.geometry import spacing_mm
+from tumortrack.core.store import new_folder
 from tumortrack.core.types import LabelVolume, Volume
 
 if TYPE_CHECKING:
@@ -54,8 +54,6 @@ def write_nifti(volume: Volume | LabelVolume, path: Path) -> None:
         InputError: another suffix, or HU outside int16.
         StorageError: the disk refused; an older file at ``path`` is untouched.
     """
-    import nibabel
-
     path = Path(path)
     if not path.name.endswith((".nii", ".nii.gz")):
         raise InputError(f"{path}: a NIfTI file's name must end in .nii or .nii.gz.")
@@ -65,16 +63,7 @@ def write_nifti(volume: Volume | LabelVolume, path: Path) -> None:
         if not (np.abs(volume.hu) <= 32767).all():
             raise InputError("HU must be finite and within -32767..32767 to be stored.")
         data = np.rint(volume.hu).astype(np.int16)
-    ras_from_index = RAS_FROM_LPS @ volume.lps_from_index
-    image = nibabel.Nifti1Image(data, ras_from_index)
-    image.header.set_xyzt_units("mm")
-    image.set_sform(ras_from_index, code="scanner")
-    # A quaternion cannot hold shear; the sform alone is right for every affine.
-    image.set_qform(ras_from_index, code="unknown")
-    content = image.to_bytes()
-    if path.name.endswith(".gz"):
-        content = gzip.compress(content, compresslevel=4, mtime=0)
-    write_atomically(path, content)
+    core_nifti.write_nifti(path, data, volume.lps_from_index, lps=True)
 
 
 def _check(volume: Volume) -> None:
