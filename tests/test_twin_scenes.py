@@ -35,6 +35,7 @@ from tumortrack.evaluate.twin.variants import (
     Settled,
     ViewConfig,
     camera_from_bench,
+    for_organ,
     make_scene,
 )
 from tumortrack.imaging.case import Case, save_case
@@ -184,6 +185,18 @@ def test_the_crop_keeps_all_that_is_visible(variant):
     points = made.cloud.points_mm[:100].astype(float)
     hits = render_objects.ray_hits(np.zeros(3), points, made.reference.organ, slack=1e-4)
     assert np.allclose(hits.min(1), 1, atol=1e-4)
+
+
+def test_the_camera_rises_over_tall_organs():
+    plain = ViewConfig()
+    assert for_organ(plain, 60.0) == plain
+    tall = for_organ(plain, 90.0)
+    assert tall.camera_above_mm == 175
+    assert tall.far_mm == 175  # the support stays the limit
+    made, targets = scene("Rot90", config=tall)
+    assert made.meta["seen"]["in_image_share"] == 1
+    _, lower_targets = scene("Rot90")
+    assert np.allclose(targets - lower_targets, [0, 0, 25])
 
 
 def test_a_shaft_only_takes_points_away():

@@ -34,6 +34,7 @@ from tumortrack.evaluate.twin.variants import (
     Settled,
     View,
     ViewConfig,
+    for_organ,
     make_scene,
 )
 from tumortrack.imaging.case import load_case
@@ -213,8 +214,10 @@ def _write(
 ) -> None:
     """One scene's folder with targets and picture, all or nothing."""
     variant, _, view = folder.name.partition("-")
-    scene, targets_mm = make_scene(settled, variant, view, run.view, run.seed)  # type: ignore[arg-type]
-    scene = replace(scene, meta={**scene.meta, **identity})
+    height_mm = float(np.ptp(anatomy_ct.organ.vertices_mm @ settled.bench_from_ct[2, :3]))
+    config = for_organ(run.view, height_mm)
+    scene, targets_mm = make_scene(settled, variant, view, config, run.seed)  # type: ignore[arg-type]
+    scene = replace(scene, meta={**identity, **scene.meta})
     with store.new_folder(folder) as aside:
         write_scene_files(aside, scene)
         store.write_atomically(aside / "targets.csv", _table(targets, targets_mm))

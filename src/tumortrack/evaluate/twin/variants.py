@@ -7,6 +7,7 @@ from typing import Literal
 
 import numpy as np
 from jaxtyping import Float64
+from msgspec import structs
 
 from tumortrack.core.config import Config, to_builtins
 from tumortrack.core.errors import InputError
@@ -49,6 +50,9 @@ class ViewConfig(Config, frozen=True, kw_only=True):
 
     camera_above_mm: the camera's height above the support; it looks straight down at the
         middle of the organ in D0.
+    nearest_mm: the top of the undeformed organ is at least this far from the camera: over a
+        taller organ the camera and far_mm are raised (``for_organ``), or else the image would
+        cut off its ends.
     near_mm, far_mm: depths kept, exclusive. The paper's 110..150 mm would cut off the top of an
         organ that stands 60 mm high under a camera 150 mm above its bed; this range keeps it all.
     n_points: of the cloud; every method thins it by itself.
@@ -58,6 +62,7 @@ class ViewConfig(Config, frozen=True, kw_only=True):
     """
 
     camera_above_mm: float = 150.0
+    nearest_mm: float = 85.0
     near_mm: float = 50.0
     far_mm: float = 150.0
     width: int = 848
@@ -70,6 +75,16 @@ class ViewConfig(Config, frozen=True, kw_only=True):
     @property
     def crop(self) -> CloudConfig:
         return CloudConfig(near_mm=self.near_mm, far_mm=self.far_mm, n_points=self.n_points)
+
+
+def for_organ(config: ViewConfig, height_mm: float) -> ViewConfig:
+    """The views of an organ that stands so high undeformed."""
+    raised_mm = max(0.0, height_mm + config.nearest_mm - config.camera_above_mm)
+    return structs.replace(
+        config,
+        camera_above_mm=config.camera_above_mm + raised_mm,
+        far_mm=config.far_mm + raised_mm,
+    )
 
 
 @dataclass(frozen=True, eq=False)
