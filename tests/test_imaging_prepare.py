@@ -121,6 +121,14 @@ def test_single_kidney_masks_become_cases(shared_data, side, ml):
         prepare(path, PrepareOptions(side="left" if side == "right" else "right"))
 
 
+fuzzed = settings(
+    max_examples=80,
+    deadline=10_000,
+    derandomize=True,
+    suppress_health_check=[HealthCheck.function_scoped_fixture],
+)
+
+
 @pytest.fixture(scope="module")
 def samples(tmp_path_factory):
     """One tiny valid file of each type, and what reads it."""
@@ -151,12 +159,7 @@ def read_either(path):
     "name",
     ["v.nii", "v.nii.gz", "raw.nrrd", "gz.nrrd", "kidney.ply", "kidney.stl", "kidney.obj"],
 )
-@settings(
-    max_examples=60,
-    deadline=10_000,
-    derandomize=True,
-    suppress_health_check=[HealthCheck.function_scoped_fixture],
-)
+@fuzzed
 @given(data=st.data())
 def test_damaged_files_give_a_value_or_an_input_error(tmp_path, samples, name, data):
     content, read = samples[name]
@@ -180,12 +183,7 @@ def slices(tmp_path_factory):
     return {path.name: path.read_bytes() for path in sorted(folder.iterdir())}, hu
 
 
-@settings(
-    max_examples=120,
-    deadline=10_000,
-    derandomize=True,
-    suppress_health_check=[HealthCheck.function_scoped_fixture],
-)
+@fuzzed
 @given(data=st.data())
 def test_damaged_slices_give_a_whole_volume_a_note_or_an_input_error(tmp_path, slices, data):
     files, hu = slices

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import platform
 import shutil
 from importlib import import_module
@@ -10,6 +9,7 @@ from importlib.metadata import version
 from pathlib import Path
 
 from tumortrack.app.console import say
+from tumortrack.learn.cores import available_cores
 
 _LIBRARIES = {
     "torch": "training and locating",
@@ -29,7 +29,7 @@ _DISTRIBUTIONS = {"skimage": "scikit-image"}
 def examine() -> None:
     """Print the machine, each library by importing it, and what bf16 and CUDA offer."""
     say(f"tumortrack {version('tumortrack')}, Python {platform.python_version()}")
-    say(f"cores: {_cores()}, {platform.machine()}, {platform.system()}")
+    say(f"cores: {available_cores()}, {platform.machine()}, {platform.system()}")
     free = shutil.disk_usage(Path.cwd()).free / 2**30
     say(f"free disk here: {free:.1f} GiB" + (" - little" if free < 2 else ""))
     for name, purpose in _LIBRARIES.items():
@@ -39,13 +39,6 @@ def examine() -> None:
         except Exception as error:  # whatever a broken installation raises is the finding
             say(f"BROKEN   {name} ({purpose}): {error}")
     _examine_torch()
-
-
-def _cores() -> int:
-    """Cores that this process may use (macOS and Windows tell only how many there are)."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
 
 
 def _examine_torch() -> None:
