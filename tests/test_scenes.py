@@ -3,6 +3,7 @@
 import multiprocessing
 import pickle
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -11,6 +12,7 @@ from tumortrack.core.config import from_builtins, to_builtins
 from tumortrack.core.errors import InputError, TumortrackError
 from tumortrack.sense.camera import deproject
 from tumortrack.sense.cloud import CloudConfig
+from tumortrack.sense.clutter import ClutterConfig
 from tumortrack.sense.noise import D405_NOISE
 from tumortrack.simulate.dataset import SceneStream
 from tumortrack.simulate.deform import DragConfig, RestConfig
@@ -148,6 +150,32 @@ def test_deformations_are_chosen_with_equal_chance():
     kinds = [simulator.stage(recipe(i)).deformation.record()["kind"] for i in range(60)]
     assert 18 < kinds.count("drag") < 42
     assert kinds.count("drag") + kinds.count("rest") == 60
+
+
+def test_background_joins_a_scene_and_changes_nothing_else():
+    clutter = ClutterConfig(scenes=1.0, largest_share=0.3)
+    free = SceneConfig(occupancy=SMALL, free_range=1.0)
+    clean, spoiled = (
+        Simulator(ANATOMY, UP, config)
+        for config in (free, msgspec.structs.replace(free, clutter=clutter))
+    )
+    added = []
+    for index in range(12):
+        one, two = clean.stage(recipe(index)), spoiled.stage(recipe(index))
+        assert one.deformation.record() == two.deformation.record()
+        np.testing.assert_array_equal(one.camera_from_ct, two.camera_from_ct)
+        seen = np.isfinite(one.frame.depth_mm)
+        np.testing.assert_array_equal(one.frame.depth_mm[seen], two.frame.depth_mm[seen])
+        organ = {tuple(p) for p in deproject(one.frame).tolist()}
+        added.append(np.mean([tuple(p) not in organ for p in two.cloud.points_mm.tolist()]))
+    assert max(added) <= 0.36  # the image's share of 0.3, drawn at random
+    assert np.mean(added) > 0.05
+
+
+def test_recipes_are_numbered_from_zero():
+    for bad in ((-1, 0), (0, -1)):
+        with pytest.raises(InputError, match="0 or more"):
+            SceneRecipe(bad[0], "test", bad[1])
 
 
 def test_a_range_that_shows_nothing_is_an_error():
