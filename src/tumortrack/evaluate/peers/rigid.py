@@ -26,6 +26,7 @@ from tumortrack.simulate.scene_folder import Scene
 
 _TOWARDS_CAMERA = np.array([0.0, 0.0, -1.0])
 CROP_PERCENT = 98.0  # of the cloud's depths: beyond, nothing was kept (or it is noise)
+_POLISH = 20  # iterations
 _ALIKE_DEG, _ALIKE_MM = 8.0, 5.0
 _FEWEST_POINTS = 20
 _GOLDEN_ANGLE = np.pi * (3 - np.sqrt(5))
@@ -133,6 +134,7 @@ class PoseSearch:
             camera_from_ct = pose.camera_from_ct
             for reach_mm in then:
                 camera_from_ct = self._icp(points, camera_from_ct, reach_mm)
+            camera_from_ct = self._polished(points, camera_from_ct, then[-1])
             fine.append(Pose(camera_from_ct, self.error_mm(points, camera_from_ct), pose.start))
         fine.sort(key=lambda pose: pose.error_mm)
         return _distinct(fine, self._ct_from_middle[:3, 3])
@@ -191,11 +193,33 @@ class PoseSearch:
             registration_type="PLANE_ICP",
             max_correspondence_distance=reach_mm,
             max_iterations=30,
-            translation_epsilon=1e-3,
-            rotation_epsilon=1e-4,
+            translation_epsilon=1e-4,
+            rotation_epsilon=1e-5,
         )
         ct_from_camera = self._ct_from_middle @ result.T_target_source @ middle_from_camera
         return np.linalg.inv(ct_from_camera)
+
+    def _polished(
+        self,
+        points: Float64[np.ndarray, "n 3"],
+        camera_from_ct: Float64[np.ndarray, "4 4"],
+        reach_mm: float,
+    ) -> Float64[np.ndarray, "4 4"]:
+        """Point-to-plane once more, with the mesh's own normals and Tukey weights: small_gicp
+        estimates normals from neighbours, and those leave half a millimetre."""
+        middle = self._ct_from_middle[:3, 3]
+        for _ in range(_POLISH):
+            placed = transform_points(np.linalg.inv(camera_from_ct), points)
+            distance, index = self._tree.query(placed)
+            normal, at = self.surface.normals[index], self.surface.points_mm[index]
+            weight = (1 - np.minimum(distance / reach_mm, 1) ** 2) ** 2
+            rows = np.concatenate([np.cross(at - middle, normal), normal], axis=1)
+            residual = np.einsum("ij,ij->i", normal, placed - at)
+            scaled = rows.T * weight
+            step = np.linalg.solve(scaled @ rows + 1e-6 * np.eye(6), scaled @ residual)
+            turn = Rotation.from_rotvec(step[:3]).as_matrix()
+            camera_from_ct = camera_from_ct @ rigid(turn, middle + step[3:] - turn @ middle)
+        return camera_from_ct
 
 
 def _distinct(ordered: list[Pose], middle_ct: Float64[np.ndarray, " 3"]) -> list[Pose]:
