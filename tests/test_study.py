@@ -366,7 +366,7 @@ def test_end_to_end_twice_gives_the_same_document(phantom, tmp_path):
     first = document.read_text()
     assert first.startswith("mine\n")
     assert first.endswith("yours\n")
-    for words in ("models of 2 steps", "(bound)", "\n| 3 | "):
+    for words in ("Models: 1 of 2 steps", "(bound)", "\n| 3 | "):
         assert words in first
     for name in ("variants_phantom", "depth_phantom", "gallery"):
         assert f"](images/results_{name}.png)" in first

@@ -81,7 +81,8 @@ def section_blocks(
     return {section: "\n\n".join(texts)}
 
 
-_OVER_SCENES = f"Distances in mm. {RULE} ± is the standard deviation over the seeds."
+_MEDIANS = RULE.replace("written as null", "written as not found")
+_OVER_SCENES = f"Distances in mm. {_MEDIANS} ± is the standard deviation over the seeds."
 _RULES: dict[Section, str] = {
     "accuracy": "Distances in mm; ± is the standard deviation over the seeds, one scene each.",
     "deformation": "mIoU; ± is the standard deviation over the seeds.",

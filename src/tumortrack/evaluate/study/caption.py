@@ -8,14 +8,15 @@ from collections.abc import Iterable
 def caption(cells: list[dict], command: str) -> str:
     """Command, scenes, models with their steps and training time, device, grid; from the cells."""
     specs = [cell["spec"] for cell in cells]
-    scenes = len({(s["case"], s["scene"], s["fault"]) for s in specs})
+    scenes = len({(s["case"], s["scene"], s["fault"], s["fault_seed"]) for s in specs})
     grids = sorted({s["grid"] for s in specs})
     sentences = [
         f"`{command}`: {len(cells)} measurements, {scenes} scenes (views: "
         f"{_list(sorted({s['view'] for s in specs}))}), volumes of "
         f"{_list(f'{g}³' for g in grids)} voxels at most.",
         *_training(cells),
-        f"Measured on {_list(sorted({_device(cell['provenance']) for cell in cells}))}.",
+        f"Measured on {_list(sorted({_device(cell['provenance']) for cell in cells}))}, "
+        f"{_load(cells)}.",
     ]
     return " ".join(sentences)
 
@@ -35,7 +36,7 @@ def _training(cells: list[dict]) -> list[str]:
     seeds = _list(str(seed) for seed in sorted({one["seed"] for one in about}))
     on = _list(sorted({one["device"] for one in about}))
     return [
-        f"{len(about)} models of {steps} steps, seeds {seeds}, trained on {on} in "
+        f"Models: {len(about)} of {steps} steps, seed {seeds}, trained on {on} in "
         f"{min(minutes):.1f} to {max(minutes):.1f} minutes each."
     ]
 
@@ -43,7 +44,13 @@ def _training(cells: list[dict]) -> list[str]:
 def _device(about: dict) -> str:
     if about["device"] != "cpu":
         return f"{about['device']} beside {about['cpu']}"
-    return f"{about['cpu']} ({about['cores']} cores, {about['threads']} threads)"
+    return f"{about['cpu']} ({about['cores']} cores, PyTorch on {about['threads']})"
+
+
+def _load(cells: list[dict]) -> str:
+    """How busy the machine was: seconds a frame mean little without it."""
+    loads = [load for cell in cells if (load := cell["provenance"]["load"]) is not None]
+    return f"load average {min(loads):.1f} to {max(loads):.1f}" if loads else "load not known"
 
 
 def _list(items: Iterable[str]) -> str:

@@ -47,6 +47,7 @@ class Job:
     view: str
     grid: int
     fault: str = "none"
+    fault_seed: int = 0
 
 
 @dataclass(frozen=True)
@@ -83,7 +84,8 @@ def measure(
         pace.add(_kind_of(spec), time.perf_counter() - start)
         if report:
             done = len(kept) - len(todo) + number
-            name = f"{spec.case} {spec.method['name']} {spec.scene}"
+            name = f"{spec.case} {spec.method['name']} {spec.scene} {spec.fault}"
+            name = name.removesuffix(" none")
             report(Status(done, len(kept), number, name, pace.mean(), pace.left()))
     found = [kept[spec.digest] for spec in specs]
     return [cell for cell in found if cell is not None]
@@ -107,6 +109,7 @@ def spec_of(job: Job, hashes: Hashes) -> CellSpec:
         method=job.method.identity,
         grid=job.grid,
         fault=job.fault,
+        fault_seed=job.fault_seed,
     )
 
 
@@ -116,7 +119,7 @@ def measure_one(job: Job, name: str) -> dict:
     if job.fault != "none":
         from tumortrack.evaluate.twin.faults import faulty
 
-        scene = faulty(scene, job.fault, 0)
+        scene = faulty(scene, job.fault, job.fault_seed)
     answers: list[Answer] = []
 
     def locate(_: object) -> Estimate:

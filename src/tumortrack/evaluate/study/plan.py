@@ -39,6 +39,7 @@ class StudyPlan(Config, frozen=True):
     configuration_view: str = "noise"
     peers: tuple[str, ...] = ("rigid_bound", "rigid", "cpd", "elastic")
     faults: tuple[str, ...] = FAULTS
+    fault_seeds: tuple[int, ...] = (0, 1, 2)  # a shaft or a direction is drawn anew for each
     fault_peers: tuple[str, ...] = ("elastic",)
     fault_variants: tuple[str, ...] = ("D1", "D2", "D3", "G1", "P1")
     views: tuple[str, ...] = VIEWS
@@ -56,6 +57,7 @@ QUICK = StudyPlan(
     configuration_variants=("D1", "D3"),
     peers=("rigid_bound", "rigid", "elastic"),
     faults=("clean", "noise", "offset", "all"),
+    fault_seeds=(0,),
     fault_variants=("D2", "G1"),
     views=("clean", "noise", "clutter"),
 )
@@ -137,9 +139,10 @@ def _peers(plan: StudyPlan, case: StudyCase, methods: Methods) -> list[Job]:
 def _faults(plan: StudyPlan, case: StudyCase, methods: Methods) -> list[Job]:
     beside = [methods.peer(name, case) for name in plan.fault_peers if name in plan.peers]
     return [
-        Job(case, method, variant, "clean", plan.coarse_grid, fault)
+        Job(case, method, variant, "clean", plan.coarse_grid, fault, seed)
         for method in [*_networks(plan, case, methods, ("M_lim",)), *beside]
         for fault in plan.faults
+        for seed in (plan.fault_seeds if fault != "clean" else (0,))
         for variant in plan.fault_variants
     ]
 

@@ -47,16 +47,18 @@ def error_against(cells: list[dict], key: str, path: Path) -> bool:
     curves = {name: curve for name, curve in curves.items() if len(curve[0]) >= _FEWEST}
     if not curves:
         return False
+    highest = 1.0
     drawing = new_figure(9.4, 4.6)
     axes = drawing.add_axes((0.075, 0.125, 0.6, 0.8))
     for number, (method, (x, error)) in enumerate(curves.items()):
         color, marker = STYLES.get(method, _OTHER)
         at, low, middle, high = _grouped(x, error)
+        highest = max(highest, 1.25 * float(middle.max()))
         if number < 2:
             axes.fill_between(at, low, high, color=color, alpha=0.13, linewidth=0)
         axes.plot(at, middle, color=color, marker=marker, linewidth=2, label=label_of(method))
     axes.set(xlabel=f"{_ALONG[key]}, mm", ylabel="distance to the estimated tumor surface, mm")
-    axes.set_ylim(bottom=0)
+    axes.set_ylim(0, highest)  # bands may go beyond: a bad method must not flatten the others
     axes.set_xlim(left=0)
     _tidy(axes)
     axes.legend(
@@ -89,14 +91,17 @@ def error_per_variant(cells: list[dict], lies: dict[str, paper.Lie], path: Path)
             _paper_marks(axes, variants, model, lies[tumor].kind, shift)
         axes.set_xticks(range(len(variants)), variants)
         axes.set_title(f"{tumor.replace('_', ' ')}, {lies[tumor].kind}", loc="left", fontsize=11)
-        axes.set_ylim(bottom=0)
+        for place in range(len(variants) - 1):
+            axes.axvline(place + 0.5, color="0.93", linewidth=0.8, zorder=0)
+        axes.set_xlim(-0.5, len(variants) - 0.5)
         _tidy(axes)
+    panels[0].set_ylim(bottom=0)  # after all panels: it ends the search for common limits
     panels[0].set_ylabel("Hausdorff distance, estimate to truth, mm")
     drawing.legend(
         handles=_legend(names(cells, "method")),
         loc="upper left",
-        bbox_to_anchor=(0.06, 0.99),
-        ncols=4,
+        bbox_to_anchor=(0.06, 0.995),
+        ncols=5,
         frameon=False,
         fontsize=10,
     )
@@ -178,7 +183,9 @@ def _legend(models: list[str]) -> list:
                 label=f"{model}, paper (hydrogel)",
             )
         )
-    return handles
+    bound = Line2D([], [], color="0.4", marker=r"$\downarrow$", markersize=9, lw=1.6)
+    bound.set_label("paper: at most")
+    return [*handles, bound]
 
 
 def _points(cells: list[dict], key: str) -> tuple[np.ndarray, np.ndarray]:

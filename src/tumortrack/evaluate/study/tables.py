@@ -172,4 +172,5 @@ def _said(said: paper.Said | None) -> str:
 def _change(here: Figure, base: Figure) -> str:
     if here.mean is None or base.mean is None or here is base or here == base:
         return here.text()
-    return f"{here.text()} ({here.mean - base.mean:+.1f})"
+    change = round(here.mean - base.mean, 1) + 0.0  # no minus before a zero
+    return f"{here.text()} ({change:+.1f})"
