@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import tempfile
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -46,21 +48,24 @@ def tetrahedralise(surface: Mesh, edge_mm: float) -> TetMesh:
     """Fill a closed surface with tetrahedra (Hu et al. 2020, doi 10.1145/3386569.3392385).
 
     The mesh's own surface keeps within 0.2 % of the diagonal (about 0.3 mm on a kidney) of the
-    given one. One thread, so that the same surface gives the same mesh.
+    given one. Even on one thread fTetWild does not repeat itself exactly: a result that is to be
+    repeated keeps its mesh.
 
     Raises:
         InputError: nothing could be filled (an open or inverted surface).
     """
     import pytetwild
 
-    nodes_mm, tets = pytetwild.tetrahedralize(
-        surface.vertices_mm.copy(),  # the binding takes writable arrays of these types only
-        surface.faces.astype(np.uint32),
-        edge_length_abs=edge_mm,
-        epsilon=2e-3,
-        num_threads=1,
-        loglevel=6,
-    )
+    # fTetWild leaves a file of its own in the working folder.
+    with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):
+        nodes_mm, tets = pytetwild.tetrahedralize(
+            surface.vertices_mm.copy(),  # the binding takes writable arrays of these types only
+            surface.faces.astype(np.uint32),
+            edge_length_abs=edge_mm,
+            epsilon=2e-3,
+            num_threads=1,
+            loglevel=6,
+        )
     if len(tets) == 0:
         raise InputError("the surface encloses nothing that tetrahedra could fill; repair it.")
     tets = np.ascontiguousarray(tets, np.int32)
