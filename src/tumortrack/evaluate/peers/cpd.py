@@ -28,18 +28,19 @@ class CpdConfig(Config, frozen=True):
     """Settings of CPD, lengths in mm.
 
     ``kernel_mm`` is the paper's beta, the distance over which points move together; ``smooth``
-    its lambda, the weight of smoothness; ``outliers`` its w. ``first_sigma_mm`` starts the
+    its lambda, the weight of smoothness (of points scaled to a spread of 1, as the paper scales
+    them); ``outliers`` its w. ``first_sigma_mm`` starts the
     annealing at the error that a rigid pose leaves, instead of at the size of the cloud.
     """
 
     rigid: RigidConfig = RigidConfig()
-    starts: int = 3  # the best rigid poses, each fitted
-    kernel_mm: float = 40.0
-    smooth: float = 3.0
+    starts: int = 2  # the best rigid poses, each fitted
+    kernel_mm: float = 50.0
+    smooth: float = 1000.0
     outliers: float = 0.1
     first_sigma_mm: float = 6.0
     iterations: int = 60
-    points: int = 700  # of the visible surface
+    points: int = 400  # of the visible surface
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,7 +105,7 @@ class Cpd:
             X=cloud,
             Y=source,
             sigma2=config.first_sigma_mm**2,
-            alpha=config.smooth,
+            alpha=config.smooth / ((cloud - cloud.mean(0)) ** 2).mean(),
             beta=config.kernel_mm,
             w=config.outliers,
             max_iterations=config.iterations,
