@@ -1,6 +1,6 @@
 """A training of seconds, to see the parts work. For a model worth using see `tumortrack train`.
 
-After the default 20 steps the kidney is a blob and the tumors are not found yet.
+After the default 60 steps the kidney is a blob and the tumors are guesses.
 
 Run after 01: python examples/03_train_and_locate.py [FOLDER] [STEPS]
 """
@@ -55,5 +55,5 @@ def main(out: Path, steps: int) -> None:
 if __name__ == "__main__":
     main(
         Path(sys.argv[1] if len(sys.argv) > 1 else "runs/examples"),
-        int(sys.argv[2]) if len(sys.argv) > 2 else 20,
+        int(sys.argv[2]) if len(sys.argv) > 2 else 60,
     )

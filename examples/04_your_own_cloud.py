@@ -37,6 +37,6 @@ if __name__ == "__main__":
     folder = given[0] if given else Path("runs/examples")
     main(
         folder,
-        given[1] if len(given) > 1 else folder / "model_20",
+        given[1] if len(given) > 1 else folder / "model_60",
         given[2] if len(given) > 2 else folder / "scene" / "cloud.ply",
     )

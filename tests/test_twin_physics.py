@@ -14,10 +14,10 @@ from scipy.spatial.transform import Rotation
 
 from tumortrack.core.errors import InputError, TumortrackError
 from tumortrack.core.types import Anatomy, Mesh
+from tumortrack.evaluate.tets import TetMesh, embed, tetrahedralise
 from tumortrack.evaluate.twin.bench import Bench, BenchConfig
 from tumortrack.evaluate.twin.contact import Contact, Indenter, Plate, Support
 from tumortrack.evaluate.twin.equilibrium import Hold, Preconditioner, Problem, settle
-from tumortrack.evaluate.twin.mesh import TetMesh, embed, tetrahedralise
 from tumortrack.evaluate.twin.solid import Solid
 from tumortrack.evaluate.twin.states import solve
 

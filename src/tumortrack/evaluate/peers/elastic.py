@@ -21,11 +21,14 @@ from tumortrack.core.config import Config
 from tumortrack.core.geometry import rigid, transform_points
 from tumortrack.core.types import Anatomy
 from tumortrack.evaluate.peers.base import Carry, Fit, stopwatch
-from tumortrack.evaluate.peers.elastic_body import ElasticBody, elastic_body, tetrahedra
+from tumortrack.evaluate.peers.elastic_body import ElasticBody, elastic_body
 from tumortrack.evaluate.peers.rigid import CROP_PERCENT, PoseSearch, RigidConfig
 from tumortrack.evaluate.peers.surface import SurfacePoints, seen_from
+from tumortrack.evaluate.tets import tetrahedralise
 from tumortrack.simulate.scene_folder import Scene
 
+# Of the diagonal: the mesh may cut corners by 1 mm, for the organ's own surface rides on it.
+_ENVELOPE = 7e-3
 _STEP_MM = 1.0  # along the surface, for the normals of the deformed one
 _BESIDE_MM = 2.0  # spacing: partners lie this far apart along the surface
 _SEEN_POINTS = 500  # of the visible surface that look for their place in the cloud
@@ -88,8 +91,8 @@ class Elastic:
         self.config = config or ElasticConfig()
         with stopwatch() as watch:
             self._search = PoseSearch(anatomy_ct, up_lps, self.config.rigid)
-            nodes_mm, tets = tetrahedra(anatomy_ct.organ, self.config.edge_mm)
-            self.body = elastic_body(nodes_mm, tets, self.config.poisson, self.config.modes)
+            mesh = tetrahedralise(anatomy_ct.organ, self.config.edge_mm, _ENVELOPE)
+            self.body = elastic_body(mesh, self.config.poisson, self.config.modes)
             self._surface = RidingSurface(self.body, self._search)
             variance = self.config.displacement_mm**2 * self.body.area_mm2
             self._precision = self.body.stiffness * (1 / self.body.stiffness).sum() / variance

@@ -12,13 +12,11 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Float64, Int
-from scipy.spatial import cKDTree
 
 from tumortrack.core.errors import InputError
-from tumortrack.core.types import Mesh
+from tumortrack.evaluate.tets import TetMesh, find
 
 _RIGID_MODES = 6
-_CANDIDATES = 24  # elements round a point among which its own is looked for
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,15 +57,8 @@ class ElasticBody:
         self, points_mm: Float[np.ndarray, "m 3"]
     ) -> tuple[Int[np.ndarray, " m"], Float64[np.ndarray, "m 10"]]:
         """Each point's element (the nearest for points just outside) and shape functions there."""
-        corners = self.corners_mm
-        inverse = np.linalg.inv((corners[:, 1:] - corners[:, :1]).transpose(0, 2, 1))
-        count = min(_CANDIDATES, len(corners))
-        near = cKDTree(corners.mean(1)).query(points_mm, k=count)[1].reshape(-1, count)
-        local = np.einsum("mkij,mkj->mki", inverse[near], points_mm[:, None] - corners[near, 0])
-        weights = np.concatenate([1 - local.sum(2, keepdims=True), local], axis=2)
-        best = weights.min(2).argmax(1)
-        row = np.arange(len(points_mm))
-        return near[row, best], _quadratic(weights[row, best])
+        element, weights = find(self.corners_mm, points_mm)
+        return element, _quadratic(weights)
 
 
 def _quadratic(weights: Float64[np.ndarray, "m 4"]) -> Float64[np.ndarray, "m 10"]:
@@ -79,52 +70,19 @@ def _quadratic(weights: Float64[np.ndarray, "m 4"]) -> Float64[np.ndarray, "m 10
     )
 
 
-def tetrahedra(
-    organ: Mesh, edge_mm: float
-) -> tuple[Float64[np.ndarray, "n 3"], Int[np.ndarray, "t 4"]]:
-    """Nodes and tetrahedra inside a closed surface (fTetWild: Hu et al. 2020,
-    doi 10.1145/3386569.3392385).
-
-    The mesh may cut corners by 0.7 % of the diagonal (1 mm on a kidney): it carries the
-    displacement only, the organ's own surface rides on it. One thread, so that the same surface
-    gives the same mesh.
-
-    Raises:
-        InputError: nothing could be filled (an open or inverted surface).
-    """
-    import pytetwild
-
-    nodes_mm, tets = pytetwild.tetrahedralize(
-        organ.vertices_mm.copy(),  # the binding takes writable arrays of these types only
-        organ.faces.astype(np.uint32),
-        edge_length_abs=edge_mm,
-        epsilon=7e-3,
-        num_threads=1,
-        loglevel=6,
-    )
-    if len(tets) == 0:
-        raise InputError("the surface encloses nothing that tetrahedra could fill; repair it.")
-    return np.asarray(nodes_mm, float), np.asarray(tets, int)
-
-
-def stiffness_matrix(
-    nodes_mm: Float[np.ndarray, "n 3"], tets: Int[np.ndarray, "t 4"], poisson: float
-) -> tuple[Any, Any]:
+def stiffness_matrix(tets: TetMesh, poisson: float) -> tuple[Any, Any]:
     """The sparse stiffness matrix for a Young's modulus of 1, and scikit-fem's basis over it."""
     from skfem import Basis, ElementTetP2, ElementVector, MeshTet
     from skfem.models.elasticity import lame_parameters, linear_elasticity
 
-    mesh = MeshTet(np.ascontiguousarray(nodes_mm.T, float), np.ascontiguousarray(tets.T, int))
+    mesh = MeshTet(
+        np.ascontiguousarray(tets.nodes_mm.T), np.ascontiguousarray(tets.tets.T, dtype=int)
+    )
     basis = Basis(mesh, ElementVector(ElementTetP2()), intorder=2)
     return linear_elasticity(*lame_parameters(1.0, poisson)).assemble(basis), basis
 
 
-def elastic_body(
-    nodes_mm: Float[np.ndarray, "n 3"],
-    tets: Int[np.ndarray, "t 4"],
-    poisson: float,
-    modes: int,
-) -> ElasticBody:
+def elastic_body(tets: TetMesh, poisson: float, modes: int) -> ElasticBody:
     """The body with its softest surface modes, rigid motions left out.
 
     Modes solve K u = s M u with K the stiffness and M the mass of the *surface* (Steklov's
@@ -138,7 +96,7 @@ def elastic_body(
     from scipy.sparse import csc_matrix
     from scipy.sparse.linalg import LinearOperator, eigsh, splu
 
-    K, basis = stiffness_matrix(nodes_mm, tets, poisson)
+    K, basis = stiffness_matrix(tets, poisson)
     M = _surface_mass(basis)
     if modes + _RIGID_MODES >= len(basis.get_dofs().flatten()):
         raise InputError(f"{modes} modes are more than this mesh's surface has; refine the mesh.")

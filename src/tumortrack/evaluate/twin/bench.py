@@ -19,6 +19,7 @@ from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import rigid, rotation_onto, transform_points
 from tumortrack.core.types import Anatomy, Mesh
 from tumortrack.evaluate.metrics import label_grid, surface_samples
+from tumortrack.evaluate.tets import TetMesh, embed, tetrahedralise
 from tumortrack.evaluate.twin.contact import Contact, Obstacle
 from tumortrack.evaluate.twin.equilibrium import (
     Convergence,
@@ -27,7 +28,6 @@ from tumortrack.evaluate.twin.equilibrium import (
     Problem,
     settle,
 )
-from tumortrack.evaluate.twin.mesh import TetMesh, embed, tetrahedralise
 from tumortrack.evaluate.twin.solid import Solid
 
 GRAVITY_KPA_PER_MM = 9.81e-6  # of 1 kg/m^3

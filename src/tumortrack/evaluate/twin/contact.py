@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Float64
 
-from tumortrack.evaluate.twin.mesh import Embedding
+from tumortrack.evaluate.tets import Embedding
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_matrix

@@ -19,7 +19,7 @@ import numba
 import numpy as np
 from jaxtyping import Float, Float64
 
-from tumortrack.evaluate.twin.mesh import TetMesh
+from tumortrack.evaluate.tets import TetMesh
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_matrix

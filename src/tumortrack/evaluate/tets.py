@@ -44,12 +44,12 @@ def tet_volumes(
     return np.linalg.det(corners[:, 1:] - corners[:, :1]) / 6
 
 
-def tetrahedralise(surface: Mesh, edge_mm: float) -> TetMesh:
+def tetrahedralise(surface: Mesh, edge_mm: float, envelope: float = 2e-3) -> TetMesh:
     """Fill a closed surface with tetrahedra (Hu et al. 2020, doi 10.1145/3386569.3392385).
 
-    The mesh's own surface keeps within 0.2 % of the diagonal (about 0.3 mm on a kidney) of the
-    given one. Even on one thread fTetWild does not repeat itself exactly: a result that is to be
-    repeated keeps its mesh.
+    The mesh's own surface keeps within ``envelope`` times the diagonal (0.002: about 0.3 mm on a
+    kidney) of the given one. Even on one thread fTetWild does not repeat itself exactly: a result
+    that is to be repeated keeps its mesh.
 
     Raises:
         InputError: nothing could be filled (an open or inverted surface).
@@ -62,7 +62,7 @@ def tetrahedralise(surface: Mesh, edge_mm: float) -> TetMesh:
             surface.vertices_mm.copy(),  # the binding takes writable arrays of these types only
             surface.faces.astype(np.uint32),
             edge_length_abs=edge_mm,
-            epsilon=2e-3,
+            epsilon=envelope,
             num_threads=1,
             loglevel=6,
         )
@@ -89,20 +89,27 @@ class Embedding:
 def embed(mesh: TetMesh, points_mm: Float[np.ndarray, "m 3"]) -> Embedding:
     """Find each point's tetrahedron. A point just outside the mesh (its surface is coarser than
     the anatomy's) rides on the nearest one, its weights extrapolated."""
+    owner, weights = find(mesh.nodes_mm[mesh.tets], points_mm)
+    return Embedding(mesh.tets[owner], weights)
+
+
+def find(
+    corners_mm: Float[np.ndarray, "t 4 3"], points_mm: Float[np.ndarray, "m 3"]
+) -> tuple[Int[np.ndarray, " m"], Float64[np.ndarray, "m 4"]]:
+    """The tetrahedron that holds each point (the nearest for points just outside), and the
+    point's barycentric weights there."""
     from scipy.spatial import cKDTree
 
-    corners = mesh.nodes_mm[mesh.tets]
-    inverse = np.linalg.inv((corners[:, 1:] - corners[:, :1]).transpose(0, 2, 1))
-    count = min(_CANDIDATES, len(mesh.tets))
-    near = cKDTree(corners.mean(1)).query(points_mm, k=count)[1].reshape(len(points_mm), count)
+    inverse = np.linalg.inv((corners_mm[:, 1:] - corners_mm[:, :1]).transpose(0, 2, 1))
+    count = min(_CANDIDATES, len(corners_mm))
+    near = cKDTree(corners_mm.mean(1)).query(points_mm, k=count)[1].reshape(-1, count)
     best = np.full(len(points_mm), -np.inf)
     owner = near[:, 0].copy()
     weights = np.zeros((len(points_mm), 4))
-    for column in range(count):
-        tet = near[:, column]
-        local = np.einsum("mij,mj->mi", inverse[tet], points_mm - corners[tet, 0])
-        bary = np.concatenate([1 - local.sum(1, keepdims=True), local], axis=1)
-        least = bary.min(1)
-        better = least > best
-        best[better], owner[better], weights[better] = least[better], tet[better], bary[better]
-    return Embedding(mesh.tets[owner], weights)
+    for tet in near.T:
+        local = np.einsum("mij,mj->mi", inverse[tet], points_mm - corners_mm[tet, 0])
+        here = np.concatenate([1 - local.sum(1, keepdims=True), local], axis=1)
+        better = here.min(1) > best
+        best[better] = here.min(1)[better]
+        owner[better], weights[better] = tet[better], here[better]
+    return owner, weights
