@@ -9,6 +9,7 @@ Scenes, models and measurements are kept under --out; what is there already is n
 from __future__ import annotations
 
 import os
+import shlex
 import shutil
 import subprocess
 import sys
@@ -68,8 +69,14 @@ class Options:
     """Of training, for every model."""
     seeds: tuple[int, ...] | None = None
     """Of training."""
+    case_seeds: tuple[int, ...] | None = None
+    """Of training for --case (the same as the phantom's)."""
+    configuration_seeds: tuple[int, ...] | None = None
+    """Of training in the deformation study (the same as the phantom's)."""
     grid: int | None = None
     """Voxels along the longest side, in the table of accuracy."""
+    case_grid: int | None = None
+    """The same for --case (as for the phantom)."""
     bcpd: Path = Path("runs/bcpd/bcpd")
     """The built program of the peer BCPD; where there is none it is left out (docs/peers.md)."""
     device: str = "auto"
@@ -86,7 +93,8 @@ def main(options: Options) -> None:
     if options.quick:
         document = out / "results.md"
         shutil.copyfile(options.document, document)
-    book = Book(document, "make results" + (" ARGS=--quick" if options.quick else ""))
+    given = shlex.join(sys.argv[1:])
+    book = Book(document, "make results" + (f" ARGS='{given}'" if given else ""))
     trainer = Trainer(out / "models", quick, plan.steps, options.device, report=Training().show)
     cells = CellStore(out / "cells")
     studied, second = _cases(options, out)
@@ -111,7 +119,8 @@ def _plan(options: Options) -> StudyPlan:
     plan = QUICK if options.quick else FULL
     if options.bcpd.is_file() and not options.quick:
         plan = msgspec.structs.replace(plan, peers=(*plan.peers, "bcpd"))
-    given = {"steps": options.steps, "seeds": options.seeds, "grid": options.grid}
+    names = ("steps", "seeds", "case_seeds", "configuration_seeds", "grid", "case_grid")
+    given = {name: getattr(options, name) for name in names}
     return msgspec.structs.replace(plan, **{k: v for k, v in given.items() if v is not None})
 
 

@@ -24,15 +24,20 @@ class StudyPlan(Config, frozen=True):
     """Which cells there are.
 
     ``accuracy`` (the paper's table of results) is measured at ``grid``, everything else at
-    ``coarse_grid``; networks always with every seed.
+    ``coarse_grid``. ``seeds`` are those of networks for the paper's phantom; other cases and the
+    deformation study may do with fewer, and a coarser grid (None: the same). Faults and views
+    take the first seed.
     """
 
     name: str
     steps: int = 12_000
     seeds: tuple[int, ...] = (0, 1, 2)
+    case_seeds: tuple[int, ...] | None = None
+    configuration_seeds: tuple[int, ...] | None = None
     variants: tuple[str, ...] = VARIANTS
     view: str = "noise"  # of every table but those of faults and views
     grid: int = 400
+    case_grid: int | None = None
     coarse_grid: int = 160
     configurations: tuple[int, ...] = (1, 2, 3, 4, 5, 6)
     configuration_variants: tuple[str, ...] = ("D0", "D1", "D2", "D3")
@@ -43,6 +48,12 @@ class StudyPlan(Config, frozen=True):
     fault_peers: tuple[str, ...] = ("elastic",)
     fault_variants: tuple[str, ...] = ("D1", "D2", "D3", "G1", "P1")
     views: tuple[str, ...] = VIEWS
+
+    def seeds_for(self, case: StudyCase) -> tuple[int, ...]:
+        return self.seeds if case.is_paper or self.case_seeds is None else self.case_seeds
+
+    def grid_for(self, case: StudyCase) -> int:
+        return self.grid if case.is_paper or self.case_grid is None else self.case_grid
 
 
 FULL = StudyPlan(name="full")
@@ -109,19 +120,18 @@ def scenes_of(plan: StudyPlan, section: Section) -> tuple[tuple[str, ...], tuple
 
 def _accuracy(plan: StudyPlan, case: StudyCase, methods: Methods) -> list[Job]:
     return [
-        Job(case, model, variant, plan.view, plan.grid)
-        for name in MODELS
-        for seed in plan.seeds
-        for model in [methods.model(case, name, seed)]
+        Job(case, model, variant, plan.view, plan.grid_for(case))
+        for model in _networks(plan, case, methods)
         for variant in plan.variants
     ]
 
 
 def _deformation(plan: StudyPlan, case: StudyCase, methods: Methods) -> list[Job]:
+    seeds = plan.seeds if plan.configuration_seeds is None else plan.configuration_seeds
     return [
         Job(case, model, variant, plan.configuration_view, plan.coarse_grid)
         for number in plan.configurations
-        for seed in plan.seeds
+        for seed in seeds
         for model in [methods.model(case, configuration_name(number), seed)]
         for variant in plan.configuration_variants
     ]
@@ -140,7 +150,7 @@ def _faults(plan: StudyPlan, case: StudyCase, methods: Methods) -> list[Job]:
     beside = [methods.peer(name, case) for name in plan.fault_peers if name in plan.peers]
     return [
         Job(case, method, variant, "clean", plan.coarse_grid, fault, seed)
-        for method in [*_networks(plan, case, methods, ("M_lim",)), *beside]
+        for method in [methods.model(case, "M_lim", plan.seeds_for(case)[0]), *beside]
         for fault in plan.faults
         for seed in (plan.fault_seeds if fault != "clean" else (0,))
         for variant in plan.fault_variants
@@ -150,13 +160,12 @@ def _faults(plan: StudyPlan, case: StudyCase, methods: Methods) -> list[Job]:
 def _views(plan: StudyPlan, case: StudyCase, methods: Methods) -> list[Job]:
     return [
         Job(case, method, variant, view, plan.coarse_grid)
-        for method in _networks(plan, case, methods)
+        for name in MODELS
+        for method in [methods.model(case, name, plan.seeds_for(case)[0])]
         for view in plan.views
         for variant in plan.variants
     ]
 
 
-def _networks(
-    plan: StudyPlan, case: StudyCase, methods: Methods, names: tuple[str, ...] = tuple(MODELS)
-) -> list[Network]:
-    return [methods.model(case, name, seed) for name in names for seed in plan.seeds]
+def _networks(plan: StudyPlan, case: StudyCase, methods: Methods) -> list[Network]:
+    return [methods.model(case, name, seed) for name in MODELS for seed in plan.seeds_for(case)]
