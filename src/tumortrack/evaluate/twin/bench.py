@@ -1,7 +1,12 @@
 """The apparatus of the paper's experiment as physics, with one case on it.
 
 Bench frame, mm: z up, towards the camera; the support is the plane z = 0, on which the organ
-stands as in its CT; its long axis lies along x, its middle at x = y = 0.
+stands as in its CT; its long axis lies along x, its middle at x = y = 0. Packing between support
+and organ fits the underside, as the body's own bed does: on a bare plane an organ that stands on
+its pole would first of all collapse, which says nothing of plates and instruments.
+
+The CT shows the organ at rest under its weight in that bed. Only what is added deforms it: loads,
+and weight that softened tissue no longer bears.
 
 Nothing here is shared with the deformations that networks are trained on.
 """
@@ -10,6 +15,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Bool, Float, Float64
@@ -20,15 +26,17 @@ from tumortrack.core.geometry import rigid, rotation_onto, transform_points
 from tumortrack.core.types import Anatomy, Mesh
 from tumortrack.evaluate.metrics import label_grid, surface_samples
 from tumortrack.evaluate.tets import TetMesh, embed, tetrahedralise
-from tumortrack.evaluate.twin.contact import Contact, Obstacle
+from tumortrack.evaluate.twin.contact import Contact, Obstacle, Packing, Support
 from tumortrack.evaluate.twin.equilibrium import (
     Convergence,
     Hold,
-    Preconditioner,
     Problem,
     settle,
 )
 from tumortrack.evaluate.twin.solid import Solid
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_matrix
 
 GRAVITY_KPA_PER_MM = 9.81e-6  # of 1 kg/m^3
 
@@ -41,6 +49,7 @@ class BenchConfig(Config, frozen=True, kw_only=True):
     poisson, density_kg_m3: nearly incompressible, water-like.
     edge_mm: of the tetrahedra.
     contact_kpa_mm: penalty per depth; pressures of a few kPa sink in by about 0.1 mm.
+    packing_kpa_mm: of what bears the underside: fat, foam.
     plate_mm: width of the plates along the organ; rounding_mm: of their edges.
     load_step_mm: plates and rod advance by this much at a time.
     """
@@ -49,8 +58,9 @@ class BenchConfig(Config, frozen=True, kw_only=True):
     tumor_ratio: float = 3.0
     poisson: float = 0.49
     density_kg_m3: float = 1050.0
-    edge_mm: float = 4.5
+    edge_mm: float = 5.5
     contact_kpa_mm: float = 300.0
+    packing_kpa_mm: float = 3.0
     plate_mm: float = 36.0
     rounding_mm: float = 4.0
     load_step_mm: float = 2.0
@@ -93,13 +103,11 @@ class Bench:
         ratio = 1 + (config.tumor_ratio - 1) * _tumor_share(self.mesh, self.anatomy)
         shear_kpa = config.youngs_kpa * ratio / (2 * (1 + config.poisson))
         self.solid = Solid(self.mesh, shear_kpa, config.poisson)
-        points_mm, areas_mm2, _ = surface_samples(self.anatomy.organ, spacing_mm=2.0)
-        kept = areas_mm2 > 0
-        self.contact = Contact(
-            embed(self.mesh, points_mm[kept]), areas_mm2[kept], config.contact_kpa_mm
-        )
+        points_mm, areas_mm2 = _contact_points(self.anatomy.organ)
+        self.contact = Contact(embed(self.mesh, points_mm), areas_mm2, config.contact_kpa_mm)
         volumes = self.solid.node_volumes_mm3
         self._weight_mn = config.density_kg_m3 * GRAVITY_KPA_PER_MM * volumes
+        self._packing = self._packed(points_mm, areas_mm2)
         self._hold = Hold(self.mesh.nodes_mm, volumes / volumes.sum())
 
     def carry(
@@ -111,17 +119,27 @@ class Bench:
         # The displacement is carried, not the point: D0 is then exact to the last digit.
         return points + moved.carry(state.nodes_mm - self.mesh.nodes_mm)
 
+    def _packed(
+        self, points_mm: np.ndarray, areas_mm2: np.ndarray
+    ) -> tuple[Contact, tuple[Obstacle, ...]]:
+        under = _faces_down(self.anatomy.organ, points_mm)
+        surface = embed(self.mesh, points_mm[under])
+        contact = Contact(surface, areas_mm2[under], self.config.packing_kpa_mm)
+        return contact, (Packing(points_mm[under, 2]),)
+
     def settle(
-        self, nodes_mm: np.ndarray, obstacles: tuple[Obstacle, ...], weight: float = 1.0
+        self, nodes_mm: np.ndarray, obstacles: tuple[Obstacle, ...], weight: float = 0.0
     ) -> tuple[np.ndarray, Convergence]:
-        """One load step: the nodes at rest among obstacles, under so many times their weight.
+        """One load step: the nodes at rest in their bed among obstacles, under so many weights
+        more than in the CT.
 
         Raises:
             TumortrackError: no equilibrium was found.
         """
         load = weight * self._weight_mn
-        problem = Problem(self.solid, self.contact, obstacles, load, self._hold)
-        return settle(problem, nodes_mm, self._preconditioner)
+        contacts = ((self.contact, (Support(), *obstacles)), self._packing)
+        problem = Problem(self.solid, contacts, load, self._hold)
+        return settle(problem, nodes_mm, self._stiffness)
 
     def midsection(self, nodes_mm: np.ndarray) -> tuple[float, float]:
         """Lowest and highest z of the surface under the middle half of the plates, mm."""
@@ -140,8 +158,8 @@ class Bench:
         return np.abs(at_rest[:, 0]) < self.config.plate_mm / 4
 
     @cached_property
-    def _preconditioner(self) -> Preconditioner:
-        return Preconditioner(self.solid.rest_stiffness())
+    def _stiffness(self) -> csr_matrix:
+        return self.solid.rest_stiffness()
 
 
 def _bench_from_ct(organ_ct: Mesh, up_lps: tuple[float, float, float]) -> np.ndarray:
@@ -152,6 +170,28 @@ def _bench_from_ct(organ_ct: Mesh, up_lps: tuple[float, float, float]) -> np.nda
     box = np.stack([f(organ_ct.vertices_mm @ rotation.T, axis=0) for f in (np.min, np.max)])
     middle = box.mean(0)
     return rigid(rotation, -np.array([middle[0], middle[1], box[0, 2]]))
+
+
+def _contact_points(
+    organ: Mesh, spacing_mm: float = 1.0
+) -> tuple[Float64[np.ndarray, "m 3"], Float64[np.ndarray, " m"]]:
+    """One point of the surface per cube of this size that it passes, and the area there."""
+    points_mm, areas_mm2, _ = surface_samples(organ, spacing_mm)
+    cubes = np.floor(points_mm / spacing_mm).astype(int)
+    _, first, cube = np.unique(cubes, axis=0, return_index=True, return_inverse=True)
+    return points_mm[first], np.bincount(cube.ravel(), areas_mm2)
+
+
+def _faces_down(
+    organ: Mesh, points_mm: Float64[np.ndarray, "m 3"], steepest: float = 1.5
+) -> Bool[np.ndarray, " m"]:
+    """Which points of the surface lie on its underside, where the slope is at most so much."""
+    from scipy.spatial import cKDTree
+
+    a, b, c = (organ.vertices_mm[organ.faces[:, i]] for i in range(3))
+    normal = np.cross(b - a, c - a)
+    down = -normal[:, 2] > np.linalg.norm(normal, axis=1) / np.hypot(1, steepest)
+    return np.asarray(down[cKDTree((a + b + c) / 3).query(points_mm)[1]])
 
 
 def _tumor_share(mesh: TetMesh, anatomy: Anatomy) -> Float64[np.ndarray, " t"]:

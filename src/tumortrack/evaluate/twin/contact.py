@@ -26,7 +26,7 @@ class Obstacle(Protocol):
     """A rigid body; frame and unit are the bench's (mm)."""
 
     def distance(self, points_mm: Points) -> tuple[Distances, Points]:
-        """Signed distance (negative inside) and its gradient, the outward unit normal."""
+        """Distance (negative inside) and its gradient: outwards, of length 1 where it is true."""
 
 
 @dataclass(frozen=True)
@@ -37,6 +37,17 @@ class Support:
 
     def distance(self, points_mm: Points) -> tuple[Distances, Points]:
         return points_mm[:, 2] - self.height_mm, np.tile([0.0, 0.0, 1.0], (len(points_mm), 1))
+
+
+@dataclass(frozen=True, eq=False)
+class Packing:
+    """Bears each point of a surface from below at the height where it lay; one height a point."""
+
+    heights_mm: Distances
+
+    def distance(self, points_mm: Points) -> tuple[Distances, Points]:
+        upwards = np.tile([0.0, 0.0, 1.0], (len(points_mm), 1))
+        return points_mm[:, 2] - self.heights_mm, upwards
 
 
 @dataclass(frozen=True)
@@ -109,7 +120,7 @@ class Contact:
     def depth_mm(self, nodes_mm: Points, obstacles: tuple[Obstacle, ...]) -> float:
         """How far the surface sinks into an obstacle at worst."""
         points = self.surface.carry(nodes_mm)
-        return max(0.0, *(float(-o.distance(points)[0].min()) for o in obstacles))
+        return max(0.0, *(-float(o.distance(points)[0].min()) for o in obstacles))
 
     def stiffness(self, nodes_mm: Points, obstacles: tuple[Obstacle, ...]) -> csr_matrix:
         """Hessian of the penalty, the obstacles' curvature left out: (3 n, 3 n), mN/mm."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -60,11 +60,13 @@ class Hold:
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """A solid among obstacles under its weight. Units: mm, kPa, mN, uJ."""
+    """A solid among obstacles under its weight. Units: mm, kPa, mN, uJ.
+
+    ``contacts``: surfaces (of a stiffness each) and the obstacles that push them back.
+    """
 
     solid: Solid
-    contact: Contact
-    obstacles: tuple[Obstacle, ...]
+    contacts: tuple[tuple[Contact, tuple[Obstacle, ...]], ...]
     weight_mn: Float64[np.ndarray, " n"]  # along -z
     hold: Hold | None = None
 
@@ -75,7 +77,7 @@ class Problem:
             return energy, gradient
         energy += float(self.weight_mn @ (nodes_mm - self.solid.mesh.nodes_mm)[:, 2])
         gradient[:, 2] += self.weight_mn
-        terms = [self.contact.energy(nodes_mm, self.obstacles)]
+        terms = [contact.energy(nodes_mm, obstacles) for contact, obstacles in self.contacts]
         if self.hold is not None:
             terms.append(self.hold.energy(nodes_mm))
         for more, slope in terms:
@@ -85,7 +87,7 @@ class Problem:
 
     def load_mn(self, nodes_mm: Nodes) -> float:
         """What unbalanced forces are measured against: weight and contact forces, summed."""
-        pushes = [self.contact.load_mn(nodes_mm, obstacle) for obstacle in self.obstacles]
+        pushes = [c.load_mn(nodes_mm, obstacle) for c, some in self.contacts for obstacle in some]
         return float(self.weight_mn.sum() + sum(np.linalg.norm(push) for push in pushes))
 
 
@@ -96,38 +98,8 @@ class Convergence:
     residual: float  # unbalanced force / load
 
 
-class Preconditioner:
-    """Factors of the rest stiffness and of the contacts at some moment; kept from one load step
-    to the next, since factorising takes as long as a hundred iterations."""
-
-    def __init__(self, rest_stiffness: csr_matrix) -> None:
-        self._rest = rest_stiffness
-        self._solve: Callable[[np.ndarray], np.ndarray] | None = None
-
-    def refresh(self, problem: Problem, nodes_mm: Nodes) -> None:
-        """Factorise with the contacts as they are now."""
-        from scipy.sparse import eye
-        from scipy.sparse.linalg import splu
-
-        # A little on the diagonal stands for the hold: it alone has no motion free of force.
-        ground = 1e-3 * self._rest.diagonal().mean()
-        matrix = self._rest + problem.contact.stiffness(nodes_mm, problem.obstacles)
-        self._solve = splu(
-            (matrix + ground * eye(matrix.shape[0])).tocsc(),
-            permc_spec="MMD_AT_PLUS_A",
-            diag_pivot_thresh=0.0,
-            options={"SymmetricMode": True},
-        ).solve
-
-    def solve(self, problem: Problem, nodes_mm: Nodes, right: np.ndarray) -> np.ndarray:
-        if self._solve is None:
-            self.refresh(problem, nodes_mm)
-        assert self._solve is not None
-        return self._solve(right)
-
-
 def settle(
-    problem: Problem, start_mm: Nodes, preconditioner: Preconditioner
+    problem: Problem, start_mm: Nodes, rest_stiffness: csr_matrix
 ) -> tuple[Nodes, Convergence]:
     """Nodes at rest, from a start in which no element is turned over.
 
@@ -136,17 +108,16 @@ def settle(
     """
     nodes, evaluations = start_mm, 0
     energy, gradient = problem.energy(nodes)
+    precondition = _factorised(problem, nodes, rest_stiffness)
     pairs: deque[tuple[np.ndarray, np.ndarray]] = deque(maxlen=_MEMORY)
     for iteration in range(_ITERATIONS):
         residual = float(np.linalg.norm(gradient)) / max(problem.load_mn(nodes), 1e-9)
         if residual < TOLERANCE:
             return nodes, Convergence(iteration, evaluations, residual)
         if iteration and iteration % _REFRESH_AFTER == 0:
-            preconditioner.refresh(problem, nodes)
+            precondition = _factorised(problem, nodes, rest_stiffness)
             pairs.clear()
-        step = -_two_loop(
-            gradient.ravel(), pairs, partial(preconditioner.solve, problem, nodes)
-        ).reshape(-1, 3)
+        step = -_two_loop(gradient.ravel(), pairs, precondition).reshape(-1, 3)
         slope = float((gradient * step).sum())
         share = min(1.0, _LONGEST_MM / float(np.abs(step).max()))
         while True:
@@ -181,6 +152,27 @@ def _two_loop(
     for (moved, turned), amount in zip(pairs, reversed(amounts), strict=True):
         out += (amount - (turned @ out) / (moved @ turned)) * moved
     return out
+
+
+def _factorised(
+    problem: Problem, nodes: Nodes, rest_stiffness: csr_matrix
+) -> Callable[[np.ndarray], np.ndarray]:
+    """Solves with the rest stiffness and the contacts as they are now."""
+    from scipy.sparse import eye
+    from scipy.sparse.linalg import splu
+
+    # A little on the diagonal stands for the hold: it alone has no motion free of force.
+    ground = 1e-3 * rest_stiffness.diagonal().mean()
+    matrix = rest_stiffness
+    for contact, obstacles in problem.contacts:
+        matrix = matrix + contact.stiffness(nodes, obstacles)
+    factors = splu(
+        (matrix + ground * eye(matrix.shape[0])).tocsc(),
+        permc_spec="MMD_AT_PLUS_A",
+        diag_pivot_thresh=0.0,
+        options={"SymmetricMode": True},
+    )
+    return factors.solve
 
 
 def _stuck(iteration: int, residual: float) -> str:
