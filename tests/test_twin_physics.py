@@ -16,8 +16,8 @@ from tumortrack.core.errors import InputError, TumortrackError
 from tumortrack.core.types import Anatomy, Mesh
 from tumortrack.evaluate.tets import TetMesh, embed, tetrahedralise
 from tumortrack.evaluate.twin.bench import Bench, BenchConfig
-from tumortrack.evaluate.twin.contact import Contact, Indenter, Plate, Support
-from tumortrack.evaluate.twin.equilibrium import Hold, Preconditioner, Problem, settle
+from tumortrack.evaluate.twin.contact import Contact, Indenter, Packing, Plate, Support
+from tumortrack.evaluate.twin.equilibrium import Hold, Problem, settle
 from tumortrack.evaluate.twin.solid import Solid
 from tumortrack.evaluate.twin.states import solve
 
@@ -95,9 +95,10 @@ def test_a_block_between_plates_follows_theory(poisson: float) -> None:
     nothing = np.zeros(len(mesh.nodes_mm))
     share = solid.node_volumes_mm3 / mesh.volumes_mm3.sum()
     above = Plate((10.0, 10.0, 16.0 + 10), (40.0, 40.0, 10.0), 1.0)
-    problem = Problem(solid, contact, (Support(), above), nothing, Hold(mesh.nodes_mm, share))
+    contacts = ((contact, (Support(), above)),)
+    problem = Problem(solid, contacts, nothing, Hold(mesh.nodes_mm, share))
     start = mesh.nodes_mm * [1.05, 1.05, 0.9]
-    nodes, about = settle(problem, start, Preconditioner(solid.rest_stiffness()))
+    nodes, about = settle(problem, start, solid.rest_stiffness())
     assert about.residual < 1e-3
 
     axial = float(np.ptp(nodes[:, 2])) / side
@@ -125,6 +126,8 @@ def test_obstacles_measure_true_distances() -> None:
     points = rng.uniform(-20, 20, (400, 3))
     plate = Plate((1.0, -2.0, 3.0), (8.0, 12.0, 5.0), 2.0)
     rod = Indenter((0.0, 0.0, -5.0), (0.0, 0.6, 0.8), 4.0)
+    packing = Packing(points[:, 2] - np.linspace(-3, 3, 400))
+    np.testing.assert_allclose(packing.distance(points)[0], np.linspace(-3, 3, 400), atol=1e-12)
     for obstacle in (plate, rod, Support(2.0)):
         distance, normal = obstacle.distance(points)
         assert (distance < 0).any()
@@ -179,6 +182,16 @@ def test_plates_close_by_what_the_state_says(bench: Bench, squeezed) -> None:
     assert np.ptp(surface[np.abs(surface[:, 0]) < 4, 2]) == pytest.approx(after, abs=0.5)
 
 
+def test_nothing_moves_until_something_is_added(bench: Bench) -> None:
+    nodes, about = bench.settle(bench.mesh.nodes_mm, ())
+    assert about.iterations == 0
+    np.testing.assert_array_equal(nodes, bench.mesh.nodes_mm)
+    heavier, about = bench.settle(bench.mesh.nodes_mm, (), weight=1.0)
+    assert about.iterations > 0
+    lowered = (bench.mesh.nodes_mm - heavier)[:, 2]
+    assert 0 < lowered.mean() < 1.0  # the packing bears it
+
+
 def test_going_on_from_less_compression_ends_where_a_fresh_start_does(
     bench: Bench, squeezed
 ) -> None:
@@ -204,7 +217,7 @@ def test_a_finer_mesh_says_the_same(bench: Bench, squeezed) -> None:
 
 def test_gravity_sinks_the_midsection_as_far_as_asked(bench: Bench) -> None:
     state = solve(bench, "G1")
-    assert state.report["sunk_mm"] == pytest.approx(2.0, abs=0.1)
+    assert state.report["sunk_mm"] == pytest.approx(2.0, abs=0.4)
     assert sum(state.report["sides_outwards_mm"]) > 0.3
     assert state.report["youngs_kpa"] < SMALL.youngs_kpa
     assert abs(state.report["volume_change"]) < 0.02
@@ -238,7 +251,7 @@ def test_a_stiffer_tumor_deforms_less() -> None:
 def test_a_load_that_finds_no_rest_is_an_error(bench: Bench) -> None:
     trap = (Plate((0.0, 0.0, 15.0), (100.0, 100.0, 14.9), 1.0),)  # swallows the organ whole
     with pytest.raises(TumortrackError, match="no equilibrium"):
-        bench.settle(bench.mesh.nodes_mm, (Support(), *trap), weight=1e6)
+        bench.settle(bench.mesh.nodes_mm, trap, weight=1e6)
 
 
 def test_the_twin_shares_no_code_with_the_training_deformations() -> None:

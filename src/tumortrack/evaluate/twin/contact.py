@@ -17,6 +17,8 @@ from tumortrack.evaluate.tets import Embedding
 if TYPE_CHECKING:
     from scipy.sparse import csr_matrix
 
+_TOUCHING_MM = 1e-6  # what just touches will push back
+
 Points = Float64[np.ndarray, "n 3"]
 Distances = Float64[np.ndarray, " n"]
 
@@ -131,7 +133,7 @@ class Contact:
         points = self.surface.carry(nodes_mm)
         for obstacle in obstacles:
             distance, normal = obstacle.distance(points)
-            hit = np.flatnonzero(distance < 0)
+            hit = np.flatnonzero(distance < _TOUCHING_MM)
             pull = (self.surface.weights[hit][..., None] * normal[hit][:, None]).reshape(-1, 12)
             unknowns = (3 * self.surface.nodes[hit][..., None] + np.arange(3)).reshape(-1, 12)
             rows = np.repeat(np.arange(len(hit)), 12)

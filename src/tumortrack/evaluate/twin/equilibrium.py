@@ -23,10 +23,11 @@ if TYPE_CHECKING:
     from scipy.sparse import csr_matrix
 
 TOLERANCE = 1e-3  # largest unbalanced force (2-norm over nodes), share of the load
+_LEAST_LOAD_MN = 1.0  # a tenth of a gram: less is no load
 _ITERATIONS = 1500
 _REFRESH_AFTER = 60  # iterations: by then other points touch than when it was factorised
 _MEMORY = 10
-_LONGEST_MM = 2.0  # step of any node
+_LONGEST_MM, _SHORTEST_MM = 2.0, 1e-9  # step of any node
 
 Nodes = Float64[np.ndarray, "n 3"]
 
@@ -111,7 +112,7 @@ def settle(
     precondition = _factorised(problem, nodes, rest_stiffness)
     pairs: deque[tuple[np.ndarray, np.ndarray]] = deque(maxlen=_MEMORY)
     for iteration in range(_ITERATIONS):
-        residual = float(np.linalg.norm(gradient)) / max(problem.load_mn(nodes), 1e-9)
+        residual = float(np.linalg.norm(gradient)) / max(problem.load_mn(nodes), _LEAST_LOAD_MN)
         if residual < TOLERANCE:
             return nodes, Convergence(iteration, evaluations, residual)
         if iteration and iteration % _REFRESH_AFTER == 0:
@@ -119,7 +120,8 @@ def settle(
             pairs.clear()
         step = -_two_loop(gradient.ravel(), pairs, precondition).reshape(-1, 3)
         slope = float((gradient * step).sum())
-        share = min(1.0, _LONGEST_MM / float(np.abs(step).max()))
+        longest = float(np.abs(step).max())
+        share = min(1.0, _LONGEST_MM / longest)
         while True:
             evaluations += 1
             trial = nodes + share * step
@@ -128,7 +130,7 @@ def settle(
             if trial_energy <= energy + 1e-4 * share * slope + 1e-12 * abs(energy):
                 break
             share /= 2
-            if share < 1e-9:
+            if share * longest < _SHORTEST_MM:
                 raise TumortrackError(_stuck(iteration, residual))
         moved, turned = (share * step).ravel(), (trial_gradient - gradient).ravel()
         if moved @ turned > 1e-10 * np.linalg.norm(moved) * np.linalg.norm(turned):
