@@ -73,6 +73,8 @@ class Options:
     """Of training for --case (the same as the phantom's)."""
     configuration_seeds: tuple[int, ...] | None = None
     """Of training in the deformation study (the same as the phantom's)."""
+    fault_seeds: tuple[int, ...] | None = None
+    """Of the random part of each fault."""
     grid: int | None = None
     """Voxels along the longest side, in the table of accuracy."""
     case_grid: int | None = None
@@ -119,7 +121,15 @@ def _plan(options: Options) -> StudyPlan:
     plan = QUICK if options.quick else FULL
     if options.bcpd.is_file() and not options.quick:
         plan = msgspec.structs.replace(plan, peers=(*plan.peers, "bcpd"))
-    names = ("steps", "seeds", "case_seeds", "configuration_seeds", "grid", "case_grid")
+    names = (
+        "steps",
+        "seeds",
+        "case_seeds",
+        "configuration_seeds",
+        "fault_seeds",
+        "grid",
+        "case_grid",
+    )
     given = {name: getattr(options, name) for name in names}
     return msgspec.structs.replace(plan, **{k: v for k, v in given.items() if v is not None})
 
