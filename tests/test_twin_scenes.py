@@ -50,9 +50,9 @@ HALF_HEIGHT = 28.0  # of the ellipsoid kidney along UP
 BENCH_FROM_CT = rigid(np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]), np.array([0, 0, HALF_HEIGHT]))
 REPORTS = {
     "D0": {"state": "D0"},
-    "D1": {"state": "D1", "by": 4.0, "plates_z_mm": [0.0, 52.0], "volume_change": 0.001},
-    "D2": {"state": "D2", "by": 8.0, "plates_z_mm": [0.0, 48.0], "volume_change": 0.001},
-    "D3": {"state": "D3", "by": 12.0, "plates_z_mm": [0.0, 44.0], "volume_change": 0.001},
+    "D1": {"state": "D1", "by": 4.0, "plate_z_mm": 52.0, "volume_change": 0.001},
+    "D2": {"state": "D2", "by": 8.0, "plate_z_mm": 48.0, "volume_change": 0.001},
+    "D3": {"state": "D3", "by": 12.0, "plate_z_mm": 44.0, "volume_change": 0.001},
     "G1": {"state": "G1", "by": 8.0},
     "P1": {
         "state": "P1",

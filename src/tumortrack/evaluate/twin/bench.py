@@ -50,8 +50,8 @@ class BenchConfig(Config, frozen=True, kw_only=True):
     edge_mm: of the tetrahedra.
     contact_kpa_mm: penalty per depth; pressures of a few kPa sink in by about 0.1 mm.
     packing_kpa_mm: of what bears the underside: fat, foam.
-    plate_mm: width of the plates along the organ; rounding_mm: of their edges.
-    load_step_mm: plates and rod advance by this much at a time.
+    plate_mm: width of the plate along the organ; rounding_mm: of its edges.
+    load_step_mm: the plate advances by this much at a time, the rod by half.
     """
 
     youngs_kpa: float = 15.0
@@ -142,7 +142,7 @@ class Bench:
         return settle(problem, nodes_mm, self._stiffness)
 
     def midsection(self, nodes_mm: np.ndarray) -> tuple[float, float]:
-        """Lowest and highest z of the surface under the middle half of the plates, mm."""
+        """Lowest and highest z of the surface under the middle half of the plate, mm."""
         z = self.contact.surface.carry(nodes_mm)[self._in_middle, 2]
         return float(z.min()), float(z.max())
 

@@ -142,21 +142,20 @@ def _paint(axes: Axes, tumors: list[Mesh], organ: Mesh, view: View, frame: Frame
 
 
 def _apparatus(axes: Axes, report: dict, view: View) -> None:
-    """Plates and rod, where the state has them; their far ends are left out."""
+    """Plate and rod, where the state has them; their far ends are left out."""
     from matplotlib.patches import FancyBboxPatch, Polygon
 
-    if "plates_z_mm" in report:
-        low, high = report["plates_z_mm"]
+    if "plate_z_mm" in report:
         left, right = axes.get_xlim()
         half = report["plate_mm"] / 2 if view is FROM_FRONT else 0.46 * (right - left)
         middle = 0.0 if view is FROM_FRONT else (left + right) / 2
         style = f"round,pad=0,rounding_size={report['rounding_mm']}"
-        for upper in (low, high + _PLATE_SHOWN_MM):
-            shape = FancyBboxPatch(
-                (middle - half, -upper), 2 * half, _PLATE_SHOWN_MM, boxstyle=style,
-                facecolor=_STEEL, edgecolor="0.3", alpha=0.8, zorder=4,
-            )  # fmt: skip
-            axes.add_patch(shape)
+        upper = report["plate_z_mm"] + _PLATE_SHOWN_MM
+        shape = FancyBboxPatch(
+            (middle - half, -upper), 2 * half, _PLATE_SHOWN_MM, boxstyle=style,
+            facecolor=_STEEL, edgecolor="0.3", alpha=0.8, zorder=4,
+        )  # fmt: skip
+        axes.add_patch(shape)
     if "poke" in report:
         tip, axis = np.array(report["poke"]["tip_mm"]), np.array(report["poke"]["axis"])
         radius = report["poke"]["radius_mm"]

@@ -107,7 +107,7 @@ def _compress(run: _Run, by_mm: float, warm: State | None) -> tuple[Nodes, dict]
         nodes = run.step(nodes, (above,), f"plate lowered by {amount:.1f} mm")
     now_low, now_high = bench.midsection(nodes)
     return nodes, {
-        "plates_z_mm": [low, high - by_mm],
+        "plate_z_mm": high - by_mm,
         "midsection_mm": [high - low, now_high - now_low],
         "plate_load_n": -float(bench.contact.load_mn(nodes, above)[2]) / 1000,
         "sunk_in_mm": bench.contact.depth_mm(nodes, (Support(), above)),
@@ -151,7 +151,8 @@ def _poke(run: _Run) -> tuple[Nodes, dict]:
     radius = config.poke_diameter_mm / 2
     x, y, z = poke_point(bench).tolist()
     nodes = bench.mesh.nodes_mm
-    for depth in np.linspace(0, config.poke_mm, round(config.poke_mm) + 1)[1:].tolist():
+    steps = max(1, round(2 * config.poke_mm / config.load_step_mm))
+    for depth in np.linspace(0, config.poke_mm, steps + 1)[1:].tolist():
         rod = Indenter((x, y, z - depth), (0.0, 0.0, 1.0), radius)
         nodes = run.step(nodes, (rod,), f"rod pressed in by {depth:.1f} mm")
     load_n = -float(bench.contact.load_mn(nodes, rod)[2]) / 1000
