@@ -30,7 +30,8 @@ from tumortrack.core.store import write_json
 from tumortrack.evaluate.study.book import Book, gallery_block, section_blocks
 from tumortrack.evaluate.study.cells import CellStore
 from tumortrack.evaluate.study.measure import Job, Status, StudyCase, measure
-from tumortrack.evaluate.study.models import Trainer
+from tumortrack.evaluate.study.methods import Network
+from tumortrack.evaluate.study.models import MODELS, Trainer
 from tumortrack.evaluate.study.peer_methods import peer_method
 from tumortrack.evaluate.study.phantoms import phantom_case, study_case
 from tumortrack.evaluate.study.plan import (
@@ -66,7 +67,9 @@ class Options:
     sections: tuple[Section, ...] = SECTIONS
     """Which blocks to make."""
     steps: int | None = None
-    """Of training, for every model."""
+    """Of training."""
+    configuration_steps: int | None = None
+    """Of training in the deformation study (as many as --steps)."""
     seeds: tuple[int, ...] | None = None
     """Of training."""
     case_seeds: tuple[int, ...] | None = None
@@ -97,11 +100,20 @@ def main(options: Options) -> None:
         shutil.copyfile(options.document, document)
     given = shlex.join(sys.argv[1:])
     book = Book(document, "make results" + (f" ARGS='{given}'" if given else ""))
-    trainer = Trainer(out / "models", quick, plan.steps, options.device, report=Training().show)
+    training = Training()
+    trainers = {
+        steps: Trainer(out / "models", quick, steps, options.device, report=training.show)
+        for steps in (plan.steps, plan.configuration_steps)
+    }
+
+    def model(case: StudyCase, name: str, seed: int) -> Network:
+        steps = plan.steps if name in MODELS else plan.configuration_steps
+        return trainers[steps].model(case, name, seed)
+
     cells = CellStore(out / "cells")
     studied, second = _cases(options, out)
     bcpd = options.bcpd if options.bcpd.is_file() else None
-    methods = Methods(cache(trainer.model), cache(lambda name, case: peer_method(name, case, bcpd)))
+    methods = Methods(cache(model), cache(lambda name, case: peer_method(name, case, bcpd)))
     for section in options.sections:
         cases = (second,) if section == "deformation" else studied
         for case in cases:
@@ -131,6 +143,7 @@ def _plan(options: Options) -> StudyPlan:
         "case_grid",
     )
     given = {name: getattr(options, name) for name in names}
+    given["configuration_steps"] = options.configuration_steps or options.steps
     return msgspec.structs.replace(plan, **{k: v for k, v in given.items() if v is not None})
 
 

@@ -31,6 +31,7 @@ class StudyPlan(Config, frozen=True):
 
     name: str
     steps: int = 12_000
+    configuration_steps: int = 12_000
     seeds: tuple[int, ...] = (0, 1, 2)
     case_seeds: tuple[int, ...] | None = None
     configuration_seeds: tuple[int, ...] | None = None
@@ -60,6 +61,7 @@ FULL = StudyPlan(name="full")
 QUICK = StudyPlan(
     name="quick",
     steps=800,
+    configuration_steps=800,
     seeds=(0,),
     variants=("D0", "D2", "G1"),
     grid=96,
