@@ -80,6 +80,8 @@ class Options:
     """Of the random part of each fault."""
     grid: int | None = None
     """Voxels along the longest side, in the table of accuracy."""
+    case_peers: tuple[str, ...] | None = None
+    """Peers for --case (as for the phantom)."""
     case_grid: int | None = None
     """The same for --case (as for the phantom)."""
     bcpd: Path = Path("runs/bcpd/bcpd")
@@ -116,6 +118,8 @@ def main(options: Options) -> None:
     methods = Methods(cache(model), cache(lambda name, case: peer_method(name, case, bcpd)))
     for section in options.sections:
         cases = (second,) if section == "deformation" else studied
+        if section in ("faults", "views"):
+            cases = studied[:1]
         for case in cases:
             _scenes(case, *scenes_of(plan, section))
         say(f"== {section}")
@@ -134,6 +138,7 @@ def _plan(options: Options) -> StudyPlan:
     if options.bcpd.is_file() and not options.quick:
         plan = msgspec.structs.replace(plan, peers=(*plan.peers, "bcpd"))
     names = (
+        "case_peers",
         "steps",
         "seeds",
         "case_seeds",

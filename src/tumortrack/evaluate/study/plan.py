@@ -25,8 +25,8 @@ class StudyPlan(Config, frozen=True):
 
     ``accuracy`` (the paper's table of results) is measured at ``grid``, everything else at
     ``coarse_grid``. ``seeds`` are those of networks for the paper's phantom; other cases and the
-    deformation study may do with fewer, and a coarser grid (None: the same). Faults and views
-    take the first seed.
+    deformation study may do with fewer, a coarser grid and fewer peers (None: the same). Faults
+    and views are measured on the paper's phantom alone, with the first seed.
     """
 
     name: str
@@ -44,6 +44,7 @@ class StudyPlan(Config, frozen=True):
     configuration_variants: tuple[str, ...] = ("D0", "D1", "D2", "D3")
     configuration_view: str = "noise"
     peers: tuple[str, ...] = ("rigid_bound", "rigid", "cpd", "elastic")
+    case_peers: tuple[str, ...] | None = None
     faults: tuple[str, ...] = FAULTS
     fault_seeds: tuple[int, ...] = (0, 1, 2)  # a shaft or a direction is drawn anew for each
     fault_peers: tuple[str, ...] = ("elastic",)
@@ -52,6 +53,9 @@ class StudyPlan(Config, frozen=True):
 
     def seeds_for(self, case: StudyCase) -> tuple[int, ...]:
         return self.seeds if case.is_paper or self.case_seeds is None else self.case_seeds
+
+    def peers_for(self, case: StudyCase) -> tuple[str, ...]:
+        return self.peers if case.is_paper or self.case_peers is None else self.case_peers
 
     def grid_for(self, case: StudyCase) -> int:
         return self.grid if case.is_paper or self.case_grid is None else self.case_grid
@@ -140,7 +144,7 @@ def _deformation(plan: StudyPlan, case: StudyCase, methods: Methods) -> list[Job
 
 
 def _peers(plan: StudyPlan, case: StudyCase, methods: Methods) -> list[Job]:
-    beside = [methods.peer(name, case) for name in plan.peers]
+    beside = [methods.peer(name, case) for name in plan.peers_for(case)]
     return [
         Job(case, method, variant, plan.view, plan.coarse_grid)
         for method in [*_networks(plan, case, methods), *beside]
