@@ -81,7 +81,11 @@ def error_per_variant(cells: list[dict], lies: dict[str, paper.Lie], path: Path)
     tumors, variants = tumors_of(cells), names(cells, "variant")
     drawing = new_figure(4.6 * len(tumors) + 2.4, 4.6)
     panels = drawing.subplots(1, len(tumors), sharey=True, squeeze=False)[0]
-    drawing.subplots_adjust(left=0.07, right=0.985, top=0.85, bottom=0.08, wspace=0.06)
+    narrow = len(tumors) == 1  # its legend takes two rows
+    drawing.subplots_adjust(
+        left=0.1 if narrow else 0.07, right=0.985, top=0.8 if narrow else 0.85, bottom=0.08,
+        wspace=0.06,
+    )  # fmt: skip
     for axes, tumor in zip(panels, tumors, strict=True):
         models = names(cells, "method")
         for number, model in enumerate(models):
@@ -101,7 +105,7 @@ def error_per_variant(cells: list[dict], lies: dict[str, paper.Lie], path: Path)
         handles=_legend(names(cells, "method")),
         loc="upper left",
         bbox_to_anchor=(0.06, 0.995),
-        ncols=5,
+        ncols=3 if narrow else 5,
         frameon=False,
         fontsize=10,
     )
