@@ -17,6 +17,7 @@ from tumortrack.app.presets import quick
 from tumortrack.core import store
 from tumortrack.core.errors import ArtifactError, InputError, NoEstimate
 from tumortrack.core.geometry import rigid
+from tumortrack.core.motion import OneWay
 from tumortrack.core.types import Anatomy, Mesh, SensorCloud
 from tumortrack.evaluate.peers.base import Fit, estimate_of, rigid_carry
 from tumortrack.evaluate.study import paper, tables
@@ -108,7 +109,7 @@ class Shifted(Method):
         estimate = estimate_of(fit, anatomy(), grid=grid)
         for part in self.without:
             del estimate.meshes[part]
-        return Answer(estimate, fit.seconds, fit.carry)
+        return Answer(replace(estimate, motion=OneWay(fit.carry)), fit.seconds)
 
 
 def jobs(case, method, grid=24):

@@ -26,7 +26,7 @@ from tumortrack.evaluate.metrics import label_grid
 from tumortrack.evaluate.protocol import evaluate_scenes
 from tumortrack.evaluate.twin import dataset
 from tumortrack.evaluate.twin.bench import State
-from tumortrack.evaluate.twin.dataset import TwinRun, draw_targets, make_scenes
+from tumortrack.evaluate.twin.dataset import TwinRun, make_scenes
 from tumortrack.evaluate.twin.faults import FAULTS, faulty
 from tumortrack.evaluate.twin.props import Rod, rod_mesh, shaft_over
 from tumortrack.evaluate.twin.variants import (
@@ -42,6 +42,7 @@ from tumortrack.imaging.case import Case, save_case
 from tumortrack.sense.camera import deproject
 from tumortrack.simulate.occupancy import contains, labels_of
 from tumortrack.simulate.scene_folder import list_scenes, read_scene
+from tumortrack.simulate.targets import draw_targets
 from tumortrack.track.estimate import Estimate
 
 UP = (0.0, -1.0, 0.0)

@@ -57,12 +57,14 @@ def write_scenes(case_folder: Path, dataset: Path, options: SimulateOptions) -> 
     from tumortrack.imaging.case import load_case
     from tumortrack.simulate.scene import SceneRecipe, Simulator
     from tumortrack.simulate.scene_folder import Scene, write_scene
+    from tumortrack.simulate.targets import draw_targets
 
     if options.scenes < 1:
         raise InputError(f"--scenes {options.scenes} must be at least 1.")
     case = load_case(case_folder)
     config = options.scene_config()
     simulator = Simulator(case.anatomy, case.up_lps, config)
+    targets = draw_targets(case.anatomy, options.seed)
     volumes = [part.volume_mm3 for part in case.anatomy.parts]
     about = {
         "case_sha256": store.sha256_of(case_folder / store.MANIFEST),
@@ -84,7 +86,8 @@ def write_scenes(case_folder: Path, dataset: Path, options: SimulateOptions) -> 
                     "deformation": stage.deformation.record(),
                 }
                 truth = simulator.reference(stage)
-                write_scene(folder, Scene(stage.cloud, truth, stage.frame, meta))
+                placed = targets.at(stage.carry(targets.points_ct))
+                write_scene(folder, Scene(stage.cloud, truth, stage.frame, meta, placed))
             advance()
 
 

@@ -131,9 +131,18 @@ def _webp(picture: Path) -> bytes:
 
 
 def _counts(summary: dict) -> str:
+    counts = f"{summary['scenes']} scenes, {summary['failed']} failed."
+    return f"{counts} Median mIoU {summary['miou']:.3f}.{_summary_targets(summary)}"
+
+
+def _summary_targets(summary: dict) -> str:
+    errors = summary.get("tre_mm")
+    if not errors:
+        return ""
+    mean, p95, largest = (_number(errors[key]) for key in ("mean", "p95", "max"))
     return (
-        f"{summary['scenes']} scenes, {summary['failed']} failed. "
-        f"Median mIoU {summary['miou']:.3f}."
+        f" Target registration error, medians over {errors['scenes']} scenes: mean {mean} mm, "
+        f"95th percentile {p95} mm, largest {largest} mm."
     )
 
 
@@ -141,11 +150,26 @@ def _note(entry: dict) -> str:
     seconds = entry.get("seconds")
     took = "" if seconds is None else f", located in {seconds:.2f} s"
     failed = "" if entry["failed"] is None else f", FAILED: {entry['failed']}"
-    return f"mIoU {entry['miou']:.3f}{took}{failed}"
+    errors = entry.get("tre_mm")
+    targets = "" if not errors else f", {target_text(errors)}"
+    return f"mIoU {entry['miou']:.3f}{targets}{took}{failed}"
+
+
+def target_text(errors: dict) -> str:
+    """A scene's target errors in a few words."""
+    return (
+        f"target error {errors['mean']:.1f} mm (mean of {errors['count']}, "
+        f"largest {errors['max']:.1f} mm)"
+    )
+
+
+def part_rows(summary: dict) -> dict[str, dict]:
+    """What the summary says of parts, by name."""
+    return {k: row for k, row in summary.items() if isinstance(row, dict) and "found" in row}
 
 
 def _summary_table(summary: dict) -> str:
-    parts = {name: part for name, part in summary.items() if isinstance(part, dict)}
+    parts = part_rows(summary)
     found = {name: f"{part['found']}/{part['scenes']}" for name, part in parts.items()}
     return _table(parts, found)
 

@@ -168,7 +168,9 @@ def _distances(entry: dict, name: str) -> str:
 
 def _headline(entry: dict) -> str:
     failed = "" if entry["failed"] is None else f"   {textwrap.shorten(entry['failed'], 60)}"
-    return f"{entry['name']}   mIoU {entry['miou']:.2f}{failed}"
+    errors = entry.get("tre_mm")
+    targets = f"   target error {errors['mean']:.1f} mm" if errors else ""
+    return f"{entry['name']}   mIoU {entry['miou']:.2f}{targets}{failed}"
 
 
 def _legend() -> list:

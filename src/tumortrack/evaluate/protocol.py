@@ -18,8 +18,9 @@ from tumortrack.evaluate.metrics import (
     label_ious,
     mean_iou,
     surface_distances,
+    target_errors,
 )
-from tumortrack.evaluate.page import PageScene, page_scene, write_page
+from tumortrack.evaluate.page import PageScene, page_scene, part_rows, write_page
 from tumortrack.evaluate.pictures import scene_picture
 from tumortrack.simulate.scene_folder import Scene, list_scenes, read_scene
 from tumortrack.track.estimate import Estimate
@@ -37,8 +38,10 @@ DISTANCES = (
 RULE = (
     "Medians over all scenes that have the part. A part that was not found counts as infinitely "
     "far and with IoU 0; a median that is infinite is written as null. A scene with a part "
-    "missing counts as failed; where nothing was found its mIoU is 0."
+    "missing counts as failed; where nothing was found its mIoU is 0 and its target errors are "
+    "infinite."
 )
+TARGET_ERRORS = ("mean", "rms", "median", "p95", "max")
 Locate = Callable[[SensorCloud], Estimate]
 Progress = Callable[[int, int, str], None]
 
@@ -102,13 +105,18 @@ def evaluate_scenes(
 
 
 def evaluate_scene(locate: Locate, scene: Scene, name: str) -> tuple[dict, Estimate | None]:
-    """One scene's entry: name, parts -> metrics, miou, seconds, timings, and failed (or null)."""
+    """One scene's entry: name, parts -> metrics, miou, seconds, timings, and failed (or null).
+
+    ``tre_mm`` is there where the scene has targets and the estimate a motion; null where the scene
+    has targets and nothing was found.
+    """
     start = time.perf_counter()
     try:
         estimate = locate(scene.cloud)
     except (NoEstimate, InputError) as error:
         parts = {part: {"found": False, "iou": 0.0} for part in scene.reference.names}
-        return {"name": name, "parts": parts, "miou": 0.0, "failed": str(error)}, None
+        entry = {"name": name, "parts": parts, "miou": 0.0, "failed": str(error)}
+        return (entry if scene.targets is None else {**entry, "tre_mm": None}), None
     seconds = time.perf_counter() - start
     parts = compare(estimate, scene)
     missing = [part for part, metrics in parts.items() if not metrics["found"]]
@@ -120,6 +128,8 @@ def evaluate_scene(locate: Locate, scene: Scene, name: str) -> tuple[dict, Estim
         "timings": estimate.report.get("timings", {}),
         "failed": f"not found: {', '.join(missing)}" if missing else None,
     }
+    if estimate.motion is not None and scene.targets is not None:
+        entry["tre_mm"] = target_errors(estimate.motion, scene.targets)
     return entry, estimate
 
 
@@ -148,7 +158,8 @@ def compare(estimate: Estimate, scene: Scene) -> dict[str, dict]:
 def summarise(entries: list[dict]) -> dict:
     """Medians per part, ``miou`` (median over scenes), ``failed`` and ``scenes`` (counts).
 
-    The rule for parts that were not found is ``RULE``.
+    ``tre_mm`` holds the medians of the scenes' target errors and how many ``scenes`` count, where
+    the method knows a motion. The rule for parts that were not found is ``RULE``.
     """
     summary: dict = {}
     names = sorted({part for entry in entries for part in entry["parts"]}, key=_part_order)
@@ -161,6 +172,12 @@ def summarise(entries: list[dict]) -> dict:
             "found": sum(row["found"] for row in rows),
             "scenes": len(rows),
         }
+    errors = [entry["tre_mm"] for entry in entries if "tre_mm" in entry]
+    if any(errors):
+        medians = {
+            key: _median([(e or {}).get(key, np.inf) for e in errors]) for key in TARGET_ERRORS
+        }
+        summary["tre_mm"] = {**medians, "scenes": len(errors)}
     summary["miou"] = _median([entry["miou"] for entry in entries])
     summary["miou_mean"] = float(np.mean([entry["miou"] for entry in entries]))
     summary["failed"] = sum(entry["failed"] is not None for entry in entries)
@@ -175,17 +192,21 @@ def summary_table(report: dict) -> Table:
     summary = report["summary"]
     table = Table(
         title=f"{summary['scenes']} scenes, {summary['failed']} failed, "
-        f"mIoU {summary['miou']:.3f} (medians)"
+        f"mIoU {summary['miou']:.3f}{_targets_text(summary)} (medians)"
     )
     table.add_column("part")
     for head in ("found", "HD mm", "one-sided", "HD95", "surface", "centre", "IoU"):
         table.add_column(head, justify="right")
-    for name, part in summary.items():
-        if isinstance(part, dict):
-            numbers = [_text(part[key], 1 if key != "surface_mm" else 2) for key in DISTANCES]
-            found = f"{part['found']}/{part['scenes']}"
-            table.add_row(name, found, *numbers, _text(part["iou"], 2))
+    for name, part in part_rows(summary).items():
+        numbers = [_text(part[key], 1 if key != "surface_mm" else 2) for key in DISTANCES]
+        found = f"{part['found']}/{part['scenes']}"
+        table.add_row(name, found, *numbers, _text(part["iou"], 2))
     return table
+
+
+def _targets_text(summary: dict) -> str:
+    errors = summary.get("tre_mm")
+    return f", target error {_text(errors['mean'], 1)} mm" if errors else ""
 
 
 def _text(value: float | None, digits: int) -> str:

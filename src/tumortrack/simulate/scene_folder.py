@@ -1,7 +1,8 @@
 """One scene on disk: what the sensor saw and the truth, in files that other programs can make.
 
 cloud.ply (camera frame, mm), depth.png (16 bit, steps of 0.1 mm) with intrinsics.json, kidney.ply,
-tumor_1.ply, ... (the truth, camera frame, mm) and meta.json. Depth and meta.json may be absent.
+tumor_1.ply, ... (the truth, camera frame, mm), targets.csv (inner points in both frames) and
+meta.json. Depth, targets and meta.json may be absent.
 """
 
 from __future__ import annotations
@@ -23,10 +24,12 @@ from tumortrack.sense.files import (
     write_depth_png,
     write_intrinsics,
 )
+from tumortrack.simulate.targets import Targets, read_targets, write_targets
 
 # Our own scenes say in meta.json that kidney.ply is the whole organ, tumors included.
 _UNITED = "organ_includes_tumors"
 _STAMP = "stamp_ns"
+_TARGETS = "targets.csv"
 # Of a tumor's volume: smoothing alone lets a surface stick out by less than this.
 _STICKS_OUT = 0.02
 _ORGAN_SIZE_MM = (5.0, 1000.0)
@@ -37,13 +40,15 @@ class Scene:
     """An observed cloud and the truth behind it, camera frame, mm.
 
     ``reference.parts[0]`` is the whole organ, tumors included. ``depth`` is the image that the
-    cloud was taken from, where it is known; ``meta`` is plain JSON (recipe, origin, ...).
+    cloud was taken from, where it is known; ``meta`` is plain JSON (recipe, origin, ...);
+    ``targets`` are inner points whose way from the CT is known.
     """
 
     cloud: SensorCloud
     reference: Anatomy
     depth: DepthFrame | None = None
     meta: dict = field(default_factory=dict)
+    targets: Targets | None = None
 
 
 def write_scene(folder: Path, scene: Scene) -> None:
@@ -68,6 +73,8 @@ def write_scene_files(folder: Path, scene: Scene) -> None:
         write_depth_png(folder / "depth.png", scene.depth)
         write_intrinsics(folder / "intrinsics.json", scene.depth.intrinsics)
     write_anatomy(folder, scene.reference)
+    if scene.targets is not None:
+        write_targets(folder / _TARGETS, scene.targets)
     meta = {**scene.meta, "units": "mm", "frame": "camera", _STAMP: scene.cloud.stamp_ns}
     write_json(folder / "meta.json", {**meta, _UNITED: True})
 
@@ -99,7 +106,9 @@ def read_scene(folder: Path) -> Scene:
     if not isinstance(stamp_ns, int):
         raise InputError(f"{folder / 'meta.json'}: {_STAMP} must be a whole number of ns.")
     cloud, _ = read_cloud(folder / "cloud.ply")
-    return Scene(SensorCloud(cloud.points_mm, stamp_ns), reference, _depth(folder), meta)
+    targets = read_targets(folder / _TARGETS) if (folder / _TARGETS).exists() else None
+    cloud = SensorCloud(cloud.points_mm, stamp_ns)
+    return Scene(cloud, reference, _depth(folder), meta, targets)
 
 
 def list_scenes(folder: Path) -> list[Path]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from tumortrack.core.motion import Motion
 from tumortrack.core.types import CameraLabels, Mesh, OccupancyCloud
 
 
@@ -14,9 +15,11 @@ class Estimate:
     ``meshes`` maps kidney, tumor_1, ... to closed surfaces; a part that was not found is absent.
     The kidney's surface is the whole organ, tumors included, as in ``Anatomy``. ``report`` is
     plain JSON: per part volume, centre, box and probability, and ``timings`` in seconds.
+    ``motion`` says where every point of the CT is, where the method knows that.
     """
 
     cloud: OccupancyCloud
     volume: CameraLabels
     meshes: dict[str, Mesh]
     report: dict
+    motion: Motion | None = None

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
+
 from tumortrack.core import store
 from tumortrack.core.mesh_files import write_mesh
 from tumortrack.imaging.volume import write_labels_nifti
@@ -12,8 +14,9 @@ from tumortrack.track.estimate import Estimate
 
 
 def write_estimate(folder: Path, estimate: Estimate, overwrite: bool = False) -> None:
-    """occupancy.ply (points with label and probability), labels.nii.gz (voxel -> camera frame,
-    mm), kidney.ply, tumor_1.ply, ... and report.json; all or nothing.
+    """occupancy.ply (points with label and probability and, where the estimate knows the way
+    back, their place in the CT), labels.nii.gz (voxel -> camera frame, mm), kidney.ply,
+    tumor_1.ply, ... and report.json; all or nothing.
 
     Raises:
         InputError: the folder exists and ``overwrite`` is False.
@@ -26,6 +29,7 @@ def write_estimate(folder: Path, estimate: Estimate, overwrite: bool = False) ->
             cloud.points_mm,
             label=cloud.labels,
             probability=cloud.probability,
+            **_places_in_ct(estimate),
         )
         volume = estimate.volume
         write_labels_nifti(
@@ -35,3 +39,13 @@ def write_estimate(folder: Path, estimate: Estimate, overwrite: bool = False) ->
             write_mesh(aside / f"{name}.ply", mesh)
         store.write_json(aside / "report.json", estimate.report)
         store.seal(aside, "run", {"report": "report.json"}, frame="camera")
+
+
+def _places_in_ct(estimate: Estimate) -> dict[str, np.ndarray]:
+    """ct_x, ct_y, ct_z (LPS, mm) of the cloud's points; empty where they are not known."""
+    if estimate.motion is None:
+        return {}
+    points_ct = estimate.motion.back(estimate.cloud.points_mm.astype(np.float64))
+    if points_ct is None:
+        return {}
+    return {f"ct_{axis}": points_ct[:, n].astype(np.float32) for n, axis in enumerate("xyz")}

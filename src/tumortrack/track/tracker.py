@@ -45,6 +45,12 @@ class Tracker:
         self._device = next(model.network.parameters()).device
         self._bf16 = has_fast_bfloat16(self._device)
 
+    @property
+    def organ_box_ct(self) -> Box | None:
+        """The organ's box in the CT (LPS, mm: lower and upper corner) if this model's estimates
+        have a motion; None for models that know no correspondences."""
+        return None
+
     @torch.inference_mode()
     def locate(self, cloud: SensorCloud, grid: int = 160, seed: int = 0) -> Estimate:
         """Everything about one cloud; the same cloud and seed give the same answer.

@@ -136,7 +136,7 @@ def measure_one(job: Job, name: str) -> dict:
         "locate_s": entry.get("seconds"),
         "prepare_s": job.method.prepare_s,
         "points": _points(job, scene, estimate) if estimate else {},
-        "targets_mm": _target_errors(job, answer) if answer else None,
+        "targets_mm": entry.get("tre_mm"),
         "method": job.method.about,
         "provenance": provenance(job.method.device),
     }
@@ -146,26 +146,6 @@ def _points(job: Job, scene: Scene, estimate: Estimate) -> dict:
     clean = job.case.scene(job.variant, CLEAN_VIEW)
     seen = read_scene(clean) if clean.is_dir() else scene
     return point_errors(scene.reference, job.case.anatomy_ct, visible_points(seen), estimate.meshes)
-
-
-def _target_errors(job: Job, answer: Answer) -> dict | None:
-    """Mean, root mean square and largest target error, where a method carries points and the
-    scene has targets.csv."""
-    path = job.case.scene(job.variant, job.view) / "targets.csv"
-    if answer.carry is None or not path.is_file():
-        return None
-    table = np.genfromtxt(path, delimiter=",", names=True, dtype=None, encoding="utf-8")
-    ct, camera = (
-        np.stack([table[f"{frame}_{axis}"] for axis in "xyz"], axis=1).astype(float)
-        for frame in ("ct", "camera")
-    )
-    error = np.linalg.norm(answer.carry(ct) - camera, axis=1)
-    return {
-        "mean": float(error.mean()),
-        "rms": float(np.sqrt((error**2).mean())),
-        "max": float(error.max()),
-        "count": len(error),
-    }
 
 
 class Hashes:

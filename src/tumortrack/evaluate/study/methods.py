@@ -3,13 +3,9 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-
-import numpy as np
-from jaxtyping import Float
 
 from tumortrack.core import store
 from tumortrack.learn.model import Model, load_model
@@ -17,20 +13,15 @@ from tumortrack.simulate.scene_folder import Scene
 from tumortrack.track.estimate import Estimate
 from tumortrack.track.tracker import Tracker
 
-Carry = Callable[[Float[np.ndarray, "n 3"]], Float[np.ndarray, "n 3"]]
-
-
 LIVE_STAGES = ("encode", "coarse", "fine")  # what a live frame takes; the dense volume is extra
 
 
 @dataclass(frozen=True)
 class Answer:
-    """An estimate, what a live frame of it costs, and the map from CT points to camera points
-    where the method has one."""
+    """An estimate, and what a live frame of it costs."""
 
     estimate: Estimate
     frame_s: float
-    carry: Carry | None = None
 
 
 class Method(ABC):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import ast
 import hashlib
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from importlib.metadata import version
 from pathlib import Path
@@ -15,6 +15,7 @@ import tumortrack
 from tumortrack.core import store
 from tumortrack.core.config import Config, to_builtins
 from tumortrack.core.errors import InputError
+from tumortrack.core.motion import OneWay
 from tumortrack.core.types import Anatomy
 from tumortrack.evaluate.peers.base import estimate_of
 from tumortrack.evaluate.study.measure import StudyCase
@@ -78,7 +79,7 @@ class PeerMethod(Method):
     def locate(self, scene: Scene, grid: int) -> Answer:
         fit = self._peer.fit(scene)
         estimate = estimate_of(fit, self._anatomy_ct, scene.cloud.stamp_ns, grid)
-        return Answer(estimate, fit.seconds, fit.carry)
+        return Answer(replace(estimate, motion=OneWay(fit.carry)), fit.seconds)
 
 
 @cache

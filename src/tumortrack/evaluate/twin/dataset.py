@@ -9,15 +9,12 @@ SCENES/
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Float64, UInt8
 
 from tumortrack.core import store
 from tumortrack.core.config import to_builtins
@@ -38,23 +35,14 @@ from tumortrack.evaluate.twin.variants import (
     make_scene,
 )
 from tumortrack.imaging.case import load_case
-from tumortrack.simulate.occupancy import contains, labels_of
 from tumortrack.simulate.scene_folder import write_scene_files
+from tumortrack.simulate.targets import TARGETS, InnerPoints, draw_targets
 
 KIND = "twin"
-TARGETS = 200
 _STATES = "states"
 _STATE_SHARE = 15.0  # a state takes about as long as so many scenes
 
 Build = Callable[[Anatomy, tuple[float, float, float], BenchConfig], Any]
-
-
-@dataclass(frozen=True)
-class Targets:
-    """Points inside the undeformed anatomy, CT frame (LPS), mm, with their labels."""
-
-    points_ct: Float64[np.ndarray, "n 3"]
-    labels: UInt8[np.ndarray, " n"]
 
 
 @dataclass(frozen=True)
@@ -124,38 +112,6 @@ def make_scenes(
     return [out / f"{v}-{w}" for v, w in wanted]
 
 
-def draw_targets(anatomy_ct: Anatomy, seed: int, count: int = TARGETS) -> Targets:
-    """Points spread evenly inside each part: half of them in the parenchyma, the others shared
-    by the tumors (all in the organ where it has none).
-
-    Raises:
-        InputError: a tumor that others cover.
-    """
-    rng = np.random.default_rng([seed, 1000])
-    n_tumors = len(anatomy_ct.tumors)
-    inside = count // 2 if n_tumors else count
-    each = np.full(n_tumors, (count - inside) // max(n_tumors, 1))
-    each[: count - inside - each.sum()] += 1
-    points, labels = [], []
-    for label, (part, wanted) in enumerate(
-        zip(anatomy_ct.parts, [inside, *each.tolist()], strict=True), start=1
-    ):
-        found = np.zeros((0, 3))
-        for _ in range(40):
-            if len(found) >= wanted:
-                break
-            low, high = part.box_mm
-            drawn = low + rng.random((4 * count, 3)) * (high - low)
-            drawn = drawn[contains(part, drawn)]
-            found = np.concatenate([found, drawn[labels_of(anatomy_ct, drawn) == label]])
-        else:
-            name = anatomy_ct.names[label - 1]
-            raise InputError(f"{name} has no room for target points: other tumors cover it.")
-        points.append(found[:wanted])
-        labels.append(np.full(wanted, label, np.uint8))
-    return Targets(np.concatenate(points), np.concatenate(labels))
-
-
 def seal_scenes(out: Path, identity: dict) -> None:
     """Write the manifest over all finished scenes.
 
@@ -208,7 +164,7 @@ def _write(
     folder: Path,
     settled: Settled,
     run: TwinRun,
-    targets: Targets,
+    targets: InnerPoints,
     anatomy_ct: Anatomy,
     identity: dict,
 ) -> None:
@@ -217,10 +173,9 @@ def _write(
     height_mm = float(np.ptp(anatomy_ct.organ.vertices_mm @ settled.bench_from_ct[2, :3]))
     config = for_organ(run.view, height_mm)
     scene, targets_mm = make_scene(settled, variant, view, config, run.seed)  # type: ignore[arg-type]
-    scene = replace(scene, meta={**identity, **scene.meta})
+    scene = replace(scene, meta={**identity, **scene.meta}, targets=targets.at(targets_mm))
     with store.new_folder(folder) as aside:
         write_scene_files(aside, scene)
-        store.write_atomically(aside / "targets.csv", _table(targets, targets_mm))
         rest = anatomy_ct.organ
         rest = rest.moved(transform_points(settled.bench_from_ct, rest.vertices_mm))
         twin_picture(scene, settled, rest, aside / "scene.png")
@@ -240,13 +195,3 @@ class _Pace:
     def add(self, amount: float, text: str) -> None:
         self._done += amount
         self.say(text)
-
-
-def _table(targets: Targets, camera_mm: Float[np.ndarray, "n 3"]) -> bytes:
-    stream = io.StringIO()
-    writer = csv.writer(stream, lineterminator="\n")
-    frames = [f"{frame}_{axis}" for frame in ("ct", "camera") for axis in "xyz"]
-    writer.writerow(["label", *frames])
-    for label, ct, camera in zip(targets.labels, targets.points_ct, camera_mm, strict=True):
-        writer.writerow([int(label), *(f"{value:.5f}" for value in (*ct, *camera))])
-    return stream.getvalue().encode()

@@ -6,6 +6,7 @@ They answer what the paper could not: how much of the error is the sensor's.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Literal, get_args
 
 import numpy as np
@@ -81,14 +82,17 @@ def faulty(clean: Scene, fault: str, seed: int) -> Scene:
     cloud = clean.cloud
     if frame is not clean.depth:
         cloud = cloud_from_depth(frame, config.crop, np.random.default_rng([seed, len(FAULTS)]))
-    reference, meta = clean.reference, {**clean.meta, "fault": fault, "fault_seed": seed}
+    reference, targets = clean.reference, clean.targets
+    meta = {**clean.meta, "fault": fault, "fault_seed": seed}
     if fault in ("registration", "all"):
         moved = registration_error(clean.reference, _rng(seed, "registration"))
         reference = Anatomy(
             tuple(p.moved(transform_points(moved, p.vertices_mm)) for p in reference.parts)
         )
+        if targets:
+            targets = replace(targets, points_mm=transform_points(moved, targets.points_mm))
         meta["registration"] = moved.tolist()
-    return Scene(cloud, reference, frame, meta)
+    return Scene(cloud, reference, frame, meta, targets)
 
 
 def registration_error(reference: Anatomy, rng: np.random.Generator) -> Float64[np.ndarray, "4 4"]:
