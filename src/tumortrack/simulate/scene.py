@@ -7,6 +7,7 @@ its sums, and the exponential of a drag, as the processor likes.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
@@ -24,10 +25,12 @@ from tumortrack.core.types import (
     OccupancySamples,
     SensorCloud,
 )
+from tumortrack.sense.calibration import CalibrationConfig, miscalibrate
 from tumortrack.sense.camera import d405, project
-from tumortrack.sense.cloud import CloudConfig, cloud_from_depth
+from tumortrack.sense.cloud import FEWEST_POINTS, CloudConfig, cloud_from_depth
 from tumortrack.sense.clutter import ClutterConfig, add_clutter
 from tumortrack.sense.noise import NoiseConfig, add_noise
+from tumortrack.sense.occlusion import OcclusionConfig, occlude
 from tumortrack.sense.render import Visibility, render_depth
 from tumortrack.simulate.deform import DeformConfig, DragConfig
 from tumortrack.simulate.deform.base import Deformation, View
@@ -42,7 +45,8 @@ class SceneConfig(Config, frozen=True):
 
     A share ``free_range`` of them is seen from any distance and not cropped by depth: a cloud
     that a user has freed of its background himself. The others follow the paper: near 15 cm,
-    cropped to 11..15 cm.
+    cropped to 11..15 cm. With ``cloud_points`` each scene's cloud has at most a number of points
+    drawn from that range, evenly on a logarithmic scale, instead of ``cloud.n_points``.
     """
 
     width: int = 424
@@ -55,6 +59,19 @@ class SceneConfig(Config, frozen=True):
     occupancy: OccupancyConfig = OccupancyConfig()
     free_range: float = 0.0
     free_nearest_mm: tuple[float, float] = (80.0, 250.0)
+    occlusion: OcclusionConfig = OcclusionConfig()
+    calibration: CalibrationConfig = CalibrationConfig()
+    cloud_points: tuple[int, int] | None = None
+
+    def __post_init__(self) -> None:
+        if self.cloud_points is None:
+            return
+        fewest, most = self.cloud_points
+        if not FEWEST_POINTS <= fewest <= most:
+            raise InputError(
+                f"cloud_points is {fewest}..{most}; it must be a rising range from "
+                f"{FEWEST_POINTS} points up."
+            )
 
 
 @dataclass(frozen=True)
@@ -151,11 +168,21 @@ class Simulator:
         vertices = transform_points(camera_from_ct, deformation.apply(organ.vertices_mm))
         frame = render_depth(vertices, organ.faces, self._intrinsics)
         frame = add_clutter(frame, config.clutter, rng)
+        frame = occlude(frame, config.occlusion, rng)  # hides background too
+        frame = miscalibrate(frame, config.calibration, rng)
         frame = add_noise(frame, config.noise, rng)
-        crop = config.cloud
-        if free:
-            crop = CloudConfig(near_mm=1.0, far_mm=1e4, n_points=crop.n_points)
+        crop = _crop(config, free, rng)
         return Stage(camera_from_ct, deformation, frame, cloud_from_depth(frame, crop, rng))
+
+
+def _crop(config: SceneConfig, free: bool, rng: np.random.Generator) -> CloudConfig:
+    """What of this scene's image becomes the cloud."""
+    near_mm, far_mm = (1.0, 1e4) if free else (config.cloud.near_mm, config.cloud.far_mm)
+    n_points = config.cloud.n_points
+    if config.cloud_points is not None:
+        fewest, most = config.cloud_points
+        n_points = round(math.exp(rng.uniform(math.log(fewest), math.log(most))))
+    return CloudConfig(near_mm=near_mm, far_mm=far_mm, n_points=n_points)
 
 
 def _visible_from(

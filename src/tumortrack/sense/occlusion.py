@@ -1,0 +1,180 @@
+"""What lies between camera and organ: instrument shafts, patches of fat, drapes.
+
+They are taken to be segmented out, so the organ has no return there; a segmentation that misses
+one end of them leaves its points in. Works on the image alone, in pixels and the organ's own width.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Float32, Int32
+
+from tumortrack.core.config import Config
+from tumortrack.core.errors import InputError
+from tumortrack.core.types import DepthFrame
+
+_LOOK_AT = 200  # pixels tell where the organ lies
+_STEEPEST = 0.6  # slope of what is left in: 30 degrees
+_MOST_SHAFTS, _MOST_PATCHES = 2, 2
+_CROSSES = 0.25  # share of shafts that go on over the whole organ
+_WIDER = 0.3  # a shaft that rises towards the camera looks wider by up to this an organ's width
+_WAVES = 3
+_PATCHES_ALONE, _SHAFTS_ALONE = 0.4, 0.2  # shares of images; the others have both
+
+
+class OcclusionConfig(Config, frozen=True, kw_only=True):
+    """How much of the organ is hidden; zero ``scenes`` or ``largest_share`` switches it off.
+
+    scenes: share of images with something before the organ.
+    largest_share: of the visible pixels that are hidden there; each image draws its share
+        uniformly up to it (shafts alone may hide less than drawn).
+    left_in: of the hidden pixels, at most this share shows the occluder instead of nothing; each
+        image draws its share uniformly up to it.
+    shaft_mm: widths of shafts, at the organ's depth.
+    nearer_mm: how much nearer than the organ, on the same line of sight, what is left in lies.
+    """
+
+    scenes: float = 0.0
+    largest_share: float = 0.0
+    left_in: float = 0.0
+    shaft_mm: tuple[float, float] = (3.0, 12.0)
+    nearer_mm: tuple[float, float] = (5.0, 40.0)
+
+    def __post_init__(self) -> None:
+        for name, most in (("scenes", 1.0), ("largest_share", 0.9), ("left_in", 1.0)):
+            value = getattr(self, name)
+            if not 0 <= value <= most:
+                raise InputError(f"occlusion {name} is {value}; allowed: 0 (off) to {most:g}.")
+        for name in ("shaft_mm", "nearer_mm"):
+            low, high = getattr(self, name)
+            if not 0 < low <= high < np.inf:
+                raise InputError(
+                    f"occlusion {name} is {low:g}..{high:g}; it must be a range of positive mm."
+                )
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """The pixels with a return, and where they lie in the image."""
+
+    columns: Int32[np.ndarray, " n"]
+    rows: Int32[np.ndarray, " n"]
+    depth_mm: Float32[np.ndarray, " n"]
+    some: Float[np.ndarray, "k 2"]  # (column, row) of a few
+    width_px: float
+    focal_px: float
+
+
+def occlude(frame: DepthFrame, config: OcclusionConfig, rng: np.random.Generator) -> DepthFrame:
+    """The frame without what lies behind shafts, patches, or both.
+
+    Occlusion has random numbers of its own: ``rng`` is left as it was, and so is the rest of the
+    scene. Where it is off, nothing is drawn and the frame itself comes back.
+    """
+    if config.scenes == 0 or config.largest_share == 0:
+        return frame
+    rng = rng.spawn(1)[0]
+    if rng.uniform() >= config.scenes:
+        return frame
+    seen = _look(frame, rng)
+    most = int(rng.uniform(0, config.largest_share) * len(seen.depth_mm))
+    if most == 0:
+        return frame
+    hidden = _hide(seen, most, config, rng)
+    out_mm = frame.depth_mm.copy()
+    out_mm[seen.rows[hidden], seen.columns[hidden]] = np.nan
+    left = int(rng.uniform(0, config.left_in) * hidden.sum())
+    if left:
+        _leave_in(out_mm, seen, hidden, left, config, rng)
+    return DepthFrame(out_mm, frame.intrinsics, frame.stamp_ns)
+
+
+def _look(frame: DepthFrame, rng: np.random.Generator) -> _Seen:
+    from tumortrack.sense import occlusion_kernels as kernels
+
+    columns, rows, depth_mm = kernels.seen_pixels(frame.depth_mm)
+    chosen = rng.integers(max(len(columns), 1), size=_LOOK_AT if len(columns) else 0)
+    some = np.stack([columns[chosen], rows[chosen]], axis=1).astype(float)
+    width_px = float(np.ptp(some, axis=0).max(initial=1.0)) if len(some) else 1.0
+    return _Seen(columns, rows, depth_mm, some, width_px, frame.intrinsics.fx)
+
+
+def _hide(seen: _Seen, most: int, config: OcclusionConfig, rng: np.random.Generator) -> np.ndarray:
+    """Which pixels are hidden: by shafts, patches, or shafts and patches."""
+    from tumortrack.sense.occlusion_kernels import take_first
+
+    hidden = np.zeros(len(seen.depth_mm), np.bool_)
+    left, kind = most, rng.uniform()
+    if kind > _PATCHES_ALONE:
+        for _ in range(rng.integers(1, _MOST_SHAFTS + 1)):
+            left -= take_first(_shaft(seen, config, rng), hidden, left)
+    if kind < 1 - _SHAFTS_ALONE:
+        for after in reversed(range(rng.integers(1, _MOST_PATCHES + 1))):
+            count = left if after == 0 else int(rng.uniform() * left)
+            left -= take_first(_patch(seen, rng), hidden, count)
+    return hidden
+
+
+def _shaft(seen: _Seen, config: OcclusionConfig, rng: np.random.Generator) -> np.ndarray:
+    """A straight shaft from any side, its tip over a random pixel of the organ or beyond it."""
+    from tumortrack.sense.occlusion_kernels import order_shaft
+
+    at = rng.integers(len(seen.depth_mm))
+    towards = _direction(rng)
+    tip = np.array([seen.columns[at], seen.rows[at]], float)
+    half = rng.uniform(*config.shaft_mm) / 2 * seen.focal_px / float(seen.depth_mm[at])
+    taper = rng.uniform(0, _WIDER) * half / seen.width_px
+    if rng.uniform() < _CROSSES:
+        tip -= 2 * seen.width_px * towards
+        taper /= 2
+    return order_shaft(seen.columns, seen.rows, tip, towards, half, taper)
+
+
+def _patch(seen: _Seen, rng: np.random.Generator) -> np.ndarray:
+    """Fat or a drape: a blob or a half plane, from any border of the organ inwards."""
+    from tumortrack.sense.occlusion_kernels import order_patch
+
+    inwards = _direction(rng)
+    across = np.array([-inwards[1], inwards[0]])
+    start = seen.some[np.argmin(seen.some @ inwards)] + rng.uniform(-0.1, 0.1, 2) * seen.width_px
+    stretch = np.exp(rng.uniform(-0.7, 0.7))
+    axes = np.stack([inwards * stretch, across / stretch]) / seen.width_px
+    frequency = rng.uniform(3, 20, (2, _WAVES))  # rad an organ's width
+    height = rng.uniform(0, 0.6, (2, _WAVES)) / frequency
+    phase = rng.uniform(0, 2 * np.pi, (2, _WAVES))
+    waves = np.stack([frequency / seen.width_px, phase, height], axis=2)
+    return order_patch(seen.columns, seen.rows, start, axes, bool(rng.integers(2)), waves)
+
+
+def _leave_in(
+    out_mm: np.ndarray,
+    seen: _Seen,
+    hidden: np.ndarray,
+    count: int,
+    config: OcclusionConfig,
+    rng: np.random.Generator,
+) -> None:
+    """The occluder's own surface, a tilted plane, at one end of what it hides."""
+    from tumortrack.sense.occlusion_kernels import take_first
+
+    columns, rows, organ_mm = seen.columns[hidden], seen.rows[hidden], seen.depth_mm[hidden]
+    shown = np.zeros(len(organ_mm), np.bool_)
+    x, y = _direction(rng).astype(np.float32)
+    take_first(columns * x + rows * y, shown, count)
+    columns, rows, organ_mm = columns[shown], rows[shown], organ_mm[shown]
+    if not len(rows):
+        return
+    low, high = config.nearer_mm
+    anchor = rng.integers(len(rows))
+    slope_x, slope_y = rng.uniform(-_STEEPEST, _STEEPEST, 2) / seen.focal_px
+    rise = slope_x * (columns - columns[anchor]) + slope_y * (rows - rows[anchor])
+    depth_mm = float(organ_mm[anchor]) - rng.uniform(low, high)
+    own_mm = np.clip(depth_mm / np.maximum(1 - rise, 0.2), organ_mm - high, organ_mm - low)
+    out_mm[rows, columns] = np.where(own_mm > 1.0, own_mm, np.nan)
+
+
+def _direction(rng: np.random.Generator) -> Float[np.ndarray, " 2"]:
+    angle = rng.uniform(0, 2 * np.pi)
+    return np.array([np.cos(angle), np.sin(angle)])
