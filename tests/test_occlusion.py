@@ -9,7 +9,7 @@ import pytest
 from depth_objects import SMALL, dome, wall
 from render_objects import anatomy
 from tumortrack.app.presets import paper, quick
-from tumortrack.core.config import from_builtins, to_builtins
+from tumortrack.core.config import from_builtins, identity, to_builtins
 from tumortrack.core.errors import InputError
 from tumortrack.core.types import DepthFrame
 from tumortrack.sense import occlusion_kernels as kernels
@@ -172,6 +172,19 @@ def test_a_camera_out_of_calibration_errs_alike_everywhere():
     assert np.mean(offsets) == pytest.approx(0, abs=0.2)
     assert np.std(offsets) == pytest.approx(2 / math.sqrt(3), abs=0.12)
     assert abs(np.corrcoef(offsets, factors)[0, 1]) < 0.2
+
+
+def test_fields_that_came_later_change_no_hash_while_they_are_off():
+    before = {"width", "height", "pose", "deform", "clutter", "noise", "cloud", "occupancy"}
+    before |= {"free_range", "free_nearest_mm"}
+    plain, on = SceneConfig(), SceneConfig(occlusion=HIDING)
+    assert set(identity(plain)) == before
+    assert {key: to_builtins(plain)[key] for key in before} == identity(plain)
+    assert set(identity(on)) == {*before, "occlusion"}
+    assert identity(on)["occlusion"] == to_builtins(HIDING)
+    inside = identity(quick(ANATOMY))["scene"]  # and however deep they lie
+    assert set(inside) == before
+    assert inside["noise"] == to_builtins(D405_NOISE)
 
 
 # --- in scenes ---

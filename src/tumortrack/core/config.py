@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TypeVar
+from typing import Any, ClassVar, TypeVar
 
 import msgspec
 
@@ -12,8 +12,11 @@ from tumortrack.core.errors import InputError
 class Config(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Base of every configuration value.
 
-    Subclasses that take part in a typed union (one kind, one file) add ``tag=...``.
+    Subclasses that take part in a typed union (one kind, one file) add ``tag=...``. ``LATER``
+    names fields that came after the first hashes of such values; see ``identity``.
     """
+
+    LATER: ClassVar[tuple[str, ...]] = ()
 
 
 C = TypeVar("C", bound=msgspec.Struct)
@@ -22,6 +25,33 @@ C = TypeVar("C", bound=msgspec.Struct)
 def to_builtins(config: msgspec.Struct) -> dict:
     """The configuration as what JSON would give back, every key written out."""
     return msgspec.json.decode(msgspec.json.encode(config))
+
+
+def identity(config: msgspec.Struct) -> dict:
+    """``to_builtins`` to be hashed: fields named in ``LATER`` are left out where they have their
+    default, so that what was made before there was such a field is still known as the same."""
+    written = to_builtins(config)
+    _drop_later(config, written)
+    return written
+
+
+def _drop_later(value: Any, written: Any) -> None:
+    if isinstance(value, tuple):
+        for one, its in zip(value, written, strict=True):
+            _drop_later(one, its)
+    elif isinstance(value, Config):
+        for field in msgspec.structs.fields(value):
+            here = getattr(value, field.name)
+            if field.name in value.LATER and here == _default(field):
+                del written[field.name]
+            else:
+                _drop_later(here, written[field.name])
+
+
+def _default(field: msgspec.structs.FieldInfo) -> Any:
+    if field.default_factory is not msgspec.NODEFAULT:
+        return field.default_factory()
+    return field.default
 
 
 def from_builtins(data: object, kind: type[C], where: str) -> C:

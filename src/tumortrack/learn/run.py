@@ -10,7 +10,7 @@ from typing import Literal
 import torch
 
 from tumortrack.core import store
-from tumortrack.core.config import to_builtins
+from tumortrack.core.config import identity
 from tumortrack.core.errors import InputError
 from tumortrack.core.types import Anatomy
 from tumortrack.learn.checkpoint import Progress
@@ -52,7 +52,7 @@ def run_identity(run: Run) -> str:
     """sha256 of all that decides the weights, so that a resumed run is the same run."""
     content = {
         "case": run.case_sha256,
-        "config": to_builtins(run.config),
+        "config": identity(run.config),
         "seed": run.seed,
         "steps": run.steps,
         "minutes": run.minutes,

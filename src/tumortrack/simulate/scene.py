@@ -49,6 +49,8 @@ class SceneConfig(Config, frozen=True):
     drawn from that range, evenly on a logarithmic scale, instead of ``cloud.n_points``.
     """
 
+    LATER = ("occlusion", "calibration", "cloud_points")
+
     width: int = 424
     height: int = 240
     pose: PoseConfig = PoseConfig()
