@@ -117,6 +117,7 @@ def locate(
     range: tuple[float, float] | None = None,
     unit: Literal["mm", "m"] = "mm",
     intrinsics: Path | None = None,
+    map: Path | None = None,
     device: Literal["auto", "cpu", "cuda"] = "auto",
     overwrite: bool = False,
 ) -> None:
@@ -132,6 +133,8 @@ def locate(
             cropped by the range the model was trained for.
         unit: of the cloud's numbers.
         intrinsics: JSON with width, height, fx, fy, cx, cy in pixels.
+        map: points of the CT, to be found before the camera (OUT/points.csv): a .csv with columns
+            x,y,z (LPS, mm), or 3D Slicer's .mrk.json or .fcsv. Needs a model of preset clinic.
         device: auto takes CUDA where it is.
         overwrite: replace OUT if it exists.
     """
@@ -141,7 +144,7 @@ def locate(
         model,
         cloud,
         out,
-        commands.LocateOptions(grid, seed, range, unit, intrinsics, device, overwrite),
+        commands.LocateOptions(grid, seed, range, unit, intrinsics, map, device, overwrite),
     )
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -17,6 +17,7 @@ from tumortrack.core.types import SensorCloud
 if TYPE_CHECKING:
     from tumortrack.imaging.prepare import PrepareOptions
     from tumortrack.learn.model import Model
+    from tumortrack.track.points import PointTable
 
 Device = Literal["auto", "cpu", "cuda"]
 
@@ -106,6 +107,7 @@ class LocateOptions:
     range_mm: tuple[float, float] | None = None
     unit: Literal["mm", "m"] = "mm"
     intrinsics: Path | None = None
+    map_points: Path | None = None
     device: Device = "auto"
     overwrite: bool = False
 
@@ -119,15 +121,25 @@ def locate(model_folder: Path, source: Path, out: Path, options: LocateOptions) 
     _check_grid(options.grid)
     store.check_place(out, "run", options.overwrite)
     model = load_model(model_folder, options.device)
+    tracker = Tracker(model)
+    points = _asked(options.map_points, tracker.organ_box_ct, model_folder)
     cloud, notes = _observed(model, source, options)
-    estimate = Tracker(model).locate(cloud, options.grid, options.seed)
+    estimate = tracker.locate(cloud, options.grid, options.seed)
+    if points is not None and options.map_points is not None:
+        notes = (*notes, *points.notes)
+        estimate.report["map"] = {
+            "points": len(points.points_ct),
+            "from": "lps",
+            "to": "camera",
+            "sha256": store.sha256_of(options.map_points),
+        }
     estimate.report.update(
         notes=list(notes),
         model=model.provenance,
         model_sha256=store.sha256_of(model_folder / store.MANIFEST),
         cloud_sha256=store.sha256_of(source),
     )
-    write_estimate(out, estimate, options.overwrite)
+    write_estimate(out, estimate, options.overwrite, points)
     for note in notes:
         say(f"note: {note}")
     for name, part in estimate.report["parts"].items():
@@ -136,7 +148,27 @@ def locate(model_folder: Path, source: Path, out: Path, options: LocateOptions) 
             say(f"{name}: {part['volume_ml']:.1f} ml, centre ({x:.1f}, {y:.1f}, {z:.1f}) mm")
         else:
             say(f"{name}: not found")
+    if points is not None:
+        say(f"{len(points.points_ct)} points of the CT: their places are in {out / 'points.csv'}")
     say(f"written to {out} (camera frame, mm) in {estimate.report['timings']['total']:.2f} s.")
+
+
+def _asked(
+    path: Path | None, organ_box_ct: np.ndarray | None, model_folder: Path
+) -> PointTable | None:
+    """The points of --map, checked before there is anything to wait for."""
+    from tumortrack.track.points import check_near_organ, read_points
+
+    if path is None:
+        return None
+    if organ_box_ct is None:
+        raise InputError(
+            f"--map: {model_folder} says what is where, but not which point of the CT lies there. "
+            "A model of the preset clinic knows: tumortrack train CASE MODEL --preset clinic."
+        )
+    points = read_points(path)
+    far = check_near_organ(points.points_ct, organ_box_ct, str(path))
+    return replace(points, notes=(*points.notes, *far))
 
 
 def _observed(

@@ -11,15 +11,20 @@ from tumortrack.core.mesh_files import write_mesh
 from tumortrack.imaging.volume import write_labels_nifti
 from tumortrack.sense.ply import write_cloud_ply
 from tumortrack.track.estimate import Estimate
+from tumortrack.track.points import PointTable, camera_table
 
 
-def write_estimate(folder: Path, estimate: Estimate, overwrite: bool = False) -> None:
+def write_estimate(
+    folder: Path, estimate: Estimate, overwrite: bool = False, points: PointTable | None = None
+) -> None:
     """occupancy.ply (points with label and probability and, where the estimate knows the way
     back, their place in the CT), labels.nii.gz (voxel -> camera frame, mm), kidney.ply,
-    tumor_1.ply, ... and report.json; all or nothing.
+    tumor_1.ply, ... and report.json; points.csv, the given ``points`` of the CT and where they are
+    now; all or nothing.
 
     Raises:
-        InputError: the folder exists and ``overwrite`` is False.
+        InputError: the folder exists and ``overwrite`` is False; points without a motion.
+        NoEstimate: the motion has no answer for a point.
         StorageError: the disk refused.
     """
     with store.new_folder(folder, overwrite) as aside:
@@ -37,6 +42,9 @@ def write_estimate(folder: Path, estimate: Estimate, overwrite: bool = False) ->
         )
         for name, mesh in estimate.meshes.items():
             write_mesh(aside / f"{name}.ply", mesh)
+        if points is not None:
+            table = camera_table(points, estimate.motion)
+            store.write_atomically(aside / "points.csv", table)
         store.write_json(aside / "report.json", estimate.report)
         store.seal(aside, "run", {"report": "report.json"}, frame="camera")
 
