@@ -84,4 +84,6 @@ def _scene(folder: Path) -> list[str]:
         f"{name} {part.volume_mm3 / 1000:.1f} ml"
         for name, part in zip(scene.reference.names, scene.reference.parts, strict=True)
     )
-    return [f"{folder}: a scene with {len(scene.cloud.points_mm)} points; truth: {volumes}."]
+    targets = f", {len(scene.targets.labels)} targets" if scene.targets else ""
+    points = f"{len(scene.cloud.points_mm)} points"
+    return [f"{folder}: a scene with {points}; truth: {volumes}{targets}."]

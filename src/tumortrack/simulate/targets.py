@@ -111,9 +111,9 @@ def read_targets(path: Path) -> Targets:
         table = np.array([[float(row[name]) for name in _COLUMNS] for row in rows])
         if not np.isfinite(table).all():
             raise ValueError("NaN or infinite")
-        labels = table[:, 0].astype(np.uint8)
-        if (labels != table[:, 0]).any() or not labels.all():
+        labels = table[:, 0]
+        if not np.isin(labels, np.arange(1, 256)).all():
             raise ValueError("labels must be 1 (organ), 2, 3, ... (tumors)")
     except (TypeError, ValueError, OverflowError) as error:
         raise InputError(f"{path} has a row that is no target: {error}.") from error
-    return Targets(table[:, 1:4], table[:, 4:], labels)
+    return Targets(table[:, 1:4], table[:, 4:], labels.astype(np.uint8))
