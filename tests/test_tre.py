@@ -101,6 +101,11 @@ def test_the_true_motion_has_no_error_and_a_rigid_one_has_the_waves():
 # --- scenes hold targets ---
 
 
+def test_a_negative_seed_is_refused():
+    with pytest.raises(InputError, match="seed -1 must be 0 or more"):
+        draw_targets(anatomy_ct(), -1)
+
+
 def test_targets_come_back_from_a_scenes_folder(tmp_path):
     made = scene()
     write_scene(tmp_path / "scene", made)

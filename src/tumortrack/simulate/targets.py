@@ -48,8 +48,10 @@ def draw_targets(anatomy_ct: Anatomy, seed: int, count: int = TARGETS) -> InnerP
     by the tumors (all in the organ where it has none).
 
     Raises:
-        InputError: a tumor that others cover.
+        InputError: a tumor that others cover; a negative seed.
     """
+    if seed < 0:
+        raise InputError(f"seed {seed} must be 0 or more.")
     rng = np.random.default_rng([seed, 1000])
     n_tumors = len(anatomy_ct.tumors)
     inside = count // 2 if n_tumors else count

@@ -87,8 +87,8 @@ def make_scenes(
     """
     wanted = [(v, w) for v in _known(variants, VARIANTS) for w in _known(views, VIEWS)]
     case = load_case(run.case_folder)
-    identity = _claim(run, out)
     targets = draw_targets(case.anatomy, run.seed)
+    identity = _claim(run, out)
     todo = [(v, w) for v, w in wanted if not (out / f"{v}-{w}").exists()]
     states = list(dict.fromkeys(VARIANTS[v].state for v, _ in todo))
     stock = Stock(
