@@ -78,6 +78,8 @@ class Options:
     """Of training in the deformation study (the same as the phantom's)."""
     fault_seeds: tuple[int, ...] | None = None
     """Of the random part of each fault."""
+    severity_seeds: tuple[int, ...] | None = None
+    """Of the random part of each severity."""
     grid: int | None = None
     """Voxels along the longest side, in the table of accuracy."""
     case_peers: tuple[str, ...] | None = None
@@ -118,7 +120,7 @@ def main(options: Options) -> None:
     methods = Methods(cache(model), cache(lambda name, case: peer_method(name, case, bcpd)))
     for section in options.sections:
         cases = (second,) if section == "deformation" else studied
-        if section in ("faults", "views"):
+        if section in ("faults", "views", "severity"):
             cases = studied[:1]
         for case in cases:
             _scenes(case, *scenes_of(plan, section))
@@ -144,6 +146,7 @@ def _plan(options: Options) -> StudyPlan:
         "case_seeds",
         "configuration_seeds",
         "fault_seeds",
+        "severity_seeds",
         "grid",
         "case_grid",
     )

@@ -10,7 +10,7 @@ from pathlib import Path
 from tumortrack.core import store
 from tumortrack.core.errors import InputError, StorageError
 from tumortrack.evaluate.protocol import RULE
-from tumortrack.evaluate.study import plots, tables
+from tumortrack.evaluate.study import plots, severity, tables
 from tumortrack.evaluate.study.caption import caption
 from tumortrack.evaluate.study.figures import pick
 from tumortrack.evaluate.study.gallery import gallery
@@ -70,6 +70,7 @@ def section_blocks(
         "peers": _peers,
         "faults": _faults,
         "views": _views,
+        "severity": _severity,
     }
     texts = []
     for case in cases:
@@ -91,6 +92,7 @@ _RULES: dict[Section, str] = {
     "for methods that carry points.",
     "faults": f"{_OVER_SCENES} In brackets: the change against clean depth.",
     "views": f"{_OVER_SCENES} In brackets: the change against the clean view.",
+    "severity": f"Distances in mm. {_MEDIANS} Here {severity.RULE}",
 }
 
 
@@ -133,6 +135,13 @@ def _faults(cells: list[dict], case: StudyCase, book: Book) -> str:
 
 def _views(cells: list[dict], case: StudyCase, book: Book) -> str:
     return tables.conditions(cells, "view", "clean")
+
+
+def _severity(cells: list[dict], case: StudyCase, book: Book) -> str:
+    image = book.image("severity")
+    severity.curves(cells, image)
+    picture = _picture(book, image, f"{case.name}: tumor error against severity")
+    return f"{picture}\n\n{severity.table_of(cells)}"
 
 
 def gallery_block(plan: StudyPlan, jobs: list[Job], book: Book, memory: Path) -> dict[str, str]:

@@ -117,9 +117,9 @@ def measure_one(job: Job, name: str) -> dict:
     """One cell's numbers: the protocol's metrics, errors at points, target errors, times."""
     scene = read_scene(job.case.scene(job.variant, job.view))
     if job.fault != "none":
-        from tumortrack.evaluate.twin.faults import faulty
+        from tumortrack.evaluate.twin.severity import disturbed
 
-        scene = faulty(scene, job.fault, job.fault_seed)
+        scene = disturbed(scene, job.fault, job.fault_seed)
     answers: list[Answer] = []
 
     def locate(_: object) -> Estimate:
@@ -143,8 +143,10 @@ def measure_one(job: Job, name: str) -> dict:
 
 
 def _points(job: Job, scene: Scene, estimate: Estimate) -> dict:
+    from tumortrack.evaluate.twin.severity import MOVED
+
     clean = job.case.scene(job.variant, CLEAN_VIEW)
-    seen = read_scene(clean) if clean.is_dir() else scene
+    seen = scene if MOVED in scene.meta or not clean.is_dir() else read_scene(clean)
     return point_errors(scene.reference, job.case.anatomy_ct, visible_points(seen), estimate.meshes)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, get_args
 
 from tumortrack.core.config import Config
 from tumortrack.evaluate.study.measure import Job, StudyCase, by_method
@@ -16,8 +16,17 @@ VIEWS = ("clean", "noise", "shaft", "clutter")
 FAULTS = (
     "clean", "noise", "distortion", "offset", "occlusion", "outliers", "registration", "all"
 )  # fmt: skip
-Section = Literal["accuracy", "deformation", "peers", "faults", "views"]
-SECTIONS: tuple[Section, ...] = ("accuracy", "deformation", "peers", "faults", "views")
+SEVERITIES = (
+    "noise=0.5", "noise=1", "noise=2", "noise=4",
+    "visible=80", "visible=60", "visible=40",
+    "outliers=1", "outliers=3", "outliers=10", "outliers=20",
+    "points=500", "points=1000", "points=2000",
+    "offset=1", "offset=2", "offset=4",
+    "distance=80", "distance=120", "distance=160", "distance=200", "distance=250", "distance=300",
+    "tilt=15", "tilt=30", "tilt=45",
+)  # fmt: skip
+Section = Literal["accuracy", "deformation", "peers", "faults", "views", "severity"]
+SECTIONS: tuple[Section, ...] = get_args(Section)
 
 
 class StudyPlan(Config, frozen=True):
@@ -25,8 +34,9 @@ class StudyPlan(Config, frozen=True):
 
     ``accuracy`` (the paper's table of results) is measured at ``grid``, everything else at
     ``coarse_grid``. ``seeds`` are those of networks for the paper's phantom; other cases and the
-    deformation study may do with fewer, a coarser grid and fewer peers (None: the same). Faults
-    and views are measured on the paper's phantom alone, with the first seed.
+    deformation study may do with fewer, a coarser grid and fewer peers (None: the same). Faults,
+    views and severities are measured on the paper's phantom alone, with the first seed;
+    severities beside the clean scene, which is the end of most curves.
     """
 
     name: str
@@ -50,6 +60,11 @@ class StudyPlan(Config, frozen=True):
     fault_peers: tuple[str, ...] = ("elastic",)
     fault_variants: tuple[str, ...] = ("D1", "D2", "D3", "G1", "P1")
     views: tuple[str, ...] = VIEWS
+    severities: tuple[str, ...] = SEVERITIES
+    severity_seeds: tuple[int, ...] = (0, 1, 2)
+    severity_variants: tuple[str, ...] = ("D2", "G1")
+    severity_models: tuple[str, ...] = ("M_lim",)
+    severity_peers: tuple[str, ...] = ("rigid",)
 
     def seeds_for(self, case: StudyCase) -> tuple[int, ...]:
         return self.seeds if case.is_paper or self.case_seeds is None else self.case_seeds
@@ -77,6 +92,8 @@ QUICK = StudyPlan(
     fault_seeds=(0,),
     fault_variants=("D2", "G1"),
     views=("clean", "noise", "clutter"),
+    severities=("noise=2", "visible=60", "points=500", "tilt=30"),
+    severity_seeds=(0,),
 )
 
 Peers = Callable[[str, StudyCase], Method]
@@ -107,6 +124,7 @@ def jobs_of(
         "peers": _peers,
         "faults": _faults,
         "views": _views,
+        "severity": _severity,
     }
     jobs = [job for case in cases for job in makers[section](plan, case, methods)]
     return by_method(jobs)
@@ -115,11 +133,16 @@ def jobs_of(
 def scenes_of(plan: StudyPlan, section: Section) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Variants and views that a section needs; the clean view always, for it says what is
     visible."""
-    variants = {"deformation": plan.configuration_variants, "faults": plan.fault_variants}
+    variants = {
+        "deformation": plan.configuration_variants,
+        "faults": plan.fault_variants,
+        "severity": plan.severity_variants,
+    }
     views = {
         "deformation": (plan.configuration_view,),
         "faults": (),
         "views": plan.views,
+        "severity": (),
     }.get(section, (plan.view,))
     return variants.get(section, plan.variants), tuple(dict.fromkeys(("clean", *views)))
 
@@ -170,6 +193,18 @@ def _views(plan: StudyPlan, case: StudyCase, methods: Methods) -> list[Job]:
         for method in [methods.model(case, name, plan.seeds_for(case)[0])]
         for view in plan.views
         for variant in plan.variants
+    ]
+
+
+def _severity(plan: StudyPlan, case: StudyCase, methods: Methods) -> list[Job]:
+    seed = plan.seeds_for(case)[0]
+    beside = [methods.peer(name, case) for name in plan.severity_peers if name in plan.peers]
+    draws = [(name, draw) for name in plan.severities for draw in plan.severity_seeds]
+    return [
+        Job(case, method, variant, "clean", plan.coarse_grid, fault, draw)
+        for method in [*(methods.model(case, n, seed) for n in plan.severity_models), *beside]
+        for fault, draw in [("clean", 0), *draws]
+        for variant in plan.severity_variants
     ]
 
 

@@ -28,7 +28,7 @@ STYLES = {
     "bcpd": ("#56B4E9", "D"),
     "elastic": ("#009E73", "P"),
 }
-_OTHER = ("#D55E00", "*")
+OTHER_STYLE = ("#D55E00", "*")
 _BANDS = 8  # groups of equally many points along a curve
 _FEWEST = 40  # points in a group
 _ALONG = {
@@ -51,7 +51,7 @@ def error_against(cells: list[dict], key: str, path: Path) -> bool:
     drawing = new_figure(9.4, 4.6)
     axes = drawing.add_axes((0.075, 0.125, 0.6, 0.8))
     for number, (method, (x, error)) in enumerate(curves.items()):
-        color, marker = STYLES.get(method, _OTHER)
+        color, marker = STYLES.get(method, OTHER_STYLE)
         at, low, middle, high = _grouped(x, error)
         highest = max(highest, 1.25 * float(middle.max()))
         if number < 2:
@@ -60,7 +60,7 @@ def error_against(cells: list[dict], key: str, path: Path) -> bool:
     axes.set(xlabel=f"{_ALONG[key]}, mm", ylabel="distance to the estimated tumor surface, mm")
     axes.set_ylim(0, highest)  # bands may go beyond: a bad method must not flatten the others
     axes.set_xlim(left=0)
-    _tidy(axes)
+    tidy(axes)
     axes.legend(
         loc="upper left",
         bbox_to_anchor=(1.02, 1.0),
@@ -98,7 +98,7 @@ def error_per_variant(cells: list[dict], lies: dict[str, paper.Lie], path: Path)
         for place in range(len(variants) - 1):
             axes.axvline(place + 0.5, color="0.93", linewidth=0.8, zorder=0)
         axes.set_xlim(-0.5, len(variants) - 0.5)
-        _tidy(axes)
+        tidy(axes)
     panels[0].set_ylim(bottom=0)  # after all panels: it ends the search for common limits
     panels[0].set_ylabel("Hausdorff distance, estimate to truth, mm")
     drawing.legend(
@@ -114,7 +114,7 @@ def error_per_variant(cells: list[dict], lies: dict[str, paper.Lie], path: Path)
 
 def _variant_bars(axes: Axes, cells: list[dict], tumor: str, shift: float) -> None:
     model = cells[0]["spec"]["method"]["name"]
-    color, marker = STYLES.get(model, _OTHER)
+    color, marker = STYLES.get(model, OTHER_STYLE)
     value = part_value(tumor, "hausdorff_one_sided_mm")
     for place, variant in enumerate(names(cells, "variant")):
         number = figure(pick(cells, variant=variant), value)
@@ -138,7 +138,7 @@ def _variant_bars(axes: Axes, cells: list[dict], tumor: str, shift: float) -> No
 def _paper_marks(
     axes: Axes, variants: list[str], model: str, kind: paper.Kind, shift: float
 ) -> None:
-    color, marker = STYLES.get(model, _OTHER)
+    color, marker = STYLES.get(model, OTHER_STYLE)
     for place, variant in enumerate(variants):
         said = paper.hausdorff(variant, model, kind)
         if said is None:
@@ -170,7 +170,7 @@ def _legend(models: list[str]) -> list:
 
     handles = []
     for model in models:
-        color, marker = STYLES.get(model, _OTHER)
+        color, marker = STYLES.get(model, OTHER_STYLE)
         handles.append(
             Line2D([], [], color=color, marker=marker, markersize=7, lw=1.6, label=f"{model}, here")
         )
@@ -218,7 +218,8 @@ def _grouped(
     return at, low, middle, high
 
 
-def _tidy(axes: Axes) -> None:
+def tidy(axes: Axes) -> None:
+    """A light grid, and no more frame than needed."""
     axes.grid(axis="y", color="0.9", linewidth=0.8)
     axes.set_axisbelow(True)
     for side in ("top", "right"):

@@ -67,15 +67,9 @@ def faulty(clean: Scene, fault: str, seed: int) -> Scene:
     """
     if fault not in FAULTS:
         raise InputError(f"fault {fault!r} is not known; allowed: {', '.join(FAULTS)}.")
-    if clean.depth is None or clean.meta.get("view") != "clean" or "fault" in clean.meta:
-        raise InputError(
-            "faults are made from clean scenes of the twin with their depth image: the folders "
-            "VARIANT-clean that `tumortrack twin` writes."
-        )
+    frame, config = clean_view(clean)
     if fault == "clean":
         return clean
-    config = from_builtins(clean.meta.get("view_config"), ViewConfig, "meta.json, view_config")
-    frame = clean.depth
     for name, change in _IN_ORDER.items():
         if fault in (name, "all"):
             frame = change(frame, config, _rng(seed, name))
@@ -93,6 +87,21 @@ def faulty(clean: Scene, fault: str, seed: int) -> Scene:
             targets = replace(targets, points_mm=transform_points(moved, targets.points_mm))
         meta["registration"] = moved.tolist()
     return Scene(cloud, reference, frame, meta, targets)
+
+
+def clean_view(clean: Scene) -> tuple[DepthFrame, ViewConfig]:
+    """The depth image of a clean scene, and how it was taken.
+
+    Raises:
+        InputError: no clean scene of the twin with its depth image.
+    """
+    if clean.depth is None or clean.meta.get("view") != "clean" or "fault" in clean.meta:
+        raise InputError(
+            "faults are made from clean scenes of the twin with their depth image: the folders "
+            "VARIANT-clean that `tumortrack twin` writes."
+        )
+    config = from_builtins(clean.meta.get("view_config"), ViewConfig, "meta.json, view_config")
+    return clean.depth, config
 
 
 def registration_error(reference: Anatomy, rng: np.random.Generator) -> Float64[np.ndarray, "4 4"]:
