@@ -27,6 +27,7 @@ from tumortrack.learn.schedule import settle_end
 from tumortrack.learn.state import TrainingState
 from tumortrack.learn.validate import ValidationSet
 from tumortrack.learn.work import work_folder
+from tumortrack.simulate.bodies import body_for
 from tumortrack.simulate.dataset import SceneStream
 from tumortrack.simulate.occupancy import OccupancyPool
 
@@ -78,10 +79,11 @@ def _train(run: Run, folder: Path, work: Path, report: Callable[[Status], None])
     state.resume(work)
 
     pool = OccupancyPool(run.anatomy_ct, config.scene.occupancy, run.seed)
+    body = body_for(run.anatomy_ct, run.up_lps, config.scene, run.seed)
     stream = SceneStream(
-        run.anatomy_ct, run.up_lps, config.scene, pool, run.seed, "train", config.batch_size
+        run.anatomy_ct, run.up_lps, config.scene, pool, run.seed, "train", config.batch_size, body
     )
-    validation = ValidationSet(run.anatomy_ct, run.up_lps, config, pool, run.seed, device)
+    validation = ValidationSet(run.anatomy_ct, run.up_lps, config, pool, run.seed, device, body)
     steps = range(state.progress.step, state.progress.end or config.steps)
     period = config.training_pairs // config.batch_size
 

@@ -12,6 +12,7 @@ from tumortrack.learn.config import TrainConfig
 from tumortrack.learn.fit import Familiar, fit_mm, spread_mm, surface_distances
 from tumortrack.learn.network import Latent, OccupancyNetwork
 from tumortrack.simulate.dataset import refill
+from tumortrack.simulate.elastic.body import Body
 from tumortrack.simulate.occupancy import OccupancyPool
 from tumortrack.simulate.scene import SceneRecipe, Simulator
 
@@ -32,8 +33,9 @@ class ValidationSet:
         pool: OccupancyPool,
         seed: int,
         device: torch.device,
+        body: Body | None = None,
     ) -> None:
-        simulator = Simulator(anatomy_ct, up_lps, config.scene)
+        simulator = Simulator(anatomy_ct, up_lps, config.scene, body)
         vertices = anatomy_ct.organ.vertices_mm
         clouds, points, labels, boxes = [], [], [], []
         n = config.scene.cloud.n_points

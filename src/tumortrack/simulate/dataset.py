@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float32, UInt8
 
 from tumortrack.core.types import Anatomy
+from tumortrack.simulate.elastic.body import Body
 from tumortrack.simulate.occupancy import OccupancyPool
 from tumortrack.simulate.scene import SceneConfig, SceneRecipe, Simulator
 
@@ -35,10 +36,11 @@ class SceneStream:
     seed: int
     stream: Literal["train", "validation", "test"]
     batch_size: int
+    body: Body | None = None  # built once by the caller, for elastic deformations
 
     @cached_property
     def _simulator(self) -> Simulator:  # built where it is used: ray trees do not travel
-        return Simulator(self.anatomy_ct, self.up_lps, self.config)
+        return Simulator(self.anatomy_ct, self.up_lps, self.config, self.body)
 
     def __getstate__(self) -> dict:
         return {k: v for k, v in self.__dict__.items() if k != "_simulator"}

@@ -34,6 +34,7 @@ from tumortrack.sense.occlusion import OcclusionConfig, occlude
 from tumortrack.sense.render import Visibility, render_depth
 from tumortrack.simulate.deform import DeformConfig, DragConfig
 from tumortrack.simulate.deform.base import Deformation, View
+from tumortrack.simulate.elastic.body import Body
 from tumortrack.simulate.occupancy import OccupancyConfig, OccupancyPool
 from tumortrack.simulate.pose import PoseConfig, sample_pose
 
@@ -118,12 +119,18 @@ class Stage:
 
 
 class Simulator:
-    """Makes the scenes of one anatomy (CT frame, LPS mm)."""
+    """Makes the scenes of one anatomy (CT frame, LPS mm); ``body`` where the configuration has
+    elastic deformations (``simulate.bodies.body_for`` builds it)."""
 
     def __init__(
-        self, anatomy_ct: Anatomy, up_lps: tuple[float, float, float], config: SceneConfig
+        self,
+        anatomy_ct: Anatomy,
+        up_lps: tuple[float, float, float],
+        config: SceneConfig,
+        body: Body | None = None,
     ) -> None:
         self.anatomy_ct = anatomy_ct
+        self._body = body
         self.config = config
         self._up_lps = up_lps
         self._intrinsics = d405(config.width, config.height)
@@ -163,9 +170,8 @@ class Simulator:
         nearest = config.free_nearest_mm if free else config.pose.nearest_mm
         camera_from_ct = sample_pose(config.pose, organ, self._up_lps, nearest, rng)
         model = config.deform[rng.integers(len(config.deform))]
-        view = View(
-            self.anatomy_ct, _visible_from(self._visibility, self._intrinsics, camera_from_ct)
-        )
+        visible = _visible_from(self._visibility, self._intrinsics, camera_from_ct)
+        view = View(self.anatomy_ct, visible, self._body)
         deformation = model.sample(view, rng)
         vertices = transform_points(camera_from_ct, deformation.apply(organ.vertices_mm))
         frame = render_depth(vertices, organ.faces, self._intrinsics)

@@ -7,7 +7,8 @@ can be recorded (``record``). To add one: write its file, add its configuration 
 
 from tumortrack.simulate.deform.chain import ChainConfig
 from tumortrack.simulate.deform.drag import DragConfig
+from tumortrack.simulate.deform.elastic import ElasticConfig
 from tumortrack.simulate.deform.rest import RestConfig
 from tumortrack.simulate.deform.stretch import StretchConfig
 
-DeformConfig = DragConfig | StretchConfig | ChainConfig | RestConfig
+DeformConfig = DragConfig | StretchConfig | ElasticConfig | ChainConfig | RestConfig

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 from jaxtyping import Float
 
 from tumortrack.core.types import Anatomy
+
+if TYPE_CHECKING:
+    from tumortrack.simulate.elastic.body import Body
 
 
 @dataclass(frozen=True)
@@ -19,6 +22,7 @@ class View:
     anatomy_ct: Anatomy
     # visible(points_ct) -> bool each: nothing before the point, and the point in the picture
     visible: Callable[[np.ndarray], np.ndarray]
+    body: Body | None = None  # what the organ can do elastically, where a deformation needs it
 
 
 class Deformation(Protocol):

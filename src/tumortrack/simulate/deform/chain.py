@@ -10,6 +10,7 @@ from jaxtyping import Float
 from tumortrack.core.config import Config
 from tumortrack.simulate.deform.base import Deformation, View
 from tumortrack.simulate.deform.drag import DragConfig
+from tumortrack.simulate.deform.elastic import ElasticConfig
 from tumortrack.simulate.deform.stretch import StretchConfig
 
 
@@ -31,7 +32,7 @@ class Chain:
 class ChainConfig(Config, frozen=True, tag="chain"):
     """Each link is sampled from the view of the undeformed organ; local ones come first."""
 
-    links: tuple[DragConfig | StretchConfig, ...]
+    links: tuple[DragConfig | StretchConfig | ElasticConfig, ...]
 
     def sample(self, view: View, rng: np.random.Generator) -> Chain:
         return Chain(tuple(link.sample(view, rng) for link in self.links))

@@ -1,0 +1,62 @@
+"""Deformations that the organ's own elastic body makes: states of a library, scaled and mixed.
+
+The body (``simulate.elastic``) is built once for an anatomy and reaches the model by the view.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from jaxtyping import Float, Float32
+
+from tumortrack.core.config import Config
+from tumortrack.core.errors import InputError
+from tumortrack.simulate.deform.base import View
+from tumortrack.simulate.elastic.body import Body, BodyConfig
+
+
+@dataclass(frozen=True, eq=False)
+class Elastic:
+    """Points follow the velocity field of some coefficients of a body's modes."""
+
+    body: Body
+    coefficients: Float32[np.ndarray, " m"]
+
+    @cached_property
+    def _velocity(self) -> Float32[np.ndarray, "i j k 3"]:
+        return self.body.velocity(self.coefficients)
+
+    def apply(self, points_ct: Float[np.ndarray, "n 3"]) -> Float32[np.ndarray, "n 3"]:
+        return self.body.follow(self._velocity, points_ct)
+
+    def record(self) -> dict:
+        return {"kind": "elastic", "coefficients": self.coefficients.tolist()}
+
+
+class ElasticConfig(Config, frozen=True, tag="elastic"):
+    """A random state of the body's library times ``scale``; a share ``mixed`` of scenes adds a
+    second one times ``second_scale``. ``body`` says how the library is made."""
+
+    scale: tuple[float, float] = (0.2, 1.1)
+    mixed: float = 0.25
+    second_scale: tuple[float, float] = (0.1, 0.6)
+    body: BodyConfig = BodyConfig()
+
+    def sample(self, view: View, rng: np.random.Generator) -> Elastic:
+        """Draw states and scales uniformly.
+
+        Raises:
+            InputError: the view has no body.
+        """
+        if view.body is None:
+            raise InputError(
+                "elastic deformations need the organ's body; build it with body_for(...) and give "
+                "it to the Simulator."
+            )
+        states = view.body.states
+        state = states[rng.integers(len(states))] * rng.uniform(*self.scale)
+        if rng.uniform() < self.mixed:
+            state = state + states[rng.integers(len(states))] * rng.uniform(*self.second_scale)
+        return Elastic(view.body, view.body.within_reach(state.astype(np.float32)))

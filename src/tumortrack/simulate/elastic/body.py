@@ -1,0 +1,174 @@
+"""A body: what an organ can do elastically, as numbers small enough for every scene and frame."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from jaxtyping import Float, Float32, Float64
+
+from tumortrack.core.config import Config
+from tumortrack.core.errors import InputError
+from tumortrack.core.types import Anatomy
+from tumortrack.simulate.elastic.flow import follow, steps_for
+
+_RIDGE = 1e-4  # mm2, on the covariance: no coefficient is ever known for sure
+_ARRAYS = ("origin_mm", "spacing_mm", "center_ct", "modes", "states")
+
+
+class BodyConfig(Config, frozen=True):
+    """How an organ's body is built. ``bed_anywhere``: share of states whose bed lies on any side
+    of the organ, instead of opposite to the direction that faces the camera."""
+
+    cells: int = 1000  # so many cubes have the organ's volume: decides the spacing
+    modes: int = 48
+    responses: int = 480
+    contrasts: tuple[float, ...] = (1.0, 3.0, 10.0)  # of tumors' stiffness, among the responses
+    poisson: float = 0.49
+    patches: int = 600
+    states: int = 2000
+    bed_anywhere: float = 0.15
+
+
+@dataclass(frozen=True, eq=False)
+class Body:
+    """Modes of an organ (CT frame, LPS mm) and a library of states under random loads.
+
+    A state is a vector of coefficients; points follow the velocity ``modes @ coefficients`` for
+    one unit of time. Outside the organ space follows smoothly.
+
+    Attributes:
+        origin_mm: node (0, 0, 0) of the lattice; ``spacing_mm``: its step.
+        modes: displacement at each node; a unit coefficient moves the organ by 1 mm rms. Free of
+            rigid motion; the last one swells, the others keep volume.
+        center_ct: the organ's centre of mass.
+        states: the library, one state a row.
+    """
+
+    origin_mm: Float32[np.ndarray, " 3"]
+    spacing_mm: float
+    center_ct: Float64[np.ndarray, " 3"]
+    modes: Float32[np.ndarray, "i j k 3 m"]
+    states: Float32[np.ndarray, "s m"]
+
+    def __post_init__(self) -> None:
+        shapes = (self.modes.ndim, self.states.ndim, self.modes.shape[-1])
+        if shapes != (5, 2, self.states.shape[-1]):
+            raise InputError(
+                f"a body's modes {self.modes.shape} and states {self.states.shape} do not fit; "
+                "build it again."
+            )
+        for name in ("origin_mm", "center_ct", "modes", "states"):
+            array = getattr(self, name)
+            if not np.isfinite(array).all():
+                raise InputError(f"a body's {name} has NaN or infinite values; build it again.")
+            array.flags.writeable = False
+
+    @cached_property
+    def mean(self) -> Float64[np.ndarray, " m"]:
+        """Of the library."""
+        return self.states.mean(0, dtype=float)
+
+    @cached_property
+    def covariance(self) -> Float64[np.ndarray, "m m"]:
+        """Of the library, with a small ridge: always invertible."""
+        ridge = _RIDGE * np.eye(self.states.shape[1])
+        return np.cov(self.states.T.astype(float)) + ridge
+
+    def velocity(self, coefficients: Float[np.ndarray, " m"]) -> Float32[np.ndarray, "i j k 3"]:
+        """The field that points follow, mm per unit of time, at the lattice's nodes."""
+        return self.modes @ coefficients.astype(np.float32)
+
+    def carry(
+        self, coefficients: Float[np.ndarray, " m"], points_ct: Float[np.ndarray, "n 3"]
+    ) -> Float32[np.ndarray, "n 3"]:
+        """Where points of the undeformed organ or about it are in a state."""
+        return self.follow(self.velocity(coefficients), points_ct)
+
+    def back(
+        self, coefficients: Float[np.ndarray, " m"], points: Float[np.ndarray, "n 3"]
+    ) -> Float32[np.ndarray, "n 3"]:
+        """The inverse of ``carry``."""
+        return self.carry(-coefficients, points)
+
+    def follow(
+        self, velocity_mm: Float32[np.ndarray, "i j k 3"], points: Float[np.ndarray, "n 3"]
+    ) -> Float32[np.ndarray, "n 3"]:
+        """Where points are after one unit of time in a field on this body's lattice."""
+        start = np.ascontiguousarray(points, np.float32)
+        steps = steps_for(velocity_mm, self.spacing_mm)
+        return follow(velocity_mm, self.origin_mm, np.float32(self.spacing_mm), start, steps)
+
+    def within_reach(self, coefficients: Float32[np.ndarray, " m"]) -> Float32[np.ndarray, " m"]:
+        """The same with no more swelling or shrinking than the library has."""
+        kept = coefficients.copy()
+        kept[-1] = np.clip(kept[-1], self.states[:, -1].min(), self.states[:, -1].max())
+        return kept
+
+    def to_arrays(self) -> dict[str, np.ndarray]:
+        """Everything as named arrays, for a file."""
+        return {name: np.asarray(getattr(self, name)) for name in _ARRAYS}
+
+    @classmethod
+    def from_arrays(cls, arrays: dict[str, np.ndarray]) -> Body:
+        """The inverse of ``to_arrays``.
+
+        Raises:
+            InputError: an array is missing or of a wrong shape.
+        """
+        missing = [name for name in _ARRAYS if name not in arrays]
+        if missing:
+            raise InputError(f"a body lacks {', '.join(missing)}; build it again.")
+        return cls(
+            np.asarray(arrays["origin_mm"], np.float32),
+            float(arrays["spacing_mm"]),
+            np.asarray(arrays["center_ct"], float),
+            np.ascontiguousarray(arrays["modes"], np.float32),
+            np.asarray(arrays["states"], np.float32),
+        )
+
+
+def build_body(
+    anatomy_ct: Anatomy,
+    up_lps: tuple[float, float, float],
+    config: BodyConfig,
+    seed: int,
+) -> Body:
+    """Finite elements of an organ, its modes, and a library of states under random loads.
+
+    Takes seconds on one core. The same anatomy, configuration and seed give the same body on the
+    same machine; elsewhere last digits differ, and with them possibly the order of modes that
+    matter equally.
+
+    Raises:
+        InputError: an organ so thin, or a lattice so coarse, that no cell is filled.
+    """
+    from tumortrack.simulate.elastic.finite import solid_of
+    from tumortrack.simulate.elastic.lattice import lattice_over
+    from tumortrack.simulate.elastic.loads import random_state
+    from tumortrack.simulate.elastic.modes import modes_of, random_loads
+    from tumortrack.simulate.elastic.settle import Reduced
+    from tumortrack.simulate.elastic.surface import patches_of
+
+    rng = np.random.default_rng([seed, 0xE1A57])
+    up = np.asarray(up_lps, float) / np.linalg.norm(up_lps)
+    organ = anatomy_ct.organ
+    spacing = float(np.cbrt(organ.volume_mm3 / config.cells))
+    solid = solid_of(anatomy_ct, lattice_over(organ.box_mm, spacing), config.poisson)
+    patches = patches_of(organ, config.patches, rng)
+    loads = random_loads(solid, patches, up, config.responses, rng)
+    modes = modes_of(solid, patches, config.modes, config.contrasts, loads)
+    reduced = Reduced(solid, modes, patches)
+    states: list[np.ndarray] = []
+    while len(states) < config.states:
+        state = random_state(reduced, up, config.bed_anywhere, rng)
+        if state is not None:
+            states.append(state)
+    return Body(
+        solid.lattice.origin_mm.astype(np.float32),
+        spacing,
+        solid.center_mm,
+        solid.spread(modes.shapes).astype(np.float32),
+        np.array(states, np.float32),
+    )
