@@ -78,6 +78,8 @@ class Options:
     """Of training in the deformation study (the same as the phantom's)."""
     fault_seeds: tuple[int, ...] | None = None
     """Of the random part of each fault."""
+    severities: tuple[str, ...] | None = None
+    """Faults and their levels, such as visible=60 (those of the plan)."""
     severity_seeds: tuple[int, ...] | None = None
     """Of the random part of each severity."""
     grid: int | None = None
@@ -146,6 +148,7 @@ def _plan(options: Options) -> StudyPlan:
         "case_seeds",
         "configuration_seeds",
         "fault_seeds",
+        "severities",
         "severity_seeds",
         "grid",
         "case_grid",
