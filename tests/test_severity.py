@@ -279,7 +279,7 @@ def test_curves_begin_at_the_clean_scene():
     def curve(kind):
         return [(at, figure(here, value).text()) for at, here in study.levels_of(mine, kind)]
 
-    assert curve("visible") == [(40.0, "10.0"), (100.0, "2.0")]
+    assert curve("visible") == [(100.0, "2.0"), (40.0, "10.0")]
     assert curve("distance") == [(200.0, "2.5")]
     assert curve("noise") == [(0.0, "2.0"), (2.0, "not found")]
     assert curve("tilt") == []
@@ -296,9 +296,12 @@ def test_the_table_has_a_row_for_every_level():
     assert first[3:9] == ["1.5", "1.5", "1.5", "2.0", "2.0", "2.0"]
     assert second[:3] == ["", "", "2"]
     assert second[-1] == "2 of 3"
-    assert rows[2][:3] == ["M_lim", "visible surface left, %", "40"]
+    assert [row[:3] for row in rows[2:4]] == [
+        ["M_lim", "visible surface left, %", "100"],
+        ["", "", "40"],
+    ]
     rigid_rows = rows[-2:]
-    assert [row[-3] for row in rigid_rows] == ["8.8", "2.2"]
+    assert [row[-3] for row in rigid_rows] == ["2.2", "8.8"]
     assert first[-3] == "–"
 
 

@@ -30,7 +30,7 @@ RULE = (
     "targets, for methods that carry points. Bars in the picture reach to the best and the worst "
     "scene, a cross at the top is a level where some scene's tumor was not found."
 )
-_FALLING = ("visible", "points")  # less is more severe: it stands on the right
+_FALLING = ("visible", "points")  # less is more severe
 _DASHES: tuple[Literal["-", "--", ":", "-."], ...] = ("-", "--", ":", "-.")
 _LEAST_MM = 0.1  # the scale is logarithmic
 _TICKS_MM = (1, 2, 5, 10, 20, 50)
@@ -39,7 +39,7 @@ _PANEL_IN = (3.1, 2.75)
 
 
 def levels_of(cells: list[dict], kind: str) -> list[tuple[float, list[dict]]]:
-    """The cells of each level of a kind, from the lowest level up, the clean scene among them."""
+    """The cells of each level of a kind, from mild to severe, the clean scene among them."""
     by_level: dict[float, list[dict]] = {}
     for fault in names(cells, "fault"):
         severity = parse(fault)
@@ -48,7 +48,7 @@ def levels_of(cells: list[dict], kind: str) -> list[tuple[float, list[dict]]]:
     clean, at = pick(cells, fault="clean"), clean_level(kind)
     if by_level and clean and at is not None:
         by_level[at] = clean
-    return sorted(by_level.items())
+    return sorted(by_level.items(), reverse=kind in _FALLING)
 
 
 def table_of(cells: list[dict]) -> str:
