@@ -81,35 +81,69 @@ class Problem:
 
 def settle(problem: Problem) -> Float64[np.ndarray, " m"] | None:
     """The unknowns at rest; None where the contacts do not come to rest."""
-    if not problem.one_sided:
-        return np.linalg.solve(problem.stiffness, problem.forces)
-    rows = np.concatenate([part[0] for part in problem.one_sided])
-    depth = np.concatenate([part[1] for part in problem.one_sided])
-    springs = np.concatenate([part[2] for part in problem.one_sided])
-    z = np.zeros(len(problem.forces))
+    none = (np.zeros((0, len(problem.forces))), np.zeros(0), np.zeros(0))
+    rows, depth, springs = (
+        np.concatenate(parts) for parts in zip(none, *problem.one_sided, strict=True)
+    )
+    z, settled = _settle(problem.stiffness, problem.forces, rows, depth, springs)
+    return z if settled else None
+
+
+# Own loops for all that is small: BLAS would ask every thread to each product, which on a busy
+# machine takes many times longer than the product; and most springs are open.
+@numba.njit(cache=True, nogil=True)
+def _settle(stiffness, forces, rows, depth, springs):  # type: ignore[no-untyped-def]
+    z = np.zeros(len(forces))
     for step in range(_MOST_STEPS):
-        closed = np.where(depth + rows @ z > 0, springs, 0.0)
-        matrix, right = problem.stiffness.copy(), problem.forces.copy()
-        add_springs(matrix, right, rows, -closed * depth, closed)
-        found = np.linalg.solve(matrix, right)
-        move = found - z
-        if np.abs(move).max() < _SETTLED_MM:
-            return found
-        z = z + (1.0 if step < 6 else 0.6) * move  # contacts that open and close in turns
-    return None
+        closed, loads = np.zeros(len(rows)), np.zeros(len(rows))
+        for p in range(len(rows)):
+            sunk = depth[p]
+            for a in range(len(z)):
+                sunk += rows[p, a] * z[a]
+            if sunk > 0:
+                closed[p] = springs[p]
+                loads[p] = -springs[p] * depth[p]
+        matrix, found = stiffness.copy(), forces.copy()
+        add_springs(matrix, found, rows, loads, closed)
+        _solve(matrix, found)
+        farthest = 0.0
+        for a in range(len(z)):
+            move = found[a] - z[a]
+            farthest = max(farthest, abs(move))
+            z[a] += move if step < 6 else 0.6 * move  # contacts that open and close in turns
+        if farthest < _SETTLED_MM:
+            return found, True
+    return z, False
 
 
-# Own loops, since springs are mostly zero, and since BLAS would ask all threads to such small
-# products, which on a busy machine takes many times longer than the product.
 @numba.njit(cache=True, nogil=True)
 def add_springs(matrix, right, rows, loads, springs):  # type: ignore[no-untyped-def]
     """matrix += rows' diag(springs) rows and right += rows' loads, in place."""
-    m = rows.shape[1]
     for p in range(len(rows)):
         if springs[p] == 0.0:
             continue
-        for a in range(m):
+        for a in range(len(right)):
             force = springs[p] * rows[p, a]
             right[a] += rows[p, a] * loads[p]
-            for b in range(m):
+            for b in range(len(right)):
                 matrix[a, b] += force * rows[p, b]
+
+
+@numba.njit(cache=True, nogil=True)
+def _solve(matrix, right):  # type: ignore[no-untyped-def]
+    """right = inverse(matrix) right, by Cholesky; both are overwritten."""
+    n = len(right)
+    for i in range(n):
+        for j in range(i + 1):
+            total = matrix[i, j]
+            for k in range(j):
+                total -= matrix[i, k] * matrix[j, k]
+            matrix[i, j] = np.sqrt(total) if i == j else total / matrix[j, j]
+        total = right[i]
+        for k in range(i):
+            total -= matrix[i, k] * right[k]
+        right[i] = total / matrix[i, i]
+    for i in range(n - 1, -1, -1):
+        right[i] /= matrix[i, i]
+        for k in range(i):
+            right[k] -= matrix[i, k] * right[i]

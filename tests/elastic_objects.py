@@ -1,0 +1,21 @@
+"""A small ellipsoid with a ball as its tumor, on a coarse lattice."""
+
+from __future__ import annotations
+
+import numpy as np
+import trimesh
+
+from tumortrack.core.types import Anatomy, Mesh
+from tumortrack.simulate.elastic.body import BodyConfig
+
+UP = (0.0, -1.0, 0.0)
+CENTER = np.array([60.0, -20.0, -900.0])
+RADII = np.array([30.0, 24.0, 48.0])
+SMALL = BodyConfig(cells=200, modes=20, responses=80, patches=200, states=80)
+
+
+def organ() -> Anatomy:
+    ball = trimesh.creation.icosphere(subdivisions=4)
+    whole = Mesh(ball.vertices * RADII + CENTER, ball.faces)
+    tumor = Mesh(ball.vertices * 11 + CENTER + [0, -8, 20], ball.faces)
+    return Anatomy((whole, tumor))
