@@ -160,6 +160,7 @@ def simulate(
     rotations: Literal["limited", "full"] = "limited",
     squeeze: bool = False,
     noise: bool = True,
+    elastic: bool = False,
 ) -> None:
     """Write deformed scenes of a case with their truth: what `evaluate` reads.
 
@@ -173,13 +174,17 @@ def simulate(
         rotations: poses, as in `train`.
         squeeze: also squeeze and bend the organ as a whole.
         noise: with the depth sensor's noise.
+        elastic: deform the organ as an elastic body in its bed does (plates, instruments, pulls,
+            weight, swelling), instead of by the paper's table.
     """
     from tumortrack.app import commands
 
     commands.simulate(
         case,
         dataset,
-        commands.SimulateOptions(scenes, seed, configuration, falloff, rotations, squeeze, noise),
+        commands.SimulateOptions(
+            scenes, seed, configuration, falloff, rotations, squeeze, noise, elastic
+        ),
     )
 
 
@@ -282,6 +287,8 @@ def main() -> None:
     # OpenMP's threads wait by spinning; where other programs want the cores that is several times
     # slower than giving them back soon, and no faster where they don't.
     os.environ.setdefault("GOMP_SPINCOUNT", "1000")
+    # NumPy's and SciPy's matrices here are small: more threads gain little, and lose much likewise.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     try:
         tyro.extras.subcommand_cli_from_dict(
             COMMANDS,

@@ -15,6 +15,8 @@ if TYPE_CHECKING:
     from tumortrack.learn.model import Model
     from tumortrack.simulate.scene import SceneConfig
 
+_TEST_BODY = 2**20  # and the seed: elastic states that training with the same seed never sees
+
 
 @dataclass(frozen=True)
 class SimulateOptions:
@@ -25,19 +27,29 @@ class SimulateOptions:
     rotations: Literal["limited", "full"] = "limited"
     squeeze: bool = False
     noise: bool = True
+    elastic: bool = False
 
     def scene_config(self) -> SceneConfig:
         from tumortrack.sense.noise import CLEAN, D405_NOISE
-        from tumortrack.simulate.deform import ChainConfig, DeformConfig, DragConfig, StretchConfig
+        from tumortrack.simulate.deform import (
+            ChainConfig,
+            DeformConfig,
+            DragConfig,
+            ElasticConfig,
+            StretchConfig,
+        )
         from tumortrack.simulate.deform.drag import CONFIGURATIONS
         from tumortrack.simulate.pose import PoseConfig
         from tumortrack.simulate.scene import SceneConfig
 
-        drags = (
+        models: list[DragConfig | ElasticConfig] = [
             DragConfig(steps=CONFIGURATIONS[n], falloff=self.falloff) for n in self.configurations
-        )
+        ]
+        if self.elastic:
+            models = [ElasticConfig()]
         deform: tuple[DeformConfig, ...] = tuple(
-            ChainConfig(links=(drag, StretchConfig())) if self.squeeze else drag for drag in drags
+            ChainConfig(links=(model, StretchConfig())) if self.squeeze else model
+            for model in models
         )
         return SceneConfig(
             width=848,
@@ -55,6 +67,7 @@ def write_scenes(case_folder: Path, dataset: Path, options: SimulateOptions) -> 
         InputError: no case, or scenes that are not of this case, seed and options.
     """
     from tumortrack.imaging.case import load_case
+    from tumortrack.simulate.bodies import body_for
     from tumortrack.simulate.scene import SceneRecipe, Simulator
     from tumortrack.simulate.scene_folder import Scene, write_scene
     from tumortrack.simulate.targets import draw_targets
@@ -63,7 +76,8 @@ def write_scenes(case_folder: Path, dataset: Path, options: SimulateOptions) -> 
         raise InputError(f"--scenes {options.scenes} must be at least 1.")
     case = load_case(case_folder)
     config = options.scene_config()
-    simulator = Simulator(case.anatomy, case.up_lps, config)
+    body = body_for(case.anatomy, case.up_lps, config, _TEST_BODY + options.seed)
+    simulator = Simulator(case.anatomy, case.up_lps, config, body)
     targets = draw_targets(case.anatomy, options.seed)
     volumes = [part.volume_mm3 for part in case.anatomy.parts]
     about = {
