@@ -21,6 +21,7 @@ import torch
 import trimesh
 from rich.console import Console
 from rich.table import Table
+from scipy.ndimage import map_coordinates
 
 from tumortrack.app.presets import paper, quick
 from tumortrack.core.geometry import transform_points
@@ -30,7 +31,10 @@ from tumortrack.learn.config import TrainConfig
 from tumortrack.learn.model import has_fast_bfloat16
 from tumortrack.learn.network import OccupancyNetwork
 from tumortrack.phantom.digital import PhantomParameters, phantom_labels
+from tumortrack.simulate.bodies import body_for
+from tumortrack.simulate.deform import DragConfig, ElasticConfig
 from tumortrack.simulate.deform.drag import Drags
+from tumortrack.simulate.deform.elastic import Elastic
 from tumortrack.simulate.occupancy import OccupancyConfig, OccupancyPool, labels_of
 from tumortrack.simulate.scene import SceneConfig, SceneRecipe, Simulator, Stage
 
@@ -52,12 +56,12 @@ def medians(*versions: Callable[[], object]) -> list[float]:
     return [float(np.median(times)) for times in seconds]
 
 
-def generator() -> tuple[str, float, float]:
+def generator(name: str, deform: DragConfig | ElasticConfig) -> tuple[str, float, float]:
     """One training pair: deform 2,000 labelled points and the surface, depth at 424 x 240."""
     anatomy, _ = surfaces(phantom_labels(PhantomParameters()))
-    config = SceneConfig(occupancy=OccupancyConfig(per_side=283))
+    config = SceneConfig(occupancy=OccupancyConfig(per_side=283), deform=(deform,))
     pool = OccupancyPool(anatomy, config.occupancy, 0)
-    simulator = Simulator(anatomy, UP, config)
+    simulator = Simulator(anatomy, UP, config, body_for(anatomy, UP, config, 0))
     index = iter(range(10**9))
 
     def ours() -> None:
@@ -66,28 +70,44 @@ def generator() -> tuple[str, float, float]:
 
     def naive() -> None:
         stage = simulator.stage(SceneRecipe(0, "train", next(index)))
-        assert isinstance(stage.deformation, Drags)
-        parts = [
-            part.moved(_plain_carry(stage, stage.deformation, part.vertices_mm))
-            for part in anatomy.parts
-        ]
+        parts = [part.moved(_plain_carry(stage, part.vertices_mm)) for part in anatomy.parts]
         _plain_depth(trimesh.Trimesh(parts[0].vertices_mm, parts[0].faces, process=False), stage)
         lower, upper = parts[0].box_mm
         points = np.random.default_rng(0).uniform(lower, upper, (2000, 3)).astype(np.float32)
         labels_of(type(anatomy)(tuple(parts)), points)
 
     mine, plain = medians(ours, naive)
-    return "generator, 2,000 labels (pairs/s)", 20 / mine, 1 / plain
+    return f"generator, {name}, 2,000 labels (pairs/s)", 20 / mine, 1 / plain
 
 
-def _plain_carry(stage: Stage, drags: Drags, points_ct: np.ndarray) -> np.ndarray:
+def _plain_carry(stage: Stage, points_ct: np.ndarray) -> np.ndarray:
+    deformation = stage.deformation
+    plain = _plain_drags if isinstance(deformation, Drags) else _plain_flow
+    return transform_points(stage.camera_from_ct, plain(deformation, points_ct))
+
+
+def _plain_drags(drags: Drags, points_ct: np.ndarray) -> np.ndarray:
     moved = points_ct.copy()
     for centre, shift, sigma in zip(
         drags.centres_ct, drags.shifts_mm, drags.sigmas_mm, strict=True
     ):
         square = ((moved - centre) ** 2).sum(1)
         moved += np.exp(-0.5 * square / sigma**2)[:, None] * shift
-    return transform_points(stage.camera_from_ct, moved)
+    return moved
+
+
+def _plain_flow(elastic: Elastic, points_ct: np.ndarray) -> np.ndarray:
+    body, steps = elastic.body, 12
+    field = np.moveaxis(body.velocity(elastic.coefficients), 3, 0)
+
+    def sample(points: np.ndarray) -> np.ndarray:
+        place = (points - body.origin_mm).T / body.spacing_mm
+        return np.stack([map_coordinates(f, place, order=1, mode="nearest") for f in field], 1)
+
+    moved = points_ct.copy()
+    for _ in range(steps):  # midpoint rule
+        moved += sample(moved + sample(moved) / (2 * steps)) / steps
+    return moved
 
 
 def _plain_depth(mesh: trimesh.Trimesh, stage: Stage) -> np.ndarray:
@@ -147,7 +167,8 @@ def main() -> None:
     keep_freed_memory()
     anatomy, _ = surfaces(phantom_labels(PhantomParameters(), voxel_mm=1.5))
     rows = [
-        generator(),
+        generator("drags", DragConfig()),
+        generator("elastic", ElasticConfig()),
         training_step("quick", quick(anatomy), 32),
         training_step("paper", paper(anatomy), 8),
         frame("quick", quick(anatomy)),

@@ -346,6 +346,25 @@ def test_a_body_survives_a_file(body):
         Body.from_arrays({**body.to_arrays(), "center_ct": np.full(3, np.nan)})
 
 
+@pytest.mark.parametrize(
+    "change", [{"modes": 1}, {"modes": 90}, {"cells": 9}, {"poisson": 0.5}, {"contrasts": ()}]
+)
+def test_numbers_that_make_no_body_are_refused(change):
+    with pytest.raises(InputError, match="makes no body"):
+        build_body(ANATOMY, UP, msgspec.structs.replace(SMALL, **change), 0)
+
+
+def test_a_surface_turned_inside_out_is_refused():
+    inside_out = Anatomy((Mesh(ORGAN.vertices_mm, ORGAN.faces[:, ::-1]),))
+    with pytest.raises(InputError, match="outward"):
+        build_body(inside_out, UP, SMALL, 0)
+
+
+def test_an_organ_without_tumors_has_a_body_too():
+    plain = build_body(Anatomy((ORGAN,)), UP, SMALL, 0)
+    assert np.linalg.norm(plain.states, axis=1).max() > 1.5
+
+
 def visible(points: np.ndarray) -> np.ndarray:
     return np.ones(len(points), bool)
 

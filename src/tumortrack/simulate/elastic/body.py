@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import islice
 
 import numpy as np
 from jaxtyping import Float, Float32, Float64
@@ -11,7 +12,7 @@ from jaxtyping import Float, Float32, Float64
 from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError
 from tumortrack.core.types import Anatomy
-from tumortrack.simulate.elastic.flow import follow, steps_for
+from tumortrack.simulate.elastic.flow import follow, project, steps_for
 
 _RIDGE = 1e-4  # mm2, on the covariance: no coefficient is ever known for sure
 _ARRAYS = ("origin_mm", "spacing_mm", "center_ct", "modes", "states")
@@ -100,6 +101,20 @@ class Body:
         steps = steps_for(velocity_mm, self.spacing_mm)
         return follow(velocity_mm, self.origin_mm, np.float32(self.spacing_mm), start, steps)
 
+    def modes_at(self, points: Float[np.ndarray, "n 3"]) -> Float32[np.ndarray, "n 3 m"]:
+        """The modes at points of the CT frame."""
+        eye = np.eye(3, dtype=np.float32)
+        along = [self.modes_along(points, np.tile(axis, (len(points), 1))) for axis in eye]
+        return np.stack(along, 1)
+
+    def modes_along(
+        self, points: Float[np.ndarray, "n 3"], directions: Float[np.ndarray, "n 3"]
+    ) -> Float32[np.ndarray, "n m"]:
+        """The modes at points of the CT frame, each along a direction of the point's own."""
+        place = np.ascontiguousarray(points, np.float32)
+        along = np.ascontiguousarray(directions, np.float32)
+        return project(self.modes, self.origin_mm, np.float32(self.spacing_mm), place, along)
+
     def within_reach(self, coefficients: Float32[np.ndarray, " m"]) -> Float32[np.ndarray, " m"]:
         """The same with no more swelling or shrinking than the library has."""
         kept = coefficients.copy()
@@ -142,8 +157,9 @@ def build_body(
     matter equally.
 
     Raises:
-        InputError: an organ so thin, or a lattice so coarse, that no cell is filled.
+        InputError: a surface that turns inside, or numbers that make no body.
     """
+    _check(anatomy_ct, config)
     from tumortrack.simulate.elastic.finite import solid_of
     from tumortrack.simulate.elastic.lattice import lattice_over
     from tumortrack.simulate.elastic.loads import random_state
@@ -160,11 +176,13 @@ def build_body(
     loads = random_loads(solid, patches, up, config.responses, rng)
     modes = modes_of(solid, patches, config.modes, config.contrasts, loads)
     reduced = Reduced(solid, modes, patches)
-    states: list[np.ndarray] = []
-    while len(states) < config.states:
-        state = random_state(reduced, up, config.bed_anywhere, rng)
-        if state is not None:
-            states.append(state)
+    drawn = (random_state(reduced, up, config.bed_anywhere, rng) for _ in range(2 * config.states))
+    states = list(islice((state for state in drawn if state is not None), config.states))
+    if len(states) < config.states:
+        raise InputError(
+            f"only {len(states)} of {2 * config.states} loads leave this organ at rest; its "
+            "surface may be torn. Look at the case's pictures, and prepare it again."
+        )
     return Body(
         solid.lattice.origin_mm.astype(np.float32),
         spacing,
@@ -172,3 +190,21 @@ def build_body(
         solid.spread(modes.shapes).astype(np.float32),
         np.array(states, np.float32),
     )
+
+
+def _check(anatomy_ct: Anatomy, config: BodyConfig) -> None:
+    if anatomy_ct.organ.volume_mm3 <= 0:
+        raise InputError("the organ's surface has no volume inside; its faces must turn outward.")
+    if not (
+        config.cells >= 50
+        and 2 <= config.modes <= min(config.responses, config.cells)
+        and config.states >= 2
+        and config.patches >= 20
+        and 0 <= config.poisson < 0.5
+        and len(config.contrasts) > 0
+        and min(config.contrasts) > 0
+    ):
+        raise InputError(
+            f"{config} makes no body: it needs at least 50 cells, 20 patches, 2 states, 2 modes "
+            "(no more than responses and cells), contrasts above 0, a Poisson ratio in 0..0.5."
+        )

@@ -80,3 +80,28 @@ def follow(velocity, origin, spacing, points, steps):  # type: ignore[no-untyped
         out[p, 1] = origin[1] + spacing * y
         out[p, 2] = origin[2] + spacing * z
     return out
+
+
+@numba.njit(cache=True, fastmath=True, nogil=True)
+def project(modes, origin, spacing, points, directions):  # type: ignore[no-untyped-def]
+    """Trilinear values of modes (i, j, k, 3, m) at points (n, 3), each along a direction (n, 3);
+    all float32. Beyond the lattice those of its nearest border."""
+    n, m = len(points), modes.shape[4]
+    out = np.zeros((n, m), np.float32)
+    zero, one, most = np.float32(0), np.float32(1), np.float32(1.001)
+    per_cell = one / spacing
+    for p in range(n):
+        x = min(max((points[p, 0] - origin[0]) * per_cell, zero), modes.shape[0] - most)
+        y = min(max((points[p, 1] - origin[1]) * per_cell, zero), modes.shape[1] - most)
+        z = min(max((points[p, 2] - origin[2]) * per_cell, zero), modes.shape[2] - most)
+        i, j, k = int(x), int(y), int(z)
+        a, b, c = np.float32(x - i), np.float32(y - j), np.float32(z - k)
+        d0, d1, d2 = directions[p, 0], directions[p, 1], directions[p, 2]
+        for corner in range(8):
+            u, v, w = corner >> 2, (corner >> 1) & 1, corner & 1
+            share = (a if u else one - a) * (b if v else one - b) * (c if w else one - c)
+            here = modes[i + u, j + v, k + w]
+            s0, s1, s2 = share * d0, share * d1, share * d2
+            for mode in range(m):
+                out[p, mode] += s0 * here[0, mode] + s1 * here[1, mode] + s2 * here[2, mode]
+    return out
