@@ -11,7 +11,7 @@ import numba
 import numpy as np
 from jaxtyping import Float32
 
-_PER_SLOPE = 8  # steps, times the field's steepest slope: back within 0.01 mm of the start
+_PER_SLOPE = 10  # steps, times the field's steepest slope: back within 0.01 mm of the start
 _FEWEST, _MOST = 3, 24
 
 
