@@ -11,6 +11,7 @@ import trimesh
 from scipy.linalg import expm
 
 from elastic_objects import CENTER, RADII, SMALL, UP, organ
+from tumortrack.app.scenes import SimulateOptions
 from tumortrack.core.config import from_builtins, to_builtins
 from tumortrack.core.errors import InputError
 from tumortrack.core.types import Anatomy, Mesh
@@ -411,6 +412,12 @@ def test_a_body_is_built_where_it_is_needed_and_once():
     finer = ElasticConfig(body=msgspec.structs.replace(SMALL, cells=300))
     with pytest.raises(InputError, match="different bodies"):
         body_for(ANATOMY, UP, SceneConfig(deform=(model, finer)), 0)
+
+
+def test_simulate_makes_elastic_scenes_on_request():
+    assert SimulateOptions(elastic=True).scene_config().deform == (ElasticConfig(),)
+    (chain,) = SimulateOptions(elastic=True, squeeze=True).scene_config().deform
+    assert chain == ChainConfig(links=(ElasticConfig(), StretchConfig()))
 
 
 def test_a_stream_takes_its_body_along(body):
