@@ -71,7 +71,7 @@ def train(
     model: Positional[Path],
     /,
     *,
-    preset: Literal["quick", "paper"] = "quick",
+    preset: Literal["clinic", "quick", "paper"] = "clinic",
     rotations: Literal["limited", "full"] = "limited",
     minutes: float | None = None,
     steps: int | None = None,
@@ -85,7 +85,8 @@ def train(
     Args:
         case: folder that `prepare` wrote.
         model: folder to write.
-        preset: network and rules of training.
+        preset: network and rules of training: clinic places the organ of the CT (default), quick
+            and paper label points.
         rotations: poses to learn: any turn about the camera's axis and tilts up to 15 degrees,
             or every rotation.
         minutes: stop after about so long (default: the preset's end).

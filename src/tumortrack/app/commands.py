@@ -42,7 +42,7 @@ def prepare(source: Path, folder: Path, options: PrepareOptions, overwrite: bool
 
 @dataclass(frozen=True)
 class TrainOptions:
-    preset: Literal["quick", "paper"] = "quick"
+    preset: Literal["clinic", "quick", "paper"] = "clinic"
     rotations: Literal["limited", "full"] = "limited"
     minutes: float | None = None
     steps: int | None = None

@@ -9,10 +9,12 @@ import numpy as np
 
 from tumortrack.core.types import Anatomy
 from tumortrack.learn.config import Schedule, TrainConfig
-from tumortrack.learn.network import paper_network, quick_network
+from tumortrack.learn.network import clinic_network, paper_network, quick_network
+from tumortrack.sense.calibration import CalibrationConfig
 from tumortrack.sense.clutter import ClutterConfig
 from tumortrack.sense.noise import D405_NOISE
-from tumortrack.simulate.deform import ChainConfig, DragConfig, StretchConfig
+from tumortrack.sense.occlusion import OcclusionConfig
+from tumortrack.simulate.deform import ChainConfig, DragConfig, ElasticConfig, StretchConfig
 from tumortrack.simulate.deform.drag import CONFIGURATIONS
 from tumortrack.simulate.occupancy import OccupancyConfig
 from tumortrack.simulate.pose import PoseConfig
@@ -62,4 +64,34 @@ def quick(anatomy: Anatomy, rotations: Rotations = "limited") -> TrainConfig:
     )
 
 
-PRESETS: dict[str, Callable[[Anatomy, Rotations], TrainConfig]] = {"paper": paper, "quick": quick}
+def clinic(anatomy: Anatomy, rotations: Rotations = "limited") -> TrainConfig:
+    """The default: a warp of the organ's elastic body, learnt in minutes from scenes with faulty
+    sensors, hidden surface and background."""
+    lower, upper = anatomy.organ.box_mm
+    elastic = ElasticConfig()
+    return TrainConfig(
+        network=clinic_network(elastic.body.modes, scale_mm=float(np.max(upper - lower)) / 2),
+        scene=SceneConfig(
+            pose=PoseConfig(rotations=rotations, tilt_deg=30.0),
+            deform=(elastic,),
+            clutter=ClutterConfig(scenes=0.5, largest_share=0.15),
+            noise=D405_NOISE,
+            occlusion=OcclusionConfig(scenes=0.6, largest_share=0.6, left_in=0.15),
+            calibration=CalibrationConfig(offset_mm=2.0, scale=0.01),
+            cloud_points=(500, 5000),
+            free_range=0.6,
+            free_nearest_mm=(80.0, 300.0),
+        ),
+        schedule=Schedule(learning_rate=1.5e-3),
+        batch_size=32,
+        steps=6_000,
+        drop_points=0.6,
+        validate_every=500,
+    )
+
+
+PRESETS: dict[str, Callable[[Anatomy, Rotations], TrainConfig]] = {
+    "clinic": clinic,
+    "quick": quick,
+    "paper": paper,
+}

@@ -10,13 +10,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Float, Int
 
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.motion import Motion
 from tumortrack.core.types import Anatomy, CameraLabels, Mesh
-from tumortrack.imaging.raster import _expand, voxelise
+from tumortrack.imaging.raster import _expand
+from tumortrack.imaging.raster import label_grid as label_grid
 from tumortrack.simulate.targets import Targets
 
 # Vertices are sampled too, so the maximum misses at most s^2 / (8 R) where a flat piece of size s
@@ -176,16 +177,6 @@ def target_errors(motion: Motion, targets: Targets) -> dict[str, float]:
 def box_center_distance(estimate: Mesh, reference: Mesh) -> float:
     """Distance between the centres of the two axis-aligned bounding boxes, mm."""
     return float(np.linalg.norm(estimate.box_mm.mean(0) - reference.box_mm.mean(0)))
-
-
-def label_grid(
-    anatomy: Anatomy, camera_from_index: Float[np.ndarray, "4 4"], shape: tuple[int, int, int]
-) -> UInt8[np.ndarray, "i j k"]:
-    """Labels of an anatomy on a grid: 1 organ, 2, 3, ... tumors; a tumor wins over the organ."""
-    labels = np.zeros(shape, np.uint8)
-    for label, part in enumerate(anatomy.parts, start=1):
-        labels[voxelise(part, camera_from_index, shape)] = label
-    return labels
 
 
 def label_ious(estimate: CameraLabels, reference: Anatomy) -> dict[str, float]:

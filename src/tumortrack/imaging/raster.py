@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, Int16
+from jaxtyping import Bool, Float, Int, Int16, UInt8
 
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import transform_points
-from tumortrack.core.types import Mesh
+from tumortrack.core.types import Anatomy, Mesh
 
 _CHUNK = 2_000_000  # candidate pixels held at once
 _MOST_CELLS = 2**28  # of a grid
@@ -134,3 +134,13 @@ def voxelise(
     Overlapping sheets of a folded surface so cut no holes, as plain parity would.
     """
     return winding_numbers(mesh, frame_from_index, shape) != 0
+
+
+def label_grid(
+    anatomy: Anatomy, camera_from_index: Float[np.ndarray, "4 4"], shape: tuple[int, int, int]
+) -> UInt8[np.ndarray, "i j k"]:
+    """Labels of an anatomy on a grid: 1 organ, 2, 3, ... tumors; a tumor wins over the organ."""
+    labels = np.zeros(shape, np.uint8)
+    for label, part in enumerate(anatomy.parts, start=1):
+        labels[voxelise(part, camera_from_index, shape)] = label
+    return labels

@@ -6,6 +6,7 @@ from typing import Literal
 
 from tumortrack.core.config import Config
 from tumortrack.learn.network import NetworkConfig
+from tumortrack.learn.warp.refine import RefineConfig
 from tumortrack.simulate.scene import SceneConfig
 
 
@@ -25,7 +26,10 @@ class Schedule(Config, frozen=True):
 
 
 class TrainConfig(Config, frozen=True):
-    """Everything that decides the weights, apart from case, seed and number of steps."""
+    """Everything that decides the weights, apart from case, seed and number of steps; ``refine``
+    is how a warp is laid on the cloud, in validation and in use."""
+
+    LATER = ("refine",)
 
     network: NetworkConfig
     scene: SceneConfig
@@ -39,3 +43,4 @@ class TrainConfig(Config, frozen=True):
     validation_pairs: int = 64
     validation_points: int = 2048
     validate_every: int = 250  # steps
+    refine: RefineConfig = RefineConfig()

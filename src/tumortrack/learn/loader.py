@@ -15,7 +15,8 @@ from tumortrack.simulate.dataset import SceneStream
 
 __all__ = ["Tensors", "available_cores", "batches", "default_workers"]
 
-Tensors = tuple[torch.Tensor, torch.Tensor, torch.Tensor]  # clouds, points, labels
+# clouds, points, labels, poses (camera_from_ct)
+Tensors = tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]
 
 
 class _Batches(Dataset[Tensors]):
@@ -31,6 +32,7 @@ class _Batches(Dataset[Tensors]):
             torch.from_numpy(batch.clouds_mm),
             torch.from_numpy(batch.points_mm),
             torch.from_numpy(batch.labels),
+            torch.from_numpy(batch.camera_from_ct),
         )
 
 

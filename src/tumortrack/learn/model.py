@@ -8,6 +8,8 @@ from pathlib import Path
 import numpy as np
 import torch
 from jaxtyping import Float64
+from safetensors.numpy import load as load_arrays
+from safetensors.numpy import save as save_arrays
 from safetensors.torch import load, save
 
 from tumortrack.core import store
@@ -15,10 +17,12 @@ from tumortrack.core.config import from_builtins, to_builtins
 from tumortrack.core.errors import ArtifactError, InputError
 from tumortrack.learn.config import TrainConfig
 from tumortrack.learn.fit import Familiar
-from tumortrack.learn.network import OccupancyNetwork
+from tumortrack.learn.networks import Network, network_of
+from tumortrack.learn.warp.shape import Shape
 
 KIND = "model"
 _WEIGHTS = "weights.safetensors"
+_SHAPE = "shape.safetensors"
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,23 +31,29 @@ class Model:
 
     ``query_box_mm``: where the organ can lie, relative to the median of the observed points,
     camera frame (lower and upper corner). ``familiar``: what tells its clouds from others.
-    ``provenance``: seeds, steps, hashes.
+    ``provenance``: seeds, steps, hashes. A warp also has the organ's ``shape``, and ``std_scale``:
+    what its motions' standard deviations are to be multiplied by.
     """
 
-    network: OccupancyNetwork
+    network: Network
     config: TrainConfig
     parts: tuple[str, ...]
     query_box_mm: Float64[np.ndarray, "2 3"]
     familiar: Familiar
     provenance: dict
+    shape: Shape | None = None
+    std_scale: float = 1.0
 
 
 def save_model(model: Model, folder: Path) -> None:
     """Write weights and manifest into an existing folder, the manifest last."""
     weights = {k: v.contiguous() for k, v in model.network.state_dict().items()}
     store.write_atomically(folder / _WEIGHTS, save(weights))
+    if model.shape is not None:
+        store.write_atomically(folder / _SHAPE, save_arrays(model.shape.to_arrays()))
     content = {
         "parts": list(model.parts),
+        "std_scale": model.std_scale,
         "query_box_mm": model.query_box_mm.tolist(),
         "familiar": to_builtins(model.familiar),
         "provenance": model.provenance,
@@ -74,10 +84,14 @@ def load_model(folder: Path, device: str = "auto") -> Model:
         config = from_builtins(manifest["config"], TrainConfig, f"{folder}: config")
         parts = tuple(manifest["parts"])
         box = np.array(manifest["query_box_mm"], float).reshape(2, 3)
-        network = OccupancyNetwork(config.network)
+        network = network_of(config.network)
         network.load_state_dict(load((folder / _WEIGHTS).read_bytes()))
         familiar = from_builtins(manifest["familiar"], Familiar, f"{folder}: familiar")
         provenance = dict(manifest["provenance"])
+        shape = None
+        if config.network.warps:
+            shape = Shape.from_arrays(load_arrays((folder / _SHAPE).read_bytes()), len(parts))
+        std_scale = float(manifest.get("std_scale", 1.0))
     except InputError as error:
         raise ArtifactError(
             f"{error} The model was trained by another version of tumortrack; train it again."
@@ -87,7 +101,7 @@ def load_model(folder: Path, device: str = "auto") -> Model:
             f"{folder} is not a whole model of this version: {error}. Train it again."
         ) from error
     network.eval().requires_grad_(False).to(choose_device(device))
-    return Model(network, config, parts, box, familiar, provenance)
+    return Model(network, config, parts, box, familiar, provenance, shape, std_scale)
 
 
 def choose_device(device: str) -> torch.device:

@@ -16,7 +16,9 @@ from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError
 from tumortrack.learn.decoders import DecoderConfig
 from tumortrack.learn.decoders.mlp import MlpDecoderConfig
+from tumortrack.learn.decoders.warp import WarpDecoderConfig
 from tumortrack.learn.encoders import EncoderConfig
+from tumortrack.learn.encoders.heightmap import HeightMapConfig
 from tumortrack.learn.encoders.pointnet2 import PointNet2Config, SetAbstraction
 from tumortrack.learn.layers import Layer
 from tumortrack.learn.sampling import take
@@ -63,8 +65,17 @@ class NetworkConfig(Config, frozen=True):
     decoder: DecoderConfig
     normalisation: CloudBox | FixedScale | Aligned
 
+    @property
+    def warps(self) -> bool:
+        """Whether the network places the pre-operative organ, instead of labelling points."""
+        return isinstance(self.decoder, WarpDecoderConfig)
+
     def build(self) -> OccupancyNetwork:
-        """The network, with weights from torch's global generator (``torch.manual_seed``)."""
+        """The network, with weights from torch's global generator (``torch.manual_seed``).
+
+        Raises:
+            InputError: a warp decoder; ``learn.warp.network`` has its network.
+        """
         return OccupancyNetwork(self)
 
 
@@ -85,6 +96,8 @@ class OccupancyNetwork(nn.Module):
     def __init__(self, config: NetworkConfig) -> None:
         super().__init__()
         self.config = config
+        if not isinstance(config.decoder, MlpDecoderConfig):
+            raise InputError("an occupancy network needs a decoder of queries, such as `mlp`.")
         self.encoder = config.encoder.build()
         self.decoder = config.decoder.build(config.encoder.latent_size)
 
@@ -113,6 +126,15 @@ class OccupancyNetwork(nn.Module):
     def forward(self, points_mm: Tensor, queries_mm: Tensor) -> Tensor:
         """Both at once: (B, N, 3) and (B, Q, 3) -> logits (B, Q, classes)."""
         return self.query(self.encode(points_mm), queries_mm)
+
+    def loss(
+        self, clouds_mm: Tensor, points_mm: Tensor, labels: Tensor, camera_from_ct: Tensor
+    ) -> Tensor:
+        """Cross-entropy of the points' labels, all points equal (the paper). The poses are not
+        used."""
+        logits = self.query(self.encode(clouds_mm), points_mm)
+        flat = logits.float().flatten(0, 1)
+        return nn.functional.cross_entropy(flat, labels.long().flatten())
 
     def folded(self) -> OccupancyNetwork:
         """A copy for inference: batch norms folded into their linear layers, no gradients."""
@@ -221,5 +243,15 @@ def quick_network(n_classes: int, scale_mm: float) -> NetworkConfig:
         decoder=MlpDecoderConfig(
             n_classes=n_classes, width=128, hidden_layers=5, skip_layer=3, octaves=(0, 1, 2)
         ),
+        normalisation=Aligned(scale_mm=scale_mm, reach=1.35),
+    )
+
+
+def clinic_network(modes: int, scale_mm: float) -> NetworkConfig:
+    """Height map to warp: learns in minutes, runs in milliseconds (docs/results.md has the
+    comparison with the other encoders and decoders). ``modes``: of the organ's body."""
+    return NetworkConfig(
+        encoder=HeightMapConfig(),
+        decoder=WarpDecoderConfig(modes=modes),
         normalisation=Aligned(scale_mm=scale_mm, reach=1.35),
     )

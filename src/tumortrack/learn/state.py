@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from tumortrack.core.errors import TumortrackError
 from tumortrack.learn.checkpoint import (
@@ -19,7 +20,7 @@ from tumortrack.learn.checkpoint import (
 )
 from tumortrack.learn.loader import Tensors
 from tumortrack.learn.model import has_fast_bfloat16
-from tumortrack.learn.network import OccupancyNetwork
+from tumortrack.learn.networks import Network, network_of
 from tumortrack.learn.run import Run, run_identity
 from tumortrack.learn.schedule import learning_rate
 
@@ -42,8 +43,8 @@ class TrainingState:
         self._bf16 = has_fast_bfloat16(device)
         config = run.config
         torch.manual_seed(run.seed)
-        self.network = OccupancyNetwork(config.network).to(device)
-        self.average = OccupancyNetwork(config.network).to(device).eval().requires_grad_(False)
+        self.network = network_of(config.network).to(device)
+        self.average = network_of(config.network).to(device).eval().requires_grad_(False)
         self.average.load_state_dict(self.network.state_dict())
         self.optimizer = torch.optim.Adam(
             self.network.parameters(),
@@ -54,6 +55,11 @@ class TrainingState:
         self.progress = Progress(end=end)
         self._best: dict[str, Tensor] = {}
         self.learning_rate = 0.0  # of the last step
+
+    def know(self, teach: Callable[[Network], None]) -> None:
+        """Give both networks what does not have to be learnt."""
+        teach(self.network)
+        teach(self.average)
 
     def resume(self, work: Path) -> None:
         """Take up the last checkpoint, if there is one."""
@@ -90,15 +96,14 @@ class TrainingState:
             Diverged: the loss is no number; the weights are as they were.
         """
         config, progress = self._run.config, self.progress
-        clouds, points, labels = (part.to(self._device, non_blocking=True) for part in batch)
+        clouds, *truth = (part.to(self._device, non_blocking=True) for part in batch)
         clouds = clouds[:, : self.points_kept(clouds.shape[1])]
         self.learning_rate = learning_rate(config, progress)
         for group in self.optimizer.param_groups:
             group["lr"] = self.learning_rate
         self.network.train()
         with torch.autocast(self._device.type, torch.bfloat16, enabled=self._bf16):
-            logits = self.network.query(self.network.encode(clouds), points)
-        loss = nn.functional.cross_entropy(logits.float().flatten(0, 1), labels.long().flatten())
+            loss = self.network.loss(clouds, *truth)
         value = float(loss.detach())
         if not math.isfinite(value):
             raise Diverged(progress.step)
@@ -133,7 +138,7 @@ class TrainingState:
             self.progress.best_miou = miou
             self._best = {k: v.clone() for k, v in self.average.state_dict().items()}
 
-    def best_network(self) -> OccupancyNetwork:
+    def best_network(self) -> Network:
         """The averaged weights of the best validation."""
         self.average.load_state_dict(self._best)
         return self.average

@@ -19,17 +19,15 @@ from tumortrack.core.errors import TumortrackError
 from tumortrack.learn.allocator import keep_freed_memory
 from tumortrack.learn.checkpoint import Progress
 from tumortrack.learn.cores import available_cores
+from tumortrack.learn.course import course_of
 from tumortrack.learn.history import History, Record
 from tumortrack.learn.loader import batches, default_workers
 from tumortrack.learn.model import Model, choose_device, save_model
 from tumortrack.learn.run import Run, provenance, run_identity
 from tumortrack.learn.schedule import settle_end
 from tumortrack.learn.state import TrainingState
-from tumortrack.learn.validate import ValidationSet
 from tumortrack.learn.work import work_folder
-from tumortrack.simulate.bodies import body_for
 from tumortrack.simulate.dataset import SceneStream
-from tumortrack.simulate.occupancy import OccupancyPool
 
 __all__ = ["Interrupted", "Run", "Status", "run_identity", "train"]
 
@@ -75,15 +73,20 @@ def _train(run: Run, folder: Path, work: Path, report: Callable[[Status], None])
     if device.type == "cpu":
         keep_freed_memory()
         torch.set_num_threads(max(1, min(MOST_THREADS, available_cores() - workers)))
+    course = course_of(run, device)
     state = TrainingState(run, device)
+    state.know(course.teach)
     state.resume(work)
-
-    pool = OccupancyPool(run.anatomy_ct, config.scene.occupancy, run.seed)
-    body = body_for(run.anatomy_ct, run.up_lps, config.scene, run.seed)
     stream = SceneStream(
-        run.anatomy_ct, run.up_lps, config.scene, pool, run.seed, "train", config.batch_size, body
+        run.anatomy_ct,
+        run.up_lps,
+        config.scene,
+        course.points,
+        run.seed,
+        "train",
+        config.batch_size,
+        course.body,
     )
-    validation = ValidationSet(run.anatomy_ct, run.up_lps, config, pool, run.seed, device, body)
     steps = range(state.progress.step, state.progress.end or config.steps)
     period = config.training_pairs // config.batch_size
 
@@ -96,7 +99,7 @@ def _train(run: Run, folder: Path, work: Path, report: Callable[[Status], None])
             settled = settle_end(config, progress, run.minutes)
             done, stop = progress.step == progress.end, stopped()
             if done or progress.step % config.validate_every == 0:
-                miou = validation.miou(state.average)
+                miou = course.miou(state.average)
                 state.keep_if_best(miou)
                 speed = clock.rate(progress) * config.batch_size
                 history.write(progress, Record(loss, miou, speed, state.learning_rate))
@@ -111,15 +114,7 @@ def _train(run: Run, folder: Path, work: Path, report: Callable[[Status], None])
                     f"stopped at step {progress.step}; the state is saved in {folder}. The same "
                     "command goes on from there."
                 )
-    network = state.best_network()
-    model = Model(
-        network,
-        config,
-        run.anatomy_ct.names,
-        validation.query_box_mm,
-        validation.familiar(network),
-        provenance(run, progress, device),
-    )
+    model = course.model(state.best_network(), provenance(run, progress, device))
     save_model(model, folder)
     return model
 

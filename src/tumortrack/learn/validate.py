@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 import torch
-from jaxtyping import Float64
+from jaxtyping import Float32, Float64, UInt8
 
 from tumortrack.core.errors import NoEstimate
-from tumortrack.core.types import Anatomy
 from tumortrack.learn.config import TrainConfig
 from tumortrack.learn.fit import Familiar, fit_mm, spread_mm, surface_distances
 from tumortrack.learn.network import Latent, OccupancyNetwork
 from tumortrack.simulate.dataset import refill
-from tumortrack.simulate.elastic.body import Body
 from tumortrack.simulate.occupancy import OccupancyPool
 from tumortrack.simulate.scene import SceneRecipe, Simulator
 
@@ -21,56 +21,73 @@ _FIT_ON = 32  # scenes
 _QUERIES = 2**13  # at once: bounds the memory
 
 
-class ValidationSet:
+@dataclass(frozen=True, eq=False)
+class ValidationScenes:
     """Scenes of the ``validation`` stream with points spread evenly over the organ's enlarged
-    box, so that the shares of points are volumes and the mIoU is one of volumes."""
+    box, so that shares of points are volumes; camera frame, mm.
 
-    def __init__(
-        self,
-        anatomy_ct: Anatomy,
-        up_lps: tuple[float, float, float],
-        config: TrainConfig,
-        pool: OccupancyPool,
-        seed: int,
-        device: torch.device,
-        body: Body | None = None,
-    ) -> None:
-        simulator = Simulator(anatomy_ct, up_lps, config.scene, body)
-        vertices = anatomy_ct.organ.vertices_mm
-        clouds, points, labels, boxes = [], [], [], []
-        n = config.scene.cloud.n_points
-        for index in range(config.validation_pairs):
-            recipe = SceneRecipe(seed, "validation", index)
-            stage = simulator.stage(recipe)
-            drawn, answer = pool.draw_evenly(recipe.generator(999), config.validation_points)
-            observed = stage.cloud.points_mm
-            clouds.append(refill(observed, n))
-            points.append(stage.carry(drawn))
-            labels.append(answer)
-            organ = stage.carry(vertices) - np.median(observed, axis=0)
-            boxes.append((organ.min(0), organ.max(0)))
-        self._clouds = torch.from_numpy(np.stack(clouds)).to(device)
-        self._points = torch.from_numpy(np.stack(points)).to(device)
-        self._labels = torch.from_numpy(np.stack(labels)).to(device)
-        self._n_classes = len(anatomy_ct.parts) + 1
-        self._boxes_mm = np.array(boxes, float)
-        self.query_box_mm = _grown(self._boxes_mm)
+    ``boxes_mm``: the organ's, relative to the median of the observed points.
+    """
+
+    clouds_mm: Float32[np.ndarray, "s n 3"]
+    points_ct: Float32[np.ndarray, "s q 3"]
+    points_mm: Float32[np.ndarray, "s q 3"]
+    labels: UInt8[np.ndarray, "s q"]
+    boxes_mm: Float64[np.ndarray, "s 2 3"]
+
+    @property
+    def query_box_mm(self) -> Float64[np.ndarray, "2 3"]:
+        """Where the organ can lie, relative to the median of the observed points."""
+        return _grown(self.boxes_mm)
+
+
+def validation_scenes(
+    simulator: Simulator, pool: OccupancyPool, config: TrainConfig, seed: int
+) -> ValidationScenes:
+    """The first scenes of the ``validation`` stream."""
+    vertices = simulator.anatomy_ct.organ.vertices_mm
+    n = config.scene.cloud.n_points
+    rows = []
+    for index in range(config.validation_pairs):
+        recipe = SceneRecipe(seed, "validation", index)
+        stage = simulator.stage(recipe)
+        drawn, answer = pool.draw_evenly(recipe.generator(999), config.validation_points)
+        observed = stage.cloud.points_mm
+        organ = stage.carry(vertices) - np.median(observed, axis=0)
+        box = np.array([organ.min(0), organ.max(0)], float)
+        rows.append((refill(observed, n), drawn, stage.carry(drawn), answer, box))
+    return ValidationScenes(*(np.stack(column) for column in zip(*rows, strict=True)))
+
+
+def mean_iou_of(
+    guess: UInt8[np.ndarray, ...], labels: UInt8[np.ndarray, ...], n_classes: int
+) -> float:
+    """Mean over the parts (organ, tumors; not the outside) of the IoU over all points."""
+    pairs = guess.astype(np.int64).ravel() * n_classes + labels.ravel()
+    table = np.bincount(pairs, minlength=n_classes**2).reshape(n_classes, n_classes)
+    both = table.diagonal()
+    either = table.sum(0) + table.sum(1) - both
+    return float((both / np.maximum(either, 1))[1:].mean())
+
+
+class ValidationSet:
+    """How good an occupancy network is on validation scenes."""
+
+    def __init__(self, scenes: ValidationScenes, n_classes: int, device: torch.device) -> None:
+        self._labels, self._n_classes, self._boxes_mm = scenes.labels, n_classes, scenes.boxes_mm
+        self._clouds = torch.from_numpy(scenes.clouds_mm).to(device)
+        self._points = torch.from_numpy(scenes.points_mm).to(device)
 
     @torch.no_grad()
     def miou(self, network: OccupancyNetwork) -> float:
-        """Mean over the parts (organ, tumors; not the outside) of the IoU over all points."""
-        n = self._n_classes
-        counts = torch.zeros(n * n, dtype=torch.long)
+        """``mean_iou_of`` the network's labels."""
         network.eval()
+        guesses = []
         for i in range(0, len(self._clouds), _AT_ONCE):
             latent = network.encode(self._clouds[i : i + _AT_ONCE])
-            guess = network.query(latent, self._points[i : i + _AT_ONCE]).argmax(-1)
-            pairs = guess * n + self._labels[i : i + _AT_ONCE].long()
-            counts += torch.bincount(pairs.flatten().cpu(), minlength=n * n)
-        table = counts.reshape(n, n).double()
-        both = table.diagonal()
-        either = table.sum(0) + table.sum(1) - both
-        return float((both / either.clamp(min=1))[1:].mean())
+            guesses.append(network.query(latent, self._points[i : i + _AT_ONCE]).argmax(-1))
+        guess = torch.cat(guesses).to(torch.uint8).cpu().numpy()
+        return mean_iou_of(guess, self._labels, self._n_classes)
 
     @torch.no_grad()
     def familiar(self, network: OccupancyNetwork) -> Familiar:

@@ -11,7 +11,7 @@ from jaxtyping import Float32, UInt8
 
 from tumortrack.core.types import Anatomy
 from tumortrack.simulate.elastic.body import Body
-from tumortrack.simulate.occupancy import OccupancyPool
+from tumortrack.simulate.occupancy import PointSource
 from tumortrack.simulate.scene import SceneConfig, SceneRecipe, Simulator
 
 
@@ -22,6 +22,7 @@ class Batch:
     clouds_mm: Float32[np.ndarray, "b n 3"]
     points_mm: Float32[np.ndarray, "b q 3"]
     labels: UInt8[np.ndarray, "b q"]
+    camera_from_ct: Float32[np.ndarray, "b 4 4"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,7 +33,7 @@ class SceneStream:
     anatomy_ct: Anatomy
     up_lps: tuple[float, float, float]
     config: SceneConfig
-    pool: OccupancyPool
+    pool: PointSource
     seed: int
     stream: Literal["train", "validation", "test"]
     batch_size: int
@@ -60,6 +61,7 @@ class SceneStream:
             np.stack([refill(p.cloud.points_mm, n) for p in pairs]),
             np.stack([p.samples.points_mm for p in pairs]),
             np.stack([p.samples.labels for p in pairs]),
+            np.stack([p.camera_from_ct for p in pairs]).astype(np.float32),
         )
 
 

@@ -10,9 +10,10 @@ carries labels along exactly. Distances are those before the deformation.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float, Float32, UInt8
 
 from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError
@@ -28,6 +29,29 @@ class OccupancyConfig(Config, frozen=True):
     far_share: float = 0.15
     far_reach: float = 1.2  # half of the far points: a cube of +- this times the organ's diagonal
     pool: int = 100_000  # points per part whose labels are worked out once
+
+
+class PointSource(Protocol):
+    """Where the points of scenes come from."""
+
+    def draw(
+        self, rng: np.random.Generator
+    ) -> tuple[Float[np.ndarray, "n 3"], UInt8[np.ndarray, " n"]]:
+        """One scene's points (CT frame, undeformed) and labels; the same number every time."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class FixedPoints:
+    """The same points in every scene: where each of them goes is what is learnt."""
+
+    points_ct: Float32[np.ndarray, "n 3"]
+    labels: UInt8[np.ndarray, " n"]
+
+    def draw(
+        self, rng: np.random.Generator
+    ) -> tuple[Float32[np.ndarray, "n 3"], UInt8[np.ndarray, " n"]]:
+        return self.points_ct, self.labels
 
 
 @dataclass(frozen=True, eq=False)

@@ -35,7 +35,7 @@ from tumortrack.sense.render import Visibility, render_depth
 from tumortrack.simulate.deform import DeformConfig, DragConfig
 from tumortrack.simulate.deform.base import Deformation, View
 from tumortrack.simulate.elastic.body import Body
-from tumortrack.simulate.occupancy import OccupancyConfig, OccupancyPool
+from tumortrack.simulate.occupancy import OccupancyConfig, PointSource
 from tumortrack.simulate.pose import PoseConfig, sample_pose
 
 STREAMS = ("train", "validation", "test")
@@ -102,6 +102,7 @@ class Pair:
     recipe: SceneRecipe
     cloud: SensorCloud
     samples: OccupancySamples
+    camera_from_ct: Float64[np.ndarray, "4 4"]  # the organ's pose, its deformation left out
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,11 +137,12 @@ class Simulator:
         self._intrinsics = d405(config.width, config.height)
         self._visibility = Visibility(anatomy_ct.organ)
 
-    def pair(self, recipe: SceneRecipe, pool: OccupancyPool) -> Pair:
+    def pair(self, recipe: SceneRecipe, pool: PointSource) -> Pair:
         """The scene's cloud and its labelled points, camera frame."""
         stage, rng = self._stage(recipe)
         points_ct, labels = pool.draw(rng)
-        return Pair(recipe, stage.cloud, OccupancySamples(stage.carry(points_ct), labels))
+        samples = OccupancySamples(stage.carry(points_ct), labels)
+        return Pair(recipe, stage.cloud, samples, stage.camera_from_ct)
 
     def stage(self, recipe: SceneRecipe) -> Stage:
         """Pose, deformation, depth image and cloud of a recipe."""

@@ -13,7 +13,12 @@ from tumortrack.simulate.scene_folder import Scene
 from tumortrack.track.estimate import Estimate
 from tumortrack.track.tracker import Tracker
 
-LIVE_STAGES = ("encode", "coarse", "fine")  # what a live frame takes; the dense volume is extra
+LIVE_STAGES = (
+    "encode",
+    "coarse",
+    "refine",
+    "fine",
+)  # what a live frame takes; the dense volume is extra
 
 
 @dataclass(frozen=True)
@@ -108,4 +113,4 @@ class Network(Method):
     def locate(self, scene: Scene, grid: int) -> Answer:
         estimate = self._tracker.locate(scene.cloud, grid, self.locate_seed)
         seconds = estimate.report["timings"]
-        return Answer(estimate, sum(seconds[stage] for stage in LIVE_STAGES))
+        return Answer(estimate, sum(seconds.get(stage, 0.0) for stage in LIVE_STAGES))

@@ -1,7 +1,11 @@
-"""Decoders: latent and normalised queries -> logits. One file per kind, one name here."""
+"""Decoders: what a latent says. One file per kind, one name here.
+
+``mlp`` labels normalised queries; ``warp`` gives pose and state of the pre-operative organ.
+"""
 
 from tumortrack.learn.decoders.mlp import MlpDecoderConfig
+from tumortrack.learn.decoders.warp import WarpDecoderConfig
 
-DecoderConfig = MlpDecoderConfig  # a second kind: ``MlpDecoderConfig | OtherConfig``
+DecoderConfig = MlpDecoderConfig | WarpDecoderConfig
 
 __all__ = ["DecoderConfig"]

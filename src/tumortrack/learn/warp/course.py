@@ -1,0 +1,131 @@
+"""Teaching a warp network: correspondences are shown, the refined motion is judged."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from tumortrack.core.errors import InputError
+from tumortrack.learn.decoders.warp import WarpDecoderConfig
+from tumortrack.learn.fit import Familiar, fit_mm, spread_mm
+from tumortrack.learn.model import Model
+from tumortrack.learn.networks import Network
+from tumortrack.learn.run import Run
+from tumortrack.learn.validate import ValidationScenes, mean_iou_of, validation_scenes
+from tumortrack.learn.warp.locate import best_fit, first_motions
+from tumortrack.learn.warp.network import WarpNetwork
+from tumortrack.learn.warp.refine import Refined
+from tumortrack.learn.warp.shape import shape_of
+from tumortrack.simulate.bodies import body_for
+from tumortrack.simulate.occupancy import FixedPoints, OccupancyPool
+from tumortrack.simulate.scene import Simulator
+from tumortrack.simulate.targets import draw_targets
+
+_AT_SURFACE = 0.5  # of the points whose places are learnt; the others lie inside the parts
+
+
+class WarpCourse:
+    """Where fixed points of the organ go in each scene."""
+
+    def __init__(self, run: Run, device: torch.device) -> None:
+        self._run = run
+        body = body_for(run.anatomy_ct, run.up_lps, run.config.scene, run.seed)
+        if body is None:
+            raise InputError(
+                "a warp network learns from elastic deformations; the scene configuration has none."
+            )
+        self.body = body
+        self._shape = shape_of(run.anatomy_ct, body)
+        self.points = _points(run)
+
+    @cached_property
+    def _scenes(self) -> ValidationScenes:
+        run = self._run
+        pool = OccupancyPool(run.anatomy_ct, run.config.scene.occupancy, run.seed)
+        simulator = Simulator(run.anatomy_ct, run.up_lps, run.config.scene, self.body)
+        return validation_scenes(simulator, pool, run.config, run.seed)
+
+    def teach(self, network: Network) -> None:
+        assert isinstance(network, WarpNetwork)
+        network.know(self._shape, self._run.up_lps, self.points.points_ct)
+
+    def miou(self, network: Network) -> float:
+        return self._judged(network).miou
+
+    def model(self, network: Network, provenance: dict) -> Model:
+        judged = self._judged(network)
+        return Model(
+            network,
+            self._run.config,
+            self._run.anatomy_ct.names,
+            self._scenes.query_box_mm,
+            judged.familiar,
+            {**provenance, "validation_tre_mm": round(judged.tre_mm, 3)},
+            self._shape,
+            judged.std_scale,
+        )
+
+    def _judged(self, network: Network) -> Judged:
+        """Labels, places and trust over all validation scenes."""
+        assert isinstance(network, WarpNetwork)
+        network.eval()
+        scenes, shape = self._scenes, self._shape
+        guesses, errors, deviations, fits = [], [], [], []
+        for cloud, points_mm, points_ct, labels in zip(
+            scenes.clouds_mm, scenes.points_mm, scenes.points_ct, scenes.labels, strict=True
+        ):
+            starts = first_motions(network, shape, cloud)
+            fit = best_fit(shape, cloud, starts, self._run.config.refine)
+            guesses.append(shape.labels_at(fit.motion.back(points_mm).astype(np.float32))[0])
+            inside = labels > 0
+            error, deviation = _errors(fit, points_ct[inside], points_mm[inside])
+            errors.append(error)
+            deviations.append(deviation)
+            fits.append(fit_mm(np.abs(fit.distances_mm)))
+        spreads = [spread_mm(cloud) for cloud in scenes.clouds_mm]
+        error, deviation = np.concatenate(errors), np.concatenate(deviations)
+        # So that the errors' mean square along an axis is what the standard deviations say.
+        scale = float(np.sqrt(np.mean(error**2 / 3) / np.mean(deviation**2)))
+        return Judged(
+            mean_iou_of(np.stack(guesses), scenes.labels, len(shape.anatomy_ct.parts) + 1),
+            float(np.median([part.mean() for part in errors])),
+            scale,
+            Familiar(spread_mm=(min(spreads), max(spreads)), fit_mm=float(np.percentile(fits, 95))),
+        )
+
+
+@dataclass(frozen=True)
+class Judged:
+    """What validation says: labels, the median scene's error of places, how the estimated
+    standard deviations have to be scaled, and what clouds are like."""
+
+    miou: float
+    tre_mm: float
+    std_scale: float
+    familiar: Familiar
+
+
+def _errors(
+    fit: Refined, points_ct: Float[np.ndarray, "n 3"], points_mm: Float[np.ndarray, "n 3"]
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+    deviation = fit.motion.std_mm(points_ct)
+    assert deviation is not None
+    return np.linalg.norm(fit.motion.carry(points_ct) - points_mm, axis=1), deviation
+
+
+def _points(run: Run) -> FixedPoints:
+    """Points of the organ's surface, evenly drawn vertices, and of the parts' insides."""
+    decoder = run.config.network.decoder
+    assert isinstance(decoder, WarpDecoderConfig)
+    count = decoder.points
+    rng = np.random.default_rng([run.seed, 0x9A49])
+    vertices = run.anatomy_ct.organ.vertices_mm
+    surface = vertices[rng.choice(len(vertices), round(count * _AT_SURFACE), replace=True)]
+    inner = draw_targets(run.anatomy_ct, run.seed).points_ct
+    inner = inner[rng.choice(len(inner), count - len(surface), replace=True)]
+    points = np.concatenate([surface, inner]).astype(np.float32)
+    return FixedPoints(points, np.zeros(len(points), np.uint8))

@@ -1,0 +1,46 @@
+"""A cloud's motion: the network's placements, each refined, and the one that fits best."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from tumortrack.learn.warp.motion import WarpMotion
+from tumortrack.learn.warp.network import Placement, WarpNetwork
+from tumortrack.learn.warp.refine import RefineConfig, Refined, refine
+from tumortrack.learn.warp.shape import Shape
+
+_SURE = 6.0  # logits: the other way round is not even tried
+
+
+@torch.no_grad()
+def first_motions(
+    network: WarpNetwork, shape: Shape, points_mm: Float[np.ndarray, "n 3"]
+) -> list[WarpMotion]:
+    """What the network sees in a cloud (camera frame, mm), the likelier way round first; the other
+    one only where it may be right."""
+    device = next(network.parameters()).device
+    cloud = torch.tensor(np.asarray(points_mm, np.float32), device=device)[None]
+    ways = sorted(network.both_ways(cloud), key=lambda way: -float(way.right_way))
+    if float(ways[0].right_way - ways[1].right_way) > _SURE:
+        ways = ways[:1]
+    return [_motion(way, shape) for way in ways]
+
+
+def best_fit(
+    shape: Shape,
+    points_mm: Float[np.ndarray, "n 3"],
+    starts: list[WarpMotion],
+    config: RefineConfig,
+) -> Refined:
+    """The refined start of the least cost."""
+    fits = [refine(shape, points_mm, start, config) for start in starts]
+    return min(fits, key=lambda fit: fit.cost)
+
+
+def _motion(way: Placement, shape: Shape) -> WarpMotion:
+    rotation, centre, coefficients = (
+        value[0].double().cpu().numpy() for value in (way.rotation, way.centre_mm, way.coefficients)
+    )
+    return WarpMotion(shape, rotation, centre, coefficients)

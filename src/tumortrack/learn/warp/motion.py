@@ -1,0 +1,79 @@
+"""Where one frame's organ lies: a pose, an elastic state, and how sure they are."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from jaxtyping import Float, Float64
+
+from tumortrack.learn.warp.shape import Shape
+
+_AT_ONCE = 4096  # points: bounds the memory of their derivatives
+
+
+@dataclass(frozen=True, eq=False)
+class WarpMotion:
+    """``core.motion.Motion`` of a shape: x -> rotation (flow(x) - center_ct) + centre_mm.
+
+    Attributes:
+        rotation, centre_mm: where the organ's centre and axes are before the camera.
+        coefficients: of the body's modes.
+        covariance: of shift (mm), turn (rad; both in the CT's axes, about the centre) and
+            coefficients, as ``refine`` left it; None where nothing was refined.
+        std_scale: what its standard deviations are to be multiplied by; found on validation
+            scenes.
+    """
+
+    shape: Shape
+    rotation: Float64[np.ndarray, "3 3"]
+    centre_mm: Float64[np.ndarray, " 3"]
+    coefficients: Float64[np.ndarray, " m"]
+    covariance: Float64[np.ndarray, "p p"] | None = None
+    std_scale: float = 1.0
+
+    @property
+    def camera_from_ct(self) -> Float64[np.ndarray, "4 4"]:
+        """The rigid part."""
+        out = np.eye(4)
+        out[:3, :3] = self.rotation
+        out[:3, 3] = self.centre_mm - self.rotation @ self.shape.body.center_ct
+        return out
+
+    def carry(self, points_ct: Float[np.ndarray, "n 3"], /) -> Float64[np.ndarray, "n 3"]:
+        """CT (LPS, mm) -> camera frame (mm)."""
+        moved = self.shape.body.carry(self.coefficients, points_ct).astype(float)
+        return (moved - self.shape.body.center_ct) @ self.rotation.T + self.centre_mm
+
+    def back(self, points_camera: Float[np.ndarray, "n 3"], /) -> Float64[np.ndarray, "n 3"]:
+        """Camera frame (mm) -> CT (LPS, mm)."""
+        rest = (points_camera - self.centre_mm) @ self.rotation + self.shape.body.center_ct
+        return self.shape.body.back(self.coefficients, rest).astype(float)
+
+    def std_mm(self, points_ct: Float[np.ndarray, "n 3"], /) -> Float64[np.ndarray, " n"] | None:
+        """One standard deviation along any axis, mm: the pose's and the state's, to first order."""
+        if self.covariance is None:
+            return None
+        parts = [
+            self._std(points_ct[first : first + _AT_ONCE])
+            for first in range(0, len(points_ct), _AT_ONCE)
+        ]
+        return np.concatenate(parts) if parts else np.zeros(0)
+
+    def _std(self, points_ct: Float[np.ndarray, "n 3"]) -> Float64[np.ndarray, " n"]:
+        body = self.shape.body
+        offset = body.carry(self.coefficients, points_ct).astype(float) - body.center_ct
+        modes = body.modes_at(body.carry(0.5 * self.coefficients, points_ct))
+        variance = np.zeros(len(points_ct))
+        for axis in range(3):
+            along = np.tile(np.eye(3)[axis], (len(offset), 1))
+            row = np.concatenate([along, np.cross(offset, along), modes[:, axis]], axis=1)
+            half = row @ self._root
+            variance += np.einsum("nk,nk->n", half, half)
+        return self.std_scale * np.sqrt(variance / 3)
+
+    @cached_property
+    def _root(self) -> Float64[np.ndarray, "p p"]:
+        assert self.covariance is not None
+        return np.linalg.cholesky(self.covariance)

@@ -1,0 +1,119 @@
+"""Lay the organ's surface on the observed points: a few Gauss-Newton steps.
+
+Unknown are a rigid motion and the coefficients of the body's modes. The most likely ones, given
+points with errors and the library of states as a Gaussian prior, minimise
+
+    n_effective / n * sum of rho(distance of a point, carried back to the CT, to the organ / sigma)
+    + the squared Mahalanobis distance of the coefficients from the library's mean.
+
+The distance is looked up in a field, so no nearest point is searched. The same curvature is the
+estimate's uncertainty. Source: surface registration as maximum a posteriori with a statistical
+shape prior, e.g. Heimann and Meinzer 2009 (doi 10.1016/j.media.2009.05.004); rho: Geman and
+McClure 1987.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Float64
+from scipy.spatial.transform import Rotation
+
+from tumortrack.core.config import Config
+from tumortrack.learn.warp.motion import WarpMotion
+from tumortrack.learn.warp.shape import Shape
+
+
+class RefineConfig(Config, frozen=True):
+    """``n_effective``: independent points that a cloud is worth: neighbours err alike.
+
+    ``sigma_mm``: of a point that belongs to the organ, model errors included. ``first_mm`` and
+    ``last_mm``: the distance where a point's pull is greatest falls from the one to the other;
+    points far beyond do not count. ``shift_mm``, ``turn_rad``: how far the start may be off.
+    """
+
+    steps: int = 15
+    n_effective: float = 300.0
+    sigma_mm: float = 1.0
+    first_mm: float = 5.0
+    last_mm: float = 2.0
+    narrowing: float = 0.7
+    shift_mm: float = 20.0
+    turn_rad: float = 0.5
+    enough_mm: float = 0.02  # a step that moves less is the last
+
+
+@dataclass(frozen=True, eq=False)
+class Refined:
+    """A motion, the squared error it minimises, and the distances left (signed, mm)."""
+
+    motion: WarpMotion
+    cost: float
+    distances_mm: Float[np.ndarray, " n"]
+    steps: int
+
+
+def refine(
+    shape: Shape,
+    points_mm: Float[np.ndarray, "n 3"],
+    start: WarpMotion,
+    config: RefineConfig,
+) -> Refined:
+    """The motion near ``start`` that fits points (camera frame, mm) and the library best."""
+    precision = _prior(shape, config)
+    mean = shape.body.mean
+    rotation, centre = start.rotation, start.centre_mm
+    coefficients = start.coefficients.astype(float)
+    moved = np.zeros(6)  # from the start: shift and turn
+    weight = min(config.n_effective / len(points_mm), 1.0) / config.sigma_mm**2
+    done = 0
+    for step in range(config.steps + 1):
+        width = max(config.last_mm, config.first_mm * config.narrowing**step)
+        distance, rows = _residuals(shape, points_mm, rotation, centre, coefficients)
+        pull = 1 / (1 + (distance / width) ** 2) ** 2
+        curvature = weight * (rows.T @ (pull[:, None] * rows)).astype(float) + precision
+        off = np.concatenate([moved, coefficients - mean])
+        if step == config.steps or done:
+            break
+        slope = weight * (rows.T @ (pull * distance)).astype(float) + precision @ off
+        change = -np.linalg.solve(curvature, slope)
+        centre = centre + rotation @ change[:3]
+        rotation = rotation @ Rotation.from_rotvec(change[3:6]).as_matrix()
+        coefficients = coefficients + change[6:]
+        moved += change[:6]
+        settled = np.abs(change).max() < config.enough_mm and width == config.last_mm
+        done = step + 1 if settled else 0
+    square = (distance / config.last_mm) ** 2
+    fit = weight * config.last_mm**2 * float((square / (1 + square)).sum())
+    motion = WarpMotion(shape, rotation, centre, coefficients, np.linalg.inv(curvature))
+    return Refined(motion, fit + float(off @ precision @ off), distance, step)
+
+
+def _prior(shape: Shape, config: RefineConfig) -> Float64[np.ndarray, "p p"]:
+    modes = len(shape.body.mean)
+    precision = np.zeros((6 + modes, 6 + modes))
+    precision[:3, :3] = np.eye(3) / config.shift_mm**2
+    precision[3:6, 3:6] = np.eye(3) / config.turn_rad**2
+    precision[6:, 6:] = np.linalg.inv(shape.body.covariance)
+    return precision
+
+
+def _residuals(
+    shape: Shape,
+    points_mm: Float[np.ndarray, "n 3"],
+    rotation: Float64[np.ndarray, "3 3"],
+    centre_mm: Float64[np.ndarray, " 3"],
+    coefficients: Float64[np.ndarray, " m"],
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n p"]]:
+    """Signed distances of the points carried back, and their derivatives by shift, turn and
+    coefficients (those by the coefficients to first order: the modes halfway along the path)."""
+    body = shape.body
+    offset = ((points_mm - centre_mm) @ rotation).astype(np.float32)
+    rest = offset + body.center_ct.astype(np.float32)
+    velocity = body.velocity(-coefficients)
+    distance, outwards = shape.distances[0].with_slope(body.follow(velocity, rest))
+    halfway = body.follow(np.float32(0.5) * velocity, rest)
+    by_modes = -body.modes_along(halfway, outwards)
+    by_turn = -np.cross(offset, outwards)
+    return distance, np.concatenate([-outwards, by_turn, by_modes], axis=1)

@@ -1,0 +1,149 @@
+"""What a warp model knows of the organ at rest: surfaces, signed distances, elastic body."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numba
+import numpy as np
+from jaxtyping import Float32, Float64, UInt8
+
+from tumortrack.core.errors import InputError
+from tumortrack.core.types import Anatomy, Mesh
+from tumortrack.simulate.elastic.body import Body
+from tumortrack.simulate.occupancy import contains, surface_distance
+
+_STEPS = 40  # of a distance field, along the part's longest side
+_FINEST_MM, _COARSEST_MM = 0.5, 2.0
+_REACH = 10  # steps about a part; farther out the distance is that of the nearest border
+_BODY = "body."
+
+
+@dataclass(frozen=True, eq=False)
+class Distance:
+    """Signed distance to one closed surface (mm, negative inside) on a lattice, CT frame."""
+
+    origin_mm: Float32[np.ndarray, " 3"]
+    spacing_mm: float
+    values_mm: Float32[np.ndarray, "i j k"]
+
+    def at(self, points_ct: Float32[np.ndarray, "n 3"]) -> Float32[np.ndarray, " n"]:
+        """The distance of points, by trilinear interpolation."""
+        return self.with_slope(points_ct)[0]
+
+    def with_slope(
+        self, points_ct: Float32[np.ndarray, "n 3"]
+    ) -> tuple[Float32[np.ndarray, " n"], Float32[np.ndarray, "n 3"]]:
+        """Distance and its slope, which points outwards."""
+        spacing = np.float32(self.spacing_mm)
+        return _distance(self.values_mm, self.origin_mm, spacing, points_ct)
+
+
+def distance_of(mesh: Mesh) -> Distance:
+    """Distances to a closed surface, right to a tenth of a millimetre near it."""
+    lower, upper = mesh.box_mm
+    step = float(np.clip((upper - lower).max() / _STEPS, _FINEST_MM, _COARSEST_MM))
+    origin = lower - _REACH * step
+    shape = np.ceil((upper - lower) / step).astype(int) + 2 * _REACH + 1
+    nodes = origin + step * np.indices(tuple(shape)).reshape(3, -1).T
+    distance = surface_distance(mesh, nodes).astype(np.float32)
+    near = ((nodes > lower) & (nodes < upper)).all(1)
+    inside = np.zeros(len(nodes), bool)
+    inside[near] = contains(mesh, nodes[near])
+    values = np.where(inside, -distance, distance).reshape(tuple(shape))
+    return Distance(origin.astype(np.float32), step, values)
+
+
+@dataclass(frozen=True, eq=False)
+class Shape:
+    """The organ at rest (CT frame, LPS mm): ``distances`` has one field per part."""
+
+    anatomy_ct: Anatomy
+    body: Body
+    distances: tuple[Distance, ...]
+
+    @cached_property
+    def long_axis(self) -> Float64[np.ndarray, " 3"]:
+        """The organ's longest principal direction; its sign is arbitrary but fixed."""
+        vertices = self.anatomy_ct.organ.vertices_mm
+        return np.linalg.svd(vertices - vertices.mean(0), full_matrices=False)[2][0]
+
+    def labels_at(
+        self, points_ct: Float32[np.ndarray, "n 3"]
+    ) -> tuple[UInt8[np.ndarray, " n"], Float32[np.ndarray, " n"]]:
+        """Label of each point, and its distance (mm) to the nearest surface that bounds it."""
+        distances = np.stack([field.at(points_ct) for field in self.distances])
+        labels = np.zeros(len(points_ct), np.uint8)
+        for label, distance in enumerate(distances, start=1):
+            labels[distance < 0] = label
+        return labels, np.abs(distances).min(0)
+
+    def to_arrays(self) -> dict[str, np.ndarray]:
+        """Everything as named arrays, for a file."""
+        arrays = {f"{_BODY}{name}": value for name, value in self.body.to_arrays().items()}
+        for n, (part, field) in enumerate(zip(self.anatomy_ct.parts, self.distances, strict=True)):
+            arrays |= {
+                f"{n}.vertices_mm": part.vertices_mm,
+                f"{n}.faces": part.faces,
+                f"{n}.origin_mm": field.origin_mm,
+                f"{n}.spacing_mm": np.array(field.spacing_mm),
+                f"{n}.values_mm": field.values_mm,
+            }
+        return arrays
+
+    @classmethod
+    def from_arrays(cls, arrays: dict[str, np.ndarray], n_parts: int) -> Shape:
+        """The inverse of ``to_arrays``.
+
+        Raises:
+            InputError: an array is missing or of a wrong shape.
+        """
+        try:
+            body = {k.removeprefix(_BODY): v for k, v in arrays.items() if k.startswith(_BODY)}
+            parts, fields = [], []
+            for n in range(n_parts):
+                parts.append(Mesh(arrays[f"{n}.vertices_mm"], arrays[f"{n}.faces"]))
+                fields.append(
+                    Distance(
+                        np.asarray(arrays[f"{n}.origin_mm"], np.float32),
+                        float(arrays[f"{n}.spacing_mm"]),
+                        np.ascontiguousarray(arrays[f"{n}.values_mm"], np.float32),
+                    )
+                )
+        except KeyError as error:
+            raise InputError(f"the organ's shape lacks {error}; train the model again.") from error
+        return cls(Anatomy(tuple(parts)), Body.from_arrays(body), tuple(fields))
+
+
+def shape_of(anatomy_ct: Anatomy, body: Body) -> Shape:
+    """The shape of an anatomy with its body; seconds."""
+    return Shape(anatomy_ct, body, tuple(distance_of(part) for part in anatomy_ct.parts))
+
+
+@numba.njit(cache=True, fastmath=True, nogil=True)
+def _distance(values, origin, spacing, points):  # type: ignore[no-untyped-def]
+    n = len(points)
+    out, slope = np.empty(n, np.float32), np.empty((n, 3), np.float32)
+    zero, one, most = np.float32(0), np.float32(1), np.float32(1.001)
+    per_cell = one / spacing
+    for p in range(n):
+        x = min(max((points[p, 0] - origin[0]) * per_cell, zero), values.shape[0] - most)
+        y = min(max((points[p, 1] - origin[1]) * per_cell, zero), values.shape[1] - most)
+        z = min(max((points[p, 2] - origin[2]) * per_cell, zero), values.shape[2] - most)
+        i, j, k = int(x), int(y), int(z)
+        a, b, c = np.float32(x - i), np.float32(y - j), np.float32(z - k)
+        v000, v001 = values[i, j, k], values[i, j, k + 1]
+        v010, v011 = values[i, j + 1, k], values[i, j + 1, k + 1]
+        v100, v101 = values[i + 1, j, k], values[i + 1, j, k + 1]
+        v110, v111 = values[i + 1, j + 1, k], values[i + 1, j + 1, k + 1]
+        l00, l01 = v000 + (v001 - v000) * c, v010 + (v011 - v010) * c
+        l10, l11 = v100 + (v101 - v100) * c, v110 + (v111 - v110) * c
+        f0, f1 = l00 + (l01 - l00) * b, l10 + (l11 - l10) * b
+        out[p] = f0 + (f1 - f0) * a
+        slope[p, 0] = (f1 - f0) * per_cell
+        slope[p, 1] = ((l01 - l00) * (one - a) + (l11 - l10) * a) * per_cell
+        d0 = (v001 - v000) * (one - b) + (v011 - v010) * b
+        d1 = (v101 - v100) * (one - b) + (v111 - v110) * b
+        slope[p, 2] = (d0 * (one - a) + d1 * a) * per_cell
+    return out, slope
