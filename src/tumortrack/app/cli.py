@@ -79,6 +79,7 @@ def train(
     device: Literal["auto", "cpu", "cuda"] = "auto",
     workers: int | None = None,
     checkpoint_every: float = 30.0,
+    start: Path | None = None,
 ) -> None:
     """Train a model for a case; the same command resumes after Ctrl-C or a crash.
 
@@ -95,6 +96,7 @@ def train(
         device: auto takes CUDA where it is.
         workers: processes that make scenes (default: as the machine allows).
         checkpoint_every: seconds; a crash loses at most the steps since.
+        start: folder that `pretrain` wrote: learn the patient from there (preset clinic).
     """
     from tumortrack.app import commands
 
@@ -102,9 +104,37 @@ def train(
         case,
         model,
         commands.TrainOptions(
-            preset, rotations, minutes, steps, seed, device, workers, checkpoint_every
+            preset, rotations, minutes, steps, seed, device, workers, checkpoint_every, start
         ),
     )
+
+
+def pretrain(
+    out: Positional[Path],
+    /,
+    *,
+    anatomies: int = 40,
+    steps: int = 6000,
+    seed: int = 0,
+    device: Literal["auto", "cpu", "cuda"] = "auto",
+    workers: int | None = None,
+    checkpoint_every: float = 30.0,
+) -> None:
+    """Teach a network on random kidneys, as a start for `train`; the same command resumes.
+
+    Args:
+        out: folder to write.
+        anatomies: how many random kidneys.
+        steps: stop after exactly so many steps.
+        seed: of kidneys, weights and scenes.
+        device: auto takes CUDA where it is.
+        workers: processes that make scenes (default: as the machine allows).
+        checkpoint_every: seconds; a crash loses at most the steps since.
+    """
+    from tumortrack.app.pretraining import PretrainOptions
+    from tumortrack.app.pretraining import pretrain as run
+
+    run(out, PretrainOptions(anatomies, steps, seed, device, workers, checkpoint_every))
 
 
 def locate(
@@ -239,7 +269,7 @@ def evaluate(
     commands.evaluate(model, variants, report, grid, seed, device)
 
 
-def demo(*, out: Path = Path("runs/demo"), minutes: float = 3.0, scenes: int = 20) -> None:
+def demo(*, out: Path = Path("runs/demo"), minutes: float = 1.5, scenes: int = 20) -> None:
     """The whole story on the built-in phantom, in a few minutes.
 
     Args:
@@ -274,6 +304,7 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "demo": demo,
     "prepare": prepare,
     "train": train,
+    "pretrain": pretrain,
     "locate": locate,
     "simulate": simulate,
     "twin": twin,

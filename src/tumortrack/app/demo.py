@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import tumortrack
@@ -12,8 +13,11 @@ from tumortrack.core import store
 from tumortrack.core.errors import InputError, StorageError
 
 CT_SEED, SCENE_SEED = 1, 2
-# Two of the paper's deformation configurations: the one that training uses, and a stronger one.
-CONFIGURATIONS = (2, 3)
+# Deformations of a kind that training does not show: two of the paper's configurations of drags,
+# the one that the paper trains with and the one with the most drags, and squeezed and bent as a
+# whole. And elastic ones, of a library of states that training did not draw from.
+DRAGGED = commands.SimulateOptions(seed=SCENE_SEED, configurations=(3, 6), squeeze=True)
+ELASTIC = commands.SimulateOptions(seed=SCENE_SEED, elastic=True)
 _MARKER = "demo.json"  # says that what lies beside it is a demo's and may be replaced
 _MINE = ("ct_dicom", "case", "model", "dataset", "scenes", "report.json", "index.html")
 
@@ -41,9 +45,15 @@ def run_demo(out: Path, minutes: float, scenes: int) -> None:
     commands.prepare(out / "ct_dicom", out / "case", PrepareOptions(), overwrite=False)
     say(f"3/5 training for {minutes:g} minutes")
     commands.train(out / "case", out / "model", commands.TrainOptions(minutes=minutes))
-    say(f"4/5 simulating {scenes} unseen deformed scenes")
-    options = commands.SimulateOptions(scenes, SCENE_SEED, CONFIGURATIONS)
-    commands.write_scenes(out / "case", out / "dataset", options)
+    dragged, elastic = scenes // 2, scenes - scenes // 2
+    say(
+        f"4/5 simulating {scenes} unseen scenes: {elastic} deformed as an elastic body, {dragged} "
+        "dragged, squeezed and bent as no training scene is"
+    )
+    for kind, count, options in (("elastic", elastic, ELASTIC), ("dragged", dragged, DRAGGED)):
+        if count > 0:
+            made = replace(options, scenes=count)
+            commands.write_scenes(out / "case", out / "dataset", made, f"{kind}-")
     say("5/5 locating kidney and tumors in each from one depth image")
     commands.evaluate(out / "model", out / "dataset", out, grid=128, seed=0, device="auto")
     say(f"open {out / 'index.html'} in a browser: estimate over truth, in 3-D, scene by scene.")

@@ -60,8 +60,10 @@ class SimulateOptions:
         )
 
 
-def write_scenes(case_folder: Path, dataset: Path, options: SimulateOptions) -> None:
-    """Scenes 0000, 0001, ... of the ``test`` stream; those that are there already stay.
+def write_scenes(
+    case_folder: Path, dataset: Path, options: SimulateOptions, prefix: str = ""
+) -> None:
+    """Scenes PREFIX0000, PREFIX0001, ... of the ``test`` stream; those that are there stay.
 
     Raises:
         InputError: no case, or scenes that are not of this case, seed and options.
@@ -87,7 +89,7 @@ def write_scenes(case_folder: Path, dataset: Path, options: SimulateOptions) -> 
     }
     with progress_bar("simulate", options.scenes) as advance:
         for index in range(options.scenes):
-            folder = dataset / f"{index:04d}"
+            folder = dataset / f"{prefix}{index:04d}"
             recipe = SceneRecipe(options.seed, "test", index)
             made_from = {**about, "recipe": asdict(recipe)}
             if folder.exists():
