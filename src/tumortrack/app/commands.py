@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from tumortrack.app.console import console, progress_bar, say
+from tumortrack.app.pretraining import start_of
 from tumortrack.app.scenes import SimulateOptions, check_case, write_scenes
 from tumortrack.core import store
 from tumortrack.core.errors import InputError
@@ -50,6 +51,7 @@ class TrainOptions:
     device: Device = "auto"
     workers: int | None = None
     checkpoint_every_s: float = 30.0
+    start: Path | None = None
 
 
 def train(case_folder: Path, folder: Path, options: TrainOptions) -> None:
@@ -81,6 +83,7 @@ def train(case_folder: Path, folder: Path, options: TrainOptions) -> None:
         device=options.device,
         workers=options.workers,
         checkpoint_every_s=options.checkpoint_every_s,
+        start=start_of(options.start),
     )
     if is_finished(folder):
         done = load_model(folder).provenance

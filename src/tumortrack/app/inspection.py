@@ -25,7 +25,7 @@ def describe(path: Path) -> list[str]:
             "resumes them."
         ]
     if (path / "training").is_dir():
-        return [f"{path}: a training that has not ended; the same `train` command resumes it."]
+        return [f"{path}: a training that has not ended; the same command resumes it."]
     if (path / "cloud.ply").is_file():
         return _scene(path)
     if path.is_dir() and any((p / "cloud.ply").is_file() for p in path.iterdir()):

@@ -10,12 +10,14 @@ import numpy as np
 from tumortrack.core.types import Anatomy
 from tumortrack.learn.config import Schedule, TrainConfig
 from tumortrack.learn.network import clinic_network, paper_network, quick_network
+from tumortrack.learn.warp.generic import FIELDS, UPRIGHT_MM
 from tumortrack.sense.calibration import CalibrationConfig
 from tumortrack.sense.clutter import ClutterConfig
 from tumortrack.sense.noise import D405_NOISE
 from tumortrack.sense.occlusion import OcclusionConfig
 from tumortrack.simulate.deform import ChainConfig, DragConfig, ElasticConfig, StretchConfig
 from tumortrack.simulate.deform.drag import CONFIGURATIONS
+from tumortrack.simulate.elastic.body import BodyConfig
 from tumortrack.simulate.occupancy import OccupancyConfig
 from tumortrack.simulate.pose import PoseConfig
 from tumortrack.simulate.scene import SceneConfig
@@ -69,8 +71,23 @@ def clinic(anatomy: Anatomy, rotations: Rotations = "limited") -> TrainConfig:
     sensors, hidden surface and background."""
     lower, upper = anatomy.organ.box_mm
     elastic = ElasticConfig()
+    return _clinic(elastic, elastic.body.modes, float(np.max(upper - lower)) / 2, rotations)
+
+
+def pretraining(rotations: Rotations = "limited") -> TrainConfig:
+    """What ``clinic`` sees and learns, for many organs in their common frame: each with a small
+    elastic body that takes half a second to build."""
+    elastic = ElasticConfig(
+        body=BodyConfig(cells=500, modes=24, responses=120, patches=250, states=200)
+    )
+    return _clinic(elastic, FIELDS, UPRIGHT_MM, rotations)
+
+
+def _clinic(
+    elastic: ElasticConfig, modes: int, scale_mm: float, rotations: Rotations
+) -> TrainConfig:
     return TrainConfig(
-        network=clinic_network(elastic.body.modes, scale_mm=float(np.max(upper - lower)) / 2),
+        network=clinic_network(modes, scale_mm),
         scene=SceneConfig(
             pose=PoseConfig(rotations=rotations, tilt_deg=30.0),
             deform=(elastic,),

@@ -6,23 +6,32 @@ import atexit
 import os
 import signal
 from collections.abc import Generator
+from typing import Protocol
 
 import torch
 from torch.utils.data import DataLoader, Dataset
 
 from tumortrack.learn.cores import available_cores
-from tumortrack.simulate.dataset import SceneStream
+from tumortrack.simulate.dataset import Batch
 
-__all__ = ["Tensors", "available_cores", "batches", "default_workers"]
+__all__ = ["Stream", "Tensors", "available_cores", "batches", "default_workers"]
 
 # clouds, points, labels, poses (camera_from_ct)
 Tensors = tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]
 
 
+class Stream(Protocol):
+    """Batches by number. Picklable; the same number gives the same batch."""
+
+    def batch(self, index: int) -> Batch:
+        """The batch with this number."""
+        ...
+
+
 class _Batches(Dataset[Tensors]):
     """A scene stream as torch's loader wants it."""
 
-    def __init__(self, stream: SceneStream, period: int) -> None:
+    def __init__(self, stream: Stream, period: int) -> None:
         self._stream = stream
         self._period = period
 
@@ -37,7 +46,7 @@ class _Batches(Dataset[Tensors]):
 
 
 def batches(
-    stream: SceneStream, steps: range, period: int, workers: int, device: torch.device
+    stream: Stream, steps: range, period: int, workers: int, device: torch.device
 ) -> Generator[Tensors, None, None]:
     """The batches of these steps, in order, whatever the number of workers; after ``period``
     steps (0: never) they repeat. Close the generator to end the workers."""

@@ -15,6 +15,7 @@ from tumortrack.core.errors import InputError
 from tumortrack.core.types import Anatomy
 from tumortrack.learn.checkpoint import Progress
 from tumortrack.learn.config import TrainConfig
+from tumortrack.learn.start import Start
 
 
 @dataclass(frozen=True)
@@ -31,6 +32,7 @@ class Run:
     device: Literal["auto", "cpu", "cuda"] = "auto"
     workers: int | None = None  # processes that make scenes; None: as the machine allows
     checkpoint_every_s: float = 30.0
+    start: Start | None = None  # pretrained weights, for warps
 
     def __post_init__(self) -> None:
         for name, value, fewest in (
@@ -46,6 +48,12 @@ class Run:
             raise InputError(
                 f"--checkpoint-every is {self.checkpoint_every_s}; give seconds, 0 or more."
             )
+        if self.start is not None:
+            self.start.check(self.config.network)
+
+    @property
+    def identity(self) -> str:
+        return run_identity(self)
 
 
 def run_identity(run: Run) -> str:
@@ -58,11 +66,13 @@ def run_identity(run: Run) -> str:
         "minutes": run.minutes,
         "schema": store.SCHEMA,
     }
+    if run.start is not None:
+        content["start"] = run.start.sha256
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
 
 def provenance(run: Run, progress: Progress, device: torch.device) -> dict:
-    return {
+    about = {
         "seed": run.seed,
         "steps": progress.step,
         "training_s": round(progress.elapsed_s, 1),
@@ -73,3 +83,4 @@ def provenance(run: Run, progress: Progress, device: torch.device) -> dict:
         "case_sha256": run.case_sha256,
         "up_lps": list(run.up_lps),
     }
+    return about if run.start is None else {**about, "start_sha256": run.start.sha256}

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 import torch
@@ -18,10 +19,10 @@ from tumortrack.learn.checkpoint import (
     restore_optimizer,
     save_checkpoint,
 )
+from tumortrack.learn.config import TrainConfig
 from tumortrack.learn.loader import Tensors
 from tumortrack.learn.model import has_fast_bfloat16
 from tumortrack.learn.networks import Network, network_of
-from tumortrack.learn.run import Run, run_identity
 from tumortrack.learn.schedule import learning_rate
 
 
@@ -35,10 +36,27 @@ class Diverged(TumortrackError):
         )
 
 
+class Plan(Protocol):
+    """What the state has to know of a run."""
+
+    @property
+    def config(self) -> TrainConfig: ...
+    @property
+    def seed(self) -> int: ...
+    @property
+    def steps(self) -> int | None: ...
+    @property
+    def minutes(self) -> float | None: ...
+    @property
+    def identity(self) -> str:
+        """sha256 of all that decides the weights."""
+        ...
+
+
 class TrainingState:
     """All that changes while training, and nothing else."""
 
-    def __init__(self, run: Run, device: torch.device) -> None:
+    def __init__(self, run: Plan, device: torch.device) -> None:
         self._run, self._device = run, device
         self._bf16 = has_fast_bfloat16(device)
         config = run.config
@@ -63,7 +81,7 @@ class TrainingState:
 
     def resume(self, work: Path) -> None:
         """Take up the last checkpoint, if there is one."""
-        found = load_checkpoint(work, run_identity(self._run))
+        found = load_checkpoint(work, self._run.identity)
         if found is None:
             return
         self.progress, groups = found
@@ -87,7 +105,7 @@ class TrainingState:
             "optimizer": optimizer_tensors(self.optimizer),
             "best": self._best,
         }
-        save_checkpoint(work, self.progress, groups, run_identity(self._run))
+        save_checkpoint(work, self.progress, groups, self._run.identity)
 
     def step(self, batch: Tensors) -> float:
         """One optimizer step; returns the loss.

@@ -6,23 +6,16 @@ atomic file: a run that is killed and started again ends with the weights of one
 
 from __future__ import annotations
 
-import signal
-import time
-from collections.abc import Callable, Iterator
-from contextlib import closing, contextmanager
-from dataclasses import dataclass
+from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 
-import torch
-
-from tumortrack.core.errors import TumortrackError
-from tumortrack.learn.allocator import keep_freed_memory
 from tumortrack.learn.checkpoint import Progress
-from tumortrack.learn.cores import available_cores
 from tumortrack.learn.course import course_of
 from tumortrack.learn.history import History, Record
 from tumortrack.learn.loader import batches, default_workers
 from tumortrack.learn.model import Model, choose_device, save_model
+from tumortrack.learn.pace import REPORT_EVERY_S, Clock, Interrupted, Status, ctrl_c, use_cores
 from tumortrack.learn.run import Run, provenance, run_identity
 from tumortrack.learn.schedule import settle_end
 from tumortrack.learn.state import TrainingState
@@ -30,27 +23,6 @@ from tumortrack.learn.work import work_folder
 from tumortrack.simulate.dataset import SceneStream
 
 __all__ = ["Interrupted", "Run", "Status", "run_identity", "train"]
-
-REPORT_EVERY_S = 5.0
-MOST_THREADS = 16  # more only wait for each other in layers this small
-
-
-@dataclass(frozen=True)
-class Status:
-    """What the loop tells while it runs; ``end`` is None while minutes decide."""
-
-    step: int
-    end: int | None
-    seconds_left: float
-    samples_per_s: float
-    loss: float
-    miou: float | None  # of the last validation
-
-
-class Interrupted(TumortrackError):
-    """Ctrl-C: the state is saved, the same command goes on."""
-
-    exit_code = 130
 
 
 def train(run: Run, folder: Path, report: Callable[[Status], None]) -> Model:
@@ -70,9 +42,7 @@ def train(run: Run, folder: Path, report: Callable[[Status], None]) -> Model:
 def _train(run: Run, folder: Path, work: Path, report: Callable[[Status], None]) -> Model:
     config, device = run.config, choose_device(run.device)
     workers = default_workers() if run.workers is None else run.workers
-    if device.type == "cpu":
-        keep_freed_memory()
-        torch.set_num_threads(max(1, min(MOST_THREADS, available_cores() - workers)))
+    use_cores(device, workers)
     course = course_of(run, device)
     state = TrainingState(run, device)
     state.know(course.teach)
@@ -90,9 +60,9 @@ def _train(run: Run, folder: Path, work: Path, report: Callable[[Status], None])
     steps = range(state.progress.step, state.progress.end or config.steps)
     period = config.training_pairs // config.batch_size
 
-    progress, clock, miou = state.progress, _Clock(state.progress), None
+    progress, clock, miou = state.progress, Clock(state.progress), None
     source = closing(batches(stream, steps, period, workers, device))
-    with History(work, progress) as history, _ctrl_c() as stopped, source as loaded:
+    with History(work, progress) as history, ctrl_c() as stopped, source as loaded:
         for batch in loaded:
             loss = state.step(batch)
             progress.elapsed_s = clock.elapsed()
@@ -110,36 +80,10 @@ def _train(run: Run, folder: Path, work: Path, report: Callable[[Status], None])
             if done:
                 break
             if stop:
-                raise Interrupted(
-                    f"stopped at step {progress.step}; the state is saved in {folder}. The same "
-                    "command goes on from there."
-                )
+                raise Interrupted.at(progress.step, folder)
     model = course.model(state.best_network(), provenance(run, progress, device))
     save_model(model, folder)
     return model
-
-
-class _Clock:
-    """Time spent in all sessions of a run, and when things are due again."""
-
-    def __init__(self, progress: Progress) -> None:
-        self._start, self._first_step = time.monotonic(), progress.step
-        self._before = progress.elapsed_s
-        self._last: dict[str, float] = {}
-
-    def elapsed(self) -> float:
-        return self._before + time.monotonic() - self._start
-
-    def rate(self, progress: Progress) -> float:
-        """Steps per second in this session."""
-        return (progress.step - self._first_step) / max(time.monotonic() - self._start, 1e-9)
-
-    def due(self, what: str, every_s: float) -> bool:
-        now = time.monotonic()
-        if now - self._last.setdefault(what, self._start) < every_s:
-            return False
-        self._last[what] = now
-        return True
 
 
 def _status(run: Run, progress: Progress, rate: float, loss: float, miou: float | None) -> Status:
@@ -148,18 +92,3 @@ def _status(run: Run, progress: Progress, rate: float, loss: float, miou: float 
         left = min(left, run.minutes * 60 - progress.elapsed_s)
     speed = rate * run.config.batch_size
     return Status(progress.step, progress.end, max(left, 0.0), speed, loss, miou)
-
-
-@contextmanager
-def _ctrl_c() -> Iterator[Callable[[], bool]]:
-    """Turns Ctrl-C and SIGTERM into a question that the loop asks after each step."""
-    asked: list[int] = []
-    before = {
-        number: signal.signal(number, lambda received, _: asked.append(received))
-        for number in (signal.SIGINT, signal.SIGTERM)
-    }
-    try:
-        yield lambda: bool(asked)
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)

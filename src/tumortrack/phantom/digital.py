@@ -159,6 +159,12 @@ def gap_mm(one: TumorParameters, other: TumorParameters) -> float:
 
 def organ_mask(parameters: PhantomParameters, axes_mm: Axes) -> Bool[np.ndarray, "i j k"]:
     """Where the organ is, tumors aside, on the grid of three axes (organ frame, mm)."""
+    return organ_field(parameters, axes_mm) < 0
+
+
+def organ_field(parameters: PhantomParameters, axes_mm: Axes) -> Float[np.ndarray, "i j k"]:
+    """About the signed distance to the organ without its tumors, negative inside, on the grid of
+    three axes (organ frame, mm)."""
     x, y, z = (np.linspace(-0.75 * length, 0.75 * length, 65) for length in parameters.size_mm)
     raw = (x, y, z)
     field = _organ_field(parameters, raw)
@@ -170,7 +176,7 @@ def organ_mask(parameters: PhantomParameters, axes_mm: Axes) -> Bool[np.ndarray,
         scale = (high - low) / length_mm
         stretched.append(np.asarray(axes_mm[axis]) * scale + (low + high) / 2)
     x, y, z = stretched
-    return _organ_field(parameters, (x, y, z)) < 0
+    return _organ_field(parameters, (x, y, z))
 
 
 def _crossings(
@@ -234,7 +240,13 @@ def _lumps(parameters: PhantomParameters, point_mm: tuple[np.ndarray, ...]) -> n
 
 def tumor_masks(parameters: PhantomParameters, axes_mm: Axes) -> list[Bool[np.ndarray, "i j k"]]:
     """Where each tumor is, in label order, on the grid of three axes (organ frame, mm)."""
-    masks = []
+    return [field < 0 for field in tumor_fields(parameters, axes_mm)]
+
+
+def tumor_fields(parameters: PhantomParameters, axes_mm: Axes) -> list[Float[np.ndarray, "i j k"]]:
+    """About the signed distance to each tumor, in label order, negative inside, on the grid of
+    three axes (organ frame, mm)."""
+    fields = []
     for number, tumor in enumerate(sorted_tumors(parameters)):
         rng = np.random.default_rng((parameters.shape_seed, 1, number))
         waves = rng.normal(size=(3, 3))
@@ -245,5 +257,5 @@ def tumor_masks(parameters: PhantomParameters, axes_mm: Axes) -> list[Bool[np.nd
         away = np.maximum(distance_mm, 1e-9)
         # Odd in direction: what one side gains its opposite loses, so diameters stay as stated.
         lobes = sum(np.sin((a * x + b * y + c * z) / away) for a, b, c in waves) / 3
-        masks.append(distance_mm < tumor.diameter_mm / 2 * (1 + tumor.lobulation * lobes))
-    return masks
+        fields.append(distance_mm - tumor.diameter_mm / 2 * (1 + tumor.lobulation * lobes))
+    return fields

@@ -16,6 +16,7 @@ from tumortrack.learn.model import Model
 from tumortrack.learn.networks import Network
 from tumortrack.learn.run import Run
 from tumortrack.learn.validate import ValidationScenes, mean_iou_of, validation_scenes
+from tumortrack.learn.warp.generic import carry_over, upright_of
 from tumortrack.learn.warp.locate import best_fit, first_motions
 from tumortrack.learn.warp.network import WarpNetwork
 from tumortrack.learn.warp.refine import Refined
@@ -51,7 +52,13 @@ class WarpCourse:
 
     def teach(self, network: Network) -> None:
         assert isinstance(network, WarpNetwork)
-        network.know(self._shape, self._run.up_lps, self.points.points_ct)
+        run, shape = self._run, self._shape
+        network.know(shape, run.up_lps, self.points.points_ct)
+        if run.start is not None:
+            upright = upright_of(
+                run.anatomy_ct.organ, run.up_lps, shape.body.center_ct, shape.long_axis
+            )
+            carry_over(network, run.start.weights, upright)
 
     def miou(self, network: Network) -> float:
         return self._judged(network).miou

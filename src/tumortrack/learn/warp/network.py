@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from jaxtyping import Float
+from scipy.spatial.transform import Rotation
 from torch import Tensor, nn
 from torch.nn import functional
 
@@ -27,7 +28,7 @@ _LARGEST = 4.0  # coefficients lie within so many standard deviations of the lib
 _SMALL_START = 0.3  # of the last layer's weights
 _STEP = 0.5  # of the organ's half length: what an output of 1 moves it by
 _BEHIND = 0.3  # of the half length: the organ's middle lies about so far behind the cloud's
-_POSE = 10  # outputs before the coefficients: rotation 6, place 3, way round 1
+POSE_OUTPUTS = 10  # before the coefficients: rotation 6, place 3, way round 1
 _HUBER_MM = 5.0  # errors beyond count by their size, not its square
 _RIGID_SHARE = 0.5  # of the loss: the organ's pose without its deformation
 _WAY_SHARE = 0.2  # of the loss: which way round is right
@@ -86,7 +87,7 @@ class WarpNetwork(nn.Module):
         self.hidden = nn.Sequential(
             Layer(config.encoder.latent_size, width, "none"), Layer(width, width, "none")
         )
-        self.output = nn.Linear(width, _POSE + modes)
+        self.output = nn.Linear(width, POSE_OUTPUTS + modes)
         with torch.no_grad():
             self.output.weight.mul_(_SMALL_START)
             self.output.bias.zero_()
@@ -105,9 +106,9 @@ class WarpNetwork(nn.Module):
         up_lps: tuple[float, float, float],
         points_ct: Float[np.ndarray, "p 3"],
     ) -> None:
-        """Take over what does not have to be learnt: the organ's centre and long axis, its states'
-        mean and spread, the direction that faces the camera, and the points (CT frame) whose
-        places before the camera the loss compares."""
+        """Take over what does not have to be learnt: the organ's centre and axes, its states'
+        mean and spread, and the points (CT frame) whose places before the camera the loss
+        compares."""
         body = shape.body
         known = {
             "center_ct": body.center_ct,
@@ -115,7 +116,7 @@ class WarpNetwork(nn.Module):
             "modes": body.modes_at(points_ct),
             "mean": body.states.mean(0),
             "std": body.states.std(0),
-            "facing": rotation_onto(np.asarray(up_lps, float), np.array([0.0, 0.0, -1.0])),
+            "facing": facing_rotation(up_lps, shape.long_axis),
             "long_axis": shape.long_axis,
         }
         for name, value in known.items():
@@ -151,7 +152,7 @@ class WarpNetwork(nn.Module):
         rotation = back @ torch.stack([first, second, third], -1) @ self.facing
         place = (out[:, 6:9] * _STEP + out.new_tensor([0.0, 0.0, _BEHIND])) * self.scale_mm
         centre_mm = aside.centre_mm + (back @ place[..., None])[..., 0]
-        bounded = _LARGEST * torch.tanh(out[:, _POSE:] / _LARGEST)
+        bounded = _LARGEST * torch.tanh(out[:, POSE_OUTPUTS:] / _LARGEST)
         return Placement(rotation, centre_mm, self.mean + self.std * bounded, out[:, 9])
 
     def loss(
@@ -184,6 +185,16 @@ class WarpNetwork(nn.Module):
         aside = self.aside(points_mm)
         sign = torch.ones_like(aside.centre_mm[:, 0])
         return self(aside), self(aside.other_way(-sign))
+
+
+def facing_rotation(
+    up_lps: tuple[float, float, float], long_axis: Float[np.ndarray, " 3"]
+) -> Float[np.ndarray, "3 3"]:
+    """The rotation that an organ of any patient has where nothing is tilted: its upper side
+    towards the camera, its long axis along +x as far as it lies across the view."""
+    facing = rotation_onto(np.asarray(up_lps, float), np.array([0.0, 0.0, -1.0]))
+    x, y, _ = facing @ long_axis
+    return Rotation.from_euler("z", -np.arctan2(y, x)).as_matrix() @ facing
 
 
 def _placed(points: Tensor, rotation: Tensor, centre_mm: Tensor) -> Tensor:

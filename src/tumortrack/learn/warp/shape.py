@@ -65,9 +65,8 @@ class Shape:
 
     @cached_property
     def long_axis(self) -> Float64[np.ndarray, " 3"]:
-        """The organ's longest principal direction; its sign is arbitrary but fixed."""
-        vertices = self.anatomy_ct.organ.vertices_mm
-        return np.linalg.svd(vertices - vertices.mean(0), full_matrices=False)[2][0]
+        """The organ's longest principal direction, towards its slimmer, farther reaching end."""
+        return long_axis_of(self.anatomy_ct.organ)
 
     def labels_at(
         self, points_ct: Float32[np.ndarray, "n 3"]
@@ -114,6 +113,14 @@ class Shape:
         except KeyError as error:
             raise InputError(f"the organ's shape lacks {error}; train the model again.") from error
         return cls(Anatomy(tuple(parts)), Body.from_arrays(body), tuple(fields))
+
+
+def long_axis_of(organ: Mesh) -> Float64[np.ndarray, " 3"]:
+    """The longest principal direction of a surface's vertices, in which their third moment is
+    positive: a rule that means the same in every patient, however the CT's axes lie."""
+    spread = organ.vertices_mm - organ.vertices_mm.mean(0)
+    axis = np.linalg.svd(spread, full_matrices=False)[2][0]
+    return axis if ((spread @ axis) ** 3).sum() >= 0 else -axis
 
 
 def shape_of(anatomy_ct: Anatomy, body: Body) -> Shape:

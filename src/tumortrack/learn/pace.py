@@ -1,0 +1,91 @@
+"""What every training loop needs besides its steps: time, cores, Ctrl-C, a word on progress."""
+
+from __future__ import annotations
+
+import signal
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+
+from tumortrack.core.errors import TumortrackError
+from tumortrack.learn.allocator import keep_freed_memory
+from tumortrack.learn.checkpoint import Progress
+from tumortrack.learn.cores import available_cores
+
+REPORT_EVERY_S = 5.0
+MOST_THREADS = 16  # more only wait for each other in layers this small
+
+
+@dataclass(frozen=True)
+class Status:
+    """What the loop tells while it runs; ``end`` is None while minutes decide."""
+
+    step: int
+    end: int | None
+    seconds_left: float
+    samples_per_s: float
+    loss: float
+    miou: float | None  # of the last validation
+
+
+class Interrupted(TumortrackError):
+    """Ctrl-C: the state is saved, the same command goes on."""
+
+    exit_code = 130
+
+    @classmethod
+    def at(cls, step: int, folder: Path) -> Interrupted:
+        """After this step of the training in ``folder``."""
+        return cls(
+            f"stopped at step {step}; the state is saved in {folder}. The same "
+            "command goes on from there."
+        )
+
+
+def use_cores(device: torch.device, workers: int) -> None:
+    """Give the network the cores that the workers leave."""
+    if device.type == "cpu":
+        keep_freed_memory()
+        torch.set_num_threads(max(1, min(MOST_THREADS, available_cores() - workers)))
+
+
+class Clock:
+    """Time spent in all sessions of a run, and when things are due again."""
+
+    def __init__(self, progress: Progress) -> None:
+        self._start, self._first_step = time.monotonic(), progress.step
+        self._before = progress.elapsed_s
+        self._last: dict[str, float] = {}
+
+    def elapsed(self) -> float:
+        return self._before + time.monotonic() - self._start
+
+    def rate(self, progress: Progress) -> float:
+        """Steps per second in this session."""
+        return (progress.step - self._first_step) / max(time.monotonic() - self._start, 1e-9)
+
+    def due(self, what: str, every_s: float) -> bool:
+        now = time.monotonic()
+        if now - self._last.setdefault(what, self._start) < every_s:
+            return False
+        self._last[what] = now
+        return True
+
+
+@contextmanager
+def ctrl_c() -> Iterator[Callable[[], bool]]:
+    """Turns Ctrl-C and SIGTERM into a question that the loop asks after each step."""
+    asked: list[int] = []
+    before = {
+        number: signal.signal(number, lambda received, _: asked.append(received))
+        for number in (signal.SIGINT, signal.SIGTERM)
+    }
+    try:
+        yield lambda: bool(asked)
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

@@ -1,0 +1,122 @@
+"""Random kidneys with random tumors, as many as wanted: what pretraining learns from.
+
+Each is the built-in phantom's implicit surface with parameters of its own, turned at random in the
+CT and seen from a random side. Nothing in it comes from a patient.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+
+from tumortrack.core.errors import TumortrackError
+from tumortrack.core.types import Anatomy, Mesh
+from tumortrack.phantom.digital import (
+    SMALLEST_GAP_MM,
+    Axes,
+    PhantomParameters,
+    TumorParameters,
+    gap_mm,
+    organ_field,
+    sorted_tumors,
+    tumor_fields,
+)
+
+_STEP_MM = 2.0  # of the grid that surfaces are drawn from
+_MARGIN_MM = 6.0
+_MOST_TUMORS = 3
+_SIDEWAYS_DEG = 60.0  # the side that faces the camera lies so far from anterior at most
+_ATTEMPTS = 100
+_FIELD_LIMIT_MM = 2 * _STEP_MM  # vertices lie where neighbouring nodes differ in sign
+
+
+def random_anatomy(seed: int) -> tuple[Anatomy, tuple[float, float, float]]:
+    """A kidney of 90 to 130 mm with one to three tumors of 10 to 45 mm, deep or bulging, and the
+    direction that faces the camera: CT frame (LPS), mm; closed surfaces, tumors in label order.
+
+    The same seed gives the same kidney.
+
+    Raises:
+        InputError: a negative seed.
+    """
+    rng = np.random.default_rng([seed, 0x81D])
+    parameters = random_parameters(rng)
+    turn = Rotation.random(rng=rng).as_matrix()
+    if rng.uniform() < 0.5:  # a left kidney: the mirror image
+        turn = turn @ np.diag([-1.0, 1.0, 1.0])
+    centre = rng.uniform(-100, 100, 3)
+    parts = tuple(
+        _placed(_surface(field, axes), turn, centre) for field, axes in _fields(parameters)
+    )
+    aside = Rotation.from_euler("z", rng.uniform(-_SIDEWAYS_DEG, _SIDEWAYS_DEG), degrees=True)
+    x, y, z = turn @ aside.apply([0.0, -1.0, 0.0])
+    return Anatomy(parts), (float(x), float(y), float(z))
+
+
+def random_parameters(rng: np.random.Generator) -> PhantomParameters:
+    """The shape of a random kidney and its tumors."""
+    length = rng.uniform(90, 130)
+    size = (length * rng.uniform(0.45, 0.62), length * rng.uniform(0.38, 0.52), length)
+    return PhantomParameters(
+        size_mm=size,
+        bend_mm=rng.uniform(2, 18),
+        taper=rng.uniform(0, 0.25),
+        hilum_depth_mm=rng.uniform(6, 24),
+        lump_mm=rng.uniform(0.3, 2.0),
+        shape_seed=int(rng.integers(1 << 31)),
+        tumors=_random_tumors(size, rng),
+    )
+
+
+def _random_tumors(
+    size_mm: tuple[float, float, float], rng: np.random.Generator
+) -> tuple[TumorParameters, ...]:
+    """Tumors that keep apart: centres anywhere from the middle out to the organ's surface."""
+    wanted = int(rng.integers(1, _MOST_TUMORS + 1))
+    tumors: list[TumorParameters] = []
+    for _ in range(_ATTEMPTS):
+        direction = rng.normal(size=3)
+        depth = rng.uniform(0.1, 0.95) * np.array(size_mm) / 2
+        x, y, z = direction / np.linalg.norm(direction) * depth
+        diameter = float(np.exp(rng.uniform(np.log(10), np.log(45))))
+        tumor = TumorParameters(diameter_mm=diameter, center_mm=(x, y, z))
+        if all(gap_mm(tumor, other) >= SMALLEST_GAP_MM for other in tumors):
+            tumors.append(tumor)
+        if len(tumors) == wanted:
+            break
+    return tuple(tumors)
+
+
+def _fields(parameters: PhantomParameters) -> list[tuple[Float[np.ndarray, "i j k"], Axes]]:
+    """About the signed distance to the whole organ and to each tumor, on a grid about it."""
+    reach = np.array(parameters.size_mm) / 2
+    for tumor in sorted_tumors(parameters):
+        reach = np.maximum(reach, np.abs(tumor.center_mm) + 0.6 * tumor.diameter_mm)
+    reach = reach + _MARGIN_MM
+    x, y, z = (np.arange(-length, length + _STEP_MM, _STEP_MM) for length in reach)
+    axes = (x, y, z)
+    tumors = tumor_fields(parameters, axes)
+    whole = np.minimum.reduce([organ_field(parameters, axes), *tumors])
+    return [(field, axes) for field in (whole, *tumors)]
+
+
+def _surface(field_mm: Float[np.ndarray, "i j k"], axes: Axes) -> Mesh:
+    """The closed zero surface of a field, its largest piece, organ frame."""
+    import trimesh
+    from skimage.measure import marching_cubes
+
+    capped = np.clip(field_mm, -_FIELD_LIMIT_MM, _FIELD_LIMIT_MM)
+    vertices, faces, _, _ = marching_cubes(capped, 0.0, spacing=(_STEP_MM,) * 3)
+    pieces = trimesh.Trimesh(vertices, faces[:, ::-1]).split(only_watertight=True)
+    if len(pieces) == 0:
+        raise TumortrackError("a random kidney's surface is not closed; take another seed.")
+    largest = max(pieces, key=lambda piece: abs(piece.volume))
+    mesh = Mesh(largest.vertices + [axis[0] for axis in axes], largest.faces)
+    return mesh if mesh.volume_mm3 > 0 else Mesh(mesh.vertices_mm, mesh.faces[:, ::-1])
+
+
+def _placed(mesh: Mesh, turn: Float[np.ndarray, "3 3"], centre_mm: Float[np.ndarray, " 3"]) -> Mesh:
+    """The mesh turned (or mirrored) and moved, its faces outward again."""
+    faces = mesh.faces if np.linalg.det(turn) > 0 else mesh.faces[:, ::-1]
+    return Mesh(mesh.vertices_mm @ turn.T + centre_mm, faces)
