@@ -14,7 +14,7 @@ import shutil
 import subprocess
 import sys
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cache
 from pathlib import Path
 
@@ -24,14 +24,15 @@ import msgspec
 import tyro
 
 from tumortrack.app.console import say
-from tumortrack.app.presets import quick
+from tumortrack.app.presets import clinic, quick
 from tumortrack.core.errors import InputError, TumortrackError
 from tumortrack.core.store import write_json
 from tumortrack.evaluate.study.book import Book, gallery_block, section_blocks
+from tumortrack.evaluate.study.bound import BOUNDS, Bound
 from tumortrack.evaluate.study.cells import CellStore
 from tumortrack.evaluate.study.measure import Job, Status, StudyCase, measure
-from tumortrack.evaluate.study.methods import Network
-from tumortrack.evaluate.study.models import MODELS, Trainer
+from tumortrack.evaluate.study.methods import Method, Network
+from tumortrack.evaluate.study.models import CLINIC, MODELS, Presets, Trainer
 from tumortrack.evaluate.study.peer_methods import peer_method
 from tumortrack.evaluate.study.phantoms import phantom_case, study_case
 from tumortrack.evaluate.study.plan import (
@@ -67,7 +68,11 @@ class Options:
     sections: tuple[Section, ...] = SECTIONS
     """Which blocks to make."""
     steps: int | None = None
-    """Of training."""
+    """Of training M_lim and M_full."""
+    clinic_steps: int | None = None
+    """Of training clinic (the preset's)."""
+    models: tuple[str, ...] | None = None
+    """In accuracy, peers and views: M_lim, M_full, clinic."""
     configuration_steps: int | None = None
     """Of training in the deformation study (as many as --steps)."""
     seeds: tuple[int, ...] | None = None
@@ -82,6 +87,22 @@ class Options:
     """Faults and their levels, such as visible=60 (those of the plan)."""
     severity_seeds: tuple[int, ...] | None = None
     """Of the random part of each severity."""
+    severity_models: tuple[str, ...] | None = None
+    """Models beside the severities' peers."""
+    severity_peers: tuple[str, ...] | None = None
+    """Peers in the severities."""
+    goal_models: tuple[str, ...] | None = None
+    """Models in the table of goals."""
+    ablation_models: tuple[str, ...] | None = None
+    """Rows of the ablation."""
+    ablation_cases: tuple[str, ...] | None = None
+    """Cases of the ablation, of those that are given."""
+    ablation_scenes: int | None = None
+    """Training scenes of each model in the ablation."""
+    ablation_seeds: tuple[int, ...] | None = None
+    """Of training in the ablation."""
+    ablation_views: tuple[str, ...] | None = None
+    """Views in the ablation."""
     grid: int | None = None
     """Voxels along the longest side, in the table of accuracy."""
     case_peers: tuple[str, ...] | None = None
@@ -106,20 +127,9 @@ def main(options: Options) -> None:
         shutil.copyfile(options.document, document)
     given = shlex.join(sys.argv[1:])
     book = Book(document, "make results" + (f" ARGS='{given}'" if given else ""))
-    training = Training()
-    trainers = {
-        steps: Trainer(out / "models", quick, steps, options.device, report=training.show)
-        for steps in (plan.steps, plan.configuration_steps)
-    }
-
-    def model(case: StudyCase, name: str, seed: int) -> Network:
-        steps = plan.steps if name in MODELS else plan.configuration_steps
-        return trainers[steps].model(case, name, seed)
-
     cells = CellStore(out / "cells")
     studied, second = _cases(options, out)
-    bcpd = options.bcpd if options.bcpd.is_file() else None
-    methods = Methods(cache(model), cache(lambda name, case: peer_method(name, case, bcpd)))
+    methods = _methods(options, plan, out)
     for section in options.sections:
         cases = (second,) if section == "deformation" else studied
         if section in ("faults", "views", "severity"):
@@ -137,22 +147,32 @@ def main(options: Options) -> None:
     say(f"done; {document} is up to date.")
 
 
+def _methods(options: Options, plan: StudyPlan, out: Path) -> Methods:
+    """Each is trained, or made ready, once."""
+    presets = Presets(quick, clinic)
+    trainer = Trainer(out / "models", presets, options.device, report=Training().show)
+    bcpd = options.bcpd if options.bcpd.is_file() else None
+
+    def model(case: StudyCase, name: str, seed: int) -> Network:
+        steps = plan.clinic_steps if name == CLINIC else plan.configuration_steps
+        return trainer.model(case, name, seed, plan.steps if name in MODELS else steps)
+
+    def ablated(case: StudyCase, name: str, seed: int) -> Network:
+        steps = trainer.steps_for(case, name, plan.ablation_scenes)
+        return trainer.model(case, name, seed, steps)
+
+    def peer(name: str, case: StudyCase) -> Method:
+        bounds = {bound: Bound(bound, case) for bound in BOUNDS}
+        return bounds[name] if name in bounds else peer_method(name, case, bcpd)
+
+    return Methods(cache(model), cache(peer), cache(ablated))
+
+
 def _plan(options: Options) -> StudyPlan:
     plan = QUICK if options.quick else FULL
     if options.bcpd.is_file() and not options.quick:
         plan = msgspec.structs.replace(plan, peers=(*plan.peers, "bcpd"))
-    names = (
-        "case_peers",
-        "steps",
-        "seeds",
-        "case_seeds",
-        "configuration_seeds",
-        "fault_seeds",
-        "severities",
-        "severity_seeds",
-        "grid",
-        "case_grid",
-    )
+    names = {field.name for field in fields(options)} & set(plan.__struct_fields__)
     given = {name: getattr(options, name) for name in names}
     given["configuration_steps"] = options.configuration_steps or options.steps
     return msgspec.structs.replace(plan, **{k: v for k, v in given.items() if v is not None})
@@ -188,7 +208,7 @@ def _scenes(case: StudyCase, variants: tuple[str, ...], views: tuple[str, ...]) 
 
 
 def _gallery_jobs(plan: StudyPlan, case: StudyCase, methods: Methods) -> list[Job]:
-    chosen = [methods.model(case, name, plan.seeds[0]) for name in ("M_lim", "M_full")]
+    chosen = [methods.model(case, name, plan.seeds[0]) for name in plan.models]
     chosen += [methods.peer(name, case) for name in ("elastic",) if name in plan.peers]
     return [
         Job(case, method, variant, plan.view, plan.coarse_grid)

@@ -13,7 +13,7 @@ import pytest
 import trimesh
 
 from stories import write_phantom_case
-from tumortrack.app.presets import quick
+from tumortrack.app.presets import clinic, quick
 from tumortrack.core import store
 from tumortrack.core.errors import ArtifactError, InputError, NoEstimate
 from tumortrack.core.geometry import rigid
@@ -28,7 +28,7 @@ from tumortrack.evaluate.study.figures import NOT_FOUND, Figure, figure, median,
 from tumortrack.evaluate.study.markdown import closing, fill, opening, table
 from tumortrack.evaluate.study.measure import Job, Status, StudyCase, measure
 from tumortrack.evaluate.study.methods import Answer, Method
-from tumortrack.evaluate.study.models import Trainer, train_config
+from tumortrack.evaluate.study.models import ABLATED, Presets, Trainer, train_config
 from tumortrack.evaluate.study.peer_methods import peer_kinds, peer_method
 from tumortrack.evaluate.study.phantoms import study_case
 from tumortrack.evaluate.study.plan import FULL, QUICK, SECTIONS, Methods, StudyPlan, jobs_of
@@ -298,6 +298,9 @@ def tiny(anatomy_ct, rotations):
     )
 
 
+PRESETS = Presets(tiny, clinic)
+
+
 @pytest.fixture(scope="module")
 def phantom(tmp_path_factory):
     """The phantom with two simulated scenes under the twin's names."""
@@ -313,20 +316,49 @@ def phantom(tmp_path_factory):
 
 def test_configurations_change_the_drags_alone(phantom):
     plain, fourth = (
-        train_config("M_lim", phantom, quick),
-        train_config("configuration_4", phantom, quick),
+        train_config("M_lim", phantom, PRESETS),
+        train_config("configuration_4", phantom, PRESETS),
     )
     assert [drag.steps for drag in fourth.scene.deform] == [CONFIGURATIONS[4]]
     back = msgspec.structs.replace(
         fourth, scene=msgspec.structs.replace(fourth.scene, deform=plain.scene.deform)
     )
     assert back == plain
-    assert train_config("M_full", phantom, quick).scene.pose.rotations == "full"
+    assert train_config("M_full", phantom, PRESETS).scene.pose.rotations == "full"
+
+
+def test_each_model_of_the_ablation_lacks_its_piece_alone(phantom):
+    own, slim = (train_config(name, phantom, PRESETS) for name in ("clinic", "M_lim"))
+    assert own == clinic(phantom.anatomy_ct, "limited")
+    configs = {name: train_config(name, phantom, PRESETS) for name in ABLATED}
+    changed = {
+        "clinic_drags": ("deform",),
+        "clinic_clean": ("occlusion", "clutter", "calibration"),
+    }
+    for name, fields in changed.items():
+        theirs = {field: getattr(own.scene, field) for field in fields}
+        assert configs[name] != own
+        back = msgspec.structs.replace(configs[name].scene, **theirs)
+        assert msgspec.structs.replace(configs[name], scene=back) == own
+    drags = [model for model in configs["clinic_drags"].scene.deform if hasattr(model, "steps")]
+    assert len(drags) == 10
+    assert len(configs["clinic_drags"].scene.deform) == 11
+    assert configs["clinic_pointnet"].network.encoder == slim.network.encoder
+    assert configs["clinic_pointnet"].scene == own.scene
+    assert configs["quick_elastic"].network == slim.network
+    assert configs["quick_elastic"].scene.deform == own.scene.deform
+    trainer = Trainer(Path("nowhere"), PRESETS)
+    for name in ("clinic", "clinic_unrefined", "clinic_clean"):
+        assert trainer.steps_for(phantom, name, 3200) * own.batch_size == 3200
+    assert trainer.steps_for(phantom, "M_lim", 3200) * slim.batch_size == 3200
+    with pytest.raises(InputError, match="quick_elastic"):
+        train_config("clinical", phantom, PRESETS)
 
 
 def test_end_to_end_twice_gives_the_same_document(phantom, tmp_path):
     plan = StudyPlan(
         name="tiny",
+        models=("M_lim", "M_full"),
         steps=2,
         seeds=(0,),
         variants=("D0", "D1"),
@@ -347,14 +379,14 @@ def test_end_to_end_twice_gives_the_same_document(phantom, tmp_path):
     def run():
         told, trained = list[Status](), []
         trainer = Trainer(
-            tmp_path / "models", tiny, plan.steps, "cpu", 0, lambda name, _: trained.append(name)
+            tmp_path / "models", PRESETS, "cpu", 0, lambda name, _: trained.append(name)
         )
 
         def model(case, name, seed):  # one training serves under every name
-            return replace(trainer.model(case, "configuration_3", seed), name=name)
+            return replace(trainer.model(case, "configuration_3", seed, plan.steps), name=name)
 
         for section in names:
-            todo = jobs_of(plan, section, (phantom,), Methods(model, peer_method))
+            todo = jobs_of(plan, section, (phantom,), Methods(model, peer_method, model))
             cells = measure(todo, CellStore(tmp_path / "cells"), told.append)
             book.write(section_blocks(section, cells, (phantom,), book))
         bound = [Job(phantom, peer_method("rigid_bound", phantom), "D1", "clean", 24)]

@@ -10,7 +10,7 @@ from pathlib import Path
 from tumortrack.core import store
 from tumortrack.core.errors import InputError, StorageError
 from tumortrack.evaluate.protocol import RULE
-from tumortrack.evaluate.study import plots, severity, tables
+from tumortrack.evaluate.study import ablation, goals, plots, severity, tables
 from tumortrack.evaluate.study.caption import caption
 from tumortrack.evaluate.study.figures import pick
 from tumortrack.evaluate.study.gallery import gallery
@@ -66,26 +66,39 @@ def section_blocks(
     """The block of one section, its pictures drawn: name -> markdown."""
     makers: dict[Section, Callable[[list[dict], StudyCase, Book], str]] = {
         "accuracy": _accuracy,
+        "ablation": _ablation,
         "deformation": _deformation,
         "peers": _peers,
         "faults": _faults,
         "views": _views,
         "severity": _severity,
     }
+    if section == "goals":
+        lies = {case.name: tumor_lies(case.anatomy_ct) for case in cases}
+        return {section: f"{goals.tables_of(cells, lies)}\n\n{_below(section, cells, book)}"}
     texts = []
     for case in cases:
         mine = pick(cells, case=case.name)
+        if not mine:
+            continue  # a section may ask for some cases alone
         if len(cases) > 1 or section == "accuracy":
             texts.append(f"#### {case.name}")
         texts.append(makers[section](mine, case, book))
-    texts.append(f"{caption(cells, book.command)} {_RULES[section]}")
+    texts.append(_below(section, cells, book))
     return {section: "\n\n".join(texts)}
+
+
+def _below(section: Section, cells: list[dict], book: Book) -> str:
+    return f"{caption(cells, book.command)} {_RULES[section]}"
 
 
 _MEDIANS = RULE.replace("written as null", "written as not found")
 _OVER_SCENES = f"Distances in mm. {_MEDIANS} ± is the standard deviation over the seeds."
 _RULES: dict[Section, str] = {
-    "accuracy": "Distances in mm; ± is the standard deviation over the seeds, one scene each.",
+    "accuracy": "Distances in mm; ± is the standard deviation over the seeds, one scene each; "
+    "target error: mean over the scene's inner targets, for methods that carry points.",
+    "goals": goals.RULE,
+    "ablation": ablation.RULE,
     "deformation": "mIoU; ± is the standard deviation over the seeds.",
     "peers": f"{_OVER_SCENES} A network's seconds a frame are those of 50,000 queries without the "
     "dense volume, its preparation is training; target error: mean over the scene's inner targets, "
@@ -107,6 +120,10 @@ def _accuracy(cells: list[dict], case: StudyCase, book: Book) -> str:
             tables.accuracy(cells, lies, case.is_paper),
         ]
     )
+
+
+def _ablation(cells: list[dict], case: StudyCase, book: Book) -> str:
+    return ablation.table_of(cells)
 
 
 def _deformation(cells: list[dict], case: StudyCase, book: Book) -> str:

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+
+import msgspec
 
 from tumortrack.core import store
 from tumortrack.learn.model import Model, load_model
@@ -64,16 +67,19 @@ class Method(ABC):
 
 @dataclass(frozen=True)
 class Network(Method):
-    """A trained model under a name such as M_lim."""
+    """A trained model under a name such as M_lim; ``unrefined``: its warps as the network says
+    them, not laid on the cloud."""
 
     name: str
     folder: Path
     want_device: str = "auto"
     locate_seed: int = 0
+    unrefined: bool = False
 
     @cached_property
     def identity(self) -> dict:
         about = self.provenance
+        named = {"unrefined": True} if self.unrefined else {}  # older cells have no such word
         return {
             "kind": "network",
             "name": self.name,
@@ -81,6 +87,7 @@ class Network(Method):
             "steps": about["steps"],
             "locate_seed": self.locate_seed,
             "model_sha256": store.sha256_of(self.folder / store.MANIFEST),
+            **named,
         }
 
     @property
@@ -90,7 +97,8 @@ class Network(Method):
 
     @cached_property
     def _model(self) -> Model:
-        return load_model(self.folder, self.want_device)
+        model = load_model(self.folder, self.want_device)
+        return without_refinement(model) if self.unrefined else model
 
     @cached_property
     def _tracker(self) -> Tracker:
@@ -114,3 +122,12 @@ class Network(Method):
         estimate = self._tracker.locate(scene.cloud, grid, self.locate_seed)
         seconds = estimate.report["timings"]
         return Answer(estimate, sum(seconds.get(stage, 0.0) for stage in LIVE_STAGES))
+
+
+def without_refinement(model: Model) -> Model:
+    """The model that takes its network's word. Any fit is familiar to it: what validation found
+    was that of refined warps."""
+    config = model.config
+    refine = msgspec.structs.replace(config.refine, steps=0)
+    familiar = msgspec.structs.replace(model.familiar, fit_mm=math.inf)
+    return replace(model, config=msgspec.structs.replace(config, refine=refine), familiar=familiar)

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Literal, get_args
 
 from tumortrack.core.config import Config
+from tumortrack.evaluate.study.bound import BOUNDS
 from tumortrack.evaluate.study.measure import Job, StudyCase, by_method
 from tumortrack.evaluate.study.methods import Method, Network
-from tumortrack.evaluate.study.models import MODELS, configuration_name
+from tumortrack.evaluate.study.models import CLINIC, UNREFINED, configuration_name
 
 VARIANTS = ("D0", "D1", "D2", "D3", "Rot90", "Rot180", "Rot270", "G1", "P1")
 VIEWS = ("clean", "noise", "shaft", "clutter")
@@ -25,7 +26,14 @@ SEVERITIES = (
     "distance=80", "distance=120", "distance=160", "distance=200", "distance=250", "distance=300",
     "tilt=15", "tilt=30", "tilt=45",
 )  # fmt: skip
-Section = Literal["accuracy", "deformation", "peers", "faults", "views", "severity"]
+HIDDEN = "visible=60"  # the severity of the goals: 40 % of the visible surface is hidden
+ABLATION = (
+    CLINIC, f"{CLINIC}{UNREFINED}", "clinic_clean", "clinic_drags", "clinic_pointnet",
+    "quick_elastic", "M_lim",
+)  # fmt: skip
+Section = Literal[
+    "accuracy", "goals", "ablation", "deformation", "peers", "faults", "views", "severity"
+]
 SECTIONS: tuple[Section, ...] = get_args(Section)
 
 
@@ -36,11 +44,15 @@ class StudyPlan(Config, frozen=True):
     ``coarse_grid``. ``seeds`` are those of networks for the paper's phantom; other cases and the
     deformation study may do with fewer, a coarser grid and fewer peers (None: the same). Faults,
     views and severities are measured on the paper's phantom alone, with the first seed;
-    severities beside the clean scene, which is the end of most curves.
+    severities beside the clean scene, which is the end of most curves. ``steps`` are those of
+    M_lim and M_full, ``clinic_steps`` those of the preset ``clinic``; models of the ablation have
+    all seen ``ablation_scenes``, whatever their batches.
     """
 
     name: str
+    models: tuple[str, ...] = ("M_lim", "M_full", CLINIC)
     steps: int = 12_000
+    clinic_steps: int = 6_000
     configuration_steps: int = 12_000
     seeds: tuple[int, ...] = (0, 1, 2)
     case_seeds: tuple[int, ...] | None = None
@@ -57,14 +69,23 @@ class StudyPlan(Config, frozen=True):
     case_peers: tuple[str, ...] | None = None
     faults: tuple[str, ...] = FAULTS
     fault_seeds: tuple[int, ...] = (0, 1, 2)  # a shaft or a direction is drawn anew for each
+    fault_models: tuple[str, ...] = ("M_lim", CLINIC)
     fault_peers: tuple[str, ...] = ("elastic",)
     fault_variants: tuple[str, ...] = ("D1", "D2", "D3", "G1", "P1")
     views: tuple[str, ...] = VIEWS
     severities: tuple[str, ...] = SEVERITIES
     severity_seeds: tuple[int, ...] = (0, 1, 2)
     severity_variants: tuple[str, ...] = ("D2", "G1")
-    severity_models: tuple[str, ...] = ("M_lim",)
+    severity_models: tuple[str, ...] = ("M_lim", CLINIC)
     severity_peers: tuple[str, ...] = ("rigid",)
+    goal_models: tuple[str, ...] = ("M_lim", CLINIC)
+    goal_peers: tuple[str, ...] = ("elastic",)
+    ablation_models: tuple[str, ...] = ABLATION
+    ablation_cases: tuple[str, ...] = ("phantom", "case_00000")  # of those that are given
+    ablation_scenes: int = 32_000
+    ablation_seeds: tuple[int, ...] = (0, 1, 2)
+    ablation_views: tuple[str, ...] = ("noise", "shaft")
+    ablation_variants: tuple[str, ...] = ("D1", "D2", "D3", "G1", "P1")
 
     def seeds_for(self, case: StudyCase) -> tuple[int, ...]:
         return self.seeds if case.is_paper or self.case_seeds is None else self.case_seeds
@@ -80,6 +101,7 @@ FULL = StudyPlan(name="full")
 QUICK = StudyPlan(
     name="quick",
     steps=800,
+    clinic_steps=200,
     configuration_steps=800,
     seeds=(0,),
     variants=("D0", "D2", "G1"),
@@ -94,6 +116,10 @@ QUICK = StudyPlan(
     views=("clean", "noise", "clutter"),
     severities=("noise=2", "visible=60", "points=500", "tilt=30"),
     severity_seeds=(0,),
+    ablation_models=(CLINIC, f"{CLINIC}{UNREFINED}", "quick_elastic"),
+    ablation_scenes=3_200,
+    ablation_seeds=(0,),
+    ablation_variants=("D2", "G1"),
 )
 
 Peers = Callable[[str, StudyCase], Method]
@@ -102,10 +128,12 @@ Models = Callable[[StudyCase, str, int], Network]
 
 @dataclass(frozen=True)
 class Methods:
-    """Where methods come from: trained models, and peers made ready for a patient."""
+    """Where methods come from: trained models, those of the ablation, peers (and bounds) made
+    ready for a patient."""
 
     model: Models
     peer: Peers
+    ablated: Models
 
 
 def jobs_of(
@@ -120,6 +148,8 @@ def jobs_of(
     """
     makers = {
         "accuracy": _accuracy,
+        "goals": _goals,
+        "ablation": _ablation,
         "deformation": _deformation,
         "peers": _peers,
         "faults": _faults,
@@ -134,11 +164,13 @@ def scenes_of(plan: StudyPlan, section: Section) -> tuple[tuple[str, ...], tuple
     """Variants and views that a section needs; the clean view always, for it says what is
     visible."""
     variants = {
+        "ablation": plan.ablation_variants,
         "deformation": plan.configuration_variants,
         "faults": plan.fault_variants,
         "severity": plan.severity_variants,
     }
     views = {
+        "ablation": plan.ablation_views,
         "deformation": (plan.configuration_view,),
         "faults": (),
         "views": plan.views,
@@ -179,7 +211,7 @@ def _faults(plan: StudyPlan, case: StudyCase, methods: Methods) -> list[Job]:
     beside = [methods.peer(name, case) for name in plan.fault_peers if name in plan.peers]
     return [
         Job(case, method, variant, "clean", plan.coarse_grid, fault, seed)
-        for method in [methods.model(case, "M_lim", plan.seeds_for(case)[0]), *beside]
+        for method in [*_first_seed(plan, case, methods, plan.fault_models), *beside]
         for fault in plan.faults
         for seed in (plan.fault_seeds if fault != "clean" else (0,))
         for variant in plan.fault_variants
@@ -189,24 +221,66 @@ def _faults(plan: StudyPlan, case: StudyCase, methods: Methods) -> list[Job]:
 def _views(plan: StudyPlan, case: StudyCase, methods: Methods) -> list[Job]:
     return [
         Job(case, method, variant, view, plan.coarse_grid)
-        for name in MODELS
-        for method in [methods.model(case, name, plan.seeds_for(case)[0])]
+        for method in _first_seed(plan, case, methods, plan.models)
         for view in plan.views
         for variant in plan.variants
     ]
 
 
 def _severity(plan: StudyPlan, case: StudyCase, methods: Methods) -> list[Job]:
-    seed = plan.seeds_for(case)[0]
     beside = [methods.peer(name, case) for name in plan.severity_peers if name in plan.peers]
     draws = [(name, draw) for name in plan.severities for draw in plan.severity_seeds]
+    return _disturbed(
+        plan, case, [*_first_seed(plan, case, methods, plan.severity_models), *beside], draws
+    )
+
+
+def _goals(plan: StudyPlan, case: StudyCase, methods: Methods) -> list[Job]:
+    """Everything on the noisy scenes; methods that have to find the organ also where a part of
+    the visible surface is hidden, for the bounds do not look at the cloud."""
+    seeds = plan.seeds_for(case)
+    models = [methods.model(case, name, seed) for name in plan.goal_models for seed in seeds]
+    beside = [methods.peer(name, case) for name in plan.goal_peers]
+    bounds = [methods.peer(name, case) for name in BOUNDS]
+    draws = [(HIDDEN, draw) for draw in plan.severity_seeds]
+    return [
+        Job(case, method, variant, plan.view, plan.coarse_grid)
+        for method in [*models, *beside, *bounds]
+        for variant in plan.variants
+    ] + _disturbed(plan, case, [*models, *beside], draws)
+
+
+def _ablation(plan: StudyPlan, case: StudyCase, methods: Methods) -> list[Job]:
+    if case.name not in plan.ablation_cases:
+        return []
+    return [
+        Job(case, model, variant, view, plan.coarse_grid)
+        for name in plan.ablation_models
+        for seed in plan.ablation_seeds
+        for model in [methods.ablated(case, name, seed)]
+        for view in plan.ablation_views
+        for variant in plan.ablation_variants
+    ]
+
+
+def _disturbed(
+    plan: StudyPlan, case: StudyCase, methods: Sequence[Method], draws: list[tuple[str, int]]
+) -> list[Job]:
     return [
         Job(case, method, variant, "clean", plan.coarse_grid, fault, draw)
-        for method in [*(methods.model(case, n, seed) for n in plan.severity_models), *beside]
+        for method in methods
         for fault, draw in [("clean", 0), *draws]
         for variant in plan.severity_variants
     ]
 
 
+def _first_seed(
+    plan: StudyPlan, case: StudyCase, methods: Methods, models: tuple[str, ...]
+) -> list[Network]:
+    return [methods.model(case, name, plan.seeds_for(case)[0]) for name in models]
+
+
 def _networks(plan: StudyPlan, case: StudyCase, methods: Methods) -> list[Network]:
-    return [methods.model(case, name, seed) for name in MODELS for seed in plan.seeds_for(case)]
+    return [
+        methods.model(case, name, seed) for name in plan.models for seed in plan.seeds_for(case)
+    ]

@@ -22,13 +22,14 @@ if TYPE_CHECKING:
 STYLES = {
     "M_lim": ("#0072B2", "o"),
     "M_full": ("#E69F00", "s"),
+    "clinic": ("#D55E00", "*"),
     "rigid_bound": ("#000000", "x"),
     "rigid": ("#7F7F7F", "v"),
     "cpd": ("#CC79A7", "^"),
     "bcpd": ("#56B4E9", "D"),
     "elastic": ("#009E73", "P"),
 }
-OTHER_STYLE = ("#D55E00", "*")
+OTHER_STYLE = ("#56B4E9", "h")
 _BANDS = 8  # groups of equally many points along a curve
 _FEWEST = 40  # points in a group
 _ALONG = {

@@ -9,7 +9,14 @@ from tumortrack.evaluate.drawing import new_figure, save
 from tumortrack.evaluate.study.figures import Value, figure, names, part_value, pick
 from tumortrack.evaluate.study.markdown import table
 from tumortrack.evaluate.study.plots import OTHER_STYLE, STYLES, tidy
-from tumortrack.evaluate.study.tables import EMPTY, label_of, tumors_of
+from tumortrack.evaluate.study.tables import (
+    EMPTY,
+    failed_text,
+    label_of,
+    miou_text,
+    target_text,
+    tumors_of,
+)
 from tumortrack.evaluate.twin.severity import KINDS, clean_level, parse
 
 if TYPE_CHECKING:
@@ -72,17 +79,7 @@ def table_of(cells: list[dict]) -> str:
 
 
 def _whole_scene(cells: list[dict]) -> list[str]:
-    carries = any(cell["targets_mm"] for cell in cells)
-    failed = sum(cell["failed"] is not None for cell in cells)
-    return [
-        figure(cells, _target_error).text() if carries else "–",
-        figure(cells, lambda cell: cell["miou"]).text(2),
-        f"{failed} of {len(cells)}",
-    ]
-
-
-def _target_error(cell: dict) -> float | None:
-    return (cell["targets_mm"] or {}).get("mean")
+    return [target_text(cells), miou_text(cells), failed_text(cells)]
 
 
 def curves(cells: list[dict], path: Path) -> None:

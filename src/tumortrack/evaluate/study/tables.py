@@ -13,6 +13,8 @@ LABELS = {
     "cpd": "coherent point drift",
     "bcpd": "Bayesian coherent point drift",
     "elastic": "linear-elastic surface fit",
+    "visible_bound": "true visible surface (bound)",
+    "basis_bound": "all true surfaces (bound)",
 }
 FAULT_LABELS = {
     "clean": "none (clean depth)",
@@ -46,6 +48,7 @@ def tumors_of(cells: list[dict]) -> list[str]:
 def accuracy(cells: list[dict], lies: dict[str, paper.Lie], is_paper: bool) -> str:
     """The paper's table of results for one case: a row for each variant, model and tumor."""
     head = ["variant", "model", "tumor", "one-sided HD", "HD", "HD95", "centre", "IoU", "mIoU"]
+    head += ["target error"]
     if is_paper:
         head[4:4] = ["paper"]
         head[8:8] = ["paper"]
@@ -57,7 +60,7 @@ def accuracy(cells: list[dict], lies: dict[str, paper.Lie], is_paper: bool) -> s
                 kind = lies[tumor].kind
                 first = [variant, model] if number == 0 else [EMPTY, EMPTY]
                 row = [*first, tumor_text(tumor, kind), *_distances(mine, tumor)]
-                row += [_miou(mine) if number == 0 else EMPTY]
+                row += [miou_text(mine), target_text(mine)] if number == 0 else [EMPTY] * 2
                 if is_paper:
                     row[4:4] = [_said(paper.hausdorff(variant, model, kind))]
                     row[8:8] = [_said(paper.center(variant, model))]
@@ -73,7 +76,7 @@ def deformation(cells: list[dict]) -> str:
     for method in names(cells, "method"):
         number = int(method.rpartition("_")[2])
         mine = pick(cells, method=method)
-        columns = [_miou(pick(mine, variant=variant)) for variant in variants]
+        columns = [miou_text(pick(mine, variant=variant)) for variant in variants]
         said = f"{paper.CONFIGURATION_MIOU[number]:.2f}"
         rows.append([str(number), *columns, _mean_miou(mine).text(2), said])
     return table(head, rows)
@@ -98,7 +101,8 @@ def conditions(cells: list[dict], field: str, base: str) -> str:
     scenes, and in brackets the change against ``base``."""
     tumors = tumors_of(cells)
     parts = [f"{tumor.replace('_', ' ')} {what}" for tumor in tumors for what in ("HD", "centre")]
-    head = ["method", "view" if field == "view" else "error source", *parts, "mIoU", "failed"]
+    head = ["method", "view" if field == "view" else "error source", *parts]
+    head += ["target error", "mIoU", "failed"]
     labels = VIEW_LABELS if field == "view" else FAULT_LABELS
     rows = []
     for method in names(cells, "method"):
@@ -110,8 +114,8 @@ def conditions(cells: list[dict], field: str, base: str) -> str:
             for tumor in tumors:
                 for key in ("hausdorff_mm", "center_mm"):
                     value = part_value(tumor, key)
-                    row.append(_change(figure(here, value), figure(reference, value)))
-            rows.append([*row, _miou(here), _failed(here)])
+                    row.append(change(figure(here, value), figure(reference, value)))
+            rows.append([*row, target_text(here), miou_text(here), failed_text(here)])
     return table(head, rows, left=2)
 
 
@@ -136,24 +140,36 @@ def _distances(cells: list[dict], tumor: str) -> list[str]:
 
 
 def _whole_scene(cells: list[dict]) -> list[str]:
-    targets = figure(cells, lambda cell: (cell["targets_mm"] or {}).get("mean"))
     frame = figure(cells, lambda cell: cell["frame_s"])
     prepare = figure(cells, lambda cell: cell["prepare_s"])
-    carries = any(cell["targets_mm"] for cell in cells)
     return [
-        _miou(cells),
-        targets.text() if carries else "–",
-        _failed(cells),
+        miou_text(cells),
+        target_text(cells),
+        failed_text(cells),
         frame.text(3) if (frame.mean or 0) < 1 else frame.text(),
         prepare.text(),
     ]
 
 
-def _failed(cells: list[dict]) -> str:
+def target_error(cell: dict) -> float | None:
+    """Mean over the scene's inner targets, mm."""
+    return (cell["targets_mm"] or {}).get("mean")
+
+
+def carries(cells: list[dict]) -> bool:
+    """Whether the method of these cells carries points."""
+    return any(cell["targets_mm"] for cell in cells)
+
+
+def target_text(cells: list[dict]) -> str:
+    return figure(cells, target_error).text() if carries(cells) else "–"
+
+
+def failed_text(cells: list[dict]) -> str:
     return f"{sum(cell['failed'] is not None for cell in cells)} of {len(cells)}"
 
 
-def _miou(cells: list[dict]) -> str:
+def miou_text(cells: list[dict]) -> str:
     return figure(cells, lambda cell: cell["miou"]).text(2)
 
 
@@ -169,8 +185,9 @@ def _said(said: paper.Said | None) -> str:
     return EMPTY if said is None else said.text
 
 
-def _change(here: Figure, base: Figure) -> str:
+def change(here: Figure, base: Figure) -> str:
+    """A figure, and in brackets how much it is above its base."""
     if here.mean is None or base.mean is None or here is base or here == base:
         return here.text()
-    change = round(here.mean - base.mean, 1) + 0.0  # no minus before a zero
-    return f"{here.text()} ({change:+.1f})"
+    more = round(here.mean - base.mean, 1) + 0.0  # no minus before a zero
+    return f"{here.text()} ({more:+.1f})"
