@@ -12,6 +12,7 @@ import torch
 from torch.utils.data import DataLoader, Dataset
 
 from tumortrack.learn.cores import available_cores
+from tumortrack.learn.network import NetworkConfig
 from tumortrack.simulate.dataset import Batch
 
 __all__ = ["Stream", "Tensors", "available_cores", "batches", "default_workers"]
@@ -63,9 +64,11 @@ def batches(
     yield from loader
 
 
-def default_workers() -> int:
-    """Half of the cores make scenes (one at least, sixteen at most)."""
-    return max(1, min(16, available_cores() // 2))
+def default_workers(network: NetworkConfig) -> int:
+    """Half of the cores make scenes (one at least, sixteen at most); all of them for a warp, whose
+    steps cost a fraction of its scenes."""
+    cores = available_cores()
+    return max(1, min(16, cores if network.warps else cores // 2))
 
 
 def _quiet_worker(_: int) -> None:

@@ -13,7 +13,7 @@ from safetensors.numpy import save as save_arrays
 from safetensors.torch import load, save
 
 from tumortrack.core import store
-from tumortrack.core.config import from_builtins, to_builtins
+from tumortrack.core.config import Config, from_builtins, to_builtins
 from tumortrack.core.errors import ArtifactError, InputError
 from tumortrack.learn.config import TrainConfig
 from tumortrack.learn.fit import Familiar
@@ -25,14 +25,21 @@ _WEIGHTS = "weights.safetensors"
 _SHAPE = "shape.safetensors"
 
 
+class Trust(Config, frozen=True):
+    """What validation taught of a warp's own figures: its standard deviations are to be multiplied
+    by ``std_scale``; a fit that costs more than ``usual_cost`` is tried from other starts."""
+
+    std_scale: float
+    usual_cost: float
+
+
 @dataclass(frozen=True, eq=False)
 class Model:
     """A network in evaluation mode and what it was trained for.
 
     ``query_box_mm``: where the organ can lie, relative to the median of the observed points,
     camera frame (lower and upper corner). ``familiar``: what tells its clouds from others.
-    ``provenance``: seeds, steps, hashes. A warp also has the organ's ``shape``, and ``std_scale``:
-    what its motions' standard deviations are to be multiplied by.
+    ``provenance``: seeds, steps, hashes. A warp also has the organ's ``shape``, and ``trust``.
     """
 
     network: Network
@@ -42,7 +49,7 @@ class Model:
     familiar: Familiar
     provenance: dict
     shape: Shape | None = None
-    std_scale: float = 1.0
+    trust: Trust | None = None
 
 
 def save_model(model: Model, folder: Path) -> None:
@@ -53,7 +60,7 @@ def save_model(model: Model, folder: Path) -> None:
         store.write_atomically(folder / _SHAPE, save_arrays(model.shape.to_arrays()))
     content = {
         "parts": list(model.parts),
-        "std_scale": model.std_scale,
+        "trust": None if model.trust is None else to_builtins(model.trust),
         "query_box_mm": model.query_box_mm.tolist(),
         "familiar": to_builtins(model.familiar),
         "provenance": model.provenance,
@@ -88,10 +95,10 @@ def load_model(folder: Path, device: str = "auto") -> Model:
         network.load_state_dict(load((folder / _WEIGHTS).read_bytes()))
         familiar = from_builtins(manifest["familiar"], Familiar, f"{folder}: familiar")
         provenance = dict(manifest["provenance"])
-        shape = None
+        shape, trust = None, None
         if config.network.warps:
             shape = Shape.from_arrays(load_arrays((folder / _SHAPE).read_bytes()), len(parts))
-        std_scale = float(manifest.get("std_scale", 1.0))
+            trust = from_builtins(manifest["trust"], Trust, f"{folder}: trust")
     except InputError as error:
         raise ArtifactError(
             f"{error} The model was trained by another version of tumortrack; train it again."
@@ -101,7 +108,7 @@ def load_model(folder: Path, device: str = "auto") -> Model:
             f"{folder} is not a whole model of this version: {error}. Train it again."
         ) from error
     network.eval().requires_grad_(False).to(choose_device(device))
-    return Model(network, config, parts, box, familiar, provenance, shape, std_scale)
+    return Model(network, config, parts, box, familiar, provenance, shape, trust)
 
 
 def choose_device(device: str) -> torch.device:

@@ -162,7 +162,7 @@ def pretrain(run: Pretraining, folder: Path, report: Callable[[Status], None]) -
 
 def _pretrain(run: Pretraining, folder: Path, work: Path, report: Callable[[Status], None]) -> dict:
     device = choose_device(run.device)
-    workers = default_workers() if run.workers is None else run.workers
+    workers = default_workers(run.config.network) if run.workers is None else run.workers
     use_cores(device, workers)
     state = TrainingState(run, device)
     state.know(_teach)

@@ -41,7 +41,7 @@ def train(run: Run, folder: Path, report: Callable[[Status], None]) -> Model:
 
 def _train(run: Run, folder: Path, work: Path, report: Callable[[Status], None]) -> Model:
     config, device = run.config, choose_device(run.device)
-    workers = default_workers() if run.workers is None else run.workers
+    workers = default_workers(config.network) if run.workers is None else run.workers
     use_cores(device, workers)
     course = course_of(run, device)
     state = TrainingState(run, device)

@@ -29,7 +29,9 @@ class WarpLocator:
     def __init__(self, model: Model) -> None:
         assert isinstance(model.network, WarpNetwork)
         assert model.shape is not None
+        assert model.trust is not None
         self._model, self._network, self._shape = model, model.network, model.shape
+        self._trust = model.trust
         self._device = next(model.network.parameters()).device
         organ = model.shape.anatomy_ct.organ
         self.organ_box_ct: Float[np.ndarray, "2 3"] | None = organ.box_mm
@@ -48,7 +50,8 @@ class WarpLocator:
         with stage(seconds, "encode", self._device):
             starts = first_motions(self._network, self._shape, points)
         with stage(seconds, "refine", self._device):
-            fit = best_fit(self._shape, points, starts, self._model.config.refine)
+            refine, usual_cost = self._model.config.refine, self._trust.usual_cost
+            fit = best_fit(self._shape, points, starts, refine, usual_cost)
             distances = np.abs(fit.distances_mm)
             check_familiar(self._model.familiar, spread_mm(points), fit_mm(distances))
         with stage(seconds, "surfaces", self._device):
@@ -84,7 +87,7 @@ class WarpLocator:
             found.centre_mm,
             found.coefficients,
             found.covariance,
-            self._model.std_scale,
+            self._trust.std_scale,
         )
 
     def _asked(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -12,7 +13,7 @@ from jaxtyping import Float
 from tumortrack.core.errors import InputError
 from tumortrack.learn.decoders.warp import WarpDecoderConfig
 from tumortrack.learn.fit import Familiar, fit_mm, spread_mm
-from tumortrack.learn.model import Model
+from tumortrack.learn.model import Model, Trust
 from tumortrack.learn.networks import Network
 from tumortrack.learn.run import Run
 from tumortrack.learn.validate import ValidationScenes, mean_iou_of, validation_scenes
@@ -26,6 +27,9 @@ from tumortrack.simulate.occupancy import FixedPoints, OccupancyPool
 from tumortrack.simulate.scene import Simulator
 from tumortrack.simulate.targets import draw_targets
 
+_USUAL = 90  # per cent of the validation scenes have no more than the usual cost
+_COVERED = 0.683  # of all errors lie within this radius if each axis errs normally by 1
+_RADIUS = 1.878
 _AT_SURFACE = 0.5  # of the points whose places are learnt; the others lie inside the parts
 
 
@@ -64,7 +68,8 @@ class WarpCourse:
         return self._judged(network).miou
 
     def model(self, network: Network, provenance: dict) -> Model:
-        judged = self._judged(network)
+        usual_cost = self._judged(network).usual_cost
+        judged = self._judged(network, usual_cost)
         return Model(
             network,
             self._run.config,
@@ -73,47 +78,51 @@ class WarpCourse:
             judged.familiar,
             {**provenance, "validation_tre_mm": round(judged.tre_mm, 3)},
             self._shape,
-            judged.std_scale,
+            Trust(std_scale=judged.std_scale, usual_cost=usual_cost),
         )
 
-    def _judged(self, network: Network) -> Judged:
+    def _judged(self, network: Network, usual_cost: float = math.inf) -> Judged:
         """Labels, places and trust over all validation scenes."""
         assert isinstance(network, WarpNetwork)
         network.eval()
         scenes, shape = self._scenes, self._shape
-        guesses, errors, deviations, fits = [], [], [], []
+        guesses, errors, deviations, fits, costs = [], [], [], [], []
         for cloud, points_mm, points_ct, labels in zip(
             scenes.clouds_mm, scenes.points_mm, scenes.points_ct, scenes.labels, strict=True
         ):
             starts = first_motions(network, shape, cloud)
-            fit = best_fit(shape, cloud, starts, self._run.config.refine)
+            fit = best_fit(shape, cloud, starts, self._run.config.refine, usual_cost)
             guesses.append(shape.labels_at(fit.motion.back(points_mm).astype(np.float32))[0])
             inside = labels > 0
             error, deviation = _errors(fit, points_ct[inside], points_mm[inside])
             errors.append(error)
             deviations.append(deviation)
             fits.append(fit_mm(np.abs(fit.distances_mm)))
+            costs.append(fit.cost)
         spreads = [spread_mm(cloud) for cloud in scenes.clouds_mm]
-        error, deviation = np.concatenate(errors), np.concatenate(deviations)
-        # So that the errors' mean square along an axis is what the standard deviations say.
-        scale = float(np.sqrt(np.mean(error**2 / 3) / np.mean(deviation**2)))
+        familiar = Familiar(
+            spread_mm=(min(spreads), max(spreads)), fit_mm=float(np.percentile(fits, 95))
+        )
+        ratios = np.concatenate(errors) / np.concatenate(deviations)
         return Judged(
             mean_iou_of(np.stack(guesses), scenes.labels, len(shape.anatomy_ct.parts) + 1),
             float(np.median([part.mean() for part in errors])),
-            scale,
-            Familiar(spread_mm=(min(spreads), max(spreads)), fit_mm=float(np.percentile(fits, 95))),
+            float(np.quantile(ratios, _COVERED)) / _RADIUS,
+            familiar,
+            float(np.percentile(costs, _USUAL)),
         )
 
 
 @dataclass(frozen=True)
 class Judged:
     """What validation says: labels, the median scene's error of places, how the estimated
-    standard deviations have to be scaled, and what clouds are like."""
+    standard deviations have to be scaled, what clouds are like, and the cost that few exceed."""
 
     miou: float
     tre_mm: float
     std_scale: float
     familiar: Familiar
+    usual_cost: float
 
 
 def _errors(

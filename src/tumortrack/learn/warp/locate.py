@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import torch
 from jaxtyping import Float
+from scipy.spatial.transform import Rotation
 
 from tumortrack.learn.warp.motion import WarpMotion
 from tumortrack.learn.warp.network import Placement, WarpNetwork
@@ -12,6 +15,7 @@ from tumortrack.learn.warp.refine import RefineConfig, Refined, refine
 from tumortrack.learn.warp.shape import Shape
 
 _SURE = 6.0  # logits: the other way round is not even tried
+_TURNS = 8  # of a start that does not fit
 
 
 @torch.no_grad()
@@ -33,10 +37,22 @@ def best_fit(
     points_mm: Float[np.ndarray, "n 3"],
     starts: list[WarpMotion],
     config: RefineConfig,
+    usual_cost: float = math.inf,
 ) -> Refined:
-    """The refined start of the least cost."""
+    """The refined start of the least cost; where that is more than usual, also the likeliest start
+    turned about the camera's axis, which repairs most starts that are wrong altogether."""
     fits = [refine(shape, points_mm, start, config) for start in starts]
+    if min(fit.cost for fit in fits) > usual_cost:
+        fits += [refine(shape, points_mm, start, config) for start in _turned(starts[0])]
     return min(fits, key=lambda fit: fit.cost)
+
+
+def _turned(start: WarpMotion) -> list[WarpMotion]:
+    """The undeformed organ in the same place, turned all around the camera's axis."""
+    angles = np.arange(_TURNS) * 360 / _TURNS
+    turns = Rotation.from_euler("z", angles, degrees=True).as_matrix()
+    rest = start.shape.body.mean
+    return [WarpMotion(start.shape, turn @ start.rotation, start.centre_mm, rest) for turn in turns]
 
 
 def _motion(way: Placement, shape: Shape) -> WarpMotion:

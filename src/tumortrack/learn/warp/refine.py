@@ -33,11 +33,11 @@ class RefineConfig(Config, frozen=True):
     points far beyond do not count. ``shift_mm``, ``turn_rad``: how far the start may be off.
     """
 
-    steps: int = 15
+    steps: int = 20
     n_effective: float = 300.0
     sigma_mm: float = 1.0
     first_mm: float = 5.0
-    last_mm: float = 2.0
+    last_mm: float = 1.0
     narrowing: float = 0.7
     shift_mm: float = 20.0
     turn_rad: float = 0.5
