@@ -50,7 +50,7 @@ def best_fit(
 def _turned(start: WarpMotion) -> list[WarpMotion]:
     """The undeformed organ in the same place, turned all around the camera's axis."""
     angles = np.arange(_TURNS) * 360 / _TURNS
-    turns = Rotation.from_euler("z", angles, degrees=True).as_matrix()
+    turns = Rotation.from_euler("z", angles[:, None], degrees=True).as_matrix()
     rest = start.shape.body.mean
     return [WarpMotion(start.shape, turn @ start.rotation, start.centre_mm, rest) for turn in turns]
 
