@@ -4,7 +4,7 @@ BIN := .venv/bin
 SETUP := .venv/.installed
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test check bench results clean
+.PHONY: help setup demo test check bench results headstart clean
 
 help:  ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 10
@@ -17,7 +17,7 @@ $(SETUP): pyproject.toml constraints.txt
 	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev,peers]'
 	touch $@
 
-demo: setup  ## CT -> tumors located in unseen deformed scenes (about 8 minutes)
+demo: setup  ## CT -> tumors located in unseen deformed scenes (about 5 minutes)
 	$(BIN)/tumortrack demo
 
 check: setup  ## lint, types, import order
@@ -34,6 +34,9 @@ bench: setup  ## speed of the generator, training and inference, side by side wi
 
 results: setup  ## the tables and plots of docs/results.md (hours; ARGS=--quick: minutes)
 	$(BIN)/python bench/results.py $(ARGS)
+
+headstart: setup  ## accuracy against training steps from pretrained weights (ARGS=--start OUT)
+	$(BIN)/python bench/pretraining.py $(ARGS)
 
 clean:  ## remove .venv and caches (runs/ stays)
 	rm -rf .venv .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache
