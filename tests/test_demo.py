@@ -8,6 +8,7 @@ import re
 
 from stories import succeeded, tumortrack
 from tumortrack.app.doctor import examine
+from tumortrack.app.inspection import describe
 from tumortrack.core import store
 from tumortrack.imaging.case import load_case
 from tumortrack.simulate.scene_folder import list_scenes, read_scene
@@ -25,6 +26,8 @@ def test_the_demo_tells_the_whole_story(tmp_path):
     assert names == [entry["name"] for entry in report["scenes"]] == ["dragged-0000", "elastic-0000"]
     assert report["model_sha256"] == store.sha256_of(out / "model" / store.MANIFEST)
     assert report["model"]["case_sha256"] == store.sha256_of(out / "case" / store.MANIFEST)
+    assert any("warp" in line and "--map" in line for line in describe(out / "model"))
+    assert report["summary"]["tre_mm"]["scenes"] == 2  # the default preset knows correspondences
     for name in names:
         scene = read_scene(out / "dataset" / name)
         assert scene.meta["case_sha256"] == report["model"]["case_sha256"]

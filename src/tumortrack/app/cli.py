@@ -88,8 +88,8 @@ def train(
         model: folder to write.
         preset: network and rules of training: clinic places the organ of the CT (default), quick
             and paper label points.
-        rotations: poses to learn: any turn about the camera's axis and tilts up to 15 degrees,
-            or every rotation.
+        rotations: poses to learn: any turn about the camera's axis and tilts up to 15 degrees
+            (clinic: 30), or every rotation.
         minutes: stop after about so long (default: the preset's end).
         steps: stop after exactly so many steps.
         seed: of weights and scenes.

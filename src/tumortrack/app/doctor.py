@@ -13,7 +13,7 @@ from tumortrack.learn.cores import available_cores
 
 _LIBRARIES = {
     "torch": "training and locating",
-    "numba": "rendering and deforming",
+    "numba": "rendering, deforming and refining",
     "SimpleITK": "DICOM",
     "nibabel": "NIfTI",
     "embreex": "ray visibility",

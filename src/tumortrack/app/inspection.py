@@ -7,6 +7,8 @@ from pathlib import Path
 from tumortrack.core import store
 from tumortrack.core.errors import InputError
 
+_NAMES = {"pretrained": "pretrained weights"}  # where the kind is no noun
+
 
 def describe(path: Path) -> list[str]:
     """Lines about a case, model, run, scene, report or cloud.
@@ -53,14 +55,26 @@ def _artifact(folder: Path) -> list[str]:
     kind = store.read_json(folder / store.MANIFEST).get("kind")
     manifest = store.read_manifest(folder, str(kind))
     lines = [
-        f"{folder}: a {kind} (schema {manifest['schema']}, tumortrack {manifest['tumortrack']}); "
+        f"{folder}: {_NAMES.get(str(kind), f'a {kind}')} (schema {manifest['schema']}, tumortrack {manifest['tumortrack']}); "
         f"{manifest['units']}, {manifest['frame']} frame; all files as they were written."
     ]
     if isinstance(scenes := manifest.get("scenes"), dict):
         return [*lines, *_sealed_scenes(folder, scenes)]
+    if kind == "model":
+        lines.append(_kind_of_model(manifest))
     skip = {"kind", "schema", "tumortrack", "units", "frame", "files", "config"}
     lines += [f"  {key}: {value}" for key, value in manifest.items() if key not in skip]
     return [*lines, f"  files: {', '.join(manifest['files'])}"]
+
+
+def _kind_of_model(manifest: dict) -> str:
+    network = manifest.get("config", {}).get("network", {})
+    kinds = [network.get(part, {}).get("type", "?") for part in ("encoder", "decoder")]
+    if kinds[1] == "warp":
+        does = "places the organ of the CT; `locate --map` says where points of the CT are"
+    else:
+        does = "labels points; it does not know which point of the CT lies where (no `--map`)"
+    return f"  {kinds[0]} + {kinds[1]}: {does}"
 
 
 def _sealed_scenes(folder: Path, scenes: dict) -> list[str]:
