@@ -1,4 +1,4 @@
-"""From a cloud that another program rendered to tumors in the camera's frame."""
+"""From a cloud that another program rendered to tumors in the camera's frame, by labels."""
 
 from __future__ import annotations
 
@@ -36,7 +36,8 @@ STEPS = 700
 def work(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("locate")
     write_phantom_case(folder / "case")
-    succeeded(tumortrack("train", folder / "case", folder / "model", "--steps", STEPS))
+    options = ["--preset", "quick", "--steps", STEPS]
+    succeeded(tumortrack("train", folder / "case", folder / "model", *options))
     return folder
 
 
@@ -144,7 +145,7 @@ def test_clouds_in_other_formats_and_units_agree(work, seen, out):
 @pytest.mark.parametrize("fast_bfloat16", [False, True])
 def test_the_answer_does_not_hang_on_half_precision(tracker, seen, monkeypatch, fast_bfloat16):
     points, _ = seen
-    module = "tumortrack.track.tracker"
+    module = "tumortrack.track.occupancy"
     monkeypatch.setattr(f"{module}.has_fast_bfloat16", lambda _: fast_bfloat16)
     forced = Tracker(tracker.model).locate(SensorCloud(points), grid=32).report
     usual = tracker.locate(SensorCloud(points), grid=32).report

@@ -17,7 +17,7 @@ import pytest
 import torch
 
 from stories import COMMAND, environment, refusal, succeeded, tumortrack, write_phantom_case
-from tumortrack.app.presets import paper, quick
+from tumortrack.app.presets import clinic, paper, quick
 from tumortrack.core.config import from_builtins, to_builtins
 from tumortrack.core.errors import ArtifactError, InputError
 from tumortrack.core.types import Anatomy
@@ -32,7 +32,7 @@ from tumortrack.learn.state import Diverged, TrainingState
 from tumortrack.learn.train import Run, train
 from tumortrack.learn.work import work_folder
 
-STEPS = 100
+STEPS = {"clinic": 12, "quick": 60}
 
 
 @pytest.fixture(scope="module")
@@ -44,19 +44,27 @@ def case(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def uninterrupted(case: Path) -> Path:
-    model = case.parent / "uninterrupted"
-    succeeded(tumortrack(*train_command(case, model)))
+    """A model folder of the preset quick."""
+    return trained(case, "quick")
+
+
+def trained(case: Path, preset: str) -> Path:
+    model = case.parent / f"uninterrupted_{preset}"
+    if not model.exists():
+        succeeded(tumortrack(*train_command(case, model, preset)))
     return model
 
 
-def train_command(case: Path, model: Path) -> list[object]:
-    return ["train", case, model, "--steps", STEPS, "--workers", 1, "--device", "cpu"]
+def train_command(case: Path, model: Path, preset: str = "quick") -> list[object]:
+    options = ["--preset", preset, "--steps", STEPS[preset], "--workers", 1, "--device", "cpu"]
+    return ["train", case, model, *options]
 
 
-def test_a_killed_run_ends_with_the_weights_of_one_that_was_not(case, uninterrupted):
+@pytest.mark.parametrize("preset", ["quick", "clinic"])
+def test_a_killed_run_ends_with_the_weights_of_one_that_was_not(case, preset):
     """Killed at once when its first checkpoint is there, long before its end."""
-    model = case.parent / "killed"
-    command = [*train_command(case, model), "--checkpoint-every", 0]
+    model = case.parent / f"killed_{preset}"
+    command = [*train_command(case, model, preset), "--checkpoint-every", 0]
     with subprocess.Popen(
         [*COMMAND, *map(str, command)], stdout=subprocess.DEVNULL, env=environment()
     ) as process:
@@ -68,14 +76,16 @@ def test_a_killed_run_ends_with_the_weights_of_one_that_was_not(case, uninterrup
     assert checkpoint.exists()
     assert not (model / "manifest.json").exists(), "the run ended before it was killed"
     assert "has not ended" in refusal(tumortrack("locate", model, "cloud.ply", model / "out"))
-    succeeded(tumortrack(*train_command(case, model)))
+    succeeded(tumortrack(*train_command(case, model, preset)))
     weights = (model / "weights.safetensors").read_bytes()
-    assert weights == (uninterrupted / "weights.safetensors").read_bytes()
+    assert weights == (trained(case, preset) / "weights.safetensors").read_bytes()
+    assert (model / "shape.safetensors").exists() == (preset == "clinic")
 
 
 def test_ctrl_c_keeps_the_state_and_says_how_to_go_on(case):
     model = case.parent / "stopped"
-    command = [*COMMAND, "train", str(case), str(model), "--steps", "100000", "--workers", "1"]
+    options = ["--preset", "quick", "--steps", "100000"]
+    command = [*COMMAND, "train", str(case), str(model), *options, "--workers", "1"]
     with subprocess.Popen(
         command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment()
     ) as process:
@@ -87,23 +97,26 @@ def test_ctrl_c_keeps_the_state_and_says_how_to_go_on(case):
     assert "The same command goes on" in errors
     assert "Traceback" not in errors
     assert (model / "training" / "checkpoint.safetensors").exists()
-    message = refusal(tumortrack("train", case, model, "--steps", 100000, "--seed", 1))
+    message = refusal(tumortrack("train", case, model, *options, "--seed", 1))
     assert "another case, preset, seed or option" in message
 
 
 def test_the_model_says_what_it_was_made_from(case, uninterrupted):
     about = load_model(uninterrupted).provenance
-    assert about["steps"] == STEPS
+    assert about["steps"] == STEPS["quick"]
     assert about["seed"] == 0
     lines = (uninterrupted / "training" / "history.jsonl").read_text().splitlines()
     last = json.loads(lines[-1])
-    assert last["step"] == STEPS
+    assert last["step"] == STEPS["quick"]
     assert last["samples_per_s"] > 1
     assert 0 < last["learning_rate"] < 1e-3  # the schedule has nearly ended
     assert list((uninterrupted / "training" / "tensorboard").iterdir())
     again = tumortrack(*train_command(case, uninterrupted))
     assert "trained already" in succeeded(again)
-    refusal(tumortrack("train", case, uninterrupted, "--steps", STEPS + 1))
+    more = [*train_command(case, uninterrupted), "--seed", 1]
+    assert "another case, preset, seed or option" in refusal(tumortrack(*more))
+    other = ["train", case, uninterrupted, "--steps", STEPS["quick"]]  # the default is clinic
+    assert "another case, preset, seed or option" in refusal(tumortrack(*other))
 
 
 def test_a_changed_weights_file_or_schema_is_refused(uninterrupted, tmp_path):
@@ -129,7 +142,8 @@ def test_a_full_disk_stops_training_and_spares_the_last_checkpoint(case):
     def small_disk() -> None:  # the checkpoint is larger than this, everything before is smaller
         resource.setrlimit(resource.RLIMIT_FSIZE, (1_000_000, 1_000_000))
 
-    command = ["train", case, model, "--steps", 200, "--workers", 0, "--checkpoint-every", 0.1]
+    command = ["train", case, model, "--preset", "quick", "--steps", 200, "--workers", 0]
+    command += ["--checkpoint-every", 0.1]
     message = refusal(tumortrack(*command, preexec_fn=small_disk))
     assert "cannot write" in message
     assert not list((model / "training").glob("*.part"))
@@ -231,13 +245,14 @@ def test_two_trainings_in_one_folder_are_refused_and_a_dead_ones_lock_is_not(tmp
 
 def test_a_diverged_run_stops_and_keeps_the_checkpoint_before(case, tmp_path):
     state = TrainingState(a_run(case), torch.device("cpu"))
-    batch = (torch.randn(2, 300, 3) * 30, torch.randn(2, 50, 3) * 30, torch.zeros(2, 50))
+    poses = torch.eye(4).expand(2, 4, 4)
+    batch = (torch.randn(2, 300, 3) * 30, torch.randn(2, 50, 3) * 30, torch.zeros(2, 50), poses)
     assert state.step(batch) > 0
     state.save(tmp_path)
     before = (tmp_path / "checkpoint.safetensors").read_bytes()
-    clouds, points, labels = batch
+    clouds, points, labels, _ = batch
     with pytest.raises(Diverged, match="diverged at step 1"):
-        state.step((clouds, points * float("inf"), labels))
+        state.step((clouds, points * float("inf"), labels, poses))
     with torch.no_grad():
         next(iter(state.network.parameters())).fill_(float("nan"))
     with pytest.raises(Diverged):
@@ -283,7 +298,7 @@ def test_a_case_is_needed_to_train(tmp_path):
 
 def test_presets_survive_json_and_refuse_unknown_keys(case):
     anatomy = load_case(case).anatomy
-    for preset in (paper, quick):
+    for preset in (clinic, paper, quick):
         config = preset(anatomy)
         data = to_builtins(config)
         assert from_builtins(data, TrainConfig, "here") == config
@@ -292,6 +307,11 @@ def test_presets_survive_json_and_refuse_unknown_keys(case):
     assert paper(anatomy).steps == 155_000
     assert paper(anatomy).scene.clutter.scenes == 0
     assert quick(anatomy).scene.clutter.scenes == 0.5
+    assert [preset(anatomy).network.warps for preset in (clinic, paper, quick)] == [
+        True,
+        False,
+        False,
+    ]
     assert isinstance(paper(anatomy).network.normalisation, CloudBox)
     assert paper(anatomy).scene.cloud.n_points == 1000
 

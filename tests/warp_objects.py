@@ -1,0 +1,60 @@
+"""The elastic objects' organ as a warp model knows it, and a training of seconds."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import msgspec
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from elastic_objects import SMALL, UP, organ
+from tumortrack.app.presets import clinic
+from tumortrack.core.types import Anatomy
+from tumortrack.learn.config import TrainConfig
+from tumortrack.learn.network import NetworkConfig, clinic_network
+from tumortrack.learn.warp.motion import WarpMotion
+from tumortrack.learn.warp.shape import Shape, shape_of
+from tumortrack.simulate.deform import ElasticConfig
+from tumortrack.simulate.elastic.body import build_body
+from tumortrack.simulate.occupancy import OccupancyConfig
+from tumortrack.simulate.scene import SceneConfig
+
+ANATOMY: Anatomy = organ()
+SCALE_MM = 48.0  # half the organ's length
+TURNED = Rotation.from_euler("xyz", [95, 10, 35], degrees=True).as_matrix()
+PLACE_MM = np.array([8.0, -5.0, 170.0])
+
+
+@cache
+def shape() -> Shape:
+    return shape_of(ANATOMY, build_body(ANATOMY, UP, SMALL, 3))
+
+
+def placed(state: int = 73, share: float = 1.0) -> WarpMotion:
+    """The organ before a camera, in a share of one of its library's states."""
+    coefficients = share * shape().body.states[state].astype(float)
+    return WarpMotion(shape(), TURNED, PLACE_MM, coefficients)
+
+
+def slim_network() -> NetworkConfig:
+    return clinic_network(SMALL.modes, SCALE_MM)
+
+
+def slim_clinic() -> TrainConfig:
+    """The preset clinic with a small body and clean, small pictures: learns in seconds."""
+    scene = SceneConfig(
+        width=212,
+        height=120,
+        deform=(ElasticConfig(body=SMALL),),
+        occupancy=OccupancyConfig(per_side=16, pool=4000),
+    )
+    return msgspec.structs.replace(
+        clinic(ANATOMY),
+        scene=scene,
+        network=slim_network(),
+        batch_size=16,
+        validation_pairs=16,
+        validation_points=512,
+        validate_every=1000,
+    )
