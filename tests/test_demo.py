@@ -23,7 +23,9 @@ def test_the_demo_tells_the_whole_story(tmp_path):
     assert len(case.anatomy.tumors) == 2
     report = json.loads((out / "report.json").read_text())
     names = [folder.name for folder in list_scenes(out / "dataset")]
-    assert names == [entry["name"] for entry in report["scenes"]] == ["dragged-0000", "elastic-0000"]
+    assert (
+        names == [entry["name"] for entry in report["scenes"]] == ["dragged-0000", "elastic-0000"]
+    )
     assert report["model_sha256"] == store.sha256_of(out / "model" / store.MANIFEST)
     assert report["model"]["case_sha256"] == store.sha256_of(out / "case" / store.MANIFEST)
     assert any("warp" in line and "--map" in line for line in describe(out / "model"))
