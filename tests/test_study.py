@@ -20,8 +20,9 @@ from tumortrack.core.geometry import rigid
 from tumortrack.core.motion import OneWay
 from tumortrack.core.types import Anatomy, Mesh, SensorCloud
 from tumortrack.evaluate.peers.base import Fit, estimate_of, rigid_carry
-from tumortrack.evaluate.study import paper, tables
+from tumortrack.evaluate.study import ablation, goals, paper, tables
 from tumortrack.evaluate.study.book import Book, gallery_block, section_blocks
+from tumortrack.evaluate.study.bound import BOUNDS, Bound, BoundConfig, Placed, laid_on
 from tumortrack.evaluate.study.caption import caption
 from tumortrack.evaluate.study.cells import CellStore
 from tumortrack.evaluate.study.figures import NOT_FOUND, Figure, figure, median, part_value
@@ -35,6 +36,7 @@ from tumortrack.evaluate.study.plan import FULL, QUICK, SECTIONS, Methods, Study
 from tumortrack.evaluate.study.points import displacements, point_errors
 from tumortrack.simulate.deform import RestConfig
 from tumortrack.simulate.deform.drag import CONFIGURATIONS
+from tumortrack.simulate.elastic.body import BodyConfig, build_body
 from tumortrack.simulate.occupancy import OccupancyConfig
 from tumortrack.simulate.scene import SceneConfig, SceneRecipe, Simulator
 from tumortrack.simulate.scene_folder import Scene, write_scene
@@ -406,6 +408,87 @@ def test_end_to_end_twice_gives_the_same_document(phantom, tmp_path):
         assert (tmp_path / "images" / f"results_{name}.png").stat().st_size > 5000
     assert run() == ([], [])
     assert document.read_text() == first
+
+
+SMALL = BodyConfig(cells=120, modes=8, responses=40, patches=60, states=20)
+
+
+def test_the_bound_finds_a_state_that_its_body_can_take():
+    body = build_body(anatomy(), (0.0, -1.0, 0.0), SMALL, 0)
+    truth = Placed(body, TURN, np.array([3.0, -2, 130]), body.states[3].astype(float))
+    vertices = anatomy().organ.vertices_mm
+    moved_mm = np.linalg.norm(body.carry(truth.coefficients, vertices) - vertices, axis=1)
+    assert moved_mm.max() > 1
+    found = laid_on(body, vertices, truth.carry(vertices), BoundConfig(sigma_mm=0.01))
+    inner = anatomy().parts[2].vertices_mm  # was not shown
+    np.testing.assert_allclose(found.carry(inner), truth.carry(inner), atol=0.05)
+
+
+def test_bounds_of_a_rigid_organ_are_near_zero(case, tmp_path):
+    kept = CellStore(tmp_path / "cells")
+    for name in BOUNDS:
+        cells = measure(jobs(case, Bound(name, case, BoundConfig(body=SMALL))), kept)
+        for cell in cells:
+            assert cell["parts"]["tumor_2"]["hausdorff_mm"] < 0.4
+            assert cell["failed"] is None
+    other = replace(case, anatomy_ct=Anatomy((ball(30), ball(8))))
+    with pytest.raises(InputError, match="other parts"):
+        Bound("basis_bound", other, BoundConfig(body=SMALL)).locate(
+            Scene(SensorCloud(ball(30).vertices_mm), anatomy()), 24
+        )
+
+
+def goal_cell(method, variant, hd, **spec):
+    """A cell of a case with one tumor, with what the goals read."""
+    found = {"found": True, "iou": 0.9}
+    near = {"hausdorff_mm": hd, "hausdorff_one_sided_mm": hd / 2, "center_mm": hd / 4}
+    name = {"kind": "network", "name": method, "seed": spec.pop("seed", 0)}
+    whole = {"case": "one", "variant": variant, "fault": "none", "fault_seed": 0, **spec}
+    return {
+        "spec": {"scene": f"{variant}-noise", "view": "noise", **whole, "method": name},
+        "parts": {"kidney": found, "tumor_1": {**found, **near} if hd else {"found": False}},
+        "targets_mm": {"mean": hd},
+        "miou": 0.89999 if hd else 0.0,
+        "failed": None if hd else "not found: tumor_1",
+        "method": {"device": "cpu"},
+        "prepare_s": 899.0,
+        "frame_s": 0.1,
+    }
+
+
+def test_goals_are_judged_by_exact_numbers_and_never_rounded_in_our_favour():
+    lies = {"one": {"tumor_1": paper.Lie(0.0, 5.0)}}
+    cells = [
+        goal_cell("clinic", "D1", 1.9 + 0.1001 * 2 * seed, seed=seed) for seed in (0, 1)
+    ]  # mean 2.0001
+    cells += [goal_cell("clinic", "D2", 2.9999), goal_cell("clinic", "Rot90", 0.1)]
+    cells += [goal_cell("M_lim", "D1", 1.994)]
+    cells += [goal_cell("clinic", "D2", 2.0, fault="clean")]
+    hidden = {"fault": "visible=60"}
+    cells += [goal_cell("clinic", "D2", 2.7, **hidden, fault_seed=n) for n in (0, 1)]
+    text = goals.tables_of(cells, lies)
+    rows = {line.split("|")[1].strip(): line for line in reversed(text.splitlines()) if "|" in line}
+    assert "| 1.99 | 2.01 | ≤ 2 | no |" in rows["tumor HD, D1, endophytic"]
+    assert "| – | 3.00 | ≤ 3 | yes |" in rows["tumor HD, D2, endophytic"]
+    assert "| ≈ 7 | 1.00 | 1.01 | ≤ 2 | yes |" in rows["tumor one-sided, D1, endophytic"]
+    assert "| – | – | ≤ 1.5 | – |" in rows["tumor HD, D1, exophytic"]
+    assert "| 0.90 | 0.89 | ≥ 0.9 | no |" in rows["mIoU, deformed variants"]
+    assert "| 1.99 | 2.50 | ≤ 2 | no |" in rows["target error, deformed variants"]
+    assert "| 2.01 | ≤ 2 | no |" in rows["target error, all variants"]
+    assert "| 1.35 | ≤ 1.3 | no |" in rows["hidden surface: tumor HD, times"]
+    assert "| 14.98 | 14.99 | ≤ 15 | yes |" in rows["training, minutes"]
+
+    lost = [*cells, goal_cell("clinic", "D3", None)]
+    worst = next(line for line in goals.tables_of(lost, lies).splitlines() if "worst" in line)
+    assert "| not found | ≤ 2.5 | no |" in worst
+
+
+def test_the_ablation_says_the_change_against_clinic():
+    cells = [goal_cell("clinic", "D2", 2.0), goal_cell("clinic", "G1", 3.0)]
+    cells += [goal_cell("clinic_unrefined", "D2", 4.0), goal_cell("clinic_unrefined", "G1", 4.4)]
+    text = ablation.table_of(cells)
+    assert "| clinic | 899 | 0.100 | 2.5 | 0.6 | 2.5 | 0.90 | 0 of 2 |" in text
+    assert "| 4.2 (+1.7) | 1.1 (+0.4) | 4.2 (+1.7) | 0.90 | 0 of 2 |" in text
 
 
 def test_captions_name_command_device_and_models(case, tmp_path):

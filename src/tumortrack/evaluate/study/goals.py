@@ -28,8 +28,9 @@ RULE = (
     f"{CLINIC} are rounded to its disadvantage, and its goals judged by the unrounded ones. Hidden "
     "surface: median error with 40 % of the visible surface hidden over the median error without, "
     "both on clean depth. Bounds: our elastic body fitted to the true places of the visible "
-    "surface, and of all surfaces. Training: the longest of the models; for the surface fit its "
-    "preparation."
+    "surface, and of all surfaces, in least squares: a single distance may come out below them. "
+    "Training: the longest of the models, by the wall clock of a machine with the load said here, "
+    "without the seconds that building the elastic body takes; for the surface fit its preparation."
 )
 _UPRIGHT = "D0"
 _TURNED = "Rot"

@@ -11,6 +11,7 @@ from pathlib import Path
 import msgspec
 
 from tumortrack.core import store
+from tumortrack.core.errors import InputError
 from tumortrack.learn.model import Model, load_model
 from tumortrack.simulate.scene_folder import Scene
 from tumortrack.track.estimate import Estimate
@@ -125,9 +126,18 @@ class Network(Method):
 
 
 def without_refinement(model: Model) -> Model:
-    """The model that takes its network's word. Any fit is familiar to it: what validation found
-    was that of refined warps."""
-    config = model.config
-    refine = msgspec.structs.replace(config.refine, steps=0)
+    """The warp model that takes its network's word; only which way round an organ lies, where the
+    network is in doubt, is still decided by the cloud. Any fit is familiar and usual to it, for
+    validation knew refined ones.
+
+    Raises:
+        InputError: the model is no warp.
+    """
+    if model.trust is None:
+        raise InputError("only warps are refined; an occupancy model has no unrefined form.")
+    config = msgspec.structs.replace(
+        model.config, refine=msgspec.structs.replace(model.config.refine, steps=0)
+    )
     familiar = msgspec.structs.replace(model.familiar, fit_mm=math.inf)
-    return replace(model, config=msgspec.structs.replace(config, refine=refine), familiar=familiar)
+    trust = msgspec.structs.replace(model.trust, usual_cost=math.inf)
+    return replace(model, config=config, familiar=familiar, trust=trust)
