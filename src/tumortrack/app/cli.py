@@ -269,7 +269,7 @@ def evaluate(
     commands.evaluate(model, variants, report, grid, seed, device)
 
 
-def demo(*, out: Path = Path("runs/demo"), minutes: float = 1.5, scenes: int = 20) -> None:
+def demo(*, out: Path = Path("runs/demo"), minutes: float = 2.0, scenes: int = 20) -> None:
     """The whole story on the built-in phantom, in a few minutes.
 
     Args:
