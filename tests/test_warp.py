@@ -148,6 +148,14 @@ def test_the_way_there_and_back_is_none():
     np.testing.assert_allclose((homogeneous @ motion.camera_from_ct.T)[:, :3], rigid, atol=1e-9)
 
 
+def test_a_librarys_states_have_a_rarity_of_one_on_average():
+    rarities = [placed(state).rarity for state in range(len(shape().body.states))]
+    assert np.mean(rarities) == pytest.approx(1, abs=0.03)
+    assert max(rarities) > 2
+    mean = dataclasses.replace(placed(), coefficients=shape().body.mean)
+    assert mean.rarity == 0
+
+
 def test_standard_deviations_are_those_of_random_motions():
     base = placed()
     rng = np.random.default_rng(4)

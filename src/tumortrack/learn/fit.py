@@ -30,6 +30,11 @@ _FIT_FACTOR = 2.0
 _SMALLEST_LIMIT_MM = 4.0  # a depth camera's own errors may exceed those of clean training scenes
 _SPREAD_FACTOR = 1.5
 
+# An elastic state's rarity is 1 on average over the library it is judged by. Fits of the
+# digital twin's worst states have 0.4, of the paper's drags, which no library holds, up to 0.9;
+# flat tables of the organ's size, to which it can be bent, 1.4 to 2.4.
+_RAREST = 1.25
+
 LogitsAt = Callable[[Float32[np.ndarray, "n 3"]], torch.Tensor]
 
 
@@ -101,4 +106,20 @@ def check_familiar(familiar: Familiar, spread: float, fit: float) -> None:
             f"{fit:.1f} mm from the estimated surface, where {limit:.1f} mm are the most to "
             "expect. Remove the background (--range NEAR FAR), and check that the model is of "
             "this patient and the frame is the camera's."
+        )
+
+
+def check_likely(rarity: float) -> None:
+    """Refuse what only an absurd deformation of the organ explains.
+
+    Raises:
+        NoEstimate: the state's squared Mahalanobis distance, in units of the library's mean, is
+            too large.
+    """
+    if rarity > _RAREST:
+        raise NoEstimate(
+            f"the cloud does not show this model's organ: only a deformation {rarity:.1f} times "
+            f"as rare as usual would fit it, where {_RAREST:g} times is the most to expect. Remove "
+            "the background (--range NEAR FAR), and check that the model is of this patient and "
+            "the frame is the camera's."
         )

@@ -7,7 +7,7 @@ from jaxtyping import Float, Float32
 
 from tumortrack.core.types import Anatomy, CameraLabels, Mesh, OccupancyCloud, SensorCloud
 from tumortrack.imaging.raster import label_grid
-from tumortrack.learn.fit import check_familiar, fit_mm, spread_mm
+from tumortrack.learn.fit import check_familiar, check_likely, fit_mm, spread_mm
 from tumortrack.learn.model import Model
 from tumortrack.learn.warp.locate import best_fit, first_motions
 from tumortrack.learn.warp.motion import WarpMotion
@@ -54,6 +54,7 @@ class WarpLocator:
             fit = best_fit(self._shape, points, starts, refine, usual_cost)
             distances = np.abs(fit.distances_mm)
             check_familiar(self._model.familiar, spread_mm(points), fit_mm(distances))
+            check_likely(fit.motion.rarity)
         with stage(seconds, "surfaces", self._device):
             motion = self._trusted(fit)
             parts = self._shape.anatomy_ct.parts
@@ -71,6 +72,7 @@ class WarpLocator:
             "motion": {
                 "camera_from_ct": motion.camera_from_ct.tolist(),
                 "coefficients": motion.coefficients.tolist(),
+                "rarity": motion.rarity,
                 "steps": fit.steps,
             },
             "timings": {**seconds, "total": sum(seconds.values())},

@@ -41,6 +41,12 @@ class WarpMotion:
         out[:3, 3] = self.centre_mm - self.rotation @ self.shape.body.center_ct
         return out
 
+    @property
+    def rarity(self) -> float:
+        """The state's squared Mahalanobis distance in the body's library, whose mean is 1."""
+        off = self.coefficients - self.shape.body.mean
+        return float(off @ np.linalg.solve(self.shape.body.covariance, off)) / len(off)
+
     def carry(self, points_ct: Float[np.ndarray, "n 3"], /) -> Float64[np.ndarray, "n 3"]:
         """CT (LPS, mm) -> camera frame (mm)."""
         moved = self.shape.body.carry(self.coefficients, points_ct).astype(float)
