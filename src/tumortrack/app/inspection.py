@@ -54,8 +54,9 @@ def describe(path: Path) -> list[str]:
 def _artifact(folder: Path) -> list[str]:
     kind = store.read_json(folder / store.MANIFEST).get("kind")
     manifest = store.read_manifest(folder, str(kind))
+    what = _NAMES.get(str(kind), f"a {kind}")
     lines = [
-        f"{folder}: {_NAMES.get(str(kind), f'a {kind}')} (schema {manifest['schema']}, tumortrack {manifest['tumortrack']}); "
+        f"{folder}: {what} (schema {manifest['schema']}, tumortrack {manifest['tumortrack']}); "
         f"{manifest['units']}, {manifest['frame']} frame; all files as they were written."
     ]
     if isinstance(scenes := manifest.get("scenes"), dict):
