@@ -319,16 +319,16 @@ def test_the_plan_measures_each_level_once_beside_one_clean_cell(tmp_path):
 
     def model(*given):
         made.append(given[1:])
-        return Network("M_lim", tmp_path)
+        return Network(given[1], tmp_path)
 
     def peer(name, case):
         made.append((name,))
         return peer_method(name, case)
 
-    jobs = jobs_of(FULL, "severity", (case,), Methods(model, peer))
+    jobs = jobs_of(FULL, "severity", (case,), Methods(model, peer, model))
     per_method = 2 * (1 + 3 * len(FULL.severities))
-    assert len(jobs) == 2 * per_method
-    assert made == [("rigid",), ("M_lim", 0)]
+    assert len(jobs) == 3 * per_method
+    assert sorted(made) == [("M_lim", 0), ("clinic", 0), ("rigid",)]
     assert len({(id(j.method), j.variant, j.fault, j.fault_seed) for j in jobs}) == len(jobs)
     assert {job.view for job in jobs} == {"clean"}
     assert scenes_of(FULL, "severity") == (("D2", "G1"), ("clean",))
