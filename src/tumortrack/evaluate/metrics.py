@@ -17,6 +17,8 @@ from tumortrack.core.geometry import transform_points
 from tumortrack.core.motion import Motion
 from tumortrack.core.types import Anatomy, CameraLabels, Mesh
 from tumortrack.imaging.raster import _expand
+
+# Peers take it from here; their cells are kept by the text of their code.
 from tumortrack.imaging.raster import label_grid as label_grid
 from tumortrack.simulate.targets import Targets
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from jaxtyping import Float, Float32
 
@@ -12,7 +14,6 @@ from tumortrack.learn.model import Model
 from tumortrack.learn.warp.locate import best_fit, first_motions
 from tumortrack.learn.warp.motion import WarpMotion
 from tumortrack.learn.warp.network import WarpNetwork
-from tumortrack.learn.warp.refine import Refined
 from tumortrack.sense.cloud import check_cloud, thin_cloud
 from tumortrack.track.estimate import Estimate
 from tumortrack.track.report import fit_report, report_head, stage
@@ -27,6 +28,8 @@ class WarpLocator:
     """Locates by a warp network and its refinement; its estimates have a motion."""
 
     def __init__(self, model: Model) -> None:
+        from scipy.spatial import cKDTree
+
         assert isinstance(model.network, WarpNetwork)
         assert model.shape is not None
         assert model.trust is not None
@@ -40,6 +43,7 @@ class WarpLocator:
         self._known_ct = np.concatenate(
             [organ.vertices_mm[::few], *(v[:: max(1, len(v) // 64)] for v in inner)]
         )
+        self._nearest_known = cKDTree(self._known_ct)
 
     def locate(self, cloud: SensorCloud, grid: int, seed: int) -> Estimate:
         """See ``track.tracker.Tracker.locate``."""
@@ -56,7 +60,7 @@ class WarpLocator:
             check_familiar(self._model.familiar, spread_mm(points), fit_mm(distances))
             check_likely(fit.motion.rarity)
         with stage(seconds, "surfaces", self._device):
-            motion = self._trusted(fit)
+            motion = replace(fit.motion, std_scale=self._trust.std_scale)
             parts = self._shape.anatomy_ct.parts
             moved = Anatomy(tuple(part.moved(motion.carry(part.vertices_mm)) for part in parts))
         with stage(seconds, "fine", self._device):
@@ -80,18 +84,6 @@ class WarpLocator:
         volume = CameraLabels(labels, camera_from_index)
         return Estimate(inside, volume, meshes, report, motion)
 
-    def _trusted(self, fit: Refined) -> WarpMotion:
-        """The fit's motion with standard deviations as validation found them to be."""
-        found = fit.motion
-        return WarpMotion(
-            self._shape,
-            found.rotation,
-            found.centre_mm,
-            found.coefficients,
-            found.covariance,
-            self._trust.std_scale,
-        )
-
     def _asked(
         self, motion: WarpMotion, organ: Mesh, stamp_ns: int, rng: np.random.Generator
     ) -> OccupancyCloud:
@@ -111,11 +103,9 @@ class WarpLocator:
     def _std_near(
         self, motion: WarpMotion, points_ct: Float32[np.ndarray, "n 3"]
     ) -> Float[np.ndarray, " n"]:
-        from scipy.spatial import cKDTree
-
         deviation = motion.std_mm(self._known_ct)
         assert deviation is not None
-        return deviation[cKDTree(self._known_ct).query(points_ct)[1]]
+        return deviation[self._nearest_known.query(points_ct)[1]]
 
     def _described(
         self, motion: WarpMotion, meshes: dict[str, Mesh], inside: OccupancyCloud

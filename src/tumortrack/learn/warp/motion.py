@@ -45,7 +45,7 @@ class WarpMotion:
     def rarity(self) -> float:
         """The state's squared Mahalanobis distance in the body's library, whose mean is 1."""
         off = self.coefficients - self.shape.body.mean
-        return float(off @ np.linalg.solve(self.shape.body.covariance, off)) / len(off)
+        return float(off @ self.shape.body.precision @ off) / len(off)
 
     def carry(self, points_ct: Float[np.ndarray, "n 3"], /) -> Float64[np.ndarray, "n 3"]:
         """CT (LPS, mm) -> camera frame (mm)."""

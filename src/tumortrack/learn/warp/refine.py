@@ -95,7 +95,7 @@ def _prior(shape: Shape, config: RefineConfig) -> Float64[np.ndarray, "p p"]:
     precision = np.zeros((6 + modes, 6 + modes))
     precision[:3, :3] = np.eye(3) / config.shift_mm**2
     precision[3:6, 3:6] = np.eye(3) / config.turn_rad**2
-    precision[6:, 6:] = np.linalg.inv(shape.body.covariance)
+    precision[6:, 6:] = shape.body.precision
     return precision
 
 

@@ -77,6 +77,11 @@ class Body:
         ridge = _RIDGE * np.eye(self.states.shape[1])
         return np.cov(self.states.T.astype(float)) + ridge
 
+    @cached_property
+    def precision(self) -> Float64[np.ndarray, "m m"]:
+        """The inverse of ``covariance``."""
+        return np.linalg.inv(self.covariance)
+
     def velocity(self, coefficients: Float[np.ndarray, " m"]) -> Float32[np.ndarray, "i j k 3"]:
         """The field that points follow, mm per unit of time, at the lattice's nodes."""
         return self.modes @ coefficients.astype(np.float32)
