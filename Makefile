@@ -4,7 +4,7 @@ BIN := .venv/bin
 SETUP := .venv/.installed
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test check bench results headstart clean
+.PHONY: help setup debian demo test check bench results headstart clean
 
 help:  ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 10
@@ -14,7 +14,7 @@ setup: $(SETUP)  ## install everything into .venv
 $(SETUP): pyproject.toml constraints.txt
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "tumortrack needs Python 3.11 or newer; give make PYTHON=python3.11")'
 	$(PYTHON) -m venv .venv
-	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev,peers]'
+	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev,peers,live]'
 	touch $@
 
 demo: setup  ## CT -> tumors located in unseen deformed scenes (about 5 minutes)
@@ -26,7 +26,10 @@ check: setup  ## lint, types, import order
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
-test: check  ## check, then all tests
+debian:  ## what tests need of Debian (ROS, RViz, Chromium), where it can be installed
+	tools/debian.sh
+
+test: check debian  ## check, then all tests
 	$(BIN)/pytest
 
 bench: setup  ## speed of the generator, training and inference, side by side with naive forms

@@ -135,6 +135,7 @@ def evaluate_scene(locate: Locate, scene: Scene, name: str) -> tuple[dict, Estim
 
 def compare(estimate: Estimate, scene: Scene) -> dict[str, dict]:
     """Metrics of every part of the truth; a part that was not found has only found and iou."""
+    assert estimate.volume is not None
     ious = label_ious(estimate.volume, scene.reference)
     parts: dict[str, dict] = {}
     for name, reference in zip(scene.reference.names, scene.reference.parts, strict=True):

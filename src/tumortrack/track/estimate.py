@@ -15,11 +15,12 @@ class Estimate:
     ``meshes`` maps kidney, tumor_1, ... to closed surfaces; a part that was not found is absent.
     The kidney's surface is the whole organ, tumors included, as in ``Anatomy``. ``report`` is
     plain JSON: per part volume, centre, box and probability, and ``timings`` in seconds.
-    ``motion`` says where every point of the CT is, where the method knows that.
+    ``volume`` is None where nobody asked for it (live). ``motion`` says where every point of the
+    CT is, where the method knows that.
     """
 
     cloud: OccupancyCloud
-    volume: CameraLabels
+    volume: CameraLabels | None
     meshes: dict[str, Mesh]
     report: dict
     motion: Motion | None = None

@@ -37,6 +37,7 @@ def write_estimate(
             **_places_in_ct(estimate),
         )
         volume = estimate.volume
+        assert volume is not None  # live estimates are the recording sink's
         write_labels_nifti(
             aside / "labels.nii.gz", volume.labels, volume.camera_from_index, lps=False
         )
