@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import islice
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float, Float32, Float64
@@ -13,6 +14,9 @@ from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError
 from tumortrack.core.types import Anatomy
 from tumortrack.simulate.elastic.flow import follow, project, steps_for
+
+if TYPE_CHECKING:
+    from tumortrack.simulate.elastic.settle import Reduced
 
 _RIDGE = 1e-4  # mm2, on the covariance: no coefficient is ever known for sure
 _ARRAYS = ("origin_mm", "spacing_mm", "center_ct", "modes", "states")
@@ -164,23 +168,11 @@ def build_body(
     Raises:
         InputError: a surface that turns inside, or numbers that make no body.
     """
-    _check(anatomy_ct, config)
-    from tumortrack.simulate.elastic.finite import solid_of
-    from tumortrack.simulate.elastic.lattice import lattice_over
     from tumortrack.simulate.elastic.loads import random_state
-    from tumortrack.simulate.elastic.modes import modes_of, random_loads
-    from tumortrack.simulate.elastic.settle import Reduced
-    from tumortrack.simulate.elastic.surface import patches_of
 
     rng = np.random.default_rng([seed, 0xE1A57])
     up = np.asarray(up_lps, float) / np.linalg.norm(up_lps)
-    organ = anatomy_ct.organ
-    spacing = float(np.cbrt(organ.volume_mm3 / config.cells))
-    solid = solid_of(anatomy_ct, lattice_over(organ.box_mm, spacing), config.poisson)
-    patches = patches_of(organ, config.patches, rng)
-    loads = random_loads(solid, patches, up, config.responses, rng)
-    modes = modes_of(solid, patches, config.modes, config.contrasts, loads)
-    reduced = Reduced(solid, modes, patches)
+    reduced = reduced_organ(anatomy_ct, up, config, rng)
     drawn = (random_state(reduced, up, config.bed_anywhere, rng) for _ in range(2 * config.states))
     states = list(islice((state for state in drawn if state is not None), config.states))
     if len(states) < config.states:
@@ -188,12 +180,44 @@ def build_body(
             f"only {len(states)} of {2 * config.states} loads leave this organ at rest; its "
             "surface may be torn. Look at the case's pictures, and prepare it again."
         )
+    return body_of(reduced, np.array(states, np.float32))
+
+
+def reduced_organ(
+    anatomy_ct: Anatomy,
+    up: Float64[np.ndarray, " 3"],
+    config: BodyConfig,
+    rng: np.random.Generator,
+) -> Reduced:
+    """An organ in the space of its modes, ready for loads; ``up`` is a unit vector.
+
+    Raises:
+        InputError: a surface that turns inside, or numbers that make no body.
+    """
+    _check(anatomy_ct, config)
+    from tumortrack.simulate.elastic.finite import solid_of
+    from tumortrack.simulate.elastic.lattice import lattice_over
+    from tumortrack.simulate.elastic.modes import modes_of, random_loads
+    from tumortrack.simulate.elastic.settle import Reduced
+    from tumortrack.simulate.elastic.surface import patches_of
+
+    organ = anatomy_ct.organ
+    spacing = float(np.cbrt(organ.volume_mm3 / config.cells))
+    solid = solid_of(anatomy_ct, lattice_over(organ.box_mm, spacing), config.poisson)
+    patches = patches_of(organ, config.patches, rng)
+    loads = random_loads(solid, patches, up, config.responses, rng)
+    return Reduced(solid, modes_of(solid, patches, config.modes, config.contrasts, loads), patches)
+
+
+def body_of(reduced: Reduced, states: Float32[np.ndarray, "s m"]) -> Body:
+    """The body of a reduced organ with these states as its library."""
+    solid = reduced.solid
     return Body(
         solid.lattice.origin_mm.astype(np.float32),
-        spacing,
+        solid.lattice.spacing_mm,
         solid.center_mm,
-        solid.spread(modes.shapes).astype(np.float32),
-        np.array(states, np.float32),
+        solid.spread(reduced.modes.shapes).astype(np.float32),
+        states,
     )
 
 

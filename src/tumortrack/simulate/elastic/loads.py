@@ -72,13 +72,25 @@ class Poke(Obstacle):
 
     @classmethod
     def draw(cls, organ: Reduced, up: np.ndarray, rng: np.random.Generator) -> Poke:
-        points, normals = organ.patches.points_mm, organ.patches.normals
         tip = _reachable(organ, up, rng)
-        outward = _tilted_by(normals[tip], 0.25, rng)
-        offset = points - points[tip]
+        outward = _tilted_by(organ.patches.normals[tip], 0.25, rng)
+        return cls.at(organ, tip, outward, rng.uniform(3, 10), rng.uniform(1, 14))
+
+    @classmethod
+    def at(
+        cls,
+        organ: Reduced,
+        patch: int,
+        outward: Float64[np.ndarray, " 3"],
+        radius_mm: float,
+        depth_mm: float,
+    ) -> Poke:
+        """An instrument so wide that goes in so deep at a patch, against a unit vector."""
+        points, normals = organ.patches.points_mm, organ.patches.normals
+        offset = points - points[patch]
         aside = np.linalg.norm(offset - np.outer(offset @ outward, outward), axis=1)
-        foot = _faded(rng.uniform(3, 10) - aside) * (normals @ outward > 0)
-        return cls(outward, float(points[tip] @ outward - rng.uniform(1, 14)), foot)
+        foot = _faded(radius_mm - aside) * (normals @ outward > 0)
+        return cls(outward, float(points[patch] @ outward - depth_mm), foot)
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,7 +18,7 @@ from tumortrack.simulate.elastic.modes import Modes
 from tumortrack.simulate.elastic.surface import Patches
 
 KPA = 1e-3  # N/mm2
-_LEVER_MM = 50.0  # a rigid turn's unknown is the motion at this arm
+LEVER_MM = 50.0  # a rigid turn's unknown is the motion at this arm
 _FREE = 1e-4  # N/mm: keeps the rigid motions solvable where nothing touches
 _MOST_STEPS = 20
 _SETTLED_MM = 1e-2
@@ -29,11 +29,11 @@ class Reduced:
 
     def __init__(self, solid: Solid, modes: Modes, patches: Patches) -> None:
         k, n = modes.shapes.shape[1], len(solid.nodes)
-        self.patches = patches
+        self.solid, self.modes, self.patches = solid, modes, patches
         self.n_modes = k
         weights = solid.lattice.weights(patches.points_mm)[:, solid.nodes]
         bent = (weights @ modes.shapes.reshape(n, -1)).reshape(-1, 3, k)
-        arms = (patches.points_mm - solid.center_mm) / _LEVER_MM
+        arms = (patches.points_mm - solid.center_mm) / LEVER_MM
         turned = np.stack([np.cross(axis, arms) for axis in np.eye(3)], -1)
         shifted = np.broadcast_to(np.eye(3), turned.shape)
         self.moves = np.concatenate([bent, shifted, turned], -1)  # (p, 3, k + 6)
