@@ -174,7 +174,7 @@ def _store(distro: Distro) -> Any:
         def write(raw: memoryview, pos: int, point: Any, store: Any) -> int:
             if not isinstance(point, np.ndarray):
                 return write_one(raw, pos, point, store)
-            raw[pos : pos + point.nbytes] = memoryview(point).cast("B")
+            raw[pos : pos + point.nbytes] = point.data.cast("B")
             return pos + point.nbytes
 
         return write
