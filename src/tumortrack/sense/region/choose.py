@@ -1,0 +1,159 @@
+"""Which pieces are the organ: the one that the user points at, the one seen last, or the likeliest;
+and what continues it behind something nearer."""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+
+from tumortrack.core.errors import NoEstimate
+from tumortrack.sense.region.config import RegionConfig
+from tumortrack.sense.region.picture import Picture
+
+PICK_REACH_MM = 10.0  # from the picked point to the piece it means
+_STEEPEST_GAP = 0.5  # slope of a surface behind what hides part of it
+_STEP_MM = 3.0
+_FEWEST_LINES = 5  # rows and columns along which two pieces continue each other
+
+
+def under_point(picture: Picture, pieces: np.ndarray, point_mm: np.ndarray) -> int:
+    """The piece nearest to a point (3,), camera frame, mm.
+
+    Raises:
+        NoEstimate: none within 10 mm.
+    """
+    square, piece = _nearest(
+        picture.depth_mm, pieces, picture.pinhole, np.asarray(point_mm, np.float64)
+    )
+    if not square <= PICK_REACH_MM**2:
+        there = ", ".join(f"{x:.0f}" for x in point_mm)
+        raise NoEstimate(
+            f"no piece of the scene lies within {PICK_REACH_MM:g} mm of the picked point "
+            f"({there}) mm: it is on the background, on something thin, or outside the range. "
+            "Pick again, or clear the pick."
+        )
+    return int(piece)
+
+
+def under_box(
+    picture: Picture, pieces: np.ndarray, count: int, corners_mm: np.ndarray
+) -> int | None:
+    """The piece with the most surface in a box (2, 3); None if none has any."""
+    low, high = np.sort(np.asarray(corners_mm, np.float64), axis=0)
+    area = _area_inside(picture.depth_mm, pieces, picture.pinhole, low, high, count)
+    return int(area.argmax()) if area.max() > 0 else None
+
+
+def likeliest(picture: Picture, pieces: np.ndarray, count: int, config: RegionConfig) -> int | None:
+    """The largest piece of an organ's size; what leaves the picture counts less, as arms do."""
+    area, wide, cut = _measure(picture.depth_mm, pieces, picture.pinhole, count)
+    low, high = config.organ_mm
+    fits = np.minimum(1.0, (high / np.maximum(wide, 1e-9)) ** 4)
+    score = area * fits * (1 - cut) ** 2
+    score[wide < low] = 0
+    return int(score.argmax()) if score.max() > 0 else None
+
+
+def continued(
+    picture: Picture, pieces: np.ndarray, count: int, chosen: int, config: RegionConfig
+) -> np.ndarray:
+    """The chosen piece and those that continue it behind something nearer: (count + 1,), bool."""
+    together = np.zeros(count + 1, bool)
+    together[chosen] = True
+    gap = config.gap_mm / picture.footprint
+    lines = _continuing(picture.depth_mm, pieces, gap, picture.footprint, count)
+    lines = lines + lines.T
+    for _ in range(3):  # behind several shafts
+        together |= lines[together].sum(0) >= _FEWEST_LINES
+    together[0] = False
+    return together
+
+
+@numba.njit(cache=True, nogil=True)
+def _nearest(depth_mm, pieces, pinhole, point):  # type: ignore[no-untyped-def]
+    fx, fy, cx, cy = pinhole
+    best, piece = np.inf, 0
+    for v in range(len(depth_mm)):
+        for u in range(depth_mm.shape[1]):
+            if pieces[v, u]:
+                z = depth_mm[v, u]
+                x, y = (u - cx) / fx * z - point[0], (v - cy) / fy * z - point[1]
+                square = x * x + y * y + (z - point[2]) ** 2
+                if square < best:
+                    best, piece = square, pieces[v, u]
+    return best, piece
+
+
+@numba.njit(cache=True, nogil=True)
+def _area_inside(depth_mm, pieces, pinhole, low, high, count):  # type: ignore[no-untyped-def]
+    fx, fy, cx, cy = pinhole
+    area = np.zeros(count + 1)
+    for v in range(len(depth_mm)):
+        for u in range(depth_mm.shape[1]):
+            if pieces[v, u]:
+                z = depth_mm[v, u]
+                x, y = (u - cx) / fx * z, (v - cy) / fy * z
+                if low[2] < z < high[2] and low[1] < y < high[1] and low[0] < x < high[0]:
+                    area[pieces[v, u]] += z * z / (fx * fy)
+    return area
+
+
+@numba.njit(cache=True, nogil=True)
+def _measure(depth_mm, pieces, pinhole, count):  # type: ignore[no-untyped-def]
+    """Per piece: area across the line of sight (mm^2), longest extent (mm), and how much of the
+    square root of that area lies on the image's border (0..1)."""
+    fx, fy, cx, cy = pinhole
+    height, width = depth_mm.shape
+    area, border = np.zeros(count + 1), np.zeros(count + 1)
+    low, high = np.full((count + 1, 4), np.inf), np.full((count + 1, 4), -np.inf)
+    for v in range(height):
+        for u in range(width):
+            piece = pieces[v, u]
+            if piece:
+                z = depth_mm[v, u]
+                x, y = (u - cx) / fx * z, (v - cy) / fy * z
+                area[piece] += z * z / (fx * fy)
+                if v == 0 or u == 0 or v == height - 1 or u == width - 1:
+                    border[piece] += z / fx
+                along = (x, y, (x + y) * 0.7071, (x - y) * 0.7071)
+                for k in range(4):
+                    low[piece, k] = min(low[piece, k], along[k])
+                    high[piece, k] = max(high[piece, k], along[k])
+    wide, cut = np.zeros(count + 1), np.zeros(count + 1)
+    for piece in range(1, count + 1):
+        if area[piece] > 0:
+            wide[piece] = (high[piece] - low[piece]).max()
+            cut[piece] = min(border[piece] / np.sqrt(area[piece]), 1.0)
+    return area, wide, cut
+
+
+@numba.njit(cache=True, nogil=True)
+def _continuing(depth_mm, pieces, gap, footprint, count):  # type: ignore[no-untyped-def]
+    """In how many rows and columns one piece goes on as another (count + 1, count + 1) after a gap
+    in which something is nearer and nothing is farther."""
+    lines = np.zeros((count + 1, count + 1), np.int32)
+    height, width = depth_mm.shape
+    for v in range(height):
+        for u in range(width):
+            piece = pieces[v, u]
+            if piece == 0:
+                continue
+            z = depth_mm[v, u]
+            longest = int(gap / z)
+            for dv, du in ((0, 1), (1, 0)):
+                nearer, y, x = 0, v, u
+                for length in range(1, longest + 2):
+                    y, x = y + dv, x + du
+                    if y >= height or x >= width or (length == 1 and pieces[y, x] == piece):
+                        break
+                    there = depth_mm[y, x]
+                    if there < z - _STEP_MM:
+                        nearer += 1
+                    most = _STEP_MM + _STEEPEST_GAP * length * footprint * z
+                    if there > z + most:
+                        break
+                    other = pieces[y, x]
+                    if other and abs(there - z) < most and nearer >= 2:
+                        lines[piece, other] += 1
+                        break
+    return lines

@@ -1,0 +1,127 @@
+"""The organ in the picture: a whole depth image or cloud -> the organ's points."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from tumortrack.core.errors import InputError, NoEstimate
+from tumortrack.core.types import DepthFrame, SensorCloud
+from tumortrack.sense.cloud import FEWEST_POINTS, thin_cloud
+from tumortrack.sense.region.config import RegionConfig
+
+
+@dataclass(frozen=True, eq=False)
+class Hints:
+    """What is known about one frame beside it.
+
+    Attributes:
+        mask: of a depth image's pixels, True where the organ may be.
+        picked_mm: a point on the organ, camera frame, as a user clicked it. It decides which piece
+            is taken, so give it until there is an estimate, and the estimate's box from then on:
+            organs move.
+        last_box_mm: lower and upper corner of the last estimate's organ, camera frame.
+    """
+
+    mask: Bool[np.ndarray, "h w"] | None = None
+    picked_mm: Float[np.ndarray, " 3"] | None = None
+    last_box_mm: Float[np.ndarray, "2 3"] | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Region:
+    """What is taken for the organ.
+
+    Attributes:
+        cloud: at most ``crop.n_points`` of its points, drawn at random; camera frame, mm.
+        counts: pixels of the working picture by what became of them: ``organ``, ``no return``, or
+            the step that took them (``region.picture.STEPS``).
+        taken: (h, w) uint8, the same as a picture of the working size, for a look at it: numbers
+            into ``STEPS``, 0 the organ. Of a cloud: as a camera at its origin sees it.
+        seconds: it took.
+    """
+
+    cloud: SensorCloud
+    counts: dict[str, int]
+    taken: np.ndarray
+    seconds: float
+
+
+def organ_points(
+    content: DepthFrame | SensorCloud, config: RegionConfig, hints: Hints, rng: np.random.Generator
+) -> Region:
+    """Crop by range, region of interest, mask and last estimate; remove the plane behind and
+    flying points; take one piece, and what continues it behind something nearer.
+
+    Large images are looked at in every second (third ...) pixel. The same generator gives the same
+    points.
+
+    Raises:
+        NoEstimate: fewer than 200 points are left; says which step took how many.
+        InputError: the mask is not of the image's size, or was given with a cloud.
+    """
+    from tumortrack.sense.region import picture as pictures
+    from tumortrack.sense.region.crop import keep_inside, keep_range
+    from tumortrack.sense.region.pieces import remove_flying
+    from tumortrack.sense.region.plane import remove_plane
+
+    start = time.perf_counter()
+    if isinstance(content, DepthFrame):
+        picture = pictures.picture_of_frame(content, hints.mask)
+    elif hints.mask is None:
+        picture = pictures.picture_of_cloud(content)
+    else:
+        raise InputError("a mask goes with a depth image; for a cloud give box_mm instead.")
+    keep_range(picture, config.crop.near_mm, config.crop.far_mm, pictures.RANGE)
+    if config.box_mm is not None:
+        keep_inside(picture, np.array(config.box_mm), pictures.BOX)
+    if hints.last_box_mm is not None and config.last_margin_mm > 0:
+        margin_mm = config.last_margin_mm * np.array([[-1.0], [1.0]])
+        keep_inside(picture, hints.last_box_mm + margin_mm, pictures.LAST_BOX)
+    if config.plane:
+        remove_plane(picture, config, rng)
+    if config.flying:
+        remove_flying(picture, config)
+    if config.pieces:
+        _take_one_piece(picture, config, hints)
+    counts = picture.counts()
+    points_mm = picture.points(picture.taken)
+    if len(points_mm) < FEWEST_POINTS:
+        raise NoEstimate(_too_few(len(points_mm), counts, config))
+    cloud = SensorCloud(points_mm, content.stamp_ns)
+    cloud = thin_cloud(cloud, config.crop.n_points, rng)
+    return Region(cloud, counts, picture.taken, time.perf_counter() - start)
+
+
+def _take_one_piece(picture, config: RegionConfig, hints: Hints) -> None:  # type: ignore[no-untyped-def]
+    from tumortrack.sense.region import choose
+    from tumortrack.sense.region.picture import PIECES, THIN
+    from tumortrack.sense.region.pieces import find_pieces
+
+    pieces, count = find_pieces(picture, config)
+    picture.take(pieces == 0, THIN)
+    chosen = None
+    if hints.picked_mm is not None:
+        chosen = choose.under_point(picture, pieces, hints.picked_mm)
+    elif hints.last_box_mm is not None:
+        chosen = choose.under_box(picture, pieces, count, hints.last_box_mm)
+    if chosen is None:
+        chosen = choose.likeliest(picture, pieces, count, config)
+    if chosen is None:
+        picture.take(pieces > 0, PIECES)
+    else:
+        together = choose.continued(picture, pieces, count, chosen, config)
+        picture.take(~together[pieces], PIECES)
+
+
+def _too_few(left: int, counts: dict[str, int], config: RegionConfig) -> str:
+    took = ", ".join(f"{name} {n}" for name, n in counts.items() if n and name != "organ")
+    return (
+        f"only {left} points are left for the organ; at least {FEWEST_POINTS} are needed. Of "
+        f"{sum(counts.values())} pixels went to: {took or 'nothing'} (range "
+        f"{config.crop.near_mm:g}..{config.crop.far_mm:g} mm). Move the camera, widen what took "
+        "most, or switch that step off."
+    )

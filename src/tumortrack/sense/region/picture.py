@@ -1,0 +1,147 @@
+"""Depth image or cloud -> the working picture that all steps look at; and back to points."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+
+from tumortrack.core.errors import InputError
+from tumortrack.core.types import DepthFrame, SensorCloud
+from tumortrack.sense.camera import deproject_pixels
+
+MOST_PIXELS = 110_000  # of a working picture: 424 x 240, and every second pixel of 848 x 480
+_POINTS_PER_PIXEL = 4  # of a rasterised cloud: leaves 2 % of the pixels empty
+_WIDEST = 2.0  # tangent of the largest angle from the optical axis in a rasterised cloud
+
+# What became of a pixel: still the organ's, or the step that took it.
+ORGAN, NO_RETURN, RANGE, BOX, MASK, LAST_BOX, PLANE, FLYING, THIN, PIECES = range(10)
+STEPS = (
+    "organ",
+    "no return",
+    "range",
+    "box",
+    "mask",
+    "last box",
+    "plane",
+    "flying",
+    "thin",
+    "other pieces",
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Picture:
+    """A depth image at working size, and what the steps have decided about its pixels so far.
+
+    Attributes:
+        depth_mm: (h, w) float32, NaN where there was no return.
+        taken: (h, w) uint8, one of the numbers above; the steps write into it.
+        pinhole: fx, fy, cx, cy of the working picture, px.
+        points: the points (n, 3) behind the pixels still called ORGAN, camera frame, mm, float32;
+            takes ``taken``.
+    """
+
+    depth_mm: np.ndarray
+    taken: np.ndarray
+    pinhole: tuple[float, float, float, float]
+    points: Callable[[np.ndarray], np.ndarray]
+
+    @property
+    def footprint(self) -> float:
+        """Width of a pixel at distance 1."""
+        return 2 / (self.pinhole[0] + self.pinhole[1])
+
+    def take(self, where: np.ndarray, step: int) -> None:
+        """Give the pixels (h, w, bool) that nobody has taken yet to a step."""
+        self.taken[where & (self.taken == ORGAN)] = step
+
+    def counts(self) -> dict[str, int]:
+        """Pixels by what became of them."""
+        found = np.bincount(self.taken.ravel(), minlength=len(STEPS))
+        return dict(zip(STEPS, found.tolist(), strict=True))
+
+
+def picture_of_frame(frame: DepthFrame, mask: np.ndarray | None) -> Picture:
+    """Every pixel of a small frame, every second, third ... of a large one.
+
+    Raises:
+        InputError: the mask's shape is not the image's.
+    """
+    camera = frame.intrinsics
+    step = int(np.ceil(np.sqrt(frame.depth_mm.size / MOST_PIXELS)))
+    some = (slice(step // 2, None, step), slice(step // 2, None, step))
+    depth_mm = frame.depth_mm[some].copy()
+    taken = np.isnan(depth_mm).view(np.uint8) * np.uint8(NO_RETURN)
+
+    def points(taken: np.ndarray) -> np.ndarray:
+        row, column = np.divmod(np.flatnonzero(taken == ORGAN), taken.shape[1])
+        row, column = step // 2 + row * step, step // 2 + column * step
+        seen_mm = frame.depth_mm[row, column].astype(np.float64)
+        return deproject_pixels(row * camera.width + column, seen_mm, camera)
+
+    pinhole = (
+        camera.fx / step,
+        camera.fy / step,
+        (camera.cx - step // 2) / step,
+        (camera.cy - step // 2) / step,
+    )
+    picture = Picture(depth_mm, taken, pinhole, points)
+    if mask is not None:
+        if mask.shape != frame.depth_mm.shape:
+            raise InputError(
+                f"the mask is {mask.shape[1]} x {mask.shape[0]}, the depth image {camera.width} x "
+                f"{camera.height}; give a mask of the depth image's pixels."
+            )
+        picture.take(~mask[some], MASK)
+    return picture
+
+
+def picture_of_cloud(cloud: SensorCloud) -> Picture:
+    """A cloud in any order as a pinhole camera at its origin sees it: the nearest point a pixel.
+
+    Points at or behind the camera's centre are left out, and so are those behind another.
+    """
+    points_mm = cloud.points_mm
+    before = points_mm[:, 2] > 1.0
+    tangents = points_mm[before, :2] / points_mm[before, 2:]
+    tangents = tangents[(np.abs(tangents) < _WIDEST).all(1)]
+    if not len(tangents):
+        tangents = np.zeros((1, 2), np.float32)
+    low, high = tangents.min(0), tangents.max(0)
+    pixels = min(max(len(tangents) / _POINTS_PER_PIXEL, 64.0), float(MOST_PIXELS))
+    size = max(float(np.sqrt(np.prod(high - low + 1e-3) / pixels)), 1e-5)
+    width, height = (int(n) for n in np.floor((high - low) / size) + 1)
+    pinhole = (1 / size, 1 / size, float(-low[0] / size), float(-low[1] / size))
+    depth_mm, pixel = _rasterise(points_mm.copy(), pinhole, height, width)
+    taken = np.isnan(depth_mm).view(np.uint8) * np.uint8(NO_RETURN)
+
+    def points(taken: np.ndarray) -> np.ndarray:
+        seen = np.flatnonzero(pixel >= 0)
+        seen = seen[taken.ravel()[pixel[seen]] == ORGAN]
+        behind_mm = points_mm[seen, 2] - depth_mm.ravel()[pixel[seen]]
+        return points_mm[seen[behind_mm < 2 + 2 * size * points_mm[seen, 2]]]
+
+    return Picture(depth_mm, taken, pinhole, points)
+
+
+@numba.njit(cache=True, nogil=True)
+def _rasterise(points_mm, pinhole, height, width):  # type: ignore[no-untyped-def]
+    """The nearest depth in each pixel (h, w), and each point's pixel (n,), -1 outside."""
+    fx, fy, cx, cy = pinhole
+    depth_mm = np.full(height * width, np.nan, np.float32)
+    pixel = np.full(len(points_mm), -1, np.int32)
+    for i in range(len(points_mm)):
+        z = points_mm[i, 2]
+        if z <= 1.0:
+            continue
+        u = int(np.floor(fx * points_mm[i, 0] / z + cx + 0.5))
+        v = int(np.floor(fy * points_mm[i, 1] / z + cy + 0.5))
+        if 0 <= u < width and 0 <= v < height:
+            place = v * width + u
+            pixel[i] = place
+            if not depth_mm[place] <= z:
+                depth_mm[place] = z
+    return depth_mm.reshape(height, width), pixel

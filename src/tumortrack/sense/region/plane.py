@@ -1,0 +1,144 @@
+"""The large plane behind the organ: table, drape.
+
+Random sample consensus (Fischler, Bolles 1981, doi 10.1145/358669.358692) with graded inliers
+(MSAC; Torr, Zisserman 2000, doi 10.1006/cviu.1999.0832). A background has things before it and
+nothing close behind it; an organ's flat side has the rest of the organ behind it, so points a
+little behind a plane speak against it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+
+from tumortrack.sense.region.config import RegionConfig
+from tumortrack.sense.region.picture import NO_RETURN, PLANE, Picture
+
+_LOOK_AT = 1200  # pixels
+_TRIES = 200
+_BEYOND_MM = 120.0  # so far behind the range there may be something to fit to
+_STEEPEST = 0.35  # cosine of the largest angle between the plane's normal and the optical axis
+_DEEPEST_MM = 60.0  # an organ is not deeper: what lies farther behind a plane is no part of it
+_BEHIND_COSTS = 2.0  # points on the plane outweighed by one behind it
+_MOST_BEHIND = 0.12  # of the points on the plane
+_NARROWEST_MM = 95.0  # extent of a background across its long side
+
+
+@dataclass(frozen=True)
+class Plane:
+    """Points with ``normal @ point = offset_mm``; the unit normal points to the camera, so that
+    ``normal @ point - offset_mm`` is the height above it. ``half_mm``: what is lower is the
+    plane's."""
+
+    normal: np.ndarray
+    offset_mm: float
+    half_mm: float
+
+
+def remove_plane(picture: Picture, config: RegionConfig, rng: np.random.Generator) -> Plane | None:
+    """Take the background plane and what lies behind it, where there is one."""
+    plane = find_plane(picture, config, rng)
+    if plane is not None:
+        _take_below(
+            picture.depth_mm,
+            picture.taken,
+            picture.pinhole,
+            plane.normal,
+            plane.offset_mm,
+            plane.half_mm,
+            PLANE,
+        )
+    return plane
+
+
+def find_plane(picture: Picture, config: RegionConfig, rng: np.random.Generator) -> Plane | None:
+    """The background plane, seen in all pixels (also those that other steps have taken)."""
+    points = _some_points(picture, config.crop.far_mm + _BEYOND_MM, rng)
+    if len(points) < 50:
+        return None
+    # Uneven, and noisy: three standard deviations.
+    most_mm = config.plane_mm + 3 * config.noise_mm * float(np.median(points[:, 2]) / 150) ** 2
+    triples = rng.integers(len(points), size=(_TRIES, 3))
+    score, normal, offset = _consensus(points, triples, most_mm)
+    if score < config.plane_share / 2 * len(points):
+        return None
+    half_mm = most_mm
+    for _ in range(3):
+        height = points @ normal - offset
+        inliers = points[np.abs(height) < half_mm]
+        if len(inliers) < 20:
+            return None
+        middle = inliers.mean(0)
+        spreads, axes = np.linalg.eigh(np.cov((inliers - middle).T))
+        normal = axes[:, 0] * -np.sign(axes[2, 0] or 1.0)
+        offset = float(normal @ middle)
+        off = np.abs((inliers - middle) @ normal)
+        half_mm = float(np.clip(4.5 * np.median(off), 1.5, most_mm))
+    height = points @ normal - offset
+    on = np.count_nonzero(np.abs(height) < half_mm)
+    behind = np.count_nonzero((height < -half_mm) & (height > -_DEEPEST_MM))
+    # A strip or disc of even density is sqrt(12) or 4 standard deviations wide.
+    wide_mm = np.sqrt(12 * spreads[1])
+    good = (
+        on >= config.plane_share * len(points)
+        and behind <= _MOST_BEHIND * on
+        and wide_mm >= _NARROWEST_MM
+    )
+    return Plane(normal.astype(np.float64), offset, half_mm) if good else None
+
+
+def _some_points(picture: Picture, far_mm: float, rng: np.random.Generator) -> np.ndarray:
+    """Points (n, 3), float32, of random pixels not farther than ``far_mm``."""
+    height, width = picture.depth_mm.shape
+    pixel = rng.integers(height * width, size=3 * _LOOK_AT)
+    z = picture.depth_mm.ravel()[pixel]
+    good = np.flatnonzero((picture.taken.ravel()[pixel] != NO_RETURN) & (z < far_mm))[:_LOOK_AT]
+    row, column = np.divmod(pixel[good], width)
+    fx, fy, cx, cy = picture.pinhole
+    z = z[good]
+    out = np.empty((len(good), 3), np.float32)
+    out[:, 0], out[:, 1], out[:, 2] = (column - cx) / fx * z, (row - cy) / fy * z, z
+    return out
+
+
+@numba.njit(cache=True, nogil=True)
+def _consensus(points, triples, tolerance):  # type: ignore[no-untyped-def]
+    best, best_offset = -np.inf, 0.0
+    best_normal = np.zeros(3, np.float32)
+    for t in range(len(triples)):
+        a, b, c = points[triples[t, 0]], points[triples[t, 1]], points[triples[t, 2]]
+        normal = np.cross(b - a, c - a)
+        length = np.sqrt((normal * normal).sum())
+        if length < 100.0:  # mm^2: a sliver says nothing
+            continue
+        normal = normal / -length if normal[2] > 0 else normal / length
+        if normal[2] > -_STEEPEST:
+            continue
+        offset = normal[0] * a[0] + normal[1] * a[1] + normal[2] * a[2]
+        score = 0.0
+        for i in range(len(points)):
+            p = points[i]
+            height = normal[0] * p[0] + normal[1] * p[1] + normal[2] * p[2] - offset
+            share = height / tolerance
+            if abs(share) < 1:
+                score += 1 - share * share
+            elif -_DEEPEST_MM < height < 0:
+                score -= _BEHIND_COSTS
+        if score > best:
+            best, best_offset, best_normal = score, offset, normal
+    return best, best_normal, best_offset
+
+
+@numba.njit(cache=True, nogil=True)
+def _take_below(depth_mm, taken, pinhole, normal, offset, half, step):  # type: ignore[no-untyped-def]
+    fx, fy, cx, cy = pinhole
+    height, width = depth_mm.shape
+    for v in range(height):
+        across = normal[1] * (v - cy) / fy + normal[2]
+        for u in range(width):
+            if taken[v, u] == 0:
+                above = depth_mm[v, u] * (normal[0] * (u - cx) / fx + across) - offset
+                if above < half:
+                    taken[v, u] = step
