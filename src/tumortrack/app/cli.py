@@ -179,6 +179,72 @@ def locate(
     )
 
 
+def track(
+    model: Positional[Path],
+    source: Positional[str],
+    sinks: Positional[tuple[str, ...]] = (),
+    /,
+    *,
+    range: tuple[float, float] | None = None,
+    box: tuple[float, float, float, float, float, float] | None = None,
+    whole: bool = False,
+    frame: Path | None = None,
+    smoothing: float = 0.0,
+    rescan: float = 1.0,
+    stale: float = 0.5,
+    give_up: float = 60.0,
+    seconds: float = 0.0,
+    report: Path | None = None,
+    seed: int = 0,
+    device: Literal["auto", "cpu", "cuda"] = "auto",
+) -> None:
+    """Follow kidney and tumors live, from a camera to viewers, recordings and robots.
+
+    Sources and sinks are written kind:target?option=value&option=value. Sources: virtual:CASE,
+    recording:PATH, realsense[:SERIAL|FILE], ros2:TOPIC, ros1:TOPIC. Sinks: viewer[:PORT],
+    recording:FOLDER, ros2[:TOPIC], ros1[:TOPIC], openigtlink[:PORT]. A wrong one is answered with
+    its options. docs/live.md has examples.
+
+    Args:
+        model: folder that `train` wrote.
+        source: where frames come from.
+        sinks: where estimates go; any number.
+        range: keep depths between NEAR and FAR mm (default: those that the model has learned).
+        box: keep what lies in a box: two opposite corners X Y Z X Y Z, camera frame, mm.
+        whole: what is in range and box is the organ alone; do not look for it among other things.
+        frame: JSON file that says where the camera is; results are then in the robot's frame.
+        smoothing: time constant in s of a mean over past estimates; the lag is in the report.
+        rescan: every so many s, look for the organ as in a first frame.
+        stale: frames older than so many s are refused, and a pause so long is said.
+        give_up: end after so many s without a frame.
+        seconds: end after so many s; 0: never.
+        report: file for latencies, counts and reasons (default: runs/track-TIME.json).
+        seed: of the random points.
+        device: auto takes CUDA where it is.
+    """
+    from tumortrack.app import live
+
+    live.track(
+        model,
+        source,
+        sinks,
+        live.TrackOptions(
+            range,
+            box,
+            whole,
+            frame,
+            smoothing,
+            rescan,
+            stale,
+            give_up,
+            seconds,
+            report,
+            seed,
+            device,
+        ),
+    )
+
+
 def simulate(
     case: Positional[Path],
     dataset: Positional[Path],
@@ -306,6 +372,7 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "train": train,
     "pretrain": pretrain,
     "locate": locate,
+    "track": track,
     "simulate": simulate,
     "twin": twin,
     "evaluate": evaluate,

@@ -13,7 +13,7 @@ from tumortrack.app.pretraining import start_of
 from tumortrack.app.scenes import SimulateOptions, check_case, write_scenes
 from tumortrack.core import store
 from tumortrack.core.errors import InputError
-from tumortrack.core.types import SensorCloud
+from tumortrack.core.types import Anatomy, SensorCloud
 
 if TYPE_CHECKING:
     from tumortrack.imaging.prepare import PrepareOptions
@@ -125,7 +125,7 @@ def locate(model_folder: Path, source: Path, out: Path, options: LocateOptions) 
     store.check_place(out, "run", options.overwrite)
     model = load_model(model_folder, options.device)
     tracker = Tracker(model)
-    points = _asked(options.map_points, tracker.organ_box_ct, model_folder)
+    points = _asked(options.map_points, tracker.anatomy_ct, model_folder)
     cloud, notes = _observed(model, source, options)
     estimate = tracker.locate(cloud, options.grid, options.seed)
     if points is not None and options.map_points is not None:
@@ -156,21 +156,19 @@ def locate(model_folder: Path, source: Path, out: Path, options: LocateOptions) 
     say(f"written to {out} (camera frame, mm) in {estimate.report['timings']['total']:.2f} s.")
 
 
-def _asked(
-    path: Path | None, organ_box_ct: np.ndarray | None, model_folder: Path
-) -> PointTable | None:
+def _asked(path: Path | None, anatomy_ct: Anatomy | None, model_folder: Path) -> PointTable | None:
     """The points of --map, checked before there is anything to wait for."""
     from tumortrack.track.points import check_near_organ, read_points
 
     if path is None:
         return None
-    if organ_box_ct is None:
+    if anatomy_ct is None:
         raise InputError(
             f"--map: {model_folder} says what is where, but not which point of the CT lies there. "
             "A model of the preset clinic knows: tumortrack train CASE MODEL --preset clinic."
         )
     points = read_points(path)
-    far = check_near_organ(points.points_ct, organ_box_ct, str(path))
+    far = check_near_organ(points.points_ct, anatomy_ct.organ.box_mm, str(path))
     return replace(points, notes=(*points.notes, *far))
 
 

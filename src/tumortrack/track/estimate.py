@@ -4,8 +4,26 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from tumortrack.core.config import Config
+from tumortrack.core.errors import InputError
 from tumortrack.core.motion import Motion
 from tumortrack.core.types import CameraLabels, Mesh, OccupancyCloud
+
+
+class Following(Config, frozen=True, kw_only=True):
+    """How one frame of many is located. ``thorough``: also search as if there were no last
+    estimate, and take what fits better: a search near the last answer alone keeps what was wrong
+    in it. ``smoothing_s``: time constant of the mean over past estimates; 0: none."""
+
+    thorough: bool = False
+    smoothing_s: float = 0.0
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if self.seed < 0:
+            raise InputError(f"the seed is {self.seed}; it must be 0 or more.")
+        if not 0 <= self.smoothing_s <= 5:
+            raise InputError(f"smoothing is {self.smoothing_s:g} s; allowed: 0 (off) to 5 s.")
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,7 +11,7 @@ import threading
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import ClassVar, Literal, Protocol
+from typing import ClassVar, Literal, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, UInt8
@@ -59,6 +59,7 @@ class Seen:
         return self.content.stamp_ns
 
 
+@runtime_checkable
 class Source(Protocol):
     """An open source. ``read`` is called from one thread, ``close`` perhaps from another."""
 
@@ -176,6 +177,7 @@ class Setting:
     controls: Controls = field(default_factory=Controls)
 
 
+@runtime_checkable
 class Sink(Protocol):
     """An open sink. ``publish`` and ``close`` are called from one thread of its own, so it may
     take its time; an error it raises is counted and said, and the loop goes on."""
@@ -187,7 +189,7 @@ class Sink(Protocol):
         ...
 
 
-class SourceConfig(Config, frozen=True, kw_only=True):
+class SourceConfig(Config, frozen=True, kw_only=True, tag_field="kind"):
     """Base of every source's configuration. ``target`` names the field that stands before the
     question mark in ``kind:target?key=value``; empty: the kind has none.
 
@@ -198,7 +200,7 @@ class SourceConfig(Config, frozen=True, kw_only=True):
     target: ClassVar[str] = ""
 
 
-class SinkConfig(Config, frozen=True, kw_only=True):
+class SinkConfig(Config, frozen=True, kw_only=True, tag_field="kind"):
     """Base of every sink's configuration; ``target`` as in ``SourceConfig``. ``waiting``: how many
     updates may wait for it before it loses some; 1: it gets the newest.
 

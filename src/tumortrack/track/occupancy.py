@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
+from dataclasses import replace
+
 import numpy as np
 import torch
 from jaxtyping import Float, Float32
 
 from tumortrack.core.errors import NoEstimate
-from tumortrack.core.types import CameraLabels, OccupancyCloud, SensorCloud
+from tumortrack.core.types import Anatomy, CameraLabels, OccupancyCloud, SensorCloud
 from tumortrack.learn.fit import check_familiar, fit_mm, spread_mm, surface_distances
 from tumortrack.learn.model import Model, has_fast_bfloat16
 from tumortrack.learn.network import Latent, OccupancyNetwork
 from tumortrack.sense.cloud import check_cloud, thin_cloud
-from tumortrack.track.estimate import Estimate
+from tumortrack.track.estimate import Estimate, Following
 from tumortrack.track.report import fit_report, report_head, stage
 from tumortrack.track.volume import (
     dense_margins,
@@ -26,6 +29,8 @@ from tumortrack.track.volume import (
 COARSE_QUERIES = 10_000
 FINE_QUERIES = 40_000
 FEWEST_INSIDE = 20  # of the coarse queries: fewer are no organ
+_LIVE_GRID = 48  # of a live estimate's surfaces: about 2 mm for a kidney
+_LIVE_MARGIN = 0.1  # of the organ's extent: how far it may move from one live frame to the next
 CHUNK = 2048  # queries at once and core: their activations stay in its cache
 
 Box = Float[np.ndarray, "2 3"]
@@ -34,7 +39,7 @@ Box = Float[np.ndarray, "2 3"]
 class OccupancyLocator:
     """Locates by an occupancy network; its estimates have no motion."""
 
-    organ_box_ct: Box | None = None
+    anatomy_ct: Anatomy | None = None
 
     def __init__(self, model: Model) -> None:
         assert isinstance(model.network, OccupancyNetwork)
@@ -51,13 +56,39 @@ class OccupancyLocator:
         can be, then 40,000 in the box of those inside, enlarged.
         """
         rng = np.random.default_rng(seed)
+        return self._located(cloud, None, grid, seed, rng)
+
+    @torch.inference_mode()
+    def follow(self, cloud: SensorCloud, last: Estimate | None, how: Following) -> Estimate:
+        """See ``track.tracker.Tracker.follow``: the last organ's box, enlarged, stands for the
+        coarse queries, and the dense grid that surfaces come from is coarse."""
+        rng = np.random.default_rng((how.seed, cloud.stamp_ns))
+        box = None
+        if last is not None and not how.thorough:
+            low, high = last.cloud.points_mm.min(0), last.cloud.points_mm.max(0)
+            margin = _LIVE_MARGIN * float((high - low).max())
+            box = np.stack([low - margin, high + margin]).astype(float)
+        return replace(self._located(cloud, box, _LIVE_GRID, how.seed, rng), volume=None)
+
+    def warm(self) -> None:
+        """See ``track.tracker.Tracker.warm``."""
+        points = np.random.default_rng(0).normal(0, 15, (self.model.config.scene.cloud.n_points, 3))
+        cloud = SensorCloud(points + [0, 0, 150])
+        with suppress(NoEstimate):  # it is no organ
+            self.follow(cloud, None, Following())
+
+    def _located(
+        self, cloud: SensorCloud, box: Box | None, grid: int, seed: int, rng: np.random.Generator
+    ) -> Estimate:
+        """``box``: where the organ can lie; found out where it is None."""
         seconds: dict[str, float] = {}
         check_cloud(cloud)
         thinned = thin_cloud(cloud, self.model.config.scene.cloud.n_points, rng)
         with stage(seconds, "encode", self._device):
             latent = self._encode(thinned)
-        with stage(seconds, "coarse", self._device):
-            box = self._coarse_box(latent, cloud, rng)
+        if box is None:
+            with stage(seconds, "coarse", self._device):
+                box = self._coarse_box(latent, cloud, rng)
         with stage(seconds, "fit", self._device):
             distances = surface_distances(
                 lambda points: self._logits(latent, points), box, thinned.points_mm
@@ -66,6 +97,8 @@ class OccupancyLocator:
             check_familiar(self.model.familiar, spread, fit_mm(distances))
         with stage(seconds, "fine", self._device):
             inside = self._fine(latent, box, cloud.stamp_ns, rng)
+            if len(inside.points_mm) < FEWEST_INSIDE:
+                raise NoEstimate("no organ was found: it has left the place where it was.")
         with stage(seconds, "volume", self._device):
             camera_from_index, shape = grid_over(inside.points_mm, grid)
             margins, found = dense_margins(
@@ -77,7 +110,8 @@ class OccupancyLocator:
             meshes = part_surfaces(margins, labels, camera_from_index, self.model.parts)
         volume = CameraLabels(labels, camera_from_index)
         report = {
-            **report_head(cloud, seed, camera_from_index),
+            **report_head(cloud, seed),
+            "voxel_mm": float(camera_from_index[0, 0]),
             "fit_mm": fit_report(distances),
             "parts": describe_parts(self.model.parts, meshes, inside),
             "timings": {**seconds, "total": sum(seconds.values())},

@@ -8,15 +8,13 @@ from contextlib import contextmanager
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float64
+from jaxtyping import Float
 
 import tumortrack
 from tumortrack.core.types import SensorCloud
 
 
-def report_head(
-    cloud: SensorCloud, seed: int, camera_from_index: Float64[np.ndarray, "4 4"]
-) -> dict:
+def report_head(cloud: SensorCloud, seed: int) -> dict:
     """The first entries of report.json."""
     return {
         "tumortrack": tumortrack.__version__,
@@ -25,7 +23,6 @@ def report_head(
         "stamp_ns": cloud.stamp_ns,
         "seed": seed,
         "points": len(cloud.points_mm),
-        "voxel_mm": float(camera_from_index[0, 0]),
     }
 
 

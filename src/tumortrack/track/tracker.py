@@ -2,27 +2,30 @@
 
 from __future__ import annotations
 
-from typing import Protocol
-
-import numpy as np
-from jaxtyping import Float
+from typing import Protocol, runtime_checkable
 
 from tumortrack.core.errors import InputError
-from tumortrack.core.types import SensorCloud
+from tumortrack.core.types import Anatomy, SensorCloud
 from tumortrack.learn.model import Model
-from tumortrack.track.estimate import Estimate
+from tumortrack.track.estimate import Estimate, Following
 from tumortrack.track.occupancy import OccupancyLocator
 from tumortrack.track.warp import WarpLocator
 
 LARGEST_GRID = 400
+_ALONE = Following()
 
 
+@runtime_checkable
 class Locator(Protocol):
     """One kind of model at work."""
 
-    organ_box_ct: Float[np.ndarray, "2 3"] | None
+    anatomy_ct: Anatomy | None
 
     def locate(self, cloud: SensorCloud, grid: int, seed: int) -> Estimate: ...
+
+    def follow(self, cloud: SensorCloud, last: Estimate | None, how: Following) -> Estimate: ...
+
+    def warm(self) -> None: ...
 
 
 class Tracker:
@@ -35,10 +38,10 @@ class Tracker:
         )
 
     @property
-    def organ_box_ct(self) -> Float[np.ndarray, "2 3"] | None:
-        """The organ's box in the CT (LPS, mm: lower and upper corner) if this model's estimates
-        have a motion; None for models that know no correspondences."""
-        return self._locator.organ_box_ct
+    def anatomy_ct(self) -> Anatomy | None:
+        """The organ in the CT (LPS, mm) if this model's estimates have a motion; None for models
+        that know no correspondences."""
+        return self._locator.anatomy_ct
 
     def locate(self, cloud: SensorCloud, grid: int = 160, seed: int = 0) -> Estimate:
         """Everything about one cloud; the same cloud and seed give the same answer.
@@ -52,3 +55,24 @@ class Tracker:
         if seed < 0:
             raise InputError(f"the seed is {seed}; it must be 0 or more.")
         return self._locator.locate(cloud, grid, seed)
+
+    def follow(
+        self, cloud: SensorCloud, last: Estimate | None = None, how: Following = _ALONE
+    ) -> Estimate:
+        """The same, fast, for one frame of many: no volume, and a search that starts at the
+        ``last`` estimate, if there is one a moment old.
+
+        Raises:
+            NoEstimate: as ``locate``.
+            InputError: the cloud is in metres; smoothing, where the model knows no motion.
+        """
+        if how.smoothing_s > 0 and self.anatomy_ct is None:
+            raise InputError(
+                "smoothing needs a motion, which models of the presets quick and paper do not "
+                "know. Train with --preset clinic, or leave smoothing out."
+            )
+        return self._locator.follow(cloud, last, how)
+
+    def warm(self) -> None:
+        """Load and compile what ``follow`` needs, which its first call would otherwise wait for."""
+        self._locator.warm()

@@ -2,26 +2,42 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+import math
+from dataclasses import dataclass, replace
 
+import msgspec
 import numpy as np
-from jaxtyping import Float, Float32
+from jaxtyping import Bool, Float, Float32, Int, UInt8
 
 from tumortrack.core.types import Anatomy, CameraLabels, Mesh, OccupancyCloud, SensorCloud
 from tumortrack.imaging.raster import label_grid
 from tumortrack.learn.fit import check_familiar, check_likely, fit_mm, spread_mm
 from tumortrack.learn.model import Model
 from tumortrack.learn.warp.locate import best_fit, first_motions
-from tumortrack.learn.warp.motion import WarpMotion
+from tumortrack.learn.warp.motion import WarpMotion, blend
 from tumortrack.learn.warp.network import WarpNetwork
+from tumortrack.learn.warp.refine import Refined, refine
 from tumortrack.sense.cloud import check_cloud, thin_cloud
-from tumortrack.track.estimate import Estimate
+from tumortrack.track.estimate import Estimate, Following
 from tumortrack.track.report import fit_report, report_head, stage
 from tumortrack.track.volume import describe_parts, grid_over
 
 QUERIES = 40_000  # as many as the paper asks
+CARRIED = 20_000  # points of the undeformed organ that live estimates carry along
 _KNOWN_AT = 256  # places where the uncertainty is worked out; others take the nearest's
 _FIELD_MM = 0.3  # error of the distance fields and surfaces themselves
+_MOVED_MM = 2.5  # from one live frame to the next: more is found again from the start
+
+
+@dataclass(frozen=True, eq=False)
+class _Inside:
+    """Points of the undeformed organ: where (CT, mm), label, distance to the nearest surface that
+    bounds it, and which place of known uncertainty is nearest."""
+
+    points_ct: Float32[np.ndarray, "n 3"]
+    labels: UInt8[np.ndarray, " n"]
+    margin_mm: Float32[np.ndarray, " n"]
+    known: Int[np.ndarray, " n"]
 
 
 class WarpLocator:
@@ -36,42 +52,116 @@ class WarpLocator:
         self._model, self._network, self._shape = model, model.network, model.shape
         self._trust = model.trust
         self._device = next(model.network.parameters()).device
+        self._near = msgspec.structs.replace(model.config.refine, first_mm=_MOVED_MM)
         organ = model.shape.anatomy_ct.organ
-        self.organ_box_ct: Float[np.ndarray, "2 3"] | None = organ.box_mm
+        self.anatomy_ct: Anatomy | None = model.shape.anatomy_ct
         few = max(1, len(organ.vertices_mm) // (_KNOWN_AT // 2))
         inner = [part.vertices_mm for part in model.shape.anatomy_ct.tumors]
         self._known_ct = np.concatenate(
             [organ.vertices_mm[::few], *(v[:: max(1, len(v) // 64)] for v in inner)]
         )
         self._nearest_known = cKDTree(self._known_ct)
+        self._carried: _Inside | None = None
 
     def locate(self, cloud: SensorCloud, grid: int, seed: int) -> Estimate:
         """See ``track.tracker.Tracker.locate``."""
         rng = np.random.default_rng(seed)
         seconds: dict[str, float] = {}
-        check_cloud(cloud)
-        points = thin_cloud(cloud, self._model.config.scene.cloud.n_points, rng).points_mm
+        points = self._thinned(cloud, rng)
         with stage(seconds, "encode", self._device):
             starts = first_motions(self._network, self._shape, points)
         with stage(seconds, "refine", self._device):
             refine, usual_cost = self._model.config.refine, self._trust.usual_cost
             fit = best_fit(self._shape, points, starts, refine, usual_cost)
-            distances = np.abs(fit.distances_mm)
-            check_familiar(self._model.familiar, spread_mm(points), fit_mm(distances))
-            check_likely(fit.motion.rarity)
+        motion, meshes = self._placed(points, fit, seconds)
+        organ = meshes[self._model.parts[0]]
+        with stage(seconds, "fine", self._device):
+            inside = self._asked(motion, organ, cloud.stamp_ns, rng)
+        with stage(seconds, "volume", self._device):
+            camera_from_index, shape = grid_over(organ.vertices_mm, grid)
+            anatomy = Anatomy(tuple(meshes.values()))
+            labels = label_grid(anatomy, camera_from_index, shape)
+        head = report_head(cloud, seed)
+        head["voxel_mm"] = float(camera_from_index[0, 0])
+        report = self._report(head, fit, motion, meshes, inside, seconds)
+        return Estimate(inside, CameraLabels(labels, camera_from_index), meshes, report, motion)
+
+    def follow(self, cloud: SensorCloud, last: Estimate | None, how: Following) -> Estimate:
+        """See ``track.tracker.Tracker.follow``."""
+        rng = np.random.default_rng((how.seed, cloud.stamp_ns))
+        seconds: dict[str, float] = {}
+        points = self._thinned(cloud, rng)
+        before = last.motion if last is not None else None
+        usual, fits = self._trust.usual_cost, []
+        if isinstance(before, WarpMotion):
+            with stage(seconds, "follow", self._device):
+                fits.append(refine(self._shape, points, before, self._near))
+        if not fits or how.thorough or fits[0].cost > usual:
+            with stage(seconds, "encode", self._device):
+                starts = first_motions(self._network, self._shape, points)
+            with stage(seconds, "refine", self._device):
+                enough = usual if how.thorough or not fits else np.inf
+                config = self._model.config.refine
+                fits.append(best_fit(self._shape, points, starts, config, enough))
+        fit = min(fits, key=lambda fit: fit.cost)
+        lag_s = 0.0
+        if isinstance(before, WarpMotion) and last is not None and how.smoothing_s > 0:
+            past_s = (cloud.stamp_ns - last.cloud.stamp_ns) * 1e-9
+            share = -math.expm1(-past_s / how.smoothing_s)
+            fit = replace(fit, motion=blend(before, fit.motion, share))
+            lag_s = past_s * (1 - share) / share  # of what moves steadily
+        motion, meshes = self._placed(points, fit, seconds)
+        with stage(seconds, "carry", self._device):
+            inside = self._carry(motion, cloud.stamp_ns)
+        head = report_head(cloud, how.seed)
+        report = self._report(head, fit, motion, meshes, inside, seconds)
+        report["smoothing"] = {"time_s": how.smoothing_s, "lag_ms": 1000 * lag_s}
+        return Estimate(inside, None, meshes, report, motion)
+
+    def warm(self) -> None:
+        """See ``track.tracker.Tracker.warm``."""
+        rest = WarpMotion(
+            self._shape, np.eye(3), np.array([0.0, 0.0, 150.0]), self._shape.body.mean
+        )
+        cloud = SensorCloud(rest.carry(self._shape.anatomy_ct.organ.vertices_mm))
+        points = self._thinned(cloud, np.random.default_rng(0))
+        first_motions(self._network, self._shape, points)
+        motion = refine(self._shape, points, rest, self._near).motion
+        motion.carry(self._known_ct)
+        self._carry(motion, 0)
+
+    def _thinned(self, cloud: SensorCloud, rng: np.random.Generator) -> Float32[np.ndarray, "n 3"]:
+        check_cloud(cloud)
+        return thin_cloud(cloud, self._model.config.scene.cloud.n_points, rng).points_mm
+
+    def _placed(
+        self, points: Float32[np.ndarray, "n 3"], fit: Refined, seconds: dict[str, float]
+    ) -> tuple[WarpMotion, dict[str, Mesh]]:
+        """The motion of a fit that can be this organ's, and the surfaces it moves."""
+        check_familiar(self._model.familiar, spread_mm(points), fit_mm(np.abs(fit.distances_mm)))
+        check_likely(fit.motion.rarity)
         with stage(seconds, "surfaces", self._device):
             motion = replace(fit.motion, std_scale=self._trust.std_scale)
-            parts = self._shape.anatomy_ct.parts
-            moved = Anatomy(tuple(part.moved(motion.carry(part.vertices_mm)) for part in parts))
-        with stage(seconds, "fine", self._device):
-            inside = self._asked(motion, moved.organ, cloud.stamp_ns, rng)
-        with stage(seconds, "volume", self._device):
-            camera_from_index, shape = grid_over(moved.organ.vertices_mm, grid)
-            labels = label_grid(moved, camera_from_index, shape)
-        meshes = dict(zip(moved.names, moved.parts, strict=True))
-        report = {
-            **report_head(cloud, seed, camera_from_index),
-            "fit_mm": fit_report(distances),
+            anatomy = self._shape.anatomy_ct
+            meshes = {
+                name: part.moved(motion.carry(part.vertices_mm))
+                for name, part in zip(anatomy.names, anatomy.parts, strict=True)
+            }
+        return motion, meshes
+
+    def _report(
+        self,
+        head: dict,
+        fit: Refined,
+        motion: WarpMotion,
+        meshes: dict[str, Mesh],
+        inside: OccupancyCloud,
+        seconds: dict[str, float],
+    ) -> dict:
+        return {
+            **head,
+            "fit_mm": fit_report(np.abs(fit.distances_mm)),
+            "fit_cost": {"now": fit.cost, "usual": self._trust.usual_cost},
             "parts": self._described(motion, meshes, inside),
             "motion": {
                 "camera_from_ct": motion.camera_from_ct.tolist(),
@@ -81,31 +171,48 @@ class WarpLocator:
             },
             "timings": {**seconds, "total": sum(seconds.values())},
         }
-        volume = CameraLabels(labels, camera_from_index)
-        return Estimate(inside, volume, meshes, report, motion)
 
     def _asked(
         self, motion: WarpMotion, organ: Mesh, stamp_ns: int, rng: np.random.Generator
     ) -> OccupancyCloud:
-        """Random points of the organ's box that lie inside, with label and probability: that the
-        nearest surface does not lie on the point's other side, errors being normal."""
-        from scipy.special import ndtr
-
+        """Random points of the organ's box that lie inside, with label and probability."""
         lower, upper = organ.box_mm
         points = rng.uniform(lower, upper, (QUERIES, 3)).astype(np.float32)
-        points_ct = motion.back(points).astype(np.float32)
+        inside, mine = self._inside(motion.back(points).astype(np.float32))
+        return OccupancyCloud(
+            points[inside], mine.labels, self._probability(motion, mine), stamp_ns
+        )
+
+    def _carry(self, motion: WarpMotion, stamp_ns: int) -> OccupancyCloud:
+        """The same points of the organ in every frame: labels stay, places and probabilities are
+        new."""
+        if self._carried is None:
+            lower, upper = self._shape.anatomy_ct.organ.box_mm
+            rng, found = np.random.default_rng(0), np.zeros((0, 3), np.float32)
+            while len(found) < CARRIED:
+                points = rng.uniform(lower, upper, (CARRIED, 3)).astype(np.float32)
+                found = np.concatenate([found, points[self._shape.labels_at(points)[0] > 0]])
+            self._carried = self._inside(found[:CARRIED])[1]
+        mine = self._carried
+        places = motion.carry(mine.points_ct).astype(np.float32)
+        return OccupancyCloud(places, mine.labels, self._probability(motion, mine), stamp_ns)
+
+    def _inside(
+        self, points_ct: Float32[np.ndarray, "n 3"]
+    ) -> tuple[Bool[np.ndarray, " n"], _Inside]:
+        """Which points lie inside, and what is known of those."""
         labels, margin_mm = self._shape.labels_at(points_ct)
         inside = labels > 0
-        deviation = np.hypot(self._std_near(motion, points_ct[inside]), _FIELD_MM)
-        probability = ndtr(margin_mm[inside] / deviation)
-        return OccupancyCloud(points[inside], labels[inside], probability, stamp_ns)
+        known = self._nearest_known.query(points_ct[inside])[1]
+        return inside, _Inside(points_ct[inside], labels[inside], margin_mm[inside], known)
 
-    def _std_near(
-        self, motion: WarpMotion, points_ct: Float32[np.ndarray, "n 3"]
-    ) -> Float[np.ndarray, " n"]:
+    def _probability(self, motion: WarpMotion, mine: _Inside) -> Float[np.ndarray, " n"]:
+        """That the nearest surface does not lie on a point's other side, errors being normal."""
+        from scipy.special import ndtr
+
         deviation = motion.std_mm(self._known_ct)
         assert deviation is not None
-        return deviation[self._nearest_known.query(points_ct)[1]]
+        return ndtr(mine.margin_mm / np.hypot(deviation, _FIELD_MM)[mine.known])
 
     def _described(
         self, motion: WarpMotion, meshes: dict[str, Mesh], inside: OccupancyCloud

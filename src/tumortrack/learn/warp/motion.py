@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float, Float64
+from scipy.spatial.transform import Rotation
 
 from tumortrack.learn.warp.shape import Shape
 
@@ -83,3 +84,15 @@ class WarpMotion:
     def _root(self) -> Float64[np.ndarray, "p p"]:
         assert self.covariance is not None
         return np.linalg.cholesky(self.covariance)
+
+
+def blend(a: WarpMotion, b: WarpMotion, share: float) -> WarpMotion:
+    """Between two motions of one shape: ``share`` 0 is at ``a``, 1 at ``b``, whose covariance it
+    keeps."""
+    turn = Rotation.from_matrix(a.rotation.T @ b.rotation).as_rotvec()
+    return replace(
+        b,
+        rotation=a.rotation @ Rotation.from_rotvec(share * turn).as_matrix(),
+        centre_mm=(1 - share) * a.centre_mm + share * b.centre_mm,
+        coefficients=(1 - share) * a.coefficients + share * b.coefficients,
+    )

@@ -1,0 +1,262 @@
+"""`tumortrack track`: source -> loop -> sinks, and what the user sees of it."""
+
+from __future__ import annotations
+
+import signal
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+from tumortrack.app.console import console, say
+from tumortrack.core import store
+from tumortrack.core.config import to_builtins
+from tumortrack.core.errors import InputError
+
+if TYPE_CHECKING:
+    from tumortrack.learn.config import TrainConfig
+    from tumortrack.sense.region import RegionConfig
+    from tumortrack.track.live import Setting, SinkConfig, Update
+    from tumortrack.track.loop import Loop, LoopConfig
+    from tumortrack.track.outlet import Outlet
+    from tumortrack.track.reader import Reader
+
+_SAY_S, _SAY_PLAIN_S = 1.0, 5.0  # between two lines of state: on a terminal, in a file
+_STORE_S = 10.0  # between two writings of the report: kill -9 loses no more
+
+
+@dataclass(frozen=True)
+class TrackOptions:
+    range_mm: tuple[float, float] | None = None
+    box_mm: tuple[float, float, float, float, float, float] | None = None
+    whole: bool = False
+    frame: Path | None = None
+    smoothing_s: float = 0.0
+    rescan_s: float = 1.0
+    stale_s: float = 0.5
+    give_up_s: float = 60.0
+    seconds: float = 0.0
+    report: Path | None = None
+    seed: int = 0
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+
+
+def track(model_folder: Path, source: str, sinks: tuple[str, ...], options: TrackOptions) -> None:
+    """Runs until the source ends, the time is up, or Ctrl-C."""
+    from tumortrack.learn.model import load_model
+    from tumortrack.track.frames import read_frames
+    from tumortrack.track.live import Controls, Frames, Setting
+    from tumortrack.track.loop import Loop
+    from tumortrack.track.reader import Reader
+    from tumortrack.track.sinks import SINKS
+    from tumortrack.track.sources import SOURCES
+    from tumortrack.track.spec import parse_spec
+    from tumortrack.track.tracker import Tracker
+
+    source_config = parse_spec(source, SOURCES, "source")
+    sink_configs = [parse_spec(sink, SINKS, "sink") for sink in sinks]
+    if doubled := sorted({sink for sink in sinks if sinks.count(sink) > 1}):
+        raise InputError(f"sink {doubled[0]!r} is given twice.")
+    frames = read_frames(options.frame) if options.frame else Frames()
+    report = _place_of_report(options.report)
+    model = load_model(model_folder, options.device)
+    config = _loop_config(model.config, options)
+    tracker = Tracker(model)
+    setting = Setting(model.parts, frames, tracker.anatomy_ct, Controls())
+    loop = Loop(tracker, setting, config)
+    about = {
+        "model": model.provenance,
+        "model_sha256": store.sha256_of(model_folder / store.MANIFEST),
+        "source": source,
+        "sinks": list(sinks),
+        "config": to_builtins(config),
+        "frame": {
+            "frame_id": frames.frame_id,
+            "published_from_camera": frames.published_from_camera.tolist(),
+        },
+    }
+    say("warming up ...")
+    loop.warm()
+    with ExitStack() as stack:
+        screen = _Screen(loop, report, about)
+        stack.callback(screen.end)  # last of all: when every sink has closed
+        outlets = [
+            _open(spec, sink, setting, stack)
+            for spec, sink in zip(sinks, sink_configs, strict=True)
+        ]
+        reader = Reader(source_config.open)
+        stack.callback(reader.close)
+        screen.watch(reader, outlets)
+        stack.enter_context(_stopping(loop))
+        say(f"tracking {source} in frame {frames.frame_id!r}; Ctrl-C ends it.")
+        loop.run(reader, outlets, screen.show)
+
+
+def _open(spec: str, config: SinkConfig, setting: Setting, stack: ExitStack) -> Outlet:
+    from tumortrack.track.outlet import Outlet
+
+    outlet = Outlet(spec, config.open(setting), config.waiting)  # type: ignore[attr-defined]
+    stack.callback(outlet.close)
+    return outlet
+
+
+def _loop_config(trained: TrainConfig, options: TrackOptions) -> LoopConfig:
+    from tumortrack.track.follower import FollowerConfig
+    from tumortrack.track.loop import LoopConfig
+
+    return LoopConfig(
+        region=_region(trained, options),
+        follower=FollowerConfig(
+            rescan_s=options.rescan_s, smoothing_s=options.smoothing_s, seed=options.seed
+        ),
+        stale_s=options.stale_s,
+        give_up_s=options.give_up_s,
+        seconds=options.seconds,
+    )
+
+
+def _region(trained: TrainConfig, options: TrackOptions) -> RegionConfig:
+    """Depths that training showed, unless the user says others; where it showed any distance, its
+    farthest organ still lies in them whole."""
+    from tumortrack.sense.cloud import CloudConfig
+    from tumortrack.sense.region import RegionConfig
+
+    scene = trained.scene
+    near, far = scene.cloud.near_mm, scene.cloud.far_mm
+    if scene.free_range > 0:
+        nearest, farthest = scene.free_nearest_mm
+        near, far = min(near, nearest - 5), max(far, farthest + far - near)
+    if options.range_mm is not None:
+        near, far = options.range_mm
+    crop = CloudConfig(near_mm=near, far_mm=far, n_points=scene.cloud.n_points)
+    box = None
+    if options.box_mm is not None:
+        ax, ay, az, bx, by, bz = options.box_mm
+        box = ((ax, ay, az), (bx, by, bz))
+    if options.whole:
+        return RegionConfig(crop=crop, box_mm=box, plane=False, flying=False, pieces=False)
+    return RegionConfig(crop=crop, box_mm=box)
+
+
+def _place_of_report(path: Path | None) -> Path:
+    if path is None:
+        path = Path("runs") / f"track-{datetime.now(UTC):%Y%m%dT%H%M%SZ}.json"
+    elif path.exists():
+        raise InputError(f"{path} exists already. Choose another file for --report.")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"--report {path}: {error.strerror}.") from error
+    return path
+
+
+@contextmanager
+def _stopping(loop: Loop) -> Iterator[None]:
+    """Ctrl-C and SIGTERM end the loop after the frame it is at; a second Ctrl-C interrupts."""
+
+    def stop(number: int, _: object) -> None:
+        loop.stop()
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+
+    before = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+class _Screen:
+    """One line of state now and then, every change of quality, and the report."""
+
+    def __init__(self, loop: Loop, report: Path, about: dict) -> None:
+        self._loop, self._report, self._about = loop, report, about
+        self._reader: Reader | None = None
+        self._outlets: list[Outlet] = []
+        self._started = self._said = self._stored = time.monotonic()
+        self._before = 0
+        self._state = ""
+        self._errors: dict[str, str] = {}
+        self._start_mb = _resident_mb()
+
+    def watch(self, reader: Reader, outlets: list[Outlet]) -> None:
+        """From here on there is something to show."""
+        self._reader, self._outlets = reader, outlets
+
+    def show(self, update: Update) -> None:
+        """Called with every update."""
+        state = update.reason or update.warning or "good"
+        kind = "".join(c for c in state if not c.isdigit())
+        if kind != self._state:
+            self._state = kind
+            say(f"{update.quality}: {state}")
+        for outlet in self._outlets:
+            if outlet.failing and self._errors.get(outlet.name) != outlet.error:
+                self._errors[outlet.name] = outlet.error
+                say(f"sink {outlet.name}: {outlet.error}")
+        reader = self._reader
+        assert reader is not None
+        now = time.monotonic()
+        every_s = _SAY_S if console.is_terminal else _SAY_PLAIN_S
+        if now - self._said >= every_s:
+            self._line(now, reader)
+        if now - self._stored >= _STORE_S:
+            self._store(reader)
+
+    def end(self) -> None:
+        """The last lines."""
+        reader, loop = self._reader, self._loop
+        if reader is None:
+            return  # nothing was tracked: a sink could not be opened
+        self._store(reader)
+        estimates = loop.counts["good"] + loop.counts["poor"]
+        say(
+            f"{estimates} estimates ({loop.counts['poor']} poor), {loop.counts['none']} times none, "
+            f"{reader.dropped} frames dropped."
+        )
+        if len(loop.latency):
+            times = loop.latency.summary()
+            since = "stamp" if reader.host_clock else "arrival"
+            say(
+                f"latency from {since} to published estimate: p50 {times['p50']:.1f}, "
+                f"p95 {times['p95']:.1f}, p99.9 {times['p99.9']:.1f} ms."
+            )
+        say(f"written to {self._report}.")
+
+    def _line(self, now: float, reader: Reader) -> None:
+        total = sum(self._loop.counts.values())
+        rate = (total - self._before) / (now - self._said)
+        self._before, self._said = total, now
+        latency = self._loop.latency
+        say(
+            f"{now - self._started:6.0f} s  {rate:5.1f} updates/s  latency p50 "
+            f"{latency.percentile(50):.1f} p95 {latency.percentile(95):.1f} ms  "
+            f"dropped {reader.dropped}  {_resident_mb():.0f} MB"
+        )
+
+    def _store(self, reader: Reader) -> None:
+        from tumortrack.track.loop import summary
+
+        self._stored = time.monotonic()
+        memory = {"start": round(self._start_mb, 1), "now": round(_resident_mb(), 1)}
+        content = {
+            **self._about,
+            "seconds": round(self._stored - self._started, 2),
+            "memory_mb": memory,
+            **summary(self._loop, reader, self._outlets),
+        }
+        store.write_json(self._report, content)
+
+
+def _resident_mb() -> float:
+    """Memory of this process now, or where the system does not say: its greatest so far."""
+    import resource
+
+    try:
+        pages = int(Path("/proc/self/statm").read_text().split()[1])
+    except OSError:
+        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    return pages * resource.getpagesize() / 2**20
