@@ -1,0 +1,179 @@
+"""Depth images or clouds of a ROS 1 graph, through rospy."""
+
+from __future__ import annotations
+
+import time
+from typing import Any, ClassVar
+
+import numpy as np
+
+from tumortrack.core.errors import InputError
+from tumortrack.core.types import DepthFrame
+from tumortrack.track.live import Seen, SourceConfig, SourceLost
+from tumortrack.track.ros import incoming, rospy_node
+from tumortrack.track.ros.messages import Messages, stamp_of
+from tumortrack.track.ros.newest import Newest, Raw
+
+_BUFFER = 2**21  # bytes taken from the socket at once: a cloud in one go
+_ALIVE_S = 1.0  # without a frame for so long: the master is asked
+_MASK_AGE_NS = 500_000_000  # a mask that is older than its frame by more shows another place
+
+
+class Ros1(SourceConfig, frozen=True, kw_only=True, tag="ros1"):
+    """A PointCloud2, or a depth Image with its CameraInfo; the master says which.
+
+    Attributes:
+        topic: of the cloud or the depth image.
+        info: of the CameraInfo; empty: ``camera_info`` beside the image's topic.
+        mask: of an image that is not 0 where the organ may be; empty: there is none.
+        rectified: the depth image is a rectified one, its camera is the CameraInfo's P.
+        unit_mm: of one step of a 16-bit depth image.
+        host_clock: stamps are of this machine's clock, or one that is kept equal to it. Where
+            ``/use_sim_time`` is set they are not.
+    """
+
+    target: ClassVar[str] = "topic"
+
+    topic: str
+    info: str = ""
+    mask: str = ""
+    rectified: bool = False
+    unit_mm: float = 1.0
+    host_clock: bool = True
+
+    def __post_init__(self) -> None:
+        rospy_node.check_name(self.topic)
+        for name in filter(None, (self.info, self.mask)):
+            rospy_node.check_name(name)
+        if not 0 < self.unit_mm <= 1000:
+            raise InputError(f"ros1: unit_mm is {self.unit_mm:g}; it must lie in 0..1000 mm.")
+
+    def open(self) -> Ros1Source:
+        """Subscribe.
+
+        Raises:
+            SourceLost: no master, or nobody publishes the topic.
+            InputError: no rospy; the topic is neither cloud nor image.
+        """
+        node = rospy_node.node()
+        topic = node.resolved(self.topic)
+        kind = _kind_of(node.master, topic)
+        if self.mask and kind == incoming.CLOUD:
+            raise InputError(f"ros1: a mask needs a depth image, and {topic} is a cloud.")
+        return Ros1Source(self, node, topic, kind)
+
+
+class Ros1Source:
+    """An open subscription. Each frame is taken as it comes; read or not, the next replaces it."""
+
+    waits = False
+
+    def __init__(self, config: Ros1, node: rospy_node.Node, topic: str, kind: str) -> None:
+        self.host_clock = config.host_clock and not node.master.simulated_time()
+        self._config, self._node, self._topic, self._kind = config, node, topic, kind
+        self._messages = Messages("noetic")
+        self._frames, self._infos, self._masks = Newest(), Newest(), Newest()
+        self._heard_s = time.monotonic()
+        wanted = [(topic, self._frames)]
+        if kind == incoming.IMAGE:
+            self._info = node.resolved(config.info or topic.rpartition("/")[0] + "/camera_info")
+            wanted.insert(0, (self._info, self._infos))
+        if config.mask:
+            wanted.insert(0, (node.resolved(config.mask), self._masks))
+        self._subscribers = [self._subscribe(name, newest) for name, newest in wanted]
+
+    @property
+    def dropped(self) -> int:
+        return self._frames.replaced
+
+    def read(self, timeout_s: float) -> Seen | None:
+        """The newest frame, as ``Source`` says; lost when nothing comes and the master is gone or
+        was started anew. Frames go from node to node: with the master gone they may still come.
+        """
+        until_s = time.monotonic() + timeout_s
+        raw = self._frames.take(timeout_s)
+        if raw is None:
+            self._check_alive()
+            return None
+        self._heard_s = time.monotonic()
+        if self._kind == incoming.CLOUD:
+            return Seen(incoming.cloud_of(self._parsed(raw, incoming.CLOUD)), raw.arrived_ns)
+        frame = self._depth(raw, until_s)
+        return Seen(frame, raw.arrived_ns, self._mask_for(frame))
+
+    def close(self) -> None:
+        """Unsubscribe."""
+        for one in self._subscribers:
+            one.unregister()
+        for newest in (self._frames, self._infos, self._masks):
+            newest.close()
+
+    def _subscribe(self, topic: str, newest: Newest) -> Any:
+        rospy = self._node.rospy
+
+        def came(message: Any) -> None:
+            kind = rospy_node.full_type(message._connection_header["type"])
+            newest.put(topic, kind, message._buff)
+
+        return rospy.Subscriber(topic, rospy.AnyMsg, came, buff_size=_BUFFER, tcp_nodelay=True)
+
+    def _parsed(self, raw: Raw, expected: str) -> Any:
+        if raw.kind != expected:
+            raise InputError(f"on {raw.topic} came a {raw.kind}; it must be {expected}.")
+        return self._messages.from_bytes(raw.content, expected)
+
+    def _depth(self, raw: Raw, until_s: float) -> DepthFrame:
+        info = self._infos.latest(until_s - time.monotonic())
+        if info is None:
+            raise InputError(
+                f"no camera_info came on {self._info} so far. Name its topic: "
+                f"ros1:{self._config.topic}?info=/.../camera_info."
+            )
+        return incoming.depth_of(
+            self._parsed(raw, incoming.IMAGE),
+            self._parsed(info, incoming.CAMERA_INFO),
+            self._config.rectified,
+            self._config.unit_mm,
+        )
+
+    def _mask_for(self, frame: DepthFrame) -> np.ndarray | None:
+        if not self._config.mask:
+            return None
+        raw = self._masks.latest(0.0)
+        if raw is None:
+            raise InputError(f"no mask came on {self._config.mask} so far.")
+        image = self._parsed(raw, incoming.IMAGE)
+        mask, age_ns = incoming.mask_of(image), frame.stamp_ns - stamp_of(image.header)
+        if mask.shape != frame.depth_mm.shape:
+            raise InputError(
+                f"a mask of {mask.shape[1]} x {mask.shape[0]} pixels came for depth images of "
+                f"{frame.intrinsics.width} x {frame.intrinsics.height}; they must be of one size."
+            )
+        if abs(age_ns) > _MASK_AGE_NS:
+            raise InputError(
+                f"the newest mask on {self._config.mask} is {age_ns * 1e-9:.2f} s older than the "
+                f"frame; allowed: {_MASK_AGE_NS * 1e-9:g} s."
+            )
+        return mask
+
+    def _check_alive(self) -> None:
+        if time.monotonic() - self._heard_s < _ALIVE_S:
+            return
+        self._heard_s = time.monotonic()
+        if not self._node.listens(self._topic):
+            raise SourceLost("the ROS master was started anew; the topic is subscribed to again")
+
+
+def _kind_of(master: rospy_node.Master, topic: str) -> str:
+    types = {name: rospy_node.full_type(kind) for name, kind in master.types().items()}
+    usable = {name for name, kind in types.items() if kind in (incoming.CLOUD, incoming.IMAGE)}
+    published = master.published()
+    if topic not in published:
+        there = ", ".join(sorted(usable & published)[:12]) or "none"
+        raise SourceLost(f"nobody publishes {topic} at {master.uri}. Clouds and images: {there}.")
+    kind = types.get(topic, "*")
+    if kind not in (incoming.CLOUD, incoming.IMAGE):
+        raise InputError(
+            f"{topic} is a {kind}; it must be {incoming.CLOUD} or a depth {incoming.IMAGE}."
+        )
+    return kind
