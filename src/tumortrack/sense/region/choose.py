@@ -3,12 +3,14 @@ and what continues it behind something nearer."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numba
 import numpy as np
 
 from tumortrack.core.errors import NoEstimate
 from tumortrack.sense.region.config import RegionConfig
-from tumortrack.sense.region.picture import Picture
+from tumortrack.sense.region.picture import BOX, LAST_BOX, Picture
 
 PICK_REACH_MM = 10.0  # from the picked point to the piece it means
 _STEEPEST_GAP = 0.5  # slope of a surface behind what hides part of it
@@ -36,22 +38,42 @@ def under_point(picture: Picture, pieces: np.ndarray, point_mm: np.ndarray) -> i
 
 
 def under_box(
-    picture: Picture, pieces: np.ndarray, count: int, corners_mm: np.ndarray
+    picture: Picture, pieces: np.ndarray, these: Sizes, corners_mm: np.ndarray
 ) -> int | None:
     """The piece with the most surface in a box (2, 3); None if none has any."""
     low, high = np.sort(np.asarray(corners_mm, np.float64), axis=0)
-    area = _area_inside(picture.depth_mm, pieces, picture.pinhole, low, high, count)
+    area = _area_inside(picture.depth_mm, pieces, picture.pinhole, low, high, len(these.cut))
     return int(area.argmax()) if area.max() > 0 else None
 
 
-def likeliest(picture: Picture, pieces: np.ndarray, count: int, config: RegionConfig) -> int | None:
+@dataclass(frozen=True, eq=False)
+class Sizes:
+    """Of every piece (count + 1,): ``area_mm2`` across the line of sight, longest extent
+    ``wide_mm``, and ``cut``: how much of it goes on outside what is looked at, as the width there
+    over the square root of the area, 0..1."""
+
+    area_mm2: np.ndarray
+    wide_mm: np.ndarray
+    cut: np.ndarray
+
+
+def sizes(picture: Picture, pieces: np.ndarray, count: int) -> Sizes:
+    return Sizes(*_measure(picture.depth_mm, picture.taken, pieces, picture.pinhole, count))
+
+
+def likeliest(these: Sizes, config: RegionConfig) -> int | None:
     """The largest piece of an organ's size; what leaves the picture counts less, as arms do."""
-    area, wide, cut = _measure(picture.depth_mm, pieces, picture.pinhole, count)
     low, high = config.organ_mm
-    fits = np.minimum(1.0, (high / np.maximum(wide, 1e-9)) ** 4)
-    score = area * fits * (1 - cut) ** 2
-    score[wide < low] = 0
+    fits = np.minimum(1.0, (high / np.maximum(these.wide_mm, 1e-9)) ** 4)
+    score = these.area_mm2 * fits * (1 - these.cut) ** 2
+    score[these.wide_mm < low] = 0
     return int(score.argmax()) if score.max() > 0 else None
+
+
+def oddness(these: Sizes, chosen: int, config: RegionConfig) -> float:
+    """0 for what may be an organ alone, more for what is too wide or leaves the picture."""
+    too_wide = max(float(these.wide_mm[chosen]) / config.organ_mm[1] - 1, 0.0)
+    return too_wide + float(these.cut[chosen])
 
 
 def continued(
@@ -87,7 +109,7 @@ def _nearest(depth_mm, pieces, pinhole, point):  # type: ignore[no-untyped-def]
 @numba.njit(cache=True, nogil=True)
 def _area_inside(depth_mm, pieces, pinhole, low, high, count):  # type: ignore[no-untyped-def]
     fx, fy, cx, cy = pinhole
-    area = np.zeros(count + 1)
+    area = np.zeros(count)
     for v in range(len(depth_mm)):
         for u in range(depth_mm.shape[1]):
             if pieces[v, u]:
@@ -99,9 +121,7 @@ def _area_inside(depth_mm, pieces, pinhole, low, high, count):  # type: ignore[n
 
 
 @numba.njit(cache=True, nogil=True)
-def _measure(depth_mm, pieces, pinhole, count):  # type: ignore[no-untyped-def]
-    """Per piece: area across the line of sight (mm^2), longest extent (mm), and how much of the
-    square root of that area lies on the image's border (0..1)."""
+def _measure(depth_mm, taken, pieces, pinhole, count):  # type: ignore[no-untyped-def]
     fx, fy, cx, cy = pinhole
     height, width = depth_mm.shape
     area, border = np.zeros(count + 1), np.zeros(count + 1)
@@ -109,22 +129,37 @@ def _measure(depth_mm, pieces, pinhole, count):  # type: ignore[no-untyped-def]
     for v in range(height):
         for u in range(width):
             piece = pieces[v, u]
-            if piece:
-                z = depth_mm[v, u]
-                x, y = (u - cx) / fx * z, (v - cy) / fy * z
-                area[piece] += z * z / (fx * fy)
-                if v == 0 or u == 0 or v == height - 1 or u == width - 1:
-                    border[piece] += z / fx
-                along = (x, y, (x + y) * 0.7071, (x - y) * 0.7071)
-                for k in range(4):
-                    low[piece, k] = min(low[piece, k], along[k])
-                    high[piece, k] = max(high[piece, k], along[k])
+            if piece == 0:
+                continue
+            z = depth_mm[v, u]
+            x, y = (u - cx) / fx * z, (v - cy) / fy * z
+            area[piece] += z * z / (fx * fy)
+            if (
+                _outside(taken, v - 1, u)
+                or _outside(taken, v + 1, u)
+                or _outside(taken, v, u - 1)
+                or _outside(taken, v, u + 1)
+            ):
+                border[piece] += z / fx
+            along = (x, y, (x + y) * 0.7071, (x - y) * 0.7071)
+            for k in range(4):
+                low[piece, k] = min(low[piece, k], along[k])
+                high[piece, k] = max(high[piece, k], along[k])
     wide, cut = np.zeros(count + 1), np.zeros(count + 1)
     for piece in range(1, count + 1):
         if area[piece] > 0:
             wide[piece] = (high[piece] - low[piece]).max()
             cut[piece] = min(border[piece] / np.sqrt(area[piece]), 1.0)
     return area, wide, cut
+
+
+@numba.njit(cache=True, nogil=True)
+def _outside(taken, v, u):  # type: ignore[no-untyped-def]
+    """Not looked at; the depth range, which cuts organs too, does not count."""
+    height, width = taken.shape
+    if not (0 <= v < height and 0 <= u < width):
+        return True
+    return BOX <= taken[v, u] <= LAST_BOX
 
 
 @numba.njit(cache=True, nogil=True)
@@ -141,19 +176,19 @@ def _continuing(depth_mm, pieces, gap, footprint, count):  # type: ignore[no-unt
             z = depth_mm[v, u]
             longest = int(gap / z)
             for dv, du in ((0, 1), (1, 0)):
-                nearer, y, x = 0, v, u
+                nearer, last, y, x = 0, piece, v, u
                 for length in range(1, longest + 2):
                     y, x = y + dv, x + du
-                    if y >= height or x >= width or (length == 1 and pieces[y, x] == piece):
+                    if y >= height or x >= width or pieces[y, x] == piece:
                         break
-                    there = depth_mm[y, x]
-                    if there < z - _STEP_MM:
-                        nearer += 1
+                    there, other = depth_mm[y, x], pieces[y, x]
                     most = _STEP_MM + _STEEPEST_GAP * length * footprint * z
                     if there > z + most:
                         break
-                    other = pieces[y, x]
-                    if other and abs(there - z) < most and nearer >= 2:
+                    # Where another piece begins, not in its midst: that one is itself in front.
+                    if other and other != last and nearer >= 2 and abs(there - z) < most:
                         lines[piece, other] += 1
                         break
+                    nearer += there < z - _STEP_MM
+                    last = other
     return lines

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 import time
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -12,6 +14,13 @@ from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.types import DepthFrame, SensorCloud
 from tumortrack.sense.cloud import FEWEST_POINTS, thin_cloud
 from tumortrack.sense.region.config import RegionConfig
+
+if TYPE_CHECKING:
+    from tumortrack.sense.region.choose import Sizes
+    from tumortrack.sense.region.picture import Picture
+
+_OPENINGS = (1.0, 1.7, 2.8)  # times ``opening_mm``: the last is wider than fingers
+_ODD = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,25 +105,44 @@ def organ_points(
     return Region(cloud, counts, picture.taken, time.perf_counter() - start)
 
 
-def _take_one_piece(picture, config: RegionConfig, hints: Hints) -> None:  # type: ignore[no-untyped-def]
+def _take_one_piece(picture: Picture, config: RegionConfig, hints: Hints) -> None:
+    """At the least opening that leaves something like an organ: a hand that touches it makes one
+    large piece with it, which goes on outside the picture, until fingers are too narrow."""
     from tumortrack.sense.region import choose
     from tumortrack.sense.region.picture import PIECES, THIN
-    from tumortrack.sense.region.pieces import find_pieces
+    from tumortrack.sense.region.pieces import find_edges, find_pieces
 
-    pieces, count = find_pieces(picture, config)
+    edges = find_edges(picture, config)
+    best, least = None, math.inf
+    for wider in _OPENINGS:
+        pieces, count = find_pieces(picture, edges, wider * config.opening_mm)
+        sizes = choose.sizes(picture, pieces, count)
+        chosen = _choice(picture, pieces, sizes, config, hints)
+        odd = math.inf if chosen is None else choose.oddness(sizes, chosen, config)
+        if best is None or odd < least - _ODD:
+            best, least = (pieces, count, chosen), odd
+        if odd < _ODD:
+            break
+    pieces, count, chosen = best
     picture.take(pieces == 0, THIN)
-    chosen = None
-    if hints.picked_mm is not None:
-        chosen = choose.under_point(picture, pieces, hints.picked_mm)
-    elif hints.last_box_mm is not None:
-        chosen = choose.under_box(picture, pieces, count, hints.last_box_mm)
-    if chosen is None:
-        chosen = choose.likeliest(picture, pieces, count, config)
     if chosen is None:
         picture.take(pieces > 0, PIECES)
     else:
         together = choose.continued(picture, pieces, count, chosen, config)
         picture.take(~together[pieces], PIECES)
+
+
+def _choice(
+    picture: Picture, pieces: np.ndarray, sizes: Sizes, config: RegionConfig, hints: Hints
+) -> int | None:
+    from tumortrack.sense.region import choose
+
+    chosen = None
+    if hints.picked_mm is not None:
+        return choose.under_point(picture, pieces, hints.picked_mm)
+    if hints.last_box_mm is not None:
+        chosen = choose.under_box(picture, pieces, sizes, hints.last_box_mm)
+    return choose.likeliest(sizes, config) if chosen is None else chosen
 
 
 def _too_few(left: int, counts: dict[str, int], config: RegionConfig) -> str:

@@ -8,6 +8,7 @@ grow from their cores, by little more than what the opening took, and never over
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numba
 import numpy as np
@@ -35,18 +36,31 @@ def remove_flying(picture: Picture, config: RegionConfig) -> None:
     _take_lonely(picture.depth_mm, picture.taken, jump_scale(picture, config), FLYING)
 
 
-def find_pieces(picture: Picture, config: RegionConfig) -> tuple[np.ndarray, int]:
-    """Number of its piece for every pixel (h, w), int32, 0 for none, and how many there are."""
-    from scipy.ndimage import label
+@dataclass(frozen=True, eq=False)
+class Edges:
+    """Where the picture may part: ``depth_mm`` (h, w) with short holes bridged, NaN where nothing
+    is left; ``distance`` (h, w) of every pixel to the nearest edge, px."""
 
+    depth_mm: np.ndarray
+    distance: np.ndarray
+    jump: tuple[float, float]
+
+
+def find_edges(picture: Picture, config: RegionConfig) -> Edges:
+    """Edges between what is left of the picture."""
     jump = jump_scale(picture, config)
     depth_mm = _without_holes(picture.depth_mm, picture.taken, jump)
     crease = (config.crease_mm, _CREASE_REACH_MM / picture.footprint)
-    distance = _edge_distance(depth_mm, jump, crease)
-    radius = config.opening_mm / picture.footprint  # px at distance 1
-    core = distance * depth_mm > radius
-    pieces, count = label(core)
-    _grow(depth_mm, distance, pieces, jump, radius)
+    return Edges(depth_mm, _edge_distance(depth_mm, jump, crease), jump)
+
+
+def find_pieces(picture: Picture, edges: Edges, opening_mm: float) -> tuple[np.ndarray, int]:
+    """Number of its piece for every pixel (h, w), int32, 0 for none, and how many there are."""
+    from scipy.ndimage import label
+
+    radius = opening_mm / picture.footprint  # px at distance 1
+    pieces, count = label(edges.distance * edges.depth_mm > radius)
+    _grow(edges.depth_mm, edges.distance, pieces, edges.jump, radius)
     pieces[picture.taken != ORGAN] = 0  # bridged holes
     return pieces, count
 
