@@ -219,9 +219,8 @@ class _Screen:
         )
         if len(loop.latency):
             times = loop.latency.summary()
-            since = "stamp" if reader.host_clock else "arrival"
             say(
-                f"latency from {since} to published estimate: p50 {times['p50']:.1f}, "
+                f"latency from {reader.latency_from} to published estimate: p50 {times['p50']:.1f}, "
                 f"p95 {times['p95']:.1f}, p99.9 {times['p99.9']:.1f} ms."
             )
         say(f"written to {self._report}.")

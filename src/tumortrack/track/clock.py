@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from tumortrack.core.errors import NoEstimate
-from tumortrack.track.live import Seen
 
 _AHEAD_S = 0.1  # what two clocks may differ by
 _BELIEVED_AFTER = 3  # frames whose stamps grow: then the clock was set back, and goes on from there
@@ -18,14 +17,12 @@ class StampCheck:
         self._behind: list[int] = []
         self.jumps = 0
 
-    def check(self, seen: Seen, host_clock: bool, now_ns: int) -> None:
-        """``now_ns``: ``time.time_ns`` at this moment.
+    def check(self, stamp_ns: int, age_s: float) -> None:
+        """``age_s``: how long ago the frame was made, or came, as well as one can tell.
 
         Raises:
             NoEstimate: stale, or out of order.
         """
-        born_ns = seen.stamp_ns if host_clock else seen.arrived_ns
-        age_s = (now_ns - born_ns) * 1e-9
         if age_s > self._stale_s:
             raise NoEstimate(f"the frame is stale: {age_s:.2f} s old")
         if age_s < -_AHEAD_S:
@@ -33,7 +30,7 @@ class StampCheck:
                 f"the frame's stamp lies {-age_s:.2f} s in the future: the clocks of camera and "
                 "computer disagree"
             )
-        self._in_order(seen.stamp_ns)
+        self._in_order(stamp_ns)
 
     def _in_order(self, stamp_ns: int) -> None:
         if self._last_ns is None or stamp_ns > self._last_ns:

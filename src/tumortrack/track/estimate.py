@@ -34,7 +34,8 @@ class Estimate:
     The kidney's surface is the whole organ, tumors included, as in ``Anatomy``. ``report`` is
     plain JSON: per part volume, centre, box and probability, and ``timings`` in seconds.
     ``volume`` is None where nobody asked for it (live). ``motion`` says where every point of the
-    CT is, where the method knows that.
+    CT is, where the method knows that; ``unsmoothed`` the same before a mean over past frames was
+    taken: where the next frame's search starts.
     """
 
     cloud: OccupancyCloud
@@ -42,3 +43,4 @@ class Estimate:
     meshes: dict[str, Mesh]
     report: dict
     motion: Motion | None = None
+    unsmoothed: Motion | None = None

@@ -116,8 +116,9 @@ class Update:
             frame.
         frames: where it is published.
         seconds: time of each stage.
-        latency_ms: from the stamp (by a source without this machine's clock: from the arrival) to
-            the moment at which the update was handed to the sinks; None where no frame came.
+        latency_ms: from the stamp (of a source without this machine's clock: from the arrival; of
+            one that waits for the loop: from the taking) to the moment at which the update was
+            handed to the sinks; None where no frame came.
     """
 
     sequence: int

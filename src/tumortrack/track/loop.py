@@ -105,7 +105,7 @@ class Loop:
             now = time.monotonic()
             if isinstance(got, Seen):
                 fresh = now
-                update = self._answer(got, reader.host_clock)
+                update = self._answer(got, reader.born_ns(got))
             elif reader.ended:
                 return
             else:
@@ -121,14 +121,14 @@ class Loop:
                     "then start again."
                 )
 
-    def _answer(self, seen: Seen, host_clock: bool) -> Update:
-        """The update of one frame."""
+    def _answer(self, seen: Seen, born_ns: int) -> Update:
+        """The update of one frame, which came to be at ``born_ns``."""
         seconds: dict[str, float] = {}
         organ, estimate, reason = None, None, ""
         quality: Quality = "none"
         warning = ""
         try:
-            self._believe(seen, host_clock)
+            self._believe(seen.stamp_ns, born_ns)
             with timed(seconds, "organ"):
                 rng = np.random.default_rng((self._config.follower.seed, seen.stamp_ns))
                 region = organ_points(seen.content, self._config.region, self._hints(seen), rng)
@@ -145,7 +145,6 @@ class Loop:
         if reason:
             self._follower.forget()
             estimate = None
-        born_ns = seen.stamp_ns if host_clock else seen.arrived_ns
         return Update(
             self._next(),
             seen.stamp_ns,
@@ -160,9 +159,9 @@ class Loop:
             latency_ms=(time.time_ns() - born_ns) * 1e-6,
         )
 
-    def _believe(self, seen: Seen, host_clock: bool) -> None:
+    def _believe(self, stamp_ns: int, born_ns: int) -> None:
         jumps = self._stamps.jumps
-        self._stamps.check(seen, host_clock, time.time_ns())
+        self._stamps.check(stamp_ns, (time.time_ns() - born_ns) * 1e-9)
         if self._stamps.jumps > jumps:
             self._follower.forget()
 
@@ -231,7 +230,7 @@ def summary(loop: Loop, reader: Reader, outlets: list[Outlet]) -> dict:
         "dropped": reader.dropped,
         "opened": reader.opened,
         "clock_jumps": loop.clock_jumps,
-        "latency_from": "stamp" if reader.host_clock else "arrival",
+        "latency_from": reader.latency_from,
         "latency_ms": loop.latency.summary(),
         "stages_ms": {name: times.summary() for name, times in loop.stages.items()},
         "sinks": {outlet.name: outlet.summary() for outlet in outlets},

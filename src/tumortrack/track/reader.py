@@ -28,7 +28,7 @@ class Reader:
         self._passed = 0  # replaced before they were taken
         self._lost_inside = 0  # dropped by sources that are closed
         self._source: Source | None = None
-        self._host_clock = False
+        self.latency_from = "arrival"  # what ages and latencies count from; see ``born_ns``
         self.trouble = "the source is not open yet"
         self.ended = False
         self.failure: BaseException | None = None
@@ -42,10 +42,12 @@ class Reader:
         source = self._source
         return self._passed + self._lost_inside + (source.dropped if source else 0)
 
-    @property
-    def host_clock(self) -> bool:
-        """Whether the stamps of the source, or of the last one, are this machine's clock."""
-        return self._host_clock
+    def born_ns(self, seen: Seen) -> int:
+        """When a frame just taken came to be, by ``time.time_ns``: its stamp, or where the source
+        has another clock, its arrival; of a source that waits for us, now."""
+        if self.latency_from == "stamp":
+            return seen.stamp_ns
+        return seen.arrived_ns if self.latency_from == "arrival" else time.time_ns()
 
     def take(self, timeout_s: float) -> Seen | TumortrackError | None:
         """The newest frame, or what was wrong with it; None if none came in time or all is over.
@@ -90,7 +92,9 @@ class Reader:
 
     def _read_all(self) -> None:
         source = self._open()
-        self._source, self._host_clock = source, source.host_clock
+        self._source = source
+        clock = "stamp" if source.host_clock else "arrival"
+        self.latency_from = "taking" if source.waits else clock
         self.opened += 1
         self.trouble = ""
         try:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import TypeVar
 from urllib.parse import parse_qsl
 
@@ -43,9 +44,15 @@ def parse_spec(text: str, kinds: Sequence[type[C]], what: str) -> C:
     if missing := [n for n, f in names.items() if f.required and n not in given]:
         raise InputError(f"{what} {text!r} lacks its {missing[0]}. {usage(config)}")
     try:
-        return msgspec.convert(given, config, strict=False)
+        return msgspec.convert(given, config, strict=False, dec_hook=_path)
     except msgspec.ValidationError as error:
         raise InputError(f"{what} {text!r}: {error}. {usage(config)}") from error
+
+
+def _path(kind: type, value: object) -> object:
+    if kind is Path and isinstance(value, str):
+        return Path(value)
+    raise TypeError(f"{kind.__name__} is not read from text")
 
 
 def usage(config: type[Config]) -> str:

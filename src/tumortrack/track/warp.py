@@ -91,11 +91,11 @@ class WarpLocator:
         rng = np.random.default_rng((how.seed, cloud.stamp_ns))
         seconds: dict[str, float] = {}
         points = self._thinned(cloud, rng)
-        before = last.motion if last is not None else None
+        start = last.unsmoothed if last is not None else None
         usual, fits = self._trust.usual_cost, []
-        if isinstance(before, WarpMotion):
+        if isinstance(start, WarpMotion):
             with stage(seconds, "follow", self._device):
-                fits.append(refine(self._shape, points, before, self._near))
+                fits.append(refine(self._shape, points, start, self._near))
         if not fits or how.thorough or fits[0].cost > usual:
             with stage(seconds, "encode", self._device):
                 starts = first_motions(self._network, self._shape, points)
@@ -104,11 +104,11 @@ class WarpLocator:
                 config = self._model.config.refine
                 fits.append(best_fit(self._shape, points, starts, config, enough))
         fit = min(fits, key=lambda fit: fit.cost)
-        lag_s = 0.0
-        if isinstance(before, WarpMotion) and last is not None and how.smoothing_s > 0:
+        unsmoothed, lag_s = fit.motion, 0.0
+        if last is not None and isinstance(last.motion, WarpMotion) and how.smoothing_s > 0:
             past_s = (cloud.stamp_ns - last.cloud.stamp_ns) * 1e-9
             share = -math.expm1(-past_s / how.smoothing_s)
-            fit = replace(fit, motion=blend(before, fit.motion, share))
+            fit = replace(fit, motion=blend(last.motion, unsmoothed, share))
             lag_s = past_s * (1 - share) / share  # of what moves steadily
         motion, meshes = self._placed(points, fit, seconds)
         with stage(seconds, "carry", self._device):
@@ -116,7 +116,7 @@ class WarpLocator:
         head = report_head(cloud, how.seed)
         report = self._report(head, fit, motion, meshes, inside, seconds)
         report["smoothing"] = {"time_s": how.smoothing_s, "lag_ms": 1000 * lag_s}
-        return Estimate(inside, None, meshes, report, motion)
+        return Estimate(inside, None, meshes, report, motion, unsmoothed)
 
     def warm(self) -> None:
         """See ``track.tracker.Tracker.warm``."""
