@@ -15,7 +15,9 @@ from tumortrack.sense.region.picture import BOX, LAST_BOX, Picture
 PICK_REACH_MM = 10.0  # from the picked point to the piece it means
 _STEEPEST_GAP = 0.5  # slope of a surface behind what hides part of it
 _STEP_MM = 3.0
-_FEWEST_LINES = 5  # rows and columns along which two pieces continue each other
+_FEWEST_LINES = 0.4  # length along which pieces continue each other, over the smaller one's size
+_TIMES = 2  # so many things may lie between the chosen piece and another
+_CUT = 0.1
 
 
 def under_point(picture: Picture, pieces: np.ndarray, point_mm: np.ndarray) -> int:
@@ -63,32 +65,56 @@ def sizes(picture: Picture, pieces: np.ndarray, count: int) -> Sizes:
 
 def likeliest(these: Sizes, config: RegionConfig) -> int | None:
     """The largest piece of an organ's size; what leaves the picture counts less, as arms do."""
-    low, high = config.organ_mm
-    fits = np.minimum(1.0, (high / np.maximum(these.wide_mm, 1e-9)) ** 4)
-    score = these.area_mm2 * fits * (1 - these.cut) ** 2
-    score[these.wide_mm < low] = 0
+    score = these.area_mm2 * _like_an_organ(these, config)
     return int(score.argmax()) if score.max() > 0 else None
 
 
-def oddness(these: Sizes, chosen: int, config: RegionConfig) -> float:
-    """0 for what may be an organ alone, more for what is too wide or leaves the picture."""
-    too_wide = max(float(these.wide_mm[chosen]) / config.organ_mm[1] - 1, 0.0)
-    return too_wide + float(these.cut[chosen])
+@dataclass(frozen=True, eq=False)
+class Choice:
+    """What is taken for the organ at one way of parting the picture.
+
+    Attributes:
+        pieces: number of its piece for every pixel (h, w).
+        together: (count + 1,) bool, which of them.
+        score: how like an organ it is; the largest of several choices is the best.
+        doubtful: it leaves the picture or is too wide, or something that does seems to continue
+            it: perhaps a wider opening parts them.
+    """
+
+    pieces: np.ndarray
+    together: np.ndarray
+    score: float
+    doubtful: bool
 
 
-def continued(
-    picture: Picture, pieces: np.ndarray, count: int, chosen: int, config: RegionConfig
-) -> np.ndarray:
-    """The chosen piece and those that continue it behind something nearer: (count + 1,), bool."""
-    together = np.zeros(count + 1, bool)
-    together[chosen] = True
+def choice(
+    picture: Picture, pieces: np.ndarray, these: Sizes, chosen: int | None, config: RegionConfig
+) -> Choice:
+    """The chosen piece and those that continue it behind something nearer."""
+    together = np.zeros(len(these.cut), bool)
+    if chosen is None:
+        return Choice(pieces, together, -1.0, True)
+    leaves = these.cut > _CUT
     gap = config.gap_mm / picture.footprint
-    lines = _continuing(picture.depth_mm, pieces, gap, picture.footprint, count)
+    lines = _continuing(picture.depth_mm, pieces, gap, picture.footprint, len(together))
     lines = lines + lines.T
-    for _ in range(3):  # behind several shafts
-        together |= lines[together].sum(0) >= _FEWEST_LINES
-    together[0] = False
-    return together
+    together[chosen] = True
+    refused = False
+    for _ in range(_TIMES):
+        more = lines[together].sum(0) > _FEWEST_LINES * np.sqrt(these.area_mm2)
+        more[0] = False
+        refused |= bool((more & leaves & ~together).any())
+        together |= more & ~leaves
+    score = these.area_mm2[together].sum() * _like_an_organ(these, config)[chosen]
+    too_wide = these.wide_mm[chosen] > config.organ_mm[1]
+    return Choice(pieces, together, float(score), bool(refused or leaves[chosen] or too_wide))
+
+
+def _like_an_organ(these: Sizes, config: RegionConfig) -> np.ndarray:
+    """Of every piece, 0..1."""
+    low, high = config.organ_mm
+    fits = np.minimum(1.0, (high / np.maximum(these.wide_mm, 1e-9)) ** 4)
+    return fits * (1 - these.cut) ** 2 * (these.wide_mm > low)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -132,8 +158,14 @@ def _measure(depth_mm, taken, pieces, pinhole, count):  # type: ignore[no-untype
             if piece == 0:
                 continue
             z = depth_mm[v, u]
-            x, y = (u - cx) / fx * z, (v - cy) / fy * z
             area[piece] += z * z / (fx * fy)
+            inside = 0 < v < height - 1 and 0 < u < width - 1
+            if (
+                inside
+                and pieces[v - 1, u] == pieces[v + 1, u] == piece
+                and pieces[v, u - 1] == pieces[v, u + 1] == piece
+            ):
+                continue  # the extent is reached at the outline
             if (
                 _outside(taken, v - 1, u)
                 or _outside(taken, v + 1, u)
@@ -141,6 +173,7 @@ def _measure(depth_mm, taken, pieces, pinhole, count):  # type: ignore[no-untype
                 or _outside(taken, v, u + 1)
             ):
                 border[piece] += z / fx
+            x, y = (u - cx) / fx * z, (v - cy) / fy * z
             along = (x, y, (x + y) * 0.7071, (x - y) * 0.7071)
             for k in range(4):
                 low[piece, k] = min(low[piece, k], along[k])
@@ -164,9 +197,9 @@ def _outside(taken, v, u):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def _continuing(depth_mm, pieces, gap, footprint, count):  # type: ignore[no-untyped-def]
-    """In how many rows and columns one piece goes on as another (count + 1, count + 1) after a gap
-    in which something is nearer and nothing is farther."""
-    lines = np.zeros((count + 1, count + 1), np.int32)
+    """Along which length (count, count), mm, one piece goes on as another after a gap in which
+    something is nearer and nothing is farther."""
+    lines = np.zeros((count, count))
     height, width = depth_mm.shape
     for v in range(height):
         for u in range(width):
@@ -187,7 +220,7 @@ def _continuing(depth_mm, pieces, gap, footprint, count):  # type: ignore[no-unt
                         break
                     # Where another piece begins, not in its midst: that one is itself in front.
                     if other and other != last and nearer >= 2 and abs(there - z) < most:
-                        lines[piece, other] += 1
+                        lines[piece, other] += z * footprint
                         break
                     nearer += there < z - _STEP_MM
                     last = other

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -12,15 +11,15 @@ from jaxtyping import Bool, Float
 
 from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.types import DepthFrame, SensorCloud
-from tumortrack.sense.cloud import FEWEST_POINTS, thin_cloud
+from tumortrack.sense.cloud import FEWEST_POINTS
 from tumortrack.sense.region.config import RegionConfig
 
 if TYPE_CHECKING:
-    from tumortrack.sense.region.choose import Sizes
+    from tumortrack.sense.region.choose import Choice, Sizes
     from tumortrack.sense.region.picture import Picture
 
 _OPENINGS = (1.0, 1.7, 2.8)  # times ``opening_mm``: the last is wider than fingers
-_ODD = 0.1
+_CLEARLY = 1.1  # better by so much is worth a wider opening
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,42 +96,38 @@ def organ_points(
     if config.pieces:
         _take_one_piece(picture, config, hints)
     counts = picture.counts()
-    points_mm = picture.points(picture.taken)
-    if len(points_mm) < FEWEST_POINTS:
-        raise NoEstimate(_too_few(len(points_mm), counts, config))
-    cloud = SensorCloud(points_mm, content.stamp_ns)
-    cloud = thin_cloud(cloud, config.crop.n_points, rng)
+    left = picture.left(picture.taken)
+    if len(left) < FEWEST_POINTS:
+        raise NoEstimate(_too_few(len(left), counts, config))
+    drawn = rng.choice(left, min(len(left), config.crop.n_points), replace=False)
+    cloud = SensorCloud(picture.points(drawn), content.stamp_ns)
     return Region(cloud, counts, picture.taken, time.perf_counter() - start)
 
 
 def _take_one_piece(picture: Picture, config: RegionConfig, hints: Hints) -> None:
-    """At the least opening that leaves something like an organ: a hand that touches it makes one
-    large piece with it, which goes on outside the picture, until fingers are too narrow."""
+    """A hand that touches the organ makes one large piece with it, which goes on outside the
+    picture: then wider openings, until fingers are too narrow to connect."""
     from tumortrack.sense.region import choose
     from tumortrack.sense.region.picture import PIECES, THIN
     from tumortrack.sense.region.pieces import find_edges, find_pieces
 
     edges = find_edges(picture, config)
-    best, least = None, math.inf
+    best: Choice | None = None
     for wider in _OPENINGS:
         pieces, count = find_pieces(picture, edges, wider * config.opening_mm)
         sizes = choose.sizes(picture, pieces, count)
-        chosen = _choice(picture, pieces, sizes, config, hints)
-        odd = math.inf if chosen is None else choose.oddness(sizes, chosen, config)
-        if best is None or odd < least - _ODD:
-            best, least = (pieces, count, chosen), odd
-        if odd < _ODD:
+        chosen = _chosen(picture, pieces, sizes, config, hints)
+        here = choose.choice(picture, pieces, sizes, chosen, config)
+        if best is None or here.score > _CLEARLY * best.score:
+            best = here
+        if not here.doubtful:
             break
-    pieces, count, chosen = best
-    picture.take(pieces == 0, THIN)
-    if chosen is None:
-        picture.take(pieces > 0, PIECES)
-    else:
-        together = choose.continued(picture, pieces, count, chosen, config)
-        picture.take(~together[pieces], PIECES)
+    assert best is not None
+    picture.take(best.pieces == 0, THIN)
+    picture.take(~best.together[best.pieces], PIECES)
 
 
-def _choice(
+def _chosen(
     picture: Picture, pieces: np.ndarray, sizes: Sizes, config: RegionConfig, hints: Hints
 ) -> int | None:
     from tumortrack.sense.region import choose

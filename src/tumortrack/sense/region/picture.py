@@ -40,13 +40,14 @@ class Picture:
         depth_mm: (h, w) float32, NaN where there was no return.
         taken: (h, w) uint8, one of the numbers above; the steps write into it.
         pinhole: fx, fy, cx, cy of the working picture, px.
-        points: the points (n, 3) behind the pixels still called ORGAN, camera frame, mm, float32;
-            takes ``taken``.
+        left: ``taken`` -> which points of the content are still called ORGAN, (n,) int.
+        points: some of these -> points (n, 3), camera frame, mm, float32.
     """
 
     depth_mm: np.ndarray
     taken: np.ndarray
     pinhole: tuple[float, float, float, float]
+    left: Callable[[np.ndarray], np.ndarray]
     points: Callable[[np.ndarray], np.ndarray]
 
     @property
@@ -60,8 +61,7 @@ class Picture:
 
     def counts(self) -> dict[str, int]:
         """Pixels by what became of them."""
-        found = np.bincount(self.taken.ravel(), minlength=len(STEPS))
-        return dict(zip(STEPS, found.tolist(), strict=True))
+        return dict(zip(STEPS, _count(self.taken, len(STEPS)).tolist(), strict=True))
 
 
 def picture_of_frame(frame: DepthFrame, mask: np.ndarray | None) -> Picture:
@@ -76,8 +76,11 @@ def picture_of_frame(frame: DepthFrame, mask: np.ndarray | None) -> Picture:
     depth_mm = frame.depth_mm[some].copy()
     taken = np.isnan(depth_mm).view(np.uint8) * np.uint8(NO_RETURN)
 
-    def points(taken: np.ndarray) -> np.ndarray:
-        row, column = np.divmod(np.flatnonzero(taken == ORGAN), taken.shape[1])
+    def left(taken: np.ndarray) -> np.ndarray:
+        return np.flatnonzero(taken == ORGAN)
+
+    def points(pixel: np.ndarray) -> np.ndarray:
+        row, column = np.divmod(pixel, depth_mm.shape[1])
         row, column = step // 2 + row * step, step // 2 + column * step
         seen_mm = frame.depth_mm[row, column].astype(np.float64)
         return deproject_pixels(row * camera.width + column, seen_mm, camera)
@@ -88,7 +91,7 @@ def picture_of_frame(frame: DepthFrame, mask: np.ndarray | None) -> Picture:
         (camera.cx - step // 2) / step,
         (camera.cy - step // 2) / step,
     )
-    picture = Picture(depth_mm, taken, pinhole, points)
+    picture = Picture(depth_mm, taken, pinhole, left, points)
     if mask is not None:
         if mask.shape != frame.depth_mm.shape:
             raise InputError(
@@ -118,13 +121,13 @@ def picture_of_cloud(cloud: SensorCloud) -> Picture:
     depth_mm, pixel = _rasterise(points_mm.copy(), pinhole, height, width)
     taken = np.isnan(depth_mm).view(np.uint8) * np.uint8(NO_RETURN)
 
-    def points(taken: np.ndarray) -> np.ndarray:
+    def left(taken: np.ndarray) -> np.ndarray:
         seen = np.flatnonzero(pixel >= 0)
         seen = seen[taken.ravel()[pixel[seen]] == ORGAN]
         behind_mm = points_mm[seen, 2] - depth_mm.ravel()[pixel[seen]]
-        return points_mm[seen[behind_mm < 2 + 2 * size * points_mm[seen, 2]]]
+        return seen[behind_mm < 2 + 2 * size * points_mm[seen, 2]]
 
-    return Picture(depth_mm, taken, pinhole, points)
+    return Picture(depth_mm, taken, pinhole, left, lambda some: points_mm[some])
 
 
 @numba.njit(cache=True, nogil=True)
@@ -145,3 +148,11 @@ def _rasterise(points_mm, pinhole, height, width):  # type: ignore[no-untyped-de
             if not depth_mm[place] <= z:
                 depth_mm[place] = z
     return depth_mm.reshape(height, width), pixel
+
+
+@numba.njit(cache=True, nogil=True)
+def _count(taken, kinds):  # type: ignore[no-untyped-def]
+    found = np.zeros(kinds, np.int64)
+    for kind in taken.ravel():
+        found[kind] += 1
+    return found

@@ -17,7 +17,7 @@ from tumortrack.sense.region.config import RegionConfig
 from tumortrack.sense.region.picture import NO_RETURN, PLANE, Picture
 
 _LOOK_AT = 1200  # pixels
-_TRIES = 200
+_TRIES = 150
 _BEYOND_MM = 120.0  # so far behind the range there may be something to fit to
 _STEEPEST = 0.35  # cosine of the largest angle between the plane's normal and the optical axis
 _DEEPEST_MM = 60.0  # an organ is not deeper: what lies farther behind a plane is no part of it
@@ -105,30 +105,43 @@ def _some_points(picture: Picture, far_mm: float, rng: np.random.Generator) -> n
 
 @numba.njit(cache=True, nogil=True)
 def _consensus(points, triples, tolerance):  # type: ignore[no-untyped-def]
+    """The plane through three points with the best score: normal and offset. A tenth of the
+    points tells which planes are hopeless."""
     best, best_offset = -np.inf, 0.0
     best_normal = np.zeros(3, np.float32)
+    few = len(points) // 10
     for t in range(len(triples)):
         a, b, c = points[triples[t, 0]], points[triples[t, 1]], points[triples[t, 2]]
-        normal = np.cross(b - a, c - a)
-        length = np.sqrt((normal * normal).sum())
-        if length < 100.0:  # mm^2: a sliver says nothing
+        bx, by, bz = b[0] - a[0], b[1] - a[1], b[2] - a[2]
+        cx, cy, cz = c[0] - a[0], c[1] - a[1], c[2] - a[2]
+        nx, ny, nz = by * cz - bz * cy, bz * cx - bx * cz, bx * cy - by * cx
+        length = np.sqrt(nx * nx + ny * ny + nz * nz)
+        if length < 100.0 or abs(nz) < _STEEPEST * length:  # mm^2: a sliver says nothing
             continue
-        normal = normal / -length if normal[2] > 0 else normal / length
-        if normal[2] > -_STEEPEST:
+        to_camera = -1 / length if nz > 0 else 1 / length
+        nx, ny, nz = nx * to_camera, ny * to_camera, nz * to_camera
+        offset = nx * a[0] + ny * a[1] + nz * a[2]
+        score = _score(points[:few], nx, ny, nz, offset, tolerance)
+        if score < 0.05 * best:
             continue
-        offset = normal[0] * a[0] + normal[1] * a[1] + normal[2] * a[2]
-        score = 0.0
-        for i in range(len(points)):
-            p = points[i]
-            height = normal[0] * p[0] + normal[1] * p[1] + normal[2] * p[2] - offset
-            share = height / tolerance
-            if abs(share) < 1:
-                score += 1 - share * share
-            elif -_DEEPEST_MM < height < 0:
-                score -= _BEHIND_COSTS
+        score += _score(points[few:], nx, ny, nz, offset, tolerance)
         if score > best:
-            best, best_offset, best_normal = score, offset, normal
+            best, best_offset = score, offset
+            best_normal[0], best_normal[1], best_normal[2] = nx, ny, nz
     return best, best_normal, best_offset
+
+
+@numba.njit(cache=True, nogil=True)
+def _score(points, nx, ny, nz, offset, tolerance):  # type: ignore[no-untyped-def]
+    score = np.float32(0)
+    for i in range(len(points)):
+        height = nx * points[i, 0] + ny * points[i, 1] + nz * points[i, 2] - offset
+        share = height / tolerance
+        if abs(share) < 1:
+            score += 1 - share * share
+        elif -_DEEPEST_MM < height < 0:
+            score -= np.float32(_BEHIND_COSTS)
+    return score
 
 
 @numba.njit(cache=True, nogil=True)
