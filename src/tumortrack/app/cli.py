@@ -66,6 +66,27 @@ def prepare(
     commands.prepare(input, case, options, overwrite)
 
 
+def export(
+    case: Positional[Path],
+    out: Positional[Path],
+    /,
+    *,
+    dicom: Path | None = None,
+    series: str | None = None,
+) -> None:
+    """Write a case's segmentation for 3D Slicer and, with its CT, as DICOM.
+
+    Args:
+        case: folder that `prepare` wrote.
+        out: folder to write: case.seg.nrrd and, with --dicom, segmentation.dcm.
+        dicom: folder of the CT's slices that the case's voxels come from.
+        series: which of its series, if the folder holds several (UID or number in the list).
+    """
+    from tumortrack.app.export import export as run
+
+    run(case, out, dicom, series)
+
+
 def train(
     case: Positional[Path],
     model: Positional[Path],
@@ -369,6 +390,7 @@ def doctor() -> None:
 COMMANDS: dict[str, Callable[..., None]] = {
     "demo": demo,
     "prepare": prepare,
+    "export": export,
     "train": train,
     "pretrain": pretrain,
     "locate": locate,

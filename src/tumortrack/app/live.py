@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from tumortrack.track.reader import Reader
 
 _SAY_S, _SAY_PLAIN_S = 1.0, 5.0  # between two lines of state: on a terminal, in a file
+_SETTLED_S = 60.0  # by then all buffers have their size: memory that grows on is a leak
 _STORE_S = 10.0  # between two writings of the report: kill -9 loses no more
 
 
@@ -180,7 +181,7 @@ class _Screen:
         self._before = 0
         self._state = ""
         self._errors: dict[str, str] = {}
-        self._start_mb = _resident_mb()
+        self._memory_mb = {"start": round(_resident_mb(), 1)}
 
     def watch(self, reader: Reader, outlets: list[Outlet]) -> None:
         """From here on there is something to show."""
@@ -214,15 +215,18 @@ class _Screen:
         self._store(reader)
         estimates = loop.counts["good"] + loop.counts["poor"]
         say(
-            f"{estimates} estimates ({loop.counts['poor']} poor), {loop.counts['none']} times none, "
-            f"{reader.dropped} frames dropped."
+            f"{estimates} estimates ({loop.counts['poor']} poor), {loop.counts['none']} times "
+            f"none, {reader.dropped} frames dropped."
         )
         if len(loop.latency):
             times = loop.latency.summary()
             say(
-                f"latency from {reader.latency_from} to published estimate: p50 {times['p50']:.1f}, "
-                f"p95 {times['p95']:.1f}, p99.9 {times['p99.9']:.1f} ms."
+                f"latency from {reader.latency_from} to published estimate: p50 "
+                f"{times['p50']:.1f}, p95 {times['p95']:.1f}, p99.9 {times['p99.9']:.1f} ms."
             )
+        for name, errors in loop.errors.items():
+            off = errors.summary()
+            say(f"{name}: centre off by {off['p50']:.1f} mm (median; 95 %: {off['p95']:.1f} mm).")
         say(f"written to {self._report}.")
 
     def _line(self, now: float, reader: Reader) -> None:
@@ -240,11 +244,14 @@ class _Screen:
         from tumortrack.track.loop import summary
 
         self._stored = time.monotonic()
-        memory = {"start": round(self._start_mb, 1), "now": round(_resident_mb(), 1)}
+        now_mb = round(_resident_mb(), 1)
+        self._memory_mb["now"] = now_mb
+        if self._stored - self._started > _SETTLED_S:
+            self._memory_mb.setdefault("settled", now_mb)
         content = {
             **self._about,
             "seconds": round(self._stored - self._started, 2),
-            "memory_mb": memory,
+            "memory_mb": self._memory_mb,
             **summary(self._loop, reader, self._outlets),
         }
         store.write_json(self._report, content)

@@ -8,6 +8,7 @@ import numpy as np
 
 from tumortrack.core import store
 from tumortrack.core.mesh_files import write_mesh
+from tumortrack.imaging.segmentation import segments, write_seg_nrrd
 from tumortrack.imaging.volume import write_labels_nifti
 from tumortrack.sense.ply import write_cloud_ply
 from tumortrack.track.estimate import Estimate
@@ -18,9 +19,9 @@ def write_estimate(
     folder: Path, estimate: Estimate, overwrite: bool = False, points: PointTable | None = None
 ) -> None:
     """occupancy.ply (points with label and probability and, where the estimate knows the way
-    back, their place in the CT), labels.nii.gz (voxel -> camera frame, mm), kidney.ply,
-    tumor_1.ply, ... and report.json; points.csv, the given ``points`` of the CT and where they are
-    now; all or nothing.
+    back, their place in the CT), labels.nii.gz (voxel -> camera frame, mm), labels.seg.nrrd (the
+    same for 3D Slicer), kidney.ply, tumor_1.ply, ... and report.json; points.csv, the given
+    ``points`` of the CT and where they are now; all or nothing.
 
     Raises:
         InputError: the folder exists and ``overwrite`` is False; points without a motion.
@@ -40,6 +41,12 @@ def write_estimate(
         assert volume is not None  # live estimates are the recording sink's
         write_labels_nifti(
             aside / "labels.nii.gz", volume.labels, volume.camera_from_index, lps=False
+        )
+        write_seg_nrrd(
+            aside / "labels.seg.nrrd",
+            volume.labels,
+            volume.camera_from_index,
+            segments(estimate.report["parts"]),
         )
         for name, mesh in estimate.meshes.items():
             write_mesh(aside / f"{name}.ply", mesh)

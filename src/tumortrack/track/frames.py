@@ -21,9 +21,9 @@ Rows = tuple[tuple[float, float, float, float], ...]
 class CalibrationFile(Config, frozen=True, kw_only=True):
     """A file that says where the camera is, in one of three ways, each by 4 x 4 rows.
 
-    ``camera_from_robot`` or ``robot_from_camera``: of a hand-eye calibration. ``camera_from_marker``
-    with ``robot_from_marker``: a marker that both know. ``unit``: of the translations.
-    ``frame_id``: the robot's frame, as ROS calls it.
+    ``camera_from_robot`` or ``robot_from_camera``: of a hand-eye calibration.
+    ``camera_from_marker`` with ``robot_from_marker``: a marker that both know. ``unit``: of the
+    translations. ``frame_id``: the robot's frame, as ROS calls it.
     """
 
     frame_id: str

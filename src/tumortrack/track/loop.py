@@ -18,10 +18,11 @@ import numpy as np
 
 from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError, NoEstimate, TumortrackError
-from tumortrack.core.types import DepthFrame
+from tumortrack.core.types import Anatomy, DepthFrame
 from tumortrack.sense.camera import d405
 from tumortrack.sense.region import Hints, RegionConfig, organ_points
 from tumortrack.track.clock import StampCheck
+from tumortrack.track.estimate import Estimate
 from tumortrack.track.follower import Follower, FollowerConfig
 from tumortrack.track.live import Quality, Seen, Setting, SourceLost, Update
 from tumortrack.track.meter import Histogram
@@ -68,6 +69,7 @@ class Loop:
         self._picked: np.ndarray | None = None
         self.latency = Histogram()
         self.stages: dict[str, Histogram] = {}
+        self.errors: dict[str, Histogram] = {}  # mm, of a source that knows the truth
         self.counts: Counter[str] = Counter()
         self.reasons: Counter[str] = Counter()
         self.defects: list[str] = []
@@ -194,6 +196,18 @@ class Loop:
             self.latency.add(update.latency_ms)
         for name, stage_s in update.seconds.items():
             self.stages.setdefault(name, Histogram()).add(1000 * stage_s)
+        if (
+            update.seen is not None
+            and update.seen.truth is not None
+            and update.estimate is not None
+        ):
+            self._hold_against(update.estimate, update.seen.truth)
+
+    def _hold_against(self, estimate: Estimate, truth: Anatomy) -> None:
+        for name, true in zip(truth.names, truth.parts, strict=True):
+            if name in estimate.meshes:
+                off = estimate.meshes[name].box_mm.mean(0) - true.box_mm.mean(0)
+                self.errors.setdefault(name, Histogram()).add(float(np.linalg.norm(off)))
 
     def _count_reason(self, reason: str) -> None:
         kind = re.sub(r"-?[0-9]+([.,][0-9]+)?", "#", reason)
@@ -233,6 +247,7 @@ def summary(loop: Loop, reader: Reader, outlets: list[Outlet]) -> dict:
         "latency_from": reader.latency_from,
         "latency_ms": loop.latency.summary(),
         "stages_ms": {name: times.summary() for name, times in loop.stages.items()},
+        "center_error_mm": {name: errors.summary() for name, errors in loop.errors.items()},
         "sinks": {outlet.name: outlet.summary() for outlet in outlets},
         "defects": loop.defects,
     }

@@ -1,41 +1,41 @@
-"""How long things take, over hours, in a memory that does not grow."""
+"""How long things take and how far they are off, over hours, in a memory that does not grow."""
 
 from __future__ import annotations
 
 import numpy as np
 
-_FINEST_MS, _COARSEST_MS = 0.01, 1e6
+_FINEST, _COARSEST = 0.01, 1e6
 _STEP = 1.01  # one bin to the next: percentiles are right to 1 %
 
 
 class Histogram:
-    """Times in ms, counted in bins that widen by 1 %."""
+    """Positive numbers (times in ms, errors in mm), counted in bins that widen by 1 %."""
 
     def __init__(self) -> None:
-        bins = int(np.ceil(np.log(_COARSEST_MS / _FINEST_MS) / np.log(_STEP))) + 1
+        bins = int(np.ceil(np.log(_COARSEST / _FINEST) / np.log(_STEP))) + 1
         self._counts = np.zeros(bins, np.int64)
         self._largest = 0.0
 
-    def add(self, time_ms: float) -> None:
-        """Count one time; what lies beyond 0.01 ms or 1,000 s counts as that."""
-        place = np.log(max(time_ms, _FINEST_MS) / _FINEST_MS) / np.log(_STEP)
+    def add(self, number: float) -> None:
+        """Count one; what lies beyond 0.01 or a million counts as that."""
+        place = np.log(max(number, _FINEST) / _FINEST) / np.log(_STEP)
         self._counts[min(int(place), len(self._counts) - 1)] += 1
-        self._largest = max(self._largest, time_ms)
+        self._largest = max(self._largest, number)
 
     def __len__(self) -> int:
         return int(self._counts.sum())
 
     def percentile(self, share: float) -> float:
-        """The time that ``share`` per cent do not exceed: the middle of its bin. NaN of nothing."""
+        """What ``share`` per cent do not exceed: the middle of its bin. NaN of nothing."""
         total = self._counts.sum()
         if not total:
             return float("nan")
         rank = max(int(np.ceil(share / 100 * total)), 1)
         place = int(np.searchsorted(np.cumsum(self._counts), rank))
-        return min(float(_FINEST_MS * _STEP ** (place + 0.5)), self._largest)
+        return min(float(_FINEST * _STEP ** (place + 0.5)), self._largest)
 
     def summary(self) -> dict[str, float | int]:
-        """count, p50, p95, p99, p99.9 and largest, ms (JSON types); count alone of nothing."""
+        """count, p50, p95, p99, p99.9 and max (JSON types); count alone of nothing."""
         if not len(self):
             return {"count": 0}
         marks = {f"p{mark:g}": round(self.percentile(mark), 3) for mark in (50.0, 95.0, 99.0, 99.9)}

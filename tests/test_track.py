@@ -1,0 +1,218 @@
+"""`tumortrack track` as a user runs it: from a moving world to files, streams and the report."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import time
+
+import numpy as np
+import pytest
+
+from stories import COMMAND, environment, refusal, succeeded, tumortrack, write_phantom_case
+
+
+@pytest.fixture(scope="module")
+def world(tmp_path_factory):
+    """A case and a model of it, trained for seconds."""
+    folder = tmp_path_factory.mktemp("track")
+    write_phantom_case(folder / "case")
+    succeeded(tumortrack("train", folder / "case", folder / "model", "--steps", 120))
+    return folder
+
+
+def start(world, *arguments):
+    return subprocess.Popen(
+        [*COMMAND, "track", str(world / "model"), *map(str, arguments)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        env=environment(),
+        cwd=world,
+    )
+
+
+def virtual(world, **options):
+    text = "&".join(f"{key}={value}" for key, value in options.items())
+    return f"virtual:{world / 'case'}" + (f"?{text}" if text else "")
+
+
+def told(path):
+    return json.loads(path.read_text())
+
+
+def test_a_moving_case_is_followed_and_the_report_says_how_well(world, tmp_path):
+    report = tmp_path / "report.json"
+    done = tumortrack(
+        "track", world / "model", virtual(world, fps=10), "--seconds", 8, "--report", report
+    )
+    said = succeeded(done)
+    assert "latency from stamp to published estimate: p50" in said
+    found = told(report)
+    assert sum(found["estimates"].values()) > 20
+    assert found["center_error_mm"]["kidney"]["p50"] < 6  # trained for seconds
+    assert found["center_error_mm"]["kidney"]["p50"] > 0.05
+    assert found["latency_ms"]["p50"] < 500
+    assert found["latency_from"] == "stamp"
+    assert found["defects"] == []
+    assert found["config"]["follower"]["rescan_s"] == 1.0
+    assert len(found["model_sha256"]) == 64
+
+
+def test_a_recording_is_played_back_to_the_same_estimates(world, tmp_path):
+    live, replay = tmp_path / "live", tmp_path / "replay"
+    first = tumortrack(
+        "track",
+        world / "model",
+        virtual(world, fps=10),
+        f"recording:{live}?format=files",
+        "--seconds",
+        4,
+        "--report",
+        tmp_path / "live.json",
+    )
+    succeeded(first)
+    frames = [line for line in (live / "index.jsonl").read_text().splitlines() if line]
+    assert len(frames) >= 10
+    again = tumortrack(
+        "track",
+        world / "model",
+        f"recording:{live}?rate=0",
+        f"recording:{replay}?format=files",
+        "--report",
+        tmp_path / "replay.json",
+    )
+    succeeded(again)
+    found = told(tmp_path / "replay.json")
+    assert found["dropped"] == 0  # at rate 0 every frame counts
+    assert sum(found["estimates"].values()) >= 10
+
+
+def test_ctrl_c_ends_cleanly_and_flushes(world, tmp_path):
+    folder, report = tmp_path / "kept", tmp_path / "report.json"
+    process = start(world, virtual(world, fps=10), f"recording:{folder}", "--report", report)
+    _wait_for(process, "tracking")
+    time.sleep(6)
+    process.send_signal(signal.SIGINT)
+    said, _ = process.communicate(timeout=30)
+    assert process.returncode == 0, said
+    assert "Traceback" not in said
+    found = told(report)
+    name = next(iter(found["sinks"]))
+    assert found["sinks"][name]["delivered"] == found["updates"]
+    assert (folder / "metadata.yaml").is_file()
+
+
+def test_kill_9_leaves_a_recording_that_plays(world, tmp_path):
+    folder = tmp_path / "kept"
+    process = start(
+        world,
+        virtual(world, fps=10),
+        f"recording:{folder}?format=files",
+        "--report",
+        tmp_path / "report.json",
+    )
+    _wait_for(process, "good|poor")
+    time.sleep(2.5)
+    process.kill()
+    process.communicate(timeout=30)
+    again = tumortrack(
+        "track",
+        world / "model",
+        f"recording:{folder}?rate=0",
+        "--report",
+        tmp_path / "again.json",
+    )
+    succeeded(again)
+    assert sum(told(tmp_path / "again.json")["estimates"].values()) >= 5
+
+
+def test_a_robot_gets_its_own_frame(world, tmp_path):
+    turn = np.diag([1.0, -1.0, -1.0, 1.0])
+    turn[:3, 3] = [0.4, 0.1, 0.7]
+    calibration = tmp_path / "hand_eye.json"
+    calibration.write_text(
+        json.dumps({"frame_id": "base_link", "unit": "m", "robot_from_camera": turn.tolist()})
+    )
+    out = tmp_path / "out"
+    report = tmp_path / "report.json"
+    done = tumortrack(
+        "track",
+        world / "model",
+        virtual(world, fps=5),
+        f"recording:{out}?format=files",
+        "--frame",
+        calibration,
+        "--seconds",
+        4,
+        "--report",
+        report,
+    )
+    assert "in frame 'base_link'" in succeeded(done)
+    found = told(report)
+    assert found["frame"]["frame_id"] == "base_link"
+    assert found["frame"]["published_from_camera"][2][3] == pytest.approx(700)
+
+
+def test_a_source_that_vanishes_ends_with_a_reason(world, tmp_path):
+    done = tumortrack(
+        "track",
+        world / "model",
+        f"recording:{tmp_path / 'nothing'}",
+        "--give-up",
+        1,
+        "--report",
+        tmp_path / "r.json",
+    )
+    assert "nothing" in refusal(done)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["camera"], "Allowed: realsense, recording, ros1, ros2, virtual"),
+        (["virtual"], "lacks its case. Write virtual:CASE"),
+        (["virtual:CASE", "screen"], "Allowed: openigtlink, recording, ros1, ros2, viewer"),
+        (["virtual:CASE", "viewer:abc"], "Write viewer[:port]"),
+        (["virtual:CASE", "viewer", "viewer"], "'viewer' is given twice"),
+        (["virtual:CASE", "--smoothing", "9"], "allowed: 0 (off) to 5 s"),
+        (["virtual:CASE", "--range", "200", "100"], "depth range"),
+        (["virtual:CASE", "--frame", "none.json"], "none.json"),
+        (["virtual:no_case"], "no_case"),
+    ],
+)
+def test_bad_options_are_answered_in_one_line(world, tmp_path, arguments, said):
+    given = [virtual(world) if a == "virtual:CASE" else a for a in arguments]
+    done = tumortrack("track", world / "model", *given, "--report", tmp_path / "r.json")
+    assert said in refusal(done)
+
+
+def test_a_port_that_is_taken_is_refused(world, tmp_path):
+    with socket.socket() as other:
+        other.bind(("127.0.0.1", 0))
+        other.listen()
+        port = other.getsockname()[1]
+        done = tumortrack(
+            "track",
+            world / "model",
+            virtual(world),
+            f"openigtlink:{port}",
+            "--report",
+            tmp_path / "r.json",
+        )
+    assert str(port) in refusal(done)
+
+
+def _wait_for(process, words, seconds=60):
+    """Read the output until one of the words stands in it."""
+    until = time.monotonic() + seconds
+    os.set_blocking(process.stdout.fileno(), True)
+    while time.monotonic() < until:
+        line = process.stdout.readline()
+        if any(word in line for word in words.split("|")):
+            return
+        assert process.poll() is None, line
+    raise AssertionError(f"{words!r} was never said")
