@@ -11,6 +11,7 @@ from tumortrack.core.types import Anatomy, Mesh
 
 SUFFIXES = (".ply", ".stl", ".obj")
 _LARGEST_FILE = 512 * 2**20  # bytes
+_SPACE, _STL_HEADER = b"SPACE=LPS", 80
 
 
 def read_mesh(path: Path) -> Mesh:
@@ -49,14 +50,26 @@ def read_mesh(path: Path) -> Mesh:
 def write_mesh(path: Path, mesh: Mesh) -> None:
     """Write a binary PLY (or STL, by suffix), vertices in mm, in the mesh's own frame.
 
+    The header says ``SPACE=LPS``, the words that 3D Slicer looks for. Of a mesh before the camera
+    too: as all files of a run, it is shown as if its frame were the patient's.
+
     Raises:
         StorageError: the disk refused.
     """
     import trimesh
 
     out = trimesh.Trimesh(mesh.vertices_mm, mesh.faces, process=False)
+    kind = path.suffix.lower().removeprefix(".")
+    content = out.export(file_type=kind)
+    data = content if isinstance(content, bytes) else str(content).encode()
+    if kind == "ply":
+        data = data.replace(b"1.0\n", b"1.0\ncomment " + _SPACE + b"\n", 1)  # after the format
+    elif kind == "stl":
+        data = _SPACE.ljust(_STL_HEADER, b"\0") + data[_STL_HEADER:]
+    else:
+        data = b"# " + _SPACE + b"\n" + data
     try:
-        out.export(path)
+        path.write_bytes(data)
     except OSError as error:
         raise StorageError(f"cannot write {path}: {error.strerror}.") from error
 

@@ -42,14 +42,27 @@ class _Slice:
         return (self.uid, self.shape, tuple(round(c, 3) for c in self.orientation))
 
 
-def read_dicom(folder: Path, series: str | None = None) -> RawVolume:
-    """Read one CT series of a folder (sub-folders not searched).
+@dataclass(frozen=True, eq=False)
+class Series:
+    """The slices of one series, in order along the slice normal, and how they lie.
+
+    ``shape``: columns, rows, slices; ``lps_from_index``: (column, row, slice) -> LPS mm.
+    """
+
+    files: tuple[Path, ...]
+    shape: tuple[int, int, int]
+    lps_from_index: Float[np.ndarray, "4 4"]
+    notes: tuple[str, ...] = ()
+
+
+def find_series(folder: Path, series: str | None = None) -> Series:
+    """Find one CT series of a folder (sub-folders not searched); its pixels are not read.
 
     The rule among several: the only one with modality CT and at least 10 slices of one size and
     orientation. Otherwise ``series`` must name one: its UID or its number in the error's list.
 
     Raises:
-        InputError: no series, several, a missing, double or stray slice, damaged pixels.
+        InputError: no series, several, a missing, double or stray slice.
     """
     groups, notes = _groups(folder)
     slices = _choose(folder, groups, series)
@@ -69,11 +82,19 @@ def read_dicom(folder: Path, series: str | None = None) -> RawVolume:
     shape = (first.shape[1], first.shape[0], len(slices))
     check_size(folder, shape, 4)
     check_affine(folder, lps_from_index)
-    return RawVolume(
-        _pixels(folder, [s.path for s in slices], shape),
-        lps_from_index,
-        notes + _other_series(groups, slices),
-    )
+    files = tuple(s.path for s in slices)
+    return Series(files, shape, lps_from_index, notes + _other_series(groups, slices))
+
+
+def read_dicom(folder: Path, series: str | None = None) -> RawVolume:
+    """Read one CT series of a folder, chosen as by ``find_series``.
+
+    Raises:
+        InputError: see ``find_series``; damaged pixels.
+    """
+    found = find_series(folder, series)
+    pixels = _pixels(folder, list(found.files), found.shape)
+    return RawVolume(pixels, found.lps_from_index, found.notes)
 
 
 def _groups(folder: Path) -> tuple[list[list[_Slice]], tuple[str, ...]]:
