@@ -4,7 +4,7 @@ BIN := .venv/bin
 SETUP := .venv/.installed
 
 .DEFAULT_GOAL := help
-.PHONY: help setup debian demo test check bench results headstart clean
+.PHONY: help setup debian demo test check bench soak results headstart clean
 
 help:  ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 10
@@ -34,6 +34,9 @@ test: check debian  ## check, then all tests
 
 bench: setup  ## speed of the generator, training and inference, side by side with naive forms
 	$(BIN)/python bench/bench.py
+
+soak: setup  ## an hour of tracking: memory, latency, errors (ARGS="MODEL CASE --minutes 5"; after make demo)
+	$(BIN)/python bench/soak.py $(ARGS)
 
 results: setup  ## the tables and plots of docs/results.md (hours; ARGS=--quick: minutes)
 	$(BIN)/python bench/results.py $(ARGS)

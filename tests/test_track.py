@@ -7,7 +7,9 @@ import os
 import signal
 import socket
 import subprocess
+import sys
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -128,6 +130,22 @@ def test_kill_9_leaves_a_recording_that_plays(world, tmp_path):
     )
     succeeded(again)
     assert sum(told(tmp_path / "again.json")["estimates"].values()) >= 5
+
+
+def test_minutes_of_tracking_leave_memory_as_it_was(world):
+    """The hour is `make soak`."""
+    soak = Path(__file__).parents[1] / "bench" / "soak.py"
+    sinks = ["openigtlink:0", "viewer:0"]
+    options = ["--minutes", "1.6", "--fps", "15", "--error", "6", "--sinks", *sinks]
+    done = subprocess.run(
+        [sys.executable, str(soak), str(world / "model"), str(world / "case"), *options],
+        capture_output=True,
+        text=True,
+        env=environment(),
+        timeout=300,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "after a minute" in done.stdout
 
 
 def test_a_robot_gets_its_own_frame(world, tmp_path):
