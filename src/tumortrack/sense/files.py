@@ -154,9 +154,14 @@ def write_intrinsics(
     Raises:
         StorageError: the disk refused.
     """
+    write_json(path, intrinsics_json(intrinsics, depth_unit_mm))
+
+
+def intrinsics_json(intrinsics: Intrinsics, depth_unit_mm: float = DEPTH_UNIT_MM) -> dict:
+    """What ``write_intrinsics`` writes."""
     names = ("width", "height", "fx", "fy", "cx", "cy")
     values = {name: getattr(intrinsics, name) for name in names}
-    write_json(path, {**values, "depth_unit_mm": depth_unit_mm})
+    return {**values, "depth_unit_mm": depth_unit_mm}
 
 
 def read_depth_png(
@@ -201,6 +206,15 @@ def write_depth_png(path: Path, frame: DepthFrame, depth_unit_mm: float = DEPTH_
         InputError: a depth that 16 bits of this unit cannot hold.
         StorageError: the disk refused.
     """
+    write_atomically(path, depth_png(frame, depth_unit_mm))
+
+
+def depth_png(frame: DepthFrame, depth_unit_mm: float = DEPTH_UNIT_MM) -> bytes:
+    """What ``write_depth_png`` writes.
+
+    Raises:
+        InputError: a depth that 16 bits of this unit cannot hold.
+    """
     from PIL import Image
 
     steps = np.rint(frame.depth_mm.astype(np.float64) / depth_unit_mm)
@@ -212,4 +226,4 @@ def write_depth_png(path: Path, frame: DepthFrame, depth_unit_mm: float = DEPTH_
         )
     stream = io.BytesIO()
     Image.fromarray(np.where(seen, steps, 0).astype(np.uint16)).save(stream, format="PNG")
-    write_atomically(path, stream.getvalue())
+    return stream.getvalue()

@@ -103,6 +103,15 @@ def write_cloud_ply(path: Path, points_mm: np.ndarray, **point_properties: np.nd
         InputError: a property of another length or type.
         StorageError: the disk refused.
     """
+    write_atomically(path, cloud_ply(points_mm, **point_properties))
+
+
+def cloud_ply(points_mm: np.ndarray, **point_properties: np.ndarray) -> bytes:
+    """What ``write_cloud_ply`` writes.
+
+    Raises:
+        InputError: a property of another length or type.
+    """
     points = np.asarray(points_mm, "<f4")
     columns = [(axis, points[:, i]) for i, axis in enumerate("xyz")]
     for name, values in point_properties.items():
@@ -129,4 +138,4 @@ def write_cloud_ply(path: Path, points_mm: np.ndarray, **point_properties: np.nd
         ),
         "end_header\n",
     ]
-    write_atomically(path, "\n".join(header).encode() + table.tobytes())
+    return "\n".join(header).encode() + table.tobytes()

@@ -1,0 +1,89 @@
+"""Updates into plain files: a folder each, and one line each in index.jsonl. Camera frame, mm."""
+
+from __future__ import annotations
+
+import io
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from tumortrack.core.errors import StorageError, TumortrackError
+from tumortrack.core.mesh_files import write_mesh
+from tumortrack.core.types import DepthFrame
+from tumortrack.sense.files import DEPTH_UNIT_MM, depth_png, intrinsics_json
+from tumortrack.sense.ply import cloud_ply
+from tumortrack.track.estimate import Estimate
+from tumortrack.track.live import Seen, Update
+from tumortrack.track.recording.folders import CLOUD, DEPTH, FRAMES, INTRINSICS, MASK, REPORT
+from tumortrack.track.recording.said import facts, report
+
+INDEX = "index.jsonl"
+_ESTIMATE = "estimate"  # apart from what was seen: these surfaces are no truth
+
+
+class FrameFolders:
+    """``frames/00000012/``: depth.png and intrinsics.json (and mask.png), or cloud.ply;
+    report.json; ``estimate/``: occupancy.ply, kidney.ply, tumor_1.ply, ...
+
+    Depths are rounded to 0.1 mm; those that 16 bits of it cannot hold (from 6553.5 mm) are left
+    out. Files are not forced to the disk one by one, as that would take longer than a frame.
+
+    Raises:
+        StorageError: the disk refused; the frame's folder is taken away again.
+    """
+
+    def __init__(self, folder: Path, frames: bool) -> None:
+        self._root, self._frames = folder / FRAMES, frames
+        self._root.mkdir(parents=True)
+        self._index = (folder / INDEX).open("ab", buffering=0)
+
+    def write(self, update: Update) -> None:
+        folder = self._root / f"{update.sequence:08d}"
+        try:
+            folder.mkdir()
+            if self._frames and update.seen is not None:
+                _write_seen(folder, update.seen)
+            if update.estimate is not None:
+                _write_estimate(folder / _ESTIMATE, update.estimate)
+            text = json.dumps(report(update), indent=1, allow_nan=False)
+            (folder / REPORT).write_text(text + "\n", encoding="utf-8")
+            line = json.dumps({**facts(update), "folder": folder.name}) + "\n"
+            self._index.write(line.encode())
+        except (OSError, StorageError) as error:
+            shutil.rmtree(folder, ignore_errors=True)
+            if isinstance(error, TumortrackError):
+                raise
+            raise StorageError(f"cannot write {folder}: {error.strerror or error}.") from error
+
+    def close(self) -> None:
+        self._index.close()
+
+
+def _write_seen(folder: Path, seen: Seen) -> None:
+    frame = seen.content
+    if not isinstance(frame, DepthFrame):
+        (folder / CLOUD).write_bytes(cloud_ply(frame.points_mm))
+        return
+    steps = np.rint(frame.depth_mm / DEPTH_UNIT_MM)
+    held = np.where((steps >= 1) & (steps <= 65535), frame.depth_mm, np.nan)
+    (folder / DEPTH).write_bytes(depth_png(replace(frame, depth_mm=held)))
+    camera = json.dumps(intrinsics_json(frame.intrinsics), indent=1)
+    (folder / INTRINSICS).write_text(camera + "\n", encoding="utf-8")
+    if seen.mask is not None:
+        from PIL import Image
+
+        stream = io.BytesIO()
+        Image.fromarray(seen.mask.astype(np.uint8) * np.uint8(255)).save(stream, format="PNG")
+        (folder / MASK).write_bytes(stream.getvalue())
+
+
+def _write_estimate(folder: Path, estimate: Estimate) -> None:
+    folder.mkdir()
+    cloud = estimate.cloud
+    points = cloud_ply(cloud.points_mm, label=cloud.labels, probability=cloud.probability)
+    (folder / "occupancy.ply").write_bytes(points)
+    for name, mesh in estimate.meshes.items():
+        write_mesh(folder / f"{name}.ply", mesh)
