@@ -10,12 +10,13 @@ import numpy as np
 
 from tumortrack.core.errors import NoEstimate
 from tumortrack.sense.region.config import RegionConfig
-from tumortrack.sense.region.picture import BOX, LAST_BOX, Picture
+from tumortrack.sense.region.picture import BOX, FLYING, LAST_BOX, Picture
 
 PICK_REACH_MM = 10.0  # from the picked point to the piece it means
 _STEEPEST_GAP = 0.5  # slope of a surface behind what hides part of it
 _STEP_MM = 3.0
 _FEWEST_LINES = 0.4  # length along which pieces continue each other, over the smaller one's size
+_STRAY = 2  # false matches in a row that are no background
 _TIMES = 2  # so many things may lie between the chosen piece and another
 _CUT = 0.1
 
@@ -96,7 +97,7 @@ def choice(
         return Choice(pieces, together, -1.0, True)
     leaves = these.cut > _CUT
     gap = config.gap_mm / picture.footprint
-    lines = _continuing(picture.depth_mm, pieces, gap, picture.footprint, len(together))
+    lines = _continuing(picture.depth_mm, picture.taken, pieces, gap, picture.footprint, len(together))
     lines = lines + lines.T
     together[chosen] = True
     refused = False
@@ -196,7 +197,7 @@ def _outside(taken, v, u):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def _continuing(depth_mm, pieces, gap, footprint, count):  # type: ignore[no-untyped-def]
+def _continuing(depth_mm, taken, pieces, gap, footprint, count):  # type: ignore[no-untyped-def]
     """Along which length (count, count), mm, one piece goes on as another after a gap in which
     something is nearer and nothing is farther."""
     lines = np.zeros((count, count))
@@ -209,15 +210,21 @@ def _continuing(depth_mm, pieces, gap, footprint, count):  # type: ignore[no-unt
             z = depth_mm[v, u]
             longest = int(gap / z)
             for dv, du in ((0, 1), (1, 0)):
-                nearer, last, y, x = 0, piece, v, u
+                nearer, farther, last, y, x = 0, 0, piece, v, u
                 for length in range(1, longest + 2):
                     y, x = y + dv, x + du
                     if y >= height or x >= width or pieces[y, x] == piece:
                         break
+                    if taken[y, x] == FLYING:  # anywhere in depth
+                        continue
                     there, other = depth_mm[y, x], pieces[y, x]
                     most = _STEP_MM + _STEEPEST_GAP * length * footprint * z
                     if there > z + most:
-                        break
+                        farther += 1
+                        if farther > _STRAY:
+                            break
+                        continue
+                    farther = 0
                     # Where another piece begins, not in its midst: that one is itself in front.
                     if other and other != last and nearer >= 2 and abs(there - z) < most:
                         lines[piece, other] += z * footprint

@@ -60,7 +60,7 @@ def find_pieces(picture: Picture, edges: Edges, opening_mm: float) -> tuple[np.n
 
     radius = opening_mm / picture.footprint  # px at distance 1
     pieces, count = label(edges.distance * edges.depth_mm > radius)
-    _grow(edges.depth_mm, edges.distance, pieces, edges.jump, radius)
+    _grow(edges.depth_mm, pieces, edges.jump, radius)
     pieces[picture.taken != ORGAN] = 0  # bridged holes
     return pieces, count
 
@@ -184,8 +184,8 @@ def _edge_distance(depth_mm, jump, crease):  # type: ignore[no-untyped-def]
 
 
 @_jit
-def _grow(depth_mm, distance, pieces, jump, radius):  # type: ignore[no-untyped-def]
-    """Grow all cores at the same pace, a pixel a round. An edge pixel is reached, not passed."""
+def _grow(depth_mm, pieces, jump, radius):  # type: ignore[no-untyped-def]
+    """Grow all cores at the same pace, a pixel a round, never over a jump."""
     height, width = depth_mm.shape
     queue = np.empty(height * width, np.int32)
     rounds = np.zeros(height * width, np.int16)
@@ -206,7 +206,7 @@ def _grow(depth_mm, distance, pieces, jump, radius):  # type: ignore[no-untyped-
         start += 1
         v, u = place // width, place % width
         z = depth_mm[v, u]
-        if rounds[place] >= 1.4 * radius / z + 2 or (distance[v, u] == 0 and rounds[place] > 0):
+        if rounds[place] >= 1.4 * radius / z + 2:
             continue
         most = jump[0] * z + jump[1] * z * z
         for dv in range(-1, 2):
