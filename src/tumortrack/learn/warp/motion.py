@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from jaxtyping import Float, Float64
+from jaxtyping import Float, Float32, Float64
 from scipy.spatial.transform import Rotation
 
 from tumortrack.learn.warp.shape import Shape
@@ -50,13 +50,13 @@ class WarpMotion:
 
     def carry(self, points_ct: Float[np.ndarray, "n 3"], /) -> Float64[np.ndarray, "n 3"]:
         """CT (LPS, mm) -> camera frame (mm)."""
-        moved = self.shape.body.carry(self.coefficients, points_ct).astype(float)
+        moved = self.shape.body.follow(self._velocity, points_ct).astype(float)
         return (moved - self.shape.body.center_ct) @ self.rotation.T + self.centre_mm
 
     def back(self, points_camera: Float[np.ndarray, "n 3"], /) -> Float64[np.ndarray, "n 3"]:
         """Camera frame (mm) -> CT (LPS, mm)."""
         rest = (points_camera - self.centre_mm) @ self.rotation + self.shape.body.center_ct
-        return self.shape.body.back(self.coefficients, rest).astype(float)
+        return self.shape.body.follow(-self._velocity, rest).astype(float)
 
     def std_mm(self, points_ct: Float[np.ndarray, "n 3"], /) -> Float64[np.ndarray, " n"] | None:
         """One standard deviation along any axis, mm: the pose's and the state's, to first order."""
@@ -70,8 +70,8 @@ class WarpMotion:
 
     def _std(self, points_ct: Float[np.ndarray, "n 3"]) -> Float64[np.ndarray, " n"]:
         body = self.shape.body
-        offset = body.carry(self.coefficients, points_ct).astype(float) - body.center_ct
-        modes = body.modes_at(body.carry(0.5 * self.coefficients, points_ct))
+        offset = body.follow(self._velocity, points_ct).astype(float) - body.center_ct
+        modes = body.modes_at(body.follow(np.float32(0.5) * self._velocity, points_ct))
         variance = np.zeros(len(points_ct))
         for axis in range(3):
             along = np.tile(np.eye(3)[axis], (len(offset), 1))
@@ -79,6 +79,10 @@ class WarpMotion:
             half = row @ self._root
             variance += np.einsum("nk,nk->n", half, half)
         return self.std_scale * np.sqrt(variance / 3)
+
+    @cached_property
+    def _velocity(self) -> Float32[np.ndarray, "i j k 3"]:
+        return self.shape.body.velocity(self.coefficients)
 
     @cached_property
     def _root(self) -> Float64[np.ndarray, "p p"]:
