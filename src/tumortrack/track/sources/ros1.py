@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 
@@ -28,8 +28,9 @@ class Ros1(SourceConfig, frozen=True, kw_only=True, tag="ros1"):
         mask: of an image that is not 0 where the organ may be; empty: there is none.
         rectified: the depth image is a rectified one, its camera is the CameraInfo's P.
         unit_mm: of one step of a 16-bit depth image.
-        host_clock: stamps are of this machine's clock, or one that is kept equal to it. Where
-            ``/use_sim_time`` is set they are not.
+        clock: whose time the stamps are. host: this machine's, or one kept equal to it; other:
+            another (simulated, replayed, of the camera); auto: other where ``/use_sim_time`` is
+            set, else host.
     """
 
     target: ClassVar[str] = "topic"
@@ -39,7 +40,7 @@ class Ros1(SourceConfig, frozen=True, kw_only=True, tag="ros1"):
     mask: str = ""
     rectified: bool = False
     unit_mm: float = 1.0
-    host_clock: bool = True
+    clock: Literal["auto", "host", "other"] = "auto"
 
     def __post_init__(self) -> None:
         rospy_node.check_name(self.topic)
@@ -69,7 +70,9 @@ class Ros1Source:
     waits = False
 
     def __init__(self, config: Ros1, node: rospy_node.Node, topic: str, kind: str) -> None:
-        self.host_clock = config.host_clock and not node.master.simulated_time()
+        self.host_clock = config.clock == "host" or (
+            config.clock == "auto" and not node.master.simulated_time()
+        )
         self._config, self._node, self._topic, self._kind = config, node, topic, kind
         self._messages = Messages("noetic")
         self._frames, self._infos, self._masks = Newest(), Newest(), Newest()
