@@ -97,7 +97,9 @@ def choice(
         return Choice(pieces, together, -1.0, True)
     leaves = these.cut > _CUT
     gap = config.gap_mm / picture.footprint
-    lines = _continuing(picture.depth_mm, picture.taken, pieces, gap, picture.footprint, len(together))
+    lines = _continuing(
+        picture.depth_mm, picture.taken, pieces, gap, picture.footprint, len(together)
+    )
     lines = lines + lines.T
     together[chosen] = True
     refused = False

@@ -94,7 +94,10 @@ def organ_points(
     if config.flying:
         remove_flying(picture, config)
     if config.pieces:
-        _take_one_piece(picture, config, hints)
+        window = picture.remaining()
+        part = picture.part(window)
+        _take_one_piece(part, config, hints)
+        picture.taken[window] = part.taken
     counts = picture.counts()
     left = picture.left(picture.taken)
     if len(left) < FEWEST_POINTS:

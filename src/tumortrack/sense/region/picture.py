@@ -59,6 +59,21 @@ class Picture:
         """Give the pixels (h, w, bool) that nobody has taken yet to a step."""
         self.taken[where & (self.taken == ORGAN)] = step
 
+    def remaining(self) -> tuple[slice, slice]:
+        """The rows and columns that hold what is left, and one more to each side."""
+        rows, columns = (np.flatnonzero((self.taken == ORGAN).any(axis)) for axis in (1, 0))
+        if not len(rows):
+            return slice(0, 1), slice(0, 1)
+        tall, wide = (slice(max(int(i[0]) - 1, 0), int(i[-1]) + 2) for i in (rows, columns))
+        return tall, wide
+
+    def part(self, window: tuple[slice, slice]) -> Picture:
+        """Those rows and columns alone; what is decided there must be written back."""
+        fx, fy, cx, cy = self.pinhole
+        pinhole = (fx, fy, cx - window[1].start, cy - window[0].start)
+        depth_mm, taken = self.depth_mm[window].copy(), self.taken[window].copy()
+        return Picture(depth_mm, taken, pinhole, self.left, self.points)
+
     def counts(self) -> dict[str, int]:
         """Pixels by what became of them."""
         return dict(zip(STEPS, _count(self.taken, len(STEPS)).tolist(), strict=True))
@@ -153,6 +168,7 @@ def _rasterise(points_mm, pinhole, height, width):  # type: ignore[no-untyped-de
 @numba.njit(cache=True, nogil=True)
 def _count(taken, kinds):  # type: ignore[no-untyped-def]
     found = np.zeros(kinds, np.int64)
-    for kind in taken.ravel():
-        found[kind] += 1
+    for v in range(len(taken)):
+        for u in range(taken.shape[1]):
+            found[taken[v, u]] += 1
     return found

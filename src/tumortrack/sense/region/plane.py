@@ -71,10 +71,11 @@ def find_plane(picture: Picture, config: RegionConfig, rng: np.random.Generator)
         if len(inliers) < 20:
             return None
         middle = inliers.mean(0)
-        spreads, axes = np.linalg.eigh(np.cov((inliers - middle).T))
+        apart = inliers - middle
+        spreads, axes = np.linalg.eigh(apart.T @ apart / len(apart))
         normal = axes[:, 0] * -np.sign(axes[2, 0] or 1.0)
         offset = float(normal @ middle)
-        off = np.abs((inliers - middle) @ normal)
+        off = np.abs(apart @ normal)
         half_mm = float(np.clip(4.5 * np.median(off), 1.5, most_mm))
     height = points @ normal - offset
     on = np.count_nonzero(np.abs(height) < half_mm)
