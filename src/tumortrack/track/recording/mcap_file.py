@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from tumortrack.core.errors import StorageError
 from tumortrack.track.live import Frames, Setting, Update
@@ -137,6 +136,8 @@ class _WholeWrites(io.FileIO):
 
 def _transform(stamp_ns: int, frames: Frames, camera: str, messages: Messages) -> Outgoing:
     """Where the camera stands in the published frame."""
+    from scipy.spatial.transform import Rotation
+
     way = frames.published_from_camera
     x, y, z = (float(v) for v in way[:3, 3] / MM_PER_M)
     qx, qy, qz, qw = (float(v) for v in Rotation.from_matrix(np.array(way[:3, :3])).as_quat())

@@ -36,7 +36,7 @@ _POINT = np.dtype(
     {
         "names": ["x", "y", "z", "label", "probability", "rgb"],
         "formats": ["<f4", "<f4", "<f4", "u1", "<f4", "<u4"],
-        "offsets": [0, 4, 8, 20, 12, 16],
+        "offsets": [0, 4, 8, 12, 16, 20],  # rising: ROS 1's reader goes by them, not by the list
         "itemsize": 24,
     }
 )
