@@ -1,0 +1,54 @@
+"""The viewer's colours: red, green and blue in 0..255."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float, UInt8
+
+Colour = tuple[int, int, int]
+
+KIDNEY: Colour = (185, 102, 83)
+TUMORS: tuple[Colour, ...] = (
+    (144, 238, 144),
+    (255, 205, 60),
+    (110, 190, 255),
+    (240, 130, 230),
+    (170, 150, 255),
+)
+SEEN: Colour = (112, 118, 126)
+ORGAN: Colour = (225, 230, 235)
+REGION: Colour = (64, 70, 82)
+PICKED: Colour = (255, 80, 200)
+
+GOOD: Colour = (46, 160, 67)
+POOR: Colour = (210, 140, 0)
+NONE: Colour = (205, 20, 30)
+STALE: Colour = (110, 60, 160)
+BACKGROUND: Colour = (22, 24, 29)
+BACKGROUND_NONE: Colour = (74, 8, 12)
+BACKGROUND_STALE: Colour = (48, 24, 72)
+
+# Probabilities from a guess to certainty.
+_LEVELS = (0.5, 0.75, 0.9, 1.0)
+_SHADES = ((215, 48, 39), (253, 174, 97), (217, 239, 139), (26, 152, 80))
+
+
+def part_colour(label: int) -> Colour:
+    """Of label 1, 2, 3, ...: the organ, then the tumors, over again after the fifth."""
+    return KIDNEY if label == 1 else TUMORS[(label - 2) % len(TUMORS)]
+
+
+def label_colours(labels: UInt8[np.ndarray, " n"]) -> UInt8[np.ndarray, "n 3"]:
+    table = np.array([SEEN, *(part_colour(n) for n in range(1, 256))], np.uint8)
+    return table[labels]
+
+
+def probability_colours(probability: Float[np.ndarray, " n"]) -> UInt8[np.ndarray, "n 3"]:
+    """Red at a half or less, over yellow to green at 1."""
+    shades = np.array(_SHADES, float)
+    mixed = [np.interp(probability, _LEVELS, shades[:, axis]) for axis in range(3)]
+    return np.stack(mixed, axis=1).astype(np.uint8)
+
+
+def css(colour: Colour) -> str:
+    return "#{:02x}{:02x}{:02x}".format(*colour)

@@ -1,0 +1,323 @@
+"""The viewer's 3-D scene: what was seen, what was estimated; published frame, mm.
+
+Every node is made once and then changed in place, so that clients keep their buffers. Calls must
+not overlap: the sink holds a lock round them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from jaxtyping import Float, Float32, UInt8
+
+from tumortrack.core.geometry import transform_points
+from tumortrack.core.types import DepthFrame, Mesh, SensorCloud
+from tumortrack.sense.camera import deproject_pixels
+from tumortrack.track.live import Frames, Placed, Setting, Update
+from tumortrack.track.view import colours
+from tumortrack.track.view.slices import Plane
+from tumortrack.track.view.surfaces import bare_faces, exact_margin, rough_margin
+
+if TYPE_CHECKING:
+    from viser import (
+        CameraHandle,
+        ClientHandle,
+        ImageHandle,
+        MeshHandle,
+        PointCloudHandle,
+        ViserServer,
+    )
+
+MOST_SEEN, MOST_LABELLED = 20_000, 15_000  # points shown
+_AXES_MM = 12.0
+_NEAR_MM, _FAR_MM = 0.5, 20_000.0  # viser draws its background 1 before the eye
+_FIRST_LOOK_MM = 130.0
+_FOV_RADIANS = 0.9
+_CORNERS = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)])
+_EDGES = [(a, b) for a in range(8) for b in range(a) if abs(_CORNERS[a] - _CORNERS[b]).sum() == 1]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Options:
+    """What the user wants to see."""
+
+    observed: bool = True
+    kidney: float = 0.35  # opacity
+    margin: bool = True
+    points: str = "none"  # none | tumors | all
+    by_probability: bool = False
+    slice_plane: bool = False
+    helpers: bool = True  # axes and the region of the organ's points
+
+
+class Scene:
+    """viser's nodes, and what goes into them."""
+
+    def __init__(self, server: ViserServer, setting: Setting, margin_mm: float) -> None:
+        self._server, self._nodes = server, server.scene
+        self._margin_mm = margin_mm
+        self._anatomy_ct, self._margins_ct = setting.anatomy_ct, None
+        if setting.anatomy_ct is not None:
+            self._bare_faces = bare_faces(setting.anatomy_ct)
+            if margin_mm > 0:
+                tumors = setting.anatomy_ct.tumors
+                self._margins_ct = tuple(exact_margin(tumor, margin_mm) for tumor in tumors)
+        self.options = Options()
+        self.margins: dict[str, Mesh] = {}  # of the shown estimate, published frame
+        self._placed: Placed | None = None
+        self._aimed = self._has_organ = self._has_slice = False
+        self._parts: dict[str, MeshHandle] = {}
+        self._shells: dict[str, MeshHandle] = {}
+        self._look(setting.frames)
+        self._make_nodes(setting)
+
+    def observe(self, update: Update) -> None:
+        """Show what this update saw; nothing, if it saw nothing."""
+        way = update.frames.published_from_camera
+        seen = np.zeros((0, 3), np.float32) if update.seen is None else seen_points(update)
+        organ = np.zeros((0, 3), np.float32) if update.organ is None else update.organ.points_mm
+        self._put_points(self._seen, transform_points(way, thinned(seen, MOST_SEEN)), colours.SEEN)
+        organ_there = transform_points(way, thinned(organ, MOST_SEEN))
+        self._put_points(self._organ, organ_there, colours.ORGAN)
+        if len(organ):
+            lower, upper = organ.min(0), organ.max(0)
+            corners = transform_points(way, lower + _CORNERS * (upper - lower))
+            self._region.points = corners[_EDGES].astype(np.float32)
+            self._aim(update.frames, float(np.median(organ[:, 2])))
+        self._has_organ = len(organ) > 0
+
+    def show(self, update: Update) -> None:
+        """Show this update's estimate, which it must have."""
+        placed = update.placed
+        assert placed is not None
+        self._put_labelled(placed)
+        self.margins = self._margins_of(update, placed)
+        for name, mesh in placed.meshes.items():
+            if name in self._parts:
+                shown = self._in_front(self._bare(mesh)) if name == "kidney" else mesh
+                _put_mesh(self._parts[name], shown)
+        for name, mesh in self.margins.items():
+            _put_mesh(self._shells[name], mesh)
+        self._placed = placed
+        self.apply()
+
+    def hide(self) -> None:
+        """Nothing of any estimate stays visible."""
+        self._placed = None
+        self._estimate.visible = False
+        self.margins = {}
+
+    def apply(self) -> None:
+        """Show and hide nodes by the options and by what there is."""
+        options, placed = self.options, self._placed
+        self._seen.visible = self._organ.visible = options.observed
+        self._axes.visible = options.helpers
+        self._region.visible = options.helpers and self._has_organ
+        if placed is None:
+            return
+        for name, node in self._parts.items():
+            node.visible = name in placed.meshes and (name != "kidney" or options.kidney > 0)
+        for name, node in self._shells.items():
+            node.visible = options.margin and name in self.margins
+        self._parts["kidney"].opacity = options.kidney
+        self._points.visible = options.points != "none"
+        self._slice.visible = options.slice_plane and self._has_slice
+        self._estimate.visible = True
+
+    def redraw_points(self) -> None:
+        """After a change of what labelled points are to be shown."""
+        if self._placed is not None:
+            self._put_labelled(self._placed)
+            self.apply()
+
+    def put_slice(self, picture: UInt8[np.ndarray, "h w 3"], plane: Plane, frames: Frames) -> None:
+        """The slice as a plane of the scene, at its true place."""
+        self._has_slice = True
+        if not self.options.slice_plane:
+            return
+        # viser lays a picture's columns along x and its rows along y.
+        axes = np.stack([plane.across, plane.down, np.cross(plane.across, plane.down)], axis=1)
+        way = frames.published_from_camera
+        self._slice.position = transform_points(way, plane.centre_mm[None])[0]
+        self._slice.wxyz = _wxyz(way[:3, :3] @ axes)
+        self._slice.render_width = self._slice.render_height = plane.side_mm
+        solid = (picture > 8).any(2, keepdims=True)
+        self._slice.image = np.concatenate([picture, solid.astype(np.uint8) * 255], axis=2)
+        self.apply()
+
+    def mark(self, point_mm: Float[np.ndarray, " 3"] | None, frames: Frames) -> None:
+        """Where the user clicked (camera frame); None: nowhere."""
+        self._picked.visible = point_mm is not None
+        if point_mm is not None:
+            there = transform_points(frames.published_from_camera, np.asarray(point_mm)[None])
+            self._picked.position = there[0]
+
+    def _make_nodes(self, setting: Setting) -> None:
+        nodes, way = self._nodes, setting.frames.published_from_camera
+        self._axes = nodes.add_frame(
+            "/camera",
+            axes_length=_AXES_MM,
+            axes_radius=0.35,
+            wxyz=_wxyz(way[:3, :3]),
+            position=way[:3, 3],
+        )
+        self._seen = self._cloud("/seen", 0.2, colours.SEEN)
+        self._organ = self._cloud("/organ", 0.3, colours.ORGAN)
+        self._region = nodes.add_line_segments(
+            "/region",
+            np.zeros((12, 2, 3), np.float32),
+            colours.REGION,
+            thickness=1.0,
+            thickness_units="screen",
+        )
+        self._region.visible = False
+        self._picked = nodes.add_icosphere(
+            "/picked", radius=1.5, color=colours.PICKED, visible=False, cast_shadow=False
+        )
+        self._estimate = nodes.add_frame("/estimate", show_axes=False, visible=False)
+        self._shells = {
+            name: self._surface(f"/estimate/margin_{name}", label, 0.22)
+            for label, name in enumerate(setting.parts[1:], start=2)
+            if self._margin_mm > 0
+        }
+        self._parts = {
+            name: self._surface(f"/estimate/{name}", label, 0.35 if label == 1 else None)
+            for label, name in enumerate(setting.parts, start=1)
+        }
+        self._points = self._cloud("/estimate/points", 0.3, colours.KIDNEY)
+        blank = np.zeros((2, 2, 4), np.uint8)
+        self._slice: ImageHandle = nodes.add_image(
+            "/estimate/slice", blank, 1, 1, format="png", cast_shadow=False, receive_shadow=False
+        )
+
+    def _cloud(self, name: str, size_mm: float, colour: colours.Colour) -> PointCloudHandle:
+        return self._nodes.add_point_cloud(
+            name,
+            np.zeros((0, 3), np.float32),
+            np.array(colour, np.uint8),
+            point_size=size_mm,
+            point_shape="circle",
+            point_shading="flat",
+            precision="float32",  # half precision is 0.125 mm at 150 mm
+        )
+
+    def _surface(self, name: str, label: int, opacity: float | None) -> MeshHandle:
+        return self._nodes.add_mesh_simple(
+            name,
+            np.zeros((3, 3), np.float32),
+            np.array([[0, 1, 2]], np.uint32),
+            color=colours.part_colour(label),
+            opacity=opacity,
+            visible=False,
+            cast_shadow=False,
+            receive_shadow=False,
+        )
+
+    def _put_points(
+        self, node: PointCloudHandle, points: np.ndarray, colour: UInt8[np.ndarray, "n 3"] | tuple
+    ) -> None:
+        node.points = points.astype(np.float32)
+        node.colors = np.asarray(colour, np.uint8)
+
+    def _put_labelled(self, placed: Placed) -> None:
+        if self.options.points == "none":
+            return
+        least = 2 if self.options.points == "tumors" else 1
+        some = thinned(np.flatnonzero(placed.labels >= least), MOST_LABELLED)
+        if self.options.by_probability:
+            colour = colours.probability_colours(placed.probability[some])
+        else:
+            colour = colours.label_colours(placed.labels[some])
+        self._put_points(self._points, placed.points_mm[some], colour)
+
+    def _margins_of(self, update: Update, placed: Placed) -> dict[str, Mesh]:
+        assert update.estimate is not None
+        tumors = {n: m for n, m in placed.meshes.items() if n in self._shells}
+        motion = update.estimate.motion
+        if self._margins_ct is None or motion is None:
+            return {name: rough_margin(mesh, self._margin_mm) for name, mesh in tumors.items()}
+        way = update.frames.published_from_camera
+        at_rest = dict(zip(self._shells, self._margins_ct, strict=True))
+        return {
+            name: at_rest[name].moved(
+                transform_points(way, motion.carry(at_rest[name].vertices_mm))
+            )
+            for name in tumors
+        }
+
+    def _bare(self, organ: Mesh) -> Mesh:
+        """The organ's surface where it is no tumor's, if its triangles are those of the CT."""
+        at_rest = self._anatomy_ct
+        if at_rest is None or not np.array_equal(at_rest.organ.faces, organ.faces):
+            return organ
+        return Mesh(organ.vertices_mm, self._bare_faces)
+
+    def _in_front(self, organ: Mesh) -> Mesh:
+        """The same triangles, and two idle vertices that put the middle of all into the eye of
+        whoever moved last. Browsers draw translucent surfaces in the order of their middles: the
+        organ must be the last, or it covers the margins that lie within."""
+        half = np.abs(organ.vertices_mm - self._eye_mm).max(0)
+        corners = [self._eye_mm - half, self._eye_mm + half]
+        return Mesh(np.concatenate([organ.vertices_mm, corners]), organ.faces)
+
+    def _follow(self, client: ClientHandle) -> None:
+        @client.camera.on_update
+        def _(camera: CameraHandle) -> None:
+            self._eye_mm = camera.position
+
+    def _look(self, frames: Frames) -> None:
+        """New clients look from the depth camera's place along its axis, its y axis down."""
+        way = frames.published_from_camera
+        self._nodes.set_up_direction(-way[:3, 1])
+        first = self._server.initial_camera
+        first.fov, first.near, first.far = _FOV_RADIANS, _NEAR_MM, _FAR_MM
+        self._eye_mm = way[:3, 3]
+        self._server.on_client_connect(self._follow)
+        first.position, first.up = way[:3, 3], -way[:3, 1]
+        first.look_at = way[:3, 3] + _FIRST_LOOK_MM * way[:3, 2]
+
+    def _aim(self, frames: Frames, depth_mm: float) -> None:
+        """Turn about the organ from now on, once its distance is known."""
+        if self._aimed:
+            return
+        self._aimed = True
+        way = frames.published_from_camera
+        centre = way[:3, 3] + depth_mm * way[:3, 2]
+        self._server.initial_camera.look_at = centre
+        for client in self._server.get_clients().values():
+            client.camera.look_at = centre
+
+
+def seen_points(update: Update) -> Float32[np.ndarray, "n 3"]:
+    """Points that the frame shows, thinned while they are still pixels; camera frame."""
+    assert update.seen is not None
+    content = update.seen.content
+    if isinstance(content, SensorCloud):
+        return content.points_mm
+    assert isinstance(content, DepthFrame)
+    height, width = content.depth_mm.shape
+    step = max(1, int(np.ceil(np.sqrt(height * width / MOST_SEEN))))
+    rows, columns = np.mgrid[0:height:step, 0:width:step]
+    depth_mm = content.depth_mm[::step, ::step].ravel()
+    there = np.flatnonzero(np.isfinite(depth_mm) & (depth_mm > 0))
+    index = (rows * width + columns).ravel()[there]
+    return deproject_pixels(index, depth_mm[there].astype(np.float64), content.intrinsics)
+
+
+def thinned(rows: np.ndarray, most: int) -> np.ndarray:
+    """Evenly spaced rows, ``most`` at the most."""
+    return rows[:: max(1, -(-len(rows) // most))]
+
+
+def _put_mesh(node: MeshHandle, mesh: Mesh) -> None:
+    if not np.array_equal(node.faces, mesh.faces):
+        node.faces = mesh.faces.astype(np.uint32)
+    node.vertices = mesh.vertices_mm.astype(np.float32)
+
+
+def _wxyz(rotation: Float[np.ndarray, "3 3"]) -> np.ndarray:
+    from scipy.spatial.transform import Rotation
+
+    return Rotation.from_matrix(rotation).as_quat(scalar_first=True)

@@ -1,0 +1,155 @@
+"""What the page says in words: how good the estimate is, and how old; as HTML."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from html import escape
+from typing import Literal
+
+import numpy as np
+from jaxtyping import UInt8
+
+from tumortrack.track.live import Update
+from tumortrack.track.view import colours
+from tumortrack.track.view.colours import Colour, css, part_colour
+
+State = Literal["waiting", "good", "poor", "none", "stale"]
+
+SILENCE_S = 2.0  # without a word from the server the page itself says so
+
+_COLOURS: dict[State, Colour] = {
+    "waiting": colours.STALE,
+    "good": colours.GOOD,
+    "poor": colours.POOR,
+    "none": colours.NONE,
+    "stale": colours.STALE,
+}
+_LOUD: dict[State, str] = {"waiting": "WAITING", "none": "NO ESTIMATE", "stale": "STALE"}
+
+# The page's own watch: every message replaces this element and so starts its clock anew. When
+# none comes (the program was killed, the network is gone) it shows itself, by the browser alone;
+# as a popover it lies above all, where the panel has been dimmed too.
+_WATCH = f"""
+<style>
+@keyframes tumortrack-silence {{ to {{ visibility: visible; }} }}
+.tumortrack-silence {{ visibility: hidden; animation: tumortrack-silence 1ms {SILENCE_S}s forwards;
+  position: fixed; inset: 0; width: 100vw; height: 100vh; box-sizing: border-box; border: 0;
+  margin: 0; z-index: 9999; pointer-events: none; background: {css(colours.STALE)}99;
+  backdrop-filter: grayscale(1); display: flex; align-items: center; justify-content: center; }}
+.tumortrack-silence div {{ background: {css(colours.STALE)}; color: white; padding: 24px 36px;
+  border-radius: 10px; font: 800 44px/1.25 system-ui, sans-serif; text-align: center; }}
+.tumortrack-silence small {{ display: block; font-size: 19px; font-weight: 400; }}
+</style>
+<div class="tumortrack-silence" onanimationend="this.popover = 'manual'; this.showPopover()">
+<div>STALE<small>tumortrack has been silent for {SILENCE_S:g} s; what you see is old</small></div>
+</div>
+"""
+
+
+@dataclass(frozen=True, eq=False)
+class Status:
+    """What is to be said now. ``update``: the last; ``age_s``: since its frame; ``beat`` differs
+    from message to message."""
+
+    state: State
+    update: Update | None
+    age_s: float
+    beat: int
+
+    def html(self) -> str:
+        """For the panel; the banner lies over the whole page."""
+        return f"<i hidden>{self.beat}</i>{_WATCH}{self._banner()}{self._flag()}{self._numbers()}"
+
+    def _reason(self) -> str:
+        if self.state == "waiting":
+            return "no frame has come yet"
+        if self.state == "stale":
+            return f"nothing has come for {self.age_s:.1f} s; the last estimate is hidden"
+        assert self.update is not None
+        return self.update.reason if self.state == "none" else self.update.warning
+
+    def _banner(self) -> str:
+        """Over the scene: big where there is nothing to see."""
+        if self.state == "good":
+            return ""
+        loud = _LOUD.get(self.state)
+        size = 44 if loud else 20
+        why = f"<div style='font-size:19px;font-weight:400'>{escape(self._reason())}</div>"
+        return (
+            "<div style='position:fixed;top:18px;left:18px;right:378px;z-index:9998;"
+            "pointer-events:none;display:flex;justify-content:center'>"
+            f"<div style='background:{css(_COLOURS[self.state])};color:white;padding:10px 26px;"
+            f"border-radius:10px;text-align:center;font:800 {size}px/1.2 system-ui,sans-serif'>"
+            f"{loud or 'POOR ESTIMATE'}{why}</div></div>"
+        )
+
+    def _flag(self) -> str:
+        text = {"good": "GOOD", "poor": "POOR"}.get(self.state) or _LOUD[self.state]
+        reason = f"<div style='font-weight:400'>{escape(self._reason())}</div>"
+        return (
+            f"<div style='background:{css(_COLOURS[self.state])};color:white;padding:8px 12px;"
+            "margin:8px 12px;border-radius:6px;font-size:15px;font-weight:700'>"
+            f"{text}{'' if self.state == 'good' else reason}</div>"
+        )
+
+    def _numbers(self) -> str:
+        update = self.update
+        if update is None:
+            return ""
+        latency = "–" if update.latency_ms is None else f"{update.latency_ms:.0f} ms"
+        times = " · ".join(f"{escape(k)} {1000 * v:.1f}" for k, v in update.seconds.items())
+        shown = update.estimate is not None and self.state in ("good", "poor")
+        parts = _parts(update.estimate.report.get("parts", {})) if shown else ""  # type: ignore[union-attr]
+        return (
+            "<div style='margin:4px 14px 10px;font-size:13px;font-variant-numeric:tabular-nums'>"
+            f"{parts}<div style='display:flex;justify-content:space-between;margin-top:6px'>"
+            f"<span>latency <b>{latency}</b></span><span>last frame <b>{self.age_s:.1f} s</b> ago"
+            f"</span><span>no. {update.sequence}</span></div>"
+            f"<div style='opacity:0.65;font-size:12px'>{times and 'stages, ms: '}{times}</div>"
+            "</div>"
+        )
+
+
+def backdrop(state: State) -> UInt8[np.ndarray, "h w 3"]:
+    """What lies behind the scene: dark; where nothing can be shown, a warning colour and the word,
+    so that it is read with the panel closed too."""
+    from PIL import Image, ImageDraw
+
+    if state not in _LOUD:
+        return np.full((4, 4, 3), colours.BACKGROUND, np.uint8)
+    dark = colours.BACKGROUND_NONE if state == "none" else colours.BACKGROUND_STALE
+    image = Image.new("RGB", (960, 800), dark)
+    brighter = tuple(min(255, 2 * channel + 30) for channel in dark)
+    draw = ImageDraw.Draw(image)
+    draw.text((480, 730), _LOUD[state], fill=brighter, font_size=84, anchor="mm")
+    return np.asarray(image)
+
+
+def _parts(parts: Mapping[str, dict]) -> str:
+    """A row per part: colour, name, probability as a bar and number, volume, deviation."""
+    rows = []
+    for name, part in parts.items():
+        swatch = css(part_colour(part["label"]))
+        probability = part.get("probability")
+        if not part.get("found") or probability is None:
+            rest = "<td colspan=3 style='opacity:0.7'>not found</td>"
+        else:
+            deviation = part.get("center_std_mm")
+            bar = (
+                "<div style='background:#8884;border-radius:3px;width:70px'><div style='height:8px;"
+                f"border-radius:3px;background:{swatch};width:{100 * probability:.0f}%'></div>"
+                "</div>"
+            )
+            rest = (
+                f"<td>{bar}</td><td style='text-align:right'>{probability:.2f}</td>"
+                f"<td style='text-align:right'>{part['volume_ml']:.1f} ml</td>"
+                f"<td style='text-align:right'>"
+                f"{'' if deviation is None else f'± {deviation:.1f} mm'}</td>"
+            )
+        rows.append(
+            f"<tr><td><span style='display:inline-block;width:11px;height:11px;border-radius:3px;"
+            f"background:{swatch};margin-right:6px'></span>{escape(name.replace('_', ' '))}</td>"
+            f"{rest}</tr>"
+        )
+    return f"<table style='width:100%;border-spacing:2px 3px'>{''.join(rows)}</table>"

@@ -1,0 +1,148 @@
+"""A headless Chromium, driven over its DevTools websocket."""
+
+from __future__ import annotations
+
+import base64
+import io
+import json
+import os
+import shutil
+import signal
+import subprocess
+import tempfile
+import time
+import urllib.request
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+FLAGS = (
+    "--headless",
+    "--no-sandbox",
+    "--disable-quic",
+    "--no-first-run",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+    "--use-angle=swiftshader",  # WebGL without a graphics card
+    "--enable-unsafe-swiftshader",
+    "--disable-dev-shm-usage",
+    "--remote-debugging-port=0",
+    "--remote-allow-origins=*",
+)
+
+
+def chromium() -> str:
+    """Where Chromium is; skips the test where it is not."""
+    for name in ("chromium", "chromium-browser", "google-chrome"):
+        if found := shutil.which(name):
+            return found
+    pytest.skip("no Chromium: apt-get install chromium (tools/debian-packages.txt)")
+
+
+class Browser:
+    """One page in a browser of its own; a context manager that ends it."""
+
+    def __init__(self, width: int = 1280, height: int = 800) -> None:
+        self._folder = tempfile.mkdtemp(prefix="browser-")
+        self._ids = 0
+        command = [chromium(), *FLAGS, f"--user-data-dir={self._folder}"]
+        self._process = subprocess.Popen(
+            [*command, f"--window-size={width},{height}", "about:blank"],
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+            start_new_session=True,
+        )
+        try:
+            self._socket = self._connect()
+            self.call(
+                "Emulation.setDeviceMetricsOverride",
+                width=width,
+                height=height,
+                deviceScaleFactor=1,
+                mobile=False,
+            )
+        except BaseException:
+            self._end()
+            raise
+
+    def __enter__(self) -> Browser:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._socket.close()
+        self._end()
+
+    def _connect(self) -> Any:
+        from websockets.sync.client import connect
+
+        port_file = Path(self._folder) / "DevToolsActivePort"
+        until(lambda: port_file.exists() and port_file.read_text().count("\n") >= 1, 20)
+        port = port_file.read_text().split()[0]
+        with urllib.request.urlopen(f"http://127.0.0.1:{port}/json/list", timeout=10) as answer:
+            pages = [target for target in json.load(answer) if target["type"] == "page"]
+        return connect(pages[0]["webSocketDebuggerUrl"], max_size=2**26, proxy=None)
+
+    def _end(self) -> None:
+        os.killpg(self._process.pid, signal.SIGKILL)
+        self._process.wait(10)
+        shutil.rmtree(self._folder, ignore_errors=True)
+
+    def call(self, method: str, **params: Any) -> dict:
+        """One DevTools command and its answer."""
+        self._ids += 1
+        self._socket.send(json.dumps({"id": self._ids, "method": method, "params": params}))
+        while True:
+            answer = json.loads(self._socket.recv(timeout=30))
+            if answer.get("id") == self._ids:
+                assert "error" not in answer, answer["error"]
+                return answer["result"]
+
+    def open(self, url: str) -> None:
+        self.call("Page.navigate", url=url)
+
+    def text(self) -> str:
+        """What the page says, hidden text left out."""
+        script = "document.body ? document.body.innerText : ''"
+        return self.call("Runtime.evaluate", expression=script)["result"]["value"]
+
+    def picture(self) -> np.ndarray:
+        """The page as it looks: (h, w, 3), uint8."""
+        data = self.call("Page.captureScreenshot", format="png")["data"]
+        return np.asarray(Image.open(io.BytesIO(base64.b64decode(data))).convert("RGB"))
+
+    def click(self, x: float, y: float) -> None:
+        for kind, buttons in (("mouseMoved", 0), ("mousePressed", 1), ("mouseReleased", 0)):
+            self.call(
+                "Input.dispatchMouseEvent",
+                type=kind,
+                x=x,
+                y=y,
+                button="none" if kind == "mouseMoved" else "left",
+                buttons=buttons,
+                clickCount=0 if kind == "mouseMoved" else 1,
+            )
+
+    def click_text(self, text: str) -> None:
+        """Click the middle of the button that says this."""
+        script = f"""(() => {{ for (const b of document.querySelectorAll('button'))
+            if (b.innerText.includes({json.dumps(text)})) {{
+                b.scrollIntoView(); const r = b.getBoundingClientRect();
+                return [r.x + r.width / 2, r.y + r.height / 2]; }} }})()"""
+        place = self.call("Runtime.evaluate", expression=script, returnByValue=True)["result"]
+        assert "value" in place, f"no button says {text!r}"
+        self.click(*place["value"])
+
+
+def until(met: Callable[[], Any], seconds: float, what: str = "it") -> Any:
+    """Wait for something to be true, and give it back."""
+    end = time.monotonic() + seconds
+    while time.monotonic() < end:
+        if found := met():
+            return found
+        time.sleep(0.05)
+    raise AssertionError(f"{what} did not happen within {seconds:g} s")
