@@ -104,7 +104,7 @@ class RealSenseSource:
             InputError: the camera's clock cannot be tied to this machine's.
         """
         came = self._next(timeout_s)
-        if came is None and self._playback is not None and self._is_over():
+        if came is None and self._is_over():
             came = self._next(_LAST_S)
             if came is None:
                 raise SourceEnded("the recording is over.")
@@ -158,7 +158,7 @@ class RealSenseSource:
         return came
 
     def _is_over(self) -> bool:
-        return self._playback.current_status() == self._stopped
+        return self._playback is not None and self._playback.current_status() == self._stopped
 
     def _wait_for_clock(self) -> None:
         """A camera's first frames come before its clock is tied to this machine's."""
