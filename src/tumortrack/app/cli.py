@@ -238,7 +238,7 @@ def track(
         rescan: every so many s, look for the organ as in a first frame.
         stale: frames older than so many s are refused, and a pause so long is said.
         give_up: end after so many s without a frame.
-        seconds: end after so many s; 0: never.
+        seconds: end so many s after the first frame; 0: never.
         report: file for latencies, counts and reasons (default: runs/track-TIME.json).
         seed: of the random points.
         device: auto takes CUDA where it is.

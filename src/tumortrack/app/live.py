@@ -47,15 +47,11 @@ class TrackOptions:
 
 def track(model_folder: Path, source: str, sinks: tuple[str, ...], options: TrackOptions) -> None:
     """Runs until the source ends, the time is up, or Ctrl-C."""
-    from tumortrack.learn.model import load_model
     from tumortrack.track.frames import read_frames
     from tumortrack.track.live import Controls, Frames, Setting
-    from tumortrack.track.loop import Loop
-    from tumortrack.track.reader import Reader
     from tumortrack.track.sinks import SINKS
     from tumortrack.track.sources import SOURCES
     from tumortrack.track.spec import parse_spec
-    from tumortrack.track.tracker import Tracker
 
     source_config = parse_spec(source, SOURCES, "source")
     sink_configs = [parse_spec(sink, SINKS, "sink") for sink in sinks]
@@ -63,6 +59,12 @@ def track(model_folder: Path, source: str, sinks: tuple[str, ...], options: Trac
         raise InputError(f"sink {doubled[0]!r} is given twice.")
     frames = read_frames(options.frame) if options.frame else Frames()
     report = _place_of_report(options.report)
+
+    from tumortrack.learn.model import load_model  # PyTorch takes seconds
+    from tumortrack.track.loop import Loop
+    from tumortrack.track.reader import Reader
+    from tumortrack.track.tracker import Tracker
+
     model = load_model(model_folder, options.device)
     config = _loop_config(model.config, options)
     tracker = Tracker(model)

@@ -6,6 +6,7 @@ answer is ever given again.
 
 from __future__ import annotations
 
+import math
 import re
 import threading
 import time
@@ -37,7 +38,8 @@ _DEFECTS = 5  # tracebacks that are kept
 
 class LoopConfig(Config, frozen=True, kw_only=True):
     """``stale_s``: no frame for so long, or one that old, gives 'no estimate'. ``give_up_s``: the
-    loop ends where no frame came for so long. ``seconds``: the loop ends after so long; 0: never.
+    loop ends where no frame came for so long. ``seconds``: the loop ends so long after the first
+    frame; 0: never.
     """
 
     region: RegionConfig = RegionConfig()
@@ -101,12 +103,15 @@ class Loop:
             SourceLost: no frame came for ``give_up_s``.
             TumortrackError: the source can never work (as its ``open`` said).
         """
-        started = fresh = time.monotonic()
+        fresh = time.monotonic()
+        ends = math.inf
         while not self._stop.is_set():
             got = reader.take(self._config.stale_s)
             now = time.monotonic()
             if isinstance(got, Seen):
                 fresh = now
+                if self._config.seconds and ends == math.inf:
+                    ends = now + self._config.seconds
                 update = self._answer(got, reader.born_ns(got))
             elif reader.ended:
                 return
@@ -114,7 +119,7 @@ class Loop:
                 update = self._silence(got, now - fresh, reader.trouble)
             self._publish(update, outlets)
             seen_by(update)
-            if self._config.seconds and now - started >= self._config.seconds:
+            if now >= ends:
                 return
             if now - fresh > self._config.give_up_s:
                 trouble = f": {reader.trouble}" if reader.trouble else ""

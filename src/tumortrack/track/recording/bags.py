@@ -57,8 +57,8 @@ class BagReel:
         self._messages = Messages("noetic" if files and files[0].suffix == ".bag" else "humble")
         self._readers: list[Any] = []
         try:
-            for opened in _guarded(path, lambda: _readers(path, files)):
-                self._readers.append(opened)
+            for file in [path] if (path / "metadata.yaml").is_file() else files:
+                self._readers.append(_guarded(path, partial(_open, file)))
             self._types = {c.topic: c.msgtype for r in self._readers for c in r.connections}
             self._topic = self._choose_topic()
             self._info_topic = self._choose_info() if self._types[self._topic] == IMAGE else ""
@@ -145,9 +145,14 @@ class BagReel:
         found = images or [topic for topic, kind in usable.items() if kind == CLOUD]
         if len(found) == 1:
             return found[0]
+        if not usable:
+            raise InputError(
+                f"{self._path} holds no depth images and no clouds (topics of {IMAGE} or {CLOUD}; "
+                f"those under {ESTIMATES} are estimates)."
+            )
         raise InputError(
             f"{self._path}: which topic holds the depth images or clouds? Say topic=NAME; "
-            f"candidates: {', '.join(found or usable) or 'none'} ({IMAGE} or {CLOUD})."
+            f"candidates: {', '.join(found or usable)}."
         )
 
     def _is_depth(self, topic: str) -> bool:
@@ -182,19 +187,17 @@ def _files(path: Path) -> list[Path]:
     return sorted(inside, key=lambda p: (len(p.name), p.name))
 
 
-def _readers(path: Path, files: list[Path]) -> Iterator[Any]:
-    """Opened readers, one after another in time."""
+def _open(path: Path) -> Any:
+    """An opened reader of a file, or of a rosbag2 folder."""
     from rosbags.rosbag1 import Reader as Reader1
     from rosbags.rosbag2 import Reader as Reader2
 
-    whole = (path / "metadata.yaml").is_file()
-    for file in [path] if whole else files:
-        if file.suffix.lower() == ".mcap" and not is_whole(file):
-            yield open_cut(file)
-            continue
-        reader: Any = Reader1(file) if file.suffix.lower() == ".bag" else Reader2(file)
-        reader.open()
-        yield reader
+    kind = path.suffix.lower() if path.is_file() else ""
+    if kind == ".mcap" and not is_whole(path):
+        return open_cut(path)
+    reader: Any = Reader1(path) if kind == ".bag" else Reader2(path)
+    reader.open()
+    return reader
 
 
 def _guarded(path: Path, step: Callable[[], Any]) -> Any:

@@ -114,8 +114,9 @@ class McapFile:
             os.ftruncate(self._file.fileno(), self._whole)
             self._file.close()
         raise StorageError(
-            f"cannot write {self._file.name}: {error.strerror}. What came before is in it and can "
-            "be played with recording:FOLDER; `ros2 bag reindex` makes it whole for others."
+            f"cannot write {self._file.name}: {error.strerror}. The recording ends {_CHUNK_S:g} s "
+            "before or less; it can be played with recording:FOLDER, and `mcap recover` makes it "
+            "whole for others."
         ) from error
 
 

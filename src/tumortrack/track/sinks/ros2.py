@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from typing import ClassVar
 
 from tumortrack.core.errors import InputError, TumortrackError
@@ -83,8 +84,9 @@ class Ros2Sink:
             if last is not None and last.estimate is not None:
                 self.publish(_ended(last))
             self._last = None
+            until_s = time.monotonic() + _FLUSH_S
             for publisher in self._publishers.values():
-                publisher.flush(_FLUSH_S)
+                publisher.flush(max(0.0, until_s - time.monotonic()))
         finally:
             self._publishers = {}
             self._bus.close()

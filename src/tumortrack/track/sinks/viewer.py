@@ -22,8 +22,8 @@ from tumortrack.core.types import Mesh
 from tumortrack.track.live import Setting, SinkConfig, Update
 from tumortrack.track.view import colours
 from tumortrack.track.view.panel import Actions, Panel
-from tumortrack.track.view.pick import point_under
-from tumortrack.track.view.scene import Scene, seen_points
+from tumortrack.track.view.points import point_under, seen_points
+from tumortrack.track.view.scene import Scene
 from tumortrack.track.view.server import close_server, open_server
 from tumortrack.track.view.slices import ORIENTATIONS, CarriedCt, Plane, slice_picture
 from tumortrack.track.view.status import State, Status, backdrop
@@ -103,6 +103,8 @@ class ViewerSink:
 
     def publish(self, update: Update) -> None:
         """Show it: without an estimate at once, with one not more often than ``hz``."""
+        if self._closing.is_set():
+            return
         now = time.monotonic()
         with self._page():
             before, self._update, self._came = self._update, update, now

@@ -2,5 +2,12 @@
 
 A source's configuration is what the command line writes as ``kind:target?key=value``; its
 ``open`` makes the source (``track.live.Source``). To add one: write its file, add its
-configuration to the union.
+configuration here.
 """
+
+from tumortrack.track.sources.recording import Recording
+from tumortrack.track.sources.ros1 import Ros1
+from tumortrack.track.sources.ros2 import Ros2
+from tumortrack.track.sources.virtual import Virtual
+
+SOURCES = (Virtual, Recording, Ros2, Ros1)

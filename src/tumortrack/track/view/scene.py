@@ -7,16 +7,16 @@ not overlap: the sink holds a lock round them.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
-from jaxtyping import Float, Float32, UInt8
+from jaxtyping import Float, UInt8
 
 from tumortrack.core.geometry import transform_points
-from tumortrack.core.types import DepthFrame, Mesh, SensorCloud
-from tumortrack.sense.camera import deproject_pixels
+from tumortrack.core.types import Mesh
 from tumortrack.track.live import Frames, Placed, Setting, Update
 from tumortrack.track.view import colours
+from tumortrack.track.view.points import MOST_SEEN, seen_points, thinned
 from tumortrack.track.view.slices import Plane
 from tumortrack.track.view.surfaces import bare_faces, exact_margin, rough_margin
 
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
         ViserServer,
     )
 
-MOST_SEEN, MOST_LABELLED = 20_000, 15_000  # points shown
+_MOST_LABELLED = 15_000  # points shown
 _AXES_MM = 12.0
 _NEAR_MM, _FAR_MM = 0.5, 20_000.0  # viser draws its background 1 before the eye
 _FIRST_LOOK_MM = 130.0
@@ -178,7 +178,8 @@ class Scene:
         )
         self._estimate = nodes.add_frame("/estimate", show_axes=False, visible=False)
         self._shells = {
-            name: self._surface(f"/estimate/margin_{name}", label, 0.22)
+            # Of a margin its far half: the near one would cover the organ that it reaches out of.
+            name: self._surface(f"/estimate/margin_{name}", label, 0.3, "back")
             for label, name in enumerate(setting.parts[1:], start=2)
             if self._margin_mm > 0
         }
@@ -203,13 +204,16 @@ class Scene:
             precision="float32",  # half precision is 0.125 mm at 150 mm
         )
 
-    def _surface(self, name: str, label: int, opacity: float | None) -> MeshHandle:
+    def _surface(
+        self, name: str, label: int, opacity: float | None, side: Literal["front", "back"] = "front"
+    ) -> MeshHandle:
         return self._nodes.add_mesh_simple(
             name,
             np.zeros((3, 3), np.float32),
             np.array([[0, 1, 2]], np.uint32),
             color=colours.part_colour(label),
             opacity=opacity,
+            side=side,
             visible=False,
             cast_shadow=False,
             receive_shadow=False,
@@ -225,7 +229,7 @@ class Scene:
         if self.options.points == "none":
             return
         least = 2 if self.options.points == "tumors" else 1
-        some = thinned(np.flatnonzero(placed.labels >= least), MOST_LABELLED)
+        some = thinned(np.flatnonzero(placed.labels >= least), _MOST_LABELLED)
         if self.options.by_probability:
             colour = colours.probability_colours(placed.probability[some])
         else:
@@ -271,6 +275,13 @@ class Scene:
         """New clients look from the depth camera's place along its axis, its y axis down."""
         way = frames.published_from_camera
         self._nodes.set_up_direction(-way[:3, 1])
+        # Light from the camera's side, as an endoscope gives it, and no shadows.
+        self._nodes.configure_default_lights(False)
+        self._nodes.configure_environment_map(None)
+        self._nodes.add_light_ambient("/ambient", intensity=0.9)
+        self._nodes.add_light_directional(
+            "/light", intensity=2.6, position=way[:3, :3] @ [-60.0, -120.0, -130.0]
+        )
         first = self._server.initial_camera
         first.fov, first.near, first.far = _FOV_RADIANS, _NEAR_MM, _FAR_MM
         self._eye_mm = way[:3, 3]
@@ -288,27 +299,6 @@ class Scene:
         self._server.initial_camera.look_at = centre
         for client in self._server.get_clients().values():
             client.camera.look_at = centre
-
-
-def seen_points(update: Update) -> Float32[np.ndarray, "n 3"]:
-    """Points that the frame shows, thinned while they are still pixels; camera frame."""
-    assert update.seen is not None
-    content = update.seen.content
-    if isinstance(content, SensorCloud):
-        return content.points_mm
-    assert isinstance(content, DepthFrame)
-    height, width = content.depth_mm.shape
-    step = max(1, int(np.ceil(np.sqrt(height * width / MOST_SEEN))))
-    rows, columns = np.mgrid[0:height:step, 0:width:step]
-    depth_mm = content.depth_mm[::step, ::step].ravel()
-    there = np.flatnonzero(np.isfinite(depth_mm) & (depth_mm > 0))
-    index = (rows * width + columns).ravel()[there]
-    return deproject_pixels(index, depth_mm[there].astype(np.float64), content.intrinsics)
-
-
-def thinned(rows: np.ndarray, most: int) -> np.ndarray:
-    """Evenly spaced rows, ``most`` at the most."""
-    return rows[:: max(1, -(-len(rows) // most))]
 
 
 def _put_mesh(node: MeshHandle, mesh: Mesh) -> None:

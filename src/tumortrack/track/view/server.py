@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import socket
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -24,6 +25,7 @@ def open_server(host: str, port: int) -> ViserServer:
     except ImportError as error:
         raise InputError("the viewer needs viser: pip install 'tumortrack[live]'.") from error
     _check_free(host, port)  # asked for a taken port, viser takes another and doesn't say so
+    logging.getLogger("websockets.server").addFilter(_is_no_refusal)
     with _silence():
         server = viser.ViserServer(host=host, port=port, label="tumortrack", verbose=False)
     if port not in (0, server.get_port()):
@@ -36,6 +38,11 @@ def close_server(server: ViserServer) -> None:
     """Stop it, its threads and its connections."""
     with _silence():
         server.stop()
+
+
+def _is_no_refusal(record: logging.LogRecord) -> bool:
+    """Browsers open connections in advance and drop them, which websockets logs as an error."""
+    return record.getMessage() != "opening handshake failed"
 
 
 def _check_free(host: str, port: int) -> None:
