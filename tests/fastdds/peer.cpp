@@ -1,0 +1,175 @@
+// A program that speaks ROS 2's topics over eProsima Fast DDS, without ROS: serialised messages
+// as they are, no generated code. Built and run by tests/test_ros2.py.
+//
+//   peer DOMAIN sub SECONDS TOPIC TYPE FILE
+//       listens; FILE gets the last message, standard output the number of messages
+//   peer DOMAIN pub SECONDS HZ TOPIC TYPE FILE [TOPIC TYPE FILE ...]
+//       sends the files' bytes, with the present time as their header's stamp
+#include <atomic>
+#include <chrono>
+#include <cstring>
+#include <fstream>
+#include <iostream>
+#include <iterator>
+#include <mutex>
+#include <string>
+#include <thread>
+#include <vector>
+
+#include <fastdds/dds/domain/DomainParticipantFactory.hpp>
+#include <fastdds/dds/domain/DomainParticipant.hpp>
+#include <fastdds/dds/publisher/DataWriter.hpp>
+#include <fastdds/dds/publisher/Publisher.hpp>
+#include <fastdds/dds/subscriber/DataReader.hpp>
+#include <fastdds/dds/subscriber/DataReaderListener.hpp>
+#include <fastdds/dds/subscriber/SampleInfo.hpp>
+#include <fastdds/dds/subscriber/Subscriber.hpp>
+#include <fastdds/dds/topic/TopicDataType.hpp>
+
+using namespace eprosima::fastdds::dds;
+using Payload = eprosima::fastrtps::rtps::SerializedPayload_t;
+using Bytes = std::vector<char>;
+using Clock = std::chrono::steady_clock;
+
+// CDR bytes, header included, as the value of any type.
+class Raw : public TopicDataType
+{
+public:
+    explicit Raw(const std::string& name)
+    {
+        setName(name.c_str());
+        m_typeSize = 8 << 20;
+        m_isGetKeyDefined = false;
+        auto_fill_type_object(false);
+        auto_fill_type_information(false);
+    }
+    bool serialize(void* data, Payload* payload) override
+    {
+        const Bytes& bytes = *static_cast<Bytes*>(data);
+        std::memcpy(payload->data, bytes.data(), bytes.size());
+        payload->length = bytes.size();
+        payload->encapsulation = CDR_LE;
+        return true;
+    }
+    bool deserialize(Payload* payload, void* data) override
+    {
+        static_cast<Bytes*>(data)->assign(payload->data, payload->data + payload->length);
+        return true;
+    }
+    std::function<uint32_t()> getSerializedSizeProvider(void* data) override
+    {
+        return [data] { return static_cast<uint32_t>(static_cast<Bytes*>(data)->size()); };
+    }
+    void* createData() override { return new Bytes; }
+    void deleteData(void* data) override { delete static_cast<Bytes*>(data); }
+    bool getKey(void*, eprosima::fastrtps::rtps::InstanceHandle_t*, bool) override { return false; }
+};
+
+class Listener : public DataReaderListener
+{
+public:
+    void on_data_available(DataReader* reader) override
+    {
+        Bytes bytes;
+        SampleInfo info;
+        while (reader->take_next_sample(&bytes, &info) == ReturnCode_t::RETCODE_OK)
+        {
+            if (info.valid_data)
+            {
+                std::lock_guard<std::mutex> guard(lock);
+                last = bytes;
+                ++count;
+            }
+        }
+    }
+    std::mutex lock;
+    Bytes last;
+    int count = 0;
+};
+
+static Topic* topic_of(DomainParticipant* member, const std::string& name, const std::string& type)
+{
+    TypeSupport(new Raw(type)).register_type(member);
+    return member->create_topic(name, type, TOPIC_QOS_DEFAULT);
+}
+
+static int listen(DomainParticipant* member, double seconds, char** names)
+{
+    DataReaderQos qos;
+    qos.reliability().kind = RELIABLE_RELIABILITY_QOS;
+    qos.history().depth = 5;
+    qos.endpoint().history_memory_policy =
+        eprosima::fastrtps::rtps::PREALLOCATED_WITH_REALLOC_MEMORY_MODE;
+    Listener listener;
+    Subscriber* subscriber = member->create_subscriber(SUBSCRIBER_QOS_DEFAULT);
+    subscriber->create_datareader(topic_of(member, names[0], names[1]), qos, &listener);
+    std::this_thread::sleep_for(std::chrono::duration<double>(seconds));
+    std::lock_guard<std::mutex> guard(listener.lock);
+    std::ofstream(names[2], std::ios::binary).write(listener.last.data(), listener.last.size());
+    std::cout << listener.count << std::endl;
+    return 0;
+}
+
+static void stamp_now(Bytes& message)
+{
+    const auto now = std::chrono::system_clock::now().time_since_epoch();
+    const auto ns = std::chrono::duration_cast<std::chrono::nanoseconds>(now).count();
+    const int32_t seconds = static_cast<int32_t>(ns / 1000000000);
+    const uint32_t rest = static_cast<uint32_t>(ns % 1000000000);
+    std::memcpy(message.data() + 4, &seconds, 4);
+    std::memcpy(message.data() + 8, &rest, 4);
+}
+
+static int publish(DomainParticipant* member, double seconds, double hz, int n, char** names)
+{
+    DataWriterQos qos;
+    qos.reliability().kind = RELIABLE_RELIABILITY_QOS;
+    qos.history().depth = 1;
+    qos.publish_mode().kind = ASYNCHRONOUS_PUBLISH_MODE;
+    qos.endpoint().history_memory_policy =
+        eprosima::fastrtps::rtps::PREALLOCATED_WITH_REALLOC_MEMORY_MODE;
+    Publisher* publisher = member->create_publisher(PUBLISHER_QOS_DEFAULT);
+    std::vector<DataWriter*> writers;
+    std::vector<Bytes> messages;
+    for (int i = 0; i + 2 < n; i += 3)
+    {
+        std::ifstream file(names[i + 2], std::ios::binary);
+        messages.emplace_back(std::istreambuf_iterator<char>(file), std::istreambuf_iterator<char>());
+        writers.push_back(publisher->create_datawriter(topic_of(member, names[i], names[i + 1]), qos));
+    }
+    const auto end = Clock::now() + std::chrono::duration<double>(seconds);
+    auto next = Clock::now();
+    int count = 0;
+    for (; Clock::now() < end; ++count)
+    {
+        for (size_t i = 0; i < writers.size(); ++i)
+        {
+            stamp_now(messages[i]);
+            writers[i]->write(&messages[i]);
+        }
+        next += std::chrono::duration_cast<Clock::duration>(std::chrono::duration<double>(1 / hz));
+        std::this_thread::sleep_until(next);
+    }
+    std::cout << count << std::endl;
+    return 0;
+}
+
+int main(int argc, char** argv)
+{
+    if (argc < 7)
+    {
+        return 2;
+    }
+    DomainParticipant* member = DomainParticipantFactory::get_instance()->create_participant(
+        std::stoi(argv[1]), PARTICIPANT_QOS_DEFAULT);
+    if (member == nullptr)
+    {
+        return 1;
+    }
+    const double seconds = std::stod(argv[3]);
+    if (std::string(argv[2]) == "sub")
+    {
+        return listen(member, seconds, argv + 4);
+    }
+    return publish(member, seconds, std::stod(argv[4]), argc - 5, argv + 5);
+}
