@@ -24,7 +24,8 @@ class Props:
     """How hard a scene is.
 
     distance_mm: camera to the organ's top. tilt_degrees: of the table. waves_mm: height of the
-    drape's waves. bed: the organ lies half sunk in something soft that rises around it.
+    drape's waves. bed: the organ lies half sunk in something soft that rises around it. up: which
+    way of the organ points up, in its own frame; None: one of its two broad sides, by chance.
     """
 
     distance_mm: tuple[float, float] = (110.0, 200.0)
@@ -33,6 +34,7 @@ class Props:
     shafts: int = 0
     hand: bool = False
     bed: bool = False
+    up: tuple[float, float, float] | None = None
 
 
 EASY = Props()
@@ -68,7 +70,7 @@ def make_scene(
     noise: NoiseConfig = D405_NOISE,
 ) -> Scene:
     camera = camera or d405(424, 240)
-    table_from_organ, size_mm = _laid_down(organ, rng)
+    table_from_organ, size_mm = _laid_down(organ, props, rng)
     sunk_mm = size_mm[2] * rng.uniform(0.3, 0.5) if props.bed else 0.0
     table_from_organ[2, 3] -= sunk_mm
     top_mm = np.array([0.0, 0.0, size_mm[2] - sunk_mm])
@@ -109,12 +111,18 @@ def stereo_shadow(frame: DepthFrame) -> np.ndarray:
     return hidden
 
 
-def _laid_down(organ: Mesh, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """``table_from_organ`` (table: z up, its surface at 0) of an organ lying on a broad side."""
+def _laid_down(
+    organ: Mesh, props: Props, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
+    """``table_from_organ`` (table: z up, its surface at 0) of an organ lying on a broad side, and
+    its size as it lies."""
     centred = organ.vertices_mm - organ.box_mm.mean(0)
     axes = np.linalg.svd(centred[:: max(len(centred) // 2000, 1)], full_matrices=False)[2]
     axes[2] = np.cross(axes[0], axes[1])
     roll = Rotation.from_euler("x", rng.choice([0, 180]) + rng.uniform(-25, 25), degrees=True)
+    if props.up is not None:
+        axes = rotation_onto(np.array(props.up), np.array([0.0, 0.0, 1.0]))
+        roll = Rotation.identity()
     turn = Rotation.from_euler("z", rng.uniform(0, 360), degrees=True)
     tip = Rotation.from_euler("y", rng.uniform(-15, 15), degrees=True)
     rotation = (turn * tip * roll).as_matrix() @ axes
