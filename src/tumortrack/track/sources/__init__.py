@@ -5,9 +5,10 @@ A source's configuration is what the command line writes as ``kind:target?key=va
 configuration here.
 """
 
+from tumortrack.track.sources.realsense import RealSense
 from tumortrack.track.sources.recording import Recording
 from tumortrack.track.sources.ros1 import Ros1
 from tumortrack.track.sources.ros2 import Ros2
 from tumortrack.track.sources.virtual import Virtual
 
-SOURCES = (Virtual, Recording, Ros2, Ros1)
+SOURCES = (Virtual, RealSense, Recording, Ros2, Ros1)
