@@ -223,6 +223,31 @@ def test_damaged_polydata_is_refused(at: int, value: int) -> None:
         unpack_polydata(bytes(content))
 
 
+@settings(max_examples=200, deadline=None)
+@given(st.data())
+def test_no_damage_gets_further_than_a_refusal(data: st.DataObject) -> None:
+    """Whatever is done to a content, it is read as something whole or refused."""
+    surface = Polydata(np.eye(3), np.array([[0, 1, 2]]), np.array([[0, 2]]), {"p": np.ones(3)})
+    for content, read in (
+        (pack_polydata(surface), unpack_polydata),
+        (pack_status(Status(1, "good", "text")), unpack_status),
+        (pack_string("text"), unpack_string),
+        (pack_transform(np.eye(4)), unpack_transform),
+    ):
+        damaged = bytearray(content)
+        for at in data.draw(st.lists(st.integers(0, len(content) - 1), max_size=3)):
+            damaged[at] = data.draw(st.sampled_from([0, 1, 2, 4, 127, 128, 255]))
+        cut = data.draw(st.integers(0, len(content)) | st.just(len(content)))
+        try:
+            found = read(bytes(damaged[:cut]))
+        except ProtocolError:
+            continue
+        if isinstance(found, Polydata):
+            assert cut == len(content)
+            for cells in (found.triangles, found.segments):
+                assert (cells < len(found.points)).all()
+
+
 def test_pyigtl_reads_our_messages() -> None:
     from pyigtl.messages import MessageBase
 

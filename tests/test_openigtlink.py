@@ -238,6 +238,19 @@ def test_requests_are_answered_and_others_ignored(opened) -> None:
     assert hear(sock).device == "tumortrack"
 
 
+def test_one_that_only_asks_fills_no_memory(opened) -> None:
+    open_sink, open_receiver = opened
+    sink = open_sink()
+    asker, friend = open_receiver(sink, buffer=4096), open_receiver(sink)
+    asker.settimeout(5)
+    for n in range(3000):
+        asker.sendall(pack(Message("GET_IMAGE", f"ct{n}")))
+    sink.publish(small_update())
+    assert len(hear_all(friend, ALL)) == ALL
+    most = max(len(one.waiting) for one in sink._link._receivers.values())
+    assert most <= 100 + ALL
+
+
 @pytest.mark.parametrize(
     "garbage", [b"GET / HTTP/1.1\r\n".ljust(60), b"\0\1" + bytes(40) + b"\xff" * 16]
 )
@@ -277,6 +290,8 @@ def test_what_cannot_work_is_refused(opened) -> None:
     taken = open_sink()
     with pytest.raises(InputError, match="Choose another port"):
         OpenIgtLink(port=taken.port).open(small_setting())
+    with pytest.raises(InputError, match="there is no host"):
+        OpenIgtLink(connect="no..host").open(small_setting())
     for bad in ({"port": 70000}, {"mesh_hz": -1.0}, {"cloud_hz": float("nan")}):
         with pytest.raises(InputError, match="must lie in"):
             OpenIgtLink(**bad)  # type: ignore[arg-type]

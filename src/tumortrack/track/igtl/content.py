@@ -49,11 +49,14 @@ def pack_transform(b_from_a: Float[np.ndarray, "4 4"]) -> bytes:
 
 
 def unpack_transform(content: bytes) -> Float[np.ndarray, "4 4"]:
-    """Raises ProtocolError: not 48 bytes."""
+    """Raises ProtocolError: not 48 bytes, or NaN or infinity among its numbers."""
     if len(content) != 48:
         raise ProtocolError(f"TRANSFORM has 48 bytes, not {len(content)}.")
+    columns = np.frombuffer(content, ">f4").reshape(4, 3)
+    if not np.isfinite(columns).all():
+        raise ProtocolError("TRANSFORM has NaN or infinity among its numbers.")
     b_from_a = np.eye(4)
-    b_from_a[:3] = np.frombuffer(content, ">f4").reshape(4, 3).T
+    b_from_a[:3] = columns.T
     return b_from_a
 
 
@@ -138,6 +141,8 @@ def unpack_polydata(content: bytes) -> Polydata:
             raise ProtocolError("POLYDATA: only attributes of one number a point are read.")
         names = take.names(n_attributes)
         scalars = {name: take.numbers(n_points, ">f4").astype(np.float32) for name in names}
+        if take.left or any(size % 4 for size in sizes.values()):
+            raise ProtocolError("POLYDATA: its sizes do not fit.")
     except (struct.error, ValueError, UnicodeDecodeError) as error:
         raise ProtocolError(f"POLYDATA is damaged: {error}.") from error
     return Polydata(
@@ -151,9 +156,11 @@ def unpack_polydata(content: bytes) -> Polydata:
 def _corners(
     numbers: UInt32[np.ndarray, " m"], count: int, size: int, n_points: int
 ) -> Int[np.ndarray, "count size"]:
-    cells = numbers.reshape(-1, 1 + size) if len(numbers) % (1 + size) == 0 else numbers[:0, None]
-    if len(cells) != count or (cells[:, :1] != size).any() or (cells[:, 1:] >= n_points).any():
-        raise ProtocolError(f"POLYDATA: its cells are damaged, or not of {size} points each.")
+    if len(numbers) != count * (1 + size):
+        raise ProtocolError(f"POLYDATA: {count} cells of {size} points each do not fit.")
+    cells = numbers.reshape(-1, 1 + size)
+    if (cells[:, 0] != size).any() or (cells[:, 1:] >= n_points).any():
+        raise ProtocolError("POLYDATA: cells of another size, or of points that do not exist.")
     return cells[:, 1:].astype(np.int32)
 
 
@@ -162,6 +169,10 @@ class _Reader:
 
     def __init__(self, content: bytes, at: int) -> None:
         self._content, self._at = content, at
+
+    @property
+    def left(self) -> int:
+        return len(self._content) - self._at
 
     def bytes(self, size: int) -> bytes:
         piece = self._content[self._at : self._at + size]

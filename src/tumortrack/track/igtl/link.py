@@ -28,6 +28,7 @@ from tumortrack.track.igtl.message import (
 )
 
 _LARGEST_REQUEST = 2**16  # bytes; what a receiver sends is small
+_MOST_ANSWERS = 100  # that wait for a receiver: one that only asks gets no more
 _STALLED_S = 10.0  # a receiver that takes nothing for so long is gone
 _AGAIN_S = 1.0  # between tries to connect
 _AT_ONCE = 2**18  # bytes handed to the socket in one go
@@ -64,7 +65,7 @@ class Link:
         self._lock = threading.Lock()
         self._newest: dict[Key, bytes] = {}
         self._receivers: dict[socket.socket, _Receiver] = {}
-        self._goal = (connect, port) if connect else None
+        self._goal = _known(connect, port) if connect else None
         self._try_s = 0.0
         self._closing = False
         self._selector = selectors.DefaultSelector()
@@ -217,7 +218,8 @@ class Link:
             del receiver.received[:end]
             for key, answer in self._answers(header, body).items():
                 with self._lock:
-                    receiver.waiting[key] = answer
+                    if key in receiver.waiting or len(receiver.waiting) < _MOST_ANSWERS:
+                        receiver.waiting[key] = answer
 
     def _answers(self, header: Header, body: bytes) -> dict[Key, bytes]:
         """To GET_...: the newest of that type (of that device, if it names one), an empty message
@@ -247,8 +249,16 @@ class Link:
 def _listen(host: str, port: int) -> socket.socket:
     try:
         return socket.create_server((host, port), backlog=16)
-    except (OSError, OverflowError) as error:
+    except (OSError, ValueError) as error:  # ValueError: a name that cannot be one
         raise InputError(
             f"openigtlink: cannot listen on {host}:{port}: {error}. Choose another port, or end "
             "the program that has it."
         ) from error
+
+
+def _known(host: str, port: int) -> tuple[str, int]:
+    try:
+        socket.getaddrinfo(host, port)
+    except (OSError, ValueError) as error:
+        raise InputError(f"openigtlink: there is no host {host!r}: {error}.") from error
+    return host, port
