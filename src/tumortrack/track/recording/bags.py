@@ -73,39 +73,28 @@ class BagReel:
                 reader.close()
 
     def shots(self) -> Iterator[Shot]:
-        if not self._info_topic:
-            yield from self._cloud_shots()
-            return
-        info, mask = self._first(self._info_topic, CAMERA_INFO), None
+        images = bool(self._info_topic)
+        info = self._first(self._info_topic) if images else None
+        mask: Any = None
         waiting: Any = None  # an image: its camera_info and mask may follow it
         last_ns = 0
-        for topic, data in self._all({self._topic, self._info_topic, MASK_TOPIC}):
-            try:
-                message = self._messages.from_bytes(data, self._types[topic])
-            except InputError as error:
-                yield Shot(last_ns, partial(refuse, error))
+        for topic, message in self._all({self._topic, self._info_topic, MASK_TOPIC}):
+            if topic and topic != self._topic:
+                info, mask = (info, message) if topic == MASK_TOPIC else (message, mask)
                 continue
-            if topic == self._info_topic:
-                info = message
-            elif topic == MASK_TOPIC:
-                mask = message
-            else:
-                if waiting is not None:
-                    yield self._image_shot(waiting, info, mask)
-                waiting, last_ns = message, stamp_of(message.header)
-        if waiting is not None:
-            yield self._image_shot(waiting, info, mask)
-
-    def _cloud_shots(self) -> Iterator[Shot]:
-        last_ns = 0
-        for _, data in self._all({self._topic}):
-            try:
-                message = self._messages.from_bytes(data, CLOUD)
-            except InputError as error:
-                yield Shot(last_ns, partial(refuse, error))
+            if waiting is not None:
+                yield self._image_shot(waiting, info, mask)
+                waiting = None
+            if isinstance(message, InputError):
+                yield Shot(last_ns, partial(refuse, message))
                 continue
             last_ns = stamp_of(message.header)
-            yield Shot(last_ns, partial(_cloud, message))
+            if images:
+                waiting = message
+            else:
+                yield Shot(last_ns, partial(_cloud, message))
+        if waiting is not None:
+            yield self._image_shot(waiting, info, mask)
 
     def _image_shot(self, image: Any, info: Any, mask: Any) -> Shot:
         stamp_ns = stamp_of(image.header)
@@ -113,19 +102,33 @@ class BagReel:
             mask = None
         return Shot(stamp_ns, partial(_frame, image, info, mask, self._choice))
 
-    def _all(self, topics: set[str]) -> Iterator[tuple[str, bytes]]:
-        """Topic and bytes of messages, in the order of their recording."""
+    def _all(self, topics: set[str]) -> Iterator[tuple[str, Any]]:
+        """Topic and message in the order of their recording; without a topic an InputError, where
+        a message, or the bag from there on, is damaged."""
         for reader in self._readers:
             wanted = [c for c in reader.connections if c.topic in topics]
             if not wanted:
                 continue
-            messages = reader.messages(wanted)
-            while got := _guarded(self._path, partial(next, messages, None)):
-                yield got[0].topic, got[2]
+            raw = reader.messages(wanted)
+            while True:
+                try:
+                    got = _guarded(self._path, partial(next, raw, None))
+                except InputError as error:
+                    yield "", error
+                    break
+                if got is None:
+                    break
+                topic = got[0].topic
+                try:
+                    yield topic, self._messages.from_bytes(got[2], self._types[topic])
+                except InputError as error:
+                    yield "", error
 
-    def _first(self, topic: str, message_type: str) -> Any:
-        for _, data in self._all({topic}):
-            return self._messages.from_bytes(data, message_type)
+    def _first(self, topic: str) -> Any:
+        for _, message in self._all({topic}):
+            if isinstance(message, InputError):
+                raise message
+            return message
         raise InputError(f"{self._path} has no message on {topic}, which was announced in it.")
 
     def _choose_topic(self) -> str:
@@ -157,7 +160,7 @@ class BagReel:
 
     def _is_depth(self, topic: str) -> bool:
         try:
-            return self._first(topic, IMAGE).encoding in _DEPTHS
+            return self._first(topic).encoding in _DEPTHS
         except InputError:
             return False
 

@@ -35,11 +35,8 @@ class Reel(Protocol):
     """An open recording."""
 
     def shots(self) -> Iterator[Shot]:
-        """From the first to the last, anew with each call.
-
-        Raises:
-            InputError: the recording is damaged from here on.
-        """
+        """From the first to the last, anew with each call. What is damaged is a shot too, whose
+        ``load`` says so."""
         ...
 
     def close(self) -> None:

@@ -6,7 +6,6 @@ import threading
 import time
 from collections.abc import Iterator
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import ClassVar, Literal
 
@@ -14,7 +13,7 @@ from tumortrack.core.errors import InputError
 from tumortrack.track.live import Seen, SourceConfig, SourceEnded
 from tumortrack.track.recording.bags import BagChoice, BagReel, is_bag
 from tumortrack.track.recording.folders import open_folder
-from tumortrack.track.recording.shots import Content, Reel, Shot, refuse
+from tumortrack.track.recording.shots import Content, Reel, Shot
 
 # Less than what the loop takes for a frozen source.
 _LONGEST_WAIT_S = 2.0
@@ -88,7 +87,7 @@ class RecordingSource:
         self.waits = rate == 0
         self.dropped = 0
         self._reel, self._rate = reel, rate
-        self._shots = _endless(reel) if loop else _once(reel)
+        self._shots = _endless(reel) if loop else reel.shots()
         self._next: Shot | None = None
         self._shown_ns: int | None = None  # stamp of the shot before
         self._due_s = 0.0  # when the next one is due, by time.monotonic
@@ -148,23 +147,12 @@ class RecordingSource:
         self._shown_ns = self._next.stamp_ns
 
 
-def _once(reel: Reel) -> Iterator[Shot]:
-    """All shots; where the recording itself is damaged, a last one that says so."""
-    last_ns = 0
-    try:
-        for shot in reel.shots():
-            yield shot
-            last_ns = shot.stamp_ns
-    except InputError as error:
-        yield Shot(last_ns, partial(refuse, error))
-
-
 def _endless(reel: Reel) -> Iterator[Shot]:
     """The reel again and again, each time later by its length and one period."""
     shift_ns = 0
     while True:
         stamps_ns = set()
-        for shot in _once(reel):
+        for shot in reel.shots():
             stamps_ns.add(shot.stamp_ns)
             yield shot if shift_ns == 0 else _later(shot, shift_ns)
         if not any(stamps_ns):
