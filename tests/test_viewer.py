@@ -26,7 +26,7 @@ from tumortrack.imaging.case import Case, save_case
 from tumortrack.track.live import Frames, Seen, Setting, Update
 from tumortrack.track.sinks.viewer import Viewer, ViewerSink
 from tumortrack.track.view.colours import TUMORS, part_colour
-from tumortrack.track.view.pick import point_under
+from tumortrack.track.view.points import point_under
 from tumortrack.track.view.slices import CarriedCt, Plane, slice_picture
 from tumortrack.track.view.status import Status
 from tumortrack.track.view.surfaces import bare_faces, exact_margin, rough_margin
@@ -327,12 +327,12 @@ class Feed(threading.Thread):
 
 def greenish(picture: np.ndarray) -> int:
     """Pixels with the hue of the first tumor, seen through kidney or not."""
-    r, g, b = picture[:, :500].astype(int).transpose(2, 0, 1)
+    r, g, b = picture[:, :400].astype(int).transpose(2, 0, 1)
     return int(((g >= r) & (g > b + 15)).sum())
 
 
 def kidneyish(picture: np.ndarray) -> int:
-    r, g, b = picture[:, :500].astype(int).transpose(2, 0, 1)
+    r, g, b = picture[:, :400].astype(int).transpose(2, 0, 1)
     return int(((r > 1.2 * g) & (r < 2.6 * g) & (g > b) & (g > 20)).sum())
 
 
@@ -341,12 +341,12 @@ def test_page_in_a_browser(sinks):
     sink = sinks(setting)
     shown = small_update(frames=ROBOT)
     hidden = replace(empty_update(reason="only 12 points lie in range"), frames=ROBOT)
-    with Browser(900, 600) as browser:
+    with Browser(780, 480) as browser:
         feed = Feed(sink, shown)
         try:
             browser.open(f"http://127.0.0.1:{sink.port}")
             until(lambda: "GOOD" in browser.text(), 20, "the page")
-            until(lambda: greenish(browser.picture()) > 1000, 10, "a tumor")
+            until(lambda: greenish(browser.picture()) > 700, 10, "a tumor")
             assert kidneyish(browser.picture()) > 5000
             assert "STALE" not in browser.text()
 
@@ -365,7 +365,7 @@ def test_page_in_a_browser(sinks):
             until(lambda: "only 12 points" in browser.text(), 20, "the page again")
             feed.update = replace(shown, quality="poor", warning="it fits only to 3 mm")
             until(lambda: "it fits only to 3 mm" in browser.text(), 5, "the warning")
-            until(lambda: greenish(browser.picture()) > 1000, 10, "the tumor again")
+            until(lambda: greenish(browser.picture()) > 700, 10, "the tumor again")
 
             check_click(browser, setting)
 

@@ -16,25 +16,16 @@ from tumortrack.core.geometry import transform_points
 from tumortrack.core.types import Mesh
 from tumortrack.track.live import Frames, Placed, Setting, Update
 from tumortrack.track.view import colours
+from tumortrack.track.view.look import Look
 from tumortrack.track.view.points import MOST_SEEN, seen_points, thinned
 from tumortrack.track.view.slices import Plane
 from tumortrack.track.view.surfaces import bare_faces, exact_margin, rough_margin
 
 if TYPE_CHECKING:
-    from viser import (
-        CameraHandle,
-        ClientHandle,
-        ImageHandle,
-        MeshHandle,
-        PointCloudHandle,
-        ViserServer,
-    )
+    from viser import ImageHandle, MeshHandle, PointCloudHandle, ViserServer
 
 _MOST_LABELLED = 15_000  # points shown
 _AXES_MM = 12.0
-_NEAR_MM, _FAR_MM = 0.5, 20_000.0  # viser draws its background 1 before the eye
-_FIRST_LOOK_MM = 130.0
-_FOV_RADIANS = 0.9
 _CORNERS = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)])
 _EDGES = [(a, b) for a in range(8) for b in range(a) if abs(_CORNERS[a] - _CORNERS[b]).sum() == 1]
 
@@ -56,7 +47,7 @@ class Scene:
     """viser's nodes, and what goes into them."""
 
     def __init__(self, server: ViserServer, setting: Setting, margin_mm: float) -> None:
-        self._server, self._nodes = server, server.scene
+        self._nodes = server.scene
         self._margin_mm = margin_mm
         self._anatomy_ct, self._margins_ct = setting.anatomy_ct, None
         if setting.anatomy_ct is not None:
@@ -67,10 +58,10 @@ class Scene:
         self.options = Options()
         self.margins: dict[str, Mesh] = {}  # of the shown estimate, published frame
         self._placed: Placed | None = None
-        self._aimed = self._has_organ = self._has_slice = False
+        self._has_organ = self._has_slice = False
         self._parts: dict[str, MeshHandle] = {}
         self._shells: dict[str, MeshHandle] = {}
-        self._look(setting.frames)
+        self._look = Look(server, setting.frames)
         self._make_nodes(setting)
 
     def observe(self, update: Update) -> None:
@@ -81,11 +72,12 @@ class Scene:
         self._put_points(self._seen, transform_points(way, thinned(seen, MOST_SEEN)), colours.SEEN)
         organ_there = transform_points(way, thinned(organ, MOST_SEEN))
         self._put_points(self._organ, organ_there, colours.ORGAN)
+        self._axes.wxyz, self._axes.position = _wxyz(way[:3, :3]), way[:3, 3]
         if len(organ):
             lower, upper = organ.min(0), organ.max(0)
             corners = transform_points(way, lower + _CORNERS * (upper - lower))
             self._region.points = corners[_EDGES].astype(np.float32)
-            self._aim(update.frames, float(np.median(organ[:, 2])))
+            self._look.aim(update.frames, float(np.median(organ[:, 2])))
         self._has_organ = len(organ) > 0
 
     def show(self, update: Update) -> None:
@@ -96,7 +88,7 @@ class Scene:
         self.margins = self._margins_of(update, placed)
         for name, mesh in placed.meshes.items():
             if name in self._parts:
-                shown = self._in_front(self._bare(mesh)) if name == "kidney" else mesh
+                shown = self._look.last_drawn(self._bare(mesh)) if name == "kidney" else mesh
                 _put_mesh(self._parts[name], shown)
         for name, mesh in self.margins.items():
             _put_mesh(self._shells[name], mesh)
@@ -155,14 +147,8 @@ class Scene:
             self._picked.position = there[0]
 
     def _make_nodes(self, setting: Setting) -> None:
-        nodes, way = self._nodes, setting.frames.published_from_camera
-        self._axes = nodes.add_frame(
-            "/camera",
-            axes_length=_AXES_MM,
-            axes_radius=0.35,
-            wxyz=_wxyz(way[:3, :3]),
-            position=way[:3, 3],
-        )
+        nodes = self._nodes
+        self._axes = nodes.add_frame("/camera", axes_length=_AXES_MM, axes_radius=0.35)
         self._seen = self._cloud("/seen", 0.2, colours.SEEN)
         self._organ = self._cloud("/organ", 0.3, colours.ORGAN)
         self._region = nodes.add_line_segments(
@@ -257,48 +243,6 @@ class Scene:
         if at_rest is None or not np.array_equal(at_rest.organ.faces, organ.faces):
             return organ
         return Mesh(organ.vertices_mm, self._bare_faces)
-
-    def _in_front(self, organ: Mesh) -> Mesh:
-        """The same triangles, and two idle vertices that put the middle of all into the eye of
-        whoever moved last. Browsers draw translucent surfaces in the order of their middles: the
-        organ must be the last, or it covers the margins that lie within."""
-        half = np.abs(organ.vertices_mm - self._eye_mm).max(0)
-        corners = [self._eye_mm - half, self._eye_mm + half]
-        return Mesh(np.concatenate([organ.vertices_mm, corners]), organ.faces)
-
-    def _follow(self, client: ClientHandle) -> None:
-        @client.camera.on_update
-        def _(camera: CameraHandle) -> None:
-            self._eye_mm = camera.position
-
-    def _look(self, frames: Frames) -> None:
-        """New clients look from the depth camera's place along its axis, its y axis down."""
-        way = frames.published_from_camera
-        self._nodes.set_up_direction(-way[:3, 1])
-        # Light from the camera's side, as an endoscope gives it, and no shadows.
-        self._nodes.configure_default_lights(False)
-        self._nodes.configure_environment_map(None)
-        self._nodes.add_light_ambient("/ambient", intensity=0.9)
-        self._nodes.add_light_directional(
-            "/light", intensity=2.6, position=way[:3, :3] @ [-60.0, -120.0, -130.0]
-        )
-        first = self._server.initial_camera
-        first.fov, first.near, first.far = _FOV_RADIANS, _NEAR_MM, _FAR_MM
-        self._eye_mm = way[:3, 3]
-        self._server.on_client_connect(self._follow)
-        first.position, first.up = way[:3, 3], -way[:3, 1]
-        first.look_at = way[:3, 3] + _FIRST_LOOK_MM * way[:3, 2]
-
-    def _aim(self, frames: Frames, depth_mm: float) -> None:
-        """Turn about the organ from now on, once its distance is known."""
-        if self._aimed:
-            return
-        self._aimed = True
-        way = frames.published_from_camera
-        centre = way[:3, 3] + depth_mm * way[:3, 2]
-        self._server.initial_camera.look_at = centre
-        for client in self._server.get_clients().values():
-            client.camera.look_at = centre
 
 
 def _put_mesh(node: MeshHandle, mesh: Mesh) -> None:

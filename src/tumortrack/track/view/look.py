@@ -1,0 +1,64 @@
+"""From where the scene is looked at, and in what light."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from tumortrack.core.types import Mesh
+from tumortrack.track.live import Frames
+
+if TYPE_CHECKING:
+    from viser import CameraHandle, ClientHandle, ViserServer
+
+_FIRST_LOOK_MM = 130.0
+_FOV_RADIANS = 0.9
+_NEAR_MM, _FAR_MM = 0.5, 20_000.0  # viser draws its background 1 before the eye
+_LIGHT_FROM = np.array([-60.0, -120.0, -130.0])  # camera frame: above it, from the left
+
+
+class Look:
+    """New visitors look from the depth camera's place along its axis, its y axis down."""
+
+    def __init__(self, server: ViserServer, frames: Frames) -> None:
+        way = frames.published_from_camera
+        self._server = server
+        self._aimed = False
+        self._eye_mm = way[:3, 3]
+        server.scene.set_up_direction(-way[:3, 1])
+        first = server.initial_camera
+        first.fov, first.near, first.far = _FOV_RADIANS, _NEAR_MM, _FAR_MM
+        first.position, first.up = way[:3, 3], -way[:3, 1]
+        first.look_at = way[:3, 3] + _FIRST_LOOK_MM * way[:3, 2]
+        # Light from the camera's side, as an endoscope gives it, and no shadows.
+        server.scene.configure_default_lights(False)
+        server.scene.configure_environment_map(None)
+        server.scene.add_light_ambient("/ambient", intensity=0.9)
+        x, y, z = (way[:3, :3] @ _LIGHT_FROM).tolist()
+        server.scene.add_light_directional("/light", intensity=2.6, position=(x, y, z))
+        server.on_client_connect(self._follow)
+
+    def aim(self, frames: Frames, depth_mm: float) -> None:
+        """Turn about the organ from now on, once its distance is known."""
+        if self._aimed:
+            return
+        self._aimed = True
+        way = frames.published_from_camera
+        centre = way[:3, 3] + depth_mm * way[:3, 2]
+        self._server.initial_camera.look_at = centre
+        for client in self._server.get_clients().values():
+            client.camera.look_at = centre
+
+    def last_drawn(self, surface: Mesh) -> Mesh:
+        """The same triangles, and two idle vertices that put the middle of all into the eye of
+        whoever moved last. Browsers draw translucent surfaces in the order of their middles: the
+        organ must be the last, or it covers the margins that lie within."""
+        half = np.abs(surface.vertices_mm - self._eye_mm).max(0)
+        corners = [self._eye_mm - half, self._eye_mm + half]
+        return Mesh(np.concatenate([surface.vertices_mm, corners]), surface.faces)
+
+    def _follow(self, client: ClientHandle) -> None:
+        @client.camera.on_update
+        def _(camera: CameraHandle) -> None:
+            self._eye_mm = camera.position
