@@ -36,8 +36,17 @@ def story(tmp_path_factory):
     return out, said
 
 
-def test_there_are_five_in_order():
-    assert [file.name[:2] for file in EXAMPLES] == ["01", "02", "03", "04", "05"]
+def test_there_are_six_in_order():
+    assert [file.name[:2] for file in EXAMPLES] == ["01", "02", "03", "04", "05", "06"]
+
+
+def test_a_moving_organ_is_followed(story):
+    _, said = story
+    heard = [float(x) for x in re.findall(r"off by ([0-9.]+) mm; ", said["06"])]
+    assert len(heard) >= 10
+    assert 0.01 < np.median(heard) < 15  # a model of 60 steps
+    assert "that was all" in said["06"]
+    assert "latency p50" in said["06"]
 
 
 def test_the_case_is_the_phantom(story):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import platform
 import shutil
 from importlib import import_module
+from importlib.util import find_spec
 from importlib.metadata import version
 from pathlib import Path
 
@@ -23,6 +24,15 @@ _LIBRARIES = {
     "pypcd4": ".pcd clouds",
     "plotly": "3-D page",
 }
+_LIVE = {
+    "viser": "web viewer",
+    "rosbags": "ROS messages and recordings",
+    "cyclonedds": "ROS 2 without ROS",
+    "rclpy": "ROS 2 through your ROS",
+    "rospy": "ROS 1",
+    "pyrealsense2": "RealSense cameras",
+    "highdicom": "DICOM segmentations",
+}
 _DISTRIBUTIONS = {"skimage": "scikit-image"}
 
 
@@ -38,6 +48,8 @@ def examine() -> None:
             say(f"ok       {name} {version(_DISTRIBUTIONS.get(name, name))} ({purpose})")
         except Exception as error:  # whatever a broken installation raises is the finding
             say(f"BROKEN   {name} ({purpose}): {error}")
+    for name, purpose in _LIVE.items():
+        say(f"{'ok      ' if find_spec(name) else 'absent  '} {name} ({purpose})")
     _examine_torch()
 
 
