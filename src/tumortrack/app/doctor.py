@@ -5,8 +5,8 @@ from __future__ import annotations
 import platform
 import shutil
 from importlib import import_module
-from importlib.util import find_spec
 from importlib.metadata import version
+from importlib.util import find_spec
 from pathlib import Path
 
 from tumortrack.app.console import say
