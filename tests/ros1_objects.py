@@ -133,12 +133,12 @@ def ros1_graph() -> Graph:
 
 
 @contextlib.contextmanager
-def publisher(what: str, topic: str, hz: float = 20.0, **more: Any) -> Iterator[subprocess.Popen]:
-    """A node that publishes ``what`` until the end: see ``ros1_peer``."""
-    given = {"what": what, "topic": topic, "hz": hz, **more}
-    process = _peer("publish", given, stdout=subprocess.DEVNULL)
+def publisher(topics: dict[str, str], hz: float = 20.0, **more: Any) -> Iterator[None]:
+    """A node that publishes ``depth``, ``info``, ``mask`` or ``cloud`` on topics: see
+    ``ros1_peer``."""
+    process = _peer("publish", {"topics": topics, "hz": hz, **more}, stdout=subprocess.DEVNULL)
     try:
-        yield process
+        yield
     finally:
         end(process)
 

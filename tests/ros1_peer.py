@@ -17,12 +17,6 @@ from visualization_msgs.msg import MarkerArray
 WIDTH, HEIGHT = 64, 48
 
 
-def stamped(message):
-    message.header.stamp = rospy.Time.now()
-    message.header.frame_id = "camera_depth_optical_frame"
-    return message
-
-
 def depth(given):
     rows, columns = np.mgrid[0:HEIGHT, 0:WIDTH]
     if given.get("encoding") == "32FC1":
@@ -62,12 +56,17 @@ def cloud(given):
 
 
 def publish(given):
-    kind, message = {"depth": depth, "mask": mask, "info": info, "cloud": cloud}[given["what"]](
-        given
-    )
-    sender = rospy.Publisher(given["topic"], kind, queue_size=2)
+    makers = {"depth": depth, "mask": mask, "info": info, "cloud": cloud}
+    sent = []
+    for topic, what in given["topics"].items():
+        kind, message = makers[what](given)
+        sent.append((rospy.Publisher(topic, kind, queue_size=2, tcp_nodelay=True), message))
     while not rospy.is_shutdown():
-        sender.publish(stamped(message))
+        stamp = rospy.Time.now()
+        for sender, message in sent:
+            message.header.stamp = stamp
+            message.header.frame_id = "camera_depth_optical_frame"
+            sender.publish(message)
         rospy.rostime.wallsleep(1 / given["hz"])
 
 

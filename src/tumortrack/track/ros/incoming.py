@@ -22,6 +22,7 @@ CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 _FLOATS = {7: "f4", 8: "f8"}  # PointField.FLOAT32, FLOAT64
 _DEPTHS = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}
 _MASKS = {"mono8": "u1", "8UC1": "u1"}
+_MASK_APART_NS = 500_000_000  # a mask that is further from its frame shows another place
 _LONGEST_SIDE = 8192  # as of Intrinsics
 
 
@@ -118,6 +119,27 @@ def mask_of(image: Any) -> Bool[np.ndarray, "h w"]:
         InputError: another encoding; a size that does not fit the data.
     """
     return _pixels(image, _MASKS, "a mask") != 0
+
+
+def mask_for(frame: DepthFrame, image: Any, topic: str) -> Bool[np.ndarray, "h w"]:
+    """``mask_of`` the newest image on a mask's topic, held against the frame that it goes with.
+
+    Raises:
+        InputError: no mask, of another size, or of another time.
+    """
+    mask, older_ns = mask_of(image), frame.stamp_ns - stamp_of(image.header)
+    if mask.shape != frame.depth_mm.shape:
+        raise InputError(
+            f"a mask of {mask.shape[1]} x {mask.shape[0]} pixels came for depth images of "
+            f"{frame.intrinsics.width} x {frame.intrinsics.height}; they must be of one size."
+        )
+    if abs(older_ns) > _MASK_APART_NS:
+        raise InputError(
+            f"the newest mask on {topic} is {abs(older_ns) * 1e-9:.2f} s "
+            f"{'older' if older_ns > 0 else 'newer'} than the frame; allowed: "
+            f"{_MASK_APART_NS * 1e-9:g} s."
+        )
+    return mask
 
 
 def intrinsics_of(info: Any, rectified: bool = False) -> Intrinsics:

@@ -23,7 +23,7 @@ class Newest:
     def __init__(self) -> None:
         self._changed = threading.Condition()
         self._last: Raw | None = None
-        self._fresh = self._closed = False
+        self._fresh = self.closed = False
         self.replaced = 0
 
     def put(self, topic: str, kind: str, content: bytes) -> None:
@@ -36,19 +36,19 @@ class Newest:
     def take(self, timeout_s: float) -> Raw | None:
         """The newest message not yet taken; None if none came in time or all is closed."""
         with self._changed:
-            self._changed.wait_for(lambda: self._fresh or self._closed, max(timeout_s, 0.0))
+            self._changed.wait_for(lambda: self._fresh or self.closed, max(timeout_s, 0.0))
             fresh, self._fresh = self._fresh, False
             return self._last if fresh else None
 
     def latest(self, timeout_s: float) -> Raw | None:
         """The newest message, taken or not; None if there was none in time."""
         with self._changed:
-            self._changed.wait_for(lambda: self._last or self._closed, max(timeout_s, 0.0))
+            self._changed.wait_for(lambda: self._last or self.closed, max(timeout_s, 0.0))
             self._fresh = False
             return self._last
 
     def close(self) -> None:
         """Nobody waits any longer."""
         with self._changed:
-            self._closed = True
+            self.closed = True
             self._changed.notify_all()

@@ -88,6 +88,16 @@ def messages_of(
     ]
 
 
+def ended(last: Update) -> Update:
+    """What is published at the end, so that no estimate stays on a screen."""
+    return Update(
+        sequence=last.sequence + 1,
+        stamp_ns=last.stamp_ns + 1,
+        reason="tracking has ended",
+        frames=last.frames,
+    )
+
+
 def _labelled_cloud(placed: Placed | None, header: Any, messages: Messages) -> Any:
     n = 0 if placed is None else len(placed.points_mm)
     table = np.zeros(n, _POINT)

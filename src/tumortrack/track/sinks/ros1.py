@@ -9,7 +9,7 @@ from tumortrack.core.errors import InputError
 from tumortrack.track.live import Setting, SinkConfig, Update
 from tumortrack.track.ros import rospy_node
 from tumortrack.track.ros.messages import Messages
-from tumortrack.track.ros.outgoing import Rate, messages_of
+from tumortrack.track.ros.outgoing import Rate, ended, messages_of
 
 _CHECK_S = 1.0  # how often the master is asked whether it knows the topics
 _CHECK_SHARE = 0.1  # and at most so much of the time is spent waiting for its answer
@@ -88,7 +88,7 @@ class Ros1Sink:
         last, publishers = self._last, self._publishers
         try:
             if last is not None and last.estimate is not None:
-                self.publish(_ended(last))
+                self.publish(ended(last))
                 time.sleep(_FLUSH_S)
         finally:
             self._publishers = {}
@@ -114,12 +114,3 @@ class Ros1Sink:
             self._lost = str(error)
         end_s = time.monotonic()
         self._check_at_s = end_s + max(_CHECK_S, (end_s - start_s) / _CHECK_SHARE)
-
-
-def _ended(last: Update) -> Update:
-    return Update(
-        sequence=last.sequence + 1,
-        stamp_ns=last.stamp_ns + 1,
-        reason="tracking has ended",
-        frames=last.frames,
-    )

@@ -5,18 +5,16 @@ from __future__ import annotations
 import time
 from typing import Any, ClassVar, Literal
 
-import numpy as np
-
 from tumortrack.core.errors import InputError
-from tumortrack.core.types import DepthFrame
 from tumortrack.track.live import Seen, SourceConfig, SourceLost
 from tumortrack.track.ros import incoming, rospy_node
-from tumortrack.track.ros.messages import Messages, stamp_of
+from tumortrack.track.ros.messages import Messages
 from tumortrack.track.ros.newest import Newest, Raw
 
 _BUFFER = 2**21  # bytes taken from the socket at once: a cloud in one go
 _ALIVE_S = 1.0  # without a frame for so long: the master is asked
-_MASK_AGE_NS = 500_000_000  # a mask that is older than its frame by more shows another place
+_SOON_S = 1.0  # after opening: the first CameraInfo and mask may still be on their way
+_ANY = "*/msg/"  # the type of a topic that so far is only subscribed to
 
 
 class Ros1(SourceConfig, frozen=True, kw_only=True, tag="ros1"):
@@ -76,14 +74,15 @@ class Ros1Source:
         self._config, self._node, self._topic, self._kind = config, node, topic, kind
         self._messages = Messages("noetic")
         self._frames, self._infos, self._masks = Newest(), Newest(), Newest()
-        self._heard_s = time.monotonic()
-        wanted = [(topic, self._frames)]
-        if kind == incoming.IMAGE:
-            self._info = node.resolved(config.info or topic.rpartition("/")[0] + "/camera_info")
-            wanted.insert(0, (self._info, self._infos))
-        if config.mask:
-            wanted.insert(0, (node.resolved(config.mask), self._masks))
-        self._subscribers = [self._subscribe(name, newest) for name, newest in wanted]
+        self._heard_s = self._opened_s = time.monotonic()
+        self._info = config.info or topic.rpartition("/")[0] + "/camera_info"
+        beside = [name for name in (self._info, config.mask) if name]
+        self._subscribers = [
+            self._subscribe(node.resolved(name), newest)
+            for name, newest in zip(beside, (self._infos, self._masks), strict=False)
+            if kind == incoming.IMAGE
+        ]
+        self._subscribers.append(self._subscribe(topic, self._frames))
 
     @property
     def dropped(self) -> int:
@@ -95,21 +94,35 @@ class Ros1Source:
         """
         until_s = time.monotonic() + timeout_s
         raw = self._frames.take(timeout_s)
+        if self._frames.closed:
+            raise SourceLost(f"the source ros1:{self._config.topic} is closed")
         if raw is None:
             self._check_alive()
             return None
         self._heard_s = time.monotonic()
         if self._kind == incoming.CLOUD:
             return Seen(incoming.cloud_of(self._parsed(raw, incoming.CLOUD)), raw.arrived_ns)
-        frame = self._depth(raw, until_s)
-        return Seen(frame, raw.arrived_ns, self._mask_for(frame))
+        info = self._beside(self._infos, self._info, until_s)
+        mask = self._beside(self._masks, self._config.mask, until_s)
+        if info is None or (mask is None and self._config.mask):
+            return None
+        frame = incoming.depth_of(
+            self._parsed(raw, incoming.IMAGE),
+            self._parsed(info, incoming.CAMERA_INFO),
+            self._config.rectified,
+            self._config.unit_mm,
+        )
+        if mask is None:
+            return Seen(frame, raw.arrived_ns)
+        image = self._parsed(mask, incoming.IMAGE)
+        return Seen(frame, raw.arrived_ns, incoming.mask_for(frame, image, mask.topic))
 
     def close(self) -> None:
         """Unsubscribe."""
-        for one in self._subscribers:
-            one.unregister()
         for newest in (self._frames, self._infos, self._masks):
             newest.close()
+        for one in self._subscribers:
+            one.unregister()
 
     def _subscribe(self, topic: str, newest: Newest) -> Any:
         rospy = self._node.rospy
@@ -125,39 +138,18 @@ class Ros1Source:
             raise InputError(f"on {raw.topic} came a {raw.kind}; it must be {expected}.")
         return self._messages.from_bytes(raw.content, expected)
 
-    def _depth(self, raw: Raw, until_s: float) -> DepthFrame:
-        info = self._infos.latest(until_s - time.monotonic())
-        if info is None:
-            raise InputError(
-                f"no camera_info came on {self._info} so far. Name its topic: "
-                f"ros1:{self._config.topic}?info=/.../camera_info."
-            )
-        return incoming.depth_of(
-            self._parsed(raw, incoming.IMAGE),
-            self._parsed(info, incoming.CAMERA_INFO),
-            self._config.rectified,
-            self._config.unit_mm,
-        )
-
-    def _mask_for(self, frame: DepthFrame) -> np.ndarray | None:
-        if not self._config.mask:
+    def _beside(self, newest: Newest, topic: str, until_s: float) -> Raw | None:
+        """What belongs to an image; None without a topic, and right after opening, when the first
+        message may still be on its way."""
+        if not topic:
             return None
-        raw = self._masks.latest(0.0)
-        if raw is None:
-            raise InputError(f"no mask came on {self._config.mask} so far.")
-        image = self._parsed(raw, incoming.IMAGE)
-        mask, age_ns = incoming.mask_of(image), frame.stamp_ns - stamp_of(image.header)
-        if mask.shape != frame.depth_mm.shape:
+        found = newest.latest(until_s - time.monotonic())
+        if found is None and time.monotonic() - self._opened_s > _SOON_S:
             raise InputError(
-                f"a mask of {mask.shape[1]} x {mask.shape[0]} pixels came for depth images of "
-                f"{frame.intrinsics.width} x {frame.intrinsics.height}; they must be of one size."
+                f"images come on {self._topic}, but nothing on {topic}. Say where it is: "
+                f"ros1:{self._config.topic}?info=/.../camera_info&mask=/..."
             )
-        if abs(age_ns) > _MASK_AGE_NS:
-            raise InputError(
-                f"the newest mask on {self._config.mask} is {age_ns * 1e-9:.2f} s older than the "
-                f"frame; allowed: {_MASK_AGE_NS * 1e-9:g} s."
-            )
-        return mask
+        return found
 
     def _check_alive(self) -> None:
         if time.monotonic() - self._heard_s < _ALIVE_S:
@@ -168,13 +160,13 @@ class Ros1Source:
 
 
 def _kind_of(master: rospy_node.Master, topic: str) -> str:
-    types = {name: rospy_node.full_type(kind) for name, kind in master.types().items()}
-    usable = {name for name, kind in types.items() if kind in (incoming.CLOUD, incoming.IMAGE)}
     published = master.published()
-    if topic not in published:
+    types = {name: rospy_node.full_type(kind) for name, kind in master.types().items()}
+    kind = types.get(topic, _ANY)
+    if topic not in published or kind == _ANY:
+        usable = {name for name, kind in types.items() if kind in (incoming.CLOUD, incoming.IMAGE)}
         there = ", ".join(sorted(usable & published)[:12]) or "none"
-        raise SourceLost(f"nobody publishes {topic} at {master.uri}. Clouds and images: {there}.")
-    kind = types.get(topic, "*")
+        raise SourceLost(f"nobody publishes {topic} at {master.uri}. Clouds and images: {there}")
     if kind not in (incoming.CLOUD, incoming.IMAGE):
         raise InputError(
             f"{topic} is a {kind}; it must be {incoming.CLOUD} or a depth {incoming.IMAGE}."
