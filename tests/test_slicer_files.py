@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gzip
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -283,6 +284,16 @@ def test_another_ct_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="lack what a segmentation must repeat"):
         write_dicom_seg(path, labels, parts, bare)
     assert not path.exists()
+
+
+def test_without_highdicom_it_says_what_to_install(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "highdicom", None)
+    affine = affine_lps("LPS", (1.0, 1.0, 1.0), np.eye(3))
+    ct = ct_series(tmp_path / "ct", affine)
+    with pytest.raises(InputError, match=r"pip install 'tumortrack\[live\]'"):
+        write_dicom_seg(tmp_path / "seg.dcm", blob_labels(affine), segments(PARTS), ct)
 
 
 def test_export_writes_both(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
