@@ -38,7 +38,10 @@ class Publisher(Protocol):
 class Subscriber(Protocol):
     """One topic in, from reliable and best effort publishers alike."""
 
-    lost: int  # messages that were sent and never got here, as far as is known
+    @property
+    def lost(self) -> int:
+        """Messages that were sent and never taken, as far as is known."""
+        ...
 
     def take(self) -> list[bytes | memoryview]:
         """What came since the last call, oldest first, at most the depth asked for: CDR."""

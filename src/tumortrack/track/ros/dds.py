@@ -188,7 +188,7 @@ class DdsSubscriber:
         from cyclonedds.qos import Policy, Qos
         from cyclonedds.sub import DataReader
 
-        self._depth = depth
+        self._depth, self._lost = depth, 0
         # Best effort and volatile ask for the least, and so match every publisher; what was
         # published before comes only to who asks for it, reliably.
         reliability = Policy.Reliability.Reliable(0) if latched else Policy.Reliability.BestEffort
@@ -224,7 +224,8 @@ class DdsSubscriber:
 
         status = dds_c_t.sample_lost_status()
         DDS._dll_handle.dds_get_sample_lost_status(self._reader._ref, ctypes.byref(status))
-        return int(status.total_count)
+        self._lost = max(self._lost, int(status.total_count))  # once closed it would be 0
+        return self._lost
 
 
 def _set_up(domain_id: int) -> None:

@@ -9,7 +9,7 @@ from tumortrack.core.errors import InputError, TumortrackError
 from tumortrack.track.live import Setting, SinkConfig, Update
 from tumortrack.track.ros.bus import Bus, Publisher, Via, check_topic, open_bus
 from tumortrack.track.ros.messages import Messages
-from tumortrack.track.ros.outgoing import Rate, messages_of
+from tumortrack.track.ros.outgoing import Rate, ended, messages_of
 
 _FLUSH_S = 0.2  # what was published last leaves within that time
 
@@ -82,7 +82,7 @@ class Ros2Sink:
         last, self._last = self._last, None
         try:
             if last is not None and last.estimate is not None:
-                self.publish(_ended(last))
+                self.publish(ended(last))
             self._last = None
             until_s = time.monotonic() + _FLUSH_S
             for publisher in self._publishers.values():
@@ -90,12 +90,3 @@ class Ros2Sink:
         finally:
             self._publishers = {}
             self._bus.close()
-
-
-def _ended(last: Update) -> Update:
-    return Update(
-        sequence=last.sequence + 1,
-        stamp_ns=last.stamp_ns,
-        reason="tracking has ended",
-        frames=last.frames,
-    )

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from typing import Any, ClassVar, Literal
 
 from tumortrack.core.errors import InputError
 from tumortrack.core.types import DepthFrame
-from tumortrack.track.live import Seen, SourceConfig
+from tumortrack.track.live import Seen, SourceConfig, SourceLost
 from tumortrack.track.ros import incoming
 from tumortrack.track.ros.bus import Bus, Subscriber, Via, check_topic, open_bus
 from tumortrack.track.ros.messages import Messages, stamp_of
@@ -15,7 +16,6 @@ from tumortrack.track.ros.messages import Messages, stamp_of
 _KINDS = {"image": incoming.IMAGE, "cloud": incoming.CLOUD}
 _LOOK_S = 0.1  # how often the graph is asked for the topic's type, until it is known
 _SAME_CLOCK_NS = 60 * 1_000_000_000
-_MASK_AGE_NS = 500_000_000  # a mask that is older than its frame by more shows another place
 
 
 class Ros2(SourceConfig, frozen=True, kw_only=True, tag="ros2"):
@@ -82,6 +82,7 @@ class Ros2Source:
         self._latest: dict[str, Any] = {}  # by topic: CameraInfo and mask
         self._waiting: bytes | memoryview | None = None  # an image whose CameraInfo is not here yet
         self._passed = 0
+        self._lock, self._closed = threading.Lock(), False
 
     @property
     def dropped(self) -> int:
@@ -91,24 +92,30 @@ class Ros2Source:
         """As ``Source`` says."""
         until_s = time.monotonic() + timeout_s
         while True:
+            if self._closed:
+                raise SourceLost(f"ros2: the source {self._config.topic} is closed")
             left_s = max(0.0, until_s - time.monotonic())
-            if self._frames is None and not self._subscribe(final=not left_s):
-                self._bus.wait(min(left_s, _LOOK_S))
-            else:
-                raw = self._newest()
-                if raw is not None and (self._ready() or not left_s):
-                    self._waiting = None
-                    return self._seen(raw, time.time_ns())
-                if left_s:
-                    self._bus.wait(left_s)
+            known = self._frames is not None or self._found(final=not left_s)
+            raw = self._newest() if known else None
+            if raw is not None and (self._ready() or not left_s):
+                self._waiting = None
+                return self._seen(raw, time.time_ns())
             if not left_s:
                 return None
+            self._bus.wait(left_s if known else min(left_s, _LOOK_S))
 
     def close(self) -> None:
-        self._bus.close()
+        """Unsubscribe; whoever reads is woken."""
+        with self._lock:
+            self._closed = True
+            self._bus.close()
+
+    def _found(self, final: bool) -> bool:
+        """Listen, once it is known to what. ``final``: say what is wrong with what is there."""
+        with self._lock:
+            return not self._closed and self._subscribe(final)
 
     def _subscribe(self, final: bool) -> bool:
-        """Listen, once it is known to what. ``final``: say what is wrong with what is there."""
         topic, mask = self._config.topic, self._config.mask
         if not self._kind:
             there = self._bus.types_of(topic)
@@ -165,18 +172,7 @@ class Ros2Source:
         image = self._latest.get(incoming.IMAGE)
         if image is None:
             raise InputError(f"no mask came on {self._config.mask} so far.")
-        mask, age_ns = incoming.mask_of(image), frame.stamp_ns - stamp_of(image.header)
-        if mask.shape != frame.depth_mm.shape:
-            raise InputError(
-                f"a mask of {mask.shape[1]} x {mask.shape[0]} pixels came for depth images of "
-                f"{frame.intrinsics.width} x {frame.intrinsics.height}; they must be of one size."
-            )
-        if abs(age_ns) > _MASK_AGE_NS:
-            raise InputError(
-                f"the newest mask on {self._config.mask} is {age_ns * 1e-9:.2f} s older than the "
-                f"frame; allowed: {_MASK_AGE_NS * 1e-9:g} s."
-            )
-        return mask
+        return incoming.mask_for(frame, image, self._config.mask)
 
 
 def _unusable(topic: str, there: set[str], wanted: set[str]) -> str:
