@@ -13,7 +13,7 @@ from tumortrack.core.types import DepthFrame, SensorCloud
 from tumortrack.sense.camera import deproject_pixels
 
 MOST_PIXELS = 110_000  # of a working picture: 424 x 240, and every second pixel of 848 x 480
-_POINTS_PER_PIXEL = 4  # of a rasterised cloud: leaves 2 % of the pixels empty
+_POINTS_PER_PIXEL = 2
 _WIDEST = 2.0  # tangent of the largest angle from the optical axis in a rasterised cloud
 
 # What became of a pixel: still the organ's, or the step that took it.
@@ -123,17 +123,14 @@ def picture_of_cloud(cloud: SensorCloud) -> Picture:
     Points at or behind the camera's centre are left out, and so are those behind another.
     """
     points_mm = cloud.points_mm
-    before = points_mm[:, 2] > 1.0
-    tangents = points_mm[before, :2] / points_mm[before, 2:]
-    tangents = tangents[(np.abs(tangents) < _WIDEST).all(1)]
-    if not len(tangents):
-        tangents = np.zeros((1, 2), np.float32)
-    low, high = tangents.min(0), tangents.max(0)
-    pixels = min(max(len(tangents) / _POINTS_PER_PIXEL, 64.0), float(MOST_PIXELS))
-    size = max(float(np.sqrt(np.prod(high - low + 1e-3) / pixels)), 1e-5)
+    tangents, low, high, inner = _spread(points_mm.copy(), _WIDEST)
+    # Stray points widen the picture, but don't coarsen it.
+    pixels = max(len(tangents) / _POINTS_PER_PIXEL, 64.0)
+    most = np.prod(high - low + 1e-3) / MOST_PIXELS
+    size = float(np.sqrt(max(np.prod(inner + 1e-3) / pixels, most)))
     width, height = (int(n) for n in np.floor((high - low) / size) + 1)
     pinhole = (1 / size, 1 / size, float(-low[0] / size), float(-low[1] / size))
-    depth_mm, pixel = _rasterise(points_mm.copy(), pinhole, height, width)
+    depth_mm, pixel = _rasterise(tangents, points_mm[:, 2].copy(), pinhole, height, width)
     taken = np.isnan(depth_mm).view(np.uint8) * np.uint8(NO_RETURN)
 
     def left(taken: np.ndarray) -> np.ndarray:
@@ -146,22 +143,57 @@ def picture_of_cloud(cloud: SensorCloud) -> Picture:
 
 
 @numba.njit(cache=True, nogil=True)
-def _rasterise(points_mm, pinhole, height, width):  # type: ignore[no-untyped-def]
+def _spread(points_mm, widest):  # type: ignore[no-untyped-def]
+    """x / z and y / z (n, 2), NaN where not before the camera or wider than ``widest``; their
+    extremes (2,) and (2,); and how far the middle 96 % spread (2,), from a histogram: the order of
+    the points doesn't matter."""
+    tangents = np.full((len(points_mm), 2), np.nan, np.float32)
+    low, high = np.full(2, np.inf), np.full(2, -np.inf)
+    count = 0
+    for i in range(len(points_mm)):
+        z = points_mm[i, 2]
+        if z > 1.0:
+            x, y = points_mm[i, 0] / z, points_mm[i, 1] / z
+            if abs(x) < widest and abs(y) < widest:
+                tangents[i, 0], tangents[i, 1] = x, y
+                low[0], low[1] = min(low[0], x), min(low[1], y)
+                high[0], high[1] = max(high[0], x), max(high[1], y)
+                count += 1
+    if count == 0:
+        return tangents, np.zeros(2), np.zeros(2), np.zeros(2)
+    bins = 1000
+    found = np.zeros((2, bins), np.int64)
+    for i in range(len(tangents)):
+        if not np.isnan(tangents[i, 0]):
+            for k in range(2):
+                share = (tangents[i, k] - low[k]) / max(high[k] - low[k], 1e-9)
+                found[k, min(int(share * bins), bins - 1)] += 1
+    inner = np.zeros(2)
+    for k in range(2):
+        total = 0
+        for one in found[k]:
+            total += one
+            if 0.02 * count < total < 0.98 * count:
+                inner[k] += (high[k] - low[k]) / bins
+    return tangents, low, high, inner
+
+
+@numba.njit(cache=True, nogil=True)
+def _rasterise(tangents, z_mm, pinhole, height, width):  # type: ignore[no-untyped-def]
     """The nearest depth in each pixel (h, w), and each point's pixel (n,), -1 outside."""
     fx, fy, cx, cy = pinhole
     depth_mm = np.full(height * width, np.nan, np.float32)
-    pixel = np.full(len(points_mm), -1, np.int32)
-    for i in range(len(points_mm)):
-        z = points_mm[i, 2]
-        if z <= 1.0:
+    pixel = np.full(len(tangents), -1, np.int32)
+    for i in range(len(tangents)):
+        if np.isnan(tangents[i, 0]):
             continue
-        u = int(np.floor(fx * points_mm[i, 0] / z + cx + 0.5))
-        v = int(np.floor(fy * points_mm[i, 1] / z + cy + 0.5))
+        u = int(fx * tangents[i, 0] + cx + 0.5)
+        v = int(fy * tangents[i, 1] + cy + 0.5)
         if 0 <= u < width and 0 <= v < height:
             place = v * width + u
             pixel[i] = place
-            if not depth_mm[place] <= z:
-                depth_mm[place] = z
+            if not depth_mm[place] <= z_mm[i]:
+                depth_mm[place] = z_mm[i]
     return depth_mm.reshape(height, width), pixel
 
 

@@ -23,7 +23,7 @@ _STEEPEST = 0.35  # cosine of the largest angle between the plane's normal and t
 _DEEPEST_MM = 60.0  # an organ is not deeper: what lies farther behind a plane is no part of it
 _BEHIND_COSTS = 2.0  # points on the plane outweighed by one behind it
 _MOST_BEHIND = 0.12  # of the points on the plane
-_NARROWEST_MM = 95.0  # extent of a background across its long side
+_NARROWEST_MM = 120.0  # extent of a background across its long side
 
 
 @dataclass(frozen=True)
