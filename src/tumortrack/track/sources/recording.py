@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import ClassVar, Literal
 
 from tumortrack.core.errors import InputError
-from tumortrack.track.live import Seen, SourceConfig, SourceEnded
+from tumortrack.track.live import Seen, SourceConfig, SourceEnded, SourceLost
 from tumortrack.track.recording.bags import BagChoice, BagReel, is_bag
 from tumortrack.track.recording.folders import open_folder
 from tumortrack.track.recording.shots import Content, Reel, Shot
@@ -98,7 +98,8 @@ class RecordingSource:
         """
         Raises:
             InputError: this frame is damaged.
-            SourceEnded: that was all, or it was closed.
+            SourceEnded: that was all.
+            SourceLost: it was closed.
         """
         with self._lock:
             shot = self._newest_due()
@@ -122,7 +123,7 @@ class RecordingSource:
         due: Shot | None = None
         while True:
             if self._closed.is_set():
-                raise SourceEnded("the recording was closed.")
+                raise SourceLost("the recording is closed; open it again.")
             if self._next is None:
                 self._advance()
             if self._next is None and due is None:
