@@ -42,14 +42,14 @@ def eventually(ask: Callable[[], T], what: str, every_s: float = 0.02) -> T:
     raise AssertionError(f"waited {PATIENCE_S:g} s for {what}. {last}")
 
 
-def refusal_of(ask: Callable[[], object], kind: type[TumortrackError]) -> str:
-    """What it says when it refuses at last."""
+def refusal_of(ask: Callable[[], object], kind: type[TumortrackError], words: str = "") -> str:
+    """What it says when it refuses at last, with these words."""
 
     def error() -> str:
         try:
             ask()
         except kind as refused:
-            return str(refused)
+            return str(refused) if words in str(refused) else ""
         return ""
 
     return eventually(error, f"a {kind.__name__}")

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import shutil
+import sys
+import sysconfig
 import time
 from pathlib import Path
 
@@ -27,6 +30,7 @@ from tumortrack.core.geometry import transform_points
 from tumortrack.core.types import DepthFrame, OccupancyCloud, SensorCloud
 from tumortrack.track.estimate import Estimate
 from tumortrack.track.live import Frames, Seen, Setting, SourceLost, Update
+from tumortrack.track.ros import rospy_node
 from tumortrack.track.sinks.ros1 import Ros1 as Sink
 from tumortrack.track.sinks.ros1 import Ros1Sink
 from tumortrack.track.sources.ros1 import Ros1 as Source
@@ -136,14 +140,24 @@ def test_what_cannot_be_used_is_refused_with_what_there_is(graph):
         Source(topic="/a", unit_mm=0.0)
 
 
-def test_simulated_time_is_not_this_machines(graph):
-    from tumortrack.track.ros.rospy_node import node
+def test_another_type_on_the_topic_is_refused_and_the_right_one_taken_again(graph):
+    with publisher({"/j/points": "cloud"}):
+        source = opened(Source(topic="/j/points"))
+        first(source)
+    with publisher({"/j/points": "depth"}):
+        said = refusal_of(lambda: source.read(0.2), InputError)
+        assert "on /j/points came a sensor_msgs/msg/Image; it must be" in said
+    with publisher({"/j/points": "cloud"}):
+        first(source)
+    source.close()
 
+
+def test_simulated_time_is_not_this_machines(graph):
     with publisher({"/e/points": "cloud"}):
         source = opened(Source(topic="/e/points"))
         assert source.host_clock
         source.close()
-        node().master.call("setParam", "/use_sim_time", True)
+        rospy_node.node().master.call("setParam", "/use_sim_time", True)
         try:
             source = opened(Source(topic="/e/points"))
             assert not source.host_clock
@@ -152,7 +166,7 @@ def test_simulated_time_is_not_this_machines(graph):
             assert source.host_clock
             source.close()
         finally:
-            node().master.call("setParam", "/use_sim_time", False)
+            rospy_node.node().master.call("setParam", "/use_sim_time", False)
 
 
 def test_an_estimate_arrives_in_metres_in_its_frame_at_its_time(graph, tmp_path):
@@ -210,10 +224,10 @@ def test_without_an_estimate_everything_is_taken_off_and_the_reason_said(graph, 
 
 def test_a_master_may_die_and_come_back(graph, tmp_path):
     sink = Sink(namespace="/h").open(small_setting())
-    source = None
     with listener("/h", tmp_path, "before") as before:
         with publisher({"/h/points": "cloud"}, hz=50):
             source = opened(Source(topic="/h/points"))
+            held = opened(Source(topic="/h/points"))
             first(source)
             published(sink, before, small_update())
             graph.kill()
@@ -228,6 +242,8 @@ def test_a_master_may_die_and_come_back(graph, tmp_path):
         assert "does not answer" in refusal_of(lambda: sink.publish(small_update()), SourceLost)
         eventually(lambda: len(before.messages("cloud")) > count, "the cloud, without a master")
         graph.start()
+        assert "was started anew" in refusal_of(lambda: held.read(0.2), SourceLost, "anew")
+        held.close()
         with listener("/h", tmp_path, "after") as after, publisher({"/h/points": "cloud"}):
             published(sink, after, small_update(9))
             published(sink, before, small_update(9))
@@ -235,6 +251,35 @@ def test_a_master_may_die_and_come_back(graph, tmp_path):
             first(source)
             source.close()
     sink.close()
+
+
+def test_without_rospy_it_says_how_to_get_it(monkeypatch):
+    monkeypatch.setitem(sys.modules, "rospy", None)
+    with pytest.raises(InputError, match=r"needs rospy.*apt install python3-rospy"):
+        rospy_node.rospy_module()
+    monkeypatch.setattr(rospy_node, "_DEBIAN_PYTHON", "/nowhere/python3.4")
+    with pytest.raises(InputError, match=r"Debian's is for python3.4|has none"):
+        rospy_node.rospy_module()
+
+
+def test_debians_packages_come_last(graph):
+    assert sys.path.index(rospy_node._DEBIAN) > sys.path.index(sysconfig.get_path("purelib"))
+    assert not np.__file__.startswith(rospy_node._DEBIAN)
+    assert logging.getLoggerClass() is logging.Logger
+
+
+@pytest.mark.parametrize("uri", ["localhost:11311", "http://", "http://host:port", "file:///tmp"])
+def test_a_master_must_have_an_address(monkeypatch, uri):
+    monkeypatch.setenv("ROS_MASTER_URI", uri)
+    with pytest.raises(InputError, match=r"must look like http://localhost:11311"):
+        Source(topic="/a").open()
+
+
+def test_a_program_has_one_master(graph, monkeypatch):
+    Sink(namespace="/k").open(small_setting()).close()
+    monkeypatch.setenv("ROS_MASTER_URI", "http://127.0.0.1:1")
+    with pytest.raises(InputError, match=r"already a node of"):
+        Sink(namespace="/k").open(small_setting())
 
 
 def phantom_update(folder: Path) -> Update:

@@ -7,6 +7,7 @@ So the master is asked here first, with a time limit, and registrations are look
 
 from __future__ import annotations
 
+import importlib
 import logging
 import os
 import re
@@ -45,15 +46,17 @@ def rospy_module() -> ModuleType:
     Raises:
         InputError: there is none that this Python can import.
     """
+    logger_class = logging.getLoggerClass()
     try:
-        import rospy
-    except ImportError:
-        _append_debian()
         try:
-            import rospy
-        except ImportError as error:
-            raise InputError(_how_to_get(str(error))) from error
-    return rospy
+            return importlib.import_module("rospy")
+        except ImportError:
+            _append_debian()
+            return importlib.import_module("rospy")
+    except ImportError as error:
+        raise InputError(_how_to_get(str(error))) from error
+    finally:
+        logging.setLoggerClass(logger_class)  # rospy's own is for rospy
 
 
 def _append_debian() -> None:
@@ -204,25 +207,21 @@ def _master_uri() -> str:
 
 def _start(rospy: ModuleType) -> None:
     """rospy's start, without its grip on signals, arguments, the clock and logging."""
-    root = logging.getLogger()
-    handlers, level = root.handlers[:], root.level
-    rospy.init_node(
-        "tumortrack",
-        argv=[],
-        anonymous=True,
-        disable_signals=True,
-        disable_rostime=True,
-        disable_rosout=True,
-    )
-    # It sends everybody's log records to its file, and prints its own: the latter is useful where
-    # a person reads them, but what matters of it is found out and said by who uses this node.
-    for handler in set(root.handlers) - set(handlers):
-        root.removeHandler(handler)
-        handler.close()
-    root.setLevel(level)
-    own = logging.getLogger("rosout")
-    own.handlers[:] = [logging.NullHandler()]
-    own.propagate = False
+    configure = rospy.core.configure_logging
+    rospy.core.configure_logging = lambda *_: None  # it would close everybody's log handlers
+    try:
+        rospy.init_node(
+            "tumortrack",
+            argv=[],
+            anonymous=True,
+            disable_signals=True,
+            disable_rostime=True,
+            disable_rosout=True,
+        )
+    finally:
+        rospy.core.configure_logging = configure
+    # Its warnings go to whoever listens to Python's logging, and are not printed.
+    logging.getLogger("rosout").addHandler(logging.NullHandler())
 
 
 @cache
