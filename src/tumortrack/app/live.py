@@ -101,7 +101,7 @@ def track(model_folder: Path, source: str, sinks: tuple[str, ...], options: Trac
 def _open(spec: str, config: SinkConfig, setting: Setting, stack: ExitStack) -> Outlet:
     from tumortrack.track.outlet import Outlet
 
-    outlet = Outlet(spec, config.open(setting), config.waiting)  # type: ignore[attr-defined]
+    outlet = Outlet(spec, config.open(setting), config.waiting)
     stack.callback(outlet.close)
     return outlet
 

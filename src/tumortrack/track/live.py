@@ -8,6 +8,7 @@ whose ``open`` makes it: see ``track.sources`` and ``track.sinks``.
 from __future__ import annotations
 
 import threading
+from abc import abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -192,22 +193,23 @@ class Sink(Protocol):
 
 class SourceConfig(Config, frozen=True, kw_only=True, tag_field="kind"):
     """Base of every source's configuration. ``target`` names the field that stands before the
-    question mark in ``kind:target?key=value``; empty: the kind has none.
-
-    Each has ``open(self) -> Source``, which raises SourceLost where what it needs is not there
-    now, and InputError where it never can be.
-    """
+    question mark in ``kind:target?key=value``; empty: the kind has none."""
 
     target: ClassVar[str] = ""
+
+    @abstractmethod
+    def open(self) -> Source:
+        """Raises SourceLost where what it needs is not there now, InputError where it never can
+        be."""
 
 
 class SinkConfig(Config, frozen=True, kw_only=True, tag_field="kind"):
     """Base of every sink's configuration; ``target`` as in ``SourceConfig``. ``waiting``: how many
-    updates may wait for it before it loses some; 1: it gets the newest.
-
-    Each has ``open(self, setting: Setting) -> Sink``, which raises InputError where it cannot work:
-    a port taken, a folder that exists.
-    """
+    updates may wait for it before it loses some; 1: it gets the newest."""
 
     target: ClassVar[str] = ""
     waiting: ClassVar[int] = 1
+
+    @abstractmethod
+    def open(self, setting: Setting) -> Sink:
+        """Raises InputError where it cannot work: a port taken, a folder that exists."""
