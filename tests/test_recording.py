@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag1 import Writer as Writer1
-from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 
 from live_objects import (
     CAMERA,
@@ -372,8 +372,11 @@ def test_scenes_bring_their_truth(tmp_path):
 def write_bag(path: Path, topics: dict[str, list], kind: str) -> Path:
     """A foreign bag: per topic messages' suffix in ``messages_seen`` and frames."""
     messages = Messages("noetic" if kind == "bag" else "humble")
-    plugin = StoragePlugin.MCAP if kind == "mcap" else StoragePlugin.SQLITE3
+    plugin = StoragePlugin.MCAP if "mcap" in kind else StoragePlugin.SQLITE3
     writer = Writer1(path) if kind == "bag" else Writer(path, version=8, storage_plugin=plugin)
+    if kind.startswith("packed"):
+        mode = CompressionMode.STORAGE if "mcap" in kind else CompressionMode.MESSAGE
+        writer.set_compression(mode, CompressionFormat.ZSTD)
     with writer:
         connections = {}
         rows = [
@@ -392,7 +395,7 @@ def write_bag(path: Path, topics: dict[str, list], kind: str) -> Path:
     return path
 
 
-@pytest.mark.parametrize("kind", ["mcap", "sqlite3", "bag"])
+@pytest.mark.parametrize("kind", ["mcap", "packed mcap", "sqlite3", "packed sqlite3", "bag"])
 def test_bags_of_every_kind_are_played(tmp_path, kind):
     frames = [frame_number(n) for n in range(3)]
     cloud = SensorCloud(np.float32([[1, 2, 130]]), STAMP_NS)
@@ -409,12 +412,42 @@ def test_bags_of_every_kind_are_played(tmp_path, kind):
         np.testing.assert_allclose(seen.content.depth_mm, frame.depth_mm, rtol=2e-7)
     (seen,) = play(path, topic="/arm/points")
     np.testing.assert_allclose(seen.content.points_mm, cloud.points_mm, rtol=2e-7)
-    if kind != "bag":
+    if kind in ("mcap", "packed mcap", "sqlite3"):
         (file,) = [p for p in path.iterdir() if p.suffix in (".mcap", ".db3")]
         assert stamps(play(file)) == stamps(frames)
     for options in ({"topic": "/nowhere"}, {"info_topic": "/arm/points"}):
         with pytest.raises(InputError, match="has no"):
             Recording(path=path, **options).open()
+
+
+ROSBAG = """
+import struct, sys
+import rosbag, rospy
+from sensor_msgs.msg import CameraInfo, Image
+from std_msgs.msg import Header
+with rosbag.Bag(sys.argv[1], "w", compression=sys.argv[2], chunk_threshold=100) as bag:
+    for n in range(4):
+        header = Header(stamp=rospy.Time(100 + n, 7), frame_id="arm")
+        image = Image(header=header, height=2, width=3, encoding="16UC1", step=6)
+        image.data = struct.pack("<6H", 120 + n, 0, 130, 140, 150, 160)
+        info = CameraInfo(header=header, height=2, width=3, D=[0.0] * 5)
+        info.K = [60.0, 0, 1.25, 0, 61, 0.5, 0, 0, 1]
+        bag.write("/arm/depth/image_raw", image, header.stamp)
+        bag.write("/arm/depth/camera_info", info, header.stamp)
+"""
+
+
+@pytest.mark.parametrize("packing", ["none", "bz2", "lz4"])
+def test_bags_of_ros_1_itself_are_played(tmp_path, packing):
+    if not Path("/usr/lib/python3/dist-packages/rosbag").is_dir():
+        pytest.skip("Debian's ROS packages are not installed (make debian)")
+    command = ["/usr/bin/python3", "-c", ROSBAG, str(tmp_path / "r.bag"), packing]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == 0, done.stderr
+    got = play(tmp_path / "r.bag")
+    assert stamps(got) == [(100 + n) * 10**9 + 7 for n in range(4)]
+    assert [seen.content.depth_mm[0, 0] for seen in got] == [120, 121, 122, 123]
+    assert got[0].content.intrinsics.cx == 1.25
 
 
 def test_two_candidates_are_named_rather_than_guessed(tmp_path):

@@ -33,9 +33,9 @@ class McapFile:
     """
 
     def __init__(self, folder: Path, setting: Setting, frames: bool, meshes_hz: float) -> None:
+        self._messages, self._setting = Messages("humble"), setting
         from rosbags.rosbag2 import StoragePlugin, Writer
 
-        self._messages, self._setting = Messages("humble"), setting
         self._frames, self._meshes = frames, Rate(meshes_hz)
         self._connections: dict[str, Any] = {}
         self._last_ns, self._chunk_s = 0, time.monotonic()
