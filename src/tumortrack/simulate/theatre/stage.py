@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from jaxtyping import Float, Float64
+from jaxtyping import Float, Float32, Float64
 from scipy.interpolate import PchipInterpolator
 from scipy.spatial.transform import Rotation
 
@@ -84,6 +84,7 @@ class Instant:
     camera_from_room: Float64[np.ndarray, "4 4"]
     room_from_organ: Float64[np.ndarray, "4 4"]  # the organ's rigid motion, after its deformation
     coefficients: Float64[np.ndarray, " m"]  # of the body's modes
+    velocity: Float32[np.ndarray, "i j k 3"]  # the field of these, which points of the CT follow
     depth_mm: float  # of the push
     room_from_rod: Float64[np.ndarray, "4 4"] = field(default_factory=lambda: np.eye(4))
 
@@ -141,10 +142,13 @@ class Theatre:
         center = self._body.center_ct
         moved = shift + config.breath_mm * breath * self._down_the_body
         room_from_organ = rigid(rotation, center - rotation @ center + moved)
-        instant = Instant(t_s, self._camera_at(t_s), room_from_organ, coefficients, depth_mm)
+        velocity = self._body.velocity(coefficients)
+        camera_from_room = self._camera_at(t_s)
+        instant = Instant(t_s, camera_from_room, room_from_organ, coefficients, velocity, depth_mm)
         if push is None:
             return instant
-        tip = self._to_room(instant, push.place_ct[None])[0] + away_mm * push.axis
+        place = self._deformed(instant, push.place_ct[None])
+        tip = transform_points(room_from_organ, place)[0] + away_mm * push.axis
         upright = rigid(rotation_onto(np.array([0.0, 0.0, 1.0]), push.axis), tip)
         return replace(instant, room_from_rod=upright)
 
@@ -152,7 +156,8 @@ class Theatre:
         self, instant: Instant, points_ct: Float[np.ndarray, "n 3"]
     ) -> Float64[np.ndarray, "n 3"]:
         """Where points of the CT are before the camera."""
-        return transform_points(instant.camera_from_room, self._to_room(instant, points_ct))
+        camera_from_organ = instant.camera_from_room @ instant.room_from_organ
+        return transform_points(camera_from_organ, self._deformed(instant, points_ct))
 
     def truth(self, instant: Instant) -> Anatomy:
         """The true surfaces, camera frame."""
@@ -175,12 +180,11 @@ class Theatre:
         rng = np.random.default_rng([self._seed, round(instant.t_s * 1e6)])
         return add_noise(clean, self.config.noise, rng)
 
-    def _to_room(self, instant: Instant, points_ct: np.ndarray) -> np.ndarray:
-        body = self._body
-        velocity = body.velocity(instant.coefficients)
-        start = np.ascontiguousarray(points_ct, np.float32)
-        deformed = follow(velocity, body.origin_mm, np.float32(body.spacing_mm), start, _STEPS)
-        return transform_points(instant.room_from_organ, deformed.astype(np.float64))
+    def _deformed(self, instant: Instant, points_ct: np.ndarray) -> Float64[np.ndarray, "n 3"]:
+        start, spacing_mm = np.ascontiguousarray(points_ct, np.float32), self._body.spacing_mm
+        origin_mm = self._body.origin_mm
+        moved = follow(instant.velocity, origin_mm, np.float32(spacing_mm), start, _STEPS)
+        return moved.astype(np.float64)
 
     def _push_at(self, t_s: float) -> tuple[float, float, Push | None]:
         """Depth, way from the organ (mm), and which push it is."""
