@@ -6,6 +6,7 @@ To add a kind: a context manager that yields the open source while frames come, 
 
 from __future__ import annotations
 
+import contextlib
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -15,10 +16,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from recording_objects import record, update_number
 from theatre_objects import small_theatre
+from tumortrack.core.errors import InputError
 from tumortrack.core.types import DepthFrame, SensorCloud
 from tumortrack.track.live import Seen, Source, SourceEnded, SourceLost
 from tumortrack.track.sources.realsense import RealSense, RealSenseSource
+from tumortrack.track.sources.recording import Recording
+from tumortrack.track.sources.ros1 import Ros1
 from tumortrack.track.sources.virtual import VirtualSource
 
 SLACK_S = 0.5  # that a busy machine may take longer
@@ -50,6 +55,64 @@ def playback_frame_by_frame(folder: Path) -> Iterator[Source]:
     yield RealSense(device=_recording(folder), realtime=False).open()
 
 
+@contextmanager
+def ros2_images(_folder: Path) -> Iterator[Source]:
+    with _ros2("image") as opened:
+        yield opened
+
+
+@contextmanager
+def ros2_clouds(_folder: Path) -> Iterator[Source]:
+    with _ros2("cloud") as opened:
+        yield opened
+
+
+@contextmanager
+def _ros2(kind: str) -> Iterator[Source]:
+    pytest.importorskip("cyclonedds")
+    from ros2_objects import own_graph, sending
+    from tumortrack.track.sources.ros2 import Ros2
+
+    with own_graph(), sending(kind) as topic:
+        source = Ros2(topic=topic).open()
+        for _ in range(100):  # an image may be here before the first CameraInfo
+            with contextlib.suppress(InputError):
+                if source.read(0.1) is not None:
+                    break
+        yield source
+
+
+@contextmanager
+def ros1_depth(_folder: Path) -> Iterator[Source]:
+    yield from _ros1({"/contract/depth/camera_info": "info", "/contract/depth/image_raw": "depth"})
+
+
+@contextmanager
+def ros1_cloud(_folder: Path) -> Iterator[Source]:
+    yield from _ros1({"/contract/points": "cloud"})
+
+
+def _ros1(topics: dict[str, str]) -> Iterator[Source]:
+    from ros1_objects import eventually, publisher, ros1_graph
+
+    ros1_graph()
+    with publisher(topics):
+        yield eventually(Ros1(topic=list(topics)[-1]).open, "the topic")
+
+
+@contextmanager
+def recorded_mcap(folder: Path) -> Iterator[Source]:
+    pytest.importorskip("rosbags")
+    path = record(folder / "r", [update_number(n) for n in range(8)])
+    yield Recording(path=path, rate=0).open()
+
+
+@contextmanager
+def recorded_files(folder: Path) -> Iterator[Source]:
+    path = record(folder / "r", [update_number(n) for n in range(8)], format="files")
+    yield Recording(path=path).open()
+
+
 def _recording(folder: Path) -> str:
     pytest.importorskip("pyrealsense2")
     from realsense_objects import record
@@ -60,9 +123,15 @@ def _recording(folder: Path) -> str:
 
 KINDS: dict[str, Callable[[Path], AbstractContextManager[Source]]] = {
     "virtual": virtual,
+    "recorded_mcap": recorded_mcap,
+    "recorded_files": recorded_files,
+    "ros2_images": ros2_images,
+    "ros2_clouds": ros2_clouds,
     "realsense": realsense,
     "realsense_playback": playback,
     "realsense_playback_frame_by_frame": playback_frame_by_frame,
+    "ros1_depth": ros1_depth,
+    "ros1_cloud": ros1_cloud,
 }
 
 
