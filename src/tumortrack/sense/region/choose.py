@@ -11,6 +11,7 @@ import numpy as np
 from tumortrack.core.errors import NoEstimate
 from tumortrack.sense.region.config import RegionConfig
 from tumortrack.sense.region.picture import BOX, FLYING, LAST_BOX, Picture
+from tumortrack.sense.region.pieces import Edges
 
 PICK_REACH_MM = 10.0  # from the picked point to the piece it means
 _STEEPEST_GAP = 0.5  # slope of a surface behind what hides part of it
@@ -19,6 +20,8 @@ _FEWEST_LINES = 0.4  # length along which pieces continue each other, over the s
 _STRAY = 2  # false matches in a row that are no background
 _TIMES = 2  # so many things may lie between the chosen piece and another
 _CUT = 0.1
+_AIMED = 0.4  # so far (tangent) from the optical axis a piece is half as likely the organ
+_THICK = 0.8  # of an organ's shortest extent: thinner pieces are likely fingers or shafts
 
 
 def under_point(picture: Picture, pieces: np.ndarray, point_mm: np.ndarray) -> int:
@@ -53,15 +56,20 @@ def under_box(
 class Sizes:
     """Of every piece (count + 1,): ``area_mm2`` across the line of sight, longest extent
     ``wide_mm``, and ``cut``: how much of it goes on outside what is looked at, as the width there
-    over the square root of the area, 0..1."""
+    over the square root of the area, 0..1; ``thick_mm``: diameter of the largest disc in it;
+    ``aside``: tangent of the angle between its middle and the optical axis."""
 
     area_mm2: np.ndarray
     wide_mm: np.ndarray
     cut: np.ndarray
+    thick_mm: np.ndarray
+    aside: np.ndarray
 
 
-def sizes(picture: Picture, pieces: np.ndarray, count: int) -> Sizes:
-    return Sizes(*_measure(picture.depth_mm, picture.taken, pieces, picture.pinhole, count))
+def sizes(picture: Picture, edges: Edges, pieces: np.ndarray, count: int) -> Sizes:
+    return Sizes(
+        *_measure(edges.depth_mm, edges.distance, picture.taken, pieces, picture.pinhole, count)
+    )
 
 
 def likeliest(these: Sizes, config: RegionConfig) -> int | None:
@@ -89,11 +97,17 @@ class Choice:
 
 
 def choice(
-    picture: Picture, pieces: np.ndarray, these: Sizes, chosen: int | None, config: RegionConfig
+    picture: Picture,
+    pieces: np.ndarray,
+    these: Sizes,
+    chosen: tuple[int | None, bool],
+    config: RegionConfig,
 ) -> Choice:
-    """The chosen piece and those that continue it behind something nearer."""
+    """The chosen piece (None: there is none; and whether it is a guess), and those that continue
+    it behind something nearer."""
+    piece, guessed = chosen
     together = np.zeros(len(these.cut), bool)
-    if chosen is None:
+    if piece is None:
         return Choice(pieces, together, -1.0, True)
     leaves = these.cut > _CUT
     gap = config.gap_mm / picture.footprint
@@ -101,23 +115,28 @@ def choice(
         picture.depth_mm, picture.taken, pieces, gap, picture.footprint, len(together)
     )
     lines = lines + lines.T
-    together[chosen] = True
+    together[piece] = True
     refused = False
     for _ in range(_TIMES):
         more = lines[together].sum(0) > _FEWEST_LINES * np.sqrt(these.area_mm2)
         more[0] = False
         refused |= bool((more & leaves & ~together).any())
         together |= more & ~leaves
-    score = these.area_mm2[together].sum() * _like_an_organ(these, config)[chosen]
-    too_wide = these.wide_mm[chosen] > config.organ_mm[1]
-    return Choice(pieces, together, float(score), bool(refused or leaves[chosen] or too_wide))
+    score = these.area_mm2[together].sum() * _like_an_organ(these, config)[piece]
+    too_wide = these.wide_mm[piece] > config.organ_mm[1]
+    # Something larger that leaves the picture: a hand that holds the organ?
+    held = guessed and these.area_mm2[leaves].max(initial=0) > score
+    doubtful = refused or leaves[piece] or too_wide or held
+    return Choice(pieces, together, float(score), bool(doubtful))
 
 
 def _like_an_organ(these: Sizes, config: RegionConfig) -> np.ndarray:
     """Of every piece, 0..1."""
     low, high = config.organ_mm
     fits = np.minimum(1.0, (high / np.maximum(these.wide_mm, 1e-9)) ** 4)
-    return fits * (1 - these.cut) ** 2 * (these.wide_mm > low)
+    thick = np.minimum(1.0, these.thick_mm / (_THICK * low)) ** 2
+    aimed = 1 / (1 + (these.aside / _AIMED) ** 2)
+    return fits * thick * aimed * (1 - these.cut) ** 4 * (these.wide_mm > low)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -150,10 +169,11 @@ def _area_inside(depth_mm, pieces, pinhole, low, high, count):  # type: ignore[n
 
 
 @numba.njit(cache=True, nogil=True)
-def _measure(depth_mm, taken, pieces, pinhole, count):  # type: ignore[no-untyped-def]
+def _measure(depth_mm, distance, taken, pieces, pinhole, count):  # type: ignore[no-untyped-def]
     fx, fy, cx, cy = pinhole
     height, width = depth_mm.shape
-    area, border = np.zeros(count + 1), np.zeros(count + 1)
+    area, border, disc = np.zeros(count + 1), np.zeros(count + 1), np.zeros(count + 1)
+    middle, pixels = np.zeros((count + 1, 2)), np.zeros(count + 1)
     low, high = np.full((count + 1, 4), np.inf), np.full((count + 1, 4), -np.inf)
     for v in range(height):
         for u in range(width):
@@ -162,6 +182,10 @@ def _measure(depth_mm, taken, pieces, pinhole, count):  # type: ignore[no-untype
                 continue
             z = depth_mm[v, u]
             area[piece] += z * z / (fx * fy)
+            pixels[piece] += 1
+            middle[piece, 0] += (u - cx) / fx
+            middle[piece, 1] += (v - cy) / fy
+            disc[piece] = max(disc[piece], distance[v, u] * z / fx)
             inside = 0 < v < height - 1 and 0 < u < width - 1
             if (
                 inside
@@ -186,7 +210,7 @@ def _measure(depth_mm, taken, pieces, pinhole, count):  # type: ignore[no-untype
         if area[piece] > 0:
             wide[piece] = (high[piece] - low[piece]).max()
             cut[piece] = min(border[piece] / np.sqrt(area[piece]), 1.0)
-    return area, wide, cut
+    return area, wide, cut, 2 * disc, np.sqrt((middle**2).sum(1)) / np.maximum(pixels, 1)
 
 
 @numba.njit(cache=True, nogil=True)

@@ -118,7 +118,7 @@ def _take_one_piece(picture: Picture, config: RegionConfig, hints: Hints) -> Non
     best: Choice | None = None
     for wider in _OPENINGS:
         pieces, count = find_pieces(picture, edges, wider * config.opening_mm)
-        sizes = choose.sizes(picture, pieces, count)
+        sizes = choose.sizes(picture, edges, pieces, count)
         chosen = _chosen(picture, pieces, sizes, config, hints)
         here = choose.choice(picture, pieces, sizes, chosen, config)
         if best is None or here.score > _CLEARLY * best.score:
@@ -132,15 +132,17 @@ def _take_one_piece(picture: Picture, config: RegionConfig, hints: Hints) -> Non
 
 def _chosen(
     picture: Picture, pieces: np.ndarray, sizes: Sizes, config: RegionConfig, hints: Hints
-) -> int | None:
+) -> tuple[int | None, bool]:
+    """The piece that the hints tell, or the likeliest; and whether it is but the likeliest."""
     from tumortrack.sense.region import choose
 
-    chosen = None
     if hints.picked_mm is not None:
-        return choose.under_point(picture, pieces, hints.picked_mm)
+        return choose.under_point(picture, pieces, hints.picked_mm), False
     if hints.last_box_mm is not None:
-        chosen = choose.under_box(picture, pieces, sizes, hints.last_box_mm)
-    return choose.likeliest(sizes, config) if chosen is None else chosen
+        piece = choose.under_box(picture, pieces, sizes, hints.last_box_mm)
+        if piece is not None:
+            return piece, False
+    return choose.likeliest(sizes, config), True
 
 
 def _too_few(left: int, counts: dict[str, int], config: RegionConfig) -> str:
