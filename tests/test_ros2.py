@@ -6,6 +6,7 @@ import contextlib
 import json
 import os
 import queue
+import re
 import secrets
 import shutil
 import signal
@@ -31,12 +32,13 @@ from live_objects import (
     small_setting,
     small_update,
 )
-from ros2_objects import DOMAIN, Frames, own_graph
+from ros2_objects import DOMAIN, Frames, own_graph, sending
 from ros2_peer import frame_numbered, points_mm
 from tumortrack.core.errors import InputError, TumortrackError
 from tumortrack.core.types import OccupancyCloud, SensorCloud
 from tumortrack.track.estimate import Estimate
 from tumortrack.track.live import Seen, Sink, Source, Update
+from tumortrack.track.reader import Reader
 from tumortrack.track.ros import incoming
 from tumortrack.track.ros.bus import Bus, domain_id, open_bus
 from tumortrack.track.ros.dds_types import dds_name, idl_type, ros_name
@@ -306,6 +308,26 @@ def test_whose_clock(offset_s: int, clock: str, host: bool, bus: Bus, messages: 
         assert abs(seen.arrived_ns - time.time_ns()) < 5_000_000_000
     finally:
         source.close()
+
+
+def test_the_loop_counts_ages_from_the_stamp_once_a_frame_came() -> None:
+    with sending("cloud") as topic:
+        reader = Reader(SourceRos2(topic=topic).open)
+        seen = reader.take(10)
+        assert reader.latency_from == "stamp"
+        assert reader.born_ns(seen) == seen.stamp_ns
+        reader.close()
+
+
+def test_the_view_for_rviz_shows_what_is_published(messages: Messages) -> None:
+    """Topics, frame and reliability of docs/ros/tumortrack.rviz are the sink's."""
+    view = (HERE.parent / "docs" / "ros" / "tumortrack.rviz").read_text(encoding="utf-8")
+    published = {f"/tumortrack/{one.suffix}" for one in messages_of(empty_update(), messages)}
+    shown = set(re.findall(r"Value: (/\S+)", view))
+    assert {"/tumortrack/cloud", "/tumortrack/meshes"} == shown
+    assert shown < published
+    assert "Fixed Frame: camera" in view
+    assert "Transient Local" not in view  # that would not hear a volatile publisher
 
 
 def test_other_types_are_refused(bus: Bus, messages: Messages) -> None:

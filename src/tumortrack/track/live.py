@@ -64,7 +64,9 @@ class Seen:
 class Source(Protocol):
     """An open source. ``read`` is called from one thread, ``close`` perhaps from another."""
 
-    host_clock: bool  # stamps are this machine's time.time_ns: the frame's age is known
+    # Stamps are this machine's time.time_ns: the frame's age is known. True of the frame read last;
+    # before the first one it may not be known.
+    host_clock: bool
     waits: bool  # every frame counts: the loop takes each, instead of the newest
     dropped: int  # frames that never got out of the source, as far as it knows
 

@@ -93,8 +93,6 @@ class Reader:
     def _read_all(self) -> None:
         source = self._open()
         self._source = source
-        clock = "stamp" if source.host_clock else "arrival"
-        self.latency_from = "taking" if source.waits else clock
         self.opened += 1
         self.trouble = ""
         try:
@@ -106,6 +104,9 @@ class Reader:
                     got = error
                 if got is not None:
                     came = time.monotonic()
+                    # Asked for again: some know whose clock it is from the first frame on only.
+                    clock = "stamp" if source.host_clock else "arrival"
+                    self.latency_from = "taking" if source.waits else clock
                     self._put(got, source.waits)
                 elif time.monotonic() - came > _FROZEN_S:
                     raise SourceLost(f"no frame for {_FROZEN_S:g} s; the source is opened again")
