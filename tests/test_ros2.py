@@ -313,7 +313,7 @@ def test_whose_clock(offset_s: int, clock: str, host: bool, bus: Bus, messages: 
 def test_the_loop_counts_ages_from_the_stamp_once_a_frame_came() -> None:
     with sending("cloud") as topic:
         reader = Reader(SourceRos2(topic=topic).open)
-        seen = reader.take(10)
+        seen = reader.take(10.0)
         assert reader.latency_from == "stamp"
         assert reader.born_ns(seen) == seen.stamp_ns
         reader.close()
