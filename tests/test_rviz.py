@@ -1,0 +1,92 @@
+"""RViz shows what the ROS 1 sink publishes: looked at on a screen of its own."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from live_objects import STAMP_NS, empty_update, small_setting
+from ros1_objects import eventually, ros1_graph
+from ros1_rviz import Screen, rviz
+from stories import looking_down, write_phantom_case
+from tumortrack.core.geometry import transform_points
+from tumortrack.core.types import OccupancyCloud
+from tumortrack.track.estimate import Estimate
+from tumortrack.track.live import Update
+from tumortrack.track.sinks.ros1 import Ros1
+from tumortrack.track.view.colours import KIDNEY
+
+pytestmark = pytest.mark.filterwarnings("ignore:notifyAll:DeprecationWarning")  # rospy's own
+
+
+def phantom_update(folder: Path) -> Update:
+    """The built-in phantom before the camera, as a perfect tracker would see it."""
+    case = write_phantom_case(folder / "case")
+    camera_from_ct = looking_down(case)
+    meshes = {
+        name: part.moved(transform_points(camera_from_ct, part.vertices_mm))
+        for name, part in zip(case.anatomy.names, case.anatomy.parts, strict=True)
+    }
+    rng = np.random.default_rng(0)
+    voxels = np.argwhere(case.labels.labels)
+    voxels = voxels[rng.choice(len(voxels), 8000)]
+    points_ct = transform_points(
+        case.labels.lps_from_index, voxels + rng.uniform(-0.5, 0.5, voxels.shape)
+    )
+    cloud = OccupancyCloud(
+        transform_points(camera_from_ct, points_ct),
+        case.labels.labels[tuple(voxels.T)],
+        np.ones(len(voxels)),
+        STAMP_NS,
+    )
+    estimate = Estimate(cloud, None, meshes, {})
+    return Update(sequence=0, stamp_ns=STAMP_NS, estimate=estimate, quality="good")
+
+
+def shown(screen: Screen) -> dict[str, int]:
+    """How many pixels look like each part, shaded and through one another."""
+    pixels = screen.pixels()[80:690, 370:1160]
+    red, green, blue = np.moveaxis(pixels, -1, 0)
+    bright = red + green + blue > 90
+    brown = bright & (red > green + 15) & (abs(green - blue) < 20)
+    return {
+        "tumor_1": int((bright & (green > red + 15) & (green > blue + 15)).sum()),
+        "tumor_2": int((bright & (red > green + 15) & (green > blue + 40)).sum()),
+        "kidney": int((brown & (red < 2.5 * green)).sum()),
+        "kidney's points": int((abs(pixels - KIDNEY).max(-1) < 30).sum()),
+        "warning": int((brown & (red > 3 * green)).sum()),
+    }
+
+
+def all_there(count: dict[str, int]) -> bool:
+    tumors = min(count["tumor_1"], count["tumor_2"])
+    return tumors > 4000 and count["kidney"] > 15_000 and count["kidney's points"] > 400
+
+
+def test_rviz_shows_the_tumors_through_the_kidney_and_nothing_without_an_estimate(tmp_path):
+    """With TUMORTRACK_PICTURES=docs/images it also makes the picture in the documentation."""
+    ros1_graph()
+    update = phantom_update(tmp_path)
+    sink = Ros1().open(small_setting())
+
+    def ask(update: Update) -> dict[str, int]:
+        for _ in range(5):
+            sink.publish(update)
+            time.sleep(0.05)
+        return shown(screen)
+
+    with rviz(tmp_path) as screen:
+        eventually(lambda: all_there(ask(update)), "all parts")
+        if folder := os.environ.get("TUMORTRACK_PICTURES"):
+            shutil.copy(screen.picture(), Path(folder) / "rviz.png")
+        assert shown(screen)["warning"] < 50
+        eventually(lambda: ask(empty_update())["warning"] > 500, "the reason in red")
+        left = shown(screen)
+        assert left["tumor_1"] + left["tumor_2"] + left["kidney's points"] < 50, left
+        assert left["kidney"] < 1500, left  # the text's soft edges
+    sink.close()
