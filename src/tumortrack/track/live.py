@@ -68,7 +68,11 @@ class Source(Protocol):
     # before the first one it may not be known.
     host_clock: bool
     waits: bool  # every frame counts: the loop takes each, instead of the newest
-    dropped: int  # frames that never got out of the source, as far as it knows
+
+    @property
+    def dropped(self) -> int:
+        """Frames that never got out of the source, as far as it knows."""
+        ...
 
     def read(self, timeout_s: float) -> Seen | None:
         """The newest frame not yet given; None if none came in time.
