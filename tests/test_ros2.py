@@ -357,6 +357,20 @@ def test_domains_that_are_none(value: str, monkeypatch: pytest.MonkeyPatch) -> N
         domain_id()
 
 
+def test_a_graph_in_which_nothing_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "off")
+    monkeypatch.setenv("ROS_DOMAIN_ID", "101")  # one that this process has not joined yet
+    with pytest.raises(InputError, match="is OFF"):
+        SourceRos2(topic="/points", via="dds").open()
+
+
+def test_a_network_that_cannot_be(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("CYCLONEDDS_URI", "<CycloneDDS><Domain><Bad/></Domain></CycloneDDS>")
+    monkeypatch.setenv("ROS_DOMAIN_ID", "101")
+    with pytest.raises(InputError, match=r"domain 101 cannot be joined.*CYCLONEDDS_URI"):
+        SourceRos2(topic="/points", via="dds").open()
+
+
 @pytest.mark.parametrize(
     ("options", "said"),
     [

@@ -1,7 +1,7 @@
 """A ROS 2 graph as seen by one program: topics in and out as CDR bytes, through whichever way.
 
 Two ways stand behind the same interface: ``dds`` (Cyclone DDS from the package index, no ROS
-needed) and ``rclpy`` (the user's own ROS, with its RMW, security and remapping).
+needed) and ``rclpy`` (the user's own ROS, with its RMW and security).
 """
 
 from __future__ import annotations

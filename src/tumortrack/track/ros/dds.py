@@ -238,9 +238,18 @@ def _set_up(domain_id: int) -> None:
 
 
 def _local_only() -> bool:
-    """Whether the environment keeps ROS 2 on this machine, as its own nodes read it."""
+    """Whether the environment keeps ROS 2 on this machine, as its own nodes read it.
+
+    Raises:
+        InputError: it says that nothing shall be found.
+    """
     reach = os.environ.get("ROS_AUTOMATIC_DISCOVERY_RANGE", "").upper()
-    return os.environ.get("ROS_LOCALHOST_ONLY") == "1" or reach in ("LOCALHOST", "OFF")
+    if reach == "OFF":
+        raise InputError(
+            "ROS_AUTOMATIC_DISCOVERY_RANGE is OFF: no topic would ever be found. Allowed here: "
+            "LOCALHOST, SUBNET, SYSTEM_DEFAULT, or not set."
+        )
+    return os.environ.get("ROS_LOCALHOST_ONLY") == "1" or reach == "LOCALHOST"
 
 
 def _said(code: int) -> str:

@@ -33,7 +33,7 @@ class RclpyBus:
                 "the same version; or use via=dds, which needs no ROS."
             ) from error
         self._context = rclpy.Context()
-        rclpy.init(context=self._context)
+        rclpy.init(args=[], context=self._context)  # its own context: no grip on signals
         self._node = rclpy.create_node("tumortrack", context=self._context)
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self._node)
