@@ -162,7 +162,7 @@ class ViewerSink:
         age_s = time.monotonic() - self._came if update is not None else 0.0
         if update is not None and update.latency_ms is not None:
             age_s += update.latency_ms / 1000
-        self._panel.say(Status(state, update, age_s, self._beat).html())
+        self._panel.say(Status(state, update, age_s, self._beat))
 
     def _keep_watch(self) -> None:
         """Says how old the last frame is, hides what got too old, renews the slice."""

@@ -15,7 +15,8 @@ if TYPE_CHECKING:
 _FIRST_LOOK_MM = 130.0
 _FOV_RADIANS = 0.9
 _NEAR_MM, _FAR_MM = 0.5, 20_000.0  # viser draws its background 1 before the eye
-_LIGHT_FROM = np.array([-60.0, -120.0, -130.0])  # camera frame: above it, from the left
+# In the camera's frame: one above the camera and left of it, a weaker one from behind the organ.
+_LIGHTS = (("/light", 2.6, (-60.0, -120.0, -130.0)), ("/light_behind", 1.5, (60.0, -120.0, 130.0)))
 
 
 class Look:
@@ -31,12 +32,13 @@ class Look:
         first.fov, first.near, first.far = _FOV_RADIANS, _NEAR_MM, _FAR_MM
         first.position, first.up = way[:3, 3], -way[:3, 1]
         first.look_at = way[:3, 3] + _FIRST_LOOK_MM * way[:3, 2]
-        # Light from the camera's side, as an endoscope gives it, and no shadows.
+        # Light from the camera's side, as an endoscope gives it, some from behind, no shadows.
         server.scene.configure_default_lights(False)
         server.scene.configure_environment_map(None)
         server.scene.add_light_ambient("/ambient", intensity=0.9)
-        x, y, z = (way[:3, :3] @ _LIGHT_FROM).tolist()
-        server.scene.add_light_directional("/light", intensity=2.6, position=(x, y, z))
+        for name, intensity, place in _LIGHTS:
+            x, y, z = (way[:3, :3] @ place).tolist()
+            server.scene.add_light_directional(name, intensity=intensity, position=(x, y, z))
         server.on_client_connect(self._follow)
 
     def aim(self, frames: Frames, depth_mm: float) -> None:

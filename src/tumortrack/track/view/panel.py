@@ -1,4 +1,4 @@
-"""The viewer's panel: status, slice, buttons and switches. It knows viser, and no estimates."""
+"""The viewer's panel: status, slice, buttons and switches."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from jaxtyping import UInt8
 
 from tumortrack.track.view.scene import Options
 from tumortrack.track.view.slices import ORIENTATIONS
+from tumortrack.track.view.status import Status
 
 if TYPE_CHECKING:
     from viser import ViserServer
@@ -38,11 +39,12 @@ class Panel:
         gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
         gui.main_panel.dock_right()
         gui.main_panel.set_width(_WIDTH)
-        self._status = gui.add_html("")
+        self._flag = gui.add_html("")  # of one height: what is to be clicked must not jump
         self._pick = gui.add_button(
             _CLICK, hint="Of several things before the camera, choose the one that is the organ"
         )
         self._forget = gui.add_button("Choose again", visible=False)
+        self._numbers = gui.add_html("")
         self._slice = None
         if slices:
             with gui.add_folder("CT at the present position"):
@@ -91,8 +93,10 @@ class Panel:
         """The part and the orientation that the user chose."""
         return self._through.value, self._plane.value
 
-    def say(self, html: str) -> None:
-        self._status.content = html
+    def say(self, status: Status) -> None:
+        # Both before either: what cannot be said leaves the page as it was.
+        flag, numbers = status.flag(), status.numbers()
+        self._flag.content, self._numbers.content = flag, numbers
 
     def picking(self, asked: bool, chosen: bool) -> None:
         """``asked``: the next click counts; ``chosen``: one did."""

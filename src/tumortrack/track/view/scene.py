@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 
 _MOST_LABELLED = 15_000  # points shown
 _AXES_MM = 12.0
+_TUMOR_WITH_POINTS = 0.3  # opacity
 _CORNERS = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)])
 _EDGES = [(a, b) for a in range(8) for b in range(a) if abs(_CORNERS[a] - _CORNERS[b]).sum() == 1]
 
@@ -111,6 +112,8 @@ class Scene:
             return
         for name, node in self._parts.items():
             node.visible = name in placed.meshes and (name != "kidney" or options.kidney > 0)
+            if name != "kidney":  # solid, unless points are to be seen in it
+                node.opacity = None if options.points == "none" else _TUMOR_WITH_POINTS
         for name, node in self._shells.items():
             node.visible = options.margin and name in self.margins
         self._parts["kidney"].opacity = options.kidney

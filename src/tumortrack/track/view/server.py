@@ -35,7 +35,7 @@ def open_server(host: str, port: int) -> ViserServer:
 
 
 def close_server(server: ViserServer) -> None:
-    """Stop it, its threads and its connections."""
+    """Stop it, its threads and its connections; browsers have up to 6 s to say goodbye."""
     with _silence():
         server.stop()
 

@@ -57,9 +57,37 @@ class Status:
     age_s: float
     beat: int
 
-    def html(self) -> str:
-        """For the panel; the banner lies over the whole page."""
-        return f"<i hidden>{self.beat}</i>{_WATCH}{self._banner()}{self._flag()}{self._numbers()}"
+    def flag(self) -> str:
+        """How good, in one line; over the page a banner with the reason, and the page's watch."""
+        text = {"good": "GOOD", "poor": "POOR"}.get(self.state) or _LOUD[self.state]
+        return (
+            f"<i hidden>{self.beat}</i>{_WATCH}{self._banner()}"
+            f"<div style='background:{css(_COLOURS[self.state])};color:white;padding:8px 12px;"
+            "margin:8px 12px;border-radius:6px;font-size:15px;font-weight:700'>"
+            f"{text}</div>"
+        )
+
+    def numbers(self) -> str:
+        """Probabilities, age, latency and the stages' times."""
+        update = self.update
+        if update is None:
+            return ""
+        latency = "–" if update.latency_ms is None else f"{update.latency_ms:.0f} ms"
+        parts = ""
+        if update.estimate is not None and self.state in ("good", "poor"):
+            report = update.estimate.report
+            parts = _parts(report.get("parts", {}))
+            lag_ms = report.get("smoothing", {}).get("lag_ms", 0.0)
+            latency += f" + {lag_ms:.0f} smoothing" if lag_ms >= 0.5 else ""
+        times = " · ".join(f"{escape(k)} {1000 * v:.1f}" for k, v in update.seconds.items())
+        return (
+            "<div style='margin:4px 14px 10px;font-size:13px;font-variant-numeric:tabular-nums'>"
+            f"{parts}<div style='display:flex;justify-content:space-between;margin-top:6px'>"
+            f"<span>latency <b>{latency}</b></span><span>last frame <b>{self.age_s:.1f} s</b> ago"
+            f"</span><span>no. {update.sequence}</span></div>"
+            "<div style='opacity:0.65;font-size:12px;min-height:36px'>"
+            f"{times and 'stages, ms: '}{times}</div></div>"
+        )
 
     def _reason(self) -> str:
         if self.state == "waiting":
@@ -82,32 +110,6 @@ class Status:
             f"<div style='background:{css(_COLOURS[self.state])};color:white;padding:10px 26px;"
             f"border-radius:10px;text-align:center;font:800 {size}px/1.2 system-ui,sans-serif'>"
             f"{loud or 'POOR ESTIMATE'}{why}</div></div>"
-        )
-
-    def _flag(self) -> str:
-        text = {"good": "GOOD", "poor": "POOR"}.get(self.state) or _LOUD[self.state]
-        reason = f"<div style='font-weight:400'>{escape(self._reason())}</div>"
-        return (
-            f"<div style='background:{css(_COLOURS[self.state])};color:white;padding:8px 12px;"
-            "margin:8px 12px;border-radius:6px;font-size:15px;font-weight:700'>"
-            f"{text}{'' if self.state == 'good' else reason}</div>"
-        )
-
-    def _numbers(self) -> str:
-        update = self.update
-        if update is None:
-            return ""
-        latency = "–" if update.latency_ms is None else f"{update.latency_ms:.0f} ms"
-        times = " · ".join(f"{escape(k)} {1000 * v:.1f}" for k, v in update.seconds.items())
-        shown = update.estimate is not None and self.state in ("good", "poor")
-        parts = _parts(update.estimate.report.get("parts", {})) if shown else ""  # type: ignore[union-attr]
-        return (
-            "<div style='margin:4px 14px 10px;font-size:13px;font-variant-numeric:tabular-nums'>"
-            f"{parts}<div style='display:flex;justify-content:space-between;margin-top:6px'>"
-            f"<span>latency <b>{latency}</b></span><span>last frame <b>{self.age_s:.1f} s</b> ago"
-            f"</span><span>no. {update.sequence}</span></div>"
-            f"<div style='opacity:0.65;font-size:12px'>{times and 'stages, ms: '}{times}</div>"
-            "</div>"
         )
 
 
