@@ -10,12 +10,13 @@ import numpy as np
 
 from tumortrack.core.errors import NoEstimate
 from tumortrack.sense.region.config import RegionConfig
-from tumortrack.sense.region.picture import BOX, FLYING, LAST_BOX, Picture
+from tumortrack.sense.region.picture import FLYING, LAST_BOX, Picture
 from tumortrack.sense.region.pieces import Edges
 
 PICK_REACH_MM = 10.0  # from the picked point to the piece it means
 _STEEPEST_GAP = 0.5  # slope of a surface behind what hides part of it
 _STEP_MM = 3.0
+_SAME_MM = 5.0  # neighbouring pixels of one surface
 _FEWEST_LINES = 0.4  # length along which pieces continue each other, over the smaller one's size
 _STRAY = 2  # false matches in a row that are no background
 _TIMES = 2  # so many things may lie between the chosen piece and another
@@ -68,7 +69,7 @@ class Sizes:
 
 def sizes(picture: Picture, edges: Edges, pieces: np.ndarray, count: int) -> Sizes:
     return Sizes(
-        *_measure(edges.depth_mm, edges.distance, picture.taken, pieces, picture.pinhole, count)
+        *_measure(picture.depth_mm, edges.distance, picture.taken, pieces, picture.pinhole, count)
     )
 
 
@@ -136,7 +137,7 @@ def _like_an_organ(these: Sizes, config: RegionConfig) -> np.ndarray:
     fits = np.minimum(1.0, (high / np.maximum(these.wide_mm, 1e-9)) ** 4)
     thick = np.minimum(1.0, these.thick_mm / (_THICK * low)) ** 2
     aimed = 1 / (1 + (these.aside / _AIMED) ** 2)
-    return fits * thick * aimed * (1 - these.cut) ** 4 * (these.wide_mm > low)
+    return fits * thick * aimed * (1 - 0.95 * these.cut) ** 4 * (these.wide_mm > low)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -194,10 +195,10 @@ def _measure(depth_mm, distance, taken, pieces, pinhole, count):  # type: ignore
             ):
                 continue  # the extent is reached at the outline
             if (
-                _outside(taken, v - 1, u)
-                or _outside(taken, v + 1, u)
-                or _outside(taken, v, u - 1)
-                or _outside(taken, v, u + 1)
+                _goes_on(depth_mm, taken, z, v - 1, u)
+                or _goes_on(depth_mm, taken, z, v + 1, u)
+                or _goes_on(depth_mm, taken, z, v, u - 1)
+                or _goes_on(depth_mm, taken, z, v, u + 1)
             ):
                 border[piece] += z / fx
             x, y = (u - cx) / fx * z, (v - cy) / fy * z
@@ -214,12 +215,13 @@ def _measure(depth_mm, distance, taken, pieces, pinhole, count):  # type: ignore
 
 
 @numba.njit(cache=True, nogil=True)
-def _outside(taken, v, u):  # type: ignore[no-untyped-def]
-    """Not looked at; the depth range, which cuts organs too, does not count."""
+def _goes_on(depth_mm, taken, z, v, u):  # type: ignore[no-untyped-def]
+    """Beyond the image's border, or as the same surface beyond the last estimate's surroundings.
+    Range, box and mask don't count: they are there to cut around the organ."""
     height, width = taken.shape
     if not (0 <= v < height and 0 <= u < width):
         return True
-    return BOX <= taken[v, u] <= LAST_BOX
+    return taken[v, u] == LAST_BOX and abs(depth_mm[v, u] - z) < _SAME_MM
 
 
 @numba.njit(cache=True, nogil=True)
