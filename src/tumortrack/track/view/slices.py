@@ -24,6 +24,7 @@ _SURE_MM, _UNSURE_MM = 5.0, 20.0  # outside the organ the motion is a guess: the
 _FAINT = 0.3
 _BAR_MM = 10
 _FINER = 2
+_COARSER = 2  # the CT is sampled coarser: a pixel in the panel is less than a voxel
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,10 +109,11 @@ def slice_picture(
     """
     from PIL import Image, ImageDraw
 
-    points_ct = motion.back(plane.points(pixels))
+    sampled = pixels // _COARSER
+    points_ct = motion.back(plane.points(sampled))
     if points_ct is None:
         return None
-    grey = Image.fromarray(ct.grey(points_ct).reshape(pixels, pixels))
+    grey = Image.fromarray(ct.grey(points_ct).reshape(sampled, sampled))
     fine = _FINER * pixels  # lines are drawn finer and then shrunk, so that they are smooth
     image = grey.resize((fine, fine), Image.Resampling.BILINEAR).convert("RGB")
     draw = ImageDraw.Draw(image)
