@@ -93,7 +93,8 @@ def reliably(bus: DdsBus) -> object:
 
 def told(message: object, kind: str) -> dict:
     if kind == MARKERS:
-        return {"markers": [[m.ns, int(m.action), len(m.points)] for m in message.markers]}
+        markers = [[m.ns, int(m.action), len(m.points)] for m in message.markers]
+        return {"stamp_ns": stamp_of(message.markers[0].header), "markers": markers}
     said = {"stamp_ns": stamp_of(message.header), "frame": message.header.frame_id}
     if kind == CLOUD:
         return {**said, "points": int(message.width), "sum": int(message.data.sum())}

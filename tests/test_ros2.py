@@ -183,6 +183,26 @@ def test_names_that_are_none_of_ros() -> None:
         idl_type("sensor_msgs/msg/Nothing", "humble")
 
 
+def test_what_other_nodes_see_of_a_topic(bus: Bus) -> None:
+    """Name, type, type hash and QoS are those that a ROS 2 node announces."""
+    from cyclonedds.qos import Policy
+
+    bus.publisher("/seen/points", incoming.CLOUD)
+    for _ in range(50):
+        known = [one for one in bus._published.read(100) if one.topic_name == "rt/seen/points"]
+        if known:
+            break
+        time.sleep(0.05)
+    (one,) = known
+    assert one.type_name == CLOUD_DDS
+    assert bus.types_of("/seen/points") == {incoming.CLOUD}
+    # As `ros2 topic info -v` prints it for sensor_msgs/msg/PointCloud2.
+    said = "9198cabf7da3796ae6fe19c4cb3bdd3525492988c70522628af5daa124bae2b5"
+    assert one.qos[Policy.Userdata].data == f"typehash=RIHS01_{said};".encode()
+    assert isinstance(one.qos[Policy.Reliability], Policy.Reliability.Reliable)
+    assert one.qos[Policy.Durability] == Policy.Durability.Volatile
+
+
 # --- the source ----------------------------------------------------------------------------------
 
 
@@ -429,8 +449,8 @@ def test_updates_reach_another_process(messages: Messages) -> None:
 
 
 def at(last: dict[str, dict], stamp_ns: int) -> bool:
-    """All topics that say a stamp say this one."""
-    return {one["stamp_ns"] for one in last.values() if "stamp_ns" in one} == {stamp_ns}
+    """All topics are at this stamp."""
+    return {one["stamp_ns"] for one in last.values()} == {stamp_ns}
 
 
 def publish_until(sink: Sink, other: Other, update: Update) -> dict[str, dict]:
@@ -463,13 +483,10 @@ def test_subscribers_that_hang_die_and_come_late_hold_up_nobody() -> None:
             hung_ms = publish_at(sink, 30, 3.0)
             other.signal(signal.SIGKILL)
             killed_ms = publish_at(sink, 30, 0.5)
-            last = large_update(999)
-            sink.publish(last)
-            ages_ms = [
-                (one["now_ns"] - one["stamp_ns"]) * 1e-6
-                for one in lively.lines_until(lambda one: one.get("stamp_ns") == last.stamp_ns)
-                if one.get("topic") == "cloud"
-            ]
+            last = ("cloud", sent_last(sink))
+            heard = lively.lines_until(lambda one: (one["topic"], one["stamp_ns"]) == last)
+            clouds = [one for one in heard if one["topic"] == "cloud"]
+            ages_ms = [(one["now_ns"] - one["stamp_ns"]) * 1e-6 for one in clouds]
         with peer("hear", 60) as late:
             late.lines_until(lambda said: "listens" in said)
             by_topic = publish_until(sink, late, small_update(1000))
@@ -485,6 +502,13 @@ def test_subscribers_that_hang_die_and_come_late_hold_up_nobody() -> None:
     )
     assert np.percentile(publish_ms, 90) < 500
     assert len(ages_ms) > len(publish_ms) / 2
+
+
+def sent_last(sink: Sink) -> int:
+    """One more, whose stamp it gives back."""
+    update = large_update(999)
+    sink.publish(update)
+    return update.stamp_ns
 
 
 def publish_at(sink: Sink, hz: float, seconds: float) -> list[float]:
