@@ -187,7 +187,7 @@ def test_what_other_nodes_see_of_a_topic(bus: Bus) -> None:
     """Name, type, type hash and QoS are those that a ROS 2 node announces."""
     from cyclonedds.qos import Policy
 
-    bus.publisher("/seen/points", incoming.CLOUD)
+    publisher = bus.publisher("/seen/points", incoming.CLOUD)
     for _ in range(50):
         known = [one for one in bus._published.read(100) if one.topic_name == "rt/seen/points"]
         if known:
@@ -201,6 +201,7 @@ def test_what_other_nodes_see_of_a_topic(bus: Bus) -> None:
     assert one.qos[Policy.Userdata].data == f"typehash=RIHS01_{said};".encode()
     assert isinstance(one.qos[Policy.Reliability], Policy.Reliability.Reliable)
     assert one.qos[Policy.Durability] == Policy.Durability.Volatile
+    assert publisher  # it lives as long as whoever asked for it holds it
 
 
 # --- the source ----------------------------------------------------------------------------------
