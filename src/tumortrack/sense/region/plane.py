@@ -22,7 +22,7 @@ _BEYOND_MM = 120.0  # so far behind the range there may be something to fit to
 _STEEPEST = 0.35  # cosine of the largest angle between the plane's normal and the optical axis
 _DEEPEST_MM = 60.0  # an organ is not deeper: what lies farther behind a plane is no part of it
 _BEHIND_COSTS = 2.0  # points on the plane outweighed by one behind it
-_MOST_BEHIND = 0.12  # of the points on the plane
+_MOST_BEHIND = 0.03  # of the points on the plane: more is a cavity, and the organ may lie in it
 _NARROWEST_MM = 120.0  # extent of a background across its long side
 
 
