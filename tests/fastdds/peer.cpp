@@ -1,5 +1,5 @@
 // A program that speaks ROS 2's topics over eProsima Fast DDS, without ROS: serialised messages
-// as they are, no generated code. Built and run by tests/test_ros2.py.
+// as they are, no generated code. Built and run by tests/test_ros2_processes.py.
 //
 //   peer DOMAIN sub SECONDS TOPIC TYPE FILE
 //       listens; FILE gets the last message, standard output the number of messages
