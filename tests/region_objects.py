@@ -24,8 +24,9 @@ class Props:
     """How hard a scene is.
 
     distance_mm: camera to the organ's top. tilt_degrees: of the table. waves_mm: height of the
-    drape's waves. bed: the organ lies half sunk in something soft that rises around it. up: which
-    way of the organ points up, in its own frame; None: one of its two broad sides, by chance.
+    drape's waves. bed: the organ lies half sunk in something soft that rises around it. cavity: it
+    lies in a hole, below, level with or above what surrounds the hole. up: which way of the organ
+    points up, in its own frame; None: one of its two broad sides, by chance.
     """
 
     distance_mm: tuple[float, float] = (110.0, 200.0)
@@ -34,6 +35,7 @@ class Props:
     shafts: int = 0
     hand: bool = False
     bed: bool = False
+    cavity: bool = False
     up: tuple[float, float, float] | None = None
 
 
@@ -42,12 +44,14 @@ DRAPED = Props(tilt_degrees=30.0, waves_mm=3.0, distance_mm=(100.0, 300.0))
 TOOLS = Props(tilt_degrees=30.0, waves_mm=3.0, shafts=3)
 HANDS = Props(tilt_degrees=30.0, waves_mm=3.0, shafts=1, hand=True)
 SUNK = Props(tilt_degrees=30.0, waves_mm=3.0, shafts=2, bed=True)
+CAVITY = Props(tilt_degrees=15.0, waves_mm=2.0, shafts=1, cavity=True)
 DIFFICULTIES = {
     "table": EASY,
     "uneven drape, 100-300 mm": DRAPED,
     "shafts": TOOLS,
     "hand": HANDS,
     "sunk into a bed": SUNK,
+    "in a cavity": CAVITY,
 }
 
 
@@ -75,9 +79,9 @@ def make_scene(
     table_from_organ[2, 3] -= sunk_mm
     top_mm = np.array([0.0, 0.0, size_mm[2] - sunk_mm])
     camera_from_table = _looking_at(top_mm, props, rng)
-    bumps = _Bumps(props.waves_mm, sunk_mm, size_mm, rng)
+    ground = _Ground(props, sunk_mm, size_mm, rng)
     things = [
-        (BACKGROUND, bumps.surface()),
+        (BACKGROUND, ground.surface()),
         (ORGAN, organ.moved(transform_points(table_from_organ, organ.vertices_mm))),
     ]
     if props.shafts:
@@ -142,19 +146,22 @@ def _looking_at(top_mm: np.ndarray, props: Props, rng: np.random.Generator) -> n
     return rigid(rotation, at - rotation @ top_mm)
 
 
-class _Bumps:
-    """The background as a height over the table: waves, and a bed that rises around the organ."""
+class _Ground:
+    """The background as a height over the table: waves, a bed that rises around the organ, or a
+    hole around it."""
 
-    def __init__(self, waves_mm, sunk_mm, size_mm, rng):  # type: ignore[no-untyped-def]
-        self.waves_mm, self.sunk_mm, self.size_mm = waves_mm, sunk_mm, size_mm
+    def __init__(self, props, sunk_mm, size_mm, rng):  # type: ignore[no-untyped-def]
+        self.waves_mm, self.size_mm = props.waves_mm, size_mm
         self.along = rng.normal(size=(5, 2))
         self.along /= np.linalg.norm(self.along, axis=1, keepdims=True)
         self.along *= 2 * np.pi / rng.uniform(50, 150, (5, 1))
         self.phase = rng.uniform(0, 2 * np.pi, 5)
         self.rise_mm = rng.uniform(0, 6) if sunk_mm else 0.0
+        self.hole_mm = rng.uniform(0.6, 1.3) * size_mm[2] if props.cavity else 0.0
+        self.around_mm = rng.uniform(3, 15, 2)
 
     def surface(self) -> Mesh:
-        side = np.arange(-450.0, 451.0, 5.0)
+        side = np.arange(-450.0, 451.0, 4.0)
         x, y = np.meshgrid(side, side)
         wave = np.cos(
             x[..., None] * self.along[:, 0] + y[..., None] * self.along[:, 1] + self.phase
@@ -163,6 +170,9 @@ class _Bumps:
         # Soft tissue bulges a little where the organ was pressed in.
         away = np.hypot(x / (self.size_mm[0] / 2 + 8), y / (self.size_mm[1] / 2 + 8))
         height += self.rise_mm * np.exp(-(((away - 1) / 0.3) ** 2))
+        if self.hole_mm:
+            wide, tall = self.size_mm[:2] / 2 + self.around_mm
+            height = np.where(np.hypot(x / wide, y / tall) > 1, height + self.hole_mm, 0.0)
         n = len(side)
         a = (np.arange(n - 1)[:, None] * n + np.arange(n - 1)).ravel()
         faces = np.concatenate(

@@ -252,14 +252,15 @@ def test_wrong_input_is_refused():
             RegionConfig(**wrong)
 
 
-# Precision and recall, mean over scenes; and in how many scenes nine tenths of what is found are
-# the organ's. What is reached over 50 scenes each is in docs/live_region.md.
+# Precision and recall, mean over scenes; and in how many scenes 85 % of what is found are the
+# organ's, which the trained networks tolerate. What is reached over 50 scenes each is in docs/live_region.md.
 LEAST = {
     "table": (0.97, 0.9, 1.0),
     "uneven drape, 100-300 mm": (0.97, 0.9, 1.0),
     "shafts": (0.97, 0.85, 0.9),
     "hand": (0.94, 0.75, 0.8),
     "sunk into a bed": (0.94, 0.75, 0.8),
+    "in a cavity": (0.94, 0.75, 0.8),
 }
 
 
@@ -278,7 +279,7 @@ def test_found_in_random_scenes(difficulty, kidneys):
     least_precision, least_recall, least_good = LEAST[difficulty]
     assert precision.mean() > least_precision
     assert recall.mean() > least_recall
-    assert (precision > 0.9).mean() >= least_good
+    assert (precision > 0.85).mean() >= least_good
 
 
 def test_found_of_a_real_kidney_among_hands(real_kidney):
