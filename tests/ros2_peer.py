@@ -1,4 +1,4 @@
-"""The other end of test_ros2_processes.py in a process of its own: sends frames, or says what it heard.
+"""The other end of test_ros2_processes.py: a process that sends frames, or says what it heard.
 
 ros2_peer.py send image|cloud HZ SECONDS
 ros2_peer.py hear SECONDS
