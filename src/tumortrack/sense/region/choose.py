@@ -21,6 +21,7 @@ _FEWEST_LINES = 0.4  # length along which pieces continue each other, over the s
 _STRAY = 2  # false matches in a row that are no background
 _TIMES = 2  # so many things may lie between the chosen piece and another
 _CUT = 0.1
+_POOR = 0.5
 _AIMED = 0.4  # so far (tangent) from the optical axis a piece is half as likely the organ
 _THICK = 0.8  # of an organ's shortest extent: thinner pieces are likely fingers or shafts
 
@@ -47,10 +48,12 @@ def under_point(picture: Picture, pieces: np.ndarray, point_mm: np.ndarray) -> i
 def under_box(
     picture: Picture, pieces: np.ndarray, these: Sizes, corners_mm: np.ndarray
 ) -> int | None:
-    """The piece with the most surface in a box (2, 3); None if none has any."""
+    """The piece with the most surface, and the most of its surface, in a box (2, 3); None if none
+    has any."""
     low, high = np.sort(np.asarray(corners_mm, np.float64), axis=0)
     area = _area_inside(picture.depth_mm, pieces, picture.pinhole, low, high, len(these.cut))
-    return int(area.argmax()) if area.max() > 0 else None
+    inside = area**2 / np.maximum(these.area_mm2, 1e-9)  # what surrounds it reaches in, too
+    return int(inside.argmax()) if inside.max() > 0 else None
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,10 +126,11 @@ def choice(
         more[0] = False
         refused |= bool((more & leaves & ~together).any())
         together |= more & ~leaves
-    score = these.area_mm2[together].sum() * _like_an_organ(these, config)[piece]
+    likeness = _like_an_organ(these, config)[piece]
+    score = these.area_mm2[together].sum() * likeness
     too_wide = these.wide_mm[piece] > config.organ_mm[1]
-    # Something larger that leaves the picture: a hand that holds the organ?
-    held = guessed and these.area_mm2[leaves].max(initial=0) > score
+    # A poor guess beside something larger that leaves the picture: a hand that holds the organ?
+    held = guessed and likeness < _POOR and these.area_mm2[leaves].max(initial=0) > score
     doubtful = refused or leaves[piece] or too_wide or held
     return Choice(pieces, together, float(score), bool(doubtful))
 
