@@ -113,74 +113,68 @@ def _without_holes(depth_mm, taken, jump):  # type: ignore[no-untyped-def]
 
 
 @_jit
-def _folds(before, here, after, deep):  # type: ignore[no-untyped-def]
-    return here - (before + after) * np.float32(0.5) > deep  # False where one is NaN
-
-
-@_jit
-def _is_edge(depth_mm, v, u, most, crease, reach):  # type: ignore[no-untyped-def]
-    height, width = depth_mm.shape
-    z = depth_mm[v, u]
-    for dv, du in ((-1, 0), (1, 0), (0, -1), (0, 1)):
-        y, x = v + dv, u + du
-        inside = 0 <= y < height and 0 <= x < width  # the image's border is no edge
-        if inside and not abs(depth_mm[y, x] - z) < most:
-            return True
-    if crease > 0 and reach <= v < height - reach and reach <= u < width - reach:
-        r, d = reach, (reach * 7) // 10
-        return (
-            _folds(depth_mm[v, u - r], z, depth_mm[v, u + r], crease)
-            or _folds(depth_mm[v - r, u], z, depth_mm[v + r, u], crease)
-            or _folds(depth_mm[v - d, u - d], z, depth_mm[v + d, u + d], crease)
-            or _folds(depth_mm[v - d, u + d], z, depth_mm[v + d, u - d], crease)
-        )
-    return False
-
-
-@_jit
 def _edge_distance(depth_mm, jump, crease):  # type: ignore[no-untyped-def]
     """Chamfer distance (Borgefors 1986, doi 10.1016/S0734-189X(86)80047-0) in px to the nearest
-    edge; 0 on edges and where nothing is left."""
+    edge; 0 on edges and where nothing is left. The image's border is no edge: the frame of pixels
+    around it is far from everything."""
     height, width = depth_mm.shape
     far = np.float32(height + width)
+    out = np.full((height + 2, width + 2), far, np.float32)
+    _mark_jumps(depth_mm, out, np.float32(jump[0]), np.float32(jump[1]))
+    if crease[0] > 0:
+        _mark_creases(depth_mm, out, np.float32(jump[1]), crease)
     one, oblique = np.float32(0.955), np.float32(1.369)
-    out = np.zeros((height, width), np.float32)
+    for v in range(1, height + 1):
+        for u in range(1, width + 1):
+            straight = min(out[v, u - 1], out[v - 1, u]) + one
+            across = min(out[v - 1, u - 1], out[v - 1, u + 1]) + oblique
+            out[v, u] = min(out[v, u], straight, across)
+    for v in range(height, 0, -1):
+        for u in range(width, 0, -1):
+            straight = min(out[v, u + 1], out[v + 1, u]) + one
+            across = min(out[v + 1, u - 1], out[v + 1, u + 1]) + oblique
+            out[v, u] = min(out[v, u], straight, across)
+    return out[1:-1, 1:-1].copy()
+
+
+@_jit
+def _mark_jumps(depth_mm, out, slope, noise):  # type: ignore[no-untyped-def]
+    """Zero what is missing, and both sides of a jump; ``out`` is larger by 1 on every side."""
+    height, width = depth_mm.shape
     for v in range(height):
         for u in range(width):
             z = depth_mm[v, u]
-            if z > 0:
-                noise = jump[1] * z * z
-                deep = crease[0] + noise if crease[0] > 0 else 0.0
-                reach = max(int(crease[1] / z + 0.5), 1)
-                if not _is_edge(depth_mm, v, u, jump[0] * z + noise, deep, reach):
-                    out[v, u] = far
+            most = (slope + noise * z) * z
+            if not z > 0:
+                out[v + 1, u + 1] = 0
+            if u + 1 < width and not abs(depth_mm[v, u + 1] - z) < most:
+                out[v + 1, u + 1] = out[v + 1, u + 2] = 0
+            if v + 1 < height and not abs(depth_mm[v + 1, u] - z) < most:
+                out[v + 1, u + 1] = out[v + 2, u + 1] = 0
+
+
+@_jit
+def _mark_creases(depth_mm, out, noise, crease):  # type: ignore[no-untyped-def]
+    """Zero where the surface lies deeper than its neighbourhood to both sides."""
+    height, width = depth_mm.shape
+    least, reach_mm = np.float32(2 * crease[0]), np.float32(crease[1])
     for v in range(height):
         for u in range(width):
-            here = out[v, u]
-            if here > 0:
-                if u > 0:
-                    here = min(here, out[v, u - 1] + one)
-                if v > 0:
-                    here = min(here, out[v - 1, u] + one)
-                    if u > 0:
-                        here = min(here, out[v - 1, u - 1] + oblique)
-                    if u + 1 < width:
-                        here = min(here, out[v - 1, u + 1] + oblique)
-                out[v, u] = here
-    for v in range(height - 1, -1, -1):
-        for u in range(width - 1, -1, -1):
-            here = out[v, u]
-            if here > 0:
-                if u + 1 < width:
-                    here = min(here, out[v, u + 1] + one)
-                if v + 1 < height:
-                    here = min(here, out[v + 1, u] + one)
-                    if u > 0:
-                        here = min(here, out[v + 1, u - 1] + oblique)
-                    if u + 1 < width:
-                        here = min(here, out[v + 1, u + 1] + oblique)
-                out[v, u] = here
-    return out
+            if out[v + 1, u + 1] == 0:
+                continue
+            z = depth_mm[v, u]
+            r = max(int(reach_mm / z + np.float32(0.5)), 1)
+            if not (r <= v < height - r and r <= u < width - r):
+                continue
+            d = (r * 7) // 10
+            twice = 2 * z - least - 2 * noise * z * z  # NaN of a neighbour compares as no crease
+            if (
+                depth_mm[v, u - r] + depth_mm[v, u + r] < twice
+                or depth_mm[v - r, u] + depth_mm[v + r, u] < twice
+                or depth_mm[v - d, u - d] + depth_mm[v + d, u + d] < twice
+                or depth_mm[v - d, u + d] + depth_mm[v + d, u - d] < twice
+            ):
+                out[v + 1, u + 1] = 0
 
 
 @_jit
