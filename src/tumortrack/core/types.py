@@ -21,7 +21,10 @@ OUTSIDE, ORGAN, FIRST_TUMOR = 0, 1, 2
 def _freeze(value: object, name: str, dtype: npt.DTypeLike, shape: tuple[int | None, ...]) -> None:
     """Convert one field to a read-only array and check its shape (None: any length)."""
     given = np.asarray(getattr(value, name))
-    array = given.astype(dtype)  # a copy: the caller's stays writable
+    if given.dtype == dtype and given.flags.owndata and not given.flags.writeable:
+        array = given  # frozen already, by another value: nobody can change it
+    else:
+        array = given.astype(dtype)  # a copy: the caller's stays writable
     if array.dtype.kind in "iu" and array.dtype != given.dtype and (array != given).any():
         raise InputError(
             f"{type(value).__name__}.{name} has numbers that are no {array.dtype}; give whole "
@@ -105,13 +108,17 @@ class Mesh:
     @cached_property
     def volume_mm3(self) -> float:
         """Signed volume (divergence theorem): positive where faces turn outward."""
-        a, b, c = (self.vertices_mm[self.faces[:, i]] - self.vertices_mm[0] for i in range(3))
-        return float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6)
+        from_first = self.vertices_mm - self.vertices_mm[0]
+        x, y, z = (np.ascontiguousarray(axis)[self.faces.T] for axis in from_first.T)
+        (ax, bx, cx), (ay, by, cy), (az, bz, cz) = x, y, z
+        triple = ax * (by * cz - bz * cy) + ay * (bz * cx - bx * cz) + az * (bx * cy - by * cx)
+        return float(triple.sum() / 6)
 
     @cached_property
     def box_mm(self) -> Float64[np.ndarray, "2 3"]:
         """Axis-aligned bounding box: lower and upper corner."""
-        return np.stack([self.vertices_mm.min(0), self.vertices_mm.max(0)])
+        axes = np.ascontiguousarray(self.vertices_mm.T)  # ten times as fast as along the short axis
+        return np.stack([axes.min(1), axes.max(1)])
 
     def moved(self, vertices_mm: Float[np.ndarray, "v 3"]) -> Mesh:
         """The same triangles over other vertices (a deformation or a change of frame)."""

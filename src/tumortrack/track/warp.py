@@ -40,6 +40,18 @@ class _Inside:
     known: Int[np.ndarray, " n"]
 
 
+@dataclass(frozen=True, eq=False)
+class _Placed:
+    """A fit that can be this organ's: its motion, the surfaces that it moves (camera frame), and
+    one standard deviation (mm) at the known places and at the middle of each part's box."""
+
+    fit: Refined
+    motion: WarpMotion
+    meshes: dict[str, Mesh]
+    known_std_mm: Float[np.ndarray, " k"]
+    middles_std_mm: Float[np.ndarray, " parts"]
+
+
 class WarpLocator:
     """Locates by a warp network and its refinement; its estimates have a motion."""
 
@@ -53,14 +65,16 @@ class WarpLocator:
         self._trust = model.trust
         self._device = next(model.network.parameters()).device
         self._near = msgspec.structs.replace(model.config.refine, first_mm=_MOVED_MM)
-        organ = model.shape.anatomy_ct.organ
-        self.anatomy_ct: Anatomy | None = model.shape.anatomy_ct
+        anatomy = model.shape.anatomy_ct
+        organ = anatomy.organ
+        self.anatomy_ct: Anatomy | None = anatomy
         few = max(1, len(organ.vertices_mm) // (_KNOWN_AT // 2))
-        inner = [part.vertices_mm for part in model.shape.anatomy_ct.tumors]
+        inner = [part.vertices_mm for part in anatomy.tumors]
         self._known_ct = np.concatenate(
             [organ.vertices_mm[::few], *(v[:: max(1, len(v) // 64)] for v in inner)]
         )
         self._nearest_known = cKDTree(self._known_ct)
+        self._middles_ct = np.array([part.box_mm.mean(0) for part in anatomy.parts])
         self._carried: _Inside | None = None
 
     def locate(self, cloud: SensorCloud, grid: int, seed: int) -> Estimate:
@@ -73,18 +87,20 @@ class WarpLocator:
         with stage(seconds, "refine", self._device):
             refine, usual_cost = self._model.config.refine, self._trust.usual_cost
             fit = best_fit(self._shape, points, starts, refine, usual_cost)
-        motion, meshes = self._placed(points, fit, seconds)
+        placed = self._placed(points, fit, seconds)
+        meshes = placed.meshes
         organ = meshes[self._model.parts[0]]
         with stage(seconds, "fine", self._device):
-            inside = self._asked(motion, organ, cloud.stamp_ns, rng)
+            inside = self._asked(placed, organ, cloud.stamp_ns, rng)
         with stage(seconds, "volume", self._device):
             camera_from_index, shape = grid_over(organ.vertices_mm, grid)
             anatomy = Anatomy(tuple(meshes.values()))
             labels = label_grid(anatomy, camera_from_index, shape)
         head = report_head(cloud, seed)
         head["voxel_mm"] = float(camera_from_index[0, 0])
-        report = self._report(head, fit, motion, meshes, inside, seconds)
-        return Estimate(inside, CameraLabels(labels, camera_from_index), meshes, report, motion)
+        report = self._report(head, placed, inside, seconds)
+        volume = CameraLabels(labels, camera_from_index)
+        return Estimate(inside, volume, meshes, report, placed.motion)
 
     def follow(self, cloud: SensorCloud, last: Estimate | None, how: Following) -> Estimate:
         """See ``track.tracker.Tracker.follow``."""
@@ -110,13 +126,12 @@ class WarpLocator:
             share = -math.expm1(-past_s / how.smoothing_s)
             fit = replace(fit, motion=blend(last.motion, unsmoothed, share))
             lag_s = past_s * (1 - share) / share  # of what moves steadily
-        motion, meshes = self._placed(points, fit, seconds)
+        placed = self._placed(points, fit, seconds)
         with stage(seconds, "carry", self._device):
-            inside = self._carry(motion, cloud.stamp_ns)
-        head = report_head(cloud, how.seed)
-        report = self._report(head, fit, motion, meshes, inside, seconds)
+            inside = self._carry(placed, cloud.stamp_ns)
+        report = self._report(report_head(cloud, how.seed), placed, inside, seconds)
         report["smoothing"] = {"time_s": how.smoothing_s, "lag_ms": 1000 * lag_s}
-        return Estimate(inside, None, meshes, report, motion, unsmoothed)
+        return Estimate(inside, None, placed.meshes, report, placed.motion, unsmoothed)
 
     def warm(self) -> None:
         """See ``track.tracker.Tracker.warm``."""
@@ -126,9 +141,8 @@ class WarpLocator:
         cloud = SensorCloud(rest.carry(self._shape.anatomy_ct.organ.vertices_mm))
         points = self._thinned(cloud, np.random.default_rng(0))
         first_motions(self._network, self._shape, points)
-        motion = refine(self._shape, points, rest, self._near).motion
-        motion.carry(self._known_ct)
-        self._carry(motion, 0)
+        fit = refine(self._shape, points, rest, self._near)
+        self._carry(self._moved(fit), 0)
 
     def _thinned(self, cloud: SensorCloud, rng: np.random.Generator) -> Float32[np.ndarray, "n 3"]:
         check_cloud(cloud)
@@ -136,33 +150,37 @@ class WarpLocator:
 
     def _placed(
         self, points: Float32[np.ndarray, "n 3"], fit: Refined, seconds: dict[str, float]
-    ) -> tuple[WarpMotion, dict[str, Mesh]]:
-        """The motion of a fit that can be this organ's, and the surfaces it moves."""
+    ) -> _Placed:
+        """What a fit says, if it can be this organ's."""
         check_familiar(self._model.familiar, spread_mm(points), fit_mm(np.abs(fit.distances_mm)))
         check_likely(fit.motion.rarity)
         with stage(seconds, "surfaces", self._device):
-            motion = replace(fit.motion, std_scale=self._trust.std_scale)
-            anatomy = self._shape.anatomy_ct
-            meshes = {
-                name: part.moved(motion.carry(part.vertices_mm))
-                for name, part in zip(anatomy.names, anatomy.parts, strict=True)
-            }
-        return motion, meshes
+            return self._moved(fit)
+
+    def _moved(self, fit: Refined) -> _Placed:
+        motion = replace(fit.motion, std_scale=self._trust.std_scale)
+        anatomy = self._shape.anatomy_ct
+        meshes = {
+            name: part.moved(motion.carry(part.vertices_mm))
+            for name, part in zip(anatomy.names, anatomy.parts, strict=True)
+        }
+        deviation = motion.std_mm(np.concatenate([self._known_ct, self._middles_ct]))
+        assert deviation is not None
+        known = len(self._known_ct)
+        return _Placed(fit, motion, meshes, deviation[:known], deviation[known:])
 
     def _report(
-        self,
-        head: dict,
-        fit: Refined,
-        motion: WarpMotion,
-        meshes: dict[str, Mesh],
-        inside: OccupancyCloud,
-        seconds: dict[str, float],
+        self, head: dict, placed: _Placed, inside: OccupancyCloud, seconds: dict[str, float]
     ) -> dict:
+        fit, motion = placed.fit, placed.motion
+        parts = describe_parts(self._model.parts, placed.meshes, inside)
+        for part, std_mm in zip(parts.values(), placed.middles_std_mm, strict=True):
+            part["center_std_mm"] = float(std_mm)
         return {
             **head,
             "fit_mm": fit_report(np.abs(fit.distances_mm)),
             "fit_cost": {"now": fit.cost, "usual": self._trust.usual_cost},
-            "parts": self._described(motion, meshes, inside),
+            "parts": parts,
             "motion": {
                 "camera_from_ct": motion.camera_from_ct.tolist(),
                 "coefficients": motion.coefficients.tolist(),
@@ -173,17 +191,16 @@ class WarpLocator:
         }
 
     def _asked(
-        self, motion: WarpMotion, organ: Mesh, stamp_ns: int, rng: np.random.Generator
+        self, placed: _Placed, organ: Mesh, stamp_ns: int, rng: np.random.Generator
     ) -> OccupancyCloud:
         """Random points of the organ's box that lie inside, with label and probability."""
         lower, upper = organ.box_mm
         points = rng.uniform(lower, upper, (QUERIES, 3)).astype(np.float32)
-        inside, mine = self._inside(motion.back(points).astype(np.float32))
-        return OccupancyCloud(
-            points[inside], mine.labels, self._probability(motion, mine), stamp_ns
-        )
+        inside, mine = self._inside(placed.motion.back(points).astype(np.float32))
+        probability = _probability(placed, mine)
+        return OccupancyCloud(points[inside], mine.labels, probability, stamp_ns)
 
-    def _carry(self, motion: WarpMotion, stamp_ns: int) -> OccupancyCloud:
+    def _carry(self, placed: _Placed, stamp_ns: int) -> OccupancyCloud:
         """The same points of the organ in every frame: labels stay, places and probabilities are
         new."""
         if self._carried is None:
@@ -194,8 +211,8 @@ class WarpLocator:
                 found = np.concatenate([found, points[self._shape.labels_at(points)[0] > 0]])
             self._carried = self._inside(found[:CARRIED])[1]
         mine = self._carried
-        places = motion.carry(mine.points_ct).astype(np.float32)
-        return OccupancyCloud(places, mine.labels, self._probability(motion, mine), stamp_ns)
+        places = placed.motion.carry(mine.points_ct).astype(np.float32)
+        return OccupancyCloud(places, mine.labels, _probability(placed, mine), stamp_ns)
 
     def _inside(
         self, points_ct: Float32[np.ndarray, "n 3"]
@@ -206,22 +223,9 @@ class WarpLocator:
         known = self._nearest_known.query(points_ct[inside])[1]
         return inside, _Inside(points_ct[inside], labels[inside], margin_mm[inside], known)
 
-    def _probability(self, motion: WarpMotion, mine: _Inside) -> Float[np.ndarray, " n"]:
-        """That the nearest surface does not lie on a point's other side, errors being normal."""
-        from scipy.special import ndtr
 
-        deviation = motion.std_mm(self._known_ct)
-        assert deviation is not None
-        return ndtr(mine.margin_mm / np.hypot(deviation, _FIELD_MM)[mine.known])
+def _probability(placed: _Placed, mine: _Inside) -> Float[np.ndarray, " n"]:
+    """That the nearest surface does not lie on a point's other side, errors being normal."""
+    from scipy.special import ndtr
 
-    def _described(
-        self, motion: WarpMotion, meshes: dict[str, Mesh], inside: OccupancyCloud
-    ) -> dict[str, dict]:
-        """``describe_parts``, and how unsure the place of each part's middle is."""
-        parts = describe_parts(self._model.parts, meshes, inside)
-        middles = [part.box_mm.mean(0) for part in self._shape.anatomy_ct.parts]
-        deviation = motion.std_mm(np.array(middles))
-        assert deviation is not None
-        for part, std_mm in zip(parts.values(), deviation, strict=True):
-            part["center_std_mm"] = float(std_mm)
-        return parts
+    return ndtr(mine.margin_mm / np.hypot(placed.known_std_mm, _FIELD_MM)[mine.known])
