@@ -17,13 +17,14 @@ from region_objects import (
     HANDS,
     ORGAN,
     TOOLS,
+    kidney_of,
     make_scene,
     precision_recall,
     working_truth,
 )
 from render_objects import ellipsoid
 from tumortrack.core.errors import InputError, NoEstimate
-from tumortrack.core.types import DepthFrame, Mesh, SensorCloud
+from tumortrack.core.types import DepthFrame, SensorCloud
 from tumortrack.phantom.kidneys import random_anatomy
 from tumortrack.sense.camera import d405, deproject, deproject_pixels, project
 from tumortrack.sense.cloud import CloudConfig
@@ -42,21 +43,7 @@ def kidneys():
 
 @pytest.fixture(scope="module")
 def real_kidney(shared_data):
-    """A patient's kidney with its tumor, straight from the label map."""
-    import nibabel
-    from scipy.ndimage import find_objects, label
-    from skimage.measure import marching_cubes
-
-    image = nibabel.load(shared_data / "kits19" / "case_00002" / "segmentation.nii.gz")
-    labels = np.asarray(image.dataobj)
-    pieces, _ = label(labels > 0)
-    one = np.bincount(pieces[labels == 2]).argmax()
-    box = tuple(slice(max(s.start - 2, 0), s.stop + 2) for s in find_objects(pieces)[one - 1])
-    inside = (pieces[box] == one).astype(np.float32)
-    spacing = tuple(float(x) for x in image.header.get_zooms())
-    vertices, faces, _, _ = marching_cubes(inside, 0.5, spacing=spacing, step_size=2)
-    mesh = Mesh(vertices, faces)
-    return mesh if mesh.volume_mm3 > 0 else Mesh(vertices, faces[:, ::-1])
+    return kidney_of(shared_data / "kits19" / "case_00002" / "segmentation.nii.gz")
 
 
 def points(content, config=CONFIG, seed=0, **hints):
@@ -176,6 +163,17 @@ def test_largest_then_last_then_picked():
     assert column_of(points(frame, last_box_mm=around).cloud).min() > 265
     with pytest.raises(NoEstimate, match="picked point"):
         points(frame, picked_mm=np.array([0.0, 60.0, 120.0]))
+
+
+def test_parts_in_the_last_box_belong_to_the_organ():
+    """A tumor that stands out is another piece; the last estimate's box has both."""
+    frame = two_domes()
+    every = points(frame, NOTHING).cloud.points_mm
+    around = np.stack([every.min(0), every.max(0)])
+    around[1, 2] += 25  # organs have a far side
+    column = column_of(points(frame, last_box_mm=around).cloud)
+    assert column.min() < 100
+    assert column.max() > 340
 
 
 def test_an_organ_behind_a_shaft_stays_one():

@@ -1,5 +1,5 @@
 """Which pieces are the organ: the one that the user points at, the one seen last, or the likeliest;
-and what continues it behind something nearer."""
+what continues it behind something nearer; and what lies in the last estimate's box alone."""
 
 from __future__ import annotations
 
@@ -22,6 +22,10 @@ _STRAY = 2  # false matches in a row that are no background
 _TIMES = 2  # so many things may lie between the chosen piece and another
 _CUT = 0.1
 _POOR = 0.5
+_WHOLLY = 0.97  # of a piece's surface in the last box: it is a part of the organ
+_BOX_MM = 5.0  # the last box may be wrong by so much
+_FAR_SIDE = 0.4  # of the box's depth: the camera sees an organ's near side; there is the ground
+_THICK_PART_MM = 9.0
 _AIMED = 0.4  # so far (tangent) from the optical axis a piece is half as likely the organ
 _THICK = 0.8  # of an organ's shortest extent: thinner pieces are likely fingers or shafts
 
@@ -88,6 +92,7 @@ class Choice:
 
     Attributes:
         pieces: number of its piece for every pixel (h, w).
+        these: their sizes.
         together: (count + 1,) bool, which of them.
         score: how like an organ it is; the largest of several choices is the best.
         doubtful: it leaves the picture or is too wide, or something that does seems to continue
@@ -95,6 +100,7 @@ class Choice:
     """
 
     pieces: np.ndarray
+    these: Sizes
     together: np.ndarray
     score: float
     doubtful: bool
@@ -112,7 +118,7 @@ def choice(
     piece, guessed = chosen
     together = np.zeros(len(these.cut), bool)
     if piece is None:
-        return Choice(pieces, together, -1.0, True)
+        return Choice(pieces, these, together, -1.0, True)
     leaves = these.cut > _CUT
     gap = config.gap_mm / picture.footprint
     lines = _continuing(
@@ -132,7 +138,18 @@ def choice(
     # A poor guess beside something larger that leaves the picture: a hand that holds the organ?
     held = guessed and likeness < _POOR and these.area_mm2[leaves].max(initial=0) > score
     doubtful = refused or leaves[piece] or too_wide or held
-    return Choice(pieces, together, float(score), bool(doubtful))
+    return Choice(pieces, these, together, float(score), bool(doubtful))
+
+
+def parts_of(picture: Picture, taken: Choice, corners_mm: np.ndarray) -> np.ndarray:
+    """Further pieces (count + 1,), bool, that lie in the last estimate's box (2, 3) alone, not at
+    its far side, and are no thin thing: a tumor that stands out, what a crease parts."""
+    low, high = np.sort(np.asarray(corners_mm, np.float64), axis=0)
+    high[2] -= _FAR_SIDE * (high[2] - low[2])
+    low, high = low - _BOX_MM, high + _BOX_MM
+    these = taken.these
+    area = _area_inside(picture.depth_mm, taken.pieces, picture.pinhole, low, high, len(these.cut))
+    return (area > _WHOLLY * these.area_mm2) & (these.thick_mm > _THICK_PART_MM) & (area > 0)
 
 
 def _like_an_organ(these: Sizes, config: RegionConfig) -> np.ndarray:

@@ -127,7 +127,10 @@ def _take_one_piece(picture: Picture, config: RegionConfig, hints: Hints) -> Non
             break
     assert best is not None
     picture.take(best.pieces == 0, THIN)
-    picture.take(~best.together[best.pieces], PIECES)
+    together = best.together
+    if hints.last_box_mm is not None and together.any():
+        together = together | choose.parts_of(picture, best, hints.last_box_mm)
+    picture.take(~together[best.pieces], PIECES)
 
 
 def _chosen(
