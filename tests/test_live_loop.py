@@ -15,7 +15,9 @@ from tumortrack.core.errors import InputError, NoEstimate, StorageError
 from tumortrack.core.types import DepthFrame, Intrinsics, SensorCloud
 from tumortrack.learn.model import load_model
 from tumortrack.learn.train import Run, train
+from tumortrack.sense.camera import d405
 from tumortrack.sense.region import RegionConfig
+from tumortrack.sense.render import render_depth
 from tumortrack.simulate.bodies import body_for
 from tumortrack.simulate.scene import SceneRecipe, Simulator
 from tumortrack.track.estimate import Following
@@ -23,7 +25,7 @@ from tumortrack.track.follower import Follower, FollowerConfig
 from tumortrack.track.live import Controls, Frames, Seen, Setting, SourceEnded, SourceLost
 from tumortrack.track.loop import Loop, LoopConfig, summary
 from tumortrack.track.outlet import Outlet
-from tumortrack.track.quality import judge
+from tumortrack.track.quality import judge, seen_through
 from tumortrack.track.reader import Reader
 from tumortrack.track.tracker import Tracker
 from warp_objects import ANATOMY, placed, slim_clinic
@@ -150,7 +152,7 @@ def test_points_that_are_carried_have_the_labels_of_where_they_are(tracker, stag
 def test_smoothing_halves_jitter_and_says_its_lag(tracker, stages):
     rng = np.random.default_rng(3)
     clouds = [
-        SensorCloud(c.points_mm + rng.normal(0, 0.6, 3).astype(np.float32), c.stamp_ns)
+        SensorCloud(c.points_mm + rng.normal(0, 0.3, 3).astype(np.float32), c.stamp_ns)
         for c in moving(stages[0], 24, step_mm=(0, 0, 0))
     ]
 
@@ -198,17 +200,46 @@ def test_an_old_estimate_does_not_help(tracker, stages):
 
 
 def test_a_worse_fit_is_flagged(tracker, stages):
-    estimate = tracker.follow(stages[0].cloud)
+    cloud = stages[0].cloud
+    estimate = tracker.follow(cloud)
     estimate.report["fit_cost"] = {"now": 1.0, "usual": 2.0}
     for part in estimate.report["parts"].values():
         part["probability"], part["center_std_mm"] = 0.9, 1.0
-    assert judge(estimate) == ("good", "")
+    assert judge(estimate, cloud) == ("good", "")
     estimate.report["parts"]["tumor_1"]["center_std_mm"] = 3.4
-    quality, warning = judge(estimate)
+    quality, warning = judge(estimate, cloud)
     assert quality == "poor"
     assert "tumor_1 is unsure by 3.4 mm" in warning
     estimate.report["fit_cost"]["now"] = 2.1
-    assert "worse than in most" in judge(estimate)[1]
+    assert "worse than in most" in judge(estimate, cloud)[1]
+
+
+def test_an_organ_that_the_camera_sees_through_is_refused(tracker, stages):
+    estimate = tracker.follow(stages[0].cloud)
+    camera = d405(424, 240)
+    organ = estimate.meshes["kidney"]
+    alone = render_depth(organ.vertices_mm, organ.faces, camera)
+    behind_mm = np.float32(np.nanmax(alone.depth_mm) + 30)
+    table = DepthFrame(np.fmin(alone.depth_mm, behind_mm), camera)
+    assert seen_through(estimate, alone) == 0
+    assert seen_through(estimate, table) == 0
+    rows = np.flatnonzero(np.isfinite(alone.depth_mm).any(1))
+    for share, expected in ((0.07, "poor"), (0.3, "none")):
+        area = np.cumsum(np.isfinite(alone.depth_mm[rows]).sum(1))
+        few = rows[: np.searchsorted(area, share * area[-1])]
+        depth_mm = table.depth_mm.copy()
+        depth_mm[few] = behind_mm  # the table where the organ is said to be
+        holed = DepthFrame(depth_mm, camera)
+        assert seen_through(estimate, holed) == pytest.approx(share, abs=0.02)
+        if expected == "poor":
+            assert judge(estimate, holed)[0] == "poor"
+            assert estimate.report["seen_through"] == pytest.approx(share, abs=0.02)
+        else:
+            with pytest.raises(NoEstimate, match="sees through 3"):
+                judge(estimate, holed)
+    hidden = table.depth_mm.copy()
+    hidden[:, :200] = behind_mm - 90  # a hand before it hides it, and proves nothing
+    assert seen_through(estimate, DepthFrame(hidden, camera)) == 0
 
 
 def test_every_frame_gives_one_update_with_its_own_stamp(tracker, stages):
@@ -301,6 +332,75 @@ def test_stale_frames_are_refused(tracker, stages):
     assert updates[1].estimate is not None
     assert told["latency_from"] == "stamp"
     assert updates[0].latency_ms > 3000
+
+
+def test_an_answer_that_comes_too_late_is_none_and_yet_a_start(tracker, stages):
+    class Slow(Tracker):
+        def follow(self, cloud, last=None, how=Following()):  # noqa: B008
+            helped.append(last is not None)
+            time.sleep(0.4 if len(helped) == 1 else 0)
+            return super().follow(cloud, last, how)
+
+    helped = []
+    now = time.time_ns()
+    clouds = [
+        SensorCloud(stages[0].cloud.points_mm, now),
+        SensorCloud(stages[0].cloud.points_mm, now + 600_000_000),
+    ]
+    config = LoopConfig(region=WHOLE, stale_s=0.3)
+    updates, _ = play(Slow(tracker.model), [clouds[0], 0.6, clouds[1]], config, waits=False)
+    assert "too late" in updates[0].reason
+    assert updates[0].estimate is None
+    assert updates[-1].estimate is not None
+    assert helped == [False, True]
+
+
+def test_smoothing_never_lags_by_much(tracker, stages):
+    """A jump of 15 mm is shown at once, not blended over seconds."""
+    follower = Follower(tracker, FollowerConfig(smoothing_s=1.0))
+    clouds = moving(stages[0], 3, step_mm=(0, 0, 0))
+    for cloud in clouds:
+        follower.locate(cloud)
+    jumped = SensorCloud(clouds[-1].points_mm + np.float32([15, 0, 0]), clouds[-1].stamp_ns + 1)
+    found = follower.locate(jumped)
+    alone = tracker.follow(jumped)
+    assert np.linalg.norm(found.motion.centre_mm - alone.motion.centre_mm) < 2.5
+    assert found.report["smoothing"]["lag_ms"] == 0
+
+
+def test_a_pick_moves_along_and_is_forgotten_when_lost(tracker, stages, monkeypatch):
+    monkeypatch.setattr("tumortrack.track.loop._PICK_S", 0.2)
+    clouds = moving(stages[0], 3, step_mm=(6, 0, 0))
+    controls = Controls()
+    controls.pick(clouds[0].points_mm[5].astype(float))
+    setting = Setting(tracker.model.parts, Frames(), tracker.anatomy_ct, controls)
+    loop = Loop(tracker, setting, LoopConfig(region=WHOLE, stale_s=0.3))
+    places = []
+    few = [SensorCloud(clouds[2].points_mm[:9], clouds[2].stamp_ns + n) for n in (1, 2)]
+    reader = Reader(lambda: Script([*clouds, few[0], 0.4, few[1]]))
+    loop.run(reader, [], lambda _: places.append((loop._place_mm, controls.picked_mm)))
+    reader.close()
+    assert np.linalg.norm(places[2][0] - places[0][0]) == pytest.approx(12, abs=0.5)
+    assert places[2][1] is not None
+    assert places[-1] == (None, None)
+
+
+def test_other_intrinsics_replace_the_sources(tracker):
+    frame = small_frame()
+    given = Intrinsics(64, 48, 30.0, 30.5, 31.5, 23.5)
+    setting = Setting(tracker.model.parts, Frames(), tracker.anatomy_ct, Controls())
+    sink = Notes()
+    for intrinsics, said in ((given, None), (Intrinsics(32, 48, 30, 30, 15, 23), "32 x 48")):
+        loop = Loop(tracker, setting, LoopConfig(intrinsics=intrinsics))
+        outlets = [Outlet("notes", sink, 10)]
+        reader = Reader(lambda: Script([frame]))
+        loop.run(reader, outlets, lambda _: None)
+        reader.close()
+        outlets[0].close()
+        if said is None:
+            assert sink.updates[-1].seen.content.intrinsics == given
+        else:
+            assert said in sink.updates[-1].reason
 
 
 def test_a_frozen_source_is_said_again_and_again_and_its_return_is_seen(tracker, stages):

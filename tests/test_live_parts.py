@@ -55,6 +55,7 @@ KINDS = (Camera, Window, Plain)
         ("camera:C:/folder:with colons", Camera(topic="C:/folder:with colons")),
         ("window", Window()),
         ("window:9000", Window(port=9000)),
+        ("camera:/a+b%20c", Camera(topic="/a+b%20c")),
         ("window?port=9000", Window(port=9000)),
         ("plain", Plain()),
     ],
@@ -107,6 +108,8 @@ def test_a_stale_frame_and_one_from_the_future_are_refused():
     with pytest.raises(NoEstimate, match=r"2\.00 s in the future"):
         check.check(1 * SECOND, -2.0)
     check.check(1 * SECOND, 0.4)
+    with pytest.raises(NoEstimate, match="must be 0 or more"):
+        check.check(-5, 0.0)
 
 
 def test_a_clock_that_was_set_back_is_believed_when_it_goes_on():
@@ -226,6 +229,27 @@ def test_a_source_that_can_never_work_ends_the_loop():
     reader.close()
 
 
+def test_what_breaks_at_reopening_is_no_end():
+    """A camera that is plugged in again fails in ways of its own while it comes up."""
+    opened = []
+
+    def open_next():
+        opened.append(len(opened))
+        if len(opened) == 2:
+            raise RuntimeError("failed to set power state")
+        if len(opened) == 3:
+            raise InputError("no 848x480@30 at USB 2")
+        return Script([_seen(len(opened)), SourceLost("unplugged")], waits=True)
+
+    reader = Reader(open_next)
+    assert reader.take(1.0).stamp_ns == 1
+    assert reader.take(5.0).stamp_ns == 4
+    assert reader.failure is None
+    assert len(reader.defects) == 1
+    assert "power state" in reader.defects[0]
+    reader.close()
+
+
 def test_garbage_is_handed_on_and_reading_goes_on():
     reader = Reader(lambda: Script([InputError("a message of no image"), _seen(3)], waits=True))
     assert "no image" in str(reader.take(1.0))
@@ -273,6 +297,36 @@ def test_a_sink_that_may_be_behind_loses_nothing():
         outlet.put(small_update(n))
     outlet.close()
     assert sink.got == list(range(64))
+
+
+def test_a_sink_that_shows_is_told_when_the_loop_hangs(monkeypatch):
+    monkeypatch.setattr("tumortrack.track.outlet._SILENT_S", 0.2)
+
+    class Shown(Notes):
+        def publish(self, update):
+            self.got.append(update)
+
+    shown, kept = Shown(), Shown()
+    outlets = [Outlet("viewer", shown, 1), Outlet("recording", kept, 30)]
+    for outlet in outlets:
+        outlet.put(small_update(7))
+    time.sleep(0.9)
+    for outlet in outlets:
+        outlet.close()
+    assert [u.estimate is not None for u in shown.got] == [True, False]  # and once only
+    assert "said nothing" in shown.got[1].reason
+    assert [u.sequence for u in kept.got] == [7]  # what was said, and no more
+
+
+def test_a_sink_that_fails_at_its_end_is_known():
+    class Cut(Notes):
+        def close(self):
+            raise StorageError("no index")
+
+    outlet = Outlet("recording", Cut(), 5)
+    outlet.close()
+    assert outlet.unclosed
+    assert outlet.error == "no index"
 
 
 def test_a_broken_sink_is_said_and_recovers():

@@ -173,6 +173,31 @@ def test_a_robot_gets_its_own_frame(world, tmp_path):
     found = told(report)
     assert found["frame"]["frame_id"] == "base_link"
     assert found["frame"]["published_from_camera"][2][3] == pytest.approx(700)
+    about = told(out / "recording.json")
+    assert (about["frame_id"], about["estimate_frame"]) == ("base_link", "camera")
+
+
+def test_a_report_that_cannot_be_written_ends_nothing(world, tmp_path):
+    folder = tmp_path / "gone"
+    process = start(
+        world, virtual(world, fps=10), "--seconds", 3, "--report", folder / "report.json"
+    )
+    _wait_for(process, "tracking")
+    folder.rmdir()
+    said, _ = process.communicate(timeout=60)
+    assert process.returncode == 0, said
+    assert "report: cannot write" in said
+    assert "estimates" in said
+
+
+def test_smoothing_needs_a_model_with_a_motion(world, tmp_path):
+    done = tumortrack("train", world / "case", world / "quick", "--preset", "quick", "--steps", 2)
+    succeeded(done)
+    done = tumortrack(
+        *("track", world / "quick", virtual(world), "--smoothing", "0.2"),
+        *("--report", tmp_path / "r.json"),
+    )
+    assert "needs a motion" in refusal(done)
 
 
 def test_a_source_that_vanishes_ends_with_a_reason(world, tmp_path):

@@ -210,6 +210,7 @@ def track(
     box: tuple[float, float, float, float, float, float] | None = None,
     whole: bool = False,
     frame: Path | None = None,
+    intrinsics: Path | None = None,
     smoothing: float = 0.0,
     rescan: float = 1.0,
     stale: float = 0.5,
@@ -234,6 +235,8 @@ def track(
         box: keep what lies in a box: two opposite corners X Y Z X Y Z, camera frame, mm.
         whole: what is in range and box is the organ alone; do not look for it among other things.
         frame: JSON file that says where the camera is; results are then in the robot's frame.
+        intrinsics: JSON with the camera's width, height, fx, fy, cx, cy in pixels, instead of what
+            the source says.
         smoothing: time constant in s of a mean over past estimates; the lag is in the report.
         rescan: every so many s, look for the organ as in a first frame.
         stale: frames older than so many s are refused, and a pause so long is said.
@@ -254,6 +257,7 @@ def track(
             box,
             whole,
             frame,
+            intrinsics,
             smoothing,
             rescan,
             stale,

@@ -11,12 +11,15 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
+import numpy as np
+
 from tumortrack.app.console import console, say
 from tumortrack.core import store
 from tumortrack.core.config import to_builtins
-from tumortrack.core.errors import InputError
+from tumortrack.core.errors import InputError, StorageError
 
 if TYPE_CHECKING:
+    from tumortrack.core.types import Anatomy
     from tumortrack.learn.config import TrainConfig
     from tumortrack.sense.region import RegionConfig
     from tumortrack.track.live import Setting, SinkConfig, Update
@@ -25,6 +28,7 @@ if TYPE_CHECKING:
     from tumortrack.track.reader import Reader
 
 _SAY_S, _SAY_PLAIN_S = 1.0, 5.0  # between two lines of state: on a terminal, in a file
+_ENDS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _SETTLED_S = 60.0  # by then all buffers have their size: memory that grows on is a leak
 _STORE_S = 10.0  # between two writings of the report: kill -9 loses no more
 
@@ -35,6 +39,7 @@ class TrackOptions:
     box_mm: tuple[float, float, float, float, float, float] | None = None
     whole: bool = False
     frame: Path | None = None
+    intrinsics: Path | None = None
     smoothing_s: float = 0.0
     rescan_s: float = 1.0
     stale_s: float = 0.5
@@ -66,8 +71,8 @@ def track(model_folder: Path, source: str, sinks: tuple[str, ...], options: Trac
     from tumortrack.track.tracker import Tracker
 
     model = load_model(model_folder, options.device)
-    config = _loop_config(model.config, options)
     tracker = Tracker(model)
+    config = _loop_config(model.config, tracker.anatomy_ct, options)
     setting = Setting(model.parts, frames, tracker.anatomy_ct, Controls())
     loop = Loop(tracker, setting, config)
     about = {
@@ -84,16 +89,15 @@ def track(model_folder: Path, source: str, sinks: tuple[str, ...], options: Trac
     say("warming up ...")
     loop.warm()
     with ExitStack() as stack:
+        stack.enter_context(_stopping(loop))  # first in, last out: also while sinks flush
         screen = _Screen(loop, report, about)
-        stack.callback(screen.end)  # last of all: when every sink has closed
-        outlets = [
-            _open(spec, sink, setting, stack)
-            for spec, sink in zip(sinks, sink_configs, strict=True)
-        ]
+        stack.callback(screen.end)
+        # Those that make a folder last: if another cannot open, none is left behind.
+        in_turn = sorted(zip(sink_configs, sinks, strict=True), key=lambda pair: pair[0].waiting)
+        outlets = [_open(spec, sink, setting, stack) for sink, spec in in_turn]
         reader = Reader(source_config.open)
         stack.callback(reader.close)
         screen.watch(reader, outlets)
-        stack.enter_context(_stopping(loop))
         say(f"tracking {source} in frame {frames.frame_id!r}; Ctrl-C ends it.")
         loop.run(reader, outlets, screen.show)
 
@@ -106,24 +110,30 @@ def _open(spec: str, config: SinkConfig, setting: Setting, stack: ExitStack) -> 
     return outlet
 
 
-def _loop_config(trained: TrainConfig, options: TrackOptions) -> LoopConfig:
+def _loop_config(
+    trained: TrainConfig, anatomy_ct: Anatomy | None, options: TrackOptions
+) -> LoopConfig:
+    from tumortrack.sense.files import read_intrinsics
     from tumortrack.track.follower import FollowerConfig
     from tumortrack.track.loop import LoopConfig
 
     return LoopConfig(
-        region=_region(trained, options),
+        region=_region(trained, anatomy_ct, options),
         follower=FollowerConfig(
             rescan_s=options.rescan_s, smoothing_s=options.smoothing_s, seed=options.seed
         ),
+        intrinsics=None if options.intrinsics is None else read_intrinsics(options.intrinsics),
         stale_s=options.stale_s,
         give_up_s=options.give_up_s,
         seconds=options.seconds,
     )
 
 
-def _region(trained: TrainConfig, options: TrackOptions) -> RegionConfig:
+def _region(
+    trained: TrainConfig, anatomy_ct: Anatomy | None, options: TrackOptions
+) -> RegionConfig:
     """Depths that training showed, unless the user says others; where it showed any distance, its
-    farthest organ still lies in them whole."""
+    farthest organ still lies in them whole. Pieces of about the organ's size, if that is known."""
     from tumortrack.sense.cloud import CloudConfig
     from tumortrack.sense.region import RegionConfig
 
@@ -141,7 +151,13 @@ def _region(trained: TrainConfig, options: TrackOptions) -> RegionConfig:
         box = ((ax, ay, az), (bx, by, bz))
     if options.whole:
         return RegionConfig(crop=crop, box_mm=box, plane=False, flying=False, pieces=False)
-    return RegionConfig(crop=crop, box_mm=box)
+    if anatomy_ct is None:
+        return RegionConfig(crop=crop, box_mm=box)
+    vertices = anatomy_ct.organ.vertices_mm
+    axes = np.linalg.svd(vertices - vertices.mean(0), full_matrices=False)[2]
+    extents_mm = np.ptp(vertices @ axes.T, axis=0)
+    size_mm = (0.7 * float(extents_mm.min()), 1.25 * float(extents_mm.max()))
+    return RegionConfig(crop=crop, box_mm=box, organ_mm=size_mm)
 
 
 def _place_of_report(path: Path | None) -> Path:
@@ -158,13 +174,14 @@ def _place_of_report(path: Path | None) -> Path:
 
 @contextmanager
 def _stopping(loop: Loop) -> Iterator[None]:
-    """Ctrl-C and SIGTERM end the loop after the frame it is at; a second Ctrl-C interrupts."""
+    """Ctrl-C, SIGTERM and a terminal that goes end the loop after the frame it is at, and sinks
+    flush; a second Ctrl-C interrupts."""
 
     def stop(number: int, _: object) -> None:
         loop.stop()
         signal.signal(signal.SIGINT, signal.default_int_handler)
 
-    before = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
+    before = {number: signal.signal(number, stop) for number in _ENDS}
     try:
         yield
     finally:
@@ -181,7 +198,8 @@ class _Screen:
         self._outlets: list[Outlet] = []
         self._started = self._said = self._stored = time.monotonic()
         self._before = 0
-        self._state = ""
+        self._state, self._changed = "", 0.0
+        self._unwritten = ""
         self._errors: dict[str, str] = {}
         self._memory_mb = {"start": round(_resident_mb(), 1)}
 
@@ -193,8 +211,9 @@ class _Screen:
         """Called with every update."""
         state = update.reason or update.warning or "good"
         kind = "".join(c for c in state if not c.isdigit())
-        if kind != self._state:
-            self._state = kind
+        now = time.monotonic()
+        if kind != self._state and now - self._changed >= _SAY_S:
+            self._state, self._changed = kind, now
             say(f"{update.quality}: {state}")
         for outlet in self._outlets:
             if outlet.failing and self._errors.get(outlet.name) != outlet.error:
@@ -202,7 +221,6 @@ class _Screen:
                 say(f"sink {outlet.name}: {outlet.error}")
         reader = self._reader
         assert reader is not None
-        now = time.monotonic()
         every_s = _SAY_S if console.is_terminal else _SAY_PLAIN_S
         if now - self._said >= every_s:
             self._line(now, reader)
@@ -226,16 +244,25 @@ class _Screen:
                 f"latency from {reader.latency_from} to published estimate: p50 "
                 f"{times['p50']:.1f}, p95 {times['p95']:.1f}, p99.9 {times['p99.9']:.1f} ms."
             )
+        for outlet in self._outlets:
+            if outlet.dropped or outlet.errors:
+                last = f"; the last: {outlet.error}" if outlet.error else ""
+                say(f"sink {outlet.name}: {outlet.dropped} missed, {outlet.errors} errors{last}.")
         for name, errors in loop.errors.items():
             off = errors.summary()
             say(f"{name}: centre off by {off['p50']:.1f} mm (median; 95 %: {off['p95']:.1f} mm).")
-        say(f"written to {self._report}.")
+        if not self._unwritten:
+            say(f"written to {self._report}.")
+        if lost := [outlet for outlet in self._outlets if outlet.unclosed]:
+            raise StorageError(f"sink {lost[0].name} did not end well: {lost[0].error}.")
 
     def _line(self, now: float, reader: Reader) -> None:
         total = sum(self._loop.counts.values())
         rate = (total - self._before) / (now - self._said)
         self._before, self._said = total, now
         latency = self._loop.latency
+        if not len(latency):
+            return
         say(
             f"{now - self._started:6.0f} s  {rate:5.1f} updates/s  latency p50 "
             f"{latency.percentile(50):.1f} p95 {latency.percentile(95):.1f} ms  "
@@ -256,7 +283,13 @@ class _Screen:
             "memory_mb": self._memory_mb,
             **summary(self._loop, reader, self._outlets),
         }
-        store.write_json(self._report, content)
+        try:
+            store.write_json(self._report, content)
+            self._unwritten = ""
+        except StorageError as error:  # a full disk must not end what is seen live
+            if not self._unwritten:
+                say(f"report: {error}")
+            self._unwritten = str(error)
 
 
 def _resident_mb() -> float:

@@ -24,12 +24,16 @@ class StampCheck:
             NoEstimate: stale, or out of order.
         """
         if age_s > self._stale_s:
-            raise NoEstimate(f"the frame is stale: {age_s:.2f} s old")
+            raise NoEstimate(
+                f"the frame is stale: {age_s:.2f} s old, if the clocks of camera and computer agree"
+            )
         if age_s < -_AHEAD_S:
             raise NoEstimate(
                 f"the frame's stamp lies {-age_s:.2f} s in the future: the clocks of camera and "
                 "computer disagree"
             )
+        if stamp_ns < 0:
+            raise NoEstimate(f"the frame's stamp is {stamp_ns} ns; it must be 0 or more")
         self._in_order(stamp_ns)
 
     def _in_order(self, stamp_ns: int) -> None:

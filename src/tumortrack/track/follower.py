@@ -18,7 +18,7 @@ class FollowerConfig(Config, frozen=True, kw_only=True):
     the mean over past estimates; 0: none; the lag it adds stands in every report."""
 
     rescan_s: float = 1.0
-    forget_s: float = 0.5
+    forget_s: float = 1.0
     smoothing_s: float = 0.0
     seed: int = 0
 
@@ -30,9 +30,18 @@ class FollowerConfig(Config, frozen=True, kw_only=True):
 
 
 class Follower:
-    """Locates in one frame after the other, each helped by the one before."""
+    """Locates in one frame after the other, each helped by the one before.
+
+    Raises:
+        InputError: smoothing, where the model knows no motion.
+    """
 
     def __init__(self, tracker: Tracker, config: FollowerConfig) -> None:
+        if config.smoothing_s > 0 and tracker.anatomy_ct is None:
+            raise InputError(
+                "smoothing needs a motion, which models of the presets quick and paper do not "
+                "know. Train with --preset clinic, or leave smoothing out."
+            )
         self._tracker, self._config = tracker, config
         self._last: Estimate | None = None
         self._scanned_ns = 0

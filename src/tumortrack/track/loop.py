@@ -14,12 +14,14 @@ import traceback
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from dataclasses import replace
 
 import numpy as np
+from jaxtyping import Float64
 
 from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError, NoEstimate, TumortrackError
-from tumortrack.core.types import Anatomy, DepthFrame
+from tumortrack.core.types import Anatomy, DepthFrame, Intrinsics, SensorCloud
 from tumortrack.sense.camera import d405
 from tumortrack.sense.region import Hints, RegionConfig, organ_points
 from tumortrack.track.clock import StampCheck
@@ -34,16 +36,19 @@ from tumortrack.track.tracker import Tracker
 
 _KINDS = 50  # of reasons that are counted apart
 _DEFECTS = 5  # tracebacks that are kept
+_PICK_S = 3.0  # without the organ: a pick is forgotten
 
 
 class LoopConfig(Config, frozen=True, kw_only=True):
     """``stale_s``: no frame for so long, or one that old, gives 'no estimate'. ``give_up_s``: the
-    loop ends where no frame came for so long. ``seconds``: the loop ends so long after the first
+    loop ends where no frame came for so long. ``intrinsics``: of depth images, instead of what the
+    source says. ``seconds``: the loop ends so long after the first
     frame; 0: never.
     """
 
     region: RegionConfig = RegionConfig()
     follower: FollowerConfig = FollowerConfig()
+    intrinsics: Intrinsics | None = None
     stale_s: float = 0.5
     give_up_s: float = 60.0
     seconds: float = 0.0
@@ -58,6 +63,10 @@ class LoopConfig(Config, frozen=True, kw_only=True):
             raise InputError(f"seconds is {self.seconds:g}; it must be 0 (no end) or more.")
 
 
+class TooLate(NoEstimate):
+    """The estimate is right, but its frame is stale by now."""
+
+
 class Loop:
     """One run from a source to sinks. ``run`` returns when the source ends, when ``stop`` was
     called from anywhere, or when the time is up."""
@@ -68,7 +77,10 @@ class Loop:
         self._stamps = StampCheck(config.stale_s)
         self._stop = threading.Event()
         self._sequence = 0
-        self._picked: np.ndarray | None = None
+        self._picked: Float64[np.ndarray, " 3"] | None = None  # by the user
+        self._place_mm: Float64[np.ndarray, " 3"] | None = None  # where that is by now
+        self._found_s = time.monotonic()
+        self._stamp: tuple[int, int] | None = None  # of the last frame, and when that was here
         self.latency = Histogram()
         self.stages: dict[str, Histogram] = {}
         self.errors: dict[str, Histogram] = {}  # mm, of a source that knows the truth
@@ -109,11 +121,13 @@ class Loop:
             got = reader.take(self._config.stale_s)
             now = time.monotonic()
             if isinstance(got, Seen):
+                got = self._calibrated(got)
+            if isinstance(got, Seen):
                 fresh = now
                 if self._config.seconds and ends == math.inf:
                     ends = now + self._config.seconds
-                update = self._answer(got, reader.born_ns(got))
-            elif reader.ended:
+                update = self._answer(got, reader.born_ns(got), reader.latency_from != "taking")
+            elif got is None and reader.ended:
                 return
             else:
                 update = self._silence(got, now - fresh, reader.trouble)
@@ -128,14 +142,14 @@ class Loop:
                     "then start again."
                 )
 
-    def _answer(self, seen: Seen, born_ns: int) -> Update:
-        """The update of one frame, which came to be at ``born_ns``."""
+    def _answer(self, seen: Seen, born_ns: int, hurry: bool) -> Update:
+        """The update of one frame, which came to be at ``born_ns``. ``hurry``: time goes on while
+        we work, so an answer can come too late."""
         seconds: dict[str, float] = {}
-        organ, estimate, reason = None, None, ""
+        organ, estimate, reason, warning = None, None, "", ""
         quality: Quality = "none"
-        warning = ""
         try:
-            self._believe(seen.stamp_ns, born_ns)
+            self._believe(seen.stamp_ns, _age_s(born_ns))
             with timed(seconds, "organ"):
                 rng = np.random.default_rng((self._config.follower.seed, seen.stamp_ns))
                 region = organ_points(seen.content, self._config.region, self._hints(seen), rng)
@@ -143,15 +157,23 @@ class Loop:
             with timed(seconds, "locate"):
                 estimate = self._follower.locate(organ)
             seconds |= {f"locate.{k}": v for k, v in estimate.report["timings"].items()}
-            quality, warning = judge(estimate)
+            with timed(seconds, "judge"):
+                quality, warning = judge(estimate, seen.content)
+            self._follow_pick(organ)
+            if hurry and _age_s(born_ns) > self._config.stale_s:
+                raise TooLate(f"the answer came too late: {_age_s(born_ns):.2f} s after the frame")
+        except TooLate as error:  # and yet the best place to start the next search at
+            estimate, reason = None, str(error)
         except TumortrackError as error:
-            reason = str(error)
-        except Exception as error:  # a defect of ours: said, kept, and the next frame is tried
-            self._remember(error)
-            reason = f"internal error, {type(error).__name__}: {error}"
-        if reason:
             self._follower.forget()
-            estimate = None
+            estimate, reason = None, str(error)
+        except Exception as error:  # a defect of ours: said, kept, and the next frame is tried
+            self._follower.forget()
+            self._remember(error)
+            estimate, reason = None, f"internal error, {type(error).__name__}: {error}"
+        if estimate is None:
+            quality, warning = "none", ""
+        self._stamp = (seen.stamp_ns, time.monotonic_ns())
         return Update(
             self._next(),
             seen.stamp_ns,
@@ -163,33 +185,61 @@ class Loop:
             organ,
             self._setting.frames,
             seconds,
-            latency_ms=(time.time_ns() - born_ns) * 1e-6,
+            latency_ms=1000 * _age_s(born_ns),
         )
 
-    def _believe(self, stamp_ns: int, born_ns: int) -> None:
+    def _calibrated(self, seen: Seen) -> Seen | InputError:
+        """The frame as the camera that the user says it is took it."""
+        given, content = self._config.intrinsics, seen.content
+        if given is None or not isinstance(content, DepthFrame):
+            return seen
+        has = content.intrinsics
+        if (has.width, has.height) != (given.width, given.height):
+            return InputError(
+                f"the depth images are {has.width} x {has.height}, and --intrinsics is for "
+                f"{given.width} x {given.height}; calibrate for the size that is streamed."
+            )
+        return replace(seen, content=DepthFrame(content.depth_mm, given, content.stamp_ns))
+
+    def _believe(self, stamp_ns: int, age_s: float) -> None:
         jumps = self._stamps.jumps
-        self._stamps.check(stamp_ns, (time.time_ns() - born_ns) * 1e-9)
+        self._stamps.check(stamp_ns, age_s)
         if self._stamps.jumps > jumps:
             self._follower.forget()
 
     def _hints(self, seen: Seen) -> Hints:
-        picked = self._setting.controls.picked_mm
-        if picked is not self._picked:  # the user chose anew
-            self._picked = picked
+        controls = self._setting.controls
+        if controls.picked_mm is not self._picked:  # the user chose anew
+            self._picked = self._place_mm = controls.picked_mm
+            self._found_s = time.monotonic()
             self._follower.forget()
+        elif self._picked is not None and time.monotonic() - self._found_s > _PICK_S:
+            controls.pick(None)  # it is not there any more, nor where it was seen last
+            self._picked = self._place_mm = None
         last_box_mm = self._follower.last_box_mm(seen.stamp_ns)
-        # Once the organ is found its box is the better guide: the picked point does not move along.
-        return Hints(
-            mask=seen.mask,
-            picked_mm=picked if last_box_mm is None else None,
-            last_box_mm=last_box_mm,
-        )
+        # Once the organ is found its box is the better guide: pieces may cover the place.
+        place_mm = self._place_mm if last_box_mm is None else None
+        return Hints(mask=seen.mask, picked_mm=place_mm, last_box_mm=last_box_mm)
+
+    def _follow_pick(self, organ: SensorCloud) -> None:
+        """The organ was found: what the user picked moves along with it."""
+        self._found_s = time.monotonic()
+        if self._picked is not None:
+            points_mm = organ.points_mm.astype(np.float64)
+            off_mm = np.linalg.norm(points_mm - np.median(points_mm, axis=0), axis=1)
+            self._place_mm = points_mm[int(off_mm.argmin())]
 
     def _silence(self, fault: TumortrackError | None, silent_s: float, trouble: str) -> Update:
         """The update where there is no frame."""
         reason = str(fault) if fault is not None else trouble or f"no frame for {silent_s:.1f} s"
-        self._follower.forget()
-        return Update(self._next(), time.time_ns(), reason=reason, frames=self._setting.frames)
+        return Update(self._next(), self._now_ns(), reason=reason, frames=self._setting.frames)
+
+    def _now_ns(self) -> int:
+        """Now, by the source's clock as far as it is known."""
+        if self._stamp is None:
+            return time.time_ns()
+        stamp_ns, then_ns = self._stamp
+        return stamp_ns + time.monotonic_ns() - then_ns
 
     def _publish(self, update: Update, outlets: list[Outlet]) -> None:
         for outlet in outlets:
@@ -197,7 +247,7 @@ class Loop:
         self.counts[update.quality] += 1
         if update.reason:
             self._count_reason(update.reason)
-        if update.latency_ms is not None:
+        if update.latency_ms is not None and update.estimate is not None:
             self.latency.add(update.latency_ms)
         for name, stage_s in update.seconds.items():
             self.stages.setdefault(name, Histogram()).add(1000 * stage_s)
@@ -239,6 +289,10 @@ def timed(seconds: dict[str, float], name: str) -> Iterator[None]:
         seconds[name] = time.perf_counter() - start
 
 
+def _age_s(born_ns: int) -> float:
+    return (time.time_ns() - born_ns) * 1e-9
+
+
 def summary(loop: Loop, reader: Reader, outlets: list[Outlet]) -> dict:
     """What the run was like (JSON types): counts, latencies and stage times in ms."""
     return {
@@ -254,5 +308,5 @@ def summary(loop: Loop, reader: Reader, outlets: list[Outlet]) -> dict:
         "stages_ms": {name: times.summary() for name, times in loop.stages.items()},
         "center_error_mm": {name: errors.summary() for name, errors in loop.errors.items()},
         "sinks": {outlet.name: outlet.summary() for outlet in outlets},
-        "defects": loop.defects,
+        "defects": [*loop.defects, *reader.defects],
     }

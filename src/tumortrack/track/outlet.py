@@ -11,6 +11,7 @@ from tumortrack.track.live import Sink, Update
 from tumortrack.track.meter import Histogram
 
 _CLOSE_S = 10.0  # to write what waits, and flush
+_SILENT_S = 2.0  # without a word from the loop: what a sink shows holds no longer
 
 
 class Outlet:
@@ -23,6 +24,7 @@ class Outlet:
         self._waiting: deque[tuple[Update, float]] = deque(maxlen=waiting)
         self._lock = threading.Condition()
         self._stop = False
+        self.unclosed = False  # it failed at its end
         self.delivered = self.dropped = self.errors = 0
         self.failing, self.error = False, ""  # now; the last one there was
         self.latency = Histogram()  # from the stamp (or arrival) to the end of publish
@@ -45,6 +47,7 @@ class Outlet:
         self._thread.join(_CLOSE_S)
         if self._thread.is_alive():
             self._failed(f"it did not finish within {_CLOSE_S:g} s")
+            self.unclosed = True
 
     def summary(self) -> dict:
         """What became of the updates (JSON types)."""
@@ -57,17 +60,24 @@ class Outlet:
         }
 
     def _run(self) -> None:
+        said: Update | None = None  # the last update, until its end has been said too
         while True:
             with self._lock:
-                self._lock.wait_for(lambda: self._waiting or self._stop)
-                if not self._waiting:
+                self._lock.wait_for(lambda: self._waiting or self._stop, _SILENT_S)
+                came = self._waiting.popleft() if self._waiting else None
+                if came is None and self._stop:
                     break
-                update, handed_s = self._waiting.popleft()
-            self._guarded(update, handed_s)
+            if came is not None:
+                said = came[0]
+                self._guarded(*came)
+            elif said is not None and self._waiting.maxlen == 1:  # a recording keeps what was said
+                self._guarded(_hung(said), 0.0)
+                said = None
         try:
             self._sink.close()
         except Exception as error:
             self._failed(_said(error))
+            self.unclosed = True
 
     def _guarded(self, update: Update, handed_s: float) -> None:
         try:
@@ -83,6 +93,16 @@ class Outlet:
     def _failed(self, text: str) -> None:
         self.errors += 1
         self.failing, self.error = True, text
+
+
+def _hung(last: Update) -> Update:
+    """What follows an update after which the loop said nothing more."""
+    return Update(
+        last.sequence,
+        last.stamp_ns + int(_SILENT_S * 1e9),
+        reason=f"the loop has said nothing for {_SILENT_S:g} s",
+        frames=last.frames,
+    )
 
 
 def _said(error: Exception) -> str:

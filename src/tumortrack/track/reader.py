@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+import traceback
 from collections.abc import Callable
 
 from tumortrack.core.errors import InputError, TumortrackError
@@ -12,6 +13,7 @@ from tumortrack.track.live import Seen, Source, SourceEnded, SourceLost
 _READ_S = 0.2  # one wait for a frame: how soon the thread sees that it is to stop
 _AGAIN_S = 1.0  # between two tries to open
 _FROZEN_S = 5.0  # without a frame: closed and opened again
+_DEFECTS = 5  # tracebacks that are kept
 _STOP_S = 2.0  # how long close waits for a source that hangs
 
 
@@ -23,15 +25,16 @@ class Reader:
     def __init__(self, open_source: Callable[[], Source]) -> None:
         self._open = open_source
         self._lock = threading.Condition()
-        self._newest: Seen | TumortrackError | None = None
+        self._newest: tuple[Seen | TumortrackError, str] | None = None
         self._stop = threading.Event()
         self._passed = 0  # replaced before they were taken
         self._lost_inside = 0  # dropped by sources that are closed
         self._source: Source | None = None
-        self.latency_from = "arrival"  # what ages and latencies count from; see ``born_ns``
+        self.latency_from = "arrival"  # what the age of what was taken counts from
         self.trouble = "the source is not open yet"
         self.ended = False
-        self.failure: BaseException | None = None
+        self.failure: Exception | None = None
+        self.defects: list[str] = []
         self.opened = 0
         self._thread = threading.Thread(target=self._run, name="source", daemon=True)
         self._thread.start()
@@ -43,7 +46,7 @@ class Reader:
         return self._passed + self._lost_inside + (source.dropped if source else 0)
 
     def born_ns(self, seen: Seen) -> int:
-        """When a frame just taken came to be, by ``time.time_ns``: its stamp, or where the source
+        """When the frame just taken came to be, by ``time.time_ns``: its stamp, or where the source
         has another clock, its arrival; of a source that waits for us, now."""
         if self.latency_from == "stamp":
             return seen.stamp_ns
@@ -56,11 +59,14 @@ class Reader:
         """
         with self._lock:
             self._lock.wait_for(lambda: self._newest is not None or self._over, timeout_s)
-            taken, self._newest = self._newest, None
+            newest, self._newest = self._newest, None
             self._lock.notify_all()
-        if taken is None and self.failure is not None:
+        if newest is not None:
+            taken, self.latency_from = newest
+            return taken
+        if self.failure is not None:
             raise self.failure
-        return taken
+        return None
 
     def close(self) -> None:
         """Stop reading and close the source; one that hangs is left behind after 2 s."""
@@ -76,17 +82,24 @@ class Reader:
         return self.ended or self.failure is not None
 
     def _run(self) -> None:
-        try:
-            while not self._stop.is_set():
-                try:
-                    self._read_all()
-                except SourceLost as error:
+        while not self._stop.is_set() and not self._over:
+            try:
+                self._read_all()
+            except SourceEnded:
+                self.ended = True
+            except SourceLost as error:
+                self.trouble = str(error)
+            except Exception as error:  # after it worked once, whatever it is may pass
+                if not self.opened:
+                    self.failure = error  # handed to the loop, which raises it
+                elif isinstance(error, TumortrackError):
                     self.trouble = str(error)
-                    self._stop.wait(_AGAIN_S)
-        except SourceEnded:
-            self.ended = True
-        except BaseException as error:  # handed to the loop, which raises it
-            self.failure = error
+                else:
+                    self.trouble = f"internal error, {type(error).__name__}: {error}"
+                    self.defects.append("".join(traceback.format_exception(error)))
+                    del self.defects[_DEFECTS:]
+            if not self._over:
+                self._stop.wait(_AGAIN_S)
         with self._lock:
             self._lock.notify_all()
 
@@ -106,8 +119,7 @@ class Reader:
                     came = time.monotonic()
                     # Asked for again: some know whose clock it is from the first frame on only.
                     clock = "stamp" if source.host_clock else "arrival"
-                    self.latency_from = "taking" if source.waits else clock
-                    self._put(got, source.waits)
+                    self._put(got, "taking" if source.waits else clock)
                 elif time.monotonic() - came > _FROZEN_S:
                     raise SourceLost(f"no frame for {_FROZEN_S:g} s; the source is opened again")
         finally:
@@ -115,11 +127,11 @@ class Reader:
             self._source = None
             source.close()
 
-    def _put(self, got: Seen | TumortrackError, waits: bool) -> None:
+    def _put(self, got: Seen | TumortrackError, counts_from: str) -> None:
         with self._lock:
-            if waits:
+            if counts_from == "taking":
                 self._lock.wait_for(lambda: self._newest is None or self._stop.is_set())
             elif self._newest is not None:
                 self._passed += 1
-            self._newest = got
+            self._newest = (got, counts_from)
             self._lock.notify_all()

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TypeVar
-from urllib.parse import parse_qsl
 
 import msgspec
 
@@ -29,7 +28,8 @@ def parse_spec(text: str, kinds: Sequence[type[C]], what: str) -> C:
         raise InputError(f"{what} {text!r}: there is no kind {kind!r}. Allowed: {_all(by_name)}.")
     config = by_name[kind]
     given: dict[str, str] = {}
-    for key, value in parse_qsl(options, keep_blank_values=True):
+    for option in filter(None, options.split("&")):
+        key, _, value = option.partition("=")  # as it is: paths may hold + and %
         if key in given:
             raise InputError(f"{what} {text!r}: {key!r} is given twice.")
         given[key] = value

@@ -60,17 +60,12 @@ class Tracker:
         self, cloud: SensorCloud, last: Estimate | None = None, how: Following = _ALONE
     ) -> Estimate:
         """The same, fast, for one frame of many: no volume, and a search that starts at the
-        ``last`` estimate, if there is one a moment old.
+        ``last`` estimate, if there is one a moment old. Models that know no motion smooth nothing.
 
         Raises:
             NoEstimate: as ``locate``.
-            InputError: the cloud is in metres; smoothing, where the model knows no motion.
+            InputError: the cloud is in metres.
         """
-        if how.smoothing_s > 0 and self.anatomy_ct is None:
-            raise InputError(
-                "smoothing needs a motion, which models of the presets quick and paper do not "
-                "know. Train with --preset clinic, or leave smoothing out."
-            )
         return self._locator.follow(cloud, last, how)
 
     def warm(self) -> None:

@@ -27,6 +27,7 @@ CARRIED = 20_000  # points of the undeformed organ that live estimates carry alo
 _KNOWN_AT = 256  # places where the uncertainty is worked out; others take the nearest's
 _FIELD_MM = 0.3  # error of the distance fields and surfaces themselves
 _MOVED_MM = 2.5  # from one live frame to the next: more is found again from the start
+_BEHIND_MM = 2.0  # that a mean may lie behind: beyond, it begins anew
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,8 +125,11 @@ class WarpLocator:
         if last is not None and isinstance(last.motion, WarpMotion) and how.smoothing_s > 0:
             past_s = (cloud.stamp_ns - last.cloud.stamp_ns) * 1e-9
             share = -math.expm1(-past_s / how.smoothing_s)
-            fit = replace(fit, motion=blend(last.motion, unsmoothed, share))
-            lag_s = past_s * (1 - share) / share  # of what moves steadily
+            smooth = blend(last.motion, unsmoothed, share)
+            behind = smooth.carry(self._known_ct) - unsmoothed.carry(self._known_ct)
+            if np.linalg.norm(behind, axis=1).max() < _BEHIND_MM:
+                fit = replace(fit, motion=smooth)
+                lag_s = past_s * (1 - share) / share  # of what moves steadily
         placed = self._placed(points, fit, seconds)
         with stage(seconds, "carry", self._device):
             inside = self._carry(placed, cloud.stamp_ns)

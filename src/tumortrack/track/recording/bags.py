@@ -22,6 +22,7 @@ from tumortrack.track.ros.messages import Messages, stamp_of
 SUFFIXES = (".mcap", ".db3", ".bag")
 ESTIMATES = "/tumortrack/"  # topics of our own estimates, which are no input
 MASK_TOPIC = "/camera/mask"
+_REALSENSE = "/device_0/"  # how the RealSense SDK names all its topics
 _DEPTHS = ("16UC1", "mono16", "32FC1")
 
 
@@ -148,6 +149,11 @@ class BagReel:
         found = images or [topic for topic, kind in usable.items() if kind == CLOUD]
         if len(found) == 1:
             return found[0]
+        if any(topic.startswith(_REALSENSE) for topic in self._types):
+            raise InputError(
+                f"{self._path} was recorded by the RealSense SDK, whose depth unit stands apart: "
+                f"give the source realsense:{self._path}."
+            )
         if not usable:
             raise InputError(
                 f"{self._path} holds no depth images and no clouds (topics of {IMAGE} or {CLOUD}; "

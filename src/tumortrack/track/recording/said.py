@@ -49,6 +49,8 @@ def about(form: str, parts: tuple[str, ...], frames: Frames) -> dict:
         "parts": list(parts),
         "frame_id": frames.frame_id,
         "published_from_camera": frames.published_from_camera.tolist(),
+        # Plain files lie beside their depth images; messages are as they were published.
+        "estimate_frame": "camera" if form == "files" else frames.frame_id,
     }
 
 

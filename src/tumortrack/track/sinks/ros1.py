@@ -87,7 +87,7 @@ class Ros1Sink:
             return
         last, publishers = self._last, self._publishers
         try:
-            if last is not None and last.estimate is not None:
+            if last is not None:
                 self.publish(ended(last))
                 time.sleep(_FLUSH_S)
         finally:

@@ -81,7 +81,7 @@ class Ros2Sink:
         """Say that it is over, so that no estimate stays on a screen, and leave."""
         last, self._last = self._last, None
         try:
-            if last is not None and last.estimate is not None:
+            if last is not None:
                 self.publish(ended(last))
             self._last = None
             until_s = time.monotonic() + _FLUSH_S

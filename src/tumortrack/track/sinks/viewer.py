@@ -167,14 +167,14 @@ class ViewerSink:
     def _keep_watch(self) -> None:
         """Says how old the last frame is, hides what got too old, renews the slice."""
         while not self._closing.wait(_TICK_S):
-            with self._page():
-                if self._update is not None and time.monotonic() - self._came > _STALE_S:
-                    if self._shown is not None:
-                        self._hide()
-                    self._say("stale")
-                else:
-                    self._say(self._state or "waiting")
             try:
+                with self._page():
+                    if self._update is not None and time.monotonic() - self._came > _STALE_S:
+                        if self._shown is not None:
+                            self._hide()
+                        self._say("stale")
+                    else:
+                        self._say(self._state or "waiting")
                 self._renew_slice()
             except Exception as error:
                 self._fault = error  # for the next publish to raise: the watch must go on

@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import threading
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
 from typing import Any, ClassVar, Literal
@@ -64,7 +65,8 @@ class RealSense(SourceConfig, frozen=True, kw_only=True, tag="realsense"):
         rs = _sdk()
         if self.recording is not None:
             return RealSenseSource(_recorded(rs, self.recording, self.realtime), self)
-        return RealSenseSource(_connected(rs, self.device), self)
+        with _while_connected():
+            return RealSenseSource(_connected(rs, self.device), self)
 
 
 class RealSenseSource:
@@ -86,14 +88,11 @@ class RealSenseSource:
         self._sensor, profile = _depth_stream(rs, device, None if self._playback else config)
         self._intrinsics = _intrinsics(profile)
         self._unit_mm = float(f"{self._sensor.get_option(rs.option.depth_units) * 1000:.6g}")
-        try:
-            if self._playback is None:
-                _set_up(rs, self._sensor, config)
-            self.host_clock = self._playback is None and _tied_to_host(rs, self._sensor)
-            self._sensor.open(profile)
-            self._sensor.start(self._take)
-        except RuntimeError as error:
-            raise SourceLost(f"the RealSense does not start: {error}. Replug it.") from error
+        if self._playback is None:
+            _set_up(rs, self._sensor, config)
+        self.host_clock = self._playback is None and _tied_to_host(rs, self._sensor)
+        self._sensor.open(profile)
+        self._sensor.start(self._take)
 
     def read(self, timeout_s: float) -> Seen | None:
         """The newest frame not yet given; None if none came in time.
@@ -103,6 +102,10 @@ class RealSenseSource:
             SourceEnded: the recording is over.
             InputError: the camera's clock cannot be tied to this machine's.
         """
+        with _while_connected():
+            return self._read(timeout_s)
+
+    def _read(self, timeout_s: float) -> Seen | None:
         came = self._next(timeout_s)
         if came is None and self._is_over():
             came = self._next(_LAST_S)
@@ -169,6 +172,15 @@ class RealSenseSource:
                 "the RealSense's clock is not tied to this machine's: its frames have no global "
                 "time. Give global_time=false."
             )
+
+
+@contextlib.contextmanager
+def _while_connected() -> Iterator[None]:
+    """Anything that the SDK is asked fails while a camera comes or goes."""
+    try:
+        yield
+    except RuntimeError as error:
+        raise SourceLost(f"the RealSense does not answer: {error}. Replug it.") from error
 
 
 def _sdk() -> ModuleType:

@@ -15,7 +15,8 @@ from tumortrack.track.ros.messages import Messages, stamp_of
 
 _KINDS = {"image": incoming.IMAGE, "cloud": incoming.CLOUD}
 _LOOK_S = 0.1  # how often the graph is asked for the topic's type, until it is known
-_SAME_CLOCK_NS = 60 * 1_000_000_000
+# A late frame, or a camera's computer with a wrong time, is no other clock; a bag is older.
+_SAME_CLOCK_NS = 24 * 3600 * 1_000_000_000
 
 
 class Ros2(SourceConfig, frozen=True, kw_only=True, tag="ros2"):
@@ -30,7 +31,7 @@ class Ros2(SourceConfig, frozen=True, kw_only=True, tag="ros2"):
         unit_mm: of one step of a 16-bit depth image.
         clock: whose time the stamps are. host: this machine's, or one kept equal to it; other:
             another (simulated, replayed, of the camera); auto: host if the first frame's stamp is
-            less than a minute off. A minute, so that a stream that lags is taken for what it is,
+            less than a day off. A day, so that a stream that lags is taken for what it is,
             and not for one with a clock of its own.
         via: dds: without ROS; rclpy: through the ROS that is sourced; auto: rclpy where there is.
     """

@@ -99,6 +99,7 @@ class Scene:
     def hide(self) -> None:
         """Nothing of any estimate stays visible."""
         self._placed = None
+        self._has_slice = False
         self._estimate.visible = False
         self.margins = {}
 
@@ -129,8 +130,8 @@ class Scene:
 
     def put_slice(self, picture: UInt8[np.ndarray, "h w 3"], plane: Plane, frames: Frames) -> None:
         """The slice as a plane of the scene, at its true place."""
-        self._has_slice = True
         if not self.options.slice_plane:
+            self._has_slice = False  # what was there is old by the time it is asked for
             return
         # viser lays a picture's columns along x and its rows along y.
         axes = np.stack([plane.across, plane.down, np.cross(plane.across, plane.down)], axis=1)
@@ -140,6 +141,7 @@ class Scene:
         self._slice.render_width = self._slice.render_height = plane.side_mm
         solid = (picture > 8).any(2, keepdims=True)
         self._slice.image = np.concatenate([picture, solid.astype(np.uint8) * 255], axis=2)
+        self._has_slice = True
         self.apply()
 
     def mark(self, point_mm: Float[np.ndarray, " 3"] | None, frames: Frames) -> None:
