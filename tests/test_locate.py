@@ -27,6 +27,7 @@ from tumortrack.core.mesh_files import read_mesh
 from tumortrack.core.types import Anatomy, SensorCloud
 from tumortrack.imaging.case import load_case
 from tumortrack.learn.model import load_model
+from tumortrack.track.follower import Follower, FollowerConfig
 from tumortrack.track.tracker import Tracker
 
 STEPS = 700
@@ -78,6 +79,27 @@ def evaluated(work: Path, scenes: Path) -> Path:
     said = succeeded(tumortrack("evaluate", work / "model", scenes, report, "--grid", 64))
     assert "3 scenes" in said
     return report
+
+
+def test_a_moving_organ_is_followed_by_labels(tracker, seen):
+    """The last organ's box stands for the coarse queries; the answer is that of a first frame."""
+    points, _ = seen
+    points = points.astype(np.float32)
+    follower = Follower(tracker, FollowerConfig(rescan_s=10))
+    for n in range(4):
+        cloud = SensorCloud(points + np.float32([0.8 * n, 0, 0]), 10**9 * (n + 1) // 10 + 1)
+        estimate = follower.locate(cloud)
+        assert ("coarse" in estimate.report["timings"]) == (n == 0)
+    assert estimate.volume is None
+    alone = tracker.locate(cloud, grid=48)
+    for name, mesh in alone.meshes.items():
+        off = mesh.box_mm.mean(0) - estimate.meshes[name].box_mm.mean(0)
+        assert np.linalg.norm(off) < 2.5
+    gone = SensorCloud(points + np.float32([300, 0, 0]), cloud.stamp_ns + 10**8)
+    with pytest.raises(NoEstimate):
+        follower.locate(gone)
+    assert follower.last_box_mm(gone.stamp_ns) is None
+    assert "coarse" in follower.locate(cloud).report["timings"]
 
 
 def test_tumors_are_found_within_millimetres_in_the_camera_frame(work, seen, out):

@@ -14,7 +14,9 @@ _UNSURE_MM = 3.0  # standard deviation of a tumor's middle
 # Shares of the organ's picture. Right estimates have up to 0.03 (moving and pushed, on tables, in
 # beds and cavities, among instruments and hands), an organ upside down 0.12 to 0.16, one laid on
 # the points of a hand 0.2 to 0.4, a model laid on another patient's kidney mostly 0.1 to 0.24.
-_DOUBTFUL, _IMPOSSIBLE = 0.05, 0.09
+_LIMITS = 0.05, 0.09  # doubtful, impossible
+# Without a motion surfaces are rougher: where centres are 2 to 8 mm off, 0.09 to 0.15 are usual.
+_ROUGH_LIMITS = 0.1, 0.2
 _WIDTH = 212  # pixels: so coarse a picture tells
 _THROUGH_MM = 6.0  # behind the estimated surface: what is seen there lies behind, not beside
 _UNSURE = 0.6  # mean probability of a tumor's points
@@ -33,12 +35,13 @@ def judge(estimate: Estimate, content: DepthFrame | SensorCloud) -> tuple[Qualit
     if isinstance(content, DepthFrame):
         share = seen_through(estimate, content)
         estimate.report["seen_through"] = share
-        if share > _IMPOSSIBLE:
+        doubtful, impossible = _LIMITS if estimate.motion is not None else _ROUGH_LIMITS
+        if share > impossible:
             raise NoEstimate(
                 f"the camera sees through {100 * share:.0f} % of where the organ would lie: what "
                 "was taken for it is something else, or lies as no organ in training did."
             )
-        if share > _DOUBTFUL:
+        if share > doubtful:
             return "poor", f"the camera sees through {100 * share:.0f} % of where the organ lies"
     cost = estimate.report.get("fit_cost")
     if cost is not None and cost["now"] > cost["usual"]:
