@@ -21,6 +21,22 @@ install_import_hook(
 )
 
 
+# The longest files first: with two workers none is left alone with one at the end.
+SLOWEST = (
+    "test_training.py",
+    "test_track.py",
+    "test_locate.py",
+    "test_real_patients.py",
+    "test_demo.py",
+    "test_examples.py",
+)
+
+
+def pytest_collection_modifyitems(items):
+    order = {name: n for n, name in enumerate(SLOWEST)}
+    items.sort(key=lambda item: order.get(item.path.name, len(order)))
+
+
 @pytest.fixture(scope="session")
 def shared_data():
     """Real patients' anatomy beside the checkout; tests that need it skip where it is absent."""

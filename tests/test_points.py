@@ -362,10 +362,15 @@ def test_a_model_without_correspondences_refuses_before_any_work(model, tmp_path
     assert not (tmp_path / "out").exists()
 
 
+def _block(box_mm):
+    block = trimesh.creation.box(bounds=box_mm)
+    return block.vertices, block.faces
+
+
 class Knowing:
     """Stands in for the tracker of a model that knows correspondences."""
 
-    organ_box_ct = BOX
+    anatomy_ct = Anatomy((Mesh(*_block(BOX)),))
     asked = 0
 
     def __init__(self, model):

@@ -22,7 +22,7 @@ def world(tmp_path_factory):
     """A case and a model of it, trained for seconds."""
     folder = tmp_path_factory.mktemp("track")
     write_phantom_case(folder / "case")
-    succeeded(tumortrack("train", folder / "case", folder / "model", "--steps", 120))
+    succeeded(tumortrack("train", folder / "case", folder / "model", "--steps", 80))
     return folder
 
 

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
+import signal
 import socket
+import subprocess
 import threading
 import time
 from dataclasses import dataclass, replace
@@ -18,12 +20,13 @@ from scipy.spatial.transform import Rotation
 
 from browser import Browser, until
 from live_objects import PARTS, ball, empty_update, small_anatomy, small_setting, small_update
+from stories import COMMAND, environment
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import rigid, transform_points
 from tumortrack.core.store import new_folder
-from tumortrack.core.types import Anatomy, LabelVolume, Mesh, SensorCloud, Volume
+from tumortrack.core.types import Anatomy, LabelVolume, Mesh, Volume
 from tumortrack.imaging.case import Case, save_case
-from tumortrack.track.live import Frames, Seen, Setting, Update
+from tumortrack.track.live import Frames, Setting, Update
 from tumortrack.track.sinks.viewer import Viewer, ViewerSink
 from tumortrack.track.view.colours import TUMORS, part_colour
 from tumortrack.track.view.points import point_under
@@ -408,48 +411,48 @@ PICTURES, DEMO = (os.environ.get(f"TUMORTRACK_{name}") for name in ("PICTURES", 
 
 
 @pytest.mark.skipif(not (PICTURES and DEMO), reason="TUMORTRACK_PICTURES, TUMORTRACK_DEMO not set")
-def test_pictures_for_the_documentation(sinks):
-    """TUMORTRACK_PICTURES: where pictures go; TUMORTRACK_DEMO: what ``tumortrack demo`` left."""
-    from tumortrack.learn.model import load_model
-    from tumortrack.simulate.scene_folder import list_scenes, read_scene
-    from tumortrack.track.tracker import Tracker
-
+def test_pictures_for_the_documentation(tmp_path):
+    """TUMORTRACK_PICTURES: where pictures go; TUMORTRACK_DEMO: what ``tumortrack demo`` left. The
+    command itself, on a case in motion; then its process is stopped, as a hung machine would be."""
     assert PICTURES
     assert DEMO
-    model = load_model(Path(DEMO) / "model")
-    assert model.shape is not None
-    scene = read_scene(list_scenes(Path(DEMO) / "dataset")[-10])
-    tracker = Tracker(model)
-    tracker.locate(scene.cloud)
-    started = time.perf_counter()
-    estimate = tracker.locate(scene.cloud, grid=40)
-    latency_ms = 1000 * (time.perf_counter() - started)
-    setting = Setting(parts=model.parts, frames=Frames(), anatomy_ct=model.shape.anatomy_ct)
-    sink = sinks(setting, case=str(Path(DEMO) / "case"))
-    update = replace(
-        small_update(),
-        estimate=estimate,
-        seen=Seen(scene.depth or scene.cloud, 0),
-        organ=SensorCloud(scene.cloud.points_mm[::2]),
-        seconds=estimate.report["timings"],
-        latency_ms=latency_ms,
+    demo, port = Path(DEMO).resolve(), free_port()
+    command = [*COMMAND, "track", demo / "model", f"virtual:{demo / 'case'}"]
+    process = subprocess.Popen(
+        [*map(str, command), f"viewer:{port}?case={demo / 'case'}"],
+        env=environment(),
+        cwd=tmp_path,
     )
-    nothing = replace(update, estimate=None, quality="none", reason="only 57 points lie in range")
-    with Browser(1280, 800) as browser:
-        feed = Feed(sink, update)
-        try:
-            browser.open(f"http://127.0.0.1:{sink.port}")
-            until(lambda: "Software WebGL" in browser.text(), 30, "the page")
-            close = "document.querySelector('.mantine-Notification-closeButton').click()"
+    try:
+        with Browser(1280, 800) as browser:
+            until(lambda: answers(port), 60, "the viewer")
+            browser.open(f"http://127.0.0.1:{port}")
+            until(lambda: "GOOD" in browser.text(), 60, "an estimate")
+            close = "document.querySelector('.mantine-Notification-closeButton')?.click()"
             browser.call("Runtime.evaluate", expression=close)
-            time.sleep(5)
-            Image.fromarray(browser.picture()).save(Path(PICTURES) / "viewer.png", optimize=True)
-            feed.update = nothing
-            time.sleep(3)
-            name = "viewer_no_estimate.png"
-            Image.fromarray(browser.picture()).save(Path(PICTURES) / name, optimize=True)
-        finally:
-            feed.end()
+            time.sleep(8)
+            save(browser, "viewer.png")
+            process.send_signal(signal.SIGSTOP)
+            time.sleep(4)
+            save(browser, "viewer_no_estimate.png")
+    finally:
+        process.kill()
+        process.wait()
+
+
+def answers(port: int) -> bool:
+    with socket.socket() as one:
+        return one.connect_ex(("127.0.0.1", port)) == 0
+
+
+def free_port() -> int:
+    with socket.socket() as one:
+        one.bind(("127.0.0.1", 0))
+        return int(one.getsockname()[1])
+
+
+def save(browser: Browser, name: str) -> None:
+    Image.fromarray(browser.picture()).save(Path(str(PICTURES)) / name, optimize=True)
 
 
 def test_tumors_differ_in_colour():

@@ -126,20 +126,22 @@ def surface_distances(
 
 
 def _to_surface(points_mm: Float[np.ndarray, "n 3"], target: Mesh) -> Float[np.ndarray, " n"]:
-    """Distance of every point to a surface: exact to the triangles of the nearest few samples.
+    """Distance of every point to a surface: exact to the triangles of the nearest few samples, and
+    to one at the nearest corner, whose triangles may be too thin for samples near it.
 
     Against all triangles this errs by less than 0.01 mm (tested), always upwards.
     """
     from scipy.spatial import cKDTree
 
     seeds, area, seed_face = surface_samples(target, _SEED_SPACING_MM)
-    seeds, seed_face = seeds[area > 0], seed_face[area > 0]
-    count = min(_NEIGHBOURS, len(seeds))
-    near = cKDTree(seeds).query(points_mm, k=count, workers=-1)[1].reshape(len(points_mm), count)
+    middle = area > 0
+    count = min(_NEIGHBOURS, int(middle.sum()))
+    near = cKDTree(seeds[middle]).query(points_mm, k=count, workers=-1)[1]
+    corner = cKDTree(seeds[~middle]).query(points_mm, workers=-1)[1]
     triangles = target.vertices_mm[target.faces]
-    faces = seed_face[near]
+    faces = np.column_stack([seed_face[middle][near], seed_face[~middle][corner]])
     best = np.full(len(points_mm), np.inf)
-    for column in range(count):
+    for column in range(count + 1):
         new = np.flatnonzero((faces[:, :column] != faces[:, column : column + 1]).all(1))
         distance = triangle_distance(points_mm[new], triangles[faces[new, column]])
         best[new] = np.minimum(best[new], distance)
