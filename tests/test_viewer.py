@@ -434,7 +434,7 @@ def test_pictures_for_the_documentation(tmp_path):
             save(browser, "viewer.png")
             process.send_signal(signal.SIGSTOP)
             time.sleep(4)
-            save(browser, "viewer_no_estimate.png")
+            save(browser, "viewer_stale.png")
     finally:
         process.kill()
         process.wait()

@@ -79,7 +79,8 @@ class Status:
             parts = _parts(report.get("parts", {}))
             lag_ms = report.get("smoothing", {}).get("lag_ms", 0.0)
             latency += f" + {lag_ms:.0f} smoothing" if lag_ms >= 0.5 else ""
-        times = " · ".join(f"{escape(k)} {1000 * v:.1f}" for k, v in update.seconds.items())
+        stages = {k: v for k, v in update.seconds.items() if "." not in k}  # "a.b" is a part of a
+        times = " · ".join(f"{escape(k)} {1000 * v:.1f}" for k, v in stages.items())
         return (
             "<div style='margin:4px 14px 10px;font-size:13px;font-variant-numeric:tabular-nums'>"
             f"{parts}<div style='display:flex;justify-content:space-between;margin-top:6px'>"
