@@ -29,6 +29,12 @@ class NoEstimate(TumortrackError):
     exit_code = 3
 
 
+class NoPlan(TumortrackError):
+    """What was located can't be cut out as asked, and why."""
+
+    exit_code = 3
+
+
 class StorageError(TumortrackError):
     """The disk refused a write; what was there before is still whole."""
 

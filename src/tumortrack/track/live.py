@@ -109,6 +109,49 @@ class Placed:
 
 
 @dataclass(frozen=True, eq=False)
+class Shape:
+    """A surface that moves as a whole: a link of an arm, a table, a planned piece.
+
+    ``name`` is its own within a workcell, with slashes between levels (``cutter/forearm``).
+    Sinks send the surface again only where ``mesh`` is another object than before, and else its
+    place alone.
+    """
+
+    name: str
+    mesh: Mesh  # in its own frame, mm
+    published_from_shape: Float64[np.ndarray, "4 4"]
+    colour: tuple[int, int, int]  # 0..255
+    opacity: float = 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class Line:
+    """A line through points of the published frame, mm: a cut, an instrument's way."""
+
+    name: str
+    points_mm: Float64[np.ndarray, "n 3"]
+    colour: tuple[int, int, int]
+    width_mm: float = 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class Workcell:
+    """What arms do at this moment, and what is shown with them; published frame, mm.
+
+    Attributes:
+        state: of the procedure: approach, grasp, hold, sweep 1, ...
+        halted: why the arms stand still though they have not ended; empty: they don't.
+        joints_rad: angle by joint's name; empty without arms.
+    """
+
+    state: str
+    halted: str = ""
+    joints_rad: Mapping[str, float] = field(default_factory=dict)
+    shapes: tuple[Shape, ...] = ()
+    lines: tuple[Line, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
 class Update:
     """What the loop says about one frame: an estimate, or the reason why there is none.
 
@@ -123,6 +166,7 @@ class Update:
             frame.
         frames: where it is published.
         seconds: time of each stage.
+        workcell: what arms do with it; None without arms.
         latency_ms: from the stamp (of a source without this machine's clock: from the arrival; of
             one that waits for the loop: from the taking) to the moment at which the update was
             handed to the sinks; None where no frame came.
@@ -139,6 +183,7 @@ class Update:
     frames: Frames = field(default_factory=Frames)
     seconds: Mapping[str, float] = field(default_factory=dict)
     latency_ms: float | None = None
+    workcell: Workcell | None = None
 
     @cached_property
     def placed(self) -> Placed | None:

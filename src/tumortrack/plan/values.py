@@ -1,0 +1,125 @@
+"""The values of planning: what was located, where to cut, and what then comes away.
+
+All in the ``table`` frame, mm: z up against gravity, its origin on the table's top. The paper's
+'transverse plane' is the table's plane, its 'superior' is up and its 'posterior' is down.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float, Float64, UInt8
+
+from tumortrack.core.errors import InputError
+from tumortrack.core.types import FIRST_TUMOR, Mesh
+
+Method = Literal["published", "margin"]
+
+
+@dataclass(frozen=True, eq=False)
+class Located:
+    """Kidney and tumors as they were located, table frame, mm.
+
+    Attributes:
+        points_mm, labels: the labelled cloud: label 1 organ without tumors, 2, 3, ... tumors.
+        meshes: kidney (the whole organ, tumors included), tumor_1, ...: closed; those that there
+            are.
+        std_mm: per tumor, the standard deviation of each of its mesh's vertices along any axis;
+            without where the estimate does not know it.
+    """
+
+    points_mm: Float[np.ndarray, "n 3"]
+    labels: UInt8[np.ndarray, " n"]
+    meshes: dict[str, Mesh] = field(default_factory=dict)
+    std_mm: dict[str, Float64[np.ndarray, " v"]] = field(default_factory=dict)
+    stamp_ns: int = 0
+
+    def of(self, label: int) -> Float[np.ndarray, "m 3"]:
+        """The points with this label."""
+        return self.points_mm[self.labels == label]
+
+    @property
+    def tumors(self) -> tuple[int, ...]:
+        """Labels of the tumors that were found."""
+        return tuple(int(label) for label in np.unique(self.labels) if label >= FIRST_TUMOR)
+
+
+@dataclass(frozen=True, eq=False)
+class Layer:
+    """A slab of what is to come away: this outline between two heights.
+
+    ``rings_mm``: closed polygons (n, 2), x and y, the first point not repeated; several where the
+    slab is in pieces. ``top_mm`` is infinite in the uppermost.
+    """
+
+    bottom_mm: float
+    top_mm: float
+    rings_mm: tuple[Float64[np.ndarray, "n 2"], ...]
+
+    def __post_init__(self) -> None:
+        if not self.bottom_mm < self.top_mm:
+            raise InputError(f"a layer from {self.bottom_mm:g} up to {self.top_mm:g} mm is none.")
+
+
+@dataclass(frozen=True, eq=False)
+class Cut:
+    """One stroke of the instrument's tip, which is held horizontally.
+
+    Attributes:
+        sweep: which sweep it belongs to, from 1.
+        path_mm: the tip's way (n, 3), evenly spaced, all at one height, in the order in which it
+            goes; of a closed one the first point is repeated at the end.
+        kind: wall: along the outline of a layer; floor: the sheet below the piece.
+    """
+
+    sweep: int
+    path_mm: Float64[np.ndarray, "n 3"]
+    kind: Literal["wall", "floor"] = "wall"
+
+    @property
+    def height_mm(self) -> float:
+        return float(self.path_mm[0, 2])
+
+    @property
+    def closed(self) -> bool:
+        return bool(np.allclose(self.path_mm[0], self.path_mm[-1]))
+
+    @property
+    def length_mm(self) -> float:
+        return float(np.linalg.norm(np.diff(self.path_mm, axis=0), axis=1).sum())
+
+
+@dataclass(frozen=True, eq=False)
+class ResectionPlan:
+    """Where to hold, where to cut, and what comes away if the estimate is right.
+
+    Attributes:
+        tumor: its part's name (tumor_1, ...) and ``label``.
+        grasp_mm: where the grasper's cup touches; it comes from straight above.
+        cuts: strokes in the order in which they are made.
+        layers: what the cuts enclose, top first: the wall is each layer's outline, and where a
+            layer is wider than the one below it, or has none below, the tissue is cut level.
+        margin_mm: the least distance that was asked for between tumor and cut.
+        volumes_ml: tumor, piece (all that comes away), healthy (of that, no tumor), organ.
+        exophytic: share of the tumor outside the organ's hull.
+        notes: what the user should know.
+    """
+
+    method: Method
+    tumor: str
+    label: int
+    grasp_mm: Float64[np.ndarray, " 3"]
+    cuts: tuple[Cut, ...]
+    layers: tuple[Layer, ...]
+    margin_mm: float
+    volumes_ml: dict[str, float]
+    exophytic: float
+    stamp_ns: int = 0
+    notes: tuple[str, ...] = ()
+
+    @property
+    def sweeps(self) -> int:
+        """How many sweeps there are."""
+        return max(cut.sweep for cut in self.cuts)
