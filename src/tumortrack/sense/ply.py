@@ -7,6 +7,7 @@ Format: Turk 1994, "The PLY Polygon File Format".
 from __future__ import annotations
 
 import io
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -30,6 +31,15 @@ def parse_ply_points(content: bytes, name: str) -> np.ndarray:
     Raises:
         InputError: not a PLY, fewer bytes than the header claims, no x, y, z.
     """
+    return parse_ply_properties(content, name, "xyz")
+
+
+def parse_ply_properties(content: bytes, name: str, wanted: Sequence[str]) -> np.ndarray:
+    """The wanted properties of the vertices as floats (n, len(wanted)), in the file's unit.
+
+    Raises:
+        InputError: not a PLY, fewer bytes than the header claims, a property that is not there.
+    """
     end = content.find(b"end_header", 0, _LONGEST_HEADER)
     start = content.find(b"\n", end) + 1
     if not content.startswith(b"ply") or end < 0 or start == 0:
@@ -39,16 +49,19 @@ def parse_ply_points(content: bytes, name: str) -> np.ndarray:
     if form not in _ORDERS:
         raise InputError(f"{name}: PLY format {form!r}; allowed: {', '.join(_ORDERS)}.")
     count, columns = _vertex_layout(lines, name)
-    if not {"x", "y", "z"} <= columns.keys():
-        raise InputError(f"{name}: its vertices have {list(columns)}, but no x, y and z.")
+    if not set(wanted) <= columns.keys():
+        raise InputError(
+            f"{name}: its vertices have {list(columns)}, but no {', '.join(wanted[:-1])} and "
+            f"{wanted[-1]}."
+        )
     body = content[start:]
     if form == "ascii":
-        return _ascii_points(body, count, list(columns), name)
+        return _ascii(body, count, list(columns), wanted, name)
     dtype = np.dtype([(column, _ORDERS[form] + code) for column, code in columns.items()])
     if count * dtype.itemsize > len(body):
         raise InputError(_cut_off(name, count, len(body) // dtype.itemsize))
     table = np.frombuffer(body, dtype, count)
-    return np.stack([table[axis].astype(np.float64) for axis in "xyz"], axis=1)
+    return np.stack([table[column].astype(np.float64) for column in wanted], axis=1)
 
 
 def _vertex_layout(lines: list[list[str]], name: str) -> tuple[int, dict[str, str]]:
@@ -71,14 +84,16 @@ def _vertex_layout(lines: list[list[str]], name: str) -> tuple[int, dict[str, st
     return count, columns
 
 
-def _ascii_points(body: bytes, count: int, columns: list[str], name: str) -> np.ndarray:
+def _ascii(
+    body: bytes, count: int, columns: list[str], wanted: Sequence[str], name: str
+) -> np.ndarray:
     if 2 * count * len(columns) > len(body) + 1:  # a digit and a blank each
         raise InputError(_cut_off(name, count, len(body) // (2 * len(columns))))
     if count == 0:
-        return np.empty((0, 3))
-    axes = [columns.index(axis) for axis in "xyz"]
+        return np.empty((0, len(wanted)))
+    these = [columns.index(column) for column in wanted]
     try:
-        points = np.loadtxt(io.BytesIO(body), comments=None, usecols=axes, max_rows=count, ndmin=2)
+        points = np.loadtxt(io.BytesIO(body), comments=None, usecols=these, max_rows=count, ndmin=2)
     except ValueError as error:
         raise InputError(f"{name} has a vertex that is no row of numbers: {error}.") from error
     if len(points) < count:

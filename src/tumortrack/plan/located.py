@@ -1,0 +1,119 @@
+"""What the planner sees: an estimate, or the folder that `locate` wrote, in the table's frame."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, Float64
+from scipy.spatial import cKDTree
+
+from tumortrack.core.errors import ArtifactError, InputError
+from tumortrack.core.geometry import rigid, transform_points
+from tumortrack.core.mesh_files import read_mesh
+from tumortrack.core.motion import Motion
+from tumortrack.core.store import read_manifest
+from tumortrack.core.types import Mesh, OccupancyCloud
+from tumortrack.plan.values import Located
+from tumortrack.sense.ply import parse_ply_properties
+
+STAND_MM = 120.0  # the organ's lowest point over the table, where nobody says where the table is
+
+
+def table_below(points_mm: Float[np.ndarray, "n 3"], stand_mm: float) -> Float64[np.ndarray, "4 4"]:
+    """``table_from_camera`` of a camera that looks straight down on the organ.
+
+    x goes to the right in the picture, y to its top, z towards the camera; the origin lies on the
+    table below the organ's middle.
+
+    Args:
+        points_mm: of the organ, camera frame.
+        stand_mm: height of the organ's lowest point over the table.
+    """
+    low, high = points_mm.min(0), points_mm.max(0)
+    middle = (low + high) / 2
+    turn = np.diag([1.0, -1.0, -1.0])
+    return rigid(turn, np.array([-middle[0], middle[1], high[2] + stand_mm]))
+
+
+def located(
+    cloud: OccupancyCloud,
+    meshes: Mapping[str, Mesh],
+    motion: Motion | None,
+    table_from_camera: Float[np.ndarray, "4 4"],
+) -> Located:
+    """An estimate's parts (camera frame) in the table's frame, with how unsure it is of tumors."""
+    names = [name for name in meshes if name != "kidney"]
+    deviations = {}
+    for name in names:
+        std_mm = None if motion is None else _std_mm(motion, meshes[name])
+        if std_mm is not None:
+            deviations[name] = std_mm
+    return Located(
+        transform_points(table_from_camera, cloud.points_mm),
+        cloud.labels,
+        _moved(meshes, table_from_camera),
+        deviations,
+        cloud.stamp_ns,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """What `locate` wrote, camera frame, mm. ``std_mm``: of the cloud's points, if it is known."""
+
+    cloud: OccupancyCloud
+    meshes: dict[str, Mesh]
+    std_mm: Float64[np.ndarray, " n"] | None
+
+    def located(self, table_from_camera: Float[np.ndarray, "4 4"]) -> Located:
+        """In the table's frame; a surface is as unsure as the cloud's points next to it."""
+        found = located(self.cloud, self.meshes, None, table_from_camera)
+        if self.std_mm is None:
+            return found
+        nearest = cKDTree(found.points_mm)
+        deviations = {
+            name: self.std_mm[nearest.query(mesh.vertices_mm)[1]]
+            for name, mesh in found.meshes.items()
+            if name != "kidney"
+        }
+        return replace(found, std_mm=deviations)
+
+
+def read_run(folder: Path) -> Run:
+    """
+    Raises:
+        ArtifactError: no run of `locate`'s, damaged, or without its cloud.
+    """
+    manifest = read_manifest(folder, "run")
+    path = folder / "occupancy.ply"
+    try:
+        content = path.read_bytes()
+        table = parse_ply_properties(content, str(path), ("x", "y", "z", "label", "probability"))
+    except (OSError, InputError) as error:
+        raise ArtifactError(f"{folder} is no run that can be planned on: {error}") from error
+    cloud = OccupancyCloud(table[:, :3], table[:, 3], table[:, 4])
+    names = [f.removesuffix(".ply") for f in manifest["files"] if f.endswith(".ply")]
+    meshes = {name: read_mesh(folder / f"{name}.ply") for name in names if name != path.stem}
+    return Run(cloud, meshes, _deviations(content, str(path)))
+
+
+def _deviations(content: bytes, name: str) -> Float64[np.ndarray, " n"] | None:
+    try:
+        return parse_ply_properties(content, name, ("std_mm",))[:, 0]
+    except InputError:  # a method that does not know
+        return None
+
+
+def _std_mm(motion: Motion, mesh: Mesh) -> Float64[np.ndarray, " v"] | None:
+    places = motion.back(mesh.vertices_mm)
+    return None if places is None else motion.std_mm(places)
+
+
+def _moved(meshes: Mapping[str, Mesh], b_from_a: Float[np.ndarray, "4 4"]) -> dict[str, Mesh]:
+    return {
+        name: mesh.moved(transform_points(b_from_a, mesh.vertices_mm))
+        for name, mesh in meshes.items()
+    }

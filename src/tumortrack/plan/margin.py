@@ -1,0 +1,253 @@
+"""Our planner: the margin kept in all directions, as wide as the estimate is unsure.
+
+The tumor is grown by its margin as a solid; what lies straight above that comes away too, so that
+the piece can be lifted. Its side is cut in level layers from the top down, only where there is
+organ, and its floor by strokes side by side.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Float64
+
+from tumortrack.core.errors import NoPlan
+from tumortrack.plan.config import ResectionConfig
+from tumortrack.plan.exophytic import name_of
+from tumortrack.plan.outline import arcs, evenly, polygon_of, polygons, rings_of
+from tumortrack.plan.values import Cut, Layer, Located
+
+_CELL_MM = 0.8  # of outlines: they are exact to a tenth of that, for they are interpolated
+_THIN_MM = 1.0  # one surface point in each cube of this size
+_COLUMN_MM = 2.0  # of the organ's upper and lower surface
+_SMOOTH_MM = 0.05  # outlines lose corners smaller than this
+_FAR_MM = 1e3
+_MOST_LAYERS = 60
+
+
+def margin_cuts(
+    located: Located, label: int, config: ResectionConfig
+) -> tuple[tuple[Layer, ...], tuple[Cut, ...]]:
+    """The piece and its strokes, table frame, mm; layers and strokes from the top down.
+
+    Raises:
+        NoPlan: the margin with its uncertainty is wider than allowed; there is nothing to cut.
+    """
+    points, margins = grown_tumor(located, label, config)
+    columns = Columns.of(located)
+    layers = _layers(points, margins, columns, config.layer_mm)
+    cuts: list[Cut] = []
+    for number, layer in enumerate(layers):
+        below = layers[number + 1] if number + 1 < len(layers) else None
+        strokes = _strokes(layer, below, columns, config)
+        if strokes:
+            sweep = cuts[-1].sweep + 1 if cuts else 1
+            cuts += _in_turn(strokes, sweep, cuts[-1].path_mm[-1] if cuts else None)
+    if not cuts:
+        raise NoPlan("the organ does not reach the tumor's margin; there is nothing to cut.")
+    return layers, tuple(cuts)
+
+
+def grown_tumor(
+    located: Located, label: int, config: ResectionConfig
+) -> tuple[Float64[np.ndarray, "n 3"], Float64[np.ndarray, " n"]]:
+    """Points of the tumor's surface (of its inside too, where there is no mesh) and the margin
+    that each needs, mm.
+
+    Raises:
+        NoPlan: a margin is wider than ``most_margin_mm``; an uncertainty is asked for that the
+            estimate does not know.
+    """
+    name = name_of(label)
+    mesh = located.meshes.get(name)
+    points = np.asarray(located.of(label) if mesh is None else mesh.vertices_mm, float)
+    margins = np.full(len(points), config.margin_mm)
+    if config.sigmas > 0:
+        if mesh is None or name not in located.std_mm:
+            raise NoPlan(
+                "the estimate does not say how unsure it is, so its uncertainty can't be added to "
+                "the margin. Use a model of preset clinic, or sigmas 0."
+            )
+        margins = margins + config.sigmas * located.std_mm[name]
+    if (widest := float(margins.max())) > config.most_margin_mm:
+        raise NoPlan(
+            f"the estimate is so unsure that the margin would be {widest:.1f} mm wide; allowed are "
+            f"{config.most_margin_mm:g} mm. Look from nearer, or uncover more of the organ."
+        )
+    cube = np.floor(points / _THIN_MM).astype(np.int64)
+    cube -= cube.min(0)
+    size = cube.max(0) + 1
+    keep = np.unique((cube[:, 0] * size[1] + cube[:, 1]) * size[2] + cube[:, 2], return_index=True)
+    return points[keep[1]], margins[keep[1]]
+
+
+@dataclass(frozen=True, eq=False)
+class Columns:
+    """The organ's lowest and highest point over a grid of the table's plane, mm; NaN where it is
+    not. ``first_mm``: the middle of the first cell."""
+
+    first_mm: Float64[np.ndarray, " 2"]
+    lowest_mm: Float64[np.ndarray, "i j"]
+    highest_mm: Float64[np.ndarray, "i j"]
+
+    @classmethod
+    def of(cls, located: Located) -> Columns:
+        """From the organ's surface, or from all points, where there is no surface."""
+        mesh = located.meshes.get("kidney")
+        points = np.asarray(located.points_mm if mesh is None else mesh.vertices_mm, float)
+        low = points[:, :2].min(0) - 2 * _COLUMN_MM
+        cell = np.round((points[:, :2] - low) / _COLUMN_MM).astype(int)
+        shape = cell.max(0) + 3
+        flat = cell[:, 0] * shape[1] + cell[:, 1]
+        lowest, highest = np.full(shape, np.inf), np.full(shape, -np.inf)
+        np.minimum.at(lowest.reshape(-1), flat, points[:, 2])
+        np.maximum.at(highest.reshape(-1), flat, points[:, 2])
+        return cls(low, _spread(lowest), -_spread(-highest))
+
+    def at(
+        self, points_mm: Float[np.ndarray, "n 2"]
+    ) -> tuple[Float64[np.ndarray, " n"], Float64[np.ndarray, " n"]]:
+        """Lowest and highest point of the organ below and above each place."""
+        cell = np.round((points_mm - self.first_mm) / _COLUMN_MM).astype(int)
+        shape = np.array(self.lowest_mm.shape)
+        inside = ((cell >= 0) & (cell < shape)).all(1)
+        i, j = np.clip(cell, 0, shape - 1).T
+        low, high = self.lowest_mm[i, j].copy(), self.highest_mm[i, j].copy()
+        low[~inside], high[~inside] = np.nan, np.nan
+        return low, high
+
+    def within(
+        self, points_mm: Float[np.ndarray, "n 2"], bottom_mm: float, top_mm: float
+    ) -> np.ndarray:
+        """Where there is organ between two heights."""
+        low, high = self.at(points_mm)
+        return (high > bottom_mm) & (low < top_mm)  # False at NaN
+
+    @property
+    def volume_mm3(self) -> float:
+        """Of a body without overhangs."""
+        return float(np.nansum(self.highest_mm - self.lowest_mm)) * _COLUMN_MM**2
+
+
+def _spread(values: Float[np.ndarray, "i j"]) -> Float64[np.ndarray, "i j"]:
+    """Cells that nothing fell into take the least of their neighbours, if those surround them."""
+    from scipy.ndimage import binary_closing, minimum_filter
+
+    known = np.isfinite(values)
+    closed = binary_closing(known, iterations=2) | known
+    near = minimum_filter(np.where(known, values, np.inf), 5)
+    filled = np.where(known, values, near)
+    return np.where(closed & np.isfinite(filled), filled, np.nan)
+
+
+def _layers(
+    points: Float[np.ndarray, "n 3"],
+    margins: Float[np.ndarray, " n"],
+    columns: Columns,
+    layer_mm: float,
+) -> tuple[Layer, ...]:
+    """Slabs from the top down; each has the outline at its upper end, where it is widest."""
+    floor = float((points[:, 2] - margins).min())
+    outermost = _outlines(points, margins, np.array([np.inf]))[0]
+    if not outermost:
+        raise NoPlan("the tumor's outline has no area; locate it again with more points.")
+    high = columns.at(np.concatenate(outermost))[1]
+    if np.isnan(high).all():
+        raise NoPlan("the organ does not reach the tumor's margin; there is nothing to cut.")
+    n = int(np.clip(np.ceil((np.nanmax(high) - floor) / layer_mm), 1, _MOST_LAYERS))
+    bottoms = floor + (np.nanmax(high) - floor) / n * np.arange(n)
+    tops = np.append(bottoms[1:], np.inf)
+    outlines = [*_outlines(points, margins, tops[:-1]), outermost]
+    layers = [
+        Layer(float(bottom), float(top), rings)
+        for bottom, top, rings in zip(bottoms, tops, outlines, strict=True)
+        if rings
+    ]
+    return tuple(reversed(layers))
+
+
+def _outlines(
+    points: Float[np.ndarray, "n 3"],
+    margins: Float[np.ndarray, " n"],
+    levels_mm: Float[np.ndarray, " k"],
+) -> list[tuple[Float64[np.ndarray, "m 2"], ...]]:
+    """Rings of what comes away at each height."""
+    import shapely
+    from skimage.measure import find_contours
+
+    from tumortrack.plan.margin_kernels import outline_fields
+
+    room = float(margins.max()) + 4 * _CELL_MM
+    first = points[:, :2].min(0) - room
+    shape = np.ceil((points[:, :2].max(0) + room - first) / _CELL_MM).astype(int) + 1
+    fields = np.full((len(levels_mm), *shape), _FAR_MM)
+    outline_fields(points, margins, np.asarray(levels_mm, float), first, _CELL_MM, fields)
+    found = []
+    for field in fields:
+        # Far cells hold no distance: next to the outline all are nearer than this.
+        contours = find_contours(np.minimum(field, 2 * _CELL_MM), 0.0)
+        pieces = [shapely.Polygon(first + c * _CELL_MM) for c in contours if len(c) > 3]
+        area = shapely.union_all([shapely.Polygon(p.exterior) for p in pieces])
+        found.append(rings_of(area.simplify(_SMOOTH_MM)))
+    return found
+
+
+def _strokes(
+    layer: Layer, below: Layer | None, columns: Columns, config: ResectionConfig
+) -> list[Cut]:
+    """A layer's strokes at its lower end: along its outline, and over its floor where that is not
+    the next layer's."""
+    import shapely
+
+    area = polygon_of(layer.rings_mm)
+    open_floor = area if below is None else area.difference(polygon_of(below.rings_mm))
+    z, lead = layer.bottom_mm, int(np.ceil(config.lead_mm / config.spacing_mm))
+    strokes = []
+    for ring in layer.rings_mm:
+        flat = evenly(np.concatenate([ring, ring[:1]]), config.spacing_mm)[:-1]
+        there = columns.within(flat, z, layer.top_mm)
+        strokes += [_cut(line, z, "wall") for line in arcs(flat, there, lead)]
+    inset = area.buffer(-config.stroke_mm)
+    while not inset.is_empty:
+        for piece in polygons(inset):
+            ring = np.array(piece.exterior.coords)
+            flat = evenly(ring, config.spacing_mm)[:-1]
+            there = shapely.contains_xy(open_floor, *flat.T) & columns.within(flat, z, z)
+            strokes += [_cut(line, z, "floor") for line in arcs(flat, there, lead)]
+        inset = inset.buffer(-config.stroke_mm)
+    return strokes
+
+
+def _cut(flat: Float[np.ndarray, "n 2"], z: float, kind: str) -> Cut:
+    path = np.column_stack([flat, np.full(len(flat), z)])
+    return Cut(1, path, "wall" if kind == "wall" else "floor")
+
+
+def _in_turn(strokes: list[Cut], sweep: int, last: Float[np.ndarray, " 3"] | None) -> list[Cut]:
+    """Walls first, then the floor; each stroke from the end that is nearer to where the one before
+    ended."""
+    ordered = []
+    for kind in ("wall", "floor"):
+        left = [stroke for stroke in strokes if stroke.kind == kind]
+        while left:
+            gaps = [
+                (0.0 if last is None else float(np.linalg.norm(path[0] - last)), number, turned)
+                for number, stroke in enumerate(left)
+                for turned, path in enumerate((stroke.path_mm, stroke.path_mm[::-1]))
+            ]
+            _, number, turned = min(gaps)
+            stroke = left.pop(number)
+            path = stroke.path_mm[::-1] if turned else stroke.path_mm
+            ordered.append(Cut(sweep, path, stroke.kind))
+            last = path[-1]
+    return ordered
+
+
+def margin_grasp(located: Located, label: int) -> Float64[np.ndarray, " 3"]:
+    """The surface straight above the tumor's centre of mass: there the cup finds something."""
+    x, y, _ = located.of(label).mean(0)
+    high = Columns.of(located).at(np.array([[x, y]], float))[1][0]
+    if np.isnan(high):
+        high = located.of(label)[:, 2].max()
+    return np.array([x, y, high], float)

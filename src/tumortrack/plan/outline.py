@@ -1,0 +1,146 @@
+"""Outlines in the table's plane: hulls of projected points, grown, cut, and walked along."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from jaxtyping import Bool, Float, Float64
+
+from tumortrack.core.errors import NoPlan
+
+if TYPE_CHECKING:
+    from shapely import Polygon
+
+_MOST = 1200  # points of a hull: more don't change it, and take longer
+_EDGE = 6.0  # longest edge of a hull in typical distances between its points
+_GAP = 4.0  # farther than that from all others, in the same unit: another cluster
+_LEAST_MM2 = 1.0  # smaller pieces of an outline are none
+_SMOOTH = 16  # corners of a quarter circle: 5 mm of margin are exact to 0.01 mm
+
+
+def concave_hull(points_mm: Float[np.ndarray, "n 2"]) -> Polygon:
+    """The outline of a cloud's largest cluster.
+
+    Edges may be as long as 6 sqrt(A / n), A being the convex hull's area: the ratio that GEOS
+    takes means another length at every density.
+
+    Raises:
+        NoPlan: fewer than three points, or all on a line.
+    """
+    import shapely
+    from scipy.spatial import Delaunay, QhullError
+
+    points = _thinned(np.asarray(points_mm, float))
+    try:
+        points = _largest_cluster(points)
+        triangles = Delaunay(points).simplices
+    except (QhullError, ValueError, IndexError) as error:
+        raise NoPlan(
+            f"{len(points_mm)} points that lie on a line, or are too few, have no outline."
+        ) from error
+    cloud = shapely.MultiPoint(points)
+    corners = points[triangles]
+    lengths = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)
+    wanted = _EDGE * np.sqrt(cloud.convex_hull.area / len(points))
+    span = max(float(np.ptp(lengths)), 1e-9)
+    ratio = float(np.clip((wanted - lengths.min()) / span, 0.0, 1.0))
+    return _largest(shapely.concave_hull(cloud, ratio=ratio))
+
+
+def grown(outline: Polygon, margin_mm: float) -> Polygon:
+    """All within ``margin_mm`` of an outline."""
+    return _largest(outline.buffer(margin_mm, quad_segs=_SMOOTH))
+
+
+def common(a: Polygon, b: Polygon) -> Polygon:
+    """The largest piece that both have; NoPlan where there is none."""
+    return _largest(a.intersection(b))
+
+
+def evenly(ring_mm: Float[np.ndarray, "n 2"], spacing_mm: float) -> Float64[np.ndarray, "m 2"]:
+    """Points at equal distances along a line, ends included; at most ``spacing_mm`` apart."""
+    steps = np.linalg.norm(np.diff(ring_mm, axis=0), axis=1)
+    keep = np.concatenate([[True], steps > 1e-9])
+    line = np.asarray(ring_mm, float)[keep]
+    way = np.concatenate([[0.0], np.cumsum(steps[steps > 1e-9])])
+    n = max(2, int(np.ceil(way[-1] / spacing_mm)) + 1)
+    at = np.linspace(0.0, way[-1], n)
+    return np.stack([np.interp(at, way, line[:, axis]) for axis in range(2)], axis=1)
+
+
+def arcs(
+    ring_mm: Float[np.ndarray, "n 2"], wanted: Bool[np.ndarray, " n"], lead: int
+) -> list[Float64[np.ndarray, "m 2"]]:
+    """The runs of a closed ring's points that are wanted, each longer by ``lead`` points at both
+    ends; the whole ring, closed, where that leaves no gap.
+
+    Args:
+        ring_mm: evenly spaced, the first point not repeated.
+    """
+    n = len(ring_mm)
+    if not wanted.any():
+        return []
+    reach = np.arange(-lead, lead + 1)
+    grown_to = np.zeros(n, bool)
+    grown_to[(np.flatnonzero(wanted)[:, None] + reach).ravel() % n] = True
+    if grown_to.all():
+        return [np.concatenate([ring_mm, ring_mm[:1]])]
+    first = int(np.flatnonzero(~grown_to)[0])
+    turned = np.roll(grown_to, -first)  # begins with a gap, so that no run goes over the end
+    edges = np.flatnonzero(np.diff(np.concatenate([turned, [False]]).astype(int)))
+    runs = zip(edges[::2] + 1, edges[1::2] + 1, strict=True)
+    return [ring_mm[(np.arange(start, stop) + first) % n] for start, stop in runs]
+
+
+def rings_of(area: Any) -> tuple[Float64[np.ndarray, "n 2"], ...]:
+    """The outer rings of a polygon or several, first points not repeated, largest first."""
+    pieces = [p for p in polygons(area) if p.area >= _LEAST_MM2]
+    pieces.sort(key=lambda piece: -piece.area)
+    return tuple(np.array(piece.exterior.coords)[:-1, :2] for piece in pieces)
+
+
+def polygon_of(rings_mm: Iterable[Float[np.ndarray, "n 2"]]) -> Any:
+    """What ``rings_of`` took apart."""
+    import shapely
+
+    return shapely.union_all([shapely.Polygon(ring).buffer(0) for ring in rings_mm])
+
+
+def polygons(area: Any) -> list[Polygon]:
+    """The polygons in a geometry of whatever kind."""
+    if area.geom_type == "Polygon":
+        return [] if area.is_empty else [area]
+    return [piece for piece in getattr(area, "geoms", ()) if piece.geom_type == "Polygon"]
+
+
+def _largest(area: Any) -> Polygon:
+    import shapely
+
+    pieces = polygons(area)
+    if not pieces or max(piece.area for piece in pieces) < _LEAST_MM2:
+        raise NoPlan("the outline has no area; there is no contour to cut along.")
+    largest = max(pieces, key=lambda piece: piece.area)
+    return shapely.Polygon(largest.exterior)  # what lies in a hole comes away too
+
+
+def _thinned(points: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "m 2"]:
+    if len(points) <= _MOST:
+        return points
+    return points[np.linspace(0, len(points) - 1, _MOST).astype(int)]
+
+
+def _largest_cluster(points: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "m 2"]:
+    """Without points that lie far from the most."""
+    from scipy.sparse.csgraph import connected_components
+    from scipy.spatial import cKDTree
+
+    tree = cKDTree(points)
+    nearest = tree.query(points, k=2)[0][:, 1]
+    apart_mm = _GAP * float(np.median(nearest)) + 1e-9
+    # Points at random leave gaps of several times their typical distance.
+    apart_mm = max(apart_mm, 2.0 * float(np.percentile(nearest, 95)))
+    close = tree.sparse_distance_matrix(tree, apart_mm, output_type="coo_matrix")
+    which = connected_components(close, directed=False)[1]
+    return points[which == np.bincount(which).argmax()]

@@ -1,0 +1,109 @@
+"""From what was located to what is cut: which tumor, where to hold it, along which lines.
+
+The paper's planner (its section "Integration with Robotic Resection") and ours, by ``method``.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from tumortrack.core.errors import NoPlan
+from tumortrack.core.types import FIRST_TUMOR
+from tumortrack.plan.config import ResectionConfig
+from tumortrack.plan.exophytic import chosen_tumor, name_of
+from tumortrack.plan.margin import Columns, margin_cuts, margin_grasp
+from tumortrack.plan.outline import polygon_of
+from tumortrack.plan.published import published_cuts, published_grasp
+from tumortrack.plan.values import Layer, Located, ResectionPlan
+
+_WHOLE, _TOUCHED = 0.99, 0.02  # of another tumor's points
+
+
+def plan_resection(located: Located, config: ResectionConfig) -> ResectionPlan:
+    """The plan, table frame, mm.
+
+    Raises:
+        InputError: no such tumor.
+        NoPlan: nothing to cut, or not as asked; why.
+    """
+    label, share = chosen_tumor(located, config)
+    if config.method == "published":
+        layers, cuts = published_cuts(located, label, config)
+        grasp_mm = published_grasp(located, label)
+    else:
+        layers, cuts = margin_cuts(located, label, config)
+        grasp_mm = margin_grasp(located, label)
+    taken = inside(layers, located.points_mm)
+    volumes_ml = _volumes_ml(located, label, taken)
+    notes = _others(located, label, taken)
+    healthy_share = volumes_ml["healthy"] / volumes_ml["parenchyma"]
+    if healthy_share > config.most_healthy:
+        raise NoPlan(
+            f"{healthy_share:.0%} of the organ's healthy tissue would come away; allowed are "
+            f"{config.most_healthy:.0%}. Ask for a smaller margin, or allow more."
+        )
+    return ResectionPlan(
+        method=config.method,
+        tumor=name_of(label),
+        label=label,
+        grasp_mm=grasp_mm,
+        cuts=cuts,
+        layers=layers,
+        margin_mm=config.margin_mm,
+        volumes_ml=volumes_ml,
+        exophytic=share,
+        stamp_ns=located.stamp_ns,
+        notes=notes,
+    )
+
+
+def inside(
+    layers: tuple[Layer, ...], points_mm: Float[np.ndarray, "n 3"]
+) -> Bool[np.ndarray, " n"]:
+    """Which points lie in the piece that the layers make up."""
+    import shapely
+
+    found = np.zeros(len(points_mm), bool)
+    for layer in layers:
+        area = polygon_of(layer.rings_mm)
+        left, low, right, high = area.bounds
+        x, y, z = points_mm.T
+        near = np.flatnonzero(
+            (z >= layer.bottom_mm) & (z < layer.top_mm)
+            & (x > left) & (x < right) & (y > low) & (y < high)
+        )  # fmt: skip
+        shapely.prepare(area)
+        found[near] = shapely.contains_xy(area, x[near], y[near])
+    return found
+
+
+def _volumes_ml(located: Located, label: int, taken: Bool[np.ndarray, " n"]) -> dict[str, float]:
+    """By counting points, which lie evenly in the organ."""
+    kidney = located.meshes.get("kidney")
+    organ_ml = (Columns.of(located).volume_mm3 if kidney is None else kidney.volume_mm3) / 1000
+    each_ml = organ_ml / len(located.points_mm)
+    tumor, healthy = located.labels == label, located.labels < FIRST_TUMOR
+    return {
+        "organ": organ_ml,
+        "parenchyma": each_ml * float(healthy.sum()),
+        "tumor": each_ml * float(tumor.sum()),
+        "piece": each_ml * float((taken | tumor).sum()),
+        "healthy": each_ml * float((taken & healthy).sum()),
+    }
+
+
+def _others(located: Located, label: int, taken: Bool[np.ndarray, " n"]) -> tuple[str, ...]:
+    """What becomes of other tumors; a cut through one is no plan."""
+    notes = []
+    for other in located.tumors:
+        share = float(taken[located.labels == other].mean())
+        if other == label or share < _TOUCHED:
+            continue
+        if share < _WHOLE:
+            raise NoPlan(
+                f"the cut would go through {name_of(other)} ({share:.0%} of it would come away). "
+                "Ask for another margin, or plan that tumor."
+            )
+        notes.append(f"{name_of(other)} comes away with {name_of(label)}.")
+    return tuple(notes)
