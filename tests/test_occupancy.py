@@ -94,6 +94,17 @@ def test_distance_to_a_sphere_is_about_right():
     assert found[true < 0.2].max() < 0.5
 
 
+def test_distances_are_those_to_the_nearest_sample_of_a_surface():
+    mesh = ellipsoid((20, 9, 14), (3, 4, 5), 2)
+    points = np.random.default_rng(1).uniform(-40, 40, (300, 3))
+    corners = mesh.vertices_mm[mesh.faces]
+    shares = np.array([(1, 1, 1), (4, 1, 1), (1, 4, 1), (1, 1, 4), (1, 1, 0), (0, 1, 1), (1, 0, 1)])
+    inner = np.einsum("fkx,wk->wfx", corners, shares / shares.sum(1, keepdims=True)).reshape(-1, 3)
+    samples = np.concatenate([mesh.vertices_mm, inner])
+    nearest = np.linalg.norm(points[:, None] - samples, axis=2).min(1)
+    np.testing.assert_allclose(surface_distance(mesh, points), nearest, rtol=1e-6)
+
+
 def test_even_points_measure_volume(pool):
     _, labels = pool.draw_evenly(np.random.default_rng(0), 10_000)
     volumes = [np.prod(axes) * 4 / 3 * np.pi for axes, _ in ELLIPSOIDS]
