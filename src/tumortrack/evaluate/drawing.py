@@ -89,6 +89,30 @@ def scale_bar(axes: Axes, frame: Frame, color: str = "black") -> None:
     )
 
 
+def axis_arrows(axes: Axes, frame: Frame, arrows: dict[str, tuple[float, float]]) -> None:
+    """Small arrows that name the frame's axes, by their letters and directions (right, down), in
+    the upper left corner; those that point up begin lower."""
+    span = 0.07 * min(frame.right - frame.left, frame.bottom - frame.top)
+    rises = any(down < 0 for _, down in arrows.values())
+    x, y = frame.left + 0.6 * span, frame.top + (2.1 if rises else 0.6) * span
+    for letter, (right, down) in arrows.items():
+        axes.annotate(
+            "",
+            (x + right * span, y + down * span),
+            (x, y),
+            arrowprops={"arrowstyle": "->", "color": "0.35", "shrinkA": 0, "shrinkB": 0},
+        )
+        axes.text(
+            x + 1.5 * right * span,
+            y + 1.5 * down * span,
+            letter,
+            color="0.35",
+            fontsize=8,
+            ha="center",
+            va="center",
+        )
+
+
 def blank(axes: Axes, frame: Frame, background: str = "white") -> None:
     """Axes in mm, down pointing down, equal scales, without ticks."""
     axes.set(xlim=(frame.left, frame.right), ylim=(frame.bottom, frame.top), aspect="equal")

@@ -17,6 +17,7 @@ from tumortrack.evaluate.drawing import (
     KIDNEY,
     OBSERVED,
     TRUE,
+    axis_arrows,
     blank,
     draw_lines,
     new_figure,
@@ -28,7 +29,6 @@ from tumortrack.evaluate.drawing import (
 )
 from tumortrack.evaluate.qc import qc_picture
 from tumortrack.evaluate.shade import (
-    Frame,
     Layer,
     View,
     frame_around,
@@ -47,7 +47,10 @@ __all__ = ["qc_picture", "scene_picture"]
 
 FROM_CAMERA = View("seen from the camera", (1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
 FROM_SIDE = View("seen from the side, camera above", (1.0, 0.0, 0.0), (0.0, 0.0, 1.0))
-_CAMERA_AXES = {FROM_CAMERA: ("x", "y", "z"), FROM_SIDE: ("x", "z", "y")}
+_CAMERA_AXES = {
+    FROM_CAMERA: {"x": (1.0, 0.0), "y": (0.0, 1.0)},
+    FROM_SIDE: {"x": (1.0, 0.0), "z": (0.0, 1.0)},
+}
 
 
 def scene_picture(scene: Scene, estimate: Estimate | None, entry: dict, path: Path) -> None:
@@ -110,7 +113,7 @@ def _solid_view(axes: Axes, scene: Scene, estimate: Estimate | None, view: View)
             axes.text(u, v, name.split("_")[-1], ha="center", va="center", fontweight="bold")
     blank(axes, frame)
     scale_bar(axes, frame)
-    _axes_cross(axes, frame, view)
+    axis_arrows(axes, frame, _CAMERA_AXES[view])
     axes.set_title(view.name, fontsize=11)
 
 
@@ -132,24 +135,7 @@ def _slice_view(axes: Axes, scene: Scene, estimate: Estimate | None, name: str, 
     axes.scatter(flat[near, 0], flat[near, 1], s=7, color=OBSERVED, linewidths=0, zorder=5)
     blank(axes, frame)
     scale_bar(axes, frame)
-    _axes_cross(axes, frame, view)
-
-
-def _axes_cross(axes: Axes, frame: Frame, view: View) -> None:
-    """Small arrows that name the camera's axes, in the upper left corner."""
-    right, down, _ = _CAMERA_AXES[view]
-    span = 0.07 * min(frame.right - frame.left, frame.bottom - frame.top)
-    x, y = frame.left + 0.6 * span, frame.top + 0.6 * span
-    for dx, dy, letter in ((span, 0, right), (0, span, down)):
-        axes.annotate(
-            "",
-            (x + dx, y + dy),
-            (x, y),
-            arrowprops={"arrowstyle": "->", "color": "0.35", "shrinkA": 0, "shrinkB": 0},
-        )
-        axes.text(
-            x + 1.5 * dx, y + 1.5 * dy, letter, color="0.35", fontsize=8, ha="center", va="center"
-        )
+    axis_arrows(axes, frame, _CAMERA_AXES[view])
 
 
 def _slice_name(view: View) -> str:

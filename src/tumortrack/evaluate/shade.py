@@ -15,6 +15,7 @@ from tumortrack.core.types import Mesh
 from tumortrack.imaging.raster import cover
 
 _LIGHT = np.array([-0.35, -0.55, -1.0]) / np.linalg.norm([-0.35, -0.55, -1.0])
+_SAME_MM = 0.6  # a translucent surface that close over an opaque one is the same one
 _SHARPER = 2  # pixels drawn per pixel shown, each way: smooth edges
 
 
@@ -78,7 +79,7 @@ def shade(
 ) -> Float[np.ndarray, "h w 3"]:
     """Paint the layers in this order, each over the ones before it (organ last).
 
-    Opaque layers hide each other by depth; translucent ones tint whatever lies below.
+    Opaque layers hide each other by depth; translucent ones tint what lies behind them.
 
     Returns:
         RGB in 0..1 on white (h, w, 3), row 0 at the frame's top, for
@@ -89,9 +90,8 @@ def shade(
     nearest = np.full((height, width), np.inf)
     for layer in layers:
         depth, normal = _trace(layer.mesh, view, frame, (height, width), pixel_mm / _SHARPER)
-        seen = np.isfinite(depth)
+        seen = depth < nearest if layer.opacity >= 1 else depth < nearest - _SAME_MM
         if layer.opacity >= 1:
-            seen &= depth < nearest
             nearest[seen] = depth[seen]
         slant = 1 - np.abs(normal[seen, 2])
         strength = layer.opacity + (1 - layer.opacity) * 0.75 * slant**2

@@ -24,9 +24,12 @@ GOOD: Colour = (46, 160, 67)
 POOR: Colour = (210, 140, 0)
 NONE: Colour = (205, 20, 30)
 STALE: Colour = (110, 60, 160)
+ARMS: Colour = (45, 95, 165)
 BACKGROUND: Colour = (22, 24, 29)
 BACKGROUND_NONE: Colour = (74, 8, 12)
 BACKGROUND_STALE: Colour = (48, 24, 72)
+
+_SWEEPS: tuple[Colour, ...] = ((0, 120, 240), (90, 60, 220), (205, 0, 130))
 
 # Probabilities from a guess to certainty.
 _LEVELS = (0.5, 0.75, 0.9, 1.0)
@@ -52,3 +55,12 @@ def probability_colours(probability: Float[np.ndarray, " n"]) -> UInt8[np.ndarra
 
 def css(colour: Colour) -> str:
     return "#{:02x}{:02x}{:02x}".format(*colour)
+
+
+def sweep_colour(sweep: int, sweeps: int) -> Colour:
+    """Of the cuts of sweep 1, 2, ...: from blue for the first to magenta for the last; none of it
+    is a part's colour."""
+    along = (sweep - 1) / max(sweeps - 1, 1)
+    mixed = [np.interp(along, (0.0, 0.5, 1.0), shades) for shades in zip(*_SWEEPS, strict=True)]
+    red, green, blue = (round(float(value)) for value in mixed)
+    return red, green, blue

@@ -1,0 +1,284 @@
+"""A film of what the arms do: an animated GIF, drawn without a display.
+
+MP4 is not offered: no encoder among the Python packages comes under a permissive licence.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable, Iterable, Iterator
+from itertools import groupby, pairwise
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from tumortrack.core.errors import InputError
+from tumortrack.core.geometry import transform_points
+from tumortrack.core.store import write_atomically
+from tumortrack.core.types import Mesh
+from tumortrack.evaluate.organ_surfaces import organ_surfaces
+from tumortrack.evaluate.painter import Body, Eye, paint
+from tumortrack.plan.values import Located
+from tumortrack.track.live import Line, Workcell
+from tumortrack.track.view.colours import BACKGROUND, NONE, part_colour
+
+if TYPE_CHECKING:
+    from PIL import Image, ImageDraw, ImageFont
+
+_FROM = np.array([-0.36, -0.8, 0.48])  # where the eye is, seen from the middle: left, front, above
+_CLOSE_FROM = np.array([-0.36, -0.72, 0.6])
+_AWAY = 2.6  # the eye's distance in radii of what it sees: a natural perspective
+_CLOSE = 0.36, 0.38  # the close-up's share of width and height
+_CLOSE_MM = 40.0  # the close-up cuts away what is nearer to the eye than the organ by this
+_ORGAN_OPACITY = 0.42
+_LEAST_PIXELS = 2.0  # width of a line
+_COLOURS = 255  # and one for what did not change
+_SAMPLES = 8  # frames from which the colours are chosen
+_LAST_S = 1.5  # the last picture stays
+_FASTEST, _SMALLEST = 50, 160
+
+
+def film(
+    frames: Iterable[Workcell],
+    located: Located,
+    path: Path,
+    fps: int = 10,
+    size: tuple[int, int] = (640, 480),
+    progress: Callable[[int, int], None] | None = None,
+) -> None:
+    """Write the frames as an animated GIF that begins again when it has ended.
+
+    Seen obliquely from the front: whatever has a slash in its name (an arm's parts) is in the
+    picture in all frames; in the corner the organ from near by. The same frames give the same
+    bytes; frames that look the same are one that lasts longer.
+
+    Args:
+        frames: of the table frame, evenly spaced in time.
+        located: organ and tumors, table frame, mm.
+        path: ``.gif``, written atomically.
+        fps: frames a second, up to 50.
+        size: width and height in pixels.
+        progress: called with frames done and frames in all.
+
+    Raises:
+        InputError: no frame, or another kind of file, speed or size.
+        StorageError: the disk refused.
+    """
+    told = list(frames)
+    _check(told, path, fps, size)
+    stage = _Stage(told, located, size)
+    chosen = np.linspace(0, len(told) - 1, min(_SAMPLES, len(told))).astype(int)
+    palette, index_of = _palette([stage.picture(n) for n in chosen])
+
+    def indexed() -> Iterator[Image.Image]:
+        for n in range(len(told)):
+            yield _indexed(stage.picture(n), palette, index_of)
+            if progress is not None:
+                progress(n + 1, len(told))
+
+    pictures = indexed()
+    each_ms = round(100 / fps) * 10  # a GIF counts hundredths of a second
+    buffer = io.BytesIO()
+    next(pictures).save(
+        buffer,
+        format="GIF",
+        save_all=True,
+        append_images=pictures,
+        duration=[each_ms] * (len(told) - 1) + [each_ms + round(1000 * _LAST_S)],
+        loop=0,
+        palette=palette.tobytes(),
+        transparency=_COLOURS,
+        disposal=1,
+        optimize=True,
+    )
+    write_atomically(path, buffer.getvalue())
+
+
+def _check(frames: list[Workcell], path: Path, fps: int, size: tuple[int, int]) -> None:
+    if path.suffix.lower() != ".gif":
+        raise InputError(f"{path}: a film is an animated GIF; give a name that ends in .gif.")
+    if not 1 <= fps <= _FASTEST:
+        raise InputError(f"{fps} frames a second are not possible; allowed: 1 to {_FASTEST}.")
+    if min(size) < _SMALLEST or max(size) > 10 * _SMALLEST:
+        raise InputError(
+            f"a film of {size[0]} x {size[1]} pixels is not possible; allowed: {_SMALLEST} to "
+            f"{10 * _SMALLEST} each way."
+        )
+    if not frames:
+        raise InputError("there is no frame to film: the arms did nothing.")
+
+
+class _Stage:
+    """What stays the same in all pictures: eyes, organ, letters."""
+
+    def __init__(self, frames: list[Workcell], located: Located, size: tuple[int, int]) -> None:
+        self._frames, self._size = frames, size
+        self._organ = [
+            Body(mesh, part_colour(label), None, _ORGAN_OPACITY if label == 1 else 1.0, label == 1)
+            for label, mesh in sorted(organ_surfaces(located).items())
+        ]
+        self._close_size = round(_CLOSE[0] * size[0]), round(_CLOSE[1] * size[1])
+        self._far = _eye_around(_reach(frames), _FROM, size)
+        self._near = _close_eye(self._organ[0].mesh, self._close_size)
+        self._letters = _letters(size[1] // 20), _letters(size[1] // 34)
+        self._tubes: dict[tuple[int, float], tuple[Line, Mesh]] = {}
+
+    def picture(self, n: int) -> Image.Image:
+        """Frame n, in full colour."""
+        from PIL import Image, ImageDraw
+
+        cell = self._frames[n]
+        shapes = [Body(s.mesh, s.colour, s.published_from_shape, s.opacity) for s in cell.shapes]
+        out = Image.fromarray(self._seen(cell, shapes, self._far, self._size))
+        close = Image.fromarray(self._seen(cell, shapes, self._near, self._close_size))
+        left, top = self._size[0] - close.width - 8, 8
+        out.paste(close, (left, top))
+        draw = ImageDraw.Draw(out)
+        draw.rectangle(
+            (left - 1, top - 1, left + close.width, top + close.height), outline=(90, 96, 106)
+        )
+        self._say(draw, n)
+        return out
+
+    def _seen(
+        self, cell: Workcell, shapes: list[Body], eye: Eye, size: tuple[int, int]
+    ) -> UInt8[np.ndarray, "h w 3"]:
+        least_mm = _LEAST_PIXELS * eye.width_mm / size[0]
+        lines = [
+            Body(self._tube(line, max(line.width_mm, least_mm)), line.colour, shaded=False)
+            for line in cell.lines
+            if len(line.points_mm) > 1
+        ]
+        return paint(shapes + lines + self._organ, eye, size)
+
+    def _tube(self, line: Line, width_mm: float) -> Mesh:
+        known = self._tubes.get((id(line), width_mm))  # the line is kept, so its id stays its own
+        if known is None:
+            known = line, tube(line.points_mm, width_mm / 2)
+            self._tubes[id(line), width_mm] = known
+        return known[1]
+
+    def _say(self, draw: ImageDraw.ImageDraw, n: int) -> None:
+        """The state, why the arms stand still, and how far the procedure is."""
+        cell = self._frames[n]
+        large, small = self._letters
+        draw.text((12, 10), cell.state, fill=BACKGROUND, font=large)
+        if cell.halted:
+            draw.text((12, 18 + large.size), f"halted: {cell.halted}", fill=NONE, font=small)
+        width, height = self._size
+        done = 0
+        for state, group in groupby(self._frames, lambda one: one.state):
+            first, done = done, done + len(list(group))
+            x = [8 + (width - 16) * k / len(self._frames) for k in (first, min(done, n + 1), done)]
+            box = height - 11, height - 6
+            draw.rectangle((x[0], box[0], x[2] - 2, box[1]), fill=(205, 209, 214))
+            if n >= first:
+                colour = NONE if cell.halted and state == cell.state else (60, 110, 190)
+                draw.rectangle((x[0], box[0], max(x[1] - 2, x[0]), box[1]), fill=colour)
+
+
+def _letters(pixels: int) -> ImageFont.FreeTypeFont:
+    import matplotlib
+    from PIL import ImageFont
+
+    return ImageFont.truetype(f"{matplotlib.get_data_path()}/fonts/ttf/DejaVuSans.ttf", pixels)
+
+
+def _reach(frames: list[Workcell]) -> Float[np.ndarray, "n 3"]:
+    """Corners of the boxes about all parts of arms, in all frames; of everything without arms."""
+    arms = [shape for cell in frames for shape in cell.shapes if "/" in shape.name]
+    boxes = []
+    for shape in arms or [shape for cell in frames for shape in cell.shapes]:
+        corners = np.stack(np.meshgrid(*shape.mesh.box_mm.T), -1).reshape(-1, 3)
+        boxes.append(transform_points(shape.published_from_shape, corners))
+    if not boxes:
+        raise InputError("the frames show no arms and no table: nothing to film.")
+    return np.concatenate(boxes)
+
+
+def _eye_around(
+    points_mm: Float[np.ndarray, "n 3"], direction: np.ndarray, size: tuple[int, int]
+) -> Eye:
+    """The eye in this direction that sees all points, as large as can be."""
+    target = (points_mm.min(0) + points_mm.max(0)) / 2
+    radius = float(np.linalg.norm(points_mm - target, axis=1).max())
+    away = _AWAY * radius * direction / np.linalg.norm(direction)
+    eye = Eye(target + away, target, 2 * radius)
+    right = np.cross([0.0, 0.0, 1.0], away)
+    right /= np.linalg.norm(right)
+    down = np.cross(right, away) / np.linalg.norm(away)
+    for _ in range(4):  # moved and widened until it fits
+        flat = eye.project(points_mm, size)[:, :2]
+        low, high = flat.min(0), flat.max(0)
+        off = ((low + high) / 2 - (np.array(size) - 1) / 2) * eye.width_mm / size[0]
+        target = target + off[0] * right + off[1] * down
+        width = eye.width_mm * 1.05 * float(((high - low) / size).max())
+        eye = Eye(target + away, target, width)
+    return eye
+
+
+def _close_eye(organ: Mesh, size: tuple[int, int]) -> Eye:
+    fitted = _eye_around(organ.vertices_mm, _CLOSE_FROM, size)
+    away = fitted.place_mm - fitted.target_mm
+    radius = float(np.linalg.norm(organ.vertices_mm - organ.box_mm.mean(0), axis=1).max())
+    far = fitted.target_mm + away * 10
+    return Eye(far, fitted.target_mm, 1.12 * fitted.width_mm, True, radius + _CLOSE_MM)
+
+
+def tube(points_mm: Float[np.ndarray, "n 3"], radius_mm: float, sides: int = 6) -> Mesh:
+    """A polyline as a thin closed tube; its joints are mitred."""
+    step = np.diff(points_mm, axis=0)
+    step /= np.maximum(np.linalg.norm(step, axis=1, keepdims=True), 1e-9)
+    along = np.concatenate([step[:1], step[:-1] + step[1:], step[-1:]])
+    along /= np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-9)
+    least = np.eye(3)[np.abs(along).argmin(1)]  # the axis most across
+    a = np.cross(along, least)
+    for one, two in pairwise(range(len(a))):  # carried along, so that the tube does not twist
+        a[two] = a[one] - along[two] * (a[one] @ along[two])
+        a[two] /= max(float(np.linalg.norm(a[two])), 1e-9)
+    a[0] /= np.linalg.norm(a[0])
+    b = np.cross(along, a)
+    turn = 2 * np.pi * np.arange(sides) / sides
+    ring = np.cos(turn)[None, :, None] * a[:, None] + np.sin(turn)[None, :, None] * b[:, None]
+    vertices = (points_mm[:, None] + radius_mm * ring).reshape(-1, 3)
+    n = len(points_mm)
+    first = sides * np.arange(n - 1)[:, None] + np.arange(sides)
+    next_ = sides * np.arange(n - 1)[:, None] + (np.arange(sides) + 1) % sides
+    low = np.stack([first, next_, next_ + sides], -1).reshape(-1, 3)
+    high = np.stack([first, next_ + sides, first + sides], -1).reshape(-1, 3)
+    fan = np.stack([np.zeros(sides - 2), np.arange(1, sides - 1), np.arange(2, sides)], -1)
+    ends = [fan[:, ::-1], fan + sides * (n - 1)]
+    return Mesh(vertices, np.concatenate([low, high, *ends]).astype(np.int32))
+
+
+def _palette(
+    pictures: list[Image.Image],
+) -> tuple[UInt8[np.ndarray, "256 3"], UInt8[np.ndarray, "64 64 64"]]:
+    """Colours that suit these pictures, and for every colour (6 bits each) the nearest of them."""
+    from PIL import Image
+    from scipy.spatial import cKDTree
+
+    sheet = Image.fromarray(np.concatenate([np.asarray(one) for one in pictures]))
+    few = sheet.quantize(_COLOURS, Image.Quantize.MEDIANCUT, kmeans=2, dither=Image.Dither.NONE)
+    colours = np.array(few.getpalette(), np.uint8).reshape(-1, 3)[:_COLOURS]
+    palette = np.zeros((256, 3), np.uint8)
+    palette[: len(colours)] = colours
+    shades = (np.arange(64) * 4 + 2).astype(float)
+    cube = np.stack(np.meshgrid(shades, shades, shades, indexing="ij"), -1).reshape(-1, 3)
+    _, nearest = cKDTree(colours.astype(float)).query(cube)
+    return palette, nearest.astype(np.uint8).reshape(64, 64, 64)
+
+
+def _indexed(
+    picture: Image.Image,
+    palette: UInt8[np.ndarray, "256 3"],
+    index_of: UInt8[np.ndarray, "64 64 64"],
+) -> Image.Image:
+    from PIL import Image
+
+    red, green, blue = np.moveaxis(np.asarray(picture) >> 2, -1, 0)
+    out = Image.fromarray(index_of[red, green, blue])
+    out.putpalette(palette.tobytes())
+    return out

@@ -1,0 +1,54 @@
+"""Surfaces to draw of what was located: its meshes, or of a bare cloud the skin of its points."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float
+
+from tumortrack.core.errors import InputError
+from tumortrack.core.types import ORGAN, Mesh
+from tumortrack.plan.values import Located
+
+_BLUR = 1.2  # cells: bridges the gaps between points strewn at random
+_FEWEST, _MOST_CELLS = 8, 60  # points of a part; cells along its longest side
+
+
+def organ_surfaces(located: Located) -> dict[int, Mesh]:
+    """By label 1 (the whole organ, tumors included), 2, ...: closed surfaces, table frame, mm.
+
+    Raises:
+        InputError: neither meshes nor enough points.
+    """
+    if "kidney" in located.meshes:
+        names = {"kidney": ORGAN} | {f"tumor_{n - 1}": n for n in range(2, 256)}
+        return {names[name]: mesh for name, mesh in located.meshes.items() if name in names}
+    clouds = {ORGAN: located.points_mm} | {n: located.of(n) for n in located.tumors}
+    return {label: skin(np.asarray(points, float)) for label, points in clouds.items()}
+
+
+def skin(points_mm: Float[np.ndarray, "n 3"]) -> Mesh:
+    """The closed surface around points strewn evenly through a body.
+
+    Where the points' blurred density falls to half of what it is inside.
+
+    Raises:
+        InputError: too few points.
+    """
+    from scipy.ndimage import gaussian_filter
+    from skimage.measure import marching_cubes
+
+    if len(points_mm) < _FEWEST:
+        raise InputError(f"{len(points_mm)} points are too few to draw a part of the organ.")
+    low, size = points_mm.min(0), np.ptp(points_mm, axis=0)
+    # About two points a cell, if they fill an ellipsoid.
+    cell = (2 * np.pi / 6 * np.prod(np.maximum(size, 1.0)) / len(points_mm)) ** (1 / 3)
+    cell = max(cell, size.max() / _MOST_CELLS)
+    low = low - 4 * cell
+    edges = [low[d] + cell * np.arange(np.ceil(size[d] / cell) + 9) for d in range(3)]
+    counts, _ = np.histogramdd(points_mm, edges)
+    density = gaussian_filter(counts, _BLUR, mode="constant")
+    inside = density[tuple(((points_mm - low) / cell).astype(int).T)]
+    level = 0.5 * float(np.quantile(inside, 0.75))
+    vertices, faces, _, _ = marching_cubes(density, level, gradient_direction="ascent")
+    mesh = Mesh(low + cell * (vertices + 0.5), faces)
+    return mesh if mesh.volume_mm3 > 0 else Mesh(mesh.vertices_mm, mesh.faces[:, ::-1])

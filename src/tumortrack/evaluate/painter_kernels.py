@@ -1,0 +1,158 @@
+"""The painter's inner loops: which triangle a pixel sees, and in what light."""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+
+_SHADOW_BIAS = 4.0  # pixels of the shadow's picture: a surface doesn't shade itself
+
+
+@numba.njit(cache=True, nogil=True)
+def crease(area, unit, corner, faces, first, limit):  # type: ignore[no-untyped-def]
+    out = np.zeros((len(corner), 3))
+    for n in range(len(corner)):
+        own = n // 3
+        for k in range(first[corner[n]], first[corner[n] + 1]):
+            other = faces[k]
+            angle = 0.0
+            for d in range(3):
+                angle += unit[own, d] * unit[other, d]
+            if angle >= limit or other == own:
+                for d in range(3):
+                    out[n, d] += area[other, d]
+        length = np.sqrt(out[n, 0] ** 2 + out[n, 1] ** 2 + out[n, 2] ** 2)
+        for d in range(3):
+            out[n, d] /= max(length, 1e-12)
+    return out
+
+
+@numba.njit(cache=True, nogil=True)
+def nearest(corners, width, height, limit):  # type: ignore[no-untyped-def]
+    """Greatest nearness up to the limit in each pixel (-inf: nothing) and whose it is (-1).
+
+    Corners (t, 3, 3) are column, row and nearness, linear in the picture.
+    """
+    near = np.full((height, width), -np.inf, np.float32)
+    winner = np.full((height, width), -1, np.int32)
+    for t in range(len(corners)):
+        ua, va, na = corners[t, 0]
+        ub, vb, nb = corners[t, 1]
+        uc, vc, nc = corners[t, 2]
+        area = (ub - ua) * (vc - va) - (vb - va) * (uc - ua)
+        if area == 0:
+            continue
+        top = max(int(np.ceil(min(va, vb, vc))), 0)
+        bottom = min(int(np.floor(max(va, vb, vc))), height - 1)
+        # Along a row nearness is slope * x + constant.
+        slope = (na * (vb - vc) + nb * (vc - va) + nc * (va - vb)) / area
+        rise = (na * (uc - ub) + nb * (ua - uc) + nc * (ub - ua)) / area
+        for y in range(top, bottom + 1):
+            start, end = np.float32(np.inf), np.float32(-np.inf)
+            for u, v, to_u, to_v in ((ua, va, ub, vb), (ub, vb, uc, vc), (uc, vc, ua, va)):
+                if min(v, to_v) <= y <= max(v, to_v):
+                    at = u + (y - v) * (to_u - u) / (to_v - v) if to_v != v else u
+                    start, end = min(start, at), max(end, at)
+                    if to_v == v:
+                        start, end = min(start, to_u), max(end, to_u)
+            left = max(int(np.ceil(start - 1e-3)), 0)  # no cracks between neighbours
+            right = min(int(np.floor(end + 1e-3)), width - 1)
+            here = na + slope * (left - ua) + rise * (y - va)
+            for x in range(left, right + 1):
+                if near[y, x] < here <= limit:
+                    near[y, x] = here
+                    winner[y, x] = t
+                here += slope
+    return near, winner
+
+
+@numba.njit(cache=True, nogil=True)
+def _shares(corner, x, y, perspective):  # type: ignore[no-untyped-def]
+    """How much of each corner there is in a pixel of a triangle."""
+    ua, va, na = corner[0]
+    ub, vb, nb = corner[1]
+    uc, vc, nc = corner[2]
+    area = (ub - ua) * (vc - va) - (vb - va) * (uc - ua)
+    a = ((ub - x) * (vc - y) - (vb - y) * (uc - x)) / area
+    b = ((uc - x) * (va - y) - (vc - y) * (ua - x)) / area
+    c = np.float32(1.0) - a - b
+    if perspective:
+        a, b, c = a * na, b * nb, c * nc
+        whole = a + b + c
+        a, b, c = a / whole, b / whole, c / whole
+    return a, b, c
+
+
+@numba.njit(cache=True, nogil=True)
+def _mixed(three, a, b, c):  # type: ignore[no-untyped-def]
+    return (
+        a * three[0, 0] + b * three[1, 0] + c * three[2, 0],
+        a * three[0, 1] + b * three[1, 1] + c * three[2, 1],
+        a * three[0, 2] + b * three[1, 2] + c * three[2, 2],
+    )
+
+
+@numba.njit(cache=True, nogil=True)
+def _dark(spot, shadow):  # type: ignore[no-untyped-def]
+    """Whether something lies between this place and the light."""
+    axes, step = shadow.axes, shadow.pixel_mm
+    u = (axes[0, 0] * spot[0] + axes[0, 1] * spot[1] + axes[0, 2] * spot[2]) - shadow.corner[0]
+    v = (axes[1, 0] * spot[0] + axes[1, 1] * spot[1] + axes[1, 2] * spot[2]) - shadow.corner[1]
+    up = axes[2, 0] * spot[0] + axes[2, 1] * spot[1] + axes[2, 2] * spot[2]
+    column, row = int(np.rint(u / step)), int(np.rint(v / step))
+    side = shadow.near.shape[0]
+    if not (0 <= column < side and 0 <= row < side):
+        return False
+    return shadow.near[row, column] > up + _SHADOW_BIAS * step
+
+
+@numba.njit(cache=True, nogil=True)
+def light(  # type: ignore[no-untyped-def]
+    picture, winner, corners, perspective, place, opacity, triangles, shadow
+):
+    """Lay each pixel's triangle over what is there; a diffuse light, a little gloss."""
+    lx, ly, lz = shadow.axes[2]
+    for y in range(winner.shape[0]):
+        for x in range(winner.shape[1]):
+            t = winner[y, x]
+            if t < 0:
+                continue
+            a, b, c = _shares(corners[t], x, y, perspective)
+            spot = _mixed(triangles.places[t], a, b, c)
+            nx, ny, nz = _mixed(triangles.normals[t], a, b, c)
+            vx, vy, vz = place[0] - spot[0], place[1] - spot[1], place[2] - spot[2]
+            scale = 1 / max(np.sqrt(nx * nx + ny * ny + nz * nz), 1e-12)
+            far = 1 / np.sqrt(vx * vx + vy * vy + vz * vz)
+            vx, vy, vz = vx * far, vy * far, vz * far
+            toward = (nx * vx + ny * vy + nz * vz) * scale
+            scale = scale if toward >= 0 else -scale  # of a surface seen from behind
+            nx, ny, nz = nx * scale, ny * scale, nz * scale
+            lit, gloss = max(nx * lx + ny * ly + nz * lz, 0.0), 0.0
+            if lit > 0 and triangles.shaded[t] and _dark(spot, shadow):
+                lit = 0.0
+            elif lit > 0:
+                hx, hy, hz = lx + vx, ly + vy, lz + vz
+                gloss = (nx * hx + ny * hy + nz * hz) / np.sqrt(hx * hx + hy * hy + hz * hz)
+                gloss = 0.16 * max(gloss, 0.0) ** 40
+            strength = 0.46 + 0.1 * nz + 0.5 * lit
+            slant = 1 - abs(toward)
+            cover = opacity + (1 - opacity) * 0.75 * slant * slant
+            for d in range(3):
+                own = min(triangles.colours[t, d] * strength + gloss, 1.0)
+                picture[y, x, d] += cover * (own - picture[y, x, d])
+
+
+@numba.njit(cache=True, nogil=True)
+def shrunk(picture, step):  # type: ignore[no-untyped-def]
+    """Means of step x step pixels, in 0..255."""
+    height, width = picture.shape[0] // step, picture.shape[1] // step
+    out = np.empty((height, width, 3), np.uint8)
+    for y in range(height):
+        for x in range(width):
+            for d in range(3):
+                total = 0.0
+                for i in range(step):
+                    for j in range(step):
+                        total += picture[y * step + i, x * step + j, d]
+                out[y, x, d] = int(255 * min(max(total / step**2, 0.0), 1.0) + 0.5)
+    return out
