@@ -30,9 +30,10 @@ from tumortrack.core.geometry import rigid
 from tumortrack.core.types import SensorCloud
 from tumortrack.track.live import Frames, Seen
 from tumortrack.track.ros.incoming import CAMERA_INFO, CLOUD, IMAGE, cloud_of, depth_of, mask_of
+from tumortrack.track.ros.markers import MARKERS, Rate
 from tumortrack.track.ros.messages import Messages, stamp_of
 from tumortrack.track.ros.observed import messages_seen
-from tumortrack.track.ros.outgoing import MARKERS, Rate, messages_of
+from tumortrack.track.ros.outgoing import messages_of
 
 HUMBLE, NOETIC = Messages("humble"), Messages("noetic")
 STOCK = {HUMBLE: get_typestore(Stores.ROS2_HUMBLE), NOETIC: get_typestore(Stores.ROS1_NOETIC)}

@@ -200,11 +200,31 @@ class Update:
         return Placed(points_mm, cloud.labels, cloud.probability, meshes)
 
 
+@runtime_checkable
+class Companion(Protocol):
+    """Who acts on estimates as part of the loop: arms. Called from the loop's thread alone."""
+
+    @property
+    def ended(self) -> bool:
+        """There is nothing more to do; the loop ends too."""
+        ...
+
+    def act(self, update: Update) -> Update:
+        """The update as sinks get it, with the workcell as it is now. Called with every update,
+        also where there is no estimate."""
+        ...
+
+    def abort(self, reason: str) -> None:
+        """Stop for good."""
+        ...
+
+
 class Controls:
     """What the user asks of the running loop, from whichever thread."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
+        self.aborted = threading.Event()  # arms stop for good
         self._picked_mm: Float64[np.ndarray, " 3"] | None = None
 
     def pick(self, point_mm: Float64[np.ndarray, " 3"] | None) -> None:
@@ -222,12 +242,14 @@ class Controls:
 @dataclass(frozen=True, eq=False)
 class Setting:
     """What a sink may know from the start. ``anatomy_ct``: the organ in the CT (LPS, mm), where
-    the model has it: estimates then have a motion, and their meshes its triangles."""
+    the model has it: estimates then have a motion, and their meshes its triangles. ``arms``:
+    updates may carry a workcell."""
 
     parts: tuple[str, ...]
     frames: Frames
     anatomy_ct: Anatomy | None = None
     controls: Controls = field(default_factory=Controls)
+    arms: bool = False
 
 
 @runtime_checkable
@@ -240,6 +262,14 @@ class Sink(Protocol):
     def close(self) -> None:
         """Flush and give everything back; may be called twice."""
         ...
+
+
+@runtime_checkable
+class Counting(Protocol):
+    """A sink that has more to say of its updates, for the run's report."""
+
+    @property
+    def counts(self) -> dict[str, int]: ...
 
 
 class SourceConfig(Config, frozen=True, kw_only=True, tag_field="kind"):

@@ -7,7 +7,7 @@ import time
 from collections import deque
 
 from tumortrack.core.errors import TumortrackError
-from tumortrack.track.live import Sink, Update
+from tumortrack.track.live import Counting, Sink, Update
 from tumortrack.track.meter import Histogram
 
 _CLOSE_S = 10.0  # to write what waits, and flush
@@ -57,6 +57,7 @@ class Outlet:
             "errors": self.errors,
             "last_error": self.error,
             "latency_ms": self.latency.summary(),
+            **({"counts": self._sink.counts} if isinstance(self._sink, Counting) else {}),
         }
 
     def _run(self) -> None:

@@ -13,7 +13,8 @@ from jaxtyping import Float, Int, Num, UInt32
 
 from tumortrack.track.igtl.message import ProtocolError
 
-OK, NOT_FOUND, CHECKSUM_ERROR, EXITING = 1, 4, 9, 19  # STATUS codes
+# STATUS codes
+OK, NOT_FOUND, CHECKSUM_ERROR, NOT_READY, NOT_PRESENT, EXITING = 1, 4, 9, 13, 16, 19
 _STATUS = struct.Struct("> H q 20s")
 _POLYDATA = struct.Struct("> 10I")
 _ATTRIBUTE = struct.Struct("> B B I")

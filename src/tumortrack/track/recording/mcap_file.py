@@ -14,9 +14,11 @@ import numpy as np
 from tumortrack.core.errors import StorageError
 from tumortrack.track.live import Frames, Setting, Update
 from tumortrack.track.recording.said import camera_frame, report
+from tumortrack.track.ros.cell import Cell
+from tumortrack.track.ros.markers import Rate
 from tumortrack.track.ros.messages import Messages
 from tumortrack.track.ros.observed import MM_PER_M, Outgoing, messages_seen
-from tumortrack.track.ros.outgoing import Rate, messages_of
+from tumortrack.track.ros.outgoing import messages_of
 
 # A killed program loses what is in no chunk yet.
 _CHUNK_S = 0.5
@@ -24,7 +26,8 @@ _CHUNK_S = 0.5
 
 class McapFile:
     """Topics: ``/camera/...`` what the source saw, in the camera's frame; ``/tumortrack/...`` the
-    estimates, and ``/tumortrack/report`` (JSON); ``/tf`` where the two frames differ.
+    estimates and what arms do, and ``/tumortrack/report`` (JSON); ``/tf`` where the two frames
+    differ.
 
     Messages are filed under their time of arrival, which never goes back; headers have the stamps.
 
@@ -37,6 +40,7 @@ class McapFile:
         from rosbags.rosbag2 import StoragePlugin, Writer
 
         self._frames, self._meshes = frames, Rate(meshes_hz)
+        self._cell = Cell(self._messages, meshes_hz, observed=False) if setting.arms else None
         self._connections: dict[str, Any] = {}
         self._last_ns, self._chunk_s = 0, time.monotonic()
         writer: Any = Writer(folder, version=8, storage_plugin=StoragePlugin.MCAP)  # 8: Humble's
@@ -64,7 +68,8 @@ class McapFile:
 
     def _messages_of(self, update: Update) -> list[Outgoing]:
         messages, published = self._messages, update.frames
-        out = messages_of(update, messages, self._setting.parts, self._meshes.due())
+        due = self._meshes.due()
+        out = messages_of(update, messages, self._setting.parts, due, self._cell)
         text = json.dumps(report(update), allow_nan=False)
         string = "std_msgs/msg/String"
         out.append(Outgoing("report", string, messages.make(string, data=text)))

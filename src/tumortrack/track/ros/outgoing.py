@@ -6,7 +6,6 @@ empty cloud, markers deleted, places that are not a number, a diagnostic with th
 
 from __future__ import annotations
 
-import time
 from typing import Any
 
 import numpy as np
@@ -14,23 +13,31 @@ import numpy as np
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.types import Mesh
 from tumortrack.track.live import Placed, Quality, Update
+from tumortrack.track.ros.cell import Cell
 from tumortrack.track.ros.incoming import CLOUD
+from tumortrack.track.ros.markers import (
+    ADD,
+    DELETE,
+    DELETE_ALL,
+    MARKERS,
+    TEXT,
+    TRIANGLES,
+    colour,
+    marker,
+    point,
+    pose,
+)
 from tumortrack.track.ros.messages import Messages, PointBlock
 from tumortrack.track.ros.observed import FLOAT32, MM_PER_M, UINT8, Outgoing, cloud_message
 from tumortrack.track.view.colours import GOOD, NONE, POOR, Colour, label_colours, part_colour
 
-MARKERS = "visualization_msgs/msg/MarkerArray"
 DIAGNOSTICS = "diagnostic_msgs/msg/DiagnosticArray"
 PLACE = "geometry_msgs/msg/PointStamped"
 
-_ADD, _DELETE, _DELETE_ALL = 0, 2, 3  # Marker's
-_TRIANGLES, _TEXT = 11, 9
 _LEVELS = {"good": 0, "poor": 1, "none": 2}  # DiagnosticStatus: OK, WARN, ERROR
 _TEXT_COLOURS: dict[Quality, Colour] = {"good": GOOD, "poor": POOR, "none": NONE}
 _KIDNEY_OPACITY = 0.35
 _TEXT_HEIGHT_M = 0.008
-# Markers vanish by themselves if nothing follows: a stopped loop leaves nothing that looks fresh.
-MARKER_LIFETIME_S = 2.0
 
 _POINT = np.dtype(
     {
@@ -42,34 +49,25 @@ _POINT = np.dtype(
 )
 
 
-class Rate:
-    """Lets things happen at most ``hz`` times a second; 0: each time."""
-
-    def __init__(self, hz: float) -> None:
-        self._every_s = 1 / hz if hz > 0 else 0.0
-        self._next_s = 0.0
-
-    def due(self) -> bool:
-        now = time.monotonic()
-        if now < self._next_s:
-            return False
-        self._next_s = now + self._every_s
-        return True
-
-
 def messages_of(
-    update: Update, messages: Messages, parts: tuple[str, ...] = (), meshes: bool = True
+    update: Update,
+    messages: Messages,
+    parts: tuple[str, ...] = (),
+    meshes: bool = True,
+    cell: Cell | None = None,
 ) -> list[Outgoing]:
     """What is published of one update.
 
     ``cloud`` (PointCloud2: x, y, z, label, probability, rgb), ``meshes`` (MarkerArray: a list of
     triangles per part and a text), ``diagnostics``, and for each of ``parts`` ``PART/center``
-    (PointStamped: middle of its box; NaN where it was not found).
+    (PointStamped: middle of its box; NaN where it was not found). With ``cell`` what arms do, too:
+    ``joint_states`` and ``workcell``.
 
     Args:
         parts: the model's parts, kidney first; those that were not found are deleted.
         meshes: False leaves the triangles out, where meshes are sent at a lower rate; where there
             is no estimate, their deletion is sent all the same.
+        cell: where updates may carry a workcell, the memory of what was shown of it.
 
     Raises:
         InputError: a stamp that ROS can't say.
@@ -84,7 +82,8 @@ def messages_of(
             Outgoing(f"{name}/center", PLACE, _center(update, name, header, messages))
             for name in names
         ),
-        Outgoing("diagnostics", DIAGNOSTICS, _diagnostics(update, header, messages)),
+        Outgoing("diagnostics", DIAGNOSTICS, _diagnostics(update, header, messages, cell)),
+        *(cell.outgoing(update, header) if cell is not None else ()),
     ]
 
 
@@ -120,56 +119,28 @@ def _markers(
     """Triangles per part and a text about their quality; everything deleted without estimate."""
     placed, markers = update.placed, []
     if placed is None:
-        markers.append(_marker(messages, header, action=_DELETE_ALL))
+        markers.append(marker(messages, header, action=DELETE_ALL))
     elif meshes:
         for label, name in enumerate(names, start=1):
             if name in placed.meshes:
                 markers.append(_triangles(placed.meshes[name], name, label, header, messages))
             else:
-                markers.append(_marker(messages, header, ns=name, action=_DELETE))
+                markers.append(marker(messages, header, ns=name, action=DELETE))
     markers.append(_text(update, header, messages))
     return messages.make(MARKERS, markers=markers)
 
 
-def _marker(messages: Messages, header: Any, **values: Any) -> Any:
-    seconds, rest = divmod(MARKER_LIFETIME_S, 1)
-    lifetime = messages.make(
-        "builtin_interfaces/msg/Duration", sec=int(seconds), nanosec=round(rest * 1e9)
-    )
-    return messages.make(
-        "visualization_msgs/msg/Marker", header=header, lifetime=lifetime, **values
-    )
-
-
-def _pose(messages: Messages, position_m: np.ndarray) -> Any:
-    return messages.make(
-        "geometry_msgs/msg/Pose",
-        position=_point(messages, position_m),
-        orientation=messages.make("geometry_msgs/msg/Quaternion", w=1.0),
-    )
-
-
-def _point(messages: Messages, position_m: np.ndarray) -> Any:
-    x, y, z = (float(v) for v in position_m)
-    return messages.make("geometry_msgs/msg/Point", x=x, y=y, z=z)
-
-
-def _colour(messages: Messages, colour: Colour, opacity: float = 1.0) -> Any:
-    r, g, b = (value / 255 for value in colour)
-    return messages.make("std_msgs/msg/ColorRGBA", r=r, g=g, b=b, a=opacity)
-
-
 def _triangles(mesh: Mesh, name: str, label: int, header: Any, messages: Messages) -> Any:
     corners_m = mesh.vertices_mm[mesh.faces.ravel()] / MM_PER_M
-    return _marker(
+    return marker(
         messages,
         header,
         ns=name,
-        type=_TRIANGLES,
-        action=_ADD,
-        pose=_pose(messages, np.zeros(3)),
+        type=TRIANGLES,
+        action=ADD,
+        pose=pose(messages, np.zeros(3)),
         scale=messages.make("geometry_msgs/msg/Vector3", x=1.0, y=1.0, z=1.0),
-        color=_colour(messages, part_colour(label), _KIDNEY_OPACITY if label == 1 else 1.0),
+        color=colour(messages, part_colour(label), _KIDNEY_OPACITY if label == 1 else 1.0),
         points=PointBlock(corners_m),
     )
 
@@ -180,15 +151,15 @@ def _text(update: Update, header: Any, messages: Messages) -> Any:
     if update.estimate is not None and (organ := update.estimate.meshes.get("kidney")):
         low, high = organ.box_mm
         above_mm = np.array([[(low + high)[0] / 2, low[1] - 8.0, (low + high)[2] / 2]])
-    return _marker(
+    return marker(
         messages,
         header,
         ns="quality",
-        type=_TEXT,
-        action=_ADD,
-        pose=_pose(messages, transform_points(way, above_mm)[0] / MM_PER_M),
+        type=TEXT,
+        action=ADD,
+        pose=pose(messages, transform_points(way, above_mm)[0] / MM_PER_M),
         scale=messages.make("geometry_msgs/msg/Vector3", z=_TEXT_HEIGHT_M),
-        color=_colour(messages, _TEXT_COLOURS[update.quality]),
+        color=colour(messages, _TEXT_COLOURS[update.quality]),
         text=_words(update),
     )
 
@@ -205,10 +176,10 @@ def _center(update: Update, name: str, header: Any, messages: Messages) -> Any:
     if mesh is not None:
         middle_mm = mesh.box_mm.mean(0, keepdims=True)
         middle_m = transform_points(update.frames.published_from_camera, middle_mm)[0] / MM_PER_M
-    return messages.make(PLACE, header=header, point=_point(messages, middle_m))
+    return messages.make(PLACE, header=header, point=point(messages, middle_m))
 
 
-def _diagnostics(update: Update, header: Any, messages: Messages) -> Any:
+def _diagnostics(update: Update, header: Any, messages: Messages, cell: Cell | None) -> Any:
     said: dict[str, Any] = {
         "quality": update.quality,
         "sequence": update.sequence,
@@ -230,4 +201,5 @@ def _diagnostics(update: Update, header: Any, messages: Messages) -> Any:
         hardware_id=update.frames.frame_id,
         values=values,
     )
-    return messages.make(DIAGNOSTICS, header=header, status=[status])
+    statuses = [status] if cell is None else [status, cell.status(update)]
+    return messages.make(DIAGNOSTICS, header=header, status=statuses)

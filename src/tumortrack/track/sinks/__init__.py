@@ -8,6 +8,7 @@ from tumortrack.track.sinks.openigtlink import OpenIgtLink
 from tumortrack.track.sinks.recording import Recording
 from tumortrack.track.sinks.ros1 import Ros1
 from tumortrack.track.sinks.ros2 import Ros2
+from tumortrack.track.sinks.ur import Ur
 from tumortrack.track.sinks.viewer import Viewer
 
-SINKS = (Viewer, Recording, Ros2, Ros1, OpenIgtLink)
+SINKS = (Viewer, Recording, Ros2, Ros1, OpenIgtLink, Ur)

@@ -18,6 +18,8 @@ from tumortrack.core.geometry import RAS_FROM_LPS, rigid, transform_points
 from tumortrack.track.igtl.content import (
     EXITING,
     NOT_FOUND,
+    NOT_PRESENT,
+    NOT_READY,
     OK,
     Polydata,
     Status,
@@ -29,7 +31,8 @@ from tumortrack.track.igtl.link import Link
 from tumortrack.track.igtl.message import Message
 from tumortrack.track.live import Placed, Setting, SinkConfig, Update
 
-STATUS_DEVICE, CT_DEVICE, CLOUD_DEVICE = "tumortrack", "ct", "occupancy"
+STATUS_DEVICE, CT_DEVICE, CLOUD_DEVICE, ARMS_DEVICE = "tumortrack", "ct", "occupancy", "arms"
+_TIP = "/tip"  # how the names of shapes at the tips of tools end
 _NOWHERE = np.eye(4)
 _NO_POINTS, _NO_FACES = np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32)
 
@@ -79,6 +82,10 @@ class OpenIgtLinkSink:
     TRANSFORM ``ct`` is the organ's pose: what is put under it in Slicer follows the organ, as
     a rigid body. Without an estimate STATUS says why, transforms are the identity with
     ``TransformStatus`` MISSING, and surfaces and cloud are empty.
+
+    Where there may be arms also STATUS ``arms`` (well: its name is their state; not ready: halted,
+    and why; not present: nothing is known), and a TRANSFORM of each tool's tip, named as its shape
+    (``cutter/tip``): from the tip's own frame, and MISSING once it is gone.
     """
 
     def __init__(self, config: OpenIgtLink, setting: Setting) -> None:
@@ -86,7 +93,8 @@ class OpenIgtLinkSink:
         self._axes = RAS_FROM_LPS if config.space == "ras" else np.eye(4)
         self._link = Link(config.host, config.port, config.connect)
         self._meshes, self._cloud = _Pace(config.mesh_hz), _Pace(config.cloud_hz)
-        self._has_ct = setting.anatomy_ct is not None
+        self._has_ct, self._arms = setting.anatomy_ct is not None, setting.arms
+        self._tips: set[str] = set()  # that ever were
         self._next, self._closed = 0, False
 
     @property
@@ -113,7 +121,9 @@ class OpenIgtLinkSink:
             self._link.close()
 
     def _said(self, update: Update, code: int) -> list[Message]:
-        return [self._status(update, code), *self._transforms(update), *self._surfaces(update)]
+        arms = [self._arms_status(update)] if self._arms else []
+        status = self._status(update, code)
+        return [status, *arms, *self._transforms(update), *self._surfaces(update)]
 
     def _message(
         self, kind: str, device: str, update: Update, content: bytes, **more: str
@@ -130,6 +140,15 @@ class OpenIgtLinkSink:
         content = pack_status(Status(code, name, text))
         return self._message("STATUS", STATUS_DEVICE, update, content, **more)
 
+    def _arms_status(self, update: Update) -> Message:
+        cell = update.workcell
+        if cell is None:
+            status = Status(NOT_PRESENT, "unknown", "nothing is known of the arms")
+            return self._message("STATUS", ARMS_DEVICE, update, pack_status(status))
+        status = Status(NOT_READY if cell.halted else OK, cell.state, cell.halted)
+        content = pack_status(status)
+        return self._message("STATUS", ARMS_DEVICE, update, content, state=cell.state)
+
     def _transforms(self, update: Update) -> Iterator[Message]:
         way, pose = update.frames.published_from_camera, _camera_from_ct(update)
         places: dict[str, Float64[np.ndarray, "4 4"] | None] = dict.fromkeys(self._parts[1:])
@@ -141,6 +160,11 @@ class OpenIgtLinkSink:
                 if (mesh := update.estimate.meshes.get(name)) is not None:
                     middle = transform_points(way, mesh.box_mm.mean(0, keepdims=True))[0]
                     places[name] = rigid(turn, middle)
+        if self._arms:
+            shapes = () if update.workcell is None else update.workcell.shapes
+            tips = {s.name: s.published_from_shape for s in shapes if s.name.endswith(_TIP)}
+            self._tips |= tips.keys()
+            places |= {name: tips.get(name) for name in sorted(self._tips)}
         for name, place in places.items():
             turned = _NOWHERE if place is None else self._axes @ place @ self._axes
             known = "MISSING" if place is None else "OK"

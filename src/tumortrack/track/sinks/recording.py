@@ -11,7 +11,7 @@ from tumortrack.core.errors import InputError, StorageError
 from tumortrack.core.store import read_json
 from tumortrack.track.live import Setting, SinkConfig, Update
 from tumortrack.track.recording.folders import FRAMES
-from tumortrack.track.recording.frame_folders import INDEX, FrameFolders
+from tumortrack.track.recording.frame_folders import INDEX, SHAPES, FrameFolders
 from tumortrack.track.recording.mcap_file import McapFile
 from tumortrack.track.recording.said import KIND, about
 
@@ -101,7 +101,7 @@ def _make_room(path: Path, overwrite: bool) -> None:
             "recording."
         )
     inside = {p.name for p in path.iterdir()} if path.is_dir() else {path.name}
-    ours = {_ABOUT, INDEX, FRAMES, "metadata.yaml", f"{path.name}.mcap"}
+    ours = {_ABOUT, INDEX, FRAMES, SHAPES, "metadata.yaml", f"{path.name}.mcap"}
     is_ours = _ABOUT in inside and read_json(path / _ABOUT).get("kind") == KIND
     if inside and (inside - ours or not is_ours or not path.is_dir()):
         raise InputError(

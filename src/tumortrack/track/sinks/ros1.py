@@ -8,8 +8,11 @@ from typing import Any, ClassVar
 from tumortrack.core.errors import InputError
 from tumortrack.track.live import Setting, SinkConfig, Update
 from tumortrack.track.ros import rospy_node
+from tumortrack.track.ros.cell import Cell
+from tumortrack.track.ros.markers import Rate
 from tumortrack.track.ros.messages import Messages
-from tumortrack.track.ros.outgoing import Rate, ended, messages_of
+from tumortrack.track.ros.observed import Outgoing
+from tumortrack.track.ros.outgoing import ended, messages_of
 
 _CHECK_S = 1.0  # how often the master is asked whether it knows the topics
 _CHECK_SHARE = 0.1  # and at most so much of the time is spent waiting for its answer
@@ -20,7 +23,7 @@ class Ros1(SinkConfig, frozen=True, kw_only=True, tag="ros1"):
     """Topics under ``namespace``: see ``track.ros.outgoing``.
 
     Attributes:
-        mesh_hz: surfaces at most so often; 0: with every update.
+        mesh_hz: surfaces, and arms' markers, at most so often; 0: with every update.
     """
 
     target: ClassVar[str] = "namespace"
@@ -53,12 +56,13 @@ class Ros1Sink:
         self._node, self._parts = node, setting.parts
         self._messages = Messages("noetic")
         self._mesh_rate = Rate(config.mesh_hz)
+        self._cell = Cell(self._messages, config.mesh_hz) if setting.arms else None
         self._last: Update | None = None
         self._lost = ""
         nothing = Update(sequence=0, stamp_ns=0, frames=setting.frames)
         self._publishers: dict[str, Any] = {
             suffix: self._advertise(f"{config.namespace}/{suffix}", message_type)
-            for suffix, message_type, _ in messages_of(nothing, self._messages, self._parts)
+            for suffix, message_type, _ in self._messages_of(nothing)
         }
         self._check_at_s = time.monotonic() + _CHECK_S
 
@@ -71,7 +75,7 @@ class Ros1Sink:
         """
         self._last = update
         meshes = update.estimate is None or self._mesh_rate.due()
-        for out in messages_of(update, self._messages, self._parts, meshes):
+        for out in self._messages_of(update, meshes):
             publisher = self._publishers[out.suffix]
             if publisher.get_num_connections():
                 raw = publisher.data_class()
@@ -94,6 +98,9 @@ class Ros1Sink:
             self._publishers = {}
             for one in publishers.values():
                 one.unregister()
+
+    def _messages_of(self, update: Update, meshes: bool = True) -> list[Outgoing]:
+        return messages_of(update, self._messages, self._parts, meshes, self._cell)
 
     def _advertise(self, topic: str, message_type: str) -> Any:
         kind = rospy_node.raw_class(

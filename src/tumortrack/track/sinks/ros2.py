@@ -8,8 +8,11 @@ from typing import ClassVar
 from tumortrack.core.errors import InputError, TumortrackError
 from tumortrack.track.live import Setting, SinkConfig, Update
 from tumortrack.track.ros.bus import Bus, Publisher, Via, check_topic, open_bus
+from tumortrack.track.ros.cell import Cell
+from tumortrack.track.ros.markers import Rate
 from tumortrack.track.ros.messages import Messages
-from tumortrack.track.ros.outgoing import Rate, ended, messages_of
+from tumortrack.track.ros.observed import Outgoing
+from tumortrack.track.ros.outgoing import ended, messages_of
 
 _FLUSH_S = 0.2  # what was published last leaves within that time
 
@@ -18,7 +21,7 @@ class Ros2(SinkConfig, frozen=True, kw_only=True, tag="ros2"):
     """Topics under ``namespace``: see ``track.ros.outgoing``.
 
     Attributes:
-        mesh_hz: surfaces at most so often; 0: with every update.
+        mesh_hz: surfaces, and arms' markers, at most so often; 0: with every update.
         via: dds: without ROS; rclpy: through the ROS that is sourced; auto: rclpy where there is.
     """
 
@@ -50,11 +53,12 @@ class Ros2Sink:
     def __init__(self, config: Ros2, setting: Setting, bus: Bus, messages: Messages) -> None:
         self._bus, self._messages, self._parts = bus, messages, setting.parts
         self._mesh_rate = Rate(config.mesh_hz)
+        self._cell = Cell(messages, config.mesh_hz) if setting.arms else None
         self._last: Update | None = None
         nothing = Update(sequence=0, stamp_ns=0, frames=setting.frames)
         self._publishers: dict[str, Publisher] = {
             suffix: bus.publisher(f"{config.namespace}/{suffix}", message_type)
-            for suffix, message_type, _ in messages_of(nothing, messages, self._parts)
+            for suffix, message_type, _ in self._messages_of(nothing)
         }
 
     def publish(self, update: Update) -> None:
@@ -67,7 +71,7 @@ class Ros2Sink:
         self._last = update
         failed: list[str] = []
         meshes = update.estimate is None or self._mesh_rate.due()
-        for suffix, _, message in messages_of(update, self._messages, self._parts, meshes):
+        for suffix, _, message in self._messages_of(update, meshes):
             try:
                 self._publishers[suffix].publish(self._messages.to_bytes(message))
             except InputError:
@@ -90,3 +94,6 @@ class Ros2Sink:
         finally:
             self._publishers = {}
             self._bus.close()
+
+    def _messages_of(self, update: Update, meshes: bool = True) -> list[Outgoing]:
+        return messages_of(update, self._messages, self._parts, meshes, self._cell)

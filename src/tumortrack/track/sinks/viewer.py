@@ -11,7 +11,6 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
-from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
@@ -25,8 +24,9 @@ from tumortrack.track.view.panel import Actions, Panel
 from tumortrack.track.view.points import point_under, seen_points
 from tumortrack.track.view.scene import Scene
 from tumortrack.track.view.server import close_server, open_server
-from tumortrack.track.view.slices import ORIENTATIONS, CarriedCt, Plane, slice_picture
+from tumortrack.track.view.slices import load_ct, plane_through, slice_picture
 from tumortrack.track.view.status import State, Status, backdrop
+from tumortrack.track.view.workcell import Cell, box_of
 
 if TYPE_CHECKING:
     from viser import SceneClickEvent
@@ -34,8 +34,6 @@ if TYPE_CHECKING:
 _STALE_S = 1.0
 _TICK_S = 0.2  # the status grows older, and slices are renewed, this often
 _SLICE_PIXELS = 320
-_SLICE_ROOM = 1.15  # side of a slice in the organ's largest extent
-_SAME_ORGAN_MM = 3.0  # a case's surface may differ from the model's by so much
 
 
 class Viewer(SinkConfig, frozen=True, kw_only=True, tag="viewer"):
@@ -80,7 +78,7 @@ class ViewerSink:
     """See ``track.live.Sink``. ``port``: where the page is."""
 
     def __init__(self, config: Viewer, setting: Setting) -> None:
-        ct = _load_ct(config.case, setting) if config.case else None
+        ct = load_ct(config.case, setting) if config.case else None
         self._config, self._setting, self._ct = config, setting, ct
         self._server = open_server(config.host, config.port)
         self.port: int = self._server.get_port()
@@ -93,16 +91,19 @@ class ViewerSink:
         self._fault: BaseException | None = None
         self._asked = False
         self._state: State | None = None
+        self._behind: tuple[State, bool] | None = None
         self._scene = Scene(self._server, setting, config.margin_mm)
-        actions = Actions(changed=self._changed, pick=self._ask, forget=self._forget)
-        self._panel = Panel(self._server, setting.parts, ct is not None, actions)
+        self._cell = Cell(self._server)
+        actions = Actions(self._changed, self._ask, self._forget, self._scene.look.turn)
+        self._panel = Panel(self._server, setting.parts, actions, ct is not None, setting.arms)
         self._say("waiting")
         self._closing = threading.Event()
         self._watch = threading.Thread(target=self._keep_watch, name="viewer", daemon=True)
         self._watch.start()
 
     def publish(self, update: Update) -> None:
-        """Show it: without an estimate at once, with one not more often than ``hz``."""
+        """Show it: without an estimate at once, with one not more often than ``hz``; arms each
+        time."""
         if self._closing.is_set():
             return
         now = time.monotonic()
@@ -110,6 +111,7 @@ class ViewerSink:
             before, self._update, self._came = self._update, update, now
             if update.estimate is None:
                 self._hide()
+            self._draw_cell(update)
             changed = before is None or self._shown is None or before.quality != update.quality
             if changed or now - self._drawn >= 1 / self._config.hz:
                 self._drawn = now
@@ -147,6 +149,18 @@ class ViewerSink:
             self._say("none")
             raise
 
+    def _draw_cell(self, update: Update) -> None:
+        try:
+            if update.workcell is None:
+                self._cell.hide()
+                return
+            self._cell.show(update.workcell)
+            if (box_mm := box_of(update.workcell)) is not None:
+                self._scene.look.oversee(box_mm)
+        except Exception as error:
+            self._cell.hide()
+            self._fault = error  # raised when the estimate has been shown
+
     def _hide(self) -> None:
         self._shown = None
         self._spells += 1
@@ -154,15 +168,17 @@ class ViewerSink:
         self._panel.put_slice(None)
 
     def _say(self, state: State) -> None:
-        if state != self._state:
-            self._state = state
-            self._server.scene.set_background_image(backdrop(state))
+        self._state = state
         self._beat += 1
         update = self._update
         age_s = time.monotonic() - self._came if update is not None else 0.0
         if update is not None and update.latency_ms is not None:
             age_s += update.latency_ms / 1000
-        self._panel.say(Status(state, update, age_s, self._beat))
+        status = Status(state, update, age_s, self._beat, self._setting.arms)
+        if (behind := (state, status.loud)) != self._behind:
+            self._behind = behind
+            self._server.scene.set_background_image(backdrop(*behind))
+        self._panel.say(status)
 
     def _keep_watch(self) -> None:
         """Says how old the last frame is, hides what got too old, renews the slice."""
@@ -172,6 +188,7 @@ class ViewerSink:
                     if self._update is not None and time.monotonic() - self._came > _STALE_S:
                         if self._shown is not None:
                             self._hide()
+                        self._cell.hide()
                         self._say("stale")
                     else:
                         self._say(self._state or "waiting")
@@ -187,7 +204,7 @@ class ViewerSink:
             part, orientation = self._panel.slice_through
         if update is None:
             return
-        plane = _plane(update, part, orientation)
+        plane = plane_through(update, part, orientation)
         motion = update.estimate.motion if update.estimate is not None else None
         picture = None
         if plane is not None and motion is not None:
@@ -253,35 +270,3 @@ class ViewerSink:
             self._setting.controls.pick(None)
             self._scene.mark(None, self._setting.frames)
             self._panel.picking(self._asked, False)
-
-
-def _load_ct(case: str, setting: Setting) -> CarriedCt:
-    from tumortrack.imaging.case import load_case
-
-    loaded = load_case(Path(case))
-    if setting.anatomy_ct is None:
-        raise InputError(
-            "viewer: case= shows the CT at the present position, which this model cannot: its "
-            "estimates have no motion. Leave it out, or train with a preset that warps."
-        )
-    apart = np.abs(loaded.anatomy.organ.box_mm - setting.anatomy_ct.organ.box_mm).max()
-    if apart > _SAME_ORGAN_MM:
-        raise InputError(
-            f"viewer: {case} is not the case that the model was trained on: the organs' boxes in "
-            f"the CT differ by {apart:.1f} mm. Give that case."
-        )
-    return CarriedCt(loaded)
-
-
-def _plane(update: Update, part: str, orientation: str) -> Plane | None:
-    """Through the middle of a part's present surface; centred on the organ, and as large."""
-    assert update.estimate is not None
-    meshes = update.estimate.meshes
-    if part not in meshes or "kidney" not in meshes:
-        return None
-    across, down = (np.array(axis) for axis in ORIENTATIONS[orientation])
-    normal = np.cross(across, down)
-    centre, middle = (meshes[name].box_mm.mean(0) for name in ("kidney", part))
-    everything = np.concatenate([mesh.box_mm for mesh in meshes.values()])
-    side = _SLICE_ROOM * float(np.ptp(everything, axis=0).max())
-    return Plane(centre + normal * (normal @ (middle - centre)), across, down, side)

@@ -4,17 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, get_args
 
 import numpy as np
 from jaxtyping import UInt8
 
+from tumortrack.track.view.look import View
 from tumortrack.track.view.scene import Options
 from tumortrack.track.view.slices import ORIENTATIONS
 from tumortrack.track.view.status import Status
 
 if TYPE_CHECKING:
-    from viser import ViserServer
+    from viser import ClientHandle, GuiEvent, ViserServer
 
 _WIDTH = 360  # pixels; the banner leaves this much room
 _CLICK, _CANCEL = "Click the organ", "Now click on the organ (again: cancel)"
@@ -27,13 +28,19 @@ class Actions:
     changed: Callable[[], None]
     pick: Callable[[], None]
     forget: Callable[[], None]
+    look: Callable[[ClientHandle, View], None]
 
 
 class Panel:
-    """The elements, shared by all clients."""
+    """The elements, shared by all clients. ``slices``: with the CT; ``arms``: with what they do."""
 
     def __init__(
-        self, server: ViserServer, parts: tuple[str, ...], slices: bool, actions: Actions
+        self,
+        server: ViserServer,
+        parts: tuple[str, ...],
+        actions: Actions,
+        slices: bool = False,
+        arms: bool = False,
     ) -> None:
         gui = server.gui
         gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
@@ -44,6 +51,14 @@ class Panel:
             _CLICK, hint="Of several things before the camera, choose the one that is the organ"
         )
         self._forget = gui.add_button("Choose again", visible=False)
+        if arms:
+            views = gui.add_button_group("Look at", get_args(View))
+
+            @views.on_click
+            def _(event: GuiEvent) -> None:
+                if event.client is not None:  # nobody's click otherwise: set by the program
+                    actions.look(event.client, event.target.value)
+
         self._numbers = gui.add_html("")
         self._slice = None
         if slices:

@@ -62,7 +62,7 @@ class Scene:
         self._has_organ = self._has_slice = False
         self._parts: dict[str, MeshHandle] = {}
         self._shells: dict[str, MeshHandle] = {}
-        self._look = Look(server, setting.frames)
+        self.look = Look(server, setting.frames)
         self._make_nodes(setting)
 
     def observe(self, update: Update) -> None:
@@ -73,12 +73,12 @@ class Scene:
         self._put_points(self._seen, transform_points(way, thinned(seen, MOST_SEEN)), colours.SEEN)
         organ_there = transform_points(way, thinned(organ, MOST_SEEN))
         self._put_points(self._organ, organ_there, colours.ORGAN)
-        self._axes.wxyz, self._axes.position = _wxyz(way[:3, :3]), way[:3, 3]
+        self._axes.wxyz, self._axes.position = wxyz_of(way[:3, :3]), way[:3, 3]
         if len(organ):
             lower, upper = organ.min(0), organ.max(0)
             corners = transform_points(way, lower + _CORNERS * (upper - lower))
             self._region.points = corners[_EDGES].astype(np.float32)
-            self._look.aim(update.frames, float(np.median(organ[:, 2])))
+            self.look.aim(update.frames, float(np.median(organ[:, 2])))
         self._has_organ = len(organ) > 0
 
     def show(self, update: Update) -> None:
@@ -89,7 +89,7 @@ class Scene:
         self.margins = self._margins_of(update, placed)
         for name, mesh in placed.meshes.items():
             if name in self._parts:
-                shown = self._look.last_drawn(self._bare(mesh)) if name == "kidney" else mesh
+                shown = self.look.last_drawn(self._bare(mesh)) if name == "kidney" else mesh
                 _put_mesh(self._parts[name], shown)
         for name, mesh in self.margins.items():
             _put_mesh(self._shells[name], mesh)
@@ -137,7 +137,7 @@ class Scene:
         axes = np.stack([plane.across, plane.down, np.cross(plane.across, plane.down)], axis=1)
         way = frames.published_from_camera
         self._slice.position = transform_points(way, plane.centre_mm[None])[0]
-        self._slice.wxyz = _wxyz(way[:3, :3] @ axes)
+        self._slice.wxyz = wxyz_of(way[:3, :3] @ axes)
         self._slice.render_width = self._slice.render_height = plane.side_mm
         solid = (picture > 8).any(2, keepdims=True)
         self._slice.image = np.concatenate([picture, solid.astype(np.uint8) * 255], axis=2)
@@ -256,7 +256,8 @@ def _put_mesh(node: MeshHandle, mesh: Mesh) -> None:
     node.vertices = mesh.vertices_mm.astype(np.float32)
 
 
-def _wxyz(rotation: Float[np.ndarray, "3 3"]) -> np.ndarray:
+def wxyz_of(rotation: Float[np.ndarray, "3 3"]) -> np.ndarray:
+    """The quaternion, as viser wants it."""
     from scipy.spatial.transform import Rotation
 
     return Rotation.from_matrix(rotation).as_quat(scalar_first=True)

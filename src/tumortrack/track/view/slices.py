@@ -4,14 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float, Float32, Float64, UInt8
 
+from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import spacing_mm, transform_points
 from tumortrack.core.motion import Motion
 from tumortrack.core.types import Mesh
-from tumortrack.imaging.case import Case
+from tumortrack.imaging.case import Case, load_case
+from tumortrack.track.live import Setting, Update
 from tumortrack.track.view.colours import Colour
 
 # Directions of the image's columns and rows in the camera frame (x right, y down, z forward).
@@ -22,6 +25,8 @@ ORIENTATIONS: dict[str, tuple[tuple[float, ...], tuple[float, ...]]] = {
 }
 _SURE_MM, _UNSURE_MM = 5.0, 20.0  # outside the organ the motion is a guess: the CT fades out
 _FAINT = 0.3
+_SLICE_ROOM = 1.15  # side of a slice in the organ's largest extent
+_SAME_ORGAN_MM = 3.0  # a case's surface may differ from the model's by so much
 _BAR_MM = 10
 _FINER = 2
 _COARSER = 2  # the CT is sampled coarser: a pixel in the panel is less than a voxel
@@ -146,3 +151,38 @@ def _window(hu: Float32[np.ndarray, " n"]) -> tuple[float, float]:
     low, high = np.nanpercentile(hu, (1, 99))
     room = max(50.0, 0.5 * float(high - low))
     return float(low) - room, float(high) + room
+
+
+def load_ct(case: str, setting: Setting) -> CarriedCt:
+    """
+    Raises:
+        InputError: the model knows no motion, or the case is another patient's.
+        ArtifactError: ``case`` is no case.
+    """
+    loaded = load_case(Path(case))
+    if setting.anatomy_ct is None:
+        raise InputError(
+            "viewer: case= shows the CT at the present position, which this model cannot: its "
+            "estimates have no motion. Leave it out, or train with a preset that warps."
+        )
+    apart = np.abs(loaded.anatomy.organ.box_mm - setting.anatomy_ct.organ.box_mm).max()
+    if apart > _SAME_ORGAN_MM:
+        raise InputError(
+            f"viewer: {case} is not the case that the model was trained on: the organs' boxes in "
+            f"the CT differ by {apart:.1f} mm. Give that case."
+        )
+    return CarriedCt(loaded)
+
+
+def plane_through(update: Update, part: str, orientation: str) -> Plane | None:
+    """Through the middle of a part's present surface; centred on the organ, and as large."""
+    assert update.estimate is not None
+    meshes = update.estimate.meshes
+    if part not in meshes or "kidney" not in meshes:
+        return None
+    across, down = (np.array(axis) for axis in ORIENTATIONS[orientation])
+    normal = np.cross(across, down)
+    centre, middle = (meshes[name].box_mm.mean(0) for name in ("kidney", part))
+    everything = np.concatenate([mesh.box_mm for mesh in meshes.values()])
+    side = _SLICE_ROOM * float(np.ptp(everything, axis=0).max())
+    return Plane(centre + normal * (normal @ (middle - centre)), across, down, side)

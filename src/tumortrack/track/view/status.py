@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import UInt8
 
-from tumortrack.track.live import Update
+from tumortrack.track.live import Update, Workcell
 from tumortrack.track.view import colours
 from tumortrack.track.view.colours import Colour, css, part_colour
 
@@ -25,7 +25,7 @@ _COLOURS: dict[State, Colour] = {
     "none": colours.NONE,
     "stale": colours.STALE,
 }
-_LOUD: dict[State, str] = {"waiting": "WAITING", "none": "NO ESTIMATE", "stale": "STALE"}
+_HEADING: dict[State, str] = {"waiting": "WAITING", "none": "NO ESTIMATE", "stale": "STALE"}
 
 # The page's own watch: every message replaces this element and so starts its clock anew. When
 # none comes (the program was killed, the network is gone) it shows itself, by the browser alone;
@@ -50,22 +50,52 @@ _WATCH = f"""
 @dataclass(frozen=True, eq=False)
 class Status:
     """What is to be said now. ``update``: the last; ``age_s``: since its frame; ``beat`` differs
-    from message to message."""
+    from message to message; ``arms``: there may be some."""
 
     state: State
     update: Update | None
     age_s: float
     beat: int
+    arms: bool = False
+
+    @property
+    def loud(self) -> bool:
+        """There is nothing that may be looked at. Arms that go on without an estimate are meant
+        to, as of a plan that is only shown: they would be halted."""
+        cell = self._cell
+        return self.state in _HEADING and (cell is None or bool(cell.halted))
+
+    @property
+    def _cell(self) -> Workcell | None:
+        """What arms do, as far as it is still true."""
+        if self.update is None or self.state in ("waiting", "stale"):
+            return None
+        return self.update.workcell
 
     def flag(self) -> str:
         """How good, in one line; over the page a banner with the reason, and the page's watch."""
-        text = {"good": "GOOD", "poor": "POOR"}.get(self.state) or _LOUD[self.state]
+        text = {"good": "GOOD", "poor": "POOR"}.get(self.state) or _HEADING[self.state]
         return (
             f"<i hidden>{self.beat}</i>{_WATCH}{self._banner()}"
-            f"<div style='background:{css(_COLOURS[self.state])};color:white;padding:8px 12px;"
-            "margin:8px 12px;border-radius:6px;font-size:15px;font-weight:700'>"
-            f"{text}</div>"
+            f"{_box(text, _COLOURS[self.state])}{self._arms() if self.arms else ''}"
         )
+
+    def _arms(self) -> str:
+        """What they do: in the panel, and over the scene; where they stand still, why."""
+        cell = self._cell
+        if cell is None:
+            return _box("ARMS: nothing is known of them", colours.STALE)
+        colour = colours.NONE if cell.halted else colours.ARMS
+        said = f"ARMS: {escape(cell.state)}"
+        why = f"<div style='font-weight:400'>{escape(cell.halted)}</div>" if cell.halted else ""
+        over = (
+            "<div style='position:fixed;bottom:18px;left:18px;right:378px;z-index:9998;"
+            "pointer-events:none;display:flex;justify-content:center'>"
+            f"<div style='background:{css(colour)};color:white;padding:8px 20px;border-radius:10px;"
+            f"text-align:center;font:700 20px/1.25 system-ui,sans-serif'>{escape(cell.state)}"
+            f"{': HALTED' if cell.halted else ''}{why}</div></div>"
+        )
+        return over + _box(f"{said}{', HALTED' if cell.halted else ''}", colour)
 
     def numbers(self) -> str:
         """Probabilities, age, latency and the stages' times."""
@@ -102,30 +132,37 @@ class Status:
         """Over the scene: big where there is nothing to see."""
         if self.state == "good":
             return ""
-        loud = _LOUD.get(self.state)
-        size = 44 if loud else 20
+        size = 44 if self.loud else 20
         why = f"<div style='font-size:19px;font-weight:400'>{escape(self._reason())}</div>"
         return (
             "<div style='position:fixed;top:18px;left:18px;right:378px;z-index:9998;"
             "pointer-events:none;display:flex;justify-content:center'>"
             f"<div style='background:{css(_COLOURS[self.state])};color:white;padding:10px 26px;"
             f"border-radius:10px;text-align:center;font:800 {size}px/1.2 system-ui,sans-serif'>"
-            f"{loud or 'POOR ESTIMATE'}{why}</div></div>"
+            f"{_HEADING.get(self.state, 'POOR ESTIMATE')}{why}</div></div>"
         )
 
 
-def backdrop(state: State) -> UInt8[np.ndarray, "h w 3"]:
-    """What lies behind the scene: dark; where nothing can be shown, a warning colour and the word,
-    so that it is read with the panel closed too."""
+def _box(text: str, colour: Colour) -> str:
+    """A line of the panel."""
+    return (
+        f"<div style='background:{css(colour)};color:white;padding:8px 12px;margin:8px 12px;"
+        f"border-radius:6px;font-size:15px;font-weight:700'>{text}</div>"
+    )
+
+
+def backdrop(state: State, loud: bool) -> UInt8[np.ndarray, "h w 3"]:
+    """What lies behind the scene: dark; where it is ``loud``, a warning colour and the word, so
+    that it is read with the panel closed too."""
     from PIL import Image, ImageDraw
 
-    if state not in _LOUD:
+    if not loud:
         return np.full((4, 4, 3), colours.BACKGROUND, np.uint8)
     dark = colours.BACKGROUND_NONE if state == "none" else colours.BACKGROUND_STALE
     image = Image.new("RGB", (960, 800), dark)
     brighter = tuple(min(255, 2 * channel + 30) for channel in dark)
     draw = ImageDraw.Draw(image)
-    draw.text((480, 730), _LOUD[state], fill=brighter, font_size=84, anchor="mm")
+    draw.text((480, 730), _HEADING[state], fill=brighter, font_size=84, anchor="mm")
     return np.asarray(image)
 
 
