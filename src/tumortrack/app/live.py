@@ -21,8 +21,9 @@ from tumortrack.core.errors import InputError, StorageError
 if TYPE_CHECKING:
     from tumortrack.core.types import Anatomy
     from tumortrack.learn.config import TrainConfig
+    from tumortrack.plan.operation import Operation
     from tumortrack.sense.region import RegionConfig
-    from tumortrack.track.live import Setting, SinkConfig, Update
+    from tumortrack.track.live import Frames, Setting, SinkConfig, Update
     from tumortrack.track.loop import Loop, LoopConfig
     from tumortrack.track.outlet import Outlet
     from tumortrack.track.reader import Reader
@@ -50,20 +51,34 @@ class TrackOptions:
     device: Literal["auto", "cpu", "cuda"] = "auto"
 
 
-def track(model_folder: Path, source: str, sinks: tuple[str, ...], options: TrackOptions) -> None:
-    """Runs until the source ends, the time is up, or Ctrl-C."""
+@dataclass(frozen=True, eq=False)
+class Arms:
+    """Arms that act on what is tracked, and the frame in which everything is then published."""
+
+    companion: Operation
+    frames: Frames
+    about: dict
+
+
+def track(
+    model_folder: Path,
+    source: str,
+    sinks: tuple[str, ...],
+    options: TrackOptions,
+    arms: Arms | None = None,
+) -> None:
+    """Runs until the source ends, the time is up, the arms have ended, or Ctrl-C."""
     from tumortrack.track.frames import read_frames
     from tumortrack.track.live import Controls, Frames, Setting
-    from tumortrack.track.sinks import SINKS
     from tumortrack.track.sources import SOURCES
     from tumortrack.track.spec import parse_spec
 
     source_config = parse_spec(source, SOURCES, "source")
-    sink_configs = [parse_spec(sink, SINKS, "sink") for sink in sinks]
-    if doubled := sorted({sink for sink in sinks if sinks.count(sink) > 1}):
-        raise InputError(f"sink {doubled[0]!r} is given twice.")
+    sink_configs = parse_sinks(sinks)
     frames = read_frames(options.frame) if options.frame else Frames()
-    report = _place_of_report(options.report)
+    if arms is not None:
+        frames = arms.frames
+    report = place_of_report(options.report, "track")
 
     from tumortrack.learn.model import load_model  # PyTorch takes seconds
     from tumortrack.track.loop import Loop
@@ -73,8 +88,8 @@ def track(model_folder: Path, source: str, sinks: tuple[str, ...], options: Trac
     model = load_model(model_folder, options.device)
     tracker = Tracker(model)
     config = _loop_config(model.config, tracker.anatomy_ct, options)
-    setting = Setting(model.parts, frames, tracker.anatomy_ct, Controls())
-    loop = Loop(tracker, setting, config)
+    setting = Setting(model.parts, frames, tracker.anatomy_ct, Controls(), arms is not None)
+    loop = Loop(tracker, setting, config, None if arms is None else arms.companion)
     about = {
         "model": model.provenance,
         "model_sha256": store.sha256_of(model_folder / store.MANIFEST),
@@ -85,16 +100,15 @@ def track(model_folder: Path, source: str, sinks: tuple[str, ...], options: Trac
             "frame_id": frames.frame_id,
             "published_from_camera": frames.published_from_camera.tolist(),
         },
+        **({} if arms is None else arms.about),
     }
     say("warming up ...")
     loop.warm()
     with ExitStack() as stack:
         stack.enter_context(_stopping(loop))  # first in, last out: also while sinks flush
-        screen = _Screen(loop, report, about)
+        screen = _Screen(loop, report, about, None if arms is None else arms.companion)
         stack.callback(screen.end)
-        # Those that make a folder last: if another cannot open, none is left behind.
-        in_turn = sorted(zip(sink_configs, sinks, strict=True), key=lambda pair: pair[0].waiting)
-        outlets = [_open(spec, sink, setting, stack) for sink, spec in in_turn]
+        outlets = open_sinks(sinks, sink_configs, setting, stack)
         reader = Reader(source_config.open)
         stack.callback(reader.close)
         screen.watch(reader, outlets)
@@ -102,12 +116,30 @@ def track(model_folder: Path, source: str, sinks: tuple[str, ...], options: Trac
         loop.run(reader, outlets, screen.show)
 
 
-def _open(spec: str, config: SinkConfig, setting: Setting, stack: ExitStack) -> Outlet:
+def parse_sinks(sinks: tuple[str, ...]) -> list[SinkConfig]:
+    """Configurations of what was written on the command line."""
+    from tumortrack.track.sinks import SINKS
+    from tumortrack.track.spec import parse_spec
+
+    configs = [parse_spec(sink, SINKS, "sink") for sink in sinks]
+    if doubled := sorted({sink for sink in sinks if sinks.count(sink) > 1}):
+        raise InputError(f"sink {doubled[0]!r} is given twice.")
+    return configs
+
+
+def open_sinks(
+    sinks: tuple[str, ...], configs: list[SinkConfig], setting: Setting, stack: ExitStack
+) -> list[Outlet]:
+    """Each at work in a thread of its own, until the stack ends."""
     from tumortrack.track.outlet import Outlet
 
-    outlet = Outlet(spec, config.open(setting), config.waiting)
-    stack.callback(outlet.close)
-    return outlet
+    outlets = []
+    # Those that make a folder last: if another cannot open, none is left behind.
+    for spec, config in sorted(zip(sinks, configs, strict=True), key=lambda pair: pair[1].waiting):
+        outlet = Outlet(spec, config.open(setting), config.waiting)
+        stack.callback(outlet.close)
+        outlets.append(outlet)
+    return outlets
 
 
 def _loop_config(
@@ -160,9 +192,10 @@ def _region(
     return RegionConfig(crop=crop, box_mm=box, organ_mm=size_mm)
 
 
-def _place_of_report(path: Path | None) -> Path:
+def place_of_report(path: Path | None, command: str) -> Path:
+    """Where the report goes; its folder is made."""
     if path is None:
-        path = Path("runs") / f"track-{datetime.now(UTC):%Y%m%dT%H%M%SZ}.json"
+        path = Path("runs") / f"{command}-{datetime.now(UTC):%Y%m%dT%H%M%SZ}.json"
     elif path.exists():
         raise InputError(f"{path} exists already. Choose another file for --report.")
     try:
@@ -192,8 +225,10 @@ def _stopping(loop: Loop) -> Iterator[None]:
 class _Screen:
     """One line of state now and then, every change of quality, and the report."""
 
-    def __init__(self, loop: Loop, report: Path, about: dict) -> None:
-        self._loop, self._report, self._about = loop, report, about
+    def __init__(
+        self, loop: Loop, report: Path, about: dict, arms: Operation | None = None
+    ) -> None:
+        self._loop, self._report, self._about, self._arms = loop, report, about, arms
         self._reader: Reader | None = None
         self._outlets: list[Outlet] = []
         self._started = self._said = self._stored = time.monotonic()
@@ -211,6 +246,9 @@ class _Screen:
         """Called with every update."""
         state = update.reason or update.warning or "good"
         kind = "".join(c for c in state if not c.isdigit())
+        if (cell := update.workcell) is not None:
+            state += f"; arms: {cell.state}" + (f" ({cell.halted})" if cell.halted else "")
+            kind += cell.state + "".join(c for c in cell.halted if not c.isdigit())
         now = time.monotonic()
         if kind != self._state and now - self._changed >= _SAY_S:
             self._state, self._changed = kind, now
@@ -282,6 +320,7 @@ class _Screen:
             "seconds": round(self._stored - self._started, 2),
             "memory_mb": self._memory_mb,
             **summary(self._loop, reader, self._outlets),
+            **({} if self._arms is None else {"resection": self._arms.summary()}),
         }
         try:
             store.write_json(self._report, content)

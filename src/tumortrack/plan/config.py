@@ -7,7 +7,7 @@ from tumortrack.core.errors import InputError
 from tumortrack.plan.values import Method
 
 _ALLOWED = {
-    "margin_mm": (0.0, 30.0),
+    "margin_mm": (1.0, 30.0),
     "sigmas": (0.0, 10.0),
     "spacing_mm": (0.2, 10.0),
     "layer_mm": (0.5, 20.0),

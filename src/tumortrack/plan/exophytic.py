@@ -29,7 +29,7 @@ def chosen_tumor(located: Located, config: ResectionConfig) -> tuple[int, float]
     if config.tumor and config.tumor not in names:
         raise InputError(f"there is no {config.tumor!r}; located were {', '.join(names)}.")
     asked = [names[config.tumor]] if config.tumor else list(names.values())
-    shares = {label: exophytic_share(located, label) for label in asked}
+    shares = exophytic_shares(located, asked)
     label = max(shares, key=lambda one: shares[one])
     if len(located.of(label)) < _FEWEST:
         raise NoPlan(
@@ -50,19 +50,20 @@ def name_of(label: int) -> str:
     return part_names(label)[label - 1]
 
 
-def exophytic_share(located: Located, label: int) -> float:
-    """How much of a tumor lies outside the convex hull of the organ without tumors."""
+def exophytic_shares(located: Located, labels: list[int]) -> dict[int, float]:
+    """How much of each tumor lies outside the convex hull of the organ without tumors."""
     from scipy.spatial import ConvexHull, QhullError
 
-    organ = located.of(ORGAN)
     try:
-        hull = ConvexHull(_outermost(organ))
+        hull = ConvexHull(_outermost(located.of(ORGAN)))
     except QhullError as error:
         raise NoPlan("the organ's points lie in a plane; locate it anew.") from error
-    sides = hull.equations[:, :3].astype(np.float32), hull.equations[:, 3].astype(np.float32)
-    tumor = located.of(label).astype(np.float32)
-    outside = (tumor @ sides[0].T + sides[1]).max(axis=1) > 0
-    return float(outside.mean())
+    normals, offsets = np.split(hull.equations.astype(np.float32), [3], axis=1)
+    shares = {}
+    for label in labels:
+        points = located.of(label).astype(np.float32)
+        shares[label] = float(((normals @ points.T + offsets).max(axis=0) > 0).mean())
+    return shares
 
 
 def _outermost(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "m 3"]:
@@ -71,6 +72,6 @@ def _outermost(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "m 3"]:
     z = 1 - (2 * n + 1) / _DIRECTIONS  # a Fibonacci sphere
     turn = n * np.pi * (3 - np.sqrt(5))
     ring = np.sqrt(1 - z * z)
-    directions = np.stack([ring * np.cos(turn), ring * np.sin(turn), z]).astype(np.float32)
-    farthest = (points.astype(np.float32) @ directions).argmax(axis=0)
+    directions = np.stack([ring * np.cos(turn), ring * np.sin(turn), z], axis=1)
+    farthest = (directions.astype(np.float32) @ points.T.astype(np.float32)).argmax(axis=1)
     return points[np.unique(farthest)].astype(np.float64)

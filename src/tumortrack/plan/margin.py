@@ -18,11 +18,14 @@ from tumortrack.plan.exophytic import name_of
 from tumortrack.plan.outline import arcs, evenly, polygon_of, polygons, rings_of
 from tumortrack.plan.values import Cut, Layer, Located
 
-_CELL_MM = 0.8  # of outlines: they are exact to a tenth of that, for they are interpolated
-_THIN_MM = 1.0  # one surface point in each cube of this size
+# Of outlines, which are interpolated; and one surface point in each cube of that size. Both finer
+# where the margin is narrow, so that it is kept to a sixth of a millimetre.
+_CELL_MM, _CELL_SHARE = 1.0, 0.4
+_THIN_MM, _THIN_SHARE = 1.2, 0.33
 _COLUMN_MM = 2.0  # of the organ's upper and lower surface
 _SMOOTH_MM = 0.05  # outlines lose corners smaller than this
 _FAR_MM = 1e3
+_LEAST_MM2 = 1.0  # a smaller rest of a floor needs no stroke
 _MOST_LAYERS = 60
 
 
@@ -75,7 +78,8 @@ def grown_tumor(
             f"the estimate is so unsure that the margin would be {widest:.1f} mm wide; allowed are "
             f"{config.most_margin_mm:g} mm. Look from nearer, or uncover more of the organ."
         )
-    cube = np.floor(points / _THIN_MM).astype(np.int64)
+    size_mm = min(_THIN_MM, _THIN_SHARE * float(margins.min()))
+    cube = np.floor(points / size_mm).astype(np.int64)
     cube -= cube.min(0)
     size = cube.max(0) + 1
     keep = np.unique((cube[:, 0] * size[1] + cube[:, 1]) * size[2] + cube[:, 2], return_index=True)
@@ -123,11 +127,6 @@ class Columns:
         """Where there is organ between two heights."""
         low, high = self.at(points_mm)
         return (high > bottom_mm) & (low < top_mm)  # False at NaN
-
-    @property
-    def volume_mm3(self) -> float:
-        """Of a body without overhangs."""
-        return float(np.nansum(self.highest_mm - self.lowest_mm)) * _COLUMN_MM**2
 
 
 def _spread(values: Float[np.ndarray, "i j"]) -> Float64[np.ndarray, "i j"]:
@@ -178,18 +177,18 @@ def _outlines(
 
     from tumortrack.plan.margin_kernels import outline_fields
 
-    room = float(margins.max()) + 4 * _CELL_MM
+    cell = min(_CELL_MM, _CELL_SHARE * float(margins.min()))
+    room = float(margins.max()) + 4 * cell
     first = points[:, :2].min(0) - room
-    shape = np.ceil((points[:, :2].max(0) + room - first) / _CELL_MM).astype(int) + 1
+    shape = np.ceil((points[:, :2].max(0) + room - first) / cell).astype(int) + 1
     fields = np.full((len(levels_mm), *shape), _FAR_MM)
-    outline_fields(points, margins, np.asarray(levels_mm, float), first, _CELL_MM, fields)
+    outline_fields(points, margins, np.asarray(levels_mm, float), first, cell, fields)
     found = []
     for field in fields:
         # Far cells hold no distance: next to the outline all are nearer than this.
-        contours = find_contours(np.minimum(field, 2 * _CELL_MM), 0.0)
-        pieces = [shapely.Polygon(first + c * _CELL_MM) for c in contours if len(c) > 3]
-        area = shapely.union_all([shapely.Polygon(p.exterior) for p in pieces])
-        found.append(rings_of(area.simplify(_SMOOTH_MM)))
+        contours = find_contours(np.minimum(field, 2 * cell), 0.0)
+        area = polygon_of(first + c * cell for c in contours if len(c) > 3)
+        found.append(rings_of(shapely.simplify(area, _SMOOTH_MM, preserve_topology=False)))
     return found
 
 
@@ -208,14 +207,14 @@ def _strokes(
         flat = evenly(np.concatenate([ring, ring[:1]]), config.spacing_mm)[:-1]
         there = columns.within(flat, z, layer.top_mm)
         strokes += [_cut(line, z, "wall") for line in arcs(flat, there, lead)]
-    inset = area.buffer(-config.stroke_mm)
-    while not inset.is_empty:
+    inset = area.buffer(-config.stroke_mm, quad_segs=4)
+    while inset.intersection(open_floor).area > _LEAST_MM2:
         for piece in polygons(inset):
             ring = np.array(piece.exterior.coords)
             flat = evenly(ring, config.spacing_mm)[:-1]
             there = shapely.contains_xy(open_floor, *flat.T) & columns.within(flat, z, z)
             strokes += [_cut(line, z, "floor") for line in arcs(flat, there, lead)]
-        inset = inset.buffer(-config.stroke_mm)
+        inset = inset.buffer(-config.stroke_mm, quad_segs=4)
     return strokes
 
 

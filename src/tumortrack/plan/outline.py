@@ -14,8 +14,8 @@ if TYPE_CHECKING:
     from shapely import Polygon
 
 _MOST = 1200  # points of a hull: more don't change it, and take longer
-_EDGE = 6.0  # longest edge of a hull in typical distances between its points
-_GAP = 4.0  # farther than that from all others, in the same unit: another cluster
+_EDGE = 5.0  # longest edge of a hull, in sqrt(area / number of points)
+_GAP = 3.0  # wider apart, in the same unit: another cluster
 _LEAST_MM2 = 1.0  # smaller pieces of an outline are none
 _SMOOTH = 16  # corners of a quarter circle: 5 mm of margin are exact to 0.01 mm
 
@@ -23,7 +23,7 @@ _SMOOTH = 16  # corners of a quarter circle: 5 mm of margin are exact to 0.01 mm
 def concave_hull(points_mm: Float[np.ndarray, "n 2"]) -> Polygon:
     """The outline of a cloud's largest cluster.
 
-    Edges may be as long as 6 sqrt(A / n), A being the convex hull's area: the ratio that GEOS
+    Edges may be as long as 5 sqrt(A / n), A being the convex hull's area: the ratio that GEOS
     takes means another length at every density.
 
     Raises:
@@ -34,6 +34,8 @@ def concave_hull(points_mm: Float[np.ndarray, "n 2"]) -> Polygon:
 
     points = _thinned(np.asarray(points_mm, float))
     try:
+        if len(points) < 3:
+            raise ValueError("too few")
         points = _largest_cluster(points)
         triangles = Delaunay(points).simplices
     except (QhullError, ValueError, IndexError) as error:
@@ -105,7 +107,10 @@ def polygon_of(rings_mm: Iterable[Float[np.ndarray, "n 2"]]) -> Any:
     """What ``rings_of`` took apart."""
     import shapely
 
-    return shapely.union_all([shapely.Polygon(ring).buffer(0) for ring in rings_mm])
+    pieces = [shapely.Polygon(ring) for ring in rings_mm]
+    if len(pieces) == 1 and pieces[0].is_valid:
+        return pieces[0]
+    return shapely.union_all([shapely.make_valid(piece) for piece in pieces])
 
 
 def polygons(area: Any) -> list[Polygon]:
@@ -134,13 +139,10 @@ def _thinned(points: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "m 2"]:
 def _largest_cluster(points: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "m 2"]:
     """Without points that lie far from the most."""
     from scipy.sparse.csgraph import connected_components
-    from scipy.spatial import cKDTree
+    from scipy.spatial import ConvexHull, cKDTree
 
     tree = cKDTree(points)
-    nearest = tree.query(points, k=2)[0][:, 1]
-    apart_mm = _GAP * float(np.median(nearest)) + 1e-9
-    # Points at random leave gaps of several times their typical distance.
-    apart_mm = max(apart_mm, 2.0 * float(np.percentile(nearest, 95)))
+    apart_mm = _GAP * np.sqrt(ConvexHull(points).volume / len(points))
     close = tree.sparse_distance_matrix(tree, apart_mm, output_type="coo_matrix")
     which = connected_components(close, directed=False)[1]
     return points[which == np.bincount(which).argmax()]

@@ -12,11 +12,12 @@ from tumortrack.core.errors import NoPlan
 from tumortrack.core.types import FIRST_TUMOR
 from tumortrack.plan.config import ResectionConfig
 from tumortrack.plan.exophytic import chosen_tumor, name_of
-from tumortrack.plan.margin import Columns, margin_cuts, margin_grasp
+from tumortrack.plan.margin import margin_cuts, margin_grasp
 from tumortrack.plan.outline import polygon_of
 from tumortrack.plan.published import published_cuts, published_grasp
 from tumortrack.plan.values import Layer, Located, ResectionPlan
 
+_A_COLUMN = 30  # points in a column, about
 _WHOLE, _TOUCHED = 0.99, 0.02  # of another tumor's points
 
 
@@ -81,7 +82,8 @@ def inside(
 def _volumes_ml(located: Located, label: int, taken: Bool[np.ndarray, " n"]) -> dict[str, float]:
     """By counting points, which lie evenly in the organ."""
     kidney = located.meshes.get("kidney")
-    organ_ml = (Columns.of(located).volume_mm3 if kidney is None else kidney.volume_mm3) / 1000
+    organ_mm3 = cloud_volume_mm3(located.points_mm) if kidney is None else kidney.volume_mm3
+    organ_ml = organ_mm3 / 1000
     each_ml = organ_ml / len(located.points_mm)
     tumor, healthy = located.labels == label, located.labels < FIRST_TUMOR
     return {
@@ -91,6 +93,26 @@ def _volumes_ml(located: Located, label: int, taken: Bool[np.ndarray, " n"]) -> 
         "piece": each_ml * float((taken | tumor).sum()),
         "healthy": each_ml * float((taken & healthy).sum()),
     }
+
+
+def cloud_volume_mm3(points_mm: Float[np.ndarray, "n 3"]) -> float:
+    """Of a body that points lie evenly in, without overhangs: the sum over columns of their area
+    times the height that k points' span stands for, (k + 1) / (k - 1) of it."""
+    flat = points_mm[:, :2] - points_mm[:, :2].min(0)
+    side_mm = float(np.sqrt(_A_COLUMN * np.ptp(flat, axis=0).prod() / len(flat)))
+    cell = (flat / side_mm).astype(int)
+    shape = cell.max(0) + 1
+    index = cell[:, 0] * shape[1] + cell[:, 1]
+    low, high = np.full(shape.prod(), np.inf), np.full(shape.prod(), -np.inf)
+    np.minimum.at(low, index, points_mm[:, 2])
+    np.maximum.at(high, index, points_mm[:, 2])
+    count = np.bincount(index, minlength=len(low))
+    some = count >= 2
+    span = (high - low)[some] * (count[some] + 1) / (count[some] - 1)
+    # A column at the edge is not full: it counts by how dense its points are.
+    dense = np.median(count[some] / span)
+    area = np.minimum(1.0, count[some] / span / dense)
+    return float((span * area).sum() * side_mm**2)
 
 
 def _others(located: Located, label: int, taken: Bool[np.ndarray, " n"]) -> tuple[str, ...]:

@@ -22,6 +22,7 @@ _TYPES = {
 }
 _NAMES = {"u1": "uchar", "i4": "int", "f4": "float", "f8": "double"}
 _ORDERS = {"ascii": "<", "binary_little_endian": "<", "binary_big_endian": ">"}
+CAMERA = "camera (x right, y down, z forward)"
 _LONGEST_HEADER = 64 * 1024  # bytes
 
 
@@ -108,20 +109,24 @@ def _cut_off(name: str, claimed: int, held: int) -> str:
     )
 
 
-def write_cloud_ply(path: Path, points_mm: np.ndarray, **point_properties: np.ndarray) -> None:
+def write_cloud_ply(
+    path: Path, points_mm: np.ndarray, *, frame: str = CAMERA, **point_properties: np.ndarray
+) -> None:
     """Write points (n, 3) as binary little-endian PLY, float32 mm, with further properties.
 
     Each property is an array (n,) of uint8, int32, float32 or float64 (``label=``,
-    ``probability=``).
+    ``probability=``); ``frame`` stands in a comment.
 
     Raises:
         InputError: a property of another length or type.
         StorageError: the disk refused.
     """
-    write_atomically(path, cloud_ply(points_mm, **point_properties))
+    write_atomically(path, cloud_ply(points_mm, frame=frame, **point_properties))
 
 
-def cloud_ply(points_mm: np.ndarray, **point_properties: np.ndarray) -> bytes:
+def cloud_ply(
+    points_mm: np.ndarray, *, frame: str = CAMERA, **point_properties: np.ndarray
+) -> bytes:
     """What ``write_cloud_ply`` writes.
 
     Raises:
@@ -145,7 +150,7 @@ def cloud_ply(points_mm: np.ndarray, **point_properties: np.ndarray) -> bytes:
     header = [
         "ply",
         "format binary_little_endian 1.0",
-        "comment frame camera (x right, y down, z forward), unit mm",
+        f"comment frame {frame}, unit mm",
         f"element vertex {len(points)}",
         *(
             f"property {_NAMES[code]} {name}"

@@ -27,7 +27,7 @@ from tumortrack.sense.region import Hints, RegionConfig, organ_points
 from tumortrack.track.clock import StampCheck
 from tumortrack.track.estimate import Estimate
 from tumortrack.track.follower import Follower, FollowerConfig
-from tumortrack.track.live import Quality, Seen, Setting, SourceLost, Update
+from tumortrack.track.live import Companion, Quality, Seen, Setting, SourceLost, Update
 from tumortrack.track.meter import Histogram
 from tumortrack.track.outlet import Outlet
 from tumortrack.track.quality import judge
@@ -71,8 +71,14 @@ class Loop:
     """One run from a source to sinks. ``run`` returns when the source ends, when ``stop`` was
     called from anywhere, or when the time is up."""
 
-    def __init__(self, tracker: Tracker, setting: Setting, config: LoopConfig) -> None:
-        self._config, self._setting = config, setting
+    def __init__(
+        self,
+        tracker: Tracker,
+        setting: Setting,
+        config: LoopConfig,
+        companion: Companion | None = None,
+    ) -> None:
+        self._config, self._setting, self._companion = config, setting, companion
         self._follower = Follower(tracker, config.follower)
         self._stamps = StampCheck(config.stale_s)
         self._stop = threading.Event()
@@ -115,6 +121,16 @@ class Loop:
             SourceLost: no frame came for ``give_up_s``.
             TumortrackError: the source can never work (as its ``open`` said).
         """
+        try:
+            self._run(reader, outlets, seen_by)
+        finally:
+            if self._companion is not None and not self._companion.ended:
+                self._companion.abort("tracking has ended")
+                self._publish(self._silence(None, 0.0, "tracking has ended"), outlets)
+
+    def _run(
+        self, reader: Reader, outlets: list[Outlet], seen_by: Callable[[Update], None]
+    ) -> None:
         fresh = time.monotonic()
         ends = math.inf
         while not self._stop.is_set():
@@ -131,9 +147,9 @@ class Loop:
                 return
             else:
                 update = self._silence(got, now - fresh, reader.trouble)
-            self._publish(update, outlets)
+            update = self._publish(update, outlets)
             seen_by(update)
-            if now >= ends:
+            if now >= ends or (self._companion is not None and self._companion.ended):
                 return
             if now - fresh > self._config.give_up_s:
                 trouble = f": {reader.trouble}" if reader.trouble else ""
@@ -241,7 +257,9 @@ class Loop:
         stamp_ns, then_ns = self._stamp
         return stamp_ns + time.monotonic_ns() - then_ns
 
-    def _publish(self, update: Update, outlets: list[Outlet]) -> None:
+    def _publish(self, update: Update, outlets: list[Outlet]) -> Update:
+        if self._companion is not None:
+            update = self._with_arms(self._companion, update)
         for outlet in outlets:
             outlet.put(update)
         self.counts[update.quality] += 1
@@ -257,6 +275,17 @@ class Loop:
             and update.estimate is not None
         ):
             self._hold_against(update.estimate, update.seen.truth)
+        return update
+
+    def _with_arms(self, arms: Companion, update: Update) -> Update:
+        try:
+            if self._setting.controls.aborted.is_set():
+                arms.abort("aborted by the user")
+            return arms.act(update)
+        except Exception as error:  # a defect there: no arms move, and the organ is still seen
+            self._remember(error)
+            arms.abort(f"internal error, {type(error).__name__}: {error}")
+            return update
 
     def _hold_against(self, estimate: Estimate, truth: Anatomy) -> None:
         for name, true in zip(truth.names, truth.parts, strict=True):

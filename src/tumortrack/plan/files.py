@@ -1,0 +1,212 @@
+"""The folder of a plan: numbers as JSON, strokes and surfaces as PLY, motions as safetensors.
+
+Everything in it is in the table's frame, mm; ``plan.json`` has ``table_from_camera``.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float64
+
+from tumortrack.core import store
+from tumortrack.core.config import from_builtins, to_builtins
+from tumortrack.core.errors import ArtifactError
+from tumortrack.core.mesh_files import read_mesh, write_mesh
+from tumortrack.core.types import Mesh
+from tumortrack.plan.config import ResectionConfig
+from tumortrack.plan.motions import JOINTS, Motions, Stage
+from tumortrack.plan.values import Cut, Layer, ResectionPlan
+from tumortrack.sense.ply import write_cloud_ply
+
+KIND = "plan"
+_NAME, _STROKES, _MOTIONS = "plan.json", "strokes.ply", "motions.safetensors"
+
+
+@dataclass(frozen=True, eq=False)
+class PlanFolder:
+    """What a plan's folder holds. ``cell``: the configuration of table and arms that the motions
+    are for, as JSON would give it; motions and cell are None where no arms were planned."""
+
+    plan: ResectionPlan
+    config: ResectionConfig
+    table_from_camera: Float64[np.ndarray, "4 4"]
+    frame_id: str
+    meshes: dict[str, Mesh]
+    cell: dict | None = None
+    motions: Motions | None = None
+
+
+def write_plan(
+    folder: Path,
+    content: PlanFolder,
+    inputs: dict[str, str],
+    more: Callable[[Path], None],
+    overwrite: bool = False,
+) -> None:
+    """All or nothing. ``inputs``: sha256 of what it was made from; ``more`` adds files (pictures)
+    to the folder that is given to it.
+
+    Raises:
+        InputError: the folder exists and ``overwrite`` is False.
+        StorageError: the disk refused.
+    """
+    with store.new_folder(folder, overwrite) as aside:
+        plan = content.plan
+        data = {
+            "frame_id": content.frame_id,
+            "table_from_camera": content.table_from_camera.tolist(),
+            "config": to_builtins(content.config),
+            "plan": as_builtins(plan),
+            "cell": content.cell,
+            "seconds": None if content.motions is None else content.motions.seconds,
+        }
+        store.write_json(aside / _NAME, data)
+        _write_strokes(aside / _STROKES, plan)
+        for name, mesh in content.meshes.items():
+            write_mesh(aside / f"{name}.ply", mesh)
+        if content.motions is not None:
+            _write_motions(aside / _MOTIONS, content.motions)
+        more(aside)
+        store.seal(aside, KIND, {"inputs": inputs}, frame=content.frame_id)
+
+
+def read_plan(folder: Path) -> PlanFolder:
+    """
+    Raises:
+        ArtifactError: no plan, damaged, or of another version.
+    """
+    manifest = store.read_manifest(folder, KIND)
+    data = store.read_json(folder / _NAME)
+    try:
+        plan = from_plain(data["plan"])
+        table_from_camera = np.array(data["table_from_camera"], float)
+        frame_id, cell = str(data["frame_id"]), data["cell"]
+        config = from_builtins(data["config"], ResectionConfig, str(folder / _NAME))
+    except (KeyError, TypeError, ValueError) as error:
+        raise ArtifactError(f"{folder / _NAME} lacks or spoils {error}; plan again.") from error
+    surfaces = [Path(name).stem for name in manifest["files"] if name.endswith(".ply")]
+    meshes = {
+        name: read_mesh(folder / f"{name}.ply") for name in surfaces if name != Path(_STROKES).stem
+    }
+    path = folder / _MOTIONS
+    motions = _read_motions(path) if path.is_file() else None
+    return PlanFolder(plan, config, table_from_camera, frame_id, meshes, cell, motions)
+
+
+def as_builtins(plan: ResectionPlan) -> dict[str, Any]:
+    """The plan as what JSON would give back; an infinite height is null."""
+    return {
+        "method": plan.method,
+        "tumor": plan.tumor,
+        "label": plan.label,
+        "grasp_mm": plan.grasp_mm.tolist(),
+        "approach": [0.0, 0.0, -1.0],
+        "margin_mm": plan.margin_mm,
+        "exophytic": plan.exophytic,
+        "volumes_ml": plan.volumes_ml,
+        "stamp_ns": plan.stamp_ns,
+        "notes": list(plan.notes),
+        "cuts": [
+            {
+                "sweep": cut.sweep,
+                "kind": cut.kind,
+                "closed": cut.closed,
+                "length_mm": round(cut.length_mm, 1),
+                "path_mm": cut.path_mm.round(4).tolist(),
+            }
+            for cut in plan.cuts
+        ],
+        "layers": [
+            {
+                "bottom_mm": layer.bottom_mm,
+                "top_mm": layer.top_mm if np.isfinite(layer.top_mm) else None,
+                "rings_mm": [ring.round(4).tolist() for ring in layer.rings_mm],
+            }
+            for layer in plan.layers
+        ],
+    }
+
+
+def from_plain(data: dict[str, Any]) -> ResectionPlan:
+    """What ``as_builtins`` took apart. Raises KeyError, TypeError or ValueError if it did not."""
+    return ResectionPlan(
+        method=data["method"],
+        tumor=data["tumor"],
+        label=int(data["label"]),
+        grasp_mm=np.array(data["grasp_mm"], float),
+        cuts=tuple(
+            Cut(int(cut["sweep"]), np.array(cut["path_mm"], float), cut["kind"])
+            for cut in data["cuts"]
+        ),
+        layers=tuple(
+            Layer(
+                float(layer["bottom_mm"]),
+                np.inf if layer["top_mm"] is None else float(layer["top_mm"]),
+                tuple(np.array(ring, float) for ring in layer["rings_mm"]),
+            )
+            for layer in data["layers"]
+        ),
+        margin_mm=float(data["margin_mm"]),
+        volumes_ml={name: float(value) for name, value in data["volumes_ml"].items()},
+        exophytic=float(data["exophytic"]),
+        stamp_ns=int(data["stamp_ns"]),
+        notes=tuple(data["notes"]),
+    )
+
+
+def _write_strokes(path: Path, plan: ResectionPlan) -> None:
+    """The strokes' points in their order, each with its sweep, its stroke and whether it is one of
+    the floor; the grasp point last, with sweep 0."""
+    strokes = [np.full(len(cut.path_mm), n, np.int32) for n, cut in enumerate(plan.cuts, start=1)]
+    write_cloud_ply(
+        path,
+        np.concatenate([*(cut.path_mm for cut in plan.cuts), plan.grasp_mm[None]]),
+        sweep=np.concatenate(
+            [*(np.full(len(c.path_mm), c.sweep, np.int32) for c in plan.cuts), [np.int32(0)]]
+        ).astype(np.int32),
+        stroke=np.concatenate([*strokes, [0]]).astype(np.int32),
+        floor=np.concatenate(
+            [*(np.full(len(c.path_mm), c.kind == "floor") for c in plan.cuts), [False]]
+        ).astype(np.uint8),
+        frame="table (z up)",
+    )
+
+
+def _write_motions(path: Path, motions: Motions) -> None:
+    from safetensors.numpy import save
+
+    tensors = {}
+    for number, stage in enumerate(motions.stages):
+        tensors[f"{number}.times_s"] = stage.times_s
+        tensors[f"{number}.joints_rad"] = stage.joints_rad
+        tensors[f"{number}.cutting"] = np.asarray(stage.cutting, np.uint8)
+    names = {"stages": json.dumps([s.name for s in motions.stages]), "joints": json.dumps(JOINTS)}
+    store.write_atomically(path, save(tensors, metadata=names))
+
+
+def _read_motions(path: Path) -> Motions:
+    from safetensors import SafetensorError, safe_open
+
+    try:
+        with safe_open(path, "np") as tensors:
+            named = tensors.metadata() or {}
+            if json.loads(named.get("joints", "[]")) != list(JOINTS):
+                raise ArtifactError(f"{path} is for other arms' joints; plan again.")
+            stages = tuple(
+                Stage(
+                    name,
+                    tensors.get_tensor(f"{number}.times_s"),
+                    tensors.get_tensor(f"{number}.joints_rad"),
+                    tensors.get_tensor(f"{number}.cutting").astype(bool),
+                )
+                for number, name in enumerate(json.loads(named["stages"]))
+            )
+    except (OSError, SafetensorError, KeyError, ValueError) as error:
+        raise ArtifactError(f"{path} cannot be read: {error}. Plan again.") from error
+    return Motions(stages)

@@ -1,0 +1,277 @@
+"""A plan carried out beside the live loop: halted by every doubt, planned anew where the tumor
+has moved.
+
+No torch here, and no clock but the updates' own arrival: ``act`` is called with every update.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float64
+
+from tumortrack.core.config import Config
+from tumortrack.core.errors import InputError, TumortrackError
+from tumortrack.core.types import Mesh
+from tumortrack.plan.execute import ABORTED, Execution
+from tumortrack.plan.motions import JOINTS, Motions
+from tumortrack.plan.values import Located, ResectionPlan
+from tumortrack.track.live import Line, Shape, Update, Workcell
+
+Colour = tuple[int, int, int]
+TO_CUT: Colour = (255, 200, 40)
+NOW: Colour = (255, 90, 30)
+CUT: Colour = (120, 40, 40)
+PIECE: Colour = (255, 220, 120)
+_BLIND_S = 0.2  # without an update for longer, the arms halt by themselves
+
+
+class OperationConfig(Config, frozen=True, kw_only=True):
+    """``moved_mm``: the tumor is elsewhere than planned if its surface moved by so much (root mean
+    square). ``settled_mm``, ``settled_s``: it is planned anew once it has moved no more than that
+    for so long; before, the arms wait. ``speed``: of the arms' time."""
+
+    moved_mm: float = 2.0
+    settled_mm: float = 0.7
+    settled_s: float = 0.5
+    speed: float = 1.0
+
+    def __post_init__(self) -> None:
+        for name in ("moved_mm", "settled_mm", "settled_s"):
+            if not 0 < getattr(self, name) <= 100:
+                raise InputError(f"{name} is {getattr(self, name):g}; allowed: 0 to 100.")
+        if not 0 < self.speed <= 20:
+            raise InputError(f"speed is {self.speed:g}; allowed: more than 0, up to 20.")
+
+
+@dataclass(frozen=True, eq=False)
+class Planned:
+    """A plan, what it was made for (table frame), and the motions."""
+
+    plan: ResectionPlan
+    tumor: Mesh
+    motions: Motions
+
+
+# What was located, the arms' joints, and the sweep to begin with (None: from the approach) -> plan
+Replan = Callable[[Located, Float64[np.ndarray, " 12"], int | None], Planned]
+Locate = Callable[[Update], Located]
+Draw = Callable[[Float64[np.ndarray, " 12"]], tuple[Shape, ...]]
+
+
+class Operation:
+    """``track.live.Companion``: arms that act on estimates.
+
+    Args:
+        planned: what to begin with.
+        draw: the arms, table and tools as shapes, for twelve joint angles.
+        locate: an update's estimate in the table's frame; None: a stored plan is carried out and
+            nothing is looked at.
+        replan: makes a new plan; called from a thread of its own.
+        still_life: shapes that are shown all the time.
+    """
+
+    def __init__(
+        self,
+        planned: Planned,
+        config: OperationConfig,
+        draw: Draw,
+        locate: Locate | None = None,
+        replan: Replan | None = None,
+    ) -> None:
+        self._planned, self._config = planned, config
+        self._draw, self._locate, self._replan = draw, locate, replan
+        self._execution = Execution(planned.motions)
+        self._last_s: float | None = None
+        self._first_s = 0.0
+        self._settled: tuple[Mesh, float] | None = None  # where the tumor is, and since when
+        self._work: _Work | None = None
+        self.still_life: tuple[Shape, ...] = ()
+        self.log: list[dict] = []
+        self.halts: Counter[str] = Counter()
+        self._said = ""
+
+    @property
+    def ended(self) -> bool:
+        return self._execution.ended
+
+    @property
+    def planned(self) -> Planned:
+        """What is carried out now."""
+        return self._planned
+
+    @property
+    def joints_rad(self) -> Float64[np.ndarray, " 12"]:
+        """In the order of ``motions.JOINTS``."""
+        return self._execution.joints_rad
+
+    def act(self, update: Update, now_s: float | None = None) -> Update:
+        """The update with what the arms do now. ``now_s``: a steady clock's time."""
+        now_s = time.monotonic() if now_s is None else now_s
+        self._pass(now_s)
+        self._look(update, now_s)
+        self._note(now_s)
+        return replace(update, workcell=self.workcell())
+
+    def abort(self, reason: str) -> None:
+        """Stop for good, from whatever state."""
+        self._execution.abort(reason)
+
+    def workcell(self) -> Workcell:
+        """What is seen of it."""
+        execution = self._execution
+        joints = execution.joints_rad
+        return Workcell(
+            execution.state,
+            execution.halted,
+            dict(zip(JOINTS, joints.tolist(), strict=True)),
+            (*self.still_life, *self._draw(joints)),
+            self._lines(),
+        )
+
+    def summary(self) -> dict:
+        """For the report: states and when they began, halts, plans made anew."""
+        return {
+            "state": self._execution.state,
+            "halted": self._execution.halted,
+            "halts": dict(self.halts.most_common()),
+            "log": self.log,
+        }
+
+    def _pass(self, now_s: float) -> None:
+        """Let the time since the last update go by."""
+        if self._last_s is None:
+            self._last_s = self._first_s = now_s
+        passed_s, speed = max(0.0, now_s - self._last_s), self._config.speed
+        self._last_s = now_s
+        self._execution.step(min(passed_s, _BLIND_S) * speed)
+        if passed_s > _BLIND_S:
+            self._execution.halt("no word from the loop")
+            self._execution.step((passed_s - _BLIND_S) * speed)
+
+    def _look(self, update: Update, now_s: float) -> None:
+        """Go on, or halt and why."""
+        execution = self._execution
+        if self._work is not None:
+            self._take_work(now_s)
+        if self._locate is None or execution.ended or execution.state == ABORTED:
+            execution.go()
+            return
+        if update.estimate is None:
+            self._settled = None
+            execution.halt(f"no estimate: {update.reason}")
+        elif update.quality != "good":
+            self._settled = None
+            execution.halt(f"{update.quality} estimate: {update.warning}")
+        elif self._work is not None:
+            execution.halt("planning anew")
+        elif execution.sweep > self._planned.plan.sweeps:
+            execution.go()  # it is cut out
+        else:
+            self._compare(self._locate(update), now_s)
+
+    def _compare(self, located: Located, now_s: float) -> None:
+        execution, config = self._execution, self._config
+        tumor = located.meshes.get(self._planned.plan.tumor)
+        if tumor is None:
+            execution.halt(f"{self._planned.plan.tumor} was not found")
+            return
+        moved_mm = apart_mm(tumor, self._planned.tumor)
+        if moved_mm <= config.moved_mm:
+            self._settled = None
+            execution.go()
+            return
+        execution.halt(f"{self._planned.plan.tumor} has moved by {moved_mm:.1f} mm")
+        if self._settled is None or apart_mm(tumor, self._settled[0]) > config.settled_mm:
+            self._settled = (tumor, now_s)
+        elif now_s - self._settled[1] >= config.settled_s and execution.still:
+            self._settled = None
+            if self._replan is not None:
+                sweep = max(execution.sweep, 1) if execution.holds else None
+                self._work = _Work(self._replan, located, execution.joints_rad, sweep)
+
+    def _take_work(self, now_s: float) -> None:
+        work, execution = self._work, self._execution
+        assert work is not None
+        if not work.done:
+            return
+        self._work = None
+        if work.found is None:
+            execution.abort(f"no new plan: {work.reason}")
+            return
+        execution.replace(work.found.motions)
+        self._planned = work.found
+        self._log(now_s, "planned anew")
+
+    def _note(self, now_s: float) -> None:
+        state = self._execution.state
+        if not self.log or self.log[-1]["state"] != state:
+            self._log(now_s, "")
+        halted = "".join(c for c in self._execution.halted if not (c.isdigit() or c == "."))
+        if halted != self._said:
+            self._said = halted
+            if halted:
+                self.halts[halted] += 1
+
+    def _log(self, now_s: float, what: str) -> None:
+        entry = {"state": self._execution.state, "at_s": round(now_s - self._first_s, 3)}
+        self.log.append({**entry, "event": what} if what else entry)
+
+    def _lines(self) -> tuple[Line, ...]:
+        sweep, plan = self._execution.sweep, self._planned.plan
+        lines = []
+        for number, cut in enumerate(plan.cuts, start=1):
+            colour = CUT if cut.sweep < sweep else NOW if cut.sweep == sweep else TO_CUT
+            lines.append(Line(f"cut/{number}", cut.path_mm, colour, 0.8))
+        above = plan.grasp_mm + np.array([[0.0, 0.0, 40.0], [0.0, 0.0, 0.0]])
+        return (*lines, Line("grasp", above, (90, 200, 255), 0.8))
+
+
+class _Work:
+    """A plan in the making, in a thread of its own."""
+
+    def __init__(
+        self,
+        replan: Replan,
+        located: Located,
+        joints_rad: Float64[np.ndarray, " 12"],
+        sweep: int | None,
+    ) -> None:
+        self.found: Planned | None = None
+        self.reason = ""
+        self._thread = threading.Thread(
+            target=self._run, args=(replan, located, joints_rad, sweep), daemon=True
+        )
+        self._thread.start()
+
+    @property
+    def done(self) -> bool:
+        return not self._thread.is_alive()
+
+    def _run(
+        self,
+        replan: Replan,
+        located: Located,
+        joints_rad: Float64[np.ndarray, " 12"],
+        sweep: int | None,
+    ) -> None:
+        try:
+            self.found = replan(located, joints_rad, sweep)
+        except TumortrackError as error:
+            self.reason = str(error)
+        except Exception as error:  # a defect of ours must stop the arms, and say so
+            self.reason = f"internal error, {type(error).__name__}: {error}"
+
+
+def apart_mm(a: Mesh, b: Mesh) -> float:
+    """How far a surface has moved: root mean square over its vertices where both have the same,
+    else between the middles of their boxes."""
+    if np.array_equal(a.faces, b.faces):
+        off = a.vertices_mm - b.vertices_mm
+        return float(np.sqrt((off**2).sum(axis=1).mean()))
+    return float(np.linalg.norm(a.box_mm.mean(0) - b.box_mm.mean(0)))
