@@ -15,7 +15,7 @@ from tumortrack.core.errors import InputError
 from tumortrack.core.solids import mesh_of, solid_of
 from tumortrack.core.types import Anatomy, Mesh
 from tumortrack.evaluate.resection import cut
-from tumortrack.evaluate.severing import Severed, come_away, within
+from tumortrack.evaluate.severing import Severed, pieces_of, within
 from tumortrack.plan.values import Cut, Layer, ResectionPlan
 
 ML = 1e-3
@@ -175,6 +175,37 @@ def test_a_tumor_that_lies_elsewhere_is_cut_as_deep_and_left_as_much_as_it_is_of
     assert result.margin_mm == pytest.approx(-beyond_mm, abs=0.1)
 
 
+def test_a_strand_that_tears_holds_nothing():
+    """The gap is 1.5 mm wide at the top of the wall alone, where 1 mm of tissue is."""
+    truth = Anatomy((block([-20, -20, 0], [20, 20, 20]), ball(5, (0, 0, 14))))
+    ring = square((-10, -10), (10, 10))
+    layers = [prism(ring, 19.0), Layer(5.0, 19.0, (ring,))]
+    gap = np.concatenate([ring, [[-10.0, -7.5]]])
+    whole = stroke(ring, 5.0)
+    result = cut(truth, plan(layers, [stroke(gap, 19.0, closed=False), whole]))
+    assert result.bridge_mm2 == pytest.approx(1.5, rel=0.3)
+    assert result.detached
+    assert result.removed_share == 1.0
+    longer = np.concatenate([ring, [[-10.0, -4.5]]])
+    held = cut(truth, plan(layers, [stroke(longer, 19.0, closed=False), whole]))
+    assert held.bridge_mm2 == pytest.approx(4.5, rel=0.25)
+    assert not held.detached
+
+
+def test_what_comes_off_beside_the_piece_is_not_removed():
+    """A wall goes through a tumor that lies in an organ's end: its rest is off, but loose."""
+    truth = Anatomy((block([-40, -10, 0], [14.25, 10, 20]), ball(8, (6.25, 0, 10))))
+    ring = square((-15, -12), (10.25, 12))
+    result = cut(truth, plan([prism(ring, 0.0)]))
+    cap = np.pi * 16 * (24 - 4) / 3 * ML
+    assert result.detached
+    assert result.loose_share * result.tumor_ml == pytest.approx(cap, rel=0.03)
+    assert result.removed_share == pytest.approx(1 - result.loose_share)
+    assert result.enclosed_share == pytest.approx(result.removed_share)
+    assert result.left_ml == pytest.approx(cap, rel=0.03)
+    assert result.piece_ml == pytest.approx((25.25 * 20 * 20) * ML, rel=0.03)
+
+
 @pytest.mark.parametrize("wall_mm", [12.0, 12.1, 12.4])
 def test_volumes_err_by_half_a_voxel_at_each_of_their_ends_at_most(wall_mm):
     truth = Anatomy((block([-30, -20, 0], [30, 20, 30]), ball(4, (0, 0, 20))))
@@ -234,13 +265,17 @@ def test_what_is_severed_agrees_with_walking_from_voxel_to_voxel(seed):
     severed = Severed(tissue.shape)
     for faces in severed.faces:
         faces |= rng.random(faces.shape) < 0.5
-    away = come_away(tissue, severed)
-    pieces = _walked(tissue, severed.faces)
-    largest = max(len(piece) for piece in pieces)
-    kept = {tuple(v) for v in np.argwhere(tissue & ~away).tolist()}
-    assert kept in pieces
-    assert len(kept) == largest
-    assert len(pieces) > 3
+    found = pieces_of(tissue, severed)
+    expected = _walked(tissue, severed.faces)
+    assert len(expected) > 3
+    assert np.array_equal(found > 0, tissue)
+    assert found.max() == len(expected)
+    sizes = []
+    for number in range(1, found.max() + 1):
+        piece = {tuple(v) for v in np.argwhere(found == number).tolist()}
+        assert piece in expected
+        sizes.append(len(piece))
+    assert sizes == sorted(sizes, reverse=True)
 
 
 def _walked(tissue, faces):
@@ -276,7 +311,7 @@ def test_closed_strokes_sever_just_what_they_enclose(whole):
         columns = within((ring,), tissue.shape[:2])
         severed.sheet(columns, 1)
         expected = columns[:, :, None] & np.array([False, True, True])
-        away = come_away(tissue, severed)
+        away = pieces_of(tissue, severed) > 1
         # A corner less wide than a voxel may leave single voxels by themselves.
         assert np.array_equal(away & expected, expected)
         assert (away & ~expected).sum() <= 4

@@ -12,12 +12,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, Float64, UInt8
+from jaxtyping import Bool, Float, Float64, Int, UInt8
 
 from tumortrack.core.errors import InputError
 from tumortrack.core.types import ORGAN, Anatomy, Mesh
 from tumortrack.evaluate.metrics import _to_surface
-from tumortrack.evaluate.severing import Flat, Mask, Severed, come_away, within
+from tumortrack.evaluate.severing import Flat, Mask, Severed, Voxels, pieces_of, within
 from tumortrack.imaging.raster import label_grid
 from tumortrack.plan.values import Cut, Layer, ResectionPlan
 
@@ -25,10 +25,10 @@ VOXEL_MM = 0.5
 SAMPLES_MM = 0.4  # between points of the cut's surface
 _SAME_MM = 1e-6  # of heights
 _BESIDE_MM = 0.5  # an outline this close to a stroke is cut: its chords leave it by less
+_TEARS_MM2 = 2.0  # a thinner bridge tears when the piece is lifted
 _ML = 1e-3  # of a mm3
 
 Points = Float[np.ndarray, "_ 3"]
-Voxels = Bool[np.ndarray, "i j k"]
 Box = Float64[np.ndarray, "2 3"]
 Walls = list[tuple[Cut, Layer]]
 
@@ -39,12 +39,14 @@ class CutResult:
 
     Attributes:
         tumor_ml: true volume of the tumor that was to come away.
-        removed_share: of it, what has come away.
+        removed_share: of it, what came away within the piece that the layers enclose.
+        loose_share: of it, what came off beside that piece, for a cut went through the tumor.
         enclosed_share: of it, what lies within the layers, whether or not they came free.
-        healthy_ml: organ without tumors that has come away.
-        piece_ml: all that has come away.
-        detached: whether what the layers enclose came free.
-        bridge_mm2: area of its outline that lies in tissue and that no stroke went along.
+        healthy_ml: organ without tumors that has come away, within that piece or beside it.
+        piece_ml: all of that piece; 0 where it did not come free.
+        detached: whether it came free.
+        bridge_mm2: area of its outline that lies in tissue and that no stroke went along. Less
+            than 2 mm2 tears, and counts as cut.
         margin_mm: least distance between a cut within tissue and the tumor's surface; negative:
             this deep the cut went into the tumor. None where nothing was cut at all.
         hurt: other tumors that were cut into.
@@ -52,6 +54,7 @@ class CutResult:
 
     tumor_ml: float
     removed_share: float
+    loose_share: float
     enclosed_share: float
     healthy_ml: float
     piece_ml: float
@@ -62,7 +65,7 @@ class CutResult:
 
     @property
     def left_ml(self) -> float:
-        """Tumor that stays behind."""
+        """Tumor that does not come away with the piece."""
         return self.tumor_ml * (1 - self.removed_share)
 
 
@@ -82,8 +85,12 @@ def cut(truth: Anatomy, plan: ResectionPlan, voxel_mm: float = VOXEL_MM) -> CutR
         )
     grid, walls = _grid_for(truth, plan.layers, voxel_mm), _walls_of(plan)
     tissue, number = grid.labels > 0, truth.names.index(plan.tumor)
-    away = come_away(tissue, _severed(grid, walls, plan.layers))
+    bridge_mm2 = _bridge_mm2(grid, walls, plan.layers, truth.organ.box_mm)
+    severed = _severed(grid, walls, plan.layers, torn=bridge_mm2 < _TEARS_MM2)
+    pieces = pieces_of(tissue, severed)
     enclosed = _enclosed(grid, plan.layers) & tissue
+    largest = _largest(pieces[enclosed])
+    piece = pieces == largest if largest > 1 else np.zeros_like(tissue)
     tumor = grid.labels == ORGAN + number
     surface = _cut_surface(walls, plan.layers, truth.organ.box_mm)
     found = grid.at(surface)
@@ -91,12 +98,13 @@ def cut(truth: Anatomy, plan: ResectionPlan, voxel_mm: float = VOXEL_MM) -> CutR
     voxel_ml = voxel_mm**3 * _ML
     return CutResult(
         tumor_ml=float(tumor.sum()) * voxel_ml,
-        removed_share=_share(away, tumor),
+        removed_share=_share(piece, tumor),
+        loose_share=_share((pieces > 1) & ~piece, tumor),
         enclosed_share=_share(enclosed, tumor),
-        healthy_ml=float((away & (grid.labels == ORGAN)).sum()) * voxel_ml,
-        piece_ml=float(away.sum()) * voxel_ml,
-        detached=_share(away, enclosed) > 0.5,
-        bridge_mm2=_bridge_mm2(grid, walls, plan.layers, truth.organ.box_mm),
+        healthy_ml=float(((pieces > 1) & (grid.labels == ORGAN)).sum()) * voxel_ml,
+        piece_ml=float(piece.sum()) * voxel_ml,
+        detached=largest > 1,
+        bridge_mm2=bridge_mm2,
         margin_mm=_margin_mm(surface, found == ORGAN + number, truth.parts[number]),
         hurt=tuple(
             name
@@ -170,8 +178,9 @@ def _below(layer: Layer, layers: Sequence[Layer]) -> list[Layer]:
     return [other for other in layers if abs(other.top_mm - layer.bottom_mm) < _SAME_MM]
 
 
-def _severed(grid: _Grid, walls: Walls, layers: Sequence[Layer]) -> Severed:
-    """A sheet reaches one voxel further than its outlines, for the strokes' chords leave those."""
+def _severed(grid: _Grid, walls: Walls, layers: Sequence[Layer], torn: bool) -> Severed:
+    """A sheet reaches one voxel further than its outlines, for the strokes' chords leave those.
+    ``torn``: what the strokes left of the outlines is severed too."""
     from scipy.ndimage import binary_dilation, binary_erosion
 
     severed, near = Severed(grid.labels.shape), np.ones((3, 3), bool)
@@ -179,6 +188,9 @@ def _severed(grid: _Grid, walls: Walls, layers: Sequence[Layer]) -> Severed:
         path = (stroke.path_mm[:, :2] - grid.low_mm[:2]) / grid.voxel_mm
         severed.wall(path, grid.level(layer.bottom_mm), grid.level(layer.top_mm))
     for layer in layers:
+        for ring in grid.rings(layer) if torn else ():
+            closed = np.concatenate([ring, ring[:1]])
+            severed.wall(closed, grid.level(layer.bottom_mm), grid.level(layer.top_mm))
         sheet = binary_dilation(grid.columns(layer), near)
         for lower in _below(layer, layers):
             sheet &= ~binary_erosion(grid.columns(lower), near)
@@ -234,9 +246,8 @@ def _even(path: Flat) -> Flat:
 def _curtain(path: Flat, layer: Layer, box_mm: Box) -> Points:
     """Points on the wall over a line, from the layer's bottom to its top, within the box."""
     low, high = max(layer.bottom_mm, box_mm[0, 2]), min(layer.top_mm, box_mm[1, 2])
-    heights, flat = np.arange(low, high, SAMPLES_MM), _even(path)
-    points = np.column_stack([np.tile(flat, (len(heights), 1)), np.repeat(heights, len(flat))])
-    return points
+    heights, flat = np.arange(low + SAMPLES_MM / 2, high, SAMPLES_MM), _even(path)
+    return np.column_stack([np.tile(flat, (len(heights), 1)), np.repeat(heights, len(flat))])
 
 
 def _flat(layer: Layer, without: Sequence[Layer], height_mm: float, box_mm: Box) -> Points:
@@ -256,6 +267,11 @@ def _margin_mm(surface: Points, inside: Bool[np.ndarray, " n"], tumor: Mesh) -> 
     if inside.any():
         return -float(_to_surface(surface[inside], tumor).max())
     return float(_to_surface(surface, tumor).min())
+
+
+def _largest(numbers: Int[np.ndarray, " n"]) -> int:
+    """The number that occurs most often; 0 where there is none."""
+    return int(np.bincount(numbers, minlength=1).argmax())
 
 
 def _share(of: Voxels, whole: Voxels) -> float:

@@ -12,6 +12,7 @@ from tumortrack.imaging.raster import _expand
 
 Flat = Float[np.ndarray, "_ 2"]
 Mask = Bool[np.ndarray, "i j"]
+Voxels = Bool[np.ndarray, "i j k"]
 
 # In voxels: no line that anyone draws then runs through a voxel's very centre, where rounding would
 # have to say which side it passes on. Closed lines so separate inside from outside.
@@ -66,9 +67,9 @@ def _crossings(path: Flat, shape: tuple[int, int]) -> Int[np.ndarray, "i j"]:
     return counts
 
 
-def come_away(tissue: Bool[np.ndarray, "i j k"], severed: Severed) -> Bool[np.ndarray, "i j k"]:
-    """What hangs together, over faces that are not severed, with no more of it than a smaller
-    piece: all tissue but the largest piece."""
+def pieces_of(tissue: Voxels, severed: Severed) -> Int[np.ndarray, "i j k"]:
+    """What hangs together over faces that are not severed: 1 in the largest piece, 2, 3, ... in
+    the others, 0 where there is no tissue."""
     from scipy.ndimage import label
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
@@ -92,8 +93,10 @@ def come_away(tissue: Bool[np.ndarray, "i j k"], severed: Severed) -> Bool[np.nd
     graph = coo_array((np.ones(len(a), bool), (a, b)), (total, total))
     _, whole = connected_components(graph, directed=False)
     of_voxel = whole[pieces]
-    largest = np.bincount(of_voxel[tissue]).argmax() if tissue.any() else 0
-    return tissue & (of_voxel != largest)
+    sizes = np.bincount(of_voxel[tissue], minlength=total)
+    rank = np.empty(total, int)
+    rank[np.argsort(-sizes, kind="stable")] = 1 + np.arange(total)
+    return np.where(tissue, rank[of_voxel], 0)
 
 
 def _ends(axis: int) -> tuple[tuple[slice, ...], tuple[slice, ...]]:
