@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -18,7 +17,8 @@ from tumortrack.learn.networks import Network
 from tumortrack.learn.run import Run
 from tumortrack.learn.validate import ValidationScenes, mean_iou_of, validation_scenes
 from tumortrack.learn.warp.generic import carry_over, upright_of
-from tumortrack.learn.warp.locate import best_fit, first_motions
+from tumortrack.learn.warp.locate import best_fit, first_motions, repaired
+from tumortrack.learn.warp.motion import WarpMotion
 from tumortrack.learn.warp.network import WarpNetwork
 from tumortrack.learn.warp.refine import Refined
 from tumortrack.learn.warp.shape import shape_of
@@ -65,11 +65,12 @@ class WarpCourse:
             carry_over(network, run.start.weights, upright)
 
     def miou(self, network: Network) -> float:
-        return self._judged(network).miou
+        return self._judged([fit for _, fit in self._fits(network)]).miou
 
     def model(self, network: Network, provenance: dict) -> Model:
-        usual_cost = self._judged(network).usual_cost
-        judged = self._judged(network, usual_cost)
+        fits = self._fits(network)
+        usual_cost = float(np.percentile([fit.cost for _, fit in fits], _USUAL))
+        judged = self._judged(self._repaired(fits, usual_cost))
         return Model(
             network,
             self._run.config,
@@ -81,27 +82,40 @@ class WarpCourse:
             Trust(std_scale=judged.std_scale, usual_cost=usual_cost),
         )
 
-    def _judged(self, network: Network, usual_cost: float = math.inf) -> Judged:
-        """Labels, places and trust over all validation scenes."""
+    def _fits(self, network: Network) -> list[tuple[WarpMotion, Refined]]:
+        """The likeliest start and the best fit in each validation scene."""
         assert isinstance(network, WarpNetwork)
         network.eval()
+        fits = []
+        for cloud in self._scenes.clouds_mm:
+            starts = first_motions(network, self._shape, cloud)
+            fits.append((starts[0], best_fit(self._shape, cloud, starts, self._run.config.refine)))
+        return fits
+
+    def _repaired(self, fits: list[tuple[WarpMotion, Refined]], usual_cost: float) -> list[Refined]:
+        """The fits as the model will make them, which knows the usual cost."""
+        shape, config = self._shape, self._run.config.refine
+        return [
+            repaired(shape, cloud, start, config, fit) if fit.cost > usual_cost else fit
+            for cloud, (start, fit) in zip(self._scenes.clouds_mm, fits, strict=True)
+        ]
+
+    def _judged(self, fits: list[Refined]) -> Judged:
+        """Labels, places and trust over all validation scenes."""
         scenes, shape = self._scenes, self._shape
-        guesses, errors, deviations, fits, costs = [], [], [], [], []
-        for cloud, points_mm, points_ct, labels in zip(
-            scenes.clouds_mm, scenes.points_mm, scenes.points_ct, scenes.labels, strict=True
+        guesses, errors, deviations = [], [], []
+        for fit, points_mm, points_ct, labels in zip(
+            fits, scenes.points_mm, scenes.points_ct, scenes.labels, strict=True
         ):
-            starts = first_motions(network, shape, cloud)
-            fit = best_fit(shape, cloud, starts, self._run.config.refine, usual_cost)
             guesses.append(shape.labels_at(fit.motion.back(points_mm).astype(np.float32))[0])
             inside = labels > 0
             error, deviation = _errors(fit, points_ct[inside], points_mm[inside])
             errors.append(error)
             deviations.append(deviation)
-            fits.append(fit_mm(np.abs(fit.distances_mm)))
-            costs.append(fit.cost)
         spreads = [spread_mm(cloud) for cloud in scenes.clouds_mm]
+        off = [fit_mm(np.abs(fit.distances_mm)) for fit in fits]
         familiar = Familiar(
-            spread_mm=(min(spreads), max(spreads)), fit_mm=float(np.percentile(fits, 95))
+            spread_mm=(min(spreads), max(spreads)), fit_mm=float(np.percentile(off, 95))
         )
         ratios = np.concatenate(errors) / np.concatenate(deviations)
         return Judged(
@@ -109,20 +123,18 @@ class WarpCourse:
             float(np.median([part.mean() for part in errors])),
             float(np.quantile(ratios, _COVERED)) / _RADIUS,
             familiar,
-            float(np.percentile(costs, _USUAL)),
         )
 
 
 @dataclass(frozen=True)
 class Judged:
     """What validation says: labels, the median scene's error of places, how the estimated
-    standard deviations have to be scaled, what clouds are like, and the cost that few exceed."""
+    standard deviations have to be scaled, and what clouds are like."""
 
     miou: float
     tre_mm: float
     std_scale: float
     familiar: Familiar
-    usual_cost: float
 
 
 def _errors(

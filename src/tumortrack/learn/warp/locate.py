@@ -41,10 +41,21 @@ def best_fit(
 ) -> Refined:
     """The refined start of the least cost; where that is more than usual, also the likeliest start
     turned about the camera's axis, which repairs most starts that are wrong altogether."""
-    fits = [refine(shape, points_mm, start, config) for start in starts]
-    if min(fit.cost for fit in fits) > usual_cost:
-        fits += [refine(shape, points_mm, start, config) for start in _turned(starts[0])]
-    return min(fits, key=lambda fit: fit.cost)
+    fits = (refine(shape, points_mm, start, config) for start in starts)
+    fit = min(fits, key=lambda fit: fit.cost)
+    return repaired(shape, points_mm, starts[0], config, fit) if fit.cost > usual_cost else fit
+
+
+def repaired(
+    shape: Shape,
+    points_mm: Float[np.ndarray, "n 3"],
+    start: WarpMotion,
+    config: RefineConfig,
+    fit: Refined,
+) -> Refined:
+    """The best of a fit and those of a start turned about the camera's axis."""
+    turned = (refine(shape, points_mm, turn, config) for turn in _turned(start))
+    return min((fit, *turned), key=lambda fit: fit.cost)
 
 
 def _turned(start: WarpMotion) -> list[WarpMotion]:
