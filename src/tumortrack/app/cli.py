@@ -270,6 +270,75 @@ def track(
     )
 
 
+def plan(
+    run: Positional[Path],
+    plan: Positional[Path],
+    /,
+    *,
+    method: Literal["margin", "published"] = "margin",
+    tumor: str = "",
+    margin: float = 5.0,
+    sigmas: float = 0.0,
+    frame: Path | None = None,
+    stand: float | None = None,
+    cell: Path | None = None,
+    arms: bool = True,
+    overwrite: bool = False,
+) -> None:
+    """Plan how to cut a located tumor out, and how two arms do it.
+
+    Args:
+        run: folder that `locate` wrote.
+        plan: folder to write: plan.json, strokes.ply, plan.png, motions, the cell as URDF.
+        method: margin keeps the margin in all directions; published is the paper's planner.
+        tumor: which one (tumor_1, ...; default: the one that lies farthest out of the organ).
+        margin: least distance between tumor and cut in mm.
+        sigmas: add so many standard deviations of the estimate's own uncertainty to the margin.
+        frame: JSON file that says where the camera is; the plan is then in the robot's frame, whose
+            z must point up. Without, the camera looks straight down.
+        stand: height of the organ's lowest point over the table in mm, where no frame is given.
+        cell: JSON file with arms, tools, table and their places (docs/resection.md).
+        arms: also plan the motions of both arms.
+        overwrite: replace PLAN if it exists.
+    """
+    from tumortrack.app import planning
+    from tumortrack.plan.config import ResectionConfig
+
+    config = ResectionConfig(method=method, tumor=tumor, margin_mm=margin, sigmas=sigmas)
+    planning.plan(run, plan, config, planning.PlanOptions(frame, stand, cell, arms, overwrite))
+
+
+def resect(
+    plan: Positional[Path],
+    sinks: Positional[tuple[str, ...]] = (),
+    /,
+    *,
+    live: tuple[Path, str] | None = None,
+    speed: float = 1.0,
+    moved: float = 2.0,
+    film: Path | None = None,
+    report: Path | None = None,
+    device: Literal["auto", "cpu", "cuda"] = "auto",
+) -> None:
+    """Carry a plan out with virtual arms, seen by sinks as those of `track`.
+
+    Args:
+        plan: folder that `plan` wrote.
+        sinks: where arms, cuts and estimates go; see `track`. ur:ADDRESS is a real arm, and only
+            says what it would do unless told execute=true.
+        live: MODEL SOURCE: follow the organ meanwhile, as `track` does. Arms stand while there is
+            no good estimate, and it is planned anew where the tumor has moved.
+        speed: of the arms' time; 2 is twice as fast.
+        moved: the tumor has moved if its surface has by so many mm (root mean square).
+        film: write an animated GIF of the stored plan instead.
+        report: file for states, halts and what else there was (default: runs/resect-TIME.json).
+        device: auto takes CUDA where it is.
+    """
+    from tumortrack.app import resection
+
+    resection.resect(plan, sinks, resection.ResectOptions(live, speed, moved, film, report, device))
+
+
 def simulate(
     case: Positional[Path],
     dataset: Positional[Path],
@@ -399,6 +468,8 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "pretrain": pretrain,
     "locate": locate,
     "track": track,
+    "plan": plan,
+    "resect": resect,
     "simulate": simulate,
     "twin": twin,
     "evaluate": evaluate,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import signal
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -105,7 +105,7 @@ def track(
     say("warming up ...")
     loop.warm()
     with ExitStack() as stack:
-        stack.enter_context(_stopping(loop))  # first in, last out: also while sinks flush
+        stack.enter_context(stopping(loop.stop))  # first in, last out: also while sinks flush
         screen = _Screen(loop, report, about, None if arms is None else arms.companion)
         stack.callback(screen.end)
         outlets = open_sinks(sinks, sink_configs, setting, stack)
@@ -206,12 +206,12 @@ def place_of_report(path: Path | None, command: str) -> Path:
 
 
 @contextmanager
-def _stopping(loop: Loop) -> Iterator[None]:
-    """Ctrl-C, SIGTERM and a terminal that goes end the loop after the frame it is at, and sinks
-    flush; a second Ctrl-C interrupts."""
+def stopping(end: Callable[[], None]) -> Iterator[None]:
+    """Ctrl-C, SIGTERM and a terminal that goes call ``end``, which lets the loop end after the
+    frame it is at, and sinks flush; a second Ctrl-C interrupts."""
 
     def stop(number: int, _: object) -> None:
-        loop.stop()
+        end()
         signal.signal(signal.SIGINT, signal.default_int_handler)
 
     before = {number: signal.signal(number, stop) for number in _ENDS}

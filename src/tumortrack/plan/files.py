@@ -21,8 +21,8 @@ from tumortrack.core.mesh_files import read_mesh, write_mesh
 from tumortrack.core.types import Mesh
 from tumortrack.plan.config import ResectionConfig
 from tumortrack.plan.motions import JOINTS, Motions, Stage
-from tumortrack.plan.values import Cut, Layer, ResectionPlan
-from tumortrack.sense.ply import write_cloud_ply
+from tumortrack.plan.values import Cut, Layer, Located, ResectionPlan
+from tumortrack.sense.ply import framed_ply
 
 KIND = "plan"
 _NAME, _STROKES, _MOTIONS = "plan.json", "strokes.ply", "motions.safetensors"
@@ -74,6 +74,12 @@ def write_plan(
             _write_motions(aside / _MOTIONS, content.motions)
         more(aside)
         store.seal(aside, KIND, {"inputs": inputs}, frame=content.frame_id)
+
+
+def as_located(content: PlanFolder) -> Located:
+    """What the plan was made on, without its cloud: for pictures."""
+    none = np.zeros((0, 3))
+    return Located(none, np.zeros(0, np.uint8), content.meshes, stamp_ns=content.plan.stamp_ns)
 
 
 def read_plan(folder: Path) -> PlanFolder:
@@ -163,19 +169,20 @@ def from_plain(data: dict[str, Any]) -> ResectionPlan:
 def _write_strokes(path: Path, plan: ResectionPlan) -> None:
     """The strokes' points in their order, each with its sweep, its stroke and whether it is one of
     the floor; the grasp point last, with sweep 0."""
-    strokes = [np.full(len(cut.path_mm), n, np.int32) for n, cut in enumerate(plan.cuts, start=1)]
-    write_cloud_ply(
-        path,
-        np.concatenate([*(cut.path_mm for cut in plan.cuts), plan.grasp_mm[None]]),
-        sweep=np.concatenate(
-            [*(np.full(len(c.path_mm), c.sweep, np.int32) for c in plan.cuts), [np.int32(0)]]
-        ).astype(np.int32),
-        stroke=np.concatenate([*strokes, [0]]).astype(np.int32),
-        floor=np.concatenate(
-            [*(np.full(len(c.path_mm), c.kind == "floor") for c in plan.cuts), [False]]
-        ).astype(np.uint8),
-        frame="table (z up)",
-    )
+    points, sweeps, strokes, floor = [plan.grasp_mm[None]], [0], [0], [0]
+    for number, cut in reversed(list(enumerate(plan.cuts, start=1))):
+        n = len(cut.path_mm)
+        points.insert(0, cut.path_mm)
+        sweeps = [cut.sweep] * n + sweeps
+        strokes = [number] * n + strokes
+        floor = [int(cut.kind == "floor")] * n + floor
+    properties: dict[str, np.ndarray] = {
+        "sweep": np.array(sweeps, np.int32),
+        "stroke": np.array(strokes, np.int32),
+        "floor": np.array(floor, np.uint8),
+    }
+    table = framed_ply(np.concatenate(points), properties, "table (z up)")
+    store.write_atomically(path, table)
 
 
 def _write_motions(path: Path, motions: Motions) -> None:

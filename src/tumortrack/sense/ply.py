@@ -7,7 +7,7 @@ Format: Turk 1994, "The PLY Polygon File Format".
 from __future__ import annotations
 
 import io
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -109,25 +109,33 @@ def _cut_off(name: str, claimed: int, held: int) -> str:
     )
 
 
-def write_cloud_ply(
-    path: Path, points_mm: np.ndarray, *, frame: str = CAMERA, **point_properties: np.ndarray
-) -> None:
-    """Write points (n, 3) as binary little-endian PLY, float32 mm, with further properties.
+def write_cloud_ply(path: Path, points_mm: np.ndarray, **point_properties: np.ndarray) -> None:
+    """Write points (n, 3) of the camera frame as binary little-endian PLY, float32 mm, with further
+    properties.
 
     Each property is an array (n,) of uint8, int32, float32 or float64 (``label=``,
-    ``probability=``); ``frame`` stands in a comment.
+    ``probability=``).
 
     Raises:
         InputError: a property of another length or type.
         StorageError: the disk refused.
     """
-    write_atomically(path, cloud_ply(points_mm, frame=frame, **point_properties))
+    write_atomically(path, cloud_ply(points_mm, **point_properties))
 
 
-def cloud_ply(
-    points_mm: np.ndarray, *, frame: str = CAMERA, **point_properties: np.ndarray
-) -> bytes:
+def cloud_ply(points_mm: np.ndarray, **point_properties: np.ndarray) -> bytes:
     """What ``write_cloud_ply`` writes.
+
+    Raises:
+        InputError: a property of another length or type.
+    """
+    return framed_ply(points_mm, point_properties, CAMERA)
+
+
+def framed_ply(
+    points_mm: np.ndarray, point_properties: Mapping[str, np.ndarray], frame: str
+) -> bytes:
+    """The same in another frame, which is named in a comment.
 
     Raises:
         InputError: a property of another length or type.

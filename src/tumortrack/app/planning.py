@@ -1,0 +1,126 @@
+"""`tumortrack plan`: a run -> strokes, motions of two arms, pictures."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from tumortrack.app.console import say
+from tumortrack.core import store
+from tumortrack.core.config import from_builtins, to_builtins
+from tumortrack.core.errors import NoPlan
+
+if TYPE_CHECKING:
+    from tumortrack.core.types import Mesh
+    from tumortrack.plan.arms.config import CellConfig
+    from tumortrack.plan.config import ResectionConfig
+    from tumortrack.plan.values import Located, ResectionPlan
+
+
+@dataclass(frozen=True)
+class PlanOptions:
+    frame: Path | None = None
+    stand_mm: float | None = None
+    cell: Path | None = None
+    arms: bool = True
+    overwrite: bool = False
+
+
+def plan(run_folder: Path, folder: Path, config: ResectionConfig, options: PlanOptions) -> None:
+    """`tumortrack plan`: a run -> strokes, motions, pictures."""
+    from tumortrack.evaluate.plan_pictures import draw_plan
+    from tumortrack.plan.files import KIND, PlanFolder, write_plan
+    from tumortrack.plan.located import read_run, table_below
+    from tumortrack.plan.resection import plan_resection
+
+    store.check_place(folder, KIND, options.overwrite)
+    cell_config = _cell_config(options)
+    run = read_run(run_folder)
+    if options.frame is not None:
+        from tumortrack.track.frames import read_frames
+
+        frames = read_frames(options.frame)
+        frame_id, table_from_camera = frames.frame_id, frames.published_from_camera
+    else:
+        kidney = run.meshes.get("kidney")
+        points_mm = run.cloud.points_mm if kidney is None else kidney.vertices_mm
+        frame_id, table_from_camera = "table", table_below(points_mm, cell_config.stand_mm)
+    located = run.located(table_from_camera)
+    start = time.perf_counter()
+    resection = plan_resection(located, config)
+    seconds = time.perf_counter() - start
+    _tell(resection, seconds)
+    motions, cell_used = None, None
+    if options.arms:
+        from tumortrack.plan.arms.cell import Cell
+        from tumortrack.plan.arms.procedure import plan_motions
+
+        start = time.perf_counter()
+        organ = organ_of(located)
+        placed = Cell(cell_config, organ)
+        motions = plan_motions(resection, placed, organ)
+        cell_used = to_builtins(placed.config)
+        say(
+            f"arms: {len(motions.stages)} stages, {motions.seconds:.0f} s; planned in "
+            f"{time.perf_counter() - start:.1f} s."
+        )
+        if placed.config != cell_config:
+            say("note: the arms do not reach from where they stand; plan.json says where to put "
+                "them.")  # fmt: skip
+    content = PlanFolder(
+        resection, config, table_from_camera, frame_id, located.meshes, cell_used, motions
+    )
+
+    def pictures(aside: Path) -> None:
+        draw_plan(resection, located, aside / "plan.png")
+        if options.arms:
+            from tumortrack.plan.arms.urdf import cell_urdf
+
+            store.write_atomically(aside / "cell.urdf", cell_urdf(placed.config).encode())
+
+    digest = store.sha256_of(run_folder / store.MANIFEST)
+    write_plan(folder, content, {"run": digest}, pictures, options.overwrite)
+    say(f"written to {folder} (frame {frame_id!r}, mm); look at {folder / 'plan.png'}.")
+
+
+def _cell_config(options: PlanOptions) -> CellConfig:
+    import msgspec
+
+    from tumortrack.plan.arms.config import CellConfig
+
+    config = CellConfig()
+    if options.cell is not None:
+        config = from_builtins(store.read_json(options.cell), CellConfig, str(options.cell))
+    if options.stand_mm is not None:
+        config = msgspec.structs.replace(config, stand_mm=options.stand_mm)
+    return config
+
+
+def organ_of(located: Located) -> Mesh:
+    """The organ's surface, which arms must not touch.
+
+    Raises:
+        NoPlan: the run has none.
+    """
+    if "kidney" not in located.meshes:
+        raise NoPlan("the run has no kidney.ply, so arms can't keep clear of it; give --no-arms.")
+    return located.meshes["kidney"]
+
+
+def _tell(resection: ResectionPlan, seconds: float) -> None:
+    volumes = resection.volumes_ml
+    say(
+        f"{resection.tumor} ({volumes['tumor']:.1f} ml, {resection.exophytic:.0%} outside the "
+        f"organ's hull): {len(resection.cuts)} strokes in {resection.sweeps} sweeps, "
+        f"{sum(cut.length_mm for cut in resection.cuts):.0f} mm; planned in {1000 * seconds:.0f} "
+        "ms."
+    )
+    say(
+        f"margin {resection.margin_mm:g} mm; {volumes['piece']:.1f} ml come away, of that "
+        f"{volumes['healthy']:.1f} ml healthy tissue "
+        f"({volumes['healthy'] / volumes['parenchyma']:.0%} of the organ's)."
+    )
+    for note in resection.notes:
+        say(f"note: {note}")

@@ -1,0 +1,223 @@
+"""`tumortrack resect`: the motions of a plan, virtually, seen by sinks or filmed."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+
+from tumortrack.app.console import progress_bar, say
+from tumortrack.core import store
+from tumortrack.core.config import from_builtins, to_builtins
+from tumortrack.core.errors import InputError, NoPlan
+
+if TYPE_CHECKING:
+    from jaxtyping import Float64
+
+    from tumortrack.plan.arms.cell import Cell
+    from tumortrack.plan.files import PlanFolder
+    from tumortrack.plan.operation import Operation, OperationConfig, Planned
+    from tumortrack.plan.values import Located
+    from tumortrack.track.live import Shape, Update, Workcell
+
+    Sinks = tuple[str, ...]
+
+_FPS = 30.0  # of an execution that no camera drives
+_NOTHING = "virtual execution of a stored plan: nothing is tracked"
+_FILM_FPS = 10
+
+
+@dataclass(frozen=True)
+class ResectOptions:
+    live: tuple[Path, str] | None = None
+    speed: float = 1.0
+    moved_mm: float = 2.0
+    film: Path | None = None
+    report: Path | None = None
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+
+
+def resect(plan_folder: Path, sinks: tuple[str, ...], options: ResectOptions) -> None:
+    """`tumortrack resect`: a plan's motions, virtually, shown by sinks or filmed."""
+    from tumortrack.app.live import parse_sinks
+    from tumortrack.plan.arms.cell import Cell
+    from tumortrack.plan.arms.config import CellConfig
+    from tumortrack.plan.files import read_plan
+    from tumortrack.plan.operation import OperationConfig
+
+    stored = read_plan(plan_folder)
+    if stored.motions is None or stored.cell is None:
+        raise InputError(f"{plan_folder} was planned with --no-arms; plan again without it.")
+    parse_sinks(sinks)  # a wrong one is said before anything heavy is loaded
+    config = OperationConfig(speed=options.speed, moved_mm=options.moved_mm)
+    where = str(plan_folder)
+    cell = Cell(from_builtins(stored.cell, CellConfig, where), stored.meshes.get("kidney"))
+    if options.film is not None:
+        if options.live is not None or sinks:
+            raise InputError("--film shows the stored plan; give it without sinks and --live.")
+        _film(stored, cell, options.film)
+    elif options.live is not None:
+        _live(stored, cell, config, sinks, options)
+    else:
+        _virtual(stored, cell, config, sinks, options)
+
+
+def _operation(stored: PlanFolder, cell: Cell, config: OperationConfig, **live: Any) -> Operation:
+    from tumortrack.plan.operation import Operation, Planned
+
+    assert stored.motions is not None
+    tumor = stored.meshes.get(stored.plan.tumor)
+    if tumor is None:
+        raise InputError(f"the plan lacks {stored.plan.tumor}.ply; plan again.")
+    return Operation(Planned(stored.plan, tumor, stored.motions), config, cell.shapes, **live)
+
+
+def _live(
+    stored: PlanFolder, cell: Cell, config: OperationConfig, sinks: Sinks, options: ResectOptions
+) -> None:
+    """Beside the live loop: every estimate is looked at, and planned on where the tumor moved."""
+    from tumortrack.app.live import Arms, TrackOptions, track
+    from tumortrack.app.planning import organ_of
+    from tumortrack.plan.arms.procedure import plan_motions
+    from tumortrack.plan.located import located
+    from tumortrack.plan.operation import Planned
+    from tumortrack.plan.resection import plan_resection
+    from tumortrack.track.live import Frames
+
+    assert options.live is not None
+    unsure = stored.config.sigmas > 0
+
+    def locate(update: Update) -> Located:
+        estimate = update.estimate
+        assert estimate is not None
+        motion = estimate.motion if unsure else None
+        return located(estimate.cloud, estimate.meshes, motion, stored.table_from_camera)
+
+    def replan(seen: Located, joints_rad: Float64[np.ndarray, " 12"], sweep: int | None) -> Planned:
+        resection = plan_resection(seen, stored.config)
+        organ = organ_of(seen)
+        motions = plan_motions(
+            resection, cell.with_organ(organ), organ, start_rad=joints_rad, from_sweep=sweep
+        )
+        return Planned(resection, seen.meshes[resection.tumor], motions)
+
+    operation = _operation(stored, cell, config, locate=locate, replan=replan)
+    frames = Frames(stored.frame_id, stored.table_from_camera)
+    arms = Arms(operation, frames, {"plan_config": to_builtins(config)})
+    model, source = options.live
+    track(model, source, sinks, TrackOptions(report=options.report, device=options.device), arms)
+    _tell_end(operation)
+
+
+def _virtual(
+    stored: PlanFolder, cell: Cell, config: OperationConfig, sinks: Sinks, options: ResectOptions
+) -> None:
+    """Without a camera: the stored motions in real time."""
+    from tumortrack.app.live import open_sinks, parse_sinks, place_of_report, stopping
+    from tumortrack.track.live import Controls, Frames, Setting, Update
+
+    assert stored.motions is not None
+    operation = _operation(stored, cell, config)
+    operation.still_life = _organ_shapes(stored)
+    report = place_of_report(options.report, "resect")
+    frames = Frames(stored.frame_id, stored.table_from_camera)
+    controls = Controls()
+    setting = Setting(tuple(stored.meshes), frames, None, controls, arms=True)
+    with ExitStack() as stack:
+        stack.enter_context(stopping(lambda: operation.abort("stopped by Ctrl-C")))
+        outlets = open_sinks(sinks, parse_sinks(sinks), setting, stack)
+        say(f"{stored.motions.seconds / config.speed:.0f} s in frame {frames.frame_id!r}; "
+            "Ctrl-C stops the arms.")  # fmt: skip
+        said, sequence, next_s = "", 0, time.monotonic()
+        while True:
+            if controls.aborted.is_set():
+                operation.abort("aborted by the user")
+            update = operation.act(Update(sequence, time.time_ns(), reason=_NOTHING, frames=frames))
+            for outlet in outlets:
+                outlet.put(update)
+            said = _say_state(update.workcell, said)
+            if operation.ended:
+                break
+            sequence += 1
+            next_s += 1 / _FPS
+            time.sleep(max(0.0, next_s - time.monotonic()))
+    _write_report(report, stored, operation, {outlet.name: outlet.summary() for outlet in outlets})
+    _tell_end(operation)
+    say(f"written to {report}.")
+
+
+def _organ_shapes(stored: PlanFolder) -> tuple[Shape, ...]:
+    from tumortrack.track.live import Shape
+    from tumortrack.track.view.colours import part_colour
+
+    names = sorted(stored.meshes)  # kidney before tumors
+    return tuple(
+        Shape(f"planned/{name}", stored.meshes[name], np.eye(4), part_colour(label),
+              0.35 if name == "kidney" else 1.0)
+        for label, name in enumerate(names, start=1)
+    )  # fmt: skip
+
+
+def _say_state(cell: Workcell | None, said: str) -> str:
+    assert cell is not None
+    state = cell.state + (f": {cell.halted}" if cell.halted else "")
+    if state != said:
+        say(state)
+    return state
+
+
+def _write_report(path: Path, stored: PlanFolder, operation: Operation, sinks: dict) -> None:
+    content = {
+        "plan": {"tumor": stored.plan.tumor, "method": stored.plan.method},
+        "frame": stored.frame_id,
+        "resection": operation.summary(),
+        "sinks": sinks,
+    }
+    store.write_json(path, content)
+
+
+def _tell_end(operation: Operation) -> None:
+    found = operation.summary()
+    if found["state"] == "done":
+        say("done: both arms are home.")
+        return
+    raise NoPlan(f"the resection did not end: {found['state']}, {found['halted']}.")
+
+
+def _film(stored: PlanFolder, cell: Cell, path: Path) -> None:
+    """An animated GIF of about twelve seconds."""
+    from tumortrack.evaluate.film import film
+    from tumortrack.plan.files import as_located
+
+    seconds = stored.motions.seconds if stored.motions is not None else 0.0
+    n = 120
+    with progress_bar("drawing", 2 * n) as advance:
+        done = 0
+
+        def progress(now: int, _: int) -> None:
+            nonlocal done
+            for _step in range(now - done):
+                advance()
+            done = now
+
+        film(_frames(stored, cell, seconds / n), as_located(stored), path, _FILM_FPS,
+             progress=progress)  # fmt: skip
+    say(f"written to {path}: {seconds:.0f} s in {n / _FILM_FPS:.0f}.")
+
+
+def _frames(stored: PlanFolder, cell: Cell, step_s: float) -> Iterator[Workcell]:
+    from tumortrack.plan.operation import OperationConfig
+    from tumortrack.track.live import Update
+
+    operation = _operation(stored, cell, OperationConfig())
+    now_s = 0.0
+    while not operation.ended:
+        frame = operation.act(Update(0, 0, reason=_NOTHING), now_s)
+        assert frame.workcell is not None
+        yield frame.workcell
+        now_s += step_s
