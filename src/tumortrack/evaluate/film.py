@@ -30,7 +30,8 @@ if TYPE_CHECKING:
 _FROM = np.array([-0.36, -0.8, 0.48])  # where the eye is, seen from the middle: left, front, above
 _CLOSE_FROM = np.array([-0.36, -0.72, 0.6])
 _AWAY = 2.6  # the eye's distance in radii of what it sees: a natural perspective
-_CLOSE = 0.36, 0.38  # the close-up's share of width and height
+_CLOSE = 0.47, 0.42  # the close-up's share of width and height, in the lower right corner
+_ARMS = 0.97, 0.62  # and that of the arms, above it
 _CLOSE_MM = 40.0  # the close-up cuts away what is nearer to the eye than the organ by this
 _ORGAN_OPACITY = 0.42
 _LEAST_PIXELS = 2.0  # width of a line
@@ -69,7 +70,7 @@ def film(
     told = list(frames)
     _check(told, path, fps, size)
     stage = _Stage(told, located, size)
-    chosen = np.linspace(0, len(told) - 1, min(_SAMPLES, len(told))).astype(int)
+    chosen = np.linspace(0, len(told) - 1, min(_SAMPLES, len(told))).astype(int).tolist()
     palette, index_of = _palette([stage.picture(n) for n in chosen])
 
     def indexed() -> Iterator[Image.Image]:
@@ -120,7 +121,7 @@ class _Stage:
             for label, mesh in sorted(organ_surfaces(located).items())
         ]
         self._close_size = round(_CLOSE[0] * size[0]), round(_CLOSE[1] * size[1])
-        self._far = _eye_around(_reach(frames), _FROM, size)
+        self._far = _eye_around(_reach(frames), _FROM, size, _ARMS)
         self._near = _close_eye(self._organ[0].mesh, self._close_size)
         self._letters = _letters(size[1] // 20), _letters(size[1] // 34)
         self._tubes: dict[tuple[int, float], tuple[Line, Mesh]] = {}
@@ -133,7 +134,8 @@ class _Stage:
         shapes = [Body(s.mesh, s.colour, s.published_from_shape, s.opacity) for s in cell.shapes]
         out = Image.fromarray(self._seen(cell, shapes, self._far, self._size))
         close = Image.fromarray(self._seen(cell, shapes, self._near, self._close_size))
-        left, top = self._size[0] - close.width - 8, 8
+        left, top = (whole - part - 8 for whole, part in zip(self._size, close.size, strict=True))
+        top -= 10
         out.paste(close, (left, top))
         draw = ImageDraw.Draw(out)
         draw.rectangle(
@@ -199,9 +201,13 @@ def _reach(frames: list[Workcell]) -> Float[np.ndarray, "n 3"]:
 
 
 def _eye_around(
-    points_mm: Float[np.ndarray, "n 3"], direction: np.ndarray, size: tuple[int, int]
+    points_mm: Float[np.ndarray, "n 3"],
+    direction: np.ndarray,
+    size: tuple[int, int],
+    share: tuple[float, float] = (0.9, 0.9),
 ) -> Eye:
-    """The eye in this direction that sees all points, as large as can be."""
+    """The eye in this direction that sees all points as large as they can be in the uppermost
+    ``share`` of the picture."""
     target = (points_mm.min(0) + points_mm.max(0)) / 2
     radius = float(np.linalg.norm(points_mm - target, axis=1).max())
     away = _AWAY * radius * direction / np.linalg.norm(direction)
@@ -209,22 +215,23 @@ def _eye_around(
     right = np.cross([0.0, 0.0, 1.0], away)
     right /= np.linalg.norm(right)
     down = np.cross(right, away) / np.linalg.norm(away)
-    for _ in range(4):  # moved and widened until it fits
+    room = np.array(size) * share
+    middle = np.array([size[0] / 2, (room[1] + (1 - max(share)) * size[1]) / 2])
+    for _ in range(6):  # moved and widened until it fits
         flat = eye.project(points_mm, size)[:, :2]
         low, high = flat.min(0), flat.max(0)
-        off = ((low + high) / 2 - (np.array(size) - 1) / 2) * eye.width_mm / size[0]
+        off = ((low + high) / 2 - middle) * eye.width_mm / size[0]
         target = target + off[0] * right + off[1] * down
-        width = eye.width_mm * 1.05 * float(((high - low) / size).max())
+        width = eye.width_mm * float(((high - low) / room).max())
         eye = Eye(target + away, target, width)
     return eye
 
 
 def _close_eye(organ: Mesh, size: tuple[int, int]) -> Eye:
-    fitted = _eye_around(organ.vertices_mm, _CLOSE_FROM, size)
-    away = fitted.place_mm - fitted.target_mm
+    eye = _eye_around(organ.vertices_mm, _CLOSE_FROM, size)
+    away = eye.place_mm - eye.target_mm
     radius = float(np.linalg.norm(organ.vertices_mm - organ.box_mm.mean(0), axis=1).max())
-    far = fitted.target_mm + away * 10
-    return Eye(far, fitted.target_mm, 1.12 * fitted.width_mm, True, radius + _CLOSE_MM)
+    return Eye(eye.target_mm + 10 * away, eye.target_mm, eye.width_mm, True, radius + _CLOSE_MM)
 
 
 def tube(points_mm: Float[np.ndarray, "n 3"], radius_mm: float, sides: int = 6) -> Mesh:

@@ -10,6 +10,7 @@ from tumortrack.core.types import ORGAN, Mesh
 from tumortrack.plan.values import Located
 
 _BLUR = 1.2  # cells: bridges the gaps between points strewn at random
+_INSIDE = 0.75  # quantile of the density at the points: those near the surface have less
 _FEWEST, _MOST_CELLS = 8, 60  # points of a part; cells along its longest side
 
 
@@ -29,7 +30,8 @@ def organ_surfaces(located: Located) -> dict[int, Mesh]:
 def skin(points_mm: Float[np.ndarray, "n 3"]) -> Mesh:
     """The closed surface around points strewn evenly through a body.
 
-    Where the points' blurred density falls to half of what it is inside.
+    A level of the points' blurred density: the one that holds all of them at the density that
+    there is inside.
 
     Raises:
         InputError: too few points.
@@ -47,8 +49,9 @@ def skin(points_mm: Float[np.ndarray, "n 3"]) -> Mesh:
     edges = [low[d] + cell * np.arange(np.ceil(size[d] / cell) + 9) for d in range(3)]
     counts, _ = np.histogramdd(points_mm, edges)
     density = gaussian_filter(counts, _BLUR, mode="constant")
-    inside = density[tuple(((points_mm - low) / cell).astype(int).T)]
-    level = 0.5 * float(np.quantile(inside, 0.75))
+    inside = np.quantile(density[tuple(((points_mm - low) / cell).astype(int).T)], _INSIDE)
+    ranked, cells = np.sort(density, axis=None), round(len(points_mm) / inside)
+    level = float(ranked[-cells - 1 : -cells + 1].mean())  # of no cell: corners would coincide
     vertices, faces, _, _ = marching_cubes(density, level, gradient_direction="ascent")
     mesh = Mesh(low + cell * (vertices + 0.5), faces)
     return mesh if mesh.volume_mm3 > 0 else Mesh(mesh.vertices_mm, mesh.faces[:, ::-1])

@@ -52,43 +52,44 @@ _ARROW_EVERY_MM, _HEAD_MM = 45.0, 2.6
 
 
 def draw_plan(plan: ResectionPlan, located: Located, path: Path) -> None:
+    """Write ``plan_figure`` as a PNG of 1200 x 600 pixels, atomically.
+
+    Raises:
+        InputError: as ``plan_figure``.
+        StorageError: the disk refused.
+    """
+    save(plan_figure(plan, located), path)
+
+
+def plan_figure(plan: ResectionPlan, located: Located) -> Figure:
     """Organ, tumors, what comes away, strokes with their directions, and where it is held.
 
-    Strokes are bold where they pass through the organ. Of a located cloud without meshes the skin
-    is drawn.
+    Two axes in mm, down pointing down: from above x and -y, from the side x and -z. Strokes are
+    bold where they pass through the organ. Of a cloud without meshes the skin is drawn.
 
     Args:
         plan, located: table frame, mm.
-        path: PNG to write, atomically.
 
     Raises:
         InputError: what was located has no surface, or one that is not closed.
-        StorageError: the disk refused.
     """
     surfaces = organ_surfaces(located)
     if plan.label not in surfaces:
         raise InputError(f"{plan.tumor} was not located, so its plan can't be drawn.")
-    piece, rest = _parted(surfaces[ORGAN], plan.layers)
-    through = [_through(cut, surfaces[ORGAN]) for cut in plan.cuts]
+    piece, rest = parted(surfaces[ORGAN], plan.layers)
+    in_organ = [within(cut, surfaces[ORGAN]) for cut in plan.cuts]
     figure = new_figure(12.0, 6.0)
     figure.subplots_adjust(left=0.012, right=0.988, top=0.845, bottom=0.1, wspace=0.02)
     for column, view in enumerate((FROM_ABOVE, FROM_SIDE)):
         axes = figure.add_subplot(1, 2, column + 1)
         frame = _frame(view, surfaces, plan)
-        parts = [Layer(m, _unit(part_colour(n))) for n, m in surfaces.items() if n != ORGAN]
-        parts.append(Layer(rest, _unit(part_colour(ORGAN)), _ORGAN_OPACITY))
-        if len(piece.faces):
-            parts.append(Layer(piece, _PIECE, _PIECE_OPACITY))
-        axes.imshow(shade(parts, view, frame), extent=frame.extent, interpolation="bilinear")
-        if len(piece.faces):
-            x, y = np.meshgrid(*pixel_centres(frame))
-            mask = silhouette(piece, view, frame)
-            axes.contour(x, y, mask, levels=[0.5], colors=[_PIECE], linewidths=0.9)
-        _draw_cuts(axes, plan, through, view)
+        tumors = {label: mesh for label, mesh in surfaces.items() if label != ORGAN}
+        _draw_bodies(axes, view, frame, tumors, piece, rest)
+        _draw_cuts(axes, plan, in_organ, view)
         _draw_numbers(axes, plan, view, frame)
         _draw_grasp(axes, plan, view)
-        for label, mesh in surfaces.items():
-            if label not in (ORGAN, plan.label):
+        for label, mesh in tumors.items():
+            if label != plan.label:
                 u, v = view.project(mesh.box_mm.mean(0)[None])[0, :2]
                 axes.text(u, v, f"tumor {label - ORGAN}", ha="center", va="center", zorder=3)
         blank(axes, frame)
@@ -96,7 +97,20 @@ def draw_plan(plan: ResectionPlan, located: Located, path: Path) -> None:
         axis_arrows(axes, frame, _ARROWS[view])
         axes.set_title(view.name, fontsize=11)
     _words(figure, plan)
-    save(figure, path)
+    return figure
+
+
+def _draw_bodies(
+    axes: Axes, view: View, frame: Frame, tumors: dict[int, Mesh], piece: Mesh, rest: Mesh
+) -> None:
+    parts = [Layer(mesh, _unit(part_colour(label))) for label, mesh in tumors.items()]
+    parts.append(Layer(rest, _unit(part_colour(ORGAN)), _ORGAN_OPACITY))
+    parts.append(Layer(piece, _PIECE, _PIECE_OPACITY))
+    axes.imshow(shade(parts, view, frame), extent=frame.extent, interpolation="bilinear")
+    if len(piece.faces):
+        x, y = np.meshgrid(*pixel_centres(frame))
+        mask = silhouette(piece, view, frame)
+        axes.contour(x, y, mask, levels=[0.5], colors=[_PIECE], linewidths=0.9)
 
 
 def _unit(colour: Colour) -> tuple[float, float, float]:
@@ -104,7 +118,7 @@ def _unit(colour: Colour) -> tuple[float, float, float]:
     return red, green, blue
 
 
-def _parted(organ: Mesh, layers: tuple[Slab, ...]) -> tuple[Mesh, Mesh]:
+def parted(organ: Mesh, layers: tuple[Slab, ...]) -> tuple[Mesh, Mesh]:
     """The piece that comes away, and what stays."""
     import manifold3d
 
@@ -120,7 +134,7 @@ def _parted(organ: Mesh, layers: tuple[Slab, ...]) -> tuple[Mesh, Mesh]:
     return mesh_of(solid ^ taken), mesh_of(solid - taken)
 
 
-def _through(cut: Cut, organ: Mesh) -> Bool[np.ndarray, " n"]:
+def within(cut: Cut, organ: Mesh) -> Bool[np.ndarray, " n"]:
     """Which points of a stroke lie in the organ."""
     low, high = cut.path_mm.min(0) - _INSIDE_MM, cut.path_mm.max(0) + _INSIDE_MM
     way = np.diag([_INSIDE_MM, _INSIDE_MM, _INSIDE_MM, 1.0])
@@ -137,17 +151,17 @@ def _frame(view: View, surfaces: dict[int, Mesh], plan: ResectionPlan) -> Frame:
 
 
 def _draw_cuts(
-    axes: Axes, plan: ResectionPlan, through: list[Bool[np.ndarray, " n"]], view: View
+    axes: Axes, plan: ResectionPlan, in_organ: list[Bool[np.ndarray, " n"]], view: View
 ) -> None:
     """The lowest first and, from above, widest, so that strokes above each other all show."""
     from matplotlib.patheffects import Normal, Stroke
 
-    for cut, inside in reversed(list(zip(plan.cuts, through, strict=True))):
+    for cut, inside in reversed(list(zip(plan.cuts, in_organ, strict=True))):
         flat = view.project(cut.path_mm)
         colour = _unit(sweep_colour(cut.sweep, plan.sweeps))
         low = (cut.sweep - 1) / max(plan.sweeps - 1, 1) if view is FROM_ABOVE else 0.5
-        width = (1.9 + 1.8 * low) * (1.0 if cut.kind == "wall" else 0.6)
-        casing = [Stroke(linewidth=width + 1.6, foreground="white", alpha=0.8), Normal()]
+        width = (1.9 + 2.8 * low) * (1.0 if cut.kind == "wall" else 0.6)
+        casing = [Stroke(linewidth=width + 1.2, foreground="white", alpha=0.8), Normal()]
         axes.plot(*flat[:, :2].T, color=colour, linewidth=0.9, alpha=0.8, zorder=5)
         bold = np.where(inside[:, None], flat[:, :2], np.nan)
         axes.plot(*bold.T, color=colour, linewidth=width, path_effects=casing, zorder=6)
