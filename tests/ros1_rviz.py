@@ -15,7 +15,7 @@ from PIL import Image
 
 from ros1_objects import end
 
-CONFIGURATION = Path(__file__).parents[1] / "docs" / "ros" / "tumortrack_ros1.rviz"
+CONFIGURATIONS = Path(__file__).parents[1] / "docs" / "ros"
 _SIZE = "1180x720x24"
 
 
@@ -48,8 +48,8 @@ class Screen:
 
 
 @contextlib.contextmanager
-def rviz(folder: Path) -> Iterator[Screen]:
-    """RViz with the shipped configuration. Skips where there is none."""
+def rviz(folder: Path, configuration: str = "tumortrack_ros1.rviz") -> Iterator[Screen]:
+    """RViz with a shipped configuration. Skips where there is none."""
     for program in ("rviz", "Xvfb", "import"):
         if shutil.which(program) is None:
             pytest.skip(f"no {program} here: tools/debian.sh installs it")
@@ -68,7 +68,7 @@ def rviz(folder: Path) -> Iterator[Screen]:
             screen = Screen(":" + answer.readline().strip(), folder)
         with (folder / "rviz.log").open("w") as log:
             viewer = subprocess.Popen(
-                ["rviz", "-d", str(CONFIGURATION), "--splash-screen", ""],
+                ["rviz", "-d", str(CONFIGURATIONS / configuration), "--splash-screen", ""],
                 env=screen.environment,
                 stdout=log,
                 stderr=log,

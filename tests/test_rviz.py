@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,12 +15,13 @@ from live_objects import STAMP_NS, empty_update, small_setting
 from ros1_objects import eventually, ros1_graph
 from ros1_rviz import Screen, rviz
 from stories import looking_down, write_phantom_case
-from tumortrack.core.geometry import transform_points
+from tumortrack.core.geometry import rigid, transform_points
 from tumortrack.core.types import OccupancyCloud
 from tumortrack.track.estimate import Estimate
-from tumortrack.track.live import Update
+from tumortrack.track.live import Frames, Update
 from tumortrack.track.sinks.ros1 import Ros1
 from tumortrack.track.view.colours import KIDNEY
+from workcell_objects import with_arms, workcell
 
 pytestmark = pytest.mark.filterwarnings("ignore:notifyAll:DeprecationWarning")  # rospy's own
 
@@ -89,4 +91,59 @@ def test_rviz_shows_the_tumors_through_the_kidney_and_nothing_without_an_estimat
         left = shown(screen)
         assert left["tumor_1"] + left["tumor_2"] + left["kidney's points"] < 50, left
         assert left["kidney"] < 1500, left  # the text's soft edges
+    sink.close()
+
+
+def seen_of_the_cell(screen: Screen) -> dict[str, np.ndarray]:
+    """Which pixels look like what, shaded."""
+    red, green, blue = np.moveaxis(screen.pixels()[80:690, 370:1160], -1, 0)
+    bright = red + green + blue > 90
+    return {
+        "cutter": bright & (red > 1.4 * green) & (green > 2 * blue),
+        "holder": bright & (blue > 1.35 * green) & (green > 1.5 * red),
+        "table": (red > 55) & (abs(red - green) < 8) & (abs(blue - green) < 8) & (red < 180),
+        "cut": bright & (red > 2 * green) & (blue > 1.5 * green),
+        "tumor": bright & (red > green + 15) & (green > blue + 40) & (red < 1.35 * green),
+        "kidney": bright & (red > 1.3 * green) & (red < 2.5 * green) & (abs(green - blue) < 25),
+    }
+
+
+def test_rviz_shows_arms_at_work_and_nothing_of_them_when_nothing_is_known(tmp_path):
+    ros1_graph()
+    update = phantom_update(tmp_path)
+    assert update.estimate is not None
+    # The camera looks straight down; the organ lies on the table.
+    far_mm = update.estimate.meshes["kidney"].box_mm[1, 2]
+    frames = Frames("table", rigid(np.diag([1.0, -1, -1]), np.array([0.0, 0, far_mm])))
+    update = replace(update, frames=frames)
+    assert update.placed is not None
+    x, y, z = update.placed.meshes["tumor_2"].box_mm.mean(0)
+    sink = Ros1(mesh_hz=0).open(replace(with_arms(), frames=frames))
+
+    def ask(progress: float | None) -> dict[str, np.ndarray]:
+        cell = None if progress is None else workcell(progress, "", (x, y, z), 25.0)
+        for _ in range(5):
+            sink.publish(replace(update, workcell=cell))
+            time.sleep(0.05)
+        return seen_of_the_cell(screen)
+
+    least = {"cutter": 5000, "holder": 5000, "table": 50_000, "cut": 40, "tumor": 60, "kidney": 300}
+
+    def all_there() -> bool:
+        found = {name: int(pixels.sum()) for name, pixels in ask(0.1).items()}
+        return all(found[name] > number for name, number in least.items())
+
+    with rviz(tmp_path, "resection_ros1.rviz") as screen:
+        eventually(all_there, "arms, table, cuts, kidney and tumor")
+        before = ask(0.1)
+        later = ask(0.6)
+        assert (before["cutter"] ^ later["cutter"]).sum() > 800  # it moves,
+        assert (before["holder"] ^ later["holder"]).sum() < 300  # and the other does not
+        left = eventually(
+            lambda: (now := ask(None))["cutter"].sum() == 0 and now, "the arms' disappearance"
+        )
+        assert not left["holder"].any()
+        assert not left["table"].any()
+        assert left["cut"].sum() < 20
+        assert left["tumor"].sum() > 60
     sink.close()

@@ -37,6 +37,7 @@ from tumortrack.track.sinks.ur import Ur, UrSink
 from tumortrack.track.sources.recording import Recording
 from tumortrack.track.spec import parse_spec
 from tumortrack.track.ur_link import SILENT_S, UR_JOINTS
+from tumortrack.track.view.workcell import box_of
 from workcell_objects import CUT, REASON, TABLE, virtual, with_arms, workcell, working
 
 HUMBLE, NOETIC = Messages("humble"), Messages("noetic")
@@ -88,9 +89,13 @@ def test_joints_and_markers_say_where_everything_stands():
     assert [cut.color.r, cut.color.g, cut.color.b] == pytest.approx(np.array(CUT) / 255)
     text = markers["state"]
     assert (text.text, text.type) == ("sweep 1", text.TEXT_VIEW_FACING)
-    highest = max(transform_points(s.published_from_shape, s.mesh.vertices_mm)[:, 2].max()
-                  for s in cell.shapes)  # fmt: skip
-    assert text.pose.position.z * 1000 > highest > 400
+    everything = np.concatenate(
+        [transform_points(s.published_from_shape, s.mesh.vertices_mm) for s in cell.shapes]
+    )
+    np.testing.assert_allclose(box_of(cell), [everything.min(0), everything.max(0)], atol=1e-9)
+    place, middle = text.pose.position, everything.min(0) / 2 + everything.max(0) / 2
+    assert [place.x * 1000, place.y * 1000] == pytest.approx(middle[:2])
+    assert place.z * 1000 == pytest.approx(everything[:, 2].max() + 60)
 
 
 def test_arms_are_told_of_without_an_estimate_and_why_they_stand():

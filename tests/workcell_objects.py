@@ -17,7 +17,7 @@ from tumortrack.track.live import Frames, Line, Setting, Shape, Update, Workcell
 UR = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
 # The camera of the small objects looks straight down onto their middle, 130 mm away.
 TABLE = Frames("table", rigid(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 160.0])))
-CUTTER, HOLDER, TOP = (245, 150, 40), (70, 150, 240), (92, 98, 108)
+CUTTER, HOLDER, TOP = (245, 150, 40), (70, 150, 240), (200, 205, 212)
 CUT = (255, 40, 160)
 REASON = "virtual execution of a stored plan: nothing is tracked"
 
@@ -29,11 +29,17 @@ def box(x: float, y: float, z: float) -> Mesh:
     return Mesh(made.vertices, made.faces)
 
 
-def link(name: str, start: np.ndarray, end: np.ndarray, colour: tuple[int, int, int]) -> Shape:
-    """A bar of a length that does not change, from one point towards another."""
+def bar(
+    name: str,
+    start: np.ndarray,
+    end: np.ndarray,
+    colour: tuple[int, int, int],
+    wide: float = 60.0,
+) -> Shape:
+    """From one point to another; its length in whole millimetres."""
     along = end - start
     turn = Rotation.align_vectors([along / np.linalg.norm(along)], [[0, 0, 1]])[0].as_matrix()
-    mesh = box(60.0, 60.0, round(float(np.linalg.norm(along))))
+    mesh = box(wide, wide, round(float(np.linalg.norm(along))))
     return Shape(name, mesh, rigid(turn, (start + end) / 2), colour)
 
 
@@ -42,23 +48,29 @@ def arm(name: str, base: float, tip: np.ndarray, colour: tuple[int, int, int]) -
     foot = np.array([base, 250.0, 0.0])
     elbow = np.array([0.75 * base, 200.0, 420.0])
     return [
-        link(f"{name}/upper_arm", foot, elbow, colour),
-        link(f"{name}/forearm", elbow, tip + [0.1 * base, 80.0, 60.0], colour),
-        link(f"{name}/tool", tip + [0.1 * base, 80.0, 60.0], tip, (200, 205, 210)),
+        bar(f"{name}/upper_arm", foot, elbow, colour),
+        bar(f"{name}/forearm", elbow, tip + [0.1 * base, 80.0, 60.0], colour),
+        bar(f"{name}/tool", tip + [0.1 * base, 80.0, 60.0], tip, (200, 205, 210), 14.0),
         Shape(f"{name}/tip", box(8.0, 8.0, 8.0), rigid(np.eye(3), tip), (250, 230, 60)),
     ]
 
 
-def workcell(progress: float = 0.0, halted: str = "") -> Workcell:
-    """``progress``: 0..1 along a circle round the place of the small objects' first tumor."""
-    angle = 2 * np.pi * progress
-    ring = np.linspace(0, 2 * np.pi, 41)
-    circle = np.stack([14 + 12 * np.cos(ring), 3 + 12 * np.sin(ring), np.full(41, 40.0)], axis=1)
-    tip = np.array([14 + 12 * np.cos(angle), 3 + 12 * np.sin(angle), 40.0])
+def workcell(
+    progress: float = 0.0,
+    halted: str = "",
+    around_mm: tuple[float, float, float] = (14.0, 3.0, 40.0),
+    radius_mm: float = 12.0,
+) -> Workcell:
+    """``progress``: 0..1 along a circle round a place: by default the small objects' first
+    tumor."""
+    middle = np.array(around_mm)
+    ring = 2 * np.pi * np.append(np.linspace(0, 1, 41), progress)
+    circle = middle + radius_mm * np.stack([np.cos(ring), np.sin(ring), 0 * ring], axis=1)
+    circle, tip = circle[:-1], circle[-1]
     shapes = (
         Shape("table", box(1300.0, 800.0, 20.0), rigid(np.eye(3), np.array([0, 0, -10.0])), TOP),
         *arm("cutter", 480.0, tip, CUTTER),
-        *arm("holder", -480.0, np.array([14.0, 3.0, 58.0]), HOLDER),
+        *arm("holder", -480.0, middle + [0, 0, 18.0], HOLDER),
     )
     joints = {
         f"{one}_{joint}_joint": 0.1 * k + 0.2 * progress + (0.5 if one == "holder" else 0.0)

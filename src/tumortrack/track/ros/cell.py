@@ -3,6 +3,7 @@ line of the diagnostics. Metres and radians, in the published frame."""
 
 from __future__ import annotations
 
+import time
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,7 @@ from tumortrack.track.ros.markers import (
     DELETE,
     DELETE_ALL,
     LINE,
+    MARKER_LIFETIME_S,
     MARKERS,
     TEXT,
     TRIANGLES,
@@ -42,14 +44,16 @@ _TEXT_ABOVE_MM = 60.0
 class Cell:
     """A publisher's memory of what it showed, so that what is gone is deleted.
 
-    ``hz``: markers and observed points at most so often (0: each time); the state's text, the
-    joints and deletions come with every update. ``observed``: without, those points never come.
+    ``hz``: markers and observed points at most so often (0: each time), what stands still once a
+    second; the state's text, the joints and deletions come with every update. ``observed``:
+    without, those points never come.
     """
 
     def __init__(self, messages: Messages, hz: float, observed: bool = True) -> None:
         self._messages, self._observed = messages, observed
         self._markers_rate, self._points_rate = Rate(hz), Rate(hz)
         self._shown: set[str] = set()
+        self._sent: dict[str, tuple[tuple, float]] = {}  # how each looked, and when it was sent
 
     def outgoing(self, update: Update, header: Any) -> list[Outgoing]:
         """``joint_states`` (JointState; no names without arms) and ``workcell`` (MarkerArray: a
@@ -113,17 +117,32 @@ class Cell:
     def _markers(self, cell: Workcell | None, header: Any) -> list[Any]:
         messages = self._messages
         if cell is None:
-            self._shown.clear()
+            self._shown, self._sent = set(), {}
             return [marker(messages, header, action=DELETE_ALL)]
         shapes, lines = cell.shapes, [line for line in cell.lines if len(line.points_mm) > 1]
         names = {STATE, *(shape.name for shape in shapes), *(line.name for line in lines)}
         gone, self._shown = self._shown - names, names
         out = [marker(messages, header, ns=name, action=DELETE) for name in sorted(gone)]
+        for name in gone:
+            self._sent.pop(name, None)
         if self._markers_rate.due():
-            out += [_surface(shape, header, messages) for shape in shapes]
-            out += [_strip(line, header, messages) for line in lines]
+            out += [_surface(one, header, messages) for one in shapes if self._is_news(one)]
+            out += [_strip(one, header, messages) for one in lines if self._is_news(one)]
         out.append(_text(cell, header, messages))
         return out
+
+    def _is_news(self, one: Shape | Line) -> bool:
+        """It changed, or its marker is half way to its end: what stands still costs little."""
+        now_s = time.monotonic()
+        if isinstance(one, Shape):
+            looks: tuple = (one.mesh, one.published_from_shape.tobytes(), one.colour, one.opacity)
+        else:
+            looks = (one.points_mm.tobytes(), one.colour, one.width_mm)
+        before, sent_s = self._sent.get(one.name, ((), 0.0))
+        if looks == before and now_s - sent_s < MARKER_LIFETIME_S / 2:
+            return False
+        self._sent[one.name] = looks, now_s
+        return True
 
 
 def words(cell: Workcell) -> str:

@@ -26,7 +26,7 @@ from tumortrack.track.view.scene import Scene
 from tumortrack.track.view.server import close_server, open_server
 from tumortrack.track.view.slices import load_ct, plane_through, slice_picture
 from tumortrack.track.view.status import State, Status, backdrop
-from tumortrack.track.view.workcell import Cell, box_of
+from tumortrack.track.view.workcell import Cell
 
 if TYPE_CHECKING:
     from viser import SceneClickEvent
@@ -94,7 +94,8 @@ class ViewerSink:
         self._behind: tuple[State, bool] | None = None
         self._scene = Scene(self._server, setting, config.margin_mm)
         self._cell = Cell(self._server)
-        actions = Actions(self._changed, self._ask, self._forget, self._scene.look.turn)
+        turn = self._scene.look.turn
+        actions = Actions(self._changed, self._ask, self._forget, turn, self._abort)
         self._panel = Panel(self._server, setting.parts, actions, ct is not None, setting.arms)
         self._say("waiting")
         self._closing = threading.Event()
@@ -155,8 +156,7 @@ class ViewerSink:
                 self._cell.hide()
                 return
             self._cell.show(update.workcell)
-            if (box_mm := box_of(update.workcell)) is not None:
-                self._scene.look.oversee(box_mm)
+            self._scene.look.oversee(update.workcell)
         except Exception as error:
             self._cell.hide()
             self._fault = error  # raised when the estimate has been shown
@@ -270,3 +270,8 @@ class ViewerSink:
             self._setting.controls.pick(None)
             self._scene.mark(None, self._setting.frames)
             self._panel.picking(self._asked, False)
+
+    def _abort(self) -> None:
+        with self._lock:
+            self._setting.controls.aborted.set()
+            self._panel.aborted()

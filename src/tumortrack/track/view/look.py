@@ -5,10 +5,10 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
-from jaxtyping import Float64
 
 from tumortrack.core.types import Mesh
-from tumortrack.track.live import Frames
+from tumortrack.track.live import Frames, Workcell
+from tumortrack.track.view.workcell import box_of
 
 if TYPE_CHECKING:
     from viser import CameraHandle, ClientHandle, ViserServer
@@ -34,7 +34,7 @@ class Look:
         self._eye_mm = way[:3, 3]
         self._way = way
         self._organ_mm = way[:3, 3] + _FIRST_LOOK_MM * way[:3, 2]
-        self._box_mm: Float64[np.ndarray, "2 3"] | None = None  # of the workcell
+        self._cell: Workcell | None = None  # the last there was
         server.scene.set_up_direction(-way[:3, 1])
         first = server.initial_camera
         first.fov, first.near, first.far = _FOV_RADIANS, _NEAR_MM, _FAR_MM
@@ -56,15 +56,15 @@ class Look:
         self._aimed = True
         way = frames.published_from_camera
         self._organ_mm = way[:3, 3] + depth_mm * way[:3, 2]
-        if self._box_mm is not None:
+        if self._cell is not None:
             return  # they look at the whole workcell
         self._server.initial_camera.look_at = self._organ_mm
         for client in self._server.get_clients().values():
             client.camera.look_at = self._organ_mm
 
-    def oversee(self, box_mm: Float64[np.ndarray, "2 3"]) -> None:
-        """There is a workcell, and this is its box: all look at it whole when it comes first."""
-        first, self._box_mm = self._box_mm is None, box_mm
+    def oversee(self, cell: Workcell) -> None:
+        """There is a workcell: when it comes first, all look at it whole."""
+        first, self._cell = self._cell is None, cell
         if not first:
             return
         eye_mm, middle_mm, up = self._overview()
@@ -86,10 +86,11 @@ class Look:
 
     def _overview(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Eye, what it looks at, up."""
-        if self._box_mm is None:
+        box_mm = None if self._cell is None else box_of(self._cell)
+        if box_mm is None:
             return self._way[:3, 3], self._organ_mm, -self._way[:3, 1]
-        middle_mm = self._box_mm.mean(0)
-        radius_mm = float(np.linalg.norm(np.ptp(self._box_mm, axis=0))) / 2
+        middle_mm = box_mm.mean(0)
+        radius_mm = float(np.linalg.norm(np.ptp(box_mm, axis=0))) / 2
         away = _OVERVIEW_FROM / np.linalg.norm(_OVERVIEW_FROM)
         return middle_mm + radius_mm / np.tan(_FOV_RADIANS / 2) * away, middle_mm, _UP
 

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from viser import ClientHandle, GuiEvent, ViserServer
 
 _WIDTH = 360  # pixels; the banner leaves this much room
+_ABORT, _ABORTED = "Stop the arms for good", "The arms were stopped for good"
 _CLICK, _CANCEL = "Click the organ", "Now click on the organ (again: cancel)"
 
 
@@ -29,6 +30,7 @@ class Actions:
     pick: Callable[[], None]
     forget: Callable[[], None]
     look: Callable[[ClientHandle, View], None]
+    abort: Callable[[], None]
 
 
 class Panel:
@@ -52,6 +54,10 @@ class Panel:
         )
         self._forget = gui.add_button("Choose again", visible=False)
         if arms:
+            self._abort = gui.add_button(
+                _ABORT, color="red", hint="The arms stop, and move no more in this run"
+            )
+            self._abort.on_click(lambda _: actions.abort())
             views = gui.add_button_group("Look at", get_args(View))
 
             @views.on_click
@@ -117,6 +123,10 @@ class Panel:
         """``asked``: the next click counts; ``chosen``: one did."""
         self._pick.label = _CANCEL if asked else _CLICK
         self._forget.visible = chosen
+
+    def aborted(self) -> None:
+        """The arms move no more."""
+        self._abort.label, self._abort.disabled = _ABORTED, True
 
     def put_slice(self, picture: UInt8[np.ndarray, "h w 3"] | None) -> None:
         if self._slice is not None:

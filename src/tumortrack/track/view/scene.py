@@ -20,6 +20,7 @@ from tumortrack.track.view.look import Look
 from tumortrack.track.view.points import MOST_SEEN, seen_points, thinned
 from tumortrack.track.view.slices import Plane
 from tumortrack.track.view.surfaces import bare_faces, exact_margin, rough_margin
+from tumortrack.track.view.workcell import wxyz_of
 
 if TYPE_CHECKING:
     from viser import ImageHandle, MeshHandle, PointCloudHandle, ViserServer
@@ -254,10 +255,3 @@ def _put_mesh(node: MeshHandle, mesh: Mesh) -> None:
     if not np.array_equal(node.faces, mesh.faces):
         node.faces = mesh.faces.astype(np.uint32)
     node.vertices = mesh.vertices_mm.astype(np.float32)
-
-
-def wxyz_of(rotation: Float[np.ndarray, "3 3"]) -> np.ndarray:
-    """The quaternion, as viser wants it."""
-    from scipy.spatial.transform import Rotation
-
-    return Rotation.from_matrix(rotation).as_quat(scalar_first=True)

@@ -10,12 +10,9 @@ from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float, Float64
 
-from tumortrack.core.geometry import transform_points
-from tumortrack.core.types import Mesh
 from tumortrack.track.live import Line, Shape, Workcell
-from tumortrack.track.view.scene import wxyz_of
 
 if TYPE_CHECKING:
     from viser import FrameHandle, LineSegmentsHandle, MeshHandle, ViserServer
@@ -39,8 +36,10 @@ class Cell:
             self._shapes.pop(name)[1].remove()
         for name in _gone(self._lines, drawn):
             self._lines.pop(name)[1].remove()
-        for shape in cell.shapes:
-            self._put_shape(shape)
+        places = np.array([shape.published_from_shape for shape in cell.shapes]).reshape(-1, 4, 4)
+        turns = wxyz_of(places[:, :3, :3]) if len(places) else ()  # all at once: 5 times quicker
+        for shape, wxyz in zip(cell.shapes, turns, strict=True):
+            self._put_shape(shape, wxyz)
         for line in drawn:
             self._put_line(line)
         self._root.visible = True
@@ -49,7 +48,7 @@ class Cell:
         """Nothing of it stays visible."""
         self._root.visible = False
 
-    def _put_shape(self, shape: Shape) -> None:
+    def _put_shape(self, shape: Shape, wxyz: Float64[np.ndarray, " 4"]) -> None:
         before, node = self._shapes.get(shape.name, (None, None))
         if before is None or node is None or not _looks_alike(before, shape):
             node = self._nodes.add_mesh_simple(
@@ -63,8 +62,10 @@ class Cell:
                 cast_shadow=False,
                 receive_shadow=False,
             )
+            before = None
         way = shape.published_from_shape
-        node.position, node.wxyz = way[:3, 3], wxyz_of(way[:3, :3])
+        if before is None or not np.array_equal(before.published_from_shape, way):
+            node.position, node.wxyz = way[:3, 3], wxyz
         self._shapes[shape.name] = shape, node
 
     def _put_line(self, line: Line) -> None:
@@ -85,18 +86,21 @@ class Cell:
 
 
 def box_of(cell: Workcell) -> Float64[np.ndarray, "2 3"] | None:
-    """The box round all shapes, as they stand; None without any."""
-    places = [_box(shape.mesh, shape.published_from_shape) for shape in cell.shapes]
-    if not places:
+    """The box round all shapes' own boxes, as they stand; None without any."""
+    if not cell.shapes:
         return None
-    corners = np.concatenate(places)
-    return np.stack([corners.min(0), corners.max(0)])
+    boxes = np.array([shape.mesh.box_mm for shape in cell.shapes])  # (n, 2, 3)
+    ways = np.array([shape.published_from_shape for shape in cell.shapes])
+    middles = np.einsum("nij,nj->ni", ways[:, :3, :3], boxes.mean(1)) + ways[:, :3, 3]
+    halves = np.einsum("nij,nj->ni", np.abs(ways[:, :3, :3]), np.ptp(boxes, axis=1) / 2)
+    return np.stack([(middles - halves).min(0), (middles + halves).max(0)])
 
 
-def _box(mesh: Mesh, way: Float64[np.ndarray, "4 4"]) -> Float64[np.ndarray, "8 3"]:
-    """Corners of the mesh's own box, moved."""
-    corners = np.stack(np.meshgrid(*mesh.box_mm.T, indexing="ij"), axis=-1).reshape(8, 3)
-    return transform_points(way, corners.astype(np.float64))
+def wxyz_of(rotation: Float[np.ndarray, "*n 3 3"]) -> Float[np.ndarray, "*n 4"]:
+    """Quaternions, as viser wants them."""
+    from scipy.spatial.transform import Rotation
+
+    return Rotation.from_matrix(rotation).as_quat(scalar_first=True)
 
 
 def _node(kind: str, name: str) -> str:
