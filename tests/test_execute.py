@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
@@ -147,12 +148,14 @@ class World:
         self.seen = SEEN
         self.planned = Planned(PLAN, self.seen.meshes["tumor_1"], motions())
         self.calls = []
+        self.made = replan or self.replan
+        self.pool = ThreadPoolExecutor(1)
         self.operation = Operation(
             self.planned,
             config or OperationConfig(settled_s=0.2),
             lambda joints: (),
             self.locate,
-            replan or self.replan,
+            self.begin,
         )
         self.now_s = 100.0
         self.shift = np.zeros(3)
@@ -163,6 +166,9 @@ class World:
             for name, mesh in self.seen.meshes.items()
         }
         return replace(self.seen, points_mm=self.seen.points_mm + self.shift, meshes=meshes)
+
+    def begin(self, seen, joints_rad, sweep):
+        return self.pool.submit(self.made, seen, joints_rad, sweep)
 
     def replan(self, seen, joints_rad, sweep):
         self.calls.append((seen.meshes["tumor_1"].box_mm.mean(0), sweep))

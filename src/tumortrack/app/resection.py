@@ -81,12 +81,12 @@ def _live(
     stored: PlanFolder, cell: Cell, config: OperationConfig, sinks: Sinks, options: ResectOptions
 ) -> None:
     """Beside the live loop: every estimate is looked at, and planned on where the tumor moved."""
+    from concurrent.futures import Future, ProcessPoolExecutor
+    from multiprocessing import get_context
+
     from tumortrack.app.live import Arms, TrackOptions, track
-    from tumortrack.app.planning import organ_of
-    from tumortrack.plan.arms.procedure import plan_motions
+    from tumortrack.plan.anew import begin, plan_anew, ready
     from tumortrack.plan.located import located
-    from tumortrack.plan.operation import Planned
-    from tumortrack.plan.resection import plan_resection
     from tumortrack.track.live import Frames
 
     assert options.live is not None
@@ -98,19 +98,24 @@ def _live(
         motion = estimate.motion if unsure else None
         return located(estimate.cloud, estimate.meshes, motion, stored.table_from_camera)
 
-    def replan(seen: Located, joints_rad: Float64[np.ndarray, " 12"], sweep: int | None) -> Planned:
-        resection = plan_resection(seen, stored.config)
-        organ = organ_of(seen)
-        motions = plan_motions(
-            resection, cell.with_organ(organ), organ, start_rad=joints_rad, from_sweep=sweep
-        )
-        return Planned(resection, seen.meshes[resection.tumor], motions)
+    # In a process of its own: planning for a second must not hold up a frame.
+    with ProcessPoolExecutor(
+        1, get_context("spawn"), initializer=begin, initargs=(stored.config, cell.config)
+    ) as planner:
 
-    operation = _operation(stored, cell, config, locate=locate, replan=replan)
-    frames = Frames(stored.frame_id, stored.table_from_camera)
-    arms = Arms(operation, frames, {"plan_config": to_builtins(config)})
-    model, source = options.live
-    track(model, source, sinks, TrackOptions(report=options.report, device=options.device), arms)
+        def replan(
+            seen: Located, joints_rad: Float64[np.ndarray, " 12"], sweep: int | None
+        ) -> Future[Planned]:
+            return planner.submit(plan_anew, seen, joints_rad, sweep)
+
+        say("making ready to plan anew ...")
+        planner.submit(ready).result()
+        operation = _operation(stored, cell, config, locate=locate, replan=replan)
+        frames = Frames(stored.frame_id, stored.table_from_camera)
+        arms = Arms(operation, frames, {"plan_config": to_builtins(config)})
+        model, source = options.live
+        following = TrackOptions(report=options.report, device=options.device)
+        track(model, source, sinks, following, arms)
     _tell_end(operation)
 
 

@@ -6,10 +6,10 @@ No torch here, and no clock but the updates' own arrival: ``act`` is called with
 
 from __future__ import annotations
 
-import threading
 import time
 from collections import Counter
 from collections.abc import Callable
+from concurrent.futures import Future
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -58,8 +58,8 @@ class Planned:
     motions: Motions
 
 
-# What was located, the arms' joints, and the sweep to begin with (None: from the approach) -> plan
-Replan = Callable[[Located, Float64[np.ndarray, " 12"], int | None], Planned]
+# What was located, the arms' joints, and the sweep to begin with (None: from the approach)
+Replan = Callable[[Located, Float64[np.ndarray, " 12"], int | None], "Future[Planned]"]
 Locate = Callable[[Update], Located]
 Draw = Callable[[Float64[np.ndarray, " 12"]], tuple[Shape, ...]]
 
@@ -72,7 +72,7 @@ class Operation:
         draw: the arms, table and tools as shapes, for twelve joint angles.
         locate: an update's estimate in the table's frame; None: a stored plan is carried out and
             nothing is looked at.
-        replan: makes a new plan; called from a thread of its own.
+        replan: begins a new plan elsewhere, so that the loop goes on meanwhile.
         still_life: shapes that are shown all the time.
     """
 
@@ -90,7 +90,7 @@ class Operation:
         self._last_s: float | None = None
         self._first_s = 0.0
         self._settled: tuple[Mesh, float] | None = None  # where the tumor is, and since when
-        self._work: _Work | None = None
+        self._work: Future[Planned] | None = None
         self.still_life: tuple[Shape, ...] = ()
         self.log: list[dict] = []
         self.halts: Counter[str] = Counter()
@@ -193,20 +193,23 @@ class Operation:
             self._settled = None
             if self._replan is not None:
                 sweep = max(execution.sweep, 1) if execution.holds else None
-                self._work = _Work(self._replan, located, execution.joints_rad, sweep)
+                self._work = self._replan(located, execution.joints_rad, sweep)
 
     def _take_work(self, now_s: float) -> None:
         work, execution = self._work, self._execution
         assert work is not None
-        if not work.done:
+        if not work.done():
             return
         self._work = None
-        if work.found is None:
-            execution.abort(f"no new plan: {work.reason}")
-            return
-        execution.replace(work.found.motions)
-        self._planned = work.found
-        self._log(now_s, "planned anew")
+        failure = work.exception()
+        if failure is None:
+            self._planned = work.result()
+            execution.replace(self._planned.motions)
+            self._log(now_s, "planned anew")
+        elif isinstance(failure, TumortrackError):
+            execution.abort(f"no new plan: {failure}")
+        else:  # a defect of ours must stop the arms, and say so
+            execution.abort(f"internal error, {type(failure).__name__}: {failure}")
 
     def _note(self, now_s: float) -> None:
         state = self._execution.state
@@ -230,42 +233,6 @@ class Operation:
             lines.append(Line(f"cut/{number}", cut.path_mm, colour, 0.8))
         above = plan.grasp_mm + np.array([[0.0, 0.0, 40.0], [0.0, 0.0, 0.0]])
         return (*lines, Line("grasp", above, (90, 200, 255), 0.8))
-
-
-class _Work:
-    """A plan in the making, in a thread of its own."""
-
-    def __init__(
-        self,
-        replan: Replan,
-        located: Located,
-        joints_rad: Float64[np.ndarray, " 12"],
-        sweep: int | None,
-    ) -> None:
-        self.found: Planned | None = None
-        self.reason = ""
-        self._thread = threading.Thread(
-            target=self._run, args=(replan, located, joints_rad, sweep), daemon=True
-        )
-        self._thread.start()
-
-    @property
-    def done(self) -> bool:
-        return not self._thread.is_alive()
-
-    def _run(
-        self,
-        replan: Replan,
-        located: Located,
-        joints_rad: Float64[np.ndarray, " 12"],
-        sweep: int | None,
-    ) -> None:
-        try:
-            self.found = replan(located, joints_rad, sweep)
-        except TumortrackError as error:
-            self.reason = str(error)
-        except Exception as error:  # a defect of ours must stop the arms, and say so
-            self.reason = f"internal error, {type(error).__name__}: {error}"
 
 
 def apart_mm(a: Mesh, b: Mesh) -> float:
