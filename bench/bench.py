@@ -19,6 +19,7 @@ from typing import Any
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import numpy as np
+import planning
 import torch
 import trimesh
 from rich.console import Console
@@ -284,6 +285,7 @@ def main() -> None:
         placed.live(quick(anatomy)),
         frame("quick", quick(anatomy)),
         frame("paper", paper(anatomy)),
+        *planning.rows(),
     ]
     # "A | B": A stands in the first column, B in the second; else the second is the naive form.
     table = Table("part, one core", "tumortrack", "naive", "ratio", title=platform.processor())
