@@ -13,10 +13,12 @@ from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import rigid
 from tumortrack.core.solids import mesh_of, solid_of
 from tumortrack.core.types import Mesh
-from tumortrack.evaluate.film import film, tube
+from tumortrack.evaluate.film import film, moments_s
 from tumortrack.evaluate.organ_surfaces import organ_surfaces, skin
-from tumortrack.evaluate.painter import Body, Eye, corner_normals, paint
-from tumortrack.evaluate.plan_pictures import draw_plan, parted, plan_figure, within
+from tumortrack.evaluate.painter import Body, Eye, corner_normals, paint, tube
+from tumortrack.evaluate.plan_parts import parted, within
+from tumortrack.evaluate.plan_pictures import draw_plan, plan_figure
+from tumortrack.plan.motions import Motions, Stage
 from tumortrack.plan.values import Cut, Layer, Located, ResectionPlan
 from tumortrack.track.live import Line, Shape, Workcell
 from tumortrack.track.view.colours import sweep_colour
@@ -61,7 +63,13 @@ def plan() -> ResectionPlan:
         cuts=(Cut(1, ring(19.0, 160.0)), Cut(2, ring(19.0, 149.0))),
         layers=(Layer(149.0, np.inf, (ring(19.0, 0.0)[:-1, :2],)),),
         margin_mm=5.0,
-        volumes_ml={"organ": 180.0, "tumor": 11.5, "piece": 20.0, "healthy": 8.5},
+        volumes_ml={
+            "organ": 180.0,
+            "parenchyma": 168.5,
+            "tumor": 11.5,
+            "piece": 20.0,
+            "healthy": 8.5,
+        },
         exophytic=0.5,
     )
 
@@ -281,6 +289,24 @@ def test_the_same_frames_are_the_same_film(
         picture = np.asarray(gif.convert("RGB")).astype(int)
     red = (picture[..., 0] > picture[..., 1] + 90) & (picture[..., 0] > picture[..., 2] + 90)
     assert red[:45, :120].sum() > 10  # that it stands still is said in red
+
+
+def test_every_stage_has_its_moments() -> None:
+    def stage(name: str, seconds: float) -> Stage:
+        times = np.array([0.0, seconds]) if seconds else np.zeros(1)
+        return Stage(name, times, np.zeros((len(times), 12)), np.zeros(len(times), bool))
+
+    lasting = {"approach": 4.0, "grasp": 1.0, "hold": 0.0, "sweep 1": 64.0, "home": 4.0}
+    motions = Motions(tuple(stage(name, seconds) for name, seconds in lasting.items()))
+    moments = moments_s(motions, 130)
+    assert (np.diff(moments) >= 0).all()
+    assert (moments[0], moments[-1]) == (0.0, motions.seconds)
+    assert len(moments) == pytest.approx(130, abs=6)
+    ends = np.cumsum(list(lasting.values()))
+    found = [int(((moments >= end - s) & (moments < end)).sum()) for end, s in
+             zip(ends, lasting.values(), strict=True)]  # fmt: skip
+    assert found[3] == pytest.approx(4 * found[0], abs=3)  # 16 times as long
+    assert found[0] == pytest.approx(2 * found[1], abs=1)
 
 
 @pytest.mark.parametrize(

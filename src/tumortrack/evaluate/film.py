@@ -7,19 +7,20 @@ from __future__ import annotations
 
 import io
 from collections.abc import Callable, Iterable, Iterator
-from itertools import groupby, pairwise
+from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Float64, UInt8
 
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.store import write_atomically
 from tumortrack.core.types import Mesh
 from tumortrack.evaluate.organ_surfaces import organ_surfaces
-from tumortrack.evaluate.painter import Body, Eye, paint
+from tumortrack.evaluate.painter import Body, Eye, paint, tube
+from tumortrack.plan.motions import Motions
 from tumortrack.plan.values import Located
 from tumortrack.track.live import Line, Workcell
 from tumortrack.track.view.colours import BACKGROUND, NONE, part_colour
@@ -34,9 +35,12 @@ _CLOSE = 0.47, 0.42  # the close-up's share of width and height, in the lower ri
 _ARMS = 0.97, 0.62  # and that of the arms, above it
 _CLOSE_MM = 40.0  # the close-up cuts away what is nearer to the eye than the organ by this
 _ORGAN_OPACITY = 0.42
+_FRAME = (90, 96, 106)
 _LEAST_PIXELS = 2.0  # width of a line
 _COLOURS = 255  # and one for what did not change
 _SAMPLES = 8  # frames from which the colours are chosen
+_LOOKED_AT, _EVERY = 40, 3  # frames, and every which vertex, from which the eye's place is chosen
+_LEAST_FRAMES = 2  # of a stage
 _LAST_S = 1.5  # the last picture stays
 _FASTEST, _SMALLEST = 50, 160
 
@@ -97,6 +101,19 @@ def film(
     write_atomically(path, buffer.getvalue())
 
 
+def moments_s(motions: Motions, frames: int) -> Float64[np.ndarray, " n"]:
+    """Times since the beginning, about so many, that show every stage: a stage gets frames by the
+    square root of its duration, for sweeps take minutes and the grasp seconds; the end is among
+    them."""
+    seconds = np.array([stage.seconds for stage in motions.stages])
+    share = np.sqrt(seconds) / max(float(np.sqrt(seconds).sum()), 1e-9)
+    counts = np.maximum(np.rint(frames * share).astype(int), _LEAST_FRAMES)
+    starts = np.cumsum(seconds) - seconds
+    stages = zip(starts, seconds, counts.tolist(), strict=True)
+    each = [start + length * np.arange(n) / n for start, length, n in stages]
+    return np.append(np.concatenate(each), seconds.sum())
+
+
 def _check(frames: list[Workcell], path: Path, fps: int, size: tuple[int, int]) -> None:
     if path.suffix.lower() != ".gif":
         raise InputError(f"{path}: a film is an animated GIF; give a name that ends in .gif.")
@@ -117,12 +134,14 @@ class _Stage:
     def __init__(self, frames: list[Workcell], located: Located, size: tuple[int, int]) -> None:
         self._frames, self._size = frames, size
         self._organ = [
-            Body(mesh, part_colour(label), None, _ORGAN_OPACITY if label == 1 else 1.0, label == 1)
+            Body(mesh, part_colour(label), None, _ORGAN_OPACITY if label == 1 else 1.0, False)
             for label, mesh in sorted(organ_surfaces(located).items())
         ]
         self._close_size = round(_CLOSE[0] * size[0]), round(_CLOSE[1] * size[1])
         self._far = _eye_around(_reach(frames), _FROM, size, _ARMS)
         self._near = _close_eye(self._organ[0].mesh, self._close_size)
+        flat = self._far.project(self._organ[0].mesh.vertices_mm, size)[:, :2]
+        self._spot = (*(flat.min(0) - 4).round().tolist(), *(flat.max(0) + 4).round().tolist())
         self._letters = _letters(size[1] // 20), _letters(size[1] // 34)
         self._tubes: dict[tuple[int, float], tuple[Line, Mesh]] = {}
 
@@ -131,22 +150,22 @@ class _Stage:
         from PIL import Image, ImageDraw
 
         cell = self._frames[n]
-        shapes = [Body(s.mesh, s.colour, s.published_from_shape, s.opacity) for s in cell.shapes]
-        out = Image.fromarray(self._seen(cell, shapes, self._far, self._size))
-        close = Image.fromarray(self._seen(cell, shapes, self._near, self._close_size))
+        out = Image.fromarray(self._seen(cell, self._far, self._size))
+        close = Image.fromarray(self._seen(cell, self._near, self._close_size))
         left, top = (whole - part - 8 for whole, part in zip(self._size, close.size, strict=True))
         top -= 10
         out.paste(close, (left, top))
         draw = ImageDraw.Draw(out)
-        draw.rectangle(
-            (left - 1, top - 1, left + close.width, top + close.height), outline=(90, 96, 106)
-        )
+        draw.rectangle(self._spot, outline=_FRAME)  # what is shown from near
+        draw.rectangle((left - 1, top - 1, left + close.width, top + close.height), outline=_FRAME)
         self._say(draw, n)
         return out
 
-    def _seen(
-        self, cell: Workcell, shapes: list[Body], eye: Eye, size: tuple[int, int]
-    ) -> UInt8[np.ndarray, "h w 3"]:
+    def _seen(self, cell: Workcell, eye: Eye, size: tuple[int, int]) -> UInt8[np.ndarray, "h w 3"]:
+        shaded = eye is self._far  # the arms' shadows would darken the close-up
+        shapes = [
+            Body(s.mesh, s.colour, s.published_from_shape, s.opacity, shaded) for s in cell.shapes
+        ]
         least_mm = _LEAST_PIXELS * eye.width_mm / size[0]
         lines = [
             Body(self._tube(line, max(line.width_mm, least_mm)), line.colour, shaded=False)
@@ -156,11 +175,10 @@ class _Stage:
         return paint(shapes + lines + self._organ, eye, size)
 
     def _tube(self, line: Line, width_mm: float) -> Mesh:
-        known = self._tubes.get((id(line), width_mm))  # the line is kept, so its id stays its own
-        if known is None:
-            known = line, tube(line.points_mm, width_mm / 2)
-            self._tubes[id(line), width_mm] = known
-        return known[1]
+        key = id(line.points_mm), width_mm  # the line is kept, so its points' id stays theirs
+        if key not in self._tubes:
+            self._tubes[key] = line, tube(line.points_mm, width_mm / 2)
+        return self._tubes[key][1]
 
     def _say(self, draw: ImageDraw.ImageDraw, n: int) -> None:
         """The state, why the arms stand still, and how far the procedure is."""
@@ -175,7 +193,7 @@ class _Stage:
             first, done = done, done + len(list(group))
             x = [8 + (width - 16) * k / len(self._frames) for k in (first, min(done, n + 1), done)]
             box = height - 11, height - 6
-            draw.rectangle((x[0], box[0], x[2] - 2, box[1]), fill=(205, 209, 214))
+            draw.rectangle((x[0], box[0], max(x[2] - 2, x[0]), box[1]), fill=(205, 209, 214))
             if n >= first:
                 colour = NONE if cell.halted and state == cell.state else (60, 110, 190)
                 draw.rectangle((x[0], box[0], max(x[1] - 2, x[0]), box[1]), fill=colour)
@@ -189,15 +207,16 @@ def _letters(pixels: int) -> ImageFont.FreeTypeFont:
 
 
 def _reach(frames: list[Workcell]) -> Float[np.ndarray, "n 3"]:
-    """Corners of the boxes about all parts of arms, in all frames; of everything without arms."""
-    arms = [shape for cell in frames for shape in cell.shapes if "/" in shape.name]
-    boxes = []
-    for shape in arms or [shape for cell in frames for shape in cell.shapes]:
-        corners = np.stack(np.meshgrid(*shape.mesh.box_mm.T), -1).reshape(-1, 3)
-        boxes.append(transform_points(shape.published_from_shape, corners))
-    if not boxes:
+    """Points of all parts of arms in frames of all stages; of everything, where there are none."""
+    told = frames[:: max(1, len(frames) // _LOOKED_AT)]
+    arms = [shape for cell in told for shape in cell.shapes if "/" in shape.name]
+    points = [
+        transform_points(shape.published_from_shape, shape.mesh.vertices_mm[::_EVERY])
+        for shape in arms or [shape for cell in told for shape in cell.shapes]
+    ]
+    if not points:
         raise InputError("the frames show no arms and no table: nothing to film.")
-    return np.concatenate(boxes)
+    return np.concatenate(points)
 
 
 def _eye_around(
@@ -234,32 +253,6 @@ def _close_eye(organ: Mesh, size: tuple[int, int]) -> Eye:
     return Eye(eye.target_mm + 10 * away, eye.target_mm, eye.width_mm, True, radius + _CLOSE_MM)
 
 
-def tube(points_mm: Float[np.ndarray, "n 3"], radius_mm: float, sides: int = 6) -> Mesh:
-    """A polyline as a thin closed tube; its joints are mitred."""
-    step = np.diff(points_mm, axis=0)
-    step /= np.maximum(np.linalg.norm(step, axis=1, keepdims=True), 1e-9)
-    along = np.concatenate([step[:1], step[:-1] + step[1:], step[-1:]])
-    along /= np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-9)
-    least = np.eye(3)[np.abs(along).argmin(1)]  # the axis most across
-    a = np.cross(along, least)
-    for one, two in pairwise(range(len(a))):  # carried along, so that the tube does not twist
-        a[two] = a[one] - along[two] * (a[one] @ along[two])
-        a[two] /= max(float(np.linalg.norm(a[two])), 1e-9)
-    a[0] /= np.linalg.norm(a[0])
-    b = np.cross(along, a)
-    turn = 2 * np.pi * np.arange(sides) / sides
-    ring = np.cos(turn)[None, :, None] * a[:, None] + np.sin(turn)[None, :, None] * b[:, None]
-    vertices = (points_mm[:, None] + radius_mm * ring).reshape(-1, 3)
-    n = len(points_mm)
-    first = sides * np.arange(n - 1)[:, None] + np.arange(sides)
-    next_ = sides * np.arange(n - 1)[:, None] + (np.arange(sides) + 1) % sides
-    low = np.stack([first, next_, next_ + sides], -1).reshape(-1, 3)
-    high = np.stack([first, next_ + sides, first + sides], -1).reshape(-1, 3)
-    fan = np.stack([np.zeros(sides - 2), np.arange(1, sides - 1), np.arange(2, sides)], -1)
-    ends = [fan[:, ::-1], fan + sides * (n - 1)]
-    return Mesh(vertices, np.concatenate([low, high, *ends]).astype(np.int32))
-
-
 def _palette(
     pictures: list[Image.Image],
 ) -> tuple[UInt8[np.ndarray, "256 3"], UInt8[np.ndarray, "64 64 64"]]:
@@ -267,7 +260,7 @@ def _palette(
     from PIL import Image
     from scipy.spatial import cKDTree
 
-    sheet = Image.fromarray(np.concatenate([np.asarray(one) for one in pictures]))
+    sheet = Image.fromarray(np.concatenate([np.asarray(one)[::2, ::2] for one in pictures]))
     few = sheet.quantize(_COLOURS, Image.Quantize.MEDIANCUT, kmeans=2, dither=Image.Dither.NONE)
     colours = np.array(few.getpalette(), np.uint8).reshape(-1, 3)[:_COLOURS]
     palette = np.zeros((256, 3), np.uint8)

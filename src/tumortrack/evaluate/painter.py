@@ -7,11 +7,12 @@ shadows, and see-through bodies over the opaque ones. ``shade`` is for stills in
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import NamedTuple
 from weakref import WeakKeyDictionary
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, UInt8
+from jaxtyping import Bool, Float, Float32, Int32, UInt8
 
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.types import Mesh
@@ -91,9 +92,11 @@ class Eye:
 
 
 class _Triangles(NamedTuple):
-    """Many bodies as one: per corner its place and normal (t, 3, 3), world frame."""
+    """Many bodies as one, world frame: vertices, and per triangle its corners, their normals, its
+    colour."""
 
-    places: Float32[np.ndarray, "t 3 3"]
+    places: Float32[np.ndarray, "v 3"]
+    faces: Int32[np.ndarray, "t 3"]
     normals: Float32[np.ndarray, "t 3 3"]
     colours: Float32[np.ndarray, "t 3"]
     shaded: Bool[np.ndarray, " t"]
@@ -114,7 +117,7 @@ def paint(
     """The bodies as the eye sees them; ``size`` is width and height in pixels."""
     width, height = (_SHARPER * n for n in size)
     solid = _join([body for body in bodies if body.opacity >= 1])
-    shadow = _shadow(solid.places, eye)
+    shadow = _shadow(solid if solid.shaded.any() else _join([]), eye)
     picture = np.empty((height, width, 3), np.float32)
     picture[:] = np.array(backdrop) / 255
     near = np.full((height, width), -np.inf, np.float32)
@@ -135,31 +138,31 @@ def _far_first(bodies: list[Body], eye: Eye) -> list[Body]:
 
 
 def _join(bodies: list[Body]) -> _Triangles:
-    places, normals, colours, shaded = [], [], [], []
+    places, faces, normals, count = [np.zeros((0, 3))], [np.zeros((0, 3), int)], [], 0
     for body in bodies:
-        corners, normal = body.mesh.vertices_mm[body.mesh.faces], corner_normals(body.mesh)
-        if body.world_from_mesh is not None:
-            turn = body.world_from_mesh[:3, :3].T
-            corners, normal = corners @ turn + body.world_from_mesh[:3, 3], normal @ turn
-        places.append(corners)
+        vertices, normal = body.mesh.vertices_mm, corner_normals(body.mesh)
+        if (way := body.world_from_mesh) is not None:
+            vertices = transform_points(way, vertices)
+            normal = (normal.reshape(-1, 3) @ way[:3, :3].T.astype(np.float32)).reshape(-1, 3, 3)
+        places.append(vertices)
+        faces.append(body.mesh.faces + count)
         normals.append(normal)
-        colours.append(np.tile(np.array(body.colour) / 255, (len(corners), 1)))
-        shaded.append(np.full(len(corners), body.shaded))
-    if not places:
-        empty = np.zeros((0, 3, 3), np.float32)
-        return _Triangles(empty, empty, empty[:, 0], np.zeros(0, bool))
+        count += len(vertices)
+    each = [len(body.mesh.faces) for body in bodies]
+    colours = np.array([body.colour for body in bodies], np.float32).reshape(-1, 3) / 255
     return _Triangles(
         np.concatenate(places).astype(np.float32),
-        np.concatenate(normals).astype(np.float32),
-        np.concatenate(colours).astype(np.float32),
-        np.concatenate(shaded),
+        np.concatenate(faces).astype(np.int32),
+        np.concatenate([np.zeros((0, 3, 3), np.float32), *normals]),
+        np.repeat(colours, each, axis=0),
+        np.repeat(np.array([body.shaded for body in bodies], bool), each),
     )
 
 
 _NORMALS: WeakKeyDictionary[Mesh, np.ndarray] = WeakKeyDictionary()  # a link's never change
 
 
-def corner_normals(mesh: Mesh) -> Float[np.ndarray, "f 3 3"]:
+def corner_normals(mesh: Mesh) -> Float32[np.ndarray, "f 3 3"]:
     """Unit normal at each face's corners: the mean of the faces about the same place that make no
     crease with this one, weighted by their areas."""
     if (known := _NORMALS.get(mesh)) is not None:
@@ -172,20 +175,20 @@ def corner_normals(mesh: Mesh) -> Float[np.ndarray, "f 3 3"]:
     order = np.argsort(corner, kind="stable")
     first = np.searchsorted(corner[order], np.arange(corner.max(initial=-1) + 2))
     normals = crease(area, unit, corner, order // 3, first, _CREASE)
-    _NORMALS[mesh] = normals.reshape(-1, 3, 3)
+    _NORMALS[mesh] = normals.reshape(-1, 3, 3).astype(np.float32)
     return _NORMALS[mesh]
 
 
-def _shadow(places: Float32[np.ndarray, "t 3 3"], eye: Eye) -> _Shadow:
+def _shadow(triangles: _Triangles, eye: Eye) -> _Shadow:
     across = np.cross([0.0, 1.0, 0.0], _LIGHT)
     across /= np.linalg.norm(across)
     axes = np.stack([across, np.cross(_LIGHT, across), _LIGHT]).astype(np.float32)
     pixel_mm = 1.6 * eye.width_mm / _SHADOW_PIXELS
     middle = axes[:2] @ eye.target_mm.astype(np.float32)
     corner = (middle - pixel_mm * _SHADOW_PIXELS / 2).astype(np.float32)
-    seen = places @ axes.T
-    seen[..., :2] = (seen[..., :2] - corner) / pixel_mm
-    near, _ = nearest(np.ascontiguousarray(seen), _SHADOW_PIXELS, _SHADOW_PIXELS, np.inf)
+    seen = triangles.places @ axes.T
+    seen[:, :2] = (seen[:, :2] - corner) / pixel_mm
+    near, _ = nearest(seen, triangles.faces, _SHADOW_PIXELS, _SHADOW_PIXELS, np.inf, False)
     return _Shadow(near, axes, corner, pixel_mm)
 
 
@@ -199,15 +202,36 @@ def _lay(
 ) -> Float32[np.ndarray, "h w"]:
     """Paint them where nothing in ``below`` is nearer; returns their nearness (-inf: nothing)."""
     size = picture.shape[1], picture.shape[0]
-    corners = eye.project(triangles.places.astype(float), size)
-    if not eye.parallel:  # a triangle that reaches behind the eye is left out
-        behind = (corners[..., 2] <= 0).any(1)
-        triangles = _Triangles(*(array[~behind] for array in triangles))
-        corners = corners[~behind]
-    corners = corners.astype(np.float32)
-    near, winner = nearest(corners, *size, eye.limit)
+    seen = eye.project(triangles.places.astype(float), size).astype(np.float32)
+    near, winner = nearest(seen, triangles.faces, *size, eye.limit, not eye.parallel)
     one_mm = np.float32(1.0) if eye.parallel else near**2  # of nearness
     winner[near - _SAME_MM * one_mm <= below] = -1
     place = eye.place_mm.astype(np.float32)
-    light(picture, winner, corners, not eye.parallel, place, opacity, triangles, shadow)
+    light(picture, winner, seen, not eye.parallel, place, opacity, triangles, shadow)
     return near
+
+
+def tube(points_mm: Float[np.ndarray, "n 3"], radius_mm: float, sides: int = 6) -> Mesh:
+    """A polyline as a thin closed tube; its joints are mitred."""
+    step = np.diff(points_mm, axis=0)
+    step /= np.maximum(np.linalg.norm(step, axis=1, keepdims=True), 1e-9)
+    along = np.concatenate([step[:1], step[:-1] + step[1:], step[-1:]])
+    along /= np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-9)
+    least = np.eye(3)[np.abs(along).argmin(1)]  # the axis most across
+    a = np.cross(along, least)
+    for one, two in pairwise(range(len(a))):  # carried along, so that the tube does not twist
+        a[two] = a[one] - along[two] * (a[one] @ along[two])
+        a[two] /= max(float(np.linalg.norm(a[two])), 1e-9)
+    a[0] /= np.linalg.norm(a[0])
+    b = np.cross(along, a)
+    turn = 2 * np.pi * np.arange(sides) / sides
+    ring = np.cos(turn)[None, :, None] * a[:, None] + np.sin(turn)[None, :, None] * b[:, None]
+    vertices = (points_mm[:, None] + radius_mm * ring).reshape(-1, 3)
+    n = len(points_mm)
+    first = sides * np.arange(n - 1)[:, None] + np.arange(sides)
+    next_ = sides * np.arange(n - 1)[:, None] + (np.arange(sides) + 1) % sides
+    low = np.stack([first, next_, next_ + sides], -1).reshape(-1, 3)
+    high = np.stack([first, next_ + sides, first + sides], -1).reshape(-1, 3)
+    fan = np.stack([np.zeros(sides - 2), np.arange(1, sides - 1), np.arange(2, sides)], -1)
+    ends = [fan[:, ::-1], fan + sides * (n - 1)]
+    return Mesh(vertices, np.concatenate([low, high, *ends]).astype(np.int32))

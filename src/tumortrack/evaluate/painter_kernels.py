@@ -28,17 +28,20 @@ def crease(area, unit, corner, faces, first, limit):  # type: ignore[no-untyped-
 
 
 @numba.njit(cache=True, nogil=True)
-def nearest(corners, width, height, limit):  # type: ignore[no-untyped-def]
+def nearest(seen, faces, width, height, limit, perspective):  # type: ignore[no-untyped-def]
     """Greatest nearness up to the limit in each pixel (-inf: nothing) and whose it is (-1).
 
-    Corners (t, 3, 3) are column, row and nearness, linear in the picture.
+    Seen (v, 3) are the vertices' column, row and nearness, linear in the picture. In perspective a
+    triangle that reaches behind the eye (nearness 0 or less) is left out.
     """
     near = np.full((height, width), -np.inf, np.float32)
     winner = np.full((height, width), -1, np.int32)
-    for t in range(len(corners)):
-        ua, va, na = corners[t, 0]
-        ub, vb, nb = corners[t, 1]
-        uc, vc, nc = corners[t, 2]
+    for t in range(len(faces)):
+        ua, va, na = seen[faces[t, 0]]
+        ub, vb, nb = seen[faces[t, 1]]
+        uc, vc, nc = seen[faces[t, 2]]
+        if perspective and min(na, nb, nc) <= 0:
+            continue
         area = (ub - ua) * (vc - va) - (vb - va) * (uc - ua)
         if area == 0:
             continue
@@ -67,11 +70,11 @@ def nearest(corners, width, height, limit):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def _shares(corner, x, y, perspective):  # type: ignore[no-untyped-def]
+def _shares(seen, face, x, y, perspective):  # type: ignore[no-untyped-def]
     """How much of each corner there is in a pixel of a triangle."""
-    ua, va, na = corner[0]
-    ub, vb, nb = corner[1]
-    uc, vc, nc = corner[2]
+    ua, va, na = seen[face[0]]
+    ub, vb, nb = seen[face[1]]
+    uc, vc, nc = seen[face[2]]
     area = (ub - ua) * (vc - va) - (vb - va) * (uc - ua)
     a = ((ub - x) * (vc - y) - (vb - y) * (uc - x)) / area
     b = ((uc - x) * (va - y) - (vc - y) * (ua - x)) / area
@@ -84,11 +87,12 @@ def _shares(corner, x, y, perspective):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def _mixed(three, a, b, c):  # type: ignore[no-untyped-def]
+def _mixed(one, two, three, shares):  # type: ignore[no-untyped-def]
+    a, b, c = shares
     return (
-        a * three[0, 0] + b * three[1, 0] + c * three[2, 0],
-        a * three[0, 1] + b * three[1, 1] + c * three[2, 1],
-        a * three[0, 2] + b * three[1, 2] + c * three[2, 2],
+        a * one[0] + b * two[0] + c * three[0],
+        a * one[1] + b * two[1] + c * three[1],
+        a * one[2] + b * two[2] + c * three[2],
     )
 
 
@@ -108,18 +112,20 @@ def _dark(spot, shadow):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def light(  # type: ignore[no-untyped-def]
-    picture, winner, corners, perspective, place, opacity, triangles, shadow
+    picture, winner, seen, perspective, place, opacity, triangles, shadow
 ):
     """Lay each pixel's triangle over what is there; a diffuse light, a little gloss."""
     lx, ly, lz = shadow.axes[2]
+    places = triangles.places
     for y in range(winner.shape[0]):
         for x in range(winner.shape[1]):
             t = winner[y, x]
             if t < 0:
                 continue
-            a, b, c = _shares(corners[t], x, y, perspective)
-            spot = _mixed(triangles.places[t], a, b, c)
-            nx, ny, nz = _mixed(triangles.normals[t], a, b, c)
+            face, corner = triangles.faces[t], triangles.normals[t]
+            shares = _shares(seen, face, x, y, perspective)
+            spot = _mixed(places[face[0]], places[face[1]], places[face[2]], shares)
+            nx, ny, nz = _mixed(corner[0], corner[1], corner[2], shares)
             vx, vy, vz = place[0] - spot[0], place[1] - spot[1], place[2] - spot[2]
             scale = 1 / max(np.sqrt(nx * nx + ny * ny + nz * nz), 1e-12)
             far = 1 / np.sqrt(vx * vx + vy * vy + vz * vz)

@@ -10,23 +10,22 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from tumortrack.core.errors import InputError
-from tumortrack.core.solids import mesh_of, solid_of
 from tumortrack.core.types import ORGAN, Mesh
 from tumortrack.evaluate.drawing import axis_arrows, blank, new_figure, save, scale_bar
 from tumortrack.evaluate.organ_surfaces import organ_surfaces
+from tumortrack.evaluate.plan_parts import parted, within
 from tumortrack.evaluate.shade import (
     Frame,
     Layer,
     View,
+    depth_of,
     frame_around,
     pixel_centres,
     shade,
     silhouette,
     widened,
 )
-from tumortrack.imaging.raster import voxelise
 from tumortrack.plan.values import Cut, Located, ResectionPlan
-from tumortrack.plan.values import Layer as Slab
 from tumortrack.track.view.colours import Colour, part_colour, sweep_colour
 
 if TYPE_CHECKING:
@@ -46,7 +45,6 @@ _PIECE = (0.36, 0.5, 0.95)
 _GRASP = (0.1, 0.1, 0.12)
 _APPROACH_MM, _CUP_MM = 24.0, 5.0
 _ORGAN_OPACITY, _PIECE_OPACITY = 0.36, 0.3
-_INSIDE_MM = 1.0  # cells in which a stroke is said to be in the organ
 _BADGE_MM = 4.4  # numbers closer than this would cover each other
 _ARROW_EVERY_MM, _HEAD_MM = 45.0, 2.6
 
@@ -85,7 +83,9 @@ def plan_figure(plan: ResectionPlan, located: Located) -> Figure:
         frame = _frame(view, surfaces, plan)
         tumors = {label: mesh for label, mesh in surfaces.items() if label != ORGAN}
         _draw_bodies(axes, view, frame, tumors, piece, rest)
-        _draw_cuts(axes, plan, in_organ, view)
+        depth = np.min([depth_of(mesh, view, frame) for mesh in tumors.values()], axis=0)
+        hidden = [_behind(cut, depth, view, frame) for cut in plan.cuts]
+        _draw_cuts(axes, plan, in_organ, hidden, view)
         _draw_numbers(axes, plan, view, frame)
         _draw_grasp(axes, plan, view)
         for label, mesh in tumors.items():
@@ -118,52 +118,44 @@ def _unit(colour: Colour) -> tuple[float, float, float]:
     return red, green, blue
 
 
-def parted(organ: Mesh, layers: tuple[Slab, ...]) -> tuple[Mesh, Mesh]:
-    """The piece that comes away, and what stays."""
-    import manifold3d
-
-    solid = solid_of(organ, "the located organ")
-    above_mm = organ.box_mm[1, 2] + 1.0
-    slabs = []
-    for layer in layers:
-        area = manifold3d.CrossSection(list(layer.rings_mm), manifold3d.FillRule.NonZero)
-        height = min(layer.top_mm, above_mm) - layer.bottom_mm
-        if height > 0:
-            slabs.append(area.extrude(height).translate((0.0, 0.0, layer.bottom_mm)))
-    taken = manifold3d.Manifold.batch_boolean(slabs, manifold3d.OpType.Add)
-    return mesh_of(solid ^ taken), mesh_of(solid - taken)
-
-
-def within(cut: Cut, organ: Mesh) -> Bool[np.ndarray, " n"]:
-    """Which points of a stroke lie in the organ."""
-    low, high = cut.path_mm.min(0) - _INSIDE_MM, cut.path_mm.max(0) + _INSIDE_MM
-    way = np.diag([_INSIDE_MM, _INSIDE_MM, _INSIDE_MM, 1.0])
-    way[:3, 3] = low
-    nx, ny, nz = (np.ceil((high - low) / _INSIDE_MM).astype(int) + 1).tolist()
-    grid = voxelise(organ, way, (nx, ny, nz))
-    return grid[tuple(np.rint((cut.path_mm - low) / _INSIDE_MM).astype(int).T)]
-
-
 def _frame(view: View, surfaces: dict[int, Mesh], plan: ResectionPlan) -> Frame:
     reach = plan.grasp_mm + np.array([0.0, 0.0, _APPROACH_MM])
     points = [surfaces[ORGAN].vertices_mm, *(cut.path_mm for cut in plan.cuts), reach[None]]
     return widened(frame_around(view, np.concatenate(points), 7.0), _ASPECT)
 
 
+def _behind(
+    cut: Cut, depth: Float[np.ndarray, "h w"], view: View, frame: Frame
+) -> Bool[np.ndarray, " n"]:
+    """Which points of a stroke are hidden by what lies at that depth."""
+    x, y = pixel_centres(frame)
+    flat = view.project(cut.path_mm)
+    column = np.rint((flat[:, 0] - x[0]) / (x[1] - x[0])).astype(int)
+    row = np.rint((flat[:, 1] - y[0]) / (y[1] - y[0])).astype(int)
+    return depth[row, column] < flat[:, 2]
+
+
 def _draw_cuts(
-    axes: Axes, plan: ResectionPlan, in_organ: list[Bool[np.ndarray, " n"]], view: View
+    axes: Axes,
+    plan: ResectionPlan,
+    in_organ: list[Bool[np.ndarray, " n"]],
+    hidden: list[Bool[np.ndarray, " n"]],
+    view: View,
 ) -> None:
-    """The lowest first and, from above, widest, so that strokes above each other all show."""
+    """The lowest first and, from above, widest, so that strokes above each other all show; what
+    lies behind a tumor is faint."""
     from matplotlib.patheffects import Normal, Stroke
 
-    for cut, inside in reversed(list(zip(plan.cuts, in_organ, strict=True))):
+    for cut, inside, behind in reversed(list(zip(plan.cuts, in_organ, hidden, strict=True))):
         flat = view.project(cut.path_mm)
         colour = _unit(sweep_colour(cut.sweep, plan.sweeps))
         low = (cut.sweep - 1) / max(plan.sweeps - 1, 1) if view is FROM_ABOVE else 0.5
         width = (1.9 + 2.8 * low) * (1.0 if cut.kind == "wall" else 0.6)
         casing = [Stroke(linewidth=width + 1.2, foreground="white", alpha=0.8), Normal()]
         axes.plot(*flat[:, :2].T, color=colour, linewidth=0.9, alpha=0.8, zorder=5)
-        bold = np.where(inside[:, None], flat[:, :2], np.nan)
+        faint = np.where((inside & behind)[:, None], flat[:, :2], np.nan)
+        axes.plot(*faint.T, color=colour, linewidth=0.8 * width, alpha=0.4, zorder=5)
+        bold = np.where((inside & ~behind)[:, None], flat[:, :2], np.nan)
         axes.plot(*bold.T, color=colour, linewidth=width, path_effects=casing, zorder=6)
         if cut.kind == "wall":
             _draw_arrows(axes, flat, colour)
@@ -251,7 +243,7 @@ def _words(figure: Figure, plan: ResectionPlan) -> None:
         f"Resection of {plan.tumor.replace('_', ' ')}: {_METHODS[plan.method]}, {sweeps}",
         x=0.014, y=0.975, ha="left", fontsize=13, fontweight="bold",
     )  # fmt: skip
-    share = ml["healthy"] / max(ml["organ"] - ml["tumor"], 1e-9)
+    share = ml["healthy"] / ml["parenchyma"]
     figure.text(
         0.014,
         0.055,

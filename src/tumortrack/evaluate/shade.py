@@ -117,8 +117,14 @@ def _pixels(frame: Frame, pixel_mm: float) -> tuple[int, int]:
 
 def silhouette(mesh: Mesh, view: View, frame: Frame, pixel_mm: float = 0.25) -> np.ndarray:
     """Where the mesh covers the picture: 1.0 or 0.0 per pixel (h, w), for a contour at 0.5."""
-    depth, _ = _trace(mesh, view, frame, _pixels(frame, pixel_mm), pixel_mm)
-    return np.isfinite(depth).astype(float)
+    return np.isfinite(depth_of(mesh, view, frame, pixel_mm)).astype(float)
+
+
+def depth_of(
+    mesh: Mesh, view: View, frame: Frame, pixel_mm: float = 0.25
+) -> Float[np.ndarray, "h w"]:
+    """Of the surface that is seen, mm away from the viewer as ``View.project``; inf: nothing."""
+    return _trace(mesh, view, frame, _pixels(frame, pixel_mm), pixel_mm)[0]
 
 
 def _trace(
