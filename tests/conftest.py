@@ -1,5 +1,8 @@
 """Runs every test with array shapes checked: jaxtyping's annotations are executed by beartype."""
 
+import fcntl
+import os
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -44,3 +47,58 @@ def shared_data():
     if not folder.is_dir():
         pytest.skip(f"real data not found at {folder}")
     return folder
+
+
+# What several files need is made once in a run, whatever the number of workers. Not to be altered.
+
+Once = Callable[[str, Callable[[Path], object]], Path]
+
+
+@pytest.fixture(scope="session")
+def once(tmp_path_factory: pytest.TempPathFactory) -> Once:
+    """``once(name, make)``: the folder that the first worker who asks has ``make`` write."""
+    own = tmp_path_factory.getbasetemp()
+    shared = (own.parent if "PYTEST_XDIST_WORKER" in os.environ else own) / "shared"
+    shared.mkdir(exist_ok=True)
+
+    def made(name: str, make: Callable[[Path], object]) -> Path:
+        with (shared / f"{name}.lock").open("w") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)  # another worker may be making it
+            if not (shared / f"{name}.made").exists():
+                make(shared / name)
+                (shared / f"{name}.made").touch()
+        return shared / name
+
+    return made
+
+
+@pytest.fixture(scope="session")
+def phantom_case(once) -> Path:
+    """The built-in phantom on coarse voxels, as a case folder."""
+    from stories import write_phantom_case
+
+    return once("phantom_case", write_phantom_case)
+
+
+@pytest.fixture(scope="session")
+def clinic_model(once, phantom_case) -> Path:
+    """A model folder of the phantom: the preset clinic, trained for seconds."""
+    from stories import trained
+
+    return once("clinic_model", lambda model: trained(phantom_case, model, "clinic"))
+
+
+@pytest.fixture(scope="session")
+def quick_model(once, phantom_case) -> Path:
+    """A model folder of the phantom: the preset quick, trained for seconds."""
+    from stories import trained
+
+    return once("quick_model", lambda model: trained(phantom_case, model, "quick"))
+
+
+@pytest.fixture(scope="session")
+def slim_model(once) -> Path:
+    """A model folder of the elastic objects' organ: a slim clinic, trained for seconds."""
+    from warp_objects import train_slim
+
+    return once("slim_model", train_slim)

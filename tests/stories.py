@@ -59,6 +59,20 @@ def write_phantom_case(folder: Path) -> Case:
     return case
 
 
+STEPS = {"clinic": 60, "quick": 60}
+
+
+def train_command(case: Path, model: Path, preset: str = "quick") -> list[object]:
+    """A training of seconds, with the same weights whatever number of cores there is."""
+    options = ["--preset", preset, "--steps", STEPS[preset], "--workers", 1, "--device", "cpu"]
+    return ["train", case, model, *options]
+
+
+def trained(case: Path, model: Path, preset: str) -> None:
+    """Write a model folder."""
+    succeeded(tumortrack(*train_command(case, model, preset)))
+
+
 def looking_down(case: Case, distance_mm: float = 130.0, spin_degrees: float = 30.0) -> np.ndarray:
     """``camera_from_ct`` of a camera above the organ's anterior side, turned about its axis."""
     from scipy.spatial.transform import Rotation

@@ -14,7 +14,6 @@ from live_objects import small_frame
 from tumortrack.core.errors import InputError, NoEstimate, StorageError
 from tumortrack.core.types import DepthFrame, Intrinsics, SensorCloud
 from tumortrack.learn.model import load_model
-from tumortrack.learn.train import Run, train
 from tumortrack.sense.camera import d405
 from tumortrack.sense.region import RegionConfig
 from tumortrack.sense.render import render_depth
@@ -35,11 +34,8 @@ WHOLE = RegionConfig(plane=False, flying=False, pieces=False, crop=slim_clinic()
 
 
 @pytest.fixture(scope="module")
-def tracker(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("live") / "model"
-    run = Run(ANATOMY, UP, "no digest", slim_clinic(), steps=80, workers=0, device="cpu")
-    train(run, folder, lambda _: None)
-    return Tracker(load_model(folder, "cpu"))
+def tracker(slim_model):
+    return Tracker(load_model(slim_model, "cpu"))
 
 
 @pytest.fixture(scope="module")

@@ -16,7 +16,6 @@ from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.motion import Motion
 from tumortrack.core.types import SensorCloud
 from tumortrack.learn.model import load_model, save_model
-from tumortrack.learn.train import Run, train
 from tumortrack.sense.files import write_cloud_ply
 from tumortrack.simulate.bodies import body_for
 from tumortrack.simulate.occupancy import labels_of, surface_distance
@@ -25,21 +24,10 @@ from tumortrack.simulate.targets import draw_targets
 from tumortrack.track.tracker import Tracker
 from warp_objects import ANATOMY, shape, slim_clinic
 
-STEPS = 80
-
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory):
-    """A model folder."""
-    folder = tmp_path_factory.mktemp("warp") / "model"
-    run = Run(ANATOMY, UP, "no digest", slim_clinic(), steps=STEPS, workers=0, device="cpu")
-    train(run, folder, lambda _: None)
-    return folder
-
-
-@pytest.fixture(scope="module")
-def model(folder):
-    return load_model(folder, "cpu")
+def model(slim_model):
+    return load_model(slim_model, "cpu")
 
 
 @pytest.fixture(scope="module")
@@ -190,13 +178,13 @@ def test_metres_are_refused(tracker, stages):
         tracker.locate(SensorCloud(stages[0].cloud.points_mm / 1000))
 
 
-def test_the_command_says_where_points_of_the_ct_are(folder, stages, estimate, tmp_path):
+def test_the_command_says_where_points_of_the_ct_are(slim_model, stages, estimate, tmp_path):
     write_cloud_ply(tmp_path / "cloud.ply", stages[0].cloud.points_mm)
     points = np.round(CENTER + np.array([[0, -8, 20.0], [10, 5, -30], [0, 0, 44]]), 3)
     lines = [f"p{n},{','.join(map(str, p))}" for n, p in enumerate(points)]
     (tmp_path / "asked.csv").write_text("\n".join(["name,x,y,z", *lines, ""]))
     out = tmp_path / "out"
-    command = ["locate", folder, tmp_path / "cloud.ply", out, "--grid", 48, "--seed", 3]
+    command = ["locate", slim_model, tmp_path / "cloud.ply", out, "--grid", 48, "--seed", 3]
     said = succeeded(tumortrack(*command, "--map", tmp_path / "asked.csv", "--device", "cpu"))
     assert "3 points of the CT" in said
     rows = list(csv.DictReader((out / "points.csv").open()))
@@ -232,13 +220,13 @@ def test_clouds_of_an_organ_as_never_seen_are_answered(tracker, stages):
     assert part.mean() > certain.mean()
 
 
-def test_a_model_without_its_shape_is_refused(model, folder, tmp_path):
+def test_a_model_without_its_shape_is_refused(slim_model, tmp_path):
     import shutil
 
     from tumortrack.core.errors import ArtifactError
 
     broken = tmp_path / "broken"
-    shutil.copytree(folder, broken)
+    shutil.copytree(slim_model, broken)
     (broken / "shape.safetensors").unlink()
     with pytest.raises(ArtifactError, match=r"shape\.safetensors"):
         load_model(broken)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import cache
+from pathlib import Path
 
 import msgspec
 import numpy as np
@@ -13,6 +14,7 @@ from tumortrack.app.presets import clinic
 from tumortrack.core.types import Anatomy
 from tumortrack.learn.config import TrainConfig
 from tumortrack.learn.network import NetworkConfig, clinic_network
+from tumortrack.learn.train import Run, train
 from tumortrack.learn.warp.motion import WarpMotion
 from tumortrack.learn.warp.shape import Shape, shape_of
 from tumortrack.simulate.deform import ElasticConfig
@@ -58,3 +60,9 @@ def slim_clinic() -> TrainConfig:
         validation_points=512,
         validate_every=1000,
     )
+
+
+def train_slim(folder: Path) -> None:
+    """Write a model folder of the slim clinic."""
+    run = Run(ANATOMY, UP, "no digest", slim_clinic(), steps=80, workers=0, device="cpu")
+    train(run, folder, lambda _: None)
