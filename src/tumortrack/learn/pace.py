@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import time
 from collections.abc import Callable, Iterator
@@ -47,10 +48,12 @@ class Interrupted(TumortrackError):
 
 
 def use_cores(device: torch.device, workers: int) -> None:
-    """Give the network the cores that the workers leave."""
+    """Give the network the cores that the workers leave, as far as OMP_NUM_THREADS grants them."""
     if device.type == "cpu":
         keep_freed_memory()
-        torch.set_num_threads(max(1, min(MOST_THREADS, available_cores() - workers)))
+        granted = os.environ.get("OMP_NUM_THREADS", "")
+        most = int(granted) if granted.isdigit() else MOST_THREADS
+        torch.set_num_threads(max(1, min(most, MOST_THREADS, available_cores() - workers)))
 
 
 class Clock:
