@@ -128,9 +128,11 @@ class Browser:
             )
 
     def click_text(self, text: str) -> None:
-        """Click the middle of the button that says this."""
-        script = f"""(() => {{ for (const b of document.querySelectorAll('button'))
-            if (b.innerText.includes({json.dumps(text)})) {{
+        """Click the middle of the button that says this, rather than of one that says more."""
+        script = f"""(() => {{ const says = [...document.querySelectorAll('button')].filter(
+                b => b.innerText.includes({json.dumps(text)}));
+            says.sort((a, b) => a.innerText.length - b.innerText.length);
+            for (const b of says) {{
                 b.scrollIntoView(); const r = b.getBoundingClientRect();
                 return [r.x + r.width / 2, r.y + r.height / 2]; }} }})()"""
         place = self.call("Runtime.evaluate", expression=script, returnByValue=True)["result"]

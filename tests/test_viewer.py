@@ -33,6 +33,7 @@ from tumortrack.track.view.points import point_under
 from tumortrack.track.view.slices import CarriedCt, Plane, slice_picture
 from tumortrack.track.view.status import Status
 from tumortrack.track.view.surfaces import bare_faces, exact_margin, rough_margin
+from workcell_objects import REASON, virtual, with_arms, workcell, working
 
 TURN = Rotation.from_euler("xyz", [20, -35, 50], degrees=True).as_matrix()
 ROBOT = Frames("robot", rigid(TURN, np.array([400.0, -250.0, 90.0])))
@@ -293,6 +294,57 @@ def test_case_gives_slices_and_an_exact_margin_that_moves_along(sinks, tmp_path)
         sinks(replace(setting, anatomy_ct=None), case=str(tmp_path / "case"))
 
 
+def test_arms_move_without_being_sent_again_and_what_is_gone_is_removed(sinks):
+    sink = sinks(with_arms(), hz=0.01)  # arms come with every update all the same
+    nodes = sink._server.scene.get_handle_by_name
+    sink.publish(working(0, 0.0))
+    assert nodes("/workcell").visible
+    forearm, cut = nodes("/workcell/shape/cutter:forearm"), nodes("/workcell/line/cut:1")
+    assert len(cut.points) == 40
+    now = working(1, 0.02).workcell
+    assert now is not None
+    moved = next(shape for shape in now.shapes if shape.name == "cutter/forearm")
+    forearm_before = forearm.position.copy()
+    mesh_before = next(s for s in workcell().shapes if s.name == "cutter/forearm").mesh
+    sink.publish(replace(working(1), workcell=now))
+    assert (nodes("/workcell/shape/cutter:forearm") is forearm) == (moved.mesh is mesh_before)
+    shown = nodes("/workcell/shape/cutter:forearm")
+    assert shown.position == pytest.approx(moved.published_from_shape[:3, 3])
+    assert not np.allclose(shown.position, forearm_before)
+    turn = Rotation.from_quat(shown.wxyz, scalar_first=True).as_matrix()
+    assert turn == pytest.approx(moved.published_from_shape[:3, :3])
+    table = nodes("/workcell/shape/table")
+    kept = tuple(shape for shape in now.shapes if shape.name != "holder/tip")
+    sink.publish(replace(working(2), workcell=replace(now, shapes=kept, lines=now.lines[1:])))
+    assert nodes("/workcell/shape/holder:tip") is None
+    assert nodes("/workcell/line/cut:1") is None
+    assert nodes("/workcell/line/cut:2") is not None
+    assert nodes("/workcell/shape/table") is table
+
+
+def test_arms_are_shown_without_an_estimate_and_never_after_silence(sinks):
+    sink = sinks(with_arms())
+    nodes = sink._server.scene.get_handle_by_name
+    sink.publish(working(0))
+    sink.publish(virtual(1))
+    assert nodes("/workcell").visible
+    assert not nodes("/estimate").visible
+    assert REASON in sink._panel._flag.content
+    sink.publish(small_update(2))
+    assert not nodes("/workcell").visible
+    nowhere = replace(workcell().shapes[0], published_from_shape=np.zeros((4, 4)))
+    broken = replace(workcell(), shapes=(nowhere,))
+    with pytest.raises(ValueError, match="determinant"):
+        sink.publish(replace(working(3), workcell=broken))
+    assert not nodes("/workcell").visible
+    assert nodes("/estimate").visible
+    sink.publish(working(4))
+    assert nodes("/workcell").visible
+    until(lambda: "nothing has come for" in sink._panel._flag.content, 3, "silence")
+    assert not nodes("/workcell").visible
+    assert "nothing is known of them" in sink._panel._flag.content
+
+
 def test_status_says_why_and_no_old_numbers():
     update = replace(empty_update(), reason="depth < 110 mm & hidden")
     flag = Status("none", update, 0.1, 7).flag()
@@ -339,8 +391,14 @@ def kidneyish(picture: np.ndarray) -> int:
     return int(((r > 1.2 * g) & (r < 2.6 * g) & (g > b) & (g > 20)).sum())
 
 
+def orange(picture: np.ndarray) -> int:
+    """Pixels that look like the cutter's arm, where no banner is."""
+    r, g, b = picture[150:420, :400].astype(int).transpose(2, 0, 1)
+    return int(((r > 80) & (r > 1.4 * g) & (g > 2 * b)).sum())
+
+
 def test_page_in_a_browser(sinks):
-    setting = replace(small_setting(), frames=ROBOT)
+    setting = replace(small_setting(), frames=ROBOT, arms=True)
     sink = sinks(setting)
     shown = small_update(frames=ROBOT)
     hidden = replace(empty_update(reason="only 12 points lie in range"), frames=ROBOT)
@@ -371,17 +429,43 @@ def test_page_in_a_browser(sinks):
             until(lambda: greenish(browser.picture()) > 700, 10, "the tumor again")
 
             check_click(browser, setting)
+            check_arms(browser, feed, shown, setting)
 
             feed.update = None  # type: ignore[assignment]
             until(lambda: "nothing has come for" in browser.text(), 5, "STALE")
             until(lambda: greenish(browser.picture()) == 0, 3, "hiding")
+            assert orange(browser.picture()) < 300
+            assert "nothing is known of them" in browser.text()
             feed.update = shown
             until(lambda: "GOOD" in browser.text(), 5, "recovery")
+            assert orange(browser.picture()) < 300
             assert "has been silent" not in browser.text()
         finally:
             feed.end()
         sink.close()  # the page, alone now, says so itself
         until(lambda: "has been silent" in browser.text(), 6, "the page's own watch")
+
+
+def check_arms(browser: Browser, feed: Feed, shown: Update, setting: Setting) -> None:
+    """Arms are seen whole, with and without an estimate; what they do is said; they are stopped."""
+    assert orange(browser.picture()) < 300
+    feed.update = replace(shown, workcell=workcell())
+    until(lambda: "ARMS: sweep 1" in browser.text(), 5, "the arms' state")
+    until(lambda: orange(browser.picture()) > 1000, 5, "an arm")
+    feed.update = replace(virtual(), frames=ROBOT)
+    until(lambda: REASON in browser.text(), 5, "why there is no estimate")
+    assert "NO ESTIMATE" in browser.text()
+    assert orange(browser.picture()) > 1000
+    browser.click_text("organ")
+    until(lambda: orange(browser.picture()) < 300, 5, "the view from the camera")
+    browser.click_text("arms")
+    until(lambda: orange(browser.picture()) > 1000, 5, "the view of all")
+    feed.update = replace(shown, workcell=workcell(halted="the tumor has moved by 6 mm"))
+    until(lambda: "the tumor has moved by 6 mm" in browser.text(), 5, "the halt")
+    assert "sweep 1: HALTED" in browser.text()
+    browser.click_text("Stop the arms for good")
+    until(setting.controls.aborted.is_set, 5, "the arms' end")
+    until(lambda: "The arms were stopped for good" in browser.text(), 5, "being told so")
 
 
 def check_click(browser: Browser, setting: Setting) -> None:

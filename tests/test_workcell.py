@@ -101,9 +101,10 @@ def test_joints_and_markers_say_where_everything_stands():
 def test_arms_are_told_of_without_an_estimate_and_why_they_stand():
     out = sent(virtual(halted="the tumor moved by 6 mm"), Cell(NOETIC, 0), NOETIC)
     assert len(out["workcell"].markers) == len(NAMES) + 3
-    assert out["meshes"].markers[0].action == 3  # DELETEALL: no estimate
-    assert REASON in out["meshes"].markers[1].text
-    assert out["workcell"].markers[-1].text == "sweep 1, halted: the tumor moved by 6 mm"
+    assert [m.action for m in out["meshes"].markers] == [3]  # DELETEALL: no estimate
+    assert out["workcell"].markers[-1].text == (
+        f"sweep 1, halted: the tumor moved by 6 mm\nno estimate: {REASON}"
+    )
     estimate, arms = out["diagnostics"].status
     assert (estimate.level, arms.level, arms.name) == (2, 1, "tumortrack: arms")
     assert {v.key: v.value for v in arms.values} == {
@@ -112,15 +113,19 @@ def test_arms_are_told_of_without_an_estimate_and_why_they_stand():
     assert sent(working(), Cell(HUMBLE, 0))["diagnostics"].status[1].level == 0
 
 
-def test_what_is_gone_is_deleted_at_once_and_markers_keep_their_rate():
+def test_markers_keep_their_rate_and_changes_come_at_once():
     cell = Cell(HUMBLE, 0.01)
-    first = sent(working(0), cell)["workcell"].markers
-    assert len(first) == len(NAMES) + 3
-    later = sent(less(working(1, 0.2), "holder/tip", "cut/2"), cell)
-    assert [(m.ns, m.action) for m in later["workcell"].markers] == [
-        ("cut/2", 2), ("holder/tip", 2), ("state", 0),
-    ]  # fmt: skip
+    assert len(sent(working(0), cell)["workcell"].markers) == len(NAMES) + 3
+    later = sent(working(1, 0.2), cell)
+    assert "workcell" not in later
     assert later["joint_states"].position[0] == pytest.approx(0.04)  # joints come each time
+    # Whoever is slow gets the newest message alone: each is whole.
+    markers = sent(less(working(2, 0.3), "holder/tip", "cut/2"), cell)["workcell"].markers
+    assert [(m.ns, m.action) for m in markers[:2]] == [("cut/2", 2), ("holder/tip", 2)]
+    assert [m.ns for m in markers[2:]] == [*NAMES[:-1], "cut/1", "state"]
+    halted = less(working(3, 0.3, "hidden"), "holder/tip", "cut/2")
+    assert sent(halted, cell)["workcell"].markers[-1].text == "sweep 1, halted: hidden"
+    assert "workcell" not in sent(halted, cell)
     (all_gone,) = sent(small_update(2, frames=TABLE), cell)["workcell"].markers
     assert all_gone.action == all_gone.DELETEALL
     nothing = sent(replace(working(3), workcell=None), cell)

@@ -3,7 +3,6 @@ line of the diagnostics. Metres and radians, in the published frame."""
 
 from __future__ import annotations
 
-import time
 from typing import Any
 
 import numpy as np
@@ -17,7 +16,6 @@ from tumortrack.track.ros.markers import (
     DELETE,
     DELETE_ALL,
     LINE,
-    MARKER_LIFETIME_S,
     MARKERS,
     TEXT,
     TRIANGLES,
@@ -44,16 +42,16 @@ _TEXT_ABOVE_MM = 60.0
 class Cell:
     """A publisher's memory of what it showed, so that what is gone is deleted.
 
-    ``hz``: markers and observed points at most so often (0: each time), what stands still once a
-    second; the state's text, the joints and deletions come with every update. ``observed``:
-    without, those points never come.
+    ``hz``: markers and observed points at most so often (0: each time), but at once where the
+    state changes or something is gone; joints come with every update. ``observed``: without, those
+    points never come.
     """
 
     def __init__(self, messages: Messages, hz: float, observed: bool = True) -> None:
         self._messages, self._observed = messages, observed
         self._markers_rate, self._points_rate = Rate(hz), Rate(hz)
         self._shown: set[str] = set()
-        self._sent: dict[str, tuple[tuple, float]] = {}  # how each looked, and when it was sent
+        self._said: tuple[str, bool] | None = None
 
     def outgoing(self, update: Update, header: Any) -> list[Outgoing]:
         """``joint_states`` (JointState; no names without arms) and ``workcell`` (MarkerArray: a
@@ -63,16 +61,13 @@ class Cell:
         background being told apart; no points where it saw nothing). Nothing is sent on /tf, so
         that a camera's own cloud could not be shown beside them."""
         cell = update.workcell
-        points = self._points(update, header) if self._observed else None
-        return [
-            *((Outgoing("observed", CLOUD, points),) if points is not None else ()),
-            Outgoing("joint_states", JOINTS, self._joints(cell, header)),
-            Outgoing(
-                "workcell",
-                MARKERS,
-                self._messages.make(MARKERS, markers=self._markers(cell, header)),
-            ),
-        ]
+        out = [Outgoing("joint_states", JOINTS, self._joints(cell, header))]
+        if (markers := self._markers(update, header)) is not None:
+            array = self._messages.make(MARKERS, markers=markers)
+            out.append(Outgoing("workcell", MARKERS, array))
+        if self._observed and (points := self._points(update, header)) is not None:
+            out.append(Outgoing("observed", CLOUD, points))
+        return out
 
     def status(self, update: Update) -> Any:
         """A DiagnosticStatus: OK with the state, WARN where the arms are halted, STALE without a
@@ -114,35 +109,33 @@ class Cell:
             points_mm = transform_points(update.frames.published_from_camera, points_mm)
         return plain_cloud(SensorCloud(points_mm, update.stamp_ns), header, self._messages)
 
-    def _markers(self, cell: Workcell | None, header: Any) -> list[Any]:
-        messages = self._messages
+    def _markers(self, update: Update, header: Any) -> list[Any] | None:
+        """All or, if it is not their turn, None: receivers that are slow keep the newest message
+        alone, so each must be whole."""
+        messages, cell = self._messages, update.workcell
         if cell is None:
-            self._shown, self._sent = set(), {}
+            self._shown, self._said = set(), None
             return [marker(messages, header, action=DELETE_ALL)]
         shapes, lines = cell.shapes, [line for line in cell.lines if len(line.points_mm) > 1]
         names = {STATE, *(shape.name for shape in shapes), *(line.name for line in lines)}
         gone, self._shown = self._shown - names, names
-        out = [marker(messages, header, ns=name, action=DELETE) for name in sorted(gone)]
-        for name in gone:
-            self._sent.pop(name, None)
-        if self._markers_rate.due():
-            out += [_surface(one, header, messages) for one in shapes if self._is_news(one)]
-            out += [_strip(one, header, messages) for one in lines if self._is_news(one)]
-        out.append(_text(cell, header, messages))
-        return out
+        said = cell.state, bool(cell.halted)  # why may change with each frame
+        changed, self._said = gone or said != self._said, said
+        if not self._markers_rate.due() and not changed:
+            return None
+        return [
+            *(marker(messages, header, ns=name, action=DELETE) for name in sorted(gone)),
+            *(_surface(shape, header, messages) for shape in shapes),
+            *(_strip(line, header, messages) for line in lines),
+            _text(update, cell, header, messages),
+        ]
 
-    def _is_news(self, one: Shape | Line) -> bool:
-        """It changed, or its marker is half way to its end: what stands still costs little."""
-        now_s = time.monotonic()
-        if isinstance(one, Shape):
-            looks: tuple = (one.mesh, one.published_from_shape.tobytes(), one.colour, one.opacity)
-        else:
-            looks = (one.points_mm.tobytes(), one.colour, one.width_mm)
-        before, sent_s = self._sent.get(one.name, ((), 0.0))
-        if looks == before and now_s - sent_s < MARKER_LIFETIME_S / 2:
-            return False
-        self._sent[one.name] = looks, now_s
-        return True
+
+def verdict(update: Update) -> str:
+    """How good the estimate is, or why there is none."""
+    if update.estimate is None:
+        return f"no estimate: {update.reason}"
+    return f"{update.quality}: {update.warning}" if update.warning else update.quality
 
 
 def words(cell: Workcell) -> str:
@@ -180,8 +173,9 @@ def _strip(line: Line, header: Any, messages: Messages) -> Any:
     )
 
 
-def _text(cell: Workcell, header: Any, messages: Messages) -> Any:
+def _text(update: Update, cell: Workcell, header: Any, messages: Messages) -> Any:
     """Above everything: where arms are, z is up."""
+    said = words(cell) if update.estimate is not None else f"{words(cell)}\n{verdict(update)}"
     box = box_of(cell)
     spots = [] if box is None else [box]
     spots += [line.points_mm for line in cell.lines if len(line.points_mm) > 1]
@@ -197,5 +191,5 @@ def _text(cell: Workcell, header: Any, messages: Messages) -> Any:
         pose=pose(messages, place_mm / MM_PER_M),
         scale=messages.make("geometry_msgs/msg/Vector3", z=_TEXT_HEIGHT_M),
         color=colour(messages, NONE if cell.halted else _TEXT_COLOUR),
-        text=words(cell),
+        text=said,
     )

@@ -13,7 +13,7 @@ import numpy as np
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.types import Mesh
 from tumortrack.track.live import Placed, Quality, Update
-from tumortrack.track.ros.cell import Cell
+from tumortrack.track.ros.cell import Cell, verdict
 from tumortrack.track.ros.incoming import CLOUD
 from tumortrack.track.ros.markers import (
     ADD,
@@ -126,7 +126,8 @@ def _markers(
                 markers.append(_triangles(placed.meshes[name], name, label, header, messages))
             else:
                 markers.append(marker(messages, header, ns=name, action=DELETE))
-    markers.append(_text(update, header, messages))
+    if placed is not None or update.workcell is None:  # else said with what the arms do
+        markers.append(_text(update, header, messages))
     return messages.make(MARKERS, markers=markers)
 
 
@@ -160,14 +161,8 @@ def _text(update: Update, header: Any, messages: Messages) -> Any:
         pose=pose(messages, transform_points(way, above_mm)[0] / MM_PER_M),
         scale=messages.make("geometry_msgs/msg/Vector3", z=_TEXT_HEIGHT_M),
         color=colour(messages, _TEXT_COLOURS[update.quality]),
-        text=_words(update),
+        text=verdict(update),
     )
-
-
-def _words(update: Update) -> str:
-    if update.estimate is None:
-        return f"no estimate: {update.reason}"
-    return f"{update.quality}: {update.warning}" if update.warning else update.quality
 
 
 def _center(update: Update, name: str, header: Any, messages: Messages) -> Any:
@@ -197,7 +192,7 @@ def _diagnostics(update: Update, header: Any, messages: Messages, cell: Cell | N
         "diagnostic_msgs/msg/DiagnosticStatus",
         level=_LEVELS[update.quality],
         name="tumortrack: estimate",
-        message=_words(update),
+        message=verdict(update),
         hardware_id=update.frames.frame_id,
         values=values,
     )
