@@ -45,6 +45,7 @@ from tumortrack.evaluate.study.plan import (
     jobs_of,
     scenes_of,
 )
+from tumortrack.evaluate.study.resection import cut_one
 from tumortrack.learn.train import Status as TrainStatus
 from tumortrack.phantom.digital import PhantomParameters, second_phantom
 
@@ -93,6 +94,8 @@ class Options:
     """Peers in the severities."""
     goal_models: tuple[str, ...] | None = None
     """Models in the table of goals."""
+    resection_models: tuple[str, ...] | None = None
+    """Models whose estimates are planned on and cut, beside the truth."""
     ablation_models: tuple[str, ...] | None = None
     """Rows of the ablation."""
     ablation_cases: tuple[str, ...] | None = None
@@ -138,7 +141,8 @@ def main(options: Options) -> None:
             _scenes(case, *scenes_of(plan, section))
         say(f"== {section}")
         jobs = jobs_of(plan, section, cases, methods)
-        measured = measure(jobs, cells, Measuring(section).show)
+        one = cut_one if section == "resection" else None
+        measured = measure(jobs, cells, Measuring(section).show, one)
         book.write(section_blocks(section, measured, cases, book))
         say(f"{section}: {len(measured)} measurements, block written to {document}")
     if "peers" in options.sections:

@@ -10,7 +10,7 @@ from pathlib import Path
 from tumortrack.core import store
 from tumortrack.core.errors import InputError, StorageError
 from tumortrack.evaluate.protocol import RULE
-from tumortrack.evaluate.study import ablation, goals, plots, severity, tables
+from tumortrack.evaluate.study import ablation, goals, plots, resection_table, severity, tables
 from tumortrack.evaluate.study.caption import caption
 from tumortrack.evaluate.study.figures import pick
 from tumortrack.evaluate.study.gallery import gallery
@@ -76,6 +76,8 @@ def section_blocks(
     if section == "goals":
         lies = {case.name: tumor_lies(case.anatomy_ct) for case in cases}
         return {section: f"{goals.tables_of(cells, lies)}\n\n{_below(section, cells, book)}"}
+    if section == "resection":
+        return {section: f"{resection_table.tables_of(cells)}\n\n{_below(section, cells, book)}"}
     texts = []
     for case in cases:
         mine = pick(cells, case=case.name)
@@ -106,6 +108,7 @@ _RULES: dict[Section, str] = {
     "faults": f"{_OVER_SCENES} In brackets: the change against clean depth.",
     "views": f"{_OVER_SCENES} In brackets: the change against the clean view.",
     "severity": f"Distances in mm. {_MEDIANS} Here {severity.RULE}",
+    "resection": resection_table.RULE,
 }
 
 

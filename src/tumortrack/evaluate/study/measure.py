@@ -63,9 +63,13 @@ class Status:
 
 
 def measure(
-    jobs: Iterable[Job], cells: CellStore, report: Callable[[Status], None] | None = None
+    jobs: Iterable[Job],
+    cells: CellStore,
+    report: Callable[[Status], None] | None = None,
+    one: Callable[[Job, str], dict] | None = None,
 ) -> list[dict]:
-    """The cells of these jobs in their order; only those that are not kept yet are measured.
+    """The cells of these jobs in their order; only those that are not kept yet are measured,
+    each by ``one`` (``measure_one``) from its job and its scene's name.
 
     Raises:
         InputError: a scene is missing or cannot be read.
@@ -80,7 +84,7 @@ def measure(
     pace = _Pace([_kind_of(spec) for spec, _ in todo.values()])
     for number, (digest, (spec, job)) in enumerate(todo.items(), start=1):
         start = time.perf_counter()
-        kept[digest] = cells.write(spec, measure_one(job, spec.scene))
+        kept[digest] = cells.write(spec, (one or measure_one)(job, spec.scene))
         pace.add(_kind_of(spec), time.perf_counter() - start)
         if report:
             done = len(kept) - len(todo) + number

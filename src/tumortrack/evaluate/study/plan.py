@@ -11,6 +11,7 @@ from tumortrack.evaluate.study.bound import BOUNDS
 from tumortrack.evaluate.study.measure import Job, StudyCase, by_method
 from tumortrack.evaluate.study.methods import Method, Network
 from tumortrack.evaluate.study.models import CLINIC, UNREFINED, configuration_name
+from tumortrack.evaluate.study.resection import Cutting, Truth
 
 VARIANTS = ("D0", "D1", "D2", "D3", "Rot90", "Rot180", "Rot270", "G1", "P1")
 VIEWS = ("clean", "noise", "shaft", "clutter")
@@ -32,8 +33,9 @@ ABLATION = (
     "quick_elastic", "M_lim",
 )  # fmt: skip
 Section = Literal[
-    "accuracy", "goals", "ablation", "deformation", "peers", "faults", "views", "severity"
-]
+    "accuracy", "goals", "ablation", "deformation", "peers", "faults", "views", "severity",
+    "resection",
+]  # fmt: skip
 SECTIONS: tuple[Section, ...] = get_args(Section)
 
 
@@ -80,6 +82,7 @@ class StudyPlan(Config, frozen=True):
     severity_peers: tuple[str, ...] = ("rigid",)
     goal_models: tuple[str, ...] = ("M_lim", CLINIC)
     goal_peers: tuple[str, ...] = ("elastic",)
+    resection_models: tuple[str, ...] = ("M_lim", CLINIC)
     ablation_models: tuple[str, ...] = ABLATION
     ablation_cases: tuple[str, ...] = ("phantom", "case_00000")  # of those that are given
     ablation_scenes: int = 32_000
@@ -155,6 +158,7 @@ def jobs_of(
         "faults": _faults,
         "views": _views,
         "severity": _severity,
+        "resection": _resection,
     }
     jobs = [job for case in cases for job in makers[section](plan, case, methods)]
     return by_method(jobs)
@@ -248,6 +252,15 @@ def _goals(plan: StudyPlan, case: StudyCase, methods: Methods) -> list[Job]:
         for method in [*models, *beside, *bounds]
         for variant in plan.variants
     ] + _disturbed(plan, case, [*models, *beside], draws)
+
+
+def _resection(plan: StudyPlan, case: StudyCase, methods: Methods) -> list[Job]:
+    located_by = [*_first_seed(plan, case, methods, plan.resection_models), Truth()]
+    return [
+        Job(case, cutting, variant, plan.view, plan.coarse_grid)
+        for cutting in map(Cutting, located_by)
+        for variant in plan.variants
+    ]
 
 
 def _ablation(plan: StudyPlan, case: StudyCase, methods: Methods) -> list[Job]:
