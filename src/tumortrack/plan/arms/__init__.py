@@ -1,0 +1,5 @@
+"""Two arms that execute a resection: kinematics, collisions, motions.
+
+Millimetres and the table frame at every interface; metres only inside calls of pinocchio, coal
+and the analytic inverse kinematics.
+"""

@@ -1,0 +1,213 @@
+"""The cell, built once: where the tips are, what collides with what, how near things are."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator
+from functools import cached_property
+from itertools import product
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from jaxtyping import Float64
+
+from tumortrack.core.types import Mesh
+from tumortrack.plan.arms.body import CAMERA, LINKS, STAND, TABLE, Part, cell_parts
+from tumortrack.plan.arms.config import Base, CellConfig
+from tumortrack.plan.arms.urdf import cell_urdf
+from tumortrack.plan.motions import CUTTER, HOLDER
+
+if TYPE_CHECKING:
+    from tumortrack.track.live import Shape
+
+__all__ = ["Base", "Cell", "CellConfig"]
+
+ORGAN = "organ"
+ARMS = (CUTTER, HOLDER)
+TOOLS = {CUTTER: ("bracket", "pencil", "electrode"), HOLDER: ("rod", "cup")}
+TOUCHES = {CUTTER: "cutter/electrode", HOLDER: "holder/cup"}  # what of a tool may touch the organ
+
+
+class Cell:
+    """Both arms with their tools over the table, and the organ once it is known.
+
+    Values do not change after construction, but the buffers of pinocchio do: one thread at a time.
+    """
+
+    def __init__(self, config: CellConfig | None = None, organ: Mesh | None = None) -> None:
+        import pinocchio as pin
+
+        self.config = config or CellConfig()
+        self.organ = organ
+        text = cell_urdf(self.config)
+        self._model = pin.buildModelFromXML(text)
+        self._data = self._model.createData()
+        self._solids = pin.buildGeomFromUrdfString(self._model, text, pin.GeometryType.COLLISION)
+        self._names = _name_solids(self._solids, cell_parts(self.config))
+        if organ is not None:
+            surface = _bounding_volumes(organ)
+            self._solids.addGeometryObject(
+                pin.GeometryObject(ORGAN, 0, pin.SE3.Identity(), surface)
+            )
+            self._names.append(ORGAN)
+        index = {name: n for n, name in enumerate(self._names)}
+        self._pairs = [pair for pair in _pairs() if pair[0] in index and pair[1] in index]
+        for one, other in self._pairs:
+            self._solids.addCollisionPair(pin.CollisionPair(index[one], index[other]))
+        self._tips = {arm: self._model.getFrameId(f"{arm}_tip") for arm in ARMS}
+        self._states: dict[tuple, Any] = {}
+        self._looks: Any = None
+
+    def with_organ(self, organ: Mesh | None) -> Cell:
+        """The same cell with this organ on its post (table frame, mm)."""
+        return Cell(self.config, organ)
+
+    @property
+    def home_rad(self) -> Float64[np.ndarray, " 12"]:
+        return np.array(self.config.home_rad)
+
+    @cached_property
+    def limits_rad(self) -> Float64[np.ndarray, " 12"]:
+        """Each joint may turn so far both ways."""
+        return np.concatenate([self.config.model(arm).limits_rad for arm in ARMS])
+
+    @cached_property
+    def speeds_rad_s(self) -> Float64[np.ndarray, " 12"]:
+        """Greatest speeds planned with."""
+        makers = np.concatenate([self.config.model(arm).speeds_rad_s for arm in ARMS])
+        return self.config.speed_share * makers
+
+    @cached_property
+    def levers_mm(self) -> Float64[np.ndarray, " 12"]:
+        """No point of an arm or its tool moves farther than this per radian of each joint."""
+        levers = []
+        for arm in ARMS:
+            model, tool = self.config.model(arm), self.config.flange_from_tip(arm)[:3, 3]
+            ahead, low = float(np.linalg.norm(tool[:2])) + 10.0, tool[2] + model.d_mm[5]
+            hand = float(np.hypot(ahead, low))
+            fore = hand + model.d_mm[4]
+            elbow = fore + float(np.hypot(model.a_mm[2], model.d_mm[3]))
+            levers += [abs(model.a_mm[1]) + elbow] * 2 + [elbow, fore, hand, ahead]
+        return np.array(levers)
+
+    def tips(self, joints_rad: Float64[np.ndarray, " 12"]) -> dict[str, Float64[np.ndarray, "4 4"]]:
+        """``table_from_tip`` (mm) of ``cutter`` and ``holder``: z up; the instrument points along
+        its x."""
+        import pinocchio as pin
+
+        pin.framesForwardKinematics(self._model, self._data, joints_rad)
+        places = {}
+        for arm, frame in self._tips.items():
+            place = self._data.oMf[frame].homogeneous.copy()
+            place[:3, 3] *= 1000
+            places[arm] = place
+        return places
+
+    def collisions(
+        self,
+        joints_rad: Float64[np.ndarray, " 12"],
+        touching: Collection[str] = (),
+        clearance: bool = True,
+        moving: str | None = None,
+    ) -> tuple[str, str] | None:
+        """Names of the first pair that collides, or None.
+
+        Args:
+            touching: arms whose electrode or cup may be on or in the organ now.
+            clearance: things that come nearer than the configured clearances collide too.
+            moving: the arm that moves, if the rest is known to be free; None: test everything.
+        """
+        import pinocchio as pin
+
+        state = self._state(tuple(sorted(touching)), clearance, moving)
+        pin.updateGeometryPlacements(self._model, self._data, self._solids, state, joints_rad)
+        if not pin.computeCollisions(self._solids, state, True):
+            return None
+        # It stops at the first; results beyond that are of earlier calls.
+        results = zip(self._pairs, state.activeCollisionPairs, state.collisionResults, strict=True)
+        return next(pair for pair, active, one in results if active and one.isCollision())
+
+    def nearest(
+        self, joints_rad: Float64[np.ndarray, " 12"], touching: Collection[str] = ()
+    ) -> tuple[float, tuple[str, str]]:
+        """The least distance of any pair, mm (negative: how deep), and its names."""
+        import pinocchio as pin
+
+        state = self._state(tuple(sorted(touching)), False, None)
+        pin.updateGeometryPlacements(self._model, self._data, self._solids, state, joints_rad)
+        n = pin.computeDistances(self._solids, state)
+        return 1000 * state.distanceResults[n].min_distance, self._pairs[n]
+
+    def shapes(self, joints_rad: Float64[np.ndarray, " 12"]) -> tuple[Shape, ...]:
+        """Everything as surfaces in the table frame; the organ is not among them."""
+        import pinocchio as pin
+
+        from tumortrack.plan.arms.looks import Looks
+
+        if self._looks is None:
+            self._looks = Looks(cell_parts(self.config))
+        pin.framesForwardKinematics(self._model, self._data, joints_rad)
+        places = {}
+        for link in self._looks.links:
+            place = self._data.oMf[self._model.getFrameId(link)].homogeneous.copy()
+            place[:3, 3] *= 1000
+            places[link] = place
+        return self._looks.shapes(places)
+
+    def _state(self, touching: tuple[str, ...], clearance: bool, moving: str | None) -> Any:
+        """Collision buffers in which only the pairs that matter are active."""
+        key = (touching, clearance, moving)
+        if key not in self._states:
+            import pinocchio as pin
+
+            state, ends = pin.GeometryData(self._solids), {TOUCHES[arm] for arm in touching}
+            for n, pair in enumerate(self._pairs):
+                still = moving is not None and not any(moving in name for name in pair)
+                if still or (ORGAN in pair and ends & set(pair)):
+                    state.deactivateCollisionPair(n)
+                margin = (
+                    self.config.organ_clearance_mm if ORGAN in pair else self.config.clearance_mm
+                )
+                state.collisionRequests[n].security_margin = margin / 1000 if clearance else 0.0
+            self._states[key] = state
+        return self._states[key]
+
+
+def _name_solids(solids: Any, parts: tuple[Part, ...]) -> list[str]:
+    """Our names in pinocchio's order, which is that of each link's collision elements."""
+    by_link: dict[str, Iterator[str]] = {}
+    for link in {part.link for part in parts}:
+        by_link[link] = iter([_name(p) for p in parts if p.link == link and p.use != "picture"])
+    return [next(by_link[solid.name.rsplit("_", 1)[0]]) for solid in solids.geometryObjects]
+
+
+def _name(part: Part) -> str:
+    return part.name if part.link == TABLE else f"{part.link.split('_')[0]}/{part.name}"
+
+
+def _pairs() -> list[tuple[str, str]]:
+    """All that could ever meet. Links next to each other are left out, and of an arm with itself
+    what its joints' offsets keep apart."""
+    moving = {arm: [f"{arm}/{name}" for name in (*LINKS[2:], *TOOLS[arm])] for arm in ARMS}
+    pairs = list(product(moving[CUTTER], moving[HOLDER]))
+    for arm, other in (ARMS, ARMS[::-1]):
+        own = moving[arm]
+        still = [f"{arm}/{name}" for name in LINKS[:2]]
+        pairs += product(own, (f"{other}/base", f"{other}/shoulder"))
+        pairs += product(own, (TABLE, STAND, CAMERA))
+        pairs += product(own[1:], (ORGAN,))
+        pairs += product(own[1:], still)
+        pairs += product(own[2:], own[:1])  # the upper arm
+        pairs += product(own[4:], own[1:2])  # the forearm
+    return pairs
+
+
+def _bounding_volumes(organ: Mesh) -> Any:
+    """The organ's surface as coal's tree of boxes, metres."""
+    import coal
+
+    surface = coal.BVHModelOBBRSS()
+    surface.beginModel(len(organ.faces), len(organ.vertices_mm))
+    surface.addVertices(np.array(organ.vertices_mm / 1000))
+    surface.addTriangles(np.array(organ.faces, dtype=np.int64))
+    surface.endModel()
+    return surface

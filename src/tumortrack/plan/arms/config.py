@@ -1,0 +1,107 @@
+"""The cell as one value: two arms, their tools, table, stand and camera."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float64
+
+from tumortrack.core.config import Config
+from tumortrack.core.errors import InputError
+from tumortrack.core.geometry import rigid
+from tumortrack.plan.arms.dh import MODELS, ArmModel
+from tumortrack.plan.motions import CUTTER, JOINTS
+
+_DOWN = np.diag([1.0, -1.0, -1.0])  # a flange that points down, over a tip whose z is up
+
+
+class Base(Config, frozen=True, kw_only=True):
+    """Where an arm stands: its base's middle in the table frame, turned about the vertical."""
+
+    position_mm: tuple[float, float, float]
+    yaw_deg: float
+
+    @property
+    def table_from_base(self) -> Float64[np.ndarray, "4 4"]:
+        yaw = np.radians(self.yaw_deg)
+        turn = [[np.cos(yaw), -np.sin(yaw), 0], [np.sin(yaw), np.cos(yaw), 0], [0, 0, 1]]
+        return rigid(np.array(turn), np.array(self.position_mm))
+
+
+class CellConfig(Config, frozen=True, kw_only=True):
+    """What stands where; table frame, mm.
+
+    Attributes:
+        cutter_model, holder_model: which arm carries the instrument, which the vacuum grasper.
+        cutter_base, holder_base: where they stand.
+        bracket_mm, pencil_mm, electrode_mm: the instrument hangs this far below the flange; its
+            grip and its bare electrode (the usual long one) reach this far forward, level.
+        rod_mm, cup_mm, cup_radius_mm: the grasper hangs straight down from its flange; the last
+            ``cup_mm`` are a soft cup.
+        home_rad: all twelve joints in the order of ``JOINTS``.
+        table_mm: the table's size along x and y, its middle below the organ.
+        stand_mm: height of the organ's lowest point above the table; ``stand_radius_mm``: of the
+            post that carries it.
+        camera_mm: middle of the camera's box. By default it looks straight down from 150 mm, which
+            is between the arms; ``camera_is_obstacle`` False says that it is swung away (or looks
+            from the side) while they move.
+        clearance_mm: what arms keep from each other, from themselves and from all that stands;
+            ``organ_clearance_mm``: what of the tools keeps from the organ.
+        cutting_mm_s: the tip's greatest speed on a cut and in tissue; ``grasping_mm_s``: on the
+            straight way to the grasp and back.
+        speed_share: joints go no faster than this share of what the maker allows.
+    """
+
+    cutter_model: Literal["ur10e", "ur5"] = "ur10e"
+    holder_model: Literal["ur10e", "ur5"] = "ur5"
+    cutter_base: Base = Base(position_mm=(850.0, 0.0, 0.0), yaw_deg=0.0)
+    holder_base: Base = Base(position_mm=(-520.0, 0.0, 0.0), yaw_deg=180.0)
+    bracket_mm: float = 110.0
+    pencil_mm: float = 110.0
+    electrode_mm: float = 70.0
+    rod_mm: float = 200.0
+    cup_mm: float = 20.0
+    cup_radius_mm: float = 8.0
+    home_rad: tuple[float, ...] = (
+        *(-0.490, -2.175, 2.419, -1.815, -np.pi / 2, -2.061),
+        *(-0.416, -1.982, 1.376, -0.965, -np.pi / 2, -0.416),
+    )
+    table_mm: tuple[float, float] = (2000.0, 1000.0)
+    stand_mm: float = 120.0
+    stand_radius_mm: float = 20.0
+    camera_mm: tuple[float, float, float] = (0.0, 0.0, 320.0)
+    camera_is_obstacle: bool = False
+    clearance_mm: float = 8.0
+    organ_clearance_mm: float = 3.0
+    cutting_mm_s: float = 10.0
+    grasping_mm_s: float = 25.0
+    speed_share: float = 0.5
+
+    def __post_init__(self) -> None:
+        if len(self.home_rad) != len(JOINTS):
+            raise InputError(f"home has {len(self.home_rad)} joints; give {len(JOINTS)} angles.")
+        lengths = ("bracket_mm", "pencil_mm", "electrode_mm", "rod_mm", "cup_mm", "cup_radius_mm")
+        for name in (*lengths, "stand_mm", "stand_radius_mm", "cutting_mm_s", "grasping_mm_s"):
+            if not 0 < getattr(self, name) < 1000:
+                raise InputError(
+                    f"cell: {name} is {getattr(self, name):g}; allowed: over 0 to 1000."
+                )
+        if self.cup_mm >= self.rod_mm:
+            raise InputError("cell: the cup must be shorter than the rod that ends in it.")
+        if not 0 < self.speed_share <= 1:
+            raise InputError(f"cell: speed_share is {self.speed_share:g}; allowed: over 0 to 1.")
+
+    def model(self, arm: str) -> ArmModel:
+        """The type of arm that is ``cutter`` or ``holder``."""
+        return MODELS[self.cutter_model if arm == CUTTER else self.holder_model]
+
+    def base(self, arm: str) -> Base:
+        return self.cutter_base if arm == CUTTER else self.holder_base
+
+    def flange_from_tip(self, arm: str) -> Float64[np.ndarray, "4 4"]:
+        """The tip's frame: z up where the flange points down; the instrument points along x."""
+        if arm == CUTTER:
+            ahead_mm = self.pencil_mm + self.electrode_mm
+            return rigid(_DOWN, np.array([ahead_mm, 0.0, self.bracket_mm]))
+        return rigid(_DOWN, np.array([0.0, 0.0, self.rod_mm]))
