@@ -29,12 +29,14 @@ from tumortrack.track.live import Seen, Source
 from tumortrack.track.reader import Reader
 from tumortrack.track.ros import incoming
 from tumortrack.track.ros.bus import Bus, domain_id, open_bus
+from tumortrack.track.ros.cell import JOINTS, Cell
 from tumortrack.track.ros.dds_types import dds_name, idl_type, ros_name
 from tumortrack.track.ros.messages import Messages
 from tumortrack.track.ros.observed import messages_seen, plain_cloud
 from tumortrack.track.ros.outgoing import MARKERS, messages_of
 from tumortrack.track.sinks.ros2 import Ros2 as SinkRos2
 from tumortrack.track.sources.ros2 import Ros2 as SourceRos2
+from workcell_objects import with_arms, working
 
 pytest.importorskip("cyclonedds", reason="cyclonedds is not installed (tumortrack[live])")
 
@@ -63,13 +65,13 @@ def bus(messages: Messages) -> Iterator[Bus]:
 # --- types ---------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("kind", [incoming.CLOUD, incoming.CAMERA_INFO, MARKERS])
+@pytest.mark.parametrize("kind", [incoming.CLOUD, incoming.CAMERA_INFO, MARKERS, JOINTS])
 def test_types_agree_with_a_second_encoder(kind: str, messages: Messages) -> None:
     """cyclonedds' own (slow) coding of our type gives the bytes that rosbags gives."""
     seen = Seen(small_frame(), 0)
     cloud = Seen(SensorCloud(points_mm()[:7], 12_000_000_034), 0)
     made = [*messages_seen(seen, messages), *messages_seen(cloud, messages)]
-    made += messages_of(small_update(), messages, PARTS)
+    made += messages_of(working(), messages, PARTS, True, Cell(messages, 0))
     message = next(one.message for one in made if one.message_type == kind)
     cdr = bytes(messages.to_bytes(message))
     type_ = idl_type(kind, "humble")
@@ -185,15 +187,56 @@ def test_the_loop_counts_ages_from_the_stamp_once_a_frame_came() -> None:
         reader.close()
 
 
-def test_the_view_for_rviz_shows_what_is_published(messages: Messages) -> None:
-    """Topics, frame and reliability of docs/ros/tumortrack.rviz are the sink's."""
-    view = (HERE.parent / "docs" / "ros" / "tumortrack.rviz").read_text(encoding="utf-8")
-    published = {f"/tumortrack/{one.suffix}" for one in messages_of(empty_update(), messages)}
-    shown = set(re.findall(r"Value: (/\S+)", view))
-    assert {"/tumortrack/cloud", "/tumortrack/meshes"} == shown
-    assert shown < published
-    assert "Fixed Frame: camera" in view
-    assert "Transient Local" not in view  # that would not hear a volatile publisher
+@pytest.mark.parametrize(
+    ("name", "frame", "topics"),
+    [
+        ("tumortrack.rviz", "camera", ["cloud", "meshes"]),
+        ("resection.rviz", "table", ["cloud", "meshes", "observed", "workcell"]),
+    ],
+)
+def test_the_view_for_rviz_shows_what_is_published(
+    name: str, frame: str, topics: list[str], messages: Messages
+) -> None:
+    """Topics, frame and reliability of docs/ros/*.rviz are the sink's."""
+    view = (HERE.parent / "docs" / "ros" / name).read_text(encoding="utf-8")
+    cell = Cell(messages, 0)
+    sent = {
+        f"/tumortrack/{one.suffix}" for one in messages_of(empty_update(), messages, (), cell=cell)
+    }
+    shown = set(re.findall(r"Value: (/tumortrack\S+)", view))
+    assert sorted(shown) == [f"/tumortrack/{topic}" for topic in topics]
+    assert shown < sent
+    assert f"Fixed Frame: {frame}" in view
+    # A subscriber that wants what was published before does not hear a volatile publisher.
+    assert re.findall(r"Transient Local\n.*\n.*\n +Value: (\S+)", view) == (
+        ["/robot_description"] if name == "resection.rviz" else []
+    )
+
+
+def test_arms_travel_over_dds(bus: Bus, messages: Messages) -> None:
+    kinds = {"joint_states": JOINTS, "workcell": MARKERS}
+    heard = {name: bus.subscriber(f"/arms/{name}", kind) for name, kind in kinds.items()}
+    sink = SinkRos2(namespace="/arms", mesh_hz=0, via="dds").open(with_arms())
+    came: dict = {}
+    for n in range(200):
+        update = working(n, 0.25)
+        sink.publish(update)
+        bus.wait(0.05)
+        came |= {
+            name: messages.from_bytes(raw, kinds[name])
+            for name, one in heard.items()
+            for raw in one.take()
+        }
+        if len(came) == 2:
+            break
+    sink.close()
+    assert update.workcell is not None
+    joints = came["joint_states"]
+    assert dict(zip(joints.name, joints.position, strict=True)) == update.workcell.joints_rad
+    markers = {marker.ns: marker for marker in came["workcell"].markers}
+    for shape in update.workcell.shapes:
+        assert len(markers[shape.name].points) == shape.mesh.faces.size
+    assert markers["state"].text == "sweep 1"
 
 
 def test_other_types_are_refused(bus: Bus, messages: Messages) -> None:

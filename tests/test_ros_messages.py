@@ -29,11 +29,13 @@ from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import rigid
 from tumortrack.core.types import SensorCloud
 from tumortrack.track.live import Frames, Seen
+from tumortrack.track.ros.cell import Cell
 from tumortrack.track.ros.incoming import CAMERA_INFO, CLOUD, IMAGE, cloud_of, depth_of, mask_of
 from tumortrack.track.ros.markers import MARKERS, Rate
 from tumortrack.track.ros.messages import Messages, stamp_of
 from tumortrack.track.ros.observed import messages_seen
 from tumortrack.track.ros.outgoing import messages_of
+from workcell_objects import workcell
 
 HUMBLE, NOETIC = Messages("humble"), Messages("noetic")
 STOCK = {HUMBLE: get_typestore(Stores.ROS2_HUMBLE), NOETIC: get_typestore(Stores.ROS1_NOETIC)}
@@ -423,6 +425,8 @@ for line in Path(sys.argv[1], "list").read_text().splitlines():
     if short == "MarkerArray":
         entry["corners"] = {m.ns: [(p.x, p.y, p.z) for p in m.points] for m in message.markers}
         entry["stamp"] = message.markers[0].header.stamp.to_nsec()
+    if short == "JointState":
+        entry["joints"] = dict(zip(message.name, message.position))
     if short == "DiagnosticArray":
         entry["said"] = {v.key: v.value for v in message.status[0].values}
 print(json.dumps(said))
@@ -455,8 +459,8 @@ def run_ros(script: str, folder: Path) -> str:
 
 
 def test_ros_s_own_classes_read_what_is_sent(tmp_path):
-    update, lines = small_update(frames=TURNED), []
-    for out in messages_of(update, NOETIC, PARTS):
+    update, lines = replace(small_update(frames=TURNED), workcell=workcell(0.3)), []
+    for out in messages_of(update, NOETIC, PARTS, True, Cell(NOETIC, 0)):
         name = out.suffix.replace("/", "_")
         (tmp_path / name).write_bytes(NOETIC.to_bytes(out.message))
         lines.append(f"{name} {out.message_type} {NOETIC.md5(out.message_type)}")
@@ -465,7 +469,7 @@ def test_ros_s_own_classes_read_what_is_sent(tmp_path):
         lines.append(f"seen_{n} {out.message_type} {NOETIC.md5(out.message_type)}")
     (tmp_path / "list").write_text("\n".join(lines))
     said = json.loads(run_ros(RECEIVER, tmp_path))
-    assert len(said) == len(lines) == 8
+    assert len(said) == len(lines) == 11
     assert all(entry["same"] and entry["md5"] for entry in said.values())
     placed, points = update.placed, np.array(said["cloud"]["points"])
     np.testing.assert_allclose(points[:, :3] * 1000, placed.points_mm, atol=1e-4)
@@ -476,6 +480,9 @@ def test_ros_s_own_classes_read_what_is_sent(tmp_path):
     corners_mm = np.array(said["meshes"]["corners"]["kidney"]) * 1000
     np.testing.assert_allclose(corners_mm, kidney.vertices_mm[kidney.faces.ravel()])
     assert said["diagnostics"]["said"]["quality"] == "good"
+    assert said["joint_states"]["joints"] == workcell(0.3).joints_rad
+    cuts = {line.name: line.points_mm for line in workcell(0.3).lines}
+    np.testing.assert_allclose(np.array(said["workcell"]["corners"]["cut/2"]) * 1000, cuts["cut/2"])
 
 
 def test_what_ros_s_own_classes_send_is_read(tmp_path):
