@@ -47,6 +47,7 @@ _APPROACH_MM, _CUP_MM = 24.0, 5.0
 _ORGAN_OPACITY, _PIECE_OPACITY = 0.36, 0.3
 _BADGE_MM = 4.4  # numbers closer than this would cover each other
 _ARROW_EVERY_MM, _HEAD_MM = 45.0, 2.6
+_MOST_ARROWED = 8  # sweeps with arrows
 
 
 def draw_plan(plan: ResectionPlan, located: Located, path: Path) -> None:
@@ -146,6 +147,8 @@ def _draw_cuts(
     lies behind a tumor is faint."""
     from matplotlib.patheffects import Normal, Stroke
 
+    every = -(-plan.sweeps // _MOST_ARROWED)
+    every += 1 - every % 2  # odd: strokes go to and fro, and that is to be seen
     for cut, inside, behind in reversed(list(zip(plan.cuts, in_organ, hidden, strict=True))):
         flat = view.project(cut.path_mm)
         colour = _unit(sweep_colour(cut.sweep, plan.sweeps))
@@ -157,7 +160,7 @@ def _draw_cuts(
         axes.plot(*faint.T, color=colour, linewidth=0.8 * width, alpha=0.4, zorder=5)
         bold = np.where((inside & ~behind)[:, None], flat[:, :2], np.nan)
         axes.plot(*bold.T, color=colour, linewidth=width, path_effects=casing, zorder=6)
-        if cut.kind == "wall":
+        if cut.kind == "wall" and (plan.sweeps - cut.sweep) % every == 0:
             _draw_arrows(axes, flat, colour)
 
 
