@@ -29,7 +29,8 @@ if TYPE_CHECKING:
 
 _FPS = 30.0  # of an execution that no camera drives
 _NOTHING = "virtual execution of a stored plan: nothing is tracked"
-_FILM_FPS = 10
+_FILM_FPS, _FILM_FRAMES = 10, 120
+_FILM_STEP_S = 0.1
 
 
 @dataclass(frozen=True)
@@ -196,33 +197,36 @@ def _tell_end(operation: Operation) -> None:
 
 def _film(stored: PlanFolder, cell: Cell, path: Path) -> None:
     """An animated GIF of about twelve seconds."""
-    from tumortrack.evaluate.film import film
+    from tumortrack.evaluate.film import film, moments_s
     from tumortrack.plan.files import as_located
 
-    seconds = stored.motions.seconds if stored.motions is not None else 0.0
-    n = 120
-    with progress_bar("drawing", 2 * n) as advance:
-        done = 0
-
-        def progress(now: int, _: int) -> None:
-            nonlocal done
-            for _step in range(now - done):
-                advance()
-            done = now
-
-        film(_frames(stored, cell, seconds / n), as_located(stored), path, _FILM_FPS,
-             progress=progress)  # fmt: skip
-    say(f"written to {path}: {seconds:.0f} s in {n / _FILM_FPS:.0f}.")
+    assert stored.motions is not None
+    times_s = moments_s(stored.motions, _FILM_FRAMES)
+    with progress_bar("drawing", len(times_s)) as advance:
+        film(
+            _frames(stored, cell, times_s),
+            as_located(stored),
+            path,
+            _FILM_FPS,
+            progress=lambda *_: advance(),
+        )
+    n = len(times_s) / _FILM_FPS
+    say(f"written to {path}: {stored.motions.seconds:.0f} s in {n:.0f}.")
 
 
-def _frames(stored: PlanFolder, cell: Cell, step_s: float) -> Iterator[Workcell]:
+def _frames(
+    stored: PlanFolder, cell: Cell, times_s: Float64[np.ndarray, " n"]
+) -> Iterator[Workcell]:
+    """What is seen at these times; told of the time less often, the arms would halt."""
     from tumortrack.plan.operation import OperationConfig
     from tumortrack.track.live import Update
 
     operation = _operation(stored, cell, OperationConfig())
     now_s = 0.0
-    while not operation.ended:
+    for time_s in times_s.tolist():
         frame = operation.act(Update(0, 0, reason=_NOTHING), now_s)
+        while now_s < time_s:
+            now_s = min(now_s + _FILM_STEP_S, time_s)
+            frame = operation.act(Update(0, 0, reason=_NOTHING), now_s)
         assert frame.workcell is not None
         yield frame.workcell
-        now_s += step_s

@@ -24,10 +24,9 @@ from tumortrack.plan.values import Located, ResectionPlan
 from tumortrack.track.live import Line, Shape, Update, Workcell
 
 Colour = tuple[int, int, int]
-TO_CUT: Colour = (255, 200, 40)
+TO_CUT: Colour = (0, 120, 240)
 NOW: Colour = (255, 90, 30)
 CUT: Colour = (120, 40, 40)
-PIECE: Colour = (255, 220, 120)
 _BLIND_S = 0.2  # without an update for longer, the arms halt by themselves
 
 

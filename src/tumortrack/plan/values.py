@@ -102,7 +102,8 @@ class ResectionPlan:
         layers: what the cuts enclose, top first: the wall is each layer's outline, and where a
             layer is wider than the one below it, or has none below, the tissue is cut level.
         margin_mm: the least distance that was asked for between tumor and cut.
-        volumes_ml: tumor, piece (all that comes away), healthy (of that, no tumor), organ.
+        volumes_ml: organ, parenchyma (of that, no tumor), tumor, piece (all that comes away), healthy
+            (of that, parenchyma).
         exophytic: share of the tumor outside the organ's hull.
         notes: what the user should know.
     """
