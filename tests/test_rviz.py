@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
+import subprocess
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -11,10 +12,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from browser import until
 from live_objects import STAMP_NS, empty_update, small_setting
-from ros1_objects import eventually, ros1_graph
+from ros1_objects import end, eventually, ros1_graph
 from ros1_rviz import Screen, rviz
-from stories import looking_down, write_phantom_case
+from stories import COMMAND, environment, looking_down, write_phantom_case
 from tumortrack.core.geometry import rigid, transform_points
 from tumortrack.core.types import OccupancyCloud
 from tumortrack.track.estimate import Estimate
@@ -145,3 +147,32 @@ def test_rviz_shows_arms_at_work_and_nothing_of_them_when_nothing_is_known(tmp_p
         assert left["cut"].sum() < 20
         assert left["tumor"].sum() > 60
     sink.close()
+
+
+PICTURES, DEMO, PLAN = (
+    os.environ.get(f"TUMORTRACK_{name}") for name in ("PICTURES", "DEMO", "PLAN")
+)
+
+
+@pytest.mark.skipif(not (PICTURES and DEMO and PLAN), reason="TUMORTRACK_PLAN and more not set")
+def test_picture_of_a_resection_for_the_documentation(tmp_path):
+    """TUMORTRACK_PICTURES: where it goes; TUMORTRACK_DEMO: what ``tumortrack demo`` left;
+    TUMORTRACK_PLAN: what ``tumortrack plan`` made of its phantom. The command itself, live."""
+    ros1_graph()
+    demo = Path(str(DEMO)).resolve()
+    source = f"virtual:{demo / 'case'}?instrument=false&breathing=false&camera_motion=false"
+    command = [*COMMAND, "resect", Path(str(PLAN)).resolve(), "ros1:/tumortrack?mesh_hz=5"]
+    command += ["--live", demo / "model", source, "--speed", "2"]
+    with rviz(tmp_path, "resection_ros1.rviz") as screen:
+        with (tmp_path / "said.txt").open("w") as said:
+            process = subprocess.Popen(
+                list(map(str, command)), env=environment(), cwd=tmp_path, stdout=said, stderr=said
+            )
+        try:
+            said_so = tmp_path / "said.txt"
+            until(lambda: "sweep 2" in said_so.read_text() or process.poll(), 200, "sweep 2")
+            assert process.poll() is None, said_so.read_text()
+            time.sleep(3)
+            shutil.copy(screen.picture(), Path(str(PICTURES)) / "rviz_resection.png")
+        finally:
+            end(process)

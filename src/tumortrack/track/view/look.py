@@ -19,6 +19,7 @@ _FIRST_LOOK_MM = 130.0
 _FOV_RADIANS = 0.9
 # Onto a workcell: from before it, somewhat from the left and from above; its frame's z is up.
 _OVERVIEW_FROM, _UP = np.array([-0.45, -1.0, 0.6]), np.array([0.0, 0.0, 1.0])
+_ROOM = 0.85  # a cell is wide and flat: its box fits into less than its sphere
 _NEAR_MM, _FAR_MM = 0.5, 20_000.0  # viser draws its background 1 before the eye
 # In the camera's frame: one above the camera and left of it, a weaker one from behind the organ.
 _LIGHTS = (("/light", 2.6, (-60.0, -120.0, -130.0)), ("/light_behind", 1.5, (60.0, -120.0, 130.0)))
@@ -92,7 +93,7 @@ class Look:
         middle_mm = box_mm.mean(0)
         radius_mm = float(np.linalg.norm(np.ptp(box_mm, axis=0))) / 2
         away = _OVERVIEW_FROM / np.linalg.norm(_OVERVIEW_FROM)
-        return middle_mm + radius_mm / np.tan(_FOV_RADIANS / 2) * away, middle_mm, _UP
+        return middle_mm + _ROOM * radius_mm / np.tan(_FOV_RADIANS / 2) * away, middle_mm, _UP
 
     def last_drawn(self, surface: Mesh) -> Mesh:
         """The same triangles, and two idle vertices that put the middle of all into the eye of
