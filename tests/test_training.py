@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 import torch
 
-from stories import COMMAND, environment, refusal, succeeded, tumortrack, write_phantom_case
+from stories import COMMAND, STEPS, environment, refusal, succeeded, train_command, tumortrack
 from tumortrack.app.presets import clinic, paper, quick
 from tumortrack.core.config import from_builtins, to_builtins
 from tumortrack.core.errors import ArtifactError, InputError
@@ -27,43 +27,22 @@ from tumortrack.learn.config import TrainConfig
 from tumortrack.learn.cores import available_cores
 from tumortrack.learn.model import load_model
 from tumortrack.learn.network import CloudBox
+from tumortrack.learn.pace import use_cores
 from tumortrack.learn.schedule import learning_rate, settle_end
 from tumortrack.learn.state import Diverged, TrainingState
 from tumortrack.learn.train import Run, train
 from tumortrack.learn.work import work_folder
 
-STEPS = {"clinic": 12, "quick": 60}
 
-
-@pytest.fixture(scope="module")
-def case(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("training") / "case"
-    write_phantom_case(folder)
-    return folder
-
-
-@pytest.fixture(scope="module")
-def uninterrupted(case: Path) -> Path:
-    """A model folder of the preset quick."""
-    return trained(case, "quick")
-
-
-def trained(case: Path, preset: str) -> Path:
-    model = case.parent / f"uninterrupted_{preset}"
-    if not model.exists():
-        succeeded(tumortrack(*train_command(case, model, preset)))
-    return model
-
-
-def train_command(case: Path, model: Path, preset: str = "quick") -> list[object]:
-    options = ["--preset", preset, "--steps", STEPS[preset], "--workers", 1, "--device", "cpu"]
-    return ["train", case, model, *options]
+@pytest.fixture
+def case(phantom_case: Path) -> Path:
+    return phantom_case
 
 
 @pytest.mark.parametrize("preset", ["quick", "clinic"])
-def test_a_killed_run_ends_with_the_weights_of_one_that_was_not(case, preset):
+def test_a_killed_run_ends_with_the_weights_of_one_that_was_not(case, preset, tmp_path, request):
     """Killed at once when its first checkpoint is there, long before its end."""
-    model = case.parent / f"killed_{preset}"
+    model = tmp_path / "killed"
     command = [*train_command(case, model, preset), "--checkpoint-every", 0]
     with subprocess.Popen(
         [*COMMAND, *map(str, command)], stdout=subprocess.DEVNULL, env=environment()
@@ -78,12 +57,13 @@ def test_a_killed_run_ends_with_the_weights_of_one_that_was_not(case, preset):
     assert "has not ended" in refusal(tumortrack("locate", model, "cloud.ply", model / "out"))
     succeeded(tumortrack(*train_command(case, model, preset)))
     weights = (model / "weights.safetensors").read_bytes()
-    assert weights == (trained(case, preset) / "weights.safetensors").read_bytes()
+    uninterrupted: Path = request.getfixturevalue(f"{preset}_model")
+    assert weights == (uninterrupted / "weights.safetensors").read_bytes()
     assert (model / "shape.safetensors").exists() == (preset == "clinic")
 
 
-def test_ctrl_c_keeps_the_state_and_says_how_to_go_on(case):
-    model = case.parent / "stopped"
+def test_ctrl_c_keeps_the_state_and_says_how_to_go_on(case, tmp_path):
+    model = tmp_path / "stopped"
     options = ["--preset", "quick", "--steps", "100000"]
     command = [*COMMAND, "train", str(case), str(model), *options, "--workers", "1"]
     with subprocess.Popen(
@@ -101,29 +81,29 @@ def test_ctrl_c_keeps_the_state_and_says_how_to_go_on(case):
     assert "another case, preset, seed or option" in message
 
 
-def test_the_model_says_what_it_was_made_from(case, uninterrupted):
-    about = load_model(uninterrupted).provenance
+def test_the_model_says_what_it_was_made_from(case, quick_model):
+    about = load_model(quick_model).provenance
     assert about["steps"] == STEPS["quick"]
     assert about["seed"] == 0
-    lines = (uninterrupted / "training" / "history.jsonl").read_text().splitlines()
+    lines = (quick_model / "training" / "history.jsonl").read_text().splitlines()
     last = json.loads(lines[-1])
     assert last["step"] == STEPS["quick"]
     assert last["samples_per_s"] > 1
     assert 0 < last["learning_rate"] < 1e-3  # the schedule has nearly ended
-    assert list((uninterrupted / "training" / "tensorboard").iterdir())
-    again = tumortrack(*train_command(case, uninterrupted))
+    assert list((quick_model / "training" / "tensorboard").iterdir())
+    again = tumortrack(*train_command(case, quick_model))
     assert "trained already" in succeeded(again)
-    more = [*train_command(case, uninterrupted), "--seed", 1]
+    more = [*train_command(case, quick_model), "--seed", 1]
     assert "another case, preset, seed or option" in refusal(tumortrack(*more))
-    other = ["train", case, uninterrupted, "--steps", STEPS["quick"]]  # the default is clinic
+    other = ["train", case, quick_model, "--steps", STEPS["quick"]]  # the default is clinic
     assert "another case, preset, seed or option" in refusal(tumortrack(*other))
 
 
-def test_a_changed_weights_file_or_schema_is_refused(uninterrupted, tmp_path):
+def test_a_changed_weights_file_or_schema_is_refused(quick_model, tmp_path):
     import shutil
 
     model = tmp_path / "model"
-    shutil.copytree(uninterrupted, model)
+    shutil.copytree(quick_model, model)
     manifest = json.loads((model / "manifest.json").read_text())
     (model / "manifest.json").write_text(json.dumps({**manifest, "schema": 999}))
     with pytest.raises(ArtifactError, match="schema 999"):
@@ -136,8 +116,8 @@ def test_a_changed_weights_file_or_schema_is_refused(uninterrupted, tmp_path):
         load_model(model)
 
 
-def test_a_full_disk_stops_training_and_spares_the_last_checkpoint(case):
-    model = case.parent / "full"
+def test_a_full_disk_stops_training_and_spares_the_last_checkpoint(case, tmp_path):
+    model = tmp_path / "full"
 
     def small_disk() -> None:  # the checkpoint is larger than this, everything before is smaller
         resource.setrlimit(resource.RLIMIT_FSIZE, (1_000_000, 1_000_000))
@@ -289,6 +269,22 @@ def test_a_containers_quota_of_cores_counts(tmp_path, monkeypatch, files, cores)
     monkeypatch.delattr(os, "sched_getaffinity")  # as on macOS
     monkeypatch.setattr(os, "cpu_count", lambda: 3)
     assert available_cores(tmp_path) == (cores or 3)
+
+
+@pytest.mark.parametrize(
+    ("granted", "workers", "threads"), [("", 1, 5), ("2", 1, 2), ("2", 5, 1), ("9", 0, 6)]
+)
+def test_the_network_gets_the_cores_that_workers_and_openmp_leave(
+    monkeypatch, granted, workers, threads
+):
+    before = torch.get_num_threads()
+    monkeypatch.setenv("OMP_NUM_THREADS", granted)
+    monkeypatch.setattr("tumortrack.learn.pace.available_cores", lambda: 6)
+    use_cores(torch.device("cpu"), workers)
+    try:
+        assert torch.get_num_threads() == threads
+    finally:
+        torch.set_num_threads(before)
 
 
 def test_a_case_is_needed_to_train(tmp_path):
