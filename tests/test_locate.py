@@ -11,14 +11,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from stories import (
-    cloud_by_rays,
-    looking_down,
-    refusal,
-    succeeded,
-    tumortrack,
-    write_phantom_case,
-)
+from stories import cloud_by_rays, looking_down, refusal, succeeded, tumortrack
 from tumortrack.app.scenes import check_case
 from tumortrack.core import store
 from tumortrack.core.errors import InputError, NoEstimate
@@ -34,9 +27,9 @@ STEPS = 700
 
 
 @pytest.fixture(scope="module")
-def work(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def work(tmp_path_factory: pytest.TempPathFactory, phantom_case: Path) -> Path:
     folder = tmp_path_factory.mktemp("locate")
-    write_phantom_case(folder / "case")
+    (folder / "case").symlink_to(phantom_case)
     options = ["--preset", "quick", "--steps", STEPS]
     succeeded(tumortrack("train", folder / "case", folder / "model", *options))
     return folder
