@@ -48,8 +48,8 @@ class Screen:
 
 
 @contextlib.contextmanager
-def rviz(folder: Path, configuration: str = "tumortrack_ros1.rviz") -> Iterator[Screen]:
-    """RViz with a shipped configuration. Skips where there is none."""
+def rviz(folder: Path, configuration: str | Path = "tumortrack_ros1.rviz") -> Iterator[Screen]:
+    """RViz with a configuration, by default a shipped one. Skips where there is no RViz."""
     for program in ("rviz", "Xvfb", "import"):
         if shutil.which(program) is None:
             pytest.skip(f"no {program} here: tools/debian.sh installs it")

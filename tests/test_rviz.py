@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import io
 import os
 import shutil
 import subprocess
 import time
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
+from ruamel.yaml import YAML
 
 from browser import until
 from live_objects import STAMP_NS, empty_update, small_setting
@@ -160,19 +164,37 @@ def test_picture_of_a_resection_for_the_documentation(tmp_path):
     TUMORTRACK_PLAN: what ``tumortrack plan`` made of its phantom. The command itself, live."""
     ros1_graph()
     demo = Path(str(DEMO)).resolve()
-    source = f"virtual:{demo / 'case'}?instrument=false&breathing=false&camera_motion=false"
+    source = f"virtual:{demo / 'case'}?seed=1&instrument=false&breathing=false&camera_motion=false"
     command = [*COMMAND, "resect", Path(str(PLAN)).resolve(), "ros1:/tumortrack?mesh_hz=5"]
     command += ["--live", demo / "model", source, "--speed", "2"]
-    with rviz(tmp_path, "resection_ros1.rviz") as screen:
-        with (tmp_path / "said.txt").open("w") as said:
-            process = subprocess.Popen(
-                list(map(str, command)), env=environment(), cwd=tmp_path, stdout=said, stderr=said
-            )
-        try:
-            said_so = tmp_path / "said.txt"
-            until(lambda: "sweep 2" in said_so.read_text() or process.poll(), 200, "sweep 2")
-            assert process.poll() is None, said_so.read_text()
-            time.sleep(3)
-            shutil.copy(screen.picture(), Path(str(PICTURES)) / "rviz_resection.png")
-        finally:
-            end(process)
+    views = Path(__file__).parents[1] / "docs" / "ros"
+    near = tmp_path / "near.rviz"
+    near.write_text(_near((views / "resection_ros1.rviz").read_text()))
+    with ExitStack() as stack:
+        screens = []
+        for view in (views / "resection_ros1.rviz", near):
+            folder = tmp_path / view.stem
+            folder.mkdir()
+            screens.append(stack.enter_context(rviz(folder, view)))
+        said = stack.enter_context((tmp_path / "said.txt").open("w"))
+        process = subprocess.Popen(
+            list(map(str, command)), env=environment(), cwd=tmp_path, stdout=said, stderr=said
+        )
+        stack.callback(end, process)
+        said_so = tmp_path / "said.txt"
+        until(lambda: "sweep 2" in said_so.read_text() or process.poll(), 200, "sweep 2")
+        assert process.poll() is None, said_so.read_text()
+        time.sleep(3)
+        shots = [screen.pixels()[63:690, 364:1164] for screen in screens]
+    both = np.hstack([shots[0], np.full((len(shots[0]), 8, 3), 255), shots[1][:, 150:650]])
+    Image.fromarray(both.astype(np.uint8)).save(Path(str(PICTURES)) / "rviz_resection.png")
+
+
+def _near(text: str) -> str:
+    """The configuration with its saved view in place of the first."""
+    yaml, out = YAML(), io.StringIO()
+    content = yaml.load(text)
+    views = content["Visualization Manager"]["Views"]
+    views["Current"] |= views["Saved"][0]
+    yaml.dump(content, out)
+    return out.getvalue()
