@@ -138,10 +138,11 @@ class Cell:
         return 1000 * state.distanceResults[n].min_distance, self._pairs[n]
 
     def shapes(self, joints_rad: Float64[np.ndarray, " 12"]) -> tuple[Shape, ...]:
-        """Everything as surfaces in the table frame; the organ is not among them."""
+        """Everything as surfaces in the table frame, and a bead at each tip (``cutter/tip``); the
+        organ is not among them."""
         import pinocchio as pin
 
-        from tumortrack.plan.arms.looks import Looks
+        from tumortrack.plan.arms.looks import Looks, tip
 
         if self._looks is None:
             self._looks = Looks(cell_parts(self.config))
@@ -151,7 +152,8 @@ class Cell:
             place = self._data.oMf[self._model.getFrameId(link)].homogeneous.copy()
             place[:3, 3] *= 1000
             places[link] = place
-        return self._looks.shapes(places)
+        tips = (tip(arm, place) for arm, place in self.tips(joints_rad).items())
+        return (*self._looks.shapes(places), *tips)
 
     def _state(self, touching: tuple[str, ...], clearance: bool, moving: str | None) -> Any:
         """Collision buffers in which only the pairs that matter are active."""

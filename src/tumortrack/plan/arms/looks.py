@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import cache
 
 import numpy as np
 from jaxtyping import Float64
 
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.types import Mesh
-from tumortrack.plan.arms.body import TABLE, Part
+from tumortrack.plan.arms.body import TABLE, YELLOW, Part
 from tumortrack.track.live import Shape
 
 _SIDES = 32
+_BEAD_MM = 1.5
 
 
 class Looks:
@@ -29,6 +31,19 @@ class Looks:
             Shape(_name(part), mesh, places[part.link], part.colour)
             for part, mesh in zip(self._parts, self._meshes, strict=True)
         )
+
+
+def tip(arm: str, table_from_tip: Float64[np.ndarray, "4 4"]) -> Shape:
+    """A bead where a tool ends, by the name that sinks know tips by: ``cutter/tip``."""
+    return Shape(f"{arm}/tip", _bead(), table_from_tip, YELLOW)
+
+
+@cache
+def _bead() -> Mesh:
+    import trimesh
+
+    ball = trimesh.creation.icosphere(1, _BEAD_MM)
+    return Mesh(np.array(ball.vertices), ball.faces)
 
 
 def _name(part: Part) -> str:
