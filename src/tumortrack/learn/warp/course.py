@@ -46,6 +46,7 @@ class WarpCourse:
         self.body = body
         self._shape = shape_of(run.anatomy_ct, body)
         self.points = _points(run)
+        self._last: tuple[bytes, list[tuple[WarpMotion, Refined]]] | None = None
 
     @cached_property
     def _scenes(self) -> ValidationScenes:
@@ -83,14 +84,18 @@ class WarpCourse:
         )
 
     def _fits(self, network: Network) -> list[tuple[WarpMotion, Refined]]:
-        """The likeliest start and the best fit in each validation scene."""
+        """The likeliest start and the best fit in each validation scene; of the same weights once,
+        since the last ones are mostly the best."""
         assert isinstance(network, WarpNetwork)
-        network.eval()
-        fits = []
-        for cloud in self._scenes.clouds_mm:
-            starts = first_motions(network, self._shape, cloud)
-            fits.append((starts[0], best_fit(self._shape, cloud, starts, self._run.config.refine)))
-        return fits
+        weights = b"".join(w.numpy(force=True).tobytes() for w in network.state_dict().values())
+        if self._last is None or self._last[0] != weights:
+            network.eval()
+            shape, config, fits = self._shape, self._run.config.refine, []
+            for cloud in self._scenes.clouds_mm:
+                starts = first_motions(network, shape, cloud)
+                fits.append((starts[0], best_fit(shape, cloud, starts, config)))
+            self._last = weights, fits
+        return self._last[1]
 
     def _repaired(self, fits: list[tuple[WarpMotion, Refined]], usual_cost: float) -> list[Refined]:
         """The fits as the model will make them, which knows the usual cost."""
