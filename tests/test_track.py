@@ -10,36 +10,37 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import pytest
 
-from stories import COMMAND, environment, refusal, succeeded, tumortrack, write_phantom_case
+from stories import COMMAND, environment, refusal, succeeded, tumortrack
 
 
-@pytest.fixture(scope="module")
-def world(tmp_path_factory):
-    """A case and a model of it, trained for seconds."""
-    folder = tmp_path_factory.mktemp("track")
-    write_phantom_case(folder / "case")
-    succeeded(tumortrack("train", folder / "case", folder / "model", "--steps", 80))
-    return folder
+class World(NamedTuple):
+    case: Path
+    model: Path
+
+
+@pytest.fixture
+def world(phantom_case, clinic_model):
+    return World(phantom_case, clinic_model)
 
 
 def start(world, *arguments):
     return subprocess.Popen(
-        [*COMMAND, "track", str(world / "model"), *map(str, arguments)],
+        [*COMMAND, "track", str(world.model), *map(str, arguments)],
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,
         env=environment(),
-        cwd=world,
     )
 
 
 def virtual(world, **options):
     text = "&".join(f"{key}={value}" for key, value in options.items())
-    return f"virtual:{world / 'case'}" + (f"?{text}" if text else "")
+    return f"virtual:{world.case}" + (f"?{text}" if text else "")
 
 
 def told(path):
@@ -49,7 +50,7 @@ def told(path):
 def test_a_moving_case_is_followed_and_the_report_says_how_well(world, tmp_path):
     report = tmp_path / "report.json"
     done = tumortrack(
-        "track", world / "model", virtual(world, fps=10), "--seconds", 8, "--report", report
+        "track", world.model, virtual(world, fps=10), "--seconds", 8, "--report", report
     )
     said = succeeded(done)
     assert "latency from stamp to published estimate: p50" in said
@@ -68,7 +69,7 @@ def test_a_recording_is_played_back_to_the_same_estimates(world, tmp_path):
     live, replay = tmp_path / "live", tmp_path / "replay"
     first = tumortrack(
         "track",
-        world / "model",
+        world.model,
         virtual(world, fps=10),
         f"recording:{live}?format=files",
         "--seconds",
@@ -81,7 +82,7 @@ def test_a_recording_is_played_back_to_the_same_estimates(world, tmp_path):
     assert len(frames) >= 10
     again = tumortrack(
         "track",
-        world / "model",
+        world.model,
         f"recording:{live}?rate=0",
         f"recording:{replay}?format=files",
         "--report",
@@ -123,7 +124,7 @@ def test_kill_9_leaves_a_recording_that_plays(world, tmp_path):
     process.communicate(timeout=30)
     again = tumortrack(
         "track",
-        world / "model",
+        world.model,
         f"recording:{folder}?rate=0",
         "--report",
         tmp_path / "again.json",
@@ -138,7 +139,7 @@ def test_minutes_of_tracking_leave_memory_as_it_was(world):
     sinks = ["openigtlink:0", "viewer:0"]
     options = ["--minutes", "1.6", "--fps", "15", "--error", "6", "--sinks", *sinks]
     done = subprocess.run(
-        [sys.executable, str(soak), str(world / "model"), str(world / "case"), *options],
+        [sys.executable, str(soak), str(world.model), str(world.case), *options],
         capture_output=True,
         text=True,
         env=environment(),
@@ -159,7 +160,7 @@ def test_a_robot_gets_its_own_frame(world, tmp_path):
     report = tmp_path / "report.json"
     done = tumortrack(
         "track",
-        world / "model",
+        world.model,
         virtual(world, fps=5),
         f"recording:{out}?format=files",
         "--frame",
@@ -190,11 +191,9 @@ def test_a_report_that_cannot_be_written_ends_nothing(world, tmp_path):
     assert "estimates" in said
 
 
-def test_smoothing_needs_a_model_with_a_motion(world, tmp_path):
-    done = tumortrack("train", world / "case", world / "quick", "--preset", "quick", "--steps", 2)
-    succeeded(done)
+def test_smoothing_needs_a_model_with_a_motion(world, quick_model, tmp_path):
     done = tumortrack(
-        *("track", world / "quick", virtual(world), "--smoothing", "0.2"),
+        *("track", quick_model, virtual(world), "--smoothing", "0.2"),
         *("--report", tmp_path / "r.json"),
     )
     assert "needs a motion" in refusal(done)
@@ -203,7 +202,7 @@ def test_smoothing_needs_a_model_with_a_motion(world, tmp_path):
 def test_a_source_that_vanishes_ends_with_a_reason(world, tmp_path):
     done = tumortrack(
         "track",
-        world / "model",
+        world.model,
         f"recording:{tmp_path / 'nothing'}",
         "--give-up",
         1,
@@ -229,7 +228,7 @@ def test_a_source_that_vanishes_ends_with_a_reason(world, tmp_path):
 )
 def test_bad_options_are_answered_in_one_line(world, tmp_path, arguments, said):
     given = [virtual(world) if a == "virtual:CASE" else a for a in arguments]
-    done = tumortrack("track", world / "model", *given, "--report", tmp_path / "r.json")
+    done = tumortrack("track", world.model, *given, "--report", tmp_path / "r.json")
     assert said in refusal(done)
 
 
@@ -240,7 +239,7 @@ def test_a_port_that_is_taken_is_refused(world, tmp_path):
         port = other.getsockname()[1]
         done = tumortrack(
             "track",
-            world / "model",
+            world.model,
             virtual(world),
             f"openigtlink:{port}",
             "--report",
