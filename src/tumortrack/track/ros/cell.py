@@ -3,6 +3,7 @@ line of the diagnostics. Metres and radians, in the published frame."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -28,7 +29,7 @@ from tumortrack.track.ros.messages import Messages, PointBlock
 from tumortrack.track.ros.observed import MM_PER_M, Outgoing, plain_cloud
 from tumortrack.track.view.colours import NONE, Colour
 from tumortrack.track.view.points import MOST_SEEN, seen_points, thinned
-from tumortrack.track.view.workcell import box_of
+from tumortrack.track.view.workcell import box_of, wxyz_of
 
 JOINTS = "sensor_msgs/msg/JointState"
 STATE = "state"  # the text's namespace
@@ -125,7 +126,7 @@ class Cell:
             return None
         return [
             *(marker(messages, header, ns=name, action=DELETE) for name in sorted(gone)),
-            *(_surface(shape, header, messages) for shape in shapes),
+            *_surfaces(shapes, header, messages),
             *(_strip(line, header, messages) for line in lines),
             _text(update, cell, header, messages),
         ]
@@ -143,20 +144,23 @@ def words(cell: Workcell) -> str:
     return f"{cell.state}, halted: {cell.halted}" if cell.halted else cell.state
 
 
-def _surface(shape: Shape, header: Any, messages: Messages) -> Any:
-    way = shape.published_from_shape
-    corners_m = shape.mesh.vertices_mm[shape.mesh.faces.ravel()] / MM_PER_M
-    return marker(
-        messages,
-        header,
-        ns=shape.name,
-        type=TRIANGLES,
-        action=ADD,
-        pose=pose(messages, way[:3, 3] / MM_PER_M, way[:3, :3]),
-        scale=messages.make("geometry_msgs/msg/Vector3", x=1.0, y=1.0, z=1.0),
-        color=colour(messages, shape.colour, shape.opacity),
-        points=PointBlock(corners_m),
-    )
+def _surfaces(shapes: tuple[Shape, ...], header: Any, messages: Messages) -> Iterator[Any]:
+    ways = np.array([shape.published_from_shape for shape in shapes]).reshape(-1, 4, 4)
+    turns = wxyz_of(ways[:, :3, :3]) if shapes else ()
+    scale = messages.make("geometry_msgs/msg/Vector3", x=1.0, y=1.0, z=1.0)
+    for shape, way, wxyz in zip(shapes, ways, turns, strict=True):
+        corners_m = shape.mesh.vertices_mm[shape.mesh.faces.ravel()] / MM_PER_M
+        yield marker(
+            messages,
+            header,
+            ns=shape.name,
+            type=TRIANGLES,
+            action=ADD,
+            pose=pose(messages, way[:3, 3] / MM_PER_M, wxyz),
+            scale=scale,
+            color=colour(messages, shape.colour, shape.opacity),
+            points=PointBlock(corners_m),
+        )
 
 
 def _strip(line: Line, header: Any, messages: Messages) -> Any:

@@ -47,15 +47,10 @@ def marker(messages: Messages, header: Any, **values: Any) -> Any:
 def pose(
     messages: Messages,
     position_m: Float[np.ndarray, " 3"],
-    rotation: Float[np.ndarray, "3 3"] | None = None,
+    wxyz: Float[np.ndarray, " 4"] | None = None,
 ) -> Any:
-    """A Pose; not turned, where no ``rotation`` is given."""
-    turn = {"w": 1.0}
-    if rotation is not None:
-        from scipy.spatial.transform import Rotation
-
-        quaternion = Rotation.from_matrix(rotation).as_quat()
-        turn = {axis: float(value) for axis, value in zip("xyzw", quaternion, strict=True)}
+    """A Pose; not turned, where no quaternion is given."""
+    turn = {"w": 1.0} if wxyz is None else dict(zip("wxyz", wxyz.tolist(), strict=True))
     return messages.make(
         "geometry_msgs/msg/Pose",
         position=point(messages, position_m),
