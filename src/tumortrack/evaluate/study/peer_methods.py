@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import ast
 import hashlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from importlib.metadata import version
@@ -84,11 +84,15 @@ class PeerMethod(Method):
 
 @cache
 def peers_code_sha256() -> str:
-    """Of all peers' code without comments and docstrings: after a change of what peers do, they
-    are measured anew; after a change of words they are not."""
-    folder = Path(__file__).parent.parent / "peers"
+    """Of all peers' code."""
+    return code_sha256(sorted((Path(__file__).parent.parent / "peers").glob("*.py")))
+
+
+def code_sha256(paths: Iterable[Path]) -> str:
+    """Of files of code without comments and docstrings: after a change of what they do, it is
+    measured anew; after a change of words it is not."""
     digest = hashlib.sha256()
-    for path in sorted(folder.glob("*.py")):
+    for path in paths:
         tree = ast.parse(path.read_text(encoding="utf-8"))
         for node in ast.walk(tree):
             if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef) and ast.get_docstring(

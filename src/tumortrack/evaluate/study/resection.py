@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import ast
-import hashlib
 from dataclasses import asdict, dataclass, replace
 from functools import cache, cached_property
 from pathlib import Path
@@ -22,6 +20,7 @@ from tumortrack.evaluate.study.cells import provenance
 from tumortrack.evaluate.study.measure import Job, StudyCase
 from tumortrack.evaluate.study.methods import Answer, Method
 from tumortrack.evaluate.study.paper import tumor_lies
+from tumortrack.evaluate.study.peer_methods import code_sha256
 from tumortrack.plan.config import ResectionConfig
 from tumortrack.plan.located import located
 from tumortrack.plan.resection import plan_resection
@@ -199,11 +198,8 @@ def exophytic_tumors(case: StudyCase) -> tuple[str, ...]:
 
 @cache
 def _code_sha256() -> str:
-    """Of what plans and cuts, without comments."""
+    """Of what plans and cuts."""
     package = Path(tumortrack.__file__).parent
     paths = [package / "plan" / f"{name}.py" for name in _PLANNING]
     paths += [package / "evaluate" / f"{name}.py" for name in ("resection", "severing")]
-    digest = hashlib.sha256()
-    for path in paths:
-        digest.update(ast.dump(ast.parse(path.read_text(encoding="utf-8"))).encode())
-    return digest.hexdigest()
+    return code_sha256(paths)

@@ -17,7 +17,7 @@ WHOLE = 0.999  # of a tumor: what is missing is a voxel's rounding
 _HEAD = (
     "located by", "planner", "plans", "piece comes free", "tumor whole in the piece",
     "tumor removed, %: median", "worst", "tumor left, ml: worst",
-    "margin kept, mm: median", "worst", "healthy tissue, ml: median",
+    "margin kept, mm: median", "worst", "healthy tissue, ml: mean",
 )  # fmt: skip
 _NOTHING = "–"
 _LEFT = 2
@@ -29,12 +29,14 @@ RULE = (
     "what stays, or falls off beside it, is left; a piece that still hangs by 2 mm² of tissue or "
     f"more has not come free, and nothing of it is removed. Whole: {100 * WHOLE:g} % or more. "
     "Margin kept: least distance from the cut's surface within tissue to the true tumor; negative: "
-    "so deep did the cut go into it. Numbers are of the plans that were made, tumors' shares "
-    f"rounded down. Truth: planned on the true organ, the bound. Margins are {MARGIN_MM:g} mm; "
-    f"“+ {SIGMAS:g} sd”: and {SIGMAS:g} standard deviations of the estimate more, at each place of "
-    "the tumor's surface, with the paper's planner, which has one margin, as many as the least "
-    "certain place needs. Left out: tissue does not move or give way while it is cut, nobody pulls "
-    "at the piece, and the instrument is as thin and as long as the cut needs."
+    "so deep did the cut go into it. Healthy tissue: with the pieces that came free. Numbers are "
+    "of the plans that were made, tumors' shares rounded down. Truth: planned on the true organ, "
+    f"the bound. Margins are {MARGIN_MM:g} mm; “+ {SIGMAS:g} sd”: and {SIGMAS:g} standard "
+    "deviations of the estimate more, at each place of the tumor's surface; with the paper's "
+    "planner, which has one margin, as many as the least certain place needs. Left out: tissue "
+    "does not move or give way while it is cut, nobody pulls at the piece, the instrument takes "
+    "no tissue with it, and it reaches all of a level sheet below the piece, of which the paper's "
+    "planner gives the outline alone."
 )
 
 
@@ -67,7 +69,7 @@ class Row:
             _of([entry["left_ml"] for entry in made], max, digits=2),
             _of(margins, np.median),
             _of(margins, min),
-            _of([entry["healthy_ml"] for entry in made], np.median),
+            _of([entry["healthy_ml"] for entry in made if entry["detached"]], np.mean),
         ]
 
 
