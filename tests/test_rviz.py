@@ -20,7 +20,7 @@ from browser import until
 from live_objects import STAMP_NS, empty_update, small_setting
 from ros1_objects import end, eventually, ros1_graph
 from ros1_rviz import Screen, rviz
-from stories import COMMAND, environment, looking_down, write_phantom_case
+from stories import environment, live_resection, looking_down, write_phantom_case
 from tumortrack.core.geometry import rigid, transform_points
 from tumortrack.core.types import OccupancyCloud
 from tumortrack.track.estimate import Estimate
@@ -163,10 +163,8 @@ def test_picture_of_a_resection_for_the_documentation(tmp_path):
     """TUMORTRACK_PICTURES: where it goes; TUMORTRACK_DEMO: what ``tumortrack demo`` left;
     TUMORTRACK_PLAN: what ``tumortrack plan`` made of its phantom. The command itself, live."""
     ros1_graph()
-    demo = Path(str(DEMO)).resolve()
-    source = f"virtual:{demo / 'case'}?seed=1&instrument=false&breathing=false&camera_motion=false"
-    command = [*COMMAND, "resect", Path(str(PLAN)).resolve(), "ros1:/tumortrack?mesh_hz=5"]
-    command += ["--live", demo / "model", source, "--speed", "2"]
+    demo, plan = (Path(str(one)).resolve() for one in (DEMO, PLAN))
+    command = live_resection(demo, plan, "ros1:/tumortrack?mesh_hz=5")
     views = Path(__file__).parents[1] / "docs" / "ros"
     near = tmp_path / "near.rviz"
     near.write_text(_near((views / "resection_ros1.rviz").read_text()))
@@ -178,7 +176,7 @@ def test_picture_of_a_resection_for_the_documentation(tmp_path):
             screens.append(stack.enter_context(rviz(folder, view)))
         said = stack.enter_context((tmp_path / "said.txt").open("w"))
         process = subprocess.Popen(
-            list(map(str, command)), env=environment(), cwd=tmp_path, stdout=said, stderr=said
+            command, env=environment(), cwd=tmp_path, stdout=said, stderr=said
         )
         stack.callback(end, process)
         said_so = tmp_path / "said.txt"

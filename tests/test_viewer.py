@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 
 from browser import Browser, until
 from live_objects import PARTS, ball, empty_update, small_anatomy, small_setting, small_update
-from stories import COMMAND, environment
+from stories import COMMAND, environment, live_resection
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import rigid, transform_points
 from tumortrack.core.store import new_folder
@@ -491,7 +491,8 @@ def check_click(browser: Browser, setting: Setting) -> None:
     until(lambda: setting.controls.picked_mm is None, 5, "forgetting")
 
 
-PICTURES, DEMO = (os.environ.get(f"TUMORTRACK_{name}") for name in ("PICTURES", "DEMO"))
+GIVEN = ("PICTURES", "DEMO", "PLAN")
+PICTURES, DEMO, PLAN = (os.environ.get(f"TUMORTRACK_{name}") for name in GIVEN)
 
 
 @pytest.mark.skipif(not (PICTURES and DEMO), reason="TUMORTRACK_PICTURES, TUMORTRACK_DEMO not set")
@@ -519,6 +520,28 @@ def test_pictures_for_the_documentation(tmp_path):
             process.send_signal(signal.SIGSTOP)
             time.sleep(4)
             save(browser, "viewer_stale.png")
+    finally:
+        process.kill()
+        process.wait()
+
+
+@pytest.mark.skipif(not (PICTURES and DEMO and PLAN), reason="TUMORTRACK_PLAN and more not set")
+def test_picture_of_a_resection_for_the_documentation(tmp_path):
+    """TUMORTRACK_PLAN: what ``tumortrack plan`` made of the demo's phantom."""
+    demo, plan = (Path(str(one)).resolve() for one in (DEMO, PLAN))
+    port = free_port()
+    command = live_resection(demo, plan, f"viewer:{port}")
+    process = subprocess.Popen(command, env=environment(), cwd=tmp_path)
+    try:
+        with Browser(1280, 800) as browser:
+            until(lambda: answers(port), 60, "the viewer")
+            browser.open(f"http://127.0.0.1:{port}")
+            until(lambda: "ARMS: sweep 2" in browser.text(), 200, "the second sweep")
+            close = "document.querySelector('.mantine-Notification-closeButton')?.click()"
+            browser.call("Runtime.evaluate", expression=close)
+            browser.click_text("organ")
+            time.sleep(3)
+            save(browser, "viewer_resection.png")
     finally:
         process.kill()
         process.wait()
