@@ -4,17 +4,21 @@ import numpy as np
 import pytest
 import shapely
 import shapely.affinity
+import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from plan_objects import HALF_MM, MIDDLE_MM, RADIUS_MM, TUMOR_MM, located, sphere
 from tumortrack.core.errors import InputError, NoPlan
+from tumortrack.core.solids import mesh_of, solid_of
+from tumortrack.core.types import Anatomy, Mesh
+from tumortrack.evaluate.resection import cut as cut_out
 from tumortrack.plan.config import ResectionConfig
 from tumortrack.plan.exophytic import exophytic_shares
 from tumortrack.plan.files import as_builtins, from_plain
 from tumortrack.plan.outline import arcs, concave_hull, evenly, grown, polygon_of
 from tumortrack.plan.resection import inside, plan_resection
-from tumortrack.plan.values import Layer
+from tumortrack.plan.values import Layer, Located
 
 PUBLISHED, OURS = ResectionConfig(method="published"), ResectionConfig()
 
@@ -302,3 +306,37 @@ def test_nonsense_is_refused():
         ResectionConfig(margin_mm=-1)
     with pytest.raises(InputError, match="layer from 5 up to 5"):
         Layer(5.0, 5.0, ())
+
+
+@pytest.mark.parametrize("off_mm", [-1.5, 0.0, 1.5])
+def test_the_piece_comes_free_of_an_organ_that_is_a_little_larger_than_was_estimated(off_mm):
+    plan = plan_resection(located(), OURS)
+    ball = sphere(MIDDLE_MM, HALF_MM + off_mm)
+    tumor = sphere(TUMOR_MM, RADIUS_MM)
+    done = cut_out(Anatomy((mesh_of(solid_of(ball, "o") + solid_of(tumor, "t")), tumor)), plan)
+    assert done.detached
+    assert done.removed_share == 1.0
+    assert done.margin_mm > 4.5
+
+
+def test_an_organ_that_reaches_into_the_next_layer_is_not_left_hanging_on_it():
+    """Estimated to end 1 mm above the lowest layer, it ends 0.7 mm within."""
+    tumor = sphere([10.0, -30.0, 135.0], RADIUS_MM)
+
+    def slab(bottom_mm):
+        box = trimesh.creation.box(bounds=[[-55, -30, bottom_mm], [55, 30, 150]])
+        box = box.subdivide_to_size(2.0)
+        return mesh_of(solid_of(Mesh(box.vertices, box.faces), "o") + solid_of(tumor, "t"))
+
+    estimated, true = slab(123.0), slab(121.3)
+    rng = np.random.default_rng(0)
+    points = rng.uniform(*estimated.box_mm, (20_000, 3))
+    in_tumor = np.linalg.norm(points - [10.0, -30.0, 135.0], axis=1) < RADIUS_MM
+    in_slab = (np.abs(points[:, 1]) < 30) & (points[:, 2] > 123)
+    labels = np.where(in_tumor, 2, in_slab).astype(np.uint8)
+    seen = Located(points[labels > 0], labels[labels > 0], {"kidney": estimated, "tumor_1": tumor})
+    plan = plan_resection(seen, OURS)
+    assert min(layer.bottom_mm for layer in plan.layers) == pytest.approx(118, abs=0.05)
+    done = cut_out(Anatomy((true, tumor)), plan)
+    assert done.detached
+    assert done.removed_share == 1.0

@@ -22,6 +22,7 @@ from tumortrack.plan.values import Cut, Layer, Located
 # where the margin is narrow, so that it is kept to a sixth of a millimetre.
 _CELL_MM, _CELL_SHARE = 1.0, 0.4
 _THIN_MM, _THIN_SHARE = 1.2, 0.33
+_SLACK_MM = 2.0  # the organ may reach so much higher, or lower, than was estimated
 _COLUMN_MM = 2.0  # of the organ's upper and lower surface
 _SMOOTH_MM = 0.05  # outlines lose corners smaller than this
 _FAR_MM = 1e3
@@ -124,9 +125,10 @@ class Columns:
     def within(
         self, points_mm: Float[np.ndarray, "n 2"], bottom_mm: float, top_mm: float
     ) -> np.ndarray:
-        """Where there is organ between two heights."""
+        """Where there is organ between two heights, or nearly: the estimate may be a little off, and
+        a thin bridge would hold the piece."""
         low, high = self.at(points_mm)
-        return (high > bottom_mm) & (low < top_mm)  # False at NaN
+        return (high + _SLACK_MM > bottom_mm) & (low - _SLACK_MM < top_mm)  # False at NaN
 
 
 def _spread(values: Float[np.ndarray, "i j"]) -> Float64[np.ndarray, "i j"]:
