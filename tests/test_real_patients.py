@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -17,12 +18,26 @@ from tumortrack.phantom.scanner import ScannerParameters, scan
 
 # Volumes in ml, from the data set's own voxels: the tumor-bearing kidney and its tumor.
 PATIENTS = {"case_00000": (215.0, 7.8), "case_00002": (289.0, 35.0), "case_00003": (202.0, 10.2)}
-STEPS = 120  # enough to run the chain, not to be accurate; docs/results.md has real training
+STEPS = 40  # enough to run the chain, not to be accurate; docs/results.md has real training
+
+
+@pytest.fixture(scope="module")
+def prepared(shared_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
+    """The case of a patient's label map, prepared once."""
+    folder = tmp_path_factory.mktemp("patients")
+
+    def case_of(patient: str) -> Path:
+        if not (folder / patient).exists():
+            source = shared_data / "kits19" / patient / "segmentation.nii.gz"
+            succeeded(tumortrack("prepare", source, folder / patient))
+        return folder / patient
+
+    return case_of
 
 
 def locates_its_organ(case: Path, folder: Path) -> None:
     """Train on a case, simulate a scene, locate in it: the organ is about where it is."""
-    succeeded(tumortrack("train", case, folder / "model", "--steps", STEPS))
+    succeeded(tumortrack("train", case, folder / "model", "--steps", STEPS, "--workers", 0))
     succeeded(tumortrack("simulate", case, folder / "scenes", "--scenes", 1))
     cloud = folder / "scenes" / "0000" / "cloud.ply"
     succeeded(tumortrack("locate", folder / "model", cloud, folder / "out", "--grid", 48))
@@ -32,10 +47,8 @@ def locates_its_organ(case: Path, folder: Path) -> None:
 
 
 @pytest.mark.parametrize("patient", ["case_00000", "case_00002"])
-def test_label_map_to_located_organ(patient, shared_data, tmp_path):
-    source = shared_data / "kits19" / patient / "segmentation.nii.gz"
-    case = tmp_path / "case"
-    succeeded(tumortrack("prepare", source, case))
+def test_label_map_to_located_organ(patient, prepared, tmp_path):
+    case = prepared(patient)
     anatomy = load_case(case).anatomy
     organ_ml, tumor_ml = PATIENTS[patient]
     assert anatomy.organ.volume_mm3 / 1000 == pytest.approx(organ_ml, rel=0.02)
@@ -44,13 +57,11 @@ def test_label_map_to_located_organ(patient, shared_data, tmp_path):
 
 
 @pytest.mark.parametrize("patient", PATIENTS)
-def test_virtual_ct_gives_back_the_anatomy(patient, shared_data, tmp_path):
-    source = shared_data / "kits19" / patient / "segmentation.nii.gz"
-    succeeded(tumortrack("prepare", source, tmp_path / "labels_case"))
-    labels = load_case(tmp_path / "labels_case").labels
-    write_dicom_series(scan(labels, ScannerParameters(), 4), tmp_path / "dicom")
+def test_virtual_ct_gives_back_the_anatomy(patient, prepared, tmp_path):
+    patients = load_case(prepared(patient))
+    write_dicom_series(scan(patients.labels, ScannerParameters(), 4), tmp_path / "dicom")
     succeeded(tumortrack("prepare", tmp_path / "dicom", tmp_path / "ct_case"))
-    truth, found = (load_case(tmp_path / name).anatomy for name in ("labels_case", "ct_case"))
+    truth, found = patients.anatomy, load_case(tmp_path / "ct_case").anatomy
     assert len(found.parts) == len(truth.parts)
     for mine, theirs in zip(found.parts, truth.parts, strict=True):
         assert mine.volume_mm3 == pytest.approx(theirs.volume_mm3, rel=0.05)
