@@ -85,6 +85,8 @@ def _live(
     from concurrent.futures import Future, ProcessPoolExecutor
     from multiprocessing import get_context
 
+    import msgspec
+
     from tumortrack.app.live import Arms, TrackOptions, track
     from tumortrack.plan.anew import begin, plan_anew, ready
     from tumortrack.plan.located import located
@@ -99,9 +101,10 @@ def _live(
         motion = estimate.motion if unsure else None
         return located(estimate.cloud, estimate.meshes, motion, stored.table_from_camera)
 
+    again = msgspec.structs.replace(stored.config, tumor=stored.plan.tumor)
     # In a process of its own: planning for a second must not hold up a frame.
     with ProcessPoolExecutor(
-        1, get_context("spawn"), initializer=begin, initargs=(stored.config, cell.config)
+        1, get_context("spawn"), initializer=begin, initargs=(again, cell.config)
     ) as planner:
 
         def replan(
@@ -158,15 +161,19 @@ def _virtual(
 
 
 def _organ_shapes(stored: PlanFolder) -> tuple[Shape, ...]:
+    """Kidney and tumors as they were planned on, no surface drawn twice."""
+    from tumortrack.core.types import Anatomy, Mesh
     from tumortrack.track.live import Shape
     from tumortrack.track.view.colours import part_colour
+    from tumortrack.track.view.surfaces import bare_faces
 
     names = sorted(stored.meshes)  # kidney before tumors
+    meshes = [stored.meshes[name] for name in names]
+    meshes[0] = Mesh(meshes[0].vertices_mm, bare_faces(Anatomy(tuple(meshes))))
     return tuple(
-        Shape(f"planned/{name}", stored.meshes[name], np.eye(4), part_colour(label),
-              0.35 if name == "kidney" else 1.0)
-        for label, name in enumerate(names, start=1)
-    )  # fmt: skip
+        Shape(f"planned/{name}", mesh, np.eye(4), part_colour(label), 1.0 if label > 1 else 0.35)
+        for label, (name, mesh) in enumerate(zip(names, meshes, strict=True), start=1)
+    )
 
 
 def _say_state(cell: Workcell | None, said: str) -> str:
