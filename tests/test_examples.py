@@ -36,8 +36,19 @@ def story(tmp_path_factory):
     return out, said
 
 
-def test_there_are_six_in_order():
-    assert [file.name[:2] for file in EXAMPLES] == ["01", "02", "03", "04", "05", "06"]
+def test_there_are_seven_in_order():
+    assert [file.name[:2] for file in EXAMPLES] == [f"{n:02}" for n in range(1, 8)]
+
+
+def test_a_resection_is_planned_and_held_against_the_truth(story):
+    out, said = story
+    assert "tumor_1 lies wholly inside" in said["07"]
+    shares = [float(x) for x in re.findall(r"deeper: ([0-9.]+)% of the tumor", said["07"])]
+    assert len(shares) == 4
+    assert shares[2:] == [100.0, 100.0]  # ours: 5 mm of margin, 4 mm off
+    assert 80 < shares[1] < shares[0] < 100  # the paper's has none below
+    assert "arms: approach" in said["07"]
+    assert (out / "plan.png").stat().st_size > 50_000
 
 
 def test_a_moving_organ_is_followed(story):
