@@ -22,8 +22,10 @@ GREY, DARK, BLUE = (206, 210, 214), (92, 98, 106), (104, 160, 196)
 STEEL, YELLOW, CUP = (176, 182, 190), (222, 190, 80), (70, 76, 92)
 WOOD, POST = (226, 229, 232), (150, 158, 166)
 
+PENCIL_RADIUS_MM, ELECTRODE_RADIUS_MM = 6.5, 1.2
+
 LINKS = ("base", "shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3")
-TABLE, STAND, CAMERA = "table", "stand", "camera"
+TABLE, STAND, CAMERA, PEDESTAL = "table", "stand", "camera", "pedestal"
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,11 +133,17 @@ def arm_parts(arm: str, model: ArmModel) -> tuple[Part, ...]:
 def tool_parts(config: CellConfig) -> tuple[Part, ...]:
     """Instrument and grasper, on their arms' flanges (z out of the flange)."""
     c, link = config, f"{CUTTER}_tool"
-    ahead, down = c.pencil_mm, c.bracket_mm
+    ahead, tip, down = c.pencil_mm, c.pencil_mm + c.electrode_mm, c.bracket_mm
     cutter = (
         _rod("bracket", link, ((0, 0, 0), (0, 0, down)), 10.0, STEEL),
-        _rod("pencil", link, ((-10, 0, down), (ahead, 0, down)), 6.5, BLUE),
-        _rod("electrode", link, ((ahead, 0, down), (ahead + c.electrode_mm, 0, down)), 1.2, YELLOW),
+        _rod("pencil", link, ((-10, 0, down), (ahead, 0, down)), PENCIL_RADIUS_MM, BLUE),
+        _rod(
+            "electrode",
+            link,
+            ((ahead, 0, down), (ahead + c.electrode_mm, 0, down)),
+            ELECTRODE_RADIUS_MM,
+            YELLOW,
+        ),
     )
     link, shaft = f"{HOLDER}_tool", c.rod_mm - c.cup_mm
     holder = (
@@ -157,7 +165,19 @@ def surroundings(config: CellConfig) -> tuple[Part, ...]:
     place = rigid(np.eye(3), np.array(config.camera_mm))
     use: Literal["both", "picture"] = "both" if config.camera_is_obstacle else "picture"
     camera = Part(CAMERA, TABLE, "box", (42.0, 23.0, 42.0), place, DARK, use)
-    return table, post, camera
+    return table, post, camera, *_pedestals(config)
+
+
+def _pedestals(config: CellConfig) -> list[Part]:
+    """What bases above the table stand on."""
+    pedestals = []
+    for arm in (CUTTER, HOLDER):
+        x, y, z = config.base(arm).position_mm
+        if z > 0:
+            radius = 1.15 * _GIRTHS[config.model(arm).name].base
+            ends = ((x, y, 0.0), (x, y, z))
+            pedestals.append(_rod(f"{arm}/{PEDESTAL}", TABLE, ends, radius, POST))
+    return pedestals
 
 
 def cell_parts(config: CellConfig) -> tuple[Part, ...]:

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from tumortrack.core.types import Mesh
-from tumortrack.plan.arms.body import CAMERA, LINKS, STAND, TABLE, Part, cell_parts
+from tumortrack.plan.arms.body import CAMERA, LINKS, PEDESTAL, STAND, TABLE, Part, cell_parts
 from tumortrack.plan.arms.config import Base, CellConfig
 from tumortrack.plan.arms.urdf import cell_urdf
 from tumortrack.plan.motions import CUTTER, HOLDER
@@ -54,6 +54,13 @@ class Cell:
         for one, other in self._pairs:
             self._solids.addCollisionPair(pin.CollisionPair(index[one], index[other]))
         self._tips = {arm: self._model.getFrameId(f"{arm}_tip") for arm in ARMS}
+        self._around = {
+            arm: (
+                np.linalg.inv(self.config.base(arm).table_from_base),
+                np.linalg.inv(self.config.flange_from_tip(arm)),
+            )
+            for arm in ARMS
+        }
         self._states: dict[tuple, Any] = {}
         self._looks: Any = None
 
@@ -88,6 +95,10 @@ class Cell:
             elbow = fore + float(np.hypot(model.a_mm[2], model.d_mm[3]))
             levers += [abs(model.a_mm[1]) + elbow] * 2 + [elbow, fore, hand, ahead]
         return np.array(levers)
+
+    def around_arm(self, arm: str) -> tuple[Float64[np.ndarray, "4 4"], Float64[np.ndarray, "4 4"]]:
+        """``base_from_table`` and ``tip_from_flange``, mm."""
+        return self._around[arm]
 
     def tips(self, joints_rad: Float64[np.ndarray, " 12"]) -> dict[str, Float64[np.ndarray, "4 4"]]:
         """``table_from_tip`` (mm) of ``cutter`` and ``holder``: z up; the instrument points along
@@ -166,12 +177,17 @@ class Cell:
                 still = moving is not None and not any(moving in name for name in pair)
                 if still or (ORGAN in pair and ends & set(pair)):
                     state.deactivateCollisionPair(n)
-                margin = (
-                    self.config.organ_clearance_mm if ORGAN in pair else self.config.clearance_mm
-                )
+                margin = self._margin_mm(pair, touching)
                 state.collisionRequests[n].security_margin = margin / 1000 if clearance else 0.0
             self._states[key] = state
         return self._states[key]
+
+    def _margin_mm(self, pair: tuple[str, str], touching: tuple[str, ...]) -> float:
+        """How near these two may come."""
+        if ORGAN in pair or (STAND in pair and TOUCHES[CUTTER] in pair):
+            return self.config.organ_clearance_mm
+        tools = pair[0] == TOUCHES[CUTTER] and pair[1].removeprefix("holder/") in TOOLS[HOLDER]
+        return self.config.contact_mm if tools and len(touching) == 2 else self.config.clearance_mm
 
 
 def _name_solids(solids: Any, parts: tuple[Part, ...]) -> list[str]:
@@ -194,7 +210,8 @@ def _pairs() -> list[tuple[str, str]]:
     for arm, other in (ARMS, ARMS[::-1]):
         own = moving[arm]
         still = [f"{arm}/{name}" for name in LINKS[:2]]
-        pairs += product(own, (f"{other}/base", f"{other}/shoulder"))
+        pairs += product(own, [f"{other}/{name}" for name in (PEDESTAL, *LINKS[:2])])
+        pairs += product(own[1:], (f"{arm}/{PEDESTAL}",))
         pairs += product(own, (TABLE, STAND, CAMERA))
         pairs += product(own[1:], (ORGAN,))
         pairs += product(own[1:], still)

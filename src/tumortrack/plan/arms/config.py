@@ -34,7 +34,7 @@ class CellConfig(Config, frozen=True, kw_only=True):
 
     Attributes:
         cutter_model, holder_model: which arm carries the instrument, which the vacuum grasper.
-        cutter_base, holder_base: where they stand.
+        cutter_base, holder_base: where they stand, on pedestals if above the table.
         bracket_mm, pencil_mm, electrode_mm: the instrument hangs this far below the flange; its
             grip and its bare electrode (the usual long one) reach this far forward, level.
         rod_mm, cup_mm, cup_radius_mm: the grasper hangs straight down from its flange; the last
@@ -47,7 +47,8 @@ class CellConfig(Config, frozen=True, kw_only=True):
             is between the arms; ``camera_is_obstacle`` False says that it is swung away (or looks
             from the side) while they move.
         clearance_mm: what arms keep from each other, from themselves and from all that stands;
-            ``organ_clearance_mm``: what of the tools keeps from the organ.
+            ``organ_clearance_mm``: what they keep from the organ, but for electrode and cup while
+            they work; ``contact_mm``: what the electrode then keeps from the soft cup.
         cutting_mm_s: the tip's greatest speed on a cut and in tissue; ``grasping_mm_s``: on the
             straight way to the grasp and back.
         speed_share: joints go no faster than this share of what the maker allows.
@@ -55,8 +56,8 @@ class CellConfig(Config, frozen=True, kw_only=True):
 
     cutter_model: Literal["ur10e", "ur5"] = "ur10e"
     holder_model: Literal["ur10e", "ur5"] = "ur5"
-    cutter_base: Base = Base(position_mm=(850.0, 0.0, 0.0), yaw_deg=0.0)
-    holder_base: Base = Base(position_mm=(-520.0, 0.0, 0.0), yaw_deg=180.0)
+    cutter_base: Base = Base(position_mm=(850.0, 0.0, 100.0), yaw_deg=0.0)
+    holder_base: Base = Base(position_mm=(-520.0, 0.0, 150.0), yaw_deg=180.0)
     bracket_mm: float = 110.0
     pencil_mm: float = 110.0
     electrode_mm: float = 70.0
@@ -64,8 +65,8 @@ class CellConfig(Config, frozen=True, kw_only=True):
     cup_mm: float = 20.0
     cup_radius_mm: float = 8.0
     home_rad: tuple[float, ...] = (
-        *(-0.490, -2.175, 2.419, -1.815, -np.pi / 2, -2.061),
-        *(-0.416, -1.982, 1.376, -0.965, -np.pi / 2, -0.416),
+        *(-0.490, -2.077, 2.569, -2.063, -np.pi / 2, -2.061),
+        *(-0.416, -2.132, 1.865, -1.304, -np.pi / 2, -0.416),
     )
     table_mm: tuple[float, float] = (2000.0, 1000.0)
     stand_mm: float = 120.0
@@ -74,6 +75,7 @@ class CellConfig(Config, frozen=True, kw_only=True):
     camera_is_obstacle: bool = False
     clearance_mm: float = 8.0
     organ_clearance_mm: float = 3.0
+    contact_mm: float = 1.5
     cutting_mm_s: float = 10.0
     grasping_mm_s: float = 25.0
     speed_share: float = 0.5

@@ -23,11 +23,9 @@ def branches(
     """
     solver, pose_m = _solver(model), np.array(base_from_flange, order="C")
     pose_m[:3, 3] /= 1000
-    found = [np.asarray(one) for one in solver.inverse_kinematics(pose_m)]
-    good = [
-        _wrapped(one) for one in found if np.isfinite(one).all() and _reaches(solver, one, pose_m)
-    ]
-    return np.array(good).reshape(-1, 6)
+    found = [one for one in solver.inverse_kinematics(pose_m) if _reaches(solver, one, pose_m)]
+    joints = np.array(found).reshape(-1, 6)
+    return joints - _TURN * np.round(joints / _TURN)
 
 
 def nearest_turn(
@@ -47,9 +45,7 @@ def _solver(model: ArmModel) -> Any:
 
 
 def _reaches(solver: Any, joints_rad: np.ndarray, pose_m: np.ndarray) -> bool:
+    """Also False where there is a NaN."""
     off = np.abs(solver.forward_kinematics(*joints_rad) - pose_m)
-    return bool(off[:3, 3].max() < _EXACT_MM / 1000 and off[:3, :3].max() < _EXACT_RAD)
-
-
-def _wrapped(angles_rad: np.ndarray) -> np.ndarray:
-    return angles_rad - _TURN * np.round(angles_rad / _TURN)
+    off[:3, 3] *= _EXACT_RAD / (_EXACT_MM / 1000)
+    return bool(off.max() < _EXACT_RAD)

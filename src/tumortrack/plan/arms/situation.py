@@ -15,11 +15,13 @@ from tumortrack.plan.arms.cell import ARMS, Cell
 
 class Blocked(NoPlan):
     """This way can't be gone; perhaps another can. The text says where and why; ``pair``: who would
-    meet whom, if that is it."""
+    meet whom, if that is it; ``searchable``: a longer way round was not searched yet."""
 
-    def __init__(self, text: str, pair: tuple[str, str] | None = None) -> None:
+    def __init__(
+        self, text: str, pair: tuple[str, str] | None = None, searchable: bool = False
+    ) -> None:
         super().__init__(text)
-        self.pair = pair
+        self.pair, self.searchable = pair, searchable
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,6 +11,7 @@ from tumortrack.plan.arms.ik import branches, nearest_turn
 from tumortrack.plan.arms.situation import Blocked, Situation
 
 _TURN = 2 * np.pi
+_FEW = 12  # every so many poses are looked at before all are
 _JUMP_RAD = 0.35  # more than any joint turns between neighbouring poses of one branch
 
 
@@ -20,9 +21,8 @@ def solve(
     """All branches that bring the moving arm's tip to a pose, collisions not regarded, each joint
     turned to be near where it is."""
     config, arm = situation.cell.config, str(situation.arm)
-    to_base = np.linalg.inv(config.base(arm).table_from_base)
-    from_tip = np.linalg.inv(config.flange_from_tip(arm))
-    found = branches(config.model(arm), to_base @ table_from_tip @ from_tip)
+    base_from_table, tip_from_flange = situation.cell.around_arm(arm)
+    found = branches(config.model(arm), base_from_table @ table_from_tip @ tip_from_flange)
     return nearest_turn(config.model(arm), found, situation.here_rad)
 
 
@@ -41,6 +41,7 @@ def follow(
         Blocked: a pose out of reach, no way without a jump, or collisions on all of them.
     """
     near = situation.here_rad if near_rad is None else near_rad
+    _reject_early(situation, poses)
     joints = _options(situation, poses)
     barred = np.isnan(joints[..., 0])
     tested = np.zeros_like(barred)
@@ -61,6 +62,23 @@ def follow(
     raise Blocked(f"{pair[0]} would meet {pair[1]}", pair)
 
 
+def _reject_early(situation: Situation, poses: np.ndarray) -> None:
+    """Most ways that can't be gone show it at a few of their poses.
+
+    Raises:
+        Blocked: no branch is free at one of them.
+    """
+    for option in _options(situation, poses[_FEW // 2 :: _FEW]):
+        pair: tuple[str, str] | None = None
+        for joints in option[~np.isnan(option[:, 0])]:
+            pair = situation.collides(joints)
+            if pair is None:
+                break
+        else:
+            assert pair is not None
+            raise Blocked(f"{pair[0]} would meet {pair[1]}", pair)
+
+
 def _options(situation: Situation, poses: np.ndarray) -> np.ndarray:
     """All branches of all poses (n, most, 6), filled up with NaN."""
     options = [solve(situation, pose) for pose in poses]
@@ -68,7 +86,7 @@ def _options(situation: Situation, poses: np.ndarray) -> np.ndarray:
         if not len(option):
             x, y, z = pose[:3, 3]
             raise Blocked(f"the {situation.arm} does not reach ({x:.0f}, {y:.0f}, {z:.0f}) mm")
-    joints = np.full((len(poses), max(map(len, options)), 6), np.nan)
+    joints = np.full((len(poses), max(map(len, options), default=0), 6), np.nan)
     for row, option in zip(joints, options, strict=True):
         row[: len(option)] = option
     return joints

@@ -8,6 +8,7 @@ generators take theirs from one global seed that can be set once per process.
 from __future__ import annotations
 
 import itertools
+from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Float64
@@ -24,9 +25,16 @@ _POINT_RAD = 0.05  # between points of a path
 
 
 def connect(
-    situation: Situation, goal_rad: Float64[np.ndarray, " d"], rng: np.random.Generator
+    situation: Situation,
+    goal_rad: Float64[np.ndarray, " d"],
+    rng: np.random.Generator | None = None,
+    detours: Sequence[Float64[np.ndarray, "c d"]] = (),
 ) -> Float64[np.ndarray, "m d"]:
     """A smooth path of the moving joints from where they are to a goal.
+
+    Args:
+        rng: for the search; None: only the straight way and the detours are tried.
+        detours: corners of ways to try before a search, in joint space.
 
     Raises:
         Blocked: start or goal collide, or no way was found.
@@ -38,15 +46,33 @@ def connect(
     pair = situation.way_collides(start_rad, goal_rad)
     if pair is None:
         return _straight(start_rad, goal_rad)
+    for corners in detours:
+        path = _through(situation, np.stack([start_rad, *corners, goal_rad]))
+        if path is not None:
+            return path
+    if rng is None:
+        text = f"{pair[0]} would meet {pair[1]} on the way"
+        raise Blocked(text, pair, searchable=True)
     for room in _ROOM_RAD:
         lower = np.maximum(np.minimum(start_rad, goal_rad) - room, -situation.limits_rad)
         upper = np.minimum(np.maximum(start_rad, goal_rad) + room, situation.limits_rad)
-        corners = _grow(situation, goal_rad, (lower, upper), rng)
-        if corners is not None:
-            path = _smooth(situation, _shortcut(situation, corners, rng))
+        way = _grow(situation, goal_rad, (lower, upper), rng)
+        if way is not None:
+            path = _smooth(situation, _shortcut(situation, way, rng))
             if path is not None:
                 return path
     raise Blocked(f"no way round was found where {pair[0]} would meet {pair[1]}", pair)
+
+
+def _through(situation: Situation, corners: np.ndarray) -> np.ndarray | None:
+    """The way through these corners, rounded, if it is free."""
+    for corner in corners[1:-1]:
+        if situation.collides(corner):
+            return None
+    for here, there in itertools.pairwise(corners):
+        if situation.way_collides(here, there, _COARSE):
+            return None
+    return _smooth(situation, corners)
 
 
 def _straight(start_rad: np.ndarray, goal_rad: np.ndarray) -> np.ndarray:
