@@ -7,7 +7,7 @@ from scipy import ndimage
 from imaging_objects import kidney_labels
 from tumortrack.core.errors import InputError
 from tumortrack.core.types import LabelVolume, Volume
-from tumortrack.imaging.grid import voxel_ml
+from tumortrack.imaging.grid import label_counts, voxel_ml
 from tumortrack.imaging.segment import segment_ct, select_labels
 from tumortrack.imaging.surface import surfaces
 
@@ -222,3 +222,10 @@ def test_a_kidney_mostly_tumor_is_a_kidney_still():
     found, _ = select_labels(LabelVolume(labels, np.eye(4)))
     assert 3 < volumes(found)[1] < 10
     assert volumes(found)[2] == pytest.approx(49.6, abs=0.5)
+
+
+@pytest.mark.parametrize("order", ["C", "F"])
+def test_labels_are_counted_whatever_their_order_in_memory(order):
+    labels = np.random.default_rng(0).integers(0, 250, (60, 50, 40)).astype(np.uint8)
+    expected = np.bincount(labels.ravel(), minlength=256)
+    np.testing.assert_array_equal(label_counts(np.asarray(labels, order=order)), expected)

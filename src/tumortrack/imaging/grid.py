@@ -3,17 +3,28 @@
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Bool, Float, Int32, UInt8
+from jaxtyping import Bool, Float, Int32, Int64, UInt8
 
 from tumortrack.core.geometry import spacing_mm
 from tumortrack.core.types import LabelVolume
 
 Box = tuple[slice, slice, slice]
 
+_AT_ONCE = 2**16  # labels: counting makes eight bytes of each
+
 
 def voxel_ml(lps_from_index: Float[np.ndarray, "4 4"]) -> float:
     """The volume of one voxel in ml."""
     return float(abs(np.linalg.det(lps_from_index[:3, :3]))) / 1000
+
+
+def label_counts(labels: UInt8[np.ndarray, "i j k"]) -> Int64[np.ndarray, " 256"]:
+    """How many voxels have each label."""
+    flat = labels.ravel(order="K")
+    counts = np.zeros(256, np.int64)
+    for start in range(0, len(flat), _AT_ONCE):
+        counts += np.bincount(flat[start : start + _AT_ONCE], minlength=256)
+    return counts
 
 
 def components(mask: Bool[np.ndarray, "i j k"]) -> tuple[Int32[np.ndarray, "i j k"], np.ndarray]:

@@ -9,7 +9,14 @@ from jaxtyping import UInt8
 
 from tumortrack.core.errors import InputError
 from tumortrack.core.types import FIRST_TUMOR, ORGAN, LabelVolume
-from tumortrack.imaging.grid import bounding_box, components, cropped, moved_origin, voxel_ml
+from tumortrack.imaging.grid import (
+    bounding_box,
+    components,
+    cropped,
+    label_counts,
+    moved_origin,
+    voxel_ml,
+)
 from tumortrack.imaging.pieces import GAP_MM, Pieces, attach_tumors, find_pieces
 
 MIN_TUMOR_ML = 0.2
@@ -54,7 +61,7 @@ def select_labels(
             tumor but one apart from every kidney.
     """
     labels = label_volume.labels
-    present = [int(n) for n in np.flatnonzero(np.bincount(labels.ravel(order="K"))) if n > 0]
+    present = [int(n) for n in np.flatnonzero(label_counts(labels)) if n > 0]
     tumors = _tumor_labels(present, organ, tumor)
     affine = label_volume.lps_from_index
     box = bounding_box(np.isin(labels, [organ, *tumors]), affine, 2.0)

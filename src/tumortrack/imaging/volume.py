@@ -9,6 +9,7 @@ import numpy as np
 from tumortrack.core.errors import InputError
 from tumortrack.core.types import LabelVolume, Volume
 from tumortrack.imaging.dicom import read_dicom
+from tumortrack.imaging.grid import label_counts
 from tumortrack.imaging.nifti import read_nifti, write_labels_nifti, write_volume_nifti
 from tumortrack.imaging.nrrd import read_nrrd
 from tumortrack.imaging.voxels import RawVolume
@@ -113,4 +114,4 @@ def is_label_map(raw: RawVolume) -> bool:
     labels = array.astype(np.uint8)
     if array.dtype.kind == "f" and not np.array_equal(labels, array):
         return False
-    return int(np.count_nonzero(np.bincount(labels.ravel(order="K")))) <= _MOST_LABELS
+    return int(np.count_nonzero(label_counts(labels))) <= _MOST_LABELS
