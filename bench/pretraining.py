@@ -45,7 +45,7 @@ from tumortrack.learn.warp.shape import Shape, shape_of
 from tumortrack.phantom.digital import PhantomParameters
 from tumortrack.simulate.bodies import body_for
 from tumortrack.simulate.dataset import SceneStream
-from tumortrack.simulate.occupancy import OccupancyPool
+from tumortrack.simulate.occupancy import organ_pool
 from tumortrack.simulate.scene import Simulator
 
 BLOCK = "pretraining"
@@ -165,7 +165,7 @@ class Judge:
         config = clinic(case.anatomy)
         body = body_for(case.anatomy, case.up_lps, config.scene, UNSEEN_SEED)
         simulator = Simulator(case.anatomy, case.up_lps, config.scene, body)
-        pool = OccupancyPool(case.anatomy, config.scene.occupancy, UNSEEN_SEED)
+        pool = organ_pool(case.anatomy, config.scene.occupancy, UNSEEN_SEED)
         few = msgspec.structs.replace(config, validation_pairs=scenes)
         self._refine = config.refine
         self._scenes: ValidationScenes = validation_scenes(simulator, pool, few, UNSEEN_SEED)

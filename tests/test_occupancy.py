@@ -12,6 +12,7 @@ from tumortrack.simulate.occupancy import (
     OccupancyConfig,
     OccupancyPool,
     labels_of,
+    organ_pool,
     surface_distance,
 )
 
@@ -106,12 +107,16 @@ def test_distances_are_those_to_the_nearest_sample_of_a_surface():
 
 
 def test_even_points_measure_volume(pool):
-    _, labels = pool.draw_evenly(np.random.default_rng(0), 10_000)
+    _, labels = pool.parts[0].draw_evenly(np.random.default_rng(0), 10_000)
     volumes = [np.prod(axes) * 4 / 3 * np.pi for axes, _ in ELLIPSOIDS]
     box = np.prod(2 * 1.5 * np.array(ELLIPSOIDS[0][0]))
     assert (labels > 0).mean() == pytest.approx(volumes[0] / box, rel=0.05)
     for label in (2, 3):
         assert (labels == label).mean() == pytest.approx(volumes[label - 1] / box, rel=0.25)
+    alone, _ = organ_pool(ANATOMY, SMALL, seed=4).draw_evenly(np.random.default_rng(0), 10_000)
+    np.testing.assert_array_equal(
+        pool.parts[0].draw_evenly(np.random.default_rng(0), 10_000)[0], alone
+    )
 
 
 def test_pools_and_draws_replay():

@@ -66,7 +66,7 @@ class OccupancyCourse:
     def _scenes(self) -> ValidationScenes:
         run = self._run
         simulator = Simulator(run.anatomy_ct, run.up_lps, run.config.scene, self.body)
-        return validation_scenes(simulator, self.points, run.config, run.seed)
+        return validation_scenes(simulator, self.points.parts[0], run.config, run.seed)
 
     @cached_property
     def _validation(self) -> ValidationSet:

@@ -13,7 +13,7 @@ from tumortrack.learn.config import TrainConfig
 from tumortrack.learn.fit import Familiar, fit_mm, spread_mm, surface_distances
 from tumortrack.learn.network import Latent, OccupancyNetwork
 from tumortrack.simulate.dataset import refill
-from tumortrack.simulate.occupancy import OccupancyPool
+from tumortrack.simulate.occupancy import PartPool
 from tumortrack.simulate.scene import SceneRecipe, Simulator
 
 _AT_ONCE = 32  # scenes
@@ -42,7 +42,7 @@ class ValidationScenes:
 
 
 def validation_scenes(
-    simulator: Simulator, pool: OccupancyPool, config: TrainConfig, seed: int
+    simulator: Simulator, pool: PartPool, config: TrainConfig, seed: int
 ) -> ValidationScenes:
     """The first scenes of the ``validation`` stream."""
     vertices = simulator.anatomy_ct.organ.vertices_mm

@@ -63,12 +63,19 @@ class PartPool:
     inside: Bool[np.ndarray, " n"]
     labels: UInt8[np.ndarray, " n"]
 
+    def draw_evenly(
+        self, rng: np.random.Generator, count: int
+    ) -> tuple[Float[np.ndarray, "n 3"], UInt8[np.ndarray, " n"]]:
+        """Points spread evenly over the part's enlarged box: shares of them are volumes."""
+        chosen = _window(len(self.labels), count, rng)
+        return self.points_ct[chosen], self.labels[chosen]
+
 
 class OccupancyPool:
     """Labelled points of one undeformed anatomy, worked out once; every scene draws from them."""
 
     def __init__(self, anatomy_ct: Anatomy, config: OccupancyConfig, seed: int) -> None:
-        rng = np.random.default_rng([seed, 0x5047])
+        rng = _pool_generator(seed)
         self.config = config
         self.parts = tuple(_part_pool(anatomy_ct, part, config, rng) for part in anatomy_ct.parts)
         lower, upper = anatomy_ct.organ.box_mm
@@ -97,14 +104,6 @@ class OccupancyPool:
             np.concatenate([*labels, self.far_labels[chosen]]),
         )
 
-    def draw_evenly(
-        self, rng: np.random.Generator, count: int
-    ) -> tuple[Float[np.ndarray, "n 3"], UInt8[np.ndarray, " n"]]:
-        """Points spread evenly over the organ's enlarged box: shares of them are volumes."""
-        organ = self.parts[0]
-        chosen = _window(len(organ.labels), count, rng)
-        return organ.points_ct[chosen], organ.labels[chosen]
-
     def _sort_sample(self, part: PartPool, rng: np.random.Generator) -> np.ndarray:
         k = self.config.per_side
         share = part.inside.mean()
@@ -127,6 +126,15 @@ def _nearest(part: PartPool, drawn: np.ndarray, k: int) -> np.ndarray:
 def _window(n: int, count: int, rng: np.random.Generator) -> np.ndarray:
     """``count`` neighbours of a pool that is in random order: a random draw, without its cost."""
     return (int(rng.integers(n)) + np.arange(count)) % n
+
+
+def organ_pool(anatomy_ct: Anatomy, config: OccupancyConfig, seed: int) -> PartPool:
+    """The first part of an ``OccupancyPool``, for those who need no other."""
+    return _part_pool(anatomy_ct, anatomy_ct.organ, config, _pool_generator(seed))
+
+
+def _pool_generator(seed: int) -> np.random.Generator:
+    return np.random.default_rng([seed, 0x5047])
 
 
 def _part_pool(

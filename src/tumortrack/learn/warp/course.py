@@ -23,7 +23,7 @@ from tumortrack.learn.warp.network import WarpNetwork
 from tumortrack.learn.warp.refine import Refined
 from tumortrack.learn.warp.shape import shape_of
 from tumortrack.simulate.bodies import body_for
-from tumortrack.simulate.occupancy import FixedPoints, OccupancyPool
+from tumortrack.simulate.occupancy import FixedPoints, organ_pool
 from tumortrack.simulate.scene import Simulator
 from tumortrack.simulate.targets import draw_targets
 
@@ -51,7 +51,7 @@ class WarpCourse:
     @cached_property
     def _scenes(self) -> ValidationScenes:
         run = self._run
-        pool = OccupancyPool(run.anatomy_ct, run.config.scene.occupancy, run.seed)
+        pool = organ_pool(run.anatomy_ct, run.config.scene.occupancy, run.seed)
         simulator = Simulator(run.anatomy_ct, run.up_lps, run.config.scene, self.body)
         return validation_scenes(simulator, pool, run.config, run.seed)
 
