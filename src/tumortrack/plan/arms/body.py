@@ -37,7 +37,6 @@ class Part:
         link: the URDF's link.
         kind, size_mm: box (x, y, z) or cylinder (radius, length), its axis along z.
         link_from_part: mm.
-        end_radius_mm: of a cylinder drawn narrower at its upper end; 0: as thick as below.
         use: what it is for: collisions, pictures, or both.
     """
 
@@ -48,7 +47,11 @@ class Part:
     link_from_part: Float64[np.ndarray, "4 4"]
     colour: tuple[int, int, int]
     use: Literal["both", "collision", "picture"] = "both"
-    end_radius_mm: float = 0.0
+
+    @property
+    def whose(self) -> str:
+        """Its name within the cell: ``cutter/forearm``, ``table``."""
+        return self.name if self.link == TABLE else f"{self.link.split('_')[0]}/{self.name}"
 
 
 @dataclass(frozen=True)
@@ -133,7 +136,7 @@ def arm_parts(arm: str, model: ArmModel) -> tuple[Part, ...]:
 def tool_parts(config: CellConfig) -> tuple[Part, ...]:
     """Instrument and grasper, on their arms' flanges (z out of the flange)."""
     c, link = config, f"{CUTTER}_tool"
-    ahead, tip, down = c.pencil_mm, c.pencil_mm + c.electrode_mm, c.bracket_mm
+    ahead, down = c.pencil_mm, c.bracket_mm
     cutter = (
         _rod("bracket", link, ((0, 0, 0), (0, 0, down)), 10.0, STEEL),
         _rod("pencil", link, ((-10, 0, down), (ahead, 0, down)), PENCIL_RADIUS_MM, BLUE),
@@ -154,7 +157,7 @@ def tool_parts(config: CellConfig) -> tuple[Part, ...]:
 
 
 def surroundings(config: CellConfig) -> tuple[Part, ...]:
-    """Table, the organ's post and the camera, in the table frame."""
+    """Table, the organ's post, the arms' pedestals and a camera in the way, in the table frame."""
     width, depth = config.table_mm
     slab = rigid(np.eye(3), np.array([0.0, 0.0, -20.0]))
     table = Part(TABLE, TABLE, "box", (width, depth, 40.0), slab, WOOD)
@@ -162,10 +165,11 @@ def surroundings(config: CellConfig) -> tuple[Part, ...]:
     post = _rod(
         STAND, TABLE, ((0, 0, 0), (0, 0, config.stand_mm - 3)), config.stand_radius_mm, POST
     )
-    place = rigid(np.eye(3), np.array(config.camera_mm))
-    use: Literal["both", "picture"] = "both" if config.camera_is_obstacle else "picture"
-    camera = Part(CAMERA, TABLE, "box", (42.0, 23.0, 42.0), place, DARK, use)
-    return table, post, camera, *_pedestals(config)
+    parts = [table, post, *_pedestals(config)]
+    if config.camera_is_obstacle:
+        place = rigid(np.eye(3), np.array(config.camera_mm))
+        parts.append(Part(CAMERA, TABLE, "box", (42.0, 23.0, 42.0), place, DARK))
+    return tuple(parts)
 
 
 def _pedestals(config: CellConfig) -> list[Part]:

@@ -194,12 +194,8 @@ def _name_solids(solids: Any, parts: tuple[Part, ...]) -> list[str]:
     """Our names in pinocchio's order, which is that of each link's collision elements."""
     by_link: dict[str, Iterator[str]] = {}
     for link in {part.link for part in parts}:
-        by_link[link] = iter([_name(p) for p in parts if p.link == link and p.use != "picture"])
+        by_link[link] = iter([p.whose for p in parts if p.link == link and p.use != "picture"])
     return [next(by_link[solid.name.rsplit("_", 1)[0]]) for solid in solids.geometryObjects]
-
-
-def _name(part: Part) -> str:
-    return part.name if part.link == TABLE else f"{part.link.split('_')[0]}/{part.name}"
 
 
 def _pairs() -> list[tuple[str, str]]:

@@ -43,9 +43,9 @@ class CellConfig(Config, frozen=True, kw_only=True):
         table_mm: the table's size along x and y, its middle below the organ.
         stand_mm: height of the organ's lowest point above the table; ``stand_radius_mm``: of the
             post that carries it.
-        camera_mm: middle of the camera's box. By default it looks straight down from 150 mm, which
-            is between the arms; ``camera_is_obstacle`` False says that it is swung away (or looks
-            from the side) while they move.
+        camera_mm: middle of the camera's box, if ``camera_is_obstacle``. By default it is none and
+            not there: a camera that looks straight down from 150 mm is where the arms work, so it
+            is taken to be swung away while they do.
         clearance_mm: what arms keep from each other, from themselves and from all that stands;
             ``organ_clearance_mm``: what they keep from the organ, but for electrode and cup while
             they work; ``contact_mm``: what the electrode then keeps from the soft cup.

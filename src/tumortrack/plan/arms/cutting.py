@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections import Counter
+
 import numpy as np
 from jaxtyping import Float64
 
@@ -26,7 +28,7 @@ def cut_pass(course: Course, way_mm: Float64[np.ndarray, "n 3"], around: Surroun
     legs as are; between them it leaves and comes from another side.
 
     Raises:
-        Blocked: no direction is possible somewhere; the reason is that of the best one.
+        Blocked: no direction is possible somewhere; the reason is the most frequent one.
     """
     for _ in range(_MOST_LEGS):
         done = _cut_leg(course, way_mm, around)
@@ -39,7 +41,7 @@ def cut_pass(course: Course, way_mm: Float64[np.ndarray, "n 3"], around: Surroun
 def _cut_leg(course: Course, way_mm: np.ndarray, around: Surroundings) -> int:
     """The first leg, as long as it can be; returns the number of the point where it ended."""
     away, inside = course.situation(CUTTER, (HOLDER,)), course.situation(CUTTER, (CUTTER, HOLDER))
-    reason: Blocked | None = None
+    reasons: list[Blocked] = []
     later: list[tuple[Leg, np.ndarray]] = []
     for yaw, last in _directions(way_mm, around, inside):
         one = leg(way_mm[: last + 1], yaw, around)
@@ -47,7 +49,7 @@ def _cut_leg(course: Course, way_mm: np.ndarray, around: Surroundings) -> int:
             path = follow(inside, one.poses)
             way = connect(away, path[0], detours=_detours(away, one))
         except Blocked as blocked:
-            reason = reason or blocked
+            reasons.append(blocked)
             if blocked.searchable:
                 later.append((one, path))
             continue
@@ -60,8 +62,11 @@ def _cut_leg(course: Course, way_mm: np.ndarray, around: Surroundings) -> int:
             continue
         _carry_out(course, one, way, path)
         return len(one.cut_mm) - 1
+    if reasons:
+        often = Counter(str(blocked) for blocked in reasons).most_common(1)[0][0]
+        raise next(blocked for blocked in reasons if str(blocked) == often)
     x, y, z = way_mm[0]
-    raise reason or Blocked(
+    raise Blocked(
         f"from no direction the {CUTTER} comes to ({x:.0f}, {y:.0f}, {z:.0f}) mm without its grip "
         f"in the organ or the electrode at the {HOLDER}"
     )

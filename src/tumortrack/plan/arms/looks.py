@@ -10,10 +10,10 @@ from jaxtyping import Float64
 
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.types import Mesh
-from tumortrack.plan.arms.body import TABLE, YELLOW, Part
+from tumortrack.plan.arms.body import YELLOW, Part
 from tumortrack.track.live import Shape
 
-_SIDES = 32
+_SIDES = 28
 _BEAD_MM = 1.5
 
 
@@ -28,7 +28,7 @@ class Looks:
     def shapes(self, places: Mapping[str, Float64[np.ndarray, "4 4"]]) -> tuple[Shape, ...]:
         """All of them where ``places`` (``table_from_link``, mm) puts their links."""
         return tuple(
-            Shape(_name(part), mesh, places[part.link], part.colour)
+            Shape(part.whose, mesh, places[part.link], part.colour)
             for part, mesh in zip(self._parts, self._meshes, strict=True)
         )
 
@@ -46,10 +46,6 @@ def _bead() -> Mesh:
     return Mesh(np.array(ball.vertices), ball.faces)
 
 
-def _name(part: Part) -> str:
-    return part.name if part.link == TABLE else f"{part.link.split('_')[0]}/{part.name}"
-
-
 def _surface(part: Part) -> Mesh:
     """A box, or a cylinder with its rims rounded off."""
     import trimesh
@@ -58,13 +54,11 @@ def _surface(part: Part) -> Mesh:
         solid = trimesh.creation.box(part.size_mm)
     else:
         radius, length = part.size_mm
-        top = part.end_radius_mm or radius
         round_mm = min(0.25 * radius, 0.25 * length, 12.0)
         angle = np.linspace(0, np.pi / 2, 5)
         sin, cos = round_mm * np.sin(angle), round_mm * np.cos(angle)
         lower = np.stack([radius - round_mm + sin, round_mm - cos - length / 2], 1)
-        upper = np.stack([top - round_mm + cos, length / 2 - round_mm + sin], 1)
-        ends = ([[0.0, -length / 2]], [[0.0, length / 2]])
-        outline = np.concatenate([ends[0], lower, upper, ends[1]])
+        upper = np.stack([radius - round_mm + cos, length / 2 - round_mm + sin], 1)
+        outline = np.concatenate([[[0.0, -length / 2]], lower, upper, [[0.0, length / 2]]])
         solid = trimesh.creation.revolve(outline, sections=_SIDES)
     return Mesh(transform_points(part.link_from_part, np.array(solid.vertices)), solid.faces)
