@@ -30,8 +30,8 @@ SLOWEST = (
     "test_track.py",
     "test_locate.py",
     "test_real_patients.py",
-    "test_demo.py",
     "test_examples.py",
+    "test_demo.py",
 )
 
 
