@@ -54,21 +54,17 @@ def plan(run_folder: Path, folder: Path, config: ResectionConfig, options: PlanO
     _tell(resection, seconds)
     motions, cell_used = None, None
     if options.arms:
-        from tumortrack.plan.arms.cell import Cell
-        from tumortrack.plan.arms.procedure import plan_motions
+        from tumortrack.plan.arms.bases import search_bases
 
         start = time.perf_counter()
-        organ = organ_of(located)
-        placed = Cell(cell_config, organ)
-        motions = plan_motions(resection, placed, organ)
+        placed, motions, moved = search_bases(resection, cell_config, organ_of(located))
         cell_used = to_builtins(placed.config)
         say(
             f"arms: {len(motions.stages)} stages, {motions.seconds:.0f} s; planned in "
             f"{time.perf_counter() - start:.1f} s."
         )
-        if placed.config != cell_config:
-            say("note: the arms do not reach from where they stand; plan.json says where to put "
-                "them.")  # fmt: skip
+        if moved:
+            say(f"note: {moved}")
     content = PlanFolder(
         resection, config, table_from_camera, frame_id, located.meshes, cell_used, motions
     )

@@ -19,9 +19,9 @@ from tumortrack.plan.outline import arcs, evenly, polygon_of, polygons, rings_of
 from tumortrack.plan.values import Cut, Layer, Located
 
 # Of outlines, which are interpolated; and one surface point in each cube of that size. Both finer
-# where the margin is narrow, so that it is kept to a sixth of a millimetre.
+# where the margin is narrow, so that it is kept to a tenth of a millimetre.
 _CELL_MM, _CELL_SHARE = 1.0, 0.4
-_THIN_MM, _THIN_SHARE = 1.2, 0.33
+_THIN_MM, _THIN_SHARE = 0.7, 0.2
 _SLACK_MM = 2.0  # the organ may reach so much higher, or lower, than was estimated
 _COLUMN_MM = 2.0  # of the organ's upper and lower surface
 _SMOOTH_MM = 0.05  # outlines lose corners smaller than this
@@ -30,10 +30,10 @@ _LEAST_MM2 = 1.0  # a smaller rest of a floor needs no stroke
 _MOST_LAYERS = 60
 
 
-def margin_cuts(
+def margin_plan(
     located: Located, label: int, config: ResectionConfig
-) -> tuple[tuple[Layer, ...], tuple[Cut, ...]]:
-    """The piece and its strokes, table frame, mm; layers and strokes from the top down.
+) -> tuple[tuple[Layer, ...], tuple[Cut, ...], Float64[np.ndarray, " 3"]]:
+    """The piece, its strokes, both from the top down, and where to hold; table frame, mm.
 
     Raises:
         NoPlan: the margin with its uncertainty is wider than allowed; there is nothing to cut.
@@ -50,7 +50,7 @@ def margin_cuts(
             cuts += _in_turn(strokes, sweep, cuts[-1].path_mm[-1] if cuts else None)
     if not cuts:
         raise NoPlan("the organ does not reach the tumor's margin; there is nothing to cut.")
-    return layers, tuple(cuts)
+    return layers, tuple(cuts), _grasp(located.of(label), columns)
 
 
 def grown_tumor(
@@ -125,8 +125,8 @@ class Columns:
     def within(
         self, points_mm: Float[np.ndarray, "n 2"], bottom_mm: float, top_mm: float
     ) -> np.ndarray:
-        """Where there is organ between two heights, or nearly: the estimate may be a little off, and
-        a thin bridge would hold the piece."""
+        """Where there is organ between two heights, or nearly: the estimate may be a little off,
+        and a thin bridge would hold the piece."""
         low, high = self.at(points_mm)
         return (high + _SLACK_MM > bottom_mm) & (low - _SLACK_MM < top_mm)  # False at NaN
 
@@ -245,10 +245,8 @@ def _in_turn(strokes: list[Cut], sweep: int, last: Float[np.ndarray, " 3"] | Non
     return ordered
 
 
-def margin_grasp(located: Located, label: int) -> Float64[np.ndarray, " 3"]:
+def _grasp(tumor: Float[np.ndarray, "n 3"], columns: Columns) -> Float64[np.ndarray, " 3"]:
     """The surface straight above the tumor's centre of mass: there the cup finds something."""
-    x, y, _ = located.of(label).mean(0)
-    high = Columns.of(located).at(np.array([[x, y]], float))[1][0]
-    if np.isnan(high):
-        high = located.of(label)[:, 2].max()
-    return np.array([x, y, high], float)
+    x, y, _ = tumor.mean(0)
+    high = columns.at(np.array([[x, y]], float))[1][0]
+    return np.array([x, y, tumor[:, 2].max() if np.isnan(high) else high], float)

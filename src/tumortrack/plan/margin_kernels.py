@@ -29,7 +29,7 @@ def outline_fields(points, margins, levels, first, cell, fields):  # type: ignor
             if rise >= margin:
                 continue
             radius = margin if rise <= 0 else np.sqrt(margin * margin - rise * rise)
-            reach = radius + 2 * cell
+            reach, core = radius + 2 * cell, max(0.0, radius - 2 * cell)
             left = max(0, int(np.ceil((x - reach - first[0]) / cell)))
             right = min(nx - 1, int(np.floor((x + reach - first[0]) / cell)))
             low = max(0, int(np.ceil((y - reach - first[1]) / cell)))
@@ -38,6 +38,10 @@ def outline_fields(points, margins, levels, first, cell, fields):  # type: ignor
                 across = first[0] + a * cell - x
                 for b in range(low, high + 1):
                     along = first[1] + b * cell - y
-                    off = np.sqrt(across * across + along * along) - radius
+                    square = across * across + along * along
+                    if square >= reach * reach:
+                        continue
+                    # Deep inside it is enough to say so: only the outline's surroundings count.
+                    off = core - radius if square < core * core else np.sqrt(square) - radius
                     if off < fields[level, a, b]:
                         fields[level, a, b] = off

@@ -16,7 +16,8 @@ if TYPE_CHECKING:
 _CELL = 2.0  # of a grid that tells inner points from outer ones, in sqrt(area / number of points)
 _EDGE = 5.0  # longest edge of a hull, in sqrt(area / number of points)
 _SPARSE = 6  # of inner cells, one point in so many each way stays
-_MOST = 8000  # points that are looked at
+_MOST = 10_000  # points that are looked at
+_SAME_MM = 0.01  # points nearer to each other are one
 _LEAST_MM2 = 1.0  # smaller pieces of an outline are none
 _SMOOTH = 16  # corners of a quarter circle: 5 mm of margin are exact to 0.01 mm
 
@@ -36,6 +37,7 @@ def concave_hull(points_mm: Float[np.ndarray, "n 2"]) -> Polygon:
     points = np.asarray(points_mm, float)
     if len(points) > _MOST:  # in whatever order they come
         points = points[np.linspace(0, len(points) - 1, _MOST).astype(int)]
+    points = _told_apart(points)
     try:
         if len(points) < 3:
             raise ValueError("too few")
@@ -130,6 +132,15 @@ def _largest(area: Any) -> Polygon:
         raise NoPlan("the outline has no area; there is no contour to cut along.")
     largest = max(pieces, key=lambda piece: piece.area)
     return shapely.Polygon(largest.exterior)  # what lies in a hole comes away too
+
+
+def _told_apart(points: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "m 2"]:
+    """One of each: points of a grid lie on each other when they are projected, and would count as
+    many."""
+    rounded = np.round(points / _SAME_MM).astype(np.int64)
+    rounded -= rounded.min(0, initial=0)
+    key = rounded[:, 0] * (rounded[:, 1].max(initial=0) + 1) + rounded[:, 1]
+    return points[np.unique(key, return_index=True)[1]]
 
 
 def _outer(points: Float[np.ndarray, "n 2"], cell_mm: float) -> Float[np.ndarray, "m 2"]:

@@ -10,14 +10,15 @@ from tumortrack.plan.outline import common, concave_hull, evenly, grown, rings_o
 from tumortrack.plan.values import Cut, Layer, Located
 
 
-def published_cuts(
+def published_plan(
     located: Located, label: int, config: ResectionConfig
-) -> tuple[tuple[Layer, ...], tuple[Cut, ...]]:
-    """The piece and the two sweeps, table frame, mm.
+) -> tuple[tuple[Layer, ...], tuple[Cut, ...], Float64[np.ndarray, " 3"]]:
+    """The piece, the two sweeps, and where to hold; table frame, mm.
 
     The tumor's points are projected on the table's plane; their concave hull, grown by the margin
     and cut with the organ's projection, is walked along twice: at the middle of the tumor's
-    bounding box, and on the box's lower face.
+    bounding box, and on the box's lower face. Held is the tumor's centre of mass, carried up to the
+    top of the box.
 
     Raises:
         NoPlan: there is no contour.
@@ -33,11 +34,5 @@ def published_cuts(
         Cut(sweep, np.column_stack([flat, np.full(len(flat), height)]))
         for sweep, height in enumerate(((low + high) / 2, low), start=1)
     )
-    return (Layer(low, np.inf, (ring,)),), cuts
-
-
-def published_grasp(located: Located, label: int) -> Float64[np.ndarray, " 3"]:
-    """The tumor's centre of mass, carried up to the top of its bounding box."""
-    tumor = located.of(label)
     x, y, _ = tumor.mean(0)
-    return np.array([x, y, tumor[:, 2].max()], float)
+    return (Layer(low, np.inf, (ring,)),), cuts, np.array([x, y, high], float)

@@ -12,9 +12,9 @@ from tumortrack.core.errors import NoPlan
 from tumortrack.core.types import FIRST_TUMOR
 from tumortrack.plan.config import ResectionConfig
 from tumortrack.plan.exophytic import chosen_tumor, name_of
-from tumortrack.plan.margin import margin_cuts, margin_grasp
+from tumortrack.plan.margin import margin_plan
 from tumortrack.plan.outline import polygon_of
-from tumortrack.plan.published import published_cuts, published_grasp
+from tumortrack.plan.published import published_plan
 from tumortrack.plan.values import Layer, Located, ResectionPlan
 
 _A_COLUMN = 30  # points in a column, about
@@ -29,12 +29,8 @@ def plan_resection(located: Located, config: ResectionConfig) -> ResectionPlan:
         NoPlan: nothing to cut, or not as asked; why.
     """
     label, share = chosen_tumor(located, config)
-    if config.method == "published":
-        layers, cuts = published_cuts(located, label, config)
-        grasp_mm = published_grasp(located, label)
-    else:
-        layers, cuts = margin_cuts(located, label, config)
-        grasp_mm = margin_grasp(located, label)
+    method = published_plan if config.method == "published" else margin_plan
+    layers, cuts, grasp_mm = method(located, label, config)
     taken = inside(layers, located.points_mm)
     volumes_ml = _volumes_ml(located, label, taken)
     notes = _others(located, label, taken)

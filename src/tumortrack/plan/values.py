@@ -7,6 +7,7 @@ All in the ``table`` frame, mm: z up against gravity, its origin on the table's 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
@@ -38,12 +39,17 @@ class Located:
 
     def of(self, label: int) -> Float[np.ndarray, "m 3"]:
         """The points with this label."""
-        return self.points_mm[self.labels == label]
+        return self._by_label.get(label, self.points_mm[:0])
 
     @property
     def tumors(self) -> tuple[int, ...]:
         """Labels of the tumors that were found."""
-        return tuple(int(label) for label in np.unique(self.labels) if label >= FIRST_TUMOR)
+        return tuple(label for label in self._by_label if label >= FIRST_TUMOR)
+
+    @cached_property
+    def _by_label(self) -> dict[int, Float[np.ndarray, "m 3"]]:
+        labels = np.flatnonzero(np.bincount(self.labels))
+        return {int(label): self.points_mm[self.labels == label] for label in labels}
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,8 +108,8 @@ class ResectionPlan:
         layers: what the cuts enclose, top first: the wall is each layer's outline, and where a
             layer is wider than the one below it, or has none below, the tissue is cut level.
         margin_mm: the least distance that was asked for between tumor and cut.
-        volumes_ml: organ, parenchyma (of that, no tumor), tumor, piece (all that comes away), healthy
-            (of that, parenchyma).
+        volumes_ml: organ, parenchyma (of that, no tumor), tumor, piece (all that comes away),
+            healthy (of that, parenchyma).
         exophytic: share of the tumor outside the organ's hull.
         notes: what the user should know.
     """
