@@ -24,7 +24,7 @@ _LIBRARIES = {
     "pypcd4": ".pcd clouds",
     "plotly": "3-D page",
 }
-_LIVE = {
+_OPTIONAL = {
     "viser": "web viewer",
     "rosbags": "ROS messages and recordings",
     "cyclonedds": "ROS 2 without ROS",
@@ -32,6 +32,11 @@ _LIVE = {
     "rospy": "ROS 1",
     "pyrealsense2": "RealSense cameras",
     "highdicom": "DICOM segmentations",
+    "pinocchio": "arms: kinematics and collisions",
+    "toppra": "arms: timing",
+    "ruckig": "arms: homing",
+    "ur_analytic_ik": "arms: inverse kinematics",
+    "rtde_control": "real arms of Universal Robots",
 }
 _DISTRIBUTIONS = {"skimage": "scikit-image"}
 
@@ -48,7 +53,7 @@ def examine() -> None:
             say(f"ok       {name} {version(_DISTRIBUTIONS.get(name, name))} ({purpose})")
         except Exception as error:  # whatever a broken installation raises is the finding
             say(f"BROKEN   {name} ({purpose}): {error}")
-    for name, purpose in _LIVE.items():
+    for name, purpose in _OPTIONAL.items():
         say(f"{'ok      ' if find_spec(name) else 'absent  '} {name} ({purpose})")
     _examine_torch()
 
