@@ -25,6 +25,7 @@ ORGAN = "organ"
 ARMS = (CUTTER, HOLDER)
 TOOLS = {CUTTER: ("bracket", "pencil", "electrode"), HOLDER: ("rod", "cup")}
 TOUCHES = {CUTTER: "cutter/electrode", HOLDER: "holder/cup"}  # what of a tool may touch the organ
+_THICK_MM = 10.0  # of what a tool is made of, about its own axis
 
 
 class Cell:
@@ -83,17 +84,25 @@ class Cell:
         makers = np.concatenate([self.config.model(arm).speeds_rad_s for arm in ARMS])
         return self.config.speed_share * makers
 
-    @cached_property
-    def levers_mm(self) -> Float64[np.ndarray, " 12"]:
-        """No point of an arm or its tool moves farther than this per radian of each joint."""
-        levers = []
-        for arm in ARMS:
+    def levers_mm(
+        self, start_rad: Float64[np.ndarray, " 12"], goal_rad: Float64[np.ndarray, " 12"]
+    ) -> Float64[np.ndarray, " 12"]:
+        """On the straight way between two configurations, no point of an arm or its tool moves
+        farther than this per radian of each of its joints."""
+        levers: list[float] = []
+        for arm, elbow in zip(ARMS, (2, 8), strict=True):
             model, tool = self.config.model(arm), self.config.flange_from_tip(arm)[:3, 3]
-            ahead, low = float(np.linalg.norm(tool[:2])) + 10.0, tool[2] + model.d_mm[5]
-            hand = float(np.hypot(ahead, low))
-            fore = hand + model.d_mm[4]
-            elbow = fore + float(np.hypot(model.a_mm[2], model.d_mm[3]))
-            levers += [abs(model.a_mm[1]) + elbow] * 2 + [elbow, fore, hand, ahead]
+            upper, lower = np.abs(model.a_mm[1:3])
+            d4, d5, d6 = model.d_mm[3:]
+            ahead = float(np.hypot(*tool[:2])) + _THICK_MM
+            hand = float(np.hypot(ahead, tool[2] + d6))
+            wrist = hand + d5
+            # The arm is longest where its elbow is straightest.
+            ends = np.array([start_rad[elbow], goal_rad[elbow]])
+            bent = 0.0 if ends[0] * ends[1] <= 0 else float(np.abs(ends).min())
+            stretched = np.sqrt(upper**2 + lower**2 + 2 * upper * lower * np.cos(bent))
+            shoulder = max(np.hypot(stretched, d4) + wrist, np.hypot(upper, d4) + 2 * d5)
+            levers += [shoulder, shoulder, np.hypot(lower, d4) + wrist, wrist, hand, ahead]
         return np.array(levers)
 
     def around_arm(self, arm: str) -> tuple[Float64[np.ndarray, "4 4"], Float64[np.ndarray, "4 4"]]:

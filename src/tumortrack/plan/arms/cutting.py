@@ -20,7 +20,7 @@ _TISSUE_BIN_MM = 3.0  # differences in cut tissue below this do not count
 _MOST_LEGS = 8  # of a pass
 _LONG_WAYS = 3  # directions for which a long way round is searched
 # On the way elsewhere the tip may go back and up first, mm: what most often is free
-_DETOURS_MM = ((60.0, 0.0), (0.0, 70.0), (60.0, 70.0), (0.0, 140.0))
+DETOURS_MM = ((60.0, 0.0), (0.0, 70.0), (60.0, 70.0), (0.0, 140.0))
 
 
 def cut_pass(course: Course, way_mm: Float64[np.ndarray, "n 3"], around: Surroundings) -> None:
@@ -97,20 +97,22 @@ def _directions(
 
 def _detours(situation: Situation, one: Leg) -> list[np.ndarray]:
     """Corners of ways round: back and up, across, and down again."""
-    here = situation.cell.tips(situation.joints_rad)[CUTTER]
     there = level_poses(one.enter_mm[:1], one.yaw_rad)[0]
-    ways = []
-    for back, up in _DETOURS_MM:
-        corners = []
-        for pose in (here, there):
-            moved = pose.copy()
-            moved[:3, 3] += [0.0, 0.0, up] - back * pose[:3, 0]
-            found = solve(situation, moved)
-            if len(found):
-                corners.append(found[np.abs(found - situation.here_rad).max(1).argmin()])
-        if len(corners) == 2:
-            ways.append(np.array(corners))
-    return ways
+    here = situation.cell.tips(situation.joints_rad)[CUTTER]
+    ways = [[aside(situation, pose, *by) for pose in (here, there)] for by in DETOURS_MM]
+    return [np.array(corners) for corners in ways if all(len(corner) for corner in corners)]
+
+
+def aside(
+    situation: Situation, table_from_tip: Float64[np.ndarray, "4 4"], back_mm: float, up_mm: float
+) -> Float64[np.ndarray, " d"]:
+    """The moving arm with its tip so far back and up from a pose; empty if that is out of reach."""
+    moved = table_from_tip.copy()
+    moved[:3, 3] += [0.0, 0.0, up_mm] - back_mm * table_from_tip[:3, 0]
+    found = solve(situation, moved)
+    if not len(found):
+        return np.zeros(0)
+    return found[np.abs(found - situation.here_rad).max(1).argmin()]
 
 
 def _carry_out(course: Course, one: Leg, way_rad: np.ndarray, path_rad: np.ndarray) -> None:

@@ -12,7 +12,7 @@ from tumortrack.core.types import Mesh
 from tumortrack.plan.arms import timing
 from tumortrack.plan.arms.cell import TOUCHES, Cell
 from tumortrack.plan.arms.course import Course
-from tumortrack.plan.arms.cutting import cut_pass
+from tumortrack.plan.arms.cutting import DETOURS_MM, aside, cut_pass
 from tumortrack.plan.arms.situation import Blocked
 from tumortrack.plan.arms.strokes import Surroundings, leg, level_poses, passes
 from tumortrack.plan.arms.tracks import follow, solve
@@ -196,7 +196,11 @@ def _home(course: Course) -> Motions:
     if both.way_collides(both.joints_rad, home) is None:
         course.add(timing.together(both.joints_rad, home, course.cell.speeds_rad_s))
     else:
-        way = connect(both, home, course.rng)
+        cutter = course.situation(CUTTER)
+        tip = course.cell.tips(course.joints_rad)[CUTTER]
+        corners = [aside(cutter, tip, *by) for by in DETOURS_MM]
+        detours = [cutter.whole(corner)[None] for corner in corners if len(corner)]
+        way = connect(both, home, course.rng, detours)
         course.add(timing.along(way, course.cell.speeds_rad_s))
     course.close("home")
     return course.motions()

@@ -73,7 +73,8 @@ class Situation:
         step, so that what is free of collisions with that clearance at both ends is free between.
         """
         least_mm = min(self.cell.config.clearance_mm, self.cell.config.organ_clearance_mm)
-        moved_mm = float(np.abs(goal_rad - start_rad) @ self.cell.levers_mm[self.own])
+        levers_mm = self.cell.levers_mm(self.whole(start_rad), self.whole(goal_rad))
+        moved_mm = float(np.abs(goal_rad - start_rad) @ levers_mm[self.own])
         return int(np.ceil(moved_mm / (2 * least_mm * spacing)))
 
     def way_collides(
