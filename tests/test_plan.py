@@ -193,6 +193,29 @@ def test_only_kidney_is_cut_and_the_strokes_reach_beyond_it():
     assert max(gaps) < 25  # each begins on the side where the last one ended
 
 
+def test_order_and_direction_of_strokes_can_be_chosen():
+    down = plan_resection(located(), OURS)
+    up = plan_resection(located(), ResectionConfig(order="up"))
+    heights = [stroke.height_mm for stroke in up.cuts]
+    assert heights == sorted(heights)
+    assert [stroke.sweep for stroke in up.cuts] == sorted(stroke.sweep for stroke in up.cuts)
+    assert {round(s.length_mm, 6) for s in up.cuts} == {round(s.length_mm, 6) for s in down.cuts}
+    for direction, sign in (("anticlockwise", 1), ("clockwise", -1)):
+        plan = plan_resection(located(), ResectionConfig(direction=direction))
+        for stroke in plan.cuts:
+            arms = stroke.path_mm[:, :2] - TUMOR_MM[:2]
+            around = np.cross(arms[:-1], np.diff(arms, axis=0)).sum()
+            assert np.sign(around) == sign
+    walls = [stroke for stroke in down.cuts if stroke.kind == "wall"]
+    turns = [
+        np.sign(
+            np.cross(w.path_mm[:-1, :2] - TUMOR_MM[:2], np.diff(w.path_mm[:, :2], axis=0)).sum()
+        )
+        for w in walls
+    ]
+    assert turns == [turns[0] * (-1) ** n for n in range(len(turns))]  # to and fro
+
+
 def test_the_floor_is_cut_where_the_next_layer_is_smaller():
     plan = plan_resection(located(), ResectionConfig(stroke_mm=3.0))
     lowest = polygon_of(plan.layers[-1].rings_mm)
@@ -302,7 +325,7 @@ def test_a_turned_and_shifted_world_has_a_turned_and_shifted_plan(config):
 
 
 def test_nonsense_is_refused():
-    with pytest.raises(InputError, match="margin_mm is -1; allowed: 1 to 30"):
+    with pytest.raises(InputError, match="margin_mm is -1; allowed: 1 to 20"):
         ResectionConfig(margin_mm=-1)
     with pytest.raises(InputError, match="layer from 5 up to 5"):
         Layer(5.0, 5.0, ())

@@ -137,7 +137,7 @@ def test_a_film_is_an_animation(story, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["--margin", 40], "margin_mm is 40; allowed: 1 to 30"),
+        (["--margin", 40], "margin_mm is 40; allowed: 1 to 20"),
         (["--sigmas", 2], "does not say how unsure it is"),
         (["--tumor", "tumor_4"], "there is no 'tumor_4'; located were tumor_1"),
         (["--cell", "CELL"], "unknown field `legs`"),

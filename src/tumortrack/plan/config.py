@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError
 from tumortrack.plan.values import Method
 
 _ALLOWED = {
-    "margin_mm": (1.0, 30.0),
+    "margin_mm": (1.0, 20.0),
     "sigmas": (0.0, 10.0),
     "spacing_mm": (0.2, 10.0),
-    "layer_mm": (0.5, 20.0),
+    "layer_mm": (1.0, 20.0),
     "stroke_mm": (1.0, 30.0),
     "lead_mm": (0.0, 30.0),
     "least_exophytic": (0.0, 1.0),
     "most_healthy": (0.0, 1.0),
-    "most_margin_mm": (0.0, 60.0),
+    "most_margin_mm": (20.0, 60.0),
 }
 
 
@@ -31,6 +33,9 @@ class ResectionConfig(Config, frozen=True, kw_only=True):
         spacing_mm: between points of a stroke.
         layer_mm: height of a layer, where the method is ``margin``.
         stroke_mm: how wide a sheet one stroke of the horizontal instrument cuts.
+        order: of layers, from the top down or from the floor up.
+        direction: of strokes, seen from above; shortest: each from the end that is nearer to where
+            the one before ended.
         lead_mm: strokes begin and end so far outside the organ.
         least_exophytic: a tumor with a smaller share outside the organ's hull lies wholly inside.
         most_healthy: no plan takes more of the organ's healthy tissue, as a share.
@@ -44,6 +49,8 @@ class ResectionConfig(Config, frozen=True, kw_only=True):
     spacing_mm: float = 1.0
     layer_mm: float = 4.0
     stroke_mm: float = 6.0
+    order: Literal["down", "up"] = "down"
+    direction: Literal["shortest", "clockwise", "anticlockwise"] = "shortest"
     lead_mm: float = 5.0
     least_exophytic: float = 0.05
     most_healthy: float = 0.5

@@ -8,6 +8,7 @@ organ, and its floor by strokes side by side.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float, Float64
@@ -15,7 +16,7 @@ from jaxtyping import Float, Float64
 from tumortrack.core.errors import NoPlan
 from tumortrack.plan.config import ResectionConfig
 from tumortrack.plan.exophytic import name_of
-from tumortrack.plan.outline import arcs, evenly, polygon_of, polygons, rings_of
+from tumortrack.plan.outline import arcs, evenly, polygon_of, rings_of
 from tumortrack.plan.values import Cut, Layer, Located
 
 # Of outlines, which are interpolated; and one surface point in each cube of that size. Both finer
@@ -27,7 +28,6 @@ _COLUMN_MM = 2.0  # of the organ's upper and lower surface
 _SMOOTH_MM = 0.05  # outlines lose corners smaller than this
 _FAR_MM = 1e3
 _LEAST_MM2 = 1.0  # a smaller rest of a floor needs no stroke
-_MOST_LAYERS = 60
 
 
 def margin_plan(
@@ -41,13 +41,15 @@ def margin_plan(
     points, margins = grown_tumor(located, label, config)
     columns = Columns.of(located)
     layers = _layers(points, margins, columns, config.layer_mm)
+    below = (*layers[1:], None)
+    slabs = list(zip(layers, below, strict=True))
     cuts: list[Cut] = []
-    for number, layer in enumerate(layers):
-        below = layers[number + 1] if number + 1 < len(layers) else None
-        strokes = _strokes(layer, below, columns, config)
+    for layer, under in slabs if config.order == "down" else reversed(slabs):
+        strokes = _strokes(layer, under, columns, config)
         if strokes:
             sweep = cuts[-1].sweep + 1 if cuts else 1
-            cuts += _in_turn(strokes, sweep, cuts[-1].path_mm[-1] if cuts else None)
+            last = cuts[-1].path_mm[-1] if cuts else None
+            cuts += _in_turn(strokes, sweep, last, config.direction)
     if not cuts:
         raise NoPlan("the organ does not reach the tumor's margin; there is nothing to cut.")
     return layers, tuple(cuts), _grasp(located.of(label), columns)
@@ -80,6 +82,8 @@ def grown_tumor(
             f"{config.most_margin_mm:g} mm. Look from nearer, or uncover more of the organ."
         )
     size_mm = min(_THIN_MM, _THIN_SHARE * float(margins.min()))
+    widest_first = np.argsort(-margins, kind="stable")
+    points, margins = points[widest_first], margins[widest_first]  # of each cube, this one stays
     cube = np.floor(points / size_mm).astype(np.int64)
     cube -= cube.min(0)
     size = cube.max(0) + 1
@@ -156,7 +160,7 @@ def _layers(
     high = columns.at(np.concatenate(outermost))[1]
     if np.isnan(high).all():
         raise NoPlan("the organ does not reach the tumor's margin; there is nothing to cut.")
-    n = int(np.clip(np.ceil((np.nanmax(high) - floor) / layer_mm), 1, _MOST_LAYERS))
+    n = max(1, int(np.ceil((np.nanmax(high) - floor) / layer_mm)))
     bottoms = floor + (np.nanmax(high) - floor) / n * np.arange(n)
     tops = np.append(bottoms[1:], np.inf)
     outlines = [*_outlines(points, margins, tops[:-1]), outermost]
@@ -211,9 +215,8 @@ def _strokes(
         strokes += [_cut(line, z, "wall") for line in arcs(flat, there, lead)]
     inset = area.buffer(-config.stroke_mm, quad_segs=4)
     while inset.intersection(open_floor).area > _LEAST_MM2:
-        for piece in polygons(inset):
-            ring = np.array(piece.exterior.coords)
-            flat = evenly(ring, config.spacing_mm)[:-1]
+        for ring in rings_of(inset):
+            flat = evenly(np.concatenate([ring, ring[:1]]), config.spacing_mm)[:-1]
             there = shapely.contains_xy(open_floor, *flat.T) & columns.within(flat, z, z)
             strokes += [_cut(line, z, "floor") for line in arcs(flat, there, lead)]
         inset = inset.buffer(-config.stroke_mm, quad_segs=4)
@@ -225,24 +228,34 @@ def _cut(flat: Float[np.ndarray, "n 2"], z: float, kind: str) -> Cut:
     return Cut(1, path, "wall" if kind == "wall" else "floor")
 
 
-def _in_turn(strokes: list[Cut], sweep: int, last: Float[np.ndarray, " 3"] | None) -> list[Cut]:
-    """Walls first, then the floor; each stroke from the end that is nearer to where the one before
-    ended."""
+def _in_turn(
+    strokes: list[Cut],
+    sweep: int,
+    last: Float[np.ndarray, " 3"] | None,
+    direction: Literal["shortest", "clockwise", "anticlockwise"],
+) -> list[Cut]:
+    """Walls first, then the floor; each time the stroke that begins nearest to where the one before
+    ended. Outlines run anticlockwise, seen from above."""
+    ways = {"shortest": (1, -1), "clockwise": (-1,), "anticlockwise": (1,)}[direction]
     ordered = []
     for kind in ("wall", "floor"):
         left = [stroke for stroke in strokes if stroke.kind == kind]
         while left:
             gaps = [
-                (0.0 if last is None else float(np.linalg.norm(path[0] - last)), number, turned)
+                (0.0 if last is None else _gap_mm(stroke.path_mm[::way], last), number, -way)
                 for number, stroke in enumerate(left)
-                for turned, path in enumerate((stroke.path_mm, stroke.path_mm[::-1]))
+                for way in ways
             ]
             _, number, turned = min(gaps)
             stroke = left.pop(number)
-            path = stroke.path_mm[::-1] if turned else stroke.path_mm
+            path = stroke.path_mm[::-turned]
             ordered.append(Cut(sweep, path, stroke.kind))
             last = path[-1]
     return ordered
+
+
+def _gap_mm(path_mm: Float[np.ndarray, "n 3"], from_mm: Float[np.ndarray, " 3"]) -> float:
+    return float(np.linalg.norm(path_mm[0] - from_mm))
 
 
 def _grasp(tumor: Float[np.ndarray, "n 3"], columns: Columns) -> Float64[np.ndarray, " 3"]:

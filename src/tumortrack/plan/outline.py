@@ -101,10 +101,13 @@ def arcs(
 
 
 def rings_of(area: Any) -> tuple[Float64[np.ndarray, "n 2"], ...]:
-    """The outer rings of a polygon or several, first points not repeated, largest first."""
+    """The outer rings of a polygon or several, anticlockwise, first points not repeated, largest
+    first."""
+    from shapely.geometry.polygon import orient
+
     pieces = [p for p in polygons(area) if p.area >= _LEAST_MM2]
     pieces.sort(key=lambda piece: -piece.area)
-    return tuple(np.array(piece.exterior.coords)[:-1, :2] for piece in pieces)
+    return tuple(np.array(orient(piece).exterior.coords)[:-1, :2] for piece in pieces)
 
 
 def polygon_of(rings_mm: Iterable[Float[np.ndarray, "n 2"]]) -> Any:
