@@ -18,7 +18,8 @@ _YAWS = 24
 _PROBE_STEP = 3  # every so many points of a pass, directions are compared
 _TISSUE_BIN_MM = 3.0  # differences in cut tissue below this do not count
 _MOST_LEGS = 8  # of a pass
-_LONG_WAYS = 3  # directions for which a long way round is searched
+_FAR_RAD = 2.0  # the arm turns a joint farther than that only if nothing else is possible
+_LONG_WAYS = 4  # directions for which a long way round is searched
 # On the way elsewhere the tip may go back and up first, mm: what most often is free
 DETOURS_MM = ((60.0, 0.0), (0.0, 70.0), (60.0, 70.0), (0.0, 140.0))
 
@@ -42,22 +43,24 @@ def _cut_leg(course: Course, way_mm: np.ndarray, around: Surroundings) -> int:
     """The first leg, as long as it can be; returns the number of the point where it ended."""
     away, inside = course.situation(CUTTER, (HOLDER,)), course.situation(CUTTER, (CUTTER, HOLDER))
     reasons: list[Blocked] = []
-    later: list[tuple[Leg, np.ndarray]] = []
+    later: list[tuple[float, Leg, np.ndarray]] = []
     for yaw, last in _directions(way_mm, around, inside):
         one = leg(way_mm[: last + 1], yaw, around)
         try:
             path = follow(inside, one.poses)
+            turn = float(np.abs(path[0] - away.here_rad).max())
+            later.append((turn, one, path))
+            if turn > _FAR_RAD:
+                continue
             way = connect(away, path[0], detours=_detours(away, one))
         except Blocked as blocked:
             reasons.append(blocked)
-            if blocked.searchable:
-                later.append((one, path))
             continue
         _carry_out(course, one, way, path)
         return last
-    for one, path in later[:_LONG_WAYS]:
+    for _, one, path in sorted(later, key=lambda each: each[0])[:_LONG_WAYS]:
         try:
-            way = connect(away, path[0], course.rng)
+            way = connect(away, path[0], course.rng, _detours(away, one))
         except Blocked:
             continue
         _carry_out(course, one, way, path)

@@ -15,13 +15,11 @@ from tumortrack.plan.arms.cell import ARMS, Cell
 
 class Blocked(NoPlan):
     """This way can't be gone; perhaps another can. The text says where and why; ``pair``: who would
-    meet whom, if that is it; ``searchable``: a longer way round was not searched yet."""
+    meet whom, if that is it."""
 
-    def __init__(
-        self, text: str, pair: tuple[str, str] | None = None, searchable: bool = False
-    ) -> None:
+    def __init__(self, text: str, pair: tuple[str, str] | None = None) -> None:
         super().__init__(text)
-        self.pair, self.searchable = pair, searchable
+        self.pair = pair
 
 
 @dataclass(frozen=True, eq=False)

@@ -51,8 +51,7 @@ def connect(
         if path is not None:
             return path
     if rng is None:
-        text = f"{pair[0]} would meet {pair[1]} on the way"
-        raise Blocked(text, pair, searchable=True)
+        raise Blocked(f"{pair[0]} would meet {pair[1]} on the way", pair)
     for room in _ROOM_RAD:
         lower = np.maximum(np.minimum(start_rad, goal_rad) - room, -situation.limits_rad)
         upper = np.minimum(np.maximum(start_rad, goal_rad) + room, situation.limits_rad)
