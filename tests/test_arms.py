@@ -345,6 +345,13 @@ def test_arms_begin_anew_in_the_middle_of_a_cut(cell, motions):
     assert [stage.name for stage in only.stages] == ["release", "home"]
 
 
+def test_arms_at_home_stay_there(cell):
+    home = plan_home(cell, cell.organ, cell.home_rad)
+    assert home.seconds < 0.1
+    for stage in home.stages:
+        assert np.abs(stage.joints_rad - cell.home_rad).max() < 1e-9
+
+
 def test_starts_that_are_none_are_refused(cell):
     with pytest.raises(InputError, match="start_rad"):
         plan_motions(plan(), cell, cell.organ, from_sweep=1)

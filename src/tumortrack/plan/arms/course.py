@@ -42,7 +42,7 @@ class Course:
     ) -> None:
         """One arm along a path that begins where it is; its tip no faster than said."""
         situation = self.situation(arm)
-        if np.abs(path_rad[-1] - situation.here_rad).max() < 1e-9 and len(path_rad) < 3:
+        if np.ptp(path_rad, axis=0).max() < 1e-9:  # it is there
             return
         speeds = self.cell.speeds_rad_s[situation.own]
         if tip_mm_s is None:
