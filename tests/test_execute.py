@@ -11,14 +11,15 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
 from live_objects import small_update
-from plan_objects import RADIUS_MM, TUMOR_MM, located, sphere
+from plan_objects import MIDDLE_MM, RADIUS_MM, TUMOR_MM, located, sphere
 from tumortrack.core.errors import InputError, NoPlan
 from tumortrack.plan.config import ResectionConfig
 from tumortrack.plan.execute import ABORTED, DONE, Execution
 from tumortrack.plan.motions import JOINTS, Motions, Stage
-from tumortrack.plan.operation import Operation, OperationConfig, Planned
+from tumortrack.plan.operation import Operation, OperationConfig, Planned, Progress
 from tumortrack.plan.resection import plan_resection
 from tumortrack.track.live import Update
 
@@ -146,7 +147,7 @@ class World:
 
     def __init__(self, replan=None, config=None):
         self.seen = SEEN
-        self.planned = Planned(PLAN, self.seen.meshes["tumor_1"], motions())
+        self.planned = Planned(PLAN, self.seen.meshes, motions())
         self.calls = []
         self.made = replan or self.replan
         self.pool = ThreadPoolExecutor(1)
@@ -167,14 +168,15 @@ class World:
         }
         return replace(self.seen, points_mm=self.seen.points_mm + self.shift, meshes=meshes)
 
-    def begin(self, seen, joints_rad, sweep):
-        return self.pool.submit(self.made, seen, joints_rad, sweep)
+    def begin(self, update, joints_rad, progress):
+        return self.pool.submit(self.made, self.locate(update), joints_rad, progress)
 
-    def replan(self, seen, joints_rad, sweep):
+    def replan(self, seen, joints_rad, progress):
+        plan = plan_resection(seen, ResectionConfig(method="published"))
+        sweep = progress.first_sweep(plan, seen.meshes["tumor_1"])
         self.calls.append((seen.meshes["tumor_1"].box_mm.mean(0), sweep))
         states = STATES if sweep is None else STATES[STATES.index(f"sweep {sweep}") :]
-        plan = plan_resection(seen, ResectionConfig(method="published"))
-        return Planned(plan, seen.meshes["tumor_1"], motions(states, joints_rad))
+        return Planned(plan, seen.meshes, motions(states, joints_rad))
 
     def frame(self, seconds=FRAME_S, **changes):
         """One frame later; returns what sinks get of the arms."""
@@ -279,6 +281,60 @@ def test_a_tumor_that_moves_in_the_second_sweep_is_held_and_cut_on_from_there():
     world.until(DONE)
 
 
+def tilted(degrees):
+    turn = Rotation.from_euler("y", degrees, degrees=True).as_matrix()
+    seen = located(n=8_000)
+    move = lambda points: (points - MIDDLE_MM) @ turn.T + MIDDLE_MM + [0, 0, 4.0]  # noqa: E731
+    meshes = {name: mesh.moved(move(mesh.vertices_mm)) for name, mesh in seen.meshes.items()}
+    return replace(seen, points_mm=move(seen.points_mm), meshes=meshes)
+
+
+@pytest.mark.parametrize("degrees", [-25, 0, 25])
+def test_what_is_not_cut_yet_is_cut_in_whatever_sweeps_the_new_plan_has(degrees):
+    """Plans of the same tumor that lies otherwise have other numbers of layers."""
+    config = ResectionConfig(layer_mm=3.0)
+    first, second = (
+        plan_resection(located(n=8_000), config),
+        plan_resection(tilted(degrees), config),
+    )
+    before = located(n=8_000).meshes["tumor_1"].box_mm[0, 2]
+    tumor = tilted(degrees).meshes["tumor_1"]
+    after = tumor.box_mm[0, 2]
+    if degrees:
+        assert first.sweeps != second.sweeps
+    for sweep in range(1, first.sweeps + 1):
+        done = [cut.height_mm - before for cut in first.cuts if cut.sweep < sweep]
+        progress = Progress(True, min(done) if done else None)
+        begin = progress.first_sweep(second, tumor)
+        assert 1 <= begin <= second.sweeps
+        skipped = [cut.height_mm - after for cut in second.cuts if cut.sweep < begin]
+        if done:
+            assert all(
+                height >= min(done) - 0.21 for height in skipped
+            )  # nothing deeper is left out
+        else:
+            assert not skipped
+    assert Progress().first_sweep(second, tumor) is None
+
+
+def test_after_the_last_sweep_no_estimate_is_needed_any_more():
+    world = World()
+    world.until("release")
+    assert world.frame(**NO_ESTIMATE).halted == ""
+    world.until(DONE, **NO_ESTIMATE)
+
+
+def test_another_part_that_moved_far_halts_the_arms_too():
+    world = World()
+    world.until("approach")
+    kidney = world.seen.meshes["kidney"]
+    world.seen = replace(
+        world.seen,
+        meshes={**world.seen.meshes, "kidney": kidney.moved(kidney.vertices_mm + [0, 0, 5.0])},
+    )
+    assert world.frames(2).halted == "kidney has moved by 5.0 mm"
+
+
 def test_a_tumor_that_keeps_moving_is_waited_for_and_its_return_is_enough():
     world = World()
     world.until("approach")
@@ -301,7 +357,7 @@ def test_after_the_last_sweep_the_tumor_may_go():
 
 
 def test_where_no_new_plan_can_be_made_the_arms_stop_for_good_and_say_why():
-    def refuses(seen, joints_rad, sweep):
+    def refuses(seen, joints_rad, progress):
         raise NoPlan("the holder can't reach it")
 
     world = World(refuses)
@@ -321,7 +377,7 @@ def test_where_no_new_plan_can_be_made_the_arms_stop_for_good_and_say_why():
 def test_while_it_is_planned_the_loop_goes_on():
     gate = threading.Event()
 
-    def slow(seen, joints_rad, sweep):
+    def slow(seen, joints_rad, progress):
         gate.wait(10)
         raise NoPlan("never mind")
 
@@ -369,11 +425,12 @@ def test_what_is_cut_already_is_told_from_what_is_not():
     assert np.array_equal(cell.lines[0].points_mm, world.planned.plan.cuts[0].path_mm)
 
 
-def test_a_surface_of_other_triangles_is_compared_by_its_middle():
+def test_surfaces_of_other_triangles_are_compared_by_their_distance():
     from tumortrack.plan.operation import apart_mm
 
     a, b = sphere(TUMOR_MM, RADIUS_MM), sphere(TUMOR_MM + [3.0, 4.0, 0.0], RADIUS_MM, finer=3)
-    assert apart_mm(a, b) == pytest.approx(5.0, abs=0.1)
+    assert 2.0 < apart_mm(a, b) < 5.0  # between the surfaces, some of which slide
+    assert apart_mm(a, sphere(TUMOR_MM, RADIUS_MM, finer=3)) < 0.7
     assert apart_mm(a, a.moved(a.vertices_mm + [0, 0, 2.0])) == pytest.approx(2.0)
 
 

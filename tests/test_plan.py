@@ -193,6 +193,12 @@ def test_only_kidney_is_cut_and_the_strokes_reach_beyond_it():
     assert max(gaps) < 25  # each begins on the side where the last one ended
 
 
+def turn_of(stroke):
+    """1: anticlockwise about the tumor, seen from above."""
+    x, y = (stroke.path_mm[:, :2] - TUMOR_MM[:2]).T
+    return np.sign((x[:-1] * np.diff(y) - y[:-1] * np.diff(x)).sum())
+
+
 def test_order_and_direction_of_strokes_can_be_chosen():
     down = plan_resection(located(), OURS)
     up = plan_resection(located(), ResectionConfig(order="up"))
@@ -203,16 +209,9 @@ def test_order_and_direction_of_strokes_can_be_chosen():
     for direction, sign in (("anticlockwise", 1), ("clockwise", -1)):
         plan = plan_resection(located(), ResectionConfig(direction=direction))
         for stroke in plan.cuts:
-            arms = stroke.path_mm[:, :2] - TUMOR_MM[:2]
-            around = np.cross(arms[:-1], np.diff(arms, axis=0)).sum()
-            assert np.sign(around) == sign
+            assert turn_of(stroke) == sign
     walls = [stroke for stroke in down.cuts if stroke.kind == "wall"]
-    turns = [
-        np.sign(
-            np.cross(w.path_mm[:-1, :2] - TUMOR_MM[:2], np.diff(w.path_mm[:, :2], axis=0)).sum()
-        )
-        for w in walls
-    ]
+    turns = [turn_of(wall) for wall in walls]
     assert turns == [turns[0] * (-1) ** n for n in range(len(turns))]  # to and fro
 
 

@@ -138,6 +138,8 @@ def test_a_film_is_an_animation(story, tmp_path):
     ("arguments", "said"),
     [
         (["--margin", 40], "margin_mm is 40; allowed: 1 to 20"),
+        (["--config", "CONFIG"], "unknown field `margn`"),
+        (["--frame", "UP"], "the camera looks up in this frame"),
         (["--sigmas", 2], "does not say how unsure it is"),
         (["--tumor", "tumor_4"], "there is no 'tumor_4'; located were tumor_1"),
         (["--cell", "CELL"], "unknown field `legs`"),
@@ -150,7 +152,12 @@ def test_what_cannot_be_planned_is_said_in_one_line_and_nothing_is_written(
     folder, _ = story
     (tmp_path / "CELL").write_text('{"legs": 4}')
     (tmp_path / "FRAME").write_text('{"frame_id": "base", "unit": "mm"}')
-    arguments = [tmp_path / a if a in ("CELL", "FRAME") else a for a in arguments]
+    (tmp_path / "CONFIG").write_text('{"margn": 4}')
+    rows = np.eye(4).tolist()
+    (tmp_path / "UP").write_text(
+        json.dumps({"frame_id": "base", "unit": "mm", "robot_from_camera": rows})
+    )
+    arguments = [tmp_path / a if str(a).isupper() else a for a in arguments]
     done = tumortrack("plan", folder / "run", tmp_path / "plan", *arguments)
     assert said in refusal(done)
     assert not (tmp_path / "plan").exists()

@@ -275,10 +275,11 @@ def plan(
     plan: Positional[Path],
     /,
     *,
-    method: Literal["margin", "published"] = "margin",
-    tumor: str = "",
-    margin: float = 5.0,
-    sigmas: float = 0.0,
+    method: Literal["margin", "published"] | None = None,
+    tumor: str | None = None,
+    margin: float | None = None,
+    sigmas: float | None = None,
+    config: Path | None = None,
     frame: Path | None = None,
     stand: float | None = None,
     cell: Path | None = None,
@@ -290,10 +291,13 @@ def plan(
     Args:
         run: folder that `locate` wrote.
         plan: folder to write: plan.json, strokes.ply, plan.png, motions, the cell as URDF.
-        method: margin keeps the margin in all directions; published is the paper's planner.
+        method: margin (default) keeps the margin in all directions; published is the paper's
+            planner.
         tumor: which one (tumor_1, ...; default: the one that lies farthest out of the organ).
-        margin: least distance between tumor and cut in mm.
-        sigmas: add so many standard deviations of the estimate's own uncertainty to the margin.
+        margin: least distance between tumor and cut in mm (default 5).
+        sigmas: add so many standard deviations of the estimate's own uncertainty to the margin
+            (default 0).
+        config: JSON file with these and all other choices of the planner (docs/resection.md).
         frame: JSON file that says where the camera is; the plan is then in the robot's frame, whose
             z must point up. Without, the camera looks straight down.
         stand: height of the organ's lowest point over the table in mm, where no frame is given.
@@ -302,10 +306,10 @@ def plan(
         overwrite: replace PLAN if it exists.
     """
     from tumortrack.app import planning
-    from tumortrack.plan.config import ResectionConfig
 
-    config = ResectionConfig(method=method, tumor=tumor, margin_mm=margin, sigmas=sigmas)
-    planning.plan(run, plan, config, planning.PlanOptions(frame, stand, cell, arms, overwrite))
+    given = {"method": method, "tumor": tumor, "margin_mm": margin, "sigmas": sigmas}
+    choices = planning.choices(config, {k: v for k, v in given.items() if v is not None})
+    planning.plan(run, plan, choices, planning.PlanOptions(frame, stand, cell, arms, overwrite))
 
 
 def resect(
@@ -314,6 +318,10 @@ def resect(
     /,
     *,
     live: tuple[Path, str] | None = None,
+    range: tuple[float, float] | None = None,
+    box: tuple[float, float, float, float, float, float] | None = None,
+    whole: bool = False,
+    intrinsics: Path | None = None,
     speed: float = 1.0,
     moved: float = 2.0,
     film: Path | None = None,
@@ -328,6 +336,10 @@ def resect(
             says what it would do unless told execute=true.
         live: MODEL SOURCE: follow the organ meanwhile, as `track` does. Arms stand while there is
             no good estimate, and it is planned anew where the tumor has moved.
+        range: of depths, as in `track`.
+        box: as in `track`.
+        whole: as in `track`.
+        intrinsics: as in `track`.
         speed: of the arms' time; 2 is twice as fast.
         moved: the tumor has moved if its surface has by so many mm (root mean square).
         film: write an animated GIF of the stored plan instead.
@@ -336,7 +348,13 @@ def resect(
     """
     from tumortrack.app import resection
 
-    resection.resect(plan, sinks, resection.ResectOptions(live, speed, moved, film, report, device))
+    resection.resect(
+        plan,
+        sinks,
+        resection.ResectOptions(
+            live, range, box, whole, intrinsics, speed, moved, film, report, device
+        ),
+    )
 
 
 def simulate(

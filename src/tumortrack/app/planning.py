@@ -10,9 +10,12 @@ from typing import TYPE_CHECKING
 from tumortrack.app.console import say
 from tumortrack.core import store
 from tumortrack.core.config import from_builtins, to_builtins
-from tumortrack.core.errors import NoPlan
+from tumortrack.core.errors import InputError, NoPlan
 
 if TYPE_CHECKING:
+    import numpy as np
+    from jaxtyping import Float64
+
     from tumortrack.core.types import Mesh
     from tumortrack.plan.arms.config import CellConfig
     from tumortrack.plan.config import ResectionConfig
@@ -26,6 +29,14 @@ class PlanOptions:
     cell: Path | None = None
     arms: bool = True
     overwrite: bool = False
+
+
+def choices(file: Path | None, given: dict) -> ResectionConfig:
+    """What the file says, and over that what was given on the command line."""
+    from tumortrack.plan.config import ResectionConfig
+
+    written = {} if file is None else store.read_json(file)
+    return from_builtins({**written, **given}, ResectionConfig, str(file or "options"))
 
 
 def plan(run_folder: Path, folder: Path, config: ResectionConfig, options: PlanOptions) -> None:
@@ -43,15 +54,16 @@ def plan(run_folder: Path, folder: Path, config: ResectionConfig, options: PlanO
 
         frames = read_frames(options.frame)
         frame_id, table_from_camera = frames.frame_id, frames.published_from_camera
+        _check_up(options.frame, table_from_camera)
     else:
         kidney = run.meshes.get("kidney")
         points_mm = run.cloud.points_mm if kidney is None else kidney.vertices_mm
         frame_id, table_from_camera = "table", table_below(points_mm, cell_config.stand_mm)
     located = run.located(table_from_camera)
-    start = time.perf_counter()
+    if options.arms:
+        organ_of(located)
     resection = plan_resection(located, config)
-    seconds = time.perf_counter() - start
-    _tell(resection, seconds)
+    _tell(resection)
     motions, cell_used = None, None
     if options.arms:
         from tumortrack.plan.arms.bases import search_bases
@@ -66,7 +78,14 @@ def plan(run_folder: Path, folder: Path, config: ResectionConfig, options: PlanO
         if moved:
             say(f"note: {moved}")
     content = PlanFolder(
-        resection, config, table_from_camera, frame_id, located.meshes, cell_used, motions
+        resection,
+        config,
+        table_from_camera,
+        frame_id,
+        located.meshes,
+        cell_used,
+        motions,
+        _case_of(run_folder),
     )
 
     def pictures(aside: Path) -> None:
@@ -105,13 +124,26 @@ def organ_of(located: Located) -> Mesh:
     return located.meshes["kidney"]
 
 
-def _tell(resection: ResectionPlan, seconds: float) -> None:
+def _check_up(file: Path, table_from_camera: Float64[np.ndarray, "4 4"]) -> None:
+    """Cuts are planned from above: the camera must look down in the frame that is given."""
+    if table_from_camera[2, 2] >= 0:
+        raise InputError(
+            f"{file}: the camera looks up in this frame (its z axis does not point up, against "
+            "gravity), so 'above' would be behind the organ. Give a frame whose z points up."
+        )
+
+
+def _case_of(run_folder: Path) -> str:
+    model = store.read_json(run_folder / "report.json").get("model")
+    return str(model.get("case_sha256", "")) if isinstance(model, dict) else ""
+
+
+def _tell(resection: ResectionPlan) -> None:
     volumes = resection.volumes_ml
     say(
         f"{resection.tumor} ({volumes['tumor']:.1f} ml, {resection.exophytic:.0%} outside the "
         f"organ's hull): {len(resection.cuts)} strokes in {resection.sweeps} sweeps, "
-        f"{sum(cut.length_mm for cut in resection.cuts):.0f} mm; planned in {1000 * seconds:.0f} "
-        "ms."
+        f"{sum(cut.length_mm for cut in resection.cuts):.0f} mm."
     )
     say(
         f"margin {resection.margin_mm:g} mm; {volumes['piece']:.1f} ml come away, of that "

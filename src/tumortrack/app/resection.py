@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack
@@ -14,20 +15,22 @@ import numpy as np
 from tumortrack.app.console import progress_bar, say
 from tumortrack.core import store
 from tumortrack.core.config import from_builtins, to_builtins
-from tumortrack.core.errors import InputError, NoPlan
+from tumortrack.core.errors import Aborted, InputError, StorageError
 
 if TYPE_CHECKING:
     from jaxtyping import Float64
 
     from tumortrack.plan.arms.cell import Cell
     from tumortrack.plan.files import PlanFolder
-    from tumortrack.plan.operation import Operation, OperationConfig, Planned
+    from tumortrack.plan.operation import Operation, OperationConfig, Planned, Progress
     from tumortrack.plan.values import Located
     from tumortrack.track.live import Shape, Update, Workcell
+    from tumortrack.track.outlet import Outlet
 
     Sinks = tuple[str, ...]
 
 _FPS = 30.0  # of an execution that no camera drives
+_STOPPED = "stopped by the user"
 _NOTHING = "virtual execution of a stored plan: nothing is tracked"
 _FILM_FPS, _FILM_FRAMES = 10, 120
 _FILM_STEP_S = 0.1
@@ -36,6 +39,10 @@ _FILM_STEP_S = 0.1
 @dataclass(frozen=True)
 class ResectOptions:
     live: tuple[Path, str] | None = None
+    range_mm: tuple[float, float] | None = None
+    box_mm: tuple[float, float, float, float, float, float] | None = None
+    whole: bool = False
+    intrinsics: Path | None = None
     speed: float = 1.0
     moved_mm: float = 2.0
     film: Path | None = None
@@ -50,11 +57,14 @@ def resect(plan_folder: Path, sinks: tuple[str, ...], options: ResectOptions) ->
     from tumortrack.plan.arms.config import CellConfig
     from tumortrack.plan.files import read_plan
     from tumortrack.plan.operation import OperationConfig
+    from tumortrack.track.sinks.ur import Ur
 
     stored = read_plan(plan_folder)
     if stored.motions is None or stored.cell is None:
         raise InputError(f"{plan_folder} was planned with --no-arms; plan again without it.")
-    parse_sinks(sinks)  # a wrong one is said before anything heavy is loaded
+    # A wrong one is said before anything heavy is loaded.
+    if options.speed > 1 and any(isinstance(s, Ur) and s.execute for s in parse_sinks(sinks)):
+        raise InputError(f"--speed {options.speed:g} with real arms; allowed: up to 1.")
     config = OperationConfig(speed=options.speed, moved_mm=options.moved_mm)
     where = str(plan_folder)
     cell = Cell(from_builtins(stored.cell, CellConfig, where), stored.meshes.get("kidney"))
@@ -72,10 +82,13 @@ def _operation(stored: PlanFolder, cell: Cell, config: OperationConfig, **live: 
     from tumortrack.plan.operation import Operation, Planned
 
     assert stored.motions is not None
-    tumor = stored.meshes.get(stored.plan.tumor)
-    if tumor is None:
-        raise InputError(f"the plan lacks {stored.plan.tumor}.ply; plan again.")
-    return Operation(Planned(stored.plan, tumor, stored.motions), config, cell.shapes, **live)
+    if stored.plan.tumor not in stored.meshes:
+        raise InputError(
+            f"the plan lacks {stored.plan.tumor}.ply: it was made on a run without surfaces. "
+            "Plan on one that `locate` wrote."
+        )
+    planned = Planned(stored.plan, stored.meshes, stored.motions)
+    return Operation(planned, config, cell.shapes, **live)
 
 
 def _live(
@@ -93,9 +106,10 @@ def _live(
     from tumortrack.track.live import Frames
 
     assert options.live is not None
-    unsure = stored.config.sigmas > 0
+    model, source = options.live
+    _check_case(stored, model)
 
-    def locate(update: Update) -> Located:
+    def locate(update: Update, unsure: bool = False) -> Located:
         estimate = update.estimate
         assert estimate is not None
         motion = estimate.motion if unsure else None
@@ -108,19 +122,41 @@ def _live(
     ) as planner:
 
         def replan(
-            seen: Located, joints_rad: Float64[np.ndarray, " 12"], sweep: int | None
+            update: Update, joints_rad: Float64[np.ndarray, " 12"], progress: Progress
         ) -> Future[Planned]:
-            return planner.submit(plan_anew, seen, joints_rad, sweep)
+            seen = locate(update, unsure=stored.config.sigmas > 0)
+            return planner.submit(plan_anew, seen, joints_rad, progress)
 
         say("making ready to plan anew ...")
-        planner.submit(ready).result()
+        # The process that begins here does not hear of Ctrl-C: that is the live loop's affair.
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+        begun = planner.submit(ready)
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        begun.result()
         operation = _operation(stored, cell, config, locate=locate, replan=replan)
         frames = Frames(stored.frame_id, stored.table_from_camera)
         arms = Arms(operation, frames, {"plan_config": to_builtins(config)})
-        model, source = options.live
-        following = TrackOptions(report=options.report, device=options.device)
+        following = TrackOptions(
+            range_mm=options.range_mm,
+            box_mm=options.box_mm,
+            whole=options.whole,
+            intrinsics=options.intrinsics,
+            report=options.report,
+            device=options.device,
+        )
         track(model, source, sinks, following, arms)
     _tell_end(operation)
+
+
+def _check_case(stored: PlanFolder, model: Path) -> None:
+    """Another patient's model would find another patient's tumor."""
+    manifest = store.read_json(model / store.MANIFEST) if model.is_dir() else {}
+    case = manifest.get("provenance", {}).get("case_sha256", "")
+    if stored.case_sha256 and case and case != stored.case_sha256:
+        raise InputError(
+            f"{model} was trained for another case than the one that was planned on. Give a model "
+            "of that case, or plan on what this model locates."
+        )
 
 
 def _virtual(
@@ -137,18 +173,23 @@ def _virtual(
     frames = Frames(stored.frame_id, stored.table_from_camera)
     controls = Controls()
     setting = Setting(tuple(stored.meshes), frames, None, controls, arms=True)
+    outlets: list[Outlet] = []
     with ExitStack() as stack:
-        stack.enter_context(stopping(lambda: operation.abort("stopped by Ctrl-C")))
+        stack.enter_context(stopping(lambda: operation.abort(_STOPPED)))
         outlets = open_sinks(sinks, parse_sinks(sinks), setting, stack)
         say(f"{stored.motions.seconds / config.speed:.0f} s in frame {frames.frame_id!r}; "
             "Ctrl-C stops the arms.")  # fmt: skip
+        errors: dict[str, str] = {}
         said, sequence, next_s = "", 0, time.monotonic()
         while True:
             if controls.aborted.is_set():
-                operation.abort("aborted by the user")
+                operation.abort("stopped by the viewer, or a real arm gave up")
             update = operation.act(Update(sequence, time.time_ns(), reason=_NOTHING, frames=frames))
             for outlet in outlets:
                 outlet.put(update)
+                if outlet.failing and errors.get(outlet.name) != outlet.error:
+                    errors[outlet.name] = outlet.error
+                    say(f"sink {outlet.name}: {outlet.error}")
             said = _say_state(update.workcell, said)
             if operation.ended:
                 break
@@ -156,8 +197,10 @@ def _virtual(
             next_s += 1 / _FPS
             time.sleep(max(0.0, next_s - time.monotonic()))
     _write_report(report, stored, operation, {outlet.name: outlet.summary() for outlet in outlets})
-    _tell_end(operation)
     say(f"written to {report}.")
+    _tell_end(operation)
+    if lost := [outlet for outlet in outlets if outlet.unclosed]:
+        raise StorageError(f"sink {lost[0].name} did not end well: {lost[0].error}.")
 
 
 def _organ_shapes(stored: PlanFolder) -> tuple[Shape, ...]:
@@ -199,7 +242,9 @@ def _tell_end(operation: Operation) -> None:
     if found["state"] == "done":
         say("done: both arms are home.")
         return
-    raise NoPlan(f"the resection did not end: {found['state']}, {found['halted']}.")
+    if found["halted"] in (_STOPPED, "tracking has ended"):
+        raise KeyboardInterrupt
+    raise Aborted(f"the resection was {found['state']}: {found['halted']}.")
 
 
 def _film(stored: PlanFolder, cell: Cell, path: Path) -> None:

@@ -35,6 +35,12 @@ class NoPlan(TumortrackError):
     exit_code = 3
 
 
+class Aborted(TumortrackError):
+    """Arms were stopped for good before they had ended, and why."""
+
+    exit_code = 3
+
+
 class StorageError(TumortrackError):
     """The disk refused a write; what was there before is still whole."""
 

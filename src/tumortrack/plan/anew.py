@@ -12,7 +12,7 @@ from tumortrack.plan.arms.cell import Cell
 from tumortrack.plan.arms.config import CellConfig
 from tumortrack.plan.arms.procedure import plan_motions
 from tumortrack.plan.config import ResectionConfig
-from tumortrack.plan.operation import Planned
+from tumortrack.plan.operation import Planned, Progress
 from tumortrack.plan.resection import plan_resection
 from tumortrack.plan.values import Located
 
@@ -29,7 +29,7 @@ def ready() -> None:
     """Returns when the process has begun."""
 
 
-def plan_anew(seen: Located, joints_rad: Float64[np.ndarray, " 12"], sweep: int | None) -> Planned:
+def plan_anew(seen: Located, joints_rad: Float64[np.ndarray, " 12"], progress: Progress) -> Planned:
     """The plan for the organ as it lies now, from where the arms are; see ``plan_motions``.
 
     Raises:
@@ -41,6 +41,10 @@ def plan_anew(seen: Located, joints_rad: Float64[np.ndarray, " 12"], sweep: int 
     if organ is None:
         raise NoPlan("the organ's surface was not found")
     motions = plan_motions(
-        resection, cell.with_organ(organ), organ, start_rad=joints_rad, from_sweep=sweep
+        resection,
+        cell.with_organ(organ),
+        organ,
+        start_rad=joints_rad,
+        from_sweep=progress.first_sweep(resection, seen.meshes[resection.tumor]),
     )
-    return Planned(resection, seen.meshes[resection.tumor], motions)
+    return Planned(resection, seen.meshes, motions)

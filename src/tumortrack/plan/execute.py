@@ -88,9 +88,10 @@ class Execution:
             self._reason = reason
 
     def abort(self, reason: str) -> None:
-        """Slow down and stand, and never go on."""
-        self.halt(reason)
-        self._aborted = True
+        """Slow down and stand, and never go on. Nothing, where it has ended anyway."""
+        if not self._over:
+            self.halt(reason)
+            self._aborted = True
 
     def replace(self, motions: Motions) -> None:
         """Go on with other motions, which begin where the arms stand now.

@@ -16,7 +16,7 @@ from jaxtyping import Float64
 
 from tumortrack.core import store
 from tumortrack.core.config import from_builtins, to_builtins
-from tumortrack.core.errors import ArtifactError
+from tumortrack.core.errors import ArtifactError, InputError
 from tumortrack.core.mesh_files import read_mesh, write_mesh
 from tumortrack.core.types import Mesh
 from tumortrack.plan.config import ResectionConfig
@@ -31,7 +31,8 @@ _NAME, _STROKES, _MOTIONS = "plan.json", "strokes.ply", "motions.safetensors"
 @dataclass(frozen=True, eq=False)
 class PlanFolder:
     """What a plan's folder holds. ``cell``: the configuration of table and arms that the motions
-    are for, as JSON would give it; motions and cell are None where no arms were planned."""
+    are for, as JSON would give it; motions and cell are None where no arms were planned.
+    ``case_sha256``: of the case that the organ was located by; empty where nobody said."""
 
     plan: ResectionPlan
     config: ResectionConfig
@@ -40,6 +41,7 @@ class PlanFolder:
     meshes: dict[str, Mesh]
     cell: dict | None = None
     motions: Motions | None = None
+    case_sha256: str = ""
 
 
 def write_plan(
@@ -62,6 +64,7 @@ def write_plan(
             "frame_id": content.frame_id,
             "table_from_camera": content.table_from_camera.tolist(),
             "config": to_builtins(content.config),
+            "case_sha256": content.case_sha256,
             "plan": as_builtins(plan),
             "cell": content.cell,
             "seconds": None if content.motions is None else content.motions.seconds,
@@ -94,7 +97,8 @@ def read_plan(folder: Path) -> PlanFolder:
         table_from_camera = np.array(data["table_from_camera"], float)
         frame_id, cell = str(data["frame_id"]), data["cell"]
         config = from_builtins(data["config"], ResectionConfig, str(folder / _NAME))
-    except (KeyError, TypeError, ValueError) as error:
+        case_sha256 = str(data["case_sha256"])
+    except (KeyError, TypeError, ValueError, InputError) as error:
         raise ArtifactError(f"{folder / _NAME} lacks or spoils {error}; plan again.") from error
     surfaces = [Path(name).stem for name in manifest["files"] if name.endswith(".ply")]
     meshes = {
@@ -102,7 +106,7 @@ def read_plan(folder: Path) -> PlanFolder:
     }
     path = folder / _MOTIONS
     motions = _read_motions(path) if path.is_file() else None
-    return PlanFolder(plan, config, table_from_camera, frame_id, meshes, cell, motions)
+    return PlanFolder(plan, config, table_from_camera, frame_id, meshes, cell, motions, case_sha256)
 
 
 def as_builtins(plan: ResectionPlan) -> dict[str, Any]:

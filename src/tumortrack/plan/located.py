@@ -14,8 +14,8 @@ from tumortrack.core.errors import ArtifactError, InputError
 from tumortrack.core.geometry import rigid, transform_points
 from tumortrack.core.mesh_files import read_mesh
 from tumortrack.core.motion import Motion
-from tumortrack.core.store import read_manifest
-from tumortrack.core.types import Mesh, OccupancyCloud
+from tumortrack.core.store import read_json, read_manifest
+from tumortrack.core.types import Mesh, OccupancyCloud, part_names
 from tumortrack.plan.values import Located
 from tumortrack.sense.ply import parse_ply_properties
 
@@ -94,10 +94,24 @@ def read_run(folder: Path) -> Run:
         table = parse_ply_properties(content, str(path), ("x", "y", "z", "label", "probability"))
     except (OSError, InputError) as error:
         raise ArtifactError(f"{folder} is no run that can be planned on: {error}") from error
-    cloud = OccupancyCloud(table[:, :3], table[:, 3], table[:, 4])
+    report = read_json(folder / "report.json")
+    stamp_ns = report.get("stamp_ns", 0)
+    cloud = OccupancyCloud(
+        table[:, :3], table[:, 3], table[:, 4], stamp_ns if isinstance(stamp_ns, int) else 0
+    )
     names = [f.removesuffix(".ply") for f in manifest["files"] if f.endswith(".ply")]
     meshes = {name: read_mesh(folder / f"{name}.ply") for name in names if name != path.stem}
+    if meshes and (lacking := _lacking(cloud, meshes)):
+        raise ArtifactError(
+            f"{folder} has points of {', '.join(lacking)} and no {lacking[0]}.ply; locate again."
+        )
     return Run(cloud, meshes, _deviations(content, str(path)))
+
+
+def _lacking(cloud: OccupancyCloud, meshes: Mapping[str, Mesh]) -> list[str]:
+    labels = np.unique(cloud.labels)
+    names = part_names(int(labels.max(initial=0)))
+    return [names[label - 1] for label in labels if label and names[label - 1] not in meshes]
 
 
 def _deviations(content: bytes, name: str) -> Float64[np.ndarray, " n"] | None:

@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from concurrent.futures import Future
 from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float64
+from scipy.spatial import cKDTree
 
 from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError, TumortrackError
@@ -27,6 +28,9 @@ Colour = tuple[int, int, int]
 TO_CUT: Colour = (0, 120, 240)
 NOW: Colour = (255, 90, 30)
 CUT: Colour = (120, 40, 40)
+_SAME_MM = 0.2  # of heights
+_OTHERS = 2.0  # other parts may have moved so many times as far as the tumor
+_COMPARED = 500  # points of surfaces whose triangles differ
 _BLIND_S = 0.2  # without an update for longer, the arms halt by themselves
 
 
@@ -50,15 +54,42 @@ class OperationConfig(Config, frozen=True, kw_only=True):
 
 @dataclass(frozen=True, eq=False)
 class Planned:
-    """A plan, what it was made for (table frame), and the motions."""
+    """A plan, the surfaces it was made for (table frame), and the motions."""
 
     plan: ResectionPlan
-    tumor: Mesh
+    meshes: Mapping[str, Mesh]
     motions: Motions
 
+    @property
+    def tumor(self) -> Mesh:
+        return self.meshes[self.plan.tumor]
 
-# What was located, the arms' joints, and the sweep to begin with (None: from the approach)
-Replan = Callable[[Located, Float64[np.ndarray, " 12"], int | None], "Future[Planned]"]
+
+@dataclass(frozen=True)
+class Progress:
+    """How far a plan was carried out: whether the grasper holds, and the height of the last sweep
+    that was finished over the tumor's lowest point (None: none was)."""
+
+    holds: bool = False
+    done_mm: float | None = None
+
+    def first_sweep(self, planned: ResectionPlan, tumor: Mesh) -> int | None:
+        """With which sweep another plan goes on: the first that is not above what was finished,
+        and never past the last; None: from the approach.
+
+        Sweeps are not the same from plan to plan, and so are told apart by their height.
+        """
+        if not self.holds:
+            return None
+        if self.done_mm is None:
+            return 1
+        low = float(tumor.box_mm[0, 2])
+        left = {cut.sweep for cut in planned.cuts if cut.height_mm - low < self.done_mm - _SAME_MM}
+        return min(left, default=planned.sweeps)
+
+
+# The estimate to plan on, the arms' joints, and how far they came
+Replan = Callable[[Update, Float64[np.ndarray, " 12"], Progress], "Future[Planned]"]
 Locate = Callable[[Update], Located]
 Draw = Callable[[Float64[np.ndarray, " 12"]], tuple[Shape, ...]]
 
@@ -109,6 +140,16 @@ class Operation:
         """In the order of ``motions.JOINTS``."""
         return self._execution.joints_rad
 
+    @property
+    def progress(self) -> Progress:
+        """How far it came."""
+        if not self._execution.holds:
+            return Progress()
+        done = [c.height_mm for c in self._planned.plan.cuts if c.sweep < self._execution.sweep]
+        if not done:
+            return Progress(holds=True)
+        return Progress(True, min(done) - float(self._planned.tumor.box_mm[0, 2]))
+
     def act(self, update: Update, now_s: float | None = None) -> Update:
         """The update with what the arms do now. ``now_s``: a steady clock's time."""
         now_s = time.monotonic() if now_s is None else now_s
@@ -158,10 +199,10 @@ class Operation:
         execution = self._execution
         if self._work is not None:
             self._take_work(now_s)
-        if self._locate is None or execution.ended or execution.state == ABORTED:
-            execution.go()
-            return
-        if update.estimate is None:
+        over = execution.ended or execution.state == ABORTED
+        if self._locate is None or over or execution.sweep > self._planned.plan.sweeps:
+            execution.go()  # nothing is looked at, nothing moves any more, or it is cut out
+        elif update.estimate is None:
             self._settled = None
             execution.halt(f"no estimate: {update.reason}")
         elif update.quality != "good":
@@ -169,34 +210,47 @@ class Operation:
             execution.halt(f"{update.quality} estimate: {update.warning}")
         elif self._work is not None:
             execution.halt("planning anew")
-        elif execution.sweep > self._planned.plan.sweeps:
-            execution.go()  # it is cut out
         else:
-            self._compare(self._locate(update), now_s)
+            self._compare(update, self._locate(update), now_s)
 
-    def _compare(self, located: Located, now_s: float) -> None:
+    def _compare(self, update: Update, located: Located, now_s: float) -> None:
         execution, config = self._execution, self._config
-        tumor = located.meshes.get(self._planned.plan.tumor)
+        name = self._planned.plan.tumor
+        tumor = located.meshes.get(name)
         if tumor is None:
-            execution.halt(f"{self._planned.plan.tumor} was not found")
+            self._settled = None
+            execution.halt(f"{name} was not found")
             return
-        moved_mm = apart_mm(tumor, self._planned.tumor)
-        if moved_mm <= config.moved_mm:
+        moved = [
+            (apart_mm(located.meshes[part], mesh), part)
+            for part, mesh in self._planned.meshes.items()
+            if part in located.meshes
+        ]
+        far = [
+            (off_mm, part)
+            for off_mm, part in moved
+            if off_mm > config.moved_mm * (1.0 if part == name else _OTHERS)
+        ]
+        if not far:
             self._settled = None
             execution.go()
             return
-        execution.halt(f"{self._planned.plan.tumor} has moved by {moved_mm:.1f} mm")
+        off_mm, part = next((one for one in far if one[1] == name), max(far))
+        execution.halt(f"{part} has moved by {off_mm:.1f} mm")
         if self._settled is None or apart_mm(tumor, self._settled[0]) > config.settled_mm:
             self._settled = (tumor, now_s)
         elif now_s - self._settled[1] >= config.settled_s and execution.still:
             self._settled = None
             if self._replan is not None:
-                sweep = max(execution.sweep, 1) if execution.holds else None
-                self._work = self._replan(located, execution.joints_rad, sweep)
+                self._work = self._replan(update, execution.joints_rad, self.progress)
 
     def _take_work(self, now_s: float) -> None:
         work, execution = self._work, self._execution
         assert work is not None
+        if execution.state == ABORTED:
+            self._work = None
+            work.cancel()
+            return
         if not work.done():
             return
         self._work = None
@@ -235,9 +289,16 @@ class Operation:
 
 
 def apart_mm(a: Mesh, b: Mesh) -> float:
-    """How far a surface has moved: root mean square over its vertices where both have the same,
-    else between the middles of their boxes."""
+    """How far a surface has moved, root mean square: of its vertices where both have the same
+    triangles, else between the surfaces, for which sliding along itself is no motion."""
     if np.array_equal(a.faces, b.faces):
         off = a.vertices_mm - b.vertices_mm
         return float(np.sqrt((off**2).sum(axis=1).mean()))
-    return float(np.linalg.norm(a.box_mm.mean(0) - b.box_mm.mean(0)))
+    squares = [_nearest_mm(a, b) ** 2, _nearest_mm(b, a) ** 2]
+    return float(np.sqrt(np.concatenate(squares).mean()))
+
+
+def _nearest_mm(a: Mesh, b: Mesh) -> Float64[np.ndarray, " n"]:
+    """Distances of some of a's vertices to b's."""
+    some = a.vertices_mm[:: max(1, len(a.vertices_mm) // _COMPARED)]
+    return cKDTree(b.vertices_mm).query(some)[0]

@@ -10,13 +10,13 @@ from __future__ import annotations
 import threading
 import time
 from collections import Counter
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 from jaxtyping import Float64
 
 from tumortrack.core.errors import InputError, TumortrackError
-from tumortrack.track.live import Setting, SinkConfig, Update
+from tumortrack.track.live import Controls, Setting, SinkConfig, Update
 from tumortrack.track.ur_link import SILENT_S, UR_JOINTS, UrLink, connected
 
 # Of UR5, UR5e, UR10 and UR10e (data sheets): a turn either way; the larger ones' first two joints
@@ -41,7 +41,7 @@ class Ur(SinkConfig, frozen=True, kw_only=True, tag="ur"):
     target: ClassVar[str] = "host"
 
     host: str
-    arm: str = "cutter"
+    arm: Literal["cutter", "holder"] = "cutter"
     execute: bool = False
     jump_deg: float = 5.0
     lookahead_s: float = 0.1
@@ -65,7 +65,7 @@ class Ur(SinkConfig, frozen=True, kw_only=True, tag="ur"):
         """
         if not setting.arms:
             raise InputError("ur: nothing here moves an arm; it is for `tumortrack resect`.")
-        return UrSink(self, connected(self.host) if self.execute else None)
+        return UrSink(self, connected(self.host) if self.execute else None, setting.controls)
 
 
 class UrSink:
@@ -76,8 +76,8 @@ class UrSink:
     this process die, the arm's controller stops it within 0.2 s by itself (setWatchdog).
     """
 
-    def __init__(self, config: Ur, link: UrLink | None) -> None:
-        self._config, self._link = config, link
+    def __init__(self, config: Ur, link: UrLink | None, controls: Controls) -> None:
+        self._config, self._link, self._controls = config, link, controls
         self._names = tuple(f"{config.arm}_{joint}" for joint in UR_JOINTS)
         self._last: tuple[Float64[np.ndarray, " 6"], float, int] | None = None
         self._lock = threading.Lock()
@@ -117,9 +117,11 @@ class UrSink:
                     self._go(_target(cell.joints_rad, self._names), update.stamp_ns)
             except TumortrackError as error:
                 self._counts["refused"] += 1
+                self._give_up()
                 self._stop()
                 raise TumortrackError(f"ur {self._config.arm}: {error}") from error
             except Exception as error:  # of ur_rtde, which raises anything
+                self._give_up()
                 self._break(error)
                 raise TumortrackError(self._fault) from error
 
@@ -136,6 +138,11 @@ class UrSink:
                     self._stop()
                 finally:
                     self._link.close()
+
+    def _give_up(self) -> None:
+        """This arm no longer does what was planned: all arms stop for good."""
+        if self._link is not None:
+            self._controls.aborted.set()
 
     def _go(self, target: Float64[np.ndarray, " 6"], stamp_ns: int) -> None:
         now_s = time.monotonic()
