@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 from arm_objects import organ, plan
 from tumortrack.core.errors import InputError, NoPlan
 from tumortrack.core.geometry import transform_points
-from tumortrack.plan.arms import dh, ik, urdf
+from tumortrack.plan.arms import dh, ik, timing, urdf
 from tumortrack.plan.arms.bases import search_bases
 from tumortrack.plan.arms.cell import Cell
 from tumortrack.plan.arms.config import Base, CellConfig
@@ -350,6 +350,17 @@ def test_arms_at_home_stay_there(cell):
     assert home.seconds < 0.1
     for stage in home.stages:
         assert np.abs(stage.joints_rad - cell.home_rad).max() < 1e-9
+
+
+@pytest.mark.parametrize("turn_rad", [2e-6, 1e-4, 0.1, 3.0])
+def test_ways_of_any_length_are_timed(turn_rad):
+    path = np.linspace(np.zeros(6), turn_rad * np.arange(1, 7) / 6, 3)
+    for times, joints in (
+        timing.along(path, np.ones(6)),
+        timing.together(path[0], path[-1], np.ones(6)),
+    ):
+        assert (np.diff(times) > 0).all()
+        assert np.allclose(joints[[0, -1]], path[[0, -1]], atol=1e-9)
 
 
 def test_starts_that_are_none_are_refused(cell):

@@ -14,6 +14,8 @@ from tumortrack.plan.arms.situation import Situation
 from tumortrack.plan.arms.tracks import follow
 from tumortrack.plan.motions import Motions, Stage
 
+_THERE_RAD = 1e-6  # a thousandth of a millimetre at the tip: no motion to be timed
+
 
 class Course:
     """Where both arms are by now (``joints_rad``), and how they came there."""
@@ -42,7 +44,7 @@ class Course:
     ) -> None:
         """One arm along a path that begins where it is; its tip no faster than said."""
         situation = self.situation(arm)
-        if np.ptp(path_rad, axis=0).max() < 1e-9:  # it is there
+        if np.ptp(path_rad, axis=0).max() < _THERE_RAD:
             return
         speeds = self.cell.speeds_rad_s[situation.own]
         if tip_mm_s is None:
