@@ -142,6 +142,7 @@ def test_a_film_is_an_animation(story, tmp_path):
         (["--frame", "UP"], "the camera looks up in this frame"),
         (["--sigmas", 2], "does not say how unsure it is"),
         (["--tumor", "tumor_4"], "there is no 'tumor_4'; located were tumor_1"),
+        (["--cell", "NARROW"], "clearance_mm is -8; allowed: 0.5 to 100"),
         (["--cell", "CELL"], "unknown field `legs`"),
         (["--frame", "FRAME"], "must have camera_from_robot"),
     ],
@@ -152,6 +153,7 @@ def test_what_cannot_be_planned_is_said_in_one_line_and_nothing_is_written(
     folder, _ = story
     (tmp_path / "CELL").write_text('{"legs": 4}')
     (tmp_path / "FRAME").write_text('{"frame_id": "base", "unit": "mm"}')
+    (tmp_path / "NARROW").write_text('{"clearance_mm": -8}')
     (tmp_path / "CONFIG").write_text('{"margn": 4}')
     rows = np.eye(4).tolist()
     (tmp_path / "UP").write_text(
@@ -176,20 +178,38 @@ def test_arms_that_cannot_reach_are_no_plan(story, tmp_path):
     assert "planned with --no-arms" in refusal(tumortrack("resect", tmp_path / "plan"))
 
 
-def test_with_a_calibration_the_plan_is_in_the_robots_frame(story, tmp_path):
+def test_with_a_calibration_plan_and_arms_are_in_the_robots_frame(story, tmp_path):
+    """The same cell, told in another frame: the same motions."""
     folder, _ = story
-    turn = np.diag([1.0, -1.0, -1.0, 1.0])
-    turn[:3, 3] = [400.0, -100.0, 500.0]
-    file = tmp_path / "frame.json"
-    file.write_text(
-        json.dumps({"frame_id": "base_link", "unit": "mm", "robot_from_camera": turn.tolist()})
+    here = read_plan(folder / "plan")
+    robot_from_table = np.eye(4)
+    robot_from_table[:3, :3] = [[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]
+    robot_from_table[:3, 3] = [430.0, -120.0, -60.0]
+    frame, cell = tmp_path / "frame.json", tmp_path / "cell.json"
+    rows = (robot_from_table @ here.table_from_camera).tolist()
+    frame.write_text(json.dumps({"frame_id": "base_link", "unit": "mm", "robot_from_camera": rows}))
+    done = tumortrack("plan", folder / "run", tmp_path / "plan", "--frame", frame)
+    assert "where do the arms stand" in refusal(done)
+    bases = {}
+    for arm in ("cutter", "holder"):
+        base = here.cell[f"{arm}_base"]
+        place = robot_from_table @ [*base["position_mm"], 1.0]
+        bases[f"{arm}_base"] = {
+            "position_mm": place[:3].tolist(), "yaw_deg": base["yaw_deg"] + 90.0
+        }  # fmt: skip
+    cell.write_text(json.dumps(bases))
+    succeeded(
+        tumortrack("plan", folder / "run", tmp_path / "plan", "--frame", frame, "--cell", cell)
     )
-    succeeded(tumortrack("plan", folder / "run", tmp_path / "plan", "--frame", file, "--no-arms"))
-    there, here = read_plan(tmp_path / "plan"), read_plan(folder / "plan")
+    there = read_plan(tmp_path / "plan")
     assert there.frame_id == "base_link"
-    robot_from_table = turn @ np.linalg.inv(here.table_from_camera)
-    expected = robot_from_table[:3, :3] @ here.plan.grasp_mm + robot_from_table[:3, 3]
-    assert there.plan.grasp_mm == pytest.approx(expected, abs=0.5)
+    expected = robot_from_table @ [*here.plan.grasp_mm, 1.0]
+    assert there.plan.grasp_mm == pytest.approx(expected[:3], abs=1.6)
+    assert there.cell["middle_mm"] == pytest.approx(robot_from_table[:3, 3].tolist(), abs=1.5)
+    assert there.motions.stages[0].joints_rad[0] == pytest.approx(
+        here.motions.stages[0].joints_rad[0]
+    )
+    assert there.motions.seconds == pytest.approx(here.motions.seconds, rel=0.3)
 
 
 def test_a_live_world_that_lies_elsewhere_is_planned_anew_and_cut(

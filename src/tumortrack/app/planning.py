@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
+
+import msgspec
 
 from tumortrack.app.console import say
 from tumortrack.core import store
@@ -39,6 +42,13 @@ def choices(file: Path | None, given: dict) -> ResectionConfig:
     return from_builtins({**written, **given}, ResectionConfig, str(file or "options"))
 
 
+def check_arms_installed() -> None:
+    """Raises InputError where a library that motions need is missing."""
+    needed = ("pinocchio", "coal", "toppra", "ruckig", "ur_analytic_ik")
+    if missing := [name for name in needed if find_spec(name) is None]:
+        raise InputError(f"arms need {', '.join(missing)}: pip install 'tumortrack[arms]'.")
+
+
 def plan(run_folder: Path, folder: Path, config: ResectionConfig, options: PlanOptions) -> None:
     """`tumortrack plan`: a run -> strokes, motions, pictures."""
     from tumortrack.evaluate.plan_pictures import draw_plan
@@ -48,6 +58,8 @@ def plan(run_folder: Path, folder: Path, config: ResectionConfig, options: PlanO
 
     store.check_place(folder, KIND, options.overwrite)
     cell_config = _cell_config(options)
+    if options.arms:
+        check_arms_installed()
     run = read_run(run_folder)
     if options.frame is not None:
         from tumortrack.track.frames import read_frames
@@ -55,13 +67,21 @@ def plan(run_folder: Path, folder: Path, config: ResectionConfig, options: PlanO
         frames = read_frames(options.frame)
         frame_id, table_from_camera = frames.frame_id, frames.published_from_camera
         _check_up(options.frame, table_from_camera)
+        if options.arms and options.cell is None:
+            raise InputError(
+                "--frame: where do the arms stand in that frame? Say it with --cell FILE "
+                "(docs/resection.md), or plan the cuts alone with --no-arms."
+            )
     else:
         kidney = run.meshes.get("kidney")
         points_mm = run.cloud.points_mm if kidney is None else kidney.vertices_mm
         frame_id, table_from_camera = "table", table_below(points_mm, cell_config.stand_mm)
     located = run.located(table_from_camera)
     if options.arms:
-        organ_of(located)
+        box_mm = organ_of(located).box_mm
+        x, y = box_mm.mean(0)[:2].tolist()
+        below = (x, y, float(box_mm[0, 2]) - cell_config.stand_mm)
+        cell_config = msgspec.structs.replace(cell_config, middle_mm=below)
     resection = plan_resection(located, config)
     _tell(resection)
     motions, cell_used = None, None
@@ -101,8 +121,6 @@ def plan(run_folder: Path, folder: Path, config: ResectionConfig, options: PlanO
 
 
 def _cell_config(options: PlanOptions) -> CellConfig:
-    import msgspec
-
     from tumortrack.plan.arms.config import CellConfig
 
     config = CellConfig()

@@ -53,12 +53,14 @@ class ResectOptions:
 def resect(plan_folder: Path, sinks: tuple[str, ...], options: ResectOptions) -> None:
     """`tumortrack resect`: a plan's motions, virtually, shown by sinks or filmed."""
     from tumortrack.app.live import parse_sinks
+    from tumortrack.app.planning import check_arms_installed
     from tumortrack.plan.arms.cell import Cell
     from tumortrack.plan.arms.config import CellConfig
     from tumortrack.plan.files import read_plan
     from tumortrack.plan.operation import OperationConfig
     from tumortrack.track.sinks.ur import Ur
 
+    check_arms_installed()
     stored = read_plan(plan_folder)
     if stored.motions is None or stored.cell is None:
         raise InputError(f"{plan_folder} was planned with --no-arms; plan again without it.")

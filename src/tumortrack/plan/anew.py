@@ -26,7 +26,9 @@ def begin(config: ResectionConfig, cell: CellConfig) -> None:
 
 
 def ready() -> None:
-    """Returns when the process has begun."""
+    """Returns when the process has begun and has loaded what is slow to load."""
+    import ruckig  # noqa: F401
+    import toppra  # noqa: F401
 
 
 def plan_anew(seen: Located, joints_rad: Float64[np.ndarray, " 12"], progress: Progress) -> Planned:

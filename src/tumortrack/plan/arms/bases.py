@@ -95,7 +95,7 @@ def _places(config: CellConfig, arm: str, middle_mm: np.ndarray) -> list[Base]:
         angle = facing + np.radians(side)
         far = share * config.model(arm).reach_mm
         x, y = middle_mm + far * np.array([np.cos(angle), np.sin(angle)])
-        if abs(x) <= half[0] and abs(y) <= half[1]:
+        if abs(x - config.middle_mm[0]) <= half[0] and abs(y - config.middle_mm[1]) <= half[1]:
             place = (round(float(x)), round(float(y)), now.position_mm[2])
             bases.append(Base(position_mm=place, yaw_deg=now.yaw_deg + side))
     return bases

@@ -159,15 +159,16 @@ def tool_parts(config: CellConfig) -> tuple[Part, ...]:
 def surroundings(config: CellConfig) -> tuple[Part, ...]:
     """Table, the organ's post, the arms' pedestals and a camera in the way, in the table frame."""
     width, depth = config.table_mm
-    slab = rigid(np.eye(3), np.array([0.0, 0.0, -20.0]))
+    middle = np.array(config.middle_mm)
+    slab = rigid(np.eye(3), middle - [0.0, 0.0, 20.0])
     table = Part(TABLE, TABLE, "box", (width, depth, 40.0), slab, WOOD)
     # The post ends a little below the organ, which must not count as touched by its own support.
-    post = _rod(
-        STAND, TABLE, ((0, 0, 0), (0, 0, config.stand_mm - 3)), config.stand_radius_mm, POST
-    )
+    x, y, z = config.middle_mm
+    ends = ((x, y, z), (x, y, z + config.stand_mm - 3))
+    post = _rod(STAND, TABLE, ends, config.stand_radius_mm, POST)
     parts = [table, post, *_pedestals(config)]
     if config.camera_is_obstacle:
-        place = rigid(np.eye(3), np.array(config.camera_mm))
+        place = rigid(np.eye(3), middle + config.camera_mm)
         parts.append(Part(CAMERA, TABLE, "box", (42.0, 23.0, 42.0), place, DARK))
     return tuple(parts)
 
@@ -177,9 +178,10 @@ def _pedestals(config: CellConfig) -> list[Part]:
     pedestals = []
     for arm in (CUTTER, HOLDER):
         x, y, z = config.base(arm).position_mm
-        if z > 0:
+        top = config.middle_mm[2]
+        if z > top:
             radius = 1.15 * _GIRTHS[config.model(arm).name].base
-            ends = ((x, y, 0.0), (x, y, z))
+            ends = ((x, y, top), (x, y, z))
             pedestals.append(_rod(f"{arm}/{PEDESTAL}", TABLE, ends, radius, POST))
     return pedestals
 

@@ -40,12 +40,14 @@ class CellConfig(Config, frozen=True, kw_only=True):
         rod_mm, cup_mm, cup_radius_mm: the grasper hangs straight down from its flange; the last
             ``cup_mm`` are a soft cup.
         home_rad: all twelve joints in the order of ``JOINTS``.
-        table_mm: the table's size along x and y, its middle below the organ.
+        middle_mm: the middle of the table's top, straight below the organ: the origin, unless the
+            plan is in a robot's frame.
+        table_mm: the table's size along x and y.
         stand_mm: height of the organ's lowest point above the table; ``stand_radius_mm``: of the
             post that carries it.
-        camera_mm: middle of the camera's box, if ``camera_is_obstacle``. By default it is none and
-            not there: a camera that looks straight down from 150 mm is where the arms work, so it
-            is taken to be swung away while they do.
+        camera_mm: middle of the camera's box over ``middle_mm``, if ``camera_is_obstacle``. By
+            default it is none and not there: a camera that looks straight down from 150 mm is where
+            the arms work, so it is taken to be swung away while they do.
         clearance_mm: what arms keep from each other, from themselves and from all that stands;
             ``organ_clearance_mm``: what they keep from the organ, but for electrode and cup while
             they work; ``contact_mm``: what the electrode then keeps from the soft cup.
@@ -68,6 +70,7 @@ class CellConfig(Config, frozen=True, kw_only=True):
         *(-0.490, -2.077, 2.569, -2.063, -np.pi / 2, -2.061),
         *(-0.416, -2.132, 1.865, -1.304, -np.pi / 2, -0.416),
     )
+    middle_mm: tuple[float, float, float] = (0.0, 0.0, 0.0)
     table_mm: tuple[float, float] = (2000.0, 1000.0)
     stand_mm: float = 120.0
     stand_radius_mm: float = 20.0
@@ -89,6 +92,16 @@ class CellConfig(Config, frozen=True, kw_only=True):
                 raise InputError(
                     f"cell: {name} is {getattr(self, name):g}; allowed: over 0 to 1000."
                 )
+        for name in ("clearance_mm", "organ_clearance_mm", "contact_mm"):
+            if not 0.5 <= getattr(self, name) <= 100:
+                raise InputError(f"cell: {name} is {getattr(self, name):g}; allowed: 0.5 to 100.")
+        if not all(100 <= side <= 10_000 for side in self.table_mm):
+            raise InputError(f"cell: table_mm is {self.table_mm}; allowed: 100 to 10000 each.")
+        places = (*self.middle_mm, *self.camera_mm, *self.home_rad)
+        bases = (self.cutter_base, self.holder_base)
+        places += tuple(v for base in bases for v in (*base.position_mm, base.yaw_deg))
+        if not np.isfinite(places).all() or np.abs(places).max() > 10_000:
+            raise InputError("cell: places must be finite and within 10000 mm, angles finite.")
         if self.cup_mm >= self.rod_mm:
             raise InputError("cell: the cup must be shorter than the rod that ends in it.")
         if not 0 < self.speed_share <= 1:
