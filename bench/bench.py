@@ -10,7 +10,6 @@ from __future__ import annotations
 import json
 import os
 import platform
-import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -26,6 +25,7 @@ from rich.console import Console
 from rich.table import Table
 from scipy.ndimage import map_coordinates
 from scipy.spatial import cKDTree
+from turns import medians
 
 from tumortrack.app.presets import clinic, paper, quick
 from tumortrack.core.geometry import transform_points
@@ -48,22 +48,8 @@ from tumortrack.simulate.deform.elastic import Elastic
 from tumortrack.simulate.occupancy import OccupancyConfig, OccupancyPool, labels_of
 from tumortrack.simulate.scene import SceneConfig, SceneRecipe, Simulator, Stage
 
-ROUNDS = 5
 UP = (0.0, -1.0, 0.0)
 CPU = torch.device("cpu")
-
-
-def medians(*versions: Callable[[], object]) -> list[float]:
-    """Median seconds of each, the versions taking turns."""
-    seconds: list[list[float]] = [[] for _ in versions]
-    for version in versions:
-        version()  # compiled, cached, warm
-    for _ in range(ROUNDS):
-        for times, version in zip(seconds, versions, strict=True):
-            start = time.perf_counter()
-            version()
-            times.append(time.perf_counter() - start)
-    return [float(np.median(times)) for times in seconds]
 
 
 def generator(name: str, deform: DragConfig | ElasticConfig) -> tuple[str, float, float]:

@@ -8,8 +8,6 @@ One thread throughout.
 from __future__ import annotations
 
 import os
-import time
-from collections.abc import Callable
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
@@ -18,6 +16,7 @@ from rich.console import Console
 from scipy.ndimage import distance_transform_edt
 from scipy.spatial import Delaunay
 from skimage.measure import find_contours
+from turns import medians
 
 from tumortrack.core.types import Anatomy, Mesh
 from tumortrack.imaging.raster import label_grid
@@ -33,22 +32,8 @@ from tumortrack.plan.resection import plan_resection
 from tumortrack.plan.values import Located
 
 POINTS = 40_000
-ROUNDS = 7
 VOXEL_MM = 0.5  # of the naive margin
 Row = tuple[str, float, float]
-
-
-def timed(*versions: Callable[[], object]) -> list[float]:
-    """Median seconds of each, the versions taking turns."""
-    seconds: list[list[float]] = [[] for _ in versions]
-    for version in versions:
-        version()  # compiled, cached, warm
-    for _ in range(ROUNDS):
-        for version, its in zip(versions, seconds, strict=True):
-            start = time.perf_counter()
-            version()
-            its.append(time.perf_counter() - start)
-    return [float(np.median(its)) for its in seconds]
 
 
 def phantom() -> Located:
@@ -116,7 +101,7 @@ def rows() -> list[Row]:
         ("plan, published, 40,000 points (plans/s)", published, naive_published),
         ("plan, margin, 40,000 points (plans/s)", ours, naive_margin),
     ):
-        mine, plain = timed(
+        mine, plain = medians(
             lambda config=config: plan_resection(seen, config),  # type: ignore[misc]
             lambda naive=naive: naive(seen),  # type: ignore[misc]
         )
@@ -124,7 +109,7 @@ def rows() -> list[Row]:
     organ = seen.meshes["kidney"]
     cell = Cell(CellConfig(), organ)
     plans = [plan_resection(seen, config) for config in (ours, published)]
-    mine, plain = timed(*(lambda plan=plan: plan_motions(plan, cell, organ) for plan in plans))  # type: ignore[misc]
+    mine, plain = medians(*(lambda plan=plan: plan_motions(plan, cell, organ) for plan in plans))  # type: ignore[misc]
     rows.append((f"motions, {plans[0].sweeps} | 2 sweeps (plans/s)", 1 / mine, 1 / plain))
     return rows
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import signal
+import subprocess
 
 import numpy as np
 import pytest
@@ -10,7 +12,15 @@ from PIL import Image
 from safetensors import safe_open
 
 from plan_objects import located
-from stories import cloud_by_rays, looking_down, refusal, succeeded, tumortrack
+from stories import (
+    COMMAND,
+    cloud_by_rays,
+    environment,
+    looking_down,
+    refusal,
+    succeeded,
+    tumortrack,
+)
 from tumortrack.core.types import CameraLabels, OccupancyCloud
 from tumortrack.imaging.case import load_case
 from tumortrack.plan.files import read_plan
@@ -120,6 +130,28 @@ def test_a_plan_is_carried_out_and_recorded(story, tmp_path):
     assert way[0] == pytest.approx(first.joints_rad[0], abs=1e-6)
     assert last == pytest.approx(first.joints_rad[0], abs=1e-6)  # home again
     assert np.ptp(way, axis=0).max() > 0.5
+
+
+def test_ctrl_c_stops_the_arms_and_says_so(story, tmp_path):
+    folder, _ = story
+    report = tmp_path / "report.json"
+    process = subprocess.Popen(
+        [*COMMAND, "resect", str(folder / "plan"), "--report", str(report)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=environment(),
+    )
+    assert process.stdout is not None
+    for line in process.stdout:
+        if line.strip() == "grasp":
+            break
+    process.send_signal(signal.SIGINT)
+    _, said = process.communicate(timeout=30)
+    assert process.returncode == 130
+    assert said == "tumortrack: stopped.\n"
+    found = json.loads(report.read_text())["resection"]
+    assert (found["state"], found["halted"]) == ("aborted", "stopped by the user")
 
 
 def test_a_film_is_an_animation(story, tmp_path):

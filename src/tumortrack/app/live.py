@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from tumortrack.track.reader import Reader
 
 _SAY_S, _SAY_PLAIN_S = 1.0, 5.0  # between two lines of state: on a terminal, in a file
+STOPPED = "stopped by the user"  # why arms stand
 _ENDS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _SETTLED_S = 60.0  # by then all buffers have their size: memory that grows on is a leak
 _STORE_S = 10.0  # between two writings of the report: kill -9 loses no more
@@ -102,10 +103,16 @@ def track(
         },
         **({} if arms is None else arms.about),
     }
+
+    def stop() -> None:
+        if arms is not None:
+            arms.companion.abort(STOPPED)
+        loop.stop()
+
     say("warming up ...")
     loop.warm()
     with ExitStack() as stack:
-        stack.enter_context(stopping(loop.stop))  # first in, last out: also while sinks flush
+        stack.enter_context(stopping(stop))  # first in, last out: also while sinks flush
         screen = _Screen(loop, report, about, None if arms is None else arms.companion)
         stack.callback(screen.end)
         outlets = open_sinks(sinks, sink_configs, setting, stack)

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from tumortrack.app.console import progress_bar, say
+from tumortrack.app.live import STOPPED
 from tumortrack.core import store
 from tumortrack.core.config import from_builtins, to_builtins
 from tumortrack.core.errors import Aborted, InputError, StorageError
@@ -30,7 +31,6 @@ if TYPE_CHECKING:
     Sinks = tuple[str, ...]
 
 _FPS = 30.0  # of an execution that no camera drives
-_STOPPED = "stopped by the user"
 _NOTHING = "virtual execution of a stored plan: nothing is tracked"
 _FILM_FPS, _FILM_FRAMES = 10, 120
 _FILM_STEP_S = 0.1
@@ -177,7 +177,7 @@ def _virtual(
     setting = Setting(tuple(stored.meshes), frames, None, controls, arms=True)
     outlets: list[Outlet] = []
     with ExitStack() as stack:
-        stack.enter_context(stopping(lambda: operation.abort(_STOPPED)))
+        stack.enter_context(stopping(lambda: operation.abort(STOPPED)))
         outlets = open_sinks(sinks, parse_sinks(sinks), setting, stack)
         say(f"{stored.motions.seconds / config.speed:.0f} s in frame {frames.frame_id!r}; "
             "Ctrl-C stops the arms.")  # fmt: skip
@@ -244,7 +244,7 @@ def _tell_end(operation: Operation) -> None:
     if found["state"] == "done":
         say("done: both arms are home.")
         return
-    if found["halted"] in (_STOPPED, "tracking has ended"):
+    if found["halted"] == STOPPED:
         raise KeyboardInterrupt
     raise Aborted(f"the resection was {found['state']}: {found['halted']}.")
 

@@ -8,16 +8,9 @@ import numpy as np
 from jaxtyping import Float64
 
 from tumortrack.core.errors import InputError
+from tumortrack.track.ur_link import UR_JOINTS
 
 CUTTER, HOLDER = "cutter", "holder"  # UR10e with the instrument, UR5 with the vacuum grasper
-UR_JOINTS = (
-    "shoulder_pan_joint",
-    "shoulder_lift_joint",
-    "elbow_joint",
-    "wrist_1_joint",
-    "wrist_2_joint",
-    "wrist_3_joint",
-)
 JOINTS = tuple(f"{arm}_{joint}" for arm in (CUTTER, HOLDER) for joint in UR_JOINTS)
 
 
