@@ -17,8 +17,8 @@ from tumortrack.learn.network import Latent, OccupancyNetwork
 from tumortrack.sense.cloud import check_cloud, thin_cloud
 from tumortrack.track.estimate import Estimate, Following
 from tumortrack.track.report import fit_report, report_head, stage
+from tumortrack.track.sparse import sparse_margins
 from tumortrack.track.volume import (
-    dense_margins,
     describe_parts,
     drop_islands,
     grid_over,
@@ -101,7 +101,7 @@ class OccupancyLocator:
                 raise NoEstimate("no organ was found: it has left the place where it was.")
         with stage(seconds, "volume", self._device):
             camera_from_index, shape = grid_over(inside.points_mm, grid)
-            margins, found = dense_margins(
+            margins, found = sparse_margins(
                 lambda points: self._logits(latent, points), camera_from_index, shape
             )
         with stage(seconds, "surfaces", self._device):

@@ -13,7 +13,7 @@ from tumortrack.core.types import FIRST_TUMOR, ORGAN, Mesh, OccupancyCloud
 
 _AT_ONCE = 2**18  # queries; bounds the memory whatever the grid
 _SMALLEST_MARGIN = 1e-3  # a surface exactly through a grid point would not be closed
-_LARGEST_MARGIN = 30.0  # logits beyond say no more about where a surface lies
+LARGEST_MARGIN = 30.0  # logits beyond say no more about where a surface lies
 
 
 def grid_over(
@@ -54,7 +54,7 @@ def dense_margins(
         index[:, :, 0], index[:, :, 1:] = rows[:, None], plane
         points = transform_points(camera_from_index, index.reshape(-1, 3)).astype(np.float32)
         logits = logits_at(points)
-        won = _margins(logits).clamp(-_LARGEST_MARGIN, _LARGEST_MARGIN).half().cpu().numpy()
+        won = margins_of(logits)
         if margins is None:
             margins = np.empty((won.shape[1], *shape), np.float16)
         block = (len(rows), j, k)
@@ -64,13 +64,14 @@ def dense_margins(
     return margins, labels
 
 
-def _margins(logits: torch.Tensor) -> torch.Tensor:
-    """(n, classes) -> (n, parts)."""
+def margins_of(logits: torch.Tensor) -> Float16[np.ndarray, "n parts"]:
+    """By how much each part wins: (n, classes) -> (n, parts)."""
     columns = [logits[:, 1:].amax(1) - logits[:, 0]]
     for label in range(FIRST_TUMOR, logits.shape[1]):
         others = torch.cat([logits[:, :label], logits[:, label + 1 :]], 1).amax(1)
         columns.append(logits[:, label] - others)
-    return torch.stack(columns, 1)
+    won = torch.stack(columns, 1).clamp(-LARGEST_MARGIN, LARGEST_MARGIN)
+    return won.half().cpu().numpy()
 
 
 def keep_largest_pieces(

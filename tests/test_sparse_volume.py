@@ -1,0 +1,95 @@
+"""The volume from few questions: the dense one, voxel by voxel."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tumortrack.track.sparse import START_MM, sparse_margins
+from tumortrack.track.volume import dense_margins, grid_over, part_surfaces
+
+NAMES = ("kidney", "tumor_1", "tumor_2")
+
+
+class Field:
+    """Logits of a wavy organ with two balls in or at it; counts what it is asked."""
+
+    def __init__(self, seed, small_mm=8.0):
+        rng = np.random.default_rng(seed)
+        self.turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+        self.half_mm = rng.uniform([40, 22, 18], [60, 32, 26])
+        self.waves = rng.normal(size=(4, 3)) / 12
+        self.balls = [(self._near(rng), 12.0), (self._near(rng), small_mm / 2)]
+        self.asked = 0
+
+    def _near(self, rng):
+        way = rng.normal(size=3)
+        return self.turn @ (self.half_mm * way / np.linalg.norm(way) * rng.uniform(0.2, 1.0))
+
+    def __call__(self, points):
+        self.asked += len(points)
+        points = points.astype(np.float64)
+        at = points @ self.turn / self.half_mm
+        organ = 25 * (1 - np.linalg.norm(at, axis=1))
+        organ += 1.5 * np.sin(points @ self.waves.T).sum(1)
+        balls = [radius - np.linalg.norm(points - middle, axis=1) for middle, radius in self.balls]
+        inside = np.maximum.reduce([organ, *balls])
+        logits = np.column_stack([-inside, inside, *(inside + 3 * ball for ball in balls)])
+        return torch.tensor(logits, dtype=torch.float32)
+
+
+def both(field, grid, start_mm=START_MM):
+    box = np.array([[-66.0, -66, -66], [66, 66, 66]])
+    camera_from_index, shape = grid_over(box, grid)
+    sparse = sparse_margins(field, camera_from_index, shape, start_mm)
+    few, field.asked = field.asked, 0
+    dense = dense_margins(field, camera_from_index, shape)
+    return sparse, dense, few, field.asked, camera_from_index
+
+
+@given(st.integers(0, 10**6), st.sampled_from([93, 130]))
+@settings(max_examples=8, deadline=None)
+def test_every_voxel_is_that_of_the_dense_volume(seed, grid):
+    (margins, labels), (all_margins, all_labels), few, many, _ = both(Field(seed), grid)
+    assert np.array_equal(labels, all_labels)
+    asked = np.abs(margins) < 29
+    assert np.array_equal(margins[asked], all_margins[asked])
+    assert np.array_equal(margins > 0, all_margins > 0)
+    assert few < many
+
+
+def test_at_the_paper_s_grid_most_questions_are_saved():
+    (_, labels), (_, all_labels), few, many, _ = both(Field(3), 200)
+    assert np.array_equal(labels, all_labels)
+    assert many > 10 * few
+
+
+def test_surfaces_are_those_of_the_dense_volume():
+    (margins, labels), (all_margins, all_labels), _, _, camera_from_index = both(Field(8), 110)
+    mine = part_surfaces(margins, labels, camera_from_index, NAMES)
+    theirs = part_surfaces(all_margins, all_labels, camera_from_index, NAMES)
+    for name in NAMES:
+        assert np.array_equal(mine[name].faces, theirs[name].faces)
+        assert mine[name].vertices_mm == pytest.approx(theirs[name].vertices_mm, abs=1e-3)
+
+
+@given(st.tuples(*[st.floats(-3, 3)] * 3))
+@settings(max_examples=15, deadline=None)
+def test_a_tumor_of_5_2_mm_is_found_wherever_it_lies(off):
+    field = Field(5)
+    field.balls[1] = (np.array([20.0, 30.0, 45.0]) + off, START_MM * 3**0.5 / 2 + 1e-6)
+    box = np.array([[-66.0, -66, -66], [66, 66, 66]])
+    camera_from_index, shape = grid_over(box, 184)  # voxels of 0.746 mm, the first lattice of 2.98
+    _, labels = sparse_margins(field, camera_from_index, shape)
+    found = (labels == 3).sum() * camera_from_index[0, 0] ** 3
+    assert found == pytest.approx(4 / 3 * np.pi * (START_MM * 3**0.5 / 2) ** 3, rel=0.15)
+
+
+def test_without_a_coarse_lattice_it_is_the_dense_volume():
+    (margins, labels), (all_margins, all_labels), few, many, _ = both(Field(1), 40, start_mm=3.0)
+    assert few == many
+    assert np.array_equal(labels, all_labels)
+    assert np.array_equal(margins, all_margins)
