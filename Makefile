@@ -30,7 +30,7 @@ debian:  ## what tests need of Debian (ROS, RViz, Chromium), where it can be ins
 	tools/debian.sh
 
 test: check debian  ## check, then all tests
-	OMP_NUM_THREADS=1 $(BIN)/pytest -n 2 --dist loadfile --no-loadscope-reorder
+	OMP_NUM_THREADS=1 $(BIN)/pytest -n 3 --dist loadfile --no-loadscope-reorder
 
 bench: setup  ## speed of the generator, training and inference, side by side with naive forms
 	$(BIN)/python bench/bench.py

@@ -24,7 +24,7 @@ install_import_hook(
 )
 
 
-# The longest files first: with two workers none is left alone with one at the end.
+# The longest files first: with few workers none is left alone with one at the end.
 SLOWEST = (
     "test_training.py",
     "test_track.py",

@@ -46,14 +46,15 @@ def locates_its_organ(case: Path, folder: Path) -> None:
     assert np.linalg.norm(np.array(kidney["center_mm"]) - truth) < 25
 
 
-@pytest.mark.parametrize("patient", ["case_00000", "case_00002"])
+@pytest.mark.parametrize("patient", PATIENTS)
 def test_label_map_to_located_organ(patient, prepared, tmp_path):
     case = prepared(patient)
     anatomy = load_case(case).anatomy
     organ_ml, tumor_ml = PATIENTS[patient]
     assert anatomy.organ.volume_mm3 / 1000 == pytest.approx(organ_ml, rel=0.02)
     assert [t.volume_mm3 / 1000 for t in anatomy.tumors] == pytest.approx([tumor_ml], rel=0.02)
-    locates_its_organ(case, tmp_path)
+    if patient == "case_00000":  # one patient's label map all the way, and below another's CT
+        locates_its_organ(case, tmp_path)
 
 
 @pytest.mark.parametrize("patient", PATIENTS)
@@ -67,7 +68,7 @@ def test_virtual_ct_gives_back_the_anatomy(patient, prepared, tmp_path):
         assert mine.volume_mm3 == pytest.approx(theirs.volume_mm3, rel=0.05)
         assert np.abs(mine.box_mm - theirs.box_mm).max() < 2.0  # in place, not mirrored
     assert (tmp_path / "ct_case" / "qc.png").stat().st_size > 20_000
-    if patient == "case_00003":  # one patient's CT all the way
+    if patient == "case_00003":
         locates_its_organ(tmp_path / "ct_case", tmp_path)
 
 
