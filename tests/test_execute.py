@@ -289,10 +289,11 @@ def tilted(degrees):
     return replace(seen, points_mm=move(seen.points_mm), meshes=meshes)
 
 
+@pytest.mark.parametrize("order", ["down", "up"])
 @pytest.mark.parametrize("degrees", [-25, 0, 25])
-def test_what_is_not_cut_yet_is_cut_in_whatever_sweeps_the_new_plan_has(degrees):
+def test_what_is_not_cut_yet_is_cut_in_whatever_sweeps_the_new_plan_has(degrees, order):
     """Plans of the same tumor that lies otherwise have other numbers of layers."""
-    config = ResectionConfig(layer_mm=3.0)
+    config = ResectionConfig(layer_mm=3.0, order=order)
     first, second = (
         plan_resection(located(n=8_000), config),
         plan_resection(tilted(degrees), config),
@@ -304,7 +305,7 @@ def test_what_is_not_cut_yet_is_cut_in_whatever_sweeps_the_new_plan_has(degrees)
         assert first.sweeps != second.sweeps
     for sweep in range(1, first.sweeps + 1):
         done = [cut.height_mm - before for cut in first.cuts if cut.sweep < sweep]
-        progress = Progress(True, min(done) if done else None)
+        progress = Progress(True, done[-1] if done else None)
         begin = progress.first_sweep(second, tumor)
         assert 1 <= begin <= second.sweeps
         skipped = [cut.height_mm - after for cut in second.cuts if cut.sweep < begin]

@@ -74,8 +74,8 @@ class Progress:
     done_mm: float | None = None
 
     def first_sweep(self, planned: ResectionPlan, tumor: Mesh) -> int | None:
-        """With which sweep another plan goes on: the first that is not above what was finished,
-        and never past the last; None: from the approach.
+        """With which sweep another plan goes on: the first that lies beyond what was finished, in
+        the order in which it cuts, and never past the last; None: from the approach.
 
         Sweeps are not the same from plan to plan, and so are told apart by their height.
         """
@@ -84,7 +84,12 @@ class Progress:
         if self.done_mm is None:
             return 1
         low = float(tumor.box_mm[0, 2])
-        left = {cut.sweep for cut in planned.cuts if cut.height_mm - low < self.done_mm - _SAME_MM}
+        onward = 1 if planned.cuts[-1].height_mm > planned.cuts[0].height_mm else -1
+        left = {
+            cut.sweep
+            for cut in planned.cuts
+            if onward * (cut.height_mm - low - self.done_mm) > _SAME_MM
+        }
         return min(left, default=planned.sweeps)
 
 
@@ -145,10 +150,10 @@ class Operation:
         """How far it came."""
         if not self._execution.holds:
             return Progress()
-        done = [c.height_mm for c in self._planned.plan.cuts if c.sweep < self._execution.sweep]
+        done = [cut for cut in self._planned.plan.cuts if cut.sweep < self._execution.sweep]
         if not done:
             return Progress(holds=True)
-        return Progress(True, min(done) - float(self._planned.tumor.box_mm[0, 2]))
+        return Progress(True, done[-1].height_mm - float(self._planned.tumor.box_mm[0, 2]))
 
     def act(self, update: Update, now_s: float | None = None) -> Update:
         """The update with what the arms do now. ``now_s``: a steady clock's time."""
