@@ -309,10 +309,10 @@ def test_what_is_not_cut_yet_is_cut_in_whatever_sweeps_the_new_plan_has(degrees,
         begin = progress.first_sweep(second, tumor)
         assert 1 <= begin <= second.sweeps
         skipped = [cut.height_mm - after for cut in second.cuts if cut.sweep < begin]
-        if done:
-            assert all(
-                height >= min(done) - 0.21 for height in skipped
-            )  # nothing deeper is left out
+        if done and order == "down":  # nothing deeper than what is done is left out
+            assert all(height >= min(done) - 0.21 for height in skipped)
+        elif done:  # and nothing higher
+            assert all(height <= max(done) + 0.21 for height in skipped)
         else:
             assert not skipped
     assert Progress().first_sweep(second, tumor) is None
