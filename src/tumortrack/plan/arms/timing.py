@@ -8,6 +8,7 @@ real-time trajectory generation with arbitrary target states' (ruckig), arXiv:21
 from __future__ import annotations
 
 import logging
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float64
@@ -18,6 +19,8 @@ from tumortrack.plan.arms.situation import Blocked
 STEP_S = 0.02  # between two samples; straight lines between them stay within 0.05 mm
 _TIP_SPEED_UP_S = 0.2  # until a tip has its speed
 _GRID = 80
+_FINER = (1.0, 1.7, 2.9, 4.3)  # grids that are tried, in points of the first
+_CRAWL, _CRAWL_S = 2.0, 3.0  # a motion longer than so many times the least, and so much, crawls
 _SLACK = 0.97  # of the acceleration: toppra keeps its limits at grid points only
 
 Timed = tuple[Float64[np.ndarray, " n"], Float64[np.ndarray, "n d"]]
@@ -61,13 +64,31 @@ def along(
         constraint.JointVelocityConstraint(np.column_stack([-speeds_rad_s, speeds_rad_s])),
         constraint.JointAccelerationConstraint(np.column_stack([-acceleration, acceleration])),
     ]
-    grid = np.linspace(0, knots[-1], max(_GRID, keep.sum()))
-    solver = algorithm.TOPPRA(limits, curve, gridpoints=grid, parametrizer="ParametrizeConstAccel")
-    course = solver.compute_trajectory(0, 0)
-    if course is None:
+    # On some grids toppra crawls through a place for minutes; another grid does not share it.
+    least_s = _least_s(path_rad, speeds_rad_s)
+    best: Any = None
+    for finer in _FINER:
+        grid = np.linspace(0, knots[-1], round(finer * max(_GRID, keep.sum())))
+        solver = algorithm.TOPPRA(
+            limits, curve, gridpoints=grid, parametrizer="ParametrizeConstAccel"
+        )
+        course = solver.compute_trajectory(0, 0)
+        if course is not None and (best is None or course.duration < best.duration):
+            best = course
+        if best is not None and best.duration < _CRAWL * least_s + _CRAWL_S:
+            break
+    if best is None:
         raise Blocked("a path can't be gone within the joints' limits")
+    course = best
     times = np.linspace(0, course.duration, int(np.ceil(course.duration / STEP_S)) + 1)
     return times, course(times)[:, :width]
+
+
+def _least_s(
+    path_rad: Float64[np.ndarray, "m d"], speeds_rad_s: Float64[np.ndarray, " d"]
+) -> float:
+    """No motion along the path is shorter: each step at its slowest joint's full speed."""
+    return float((np.abs(np.diff(path_rad, axis=0)) / speeds_rad_s).max(axis=1).sum())
 
 
 def together(
