@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from arm_objects import organ, plan
+from arm_objects import CREEPING_MRAD, organ, plan
 from tumortrack.core.errors import InputError, NoPlan
 from tumortrack.core.geometry import transform_points
 from tumortrack.plan.arms import dh, ik, timing, urdf
@@ -408,3 +408,13 @@ def test_places_for_the_bases_are_searched():
     assert np.abs(tip[:3, 3] - plan(shift).grasp_mm).max() < 0.01
     same, _, nothing = search_bases(plan(), CellConfig(), organ())
     assert (same.config, nothing) == (CellConfig(), "")
+
+
+def test_no_motion_creeps(monkeypatch):
+    path_rad, speeds_rad_s = CREEPING_MRAD / 1000, np.radians([60.0, 60, 90, 90, 90, 90])
+    times_s, joints_rad = timing.along(path_rad, speeds_rad_s)
+    assert times_s[-1] < 4
+    speed = np.abs(np.diff(joints_rad, axis=0)) / np.diff(times_s)[:, None]
+    assert (speed <= 1.001 * speeds_rad_s).all()
+    monkeypatch.setattr(timing, "_FINER", (1.0,))
+    assert timing.along(path_rad, speeds_rad_s)[0][-1] > 100  # else this path shows nothing
