@@ -132,6 +132,12 @@ def test_a_plan_is_carried_out_and_recorded(story, tmp_path):
     assert np.ptp(way, axis=0).max() > 0.5
 
 
+def test_real_arms_are_not_hurried(story):
+    folder, _ = story
+    done = tumortrack("resect", folder / "plan", "ur:10.0.0.9?execute=true", "--speed", 2)
+    assert "--speed 2 with real arms; allowed: up to 1" in refusal(done)
+
+
 def test_ctrl_c_stops_the_arms_and_says_so(story, tmp_path):
     folder, _ = story
     report = tmp_path / "report.json"

@@ -516,6 +516,29 @@ def test_an_arm_in_a_protective_stop_is_said(arm, moving):
         sink.publish(working(2, 0.01))
 
 
+@pytest.mark.parametrize("why", ["refused", "fault", "halted"])
+def test_an_arm_that_gives_up_stops_all_arms_for_good(arm, monkeypatch, why):
+    monkeypatch.setattr("tumortrack.track.sinks.ur.SILENT_S", 20.0)
+    setting = with_arms()
+    sink = Ur(host="10.0.0.9", execute=True).open(setting)
+    sink.publish(working(0))
+    if why == "halted":  # as planned: no reason to give up
+        sink.publish(working(1, 0.01, "hidden"))
+    else:
+        arm.fails = "servo" if why == "fault" else ""
+        with pytest.raises(TumortrackError):
+            sink.publish(working(1, 0.01 if why == "fault" else 0.99))
+    arm.fails = ""
+    sink.close()
+    assert setting.controls.aborted.is_set() == (why != "halted")
+    dry = with_arms()
+    with pytest.raises(TumortrackError, match="jumps by"):
+        checked = Ur(host="10.0.0.9").open(dry)
+        checked.publish(working(0))
+        checked.publish(working(1, 0.99))
+    assert not dry.controls.aborted.is_set()  # nothing moved: nothing to stop
+
+
 def test_a_broken_link_is_left_to_the_controllers_watchdog(arm, moving):
     sink = moving()
     sink.publish(working(0))

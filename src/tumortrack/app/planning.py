@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from tumortrack.core.types import Mesh
     from tumortrack.plan.arms.config import CellConfig
     from tumortrack.plan.config import ResectionConfig
+    from tumortrack.plan.located import Run
     from tumortrack.plan.values import Located, ResectionPlan
 
 
@@ -53,7 +54,7 @@ def plan(run_folder: Path, folder: Path, config: ResectionConfig, options: PlanO
     """`tumortrack plan`: a run -> strokes, motions, pictures."""
     from tumortrack.evaluate.plan_pictures import draw_plan
     from tumortrack.plan.files import KIND, PlanFolder, write_plan
-    from tumortrack.plan.located import read_run, table_below
+    from tumortrack.plan.located import read_run
     from tumortrack.plan.resection import plan_resection
 
     store.check_place(folder, KIND, options.overwrite)
@@ -61,27 +62,10 @@ def plan(run_folder: Path, folder: Path, config: ResectionConfig, options: PlanO
     if options.arms:
         check_arms_installed()
     run = read_run(run_folder)
-    if options.frame is not None:
-        from tumortrack.track.frames import read_frames
-
-        frames = read_frames(options.frame)
-        frame_id, table_from_camera = frames.frame_id, frames.published_from_camera
-        _check_up(options.frame, table_from_camera)
-        if options.arms and options.cell is None:
-            raise InputError(
-                "--frame: where do the arms stand in that frame? Say it with --cell FILE "
-                "(docs/resection.md), or plan the cuts alone with --no-arms."
-            )
-    else:
-        kidney = run.meshes.get("kidney")
-        points_mm = run.cloud.points_mm if kidney is None else kidney.vertices_mm
-        frame_id, table_from_camera = "table", table_below(points_mm, cell_config.stand_mm)
+    frame_id, table_from_camera = _frame(run, options, cell_config.stand_mm)
     located = run.located(table_from_camera)
     if options.arms:
-        box_mm = organ_of(located).box_mm
-        x, y = box_mm.mean(0)[:2].tolist()
-        below = (x, y, float(box_mm[0, 2]) - cell_config.stand_mm)
-        cell_config = msgspec.structs.replace(cell_config, middle_mm=below)
+        cell_config = _below(organ_of(located), cell_config)
     resection = plan_resection(located, config)
     _tell(resection)
     motions, cell_used = None, None
@@ -140,6 +124,36 @@ def organ_of(located: Located) -> Mesh:
     if "kidney" not in located.meshes:
         raise NoPlan("the run has no kidney.ply, so arms can't keep clear of it; give --no-arms.")
     return located.meshes["kidney"]
+
+
+def _frame(
+    run: Run, options: PlanOptions, stand_mm: float
+) -> tuple[str, Float64[np.ndarray, "4 4"]]:
+    """Frame id and ``table_from_camera``: of the calibration, or of a camera that looks down."""
+    from tumortrack.plan.located import table_below
+    from tumortrack.track.frames import read_frames
+
+    if options.frame is None:
+        kidney = run.meshes.get("kidney")
+        points_mm = run.cloud.points_mm if kidney is None else kidney.vertices_mm
+        return "table", table_below(points_mm, stand_mm)
+    frames = read_frames(options.frame)
+    _check_up(options.frame, frames.published_from_camera)
+    if options.arms and options.cell is None:
+        raise InputError(
+            "--frame: where do the arms stand in that frame? Say it with --cell FILE "
+            "(docs/resection.md), or plan the cuts alone with --no-arms."
+        )
+    return frames.frame_id, frames.published_from_camera
+
+
+def _below(organ: Mesh, config: CellConfig) -> CellConfig:
+    """The table below the organ, unless the cell's file says where it is."""
+    if any(config.middle_mm):
+        return config
+    x, y = organ.box_mm.mean(0)[:2].tolist()
+    middle_mm = (x, y, float(organ.box_mm[0, 2]) - config.stand_mm)
+    return msgspec.structs.replace(config, middle_mm=middle_mm)
 
 
 def _check_up(file: Path, table_from_camera: Float64[np.ndarray, "4 4"]) -> None:

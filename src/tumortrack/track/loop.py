@@ -280,7 +280,7 @@ class Loop:
     def _with_arms(self, arms: Companion, update: Update) -> Update:
         try:
             if self._setting.controls.aborted.is_set():
-                arms.abort("aborted by the user")
+                arms.abort("stopped by the viewer, or a real arm gave up")
             return arms.act(update)
         except Exception as error:  # a defect there: no arms move, and the organ is still seen
             self._remember(error)
