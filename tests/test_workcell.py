@@ -532,9 +532,9 @@ def test_an_arm_that_gives_up_stops_all_arms_for_good(arm, monkeypatch, why):
     sink.close()
     assert setting.controls.aborted.is_set() == (why != "halted")
     dry = with_arms()
+    checked = Ur(host="10.0.0.9").open(dry)
+    checked.publish(working(0))
     with pytest.raises(TumortrackError, match="jumps by"):
-        checked = Ur(host="10.0.0.9").open(dry)
-        checked.publish(working(0))
         checked.publish(working(1, 0.99))
     assert not dry.controls.aborted.is_set()  # nothing moved: nothing to stop
 
