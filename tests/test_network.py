@@ -7,6 +7,7 @@ import torch
 
 from tumortrack.core.config import from_builtins, to_builtins
 from tumortrack.core.errors import InputError
+from tumortrack.learn import sampling
 from tumortrack.learn.decoders.mlp import MlpDecoder, MlpDecoderConfig, octave_features
 from tumortrack.learn.encoders.pointnet2 import PointNet2Config, SetAbstraction, _Level
 from tumortrack.learn.network import (
@@ -90,6 +91,19 @@ def test_farthest_points_agree_with_the_reference() -> None:
     points = torch.randn(3, 200, 3, generator=torch.Generator().manual_seed(1))
     expected = [slow_farthest_points(cloud.numpy(), 60) for cloud in points]
     assert farthest_points(points, 60).tolist() == expected
+
+
+def test_compiled_sampling_chooses_as_the_plain_form(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    points = torch.randn(4, 500, 3, generator=torch.Generator().manual_seed(1))
+    points[:, 100:150] = points[:, 50:51]  # equal points are a tie
+    chosen = farthest_points(points, 470)
+    found = ball_query(points, take(points, chosen), 0.6, 16)
+    monkeypatch.setattr(sampling, "_compiled", lambda _: False)
+    assert torch.equal(farthest_points(points, 470), chosen)
+    assert torch.equal(ball_query(points, take(points, chosen), 0.6, 16), found)
+    assert (found[..., 1] != found[..., 0]).any()
 
 
 def test_farthest_points_of_a_known_row() -> None:

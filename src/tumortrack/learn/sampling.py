@@ -1,12 +1,14 @@
-"""Choosing points and neighbours in plain torch: no compiled extension, exportable, deterministic.
+"""Choosing points and neighbours, deterministic: compiled for a CPU, in plain torch elsewhere.
 
-Points come in batches (B, N, 3). Lengths are in whatever unit the points have.
+The plain forms are the reference, run on every device and can be exported; both choose the same
+points. Points come in batches (B, N, 3). Lengths are in whatever unit the points have.
 """
 
 from __future__ import annotations
 
 from typing import Literal
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.nn import functional
@@ -34,6 +36,11 @@ def farthest_points(points: Tensor, k: int) -> Tensor:
     chosen = torch.empty((len(points), k), dtype=torch.int64, device=points.device)
     centre = points.mean(dim=1, keepdim=True)
     newest = _squared_distance(x, y, z, *centre.unbind(-1)).argmax(dim=1, keepdim=True)
+    if _compiled(points):
+        from tumortrack.learn.sampling_kernels import farthest
+
+        farthest(_rows(points), newest[:, 0].numpy(), chosen.numpy())
+        return chosen
     nearest = torch.full_like(x, torch.inf)
     for step in range(k):
         chosen[:, step : step + 1] = newest
@@ -79,6 +86,12 @@ def ball_query(points: Tensor, centres: Tensor, radius: float, k: int) -> Tensor
 
     Source: Qi et al., PointNet++, NIPS 2017, section 3.2.
     """
+    if _compiled(points):
+        from tumortrack.learn.sampling_kernels import balls
+
+        found = torch.empty((*centres.shape[:2], k), dtype=torch.int64)
+        balls(_rows(points), _rows(centres), np.float32(radius**2), found.numpy())
+        return found
     # One contiguous row per coordinate: 3x faster than strides of 3.
     across = points.detach().transpose(1, 2).contiguous()[:, :, None, :].unbind(1)
     down = centres.detach().transpose(1, 2).contiguous()[:, :, :, None].unbind(1)
@@ -99,6 +112,17 @@ def take(values: Tensor, indices: Tensor) -> Tensor:
     first_row = torch.arange(batch, device=values.device) * n
     rows = indices + first_row.view(-1, *([1] * (indices.dim() - 1)))
     return functional.embedding(rows, values.reshape(batch * n, channels))
+
+
+def _compiled(points: Tensor) -> bool:
+    """Whether the compiled kernels can take these points: not while torch traces the network."""
+    traced = torch.compiler.is_compiling() or torch.jit.is_tracing()
+    return points.device.type == "cpu" and points.dtype == torch.float32 and not traced
+
+
+def _rows(points: Tensor) -> np.ndarray:
+    """(B, N, 3) -> (B, 3, N), contiguous."""
+    return points.detach().transpose(1, 2).contiguous().numpy()
 
 
 def _squared_distance(
