@@ -10,10 +10,11 @@ carries labels along exactly. Distances are those before the deformation.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Protocol
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, UInt8
+from jaxtyping import Bool, Float, Float32, Int64, UInt8
 
 from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError
@@ -67,8 +68,35 @@ class PartPool:
         self, rng: np.random.Generator, count: int
     ) -> tuple[Float[np.ndarray, "n 3"], UInt8[np.ndarray, " n"]]:
         """Points spread evenly over the part's enlarged box: shares of them are volumes."""
-        chosen = _window(len(self.labels), count, rng)
+        chosen = self.neighbours(int(rng.integers(len(self.labels))), count)
         return self.points_ct[chosen], self.labels[chosen]
+
+    def neighbours(self, first: int, count: int) -> Int64[np.ndarray, " count"]:
+        """Indices of ``count`` points from ``first`` on; after the last comes the first."""
+        return (first + np.arange(count)) % len(self.labels)
+
+    def inside_of(self, first: int, count: int) -> int:
+        """How many of these neighbours lie inside the part."""
+        rounds, last = divmod(first + count, len(self.labels))
+        before = self._inside_before
+        return int(rounds * before[-1] + before[last] - before[first])
+
+    def nearest(self, first: int, count: int, k: int) -> Int64[np.ndarray, " 2k"]:
+        """Of these neighbours the ``k`` inside that are nearest to the surface, and ``k`` outside;
+        on a side in any order."""
+        drawn = self.neighbours(first, count)
+        inside = self.inside[drawn]
+        return np.concatenate([_nearest(self, drawn[side], k) for side in (inside, ~inside)])
+
+    @cached_property
+    def _inside_before(self) -> Int64[np.ndarray, " n+1"]:
+        return np.concatenate([[0], np.cumsum(self.inside)])
+
+    @cached_property
+    def rarer_share(self) -> float:
+        """Of the points, those on the side that has fewer."""
+        share = float(self.inside.mean())
+        return min(share, 1 - share)
 
 
 class OccupancyPool:
@@ -91,41 +119,42 @@ class OccupancyPool:
         self, rng: np.random.Generator
     ) -> tuple[Float[np.ndarray, "n 3"], UInt8[np.ndarray, " n"]]:
         """One scene's points (CT frame, undeformed) and labels; the same number every time."""
-        points, labels = [], []
-        for part in self.parts:
-            chosen = self._sort_sample(part, rng)
-            points.append(part.points_ct[chosen])
-            labels.append(part.labels[chosen])
-        near = sum(map(len, labels))
-        n_far = round(near * self.config.far_share / (1 - self.config.far_share))
-        chosen = _window(len(self.far_labels), n_far, rng)
+        *near, (first, count) = self.windows(rng)
+        chosen = [
+            part.nearest(*window, self.config.per_side)
+            for part, window in zip(self.parts, near, strict=True)
+        ]
+        far = (first + np.arange(count)) % len(self.far_labels)
+        pairs = list(zip(self.parts, chosen, strict=True))
         return (
-            np.concatenate([*points, self.far_points_ct[chosen]]),
-            np.concatenate([*labels, self.far_labels[chosen]]),
+            np.concatenate([*(p.points_ct[c] for p, c in pairs), self.far_points_ct[far]]),
+            np.concatenate([*(p.labels[c] for p, c in pairs), self.far_labels[far]]),
         )
 
-    def _sort_sample(self, part: PartPool, rng: np.random.Generator) -> np.ndarray:
+    def windows(self, rng: np.random.Generator) -> list[tuple[int, int]]:
+        """Which points of the pool a scene looks at, as (first, count): of each part so many that
+        enough lie on either side of its surface; last those anywhere. The pool is in random order,
+        so that neighbours are a random draw, without its cost."""
+        windows = [self._wide_enough(part, rng) for part in self.parts]
+        near = 2 * self.config.per_side * len(self.parts)
+        count = round(near * self.config.far_share / (1 - self.config.far_share))
+        return [*windows, (int(rng.integers(len(self.far_labels))), count)]
+
+    def _wide_enough(self, part: PartPool, rng: np.random.Generator) -> tuple[int, int]:
         k = self.config.per_side
-        share = part.inside.mean()
-        count = int(k / min(share, 1 - share) * 1.1)
+        count = int(k / part.rarer_share * 1.1)
         while True:
-            drawn = _window(len(part.inside), count, rng)
-            inside = part.inside[drawn]
-            if min(inside.sum(), (~inside).sum()) >= k:
-                break
+            first = int(rng.integers(len(part.inside)))
+            inside = part.inside_of(first, count)
+            if min(inside, count - inside) >= k:
+                return first, count
             count = min(2 * count, len(part.inside))
-        return np.concatenate([_nearest(part, drawn[side], k) for side in (inside, ~inside)])
 
 
 def _nearest(part: PartPool, drawn: np.ndarray, k: int) -> np.ndarray:
     if len(drawn) == k:
         return drawn
     return drawn[np.argpartition(part.distance_mm[drawn], k)[:k]]
-
-
-def _window(n: int, count: int, rng: np.random.Generator) -> np.ndarray:
-    """``count`` neighbours of a pool that is in random order: a random draw, without its cost."""
-    return (int(rng.integers(n)) + np.arange(count)) % n
 
 
 def organ_pool(anatomy_ct: Anatomy, config: OccupancyConfig, seed: int) -> PartPool:

@@ -14,6 +14,7 @@ from typing import Literal
 
 import numpy as np
 from jaxtyping import Float, Float64
+from scipy.spatial import ConvexHull
 
 from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError, NoEstimate, TumortrackError
@@ -22,6 +23,7 @@ from tumortrack.core.types import (
     Anatomy,
     DepthFrame,
     Intrinsics,
+    Mesh,
     OccupancySamples,
     SensorCloud,
 )
@@ -106,6 +108,15 @@ class Pair:
 
 
 @dataclass(frozen=True, eq=False)
+class Drawn:
+    """What is drawn before a picture is taken."""
+
+    free: bool  # seen from any distance and not cropped
+    camera_from_ct: Float64[np.ndarray, "4 4"]
+    deformation: Deformation
+
+
+@dataclass(frozen=True, eq=False)
 class Stage:
     """A scene before points are asked for: what lies where, and what the camera gets of it."""
 
@@ -136,6 +147,9 @@ class Simulator:
         self._up_lps = up_lps
         self._intrinsics = d405(config.width, config.height)
         self._visibility = Visibility(anatomy_ct.organ)
+        vertices = anatomy_ct.organ.vertices_mm
+        corners = vertices[ConvexHull(vertices).vertices]  # no others are its farthest anywhere
+        self._hull_ct = Mesh(corners, np.empty((0, 3)))
 
     def pair(self, recipe: SceneRecipe, pool: PointSource) -> Pair:
         """The scene's cloud and its labelled points, camera frame."""
@@ -166,26 +180,32 @@ class Simulator:
             "distances in the scene configuration."
         )
 
-    def _attempt(self, rng: np.random.Generator) -> Stage:
-        config, organ = self.config, self.anatomy_ct.organ
+    def draw(self, rng: np.random.Generator) -> Drawn:
+        """Pose and deformation of the next scene of this generator."""
+        config = self.config
         free = bool(rng.uniform() < config.free_range)
         nearest = config.free_nearest_mm if free else config.pose.nearest_mm
-        camera_from_ct = sample_pose(config.pose, organ, self._up_lps, nearest, rng)
+        camera_from_ct = sample_pose(config.pose, self._hull_ct, self._up_lps, nearest, rng)
         model = config.deform[rng.integers(len(config.deform))]
         visible = _visible_from(self._visibility, self._intrinsics, camera_from_ct)
         view = View(self.anatomy_ct, visible, self._body)
-        deformation = model.sample(view, rng)
+        return Drawn(free, camera_from_ct, model.sample(view, rng))
+
+    def _attempt(self, rng: np.random.Generator) -> Stage:
+        config, organ = self.config, self.anatomy_ct.organ
+        drawn = self.draw(rng)
+        camera_from_ct, deformation = drawn.camera_from_ct, drawn.deformation
         vertices = transform_points(camera_from_ct, deformation.apply(organ.vertices_mm))
         frame = render_depth(vertices, organ.faces, self._intrinsics)
         frame = add_clutter(frame, config.clutter, rng)
         frame = occlude(frame, config.occlusion, rng)  # hides background too
         frame = miscalibrate(frame, config.calibration, rng)
         frame = add_noise(frame, config.noise, rng)
-        crop = _crop(config, free, rng)
+        crop = crop_of(config, drawn.free, rng)
         return Stage(camera_from_ct, deformation, frame, cloud_from_depth(frame, crop, rng))
 
 
-def _crop(config: SceneConfig, free: bool, rng: np.random.Generator) -> CloudConfig:
+def crop_of(config: SceneConfig, free: bool, rng: np.random.Generator) -> CloudConfig:
     """What of this scene's image becomes the cloud."""
     near_mm, far_mm = (1.0, 1e4) if free else (config.cloud.near_mm, config.cloud.far_mm)
     n_points = config.cloud.n_points

@@ -80,13 +80,8 @@ class DragConfig(Config, frozen=True, tag="drag"):
         directions = rng.normal(size=(len(steps), 3))
         directions /= np.linalg.norm(directions, axis=1, keepdims=True)
         shifts = directions * (distances * rng.uniform(size=len(steps)))[:, None]
-        drags = Drags(start[:0], shifts[:0].astype(np.float32), sigmas[:0].astype(np.float32))
-        for k in range(len(steps)):  # a vertex is dragged from where earlier drags left it
-            centres = np.concatenate([drags.centres_ct, drags.apply(start[k : k + 1])])
-            drags = Drags(
-                centres, shifts[: k + 1].astype(np.float32), sigmas[: k + 1].astype(np.float32)
-            )
-        return drags
+        shifts_mm, sigmas_mm = shifts.astype(np.float32), sigmas.astype(np.float32)
+        return Drags(_centres(start, shifts_mm, sigmas_mm), shifts_mm, sigmas_mm)
 
 
 def _visible_vertices(view: View, count: int, rng: np.random.Generator) -> np.ndarray:
@@ -119,3 +114,12 @@ def _drag(points, centres, shifts, sigmas):  # type: ignore[no-untyped-def]
                 out[i, 1] += factor * shifts[k, 1]
                 out[i, 2] += factor * shifts[k, 2]
     return out
+
+
+@numba.njit(cache=True, nogil=True, fastmath=True)
+def _centres(start, shifts, sigmas):  # type: ignore[no-untyped-def]
+    """A vertex is dragged from where earlier drags left it."""
+    centres = start.copy()
+    for k in range(1, len(start)):
+        centres[k : k + 1] = _drag(start[k : k + 1], centres[:k], shifts[:k], sigmas[:k])
+    return centres
