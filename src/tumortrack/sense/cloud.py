@@ -43,14 +43,14 @@ def cloud_from_depth(
     index = np.flatnonzero((depth_mm > config.near_mm) & (depth_mm < config.far_mm))
     if len(index) < FEWEST_POINTS:
         raise NoEstimate(_too_few(len(index), depth_mm, config.near_mm, config.far_mm))
-    chosen = index[_draw(len(index), config.n_points, rng)]
+    chosen = index[draw_some(len(index), config.n_points, rng)]
     points_mm = deproject_pixels(chosen, depth_mm[chosen].astype(np.float64), frame.intrinsics)
     return SensorCloud(points_mm, frame.stamp_ns)
 
 
 def thin_cloud(cloud: SensorCloud, n_points: int, rng: np.random.Generator) -> SensorCloud:
     """``n_points`` unique random points of the cloud (all of them if it has no more)."""
-    chosen = _draw(len(cloud.points_mm), n_points, rng)
+    chosen = draw_some(len(cloud.points_mm), n_points, rng)
     return SensorCloud(cloud.points_mm[chosen], cloud.stamp_ns)
 
 
@@ -112,7 +112,8 @@ def _count_different(points_mm: np.ndarray) -> int:
     return count
 
 
-def _draw(available: int, wanted: int, rng: np.random.Generator) -> np.ndarray:
+def draw_some(available: int, wanted: int, rng: np.random.Generator) -> np.ndarray:
+    """Which of the ``available`` become a cloud of ``wanted``, or of all if they are no more."""
     return rng.choice(available, min(available, wanted), replace=False)
 
 

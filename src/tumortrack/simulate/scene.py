@@ -41,6 +41,7 @@ from tumortrack.simulate.occupancy import OccupancyConfig, PointSource
 from tumortrack.simulate.pose import PoseConfig, sample_pose
 
 STREAMS = ("train", "validation", "test")
+ATTEMPTS = 20  # draws of a recipe until one shows enough of the organ
 
 
 class SceneConfig(Config, frozen=True):
@@ -169,16 +170,13 @@ class Simulator:
         )
 
     def _stage(self, recipe: SceneRecipe) -> tuple[Stage, np.random.Generator]:
-        for attempt in range(20):
+        for attempt in range(ATTEMPTS):
             rng = recipe.generator(attempt)
             try:
                 return self._attempt(rng), rng
             except NoEstimate:  # the crop left too few points: another draw of the same recipe
                 continue
-        raise TumortrackError(
-            f"{recipe}: no pose in 20 shows enough of the organ; check the camera's range and the "
-            "distances in the scene configuration."
-        )
+        raise shows_nothing(recipe)
 
     def draw(self, rng: np.random.Generator) -> Drawn:
         """Pose and deformation of the next scene of this generator."""
@@ -203,6 +201,13 @@ class Simulator:
         frame = add_noise(frame, config.noise, rng)
         crop = crop_of(config, drawn.free, rng)
         return Stage(camera_from_ct, deformation, frame, cloud_from_depth(frame, crop, rng))
+
+
+def shows_nothing(recipe: SceneRecipe) -> TumortrackError:
+    return TumortrackError(
+        f"{recipe}: no pose in {ATTEMPTS} shows enough of the organ; check the camera's range and "
+        "the distances in the scene configuration."
+    )
 
 
 def crop_of(config: SceneConfig, free: bool, rng: np.random.Generator) -> CloudConfig:
