@@ -2,14 +2,18 @@
 
 import pickle
 
+import msgspec
 import numpy as np
 import pytest
 import torch
 from scipy.spatial import cKDTree
 
 from render_objects import anatomy, bumpy
+from tumortrack.app.presets import paper, quick
 from tumortrack.core.errors import InputError, TumortrackError
 from tumortrack.core.geometry import transform_points
+from tumortrack.learn.scenes import scenes_for
+from tumortrack.learn.train import Run, train
 from tumortrack.sense.camera import d405, project
 from tumortrack.sense.cloud import CloudConfig
 from tumortrack.sense.noise import D405_NOISE
@@ -241,3 +245,52 @@ def test_a_cloud_of_more_points_than_pixels_repeats_them(pool):
     clouds = DeviceStream(reference, CPU).batch(0)[0].numpy()
     np.testing.assert_allclose(clouds, reference.batch(0).clouds_mm, atol=0.01)
     assert len(np.unique(clouds[0], axis=0)) < 5000
+
+
+# in training
+
+
+def test_processes_plan_ahead_and_steps_repeat_after_the_period(pool):
+    reference = stream(pool, CONFIGS["far"], 2)
+    device = DeviceStream(reference, CPU)
+    scenes = scenes_for(reference, range(3, 6), 4, 1, CPU, "device")
+    for index, batch in zip((3, 0, 1), scenes.batches, strict=True):
+        for one, two in zip(batch, device.batch(index), strict=True):
+            torch.testing.assert_close(one, two, atol=1e-3, rtol=0)
+    assert scenes.maker == "batched on cpu"
+    assert scenes.note == ""
+
+
+def test_a_gpu_makes_what_it_can_and_the_user_hears_of_the_rest(pool):
+    gpu = torch.device("cuda")  # nothing is made here: no GPU is needed
+    able, unable = stream(pool, paper(ANATOMY).scene), stream(pool, quick(ANATOMY).scene)
+    scenes = scenes_for(able, range(1), 0, 3, gpu)
+    assert (scenes.maker, scenes.note) == ("batched on cuda", "")
+    scenes = scenes_for(unable, range(1), 0, 3, gpu)
+    assert scenes.maker == "3 processes"
+    assert "3 processes on the CPU" in scenes.note
+    assert "sensor noise" in scenes.note
+    for told in (
+        scenes_for(able, range(1), 0, 3, CPU),
+        scenes_for(able, range(1), 0, 3, gpu, "workers"),
+    ):
+        assert (told.maker, told.note) == ("3 processes", "")
+    with pytest.raises(InputError, match="sensor noise"):
+        scenes_for(unable, range(1), 0, 3, CPU, "device")
+
+
+def test_a_network_learns_from_them_as_from_the_reference_s(tmp_path):
+    config = msgspec.structs.replace(
+        quick(ANATOMY), scene=CONFIGS["paper"], batch_size=4, validation_pairs=2
+    )
+    losses, makers = [], []
+    for maker in ("device", "workers"):
+        folder = tmp_path / maker
+        folder.mkdir()
+        told: list[float] = []
+        run = Run(ANATOMY, UP, "", config, steps=4, device="cpu", workers=0, scenes=maker)
+        model = train(run, folder, lambda status, told=told: told.append(status.loss))
+        losses.append(told[-1])
+        makers.append(model.provenance["scenes"])
+    assert makers == ["batched on cpu", "0 processes"]
+    assert losses[0] == pytest.approx(losses[1], rel=0.02)

@@ -18,6 +18,7 @@ class TrainingScreen:
     def __init__(self) -> None:
         self._spinner = Spinner("making labelled points, starting workers ...", console=console)
         self._said = -_EVERY_S
+        self._noted = ""
 
     def __enter__(self) -> TrainingScreen:
         if console.is_terminal:
@@ -28,6 +29,9 @@ class TrainingScreen:
         self._spinner.stop()
 
     def show(self, status: Status) -> None:
+        if status.note != self._noted:
+            say(status.note)
+            self._noted = status.note
         text = _line(status)
         if console.is_terminal:
             self._spinner.update(text)

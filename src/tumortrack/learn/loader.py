@@ -58,7 +58,7 @@ def batches(
         num_workers=workers,
         multiprocessing_context="spawn" if workers else None,
         prefetch_factor=4 if workers else None,
-        worker_init_fn=_quiet_worker,
+        worker_init_fn=quiet_worker,
         pin_memory=device.type == "cuda",  # copies then overlap with the work before
     )
     yield from loader
@@ -71,7 +71,8 @@ def default_workers(network: NetworkConfig) -> int:
     return max(1, min(16, cores if network.warps else cores // 2))
 
 
-def _quiet_worker(_: int) -> None:
+def quiet_worker(_: int) -> None:
+    """What a process that makes data does first."""
     for number in (signal.SIGINT, signal.SIGTERM):  # the parent's to handle
         signal.signal(number, signal.SIG_IGN)
     # A worker has nothing to put in order at its end, and native libraries' threads can abort a

@@ -31,6 +31,7 @@ class Status:
     samples_per_s: float
     loss: float
     miou: float | None  # of the last validation
+    note: str = ""  # on how scenes are made, where a user should know
 
 
 class Interrupted(TumortrackError):

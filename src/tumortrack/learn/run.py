@@ -33,6 +33,7 @@ class Run:
     workers: int | None = None  # processes that make scenes; None: as the machine allows
     checkpoint_every_s: float = 30.0
     start: Start | None = None  # pretrained weights, for warps
+    scenes: Literal["auto", "workers", "device"] = "auto"  # who makes them; see ``learn.scenes``
 
     def __post_init__(self) -> None:
         for name, value, fewest in (

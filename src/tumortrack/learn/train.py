@@ -13,10 +13,11 @@ from pathlib import Path
 from tumortrack.learn.checkpoint import Progress
 from tumortrack.learn.course import course_of
 from tumortrack.learn.history import History, Record
-from tumortrack.learn.loader import batches, default_workers
+from tumortrack.learn.loader import default_workers
 from tumortrack.learn.model import Model, choose_device, save_model
 from tumortrack.learn.pace import REPORT_EVERY_S, Clock, Interrupted, Status, ctrl_c, use_cores
 from tumortrack.learn.run import Run, provenance, run_identity
+from tumortrack.learn.scenes import scenes_for
 from tumortrack.learn.schedule import settle_end
 from tumortrack.learn.state import TrainingState
 from tumortrack.learn.work import work_folder
@@ -61,7 +62,8 @@ def _train(run: Run, folder: Path, work: Path, report: Callable[[Status], None])
     period = config.training_pairs // config.batch_size
 
     progress, clock, miou = state.progress, Clock(state.progress), None
-    source = closing(batches(stream, steps, period, workers, device))
+    scenes = scenes_for(stream, steps, period, workers, device, run.scenes)
+    source = closing(scenes.batches)
     with History(work, progress) as history, ctrl_c() as stopped, source as loaded:
         for batch in loaded:
             loss = state.step(batch)
@@ -76,19 +78,22 @@ def _train(run: Run, folder: Path, work: Path, report: Callable[[Status], None])
             if done or settled or stop or clock.due("checkpoint", run.checkpoint_every_s):
                 state.save(work)
             if done or clock.due("report", REPORT_EVERY_S):
-                report(_status(run, progress, clock.rate(progress), loss, miou))
+                report(_status(run, progress, clock.rate(progress), loss, miou, scenes.note))
             if done:
                 break
             if stop:
                 raise Interrupted.at(progress.step, folder)
-    model = course.model(state.best_network(), provenance(run, progress, device))
+    origin = {**provenance(run, progress, device), "scenes": scenes.maker}
+    model = course.model(state.best_network(), origin)
     save_model(model, folder)
     return model
 
 
-def _status(run: Run, progress: Progress, rate: float, loss: float, miou: float | None) -> Status:
+def _status(
+    run: Run, progress: Progress, rate: float, loss: float, miou: float | None, note: str
+) -> Status:
     left = ((progress.end or run.config.steps) - progress.step) / rate
     if progress.end is None and run.minutes is not None:
         left = min(left, run.minutes * 60 - progress.elapsed_s)
     speed = rate * run.config.batch_size
-    return Status(progress.step, progress.end, max(left, 0.0), speed, loss, miou)
+    return Status(progress.step, progress.end, max(left, 0.0), speed, loss, miou, note)
