@@ -383,6 +383,7 @@ class Knowing:
 
 def test_locate_writes_where_the_points_are(model, cloud, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr("tumortrack.track.tracker.Tracker", Knowing)
+    monkeypatch.setattr("tumortrack.learn.model_folder.has_shape", lambda _: True)
     points = np.concatenate([some_points(4), MIDDLE[None] + [0, 0, 131.0]])
     lines = [f"{n},{','.join(map(str, p))}" for n, p in enumerate(points)]
     asked = written(tmp_path / "asked.csv", "\n".join(["label,ct_x,ct_y,ct_z", *lines]))
@@ -407,6 +408,7 @@ def test_locate_writes_where_the_points_are(model, cloud, tmp_path, monkeypatch,
 
 def test_points_that_cannot_be_meant_cost_no_locating(model, cloud, tmp_path, monkeypatch):
     monkeypatch.setattr("tumortrack.track.tracker.Tracker", Knowing)
+    monkeypatch.setattr("tumortrack.learn.model_folder.has_shape", lambda _: True)
     monkeypatch.setattr(Knowing, "asked", 0)
     asked = written(tmp_path / "asked.csv", "x,y,z\n-60,-40,-300\n")
     with pytest.raises(InputError, match="RAS"):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import sys
 from collections.abc import Callable
@@ -460,6 +461,40 @@ def demo(*, out: Path = Path("runs/demo"), minutes: float = 2.0, scenes: int = 2
     run_demo(out, minutes, scenes)
 
 
+def bench(
+    *,
+    only: tuple[
+        Literal[
+            "generator", "encoder", "decoder", "frame", "tracking", "volume", "command",
+            "planning", "gpu", "training", "whole-training",
+        ],
+        ...,
+    ] = (),
+    quick: bool = False,
+    curves: bool = False,
+    model: Path | None = None,
+    cloud: Path | None = None,
+    out: Path = Path("runs/bench.json"),
+    document: Path | None = None,
+) -> None:  # fmt: skip
+    """Measure the speed of every part on this machine, each beside its naive form, in turns.
+
+    Args:
+        only: which parts; default: all.
+        quick: shorter measurements, about a minute in all once there are models.
+        curves: also how time and memory grow with queries, points, tumors, voxels and batch.
+        model: folder that `train` wrote, to be measured instead of the one that the bench trains
+            (kept in runs/bench).
+        cloud: of that model's organ, freed of its background; .ply, .pcd or .npz in mm.
+        out: JSON file to write; curves lie beside it.
+        document: Markdown file whose marked blocks are to be filled, such as docs/performance.md.
+    """
+    from tumortrack.app.benching import BenchOptions
+    from tumortrack.app.benching import bench as run
+
+    run(BenchOptions(only, quick, curves, model, cloud, out, document))
+
+
 def inspect(path: Positional[Path], /) -> None:
     """Say what a case, model, run, scene or report is.
 
@@ -491,34 +526,59 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "simulate": simulate,
     "twin": twin,
     "evaluate": evaluate,
+    "bench": bench,
     "inspect": inspect,
     "doctor": doctor,
 }
 
 
+_OBJECTS_A_COLLECTION = 20_000
+
+
 def main() -> None:
-    """Entry point: a known error is one line and an exit code, never a traceback."""
+    """Entry point."""
     # OpenMP's threads wait by spinning; where other programs want the cores that is several times
     # slower than giving them back soon, and no faster where they don't.
     os.environ.setdefault("GOMP_SPINCOUNT", "1000")
     # NumPy's and SciPy's matrices here are small: more threads gain little, and lose much likewise.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    # PyTorch and its kin make objects by the hundred thousand that live to the end: to look through
+    # them for garbage again and again is a tenth of the time of their import.
+    gc.set_threshold(_OBJECTS_A_COLLECTION)
     try:
-        tyro.extras.subcommand_cli_from_dict(
-            COMMANDS,
-            prog="tumortrack",
-            description="Locate kidney and tumors under deformation from one depth image. "
-            "Research software, not a medical device.",
-        )
+        sys.exit(run(sys.argv[1:]))
+    finally:
+        gc.freeze()  # the memory goes back with the process: no last search, half a second long
+
+
+def run(arguments: list[str]) -> int:
+    """One command: its exit code. A known error is one line, never a traceback."""
+    try:
+        _call(arguments)
     except TumortrackError as error:
         print(f"tumortrack: {error}", file=sys.stderr)
-        sys.exit(error.exit_code)
+        return error.exit_code
     except KeyboardInterrupt:
         print("tumortrack: stopped.", file=sys.stderr)
-        sys.exit(130)
+        return 130
     except BrokenPipeError:  # `tumortrack inspect X | head`
         sys.stderr.close()
-        sys.exit(1)
+        return 1
+    return 0
+
+
+def _call(arguments: list[str]) -> None:
+    """Only the chosen command's options are made; all of them take several times as long."""
+    if arguments and (command := COMMANDS.get(arguments[0])) is not None:
+        tyro.cli(command, prog=f"tumortrack {arguments[0]}", args=arguments[1:])
+        return
+    tyro.extras.subcommand_cli_from_dict(
+        COMMANDS,
+        prog="tumortrack",
+        description="Locate kidney and tumors under deformation from one depth image. "
+        "Research software, not a medical device.",
+        args=arguments,
+    )
 
 
 if __name__ == "__main__":

@@ -13,11 +13,11 @@ from tumortrack.app.pretraining import start_of
 from tumortrack.app.scenes import SimulateOptions, check_case, write_scenes
 from tumortrack.core import store
 from tumortrack.core.errors import InputError
-from tumortrack.core.types import Anatomy, SensorCloud
+from tumortrack.core.types import Anatomy, DepthFrame, SensorCloud
 
 if TYPE_CHECKING:
     from tumortrack.imaging.prepare import PrepareOptions
-    from tumortrack.learn.model import Model
+    from tumortrack.sense.cloud import CloudConfig
     from tumortrack.track.points import PointTable
 
 Device = Literal["auto", "cpu", "cuda"]
@@ -56,12 +56,7 @@ class TrainOptions:
 
 def train(case_folder: Path, folder: Path, options: TrainOptions) -> None:
     """`tumortrack train`: case -> model folder, resumed where one was begun."""
-    from tumortrack.app.presets import PRESETS
-    from tumortrack.app.training import TrainingScreen
     from tumortrack.imaging.case import load_case
-    from tumortrack.learn.model import is_finished, load_model
-    from tumortrack.learn.train import Run, run_identity
-    from tumortrack.learn.train import train as fit
 
     if options.minutes is not None and not options.minutes > 0:
         raise InputError(f"--minutes {options.minutes} must be more than 0.")
@@ -71,7 +66,15 @@ def train(case_folder: Path, folder: Path, options: TrainOptions) -> None:
         raise InputError("--minutes and --steps both say when to stop; give one of them.")
     if options.workers is not None and options.workers < 0:
         raise InputError(f"--workers {options.workers} must be 0 or more.")
-    case = load_case(case_folder)
+    case = load_case(case_folder)  # what is wrong so far is said before PyTorch's seconds
+
+    from tumortrack.app.presets import PRESETS
+    from tumortrack.app.training import TrainingScreen
+    from tumortrack.learn.model import load_model
+    from tumortrack.learn.model_folder import is_finished
+    from tumortrack.learn.train import Run, run_identity
+    from tumortrack.learn.train import train as fit
+
     run = Run(
         anatomy_ct=case.anatomy,
         up_lps=case.up_lps,
@@ -117,16 +120,19 @@ class LocateOptions:
 
 def locate(model_folder: Path, source: Path, out: Path, options: LocateOptions) -> None:
     """`tumortrack locate`: one cloud or depth image -> run folder."""
+    _check_grid(options.grid)
+    store.check_place(out, "run", options.overwrite)
+    points = _asked(options.map_points, model_folder)
+    seen, notes = _read(source, options)  # what is wrong so far is said before PyTorch's seconds
+
     from tumortrack.learn.model import load_model
     from tumortrack.track.files import write_estimate
     from tumortrack.track.tracker import Tracker
 
-    _check_grid(options.grid)
-    store.check_place(out, "run", options.overwrite)
     model = load_model(model_folder, options.device)
     tracker = Tracker(model)
-    points = _asked(options.map_points, tracker.anatomy_ct, model_folder)
-    cloud, notes = _observed(model, source, options)
+    points = _near_organ(points, tracker.anatomy_ct, str(options.map_points))
+    cloud = _observed(seen, model.config.scene.cloud, options)
     estimate = tracker.locate(cloud, options.grid, options.seed)
     if points is not None and options.map_points is not None:
         notes = (*notes, *points.notes)
@@ -156,31 +162,40 @@ def locate(model_folder: Path, source: Path, out: Path, options: LocateOptions) 
     say(f"written to {out} (camera frame, mm) in {estimate.report['timings']['total']:.2f} s.")
 
 
-def _asked(path: Path | None, anatomy_ct: Anatomy | None, model_folder: Path) -> PointTable | None:
-    """The points of --map, checked before there is anything to wait for."""
-    from tumortrack.track.points import check_near_organ, read_points
+def _asked(path: Path | None, model_folder: Path) -> PointTable | None:
+    """The points of --map; model and points are checked before there is anything to wait for."""
+    from tumortrack.learn.model_folder import has_shape, read_model_manifest
+    from tumortrack.track.points import read_points
 
+    manifest = read_model_manifest(model_folder)
     if path is None:
         return None
-    if anatomy_ct is None:
+    if not has_shape(manifest):
         raise InputError(
             f"--map: {model_folder} says what is where, but not which point of the CT lies there. "
             "A model of the preset clinic knows: tumortrack train CASE MODEL --preset clinic."
         )
-    points = read_points(path)
-    far = check_near_organ(points.points_ct, anatomy_ct.organ.box_mm, str(path))
+    return read_points(path)
+
+
+def _near_organ(
+    points: PointTable | None, anatomy_ct: Anatomy | None, name: str
+) -> PointTable | None:
+    """The same, with notes about those far from the organ."""
+    from tumortrack.track.points import check_near_organ
+
+    if points is None:
+        return None
+    assert anatomy_ct is not None  # a model with a shape
+    far = check_near_organ(points.points_ct, anatomy_ct.organ.box_mm, name)
     return replace(points, notes=(*points.notes, *far))
 
 
-def _observed(
-    model: Model, source: Path, options: LocateOptions
-) -> tuple[SensorCloud, tuple[str, ...]]:
-    """The cloud of a cloud file or depth image, cropped as the options say."""
-    from tumortrack.sense.cloud import CloudConfig, check_cloud, cloud_from_depth, crop_cloud
+def _read(source: Path, options: LocateOptions) -> tuple[SensorCloud | DepthFrame, tuple[str, ...]]:
+    """What the file holds, and notes."""
+    from tumortrack.sense.cloud import check_cloud
     from tumortrack.sense.files import read_cloud, read_depth_png
 
-    trained = model.config.scene.cloud
-    near, far = options.range_mm or (trained.near_mm, trained.far_mm)
     if source.suffix.lower() == ".png":
         if options.intrinsics is None:
             raise InputError(f"{source} is a depth image: give --intrinsics FILE.json with it.")
@@ -189,14 +204,25 @@ def _observed(
                 "--unit is for clouds; a depth image's unit stands in its intrinsics file as "
                 "depth_unit_mm (mm per step)."
             )
-        frame = read_depth_png(source, options.intrinsics)
-        crop = CloudConfig(near_mm=near, far_mm=far, n_points=trained.n_points)
-        return cloud_from_depth(frame, crop, np.random.default_rng(options.seed)), ()
+        return read_depth_png(source, options.intrinsics), ()
     if options.intrinsics is not None:
         raise InputError(f"--intrinsics is for depth images (.png); {source} is a cloud.")
     cloud, notes = read_cloud(source, options.unit)
     check_cloud(cloud)  # before the crop, which would only say that nothing lies in range
-    return (crop_cloud(cloud, near, far) if options.range_mm else cloud), notes
+    return cloud, notes
+
+
+def _observed(
+    seen: SensorCloud | DepthFrame, trained: CloudConfig, options: LocateOptions
+) -> SensorCloud:
+    """The cloud, cropped as the options say."""
+    from tumortrack.sense.cloud import CloudConfig, cloud_from_depth, crop_cloud
+
+    near, far = options.range_mm or (trained.near_mm, trained.far_mm)
+    if isinstance(seen, SensorCloud):
+        return crop_cloud(seen, near, far) if options.range_mm else seen
+    crop = CloudConfig(near_mm=near, far_mm=far, n_points=trained.n_points)
+    return cloud_from_depth(seen, crop, np.random.default_rng(options.seed))
 
 
 def simulate(case_folder: Path, dataset: Path, options: SimulateOptions) -> None:
@@ -209,15 +235,20 @@ def evaluate(
     model_folder: Path, scenes: Path, report: Path, grid: int, seed: int, device: Device
 ) -> None:
     """`tumortrack evaluate`: model x scenes -> report folder."""
-    from tumortrack.evaluate.protocol import evaluate_scenes, summary_table
-    from tumortrack.learn.model import load_model
+    from tumortrack.learn.model_folder import read_model_manifest
     from tumortrack.simulate.scene_folder import list_scenes
-    from tumortrack.track.tracker import Tracker
 
     _check_grid(grid)
     if (report / store.MANIFEST).exists():
         raise InputError(f"{report} is a case, model or run; choose another REPORT folder.")
-    model, folders = load_model(model_folder, device), list_scenes(scenes)
+    read_model_manifest(model_folder)
+    folders = list_scenes(scenes)  # what is wrong so far is said before PyTorch's seconds
+
+    from tumortrack.evaluate.protocol import evaluate_scenes, summary_table
+    from tumortrack.learn.model import load_model
+    from tumortrack.track.tracker import Tracker
+
+    model = load_model(model_folder, device)
     check_case(model, folders)
     about = {
         "model": model.provenance,
@@ -248,7 +279,7 @@ def inspect(path: Path) -> None:
 
 
 def _check_grid(grid: int) -> None:
-    from tumortrack.track.tracker import LARGEST_GRID
+    from tumortrack.track.estimate import LARGEST_GRID
 
     if not 8 <= grid <= LARGEST_GRID:
         raise InputError(f"--grid {grid} is not allowed; choose 8 to {LARGEST_GRID}.")

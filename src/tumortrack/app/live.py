@@ -69,6 +69,7 @@ def track(
     arms: Arms | None = None,
 ) -> None:
     """Runs until the source ends, the time is up, the arms have ended, or Ctrl-C."""
+    from tumortrack.learn.model_folder import read_model_manifest
     from tumortrack.track.frames import read_frames
     from tumortrack.track.live import Controls, Frames, Setting
     from tumortrack.track.sources import SOURCES
@@ -79,9 +80,10 @@ def track(
     frames = read_frames(options.frame) if options.frame else Frames()
     if arms is not None:
         frames = arms.frames
+    read_model_manifest(model_folder)  # what is wrong is said before PyTorch's seconds
     report = place_of_report(options.report, "track")
 
-    from tumortrack.learn.model import load_model  # PyTorch takes seconds
+    from tumortrack.learn.model import load_model
     from tumortrack.track.loop import Loop
     from tumortrack.track.reader import Reader
     from tumortrack.track.tracker import Tracker

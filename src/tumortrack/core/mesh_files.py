@@ -1,4 +1,4 @@
-"""Mesh files, through trimesh: PLY out, PLY/STL/OBJ in."""
+"""Mesh files: PLY out without a library; all else through trimesh, whose import takes long."""
 
 from __future__ import annotations
 
@@ -56,22 +56,36 @@ def write_mesh(path: Path, mesh: Mesh) -> None:
     Raises:
         StorageError: the disk refused.
     """
-    import trimesh
-
-    out = trimesh.Trimesh(mesh.vertices_mm, mesh.faces, process=False)
     kind = path.suffix.lower().removeprefix(".")
-    content = out.export(file_type=kind)
-    data = content if isinstance(content, bytes) else str(content).encode()
-    if kind == "ply":
-        data = data.replace(b"1.0\n", b"1.0\ncomment " + _SPACE + b"\n", 1)  # after the format
-    elif kind == "stl":
-        data = _SPACE.ljust(_STL_HEADER, b"\0") + data[_STL_HEADER:]
-    else:
-        data = b"# " + _SPACE + b"\n" + data
+    data = _ply(mesh) if kind == "ply" else _exported(mesh, kind)
     try:
         path.write_bytes(data)
     except OSError as error:
         raise StorageError(f"cannot write {path}: {error.strerror}.") from error
+
+
+def _ply(mesh: Mesh) -> bytes:
+    """Turk 1994, "The PLY Polygon File Format"."""
+    header = (
+        f"ply\nformat binary_little_endian 1.0\ncomment {_SPACE.decode()}\n"
+        f"element vertex {len(mesh.vertices_mm)}\n"
+        "property float x\nproperty float y\nproperty float z\n"
+        f"element face {len(mesh.faces)}\nproperty list uchar int vertex_indices\nend_header\n"
+    )
+    faces = np.empty(len(mesh.faces), [("corners", "u1"), ("indices", "<i4", 3)])
+    faces["corners"], faces["indices"] = 3, mesh.faces
+    return header.encode() + mesh.vertices_mm.astype("<f4").tobytes() + faces.tobytes()
+
+
+def _exported(mesh: Mesh, kind: str) -> bytes:
+    import trimesh
+
+    out = trimesh.Trimesh(mesh.vertices_mm, mesh.faces, process=False)
+    content = out.export(file_type=kind)
+    data = content if isinstance(content, bytes) else str(content).encode()
+    if kind == "stl":
+        return _SPACE.ljust(_STL_HEADER, b"\0") + data[_STL_HEADER:]
+    return b"# " + _SPACE + b"\n" + data
 
 
 def write_anatomy(folder: Path, anatomy: Anatomy) -> None:

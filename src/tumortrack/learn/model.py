@@ -17,12 +17,11 @@ from tumortrack.core.config import Config, from_builtins, to_builtins
 from tumortrack.core.errors import ArtifactError, InputError
 from tumortrack.learn.config import TrainConfig
 from tumortrack.learn.fit import Familiar
+from tumortrack.learn.model_folder import KIND, SHAPE, read_model_manifest
 from tumortrack.learn.networks import Network, network_of
 from tumortrack.learn.warp.shape import Shape
 
-KIND = "model"
 _WEIGHTS = "weights.safetensors"
-_SHAPE = "shape.safetensors"
 
 
 class Trust(Config, frozen=True):
@@ -57,7 +56,7 @@ def save_model(model: Model, folder: Path) -> None:
     weights = {k: v.contiguous() for k, v in model.network.state_dict().items()}
     store.write_atomically(folder / _WEIGHTS, save(weights))
     if model.shape is not None:
-        store.write_atomically(folder / _SHAPE, save_arrays(model.shape.to_arrays()))
+        store.write_atomically(folder / SHAPE, save_arrays(model.shape.to_arrays()))
     content = {
         "parts": list(model.parts),
         "trust": None if model.trust is None else to_builtins(model.trust),
@@ -69,11 +68,6 @@ def save_model(model: Model, folder: Path) -> None:
     store.seal(folder, KIND, content, frame="camera")
 
 
-def is_finished(folder: Path) -> bool:
-    """Whether the folder holds a finished model (rather than a training under way)."""
-    return (folder / store.MANIFEST).is_file()
-
-
 def load_model(folder: Path, device: str = "auto") -> Model:
     """Read a model folder.
 
@@ -81,12 +75,7 @@ def load_model(folder: Path, device: str = "auto") -> Model:
         ArtifactError: missing, of another schema, damaged, or weights changed since training.
         InputError: CUDA asked for where there is none.
     """
-    if not is_finished(folder) and (folder / "training").is_dir():
-        raise ArtifactError(
-            f"{folder} holds a training that has not ended. Run the same `tumortrack train` "
-            "command again to go on with it."
-        )
-    manifest = store.read_manifest(folder, KIND)
+    manifest = read_model_manifest(folder)
     try:
         config = from_builtins(manifest["config"], TrainConfig, f"{folder}: config")
         parts = tuple(manifest["parts"])
@@ -97,7 +86,7 @@ def load_model(folder: Path, device: str = "auto") -> Model:
         provenance = dict(manifest["provenance"])
         shape, trust = None, None
         if config.network.warps:
-            shape = Shape.from_arrays(load_arrays((folder / _SHAPE).read_bytes()), len(parts))
+            shape = Shape.from_arrays(load_arrays((folder / SHAPE).read_bytes()), len(parts))
             trust = from_builtins(manifest["trust"], Trust, f"{folder}: trust")
     except InputError as error:
         raise ArtifactError(

@@ -9,6 +9,8 @@ from tumortrack.core.errors import InputError
 from tumortrack.core.motion import Motion
 from tumortrack.core.types import CameraLabels, Mesh, OccupancyCloud
 
+LARGEST_GRID = 400
+
 
 class Following(Config, frozen=True, kw_only=True):
     """How one frame of many is located. ``thorough``: also search as if there were no last

@@ -11,7 +11,6 @@ from tumortrack.track.estimate import Estimate, Following
 from tumortrack.track.occupancy import OccupancyLocator
 from tumortrack.track.warp import WarpLocator
 
-LARGEST_GRID = 400
 _ALONE = Following()
 
 

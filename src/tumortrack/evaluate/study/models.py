@@ -14,7 +14,7 @@ from tumortrack.core.types import Anatomy
 from tumortrack.evaluate.study.measure import StudyCase
 from tumortrack.evaluate.study.methods import Network
 from tumortrack.learn.config import TrainConfig
-from tumortrack.learn.model import is_finished
+from tumortrack.learn.model_folder import is_finished
 from tumortrack.learn.train import Run, Status, run_identity, train
 from tumortrack.sense.calibration import CalibrationConfig
 from tumortrack.sense.clutter import ClutterConfig

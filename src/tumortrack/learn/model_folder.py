@@ -1,0 +1,35 @@
+"""Whether a folder holds a model, said without PyTorch, whose import takes a second."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from tumortrack.core import store
+from tumortrack.core.errors import ArtifactError
+
+KIND = "model"
+SHAPE = "shape.safetensors"
+
+
+def is_finished(folder: Path) -> bool:
+    """Whether the folder holds a finished model (rather than a training under way)."""
+    return (folder / store.MANIFEST).is_file()
+
+
+def read_model_manifest(folder: Path) -> dict:
+    """The manifest of a finished model.
+
+    Raises:
+        ArtifactError: no model, not finished, of another schema, a file missing or changed.
+    """
+    if not is_finished(folder) and (folder / "training").is_dir():
+        raise ArtifactError(
+            f"{folder} holds a training that has not ended. Run the same `tumortrack train` "
+            "command again to go on with it."
+        )
+    return store.read_manifest(folder, KIND)
+
+
+def has_shape(manifest: dict) -> bool:
+    """Whether the model knows the organ's shape, and so which point of the CT lies where."""
+    return SHAPE in manifest["files"]
