@@ -12,7 +12,7 @@ from render_objects import anatomy, bumpy
 from tumortrack.app.presets import paper, quick
 from tumortrack.core.errors import InputError, TumortrackError
 from tumortrack.core.geometry import transform_points
-from tumortrack.learn.scenes import scenes_for
+from tumortrack.learn.scenes import batches_on, scenes_for
 from tumortrack.learn.train import Run, train
 from tumortrack.sense.camera import d405, project
 from tumortrack.sense.cloud import CloudConfig
@@ -98,7 +98,8 @@ def test_a_batch_is_the_reference_s(both):
 
 def test_depth_images_are_the_reference_s_but_for_single_pixels(both):
     reference, device = both
-    plan, depth_mm, _ = device._pictures(device.plan(1))
+    pictured = device.pictured(device.plan(1))
+    plan, depth_mm = pictured.plan, pictured.depth_mm
     for row, stage in enumerate(reference_stages(reference, 1)):
         seen, expected = depth_mm[row].numpy(), stage.frame.depth_mm
         assert np.sum(np.isnan(seen) != np.isnan(expected)) <= 2
@@ -128,10 +129,11 @@ def test_scenes_that_show_too_little_are_drawn_again(pool):
     reference = stream(pool, CONFIGS["far"])
     device = DeviceStream(reference, CPU)
     first = device.plan(0)
-    plan, _, counted = device._pictures(first)
+    pictured = device.pictured(first)
+    plan = pictured.plan
     again = plan.attempts > 0
     assert 0 < again.sum() < SIZE
-    assert (counted[:, -1] >= 200).all()
+    assert (pictured.available >= 200).all()
     same = (plan.camera_from_ct == first.camera_from_ct).all(axis=(1, 2))
     np.testing.assert_array_equal(same, ~again)
     for pose, stage in zip(plan.camera_from_ct, reference_stages(reference, 0), strict=True):
@@ -153,7 +155,9 @@ def test_batches_do_not_depend_on_their_size_or_who_plans(pool):
     device.batch(7)
     elsewhere = pickle.loads(pickle.dumps(device))
     plans = [pickle.loads(pickle.dumps(elsewhere.plan(index))) for index in (2, 3)]
-    small = [torch.cat(parts) for parts in zip(*map(device.made, plans), strict=True)]
+    pictured = [device.pictured(plan) for plan in plans]
+    made = [device.finished(p, device.chosen(p)) for p in pictured]
+    small = [torch.cat(parts) for parts in zip(*made, strict=True)]
     for one, two in zip(large, small, strict=True):
         torch.testing.assert_close(one, two, atol=1e-3, rtol=0)
 
@@ -213,13 +217,14 @@ def test_of_the_same_vertices_the_image_is_the_same_to_the_last_bit(away_mm):
 def test_clouds_lie_in_range_and_on_pixels(both):
     reference, device = both
     clouds, _, _, _ = device.batch(4)
-    plan, _, counted = device._pictures(device.plan(4))
+    pictured = device.pictured(device.plan(4))
+    plan = pictured.plan
     for row, cloud in enumerate(clouds.numpy()):
         assert (cloud[:, 2] > plan.near_mm[row]).all()
         assert (cloud[:, 2] < plan.far_mm[row]).all()
         pixels, _ = project(cloud, d405(reference.config.width, reference.config.height))
         np.testing.assert_allclose(pixels, np.rint(pixels), atol=1e-3)
-        wanted = min(int(plan.n_points[row]), int(counted[row, -1]), len(cloud))
+        wanted = min(int(plan.n_points[row]), int(pictured.available[row]), len(cloud))
         assert len(np.unique(cloud, axis=0)) == wanted
 
 
@@ -250,15 +255,18 @@ def test_a_cloud_of_more_points_than_pixels_repeats_them(pool):
 # in training
 
 
-def test_processes_plan_ahead_and_steps_repeat_after_the_period(pool):
+def test_batches_come_in_the_order_of_their_steps_however_many_are_made_at_once(pool):
     reference = stream(pool, CONFIGS["far"], 2)
     device = DeviceStream(reference, CPU)
-    scenes = scenes_for(reference, range(3, 6), 4, 1, CPU, "device")
-    for index, batch in zip((3, 0, 1), scenes.batches, strict=True):
-        for one, two in zip(batch, device.batch(index), strict=True):
-            torch.testing.assert_close(one, two, atol=1e-3, rtol=0)
-    assert scenes.maker == "batched on cpu"
-    assert scenes.note == ""
+    made = [
+        batches_on(CPU, reference, range(3, 10), 5, workers=workers, at_once=at_once)
+        for workers, at_once in ((1, 5), (0, 2), (0, 1))  # two batches together, one, one
+    ]
+    for index, *others in zip((3, 4, 0, 1, 2, 3, 4), *made, strict=True):
+        expected = device.batch(index)
+        for batch in others:
+            for one, two in zip(batch, expected, strict=True):
+                torch.testing.assert_close(one, two, atol=1e-3, rtol=0)
 
 
 def test_a_gpu_makes_what_it_can_and_the_user_hears_of_the_rest(pool):
@@ -281,14 +289,14 @@ def test_a_gpu_makes_what_it_can_and_the_user_hears_of_the_rest(pool):
 
 def test_a_network_learns_from_them_as_from_the_reference_s(tmp_path):
     config = msgspec.structs.replace(
-        quick(ANATOMY), scene=CONFIGS["paper"], batch_size=4, validation_pairs=2
+        quick(ANATOMY), scene=CONFIGS["far"], batch_size=4, validation_pairs=1
     )
     losses, makers = [], []
     for maker in ("device", "workers"):
         folder = tmp_path / maker
         folder.mkdir()
         told: list[float] = []
-        run = Run(ANATOMY, UP, "", config, steps=4, device="cpu", workers=0, scenes=maker)
+        run = Run(ANATOMY, UP, "", config, steps=2, device="cpu", workers=0, scenes=maker)
         model = train(run, folder, lambda status, told=told: told.append(status.loss))
         losses.append(told[-1])
         makers.append(model.provenance["scenes"])

@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator
-from dataclasses import dataclass
+from collections.abc import Generator, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from itertools import groupby
 from typing import Literal
 
 import torch
 from torch.utils.data import DataLoader, Dataset
 
+from tumortrack.core.errors import InputError
 from tumortrack.learn.loader import Tensors, batches, quiet_worker
 from tumortrack.simulate.batched.plan import Plan
-from tumortrack.simulate.batched.stream import DeviceStream, why_not
+from tumortrack.simulate.batched.stream import Chosen, DeviceStream, Pictured, why_not
 from tumortrack.simulate.dataset import SceneStream
 
 Maker = Literal["auto", "workers", "device"]
+_AT_ONCE = 256  # scenes that a GPU makes together
 
 
 @dataclass(frozen=True)
@@ -44,7 +48,10 @@ def scenes_for(
     """
     reason = why_not(stream)
     if maker == "device" or (maker == "auto" and device.type == "cuda" and reason is None):
-        made = _on_device(DeviceStream(stream, device), steps, period, workers)
+        if reason is not None:
+            raise InputError(f"the device cannot make these scenes. {reason}.")
+        at_once = _AT_ONCE if device.type == "cuda" else stream.batch_size
+        made = batches_on(device, stream, steps, period, workers, at_once)
         return Scenes(made, f"batched on {device.type}")
     by_workers = batches(stream, steps, period, workers, device)
     note = ""
@@ -54,25 +61,60 @@ def scenes_for(
 
 
 class _Plans(Dataset[Plan]):
-    def __init__(self, stream: DeviceStream, period: int) -> None:
-        self._stream, self._period = stream, period
+    def __init__(self, stream: DeviceStream) -> None:
+        self._stream = stream
 
-    def __getitem__(self, step: int) -> Plan:
-        return self._stream.plan(step % self._period if self._period else step)
+    def __getitem__(self, index: int) -> Plan:
+        return self._stream.plan(index)
 
 
-def _on_device(
-    stream: DeviceStream, steps: range, period: int, workers: int
+def batches_on(
+    device: torch.device,
+    stream: SceneStream,
+    steps: range,
+    period: int,
+    workers: int,
+    at_once: int,
 ) -> Generator[Tensors, None, None]:
-    """Workers plan ahead, some kB a batch; the device makes the scenes."""
+    """The batches of these steps, made on a device, ``at_once`` scenes or somewhat less together:
+    a device's work costs its start, however many scenes it is for. Workers plan ahead, some kB a
+    scene, and a thread draws the next clouds' pixels while the batches before are learnt from."""
+    size = stream.batch_size
+    n = max(1, at_once // size)
+    several = DeviceStream(replace(stream, batch_size=n * size), device)
+
+    def grouped() -> Iterator[tuple[int, Iterator[int]]]:
+        return groupby((s % period if period else s for s in steps), lambda index: index // n)
+
     plans = DataLoader(
-        _Plans(stream, period),
+        _Plans(several),
         batch_size=None,
-        sampler=steps,
+        sampler=(group for group, _ in grouped()),
         num_workers=workers,
         multiprocessing_context="spawn" if workers else None,
-        prefetch_factor=4 if workers else None,
+        prefetch_factor=1 if workers else None,
         worker_init_fn=quiet_worker,
     )
+    with ThreadPoolExecutor(1) as thread:
+        made = _finished(several, plans, thread)
+        for _, indices in grouped():
+            batch = next(made)
+            for index in indices:
+                first = index % n * size
+                clouds, points, labels, poses = (part[first : first + size] for part in batch)
+                yield clouds, points, labels, poses
+
+
+def _finished(
+    stream: DeviceStream, plans: Iterable[Plan], thread: ThreadPoolExecutor
+) -> Iterator[Tensors]:
+    """The batches of these plans; the pictures of each are taken before the last is handed out."""
+    before: tuple[Pictured, Future[Chosen]] | None = None
     for plan in plans:
-        yield stream.made(plan)
+        pictured = stream.pictured(plan)
+        coming = pictured, thread.submit(stream.chosen, pictured)
+        if before is not None:
+            yield stream.finished(before[0], before[1].result())
+        before = coming
+    if before is not None:
+        yield stream.finished(before[0], before[1].result())

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 import torch
-from jaxtyping import Float32, Int32
+from jaxtyping import Float32, Int32, Int64
 from torch import Tensor
 
 from tumortrack.core.errors import InputError
@@ -24,13 +25,34 @@ from tumortrack.simulate.scene import ATTEMPTS, SceneRecipe, Simulator, shows_no
 Tensors = tuple[Tensor, Tensor, Tensor, Tensor]
 
 
+@dataclass(frozen=True, eq=False)
+class Pictured:
+    """A plan whose images show enough; those, their pixels in range up to each (on the device) and
+    in all (on the host)."""
+
+    plan: Plan
+    depth_mm: Float32[Tensor, "b h w"]
+    counted: Int32[Tensor, "b hw"]
+    available: Int32[np.ndarray, " b"]
+
+
+@dataclass(frozen=True, eq=False)
+class Chosen:
+    """Which of its pixels in range become a scene's cloud, and which points of the pools (first,
+    count; the last of those anywhere) it looks at."""
+
+    ranks: Int32[np.ndarray, "b n"]
+    windows: Int64[np.ndarray, "b w 2"]
+
+
 class DeviceStream:
     """The batches of a ``SceneStream`` as tensors on a device.
 
     Float32 rounding apart, which may turn a pixel on a silhouette, a batch has the stream's
-    values; a scene's labelled points come in another order. Two steps, so that other processes
-    can plan ahead: ``plan`` needs no device, ``made`` little of the host: the number of pixels in
-    range of each scene comes back, as the random choice among them depends on it.
+    values; a scene's labelled points come in another order. A batch is made in four steps, so that
+    others can work ahead: ``plan`` (host), ``pictured`` (device), ``chosen`` (host), ``finished``
+    (device). All that comes back from the device is each scene's number of pixels in range, on
+    which the random choice among them depends.
 
     Raises:
         InputError: a configuration that ``unsupported`` refuses.
@@ -66,24 +88,58 @@ class DeviceStream:
 
     def batch(self, index: int) -> Tensors:
         """The batch with this number."""
-        return self.made(self.plan(index))
+        pictured = self.pictured(self.plan(index))
+        return self.finished(pictured, self.chosen(pictured))
 
     def plan(self, index: int) -> Plan:
-        """What chance decides in the batch with this number, up to its pictures."""
+        """What chance decides in the batch with this number, up to its pictures; no device
+        is needed."""
         size, seed, name = self._stream.batch_size, self._stream.seed, self._stream.stream
         recipes = [SceneRecipe(seed, name, i) for i in range(index * size, (index + 1) * size)]
         return plan_scenes(self._simulator, recipes, [0] * size)
 
     @torch.no_grad()
-    def made(self, plan: Plan) -> Tensors:
-        """The scenes of a plan.
+    def pictured(self, plan: Plan) -> Pictured:
+        """The plan's depth images, with another attempt at scenes that show too little.
 
         Raises:
             TumortrackError: no pose of a scene shows enough of the organ.
         """
-        plan, depth_mm, counted = self._pictures(plan)
-        ranks, windows = self._drawn(plan, counted[:, -1].cpu().numpy())
-        clouds_mm = clouds_from_depth(depth_mm, counted, self._sent(ranks), self._intrinsics)
+        depth_mm, counted = self._picture(plan)
+        while True:
+            available = counted[:, -1].cpu().numpy()
+            few = np.flatnonzero(available < FEWEST_POINTS)
+            if len(few) == 0:
+                return Pictured(plan, depth_mm, counted, available)
+            attempts = plan.attempts[few] + 1
+            if attempts.max() >= ATTEMPTS:
+                raise shows_nothing(plan.recipes[few[attempts.argmax()]])
+            again = plan_scenes(self._simulator, plan.recipes[few].tolist(), attempts.tolist())
+            plan = plan.replaced(few, again)
+            rows = self._sent(few)
+            depth_mm[rows], counted[rows] = self._picture(again)
+
+    def chosen(self, pictured: Pictured) -> Chosen:
+        """What is drawn after the pictures. Needs no device, so that a thread can do it beside
+        the device's work."""
+        assert isinstance(self._stream.pool, OccupancyPool)
+        plan, n = pictured.plan, self._stream.config.cloud.n_points
+        rng = np.random.default_rng()
+        ranks, windows = [], []
+        for state, count, wanted in zip(
+            plan.states, pictured.available.tolist(), plan.n_points.tolist(), strict=True
+        ):
+            rng.bit_generator.state = state
+            ranks.append(refill(draw_some(count, wanted, rng), n))
+            windows.append(self._stream.pool.windows(rng))
+        return Chosen(np.stack(ranks).astype(np.int32), np.array(windows))
+
+    @torch.no_grad()
+    def finished(self, pictured: Pictured, chosen: Chosen) -> Tensors:
+        """The clouds, and labelled points at their places."""
+        plan, windows = pictured.plan, chosen.windows
+        ranks = self._sent(chosen.ranks)
+        clouds_mm = clouds_from_depth(pictured.depth_mm, pictured.counted, ranks, self._intrinsics)
         points_ct, labels = self._pool.take(self._sent(windows), windows[:, :, 1].max(0).tolist())
         points_mm = Motion.of(plan, self._device).carry(points_ct)
         poses = self._sent(plan.camera_from_ct.astype(np.float32))
@@ -96,40 +152,10 @@ class DeviceStream:
         vertices_mm = Motion.of(plan, self._device).carry(everywhere)
         return depth_images(vertices_mm, faces, self._intrinsics)
 
-    def _pictures(self, plan: Plan) -> tuple[Plan, Float32[Tensor, "b h w"], Int32[Tensor, "b hw"]]:
-        """Images of the plan, with another attempt at those scenes that show too little."""
-        depth_mm, counted = self._picture(plan)
-        for _ in range(ATTEMPTS):
-            few = np.flatnonzero(counted[:, -1].cpu().numpy() < FEWEST_POINTS)
-            if len(few) == 0:
-                break
-            attempts = plan.attempts[few] + 1
-            if attempts.max() >= ATTEMPTS:
-                raise shows_nothing(plan.recipes[few[attempts.argmax()]])
-            again = plan_scenes(self._simulator, plan.recipes[few].tolist(), attempts.tolist())
-            plan = plan.replaced(few, again)
-            rows = self._sent(few)
-            depth_mm[rows], counted[rows] = self._picture(again)
-        return plan, depth_mm, counted
-
     def _picture(self, plan: Plan) -> tuple[Float32[Tensor, "b h w"], Int32[Tensor, "b hw"]]:
         depth_mm = self.depth_images(plan)
         near, far = self._sent(plan.near_mm), self._sent(plan.far_mm)
         return depth_mm, count_in_range(depth_mm, near, far)
-
-    def _drawn(
-        self, plan: Plan, available: Int32[np.ndarray, " b"]
-    ) -> tuple[Int32[np.ndarray, "b n"], np.ndarray]:
-        """Which pixels in range become the clouds, and each pool's window (b, parts + 1, 2)."""
-        assert isinstance(self._stream.pool, OccupancyPool)
-        n = self._stream.config.cloud.n_points
-        rng = np.random.default_rng()
-        ranks, windows = [], []
-        for state, count, wanted in zip(plan.states, available, plan.n_points, strict=True):
-            rng.bit_generator.state = state
-            ranks.append(refill(draw_some(int(count), int(wanted), rng), n))
-            windows.append(self._stream.pool.windows(rng))
-        return np.stack(ranks).astype(np.int32), np.array(windows)
 
     def _sent(self, array: np.ndarray) -> Tensor:
         return torch.from_numpy(array).to(self._device, non_blocking=True)
