@@ -1,0 +1,156 @@
+"""An occupancy network with a cloud and queries: what we do, what the naive form does."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from tumortrack.evaluate.bench.counts import (
+    ball_flops,
+    farthest_flops,
+    module_flops,
+    weight_bytes,
+)
+from tumortrack.evaluate.bench.row import Precision, Work
+from tumortrack.evaluate.bench.turns import Call
+
+if TYPE_CHECKING:
+    import torch
+
+    from tumortrack.evaluate.bench.naive.occupancy import NaiveOccupancy
+    from tumortrack.evaluate.bench.subject import Subject
+    from tumortrack.learn.inference import Inference
+    from tumortrack.learn.model import Model
+    from tumortrack.learn.network import OccupancyNetwork
+
+LABELLING = ("quick", "paper")  # the presets that label points
+IN_ONE_PIECE = 40_000  # queries of the naive form: of more the latent's copies fill the memory
+NAIVE = "single precision, latent beside every query, Python loops, one piece"
+
+
+@dataclass(eq=False)
+class Asked:
+    """An occupancy network with a cloud and queries about it: ours and the naive form."""
+
+    model: Model
+    points_mm: np.ndarray
+    device: str = "cpu"
+
+    @cached_property
+    def network(self) -> OccupancyNetwork:
+        from tumortrack.learn.network import OccupancyNetwork
+
+        assert isinstance(self.model.network, OccupancyNetwork)
+        return self.model.network.to(self.device)
+
+    @cached_property
+    def inference(self) -> Inference:
+        from tumortrack.learn.inference import Inference
+
+        return Inference(self.network)
+
+    @cached_property
+    def plain(self) -> NaiveOccupancy:
+        from tumortrack.evaluate.bench.naive.occupancy import NaiveOccupancy
+
+        return NaiveOccupancy(self.network)
+
+    @cached_property
+    def cloud(self) -> torch.Tensor:
+        import torch
+
+        return torch.from_numpy(self.points_mm)[None].to(self.device)
+
+    def queries(self, count: int) -> np.ndarray:
+        """Evenly in the box about the cloud where the organ can be."""
+        lower, upper = self.points_mm.min(0), self.points_mm.max(0)
+        upper[2] += upper[2] - lower[2]  # its hidden half
+        rng = np.random.default_rng(0)
+        return rng.uniform(lower, upper, (count, 3)).astype(np.float32)
+
+    def naive_labels(self, queries: np.ndarray) -> np.ndarray:
+        """In single precision, piece by piece."""
+        import torch
+
+        asked = torch.from_numpy(queries)[None].to(self.device)
+        with torch.inference_mode():
+            encoded = self.plain.encode(self.cloud)
+            pieces = asked.split(IN_ONE_PIECE, dim=1)
+            labels = [self.plain.logits(encoded, piece)[0].argmax(-1) for piece in pieces]
+        return torch.cat(labels).cpu().numpy()
+
+    def agreement(self, queries: np.ndarray) -> float:
+        """Share of our labels that are the naive form's."""
+        latent = self.inference.encode(self.points_mm)
+        mine = self.inference.logits(latent, queries).argmax(-1).cpu().numpy()
+        return float((mine == self.naive_labels(queries)).mean())
+
+    @cached_property
+    def precision(self) -> Precision:
+        import torch
+
+        from tumortrack.learn.model import has_fast_bfloat16
+
+        return "bf16" if has_fast_bfloat16(torch.device(self.device)) else "fp32"
+
+    def encoder_work(self) -> Work:
+        folded = self.network.folded()
+        flops = module_flops(lambda: folded.encode(self.cloud))
+        n = len(self.points_mm)
+        for level in folded.config.encoder.levels:  # type: ignore[union-attr]
+            centres = round(level.ratio * n)
+            flops += farthest_flops(n, centres) + ball_flops(n, centres)
+            n = centres
+        moved = weight_bytes(folded.encoder, self._bytes) + self.points_mm.nbytes
+        return Work(flops=flops, bytes=moved, precision=self.precision)
+
+    def decoder_work(self, queries: int) -> Work:
+        """The latent's share once a frame; queries in, logits out."""
+        import torch
+
+        folded = self.network.folded()
+        latent = folded.encode(self.cloud)
+        some = torch.from_numpy(self.queries(100))[None].to(self.device)
+        flops = module_flops(lambda: folded.query(latent, some)) * queries / 100
+        classes = len(self.model.parts) + 1
+        moved = weight_bytes(folded.decoder, self._bytes) + queries * (12 + 4 * classes)
+        return Work(flops=flops, bytes=moved, precision=self.precision)
+
+    def naive_decoder_work(self, queries: int) -> Work:
+        import torch
+
+        with torch.inference_mode():
+            encoded = self.plain.encode(self.cloud)
+            some = torch.from_numpy(self.queries(100))[None].to(self.device)
+            flops = module_flops(lambda: self.plain.logits(encoded, some)) * queries / 100
+        return Work(flops=flops, bytes=weight_bytes(self.network.decoder, 4))
+
+    @property
+    def _bytes(self) -> int:
+        return 2 if self.precision == "bf16" else 4
+
+    def naive_frame(self, queries: np.ndarray) -> Call:
+        import torch
+
+        asked = torch.from_numpy(queries)[None].to(self.device)
+
+        @torch.inference_mode()
+        def once() -> None:
+            encoded = self.plain.encode(self.cloud)
+            self.plain.logits(encoded, asked).argmax(-1).cpu()
+
+        return once
+
+    def our_frame(self, queries: np.ndarray) -> Call:
+        def once() -> None:
+            latent = self.inference.encode(self.points_mm)
+            self.inference.logits(latent, queries).argmax(-1).cpu()
+
+        return once
+
+
+def asked_of(subject: Subject, preset: str) -> Asked:
+    return Asked(subject.model(preset), subject.cloud(preset).points_mm)

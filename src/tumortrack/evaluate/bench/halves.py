@@ -1,0 +1,105 @@
+"""Rows of the network's halves: encoder and decoder."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
+
+from tumortrack.evaluate.bench.asked import IN_ONE_PIECE, LABELLING, NAIVE, asked_of
+from tumortrack.evaluate.bench.counts import module_flops, weight_bytes
+from tumortrack.evaluate.bench.row import Row, Work
+from tumortrack.evaluate.bench.turns import in_turns
+
+if TYPE_CHECKING:
+    from tumortrack.evaluate.bench.subject import Subject
+
+ENCODER, DECODER = "encoder", "decoder"
+DECODED = (1000, 10_000, 40_000, 400_000)  # queries
+
+
+def encoder_rows(subject: Subject, threads: int, budget_s: float) -> Iterator[Row]:
+    """A cloud of 1,000 points to what is known of it."""
+    import torch
+
+    for preset in LABELLING:
+        asked = asked_of(subject, preset)
+        with torch.inference_mode():
+            ours, naive = in_turns(
+                lambda asked=asked: asked.inference.encode(asked.points_mm),  # type: ignore[misc]
+                lambda asked=asked: asked.plain.encode(asked.cloud),  # type: ignore[misc]
+                budget_s=budget_s / 3,
+            )
+        yield Row(
+            name=ENCODER,
+            what=preset,
+            threads=threads,
+            item="cloud",
+            ours=ours,
+            naive=naive,
+            naive_is="single precision, Python loop of farthest points, neighbours by sorting",
+            work=asked.encoder_work(),
+        )
+    yield _clinic_encoder(subject, threads, budget_s / 3)
+
+
+def _clinic_encoder(subject: Subject, threads: int, budget_s: float) -> Row:
+    """To both placements; nobody writes this part differently."""
+    import torch
+
+    from tumortrack.learn.warp.locate import first_motions
+
+    model, points = subject.model("clinic"), subject.cloud("clinic").points_mm
+    assert model.shape is not None
+    shape, network = model.shape, model.network
+    (ours,) = in_turns(lambda: first_motions(network, shape, points), budget_s=budget_s)  # type: ignore[arg-type]
+    cloud = torch.from_numpy(points)[None]
+    with torch.inference_mode():
+        flops = module_flops(lambda: network.both_ways(cloud))  # type: ignore[operator]
+    moved = weight_bytes(network, 4) + points.nbytes
+    return Row(
+        name=ENCODER,
+        what="clinic",
+        threads=threads,
+        item="cloud",
+        ours=ours,
+        work=Work(flops=flops, bytes=moved),
+        note="both ways round",
+    )
+
+
+def decoder_rows(subject: Subject, threads: int, budget_s: float) -> Iterator[Row]:
+    """Labels of 1,000 to 400,000 queries, the cloud being encoded."""
+    import torch
+
+    for preset in LABELLING:
+        asked = asked_of(subject, preset)
+        latent = asked.inference.encode(asked.points_mm)
+        with torch.inference_mode():
+            encoded = asked.plain.encode(asked.cloud)
+        for count in DECODED:
+            queries = asked.queries(count)
+            piece = torch.from_numpy(queries[:IN_ONE_PIECE])[None]
+
+            @torch.inference_mode()
+            def naive(asked=asked, encoded=encoded, piece=piece) -> None:  # type: ignore[no-untyped-def]
+                asked.plain.logits(encoded, piece).argmax(-1)
+
+            def ours(asked=asked, latent=latent, queries=queries) -> None:  # type: ignore[no-untyped-def]
+                asked.inference.logits(latent, queries).argmax(-1)
+
+            share = budget_s / len(LABELLING) / len(DECODED)
+            ours_s, naive_s = in_turns(ours, naive, budget_s=share)
+            scaled = count / piece.shape[1]
+            yield Row(
+                name=DECODER,
+                what=f"{preset}, {count:,} queries",
+                threads=threads,
+                item="decoding",
+                ours=ours_s,
+                naive=naive_s.times(scaled),
+                naive_is=NAIVE,
+                work=asked.decoder_work(count),
+                naive_work=asked.naive_decoder_work(count),
+                agreement=asked.agreement(queries[:IN_ONE_PIECE]),
+                note="" if scaled == 1 else f"naive: measured on {IN_ONE_PIECE:,}, scaled",
+            )

@@ -1,0 +1,56 @@
+"""Which rows there are, and what a process that measures them says."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from tumortrack.evaluate.bench import (
+    command,
+    frames,
+    generator,
+    gpu,
+    halves,
+    planning,
+    training,
+    volume,
+)
+from tumortrack.evaluate.bench.row import Row
+
+if TYPE_CHECKING:
+    from tumortrack.evaluate.bench.subject import Subject
+
+Rows = Callable[["Subject", int, float], Iterator[Row]]
+
+
+@dataclass(frozen=True)
+class Group:
+    """Rows measured together: at which numbers of threads, for how long each time (seconds, about;
+    ``quick_s`` in a hurry), and the presets whose trained models they need."""
+
+    rows: Rows
+    threads: tuple[int, ...]
+    seconds: float
+    quick_s: float
+    needs: tuple[str, ...] = ()
+
+    def budget_s(self, quick: bool) -> float:
+        return self.quick_s if quick else self.seconds
+
+
+ALL = ("clinic", "quick", "paper")
+# Training comes last: it tells the C library to keep freed memory, which stays so.
+GROUPS: dict[str, Group] = {
+    "generator": Group(generator.rows, (1,), 6, 1.5, ("clinic",)),
+    "encoder": Group(halves.encoder_rows, (1,), 6, 1.5, ALL),
+    "decoder": Group(halves.decoder_rows, (1,), 60, 4, ALL),
+    "frame": Group(frames.frame_rows, (1, 2), 30, 4, ALL),
+    "tracking": Group(frames.tracking_rows, (1, 2), 6, 1.5, ("clinic",)),
+    "volume": Group(volume.rows, (1, 2), 30, 6, ALL),
+    "command": Group(command.rows, (2,), 40, 6, ALL),
+    "planning": Group(planning.rows, (1,), 12, 2),
+    "gpu": Group(gpu.rows, (1,), 20, 4, ALL),
+    "training": Group(training.rows, (1,), 15, 3, ("clinic",)),
+    "whole-training": Group(training.whole_rows, (2,), 10, 4),
+}

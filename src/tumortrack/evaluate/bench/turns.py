@@ -1,0 +1,77 @@
+"""Timing several versions in turns, so that what else the machine does meets all of them."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from tumortrack.core.config import Config
+
+_FEWEST, _MOST = 3, 25  # rounds
+_LEAST_S = 0.01  # that a turn lasts: shorter calls are repeated within it
+
+
+@dataclass(frozen=True)
+class Uncounted:
+    """What a timed call returns if some of its seconds belong to something else."""
+
+    seconds: float
+
+
+Call = Callable[[], object]
+
+
+class Timing(Config, frozen=True):
+    """Seconds of one call: the median of several turns, the quartiles about it, the fastest."""
+
+    best_s: float
+    median_s: float
+    low_s: float
+    high_s: float
+    turns: int
+
+    def times(self, factor: float) -> Timing:
+        """Of so many calls, or of a part of one."""
+        return Timing(
+            best_s=self.best_s * factor,
+            median_s=self.median_s * factor,
+            low_s=self.low_s * factor,
+            high_s=self.high_s * factor,
+            turns=self.turns,
+        )
+
+
+def in_turns(*versions: Call, budget_s: float) -> list[Timing]:
+    """Seconds a call of each version. Every version is called once before (compiled, cached, warm);
+    then all take turns until ``budget_s`` is spent, between 3 and 25 times each."""
+    repeats = [_repeats(version) for version in versions]
+    seconds: list[list[float]] = [[] for _ in versions]
+    begun = time.perf_counter()
+    for done in range(_MOST):
+        past_s = time.perf_counter() - begun
+        if done >= _FEWEST and past_s * (done + 1) / done > budget_s:
+            break
+        for times, version, repeat in zip(seconds, versions, repeats, strict=True):
+            start, uncounted = time.perf_counter(), 0.0
+            for _ in range(repeat):
+                told = version()
+                uncounted += told.seconds if isinstance(told, Uncounted) else 0.0
+            times.append((time.perf_counter() - start - uncounted) / repeat)
+    return [timing_of(times) for times in seconds]
+
+
+def timing_of(seconds: list[float]) -> Timing:
+    """Median and quartiles of the turns' seconds."""
+    low, middle, high = (float(np.quantile(seconds, q)) for q in (0.25, 0.5, 0.75))
+    return Timing(best_s=min(seconds), median_s=middle, low_s=low, high_s=high, turns=len(seconds))
+
+
+def _repeats(version: Call) -> int:
+    version()
+    start = time.perf_counter()
+    version()
+    return max(1, math.ceil(_LEAST_S / max(time.perf_counter() - start, 1e-7)))
