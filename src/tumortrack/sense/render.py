@@ -36,8 +36,8 @@ def render_depth(
 @numba.njit(cache=True, nogil=True)
 def _z_buffer(vertices, faces, width, height, fx, fy, cx, cy):  # type: ignore[no-untyped-def]
     n = len(vertices)
-    u = np.empty(n, np.float32)
-    v = np.empty(n, np.float32)
+    u = np.zeros(n, np.float32)
+    v = np.zeros(n, np.float32)
     w = np.empty(n, np.float32)  # 1/z: linear in the image, unlike z
     for i in range(n):
         z = vertices[i, 2]
@@ -50,25 +50,28 @@ def _z_buffer(vertices, faces, width, height, fx, fy, cx, cy):  # type: ignore[n
     nearest = np.zeros((height, width), np.float32)  # greatest 1/z so far
     for f in range(len(faces)):
         a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
-        if w[a] < 0 or w[b] < 0 or w[c] < 0:
-            continue
+        ua, ub, uc, va, vb, vc = u[a], u[b], u[c], v[a], v[b], v[c]
         # Outward faces run clockwise in a y-down image when they face the camera.
-        area = (u[b] - u[a]) * (v[c] - v[a]) - (v[b] - v[a]) * (u[c] - u[a])
+        area = (ub - ua) * (vc - va) - (vb - va) * (uc - ua)
         if area >= 0:
             continue
-        left = max(int(np.ceil(min(u[a], u[b], u[c]))), 0)
-        right = min(int(np.floor(max(u[a], u[b], u[c]))), width - 1)
-        top = max(int(np.ceil(min(v[a], v[b], v[c]))), 0)
-        bottom = min(int(np.floor(max(v[a], v[b], v[c]))), height - 1)
+        wa, wb, wc = w[a], w[b], w[c]
+        if min(wa, wb, wc) < 0:
+            continue
+        left = max(int(np.ceil(min(ua, ub, uc))), 0)
+        right = min(int(np.floor(max(ua, ub, uc))), width - 1)
+        top = max(int(np.ceil(min(va, vb, vc))), 0)
+        bottom = min(int(np.floor(max(va, vb, vc))), height - 1)
         inverse = 1.0 / area
         for y in range(top, bottom + 1):
             for x in range(left, right + 1):
-                wa = ((u[b] - x) * (v[c] - y) - (v[b] - y) * (u[c] - x)) * inverse
-                wb = ((u[c] - x) * (v[a] - y) - (v[c] - y) * (u[a] - x)) * inverse
-                wc = 1.0 - wa - wb
-                if wa >= -1e-5 and wb >= -1e-5 and wc >= -1e-5:
-                    here = wa * w[a] + wb * w[b] + wc * w[c]
-                    nearest[y, x] = max(nearest[y, x], here)
+                pa = ((ub - x) * (vc - y) - (vb - y) * (uc - x)) * inverse
+                pb = ((uc - x) * (va - y) - (vc - y) * (ua - x)) * inverse
+                pc = 1.0 - pa - pb
+                here = np.float32(pa * wa + pb * wb + pc * wc)
+                # No branch: half of these pixels lie outside, at random.
+                here = here if min(pa, pb, pc) >= -1e-5 else np.float32(0.0)
+                nearest[y, x] = max(nearest[y, x], here)
     depth = np.full((height, width), np.nan, np.float32)
     for y in range(height):
         for x in range(width):

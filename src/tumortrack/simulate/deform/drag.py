@@ -11,6 +11,7 @@ reading; ``"variance"`` takes the table's heading literally. See docs/method.md.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Literal
 
@@ -95,24 +96,51 @@ def _visible_vertices(view: View, count: int, rng: np.random.Generator) -> np.nd
     raise TumortrackError("the camera sees none of the organ's vertices; check the pose range.")
 
 
+_BLOCK = 1024  # points whose coordinates stay in the first cache through all drags
+_SMALLEST = np.float32(-12.0)  # exponents below, factors of 6e-6, count as none
+_LOG2_E = np.float32(1.4426950408889634)
+# 2^r = sum of (r ln 2)^k / k!, within 1.2e-7 for r in -0.5 ... 0.5
+_T1, _T2, _T3, _T4, _T5, _T6 = (
+    np.float32(math.log(2) ** k / math.factorial(k)) for k in range(1, 7)
+)
+
+
 # Fast math: the last digits (1e-5 mm) may depend on the processor, so that a scene replays bit for
 # bit on the machine that made it, and elsewhere to that precision.
+@numba.njit(cache=True, nogil=True, fastmath=True, inline="always")
+def _exp(x):  # type: ignore[no-untyped-def]
+    """For -80 < x <= 0. Unlike the C library's it is done for many points at once."""
+    binary = x * _LOG2_E
+    whole = np.floor(binary + np.float32(0.5))
+    r = binary - whole
+    power = r * (_T1 + r * (_T2 + r * (_T3 + r * (_T4 + r * (_T5 + r * _T6)))))
+    exponent = (np.int32(whole) + np.int32(127)) << np.int32(23)
+    return (np.float32(1.0) + power) * np.int32(exponent).view(np.float32)
+
+
 @numba.njit(cache=True, nogil=True, fastmath=True)
 def _drag(points, centres, shifts, sigmas):  # type: ignore[no-untyped-def]
-    out = points.copy()
-    for k in range(len(centres)):
-        scale = np.float32(-0.5) / (sigmas[k] * sigmas[k])
-        reach = np.float32(-12.0) / scale  # beyond, the factor is below exp(-12) = 6e-6
-        for i in range(len(out)):
-            x = out[i, 0] - centres[k, 0]
-            y = out[i, 1] - centres[k, 1]
-            z = out[i, 2] - centres[k, 2]
-            square = x * x + y * y + z * z
-            if square < reach:
-                factor = np.exp(scale * square)
-                out[i, 0] += factor * shifts[k, 0]
-                out[i, 1] += factor * shifts[k, 1]
-                out[i, 2] += factor * shifts[k, 2]
+    out = np.empty_like(points)
+    n = len(points)
+    x, y, z = np.empty((3, min(n, _BLOCK)), np.float32)
+    for start in range(0, n, _BLOCK):
+        size = min(_BLOCK, n - start)
+        for i in range(size):
+            x[i], y[i], z[i] = points[start + i]
+        for k in range(len(centres)):
+            scale = np.float32(-0.5) / (sigmas[k] * sigmas[k])
+            cx, cy, cz = centres[k]
+            sx, sy, sz = shifts[k]
+            for i in range(size):
+                dx, dy, dz = x[i] - cx, y[i] - cy, z[i] - cz
+                exponent = scale * (dx * dx + dy * dy + dz * dz)
+                factor = _exp(max(exponent, _SMALLEST))
+                factor = factor if exponent > _SMALLEST else np.float32(0.0)
+                x[i] += factor * sx
+                y[i] += factor * sy
+                z[i] += factor * sz
+        for i in range(size):
+            out[start + i, 0], out[start + i, 1], out[start + i, 2] = x[i], y[i], z[i]
     return out
 
 
