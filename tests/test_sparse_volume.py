@@ -8,8 +8,9 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tumortrack.track.sparse import START_MM, sparse_margins
-from tumortrack.track.volume import dense_margins, grid_over, part_surfaces
+from tumortrack.learn.lattice import lattice_over
+from tumortrack.track.sparse import START_MM, halved_lattice, sparse_logits, sparse_margins
+from tumortrack.track.volume import dense_margins, grid_over, margins_on, part_surfaces
 
 NAMES = ("kidney", "tumor_1", "tumor_2")
 
@@ -51,12 +52,10 @@ def both(field, grid, start_mm=START_MM):
 
 
 @given(st.integers(0, 10**6), st.sampled_from([93, 130]))
-@settings(max_examples=8, deadline=None)
+@settings(max_examples=4, deadline=None)
 def test_every_voxel_is_that_of_the_dense_volume(seed, grid):
     (margins, labels), (all_margins, all_labels), few, many, _ = both(Field(seed), grid)
     assert np.array_equal(labels, all_labels)
-    asked = np.abs(margins) < 29
-    assert np.array_equal(margins[asked], all_margins[asked])
     assert np.array_equal(margins > 0, all_margins > 0)
     assert few < many
 
@@ -73,23 +72,65 @@ def test_surfaces_are_those_of_the_dense_volume():
     theirs = part_surfaces(all_margins, all_labels, camera_from_index, NAMES)
     for name in NAMES:
         assert np.array_equal(mine[name].faces, theirs[name].faces)
-        assert mine[name].vertices_mm == pytest.approx(theirs[name].vertices_mm, abs=1e-3)
+        off_mm = np.linalg.norm(mine[name].vertices_mm - theirs[name].vertices_mm, axis=1)
+        assert np.median(off_mm) < 1e-4  # most voxels beside a surface are asked
+        assert off_mm.max() < camera_from_index[0, 0] / 4  # linear over a kink
 
 
 @given(st.tuples(*[st.floats(-3, 3)] * 3))
-@settings(max_examples=15, deadline=None)
-def test_a_tumor_of_5_2_mm_is_found_wherever_it_lies(off):
+@settings(max_examples=8, deadline=None)
+def test_a_tumor_of_6_9_mm_is_found_wherever_it_lies(off):
     field = Field(5)
     field.balls[1] = (np.array([20.0, 30.0, 45.0]) + off, START_MM * 3**0.5 / 2 + 1e-6)
     box = np.array([[-66.0, -66, -66], [66, 66, 66]])
-    camera_from_index, shape = grid_over(box, 184)  # voxels of 0.746 mm, the first lattice of 2.98
+    camera_from_index, shape = grid_over(box, 138)  # voxels of 0.995 mm, the first lattice of 3.98
     _, labels = sparse_margins(field, camera_from_index, shape)
     found = (labels == 3).sum() * camera_from_index[0, 0] ** 3
     assert found == pytest.approx(4 / 3 * np.pi * (START_MM * 3**0.5 / 2) ** 3, rel=0.15)
 
 
 def test_without_a_coarse_lattice_it_is_the_dense_volume():
-    (margins, labels), (all_margins, all_labels), few, many, _ = both(Field(1), 40, start_mm=3.0)
+    (margins, labels), (all_margins, all_labels), few, many, _ = both(Field(1), 40)
     assert few == many
     assert np.array_equal(labels, all_labels)
     assert np.array_equal(margins, all_margins)
+
+
+def test_labels_of_points_are_those_of_asking_all():
+    field, rng = Field(4), np.random.default_rng(0)
+    lattice = lattice_over(field, np.array([[-66.0, -66, -66], [66, 66, 66]]), 24)
+    points = rng.uniform(*lattice.box_mm, (40_000, 3)).astype(np.float32)
+    field.asked = 0
+    logits = sparse_logits(field, lattice, points)
+    few, all_logits = field.asked, field(points).numpy()
+    assert np.array_equal(logits.argmax(1), all_logits.argmax(1))
+    assert 100 < few < 8000
+    plain = lattice.between(points).argmax(1) != all_logits.argmax(1)
+    assert plain.mean() > 0.001  # so many would be wrong if none were asked
+
+
+def test_a_lattice_is_linear_between_its_points_and_constant_outside():
+    slope = np.array([0.3, -0.2, 0.5])
+
+    def plane(points):
+        return torch.tensor(np.column_stack([points @ slope, 1 - points @ slope]))
+
+    lattice = lattice_over(plane, np.array([[-5.0, 0, 10], [7, 8, 19]]), 4)
+    points = np.random.default_rng(0).uniform([-5, 0, 10], [7, 8, 19], (50, 3)).astype(np.float32)
+    assert lattice.between(points)[:, 0] == pytest.approx(points @ slope, abs=1e-4)
+    corner = np.array([[-5.0, 0, 10], [-50, -9, 0]], np.float32)
+    assert lattice.between(corner)[1] == pytest.approx(lattice.between(corner)[0])
+
+
+def test_a_halved_lattice_has_the_labels_of_asking_all():
+    field = Field(6)
+    box = np.array([[-66.0, -66, -66], [66, 66, 66]])
+    lattice = lattice_over(field, box, 24)
+    field.asked = 0
+    finer = halved_lattice(field, lattice)
+    assert field.asked < finer.logits[..., 0].size / 2
+    assert finer.box_mm == pytest.approx(lattice.box_mm)
+    margins, labels, camera_from_index = margins_on(finer)
+    all_margins, all_labels = dense_margins(field, camera_from_index, labels.shape)
+    assert np.array_equal(labels, all_labels)
+    assert np.array_equal(margins > 0, all_margins > 0)

@@ -7,19 +7,17 @@ from four fifths of the points, so that background and strays do not count.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
-import torch
-from jaxtyping import Float, Float32, Float64
+from jaxtyping import Float, Float32
 
 from tumortrack.core.config import Config
 from tumortrack.core.errors import NoEstimate
 from tumortrack.core.types import Mesh
+from tumortrack.learn.lattice import Lattice
 from tumortrack.simulate.occupancy import surface_distance
 
 _SHARE = 80  # per cent of the points that must fit: a tenth may be background
-_STEPS = 24  # grid steps along the box's longest side
+FIT_STEPS = 24  # of the lattice, along the box's longest side
 _LARGEST_MARGIN = 30.0  # logits
 
 # Validation scenes hold noise, background and deformation, yet what they hold is not all there is.
@@ -34,8 +32,6 @@ _SPREAD_FACTOR = 1.5
 # digital twin's worst states have 0.4, of the paper's drags, which no library holds, up to 0.9;
 # flat tables of the organ's size, to which it can be bent, 1.4 to 2.4.
 _RAREST = 1.25
-
-LogitsAt = Callable[[Float32[np.ndarray, "n 3"]], torch.Tensor]
 
 
 class Familiar(Config, frozen=True):
@@ -61,28 +57,25 @@ def fit_mm(distances_mm: Float[np.ndarray, " n"]) -> float:
 
 
 def surface_distances(
-    logits_at: LogitsAt, box_mm: Float64[np.ndarray, "2 3"], points_mm: Float[np.ndarray, "n 3"]
+    lattice: Lattice, points_mm: Float[np.ndarray, "n 3"]
 ) -> Float32[np.ndarray, " n"]:
-    """How far points (n, 3) lie from the organ's surface in a box, camera frame, mm.
+    """How far points (n, 3) lie from the organ's surface, camera frame, mm.
 
-    The surface is found on a grid of 24 steps along the box's longest side, between whose points
-    the network's margin is taken as linear: right to half a mm or so for an organ.
+    The surface is that of the network's margin, linear between the lattice's points: right to
+    half a mm or so for an organ on ``FIT_STEPS``.
 
     Raises:
-        NoEstimate: there is no surface in the box.
+        NoEstimate: there is no surface in the lattice's box.
     """
     from skimage import measure
 
-    step = float((box_mm[1] - box_mm[0]).max()) / _STEPS
-    axes = [np.arange(low, high + step, step) for low, high in box_mm.T]
-    grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).astype(np.float32)
-    logits = logits_at(grid.reshape(-1, 3))
-    margin = (logits[:, 1:].amax(1) - logits[:, 0]).clamp(-_LARGEST_MARGIN, _LARGEST_MARGIN)
-    field = margin.cpu().numpy().reshape(grid.shape[:3])
+    logits = lattice.logits
+    field = (logits[..., 1:].max(-1) - logits[..., 0]).clip(-_LARGEST_MARGIN, _LARGEST_MARGIN)
     if not field.min() < 0 < field.max():
         raise NoEstimate("no organ was found: its surface is nowhere near the cloud.")
     corners, faces, _, _ = measure.marching_cubes(field, 0.0)
-    return surface_distance(Mesh(corners * step + grid[0, 0, 0], faces), points_mm)
+    surface = Mesh(corners * lattice.step_mm + lattice.origin_mm, faces)
+    return surface_distance(surface, points_mm)
 
 
 def check_familiar(familiar: Familiar, spread: float, fit: float) -> None:

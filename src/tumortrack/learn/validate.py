@@ -10,7 +10,8 @@ from jaxtyping import Float32, Float64, UInt8
 
 from tumortrack.core.errors import NoEstimate
 from tumortrack.learn.config import TrainConfig
-from tumortrack.learn.fit import Familiar, fit_mm, spread_mm, surface_distances
+from tumortrack.learn.fit import FIT_STEPS, Familiar, fit_mm, spread_mm, surface_distances
+from tumortrack.learn.lattice import lattice_over
 from tumortrack.learn.network import Latent, OccupancyNetwork
 from tumortrack.simulate.dataset import refill
 from tumortrack.simulate.occupancy import PartPool
@@ -106,7 +107,8 @@ class ValidationSet:
 
             spreads.append(spread_mm(points_mm))
             try:
-                fits.append(fit_mm(surface_distances(logits_at, around, points_mm)))
+                lattice = lattice_over(logits_at, around, FIT_STEPS)
+                fits.append(fit_mm(surface_distances(lattice, points_mm)))
             except NoEstimate:  # a network of a few steps sees no organ
                 fits.append(spreads[-1])
         return Familiar(

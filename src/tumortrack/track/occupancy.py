@@ -1,37 +1,38 @@
-"""Locating with an occupancy network: ask for labels, coarse then fine, then everywhere."""
+"""Locating with an occupancy network: ask for labels, coarse first, then where it is not plain."""
 
 from __future__ import annotations
 
-from contextlib import suppress
-from dataclasses import replace
+from contextlib import AbstractContextManager, suppress
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float32
+from jaxtyping import Float, Float16, Float32, Float64, UInt8
 
 from tumortrack.core.errors import NoEstimate
 from tumortrack.core.types import Anatomy, CameraLabels, OccupancyCloud, SensorCloud
-from tumortrack.learn.fit import check_familiar, fit_mm, spread_mm, surface_distances
-from tumortrack.learn.model import Model, has_fast_bfloat16
-from tumortrack.learn.network import Latent, OccupancyNetwork
+from tumortrack.learn.fit import FIT_STEPS, check_familiar, fit_mm, spread_mm, surface_distances
+from tumortrack.learn.inference import Inference
+from tumortrack.learn.lattice import Lattice, lattice_over
+from tumortrack.learn.model import Model
+from tumortrack.learn.network import OccupancyNetwork
 from tumortrack.sense.cloud import check_cloud, thin_cloud
 from tumortrack.track.estimate import Estimate, Following
 from tumortrack.track.report import fit_report, report_head, stage
-from tumortrack.track.sparse import sparse_margins
+from tumortrack.track.sparse import halved_lattice, sparse_logits, sparse_margins
 from tumortrack.track.volume import (
     describe_parts,
     drop_islands,
     grid_over,
     keep_largest_pieces,
+    margins_on,
     part_surfaces,
 )
 
 COARSE_QUERIES = 10_000
 FINE_QUERIES = 40_000
 FEWEST_INSIDE = 20  # of the coarse queries: fewer are no organ
-_LIVE_GRID = 48  # of a live estimate's surfaces: about 2 mm for a kidney
 _LIVE_MARGIN = 0.1  # of the organ's extent: how far it may move from one live frame to the next
-CHUNK = 2048  # queries at once and core: their activations stay in its cache
 
 Box = Float[np.ndarray, "2 3"]
 
@@ -44,31 +45,45 @@ class OccupancyLocator:
     def __init__(self, model: Model) -> None:
         assert isinstance(model.network, OccupancyNetwork)
         self.model = model
-        self._network = model.network.folded()
-        self._device = next(model.network.parameters()).device
-        self._bf16 = has_fast_bfloat16(self._device)
+        self._inference = Inference(model.network)
 
-    @torch.inference_mode()
     def locate(self, cloud: SensorCloud, grid: int, seed: int) -> Estimate:
         """See ``track.tracker.Tracker.locate``.
 
         The two passes of queries follow the follow-up (LUDO): 10,000 coarse ones where the organ
-        can be, then 40,000 in the box of those inside, enlarged.
+        can be, then labels of 40,000 points in the box of those inside, enlarged.
         """
-        rng = np.random.default_rng(seed)
-        return self._located(cloud, None, grid, seed, rng)
+        frame = _Frame(self.model, self._inference, cloud, seed, np.random.default_rng(seed))
+        lattice = frame.lattice(frame.coarse_box(), FIT_STEPS)
+        frame.check(lattice)
+        inside = frame.inside(lattice)
+        with frame.stage("volume"):
+            camera_from_index, shape = grid_over(inside.points_mm, grid)
+            margins, labels = sparse_margins(frame.logits_at, camera_from_index, shape)
+        return frame.estimate(inside, margins, labels, camera_from_index)
 
-    @torch.inference_mode()
     def follow(self, cloud: SensorCloud, last: Estimate | None, how: Following) -> Estimate:
-        """See ``track.tracker.Tracker.follow``: the last organ's box, enlarged, stands for the
-        coarse queries, and the dense grid that surfaces come from is coarse."""
+        """See ``track.tracker.Tracker.follow``.
+
+        The last organ's box, enlarged, stands for the coarse queries, and the surfaces' grid is
+        coarse: twice as fine as the lattice, and asked only about surfaces. Without a last
+        estimate, or with ``thorough``, all of it is asked.
+        """
         rng = np.random.default_rng((how.seed, cloud.stamp_ns))
-        box = None
-        if last is not None and not how.thorough:
+        frame = _Frame(self.model, self._inference, cloud, how.seed, rng)
+        if last is None or how.thorough:
+            finer = frame.lattice(frame.coarse_box(), 2 * FIT_STEPS)
+            frame.check(finer)
+        else:
             low, high = last.cloud.points_mm.min(0), last.cloud.points_mm.max(0)
             margin = _LIVE_MARGIN * float((high - low).max())
             box = np.stack([low - margin, high + margin]).astype(float)
-        return replace(self._located(cloud, box, _LIVE_GRID, how.seed, rng), volume=None)
+            lattice = frame.lattice(box, FIT_STEPS)
+            frame.check(lattice)
+            with frame.stage("volume"):
+                finer = halved_lattice(frame.logits_at, lattice)
+        inside = frame.inside(finer)
+        return replace(frame.estimate(inside, *margins_on(finer)), volume=None)
 
     def warm(self) -> None:
         """See ``track.tracker.Tracker.warm``."""
@@ -77,56 +92,37 @@ class OccupancyLocator:
         with suppress(NoEstimate):  # it is no organ
             self.follow(cloud, None, Following())
 
-    def _located(
-        self, cloud: SensorCloud, box: Box | None, grid: int, seed: int, rng: np.random.Generator
-    ) -> Estimate:
-        """``box``: where the organ can lie; found out where it is None."""
-        seconds: dict[str, float] = {}
-        check_cloud(cloud)
-        thinned = thin_cloud(cloud, self.model.config.scene.cloud.n_points, rng)
-        with stage(seconds, "encode", self._device):
-            latent = self._encode(thinned)
-        if box is None:
-            with stage(seconds, "coarse", self._device):
-                box = self._coarse_box(latent, cloud, rng)
-        with stage(seconds, "fit", self._device):
-            distances = surface_distances(
-                lambda points: self._logits(latent, points), box, thinned.points_mm
-            )
-            spread = spread_mm(thinned.points_mm)
-            check_familiar(self.model.familiar, spread, fit_mm(distances))
-        with stage(seconds, "fine", self._device):
-            inside = self._fine(latent, box, cloud.stamp_ns, rng)
-            if len(inside.points_mm) < FEWEST_INSIDE:
-                raise NoEstimate("no organ was found: it has left the place where it was.")
-        with stage(seconds, "volume", self._device):
-            camera_from_index, shape = grid_over(inside.points_mm, grid)
-            margins, found = sparse_margins(
-                lambda points: self._logits(latent, points), camera_from_index, shape
-            )
-        with stage(seconds, "surfaces", self._device):
-            labels = keep_largest_pieces(found, len(self.model.parts))
-            inside = drop_islands(inside, found, labels, camera_from_index)
-            meshes = part_surfaces(margins, labels, camera_from_index, self.model.parts)
-        volume = CameraLabels(labels, camera_from_index)
-        report = {
-            **report_head(cloud, seed),
-            "voxel_mm": float(camera_from_index[0, 0]),
-            "fit_mm": fit_report(distances),
-            "parts": describe_parts(self.model.parts, meshes, inside),
-            "timings": {**seconds, "total": sum(seconds.values())},
-        }
-        return Estimate(inside, volume, meshes, report)
 
-    def _encode(self, cloud: SensorCloud) -> Latent:
-        points = torch.tensor(cloud.points_mm, device=self._device)[None]
-        with torch.autocast(self._device.type, torch.bfloat16, enabled=self._bf16):
-            return self._network.encode(points)
+@dataclass(eq=False)
+class _Frame:
+    """One cloud's work, from its latent to the estimate."""
 
-    def _coarse_box(self, latent: Latent, cloud: SensorCloud, rng: np.random.Generator) -> Box:
-        lower, upper = self.model.query_box_mm + np.median(cloud.points_mm, axis=0)
-        points = rng.uniform(lower, upper, (COARSE_QUERIES, 3)).astype(np.float32)
-        inside = points[self._logits(latent, points).argmax(-1).cpu().numpy() > 0]
+    model: Model
+    inference: Inference
+    cloud: SensorCloud
+    seed: int
+    rng: np.random.Generator
+    seconds: dict[str, float] = field(default_factory=dict)
+    distances_mm: Float32[np.ndarray, " n"] | None = None
+
+    def __post_init__(self) -> None:
+        check_cloud(self.cloud)
+        self.thinned = thin_cloud(self.cloud, self.model.config.scene.cloud.n_points, self.rng)
+        with self.stage("encode"):
+            self.latent = self.inference.encode(self.thinned.points_mm)
+
+    def stage(self, name: str) -> AbstractContextManager[None]:
+        return stage(self.seconds, name, self.inference.device)
+
+    def logits_at(self, points_mm: Float32[np.ndarray, "n 3"]) -> torch.Tensor:
+        return self.inference.logits(self.latent, points_mm)
+
+    def coarse_box(self) -> Box:
+        """Where the organ is."""
+        lower, upper = self.model.query_box_mm + np.median(self.cloud.points_mm, axis=0)
+        points = self.rng.uniform(lower, upper, (COARSE_QUERIES, 3)).astype(np.float32)
+        with self.stage("coarse"):
+            inside = points[self.logits_at(points).argmax(-1).cpu().numpy() > 0]
         if len(inside) < FEWEST_INSIDE:
             raise NoEstimate(
                 f"no organ was found: {len(inside)} of {COARSE_QUERIES} queries round the cloud "
@@ -137,19 +133,50 @@ class OccupancyLocator:
         margin = 0.05 * (high - low) + gap / 2
         return np.stack([low - margin, high + margin])
 
-    def _fine(
-        self, latent: Latent, box: Box, stamp_ns: int, rng: np.random.Generator
-    ) -> OccupancyCloud:
-        points = rng.uniform(box[0], box[1], (FINE_QUERIES, 3)).astype(np.float32)
-        best = self._logits(latent, points).softmax(-1).max(-1)
-        probability, labels = best.values.cpu().numpy(), best.indices.cpu().numpy()
-        inside = labels > 0
+    def lattice(self, box: Box, steps: int) -> Lattice:
+        with self.stage("lattice"):
+            return lattice_over(self.logits_at, box, steps)
+
+    def check(self, lattice: Lattice) -> None:
+        """Refuse what cannot be the organ."""
+        with self.stage("fit"):
+            self.distances_mm = surface_distances(lattice, self.thinned.points_mm)
+            spread = spread_mm(self.thinned.points_mm)
+            check_familiar(self.model.familiar, spread, fit_mm(self.distances_mm))
+
+    def inside(self, lattice: Lattice) -> OccupancyCloud:
+        """Those of 40,000 random points in the lattice's box that lie inside."""
+        with self.stage("fine"):
+            low, high = lattice.box_mm
+            points = self.rng.uniform(low, high, (FINE_QUERIES, 3)).astype(np.float32)
+            logits = torch.from_numpy(sparse_logits(self.logits_at, lattice, points))
+            best = logits.softmax(-1).max(-1)
+            labels, probability = best.indices.numpy(), best.values.numpy()
+            inside = labels > 0
+        if inside.sum() < FEWEST_INSIDE:
+            raise NoEstimate("no organ was found: it has left the place where it was.")
+        stamp_ns = self.cloud.stamp_ns
         return OccupancyCloud(points[inside], labels[inside], probability[inside], stamp_ns)
 
-    def _logits(self, latent: Latent, points_mm: Float32[np.ndarray, "n 3"]) -> torch.Tensor:
-        """(n, classes), float32, on the model's device."""
-        queries = torch.tensor(points_mm, device=self._device)[None]
-        size = CHUNK * torch.get_num_threads() if self._device.type == "cpu" else 2**17
-        with torch.autocast(self._device.type, torch.bfloat16, enabled=self._bf16):
-            chunks = [self._network.query(latent, part)[0] for part in queries.split(size, dim=1)]
-        return torch.cat(chunks).float()
+    def estimate(
+        self,
+        inside: OccupancyCloud,
+        margins: Float16[np.ndarray, "parts i j k"],
+        found: UInt8[np.ndarray, "i j k"],
+        camera_from_index: Float64[np.ndarray, "4 4"],
+    ) -> Estimate:
+        """Everything read off margins and labels of a grid."""
+        names = self.model.parts
+        assert self.distances_mm is not None
+        with self.stage("surfaces"):
+            labels = keep_largest_pieces(found, len(names))
+            inside = drop_islands(inside, found, labels, camera_from_index)
+            meshes = part_surfaces(margins, labels, camera_from_index, names)
+        report = {
+            **report_head(self.cloud, self.seed),
+            "voxel_mm": float(camera_from_index[0, 0]),
+            "fit_mm": fit_report(self.distances_mm),
+            "parts": describe_parts(names, meshes, inside),
+            "timings": {**self.seconds, "total": sum(self.seconds.values())},
+        }
+        return Estimate(inside, CameraLabels(labels, camera_from_index), meshes, report)

@@ -1,36 +1,48 @@
-"""The dense answer from few questions: coarse first, then only where labels differ.
+"""The dense answer from few questions: coarse first, then only where it is not plain.
 
-A lattice of at most ``START_MM`` is asked; cells between equal labels take them unasked, others
-are halved, down to the voxels. Whatever was not asked and touches a differing label that was, is
-asked after all, on every level: without that some voxels would be wrong.
+A lattice of at most ``START_MM`` is asked. Halfway between its points the logits are first taken as
+linear, then asked for wherever the label that leads does so by less than linear logits were found
+to err (``settled``); and so on, down to the voxels. Where an answer is another label than was
+expected, the voxels about it are asked as well.
 
-What it may miss: a part of which no lattice point lies inside and that touches nothing which is
-split. A ball of START_MM times the square root of 3, 5.2 mm, always holds a lattice point.
+What it may miss: a part that no lattice point lies in and that does not show in the logits about it
+either. A ball of START_MM times the square root of 3 always holds a lattice point: 6.9 mm, 0.17 ml,
+where ``prepare`` drops tumors of less than 0.2 ml unless it is told otherwise.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 import torch
-from jaxtyping import Float16, Float64, UInt8
+from jaxtyping import Bool, Float16, Float32, Float64, Int, UInt8
 
 from tumortrack.core.geometry import transform_points
+from tumortrack.learn.lattice import Lattice, LogitsAt
 from tumortrack.track.volume import LARGEST_MARGIN, dense_margins, margins_of
 
-START_MM = 3.0
+START_MM = 4.0
 _AT_ONCE = 2**18  # queries
+_SAFETY = 1.5
+_PROBE = 512  # of the least sure points, asked to learn how much linear logits err
+_TAIL = 0.999  # of the errors found
+_FIRST_SEEN = 0.1  # of a first lattice's points may lie near a surface
+
+Ask = Callable[[Int[np.ndarray, " n"]], Float32[np.ndarray, "n classes"]]
 
 
 def sparse_margins(
-    logits_at: Callable[[np.ndarray], torch.Tensor],
+    logits_at: LogitsAt,
     camera_from_index: Float64[np.ndarray, "4 4"],
     shape: tuple[int, int, int],
     start_mm: float = START_MM,
 ) -> tuple[Float16[np.ndarray, "parts i j k"], UInt8[np.ndarray, "i j k"]]:
-    """What ``dense_margins`` returns; far from all surfaces margins are the largest there are.
+    """What ``dense_margins`` returns; far from all surfaces margins are the largest there are,
+    between them and the asked voxels linear.
 
     Args:
         start_mm: distance of the first lattice's points at the most.
@@ -39,70 +51,218 @@ def sparse_margins(
     levels = max(0, int(np.floor(np.log2(max(start_mm / voxel_mm, 1.0)))))
     if levels == 0:
         return dense_margins(logits_at, camera_from_index, shape)
-    asked = _Asked(logits_at, camera_from_index)
     stride = 2**levels
-    size = [
-        (n - 2) // stride + 2 for n in shape
-    ]  # the last point lies on the grid's end or past it
-    labels = np.empty(size, np.uint8)
-    known = np.ones(size, bool)
-    labels.reshape(-1)[:] = asked.labels_of(np.arange(labels.size), labels.shape, stride)
-    for _ in range(levels):
-        stride //= 2
-        labels, known = _halved(labels, known, asked, stride)
-    i, j, k = shape
-    found = np.ascontiguousarray(labels[:i, :j, :k])
-    return asked.margins(found), found
+    i, j, k = ((n - 2) // stride + 2 for n in shape)  # the last lies on the grid's end or past it
+    lattice = _Lattice(logits_at, camera_from_index, (i, j, k), stride)
+    logits = lattice.ask(np.arange(i * j * k)).reshape(i, j, k, -1)
+    for _ in range(levels - 1):
+        lattice = lattice.halved()
+        logits = _halved(logits, lattice)
+    return _voxels(logits, replace(lattice.halved(), shape=shape))
 
 
-def _halved(
-    coarse: np.ndarray, known: np.ndarray, asked: _Asked, stride: int
-) -> tuple[np.ndarray, np.ndarray]:
-    from tumortrack.track.sparse_kernels import doubtful, refined
+def sparse_logits(
+    logits_at: LogitsAt, lattice: Lattice, points_mm: Float32[np.ndarray, "n 3"]
+) -> Float32[np.ndarray, "n classes"]:
+    """Logits at points in a lattice's box: linear where the label is plain, else asked for."""
+    logits = lattice.between(points_mm)
 
-    shape = tuple(2 * n - 1 for n in coarse.shape)
-    labels, now_known = np.empty(shape, np.uint8), np.empty(shape, bool)
-    frontier = refined(coarse, known, labels, now_known)
-    while len(frontier):
-        labels.reshape(-1)[frontier] = asked.labels_of(frontier, shape, stride)
-        now_known.reshape(-1)[frontier] = True
-        frontier = doubtful(labels, now_known, frontier)
-    return labels, now_known
+    def ask(some: Int[np.ndarray, " m"]) -> Float32[np.ndarray, "m classes"]:
+        return logits_at(points_mm[some]).float().cpu().numpy()
+
+    settled(logits, _best(logits)[1], ask, Trust())
+    return logits
+
+
+def halved_lattice(logits_at: LogitsAt, lattice: Lattice) -> Lattice:
+    """The lattice of half the step, asked where linear logits do not tell the label."""
+    step_mm = lattice.step_mm / 2
+    camera_from_index = np.diag([step_mm] * 3 + [1.0])
+    camera_from_index[:3, 3] = lattice.origin_mm
+    i, j, k = (2 * n - 1 for n in lattice.logits.shape[:3])
+    finer = _Lattice(logits_at, camera_from_index, (i, j, k), 1)
+    return Lattice(lattice.origin_mm, step_mm, _halved(lattice.logits, finer))
 
 
 @dataclass(eq=False)
-class _Asked:
-    """Asks, and keeps the answers."""
+class Trust:
+    """How far linear logits were found to be off: a label that leads by ``limit`` is believed.
 
-    logits_at: Callable[[np.ndarray], torch.Tensor]
+    ``coarser``: the limit at twice the distance, 0 where there was none.
+    """
+
+    limit: float = 0.0
+    coarser: float = 0.0
+    errors: list[np.ndarray] = field(default_factory=list)
+
+    def learn(self, expected: np.ndarray, found: np.ndarray) -> None:
+        """From logits (n, classes) that were expected, and those that were found."""
+        rows, order = np.arange(len(expected)), np.argpartition(expected, -2, axis=1)
+        first, second = order[:, -1], order[:, -2]
+        lead, true = (of[rows, first] - of[rows, second] for of in (expected, found))
+        self.errors.append(np.abs(lead - true))
+        worst = float(np.quantile(np.concatenate(self.errors), _TAIL))
+        self.limit = max(self.limit, _SAFETY * worst)
+
+    def finer(self) -> Trust:
+        """At half the distance, before anything is asked: smooth logits err by a quarter."""
+        return Trust(self.limit / 4, self.limit)
+
+
+@dataclass(eq=False)
+class _Lattice:
+    """Points that can be asked, ``stride`` voxels apart; knows which were."""
+
+    logits_at: LogitsAt
     camera_from_index: Float64[np.ndarray, "4 4"]
-    places: list[np.ndarray] = field(default_factory=list)  # voxels (n, 3)
-    won: list[np.ndarray] = field(default_factory=list)  # margins (n, parts)
+    shape: tuple[int, int, int]
+    stride: int
+    trust: Trust = field(default_factory=Trust)
 
-    def labels_of(self, flat: np.ndarray, shape: tuple[int, ...], stride: int) -> np.ndarray:
-        """Labels at these points of a lattice of ``shape``, ``stride`` voxels apart."""
-        labels = np.empty(len(flat), np.uint8)
+    def halved(self) -> _Lattice:
+        i, j, k = (2 * n - 1 for n in self.shape)
+        stride = self.stride // 2
+        finer = self.trust.finer()
+        return _Lattice(self.logits_at, self.camera_from_index, (i, j, k), stride, finer)
+
+    def ask_some(
+        self, flat: Int[np.ndarray, " n"], some: Int[np.ndarray, " m"]
+    ) -> Float32[np.ndarray, "m classes"]:
+        return self.ask(flat[some])
+
+    def ask(self, flat: Int[np.ndarray, " n"]) -> Float32[np.ndarray, "n classes"]:
+        parts = []
         for first in range(0, len(flat), _AT_ONCE):
-            part = slice(first, first + _AT_ONCE)
-            index = np.stack(np.unravel_index(flat[part], shape), axis=1) * stride
-            points = transform_points(self.camera_from_index, index.astype(float))
-            logits = self.logits_at(points.astype(np.float32))
-            labels[part] = logits.argmax(-1).to(torch.uint8).cpu().numpy()
-            self.places.append(index)
-            self.won.append(margins_of(logits))
-        return labels
+            index = np.unravel_index(flat[first : first + _AT_ONCE], self.shape)
+            places = np.stack(index, axis=1) * float(self.stride)
+            points = transform_points(self.camera_from_index, places)
+            parts.append(self.logits_at(points.astype(np.float32)).float().cpu().numpy())
+        return np.concatenate(parts)
 
-    def margins(self, labels: UInt8[np.ndarray, "i j k"]) -> Float16[np.ndarray, "parts i j k"]:
-        """As they were answered; elsewhere as sure as can be."""
-        n_parts = self.won[0].shape[1]
-        margins = np.empty((n_parts, *labels.shape), np.float16)
-        for part in range(n_parts):
-            inside = labels > 0 if part == 0 else labels == part + 1
-            margins[part] = np.where(
-                inside, np.float16(LARGEST_MARGIN), -np.float16(LARGEST_MARGIN)
-            )
-        places, won = np.concatenate(self.places), np.concatenate(self.won)
-        within = (places < labels.shape).all(axis=1)
-        i, j, k = places[within].T
-        margins[:, i, j, k] = won[within].T
-        return margins
+
+def settled(
+    expected: Float32[np.ndarray, "n classes"],
+    leads: Float32[np.ndarray, " n"],
+    ask: Ask,
+    trust: Trust,
+) -> Bool[np.ndarray, " n"]:
+    """Ask wherever the expected label leads by too little; which were asked.
+
+    The least sure points are asked first. How far their logits lie from the expected ones tells
+    what the others may err by, and so which of them have to be asked as well, until none is left.
+
+    Args:
+        expected: logits; where asked, they are replaced by the answer.
+        leads: by how much the largest is larger than the second.
+        ask: indices (m,) -> logits (m, classes).
+        trust: what is known of the errors; learns.
+    """
+    asked = np.zeros(len(leads), bool)
+    if len(leads) > _PROBE:
+        trust.limit = max(trust.limit, float(np.partition(leads, _PROBE)[_PROBE]))
+    while True:
+        now = np.flatnonzero((leads <= trust.limit) & ~asked)
+        if not len(now):
+            return asked
+        found = ask(now)
+        trust.learn(expected[now], found)
+        expected[now] = found
+        asked[now] = True
+
+
+def _halved(
+    coarse: Float32[np.ndarray, "a b c classes"], lattice: _Lattice
+) -> Float32[np.ndarray, "i j k classes"]:
+    """The logits of a lattice from those of the one before."""
+    from tumortrack.track.sparse_kernels import halved
+
+    fine = np.empty((*lattice.shape, coarse.shape[3]), np.float32)
+    _in_slabs(partial(halved, coarse, fine), len(fine))
+    rows = fine.reshape(-1, coarse.shape[3])
+    labels, leads = _best(rows)
+    asked = settled(rows, leads, lattice.ask, lattice.trust)
+    flat, found = _about_surprises(np.flatnonzero(asked), rows[asked], labels, lattice)
+    rows[flat] = found
+    return fine
+
+
+def _voxels(
+    coarse: Float32[np.ndarray, "a b c classes"], lattice: _Lattice
+) -> tuple[Float16[np.ndarray, "parts i j k"], UInt8[np.ndarray, "i j k"]]:
+    """Margins and labels of the voxels, from the lattice of twice their distance."""
+    from tumortrack.track.sparse_kernels import filled
+
+    classes = coarse.shape[3]
+    sure, leads = (v.reshape(coarse.shape[:3]) for v in _best(coarse.reshape(-1, classes)))
+    labels = np.empty(lattice.shape, np.uint8)
+    trust = lattice.trust
+    seen = trust.coarser or float(np.quantile(leads, _FIRST_SEEN))
+    while True:
+        lists = _in_slabs(
+            partial(filled, coarse, sure, leads, np.float32(seen), labels), len(coarse)
+        )
+        flat, expected = (np.concatenate(column) for column in zip(*lists, strict=True))
+        now, lead = _best(expected)
+        labels.reshape(-1)[flat] = now
+        asked = settled(expected, lead, partial(lattice.ask_some, flat), trust)
+        if trust.limit <= seen:
+            break
+        seen = 2 * trust.limit  # voxels that lead by less were filled unseen
+    more, found = _about_surprises(flat[asked], expected[asked], labels.reshape(-1), lattice)
+    labels.reshape(-1)[flat] = _best(expected)[0]
+    labels.reshape(-1)[more] = _best(found)[0]
+    margins = np.empty((classes - 1, *lattice.shape), np.float16)
+    for part, margin in enumerate(margins):
+        largest = np.full(classes, -LARGEST_MARGIN, np.float16)
+        largest[part + 1 if part else slice(1, None)] = LARGEST_MARGIN
+        np.take(largest, labels, out=margin)
+        for places, logits in ((flat, expected), (more, found)):
+            margin.reshape(-1)[places] = margins_of(torch.from_numpy(logits))[:, part]
+    return margins, labels
+
+
+def _about_surprises(
+    flat: Int[np.ndarray, " n"],
+    found: Float32[np.ndarray, "n classes"],
+    labels: UInt8[np.ndarray, " all"],
+    lattice: _Lattice,
+) -> tuple[Int[np.ndarray, " m"], Float32[np.ndarray, "m classes"]]:
+    """Ask about every voxel that touches one with another label than was expected, until none
+    is: what else was asked.
+
+    Args:
+        flat, found: the asked ones, and their logits.
+        labels: what was expected everywhere.
+    """
+    from tumortrack.track.sparse_kernels import neighbours
+
+    more, logits = [np.zeros(0, np.int64)], [found[:0]]
+    surprises = flat[_best(found)[0] != labels[flat]]
+    if not len(surprises):
+        return more[0], logits[0]
+    known = np.zeros(len(labels), bool)
+    known[flat] = True
+    while len(surprises):
+        frontier = neighbours(lattice.shape, surprises, known)
+        if not len(frontier):
+            break
+        more.append(frontier)
+        logits.append(lattice.ask(frontier))
+        surprises = frontier[_best(logits[-1])[0] != labels[frontier]]
+    return np.concatenate(more), np.concatenate(logits)
+
+
+def _best(rows: Float32[np.ndarray, "n classes"]) -> tuple[np.ndarray, np.ndarray]:
+    """The label that leads in every row, and by how much."""
+    from tumortrack.track.sparse_kernels import best
+
+    labels, leads = np.empty(len(rows), np.uint8), np.empty(len(rows), np.float32)
+    best(rows, labels, leads)
+    return labels, leads
+
+
+def _in_slabs(work: Callable[[int, int], object], planes: int) -> list:
+    """What ``work(first, last)`` returns for slabs of planes, one a thread."""
+    cuts = np.linspace(0, planes, torch.get_num_threads() + 1).astype(int)
+    with ThreadPoolExecutor(len(cuts) - 1) as pool:
+        return list(pool.map(work, cuts[:-1], cuts[1:]))

@@ -5,76 +5,118 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-UNKNOWN = 255  # label of a voxel that must be asked
-
 
 @numba.njit(cache=True, nogil=True)
-def refined(coarse, known, fine, fine_known):  # type: ignore[no-untyped-def]
-    """Labels at half the distance: between equal ones the same, between others ``UNKNOWN``.
+def halved(coarse, fine, first, last):  # type: ignore[no-untyped-def]
+    """Logits at half the distance, linear between the coarse ones; planes ``first`` to ``last``.
 
     Args:
-        coarse, known: labels (a, b, c), and which of them were asked.
-        fine, fine_known: (2a - 1, 2b - 1, 2c - 1); filled.
-
-    Returns:
-        Flat indices of the unknown.
+        coarse: (a, b, c, classes), float32.
+        fine: (2a - 1, 2b - 1, 2c - 1, classes); filled.
     """
-    n_i, n_j, n_k = fine.shape
-    count = 0
-    asked = np.empty(1024, np.int64)
-    for i in range(n_i):
+    for i in range(first, last):
         i0, i1 = i // 2, (i + 1) // 2
-        for j in range(n_j):
+        for j in range(fine.shape[1]):
             j0, j1 = j // 2, (j + 1) // 2
-            level = i0 == i1 and j0 == j1
-            for k in range(n_k):
+            for k in range(fine.shape[2]):
                 k0, k1 = k // 2, (k + 1) // 2
-                label = coarse[i0, j0, k0]
-                if level and k0 == k1:
-                    fine[i, j, k] = label
-                    fine_known[i, j, k] = known[i0, j0, k0]
-                    continue
-                fine_known[i, j, k] = False
-                same = (
-                    label == coarse[i0, j0, k1]
-                    and label == coarse[i0, j1, k0]
-                    and label == coarse[i0, j1, k1]
-                    and label == coarse[i1, j0, k0]
-                    and label == coarse[i1, j0, k1]
-                    and label == coarse[i1, j1, k0]
-                    and label == coarse[i1, j1, k1]
-                )
-                if same:
-                    fine[i, j, k] = label
-                    continue
-                fine[i, j, k] = UNKNOWN
-                if count == len(asked):
-                    longer = np.empty(2 * count, np.int64)
-                    longer[:count] = asked
-                    asked = longer
-                asked[count] = (i * n_j + j) * n_k + k
-                count += 1
-    return asked[:count].copy()
+                for n in range(fine.shape[3]):
+                    near = coarse[i0, j0, k0, n] + coarse[i0, j0, k1, n]
+                    near += coarse[i0, j1, k0, n] + coarse[i0, j1, k1, n]
+                    far = coarse[i1, j0, k0, n] + coarse[i1, j0, k1, n]
+                    far += coarse[i1, j1, k0, n] + coarse[i1, j1, k1, n]
+                    fine[i, j, k, n] = np.float32(0.125) * (near + far)
 
 
 @numba.njit(cache=True, nogil=True)
-def doubtful(labels, known, frontier):  # type: ignore[no-untyped-def]
-    """Voxels that were not asked and touch one of these with another label: flat indices.
+def best(logits, labels, leads):  # type: ignore[no-untyped-def]
+    """The largest logit of every row (n, classes), and by how much it leads; both filled."""
+    for row in range(len(logits)):
+        first, second, label = np.float32(-np.inf), np.float32(-np.inf), 0
+        for n in range(logits.shape[1]):
+            value = logits[row, n]
+            if value > first:
+                first, second, label = value, first, n
+            elif value > second:
+                second = value
+        labels[row] = label
+        leads[row] = first - second
 
-    They are marked as known, for whoever asks them now.
+
+@numba.njit(cache=True, nogil=True)
+def filled(coarse, labels, leads, limit, fine, first, last):  # type: ignore[no-untyped-def]
+    """The voxels between the points of the last lattice but one, cell by cell.
+
+    A cell whose corners agree and all lead by the limit holds no voxel that leads by less: it is
+    filled with their label. The voxels of all others are listed.
+
+    Args:
+        coarse, labels, leads: logits (a, b, c, classes), and what ``best`` says of them.
+        fine: labels (i, j, k); filled.
+        first, last: coarse planes.
+
+    Returns:
+        Flat indices (n,) of the listed voxels, and their linear logits (n, classes).
     """
-    n_i, n_j, n_k = labels.shape
+    classes = coarse.shape[3]
+    n_i, n_j, n_k = fine.shape
+    count = 0
+    listed = np.empty(4096, np.int64)
+    expected = np.empty((4096, classes), np.float32)
+    for i in range(first, last):
+        for j in range(coarse.shape[1]):
+            for k in range(coarse.shape[2]):
+                i1, j1 = min(i + 1, coarse.shape[0] - 1), min(j + 1, coarse.shape[1] - 1)
+                k1 = min(k + 1, coarse.shape[2] - 1)
+                label, sure = labels[i, j, k], True
+                for a in (i, i1):
+                    for b in (j, j1):
+                        for c in (k, k1):
+                            if labels[a, b, c] != label or leads[a, b, c] < limit:
+                                sure = False
+                if count + 8 > len(listed):
+                    longer = np.empty(2 * len(listed), np.int64)
+                    longer[:count] = listed[:count]
+                    listed = longer
+                    more = np.empty((len(listed), classes), np.float32)
+                    more[:count] = expected[:count]
+                    expected = more
+                for a in range(2 * i, min(2 * i + 2, n_i)):
+                    ia = (a + 1) // 2
+                    for b in range(2 * j, min(2 * j + 2, n_j)):
+                        jb = (b + 1) // 2
+                        for c in range(2 * k, min(2 * k + 2, n_k)):
+                            fine[a, b, c] = label
+                            if sure:
+                                continue
+                            kc = (c + 1) // 2
+                            for n in range(classes):
+                                near = coarse[i, j, k, n] + coarse[i, j, kc, n]
+                                near += coarse[i, jb, k, n] + coarse[i, jb, kc, n]
+                                far = coarse[ia, j, k, n] + coarse[ia, j, kc, n]
+                                far += coarse[ia, jb, k, n] + coarse[ia, jb, kc, n]
+                                expected[count, n] = np.float32(0.125) * (near + far)
+                            listed[count] = (a * n_j + b) * n_k + c
+                            count += 1
+    return listed[:count].copy(), expected[:count].copy()
+
+
+@numba.njit(cache=True, nogil=True)
+def neighbours(shape, frontier, known):  # type: ignore[no-untyped-def]
+    """The voxels that touch these and are not known yet: flat indices; they are marked as known,
+    for whoever asks them now."""
+    n_i, n_j, n_k = shape
     found = np.empty(max(26 * len(frontier), 1), np.int64)
     count = 0
     for n in range(len(frontier)):
         i, rest = divmod(frontier[n], n_j * n_k)
         j, k = divmod(rest, n_k)
-        mine = labels[i, j, k]
         for a in range(max(i - 1, 0), min(i + 2, n_i)):
             for b in range(max(j - 1, 0), min(j + 2, n_j)):
                 for c in range(max(k - 1, 0), min(k + 2, n_k)):
-                    if not known[a, b, c] and labels[a, b, c] != mine:
-                        known[a, b, c] = True
-                        found[count] = (a * n_j + b) * n_k + c
+                    at = (a * n_j + b) * n_k + c
+                    if not known[at]:
+                        known[at] = True
+                        found[count] = at
                         count += 1
     return found[:count].copy()

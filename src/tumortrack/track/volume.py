@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float16, Float64, UInt8
 
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.types import FIRST_TUMOR, ORGAN, Mesh, OccupancyCloud
+from tumortrack.learn.lattice import Lattice
 
 _AT_ONCE = 2**18  # queries; bounds the memory whatever the grid
 _SMALLEST_MARGIN = 1e-3  # a surface exactly through a grid point would not be closed
@@ -62,6 +63,21 @@ def dense_margins(
         margins[:, rows] = won.T.reshape(-1, *block)
     assert margins is not None
     return margins, labels
+
+
+def margins_on(
+    lattice: Lattice,
+) -> tuple[
+    Float16[np.ndarray, "parts i j k"], UInt8[np.ndarray, "i j k"], Float64[np.ndarray, "4 4"]
+]:
+    """The same of a lattice, and its ``camera_from_index``."""
+    logits = torch.from_numpy(lattice.logits.reshape(-1, lattice.logits.shape[3]))
+    shape = lattice.logits.shape[:3]
+    labels = logits.argmax(-1).to(torch.uint8).numpy().reshape(shape)
+    margins = np.ascontiguousarray(margins_of(logits).T).reshape(-1, *shape)
+    camera_from_index = np.diag([lattice.step_mm] * 3 + [1.0])
+    camera_from_index[:3, 3] = lattice.origin_mm
+    return margins, labels, camera_from_index
 
 
 def margins_of(logits: torch.Tensor) -> Float16[np.ndarray, "n parts"]:
