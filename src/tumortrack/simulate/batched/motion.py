@@ -15,7 +15,7 @@ from torch import Tensor
 
 from tumortrack.simulate.batched.plan import Plan
 
-_REACH = 12.0  # beyond, a drag's factor is below exp(-12) = 6e-6, and left out
+_FARTHEST = -12.0  # where a drag's factor is below exp(-12) = 6e-6, it is left out
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,11 +59,9 @@ def drag(
     points = points_ct.clone()
     scales = -0.5 / (sigmas_mm * sigmas_mm)
     for k in range(sigmas_mm.shape[1]):
-        scale = scales[:, k, None]
         offset = points - centres_ct[:, :, k, None]
-        square = offset.square_().sum(0)
-        near = square < -_REACH / scale
-        factor = square.mul_(scale).exp_().mul_(near)
+        exponent = offset.square_().sum(0).mul_(scales[:, k, None])
+        factor = torch.threshold_(exponent, _FARTHEST, -torch.inf).exp_()
         points.addcmul_(factor, shifts_mm[:, :, k, None])
     return points
 

@@ -1,14 +1,14 @@
 """Depth images of a batch of surfaces with the same triangles: a z-buffer of scattered maxima.
 
 Every triangle that faces the camera is spread over the pixels of its box, and each pixel keeps the
-greatest 1/z: the arithmetic, precision and tolerance of ``sense.render``, so that the same
-vertices give the same image to the last bit, in whatever order a device works.
+greatest 1/z: precision and tolerance are those of ``sense.render``, so that the same vertices
+give the same image, in whatever order a device works.
 """
 
 from __future__ import annotations
 
 import torch
-from jaxtyping import Float32, Int64
+from jaxtyping import Float32, Float64, Int64
 from torch import Tensor
 
 from tumortrack.core.types import Intrinsics
@@ -24,20 +24,41 @@ def depth_images(
     height, width = intrinsics.height, intrinsics.width
     batch = points_mm.shape[1]
     corners, area, box = _front(_projected(points_mm, intrinsics), faces, intrinsics)
-    triangle, x, y = _pixels(box)
-    corners, area = corners[triangle].double(), area[triangle].double()
-    (ua, va, wa), (ub, vb, wb), (uc, vc, wc) = corners.unflatten(1, (3, 3)).permute(1, 2, 0)
-    inverse = 1.0 / area
-    share_a = ((ub - x) * (vc - y) - (vb - y) * (uc - x)) * inverse
-    share_b = ((uc - x) * (va - y) - (vc - y) * (ua - x)) * inverse
-    share_c = 1.0 - share_a - share_b
-    inside = (share_a >= _EDGE) & (share_b >= _EDGE) & (share_c >= _EDGE)
-    here = (share_a * wa + share_b * wb + share_c * wc).float()
-    pixel = (box[triangle, 0] * height + y) * width + x
-    nearest = here.new_zeros(batch * height * width)
-    nearest.scatter_reduce_(0, pixel, torch.where(inside, here, 0), "amax")
+    scene, left, top, wide, high = box.unbind(1)
+    planes = _planes(corners, area, left, top)
+    triangle, column, row = _pixels(wide, high)
+    start, across, down = planes[:, :, triangle]
+    share_a, share_b, inverse = start.addcmul(across, column).addcmul(down, row)
+    least = torch.minimum(torch.minimum(share_a, share_b), 1.0 - share_a - share_b)
+    here = torch.where(least >= _EDGE, inverse, 0.0).float()
+    pixel = ((scene * height + top) * width + left)[triangle] + row * width + column
+    nearest = here.new_zeros(batch * height * width).scatter_reduce_(0, pixel, here, "amax")
     depth_mm = torch.where(nearest > 0, 1.0 / nearest, torch.nan)
     return depth_mm.view(batch, height, width)
+
+
+def _planes(
+    corners: Float32[Tensor, "t 9"],
+    area: Float32[Tensor, " t"],
+    left: Int64[Tensor, " t"],
+    top: Int64[Tensor, " t"],
+) -> Float64[Tensor, "3 3 t"]:
+    """The weights of corners a and b, and 1/z: at a box's first pixel, by how much a column adds
+    to them, by how much a row."""
+    (ua, va, wa), (ub, vb, wb), (uc, vc, wc) = (
+        corners.double().unflatten(1, (3, 3)).permute(1, 2, 0)
+    )
+    share = 1.0 / area.double()
+    start_a = ((ub - left) * (vc - top) - (vb - top) * (uc - left)) * share
+    start_b = ((uc - left) * (va - top) - (vc - top) * (ua - left)) * share
+    across_a, across_b = (vb - vc) * share, (vc - va) * share
+    down_a, down_b = (uc - ub) * share, (ua - uc) * share
+    from_a, from_b = wa - wc, wb - wc
+    start = wc + start_a * from_a + start_b * from_b
+    across = across_a * from_a + across_b * from_b
+    down = down_a * from_a + down_b * from_b
+    rows = (start_a, start_b, start, across_a, across_b, across, down_a, down_b, down)
+    return torch.stack(rows).unflatten(0, (3, 3))
 
 
 def _projected(
@@ -74,13 +95,12 @@ def _front(
 
 
 def _pixels(
-    box: Int64[Tensor, "t 5"],
+    wide: Int64[Tensor, " t"], high: Int64[Tensor, " t"]
 ) -> tuple[Int64[Tensor, " p"], Int64[Tensor, " p"], Int64[Tensor, " p"]]:
-    """All pixels of all boxes: whose, column, row."""
-    _, left, top, wide, high = box.unbind(1)
+    """All pixels of all boxes: whose, and which column and row of it."""
     count = wide * high
     triangle = torch.repeat_interleave(count)
-    place = torch.arange(len(triangle), device=box.device) - (count.cumsum(0) - count)[triangle]
+    place = torch.arange(len(triangle), device=wide.device) - (count.cumsum(0) - count)[triangle]
     wide = wide[triangle]
     row = place.div(wide, rounding_mode="floor")
-    return triangle, left[triangle] + place - row * wide, top[triangle] + row
+    return triangle, place - row * wide, row
