@@ -465,8 +465,8 @@ def bench(
     *,
     only: tuple[
         Literal[
-            "generator", "encoder", "decoder", "frame", "tracking", "volume", "command",
-            "planning", "gpu", "training", "whole-training",
+            "generator", "elastic-generator", "encoder", "decoder", "frame", "tracking", "volume",
+            "command", "planning", "gpu", "training", "whole-training",
         ],
         ...,
     ] = (),

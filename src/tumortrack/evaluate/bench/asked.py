@@ -28,6 +28,8 @@ if TYPE_CHECKING:
 
 LABELLING = ("quick", "paper")  # the presets that label points
 IN_ONE_PIECE = 40_000  # queries of the naive form: of more the latent's copies fill the memory
+_PRECISIONS: dict[str, Precision] = {"float32": "fp32", "bfloat16": "bf16", "int8": "int8"}
+_BYTES: dict[Precision, int] = {"fp32": 4, "bf16": 2, "int8": 1}
 NAIVE = "single precision, latent beside every query, Python loops, one piece"
 
 
@@ -90,11 +92,17 @@ class Asked:
 
     @cached_property
     def precision(self) -> Precision:
+        """Of the encoder."""
         import torch
 
         from tumortrack.learn.model import has_fast_bfloat16
 
         return "bf16" if has_fast_bfloat16(torch.device(self.device)) else "fp32"
+
+    @property
+    def decoder_precision(self) -> Precision:
+        """Of the products that answer queries."""
+        return _PRECISIONS.get(self.inference.arithmetic.numbers, self.precision)
 
     def encoder_work(self) -> Work:
         folded = self.network.folded()
@@ -104,7 +112,7 @@ class Asked:
             centres = round(level.ratio * n)
             flops += farthest_flops(n, centres) + ball_flops(n, centres)
             n = centres
-        moved = weight_bytes(folded.encoder, self._bytes) + self.points_mm.nbytes
+        moved = weight_bytes(folded.encoder, _BYTES[self.precision]) + self.points_mm.nbytes
         return Work(flops=flops, bytes=moved, precision=self.precision)
 
     def decoder_work(self, queries: int) -> Work:
@@ -116,8 +124,10 @@ class Asked:
         some = torch.from_numpy(self.queries(100))[None].to(self.device)
         flops = module_flops(lambda: folded.query(latent, some)) * queries / 100
         classes = len(self.model.parts) + 1
-        moved = weight_bytes(folded.decoder, self._bytes) + queries * (12 + 4 * classes)
-        return Work(flops=flops, bytes=moved, precision=self.precision)
+        moved = weight_bytes(folded.decoder, _BYTES[self.decoder_precision]) + queries * (
+            12 + 4 * classes
+        )
+        return Work(flops=flops, bytes=moved, precision=self.decoder_precision)
 
     def naive_decoder_work(self, queries: int) -> Work:
         import torch
@@ -127,10 +137,6 @@ class Asked:
             some = torch.from_numpy(self.queries(100))[None].to(self.device)
             flops = module_flops(lambda: self.plain.logits(encoded, some)) * queries / 100
         return Work(flops=flops, bytes=weight_bytes(self.network.decoder, 4))
-
-    @property
-    def _bytes(self) -> int:
-        return 2 if self.precision == "bf16" else 4
 
     def naive_frame(self, queries: np.ndarray) -> Call:
         import torch

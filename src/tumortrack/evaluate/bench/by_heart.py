@@ -85,7 +85,7 @@ def _settled(network: OccupancyNetwork, seen: Tensor) -> list[Tensor]:
     decoder's weights that hold them."""
     import torch
 
-    weights = [
+    weights: list[Tensor] = [
         weight
         for name, weight in network.decoder.named_parameters()
         if name.endswith("weight") and weight.dim() == 2 and _sees_latent(network, weight)

@@ -43,7 +43,7 @@ def count(value: float) -> str:
     for prefix, size in (("T", 1e12), ("G", 1e9), ("M", 1e6), ("k", 1e3)):
         if value >= size:
             return f"{_digits(value / size)} {prefix}"
-    return f"{value:.0f} "
+    return f"{_digits(value)} "
 
 
 def spread(row: Row) -> str:

@@ -116,7 +116,7 @@ GOALS = (
         "frame (1,000 points, 40,000 queries), `paper`, 2 CPU cores",
         "naive fp32, same run",
         "at least 25 x faster, at least 99.8 % of labels equal",
-        _row(frames.FRAME, "paper", 2, _faster_and_equal(25, 0.998)),
+        _row(frames.FRAME, "paper", 2, _faster_and_equal(25.0, 0.998)),
     ),
     Goal(
         "frame, `clinic` (the default), 2 CPU cores",
@@ -140,13 +140,13 @@ GOALS = (
         "400^3 labels, exact, `paper`, 2 CPU cores",
         "dense, same run",
         "at least 50 x faster, at most 1.4 s",
-        _row(volume.NAME, "paper", 2, _faster_within(50, 1.4)),
+        _row(volume.NAME, "paper", 2, _faster_within(50.0, 1.4)),
     ),
     Goal(
         "400^3 labels, exact, `clinic`, 2 CPU cores",
         "dense, same run",
         "at least 50 x faster, at most 0.3 s",
-        _row(volume.NAME, "clinic", 2, _faster_within(50, 0.3)),
+        _row(volume.NAME, "clinic", 2, _faster_within(50.0, 0.3)),
     ),
     Goal(
         "400^3 labels, exact, `paper`, H100",
@@ -164,14 +164,14 @@ GOALS = (
         "training, `quick`, 2 CPU cores, generator included",
         "",
         "at least 300 samples/s",
-        _row(training.WHOLE, "quick", 2, _at_least_per_s(300)),
+        _row(training.WHOLE, "quick", 2, _at_least_per_s(300.0)),
     ),
     *(
         Goal(
             f"generator, {what}, one core, 424 x 240 depth and 2,000 labels",
             "Open3D + NumPy: 15/s",
             "at least 250/s",
-            _row(generator.NAME, what, 1, _at_least_per_s(250)),
+            _row(generator.NAME, what, 1, _at_least_per_s(250.0)),
         )
         for what in ("drags", "elastic")
     ),

@@ -6,6 +6,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import msgspec
+
 from tumortrack.evaluate.bench.row import Bench, Peaks, Point, Row
 from tumortrack.evaluate.bench.suite import GROUPS
 from tumortrack.evaluate.bench.tasks import Said, Task, listen
@@ -40,12 +42,13 @@ def tasks_of(wish: Wish, cores: int) -> list[Task]:
     if wish.curves:
         needed |= {"clinic", "quick", "paper"}
     train = () if wish.model is not None else tuple(sorted(needed))
-    tasks = [task(min(cores, 2), describe=True, train=train)]
+    tasks = [task(min(cores, 2), train=train)] if train else []
     for threads in (1, 2):
         mine = tuple(name for name, group in groups.items() if threads in group.threads)
         if mine and threads <= cores:
             tasks.append(task(threads, peaks=True, groups=mine))
-    return tasks + [task(1, curves=(curve,)) for curve in wish.curves]
+    tasks += [task(1, curves=(curve,)) for curve in wish.curves]
+    return [msgspec.structs.replace(tasks[0], describe=True), *tasks[1:]]
 
 
 def measure(wish: Wish, worker: Sequence[str], command: str, tell: Callable[[str], None]) -> Bench:

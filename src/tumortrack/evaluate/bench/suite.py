@@ -42,15 +42,16 @@ class Group:
 ALL = ("clinic", "quick", "paper")
 # Training comes last: it tells the C library to keep freed memory, which stays so.
 GROUPS: dict[str, Group] = {
-    "generator": Group(generator.rows, (1,), 6, 1.5, ("clinic",)),
-    "encoder": Group(halves.encoder_rows, (1,), 6, 1.5, ALL),
-    "decoder": Group(halves.decoder_rows, (1,), 60, 4, ALL),
-    "frame": Group(frames.frame_rows, (1, 2), 30, 4, ALL),
-    "tracking": Group(frames.tracking_rows, (1, 2), 6, 1.5, ("clinic",)),
-    "volume": Group(volume.rows, (1, 2), 30, 6, ALL),
-    "command": Group(command.rows, (2,), 40, 6, ALL),
-    "planning": Group(planning.rows, (1,), 12, 2),
-    "gpu": Group(gpu.rows, (1,), 20, 4, ALL),
-    "training": Group(training.rows, (1,), 15, 3, ("clinic",)),
-    "whole-training": Group(training.whole_rows, (2,), 10, 4),
+    "generator": Group(generator.rows, (1,), 3.0, 0.7),
+    "elastic-generator": Group(generator.elastic_rows, (1,), 3.0, 0.7, ("clinic",)),
+    "encoder": Group(halves.encoder_rows, (1,), 6.0, 1.5, ALL),
+    "decoder": Group(halves.decoder_rows, (1,), 60.0, 4.0, ALL),
+    "frame": Group(frames.frame_rows, (1, 2), 30.0, 4.0, ALL),
+    "tracking": Group(frames.tracking_rows, (1, 2), 6.0, 1.5, ("clinic",)),
+    "volume": Group(volume.rows, (1, 2), 30.0, 6.0, ALL),
+    "command": Group(command.rows, (2,), 40.0, 6.0, ALL),
+    "planning": Group(planning.rows, (1,), 12.0, 2.0),
+    "gpu": Group(gpu.rows, (1,), 20.0, 4.0, ALL),
+    "training": Group(training.rows, (1,), 15.0, 3.0, ("clinic",)),
+    "whole-training": Group(training.whole_rows, (2,), 10.0, 4.0),
 }

@@ -1,0 +1,225 @@
+"""The bench: figures that follow from their definitions, naive forms that give the same answers."""
+
+import json
+import time
+
+import numpy as np
+import pytest
+import torch
+
+from stories import tumortrack
+from tumortrack.app.benching import BenchOptions, bench
+from tumortrack.core.errors import InputError
+from tumortrack.evaluate.bench.counts import module_flops
+from tumortrack.evaluate.bench.goals import GOALS, goals_table
+from tumortrack.evaluate.bench.growth import draw_growth
+from tumortrack.evaluate.bench.memory import forget_peak, peak_bytes
+from tumortrack.evaluate.bench.naive.occupancy import NaiveOccupancy
+from tumortrack.evaluate.bench.naive.scenes import flowed
+from tumortrack.evaluate.bench.report import BLOCKS, write_bench
+from tumortrack.evaluate.bench.row import Bench, Peaks, Point, Row, Work
+from tumortrack.evaluate.bench.suite import GROUPS
+from tumortrack.evaluate.bench.turns import Timing, Uncounted, in_turns, timing_of
+from tumortrack.evaluate.study.markdown import closing, opening
+from tumortrack.learn.decoders.mlp import MlpDecoderConfig
+from tumortrack.learn.encoders.pointnet2 import PointNet2Config, SetAbstraction
+from tumortrack.learn.network import CloudBox, NetworkConfig, OccupancyNetwork, quick_network
+
+PAPER_DECODER = MlpDecoderConfig(
+    n_classes=4, width=512, hidden_layers=8, skip_layer=5, norm_layers=(5, 8)
+)
+
+
+def timing(median_s: float) -> Timing:
+    return timing_of([0.9 * median_s, median_s, 1.2 * median_s])
+
+
+def test_turns_are_fair_and_what_is_not_counted_is_left_out() -> None:
+    order = []
+
+    def slow() -> None:
+        order.append("slow")
+        time.sleep(0.02)
+
+    def fast() -> Uncounted:
+        order.append("fast")
+        time.sleep(0.015)
+        return Uncounted(0.01)
+
+    slow_s, fast_s = in_turns(slow, fast, budget_s=0.2)
+    assert 0.02 <= slow_s.median_s < 0.04
+    assert 0.004 <= fast_s.median_s < 0.02
+    assert order[4:8] == ["slow", "fast", "slow", "fast"]  # after two calls of each to warm up
+    assert 3 <= slow_s.turns <= 6
+    for one in (slow_s, fast_s):
+        assert one.best_s <= one.low_s <= one.median_s <= one.high_s
+
+
+def test_arithmetic_is_that_of_the_layers() -> None:
+    decoder = PAPER_DECODER.build(latent_size=1024).eval()
+    for layer in decoder.layers:
+        layer.fold()
+    terms = decoder.prepare(torch.zeros(1, 1024))
+    # The latent's share is made once: a query costs 3 -> 512, six times 512 -> 512, [512, 3] -> 512
+    # and 512 -> 4, each product an addition and a multiplication.
+    by_hand = 2 * (3 * 512 + 6 * 512 * 512 + 515 * 512 + 512 * 4)
+    assert module_flops(lambda: decoder(terms, torch.zeros(1, 10, 3))) == 10 * by_hand
+    beside = 2 * 512 * 1024 * 2  # the latent beside every query, at both layers that see it
+    assert by_hand == 3_680_256
+    assert beside / by_hand == pytest.approx(0.57, abs=0.01)
+    assert module_flops(lambda: decoder.prepare(torch.zeros(1, 1024))) == beside
+
+
+def test_floors_follow_from_the_rates() -> None:
+    peaks = Peaks(threads=1, gemm={"fp32": 1e9, "bf16": 4e9}, triad=2e9)
+    assert peaks.floor_s(Work(flops=4e9, bytes=1.0, precision="bf16")) == 1.0
+    assert peaks.floor_s(Work(flops=1.0, bytes=4e9)) == 2.0
+    assert peaks.floor_s(Work(flops=3e9, bytes=0.0, precision="int8")) == 3.0  # not offered: fp32
+
+
+def normed_network() -> NetworkConfig:
+    levels = (
+        SetAbstraction(ratio=0.5, radius=0.2, neighbours=16, widths=(8, 16)),
+        SetAbstraction(ratio=0.25, radius=0.4, neighbours=8, widths=(16, 24)),
+    )
+    decoder = MlpDecoderConfig(
+        n_classes=3, width=24, hidden_layers=4, skip_layer=3, norm_layers=(3, 4)
+    )
+    encoder = PointNet2Config(levels=levels, widths=(24, 32))
+    return NetworkConfig(encoder=encoder, decoder=decoder, normalisation=CloudBox())
+
+
+@pytest.mark.parametrize("config", [normed_network(), quick_network(4, 60.0)])
+def test_the_naive_network_is_the_network(config: NetworkConfig) -> None:
+    torch.manual_seed(1)
+    network = OccupancyNetwork(config)
+    clouds = 30 * torch.randn(2, 300, 3) + torch.tensor([0.0, 5.0, 150.0])
+    queries = 40 * torch.randn(2, 50, 3) + torch.tensor([0.0, 5.0, 150.0])
+    with torch.no_grad():
+        for training in (True, False):  # the first settles the norms' statistics
+            network.train(training)
+            plain = NaiveOccupancy(network, training=False)
+            if training:
+                network(clouds, queries)
+                continue
+            expected = network(clouds, queries)
+            found = plain.logits(plain.encode(clouds), queries)
+    assert float(expected.std()) > 1e-3
+    torch.testing.assert_close(found, expected, rtol=1e-3, atol=1e-3)
+
+
+def test_the_naive_flow_is_the_flow() -> None:
+    from tumortrack.simulate.elastic.body import Body
+
+    rng = np.random.default_rng(0)
+    waves = np.sin(np.linspace(0, 3, 7))[:, None, None, None, None] * rng.normal(
+        size=(1, 7, 7, 3, 2)
+    )
+    smooth = (waves + np.roll(waves, 1, 1) + np.roll(waves, 1, 2)).astype(np.float32)
+    states = rng.normal(size=(5, 2)).astype(np.float32)
+    body = Body(np.zeros(3, np.float32), 20.0, np.full(3, 60.0), smooth, states)
+    points = rng.uniform(25, 95, (200, 3)).astype(np.float32)
+    moved = body.carry(states[0], points)
+    assert np.linalg.norm(moved - points, axis=1).max() > 1.0
+    np.testing.assert_allclose(flowed(body, states[0], points), moved, atol=0.1)
+
+
+def test_peak_memory_is_seen() -> None:
+    before = forget_peak()
+    if before is None:
+        pytest.skip("this system does not tell")
+    np.ones(2**25)  # 256 MiB, at once freed again
+    held = peak_bytes()
+    assert held is not None
+    assert 2**28 < held - before < 2**28 + 2**27
+
+
+def some_bench() -> Bench:
+    row = Row(
+        name="frame",
+        what="paper",
+        threads=2,
+        item="frame",
+        ours=timing(0.04),
+        naive=timing(1.2),
+        naive_is="plain",
+        work=Work(flops=1.5e11, bytes=1e6, precision="bf16"),
+        agreement=0.99941,
+    )
+    follow = Row(name="tracking frame", what="clinic", threads=2, item="frame", ours=timing(0.006))
+    points = tuple(
+        Point(curve=curve, what=what, size=size, seconds=size * 1e-4, peak_bytes=size * 10**6)
+        for curve in ("queries", "batch")
+        for what in ("clinic", "quick")
+        for size in (1, 10)
+    )
+    peaks = (Peaks(threads=2, gemm={"fp32": 1e11, "bf16": 5e12}, triad=4e10),)
+    machine = {"processor": "a processor", "GPU": "none at hand", "date": "2026-01-02"}
+    rows = (row, follow)
+    return Bench(machine=machine, command="the command", peaks=peaks, rows=rows, points=points)
+
+
+def test_goals_are_judged_by_what_was_measured() -> None:
+    lines = goals_table(some_bench()).splitlines()
+    assert len(lines) == len(GOALS) + 2
+    (frame,) = [line for line in lines if "`paper`, 2 CPU" in line and "frame" in line]
+    assert "30.0 x (40.0 ms, naive 1.20 s), 99.941 % equal | yes |" in frame
+    (tracking,) = [line for line in lines if "tracking" in line]
+    assert tracking.endswith("| 6.00 ms | no |")
+    assert sum("no GPU was at hand |  |" in line for line in lines) == 3
+    assert sum("not measured in this run |  |" in line for line in lines) == len(GOALS) - 5
+
+
+def test_a_document_is_filled_and_the_rest_of_it_stays(tmp_path) -> None:
+    document = tmp_path / "docs" / "performance.md"
+    document.parent.mkdir()
+    blocks = "\n".join(f"{opening(name)}\nold\n{closing(name)}" for name in BLOCKS)
+    document.write_text(f"before\n{blocks}\nafter")
+    written = write_bench(some_bench(), tmp_path / "bench.json", document)
+    text = document.read_text()
+    assert text.startswith("before\n")
+    assert text.endswith("after")
+    assert "old" not in text
+    assert "| frame | paper | 2 | 40.0 ms a frame |" in text
+    assert "| 150 GFLOP | 1.00 MB | bf16 | 75.0 % |" in text
+    assert (document.parent / "images" / "growth.png").stat().st_size > 10_000
+    assert {path.name for path in written} >= {"bench.json", "bench_curves.json", "growth.png"}
+    assert len(json.loads((tmp_path / "bench_curves.json").read_text())["points"]) == 8
+    draw_growth(some_bench().points[:4], tmp_path / "one.png")  # a single curve is a picture too
+
+
+def test_a_part_measured_by_the_command(tmp_path, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    bench(BenchOptions(only=("generator",), quick=True, out=tmp_path / "found.json"))
+    found = json.loads((tmp_path / "found.json").read_text())
+    (row,) = found["rows"]
+    ours, naive = row["ours"], row["naive"]
+    assert 1e-4 < ours["median_s"] < naive["median_s"]
+    assert ours["best_s"] <= ours["low_s"] <= ours["median_s"] <= ours["high_s"]
+    assert row["work"]["flops"] > 1e6
+    assert row["work"]["bytes"] > 1e5
+    (peaks,) = found["peaks"]
+    assert peaks["triad"] > 1e9
+    assert peaks["gemm"]["fp32"] > 1e9
+    assert found["machine"]["date"]
+    assert found["command"] == "tumortrack bench --only generator --quick"
+    assert not (tmp_path / "runs").exists()  # drags need no model
+
+
+def test_what_cannot_be_measured_is_refused(tmp_path) -> None:
+    assert "nonsense" in tumortrack("bench", "--only", "nonsense").stderr
+    with pytest.raises(InputError, match="belong together"):
+        bench(BenchOptions(model=tmp_path))
+    with pytest.raises(InputError, match="cannot be read"):
+        bench(BenchOptions(document=tmp_path / "none.md"))
+    (tmp_path / "bare.md").write_text("no markers")
+    with pytest.raises(InputError, match="results:goals"):
+        bench(BenchOptions(document=tmp_path / "bare.md"))
+
+
+def test_the_command_line_names_every_part() -> None:
+    from typing import get_args, get_type_hints
+
+    from tumortrack.app.cli import bench as command
+
+    assert set(get_args(get_args(get_type_hints(command)["only"])[0])) == set(GROUPS)
