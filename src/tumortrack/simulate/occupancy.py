@@ -202,16 +202,30 @@ def labels_of(anatomy: Anatomy, points_mm: Float[np.ndarray, "n 3"]) -> UInt8[np
     return labels
 
 
+_WITHIN_MM = 0.1
+
+
 def surface_distance(mesh: Mesh, points_mm: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
     """Distance to the surface in mm, by the nearest of dense surface points (within 0.1 mm or
-    so at a distance: it orders points and thins a wall, it is no metric)."""
-    from scipy.spatial import cKDTree
-
+    so: it orders points and thins a wall, it is no metric)."""
     corners = mesh.vertices_mm[mesh.faces]
+    edge = float(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(initial=0))
+    distance = _nearest_of(mesh.vertices_mm, points_mm)
+    # From farther away d + edge^2 / 6 d is all that vertices alone say: in a fifth of the time.
+    near = distance < edge**2 / 6 / _WITHIN_MM + edge
     weights = [(1, 1, 1), (4, 1, 1), (1, 4, 1), (1, 1, 4), (1, 1, 0), (0, 1, 1), (1, 0, 1)]
     dense = [np.einsum("fkx,k->fx", corners, np.array(w) / sum(w)) for w in weights]
+    distance[near] = _nearest_of(np.concatenate([mesh.vertices_mm, *dense]), points_mm[near])
+    return distance
+
+
+def _nearest_of(
+    places_mm: Float[np.ndarray, "p 3"], points_mm: Float[np.ndarray, "n 3"]
+) -> Float32[np.ndarray, " n"]:
+    from scipy.spatial import cKDTree
+
     # Points far from a surface have many almost nearest ones: large, loose leaves are six times
     # faster here than scipy's usual tree, with the same distances.
-    dense_mm = np.concatenate([mesh.vertices_mm, *dense])
-    tree = cKDTree(dense_mm, leafsize=100, balanced_tree=False, compact_nodes=False)
-    return tree.query(points_mm, workers=-1)[0].astype(np.float32)
+    tree = cKDTree(places_mm, leafsize=100, balanced_tree=False, compact_nodes=False)
+    distance: np.ndarray = tree.query(points_mm, workers=-1)[0].astype(np.float32)
+    return distance
