@@ -18,7 +18,7 @@ from tumortrack.simulate.batched.stream import Chosen, DeviceStream, Pictured, w
 from tumortrack.simulate.dataset import SceneStream
 
 Maker = Literal["auto", "workers", "device"]
-_AT_ONCE = 256  # scenes that a GPU makes together
+_TRIANGLES_AT_ONCE = 8_000_000  # of the scenes that a GPU makes together: some 2 GB
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,9 @@ def scenes_for(
     if maker == "device" or (maker == "auto" and device.type == "cuda" and reason is None):
         if reason is not None:
             raise InputError(f"the device cannot make these scenes. {reason}.")
-        at_once = _AT_ONCE if device.type == "cuda" else stream.batch_size
+        at_once = stream.batch_size
+        if device.type == "cuda":
+            at_once = _TRIANGLES_AT_ONCE // len(stream.anatomy_ct.organ.faces)
         made = batches_on(device, stream, steps, period, workers, at_once)
         return Scenes(made, f"batched on {device.type}")
     by_workers = batches(stream, steps, period, workers, device)
