@@ -26,12 +26,15 @@ install_import_hook(
 
 # The longest files first: with few workers none is left alone with one at the end.
 SLOWEST = (
+    "test_soak.py",
     "test_training.py",
+    "test_real_patients.py",
     "test_track.py",
     "test_locate.py",
-    "test_real_patients.py",
     "test_examples.py",
     "test_demo.py",
+    "test_twin_physics.py",
+    "test_resect.py",
 )
 
 

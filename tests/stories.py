@@ -59,7 +59,7 @@ def write_phantom_case(folder: Path) -> Case:
     return case
 
 
-STEPS = {"clinic": 40, "quick": 60}
+STEPS = {"clinic": 20, "quick": 30}
 
 
 def train_command(case: Path, model: Path, preset: str = "quick") -> list[object]:

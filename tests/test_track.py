@@ -7,7 +7,6 @@ import os
 import signal
 import socket
 import subprocess
-import sys
 import time
 from pathlib import Path
 from typing import NamedTuple
@@ -50,7 +49,7 @@ def told(path):
 def test_a_moving_case_is_followed_and_the_report_says_how_well(world, tmp_path):
     report = tmp_path / "report.json"
     done = tumortrack(
-        "track", world.model, virtual(world, fps=10), "--seconds", 8, "--report", report
+        "track", world.model, virtual(world, fps=10), "--seconds", 5, "--report", report
     )
     said = succeeded(done)
     assert "latency from stamp to published estimate: p50" in said
@@ -98,7 +97,7 @@ def test_ctrl_c_ends_cleanly_and_flushes(world, tmp_path):
     folder, report = tmp_path / "kept", tmp_path / "report.json"
     process = start(world, virtual(world, fps=10), f"recording:{folder}", "--report", report)
     _wait_for(process, "tracking")
-    time.sleep(6)
+    time.sleep(2)
     process.send_signal(signal.SIGINT)
     said, _ = process.communicate(timeout=30)
     assert process.returncode == 0, said
@@ -133,22 +132,6 @@ def test_kill_9_leaves_a_recording_that_plays(world, tmp_path):
     assert sum(told(tmp_path / "again.json")["estimates"].values()) >= 5
 
 
-def test_minutes_of_tracking_leave_memory_as_it_was(world):
-    """The hour is `make soak`."""
-    soak = Path(__file__).parents[1] / "bench" / "soak.py"
-    sinks = ["openigtlink:0", "viewer:0"]
-    options = ["--minutes", "1.6", "--fps", "15", "--error", "6", "--sinks", *sinks]
-    done = subprocess.run(
-        [sys.executable, str(soak), str(world.model), str(world.case), *options],
-        capture_output=True,
-        text=True,
-        env=environment(),
-        timeout=300,
-    )
-    assert done.returncode == 0, done.stdout + done.stderr
-    assert "after a minute" in done.stdout
-
-
 def test_a_robot_gets_its_own_frame(world, tmp_path):
     turn = np.diag([1.0, -1.0, -1.0, 1.0])
     turn[:3, 3] = [0.4, 0.1, 0.7]
@@ -166,7 +149,7 @@ def test_a_robot_gets_its_own_frame(world, tmp_path):
         "--frame",
         calibration,
         "--seconds",
-        4,
+        2,
         "--report",
         report,
     )

@@ -32,6 +32,7 @@ from tumortrack.learn.schedule import learning_rate, settle_end
 from tumortrack.learn.state import Diverged, TrainingState
 from tumortrack.learn.train import Run, train
 from tumortrack.learn.work import work_folder
+from warp_objects import train_slim
 
 
 @pytest.fixture
@@ -39,13 +40,13 @@ def case(phantom_case: Path) -> Path:
     return phantom_case
 
 
-@pytest.mark.parametrize("preset", ["quick", "clinic"])
-def test_a_killed_run_ends_with_the_weights_of_one_that_was_not(case, preset, tmp_path, request):
-    """Killed at once when its first checkpoint is there, long before its end."""
-    model = tmp_path / "killed"
-    command = [*train_command(case, model, preset), "--checkpoint-every", 0]
+def kill_at_first_checkpoint(command: list[object], model: Path) -> None:
+    """Long before its end."""
     with subprocess.Popen(
-        [*COMMAND, *map(str, command)], stdout=subprocess.DEVNULL, env=environment()
+        [str(word) for word in command],
+        stdout=subprocess.DEVNULL,
+        env=environment(),
+        cwd=Path(__file__).parent,  # for what this folder's files import from each other
     ) as process:
         checkpoint = model / "training" / "checkpoint.safetensors"
         deadline = time.monotonic() + 300
@@ -54,12 +55,28 @@ def test_a_killed_run_ends_with_the_weights_of_one_that_was_not(case, preset, tm
         process.send_signal(signal.SIGKILL)
     assert checkpoint.exists()
     assert not (model / "manifest.json").exists(), "the run ended before it was killed"
+
+
+def same_files(model: Path, other: Path, *names: str) -> bool:
+    return all((model / name).read_bytes() == (other / name).read_bytes() for name in names)
+
+
+def test_a_killed_run_ends_with_the_weights_of_one_that_was_not(case, quick_model, tmp_path):
+    model = tmp_path / "killed"
+    command = train_command(case, model)
+    kill_at_first_checkpoint([*COMMAND, *command, "--checkpoint-every", 0], model)
     assert "has not ended" in refusal(tumortrack("locate", model, "cloud.ply", model / "out"))
-    succeeded(tumortrack(*train_command(case, model, preset)))
-    weights = (model / "weights.safetensors").read_bytes()
-    uninterrupted: Path = request.getfixturevalue(f"{preset}_model")
-    assert weights == (uninterrupted / "weights.safetensors").read_bytes()
-    assert (model / "shape.safetensors").exists() == (preset == "clinic")
+    succeeded(tumortrack(*command))
+    assert same_files(model, quick_model, "weights.safetensors")
+    assert not (model / "shape.safetensors").exists()
+
+
+def test_a_killed_warp_ends_with_the_weights_and_shape_of_one_that_was_not(slim_model, tmp_path):
+    model = tmp_path / "killed"
+    train = "import sys, pathlib, warp_objects as w; w.train_slim(pathlib.Path(sys.argv[1]), 0.0)"
+    kill_at_first_checkpoint([sys.executable, "-c", train, model], model)
+    train_slim(model)
+    assert same_files(model, slim_model, "weights.safetensors", "shape.safetensors")
 
 
 def test_ctrl_c_keeps_the_state_and_says_how_to_go_on(case, tmp_path):

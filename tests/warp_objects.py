@@ -62,7 +62,7 @@ def slim_clinic() -> TrainConfig:
     )
 
 
-def train_slim(folder: Path) -> None:
+def train_slim(folder: Path, checkpoint_every_s: float = 30.0) -> None:
     """Write a model folder of the slim clinic."""
-    run = Run(ANATOMY, UP, "no digest", slim_clinic(), steps=80, workers=0, device="cpu")
-    train(run, folder, lambda _: None)
+    setting = {"steps": 80, "workers": 0, "device": "cpu", "checkpoint_every_s": checkpoint_every_s}
+    train(Run(ANATOMY, UP, "no digest", slim_clinic(), **setting), folder, lambda _: None)
