@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import Literal
 
 import numpy as np
@@ -38,14 +39,21 @@ def sample_pose(
     if config.rotations == "full":
         rotation = Rotation.random(rng=rng).as_matrix()
     else:
-        facing = rotation_onto(np.array(up_lps), np.array([0.0, 0.0, -1.0]))
         spin = rng.uniform(0, 360)
         tilt_x, tilt_y = rng.uniform(-config.tilt_deg, config.tilt_deg, 2)
         turn = Rotation.from_euler("zyx", [spin, tilt_y, tilt_x], degrees=True)
-        rotation = turn.as_matrix() @ facing
+        rotation = turn.as_matrix() @ _facing(up_lps)
     rotated = rotation @ organ_ct.vertices_mm.T  # (3, v): extremes along rows are fast
     lower, upper = rotated.min(1), rotated.max(1)
     offset = rng.uniform(-config.sideways_mm, config.sideways_mm, 2)
     nearest = rng.uniform(*nearest_mm)
     centre = (lower + upper) / 2
     return rigid(rotation, np.array([*(offset - centre[:2]), nearest - lower[2]]))
+
+
+@lru_cache(maxsize=64)
+def _facing(up_lps: tuple[float, float, float]) -> Float64[np.ndarray, "3 3"]:
+    """The organ's upper side towards the camera."""
+    turn = rotation_onto(np.array(up_lps), np.array([0.0, 0.0, -1.0]))
+    turn.flags.writeable = False
+    return turn
