@@ -215,7 +215,7 @@ def _voxels(
     for part, margin in enumerate(margins):
         largest = np.full(classes, -LARGEST_MARGIN, np.float16)
         largest[part + 1 if part else slice(1, None)] = LARGEST_MARGIN
-        np.take(largest, labels, out=margin)
+        np.take(largest, labels, out=margin, mode="clip")  # "raise" would copy
         for places, logits in ((flat, expected), (more, found)):
             margin.reshape(-1)[places] = margins_of(torch.from_numpy(logits))[:, part]
     return margins, labels

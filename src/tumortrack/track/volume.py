@@ -112,17 +112,16 @@ def drop_islands(
     the voxels next to it does."""
     if np.array_equal(found, kept):
         return cloud
-    from scipy import ndimage
-
     index_from_camera = np.linalg.inv(camera_from_index)
     index = np.rint(transform_points(index_from_camera, cloud.points_mm.astype(np.float64)))
-    voxel = tuple(np.clip(index.astype(int), 0, np.array(kept.shape) - 1).T)
-    near = np.ones((3, 3, 3), bool)
     labels = cloud.labels.copy()
-    for label in np.unique(labels[labels >= FIRST_TUMOR]):
-        piece = ndimage.binary_dilation(kept == label, near)
-        labels[(labels == label) & ~piece[voxel]] = ORGAN
-    stays = ndimage.binary_dilation(kept > 0, near)[voxel]
+    same, stays = np.zeros(len(labels), bool), np.zeros(len(labels), bool)
+    for off in np.ndindex(3, 3, 3):
+        voxel = np.clip(index.astype(int) + off - 1, 0, np.array(kept.shape) - 1)
+        beside = kept[tuple(voxel.T)]
+        same |= beside == labels
+        stays |= beside > 0
+    labels[(labels >= FIRST_TUMOR) & ~same] = ORGAN
     points, probability = cloud.points_mm[stays], cloud.probability[stays]
     return OccupancyCloud(points, labels[stays], probability, cloud.stamp_ns)
 
@@ -130,10 +129,24 @@ def drop_islands(
 def _largest_piece(mask: Bool[np.ndarray, "i j k"]) -> Bool[np.ndarray, "i j k"]:
     from scipy import ndimage
 
-    pieces, count = ndimage.label(mask)
+    box = _box_of(mask)
+    pieces, count = ndimage.label(mask[box])
     if count < 2:
         return mask
-    return pieces == 1 + int(np.argmax(np.bincount(pieces.ravel())[1:]))
+    largest = np.zeros_like(mask)
+    largest[box] = pieces == 1 + int(np.argmax(np.bincount(pieces.ravel())[1:]))
+    return largest
+
+
+def _box_of(mask: Bool[np.ndarray, "i j k"], margin: int = 0) -> tuple[slice, ...]:
+    """Where a mask is true, and ``margin`` voxels more on each side."""
+    box = []
+    for axis in range(3):
+        across = tuple(other for other in range(3) if other != axis)
+        found = np.flatnonzero(mask.any(axis=across))
+        first, last = (int(found[0]), int(found[-1]) + 1) if len(found) else (0, 0)
+        box.append(slice(max(first - margin, 0), last + margin))
+    return tuple(box)
 
 
 def part_surfaces(
@@ -149,7 +162,7 @@ def part_surfaces(
         if not mask.any():
             continue
         # One voxel more on each side: the surface lies between voxels of either sign.
-        box = tuple(slice(max(int(i.min()) - 1, 0), int(i.max()) + 2) for i in np.nonzero(mask))
+        box = _box_of(mask, 1)
         field = np.where(mask[box], margins[n][box], -np.abs(margins[n][box]))
         meshes[name] = _surface(field.astype(np.float32), camera_from_index, box)
     return meshes
