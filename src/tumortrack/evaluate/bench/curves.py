@@ -37,7 +37,7 @@ def points(subject: Subject, curve: str) -> Iterator[Point]:
 
 def _measured(curve: str, what: str, size: int, call: Call) -> Point:
     before = forget_peak()
-    (timing,) = in_turns(call, budget_s=_BUDGET_S)
+    (timing,) = in_turns(call, budget_s=_BUDGET_S, fewest=1)
     peak = peak_bytes() if before is not None else None
     return Point(
         curve=curve,

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
-from tumortrack.evaluate.bench.asked import IN_ONE_PIECE, LABELLING, NAIVE, asked_of
+from tumortrack.evaluate.bench.asked import IN_ONE_PIECE, LABELLING, NAIVE, Asked, asked_of
 from tumortrack.evaluate.bench.counts import module_flops, weight_bytes
 from tumortrack.evaluate.bench.row import Row, Work
 from tumortrack.evaluate.bench.turns import in_turns
@@ -69,37 +69,36 @@ def _clinic_encoder(subject: Subject, threads: int, budget_s: float) -> Row:
 
 def decoder_rows(subject: Subject, threads: int, budget_s: float) -> Iterator[Row]:
     """Labels of 1,000 to 400,000 queries, the cloud being encoded."""
-    import torch
-
+    share = budget_s / len(LABELLING) / len(DECODED)
     for preset in LABELLING:
         asked = asked_of(subject, preset)
-        latent = asked.inference.encode(asked.points_mm)
-        with torch.inference_mode():
-            encoded = asked.plain.encode(asked.cloud)
         for count in DECODED:
-            queries = asked.queries(count)
-            piece = torch.from_numpy(queries[:IN_ONE_PIECE])[None]
+            yield _decoded(asked, preset, count, threads, share)
 
-            @torch.inference_mode()
-            def naive(asked=asked, encoded=encoded, piece=piece) -> None:  # type: ignore[no-untyped-def]
-                asked.plain.logits(encoded, piece).argmax(-1)
 
-            def ours(asked=asked, latent=latent, queries=queries) -> None:  # type: ignore[no-untyped-def]
-                asked.inference.logits(latent, queries).argmax(-1)
+def _decoded(asked: Asked, preset: str, count: int, threads: int, budget_s: float) -> Row:
+    import torch
 
-            share = budget_s / len(LABELLING) / len(DECODED)
-            ours_s, naive_s = in_turns(ours, naive, budget_s=share)
-            scaled = count / piece.shape[1]
-            yield Row(
-                name=DECODER,
-                what=f"{preset}, {count:,} queries",
-                threads=threads,
-                item="decoding",
-                ours=ours_s,
-                naive=naive_s.times(scaled),
-                naive_is=NAIVE,
-                work=asked.decoder_work(count),
-                naive_work=asked.naive_decoder_work(count),
-                agreement=asked.agreement(queries[:IN_ONE_PIECE]),
-                note="" if scaled == 1 else f"naive: measured on {IN_ONE_PIECE:,}, scaled",
-            )
+    latent, queries = asked.inference.encode(asked.points_mm), asked.queries(count)
+    piece = torch.from_numpy(queries[:IN_ONE_PIECE])[None]
+    scaled = count / piece.shape[1]
+    with torch.inference_mode():
+        encoded = asked.plain.encode(asked.cloud)
+        ours, naive = in_turns(
+            lambda: asked.inference.logits(latent, queries).argmax(-1),
+            lambda: asked.plain.logits(encoded, piece).argmax(-1),
+            budget_s=budget_s,
+        )
+    return Row(
+        name=DECODER,
+        what=f"{preset}, {count:,} queries",
+        threads=threads,
+        item="decoding",
+        ours=ours,
+        naive=naive.times(scaled),
+        naive_is=NAIVE,
+        work=asked.decoder_work(count),
+        naive_work=asked.naive_decoder_work(count),
+        agreement=asked.agreement(queries[:IN_ONE_PIECE]),
+        note="" if scaled == 1 else f"naive: measured on {IN_ONE_PIECE:,}, scaled",
+    )

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 UP = (0.0, -1.0, 0.0)
 SEED = 0
 PRESETS = ("clinic", "quick", "paper")
-STEPS = {"clinic": 240, "quick": 500, "paper": 150}  # about a minute on two cores each
+STEPS = {"clinic": 240, "quick": 500, "paper": 300}  # about a minute on two cores each
 _VALIDATED = 16  # scenes
 _VOXEL_MM = 1.5  # of the phantom
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 import subprocess
+import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
@@ -94,25 +95,25 @@ def listen(command: Sequence[str], task: Task) -> Iterator[Said]:
     """
     threads = str(task.threads)
     limits = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"), threads)
-    process = subprocess.Popen(
-        [*command, msgspec.json.encode(task).decode()],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        env={**os.environ, **limits},
-    )
-    assert process.stdout is not None
-    assert process.stderr is not None
-    try:
-        for line in process.stdout:
-            if line.startswith("{"):
-                yield from_builtins(msgspec.json.decode(line), Said, "a process of the bench")
-        words = process.stderr.read().strip().splitlines()[-1:] or ["nothing was said"]
-    finally:
-        process.kill()
-        code = process.wait()
+    command = [*command, msgspec.json.encode(task).decode()]
+    with tempfile.TemporaryFile("w+") as words:  # no pipe: one that nobody reads may fill
+        process = subprocess.Popen(
+            command, stdout=subprocess.PIPE, stderr=words, text=True, env={**os.environ, **limits}
+        )
+        assert process.stdout is not None
+        try:
+            for line in process.stdout:
+                if line.startswith("{"):
+                    yield from_builtins(msgspec.json.decode(line), Said, "a process of the bench")
+        except BaseException:  # whoever listens has gone, or was interrupted
+            process.kill()
+            raise
+        finally:
+            code = process.wait()
+        words.seek(0)
+        last = words.read().strip().splitlines()[-1:] or ["nothing was said"]
     if code != 0:
-        raise TumortrackError(f"measuring failed: {words[0]}")
+        raise TumortrackError(f"measuring failed: {last[0]}")
 
 
 def keep_to_cores(count: int) -> None:

@@ -13,6 +13,7 @@ from tumortrack.core.config import Config
 
 _FEWEST, _MOST = 3, 25  # rounds
 _LEAST_S = 0.01  # that a turn lasts: shorter calls are repeated within it
+_LONG_S = 0.5  # a first call that takes longer is warm enough
 
 
 @dataclass(frozen=True)
@@ -45,15 +46,15 @@ class Timing(Config, frozen=True):
         )
 
 
-def in_turns(*versions: Call, budget_s: float) -> list[Timing]:
+def in_turns(*versions: Call, budget_s: float, fewest: int = _FEWEST) -> list[Timing]:
     """Seconds a call of each version. Every version is called once before (compiled, cached, warm);
-    then all take turns until ``budget_s`` is spent, between 3 and 25 times each."""
+    then all take turns until ``budget_s`` is spent, between ``fewest`` and 25 times each."""
     repeats = [_repeats(version) for version in versions]
     seconds: list[list[float]] = [[] for _ in versions]
     begun = time.perf_counter()
     for done in range(_MOST):
         past_s = time.perf_counter() - begun
-        if done >= _FEWEST and past_s * (done + 1) / done > budget_s:
+        if done >= fewest and past_s * (done + 1) / done > budget_s:
             break
         for times, version, repeat in zip(seconds, versions, repeats, strict=True):
             start, uncounted = time.perf_counter(), 0.0
@@ -71,7 +72,10 @@ def timing_of(seconds: list[float]) -> Timing:
 
 
 def _repeats(version: Call) -> int:
-    version()
-    start = time.perf_counter()
-    version()
-    return max(1, math.ceil(_LEAST_S / max(time.perf_counter() - start, 1e-7)))
+    for _ in range(2):
+        start = time.perf_counter()
+        version()
+        took_s = time.perf_counter() - start
+        if took_s > _LONG_S:
+            break
+    return max(1, math.ceil(_LEAST_S / max(took_s, 1e-7)))

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 NAME = "400^3 labels"
 GRID = 400
-_SLAB = 32_768  # voxels that the naive form is asked for
+_SLAB = 16_384  # voxels that the naive form is asked for
 Grid = tuple[np.ndarray, tuple[int, int, int]]  # camera_from_index, shape
 
 
