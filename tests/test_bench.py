@@ -1,24 +1,32 @@
 """The bench: figures that follow from their definitions, naive forms that give the same answers."""
 
 import json
+import sys
 import time
+from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 import torch
 
 from stories import tumortrack
-from tumortrack.app.benching import BenchOptions, bench
-from tumortrack.core.errors import InputError
+from tumortrack.app import benching
+from tumortrack.app.benching import BenchOptions
+from tumortrack.core.errors import InputError, TumortrackError
+from tumortrack.core.types import Anatomy, Mesh
 from tumortrack.evaluate.bench.counts import module_flops
 from tumortrack.evaluate.bench.goals import GOALS, goals_table
 from tumortrack.evaluate.bench.growth import draw_growth
 from tumortrack.evaluate.bench.memory import forget_peak, peak_bytes
 from tumortrack.evaluate.bench.naive.occupancy import NaiveOccupancy
 from tumortrack.evaluate.bench.naive.scenes import flowed
+from tumortrack.evaluate.bench.plan import Wish, tasks_of
 from tumortrack.evaluate.bench.report import BLOCKS, write_bench
 from tumortrack.evaluate.bench.row import Bench, Peaks, Point, Row, Work
+from tumortrack.evaluate.bench.subject import Subject
 from tumortrack.evaluate.bench.suite import GROUPS
+from tumortrack.evaluate.bench.tasks import Task, carry_out
 from tumortrack.evaluate.bench.turns import Timing, Uncounted, in_turns, timing_of
 from tumortrack.evaluate.study.markdown import closing, opening
 from tumortrack.learn.decoders.mlp import MlpDecoderConfig
@@ -188,33 +196,97 @@ def test_a_document_is_filled_and_the_rest_of_it_stays(tmp_path) -> None:
     draw_growth(some_bench().points[:4], tmp_path / "one.png")  # a single curve is a picture too
 
 
-def test_a_part_measured_by_the_command(tmp_path, monkeypatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    bench(BenchOptions(only=("generator",), quick=True, out=tmp_path / "found.json"))
-    found = json.loads((tmp_path / "found.json").read_text())
-    (row,) = found["rows"]
-    ours, naive = row["ours"], row["naive"]
-    assert 1e-4 < ours["median_s"] < naive["median_s"]
-    assert ours["best_s"] <= ours["low_s"] <= ours["median_s"] <= ours["high_s"]
-    assert row["work"]["flops"] > 1e6
-    assert row["work"]["bytes"] > 1e5
-    (peaks,) = found["peaks"]
-    assert peaks["triad"] > 1e9
-    assert peaks["gemm"]["fp32"] > 1e9
-    assert found["machine"]["date"]
-    assert found["command"] == "tumortrack bench --only generator --quick"
-    assert not (tmp_path / "runs").exists()  # drags need no model
+def small_subject(folder: Path) -> Subject:
+    """The bench's subject with a ball and a tumor in place of the phantom."""
+    import trimesh
+
+    def ball(radius_mm: float, x_mm: float) -> Mesh:
+        sphere = trimesh.creation.icosphere(2, radius_mm)
+        return Mesh(sphere.vertices + [x_mm, 0, 0], sphere.faces)
+
+    subject = Subject({}, folder)
+    subject.__dict__["anatomy"] = Anatomy((ball(30.0, 0.0), ball(8.0, 10.0)))
+    return subject
+
+
+def test_a_process_measures_a_part(tmp_path) -> None:
+    task = Task(threads=1, folder=str(tmp_path), describe=True, peaks=True, quick=True)
+    task = msgspec.structs.replace(task, groups=("generator",))
+    said = list(carry_out(task, small_subject(tmp_path)))
+    (row,) = [one.row for one in said if one.row is not None]
+    ours, naive = row.ours, row.naive
+    assert naive is not None
+    assert 1e-5 < ours.best_s <= ours.low_s <= ours.median_s <= ours.high_s
+    assert ours.median_s < naive.median_s
+    assert row.ratio == naive.median_s / ours.median_s
+    assert row.per_s == 1 / ours.median_s
+    assert row.work is not None
+    # 18 drags of 2,000 points and 162 vertices, 640 triangles' front half, a quarter of the image.
+    by_hand = 16 * 18 * 2162 + 60 * 160 + 2 * 20 * 424 * 240 / 4
+    assert row.work.flops == by_hand
+    (peaks,) = [one.peaks for one in said if one.peaks is not None]
+    assert peaks.triad > 1e9
+    assert peaks.gemm["fp32"] > 1e9
+    (machine,) = [one.machine for one in said if one.machine is not None]
+    assert int(machine["cores"]) >= 1
+    assert [one.begins for one in said if one.begins] == [
+        "the machine's own rates, one core",
+        "generator, one core",
+    ]
+
+
+WORKER = """
+import json, os, sys
+task = json.loads(sys.argv[-1])
+assert os.environ["OMP_NUM_THREADS"] == str(task["threads"])
+print("a library's chatter")
+print(json.dumps({"begins": "something"}))
+if task["describe"]:
+    print(json.dumps({"machine": {"date": "today"}}))
+for group in task["groups"]:
+    time = dict(best_s=1.0, median_s=2.0, low_s=1.5, high_s=3.0, turns=3)
+    print(json.dumps({"row": dict(name=group, what="", threads=1, item="pair", ours=time)}))
+if "encoder" in task["groups"]:
+    sys.exit("the encoder is broken")
+"""
+
+
+def test_the_command_gathers_what_processes_find(tmp_path, monkeypatch, capfd) -> None:
+    monkeypatch.setattr(benching, "_WORKER", [sys.executable, "-c", WORKER])
+    out = tmp_path / "new" / "found.json"
+    benching.bench(BenchOptions(only=("generator", "planning"), quick=True, out=out))
+    found = json.loads(out.read_text())
+    assert [row["name"] for row in found["rows"]] == ["generator", "planning"]
+    assert found["machine"] == {"date": "today"}
+    assert found["command"] == "tumortrack bench --only generator planning --quick"
+    assert "2.00 s" in capfd.readouterr().out
+    with pytest.raises(TumortrackError, match="the encoder is broken"):
+        benching.bench(BenchOptions(only=("encoder",), out=tmp_path / "none.json"))
+    assert not (tmp_path / "none.json").exists()
+
+
+def test_each_process_has_its_own_threads_and_only_needed_models_are_trained(tmp_path) -> None:
+    wish = Wish(("generator", "frame", "tracking"), ("grid",), False, tmp_path)
+    first, one, two, *curves = tasks_of(wish, cores=4)
+    assert (first.threads, first.train) == (2, ("clinic", "paper", "quick"))
+    assert first.describe
+    assert (one.threads, one.groups) == (1, ("generator", "frame", "tracking"))
+    assert (two.threads, two.groups) == (2, ("frame", "tracking"))
+    assert [task.curve for task in curves] == [("grid", p) for p in ("clinic", "quick", "paper")]
+    (alone,) = tasks_of(Wish(("generator",), (), False, tmp_path), cores=1)
+    assert alone.describe
+    assert alone.train == ()
 
 
 def test_what_cannot_be_measured_is_refused(tmp_path) -> None:
     assert "nonsense" in tumortrack("bench", "--only", "nonsense").stderr
     with pytest.raises(InputError, match="belong together"):
-        bench(BenchOptions(model=tmp_path))
+        benching.bench(BenchOptions(model=tmp_path))
     with pytest.raises(InputError, match="cannot be read"):
-        bench(BenchOptions(document=tmp_path / "none.md"))
+        benching.bench(BenchOptions(document=tmp_path / "none.md"))
     (tmp_path / "bare.md").write_text("no markers")
     with pytest.raises(InputError, match="results:goals"):
-        bench(BenchOptions(document=tmp_path / "bare.md"))
+        benching.bench(BenchOptions(document=tmp_path / "bare.md"))
 
 
 def test_the_command_line_names_every_part() -> None:

@@ -44,7 +44,7 @@ def bench(options: BenchOptions) -> None:
         check_document(options.document)
     wish = Wish(
         groups=options.only or tuple(GROUPS),
-        curves=CURVES if options.curves else (),
+        curves=tuple(CURVES) if options.curves else (),
         quick=options.quick,
         folder=TRAINED,
         model=options.model,

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tumortrack.evaluate.bench.asked import LABELLING, asked_of
+from tumortrack.evaluate.bench.asked import asked_of
 from tumortrack.evaluate.bench.memory import forget_peak, peak_bytes
 from tumortrack.evaluate.bench.placing import Placing
 from tumortrack.evaluate.bench.row import Point
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from tumortrack.core.types import Anatomy
     from tumortrack.evaluate.bench.subject import Subject
 
-_QUERIES = (1000, 4000, 16_000, 64_000, 256_000, 1_000_000)
+_QUERIES = (1000, 10_000, 100_000, 1_000_000)
 _POINTS = (250, 500, 1000, 2000, 4000, 8000)
 _TUMORS = (1, 2, 4, 8)
 _GRIDS = (64, 100, 160, 250, 400)
@@ -30,9 +30,9 @@ _SMALL = 0.3  # of the phantom's first tumor
 _BUDGET_S = 0.5
 
 
-def points(subject: Subject, curve: str) -> Iterator[Point]:
-    """The points of one curve."""
-    return CURVES[curve](subject)
+def points(subject: Subject, curve: str, preset: str) -> Iterator[Point]:
+    """The points of one curve of one preset; of ``tumors`` all that there are."""
+    return CURVES[curve](subject, preset)
 
 
 def _measured(curve: str, what: str, size: int, call: Call) -> Point:
@@ -49,42 +49,40 @@ def _measured(curve: str, what: str, size: int, call: Call) -> Point:
     )
 
 
-def _queries(subject: Subject) -> Iterator[Point]:
+def _queries(subject: Subject, preset: str) -> Iterator[Point]:
     """Labels of queries, the cloud being encoded or the organ placed."""
-    for preset in LABELLING:
-        asked = asked_of(subject, preset)
-        logits = partial(asked.inference.logits, asked.inference.encode(asked.points_mm))
+    if preset == "clinic":
+        placing = Placing(subject)
         for size in _QUERIES:
-            queries = asked.queries(size)
-            yield _measured("queries", preset, size, partial(_labels, logits, queries))
-    placing = Placing(subject)
+            yield _measured("queries", preset, size, partial(placing.labels, placing.places(size)))
+        return
+    asked = asked_of(subject, preset)
+    logits = partial(asked.inference.logits, asked.inference.encode(asked.points_mm))
     for size in _QUERIES:
-        call = partial(placing.labels, placing.places(size))
-        yield _measured("queries", "clinic", size, call)
+        yield _measured("queries", preset, size, partial(_labels, logits, asked.queries(size)))
 
 
 def _labels(logits, queries: np.ndarray) -> None:  # type: ignore[no-untyped-def]
     logits(queries).argmax(-1)
 
 
-def _points(subject: Subject) -> Iterator[Point]:
+def _points(subject: Subject, preset: str) -> Iterator[Point]:
     """A cloud of so many points encoded."""
     from tumortrack.learn.warp.locate import first_motions
 
     cloud = subject.stage.cloud.points_mm
     rng = np.random.default_rng(SEED)
-    sizes = {size: cloud[rng.integers(len(cloud), size=size)] for size in _POINTS}
-    for preset in LABELLING:
-        inference = asked_of(subject, preset).inference
-        for size, seen in sizes.items():
-            yield _measured("points", preset, size, partial(inference.encode, seen))
-    model = subject.model("clinic")
-    for size, seen in sizes.items():
-        call = partial(first_motions, model.network, model.shape, seen)  # type: ignore[arg-type]
-        yield _measured("points", "clinic", size, call)
+    model = subject.model(preset)
+    for size in _POINTS:
+        seen = cloud[rng.integers(len(cloud), size=size)]
+        if preset == "clinic":
+            call: Call = partial(first_motions, model.network, model.shape, seen)  # type: ignore[arg-type]
+        else:
+            call = partial(asked_of(subject, preset).inference.encode, seen)
+        yield _measured("points", preset, size, call)
 
 
-def _tumors(subject: Subject) -> Iterator[Point]:
+def _tumors(subject: Subject, _: str) -> Iterator[Point]:
     """An organ with so many tumors: a training pair, a labelled volume, labels of queries by an
     untrained network of so many classes (which takes as long as a trained one)."""
     import torch
@@ -126,7 +124,7 @@ def with_tumors(anatomy: Anatomy, count: int) -> Anatomy:
     return Anatomy((organ, *(tumor.moved(small + place) for place in inside[:count])))
 
 
-def _grids(subject: Subject) -> Iterator[Point]:
+def _grids(subject: Subject, preset: str) -> Iterator[Point]:
     """The labelled volume."""
     from tumortrack.core.types import Anatomy
     from tumortrack.evaluate.bench.volume import organ_grid
@@ -134,20 +132,21 @@ def _grids(subject: Subject) -> Iterator[Point]:
     from tumortrack.track.sparse import sparse_margins
     from tumortrack.track.volume import grid_over
 
-    for preset in LABELLING:
-        asked = asked_of(subject, preset)
-        latent = asked.inference.encode(asked.points_mm)
-        logits = partial(asked.inference.logits, latent)
+    if preset == "clinic":
+        anatomy = Anatomy(tuple(Placing(subject).estimate.meshes.values()))
         for size in _GRIDS:
-            call = partial(sparse_margins, logits, *organ_grid(asked, latent, size))
-            yield _measured("grid", preset, size, call)
-    anatomy = Anatomy(tuple(Placing(subject).estimate.meshes.values()))
+            filled = partial(label_grid, anatomy, *grid_over(anatomy.organ.vertices_mm, size))
+            yield _measured("grid", preset, size, filled)
+        return
+    asked = asked_of(subject, preset)
+    latent = asked.inference.encode(asked.points_mm)
+    logits = partial(asked.inference.logits, latent)
     for size in _GRIDS:
-        filled = partial(label_grid, anatomy, *grid_over(anatomy.organ.vertices_mm, size))
-        yield _measured("grid", "clinic", size, filled)
+        call = partial(sparse_margins, logits, *organ_grid(asked, latent, size))
+        yield _measured("grid", preset, size, call)
 
 
-def _batches(subject: Subject) -> Iterator[Point]:
+def _batches(subject: Subject, preset: str) -> Iterator[Point]:
     """One training step of so many samples."""
     import torch
 
@@ -156,17 +155,16 @@ def _batches(subject: Subject) -> Iterator[Point]:
     from tumortrack.learn.state import TrainingState
 
     keep_freed_memory()
-    for preset in subject.presets:
-        for size in _BATCHES:
-            if preset == "paper" and size > _MOST_PAPER:
-                continue
-            run, batches, teach = material(subject, preset, size, batches=1)
-            state = TrainingState(run, torch.device("cpu"))
-            teach(state)
-            yield _measured("batch", preset, size, partial(state.step, batches[0]))
+    for size in _BATCHES:
+        if preset == "paper" and size > _MOST_PAPER:
+            return
+        run, batches, teach = material(subject, preset, size, batches=1)
+        state = TrainingState(run, torch.device("cpu"))
+        teach(state)
+        yield _measured("batch", preset, size, partial(state.step, batches[0]))
 
 
-CURVES: dict[str, Callable[[Subject], Iterator[Point]]] = {
+CURVES: dict[str, Callable[[Subject, str], Iterator[Point]]] = {
     "queries": _queries,
     "points": _points,
     "tumors": _tumors,

@@ -58,7 +58,17 @@ def _lines(axes: Axes, points: Sequence[Point], values: list[float]) -> None:
         color, marker = _STYLES[name.replace(",", " ").split()[0]]
         chosen = [(p.size, v) for p, v in zip(points, values, strict=True) if p.what == name]
         axes.plot(*zip(*chosen, strict=True), color=color, marker=marker, label=name, linewidth=1.5)
+    sizes = sorted({point.size for point in points})
     if points[0].curve != _LINEAR:
         axes.set_xscale("log")
+    axes.set_xticks(sizes, [_short(size) for size in sizes])
+    axes.minorticks_off()
     axes.grid(alpha=0.25)
     axes.tick_params(labelsize=8)
+
+
+def _short(size: int) -> str:
+    for unit, name in ((10**6, "M"), (10**3, "k")):
+        if size >= unit:
+            return f"{size / unit:g}{name}"
+    return str(size)

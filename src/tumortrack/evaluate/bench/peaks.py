@@ -7,7 +7,7 @@ from collections.abc import Callable
 from tumortrack.evaluate.bench.row import Peaks
 from tumortrack.evaluate.bench.turns import in_turns
 
-_SIZE = 1536  # of the square matrices
+_SIZE = 1024  # of the square matrices
 _LONG = 2**24  # floats in each of the triad's three arrays (64 MB: far more than any cache)
 
 

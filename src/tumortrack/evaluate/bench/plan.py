@@ -9,11 +9,19 @@ from pathlib import Path
 import msgspec
 
 from tumortrack.evaluate.bench.row import Bench, Peaks, Point, Row
-from tumortrack.evaluate.bench.suite import GROUPS
+from tumortrack.evaluate.bench.subject import PRESETS
+from tumortrack.evaluate.bench.suite import ALL, GROUPS
 from tumortrack.evaluate.bench.tasks import Said, Task, listen
 from tumortrack.learn.cores import available_cores
 
-CURVES = ("queries", "points", "tumors", "grid", "batch")
+# Curves, and of which presets: each in a process of its own, whose memory so is its own.
+CURVES = {
+    "queries": PRESETS,
+    "points": PRESETS,
+    "tumors": ("clinic",),
+    "grid": PRESETS,
+    "batch": PRESETS,
+}
 
 
 @dataclass(frozen=True)
@@ -40,14 +48,14 @@ def tasks_of(wish: Wish, cores: int) -> list[Task]:
     groups = {name: GROUPS[name] for name in wish.groups}
     needed = {preset for group in groups.values() for preset in group.needs}
     if wish.curves:
-        needed |= {"clinic", "quick", "paper"}
+        needed |= set(ALL)
     train = () if wish.model is not None else tuple(sorted(needed))
     tasks = [task(min(cores, 2), train=train)] if train else []
     for threads in (1, 2):
         mine = tuple(name for name, group in groups.items() if threads in group.threads)
         if mine and threads <= cores:
             tasks.append(task(threads, peaks=True, groups=mine))
-    tasks += [task(1, curves=(curve,)) for curve in wish.curves]
+    tasks += [task(1, curve=(curve, of)) for curve in wish.curves for of in CURVES[curve]]
     return [msgspec.structs.replace(tasks[0], describe=True), *tasks[1:]]
 
 

@@ -22,7 +22,7 @@ from tumortrack.evaluate.bench.subject import ConfigOf, Given, Subject
 
 class Task(Config, frozen=True):
     """What one process does: describe the machine, train these presets, measure the machine's
-    peaks, these groups of rows, these curves, in that order. ``folder``: of trained models;
+    peaks, these groups of rows, this curve, in that order. ``folder``: of trained models;
     ``model`` and ``cloud``: a user's own."""
 
     threads: int
@@ -33,7 +33,7 @@ class Task(Config, frozen=True):
     train: tuple[str, ...] = ()
     peaks: bool = False
     groups: tuple[str, ...] = ()
-    curves: tuple[str, ...] = ()
+    curve: tuple[str, str] | None = None  # which, and of which preset
     quick: bool = False
 
 
@@ -78,13 +78,12 @@ def carry_out(task: Task, subject: Subject) -> Iterator[Said]:
             yield Said(begins=f"{name}, {_threads(task)}")
             for row in group.rows(subject, task.threads, group.budget_s(task.quick)):
                 yield Said(row=row)
-    if task.curves:
+    if task.curve is not None:
         from tumortrack.evaluate.bench.curves import points
 
-        for curve in task.curves:
-            yield Said(begins=f"growth with {curve}")
-            for point in points(subject, curve):
-                yield Said(point=point)
+        yield Said(begins=f"growth with {task.curve[0]}, {task.curve[1]}")
+        for point in points(subject, *task.curve):
+            yield Said(point=point)
 
 
 def listen(command: Sequence[str], task: Task) -> Iterator[Said]:

@@ -13,6 +13,7 @@ from tumortrack.core.config import Config
 
 _FEWEST, _MOST = 3, 25  # rounds
 _LEAST_S = 0.01  # that a turn lasts: shorter calls are repeated within it
+_PATIENCE = 2.0  # times the budget that the fewest turns may take
 _LONG_S = 0.5  # a first call that takes longer is warm enough
 
 
@@ -48,13 +49,16 @@ class Timing(Config, frozen=True):
 
 def in_turns(*versions: Call, budget_s: float, fewest: int = _FEWEST) -> list[Timing]:
     """Seconds a call of each version. Every version is called once before (compiled, cached, warm);
-    then all take turns until ``budget_s`` is spent, between ``fewest`` and 25 times each."""
+    then all take turns until ``budget_s`` is spent, between ``fewest`` and 25 times each; fewer only
+    where that would take more than twice as long."""
     repeats = [_repeats(version) for version in versions]
     seconds: list[list[float]] = [[] for _ in versions]
     begun = time.perf_counter()
     for done in range(_MOST):
         past_s = time.perf_counter() - begun
         if done >= fewest and past_s * (done + 1) / done > budget_s:
+            break
+        if done and past_s > _PATIENCE * budget_s:
             break
         for times, version, repeat in zip(seconds, versions, repeats, strict=True):
             start, uncounted = time.perf_counter(), 0.0
