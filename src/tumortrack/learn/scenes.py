@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Generator, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, replace
-from itertools import groupby
+from dataclasses import dataclass
+from itertools import islice
 from typing import Literal
 
 import torch
@@ -66,8 +66,8 @@ class _Plans(Dataset[Plan]):
     def __init__(self, stream: DeviceStream) -> None:
         self._stream = stream
 
-    def __getitem__(self, index: int) -> Plan:
-        return self._stream.plan(index)
+    def __getitem__(self, indices: tuple[int, ...]) -> Plan:
+        return self._stream.plan(*indices)
 
 
 def batches_on(
@@ -82,29 +82,26 @@ def batches_on(
     a device's work costs its start, however many scenes it is for. Workers plan ahead, some kB a
     scene, and a thread draws the next clouds' pixels while the batches before are learnt from."""
     size = stream.batch_size
-    n = max(1, at_once // size)
-    several = DeviceStream(replace(stream, batch_size=n * size), device)
+    on_device = DeviceStream(stream, device)
 
-    def grouped() -> Iterator[tuple[int, Iterator[int]]]:
-        return groupby((s % period if period else s for s in steps), lambda index: index // n)
+    def groups() -> Iterator[tuple[int, ...]]:
+        indices = (step % period if period else step for step in steps)
+        while group := tuple(islice(indices, max(1, at_once // size))):
+            yield group
 
     plans = DataLoader(
-        _Plans(several),
+        _Plans(on_device),
         batch_size=None,
-        sampler=(group for group, _ in grouped()),
+        sampler=groups(),
         num_workers=workers,
         multiprocessing_context="spawn" if workers else None,
         prefetch_factor=1 if workers else None,
         worker_init_fn=quiet_worker,
     )
     with ThreadPoolExecutor(1) as thread:
-        made = _finished(several, plans, thread)
-        for _, indices in grouped():
-            batch = next(made)
-            for index in indices:
-                first = index % n * size
-                clouds, points, labels, poses = (part[first : first + size] for part in batch)
-                yield clouds, points, labels, poses
+        for parts in _finished(on_device, plans, thread):
+            clouds, points, labels, poses = (part.split(size) for part in parts)
+            yield from zip(clouds, points, labels, poses, strict=True)
 
 
 def _finished(

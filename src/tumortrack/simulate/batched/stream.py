@@ -91,12 +91,13 @@ class DeviceStream:
         pictured = self.pictured(self.plan(index))
         return self.finished(pictured, self.chosen(pictured))
 
-    def plan(self, index: int) -> Plan:
-        """What chance decides in the batch with this number, up to its pictures; no device
-        is needed."""
+    def plan(self, *indices: int) -> Plan:
+        """What chance decides in the batches with these numbers, up to their pictures; no device
+        is needed. Several are made together, their scenes one batch's after another's."""
         size, seed, name = self._stream.batch_size, self._stream.seed, self._stream.stream
-        recipes = [SceneRecipe(seed, name, i) for i in range(index * size, (index + 1) * size)]
-        return plan_scenes(self._simulator, recipes, [0] * size)
+        numbers = (index * size + row for index in indices for row in range(size))
+        recipes = [SceneRecipe(seed, name, number) for number in numbers]
+        return plan_scenes(self._simulator, recipes, [0] * len(recipes))
 
     @torch.no_grad()
     def pictured(self, plan: Plan) -> Pictured:
