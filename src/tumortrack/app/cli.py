@@ -495,6 +495,18 @@ def bench(
     run(BenchOptions(only, quick, curves, model, cloud, out, document))
 
 
+def compile(model: Positional[Path], /, *, device: Literal["auto", "cpu", "cuda"] = "auto") -> None:
+    """Make a model as fast as this machine allows, before the first frame.
+
+    Args:
+        model: folder that `train` wrote; what is found fastest is kept in MODEL/compiled.
+        device: auto takes CUDA where it is.
+    """
+    from tumortrack.app.compiling import compile_model
+
+    compile_model(model, device)
+
+
 def inspect(path: Positional[Path], /) -> None:
     """Say what a case, model, run, scene or report is.
 
@@ -527,6 +539,7 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "twin": twin,
     "evaluate": evaluate,
     "bench": bench,
+    "compile": compile,
     "inspect": inspect,
     "doctor": doctor,
 }

@@ -130,7 +130,7 @@ def locate(model_folder: Path, source: Path, out: Path, options: LocateOptions) 
     from tumortrack.track.tracker import Tracker
 
     model = load_model(model_folder, options.device)
-    tracker = Tracker(model)
+    tracker, notes = Tracker(model), (*notes, *model.notes)
     points = _near_organ(points, tracker.anatomy_ct, str(options.map_points))
     cloud = _observed(seen, model.config.scene.cloud, options)
     estimate = tracker.locate(cloud, options.grid, options.seed)
@@ -258,6 +258,8 @@ def evaluate(
         "seed": seed,
     }
     tracker = Tracker(model)
+    for note in model.notes:
+        say(f"note: {note}")
     with progress_bar("evaluate", len(folders)) as advance:
         result = evaluate_scenes(
             lambda cloud: tracker.locate(cloud, grid, seed),

@@ -89,12 +89,15 @@ def track(
     from tumortrack.track.tracker import Tracker
 
     model = load_model(model_folder, options.device)
+    for note in model.notes:
+        say(f"note: {note}")
     tracker = Tracker(model)
     config = _loop_config(model.config, tracker.anatomy_ct, options)
     setting = Setting(model.parts, frames, tracker.anatomy_ct, Controls(), arms is not None)
     loop = Loop(tracker, setting, config, None if arms is None else arms.companion)
     about = {
         "model": model.provenance,
+        "notes": list(model.notes),
         "model_sha256": store.sha256_of(model_folder / store.MANIFEST),
         "source": source,
         "sinks": list(sinks),

@@ -15,13 +15,12 @@ from safetensors.torch import load, save
 from tumortrack.core import store
 from tumortrack.core.config import Config, from_builtins, to_builtins
 from tumortrack.core.errors import ArtifactError, InputError
+from tumortrack.learn.compiled import Arithmetic, find
 from tumortrack.learn.config import TrainConfig
 from tumortrack.learn.fit import Familiar
-from tumortrack.learn.model_folder import KIND, SHAPE, read_model_manifest
+from tumortrack.learn.model_folder import KIND, SHAPE, WEIGHTS, read_model_manifest
 from tumortrack.learn.networks import Network, network_of
 from tumortrack.learn.warp.shape import Shape
-
-_WEIGHTS = "weights.safetensors"
 
 
 class Trust(Config, frozen=True):
@@ -39,6 +38,7 @@ class Model:
     ``query_box_mm``: where the organ can lie, relative to the median of the observed points,
     camera frame (lower and upper corner). ``familiar``: what tells its clouds from others.
     ``provenance``: seeds, steps, hashes. A warp also has the organ's ``shape``, and ``trust``.
+    ``arithmetic``: what `tumortrack compile` found fastest here; ``notes`` say what it did not.
     """
 
     network: Network
@@ -49,12 +49,14 @@ class Model:
     provenance: dict
     shape: Shape | None = None
     trust: Trust | None = None
+    arithmetic: Arithmetic | None = None
+    notes: tuple[str, ...] = ()
 
 
 def save_model(model: Model, folder: Path) -> None:
     """Write weights and manifest into an existing folder, the manifest last."""
     weights = {k: v.contiguous() for k, v in model.network.state_dict().items()}
-    store.write_atomically(folder / _WEIGHTS, save(weights))
+    store.write_atomically(folder / WEIGHTS, save(weights))
     if model.shape is not None:
         store.write_atomically(folder / SHAPE, save_arrays(model.shape.to_arrays()))
     content = {
@@ -81,7 +83,7 @@ def load_model(folder: Path, device: str = "auto") -> Model:
         parts = tuple(manifest["parts"])
         box = np.array(manifest["query_box_mm"], float).reshape(2, 3)
         network = network_of(config.network)
-        network.load_state_dict(load((folder / _WEIGHTS).read_bytes()))
+        network.load_state_dict(load((folder / WEIGHTS).read_bytes()))
         familiar = from_builtins(manifest["familiar"], Familiar, f"{folder}: familiar")
         provenance = dict(manifest["provenance"])
         shape, trust = None, None
@@ -96,8 +98,13 @@ def load_model(folder: Path, device: str = "auto") -> Model:
         raise ArtifactError(
             f"{folder} is not a whole model of this version: {error}. Train it again."
         ) from error
-    network.eval().requires_grad_(False).to(choose_device(device))
-    return Model(network, config, parts, box, familiar, provenance, shape, trust)
+    where = choose_device(device)
+    network.eval().requires_grad_(False).to(where)
+    arithmetic, note = None, None
+    if where.type == "cpu" and not config.network.warps:
+        arithmetic, note = find(folder, manifest["files"][WEIGHTS])
+    notes = () if note is None else (note,)
+    return Model(network, config, parts, box, familiar, provenance, shape, trust, arithmetic, notes)
 
 
 def choose_device(device: str) -> torch.device:

@@ -9,6 +9,7 @@ from tumortrack.core.errors import ArtifactError
 
 KIND = "model"
 SHAPE = "shape.safetensors"
+WEIGHTS = "weights.safetensors"
 
 
 def is_finished(folder: Path) -> bool:

@@ -117,10 +117,7 @@ class OccupancyNetwork(nn.Module):
 
     def query(self, latent: Latent, queries_mm: Tensor) -> Tensor:
         """Queries (B, Q, 3), camera frame, mm, float32 -> logits (B, Q, classes)."""
-        queries = (queries_mm - latent.centre_mm) / latent.scale_mm
-        if latent.turn is not None:
-            queries = turned(queries, latent.turn)
-        logits: Tensor = self.decoder(latent.terms, queries)
+        logits: Tensor = self.decoder(latent.terms, normalised(latent, queries_mm))
         return logits
 
     def forward(self, points_mm: Tensor, queries_mm: Tensor) -> Tensor:
@@ -143,6 +140,12 @@ class OccupancyNetwork(nn.Module):
             if isinstance(module, Layer):
                 module.fold()
         return out
+
+
+def normalised(latent: Latent, queries_mm: Tensor) -> Tensor:
+    """Queries (B, Q, 3), camera frame, mm -> as the decoder is asked for them."""
+    queries = (queries_mm - latent.centre_mm) / latent.scale_mm
+    return queries if latent.turn is None else turned(queries, latent.turn)
 
 
 def normalisation(

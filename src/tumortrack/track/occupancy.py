@@ -45,7 +45,7 @@ class OccupancyLocator:
     def __init__(self, model: Model) -> None:
         assert isinstance(model.network, OccupancyNetwork)
         self.model = model
-        self._inference = Inference(model.network)
+        self._inference = Inference(model.network, model.arithmetic)
 
     def locate(self, cloud: SensorCloud, grid: int, seed: int) -> Estimate:
         """See ``track.tracker.Tracker.locate``.
