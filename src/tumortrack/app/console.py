@@ -15,7 +15,10 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
-console = Console(soft_wrap=True, highlight=False)
+from tumortrack.core.processes import is_follower
+
+# Of one training's processes the first alone speaks.
+console = Console(soft_wrap=True, highlight=False, quiet=is_follower())
 
 
 def say(text: str) -> None:

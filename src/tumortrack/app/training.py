@@ -7,7 +7,10 @@ import time
 from rich.status import Status as Spinner
 
 from tumortrack.app.console import console, say
-from tumortrack.learn.train import Status
+from tumortrack.core.processes import is_follower
+from tumortrack.learn.ranks import RankLost
+from tumortrack.learn.state import Diverged
+from tumortrack.learn.train import Interrupted, Status
 
 _EVERY_S = 15.0  # between lines where there is no terminal
 
@@ -25,8 +28,10 @@ class TrainingScreen:
             self._spinner.start()
         return self
 
-    def __exit__(self, *_: object) -> None:
+    def __exit__(self, _: object, error: BaseException | None, __: object) -> None:
         self._spinner.stop()
+        if is_follower() and isinstance(error, Interrupted | Diverged | RankLost):
+            raise SystemExit(error.exit_code)  # the first process says the same
 
     def show(self, status: Status) -> None:
         if status.note != self._noted:
@@ -46,5 +51,5 @@ def _line(status: Status) -> str:
     left = f"{int(status.seconds_left) // 60}:{int(status.seconds_left) % 60:02d}"
     return (
         f"step {status.step}{end} | {status.samples_per_s:.0f} samples/s | loss {status.loss:.4f} "
-        f"| validation mIoU {miou} | {left} left"
+        f"| validation mIoU {miou} | {left} left | {status.waiting:.0%} waiting for scenes"
     )

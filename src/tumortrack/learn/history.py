@@ -20,6 +20,7 @@ class Record:
     validation_miou: float
     samples_per_s: float
     learning_rate: float
+    waiting: float = 0.0  # share of the time that was spent waiting for scenes
 
 
 class History:
@@ -72,6 +73,7 @@ class History:
             "validation_miou": round(record.validation_miou, 4),
             "samples_per_s": round(record.samples_per_s, 1),
             "learning_rate": float(f"{record.learning_rate:.4g}"),
+            "waiting": round(record.waiting, 3),
         }
         try:
             self._lines.write(json.dumps(line) + "\n")
@@ -80,6 +82,7 @@ class History:
                 ("miou/validation", record.validation_miou),
                 ("speed/samples_per_s", record.samples_per_s),
                 ("learning_rate", record.learning_rate),
+                ("speed/waiting", record.waiting),
             ):
                 self._board.add_scalar(name, value, progress.step)
         except OSError as error:

@@ -12,10 +12,11 @@ import torch
 from torch.utils.data import DataLoader, Dataset
 
 from tumortrack.learn.cores import available_cores
-from tumortrack.learn.network import NetworkConfig
 from tumortrack.simulate.dataset import Batch
 
 __all__ = ["Stream", "Tensors", "available_cores", "batches", "default_workers"]
+
+_STANDS_BACK = 10  # how much lower the workers' priority is
 
 # clouds, points, labels, poses (camera_from_ct)
 Tensors = tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]
@@ -64,17 +65,22 @@ def batches(
     yield from loader
 
 
-def default_workers(network: NetworkConfig) -> int:
-    """Half of the cores make scenes (one at least, sixteen at most); all of them for a warp, whose
-    steps cost a fraction of its scenes."""
-    cores = available_cores()
-    return max(1, min(16, cores if network.warps else cores // 2))
+def default_workers(sharing: int = 1) -> int:
+    """As many as there are cores, sixteen at most: they stand back (``quiet_worker``) while the
+    network wants its half. ``sharing`` processes of one training have the cores together."""
+    return max(1, min(16, available_cores() // sharing))
+
+
+def network_leaves(workers: int, sharing: int = 1) -> int:
+    """How many cores the network leaves to so many workers: half at most."""
+    return min(workers, available_cores() // sharing // 2)
 
 
 def quiet_worker(_: int) -> None:
     """What a process that makes data does first."""
     for number in (signal.SIGINT, signal.SIGTERM):  # the parent's to handle
         signal.signal(number, signal.SIG_IGN)
+    os.nice(_STANDS_BACK)  # a batch is made ahead, a step waits for nobody
     # A worker has nothing to put in order at its end, and native libraries' threads can abort a
     # process that is taken down piece by piece.
     atexit.register(os._exit, 0)

@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeVar
 
 import torch
 
@@ -18,6 +19,7 @@ from tumortrack.learn.checkpoint import Progress
 from tumortrack.learn.cores import available_cores
 
 REPORT_EVERY_S = 5.0
+_Item = TypeVar("_Item")
 MOST_THREADS = 16  # more only wait for each other in layers this small
 
 
@@ -32,6 +34,7 @@ class Status:
     loss: float
     miou: float | None  # of the last validation
     note: str = ""  # on how scenes are made, where a user should know
+    waiting: float = 0.0  # share of the time that was spent waiting for scenes
 
 
 class Interrupted(TumortrackError):
@@ -48,13 +51,16 @@ class Interrupted(TumortrackError):
         )
 
 
-def use_cores(device: torch.device, workers: int) -> None:
-    """Give the network the cores that the workers leave, as far as OMP_NUM_THREADS grants them."""
+def use_cores(device: torch.device, workers: int, sharing: int = 1) -> None:
+    """Give the network the cores that the workers leave, as far as OMP_NUM_THREADS grants them;
+    ``sharing`` processes of one training have the machine together."""
     if device.type == "cpu":
         keep_freed_memory()
         granted = os.environ.get("OMP_NUM_THREADS", "")
         most = int(granted) if granted.isdigit() else MOST_THREADS
-        torch.set_num_threads(max(1, min(most, MOST_THREADS, available_cores() - workers)))
+        torch.set_num_threads(
+            max(1, min(most, MOST_THREADS, available_cores() // sharing - workers))
+        )
 
 
 class Clock:
@@ -64,6 +70,22 @@ class Clock:
         self._start, self._first_step = time.monotonic(), progress.step
         self._before = progress.elapsed_s
         self._last: dict[str, float] = {}
+        self._waited = 0.0
+
+    def waits(self, source: Iterator[_Item]) -> Iterator[_Item]:
+        """The same items; how long each is waited for counts."""
+        while True:
+            began = time.monotonic()
+            item = next(source, None)
+            self._waited += time.monotonic() - began
+            if item is None:
+                return
+            yield item
+
+    @property
+    def waiting(self) -> float:
+        """Share of this session's time that was spent waiting."""
+        return self._waited / max(time.monotonic() - self._start, 1e-9)
 
     def elapsed(self) -> float:
         return self._before + time.monotonic() - self._start

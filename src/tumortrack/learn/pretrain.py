@@ -24,7 +24,7 @@ from tumortrack.core.errors import InputError
 from tumortrack.core.types import Anatomy
 from tumortrack.learn.config import TrainConfig
 from tumortrack.learn.decoders.warp import WarpDecoderConfig
-from tumortrack.learn.loader import batches, default_workers
+from tumortrack.learn.loader import batches, default_workers, network_leaves
 from tumortrack.learn.model import choose_device
 from tumortrack.learn.networks import Network
 from tumortrack.learn.pace import REPORT_EVERY_S, Clock, Interrupted, Status, ctrl_c, use_cores
@@ -162,8 +162,8 @@ def pretrain(run: Pretraining, folder: Path, report: Callable[[Status], None]) -
 
 def _pretrain(run: Pretraining, folder: Path, work: Path, report: Callable[[Status], None]) -> dict:
     device = choose_device(run.device)
-    workers = default_workers(run.config.network) if run.workers is None else run.workers
-    use_cores(device, workers)
+    workers = default_workers() if run.workers is None else run.workers
+    use_cores(device, network_leaves(workers))
     state = TrainingState(run, device)
     state.know(_teach)
     state.resume(work)

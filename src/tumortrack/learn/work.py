@@ -12,8 +12,9 @@ _LOCK = ".lock"
 
 
 @contextmanager
-def work_folder(folder: Path) -> Iterator[Path]:
-    """MODEL/training, locked while in use; removed again if nothing was written into it.
+def work_folder(folder: Path, writes: bool = True) -> Iterator[Path]:
+    """MODEL/training, locked while in use; removed again if nothing was written into it. Nothing
+    is done for a process that only reads (``writes`` is False).
 
     The lock is the operating system's and ends with its process, whatever ended that.
 
@@ -24,6 +25,9 @@ def work_folder(folder: Path) -> Iterator[Path]:
     import fcntl
 
     work = folder / "training"
+    if not writes:
+        yield work
+        return
     try:
         work.mkdir(parents=True, exist_ok=True)
         lock = (work / _LOCK).open("w")

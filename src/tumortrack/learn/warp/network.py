@@ -169,7 +169,7 @@ class WarpNetwork(nn.Module):
             true_centre = true_rotation @ self.center_ct + camera_from_ct[:, :3, 3]
             sign = self.right_sign(aside, true_rotation)
         placed = self(aside.other_way(sign))
-        few = slice(0, max(1, len(clouds_mm) // _WRONG_SHARE))
+        few = slice(None, None, _WRONG_SHARE)  # a batch's halves have half of them each
         wrong = self(aside.other_way(-sign)[few])
         with torch.autocast(clouds_mm.device.type, enabled=False):
             moved = self.points + torch.einsum("pdm,bm->bpd", self.modes, placed.coefficients)
