@@ -18,6 +18,7 @@ from tumortrack.learn.warp.motion import WarpMotion, blend
 from tumortrack.learn.warp.network import WarpNetwork
 from tumortrack.learn.warp.refine import Refined, refine
 from tumortrack.sense.cloud import check_cloud, thin_cloud
+from tumortrack.track.chance import normal_table, probabilities
 from tumortrack.track.estimate import Estimate, Following
 from tumortrack.track.report import fit_report, report_head, stage
 from tumortrack.track.volume import describe_parts, grid_over
@@ -76,6 +77,8 @@ class WarpLocator:
         )
         self._nearest_known = cKDTree(self._known_ct)
         self._middles_ct = np.array([part.box_mm.mean(0) for part in anatomy.parts])
+        vertices = np.concatenate([part.vertices_mm for part in anatomy.parts])
+        self._vertices_ct = vertices.astype(np.float32)
         self._carried: _Inside | None = None
 
     def locate(self, cloud: SensorCloud, grid: int, seed: int) -> Estimate:
@@ -164,10 +167,10 @@ class WarpLocator:
     def _moved(self, fit: Refined) -> _Placed:
         motion = replace(fit.motion, std_scale=self._trust.std_scale)
         anatomy = self._shape.anatomy_ct
-        meshes = {
-            name: part.moved(motion.carry(part.vertices_mm))
-            for name, part in zip(anatomy.names, anatomy.parts, strict=True)
-        }
+        moved = motion.carry(self._vertices_ct)
+        ends = np.cumsum([len(part.vertices_mm) for part in anatomy.parts])[:-1]
+        parts = zip(anatomy.names, anatomy.parts, np.split(moved, ends), strict=True)
+        meshes = {name: part.moved(places) for name, part, places in parts}
         deviation = motion.std_mm(np.concatenate([self._known_ct, self._middles_ct]))
         assert deviation is not None
         known = len(self._known_ct)
@@ -228,8 +231,7 @@ class WarpLocator:
         return inside, _Inside(points_ct[inside], labels[inside], margin_mm[inside], known)
 
 
-def _probability(placed: _Placed, mine: _Inside) -> Float[np.ndarray, " n"]:
+def _probability(placed: _Placed, mine: _Inside) -> Float32[np.ndarray, " n"]:
     """That the nearest surface does not lie on a point's other side, errors being normal."""
-    from scipy.special import ndtr
-
-    return ndtr(mine.margin_mm / np.hypot(placed.known_std_mm, _FIELD_MM)[mine.known])
+    per_std = 1 / np.hypot(placed.known_std_mm, _FIELD_MM)
+    return probabilities(mine.margin_mm, per_std, mine.known, normal_table())

@@ -9,9 +9,12 @@ import numpy as np
 from jaxtyping import Float, Float32, Float64
 from scipy.spatial.transform import Rotation
 
+from tumortrack.learn.warp import kernels
 from tumortrack.learn.warp.shape import Shape
+from tumortrack.learn.warp.sharing import share
+from tumortrack.simulate.elastic.flow import steps_for
 
-_AT_ONCE = 4096  # points: bounds the memory of their derivatives
+_AT_ONCE = 4096  # points: a thread's part; bounds the memory of their derivatives
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,8 +53,10 @@ class WarpMotion:
 
     def carry(self, points_ct: Float[np.ndarray, "n 3"], /) -> Float64[np.ndarray, "n 3"]:
         """CT (LPS, mm) -> camera frame (mm)."""
-        moved = self.shape.body.follow(self._velocity, points_ct).astype(float)
-        return (moved - self.shape.body.center_ct) @ self.rotation.T + self.centre_mm
+        points, out = np.ascontiguousarray(points_ct, np.float32), np.empty((len(points_ct), 3))
+        flow = *self._flow, self.shape.body.center_ct, self.rotation, self.centre_mm
+        share(lambda part: kernels.carry(*flow, points[part], out[part]), len(out), _AT_ONCE)
+        return out
 
     def back(self, points_camera: Float[np.ndarray, "n 3"], /) -> Float64[np.ndarray, "n 3"]:
         """Camera frame (mm) -> CT (LPS, mm)."""
@@ -70,24 +75,28 @@ class WarpMotion:
 
     def _std(self, points_ct: Float[np.ndarray, "n 3"]) -> Float64[np.ndarray, " n"]:
         body = self.shape.body
-        offset = body.follow(self._velocity, points_ct).astype(float) - body.center_ct
-        modes = body.modes_at(body.follow(np.float32(0.5) * self._velocity, points_ct))
-        variance = np.zeros(len(points_ct))
-        for axis in range(3):
-            along = np.tile(np.eye(3)[axis], (len(offset), 1))
-            row = np.concatenate([along, np.cross(offset, along), modes[:, axis]], axis=1)
-            half = row @ self._root
-            variance += np.einsum("nk,nk->n", half, half)
-        return self.std_scale * np.sqrt(variance / 3)
+        rows = np.zeros((len(points_ct), 3, kernels.POSE + len(self.coefficients)), np.float32)
+        center, points = body.center_ct.astype(np.float32), np.asarray(points_ct, np.float32)
+        kernels.deviations(*self._flow, body.modes, center, np.ascontiguousarray(points), rows)
+        half = rows.reshape(-1, rows.shape[2]) @ self._root
+        variance = np.einsum("nk,nk->n", half, half).reshape(-1, 3).mean(1)
+        return self.std_scale * np.sqrt(variance).astype(float)
 
     @cached_property
     def _velocity(self) -> Float32[np.ndarray, "i j k 3"]:
         return self.shape.body.velocity(self.coefficients)
 
     @cached_property
-    def _root(self) -> Float64[np.ndarray, "p p"]:
+    def _flow(self) -> tuple[tuple[np.ndarray, np.ndarray, np.float32], int]:
+        """What the kernels follow, and in how many steps."""
+        body = self.shape.body
+        lattice = (self._velocity, body.origin_mm, np.float32(body.spacing_mm))
+        return lattice, steps_for(self._velocity, body.spacing_mm)
+
+    @cached_property
+    def _root(self) -> Float32[np.ndarray, "p p"]:
         assert self.covariance is not None
-        return np.linalg.cholesky(self.covariance)
+        return np.linalg.cholesky(self.covariance).astype(np.float32)
 
 
 def blend(a: WarpMotion, b: WarpMotion, share: float) -> WarpMotion:

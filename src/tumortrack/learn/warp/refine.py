@@ -17,12 +17,19 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Float64
+from jaxtyping import Float, Float32, Float64
 from scipy.spatial.transform import Rotation
 
 from tumortrack.core.config import Config
+from tumortrack.learn.warp import kernels
 from tumortrack.learn.warp.motion import WarpMotion
 from tumortrack.learn.warp.shape import Shape
+from tumortrack.learn.warp.sharing import share
+from tumortrack.simulate.elastic.flow import steps_for
+
+Placed = tuple[np.ndarray, np.ndarray, np.ndarray]  # rotation, centre_mm, coefficients
+
+_AT_ONCE = 256  # points: a thread's part
 
 
 class RefineConfig(Config, frozen=True):
@@ -67,17 +74,16 @@ def refine(
     coefficients = start.coefficients.astype(float)
     moved = np.zeros(6)  # from the start: shift and turn
     weight = min(config.n_effective / len(points_mm), 1.0) / config.sigma_mm**2
+    observed = np.ascontiguousarray(points_mm, np.float32)
     done = 0
     for step in range(config.steps + 1):
         width = max(config.last_mm, config.first_mm * config.narrowing**step)
-        distance, rows = _residuals(shape, points_mm, rotation, centre, coefficients)
-        pull = 1 / (1 + (distance / width) ** 2) ** 2
-        curvature = weight * (rows.T @ (pull[:, None] * rows)).astype(float) + precision
+        distance, normal = _normal(shape, observed, (rotation, centre, coefficients), width)
+        curvature = weight * normal[:-1, :-1] + precision
         off = np.concatenate([moved, coefficients - mean])
         if step == config.steps or done:
             break
-        slope = weight * (rows.T @ (pull * distance)).astype(float) + precision @ off
-        change = -np.linalg.solve(curvature, slope)
+        change = -np.linalg.solve(curvature, weight * normal[:-1, -1] + precision @ off)
         centre = centre + rotation @ change[:3]
         rotation = rotation @ Rotation.from_rotvec(change[3:6]).as_matrix()
         coefficients = coefficients + change[6:]
@@ -99,21 +105,48 @@ def _prior(shape: Shape, config: RefineConfig) -> Float64[np.ndarray, "p p"]:
     return precision
 
 
+def _normal(
+    shape: Shape, points_mm: Float32[np.ndarray, "n 3"], placed: Placed, width_mm: float
+) -> tuple[Float32[np.ndarray, " n"], Float64[np.ndarray, "columns columns"]]:
+    """Signed distances of the points carried back, and the sum over points of the pull times a
+    row times itself: a row has the distance's derivatives by shift, turn and coefficients, and
+    then the distance."""
+    known = _known(shape, *placed)
+    columns = kernels.POSE + len(placed[2]) + 1
+    distance = np.empty(len(points_mm), np.float32)
+    sums = np.empty((-(-len(points_mm) // _AT_ONCE), columns, columns), np.float32)
+
+    def add(part: slice) -> None:
+        out = distance[part], sums[part.start // _AT_ONCE]
+        kernels.normal_equations(*known, np.float32(width_mm), points_mm[part], *out)
+
+    share(add, len(points_mm), _AT_ONCE)
+    return distance, sums.sum(0, dtype=float)
+
+
 def _residuals(
+    shape: Shape, points_mm: Float[np.ndarray, "n 3"], placed: Placed
+) -> Float32[np.ndarray, "n columns"]:
+    """The rows that ``_normal`` adds up."""
+    known = _known(shape, *placed)
+    rows = np.empty((len(points_mm), kernels.POSE + len(placed[2]) + 1), np.float32)
+    kernels.residuals(*known, np.ascontiguousarray(points_mm, np.float32), rows)
+    return rows
+
+
+def _known(
     shape: Shape,
-    points_mm: Float[np.ndarray, "n 3"],
     rotation: Float64[np.ndarray, "3 3"],
     centre_mm: Float64[np.ndarray, " 3"],
     coefficients: Float64[np.ndarray, " m"],
-) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n p"]]:
-    """Signed distances of the points carried back, and their derivatives by shift, turn and
-    coefficients (those by the coefficients to first order: the modes halfway along the path)."""
-    body = shape.body
-    offset = ((points_mm - centre_mm) @ rotation).astype(np.float32)
-    rest = offset + body.center_ct.astype(np.float32)
+) -> tuple:
+    """What the kernels need besides points."""
+    body, field = shape.body, shape.distances[0]
     velocity = body.velocity(-coefficients)
-    distance, outwards = shape.distances[0].with_slope(body.follow(velocity, rest))
-    halfway = body.follow(np.float32(0.5) * velocity, rest)
-    by_modes = -body.modes_along(halfway, outwards)
-    by_turn = -np.cross(offset, outwards)
-    return distance, np.concatenate([-outwards, by_turn, by_modes], axis=1)
+    return (
+        (velocity, body.origin_mm, np.float32(body.spacing_mm)),
+        steps_for(velocity, body.spacing_mm),
+        body.modes,
+        (body.center_ct, rotation, centre_mm),
+        (field.values_mm, field.origin_mm, np.float32(field.spacing_mm)),
+    )

@@ -132,25 +132,32 @@ def shape_of(anatomy_ct: Anatomy, body: Body) -> Shape:
 def _distance(values, origin, spacing, points):  # type: ignore[no-untyped-def]
     n = len(points)
     out, slope = np.empty(n, np.float32), np.empty((n, 3), np.float32)
+    for p in range(n):
+        out[p], slope[p, 0], slope[p, 1], slope[p, 2] = distance_at(
+            values, origin, spacing, points[p, 0], points[p, 1], points[p, 2]
+        )
+    return out, slope
+
+
+@numba.njit(cache=True, fastmath=True, nogil=True, inline="always")
+def distance_at(values, origin, spacing, x, y, z):  # type: ignore[no-untyped-def]
+    """Distance and its slope along x, y, z at one place (mm), by trilinear interpolation."""
     zero, one, most = np.float32(0), np.float32(1), np.float32(1.001)
     per_cell = one / spacing
-    for p in range(n):
-        x = min(max((points[p, 0] - origin[0]) * per_cell, zero), values.shape[0] - most)
-        y = min(max((points[p, 1] - origin[1]) * per_cell, zero), values.shape[1] - most)
-        z = min(max((points[p, 2] - origin[2]) * per_cell, zero), values.shape[2] - most)
-        i, j, k = int(x), int(y), int(z)
-        a, b, c = np.float32(x - i), np.float32(y - j), np.float32(z - k)
-        v000, v001 = values[i, j, k], values[i, j, k + 1]
-        v010, v011 = values[i, j + 1, k], values[i, j + 1, k + 1]
-        v100, v101 = values[i + 1, j, k], values[i + 1, j, k + 1]
-        v110, v111 = values[i + 1, j + 1, k], values[i + 1, j + 1, k + 1]
-        l00, l01 = v000 + (v001 - v000) * c, v010 + (v011 - v010) * c
-        l10, l11 = v100 + (v101 - v100) * c, v110 + (v111 - v110) * c
-        f0, f1 = l00 + (l01 - l00) * b, l10 + (l11 - l10) * b
-        out[p] = f0 + (f1 - f0) * a
-        slope[p, 0] = (f1 - f0) * per_cell
-        slope[p, 1] = ((l01 - l00) * (one - a) + (l11 - l10) * a) * per_cell
-        d0 = (v001 - v000) * (one - b) + (v011 - v010) * b
-        d1 = (v101 - v100) * (one - b) + (v111 - v110) * b
-        slope[p, 2] = (d0 * (one - a) + d1 * a) * per_cell
-    return out, slope
+    x = min(max((x - origin[0]) * per_cell, zero), np.float32(values.shape[0]) - most)
+    y = min(max((y - origin[1]) * per_cell, zero), np.float32(values.shape[1]) - most)
+    z = min(max((z - origin[2]) * per_cell, zero), np.float32(values.shape[2]) - most)
+    i, j, k = int(x), int(y), int(z)
+    a, b, c = np.float32(x - i), np.float32(y - j), np.float32(z - k)
+    v000, v001 = values[i, j, k], values[i, j, k + 1]
+    v010, v011 = values[i, j + 1, k], values[i, j + 1, k + 1]
+    v100, v101 = values[i + 1, j, k], values[i + 1, j, k + 1]
+    v110, v111 = values[i + 1, j + 1, k], values[i + 1, j + 1, k + 1]
+    l00, l01 = v000 + (v001 - v000) * c, v010 + (v011 - v010) * c
+    l10, l11 = v100 + (v101 - v100) * c, v110 + (v111 - v110) * c
+    f0, f1 = l00 + (l01 - l00) * b, l10 + (l11 - l10) * b
+    by_y = (l01 - l00) * (one - a) + (l11 - l10) * a
+    d0 = (v001 - v000) * (one - b) + (v011 - v010) * b
+    d1 = (v101 - v100) * (one - b) + (v111 - v110) * b
+    by_z = d0 * (one - a) + d1 * a
+    return f0 + (f1 - f0) * a, (f1 - f0) * per_cell, by_y * per_cell, by_z * per_cell

@@ -13,7 +13,7 @@ from jaxtyping import Float, Float32, Float64
 from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError
 from tumortrack.core.types import Anatomy
-from tumortrack.simulate.elastic.flow import follow, project, steps_for
+from tumortrack.simulate.elastic.flow import combine, follow, project, steps_for
 
 if TYPE_CHECKING:
     from tumortrack.simulate.elastic.settle import Reduced
@@ -88,7 +88,7 @@ class Body:
 
     def velocity(self, coefficients: Float[np.ndarray, " m"]) -> Float32[np.ndarray, "i j k 3"]:
         """The field that points follow, mm per unit of time, at the lattice's nodes."""
-        return self.modes @ coefficients.astype(np.float32)
+        return combine(self.modes, np.asarray(coefficients, np.float32))
 
     def carry(
         self, coefficients: Float[np.ndarray, " m"], points_ct: Float[np.ndarray, "n 3"]

@@ -7,78 +7,154 @@ follows the opposite field, and a field without divergence keeps volumes, howeve
 
 from __future__ import annotations
 
+import math
+
 import numba
 import numpy as np
 from jaxtyping import Float32
 
 _PER_SLOPE = 10  # steps, times the field's steepest slope: back within 0.01 mm of the start
 _FEWEST, _MOST = 3, 24
+BLOCK = 64  # points that take each step together: one alone waits for its last step's numbers
 
 
 def steps_for(velocity: Float32[np.ndarray, "i j k 3"], spacing_mm: float) -> int:
     """Steps that a field needs: as many as points beside each other part from each other."""
-    slope = max(float(np.abs(np.diff(velocity, axis=a)).max()) for a in range(3)) / spacing_mm
-    return int(np.clip(np.ceil(_PER_SLOPE * slope), _FEWEST, _MOST))
+    slope = float(_steepest(velocity)) / spacing_mm
+    return min(max(math.ceil(_PER_SLOPE * slope), _FEWEST), _MOST)
 
 
 # Fast math: see simulate.deform.drag; here no sum is long enough to matter more.
-@numba.njit(cache=True, fastmath=True, nogil=True, inline="always")
-def sample(field, x, y, z):  # type: ignore[no-untyped-def]
-    """Trilinear value of a float32 field (i, j, k, 3) at a place in cells; beyond the lattice that
-    of its nearest border."""
-    zero, most = np.float32(0), np.float32(1.001)
-    x = min(max(x, zero), np.float32(field.shape[0]) - most)
-    y = min(max(y, zero), np.float32(field.shape[1]) - most)
-    z = min(max(z, zero), np.float32(field.shape[2]) - most)
-    i, j, k = int(x), int(y), int(z)
-    a, b, c = x - np.float32(i), y - np.float32(j), z - np.float32(k)
-    one = np.float32(1)
-    a0, b0, c0 = one - a, one - b, one - c
-    w00, w01, w10, w11 = a0 * b0, a0 * b, a * b0, a * b
-    w000, w001, w010, w011 = w00 * c0, w00 * c, w01 * c0, w01 * c
-    w100, w101, w110, w111 = w10 * c0, w10 * c, w11 * c0, w11 * c
-    f00, f01 = field[i, j], field[i, j + 1]
-    f10, f11 = field[i + 1, j], field[i + 1, j + 1]
-    u = (
-        w000 * f00[k, 0] + w001 * f00[k + 1, 0] + w010 * f01[k, 0] + w011 * f01[k + 1, 0]
-        + w100 * f10[k, 0] + w101 * f10[k + 1, 0] + w110 * f11[k, 0] + w111 * f11[k + 1, 0]
-    )  # fmt: skip
-    v = (
-        w000 * f00[k, 1] + w001 * f00[k + 1, 1] + w010 * f01[k, 1] + w011 * f01[k + 1, 1]
-        + w100 * f10[k, 1] + w101 * f10[k + 1, 1] + w110 * f11[k, 1] + w111 * f11[k + 1, 1]
-    )  # fmt: skip
-    w = (
-        w000 * f00[k, 2] + w001 * f00[k + 1, 2] + w010 * f01[k, 2] + w011 * f01[k + 1, 2]
-        + w100 * f10[k, 2] + w101 * f10[k + 1, 2] + w110 * f11[k, 2] + w111 * f11[k + 1, 2]
-    )  # fmt: skip
-    return u, v, w
+@numba.njit(cache=True, fastmath=True, nogil=True)
+def _steepest(velocity):  # type: ignore[no-untyped-def]
+    """Largest difference between neighbouring nodes of a field (i, j, k, 3)."""
+    most = np.float32(0)
+    nodes = velocity.reshape(velocity.shape[0], velocity.shape[1], -1)
+    for i in range(len(nodes)):
+        for j in range(nodes.shape[1]):
+            here = nodes[i, j]
+            most = max(most, _apart(here[3:], here[:-3]))
+            if i > 0:
+                most = max(most, _apart(here, nodes[i - 1, j]))
+            if j > 0:
+                most = max(most, _apart(here, nodes[i, j - 1]))
+    return most
+
+
+@numba.njit(cache=True, fastmath=True, nogil=True)
+def _apart(a, b):  # type: ignore[no-untyped-def]
+    """Largest difference between two rows of numbers."""
+    most = np.float32(0)
+    for n in range(len(a)):
+        apart = abs(a[n] - b[n])
+        most = apart if apart > most else most
+    return most
+
+
+@numba.njit(cache=True, fastmath=True, nogil=True)
+def combine(modes, coefficients):  # type: ignore[no-untyped-def]
+    """``modes @ coefficients``, (..., m) by (m,), float32. A library's product would wake threads
+    that then wait busily, in the way of those that carry points."""
+    rows = modes.reshape(-1, len(coefficients))
+    out = np.empty(len(rows), np.float32)
+    for n in range(len(rows)):
+        total, row = np.float32(0), rows[n]
+        for mode in range(len(row)):
+            total += row[mode] * coefficients[mode]
+        out[n] = total
+    return out.reshape(modes.shape[:-1])
+
+
+@numba.njit(cache=True, fastmath=True, nogil=True, error_model="numpy")
+def advance(velocity, places, speeds, count, half, move):  # type: ignore[no-untyped-def]
+    """One step of ``count`` points: ``places`` and ``speeds`` (3, BLOCK), in cells and mm per unit
+    of time; the speed at ``places + half * speeds`` carries a place on by ``move`` of it.
+
+    Trilinear; beyond the lattice the value of its nearest border.
+    """
+    flat = velocity.reshape(-1)
+    zero, one, most = np.float32(0), np.float32(1), np.float32(1.001)
+    most_x = np.float32(velocity.shape[0]) - most
+    most_y = np.float32(velocity.shape[1]) - most
+    most_z = np.float32(velocity.shape[2]) - most
+    # Unsigned indices: no question of whether one counts from the end.
+    row = np.uint32(3 * velocity.shape[2])
+    plane = np.uint32(velocity.shape[1] * row)
+    for p in range(count):
+        x = min(max(places[0, p] + half * speeds[0, p], zero), most_x)
+        y = min(max(places[1, p] + half * speeds[1, p], zero), most_y)
+        z = min(max(places[2, p] + half * speeds[2, p], zero), most_z)
+        i, j, k = np.uint32(x), np.uint32(y), np.uint32(z)
+        a, b, c = x - np.float32(i), y - np.float32(j), z - np.float32(k)
+        a0, b0, c0 = one - a, one - b, one - c
+        w00, w01, w10, w11 = a0 * b0, a0 * b, a * b0, a * b
+        n00 = np.uint32(i * plane + j * row + np.uint32(3) * k)
+        n01, n10 = np.uint32(n00 + row), np.uint32(n00 + plane)
+        n11 = np.uint32(n01 + plane)
+        for axis in range(3):
+            d, e = np.uint32(axis), np.uint32(axis + 3)
+            near = w00 * flat[n00 + d] + w01 * flat[n01 + d]
+            near += w10 * flat[n10 + d] + w11 * flat[n11 + d]
+            far = w00 * flat[n00 + e] + w01 * flat[n01 + e]
+            far += w10 * flat[n10 + e] + w11 * flat[n11 + e]
+            speed = c0 * near + c * far
+            speeds[axis, p] = speed
+            places[axis, p] += move * speed
+
+
+@numba.njit(cache=True, fastmath=True, nogil=True)
+def block():  # type: ignore[no-untyped-def]
+    """Room for the places, speeds and places halfway of one block of points."""
+    room = np.empty((3, 3, BLOCK), np.float32)
+    return room[0], room[1], room[2]
+
+
+@numba.njit(cache=True, fastmath=True, nogil=True)
+def enter(points, origin, spacing, places):  # type: ignore[no-untyped-def]
+    """Take up to ``BLOCK`` points (n, 3), mm, as places in cells."""
+    per_cell = np.float32(1) / spacing
+    for p in range(len(points)):
+        for axis in range(3):
+            places[axis, p] = (points[p, axis] - origin[axis]) * per_cell
+
+
+@numba.njit(cache=True, fastmath=True, nogil=True)
+def travel(velocity, spacing, steps, count, places, speeds, middles):  # type: ignore[no-untyped-def]
+    """Move ``count`` places of a block for one unit of time, noting where they were halfway.
+
+    Midpoint rule, with the middle of a step predicted from the last step's velocity: of second
+    order for one sample a step, and nearly symmetric, so that the opposite field leads back to
+    within some micrometres.
+    """
+    zero = np.float32(0)
+    dt = np.float32(1) / (spacing * np.float32(steps))
+    half = np.float32(0.5) * dt
+    speeds[:, :count] = zero
+    advance(velocity, places, speeds, count, half, zero)
+    for step in range(steps):
+        if step == steps // 2:  # half of the time has gone, or will have in the middle of this step
+            past = half if steps % 2 else zero
+            for axis in range(3):
+                for p in range(count):
+                    middles[axis, p] = places[axis, p] + past * speeds[axis, p]
+        advance(velocity, places, speeds, count, half, dt)
 
 
 @numba.njit(cache=True, fastmath=True, nogil=True)
 def follow(velocity, origin, spacing, points, steps):  # type: ignore[no-untyped-def]
-    """Where points (n, 3) are after one unit of time, all float32.
+    """Where points (n, 3) are after one unit of time, all float32; see ``travel``.
 
-    ``velocity`` (i, j, k, 3) is in mm, ``origin`` (3,) and ``spacing`` in mm. Midpoint rule, with
-    the middle of a step predicted from the last step's velocity: of second order for one sample a
-    step, and nearly symmetric, so that the opposite field leads back to within some micrometres.
+    ``velocity`` (i, j, k, 3) is in mm, ``origin`` (3,) and ``spacing`` in mm.
     """
     out = np.empty_like(points)
-    per_cell = np.float32(1) / spacing
-    dt = per_cell / np.float32(steps)  # positions are in cells from here on
-    half = np.float32(0.5) * dt
-    for p in range(len(points)):
-        x = (points[p, 0] - origin[0]) * per_cell
-        y = (points[p, 1] - origin[1]) * per_cell
-        z = (points[p, 2] - origin[2]) * per_cell
-        u, v, w = sample(velocity, x, y, z)
-        for _ in range(steps):
-            u, v, w = sample(velocity, x + half * u, y + half * v, z + half * w)
-            x += dt * u
-            y += dt * v
-            z += dt * w
-        out[p, 0] = origin[0] + spacing * x
-        out[p, 1] = origin[1] + spacing * y
-        out[p, 2] = origin[2] + spacing * z
+    places, speeds, middles = block()
+    for first in range(0, len(points), BLOCK):
+        some = points[first : first + BLOCK]
+        enter(some, origin, spacing, places)
+        travel(velocity, spacing, steps, len(some), places, speeds, middles)
+        for p in range(len(some)):
+            for axis in range(3):
+                out[first + p, axis] = origin[axis] + spacing * places[axis, p]
     return out
 
 
@@ -88,20 +164,33 @@ def project(modes, origin, spacing, points, directions):  # type: ignore[no-unty
     all float32. Beyond the lattice those of its nearest border."""
     n, m = len(points), modes.shape[4]
     out = np.zeros((n, m), np.float32)
-    zero, one, most = np.float32(0), np.float32(1), np.float32(1.001)
-    per_cell = one / spacing
+    per_cell = np.float32(1) / spacing
     for p in range(n):
-        x = min(max((points[p, 0] - origin[0]) * per_cell, zero), modes.shape[0] - most)
-        y = min(max((points[p, 1] - origin[1]) * per_cell, zero), modes.shape[1] - most)
-        z = min(max((points[p, 2] - origin[2]) * per_cell, zero), modes.shape[2] - most)
-        i, j, k = int(x), int(y), int(z)
-        a, b, c = np.float32(x - i), np.float32(y - j), np.float32(z - k)
-        d0, d1, d2 = directions[p, 0], directions[p, 1], directions[p, 2]
-        for corner in range(8):
-            u, v, w = corner >> 2, (corner >> 1) & 1, corner & 1
-            share = (a if u else one - a) * (b if v else one - b) * (c if w else one - c)
-            here = modes[i + u, j + v, k + w]
-            s0, s1, s2 = share * d0, share * d1, share * d2
-            for mode in range(m):
-                out[p, mode] += s0 * here[0, mode] + s1 * here[1, mode] + s2 * here[2, mode]
+        x = (points[p, 0] - origin[0]) * per_cell
+        y = (points[p, 1] - origin[1]) * per_cell
+        z = (points[p, 2] - origin[2]) * per_cell
+        add_modes(modes, x, y, z, directions[p], out[p])
     return out
+
+
+@numba.njit(cache=True, fastmath=True, nogil=True, inline="always")
+def add_modes(modes, x, y, z, direction, out):  # type: ignore[no-untyped-def]
+    """Add the modes at a place in cells, along a direction (3,), to ``out`` (m,)."""
+    zero, one, most = np.float32(0), np.float32(1), np.float32(1.001)
+    x = min(max(x, zero), np.float32(modes.shape[0]) - most)
+    y = min(max(y, zero), np.float32(modes.shape[1]) - most)
+    z = min(max(z, zero), np.float32(modes.shape[2]) - most)
+    i, j, k = int(x), int(y), int(z)
+    a, b, c = x - np.float32(i), y - np.float32(j), z - np.float32(k)
+    for column in range(4):
+        u, v = column >> 1, column & 1
+        share = (a if u else one - a) * (b if v else one - b)
+        near, far = modes[i + u, j + v, k], modes[i + u, j + v, k + 1]
+        s0, s1, s2 = share * direction[0], share * direction[1], share * direction[2]
+        n0, n1, n2 = (one - c) * s0, (one - c) * s1, (one - c) * s2
+        f0, f1, f2 = c * s0, c * s1, c * s2
+        for mode in range(len(out)):
+            out[mode] += (
+                n0 * near[0, mode] + n1 * near[1, mode] + n2 * near[2, mode]
+                + f0 * far[0, mode] + f1 * far[1, mode] + f2 * far[2, mode]
+            )  # fmt: skip

@@ -1,0 +1,144 @@
+"""Kernels of a warp: points carried to the camera or back, with what every unknown does to them.
+
+``lattice`` is (velocity, origin, spacing) of the field that points follow; ``modes`` are on the
+same lattice. Unknowns are shift, turn and coefficients, in this order. Derivatives by coefficients
+are to first order: the modes halfway along a point's path.
+"""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+
+from tumortrack.learn.warp.shape import distance_at
+from tumortrack.simulate.elastic.flow import BLOCK, add_modes, block, enter, travel
+
+POSE = 6  # unknowns before the coefficients
+
+
+@numba.njit(cache=True, fastmath=True, nogil=True)
+def carry(lattice, steps, center, turn, to, points, out):  # type: ignore[no-untyped-def]
+    """``turn (flow(point) - center) + to`` of points (n, 3), float32; the rest float64."""
+    velocity, origin, spacing = lattice
+    places, speeds, middles = block()
+    for first in range(0, len(points), BLOCK):
+        some = points[first : first + BLOCK]
+        enter(some, origin, spacing, places)
+        travel(velocity, spacing, steps, len(some), places, speeds, middles)
+        for p in range(len(some)):
+            x = np.float64(origin[0] + spacing * places[0, p]) - center[0]
+            y = np.float64(origin[1] + spacing * places[1, p]) - center[1]
+            z = np.float64(origin[2] + spacing * places[2, p]) - center[2]
+            for axis in range(3):
+                moved = turn[axis, 0] * x + turn[axis, 1] * y + turn[axis, 2] * z
+                out[first + p, axis] = moved + to[axis]
+
+
+@numba.njit(cache=True, fastmath=True, nogil=True)
+def deviations(lattice, steps, modes, center, points, rows):  # type: ignore[no-untyped-def]
+    """What each unknown does to each point's place along x, y, z, in the CT's axes: into ``rows``
+    (n, 3, p), zeroed. All float32."""
+    velocity, origin, spacing = lattice
+    places, speeds, middles = block()
+    along = np.eye(3, dtype=np.float32)
+    for first in range(0, len(points), BLOCK):
+        some = points[first : first + BLOCK]
+        enter(some, origin, spacing, places)
+        travel(velocity, spacing, steps, len(some), places, speeds, middles)
+        for p in range(len(some)):
+            x = origin[0] + spacing * places[0, p] - center[0]
+            y = origin[1] + spacing * places[1, p] - center[1]
+            z = origin[2] + spacing * places[2, p] - center[2]
+            row = rows[first + p]
+            for axis in range(3):
+                row[axis, axis] = 1
+                add_modes(
+                    modes,
+                    middles[0, p],
+                    middles[1, p],
+                    middles[2, p],
+                    along[axis],
+                    row[axis, POSE:],
+                )
+            row[0, 4], row[0, 5] = z, -y
+            row[1, 3], row[1, 5] = -z, x
+            row[2, 3], row[2, 4] = y, -x
+
+
+@numba.njit(cache=True, fastmath=True, nogil=True)
+def residuals(lattice, steps, modes, pose, field, points, rows):  # type: ignore[no-untyped-def]
+    """What each unknown does to the signed distance of points (n, 3; camera frame, mm), carried
+    back, to a surface at rest; the distance itself stands in the last column of ``rows``
+    (n, p + 1).
+
+    ``lattice`` has the opposite velocity; ``pose`` is (center_ct, rotation, centre_mm), ``field``
+    (values, origin, spacing) of the distances. ``pose`` is float64, all else float32.
+    """
+    places, speeds, middles = block()
+    for first in range(0, len(points), BLOCK):
+        some = points[first : first + BLOCK]
+        room = places, speeds, middles
+        _rows(lattice, steps, modes, pose, field, some, room, rows[first : first + BLOCK])
+
+
+@numba.njit(cache=True, fastmath=True, nogil=True)
+def normal_equations(  # type: ignore[no-untyped-def]
+    lattice, steps, modes, pose, field, width, points, distances, out
+):
+    """Distances as ``residuals`` gives them (n,), and the sum over points of ``pull * row * row'``
+    (p + 1, p + 1) in ``out``; ``pull`` is 1 / (1 + (distance / width)^2)^2.
+
+    Some hundred points at a time are best: their rows have to stay in the cache.
+    """
+    places, speeds, middles = block()
+    columns = len(out)
+    rows = np.empty((BLOCK, columns), np.float32)
+    across = np.empty((columns, len(points)), np.float32)  # sums over points run along memory
+    one, per_width = np.float32(1), np.float32(1) / width
+    for first in range(0, len(points), BLOCK):
+        some = points[first : first + BLOCK]
+        room = places, speeds, middles
+        _rows(lattice, steps, modes, pose, field, some, room, rows)
+        for p in range(len(some)):
+            distance = rows[p, -1]
+            distances[first + p] = distance
+            share = one / (one + (distance * per_width) ** 2)
+            for n in range(columns):
+                across[n, first + p] = rows[p, n] * share
+    for n in range(columns):
+        for m in range(n + 1):
+            total, one_column, other = np.float32(0), across[n], across[m]
+            for p in range(len(points)):
+                total += one_column[p] * other[p]
+            out[n, m] = total
+            out[m, n] = total
+
+
+@numba.njit(cache=True, fastmath=True, nogil=True)
+def _rows(lattice, steps, modes, pose, field, points, room, rows):  # type: ignore[no-untyped-def]
+    """``residuals`` of one block of points; ``room`` is ``flow.block()``."""
+    velocity, origin, spacing = lattice
+    center, rotation, centre = pose
+    values, corner, width = field
+    places, speeds, middles = room
+    per_cell, inwards = np.float32(1) / spacing, np.empty(3, np.float32)
+    offsets = np.empty((BLOCK, 3), np.float32)
+    for p in range(len(points)):
+        x, y, z = points[p, 0] - centre[0], points[p, 1] - centre[1], points[p, 2] - centre[2]
+        for axis in range(3):
+            turned = rotation[0, axis] * x + rotation[1, axis] * y + rotation[2, axis] * z
+            offsets[p, axis] = turned
+            places[axis, p] = (np.float32(turned + center[axis]) - origin[axis]) * per_cell
+    travel(velocity, spacing, steps, len(points), places, speeds, middles)
+    for p in range(len(points)):
+        x = origin[0] + spacing * places[0, p]
+        y = origin[1] + spacing * places[1, p]
+        z = origin[2] + spacing * places[2, p]
+        row = rows[p]
+        row[-1], sx, sy, sz = distance_at(values, corner, width, x, y, z)
+        inwards[0], inwards[1], inwards[2] = -sx, -sy, -sz
+        ox, oy, oz = offsets[p, 0], offsets[p, 1], offsets[p, 2]
+        row[0], row[1], row[2] = -sx, -sy, -sz
+        row[3], row[4], row[5] = sy * oz - sz * oy, sz * ox - sx * oz, sx * oy - sy * ox
+        row[POSE:-1] = 0
+        add_modes(modes, middles[0, p], middles[1, p], middles[2, p], inwards, row[POSE:-1])
