@@ -96,33 +96,8 @@ def winding_numbers(
     Raises:
         InputError: the grid is too large.
     """
-    if np.prod(np.array(shape, float)) > _MOST_CELLS:
-        raise InputError(f"a grid of {' x '.join(map(str, shape))} voxels is too large.")
-    out = np.zeros(shape, np.int16)
-    if len(mesh.faces) == 0:
-        return out
-    index = transform_points(np.linalg.inv(frame_from_index), mesh.vertices_mm)
-    low = np.clip(np.floor(index.min(0)), 0, shape).astype(int)
-    high = np.clip(np.ceil(index.max(0)) + 1, 0, shape).astype(int)
-    if (high <= low).any():
-        return out
-    high[2] = shape[2]  # of an open mesh the rays do not leave what they entered
-    triangles = (index - low)[mesh.faces]
-    sub = tuple((high - low).tolist())
-    a, b = (triangles[:, n, :2] - triangles[:, 0, :2] for n in (1, 2))
-    # A face that turns towards the rays' start (negative projected area) is entered.
-    enters = -np.sign(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).astype(np.int16)
-    if np.linalg.det(frame_from_index[:3, :3]) < 0:
-        enters = -enters
-    winding = np.zeros(sub, np.int16)
-    flat = winding.reshape(-1)
-    for tri, i, j, depth in cover(triangles, sub[:2]):
-        k = np.maximum(np.ceil(depth), 0).astype(int)
-        kept = k < sub[2]
-        where = (i[kept] * sub[1] + j[kept]) * sub[2] + k[kept]
-        np.add.at(flat, where, enters[tri[kept]])
-    np.cumsum(winding, axis=2, dtype=np.int16, out=winding)
-    out[low[0] : high[0], low[1] : high[1], low[2] : high[2]] = winding
+    out = _room(shape, np.int16)
+    _fill(mesh, frame_from_index, out, 0)
     return out
 
 
@@ -133,14 +108,50 @@ def voxelise(
 
     Overlapping sheets of a folded surface so cut no holes, as plain parity would.
     """
-    return winding_numbers(mesh, frame_from_index, shape) != 0
+    inside = _room(shape, np.uint8)
+    _fill(mesh, frame_from_index, inside, 1)
+    return inside.view(bool)
 
 
 def label_grid(
     anatomy: Anatomy, camera_from_index: Float[np.ndarray, "4 4"], shape: tuple[int, int, int]
 ) -> UInt8[np.ndarray, "i j k"]:
     """Labels of an anatomy on a grid: 1 organ, 2, 3, ... tumors; a tumor wins over the organ."""
-    labels = np.zeros(shape, np.uint8)
+    labels = _room(shape, np.uint8)
     for label, part in enumerate(anatomy.parts, start=1):
-        labels[voxelise(part, camera_from_index, shape)] = label
+        _fill(part, camera_from_index, labels, label)
     return labels
+
+
+def _room(shape: tuple[int, int, int], dtype: type) -> np.ndarray:
+    if np.prod(np.array(shape, float)) > _MOST_CELLS:
+        raise InputError(f"a grid of {' x '.join(map(str, shape))} voxels is too large.")
+    return np.zeros(shape, dtype)
+
+
+def _fill(mesh: Mesh, frame_from_index: np.ndarray, out: np.ndarray, value: int) -> None:
+    """See ``raster_kernels.fill``."""
+    from tumortrack.imaging import raster_kernels  # compiled: imports numba
+
+    if len(mesh.faces) == 0:
+        return
+    index = transform_points(np.linalg.inv(frame_from_index), mesh.vertices_mm)
+    low = np.clip(np.floor(index.min(0)), 0, out.shape).astype(int)
+    high = np.clip(np.ceil(index.max(0)) + 1, 0, out.shape).astype(int)
+    if (high <= low).any():
+        return
+    high[2] = out.shape[2]  # of an open mesh the rays do not leave what they entered
+    triangles = (index - low)[mesh.faces]
+    i, j, k = (high - low).tolist()
+    nothing = np.zeros(0, np.int32), np.zeros(0, np.int8)
+    first = np.zeros(i * j + 1, np.int64)
+    raster_kernels.crossings(triangles, (i, j, k), first, *nothing)
+    np.cumsum(first, out=first)
+    behind, sign = np.empty(first[-1], np.int32), np.empty(first[-1], np.int8)
+    if len(behind) == 0:
+        return
+    raster_kernels.crossings(triangles, (i, j, k), first[:-1].copy(), behind, sign)
+    if np.linalg.det(frame_from_index[:3, :3]) < 0:
+        sign = -sign
+    box = tuple(slice(a, b) for a, b in zip(low.tolist(), high.tolist(), strict=True))
+    raster_kernels.fill(first, behind, sign, value, out[box])
