@@ -1,0 +1,207 @@
+"""The warp's compiled kernels against plain forms: flow, sums, chances, rasters; and a steady
+loop."""
+
+from __future__ import annotations
+
+import tracemalloc
+
+import numpy as np
+import pytest
+from scipy.interpolate import RegularGridInterpolator
+from scipy.spatial.transform import Rotation
+from scipy.special import ndtr
+
+from elastic_objects import CENTER, RADII
+from tumortrack.core.types import Mesh, SensorCloud
+from tumortrack.imaging.raster import cover, label_grid, winding_numbers
+from tumortrack.learn.model import load_model
+from tumortrack.learn.warp.refine import _normal, _residuals
+from tumortrack.learn.warp.sharing import share
+from tumortrack.simulate.elastic.flow import BLOCK, steps_for
+from tumortrack.track.chance import normal_table, probabilities
+from tumortrack.track.estimate import Following
+from tumortrack.track.warp import WarpLocator
+from warp_objects import ANATOMY, PLACE_MM, TURNED, placed, shape
+
+
+def about(count, seed=0, reach=1.6):
+    """Points (n, 3) of the CT in the organ's box and round it, some beyond the lattice."""
+    way = np.random.default_rng(seed).uniform(-reach, reach, (count, 3))
+    return (CENTER + way * RADII).astype(np.float32)
+
+
+def plainly_followed(velocity, points, steps):
+    """``flow.follow`` in double precision: one array of all points, steps in a loop."""
+    body = shape().body
+    axes = [body.origin_mm[a] + body.spacing_mm * np.arange(velocity.shape[a]) for a in range(3)]
+    lower, upper = np.array([axis[0] for axis in axes]), np.array([axis[-1] for axis in axes])
+    field = RegularGridInterpolator(axes, velocity.astype(float))
+
+    def speed(places):
+        return field(np.clip(places, lower, upper - 0.001 * body.spacing_mm))
+
+    places = points.astype(float)
+    last, middle = speed(places), None
+    for step in range(steps):
+        if step == steps // 2:
+            middle = places + (0.5 / steps * last if steps % 2 else 0)
+        last = speed(places + 0.5 / steps * last)
+        places = places + last / steps
+    return places, middle
+
+
+# --- flow ---
+
+
+@pytest.mark.parametrize("count", [1, BLOCK - 1, BLOCK, 3 * BLOCK + 5, 9000])
+def test_points_go_where_a_plain_loop_takes_them(count):
+    body, motion = shape().body, placed()
+    velocity = (body.modes @ motion.coefficients).astype(np.float32)
+    np.testing.assert_allclose(body.velocity(motion.coefficients), velocity, atol=2e-5)
+    steps = steps_for(velocity, body.spacing_mm)
+    slope = max(np.abs(np.diff(velocity, axis=a)).max() for a in range(3)) / body.spacing_mm
+    assert steps == np.clip(np.ceil(10 * slope), 3, 24)
+    points = about(count)
+    truth, _ = plainly_followed(velocity, points, steps)
+    assert np.linalg.norm(truth - points, axis=1).max() > (1 if count > 1 else 0)
+    np.testing.assert_allclose(body.follow(velocity, points), truth, atol=2e-4)
+    carried = (truth - body.center_ct) @ TURNED.T + PLACE_MM
+    np.testing.assert_allclose(motion.carry(points), carried, atol=2e-4)
+
+
+def test_parts_are_all_done_once_and_errors_come_back():
+    done = np.zeros(10_000, int)
+    share(lambda part: done.__setitem__(part, done[part] + 1), len(done), 300)
+    assert (done == 1).all()
+    with pytest.raises(ZeroDivisionError):
+        share(lambda part: 1 // (part.start - 9900), len(done), 300)
+
+
+# --- refinement ---
+
+
+@pytest.mark.parametrize("state", [5, 73])
+def test_sums_are_those_of_the_rows_and_rows_those_of_plain_arithmetic(state):
+    body, motion = shape().body, placed(state)
+    points = motion.carry(ANATOMY.organ.vertices_mm[::5]).astype(np.float32)
+    points += np.random.default_rng(1).normal(0, 1.5, points.shape).astype(np.float32)
+    pose = (motion.rotation, motion.centre_mm, 0.9 * motion.coefficients)
+    rows = _residuals(shape(), points, pose).astype(float)
+    distance, sums = _normal(shape(), points, pose, 2.0)
+    np.testing.assert_array_equal(distance, rows[:, -1])
+    assert np.abs(distance).max() > 2
+    pulled = rows / (1 + (rows[:, -1:] / 2.0) ** 2)
+    np.testing.assert_allclose(sums, pulled.T @ pulled, atol=1e-5 * np.abs(sums).max())
+
+    velocity = body.velocity(-pose[2])
+    offsets = (points.astype(float) - pose[1]) @ pose[0]
+    rest, middle = plainly_followed(
+        velocity, offsets + body.center_ct, steps_for(velocity, body.spacing_mm)
+    )
+    distances, outwards = shape().distances[0].with_slope(rest.astype(np.float32))
+    np.testing.assert_allclose(rows[:, -1], distances, atol=1e-3)
+    by_modes = -np.einsum("ndm,nd->nm", body.modes_at(middle), outwards)
+    plain = np.concatenate([-outwards, -np.cross(offsets, outwards), by_modes], axis=1)
+    same = np.isclose(rows[:, :-1], plain, atol=0.02).all(1)  # others lie on a cell's border
+    assert same.mean() > 0.99
+
+
+def test_deviations_are_those_of_plain_products():
+    rng = np.random.default_rng(2)
+    base, points = placed(), about(300, 3, 0.9)
+    mixed = rng.normal(size=(26, 26)) * 0.05
+    motion = type(base)(
+        base.shape,
+        base.rotation,
+        base.centre_mm,
+        base.coefficients,
+        mixed @ mixed.T + 1e-4 * np.eye(26),
+    )
+    velocity = base.shape.body.velocity(base.coefficients)
+    steps = steps_for(velocity, base.shape.body.spacing_mm)
+    places, middle = plainly_followed(velocity, points, steps)
+    offsets, modes = places - base.shape.body.center_ct, base.shape.body.modes_at(middle)
+    variance = np.zeros(len(points))
+    for axis, along in enumerate(np.eye(3)):
+        turn = np.cross(offsets, np.tile(along, (len(points), 1)))
+        row = np.column_stack([np.tile(along, (len(points), 1)), turn, modes[:, axis]])
+        variance += np.einsum("nk,kl,nl->n", row, motion.covariance, row)
+    assert np.ptp(variance) > 0.1
+    np.testing.assert_allclose(motion.std_mm(points), np.sqrt(variance / 3), rtol=1e-3)
+
+
+def test_chances_are_the_normal_distributions():
+    margins = np.linspace(0, 30, 5000, dtype=np.float32)
+    which = np.arange(5000) % 3
+    std_mm = np.array([0.3, 1.0, 4.0])
+    told = probabilities(margins, 1 / std_mm, which, normal_table())
+    np.testing.assert_allclose(told, ndtr(margins / std_mm[which]), atol=3e-7)
+    assert told.min() == 0.5
+    assert told.max() == 1
+
+
+# --- labels on a grid ---
+
+
+def plain_winding(mesh, frame_from_index, size):
+    """Winding numbers by ``cover`` and a sum along each ray."""
+    index = (mesh.vertices_mm - frame_from_index[:3, 3]) @ np.linalg.inv(frame_from_index[:3, :3]).T
+    triangles = index[mesh.faces]
+    a, b = (triangles[:, n, :2] - triangles[:, 0, :2] for n in (1, 2))
+    enters = -np.sign(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).astype(int)
+    enters = enters * int(np.sign(np.linalg.det(frame_from_index[:3, :3])))
+    steps = np.zeros((*size[:2], size[2] + 1), int)
+    for tri, i, j, depth in cover(triangles, size[:2]):
+        k = np.clip(np.ceil(depth), 0, size[2]).astype(int)
+        np.add.at(steps, (i, j, k), enters[tri])
+    return steps.cumsum(2)[:, :, :-1]
+
+
+@pytest.mark.parametrize(("seed", "mirror"), [(0, 1), (1, -1), (2, 1)])
+def test_labels_of_every_voxel_are_those_of_the_plain_form(seed, mirror):
+    turn = Rotation.random(random_state=seed).as_matrix() @ np.diag([2.1, 2.4, mirror * 1.9])
+    size = (36, 44, 52)
+    frame_from_index = np.eye(4)
+    frame_from_index[:3, :3] = turn
+    frame_from_index[:3, 3] = CENTER - turn @ (
+        np.array(size) / 2 + [0.3, 9, 4]
+    )  # part lies outside
+    labels = np.zeros(size, np.uint8)
+    for label, part in enumerate(ANATOMY.parts, start=1):
+        plain = plain_winding(part, frame_from_index, size)
+        assert np.array_equal(winding_numbers(part, frame_from_index, size), plain)
+        labels[plain != 0] = label
+    assert set(np.unique(labels)) == {0, 1, 2}
+    assert np.array_equal(label_grid(ANATOMY, frame_from_index, size), labels)
+
+
+def test_open_and_nested_surfaces_wind_as_in_the_plain_form():
+    whole = ANATOMY.organ
+    few = Mesh(whole.vertices_mm, whole.faces[len(whole.faces) // 3 :])
+    vertices = np.concatenate([whole.vertices_mm, CENTER + 0.6 * (whole.vertices_mm - CENTER)])
+    twice = Mesh(vertices, np.concatenate([whole.faces, whole.faces + len(whole.vertices_mm)]))
+    frame_from_index = np.diag([3.0, 3, 3, 1])
+    frame_from_index[:3, 3] = CENTER - [60.3, 59.2, 60.7]
+    for mesh, most in ((few, 1), (twice, 2)):
+        plain = plain_winding(mesh, frame_from_index, (40, 40, 40))
+        found = winding_numbers(mesh, frame_from_index, (40, 40, 40))
+        assert np.array_equal(found, plain)
+        assert found.max() == most
+
+
+# --- frames ---
+
+
+def test_frames_leave_no_memory_behind(slim_model):
+    locator = WarpLocator(load_model(slim_model, "cpu"))
+    vertices = placed().carry(ANATOMY.organ.vertices_mm)
+    seen = vertices[vertices[:, 2] < np.median(vertices[:, 2])]
+    rng, last, sizes = np.random.default_rng(0), None, []
+    tracemalloc.start()
+    for frame in range(80):
+        cloud = (seen + rng.normal(0, 0.2, 3)).astype(np.float32)
+        last = locator.follow(SensorCloud(cloud, frame), last, Following())
+        sizes.append(tracemalloc.get_traced_memory()[0])
+    tracemalloc.stop()
+    assert "follow" in last.report["timings"]
+    assert max(sizes[-20:]) < max(sizes[15:40]) + 50_000
