@@ -136,10 +136,10 @@ def test_peak_memory_is_seen() -> None:
     before = forget_peak()
     if before is None:
         pytest.skip("this system does not tell")
-    np.ones(2**25)  # 256 MiB, at once freed again
+    np.ones(2**24)  # 128 MiB, at once freed again; the system's own count is not exact
     held = peak_bytes()
     assert held is not None
-    assert 2**28 < held - before < 2**28 + 2**27
+    assert 0.95 * 2**27 < held - before < 1.5 * 2**27
 
 
 def some_bench() -> Bench:

@@ -151,11 +151,24 @@ class Asked:
         return once
 
     def our_frame(self, queries: np.ndarray) -> Call:
-        def once() -> None:
-            latent = self.inference.encode(self.points_mm)
-            self.inference.logits(latent, queries).argmax(-1).cpu()
+        return lambda: self.frame_labels(queries)
 
-        return once
+    def frame_labels(self, queries: np.ndarray) -> tuple[np.ndarray, int]:
+        """A frame's labels as `locate` finds them, and how many points the network was asked:
+        those of a lattice, and the queries whose label that does not tell."""
+        from tumortrack.learn.fit import FIT_STEPS
+        from tumortrack.learn.lattice import lattice_over
+        from tumortrack.track.sparse import sparse_logits
+
+        latent, counted = self.inference.encode(self.points_mm), [0]
+
+        def logits_at(points_mm: np.ndarray) -> torch.Tensor:
+            counted[0] += len(points_mm)
+            return self.inference.logits(latent, points_mm)
+
+        box_mm = np.stack([queries.min(0), queries.max(0)]).astype(float)
+        lattice = lattice_over(logits_at, box_mm, FIT_STEPS)
+        return sparse_logits(logits_at, lattice, queries).argmax(-1), counted[0]
 
 
 def asked_of(subject: Subject, preset: str) -> Asked:

@@ -35,7 +35,8 @@ def frame_rows(subject: Subject, threads: int, budget_s: float) -> Iterator[Row]
 def occupancy_frame(asked: Asked, preset: str, threads: int, budget_s: float) -> Row:
     queries = asked.queries(QUERIES)
     ours, naive = in_turns(asked.our_frame(queries), asked.naive_frame(queries), budget_s=budget_s)
-    encode, decode = asked.encoder_work(), asked.decoder_work(QUERIES)
+    labels, count = asked.frame_labels(queries)
+    encode, decode = asked.encoder_work(), asked.decoder_work(count)
     return Row(
         name=FRAME,
         what=preset,
@@ -50,7 +51,9 @@ def occupancy_frame(asked: Asked, preset: str, threads: int, budget_s: float) ->
             precision=decode.precision,
         ),
         naive_work=asked.naive_decoder_work(QUERIES),
-        agreement=asked.agreement(queries),
+        agreement=float((labels == asked.naive_labels(queries)).mean()),
+        others={"asked": count},
+        note=f"{count:,} points asked",
         device=asked.device,
     )
 

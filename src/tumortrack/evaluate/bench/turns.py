@@ -48,9 +48,9 @@ class Timing(Config, frozen=True):
 
 
 def in_turns(*versions: Call, budget_s: float, fewest: int = _FEWEST) -> list[Timing]:
-    """Seconds a call of each version. Every version is called once before (compiled, cached, warm);
-    then all take turns until ``budget_s`` is spent, between ``fewest`` and 25 times each; fewer only
-    where that would take more than twice as long."""
+    """Seconds a call of each version. Every version is called before (compiled, cached, warm);
+    then all take turns until ``budget_s`` is spent, between ``fewest`` and 25 times each; fewer
+    only where that would take more than twice as long."""
     repeats = [_repeats(version) for version in versions]
     seconds: list[list[float]] = [[] for _ in versions]
     begun = time.perf_counter()
