@@ -16,7 +16,7 @@ from tumortrack.simulate.scene_folder import list_scenes, read_scene
 
 def test_the_demo_tells_the_whole_story(tmp_path):
     out = tmp_path / "demo"
-    said = succeeded(tumortrack("demo", "--out", out, "--minutes", 0.1, "--scenes", 2))
+    said = succeeded(tumortrack("demo", "--out", out, "--minutes", 0.03, "--scenes", 2))
     assert [f"{n}/5" in said for n in range(1, 6)] == [True] * 5
     case = load_case(out / "case")
     assert case.ct is not None

@@ -18,7 +18,7 @@ from tumortrack.phantom.scanner import ScannerParameters, scan
 
 # Volumes in ml, from the data set's own voxels: the tumor-bearing kidney and its tumor.
 PATIENTS = {"case_00000": (215.0, 7.8), "case_00002": (289.0, 35.0), "case_00003": (202.0, 10.2)}
-STEPS = 40  # enough to run the chain, not to be accurate; docs/results.md has real training
+STEPS = 12  # enough to run the chain, not to be accurate; docs/results.md has real training
 
 
 @pytest.fixture(scope="module")

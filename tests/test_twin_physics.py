@@ -248,7 +248,8 @@ def test_a_stiffer_tumor_deforms_less() -> None:
     assert 0 < heights[5.0] < 0.8 * heights[1.0]
 
 
-def test_a_load_that_finds_no_rest_is_an_error(bench: Bench) -> None:
+def test_a_load_that_finds_no_rest_is_an_error(bench: Bench, monkeypatch) -> None:
+    monkeypatch.setattr("tumortrack.evaluate.twin.equilibrium._ITERATIONS", 150)
     trap = (Plate((0.0, 0.0, 15.0), (100.0, 100.0, 14.9), 1.0),)  # swallows the organ whole
     with pytest.raises(TumortrackError, match="no equilibrium"):
         bench.settle(bench.mesh.nodes_mm, trap, weight=1e6)

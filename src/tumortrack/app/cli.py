@@ -558,10 +558,8 @@ def main() -> None:
     # PyTorch and its kin make objects by the hundred thousand that live to the end: to look through
     # them for garbage again and again is a tenth of the time of their import.
     gc.set_threshold(_OBJECTS_A_COLLECTION)
-    try:
-        sys.exit(run(sys.argv[1:]))
-    finally:
-        gc.freeze()  # the memory goes back with the process: no last search, half a second long
+    if code := run(sys.argv[1:]):
+        sys.exit(code)
 
 
 def run(arguments: list[str]) -> int:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from tumortrack.app.console import console, progress_bar, say
+from tumortrack.app.loading import keep_loaded
 from tumortrack.app.pretraining import start_of
 from tumortrack.app.scenes import SimulateOptions, check_case, write_scenes
 from tumortrack.core import store
@@ -75,6 +76,7 @@ def train(case_folder: Path, folder: Path, options: TrainOptions) -> None:
     from tumortrack.learn.train import Run, run_identity
     from tumortrack.learn.train import train as fit
 
+    keep_loaded()
     run = Run(
         anatomy_ct=case.anatomy,
         up_lps=case.up_lps,
@@ -129,6 +131,7 @@ def locate(model_folder: Path, source: Path, out: Path, options: LocateOptions) 
     from tumortrack.track.files import write_estimate
     from tumortrack.track.tracker import Tracker
 
+    keep_loaded()
     model = load_model(model_folder, options.device)
     tracker, notes = Tracker(model), (*notes, *model.notes)
     points = _near_organ(points, tracker.anatomy_ct, str(options.map_points))
@@ -248,6 +251,7 @@ def evaluate(
     from tumortrack.learn.model import load_model
     from tumortrack.track.tracker import Tracker
 
+    keep_loaded()
     model = load_model(model_folder, device)
     check_case(model, folders)
     about = {

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from tumortrack.app.console import console, say
+from tumortrack.app.loading import keep_loaded
 from tumortrack.core import store
 from tumortrack.core.config import to_builtins
 from tumortrack.core.errors import InputError, StorageError
@@ -88,6 +89,8 @@ def track(
     from tumortrack.track.reader import Reader
     from tumortrack.track.tracker import Tracker
 
+    if arms is None:
+        keep_loaded()
     model = load_model(model_folder, options.device)
     for note in model.notes:
         say(f"note: {note}")

@@ -139,8 +139,8 @@ def _behind(
 def _draw_cuts(
     axes: Axes,
     plan: ResectionPlan,
-    in_organ: list[Bool[np.ndarray, " n"]],
-    hidden: list[Bool[np.ndarray, " n"]],
+    in_organ: list[Bool[np.ndarray, " _"]],
+    hidden: list[Bool[np.ndarray, " _"]],
     view: View,
 ) -> None:
     """The lowest first and, from above, widest, so that strokes above each other all show; what
