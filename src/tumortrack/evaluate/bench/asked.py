@@ -52,7 +52,7 @@ class Asked:
     def inference(self) -> Inference:
         from tumortrack.learn.inference import Inference
 
-        return Inference(self.network)
+        return Inference(self.network, self.model.arithmetic)
 
     @cached_property
     def plain(self) -> NaiveOccupancy:
@@ -84,11 +84,9 @@ class Asked:
             labels = [self.plain.logits(encoded, piece)[0].argmax(-1) for piece in pieces]
         return torch.cat(labels).cpu().numpy()
 
-    def agreement(self, queries: np.ndarray) -> float:
-        """Share of our labels that are the naive form's."""
-        latent = self.inference.encode(self.points_mm)
-        mine = self.inference.logits(latent, queries).argmax(-1).cpu().numpy()
-        return float((mine == self.naive_labels(queries)).mean())
+    def agreement(self, labels: np.ndarray, queries: np.ndarray) -> float:
+        """Share of labels that are the naive form's."""
+        return float((labels == self.naive_labels(queries)).mean())
 
     @cached_property
     def precision(self) -> Precision:
@@ -150,25 +148,29 @@ class Asked:
 
         return once
 
-    def our_frame(self, queries: np.ndarray) -> Call:
-        return lambda: self.frame_labels(queries)
-
-    def frame_labels(self, queries: np.ndarray) -> tuple[np.ndarray, int]:
-        """A frame's labels as `locate` finds them, and how many points the network was asked:
-        those of a lattice, and the queries whose label that does not tell."""
+    def our_frame(self, queries: np.ndarray) -> tuple[np.ndarray, int]:
+        """Labels as `locate` finds them, and how many places were asked for: logits on a lattice
+        over the queries' box, linear between its points where that is plain, else asked."""
         from tumortrack.learn.fit import FIT_STEPS
         from tumortrack.learn.lattice import lattice_over
         from tumortrack.track.sparse import sparse_logits
 
-        latent, counted = self.inference.encode(self.points_mm), [0]
+        latent, asked = self.inference.encode(self.points_mm), 0
 
         def logits_at(points_mm: np.ndarray) -> torch.Tensor:
-            counted[0] += len(points_mm)
+            nonlocal asked
+            asked += len(points_mm)
             return self.inference.logits(latent, points_mm)
 
-        box_mm = np.stack([queries.min(0), queries.max(0)]).astype(float)
-        lattice = lattice_over(logits_at, box_mm, FIT_STEPS)
-        return sparse_logits(logits_at, lattice, queries).argmax(-1), counted[0]
+        box = np.stack([queries.min(0), queries.max(0)]).astype(float)
+        lattice = lattice_over(logits_at, box, FIT_STEPS)
+        return sparse_logits(logits_at, lattice, queries).argmax(-1), asked
+
+    def every_query(self, queries: np.ndarray) -> np.ndarray:
+        """Labels by asking at every place."""
+        latent = self.inference.encode(self.points_mm)
+        labels: np.ndarray = self.inference.logits(latent, queries).argmax(-1).cpu().numpy()
+        return labels
 
 
 def asked_of(subject: Subject, preset: str) -> Asked:

@@ -3,59 +3,73 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from itertools import cycle
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from tumortrack.core.types import SensorCloud
 from tumortrack.evaluate.bench import asked as occupancy
 from tumortrack.evaluate.bench import placing as warp
-from tumortrack.evaluate.bench.asked import Asked, asked_of
+from tumortrack.evaluate.bench.asked import LABELLING, Asked, asked_of
 from tumortrack.evaluate.bench.placing import QUERIES, Placing
 from tumortrack.evaluate.bench.row import Row, Work
 from tumortrack.evaluate.bench.subject import PRESETS
 from tumortrack.evaluate.bench.turns import in_turns
+from tumortrack.track.estimate import Following
 
 if TYPE_CHECKING:
     from tumortrack.evaluate.bench.subject import Subject
+    from tumortrack.track.tracker import Tracker
 
-FRAME, TRACKING = "frame", "tracking frame"
+FRAME, EVERY, TRACKING = "frame", "frame, every query asked", "tracking frame"
+_CARRIED = 20_000  # points that a live estimate of a warp holds
 _MOVES_MM = 0.5  # of the cloud, from frame to frame
 
 
 def frame_rows(subject: Subject, threads: int, budget_s: float) -> Iterator[Row]:
     """1,000 points to 40,000 labels."""
-    for preset in PRESETS:
-        share = budget_s / len(PRESETS)
-        if preset == "clinic":
-            yield _clinic_frame(subject, threads, share)
-        else:
-            yield occupancy_frame(asked_of(subject, preset), preset, threads, share)
+    share = budget_s / len(PRESETS)
+    yield _clinic_frame(subject, threads, share)
+    for preset in LABELLING:
+        yield from occupancy_frames(asked_of(subject, preset), preset, threads, share)
 
 
-def occupancy_frame(asked: Asked, preset: str, threads: int, budget_s: float) -> Row:
+def occupancy_frames(asked: Asked, preset: str, threads: int, budget_s: float) -> Iterator[Row]:
+    """As `locate` does it, and with every query asked."""
     queries = asked.queries(QUERIES)
-    ours, naive = in_turns(asked.our_frame(queries), asked.naive_frame(queries), budget_s=budget_s)
-    labels, count = asked.frame_labels(queries)
-    encode, decode = asked.encoder_work(), asked.decoder_work(count)
-    return Row(
-        name=FRAME,
-        what=preset,
-        threads=threads,
-        item="frame",
-        ours=ours,
-        naive=naive,
-        naive_is=occupancy.NAIVE,
-        work=Work(
-            flops=encode.flops + decode.flops,
-            bytes=encode.bytes + decode.bytes,
-            precision=decode.precision,
-        ),
-        naive_work=asked.naive_decoder_work(QUERIES),
-        agreement=float((labels == asked.naive_labels(queries)).mean()),
-        others={"asked": count},
-        note=f"{count:,} points asked",
-        device=asked.device,
+    ours, every, naive = in_turns(
+        lambda: asked.our_frame(queries),
+        lambda: asked.every_query(queries),
+        asked.naive_frame(queries),
+        budget_s=budget_s,
     )
+    found, asked_for = asked.our_frame(queries)
+    encode = asked.encoder_work()
+    for name, timing, labels, count in (
+        (FRAME, ours, found, asked_for),
+        (EVERY, every, asked.every_query(queries), QUERIES),
+    ):
+        decode = asked.decoder_work(count)
+        yield Row(
+            name=name,
+            what=preset,
+            threads=threads,
+            item="frame",
+            ours=timing,
+            naive=naive,
+            naive_is=occupancy.NAIVE,
+            work=Work(
+                flops=encode.flops + decode.flops,
+                bytes=encode.bytes + decode.bytes,
+                precision=decode.precision,
+            ),
+            naive_work=asked.naive_decoder_work(QUERIES),
+            agreement=asked.agreement(labels, queries),
+            others={"asked": count},
+            note="" if count == QUERIES else f"{count:,} places asked for {QUERIES:,} labels",
+            device=asked.device,
+        )
 
 
 def _clinic_frame(subject: Subject, threads: int, budget_s: float) -> Row:
@@ -84,32 +98,49 @@ def _clinic_frame(subject: Subject, threads: int, budget_s: float) -> Row:
 
 
 def tracking_rows(subject: Subject, threads: int, budget_s: float) -> Iterator[Row]:
-    """The default preset from frame to frame: a cloud that moves by half a millimetre."""
-    from tumortrack.core.types import SensorCloud
-    from tumortrack.track.estimate import Following
+    """From frame to frame: a cloud that moves by half a millimetre, to and fro."""
+    from tumortrack.track.tracker import Tracker
 
+    share = budget_s / len(PRESETS)
     placing = Placing(subject)
-    points, how = placing.cloud.points_mm, Following()
-    swing = np.array([_MOVES_MM, 0.0, 0.0], np.float32)
-    frames = [SensorCloud(points + sign * swing / 2) for sign in (1, -1)]
-    last = [placing.tracker.follow(frames[0], None, how)]
-    turn = [0]
-
-    def ours() -> None:
-        turn[0] = 1 - turn[0]
-        last[0] = placing.tracker.follow(frames[turn[0]], last[0], how)
-
-    ours_s, naive = in_turns(ours, placing.naive, budget_s=budget_s)
-    steps = last[0].report["motion"]["steps"]
-    unknown = 6 + len(last[0].report["motion"]["coefficients"])
+    ours = _Following(placing.tracker, placing.cloud.points_mm)
+    (timing, naive) = in_turns(ours, placing.naive, budget_s=share)
+    steps, coefficients = (ours.last.report["motion"][key] for key in ("steps", "coefficients"))
     yield Row(
         name=TRACKING,
         what="clinic",
         threads=threads,
         item="frame",
-        ours=ours_s,
+        ours=timing,
         naive=naive,
         naive_is=warp.NAIVE + ", every frame from the start",
-        work=placing.work(unknown, steps, 20_000),
-        note=f"steady state: {steps} refinement steps, 20,000 points carried, surfaces, report",
+        work=placing.work(6 + len(coefficients), steps, _CARRIED),
+        note=f"steady state: {steps} refinement steps, points carried, surfaces, report",
     )
+    for preset in LABELLING:
+        asked = asked_of(subject, preset)
+        ours = _Following(Tracker(subject.model(preset)), asked.points_mm)
+        timing, naive = in_turns(ours, asked.naive_frame(asked.queries(QUERIES)), budget_s=share)
+        yield Row(
+            name=TRACKING,
+            what=preset,
+            threads=threads,
+            item="frame",
+            ours=timing,
+            naive=naive,
+            naive_is=occupancy.NAIVE + "; every frame from the start",
+            note="steady state: labels, surfaces, report",
+        )
+
+
+class _Following:
+    """The live loop's frames, one a call."""
+
+    def __init__(self, tracker: Tracker, points_mm: np.ndarray) -> None:
+        swing = np.array([_MOVES_MM / 2, 0.0, 0.0], np.float32)
+        self._tracker = tracker
+        self._frames = cycle([SensorCloud(points_mm + swing), SensorCloud(points_mm - swing)])
+        self.last = tracker.follow(next(self._frames), None, Following())
+
+    def __call__(self) -> None:
+        self.last = self._tracker.follow(next(self._frames), self.last, Following())
