@@ -4,7 +4,7 @@ BIN := .venv/bin
 SETUP := .venv/.installed
 
 .DEFAULT_GOAL := help
-.PHONY: help setup debian demo test check bench soak results headstart clean
+.PHONY: help setup debian demo test check bench soak results headstart training-speed clean
 
 help:  ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 10
@@ -43,6 +43,9 @@ results: setup  ## the tables and plots of docs/results.md (hours; ARGS=--quick:
 
 headstart: setup  ## accuracy against training steps from pretrained weights (ARGS=--start OUT)
 	$(BIN)/python bench/pretraining.py $(ARGS)
+
+training-speed: setup  ## accuracy reached per second, by batch, learning rate and queries (half an hour)
+	$(BIN)/python bench/training.py $(ARGS)
 
 clean:  ## remove .venv and caches (runs/ stays)
 	rm -rf .venv .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache
