@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 from tumortrack.evaluate.bench.asked import LABELLING, Asked
-from tumortrack.evaluate.bench.frames import occupancy_frame
+from tumortrack.evaluate.bench.frames import occupancy_frames
 from tumortrack.evaluate.bench.row import Row
 from tumortrack.evaluate.bench.volume import asked_volume
 
@@ -29,5 +29,5 @@ def rows(subject: Subject, threads: int, budget_s: float) -> Iterator[Row]:
         model = load_model(subject.model_folder(preset), "cuda")
         asked = Asked(model, subject.cloud(preset).points_mm, "cuda")
         share = budget_s / len(LABELLING) / 2
-        yield occupancy_frame(asked, preset, threads, share)
+        yield from occupancy_frames(asked, preset, threads, share)
         yield asked_volume(asked, preset, threads, share)

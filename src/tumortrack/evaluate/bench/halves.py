@@ -80,7 +80,8 @@ def _decoded(asked: Asked, preset: str, count: int, threads: int, budget_s: floa
     import torch
 
     latent, queries = asked.inference.encode(asked.points_mm), asked.queries(count)
-    piece = torch.from_numpy(queries[:IN_ONE_PIECE])[None]
+    first = queries[:IN_ONE_PIECE]
+    piece = torch.from_numpy(first)[None]
     scaled = count / piece.shape[1]
     with torch.inference_mode():
         encoded = asked.plain.encode(asked.cloud)
@@ -99,6 +100,6 @@ def _decoded(asked: Asked, preset: str, count: int, threads: int, budget_s: floa
         naive_is=NAIVE,
         work=asked.decoder_work(count),
         naive_work=asked.naive_decoder_work(count),
-        agreement=asked.agreement(queries[:IN_ONE_PIECE]),
+        agreement=asked.agreement(asked.every_query(first), first),
         note="" if scaled == 1 else f"naive: measured on {IN_ONE_PIECE:,}, scaled",
     )

@@ -47,7 +47,7 @@ GROUPS: dict[str, Group] = {
     "encoder": Group(halves.encoder_rows, (1,), 6.0, 1.5, ALL),
     "decoder": Group(halves.decoder_rows, (1,), 40.0, 4.0, ALL),
     "frame": Group(frames.frame_rows, (1, 2), 24.0, 4.0, ALL),
-    "tracking": Group(frames.tracking_rows, (1, 2), 6.0, 1.5, ("clinic",)),
+    "tracking": Group(frames.tracking_rows, (1, 2), 12.0, 2.0, ALL),
     "volume": Group(volume.rows, (1, 2), 30.0, 6.0, ALL),
     "command": Group(command.rows, (2,), 40.0, 6.0, ALL),
     "planning": Group(planning.rows, (1,), 12.0, 2.0),
