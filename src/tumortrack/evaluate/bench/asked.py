@@ -64,7 +64,7 @@ class Asked:
     def cloud(self) -> torch.Tensor:
         import torch
 
-        return torch.from_numpy(self.points_mm)[None].to(self.device)
+        return torch.tensor(self.points_mm)[None].to(self.device)
 
     def queries(self, count: int) -> np.ndarray:
         """Evenly in the box about the cloud where the organ can be."""

@@ -52,7 +52,7 @@ def _clinic_encoder(subject: Subject, threads: int, budget_s: float) -> Row:
     assert model.shape is not None
     shape, network = model.shape, model.network
     (ours,) = in_turns(lambda: first_motions(network, shape, points), budget_s=budget_s)  # type: ignore[arg-type]
-    cloud = torch.from_numpy(points)[None]
+    cloud = torch.tensor(points)[None]
     with torch.inference_mode():
         flops = module_flops(lambda: network.both_ways(cloud))  # type: ignore[operator]
     moved = weight_bytes(network, 4) + points.nbytes
