@@ -57,12 +57,13 @@ from tumortrack.phantom.digital import PhantomParameters
 from tumortrack.simulate.bodies import body_for
 from tumortrack.simulate.dataset import SceneStream
 from tumortrack.simulate.occupancy import organ_pool
-from tumortrack.simulate.scene import SceneConfig, Simulator
+from tumortrack.simulate.scene import Simulator
 
 BLOCK = "training-speed"
 CPU = torch.device("cpu")
 UNSEEN_SEED = 1_000_003  # of the judged scenes and their library of states
 BATCHES = (8, 16, 32, 64)
+USUAL_BATCH = {"quick": 16, "clinic": 32}
 COLORS = dict(zip(BATCHES, ("#D55E00", "#0072B2", "#009E73", "#CC79A7"), strict=True))
 Preset = Literal["quick", "clinic"]
 
@@ -97,9 +98,8 @@ class Setting:
 
     @property
     def name(self) -> str:
-        return (
-            f"{self.preset}_{self.batch}_{self.per_side}_{self.learning_rate * 1e5:.0f}_{self.seed}"
-        )
+        numbers = (self.batch, self.per_side, f"{self.learning_rate * 1e5:.0f}", self.seed)
+        return "_".join(map(str, (self.preset, *numbers)))
 
     def config(self, case: Case) -> TrainConfig:
         """The preset with this setting's numbers."""
@@ -120,14 +120,10 @@ def settings(case: Case, options: Options) -> Iterator[Setting]:
     for preset, seed in (*(("quick", n) for n in range(options.seeds)), ("clinic", 0)):
         usual = PRESETS[preset](case.anatomy, "limited")
         rate, per_side = usual.schedule.learning_rate, usual.scene.occupancy.per_side
+        others = [batch for batch in BATCHES if batch != usual.batch_size]
         rows = [(batch, per_side, rate) for batch in BATCHES]
-        rows += [
-            (batch, per_side, round(rate * (batch / usual.batch_size) ** 0.5, 6))
-            for batch in BATCHES
-            if batch != usual.batch_size
-        ]
-        if preset == "quick":
-            rows += [(usual.batch_size, sides, rate) for sides in (32, 128)]
+        rows += [(n, per_side, round(rate * (n / usual.batch_size) ** 0.5, 6)) for n in others]
+        rows += [(usual.batch_size, sides, rate) for sides in (32, 128) if preset == "quick"]
         for row in rows:
             yield Setting(preset, *row, seed)
 
@@ -143,9 +139,7 @@ def main(options: Options) -> None:
         about = {
             "setting": asdict(setting),
             "case_sha256": store.sha256_of(folder / store.MANIFEST),
-            "seconds": options.seconds,
-            "scenes": options.scenes,
-            "looks": options.looks,
+            **{name: getattr(options, name) for name in ("seconds", "scenes", "looks")},
         }
         cell = options.out / f"{setting.name}.json"
         if not (cell.is_file() and (known := store.read_json(cell))["about"] == about):
@@ -157,10 +151,8 @@ def main(options: Options) -> None:
         rows.append((setting, known["curve"]))
         last = rows[-1][1][-1]
         say(f"{setting.name}: " + " ".join(f"{k}={round(v, 3)}" for k, v in last.items()))
-    command = shlex.join(["make", "training-speed"])
-    if given := shlex.join(sys.argv[1:]):
-        command += f" ARGS='{given}'"
-    _write(rows, options, Book(options.document, command))
+    given = f" ARGS='{shlex.join(sys.argv[1:])}'" if sys.argv[1:] else ""
+    _write(rows, options, Book(options.document, f"make training-speed{given}"))
 
 
 def _curve(case: Case, setting: Setting, judge: Judge, options: Options) -> list[dict]:
@@ -199,9 +191,8 @@ class Judge:
         own = PRESETS[preset](case.anatomy, "limited")
         few = msgspec.structs.replace(own, validation_pairs=scenes)
         other = (clinic if preset == "quick" else quick)(case.anatomy, "limited").scene.deform
-        strange = msgspec.structs.replace(
-            few, scene=msgspec.structs.replace(own.scene, deform=other[-1:])
-        )
+        scene = msgspec.structs.replace(own.scene, deform=other[-1:])
+        strange = msgspec.structs.replace(few, scene=scene)
         self._parts = len(case.anatomy.parts) + 1
         self._sets = {"miou": _scenes(case, few), "other_miou": _scenes(case, strange)}
         body = body_for(case.anatomy, case.up_lps, own.scene, 0)
@@ -226,10 +217,9 @@ class Judge:
 
 
 def _scenes(case: Case, config: TrainConfig) -> ValidationScenes:
-    scene: SceneConfig = config.scene
-    body = body_for(case.anatomy, case.up_lps, scene, UNSEEN_SEED)
-    simulator = Simulator(case.anatomy, case.up_lps, scene, body)
-    pool = organ_pool(case.anatomy, scene.occupancy, UNSEEN_SEED)
+    body = body_for(case.anatomy, case.up_lps, config.scene, UNSEEN_SEED)
+    simulator = Simulator(case.anatomy, case.up_lps, config.scene, body)
+    pool = organ_pool(case.anatomy, config.scene.occupancy, UNSEEN_SEED)
     return validation_scenes(simulator, pool, config, UNSEEN_SEED)
 
 
@@ -251,10 +241,8 @@ def _write(rows: Rows, options: Options, book: Book) -> None:
         _groups(rows).items(), key=lambda item: (item[0][0], -_reached(item[1]))
     ):
         speed = np.mean([curve[-1]["samples"] / curve[-1]["seconds"] for curve in curves])
-        last = [
-            " | ".join(f"{curve[-1][key]:.3f}" for curve in curves)
-            for key in ("miou", "other_miou")
-        ]
+        keys = ("miou", "other_miou")
+        last = [" / ".join(f"{curve[-1][key]:.3f}" for curve in curves) for key in keys]
         sides = str(per_side) if preset == "quick" else "-"
         body.append([preset, str(batch), sides, f"{rate:g}", f"{speed:.0f}", *last])
     image = book.images / "training_speed.png"
@@ -275,31 +263,27 @@ def _reached(curves: list[list[dict]]) -> float:
 
 
 def _draw(rows: Rows, path: Path) -> None:
-    """The mean of both kinds against seconds: by batch, and by queries a scene."""
-    groups = _groups(rows)
-    usual = {"quick": (64, 3e-3), "clinic": (256, 1.5e-3)}
-    panels = (("quick", "batch"), ("quick", "queries"), ("clinic", "batch"))
+    """The mean of both kinds against seconds, by batch and rate, and by queries a scene."""
     figure = new_figure(13.5, 4.0)
-    for number, (preset, what) in enumerate(panels, start=1):
-        axes = figure.add_subplot(1, len(panels), number)
-        for (name, batch, per_side, rate), curves in sorted(groups.items()):
-            same_sides, same_rate = per_side == usual[preset][0], rate == usual[preset][1]
-            if (
-                name != preset
-                or (what == "batch") > same_sides
-                or (what != "batch" and batch != 16)
-            ):
+    for number, (preset, what) in enumerate(
+        (("quick", "batch"), ("quick", "queries"), ("clinic", "batch")), start=1
+    ):
+        axes = figure.add_subplot(1, 3, number)
+        usual = next(s for s, _ in rows if s.preset == preset and s.batch == USUAL_BATCH[preset])
+        for s, curve in rows:
+            by_batch = what == "batch" and s.per_side == usual.per_side
+            alike = (s.batch, s.learning_rate) == (usual.batch, usual.learning_rate)
+            if s.preset != preset or not (by_batch or (what == "queries" and alike)):
                 continue
-            if what != "batch" and not same_rate:
-                continue
-            seconds = np.mean([[row["seconds"] for row in curve] for curve in curves], 0)
-            miou = [[(row["miou"] + row["other_miou"]) / 2 for row in curve] for curve in curves]
-            label = f"batch {batch}, rate {rate:g}" if what == "batch" else f"{per_side} per side"
-            color = COLORS[batch] if what == "batch" else f"C{(32, 64, 128).index(per_side)}"
-            style = "-" if same_rate else "--"
-            axes.plot(seconds, np.mean(miou, 0), style, color=color, marker=".", label=label)
-        axes.set_title(f"{preset}: {what}")
-        axes.set_xlabel("seconds of training, one core")
+            label = f"batch {s.batch}, rate {s.learning_rate:g}" if by_batch else None
+            color = COLORS[s.batch] if by_batch else f"C{(32, 64, 128).index(s.per_side)}"
+            axes.plot(
+                [row["seconds"] for row in curve],
+                [(row["miou"] + row["other_miou"]) / 2 for row in curve],
+                "-" if s.learning_rate == usual.learning_rate else "--",
+                color=color, marker=".", label=label or f"{s.per_side} per side",
+            )  # fmt: skip
+        axes.set(title=f"{preset}: {what}", xlabel="seconds of training, one core")
         axes.set_ylabel("mIoU, mean of both kinds of scenes")
         axes.grid(alpha=0.3)
         axes.legend(fontsize=7)
