@@ -14,7 +14,7 @@ setup: $(SETUP)  ## install everything into .venv
 $(SETUP): pyproject.toml constraints.txt
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "tumortrack needs Python 3.11 or newer; give make PYTHON=python3.11")'
 	$(PYTHON) -m venv .venv
-	$(BIN)/pip install --quiet --disable-pip-version-check --no-compile -c constraints.txt -e '.[dev,peers,live,arms]'
+	$(BIN)/pip install --quiet --disable-pip-version-check --no-compile -c constraints.txt -e '.[dev,peers,live,arms,onnx]'
 	touch $@
 
 demo: setup  ## CT -> tumors located in unseen deformed scenes (about 5 minutes)

@@ -507,6 +507,20 @@ def compile(model: Positional[Path], /, *, device: Literal["auto", "cpu", "cuda"
     compile_model(model, device)
 
 
+def onnx(model: Positional[Path], out: Positional[Path], /, *, overwrite: bool = False) -> None:
+    """Write a model's network as an ONNX file, for other programs.
+
+    Args:
+        model: folder that `train` wrote.
+        out: file to write, .onnx: clouds and queries in, logits out (quick, paper); clouds in,
+            placements out (clinic). docs/method.md says what they mean.
+        overwrite: replace OUT if it exists.
+    """
+    from tumortrack.app.onnx_export import write_onnx
+
+    write_onnx(model, out, overwrite)
+
+
 def inspect(path: Positional[Path], /) -> None:
     """Say what a case, model, run, scene or report is.
 
@@ -540,6 +554,7 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "evaluate": evaluate,
     "bench": bench,
     "compile": compile,
+    "onnx": onnx,
     "inspect": inspect,
     "doctor": doctor,
 }

@@ -41,7 +41,7 @@ class Layer(nn.Module):
         # In rows: the output of a linear layer on more axes is a view, and overwriting a view
         # makes autograd copy it.
         rows = self.activate(self.linear(x.flatten(0, -2)))
-        return rows.unflatten(0, x.shape[:-1])
+        return rows.view(*x.shape[:-1], -1)
 
     @torch.no_grad()
     def fold(self) -> None:

@@ -168,14 +168,19 @@ def without_strays(points_mm: Tensor, reach_mm: float) -> Tensor:
     that background moves it little (10 % of a plane behind a kidney: 0.5 mm, the mean of all by
     5 mm). The order of the points that stay is kept.
     """
-    middle = points_mm.median(dim=1, keepdim=True).values
+    n = points_mm.shape[1]
+    if torch.jit.is_tracing():  # ONNX has no median
+        middle = points_mm.sort(dim=1).values[:, (n - 1) // 2, None]
+    else:
+        middle = points_mm.median(dim=1, keepdim=True).values
     near = points_mm
     for _ in range(2):
         stray = (points_mm - middle).square().sum(dim=2) > reach_mm**2
-        order = stray.to(torch.uint8).argsort(dim=1, stable=True)
+        # No two keys are equal, so that any sorting keeps the order.
+        row = torch.arange(n, device=points_mm.device)
+        order = (stray * n + row).argsort(dim=1)
         count = (~stray).sum(dim=1, keepdim=True).clamp_min(1)
-        row = torch.arange(points_mm.shape[1], device=points_mm.device) % count
-        near = take(points_mm, order.gather(1, row))
+        near = take(points_mm, order.gather(1, row % count))
         middle = near.mean(dim=1, keepdim=True)
     return near
 

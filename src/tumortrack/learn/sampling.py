@@ -96,7 +96,7 @@ def ball_query(points: Tensor, centres: Tensor, radius: float, k: int) -> Tensor
     across = points.detach().transpose(1, 2).contiguous()[:, :, None, :].unbind(1)
     down = centres.detach().transpose(1, 2).contiguous()[:, :, :, None].unbind(1)
     inside = _squared_distance(*across, *down) <= radius**2
-    slot = inside.cumsum(dim=2)  # 1 for the first found
+    slot = inside.long().cumsum(dim=2)  # 1 for the first found; ONNX sums no truths
     count = slot[:, :, -1:].clone()
     slot.sub_(1).masked_fill_(~inside, k).clamp_(max=k)  # slot k takes all that is not wanted
     batch, n_centres, n = inside.shape
