@@ -6,12 +6,16 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
+import msgspec
 import nibabel
 import numpy as np
 import pytest
+import torch
 import trimesh
 
 from stories import cloud_by_rays, looking_down, refusal, succeeded, tumortrack
+from tumortrack.app.inspection import describe
+from tumortrack.app.presets import quick
 from tumortrack.app.scenes import check_case
 from tumortrack.core import store
 from tumortrack.core.errors import InputError, NoEstimate
@@ -19,19 +23,30 @@ from tumortrack.core.geometry import transform_points
 from tumortrack.core.mesh_files import read_mesh
 from tumortrack.core.types import Anatomy, SensorCloud
 from tumortrack.imaging.case import load_case
+from tumortrack.learn.compiled import Arithmetic
+from tumortrack.learn.inference import possible
 from tumortrack.learn.model import load_model
+from tumortrack.learn.train import Run, train
 from tumortrack.track.follower import Follower, FollowerConfig
 from tumortrack.track.tracker import Tracker
 
-STEPS = 700
+STEPS = 400
 
 
 @pytest.fixture(scope="module")
 def work(tmp_path_factory: pytest.TempPathFactory, phantom_case: Path) -> Path:
     folder = tmp_path_factory.mktemp("locate")
     (folder / "case").symlink_to(phantom_case)
-    options = ["--preset", "quick", "--steps", STEPS]
-    succeeded(tumortrack("train", folder / "case", folder / "model", *options))
+    case = load_case(phantom_case)
+    preset = quick(case.anatomy)
+    config = msgspec.structs.replace(  # with small pictures: less than a minute
+        preset,
+        scene=msgspec.structs.replace(preset.scene, width=212, height=120),
+        validation_pairs=16,
+    )
+    case_sha256 = store.sha256_of(phantom_case / store.MANIFEST)
+    run = Run(case.anatomy, case.up_lps, case_sha256, config, steps=STEPS, workers=0, device="cpu")
+    train(run, folder / "model", lambda _: None)
     return folder
 
 
@@ -76,8 +91,8 @@ def evaluated(work: Path, scenes: Path) -> Path:
 
 def test_a_moving_organ_is_followed_by_labels(tracker, seen):
     """The last organ's box stands for the coarse queries; the answer is that of a first frame."""
-    points, _ = seen
-    points = points.astype(np.float32)
+    # As many as the encoder takes: nothing is left to the choice of points.
+    points = np.random.default_rng(0).permutation(seen[0].astype(np.float32))[:512]
     follower = Follower(tracker, FollowerConfig(rescan_s=10))
     for n in range(4):
         cloud = SensorCloud(points + np.float32([0.8 * n, 0, 0]), 10**9 * (n + 1) // 10 + 1)
@@ -87,7 +102,7 @@ def test_a_moving_organ_is_followed_by_labels(tracker, seen):
     alone = tracker.locate(cloud, grid=48)
     for name, mesh in alone.meshes.items():
         off = mesh.box_mm.mean(0) - estimate.meshes[name].box_mm.mean(0)
-        assert np.linalg.norm(off) < 2.5
+        assert np.linalg.norm(off) < 1.0
     gone = SensorCloud(points + np.float32([300, 0, 0]), cloud.stamp_ns + 10**8)
     with pytest.raises(NoEstimate):
         follower.locate(gone)
@@ -157,11 +172,13 @@ def test_clouds_in_other_formats_and_units_agree(work, seen, out):
     assert np.linalg.norm(centres[0] - centres[1]) < 3
 
 
-@pytest.mark.parametrize("fast_bfloat16", [False, True])
-def test_the_answer_does_not_hang_on_half_precision(tracker, seen, monkeypatch, fast_bfloat16):
+@pytest.mark.parametrize("numbers", ["network", "float32", "bfloat16", "int8"])
+def test_the_answer_does_not_hang_on_the_arithmetic(tracker, seen, monkeypatch, numbers):
     points, _ = seen
-    module = "tumortrack.track.occupancy"
-    monkeypatch.setattr(f"{module}.has_fast_bfloat16", lambda _: fast_bfloat16)
+    if numbers not in (*possible(torch.device("cpu")), "float32"):
+        pytest.skip(f"this processor has no fast {numbers}")
+    forced = Arithmetic(numbers=numbers, chunk=2048)
+    monkeypatch.setattr("tumortrack.learn.inference.usual", lambda *_: forced)
     forced = Tracker(tracker.model).locate(SensorCloud(points), grid=32).report
     usual = tracker.locate(SensorCloud(points), grid=32).report
     for name in tracker.model.parts:
@@ -312,5 +329,6 @@ def test_inspect_says_what_things_are(work, out, scenes, evaluated):
         (evaluated, "an evaluation report"),
         (work / "cloud.ply", "points from"),
     ):
-        assert words in succeeded(tumortrack("inspect", path))
+        assert words in "\n".join(describe(path))
+    assert "a case" in succeeded(tumortrack("inspect", work / "case"))
     refusal(tumortrack("inspect", work))
