@@ -62,6 +62,11 @@ class Placement:
     coefficients: Tensor  # (B, M)
     right_way: Tensor  # (B,), logit
 
+    def __getitem__(self, rows: slice) -> Placement:
+        return Placement(
+            self.rotation[rows], self.centre_mm[rows], self.coefficients[rows], self.right_way[rows]
+        )
+
 
 class WarpNetwork(nn.Module):
     """Clouds -> placements; the buffers that name the organ are set by ``know``."""
@@ -182,9 +187,17 @@ class WarpNetwork(nn.Module):
 
     def both_ways(self, points_mm: Tensor) -> tuple[Placement, Placement]:
         """Placements for the clouds as they were turned, and for half a turn more."""
-        aside = self.aside(points_mm)
-        sign = torch.ones_like(aside.centre_mm[:, 0])
-        return self(aside), self(aside.other_way(-sign))
+        one = self.aside(points_mm)
+        other = one.other_way(-torch.ones_like(one.centre_mm[:, 0]))
+        # One batch: a network this small takes as long for two clouds as for one.
+        both = self(
+            Aside(
+                torch.cat([one.points, other.points]),
+                torch.cat([one.centre_mm, other.centre_mm]),
+                torch.cat([one.turn, other.turn], 1),
+            )
+        )
+        return both[: len(points_mm)], both[len(points_mm) :]
 
 
 def facing_rotation(

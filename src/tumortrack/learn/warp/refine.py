@@ -117,8 +117,9 @@ def _normal(
     sums = np.empty((-(-len(points_mm) // _AT_ONCE), columns, columns), np.float32)
 
     def add(part: slice) -> None:
-        out = distance[part], sums[part.start // _AT_ONCE]
-        kernels.normal_equations(*known, np.float32(width_mm), points_mm[part], *out)
+        out = sums[part.start // _AT_ONCE]
+        width = np.float32(width_mm)
+        kernels.normal_equations(*known, width, points_mm[part], distance[part], out)
 
     share(add, len(points_mm), _AT_ONCE)
     return distance, sums.sum(0, dtype=float)
@@ -139,7 +140,7 @@ def _known(
     rotation: Float64[np.ndarray, "3 3"],
     centre_mm: Float64[np.ndarray, " 3"],
     coefficients: Float64[np.ndarray, " m"],
-) -> tuple:
+) -> tuple[tuple, int, np.ndarray, tuple, tuple]:
     """What the kernels need besides points."""
     body, field = shape.body, shape.distances[0]
     velocity = body.velocity(-coefficients)

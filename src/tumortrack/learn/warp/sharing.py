@@ -41,7 +41,5 @@ def share(work: Work, count: int, at_once: int) -> None:
 @cache
 def _helper(process: int) -> ThreadPoolExecutor | None:
     """A second thread of this process (a fork has none of its parent's), if it has a core."""
-    import numba
-
-    cores = min(available_cores(), numba.config.NUMBA_NUM_THREADS)
+    cores = min(available_cores(), int(os.environ.get("NUMBA_NUM_THREADS", "2")))
     return ThreadPoolExecutor(1, "sharing") if cores > 1 else None
