@@ -16,7 +16,7 @@ from torch import Tensor
 from tumortrack.learn.compiled import Arithmetic, Numbers
 from tumortrack.learn.model import has_fast_bfloat16
 from tumortrack.learn.network import Latent, OccupancyNetwork
-from tumortrack.learn.packed import PackedDecoder, can_pack
+from tumortrack.learn.packed import PackedDecoder, can_pack, pack_stacks
 from tumortrack.learn.quantized import QuantizedDecoder, can_quantize
 
 CHUNK = 2048  # queries at once and core: their activations (2 MB at 512 channels) stay near it
@@ -39,7 +39,10 @@ class Inference:
         self.device = next(network.parameters()).device
         self.arithmetic = arithmetic or usual(self.network, self.device)
         self._decode = decoder(self.network, self.arithmetic)
-        self._bf16 = has_fast_bfloat16(self.device)
+        packed = self.arithmetic.numbers != "network"
+        if packed:
+            pack_stacks(self.network.encoder)
+        self._bf16 = not packed and has_fast_bfloat16(self.device)
 
     @torch.inference_mode()
     def encode(self, points_mm: Float32[np.ndarray, "n 3"]) -> Latent:

@@ -15,7 +15,10 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from tumortrack.learn.decoders.mlp import MlpDecoder, octave_features
+from tumortrack.learn.layers import Layer
 from tumortrack.learn.network import Latent, OccupancyNetwork, normalised
+
+_ENCODER_ROWS = 4096
 
 
 def can_pack(device: torch.device) -> bool:
@@ -46,6 +49,31 @@ class PackedLinear:
         """Rows (n, in) and (n, out) -> their product with W, and the sum."""
         out: Tensor = torch.ops.mkldnn._linear_pointwise.binary(x, added, self.packed, None, "add")
         return out
+
+
+class PackedLayer(nn.Module):
+    """A folded ``Layer`` in one pass, for inference."""
+
+    def __init__(self, layer: Layer) -> None:
+        super().__init__()
+        weight = layer.linear.weight
+        self.linear = PackedLinear(weight, _ENCODER_ROWS, weight.dtype)
+        self.bias = layer.linear.bias.detach()
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(..., in) -> (..., out)."""
+        rows = self.linear(x.flatten(0, -2), self.bias, "relu")
+        return rows.view(*x.shape[:-1], -1)
+
+
+def pack_stacks(encoder: nn.Module) -> None:
+    """Replace the layers in a folded encoder's stacks, in place. In single precision: a latent
+    that is off moves every label, and an encoder is a small part of a frame."""
+    for module in encoder.modules():
+        if isinstance(module, nn.Sequential):
+            for n, layer in enumerate(module):
+                if isinstance(layer, Layer):
+                    module[n] = PackedLayer(layer)
 
 
 @dataclass(frozen=True, eq=False)

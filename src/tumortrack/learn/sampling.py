@@ -116,8 +116,12 @@ def take(values: Tensor, indices: Tensor) -> Tensor:
 
 def _compiled(points: Tensor) -> bool:
     """Whether the compiled kernels can take these points: not while torch traces the network."""
-    traced = torch.compiler.is_compiling() or torch.jit.is_tracing()
-    return points.device.type == "cpu" and points.dtype == torch.float32 and not traced
+    return points.device.type == "cpu" and points.dtype == torch.float32 and not traced()
+
+
+def traced() -> bool:
+    """Whether torch records what is done, to export or compile it."""
+    return torch.compiler.is_compiling() or torch.jit.is_tracing()
 
 
 def _rows(points: Tensor) -> np.ndarray:

@@ -10,7 +10,16 @@ from torch.nn import functional
 
 from tumortrack.core.config import Config
 from tumortrack.learn.layers import Layer, Norm, stack
-from tumortrack.learn.sampling import Sampling, ball_query, choose_points, strided_points, take
+from tumortrack.learn.sampling import (
+    Sampling,
+    ball_query,
+    choose_points,
+    strided_points,
+    take,
+    traced,
+)
+
+_AT_ONCE = 128  # centres
 
 
 class SetAbstraction(Config, frozen=True):
@@ -93,13 +102,25 @@ class _Level(nn.Module):
         chosen = choose_points(points, math.ceil(level.ratio * n), self.sampling)
         centres = take(points, chosen)
         neighbours = ball_query(points, centres, level.radius, level.neighbours)
-        offsets = (take(points, neighbours) - centres[:, :, None]) / level.radius
+        weight, shared = self.first.linear.weight, None
+        if features is not None:
+            shared = functional.linear(features, weight[:, 3:])
+        if torch.is_grad_enabled() or traced() or points.device.type != "cpu":
+            return centres, self._described(points, centres, neighbours, shared)
+        # For use alone: what a part of the centres needs stays in the cache.
+        pairs = zip(centres.split(_AT_ONCE, 1), neighbours.split(_AT_ONCE, 1), strict=True)
+        return centres, torch.cat([self._described(points, *pair, shared) for pair in pairs], 1)
+
+    def _described(
+        self, points: Tensor, centres: Tensor, neighbours: Tensor, shared: Tensor | None
+    ) -> Tensor:
+        """Features (B, M, G) of centres (B, M, 3) from their neighbours (B, M, K)."""
+        offsets = (take(points, neighbours) - centres[:, :, None]) / self.level.radius
         linear = self.first.linear
         grouped = functional.linear(offsets, linear.weight[:, :3], linear.bias)
-        if features is not None:
-            shared = functional.linear(features, linear.weight[:, 3:])
+        if shared is not None:
             grouped = grouped + take(shared, neighbours)
-        return centres, _max_over_neighbours(self.rest(self.first.activate(grouped)))
+        return _max_over_neighbours(self.rest(self.first.activate(grouped)))
 
 
 def _max_over_neighbours(grouped: Tensor) -> Tensor:
