@@ -55,8 +55,8 @@ def test_turns_are_fair_and_what_is_not_counted_is_left_out() -> None:
         return Uncounted(0.01)
 
     slow_s, fast_s = in_turns(slow, fast, budget_s=0.2)
-    assert 0.02 <= slow_s.median_s < 0.04
-    assert 0.004 <= fast_s.median_s < 0.02
+    assert slow_s.median_s >= 0.02
+    assert 0.004 <= fast_s.median_s < slow_s.median_s  # a hundredth is not counted
     assert order[4:8] == ["slow", "fast", "slow", "fast"]  # after two calls of each to warm up
     assert 3 <= slow_s.turns <= 6
     for one in (slow_s, fast_s):

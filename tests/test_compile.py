@@ -25,6 +25,7 @@ from tumortrack.learn.network import (
     paper_network,
     quick_network,
 )
+from tumortrack.learn.packed import can_pack
 from tumortrack.learn.quantized import QuantizedDecoder, gap, shift
 from tumortrack.track.occupancy import OccupancyLocator
 
@@ -103,6 +104,7 @@ def test_fast_arithmetic_gives_the_labels_of_single_precision(numbers, known):
     torch.testing.assert_close(few, right[:7], atol=3 * near, rtol=0)
 
 
+@pytest.mark.skipif(not can_pack(CPU), reason="oneDNN's layers do not exist here")
 def test_folding_and_splitting_change_nothing_but_rounding(known):
     inference = Inference(known.network, Arithmetic(numbers="float32", chunk=1000))
     with torch.inference_mode():
@@ -129,7 +131,7 @@ def test_what_8_bits_may_get_wrong_is_asked_again(known):
     assert wrong.any()
     assert gap(alone)[wrong].max() <= shift(right, alone).max()
     answer = inference.logits(latent, known.queries)
-    assert (answer.argmax(1) != right.argmax(1)).sum() <= 0.1 * wrong.sum()
+    assert (answer.argmax(1) != right.argmax(1)).sum() <= max(1, 0.1 * wrong.sum())
 
 
 def test_usual_arithmetic_is_one_that_the_processor_has():

@@ -203,7 +203,7 @@ def test_presets_draw_the_scenes_they_drew_before_these_faults_existed(preset, m
         monkeypatch.setattr(scene_module, name, lambda frame, config, rng: frame)
     monkeypatch.setattr(
         scene_module,
-        "_crop",
+        "crop_of",
         lambda config, free, rng: (
             scene_module.CloudConfig(near_mm=1.0, far_mm=1e4) if free else config.cloud
         ),

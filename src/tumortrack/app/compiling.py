@@ -5,6 +5,8 @@ from __future__ import annotations
 from contextlib import suppress
 from pathlib import Path
 
+import numpy as np
+import torch
 from rich.table import Table
 
 from tumortrack.app.console import console, say
@@ -15,6 +17,7 @@ from tumortrack.learn.compiled import Compiled, save
 from tumortrack.learn.compiling import measured
 from tumortrack.learn.model import Model, load_model
 from tumortrack.learn.model_folder import WEIGHTS
+from tumortrack.track.sparse import sparse_margins
 from tumortrack.track.tracker import Tracker
 
 _GRID = 32
@@ -47,10 +50,18 @@ def compile_model(folder: Path, device: str) -> None:
     say(f"network: {best.numbers}, {best.chunk} queries at once and core; kept in {path}.")
 
 
+def _ball(points_mm: np.ndarray) -> torch.Tensor:
+    """Logits of a ball in the grid's middle."""
+    inside = 5.0 - np.linalg.norm(points_mm - _GRID / 4, axis=1)
+    return torch.from_numpy(np.column_stack([-inside, inside]).astype(np.float32))
+
+
 def _warm(model: Model) -> None:
     """One frame and one answer in full; models that place an organ are shown their own."""
     tracker = Tracker(model)
     tracker.warm()
+    grid = np.diag([0.5, 0.5, 0.5, 1.0])
+    sparse_margins(_ball, grid, (_GRID, _GRID, _GRID), start_mm=2.0)
     if tracker.anatomy_ct is not None:
         organ = tracker.anatomy_ct.organ.vertices_mm
         cloud = SensorCloud(organ - organ.mean(0) + [0, 0, 150])

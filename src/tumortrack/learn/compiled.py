@@ -20,7 +20,7 @@ from tumortrack.core.errors import ArtifactError, InputError, StorageError
 
 FOLDER = "compiled"
 SCHEMA = 1
-_CHUNKS = (16, 2**20)  # fewest and most queries at once and core
+_CHUNKS = (16, 2**14)  # fewest and most queries at once and core
 
 Numbers = Literal["network", "float32", "bfloat16", "int8"]
 
@@ -107,8 +107,12 @@ def find(folder: Path, weights_sha256: str) -> tuple[Arithmetic | None, str | No
     machine = this_machine()
     path = place_of(folder, machine)
     again = f"the usual arithmetic is used. `tumortrack compile {folder}` measures what is faster."
-    if not path.is_file():
+    try:
+        there = path.is_file()
         others = len(list(path.parent.glob("*.json")))
+    except OSError as error:
+        return None, f"{path.parent} cannot be read ({error.strerror}); {again}"
+    if not there:
         where = "on another machine or PyTorch only" if others else "on no machine yet"
         return None, f"this model was compiled {where}; {again}"
     try:
@@ -117,6 +121,10 @@ def find(folder: Path, weights_sha256: str) -> tuple[Arithmetic | None, str | No
         return None, f"{error} So {again}"
     if (compiled.weights_sha256, compiled.machine) != (weights_sha256, machine):
         return None, f"this model was compiled for other weights; {again}"
+    from tumortrack.learn.inference import possible  # which knows the ways and needs this module
+
+    if compiled.arithmetic.numbers not in possible(torch.device("cpu")):
+        return None, f"{path} names arithmetic that this processor does not have; {again}"
     return compiled.arithmetic, None
 
 

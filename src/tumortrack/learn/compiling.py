@@ -18,6 +18,7 @@ from tumortrack.learn.network import Latent, OccupancyNetwork
 QUERIES = 10_000
 _CHUNKS = (1024, 2048, 4096)
 _ROUNDS = 5
+ENOUGH_EQUAL = 0.999
 _POINTS = 1000
 _DISTANCE_MM = 130.0
 _FLATTER = (1.0, 0.6, 0.45)  # half axes of a kidney's upper side, about
@@ -60,9 +61,18 @@ def measured(model: Model, weights_sha256: str, rounds: int = _ROUNDS) -> Compil
         machine=this_machine(),
         threads=torch.get_num_threads(),
         queries=QUERIES,
-        arithmetic=min(timings, key=lambda timing: timing.milliseconds).arithmetic,
+        arithmetic=chosen(timings).arithmetic,
         timings=tuple(timings),
     )
+
+
+def chosen(timings: list[Timing]) -> Timing:
+    """The fastest way that gives ``ENOUGH_EQUAL`` of the labels of single precision; where none
+    does, the one that gives most."""
+    right = [one for one in timings if one.labels_equal >= ENOUGH_EQUAL]
+    if right:
+        return min(right, key=lambda one: one.milliseconds)
+    return max(timings, key=lambda one: one.labels_equal)
 
 
 def _ways(device: torch.device) -> list[Arithmetic]:

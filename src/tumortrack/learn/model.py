@@ -84,6 +84,7 @@ def load_model(folder: Path, device: str = "auto") -> Model:
         box = np.array(manifest["query_box_mm"], float).reshape(2, 3)
         network = network_of(config.network)
         network.load_state_dict(load((folder / WEIGHTS).read_bytes()))
+        weights_sha256 = str(manifest["files"][WEIGHTS])
         familiar = from_builtins(manifest["familiar"], Familiar, f"{folder}: familiar")
         provenance = dict(manifest["provenance"])
         shape, trust = None, None
@@ -102,7 +103,7 @@ def load_model(folder: Path, device: str = "auto") -> Model:
     network.eval().requires_grad_(False).to(where)
     arithmetic, note = None, None
     if where.type == "cpu" and not config.network.warps:
-        arithmetic, note = find(folder, manifest["files"][WEIGHTS])
+        arithmetic, note = find(folder, weights_sha256)
     notes = () if note is None else (note,)
     return Model(network, config, parts, box, familiar, provenance, shape, trust, arithmetic, notes)
 

@@ -112,6 +112,11 @@ def ctrl_c() -> Iterator[Callable[[], bool]]:
     }
     try:
         yield lambda: bool(asked)
+    except BaseException:
+        if "TORCHELASTIC_RUN_ID" in os.environ:
+            # torchrun ends the processes that are left; what this one has to say comes first.
+            before[signal.SIGTERM] = signal.SIG_IGN
+        raise
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)

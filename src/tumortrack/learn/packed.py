@@ -19,6 +19,7 @@ from tumortrack.learn.layers import Layer
 from tumortrack.learn.network import Latent, OccupancyNetwork, normalised
 
 _ENCODER_ROWS = 4096
+_ROUND = 512  # rows
 
 
 def can_pack(device: torch.device) -> bool:
@@ -49,6 +50,17 @@ class PackedLinear:
         """Rows (n, in) and (n, out) -> their product with W, and the sum."""
         out: Tensor = torch.ops.mkldnn._linear_pointwise.binary(x, added, self.packed, None, "add")
         return out
+
+
+def filled_up(queries: Tensor) -> Tensor:
+    """Queries (1, Q, 3) with the last one repeated until their number is a round one.
+
+    oneDNN compiles and keeps a kernel for every number of rows that it meets: frames that each
+    ask another number of questions would fill memory (0.7 GB until its cache is full).
+    """
+    n = queries.shape[1]
+    full = -(-n // _ROUND) * _ROUND if n > _ROUND else 1 << max(n - 1, 0).bit_length()
+    return torch.cat([queries, queries[:, -1:].expand(-1, full - n, -1)], 1) if n else queries
 
 
 class PackedLayer(nn.Module):
@@ -132,12 +144,12 @@ class PackedDecoder:
 
     def __call__(self, latent: Latent, queries_mm: Tensor) -> Tensor:
         """One cloud's latent and queries (1, Q, 3), mm -> logits (1, Q, classes), float32."""
-        terms = self.terms(latent)
+        terms, n = self.terms(latent), queries_mm.shape[1]
         parts = [
             self.logits(terms, self.features(latent, part))
-            for part in queries_mm.split(self.rows, dim=1)
+            for part in filled_up(queries_mm).split(self.rows, dim=1)
         ]
-        return torch.cat(parts)[None]
+        return torch.cat(parts)[None, :n]
 
     def terms(self, latent: Latent) -> list[Tensor]:
         """The latent's share of the layers that see it, (width,) each."""

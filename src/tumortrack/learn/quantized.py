@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from tumortrack.learn.network import Latent
-from tumortrack.learn.packed import PackedDecoder, PackedLinear
+from tumortrack.learn.packed import PackedDecoder, PackedLinear, filled_up
 
 _PROBE = 512  # queries answered both ways, spread evenly over those asked
 _FEWEST = 8 * _PROBE  # with fewer the probe costs more than is gained
@@ -87,9 +87,11 @@ class QuantizedDecoder:
 
     def __call__(self, latent: Latent, queries_mm: Tensor) -> Tensor:
         """One cloud's latent and queries (1, Q, 3), mm -> logits (1, Q, classes), float32."""
-        n = queries_mm.shape[1]
-        if n < _FEWEST:
+        asked = queries_mm.shape[1]
+        if asked < _FEWEST:
             return self.packed(latent, queries_mm)
+        queries_mm = filled_up(queries_mm)
+        n = queries_mm.shape[1]
         probe, peaks = torch.arange(_PROBE) * n // _PROBE, list[float]()
         features = self.packed.features(latent, queries_mm[:, probe])
         right = self.exact.logits(self.exact.terms(latent), features, peaks)
@@ -97,7 +99,7 @@ class QuantizedDecoder:
         rough = self.logits(latent, features, scales)
         doubt = float(shift(right, rough).max())
         if float((gap(rough) <= doubt).float().mean()) > _MOST_AGAIN:
-            return self.packed(latent, queries_mm)
+            return self.packed(latent, queries_mm)[:, :asked]
         logits = torch.cat([
             self.logits(latent, self.packed.features(latent, part), scales)
             for part in queries_mm.split(self.packed.rows, dim=1)
@@ -106,7 +108,7 @@ class QuantizedDecoder:
         if len(again):
             logits[again] = self.exact(latent, queries_mm[:, again])[0]
         logits[probe] = right
-        return logits[None]
+        return logits[None, :asked]
 
     def logits(self, latent: Latent, features: Tensor, scales: list[float]) -> Tensor:
         """Logits (Q, classes), float32, activations in steps of ``scales``, one a hidden layer."""

@@ -111,7 +111,8 @@ def joined(device: str) -> Iterator[Ranks]:
         InputError: CUDA asked for where there is none, or more processes than GPUs.
         RankLost: the processes do not find each other.
     """
-    chosen, size = choose_device(device), int(os.environ.get("WORLD_SIZE", "1"))
+    chosen = choose_device(device)
+    size = int(os.environ["WORLD_SIZE"]) if "TORCHELASTIC_RUN_ID" in os.environ else 1
     if size == 1:
         yield Ranks(chosen)
         return

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass, field, replace
 
@@ -32,6 +33,7 @@ from tumortrack.track.volume import (
 COARSE_QUERIES = 10_000
 FINE_QUERIES = 40_000
 FEWEST_INSIDE = 20  # of the coarse queries: fewer are no organ
+_LATTICE_MM = 4.5  # at most: always within a ball of 7.8 mm
 _LIVE_MARGIN = 0.1  # of the organ's extent: how far it may move from one live frame to the next
 
 Box = Float[np.ndarray, "2 3"]
@@ -54,7 +56,7 @@ class OccupancyLocator:
         can be, then labels of 40,000 points in the box of those inside, enlarged.
         """
         frame = _Frame(self.model, self._inference, cloud, seed, np.random.default_rng(seed))
-        lattice = frame.lattice(frame.coarse_box(), FIT_STEPS)
+        lattice = frame.lattice(frame.coarse_box())
         frame.check(lattice)
         inside = frame.inside(lattice)
         with frame.stage("volume"):
@@ -72,13 +74,13 @@ class OccupancyLocator:
         rng = np.random.default_rng((how.seed, cloud.stamp_ns))
         frame = _Frame(self.model, self._inference, cloud, how.seed, rng)
         if last is None or how.thorough:
-            finer = frame.lattice(frame.coarse_box(), 2 * FIT_STEPS)
+            finer = frame.lattice(frame.coarse_box(), finer=2)
             frame.check(finer)
         else:
             low, high = last.cloud.points_mm.min(0), last.cloud.points_mm.max(0)
             margin = _LIVE_MARGIN * float((high - low).max())
             box = np.stack([low - margin, high + margin]).astype(float)
-            lattice = frame.lattice(box, FIT_STEPS)
+            lattice = frame.lattice(box)
             frame.check(lattice)
             with frame.stage("volume"):
                 finer = halved_lattice(frame.logits_at, lattice)
@@ -87,10 +89,23 @@ class OccupancyLocator:
 
     def warm(self) -> None:
         """See ``track.tracker.Tracker.warm``."""
-        points = np.random.default_rng(0).normal(0, 15, (self.model.config.scene.cloud.n_points, 3))
-        cloud = SensorCloud(points + [0, 0, 150])
-        with suppress(NoEstimate):  # it is no organ
-            self.follow(cloud, None, Following())
+        rng = np.random.default_rng(0)
+        points = rng.normal(0, 15, (self.model.config.scene.cloud.n_points, 3)) + [0, 0, 150]
+        frame = _Frame(self.model, self._inference, SensorCloud(points), 0, rng)
+        box = self.model.query_box_mm + np.median(points, axis=0)
+        finer = halved_lattice(frame.logits_at, frame.lattice(box))
+        for step in (frame.inside, frame.check):
+            with suppress(NoEstimate):  # it is no organ
+                step(finer)
+        ball = np.linalg.norm(np.indices((16, 16, 16)).T - 7.5, axis=-1) < 5
+        margins = np.where(ball, 1, -1).astype(np.float16)[None]
+        for mesh in part_surfaces(margins, ball.astype(np.uint8), np.eye(4), ("kidney",)).values():
+            assert mesh.volume_mm3 > 0
+
+
+def steps_over(box: Box) -> int:
+    """Of the lattice along a box's longest side."""
+    return max(FIT_STEPS, math.ceil(float((box[1] - box[0]).max()) / _LATTICE_MM))
 
 
 @dataclass(eq=False)
@@ -133,9 +148,9 @@ class _Frame:
         margin = 0.05 * (high - low) + gap / 2
         return np.stack([low - margin, high + margin])
 
-    def lattice(self, box: Box, steps: int) -> Lattice:
+    def lattice(self, box: Box, finer: int = 1) -> Lattice:
         with self.stage("lattice"):
-            return lattice_over(self.logits_at, box, steps)
+            return lattice_over(self.logits_at, box, finer * steps_over(box))
 
     def check(self, lattice: Lattice) -> None:
         """Refuse what cannot be the organ."""

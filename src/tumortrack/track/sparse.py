@@ -163,8 +163,9 @@ def settled(
         trust: what is known of the errors; learns.
     """
     asked = np.zeros(len(leads), bool)
-    if len(leads) > _PROBE:
-        trust.limit = max(trust.limit, float(np.partition(leads, _PROBE)[_PROBE]))
+    if len(leads):
+        least = min(_PROBE, len(leads) - 1)
+        trust.limit = max(trust.limit, float(np.partition(leads, least)[least]))
     while True:
         now = np.flatnonzero((leads <= trust.limit) & ~asked)
         if not len(now):

@@ -93,6 +93,8 @@ def _started(row: Row) -> Verdict:
 
 def _held(row: Row) -> Verdict:
     peak = row.others[command.PEAK]
+    if not peak:  # this system does not count it
+        return Verdict("not measured", None)
     return Verdict(f"{peak / _GIB:.2f} GiB", peak < 4 * 1e9)
 
 
