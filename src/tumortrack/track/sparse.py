@@ -116,7 +116,7 @@ class Trust:
 
 @dataclass(eq=False)
 class _Lattice:
-    """Points that can be asked, ``stride`` voxels apart; knows which were."""
+    """Points that can be asked, ``stride`` voxels apart; ``trust`` in linear logits there."""
 
     logits_at: LogitsAt
     camera_from_index: Float64[np.ndarray, "4 4"]
@@ -217,13 +217,14 @@ def _voxels(
     more, found = _about_surprises(flat[asked], expected[asked], labels.reshape(-1), lattice)
     labels.reshape(-1)[flat] = _best(expected)[0]
     labels.reshape(-1)[more] = _best(found)[0]
+    places = np.concatenate([flat, more])
+    won = margins_of(torch.from_numpy(np.concatenate([expected, found])))
     margins = np.empty((classes - 1, *lattice.shape), np.float16)
     for part, margin in enumerate(margins):
         largest = np.full(classes, -LARGEST_MARGIN, np.float16)
         largest[part + 1 if part else slice(1, None)] = LARGEST_MARGIN
         np.take(largest, labels, out=margin, mode="clip")  # "raise" would copy
-        for places, logits in ((flat, expected), (more, found)):
-            margin.reshape(-1)[places] = margins_of(torch.from_numpy(logits))[:, part]
+        margin.reshape(-1)[places] = won[:, part]
     return margins, labels
 
 
