@@ -204,4 +204,7 @@ def test_frames_leave_no_memory_behind(slim_model):
         sizes.append(tracemalloc.get_traced_memory()[0])
     tracemalloc.stop()
     assert "follow" in last.report["timings"]
-    assert max(sizes[-20:]) < max(sizes[15:40]) + 50_000
+    # A leak shows in every stretch of twenty frames; what another thread holds for a moment, or
+    # something loaded once, only in a few.
+    grown = np.subtract(sizes[40:], sizes[20:-20])
+    assert np.median(grown) < 20_000
