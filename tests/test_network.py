@@ -22,6 +22,7 @@ from tumortrack.learn.network import (
     turned,
     without_strays,
 )
+from tumortrack.learn.pooling import greatest_above_zero
 from tumortrack.learn.sampling import ball_query, farthest_points, strided_points, take
 
 
@@ -195,6 +196,37 @@ def test_set_abstraction_equals_the_plain_concatenation(norm: str) -> None:
     centres, out = module(points, features)
     assert torch.equal(centres, take(points, chosen))
     torch.testing.assert_close(out, expected, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("kind", [torch.float32, torch.bfloat16])
+def test_compiled_maximum_and_its_gradient_are_those_of_the_plain_form(kind: torch.dtype) -> None:
+    torch.manual_seed(1)
+    values = torch.randn(2, 5, 4, 33).to(kind)
+    values[:, 0] = -values[:, 0].abs()  # nobody is above zero
+    values[0, 1, 2] = values[0, 1, 0] = 2.0  # equal ones
+    values[1, 2, 1], values[1, 2, 3, 5] = -0.0, torch.inf
+    compiled, plain = values.clone().requires_grad_(), values.clone().requires_grad_()
+    # What needs no gradient takes the plain form.
+    expected = greatest_above_zero(plain.detach())
+    out = greatest_above_zero(compiled)
+    assert torch.equal(out, expected)
+    assert torch.equal(out, values.clamp_min(0).amax(2))
+    weights = torch.randn_like(out)
+    out.backward(weights)
+    channels_first = torch.relu(plain).permute(0, 3, 1, 2)
+    torch.nn.functional.max_pool2d(channels_first, (1, 4)).backward(
+        weights.transpose(1, 2)[..., None]
+    )
+    assert torch.equal(compiled.grad, plain.grad)
+    assert compiled.grad.count_nonzero() > 100
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_what_is_no_number_stays_none(sign: int) -> None:
+    values = torch.ones(1, 2, 3, 4)
+    values[0, 1, 1, 2] = sign * torch.tensor(torch.nan)
+    out = greatest_above_zero(values.requires_grad_())
+    assert out.isnan().nonzero().tolist() == [[0, 1, 2]]
 
 
 def test_folded_batch_norms_change_nothing() -> None:

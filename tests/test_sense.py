@@ -19,6 +19,7 @@ from tumortrack.sense.cloud import (
 )
 from tumortrack.sense.clutter import ClutterConfig, add_clutter
 from tumortrack.sense.noise import CLEAN, D405_NOISE, NoiseConfig, add_noise
+from tumortrack.sense.noise_kernels import seen_pixels
 
 
 def rows(points):
@@ -195,6 +196,27 @@ def test_noise_replays_bit_for_bit_and_keeps_camera_and_stamp():
     assert (first.intrinsics, first.stamp_ns) == (SMALL, 7)
     assert first.depth_mm.tobytes() == again.depth_mm.tobytes()
     assert first.depth_mm.tobytes() != other.depth_mm.tobytes()
+
+
+def test_seen_pixels_are_those_with_a_return():
+    depth_mm = dome().depth_mm.copy()
+    depth_mm[3, -1] = depth_mm[-1, 0] = 77.0
+    pixels, starts = seen_pixels(depth_mm)
+    np.testing.assert_array_equal(pixels, np.flatnonzero(np.isfinite(depth_mm)))
+    np.testing.assert_array_equal(np.diff(starts), np.isfinite(depth_mm).sum(1))
+
+
+def test_false_points_lie_in_the_pixels_that_were_drawn_among_the_empty_ones():
+    frame = dome()
+    config = NoiseConfig(scatter_share=0.1)
+    out_mm = noisy(frame, scatter_share=0.1)
+    seed = int(np.random.default_rng(0).integers(2**62))
+    rng = np.random.default_rng((seed, 0))
+    empty = np.flatnonzero(np.isnan(frame.depth_mm))
+    count = rng.poisson(config.scatter_share * np.isfinite(frame.depth_mm).sum())
+    drawn = empty[rng.integers(len(empty), size=count)]
+    false_points = np.isfinite(out_mm) & np.isnan(frame.depth_mm)
+    np.testing.assert_array_equal(np.flatnonzero(false_points), np.unique(drawn))
 
 
 def test_the_generator_advances_alike_whatever_is_on():

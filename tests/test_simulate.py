@@ -14,7 +14,7 @@ from tumortrack.core.geometry import direction_lps, transform_points
 from tumortrack.simulate.deform.base import View
 from tumortrack.simulate.deform.drag import CONFIGURATIONS, DragConfig, Drags
 from tumortrack.simulate.deform.rest import RestConfig
-from tumortrack.simulate.pose import PoseConfig, sample_pose
+from tumortrack.simulate.pose import PoseConfig, _turn, sample_pose
 
 ANATOMY = anatomy()
 ORGAN = ANATOMY.organ
@@ -28,6 +28,13 @@ def poses(config, up=ANTERIOR, nearest=(110.0, 125.0), draws=DRAWS, organ=ORGAN)
 
 
 # pose
+
+
+def test_turns_are_scipys():
+    angles = np.random.default_rng(2).uniform(-np.pi, np.pi, (50, 3))
+    ours = np.stack([_turn(*about) for about in angles])
+    theirs = Rotation.from_euler("zyx", angles[:, ::-1]).as_matrix()
+    np.testing.assert_allclose(ours, theirs, rtol=0, atol=1e-15)
 
 
 @pytest.mark.parametrize("up", [ANTERIOR, (0.0, 0.0, 1.0), direction_lps("1,-2,0.5")])

@@ -37,6 +37,10 @@ class Layer(nn.Module):
         """Batch norm and ReLU of what the linear part gave; it is overwritten."""
         return functional.relu(self.normalise(linear_out), inplace=True)
 
+    def before_relu(self, x: Tensor) -> Tensor:
+        """All but the ReLU, (..., n_in) -> (..., n_out)."""
+        return self.normalise(self.linear(x))
+
     def forward(self, x: Tensor) -> Tensor:
         # In rows: the output of a linear layer on more axes is a view, and overwriting a view
         # makes autograd copy it.

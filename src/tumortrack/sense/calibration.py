@@ -45,4 +45,5 @@ def miscalibrate(
     offset, scale = rng.spawn(1)[0].uniform(-1, 1, 2)
     factor = np.float32(1 + scale * config.scale)
     depth_mm = frame.depth_mm * factor + np.float32(offset * config.offset_mm)
+    depth_mm.flags.writeable = False  # nobody else's: taken over without a copy
     return DepthFrame(depth_mm, frame.intrinsics, frame.stamp_ns)

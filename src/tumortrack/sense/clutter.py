@@ -82,6 +82,7 @@ def add_clutter(frame: DepthFrame, config: ClutterConfig, rng: np.random.Generat
     chosen = np.flatnonzero(free)[:count]
     depth_mm = frame.depth_mm.copy()
     depth_mm[row[chosen], column[chosen]] = patch.depth_mm[chosen]
+    depth_mm.flags.writeable = False  # nobody else's: taken over without a copy
     return DepthFrame(depth_mm, camera, frame.stamp_ns)
 
 

@@ -18,6 +18,8 @@ from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError
 from tumortrack.core.types import DepthFrame
 
+Seen = tuple[np.ndarray, np.ndarray]  # ``noise_kernels.seen_pixels``
+
 REFERENCE_MM = 150.0  # the distance at which ``axial_mm`` is stated
 
 
@@ -91,58 +93,84 @@ def add_noise(frame: DepthFrame, config: NoiseConfig, rng: np.random.Generator) 
     seed = int(rng.integers(2**62))
     if config == CLEAN:
         return frame
-    out_mm = frame.depth_mm.copy()
-    _err_at_edges(frame, out_mm, config, seed)
-    _err_everywhere(out_mm, config, seed)
-    if config.scatter_share:
-        _scatter(frame.depth_mm, out_mm, config, np.random.default_rng((seed, 0)))
-    if config.quantum_mm:
-        out_mm /= np.float32(config.quantum_mm)
-        np.rint(out_mm, out=out_mm)
-        out_mm *= np.float32(config.quantum_mm)
+    from tumortrack.sense.noise_kernels import seen_pixels
+
+    true_mm = frame.depth_mm
+    seen = seen_pixels(true_mm)
+    depths_mm = true_mm.ravel()[seen[0]]
+    scatter = _scatter(true_mm, seen[0], depths_mm, config, np.random.default_rng((seed, 0)))
+    _err_at_edges(frame, depths_mm, seen, config, seed)
+    _err_everywhere(true_mm.shape, depths_mm, seen, config, seed)
+    out_mm = np.full(true_mm.shape, np.nan, np.float32)
+    for pixels, values_mm in ((seen[0], depths_mm), scatter):
+        out_mm.ravel()[pixels] = _whole(values_mm, config.quantum_mm)
+    out_mm.flags.writeable = False  # nobody else's: taken over without a copy
     return DepthFrame(out_mm, frame.intrinsics, frame.stamp_ns)
 
 
-def _err_at_edges(frame: DepthFrame, out_mm: np.ndarray, config: NoiseConfig, seed: int) -> None:
+def _err_at_edges(
+    frame: DepthFrame, depths_mm: np.ndarray, seen: Seen, config: NoiseConfig, seed: int
+) -> None:
     from tumortrack.sense import noise_kernels as kernels
 
     true_mm = frame.depth_mm
     if config.flying_share:
         edge = (config.edge_px, config.edge_mm)
-        kernels.fly(true_mm, out_mm, seed + 1, config.flying_share, config.flying_mm, edge)
+        kernels.fly(true_mm, depths_mm, seen, seed + 1, config.flying_share, config.flying_mm, edge)
     if config.grazing_share:
         pinhole = kernels.pinhole(frame.intrinsics)
+        angle = config.grazing_degrees
         kernels.lose_grazing(
-            true_mm, out_mm, seed + 2, config.grazing_share, config.grazing_degrees, pinhole
+            true_mm, depths_mm, seen, seed + 2, config.grazing_share, angle, pinhole
         )
 
 
-def _err_everywhere(out_mm: np.ndarray, config: NoiseConfig, seed: int) -> None:
+def _err_everywhere(
+    shape: tuple[int, int], depths_mm: np.ndarray, seen: Seen, config: NoiseConfig, seed: int
+) -> None:
     from scipy.special import ndtri
 
     from tumortrack.sense import noise_kernels as kernels
 
-    height, width = out_mm.shape
     if config.distortion_mm:
         rng = np.random.default_rng((seed, 1))
-        out_mm += kernels.slow_field((height, width), config.distortion_mm * rng.random(), rng)
+        peak_mm = config.distortion_mm * rng.random()
+        kernels.distort(depths_mm, seen, *kernels.slow_shape(shape, peak_mm, rng))
     if config.axial_mm:
         relative = config.axial_mm / REFERENCE_MM**2
-        grid = kernels.normal_grid(height, width, config.correlation_px, seed + 3)
-        kernels.jitter(
-            out_mm, seed + 4, relative, config.correlated_share, grid, config.correlation_px
-        )
+        grid = kernels.normal_grid(*shape, config.correlation_px, seed + 3)
+        smooth = kernels.smooth_at(seen, grid, config.correlation_px, shape)
+        kernels.jitter(depths_mm, seen, seed + 4, relative, config.correlated_share, smooth)
     if config.hole_share:
-        grid = kernels.normal_grid(height, width, config.hole_px, seed + 5)
-        kernels.lose_blobs(out_mm, ndtri(config.hole_share), grid, config.hole_px)
+        grid = kernels.normal_grid(*shape, config.hole_px, seed + 5)
+        smooth = kernels.smooth_at(seen, grid, config.hole_px, shape)
+        depths_mm[smooth < ndtri(config.hole_share)] = np.nan
 
 
 def _scatter(
-    true_mm: np.ndarray, out_mm: np.ndarray, config: NoiseConfig, rng: np.random.Generator
-) -> None:
-    empty = np.flatnonzero(np.isnan(true_mm))
-    count = rng.poisson(config.scatter_share * (true_mm.size - len(empty)))
-    if len(empty) and count:
-        pixels = empty[rng.integers(len(empty), size=count)]
-        near_mm = max(np.nanmin(true_mm) - config.scatter_mm, 1.0)
-        out_mm.flat[pixels] = rng.uniform(near_mm, np.nanmax(true_mm) + config.scatter_mm, count)
+    true_mm: np.ndarray,
+    seen: np.ndarray,
+    depths_mm: np.ndarray,
+    config: NoiseConfig,
+    rng: np.random.Generator,
+) -> tuple[np.ndarray, np.ndarray]:
+    """The pixels (flat indices) that get a false point, and its depth."""
+    n_empty = true_mm.size - len(seen)
+    count = rng.poisson(config.scatter_share * len(seen)) if config.scatter_share else 0
+    if not n_empty or not count:
+        return seen[:0], depths_mm[:0]
+    number = rng.integers(n_empty, size=count)
+    # Before the k-th empty pixel lie all seen ones with at most k empty ones before them.
+    pixels = number + np.searchsorted(seen - np.arange(len(seen)), number, side="right")
+    near_mm = max(depths_mm.min() - config.scatter_mm, 1.0)
+    values_mm = rng.uniform(near_mm, depths_mm.max() + config.scatter_mm, count)
+    return pixels, values_mm.astype(np.float32)
+
+
+def _whole(values_mm: np.ndarray, quantum_mm: float) -> np.ndarray:
+    """Rounded to whole quanta, in place; as they are where there is none."""
+    if quantum_mm:
+        values_mm /= np.float32(quantum_mm)
+        np.rint(values_mm, out=values_mm)
+        values_mm *= np.float32(quantum_mm)
+    return values_mm

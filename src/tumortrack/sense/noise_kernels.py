@@ -3,11 +3,15 @@
 Random numbers come from hashing (key, pixel) with SplitMix64 (Steele, Lea and Flood 2014,
 doi 10.1145/2660193.2660195): no state, a few ns each, and a pixel's number does not depend on
 what happened to the others.
+
+An organ fills a tenth of an image: kernels go through the pixels with a return, which
+``seen_pixels`` finds once, and change a list of their depths.
 """
 
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 
 import numba
 import numpy as np
@@ -38,20 +42,44 @@ def _bits(key, counter):  # type: ignore[no-untyped-def]
 
 
 @_jit
-def lose_grazing(true_mm, out_mm, key, share, degrees, pinhole):  # type: ignore[no-untyped-def]
+def seen_pixels(depth_mm):  # type: ignore[no-untyped-def]
+    """Flat indices (n,) of the pixels with a return, row by row, and where each of the h rows
+    starts among them (h + 1,)."""
+    height, width = depth_mm.shape
+    starts = np.zeros(height + 1, np.int32)
+    for v in range(height):
+        count = np.int32(0)
+        for u in range(width):
+            count += np.int32(depth_mm[v, u] == depth_mm[v, u])
+        starts[v + 1] = starts[v] + count
+    pixels = np.empty(starts[height], np.int32)
+    for v in range(height):
+        at, last = starts[v], starts[v + 1]
+        u = 0
+        while at < last:
+            pixels[at] = v * width + u
+            at += not math.isnan(depth_mm[v, u])
+            u += 1
+    return pixels, starts
+
+
+@_jit
+def lose_grazing(true_mm, depths_mm, seen, key, share, degrees, pinhole):  # type: ignore[no-untyped-def]
     """Drop ``share`` of the pixels whose normal is over ``degrees`` from the line of sight.
 
     With the depth's slopes (p, q) per pixel the surface normal is n = (fx p, fy q,
     -(z + (u - cx) p + (v - cy) q)), and its product with the line of sight r is -z.
     """
     fx, fy, cx, cy = pinhole
+    pixels, starts = seen
     height, width = true_mm.shape
     cosine = math.cos(math.radians(degrees))
+    across = ((np.arange(width) - cx) / fx) ** 2
     for v in range(height):
-        for u in range(width):
+        down = ((v - cy) / fy) ** 2
+        for i in range(starts[v], starts[v + 1]):
+            u = pixels[i] - v * width
             z = true_mm[v, u]
-            if math.isnan(z):
-                continue
             left = true_mm[v, u - 1] if u > 0 else _NO_RETURN
             right = true_mm[v, u + 1] if u + 1 < width else _NO_RETURN
             above = true_mm[v - 1, u] if v > 0 else _NO_RETURN
@@ -59,11 +87,10 @@ def lose_grazing(true_mm, out_mm, key, share, degrees, pinhole):  # type: ignore
             p, q = _slope(left, z, right), _slope(above, z, below)
             along = z + (u - cx) * p + (v - cy) * q
             normal = (fx * p) ** 2 + (fy * q) ** 2 + along**2
-            sight = ((u - cx) / fx) ** 2 + ((v - cy) / fy) ** 2 + 1
-            if z * z < cosine * cosine * normal * sight:
-                chance = (_bits(key, v * width + u) & _LOW_32) * _TO_UNIT
+            if z * z < cosine * cosine * normal * (across[u] + down + 1):
+                chance = (_bits(key, pixels[i]) & _LOW_32) * _TO_UNIT
                 if chance < share:
-                    out_mm[v, u] = np.nan
+                    depths_mm[i] = np.nan
 
 
 @numba.njit(cache=True, inline="always")
@@ -74,27 +101,34 @@ def _slope(before, here, after):  # type: ignore[no-untyped-def]
 
 
 @_jit
-def fly(true_mm, out_mm, key, share, flying_mm, edge):  # type: ignore[no-untyped-def]
+def fly(true_mm, depths_mm, seen, key, share, flying_mm, edge):  # type: ignore[no-untyped-def]
     """Send ``share`` of the edge pixels backwards; ``edge``: (how near in px, depth step in mm).
 
     The image's own border is no edge: what it cuts off goes on outside.
     """
-    near_px, step_mm = edge
+    near, step_mm = edge
+    pixels, starts = seen
     height, width = true_mm.shape
     for v in range(height):
-        for u in range(width):
+        for i in range(starts[v], starts[v + 1]):
+            u = pixels[i] - v * width
             z = true_mm[v, u]
-            if math.isnan(z):
-                continue
-            gap = 0.0
-            for dv, du in ((-near_px, 0), (near_px, 0), (0, -near_px), (0, near_px)):
-                if 0 <= v + dv < height and 0 <= u + du < width:
-                    other = true_mm[v + dv, u + du]
-                    gap = max(gap, flying_mm if math.isnan(other) else other - z)
+            above = true_mm[v - near, u] if v >= near else z
+            below = true_mm[v + near, u] if v + near < height else z
+            left = true_mm[v, u - near] if u >= near else z
+            right = true_mm[v, u + near] if u + near < width else z
+            # A sum with no number in it is none either.
+            if math.isnan(above + below + left + right):
+                farthest, gap = z, flying_mm
+                for other in (above, below, left, right):
+                    farthest = farthest if math.isnan(other) else max(farthest, other)
+                gap = max(gap, farthest - z)
+            else:
+                gap = max(max(max(above, below), max(left, right)) - z, 0.0)
             if gap >= step_mm:
-                bits = _bits(key, v * width + u)
+                bits = _bits(key, pixels[i])
                 if (bits & _LOW_32) * _TO_UNIT < share:
-                    out_mm[v, u] = z + (bits >> _S32) * _TO_UNIT * min(gap, flying_mm)
+                    depths_mm[i] = z + (bits >> _S32) * _TO_UNIT * min(gap, flying_mm)
 
 
 @_jit
@@ -120,56 +154,70 @@ def _weights(step):  # type: ignore[no-untyped-def]
 
 
 @_jit
-def smooth_row(grid, step, v, out):  # type: ignore[no-untyped-def]
-    """Row ``v`` of the smooth field that the grid spans (each pixel standard normal)."""
-    first, second = _weights(step)
-    top, phase_v = v // step, v % step
-    width = len(out)
-    for node in range((width - 1) // step + 1):
-        left = first[phase_v] * grid[top, node] + second[phase_v] * grid[top + 1, node]
-        right = first[phase_v] * grid[top, node + 1] + second[phase_v] * grid[top + 1, node + 1]
-        for phase in range(min(step, width - node * step)):
-            out[node * step + phase] = first[phase] * left + second[phase] * right
+def distort(depths_mm, seen, field, scale):  # type: ignore[no-untyped-def]
+    """Add ``scale`` times the field."""
+    pixels, _ = seen
+    flat = field.ravel()
+    for i in range(len(pixels)):
+        depths_mm[i] += flat[pixels[i]] * scale
 
 
 @_jit
-def jitter(out_mm, key, relative, correlated_share, grid, step):  # type: ignore[no-untyped-def]
-    """Add noise of standard deviation ``relative * z^2``, part of its variance from the grid."""
-    height, width = out_mm.shape
-    smooth = np.empty(width, np.float32)
+def jitter(depths_mm, seen, key, relative, correlated_share, smooth):  # type: ignore[no-untyped-def]
+    """Add noise of standard deviation ``relative * z^2``, part of its variance from ``smooth``."""
+    pixels, _ = seen
     own_weight = np.float32(math.sqrt(1 - correlated_share))
     common_weight = np.float32(math.sqrt(correlated_share))
-    for v in range(height):
-        smooth_row(grid, step, v, smooth)
-        for u in range(width):
-            z = out_mm[v, u]
-            if not math.isnan(z):
-                own = _QUANTILES[_bits(key, v * width + u) & _LOW_14]
-                noise = own_weight * own + common_weight * smooth[u]
-                out_mm[v, u] = z + np.float32(relative) * z * z * noise
+    for i in range(len(pixels)):
+        z = depths_mm[i]
+        own = _QUANTILES[_bits(key, pixels[i]) & _LOW_14]
+        noise = own_weight * own + common_weight * smooth[i]
+        depths_mm[i] = z + np.float32(relative) * z * z * noise
 
 
 @_jit
-def lose_blobs(out_mm, threshold, grid, step):  # type: ignore[no-untyped-def]
-    """Drop the pixels where the smooth field lies below ``threshold``."""
-    height, width = out_mm.shape
-    smooth = np.empty(width, np.float32)
+def smooth_at(seen, grid, step, shape):  # type: ignore[no-untyped-def]
+    """The smooth field that the grid spans (each pixel standard normal) at the pixels."""
+    pixels, starts = seen
+    height, width = shape
+    first, second = _weights(step)
+    out = np.empty(len(pixels), np.float32)
+    row = np.empty(width + step, np.float32)
     for v in range(height):
-        smooth_row(grid, step, v, smooth)
-        for u in range(width):
-            if smooth[u] < threshold:
-                out_mm[v, u] = np.nan
+        if starts[v] == starts[v + 1]:
+            continue
+        left, right = pixels[starts[v]] - v * width, pixels[starts[v + 1] - 1] - v * width
+        top, phase_v = v // step, v % step
+        for node in range(left // step, right // step + 1):
+            one = first[phase_v] * grid[top, node] + second[phase_v] * grid[top + 1, node]
+            two = first[phase_v] * grid[top, node + 1] + second[phase_v] * grid[top + 1, node + 1]
+            for phase in range(step):
+                row[node * step + phase] = first[phase] * one + second[phase] * two
+        for i in range(starts[v], starts[v + 1]):
+            out[i] = row[pixels[i] - v * width]
+    return out
 
 
 def slow_field(shape: tuple[int, int], peak: float, rng: np.random.Generator) -> np.ndarray:
     """A random sum of the lowest 3 x 3 cosines over the image, its largest magnitude ``peak``."""
-    rows, columns = (
-        np.cos(np.pi * np.outer((np.arange(n) + 0.5) / n, np.arange(3))).astype(np.float32)
-        for n in shape
-    )
+    field, scale = slow_shape(shape, peak, rng)
+    return field * scale
+
+
+def slow_shape(
+    shape: tuple[int, int], peak: float, rng: np.random.Generator
+) -> tuple[np.ndarray, np.float32]:
+    """``slow_field`` as (field, factor), for those who need few of its pixels."""
+    rows, columns = (_lowest_cosines(n) for n in shape)
     field = (rows @ rng.standard_normal((3, 3), np.float32)) @ columns.T
-    field *= np.float32(peak) / max(field.max(), -field.min())
-    return field
+    return field, np.float32(peak) / max(field.max(), -field.min())
+
+
+@lru_cache(maxsize=16)
+def _lowest_cosines(n: int) -> np.ndarray:
+    waves = np.cos(np.pi * np.outer((np.arange(n) + 0.5) / n, np.arange(3))).astype(np.float32)
+    waves.flags.writeable = False
+    return waves
 
 
 def pinhole(intrinsics: Intrinsics) -> tuple[float, float, float, float]:

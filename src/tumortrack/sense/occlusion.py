@@ -88,6 +88,7 @@ def occlude(frame: DepthFrame, config: OcclusionConfig, rng: np.random.Generator
     left = int(rng.uniform(0, config.left_in) * hidden.sum())
     if left:
         _leave_in(out_mm, seen, hidden, left, config, rng)
+    out_mm.flags.writeable = False  # nobody else's: taken over without a copy
     return DepthFrame(out_mm, frame.intrinsics, frame.stamp_ns)
 
 

@@ -10,6 +10,7 @@ from torch.nn import functional
 
 from tumortrack.core.config import Config
 from tumortrack.learn.layers import Layer, Norm, stack
+from tumortrack.learn.pooling import greatest_above_zero
 from tumortrack.learn.sampling import (
     Sampling,
     ball_query,
@@ -120,11 +121,8 @@ class _Level(nn.Module):
         grouped = functional.linear(offsets, linear.weight[:, :3], linear.bias)
         if shared is not None:
             grouped = grouped + take(shared, neighbours)
-        return _max_over_neighbours(self.rest(self.first.activate(grouped)))
-
-
-def _max_over_neighbours(grouped: Tensor) -> Tensor:
-    """(B, M, K, C) -> (B, M, C). As pooling, whose backward on a CPU is several times faster
-    than that of a maximum along an axis."""
-    k = grouped.shape[2]
-    return functional.max_pool2d(grouped.permute(0, 3, 1, 2), (1, k)).squeeze(-1).transpose(1, 2)
+        *between, last = (layer for layer in self.rest if isinstance(layer, Layer))
+        hidden = self.first.activate(grouped)
+        for layer in between:
+            hidden = layer(hidden)
+        return greatest_above_zero(last.before_relu(hidden))

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numba
 import numpy as np
 from jaxtyping import Float, Float32, Float64
 from scipy.spatial.transform import Rotation
@@ -30,10 +31,8 @@ class Stretch:
     reach_mm: float
 
     def apply(self, points_ct: Float[np.ndarray, "n 3"]) -> Float32[np.ndarray, "n 3"]:
-        offset = points_ct - self.centre_ct
-        bend = self.sagitta_mm * (offset @ self.along / self.reach_mm) ** 2
-        moved = (offset + bend[:, None] * self.across) @ self.matrix.T + self.centre_ct
-        return moved.astype(np.float32)
+        bend = self.along / self.reach_mm, self.sagitta_mm * self.across
+        return _moved(points_ct, self.centre_ct, self.matrix, *bend)
 
     def record(self) -> dict:
         return {
@@ -70,3 +69,21 @@ class StretchConfig(Config, frozen=True, tag="stretch"):
             sagitta_mm=float(rng.uniform(-self.sagitta_mm, self.sagitta_mm)),
             reach_mm=float(np.max(upper - lower) / 2),
         )
+
+
+@numba.njit(cache=True, nogil=True)
+def _moved(points, centre, matrix, along, bend):  # type: ignore[no-untyped-def]
+    """One pass over the points, a fifth of the time of as many arrays as there are terms."""
+    out = np.empty(points.shape, np.float32)
+    cx, cy, cz = centre
+    ax, ay, az = along
+    bx, by, bz = bend
+    for i in range(len(points)):
+        x, y, z = points[i, 0] - cx, points[i, 1] - cy, points[i, 2] - cz
+        reach = x * ax + y * ay + z * az
+        far = reach * reach
+        x, y, z = x + far * bx, y + far * by, z + far * bz
+        out[i, 0] = matrix[0, 0] * x + matrix[0, 1] * y + matrix[0, 2] * z + cx
+        out[i, 1] = matrix[1, 0] * x + matrix[1, 1] * y + matrix[1, 2] * z + cy
+        out[i, 2] = matrix[2, 0] * x + matrix[2, 1] * y + matrix[2, 2] * z + cz
+    return out
