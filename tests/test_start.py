@@ -13,13 +13,16 @@ from tumortrack.imaging.case import load_case
 from tumortrack.sense.files import write_cloud_ply
 
 
-def answered(*arguments: object) -> tuple[subprocess.CompletedProcess[str], set[str]]:
+def answered(
+    *arguments: object, run: list[str] = COMMAND[1:]
+) -> tuple[subprocess.CompletedProcess[str], set[str]]:
     """A command's end, and every module that it imported."""
-    words = [sys.executable, "-X", "importtime", *COMMAND[1:], *map(str, arguments)]
-    done = subprocess.run(words, capture_output=True, text=True, timeout=120, env=environment())
+    words = [sys.executable, "-X", "importtime", *run, *map(str, arguments)]
+    buffered = {name: is_ for name, is_ in environment().items() if name != "PYTHONUNBUFFERED"}
+    done = subprocess.run(words, capture_output=True, text=True, timeout=120, env=buffered)
     rows = [line.split("|") for line in done.stderr.splitlines() if line.startswith("import time:")]
     imported = {row[-1].strip() for row in rows}
-    assert "numpy" in imported
+    assert "tyro" in imported
     return done, imported
 
 
@@ -40,6 +43,7 @@ def cloud(tmp_path, phantom_case):
         ("track NONE virtual:CASE --report OUT", "NONE is not a tumortrack model"),
         ("evaluate MODEL NONE OUT", "NONE"),
         ("train NONE OUT", "NONE is not a tumortrack case"),
+        ("onnx NONE OUT.onnx", "NONE is not a tumortrack model"),
     ],
 )
 def test_what_is_wrong_is_said_before_pytorch_is_loaded(
@@ -56,6 +60,14 @@ def test_what_is_wrong_is_said_before_pytorch_is_loaded(
     assert not (tmp_path / "out").exists()
 
 
+def test_a_missing_package_is_told_before_pytorch_is_loaded(slim_model, tmp_path):
+    without = "import sys; sys.modules['onnx'] = None; from tumortrack.app.cli import main; main()"
+    done, imported = answered("onnx", slim_model, tmp_path / "out.onnx", run=["-c", without])
+    assert done.returncode == 2, done.stderr
+    assert "pip install 'tumortrack[onnx]'" in done.stderr
+    assert "torch" not in imported
+
+
 def test_an_answer_needs_none_of_the_slow_libraries(slim_model, tmp_path):
     from warp_objects import placed
 
@@ -65,6 +77,7 @@ def test_an_answer_needs_none_of_the_slow_libraries(slim_model, tmp_path):
     done, imported = answered("locate", slim_model, file, tmp_path / "out", "--grid", 32)
     assert done.returncode == 0, done.stderr[-2000:]
     assert (tmp_path / "out" / "labels.nii.gz").exists()
+    assert "written to" in done.stdout.splitlines()[-1]  # though the process ends at once
     assert "torch" in imported
     slow = {"torch._dynamo", "nibabel", "pydicom", "trimesh", "matplotlib", "SimpleITK", "skimage"}
     assert not slow & imported

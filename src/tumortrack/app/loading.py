@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import gc
+import os
+import sys
+from typing import NoReturn
 
 
 def keep_loaded() -> None:
@@ -13,3 +16,10 @@ def keep_loaded() -> None:
     are not collected in the end.
     """
     gc.freeze()
+
+
+def leave() -> NoReturn:
+    """End the process at once, all being written: to take apart what was loaded, object by object,
+    takes a fifth of a second. What is registered for the end of Python is not called."""
+    sys.stderr.flush()
+    os._exit(0)

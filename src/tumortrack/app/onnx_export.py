@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from importlib.util import find_spec
 from pathlib import Path
 
 from tumortrack.app.console import say
 from tumortrack.core import store
 from tumortrack.core.errors import InputError
+from tumortrack.learn.model_folder import read_model_manifest
 
 
 def write_onnx(folder: Path, out: Path, overwrite: bool) -> None:
@@ -23,6 +25,9 @@ def write_onnx(folder: Path, out: Path, overwrite: bool) -> None:
         raise InputError(f"{out} exists already. Choose another file, or give --overwrite.")
     if not out.parent.is_dir():
         raise InputError(f"{out.parent} is no folder; make it first.")
+    read_model_manifest(folder)
+    if find_spec("onnx") is None:  # so far said before PyTorch's seconds
+        raise InputError("writing ONNX needs the package onnx: pip install 'tumortrack[onnx]'.")
 
     from tumortrack.learn.model import load_model
     from tumortrack.learn.onnx_file import onnx_bytes
