@@ -5,6 +5,7 @@ import shutil
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 import torch
@@ -14,6 +15,7 @@ from tumortrack.app.compiling import compile_model
 from tumortrack.app.inspection import describe
 from tumortrack.core.config import to_builtins
 from tumortrack.learn.compiled import Arithmetic, find, place_of, read, save, this_machine
+from tumortrack.learn.compiled import describe as describe_compiled
 from tumortrack.learn.compiling import like_an_organ, measured, reference
 from tumortrack.learn.decoders.mlp import MlpDecoderConfig
 from tumortrack.learn.inference import Inference, possible, usual
@@ -153,7 +155,7 @@ def test_compiled_is_found_again_and_not_where_anything_differs(quick_model, tmp
     path = save(folder, compiled)
     assert read(path) == compiled
     assert find(folder, "weights") == (compiled.arithmetic, None)
-    for change in ("weights", "machine", "damaged", "chunk", "schema"):
+    for change in ("weights", "machine", "threads", "damaged", "chunk", "schema"):
         arithmetic, notice = find(changed(folder, tmp_path / change, change), "weights")
         assert arithmetic is None
         assert "tumortrack compile" in notice
@@ -162,18 +164,47 @@ def test_compiled_is_found_again_and_not_where_anything_differs(quick_model, tmp
 def changed(folder: Path, copy: Path, what: str) -> Path:
     """A copy of the folder whose compiled file is not for here, or not whole."""
     (copy / "compiled").mkdir(parents=True)
-    path = place_of(copy, this_machine())
-    content = json.loads(place_of(folder, this_machine()).read_text())
+    place = this_machine(), torch.get_num_threads()
+    path = place_of(copy, *place)
+    content = json.loads(place_of(folder, *place).read_text())
     if what == "weights":
         content["weights_sha256"] = "others"
     elif what == "machine":
         content["machine"]["torch"] = "1.0"
+    elif what == "threads":
+        content["threads"] += 1
     elif what == "chunk":
         content["arithmetic"]["chunk"] = 10**9
     elif what == "schema":
         content["schema"] = 0
     path.write_text("{" if what == "damaged" else json.dumps(content))
     return copy
+
+
+def test_each_number_of_threads_has_its_own_choice(quick_model, tmp_path, monkeypatch):
+    """What is fastest on one core need not be on two."""
+    alone = measured(load_model(quick_model, "cpu"), "weights", rounds=1)
+    many = msgspec.structs.replace(
+        alone, threads=alone.threads + 1, arithmetic=other_than(alone.arithmetic)
+    )
+    save(tmp_path, many)
+    arithmetic, notice = find(tmp_path, "weights")
+    assert arithmetic is None
+    assert f"threads ({alone.threads} here); the usual arithmetic is used" in notice
+    save(tmp_path, alone)
+    assert find(tmp_path, "weights") == (alone.arithmetic, None)
+    lines = describe_compiled(tmp_path)
+    assert len(lines) == 2
+    for one in (alone, many):
+        (line,) = [line for line in lines if f"for {one.threads} thread" in line]
+        assert f": {one.arithmetic.numbers}, {one.arithmetic.chunk} queries" in line
+        assert line.endswith("(this machine)")
+    monkeypatch.setattr(torch, "get_num_threads", lambda: many.threads)
+    assert find(tmp_path, "weights") == (many.arithmetic, None)
+
+
+def other_than(arithmetic: Arithmetic) -> Arithmetic:
+    return Arithmetic(numbers=arithmetic.numbers, chunk=arithmetic.chunk // 2)
 
 
 def test_arithmetic_is_read_as_written():

@@ -1,8 +1,9 @@
 """What `tumortrack compile` leaves in a model folder: which arithmetic is fastest on a machine.
 
-MODEL/compiled holds one JSON file a machine. It is data: it chooses among ways of this library's
-own, each of which gives the network's labels, so that a file from a stranger may cost time and
-nothing else; nothing in it is ever run. The model's own files and manifest stay as they were.
+MODEL/compiled holds one JSON file a machine and number of threads. It is data: it chooses among
+ways of this library's own, each of which gives the network's labels, so that a file from a stranger
+may cost time and nothing else; nothing in it is ever run. The model's own files and manifest stay
+as they were.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from tumortrack.core.config import Config, from_builtins, to_builtins
 from tumortrack.core.errors import ArtifactError, InputError, StorageError
 
 FOLDER = "compiled"
-SCHEMA = 1
+SCHEMA = 2
 _CHUNKS = (16, 2**14)  # fewest and most queries at once and core
 
 Numbers = Literal["network", "float32", "bfloat16", "int8"]
@@ -81,19 +82,19 @@ def _matters(instruction: str) -> bool:
     return instruction.startswith(("avx", "amx", "asimd", "sve"))
 
 
-def place_of(folder: Path, machine: Machine) -> Path:
-    """Where a model folder keeps what was measured on a machine."""
-    digest = hashlib.sha256(msgspec.json.encode(machine)).hexdigest()
+def place_of(folder: Path, machine: Machine, threads: int) -> Path:
+    """Where a model folder keeps what was measured on a machine with so many threads."""
+    digest = hashlib.sha256(msgspec.json.encode((machine, threads))).hexdigest()
     return folder / FOLDER / f"{digest[:16]}.json"
 
 
 def save(folder: Path, compiled: Compiled) -> Path:
-    """Write it into a model folder, over an older one of the same machine.
+    """Write it into a model folder, over an older one of the same machine and threads.
 
     Raises:
         StorageError: the disk refused.
     """
-    path = place_of(folder, compiled.machine)
+    path = place_of(folder, compiled.machine, compiled.threads)
     try:
         path.parent.mkdir(exist_ok=True)
     except OSError as error:
@@ -103,9 +104,10 @@ def save(folder: Path, compiled: Compiled) -> Path:
 
 
 def find(folder: Path, weights_sha256: str) -> tuple[Arithmetic | None, str | None]:
-    """What was found fastest here for these weights; or None and one line that says why not."""
-    machine = this_machine()
-    path = place_of(folder, machine)
+    """What was found fastest here, with as many threads as now, for these weights; or None and one
+    line that says why not."""
+    machine, threads = this_machine(), torch.get_num_threads()
+    path = place_of(folder, machine, threads)
     again = f"the usual arithmetic is used. `tumortrack compile {folder}` measures what is faster."
     try:
         there = path.is_file()
@@ -113,13 +115,15 @@ def find(folder: Path, weights_sha256: str) -> tuple[Arithmetic | None, str | No
     except OSError as error:
         return None, f"{path.parent} cannot be read ({error.strerror}); {again}"
     if not there:
-        where = "on another machine or PyTorch only" if others else "on no machine yet"
+        elsewhere = f"only for other machines, PyTorches or threads ({threads} here)"
+        where = elsewhere if others else "on no machine yet"
         return None, f"this model was compiled {where}; {again}"
     try:
         compiled = read(path)
     except ArtifactError as error:
         return None, f"{error} So {again}"
-    if (compiled.weights_sha256, compiled.machine) != (weights_sha256, machine):
+    measured = (compiled.weights_sha256, compiled.machine, compiled.threads)
+    if measured != (weights_sha256, machine, threads):
         return None, f"this model was compiled for other weights; {again}"
     from tumortrack.learn.inference import possible  # which knows the ways and needs this module
 
@@ -144,7 +148,7 @@ def read(path: Path) -> Compiled:
 
 
 def describe(folder: Path) -> list[str]:
-    """A line for every machine that the model was compiled on."""
+    """A line for every machine and number of threads that the model was compiled for."""
     lines = []
     for path in sorted((folder / FOLDER).glob("*.json")):
         try:
@@ -155,6 +159,7 @@ def describe(folder: Path) -> list[str]:
         ways, here = one.arithmetic, one.machine == this_machine()
         lines.append(
             f"{FOLDER}/{path.name}: {ways.numbers}, {ways.chunk} queries at once, for "
-            f"{one.machine.processor}, PyTorch {one.machine.torch}{' (this machine)' * here}"
+            f"{one.threads} thread{'s' * (one.threads > 1)} of {one.machine.processor}, PyTorch "
+            f"{one.machine.torch}{' (this machine)' * here}"
         )
     return lines
