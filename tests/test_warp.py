@@ -22,10 +22,19 @@ from tumortrack.learn.network import OccupancyNetwork, quick_network
 from tumortrack.learn.warp.locate import best_fit
 from tumortrack.learn.warp.motion import WarpMotion
 from tumortrack.learn.warp.network import Placement, WarpNetwork
-from tumortrack.learn.warp.refine import RefineConfig, _prior, _residuals, refine
+from tumortrack.learn.warp.refine import RefineConfig, _prior, refine
 from tumortrack.learn.warp.shape import Shape, distance_of
 from tumortrack.simulate.occupancy import labels_of, surface_distance
-from warp_objects import ANATOMY, PLACE_MM, TURNED, placed, shape, slim_network
+from warp_objects import (
+    ANATOMY,
+    PLACE_MM,
+    TURNED,
+    nudged,
+    placed,
+    residual_rows,
+    shape,
+    slim_network,
+)
 
 ORGAN = ANATOMY.organ
 
@@ -44,15 +53,6 @@ def surface(motion, count, seed=0):
     rng = np.random.default_rng(seed)
     vertices = ORGAN.vertices_mm[rng.permutation(len(ORGAN.vertices_mm))[:count]]
     return motion.carry(vertices)
-
-
-def nudged(motion, shift_mm, turn_rad):
-    """Another place for the undeformed organ, to start from."""
-    turn = Rotation.from_rotvec(turn_rad).as_matrix()
-    mean = motion.shape.body.mean
-    return WarpMotion(
-        motion.shape, motion.rotation @ turn, motion.centre_mm + np.array(shift_mm), mean
-    )
 
 
 START = nudged(placed(), [4.0, -3, 5], [0.1, -0.08, 0.12])
@@ -211,7 +211,7 @@ def test_the_derivatives_are_those_of_the_distances(share, tolerance):
 
     def distances(x):
         rotation = TURNED @ Rotation.from_rotvec(x[3:6]).as_matrix()
-        rows = _residuals(shape(), points, (rotation, PLACE_MM + TURNED @ x[:3], x[6:]))
+        rows = residual_rows(points, (rotation, PLACE_MM + TURNED @ x[:3], x[6:]))
         return rows[:, -1], rows[:, :-1]
 
     _, rows = distances(state)
@@ -286,7 +286,7 @@ def test_a_slow_general_optimiser_finds_the_same():
         return START.rotation @ turn, centre, x[6:]
 
     def residuals(x):
-        distance = _residuals(shape(), points, moved(x))[:, -1].astype(float)
+        distance = residual_rows(points, moved(x))[:, -1].astype(float)
         robust = np.sqrt(weight) * distance / np.sqrt(1 + (distance / config.last_mm) ** 2)
         off = np.concatenate([x[:6], x[6:] - shape().body.mean])
         return np.concatenate([robust, root @ off])

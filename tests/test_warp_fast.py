@@ -15,13 +15,15 @@ from elastic_objects import CENTER, RADII
 from tumortrack.core.types import Mesh, SensorCloud
 from tumortrack.imaging.raster import cover, label_grid, winding_numbers
 from tumortrack.learn.model import load_model
-from tumortrack.learn.warp.refine import _normal, _residuals
+from tumortrack.learn.warp.descent import normal_equations
+from tumortrack.learn.warp.locate import best_fit
+from tumortrack.learn.warp.refine import Descent, RefineConfig, _prior, refine
 from tumortrack.learn.warp.sharing import share
 from tumortrack.simulate.elastic.flow import BLOCK, steps_for
-from tumortrack.track.chance import normal_table, probabilities
+from tumortrack.track.chance import Nearest, normal_table, probabilities
 from tumortrack.track.estimate import Following
 from tumortrack.track.warp import WarpLocator
-from warp_objects import ANATOMY, PLACE_MM, TURNED, placed, shape
+from warp_objects import ANATOMY, PLACE_MM, TURNED, nudged, placed, residual_rows, shape
 
 
 def about(count, seed=0, reach=1.6):
@@ -67,6 +69,8 @@ def test_points_go_where_a_plain_loop_takes_them(count):
     np.testing.assert_allclose(body.follow(velocity, points), truth, atol=2e-4)
     carried = (truth - body.center_ct) @ TURNED.T + PLACE_MM
     np.testing.assert_allclose(motion.carry(points), carried, atol=2e-4)
+    rest = body.follow(-velocity, (carried - PLACE_MM) @ TURNED + body.center_ct)
+    np.testing.assert_allclose(motion.back(carried), rest, atol=2e-4)
 
 
 def test_parts_are_all_done_once_and_errors_come_back():
@@ -86,14 +90,32 @@ def test_sums_are_those_of_the_rows_and_rows_those_of_plain_arithmetic(state):
     points = motion.carry(ANATOMY.organ.vertices_mm[::5]).astype(np.float32)
     points += np.random.default_rng(1).normal(0, 1.5, points.shape).astype(np.float32)
     pose = (motion.rotation, motion.centre_mm, 0.9 * motion.coefficients)
-    rows = _residuals(shape(), points, pose).astype(float)
-    distance, sums = _normal(shape(), points, pose, 2.0)
-    np.testing.assert_array_equal(distance, rows[:, -1])
-    assert np.abs(distance).max() > 2
+    rows = residual_rows(points, pose).astype(float)
+    unknowns, field, velocity = rows.shape[1] - 1, shape().distances[0], body.velocity(-pose[2])
+    left = (
+        np.empty(len(points), np.float32),
+        np.empty((unknowns, unknowns)),
+        np.empty(unknowns),
+    )
+    normal_equations(
+        (velocity, body.origin_mm, np.float32(body.spacing_mm)),
+        steps_for(velocity, body.spacing_mm),
+        body.modes,
+        (body.center_ct, *pose[:2]),
+        (field.values_mm, field.origin_mm, np.float32(field.spacing_mm)),
+        np.float32(2),
+        points,
+        (np.empty((BLOCK, unknowns + 1), np.float32), np.zeros((28, 300), np.float32)),
+        left,
+    )
+    np.testing.assert_array_equal(left[0], rows[:, -1])
+    assert np.abs(left[0]).max() > 2
     pulled = rows / (1 + (rows[:, -1:] / 2.0) ** 2)
-    np.testing.assert_allclose(sums, pulled.T @ pulled, atol=1e-5 * np.abs(sums).max())
+    sums = pulled.T @ pulled
+    most = np.abs(sums).max()
+    np.testing.assert_allclose(left[1], sums[:-1, :-1], atol=1e-5 * most)
+    np.testing.assert_allclose(left[2], sums[:-1, -1], atol=1e-5 * most)
 
-    velocity = body.velocity(-pose[2])
     offsets = (points.astype(float) - pose[1]) @ pose[0]
     rest, middle = plainly_followed(
         velocity, offsets + body.center_ct, steps_for(velocity, body.spacing_mm)
@@ -104,6 +126,98 @@ def test_sums_are_those_of_the_rows_and_rows_those_of_plain_arithmetic(state):
     plain = np.concatenate([-outwards, -np.cross(offsets, outwards), by_modes], axis=1)
     same = np.isclose(rows[:, :-1], plain, atol=0.02).all(1)  # others lie on a cell's border
     assert same.mean() > 0.99
+
+
+def plainly_refined(points, start, config):
+    """``refine`` in a plain loop: pose, coefficients, cost and number of steps."""
+    body, precision = shape().body, _prior(shape(), config)
+    rotation, centre, coefficients = start.rotation, start.centre_mm, start.coefficients
+    moved, weight = np.zeros(6), min(config.n_effective / len(points), 1) / config.sigma_mm**2
+    step, settled = 0, False
+    while True:
+        rows = residual_rows(points, (rotation, centre, coefficients)).astype(float)
+        width = max(config.last_mm, config.first_mm * config.narrowing**step)
+        pulled = rows[:, :-1] / (1 + (rows[:, -1:] / width) ** 2) ** 2
+        off = np.concatenate([moved, coefficients - body.mean])
+        if settled or step == config.steps:
+            square = (rows[:, -1] / config.last_mm) ** 2
+            robust = (config.last_mm**2 * square / (1 + square)).sum()
+            return (rotation, centre, coefficients), weight * robust + off @ precision @ off, step
+        curvature = weight * pulled.T @ rows[:, :-1] + precision
+        change = -np.linalg.solve(curvature, weight * pulled.T @ rows[:, -1] + precision @ off)
+        centre = centre + rotation @ change[:3]
+        rotation = rotation @ Rotation.from_rotvec(change[3:6]).as_matrix()
+        coefficients, moved = coefficients + change[6:], moved + change[:6]
+        settled = np.abs(change).max() < config.enough_mm and width == config.last_mm
+        step += 1
+
+
+@pytest.mark.parametrize("steps", [0, 3, 20])
+def test_a_refinement_is_that_of_a_plain_loop(steps):
+    config, start = RefineConfig(steps=steps), nudged(placed(), [3, -2, 5], [0.1, -0.05, 0.1])
+    points = placed().carry(ANATOMY.organ.vertices_mm[::3])
+    fit = refine(shape(), points, start, config)
+    (rotation, centre, coefficients), cost, gone = plainly_refined(points, start, config)
+    assert fit.steps == gone
+    assert gone < 20
+    assert fit.cost == pytest.approx(cost, rel=1e-3)
+    np.testing.assert_allclose(fit.motion.rotation, rotation, atol=1e-4)
+    np.testing.assert_allclose(fit.motion.centre_mm, centre, atol=2e-3)
+    np.testing.assert_allclose(fit.motion.coefficients, coefficients, atol=2e-3)
+    np.testing.assert_allclose(fit.motion.rotation @ fit.motion.rotation.T, np.eye(3), atol=1e-9)
+
+
+def test_a_descent_goes_on_where_it_was_stopped():
+    points = placed().carry(ANATOMY.organ.vertices_mm[::3])
+    start = nudged(placed(), [3, -2, 5], [0.1, -0.05, 0.1])
+    whole = refine(shape(), points, start, RefineConfig())
+    halves = Descent(shape(), points, start, RefineConfig())
+    halves.run(2)
+    assert halves.cost > 2 * whole.cost
+    for steps in (4, 20, 20):
+        halves.run(steps)
+    again = halves.refined()
+    assert (again.cost, again.steps) == (whole.cost, whole.steps)
+    np.testing.assert_array_equal(again.motion.coefficients, whole.motion.coefficients)
+    np.testing.assert_array_equal(again.motion.covariance, whole.motion.covariance)
+    assert start.centre_mm[2] == nudged(placed(), [3, -2, 5], [0, 0, 0]).centre_mm[2]
+
+
+def test_the_best_of_many_starts_wins_wherever_it_stands():
+    points = placed().carry(ANATOMY.organ.vertices_mm[::3])
+    near = nudged(placed(), [3, -2, 5], [0.1, -0.05, 0.1])
+    far = [nudged(placed(), [0, 0, 30.0 * n], [0, 0, 1.0 * n]) for n in (1, 2, 3)]
+    alone = refine(shape(), points, near, RefineConfig())
+    for starts in ([near, *far], [*far, near]):
+        fit = best_fit(shape(), points, starts, RefineConfig())
+        assert fit.cost == alone.cost
+        assert fit.steps == alone.steps
+
+
+def test_labels_and_margins_are_those_of_the_distances():
+    points = about(9000, 4)
+    labels, margin_mm = shape().labels_at(points)
+    distances = np.stack([field.at(points) for field in shape().distances])
+    plain = np.where(distances[1] < 0, 2, (distances[0] < 0).astype(int))
+    assert set(np.unique(plain)) == {0, 1, 2}
+    np.testing.assert_allclose(margin_mm, np.abs(distances).min(0), atol=1e-5)
+    clear = margin_mm > 1e-5
+    assert clear.mean() > 0.999
+    np.testing.assert_array_equal(labels[clear], plain[clear])
+
+
+def test_the_nearest_place_is_nearest_but_for_a_nodes_width():
+    rng = np.random.default_rng(5)
+    places = CENTER + rng.uniform(-1, 1, (200, 3)) * RADII
+    points = about(3000, 6)
+    found = np.linalg.norm(points - places[Nearest.of(places).to(points)], axis=1)
+    apart = np.linalg.norm(points[:, None] - places, axis=2)
+    inside = ((points > places.min(0)) & (points < places.max(0))).all(1)
+    assert inside.mean() > 0.2
+    assert (found[inside] <= apart.min(1)[inside] + 2 * np.sqrt(3)).all()
+    assert np.mean(found[inside] == apart.min(1)[inside].astype(found.dtype)) > 0.6
+    own = Nearest.of(places).to(places.astype(np.float32))
+    assert np.mean(own == np.arange(200)) > 0.9
 
 
 def test_deviations_are_those_of_plain_products():

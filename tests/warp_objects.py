@@ -15,10 +15,12 @@ from tumortrack.core.types import Anatomy
 from tumortrack.learn.config import TrainConfig
 from tumortrack.learn.network import NetworkConfig, clinic_network
 from tumortrack.learn.train import Run, train
+from tumortrack.learn.warp import kernels
 from tumortrack.learn.warp.motion import WarpMotion
 from tumortrack.learn.warp.shape import Shape, shape_of
 from tumortrack.simulate.deform import ElasticConfig
 from tumortrack.simulate.elastic.body import build_body
+from tumortrack.simulate.elastic.flow import steps_for
 from tumortrack.simulate.occupancy import OccupancyConfig
 from tumortrack.simulate.scene import SceneConfig
 
@@ -37,6 +39,33 @@ def placed(state: int = 73, share: float = 1.0) -> WarpMotion:
     """The organ before a camera, in a share of one of its library's states."""
     coefficients = share * shape().body.states[state].astype(float)
     return WarpMotion(shape(), TURNED, PLACE_MM, coefficients)
+
+
+def nudged(motion, shift_mm, turn_rad):
+    """Another place for the undeformed organ, to start from."""
+    turn = Rotation.from_rotvec(turn_rad).as_matrix()
+    mean = motion.shape.body.mean
+    return WarpMotion(
+        motion.shape, motion.rotation @ turn, motion.centre_mm + np.array(shift_mm), mean
+    )
+
+
+def residual_rows(points_mm, pose) -> np.ndarray:
+    """``kernels.residuals`` of points at a (rotation, centre_mm, coefficients)."""
+    rotation, centre_mm, coefficients = pose
+    body, field = shape().body, shape().distances[0]
+    velocity = body.velocity(-coefficients)
+    rows = np.empty((len(points_mm), kernels.POSE + len(coefficients) + 1), np.float32)
+    kernels.residuals(
+        (velocity, body.origin_mm, np.float32(body.spacing_mm)),
+        steps_for(velocity, body.spacing_mm),
+        body.modes,
+        (body.center_ct, rotation, centre_mm),
+        (field.values_mm, field.origin_mm, np.float32(field.spacing_mm)),
+        np.ascontiguousarray(points_mm, np.float32),
+        rows,
+    )
+    return rows
 
 
 def slim_network() -> NetworkConfig:

@@ -6,6 +6,7 @@ from typing import Protocol, runtime_checkable
 
 from tumortrack.core.errors import InputError
 from tumortrack.core.types import Anatomy, SensorCloud
+from tumortrack.learn.allocator import keep_small_blocks
 from tumortrack.learn.model import Model
 from tumortrack.track.estimate import Estimate, Following
 from tumortrack.track.occupancy import OccupancyLocator
@@ -28,9 +29,13 @@ class Locator(Protocol):
 
 
 class Tracker:
-    """Locates the organ and tumors of one model in sensor clouds (camera frame, mm)."""
+    """Locates the organ and tumors of one model in sensor clouds (camera frame, mm).
+
+    A process that has one keeps what memory a frame frees for the next one.
+    """
 
     def __init__(self, model: Model) -> None:
+        keep_small_blocks()
         self.model = model
         self._locator: Locator = (
             WarpLocator(model) if model.config.network.warps else OccupancyLocator(model)

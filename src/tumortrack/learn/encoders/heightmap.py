@@ -59,7 +59,9 @@ class HeightMap(nn.Module):
         limit = self.config.n_points
         if limit is not None:
             points = points[:, :limit]
-        latent: Tensor = self.layers(picture(points, self.config.pixels)).flatten(1)
+        seen = picture(points, self.config.pixels)
+        # In the order that convolutions work in: else each of them would change it and back.
+        latent: Tensor = self.layers(seen.to(memory_format=torch.channels_last)).flatten(1)
         return latent
 
 

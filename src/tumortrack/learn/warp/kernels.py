@@ -35,34 +35,59 @@ def carry(lattice, steps, center, turn, to, points, out):  # type: ignore[no-unt
 
 
 @numba.njit(cache=True, fastmath=True, nogil=True)
-def deviations(lattice, steps, modes, center, points, rows):  # type: ignore[no-untyped-def]
-    """What each unknown does to each point's place along x, y, z, in the CT's axes: into ``rows``
-    (n, 3, p), zeroed. All float32."""
+def back(lattice, steps, center, turn, to, points, out):  # type: ignore[no-untyped-def]
+    """The inverse of ``carry``, if ``lattice`` has the opposite velocity."""
+    velocity, origin, spacing = lattice
+    per_cell = np.float32(1) / spacing
+    places, speeds, middles = block()
+    for first in range(0, len(points), BLOCK):
+        some = points[first : first + BLOCK]
+        for p in range(len(some)):
+            x, y, z = some[p, 0] - to[0], some[p, 1] - to[1], some[p, 2] - to[2]
+            for axis in range(3):
+                turned = turn[0, axis] * x + turn[1, axis] * y + turn[2, axis] * z
+                rest = np.float32(turned + center[axis])
+                places[axis, p] = (rest - origin[axis]) * per_cell
+        travel(velocity, spacing, steps, len(some), places, speeds, middles)
+        for p in range(len(some)):
+            for axis in range(3):
+                out[first + p, axis] = origin[axis] + spacing * places[axis, p]
+
+
+@numba.njit(cache=True, fastmath=True, nogil=True)
+def variances(lattice, steps, modes, center, root, points, out):  # type: ignore[no-untyped-def]
+    """The mean over x, y, z of each point's variance (n,), if ``root @ root.T`` (p, p) is the
+    covariance of the unknowns: their effects times the root, squared. All float32."""
     velocity, origin, spacing = lattice
     places, speeds, middles = block()
     along = np.eye(3, dtype=np.float32)
+    row, mixed = np.empty(len(root), np.float32), np.empty(len(root), np.float32)
     for first in range(0, len(points), BLOCK):
         some = points[first : first + BLOCK]
         enter(some, origin, spacing, places)
         travel(velocity, spacing, steps, len(some), places, speeds, middles)
         for p in range(len(some)):
-            x = origin[0] + spacing * places[0, p] - center[0]
-            y = origin[1] + spacing * places[1, p] - center[1]
-            z = origin[2] + spacing * places[2, p] - center[2]
-            row = rows[first + p]
+            offset = (
+                origin[0] + spacing * places[0, p] - center[0],
+                origin[1] + spacing * places[1, p] - center[1],
+                origin[2] + spacing * places[2, p] - center[2],
+            )
+            out[first + p] = 0
             for axis in range(3):
-                row[axis, axis] = 1
-                add_modes(
-                    modes,
-                    middles[0, p],
-                    middles[1, p],
-                    middles[2, p],
-                    along[axis],
-                    row[axis, POSE:],
-                )
-            row[0, 4], row[0, 5] = z, -y
-            row[1, 3], row[1, 5] = -z, x
-            row[2, 3], row[2, 4] = y, -x
+                row[:] = 0
+                row[axis] = 1
+                after, before = (axis + 1) % 3, (axis + 2) % 3
+                row[3 + after] = offset[before]
+                row[3 + before] = -offset[after]
+                x, y, z = middles[0, p], middles[1, p], middles[2, p]
+                add_modes(modes, x, y, z, along[axis], row[POSE:])
+                mixed[:] = 0
+                for n in range(len(root)):
+                    for m in range(n + 1):  # the root is lower triangular
+                        mixed[m] += row[n] * root[n, m]
+                for m in range(len(root)):
+                    out[first + p] += mixed[m] ** 2
+            out[first + p] /= 3
 
 
 @numba.njit(cache=True, fastmath=True, nogil=True)
@@ -78,44 +103,11 @@ def residuals(lattice, steps, modes, pose, field, points, rows):  # type: ignore
     for first in range(0, len(points), BLOCK):
         some = points[first : first + BLOCK]
         room = places, speeds, middles
-        _rows(lattice, steps, modes, pose, field, some, room, rows[first : first + BLOCK])
+        add_rows(lattice, steps, modes, pose, field, some, room, rows[first : first + BLOCK])
 
 
 @numba.njit(cache=True, fastmath=True, nogil=True)
-def normal_equations(  # type: ignore[no-untyped-def]
-    lattice, steps, modes, pose, field, width, points, distances, out
-):
-    """Distances as ``residuals`` gives them (n,), and the sum over points of ``pull * row * row'``
-    (p + 1, p + 1) in ``out``; ``pull`` is 1 / (1 + (distance / width)^2)^2.
-
-    Some hundred points at a time are best: their rows have to stay in the cache.
-    """
-    places, speeds, middles = block()
-    columns = len(out)
-    rows = np.empty((BLOCK, columns), np.float32)
-    across = np.empty((columns, len(points)), np.float32)  # sums over points run along memory
-    one, per_width = np.float32(1), np.float32(1) / width
-    for first in range(0, len(points), BLOCK):
-        some = points[first : first + BLOCK]
-        room = places, speeds, middles
-        _rows(lattice, steps, modes, pose, field, some, room, rows)
-        for p in range(len(some)):
-            distance = rows[p, -1]
-            distances[first + p] = distance
-            share = one / (one + (distance * per_width) ** 2)
-            for n in range(columns):
-                across[n, first + p] = rows[p, n] * share
-    for n in range(columns):
-        for m in range(n + 1):
-            total, one_column, other = np.float32(0), across[n], across[m]
-            for p in range(len(points)):
-                total += one_column[p] * other[p]
-            out[n, m] = total
-            out[m, n] = total
-
-
-@numba.njit(cache=True, fastmath=True, nogil=True)
-def _rows(lattice, steps, modes, pose, field, points, room, rows):  # type: ignore[no-untyped-def]
+def add_rows(lattice, steps, modes, pose, field, points, room, rows):  # type: ignore[no-untyped-def]
     """``residuals`` of one block of points; ``room`` is ``flow.block()``."""
     velocity, origin, spacing = lattice
     center, rotation, centre = pose

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -14,7 +15,10 @@ from tumortrack.learn.warp.shape import Shape
 from tumortrack.learn.warp.sharing import share
 from tumortrack.simulate.elastic.flow import steps_for
 
-_AT_ONCE = 4096  # points: a thread's part; bounds the memory of their derivatives
+Flow = tuple[tuple[np.ndarray, np.ndarray, np.floating], int]  # lattice and steps of the kernels
+
+_AT_ONCE = 4096  # points: a thread's part
+_FEW = 64  # as well, where each takes longer
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,41 +57,39 @@ class WarpMotion:
 
     def carry(self, points_ct: Float[np.ndarray, "n 3"], /) -> Float64[np.ndarray, "n 3"]:
         """CT (LPS, mm) -> camera frame (mm)."""
-        points, out = np.ascontiguousarray(points_ct, np.float32), np.empty((len(points_ct), 3))
-        flow = *self._flow, self.shape.body.center_ct, self.rotation, self.centre_mm
-        share(lambda part: kernels.carry(*flow, points[part], out[part]), len(out), _AT_ONCE)
-        return out
+        return self._gone(kernels.carry, self._flow, points_ct)
 
     def back(self, points_camera: Float[np.ndarray, "n 3"], /) -> Float64[np.ndarray, "n 3"]:
         """Camera frame (mm) -> CT (LPS, mm)."""
-        rest = (points_camera - self.centre_mm) @ self.rotation + self.shape.body.center_ct
-        return self.shape.body.follow(-self._velocity, rest).astype(float)
+        (velocity, origin, spacing), steps = self._flow
+        return self._gone(kernels.back, ((-velocity, origin, spacing), steps), points_camera)
 
     def std_mm(self, points_ct: Float[np.ndarray, "n 3"], /) -> Float64[np.ndarray, " n"] | None:
         """One standard deviation along any axis, mm: the pose's and the state's, to first order."""
         if self.covariance is None:
             return None
-        parts = [
-            self._std(points_ct[first : first + _AT_ONCE])
-            for first in range(0, len(points_ct), _AT_ONCE)
-        ]
-        return np.concatenate(parts) if parts else np.zeros(0)
+        body, points = self.shape.body, np.ascontiguousarray(points_ct, np.float32)
+        known = *self._flow, body.modes, body.center_ct.astype(np.float32), self._root
+        variance = np.empty(len(points), np.float32)
+        share(
+            lambda part: kernels.variances(*known, points[part], variance[part]), len(points), _FEW
+        )
+        return self.std_scale * np.sqrt(variance.astype(float))
 
-    def _std(self, points_ct: Float[np.ndarray, "n 3"]) -> Float64[np.ndarray, " n"]:
-        body = self.shape.body
-        rows = np.zeros((len(points_ct), 3, kernels.POSE + len(self.coefficients)), np.float32)
-        center, points = body.center_ct.astype(np.float32), np.asarray(points_ct, np.float32)
-        kernels.deviations(*self._flow, body.modes, center, np.ascontiguousarray(points), rows)
-        half = rows.reshape(-1, rows.shape[2]) @ self._root
-        variance = np.einsum("nk,nk->n", half, half).reshape(-1, 3).mean(1)
-        return self.std_scale * np.sqrt(variance).astype(float)
+    def _gone(
+        self, kernel: Callable, flow: Flow, points_mm: Float[np.ndarray, "n 3"]
+    ) -> Float64[np.ndarray, "n 3"]:
+        points, out = np.ascontiguousarray(points_mm, np.float32), np.empty((len(points_mm), 3))
+        way = *flow, self.shape.body.center_ct, self.rotation, self.centre_mm
+        share(lambda part: kernel(*way, points[part], out[part]), len(out), _AT_ONCE)
+        return out
 
     @cached_property
     def _velocity(self) -> Float32[np.ndarray, "i j k 3"]:
         return self.shape.body.velocity(self.coefficients)
 
     @cached_property
-    def _flow(self) -> tuple[tuple[np.ndarray, np.ndarray, np.float32], int]:
+    def _flow(self) -> Flow:
         """What the kernels follow, and in how many steps."""
         body = self.shape.body
         lattice = (self._velocity, body.origin_mm, np.float32(body.spacing_mm))

@@ -17,19 +17,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Float32, Float64
-from scipy.spatial.transform import Rotation
+from jaxtyping import Float, Float64
 
 from tumortrack.core.config import Config
-from tumortrack.learn.warp import kernels
+from tumortrack.learn.warp.descent import descend
 from tumortrack.learn.warp.motion import WarpMotion
 from tumortrack.learn.warp.shape import Shape
-from tumortrack.learn.warp.sharing import share
-from tumortrack.simulate.elastic.flow import steps_for
-
-Placed = tuple[np.ndarray, np.ndarray, np.ndarray]  # rotation, centre_mm, coefficients
-
-_AT_ONCE = 256  # points: a thread's part
 
 
 class RefineConfig(Config, frozen=True):
@@ -68,32 +61,55 @@ def refine(
     config: RefineConfig,
 ) -> Refined:
     """The motion near ``start`` that fits points (camera frame, mm) and the library best."""
-    precision = _prior(shape, config)
-    mean = shape.body.mean
-    rotation, centre = start.rotation, start.centre_mm
-    coefficients = start.coefficients.astype(float)
-    moved = np.zeros(6)  # from the start: shift and turn
-    weight = min(config.n_effective / len(points_mm), 1.0) / config.sigma_mm**2
-    observed = np.ascontiguousarray(points_mm, np.float32)
-    done = 0
-    for step in range(config.steps + 1):
-        width = max(config.last_mm, config.first_mm * config.narrowing**step)
-        distance, normal = _normal(shape, observed, (rotation, centre, coefficients), width)
-        curvature = weight * normal[:-1, :-1] + precision
-        off = np.concatenate([moved, coefficients - mean])
-        if step == config.steps or done:
-            break
-        change = -np.linalg.solve(curvature, weight * normal[:-1, -1] + precision @ off)
-        centre = centre + rotation @ change[:3]
-        rotation = rotation @ Rotation.from_rotvec(change[3:6]).as_matrix()
-        coefficients = coefficients + change[6:]
-        moved += change[:6]
-        settled = np.abs(change).max() < config.enough_mm and width == config.last_mm
-        done = step + 1 if settled else 0
-    square = (distance / config.last_mm) ** 2
-    fit = weight * config.last_mm**2 * float((square / (1 + square)).sum())
-    motion = WarpMotion(shape, rotation, centre, coefficients, np.linalg.inv(curvature))
-    return Refined(motion, fit + float(off @ precision @ off), distance, step)
+    descent = Descent(shape, points_mm, start, config)
+    descent.run(config.steps)
+    return descent.refined()
+
+
+class Descent:
+    """A refinement that can be stopped on its way and gone on with.
+
+    Attributes:
+        cost: of where it is, as ``Refined`` has it; infinite before the first step.
+        steps: gone so far; ``settled``: more would not move it.
+    """
+
+    def __init__(
+        self,
+        shape: Shape,
+        points_mm: Float[np.ndarray, "n 3"],
+        start: WarpMotion,
+        config: RefineConfig,
+    ) -> None:
+        body, field, count = shape.body, shape.distances[0], len(points_mm)
+        self._shape, self._points = shape, np.ascontiguousarray(points_mm, np.float32)
+        precision = _prior(shape, config)
+        self._organ = (
+            *(body.modes, body.origin_mm, np.float32(body.spacing_mm), body.center_ct),
+            (field.values_mm, field.origin_mm, np.float32(field.spacing_mm)),
+            *(precision, body.mean),
+        )
+        weight = min(config.n_effective / count, 1.0) / config.sigma_mm**2
+        narrowing, enough = config.narrowing, config.enough_mm
+        self._rules = weight, config.first_mm, config.last_mm, narrowing, enough
+        pose = np.array(start.rotation, float), np.array(start.centre_mm, float)
+        self._state = *pose, np.array(start.coefficients, float), np.zeros(6)
+        gradient = np.empty(len(precision))
+        self._left = np.empty(count, np.float32), np.empty_like(precision), gradient
+        self.cost, self.steps, self.settled = np.inf, 0, False
+
+    def run(self, steps: int) -> None:
+        """Go on until ``steps`` are gone since the start, if it has not settled before."""
+        if self.settled or 0 < steps <= self.steps:
+            return
+        whole = self._organ, self._points, self._rules, self._state, self._left
+        self.steps, self.settled, self.cost = descend(*whole, self.steps, steps)
+
+    def refined(self) -> Refined:
+        """Where it is."""
+        distances_mm, curvature, _ = self._left
+        motion = WarpMotion(self._shape, *self._state[:3], np.linalg.inv(curvature))
+        return Refined(motion, self.cost, distances_mm, self.steps)
 
 
 def _prior(shape: Shape, config: RefineConfig) -> Float64[np.ndarray, "p p"]:
@@ -103,51 +119,3 @@ def _prior(shape: Shape, config: RefineConfig) -> Float64[np.ndarray, "p p"]:
     precision[3:6, 3:6] = np.eye(3) / config.turn_rad**2
     precision[6:, 6:] = shape.body.precision
     return precision
-
-
-def _normal(
-    shape: Shape, points_mm: Float32[np.ndarray, "n 3"], placed: Placed, width_mm: float
-) -> tuple[Float32[np.ndarray, " n"], Float64[np.ndarray, "columns columns"]]:
-    """Signed distances of the points carried back, and the sum over points of the pull times a
-    row times itself: a row has the distance's derivatives by shift, turn and coefficients, and
-    then the distance."""
-    known = _known(shape, *placed)
-    columns = kernels.POSE + len(placed[2]) + 1
-    distance = np.empty(len(points_mm), np.float32)
-    sums = np.empty((-(-len(points_mm) // _AT_ONCE), columns, columns), np.float32)
-
-    def add(part: slice) -> None:
-        out = sums[part.start // _AT_ONCE]
-        width = np.float32(width_mm)
-        kernels.normal_equations(*known, width, points_mm[part], distance[part], out)
-
-    share(add, len(points_mm), _AT_ONCE)
-    return distance, sums.sum(0, dtype=float)
-
-
-def _residuals(
-    shape: Shape, points_mm: Float[np.ndarray, "n 3"], placed: Placed
-) -> Float32[np.ndarray, "n columns"]:
-    """The rows that ``_normal`` adds up."""
-    known = _known(shape, *placed)
-    rows = np.empty((len(points_mm), kernels.POSE + len(placed[2]) + 1), np.float32)
-    kernels.residuals(*known, np.ascontiguousarray(points_mm, np.float32), rows)
-    return rows
-
-
-def _known(
-    shape: Shape,
-    rotation: Float64[np.ndarray, "3 3"],
-    centre_mm: Float64[np.ndarray, " 3"],
-    coefficients: Float64[np.ndarray, " m"],
-) -> tuple[tuple, int, np.ndarray, tuple, tuple]:
-    """What the kernels need besides points."""
-    body, field = shape.body, shape.distances[0]
-    velocity = body.velocity(-coefficients)
-    return (
-        (velocity, body.origin_mm, np.float32(body.spacing_mm)),
-        steps_for(velocity, body.spacing_mm),
-        body.modes,
-        (body.center_ct, rotation, centre_mm),
-        (field.values_mm, field.origin_mm, np.float32(field.spacing_mm)),
-    )

@@ -11,12 +11,14 @@ from jaxtyping import Float32, Float64, UInt8
 
 from tumortrack.core.errors import InputError
 from tumortrack.core.types import Anatomy, Mesh
+from tumortrack.learn.warp.sharing import share
 from tumortrack.simulate.elastic.body import Body
 from tumortrack.simulate.occupancy import contains, surface_distance
 
 _STEPS = 40  # of a distance field, along the part's longest side
 _FINEST_MM, _COARSEST_MM = 0.5, 2.0
 _REACH = 10  # steps about a part; farther out the distance is that of the nearest border
+_AT_ONCE = 4096  # points: a thread's part
 _BODY = "body."
 
 
@@ -72,11 +74,17 @@ class Shape:
         self, points_ct: Float32[np.ndarray, "n 3"]
     ) -> tuple[UInt8[np.ndarray, " n"], Float32[np.ndarray, " n"]]:
         """Label of each point, and its distance (mm) to the nearest surface that bounds it."""
-        distances = np.stack([field.at(points_ct) for field in self.distances])
         labels = np.zeros(len(points_ct), np.uint8)
-        for label, distance in enumerate(distances, start=1):
-            labels[distance < 0] = label
-        return labels, np.abs(distances).min(0)
+        margin_mm = np.full(len(points_ct), np.inf, np.float32)
+
+        def mark(part: slice) -> None:
+            some = points_ct[part], labels[part], margin_mm[part]
+            for label, field in enumerate(self.distances, start=1):
+                lattice = field.values_mm, field.origin_mm, np.float32(field.spacing_mm)
+                _mark(*lattice, np.uint8(label), *some)
+
+        share(mark, len(points_ct), _AT_ONCE)
+        return labels, margin_mm
 
     def to_arrays(self) -> dict[str, np.ndarray]:
         """Everything as named arrays, for a file."""
@@ -126,6 +134,16 @@ def long_axis_of(organ: Mesh) -> Float64[np.ndarray, " 3"]:
 def shape_of(anatomy_ct: Anatomy, body: Body) -> Shape:
     """The shape of an anatomy with its body; seconds."""
     return Shape(anatomy_ct, body, tuple(distance_of(part) for part in anatomy_ct.parts))
+
+
+@numba.njit(cache=True, fastmath=True, nogil=True)
+def _mark(values, origin, spacing, label, points, labels, margin):  # type: ignore[no-untyped-def]
+    """Give points inside the label, and every point the distance if it is the least so far."""
+    for p in range(len(points)):
+        distance = distance_at(values, origin, spacing, points[p, 0], points[p, 1], points[p, 2])[0]
+        if distance < 0:
+            labels[p] = label
+        margin[p] = min(margin[p], abs(distance))
 
 
 @numba.njit(cache=True, fastmath=True, nogil=True)

@@ -20,8 +20,7 @@ BLOCK = 64  # points that take each step together: one alone waits for its last 
 
 def steps_for(velocity: Float32[np.ndarray, "i j k 3"], spacing_mm: float) -> int:
     """Steps that a field needs: as many as points beside each other part from each other."""
-    slope = float(_steepest(velocity)) / spacing_mm
-    return min(max(math.ceil(_PER_SLOPE * slope), _FEWEST), _MOST)
+    return int(steps_of(velocity, np.float32(spacing_mm)))
 
 
 # Fast math: see simulate.deform.drag; here no sum is long enough to matter more.
@@ -49,6 +48,13 @@ def _apart(a, b):  # type: ignore[no-untyped-def]
         apart = abs(a[n] - b[n])
         most = apart if apart > most else most
     return most
+
+
+@numba.njit(cache=True, nogil=True)
+def steps_of(velocity, spacing):  # type: ignore[no-untyped-def]
+    """``steps_for``, for kernels."""
+    slope = np.float64(_steepest(velocity)) / np.float64(spacing)
+    return min(max(math.ceil(_PER_SLOPE * slope), _FEWEST), _MOST)
 
 
 @numba.njit(cache=True, fastmath=True, nogil=True)
