@@ -10,7 +10,7 @@ from torch.nn import functional
 
 from tumortrack.core.config import Config
 from tumortrack.learn.layers import Layer, Norm, stack
-from tumortrack.learn.pooling import greatest_above_zero
+from tumortrack.learn.pooling import greatest, greatest_above_zero
 from tumortrack.learn.sampling import (
     Sampling,
     ball_query,
@@ -121,8 +121,10 @@ class _Level(nn.Module):
         grouped = functional.linear(offsets, linear.weight[:, :3], linear.bias)
         if shared is not None:
             grouped = grouped + take(shared, neighbours)
-        *between, last = (layer for layer in self.rest if isinstance(layer, Layer))
         hidden = self.first.activate(grouped)
-        for layer in between:
+        layers = [layer for layer in self.rest if isinstance(layer, Layer)]
+        if not (torch.is_grad_enabled() and layers):  # for use, others may have taken their place
+            return greatest(self.rest(hidden))
+        for layer in layers[:-1]:
             hidden = layer(hidden)
-        return greatest_above_zero(last.before_relu(hidden))
+        return greatest_above_zero(layers[-1].before_relu(hidden))
