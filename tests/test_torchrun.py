@@ -10,13 +10,16 @@ import numpy as np
 import pytest
 import torch
 from safetensors.numpy import load_file
+from torch import distributed
 
 from stories import environment
 from torchrun_peer import STEPS, UP, anatomy, small_run
 from tumortrack.core.errors import InputError
-from tumortrack.learn.ranks import Ranks
+from tumortrack.learn.network import clinic_network
+from tumortrack.learn.ranks import RankLost, Ranks, joined
 from tumortrack.learn.state import TrainingState
 from tumortrack.learn.train import train
+from tumortrack.learn.warp.network import WarpNetwork
 from tumortrack.simulate.dataset import SceneStream
 from tumortrack.simulate.occupancy import FixedPoints
 from tumortrack.simulate.scene import SceneConfig
@@ -89,6 +92,50 @@ def test_shares_are_the_batch():
     assert len(Ranks(CPU, 1, 2).numbers(range(3, 9))) == 6
     with pytest.raises(InputError, match="a batch of 4 cannot be shared by 3 processes"):
         Ranks(CPU, 0, 3).share(4)
+
+
+@pytest.mark.parametrize("lost_at", ["init_process_group", "all_reduce", "destroy_process_group"])
+def test_a_lost_process_is_one_error_wherever_it_is_missed(monkeypatch, lost_at):
+    def lost(*_: object, **__: object) -> None:
+        raise distributed.DistBackendError("Connection closed by peer")
+
+    where = {"RANK": 0, "LOCAL_RANK": 0, "WORLD_SIZE": 2, "LOCAL_WORLD_SIZE": 2}
+    for name, value in {**where, "TORCHELASTIC_RUN_ID": "test"}.items():
+        monkeypatch.setenv(name, str(value))
+    for name in ("init_process_group", "all_reduce", "destroy_process_group"):
+        gone = lost if name == lost_at else lambda *_, **__: None
+        monkeypatch.setattr(distributed, name, gone)
+    monkeypatch.setattr(distributed, "get_rank", lambda: 0)
+    with pytest.raises(RankLost, match="of this training"), joined("cpu") as ranks:
+        ranks.agreed(0.0, False)
+
+
+@pytest.mark.parametrize("share", [1, 3, 6])
+def test_equal_shares_of_any_size_have_the_whole_batchs_loss_and_gradient(share):
+    """Which clouds are shown the wrong way round is the batch's matter, not a process's."""
+    torch.manual_seed(0)
+    network = WarpNetwork(clinic_network(modes=5, scale_mm=50.0))
+    network.points.normal_(std=30.0)
+    network.modes.normal_()
+    points_mm = torch.randn(12, 300, 3) * torch.tensor([40.0, 20.0, 5.0])
+    poses = torch.eye(4).repeat(12, 1, 1)
+    poses[:, :3, :3] = torch.linalg.qr(torch.randn(12, 3, 3)).Q
+    places = torch.randn(12, 96, 3) * 30
+
+    def learnt(rows: slice) -> tuple[float, np.ndarray]:
+        network.zero_grad()
+        loss = network.loss(
+            points_mm[rows], places[rows], torch.zeros(1), poses[rows], first=rows.start
+        )
+        loss.backward()
+        gradients = [parameter.grad.flatten() for parameter in network.parameters()]
+        return float(loss.detach()), torch.cat(gradients).numpy().copy()
+
+    loss, gradient = learnt(slice(0, 12))
+    parts = [learnt(slice(first, first + share)) for first in range(0, 12, share)]
+    assert np.mean([part[0] for part in parts]) == pytest.approx(loss, rel=1e-5)
+    apart = np.mean([part[1] for part in parts], axis=0) - gradient
+    assert np.abs(apart).max() < 1e-4 * np.abs(gradient).max()
 
 
 def test_the_package_is_a_command():

@@ -125,10 +125,16 @@ class OccupancyNetwork(nn.Module):
         return self.query(self.encode(points_mm), queries_mm)
 
     def loss(
-        self, clouds_mm: Tensor, points_mm: Tensor, labels: Tensor, camera_from_ct: Tensor
+        self,
+        clouds_mm: Tensor,
+        points_mm: Tensor,
+        labels: Tensor,
+        camera_from_ct: Tensor,
+        *,
+        first: int = 0,
     ) -> Tensor:
-        """Cross-entropy of the points' labels, all points equal (the paper). The poses are not
-        used."""
+        """Cross-entropy of the points' labels, all points equal (the paper). Neither the poses nor
+        the first cloud's number in the batch are used."""
         logits = self.query(self.encode(clouds_mm), points_mm)
         flat = logits.float().flatten(0, 1)
         return nn.functional.cross_entropy(flat, labels.long().flatten())

@@ -93,8 +93,23 @@ class Ranks:
         return elapsed_s, asked > 0
 
     def _sum(self, values: Tensor) -> None:
-        try:
+        with self._others_there():
             distributed.all_reduce(values)
+
+    def leave(self) -> None:
+        """Part from the others.
+
+        Raises:
+            RankLost: another process has ended.
+        """
+        with self._others_there():
+            distributed.destroy_process_group()
+
+    @contextmanager
+    def _others_there(self) -> Iterator[None]:
+        """Says in our words what Gloo and NCCL say of a process that is gone."""
+        try:
+            yield
         except RuntimeError as error:
             raise RankLost(
                 f"process {self.rank} of {self.size} stops: another one of this training has "
@@ -130,7 +145,8 @@ def joined(device: str) -> Iterator[Ranks]:
         distributed.init_process_group(backend, timeout=_PATIENCE)
     except (RuntimeError, ValueError) as error:
         raise RankLost(f"the processes of this training do not find each other: {error}") from error
+    ranks = Ranks(chosen, distributed.get_rank(), size, on_machine)
     try:
-        yield Ranks(chosen, distributed.get_rank(), size, on_machine)
+        yield ranks
     finally:
-        distributed.destroy_process_group()
+        ranks.leave()

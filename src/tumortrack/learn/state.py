@@ -118,14 +118,15 @@ class TrainingState:
             RankLost: another process of this training has ended.
         """
         config, progress = self._run.config, self.progress
-        clouds, *truth = (part.to(self._device, non_blocking=True) for part in batch)
+        clouds, points, labels, poses = (part.to(self._device, non_blocking=True) for part in batch)
         clouds = clouds[:, : self.points_kept(clouds.shape[1])]
         self.learning_rate = learning_rate(config, progress)
         for group in self.optimizer.param_groups:
             group["lr"] = self.learning_rate
         self.network.train()
         with torch.autocast(self._device.type, torch.bfloat16, enabled=self._bf16):
-            loss = self.network.loss(clouds, *truth)
+            first = self._ranks.rank * len(clouds)  # in the whole batch
+            loss = self.network.loss(clouds, points, labels, poses, first=first)
         self.optimizer.zero_grad(set_to_none=True)
         loss.backward()
         value = float(self._ranks.mean(self.network.parameters(), loss.detach()))

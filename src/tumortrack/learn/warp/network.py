@@ -161,12 +161,20 @@ class WarpNetwork(nn.Module):
         return Placement(rotation, centre_mm, self.mean + self.std * bounded, out[:, 9])
 
     def loss(
-        self, clouds_mm: Tensor, points_mm: Tensor, labels: Tensor, camera_from_ct: Tensor
+        self,
+        clouds_mm: Tensor,
+        points_mm: Tensor,
+        labels: Tensor,
+        camera_from_ct: Tensor,
+        *,
+        first: int = 0,
     ) -> Tensor:
         """How far the known points (B, P, 3) are from where the placements carry them, with and
         without deformation, and how well the right way round is told. ``labels`` is not used.
 
         The deformation counts to first order: the displacement at the points' places at rest.
+        ``first``: the first cloud's number in a batch that several processes share; the mean of
+        equal shares' losses is the whole batch's.
         """
         aside = self.aside(clouds_mm)
         with torch.autocast(clouds_mm.device.type, enabled=False):
@@ -174,16 +182,23 @@ class WarpNetwork(nn.Module):
             true_centre = true_rotation @ self.center_ct + camera_from_ct[:, :3, 3]
             sign = self.right_sign(aside, true_rotation)
         placed = self(aside.other_way(sign))
-        few = slice(None, None, _WRONG_SHARE)  # a batch's halves have half of them each
-        wrong = self(aside.other_way(-sign)[few])
+        told_wrong = self._told_wrong(aside.other_way(-sign), first)
         with torch.autocast(clouds_mm.device.type, enabled=False):
             moved = self.points + torch.einsum("pdm,bm->bpd", self.modes, placed.coefficients)
             error = _size(_placed(moved, placed.rotation, placed.centre_mm) - points_mm)
             rigid = _placed(self.points, placed.rotation, placed.centre_mm)
             rigid_error = _size(rigid - _placed(self.points, true_rotation, true_centre))
-            told = functional.softplus(-placed.right_way).mean()
-            told = told + functional.softplus(wrong.right_way).mean()
+            told = functional.softplus(-placed.right_way).mean() + told_wrong
             return error + _RIGID_SHARE * rigid_error + _WAY_SHARE * told
+
+    def _told_wrong(self, wrong: Aside, first: int) -> Tensor:
+        """How well the wrong way round is told, by some of the clouds: the same ones in every
+        sharing of the batch, so that a small share may have none."""
+        few = wrong[slice(-first % _WRONG_SHARE, None, _WRONG_SHARE)]
+        if not len(few.points):
+            return wrong.points.new_zeros(())
+        told = functional.softplus(self(few).right_way).sum()
+        return told / (len(wrong.points) / _WRONG_SHARE)
 
     def both_ways(self, points_mm: Tensor) -> tuple[Placement, Placement]:
         """Placements for the clouds as they were turned, and for half a turn more."""
