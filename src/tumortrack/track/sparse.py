@@ -3,7 +3,7 @@
 A lattice of at most ``START_MM`` is asked. Halfway between its points the logits are first taken as
 linear, then asked for wherever the label that leads does so by less than linear logits were found
 to err (``settled``); and so on, down to the voxels. Where an answer is another label than was
-expected, the voxels about it are asked as well.
+expected, and by more than noise, the voxels about it are asked as well.
 
 What it may miss: a part that no lattice point lies in and that does not show in the logits about it
 either. A ball of START_MM times the square root of 3 always holds a lattice point: 6.9 mm, 0.17 ml,
@@ -12,6 +12,7 @@ where ``prepare`` drops tumors of less than 0.2 ml unless it is told otherwise.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
@@ -28,6 +29,7 @@ from tumortrack.track.volume import LARGEST_MARGIN, dense_margins, margins_of
 START_MM = 4.0
 _AT_ONCE = 2**18  # queries
 _PROBE = 512  # of the least sure points, asked to learn how much linear logits err
+_SURPRISE = 0.5  # of what is believed of linear logits
 _FIRST_SEEN = 0.1  # of a first lattice's points may lie near a surface
 
 Ask = Callable[[Int[np.ndarray, " n"]], Float32[np.ndarray, "n classes"]]
@@ -185,9 +187,10 @@ def _halved(
     fine = np.empty((*lattice.shape, coarse.shape[3]), np.float32)
     _in_slabs(partial(halved, coarse, fine), len(fine))
     rows = fine.reshape(-1, coarse.shape[3])
-    labels, leads = _best(rows)
-    asked = settled(rows, leads, lattice.ask, lattice.trust)
-    flat, found = _about_surprises(np.flatnonzero(asked), rows[asked], labels, lattice)
+    leads = _best(rows)[1]
+    leads.reshape(lattice.shape)[::2, ::2, ::2] = np.inf  # the coarse points: settled before
+    asked = np.flatnonzero(settled(rows, leads, lattice.ask, lattice.trust))
+    flat, found = _about_surprises(asked, rows[asked], coarse, lattice)
     rows[flat] = found
     return fine
 
@@ -204,50 +207,65 @@ def _voxels(
     trust = lattice.trust
     seen = trust.coarser or float(np.quantile(leads, _FIRST_SEEN))
     while True:
-        lists = _in_slabs(
-            partial(filled, coarse, sure, leads, np.float32(seen), labels), len(coarse)
-        )
-        flat, expected = (np.concatenate(column) for column in zip(*lists, strict=True))
-        now, lead = _best(expected)
-        labels.reshape(-1)[flat] = now
+        plain = np.where(leads >= np.float32(seen), sure, np.uint8(255))
+        lists = _in_slabs(partial(filled, coarse, sure, plain, labels), len(coarse))
+        flat, expected, between = (np.concatenate(column) for column in zip(*lists, strict=True))
+        lead = _best(expected)[1]
+        lead[~between] = np.inf  # the coarse points: settled before
         asked = settled(expected, lead, partial(lattice.ask_some, flat), trust)
         if trust.limit <= seen:
             break
         seen = 2 * trust.limit  # voxels that lead by less were filled unseen
-    more, found = _about_surprises(flat[asked], expected[asked], labels.reshape(-1), lattice)
-    labels.reshape(-1)[flat] = _best(expected)[0]
-    labels.reshape(-1)[more] = _best(found)[0]
-    places = np.concatenate([flat, more])
-    won = margins_of(torch.from_numpy(np.concatenate([expected, found])))
-    margins = np.empty((classes - 1, *lattice.shape), np.float16)
+    more, found = _about_surprises(flat[asked], expected[asked], coarse, lattice)
+    places, logits = np.concatenate([flat, more]), np.concatenate([expected, found])
+    labels.reshape(-1)[places] = _best(logits)[0]
+    return _margins(labels, places, logits), labels
+
+
+def _margins(
+    labels: UInt8[np.ndarray, "i j k"],
+    places: Int[np.ndarray, " n"],
+    logits: Float32[np.ndarray, "n classes"],
+) -> Float16[np.ndarray, "parts i j k"]:
+    """The largest everywhere but at these places (flat), whose logits are known."""
+    from tumortrack.track.sparse_kernels import spread
+
+    margins = np.empty((logits.shape[1] - 1, *labels.shape), np.float16)
+    inside, outside = np.array([LARGEST_MARGIN, -LARGEST_MARGIN], np.float16).view(np.uint16)
+    _in_slabs(partial(spread, labels, inside, outside, margins.view(np.uint16)), len(labels))
+    won = margins_of(torch.from_numpy(logits))
     for part, margin in enumerate(margins):
-        largest = np.full(classes, -LARGEST_MARGIN, np.float16)
-        largest[part + 1 if part else slice(1, None)] = LARGEST_MARGIN
-        np.take(largest, labels, out=margin, mode="clip")  # "raise" would copy
         margin.reshape(-1)[places] = won[:, part]
-    return margins, labels
+    return margins
 
 
 def _about_surprises(
     flat: Int[np.ndarray, " n"],
     found: Float32[np.ndarray, "n classes"],
-    labels: UInt8[np.ndarray, " all"],
+    coarse: Float32[np.ndarray, "a b c classes"],
     lattice: _Lattice,
 ) -> tuple[Int[np.ndarray, " m"], Float32[np.ndarray, "m classes"]]:
-    """Ask about every voxel that touches one with another label than was expected, until none
-    is: what else was asked.
+    """Ask about every point that touches a surprise, until there is none: what else was asked.
+
+    A surprise is another label than was expected, and not only by what linear logits are off
+    everywhere: by more than ``_SURPRISE`` of what is believed of them.
 
     Args:
         flat, found: the asked ones, and their logits.
-        labels: what was expected everywhere.
+        coarse: the logits that the lattice's were expected from.
     """
-    from tumortrack.track.sparse_kernels import neighbours
+    from tumortrack.track.sparse_kernels import expected_at, neighbours, surprising
+
+    def surprises_among(flat: np.ndarray, found: np.ndarray) -> np.ndarray:
+        expected = np.empty_like(found)
+        expected_at(coarse, lattice.shape, flat, expected)
+        return flat[surprising(expected, found, np.float32(_SURPRISE * lattice.trust.limit))]
 
     more, logits = [np.zeros(0, np.int64)], [found[:0]]
-    surprises = flat[_best(found)[0] != labels[flat]]
+    surprises = surprises_among(flat, found)
     if not len(surprises):
         return more[0], logits[0]
-    known = np.zeros(len(labels), bool)
+    known = np.zeros(math.prod(lattice.shape), bool)
     known[flat] = True
     while len(surprises):
         frontier = neighbours(lattice.shape, surprises, known)
@@ -255,7 +273,7 @@ def _about_surprises(
             break
         more.append(frontier)
         logits.append(lattice.ask(frontier))
-        surprises = frontier[_best(logits[-1])[0] != labels[frontier]]
+        surprises = surprises_among(frontier, logits[-1])
     return np.concatenate(more), np.concatenate(logits)
 
 
