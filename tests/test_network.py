@@ -16,6 +16,7 @@ from tumortrack.learn.network import (
     FixedScale,
     NetworkConfig,
     OccupancyNetwork,
+    _without_strays,
     alignment,
     paper_network,
     quick_network,
@@ -101,7 +102,7 @@ def test_compiled_sampling_chooses_as_the_plain_form(
     points[:, 100:150] = points[:, 50:51]  # equal points are a tie
     chosen = farthest_points(points, 470)
     found = ball_query(points, take(points, chosen), 0.6, 16)
-    monkeypatch.setattr(sampling, "_compiled", lambda _: False)
+    monkeypatch.setattr(sampling, "compiled", lambda _: False)
     assert torch.equal(farthest_points(points, 470), chosen)
     assert torch.equal(ball_query(points, take(points, chosen), 0.6, 16), found)
     assert (found[..., 1] != found[..., 0]).any()
@@ -298,6 +299,16 @@ def test_strays_are_replaced_by_points_within_reach_and_the_rest_keeps_its_order
     kept[5::10] = False
     assert torch.equal(out[0, :270], points_mm[0, kept])
     assert torch.equal(out[0, 270:], points_mm[0, kept][:30])
+
+
+def test_compiled_and_plain_forms_replace_the_same_strays() -> None:
+    points_mm, _ = scene(n=301)
+    points_mm[0, ::7] += torch.tensor([150.0, 0.0, 60.0])
+    points_mm[1] *= 3.0  # the second round's middle is another
+    for reach_mm in (40.0, 80.0, 1e-3):  # the last: all are strays
+        plain = _without_strays(points_mm, reach_mm)
+        assert torch.equal(without_strays(points_mm, reach_mm), plain)
+        assert not torch.equal(plain, points_mm)
 
 
 def test_ten_per_cent_of_background_change_quick_by_little() -> None:

@@ -17,7 +17,7 @@ from elastic_objects import CENTER, RADII, UP
 from tumortrack.core.errors import InputError
 from tumortrack.core.motion import Motion
 from tumortrack.core.types import Mesh
-from tumortrack.learn.encoders.heightmap import HeightMapConfig, picture
+from tumortrack.learn.encoders.heightmap import HeightMapConfig, _spread, _spread_compiled, picture
 from tumortrack.learn.network import OccupancyNetwork, quick_network
 from tumortrack.learn.warp.locate import best_fit
 from tumortrack.learn.warp.motion import WarpMotion
@@ -454,6 +454,16 @@ def test_heights_are_means_weighted_by_nearness():
     channels = picture(flat, 16)
     torch.testing.assert_close(channels[:, 1], 0.3 * channels[:, 0])
     torch.testing.assert_close(channels[:, 3], 0.3 * channels[:, 2])
+
+
+def test_the_compiled_picture_is_the_plain_one():
+    places = 9 * torch.rand(3, 500, 2, generator=torch.Generator().manual_seed(3)) - 1
+    heights = torch.randn(3, 500, generator=torch.Generator().manual_seed(4))
+    plain, compiled = _spread(places, heights, 8), _spread_compiled(places, heights, 8)
+    assert float(plain[0].sum()) < 1400  # some lie beyond the border
+    for one, other in zip(plain, compiled, strict=True):
+        assert other.shape == (3, 1, 8, 8)
+        torch.testing.assert_close(other, one, atol=1e-5, rtol=1e-5)
 
 
 def test_neither_order_nor_number_of_a_clouds_points_matters_much():

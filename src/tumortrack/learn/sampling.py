@@ -36,7 +36,7 @@ def farthest_points(points: Tensor, k: int) -> Tensor:
     chosen = torch.empty((len(points), k), dtype=torch.int64, device=points.device)
     centre = points.mean(dim=1, keepdim=True)
     newest = _squared_distance(x, y, z, *centre.unbind(-1)).argmax(dim=1, keepdim=True)
-    if _compiled(points):
+    if compiled(points):
         from tumortrack.learn.sampling_kernels import farthest
 
         farthest(_rows(points), newest[:, 0].numpy(), chosen.numpy())
@@ -86,7 +86,7 @@ def ball_query(points: Tensor, centres: Tensor, radius: float, k: int) -> Tensor
 
     Source: Qi et al., PointNet++, NIPS 2017, section 3.2.
     """
-    if _compiled(points):
+    if compiled(points):
         from tumortrack.learn.sampling_kernels import balls
 
         found = torch.empty((*centres.shape[:2], k), dtype=torch.int64)
@@ -114,7 +114,7 @@ def take(values: Tensor, indices: Tensor) -> Tensor:
     return functional.embedding(rows, values.reshape(batch * n, channels))
 
 
-def _compiled(points: Tensor) -> bool:
+def compiled(points: Tensor) -> bool:
     """Whether the compiled kernels can take these points: not while torch traces the network."""
     return points.device.type == "cpu" and points.dtype == torch.float32 and not traced()
 

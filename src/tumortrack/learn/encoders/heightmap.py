@@ -14,6 +14,7 @@ from torch.nn import functional
 
 from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError
+from tumortrack.learn.sampling import compiled
 
 _HALF = 1.25  # normalised units from the picture's middle to its border
 _SEEN = 0.05  # of a point's weight: a pixel with less has no height of its own
@@ -71,12 +72,23 @@ def picture(points: Tensor, pixels: int) -> Tensor:
 
     A point is shared by the four pixels about it, so that heights change smoothly with it.
     """
-    batch = len(points)
     place = (points[..., :2] + _HALF) / (2 * _HALF) * pixels - 0.5
+    spread = _spread_compiled if compiled(points) and not points.requires_grad else _spread
+    weight, height = spread(place, points[..., 2].contiguous(), pixels)
+    channels = []
+    for least in (_SEEN, _SEEN_BESIDE):
+        seen = (weight > least).to(points)
+        channels += [seen, height / weight.clamp_min(least) * seen]
+        weight, height = (functional.avg_pool2d(v, 3, 1, 1) for v in (weight, height))
+    return torch.cat(channels, 1)
+
+
+def _spread(place: Tensor, heights: Tensor, pixels: int) -> tuple[Tensor, Tensor]:
+    """Shares of points (B, N, 2) and shares times heights (B, N), by pixel, (B, 1, P, P)."""
     lowest = place.floor()
     part = place - lowest
-    weight = points.new_zeros(batch, pixels * pixels)
-    height = points.new_zeros(batch, pixels * pixels)
+    weight = place.new_zeros(len(place), pixels * pixels)
+    height = torch.zeros_like(weight)
     for right in (0, 1):
         for down in (0, 1):
             share = (part[..., 0] if right else 1 - part[..., 0]) * (
@@ -86,14 +98,18 @@ def picture(points: Tensor, pixels: int) -> Tensor:
             share = share * ((x >= 0) & (x < pixels) & (y >= 0) & (y < pixels))
             index = y.clamp(0, pixels - 1) * pixels + x.clamp(0, pixels - 1)
             weight.scatter_add_(1, index, share)
-            height.scatter_add_(1, index, share * points[..., 2])
-    weight, height = (v.view(batch, 1, pixels, pixels) for v in (weight, height))
-    channels = []
-    for least in (_SEEN, _SEEN_BESIDE):
-        seen = (weight > least).to(points)
-        channels += [seen, height / weight.clamp_min(least) * seen]
-        weight, height = (functional.avg_pool2d(v, 3, 1, 1) for v in (weight, height))
-    return torch.cat(channels, 1)
+            height.scatter_add_(1, index, share * heights)
+    shape = len(place), 1, pixels, pixels
+    return weight.view(shape), height.view(shape)
+
+
+def _spread_compiled(place: Tensor, heights: Tensor, pixels: int) -> tuple[Tensor, Tensor]:
+    """The same in one pass on a CPU."""
+    from tumortrack.learn.encoders.heightmap_kernels import spread
+
+    weight, height = place.new_zeros(2, len(place), pixels, pixels)
+    spread(place.numpy(), heights.numpy(), weight.numpy(), height.numpy())
+    return weight[:, None], height[:, None]
 
 
 def _convolution(n_in: int, n_out: int, stride: int) -> list[nn.Module]:
