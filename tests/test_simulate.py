@@ -12,7 +12,7 @@ from render_objects import anatomy, sphere
 from tumortrack.core.errors import TumortrackError
 from tumortrack.core.geometry import direction_lps, transform_points
 from tumortrack.simulate.deform.base import View
-from tumortrack.simulate.deform.drag import CONFIGURATIONS, DragConfig, Drags
+from tumortrack.simulate.deform.drag import CONFIGURATIONS, DragConfig, Drags, _centres
 from tumortrack.simulate.deform.rest import RestConfig
 from tumortrack.simulate.pose import PoseConfig, _turn, sample_pose
 
@@ -228,3 +228,17 @@ def test_deformations_record_what_they_did_and_rest_does_nothing():
     rest = RestConfig().sample(VIEW, np.random.default_rng(3))
     np.testing.assert_array_equal(rest.apply(points), points.astype(np.float32))
     assert rest.record() == {"kind": "rest"}
+
+
+def test_centres_are_dragged_as_any_point_bit_for_bit():
+    """Whether the kernels were compiled by this process or found in numba's cache."""
+    rng = np.random.default_rng(0)
+    start = rng.uniform(-50, 50, (18, 3)).astype(np.float32)
+    shifts = rng.normal(0, 3, (18, 3)).astype(np.float32)
+    sigmas = rng.uniform(3, 30, 18).astype(np.float32)
+    centres = start.copy()
+    for k in range(1, len(start)):
+        before = Drags(centres[:k], shifts[:k], sigmas[:k])
+        centres[k] = before.apply(start[k : k + 1])[0]
+    np.testing.assert_array_equal(_centres(start, shifts, sigmas), centres)
+    assert np.abs(centres - start).max() > 1.0

@@ -118,9 +118,8 @@ def _exp(x):  # type: ignore[no-untyped-def]
     return (np.float32(1.0) + power) * np.int32(exponent).view(np.float32)
 
 
-@numba.njit(cache=True, nogil=True, fastmath=True)
-def _drag(points, centres, shifts, sigmas):  # type: ignore[no-untyped-def]
-    out = np.empty_like(points)
+@numba.njit(cache=True, nogil=True, fastmath=True, inline="always")
+def _carry(points, centres, shifts, sigmas, out):  # type: ignore[no-untyped-def]
     n = len(points)
     x, y, z = np.empty((3, min(n, _BLOCK)), np.float32)
     for start in range(0, n, _BLOCK):
@@ -141,6 +140,14 @@ def _drag(points, centres, shifts, sigmas):  # type: ignore[no-untyped-def]
                 z[i] += factor * sz
         for i in range(size):
             out[start + i, 0], out[start + i, 1], out[start + i, 2] = x[i], y[i], z[i]
+
+
+# Neither calls the other: whether a call is inlined, which in fast math moves last digits, depends
+# on whether this process compiled them or found them in numba's cache.
+@numba.njit(cache=True, nogil=True, fastmath=True)
+def _drag(points, centres, shifts, sigmas):  # type: ignore[no-untyped-def]
+    out = np.empty_like(points)
+    _carry(points, centres, shifts, sigmas, out)
     return out
 
 
@@ -149,5 +156,5 @@ def _centres(start, shifts, sigmas):  # type: ignore[no-untyped-def]
     """A vertex is dragged from where earlier drags left it."""
     centres = start.copy()
     for k in range(1, len(start)):
-        centres[k : k + 1] = _drag(start[k : k + 1], centres[:k], shifts[:k], sigmas[:k])
+        _carry(start[k : k + 1], centres[:k], shifts[:k], sigmas[:k], centres[k : k + 1])
     return centres
