@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -15,7 +15,7 @@ from tumortrack.evaluate.bench.counts import (
     weight_bytes,
 )
 from tumortrack.evaluate.bench.row import Precision, Work
-from tumortrack.evaluate.bench.turns import Call
+from tumortrack.evaluate.bench.turns import Call, Timing
 
 if TYPE_CHECKING:
     import torch
@@ -35,11 +35,15 @@ NAIVE = "single precision, latent beside every query, Python loops, one piece"
 
 @dataclass(eq=False)
 class Asked:
-    """An occupancy network with a cloud and queries about it: ours and the naive form."""
+    """An occupancy network with a cloud and queries about it: ours and the naive form.
+
+    ``naive_frame_s``: of the naive form's frame, once that was measured."""
 
     model: Model
     points_mm: np.ndarray
     device: str = "cpu"
+    naive_frame_s: Timing | None = None
+    _labelled: dict[int, np.ndarray] = field(default_factory=dict)
 
     @cached_property
     def network(self) -> OccupancyNetwork:
@@ -84,9 +88,12 @@ class Asked:
             labels = [self.plain.logits(encoded, piece)[0].argmax(-1) for piece in pieces]
         return torch.cat(labels).cpu().numpy()
 
-    def agreement(self, labels: np.ndarray, queries: np.ndarray) -> float:
-        """Share of labels that are the naive form's."""
-        return float((labels == self.naive_labels(queries)).mean())
+    def agreement(self, labels: np.ndarray) -> float:
+        """Share of the labels of so many ``queries`` that are the naive form's."""
+        count = len(labels)
+        if count not in self._labelled:
+            self._labelled[count] = self.naive_labels(self.queries(count))
+        return float((labels == self._labelled[count]).mean())
 
     @cached_property
     def precision(self) -> Precision:
@@ -174,4 +181,7 @@ class Asked:
 
 
 def asked_of(subject: Subject, preset: str) -> Asked:
-    return Asked(subject.model(preset), subject.cloud(preset).points_mm)
+    """Of a preset: one for all groups of rows, whose naive form then labels its queries once."""
+    if preset not in subject.asked:
+        subject.asked[preset] = Asked(subject.model(preset), subject.cloud(preset).points_mm)
+    return subject.asked[preset]

@@ -27,7 +27,7 @@ _BATCHES = (1, 4, 16, 64)
 _MOST_PAPER = 16  # samples in a step of the paper's network: larger ones take seconds
 _TUMOR_GRID = 200
 _SMALL = 0.3  # of the phantom's first tumor
-_BUDGET_S = 0.5
+_BUDGET_S = 0.3
 
 
 def points(subject: Subject, curve: str, preset: str) -> Iterator[Point]:

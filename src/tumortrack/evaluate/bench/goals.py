@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from tumortrack.evaluate.bench import command, figures, frames, generator, training, volume
+from tumortrack.evaluate.bench.machine import NO_GPU
 from tumortrack.evaluate.bench.row import Bench, Row
 from tumortrack.evaluate.study.markdown import table
 
@@ -98,19 +99,16 @@ def _held(row: Row) -> Verdict:
     return Verdict(f"{peak / _GIB:.2f} GiB", peak < 4 * 1e9)
 
 
-def _without(bench: Bench) -> Verdict:
-    return Verdict(_NO_GPU, None)
-
-
-def _on_gpu(name: str, what: str, limit_s: float) -> Judge:
-    def judge(bench: Bench) -> Verdict:
+def _on_gpu(name: str, what: str, judge: Callable[[Row], Verdict]) -> Judge:
+    def judged(bench: Bench) -> Verdict:
+        gpu = bench.machine.get("GPU", NO_GPU)
         for row in bench.rows:
             if (row.name, row.what) == (name, what) and row.device != "cpu":
-                words = f"{figures.seconds(row.ours.median_s)} on {bench.machine['GPU']}"
-                return Verdict(words, row.ours.median_s <= limit_s)
-        return Verdict(_NO_GPU, None)
+                verdict = judge(row)
+                return Verdict(f"{verdict.measured} on {gpu}", verdict.met)
+        return Verdict(_NO_GPU if gpu == NO_GPU else _NOT_MEASURED, None)
 
-    return judge
+    return judged
 
 
 GOALS = (
@@ -136,7 +134,7 @@ GOALS = (
         "frame, `paper`, H100",
         "(14 ms on an RTX 4090)",
         "at most 1 ms",
-        _on_gpu(frames.FRAME, "paper", 0.001),
+        _on_gpu(frames.FRAME, "paper", _at_most(0.001)),
     ),
     Goal(
         "400^3 labels, exact, `paper`, 2 CPU cores",
@@ -154,13 +152,13 @@ GOALS = (
         "400^3 labels, exact, `paper`, H100",
         "dense, same run",
         "at most 10 ms",
-        _on_gpu(volume.NAME, "paper", 0.01),
+        _on_gpu(volume.NAME, "paper", _at_most(0.01)),
     ),
     Goal(
         "training, `paper`, H100",
         "861 samples/s on an RTX 4090 (2 h)",
         "at least 10,000 samples/s",
-        _without,
+        _on_gpu(training.WHOLE, "paper", _at_least_per_s(10_000.0)),
     ),
     Goal(
         "training, `quick`, 2 CPU cores, generator included",

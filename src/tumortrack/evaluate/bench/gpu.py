@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from tumortrack.evaluate.bench.asked import LABELLING, Asked
 from tumortrack.evaluate.bench.frames import occupancy_frames
 from tumortrack.evaluate.bench.row import Row
+from tumortrack.evaluate.bench.training import Device, whole_row
 from tumortrack.evaluate.bench.volume import asked_volume
 
 if TYPE_CHECKING:
@@ -17,17 +18,22 @@ NAME = "GPU"
 
 
 def rows(subject: Subject, threads: int, budget_s: float) -> Iterator[Row]:
-    """Frame and volume of the presets that label points. Both forms bring their labels back to
-    the host, which waits for the device."""
+    """Those of ``rows_on``, if PyTorch sees a device."""
     import torch
 
-    if not torch.cuda.is_available():
-        return
+    if torch.cuda.is_available():
+        yield from rows_on(subject, "cuda", threads, budget_s)
+
+
+def rows_on(subject: Subject, device: Device, threads: int, budget_s: float) -> Iterator[Row]:
+    """Frame and volume of the presets that label points, and a training of each, generator
+    included. Both forms bring their labels back to the host, which waits for the device."""
     from tumortrack.learn.model import load_model
 
+    share = budget_s / len(LABELLING) / 3
     for preset in LABELLING:
-        model = load_model(subject.model_folder(preset), "cuda")
-        asked = Asked(model, subject.cloud(preset).points_mm, "cuda")
-        share = budget_s / len(LABELLING) / 2
+        model = load_model(subject.model_folder(preset), device)
+        asked = Asked(model, subject.cloud(preset).points_mm, device)
         yield from occupancy_frames(asked, preset, threads, share)
         yield asked_volume(asked, preset, threads, share)
+        yield whole_row(subject, preset, device, threads, share)

@@ -18,6 +18,7 @@ _FEATURES = {
     "amx_bf16": "AMX bf16",
     "amx_int8": "AMX int8",
 }
+NO_GPU = "none at hand"
 _LIBRARIES = ("tumortrack", "torch", "numba", "numpy", "scipy")
 
 
@@ -26,7 +27,7 @@ def describe_machine() -> dict[str, str]:
     import torch
 
     capabilities = torch.cpu.get_capabilities()
-    gpu = torch.cuda.get_device_name() if torch.cuda.is_available() else "none at hand"
+    gpu = torch.cuda.get_device_name() if torch.cuda.is_available() else NO_GPU
     libraries = ", ".join(f"{name} {version(name)}" for name in _LIBRARIES)
     return {
         "processor": _processor(),

@@ -10,7 +10,7 @@ from __future__ import annotations
 import hashlib
 import shutil
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -23,6 +23,7 @@ from tumortrack.core.types import Anatomy, SensorCloud
 from tumortrack.evaluate.bench.by_heart import learn_scene
 
 if TYPE_CHECKING:
+    from tumortrack.evaluate.bench.asked import Asked
     from tumortrack.learn.config import TrainConfig
     from tumortrack.learn.model import Model
     from tumortrack.simulate.elastic.body import Body
@@ -48,11 +49,13 @@ class Given:
 
 @dataclass(eq=False)
 class Subject:
-    """``presets``: configurations by name; ``folder``: where trained models are kept."""
+    """``presets``: configurations by name; ``folder``: where trained models are kept; ``asked``:
+    see ``asked.asked_of``."""
 
     presets: Mapping[str, ConfigOf]
     folder: Path
     given: Given | None = None
+    asked: dict[str, Asked] = field(default_factory=dict)
 
     @cached_property
     def anatomy(self) -> Anatomy:

@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Iterator
 from itertools import cycle, pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
@@ -30,6 +30,7 @@ BATCH = {"clinic": 32, "quick": 16, "paper": 8}  # samples in a step here
 _BATCHES = 4  # made before and used again
 _STEPS = 10**6  # never reached
 
+Device = Literal["cpu", "cuda"]
 Batch = tuple["torch.Tensor", "torch.Tensor", "torch.Tensor", "torch.Tensor"]
 
 
@@ -144,14 +145,20 @@ def naive_step(state: TrainingState) -> Callable[[Batch], None]:
 
 
 def whole_rows(subject: Subject, threads: int, budget_s: float) -> Iterator[Row]:
-    """Preset ``quick`` as a user trains it: workers make scenes, the network learns them."""
+    """Preset ``quick``."""
+    yield whole_row(subject, "quick", "cpu", threads, budget_s)
+
+
+def whole_row(subject: Subject, preset: str, device: Device, threads: int, budget_s: float) -> Row:
+    """A preset as a user trains it: workers, or the GPU itself, make scenes, the network learns
+    them."""
     from tumortrack.evaluate.bench.subject import SEED, UP
     from tumortrack.learn.run import Run
     from tumortrack.learn.train import train
 
-    config: TrainConfig = _barely_validated(subject.config("quick"))
+    config: TrainConfig = _barely_validated(subject.config(preset))
     seen: list[tuple[float, Status]] = []
-    run = Run(subject.anatomy, UP, "", config, SEED, minutes=budget_s / 60, device="cpu")
+    run = Run(subject.anatomy, UP, "", config, SEED, minutes=budget_s / 60, device=device)
     with tempfile.TemporaryDirectory() as folder:
         train(run, Path(folder) / "model", lambda told: seen.append((time.perf_counter(), told)))
     # Between reports, and so without the start; where the end was the first, by the last's word.
@@ -160,14 +167,15 @@ def whole_rows(subject: Subject, threads: int, budget_s: float) -> Iterator[Row]
         for (early, before), (later, after) in pairwise(seen)
         if after.step > before.step
     ]
-    yield Row(
+    return Row(
         name=WHOLE,
-        what="quick",
+        what=preset,
         threads=threads,
         item="step",
         per_call=config.batch_size,
         ours=timing_of(spans or [config.batch_size / seen[-1][1].samples_per_s]),
         note=f"`train` for {budget_s:.0f} s, {config.batch_size} samples a step",
+        device=device,
     )
 
 

@@ -13,8 +13,8 @@ from tumortrack.core.config import Config
 
 _FEWEST, _MOST = 3, 25  # rounds
 _LEAST_S = 0.01  # that a turn lasts: shorter calls are repeated within it
-_PATIENCE = 2.0  # times the budget that the fewest turns may take
 _LONG_S = 0.5  # a first call that takes longer is warm enough
+_LONGER_S = 1.0  # and one that takes longer still is a turn: what it loaded is little beside it
 
 
 @dataclass(frozen=True)
@@ -49,24 +49,32 @@ class Timing(Config, frozen=True):
 
 def in_turns(*versions: Call, budget_s: float, fewest: int = _FEWEST) -> list[Timing]:
     """Seconds a call of each version. Every version is called before (compiled, cached, warm);
-    then all take turns until ``budget_s`` is spent, between ``fewest`` and 25 times each; fewer
-    only where that would take more than twice as long."""
-    repeats = [_repeats(version) for version in versions]
-    seconds: list[list[float]] = [[] for _ in versions]
+    then all take turns until ``budget_s`` is spent, between ``fewest`` and 25 times each. A first
+    call that took more than a second counts as a turn: a median of three bears a cold one. Where
+    time is up, those that have had the fewest turns leave the last to the others."""
     begun = time.perf_counter()
+    warmed = [_warm(version) for version in versions]
+    repeats = [max(1, math.ceil(_LEAST_S / max(took_s, 1e-7))) for took_s, _ in warmed]
+    seconds = [[counted_s] if took_s > _LONGER_S else [] for took_s, counted_s in warmed]
     for done in range(_MOST):
         past_s = time.perf_counter() - begun
-        if done >= fewest and past_s * (done + 1) / done > budget_s:
-            break
-        if done and past_s > _PATIENCE * budget_s:
+        up = past_s * (done + 1) / max(done, 1) > budget_s
+        if up and min(map(len, seconds)) >= fewest:
             break
         for times, version, repeat in zip(seconds, versions, repeats, strict=True):
-            start, uncounted = time.perf_counter(), 0.0
-            for _ in range(repeat):
-                told = version()
-                uncounted += told.seconds if isinstance(told, Uncounted) else 0.0
-            times.append((time.perf_counter() - start - uncounted) / repeat)
+            if not (up and len(times) >= fewest):
+                times.append(_turn(version, repeat)[1] / repeat)
     return [timing_of(times) for times in seconds]
+
+
+def _turn(version: Call, repeat: int) -> tuple[float, float]:
+    """Seconds of so many calls: in all, and those that count."""
+    start, uncounted = time.perf_counter(), 0.0
+    for _ in range(repeat):
+        told = version()
+        uncounted += told.seconds if isinstance(told, Uncounted) else 0.0
+    took_s = time.perf_counter() - start
+    return took_s, took_s - uncounted
 
 
 def timing_of(seconds: list[float]) -> Timing:
@@ -75,11 +83,7 @@ def timing_of(seconds: list[float]) -> Timing:
     return Timing(best_s=min(seconds), median_s=middle, low_s=low, high_s=high, turns=len(seconds))
 
 
-def _repeats(version: Call) -> int:
-    for _ in range(2):
-        start = time.perf_counter()
-        version()
-        took_s = time.perf_counter() - start
-        if took_s > _LONG_S:
-            break
-    return max(1, math.ceil(_LEAST_S / max(took_s, 1e-7)))
+def _warm(version: Call) -> tuple[float, float]:
+    """Of the last call of those that warm it up."""
+    first = _turn(version, 1)
+    return first if first[0] > _LONG_S else _turn(version, 1)

@@ -42,19 +42,20 @@ def asked_volume(asked: Asked, preset: str, threads: int, budget_s: float) -> Ro
 
     latent = asked.inference.encode(asked.points_mm)
     camera_from_index, shape = organ_grid(asked, latent, GRID)
-    counted = [0]
+    asked_of_us, labels = 0, np.zeros(0, np.uint8)
 
     def logits_at(points: np.ndarray) -> torch.Tensor:
-        counted[0] += len(points)
+        nonlocal asked_of_us
+        asked_of_us += len(points)
         return asked.inference.logits(latent, points)
 
-    labels = sparse_margins(logits_at, camera_from_index, shape)[1]
-    asked_of_us = counted[0]
+    def filled() -> None:
+        nonlocal asked_of_us, labels
+        asked_of_us = 0
+        labels = sparse_margins(logits_at, camera_from_index, shape)[1]
+
     index, points = _slab((camera_from_index, shape))
-    plain = asked.naive_frame(points)
-    ours, naive = in_turns(
-        lambda: sparse_margins(logits_at, camera_from_index, shape), plain, budget_s=budget_s
-    )
+    ours, naive = in_turns(filled, asked.naive_frame(points), budget_s=budget_s)
     voxels = int(np.prod(shape))
     same = asked.naive_labels(points) == labels[tuple(index.T)]
     return Row(
