@@ -108,11 +108,49 @@ def test_a_moving_organ_is_followed_by_labels(tracker, seen):
     for name, mesh in alone.meshes.items():
         off = mesh.box_mm.mean(0) - estimate.meshes[name].box_mm.mean(0)
         assert np.linalg.norm(off) < 1.0
-    gone = SensorCloud(points + np.float32([300, 0, 0]), cloud.stamp_ns + 10**8)
+    no_organ = np.random.default_rng(0).uniform(-9, 9, (512, 3)) + points.mean(0)
+    gone = SensorCloud(no_organ.astype(np.float32), cloud.stamp_ns + 10**8)
     with pytest.raises(NoEstimate):
         follower.locate(gone)
     assert follower.last_box_mm(gone.stamp_ns) is None
     assert "coarse" in follower.locate(cloud).report["timings"]
+
+
+@pytest.mark.parametrize("jump_mm", [40.0, 300.0])
+def test_an_organ_that_jumps_is_found_in_the_same_frame(tracker, seen, jump_mm):
+    """It reaches the border of the last one's box, or is not in it: then it is looked for."""
+    points = np.random.default_rng(0).permutation(seen[0].astype(np.float32))[:512]
+    last = tracker.follow(SensorCloud(points, 1))
+    jumped = SensorCloud(points + np.float32([jump_mm, 0, 0]), 2)
+    estimate = tracker.follow(jumped, last)
+    assert "coarse" in estimate.report["timings"]
+    for name, mesh in tracker.follow(jumped).meshes.items():
+        off = np.abs(mesh.box_mm - estimate.meshes[name].box_mm).max()
+        assert off < 1.0
+        assert (estimate.meshes[name].box_mm - last.meshes[name].box_mm)[:, 0].mean() > jump_mm - 2
+
+
+def test_a_part_that_vanishes_and_returns_is_seen_at_once(tracker, seen, monkeypatch):
+    points = np.random.default_rng(0).permutation(seen[0].astype(np.float32))[:512]
+    first = tracker.follow(SensorCloud(points, 1))
+    inference = tracker._locator._inference
+    logits = inference.logits
+
+    def without_tumor(latent, points_mm):
+        out = logits(latent, points_mm).clone()
+        out[:, 2] = -30.0
+        return out
+
+    monkeypatch.setattr(inference, "logits", without_tumor)
+    hidden = tracker.follow(SensorCloud(points, 2), first)
+    assert "tumor_1" not in hidden.meshes
+    monkeypatch.undo()
+    again = tracker.follow(SensorCloud(points, 3), hidden)
+    assert "coarse" not in again.report["timings"]
+    assert "tumor_1" in first.meshes
+    for name, mesh in tracker.follow(SensorCloud(points, 3)).meshes.items():  # found anew
+        assert np.abs(again.meshes[name].box_mm - mesh.box_mm).max() < 1.0
+        assert again.meshes[name].volume_mm3 == pytest.approx(mesh.volume_mm3, rel=0.02)
 
 
 @pytest.mark.skipif(not STATM.exists(), reason="this system does not count pages so")

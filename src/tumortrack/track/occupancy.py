@@ -19,6 +19,7 @@ from tumortrack.learn.model import Model
 from tumortrack.learn.network import OccupancyNetwork
 from tumortrack.sense.cloud import check_cloud, thin_cloud
 from tumortrack.track.estimate import Estimate, Following
+from tumortrack.track.organ import leaves, organ_lattice
 from tumortrack.track.report import fit_report, report_head, stage
 from tumortrack.track.sparse import halved_lattice, sparse_logits, sparse_margins
 from tumortrack.track.volume import (
@@ -67,23 +68,26 @@ class OccupancyLocator:
     def follow(self, cloud: SensorCloud, last: Estimate | None, how: Following) -> Estimate:
         """See ``track.tracker.Tracker.follow``.
 
-        The last organ's box, enlarged, stands for the coarse queries, and the surfaces' grid is
-        coarse: twice as fine as the lattice, and asked only about surfaces. Without a last
-        estimate, or with ``thorough``, all of it is asked.
+        The last organ's box, enlarged, stands for the coarse queries, and in it the lattice is
+        asked only where the organ is (``track.organ``). Where this frame's organ reaches the
+        box's border, without a last estimate, or with ``thorough``, the organ is looked for as in
+        a first frame, and the lattice asked everywhere. The surfaces' grid is twice as fine as
+        the lattice, and asked only about surfaces.
         """
         rng = np.random.default_rng((how.seed, cloud.stamp_ns))
         frame = _Frame(self.model, self._inference, cloud, how.seed, rng)
-        if last is None or how.thorough:
-            finer = frame.lattice(frame.coarse_box(), finer=2)
-            frame.check(finer)
-        else:
+        lattice = None
+        if last is not None and not how.thorough:
             low, high = last.cloud.points_mm.min(0), last.cloud.points_mm.max(0)
             margin = _LIVE_MARGIN * float((high - low).max())
-            box = np.stack([low - margin, high + margin]).astype(float)
-            lattice = frame.lattice(box)
-            frame.check(lattice)
-            with frame.stage("volume"):
-                finer = halved_lattice(frame.logits_at, lattice)
+            lattice = frame.lattice(np.stack([low - margin, high + margin]).astype(float))
+            if leaves(lattice):
+                lattice = None
+        if lattice is None:
+            lattice = frame.lattice(frame.coarse_box(), everywhere=True)
+        frame.check(lattice)
+        with frame.stage("volume"):
+            finer = halved_lattice(frame.logits_at, lattice)
         inside = frame.inside(finer)
         return replace(frame.estimate(inside, *margins_on(finer)), volume=None)
 
@@ -148,9 +152,10 @@ class _Frame:
         margin = 0.05 * (high - low) + gap / 2
         return np.stack([low - margin, high + margin])
 
-    def lattice(self, box: Box, finer: int = 1) -> Lattice:
+    def lattice(self, box: Box, everywhere: bool = False) -> Lattice:
+        over = lattice_over if everywhere else organ_lattice
         with self.stage("lattice"):
-            return lattice_over(self.logits_at, box, finer * steps_over(box))
+            return over(self.logits_at, box, steps_over(box))
 
     def check(self, lattice: Lattice) -> None:
         """Refuse what cannot be the organ."""

@@ -166,7 +166,7 @@ def settled(
     """
     asked = np.zeros(len(leads), bool)
     if len(leads):
-        least = min(_PROBE, len(leads) - 1)
+        least = min(_PROBE, len(leads)) - 1
         trust.limit = max(trust.limit, float(np.partition(leads, least)[least]))
     while True:
         now = np.flatnonzero((leads <= trust.limit) & ~asked)

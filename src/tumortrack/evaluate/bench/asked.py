@@ -158,8 +158,8 @@ class Asked:
     def our_frame(self, queries: np.ndarray) -> tuple[np.ndarray, int]:
         """Labels as `locate` finds them, and how many places were asked for: logits on a lattice
         over the queries' box, linear between its points where that is plain, else asked."""
-        from tumortrack.learn.lattice import lattice_over
         from tumortrack.track.occupancy import steps_over
+        from tumortrack.track.organ import organ_lattice
         from tumortrack.track.sparse import sparse_logits
 
         latent, asked = self.inference.encode(self.points_mm), 0
@@ -170,7 +170,7 @@ class Asked:
             return self.inference.logits(latent, points_mm)
 
         box = np.stack([queries.min(0), queries.max(0)]).astype(float)
-        lattice = lattice_over(logits_at, box, steps_over(box))
+        lattice = organ_lattice(logits_at, box, steps_over(box))
         return sparse_logits(logits_at, lattice, queries).argmax(-1), asked
 
     def every_query(self, queries: np.ndarray) -> np.ndarray:
