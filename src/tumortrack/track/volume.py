@@ -190,8 +190,11 @@ def describe_parts(
     The kidney's numbers are those of the whole organ, tumors included.
     """
     parts: dict[str, dict] = {}
+    counts = np.bincount(inside.labels, minlength=len(names) + 1)
+    sums = np.bincount(inside.labels, inside.probability, len(names) + 1)
     for n, name in enumerate(names):
-        mine = inside.labels > 0 if n == 0 else inside.labels == n + 1
+        mine = slice(1, None) if n == 0 else n + 1
+        points = int(counts[mine].sum())
         if name not in meshes:
             parts[name] = {"label": n + 1, "found": False}
             continue
@@ -202,7 +205,7 @@ def describe_parts(
             "volume_ml": mesh.volume_mm3 / 1000,
             "center_mm": mesh.box_mm.mean(0).tolist(),
             "box_mm": mesh.box_mm.tolist(),
-            "points": int(mine.sum()),
-            "probability": float(inside.probability[mine].mean()) if mine.any() else None,
+            "points": points,
+            "probability": float(sums[mine].sum() / points) if points else None,
         }
     return parts
