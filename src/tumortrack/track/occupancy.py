@@ -21,7 +21,7 @@ from tumortrack.sense.cloud import check_cloud, thin_cloud
 from tumortrack.track.estimate import Estimate, Following
 from tumortrack.track.organ import leaves, organ_lattice
 from tumortrack.track.report import fit_report, report_head, stage
-from tumortrack.track.sparse import halved_lattice, sparse_logits, sparse_margins
+from tumortrack.track.sparse import halved_lattice, leading, sparse_logits, sparse_margins
 from tumortrack.track.volume import (
     describe_parts,
     drop_islands,
@@ -169,14 +169,14 @@ class _Frame:
         with self.stage("fine"):
             low, high = lattice.box_mm
             points = self.rng.uniform(low, high, (FINE_QUERIES, 3)).astype(np.float32)
-            logits = torch.from_numpy(sparse_logits(self.logits_at, lattice, points))
-            best = logits.softmax(-1).max(-1)
-            labels, probability = best.indices.numpy(), best.values.numpy()
+            logits = sparse_logits(self.logits_at, lattice, points)
+            labels = leading(logits)[0]
             inside = labels > 0
+            probability = torch.from_numpy(logits[inside]).softmax(-1).amax(-1).numpy()
         if inside.sum() < FEWEST_INSIDE:
             raise NoEstimate("no organ was found: it has left the place where it was.")
         stamp_ns = self.cloud.stamp_ns
-        return OccupancyCloud(points[inside], labels[inside], probability[inside], stamp_ns)
+        return OccupancyCloud(points[inside], labels[inside], probability, stamp_ns)
 
     def estimate(
         self,

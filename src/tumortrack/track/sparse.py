@@ -74,7 +74,7 @@ def sparse_logits(
     def ask(some: Int[np.ndarray, " m"]) -> Float32[np.ndarray, "m classes"]:
         return logits_at(points_mm[some]).float().cpu().numpy()
 
-    settled(logits, _best(logits)[1], ask, Trust(tail=0.99, safety=1.0))
+    settled(logits, leading(logits)[1], ask, Trust(tail=0.99, safety=1.0))
     return logits
 
 
@@ -187,7 +187,7 @@ def _halved(
     fine = np.empty((*lattice.shape, coarse.shape[3]), np.float32)
     _in_slabs(partial(halved, coarse, fine), len(fine))
     rows = fine.reshape(-1, coarse.shape[3])
-    leads = _best(rows)[1]
+    leads = leading(rows)[1]
     leads.reshape(lattice.shape)[::2, ::2, ::2] = np.inf  # the coarse points: settled before
     asked = np.flatnonzero(settled(rows, leads, lattice.ask, lattice.trust))
     flat, found = _about_surprises(asked, rows[asked], coarse, lattice)
@@ -202,7 +202,7 @@ def _voxels(
     from tumortrack.track.sparse_kernels import filled
 
     classes = coarse.shape[3]
-    sure, leads = (v.reshape(coarse.shape[:3]) for v in _best(coarse.reshape(-1, classes)))
+    sure, leads = (v.reshape(coarse.shape[:3]) for v in leading(coarse.reshape(-1, classes)))
     labels = np.empty(lattice.shape, np.uint8)
     trust = lattice.trust
     seen = trust.coarser or float(np.quantile(leads, _FIRST_SEEN))
@@ -210,7 +210,7 @@ def _voxels(
         plain = np.where(leads >= np.float32(seen), sure, np.uint8(255))
         lists = _in_slabs(partial(filled, coarse, sure, plain, labels), len(coarse))
         flat, expected, between = (np.concatenate(column) for column in zip(*lists, strict=True))
-        lead = _best(expected)[1]
+        lead = leading(expected)[1]
         lead[~between] = np.inf  # the coarse points: settled before
         asked = settled(expected, lead, partial(lattice.ask_some, flat), trust)
         if trust.limit <= seen:
@@ -218,7 +218,7 @@ def _voxels(
         seen = 2 * trust.limit  # voxels that lead by less were filled unseen
     more, found = _about_surprises(flat[asked], expected[asked], coarse, lattice)
     places, logits = np.concatenate([flat, more]), np.concatenate([expected, found])
-    labels.reshape(-1)[places] = _best(logits)[0]
+    labels.reshape(-1)[places] = leading(logits)[0]
     return _margins(labels, places, logits), labels
 
 
@@ -277,7 +277,7 @@ def _about_surprises(
     return np.concatenate(more), np.concatenate(logits)
 
 
-def _best(rows: Float32[np.ndarray, "n classes"]) -> tuple[np.ndarray, np.ndarray]:
+def leading(rows: Float32[np.ndarray, "n classes"]) -> tuple[np.ndarray, np.ndarray]:
     """The label that leads in every row, and by how much."""
     from tumortrack.track.sparse_kernels import best
 
