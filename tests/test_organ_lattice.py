@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from test_sparse_volume import Field
-from tumortrack.learn.lattice import lattice_over
+from tumortrack.learn.lattice import Lattice, lattice_over
 from tumortrack.track.organ import leaves, organ_lattice
 from tumortrack.track.volume import keep_largest_pieces
 
@@ -39,3 +39,13 @@ def test_an_organ_that_reaches_the_border_or_is_not_there_leaves():
     assert not leaves(organ_lattice(field, BOX, 40))
     assert leaves(organ_lattice(field, BOX + [80, 0, 0], 40))
     assert leaves(organ_lattice(field, BOX + 400, 40))
+
+
+def test_an_island_at_the_border_is_not_the_organ():
+    logits = np.zeros((9, 9, 9, 2), np.float32)
+    logits[..., 0] = 1
+    logits[3:6, 3:6, 3:6, 1] = 2
+    logits[0, 0, 0, 1] = logits[8, 4, 4, 1] = 2
+    assert not leaves(Lattice(np.zeros(3), 4.0, logits))
+    logits[5:, 4, 4, 1] = 2  # now the organ hangs together with it
+    assert leaves(Lattice(np.zeros(3), 4.0, logits))

@@ -9,7 +9,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tumortrack.learn.lattice import lattice_over
-from tumortrack.track.sparse import START_MM, halved_lattice, sparse_logits, sparse_margins
+from tumortrack.track.sparse import (
+    START_MM,
+    Trust,
+    halved_lattice,
+    settled,
+    sparse_logits,
+    sparse_margins,
+)
 from tumortrack.track.volume import dense_margins, grid_over, margins_on, part_surfaces
 
 NAMES = ("kidney", "tumor_1", "tumor_2")
@@ -135,3 +142,29 @@ def test_a_halved_lattice_has_the_labels_of_asking_all():
     all_margins, all_labels = dense_margins(field, camera_from_index, labels.shape)
     assert np.array_equal(labels, all_labels)
     assert np.array_equal(margins > 0, all_margins > 0)
+
+
+def test_what_was_settled_before_is_neither_a_measure_nor_asked():
+    """Few points are open, and fewer than are asked to begin with: the others stay believed."""
+    leads = np.full(1000, np.inf, np.float32)
+    leads[:100] = np.linspace(0, 1, 100)
+    expected = np.zeros((1000, 2), np.float32)
+    trust = Trust()
+    asked = settled(expected, leads, lambda which: np.zeros((len(which), 2), np.float32), trust)
+    assert np.array_equal(asked, np.isfinite(leads))
+    assert trust.limit == 1
+
+
+def test_no_point_of_the_coarse_lattice_is_asked_again():
+    field, places = Field(1), []
+
+    def noted(points_mm):
+        places.append(np.array(points_mm))
+        return field(points_mm)
+
+    coarse = lattice_over(field, np.array([[-70.0] * 3, [70.0] * 3]), 20)
+    halved_lattice(noted, coarse)
+    steps = (np.concatenate(places) - coarse.origin_mm) / coarse.step_mm
+    old = (np.abs(steps - np.rint(steps)) < 1e-3).all(1)
+    assert len(old) > 500
+    assert not old.any()

@@ -15,6 +15,7 @@ from elastic_objects import CENTER, RADII
 from tumortrack.core.types import Mesh, SensorCloud
 from tumortrack.imaging.raster import cover, label_grid, winding_numbers
 from tumortrack.learn.model import load_model
+from tumortrack.learn.warp import locate
 from tumortrack.learn.warp.descent import normal_equations
 from tumortrack.learn.warp.locate import best_fit
 from tumortrack.learn.warp.refine import Descent, RefineConfig, _prior, refine
@@ -174,7 +175,7 @@ def test_a_descent_goes_on_where_it_was_stopped():
     halves = Descent(shape(), points, start, RefineConfig())
     halves.run(2)
     assert halves.cost > 2 * whole.cost
-    for steps in (4, 20, 20):
+    for steps in (4, 0, 20, 20, 0):
         halves.run(steps)
     again = halves.refined()
     assert (again.cost, again.steps) == (whole.cost, whole.steps)
@@ -192,6 +193,27 @@ def test_the_best_of_many_starts_wins_wherever_it_stands():
         fit = best_fit(shape(), points, starts, RefineConfig())
         assert fit.cost == alone.cost
         assert fit.steps == alone.steps
+
+
+def test_starts_that_are_far_behind_are_given_up(monkeypatch):
+    gone = []
+
+    class Noted(Descent):
+        def run(self, steps):
+            super().run(steps)
+            gone.append((self, self.steps))
+
+    monkeypatch.setattr(locate, "Descent", Noted)
+    points = placed().carry(ANATOMY.organ.vertices_mm[::3])
+    near = nudged(placed(), [3, -2, 5], [0.1, -0.05, 0.1])
+    far = nudged(placed(), [60, 0, 60], [0, 0, 1.0])
+    steady = RefineConfig(enough_mm=0)  # never settles
+    best_fit(shape(), points, [far, near], steady)
+    most = {}
+    for descent, steps in gone:
+        most[descent] = max(steps, most.get(descent, 0))
+    assert sorted(most.values()) == [6, steady.steps]
+    assert min(most, key=lambda descent: descent.cost) is max(most, key=most.__getitem__)
 
 
 def test_labels_and_margins_are_those_of_the_distances():

@@ -21,5 +21,6 @@ def keep_loaded() -> None:
 def leave() -> NoReturn:
     """End the process at once, all being written: to take apart what was loaded, object by object,
     takes a fifth of a second. What is registered for the end of Python is not called."""
-    sys.stderr.flush()
+    if sys.stderr is not None:  # as after 2>&-
+        sys.stderr.flush()
     os._exit(0)

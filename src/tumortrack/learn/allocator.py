@@ -6,6 +6,7 @@ import ctypes
 import sys
 
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD, _M_MMAP_MAX = -1, -3, -4  # glibc's malloc.h
+_MMAP_MAX = 65536  # glibc's own
 _SMALL = 32 * 2**20  # bytes: no larger threshold is allowed
 
 
@@ -18,7 +19,7 @@ def keep_freed_memory() -> None:
 def keep_small_blocks() -> None:
     """The same for blocks of up to 32 MB, which hold all that a frame needs; larger ones, of
     volumes, are still returned. A frame of ``clinic`` takes a third less."""
-    _tell({_M_MMAP_THRESHOLD: _SMALL, _M_TRIM_THRESHOLD: 8 * _SMALL})
+    _tell({_M_MMAP_MAX: _MMAP_MAX, _M_MMAP_THRESHOLD: _SMALL, _M_TRIM_THRESHOLD: 8 * _SMALL})
 
 
 def _tell(options: dict[int, int]) -> None:

@@ -10,6 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 from torch.autograd import Function
+from torch.autograd.function import once_differentiable
 from torch.nn import functional
 
 from tumortrack.learn.sampling import traced
@@ -57,6 +58,7 @@ class _Greatest(Function):
         return out
 
     @staticmethod
+    @once_differentiable
     def backward(ctx: Any, *gradients: Tensor) -> Tensor:
         from tumortrack.learn.pooling_kernels import handed_back
 

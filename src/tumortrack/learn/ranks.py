@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from datetime import timedelta
 
@@ -148,5 +148,8 @@ def joined(device: str) -> Iterator[Ranks]:
     ranks = Ranks(chosen, distributed.get_rank(), size, on_machine)
     try:
         yield ranks
-    finally:
-        ranks.leave()
+    except BaseException:
+        with suppress(RankLost):  # what ended this process is to be told, not what follows
+            ranks.leave()
+        raise
+    ranks.leave()

@@ -12,7 +12,7 @@ from tumortrack.learn.lattice import Lattice, LogitsAt, lattice_over
 
 
 def organ_lattice(logits_at: LogitsAt, box_mm: Float[np.ndarray, "2 3"], steps: int) -> Lattice:
-    """``lattice_over``, asked everywhere inside of the organ and two points about it.
+    """``lattice_over``, asked everywhere inside of the organ and a point or two about it.
 
     Every second point along each axis is asked first, then all within two of one that lies
     inside, then all about those that turn out to lie inside, until none is left. The others are
@@ -42,10 +42,16 @@ def organ_lattice(logits_at: LogitsAt, box_mm: Float[np.ndarray, "2 3"], steps: 
 
 
 def leaves(lattice: Lattice) -> bool:
-    """Whether the organ reaches the border of a lattice, or is not in it at all."""
-    inside = lattice.logits.argmax(-1) != OUTSIDE
-    inner = (slice(1, -1),) * 3
-    return not inside.any() or bool(inside.sum() > inside[inner].sum())
+    """Whether the organ, the largest piece of what lies inside, reaches the border of a lattice, or
+    is not in it at all."""
+    from scipy import ndimage
+
+    pieces, count = ndimage.label(lattice.logits.argmax(-1) != OUTSIDE)
+    if not count:
+        return True
+    sizes = np.bincount(pieces.ravel())
+    largest = 1 + int(sizes[1:].argmax())
+    return bool(sizes[largest] > (pieces[1:-1, 1:-1, 1:-1] == largest).sum())
 
 
 def _inside(flat: np.ndarray, rows: Float32[np.ndarray, "n classes"]) -> np.ndarray:

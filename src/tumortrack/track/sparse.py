@@ -165,8 +165,9 @@ def settled(
         trust: what is known of the errors; learns.
     """
     asked = np.zeros(len(leads), bool)
-    if len(leads):
-        least = min(_PROBE, len(leads)) - 1
+    uncertain = int(np.isfinite(leads).sum())  # others were settled before
+    if uncertain:
+        least = min(_PROBE, uncertain) - 1
         trust.limit = max(trust.limit, float(np.partition(leads, least)[least]))
     while True:
         now = np.flatnonzero((leads <= trust.limit) & ~asked)
@@ -267,6 +268,7 @@ def _about_surprises(
         return more[0], logits[0]
     known = np.zeros(math.prod(lattice.shape), bool)
     known[flat] = True
+    known.reshape(lattice.shape)[::2, ::2, ::2] = True  # the coarse points: settled before
     while len(surprises):
         frontier = neighbours(lattice.shape, surprises, known)
         if not len(frontier):

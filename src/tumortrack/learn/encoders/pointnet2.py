@@ -123,7 +123,8 @@ class _Level(nn.Module):
             grouped = grouped + take(shared, neighbours)
         hidden = self.first.activate(grouped)
         layers = [layer for layer in self.rest if isinstance(layer, Layer)]
-        if not (torch.is_grad_enabled() and layers):  # for use, others may have taken their place
+        learns = torch.is_grad_enabled() and len(layers) == len(self.rest)
+        if not learns:  # for use, others may have taken the layers' place
             return greatest(self.rest(hidden))
         for layer in layers[:-1]:
             hidden = layer(hidden)

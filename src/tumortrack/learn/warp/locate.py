@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 
 import numpy as np
 import torch
@@ -23,6 +23,7 @@ _TURNS = 8  # of a start that does not fit
 # Of 840 clouds of four organs, of drags, elastic states and the digital twin's, none had a best
 # start that after six steps cost more than 2.5 times what another did; two thirds of the wrong
 # ways round cost more than three times.
+# (Of the turned starts: never more than twice.)
 _HEAT = 6  # steps that every start goes
 _BEHIND = 3.0  # times the least cost: goes no farther
 
@@ -30,7 +31,10 @@ _BEHIND = 3.0  # times the least cost: goes no farther
 @contextmanager
 def _one_thread() -> Iterator[None]:
     """For a network so small that a second thread saves nothing: after its part it would wait
-    busily for more, milliseconds long, on the core where the refinement wants to run."""
+    busily for more, milliseconds long, on the core where the refinement wants to run.
+
+    The number is the whole process's: nothing else should start to use torch meanwhile.
+    """
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
@@ -47,7 +51,7 @@ def first_motions(
     one only where it may be right."""
     device = next(network.parameters()).device
     cloud = torch.tensor(np.asarray(points_mm, np.float32), device=device)[None]
-    with _one_thread():
+    with _one_thread() if device.type == "cpu" else nullcontext():
         ways = sorted(network.both_ways(cloud), key=lambda way: -float(way.right_way))
     if float(ways[0].right_way - ways[1].right_way) > _SURE:
         ways = ways[:1]

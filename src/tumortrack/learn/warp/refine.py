@@ -92,15 +92,16 @@ class Descent:
         weight = min(config.n_effective / count, 1.0) / config.sigma_mm**2
         narrowing, enough = config.narrowing, config.enough_mm
         self._rules = weight, config.first_mm, config.last_mm, narrowing, enough
-        pose = np.array(start.rotation, float), np.array(start.centre_mm, float)
-        self._state = *pose, np.array(start.coefficients, float), np.zeros(6)
+        given = start.rotation, start.centre_mm, start.coefficients
+        # In C's order, whatever was given: the kernel is compiled for that.
+        self._state = *(np.array(part, float, order="C") for part in given), np.zeros(6)
         gradient = np.empty(len(precision))
         self._left = np.empty(count, np.float32), np.empty_like(precision), gradient
         self.cost, self.steps, self.settled = np.inf, 0, False
 
     def run(self, steps: int) -> None:
         """Go on until ``steps`` are gone since the start, if it has not settled before."""
-        if self.settled or 0 < steps <= self.steps:
+        if self.settled or (steps <= self.steps and np.isfinite(self.cost)):
             return
         whole = self._organ, self._points, self._rules, self._state, self._left
         self.steps, self.settled, self.cost = descend(*whole, self.steps, steps)
@@ -108,8 +109,10 @@ class Descent:
     def refined(self) -> Refined:
         """Where it is."""
         distances_mm, curvature, _ = self._left
-        motion = WarpMotion(self._shape, *self._state[:3], np.linalg.inv(curvature))
-        return Refined(motion, self.cost, distances_mm, self.steps)
+        rotation, centre_mm, coefficients, _ = (part.copy() for part in self._state)
+        covariance = np.linalg.inv(curvature)
+        motion = WarpMotion(self._shape, rotation, centre_mm, coefficients, covariance)
+        return Refined(motion, self.cost, distances_mm.copy(), self.steps)
 
 
 def _prior(shape: Shape, config: RefineConfig) -> Float64[np.ndarray, "p p"]:

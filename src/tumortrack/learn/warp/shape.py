@@ -75,7 +75,8 @@ class Shape:
     ) -> tuple[UInt8[np.ndarray, " n"], Float32[np.ndarray, " n"]]:
         """Label of each point, and its distance (mm) to the nearest surface that bounds it."""
         labels = np.zeros(len(points_ct), np.uint8)
-        margin_mm = np.full(len(points_ct), np.inf, np.float32)
+        far = np.finfo(np.float32).max  # fast math knows no infinity
+        margin_mm = np.full(len(points_ct), far, np.float32)
 
         def mark(part: slice) -> None:
             some = points_ct[part], labels[part], margin_mm[part]
