@@ -64,7 +64,7 @@ def _width(rules, step):  # type: ignore[no-untyped-def]
     return max(last_mm, first_mm * narrowing**step)
 
 
-@numba.njit(cache=True, fastmath=True, nogil=True)
+@numba.njit(cache=True, fastmath=True, nogil=True, inline="always")
 def _equations(organ, points, rules, state, width, room, left):  # type: ignore[no-untyped-def]
     """Distances, curvature and gradient of the cost at a state into ``left``; the cost."""
     modes, origin, spacing, center, field, precision, mean = organ
@@ -103,7 +103,7 @@ def _equations(organ, points, rules, state, width, room, left):  # type: ignore[
     return cost
 
 
-@numba.njit(cache=True, fastmath=True, nogil=True)
+@numba.njit(cache=True, fastmath=True, nogil=True, inline="always")
 def normal_equations(  # type: ignore[no-untyped-def]
     lattice, steps, modes, pose, field, width, points, room, out
 ):
@@ -135,7 +135,7 @@ def normal_equations(  # type: ignore[no-untyped-def]
         mixed[n] = sums[unknowns, n]
 
 
-@numba.njit(cache=True, fastmath=True, nogil=True)
+@numba.njit(cache=True, fastmath=True, nogil=True, inline="always")
 def _add_products(across, count, sums):  # type: ignore[no-untyped-def]
     """Add the products of all pairs of rows (over ``count`` columns) to the lower triangle of
     ``sums``: eight at a time, so that a number read is used more than once."""

@@ -106,7 +106,7 @@ def residuals(lattice, steps, modes, pose, field, points, rows):  # type: ignore
         add_rows(lattice, steps, modes, pose, field, some, room, rows[first : first + BLOCK])
 
 
-@numba.njit(cache=True, fastmath=True, nogil=True)
+@numba.njit(cache=True, fastmath=True, nogil=True, inline="always")
 def add_rows(lattice, steps, modes, pose, field, points, room, rows):  # type: ignore[no-untyped-def]
     """``residuals`` of one block of points; ``room`` is ``flow.block()``."""
     velocity, origin, spacing = lattice
