@@ -2,6 +2,8 @@
 PYTHON ?= python3
 BIN := .venv/bin
 SETUP := .venv/.installed
+# Whatever the environment says: without kept bytecode every start compiles PyTorch anew, for 4 s.
+unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
 .PHONY: help setup debian demo test check bench soak results headstart training-speed clean
@@ -32,7 +34,7 @@ debian:  ## what tests need of Debian (ROS, RViz, Chromium), where it can be ins
 test: check debian  ## check, then all tests
 	OMP_NUM_THREADS=1 $(BIN)/pytest -n 3 --dist loadfile --no-loadscope-reorder
 
-bench: setup  ## speed of every part beside its naive form; fills docs/performance.md (12 minutes; ARGS=--quick)
+bench: setup  ## speed of every part beside its naive form; fills docs/performance.md (10 to 13 minutes; ARGS=--quick)
 	$(BIN)/tumortrack bench --curves --document docs/performance.md $(ARGS)
 
 soak: setup  ## an hour of tracking: memory, latency, errors (ARGS="MODEL CASE --minutes 5"; after make demo)
