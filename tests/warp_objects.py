@@ -20,7 +20,7 @@ from tumortrack.learn.warp.motion import WarpMotion
 from tumortrack.learn.warp.shape import Shape, shape_of
 from tumortrack.simulate.deform import ElasticConfig
 from tumortrack.simulate.elastic.body import build_body
-from tumortrack.simulate.elastic.flow import steps_for
+from tumortrack.simulate.elastic.flow import BLOCK, block, steps_for
 from tumortrack.simulate.occupancy import OccupancyConfig
 from tumortrack.simulate.scene import SceneConfig
 
@@ -51,20 +51,22 @@ def nudged(motion, shift_mm, turn_rad):
 
 
 def residual_rows(points_mm, pose) -> np.ndarray:
-    """``kernels.residuals`` of points at a (rotation, centre_mm, coefficients)."""
+    """``kernels.add_rows`` of points at a (rotation, centre_mm, coefficients)."""
     rotation, centre_mm, coefficients = pose
     body, field = shape().body, shape().distances[0]
     velocity = body.velocity(-coefficients)
     rows = np.empty((len(points_mm), kernels.POSE + len(coefficients) + 1), np.float32)
-    kernels.residuals(
+    known = (
         (velocity, body.origin_mm, np.float32(body.spacing_mm)),
         steps_for(velocity, body.spacing_mm),
         body.modes,
         (body.center_ct, rotation, centre_mm),
         (field.values_mm, field.origin_mm, np.float32(field.spacing_mm)),
-        np.ascontiguousarray(points_mm, np.float32),
-        rows,
     )
+    points = np.ascontiguousarray(points_mm, np.float32)
+    for first in range(0, len(points), BLOCK):
+        some = slice(first, first + BLOCK)
+        kernels.add_rows(*known, points[some], block(), rows[some])
     return rows
 
 

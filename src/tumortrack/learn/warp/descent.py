@@ -107,7 +107,7 @@ def _equations(organ, points, rules, state, width, room, left):  # type: ignore[
 def normal_equations(  # type: ignore[no-untyped-def]
     lattice, steps, modes, pose, field, width, points, room, out
 ):
-    """Distances as ``kernels.residuals`` gives them (n,), and the sums over points of ``pull * row
+    """Distances as ``kernels.add_rows`` gives them (n,), and the sums over points of ``pull * row
     * row'`` (p, p) and of ``pull * row * distance`` (p,), float64: ``out``; ``pull`` is
     1 / (1 + (distance / width)^2)^2. ``room`` is overwritten."""
     rows, across = room

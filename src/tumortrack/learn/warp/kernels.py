@@ -90,25 +90,16 @@ def variances(lattice, steps, modes, center, root, points, out):  # type: ignore
             out[first + p] /= 3
 
 
-@numba.njit(cache=True, fastmath=True, nogil=True)
-def residuals(lattice, steps, modes, pose, field, points, rows):  # type: ignore[no-untyped-def]
-    """What each unknown does to the signed distance of points (n, 3; camera frame, mm), carried
-    back, to a surface at rest; the distance itself stands in the last column of ``rows``
-    (n, p + 1).
-
-    ``lattice`` has the opposite velocity; ``pose`` is (center_ct, rotation, centre_mm), ``field``
-    (values, origin, spacing) of the distances. ``pose`` is float64, all else float32.
-    """
-    places, speeds, middles = block()
-    for first in range(0, len(points), BLOCK):
-        some = points[first : first + BLOCK]
-        room = places, speeds, middles
-        add_rows(lattice, steps, modes, pose, field, some, room, rows[first : first + BLOCK])
-
-
 @numba.njit(cache=True, fastmath=True, nogil=True, inline="always")
 def add_rows(lattice, steps, modes, pose, field, points, room, rows):  # type: ignore[no-untyped-def]
-    """``residuals`` of one block of points; ``room`` is ``flow.block()``."""
+    """What each unknown does to the signed distance of one block of points (n, 3; camera frame,
+    mm), carried back, to a surface at rest; the distance itself stands in the last column of
+    ``rows`` (n, p + 1).
+
+    ``lattice`` has the opposite velocity; ``pose`` is (center_ct, rotation, centre_mm), ``field``
+    (values, origin, spacing) of the distances; ``room`` is ``flow.block()``. ``pose`` is float64,
+    all else float32.
+    """
     velocity, origin, spacing = lattice
     center, rotation, centre = pose
     values, corner, width = field
