@@ -13,18 +13,18 @@ help:  ## list the targets
 
 setup: $(SETUP)  ## install everything into .venv
 
-$(SETUP): pyproject.toml constraints.txt
+$(SETUP): pyproject.toml lab/pyproject.toml constraints.txt
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "tumortrack needs Python 3.11 or newer; give make PYTHON=python3.11")'
 	$(PYTHON) -m venv .venv
-	$(BIN)/pip install --quiet --disable-pip-version-check --no-compile -c constraints.txt -e '.[dev,peers,live,arms,onnx]'
+	$(BIN)/pip install --quiet --disable-pip-version-check --no-compile -c constraints.txt -e '.[dev,live,arms,onnx]' -e lab
 	touch $@
 
 demo: setup  ## CT -> tumors located in unseen deformed scenes (about 5 minutes)
 	$(BIN)/tumortrack demo
 
 check: setup  ## lint, types, import order
-	$(BIN)/ruff check src tests examples bench
-	$(BIN)/ruff format --check src tests examples bench
+	$(BIN)/ruff check src lab tests examples tools
+	$(BIN)/ruff format --check src lab tests examples tools
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
@@ -38,16 +38,16 @@ bench: setup  ## speed of every part beside its naive form; fills docs/performan
 	$(BIN)/tumortrack bench --curves --document docs/performance.md $(ARGS)
 
 soak: setup  ## an hour of tracking: memory, latency, errors (ARGS="MODEL CASE --minutes 5"; after make demo)
-	$(BIN)/python bench/soak.py $(ARGS)
+	$(BIN)/python lab/scripts/soak.py $(ARGS)
 
 results: setup  ## the tables and plots of docs/results.md (hours; ARGS=--quick: minutes)
-	$(BIN)/python bench/results.py $(ARGS)
+	$(BIN)/python lab/scripts/results.py $(ARGS)
 
 headstart: setup  ## accuracy against training steps from pretrained weights (ARGS=--start OUT)
-	$(BIN)/python bench/pretraining.py $(ARGS)
+	$(BIN)/python lab/scripts/pretraining.py $(ARGS)
 
 training-speed: setup  ## accuracy reached per second, by batch, learning rate and queries (half an hour)
-	$(BIN)/python bench/training.py $(ARGS)
+	$(BIN)/python lab/scripts/training.py $(ARGS)
 
 clean:  ## remove .venv and caches (runs/ stays)
 	rm -rf .venv .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache

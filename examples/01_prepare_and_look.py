@@ -8,12 +8,12 @@ import sys
 from pathlib import Path
 
 from tumortrack.core.store import new_folder
-from tumortrack.evaluate.pictures import qc_picture
 from tumortrack.imaging.case import save_case
 from tumortrack.imaging.prepare import PrepareOptions, prepare
 from tumortrack.phantom.dicom import write_dicom_series
 from tumortrack.phantom.digital import PhantomParameters, phantom_labels
 from tumortrack.phantom.scanner import ScannerParameters, scan
+from tumortrack.report.pictures import qc_picture
 
 
 def main(out: Path) -> None:

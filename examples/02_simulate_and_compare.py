@@ -11,18 +11,18 @@ from pathlib import Path
 
 import numpy as np
 
+from tumortrack.core.estimate import Estimate
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.types import Anatomy, CameraLabels, OccupancyCloud, SensorCloud
-from tumortrack.evaluate.metrics import label_grid
-from tumortrack.evaluate.pictures import scene_picture
-from tumortrack.evaluate.protocol import evaluate_scene
 from tumortrack.imaging.case import load_case
+from tumortrack.models.volume import grid_over
+from tumortrack.report.metrics import label_grid
+from tumortrack.report.pictures import scene_picture
+from tumortrack.report.protocol import evaluate_scene
 from tumortrack.sense.noise import D405_NOISE
 from tumortrack.simulate.deform.drag import CONFIGURATIONS, DragConfig
 from tumortrack.simulate.scene import SceneConfig, SceneRecipe, Simulator
 from tumortrack.simulate.scene_folder import Scene, write_scene
-from tumortrack.track.estimate import Estimate
-from tumortrack.track.volume import grid_over
 
 
 def main(out: Path) -> None:

@@ -11,13 +11,13 @@ from pathlib import Path
 
 import msgspec
 
-from tumortrack.app.presets import clinic
 from tumortrack.core.store import MANIFEST, sha256_of
 from tumortrack.imaging.case import load_case
-from tumortrack.learn.train import Run, Status, train
 from tumortrack.simulate.bodies import body_for
 from tumortrack.simulate.scene import SceneRecipe, Simulator
-from tumortrack.track.tracker import Tracker
+from tumortrack.tracking.tracker import Tracker
+from tumortrack.training.presets import clinic
+from tumortrack.training.train import Run, Status, train
 
 
 def show(status: Status) -> None:

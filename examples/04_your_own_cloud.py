@@ -7,11 +7,11 @@ import sys
 from pathlib import Path
 
 from tumortrack.core.errors import NoEstimate
-from tumortrack.learn.model import load_model
 from tumortrack.sense.cloud import crop_cloud
 from tumortrack.sense.files import read_cloud
-from tumortrack.track.files import write_estimate
-from tumortrack.track.tracker import Tracker
+from tumortrack.tracking.files import write_estimate
+from tumortrack.tracking.tracker import Tracker
+from tumortrack.training.model import load_model
 
 
 def main(out: Path, model_folder: Path, cloud_file: Path) -> None:

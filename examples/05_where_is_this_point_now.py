@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 
 from tumortrack.imaging.case import load_case
-from tumortrack.learn.model import load_model
 from tumortrack.simulate.scene_folder import read_scene
-from tumortrack.track.tracker import Tracker
+from tumortrack.tracking.tracker import Tracker
+from tumortrack.training.model import load_model
 
 
 def place(point_mm: np.ndarray) -> str:

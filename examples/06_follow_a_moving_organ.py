@@ -9,15 +9,15 @@ from pathlib import Path
 
 import numpy as np
 
-from tumortrack.learn.model import load_model
+from tumortrack.live.loop import Loop, LoopConfig, summary
+from tumortrack.live.sink_worker import Outlet
+from tumortrack.live.source_worker import Reader
+from tumortrack.live.sources.virtual import Virtual
+from tumortrack.live.values import Frames, Setting, Update
 from tumortrack.sense.cloud import CloudConfig
 from tumortrack.sense.region import RegionConfig
-from tumortrack.track.live import Frames, Setting, Update
-from tumortrack.track.loop import Loop, LoopConfig, summary
-from tumortrack.track.outlet import Outlet
-from tumortrack.track.reader import Reader
-from tumortrack.track.sources.virtual import Virtual
-from tumortrack.track.tracker import Tracker
+from tumortrack.tracking.tracker import Tracker
+from tumortrack.training.model import load_model
 
 
 class Teller:

@@ -11,8 +11,6 @@ import numpy as np
 
 from tumortrack.core.errors import NoPlan
 from tumortrack.core.types import Anatomy
-from tumortrack.evaluate.plan_pictures import draw_plan
-from tumortrack.evaluate.resection import cut
 from tumortrack.imaging.case import load_case
 from tumortrack.plan.arms.cell import Cell
 from tumortrack.plan.arms.config import CellConfig
@@ -21,7 +19,9 @@ from tumortrack.plan.config import ResectionConfig
 from tumortrack.plan.located import STAND_MM
 from tumortrack.plan.resection import plan_resection
 from tumortrack.plan.values import Located
+from tumortrack.report.plan_pictures import draw_plan
 from tumortrack.simulate.occupancy import labels_of
+from tumortrack_lab.cut.resection import cut
 
 TABLE_FROM_LPS = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])  # supine: the front is up
 

@@ -8,16 +8,22 @@ from pathlib import Path
 import pytest
 from jaxtyping import install_import_hook
 
-SOURCE = Path(__file__).parents[1] / "src"
-CHECKED = ("core/geometry.py", "imaging/*.py", "phantom/*.py", "evaluate/**/*.py", "track/*.py")
+ROOT = Path(__file__).parents[1]
+PACKAGES = (ROOT / "src" / "tumortrack", ROOT / "lab" / "src" / "tumortrack_lab")
+CHECKED = (
+    *("core/geometry.py", "core/estimate.py", "imaging/*.py", "phantom/*.py", "models/[rv]*.py"),
+    *("*/locator.py", "occupancy/[os]*.py", "tracking/*.py", "live/*.py", "report/*.py"),
+    *("bench/**/*.py", "study/*.py", "twin/*.py", "peers/*.py", "cut/*.py", "tets.py"),
+)
 
 # Left out: modules with numba kernels (numba compiles the plain function), and core.types, whose
 # constructors convert and check shapes themselves, always.
 install_import_hook(
     [
-        ".".join(path.relative_to(SOURCE).with_suffix("").parts)
+        ".".join(path.relative_to(package.parent).with_suffix("").parts)
+        for package in PACKAGES
         for pattern in CHECKED
-        for path in (SOURCE / "tumortrack").glob(pattern)
+        for path in sorted(package.glob(pattern))
         if path.name != "__init__.py" and "import numba" not in path.read_text(encoding="utf-8")
     ],
     "beartype.beartype",
@@ -46,7 +52,7 @@ def pytest_collection_modifyitems(items):
 @pytest.fixture(scope="session")
 def shared_data():
     """Real patients' anatomy beside the checkout; tests that need it skip where it is absent."""
-    folder = Path(__file__).parents[2] / "shared" / "data"
+    folder = ROOT.parent / "shared" / "data"
     if not folder.is_dir():
         pytest.skip(f"real data not found at {folder}")
     return folder

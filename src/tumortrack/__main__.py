@@ -1,6 +1,6 @@
 """`python -m tumortrack`, and with it `torchrun -m tumortrack`."""
 
-from tumortrack.app.cli import main
+from tumortrack.cli.main import main
 
 if __name__ == "__main__":
     main()

@@ -19,10 +19,10 @@ from scipy.spatial import cKDTree
 from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError, TumortrackError
 from tumortrack.core.types import Mesh
+from tumortrack.live.values import Line, Shape, Update, Workcell
 from tumortrack.plan.execute import ABORTED, Execution
 from tumortrack.plan.motions import JOINTS, Motions
 from tumortrack.plan.values import Located, ResectionPlan
-from tumortrack.track.live import Line, Shape, Update, Workcell
 
 Colour = tuple[int, int, int]
 TO_CUT: Colour = (0, 120, 240)
@@ -100,7 +100,7 @@ Draw = Callable[[Float64[np.ndarray, " 12"]], tuple[Shape, ...]]
 
 
 class Operation:
-    """``track.live.Companion``: arms that act on estimates.
+    """``live.values.Companion``: arms that act on estimates.
 
     Args:
         planned: what to begin with.

@@ -17,7 +17,7 @@ from tumortrack.plan.arms.urdf import cell_urdf
 from tumortrack.plan.motions import CUTTER, HOLDER
 
 if TYPE_CHECKING:
-    from tumortrack.track.live import Shape
+    from tumortrack.live.values import Shape
 
 __all__ = ["Base", "Cell", "CellConfig"]
 

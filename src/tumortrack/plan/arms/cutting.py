@@ -7,10 +7,10 @@ from collections import Counter
 import numpy as np
 from jaxtyping import Float64
 
-from tumortrack.plan.arms.course import Course
 from tumortrack.plan.arms.situation import Blocked, Situation
 from tumortrack.plan.arms.strokes import Leg, Surroundings, leg, level_poses
 from tumortrack.plan.arms.tracks import follow, solve
+from tumortrack.plan.arms.trajectory import Course
 from tumortrack.plan.arms.transfer import connect
 from tumortrack.plan.motions import CUTTER, HOLDER
 

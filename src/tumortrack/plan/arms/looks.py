@@ -10,8 +10,8 @@ from jaxtyping import Float64
 
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.types import Mesh
+from tumortrack.live.values import Shape
 from tumortrack.plan.arms.body import YELLOW, Part
-from tumortrack.track.live import Shape
 
 _SIDES = 28
 _BEAD_MM = 1.5

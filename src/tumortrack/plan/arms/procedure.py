@@ -11,11 +11,11 @@ from tumortrack.core.errors import InputError, NoPlan
 from tumortrack.core.types import Mesh
 from tumortrack.plan.arms import timing
 from tumortrack.plan.arms.cell import TOUCHES, Cell
-from tumortrack.plan.arms.course import Course
 from tumortrack.plan.arms.cutting import DETOURS_MM, aside, cut_pass
 from tumortrack.plan.arms.situation import Blocked
 from tumortrack.plan.arms.strokes import Surroundings, leg, level_poses, passes
 from tumortrack.plan.arms.tracks import follow, solve
+from tumortrack.plan.arms.trajectory import Course
 from tumortrack.plan.arms.transfer import connect
 from tumortrack.plan.motions import CUTTER, HOLDER, JOINTS, Motions
 from tumortrack.plan.values import ResectionPlan

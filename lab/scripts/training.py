@@ -1,0 +1,304 @@
+"""Batch, learning rate and queries a scene, by the accuracy reached per second.
+
+    make training-speed          (about half an hour on one core)
+
+Every setting trains for the same number of seconds on one core, the making of its scenes
+included, and is judged on scenes that no training has seen: of the kinds it was trained on, and of
+another kind of deformation. Writes a block of docs/training.md and its picture; measurements are
+kept under --out, and what is there is not measured again.
+"""
+
+from __future__ import annotations
+
+import os
+import shlex
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Literal
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+import msgspec
+import numpy as np
+import torch
+import tyro
+
+from tumortrack.cli.console import say
+from tumortrack.core import store
+from tumortrack.core.allocator import keep_freed_memory
+from tumortrack.core.errors import TumortrackError
+from tumortrack.imaging.case import Case, load_case
+from tumortrack.models.config import TrainConfig
+from tumortrack.occupancy.network import OccupancyNetwork
+from tumortrack.phantom.digital import PhantomParameters
+from tumortrack.registration.hypotheses import first_motions
+from tumortrack.registration.network import WarpNetwork
+from tumortrack.registration.rest_shape import shape_of
+from tumortrack.report.drawing import new_figure, save
+from tumortrack.simulate.bodies import body_for
+from tumortrack.simulate.dataset import SceneStream
+from tumortrack.simulate.occupancy import organ_pool
+from tumortrack.simulate.scene import Simulator
+from tumortrack.training.loader import batches
+from tumortrack.training.networks import Network
+from tumortrack.training.presets import PRESETS, clinic, quick
+from tumortrack.training.run import Run
+from tumortrack.training.schedule import settle_end
+from tumortrack.training.state import TrainingState
+from tumortrack.training.task import course_of
+from tumortrack.training.validate import (
+    ValidationScenes,
+    ValidationSet,
+    mean_iou_of,
+    validation_scenes,
+)
+from tumortrack_lab.study.book import Book
+from tumortrack_lab.study.markdown import table
+from tumortrack_lab.study.phantoms import phantom_case
+
+BLOCK = "training-speed"
+CPU = torch.device("cpu")
+UNSEEN_SEED = 1_000_003  # of the judged scenes and their library of states
+BATCHES = (8, 16, 32, 64)
+USUAL_BATCH = {"quick": 16, "clinic": 32}
+COLORS = dict(zip(BATCHES, ("#D55E00", "#0072B2", "#009E73", "#CC79A7"), strict=True))
+Preset = Literal["quick", "clinic"]
+
+
+@dataclass(frozen=True)
+class Options:
+    """Train every setting for the same time, and judge it."""
+
+    seconds: float = 45.0
+    """Of training, on one core."""
+    seeds: int = 2
+    """Of the trainings of quick; clinic has one."""
+    scenes: int = 32
+    """To judge on, of each kind."""
+    looks: int = 5
+    """How often a training is judged."""
+    out: Path = Path("runs/training")
+    """Where measurements are kept."""
+    document: Path = Path("docs/training.md")
+    """Whose marked block is replaced."""
+
+
+@dataclass(frozen=True)
+class Setting:
+    """One training."""
+
+    preset: Preset
+    batch: int
+    per_side: int
+    learning_rate: float
+    seed: int
+
+    @property
+    def name(self) -> str:
+        numbers = (self.batch, self.per_side, f"{self.learning_rate * 1e5:.0f}", self.seed)
+        return "_".join(map(str, (self.preset, *numbers)))
+
+    def config(self, case: Case) -> TrainConfig:
+        """The preset with this setting's numbers."""
+        config = PRESETS[self.preset](case.anatomy, "limited")
+        replace = msgspec.structs.replace
+        occupancy = replace(config.scene.occupancy, per_side=self.per_side)
+        return replace(
+            config,
+            batch_size=self.batch,
+            schedule=replace(config.schedule, learning_rate=self.learning_rate),
+            scene=replace(config.scene, occupancy=occupancy),
+        )
+
+
+def settings(case: Case, options: Options) -> Iterator[Setting]:
+    """The presets' numbers, and one thing changed at a time: the batch at the same learning rate,
+    the batch with a learning rate that grows as its root, the queries a scene."""
+    for preset, seed in (*(("quick", n) for n in range(options.seeds)), ("clinic", 0)):
+        usual = PRESETS[preset](case.anatomy, "limited")
+        rate, per_side = usual.schedule.learning_rate, usual.scene.occupancy.per_side
+        others = [batch for batch in BATCHES if batch != usual.batch_size]
+        rows = [(batch, per_side, rate) for batch in BATCHES]
+        rows += [(n, per_side, round(rate * (n / usual.batch_size) ** 0.5, 6)) for n in others]
+        rows += [(usual.batch_size, sides, rate) for sides in (32, 128) if preset == "quick"]
+        for row in rows:
+            yield Setting(preset, *row, seed)
+
+
+def main(options: Options) -> None:
+    """Every setting, then the block."""
+    torch.set_num_threads(1)
+    keep_freed_memory()
+    folder = options.out / "phantom"
+    phantom_case(folder, PhantomParameters(), 0.8)
+    case, judges, rows = load_case(folder), {}, []
+    for setting in settings(case, options):
+        about = {
+            "setting": asdict(setting),
+            "case_sha256": store.sha256_of(folder / store.MANIFEST),
+            **{name: getattr(options, name) for name in ("seconds", "scenes", "looks")},
+        }
+        cell = options.out / f"{setting.name}.json"
+        if not (cell.is_file() and (known := store.read_json(cell))["about"] == about):
+            if setting.preset not in judges:
+                judges[setting.preset] = Judge(case, setting.preset, options.scenes)
+            curve = _curve(case, setting, judges[setting.preset], options)
+            known = {"about": about, "curve": curve}
+            store.write_json(cell, known)
+        rows.append((setting, known["curve"]))
+        last = rows[-1][1][-1]
+        say(f"{setting.name}: " + " ".join(f"{k}={round(v, 3)}" for k, v in last.items()))
+    given = f" ARGS='{shlex.join(sys.argv[1:])}'" if sys.argv[1:] else ""
+    _write(rows, options, Book(options.document, f"make training-speed{given}"))
+
+
+def _curve(case: Case, setting: Setting, judge: Judge, options: Options) -> list[dict]:
+    """A training of so many seconds; judging does not count."""
+    config = setting.config(case)
+    run = Run(case.anatomy, case.up_lps, "", config, setting.seed, minutes=options.seconds / 60)
+    course = course_of(run, CPU)
+    state = TrainingState(run, CPU)
+    state.know(course.teach)
+    stream = SceneStream(
+        case.anatomy, case.up_lps, config.scene, course.points, setting.seed, "train",
+        setting.batch, course.body,
+    )  # fmt: skip
+    stream.batch(0)  # compiled kernels and ray trees are there before the clock starts
+    progress, curve, spent = state.progress, [], 0.0
+    began = time.perf_counter()
+    for batch in batches(stream, range(10**9), 0, 0, CPU):
+        state.step(batch)
+        progress.elapsed_s = spent + time.perf_counter() - began
+        settle_end(config, progress, run.minutes)
+        done = progress.step == progress.end
+        if done or progress.elapsed_s >= options.seconds * (len(curve) + 1) / options.looks:
+            spent = progress.elapsed_s
+            row = {"seconds": spent, "samples": progress.step * setting.batch}
+            curve.append({**row, **judge.figures(state.average)})
+            began = time.perf_counter()
+        if done:
+            break
+    return curve
+
+
+class Judge:
+    """Scenes of one case: of the kinds that a preset trains on, and of another kind."""
+
+    def __init__(self, case: Case, preset: Preset, scenes: int) -> None:
+        own = PRESETS[preset](case.anatomy, "limited")
+        few = msgspec.structs.replace(own, validation_pairs=scenes)
+        other = (clinic if preset == "quick" else quick)(case.anatomy, "limited").scene.deform
+        scene = msgspec.structs.replace(own.scene, deform=other[-1:])
+        strange = msgspec.structs.replace(few, scene=scene)
+        self._parts = len(case.anatomy.parts) + 1
+        self._sets = {"miou": _scenes(case, few), "other_miou": _scenes(case, strange)}
+        body = body_for(case.anatomy, case.up_lps, own.scene, 0)
+        self._shape = None if body is None else shape_of(case.anatomy, body)
+
+    def figures(self, network: Network) -> dict[str, float]:
+        """Mean IoU over the parts, on either kind of scenes; of ``clinic`` as the network places
+        the organ, before the refinement, which makes up for much that was not learnt."""
+        return {name: self._miou(network, scenes) for name, scenes in self._sets.items()}
+
+    def _miou(self, network: Network, scenes: ValidationScenes) -> float:
+        network.eval()
+        if isinstance(network, OccupancyNetwork):
+            return ValidationSet(scenes, self._parts, CPU).miou(network)
+        assert isinstance(network, WarpNetwork)
+        assert self._shape is not None
+        guesses = []
+        for cloud, points_mm in zip(scenes.clouds_mm, scenes.points_mm, strict=True):
+            motion = first_motions(network, self._shape, cloud)[0]
+            guesses.append(self._shape.labels_at(motion.back(points_mm).astype(np.float32))[0])
+        return mean_iou_of(np.stack(guesses), scenes.labels, self._parts)
+
+
+def _scenes(case: Case, config: TrainConfig) -> ValidationScenes:
+    body = body_for(case.anatomy, case.up_lps, config.scene, UNSEEN_SEED)
+    simulator = Simulator(case.anatomy, case.up_lps, config.scene, body)
+    pool = organ_pool(case.anatomy, config.scene.occupancy, UNSEEN_SEED)
+    return validation_scenes(simulator, pool, config, UNSEEN_SEED)
+
+
+Rows = list[tuple[Setting, list[dict]]]
+
+
+def _groups(rows: Rows) -> dict[tuple, list[list[dict]]]:
+    """Curves of the seeds of each setting."""
+    groups: dict[tuple, list[list[dict]]] = {}
+    for s, curve in rows:
+        groups.setdefault((s.preset, s.batch, s.per_side, s.learning_rate), []).append(curve)
+    return groups
+
+
+def _write(rows: Rows, options: Options, book: Book) -> None:
+    head = ["preset", "batch", "per side", "learning rate", "samples/s", "mIoU", "other kind"]
+    body = []
+    for (preset, batch, per_side, rate), curves in sorted(
+        _groups(rows).items(), key=lambda item: (item[0][0], -_reached(item[1]))
+    ):
+        speed = np.mean([curve[-1]["samples"] / curve[-1]["seconds"] for curve in curves])
+        keys = ("miou", "other_miou")
+        last = [" / ".join(f"{curve[-1][key]:.3f}" for curve in curves) for key in keys]
+        sides = str(per_side) if preset == "quick" else "-"
+        body.append([preset, str(batch), sides, f"{rate:g}", f"{speed:.0f}", *last])
+    image = book.images / "training_speed.png"
+    _draw(rows, image)
+    text = (
+        f"`{book.command}`: {options.seconds:g} s of training each, on one core, scenes included "
+        f"(phantom; judging not counted), then mIoU on {options.scenes} unseen scenes of the "
+        f"kinds trained on and on {options.scenes} of another kind (quick: elastic states; "
+        "clinic: drags, squeezed and bent); of clinic as its network places the organ, before any "
+        "refinement. Several numbers: one a seed. Best first, by the mean of both kinds."
+    )
+    picture = f"![mIoU against seconds of training](images/{image.name})"
+    book.write({BLOCK: f"{picture}\n\n{table(head, body)}\n\n{text}"})
+
+
+def _reached(curves: list[list[dict]]) -> float:
+    return float(np.mean([curve[-1]["miou"] + curve[-1]["other_miou"] for curve in curves])) / 2
+
+
+def _draw(rows: Rows, path: Path) -> None:
+    """The mean of both kinds against seconds, by batch and rate, and by queries a scene."""
+    figure = new_figure(13.5, 4.6)
+    for number, (preset, what) in enumerate(
+        (("quick", "batch"), ("quick", "queries"), ("clinic", "batch")), start=1
+    ):
+        axes = figure.add_subplot(1, 3, number)
+        usual = next(s for s, _ in rows if s.preset == preset and s.batch == USUAL_BATCH[preset])
+        for s, curve in rows:
+            by_batch = what == "batch" and s.per_side == usual.per_side
+            alike = (s.batch, s.learning_rate) == (usual.batch, usual.learning_rate)
+            if s.preset != preset or not (by_batch or (what == "queries" and alike)):
+                continue
+            label = f"batch {s.batch}, rate {s.learning_rate:g}" if by_batch else None
+            color = COLORS[s.batch] if by_batch else f"C{(32, 64, 128).index(s.per_side)}"
+            axes.plot(
+                [row["seconds"] for row in curve],
+                [(row["miou"] + row["other_miou"]) / 2 for row in curve],
+                "-" if s.learning_rate == usual.learning_rate else "--",
+                color=color, marker=".", label=label or f"{s.per_side} per side",
+            )  # fmt: skip
+        axes.set(title=f"{preset}: {what}", xlabel="seconds of training, one core")
+        axes.set_ylabel("mIoU, mean of both kinds of scenes")
+        axes.grid(alpha=0.3)
+        # Below: in the picture it covers a line, wherever it stands.
+        axes.legend(fontsize=7, ncols=2, loc="upper center", bbox_to_anchor=(0.5, -0.16))
+    figure.tight_layout()
+    path.parent.mkdir(parents=True, exist_ok=True)
+    save(figure, path)
+
+
+if __name__ == "__main__":
+    try:
+        main(tyro.cli(Options))
+    except TumortrackError as error:
+        print(f"training: {error}", file=sys.stderr)
+        sys.exit(error.exit_code)
+    except KeyboardInterrupt:
+        print("training: stopped; the same command goes on.", file=sys.stderr)
+        sys.exit(130)

@@ -1,0 +1,159 @@
+"""The occupancy network as PointNet++ and occupancy networks are usually written.
+
+Single precision; farthest points by a Python loop, neighbours by sorting a whole matrix, batch
+norms apart, the latent joined to every query, everything in one piece. It reads a network's weights
+and configuration and nothing else of it, so that it is also an independent reference.
+
+Source: the forms of github.com/yanx27/Pointnet_Pointnet2_pytorch and of Mescheder et al., CVPR
+2019.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from tumortrack.models.encoders.pointnet2 import PointNet2Config
+from tumortrack.occupancy.mlp_decoder import MlpDecoderConfig, octave_features
+from tumortrack.occupancy.network import (
+    Aligned,
+    CloudBox,
+    OccupancyNetwork,
+    alignment,
+    normalisation,
+    turned,
+    without_strays,
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Encoded:
+    """Latents (B, L), and what their queries are normalised by."""
+
+    latent: Tensor
+    centre_mm: Tensor
+    scale_mm: Tensor
+    turn: Tensor | None
+
+
+class NaiveOccupancy:
+    """``encode`` clouds, ``logits`` of queries. ``training``: norms take the batch's statistics."""
+
+    def __init__(self, network: OccupancyNetwork, training: bool = False) -> None:
+        encoder, decoder = network.config.encoder, network.config.decoder
+        assert isinstance(encoder, PointNet2Config)
+        assert isinstance(decoder, MlpDecoderConfig)
+        self._encoder, self._decoder = encoder, decoder
+        self._normalisation, self._training = network.config.normalisation, training
+        self._weights = {**dict(network.named_buffers()), **dict(network.named_parameters())}
+
+    def encode(self, points_mm: Tensor) -> Encoded:
+        """Clouds (B, N, 3), mm."""
+        kind = self._normalisation
+        if not isinstance(kind, CloudBox):
+            points_mm = without_strays(points_mm, kind.reach * kind.scale_mm)
+        centre, scale = normalisation(points_mm, kind)
+        points, turn = (points_mm - centre) / scale, None
+        if isinstance(kind, Aligned):
+            turn = alignment(points)
+            points = turned(points, turn)
+        return Encoded(self._latent(points), centre, scale, turn)
+
+    def logits(self, encoded: Encoded, queries_mm: Tensor) -> Tensor:
+        """Queries (B, Q, 3), mm -> (B, Q, classes)."""
+        queries = (queries_mm - encoded.centre_mm) / encoded.scale_mm
+        if encoded.turn is not None:
+            queries = turned(queries, encoded.turn)
+        return self._decoded(encoded.latent, queries)
+
+    def _latent(self, points: Tensor) -> Tensor:
+        config = self._encoder
+        n = points.shape[1]
+        if config.n_points is not None and n > config.n_points:
+            points = points[:, torch.arange(config.n_points) * n // config.n_points]
+        features = points[..., :0]
+        for number, level in enumerate(config.levels):
+            n = points.shape[1]
+            k = math.ceil(level.ratio * n)
+            strided = (torch.arange(k) * n // k).expand(len(points), -1)
+            chosen = farthest_points(points, k) if config.sampling == "fps" else strided
+            centres = rows_of(points, chosen)
+            near = neighbours(points, centres, level.radius, level.neighbours)
+            offsets = (rows_of(points, near) - centres[:, :, None]) / level.radius
+            grouped = torch.cat([offsets, rows_of(features, near)], -1)
+            grouped = self._layer(f"encoder.levels.{number}.first", grouped)
+            for layer in range(len(level.widths) - 1):
+                grouped = self._layer(f"encoder.levels.{number}.rest.{layer}", grouped)
+            points, features = centres, grouped.max(2).values
+        out = torch.cat([points, features], -1)
+        for layer in range(len(config.widths)):
+            out = self._layer(f"encoder.summary.{layer}", out)
+        return out.max(1).values
+
+    def _decoded(self, latent: Tensor, queries: Tensor) -> Tensor:
+        """The latent beside each normalised query."""
+        config = self._decoder
+        given = octave_features(queries, config.octaves)
+        given = torch.cat([given, latent[:, None].expand(-1, given.shape[1], -1)], -1)
+        hidden = given
+        for number in range(1, config.hidden_layers + 1):
+            if number == config.skip_layer and number > 1:
+                hidden = torch.cat([hidden, given], -1)
+            hidden = self._layer(f"decoder.layers.{number - 1}", hidden)
+        return functional.linear(
+            hidden, self._weights["decoder.output.weight"], self._weights["decoder.output.bias"]
+        )
+
+    def _layer(self, name: str, x: Tensor) -> Tensor:
+        """Linear, batch norm where there is one, ReLU."""
+        weights = self._weights
+        out = functional.linear(x, weights[f"{name}.linear.weight"], weights[f"{name}.linear.bias"])
+        if f"{name}.norm.weight" in weights:
+            mean, variance, gain, shift = (
+                weights[f"{name}.norm.{key}"]
+                for key in ("running_mean", "running_var", "weight", "bias")
+            )
+            flat = functional.batch_norm(
+                out.flatten(0, -2), mean, variance, gain, shift, training=self._training
+            )
+            out = flat.view(out.shape)
+        return functional.relu(out)
+
+
+def farthest_points(points: Tensor, k: int) -> Tensor:
+    """Farthest point sampling of clouds (B, N, 3) -> (B, k), a Python loop; begun at the point
+    farthest from the middle."""
+    nearest = torch.full(points.shape[:2], torch.inf, device=points.device)
+    newest = _square(points - points.mean(1, keepdim=True)).argmax(1)
+    chosen = []
+    every = torch.arange(len(points), device=points.device)
+    for _ in range(k):
+        chosen.append(newest)
+        nearest = torch.minimum(nearest, _square(points - points[every, newest][:, None]))
+        newest = nearest.argmax(1)
+    return torch.stack(chosen, 1)
+
+
+def neighbours(points: Tensor, centres: Tensor, radius: float, k: int) -> Tensor:
+    """The first ``k`` points (B, N, 3) within ``radius`` of each centre (B, M, 3) -> (B, M, k), by
+    sorting all; the first of them again where there are fewer."""
+    n = points.shape[1]
+    index = torch.arange(n, device=points.device).repeat(*centres.shape[:2], 1)
+    index[_square(centres[:, :, None] - points[:, None]) > radius**2] = n
+    index = index.sort(-1).values[..., :k]
+    return torch.where(index == n, index[..., :1].expand_as(index), index).clamp_max(n - 1)
+
+
+def rows_of(values: Tensor, index: Tensor) -> Tensor:
+    """Rows of (B, N, C) at (B, ...) -> (B, ..., C)."""
+    every = torch.arange(len(values), device=values.device)
+    return values[every.view(-1, *([1] * (index.dim() - 1))), index]
+
+
+def _square(offsets: Tensor) -> Tensor:
+    x, y, z = offsets.unbind(-1)
+    return x * x + y * y + z * z

@@ -1,0 +1,96 @@
+"""Rows of planning a resection: the plan, and the arms' motions."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from tumortrack.core.types import Anatomy, Mesh
+from tumortrack.imaging.raster import label_grid
+from tumortrack.plan.values import Located
+from tumortrack_lab.bench.row import Row
+from tumortrack_lab.bench.turns import in_turns
+
+if TYPE_CHECKING:
+    from tumortrack_lab.bench.subject import Subject
+
+NAME, MOTIONS = "plan", "motions"
+POINTS = 40_000
+
+
+def rows(subject: Subject, threads: int, budget_s: float) -> Iterator[Row]:
+    """Both planners; motions where the arms' libraries are installed."""
+    from tumortrack.plan.config import ResectionConfig
+    from tumortrack.plan.resection import plan_resection
+    from tumortrack_lab.bench.naive import plans
+
+    seen = on_its_stand(subject.anatomy)
+    published, ours = ResectionConfig(method="published"), ResectionConfig()
+    for what, config, naive, is_what in (
+        ("published", published, plans.published, "hulls and a triangulation of all points"),
+        ("margin", ours, plans.margin, "the same, and the grown tumor on voxels of 0.5 mm"),
+    ):
+        mine, plain = in_turns(
+            lambda config=config: plan_resection(seen, config),  # type: ignore[misc]
+            lambda naive=naive: naive(seen),  # type: ignore[misc]
+            budget_s=budget_s / 3,
+        )
+        yield Row(
+            name=NAME,
+            what=f"{what}, {POINTS:,} points",
+            threads=threads,
+            item="plan",
+            ours=mine,
+            naive=plain,
+            naive_is=is_what,
+        )
+    yield from _motions(seen, threads, budget_s / 3)
+
+
+def _motions(seen: Located, threads: int, budget_s: float) -> Iterator[Row]:
+    from importlib.util import find_spec
+
+    if find_spec("pinocchio") is None:  # the extra `arms`
+        return
+    from tumortrack.plan.arms.cell import Cell
+    from tumortrack.plan.arms.config import CellConfig
+    from tumortrack.plan.arms.procedure import plan_motions
+    from tumortrack.plan.config import ResectionConfig
+    from tumortrack.plan.resection import plan_resection
+
+    organ = seen.meshes["kidney"]
+    cell, plan = Cell(CellConfig(), organ), plan_resection(seen, ResectionConfig())
+    (mine,) = in_turns(lambda: plan_motions(plan, cell, organ), budget_s=budget_s)
+    yield Row(
+        name=MOTIONS,
+        what=f"margin, {plan.sweeps} sweeps",
+        threads=threads,
+        item="plan",
+        ours=mine,
+    )
+
+
+def on_its_stand(anatomy_ct: Anatomy) -> Located:
+    """An organ with its front up: 40,000 points inside, and its surfaces."""
+    from tumortrack.plan.located import STAND_MM
+
+    turn = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])  # LPS, its front up
+    parts = [part.vertices_mm @ turn.T for part in anatomy_ct.parts]
+    middle = -(parts[0].min(0) + parts[0].max(0)) / 2
+    lift = np.array([middle[0], middle[1], STAND_MM - parts[0][:, 2].min()])
+    meshes = {
+        name: Mesh(vertices + lift, part.faces)
+        for name, vertices, part in zip(anatomy_ct.names, parts, anatomy_ct.parts, strict=True)
+    }
+    low = meshes["kidney"].box_mm[0] - 2
+    table_from_index = np.eye(4)
+    table_from_index[:3, 3] = low
+    i, j, k = (int(n) for n in np.ceil(np.ptp(meshes["kidney"].box_mm, axis=0) + 4))
+    grid = label_grid(Anatomy(tuple(meshes.values())), table_from_index, (i, j, k))
+    rng = np.random.default_rng(0)
+    cells = np.argwhere(grid > 0)
+    chosen = cells[rng.integers(len(cells), size=POINTS)]
+    points = chosen + rng.uniform(-0.5, 0.5, chosen.shape) + low
+    return Located(points, grid[tuple(chosen.T)], meshes)

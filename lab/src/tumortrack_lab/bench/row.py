@@ -1,0 +1,101 @@
+"""One line of the bench: what was done, how long it took, what it has to take at least."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import msgspec
+
+from tumortrack.core.config import Config
+from tumortrack_lab.bench.turns import Timing
+
+Precision = Literal["fp32", "bf16", "int8"]
+
+
+class Work(Config, frozen=True):
+    """What cannot be left out of one call: arithmetic, and bytes that have to be moved once."""
+
+    flops: float
+    bytes: float
+    precision: Precision = "fp32"
+
+
+class Row(Config, frozen=True):
+    """One measured part.
+
+    ``item`` is what a call makes: a pair, a frame; ``per_call``: how many of them. ``naive`` is the
+    plain form's time for the same, ``naive_is`` says what it is, ``naive_work`` its arithmetic.
+    ``agreement``: share of labels equal to the naive form's in single precision. ``others``: other
+    figures, by name (seconds, bytes, shares).
+    """
+
+    name: str
+    what: str
+    threads: int
+    item: str
+    ours: Timing
+    naive: Timing | None = None
+    naive_is: str = ""
+    work: Work | None = None
+    naive_work: Work | None = None
+    per_call: int = 1
+    agreement: float | None = None
+    others: dict[str, float] = msgspec.field(default_factory=dict)
+    note: str = ""
+    device: str = "cpu"
+
+    @property
+    def ratio(self) -> float | None:
+        """How many times faster than the naive form."""
+        return None if self.naive is None else self.naive.median_s / self.ours.median_s
+
+    @property
+    def per_s(self) -> float:
+        """Items a second."""
+        return self.per_call / self.ours.median_s
+
+
+class Peaks(Config, frozen=True):
+    """What the machine reaches with so many threads: matrix products by precision (FLOP/s; absent:
+    not offered) and memory (bytes/s)."""
+
+    threads: int
+    gemm: dict[str, float]
+    triad: float
+
+    def floor_s(self, work: Work) -> float:
+        """The least time: arithmetic at the measured rate or bytes at the measured bandwidth,
+        whichever takes longer."""
+        return max(work.flops / self.rate(work.precision), work.bytes / self.triad)
+
+    def rate(self, precision: Precision) -> float:
+        """FLOP/s of matrix products; single precision's where the other is not offered."""
+        return self.gemm.get(precision, self.gemm["fp32"])
+
+
+class Point(Config, frozen=True):
+    """A point of a curve: time of one call and the process's peak memory meanwhile."""
+
+    curve: str  # against what: queries, points, ...
+    what: str
+    size: int
+    seconds: float
+    peak_bytes: int | None
+    working_bytes: int | None = None  # of the peak, what was not held before the call
+
+
+class Bench(Config, frozen=True):
+    """All that was measured in one run, and on what."""
+
+    machine: dict[str, str]
+    command: str
+    peaks: tuple[Peaks, ...] = ()
+    rows: tuple[Row, ...] = ()
+    points: tuple[Point, ...] = ()
+
+    def find(self, name: str, what: str, threads: int) -> Row | None:
+        """The row of this name, if it was measured on the CPU."""
+        for row in self.rows:
+            if (row.name, row.what, row.threads, row.device) == (name, what, threads, "cpu"):
+                return row
+        return None

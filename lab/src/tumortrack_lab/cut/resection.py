@@ -1,0 +1,278 @@
+"""A plan made on the estimate cuts the true anatomy: what comes away, and how close it came.
+
+Nothing of the planner's own reckoning of volumes is used. The true organ is voxelised, faces
+between voxels are severed where a stroke or a level sheet passes between their centres, and what
+then still hangs together with most of the organ stays. Tissue neither moves nor gives way while
+it is cut, and nobody pulls at it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Float64, Int, UInt8
+
+from tumortrack.core.errors import InputError
+from tumortrack.core.types import ORGAN, Anatomy, Mesh
+from tumortrack.imaging.raster import label_grid
+from tumortrack.plan.values import Cut, Layer, ResectionPlan
+from tumortrack.report.metrics import _to_surface
+from tumortrack_lab.cut.severing import Flat, Mask, Severed, Voxels, pieces_of, within
+
+VOXEL_MM = 0.5
+SAMPLES_MM = 0.4  # between points of the cut's surface
+_SAME_MM = 1e-6  # of heights
+_BESIDE_MM = 0.5  # an outline this close to a stroke is cut: its chords leave it by less
+_TEARS_MM2 = 2.0  # a thinner bridge tears when the piece is lifted
+_ML = 1e-3  # of a mm3
+
+Points = Float[np.ndarray, "_ 3"]
+Box = Float64[np.ndarray, "2 3"]
+Walls = list[tuple[Cut, Layer]]
+
+
+@dataclass(frozen=True)
+class CutResult:
+    """What a cut did to the true anatomy.
+
+    Attributes:
+        tumor_ml: true volume of the tumor that was to come away.
+        removed_share: of it, what came away within the piece that the layers enclose.
+        loose_share: of it, what came off beside that piece, for a cut went through the tumor.
+        enclosed_share: of it, what lies within the layers, whether or not they came free.
+        healthy_ml: organ without tumors that has come away, within that piece or beside it.
+        piece_ml: all of that piece; 0 where it did not come free.
+        detached: whether it came free.
+        bridge_mm2: area of its outline that lies in tissue and that no stroke went along. Less
+            than 2 mm2 tears, and counts as cut.
+        margin_mm: least distance between a cut within tissue and the tumor's surface; negative:
+            this deep the cut went into the tumor. None where nothing was cut at all.
+        hurt: other tumors that were cut into.
+    """
+
+    tumor_ml: float
+    removed_share: float
+    loose_share: float
+    enclosed_share: float
+    healthy_ml: float
+    piece_ml: float
+    detached: bool
+    bridge_mm2: float
+    margin_mm: float | None
+    hurt: tuple[str, ...]
+
+    @property
+    def left_ml(self) -> float:
+        """Tumor that does not come away with the piece."""
+        return self.tumor_ml * (1 - self.removed_share)
+
+
+def cut(truth: Anatomy, plan: ResectionPlan, voxel_mm: float = VOXEL_MM) -> CutResult:
+    """Cut the true anatomy (table frame, mm) by a plan.
+
+    Cut are walls, along the strokes alone, each from the bottom to the top of the layer in which
+    its stroke lies; and level sheets, at the bottom of each layer where none goes on below.
+
+    Raises:
+        InputError: the truth lacks the plan's tumor, or a stroke lies in none of its layers.
+    """
+    if plan.tumor not in truth.names[1:]:
+        raise InputError(
+            f"the plan is for {plan.tumor}, which is not among the anatomy's parts: "
+            f"{', '.join(truth.names)}."
+        )
+    grid, walls = _grid_for(truth, plan.layers, voxel_mm), _walls_of(plan)
+    tissue, number = grid.labels > 0, truth.names.index(plan.tumor)
+    bridge_mm2 = _bridge_mm2(grid, walls, plan.layers, truth.organ.box_mm)
+    severed = _severed(grid, walls, plan.layers, torn=bridge_mm2 < _TEARS_MM2)
+    pieces = pieces_of(tissue, severed)
+    enclosed = _enclosed(grid, plan.layers) & tissue
+    largest = _largest(pieces[enclosed])
+    piece = pieces == largest if largest > 1 else np.zeros_like(tissue)
+    tumor = grid.labels == ORGAN + number
+    surface = _cut_surface(walls, plan.layers, truth.organ.box_mm)
+    found = grid.at(surface)
+    surface, found = surface[found > 0], found[found > 0]
+    voxel_ml = voxel_mm**3 * _ML
+    return CutResult(
+        tumor_ml=float(tumor.sum()) * voxel_ml,
+        removed_share=_share(piece, tumor),
+        loose_share=_share((pieces > 1) & ~piece, tumor),
+        enclosed_share=_share(enclosed, tumor),
+        healthy_ml=float(((pieces > 1) & (grid.labels == ORGAN)).sum()) * voxel_ml,
+        piece_ml=float(piece.sum()) * voxel_ml,
+        detached=largest > 1,
+        bridge_mm2=bridge_mm2,
+        margin_mm=_margin_mm(surface, found == ORGAN + number, truth.parts[number]),
+        hurt=tuple(
+            name
+            for n, name in enumerate(truth.names[1:], start=1)
+            if n != number and (found == ORGAN + n).any()
+        ),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Grid:
+    """The true anatomy in voxels: voxel (i, j, k) lies at low_mm + voxel_mm (i, j, k)."""
+
+    low_mm: Float64[np.ndarray, " 3"]
+    voxel_mm: float
+    labels: UInt8[np.ndarray, "i j k"]
+
+    def rings(self, layer: Layer) -> tuple[Flat, ...]:
+        """A layer's rings in voxels."""
+        return tuple((ring - self.low_mm[:2]) / self.voxel_mm for ring in layer.rings_mm)
+
+    def level(self, height_mm: float) -> int:
+        """The lowest level whose voxels' centres lie no lower than this."""
+        level = np.ceil((height_mm - self.low_mm[2]) / self.voxel_mm)
+        return int(np.clip(level, 0, self.labels.shape[2]))
+
+    def columns(self, layer: Layer) -> Mask:
+        """Which columns of voxels lie within a layer."""
+        return within(self.rings(layer), self.labels.shape[:2])
+
+    def at(self, points_mm: Points) -> UInt8[np.ndarray, " n"]:
+        """Labels of the nearest voxels; 0 beyond the grid."""
+        index = np.rint((points_mm - self.low_mm) / self.voxel_mm).astype(int)
+        known = ((index >= 0) & (index < self.labels.shape)).all(1)
+        out = np.zeros(len(points_mm), np.uint8)
+        out[known] = self.labels[tuple(index[known].T)]
+        return out
+
+
+def _grid_for(truth: Anatomy, layers: Sequence[Layer], voxel_mm: float) -> _Grid:
+    """Over the whole anatomy; the lowest layer's bottom lies midway between two levels, so that
+    half a voxel all over the largest sheet is no bias of the volumes."""
+    corners = np.concatenate([part.box_mm for part in truth.parts])
+    low_mm = corners.min(0) - voxel_mm
+    bottom_mm = min(layer.bottom_mm for layer in layers) + voxel_mm / 2
+    low_mm[2] = bottom_mm - voxel_mm * np.ceil((bottom_mm - low_mm[2]) / voxel_mm)
+    shape = tuple((np.ceil((corners.max(0) - low_mm) / voxel_mm) + 2).astype(int).tolist())
+    table_from_index = np.diag([voxel_mm, voxel_mm, voxel_mm, 1.0])
+    table_from_index[:3, 3] = low_mm
+    return _Grid(low_mm, voxel_mm, label_grid(truth, table_from_index, shape))
+
+
+def _walls_of(plan: ResectionPlan) -> Walls:
+    """Each stroke along an outline, with the layer whose wall it cuts."""
+    walls = []
+    for stroke in (stroke for stroke in plan.cuts if stroke.kind == "wall"):
+        height = stroke.height_mm
+        here = [
+            layer
+            for layer in plan.layers
+            if layer.bottom_mm - _SAME_MM <= height < layer.top_mm - _SAME_MM
+        ]
+        if not here:
+            raise InputError(f"a stroke at {height:g} mm lies in none of the plan's layers.")
+        walls.append((stroke, here[0]))
+    return walls
+
+
+def _below(layer: Layer, layers: Sequence[Layer]) -> list[Layer]:
+    """The layers whose top is this one's bottom."""
+    return [other for other in layers if abs(other.top_mm - layer.bottom_mm) < _SAME_MM]
+
+
+def _severed(grid: _Grid, walls: Walls, layers: Sequence[Layer], torn: bool) -> Severed:
+    """A sheet reaches one voxel further than its outlines, for the strokes' chords leave those.
+    ``torn``: what the strokes left of the outlines is severed too."""
+    from scipy.ndimage import binary_dilation, binary_erosion
+
+    severed, near = Severed(grid.labels.shape), np.ones((3, 3), bool)
+    for stroke, layer in walls:
+        path = (stroke.path_mm[:, :2] - grid.low_mm[:2]) / grid.voxel_mm
+        severed.wall(path, grid.level(layer.bottom_mm), grid.level(layer.top_mm))
+    for layer in layers:
+        for ring in grid.rings(layer) if torn else ():
+            closed = np.concatenate([ring, ring[:1]])
+            severed.wall(closed, grid.level(layer.bottom_mm), grid.level(layer.top_mm))
+        sheet = binary_dilation(grid.columns(layer), near)
+        for lower in _below(layer, layers):
+            sheet &= ~binary_erosion(grid.columns(lower), near)
+        severed.sheet(sheet, grid.level(layer.bottom_mm))
+    return severed
+
+
+def _enclosed(grid: _Grid, layers: Sequence[Layer]) -> Voxels:
+    """What lies within the layers."""
+    inside = np.zeros(grid.labels.shape, bool)
+    for layer in layers:
+        levels = slice(grid.level(layer.bottom_mm), grid.level(layer.top_mm))
+        inside[:, :, levels] |= grid.columns(layer)[:, :, None]
+    return inside
+
+
+def _cut_surface(walls: Walls, layers: Sequence[Layer], box_mm: Box) -> Points:
+    """Points all over walls and sheets, SAMPLES_MM apart."""
+    points = [_curtain(stroke.path_mm[:, :2], layer, box_mm) for stroke, layer in walls]
+    points += [_flat(layer, _below(layer, layers), layer.bottom_mm, box_mm) for layer in layers]
+    return np.concatenate(points)
+
+
+def _bridge_mm2(grid: _Grid, walls: Walls, layers: Sequence[Layer], box_mm: Box) -> float:
+    """Area within tissue of what encloses the piece and was not cut: of outlines, that no stroke
+    goes along; and where a layer is wider than the one above it, that rim."""
+    from scipy.spatial import cKDTree
+
+    held = 0
+    for layer in layers:
+        strokes = [_even(s.path_mm[:, :2]) for s, wall in walls if wall is layer]
+        for ring in layer.rings_mm:
+            points = _curtain(np.concatenate([ring, ring[:1]]), layer, box_mm)
+            points = points[grid.at(points) > 0]
+            if strokes and len(points):
+                beside = cKDTree(np.concatenate(strokes)).query(points[:, :2])[0]
+                points = points[beside > _BESIDE_MM]
+            held += len(points)
+        above = [other for other in layers if layer in _below(other, layers)]
+        if np.isfinite(layer.top_mm):
+            rim = _flat(layer, above, layer.top_mm, box_mm)
+            held += int((grid.at(rim) > 0).sum())
+    return held * SAMPLES_MM**2
+
+
+def _even(path: Flat) -> Flat:
+    """Points along a line, SAMPLES_MM apart, its end included."""
+    way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
+    at = np.append(np.arange(0, way[-1], SAMPLES_MM), way[-1])
+    return np.column_stack([np.interp(at, way, axis) for axis in path.T])
+
+
+def _curtain(path: Flat, layer: Layer, box_mm: Box) -> Points:
+    """Points on the wall over a line, from the layer's bottom to its top, within the box."""
+    low, high = max(layer.bottom_mm, box_mm[0, 2]), min(layer.top_mm, box_mm[1, 2])
+    heights, flat = np.arange(low + SAMPLES_MM / 2, high, SAMPLES_MM), _even(path)
+    return np.column_stack([np.tile(flat, (len(heights), 1)), np.repeat(heights, len(flat))])
+
+
+def _flat(layer: Layer, without: Sequence[Layer], height_mm: float, box_mm: Box) -> Points:
+    """Points level within a layer and outside others, within the box."""
+    low, high = box_mm[:, :2]
+    shape = tuple((np.ceil((high - low) / SAMPLES_MM).astype(int) + 1).tolist())
+    kept = within(tuple((ring - low) / SAMPLES_MM for ring in layer.rings_mm), shape)
+    for other in without:
+        kept &= ~within(tuple((ring - low) / SAMPLES_MM for ring in other.rings_mm), shape)
+    return np.column_stack([low + SAMPLES_MM * np.argwhere(kept), np.full(kept.sum(), height_mm)])
+
+
+def _margin_mm(surface: Points, inside: Bool[np.ndarray, " n"], tumor: Mesh) -> float | None:
+    """Signed distance of the nearest, or else the deepest, of the cut's points."""
+    if not len(surface):
+        return None
+    if inside.any():
+        return -float(_to_surface(surface[inside], tumor).max())
+    return float(_to_surface(surface, tumor).min())
+
+
+def _largest(numbers: Int[np.ndarray, " n"]) -> int:
+    """The number that occurs most often; 0 where there is none."""
+    return int(np.bincount(numbers, minlength=1).argmax())
+
+
+def _share(of: Voxels, whole: Voxels) -> float:
+    return float((of & whole).sum() / max(1, whole.sum()))

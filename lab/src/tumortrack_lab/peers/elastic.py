@@ -1,0 +1,244 @@
+"""A linear-elastic finite-element surface fit to the partial cloud.
+
+The family of methods that does best on the Sparse Data Challenge (BCF-FEM, arXiv 2403.09964): the
+organ is an elastic body, unknown forces act on its surface, and its deformed surface must pass
+through the observed points. Own formulation: the pose is
+a true rotation, the displacement relative to it a sum of the body's softest surface modes, and
+both follow from one small least-squares problem, iterated with new closest points.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float64, Int
+from scipy.linalg import cho_factor, cho_solve
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from tumortrack.core.config import Config
+from tumortrack.core.geometry import rigid, transform_points
+from tumortrack.core.types import Anatomy
+from tumortrack.simulate.scene_folder import Scene
+from tumortrack_lab.peers.base import Carry, Fit, stopwatch
+from tumortrack_lab.peers.elastic_body import ElasticBody, elastic_body
+from tumortrack_lab.peers.rigid import CROP_PERCENT, PoseSearch, RigidConfig
+from tumortrack_lab.peers.surface import SurfacePoints, seen_from
+from tumortrack_lab.tets import tetrahedralise
+
+# Of the diagonal: the mesh may cut corners by 1 mm, for the organ's own surface rides on it.
+_ENVELOPE = 7e-3
+_STEP_MM = 1.0  # along the surface, for the normals of the deformed one
+_BESIDE_MM = 2.0  # spacing: partners lie this far apart along the surface
+_SEEN_POINTS = 500  # of the visible surface that look for their place in the cloud
+_SETTLED_MM = 0.05  # a step smaller than this ends the iteration
+_FREE = 1e-6  # the pose's precision: as good as none
+
+
+class ElasticConfig(Config, frozen=True):
+    """Settings of the elastic fit.
+
+    The weight of strain energy against data is not tuned but stated in mm: among the
+    displacements that the energy makes likely (Gaussian, variance inverse to stiffness) the root
+    mean square over the surface is ``displacement_mm``; a point lies ``noise_mm`` off the
+    surface. Points far off, by more than ``outlier_mm`` at the end, do not count (Tukey).
+    """
+
+    rigid: RigidConfig = RigidConfig()
+    starts: int = 4  # the best rigid poses, each fitted
+    edge_mm: float = 12.0
+    poisson: float = 0.47
+    modes: int = 100
+    displacement_mm: float = 3.0
+    noise_mm: float = 1.5
+    outlier_mm: float = 5.0
+    first_outlier_mm: float = 15.0
+    iterations: int = 30
+
+
+@dataclass(frozen=True, eq=False)
+class _State:
+    """Where the body lies and how it is deformed: camera = pose (ct + modes @ amplitudes)."""
+
+    camera_from_ct: Float64[np.ndarray, "4 4"]
+    amplitudes: Float64[np.ndarray, " modes"]
+
+
+@dataclass(frozen=True, eq=False)
+class _Pairs:
+    """Each cloud point's equation: how its distance along the surface normal follows from a small
+    turn, shift and change of amplitudes (``rows``), the distance now, whether it counts (1) or is
+    an outlier (0), and how much it would."""
+
+    rows: Float64[np.ndarray, "n unknowns"]
+    residual_mm: Float64[np.ndarray, " n"]
+    weight: Float64[np.ndarray, " n"]
+    share: Float64[np.ndarray, " n"]
+
+
+class Elastic:
+    """The elastic surface fit as a peer."""
+
+    name = "elastic"
+
+    def __init__(
+        self,
+        anatomy_ct: Anatomy,
+        up_lps: tuple[float, float, float],
+        config: ElasticConfig | None = None,
+    ) -> None:
+        self.config = config or ElasticConfig()
+        with stopwatch() as watch:
+            self._search = PoseSearch(anatomy_ct, up_lps, self.config.rigid)
+            mesh = tetrahedralise(anatomy_ct.organ, self.config.edge_mm, _ENVELOPE)
+            self.body = elastic_body(mesh, self.config.poisson, self.config.modes)
+            self._surface = RidingSurface(self.body, self._search)
+            variance = self.config.displacement_mm**2 * self.body.area_mm2
+            self._precision = self.body.stiffness * (1 / self.body.stiffness).sum() / variance
+        self.prepare_s = watch.seconds
+
+    def fit(self, scene: Scene) -> Fit:
+        """The best of the elastic fits from the best rigid poses.
+
+        Raises:
+            NoEstimate: fewer than 20 points.
+        """
+        points = scene.cloud.points_mm.astype(float)
+        with stopwatch() as watch:
+            poses = self._search.poses(scene.cloud)[: self.config.starts]
+            fits = [self._from(pose.camera_from_ct, points) for pose in poses]
+            costs = [self._cost(state, points) for state, _ in fits]
+            best = int(np.argmin([cost for cost, _ in costs]))
+        state, iterations = fits[best]
+        report = {
+            "start": poses[best].start,
+            "iterations": iterations,
+            "cost": costs[best][0],
+            "residual_mm": costs[best][1],
+            "displacement_mm": self._surface_rms(state.amplitudes),
+        }
+        return Fit(self._carry(state), watch.seconds, report)
+
+    def _carry(self, state: _State) -> Carry:
+        def carry(points_ct: np.ndarray) -> np.ndarray:
+            moved = points_ct + self.body.displacement(points_ct, state.amplitudes)
+            return transform_points(state.camera_from_ct, moved)
+
+        return carry
+
+    def _from(
+        self, camera_from_ct: Float64[np.ndarray, "4 4"], points: Float64[np.ndarray, "n 3"]
+    ) -> tuple[_State, int]:
+        """Fit from one pose; the points' reach shrinks while the body finds its place."""
+        config = self.config
+        state = _State(camera_from_ct, np.zeros(len(self._precision)))
+        reach = np.geomspace(config.first_outlier_mm, config.outlier_mm, config.iterations // 2)
+        for iteration in range(config.iterations):
+            last = iteration >= len(reach)
+            outlier_mm = config.outlier_mm if last else float(reach[iteration])
+            step = self._step(self._pairs(state, points, outlier_mm), state.amplitudes)
+            state = self._moved(state, step)
+            if last and self._surface_rms(step[6:]) + np.linalg.norm(step[3:6]) < _SETTLED_MM:
+                break
+        return state, iteration + 1
+
+    def _pairs(
+        self, state: _State, points: Float64[np.ndarray, "n 3"], outlier_mm: float
+    ) -> _Pairs:
+        """Cloud points and the surface points nearest to them; then the other way round, for the
+        surface that the camera should see: the cloud's rim says where the organ ends."""
+        ct_from_camera = np.linalg.inv(state.camera_from_ct)
+        placed, eye_ct = transform_points(ct_from_camera, points), ct_from_camera[:3, 3]
+        shape = self._surface.shape(state.amplitudes)
+        toward = np.flatnonzero(shape.faces(eye_ct))
+        index = toward[cKDTree(shape.points_mm[toward]).query(placed)[1]]
+        deepest = np.percentile(points[:, 2], CROP_PERCENT)
+        seen = self._surface.seen(shape, state.camera_from_ct, deepest)
+        nearest = cKDTree(placed).query(shape.points_mm[seen])[1]
+        index = np.concatenate([index, seen])
+        partner = np.concatenate([placed, placed[nearest]])
+        apart, normal = partner - shape.points_mm[index], shape.normals[index]
+        residual = np.einsum("ij,ij->i", normal, apart)
+        # Partners beside the surface's end have no place on it: their distance counts too.
+        off = np.maximum(np.abs(residual), np.linalg.norm(apart, axis=1) - _BESIDE_MM)
+        weight = (1 - np.minimum(off / outlier_mm, 1) ** 2) ** 2
+        share = np.concatenate(
+            [np.ones(len(placed)), np.full(len(seen), len(placed) / max(len(seen), 1))]
+        )
+        turn = np.cross(shape.points_mm[index] - self._surface.middle, normal)
+        bend = np.einsum("ij,ijk->ik", normal, self._surface.modes[index])
+        rows = np.concatenate([turn, normal, bend], axis=1)
+        return _Pairs(rows, residual, weight, share)
+
+    def _step(
+        self, pairs: _Pairs, amplitudes: Float64[np.ndarray, " modes"]
+    ) -> Float64[np.ndarray, " unknowns"]:
+        """Gauss-Newton: turn and shift (in the CT frame, about the middle), then amplitudes."""
+        precision = np.concatenate([np.full(6, _FREE), self._precision])
+        pull = np.concatenate([np.zeros(6), self._precision * amplitudes])
+        scaled = pairs.rows * (pairs.weight * pairs.share / self.config.noise_mm**2)[:, None]
+        system = scaled.T @ pairs.rows + np.diag(precision)
+        return cho_solve(cho_factor(system), scaled.T @ pairs.residual_mm - pull)
+
+    def _moved(self, state: _State, step: Float64[np.ndarray, " unknowns"]) -> _State:
+        rotation = Rotation.from_rotvec(step[:3]).as_matrix()
+        middle = self._surface.middle
+        turned = rigid(rotation, middle + step[3:6] - rotation @ middle)
+        return _State(state.camera_from_ct @ turned, state.amplitudes + step[6:])
+
+    def _cost(self, state: _State, points: Float64[np.ndarray, "n 3"]) -> tuple[float, float]:
+        """What the starts are compared by (data, Tukey's, and strain energy), and the root mean
+        square distance of the points that count, mm."""
+        pairs = self._pairs(state, points, self.config.outlier_mm)
+        data = (self.config.outlier_mm / self.config.noise_mm) ** 2 / 6
+        cost = data * (pairs.share @ (1 - pairs.weight**1.5))
+        cost += self._precision @ state.amplitudes**2 / 2
+        kept = pairs.weight > 0
+        residual = np.sqrt((pairs.residual_mm[kept] ** 2).mean()) if kept.any() else np.inf
+        return float(cost), float(residual)
+
+    def _surface_rms(self, amplitudes: Float64[np.ndarray, " modes"]) -> float:
+        return float(np.sqrt(amplitudes @ amplitudes / self.body.area_mm2))
+
+
+class RidingSurface:
+    """Points of the organ's fine surface that ride on the body's modes, with their normals."""
+
+    def __init__(self, body: ElasticBody, search: PoseSearch) -> None:
+        rest = search.surface
+        self._rest, self._visibility = rest, search.visibility
+        self.middle = rest.points_mm.mean(0)
+        self.modes = body.modes_at(rest.points_mm)
+        # Two short steps along the surface show how its normal turns with the modes.
+        helper = np.eye(3)[np.abs(rest.normals).argmin(1)]
+        first = np.cross(rest.normals, helper)
+        first /= np.linalg.norm(first, axis=1, keepdims=True)
+        self._tangents = (first, np.cross(rest.normals, first))
+        self._slopes = tuple(
+            (body.modes_at(rest.points_mm + _STEP_MM * along) - self.modes) / _STEP_MM
+            for along in self._tangents
+        )
+
+    def shape(self, amplitudes: Float64[np.ndarray, " modes"]) -> SurfacePoints:
+        """The deformed surface, CT frame."""
+        first, second = (
+            along + slope @ amplitudes
+            for along, slope in zip(self._tangents, self._slopes, strict=True)
+        )
+        normal = np.cross(first, second)
+        normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+        return SurfacePoints(self._rest.points_mm + self.modes @ amplitudes, normal)
+
+    def seen(
+        self, shape: SurfacePoints, camera_from_ct: Float64[np.ndarray, "4 4"], deepest_mm: float
+    ) -> Int[np.ndarray, " m"]:
+        """Some of the points that the camera should see above a depth, evenly spread.
+
+        Hidden is what the undeformed organ hides; which way it turns, the deformed one says.
+        """
+        seen = seen_from(self._visibility, self._rest, camera_from_ct)
+        seen &= shape.faces(np.linalg.inv(camera_from_ct)[:3, 3])
+        axis = camera_from_ct[2]
+        index = np.flatnonzero(seen & (shape.points_mm @ axis[:3] + axis[3] < deepest_mm))
+        return index[:: max(1, len(index) // _SEEN_POINTS)]

@@ -1,0 +1,199 @@
+"""What an estimate can reach at best: our elastic body laid on the truth's own correspondences.
+
+No method that anyone could use: the truth says where each known point of the organ is now. With
+the visible surface known, what is left is what a surface cannot say of the inside; with all
+surfaces known, what is left is what the body's modes cannot represent.
+"""
+
+from __future__ import annotations
+
+import ast
+import hashlib
+from dataclasses import dataclass, field, replace
+from functools import cache, cached_property
+from pathlib import Path
+from typing import Literal, get_args
+
+import numpy as np
+from jaxtyping import Bool, Float, Float64
+from scipy.spatial.transform import Rotation
+
+import tumortrack
+from tumortrack.core.config import Config, to_builtins
+from tumortrack.core.errors import InputError, NoEstimate
+from tumortrack.core.motion import OneWay
+from tumortrack.core.types import Anatomy, Mesh
+from tumortrack.sense.camera import project
+from tumortrack.sense.render import Visibility
+from tumortrack.simulate.elastic.body import Body, BodyConfig, build_body
+from tumortrack.simulate.scene_folder import Scene
+from tumortrack_lab.peers.base import Fit, estimate_of, stopwatch
+from tumortrack_lab.peers.rigid_bound import kabsch, matched_vertices
+from tumortrack_lab.study.measure import StudyCase
+from tumortrack_lab.study.methods import Answer, Method
+
+BoundName = Literal["visible_bound", "basis_bound"]
+BOUNDS: tuple[BoundName, ...] = get_args(BoundName)
+_FEWEST = 10  # known points
+
+
+class BoundConfig(Config, frozen=True):
+    """``sigma_mm``: of a known point, for modes cannot follow exactly; ``n_effective``: independent
+    points that the known ones are worth, against the library of states as prior. Both as in
+    ``registration.gauss_newton``: on the phantom 0.3 mm or 2,000 points double the inner error."""
+
+    body: BodyConfig = BodyConfig()
+    seed: int = 0  # of the body
+    sigma_mm: float = 1.0
+    n_effective: float = 300.0
+    steps: int = 12
+
+
+@dataclass(frozen=True, eq=False)
+class Placed:
+    """An organ's pose and elastic state: x -> rotation (flow(x) - center_ct) + centre_mm."""
+
+    body: Body
+    rotation: Float64[np.ndarray, "3 3"]
+    centre_mm: Float64[np.ndarray, " 3"]
+    coefficients: Float64[np.ndarray, " m"]
+
+    def carry(self, points_ct: Float[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 3"]:
+        """CT (LPS, mm) -> camera frame (mm)."""
+        offset = self.body.carry(self.coefficients, points_ct).astype(float) - self.body.center_ct
+        return offset @ self.rotation.T + self.centre_mm
+
+
+@dataclass(frozen=True, eq=False)
+class Bound(Method):
+    """``visible_bound`` knows where every visible vertex of the organ is; ``basis_bound`` where
+    every vertex of every part is."""
+
+    name: BoundName
+    case: StudyCase
+    config: BoundConfig = field(default_factory=BoundConfig)
+    device: str = "cpu"
+
+    @cached_property
+    def identity(self) -> dict:
+        return {
+            "kind": "bound",
+            "name": self.name,
+            "settings": to_builtins(self.config),
+            "code_sha256": _code_sha256(),
+            "tumortrack": tumortrack.__version__,
+        }
+
+    @property
+    def prepare_s(self) -> float | None:
+        return _body_of(self.case, self.config)[1]
+
+    @property
+    def about(self) -> dict:
+        return {"prepare_s": self.prepare_s}
+
+    def locate(self, scene: Scene, grid: int) -> Answer:
+        """See ``Method.locate``.
+
+        Raises:
+            InputError: the scene's surfaces have other triangles than the case's.
+            NoEstimate: hardly anything of the organ is in the picture.
+        """
+        body, _ = _body_of(self.case, self.config)
+        rest = self.case.anatomy_ct
+        with stopwatch() as watch:
+            known_ct, known_mm = self._known(rest, scene)
+            placed = laid_on(body, known_ct, known_mm, self.config)
+        left_mm = np.linalg.norm(placed.carry(known_ct) - known_mm, axis=1)
+        report = {"start": "truth", "residual_mm": float(np.sqrt(np.mean(left_mm**2)))}
+        fit = Fit(placed.carry, watch.seconds, report)
+        estimate = estimate_of(fit, rest, scene.cloud.stamp_ns, grid)
+        return Answer(replace(estimate, motion=OneWay(fit.carry)), fit.seconds)
+
+    def _known(self, rest: Anatomy, scene: Scene) -> tuple[np.ndarray, np.ndarray]:
+        if len(rest.parts) != len(scene.reference.parts):
+            raise InputError("the scene has other parts than the case; make its scenes again.")
+        pairs = list(zip(rest.parts, scene.reference.parts, strict=True))
+        if self.name == "visible_bound":
+            now_mm = matched_vertices(*pairs[0])
+            seen = seen_vertices(pairs[0][0].moved(now_mm), scene)
+            if seen.sum() < _FEWEST:
+                raise NoEstimate("hardly any vertex of the organ is in the picture.")
+            return pairs[0][0].vertices_mm[seen], now_mm[seen]
+        known_mm = [matched_vertices(before, now) for before, now in pairs]
+        return np.concatenate([part.vertices_mm for part in rest.parts]), np.concatenate(known_mm)
+
+
+def seen_vertices(organ_camera: Mesh, scene: Scene) -> Bool[np.ndarray, " v"]:
+    """Which vertices the camera sees: nothing of the organ lies before them, and where the scene
+    has a picture they lie in it. Sensor faults and foreign things hide nothing here."""
+    points = organ_camera.vertices_mm
+    seen = Visibility(organ_camera)(points, np.zeros(3))
+    if scene.depth is not None:
+        intrinsics = scene.depth.intrinsics
+        pixels, depth = project(points, intrinsics)
+        size = np.array([intrinsics.width, intrinsics.height])
+        seen &= ((pixels > -0.5) & (pixels < size - 0.5)).all(1) & (depth > 0)
+    return seen
+
+
+def laid_on(
+    body: Body,
+    known_ct: Float[np.ndarray, "n 3"],
+    known_mm: Float[np.ndarray, "n 3"],
+    config: BoundConfig,
+) -> Placed:
+    """The pose and state that carry known points of the CT to their places most likely, by
+    Gauss-Newton from the best rigid pose and the library's mean.
+
+    As ``registration.gauss_newton``, but of points whose partners are known: residuals are vectors,
+    and the pose needs no prior.
+    """
+    modes = len(body.mean)
+    pose = kabsch(known_ct, known_mm, np.ones(len(known_ct)))
+    rotation = pose[:3, :3]
+    centre = rotation @ body.center_ct + pose[:3, 3]
+    coefficients = body.mean.copy()
+    precision = np.zeros((6 + modes, 6 + modes))
+    precision[6:, 6:] = np.linalg.inv(body.covariance)
+    weight = min(config.n_effective / len(known_ct), 1.0) / config.sigma_mm**2
+    for _ in range(config.steps):
+        offset = body.carry(coefficients, known_ct).astype(float) - body.center_ct
+        error = (offset - (known_mm - centre) @ rotation).reshape(-1)  # in the CT's axes
+        halfway = body.carry(0.5 * coefficients, known_ct)
+        rows = np.empty((len(known_ct), 3, 6 + modes))
+        rows[:, :, :3] = np.eye(3)
+        rows[:, :, 3:6] = -_crosses(offset)
+        rows[:, :, 6:] = body.modes_at(halfway)
+        flat = rows.reshape(-1, 6 + modes)
+        off = np.concatenate([np.zeros(6), coefficients - body.mean])
+        curvature = weight * flat.T @ flat + precision
+        change = -np.linalg.solve(curvature, weight * flat.T @ error + precision @ off)
+        centre = centre + rotation @ change[:3]
+        rotation = rotation @ Rotation.from_rotvec(change[3:6]).as_matrix()
+        coefficients = coefficients + change[6:]
+    return Placed(body, rotation, centre, coefficients)
+
+
+def _crosses(vectors: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 3 3"]:
+    """Matrices that take a vector x to ``vector x x``."""
+    return np.stack([np.cross(vectors, axis) for axis in np.eye(3)], axis=2)
+
+
+@cache
+def _body_of(case: StudyCase, config: BoundConfig) -> tuple[Body, float]:
+    """The case's elastic body, and the seconds that it took; one for both bounds."""
+    with stopwatch() as watch:
+        body = build_body(case.anatomy_ct, case.up_lps, config.body, config.seed)
+    return body, watch.seconds
+
+
+@cache
+def _code_sha256() -> str:
+    """Of what decides the answers, without comments: this file and the elastic body's."""
+    study = Path(__file__)
+    bodies = study.parents[2] / "simulate" / "elastic"
+    digest = hashlib.sha256()
+    for path in (study, *sorted(bodies.glob("*.py"))):
+        digest.update(ast.dump(ast.parse(path.read_text(encoding="utf-8"))).encode())
+    return digest.hexdigest()

@@ -1,0 +1,85 @@
+"""The paper's own figures, to print beside ours, and which tumor of a case they belong to.
+
+Source: the paper, section "Localization Accuracy" and table "compare_deformations". Its full
+table of results is not in the text, so only what the text says is here; a sign before a number
+is the text's "approximately", "less than or equal to" and "less than".
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from tumortrack.core.types import Anatomy
+from tumortrack.report.metrics import _to_surface, surface_samples
+
+Kind = Literal["exophytic", "endophytic"]
+
+# mIoU of training configuration 1..6, on the paper's second phantom.
+CONFIGURATION_MIOU = {1: 0.70, 2: 0.65, 3: 0.71, 4: 0.71, 5: 0.68, 6: 0.66}
+
+
+@dataclass(frozen=True)
+class Said:
+    """A figure of the paper with its sign: ``""``, ``"~"``, ``"<="`` or ``"<"``."""
+
+    sign: str
+    value_mm: float
+
+    @property
+    def text(self) -> str:
+        signs = {"": "", "~": "≈ ", "<=": "≤ ", "<": "< "}
+        return f"{signs[self.sign]}{self.value_mm:g}"
+
+
+def hausdorff(variant: str, model: str, kind: Kind) -> Said | None:
+    """The paper's tumor distance (estimate to reference), mm, where the text gives one."""
+    first = kind == "exophytic"
+    if variant == "D1":
+        return Said("~", 4.0 if first else 7.0)
+    if variant == "D2":
+        return Said("~", 6.0 if first else 9.0)
+    if variant == "D3" and model == "M_lim":
+        return Said("", 11.3 if first else 12.9)
+    if variant == "D3" and model == "M_full":
+        return Said("", 15.4 if first else 18.5)
+    if variant.startswith("Rot") and model == "M_full":
+        return Said("<=", 13.4)
+    return None
+
+
+def center(variant: str, model: str) -> Said | None:
+    """The paper's bound on the distance of the tumors' centres, mm."""
+    told = variant in ("D1", "D2", "D3") or variant.startswith("Rot")
+    return Said("<", 10.0) if told and (variant, model) != ("D3", "M_full") else None
+
+
+EXPOSED_MM = 0.5  # a tumor's surface this close to the organ's is the organ's surface
+EXOPHYTIC_SHARE = 0.05
+
+
+@dataclass(frozen=True)
+class Lie:
+    """How a tumor lies in the organ: the share of its surface that is the organ's own surface
+    (within 0.5 mm), and the least parenchyma above it, mm. It counts as exophytic from a
+    share of 5 %."""
+
+    exposed_share: float
+    cover_mm: float
+
+    @property
+    def kind(self) -> Kind:
+        return "exophytic" if self.exposed_share >= EXOPHYTIC_SHARE else "endophytic"
+
+
+def tumor_lies(anatomy: Anatomy) -> dict[str, Lie]:
+    """By part name; any frame."""
+    lies = {}
+    for name, tumor in zip(anatomy.names[1:], anatomy.tumors, strict=True):
+        points, area, _ = surface_samples(tumor)
+        distance = _to_surface(points, anatomy.organ)
+        share = float(area[distance < EXPOSED_MM].sum() / area.sum())
+        lies[name] = Lie(share, float(np.min(distance)))
+    return lies

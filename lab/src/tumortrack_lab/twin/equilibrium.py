@@ -1,0 +1,185 @@
+"""Where a loaded solid comes to rest: the minimum of its energy among obstacles.
+
+Quasi-Newton (L-BFGS) on top of the factorised rest stiffness (Liu, Bouaziz and Kavan 2017, doi
+10.1145/2990496), with the contact stiffness of the start: a few dozen iterations a load step.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+from jaxtyping import Float64
+
+from tumortrack.core.errors import TumortrackError
+from tumortrack_lab.twin.contact import Contact, Obstacle
+from tumortrack_lab.twin.solid import Solid
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_matrix
+
+TOLERANCE = 1e-3  # largest unbalanced force (2-norm over nodes), share of the load
+_LEAST_LOAD_MN = 1.0  # a tenth of a gram: less is no load
+_ITERATIONS = 1500
+_REFRESH_AFTER = 60  # iterations: by then other points touch than when it was factorised
+_MEMORY = 10
+_LONGEST_MM, _SHORTEST_MM = 2.0, 1e-9  # step of any node
+
+Nodes = Float64[np.ndarray, "n 3"]
+
+
+@dataclass(frozen=True, eq=False)
+class Hold:
+    """Keeps the body from sliding sideways and from rolling, without deforming it.
+
+    The mean sideways displacement and the mean rotation are held by stiff springs whose forces
+    are spread over the whole mass as a rigid motion is (inertia relief): packing in the operating
+    room, the phantom's bed in the laboratory. Without it an organ rolls to its next stable side.
+    """
+
+    rest_mm: Nodes
+    share: Float64[np.ndarray, " n"]  # of the volume at each node
+    stiffness_mn_mm: float = 2e4
+
+    @cached_property
+    def _modes(self) -> Float64[np.ndarray, "5 n 3"]:
+        arm = self.rest_mm - self.share @ self.rest_mm
+        arm /= np.sqrt(self.share @ (arm**2).sum(1))  # rotations in mm at the radius of gyration
+        slides = np.tile(np.eye(3)[:2, None], (1, len(arm), 1))
+        turns = np.stack([np.cross(axis, arm) for axis in np.eye(3)])
+        return np.concatenate([slides, turns]) * self.share[:, None]
+
+    def energy(self, nodes_mm: Nodes) -> tuple[float, Nodes]:
+        amounts = np.einsum("mni,ni->m", self._modes, nodes_mm - self.rest_mm)
+        gradient = self.stiffness_mn_mm * np.einsum("m,mni->ni", amounts, self._modes)
+        return self.stiffness_mn_mm * float(amounts @ amounts) / 2, gradient
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """A solid among obstacles under its weight. Units: mm, kPa, mN, uJ.
+
+    ``contacts``: surfaces (of a stiffness each) and the obstacles that push them back.
+    """
+
+    solid: Solid
+    contacts: tuple[tuple[Contact, tuple[Obstacle, ...]], ...]
+    weight_mn: Float64[np.ndarray, " n"]  # along -z
+    hold: Hold | None = None
+
+    def energy(self, nodes_mm: Nodes) -> tuple[float, Nodes]:
+        """Potential energy and its gradient."""
+        energy, gradient = self.solid.energy(nodes_mm)
+        if not np.isfinite(energy):
+            return energy, gradient
+        energy += float(self.weight_mn @ (nodes_mm - self.solid.mesh.nodes_mm)[:, 2])
+        gradient[:, 2] += self.weight_mn
+        terms = [contact.energy(nodes_mm, obstacles) for contact, obstacles in self.contacts]
+        if self.hold is not None:
+            terms.append(self.hold.energy(nodes_mm))
+        for more, slope in terms:
+            energy += more
+            gradient += slope
+        return energy, gradient
+
+    def load_mn(self, nodes_mm: Nodes) -> float:
+        """What unbalanced forces are measured against: weight and contact forces, summed."""
+        pushes = [c.load_mn(nodes_mm, obstacle) for c, some in self.contacts for obstacle in some]
+        return float(self.weight_mn.sum() + sum(np.linalg.norm(push) for push in pushes))
+
+
+@dataclass(frozen=True)
+class Convergence:
+    iterations: int
+    evaluations: int
+    residual: float  # unbalanced force / load
+
+
+def settle(
+    problem: Problem, start_mm: Nodes, rest_stiffness: csr_matrix
+) -> tuple[Nodes, Convergence]:
+    """Nodes at rest, from a start in which no element is turned over.
+
+    Raises:
+        TumortrackError: no equilibrium within 1,500 iterations.
+    """
+    nodes, evaluations = start_mm, 0
+    energy, gradient = problem.energy(nodes)
+    precondition = _factorised(problem, nodes, rest_stiffness)
+    pairs: deque[tuple[np.ndarray, np.ndarray]] = deque(maxlen=_MEMORY)
+    for iteration in range(_ITERATIONS):
+        residual = float(np.linalg.norm(gradient)) / max(problem.load_mn(nodes), _LEAST_LOAD_MN)
+        if residual < TOLERANCE:
+            return nodes, Convergence(iteration, evaluations, residual)
+        if iteration and iteration % _REFRESH_AFTER == 0:
+            precondition = _factorised(problem, nodes, rest_stiffness)
+            pairs.clear()
+        step = -_two_loop(gradient.ravel(), pairs, precondition).reshape(-1, 3)
+        slope = float((gradient * step).sum())
+        longest = float(np.abs(step).max())
+        share = min(1.0, _LONGEST_MM / longest)
+        while True:
+            evaluations += 1
+            trial = nodes + share * step
+            trial_energy, trial_gradient = problem.energy(trial)
+            # Near the minimum differences of energy drown in rounding: 1e-12 of it is let pass.
+            if trial_energy <= energy + 1e-4 * share * slope + 1e-12 * abs(energy):
+                break
+            share /= 2
+            if share * longest < _SHORTEST_MM:
+                raise TumortrackError(_stuck(iteration, residual))
+        moved, turned = (share * step).ravel(), (trial_gradient - gradient).ravel()
+        if moved @ turned > 1e-10 * np.linalg.norm(moved) * np.linalg.norm(turned):
+            pairs.append((moved, turned))
+        nodes, energy, gradient = trial, trial_energy, trial_gradient
+    raise TumortrackError(_stuck(_ITERATIONS, residual))
+
+
+def _two_loop(
+    gradient: np.ndarray,
+    pairs: deque[tuple[np.ndarray, np.ndarray]],
+    precondition: Callable[[np.ndarray], np.ndarray],
+) -> np.ndarray:
+    """Inverse Hessian times gradient (Nocedal and Wright, Numerical Optimization, alg. 7.4)."""
+    out = gradient.copy()
+    amounts = []
+    for moved, turned in reversed(pairs):
+        amounts.append((moved @ out) / (moved @ turned))
+        out -= amounts[-1] * turned
+    out = precondition(out)
+    for (moved, turned), amount in zip(pairs, reversed(amounts), strict=True):
+        out += (amount - (turned @ out) / (moved @ turned)) * moved
+    return out
+
+
+def _factorised(
+    problem: Problem, nodes: Nodes, rest_stiffness: csr_matrix
+) -> Callable[[np.ndarray], np.ndarray]:
+    """Solves with the rest stiffness and the contacts as they are now."""
+    from scipy.sparse import eye
+    from scipy.sparse.linalg import splu
+
+    # A little on the diagonal stands for the hold: it alone has no motion free of force.
+    ground = 1e-3 * rest_stiffness.diagonal().mean()
+    matrix = rest_stiffness
+    for contact, obstacles in problem.contacts:
+        matrix = matrix + contact.stiffness(nodes, obstacles)
+    factors = splu(
+        (matrix + ground * eye(matrix.shape[0])).tocsc(),
+        permc_spec="MMD_AT_PLUS_A",
+        diag_pivot_thresh=0.0,
+        options={"SymmetricMode": True},
+    )
+    return factors.solve
+
+
+def _stuck(iteration: int, residual: float) -> str:
+    return (
+        f"the finite-element solver found no equilibrium: after {iteration} iterations "
+        f"{residual:.1e} of the load is unbalanced (wanted: {TOLERANCE:g}). Load in smaller steps, "
+        "or take a finer mesh."
+    )

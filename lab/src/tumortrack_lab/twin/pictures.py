@@ -1,0 +1,218 @@
+"""One picture per scene of the twin: what the camera gets, and what stands on the bench."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from tumortrack.core.types import Mesh
+from tumortrack.report.drawing import (
+    KIDNEY,
+    OBSERVED,
+    TRUE,
+    blank,
+    new_figure,
+    save,
+    scale_bar,
+)
+from tumortrack.report.shade import (
+    Frame,
+    Layer,
+    View,
+    frame_around,
+    pixel_centres,
+    shade,
+    silhouette,
+    widened,
+)
+from tumortrack.sense.camera import project
+from tumortrack.simulate.scene_folder import Scene
+from tumortrack_lab.twin.variants import Settled
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+FROM_CAMERA = View("seen from the camera", (1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
+FROM_FRONT = View("bench from the front", (1.0, 0.0, 0.0), (0.0, 0.0, -1.0))
+FROM_END = View("bench from its end", (0.0, 1.0, 0.0), (0.0, 0.0, -1.0))
+_STEEL = (0.62, 0.65, 0.7)
+_REST = "0.35"
+_AROUND_MM = 14.0  # of the organ: background beside it shows, points far off do not
+_ROD_SHOWN_MM = 45.0
+_PLATE_SHOWN_MM = 9.0
+
+
+def twin_picture(scene: Scene, settled: Settled, rest_organ: Mesh, path: Path) -> None:
+    """Depth image, cloud over truth, and two side views of the bench.
+
+    Args:
+        scene: with its depth image, camera frame.
+        settled: the state on the bench, bench frame.
+        rest_organ: the undeformed organ on the bench, for its outline.
+        path: PNG to write, atomically.
+    """
+    figure = new_figure(14.0, 9.6)
+    figure.subplots_adjust(left=0.02, right=0.985, top=0.875, bottom=0.03)
+    grid = figure.add_gridspec(2, 2, hspace=0.13, wspace=0.05)
+    _depth_view(figure.add_subplot(grid[0, 0]), scene)
+    _cloud_view(figure.add_subplot(grid[0, 1]), scene)
+    for column, view in enumerate((FROM_FRONT, FROM_END)):
+        axes = figure.add_subplot(grid[1, column])
+        _bench_view(axes, settled, rest_organ, view)
+        _apparatus(axes, {**scene.meta["bench_config"], **settled.report}, view)
+    figure.suptitle(
+        f"{scene.meta['variant']}, {scene.meta['view']}: {_what(scene)}",
+        x=0.02, y=0.985, ha="left", fontsize=13, fontweight="bold",
+    )  # fmt: skip
+    figure.text(0.02, 0.945, _numbers(scene, settled), ha="left", va="top", fontsize=10)
+    figure.legend(
+        handles=_legend(),
+        loc="upper right",
+        ncols=5,
+        fontsize=9.5,
+        frameon=False,
+        bbox_to_anchor=(0.99, 1.0),
+    )
+    save(figure, path)
+
+
+def _depth_view(axes: Axes, scene: Scene) -> None:
+    """The depth image as the sensor gave it, with the true tumors' outlines."""
+    from matplotlib import colormaps
+
+    assert scene.depth is not None
+    depth_mm = scene.depth.depth_mm
+    near, far = scene.meta["crop_mm"]
+    kept = np.where((depth_mm > near) & (depth_mm < far), depth_mm, np.nan)
+    colors = colormaps["viridis_r"].with_extremes(bad="white")
+    picture = axes.imshow(kept, cmap=colors, interpolation="nearest")
+    height, width = depth_mm.shape
+    for tumor in scene.reference.tumors:
+        pixels, _ = project(tumor.vertices_mm, scene.depth.intrinsics)
+        flat = Mesh(np.column_stack([pixels, np.zeros(len(pixels))]), tumor.faces)
+        frame = Frame(-0.5, width - 0.5, -0.5, height - 0.5)
+        mask = silhouette(flat, FROM_CAMERA, frame, 2.0)
+        x, y = np.meshgrid(*pixel_centres(frame, 2.0))
+        for color, line in (("white", 3.2), (TRUE, 1.4)):  # a halo: seen on any depth
+            axes.contour(x, y, mask, levels=[0.5], colors=[color], linewidths=line)
+    axes.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), xticks=[], yticks=[])
+    for spine in axes.spines.values():
+        spine.set_color("0.8")
+    bar = axes.figure.colorbar(picture, ax=axes, fraction=0.026, pad=0.015)
+    bar.set_label("depth, mm", fontsize=9)
+    bar.ax.invert_yaxis()
+    bar.ax.tick_params(labelsize=8)
+    axes.set_title(
+        f"depth image, {width} x {height}, cropped to {near:g} .. {far:g} mm", fontsize=11
+    )
+
+
+def _cloud_view(axes: Axes, scene: Scene) -> None:
+    points_mm = scene.cloud.points_mm.astype(float)
+    frame = widened(frame_around(FROM_CAMERA, scene.reference.organ.vertices_mm, _AROUND_MM), 1.6)
+    _paint(axes, list(scene.reference.tumors), scene.reference.organ, FROM_CAMERA, frame)
+    flat = FROM_CAMERA.project(points_mm)
+    axes.scatter(flat[:, 0], flat[:, 1], s=2.0, color=OBSERVED, alpha=0.5, linewidths=0, zorder=3)
+    blank(axes, frame)
+    scale_bar(axes, frame)
+    axes.set_title(f"{FROM_CAMERA.name}: {len(points_mm)} points over the truth", fontsize=11)
+
+
+def _bench_view(axes: Axes, settled: Settled, rest_organ: Mesh, view: View) -> None:
+    anatomy = settled.anatomy
+    everything = np.concatenate([anatomy.organ.vertices_mm, rest_organ.vertices_mm])
+    everything = np.concatenate([everything, everything.mean(0)[None] * [1, 1, 0] + [0, 0, -12.0]])
+    frame = widened(frame_around(view, everything, 8.0), 1.75)
+    _paint(axes, list(anatomy.tumors), anatomy.organ, view, frame)
+    x, y = np.meshgrid(*pixel_centres(frame))
+    mask = silhouette(rest_organ, view, frame)
+    axes.contour(x, y, mask, levels=[0.5], colors=[_REST], linewidths=1.3, linestyles=["dashed"])
+    axes.axhspan(0, frame.bottom, color="0.3", alpha=0.13, zorder=2.2, linewidth=0)
+    axes.axhline(0, color="0.45", linewidth=1.2, zorder=2.5)
+    blank(axes, frame)
+    scale_bar(axes, frame)
+    axes.set_title(view.name, fontsize=11)
+
+
+def _paint(axes: Axes, tumors: list[Mesh], organ: Mesh, view: View, frame: Frame) -> None:
+    layers = [*(Layer(tumor, TRUE) for tumor in tumors), Layer(organ, KIDNEY, 0.4)]
+    axes.imshow(shade(layers, view, frame), extent=frame.extent, zorder=2, interpolation="bilinear")
+
+
+def _apparatus(axes: Axes, report: dict, view: View) -> None:
+    """Plate and rod, where the state has them; their far ends are left out."""
+    from matplotlib.patches import FancyBboxPatch, Polygon
+
+    if "plate_z_mm" in report:
+        left, right = axes.get_xlim()
+        half = report["plate_mm"] / 2 if view is FROM_FRONT else 0.46 * (right - left)
+        middle = 0.0 if view is FROM_FRONT else (left + right) / 2
+        style = f"round,pad=0,rounding_size={report['rounding_mm']}"
+        upper = report["plate_z_mm"] + _PLATE_SHOWN_MM
+        shape = FancyBboxPatch(
+            (middle - half, -upper), 2 * half, _PLATE_SHOWN_MM, boxstyle=style,
+            facecolor=_STEEL, edgecolor="0.3", alpha=0.8, zorder=4,
+        )  # fmt: skip
+        axes.add_patch(shape)
+    if "poke" in report:
+        tip, axis = np.array(report["poke"]["tip_mm"]), np.array(report["poke"]["axis"])
+        radius = report["poke"]["radius_mm"]
+        end = view.project(np.stack([tip + radius * axis, tip + _ROD_SHOWN_MM * axis]))[:, :2]
+        along = end[1] - end[0]
+        length = np.linalg.norm(along)
+        along = along / max(length, 1e-9)
+        angle = np.linspace(np.pi / 2, 3 * np.pi / 2, 24)
+        across = np.array([-along[1], along[0]])
+        cap = radius * (np.outer(np.cos(angle), along) + np.outer(np.sin(angle), across))
+        far = end[1] + radius * np.stack([-across, across])
+        outline = np.concatenate([end[0] + cap, far])
+        axes.add_patch(Polygon(outline, facecolor=_STEEL, edgecolor="0.3", zorder=4, alpha=0.85))
+
+
+_TEXT = {
+    "D0": "undeformed",
+    "D1": "midsection compressed by 4 mm",
+    "D2": "midsection compressed by 8 mm",
+    "D3": "midsection compressed by 12 mm",
+    "G1": "sunk after an incision",
+    "P1": "poked by a rod",
+}
+
+
+def _what(scene: Scene) -> str:
+    variant = scene.meta["variant"]
+    if variant.startswith("Rot"):
+        return f"undeformed, turned by {variant[3:]} degrees"
+    return _TEXT[variant]
+
+
+def _numbers(scene: Scene, settled: Settled) -> str:
+    """What was measured of this scene, in one line."""
+    said = []
+    if (change := settled.report.get("volume_change")) is not None:
+        said.append(f"volume {100 * change:+.2f} %")
+    if (largest := settled.report.get("largest_displacement_mm")) is not None:
+        said.append(f"largest displacement {largest:.1f} mm")
+    for key, text in (
+        ("rod_covers_share", "rod hides {:.1%} of what is visible"),
+        ("shaft_covers_share", "shaft hides {:.1%} of what is visible"),
+        ("background_share", "{:.1%} background points"),
+    ):
+        if key in scene.meta["seen"]:
+            said.append(text.format(scene.meta["seen"][key]))
+    return "   ".join(said)
+
+
+def _legend() -> list:
+    from matplotlib.lines import Line2D
+    from matplotlib.patches import Patch
+
+    return [
+        Patch(facecolor=(*KIDNEY, 0.5), label="kidney"),
+        Patch(facecolor=TRUE, label="tumor"),
+        Line2D([], [], color=_REST, linestyle="dashed", label="undeformed"),
+        Patch(facecolor=_STEEL, edgecolor="0.3", label="plate, rod"),
+        Line2D([], [], color=OBSERVED, marker=".", linestyle="", label="point"),
+    ]

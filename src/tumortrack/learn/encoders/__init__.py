@@ -1,8 +1,0 @@
-"""Encoders: normalised points (B, N, 3) -> latent (B, L). One file per kind, one name here."""
-
-from tumortrack.learn.encoders.heightmap import HeightMapConfig
-from tumortrack.learn.encoders.pointnet2 import PointNet2Config
-
-EncoderConfig = PointNet2Config | HeightMapConfig
-
-__all__ = ["EncoderConfig"]

@@ -1,0 +1,90 @@
+"""Where results are published: the camera's frame, or a robot's by a calibration file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float64
+
+from tumortrack.core.config import Config, from_builtins
+from tumortrack.core.errors import InputError
+from tumortrack.core.store import read_json
+from tumortrack.live.values import Frames
+
+_NOT_RIGID = 1e-3  # largest deviation of a rotation from orthonormal: files have few digits
+
+Rows = tuple[tuple[float, float, float, float], ...]
+
+
+class CalibrationFile(Config, frozen=True, kw_only=True):
+    """A file that says where the camera is, in one of three ways, each by 4 x 4 rows.
+
+    ``camera_from_robot`` or ``robot_from_camera``: of a hand-eye calibration.
+    ``camera_from_marker`` with ``robot_from_marker``: a marker that both know. ``unit``: of the
+    translations. ``frame_id``: the robot's frame, as ROS calls it.
+    """
+
+    frame_id: str
+    unit: Literal["mm", "m"]
+    camera_from_robot: Rows | None = None
+    robot_from_camera: Rows | None = None
+    camera_from_marker: Rows | None = None
+    robot_from_marker: Rows | None = None
+
+
+def read_frames(path: Path) -> Frames:
+    """The robot's frame of a calibration file (JSON; keys as in ``CalibrationFile``).
+
+    Raises:
+        InputError: missing, an unknown key, a matrix that is no rigid transform, or not exactly one
+            of the three ways.
+    """
+    file = from_builtins(read_json(path), CalibrationFile, str(path))
+    matrices = {
+        name: _rigid(rows, file.unit, f"{path}: {name}")
+        for name in (
+            "camera_from_robot",
+            "robot_from_camera",
+            "camera_from_marker",
+            "robot_from_marker",
+        )
+        if (rows := getattr(file, name)) is not None
+    }
+    if set(matrices) == {"robot_from_camera"}:
+        robot_from_camera = matrices["robot_from_camera"]
+    elif set(matrices) == {"camera_from_robot"}:
+        robot_from_camera = np.linalg.inv(matrices["camera_from_robot"])
+    elif set(matrices) == {"camera_from_marker", "robot_from_marker"}:
+        marker_from_camera = np.linalg.inv(matrices["camera_from_marker"])
+        robot_from_camera = matrices["robot_from_marker"] @ marker_from_camera
+    else:
+        raise InputError(
+            f"{path} must have camera_from_robot, or robot_from_camera, or camera_from_marker and "
+            f"robot_from_marker; it has {', '.join(matrices) or 'none of them'}."
+        )
+    if not file.frame_id.strip():
+        raise InputError(f"{path}: frame_id is empty; give the robot's frame, base_link say.")
+    return Frames(file.frame_id, robot_from_camera)
+
+
+def _rigid(rows: Rows, unit: str, where: str) -> Float64[np.ndarray, "4 4"]:
+    if len(rows) != 4:
+        raise InputError(f"{where} has {len(rows)} rows; it must have 4 of 4 numbers.")
+    b_from_a = np.array(rows, float)
+    turn = b_from_a[:3, :3]
+    good = (
+        np.isfinite(b_from_a).all()
+        and np.abs(turn @ turn.T - np.eye(3)).max() < _NOT_RIGID
+        and np.linalg.det(turn) > 0
+        and np.array_equal(b_from_a[3], [0, 0, 0, 1])
+    )
+    if not good:
+        raise InputError(
+            f"{where} is no rigid transform: its rotation must be orthonormal and right-handed, "
+            "its last row 0 0 0 1."
+        )
+    if unit == "m":
+        b_from_a[:3, 3] *= 1000
+    return b_from_a

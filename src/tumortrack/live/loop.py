@@ -1,0 +1,341 @@
+"""The live loop: newest frame -> organ's points -> estimate -> every sink.
+
+Each frame gives exactly one update; where nothing can be said, it says so and why, and no older
+answer is ever given again.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+import threading
+import time
+import traceback
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Float64
+
+from tumortrack.core.config import Config
+from tumortrack.core.errors import InputError, NoEstimate, TumortrackError
+from tumortrack.core.estimate import Estimate
+from tumortrack.core.types import Anatomy, DepthFrame, Intrinsics, SensorCloud
+from tumortrack.live.clock import StampCheck
+from tumortrack.live.meter import Histogram
+from tumortrack.live.quality import judge
+from tumortrack.live.sink_worker import Outlet
+from tumortrack.live.source_worker import Reader
+from tumortrack.live.values import Companion, Quality, Seen, Setting, SourceLost, Update
+from tumortrack.sense.camera import d405
+from tumortrack.sense.region import Hints, RegionConfig, organ_points
+from tumortrack.tracking.follower import Follower, FollowerConfig
+from tumortrack.tracking.tracker import Tracker
+
+_KINDS = 50  # of reasons that are counted apart
+_DEFECTS = 5  # tracebacks that are kept
+_PICK_S = 3.0  # without the organ: a pick is forgotten
+
+
+class LoopConfig(Config, frozen=True, kw_only=True):
+    """``stale_s``: no frame for so long, or one that old, gives 'no estimate'. ``give_up_s``: the
+    loop ends where no frame came for so long. ``intrinsics``: of depth images, instead of what the
+    source says. ``seconds``: the loop ends so long after the first
+    frame; 0: never.
+    """
+
+    region: RegionConfig = RegionConfig()
+    follower: FollowerConfig = FollowerConfig()
+    intrinsics: Intrinsics | None = None
+    stale_s: float = 0.5
+    give_up_s: float = 60.0
+    seconds: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not 0 < self.stale_s < self.give_up_s:
+            raise InputError(
+                f"stale_s {self.stale_s:g} and give_up_s {self.give_up_s:g}: both must be more "
+                "than 0 s, and the first less than the second."
+            )
+        if not self.seconds >= 0:
+            raise InputError(f"seconds is {self.seconds:g}; it must be 0 (no end) or more.")
+
+
+class TooLate(NoEstimate):
+    """The estimate is right, but its frame is stale by now."""
+
+
+class Loop:
+    """One run from a source to sinks. ``run`` returns when the source ends, when ``stop`` was
+    called from anywhere, or when the time is up."""
+
+    def __init__(
+        self,
+        tracker: Tracker,
+        setting: Setting,
+        config: LoopConfig,
+        companion: Companion | None = None,
+    ) -> None:
+        self._config, self._setting, self._companion = config, setting, companion
+        self._follower = Follower(tracker, config.follower)
+        self._stamps = StampCheck(config.stale_s)
+        self._stop = threading.Event()
+        self._sequence = 0
+        self._picked: Float64[np.ndarray, " 3"] | None = None  # by the user
+        self._place_mm: Float64[np.ndarray, " 3"] | None = None  # where that is by now
+        self._found_s = time.monotonic()
+        self._stamp: tuple[int, int] | None = None  # of the last frame, and when that was here
+        self.latency = Histogram()
+        self.stages: dict[str, Histogram] = {}
+        self.errors: dict[str, Histogram] = {}  # mm, of a source that knows the truth
+        self.counts: Counter[str] = Counter()
+        self.reasons: Counter[str] = Counter()
+        self.defects: list[str] = []
+
+    @property
+    def clock_jumps(self) -> int:
+        """How often the source's clock was set back."""
+        return self._stamps.jumps
+
+    def warm(self) -> None:
+        """Do once what every frame needs, so that the first does not wait for it."""
+        bump = np.full((240, 424), 180.0, np.float32)
+        rows, columns = np.mgrid[:240, :424]
+        middle = np.hypot(rows - 120, columns - 212) < 60
+        bump[middle] = 140 + 0.005 * ((rows - 120) ** 2 + (columns - 212) ** 2)[middle]
+        with suppress(NoEstimate):
+            frame = DepthFrame(bump, d405(424, 240))
+            organ_points(frame, self._config.region, Hints(), np.random.default_rng(0))
+        self._follower.warm()
+
+    def stop(self) -> None:
+        """Ask the loop to end after the frame it is at."""
+        self._stop.set()
+
+    def run(self, reader: Reader, outlets: list[Outlet], seen_by: Callable[[Update], None]) -> None:
+        """``seen_by`` is called with every update, after the outlets have it.
+
+        Raises:
+            SourceLost: no frame came for ``give_up_s``.
+            TumortrackError: the source can never work (as its ``open`` said).
+        """
+        try:
+            self._run(reader, outlets, seen_by)
+        finally:
+            if self._companion is not None and not self._companion.ended:
+                self._companion.abort("tracking has ended")
+                self._publish(self._silence(None, 0.0, "tracking has ended"), outlets)
+
+    def _run(
+        self, reader: Reader, outlets: list[Outlet], seen_by: Callable[[Update], None]
+    ) -> None:
+        fresh = time.monotonic()
+        ends = math.inf
+        while not self._stop.is_set():
+            got = reader.take(self._config.stale_s)
+            now = time.monotonic()
+            if isinstance(got, Seen):
+                got = self._calibrated(got)
+            if isinstance(got, Seen):
+                fresh = now
+                if self._config.seconds and ends == math.inf:
+                    ends = now + self._config.seconds
+                update = self._answer(got, reader.born_ns(got), reader.latency_from != "taking")
+            elif got is None and reader.ended:
+                return
+            else:
+                update = self._silence(got, now - fresh, reader.trouble)
+            update = self._publish(update, outlets)
+            seen_by(update)
+            if now >= ends or (self._companion is not None and self._companion.ended):
+                return
+            if now - fresh > self._config.give_up_s:
+                trouble = f": {reader.trouble}" if reader.trouble else ""
+                raise SourceLost(
+                    f"no frame for {now - fresh:.0f} s{trouble}. Look at the camera or the topic, "
+                    "then start again."
+                )
+
+    def _answer(self, seen: Seen, born_ns: int, hurry: bool) -> Update:
+        """The update of one frame, which came to be at ``born_ns``. ``hurry``: time goes on while
+        we work, so an answer can come too late."""
+        seconds: dict[str, float] = {}
+        organ, estimate, reason, warning = None, None, "", ""
+        quality: Quality = "none"
+        try:
+            self._believe(seen.stamp_ns, _age_s(born_ns))
+            with timed(seconds, "organ"):
+                rng = np.random.default_rng((self._config.follower.seed, seen.stamp_ns))
+                region = organ_points(seen.content, self._config.region, self._hints(seen), rng)
+                organ = region.cloud
+            with timed(seconds, "locate"):
+                estimate = self._follower.locate(organ)
+            seconds |= {f"locate.{k}": v for k, v in estimate.report["timings"].items()}
+            with timed(seconds, "judge"):
+                quality, warning = judge(estimate, seen.content)
+            self._follow_pick(organ)
+            if hurry and _age_s(born_ns) > self._config.stale_s:
+                raise TooLate(f"the answer came too late: {_age_s(born_ns):.2f} s after the frame")
+        except TooLate as error:  # and yet the best place to start the next search at
+            estimate, reason = None, str(error)
+        except TumortrackError as error:
+            self._follower.forget()
+            estimate, reason = None, str(error)
+        except Exception as error:  # a defect of ours: said, kept, and the next frame is tried
+            self._follower.forget()
+            self._remember(error)
+            estimate, reason = None, f"internal error, {type(error).__name__}: {error}"
+        if estimate is None:
+            quality, warning = "none", ""
+        self._stamp = (seen.stamp_ns, time.monotonic_ns())
+        return Update(
+            self._next(),
+            seen.stamp_ns,
+            estimate,
+            reason,
+            quality,
+            warning,
+            seen,
+            organ,
+            self._setting.frames,
+            seconds,
+            latency_ms=1000 * _age_s(born_ns),
+        )
+
+    def _calibrated(self, seen: Seen) -> Seen | InputError:
+        """The frame as the camera that the user says it is took it."""
+        given, content = self._config.intrinsics, seen.content
+        if given is None or not isinstance(content, DepthFrame):
+            return seen
+        has = content.intrinsics
+        if (has.width, has.height) != (given.width, given.height):
+            return InputError(
+                f"the depth images are {has.width} x {has.height}, and --intrinsics is for "
+                f"{given.width} x {given.height}; calibrate for the size that is streamed."
+            )
+        return replace(seen, content=DepthFrame(content.depth_mm, given, content.stamp_ns))
+
+    def _believe(self, stamp_ns: int, age_s: float) -> None:
+        jumps = self._stamps.jumps
+        self._stamps.check(stamp_ns, age_s)
+        if self._stamps.jumps > jumps:
+            self._follower.forget()
+
+    def _hints(self, seen: Seen) -> Hints:
+        controls = self._setting.controls
+        if controls.picked_mm is not self._picked:  # the user chose anew
+            self._picked = self._place_mm = controls.picked_mm
+            self._found_s = time.monotonic()
+            self._follower.forget()
+        elif self._picked is not None and time.monotonic() - self._found_s > _PICK_S:
+            controls.pick(None)  # it is not there any more, nor where it was seen last
+            self._picked = self._place_mm = None
+        last_box_mm = self._follower.last_box_mm(seen.stamp_ns)
+        # Once the organ is found its box is the better guide: pieces may cover the place.
+        place_mm = self._place_mm if last_box_mm is None else None
+        return Hints(mask=seen.mask, picked_mm=place_mm, last_box_mm=last_box_mm)
+
+    def _follow_pick(self, organ: SensorCloud) -> None:
+        """The organ was found: what the user picked moves along with it."""
+        self._found_s = time.monotonic()
+        if self._picked is not None:
+            points_mm = organ.points_mm.astype(np.float64)
+            off_mm = np.linalg.norm(points_mm - np.median(points_mm, axis=0), axis=1)
+            self._place_mm = points_mm[int(off_mm.argmin())]
+
+    def _silence(self, fault: TumortrackError | None, silent_s: float, trouble: str) -> Update:
+        """The update where there is no frame."""
+        reason = str(fault) if fault is not None else trouble or f"no frame for {silent_s:.1f} s"
+        return Update(self._next(), self._now_ns(), reason=reason, frames=self._setting.frames)
+
+    def _now_ns(self) -> int:
+        """Now, by the source's clock as far as it is known."""
+        if self._stamp is None:
+            return time.time_ns()
+        stamp_ns, then_ns = self._stamp
+        return stamp_ns + time.monotonic_ns() - then_ns
+
+    def _publish(self, update: Update, outlets: list[Outlet]) -> Update:
+        if self._companion is not None:
+            update = self._with_arms(self._companion, update)
+        for outlet in outlets:
+            outlet.put(update)
+        self.counts[update.quality] += 1
+        if update.reason:
+            self._count_reason(update.reason)
+        if update.latency_ms is not None and update.estimate is not None:
+            self.latency.add(update.latency_ms)
+        for name, stage_s in update.seconds.items():
+            self.stages.setdefault(name, Histogram()).add(1000 * stage_s)
+        if (
+            update.seen is not None
+            and update.seen.truth is not None
+            and update.estimate is not None
+        ):
+            self._hold_against(update.estimate, update.seen.truth)
+        return update
+
+    def _with_arms(self, arms: Companion, update: Update) -> Update:
+        try:
+            if self._setting.controls.aborted.is_set():
+                arms.abort("stopped by the viewer, or a real arm gave up")
+            return arms.act(update)
+        except Exception as error:  # a defect there: no arms move, and the organ is still seen
+            self._remember(error)
+            arms.abort(f"internal error, {type(error).__name__}: {error}")
+            return update
+
+    def _hold_against(self, estimate: Estimate, truth: Anatomy) -> None:
+        for name, true in zip(truth.names, truth.parts, strict=True):
+            if name in estimate.meshes:
+                off = estimate.meshes[name].box_mm.mean(0) - true.box_mm.mean(0)
+                self.errors.setdefault(name, Histogram()).add(float(np.linalg.norm(off)))
+
+    def _count_reason(self, reason: str) -> None:
+        kind = re.sub(r"-?[0-9]+([.,][0-9]+)?", "#", reason)
+        if kind not in self.reasons and len(self.reasons) >= _KINDS:
+            kind = "other reasons"
+        self.reasons[kind] += 1
+
+    def _remember(self, error: Exception) -> None:
+        if len(self.defects) < _DEFECTS:
+            self.defects.append("".join(traceback.format_exception(error)))
+
+    def _next(self) -> int:
+        self._sequence += 1
+        return self._sequence - 1
+
+
+@contextmanager
+def timed(seconds: dict[str, float], name: str) -> Iterator[None]:
+    """Notes how long a ``with`` block took, also where it raises."""
+    start = time.perf_counter()
+    try:
+        yield
+    finally:
+        seconds[name] = time.perf_counter() - start
+
+
+def _age_s(born_ns: int) -> float:
+    return (time.time_ns() - born_ns) * 1e-9
+
+
+def summary(loop: Loop, reader: Reader, outlets: list[Outlet]) -> dict:
+    """What the run was like (JSON types): counts, latencies and stage times in ms."""
+    return {
+        "updates": sum(loop.counts.values()),
+        "estimates": {"good": loop.counts["good"], "poor": loop.counts["poor"]},
+        "no_estimate": loop.counts["none"],
+        "reasons": dict(loop.reasons.most_common()),
+        "dropped": reader.dropped,
+        "opened": reader.opened,
+        "clock_jumps": loop.clock_jumps,
+        "latency_from": reader.latency_from,
+        "latency_ms": loop.latency.summary(),
+        "stages_ms": {name: times.summary() for name, times in loop.stages.items()},
+        "center_error_mm": {name: errors.summary() for name, errors in loop.errors.items()},
+        "sinks": {outlet.name: outlet.summary() for outlet in outlets},
+        "defects": [*loop.defects, *reader.defects],
+    }

@@ -1,0 +1,162 @@
+"""Updates into a rosbag2 folder (MCAP), as `ros2 bag play` and Foxglove read it, by rosbags."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tumortrack.core.errors import StorageError
+from tumortrack.live.recording.metadata import camera_frame, report
+from tumortrack.live.ros.cell import Cell
+from tumortrack.live.ros.markers import Rate
+from tumortrack.live.ros.messages import Messages
+from tumortrack.live.ros.observed import MM_PER_M, Outgoing, messages_seen
+from tumortrack.live.ros.outgoing import messages_of
+from tumortrack.live.values import Frames, Setting, Update
+
+# A killed program loses what is in no chunk yet.
+_CHUNK_S = 0.5
+
+
+class McapFile:
+    """Topics: ``/camera/...`` what the source saw, in the camera's frame; ``/tumortrack/...`` the
+    estimates and what arms do, and ``/tumortrack/report`` (JSON); ``/tf`` where the two frames
+    differ.
+
+    Messages are filed under their time of arrival, which never goes back; headers have the stamps.
+
+    Raises:
+        StorageError: the disk refused. Whole chunks stay, in a file without an end.
+    """
+
+    def __init__(self, folder: Path, setting: Setting, frames: bool, meshes_hz: float) -> None:
+        self._messages, self._setting = Messages("humble"), setting
+        from rosbags.rosbag2 import StoragePlugin, Writer
+
+        self._frames, self._meshes = frames, Rate(meshes_hz)
+        self._cell = Cell(self._messages, meshes_hz, observed=False) if setting.arms else None
+        self._connections: dict[str, Any] = {}
+        self._last_ns, self._chunk_s = 0, time.monotonic()
+        writer: Any = Writer(folder, version=8, storage_plugin=StoragePlugin.MCAP)  # 8: Humble's
+        writer.open()
+        self._writer, self._storage = writer, writer.storage
+        self._storage.bio.close()  # what is buffered could not be taken back on a full disk
+        self._storage.bio = self._file = _WholeWrites(self._storage.path)
+        self._whole = self._file.tell()  # behind the last whole chunk
+
+    def write(self, update: Update) -> None:
+        for out in self._messages_of(update):
+            topic = out.suffix if out.suffix.startswith("/") else f"/tumortrack/{out.suffix}"
+            self._write(topic, out, self._time_of(update))
+        if time.monotonic() - self._chunk_s >= _CHUNK_S:
+            self._flush()
+
+    def close(self) -> None:
+        """Write the index and metadata.yaml."""
+        try:
+            if self._storage.chunk.msgs:
+                self._flush()
+            self._writer.close()
+        except OSError as error:
+            self._give_up(error)
+
+    def _messages_of(self, update: Update) -> list[Outgoing]:
+        messages, published = self._messages, update.frames
+        due = self._meshes.due()
+        out = messages_of(update, messages, self._setting.parts, due, self._cell)
+        text = json.dumps(report(update), allow_nan=False)
+        string = "std_msgs/msg/String"
+        out.append(Outgoing("report", string, messages.make(string, data=text)))
+        if self._frames and update.seen is not None:
+            camera = camera_frame(published)
+            seen = messages_seen(update.seen, messages, camera)
+            out = [*(one._replace(suffix=f"/camera/{one.suffix}") for one in seen), *out]
+            if camera != published.frame_id:
+                out.append(_transform(update.stamp_ns, published, camera, messages))
+        return out
+
+    def _time_of(self, update: Update) -> int:
+        now_ns = time.time_ns() if update.seen is None else update.seen.arrived_ns
+        self._last_ns = max(self._last_ns, now_ns)
+        return self._last_ns
+
+    def _write(self, topic: str, out: Outgoing, time_ns: int) -> None:
+        if topic not in self._connections:
+            self._connections[topic] = self._writer.add_connection(
+                topic,
+                out.message_type,
+                msgdef=self._messages.definition(out.message_type),
+                rihs01=self._messages.type_hash(out.message_type),
+            )
+        data = self._messages.to_bytes(out.message)
+        chunks = len(self._storage.chunks)
+        try:
+            self._writer.write(self._connections[topic], time_ns, data)
+        except OSError as error:
+            self._give_up(error)
+        if len(self._storage.chunks) > chunks:
+            self._done()
+
+    def _flush(self) -> None:
+        try:
+            self._storage.close_chunk()
+        except OSError as error:
+            self._give_up(error)
+        self._done()
+
+    def _done(self) -> None:
+        self._whole, self._chunk_s = self._file.tell(), time.monotonic()
+
+    def _give_up(self, error: OSError) -> None:
+        """Leave whole chunks only."""
+        if not self._file.closed:
+            os.ftruncate(self._file.fileno(), self._whole)
+            self._file.close()
+        raise StorageError(
+            f"cannot write {self._file.name}: {error.strerror}. The recording ends {_CHUNK_S:g} s "
+            "before or less; it can be played with recording:FOLDER, and `mcap recover` makes it "
+            "whole for others."
+        ) from error
+
+
+class _WholeWrites(io.FileIO):
+    """Appends, without a buffer; each write is whole or raises."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(path, "r+")
+        self.seek(0, io.SEEK_END)
+
+    def write(self, data: Any) -> int:
+        left = memoryview(data).cast("B")
+        size = len(left)
+        while left:
+            left = left[super().write(left) or 0 :]
+        return size
+
+
+def _transform(stamp_ns: int, frames: Frames, camera: str, messages: Messages) -> Outgoing:
+    """Where the camera stands in the published frame."""
+    from scipy.spatial.transform import Rotation
+
+    way = frames.published_from_camera
+    x, y, z = (float(v) for v in way[:3, 3] / MM_PER_M)
+    qx, qy, qz, qw = (float(v) for v in Rotation.from_matrix(np.array(way[:3, :3])).as_quat())
+    transform = messages.make(
+        "geometry_msgs/msg/Transform",
+        translation=messages.make("geometry_msgs/msg/Vector3", x=x, y=y, z=z),
+        rotation=messages.make("geometry_msgs/msg/Quaternion", x=qx, y=qy, z=qz, w=qw),
+    )
+    stamped = messages.make(
+        "geometry_msgs/msg/TransformStamped",
+        header=messages.header(stamp_ns, frames.frame_id),
+        child_frame_id=camera,
+        transform=transform,
+    )
+    kind = "tf2_msgs/msg/TFMessage"
+    return Outgoing("/tf", kind, messages.make(kind, transforms=[stamped]))

@@ -1,0 +1,233 @@
+"""This process's one node in a ROS 1 graph, through rospy, and its talks with the master.
+
+rospy is made for a program that is nothing but a node: it has one node per process, it waits for
+ever on a master that is not there, and it never registers again at a master that was restarted.
+So the master is asked here first, with a time limit, and registrations are looked after.
+"""
+
+from __future__ import annotations
+
+import importlib
+import logging
+import os
+import re
+import sys
+import threading
+import xmlrpc.client
+from functools import cache
+from http.client import HTTPConnection, HTTPException
+from types import ModuleType
+from typing import Any
+from urllib.parse import urlsplit
+
+from tumortrack.core.errors import InputError
+from tumortrack.live.values import SourceLost
+
+_DEBIAN = "/usr/lib/python3/dist-packages"
+_DEBIAN_PYTHON = "/usr/bin/python3"
+_NAME = re.compile(r"[/~]?[A-Za-z]\w*(/[A-Za-z]\w*)*", re.ASCII)
+_ANSWER_S = 1.0  # a master answers within milliseconds
+_SUCCESS = 1  # https://wiki.ros.org/ROS/Master_Slave_APIs
+
+_starting = threading.Lock()
+_node: Node | None = None
+
+
+class MasterLost(SourceLost):
+    """The ROS master does not answer."""
+
+
+def rospy_module() -> ModuleType:
+    """rospy: as the ROS environment gives it, or else as Debian installs it.
+
+    Debian's folder goes to the end of ``sys.path``, so that whatever is installed here keeps
+    precedence over Debian's older numpy.
+
+    Raises:
+        InputError: there is none that this Python can import.
+    """
+    logger_class = logging.getLoggerClass()
+    try:
+        try:
+            return importlib.import_module("rospy")
+        except ImportError:
+            _append_debian()
+            return importlib.import_module("rospy")
+    except ImportError as error:
+        raise InputError(_how_to_get(str(error))) from error
+    finally:
+        logging.setLoggerClass(logger_class)  # rospy's own is for rospy
+
+
+def _append_debian() -> None:
+    """Raises InputError where Debian's packages are for another Python."""
+    theirs = os.path.basename(os.path.realpath(_DEBIAN_PYTHON))
+    ours = f"python{sys.version_info.major}.{sys.version_info.minor}"
+    if not os.path.isdir(os.path.join(_DEBIAN, "rospy")):
+        raise InputError(_how_to_get(f"{_DEBIAN} has none"))
+    if theirs != ours:
+        raise InputError(_how_to_get(f"Debian's is for {theirs}, and this is {ours}"))
+    if _DEBIAN not in sys.path:
+        sys.path.append(_DEBIAN)
+
+
+def check_name(name: str) -> None:
+    """Raises InputError for what is no name of a topic (http://wiki.ros.org/Names)."""
+    if not _NAME.fullmatch(name):
+        raise InputError(
+            f"{name!r} is no ROS topic; names look like /camera/depth/points: letters, digits, _ "
+            "and / between them."
+        )
+
+
+def full_type(ros1_type: str) -> str:
+    """``sensor_msgs/Image`` -> ``sensor_msgs/msg/Image``."""
+    package, _, name = ros1_type.partition("/")
+    return f"{package}/msg/{name}"
+
+
+def _how_to_get(why: str) -> str:
+    return (
+        f"ROS 1 needs rospy, which cannot be imported ({why}). On Debian 12: apt install "
+        "python3-rospy, and run tumortrack with Python 3.11; elsewhere source ROS's setup.bash, "
+        "with a Python of the same version."
+    )
+
+
+class Master:
+    """The ROS master's XML-RPC interface, with a time limit on every answer."""
+
+    def __init__(self, uri: str, caller: str = "/tumortrack") -> None:
+        self.uri, self.caller = uri, caller
+
+    def call(self, method: str, *arguments: object) -> Any:
+        """The value of a call that the master granted; None of one that it refused.
+
+        Raises:
+            MasterLost: no answer, or none that is XML-RPC.
+        """
+        try:
+            proxy = xmlrpc.client.ServerProxy(self.uri, transport=_Hurried())
+            code, _, value = getattr(proxy, method)(self.caller, *arguments)
+        except (OSError, HTTPException, xmlrpc.client.Error, ValueError, TypeError) as error:
+            raise MasterLost(
+                f"the ROS master at {self.uri} does not answer ({error}). Start roscore, or set "
+                "ROS_MASTER_URI to where it runs."
+            ) from error
+        return value if code == _SUCCESS else None
+
+    def types(self) -> dict[str, str]:
+        """Every topic known to the master, with its message type as ROS 1 writes it."""
+        return dict(self.call("getTopicTypes") or [])
+
+    def published(self) -> set[str]:
+        """Topics that somebody publishes."""
+        publishers, *_ = self.call("getSystemState")
+        return {topic for topic, nodes in publishers if nodes}
+
+    def simulated_time(self) -> bool:
+        """Stamps follow a simulation's or a recording's clock, and not the machines'."""
+        return self.call("getParam", "/use_sim_time") is True
+
+
+class _Hurried(xmlrpc.client.Transport):
+    def make_connection(self, host: Any) -> HTTPConnection:
+        connection = super().make_connection(host)
+        connection.timeout = _ANSWER_S
+        return connection
+
+
+class Node:
+    """This process as a ROS 1 node; see ``node``."""
+
+    def __init__(self, master_uri: str, rospy: ModuleType) -> None:
+        self.rospy = rospy
+        self.name: str = rospy.get_name()
+        self.master = Master(master_uri, self.name)
+        self._uri: str = rospy.get_node_uri()
+
+    def resolved(self, topic: str) -> str:
+        """The topic's full name in this node's namespace."""
+        return self.rospy.resolve_name(topic)
+
+    def listens(self, topic: str) -> bool:
+        """Whether the master knows that this node subscribes; a new master does not."""
+        _, subscribers, _ = self.master.call("getSystemState")
+        return self.name in dict(subscribers).get(topic, ())
+
+    def register_again(self, publishers: list[Any]) -> None:
+        """Make publishers known to a master that does not know them; whoever listens already
+        stays connected.
+
+        Raises:
+            MasterLost: no answer.
+        """
+        known, *_ = self.master.call("getSystemState")
+        known = dict(known)
+        for one in publishers:
+            if self.name not in known.get(one.resolved_name, ()):
+                self.master.call("registerPublisher", one.resolved_name, one.type, self._uri)
+
+
+def node() -> Node:
+    """The node, started at the first call; rospy knows one per process, and one master.
+
+    Raises:
+        InputError: no rospy; ROS_MASTER_URI is no address, or changed since the start.
+        MasterLost: the master does not answer.
+    """
+    global _node
+    with _starting:
+        uri = _master_uri()
+        if _node is not None and _node.master.uri != uri:
+            raise InputError(
+                f"ROS_MASTER_URI is now {uri}, and this program is already a node of "
+                f"{_node.master.uri}. Start it anew for another master."
+            )
+        rospy = rospy_module()
+        Master(uri).call("getPid")  # rospy would wait for it for ever
+        if _node is None:
+            if not rospy.core.is_initialized():
+                _start(rospy)
+            _node = Node(uri, rospy)
+        return _node
+
+
+def _master_uri() -> str:
+    uri = os.environ.get("ROS_MASTER_URI") or "http://localhost:11311"
+    try:
+        parts = urlsplit(uri)
+        good = parts.scheme == "http" and bool(parts.hostname) and parts.port is not None
+    except ValueError:
+        good = False
+    if not good:
+        raise InputError(f"ROS_MASTER_URI is {uri!r}; it must look like http://localhost:11311.")
+    return uri
+
+
+def _start(rospy: ModuleType) -> None:
+    """rospy's start, without its grip on signals, arguments, the clock and logging."""
+    configure = rospy.core.configure_logging
+    rospy.core.configure_logging = lambda *_: None  # it would close everybody's log handlers
+    try:
+        rospy.init_node(
+            "tumortrack",
+            argv=[],
+            anonymous=True,
+            disable_signals=True,
+            disable_rostime=True,
+            disable_rosout=True,
+        )
+    finally:
+        rospy.core.configure_logging = configure
+    # Its warnings go to whoever listens to Python's logging, and are not printed.
+    logging.getLogger("rosout").addHandler(logging.NullHandler())
+
+
+@cache
+def raw_class(type_name: str, md5sum: str, definition: str) -> type:
+    """A message class that carries bytes already serialised, as ``rospy.AnyMsg`` does, but may
+    be published under its type's name."""
+    base = rospy_module().AnyMsg
+    name = type_name.replace("/", "_")
+    return type(name, (base,), {"_type": type_name, "_md5sum": md5sum, "_full_text": definition})

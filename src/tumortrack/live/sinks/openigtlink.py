@@ -1,0 +1,225 @@
+"""OpenIGTLink: tumors' places, surfaces and status to 3D Slicer, PLUS and whoever speaks it.
+
+Slicer takes what arrives as RAS. Its files are LPS, and ours say that they are; so x and y are
+sent with the other sign, and what is sent lies where the files lie (``space="lps"``: as it is).
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from typing import ClassVar, Literal
+
+import numpy as np
+from jaxtyping import Float64
+
+from tumortrack.core.errors import InputError
+from tumortrack.core.geometry import RAS_FROM_LPS, rigid, transform_points
+from tumortrack.live.igtl.content import (
+    EXITING,
+    NOT_FOUND,
+    NOT_PRESENT,
+    NOT_READY,
+    OK,
+    Polydata,
+    Status,
+    pack_polydata,
+    pack_status,
+    pack_transform,
+)
+from tumortrack.live.igtl.link import Link
+from tumortrack.live.igtl.message import Message
+from tumortrack.live.values import Placed, Setting, SinkConfig, Update
+
+STATUS_DEVICE, CT_DEVICE, CLOUD_DEVICE, ARMS_DEVICE = "tumortrack", "ct", "occupancy", "arms"
+_TIP = "/tip"  # how the names of shapes at the tips of tools end
+_NOWHERE = np.eye(4)
+_NO_POINTS, _NO_FACES = np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32)
+
+
+class OpenIgtLink(SinkConfig, frozen=True, kw_only=True, tag="openigtlink"):
+    """A server that 3D Slicer connects to, or, with ``connect``, a client of one.
+
+    Attributes:
+        port: the protocol's own is 18944; 0 takes a free one.
+        host: which of this machine's addresses to serve; 0.0.0.0: all.
+        connect: host of a server to go to instead.
+        mesh_hz: surfaces at most so often; 0: none.
+        cloud_hz: the labelled cloud at most so often; 0: none.
+        space: ras turns x and y round, for 3D Slicer; lps sends what is published.
+    """
+
+    target: ClassVar[str] = "port"
+
+    port: int = 18944
+    host: str = "127.0.0.1"
+    connect: str = ""
+    mesh_hz: float = 10.0
+    cloud_hz: float = 0.0
+    space: Literal["ras", "lps"] = "ras"
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.port <= 65535 or (self.connect and not self.port):
+            raise InputError(f"openigtlink: port {self.port} must lie in 1..65535.")
+        for name, value in (("mesh_hz", self.mesh_hz), ("cloud_hz", self.cloud_hz)):
+            if not 0 <= value <= 1000:
+                raise InputError(f"openigtlink: {name} {value} must lie in 0..1000.")
+
+    def open(self, setting: Setting) -> OpenIgtLinkSink:
+        """Serve, or begin to try to connect.
+
+        Raises:
+            InputError: the port is taken.
+        """
+        return OpenIgtLinkSink(self, setting)
+
+
+class OpenIgtLinkSink:
+    """Per update: STATUS ``tumortrack``, TRANSFORM of each tumor, and POLYDATA of each part.
+
+    A tumor's TRANSFORM has its origin in the middle of the tumor's box; its axes are the CT's, as
+    the organ is turned now, or, without a motion, those of the published frame. With a motion
+    TRANSFORM ``ct`` is the organ's pose: what is put under it in Slicer follows the organ, as
+    a rigid body. Without an estimate STATUS says why, transforms are the identity with
+    ``TransformStatus`` MISSING, and surfaces and cloud are empty.
+
+    Where there may be arms also STATUS ``arms`` (well: its name is their state; not ready: halted,
+    and why; not present: nothing is known), and a TRANSFORM of each tool's tip, named as its shape
+    (``cutter/tip``): from the tip's own frame, and MISSING once it is gone.
+    """
+
+    def __init__(self, config: OpenIgtLink, setting: Setting) -> None:
+        self._parts, self._frames = setting.parts, setting.frames
+        self._axes = RAS_FROM_LPS if config.space == "ras" else np.eye(4)
+        self._link = Link(config.host, config.port, config.connect)
+        self._meshes, self._cloud = _Pace(config.mesh_hz), _Pace(config.cloud_hz)
+        self._has_ct, self._arms = setting.anatomy_ct is not None, setting.arms
+        self._tips: set[str] = set()  # that ever were
+        self._next, self._closed = 0, False
+
+    @property
+    def port(self) -> int:
+        return self._link.port
+
+    @property
+    def receivers(self) -> int:
+        """How many are connected."""
+        return self._link.receivers
+
+    def publish(self, update: Update) -> None:
+        code = OK if update.estimate is not None else NOT_FOUND
+        self._link.send(self._said(update, code))
+        self._next = update.sequence + 1
+
+    def close(self) -> None:
+        """Say that it is over, and leave nothing that looks as if it were still true."""
+        if not self._closed:
+            self._closed = True
+            reason = "tracking has ended"
+            over = Update(self._next, time.time_ns(), reason=reason, frames=self._frames)
+            self._link.send(self._said(over, EXITING))
+            self._link.close()
+
+    def _said(self, update: Update, code: int) -> list[Message]:
+        arms = [self._arms_status(update)] if self._arms else []
+        status = self._status(update, code)
+        return [status, *arms, *self._transforms(update), *self._surfaces(update)]
+
+    def _message(
+        self, kind: str, device: str, update: Update, content: bytes, **more: str
+    ) -> Message:
+        metadata = {"frame_id": update.frames.frame_id, "sequence": str(update.sequence), **more}
+        return Message(kind, device, update.stamp_ns, content, metadata)
+
+    def _status(self, update: Update, code: int) -> Message:
+        found = update.estimate is not None
+        name, text = (update.quality, update.warning) if found else ("no estimate", update.reason)
+        more = {"quality": str(update.quality)}
+        if update.latency_ms is not None:
+            more["latency_ms"] = f"{update.latency_ms:.1f}"
+        content = pack_status(Status(code, name, text))
+        return self._message("STATUS", STATUS_DEVICE, update, content, **more)
+
+    def _arms_status(self, update: Update) -> Message:
+        cell = update.workcell
+        if cell is None:
+            status = Status(NOT_PRESENT, "unknown", "nothing is known of the arms")
+            return self._message("STATUS", ARMS_DEVICE, update, pack_status(status))
+        status = Status(NOT_READY if cell.halted else OK, cell.state, cell.halted)
+        content = pack_status(status)
+        return self._message("STATUS", ARMS_DEVICE, update, content, state=cell.state)
+
+    def _transforms(self, update: Update) -> Iterator[Message]:
+        way, pose = update.frames.published_from_camera, _camera_from_ct(update)
+        places: dict[str, Float64[np.ndarray, "4 4"] | None] = dict.fromkeys(self._parts[1:])
+        if self._has_ct:
+            places[CT_DEVICE] = None if pose is None else way @ pose
+        if update.estimate is not None:
+            turn = np.eye(3) if pose is None else (way @ pose)[:3, :3]
+            for name in self._parts[1:]:
+                if (mesh := update.estimate.meshes.get(name)) is not None:
+                    middle = transform_points(way, mesh.box_mm.mean(0, keepdims=True))[0]
+                    places[name] = rigid(turn, middle)
+        if self._arms:
+            shapes = () if update.workcell is None else update.workcell.shapes
+            tips = {s.name: s.published_from_shape for s in shapes if s.name.endswith(_TIP)}
+            self._tips |= tips.keys()
+            places |= {name: tips.get(name) for name in sorted(self._tips)}
+        for name, place in places.items():
+            turned = _NOWHERE if place is None else self._axes @ place @ self._axes
+            known = "MISSING" if place is None else "OK"
+            content = pack_transform(turned)
+            yield self._message("TRANSFORM", name, update, content, TransformStatus=known)
+
+    def _surfaces(self, update: Update) -> Iterator[Message]:
+        placed = update.placed
+        meshes, mesh_due = (placed.meshes, self._meshes.due()) if placed else ({}, True)
+        contents: dict[str, Polydata] = {}
+        for name in self._parts if self._meshes.on else ():
+            # What is not there any more goes at once; what is there may wait for its turn.
+            if (mesh := meshes.get(name)) is None:
+                contents[name] = Polydata(_NO_POINTS, _NO_FACES)
+            elif mesh_due:
+                contents[name] = Polydata(self._turned(mesh.vertices_mm), mesh.faces)
+        if self._cloud.on:
+            if placed is None:
+                contents[CLOUD_DEVICE] = Polydata(_NO_POINTS, _NO_FACES)
+            elif self._cloud.due():
+                contents[CLOUD_DEVICE] = self._points(placed)
+        for name, content in contents.items():
+            yield self._message("POLYDATA", name, update, pack_polydata(content))
+
+    def _points(self, placed: Placed) -> Polydata:
+        """Each point as a line without length: Slicer shows points of cells only, and its reader
+        does not bear cells of one point."""
+        number = np.arange(len(placed.points_mm))
+        scalars = {"label": placed.labels, "probability": placed.probability}
+        segments = np.stack([number, number], 1)
+        return Polydata(self._turned(placed.points_mm), _NO_FACES, segments, scalars)
+
+    def _turned(self, points_mm: np.ndarray) -> np.ndarray:
+        return transform_points(self._axes, points_mm)
+
+
+class _Pace:
+    """Says when the next one is due, ``hz`` times a second."""
+
+    def __init__(self, hz: float) -> None:
+        self.on = hz > 0
+        self._period_s = 1 / hz if self.on else 0.0
+        self._next_s = 0.0
+
+    def due(self) -> bool:
+        now = time.monotonic()
+        if not self.on or now < self._next_s:
+            return False
+        in_step = now < self._next_s + self._period_s
+        self._next_s = (self._next_s if in_step else now) + self._period_s
+        return True
+
+
+def _camera_from_ct(update: Update) -> Float64[np.ndarray, "4 4"] | None:
+    """The organ's pose without its deformation, where the method knows one."""
+    if update.estimate is None or "motion" not in update.estimate.report:
+        return None
+    return np.array(update.estimate.report["motion"]["camera_from_ct"], float)

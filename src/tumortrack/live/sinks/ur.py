@@ -1,0 +1,231 @@
+"""A real arm of Universal Robots': ``ur:192.168.1.10?arm=cutter&execute=false``.
+
+By default nothing is connected and nothing is sent: each joint target is checked, and counted as
+one that would be sent. With ``execute=true`` an arm moves. The checks here are no safety system:
+that is in the arm's own controller, whose limits and planes must be set for this use.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import Counter
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+from jaxtyping import Float64
+
+from tumortrack.core.errors import InputError, TumortrackError
+from tumortrack.live.ur_link import SILENT_S, UR_JOINTS, UrLink, connected
+from tumortrack.live.values import Controls, Setting, SinkConfig, Update
+
+# Of UR5, UR5e, UR10 and UR10e (data sheets): a turn either way; the larger ones' first two joints
+# are the slower ones, and their limits hold for all here.
+LIMIT_RAD = 2 * np.pi
+SPEED_RAD_S = np.radians([120.0, 120.0, 180.0, 180.0, 180.0, 180.0])
+
+_TICK_S = 0.02  # of the watchdog
+_SHORTEST_S, _LONGEST_S = 0.008, 0.1  # that the controller follows one target
+
+
+class Ur(SinkConfig, frozen=True, kw_only=True, tag="ur"):
+    """One arm at ``host``.
+
+    Attributes:
+        arm: whose joints: ``cutter_shoulder_pan_joint``, ...
+        execute: false: say what would be sent. true: move it.
+        jump_deg: the largest step of a joint from one target to the next.
+        lookahead_s, gain: of servoJ: longer and less is smoother and later.
+    """
+
+    target: ClassVar[str] = "host"
+
+    host: str
+    arm: Literal["cutter", "holder"] = "cutter"
+    execute: bool = False
+    jump_deg: float = 5.0
+    lookahead_s: float = 0.1
+    gain: float = 300.0
+
+    def __post_init__(self) -> None:
+        for name, low, high in (
+            ("jump_deg", 0.1, 20.0),
+            ("lookahead_s", 0.03, 0.2),  # servoJ's own limits
+            ("gain", 100.0, 2000.0),
+        ):
+            value = getattr(self, name)
+            if not low <= value <= high:
+                raise InputError(f"ur: {name} {value:g} must lie in {low:g}..{high:g}.")
+
+    def open(self, setting: Setting) -> UrSink:
+        """Nothing, or with ``execute`` the connection to the arm, which does not move yet.
+
+        Raises:
+            InputError: no arms in this run; with ``execute``: see ``connected``.
+        """
+        if not setting.arms:
+            raise InputError("ur: nothing here moves an arm; it is for `tumortrack resect`.")
+        return UrSink(self, connected(self.host) if self.execute else None, setting.controls)
+
+
+class UrSink:
+    """Sends one arm's joints as they come, and stops it (servoStop) where the arms are halted,
+    there is no workcell, a target is refused, 0.2 s pass without an update, or it is closed.
+
+    Whenever it stood still, it begins only where the arm is within 2 degrees of the target. Should
+    this process die, the arm's controller stops it within 0.2 s by itself (setWatchdog).
+    """
+
+    def __init__(self, config: Ur, link: UrLink | None, controls: Controls) -> None:
+        self._config, self._link, self._controls = config, link, controls
+        self._names = tuple(f"{config.arm}_{joint}" for joint in UR_JOINTS)
+        self._last: tuple[Float64[np.ndarray, " 6"], float, int] | None = None
+        self._lock = threading.Lock()
+        self._closed = threading.Event()
+        self._counts: Counter[str] = Counter()
+        self._fault = ""
+        self._watch: threading.Thread | None = None
+        if link is not None:
+            self._watch = threading.Thread(target=self._keep_watch, name="ur", daemon=True)
+            self._watch.start()
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """Updates by what became of them: sent (in a dry run: would send), halted, no arms,
+        refused; and silences."""
+        with self._lock:
+            return dict(self._counts)
+
+    def publish(self, update: Update) -> None:
+        """Send the target, or check it.
+
+        Raises:
+            TumortrackError: the target is refused, and why; the arm stands.
+        """
+        with self._lock:
+            if self._closed.is_set():
+                return
+            if self._fault:
+                raise TumortrackError(self._fault)
+            cell = update.workcell
+            try:
+                if cell is None or cell.halted:
+                    self._counts["no arms" if cell is None else "halted"] += 1
+                    self._stop()
+                else:
+                    self._heed_silence()
+                    self._go(_target(cell.joints_rad, self._names), update.stamp_ns)
+            except TumortrackError as error:
+                self._counts["refused"] += 1
+                self._give_up()
+                self._stop()
+                raise TumortrackError(f"ur {self._config.arm}: {error}") from error
+            except Exception as error:  # of ur_rtde, which raises anything
+                self._give_up()
+                self._break(error)
+                raise TumortrackError(self._fault) from error
+
+    def close(self) -> None:
+        """Stop the arm, and let it go."""
+        if self._closed.is_set():
+            return
+        self._closed.set()
+        if self._watch is not None:
+            self._watch.join()
+        with self._lock:
+            if self._link is not None:
+                try:
+                    self._stop()
+                finally:
+                    self._link.close()
+
+    def _give_up(self) -> None:
+        """This arm no longer does what was planned: all arms stop for good."""
+        if self._link is not None:
+            self._controls.aborted.set()
+
+    def _go(self, target: Float64[np.ndarray, " 6"], stamp_ns: int) -> None:
+        now_s = time.monotonic()
+        seconds = _SHORTEST_S
+        if self._last is not None:
+            before, then_s, then_ns = self._last
+            # Targets are as far apart as their stamps say, or came: a thread may have waited.
+            seconds = max(now_s - then_s, (stamp_ns - then_ns) * 1e-9, _SHORTEST_S)
+            _check_step(target - before, seconds, self._config.jump_deg)
+        if self._link is not None:
+            self._link.check()
+            if self._last is None:
+                self._link.compare(target)
+                seconds = _LONGEST_S
+            follow_s = float(np.clip(seconds, _SHORTEST_S, _LONGEST_S))
+            self._link.servo(target, follow_s, self._config.lookahead_s, self._config.gain)
+        self._last = target, now_s, stamp_ns
+        self._counts["would send" if self._link is None else "sent"] += 1
+
+    def _stop(self) -> None:
+        moving, self._last = self._last is not None, None
+        if moving and self._link is not None:
+            try:
+                self._link.stop()
+            except Exception as error:
+                self._break(error)
+
+    def _heed_silence(self) -> None:
+        if self._last is not None and time.monotonic() - self._last[1] > SILENT_S:
+            self._counts["silences"] += 1
+            self._stop()
+
+    def _break(self, error: Exception) -> None:
+        """The link is broken for good. Nobody kicks the controller's watchdog any more, so that it
+        stops the arm."""
+        self._last = None
+        self._fault = (
+            f"ur {self._config.arm}: the arm at {self._config.host} is lost ({error}); look after "
+            "it, then start again"
+        )
+
+    def _keep_watch(self) -> None:
+        while not self._closed.wait(_TICK_S):
+            with self._lock:
+                self._heed_silence()
+                if self._fault or self._link is None:
+                    return
+                try:
+                    self._link.kick()
+                except Exception as error:
+                    self._break(error)
+
+
+def _target(joints_rad: Any, names: tuple[str, ...]) -> Float64[np.ndarray, " 6"]:
+    """One arm's joints in the maker's order.
+
+    Raises:
+        TumortrackError: one is missing, no number, or beyond its limit.
+    """
+    if missing := [name for name in names if name not in joints_rad]:
+        raise TumortrackError(f"there is no joint {missing[0]}; there are {', '.join(joints_rad)}")
+    target = np.array([float(joints_rad[name]) for name in names])
+    wrong = ~(np.abs(target) <= LIMIT_RAD)  # also where it is no number
+    if wrong.any():
+        joint = int(np.flatnonzero(wrong)[0])
+        raise TumortrackError(
+            f"{UR_JOINTS[joint]} at {np.degrees(target[joint]):.1f} degrees; allowed: "
+            f"{np.degrees(LIMIT_RAD):g} either way"
+        )
+    return target
+
+
+def _check_step(step: Float64[np.ndarray, " 6"], seconds: float, jump_deg: float) -> None:
+    """Raises TumortrackError for a step too large, or too large for the time that it has."""
+    jump, speed = np.degrees(np.abs(step)), np.abs(step) / seconds / SPEED_RAD_S
+    if jump.max() > jump_deg:
+        joint = int(jump.argmax())
+        raise TumortrackError(
+            f"{UR_JOINTS[joint]} jumps by {jump[joint]:.1f} degrees; allowed: {jump_deg:g}"
+        )
+    if speed.max() > 1:
+        joint = int(speed.argmax())
+        raise TumortrackError(
+            f"{UR_JOINTS[joint]} would turn at {np.degrees(abs(step[joint]) / seconds):.0f} "
+            f"degrees/s; allowed: {np.degrees(SPEED_RAD_S[joint]):.0f}"
+        )

@@ -1,0 +1,277 @@
+"""A web page that shows each estimate: ``viewer:8080?case=CASE_FOLDER&margin_mm=5``.
+
+The page says how good the estimate is, how old, and why there is none; without one, or after a
+second of silence, nothing of an older one stays visible.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from typing import TYPE_CHECKING, ClassVar
+
+import numpy as np
+
+from tumortrack.core import colours
+from tumortrack.core.errors import InputError
+from tumortrack.core.geometry import transform_points
+from tumortrack.core.types import Mesh
+from tumortrack.live.values import Setting, SinkConfig, Update
+from tumortrack.live.viewer.panel import Actions, Panel
+from tumortrack.live.viewer.points import point_under, seen_points
+from tumortrack.live.viewer.scene import Scene
+from tumortrack.live.viewer.server import close_server, open_server
+from tumortrack.live.viewer.slices import load_ct, plane_through, slice_picture
+from tumortrack.live.viewer.status import State, Status, backdrop
+from tumortrack.live.viewer.workcell import Cell
+
+if TYPE_CHECKING:
+    from viser import SceneClickEvent
+
+_STALE_S = 1.0
+_TICK_S = 0.2  # the status grows older, and slices are renewed, this often
+_SLICE_PIXELS = 320
+
+
+class Viewer(SinkConfig, frozen=True, kw_only=True, tag="viewer"):
+    """A page at ``http://host:port``.
+
+    Attributes:
+        port: 0: any free one.
+        host: who may look: 127.0.0.1, this machine; 0.0.0.0, whoever can reach it.
+        case: folder of the patient's case: its CT (its labels, where it has none) is shown in
+            slices.
+        margin_mm: distance of the shell round each tumor; 0: none.
+        hz: how often clouds and surfaces are sent at the most.
+    """
+
+    target: ClassVar[str] = "port"
+
+    port: int = 8080
+    host: str = "127.0.0.1"
+    case: str = ""
+    margin_mm: float = 5.0
+    hz: float = 15.0
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.port <= 65535:
+            raise InputError(f"viewer: port {self.port} is not in 0..65535.")
+        if not 0 <= self.margin_mm <= 50:
+            raise InputError(f"viewer: margin_mm={self.margin_mm:g}; allowed are 0 to 50 mm.")
+        if not 0 < self.hz <= 60:
+            raise InputError(f"viewer: hz={self.hz:g}; allowed are more than 0 and up to 60.")
+
+    def open(self, setting: Setting) -> ViewerSink:
+        """The page, ready for visitors.
+
+        Raises:
+            InputError: the port is taken, viser is missing, or the case is another patient's.
+            ArtifactError: ``case`` is no case.
+        """
+        return ViewerSink(self, setting)
+
+
+class ViewerSink:
+    """See ``live.values.Sink``. ``port``: where the page is."""
+
+    def __init__(self, config: Viewer, setting: Setting) -> None:
+        ct = load_ct(config.case, setting) if config.case else None
+        self._config, self._setting, self._ct = config, setting, ct
+        self._server = open_server(config.host, config.port)
+        self.port: int = self._server.get_port()
+        self._lock = threading.RLock()  # round every change of the page
+        self._update: Update | None = None  # the last that came
+        self._shown: Update | None = None  # whose estimate is visible
+        self._came = self._drawn = -np.inf
+        self._spells = 0  # how often estimates were hidden: a slice of an earlier spell is void
+        self._beat = 0
+        self._fault: BaseException | None = None
+        self._asked = False
+        self._state: State | None = None
+        self._behind: tuple[State, bool] | None = None
+        self._scene = Scene(self._server, setting, config.margin_mm)
+        self._cell = Cell(self._server)
+        turn = self._scene.look.turn
+        actions = Actions(self._changed, self._ask, self._forget, turn, self._abort)
+        self._panel = Panel(self._server, setting.parts, actions, ct is not None, setting.arms)
+        self._say("waiting")
+        self._closing = threading.Event()
+        self._watch = threading.Thread(target=self._keep_watch, name="viewer", daemon=True)
+        self._watch.start()
+
+    def publish(self, update: Update) -> None:
+        """Show it: without an estimate at once, with one not more often than ``hz``; arms each
+        time."""
+        if self._closing.is_set():
+            return
+        now = time.monotonic()
+        with self._page():
+            before, self._update, self._came = self._update, update, now
+            if update.estimate is None:
+                self._hide()
+            self._draw_cell(update)
+            changed = before is None or self._shown is None or before.quality != update.quality
+            if changed or now - self._drawn >= 1 / self._config.hz:
+                self._drawn = now
+                self._draw(update)
+        fault, self._fault = self._fault, None
+        if fault is not None:
+            raise fault
+
+    def close(self) -> None:
+        if self._closing.is_set():
+            return
+        self._closing.set()
+        self._watch.join(5)
+        close_server(self._server)
+
+    @contextmanager
+    def _page(self) -> Iterator[None]:
+        """What is changed inside arrives at clients together."""
+        with self._lock, self._server.atomic():
+            yield
+
+    def _draw(self, update: Update) -> None:
+        try:
+            self._scene.observe(update)
+            if update.estimate is None:
+                self._scene.apply()
+            else:
+                self._scene.show(update)
+                self._shown = update
+            self._say("none" if update.estimate is None else update.quality)
+        except Exception as error:
+            self._hide()
+            reason = f"this estimate cannot be shown ({error!r})"
+            self._update = replace(update, estimate=None, quality="none", reason=reason)
+            self._say("none")
+            raise
+
+    def _draw_cell(self, update: Update) -> None:
+        try:
+            if update.workcell is None:
+                self._cell.hide()
+                return
+            self._cell.show(update.workcell)
+            self._scene.look.oversee(update.workcell)
+        except Exception as error:
+            self._cell.hide()
+            self._fault = error  # raised when the estimate has been shown
+
+    def _hide(self) -> None:
+        self._shown = None
+        self._spells += 1
+        self._scene.hide()
+        self._panel.put_slice(None)
+
+    def _say(self, state: State) -> None:
+        self._state = state
+        self._beat += 1
+        update = self._update
+        age_s = time.monotonic() - self._came if update is not None else 0.0
+        if update is not None and update.latency_ms is not None:
+            age_s += update.latency_ms / 1000
+        status = Status(state, update, age_s, self._beat, self._setting.arms)
+        if (behind := (state, status.loud)) != self._behind:
+            self._behind = behind
+            self._server.scene.set_background_image(backdrop(*behind))
+        self._panel.say(status)
+
+    def _keep_watch(self) -> None:
+        """Says how old the last frame is, hides what got too old, renews the slice."""
+        while not self._closing.wait(_TICK_S):
+            try:
+                with self._page():
+                    if self._update is not None and time.monotonic() - self._came > _STALE_S:
+                        if self._shown is not None:
+                            self._hide()
+                        self._cell.hide()
+                        self._say("stale")
+                    else:
+                        self._say(self._state or "waiting")
+                self._renew_slice()
+            except Exception as error:
+                self._fault = error  # for the next publish to raise: the watch must go on
+
+    def _renew_slice(self) -> None:
+        if self._ct is None:
+            return
+        with self._lock:
+            update, spell = self._shown, self._spells
+            part, orientation = self._panel.slice_through
+        if update is None:
+            return
+        plane = plane_through(update, part, orientation)
+        motion = update.estimate.motion if update.estimate is not None else None
+        picture = None
+        if plane is not None and motion is not None:
+            outlines = self._outlines(update)
+            picture = slice_picture(self._ct, motion, plane, outlines, _SLICE_PIXELS)
+        with self._page():
+            if spell == self._spells:
+                self._panel.put_slice(picture)
+                if picture is not None and plane is not None:
+                    self._scene.put_slice(picture, plane, update.frames)
+
+    def _outlines(self, update: Update) -> list[tuple[Mesh, colours.Colour, int]]:
+        assert update.estimate is not None
+        back = np.linalg.inv(update.frames.published_from_camera)
+        outlines = []
+        for label, name in enumerate(self._setting.parts, start=1):
+            colour = colours.part_colour(label)
+            if name in update.estimate.meshes:
+                outlines.append((update.estimate.meshes[name], colour, 2 if label > 1 else 1))
+            if margin := self._scene.margins.get(name):
+                there = margin.moved(transform_points(back, margin.vertices_mm))
+                outlines.append((there, colour, 1))
+        return outlines
+
+    def _changed(self) -> None:
+        with self._page():
+            self._scene.options = self._panel.options
+            self._scene.redraw_points()
+            self._scene.apply()
+
+    def _ask(self) -> None:
+        """The next click in the scene chooses the organ; asked twice: it does not."""
+        with self._lock:
+            self._asked = not self._asked
+            if self._asked:
+                self._server.scene.on_click()(self._clicked)
+            else:
+                self._server.scene.remove_click_callback(self._clicked)
+            self._panel.picking(self._asked, self._setting.controls.picked_mm is not None)
+
+    def _clicked(self, event: SceneClickEvent) -> None:
+        with self._lock:
+            if not self._asked:
+                return
+            self._ask()
+            update = self._update
+            if update is None or update.seen is None:
+                event.client.add_notification("Nothing is seen at present", "Click again later.")
+                return
+            back = np.linalg.inv(update.frames.published_from_camera)
+            origin = transform_points(back, np.array([event.ray_origin]))[0]
+            direction = back[:3, :3] @ np.array(event.ray_direction)
+            point = point_under(seen_points(update).astype(float), origin, direction)
+            if point is None:
+                event.client.add_notification("No observed point there", "Click on the points.")
+                return
+            self._setting.controls.pick(point)
+            self._scene.mark(point, update.frames)
+            self._panel.picking(False, True)
+
+    def _forget(self) -> None:
+        with self._lock:
+            self._setting.controls.pick(None)
+            self._scene.mark(None, self._setting.frames)
+            self._panel.picking(self._asked, False)
+
+    def _abort(self) -> None:
+        with self._lock:
+            self._setting.controls.aborted.set()
+            self._panel.aborted()

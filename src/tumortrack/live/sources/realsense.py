@@ -1,0 +1,275 @@
+"""A RealSense depth camera, or what one recorded.
+
+Camera, recording and the SDK's software device are all a device with a depth sensor that calls back
+with frames, so one class serves them. The SDK's own frame queue is not used: from Python it holds
+the interpreter while it waits for room, and a recording that is read frame by frame stops for good.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from types import ModuleType
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+
+from tumortrack.core.errors import InputError
+from tumortrack.core.types import DepthFrame, Intrinsics
+from tumortrack.live.values import Seen, SourceConfig, SourceEnded, SourceLost
+
+_RECORDINGS = (".db3", ".bag")
+_LAST_S = 0.2  # after a recording's end: its last frame may still be on its way
+_MOST_UNTIMED = 150  # frames before the camera's clock is tied to this machine's
+
+
+class RealSense(SourceConfig, frozen=True, kw_only=True, tag="realsense"):
+    """The first RealSense, the one with a serial number, or a recording (.db3, .bag).
+
+    Attributes:
+        device: empty, a serial number or a recording's path.
+        width, height, fps: of a camera's depth stream; a recording has its own.
+        emitter: a camera's projector on or off; None: as it is. A D405 has none.
+        preset: of a camera's visual presets, as ``high_accuracy``; empty: as it is.
+        global_time: stamps of a camera by this machine's clock, else by its own.
+        realtime: a recording at its own speed, else every frame as it is asked for.
+    """
+
+    target: ClassVar[str] = "device"
+
+    device: str = ""
+    width: int = 848
+    height: int = 480
+    fps: int = 30
+    emitter: bool | None = None
+    preset: str = ""
+    global_time: bool = True
+    realtime: bool = True
+
+    @property
+    def recording(self) -> Path | None:
+        path = Path(self.device)
+        return path if path.suffix in _RECORDINGS else None
+
+    def open(self) -> RealSenseSource:
+        """Start the camera or the recording.
+
+        Raises:
+            SourceLost: no such camera is connected, or another program has it.
+            InputError: it can't do what was asked, its image is distorted, no such recording, or
+                pyrealsense2 is missing.
+        """
+        rs = _sdk()
+        if self.recording is not None:
+            return RealSenseSource(_recorded(rs, self.recording, self.realtime), self)
+        with _while_connected():
+            return RealSenseSource(_connected(rs, self.device), self)
+
+
+class RealSenseSource:
+    """Depth frames of an SDK device: camera, playback or software device."""
+
+    def __init__(self, device: Any, config: RealSense) -> None:
+        """Start streaming; raises as ``RealSense.open``."""
+        rs = _sdk()
+        self.dropped = 0
+        self._device = device
+        self._playback = device.as_playback() if device.is_playback() else None
+        self.waits = self._playback is not None and not config.realtime
+        self._room = threading.Condition()
+        self._newest: tuple[Any, int] | None = None  # the SDK's frame, and when it came
+        self._closed = False
+        self._untimed = 0
+        self._hardware = rs.timestamp_domain.hardware_clock
+        self._stopped = rs.playback_status.stopped
+        self._sensor, profile = _depth_stream(rs, device, None if self._playback else config)
+        self._intrinsics = _intrinsics(profile)
+        self._unit_mm = float(f"{self._sensor.get_option(rs.option.depth_units) * 1000:.6g}")
+        if self._playback is None:
+            _set_up(rs, self._sensor, config)
+        self.host_clock = self._playback is None and _tied_to_host(rs, self._sensor)
+        self._sensor.open(profile)
+        self._sensor.start(self._take)
+
+    def read(self, timeout_s: float) -> Seen | None:
+        """The newest frame not yet given; None if none came in time.
+
+        Raises:
+            SourceLost: unplugged, or closed.
+            SourceEnded: the recording is over.
+            InputError: the camera's clock cannot be tied to this machine's.
+        """
+        with _while_connected():
+            return self._read(timeout_s)
+
+    def _read(self, timeout_s: float) -> Seen | None:
+        came = self._next(timeout_s)
+        if came is None and self._is_over():
+            came = self._next(_LAST_S)
+            if came is None:
+                raise SourceEnded("the recording is over.")
+        if came is None:
+            if not self._device.is_connected():
+                raise SourceLost("the RealSense is unplugged.")
+            return None
+        frame, arrived_ns = came
+        if self.host_clock and frame.get_frame_timestamp_domain() == self._hardware:
+            self._wait_for_clock()
+            return None
+        stamp_ns = round(frame.get_timestamp() * 1e6)
+        raw = np.asarray(frame.get_data())
+        depth_mm = raw * np.float32(self._unit_mm)
+        depth_mm[raw == 0] = np.nan  # the sensor's way to say: no return
+        return Seen(DepthFrame(depth_mm, self._intrinsics, stamp_ns), arrived_ns)
+
+    def close(self) -> None:
+        """Stop the stream; may be called twice."""
+        with self._room:
+            if self._closed:
+                return
+            self._closed = True
+            self._newest = None
+            self._room.notify_all()
+        with contextlib.suppress(RuntimeError):  # an unplugged camera can't be stopped
+            self._sensor.stop()
+            self._sensor.close()
+
+    def _take(self, frame: Any) -> None:
+        """Called by the SDK's thread."""
+        arrived_ns = time.time_ns()
+        if not frame.is_depth_frame():
+            return
+        with self._room:
+            if self.waits:
+                self._room.wait_for(lambda: self._newest is None or self._closed)
+            if self._closed:
+                return
+            self.dropped += self._newest is not None
+            self._newest = (frame, arrived_ns)
+            self._room.notify_all()
+
+    def _next(self, timeout_s: float) -> tuple[Any, int] | None:
+        with self._room:
+            self._room.wait_for(lambda: self._newest is not None or self._closed, timeout_s)
+            if self._closed:
+                raise SourceLost("the RealSense is closed; open it again.")
+            came, self._newest = self._newest, None
+            self._room.notify_all()
+        return came
+
+    def _is_over(self) -> bool:
+        return self._playback is not None and self._playback.current_status() == self._stopped
+
+    def _wait_for_clock(self) -> None:
+        """A camera's first frames come before its clock is tied to this machine's."""
+        self.dropped += 1
+        self._untimed += 1
+        if self._untimed > _MOST_UNTIMED:
+            raise InputError(
+                "the RealSense's clock is not tied to this machine's: its frames have no global "
+                "time. Give global_time=false."
+            )
+
+
+@contextlib.contextmanager
+def _while_connected() -> Iterator[None]:
+    """Anything that the SDK is asked fails while a camera comes or goes."""
+    try:
+        yield
+    except RuntimeError as error:
+        raise SourceLost(f"the RealSense does not answer: {error}. Replug it.") from error
+
+
+def _sdk() -> ModuleType:
+    try:
+        import pyrealsense2
+    except ImportError as error:
+        raise InputError(
+            "a RealSense needs pyrealsense2: pip install 'tumortrack[live]', and Debian's "
+            f"libusb-1.0-0 ({error})."
+        ) from error
+    return pyrealsense2
+
+
+def _recorded(rs: ModuleType, path: Path, realtime: bool) -> Any:
+    if not path.is_file():
+        raise InputError(f"no recording {path}.")
+    try:
+        device = rs.context().load_device(str(path))
+        device.set_real_time(realtime)
+    except RuntimeError as error:
+        raise InputError(f"{path} is no recording of a RealSense: {error}.") from error
+    return device
+
+
+def _connected(rs: ModuleType, serial: str) -> Any:
+    devices = {d.get_info(rs.camera_info.serial_number): d for d in rs.context().query_devices()}
+    if not devices:
+        raise SourceLost("no RealSense is connected. Plug one in, at a USB 3 port.")
+    if not serial:
+        return next(iter(devices.values()))
+    if serial not in devices:
+        raise SourceLost(
+            f"no RealSense {serial!r} is connected; there is {', '.join(sorted(devices))}."
+        )
+    return devices[serial]
+
+
+def _depth_stream(rs: ModuleType, device: Any, wanted: RealSense | None) -> tuple[Any, Any]:
+    """The sensor and profile of the depth stream: the only one, or as ``wanted``."""
+    there = [
+        (sensor, profile.as_video_stream_profile())
+        for sensor in device.query_sensors()
+        for profile in sensor.get_stream_profiles()
+        if profile.stream_type() == rs.stream.depth and profile.format() == rs.format.z16
+    ]
+    if not there:
+        raise InputError("the RealSense has no depth stream; choose another camera or recording.")
+    if wanted is None:
+        return there[0]
+    size = (wanted.width, wanted.height, wanted.fps)
+    modes = {(p.width(), p.height(), p.fps()): (s, p) for s, p in there}
+    if size not in modes:
+        listed = ", ".join(f"{w}x{h}@{fps}" for w, h, fps in sorted(modes))
+        raise InputError(f"the RealSense has no {size[0]}x{size[1]}@{size[2]}. Allowed: {listed}.")
+    return modes[size]
+
+
+def _intrinsics(profile: Any) -> Intrinsics:
+    given = profile.get_intrinsics()
+    if any(given.coeffs):
+        raise InputError(
+            f"the RealSense's depth image is distorted ({given.model}, {list(given.coeffs)}); a "
+            "rectified stream is needed. Calibrate the camera."
+        )
+    return Intrinsics(given.width, given.height, given.fx, given.fy, given.ppx, given.ppy)
+
+
+def _set_up(rs: ModuleType, sensor: Any, config: RealSense) -> None:
+    if config.preset:
+        presets = rs.rs400_visual_preset.__members__
+        if config.preset not in presets:
+            raise InputError(
+                f"the RealSense has no preset {config.preset!r}. Allowed: {', '.join(presets)}."
+            )
+        _set(sensor, rs.option.visual_preset, int(presets[config.preset]), "preset")
+    if config.emitter is not None:
+        _set(sensor, rs.option.emitter_enabled, int(config.emitter), "emitter")
+    if sensor.supports(rs.option.global_time_enabled):
+        _set(sensor, rs.option.global_time_enabled, int(config.global_time), "global_time")
+
+
+def _set(
+    sensor: Any, option: Any, value: int, name: Literal["preset", "emitter", "global_time"]
+) -> None:
+    if not sensor.supports(option) or sensor.is_option_read_only(option):
+        raise InputError(f"this RealSense has no {name} to set; leave the option out.")
+    sensor.set_option(option, value)
+
+
+def _tied_to_host(rs: ModuleType, sensor: Any) -> bool:
+    option = rs.option.global_time_enabled
+    return bool(sensor.supports(option) and sensor.get_option(option))

@@ -1,0 +1,171 @@
+"""A recording as a source: at the pace of its stamps, or as fast as the loop takes it."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import ClassVar, Literal
+
+from tumortrack.core.errors import InputError
+from tumortrack.live.recording.bags import BagChoice, BagReel, is_bag
+from tumortrack.live.recording.folders import open_folder
+from tumortrack.live.recording.shots import Content, Reel, Shot
+from tumortrack.live.values import Seen, SourceConfig, SourceEnded, SourceLost
+
+# Less than what the loop takes for a frozen source.
+_LONGEST_WAIT_S = 2.0
+_PERIOD_NS = 33_333_333  # of a recording of one frame that is played again
+
+
+class Recording(SourceConfig, frozen=True, kw_only=True, tag="recording"):
+    """Frames from disk: a folder (clouds, depth images, scene folders), a rosbag2 or ROS 1 bag,
+    or what the sink ``recording`` wrote.
+
+    Attributes:
+        rate: 1 plays at the pace of the stamps, 2 twice as fast; 0: every frame, as fast as the
+            loop takes them. Pauses of more than 2 s are cut to 2 s.
+        loop: begin again at the end; stamps go on rising.
+        fps: of files that state no time.
+        unit: of loose cloud files; bags are in metres, as ROS is, depth images state theirs.
+        topic, info_topic: of a bag with several.
+        rectified: the bag's camera_info means its P (a rectified image).
+        unit_mm: one step of a bag's 16-bit depth images.
+    """
+
+    target: ClassVar[str] = "path"
+
+    path: Path
+    rate: float = 1.0
+    loop: bool = False
+    fps: float = 30.0
+    unit: Literal["mm", "m"] = "mm"
+    topic: str = ""
+    info_topic: str = ""
+    rectified: bool = False
+    unit_mm: float = 1.0
+
+    def __post_init__(self) -> None:
+        if self.rate != 0 and not 0.01 <= self.rate <= 100:
+            raise InputError(
+                f"recording: rate is {self.rate:g}; it must lie in 0.01..100, or be 0 for as fast "
+                "as it goes."
+            )
+        if not 0.01 <= self.fps <= 1000:
+            raise InputError(f"recording: fps is {self.fps:g}; it must lie in 0.01..1000.")
+        if not 0 < self.unit_mm <= 100:
+            raise InputError(f"recording: unit_mm is {self.unit_mm:g}; it must lie in 0..100 mm.")
+
+    def open(self) -> RecordingSource:
+        """Find the frames; none is read yet.
+
+        Raises:
+            InputError: nothing there that could be played.
+        """
+        return RecordingSource(self._reel(), self.rate, self.loop)
+
+    def _reel(self) -> Reel:
+        if not self.path.exists():
+            raise InputError(f"{self.path} does not exist, so it cannot be played.")
+        if is_bag(self.path):
+            choice = BagChoice(self.topic, self.info_topic, self.rectified, self.unit_mm)
+            return BagReel(self.path, choice)
+        return open_folder(self.path, self.fps, self.unit)
+
+
+class RecordingSource:
+    """Plays a reel. Frames that were due before they could be read are dropped, unless ``waits``.
+
+    A damaged frame is an InputError of its own, and the next read goes on behind it.
+    """
+
+    host_clock = False  # the stamps are those of the recording
+
+    def __init__(self, reel: Reel, rate: float, loop: bool) -> None:
+        self.waits = rate == 0
+        self.dropped = 0
+        self._reel, self._rate = reel, rate
+        self._shots = _endless(reel) if loop else reel.shots()
+        self._next: Shot | None = None
+        self._shown_ns: int | None = None  # stamp of the shot before
+        self._due_s = 0.0  # when the next one is due, by time.monotonic
+        self._closed = threading.Event()
+        self._lock = threading.Lock()  # close may come while a frame is being read
+
+    def read(self, timeout_s: float) -> Seen | None:
+        """
+        Raises:
+            InputError: this frame is damaged.
+            SourceEnded: that was all.
+            SourceLost: it was closed.
+        """
+        with self._lock:
+            shot = self._newest_due()
+        if shot is None:
+            self._closed.wait(min(timeout_s, max(self._due_s - time.monotonic(), 0)))
+            with self._lock:
+                shot = self._newest_due()
+        if shot is None:
+            return None
+        with self._lock:
+            content = shot.load()
+        return Seen(content.frame, time.time_ns(), content.mask, content.truth)
+
+    def close(self) -> None:
+        self._closed.set()
+        with self._lock:
+            self._reel.close()
+
+    def _newest_due(self) -> Shot | None:
+        """The last shot whose time has come; those before it were missed."""
+        due: Shot | None = None
+        while True:
+            if self._closed.is_set():
+                raise SourceLost("the recording is closed; open it again.")
+            if self._next is None:
+                self._advance()
+            if self._next is None and due is None:
+                raise SourceEnded("the recording is at its end.")
+            if self._next is None or self._due_s > time.monotonic():
+                return due
+            self.dropped += due is not None
+            due, self._next = self._next, None
+            if self.waits:
+                return due
+
+    def _advance(self) -> None:
+        """Look at the next shot, if there is one, and find out when it is due."""
+        self._next = next(self._shots, None)
+        if self._next is None:
+            return
+        if self._shown_ns is None or self.waits:
+            self._due_s = time.monotonic()
+        else:
+            gap_s = max(self._next.stamp_ns - self._shown_ns, 0) * 1e-9 / self._rate
+            self._due_s += min(gap_s, _LONGEST_WAIT_S)
+        self._shown_ns = self._next.stamp_ns
+
+
+def _endless(reel: Reel) -> Iterator[Shot]:
+    """The reel again and again, each time later by its length and one period."""
+    shift_ns = 0
+    while True:
+        stamps_ns = set()
+        for shot in reel.shots():
+            stamps_ns.add(shot.stamp_ns)
+            yield shot if shift_ns == 0 else _later(shot, shift_ns)
+        if not any(stamps_ns):
+            return  # nothing in it can be read
+        length_ns = max(stamps_ns) - min(stamps_ns)
+        shift_ns += length_ns + (length_ns // max(len(stamps_ns) - 1, 1) or _PERIOD_NS)
+
+
+def _later(shot: Shot, shift_ns: int) -> Shot:
+    def load() -> Content:
+        content = shot.load()
+        stamp_ns = content.frame.stamp_ns + shift_ns
+        return replace(content, frame=replace(content.frame, stamp_ns=stamp_ns))
+
+    return Shot(shot.stamp_ns + shift_ns, load)

@@ -1,0 +1,133 @@
+"""A made-up operating room in real time: a case that breathes and is pushed, before a D405."""
+
+from __future__ import annotations
+
+import threading
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, ClassVar
+
+from tumortrack.core.errors import InputError
+from tumortrack.live.values import Seen, SourceConfig, SourceLost
+
+if TYPE_CHECKING:
+    from tumortrack.simulate.player.player import Theatre
+
+
+class Virtual(SourceConfig, frozen=True, kw_only=True, tag="virtual"):
+    """A case folder in motion (``simulate.player``).
+
+    Attributes:
+        case: the folder that ``prepare`` wrote.
+        fps: frames a second; what the machine doesn't manage counts as dropped.
+        distance_mm: depth of the organ's nearest point, before all motion.
+        seed: pose, places that are pushed, tissue and noise follow from it.
+        table, drape: what lies about the organ.
+        instrument: a shaft that comes and pushes, else nothing does.
+        breathing, camera_motion, noise: the rest that can be switched off.
+    """
+
+    target: ClassVar[str] = "case"
+
+    case: Path
+    fps: float = 30.0
+    width: int = 424
+    height: int = 240
+    distance_mm: float = 118.0
+    seed: int = 0
+    table: bool = True
+    drape: bool = False
+    instrument: bool = True
+    breathing: bool = True
+    camera_motion: bool = True
+    noise: bool = True
+
+    def __post_init__(self) -> None:
+        if not 0.1 <= self.fps <= 1000:
+            raise InputError(f"virtual: fps is {self.fps:g}; it must lie in 0.1..1000.")
+        if self.seed < 0:
+            raise InputError(f"virtual: seed is {self.seed}; it must be 0 or more.")
+
+    def theatre(self) -> Theatre:
+        """The room that this shows; building it takes some seconds.
+
+        Raises:
+            ArtifactError: no case there.
+            InputError: a case or options that make no scene.
+        """
+        from tumortrack.imaging.case import load_case
+        from tumortrack.sense.noise import CLEAN, D405_NOISE
+        from tumortrack.simulate.player.player import Theatre, TheatreConfig
+
+        normal = TheatreConfig()
+        config = TheatreConfig(
+            width=self.width,
+            height=self.height,
+            distance_mm=self.distance_mm,
+            breath_mm=normal.breath_mm if self.breathing else 0.0,
+            swell=normal.swell if self.breathing else 0.0,
+            push_mm=normal.push_mm if self.instrument else 0.0,
+            sway_mm=normal.sway_mm if self.camera_motion else 0.0,
+            sway_degrees=normal.sway_degrees if self.camera_motion else 0.0,
+            table=self.table,
+            drape=self.drape,
+            noise=D405_NOISE if self.noise else CLEAN,
+        )
+        case = load_case(self.case)
+        return Theatre(case.anatomy, case.up_lps, config, self.seed)
+
+    def open(self) -> VirtualSource:
+        """Build the room; its time begins with the first read.
+
+        Raises:
+            ArtifactError: no case there.
+            InputError: a case or options that make no scene.
+        """
+        return VirtualSource(self.theatre(), self.fps)
+
+
+class VirtualSource:
+    """Renders the theatre as it is now, ``fps`` times a second; ``Seen.truth`` has its surfaces."""
+
+    host_clock = True
+    waits = False
+
+    def __init__(self, theatre: Theatre, fps: float) -> None:
+        self.theatre = theatre
+        self.dropped = 0
+        self._period_s = 1 / fps
+        self._begin: float | None = None  # of the theatre's time, by time.monotonic
+        self._next = 0  # number of the frame that is due next
+        self._closed = threading.Event()
+
+    def read(self, timeout_s: float) -> Seen | None:
+        """The frame that is due, once it is; None if that is later. Frames whose time passed
+        unread are dropped.
+
+        Raises:
+            SourceLost: it was closed.
+        """
+        if self._begin is None:
+            self._begin = time.monotonic()
+        due = self._begin + self._next * self._period_s
+        wait_s = due - time.monotonic()
+        if self._closed.wait(max(min(wait_s, timeout_s), 0)):
+            raise SourceLost("the virtual source is closed; open it again.")
+        stamp_ns, t_s = time.time_ns(), time.monotonic() - self._begin
+        if t_s < self._next * self._period_s:
+            return None
+        number = int(t_s / self._period_s)
+        self.dropped += max(number - self._next, 0)
+        self._next = max(number, self._next) + 1
+        return self.at(t_s, stamp_ns)
+
+    def at(self, t_s: float, stamp_ns: int) -> Seen:
+        """The theatre at a time since its beginning: what ``read`` gives, without a clock."""
+        instant = self.theatre.state_at(t_s)
+        truth = self.theatre.truth(instant)
+        frame = self.theatre.frame(instant, truth, stamp_ns)
+        return Seen(frame, arrived_ns=time.time_ns(), truth=truth)
+
+    def close(self) -> None:
+        """Wake who reads, and end; may be called twice."""
+        self._closed.set()

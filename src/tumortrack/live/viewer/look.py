@@ -1,0 +1,109 @@
+"""From where the scene is looked at, and in what light."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+
+from tumortrack.core.types import Mesh
+from tumortrack.live.values import Frames, Workcell
+from tumortrack.live.viewer.workcell import box_of
+
+if TYPE_CHECKING:
+    from viser import CameraHandle, ClientHandle, ViserServer
+
+View = Literal["organ", "arms"]
+
+_FIRST_LOOK_MM = 130.0
+_FOV_RADIANS = 0.9
+# Onto a workcell: from before it, somewhat from the left and from above; its frame's z is up.
+_OVERVIEW_FROM, _UP = np.array([-0.45, -1.0, 0.6]), np.array([0.0, 0.0, 1.0])
+_ROOM = 0.85  # a cell is wide and flat: its box fits into less than its sphere
+_NEAR_MM, _FAR_MM = 0.5, 20_000.0  # viser draws its background 1 before the eye
+# In the camera's frame: one above the camera and left of it, a weaker one from behind the organ.
+_LIGHTS = (("/light", 2.6, (-60.0, -120.0, -130.0)), ("/light_behind", 1.5, (60.0, -120.0, 130.0)))
+
+
+class Look:
+    """New visitors look from the depth camera's place along its axis, its y axis down."""
+
+    def __init__(self, server: ViserServer, frames: Frames) -> None:
+        way = frames.published_from_camera
+        self._server = server
+        self._aimed = False
+        self._eye_mm = way[:3, 3]
+        self._way = way
+        self._organ_mm = way[:3, 3] + _FIRST_LOOK_MM * way[:3, 2]
+        self._cell: Workcell | None = None  # the last there was
+        server.scene.set_up_direction(-way[:3, 1])
+        first = server.initial_camera
+        first.fov, first.near, first.far = _FOV_RADIANS, _NEAR_MM, _FAR_MM
+        first.position, first.up = way[:3, 3], -way[:3, 1]
+        first.look_at = self._organ_mm
+        # Light from the camera's side, as an endoscope gives it, some from behind, no shadows.
+        server.scene.configure_default_lights(False)
+        server.scene.configure_environment_map(None)
+        server.scene.add_light_ambient("/ambient", intensity=0.9)
+        for name, intensity, place in _LIGHTS:
+            x, y, z = (way[:3, :3] @ place).tolist()
+            server.scene.add_light_directional(name, intensity=intensity, position=(x, y, z))
+        server.on_client_connect(self._follow)
+
+    def aim(self, frames: Frames, depth_mm: float) -> None:
+        """Turn about the organ from now on, once its distance is known."""
+        if self._aimed:
+            return
+        self._aimed = True
+        way = frames.published_from_camera
+        self._organ_mm = way[:3, 3] + depth_mm * way[:3, 2]
+        if self._cell is not None:
+            return  # they look at the whole workcell
+        self._server.initial_camera.look_at = self._organ_mm
+        for client in self._server.get_clients().values():
+            client.camera.look_at = self._organ_mm
+
+    def oversee(self, cell: Workcell) -> None:
+        """There is a workcell: when it comes first, all look at it whole."""
+        first, self._cell = self._cell is None, cell
+        if not first:
+            return
+        eye_mm, middle_mm, up = self._overview()
+        camera = self._server.initial_camera
+        camera.position, camera.look_at, camera.up = eye_mm, middle_mm, up
+        for client in self._server.get_clients().values():
+            self.turn(client, "arms")
+
+    def turn(self, client: ClientHandle, towards: View) -> None:
+        """Let a visitor look at the organ from the camera's place, or at the whole workcell."""
+        if towards == "organ":
+            eye_mm, middle_mm, up = self._way[:3, 3], self._organ_mm, -self._way[:3, 1]
+        else:
+            eye_mm, middle_mm, up = self._overview()
+        with client.atomic():
+            client.camera.up_direction = up
+            client.camera.position = eye_mm
+            client.camera.look_at = middle_mm
+
+    def _overview(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Eye, what it looks at, up."""
+        box_mm = None if self._cell is None else box_of(self._cell)
+        if box_mm is None:
+            return self._way[:3, 3], self._organ_mm, -self._way[:3, 1]
+        middle_mm = box_mm.mean(0)
+        radius_mm = float(np.linalg.norm(np.ptp(box_mm, axis=0))) / 2
+        away = _OVERVIEW_FROM / np.linalg.norm(_OVERVIEW_FROM)
+        return middle_mm + _ROOM * radius_mm / np.tan(_FOV_RADIANS / 2) * away, middle_mm, _UP
+
+    def last_drawn(self, surface: Mesh) -> Mesh:
+        """The same triangles, and two idle vertices that put the middle of all into the eye of
+        whoever moved last. Browsers draw translucent surfaces in the order of their middles: the
+        organ must be the last, or it covers the margins that lie within."""
+        half = np.abs(surface.vertices_mm - self._eye_mm).max(0)
+        corners = [self._eye_mm - half, self._eye_mm + half]
+        return Mesh(np.concatenate([surface.vertices_mm, corners]), surface.faces)
+
+    def _follow(self, client: ClientHandle) -> None:
+        @client.camera.on_update
+        def _(camera: CameraHandle) -> None:
+            self._eye_mm = camera.position

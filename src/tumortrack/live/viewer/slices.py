@@ -1,0 +1,188 @@
+"""Slices of the CT through the present scene: every pixel is carried back into the CT."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, Float32, Float64, UInt8
+
+from tumortrack.core.colours import Colour
+from tumortrack.core.errors import InputError
+from tumortrack.core.geometry import spacing_mm, transform_points
+from tumortrack.core.motion import Motion
+from tumortrack.core.types import Mesh
+from tumortrack.imaging.case import Case, load_case
+from tumortrack.live.values import Setting, Update
+
+# Directions of the image's columns and rows in the camera frame (x right, y down, z forward).
+ORIENTATIONS: dict[str, tuple[tuple[float, ...], tuple[float, ...]]] = {
+    "facing the camera": ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0)),
+    "horizontal, camera above": ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0)),
+    "vertical, camera left": ((0.0, 0.0, 1.0), (0.0, 1.0, 0.0)),
+}
+_SURE_MM, _UNSURE_MM = 5.0, 20.0  # outside the organ the motion is a guess: the CT fades out
+_FAINT = 0.3
+_SLICE_ROOM = 1.15  # side of a slice in the organ's largest extent
+_SAME_ORGAN_MM = 3.0  # a case's surface may differ from the model's by so much
+_BAR_MM = 10
+_FINER = 2
+_COARSER = 2  # the CT is sampled coarser: a pixel in the panel is less than a voxel
+
+
+@dataclass(frozen=True, eq=False)
+class Plane:
+    """A square in the camera frame: centre, unit directions of columns and rows, side; mm."""
+
+    centre_mm: Float64[np.ndarray, " 3"]
+    across: Float64[np.ndarray, " 3"]
+    down: Float64[np.ndarray, " 3"]
+    side_mm: float
+
+    def points(self, pixels: int) -> Float64[np.ndarray, "n 3"]:
+        """The pixels' centres, row by row."""
+        steps = ((np.arange(pixels) + 0.5) / pixels - 0.5) * self.side_mm
+        rows = self.centre_mm + steps[:, None, None] * self.down
+        return (rows + steps[None, :, None] * self.across).reshape(-1, 3)
+
+    def section(self, mesh: Mesh) -> Float64[np.ndarray, "m 2 2"]:
+        """Where a surface crosses the plane, as segments; (column, row) in mm from the centre."""
+        offset = mesh.vertices_mm - self.centre_mm
+        height = offset @ np.cross(self.across, self.down)
+        flat = offset @ np.stack([self.across, self.down], axis=1)
+        above = height[mesh.faces] > 0
+        cut = mesh.faces[(above.any(1)) & (~above.all(1))]
+        ends = []
+        for a, b in ((0, 1), (1, 2), (2, 0)):
+            first, second = cut[:, a], cut[:, b]
+            with np.errstate(divide="ignore", invalid="ignore"):
+                share = (height[first] / (height[first] - height[second]))[:, None]
+                point = flat[first] + share * (flat[second] - flat[first])
+            crosses = (height[first] > 0) != (height[second] > 0)
+            ends.append(np.where(crosses[:, None], point, np.nan))
+        corners = np.stack(ends, axis=1)  # of the three, exactly two are points
+        return corners[~np.isnan(corners[:, :, 0])].reshape(-1, 2, 2)
+
+
+class CarriedCt:
+    """A case's CT, or its labels where it has none, as grey values at points of the CT."""
+
+    def __init__(self, case: Case) -> None:
+        from scipy.ndimage import distance_transform_edt
+
+        organ = case.labels.labels > 0
+        label_spacing = spacing_mm(case.labels.lps_from_index)
+        self._outside_mm = distance_transform_edt(~organ, sampling=label_spacing).astype(np.float32)
+        self._label_index_from_lps = np.linalg.inv(case.labels.lps_from_index)
+        if case.ct is not None:
+            self._values = case.ct.hu
+            self._index_from_lps = np.linalg.inv(case.ct.lps_from_index)
+            self._window = _window(self._at(self._values, _centres(organ, case), linear=False))
+        else:
+            self._values = case.labels.labels.astype(np.float32)
+            self._index_from_lps = self._label_index_from_lps
+            self._window = (-0.5, float(self._values.max()))
+        self._linear = case.ct is not None
+
+    def grey(self, points_ct: Float[np.ndarray, "n 3"]) -> UInt8[np.ndarray, " n"]:
+        """Grey values: 0 where there is no CT, faint far outside the organ."""
+        values = self._at(self._values, points_ct, self._linear)
+        low, high = self._window
+        share = np.clip((values - low) / (high - low), 0, 1)
+        index = transform_points(self._label_index_from_lps, points_ct)
+        outside = _sample(self._outside_mm, index, linear=True)
+        fade = np.interp(outside, (_SURE_MM, _UNSURE_MM), (1.0, _FAINT))
+        return np.nan_to_num(255 * share * fade).astype(np.uint8)
+
+    def _at(
+        self, values: np.ndarray, points_ct: Float[np.ndarray, "n 3"], linear: bool
+    ) -> Float32[np.ndarray, " n"]:
+        return _sample(values, transform_points(self._index_from_lps, points_ct), linear)
+
+
+def slice_picture(
+    ct: CarriedCt,
+    motion: Motion,
+    plane: Plane,
+    outlines: Iterable[tuple[Mesh, Colour, int]],
+    pixels: int,
+) -> UInt8[np.ndarray, "h w 3"] | None:
+    """The CT in a plane before the camera, over it the outlines of surfaces (camera frame) in
+    their colour and width (pixels), and a bar of 10 mm. None where ``motion`` knows no way back.
+    """
+    from PIL import Image, ImageDraw
+
+    sampled = pixels // _COARSER
+    points_ct = motion.back(plane.points(sampled))
+    if points_ct is None:
+        return None
+    grey = Image.fromarray(ct.grey(points_ct).reshape(sampled, sampled))
+    fine = _FINER * pixels  # lines are drawn finer and then shrunk, so that they are smooth
+    image = grey.resize((fine, fine), Image.Resampling.BILINEAR).convert("RGB")
+    draw = ImageDraw.Draw(image)
+    per_mm = fine / plane.side_mm
+    for mesh, colour, width in outlines:
+        for a, b in plane.section(mesh) * per_mm + fine / 2:
+            draw.line((*a.tolist(), *b.tolist()), fill=colour, width=_FINER * width)
+    edge, foot = fine / 32, fine - fine / 32
+    draw.line((edge, foot, edge + _BAR_MM * per_mm, foot), fill="white", width=_FINER * 3)
+    draw.text((edge, foot - 17 * _FINER), f"{_BAR_MM} mm", fill="white", font_size=12 * _FINER)
+    return np.asarray(image.resize((pixels, pixels), Image.Resampling.BOX))
+
+
+def _sample(values: np.ndarray, index: np.ndarray, linear: bool) -> Float32[np.ndarray, " n"]:
+    """Values at fractional indices, NaN outside the grid."""
+    from scipy.ndimage import map_coordinates
+
+    return map_coordinates(
+        values, index.T, output=np.float32, order=int(linear), mode="constant", cval=np.nan
+    )
+
+
+def _centres(organ: np.ndarray, case: Case) -> Float64[np.ndarray, "n 3"]:
+    """Voxels of the organ (each tenth) as points of the CT."""
+    return transform_points(case.labels.lps_from_index, np.argwhere(organ)[::10].astype(float))
+
+
+def _window(hu: Float32[np.ndarray, " n"]) -> tuple[float, float]:
+    """Black and white: the organ's values, and as much again round them."""
+    low, high = np.nanpercentile(hu, (1, 99))
+    room = max(50.0, 0.5 * float(high - low))
+    return float(low) - room, float(high) + room
+
+
+def load_ct(case: str, setting: Setting) -> CarriedCt:
+    """
+    Raises:
+        InputError: the model knows no motion, or the case is another patient's.
+        ArtifactError: ``case`` is no case.
+    """
+    loaded = load_case(Path(case))
+    if setting.anatomy_ct is None:
+        raise InputError(
+            "viewer: case= shows the CT at the present position, which this model cannot: its "
+            "estimates have no motion. Leave it out, or train with a preset that warps."
+        )
+    apart = np.abs(loaded.anatomy.organ.box_mm - setting.anatomy_ct.organ.box_mm).max()
+    if apart > _SAME_ORGAN_MM:
+        raise InputError(
+            f"viewer: {case} is not the case that the model was trained on: the organs' boxes in "
+            f"the CT differ by {apart:.1f} mm. Give that case."
+        )
+    return CarriedCt(loaded)
+
+
+def plane_through(update: Update, part: str, orientation: str) -> Plane | None:
+    """Through the middle of a part's present surface; centred on the organ, and as large."""
+    assert update.estimate is not None
+    meshes = update.estimate.meshes
+    if part not in meshes or "kidney" not in meshes:
+        return None
+    across, down = (np.array(axis) for axis in ORIENTATIONS[orientation])
+    normal = np.cross(across, down)
+    centre, middle = (meshes[name].box_mm.mean(0) for name in ("kidney", part))
+    everything = np.concatenate([mesh.box_mm for mesh in meshes.values()])
+    side = _SLICE_ROOM * float(np.ptp(everything, axis=0).max())
+    return Plane(centre + normal * (normal @ (middle - centre)), across, down, side)

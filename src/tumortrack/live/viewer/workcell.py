@@ -1,0 +1,123 @@
+"""What arms do, in the viewer's scene: shapes that move as wholes, and lines; published frame, mm.
+
+A shape's surface goes to the page once, then only its place; calls must not overlap, as in
+``view.scene``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import TYPE_CHECKING
+
+import numpy as np
+from jaxtyping import Float, Float64
+
+from tumortrack.live.values import Line, Shape, Workcell
+
+if TYPE_CHECKING:
+    from viser import FrameHandle, LineSegmentsHandle, MeshHandle, ViserServer
+
+_ROOT = "/workcell"
+
+
+class Cell:
+    """viser's nodes under ``/workcell``: ``shape/NAME`` and ``line/NAME``."""
+
+    def __init__(self, server: ViserServer) -> None:
+        self._nodes = server.scene
+        self._root: FrameHandle = self._nodes.add_frame(_ROOT, show_axes=False, visible=False)
+        self._shapes: dict[str, tuple[Shape, MeshHandle]] = {}
+        self._lines: dict[str, tuple[Line, LineSegmentsHandle]] = {}
+
+    def show(self, cell: Workcell) -> None:
+        """Show this, and nothing of what was shown before."""
+        drawn = [line for line in cell.lines if len(line.points_mm) > 1]
+        for name in _gone(self._shapes, cell.shapes):
+            self._shapes.pop(name)[1].remove()
+        for name in _gone(self._lines, drawn):
+            self._lines.pop(name)[1].remove()
+        places = np.array([shape.published_from_shape for shape in cell.shapes]).reshape(-1, 4, 4)
+        turns = wxyz_of(places[:, :3, :3]) if len(places) else ()  # all at once: 5 times quicker
+        for shape, wxyz in zip(cell.shapes, turns, strict=True):
+            self._put_shape(shape, wxyz)
+        for line in drawn:
+            self._put_line(line)
+        self._root.visible = True
+
+    def hide(self) -> None:
+        """Nothing of it stays visible."""
+        self._root.visible = False
+
+    def _put_shape(self, shape: Shape, wxyz: Float64[np.ndarray, " 4"]) -> None:
+        before, node = self._shapes.get(shape.name, (None, None))
+        if before is None or node is None or not _looks_alike(before, shape):
+            node = self._nodes.add_mesh_simple(
+                _node("shape", shape.name),
+                shape.mesh.vertices_mm.astype(np.float32),
+                shape.mesh.faces.astype(np.uint32),
+                color=shape.colour,
+                opacity=shape.opacity if shape.opacity < 1 else None,
+                flat_shading=True,
+                side="front",
+                cast_shadow=False,
+                receive_shadow=False,
+            )
+            before = None
+        way = shape.published_from_shape
+        if before is None or not np.array_equal(before.published_from_shape, way):
+            node.position, node.wxyz = way[:3, 3], wxyz
+        self._shapes[shape.name] = shape, node
+
+    def _put_line(self, line: Line) -> None:
+        points = line.points_mm.astype(np.float32)
+        segments = np.stack([points[:-1], points[1:]], axis=1)
+        before, node = self._lines.get(line.name, (None, None))
+        if before is None or node is None or not _drawn_alike(before, line):
+            node = self._nodes.add_line_segments(
+                _node("line", line.name),
+                segments,
+                line.colour,
+                thickness=line.width_mm,
+                thickness_units="world",
+            )
+        elif not np.array_equal(before.points_mm, line.points_mm):
+            node.points = segments
+        self._lines[line.name] = line, node
+
+
+def box_of(cell: Workcell) -> Float64[np.ndarray, "2 3"] | None:
+    """The box round all shapes' own boxes, as they stand; None without any."""
+    if not cell.shapes:
+        return None
+    boxes = np.array([shape.mesh.box_mm for shape in cell.shapes])  # (n, 2, 3)
+    ways = np.array([shape.published_from_shape for shape in cell.shapes])
+    middles = np.einsum("nij,nj->ni", ways[:, :3, :3], boxes.mean(1)) + ways[:, :3, 3]
+    halves = np.einsum("nij,nj->ni", np.abs(ways[:, :3, :3]), np.ptp(boxes, axis=1) / 2)
+    return np.stack([(middles - halves).min(0), (middles + halves).max(0)])
+
+
+def wxyz_of(rotation: Float[np.ndarray, "*n 3 3"]) -> Float[np.ndarray, "*n 4"]:
+    """Quaternions, as viser wants them."""
+    from scipy.spatial.transform import Rotation
+
+    return Rotation.from_matrix(rotation).as_quat(scalar_first=True)
+
+
+def _node(kind: str, name: str) -> str:
+    """Without further slashes: to viser they say that one node moves with another."""
+    return f"{_ROOT}/{kind}/{name.replace('/', ':')}"
+
+
+def _gone(shown: Iterable[str], now: Iterable[Shape | Line]) -> set[str]:
+    return set(shown) - {one.name for one in now}
+
+
+def _looks_alike(one: Shape, two: Shape) -> bool:
+    """Whether they differ in their place alone."""
+    shades = one.colour == two.colour and one.opacity == two.opacity
+    return shades and one.mesh is two.mesh
+
+
+def _drawn_alike(one: Line, two: Line) -> bool:
+    """Whether they differ in their points alone."""
+    return one.colour == two.colour and one.width_mm == two.width_mm

@@ -1,0 +1,131 @@
+"""PointNet++ (Qi et al., NIPS 2017): set abstraction levels, then one global level."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from tumortrack.core.config import Config
+from tumortrack.models.layers import Layer, Norm, stack
+from tumortrack.models.pooling import greatest, greatest_above_zero
+from tumortrack.models.sampling import (
+    Sampling,
+    ball_query,
+    choose_points,
+    strided_points,
+    take,
+    traced,
+)
+
+_AT_ONCE = 128  # centres
+
+
+class SetAbstraction(Config, frozen=True):
+    """One level: choose centres among the points, describe each by its neighbours.
+
+    ``ratio``: centres per point (rounded up). ``radius``: of the ball, in normalised units.
+    ``neighbours``: at most so many in a ball. ``widths``: of the MLP, whose maximum over the
+    neighbours is the centre's feature.
+    """
+
+    ratio: float
+    radius: float
+    neighbours: int
+    widths: tuple[int, ...]
+
+
+class PointNet2Config(Config, frozen=True, tag="pointnet2"):
+    """``levels``, then an MLP of ``widths`` on [position, feature] and its maximum: the latent.
+
+    ``n_points``: larger clouds are first thinned to so many, by stride (None: take all).
+    ``sampling``: how the centres are chosen. Stride needs points in random order.
+    """
+
+    levels: tuple[SetAbstraction, ...]
+    widths: tuple[int, ...]
+    norm: Norm = "batch"
+    sampling: Sampling = "fps"
+    n_points: int | None = None
+
+    @property
+    def latent_size(self) -> int:
+        return self.widths[-1]
+
+    def build(self) -> PointNet2:
+        """The network, with weights from torch's global generator."""
+        return PointNet2(self)
+
+
+class PointNet2(nn.Module):
+    """Normalised points (B, N, 3) -> latent (B, L); N may differ from call to call."""
+
+    def __init__(self, config: PointNet2Config) -> None:
+        super().__init__()
+        self.config = config
+        features = [0, *(level.widths[-1] for level in config.levels)]
+        self.levels = nn.ModuleList(
+            _Level(level, n_features, config)
+            for level, n_features in zip(config.levels, features, strict=False)
+        )
+        self.summary = stack((3 + features[-1], *config.widths), config.norm)
+
+    def forward(self, points: Tensor) -> Tensor:
+        limit = self.config.n_points
+        if limit is not None and points.shape[1] > limit:
+            points = take(points, strided_points(points, limit))
+        features: Tensor | None = None
+        for level in self.levels:
+            points, features = level(points, features)
+        summary = points if features is None else torch.cat([points.to(features), features], -1)
+        out: Tensor = self.summary(summary).amax(dim=1)
+        return out
+
+
+class _Level(nn.Module):
+    """Points (B, N, 3) and features (B, N, F) or none -> centres (B, M, 3), features (B, M, G).
+
+    The first linear layer on [p_j - c_i, f_j] is W_p (p_j - c_i) + W_f f_j: the second product
+    is made once per point, before the neighbours are gathered. Offsets are taken in full
+    precision and divided by the radius.
+    """
+
+    def __init__(self, level: SetAbstraction, n_features: int, config: PointNet2Config) -> None:
+        super().__init__()
+        self.level, self.sampling = level, config.sampling
+        self.first = Layer(3 + n_features, level.widths[0], config.norm)
+        self.rest = stack(level.widths, config.norm)
+
+    def forward(self, points: Tensor, features: Tensor | None) -> tuple[Tensor, Tensor]:
+        level, n = self.level, points.shape[1]
+        chosen = choose_points(points, math.ceil(level.ratio * n), self.sampling)
+        centres = take(points, chosen)
+        neighbours = ball_query(points, centres, level.radius, level.neighbours)
+        weight, shared = self.first.linear.weight, None
+        if features is not None:
+            shared = functional.linear(features, weight[:, 3:])
+        if torch.is_grad_enabled() or traced() or points.device.type != "cpu":
+            return centres, self._described(points, centres, neighbours, shared)
+        # For use alone: what a part of the centres needs stays in the cache.
+        pairs = zip(centres.split(_AT_ONCE, 1), neighbours.split(_AT_ONCE, 1), strict=True)
+        return centres, torch.cat([self._described(points, *pair, shared) for pair in pairs], 1)
+
+    def _described(
+        self, points: Tensor, centres: Tensor, neighbours: Tensor, shared: Tensor | None
+    ) -> Tensor:
+        """Features (B, M, G) of centres (B, M, 3) from their neighbours (B, M, K)."""
+        offsets = (take(points, neighbours) - centres[:, :, None]) / self.level.radius
+        linear = self.first.linear
+        grouped = functional.linear(offsets, linear.weight[:, :3], linear.bias)
+        if shared is not None:
+            grouped = grouped + take(shared, neighbours)
+        hidden = self.first.activate(grouped)
+        layers = [layer for layer in self.rest if isinstance(layer, Layer)]
+        learns = torch.is_grad_enabled() and len(layers) == len(self.rest)
+        if not learns:  # for use, others may have taken the layers' place
+            return greatest(self.rest(hidden))
+        for layer in layers[:-1]:
+            hidden = layer(hidden)
+        return greatest_above_zero(layers[-1].before_relu(hidden))

@@ -1,0 +1,208 @@
+"""Locating with an occupancy network: ask for labels, coarse first, then where it is not plain."""
+
+from __future__ import annotations
+
+import math
+from contextlib import AbstractContextManager, suppress
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import torch
+from jaxtyping import Float, Float16, Float32, Float64, UInt8
+
+from tumortrack.core.errors import NoEstimate
+from tumortrack.core.estimate import Estimate, Following
+from tumortrack.core.types import Anatomy, CameraLabels, OccupancyCloud, SensorCloud
+from tumortrack.models.in_distribution import (
+    FIT_STEPS,
+    check_familiar,
+    fit_mm,
+    spread_mm,
+    surface_distances,
+)
+from tumortrack.models.report import fit_report, report_head, stage
+from tumortrack.models.volume import (
+    describe_parts,
+    drop_islands,
+    grid_over,
+    keep_largest_pieces,
+    margins_on,
+    part_surfaces,
+)
+from tumortrack.occupancy.inference import Inference
+from tumortrack.occupancy.lattice import Lattice, lattice_over
+from tumortrack.occupancy.network import OccupancyNetwork
+from tumortrack.occupancy.organ_lattice import leaves, organ_lattice
+from tumortrack.occupancy.sparse import halved_lattice, leading, sparse_logits, sparse_margins
+from tumortrack.sense.cloud import check_cloud, thin_cloud
+from tumortrack.training.model import Model
+
+COARSE_QUERIES = 10_000
+FINE_QUERIES = 40_000
+FEWEST_INSIDE = 20  # of the coarse queries: fewer are no organ
+_LATTICE_MM = 4.5  # at most: always within a ball of 7.8 mm
+_LIVE_MARGIN = 0.1  # of the organ's extent: how far it may move from one live frame to the next
+
+Box = Float[np.ndarray, "2 3"]
+
+
+class OccupancyLocator:
+    """Locates by an occupancy network; its estimates have no motion."""
+
+    anatomy_ct: Anatomy | None = None
+
+    def __init__(self, model: Model) -> None:
+        assert isinstance(model.network, OccupancyNetwork)
+        self.model = model
+        self._inference = Inference(model.network, model.arithmetic)
+
+    def locate(self, cloud: SensorCloud, grid: int, seed: int) -> Estimate:
+        """See ``tracking.tracker.Tracker.locate``.
+
+        The two passes of queries follow the follow-up (LUDO): 10,000 coarse ones where the organ
+        can be, then labels of 40,000 points in the box of those inside, enlarged.
+        """
+        frame = _Frame(self.model, self._inference, cloud, seed, np.random.default_rng(seed))
+        lattice = frame.lattice(frame.coarse_box())
+        frame.check(lattice)
+        inside = frame.inside(lattice)
+        with frame.stage("volume"):
+            camera_from_index, shape = grid_over(inside.points_mm, grid)
+            margins, labels = sparse_margins(frame.logits_at, camera_from_index, shape)
+        return frame.estimate(inside, margins, labels, camera_from_index)
+
+    def follow(self, cloud: SensorCloud, last: Estimate | None, how: Following) -> Estimate:
+        """See ``tracking.tracker.Tracker.follow``.
+
+        The last organ's box, enlarged, stands for the coarse queries, and in it the lattice is
+        asked only where the organ is (``organ_lattice``). Where this frame's organ reaches the
+        box's border, without a last estimate, or with ``thorough``, the organ is looked for as in
+        a first frame, and the lattice asked everywhere. The surfaces' grid is twice as fine as
+        the lattice, and asked only about surfaces.
+        """
+        rng = np.random.default_rng((how.seed, cloud.stamp_ns))
+        frame = _Frame(self.model, self._inference, cloud, how.seed, rng)
+        lattice = None
+        if last is not None and not how.thorough:
+            low, high = last.cloud.points_mm.min(0), last.cloud.points_mm.max(0)
+            margin = _LIVE_MARGIN * float((high - low).max())
+            lattice = frame.lattice(np.stack([low - margin, high + margin]).astype(float))
+            if leaves(lattice):
+                lattice = None
+        if lattice is None:
+            lattice = frame.lattice(frame.coarse_box(), everywhere=True)
+        frame.check(lattice)
+        with frame.stage("volume"):
+            finer = halved_lattice(frame.logits_at, lattice)
+        inside = frame.inside(finer)
+        return replace(frame.estimate(inside, *margins_on(finer)), volume=None)
+
+    def warm(self) -> None:
+        """See ``tracking.tracker.Tracker.warm``."""
+        rng = np.random.default_rng(0)
+        points = rng.normal(0, 15, (self.model.config.scene.cloud.n_points, 3)) + [0, 0, 150]
+        frame = _Frame(self.model, self._inference, SensorCloud(points), 0, rng)
+        box = self.model.query_box_mm + np.median(points, axis=0)
+        finer = halved_lattice(frame.logits_at, frame.lattice(box))
+        for step in (frame.inside, frame.check):
+            with suppress(NoEstimate):  # it is no organ
+                step(finer)
+        ball = np.linalg.norm(np.indices((16, 16, 16)).T - 7.5, axis=-1) < 5
+        margins = np.where(ball, 1, -1).astype(np.float16)[None]
+        for mesh in part_surfaces(margins, ball.astype(np.uint8), np.eye(4), ("kidney",)).values():
+            assert mesh.volume_mm3 > 0
+
+
+def steps_over(box: Box) -> int:
+    """Of the lattice along a box's longest side."""
+    return max(FIT_STEPS, math.ceil(float((box[1] - box[0]).max()) / _LATTICE_MM))
+
+
+@dataclass(eq=False)
+class _Frame:
+    """One cloud's work, from its latent to the estimate."""
+
+    model: Model
+    inference: Inference
+    cloud: SensorCloud
+    seed: int
+    rng: np.random.Generator
+    seconds: dict[str, float] = field(default_factory=dict)
+    distances_mm: Float32[np.ndarray, " n"] | None = None
+
+    def __post_init__(self) -> None:
+        check_cloud(self.cloud)
+        self.thinned = thin_cloud(self.cloud, self.model.config.scene.cloud.n_points, self.rng)
+        with self.stage("encode"):
+            self.latent = self.inference.encode(self.thinned.points_mm)
+
+    def stage(self, name: str) -> AbstractContextManager[None]:
+        return stage(self.seconds, name, self.inference.device)
+
+    def logits_at(self, points_mm: Float32[np.ndarray, "n 3"]) -> torch.Tensor:
+        return self.inference.logits(self.latent, points_mm)
+
+    def coarse_box(self) -> Box:
+        """Where the organ is."""
+        lower, upper = self.model.query_box_mm + np.median(self.cloud.points_mm, axis=0)
+        points = self.rng.uniform(lower, upper, (COARSE_QUERIES, 3)).astype(np.float32)
+        with self.stage("coarse"):
+            inside = points[self.logits_at(points).argmax(-1).cpu().numpy() > 0]
+        if len(inside) < FEWEST_INSIDE:
+            raise NoEstimate(
+                f"no organ was found: {len(inside)} of {COARSE_QUERIES} queries round the cloud "
+                "lie inside. Does the cloud show this model's organ, freed of its background?"
+            )
+        gap = float((np.prod(upper - lower) / COARSE_QUERIES) ** (1 / 3))
+        low, high = inside.min(0), inside.max(0)
+        margin = 0.05 * (high - low) + gap / 2
+        return np.stack([low - margin, high + margin])
+
+    def lattice(self, box: Box, everywhere: bool = False) -> Lattice:
+        over = lattice_over if everywhere else organ_lattice
+        with self.stage("lattice"):
+            return over(self.logits_at, box, steps_over(box))
+
+    def check(self, lattice: Lattice) -> None:
+        """Refuse what cannot be the organ."""
+        with self.stage("fit"):
+            self.distances_mm = surface_distances(lattice, self.thinned.points_mm)
+            spread = spread_mm(self.thinned.points_mm)
+            check_familiar(self.model.familiar, spread, fit_mm(self.distances_mm))
+
+    def inside(self, lattice: Lattice) -> OccupancyCloud:
+        """Those of 40,000 random points in the lattice's box that lie inside."""
+        with self.stage("fine"):
+            low, high = lattice.box_mm
+            points = self.rng.uniform(low, high, (FINE_QUERIES, 3)).astype(np.float32)
+            logits = sparse_logits(self.logits_at, lattice, points)
+            labels = leading(logits)[0]
+            inside = labels > 0
+            probability = torch.from_numpy(logits[inside]).softmax(-1).amax(-1).numpy()
+        if inside.sum() < FEWEST_INSIDE:
+            raise NoEstimate("no organ was found: it has left the place where it was.")
+        stamp_ns = self.cloud.stamp_ns
+        return OccupancyCloud(points[inside], labels[inside], probability, stamp_ns)
+
+    def estimate(
+        self,
+        inside: OccupancyCloud,
+        margins: Float16[np.ndarray, "parts i j k"],
+        found: UInt8[np.ndarray, "i j k"],
+        camera_from_index: Float64[np.ndarray, "4 4"],
+    ) -> Estimate:
+        """Everything read off margins and labels of a grid."""
+        names = self.model.parts
+        assert self.distances_mm is not None
+        with self.stage("surfaces"):
+            labels = keep_largest_pieces(found, len(names))
+            inside = drop_islands(inside, found, labels, camera_from_index)
+            meshes = part_surfaces(margins, labels, camera_from_index, names)
+        report = {
+            **report_head(self.cloud, self.seed),
+            "voxel_mm": float(camera_from_index[0, 0]),
+            "fit_mm": fit_report(self.distances_mm),
+            "parts": describe_parts(names, meshes, inside),
+            "timings": {**self.seconds, "total": sum(self.seconds.values())},
+        }
+        return Estimate(inside, CameraLabels(labels, camera_from_index), meshes, report)

@@ -1,0 +1,184 @@
+"""The compiled parts of ``occupancy.sparse``."""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+
+
+@numba.njit(cache=True, nogil=True)
+def halved(coarse, fine, first, last):  # type: ignore[no-untyped-def]
+    """Logits at half the distance, linear between the coarse ones; planes ``first`` to ``last``.
+
+    Args:
+        coarse: (a, b, c, classes), float32.
+        fine: (2a - 1, 2b - 1, 2c - 1, classes); filled.
+    """
+    for i in range(first, last):
+        i0, i1 = i // 2, (i + 1) // 2
+        for j in range(fine.shape[1]):
+            j0, j1 = j // 2, (j + 1) // 2
+            for k in range(fine.shape[2]):
+                k0, k1 = k // 2, (k + 1) // 2
+                for n in range(fine.shape[3]):
+                    near = coarse[i0, j0, k0, n] + coarse[i0, j0, k1, n]
+                    near += coarse[i0, j1, k0, n] + coarse[i0, j1, k1, n]
+                    far = coarse[i1, j0, k0, n] + coarse[i1, j0, k1, n]
+                    far += coarse[i1, j1, k0, n] + coarse[i1, j1, k1, n]
+                    fine[i, j, k, n] = np.float32(0.125) * (near + far)
+
+
+@numba.njit(cache=True, nogil=True)
+def best(logits, labels, leads):  # type: ignore[no-untyped-def]
+    """The largest logit of every row (n, classes), and by how much it leads; both filled."""
+    for row in range(len(logits)):
+        first, second, label = np.float32(-np.inf), np.float32(-np.inf), 0
+        for n in range(logits.shape[1]):
+            value = logits[row, n]
+            if value > first:
+                first, second, label = value, first, n
+            elif value > second:
+                second = value
+        labels[row] = label
+        leads[row] = first - second
+
+
+@numba.njit(cache=True, nogil=True)
+def surprising(expected, found, limit):  # type: ignore[no-untyped-def]
+    """Which rows (n, classes) have another label than was expected, and the two labels' distance
+    off by more than the limit: (n,)."""
+    out = np.zeros(len(expected), np.bool_)
+    for row in range(len(expected)):
+        thought, label = 0, 0
+        for n in range(1, expected.shape[1]):
+            if expected[row, n] > expected[row, thought]:
+                thought = n
+            if found[row, n] > found[row, label]:
+                label = n
+        before = expected[row, thought] - expected[row, label]
+        now = found[row, label] - found[row, thought]
+        out[row] = thought != label and before + now > limit
+    return out
+
+
+@numba.njit(cache=True, nogil=True)
+def expected_at(coarse, shape, flat, out):  # type: ignore[no-untyped-def]
+    """``halved`` at some of the finer lattice's points (flat indices); ``out``: (n, classes)."""
+    for m in range(len(flat)):
+        i, rest = divmod(flat[m], shape[1] * shape[2])
+        j, k = divmod(rest, shape[2])
+        for n in range(coarse.shape[3]):
+            total = np.float32(0)
+            for a in (i // 2, (i + 1) // 2):
+                for b in (j // 2, (j + 1) // 2):
+                    for c in (k // 2, (k + 1) // 2):
+                        total += coarse[a, b, c, n]
+            out[m, n] = np.float32(0.125) * total
+
+
+@numba.njit(cache=True, nogil=True)
+def spread(labels, inside, outside, margins, first, last):  # type: ignore[no-untyped-def]
+    """Per part one of two values (bits of half precision) by the labels; planes first to last.
+
+    Args:
+        labels: (i, j, k); the first part is inside wherever there is a label.
+        margins: (parts, i, j, k), uint16; filled.
+    """
+    for i in range(first, last):
+        for j in range(labels.shape[1]):
+            row = labels[i, j]
+            for part in range(len(margins)):
+                out = margins[part, i, j]
+                if part == 0:
+                    for k in range(len(row)):
+                        out[k] = inside if row[k] > 0 else outside
+                else:
+                    for k in range(len(row)):
+                        out[k] = inside if row[k] == part + 1 else outside
+
+
+@numba.njit(cache=True, nogil=True)
+def filled(coarse, labels, plain, fine, first, last):  # type: ignore[no-untyped-def]
+    """The voxels between the points of the last lattice but one, cell by cell.
+
+    A cell whose corners agree and all lead by the limit holds no voxel that leads by less: it is
+    filled with their label. The voxels of all others are listed.
+
+    Args:
+        coarse, labels: logits (a, b, c, classes), and their labels.
+        plain: the labels that lead by the limit, 255 for the others.
+        fine: labels (i, j, k); filled.
+        first, last: coarse planes.
+
+    Returns:
+        Flat indices (n,) of the listed voxels, their linear logits (n, classes), and whether they
+        lie between coarse points.
+    """
+    classes = coarse.shape[3]
+    n_i, n_j, n_k = fine.shape
+    count = 0
+    listed = np.empty(4096, np.int64)
+    expected = np.empty((4096, classes), np.float32)
+    between = np.empty(4096, np.bool_)
+    together = np.empty(coarse.shape[2], np.uint8)
+    for i in range(first, last):
+        for j in range(coarse.shape[1]):
+            i1, j1 = min(i + 1, coarse.shape[0] - 1), min(j + 1, coarse.shape[1] - 1)
+            for k in range(coarse.shape[2]):  # 255: not sure of one label
+                one = plain[i, j, k]
+                same = one == plain[i, j1, k] and one == plain[i1, j, k] and one == plain[i1, j1, k]
+                together[k] = one if same else 255
+            for k in range(coarse.shape[2]):
+                k1 = min(k + 1, coarse.shape[2] - 1)
+                label = labels[i, j, k]
+                sure = together[k] == together[k1] and together[k] != 255
+                if count + 8 > len(listed):
+                    longer = np.empty(2 * len(listed), np.int64)
+                    longer[:count] = listed[:count]
+                    listed = longer
+                    more = np.empty((len(listed), classes), np.float32)
+                    more[:count] = expected[:count]
+                    expected = more
+                    wider = np.empty(len(listed), np.bool_)
+                    wider[:count] = between[:count]
+                    between = wider
+                for a in range(2 * i, min(2 * i + 2, n_i)):
+                    ia = (a + 1) // 2
+                    for b in range(2 * j, min(2 * j + 2, n_j)):
+                        jb = (b + 1) // 2
+                        for c in range(2 * k, min(2 * k + 2, n_k)):
+                            fine[a, b, c] = label
+                            if sure:
+                                continue
+                            kc = (c + 1) // 2
+                            for n in range(classes):
+                                near = coarse[i, j, k, n] + coarse[i, j, kc, n]
+                                near += coarse[i, jb, k, n] + coarse[i, jb, kc, n]
+                                far = coarse[ia, j, k, n] + coarse[ia, j, kc, n]
+                                far += coarse[ia, jb, k, n] + coarse[ia, jb, kc, n]
+                                expected[count, n] = np.float32(0.125) * (near + far)
+                            listed[count] = (a * n_j + b) * n_k + c
+                            between[count] = a % 2 + b % 2 + c % 2 > 0
+                            count += 1
+    return listed[:count].copy(), expected[:count].copy(), between[:count].copy()
+
+
+@numba.njit(cache=True, nogil=True)
+def neighbours(shape, frontier, known):  # type: ignore[no-untyped-def]
+    """The voxels that touch these and are not known yet: flat indices; they are marked as known,
+    for whoever asks them now."""
+    n_i, n_j, n_k = shape
+    found = np.empty(max(26 * len(frontier), 1), np.int64)
+    count = 0
+    for n in range(len(frontier)):
+        i, rest = divmod(frontier[n], n_j * n_k)
+        j, k = divmod(rest, n_k)
+        for a in range(max(i - 1, 0), min(i + 2, n_i)):
+            for b in range(max(j - 1, 0), min(j + 2, n_j)):
+                for c in range(max(k - 1, 0), min(k + 2, n_k)):
+                    at = (a * n_j + b) * n_k + c
+                    if not known[at]:
+                        known[at] = True
+                        found[count] = at
+                        count += 1
+    return found[:count].copy()

@@ -1,0 +1,238 @@
+"""Locating with a warp: place the pre-operative organ, then read everything off it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import msgspec
+import numpy as np
+from jaxtyping import Float, Float32, Int32, Int64, UInt8
+
+from tumortrack.core.estimate import Estimate, Following
+from tumortrack.core.types import Anatomy, CameraLabels, Mesh, OccupancyCloud, SensorCloud
+from tumortrack.imaging.raster import label_grid
+from tumortrack.models.in_distribution import check_familiar, check_likely, fit_mm, spread_mm
+from tumortrack.models.report import fit_report, report_head, stage
+from tumortrack.models.volume import describe_parts, grid_over
+from tumortrack.registration.gauss_newton import Refined, refine
+from tumortrack.registration.hypotheses import best_fit, first_motions
+from tumortrack.registration.label_probability import Nearest, normal_table, probabilities
+from tumortrack.registration.motion import WarpMotion, blend
+from tumortrack.registration.network import WarpNetwork
+from tumortrack.sense.cloud import check_cloud, thin_cloud
+from tumortrack.training.model import Model
+
+QUERIES = 40_000  # as many as the paper asks
+CARRIED = 20_000  # points of the undeformed organ that live estimates carry along
+_KNOWN_AT = 256  # places where the uncertainty is worked out; others take the nearest's
+_FIELD_MM = 0.3  # error of the distance fields and surfaces themselves
+_MOVED_MM = 2.5  # from one live frame to the next: more is found again from the start
+_BEHIND_MM = 2.0  # that a mean may lie behind: beyond, it begins anew
+
+
+@dataclass(frozen=True, eq=False)
+class _Inside:
+    """Points of the undeformed organ: where (CT, mm), label, distance to the nearest surface that
+    bounds it, and which place of known uncertainty is nearest."""
+
+    points_ct: Float32[np.ndarray, "n 3"]
+    labels: UInt8[np.ndarray, " n"]
+    margin_mm: Float32[np.ndarray, " n"]
+    known: Int32[np.ndarray, " n"]
+
+
+@dataclass(frozen=True, eq=False)
+class _Placed:
+    """A fit that can be this organ's: its motion, the surfaces that it moves (camera frame), and
+    one standard deviation (mm) at the known places and at the middle of each part's box."""
+
+    fit: Refined
+    motion: WarpMotion
+    meshes: dict[str, Mesh]
+    known_std_mm: Float[np.ndarray, " k"]
+    middles_std_mm: Float[np.ndarray, " parts"]
+
+
+class WarpLocator:
+    """Locates by a warp network and its refinement; its estimates have a motion."""
+
+    def __init__(self, model: Model) -> None:
+        assert isinstance(model.network, WarpNetwork)
+        assert model.shape is not None
+        assert model.trust is not None
+        self._model, self._network, self._shape = model, model.network, model.shape
+        self._trust = model.trust
+        self._device = next(model.network.parameters()).device
+        self._near = msgspec.structs.replace(model.config.refine, first_mm=_MOVED_MM)
+        anatomy = model.shape.anatomy_ct
+        organ = anatomy.organ
+        self.anatomy_ct: Anatomy | None = anatomy
+        few = max(1, len(organ.vertices_mm) // (_KNOWN_AT // 2))
+        inner = [part.vertices_mm for part in anatomy.tumors]
+        self._known_ct = np.concatenate(
+            [organ.vertices_mm[::few], *(v[:: max(1, len(v) // 64)] for v in inner)]
+        )
+        self._nearest_known = Nearest.of(self._known_ct)
+        self._middles_ct = np.array([part.box_mm.mean(0) for part in anatomy.parts])
+        vertices = np.concatenate([part.vertices_mm for part in anatomy.parts])
+        self._vertices_ct = vertices.astype(np.float32)
+        self._carried: _Inside | None = None
+
+    def locate(self, cloud: SensorCloud, grid: int, seed: int) -> Estimate:
+        """See ``tracking.tracker.Tracker.locate``."""
+        rng = np.random.default_rng(seed)
+        seconds: dict[str, float] = {}
+        points = self._thinned(cloud, rng)
+        with stage(seconds, "encode", self._device):
+            starts = first_motions(self._network, self._shape, points)
+        with stage(seconds, "refine", self._device):
+            refine, usual_cost = self._model.config.refine, self._trust.usual_cost
+            fit = best_fit(self._shape, points, starts, refine, usual_cost)
+        placed = self._placed(points, fit, seconds)
+        meshes = placed.meshes
+        organ = meshes[self._model.parts[0]]
+        with stage(seconds, "fine", self._device):
+            inside = self._asked(placed, organ, cloud.stamp_ns, rng)
+        with stage(seconds, "volume", self._device):
+            camera_from_index, shape = grid_over(organ.vertices_mm, grid)
+            anatomy = Anatomy(tuple(meshes.values()))
+            labels = label_grid(anatomy, camera_from_index, shape)
+        head = report_head(cloud, seed)
+        head["voxel_mm"] = float(camera_from_index[0, 0])
+        report = self._report(head, placed, inside, seconds)
+        volume = CameraLabels(labels, camera_from_index)
+        return Estimate(inside, volume, meshes, report, placed.motion)
+
+    def follow(self, cloud: SensorCloud, last: Estimate | None, how: Following) -> Estimate:
+        """See ``tracking.tracker.Tracker.follow``."""
+        rng = np.random.default_rng((how.seed, cloud.stamp_ns))
+        seconds: dict[str, float] = {}
+        points = self._thinned(cloud, rng)
+        start = last.unsmoothed if last is not None else None
+        usual, fits = self._trust.usual_cost, []
+        if isinstance(start, WarpMotion):
+            with stage(seconds, "follow", self._device):
+                fits.append(refine(self._shape, points, start, self._near))
+        if not fits or how.thorough or fits[0].cost > usual:
+            with stage(seconds, "encode", self._device):
+                starts = first_motions(self._network, self._shape, points)
+            with stage(seconds, "refine", self._device):
+                enough = usual if how.thorough or not fits else np.inf
+                config = self._model.config.refine
+                fits.append(best_fit(self._shape, points, starts, config, enough))
+        fit = min(fits, key=lambda fit: fit.cost)
+        unsmoothed, lag_s = fit.motion, 0.0
+        if last is not None and isinstance(last.motion, WarpMotion) and how.smoothing_s > 0:
+            past_s = (cloud.stamp_ns - last.cloud.stamp_ns) * 1e-9
+            share = -math.expm1(-past_s / how.smoothing_s)
+            smooth = blend(last.motion, unsmoothed, share)
+            behind = smooth.carry(self._known_ct) - unsmoothed.carry(self._known_ct)
+            if np.linalg.norm(behind, axis=1).max() < _BEHIND_MM:
+                fit = replace(fit, motion=smooth)
+                lag_s = past_s * (1 - share) / share  # of what moves steadily
+        placed = self._placed(points, fit, seconds)
+        with stage(seconds, "carry", self._device):
+            inside = self._carry(placed, cloud.stamp_ns)
+        report = self._report(report_head(cloud, how.seed), placed, inside, seconds)
+        report["smoothing"] = {"time_s": how.smoothing_s, "lag_ms": 1000 * lag_s}
+        return Estimate(inside, None, placed.meshes, report, placed.motion, unsmoothed)
+
+    def warm(self) -> None:
+        """See ``tracking.tracker.Tracker.warm``."""
+        rest = WarpMotion(
+            self._shape, np.eye(3), np.array([0.0, 0.0, 150.0]), self._shape.body.mean
+        )
+        cloud = SensorCloud(rest.carry(self._shape.anatomy_ct.organ.vertices_mm))
+        points = self._thinned(cloud, np.random.default_rng(0))
+        first_motions(self._network, self._shape, points)
+        fit = refine(self._shape, points, rest, self._near)
+        self._carry(self._moved(fit), 0)
+
+    def _thinned(self, cloud: SensorCloud, rng: np.random.Generator) -> Float32[np.ndarray, "n 3"]:
+        check_cloud(cloud)
+        return thin_cloud(cloud, self._model.config.scene.cloud.n_points, rng).points_mm
+
+    def _placed(
+        self, points: Float32[np.ndarray, "n 3"], fit: Refined, seconds: dict[str, float]
+    ) -> _Placed:
+        """What a fit says, if it can be this organ's."""
+        check_familiar(self._model.familiar, spread_mm(points), fit_mm(np.abs(fit.distances_mm)))
+        check_likely(fit.motion.rarity)
+        with stage(seconds, "surfaces", self._device):
+            return self._moved(fit)
+
+    def _moved(self, fit: Refined) -> _Placed:
+        motion = replace(fit.motion, std_scale=self._trust.std_scale)
+        anatomy = self._shape.anatomy_ct
+        moved = motion.carry(self._vertices_ct)
+        ends = np.cumsum([len(part.vertices_mm) for part in anatomy.parts])[:-1]
+        parts = zip(anatomy.names, anatomy.parts, np.split(moved, ends), strict=True)
+        meshes = {name: part.moved(places) for name, part, places in parts}
+        deviation = motion.std_mm(np.concatenate([self._known_ct, self._middles_ct]))
+        assert deviation is not None
+        known = len(self._known_ct)
+        return _Placed(fit, motion, meshes, deviation[:known], deviation[known:])
+
+    def _report(
+        self, head: dict, placed: _Placed, inside: OccupancyCloud, seconds: dict[str, float]
+    ) -> dict:
+        fit, motion = placed.fit, placed.motion
+        parts = describe_parts(self._model.parts, placed.meshes, inside)
+        for part, std_mm in zip(parts.values(), placed.middles_std_mm, strict=True):
+            part["center_std_mm"] = float(std_mm)
+        return {
+            **head,
+            "fit_mm": fit_report(np.abs(fit.distances_mm)),
+            "fit_cost": {"now": fit.cost, "usual": self._trust.usual_cost},
+            "parts": parts,
+            "motion": {
+                "camera_from_ct": motion.camera_from_ct.tolist(),
+                "coefficients": motion.coefficients.tolist(),
+                "rarity": motion.rarity,
+                "steps": fit.steps,
+            },
+            "timings": {**seconds, "total": sum(seconds.values())},
+        }
+
+    def _asked(
+        self, placed: _Placed, organ: Mesh, stamp_ns: int, rng: np.random.Generator
+    ) -> OccupancyCloud:
+        """Random points of the organ's box that lie inside, with label and probability."""
+        lower, upper = organ.box_mm
+        points = rng.random((QUERIES, 3), np.float32)
+        points *= (upper - lower).astype(np.float32)
+        points += lower.astype(np.float32)
+        inside, mine = self._inside(placed.motion.back(points).astype(np.float32))
+        probability = _probability(placed, mine)
+        return OccupancyCloud(points.take(inside, 0), mine.labels, probability, stamp_ns)
+
+    def _carry(self, placed: _Placed, stamp_ns: int) -> OccupancyCloud:
+        """The same points of the organ in every frame: labels stay, places and probabilities are
+        new."""
+        if self._carried is None:
+            lower, upper = self._shape.anatomy_ct.organ.box_mm
+            rng, found = np.random.default_rng(0), np.zeros((0, 3), np.float32)
+            while len(found) < CARRIED:
+                points = rng.uniform(lower, upper, (CARRIED, 3)).astype(np.float32)
+                found = np.concatenate([found, points[self._shape.labels_at(points)[0] > 0]])
+            self._carried = self._inside(found[:CARRIED])[1]
+        mine = self._carried
+        places = placed.motion.carry(mine.points_ct).astype(np.float32)
+        return OccupancyCloud(places, mine.labels, _probability(placed, mine), stamp_ns)
+
+    def _inside(
+        self, points_ct: Float32[np.ndarray, "n 3"]
+    ) -> tuple[Int64[np.ndarray, " m"], _Inside]:
+        """Which points lie inside, and what is known of those."""
+        labels, margin_mm = self._shape.labels_at(points_ct)
+        inside = np.flatnonzero(labels)
+        mine = points_ct.take(inside, 0)  # much faster than by a mask
+        known = self._nearest_known.to(mine)
+        return inside, _Inside(mine, labels[inside], margin_mm[inside], known)
+
+
+def _probability(placed: _Placed, mine: _Inside) -> Float32[np.ndarray, " n"]:
+    """That the nearest surface does not lie on a point's other side, errors being normal."""
+    per_std = 1 / np.hypot(placed.known_std_mm, _FIELD_MM)
+    return probabilities(mine.margin_mm, per_std, mine.known, normal_table())

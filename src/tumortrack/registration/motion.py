@@ -1,0 +1,113 @@
+"""Where one frame's organ lies: a pose, an elastic state, and how sure they are."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from jaxtyping import Float, Float32, Float64
+from scipy.spatial.transform import Rotation
+
+from tumortrack.core.parallel import share
+from tumortrack.registration import residual_kernels as kernels
+from tumortrack.registration.rest_shape import Shape
+from tumortrack.simulate.elastic.flow import steps_for
+
+Flow = tuple[tuple[np.ndarray, np.ndarray, np.floating], int]  # lattice and steps of the kernels
+
+_AT_ONCE = 4096  # points: a thread's part
+_FEW = 64  # as well, where each takes longer
+
+
+@dataclass(frozen=True, eq=False)
+class WarpMotion:
+    """``core.motion.Motion`` of a shape: x -> rotation (flow(x) - center_ct) + centre_mm.
+
+    Attributes:
+        rotation, centre_mm: where the organ's centre and axes are before the camera.
+        coefficients: of the body's modes.
+        covariance: of shift (mm), turn (rad; both in the CT's axes, about the centre) and
+            coefficients, as ``refine`` left it; None where nothing was refined.
+        std_scale: what its standard deviations are to be multiplied by; found on validation
+            scenes.
+    """
+
+    shape: Shape
+    rotation: Float64[np.ndarray, "3 3"]
+    centre_mm: Float64[np.ndarray, " 3"]
+    coefficients: Float64[np.ndarray, " m"]
+    covariance: Float64[np.ndarray, "p p"] | None = None
+    std_scale: float = 1.0
+
+    @property
+    def camera_from_ct(self) -> Float64[np.ndarray, "4 4"]:
+        """The rigid part."""
+        out = np.eye(4)
+        out[:3, :3] = self.rotation
+        out[:3, 3] = self.centre_mm - self.rotation @ self.shape.body.center_ct
+        return out
+
+    @property
+    def rarity(self) -> float:
+        """The state's squared Mahalanobis distance in the body's library, whose mean is 1."""
+        off = self.coefficients - self.shape.body.mean
+        return float(off @ self.shape.body.precision @ off) / len(off)
+
+    def carry(self, points_ct: Float[np.ndarray, "n 3"], /) -> Float64[np.ndarray, "n 3"]:
+        """CT (LPS, mm) -> camera frame (mm)."""
+        return self._gone(kernels.carry, self._flow, points_ct)
+
+    def back(self, points_camera: Float[np.ndarray, "n 3"], /) -> Float64[np.ndarray, "n 3"]:
+        """Camera frame (mm) -> CT (LPS, mm)."""
+        (velocity, origin, spacing), steps = self._flow
+        return self._gone(kernels.back, ((-velocity, origin, spacing), steps), points_camera)
+
+    def std_mm(self, points_ct: Float[np.ndarray, "n 3"], /) -> Float64[np.ndarray, " n"] | None:
+        """One standard deviation along any axis, mm: the pose's and the state's, to first order."""
+        if self.covariance is None:
+            return None
+        body, points = self.shape.body, np.ascontiguousarray(points_ct, np.float32)
+        known = *self._flow, body.modes, body.center_ct.astype(np.float32), self._root
+        variance = np.empty(len(points), np.float32)
+        share(
+            lambda part: kernels.variances(*known, points[part], variance[part]), len(points), _FEW
+        )
+        return self.std_scale * np.sqrt(variance.astype(float))
+
+    def _gone(
+        self, kernel: Callable, flow: Flow, points_mm: Float[np.ndarray, "n 3"]
+    ) -> Float64[np.ndarray, "n 3"]:
+        points, out = np.ascontiguousarray(points_mm, np.float32), np.empty((len(points_mm), 3))
+        way = *flow, self.shape.body.center_ct, self.rotation, self.centre_mm
+        share(lambda part: kernel(*way, points[part], out[part]), len(out), _AT_ONCE)
+        return out
+
+    @cached_property
+    def _velocity(self) -> Float32[np.ndarray, "i j k 3"]:
+        return self.shape.body.velocity(self.coefficients)
+
+    @cached_property
+    def _flow(self) -> Flow:
+        """What the kernels follow, and in how many steps."""
+        body = self.shape.body
+        lattice = (self._velocity, body.origin_mm, np.float32(body.spacing_mm))
+        return lattice, steps_for(self._velocity, body.spacing_mm)
+
+    @cached_property
+    def _root(self) -> Float32[np.ndarray, "p p"]:
+        assert self.covariance is not None
+        return np.linalg.cholesky(self.covariance).astype(np.float32)
+
+
+def blend(a: WarpMotion, b: WarpMotion, share: float) -> WarpMotion:
+    """Between two motions of one shape: ``share`` 0 is at ``a``, 1 at ``b``, whose covariance it
+    keeps."""
+    turn = Rotation.from_matrix(a.rotation.T @ b.rotation).as_rotvec()
+    return replace(
+        b,
+        rotation=a.rotation @ Rotation.from_rotvec(share * turn).as_matrix(),
+        centre_mm=(1 - share) * a.centre_mm + share * b.centre_mm,
+        coefficients=(1 - share) * a.coefficients + share * b.coefficients,
+    )

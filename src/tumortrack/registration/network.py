@@ -1,0 +1,249 @@
+"""From a cloud to a first pose and elastic state of the pre-operative organ.
+
+The cloud is turned about the camera's axis until its longest direction is x. That leaves two ways
+round; the network is shown both, says how likely each is the right one (the organ's long axis
+pointing to +x), and is trained to locate only in the right one. Without that it learns to undo a
+wrong turn by absurd deformations.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+from torch import Tensor, nn
+from torch.nn import functional
+
+from tumortrack.core.errors import InputError
+from tumortrack.core.geometry import rotation_onto
+from tumortrack.models.layers import Layer
+from tumortrack.occupancy.network import Aligned, NetworkConfig, alignment, turned, without_strays
+from tumortrack.registration.config import WarpDecoderConfig
+from tumortrack.registration.rest_shape import Shape
+
+_LARGEST = 4.0  # coefficients lie within so many standard deviations of the library's mean
+_SMALL_START = 0.3  # of the last layer's weights
+_STEP = 0.5  # of the organ's half length: what an output of 1 moves it by
+_BEHIND = 0.3  # of the half length: the organ's middle lies about so far behind the cloud's
+POSE_OUTPUTS = 10  # before the coefficients: rotation 6, place 3, way round 1
+_HUBER_MM = 5.0  # errors beyond count by their size, not its square
+_RIGID_SHARE = 0.5  # of the loss: the organ's pose without its deformation
+_WAY_SHARE = 0.2  # of the loss: which way round is right
+_WRONG_SHARE = 4  # one cloud in so many is shown the wrong way round as well
+
+
+@dataclass(frozen=True, eq=False)
+class Aside:
+    """A batch of clouds in the network's frame: centred, scaled, turned."""
+
+    points: Tensor  # (B, N, 3)
+    centre_mm: Tensor  # (B, 3), camera frame
+    turn: Tensor  # (2, B, 1): cosine and sine of the turn about z
+
+    def other_way(self, sign: Tensor) -> Aside:
+        """Half a turn about z where ``sign`` (B,) is -1."""
+        flip = torch.stack([sign, sign, torch.ones_like(sign)], -1)[:, None]
+        return Aside(self.points * flip, self.centre_mm, self.turn * sign[None, :, None])
+
+    def __getitem__(self, rows: slice) -> Aside:
+        return Aside(self.points[rows], self.centre_mm[rows], self.turn[:, rows])
+
+
+@dataclass(frozen=True, eq=False)
+class Placement:
+    """Where organs lie and how they are deformed: rotation and centre (camera frame, mm), so that
+    a point x of the CT, deformed to y, lies at ``rotation (y - center_ct) + centre_mm``."""
+
+    rotation: Tensor  # (B, 3, 3)
+    centre_mm: Tensor  # (B, 3)
+    coefficients: Tensor  # (B, M)
+    right_way: Tensor  # (B,), logit
+
+    def __getitem__(self, rows: slice) -> Placement:
+        return Placement(
+            self.rotation[rows], self.centre_mm[rows], self.coefficients[rows], self.right_way[rows]
+        )
+
+
+class WarpNetwork(nn.Module):
+    """Clouds -> placements; the buffers that name the organ are set by ``know``."""
+
+    center_ct: Tensor
+    points: Tensor
+    modes: Tensor
+    mean: Tensor
+    std: Tensor
+    facing: Tensor
+    long_axis: Tensor
+
+    def __init__(self, config: NetworkConfig) -> None:
+        super().__init__()
+        if not isinstance(config.decoder, WarpDecoderConfig) or not isinstance(
+            config.normalisation, Aligned
+        ):
+            raise InputError("a warp network needs the warp decoder and aligned clouds.")
+        self.config = config
+        self.scale_mm, self.reach = config.normalisation.scale_mm, config.normalisation.reach
+        modes, width = config.decoder.modes, config.decoder.width
+        self.encoder = config.encoder.build()
+        self.hidden = nn.Sequential(
+            Layer(config.encoder.latent_size, width, "none"), Layer(width, width, "none")
+        )
+        self.output = nn.Linear(width, POSE_OUTPUTS + modes)
+        with torch.no_grad():
+            self.output.weight.mul_(_SMALL_START)
+            self.output.bias.zero_()
+        n_points = config.decoder.points
+        self.register_buffer("center_ct", torch.zeros(3))
+        self.register_buffer("points", torch.zeros(n_points, 3))  # about center_ct
+        self.register_buffer("modes", torch.zeros(n_points, 3, modes))  # at these points
+        self.register_buffer("mean", torch.zeros(modes))
+        self.register_buffer("std", torch.ones(modes))
+        self.register_buffer("facing", torch.eye(3))
+        self.register_buffer("long_axis", torch.tensor([1.0, 0.0, 0.0]))
+
+    def know(
+        self,
+        shape: Shape,
+        up_lps: tuple[float, float, float],
+        points_ct: Float[np.ndarray, "p 3"],
+    ) -> None:
+        """Take over what does not have to be learnt: the organ's centre and axes, its states'
+        mean and spread, and the points (CT frame) whose places before the camera the loss
+        compares."""
+        body = shape.body
+        known = {
+            "center_ct": body.center_ct,
+            "points": points_ct - body.center_ct,
+            "modes": body.modes_at(points_ct),
+            "mean": body.states.mean(0),
+            "std": body.states.std(0),
+            "facing": facing_rotation(up_lps, shape.long_axis),
+            "long_axis": shape.long_axis,
+        }
+        for name, value in known.items():
+            getattr(self, name).copy_(torch.as_tensor(np.array(value, np.float32)))
+
+    def aside(self, points_mm: Tensor) -> Aside:
+        """Clouds (B, N, 3), camera frame, mm, in the network's frame."""
+        near = without_strays(points_mm, self.reach * self.scale_mm)
+        centre_mm = near.mean(dim=1, keepdim=True)
+        points = (near - centre_mm) / self.scale_mm
+        turn = alignment(points)
+        return Aside(turned(points, turn), centre_mm[:, 0], turn)
+
+    def right_sign(self, aside: Aside, rotation: Tensor) -> Tensor:
+        """+1 where the organ's long axis points to +x in the network's frame, else -1; (B,)."""
+        axis = rotation @ self.long_axis
+        along = axis[:, 0] * aside.turn[0, :, 0] + axis[:, 1] * aside.turn[1, :, 0]
+        return torch.where(along >= 0, 1.0, -1.0)
+
+    def forward(self, aside: Aside) -> Placement:
+        """What is seen, if the clouds lie the right way round."""
+        out = self.output(self.hidden(self.encoder(aside.points)))
+        with torch.autocast(out.device.type, enabled=False):  # bf16 would round to 0.2 mm
+            return self._placement(out.float(), aside)
+
+    def _placement(self, out: Tensor, aside: Aside) -> Placement:
+        first = functional.normalize(out[:, :3] + out.new_tensor([1.0, 0.0, 0.0]), dim=1)
+        second = out[:, 3:6] + out.new_tensor([0.0, 1.0, 0.0])
+        second = second - (first * second).sum(1, keepdim=True) * first
+        second = functional.normalize(second, dim=1)
+        third = torch.cross(first, second, dim=1)
+        back = _about_z(aside.turn)
+        rotation = back @ torch.stack([first, second, third], -1) @ self.facing
+        place = (out[:, 6:9] * _STEP + out.new_tensor([0.0, 0.0, _BEHIND])) * self.scale_mm
+        centre_mm = aside.centre_mm + (back @ place[..., None])[..., 0]
+        bounded = _LARGEST * torch.tanh(out[:, POSE_OUTPUTS:] / _LARGEST)
+        return Placement(rotation, centre_mm, self.mean + self.std * bounded, out[:, 9])
+
+    def loss(
+        self,
+        clouds_mm: Tensor,
+        points_mm: Tensor,
+        labels: Tensor,
+        camera_from_ct: Tensor,
+        *,
+        first: int = 0,
+    ) -> Tensor:
+        """How far the known points (B, P, 3) are from where the placements carry them, with and
+        without deformation, and how well the right way round is told. ``labels`` is not used.
+
+        The deformation counts to first order: the displacement at the points' places at rest.
+        ``first``: the first cloud's number in a batch that several processes share; the mean of
+        equal shares' losses is the whole batch's.
+        """
+        aside = self.aside(clouds_mm)
+        with torch.autocast(clouds_mm.device.type, enabled=False):
+            true_rotation = camera_from_ct[:, :3, :3]
+            true_centre = true_rotation @ self.center_ct + camera_from_ct[:, :3, 3]
+            sign = self.right_sign(aside, true_rotation)
+        placed = self(aside.other_way(sign))
+        told_wrong = self._told_wrong(aside.other_way(-sign), first)
+        with torch.autocast(clouds_mm.device.type, enabled=False):
+            moved = self.points + torch.einsum("pdm,bm->bpd", self.modes, placed.coefficients)
+            error = _size(_placed(moved, placed.rotation, placed.centre_mm) - points_mm)
+            rigid = _placed(self.points, placed.rotation, placed.centre_mm)
+            rigid_error = _size(rigid - _placed(self.points, true_rotation, true_centre))
+            told = functional.softplus(-placed.right_way).mean() + told_wrong
+            return error + _RIGID_SHARE * rigid_error + _WAY_SHARE * told
+
+    def _told_wrong(self, wrong: Aside, first: int) -> Tensor:
+        """How well the wrong way round is told, by some of the clouds: the same ones in every
+        sharing of the batch, so that a small share may have none."""
+        few = wrong[slice(-first % _WRONG_SHARE, None, _WRONG_SHARE)]
+        if not len(few.points):
+            return wrong.points.new_zeros(())
+        told = functional.softplus(self(few).right_way).sum()
+        return told / (len(wrong.points) / _WRONG_SHARE)
+
+    def both_ways(self, points_mm: Tensor) -> tuple[Placement, Placement]:
+        """Placements for the clouds as they were turned, and for half a turn more."""
+        one = self.aside(points_mm)
+        other = one.other_way(-torch.ones_like(one.centre_mm[:, 0]))
+        # One batch: a network this small takes as long for two clouds as for one.
+        both = self(
+            Aside(
+                torch.cat([one.points, other.points]),
+                torch.cat([one.centre_mm, other.centre_mm]),
+                torch.cat([one.turn, other.turn], 1),
+            )
+        )
+        return both[: len(points_mm)], both[len(points_mm) :]
+
+
+def facing_rotation(
+    up_lps: tuple[float, float, float], long_axis: Float[np.ndarray, " 3"]
+) -> Float[np.ndarray, "3 3"]:
+    """The rotation that an organ of any patient has where nothing is tilted: its upper side
+    towards the camera, its long axis along +x as far as it lies across the view."""
+    facing = rotation_onto(np.asarray(up_lps, float), np.array([0.0, 0.0, -1.0]))
+    x, y, _ = facing @ long_axis
+    return Rotation.from_euler("z", -np.arctan2(y, x)).as_matrix() @ facing
+
+
+def _placed(points: Tensor, rotation: Tensor, centre_mm: Tensor) -> Tensor:
+    """Points (P, 3) or (B, P, 3) about the organ's centre -> camera frame (B, P, 3)."""
+    return points @ rotation.transpose(1, 2) + centre_mm[:, None]
+
+
+def _size(offsets_mm: Tensor) -> Tensor:
+    """Huber's mean of distances, about 1 for 7 mm."""
+    distance = (offsets_mm.square().sum(-1) + 1e-6).sqrt()
+    huber = functional.huber_loss(distance, torch.zeros_like(distance), delta=_HUBER_MM)
+    return huber / _HUBER_MM
+
+
+def _about_z(turn: Tensor) -> Tensor:
+    """(2, B, 1) cosine and sine -> rotations (B, 3, 3) from the turned frame back."""
+    cosine, sine = turn[0, :, 0], turn[1, :, 0]
+    zero, one = torch.zeros_like(cosine), torch.ones_like(cosine)
+    rows = [
+        torch.stack([cosine, -sine, zero], -1),
+        torch.stack([sine, cosine, zero], -1),
+        torch.stack([zero, zero, one], -1),
+    ]
+    return torch.stack(rows, 1)

@@ -1,0 +1,127 @@
+"""Kernels of a warp: points carried to the camera or back, with what every unknown does to them.
+
+``lattice`` is (velocity, origin, spacing) of the field that points follow; ``modes`` are on the
+same lattice. Unknowns are shift, turn and coefficients, in this order. Derivatives by coefficients
+are to first order: the modes halfway along a point's path.
+"""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+
+from tumortrack.registration.rest_shape import distance_at
+from tumortrack.simulate.elastic.flow import BLOCK, add_modes, block, enter, travel
+
+POSE = 6  # unknowns before the coefficients
+
+
+@numba.njit(cache=True, fastmath=True, nogil=True)
+def carry(lattice, steps, center, turn, to, points, out):  # type: ignore[no-untyped-def]
+    """``turn (flow(point) - center) + to`` of points (n, 3), float32; the rest float64."""
+    velocity, origin, spacing = lattice
+    places, speeds, middles = block()
+    for first in range(0, len(points), BLOCK):
+        some = points[first : first + BLOCK]
+        enter(some, origin, spacing, places)
+        travel(velocity, spacing, steps, len(some), places, speeds, middles)
+        for p in range(len(some)):
+            x = np.float64(origin[0] + spacing * places[0, p]) - center[0]
+            y = np.float64(origin[1] + spacing * places[1, p]) - center[1]
+            z = np.float64(origin[2] + spacing * places[2, p]) - center[2]
+            for axis in range(3):
+                moved = turn[axis, 0] * x + turn[axis, 1] * y + turn[axis, 2] * z
+                out[first + p, axis] = moved + to[axis]
+
+
+@numba.njit(cache=True, fastmath=True, nogil=True)
+def back(lattice, steps, center, turn, to, points, out):  # type: ignore[no-untyped-def]
+    """The inverse of ``carry``, if ``lattice`` has the opposite velocity."""
+    velocity, origin, spacing = lattice
+    per_cell = np.float32(1) / spacing
+    places, speeds, middles = block()
+    for first in range(0, len(points), BLOCK):
+        some = points[first : first + BLOCK]
+        for p in range(len(some)):
+            x, y, z = some[p, 0] - to[0], some[p, 1] - to[1], some[p, 2] - to[2]
+            for axis in range(3):
+                turned = turn[0, axis] * x + turn[1, axis] * y + turn[2, axis] * z
+                rest = np.float32(turned + center[axis])
+                places[axis, p] = (rest - origin[axis]) * per_cell
+        travel(velocity, spacing, steps, len(some), places, speeds, middles)
+        for p in range(len(some)):
+            for axis in range(3):
+                out[first + p, axis] = origin[axis] + spacing * places[axis, p]
+
+
+@numba.njit(cache=True, fastmath=True, nogil=True)
+def variances(lattice, steps, modes, center, root, points, out):  # type: ignore[no-untyped-def]
+    """The mean over x, y, z of each point's variance (n,), if ``root @ root.T`` (p, p) is the
+    covariance of the unknowns: their effects times the root, squared. All float32."""
+    velocity, origin, spacing = lattice
+    places, speeds, middles = block()
+    along = np.eye(3, dtype=np.float32)
+    row, mixed = np.empty(len(root), np.float32), np.empty(len(root), np.float32)
+    for first in range(0, len(points), BLOCK):
+        some = points[first : first + BLOCK]
+        enter(some, origin, spacing, places)
+        travel(velocity, spacing, steps, len(some), places, speeds, middles)
+        for p in range(len(some)):
+            offset = (
+                origin[0] + spacing * places[0, p] - center[0],
+                origin[1] + spacing * places[1, p] - center[1],
+                origin[2] + spacing * places[2, p] - center[2],
+            )
+            out[first + p] = 0
+            for axis in range(3):
+                row[:] = 0
+                row[axis] = 1
+                after, before = (axis + 1) % 3, (axis + 2) % 3
+                row[3 + after] = offset[before]
+                row[3 + before] = -offset[after]
+                x, y, z = middles[0, p], middles[1, p], middles[2, p]
+                add_modes(modes, x, y, z, along[axis], row[POSE:])
+                mixed[:] = 0
+                for n in range(len(root)):
+                    for m in range(n + 1):  # the root is lower triangular
+                        mixed[m] += row[n] * root[n, m]
+                for m in range(len(root)):
+                    out[first + p] += mixed[m] ** 2
+            out[first + p] /= 3
+
+
+@numba.njit(cache=True, fastmath=True, nogil=True, inline="always")
+def add_rows(lattice, steps, modes, pose, field, points, room, rows):  # type: ignore[no-untyped-def]
+    """What each unknown does to the signed distance of one block of points (n, 3; camera frame,
+    mm), carried back, to a surface at rest; the distance itself stands in the last column of
+    ``rows`` (n, p + 1).
+
+    ``lattice`` has the opposite velocity; ``pose`` is (center_ct, rotation, centre_mm), ``field``
+    (values, origin, spacing) of the distances; ``room`` is ``flow.block()``. ``pose`` is float64,
+    all else float32.
+    """
+    velocity, origin, spacing = lattice
+    center, rotation, centre = pose
+    values, corner, width = field
+    places, speeds, middles = room
+    per_cell, inwards = np.float32(1) / spacing, np.empty(3, np.float32)
+    offsets = np.empty((BLOCK, 3), np.float32)
+    for p in range(len(points)):
+        x, y, z = points[p, 0] - centre[0], points[p, 1] - centre[1], points[p, 2] - centre[2]
+        for axis in range(3):
+            turned = rotation[0, axis] * x + rotation[1, axis] * y + rotation[2, axis] * z
+            offsets[p, axis] = turned
+            places[axis, p] = (np.float32(turned + center[axis]) - origin[axis]) * per_cell
+    travel(velocity, spacing, steps, len(points), places, speeds, middles)
+    for p in range(len(points)):
+        x = origin[0] + spacing * places[0, p]
+        y = origin[1] + spacing * places[1, p]
+        z = origin[2] + spacing * places[2, p]
+        row = rows[p]
+        row[-1], sx, sy, sz = distance_at(values, corner, width, x, y, z)
+        inwards[0], inwards[1], inwards[2] = -sx, -sy, -sz
+        ox, oy, oz = offsets[p, 0], offsets[p, 1], offsets[p, 2]
+        row[0], row[1], row[2] = -sx, -sy, -sz
+        row[3], row[4], row[5] = sy * oz - sz * oy, sz * ox - sx * oz, sx * oy - sy * ox
+        row[POSE:-1] = 0
+        add_modes(modes, middles[0, p], middles[1, p], middles[2, p], inwards, row[POSE:-1])

@@ -1,0 +1,284 @@
+"""A film of what the arms do: an animated GIF, drawn without a display.
+
+MP4 is not offered: no encoder among the Python packages comes under a permissive licence.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable, Iterable, Iterator
+from itertools import groupby
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from jaxtyping import Float, Float64, UInt8
+
+from tumortrack.core.colours import BACKGROUND, NONE, part_colour
+from tumortrack.core.errors import InputError
+from tumortrack.core.geometry import transform_points
+from tumortrack.core.store import write_atomically
+from tumortrack.core.types import Mesh
+from tumortrack.live.values import Line, Workcell
+from tumortrack.plan.motions import Motions
+from tumortrack.plan.values import Located
+from tumortrack.report.organ_surfaces import organ_surfaces
+from tumortrack.report.painter import Body, Eye, paint, tube
+
+if TYPE_CHECKING:
+    from PIL import Image, ImageDraw, ImageFont
+
+_FROM = np.array([-0.36, -0.8, 0.48])  # where the eye is, seen from the middle: left, front, above
+_CLOSE_FROM = np.array([-0.36, -0.72, 0.6])
+_AWAY = 2.6  # the eye's distance in radii of what it sees: a natural perspective
+_CLOSE = 0.47, 0.42  # the close-up's share of width and height, in the lower right corner
+_ARMS = 0.97, 0.62  # and that of the arms, above it
+_CLOSE_MM = 40.0  # the close-up cuts away what is nearer to the eye than the organ by this
+_ORGAN_OPACITY = 0.42
+_FRAME = (90, 96, 106)
+_LEAST_PIXELS = 2.0  # width of a line
+_COLOURS = 255  # and one for what did not change
+_SAMPLES = 8  # frames from which the colours are chosen
+_LOOKED_AT, _EVERY = 40, 3  # frames, and every which vertex, from which the eye's place is chosen
+_LEAST_FRAMES = 2  # of a stage
+_LAST_S = 1.5  # the last picture stays
+_FASTEST, _SMALLEST = 50, 160
+
+
+def film(
+    frames: Iterable[Workcell],
+    located: Located,
+    path: Path,
+    fps: int = 10,
+    size: tuple[int, int] = (640, 480),
+    progress: Callable[[int, int], None] | None = None,
+) -> None:
+    """Write the frames as an animated GIF that begins again when it has ended.
+
+    Seen obliquely from the front: whatever has a slash in its name (an arm's parts) is in the
+    picture in all frames; in the corner the organ from near by. The same frames give the same
+    bytes; frames that look the same are one that lasts longer.
+
+    Args:
+        frames: of the table frame, evenly spaced in time.
+        located: organ and tumors, table frame, mm.
+        path: ``.gif``, written atomically.
+        fps: frames a second, up to 50.
+        size: width and height in pixels.
+        progress: called with frames done and frames in all.
+
+    Raises:
+        InputError: no frame, or another kind of file, speed or size.
+        StorageError: the disk refused.
+    """
+    told = list(frames)
+    _check(told, path, fps, size)
+    stage = _Stage(told, located, size)
+    chosen = np.linspace(0, len(told) - 1, min(_SAMPLES, len(told))).astype(int).tolist()
+    palette, index_of = _palette([stage.picture(n) for n in chosen])
+
+    def indexed() -> Iterator[Image.Image]:
+        for n in range(len(told)):
+            yield _indexed(stage.picture(n), palette, index_of)
+            if progress is not None:
+                progress(n + 1, len(told))
+
+    pictures = indexed()
+    each_ms = round(100 / fps) * 10  # a GIF counts hundredths of a second
+    buffer = io.BytesIO()
+    next(pictures).save(
+        buffer,
+        format="GIF",
+        save_all=True,
+        append_images=pictures,
+        duration=[each_ms] * (len(told) - 1) + [each_ms + round(1000 * _LAST_S)],
+        loop=0,
+        palette=palette.tobytes(),
+        transparency=_COLOURS,
+        disposal=1,
+        optimize=True,
+    )
+    write_atomically(path, buffer.getvalue())
+
+
+def moments_s(motions: Motions, frames: int) -> Float64[np.ndarray, " n"]:
+    """Times since the beginning, about so many, that show every stage: a stage gets frames by the
+    square root of its duration, for sweeps take minutes and the grasp seconds; the end is among
+    them."""
+    seconds = np.array([stage.seconds for stage in motions.stages])
+    share = np.sqrt(seconds) / max(float(np.sqrt(seconds).sum()), 1e-9)
+    counts = np.maximum(np.rint(frames * share).astype(int), _LEAST_FRAMES)
+    starts = np.cumsum(seconds) - seconds
+    stages = zip(starts, seconds, counts.tolist(), strict=True)
+    each = [start + length * np.arange(n) / n for start, length, n in stages]
+    return np.append(np.concatenate(each), seconds.sum())
+
+
+def _check(frames: list[Workcell], path: Path, fps: int, size: tuple[int, int]) -> None:
+    if path.suffix.lower() != ".gif":
+        raise InputError(f"{path}: a film is an animated GIF; give a name that ends in .gif.")
+    if not 1 <= fps <= _FASTEST:
+        raise InputError(f"{fps} frames a second are not possible; allowed: 1 to {_FASTEST}.")
+    if min(size) < _SMALLEST or max(size) > 10 * _SMALLEST:
+        raise InputError(
+            f"a film of {size[0]} x {size[1]} pixels is not possible; allowed: {_SMALLEST} to "
+            f"{10 * _SMALLEST} each way."
+        )
+    if not frames:
+        raise InputError("there is no frame to film: the arms did nothing.")
+
+
+class _Stage:
+    """What stays the same in all pictures: eyes, organ, letters."""
+
+    def __init__(self, frames: list[Workcell], located: Located, size: tuple[int, int]) -> None:
+        self._frames, self._size = frames, size
+        self._organ = [
+            Body(mesh, part_colour(label), None, _ORGAN_OPACITY if label == 1 else 1.0, False)
+            for label, mesh in sorted(organ_surfaces(located).items())
+        ]
+        self._close_size = round(_CLOSE[0] * size[0]), round(_CLOSE[1] * size[1])
+        self._far = _eye_around(_reach(frames), _FROM, size, _ARMS)
+        self._near = _close_eye(self._organ[0].mesh, self._close_size)
+        flat = self._far.project(self._organ[0].mesh.vertices_mm, size)[:, :2]
+        self._spot = (*(flat.min(0) - 4).round().tolist(), *(flat.max(0) + 4).round().tolist())
+        self._letters = _letters(size[1] // 20), _letters(size[1] // 34)
+        self._tubes: dict[tuple[int, float], tuple[Line, Mesh]] = {}
+
+    def picture(self, n: int) -> Image.Image:
+        """Frame n, in full colour."""
+        from PIL import Image, ImageDraw
+
+        cell = self._frames[n]
+        out = Image.fromarray(self._seen(cell, self._far, self._size))
+        close = Image.fromarray(self._seen(cell, self._near, self._close_size))
+        left, top = (whole - part - 8 for whole, part in zip(self._size, close.size, strict=True))
+        top -= 10
+        out.paste(close, (left, top))
+        draw = ImageDraw.Draw(out)
+        draw.rectangle(self._spot, outline=_FRAME)  # what is shown from near
+        draw.rectangle((left - 1, top - 1, left + close.width, top + close.height), outline=_FRAME)
+        self._say(draw, n)
+        return out
+
+    def _seen(self, cell: Workcell, eye: Eye, size: tuple[int, int]) -> UInt8[np.ndarray, "h w 3"]:
+        shaded = eye is self._far  # the arms' shadows would darken the close-up
+        shapes = [
+            Body(s.mesh, s.colour, s.published_from_shape, s.opacity, shaded) for s in cell.shapes
+        ]
+        least_mm = _LEAST_PIXELS * eye.width_mm / size[0]
+        lines = [
+            Body(self._tube(line, max(line.width_mm, least_mm)), line.colour, shaded=False)
+            for line in cell.lines
+            if len(line.points_mm) > 1
+        ]
+        return paint(shapes + lines + self._organ, eye, size)
+
+    def _tube(self, line: Line, width_mm: float) -> Mesh:
+        key = id(line.points_mm), width_mm  # the line is kept, so its points' id stays theirs
+        if key not in self._tubes:
+            self._tubes[key] = line, tube(line.points_mm, width_mm / 2)
+        return self._tubes[key][1]
+
+    def _say(self, draw: ImageDraw.ImageDraw, n: int) -> None:
+        """The state, why the arms stand still, and how far the procedure is."""
+        cell = self._frames[n]
+        large, small = self._letters
+        draw.text((12, 10), cell.state, fill=BACKGROUND, font=large)
+        if cell.halted:
+            draw.text((12, 18 + large.size), f"halted: {cell.halted}", fill=NONE, font=small)
+        width, height = self._size
+        done = 0
+        for state, group in groupby(self._frames, lambda one: one.state):
+            first, done = done, done + len(list(group))
+            x = [8 + (width - 16) * k / len(self._frames) for k in (first, min(done, n + 1), done)]
+            box = height - 11, height - 6
+            draw.rectangle((x[0], box[0], max(x[2] - 2, x[0]), box[1]), fill=(205, 209, 214))
+            if n >= first:
+                colour = NONE if cell.halted and state == cell.state else (60, 110, 190)
+                draw.rectangle((x[0], box[0], max(x[1] - 2, x[0]), box[1]), fill=colour)
+
+
+def _letters(pixels: int) -> ImageFont.FreeTypeFont:
+    import matplotlib
+    from PIL import ImageFont
+
+    return ImageFont.truetype(f"{matplotlib.get_data_path()}/fonts/ttf/DejaVuSans.ttf", pixels)
+
+
+def _reach(frames: list[Workcell]) -> Float[np.ndarray, "n 3"]:
+    """Points of all parts of arms in frames of all stages; of everything, where there are none."""
+    told = frames[:: max(1, len(frames) // _LOOKED_AT)]
+    arms = [shape for cell in told for shape in cell.shapes if "/" in shape.name]
+    points = [
+        transform_points(shape.published_from_shape, shape.mesh.vertices_mm[::_EVERY])
+        for shape in arms or [shape for cell in told for shape in cell.shapes]
+    ]
+    if not points:
+        raise InputError("the frames show no arms and no table: nothing to film.")
+    return np.concatenate(points)
+
+
+def _eye_around(
+    points_mm: Float[np.ndarray, "n 3"],
+    direction: np.ndarray,
+    size: tuple[int, int],
+    share: tuple[float, float] = (0.9, 0.9),
+) -> Eye:
+    """The eye in this direction that sees all points as large as they can be in the uppermost
+    ``share`` of the picture."""
+    target = (points_mm.min(0) + points_mm.max(0)) / 2
+    radius = float(np.linalg.norm(points_mm - target, axis=1).max())
+    away = _AWAY * radius * direction / np.linalg.norm(direction)
+    eye = Eye(target + away, target, 2 * radius)
+    right = np.cross([0.0, 0.0, 1.0], away)
+    right /= np.linalg.norm(right)
+    down = np.cross(right, away) / np.linalg.norm(away)
+    room = np.array(size) * share
+    middle = np.array([size[0] / 2, (room[1] + (1 - max(share)) * size[1]) / 2])
+    for _ in range(6):  # moved and widened until it fits
+        flat = eye.project(points_mm, size)[:, :2]
+        low, high = flat.min(0), flat.max(0)
+        off = ((low + high) / 2 - middle) * eye.width_mm / size[0]
+        target = target + off[0] * right + off[1] * down
+        width = eye.width_mm * float(((high - low) / room).max())
+        eye = Eye(target + away, target, width)
+    return eye
+
+
+def _close_eye(organ: Mesh, size: tuple[int, int]) -> Eye:
+    eye = _eye_around(organ.vertices_mm, _CLOSE_FROM, size)
+    away = eye.place_mm - eye.target_mm
+    radius = float(np.linalg.norm(organ.vertices_mm - organ.box_mm.mean(0), axis=1).max())
+    return Eye(eye.target_mm + 10 * away, eye.target_mm, eye.width_mm, True, radius + _CLOSE_MM)
+
+
+def _palette(
+    pictures: list[Image.Image],
+) -> tuple[UInt8[np.ndarray, "256 3"], UInt8[np.ndarray, "64 64 64"]]:
+    """Colours that suit these pictures, and for every colour (6 bits each) the nearest of them."""
+    from PIL import Image
+    from scipy.spatial import cKDTree
+
+    sheet = Image.fromarray(np.concatenate([np.asarray(one)[::2, ::2] for one in pictures]))
+    few = sheet.quantize(_COLOURS, Image.Quantize.MEDIANCUT, kmeans=2, dither=Image.Dither.NONE)
+    colours = np.array(few.getpalette(), np.uint8).reshape(-1, 3)[:_COLOURS]
+    palette = np.zeros((256, 3), np.uint8)
+    palette[: len(colours)] = colours
+    shades = (np.arange(64) * 4 + 2).astype(float)
+    cube = np.stack(np.meshgrid(shades, shades, shades, indexing="ij"), -1).reshape(-1, 3)
+    _, nearest = cKDTree(colours.astype(float)).query(cube)
+    return palette, nearest.astype(np.uint8).reshape(64, 64, 64)
+
+
+def _indexed(
+    picture: Image.Image,
+    palette: UInt8[np.ndarray, "256 3"],
+    index_of: UInt8[np.ndarray, "64 64 64"],
+) -> Image.Image:
+    from PIL import Image
+
+    red, green, blue = np.moveaxis(np.asarray(picture) >> 2, -1, 0)
+    out = Image.fromarray(index_of[red, green, blue])
+    out.putpalette(palette.tobytes())
+    return out

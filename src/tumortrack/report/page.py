@@ -1,0 +1,193 @@
+"""One HTML file that shows a whole report, offline: table, 3-D view per scene, pictures."""
+
+from __future__ import annotations
+
+import base64
+import html
+import io
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from tumortrack.core.estimate import Estimate
+from tumortrack.core.store import write_atomically
+from tumortrack.core.types import Mesh
+from tumortrack.report.page_template import PAGE
+from tumortrack.simulate.scene_folder import Scene
+
+_KIDNEY_CELL_MM, _TUMOR_CELL_MM = 2.5, 2.0
+_COLUMNS = {
+    "hausdorff_mm": "Hausdorff mm",
+    "hausdorff_one_sided_mm": "one-sided mm",
+    "hausdorff_95_mm": "HD95 mm",
+    "surface_mm": "mean surface mm",
+    "center_mm": "centre mm",
+    "iou": "IoU",
+}
+_SHOWN_POINTS = 4000
+
+
+@dataclass(frozen=True, eq=False)
+class PageScene:
+    """What the page shows of one scene, small: thinned meshes and a compressed picture."""
+
+    name: str
+    layers: tuple[dict, ...]
+    picture_webp: bytes
+
+
+def page_scene(name: str, scene: Scene, estimate: Estimate | None, picture: Path) -> PageScene:
+    """Thin a scene for the page; ``picture`` is the PNG that ``scene_picture`` wrote."""
+    points_mm = scene.cloud.points_mm
+    step = -(-len(points_mm) // _SHOWN_POINTS)
+    layers = [{"kind": "points", "name": "observed points", "v": _packed(points_mm[::step])}]
+    shown = estimate.meshes if estimate else {}
+    for part, mesh in shown.items():
+        layers.append(_layer("mesh", f"{part} (estimate)", part, mesh))
+    for part, mesh in zip(scene.reference.names, scene.reference.parts, strict=True):
+        kind = "truth" if part == "kidney" else "wire"
+        layers.append(_layer(kind, f"{part} (truth)", part, mesh))
+    return PageScene(name, tuple(layers), _webp(picture))
+
+
+def write_page(report: dict, scenes: list[PageScene], path: Path) -> None:
+    """Write the page; it holds plotly itself and loads nothing from anywhere.
+
+    Args:
+        report: as ``evaluate_scenes`` returns it.
+        scenes: in the order of the report's scenes.
+        path: HTML file to write, atomically.
+
+    Raises:
+        StorageError: the disk refused.
+    """
+    from plotly.offline import get_plotlyjs
+
+    data = [
+        {
+            "name": scene.name,
+            "rows": _scene_table(entry),
+            "note": html.escape(_note(entry)),
+            "layers": scene.layers,
+            "picture": base64.b64encode(scene.picture_webp).decode(),
+        }
+        for entry, scene in zip(report["scenes"], scenes, strict=True)
+    ]
+    embedded = json.dumps(data, allow_nan=False).replace("</", "<\\/")
+    # The texts that are long or hold braces go in by position, never through a formatter.
+    page = PAGE.replace("@SUMMARY@", _summary_table(report["summary"]))
+    page = page.replace("@COUNTS@", html.escape(_counts(report["summary"])))
+    page = page.replace("@RULE@", html.escape(report["rule"]))
+    head, script = page.split("@PLOTLY@")
+    middle, tail = script.split("@DATA@")
+    text = "".join((head, get_plotlyjs(), middle, embedded, tail))
+    write_atomically(path, text.encode())
+
+
+def thinned(mesh: Mesh, cell_mm: float) -> Mesh:
+    """A coarser mesh for display: vertices of one cubic cell become their mean."""
+    cells = np.floor(mesh.vertices_mm / cell_mm).astype(np.int64)
+    _, group = np.unique(cells, axis=0, return_inverse=True)
+    group = group.reshape(-1)
+    count = np.bincount(group)
+    means = [np.bincount(group, mesh.vertices_mm[:, axis]) / count for axis in range(3)]
+    a, b, c = group[mesh.faces].T
+    proper = (a != b) & (b != c) & (c != a)
+    faces = np.stack([a, b, c], axis=1)[proper]
+    # A thin fold collapses onto two sheets with the same corners: drop what occurs in pairs.
+    _, kind, times = np.unique(
+        np.sort(faces, axis=1), axis=0, return_inverse=True, return_counts=True
+    )
+    return Mesh(np.stack(means, axis=1), faces[times[kind.reshape(-1)] % 2 == 1])
+
+
+def _layer(kind: str, name: str, part: str, mesh: Mesh) -> dict:
+    small = thinned(mesh, _KIDNEY_CELL_MM if part == "kidney" else _TUMOR_CELL_MM)
+    faces = base64.b64encode(small.faces.astype("<u4").tobytes()).decode()
+    return {
+        "kind": kind,
+        "part": part,
+        "name": name.replace("_", " "),
+        "v": _packed(small.vertices_mm),
+        "f": faces,
+    }
+
+
+def _packed(points_mm: Float[np.ndarray, "n 3"]) -> str:
+    """Little-endian float32, rounded to 0.01 mm, in base64."""
+    return base64.b64encode(np.round(points_mm, 2).astype("<f4").tobytes()).decode()
+
+
+def _webp(picture: Path) -> bytes:
+    from PIL import Image  # matplotlib brings it
+
+    buffer = io.BytesIO()
+    with Image.open(picture) as image:
+        image.convert("RGB").save(buffer, "WEBP", quality=82)
+    return buffer.getvalue()
+
+
+def _counts(summary: dict) -> str:
+    counts = f"{summary['scenes']} scenes, {summary['failed']} failed."
+    return f"{counts} Median mIoU {summary['miou']:.3f}.{_summary_targets(summary)}"
+
+
+def _summary_targets(summary: dict) -> str:
+    errors = summary.get("tre_mm")
+    if not errors:
+        return ""
+    mean, p95, largest = (_number(errors[key]) for key in ("mean", "p95", "max"))
+    return (
+        f" Target registration error, medians over {errors['scenes']} scenes: mean {mean} mm, "
+        f"95th percentile {p95} mm, largest {largest} mm."
+    )
+
+
+def _note(entry: dict) -> str:
+    seconds = entry.get("seconds")
+    took = "" if seconds is None else f", located in {seconds:.2f} s"
+    failed = "" if entry["failed"] is None else f", FAILED: {entry['failed']}"
+    errors = entry.get("tre_mm")
+    targets = "" if not errors else f", {target_text(errors)}"
+    return f"mIoU {entry['miou']:.3f}{targets}{took}{failed}"
+
+
+def target_text(errors: dict) -> str:
+    """A scene's target errors in a few words."""
+    return (
+        f"target error {errors['mean']:.1f} mm (mean of {errors['count']}, "
+        f"largest {errors['max']:.1f} mm)"
+    )
+
+
+def part_rows(summary: dict) -> dict[str, dict]:
+    """What the summary says of parts, by name."""
+    return {k: row for k, row in summary.items() if isinstance(row, dict) and "found" in row}
+
+
+def _summary_table(summary: dict) -> str:
+    parts = part_rows(summary)
+    found = {name: f"{part['found']}/{part['scenes']}" for name, part in parts.items()}
+    return _table(parts, found)
+
+
+def _scene_table(entry: dict) -> str:
+    parts = entry["parts"]
+    return _table(parts, {name: "yes" if part["found"] else "no" for name, part in parts.items()})
+
+
+def _table(parts: dict[str, dict], found: dict[str, str]) -> str:
+    head = "".join(f"<th>{title}</th>" for title in ("part", "found", *_COLUMNS.values()))
+    rows = []
+    for name, part in parts.items():
+        cells = "".join(f"<td>{_number(part.get(key))}</td>" for key in _COLUMNS)
+        label = html.escape(name.replace("_", " "))
+        rows.append(f"<tr><th>{label}</th><td>{found[name]}</td>{cells}</tr>")
+    return f"<table><thead><tr>{head}</tr></thead><tbody>{''.join(rows)}</tbody></table>"
+
+
+def _number(value: float | None) -> str:
+    return "none" if value is None else f"{value:.2f}"

@@ -1,0 +1,226 @@
+"""The protocol: locate in every scene of a folder, compare with the truth, summarise."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+import tumortrack
+from tumortrack.core.errors import InputError, NoEstimate, StorageError
+from tumortrack.core.estimate import Estimate
+from tumortrack.core.store import write_json
+from tumortrack.core.types import SensorCloud
+from tumortrack.report.metrics import (
+    box_center_distance,
+    label_ious,
+    mean_iou,
+    surface_distances,
+    target_errors,
+)
+from tumortrack.report.page import PageScene, page_scene, part_rows, write_page
+from tumortrack.report.pictures import scene_picture
+from tumortrack.simulate.scene_folder import Scene, list_scenes, read_scene
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+DISTANCES = (
+    "hausdorff_mm",
+    "hausdorff_one_sided_mm",
+    "hausdorff_95_mm",
+    "surface_mm",
+    "center_mm",
+)
+RULE = (
+    "Medians over all scenes that have the part. A part that was not found counts as infinitely "
+    "far and with IoU 0; a median that is infinite is written as null. A scene with a part "
+    "missing counts as failed; where nothing was found its mIoU is 0 and its target errors are "
+    "infinite."
+)
+TARGET_ERRORS = ("mean", "rms", "median", "p95", "max")
+Locate = Callable[[SensorCloud], Estimate]
+Progress = Callable[[int, int, str], None]
+
+
+def evaluate_scenes(
+    locate: Locate,
+    scenes_dir: Path,
+    out: Path,
+    progress: Progress | None = None,
+    about: dict | None = None,
+) -> dict:
+    """Evaluate ``locate`` on every scene of a folder.
+
+    Writes OUT/scenes/NAME.png, OUT/index.html and, last, OUT/report.json (each atomically; a
+    report that lies there is replaced).
+
+    Args:
+        locate: observed cloud (camera frame, mm) -> estimate; raises NoEstimate or InputError
+            where it can say nothing, which counts as a failed scene.
+        scenes_dir: folder of scene folders.
+        out: report folder, made if it is not there.
+        progress: called after each scene with (done, total, its name).
+        about: plain JSON that the report repeats: the model and options behind ``locate``.
+
+    Returns:
+        The report: ``scenes``, ``summary`` and the ``rule`` by which medians were taken.
+
+    Raises:
+        InputError: no scenes, or a scene that cannot be read.
+        StorageError: the disk refused.
+    """
+    folders = list_scenes(scenes_dir)
+    try:
+        (out / "scenes").mkdir(parents=True, exist_ok=True)
+        (out / "report.json").unlink(missing_ok=True)  # never an old table beside new pictures
+    except OSError as error:
+        raise StorageError(f"cannot write {out}: {error.strerror}.") from error
+    entries: list[dict] = []
+    shown: list[PageScene] = []
+    for done, folder in enumerate(folders, start=1):
+        scene = read_scene(folder)
+        entry, estimate = evaluate_scene(locate, scene, folder.name)
+        picture = out / "scenes" / f"{folder.name}.png"
+        scene_picture(scene, estimate, entry, picture)
+        entries.append(entry)
+        shown.append(page_scene(folder.name, scene, estimate, picture))
+        if progress:
+            progress(done, len(folders), folder.name)
+    report = {
+        "tumortrack": tumortrack.__version__,
+        "units": "mm",
+        "frame": "camera",
+        **(about or {}),
+        "rule": RULE,
+        "summary": summarise(entries),
+        "scenes": entries,
+    }
+    write_page(report, shown, out / "index.html")
+    write_json(out / "report.json", report)
+    return report
+
+
+def evaluate_scene(locate: Locate, scene: Scene, name: str) -> tuple[dict, Estimate | None]:
+    """One scene's entry: name, parts -> metrics, miou, seconds, timings, and failed (or null).
+
+    ``tre_mm`` is there where the scene has targets and the estimate a motion; null where the scene
+    has targets and nothing was found.
+    """
+    start = time.perf_counter()
+    try:
+        estimate = locate(scene.cloud)
+    except (NoEstimate, InputError) as error:
+        parts = {part: {"found": False, "iou": 0.0} for part in scene.reference.names}
+        entry = {"name": name, "parts": parts, "miou": 0.0, "failed": str(error)}
+        return (entry if scene.targets is None else {**entry, "tre_mm": None}), None
+    seconds = time.perf_counter() - start
+    parts = compare(estimate, scene)
+    missing = [part for part, metrics in parts.items() if not metrics["found"]]
+    entry = {
+        "name": name,
+        "parts": parts,
+        "miou": mean_iou({part: metrics["iou"] for part, metrics in parts.items()}),
+        "seconds": seconds,
+        "timings": estimate.report.get("timings", {}),
+        "failed": f"not found: {', '.join(missing)}" if missing else None,
+    }
+    if estimate.motion is not None and scene.targets is not None:
+        entry["tre_mm"] = target_errors(estimate.motion, scene.targets)
+    return entry, estimate
+
+
+def compare(estimate: Estimate, scene: Scene) -> dict[str, dict]:
+    """Metrics of every part of the truth; a part that was not found has only found and iou."""
+    assert estimate.volume is not None
+    ious = label_ious(estimate.volume, scene.reference)
+    parts: dict[str, dict] = {}
+    for name, reference in zip(scene.reference.names, scene.reference.parts, strict=True):
+        parts[name] = {"found": False, "iou": ious[name]}
+        mesh = estimate.meshes.get(name)
+        if mesh is None or len(mesh.faces) == 0:
+            continue
+        distances = surface_distances(mesh, reference)
+        parts[name] = {
+            "found": True,
+            "hausdorff_mm": distances.symmetric_mm,
+            "hausdorff_one_sided_mm": distances.one_sided_mm,
+            "hausdorff_95_mm": distances.percentile_95_mm,
+            "surface_mm": distances.mean_mm,
+            "center_mm": box_center_distance(mesh, reference),
+            "iou": ious[name],
+        }
+    return parts
+
+
+def summarise(entries: list[dict]) -> dict:
+    """Medians per part, ``miou`` (median over scenes), ``failed`` and ``scenes`` (counts).
+
+    ``tre_mm`` holds the medians of the scenes' target errors and how many ``scenes`` count, where
+    the method knows a motion. The rule for parts that were not found is ``RULE``.
+    """
+    summary: dict = {}
+    names = sorted({part for entry in entries for part in entry["parts"]}, key=_part_order)
+    for name in names:
+        rows = [entry["parts"][name] for entry in entries if name in entry["parts"]]
+        medians = {key: _median([row.get(key, np.inf) for row in rows]) for key in DISTANCES}
+        summary[name] = {
+            **medians,
+            "iou": _median([row["iou"] for row in rows]),
+            "found": sum(row["found"] for row in rows),
+            "scenes": len(rows),
+        }
+    errors = [entry["tre_mm"] for entry in entries if "tre_mm" in entry]
+    if any(errors):
+        medians = {
+            key: _median([(e or {}).get(key, np.inf) for e in errors]) for key in TARGET_ERRORS
+        }
+        summary["tre_mm"] = {**medians, "scenes": len(errors)}
+    summary["miou"] = _median([entry["miou"] for entry in entries])
+    summary["miou_mean"] = float(np.mean([entry["miou"] for entry in entries]))
+    summary["failed"] = sum(entry["failed"] is not None for entry in entries)
+    summary["scenes"] = len(entries)
+    return summary
+
+
+def summary_table(report: dict) -> Table:
+    """The summary as a table for the terminal."""
+    from rich.table import Table
+
+    summary = report["summary"]
+    table = Table(
+        title=f"{summary['scenes']} scenes, {summary['failed']} failed, "
+        f"mIoU {summary['miou']:.3f}{_targets_text(summary)} (medians)"
+    )
+    table.add_column("part")
+    for head in ("found", "HD mm", "one-sided", "HD95", "surface", "centre", "IoU"):
+        table.add_column(head, justify="right")
+    for name, part in part_rows(summary).items():
+        numbers = [_text(part[key], 1 if key != "surface_mm" else 2) for key in DISTANCES]
+        found = f"{part['found']}/{part['scenes']}"
+        table.add_row(name, found, *numbers, _text(part["iou"], 2))
+    return table
+
+
+def _targets_text(summary: dict) -> str:
+    errors = summary.get("tre_mm")
+    return f", target error {_text(errors['mean'], 1)} mm" if errors else ""
+
+
+def _text(value: float | None, digits: int) -> str:
+    return "none" if value is None else f"{value:.{digits}f}"
+
+
+def _median(values: list[float]) -> float | None:
+    """The median, None where it is infinite (more than half the scenes without the part)."""
+    ordered = np.sort(np.array(values, float))
+    low, high = ordered[(len(ordered) - 1) // 2], ordered[len(ordered) // 2]
+    return float((low + high) / 2) if np.isfinite(high) else None
+
+
+def _part_order(name: str) -> tuple[int, str]:
+    number = name.rpartition("_")[2]
+    return (int(number) if number.isdigit() else 0, name)

@@ -1,0 +1,70 @@
+"""An estimate as a folder: cloud, labelled volume, surfaces, report."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from tumortrack.core import store
+from tumortrack.core.estimate import Estimate
+from tumortrack.core.mesh_files import write_mesh
+from tumortrack.imaging.segmentation import segments, write_seg_nrrd
+from tumortrack.imaging.volume import write_labels_nifti
+from tumortrack.sense.ply import write_cloud_ply
+from tumortrack.tracking.points import PointTable, camera_table
+
+
+def write_estimate(
+    folder: Path, estimate: Estimate, overwrite: bool = False, points: PointTable | None = None
+) -> None:
+    """occupancy.ply (points with label and probability and, where the estimate knows the way
+    back, their place in the CT), labels.nii.gz (voxel -> camera frame, mm), labels.seg.nrrd (the
+    same for 3D Slicer), kidney.ply, tumor_1.ply, ... and report.json; points.csv, the given
+    ``points`` of the CT and where they are now; all or nothing.
+
+    Raises:
+        InputError: the folder exists and ``overwrite`` is False; points without a motion.
+        NoEstimate: the motion has no answer for a point.
+        StorageError: the disk refused.
+    """
+    with store.new_folder(folder, overwrite) as aside:
+        cloud = estimate.cloud
+        write_cloud_ply(
+            aside / "occupancy.ply",
+            cloud.points_mm,
+            label=cloud.labels,
+            probability=cloud.probability,
+            **_places_in_ct(estimate),
+        )
+        volume = estimate.volume
+        assert volume is not None  # live estimates are the recording sink's
+        write_labels_nifti(
+            aside / "labels.nii.gz", volume.labels, volume.camera_from_index, lps=False
+        )
+        write_seg_nrrd(
+            aside / "labels.seg.nrrd",
+            volume.labels,
+            volume.camera_from_index,
+            segments(estimate.report["parts"]),
+        )
+        for name, mesh in estimate.meshes.items():
+            write_mesh(aside / f"{name}.ply", mesh)
+        if points is not None:
+            table = camera_table(points, estimate.motion)
+            store.write_atomically(aside / "points.csv", table)
+        store.write_json(aside / "report.json", estimate.report)
+        store.seal(aside, "run", {"report": "report.json"}, frame="camera")
+
+
+def _places_in_ct(estimate: Estimate) -> dict[str, np.ndarray]:
+    """ct_x, ct_y, ct_z (LPS, mm) of the cloud's points and how unsure their places are, std_mm;
+    empty where that is not known."""
+    if estimate.motion is None:
+        return {}
+    points_ct = estimate.motion.back(estimate.cloud.points_mm.astype(np.float64))
+    if points_ct is None:
+        return {}
+    places = {f"ct_{axis}": points_ct[:, n].astype(np.float32) for n, axis in enumerate("xyz")}
+    std_mm = estimate.motion.std_mm(points_ct)
+    return places if std_mm is None else {**places, "std_mm": std_mm.astype(np.float32)}

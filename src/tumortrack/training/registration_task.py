@@ -1,0 +1,164 @@
+"""Teaching a warp network: correspondences are shown, the refined motion is judged."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from tumortrack.core.errors import InputError
+from tumortrack.models.in_distribution import Familiar, fit_mm, spread_mm
+from tumortrack.registration.canonical_frame import carry_over, upright_of
+from tumortrack.registration.config import WarpDecoderConfig
+from tumortrack.registration.gauss_newton import Refined
+from tumortrack.registration.hypotheses import best_fit, first_motions, repaired
+from tumortrack.registration.motion import WarpMotion
+from tumortrack.registration.network import WarpNetwork
+from tumortrack.registration.rest_shape import shape_of
+from tumortrack.simulate.bodies import body_for
+from tumortrack.simulate.occupancy import FixedPoints, organ_pool
+from tumortrack.simulate.scene import Simulator
+from tumortrack.simulate.targets import draw_targets
+from tumortrack.training.model import Model, Trust
+from tumortrack.training.networks import Network
+from tumortrack.training.run import Run
+from tumortrack.training.validate import ValidationScenes, mean_iou_of, validation_scenes
+
+_USUAL = 90  # per cent of the validation scenes have no more than the usual cost
+_COVERED = 0.683  # of all errors lie within this radius if each axis errs normally by 1
+_RADIUS = 1.878
+_AT_SURFACE = 0.5  # of the points whose places are learnt; the others lie inside the parts
+
+
+class WarpCourse:
+    """Where fixed points of the organ go in each scene."""
+
+    def __init__(self, run: Run, device: torch.device) -> None:
+        self._run = run
+        body = body_for(run.anatomy_ct, run.up_lps, run.config.scene, run.seed)
+        if body is None:
+            raise InputError(
+                "a warp network learns from elastic deformations; the scene configuration has none."
+            )
+        self.body = body
+        self._shape = shape_of(run.anatomy_ct, body)
+        self.points = _points(run)
+        self._last: tuple[bytes, list[tuple[WarpMotion, Refined]]] | None = None
+
+    @cached_property
+    def _scenes(self) -> ValidationScenes:
+        run = self._run
+        pool = organ_pool(run.anatomy_ct, run.config.scene.occupancy, run.seed)
+        simulator = Simulator(run.anatomy_ct, run.up_lps, run.config.scene, self.body)
+        return validation_scenes(simulator, pool, run.config, run.seed)
+
+    def teach(self, network: Network) -> None:
+        assert isinstance(network, WarpNetwork)
+        run, shape = self._run, self._shape
+        network.know(shape, run.up_lps, self.points.points_ct)
+        if run.start is not None:
+            upright = upright_of(
+                run.anatomy_ct.organ, run.up_lps, shape.body.center_ct, shape.long_axis
+            )
+            carry_over(network, run.start.weights, upright)
+
+    def miou(self, network: Network) -> float:
+        return self._judged([fit for _, fit in self._fits(network)]).miou
+
+    def model(self, network: Network, provenance: dict) -> Model:
+        fits = self._fits(network)
+        usual_cost = float(np.percentile([fit.cost for _, fit in fits], _USUAL))
+        judged = self._judged(self._repaired(fits, usual_cost))
+        return Model(
+            network,
+            self._run.config,
+            self._run.anatomy_ct.names,
+            self._scenes.query_box_mm,
+            judged.familiar,
+            {**provenance, "validation_tre_mm": round(judged.tre_mm, 3)},
+            self._shape,
+            Trust(std_scale=judged.std_scale, usual_cost=usual_cost),
+        )
+
+    def _fits(self, network: Network) -> list[tuple[WarpMotion, Refined]]:
+        """The likeliest start and the best fit in each validation scene; of the same weights once,
+        since the last ones are mostly the best."""
+        assert isinstance(network, WarpNetwork)
+        weights = b"".join(w.numpy(force=True).tobytes() for w in network.state_dict().values())
+        if self._last is None or self._last[0] != weights:
+            network.eval()
+            shape, config, fits = self._shape, self._run.config.refine, []
+            for cloud in self._scenes.clouds_mm:
+                starts = first_motions(network, shape, cloud)
+                fits.append((starts[0], best_fit(shape, cloud, starts, config)))
+            self._last = weights, fits
+        return self._last[1]
+
+    def _repaired(self, fits: list[tuple[WarpMotion, Refined]], usual_cost: float) -> list[Refined]:
+        """The fits as the model will make them, which knows the usual cost."""
+        shape, config = self._shape, self._run.config.refine
+        return [
+            repaired(shape, cloud, start, config, fit) if fit.cost > usual_cost else fit
+            for cloud, (start, fit) in zip(self._scenes.clouds_mm, fits, strict=True)
+        ]
+
+    def _judged(self, fits: list[Refined]) -> Judged:
+        """Labels, places and trust over all validation scenes."""
+        scenes, shape = self._scenes, self._shape
+        guesses, errors, deviations = [], [], []
+        for fit, points_mm, points_ct, labels in zip(
+            fits, scenes.points_mm, scenes.points_ct, scenes.labels, strict=True
+        ):
+            guesses.append(shape.labels_at(fit.motion.back(points_mm).astype(np.float32))[0])
+            inside = labels > 0
+            error, deviation = _errors(fit, points_ct[inside], points_mm[inside])
+            errors.append(error)
+            deviations.append(deviation)
+        spreads = [spread_mm(cloud) for cloud in scenes.clouds_mm]
+        off = [fit_mm(np.abs(fit.distances_mm)) for fit in fits]
+        familiar = Familiar(
+            spread_mm=(min(spreads), max(spreads)), fit_mm=float(np.percentile(off, 95))
+        )
+        ratios = np.concatenate(errors) / np.concatenate(deviations)
+        return Judged(
+            mean_iou_of(np.stack(guesses), scenes.labels, len(shape.anatomy_ct.parts) + 1),
+            float(np.median([part.mean() for part in errors])),
+            float(np.quantile(ratios, _COVERED)) / _RADIUS,
+            familiar,
+        )
+
+
+@dataclass(frozen=True)
+class Judged:
+    """What validation says: labels, the median scene's error of places, how the estimated
+    standard deviations have to be scaled, and what clouds are like."""
+
+    miou: float
+    tre_mm: float
+    std_scale: float
+    familiar: Familiar
+
+
+def _errors(
+    fit: Refined, points_ct: Float[np.ndarray, "n 3"], points_mm: Float[np.ndarray, "n 3"]
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+    deviation = fit.motion.std_mm(points_ct)
+    assert deviation is not None
+    return np.linalg.norm(fit.motion.carry(points_ct) - points_mm, axis=1), deviation
+
+
+def _points(run: Run) -> FixedPoints:
+    """Points of the organ's surface, evenly drawn vertices, and of the parts' insides."""
+    decoder = run.config.network.decoder
+    assert isinstance(decoder, WarpDecoderConfig)
+    count = decoder.points
+    rng = np.random.default_rng([run.seed, 0x9A49])
+    vertices = run.anatomy_ct.organ.vertices_mm
+    surface = vertices[rng.choice(len(vertices), round(count * _AT_SURFACE), replace=True)]
+    inner = draw_targets(run.anatomy_ct, run.seed).points_ct
+    inner = inner[rng.choice(len(inner), count - len(surface), replace=True)]
+    points = np.concatenate([surface, inner]).astype(np.float32)
+    return FixedPoints(points, np.zeros(len(points), np.uint8))

@@ -1,0 +1,49 @@
+"""The demo from its first line to its page, with hardly any training."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+
+from stories import succeeded, tumortrack
+from tumortrack.cli.doctor import examine
+from tumortrack.cli.inspection import describe
+from tumortrack.core import store
+from tumortrack.imaging.case import load_case
+from tumortrack.simulate.scene_folder import list_scenes, read_scene
+
+
+def test_the_demo_tells_the_whole_story(tmp_path):
+    out = tmp_path / "demo"
+    said = succeeded(tumortrack("demo", "--out", out, "--minutes", 0.03, "--scenes", 2))
+    assert [f"{n}/5" in said for n in range(1, 6)] == [True] * 5
+    case = load_case(out / "case")
+    assert case.ct is not None
+    assert len(case.anatomy.tumors) == 2
+    report = json.loads((out / "report.json").read_text())
+    names = [folder.name for folder in list_scenes(out / "dataset")]
+    assert (
+        names == [entry["name"] for entry in report["scenes"]] == ["dragged-0000", "elastic-0000"]
+    )
+    assert report["model_sha256"] == store.sha256_of(out / "model" / store.MANIFEST)
+    assert report["model"]["case_sha256"] == store.sha256_of(out / "case" / store.MANIFEST)
+    assert any("warp" in line and "--map" in line for line in describe(out / "model"))
+    assert report["summary"]["tre_mm"]["scenes"] == 2  # the default preset knows correspondences
+    for name in names:
+        scene = read_scene(out / "dataset" / name)
+        assert scene.meta["case_sha256"] == report["model"]["case_sha256"]
+        assert len(scene.reference.tumors) == 2
+        assert (out / "scenes" / f"{name}.png").stat().st_size > 10_000
+    assert (out / "index.html").stat().st_size > 100_000  # self-contained, with its viewer
+    assert str(out / "index.html") in said.replace("\n", "")
+
+
+def test_the_doctor_finds_everything_also_where_the_system_tells_no_affinity(monkeypatch, capsys):
+    monkeypatch.delattr(os, "sched_getaffinity", raising=False)  # as on macOS
+    examine()
+    said = capsys.readouterr().out
+    assert int(re.search(r"cores: (\d+)", said).group(1)) >= 1
+    assert "BROKEN" not in said
+    assert said.count("ok ") >= 10
+    assert "rosbags (ROS messages" in said

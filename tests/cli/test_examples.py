@@ -1,0 +1,119 @@
+"""The examples are documentation: each runs, in order, each on what the ones before it left."""
+
+import contextlib
+import io
+import json
+import re
+import runpy
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tumortrack.core.mesh_files import read_mesh
+from tumortrack.imaging.case import load_case
+from tumortrack.simulate.occupancy import surface_distance
+from tumortrack.simulate.scene_folder import read_scene
+
+EXAMPLES = sorted((Path(__file__).parents[2] / "examples").glob("[0-9]*.py"))
+
+
+@pytest.fixture(scope="module")
+def story(tmp_path_factory):
+    """The folder that all examples wrote into, and what each of them said."""
+    out = tmp_path_factory.mktemp("examples")
+    said = {}
+    for file in EXAMPLES:  # as `python FILE FOLDER`, without loading PyTorch seven times
+        with (
+            pytest.MonkeyPatch.context() as patch,
+            contextlib.chdir(out),
+            contextlib.redirect_stdout(io.StringIO()) as told,
+        ):
+            patch.setattr(sys, "argv", [str(file), str(out)])
+            runpy.run_path(str(file), run_name="__main__")
+        said[file.name[:2]] = told.getvalue()
+    return out, said
+
+
+def test_there_are_seven_in_order():
+    assert [file.name[:2] for file in EXAMPLES] == [f"{n:02}" for n in range(1, 8)]
+
+
+def test_a_resection_is_planned_and_held_against_the_truth(story):
+    out, said = story
+    assert "tumor_1 lies wholly inside" in said["07"]
+    shares = [float(x) for x in re.findall(r"deeper: ([0-9.]+)% of the tumor", said["07"])]
+    assert len(shares) == 4
+    assert shares[2:] == [100.0, 100.0]  # ours: 5 mm of margin, 4 mm off
+    assert 80 < shares[1] < shares[0] < 100  # the paper's has none below
+    assert "arms: approach" in said["07"]
+    assert (out / "plan.png").stat().st_size > 50_000
+
+
+def test_a_moving_organ_is_followed(story):
+    _, said = story
+    heard = [float(x) for x in re.findall(r"off by ([0-9.]+) mm; ", said["06"])]
+    assert len(heard) >= 10
+    assert 0.01 < np.median(heard) < 15  # a model of 60 steps
+    assert "that was all" in said["06"]
+    assert "latency p50" in said["06"]
+
+
+def test_the_case_is_the_phantom(story):
+    out, said = story
+    case = load_case(out / "case")
+    assert len(case.anatomy.tumors) == 2
+    # Balls of 38 and 32 mm, lobulated by 8 % at most, through a coarse scan.
+    for tumor, diameter in zip(case.anatomy.tumors, (38.0, 32.0), strict=True):
+        assert tumor.volume_mm3 == pytest.approx(np.pi / 6 * diameter**3, rel=0.06)
+    assert "bright pieces beside the organ dropped" in said["01"]
+    assert (out / "case" / "qc.png").stat().st_size > 10_000
+
+
+def test_the_scene_is_deformed_and_pictured(story):
+    out, said = story
+    scene, case = read_scene(out / "scene"), load_case(out / "case")
+    assert len(scene.cloud.points_mm) == 1000
+    before, after = case.anatomy.organ.vertices_mm, scene.reference.organ.vertices_mm
+    lengths = [np.linalg.norm(v[1:] - v[:-1], axis=1) for v in (before, after)]
+    assert np.abs(lengths[0] - lengths[1]).max() > 0.05  # no rigid motion
+    assert "mIoU 0." in said["02"]
+    assert (out / "scene.png").stat().st_size > 10_000
+
+
+def test_the_cloud_gives_surfaces_in_its_own_frame(story):
+    out, said = story
+    report = json.loads((out / "located" / "report.json").read_text())
+    assert report["frame"] == "camera"
+    assert report["parts"]["kidney"]["found"]
+    kidney = read_mesh(out / "located" / "kidney.ply")
+    assert kidney.volume_mm3 / 1000 == pytest.approx(
+        report["parts"]["kidney"]["volume_ml"], rel=1e-3
+    )
+    # Even after 60 steps the organ lies on its cloud, with the volume that it has in the CT.
+    cloud = read_scene(out / "scene").cloud.points_mm
+    assert np.median(surface_distance(kidney, cloud)) < 3
+    true_mm3 = load_case(out / "case").anatomy.organ.volume_mm3
+    assert kidney.volume_mm3 == pytest.approx(true_mm3, rel=0.04)
+    assert "step 60" in said["03"]
+
+
+def test_points_of_the_ct_have_a_place_now_and_back(story):
+    out, said = story
+    numbers = [
+        [float(number) for number in re.findall(r"-?\d+\.\d+", line)]
+        for line in said["05"].splitlines()
+    ]
+    *parts, seen = numbers
+    organ = load_case(out / "case").anatomy.organ
+    assert len(parts) == 3
+    for line in parts:
+        assert line[6] > 0  # the standard deviation
+        assert line[-1] < 15  # mm off; the deformations are none that training showed
+    # The organ's first triangle, by carrying it and as example 04 wrote the surface.
+    written = read_mesh(out / "located" / "kidney.ply")
+    for place, mesh in ((parts[0][:3], organ), (parts[0][3:6], written)):
+        assert place == pytest.approx(mesh.vertices_mm[mesh.faces[0]].mean(0), abs=0.1)
+    # What the camera sees is the organ's surface.
+    assert surface_distance(organ, np.array([seen[3:6]], np.float32))[0] < 5

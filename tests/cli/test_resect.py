@@ -1,0 +1,277 @@
+"""`tumortrack plan` and `tumortrack resect` as a user runs them."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+
+import numpy as np
+import pytest
+from PIL import Image
+from safetensors import safe_open
+
+from plan_objects import located
+from stories import (
+    COMMAND,
+    cloud_by_rays,
+    environment,
+    looking_down,
+    refusal,
+    succeeded,
+    tumortrack,
+)
+from tumortrack.core.estimate import Estimate
+from tumortrack.core.types import CameraLabels, OccupancyCloud
+from tumortrack.imaging.case import load_case
+from tumortrack.plan.files import read_plan
+from tumortrack.plan.motions import JOINTS
+from tumortrack.sense.ply import parse_ply_properties, write_cloud_ply
+from tumortrack.tracking.files import write_estimate
+
+CAMERA_FROM_TABLE = np.array([[1.0, 0, 0, 5.0], [0, -1, 0, -8.0], [0, 0, -1, 300.0], [0, 0, 0, 1]])
+
+
+def write_run(folder):
+    """What `locate` would write of a half-sunk tumor, the camera straight above."""
+    seen = located(n=20_000)
+    camera = {
+        name: mesh.moved(mesh.vertices_mm @ CAMERA_FROM_TABLE[:3, :3].T + CAMERA_FROM_TABLE[:3, 3])
+        for name, mesh in seen.meshes.items()
+    }
+    points = seen.points_mm @ CAMERA_FROM_TABLE[:3, :3].T + CAMERA_FROM_TABLE[:3, 3]
+    cloud = OccupancyCloud(points, seen.labels, np.ones(len(points)))
+    volume = CameraLabels(np.ones((3, 3, 3), np.uint8), np.eye(4))
+    parts = {
+        name: {"label": label, "found": True, "volume_ml": mesh.volume_mm3 / 1000}
+        for label, (name, mesh) in enumerate(camera.items(), start=1)
+    }
+    write_estimate(folder, Estimate(cloud, volume, camera, {"units": "mm", "parts": parts}))
+    return seen
+
+
+@pytest.fixture(scope="module")
+def story(tmp_path_factory):
+    """A run, and the plan that the command made of it."""
+    folder = tmp_path_factory.mktemp("resect")
+    write_run(folder / "run")
+    said = succeeded(tumortrack("plan", folder / "run", folder / "plan"))
+    return folder, said
+
+
+def test_a_plan_is_written_in_the_tables_frame(story):
+    folder, said = story
+    assert "tumor_1 (7" in said
+    assert "ml healthy tissue" in said
+    stored = read_plan(folder / "plan")
+    assert stored.frame_id == "table"
+    # Straight above, 120 mm over the table by default, its middle over the origin.
+    kidney = stored.meshes["kidney"]
+    assert kidney.box_mm[0, 2] == pytest.approx(120, abs=0.01)
+    assert kidney.box_mm.mean(0)[:2] == pytest.approx([0, 0], abs=0.01)
+    assert stored.table_from_camera[:3, :3] == pytest.approx(np.diag([1, -1, -1]))
+    plan = stored.plan
+    assert plan.volumes_ml["tumor"] == pytest.approx(4 / 3 * np.pi * 1.2**3, rel=0.06)
+    data = json.loads((folder / "plan" / "plan.json").read_text())
+    assert data["plan"]["layers"][0]["top_mm"] is None
+    table = parse_ply_properties(
+        (folder / "plan" / "strokes.ply").read_bytes(),
+        "strokes",
+        ("x", "y", "z", "sweep", "stroke"),
+    )
+    assert table[-1, :3] == pytest.approx(plan.grasp_mm, abs=1e-3)
+    assert len(table) == sum(len(cut.path_mm) for cut in plan.cuts) + 1
+    assert table[0, :3] == pytest.approx(plan.cuts[0].path_mm[0], abs=1e-3)
+    assert set(table[:, 4]) == set(range(len(plan.cuts) + 1))
+    picture = np.asarray(Image.open(folder / "plan" / "plan.png").convert("RGB"))
+    assert picture.shape[1] >= 1000
+    assert picture.std() > 20
+    assert "<robot" in (folder / "plan" / "cell.urdf").read_text()
+    with safe_open(folder / "plan" / "motions.safetensors", "np") as tensors:
+        assert json.loads(tensors.metadata()["joints"]) == list(JOINTS)
+    described = succeeded(tumortrack("inspect", folder / "plan"))
+    assert "a plan" in described
+
+
+def test_a_plan_is_carried_out_and_recorded(story, tmp_path):
+    folder, _ = story
+    report = tmp_path / "report.json"
+    said = succeeded(
+        tumortrack(
+            "resect", folder / "plan", f"recording:{tmp_path / 'seen'}", "--speed", 20,
+            "--report", report,
+        )
+    )  # fmt: skip
+    stages = [stage.name for stage in read_plan(folder / "plan").motions.stages]
+    assert stages[:4] == ["approach", "grasp", "hold", "sweep 1"]
+    assert stages[-2:] == ["release", "home"]
+    lines = said.splitlines()
+    assert "done: both arms are home." in lines
+    found = json.loads(report.read_text())["resection"]
+    assert found["state"] == "done"
+    assert found["halts"] == {}
+    passed = [entry["state"] for entry in found["log"]]
+    assert passed == [
+        stage for stage in [*stages, "done"] if stage in passed
+    ]  # short ones are missed
+    assert {"approach", "sweep 1", "home", "done"} <= set(passed)
+    from rosbags.rosbag2 import Reader
+    from rosbags.typesys import Stores, get_typestore
+
+    store, joints = get_typestore(Stores.ROS2_JAZZY), []
+    with Reader(tmp_path / "seen") as reader:
+        for connection, _, raw in reader.messages():
+            if connection.msgtype == "sensor_msgs/msg/JointState":
+                joints.append(store.deserialize_cdr(raw, connection.msgtype))
+    assert len(joints) > 20
+    assert list(joints[0].name) == list(JOINTS)
+    way = np.array([message.position for message in joints])
+    first, last = read_plan(folder / "plan").motions.stages[0], way[-1]
+    assert way[0] == pytest.approx(first.joints_rad[0], abs=1e-6)
+    assert last == pytest.approx(first.joints_rad[0], abs=1e-6)  # home again
+    assert np.ptp(way, axis=0).max() > 0.5
+
+
+def test_real_arms_are_not_hurried(story):
+    folder, _ = story
+    done = tumortrack("resect", folder / "plan", "ur:10.0.0.9?execute=true", "--speed", 2)
+    assert "--speed 2 with real arms; allowed: up to 1" in refusal(done)
+
+
+def test_ctrl_c_stops_the_arms_and_says_so(story, tmp_path):
+    folder, _ = story
+    report = tmp_path / "report.json"
+    process = subprocess.Popen(
+        [*COMMAND, "resect", str(folder / "plan"), "--report", str(report)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=environment(),
+    )
+    assert process.stdout is not None
+    for line in process.stdout:
+        if line.strip() == "grasp":
+            break
+    process.send_signal(signal.SIGINT)
+    _, said = process.communicate(timeout=30)
+    assert process.returncode == 130
+    assert said == "tumortrack: stopped.\n"
+    found = json.loads(report.read_text())["resection"]
+    assert (found["state"], found["halted"]) == ("aborted", "stopped by the user")
+
+
+def test_a_film_is_an_animation(story, tmp_path):
+    folder, _ = story
+    said = succeeded(tumortrack("resect", folder / "plan", "--film", tmp_path / "film.gif"))
+    assert "written to" in said
+    with Image.open(tmp_path / "film.gif") as film:
+        assert film.n_frames > 50
+        first = np.asarray(film.convert("RGB"), float)
+        film.seek(film.n_frames // 2)
+        middle = np.asarray(film.convert("RGB"), float)
+    assert np.abs(first - middle).mean() > 1  # something moves
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["--margin", 40], "margin_mm is 40; allowed: 1 to 20"),
+        (["--config", "CONFIG"], "unknown field `margn`"),
+        (["--frame", "UP"], "the camera looks up in this frame"),
+        (["--sigmas", 2], "does not say how unsure it is"),
+        (["--tumor", "tumor_4"], "there is no 'tumor_4'; located were tumor_1"),
+        (["--cell", "NARROW"], "clearance_mm is -8; allowed: 0.5 to 100"),
+        (["--cell", "CELL"], "unknown field `legs`"),
+        (["--frame", "FRAME"], "must have camera_from_robot"),
+    ],
+)
+def test_what_cannot_be_planned_is_said_in_one_line_and_nothing_is_written(
+    story, tmp_path, arguments, said
+):
+    folder, _ = story
+    (tmp_path / "CELL").write_text('{"legs": 4}')
+    (tmp_path / "FRAME").write_text('{"frame_id": "base", "unit": "mm"}')
+    (tmp_path / "NARROW").write_text('{"clearance_mm": -8}')
+    (tmp_path / "CONFIG").write_text('{"margn": 4}')
+    rows = np.eye(4).tolist()
+    (tmp_path / "UP").write_text(
+        json.dumps({"frame_id": "base", "unit": "mm", "robot_from_camera": rows})
+    )
+    arguments = [tmp_path / a if str(a).isupper() else a for a in arguments]
+    done = tumortrack("plan", folder / "run", tmp_path / "plan", *arguments)
+    assert said in refusal(done)
+    assert not (tmp_path / "plan").exists()
+
+
+def test_arms_that_cannot_reach_are_no_plan(story, tmp_path):
+    folder, _ = story
+    cell = tmp_path / "cell.json"
+    cell.write_text('{"table_mm": [200, 200], "stand_mm": 900}')
+    done = tumortrack("plan", folder / "run", tmp_path / "plan", "--cell", cell)
+    line = refusal(done)
+    assert done.returncode == 3
+    assert "arms" in line
+    without = tumortrack("plan", folder / "run", tmp_path / "plan", "--cell", cell, "--no-arms")
+    succeeded(without)
+    assert "planned with --no-arms" in refusal(tumortrack("resect", tmp_path / "plan"))
+
+
+def test_with_a_calibration_plan_and_arms_are_in_the_robots_frame(story, tmp_path):
+    """The same cell, told in another frame: the same motions."""
+    folder, _ = story
+    here = read_plan(folder / "plan")
+    robot_from_table = np.eye(4)
+    robot_from_table[:3, :3] = [[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]
+    robot_from_table[:3, 3] = [430.0, -120.0, -60.0]
+    frame, cell = tmp_path / "frame.json", tmp_path / "cell.json"
+    rows = (robot_from_table @ here.table_from_camera).tolist()
+    frame.write_text(json.dumps({"frame_id": "base_link", "unit": "mm", "robot_from_camera": rows}))
+    done = tumortrack("plan", folder / "run", tmp_path / "plan", "--frame", frame)
+    assert "where do the arms stand" in refusal(done)
+    bases = {}
+    for arm in ("cutter", "holder"):
+        base = here.cell[f"{arm}_base"]
+        place = robot_from_table @ [*base["position_mm"], 1.0]
+        bases[f"{arm}_base"] = {
+            "position_mm": place[:3].tolist(), "yaw_deg": base["yaw_deg"] + 90.0
+        }  # fmt: skip
+    cell.write_text(json.dumps(bases))
+    succeeded(
+        tumortrack("plan", folder / "run", tmp_path / "plan", "--frame", frame, "--cell", cell)
+    )
+    there = read_plan(tmp_path / "plan")
+    assert there.frame_id == "base_link"
+    expected = robot_from_table @ [*here.plan.grasp_mm, 1.0]
+    assert there.plan.grasp_mm == pytest.approx(expected[:3], abs=1.6)
+    assert there.cell["middle_mm"] == pytest.approx(robot_from_table[:3, 3].tolist(), abs=1.5)
+    assert there.motions.stages[0].joints_rad[0] == pytest.approx(
+        here.motions.stages[0].joints_rad[0]
+    )
+    assert there.motions.seconds == pytest.approx(here.motions.seconds, rel=0.3)
+
+
+def test_a_live_world_that_lies_elsewhere_is_planned_anew_and_cut(
+    phantom_case, clinic_model, tmp_path
+):
+    case = load_case(phantom_case)
+    cloud = cloud_by_rays(case, looking_down(case))
+    write_cloud_ply(tmp_path / "cloud.ply", cloud)
+    succeeded(
+        tumortrack("locate", clinic_model, tmp_path / "cloud.ply", tmp_path / "run", "--grid", 32)
+    )
+    succeeded(tumortrack("plan", tmp_path / "run", tmp_path / "plan", "--method", "published"))
+    world = f"virtual:{phantom_case}?breathing=false&instrument=false&camera_motion=false&fps=10"
+    report = tmp_path / "report.json"
+    said = succeeded(
+        tumortrack(
+            "resect", tmp_path / "plan", "--live", clinic_model, world, "--speed", 10,
+            "--report", report,
+        )
+    )  # fmt: skip
+    assert "done: both arms are home." in said
+    found = json.loads(report.read_text())
+    passed = found["resection"]["log"]
+    assert passed[-1]["state"] == "done"
+    assert any(entry.get("event") == "planned anew" for entry in passed)
+    assert any("has moved by" in halt for halt in found["resection"]["halts"])
+    assert found["frame"]["frame_id"] == "table"

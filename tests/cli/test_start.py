@@ -1,0 +1,90 @@
+"""What a command loads before it answers: PyTorch takes a second, and some others tenths of one."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from stories import COMMAND, cloud_by_rays, environment, looking_down
+from tumortrack.imaging.case import load_case
+from tumortrack.sense.files import write_cloud_ply
+
+
+def answered(
+    *arguments: object, run: list[str] = COMMAND[1:]
+) -> tuple[subprocess.CompletedProcess[str], set[str]]:
+    """A command's end, and every module that it imported."""
+    words = [sys.executable, "-X", "importtime", *run, *map(str, arguments)]
+    buffered = {name: is_ for name, is_ in environment().items() if name != "PYTHONUNBUFFERED"}
+    done = subprocess.run(words, capture_output=True, text=True, timeout=120, env=buffered)
+    rows = [line.split("|") for line in done.stderr.splitlines() if line.startswith("import time:")]
+    imported = {row[-1].strip() for row in rows}
+    assert "tyro" in imported
+    return done, imported
+
+
+@pytest.fixture
+def cloud(tmp_path, phantom_case):
+    case = load_case(phantom_case)
+    file = tmp_path / "cloud.ply"
+    write_cloud_ply(file, cloud_by_rays(case, looking_down(case), 0.02).astype(np.float32))
+    return file
+
+
+@pytest.mark.parametrize(
+    ("command", "wrong"),
+    [
+        ("locate NONE CLOUD OUT", "NONE is not a tumortrack model"),
+        ("locate MODEL NONE.ply OUT", "NONE.ply does not exist"),
+        ("locate MODEL CLOUD CLOUD", "exists already"),
+        ("track NONE virtual:CASE --report OUT", "NONE is not a tumortrack model"),
+        ("evaluate MODEL NONE OUT", "NONE"),
+        ("train NONE OUT", "NONE is not a tumortrack case"),
+        ("onnx NONE OUT.onnx", "NONE is not a tumortrack model"),
+    ],
+)
+def test_what_is_wrong_is_said_before_pytorch_is_loaded(
+    command, wrong, slim_model, phantom_case, cloud, tmp_path
+):
+    places = {"NONE": tmp_path / "none", "MODEL": slim_model, "CASE": phantom_case}
+    places |= {"CLOUD": cloud, "OUT": tmp_path / "out"}
+    for name, place in places.items():
+        command, wrong = (text.replace(name, str(place)) for text in (command, wrong))
+    done, imported = answered(*command.split())
+    assert done.returncode == 2, done.stderr
+    assert wrong in done.stderr
+    assert "torch" not in imported
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_missing_package_is_told_before_pytorch_is_loaded(slim_model, tmp_path):
+    without = "import sys; sys.modules['onnx'] = None; from tumortrack.cli.main import main; main()"
+    done, imported = answered("onnx", slim_model, tmp_path / "out.onnx", run=["-c", without])
+    assert done.returncode == 2, done.stderr
+    assert "pip install 'tumortrack[onnx]'" in done.stderr
+    assert "torch" not in imported
+
+
+def test_an_answer_needs_none_of_the_slow_libraries(slim_model, tmp_path):
+    from warp_objects import placed
+
+    surface = placed(3).carry(placed(3).shape.anatomy_ct.organ.vertices_mm)
+    file = tmp_path / "cloud.ply"
+    write_cloud_ply(file, surface[surface[:, 2] < np.median(surface[:, 2])].astype(np.float32))
+    done, imported = answered("locate", slim_model, file, tmp_path / "out", "--grid", 32)
+    assert done.returncode == 0, done.stderr[-2000:]
+    assert (tmp_path / "out" / "labels.nii.gz").exists()
+    assert "written to" in done.stdout.splitlines()[-1]  # though the process ends at once
+    assert "torch" in imported
+    slow = {"torch._dynamo", "nibabel", "pydicom", "trimesh", "matplotlib", "SimpleITK", "skimage"}
+    assert not slow & imported
+
+
+def test_a_command_ends_well_where_nobody_reads_its_errors():
+    words = "from tumortrack.cli.loading import leave; print(1, flush=True); leave(); print(2)"
+    closed = f"exec {sys.executable} -c '{words}' 2>&-"
+    done = subprocess.run(["sh", "-c", closed], stdout=subprocess.PIPE, timeout=60, check=True)
+    assert done.stdout == b"1\n"

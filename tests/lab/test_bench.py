@@ -1,0 +1,297 @@
+"""The bench: figures that follow from their definitions, naive forms that give the same answers."""
+
+import json
+import sys
+import time
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+import torch
+
+from stories import tumortrack
+from tumortrack.core.errors import InputError, TumortrackError
+from tumortrack.core.types import Anatomy, Mesh
+from tumortrack.models.encoders.pointnet2 import PointNet2Config, SetAbstraction
+from tumortrack.occupancy.mlp_decoder import MlpDecoderConfig
+from tumortrack.occupancy.network import CloudBox, NetworkConfig, OccupancyNetwork, quick_network
+from tumortrack_lab.bench.counts import module_flops
+from tumortrack_lab.bench.goals import GOALS, goals_table
+from tumortrack_lab.bench.growth import draw_growth
+from tumortrack_lab.bench.memory import forget_peak, peak_bytes
+from tumortrack_lab.bench.naive.occupancy import NaiveOccupancy
+from tumortrack_lab.bench.naive.scenes import flowed
+from tumortrack_lab.bench.plan import Wish, tasks_of
+from tumortrack_lab.bench.report import BLOCKS, write_bench
+from tumortrack_lab.bench.row import Bench, Peaks, Point, Row, Work
+from tumortrack_lab.bench.subject import Subject
+from tumortrack_lab.bench.suite import GROUPS
+from tumortrack_lab.bench.tasks import Task, carry_out
+from tumortrack_lab.bench.turns import Timing, Uncounted, in_turns, timing_of
+from tumortrack_lab.cli import bench as benching
+from tumortrack_lab.cli.bench import BenchOptions
+from tumortrack_lab.study.markdown import closing, opening
+
+PAPER_DECODER = MlpDecoderConfig(
+    n_classes=4, width=512, hidden_layers=8, skip_layer=5, norm_layers=(5, 8)
+)
+
+
+def timing(median_s: float) -> Timing:
+    return timing_of([0.9 * median_s, median_s, 1.2 * median_s])
+
+
+def test_turns_are_fair_and_what_is_not_counted_is_left_out() -> None:
+    order = []
+
+    def slow() -> None:
+        order.append("slow")
+        time.sleep(0.02)
+
+    def fast() -> Uncounted:
+        order.append("fast")
+        time.sleep(0.015)
+        return Uncounted(0.01)
+
+    slow_s, fast_s = in_turns(slow, fast, budget_s=0.2)
+    assert slow_s.median_s >= 0.02
+    assert 0.004 <= fast_s.median_s < slow_s.median_s  # a hundredth is not counted
+    assert order[4:8] == ["slow", "fast", "slow", "fast"]  # after two calls of each to warm up
+    assert 3 <= slow_s.turns <= 6
+    for one in (slow_s, fast_s):
+        assert one.best_s <= one.low_s <= one.median_s <= one.high_s
+
+
+def test_arithmetic_is_that_of_the_layers() -> None:
+    decoder = PAPER_DECODER.build(latent_size=1024).eval()
+    for layer in decoder.layers:
+        layer.fold()
+    terms = decoder.prepare(torch.zeros(1, 1024))
+    # The latent's share is made once: a query costs 3 -> 512, six times 512 -> 512, [512, 3] -> 512
+    # and 512 -> 4, each product an addition and a multiplication.
+    by_hand = 2 * (3 * 512 + 6 * 512 * 512 + 515 * 512 + 512 * 4)
+    assert module_flops(lambda: decoder(terms, torch.zeros(1, 10, 3))) == 10 * by_hand
+    beside = 2 * 512 * 1024 * 2  # the latent beside every query, at both layers that see it
+    assert by_hand == 3_680_256
+    assert beside / by_hand == pytest.approx(0.57, abs=0.01)
+    assert module_flops(lambda: decoder.prepare(torch.zeros(1, 1024))) == beside
+
+
+def test_floors_follow_from_the_rates() -> None:
+    peaks = Peaks(threads=1, gemm={"fp32": 1e9, "bf16": 4e9}, triad=2e9)
+    assert peaks.floor_s(Work(flops=4e9, bytes=1.0, precision="bf16")) == 1.0
+    assert peaks.floor_s(Work(flops=1.0, bytes=4e9)) == 2.0
+    assert peaks.floor_s(Work(flops=3e9, bytes=0.0, precision="int8")) == 3.0  # not offered: fp32
+
+
+def normed_network() -> NetworkConfig:
+    levels = (
+        SetAbstraction(ratio=0.5, radius=0.2, neighbours=16, widths=(8, 16)),
+        SetAbstraction(ratio=0.25, radius=0.4, neighbours=8, widths=(16, 24)),
+    )
+    decoder = MlpDecoderConfig(
+        n_classes=3, width=24, hidden_layers=4, skip_layer=3, norm_layers=(3, 4)
+    )
+    encoder = PointNet2Config(levels=levels, widths=(24, 32))
+    return NetworkConfig(encoder=encoder, decoder=decoder, normalisation=CloudBox())
+
+
+@pytest.mark.parametrize("config", [normed_network(), quick_network(4, 60.0)])
+def test_the_naive_network_is_the_network(config: NetworkConfig) -> None:
+    torch.manual_seed(1)
+    network = OccupancyNetwork(config)
+    clouds = 30 * torch.randn(2, 300, 3) + torch.tensor([0.0, 5.0, 150.0])
+    queries = 40 * torch.randn(2, 50, 3) + torch.tensor([0.0, 5.0, 150.0])
+    with torch.no_grad():
+        for training in (True, False):  # the first settles the norms' statistics
+            network.train(training)
+            plain = NaiveOccupancy(network, training=False)
+            if training:
+                network(clouds, queries)
+                continue
+            expected = network(clouds, queries)
+            found = plain.logits(plain.encode(clouds), queries)
+    assert float(expected.std()) > 1e-3
+    torch.testing.assert_close(found, expected, rtol=1e-3, atol=1e-3)
+
+
+def test_the_naive_flow_is_the_flow() -> None:
+    from tumortrack.simulate.elastic.body import Body
+
+    rng = np.random.default_rng(0)
+    waves = np.sin(np.linspace(0, 3, 7))[:, None, None, None, None] * rng.normal(
+        size=(1, 7, 7, 3, 2)
+    )
+    smooth = (waves + np.roll(waves, 1, 1) + np.roll(waves, 1, 2)).astype(np.float32)
+    states = rng.normal(size=(5, 2)).astype(np.float32)
+    body = Body(np.zeros(3, np.float32), 20.0, np.full(3, 60.0), smooth, states)
+    points = rng.uniform(25, 95, (200, 3)).astype(np.float32)
+    moved = body.carry(states[0], points)
+    assert np.linalg.norm(moved - points, axis=1).max() > 1.0
+    np.testing.assert_allclose(flowed(body, states[0], points), moved, atol=0.1)
+
+
+def test_peak_memory_is_seen() -> None:
+    before = forget_peak()
+    if before is None:
+        pytest.skip("this system does not tell")
+    np.ones(2**24)  # 128 MiB, at once freed again; the system's own count is not exact
+    held = peak_bytes()
+    assert held is not None
+    assert 0.95 * 2**27 < held - before < 1.5 * 2**27
+
+
+def some_bench() -> Bench:
+    row = Row(
+        name="frame",
+        what="paper",
+        threads=2,
+        item="frame",
+        ours=timing(0.04),
+        naive=timing(1.2),
+        naive_is="plain",
+        work=Work(flops=1.5e11, bytes=1e6, precision="bf16"),
+        agreement=0.99941,
+    )
+    follow = Row(name="tracking frame", what="clinic", threads=2, item="frame", ours=timing(0.006))
+    points = tuple(
+        Point(curve=curve, what=what, size=size, seconds=size * 1e-4, peak_bytes=size * 10**6)
+        for curve in ("queries", "batch")
+        for what in ("clinic", "quick")
+        for size in (1, 10)
+    )
+    peaks = (Peaks(threads=2, gemm={"fp32": 1e11, "bf16": 5e12}, triad=4e10),)
+    machine = {"processor": "a processor", "GPU": "none at hand", "date": "2026-01-02"}
+    rows = (row, follow)
+    return Bench(machine=machine, command="the command", peaks=peaks, rows=rows, points=points)
+
+
+def test_goals_are_judged_by_what_was_measured() -> None:
+    lines = goals_table(some_bench()).splitlines()
+    assert len(lines) == len(GOALS) + 2
+    (frame,) = [line for line in lines if "`paper`, 2 CPU" in line and "frame" in line]
+    assert "30.0 x (40.0 ms, naive 1.20 s), 99.941 % equal | yes |" in frame
+    (tracking,) = [line for line in lines if "tracking" in line]
+    assert tracking.endswith("| 6.00 ms | no |")
+    assert sum("no GPU was at hand |  |" in line for line in lines) == 3
+    assert sum("not measured in this run |  |" in line for line in lines) == len(GOALS) - 5
+
+
+def test_a_document_is_filled_and_the_rest_of_it_stays(tmp_path) -> None:
+    document = tmp_path / "docs" / "performance.md"
+    document.parent.mkdir()
+    blocks = "\n".join(f"{opening(name)}\nold\n{closing(name)}" for name in BLOCKS)
+    document.write_text(f"before\n{blocks}\nafter")
+    written = write_bench(some_bench(), tmp_path / "bench.json", document)
+    text = document.read_text()
+    assert text.startswith("before\n")
+    assert text.endswith("after")
+    assert "old" not in text
+    assert "| frame | paper | 2 | 40.0 ms a frame |" in text
+    assert "| 150 GFLOP | 1.00 MB | bf16 | 75.0 % |" in text
+    assert (document.parent / "images" / "growth.png").stat().st_size > 10_000
+    assert {path.name for path in written} >= {"bench.json", "bench_curves.json", "growth.png"}
+    assert len(json.loads((tmp_path / "bench_curves.json").read_text())["points"]) == 8
+    draw_growth(some_bench().points[:4], tmp_path / "one.png")  # a single curve is a picture too
+
+
+def small_subject(folder: Path) -> Subject:
+    """The bench's subject with a ball and a tumor in place of the phantom."""
+    import trimesh
+
+    def ball(radius_mm: float, x_mm: float) -> Mesh:
+        sphere = trimesh.creation.icosphere(2, radius_mm)
+        return Mesh(sphere.vertices + [x_mm, 0, 0], sphere.faces)
+
+    subject = Subject({}, folder)
+    subject.__dict__["anatomy"] = Anatomy((ball(30.0, 0.0), ball(8.0, 10.0)))
+    return subject
+
+
+def test_a_process_measures_a_part(tmp_path) -> None:
+    task = Task(threads=1, folder=str(tmp_path), describe=True, peaks=True, quick=True)
+    task = msgspec.structs.replace(task, groups=("generator",))
+    said = list(carry_out(task, small_subject(tmp_path)))
+    (row,) = [one.row for one in said if one.row is not None]
+    ours, naive = row.ours, row.naive
+    assert naive is not None
+    assert 1e-5 < ours.best_s <= ours.low_s <= ours.median_s <= ours.high_s
+    assert ours.median_s < naive.median_s
+    assert row.ratio == naive.median_s / ours.median_s
+    assert row.per_s == 1 / ours.median_s
+    assert row.work is not None
+    # 18 drags of 2,000 points and 162 vertices, 640 triangles' front half, a quarter of the image.
+    by_hand = 16 * 18 * 2162 + 60 * 160 + 2 * 20 * 424 * 240 / 4
+    assert row.work.flops == by_hand
+    (peaks,) = [one.peaks for one in said if one.peaks is not None]
+    assert peaks.triad > 1e9
+    assert peaks.gemm["fp32"] > 1e9
+    (machine,) = [one.machine for one in said if one.machine is not None]
+    assert int(machine["cores"]) >= 1
+    assert [one.begins for one in said if one.begins] == [
+        "the machine's own rates, one core",
+        "generator, one core",
+    ]
+
+
+WORKER = """
+import json, os, sys
+task = json.loads(sys.argv[-1])
+assert os.environ["OMP_NUM_THREADS"] == str(task["threads"])
+print("a library's chatter")
+print(json.dumps({"begins": "something"}))
+if task["describe"]:
+    print(json.dumps({"machine": {"date": "today"}}))
+for group in task["groups"]:
+    time = dict(best_s=1.0, median_s=2.0, low_s=1.5, high_s=3.0, turns=3)
+    print(json.dumps({"row": dict(name=group, what="", threads=1, item="pair", ours=time)}))
+if "encoder" in task["groups"]:
+    sys.exit("the encoder is broken")
+"""
+
+
+def test_the_command_gathers_what_processes_find(tmp_path, monkeypatch, capfd) -> None:
+    monkeypatch.setattr(benching, "_WORKER", [sys.executable, "-c", WORKER])
+    out = tmp_path / "new" / "found.json"
+    benching.bench(BenchOptions(only=("generator", "planning"), quick=True, out=out))
+    found = json.loads(out.read_text())
+    assert [row["name"] for row in found["rows"]] == ["generator", "planning"]
+    assert found["machine"] == {"date": "today"}
+    assert found["command"] == "tumortrack bench --only generator planning --quick"
+    assert "2.00 s" in capfd.readouterr().out
+    with pytest.raises(TumortrackError, match="the encoder is broken"):
+        benching.bench(BenchOptions(only=("encoder",), out=tmp_path / "none.json"))
+    assert not (tmp_path / "none.json").exists()
+
+
+def test_each_process_has_its_own_threads_and_only_needed_models_are_trained(tmp_path) -> None:
+    wish = Wish(("generator", "frame", "tracking"), ("grid",), False, tmp_path)
+    first, one, two, *curves = tasks_of(wish, cores=4)
+    assert (first.threads, first.train) == (2, ("clinic", "paper", "quick"))
+    assert first.describe
+    assert (one.threads, one.groups) == (1, ("generator", "frame", "tracking"))
+    assert (two.threads, two.groups) == (2, ("frame", "tracking"))
+    assert [task.curve for task in curves] == [("grid", p) for p in ("clinic", "quick", "paper")]
+    (alone,) = tasks_of(Wish(("generator",), (), False, tmp_path), cores=1)
+    assert alone.describe
+    assert alone.train == ()
+
+
+def test_what_cannot_be_measured_is_refused(tmp_path) -> None:
+    assert "nonsense" in tumortrack("bench", "--only", "nonsense").stderr
+    with pytest.raises(InputError, match="belong together"):
+        benching.bench(BenchOptions(model=tmp_path))
+    with pytest.raises(InputError, match="cannot be read"):
+        benching.bench(BenchOptions(document=tmp_path / "none.md"))
+    (tmp_path / "bare.md").write_text("no markers")
+    with pytest.raises(InputError, match="results:goals"):
+        benching.bench(BenchOptions(document=tmp_path / "bare.md"))
+
+
+def test_the_command_line_names_every_part() -> None:
+    from typing import get_args, get_type_hints
+
+    from tumortrack.cli.main import bench as command
+
+    assert set(get_args(get_args(get_type_hints(command)["only"])[0])) == set(GROUPS)

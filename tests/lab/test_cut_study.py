@@ -1,0 +1,218 @@
+"""Plans made on estimates cut the truth: cells kept, and what the tables say of them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import msgspec
+import numpy as np
+import pytest
+import trimesh
+
+from tumortrack.core import store
+from tumortrack.core.errors import InputError, NoEstimate
+from tumortrack.core.geometry import rigid, transform_points
+from tumortrack.core.solids import mesh_of, solid_of
+from tumortrack.core.types import Anatomy, Mesh, SensorCloud
+from tumortrack.plan.located import located
+from tumortrack.plan.resection import plan_resection
+from tumortrack.simulate.scene_folder import Scene, write_scene
+from tumortrack_lab.cut.resection import cut
+from tumortrack_lab.peers.base import Fit, estimate_of, rigid_carry
+from tumortrack_lab.study.book import Book, section_blocks
+from tumortrack_lab.study.cells import CellStore
+from tumortrack_lab.study.measure import Hashes, Job, StudyCase, measure, spec_of
+from tumortrack_lab.study.methods import Answer, Method
+from tumortrack_lab.study.resection import (
+    PLANNERS,
+    Cutting,
+    Planner,
+    Truth,
+    cut_one,
+    exophytic_tumors,
+    scattered,
+)
+from tumortrack_lab.study.resection_table import rows_of, tables_of
+
+CAMERA_FROM_TABLE = rigid(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 150.0]))
+PUBLISHED, OURS = Planner(method="published"), Planner(method="margin")
+
+
+def ball(radius_mm, center_mm, semi_axes=(1, 1, 1)):
+    solid = trimesh.creation.icosphere(4, radius_mm)
+    return Mesh(solid.vertices * np.array(semi_axes) + np.array(center_mm), solid.faces)
+
+
+def kidney():
+    """Table frame: one tumor of 8 mm, half sunk into the top; one of 4 mm, deep inside."""
+    organ, tumor = ball(1, (0, 0, 30), (32, 20, 16)), ball(8, (0, 0, 46))
+    whole = mesh_of(solid_of(organ, "organ") + solid_of(tumor, "tumor"))
+    return Anatomy((whole, tumor, ball(4, (-20, 0, 27))))
+
+
+def moved(anatomy, b_from_a):
+    parts = (part.moved(transform_points(b_from_a, part.vertices_mm)) for part in anatomy.parts)
+    return Anatomy(tuple(parts))
+
+
+def located_as_it_is(anatomy):
+    estimate = scattered(estimate_of(Fit(lambda points: points, 0.0), anatomy))
+    return located(estimate.cloud, estimate.meshes, None, np.eye(4))
+
+
+def test_a_plan_on_the_truth_takes_the_tumor_with_the_margin_that_was_asked_for():
+    truth = kidney()
+    for margin_mm in (3.0, 7.0):
+        config = msgspec.structs.replace(OURS.config(located_as_it_is(truth), "tumor_1"))
+        config = msgspec.structs.replace(config, margin_mm=margin_mm)
+        result = cut(truth, plan_resection(located_as_it_is(truth), config))
+        assert result.detached
+        assert result.removed_share == 1.0
+        assert margin_mm - 0.5 < result.margin_mm < margin_mm + 1.0
+        assert result.hurt == ()
+
+
+def test_the_papers_plan_on_the_truth_passes_right_below_the_tumor():
+    """Its second sweep is the lower face of the tumor's bounding box."""
+    truth, config = kidney(), PUBLISHED.config(located_as_it_is(kidney()), "tumor_1")
+    result = cut(truth, plan_resection(located_as_it_is(truth), config))
+    assert result.detached
+    assert result.removed_share > 0.99
+    assert result.margin_mm == pytest.approx(0.0, abs=0.6)
+
+
+@dataclass
+class Shifted(Method):
+    """Answers the truth, shifted along the table's x, and says how sure it is if it is told."""
+
+    shift_mm: float = 0.0
+    std_mm: float | None = None
+    nothing: bool = False
+    calls: list[str] = field(default_factory=list)
+    name: str = "clinic"
+    device: str = "cpu"
+    prepare_s: float | None = 60.0
+
+    @property
+    def identity(self):
+        return {"kind": "stub", "name": self.name, "shift_mm": self.shift_mm}
+
+    @property
+    def about(self):
+        return {"prepare_s": self.prepare_s}
+
+    def locate(self, scene, grid):
+        self.calls.append("asked")
+        if self.nothing:
+            raise NoEstimate("the cloud shows no organ")
+        carry = rigid_carry(rigid(np.eye(3), np.array([self.shift_mm, 0.0, 0.0])))
+        estimate = scattered(estimate_of(Fit(carry, 0.2), scene.reference, grid=grid))
+        motion = None if self.std_mm is None else Sure(self.std_mm)
+        return Answer(replace(estimate, motion=motion), 0.2)
+
+
+@dataclass(frozen=True)
+class Sure:
+    std: float
+
+    def carry(self, points_ct, /):
+        return points_ct
+
+    def back(self, points_camera, /):
+        return points_camera
+
+    def std_mm(self, points_ct, /):
+        return np.full(len(points_ct), self.std)
+
+
+@pytest.fixture(scope="module")
+def case(tmp_path_factory):
+    root = tmp_path_factory.mktemp("cutting")
+    (root / "case").mkdir()
+    store.write_json(root / "case" / store.MANIFEST, {"kind": "case"})
+    truth = moved(kidney(), CAMERA_FROM_TABLE)
+    cloud = SensorCloud(truth.organ.vertices_mm[truth.organ.vertices_mm[:, 2] < 120])
+    for variant in ("D0", "D1"):
+        meta = {"camera_from_bench": CAMERA_FROM_TABLE.tolist()}
+        write_scene(root / "scenes" / f"{variant}-noise", Scene(cloud, truth, None, meta))
+    write_scene(root / "scenes" / "G1-noise", Scene(cloud, truth))
+    return StudyCase("balls", root / "case", root / "scenes", kidney(), (0.0, 0.0, 1.0))
+
+
+def jobs(case, *methods, variants=("D0",)):
+    cuttings = [Cutting(method) for method in methods]
+    return [Job(case, c, variant, "noise", 64) for c in cuttings for variant in variants]
+
+
+def test_only_exophytic_tumors_are_cut(case):
+    assert exophytic_tumors(case) == ("tumor_1",)
+
+
+def test_an_estimate_that_is_off_costs_as_much_margin(case):
+    here = cut_one(jobs(case, Shifted())[0], "D0")["plans"]["tumor_1"]
+    off = cut_one(jobs(case, Shifted(shift_mm=3.0))[0], "D0")["plans"]["tumor_1"]
+    assert here[OURS.name]["removed_share"] == off[OURS.name]["removed_share"] == 1.0
+    assert here[OURS.name]["margin_mm"] == pytest.approx(5.0, abs=0.4)
+    assert off[OURS.name]["margin_mm"] == pytest.approx(5.0 - 3.0, abs=0.5)
+    far = cut_one(jobs(case, Shifted(shift_mm=8.0))[0], "D0")["plans"]["tumor_1"]
+    assert far[OURS.name]["margin_mm"] == pytest.approx(5.0 - 8.0, abs=0.6)
+    assert far[OURS.name]["removed_share"] < 0.97
+    assert far[OURS.name]["left_ml"] > 0.1
+
+
+def test_the_margin_grows_by_what_the_estimate_is_unsure_of(case):
+    plans = cut_one(jobs(case, Shifted(std_mm=0.5))[0], "D0")["plans"]["tumor_1"]
+    assert list(plans) == [planner.name for planner in PLANNERS]
+    wider = Planner(method="margin", sigmas=2.0)
+    gained = plans[wider.name]["margin_mm"] - plans[OURS.name]["margin_mm"]
+    assert gained == pytest.approx(1.0, abs=0.3)
+    assert plans[wider.name]["healthy_ml"] > plans[OURS.name]["healthy_ml"] + 0.2
+    paper = Planner(method="published", sigmas=2.0)
+    assert plans[paper.name]["healthy_ml"] > plans[PUBLISHED.name]["healthy_ml"] + 0.2
+    without = cut_one(jobs(case, Shifted())[0], "D0")["plans"]["tumor_1"]
+    assert list(without) == [PUBLISHED.name, OURS.name]
+
+
+def test_cells_are_measured_once_and_are_others_than_those_of_accuracy(case, tmp_path):
+    method, cells = Shifted(), CellStore(tmp_path)
+    todo = jobs(case, method, variants=("D0", "D1"))
+    first = measure(todo, cells, one=cut_one)
+    assert len(method.calls) == 2
+    assert measure(todo, cells, one=cut_one) == first
+    assert len(method.calls) == 2
+    plain = replace(todo[0], method=method)
+    assert spec_of(plain, Hashes()).digest != spec_of(todo[0], Hashes()).digest
+
+
+def test_a_scene_without_a_table_is_refused(case):
+    with pytest.raises(InputError, match="where its table is"):
+        cut_one(Job(case, Cutting(Truth()), "G1", "noise", 64), "G1-noise")
+
+
+def test_tables_say_what_was_removed_and_why_not(case, tmp_path):
+    methods = (Truth(), Shifted(shift_mm=8.0), Shifted(nothing=True, name="M_lim"))
+    cells = measure(jobs(case, *methods), CellStore(tmp_path / "cells"), one=cut_one)
+    assert [(row.method, row.planner.method) for row in rows_of(cells)] == [
+        (name, planner.method)
+        for name in ("clinic", "M_lim", "truth")
+        for planner in (PLANNERS if name == "M_lim" else (PUBLISHED, OURS))
+    ]
+    text = tables_of(cells)
+    lines = {
+        tuple(cell.strip() for cell in line.split("|")[1:3]): line for line in text.split("\n")
+    }
+    best = lines["truth", "ours, 5 mm"]
+    assert "| 1 of 1 | 1 of 1 | 1 of 1 | 100.0 | 100.0 | 0.00 |" in best
+    assert "| 1 of 1 | 1 of 1 | 0 of 1 |" in lines["clinic", "ours, 5 mm"]
+    assert "| 0 of 1 | 0 of 0 | 0 of 0 | – |" in lines["M_lim", "ours, 5 mm"]
+    assert "1 x M_lim, the paper's, 5 mm: the cloud shows no organ" in text
+    block = section_blocks("resection", cells, (case,), Book(tmp_path / "x.md", "make results"))
+    assert block["resection"].startswith("All cases:")
+    assert "`make results`: 3 measurements" in block["resection"]
+
+
+def test_shares_are_never_rounded_up_to_all(case, tmp_path):
+    cells = measure(jobs(case, Truth()), CellStore(tmp_path), one=cut_one)
+    entry = {**cells[0]["plans"]["tumor_1"][OURS.name], "removed_share": 0.99996}
+    cells[0]["plans"]["tumor_1"][OURS.name] = entry
+    assert "| 99.9 | 99.9 |" in tables_of(cells)

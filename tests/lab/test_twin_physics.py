@@ -1,0 +1,264 @@
+"""The twin's solid: energies against differences, a block against theory, meshes against finer
+ones, and the bench's experiments against what they promise."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import trimesh
+from scipy.optimize import brentq
+from scipy.spatial.transform import Rotation
+
+from tumortrack.core.errors import InputError, TumortrackError
+from tumortrack.core.types import Anatomy, Mesh
+from tumortrack_lab.tets import TetMesh, embed, tetrahedralise
+from tumortrack_lab.twin.bench import Bench, BenchConfig
+from tumortrack_lab.twin.contact import Contact, Indenter, Packing, Plate, Support
+from tumortrack_lab.twin.equilibrium import Hold, Problem, settle
+from tumortrack_lab.twin.solid import Solid
+from tumortrack_lab.twin.states import solve
+
+SMALL = BenchConfig(edge_mm=7.0, plate_mm=20.0, sink_mm=2.0, poke_mm=4.0)
+
+
+def block(side_mm: float, cells: int) -> TetMesh:
+    """A cube standing on z = 0, each cell cut into six tetrahedra round its diagonal."""
+    ticks = np.linspace(0, side_mm, cells + 1)
+    nodes = np.stack(np.meshgrid(ticks, ticks, ticks, indexing="ij"), -1).reshape(-1, 3)
+    number = np.arange(len(nodes)).reshape((cells + 1,) * 3)
+    tets = []
+    for order in ((0, 1, 2), (1, 2, 0), (2, 0, 1), (1, 0, 2), (0, 2, 1), (2, 1, 0)):
+        corner = [np.zeros(3, int)]
+        for axis in order:
+            corner.append(corner[-1] + np.eye(3, dtype=int)[axis])
+        picks = [
+            number[tuple(slice(c, c + cells) for c in step)].ravel() for step in np.array(corner)
+        ]
+        cell = np.stack(picks, 1)
+        tets.append(cell if order in ((0, 1, 2), (1, 2, 0), (2, 0, 1)) else cell[:, [0, 1, 3, 2]])
+    return TetMesh(nodes, np.concatenate(tets).astype(np.int32))
+
+
+def ellipsoid(half_mm: tuple[float, float, float], centre_mm=(0.0, 0.0, 0.0)) -> Mesh:
+    sphere = trimesh.creation.icosphere(subdivisions=3)
+    return Mesh(sphere.vertices * half_mm + centre_mm, sphere.faces)
+
+
+@pytest.fixture(scope="module")
+def bench() -> Bench:
+    organ = ellipsoid((32.0, 18.0, 15.0))
+    return Bench(Anatomy((organ, ellipsoid((6, 6, 6), (12, 0, 4)))), (0.0, 0.0, 1.0), SMALL)
+
+
+def test_forces_are_the_energys_slope_and_the_stiffness_is_theirs() -> None:
+    mesh = block(10.0, 2)
+    rng = np.random.default_rng(0)
+    solid = Solid(mesh, rng.uniform(3, 9, len(mesh.tets)), 0.45)
+    bent = mesh.nodes_mm + rng.normal(0, 0.3, mesh.nodes_mm.shape)
+    way = rng.normal(size=bent.shape)
+    step = 1e-5
+    slope = (solid.energy(bent + step * way)[0] - solid.energy(bent - step * way)[0]) / (2 * step)
+    assert slope == pytest.approx(float((solid.energy(bent)[1] * way).sum()), rel=1e-5)
+    rest = mesh.nodes_mm
+    change = (solid.energy(rest + step * way)[1] - solid.energy(rest - step * way)[1]) / (2 * step)
+    np.testing.assert_allclose(
+        solid.rest_stiffness() @ way.ravel(), change.ravel(), atol=1e-5 * np.abs(change).max()
+    )
+
+
+def test_moving_a_solid_costs_nothing_and_turning_it_inside_out_is_impossible() -> None:
+    mesh = block(10.0, 2)
+    solid = Solid(mesh, np.full(len(mesh.tets), 5.0))
+    turn = Rotation.from_rotvec([0.5, -1.0, 0.8]).as_matrix()
+    energy, forces = solid.energy(mesh.nodes_mm @ turn.T + 7.0)
+    assert energy == pytest.approx(0, abs=1e-9)
+    assert np.abs(forces).max() < 1e-9
+    assert solid.energy(mesh.nodes_mm * [1.0, 1.0, -1.0])[0] == np.inf
+    flat = [solid.energy(mesh.nodes_mm * [1.0, 1.0, thin])[0] for thin in (0.5, 0.1, 0.01)]
+    assert flat[0] < flat[1] < flat[2]
+
+
+@pytest.mark.parametrize("poisson", [0.4, 0.49])
+def test_a_block_between_plates_follows_theory(poisson: float) -> None:
+    """Uniaxial compression to 80 %: force and bulge of the compressible neo-Hookean law."""
+    side, shear = 20.0, 5.0
+    mesh = block(side, 5)
+    solid = Solid(mesh, np.full(len(mesh.tets), shear), poisson)
+    bulk = 2 * shear * (1 + poisson) / (3 * (1 - 2 * poisson))
+    skin = np.flatnonzero(np.isclose(mesh.nodes_mm[:, 2] % side, 0))
+    rim = np.isclose(mesh.nodes_mm[skin, :2] % side, 0)
+    area = (side / 5) ** 2 * np.where(rim, 0.5, 1.0).prod(1)  # each node's part of the face
+    contact = Contact(embed(mesh, mesh.nodes_mm[skin]), area, 3000.0)
+    nothing = np.zeros(len(mesh.nodes_mm))
+    share = solid.node_volumes_mm3 / mesh.volumes_mm3.sum()
+    above = Plate((10.0, 10.0, 16.0 + 10), (40.0, 40.0, 10.0), 1.0)
+    contacts = ((contact, (Support(), above)),)
+    problem = Problem(solid, contacts, nothing, Hold(mesh.nodes_mm, share))
+    start = mesh.nodes_mm * [1.05, 1.05, 0.9]
+    nodes, about = settle(problem, start, solid.rest_stiffness())
+    assert about.residual < 1e-3
+
+    axial = float(np.ptp(nodes[:, 2])) / side
+
+    def lateral_stress(wide: float) -> float:
+        J = axial * wide**2
+        iso = J ** (-2 / 3) * (wide - (axial**2 + 2 * wide**2) / (3 * wide))
+        return shear * iso + bulk * (J - 1) * axial * wide
+
+    wide = brentq(lateral_stress, 0.8, 1.5)
+    J = axial * wide**2
+    iso = J ** (-2 / 3) * (axial - (axial**2 + 2 * wide**2) / (3 * axial))
+    stress = shear * iso + bulk * (J - 1) * wide**2
+    assert axial == pytest.approx(0.8, abs=0.005)
+    assert stress < -3.0  # kPa: far from small strain
+    load = contact.load_mn(nodes, above)[2]
+    assert load == pytest.approx(stress * side**2, rel=0.02)
+    for layer in np.linspace(0, side, 6):
+        widths = np.ptp(nodes[np.isclose(mesh.nodes_mm[:, 2], layer), :2], axis=0)
+        np.testing.assert_allclose(widths, wide * side, rtol=0.005)
+
+
+def test_obstacles_measure_true_distances() -> None:
+    rng = np.random.default_rng(1)
+    points = rng.uniform(-20, 20, (400, 3))
+    plate = Plate((1.0, -2.0, 3.0), (8.0, 12.0, 5.0), 2.0)
+    rod = Indenter((0.0, 0.0, -5.0), (0.0, 0.6, 0.8), 4.0)
+    packing = Packing(points[:, 2] - np.linspace(-3, 3, 400))
+    np.testing.assert_allclose(packing.distance(points)[0], np.linspace(-3, 3, 400), atol=1e-12)
+    for obstacle in (plate, rod, Support(2.0)):
+        distance, normal = obstacle.distance(points)
+        assert (distance < 0).any()
+        assert (distance > 0).any()
+        np.testing.assert_allclose(np.linalg.norm(normal, axis=1), 1)
+        # Outside, the foot of the perpendicular lies on the surface.
+        out = distance > 0
+        foot = points[out] - distance[out, None] * normal[out]
+        assert np.abs(obstacle.distance(foot)[0]).max() < 1e-9
+    # A box's face, an edge's rounding, a rod's tip and side, by hand.
+    assert plate.distance(np.array([[1.0, -2.0, 11.0]]))[0][0] == pytest.approx(3)
+    corner = np.array([[1 + 8 + 3.0, -2.0, 3 + 5 + 3.0]])
+    assert plate.distance(corner)[0][0] == pytest.approx(np.hypot(5, 5) - 2)
+    assert rod.distance(np.array([[0.0, 0.0, -5.0]]) - 2 * np.array(rod.axis))[0] == 2
+    assert rod.distance(np.array([[9.0, 6.0, 3.0]]))[0][0] == pytest.approx(5)
+
+
+def test_embedded_points_follow_affine_motions_exactly() -> None:
+    mesh = tetrahedralise(ellipsoid((12, 9, 8)), 4.0)
+    points = np.random.default_rng(2).uniform(-8.5, 8.5, (300, 3))  # some outside
+    bend = np.array([[1.2, 0.1, 0.0], [0.3, 0.9, -0.1], [0.0, 0.2, 1.1]])
+    moved = embed(mesh, points).carry(mesh.nodes_mm @ bend.T + 5)
+    np.testing.assert_allclose(moved, points @ bend.T + 5, atol=1e-9)
+
+
+def test_a_tetrahedral_mesh_keeps_the_surface_and_its_volume() -> None:
+    surface = ellipsoid((20, 14, 12))
+    mesh = tetrahedralise(surface, 5.0)
+    assert (mesh.volumes_mm3 > 0).all()
+    assert mesh.volumes_mm3.sum() == pytest.approx(surface.volume_mm3, rel=0.02)
+    with pytest.raises(InputError, match="positive volume"):
+        TetMesh(mesh.nodes_mm, mesh.tets[:, [1, 0, 2, 3]])
+
+
+@pytest.fixture(scope="module")
+def squeezed(bench: Bench):
+    return solve(bench, "D1")
+
+
+def test_plates_close_by_what_the_state_says(bench: Bench, squeezed) -> None:
+    before, after = squeezed.report["midsection_mm"]
+    assert before - after == pytest.approx(4.0, abs=0.4)
+    assert squeezed.report["sunk_in_mm"] < 0.4
+    assert abs(squeezed.report["volume_change"]) < 0.02
+    assert squeezed.report["least_stretch"] > 0
+    assert squeezed.report["residual"] < 1e-3
+    assert squeezed.report["plate_load_n"] > 0.1
+    assert min(squeezed.report["sides_outwards_mm"]) > 0.2  # volume has to go somewhere
+    # What is carried are the organ's own points: its surface stays above the support.
+    surface = bench.carry(squeezed, bench.anatomy.organ.vertices_mm - bench.bench_from_ct[:3, 3])
+    assert surface[:, 2].min() > -0.4
+    assert np.ptp(surface[np.abs(surface[:, 0]) < 4, 2]) == pytest.approx(after, abs=0.5)
+
+
+def test_nothing_moves_until_something_is_added(bench: Bench) -> None:
+    nodes, about = bench.settle(bench.mesh.nodes_mm, ())
+    assert about.iterations == 0
+    np.testing.assert_array_equal(nodes, bench.mesh.nodes_mm)
+    heavier, about = bench.settle(bench.mesh.nodes_mm, (), weight=1.0)
+    assert about.iterations > 0
+    lowered = (bench.mesh.nodes_mm - heavier)[:, 2]
+    assert 0 < lowered.mean() < 1.0  # the packing bears it
+
+
+def test_going_on_from_less_compression_ends_where_a_fresh_start_does(
+    bench: Bench, squeezed
+) -> None:
+    warm, cold = solve(bench, "D2", squeezed), solve(bench, "D2")
+    assert np.linalg.norm(warm.nodes_mm - squeezed.nodes_mm, axis=1).max() > 3
+    assert np.linalg.norm(warm.nodes_mm - cold.nodes_mm, axis=1).max() < 0.15
+
+
+def test_a_finer_mesh_says_the_same(bench: Bench, squeezed) -> None:
+    finer = BenchConfig(edge_mm=3.5, plate_mm=20.0)
+    organ_ct = ellipsoid((32.0, 18.0, 15.0))
+    tumor_ct = ellipsoid((6, 6, 6), (12, 0, 4))
+    other = Bench(Anatomy((organ_ct, tumor_ct)), (0.0, 0.0, 1.0), finer)
+    assert len(other.mesh.tets) > 2 * len(bench.mesh.tets)
+    points = np.random.default_rng(3).uniform(-1, 1, (400, 3))
+    points = points[np.linalg.norm(points, axis=1) < 0.95] * (32, 18, 15)
+    coarse = bench.carry(squeezed, points)
+    fine = other.carry(solve(other, "D1"), points)
+    rest = bench.carry(solve(bench, "D0"), points)
+    assert np.linalg.norm(fine - rest, axis=1).max() > 3
+    assert np.linalg.norm(fine - coarse, axis=1).mean() < 0.25
+
+
+def test_gravity_sinks_the_midsection_as_far_as_asked(bench: Bench) -> None:
+    state = solve(bench, "G1")
+    assert state.report["sunk_mm"] == pytest.approx(2.0, abs=0.4)
+    assert sum(state.report["sides_outwards_mm"]) > 0.3
+    assert state.report["youngs_kpa"] < SMALL.youngs_kpa
+    assert abs(state.report["volume_change"]) < 0.02
+
+
+def test_the_rod_presses_a_dent_off_the_tumor(bench: Bench) -> None:
+    state = solve(bench, "P1")
+    poke = state.report["poke"]
+    tip = np.array(poke["tip_mm"])
+    surface = bench.contact.surface.carry(state.nodes_mm)
+    at_rest = bench.contact.surface.carry(bench.mesh.nodes_mm)
+    under = np.linalg.norm(surface[:, :2] - tip[:2], axis=1) < 1.0
+    assert (at_rest[under, 2] - surface[under, 2]).max() == pytest.approx(4.0, abs=0.8)
+    tumor = bench.anatomy.tumors[0].vertices_mm
+    assert np.linalg.norm(tumor - (tip + [0, 0, 4.0]), axis=1).min() > 5
+    with pytest.raises(InputError, match="allowed: D0"):
+        solve(bench, "D9")
+
+
+def test_a_stiffer_tumor_deforms_less() -> None:
+    organ, tumor = ellipsoid((32.0, 18.0, 15.0)), ellipsoid((6, 6, 6))
+    heights = {}
+    for ratio in (1.0, 5.0):
+        config = BenchConfig(edge_mm=7.0, plate_mm=20.0, tumor_ratio=ratio)
+        bench = Bench(Anatomy((organ, tumor)), (0.0, 0.0, 1.0), config)
+        moved = bench.carry(solve(bench, "D1"), tumor.vertices_mm)
+        heights[ratio] = 12 - np.ptp(moved[:, 2])
+    assert 0 < heights[5.0] < 0.8 * heights[1.0]
+
+
+def test_a_load_that_finds_no_rest_is_an_error(bench: Bench, monkeypatch) -> None:
+    monkeypatch.setattr("tumortrack_lab.twin.equilibrium._ITERATIONS", 150)
+    trap = (Plate((0.0, 0.0, 15.0), (100.0, 100.0, 14.9), 1.0),)  # swallows the organ whole
+    with pytest.raises(TumortrackError, match="no equilibrium"):
+        bench.settle(bench.mesh.nodes_mm, trap, weight=1e6)
+
+
+def test_the_twin_shares_no_code_with_the_training_deformations() -> None:
+    code = (
+        "import sys, tumortrack_lab.twin.states\n"
+        "print([m for m in sys.modules if m.startswith('tumortrack.simulate.deform')])"
+    )
+    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert out.stdout.strip() == "[]"

@@ -1,0 +1,283 @@
+"""OpenIGTLink: bytes as the protocol has them."""
+
+from __future__ import annotations
+
+import struct
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from igtl_objects import polydata_by_the_book, slow_crc
+from live_objects import STAMP_NS
+from tumortrack.core.geometry import rigid
+from tumortrack.live.igtl.content import (
+    Polydata,
+    Status,
+    pack_polydata,
+    pack_status,
+    pack_string,
+    pack_transform,
+    unpack_polydata,
+    unpack_status,
+    unpack_string,
+    unpack_transform,
+)
+from tumortrack.live.igtl.crc64 import crc64
+from tumortrack.live.igtl.message import (
+    HEADER_SIZE,
+    Message,
+    ProtocolError,
+    pack,
+    unpack,
+    unpack_header,
+)
+
+
+def test_crc_has_the_catalogues_check_value() -> None:
+    assert crc64(b"123456789") == 0x6C40DF5F0B497347  # CRC-64/ECMA-182
+    assert crc64(b"") == 0
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.binary(max_size=70))
+def test_crc_agrees_with_the_slow_one(data: bytes) -> None:
+    assert crc64(data) == slow_crc(data)
+
+
+def from_hex(text: str) -> bytes:
+    """Hexadecimal digits before the column of remarks, two blanks away from them."""
+    lines = (line.strip().split("  ")[0] for line in text.strip().splitlines())
+    return bytes.fromhex("".join(lines))
+
+
+def test_transform_byte_for_byte() -> None:
+    body = (
+        from_hex(
+            """
+            000c 000a 00000008 00000000
+            3f800000 00000000 00000000
+            00000000 3f800000 00000000
+            00000000 00000000 3f800000
+            41200000 c1a00000 3f000000
+            0001 0003 0003 00000005
+            """
+        )
+        + b"keyvalue"
+    )
+    head = from_hex(
+        """
+        0002                                              header version
+        5452414e53464f524d000000                          TRANSFORM
+        74756d6f725f31 00000000000000000000000000         tumor_1
+        00000002 80000000                                 2.5 s
+        000000000000004e                                  78 bytes of body: 12 + 48 + 10 + 8
+        """
+    )
+    place = rigid(np.eye(3), np.array([10, -20, 0.5]))
+    message = Message(
+        "TRANSFORM", "tumor_1", 2_500_000_000, pack_transform(place), {"key": "value"}
+    )
+    assert pack(message) == head + slow_crc(body).to_bytes(8, "big") + body
+
+
+def test_status_byte_for_byte() -> None:
+    expected = from_hex(
+        """
+        0004                                              not found
+        ffffffffffffffff                                  sub code -1
+        6e6f20657374696d617465 000000000000000000         no estimate
+        6661722061776179 00                               far away
+        """
+    )
+    assert pack_status(Status(4, "no estimate", "far away", -1)) == expected
+    assert unpack_status(expected) == Status(4, "no estimate", "far away", -1)
+
+
+def test_polydata_byte_for_byte() -> None:
+    expected = from_hex(
+        """
+        00000003                                          points
+        00000000 00000000                                 vertices
+        00000001 0000000c                                 lines, their bytes
+        00000001 00000010                                 polygons, their bytes
+        00000000 00000000                                 strips
+        00000001                                          attributes
+        3f800000 40000000 40400000                        1, 2, 3
+        bf800000 00000000 00000000
+        00000000 42c80000 00000000
+        00000002 00000000 00000002                        line 0, 2
+        00000003 00000000 00000001 00000002               triangle 0, 1, 2
+        00 01 00000003                                    scalars of points, one number each, three
+        7072 00 00                                        pr, its end, padding to an even size
+        00000000 3f000000 3f800000                        0, 0.5, 1
+        """
+    )
+    points = np.array([[1.0, 2, 3], [-1, 0, 0], [0, 100, 0]])
+    scalars = {"pr": np.array([0, 0.5, 1])}
+    data = Polydata(points, np.array([[0, 1, 2]]), np.array([[0, 2]]), scalars)
+    assert pack_polydata(data) == expected
+    assert pack_polydata(Polydata(points[:0], np.zeros((0, 3), int))) == bytes(40)
+
+
+def test_string_byte_for_byte() -> None:
+    assert pack_string("hm") == bytes.fromhex("0003 0002 686d")
+    assert pack_string("µ") == bytes.fromhex("006a 0002 c2b5")
+    assert unpack_string(pack_string("37 µm")) == "37 µm"
+    with pytest.raises(ProtocolError, match="65535"):
+        pack_string("x" * 65536)
+    with pytest.raises(ProtocolError, match="says 2 bytes and has 1"):
+        unpack_string(bytes.fromhex("0003 0002 68"))
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(0, 2**32 * 10**9 - 1))
+def test_stamps_come_back_to_the_nanosecond(stamp_ns: int) -> None:
+    data = pack(Message("STRING", "d", stamp_ns))
+    assert unpack_header(data[:HEADER_SIZE]).stamp_ns == stamp_ns
+    fixed = int.from_bytes(data[34:42], "big")
+    assert fixed >> 32 == stamp_ns // 10**9
+    assert abs((fixed & 0xFFFFFFFF) / 2**32 - stamp_ns % 10**9 / 1e9) < 2**-32
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(0, 40), st.integers(0, 20), st.integers(0, 5), st.integers(0, 2**32 - 1))
+def test_polydata_as_the_document_reads_it(n: int, faces: int, lines: int, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    names = ["label", "probability", "x"][: rng.integers(0, 4)]
+    data = Polydata(
+        rng.normal(size=(n, 3)).astype(np.float32),
+        rng.integers(0, max(n, 1), (faces if n else 0, 3)),
+        rng.integers(0, max(n, 1), (lines if n else 0, 2)),
+        {name: rng.random(n).astype(np.float32) for name in names},
+    )
+    content = pack_polydata(data)
+    book, ours = polydata_by_the_book(content), unpack_polydata(content)
+    np.testing.assert_array_equal(book["points"], data.points)
+    assert book["polygons"] == [tuple(t) for t in data.triangles.tolist()]
+    assert book["lines"] == [tuple(t) for t in data.segments.tolist()]
+    for name, values in data.scalars.items():
+        assert book[name][:2] == (0, 1)
+        np.testing.assert_array_equal(book[name][2], values)
+        np.testing.assert_array_equal(ours.scalars[name], values)
+    np.testing.assert_array_equal(ours.points, data.points)
+    np.testing.assert_array_equal(ours.triangles, data.triangles)
+    np.testing.assert_array_equal(ours.segments, data.segments)
+
+
+def test_a_flipped_bit_anywhere_in_the_body_is_refused() -> None:
+    data = pack(Message("TRANSFORM", "tumor_1", 5, pack_transform(np.eye(4)), {"a": "b"}))
+    header = unpack_header(data[:HEADER_SIZE])
+    body = data[HEADER_SIZE:]
+    assert unpack_transform(unpack(header, body).content).tolist() == np.eye(4).tolist()
+    for bit in range(8 * len(body)):
+        damaged = bytearray(body)
+        damaged[bit // 8] ^= 1 << bit % 8
+        with pytest.raises(ProtocolError, match="checksum"):
+            unpack(header, bytes(damaged))
+    with pytest.raises(ProtocolError, match="its header says"):
+        unpack(header, body[:-1])
+
+
+def resealed(message: Message, **sizes: int) -> bytes:
+    """The message with other numbers in its extended header, the checksum made right again."""
+    data = bytearray(pack(message))
+    ext = list(struct.unpack_from(">HHI", data, HEADER_SIZE))
+    for n, name in enumerate(("extended", "index", "texts")):
+        ext[n] = sizes.get(name, ext[n])
+    struct.pack_into(">HHI", data, HEADER_SIZE, *ext)
+    struct.pack_into(">Q", data, 50, slow_crc(bytes(data[HEADER_SIZE:])))
+    return bytes(data)
+
+
+@pytest.mark.parametrize("sizes", [{"extended": 200}, {"index": 90}, {"texts": 9}, {"extended": 3}])
+def test_sizes_that_do_not_fit_are_refused(sizes: dict[str, int]) -> None:
+    data = resealed(Message("STATUS", "x", 0, b"", {"k": "vv"}), **sizes)
+    with pytest.raises(ProtocolError):
+        unpack(unpack_header(data[:HEADER_SIZE]), data[HEADER_SIZE:])
+
+
+def test_what_the_protocol_cannot_hold_is_refused() -> None:
+    for bad in (
+        Message("TRANSFORMATION", "x"),
+        Message("STATUS", "x" * 21),
+        Message("STATUS", "µ"),
+        Message("STATUS", "x", -1),
+        Message("STATUS", "x", 2**32 * 10**9),
+    ):
+        with pytest.raises(ProtocolError):
+            pack(bad)
+    for bad_header in (b"\0" * 57, b"\0\x09" + bytes(56), b"\0\x02\xff" + bytes(55)):
+        with pytest.raises(ProtocolError):
+            unpack_header(bad_header)
+
+
+@pytest.mark.parametrize(("at", "value"), [(3, 4), (15, 13), (23, 12), (27, 9), (39, 2), (95, 7)])
+def test_damaged_polydata_is_refused(at: int, value: int) -> None:
+    data = Polydata(np.eye(3), np.array([[0, 1, 2]]), np.array([[0, 2]]), {"p": np.ones(3)})
+    content = bytearray(pack_polydata(data))
+    assert content[at] != value
+    content[at] = value
+    with pytest.raises(ProtocolError):
+        unpack_polydata(bytes(content))
+
+
+@settings(max_examples=200, deadline=None)
+@given(st.data())
+def test_no_damage_gets_further_than_a_refusal(data: st.DataObject) -> None:
+    """Whatever is done to a content, it is read as something whole or refused."""
+    surface = Polydata(np.eye(3), np.array([[0, 1, 2]]), np.array([[0, 2]]), {"p": np.ones(3)})
+    for content, read in (
+        (pack_polydata(surface), unpack_polydata),
+        (pack_status(Status(1, "good", "text")), unpack_status),
+        (pack_string("text"), unpack_string),
+        (pack_transform(np.eye(4)), unpack_transform),
+    ):
+        damaged = bytearray(content)
+        for at in data.draw(st.lists(st.integers(0, len(content) - 1), max_size=3)):
+            damaged[at] = data.draw(st.sampled_from([0, 1, 2, 4, 127, 128, 255]))
+        cut = data.draw(st.integers(0, len(content)) | st.just(len(content)))
+        try:
+            found = read(bytes(damaged[:cut]))
+        except ProtocolError:
+            continue
+        if isinstance(found, Polydata):
+            assert cut == len(content)
+            for cells in (found.triangles, found.segments):
+                assert (cells < len(found.points)).all()
+
+
+def test_pyigtl_reads_our_messages() -> None:
+    from pyigtl.messages import MessageBase
+
+    turn = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    place = rigid(turn, np.array([1.5, -2.25, 300]))
+    data = pack(Message("TRANSFORM", "tumor_1", STAMP_NS, pack_transform(place), {"frame_id": "r"}))
+    fields = MessageBase.parse_header(data[:58])
+    theirs = MessageBase.create_message("TRANSFORM")
+    theirs.unpack(fields, data[58:])
+    np.testing.assert_array_equal(theirs.matrix, place)
+    assert (theirs.device_name, theirs.metadata) == ("tumor_1", {"frame_id": "r"})
+    assert theirs.timestamp == pytest.approx(STAMP_NS / 1e9, abs=1e-6)
+    data = pack(Message("STRING", "note", STAMP_NS, pack_string("a note")))
+    theirs = MessageBase.create_message("STRING")
+    theirs.unpack(MessageBase.parse_header(data[:58]), data[58:])
+    assert theirs.string == "a note"
+
+
+def test_we_read_pyigtls_messages() -> None:
+    from pyigtl.messages import StringMessage, TransformMessage
+
+    turned = np.eye(4)
+    turned[:3, 3] = [1, 2, 3]
+    for version in (1, 2):
+        theirs = TransformMessage(turned, device_name="needle", timestamp=1234.5)
+        theirs.header_version, theirs.metadata = version, {"key": "value"} if version > 1 else {}
+        data = theirs.pack()
+        ours = unpack(unpack_header(data[:58]), data[58:])
+        assert (ours.type, ours.device, ours.stamp_ns // 10**6) == ("TRANSFORM", "needle", 1234500)
+        assert ours.metadata == theirs.metadata
+        np.testing.assert_array_equal(unpack_transform(ours.content), turned)
+    data = StringMessage("hello", device_name="d").pack()
+    assert unpack_string(unpack(unpack_header(data[:58]), data[58:]).content) == "hello"

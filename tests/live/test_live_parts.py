@@ -1,0 +1,407 @@
+"""The live loop's parts by themselves: text to configuration, times, stamps, threads, frames."""
+
+from __future__ import annotations
+
+import json
+import threading
+import time
+from typing import ClassVar, Literal
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from live_objects import empty_update, small_frame, small_update
+from tumortrack.core.errors import InputError, NoEstimate, StorageError
+from tumortrack.live.calibration_file import read_frames
+from tumortrack.live.clock import StampCheck
+from tumortrack.live.meter import Histogram
+from tumortrack.live.sink_worker import Outlet
+from tumortrack.live.source_worker import Reader
+from tumortrack.live.spec import parse_spec
+from tumortrack.live.values import Frames, Seen, SinkConfig, SourceEnded, SourceLost
+
+SECOND = 1_000_000_000
+
+
+class Camera(SinkConfig, frozen=True, kw_only=True, tag="camera"):
+    target: ClassVar[str] = "topic"
+    topic: str
+    fps: float = 30.0
+    noise: bool = True
+    type: Literal["auto", "cloud"] = "auto"
+
+
+class Window(SinkConfig, frozen=True, kw_only=True, tag="window"):
+    target: ClassVar[str] = "port"
+    port: int = 8080
+
+
+class Plain(SinkConfig, frozen=True, kw_only=True, tag="plain"):
+    pass
+
+
+KINDS = (Camera, Window, Plain)
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("camera:/a/b", Camera(topic="/a/b")),
+        (
+            "camera:/a?fps=12.5&noise=false&type=cloud",
+            Camera(topic="/a", fps=12.5, noise=False, type="cloud"),
+        ),
+        ("camera:C:/folder:with colons", Camera(topic="C:/folder:with colons")),
+        ("window", Window()),
+        ("window:9000", Window(port=9000)),
+        ("camera:/a+b%20c", Camera(topic="/a+b%20c")),
+        ("window?port=9000", Window(port=9000)),
+        ("plain", Plain()),
+    ],
+)
+def test_text_becomes_configuration(text, expected):
+    assert parse_spec(text, KINDS, "sink") == expected
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("screen", "Allowed: camera, plain, window"),
+        ("camera", "lacks its topic. Write camera:TOPIC[?fps=30.0&noise=true&type=auto]."),
+        ("camera:/a?rate=3", "'rate' is no option. Write camera:TOPIC"),
+        ("camera:/a?fps=fast", "fps"),
+        ("camera:/a?type=mesh", "mesh"),
+        ("camera:/a?topic=/b", "'/a' has no place there"),
+        ("camera:/a?fps=1&fps=2", "'fps' is given twice"),
+        ("window:http", "Write window[:port]"),
+        ("plain:x", "'x' has no place there"),
+    ],
+)
+def test_wrong_text_is_answered_with_what_there_is(text, said):
+    with pytest.raises(InputError) as error:
+        parse_spec(text, KINDS, "sink")
+    assert said in str(error.value)
+    assert text in str(error.value)
+
+
+def test_percentiles_are_right_to_one_per_cent():
+    times = np.random.default_rng(0).lognormal(3, 1, 20_000)
+    histogram = Histogram()
+    for one in times:
+        histogram.add(float(one))
+    for share in (50.0, 95.0, 99.0, 99.9):
+        assert histogram.percentile(share) == pytest.approx(np.percentile(times, share), rel=0.012)
+    assert histogram.summary()["max"] == pytest.approx(times.max(), abs=1e-3)
+    assert len(histogram) == 20_000
+    assert Histogram().summary() == {"count": 0}
+
+
+def _seen(stamp_ns, arrived_ns=None):
+    return Seen(small_frame(stamp_ns), stamp_ns if arrived_ns is None else arrived_ns)
+
+
+def test_a_stale_frame_and_one_from_the_future_are_refused():
+    check = StampCheck(0.5)
+    with pytest.raises(NoEstimate, match=r"stale: 0\.60 s old"):
+        check.check(1 * SECOND, 0.6)
+    with pytest.raises(NoEstimate, match=r"2\.00 s in the future"):
+        check.check(1 * SECOND, -2.0)
+    check.check(1 * SECOND, 0.4)
+    with pytest.raises(NoEstimate, match="must be 0 or more"):
+        check.check(-5, 0.0)
+
+
+def test_a_clock_that_was_set_back_is_believed_when_it_goes_on():
+    check = StampCheck(0.5)
+    for stamp in (100, 101, 102):
+        check.check(stamp * SECOND, 0.0)
+    with pytest.raises(NoEstimate, match=r"went back by 92\.000 s"):
+        check.check(10 * SECOND, 0.0)
+    check.check(103 * SECOND, 0.0)  # one stray: the old clock goes on
+    assert check.jumps == 0
+    for stamp in (20, 21):
+        with pytest.raises(NoEstimate, match="went back"):
+            check.check(stamp * SECOND, 0.0)
+    check.check(22 * SECOND, 0.0)
+    check.check(23 * SECOND, 0.0)
+    assert check.jumps == 1
+    with pytest.raises(NoEstimate, match="went back"):
+        check.check(23 * SECOND, 0.0)  # the same frame again
+
+
+@pytest.mark.parametrize(
+    ("waits", "host_clock", "counts_from"),
+    [(False, True, "stamp"), (False, False, "arrival"), (True, False, "taking")],
+)
+def test_ages_count_from_where_the_source_allows(waits, host_clock, counts_from):
+    script = Script([_seen(7, arrived_ns=9)], waits=waits)
+    script.host_clock = host_clock
+    reader = Reader(lambda: script)
+    born_ns = reader.born_ns(reader.take(1.0))
+    assert reader.latency_from == counts_from
+    if waits:
+        assert abs(born_ns - time.time_ns()) < SECOND
+    else:
+        assert born_ns == (7 if host_clock else 9)
+    reader.close()
+
+
+class Script:
+    """A source that does what it is told: gives items, raises errors, waits at the end."""
+
+    host_clock = False
+    dropped = 0
+
+    def __init__(self, items, waits=False):
+        self._items, self.waits, self.closed = list(items), waits, 0
+
+    def read(self, timeout_s):
+        if not self._items:
+            time.sleep(timeout_s)
+            return None
+        item = self._items.pop(0)
+        if isinstance(item, BaseException):
+            raise item
+        return item
+
+    def close(self):
+        self.closed += 1
+
+
+def _wait(condition, seconds=5.0):
+    until = time.monotonic() + seconds
+    while not condition() and time.monotonic() < until:
+        time.sleep(0.005)
+    assert condition()
+
+
+def test_the_newest_frame_wins_and_the_others_are_counted():
+    frames = [_seen(n) for n in range(1, 6)]
+    reader = Reader(lambda: Script(frames))
+    _wait(lambda: reader.dropped == 4)
+    assert reader.take(1.0).stamp_ns == 5
+    assert reader.take(0.05) is None
+    reader.close()
+
+
+def test_a_source_that_waits_loses_nothing():
+    frames = [_seen(n) for n in range(1, 6)]
+    reader = Reader(lambda: Script([*frames, SourceEnded("end")], waits=True))
+    taken = [reader.take(1.0).stamp_ns for _ in frames]
+    assert taken == [1, 2, 3, 4, 5]
+    assert reader.take(1.0) is None
+    assert reader.ended
+    assert reader.dropped == 0
+    reader.close()
+
+
+def test_a_lost_source_is_opened_again():
+    scripts = [Script([_seen(1), SourceLost("unplugged")], waits=True), Script([_seen(2)])]
+    opened = []
+
+    def open_next():
+        if len(opened) == 1:
+            opened.append("missing")
+            raise SourceLost("still unplugged")
+        opened.append("there")
+        return scripts.pop(0)
+
+    first = scripts[0]
+    reader = Reader(open_next)
+    assert reader.take(1.0).stamp_ns == 1
+    _wait(lambda: "unplugged" in reader.trouble)
+    assert first.closed == 1
+    assert reader.take(5.0).stamp_ns == 2
+    assert reader.trouble == ""
+    assert reader.opened == 2
+    reader.close()
+
+
+def test_a_source_that_can_never_work_ends_the_loop():
+    def refuse():
+        raise InputError("no such folder")
+
+    reader = Reader(refuse)
+    _wait(lambda: reader.failure is not None)
+    with pytest.raises(InputError, match="no such folder"):
+        reader.take(1.0)
+    reader.close()
+
+
+def test_what_breaks_at_reopening_is_no_end():
+    """A camera that is plugged in again fails in ways of its own while it comes up."""
+    opened = []
+
+    def open_next():
+        opened.append(len(opened))
+        if len(opened) == 2:
+            raise RuntimeError("failed to set power state")
+        if len(opened) == 3:
+            raise InputError("no 848x480@30 at USB 2")
+        return Script([_seen(len(opened)), SourceLost("unplugged")], waits=True)
+
+    reader = Reader(open_next)
+    assert reader.take(1.0).stamp_ns == 1
+    assert reader.take(5.0).stamp_ns == 4
+    assert reader.failure is None
+    assert len(reader.defects) == 1
+    assert "power state" in reader.defects[0]
+    reader.close()
+
+
+def test_garbage_is_handed_on_and_reading_goes_on():
+    reader = Reader(lambda: Script([InputError("a message of no image"), _seen(3)], waits=True))
+    assert "no image" in str(reader.take(1.0))
+    assert reader.take(1.0).stamp_ns == 3
+    reader.close()
+
+
+class Notes:
+    """A sink that remembers, and can be slow or broken."""
+
+    def __init__(self, gate=None, broken=False):
+        self.got, self.closed, self.gate, self.broken = [], False, gate, broken
+
+    def publish(self, update):
+        if self.gate is not None:
+            self.gate.wait(5)
+        if self.broken:
+            raise StorageError("the disk is full")
+        self.got.append(update.sequence)
+
+    def close(self):
+        self.closed = True
+
+
+def test_a_slow_sink_gets_the_newest_and_holds_up_nobody():
+    gate = threading.Event()
+    sink = Notes(gate)
+    outlet = Outlet("slow", sink, waiting=1)
+    started = time.monotonic()
+    for n in range(50):
+        outlet.put(small_update(n))
+    assert time.monotonic() - started < 1
+    gate.set()
+    outlet.close()
+    assert sink.closed
+    assert sink.got[-1] == 49
+    assert outlet.dropped == 50 - len(sink.got)
+    assert outlet.summary()["latency_ms"]["count"] == len(sink.got)
+
+
+def test_a_sink_that_may_be_behind_loses_nothing():
+    sink = Notes()
+    outlet = Outlet("recording", sink, waiting=64)
+    for n in range(64):
+        outlet.put(small_update(n))
+    outlet.close()
+    assert sink.got == list(range(64))
+
+
+def test_a_sink_that_shows_is_told_when_the_loop_hangs(monkeypatch):
+    monkeypatch.setattr("tumortrack.live.sink_worker._SILENT_S", 0.2)
+
+    class Shown(Notes):
+        def publish(self, update):
+            self.got.append(update)
+
+    shown, kept = Shown(), Shown()
+    outlets = [Outlet("viewer", shown, 1), Outlet("recording", kept, 30)]
+    for outlet in outlets:
+        outlet.put(small_update(7))
+    time.sleep(0.9)
+    for outlet in outlets:
+        outlet.close()
+    assert [u.estimate is not None for u in shown.got] == [True, False]  # and once only
+    assert "said nothing" in shown.got[1].reason
+    assert [u.sequence for u in kept.got] == [7]  # what was said, and no more
+
+
+def test_a_sink_that_fails_at_its_end_is_known():
+    class Cut(Notes):
+        def close(self):
+            raise StorageError("no index")
+
+    outlet = Outlet("recording", Cut(), 5)
+    outlet.close()
+    assert outlet.unclosed
+    assert outlet.error == "no index"
+
+
+def test_a_broken_sink_is_said_and_recovers():
+    sink = Notes(broken=True)
+    outlet = Outlet("disk", sink, waiting=8)
+    outlet.put(empty_update())
+    _wait(lambda: outlet.failing)
+    assert outlet.error == "the disk is full"
+    sink.broken = False
+    outlet.put(empty_update(5))
+    _wait(lambda: not outlet.failing)
+    outlet.close()
+    assert (outlet.errors, outlet.delivered) == (1, 1)
+    assert outlet.summary()["last_error"] == "the disk is full"
+
+
+def _write(path, **content):
+    path.write_text(json.dumps(content))
+    return path
+
+
+def test_the_robots_frame_follows_from_any_of_three_files(tmp_path):
+    robot_from_camera = np.eye(4)
+    robot_from_camera[:3, :3] = Rotation.from_euler("xyz", [20, -35, 70], degrees=True).as_matrix()
+    robot_from_camera[:3, 3] = [410.0, -55.0, 620.0]
+    camera_from_marker = np.eye(4)
+    camera_from_marker[:3, :3] = Rotation.from_euler("z", 40, degrees=True).as_matrix()
+    camera_from_marker[:3, 3] = [10, 20, 300]
+    metres = robot_from_camera.copy()
+    metres[:3, 3] /= 1000
+    files = [
+        {"unit": "mm", "camera_from_robot": np.linalg.inv(robot_from_camera).tolist()},
+        {"unit": "m", "robot_from_camera": metres.tolist()},
+        {
+            "unit": "mm",
+            "camera_from_marker": camera_from_marker.tolist(),
+            "robot_from_marker": (robot_from_camera @ camera_from_marker).tolist(),
+        },
+    ]
+    for n, content in enumerate(files):
+        # A matrix inverse leaves 1e-17 in the last row; files have it exact.
+        for rows in content.values():
+            if isinstance(rows, list):
+                rows[3] = [0, 0, 0, 1]
+        frames = read_frames(_write(tmp_path / f"{n}.json", frame_id="base_link", **content))
+        assert frames.frame_id == "base_link"
+        np.testing.assert_allclose(frames.published_from_camera, robot_from_camera, atol=1e-9)
+
+
+def test_estimates_are_published_in_the_robots_frame():
+    turn = np.eye(4)
+    turn[:3, :3] = Rotation.from_euler("y", 90, degrees=True).as_matrix()
+    turn[:3, 3] = [1, 2, 3]
+    update = small_update(frames=Frames("base_link", turn))
+    camera = update.estimate.cloud.points_mm
+    expected = np.stack([camera[:, 2] + 1, camera[:, 1] + 2, -camera[:, 0] + 3], 1)
+    np.testing.assert_allclose(update.placed.points_mm, expected, atol=1e-4)
+    mesh, moved = update.estimate.meshes["tumor_1"], update.placed.meshes["tumor_1"]
+    assert moved.volume_mm3 == pytest.approx(mesh.volume_mm3)
+    assert moved.vertices_mm[0, 0] == pytest.approx(mesh.vertices_mm[0, 2] + 1)
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        ({"unit": "mm"}, "none of them"),
+        ({"unit": "inch", "camera_from_robot": np.eye(4).tolist()}, "unit"),
+        ({"unit": "mm", "camera_from_robot": np.diag([1, 1, -1, 1.0]).tolist()}, "right-handed"),
+        ({"unit": "mm", "camera_from_robot": (2 * np.eye(4)).tolist()}, "orthonormal"),
+        ({"unit": "mm", "camera_from_robot": np.eye(4)[:3].tolist()}, "3 rows"),
+        ({"unit": "mm", "camera_from_robot": np.eye(4).T[::-1].tolist()}, "no rigid transform"),
+        ({"unit": "mm", "camera_from_marker": np.eye(4).tolist()}, "it has camera_from_marker"),
+        ({"unit": "mm", "camera_from_base": np.eye(4).tolist()}, "camera_from_base"),
+    ],
+)
+def test_a_wrong_calibration_is_refused(tmp_path, content, said):
+    with pytest.raises(InputError, match=said):
+        read_frames(_write(tmp_path / "hand_eye.json", frame_id="base_link", **content))

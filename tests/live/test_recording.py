@@ -1,0 +1,584 @@
+"""Recordings: what was written comes back, also cut off or damaged; at the pace of its stamps."""
+
+from __future__ import annotations
+
+import json
+import os
+import resource
+import signal
+import subprocess
+import sys
+import threading
+import time
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rosbags.highlevel import AnyReader
+from rosbags.rosbag1 import Writer as Writer1
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
+
+from live_objects import (
+    CAMERA,
+    PARTS,
+    STAMP_NS,
+    empty_update,
+    small_anatomy,
+    small_estimate,
+    small_setting,
+)
+from recording_objects import PERIOD_NS, frame_number, record, update_number
+from tumortrack.core.errors import InputError, StorageError
+from tumortrack.core.geometry import rigid
+from tumortrack.core.mesh_files import write_anatomy
+from tumortrack.core.types import DepthFrame, SensorCloud
+from tumortrack.live.ros.messages import Messages
+from tumortrack.live.ros.observed import messages_seen
+from tumortrack.live.sinks.recording import Recording as RecordTo
+from tumortrack.live.sources.recording import Recording
+from tumortrack.live.values import Frames, Seen, SourceEnded, SourceLost
+from tumortrack.sense.files import write_cloud_ply, write_depth_png, write_intrinsics
+
+TURNED = Frames("table", rigid(np.diag([-1.0, -1.0, 1.0]), np.array([50.0, -20, 9])))
+
+
+def play(path: Path, **options) -> list[Seen | InputError]:
+    """Everything to the end, errors in their place."""
+    source = Recording(path=path, **({"rate": 0} | options)).open()
+    got: list[Seen | InputError] = []
+    try:
+        while True:
+            try:
+                seen = source.read(0.2)
+            except InputError as error:
+                seen = error
+            if seen is not None:
+                got.append(seen)
+    except SourceEnded:
+        return got
+    finally:
+        source.close()
+        source.close()
+
+
+def stamps(got: list) -> list[int]:
+    return [seen.stamp_ns for seen in got]
+
+
+@pytest.mark.parametrize("form", ["mcap", "files"])
+def test_depth_images_come_back(tmp_path, form):
+    mask = np.zeros((CAMERA.height, CAMERA.width), bool)
+    mask[3:9, 4:40] = True
+    updates = [update_number(0), update_number(1, mask=mask), empty_update(2), update_number(3)]
+    got = play(record(tmp_path / "r", updates, format=form))
+    assert stamps(got) == [updates[n].stamp_ns for n in (0, 1, 3)]
+    for seen, n in zip(got, (0, 1, 3), strict=True):
+        sent, back = frame_number(n), seen.content
+        assert back.intrinsics == sent.intrinsics
+        np.testing.assert_array_equal(np.isnan(back.depth_mm), np.isnan(sent.depth_mm))
+        np.testing.assert_array_equal(np.rint(back.depth_mm * 10), np.rint(sent.depth_mm * 10))
+        np.testing.assert_allclose(back.depth_mm, sent.depth_mm, rtol=2e-7)
+    assert got[0].mask is got[2].mask is None
+    np.testing.assert_array_equal(got[1].mask, mask)
+    assert all(seen.truth is None for seen in got)
+
+
+@pytest.mark.parametrize("form", ["mcap", "files"])
+def test_clouds_come_back(tmp_path, form):
+    points_mm = small_estimate().cloud.points_mm
+    cloud = SensorCloud(points_mm, STAMP_NS)
+    (seen,) = play(record(tmp_path / "r", [update_number(0, cloud)], format=form))
+    assert seen.stamp_ns == STAMP_NS
+    np.testing.assert_allclose(seen.content.points_mm, points_mm, rtol=2e-7)
+    assert abs(seen.arrived_ns - time.time_ns()) < 60e9
+
+
+def test_a_playing_of_a_playing_is_the_same(tmp_path):
+    first = play(record(tmp_path / "a", [update_number(n) for n in range(3)]))
+    again = record(tmp_path / "b", [update_number(n, s.content) for n, s in enumerate(first)])
+    for one, two in zip(first, play(again), strict=True):
+        np.testing.assert_allclose(one.content.depth_mm, two.content.depth_mm, rtol=2e-7)
+        assert one.stamp_ns == two.stamp_ns
+
+
+def test_an_mcap_is_read_by_rosbags_with_its_estimates(tmp_path):
+    updates = [update_number(0), empty_update(1, "the drape hides it"), update_number(2)]
+    updates = [replace(update, frames=TURNED) for update in updates]
+    path = record(tmp_path / "r", updates, meshes_hz=0)
+    with AnyReader([path]) as reader:
+        counts = {topic: about.msgcount for topic, about in reader.topics.items()}
+        said = {
+            (c.topic, n): reader.deserialize(raw, c.msgtype)
+            for n, (c, _, raw) in enumerate(reader.messages())
+        }
+        times = [t for _, t, _ in reader.messages()]
+    estimates = ("cloud", "meshes", "diagnostics", "report", *(f"{p}/center" for p in PARTS))
+    assert counts == {
+        **{f"/tumortrack/{name}": 3 for name in estimates},
+        **{"/camera/depth/image_rect": 2, "/camera/depth/camera_info": 2, "/tf": 2},
+    }
+    assert times == sorted(times)
+
+    def on(topic: str) -> list:
+        return [message for (name, _), message in said.items() if name == topic]
+
+    assert [cloud.width for cloud in on("/tumortrack/cloud")] == [500, 0, 500]
+    assert len(on("/tumortrack/meshes")[0].markers[0].points) == 3 * 320
+    reports = [json.loads(message.data) for message in on("/tumortrack/report")]
+    assert [report["reason"] for report in reports] == ["", "the drape hides it", ""]
+    assert reports[0]["estimate"]["parts"]["tumor_1"]["label"] == 2
+    assert {m.header.frame_id for m in on("/camera/depth/image_rect")} == {"camera"}
+    (transform,) = on("/tf")[0].transforms
+    assert (transform.header.frame_id, transform.child_frame_id) == ("table", "camera")
+    shift, turn = transform.transform.translation, transform.transform.rotation
+    np.testing.assert_allclose([shift.x, shift.y, shift.z], [0.05, -0.02, 0.009])
+    np.testing.assert_allclose(np.abs([turn.x, turn.y, turn.z, turn.w]), [0, 0, 1, 0], atol=1e-12)
+
+
+def test_plain_files_hold_what_was_seen_and_said(tmp_path):
+    updates = [update_number(0), empty_update(1, "the drape hides it")]
+    path = record(tmp_path / "r", updates, format="files")
+    lines = [json.loads(line) for line in (path / "index.jsonl").read_text().splitlines()]
+    assert [(line["folder"], line["seen"], line["quality"]) for line in lines] == [
+        ("00000000", "depth", "good"),
+        ("00000001", None, "none"),
+    ]
+    one, two = (path / "frames" / line["folder"] for line in lines)
+    assert {p.name for p in one.iterdir()} == {
+        *("depth.png", "intrinsics.json", "report.json", "estimate")
+    }
+    assert {p.name for p in (one / "estimate").iterdir()} == {
+        *("occupancy.ply", "kidney.ply", "tumor_1.ply", "tumor_2.ply")
+    }
+    assert [p.name for p in two.iterdir()] == ["report.json"]
+    report = json.loads((two / "report.json").read_text())
+    assert (report["estimate"], report["reason"]) == (None, "the drape hides it")
+    about = json.loads((path / "recording.json").read_text())
+    assert (about["kind"], about["parts"]) == ("recording", list(PARTS))
+
+
+def test_depths_beyond_sixteen_bits_are_left_out_of_files(tmp_path):
+    frame = frame_number(0)
+    depth_mm = frame.depth_mm.copy()
+    depth_mm[0, :3] = [6553.5, 6554, 0.04]
+    frame = replace(frame, depth_mm=depth_mm)
+    (seen,) = play(record(tmp_path / "r", [update_number(0, frame)], format="files"))
+    np.testing.assert_array_equal(
+        np.isnan(seen.content.depth_mm[0, :4]), [False, True, True, False]
+    )
+
+
+def test_without_frames_there_are_estimates_only(tmp_path):
+    path = record(tmp_path / "r", [update_number(0)], frames=False)
+    with AnyReader([path]) as reader:
+        assert all(topic.startswith("/tumortrack/") for topic in reader.topics)
+    with pytest.raises(InputError, match="no depth images"):
+        Recording(path=path).open()
+
+
+def test_an_existing_folder_is_replaced_only_if_it_is_a_recording(tmp_path):
+    for form in ("mcap", "files"):
+        path = record(tmp_path / form, [update_number(0)], format=form)
+        with pytest.raises(InputError, match="exists"):
+            record(path, [])
+        record(path, [update_number(n) for n in range(2)], format=form, overwrite=True)
+        assert len(play(path)) == 2
+        (path / "thesis.tex").write_text("years of work")
+        with pytest.raises(InputError, match="not replaced"):
+            record(path, [], overwrite=True)
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "recording.json").write_text('{"kind": "song"}')
+    for path in (tmp_path / "other", tmp_path / "mcap" / "recording.json"):
+        with pytest.raises(InputError):
+            record(path, [], overwrite=True)
+        assert path.exists()
+
+
+def test_a_file_cut_anywhere_gives_the_frames_before(tmp_path):
+    """As a killed program leaves it. Frames are those of the whole file, from the first on."""
+    sink = RecordTo(path=tmp_path / "r").open(small_setting())
+    ends = []
+    for n in range(6):
+        sink.publish(update_number(n))
+        sink._writer._flush()  # as time does
+        ends.append(sink._writer._whole)
+    sink.close()
+    raw = (tmp_path / "r" / "r.mcap").read_bytes()
+    found, cut_file = [], tmp_path / "cut.mcap"
+    for size in range(len(raw) - 1, ends[0], -len(raw) // 30):
+        cut_file.write_bytes(raw[:size])
+        got = play(cut_file)
+        assert stamps(got) == [STAMP_NS + n * PERIOD_NS for n in range(len(got))]
+        assert got[-1].content.depth_mm[0, 0] == pytest.approx(120 + 0.1 * (len(got) - 1))
+        assert len(got) - sum(end <= size for end in ends) in (0, 1)  # its index may be cut off
+        found.append(len(got))
+    assert set(found) >= {6, 5, 4, 3, 2}
+    cut_file.write_bytes(raw[: ends[2]] + bytes(5000))  # a disk that filled the rest with zeros
+    assert len(play(cut_file)) == 3
+    cut_file.write_bytes(raw[: ends[0] // 2])
+    with pytest.raises(InputError, match="no depth images"):
+        play(cut_file)
+
+
+CHILD = """
+import sys, time
+from pathlib import Path
+sys.path.insert(0, sys.argv[2])
+from recording_objects import RecordTo, small_setting, update_number
+sink = RecordTo(path=Path(sys.argv[1])).open(small_setting())
+for n in range(1000):
+    sink.publish(update_number(n))
+    print(n, time.monotonic(), flush=True)
+    time.sleep(0.02)
+"""
+
+
+def test_a_killed_recorder_loses_less_than_a_second(tmp_path):
+    here = str(Path(__file__).parents[1] / "support")
+    command = [sys.executable, "-c", CHILD, str(tmp_path / "r"), here]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, start_new_session=True) as child:
+        lines = []
+        try:
+            for line in child.stdout:
+                lines.append(line.split())
+                if float(line.split()[1]) > float(lines[0][1]) + 1.5:
+                    break
+        finally:
+            os.killpg(child.pid, signal.SIGKILL)
+        lines += [line.split() for line in child.stdout]
+    assert not (tmp_path / "r" / "metadata.yaml").exists()
+    got = play(tmp_path / "r")
+    assert stamps(got) == [STAMP_NS + n * PERIOD_NS for n in range(len(got))]
+    first_lost_s = float(dict(lines).get(str(len(got)).encode(), lines[-1][1]))
+    assert float(lines[-1][1]) - first_lost_s < 1
+
+
+@contextmanager
+def full_disk_at(size: int):
+    """No file may grow beyond ``size`` bytes."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    before = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+        signal.signal(signal.SIGXFSZ, before)
+
+
+def test_a_full_disk_is_said_and_leaves_what_was_whole(tmp_path):
+    sink = RecordTo(path=tmp_path / "r").open(small_setting())
+    said, written = [], 0
+    with full_disk_at(1_700_000):
+        for n in range(150):
+            try:
+                sink.publish(update_number(n))
+                written += 1
+            except StorageError as error:
+                said.append(str(error))
+        sink.close()
+    assert len(set(said)) == 1
+    assert len(said) == 150 - written > 5
+    got = play(tmp_path / "r")
+    assert stamps(got) == [STAMP_NS + n * PERIOD_NS for n in range(len(got))]
+    assert written > len(got) > 5
+    assert "File too large" in said[0]
+
+
+def test_plain_files_go_on_when_there_is_room_again(tmp_path):
+    sink = RecordTo(path=tmp_path / "r", format="files").open(small_setting())
+    sink.publish(update_number(0))
+    with full_disk_at(3000), pytest.raises(StorageError):
+        sink.publish(update_number(1))
+    sink.publish(update_number(2))
+    sink.close()
+    assert stamps(play(tmp_path / "r")) == [STAMP_NS, STAMP_NS + 2 * PERIOD_NS]
+
+
+def cloud_files(folder: Path, names: list[str]) -> Path:
+    folder.mkdir()
+    for n, name in enumerate(names):
+        write_cloud_ply(folder / name, np.float32([[n + 1, 2, 130], [3, 4, 140]]))
+    return folder
+
+
+def first_x(got: list) -> list[float | None]:
+    return [None if isinstance(s, InputError) else float(s.content.points_mm[0, 0]) for s in got]
+
+
+def test_a_damaged_file_among_good_ones_is_said_and_passed(tmp_path):
+    folder = cloud_files(tmp_path / "c", ["a.ply", "b.ply", "c.ply"])
+    (folder / "b.ply").write_bytes((folder / "b.ply").read_bytes()[:-5])
+    got = play(folder, fps=10)
+    assert first_x(got) == [1, None, 3]
+    assert "b.ply" in str(got[1])
+    assert got[2].stamp_ns - got[0].stamp_ns == 200_000_000
+
+
+def test_stamps_of_files(tmp_path):
+    named = cloud_files(tmp_path / "n", ["1790000000000000500.ply", "1790000000040000007.ply"])
+    assert stamps(play(named)) == [1790000000000000500, 1790000000040000007]
+    numbered = cloud_files(tmp_path / "m", ["000.ply", "001.ply"])
+    assert np.diff(stamps(play(numbered, fps=4))) == [250_000_000]
+    (numbered / "times.csv").write_text("file,stamp_ns\n001.ply,77\n000.ply,33\n")
+    assert stamps(play(numbered)) == [33, 77]
+    for text in ("file,stamp_ns\n001.ply,77\n", "name\nx\n", "file,stamp_ns\n000.ply,soon\n"):
+        (numbered / "times.csv").write_text(text)
+        with pytest.raises(InputError, match=r"times\.csv"):
+            Recording(path=numbered).open()
+
+
+def test_clouds_in_metres(tmp_path):
+    folder = tmp_path / "m"
+    folder.mkdir()
+    np.savez(folder / "a.npz", points=np.array([[0.001, 0.002, 0.13]]))
+    (seen,) = play(folder, unit="m")
+    np.testing.assert_allclose(seen.content.points_mm, [[1, 2, 130]], rtol=1e-6)
+
+
+def test_depth_images_beside_one_camera(tmp_path):
+    write_intrinsics(tmp_path / "intrinsics.json", CAMERA)
+    for n in range(3):
+        write_depth_png(tmp_path / f"{n}.png", frame_number(n))
+    got = play(tmp_path)
+    for n, seen in enumerate(got):
+        np.testing.assert_allclose(seen.content.depth_mm, frame_number(n).depth_mm, rtol=2e-7)
+    assert len(got) == 3
+    (tmp_path / "intrinsics.json").unlink()
+    with pytest.raises(InputError, match=r"intrinsics\.json"):
+        Recording(path=tmp_path).open()
+
+
+def test_scenes_bring_their_truth(tmp_path):
+    for n, name in enumerate(("one", "two")):
+        scene = tmp_path / name
+        scene.mkdir()
+        write_anatomy(scene, small_anatomy())
+        write_cloud_ply(scene / "cloud.ply", small_estimate().cloud.points_mm)
+        (scene / "meta.json").write_text(json.dumps({"stamp_ns": 5000 + n}))
+    write_intrinsics(tmp_path / "two" / "intrinsics.json", CAMERA)
+    write_depth_png(tmp_path / "two" / "depth.png", frame_number(0))
+    one, two = play(tmp_path)
+    assert (one.stamp_ns, two.stamp_ns) == (5000, 5001)
+    assert isinstance(one.content, SensorCloud)
+    assert isinstance(two.content, DepthFrame)
+    assert one.truth.names == PARTS
+    volume_mm3 = small_anatomy().parts[1].volume_mm3
+    assert two.truth.parts[1].volume_mm3 == pytest.approx(volume_mm3, rel=1e-5)
+
+
+def write_bag(path: Path, topics: dict[str, list], kind: str) -> Path:
+    """A foreign bag: per topic messages' suffix in ``messages_seen`` and frames."""
+    messages = Messages("noetic" if kind == "bag" else "humble")
+    plugin = StoragePlugin.MCAP if "mcap" in kind else StoragePlugin.SQLITE3
+    writer = Writer1(path) if kind == "bag" else Writer(path, version=8, storage_plugin=plugin)
+    if kind.startswith("packed"):
+        mode = CompressionMode.STORAGE if "mcap" in kind else CompressionMode.MESSAGE
+        writer.set_compression(mode, CompressionFormat.ZSTD)
+    with writer:
+        connections = {}
+        rows = [
+            (content.stamp_ns, topic, out)
+            for topic, (suffix, contents) in topics.items()
+            for content in contents
+            for out in messages_seen(Seen(content, 0), messages)
+            if out.suffix == suffix
+        ]
+        for stamp_ns, topic, out in sorted(rows, key=lambda row: row[:2]):
+            if topic not in connections:
+                connections[topic] = writer.add_connection(
+                    topic, out.message_type, typestore=messages._store
+                )
+            writer.write(connections[topic], stamp_ns, messages.to_bytes(out.message))
+    return path
+
+
+@pytest.mark.parametrize("kind", ["mcap", "packed mcap", "sqlite3", "packed sqlite3", "bag"])
+def test_bags_of_every_kind_are_played(tmp_path, kind):
+    frames = [frame_number(n) for n in range(3)]
+    cloud = SensorCloud(np.float32([[1, 2, 130]]), STAMP_NS)
+    topics = {
+        "/arm/depth/image": ("depth/image_rect", frames),
+        "/arm/depth/camera_info": ("depth/camera_info", frames),
+        "/other/camera_info": ("depth/camera_info", frames),
+        "/arm/points": ("points", [cloud]),
+    }
+    path = write_bag(tmp_path / "r.bag", topics, kind)
+    got = play(path)
+    assert stamps(got) == stamps(frames)
+    for seen, frame in zip(got, frames, strict=True):
+        np.testing.assert_allclose(seen.content.depth_mm, frame.depth_mm, rtol=2e-7)
+    (seen,) = play(path, topic="/arm/points")
+    np.testing.assert_allclose(seen.content.points_mm, cloud.points_mm, rtol=2e-7)
+    if kind in ("mcap", "packed mcap", "sqlite3"):
+        (file,) = [p for p in path.iterdir() if p.suffix in (".mcap", ".db3")]
+        assert stamps(play(file)) == stamps(frames)
+    for options in ({"topic": "/nowhere"}, {"info_topic": "/arm/points"}):
+        with pytest.raises(InputError, match="has no"):
+            Recording(path=path, **options).open()
+
+
+ROSBAG = """
+import struct, sys
+import rosbag, rospy
+from sensor_msgs.msg import CameraInfo, Image
+from std_msgs.msg import Header
+with rosbag.Bag(sys.argv[1], "w", compression=sys.argv[2], chunk_threshold=100) as bag:
+    for n in range(4):
+        header = Header(stamp=rospy.Time(100 + n, 7), frame_id="arm")
+        image = Image(header=header, height=2, width=3, encoding="16UC1", step=6)
+        image.data = struct.pack("<6H", 120 + n, 0, 130, 140, 150, 160)
+        info = CameraInfo(header=header, height=2, width=3, D=[0.0] * 5)
+        info.K = [60.0, 0, 1.25, 0, 61, 0.5, 0, 0, 1]
+        bag.write("/arm/depth/image_raw", image, header.stamp)
+        bag.write("/arm/depth/camera_info", info, header.stamp)
+"""
+
+
+@pytest.mark.parametrize("packing", ["none", "bz2", "lz4"])
+def test_bags_of_ros_1_itself_are_played(tmp_path, packing):
+    if not Path("/usr/lib/python3/dist-packages/rosbag").is_dir():
+        pytest.skip("Debian's ROS packages are not installed (make debian)")
+    command = ["/usr/bin/python3", "-c", ROSBAG, str(tmp_path / "r.bag"), packing]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == 0, done.stderr
+    got = play(tmp_path / "r.bag")
+    assert stamps(got) == [(100 + n) * 10**9 + 7 for n in range(4)]
+    assert [seen.content.depth_mm[0, 0] for seen in got] == [120, 121, 122, 123]
+    assert got[0].content.intrinsics.cx == 1.25
+
+
+def test_two_candidates_are_named_rather_than_guessed(tmp_path):
+    frames = [frame_number(0)]
+    topics = {
+        "/left/depth": ("depth/image_rect", frames),
+        "/right/depth": ("depth/image_rect", frames),
+    }
+    path = write_bag(tmp_path / "r", topics, "mcap")
+    with pytest.raises(InputError, match="/left/depth, /right/depth"):
+        Recording(path=path).open()
+    with pytest.raises(InputError, match="camera_info"):
+        Recording(path=path, topic="/left/depth").open()
+
+
+def test_a_bad_image_in_a_bag_is_said_and_passed(tmp_path):
+    frames = [frame_number(n) for n in range(3)]
+    topics = {
+        "/d/image": ("depth/image_rect", frames),
+        "/d/camera_info": ("depth/camera_info", frames),
+    }
+    path = write_bag(tmp_path / "d", topics, "mcap") / "d.mcap"
+    raw = bytearray(path.read_bytes())
+    begin = raw.find(b"32FC1", raw.find(b"32FC1") + 5)
+    for damage, said in ((b"bgra8", "bgra8"), (b"\xff" * 5, "no sensor_msgs/msg/Image")):
+        raw[begin : begin + 5] = damage
+        path.write_bytes(raw)
+        got = play(path)
+        assert [isinstance(seen, InputError) for seen in got] == [False, True, False]
+        assert said in str(got[1])
+
+
+def test_a_bag_damaged_in_the_middle_is_said_and_ends(tmp_path):
+    """A chunk whose own records do not add up: nothing behind it can be trusted."""
+    sink = RecordTo(path=tmp_path / "r").open(small_setting())
+    ends = []
+    for n in range(4):
+        sink.publish(update_number(n))
+        sink._writer._flush()
+        ends.append(sink._writer._whole)
+    sink.close()
+    path = tmp_path / "r" / "r.mcap"
+    raw = bytearray(path.read_bytes())
+    raw[ends[1] + 50 : ends[1] + 58] = b"\xff" * 8  # the length of the chunk's first record
+    path.write_bytes(raw)
+    got = play(tmp_path / "r")
+    assert [isinstance(seen, InputError) for seen in got[:3]] == [False, False, True]
+    assert len(got) == 3
+
+
+def test_a_bad_cloud_in_a_bag_is_said_and_passed(tmp_path):
+    clouds = [SensorCloud(np.float32([[n + 1, 2, 130]]), STAMP_NS + n) for n in range(3)]
+    path = write_bag(tmp_path / "d", {"/points": ("points", clouds)}, "mcap") / "d.mcap"
+    raw = path.read_bytes()
+    name = b"\x02\0\0\0y\0"  # of a field, in each message
+    begin = raw.find(name, raw.find(name) + 6)
+    path.write_bytes(raw[:begin] + b"\xff" * 4 + raw[begin + 4 :])
+    assert first_x(play(path)) == [1, None, 3]
+
+
+@pytest.mark.parametrize("name", ["r.mcap", "r.db3", "r.bag", "metadata.yaml"])
+def test_rubbish_is_no_recording(tmp_path, name):
+    (tmp_path / name).write_bytes(np.random.default_rng(1).bytes(3000))
+    path = tmp_path if name == "metadata.yaml" else tmp_path / name
+    with pytest.raises(InputError, match="bag"):
+        Recording(path=path).open()
+
+
+def test_what_is_no_recording_is_refused(tmp_path):
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "film.avi").touch()
+    for path in (tmp_path / "empty", tmp_path / "film.avi", tmp_path / "nowhere"):
+        with pytest.raises(InputError):
+            Recording(path=path).open()
+    for options in ({"rate": -1}, {"rate": float("nan")}, {"fps": 0}, {"unit_mm": 0}):
+        with pytest.raises(InputError):
+            Recording(path=tmp_path, **options)
+
+
+@pytest.mark.parametrize("rate", [1, 4])
+def test_frames_come_at_the_pace_of_their_stamps(tmp_path, rate):
+    folder = cloud_files(tmp_path / "c", [f"{n}.ply" for n in range(5)])
+    start, arrivals = time.monotonic(), []
+    source = Recording(path=folder, rate=rate, fps=10).open()
+    assert (source.waits, source.host_clock) == (False, False)
+    while len(arrivals) < 5:
+        if source.read(0.05) is not None:
+            arrivals.append((time.monotonic() - start) * rate)
+    assert source.dropped == 0
+    late_s = np.array(arrivals) - 0.1 * np.arange(5)
+    assert late_s.min() >= -0.001
+    assert np.median(late_s) < 0.06
+    with pytest.raises(SourceEnded):
+        source.read(0.05)
+
+
+def test_frames_that_are_late_are_dropped_and_the_newest_given(tmp_path):
+    folder = cloud_files(tmp_path / "c", [f"{n}.ply" for n in range(6)])
+    source = Recording(path=folder, fps=20).open()
+    assert first_x([source.read(0)]) == [1]
+    time.sleep(0.22)  # frames 2 to 5 were due meanwhile
+    (x,) = first_x([source.read(0)])
+    assert (x, source.dropped) in [(5, 3), (6, 4)]
+
+
+def test_a_long_pause_is_cut_short_of_a_frozen_source(tmp_path):
+    folder = cloud_files(tmp_path / "c", ["1000000000000.ply", "9000000000000.ply"])
+    source = Recording(path=folder, rate=2).open()
+    assert source.read(0).stamp_ns == 10**12
+    start = time.monotonic()
+    while (seen := source.read(0.5)) is None:
+        pass
+    assert seen.stamp_ns == 9 * 10**12
+    assert 1.9 < time.monotonic() - start < 3
+
+
+def test_a_loop_goes_on_with_rising_stamps(tmp_path):
+    folder = cloud_files(tmp_path / "c", ["1.ply", "2.ply"])
+    source = Recording(path=folder, rate=0, loop=True, fps=20).open()
+    got = [source.read(0.1) for _ in range(6)]
+    assert first_x(got) == [1, 2, 1, 2, 1, 2]
+    assert set(np.diff(stamps(got))) == {50_000_000}
+    source.close()
+
+
+def test_close_ends_a_read_that_waits(tmp_path):
+    folder = cloud_files(tmp_path / "c", ["1.ply", "2.ply"])
+    source = Recording(path=folder, fps=0.5).open()
+    source.read(0)
+    threading.Timer(0.1, source.close).start()
+    start = time.monotonic()
+    with pytest.raises(SourceLost):
+        source.read(5)
+    assert time.monotonic() - start < 1

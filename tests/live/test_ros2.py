@@ -1,0 +1,376 @@
+"""ROS 2's topics without ROS: what is announced, asked for and refused; the way through rclpy."""
+
+from __future__ import annotations
+
+import re
+import secrets
+import sys
+import time
+import types
+from collections.abc import Callable, Iterator
+from importlib.machinery import ModuleSpec
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from live_objects import (
+    PARTS,
+    empty_update,
+    small_frame,
+    small_setting,
+    small_update,
+)
+from ros2_objects import Frames, own_graph, read_until, sending
+from ros2_peer import points_mm
+from tumortrack.core.errors import InputError, TumortrackError
+from tumortrack.core.types import SensorCloud
+from tumortrack.live.ros import incoming
+from tumortrack.live.ros.bus import Bus, domain_id, open_bus
+from tumortrack.live.ros.cell import JOINTS, Cell
+from tumortrack.live.ros.dds_types import dds_name, idl_type, ros_name
+from tumortrack.live.ros.messages import Messages
+from tumortrack.live.ros.observed import messages_seen, plain_cloud
+from tumortrack.live.ros.outgoing import MARKERS, messages_of
+from tumortrack.live.sinks.ros2 import Ros2 as SinkRos2
+from tumortrack.live.source_worker import Reader
+from tumortrack.live.sources.ros2 import Ros2 as SourceRos2
+from tumortrack.live.values import Seen, Source
+from workcell_objects import with_arms, working
+
+pytest.importorskip("cyclonedds", reason="cyclonedds is not installed (tumortrack[live])")
+
+HERE = Path(__file__).parents[1] / "support"
+CLOUD_DDS = "sensor_msgs::msg::dds_::PointCloud2_"
+
+
+@pytest.fixture(autouse=True)
+def _own_graph() -> Iterator[None]:
+    with own_graph():
+        yield
+
+
+@pytest.fixture
+def messages() -> Messages:
+    return Messages()
+
+
+@pytest.fixture
+def bus(messages: Messages) -> Iterator[Bus]:
+    joined = open_bus("dds", messages)
+    yield joined
+    joined.close()
+
+
+# --- types ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", [incoming.CLOUD, incoming.CAMERA_INFO, MARKERS, JOINTS])
+def test_types_agree_with_a_second_encoder(kind: str, messages: Messages) -> None:
+    """cyclonedds' own (slow) coding of our type gives the bytes that rosbags gives."""
+    seen = Seen(small_frame(), 0)
+    cloud = Seen(SensorCloud(points_mm()[:7], 12_000_000_034), 0)
+    made = [*messages_seen(seen, messages), *messages_seen(cloud, messages)]
+    made += messages_of(working(), messages, PARTS, True, Cell(messages, 0))
+    message = next(one.message for one in made if one.message_type == kind)
+    cdr = bytes(messages.to_bytes(message))
+    type_ = idl_type(kind, "humble")
+    value = type_.deserialize(cdr)
+    assert value.serialize(use_version_2=False)[: len(cdr)] == cdr
+    if kind == incoming.CLOUD:
+        assert (value.header.stamp.sec, value.header.stamp.nanosec, value.width) == (12, 34, 7)
+    assert type_.__idl__.idl_transformed_typename == dds_name(kind)
+    assert ros_name(dds_name(kind)) == kind
+
+
+def test_names_that_are_none_of_ros() -> None:
+    assert ros_name("HelloWorld") == ""
+    assert ros_name("a::msg::dds_::B") == ""
+    with pytest.raises(InputError, match="no message type"):
+        idl_type("sensor_msgs/msg/Nothing", "humble")
+
+
+def test_what_other_nodes_see_of_a_topic(bus: Bus) -> None:
+    """Name, type, type hash and QoS are those that a ROS 2 node announces."""
+    from cyclonedds.qos import Policy
+
+    publisher = bus.publisher("/seen/points", incoming.CLOUD)
+    for _ in range(50):
+        known = [one for one in bus._published.read(100) if one.topic_name == "rt/seen/points"]
+        if known:
+            break
+        time.sleep(0.05)
+    (one,) = known
+    assert one.type_name == CLOUD_DDS
+    assert bus.types_of("/seen/points") == {incoming.CLOUD}
+    # As `ros2 topic info -v` prints it for sensor_msgs/msg/PointCloud2.
+    said = "9198cabf7da3796ae6fe19c4cb3bdd3525492988c70522628af5daa124bae2b5"
+    assert one.qos[Policy.Userdata].data == f"typehash=RIHS01_{said};".encode()
+    assert isinstance(one.qos[Policy.Reliability], Policy.Reliability.Reliable)
+    assert one.qos[Policy.Durability] == Policy.Durability.Volatile
+    assert publisher  # it lives as long as whoever asked for it holds it
+
+
+# --- the source ----------------------------------------------------------------------------------
+
+
+class Sender(Frames):
+    """Sends frames from this process, until something comes of it."""
+
+    def until(self, source: Source, seen: Seen, leave_out: tuple[str, ...] = ()) -> Seen:
+        """Send again and again until it is seen (or refused: raises)."""
+        for _ in range(100):
+            self.send(seen, leave_out)
+            if (got := source.read(0.05)) is not None:
+                return got
+        raise AssertionError("nothing came")
+
+    def refused(self, source: Source, seen: Seen, not_this: str, beside: Seen | None = None) -> str:
+        """The first refusal that does not say ``not_this``."""
+        for _ in range(100):
+            if beside is not None:
+                self.send(beside, ("depth/image_rect",))
+            try:
+                self.until(source, seen)
+            except InputError as error:
+                if not_this not in str(error):
+                    return str(error)
+        raise AssertionError("never refused")
+
+
+def test_what_belongs_to_an_image_is_asked_for(bus: Bus, messages: Messages) -> None:
+    frames = Sender(bus, messages, "/a")
+    source = SourceRos2(topic="/a/depth/image_rect", mask="/a/mask").open()
+    now = small_frame(time.time_ns())
+    old = small_frame(now.stamp_ns - 2_000_000_000)
+    mask = np.ones((48, 64), bool)
+    alone = Seen(now, 0)
+    try:
+        with pytest.raises(InputError, match=r"no camera_info on /a/depth/camera_info.*\?info="):
+            frames.until(source, alone, ("depth/camera_info",))
+        refused = frames.refused(source, alone, "camera_info")
+        assert "no mask came on /a/mask" in refused
+        frames.send(Seen(old, 0, mask), ("depth/image_rect",))
+        refused = frames.refused(source, alone, "so far", Seen(old, 0, mask))
+        assert "2.00 s older" in refused
+        assert frames.until(source, Seen(now, 0, mask)).mask is not None
+    finally:
+        source.close()
+
+
+@pytest.mark.parametrize(
+    ("offset_s", "clock", "host"),
+    [(0, "auto", True), (-20, "auto", True), (-3600, "auto", True), (-90_000, "auto", False)]
+    + [(-90_000, "host", True), (0, "other", False)],
+)
+def test_whose_clock(offset_s: int, clock: str, host: bool, bus: Bus, messages: Messages) -> None:
+    """A stream that lags by seconds is not taken for one with a clock of its own."""
+    place = f"/clock_{secrets.token_hex(4)}"
+    source = SourceRos2(topic=f"{place}/points", clock=clock).open()
+    stamp_ns = time.time_ns() + offset_s * 1_000_000_000
+    try:
+        cloud = Seen(SensorCloud(points_mm()[:9], stamp_ns), 0)
+        seen = Sender(bus, messages, place).until(source, cloud)
+        assert source.host_clock is host
+        assert seen.stamp_ns == stamp_ns
+        assert abs(seen.arrived_ns - time.time_ns()) < 5_000_000_000
+    finally:
+        source.close()
+
+
+def test_the_loop_counts_ages_from_the_stamp_once_a_frame_came() -> None:
+    with sending("cloud") as topic:
+        reader = Reader(SourceRos2(topic=topic).open)
+        seen = reader.take(10.0)
+        assert reader.latency_from == "stamp"
+        assert reader.born_ns(seen) == seen.stamp_ns
+        reader.close()
+
+
+@pytest.mark.parametrize(
+    ("name", "frame", "topics"),
+    [
+        ("tumortrack.rviz", "camera", ["cloud", "meshes"]),
+        ("resection.rviz", "table", ["cloud", "meshes", "observed", "workcell"]),
+    ],
+)
+def test_the_view_for_rviz_shows_what_is_published(
+    name: str, frame: str, topics: list[str], messages: Messages
+) -> None:
+    """Topics, frame and reliability of docs/ros/*.rviz are the sink's."""
+    view = (HERE.parent / "docs" / "ros" / name).read_text(encoding="utf-8")
+    cell = Cell(messages, 0)
+    sent = {
+        f"/tumortrack/{one.suffix}" for one in messages_of(empty_update(), messages, (), cell=cell)
+    }
+    shown = set(re.findall(r"Value: (/tumortrack\S+)", view))
+    assert sorted(shown) == [f"/tumortrack/{topic}" for topic in topics]
+    assert shown < sent
+    assert f"Fixed Frame: {frame}" in view
+    # A subscriber that wants what was published before does not hear a volatile publisher.
+    assert re.findall(r"Transient Local\n.*\n.*\n +Value: (\S+)", view) == (
+        ["/robot_description"] if name == "resection.rviz" else []
+    )
+
+
+def test_arms_travel_over_dds(bus: Bus, messages: Messages) -> None:
+    kinds = {"joint_states": JOINTS, "workcell": MARKERS}
+    heard = {name: bus.subscriber(f"/arms/{name}", kind) for name, kind in kinds.items()}
+    sink = SinkRos2(namespace="/arms", mesh_hz=0, via="dds").open(with_arms())
+    came: dict = {}
+    for n in range(200):
+        update = working(n, 0.25)
+        sink.publish(update)
+        bus.wait(0.05)
+        came |= {
+            name: messages.from_bytes(raw, kinds[name])
+            for name, one in heard.items()
+            for raw in one.take()
+        }
+        if len(came) == 2:
+            break
+    sink.close()
+    assert update.workcell is not None
+    joints = came["joint_states"]
+    assert dict(zip(joints.name, joints.position, strict=True)) == update.workcell.joints_rad
+    markers = {marker.ns: marker for marker in came["workcell"].markers}
+    for shape in update.workcell.shapes:
+        assert len(markers[shape.name].points) == shape.mesh.faces.size
+    assert markers["state"].text == "sweep 1"
+
+
+def test_other_types_are_refused(bus: Bus, messages: Messages) -> None:
+    publisher = bus.publisher("/text", "std_msgs/msg/String")
+    publisher.publish(messages.to_bytes(messages.make("std_msgs/msg/String", data="hello")))
+    source = SourceRos2(topic="/text").open()
+    try:
+        with pytest.raises(InputError, match="/text is published as std_msgs/msg/String"):
+            read_until(source, 5)
+    finally:
+        source.close()
+
+
+def test_damaged_bytes_are_not_sent(bus: Bus, messages: Messages) -> None:
+    header = messages.header(5, "camera")
+    cdr = bytes(messages.to_bytes(plain_cloud(SensorCloud(points_mm()[:9]), header, messages)))
+    publisher = bus.publisher("/points", incoming.CLOUD)
+    publisher.publish(cdr)
+    with pytest.raises(TumortrackError, match=r"/points: a message of \d+ bytes was not sent"):
+        publisher.publish(cdr[:60])
+
+
+@pytest.mark.parametrize("value", ["233", "-1", "1.5", "home", "²"])
+def test_domains_that_are_none(value: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("ROS_DOMAIN_ID", value)
+    with pytest.raises(InputError, match=r"whole number in 0\.\.232"):
+        domain_id()
+
+
+def test_a_graph_in_which_nothing_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "off")
+    monkeypatch.setenv("ROS_DOMAIN_ID", "101")  # one that this process has not joined yet
+    with pytest.raises(InputError, match="is OFF"):
+        SourceRos2(topic="/points", via="dds").open()
+
+
+def test_a_network_that_cannot_be(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("CYCLONEDDS_URI", "<CycloneDDS><Domain><Bad/></Domain></CycloneDDS>")
+    monkeypatch.setenv("ROS_DOMAIN_ID", "101")
+    with pytest.raises(InputError, match=r"domain 101 cannot be joined.*CYCLONEDDS_URI"):
+        SourceRos2(topic="/points", via="dds").open()
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"topic": "points"}, "no full topic name"),
+        ({"topic": "/a/"}, "no full topic name"),
+        ({"topic": "/a/2b"}, "no full topic name"),
+        ({"topic": "/a", "info": "b c"}, "no full topic name"),
+        ({"topic": "/a", "type": "cloud", "mask": "/m"}, "belong to a depth image"),
+        ({"topic": "/a", "unit_mm": 0.0}, "unit_mm"),
+    ],
+)
+def test_options_that_cannot_be(options: dict, said: str) -> None:
+    with pytest.raises(InputError, match=said):
+        SourceRos2(**options)
+
+
+# --- the user's own ROS --------------------------------------------------------------------------
+
+
+def test_the_way_through_rclpy(monkeypatch: pytest.MonkeyPatch, messages: Messages) -> None:
+    """Which calls go to rclpy, in which order. A stand-in: there is no rclpy to run here."""
+    calls: list[tuple] = []
+    callbacks: dict = {}
+    cloud = plain_cloud(SensorCloud(points_mm()[:300]), messages.header(7, "camera"), messages)
+
+    class Recorded:
+        """Notes what is called on it; every call gives another."""
+
+        def __init__(self, name: str) -> None:
+            self.name = name
+
+        def __getattr__(self, name: str) -> Callable:
+            def call(*args: object, **kwargs: object) -> object:
+                calls.append((f"{self.name}.{name}", args, kwargs))
+                if name == "create_subscription":
+                    callbacks[args[1]] = args[2]
+                if name == "spin_once":
+                    for came in list(callbacks.values()):
+                        came(bytes(messages.to_bytes(cloud)))
+                if name == "get_publishers_info_by_topic":
+                    return [types.SimpleNamespace(topic_type=incoming.CLOUD)]
+                return Recorded(name)
+
+            return call
+
+    def module(name: str, **content: object) -> None:
+        made = types.ModuleType(name)
+        vars(made).update(content)
+        made.__spec__ = ModuleSpec(name, None)
+        monkeypatch.setitem(sys.modules, name, made)
+
+    rclpy = Recorded("rclpy")
+    module("rclpy", Context=rclpy.Context, init=rclpy.init, create_node=rclpy.create_node)
+    module("rclpy.executors", SingleThreadedExecutor=rclpy.SingleThreadedExecutor)
+    policy = types.SimpleNamespace
+    module(
+        "rclpy.qos",
+        QoSProfile=dict,
+        ReliabilityPolicy=policy(RELIABLE="reliable", BEST_EFFORT="best effort"),
+        DurabilityPolicy=policy(TRANSIENT_LOCAL="transient local", VOLATILE="volatile"),
+    )
+    module("rclpy.duration", Duration=dict)
+    for package in ("sensor_msgs", "visualization_msgs", "geometry_msgs", "diagnostic_msgs"):
+        names = ("PointCloud2", "MarkerArray", "PointStamped", "DiagnosticArray")
+        module(f"{package}.msg", **{name: name for name in names})
+
+    source = SourceRos2(topic="/points").open()  # auto: rclpy is there now
+    seen = source.read(0.1)
+    assert seen is not None
+    np.testing.assert_allclose(seen.content.points_mm, points_mm()[:300], rtol=2e-7)
+    source.close()
+    source.close()
+    made = [name for name, _, _ in calls]
+    assert made.index("rclpy.init") < made.index("rclpy.create_node")
+    subscribed = next(call for call in calls if call[0].endswith("create_subscription"))
+    assert subscribed[1][:2] == ("PointCloud2", "/points")
+    assert subscribed[1][3]["reliability"] == "best effort"
+    assert subscribed[2] == {"raw": True}
+    assert made.count("create_node.destroy_node") == 1
+
+    calls.clear()
+    sink = SinkRos2(via="rclpy").open(small_setting())
+    sink.publish(small_update())
+    sink.close()
+    topics = {args[1] for name, args, _ in calls if name.endswith("create_publisher")}
+    assert {"/tumortrack/cloud", "/tumortrack/tumor_2/center"} < topics
+    sent = [args[0] for name, args, _ in calls if name == "create_publisher.publish"]
+    assert all(isinstance(one, bytes) and one[:4] == b"\0\1\0\0" for one in sent)
+    assert len(sent) == 2 * len(topics)  # the update, and that it is over
+
+
+def test_without_rclpy_it_says_what_to_do() -> None:
+    with pytest.raises(InputError, match=r"rclpy cannot be imported.*via=dds"):
+        SourceRos2(topic="/points", via="rclpy").open()

@@ -1,0 +1,310 @@
+"""ROS 2's topics between processes, and to and from a second maker's DDS."""
+
+from __future__ import annotations
+
+import contextlib
+import shutil
+import signal
+import subprocess
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from live_objects import (
+    CAMERA,
+    PARTS,
+    empty_update,
+    small_estimate,
+    small_frame,
+    small_setting,
+    small_update,
+)
+from ros2_objects import DOMAIN, Other, own_graph, peer, process, read_until
+from ros2_peer import frame_numbered, points_mm
+from tumortrack.core.errors import InputError
+from tumortrack.core.estimate import Estimate
+from tumortrack.core.types import OccupancyCloud, SensorCloud
+from tumortrack.live.ros import incoming
+from tumortrack.live.ros.bus import Bus, open_bus
+from tumortrack.live.ros.dds_types import dds_name
+from tumortrack.live.ros.messages import Messages
+from tumortrack.live.ros.observed import messages_seen, plain_cloud
+from tumortrack.live.ros.outgoing import messages_of
+from tumortrack.live.sinks.ros2 import Ros2 as SinkRos2
+from tumortrack.live.sources.ros2 import Ros2 as SourceRos2
+from tumortrack.live.values import Seen, Sink, Source, Update
+
+pytest.importorskip("cyclonedds", reason="cyclonedds is not installed (tumortrack[live])")
+
+HERE = Path(__file__).parents[1] / "support"
+CLOUD_DDS = "sensor_msgs::msg::dds_::PointCloud2_"
+
+
+@pytest.fixture(autouse=True)
+def _own_graph() -> Iterator[None]:
+    with own_graph():
+        yield
+
+
+@pytest.fixture
+def messages() -> Messages:
+    return Messages()
+
+
+@pytest.fixture
+def bus(messages: Messages) -> Iterator[Bus]:
+    joined = open_bus("dds", messages)
+    yield joined
+    joined.close()
+
+
+def large_update(sequence: int, n: int = 40_000) -> Update:
+    """An update with ``n`` points, stamped now."""
+    stamp_ns = time.time_ns()
+    small = small_estimate(stamp_ns)
+    points = np.resize(small.cloud.points_mm, (n, 3))
+    cloud = OccupancyCloud(points, np.ones(n, np.uint8), np.full(n, 0.5, np.float32), stamp_ns)
+    estimate = Estimate(cloud, None, small.meshes, small.report)
+    return Update(sequence=sequence, stamp_ns=stamp_ns, estimate=estimate, quality="good")
+
+
+def test_depth_images_from_another_process() -> None:
+    source = SourceRos2(topic="/camera/depth/image_rect", mask="/camera/mask").open()
+    assert isinstance(source, Source)
+    try:
+        assert source.read(0.1) is None  # nobody there is no fault
+        with peer("send", "image", 60, 30):
+            first = complete(lambda: read_until(source, 10))
+            assert source.host_clock
+            assert first.mask is not None
+            assert np.array_equal(first.mask, np.arange(48 * 64).reshape(48, 64) % 3 == 0)
+            assert first.content.intrinsics == CAMERA
+            for _ in range(5):
+                seen = read_until(source, 2)
+                number = round(float(seen.content.depth_mm[0, 0]) - 100)
+                expected = frame_numbered(number, 0).depth_mm
+                np.testing.assert_allclose(seen.content.depth_mm, expected, rtol=2e-7)
+                assert seen.stamp_ns > first.stamp_ns
+            before = source.dropped
+            time.sleep(0.4)
+            fresh = source.read(0.2)
+            assert fresh is not None
+            assert time.time_ns() - fresh.stamp_ns < 200_000_000  # the newest, not what waited
+            assert source.dropped > before
+        while source.read(0.3) is not None:
+            pass
+        assert source.read(0.3) is None  # the publisher is gone
+        with peer("send", "image", 60, 30):
+            again = complete(lambda: read_until(source, 10))
+            assert again.stamp_ns > fresh.stamp_ns
+    finally:
+        source.close()
+
+
+def complete(read: Callable[[], Seen]) -> Seen:
+    """The first frame that has all it needs; what belongs to it comes on topics of its own."""
+    for _ in range(100):
+        with contextlib.suppress(InputError):
+            return read()
+    raise AssertionError("neither mask nor camera_info came")
+
+
+def test_clouds_of_40_000_points_at_30_hz() -> None:
+    source = SourceRos2(topic="/camera/points", type="cloud").open()
+    ages_ms = []
+    try:
+        with peer("send", "cloud", 30, 30):
+            read_until(source, 10)
+            end_s = time.monotonic() + 2
+            while time.monotonic() < end_s:
+                seen = source.read(0.2)
+                if seen is not None:
+                    ages_ms.append((time.time_ns() - seen.stamp_ns) * 1e-6)
+        np.testing.assert_allclose(seen.content.points_mm, points_mm(), rtol=2e-7)
+    finally:
+        source.close()
+    p50, p95 = np.percentile(ages_ms, [50, 95])
+    print(f"40k points: {len(ages_ms) / 2:.1f} Hz, p50 {p50:.2f} ms, p95 {p95:.2f} ms")
+    assert len(ages_ms) > 30
+
+
+# --- the sink ------------------------------------------------------------------------------------
+
+
+def test_updates_reach_another_process(messages: Messages) -> None:
+    sink = SinkRos2(mesh_hz=0).open(small_setting())
+    assert isinstance(sink, Sink)
+    update = small_update()
+    expected = {one.suffix: one.message for one in messages_of(update, messages, PARTS)}
+    try:
+        with peer("hear", 60) as other:
+            other.lines_until(lambda said: "listens" in said)
+            by_topic = publish_until(sink, other, update)
+            cloud = by_topic["cloud"]
+            assert (cloud["points"], cloud["frame"]) == (500, "camera")
+            assert cloud["sum"] == int(expected["cloud"].data.sum())
+            assert cloud["stamp_ns"] == update.stamp_ns
+            corners = {name: 3 * len(mesh.faces) for name, mesh in update.placed.meshes.items()}
+            triangles = {ns: n for ns, _, n in by_topic["meshes"]["markers"] if ns in PARTS}
+            assert triangles == corners
+            centre_m = by_topic["tumor_1/center"]["m"]
+            assert centre_m == pytest.approx([0.014, -0.003, 0.120], abs=1e-9)  # metres
+            assert by_topic["diagnostics"]["level"] == 0
+
+            sink.publish(empty_update())
+            by_topic = other.topics_until(lambda last: at(last, empty_update().stamp_ns))
+            assert by_topic["cloud"]["points"] == 0
+            assert by_topic["meshes"]["markers"][0][1] == 3  # DELETEALL
+            assert np.isnan(by_topic["tumor_1/center"]["m"]).all()
+            assert by_topic["diagnostics"]["level"] == 2
+            assert "only 12 points" in by_topic["diagnostics"]["text"]
+
+            sink.publish(small_update(2))
+            other.topics_until(lambda last: last["diagnostics"]["level"] == 0)
+            sink.close()
+            by_topic = other.topics_until(lambda last: last["diagnostics"]["level"] == 2)
+            assert "ended" in by_topic["diagnostics"]["text"]
+    finally:
+        sink.close()
+        sink.close()
+
+
+def at(last: dict[str, dict], stamp_ns: int) -> bool:
+    """All topics are at this stamp."""
+    return {one["stamp_ns"] for one in last.values()} == {stamp_ns}
+
+
+def publish_until(sink: Sink, other: Other, update: Update) -> dict[str, dict]:
+    """Publish until the other end hears it on all topics; it may not be matched yet."""
+    done = threading.Event()
+
+    def again() -> None:
+        while not done.is_set():
+            sink.publish(update)
+            done.wait(0.1)
+
+    thread = threading.Thread(target=again)
+    thread.start()
+    try:
+        return other.topics_until(lambda last: at(last, update.stamp_ns))
+    finally:
+        done.set()
+        thread.join()
+
+
+def test_subscribers_that_hang_die_and_come_late_hold_up_nobody() -> None:
+    """40,000 points at 30 Hz go on whatever subscribers do."""
+    sink = SinkRos2(mesh_hz=10).open(small_setting())
+    try:
+        with peer("hear", 60) as lively, peer("hear", 60) as other:
+            for one in (lively, other):
+                one.lines_until(lambda said: "listens" in said)
+            publish_until(sink, lively, large_update(0))
+            other.signal(signal.SIGSTOP)  # matched, and acknowledges nothing any more
+            hung_ms = publish_at(sink, 30, 3.0)
+            other.signal(signal.SIGKILL)
+            killed_ms = publish_at(sink, 30, 0.5)
+            last = ("cloud", sent_last(sink))
+            heard = lively.lines_until(lambda one: (one["topic"], one["stamp_ns"]) == last)
+            clouds = [one for one in heard if one["topic"] == "cloud"]
+            ages_ms = [(one["now_ns"] - one["stamp_ns"]) * 1e-6 for one in clouds]
+        with peer("hear", 60) as late:
+            late.lines_until(lambda said: "listens" in said)
+            by_topic = publish_until(sink, late, small_update(1000))
+            assert by_topic["cloud"]["points"] == 500
+    finally:
+        sink.close()
+    publish_ms = [*hung_ms, *killed_ms]
+    p50, most = np.median(publish_ms), max(publish_ms)
+    print(
+        f"publishing 40k points beside a hung subscriber: p50 {p50:.1f} ms, most {most:.1f} ms; "
+        f"the other one got {len(ages_ms)} of {len(publish_ms) + 1}, p50 "
+        f"{np.median(ages_ms):.2f} ms"
+    )
+    assert np.percentile(publish_ms, 90) < 500
+    assert len(ages_ms) > len(publish_ms) / 2
+
+
+def sent_last(sink: Sink) -> int:
+    """One more, whose stamp it gives back."""
+    update = large_update(999)
+    sink.publish(update)
+    return update.stamp_ns
+
+
+def publish_at(sink: Sink, hz: float, seconds: float) -> list[float]:
+    """How long each call took, ms."""
+    took_ms = []
+    for number in range(int(hz * seconds)):
+        start_s = time.monotonic()
+        sink.publish(large_update(number))
+        took_ms.append(1000 * (time.monotonic() - start_s))
+        time.sleep(max(0.0, 1 / hz - (time.monotonic() - start_s)))
+    return took_ms
+
+
+# --- a second maker's DDS ------------------------------------------------------------------------
+
+
+def built(folder: Path) -> Path:
+    """The Fast DDS peer; skips where it cannot be built."""
+    if not shutil.which("g++"):
+        pytest.skip("g++ is not installed: see tools/debian-packages.txt")
+    if not Path("/usr/include/fastdds").is_dir():
+        pytest.skip("Fast DDS's headers are not installed: see tools/debian-packages.txt")
+    made = folder / "peer"
+    sources = ["-std=c++17", "-O0", str(HERE / "fastdds" / "peer.cpp"), "-o", str(made)]
+    subprocess.run(["g++", *sources, "-lfastrtps", "-lfastcdr"], check=True, timeout=120)
+    return made
+
+
+def test_fast_dds_hears_and_is_heard(tmp_path: Path, bus: Bus, messages: Messages) -> None:
+    """A cloud of ours arrives there byte for byte, an image from there here; noise does no harm."""
+    program = built(tmp_path)
+    files = []
+    for suffix, kind, message in messages_seen(Seen(small_frame(), 0), messages):
+        (tmp_path / suffix.replace("/", "_")).write_bytes(messages.to_bytes(message))
+        files += [f"rt/fast/{suffix}", dds_name(kind), tmp_path / suffix.replace("/", "_")]
+    noise = np.random.default_rng(1).integers(0, 256, 2000, np.uint8).tobytes()
+    (tmp_path / "noise").write_bytes(bytes([0, 1, 0, 0]) + noise)
+    files += ["rt/fast/noise", CLOUD_DDS, tmp_path / "noise"]
+
+    header = messages.header(5, "camera")
+    cloud = SensorCloud(points_mm()[:2000])
+    cdr = bytes(messages.to_bytes(plain_cloud(cloud, header, messages)))
+    ours = bus.publisher("/tumortrack/cloud", incoming.CLOUD)
+    image = SourceRos2(topic="/fast/depth/image_rect").open()
+    damaged = SourceRos2(topic="/fast/noise").open()
+    heard = tmp_path / "heard"
+    sub = ("sub", 4, "rt/tumortrack/cloud", CLOUD_DDS, heard)
+    try:
+        with (
+            process(program, DOMAIN, *sub) as there,
+            process(program, DOMAIN, "pub", 30, 30, *files),
+        ):
+            images, sent, end_s = [], 0, time.monotonic() + 4
+            while time.monotonic() < end_s:
+                ours.publish(cdr)
+                sent += 1
+                with contextlib.suppress(InputError):  # before the first CameraInfo
+                    images.append(image.read(1 / 30))
+                with contextlib.suppress(InputError):
+                    assert damaged.read(0.0) is None
+            received = int(there.line())
+    finally:
+        image.close()
+        damaged.close()
+    seen = [one for one in images if one is not None]
+    np.testing.assert_allclose(seen[-1].content.depth_mm, small_frame().depth_mm, rtol=2e-7)
+    ages_ms = [(one.arrived_ns - one.stamp_ns) * 1e-6 for one in seen]
+    print(
+        f"Fast DDS heard {received} of {sent}; {len(seen)} images, p50 {np.median(ages_ms):.2f} ms"
+    )
+    assert image.host_clock
+    assert len(seen) > 20
+    assert received > 20
+    assert heard.read_bytes().rstrip(b"\0") == cdr.rstrip(b"\0")

@@ -1,0 +1,568 @@
+"""The web viewer: what it computes, what its page shows in a real browser."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import subprocess
+import threading
+import time
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from PIL import Image
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from browser import Browser, until
+from live_objects import PARTS, ball, empty_update, small_anatomy, small_setting, small_update
+from stories import COMMAND, environment, live_resection
+from tumortrack.core.colours import TUMORS, part_colour
+from tumortrack.core.errors import InputError
+from tumortrack.core.geometry import rigid, transform_points
+from tumortrack.core.store import new_folder
+from tumortrack.core.types import Anatomy, LabelVolume, Mesh, Volume
+from tumortrack.imaging.case import Case, save_case
+from tumortrack.live.sinks.viewer import Viewer, ViewerSink
+from tumortrack.live.values import Frames, Setting, Update
+from tumortrack.live.viewer.points import point_under
+from tumortrack.live.viewer.slices import CarriedCt, Plane, slice_picture
+from tumortrack.live.viewer.status import Status
+from tumortrack.live.viewer.surfaces import bare_faces, exact_margin, rough_margin
+from workcell_objects import REASON, virtual, with_arms, workcell, working
+
+TURN = Rotation.from_euler("xyz", [20, -35, 50], degrees=True).as_matrix()
+ROBOT = Frames("robot", rigid(TURN, np.array([400.0, -250.0, 90.0])))
+
+
+@dataclass(frozen=True, eq=False)
+class Turned:
+    """A motion that is a rotation and a shift."""
+
+    camera_from_ct: np.ndarray
+
+    def carry(self, points_ct: np.ndarray, /) -> np.ndarray:
+        return transform_points(self.camera_from_ct, points_ct)
+
+    def back(self, points_camera: np.ndarray, /) -> np.ndarray:
+        return transform_points(np.linalg.inv(self.camera_from_ct), points_camera)
+
+    def std_mm(self, points_ct: np.ndarray, /) -> None:
+        return None
+
+
+MOTION = Turned(rigid(TURN, np.array([3.0, -2.0, 130.0])))
+
+
+def bean() -> Mesh:
+    """A closed surface with a bulge and a hollow."""
+    sphere = trimesh.creation.icosphere(4, 1.0)
+    v = sphere.vertices * [14, 9, 8]
+    return Mesh(v + np.outer(0.02 * v[:, 0] ** 2, [0, 1, 0]) + [30, -20, 55], sphere.faces)
+
+
+def sloped_case(with_ct: bool = True) -> Case:
+    """A ball of 20 mm with one of 6 mm in it, in a CT whose values rise along a direction."""
+    lps_from_index = np.diag([1.5, 1.5, 2.0, 1.0])
+    lps_from_index[:3, 3] = [-33.0, -33.0, -34.0]
+    grid = np.indices((45, 45, 35)).reshape(3, -1).T.astype(float)
+    points = transform_points(lps_from_index, grid)
+    labels = (np.linalg.norm(points, axis=1) < 20).astype(np.uint8)
+    labels[np.linalg.norm(points - [8.0, 0.0, 0.0], axis=1) < 6] = 2
+    ct = Volume((points @ [2.0, -1.0, 0.5]).reshape(45, 45, 35), lps_from_index)
+    volume = LabelVolume(labels.reshape(45, 45, 35), lps_from_index)
+    anatomy = Anatomy((ball((0, 0, 0), 20.0), ball((8, 0, 0), 6.0)))
+    return Case(anatomy, volume, (0.0, -1.0, 0.0), ct=ct if with_ct else None)
+
+
+def carried_update(case: Case) -> Update:
+    """An update whose estimate is the case's anatomy, moved by ``MOTION``."""
+    update = small_update()
+    assert update.estimate is not None
+    names = ("kidney", "tumor_1")
+    meshes = {
+        name: part.moved(MOTION.carry(part.vertices_mm))
+        for name, part in zip(names, case.anatomy.parts, strict=True)
+    }
+    return replace(update, estimate=replace(update.estimate, meshes=meshes, motion=MOTION))
+
+
+@pytest.fixture
+def sinks():
+    """Opens viewers at free ports, and closes them."""
+    opened: list[ViewerSink] = []
+
+    def open_viewer(setting: Setting | None = None, **options) -> ViewerSink:
+        sink = Viewer(port=0, **options).open(setting or small_setting())
+        opened.append(sink)
+        return sink
+
+    yield open_viewer
+    for sink in opened:
+        sink.close()
+        sink.close()
+
+
+# Surfaces
+
+
+def test_margin_lies_at_its_distance_and_is_closed():
+    tumor = bean()
+    shell = exact_margin(tumor, 5.0)
+    solid = trimesh.Trimesh(tumor.vertices_mm, tumor.faces)
+    dense = trimesh.sample.sample_surface(solid, 200_000, seed=1)[0]
+    distance, _ = cKDTree(dense).query(shell.vertices_mm)
+    assert np.abs(distance - 5).max() < 0.3
+    made = trimesh.Trimesh(shell.vertices_mm, shell.faces)
+    assert made.is_watertight
+    assert shell.volume_mm3 > tumor.volume_mm3  # faces outward, the tumor inside
+    assert made.body_count == 1
+
+
+def test_rough_margin_of_a_ball_is_the_larger_ball():
+    shell = rough_margin(ball((3, 4, 100), 8.0), 5.0)
+    assert np.linalg.norm(shell.vertices_mm - [3, 4, 100], axis=1) == pytest.approx(13, abs=0.02)
+
+
+def test_organ_leaves_out_what_is_a_tumors_surface():
+    sphere = trimesh.creation.icosphere(4, 25.0)
+    cap = trimesh.convex.convex_hull(sphere.vertices[sphere.vertices[:, 2] > 15])
+    anatomy = Anatomy((Mesh(sphere.vertices, sphere.faces), Mesh(cap.vertices, cap.faces)))
+    bare = bare_faces(anatomy)
+    height = sphere.vertices[bare][:, :, 2]
+    assert (height.min(1) <= 15).all()
+    assert len(bare) == (sphere.vertices[sphere.faces][:, :, 2].min(1) <= 15).sum()
+
+
+# Slices
+
+
+@pytest.mark.parametrize("with_ct", [True, False])
+def test_slice_shows_the_ct_where_it_is_now(with_ct):
+    case = sloped_case(with_ct)
+    ct = CarriedCt(case)
+    across, down = np.array([1.0, 0, 0]), np.array([0, 0.6, 0.8])
+    plane = Plane(MOTION.carry(np.array([[2.0, 1.0, 0.0]]))[0], across, down, 24.0)
+    picture = slice_picture(ct, MOTION, plane, [], 48)
+    assert picture is not None
+    rows, columns = (axis.ravel() for axis in np.mgrid[3:36:6, 2:46:7])  # the bar is below
+    x, y = (columns - 23.5) / 2, (rows - 23.5) / 2  # mm from the middle
+    places = MOTION.back(plane.centre_mm + np.outer(x, across) + np.outer(y, down))
+    expected = ct.grey(places).astype(int)
+    assert np.ptp(expected) > 60
+    close = np.abs(picture[rows, columns].astype(int) - expected[:, None]).max(1) <= 3
+    assert close.all() if with_ct else close.mean() > 0.8  # labels are mixed at their borders
+
+
+def test_grey_rises_with_the_ct_fades_and_ends():
+    ct = CarriedCt(sloped_case())
+    direction = np.array([2.0, -1.0, 0.5]) / np.sqrt(5.25)
+    inside = ct.grey(np.outer([-12.0, 0.0, 12.0], direction)).astype(int)
+    steps = np.diff(inside)
+    assert steps[0] > 30
+    assert steps[0] == pytest.approx(steps[1], abs=1)
+    right = ct.grey(np.array([[19.0, 0, 0], [30.0, 0, 0], [400.0, 0, 0]]))
+    assert right[0] > right[1] > 0  # the CT is brighter there, but the organ is far
+    assert right[2] == 0
+
+
+def test_section_of_a_ball_is_its_circle():
+    centre = np.array([4.0, -3.0, 130.0])
+    sphere = trimesh.creation.icosphere(5, 10.0)
+    plane = Plane(centre + [0, 0, 6.0], np.array([1.0, 0, 0]), np.array([0, 1.0, 0]), 50.0)
+    segments = plane.section(Mesh(sphere.vertices + centre, sphere.faces))
+    assert np.linalg.norm(segments, axis=2) == pytest.approx(8.0, abs=0.03)
+    length = np.linalg.norm(segments[:, 0] - segments[:, 1], axis=1).sum()
+    assert length == pytest.approx(16 * np.pi, rel=0.01)
+
+
+def test_slice_outlines_lie_on_the_surface():
+    case = sloped_case()
+    tumor = ball((8, 0, 0), 6.0)
+    there = tumor.moved(MOTION.carry(tumor.vertices_mm))
+    middle = there.box_mm.mean(0)
+    plane = Plane(middle, np.array([1.0, 0, 0]), np.array([0, 1.0, 0]), 32.0)
+    picture = slice_picture(CarriedCt(case), MOTION, plane, [(there, (0, 255, 0), 1)], 128)
+    assert picture is not None
+    drawn = np.argwhere((picture[:, :, 1] > 200) & (picture[:, :, 0] < 60))
+    assert len(drawn) > 60
+    radius_mm = np.linalg.norm((drawn - 63.5) / 4, axis=1)
+    assert radius_mm == pytest.approx(6.0, abs=0.35)
+
+
+# Clicks
+
+
+def test_click_means_the_foremost_point_under_it():
+    points = np.array([[0.0, 0, 100], [0.5, 0, 140], [9.0, 0, 90], [0, 0, -50]])
+    eye, ahead = np.zeros(3), np.array([0.0, 0, 2.0])
+    assert point_under(points, eye, ahead) == pytest.approx([0, 0, 100])
+    assert point_under(points[1:], eye, ahead) == pytest.approx([0.5, 0, 140])
+    assert point_under(points[2:3], eye, ahead) == pytest.approx([9, 0, 90])
+    assert point_under(points[3:], eye, ahead) is None  # behind
+    assert point_under(points, np.array([60.0, 0, 0]), ahead) is None  # far off
+
+
+# The sink
+
+
+@pytest.mark.parametrize("wrong", [{"port": 70_000}, {"hz": 0.0}, {"margin_mm": -1.0}])
+def test_impossible_settings_are_refused(wrong):
+    with pytest.raises(InputError, match=next(iter(wrong))):
+        Viewer(**wrong)
+
+
+def test_taken_port_is_refused():
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        with pytest.raises(InputError, match=rf"port {port} .*viewer:{port + 1}"):
+            Viewer(port=port).open(small_setting())
+
+
+def test_without_estimate_nothing_stays_and_with_one_it_is_back_at_once(sinks):
+    sink = sinks(hz=0.01)
+    nodes = sink._server.scene.get_handle_by_name
+    sink.publish(small_update(0))
+    assert nodes("/estimate").visible
+    sink.publish(empty_update(1))  # far sooner than hz allows
+    assert not nodes("/estimate").visible
+    sink.publish(small_update(2, frames=ROBOT))
+    assert nodes("/estimate").visible
+    there = transform_points(ROBOT.published_from_camera, small_anatomy().organ.vertices_mm)
+    assert nodes("/estimate/kidney").vertices[: len(there)] == pytest.approx(there, abs=1e-3)
+    first = nodes("/estimate/kidney").vertices.copy()
+    sink.publish(small_update(3))  # too soon for another
+    assert (nodes("/estimate/kidney").vertices == first).all()
+
+
+def test_part_that_was_not_found_is_not_shown(sinks):
+    sink = sinks(hz=60)
+    nodes = sink._server.scene.get_handle_by_name
+    update = small_update(0)
+    assert update.estimate is not None
+    sink.publish(update)
+    assert nodes("/estimate/tumor_1").visible
+    assert nodes("/estimate/margin_tumor_1").visible
+    kept = {name: mesh for name, mesh in update.estimate.meshes.items() if name != "tumor_1"}
+    time.sleep(1 / 60)
+    sink.publish(replace(update, estimate=replace(update.estimate, meshes=kept)))
+    assert not nodes("/estimate/tumor_1").visible
+    assert not nodes("/estimate/margin_tumor_1").visible
+    assert nodes("/estimate/tumor_2").visible
+
+
+def test_estimate_that_cannot_be_shown_hides_the_one_before(sinks):
+    sink = sinks(hz=60)
+    update = small_update(0)
+    assert update.estimate is not None
+    sink.publish(update)
+    broken = replace(update.estimate, report={"parts": {"kidney": {}}})
+    time.sleep(1 / 60)
+    with pytest.raises(KeyError):
+        sink.publish(replace(update, sequence=1, estimate=broken))
+    assert not sink._server.scene.get_handle_by_name("/estimate").visible
+    time.sleep(0.3)  # the watch goes on
+    assert "NO ESTIMATE" in sink._panel._flag.content
+    assert "cannot be shown" in sink._panel._flag.content
+
+
+def test_case_gives_slices_and_an_exact_margin_that_moves_along(sinks, tmp_path):
+    case = sloped_case()
+    with new_folder(tmp_path / "case") as folder:
+        save_case(case, folder)
+    setting = Setting(parts=PARTS[:2], frames=Frames(), anatomy_ct=case.anatomy)
+    sink = sinks(setting, case=str(tmp_path / "case"))
+    sink.publish(carried_update(case))
+    until(lambda: sink._panel._slice.visible, 3, "a slice")
+    picture = sink._panel._slice.image
+    assert (np.abs(picture.astype(int) - TUMORS[0]).sum(2) < 90).sum() > 30  # its outline
+    shell = sink._server.scene.get_handle_by_name("/estimate/margin_tumor_1").vertices
+    middle = MOTION.carry(np.array([[8.0, 0, 0]]))[0]
+    assert np.linalg.norm(shell - middle, axis=1) == pytest.approx(11.0, abs=0.35)
+    sink.publish(empty_update())
+    assert not sink._panel._slice.visible
+
+    with pytest.raises(InputError, match="is not the case that the model was trained on"):
+        sinks(replace(setting, anatomy_ct=small_anatomy()), case=str(tmp_path / "case"))
+    with pytest.raises(InputError, match="have no motion"):
+        sinks(replace(setting, anatomy_ct=None), case=str(tmp_path / "case"))
+
+
+def test_arms_move_without_being_sent_again_and_what_is_gone_is_removed(sinks):
+    sink = sinks(with_arms(), hz=0.01)  # arms come with every update all the same
+    nodes = sink._server.scene.get_handle_by_name
+    sink.publish(working(0, 0.0))
+    assert nodes("/workcell").visible
+    forearm, cut = nodes("/workcell/shape/cutter:forearm"), nodes("/workcell/line/cut:1")
+    assert len(cut.points) == 40
+    now = working(1, 0.02).workcell
+    assert now is not None
+    moved = next(shape for shape in now.shapes if shape.name == "cutter/forearm")
+    forearm_before = forearm.position.copy()
+    mesh_before = next(s for s in workcell().shapes if s.name == "cutter/forearm").mesh
+    sink.publish(replace(working(1), workcell=now))
+    assert (nodes("/workcell/shape/cutter:forearm") is forearm) == (moved.mesh is mesh_before)
+    shown = nodes("/workcell/shape/cutter:forearm")
+    assert shown.position == pytest.approx(moved.published_from_shape[:3, 3])
+    assert not np.allclose(shown.position, forearm_before)
+    turn = Rotation.from_quat(shown.wxyz, scalar_first=True).as_matrix()
+    assert turn == pytest.approx(moved.published_from_shape[:3, :3])
+    table = nodes("/workcell/shape/table")
+    kept = tuple(shape for shape in now.shapes if shape.name != "holder/tip")
+    sink.publish(replace(working(2), workcell=replace(now, shapes=kept, lines=now.lines[1:])))
+    assert nodes("/workcell/shape/holder:tip") is None
+    assert nodes("/workcell/line/cut:1") is None
+    assert nodes("/workcell/line/cut:2") is not None
+    assert nodes("/workcell/shape/table") is table
+
+
+def test_arms_are_shown_without_an_estimate_and_never_after_silence(sinks):
+    sink = sinks(with_arms())
+    nodes = sink._server.scene.get_handle_by_name
+    sink.publish(working(0))
+    sink.publish(virtual(1))
+    assert nodes("/workcell").visible
+    assert not nodes("/estimate").visible
+    assert REASON in sink._panel._flag.content
+    sink.publish(small_update(2))
+    assert not nodes("/workcell").visible
+    nowhere = replace(workcell().shapes[0], published_from_shape=np.zeros((4, 4)))
+    broken = replace(workcell(), shapes=(nowhere,))
+    with pytest.raises(ValueError, match="determinant"):
+        sink.publish(replace(working(3), workcell=broken))
+    assert not nodes("/workcell").visible
+    assert nodes("/estimate").visible
+    sink.publish(working(4))
+    assert nodes("/workcell").visible
+    until(lambda: "nothing has come for" in sink._panel._flag.content, 3, "silence")
+    assert not nodes("/workcell").visible
+    assert "nothing is known of them" in sink._panel._flag.content
+
+
+def test_status_says_why_and_no_old_numbers():
+    update = replace(empty_update(), reason="depth < 110 mm & hidden")
+    flag = Status("none", update, 0.1, 7).flag()
+    assert "NO ESTIMATE" in flag
+    assert "depth &lt; 110 mm &amp; hidden" in flag
+    stale = Status("stale", small_update(), 3.21, 8)
+    assert "3.2 s" in stale.flag()
+    assert "0.75" in Status("good", small_update(), 0.1, 8).numbers()
+    assert "0.75" not in stale.numbers()
+
+
+# The page
+
+
+class Feed(threading.Thread):
+    """Publishes the update that it is given, ten times a second; None: nothing."""
+
+    def __init__(self, sink: ViewerSink, update: Update) -> None:
+        super().__init__(daemon=True)
+        self.sink, self.update = sink, update
+        self.ended = threading.Event()
+        self.start()
+
+    def run(self) -> None:
+        sequence = 0
+        while not self.ended.wait(0.1):
+            if self.update is not None:
+                sequence += 1
+                self.sink.publish(replace(self.update, sequence=sequence))
+
+    def end(self) -> None:
+        self.ended.set()
+        self.join()
+
+
+def greenish(picture: np.ndarray) -> int:
+    """Pixels with the hue of the first tumor, seen through kidney or not."""
+    r, g, b = picture[:, :400].astype(int).transpose(2, 0, 1)
+    return int(((g >= r) & (g > b + 15)).sum())
+
+
+def kidneyish(picture: np.ndarray) -> int:
+    r, g, b = picture[:, :400].astype(int).transpose(2, 0, 1)
+    return int(((r > 1.2 * g) & (r < 2.6 * g) & (g > b) & (g > 20)).sum())
+
+
+def orange(picture: np.ndarray) -> int:
+    """Pixels that look like the cutter's arm, where no banner is."""
+    r, g, b = picture[150:420, :400].astype(int).transpose(2, 0, 1)
+    return int(((r > 80) & (r > 1.4 * g) & (g > 2 * b)).sum())
+
+
+def test_page_in_a_browser(sinks):
+    setting = replace(small_setting(), frames=ROBOT, arms=True)
+    sink = sinks(setting)
+    shown = small_update(frames=ROBOT)
+    hidden = replace(empty_update(reason="only 12 points lie in range"), frames=ROBOT)
+    with Browser(780, 480) as browser:
+        feed = Feed(sink, shown)
+        try:
+            browser.open(f"http://127.0.0.1:{sink.port}")
+            until(lambda: "GOOD" in browser.text(), 20, "the page")
+            until(lambda: greenish(browser.picture()) > 700, 10, "a tumor")
+            assert kidneyish(browser.picture()) > 5000
+            assert "STALE" not in browser.text()
+
+            feed.update = replace(
+                shown, estimate=None, quality="none", reason="the organ is hidden"
+            )
+            until(lambda: "the organ is hidden" in browser.text(), 5, "the reason")
+            assert "NO ESTIMATE" in browser.text()
+            assert "GOOD" not in browser.text()
+            until(lambda: kidneyish(browser.picture()) < 200, 3, "hiding")
+            assert greenish(browser.picture()) == 0
+
+            feed.update = hidden
+            browser.open("about:blank")
+            browser.open(f"http://127.0.0.1:{sink.port}")  # a second visit sees the present state
+            until(lambda: "only 12 points" in browser.text(), 20, "the page again")
+            feed.update = replace(shown, quality="poor", warning="it fits only to 3 mm")
+            until(lambda: "it fits only to 3 mm" in browser.text(), 5, "the warning")
+            until(lambda: greenish(browser.picture()) > 700, 10, "the tumor again")
+
+            check_click(browser, setting)
+            check_arms(browser, feed, shown, setting)
+
+            feed.update = None  # type: ignore[assignment]
+            until(lambda: "nothing has come for" in browser.text(), 5, "STALE")
+            until(lambda: greenish(browser.picture()) == 0, 3, "hiding")
+            assert orange(browser.picture()) < 300
+            assert "nothing is known of them" in browser.text()
+            feed.update = shown
+            until(lambda: "GOOD" in browser.text(), 5, "recovery")
+            assert orange(browser.picture()) < 300
+            assert "has been silent" not in browser.text()
+        finally:
+            feed.end()
+        sink.close()  # the page, alone now, says so itself
+        until(lambda: "has been silent" in browser.text(), 6, "the page's own watch")
+
+
+def check_arms(browser: Browser, feed: Feed, shown: Update, setting: Setting) -> None:
+    """Arms are seen whole, with and without an estimate; what they do is said; they are stopped."""
+    assert orange(browser.picture()) < 300
+    feed.update = replace(shown, workcell=workcell())
+    until(lambda: "ARMS: sweep 1" in browser.text(), 5, "the arms' state")
+    until(lambda: orange(browser.picture()) > 1000, 5, "an arm")
+    feed.update = replace(virtual(), frames=ROBOT)
+    until(lambda: REASON in browser.text(), 5, "why there is no estimate")
+    assert "NO ESTIMATE" in browser.text()
+    assert orange(browser.picture()) > 1000
+    browser.click_text("organ")
+    until(lambda: orange(browser.picture()) < 300, 5, "the view from the camera")
+    browser.click_text("arms")
+    until(lambda: orange(browser.picture()) > 1000, 5, "the view of all")
+    feed.update = replace(shown, workcell=workcell(halted="the tumor has moved by 6 mm"))
+    until(lambda: "the tumor has moved by 6 mm" in browser.text(), 5, "the halt")
+    assert "sweep 1: HALTED" in browser.text()
+    browser.click_text("Stop the arms for good")
+    until(setting.controls.aborted.is_set, 5, "the arms' end")
+    until(lambda: "The arms were stopped for good" in browser.text(), 5, "being told so")
+
+
+def check_click(browser: Browser, setting: Setting) -> None:
+    """A click on the scene gives the seen point under it, in the camera's frame."""
+    rect = browser.call(
+        "Runtime.evaluate",
+        expression="(r => [r.x, r.y, r.width, r.height])"
+        "(document.querySelector('canvas').getBoundingClientRect())",
+        returnByValue=True,
+    )["result"]["value"]
+    browser.click_text("Click the organ")
+    until(lambda: "Now click" in browser.text(), 5, "being asked to click")
+    column, row = 40, -25  # pixels from the middle of the view
+    browser.click(rect[0] + rect[2] / 2 + column, rect[1] + rect[3] / 2 + row)
+    until(lambda: setting.controls.picked_mm is not None, 5, "the click")
+    picked = setting.controls.picked_mm
+    assert picked is not None
+    focal = rect[3] / 2 / np.tan(0.45)  # the view starts where the camera is, 0.9 rad high
+    assert picked[2] > 100
+    assert picked[:2] == pytest.approx(np.array([column, row]) * picked[2] / focal, abs=3)
+    until(lambda: "Choose again" in browser.text(), 5, "the way back")
+    browser.click_text("Choose again")
+    until(lambda: setting.controls.picked_mm is None, 5, "forgetting")
+
+
+GIVEN = ("PICTURES", "DEMO", "PLAN")
+PICTURES, DEMO, PLAN = (os.environ.get(f"TUMORTRACK_{name}") for name in GIVEN)
+
+
+@pytest.mark.skipif(not (PICTURES and DEMO), reason="TUMORTRACK_PICTURES, TUMORTRACK_DEMO not set")
+def test_pictures_for_the_documentation(tmp_path):
+    """TUMORTRACK_PICTURES: where pictures go; TUMORTRACK_DEMO: what ``tumortrack demo`` left. The
+    command itself, on a case in motion; then its process is stopped, as a hung machine would be."""
+    assert PICTURES
+    assert DEMO
+    demo, port = Path(DEMO).resolve(), free_port()
+    command = [*COMMAND, "track", demo / "model", f"virtual:{demo / 'case'}"]
+    process = subprocess.Popen(
+        [*map(str, command), f"viewer:{port}?case={demo / 'case'}"],
+        env=environment(),
+        cwd=tmp_path,
+    )
+    try:
+        with Browser(1280, 800) as browser:
+            until(lambda: answers(port), 60, "the viewer")
+            browser.open(f"http://127.0.0.1:{port}")
+            until(lambda: "GOOD" in browser.text(), 60, "an estimate")
+            close = "document.querySelector('.mantine-Notification-closeButton')?.click()"
+            browser.call("Runtime.evaluate", expression=close)
+            time.sleep(8)
+            save(browser, "viewer.png")
+            process.send_signal(signal.SIGSTOP)
+            time.sleep(4)
+            save(browser, "viewer_stale.png")
+    finally:
+        process.kill()
+        process.wait()
+
+
+@pytest.mark.skipif(not (PICTURES and DEMO and PLAN), reason="TUMORTRACK_PLAN and more not set")
+def test_picture_of_a_resection_for_the_documentation(tmp_path):
+    """TUMORTRACK_PLAN: what ``tumortrack plan`` made of the demo's phantom."""
+    demo, plan = (Path(str(one)).resolve() for one in (DEMO, PLAN))
+    port = free_port()
+    command = live_resection(demo, plan, f"viewer:{port}")
+    process = subprocess.Popen(command, env=environment(), cwd=tmp_path)
+    try:
+        with Browser(1280, 800) as browser:
+            until(lambda: answers(port), 60, "the viewer")
+            browser.open(f"http://127.0.0.1:{port}")
+            until(lambda: "ARMS: sweep 2" in browser.text(), 200, "the second sweep")
+            close = "document.querySelector('.mantine-Notification-closeButton')?.click()"
+            browser.call("Runtime.evaluate", expression=close)
+            browser.click_text("organ")
+            time.sleep(3)
+            save(browser, "viewer_resection.png")
+    finally:
+        process.kill()
+        process.wait()
+
+
+def answers(port: int) -> bool:
+    with socket.socket() as one:
+        return one.connect_ex(("127.0.0.1", port)) == 0
+
+
+def free_port() -> int:
+    with socket.socket() as one:
+        one.bind(("127.0.0.1", 0))
+        return int(one.getsockname()[1])
+
+
+def save(browser: Browser, name: str) -> None:
+    Image.fromarray(browser.picture()).save(Path(str(PICTURES)) / name, optimize=True)
+
+
+def test_tumors_differ_in_colour():
+    colours = np.array([part_colour(label) for label in range(1, 7)], float)
+    apart = np.linalg.norm(colours[:, None] - colours[None], axis=2)
+    assert apart[~np.eye(6, dtype=bool)].min() > 60

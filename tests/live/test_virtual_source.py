@@ -1,0 +1,265 @@
+"""The virtual source: laws of its moving world, and its pace."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import fields
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from elastic_objects import UP, organ
+from render_objects import ray_hits
+from theatre_objects import COARSE, small_theatre
+from tumortrack.core.errors import InputError
+from tumortrack.core.geometry import transform_points
+from tumortrack.core.types import LabelVolume, Mesh
+from tumortrack.imaging.case import Case, save_case
+from tumortrack.live.sources.virtual import Virtual, VirtualSource
+from tumortrack.live.spec import parse_spec
+from tumortrack.sense.noise import CLEAN
+from tumortrack.simulate.elastic.body import BodyConfig
+from tumortrack.simulate.player.player import SHAFT_MM, Theatre, TheatreConfig
+from tumortrack.simulate.player.props import rod
+
+HELD_S = (3.0, 9.0, 15.0)  # a push is at its deepest
+ROUND_S = 18.0  # all places were pushed once
+STILL = {"breath_mm": 0.0, "swell": 0.0, "sway_mm": 0.0, "sway_degrees": 0.0}
+
+
+def test_seed_and_time_are_all_that_a_frame_depends_on():
+    theatre = small_theatre()
+    again = Theatre(organ(), UP, TheatreConfig(body=COARSE), 3)
+    for t_s in (7.3, 0.0, 2.9):
+        one, other = theatre.state_at(t_s), again.state_at(t_s)
+        for field in fields(one):
+            np.testing.assert_array_equal(getattr(one, field.name), getattr(other, field.name))
+        frames = [
+            room.frame(state, room.truth(state), 5).depth_mm
+            for room, state in ((theatre, one), (again, other), (theatre, one))
+        ]
+        np.testing.assert_array_equal(frames[0], frames[1])
+        np.testing.assert_array_equal(frames[0], frames[2])
+    elsewhere = small_theatre(4).state_at(2.9)
+    assert np.abs(elsewhere.camera_from_room - theatre.state_at(2.9).camera_from_room).max() > 0.01
+
+
+def test_organ_and_tumor_keep_their_volume():
+    theatre = small_theatre()
+    at_rest = [part.volume_mm3 for part in theatre.anatomy_ct.parts]
+    ratios = np.array(
+        [
+            [part.volume_mm3 for part in theatre.truth(theatre.state_at(t_s)).parts]
+            for t_s in np.arange(0, ROUND_S, 0.5)
+        ]
+    ) / np.array(at_rest)
+    assert np.abs(ratios - 1).max() < 0.03
+    assert ratios[:, 0].max() > 1.004  # but it swells a little as it breathes in
+
+
+def test_pushes_deform_the_organ_by_some_millimetres_and_it_comes_back():
+    theatre = small_theatre(**STILL)
+    rest = theatre.truth(theatre.state_at(0)).organ.vertices_mm
+    np.testing.assert_allclose(
+        theatre.truth(theatre.state_at(ROUND_S)).organ.vertices_mm, rest, atol=1e-6
+    )
+    for t_s in HELD_S:
+        instant = theatre.state_at(t_s)
+        pushed = theatre.truth(instant).organ.vertices_mm
+        bent = np.linalg.norm(pushed - _rigidly_onto(rest, pushed), axis=1)
+        assert 2 < bent.max() < 12
+        tip = (instant.camera_from_room @ instant.room_from_rod)[:3, 3]
+        near = np.linalg.norm(pushed - tip, axis=1) < 6
+        assert bent[near].min() > 1.5 * np.median(bent)  # most where the instrument is
+
+
+def _rigidly_onto(points: np.ndarray, target: np.ndarray) -> np.ndarray:
+    turn, _ = Rotation.align_vectors(target - target.mean(0), points - points.mean(0))
+    return turn.apply(points - points.mean(0)) + target.mean(0)
+
+
+def test_the_instrument_touches_what_it_pushes_and_nothing_else():
+    theatre = small_theatre(**STILL)
+    for held_s in HELD_S:
+        begin_s = held_s - 3.0
+        away, touching, held = (_gap_mm(theatre, begin_s + after_s) for after_s in (0.3, 1.2, 3.0))
+        assert away > 20
+        assert abs(touching) < 0.5
+        assert abs(held) < 0.5
+    depths = [theatre.state_at(t_s).depth_mm for t_s in np.arange(0, 6, 0.1)]
+    assert max(depths) == theatre.config.push_mm
+    assert min(depths) == 0
+
+
+def _gap_mm(theatre: Theatre, t_s: float) -> float:
+    """From the instrument's tip to the organ's surface, by a fine sampling of it."""
+    instant = theatre.state_at(t_s)
+    tip = (instant.camera_from_room @ instant.room_from_rod)[:3, 3]
+    organ_mm = theatre.truth(instant).organ
+    corners = organ_mm.vertices_mm[organ_mm.faces]
+    weights = np.random.default_rng(0).dirichlet(np.ones(3), 50)
+    return float(np.linalg.norm(weights @ corners - tip, axis=2).min())
+
+
+def test_breathing_goes_down_the_body_and_back():
+    theatre = small_theatre(push_mm=0.0, swell=0.0, sway_mm=0.0, sway_degrees=0.0)
+    places = [_in_room(theatre, t_s) for t_s in (0.0, 2.0, 4.0)]
+    way = places[1] - places[0]
+    np.testing.assert_allclose(way, [[0, 0, -6.0]], atol=1e-3)  # inferior in LPS is -z
+    np.testing.assert_allclose(places[2], places[0], atol=1e-6)
+
+
+def _in_room(theatre: Theatre, t_s: float) -> np.ndarray:
+    instant = theatre.state_at(t_s)
+    center = theatre.anatomy_ct.organ.vertices_mm.mean(0)[None]
+    before = theatre.carry(instant, center)
+    return transform_points(np.linalg.inv(instant.camera_from_room), before)
+
+
+def test_nothing_jumps_between_frames():
+    theatre = small_theatre()
+    places = [
+        theatre.carry(theatre.state_at(t_s), theatre.anatomy_ct.organ.vertices_mm[::20])
+        for t_s in np.arange(0, ROUND_S + 1, 1 / 30)
+    ]
+    steps_mm = [np.linalg.norm(b - a, axis=1).max() for a, b in pairwise(places)]
+    assert max(steps_mm) < 1.0
+    assert np.abs(np.diff(steps_mm)).max() < 0.2  # nor does the speed
+    assert np.ptp(np.array(places)[:, :, 2], axis=0).min() > 1.5  # and all moves
+
+
+def test_depth_is_what_rays_find_of_organ_table_and_instrument():
+    theatre = small_theatre(width=160, height=90, noise=CLEAN)
+    for t_s in HELD_S:
+        instant = theatre.state_at(t_s)
+        truth = theatre.truth(instant)
+        frame = theatre.frame(instant, truth, 17)
+        assert frame.stamp_ns == 17
+        expected_mm = _by_rays(theatre, instant.camera_from_room, truth.organ, t_s)
+        off = np.abs(frame.depth_mm.ravel()[::_EVERY] - expected_mm.min(0))
+        assert np.mean(off < 0.05) > 0.99  # but for a few at silhouettes
+        seen = np.bincount(expected_mm.argmin(0), minlength=3)
+        assert (seen > [100, 200, 10]).all()  # each is in the picture
+
+
+_EVERY = 7
+
+
+def _by_rays(
+    theatre: Theatre, camera_from_room: np.ndarray, organ_camera: Mesh, t_s: float
+) -> np.ndarray:
+    """Depth (3, r) of organ, table and instrument in every seventh pixel."""
+    lens = theatre.intrinsics
+    row, column = np.divmod(np.arange(lens.width * lens.height)[::_EVERY], lens.width)
+    rays = np.stack(
+        [(column - lens.cx) / lens.fx, (row - lens.cy) / lens.fy, np.ones(len(row))], axis=1
+    )
+    shaft = rod(SHAFT_MM, 200.0)
+    camera_from_rod = camera_from_room @ theatre.state_at(t_s).room_from_rod
+    shaft = shaft.moved(transform_points(camera_from_rod, shaft.vertices_mm))
+    hits = [
+        np.concatenate(
+            [ray_hits(np.zeros(3), part, mesh).min(1) for part in np.array_split(rays, 10)]
+        )
+        for mesh in (organ_camera, shaft)
+    ]
+    at_rest = organ().organ.vertices_mm
+    lowest = at_rest[np.argmin(at_rest @ np.array(UP))]
+    normal = camera_from_room[:3, :3] @ np.array(UP)
+    under = transform_points(camera_from_room, lowest[None])[0]
+    return np.stack([hits[0], (normal @ under) / (rays @ normal), hits[1]])
+
+
+def test_a_drape_rises_about_the_organ_and_hides_its_sides():
+    bare, draped = (small_theatre(noise=CLEAN, drape=drape, push_mm=0.0) for drape in (False, True))
+    instant = bare.state_at(1.0)
+    truth = bare.truth(instant)
+    before, after = (room.frame(instant, truth, 0).depth_mm for room in (bare, draped))
+    nearer = before - after
+    assert (nearer > -1e-3).all()
+    assert np.mean(nearer > 3) > 0.1
+    middle = np.nanargmin(before)
+    assert nearer.flat[middle] == 0
+
+
+def test_parts_can_be_left_out():
+    bare = small_theatre(table=False, push_mm=0.0, **STILL)
+    instant = bare.state_at(2.7)
+    np.testing.assert_array_equal(instant.camera_from_room, bare.state_at(0).camera_from_room)
+    np.testing.assert_array_equal(instant.coefficients, 0)
+    truth = bare.truth(instant)
+    depth_mm = bare.frame(instant, truth, 0).depth_mm
+    assert np.isnan(depth_mm).mean() > 0.5
+    assert truth.organ.vertices_mm[:, 2].min() == pytest.approx(118.0, abs=1e-3)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [{"distance_mm": 10.0}, {"push_mm": 30.0}, {"breath_s": 0.0}, {"width": 100}, {"places": 0}],
+)
+def test_impossible_rooms_are_refused(wrong: dict):
+    with pytest.raises(InputError):
+        TheatreConfig(**wrong)
+
+
+def test_too_many_places_and_times_before_the_beginning_are_refused():
+    few = BodyConfig(cells=100, modes=8, responses=20, patches=20)
+    with pytest.raises(InputError, match=r"ask for fewer"):
+        Theatre(organ(), UP, TheatreConfig(body=few, places=20), 3)
+    with pytest.raises(InputError, match=r"before the theatre's beginning"):
+        small_theatre().state_at(-0.1)
+
+
+def test_frames_missed_are_counted():
+    source = VirtualSource(small_theatre(), fps=50)
+    begin = time.monotonic()
+    first = source.read(1.0)
+    time.sleep(0.3)
+    second = source.read(1.0)
+    assert first is not None
+    assert second is not None
+    passed = int((time.monotonic() - begin) * 50)
+    assert 12 <= source.dropped <= passed
+    source.close()
+
+
+def test_a_frame_is_not_given_before_its_time():
+    source = VirtualSource(small_theatre(), fps=0.2)
+    assert source.read(0.0) is not None
+    begin = time.monotonic()
+    assert source.read(0.0) is None
+    assert source.read(0.05) is None
+    assert time.monotonic() - begin >= 0.05
+    assert source.dropped == 0
+    source.close()
+
+
+def test_truth_is_of_the_frames_own_instant():
+    source = VirtualSource(small_theatre(), fps=30)
+    seen = source.at(4.25, stamp_ns=99)
+    again = source.theatre.truth(source.theatre.state_at(4.25))
+    assert seen.stamp_ns == 99
+    np.testing.assert_array_equal(seen.truth.organ.vertices_mm, again.organ.vertices_mm)
+
+
+def test_the_command_lines_text_opens_a_case(tmp_path):
+    labels = LabelVolume(np.zeros((2, 2, 2), np.uint8), np.eye(4))
+    save_case(Case(organ(), labels, UP), tmp_path)
+    text = f"virtual:{tmp_path}?fps=25&instrument=false&noise=false&camera_motion=false&seed=2"
+    config = parse_spec(text, (Virtual,), "source")
+    source = config.open()
+    seen = source.read(1.0)
+    source.close()
+    assert seen is not None
+    assert source.theatre.config.push_mm == 0
+    assert source.theatre.config.noise == CLEAN
+    np.testing.assert_allclose(
+        seen.content.depth_mm[np.isfinite(seen.content.depth_mm)].min(),
+        seen.truth.organ.vertices_mm[:, 2].min(),
+        atol=0.5,
+    )
+    for wrong in ({"fps": 0.0}, {"seed": -1}):
+        with pytest.raises(InputError):
+            Virtual(case=tmp_path, **wrong)

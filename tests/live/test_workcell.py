@@ -1,0 +1,568 @@
+"""What arms do, on every sink: messages, files, OpenIGTLink, and a real arm."""
+
+from __future__ import annotations
+
+import json
+import socket
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pytest
+from rosbags.highlevel import AnyReader
+from rosbags.typesys import Stores, get_typestore
+from scipy.spatial.transform import Rotation
+
+from igtl_objects import hear_all
+from live_objects import PARTS, small_setting, small_update
+from recording_objects import frame_number
+from tumortrack.core.errors import InputError, TumortrackError
+from tumortrack.core.geometry import rigid, transform_points
+from tumortrack.core.mesh_files import read_mesh
+from tumortrack.live.igtl.content import Status, unpack_status, unpack_transform
+from tumortrack.live.ros.cell import Cell
+from tumortrack.live.ros.incoming import cloud_of
+from tumortrack.live.ros.messages import Messages, stamp_of
+from tumortrack.live.ros.outgoing import messages_of
+from tumortrack.live.sink_worker import Outlet
+from tumortrack.live.sinks import SINKS
+from tumortrack.live.sinks.openigtlink import OpenIgtLink
+from tumortrack.live.sinks.recording import Recording as RecordTo
+from tumortrack.live.sinks.ur import Ur, UrSink
+from tumortrack.live.sources.recording import Recording
+from tumortrack.live.spec import parse_spec
+from tumortrack.live.ur_link import SILENT_S, UR_JOINTS
+from tumortrack.live.values import Seen, Setting, SourceEnded, Update
+from tumortrack.live.viewer.workcell import box_of
+from workcell_objects import CUT, REASON, TABLE, virtual, with_arms, workcell, working
+
+HUMBLE, NOETIC = Messages("humble"), Messages("noetic")
+STOCK = {HUMBLE: get_typestore(Stores.ROS2_HUMBLE), NOETIC: get_typestore(Stores.ROS1_NOETIC)}
+NAMES = [shape.name for shape in workcell().shapes]
+
+
+def sent(update: Update, cell: Cell, messages: Messages = HUMBLE) -> dict:
+    return {out.suffix: out.message for out in messages_of(update, messages, PARTS, True, cell)}
+
+
+def less(update: Update, *names: str) -> Update:
+    """Without these shapes and lines."""
+    cell = update.workcell
+    assert cell is not None
+    shapes = tuple(shape for shape in cell.shapes if shape.name not in names)
+    lines = tuple(line for line in cell.lines if line.name not in names)
+    return replace(update, workcell=replace(cell, shapes=shapes, lines=lines))
+
+
+# ROS
+
+
+def test_joints_and_markers_say_where_everything_stands():
+    update = working(3, 0.3)
+    out, cell = sent(update, Cell(HUMBLE, 0)), update.workcell
+    joints = out["joint_states"]
+    assert dict(zip(joints.name, joints.position, strict=True)) == cell.joints_rad
+    assert (stamp_of(joints.header), joints.header.frame_id) == (update.stamp_ns, "table")
+
+    markers = {m.ns: m for m in out["workcell"].markers}
+    assert list(markers) == [*NAMES, "cut/1", "cut/2", "state"]
+    assert {stamp_of(m.header) for m in markers.values()} == {update.stamp_ns}
+    assert all(m.action == m.ADD and m.lifetime.sec > 0 for m in markers.values())
+    for shape in cell.shapes:
+        marker, way = markers[shape.name], shape.published_from_shape
+        p, q = marker.pose.position, marker.pose.orientation
+        shown = rigid(
+            Rotation.from_quat([q.x, q.y, q.z, q.w]).as_matrix(), np.array([p.x, p.y, p.z]) * 1000
+        )
+        corners_mm = transform_points(shown, np.vstack(list(marker.points)) * 1000)
+        expected = transform_points(way, shape.mesh.vertices_mm[shape.mesh.faces.ravel()])
+        np.testing.assert_allclose(corners_mm, expected, atol=1e-6)
+        assert marker.type == marker.TRIANGLE_LIST
+        assert (marker.color.r, marker.color.a) == (shape.colour[0] / 255, 1.0)
+    cut = markers["cut/1"]
+    np.testing.assert_allclose(np.vstack(list(cut.points)) * 1000, cell.lines[0].points_mm)
+    assert (cut.type, cut.scale.x) == (cut.LINE_STRIP, 0.002)
+    assert [cut.color.r, cut.color.g, cut.color.b] == pytest.approx(np.array(CUT) / 255)
+    text = markers["state"]
+    assert (text.text, text.type) == ("sweep 1", text.TEXT_VIEW_FACING)
+    everything = np.concatenate(
+        [transform_points(s.published_from_shape, s.mesh.vertices_mm) for s in cell.shapes]
+    )
+    np.testing.assert_allclose(box_of(cell), [everything.min(0), everything.max(0)], atol=1e-9)
+    place, middle = text.pose.position, everything.min(0) / 2 + everything.max(0) / 2
+    assert [place.x * 1000, place.y * 1000] == pytest.approx(middle[:2])
+    assert place.z * 1000 == pytest.approx(everything[:, 2].max() + 60)
+
+
+def test_arms_are_told_of_without_an_estimate_and_why_they_stand():
+    out = sent(virtual(halted="the tumor moved by 6 mm"), Cell(NOETIC, 0), NOETIC)
+    assert len(out["workcell"].markers) == len(NAMES) + 3
+    assert [m.action for m in out["meshes"].markers] == [3]  # DELETEALL: no estimate
+    assert out["workcell"].markers[-1].text == (
+        f"sweep 1, halted: the tumor moved by 6 mm\nno estimate: {REASON}"
+    )
+    estimate, arms = out["diagnostics"].status
+    assert (estimate.level, arms.level, arms.name) == (2, 1, "tumortrack: arms")
+    assert {v.key: v.value for v in arms.values} == {
+        "state": "sweep 1", "halted": "the tumor moved by 6 mm",
+    }  # fmt: skip
+    assert sent(working(), Cell(HUMBLE, 0))["diagnostics"].status[1].level == 0
+
+
+def test_markers_keep_their_rate_and_changes_come_at_once():
+    cell = Cell(HUMBLE, 0.01)
+    assert len(sent(working(0), cell)["workcell"].markers) == len(NAMES) + 3
+    later = sent(working(1, 0.2), cell)
+    assert "workcell" not in later
+    assert later["joint_states"].position[0] == pytest.approx(0.04)  # joints come each time
+    # Whoever is slow gets the newest message alone: each is whole.
+    markers = sent(less(working(2, 0.3), "holder/tip", "cut/2"), cell)["workcell"].markers
+    assert [(m.ns, m.action) for m in markers[:2]] == [("cut/2", 2), ("holder/tip", 2)]
+    assert [m.ns for m in markers[2:]] == [*NAMES[:-1], "cut/1", "state"]
+    halted = less(working(3, 0.3, "hidden"), "holder/tip", "cut/2")
+    assert sent(halted, cell)["workcell"].markers[-1].text == "sweep 1, halted: hidden"
+    assert "workcell" not in sent(halted, cell)
+    (all_gone,) = sent(small_update(2, frames=TABLE), cell)["workcell"].markers
+    assert all_gone.action == all_gone.DELETEALL
+    nothing = sent(replace(working(3), workcell=None), cell)
+    assert len(nothing["joint_states"].name) == 0
+    assert nothing["diagnostics"].status[1].level == 3  # STALE
+
+
+def test_what_the_camera_saw_is_sent_in_the_frame_of_the_arms():
+    update = working()
+    assert update.seen is not None
+    points_mm = cloud_of(sent(update, Cell(HUMBLE, 0))["observed"]).points_mm
+    depth_mm = update.seen.content.depth_mm
+    assert len(points_mm) == np.isfinite(depth_mm).sum()
+    # The camera looks down from 160 mm: a depth of d is a height of 160 - d.
+    assert np.sort(points_mm[:, 2]) == pytest.approx(
+        np.sort(160 - depth_mm[np.isfinite(depth_mm)]), abs=1e-3
+    )
+    slow = Cell(HUMBLE, 0.01)
+    assert "observed" in sent(update, slow)
+    assert "observed" not in sent(update, slow)
+    assert sent(virtual(), slow)["observed"].width == 0
+
+
+def test_without_arms_nothing_of_them_is_announced():
+    topics = {out.suffix for out in messages_of(working(), HUMBLE, PARTS)}
+    assert not topics & {"workcell", "joint_states", "observed"}
+
+
+@pytest.mark.parametrize("messages", [HUMBLE, NOETIC])
+@pytest.mark.parametrize("update", [working(), virtual(), less(virtual(), *NAMES, "cut/1")])
+def test_bytes_are_those_of_plain_messages(messages, update):
+    stock = STOCK[messages]
+    for out in messages_of(update, messages, PARTS, True, Cell(messages, 0)):
+        raw, kind = messages.to_bytes(out.message), out.message_type
+        if messages is HUMBLE:
+            again = stock.serialize_cdr(stock.deserialize_cdr(raw, kind), kind)
+        else:
+            again = stock.serialize_ros1(stock.deserialize_ros1(raw, kind), kind)
+        assert bytes(again) == bytes(raw), out.suffix
+
+
+# Recordings
+
+
+def record(path: Path, updates: list[Update], **options) -> Path:
+    sink = RecordTo(path=path, **options).open(with_arms())
+    for update in updates:
+        sink.publish(update)
+    sink.close()
+    return path
+
+
+def played(path: Path) -> list[Seen]:
+    source, got = Recording(path=path, rate=0).open(), []
+    try:
+        while True:
+            if seen := source.read(0.2):
+                got.append(seen)
+    except SourceEnded:
+        return got
+    finally:
+        source.close()
+
+
+def three() -> list[Update]:
+    """With an estimate, without one, and without a camera's picture."""
+    frames = [frame_number(n) for n in (0, 1)]
+    seen = [Seen(frame, frame.stamp_ns) for frame in frames]
+    one = replace(working(0, 0.1), seen=seen[0], stamp_ns=frames[0].stamp_ns)
+    two = replace(virtual(1, 0.2, "stale"), seen=seen[1], stamp_ns=frames[1].stamp_ns)
+    return [one, two, less(virtual(2, 0.3), "table")]
+
+
+def test_an_mcap_holds_the_arms_and_plays_again(tmp_path):
+    path = record(tmp_path / "r", three(), meshes_hz=0)
+    with AnyReader([path]) as reader:
+        said: dict[str, list] = {}
+        for connection, _, raw in reader.messages():
+            message = reader.deserialize(raw, connection.msgtype)
+            said.setdefault(connection.topic, []).append(message)
+    joints = [m.position[0] for m in said["/tumortrack/joint_states"]]
+    assert joints == pytest.approx([0.02, 0.04, 0.06])
+    markers = [[m.ns for m in one.markers] for one in said["/tumortrack/workcell"]]
+    assert markers[0] == [*NAMES, "cut/1", "cut/2", "state"]
+    assert markers[2][0] == "table"  # its deletion
+    assert said["/tumortrack/workcell"][2].markers[0].action == 2
+    assert "/tumortrack/observed" not in said  # the picture itself is there
+    assert [seen.stamp_ns for seen in played(path)] == [u.stamp_ns for u in three()[:2]]
+
+
+def test_files_hold_the_arms_each_surface_once_and_play_again(tmp_path):
+    path = record(tmp_path / "r", three(), format="files")
+    frames = sorted((path / "frames").iterdir())
+    cells = [json.loads((frame / "workcell.json").read_text()) for frame in frames]
+    assert [(c["state"], c["halted"]) for c in cells] == [
+        ("sweep 1", ""), ("sweep 1", "stale"), ("sweep 1", ""),
+    ]  # fmt: skip
+    for cell, update in zip(cells, three(), strict=True):
+        true = update.workcell
+        assert true is not None
+        assert cell["joints_rad"] == true.joints_rad
+        assert list(cell["shapes"]) == [shape.name for shape in true.shapes]
+        for shape in true.shapes:
+            kept = cell["shapes"][shape.name]
+            np.testing.assert_array_equal(kept["published_from_shape"], shape.published_from_shape)
+            mesh = read_mesh(path / kept["surface"])
+            np.testing.assert_allclose(mesh.vertices_mm, shape.mesh.vertices_mm, atol=1e-4)
+            np.testing.assert_array_equal(mesh.faces, shape.mesh.faces)
+        np.testing.assert_array_equal(cell["lines"]["cut/1"]["points_mm"], true.lines[0].points_mm)
+    lengths = {shape.name: shape.mesh for update in three() for shape in update.workcell.shapes}
+    assert len(lengths) <= len(list((path / "shapes").iterdir())) <= len(lengths) + 4
+    assert [seen.stamp_ns for seen in played(path)] == [u.stamp_ns for u in three()[:2]]
+    record(path, three()[:1], format="files", overwrite=True)  # with its shapes, it is replaced
+
+
+# OpenIGTLink
+
+
+@pytest.fixture
+def slicer() -> Iterator:
+    """A sink and a receiver of it."""
+    used: list = []
+
+    def opened(setting: Setting, **options):
+        sink = OpenIgtLink(port=0, **options).open(setting)
+        receiver = socket.create_connection(("127.0.0.1", sink.port))
+        used.extend((receiver, sink))
+        while not sink.receivers:
+            time.sleep(0.002)
+        return sink, receiver
+
+    yield opened
+    for one in used:
+        one.close()
+
+
+def test_tips_and_the_arms_state_go_to_slicer(slicer):
+    sink, receiver = slicer(with_arms())
+    update = working(4, 0.25)
+    sink.publish(update)
+    heard = hear_all(receiver, 6 + 3)
+    assert unpack_status(heard["STATUS", "arms"].content) == Status(1, "sweep 1", "")
+    shapes = {shape.name: shape for shape in update.workcell.shapes}
+    for name in ("cutter/tip", "holder/tip"):
+        place = unpack_transform(heard["TRANSFORM", name].content)
+        x, y, z = shapes[name].published_from_shape[:3, 3]
+        np.testing.assert_allclose(place[:3, 3], [-x, -y, z], atol=1e-4)  # RAS
+        assert heard["TRANSFORM", name].metadata["frame_id"] == "table"
+    sink.publish(less(virtual(5, halted="it is hidden"), "cutter/tip"))
+    heard = hear_all(receiver, 6 + 3)
+    assert unpack_status(heard["STATUS", "tumortrack"].content).text == REASON
+    assert unpack_status(heard["STATUS", "arms"].content) == Status(13, "sweep 1", "it is hidden")
+    states = {n: heard["TRANSFORM", n].metadata["TransformStatus"] for n in shapes if "tip" in n}
+    assert states == {"cutter/tip": "MISSING", "holder/tip": "OK"}
+    sink.close()
+    heard = hear_all(receiver, 6 + 3)
+    assert unpack_status(heard["STATUS", "arms"].content).code == 16
+    assert heard["TRANSFORM", "holder/tip"].metadata["TransformStatus"] == "MISSING"
+
+
+def test_without_arms_slicer_hears_nothing_of_them(slicer):
+    sink, receiver = slicer(small_setting())
+    sink.publish(working())
+    sink.close()
+    heard = hear_all(receiver, 6)
+    with pytest.raises((EOFError, ConnectionError)):
+        heard |= hear_all(receiver, 100)
+    assert not [device for _, device in heard if device == "arms" or "tip" in device]
+
+
+# A real arm, whose controller is made up: it notes what it is told, and when.
+
+
+class FakeArm:
+    """One controller behind both of ur_rtde's interfaces."""
+
+    def __init__(self) -> None:
+        self.told: list[tuple] = []
+        self.opened: list[str] = []
+        self.actual = list(angles(0.0))
+        self.running, self.protective, self.fails = True, False, ""
+        self.kicks = 0
+
+    def modules(self) -> dict[str, ModuleType]:
+        arm = self
+
+        class RTDEControlInterface:
+            def __init__(self, hostname: str) -> None:
+                if arm.fails == "connect":
+                    raise RuntimeError("Could not connect to: 10.0.0.9 at 30004, verify the IP")
+                arm.opened.append(f"control {hostname}")
+
+            def setWatchdog(self, min_frequency: float) -> bool:  # noqa: N802
+                arm.told.append(("watchdog", min_frequency))
+                return True
+
+            def kickWatchdog(self) -> bool:  # noqa: N802
+                arm.kicks += 1
+                return True
+
+            def isProgramRunning(self) -> bool:  # noqa: N802
+                return arm.running
+
+            def servoJ(self, q, speed, acceleration, time, lookahead_time, gain) -> bool:  # noqa: N802
+                if arm.fails == "servo":
+                    raise RuntimeError("connection lost")
+                arm.told.append(("servo", q, time, lookahead_time, gain))
+                return arm.fails != "refuse"
+
+            def servoStop(self, a: float = 10.0) -> bool:  # noqa: N802
+                arm.told.append(("stop", a))
+                return True
+
+            def stopScript(self) -> None:  # noqa: N802
+                arm.told.append(("script ends",))
+
+            def disconnect(self) -> None:
+                arm.told.append(("bye",))
+
+        class RTDEReceiveInterface:
+            def __init__(self, hostname: str) -> None:
+                arm.opened.append(f"receive {hostname}")
+
+            def getActualQ(self) -> list[float]:  # noqa: N802
+                return arm.actual
+
+            def isEmergencyStopped(self) -> bool:  # noqa: N802
+                return False
+
+            def isProtectiveStopped(self) -> bool:  # noqa: N802
+                return arm.protective
+
+            def disconnect(self) -> None:
+                pass
+
+        control, receive = ModuleType("rtde_control"), ModuleType("rtde_receive")
+        control.RTDEControlInterface = RTDEControlInterface  # type: ignore[attr-defined]
+        receive.RTDEReceiveInterface = RTDEReceiveInterface  # type: ignore[attr-defined]
+        return {"rtde_control": control, "rtde_receive": receive}
+
+    def what(self) -> list[str]:
+        return [one[0] for one in self.told if one[0] != "watchdog"]
+
+
+def angles(progress: float) -> list[float]:
+    cell = workcell(progress)
+    return [cell.joints_rad[f"cutter_{joint}"] for joint in UR_JOINTS]
+
+
+@pytest.fixture
+def arm(monkeypatch) -> FakeArm:
+    fake = FakeArm()
+    for name, module in fake.modules().items():
+        monkeypatch.setitem(sys.modules, name, module)
+    return fake
+
+
+@pytest.fixture
+def moving(arm, monkeypatch) -> Iterator:
+    """Opens sinks that execute, and closes them. On a loaded machine a test may pause for long."""
+    used: list[UrSink] = []
+
+    def opened(silent_s: float = 20.0, **options) -> UrSink:
+        monkeypatch.setattr("tumortrack.live.sinks.ur.SILENT_S", silent_s)
+        used.append(Ur(host="10.0.0.9", execute=True, **options).open(with_arms()))
+        return used[-1]
+
+    yield opened
+    arm.fails = ""
+    for sink in used:
+        sink.close()
+        sink.close()
+
+
+def test_by_default_nothing_is_connected_and_targets_are_counted(arm):
+    config = parse_spec("ur:10.0.0.9?arm=holder", SINKS, "sink")
+    assert config == Ur(host="10.0.0.9", arm="holder", execute=False)
+    sink = config.open(with_arms())
+    for n in range(5):
+        sink.publish(working(n, n * 0.01))
+    sink.publish(working(5, 0.05, halted="the tumor moved"))
+    sink.publish(small_update(6))
+    sink.close()
+    assert sink.counts == {"would send": 5, "halted": 1, "no arms": 1}
+    assert arm.opened == arm.told == []
+
+
+def test_an_outlet_reports_the_counts():
+    outlet = Outlet("ur", Ur(host="10.0.0.9").open(with_arms()), 5)
+    for n in range(3):
+        outlet.put(working(n, n * 0.01))
+    outlet.close()
+    assert outlet.summary()["counts"] == {"would send": 3}
+
+
+@pytest.mark.parametrize(
+    ("joints", "words"),
+    [
+        ({"cutter_elbow_joint": 6.3}, r"elbow_joint at 361\.0 degrees; allowed: 360"),
+        ({"cutter_elbow_joint": float("nan")}, "elbow_joint at nan"),
+        ({"cutter_wrist_3_joint": None}, "there is no joint cutter_wrist_3_joint"),
+        ({"cutter_wrist_1_joint": 0.3 + 0.12}, r"wrist_1_joint jumps by 6\.9 degrees; allowed: 5"),
+        ({"cutter_shoulder_pan_joint": 0.08}, r"shoulder_pan_joint would turn at 139 .*: 120"),
+    ],
+)
+def test_targets_that_an_arm_must_not_follow_are_refused(joints, words):
+    sink = Ur(host="10.0.0.9").open(with_arms())
+    sink.publish(working(0))
+    update = working(1)
+    assert update.workcell is not None
+    changed = {k: v for k, v in (update.workcell.joints_rad | joints).items() if v is not None}
+    with pytest.raises(TumortrackError, match=words):
+        sink.publish(replace(update, workcell=replace(update.workcell, joints_rad=changed)))
+    assert sink.counts == {"would send": 1, "refused": 1}
+
+
+def test_an_arm_follows_the_targets_and_is_stopped_at_the_end(arm, moving):
+    sink = moving(gain=400.0)
+    assert arm.opened == ["receive 10.0.0.9", "control 10.0.0.9"]
+    assert arm.told == [("watchdog", 5.0)]
+    for n in range(4):
+        sink.publish(working(n, n * 0.02))
+        time.sleep(0.01)
+    sink.close()
+    assert arm.what() == ["servo"] * 4 + ["stop", "script ends", "bye"]
+    for n, (_, q, follow_s, lookahead_s, gain) in enumerate(arm.told[1:5]):
+        assert q == pytest.approx(angles(n * 0.02))
+        assert (lookahead_s, gain) == (0.1, 400.0)
+        assert (follow_s == 0.1) if n == 0 else (0.032 < follow_s <= 0.1)
+    assert sink.counts == {"sent": 4}
+    assert arm.kicks > 0
+
+
+def test_an_arm_elsewhere_is_not_moved(arm, moving):
+    sink = moving()
+    arm.actual[2] += np.radians(2.5)
+    with pytest.raises(TumortrackError, match=r"elbow_joint is 2\.5 degrees from the plan"):
+        sink.publish(working(0))
+    assert arm.what() == []
+    arm.actual[2] -= np.radians(1.0)
+    sink.publish(working(1))
+    assert arm.what() == ["servo"]
+
+
+@pytest.mark.parametrize("why", ["halted", "no arms", "jump"])
+def test_an_arm_is_stopped_and_begins_again_only_where_it_stands(arm, moving, why):
+    sink = moving()
+    sink.publish(working(0))
+    sink.publish(working(1, 0.01))
+    if why == "jump":
+        with pytest.raises(TumortrackError, match="jumps by"):
+            sink.publish(working(2, 0.99))
+    else:
+        sink.publish(working(2, 0.01, "hidden") if why == "halted" else small_update(2))
+    assert arm.what() == ["servo", "servo", "stop"]
+    with pytest.raises(TumortrackError, match="from the plan"):  # it went on without the arm
+        sink.publish(working(3, 0.5))
+    assert arm.what() == ["servo", "servo", "stop"]
+    arm.actual = angles(0.5)
+    sink.publish(working(4, 0.5))
+    assert arm.what() == ["servo", "servo", "stop", "servo"]
+
+
+def test_silence_stops_an_arm(arm, moving):
+    sink = moving(SILENT_S)
+    sink.publish(working(0))
+    start_s = time.monotonic()
+    while "stop" not in arm.what():
+        assert time.monotonic() - start_s < 2
+        time.sleep(0.005)
+    assert 0.15 < time.monotonic() - start_s < 0.6
+    kicks = arm.kicks
+    time.sleep(0.1)
+    assert arm.kicks > kicks  # the program itself is well
+    assert arm.what() == ["servo", "stop"]
+    assert sink.counts == {"sent": 1, "silences": 1}
+
+
+def test_an_arm_in_a_protective_stop_is_said(arm, moving):
+    sink = moving()
+    sink.publish(working(0))
+    arm.protective = True
+    with pytest.raises(TumortrackError, match="protective stop"):
+        sink.publish(working(1, 0.01))
+    assert arm.what() == ["servo", "stop"]
+    arm.protective, arm.running = False, False
+    with pytest.raises(TumortrackError, match="no program"):
+        sink.publish(working(2, 0.01))
+
+
+@pytest.mark.parametrize("why", ["refused", "fault", "halted"])
+def test_an_arm_that_gives_up_stops_all_arms_for_good(arm, monkeypatch, why):
+    monkeypatch.setattr("tumortrack.live.sinks.ur.SILENT_S", 20.0)
+    setting = with_arms()
+    sink = Ur(host="10.0.0.9", execute=True).open(setting)
+    sink.publish(working(0))
+    if why == "halted":  # as planned: no reason to give up
+        sink.publish(working(1, 0.01, "hidden"))
+    else:
+        arm.fails = "servo" if why == "fault" else ""
+        with pytest.raises(TumortrackError):
+            sink.publish(working(1, 0.01 if why == "fault" else 0.99))
+    arm.fails = ""
+    sink.close()
+    assert setting.controls.aborted.is_set() == (why != "halted")
+    dry = with_arms()
+    checked = Ur(host="10.0.0.9").open(dry)
+    checked.publish(working(0))
+    with pytest.raises(TumortrackError, match="jumps by"):
+        checked.publish(working(1, 0.99))
+    assert not dry.controls.aborted.is_set()  # nothing moved: nothing to stop
+
+
+def test_a_broken_link_is_left_to_the_controllers_watchdog(arm, moving):
+    sink = moving()
+    sink.publish(working(0))
+    arm.fails = "servo"
+    for n in (1, 2):
+        with pytest.raises(TumortrackError, match=r"10\.0\.0\.9 is lost \(connection lost\)"):
+            sink.publish(working(n, 0.01))
+    time.sleep(0.06)
+    kicks = arm.kicks
+    time.sleep(0.1)
+    assert arm.kicks == kicks
+    assert arm.what() == ["servo"]
+
+
+def test_what_cannot_work_is_refused(arm, monkeypatch):
+    with pytest.raises(InputError, match="nothing here moves an arm"):
+        Ur(host="10.0.0.9").open(small_setting())
+    for bad in ({"gain": 10.0}, {"lookahead_s": 1.0}, {"jump_deg": float("nan")}):
+        with pytest.raises(InputError, match=next(iter(bad))):
+            Ur(host="10.0.0.9", **bad)
+    arm.fails = "connect"
+    with pytest.raises(InputError, match=r"arm at 10\.0\.0\.9 cannot be controlled"):
+        Ur(host="10.0.0.9", execute=True).open(with_arms())
+    monkeypatch.setitem(sys.modules, "rtde_control", None)
+    with pytest.raises(InputError, match=r"tumortrack\[ur\]"):
+        Ur(host="10.0.0.9", execute=True).open(with_arms())
+    assert arm.told == []

@@ -1,0 +1,235 @@
+"""Fast arithmetic against the network in single precision, and what `tumortrack compile` keeps."""
+
+import json
+import shutil
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from tumortrack.cli.compiling import compile_model
+from tumortrack.cli.inspection import describe
+from tumortrack.core.config import to_builtins
+from tumortrack.occupancy.compiled import Arithmetic, find, place_of, read, save, this_machine
+from tumortrack.occupancy.compiled import describe as describe_compiled
+from tumortrack.occupancy.compiling import like_an_organ, measured, reference
+from tumortrack.occupancy.inference import Inference, possible, usual
+from tumortrack.occupancy.locator import OccupancyLocator
+from tumortrack.occupancy.mlp_decoder import MlpDecoderConfig
+from tumortrack.occupancy.network import (
+    CloudBox,
+    NetworkConfig,
+    OccupancyNetwork,
+    paper_network,
+    quick_network,
+)
+from tumortrack.occupancy.packed import can_pack
+from tumortrack.occupancy.quantized import QuantizedDecoder, gap, shift
+from tumortrack.training.model import load_model
+
+CPU = torch.device("cpu")
+QUERIES = 6000  # enough for 8 bits, and no whole number of chunks
+STEPS = 150
+
+
+def wide() -> NetworkConfig:
+    """The paper's kind, smaller: skip, norms, raw coordinates."""
+    decoder = MlpDecoderConfig(
+        n_classes=3, width=128, hidden_layers=5, skip_layer=3, norm_layers=(3, 5)
+    )
+    slim = quick_network(3, 50.0)
+    return NetworkConfig(encoder=slim.encoder, decoder=decoder, normalisation=CloudBox())
+
+
+def label_of(points: Tensor) -> Tensor:
+    """An ellipsoid with a ball in it, camera frame, mm."""
+    axes = torch.tensor([50.0, 30.0, 25.0])
+    middle = torch.tensor([0.0, 0.0, 130.0])
+    organ = ((points - middle) / axes).norm(dim=-1) < 1
+    tumor = (points - middle - torch.tensor([20.0, 5.0, 0.0])).norm(dim=-1) < 18
+    return torch.where(tumor, 2, organ.long())
+
+
+@dataclass(frozen=True, eq=False)
+class Learnt:
+    """A network that knows one cloud's organ, and what to ask it."""
+
+    network: OccupancyNetwork
+    cloud: np.ndarray
+    queries: np.ndarray
+
+
+def learnt(config: NetworkConfig) -> Learnt:
+    torch.manual_seed(0)
+    rng = np.random.default_rng(0)
+    cloud = like_an_organ(50.0, rng)
+    lower, upper = cloud.min(0) - 10, cloud.max(0) + 40
+    queries = rng.uniform(lower, upper, (QUERIES, 3)).astype(np.float32)
+    out = config.build().eval()
+    with torch.no_grad():
+        latent = out.encode(torch.from_numpy(cloud)[None])
+    out.decoder.train()
+    optimizer = torch.optim.Adam(out.decoder.parameters(), 1e-3)
+    for step in range(STEPS):
+        optimizer.param_groups[0]["lr"] = 2e-3 * (1 - step / STEPS)  # norms settle
+        points = torch.from_numpy(rng.uniform(lower, upper, (1, 512, 3)).astype(np.float32))
+        terms = out.decoder.prepare(latent.vector)
+        logits = out.query(replace(latent, terms=terms), points)
+        optimizer.zero_grad()
+        torch.nn.functional.cross_entropy(logits[0], label_of(points[0])).backward()
+        optimizer.step()
+    return Learnt(out.eval(), cloud, queries)
+
+
+@pytest.fixture(scope="module", params=["wide", "quick"])
+def known(request) -> Learnt:
+    return learnt(wide() if request.param == "wide" else quick_network(3, 50.0))
+
+
+@pytest.mark.parametrize("numbers", possible(CPU))
+def test_fast_arithmetic_gives_the_labels_of_single_precision(numbers, known):
+    inference = Inference(known.network, Arithmetic(numbers=numbers, chunk=1024))
+    latent = inference.encode(known.cloud)
+    right = reference(inference.network, latent, known.queries)
+    assert right.argmax(1).bincount()[:2].min() > 50
+    answer = inference.logits(latent, known.queries)
+    assert answer.dtype == torch.float32
+    equal = (answer.argmax(1) == right.argmax(1)).double().mean()
+    assert equal >= (0.9995 if numbers == "int8" else 0.99)
+    near = 0.08 * float(right.std())
+    assert (answer - right).square().mean().sqrt() < near
+    few = inference.logits(latent, known.queries[:7])
+    torch.testing.assert_close(few, right[:7], atol=3 * near, rtol=0)
+
+
+@pytest.mark.skipif(not can_pack(CPU), reason="oneDNN's layers do not exist here")
+def test_folding_and_splitting_change_nothing_but_rounding(known):
+    inference = Inference(known.network, Arithmetic(numbers="float32", chunk=1000))
+    with torch.inference_mode():
+        cloud, queries = (torch.from_numpy(v)[None] for v in (known.cloud, known.queries))
+        whole = known.network(cloud, queries)[0]
+        latent = inference.network.encode(cloud)
+    torch.testing.assert_close(inference.logits(latent, known.queries), whole, atol=1e-3, rtol=1e-4)
+
+
+@pytest.mark.skipif("int8" not in possible(CPU), reason="this processor has no 8-bit products")
+def test_what_8_bits_may_get_wrong_is_asked_again(known):
+    """Alone they change labels, where the lead is within the error; of those none is left."""
+    inference = Inference(known.network, Arithmetic(numbers="int8", chunk=2048))
+    decode = inference._decode
+    assert isinstance(decode, QuantizedDecoder)
+    latent = inference.encode(known.cloud)
+    right = reference(inference.network, latent, known.queries)
+    with torch.inference_mode():
+        features = decode.packed.features(latent, torch.from_numpy(known.queries)[None])
+        peaks: list[float] = []
+        decode.exact.logits(decode.exact.terms(latent), features, peaks)
+        alone = decode.logits(latent, features, [peak / 255 for peak in peaks])
+    wrong = alone.argmax(1) != right.argmax(1)
+    assert wrong.any()
+    assert gap(alone)[wrong].max() <= shift(right, alone).max()
+    answer = inference.logits(latent, known.queries)
+    assert (answer.argmax(1) != right.argmax(1)).sum() <= max(1, 0.1 * wrong.sum())
+
+
+def test_usual_arithmetic_is_one_that_the_processor_has():
+    wide, slim = (config.build() for config in (paper_network(3), quick_network(3, 50.0)))
+    assert usual(wide, CPU).numbers == possible(CPU)[-1]
+    assert usual(slim, CPU).numbers in possible(CPU)
+    assert usual(slim, CPU).numbers != "int8"
+
+
+def test_compiled_is_found_again_and_not_where_anything_differs(quick_model, tmp_path):
+    folder = tmp_path / "model"
+    folder.mkdir()
+    arithmetic, notice = find(folder, "weights")
+    assert arithmetic is None
+    assert "tumortrack compile" in notice
+    compiled = measured(load_model(quick_model, "cpu"), "weights", rounds=1)
+    assert {timing.arithmetic.numbers for timing in compiled.timings} == set(possible(CPU))
+    assert all(timing.labels_equal > 0.99 for timing in compiled.timings)
+    path = save(folder, compiled)
+    assert read(path) == compiled
+    assert find(folder, "weights") == (compiled.arithmetic, None)
+    for change in ("weights", "machine", "threads", "damaged", "chunk", "schema"):
+        arithmetic, notice = find(changed(folder, tmp_path / change, change), "weights")
+        assert arithmetic is None
+        assert "tumortrack compile" in notice
+
+
+def changed(folder: Path, copy: Path, what: str) -> Path:
+    """A copy of the folder whose compiled file is not for here, or not whole."""
+    (copy / "compiled").mkdir(parents=True)
+    place = this_machine(), torch.get_num_threads()
+    path = place_of(copy, *place)
+    content = json.loads(place_of(folder, *place).read_text())
+    if what == "weights":
+        content["weights_sha256"] = "others"
+    elif what == "machine":
+        content["machine"]["torch"] = "1.0"
+    elif what == "threads":
+        content["threads"] += 1
+    elif what == "chunk":
+        content["arithmetic"]["chunk"] = 10**9
+    elif what == "schema":
+        content["schema"] = 0
+    path.write_text("{" if what == "damaged" else json.dumps(content))
+    return copy
+
+
+def test_each_number_of_threads_has_its_own_choice(quick_model, tmp_path, monkeypatch):
+    """What is fastest on one core need not be on two."""
+    alone = measured(load_model(quick_model, "cpu"), "weights", rounds=1)
+    many = msgspec.structs.replace(
+        alone, threads=alone.threads + 1, arithmetic=other_than(alone.arithmetic)
+    )
+    save(tmp_path, many)
+    arithmetic, notice = find(tmp_path, "weights")
+    assert arithmetic is None
+    assert f"threads ({alone.threads} here); the usual arithmetic is used" in notice
+    save(tmp_path, alone)
+    assert find(tmp_path, "weights") == (alone.arithmetic, None)
+    lines = describe_compiled(tmp_path)
+    assert len(lines) == 2
+    for one in (alone, many):
+        (line,) = [line for line in lines if f"for {one.threads} thread" in line]
+        assert f": {one.arithmetic.numbers}, {one.arithmetic.chunk} queries" in line
+        assert line.endswith("(this machine)")
+    monkeypatch.setattr(torch, "get_num_threads", lambda: many.threads)
+    assert find(tmp_path, "weights") == (many.arithmetic, None)
+
+
+def other_than(arithmetic: Arithmetic) -> Arithmetic:
+    return Arithmetic(numbers=arithmetic.numbers, chunk=arithmetic.chunk // 2)
+
+
+def test_arithmetic_is_read_as_written():
+    one = Arithmetic(numbers="int8", chunk=2048)
+    assert to_builtins(one) == {"numbers": "int8", "chunk": 2048}
+
+
+def test_compile_is_used_by_the_next_load_and_named_by_inspect(quick_model, tmp_path, capsys):
+    folder = shutil.copytree(quick_model, tmp_path / "model")
+    before = load_model(folder, "cpu")
+    assert before.arithmetic is None
+    assert "tumortrack compile" in before.notes[0]
+    compile_model(folder, "cpu")
+    said = capsys.readouterr().out
+    assert all(numbers in said for numbers in possible(CPU))
+    after = load_model(folder, "cpu")
+    assert after.notes == ()
+    assert after.arithmetic is not None
+    assert after.arithmetic.numbers in said
+    assert any("this machine" in line for line in describe(folder))
+    assert OccupancyLocator(after)._inference.arithmetic == after.arithmetic
+
+
+def test_there_is_nothing_to_choose_for_a_model_that_places_the_organ(clinic_model, capsys):
+    compile_model(clinic_model, "cpu")
+    assert "nothing to choose" in capsys.readouterr().out
+    assert not (clinic_model / "compiled").exists()
+    assert load_model(clinic_model, "cpu").notes == ()

@@ -1,0 +1,232 @@
+"""A warp model at work: trained for seconds, saved, asked, refused, questioned about points."""
+
+from __future__ import annotations
+
+import csv
+import json
+
+import numpy as np
+import pytest
+import trimesh
+from scipy.spatial.transform import Rotation
+
+from elastic_objects import CENTER, UP
+from stories import succeeded, tumortrack
+from tumortrack.core.errors import InputError, NoEstimate
+from tumortrack.core.motion import Motion
+from tumortrack.core.types import SensorCloud
+from tumortrack.sense.files import write_cloud_ply
+from tumortrack.simulate.bodies import body_for
+from tumortrack.simulate.occupancy import labels_of, surface_distance
+from tumortrack.simulate.scene import SceneRecipe, Simulator
+from tumortrack.simulate.targets import draw_targets
+from tumortrack.tracking.tracker import Tracker
+from tumortrack.training.model import load_model, save_model
+from warp_objects import ANATOMY, shape, slim_clinic
+
+
+@pytest.fixture(scope="module")
+def model(slim_model):
+    return load_model(slim_model, "cpu")
+
+
+@pytest.fixture(scope="module")
+def tracker(model):
+    return Tracker(model)
+
+
+@pytest.fixture(scope="module")
+def stages():
+    """Scenes that training never showed, of a body with other states."""
+    config = slim_clinic().scene
+    simulator = Simulator(ANATOMY, UP, config, body_for(ANATOMY, UP, config, 77))
+    return [simulator.stage(SceneRecipe(5, "test", index)) for index in range(8)]
+
+
+@pytest.fixture(scope="module")
+def estimate(tracker, stages):
+    return tracker.locate(stages[0].cloud, grid=48, seed=3)
+
+
+def test_points_inside_are_found_within_millimetres(tracker, stages):
+    targets = draw_targets(ANATOMY, 0).points_ct
+    errors, rigid_errors = [], []
+    for stage in stages:
+        motion = tracker.locate(stage.cloud, grid=16).motion
+        truth = stage.carry(targets)
+        errors.append(np.linalg.norm(motion.carry(targets) - truth, axis=1).mean())
+        middle = truth - truth.mean(0) + stage.cloud.points_mm.mean(0)
+        rigid_errors.append(np.linalg.norm(middle - truth, axis=1).mean())
+    assert np.median(rigid_errors) > 15  # the cloud's middle is no answer
+    assert np.median(errors) < 3.5
+    assert "validation_tre_mm" in tracker.model.provenance
+
+
+def test_the_same_cloud_and_seed_give_the_same_estimate(tracker, stages, estimate):
+    again = tracker.locate(stages[0].cloud, grid=48, seed=3)
+    np.testing.assert_array_equal(again.cloud.points_mm, estimate.cloud.points_mm)
+    np.testing.assert_array_equal(again.cloud.probability, estimate.cloud.probability)
+    np.testing.assert_array_equal(again.volume.labels, estimate.volume.labels)
+    other = tracker.locate(stages[0].cloud, grid=48, seed=4)
+    assert not np.array_equal(
+        other.cloud.points_mm[:100], estimate.cloud.points_mm[:100]
+    )  # points are drawn anew
+    with pytest.raises(InputError, match="seed is -1"):
+        tracker.locate(stages[0].cloud, seed=-1)
+
+
+def test_a_loaded_model_says_the_same_bit_for_bit(model, stages, tmp_path, estimate):
+    (tmp_path / "again").mkdir()
+    save_model(model, tmp_path / "again")
+    again = load_model(tmp_path / "again", "cpu")
+    assert again.trust == model.trust
+    assert again.familiar == model.familiar
+    found = Tracker(again).locate(stages[0].cloud, grid=48, seed=3)
+    np.testing.assert_array_equal(found.cloud.points_mm, estimate.cloud.points_mm)
+    np.testing.assert_array_equal(found.cloud.probability, estimate.cloud.probability)
+    for name, mesh in estimate.meshes.items():
+        np.testing.assert_array_equal(found.meshes[name].vertices_mm, mesh.vertices_mm)
+
+
+def test_meshes_are_the_cts_carried_along(estimate):
+    assert isinstance(estimate.motion, Motion)
+    for name, part in zip(ANATOMY.names, ANATOMY.parts, strict=True):
+        mesh = estimate.meshes[name]
+        np.testing.assert_array_equal(mesh.vertices_mm, estimate.motion.carry(part.vertices_mm))
+        np.testing.assert_array_equal(mesh.faces, part.faces)
+        np.testing.assert_allclose(
+            estimate.motion.back(mesh.vertices_mm), part.vertices_mm, atol=0.05
+        )
+        told = estimate.report["parts"][name]
+        assert told["volume_ml"] == pytest.approx(part.volume_mm3 / 1000, rel=0.15)
+        assert 0 < told["center_std_mm"] < 30
+
+
+def test_labels_of_points_and_voxels_agree_with_the_meshes(estimate):
+    from tumortrack.core.types import Anatomy
+
+    moved = Anatomy(tuple(estimate.meshes[name] for name in ANATOMY.names))
+    cloud = estimate.cloud
+    points = cloud.points_mm.astype(float)
+    clear = np.min([surface_distance(part, points) for part in moved.parts], axis=0) > 0.7
+    assert clear.mean() > 0.7
+    np.testing.assert_array_equal(cloud.labels[clear], labels_of(moved, points[clear]))
+    index = np.argwhere(estimate.volume.labels >= 0)
+    affine = estimate.volume.camera_from_index
+    places = index @ affine[:3, :3].T + affine[:3, 3]
+    rows = np.random.default_rng(0).permutation(len(index))[:3000]
+    truth = labels_of(moved, places[rows])
+    given = estimate.volume.labels.reshape(-1)[rows]
+    assert (truth == given).mean() > 0.999
+    assert len(cloud.points_mm) == pytest.approx(
+        40_000 * ANATOMY.organ.volume_mm3 / np.prod(np.ptp(moved.organ.box_mm, axis=0)), rel=0.15
+    )
+
+
+def test_probabilities_are_higher_away_from_surfaces(estimate):
+    probability = estimate.cloud.probability
+    assert probability.min() >= 0.5
+    assert probability.max() <= 1
+    points_ct = estimate.motion.back(estimate.cloud.points_mm).astype(np.float32)
+    _, margin_mm = shape().labels_at(points_ct)
+    near, deep = (probability[side].mean() for side in (margin_mm < 0.5, margin_mm > 6))
+    assert deep > near + 0.1
+
+
+def test_distance_and_turns_of_the_camera_change_only_the_place(tracker, stages, estimate):
+    turn = Rotation.from_euler("z", 70, degrees=True).as_matrix()
+    away = stages[0].cloud.points_mm @ turn.T + [5, -8, 60]
+    moved = tracker.locate(SensorCloud(away.astype(np.float32)), grid=16, seed=3)
+    targets = draw_targets(ANATOMY, 0).points_ct
+    expected = estimate.motion.carry(targets) @ turn.T + [5, -8, 60]
+    assert np.linalg.norm(moved.motion.carry(targets) - expected, axis=1).mean() < 0.5
+
+
+def random_points(low, high):
+    return np.random.default_rng(0).uniform(low, high, (2000, 3))
+
+
+def ball(radius_mm):
+    """The side of a ball that a camera sees."""
+    points = trimesh.creation.icosphere(4, radius_mm).vertices
+    return points[points[:, 2] < 0] + [0, 0, 160]
+
+
+NO_ORGANS = {
+    "one point": np.full((300, 3), [0.0, 0, 140]),
+    "large table": random_points([-100, -100, 149.5], [100, 100, 150.5]),
+    "table": random_points([-50, -50, 149.5], [50, 50, 150.5]),
+    "small table": random_points([-35, -35, 149.5], [35, 35, 150.5]),
+    "strip": random_points([-45, -25, 149.5], [45, 25, 150.5]),
+    "cube": random_points([-40, -40, 110], [40, 40, 190]),
+    "small cube": random_points([-8, -8, 130], [8, 8, 146]),
+    "organ-sized cube": random_points([-28, -28, 130], [28, 28, 186]),
+    "ball": ball(60),
+    "round ball": ball(45),
+    "small ball": ball(12),
+}
+
+
+@pytest.mark.parametrize("name", NO_ORGANS)
+def test_what_is_no_organ_is_refused(tracker, name):
+    with pytest.raises(NoEstimate):
+        tracker.locate(SensorCloud(NO_ORGANS[name].astype(np.float32)), grid=16)
+
+
+def test_metres_are_refused(tracker, stages):
+    with pytest.raises(InputError, match="--unit m"):
+        tracker.locate(SensorCloud(stages[0].cloud.points_mm / 1000))
+
+
+def test_the_command_says_where_points_of_the_ct_are(slim_model, stages, estimate, tmp_path):
+    write_cloud_ply(tmp_path / "cloud.ply", stages[0].cloud.points_mm)
+    points = np.round(CENTER + np.array([[0, -8, 20.0], [10, 5, -30], [0, 0, 44]]), 3)
+    lines = [f"p{n},{','.join(map(str, p))}" for n, p in enumerate(points)]
+    (tmp_path / "asked.csv").write_text("\n".join(["name,x,y,z", *lines, ""]))
+    out = tmp_path / "out"
+    command = ["locate", slim_model, tmp_path / "cloud.ply", out, "--grid", 48, "--seed", 3]
+    said = succeeded(tumortrack(*command, "--map", tmp_path / "asked.csv", "--device", "cpu"))
+    assert "3 points of the CT" in said
+    rows = list(csv.DictReader((out / "points.csv").open()))
+    assert [row["name"] for row in rows] == ["p0", "p1", "p2"]
+    places = np.array([[float(row[f"camera_{axis}"]) for axis in "xyz"] for row in rows])
+    np.testing.assert_allclose(places, estimate.motion.carry(points), atol=0.02)
+    unsure = [float(row["std_mm"]) for row in rows]
+    np.testing.assert_allclose(unsure, estimate.motion.std_mm(points), rtol=0.02)
+    assert min(unsure) > 0
+    truth = stages[0].carry(points)
+    assert np.linalg.norm(places - truth, axis=1).mean() < 6
+    report = json.loads((out / "report.json").read_text())
+    assert report["map"]["points"] == 3
+    rigid = np.array(report["motion"]["camera_from_ct"])
+    np.testing.assert_allclose(rigid[:3, :3] @ rigid[:3, :3].T, np.eye(3), atol=1e-6)
+    again = succeeded(
+        tumortrack(*command, "--map", out / "points.csv", "--device", "cpu", "--overwrite")
+    )
+    assert "give way" in again
+    assert list(csv.DictReader((out / "points.csv").open())) == rows
+
+
+def test_clouds_of_an_organ_as_never_seen_are_answered(tracker, stages):
+    """Half of the surface hidden, and millimetres of noise: still the organ."""
+    cloud = stages[1].cloud.points_mm
+    half = cloud[cloud[:, 0] > np.median(cloud[:, 0])]
+    rng = np.random.default_rng(2)
+    for points in (half, cloud + rng.normal(0, 1.5, cloud.shape)):
+        found = tracker.locate(SensorCloud(points.astype(np.float32)), grid=16)
+        assert all(part["found"] for part in found.report["parts"].values())
+    certain = tracker.locate(SensorCloud(cloud), grid=16).motion.std_mm(ANATOMY.organ.vertices_mm)
+    part = tracker.locate(SensorCloud(half), grid=16).motion.std_mm(ANATOMY.organ.vertices_mm)
+    assert part.mean() > certain.mean()
+
+
+def test_a_model_without_its_shape_is_refused(slim_model, tmp_path):
+    import shutil
+
+    from tumortrack.core.errors import ArtifactError
+
+    broken = tmp_path / "broken"
+    shutil.copytree(slim_model, broken)
+    (broken / "shape.safetensors").unlink()
+    with pytest.raises(ArtifactError, match=r"shape\.safetensors"):
+        load_model(broken)

@@ -1,0 +1,319 @@
+"""The protocol, its pictures and its page, on synthetic ellipsoids."""
+
+import json
+import re
+
+import numpy as np
+import pytest
+import trimesh
+
+from tumortrack.core.errors import InputError, NoEstimate
+from tumortrack.core.estimate import Estimate
+from tumortrack.core.types import (
+    Anatomy,
+    CameraLabels,
+    LabelVolume,
+    Mesh,
+    OccupancyCloud,
+    SensorCloud,
+    Volume,
+)
+from tumortrack.report.drawing import section, section_mask
+from tumortrack.report.metrics import label_grid
+from tumortrack.report.page import thinned
+from tumortrack.report.pictures import FROM_CAMERA, FROM_SIDE
+from tumortrack.report.protocol import evaluate_scenes, summarise, summary_table
+from tumortrack.report.qc import PLANES, qc_picture, slice_volume
+from tumortrack.report.shade import Frame, Layer, View, frame_around, pixel_centres, shade
+from tumortrack.simulate.scene_folder import Scene, write_scene
+
+
+def ball(radius_mm, center_mm=(0.0, 0.0, 0.0), subdivisions=3):
+    solid = trimesh.creation.icosphere(subdivisions, radius_mm)
+    return Mesh(solid.vertices + np.array(center_mm), solid.faces)
+
+
+def anatomy(shift_mm=(0.0, 0.0, 0.0)):
+    middle = np.array(shift_mm) + np.array([0, 0, 130])
+    return Anatomy((ball(22, middle), ball(7, middle + np.array([6, 3, -2]))))
+
+
+def scene():
+    points = anatomy().organ.vertices_mm
+    return Scene(SensorCloud(points[points[:, 2] < 130]), anatomy())
+
+
+def estimate_of(parts, without=()):
+    camera_from_index = np.eye(4)
+    camera_from_index[:3, 3] = parts.organ.box_mm[0] - 2.5
+    labels = label_grid(parts, camera_from_index, (50, 50, 50))
+    for name in without:
+        labels[labels == parts.names.index(name) + 1] = 1
+    points = np.argwhere(labels) + camera_from_index[:3, 3]
+    return Estimate(
+        OccupancyCloud(points, labels[labels > 0], np.ones(len(points))),
+        CameraLabels(labels, camera_from_index),
+        {n: m for n, m in zip(parts.names, parts.parts, strict=True) if n not in without},
+        {"timings": {"encode": 0.002}},
+    )
+
+
+class Scripted:
+    """Answers one prepared estimate or error after another."""
+
+    def __init__(self, *answers):
+        self.answers = list(answers)
+
+    def __call__(self, cloud):
+        answer = self.answers.pop(0)
+        if isinstance(answer, Exception):
+            raise answer
+        return answer
+
+
+@pytest.fixture(scope="module")
+def evaluated(tmp_path_factory):
+    """Four scenes: shifted by 3 mm, by 1 mm, without the tumor, nothing at all."""
+    folder = tmp_path_factory.mktemp("evaluate")
+    for n in range(4):
+        write_scene(folder / "scenes" / f"scene_{n}", scene())
+    locate = Scripted(
+        estimate_of(anatomy((3, 0, 0))),
+        estimate_of(anatomy((0, 0, 1))),
+        estimate_of(anatomy(), without=("tumor_1",)),
+        NoEstimate("no <organ> in view"),
+    )
+    seen = []
+    report = evaluate_scenes(
+        locate, folder / "scenes", folder / "report", lambda *step: seen.append(step)
+    )
+    return folder / "report", report, seen
+
+
+def test_report_has_the_promised_layout(evaluated):
+    out, report, seen = evaluated
+    text = (out / "report.json").read_text()
+    assert json.loads(text, parse_constant=pytest.fail) == report
+    assert [s["name"] for s in report["scenes"]] == [f"scene_{n}" for n in range(4)]
+    assert seen == [(n + 1, 4, f"scene_{n}") for n in range(4)]
+    keys = {"hausdorff_mm", "hausdorff_one_sided_mm", "hausdorff_95_mm", "surface_mm",
+            "center_mm", "iou"}  # fmt: skip
+    assert keys <= report["summary"]["tumor_1"].keys()
+    assert keys <= report["summary"]["kidney"].keys()
+
+
+def test_known_shifts_give_known_distances(evaluated):
+    first, second = evaluated[1]["scenes"][:2]
+    for part in ("kidney", "tumor_1"):
+        assert first["parts"][part]["center_mm"] == pytest.approx(3, abs=1e-3)
+        assert first["parts"][part]["hausdorff_mm"] == pytest.approx(3, abs=0.05)
+        assert second["parts"][part]["hausdorff_mm"] == pytest.approx(1, abs=0.03)
+    ious = [first["parts"][part]["iou"] for part in ("kidney", "tumor_1")]
+    assert first["miou"] == pytest.approx(np.mean(ious))
+    assert first["failed"] is None
+    assert first["timings"] == {"encode": 0.002}
+
+
+def test_what_was_not_found_counts_as_failed(evaluated):
+    _, _, partly, nothing = evaluated[1]["scenes"]
+    assert partly["failed"] == "not found: tumor_1"
+    assert partly["parts"]["tumor_1"] == {"found": False, "iou": 0.0}
+    assert partly["parts"]["kidney"]["hausdorff_mm"] < 0.01
+    assert 0.4 < partly["miou"] < 0.5
+    assert nothing["failed"] == "no <organ> in view"
+    assert nothing["miou"] == 0
+    summary = evaluated[1]["summary"]
+    assert (summary["failed"], summary["scenes"]) == (2, 4)
+    assert (summary["kidney"]["found"], summary["tumor_1"]["found"]) == (3, 2)
+    # Sorted kidney distances: 0, 1, 3, infinite.
+    assert summary["kidney"]["hausdorff_mm"] == pytest.approx(2, abs=0.05)
+    # Tumor: 1, 3, infinite, infinite: half way to infinity is infinite.
+    assert summary["tumor_1"]["hausdorff_mm"] is None
+
+
+def test_a_part_that_is_missed_never_helps():
+    def entry(hausdorff_mm):
+        found = hausdorff_mm is not None
+        part = {"found": found, "iou": 0.5 if found else 0.0}
+        if found:
+            part |= dict.fromkeys(
+                ("hausdorff_mm", "hausdorff_one_sided_mm", "hausdorff_95_mm", "surface_mm",
+                 "center_mm"), hausdorff_mm)  # fmt: skip
+        return {"parts": {"tumor_1": part}, "miou": part["iou"],
+                "failed": None if found else "not found: tumor_1"}  # fmt: skip
+
+    full = summarise([entry(h) for h in (2.0, 4.0, 9.0)])
+    assert full["tumor_1"]["hausdorff_mm"] == 4.0
+    missed = summarise([entry(h) for h in (2.0, 4.0, None)])
+    assert missed["tumor_1"]["hausdorff_mm"] == 4.0  # dropping the scene would give 3
+    assert missed["failed"] == 1
+    worse = summarise([entry(h) for h in (2.0, None, None)])
+    assert worse["tumor_1"]["hausdorff_mm"] is None
+    assert worse["tumor_1"]["iou"] == 0.0
+
+
+def test_table_shows_every_part(evaluated):
+    from rich.console import Console
+
+    console = Console(width=120, record=True, file=open("/dev/null", "w"))  # noqa: SIM115
+    console.print(summary_table(evaluated[1]))
+    text = console.export_text()
+    assert "4 scenes, 2 failed" in text
+    assert re.search(r"kidney\D+3/4\D+2\.0", text)
+    assert re.search(r"tumor_1\D+2/4\s+│\s+none", text)
+
+
+def test_errors_that_are_ours_are_not_hidden(tmp_path):
+    write_scene(tmp_path / "scenes" / "a", scene())
+    with pytest.raises(ZeroDivisionError):
+        evaluate_scenes(Scripted(ZeroDivisionError()), tmp_path / "scenes", tmp_path / "out")
+    assert not (tmp_path / "out" / "report.json").exists()
+    with pytest.raises(InputError, match="holds no scenes"):
+        evaluate_scenes(Scripted(), tmp_path / "scenes" / "a", tmp_path / "out")
+
+
+def test_every_scene_has_a_readable_picture(evaluated):
+    from matplotlib.image import imread
+
+    for n in range(4):
+        picture = imread(evaluated[0] / "scenes" / f"scene_{n}.png")
+        assert picture.shape[0] > 600
+        assert picture.shape[1] > 1000
+        flat = picture[..., :3].reshape(-1, 3)
+        orange = (np.abs(flat - [0.9, 0.55, 0.0]) < 0.1).all(1).sum()
+        blue = (np.abs(flat - [0.0, 90 / 255, 160 / 255]) < 0.05).all(1).sum()
+        assert blue > 1000  # truth in every scene
+        assert (orange > 1000) == (n < 2)  # estimated tumors only where there are some
+
+
+def test_page_is_whole_and_fetches_nothing(evaluated):
+    page = (evaluated[0] / "index.html").read_text()
+    assert len(page) < 15e6
+    assert "research use only" in page
+    assert not re.search(r"<(script|img|link|iframe)[^>]*\s(src|href)\s*=\s*[\"'](?!data:)", page)
+    assert "connect-src 'none'" in page
+    assert "@" + "DATA@" not in page
+    start = page.index('<script id="data" type="application/json">') + 42
+    data = json.loads(page[start : page.index("</script>", start)])
+    assert [s["name"] for s in data] == [f"scene_{n}" for n in range(4)]
+    assert data[3]["note"].endswith("no &lt;organ&gt; in view")
+    kinds = [[layer["kind"] for layer in s["layers"]] for s in data]
+    assert kinds[0] == ["points", "mesh", "mesh", "truth", "wire"]
+    assert kinds[3] == ["points", "truth", "wire"]
+
+
+def test_thinned_meshes_keep_shape():
+    fine = ball(20, subdivisions=5)
+    coarse = thinned(fine, 2.5)
+    assert len(coarse.faces) < len(fine.faces) / 4
+    assert coarse.volume_mm3 == pytest.approx(fine.volume_mm3, rel=0.02)
+
+
+def test_sections_of_a_ball_are_circles_of_the_right_size():
+    mesh = ball(10, (3, 4, 120), subdivisions=5)
+    through = np.array([0.0, 0.0, 126.0])
+    for view, center, radius in (
+        (FROM_CAMERA, (3, 4), 8.0),
+        (FROM_SIDE, (3, 120), np.sqrt(100 - 16)),
+    ):
+        outline = section(mesh, view, through)
+        away = np.linalg.norm(outline.reshape(-1, 2) - center, axis=1)
+        np.testing.assert_allclose(away, radius, atol=0.03)
+        length = np.linalg.norm(outline[:, 1] - outline[:, 0], axis=1).sum()
+        assert length == pytest.approx(2 * np.pi * radius, rel=1e-3)  # closed, nothing doubled
+        frame = Frame(center[0] - 12.0, center[0] + 12.0, center[1] - 12.0, center[1] + 12.0)
+        mask = section_mask(mesh, view, frame, through)
+        assert mask.sum() * 0.25**2 == pytest.approx(np.pi * radius**2, rel=0.01)
+
+
+def test_shading_hides_what_lies_behind():
+    red, green = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0)
+    near, far = ball(5, (0, 0, 100)), ball(8, (0, 0, 130))
+    frame = frame_around(FROM_CAMERA, far.vertices_mm)
+    for layers in ([Layer(near, red), Layer(far, green)], [Layer(far, green), Layer(near, red)]):
+        picture = shade(layers, FROM_CAMERA, frame)
+        x, y = pixel_centres(frame, 0.3)
+        middle = picture[np.abs(y).argmin(), np.abs(x).argmin()]
+        rim = picture[np.abs(y).argmin(), np.abs(x - 6.5).argmin()]
+        assert middle[0] > 2 * middle[1]
+        assert rim[1] > 2 * rim[0]
+        np.testing.assert_array_equal(picture[0, 0], 1.0)
+    back = View("from behind", (-1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
+    behind = shade([Layer(near, red), Layer(far, green)], back, Frame(-13.0, 13.0, -13.0, 13.0))
+    assert behind[43, 43, 1] > 2 * behind[43, 43, 0]  # from behind the far one covers the near
+
+
+# A marker on each side of the patient must appear at its own letter.
+MARKS = {"L": (30, 0, 0), "R": (-30, 0, 0), "P": (0, 30, 0), "A": (0, -30, 0), "S": (0, 0, 30),
+         "I": (0, 0, -30)}  # fmt: skip
+ORIENTATIONS = {
+    "LPS": np.eye(3),
+    "flipped": np.diag([-1.0, -1.0, 1.0]),
+    "slices first": np.eye(3)[[2, 1, 0]] * [1, -1, 1],
+    "oblique": trimesh.transformations.rotation_matrix(0.4, (1, 2, 3))[:3, :3],
+}
+
+
+@pytest.mark.parametrize("name", ORIENTATIONS)
+@pytest.mark.parametrize("plane", PLANES, ids=lambda plane: plane.view.name)
+def test_letters_stand_where_the_patients_sides_are(plane, name):
+    turn, size, step = ORIENTATIONS[name], 64, 1.5
+    lps_from_index = np.eye(4)
+    lps_from_index[:3, :3] = turn * step
+    center = np.array([100.0, -50.0, 700.0])
+    lps_from_index[:3, 3] = center - lps_from_index[:3, :3] @ np.full(3, (size - 1) / 2)
+    index = np.stack(np.meshgrid(*[np.arange(size)] * 3, indexing="ij"), axis=-1)
+    lps = index @ lps_from_index[:3, :3].T + lps_from_index[:3, 3] - center
+    frame = Frame(*(center @ plane.view.right + [-45, 45]), *(center @ plane.view.down + [-45, 45]))
+    x, y = pixel_centres(frame)
+    edges = {"left": x < x.mean(), "right": x > x.mean()}
+    rows = {"top": y < y.mean(), "bottom": y > y.mean()}
+    for border, letter in plane.letters.items():
+        mark = (np.linalg.norm(lps - MARKS[letter], axis=-1) < 8).astype(np.uint8)
+        picture = slice_volume(mark, lps_from_index, plane.view, frame, center) == 1
+        side = picture[:, edges[border]] if border in edges else picture[rows[border]]
+        assert picture.sum() > 1000
+        assert side.sum() == picture.sum()
+    hidden = set("LRAPSI") - set(plane.letters.values())
+    assert len(hidden) == 2
+
+
+def test_radiological_convention():
+    axial, coronal, sagittal = (plane.letters for plane in PLANES)
+    assert axial == {"left": "R", "right": "L", "top": "A", "bottom": "P"}
+    assert coronal == {"left": "R", "right": "L", "top": "S", "bottom": "I"}
+    assert sagittal == {"left": "A", "right": "P", "top": "S", "bottom": "I"}
+
+
+@pytest.mark.parametrize("with_ct", [True, False])
+def test_qc_picture_shows_outlines(tmp_path, with_ct):
+    from matplotlib.image import imread
+
+    parts = anatomy()
+    lps_from_index = np.eye(4)
+    lps_from_index[:3, 3] = (-30, -30, 100)
+    labels = label_grid(parts, lps_from_index, (60, 60, 60))
+    ct = Volume(np.where(labels, 50.0 * labels, -80.0), lps_from_index) if with_ct else None
+    qc_picture(LabelVolume(labels, lps_from_index), ct, parts, tmp_path / "qc.png")
+    flat = imread(tmp_path / "qc.png")[..., :3].reshape(-1, 3)
+    for color in ((1.0, 0.62, 0.45), (0.97, 0.88, 0.22)):
+        assert (np.abs(flat - color) < 0.03).all(1).sum() > 300
+    assert list(tmp_path.iterdir()) == [tmp_path / "qc.png"]
+
+
+def test_qc_picture_cuts_through_every_tumor(tmp_path):
+    """Tumors in opposite corners share no slice: each has its outline in its own row."""
+    from matplotlib.image import imread
+
+    corners = [ball(5, (-20, -20, -20)), ball(7, (20, 20, 20))]
+    parts = Anatomy((ball(48, (0, 0, 0)), *corners))
+    lps_from_index = np.diag([2.0, 2.0, 2.0, 1.0])
+    lps_from_index[:3, 3] = -60
+    labels = label_grid(parts, lps_from_index, (60, 60, 60))
+    qc_picture(LabelVolume(labels, lps_from_index), None, parts, tmp_path / "qc.png")
+    picture = imread(tmp_path / "qc.png")[..., :3]
+    top, left = picture.shape[0] // 10, int(0.74 * picture.shape[1])  # no legend, no 3-D view
+    rows = np.array_split(picture[top:, :left], 2)
+    for row, color in zip(rows, ((0.97, 0.88, 0.22), (0.34, 0.71, 0.91)), strict=True):
+        drawn = (np.abs(row - color) < 0.03).all(2)
+        assert all(part.sum() > 50 for part in np.array_split(drawn, 3, axis=1))

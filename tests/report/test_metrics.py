@@ -1,0 +1,268 @@
+"""Metrics against analytic answers and independent implementations."""
+
+import numpy as np
+import pytest
+import trimesh
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+from scipy.spatial.distance import directed_hausdorff
+
+from tumortrack.core.errors import InputError
+from tumortrack.core.types import Anatomy, CameraLabels, Mesh
+from tumortrack.imaging.raster import cover, voxelise
+from tumortrack.report.metrics import (
+    _to_surface,
+    box_center_distance,
+    label_grid,
+    label_ious,
+    mean_iou,
+    surface_distances,
+    surface_samples,
+    triangle_distance,
+    weighted_percentile,
+)
+
+
+def sphere(radius_mm, center_mm=(0.0, 0.0, 0.0), subdivisions=4):
+    ball = trimesh.creation.icosphere(subdivisions, radius_mm)
+    return Mesh(ball.vertices + np.array(center_mm), ball.faces)
+
+
+def box(size_mm, center_mm=(0.0, 0.0, 0.0)):
+    solid = trimesh.creation.box(size_mm)
+    return Mesh(solid.vertices + np.array(center_mm), solid.faces)
+
+
+def lumpy(seed, radius_mm=15.0):
+    """A ball with random smooth bumps."""
+    rng = np.random.default_rng(seed)
+    ball = trimesh.creation.icosphere(4, radius_mm)
+    waves, bumps = rng.normal(0, 0.12, (3, 3)), rng.normal(0, 1.2, (3, 3))
+    return Mesh(ball.vertices + np.sin(ball.vertices @ waves) @ bumps, ball.faces)
+
+
+def grid(low_mm, step_mm):
+    camera_from_index = np.diag([step_mm, step_mm, step_mm, 1.0])
+    camera_from_index[:3, 3] = low_mm
+    return camera_from_index
+
+
+def test_concentric_spheres_are_their_radii_apart():
+    found = surface_distances(sphere(20), sphere(23))
+    for value in (found.symmetric_mm, found.one_sided_mm, found.percentile_95_mm, found.mean_mm):
+        assert value == pytest.approx(3.0, abs=0.03)
+
+
+def test_a_shifted_sphere_is_its_shift_away():
+    found = surface_distances(sphere(20, (4, 0, 0)), sphere(20))
+    assert found.symmetric_mm == pytest.approx(4.0, abs=0.02)
+    # |d(p)| = 4 |cos| about, over the sphere: mean 2, and 95 % of the area below 0.95 * 4.
+    assert found.mean_mm == pytest.approx(2.0, abs=0.05)
+    assert found.percentile_95_mm == pytest.approx(3.8, abs=0.05)
+
+
+def test_cube_and_inscribed_sphere():
+    # The corners are sqrt(3) a from the middle; every point of the sphere lies near a face.
+    found = surface_distances(box((20, 20, 20)), sphere(10))
+    corner_mm = 10 * (np.sqrt(3) - 1)
+    assert found.one_sided_mm == pytest.approx(corner_mm, abs=0.03)
+    back = surface_distances(sphere(10), box((20, 20, 20)))
+    assert back.one_sided_mm == pytest.approx(10 * (1 - 1 / np.sqrt(3)), abs=0.02)
+    assert back.symmetric_mm == found.symmetric_mm == pytest.approx(corner_mm, abs=0.03)
+
+
+def test_one_sided_asks_whether_the_estimate_lies_near_the_truth():
+    part, whole = sphere(10, (30, 0, 0)), sphere(10)
+    both = trimesh.util.concatenate(
+        [trimesh.Trimesh(m.vertices_mm, m.faces) for m in (part, whole)]
+    )
+    estimate = Mesh(both.vertices, both.faces)
+    assert surface_distances(estimate, whole).one_sided_mm == pytest.approx(30, abs=0.1)
+    assert surface_distances(whole, estimate).one_sided_mm == pytest.approx(0, abs=1e-6)
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_hausdorff_agrees_with_scipy_on_dense_samples(seed):
+    a, b = lumpy(seed), lumpy(seed + 10)
+    dense_a, dense_b = (trimesh.sample.sample_surface(
+        trimesh.Trimesh(m.vertices_mm, m.faces, process=False), 60_000, seed=0
+    )[0] for m in (a, b))  # fmt: skip
+    there, back = directed_hausdorff(dense_a, dense_b)[0], directed_hausdorff(dense_b, dense_a)[0]
+    found = surface_distances(a, b)
+    assert found.one_sided_mm == pytest.approx(there, abs=0.12)
+    assert found.symmetric_mm == pytest.approx(max(there, back), abs=0.12)
+    assert found.symmetric_mm > 1.0
+
+
+def test_hausdorff_agrees_with_simpleitk_on_label_maps():
+    import SimpleITK as sitk  # noqa: N813
+
+    a, b = lumpy(4), sphere(13, (3, -2, 1))
+    step_mm, shape = 0.5, (96, 96, 96)
+    images = []
+    for mesh in (a, b):
+        inside = voxelise(mesh, grid((-24, -24, -24), step_mm), shape)
+        image = sitk.GetImageFromArray(inside.astype(np.uint8).transpose(2, 1, 0))
+        image.SetSpacing([step_mm] * 3)
+        images.append(image)
+    judge = sitk.HausdorffDistanceImageFilter()
+    judge.Execute(*images)
+    found = surface_distances(a, b)
+    assert found.symmetric_mm == pytest.approx(judge.GetHausdorffDistance(), abs=2 * step_mm)
+
+
+@given(st.integers(0, 10_000))
+@example(758)  # a corner whose triangles are thin
+@settings(max_examples=8, deadline=None)
+def test_distances_obey_their_laws(seed):
+    a, b = (Mesh(m.vertices_mm, m.faces) for m in (lumpy(seed), lumpy(seed + 1)))
+    there, back = surface_distances(a, b, 2.0), surface_distances(b, a, 2.0)
+    assert there.symmetric_mm == back.symmetric_mm
+    assert there.symmetric_mm == max(there.one_sided_mm, back.one_sided_mm)
+    assert there.mean_mm == pytest.approx(back.mean_mm)
+    assert there.mean_mm < there.percentile_95_mm <= there.symmetric_mm
+    assert surface_distances(a, a, 2.0).symmetric_mm < 1e-6
+    turn = trimesh.transformations.rotation_matrix(1.0, (1, 2, 3))[:3, :3]
+    turned = [m.moved(m.vertices_mm @ turn.T + 100) for m in (a, b)]
+    assert surface_distances(*turned, 2.0).symmetric_mm == pytest.approx(there.symmetric_mm)
+
+
+@pytest.mark.parametrize("target", [lumpy(7), box((22, 25, 28), (2, 1, 0))], ids=["fine", "coarse"])
+def test_nearest_triangle_is_found_among_the_few(target):
+    """The distance to the few faces that are tried is the distance to all faces."""
+    points = surface_samples(lumpy(6), 4.0)[0][::5]
+    triangles = target.vertices_mm[target.faces]
+    exact = np.array(
+        [triangle_distance(np.tile(p, (len(triangles), 1)), triangles).min() for p in points]
+    )
+    found = _to_surface(points, target)
+    assert exact.max() > 1.0
+    assert (found >= exact - 1e-9).all()
+    np.testing.assert_allclose(found, exact, atol=0.01)
+
+
+def test_triangle_distance_in_every_region():
+    triangle = np.array([[0.0, 0, 0], [4, 0, 0], [0, 3, 0]])
+    cases = {
+        (1, 1, 2): 2.0,  # above the inside
+        (-3, -4, 0): 5.0,  # off a corner
+        (2, -2, 1): np.sqrt(5),  # off an edge
+        (4, 3, 0): 2.4,  # off the slanted edge
+        (7, 0, 4): 5.0,
+    }
+    points = np.array(list(cases), float)
+    triangles = np.broadcast_to(triangle, (len(points), 3, 3))
+    np.testing.assert_allclose(triangle_distance(points, triangles), list(cases.values()))
+
+
+def test_samples_carry_the_whole_area_evenly():
+    mesh = lumpy(3)
+    points, area, face = surface_samples(mesh, 0.5)
+    assert area.sum() == pytest.approx(trimesh.Trimesh(mesh.vertices_mm, mesh.faces).area)
+    on = triangle_distance(points, mesh.vertices_mm[mesh.faces][face])
+    assert on.max() < 1e-9
+    # First moments: sums over samples equal the exact integrals over the triangles.
+    corners = mesh.vertices_mm[mesh.faces]
+    size = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]),
+                          axis=1) / 2  # fmt: skip
+    np.testing.assert_allclose(area @ points, size @ corners.mean(1), rtol=1e-9, atol=1e-6)
+
+
+def test_weighted_percentile_counts_weight_not_samples():
+    values, weights = np.array([5.0, 1.0, 9.0]), np.array([90.0, 5.0, 5.0])
+    assert weighted_percentile(values, weights, 5.0) == 1.0
+    assert weighted_percentile(values, weights, 95.0) == 5.0
+    assert weighted_percentile(values, weights, 95.1) == 9.0
+
+
+def test_empty_surfaces_are_refused():
+    nothing = Mesh(np.zeros((0, 3)), np.zeros((0, 3), int))
+    with pytest.raises(InputError, match="empty"):
+        surface_distances(sphere(5), nothing)
+
+
+def test_box_centers():
+    assert box_center_distance(box((9, 9, 9), (3, 4, 0)), sphere(2)) == pytest.approx(5.0)
+
+
+def test_a_shared_edge_belongs_to_one_triangle():
+    corners = np.array([[0.0, 0, 0], [8, 0, 0], [8, 8, 0], [0, 8, 0]])
+    square = corners[np.array([[0, 1, 2], [0, 2, 3]])]
+    hits = np.zeros((10, 10), int)
+    for _, i, j, _ in cover(square, (10, 10)):
+        np.add.at(hits, (i, j), 1)
+    assert hits.max() == 1
+    assert hits.sum() == 64
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_voxels_agree_with_an_independent_inside_test(seed):
+    mesh = lumpy(seed)
+    rng = np.random.default_rng(seed)
+    oblique = np.eye(4)
+    turn = trimesh.transformations.random_rotation_matrix(rng.random(3))[:3, :3]
+    oblique[:3, :3] = turn * [0.9, 1.1, 1.3]
+    oblique[:3, 3] = -oblique[:3, :3] @ [20, 20, 20]
+    inside = voxelise(mesh, oblique, (40, 41, 42))
+    index = np.stack(np.meshgrid(*map(np.arange, inside.shape), indexing="ij"), -1).reshape(-1, 3)
+    points = index @ oblique[:3, :3].T + oblique[:3, 3]
+    oracle = trimesh.Trimesh(mesh.vertices_mm, mesh.faces, process=False).contains(points)
+    assert inside.sum() > 5000
+    assert np.count_nonzero(inside.ravel() != oracle) <= 2  # float32 rays of the oracle
+
+
+def test_voxel_volume_of_analytic_shapes():
+    # Corners between voxel centres: the count is exact.
+    cube = voxelise(box((10, 12, 14)), grid((-9.75, -9.75, -9.75), 0.5), (40, 40, 40))
+    assert cube.sum() == 20 * 24 * 28
+    # Faces exactly through voxel centres: half-open, so still the exact volume.
+    assert voxelise(box((10, 12, 14)), grid((-10, -10, -10), 0.5), (40, 40, 40)).sum() == 13440
+    ball = voxelise(sphere(10, subdivisions=5), grid((-12, -12, -12), 0.25), (96, 96, 96))
+    assert ball.sum() * 0.25**3 == pytest.approx(4 / 3 * np.pi * 1000, rel=3e-3)
+
+
+def test_voxels_beyond_the_grid_are_cut_and_overlaps_leave_no_hole():
+    half = voxelise(box((10, 10, 10)), grid((0.25, -9.75, -9.75), 0.5), (40, 40, 40))
+    assert half.sum() == 10 * 20 * 20
+    low_cut = voxelise(box((10, 10, 10)), grid((-9.75, -9.75, 0.25), 0.5), (40, 40, 40))
+    assert low_cut.sum() == 20 * 20 * 10
+    assert not voxelise(sphere(3, (99, 0, 0)), grid((-9, -9, -9), 1.0), (18, 18, 18)).any()
+    two = trimesh.util.concatenate(
+        [trimesh.creation.box((10, 10, 10)), trimesh.creation.box((10, 10, 20))]
+    )
+    union = voxelise(Mesh(two.vertices, two.faces), grid((-14.75,) * 3, 0.5), (60, 60, 60))
+    assert union.sum() == 20 * 20 * 40
+
+
+def test_tumor_wins_over_organ():
+    anatomy = Anatomy((box((20, 20, 20)), box((6, 6, 6), (8, 0, 0))))
+    labels = label_grid(anatomy, grid((-14.5,) * 3, 1.0), (30, 30, 30))
+    assert np.bincount(labels.ravel())[1:].tolist() == [20**3 - 5 * 36, 6**3]
+
+
+def test_ious_of_shifted_boxes_are_exact():
+    reference = Anatomy((box((20, 20, 20)), box((6, 6, 6))))
+    shifted = Anatomy((box((20, 20, 20), (1, 0, 0)), box((6, 6, 6), (2, 0, 0))))
+    frame, shape = grid((-14.5,) * 3, 1.0), (30, 30, 30)
+    estimate = CameraLabels(label_grid(shifted, frame, shape), frame)
+    ious = label_ious(estimate, reference)
+    assert ious["tumor_1"] == pytest.approx(4 / 8)
+    # Common organ box 19 x 20 x 20 without either tumor (together 8 x 6 x 6); each has 8000 - 216.
+    common = 19 * 400 - 8 * 36
+    assert ious["kidney"] == pytest.approx(common / (2 * (8000 - 216) - common))
+    assert mean_iou(ious) == pytest.approx((ious["kidney"] + ious["tumor_1"]) / 2)
+
+
+def test_truth_outside_the_estimates_grid_counts_as_missed():
+    reference = Anatomy((box((20, 20, 20)),))
+    whole, half = grid((-14.5,) * 3, 1.0), grid((0.5, -14.5, -14.5), 1.0)
+    for frame, shape, iou in ((whole, (30, 30, 30), 1.0), (half, (30, 30, 30), 0.5)):
+        estimate = CameraLabels(label_grid(reference, frame, shape), frame)
+        assert label_ious(estimate, reference)["kidney"] == pytest.approx(iou)
+
+
+def test_far_or_absent_parts_have_iou_zero():
+    reference = Anatomy((box((20, 20, 20)), box((6, 6, 6))))
+    frame = grid((500.0, 0, 0), 1.0)
+    estimate = CameraLabels(np.ones((5, 5, 5), np.uint8), frame)
+    assert label_ious(estimate, reference) == {"kidney": 0.0, "tumor_1": 0.0}

@@ -1,0 +1,263 @@
+"""What hides the organ in training, and cameras out of calibration: shares, places, replay."""
+
+import math
+
+import msgspec
+import numpy as np
+import pytest
+
+from depth_objects import SMALL, dome, wall
+from render_objects import anatomy
+from tumortrack.core.config import from_builtins, identity, to_builtins
+from tumortrack.core.errors import InputError
+from tumortrack.core.types import DepthFrame
+from tumortrack.sense import occlusion_kernels as kernels
+from tumortrack.sense.calibration import CalibrationConfig, miscalibrate
+from tumortrack.sense.clutter import ClutterConfig
+from tumortrack.sense.noise import D405_NOISE
+from tumortrack.sense.occlusion import OcclusionConfig, occlude
+from tumortrack.simulate import scene as scene_module
+from tumortrack.simulate.dataset import SceneStream
+from tumortrack.simulate.occupancy import OccupancyConfig, OccupancyPool
+from tumortrack.simulate.scene import SceneConfig, SceneRecipe, Simulator
+from tumortrack.training.presets import paper, quick
+
+HIDING = OcclusionConfig(scenes=1.0, largest_share=0.6)
+ANATOMY = anatomy(3)
+UP = (0.0, -1.0, 0.0)
+SMALL_POOL = OccupancyConfig(per_side=16, pool=1000)
+
+
+def hidden(seed, config=HIDING, frame=None):
+    """Depths before and after, and which pixels lost the organ."""
+    frame = frame or dome()
+    before, after = frame.depth_mm, occlude(frame, config, np.random.default_rng(seed)).depth_mm
+    lost = np.isfinite(before) & ~(after == before)
+    return before, after, lost
+
+
+def test_what_is_hidden_has_no_return_and_the_rest_is_as_it_was():
+    shares = []
+    for seed in range(200):
+        before, after, lost = hidden(seed)
+        assert np.isnan(after[lost]).all()
+        np.testing.assert_array_equal(after[~lost], before[~lost])
+        shares.append(lost.sum() / np.isfinite(before).sum())
+    assert max(shares) <= 0.6
+    assert max(shares) > 0.55
+    assert np.percentile(shares, 25) < 0.2
+    # Uniform up to 0.6 has the mean 0.3; shafts alone hide less than drawn.
+    assert 0.2 < np.mean(shares) < 0.3
+
+
+def test_the_first_in_order_are_taken_up_to_a_count():
+    order, taken = np.random.default_rng(0).random(20_000, np.float32), np.zeros(20_000, bool)
+    taken[:100] = True
+    got = kernels.take_first(order, taken, 7000)
+    assert got == taken[100:].sum()
+    assert 7000 - 40 <= got <= 7000  # short of it by less than one of 1024 bins
+    assert order[100:][taken[100:]].max() <= order[100:][~taken[100:]].min()
+    few = np.full(50, np.inf, np.float32)
+    few[:3] = 1.0
+    assert kernels.take_first(few, np.zeros(50, bool), 10) == 3
+    assert kernels.take_first(few, np.zeros(50, bool), 2) == 0  # equal ones go together
+    assert kernels.take_first(np.full(5, np.inf, np.float32), np.zeros(5, bool), 2) == 0
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_a_shaft_is_as_wide_as_asked_and_ends_at_its_tip(seed):
+    rng = np.random.default_rng(seed)
+    angle = rng.uniform(0, 2 * np.pi)
+    towards = np.array([np.cos(angle), np.sin(angle)])
+    columns, rows, _ = kernels.seen_pixels(dome().depth_mm)
+    tip = np.array([SMALL.cx, SMALL.cy])
+    order = kernels.order_shaft(columns, rows, tip, towards, 7.0, 0.0)
+    inside = np.isfinite(order)
+    offset = np.stack([columns, rows], axis=1) - tip
+    along, across = offset @ towards, np.abs(offset @ [-towards[1], towards[0]])
+    assert (across[inside] < 7).all()
+    assert (along[inside] > -7).all()
+    assert inside[(along > 0) & (across < 6.99)].all()
+    assert not inside[(along < 0) & (np.hypot(along, across) > 7.01)].any()
+    np.testing.assert_allclose(order[inside], -along[inside], atol=1e-4)  # outermost first
+
+
+def test_hidden_regions_come_from_the_border_in_most_images():
+    """Shafts and patches enter from outside: a hidden pixel touches what had no return before."""
+    from scipy.ndimage import binary_dilation, label
+
+    entered = []
+    for seed in range(80):
+        before, _, lost = hidden(seed)
+        regions, count = label(lost)
+        rim = binary_dilation(np.isnan(before)) & lost
+        if lost.sum() > 200:
+            touching = np.isin(regions, np.unique(regions[rim])) & lost
+            entered.append(touching.sum() / lost.sum())
+        assert count <= 8
+    assert np.mean(np.array(entered) > 0.9) > 0.9
+
+
+def test_what_is_left_in_lies_before_the_organ():
+    config = OcclusionConfig(scenes=1.0, largest_share=0.6, left_in=0.3, nearer_mm=(5.0, 40.0))
+    shares, gaps = [], []
+    for seed in range(120):
+        before, after, lost = hidden(seed, config)
+        left = lost & np.isfinite(after)
+        shares.append(left.sum() / max(lost.sum(), 1))
+        gap = (before - after)[left]
+        assert (gap >= 5 - 1e-3).all()
+        assert (gap <= 40 + 1e-3).all()
+        gaps.extend(gap[:1])
+    assert 0.2 < max(shares) <= 0.301
+    assert min(gaps) < 12
+    assert max(gaps) > 33
+    near = DepthFrame(dome().depth_mm - 115, SMALL)  # 5 mm from the camera: nothing fits between
+    _, after, _ = hidden(3, config, near)
+    assert np.nanmin(after) > 1
+
+
+def test_occlusion_draws_nothing_when_off_and_leaves_the_generator_alone():
+    frame, rng, other = dome(), np.random.default_rng(3), np.random.default_rng(3)
+    for off in (OcclusionConfig(), OcclusionConfig(scenes=0.5), OcclusionConfig(largest_share=0.5)):
+        assert occlude(frame, off, rng) is frame
+    assert miscalibrate(frame, CalibrationConfig(), rng) is frame
+    assert rng.spawn(1)[0].random() == other.spawn(1)[0].random()
+    occlude(frame, HIDING, rng)
+    assert rng.random() == other.random()
+    empty = wall(np.nan)
+    assert occlude(empty, HIDING, rng) is empty
+    half = OcclusionConfig(scenes=0.5, largest_share=0.6)
+    assert 30 < sum(hidden(seed, half)[2].any() for seed in range(100)) < 70
+    for seed in (1, 2):
+        np.testing.assert_array_equal(hidden(seed)[1], hidden(seed)[1])
+    assert not np.array_equal(hidden(1)[2], hidden(2)[2])
+
+
+def test_limits_and_json():
+    config = OcclusionConfig(scenes=0.5, largest_share=0.6, left_in=0.2, shaft_mm=(4.0, 8.0))
+    assert from_builtins(to_builtins(config), OcclusionConfig, "here") == config
+    for bad in (
+        {"scenes": 1.1},
+        {"largest_share": 0.95},
+        {"left_in": math.nan},
+        {"shaft_mm": (0.0, 3.0)},
+        {"nearer_mm": (9.0, 5.0)},
+    ):
+        with pytest.raises(InputError, match="occlusion"):
+            OcclusionConfig(**bad)
+    for bad in ({"offset_mm": -1.0}, {"scale": 0.5}, {"offset_mm": math.inf}):
+        with pytest.raises(InputError, match="calibration"):
+            CalibrationConfig(**bad)
+    for bad in ((100, 500), (900, 500)):
+        with pytest.raises(InputError, match="cloud_points"):
+            SceneConfig(cloud_points=bad)
+
+
+def test_a_camera_out_of_calibration_errs_alike_everywhere():
+    frame = dome()
+    seen = np.isfinite(frame.depth_mm)
+    z = frame.depth_mm[seen].astype(float)
+    offsets, factors = [], []
+    for seed in range(300):
+        config = CalibrationConfig(offset_mm=2.0, scale=0.01)
+        out = miscalibrate(frame, config, np.random.default_rng(seed)).depth_mm
+        assert np.array_equal(np.isfinite(out), seen)
+        factor, offset = np.polyfit(z, out[seen].astype(float), 1)
+        np.testing.assert_allclose(factor * z + offset, out[seen], atol=1e-4)
+        offsets.append(offset)
+        factors.append(factor - 1)
+    assert np.abs(offsets).max() == pytest.approx(2.0, abs=0.05)
+    assert np.abs(factors).max() == pytest.approx(0.01, abs=3e-4)
+    assert np.mean(offsets) == pytest.approx(0, abs=0.2)
+    assert np.std(offsets) == pytest.approx(2 / math.sqrt(3), abs=0.12)
+    assert abs(np.corrcoef(offsets, factors)[0, 1]) < 0.2
+
+
+def test_fields_that_came_later_change_no_hash_while_they_are_off():
+    before = {"width", "height", "pose", "deform", "clutter", "noise", "cloud", "occupancy"}
+    before |= {"free_range", "free_nearest_mm"}
+    plain, on = SceneConfig(), SceneConfig(occlusion=HIDING)
+    assert set(identity(plain)) == before
+    assert {key: to_builtins(plain)[key] for key in before} == identity(plain)
+    assert set(identity(on)) == {*before, "occlusion"}
+    assert identity(on)["occlusion"] == to_builtins(HIDING)
+    inside = identity(quick(ANATOMY))["scene"]  # and however deep they lie
+    assert set(inside) == before
+    assert inside["noise"] == to_builtins(D405_NOISE)
+
+
+# --- in scenes ---
+
+
+def recipe(index):
+    return SceneRecipe(5, "train", index)
+
+
+@pytest.mark.parametrize("preset", [paper, quick])
+def test_presets_draw_the_scenes_they_drew_before_these_faults_existed(preset, monkeypatch):
+    config = preset(ANATOMY).scene
+    simulator = Simulator(ANATOMY, UP, config)
+    now = [simulator.stage(recipe(i)) for i in range(6)]
+    for name in ("occlude", "miscalibrate"):
+        monkeypatch.setattr(scene_module, name, lambda frame, config, rng: frame)
+    monkeypatch.setattr(
+        scene_module,
+        "crop_of",
+        lambda config, free, rng: (
+            scene_module.CloudConfig(near_mm=1.0, far_mm=1e4) if free else config.cloud
+        ),
+    )
+    for index, stage in enumerate(now):
+        before = simulator.stage(recipe(index))
+        np.testing.assert_array_equal(stage.cloud.points_mm, before.cloud.points_mm)
+        np.testing.assert_array_equal(stage.frame.depth_mm, before.frame.depth_mm)
+
+
+def test_hidden_scenes_lie_where_they_lay_and_their_clouds_lose_points():
+    plain = SceneConfig(occupancy=SMALL_POOL)
+    on = msgspec.structs.replace(plain, occlusion=HIDING)
+    one, two = (Simulator(ANATOMY, UP, config) for config in (plain, on))
+    lost = 0
+    for index in range(8):
+        before, after = one.stage(recipe(index)), two.stage(recipe(index))
+        np.testing.assert_array_equal(before.camera_from_ct, after.camera_from_ct)
+        kept = np.isfinite(after.frame.depth_mm)
+        np.testing.assert_array_equal(after.frame.depth_mm[kept], before.frame.depth_mm[kept])
+        lost += np.isfinite(before.frame.depth_mm).sum() - kept.sum()
+        again = two.stage(recipe(index))
+        np.testing.assert_array_equal(after.cloud.points_mm, again.cloud.points_mm)
+    assert lost > 5000
+
+
+def test_clouds_have_a_random_number_of_points_and_batches_stay_whole():
+    config = SceneConfig(occupancy=SMALL_POOL, cloud_points=(300, 3000), free_range=0.5)
+    simulator = Simulator(ANATOMY, UP, config)
+    counts = np.array([len(simulator.stage(recipe(i)).cloud.points_mm) for i in range(60)])
+    assert counts.min() >= 300
+    assert counts.max() <= 3000
+    assert 15 < (counts < math.sqrt(300 * 3000)).sum() < 45  # even on a logarithmic scale
+    pool = OccupancyPool(ANATOMY, SMALL_POOL, 1)
+    batch = SceneStream(ANATOMY, UP, config, pool, 5, "train", 6).batch(0)
+    assert batch.clouds_mm.shape == (6, 1000, 3)
+    different = [len(np.unique(cloud, axis=0)) for cloud in batch.clouds_mm]
+    assert different == [min(1000, count) for count in counts[:6].tolist()]
+
+
+def test_everything_at_once_replays():
+    config = SceneConfig(
+        occupancy=SMALL_POOL,
+        clutter=ClutterConfig(scenes=1.0, largest_share=0.05),
+        occlusion=OcclusionConfig(scenes=1.0, largest_share=0.6, left_in=0.2),
+        calibration=CalibrationConfig(offset_mm=2.0),
+        noise=D405_NOISE,
+        free_range=1.0,
+        free_nearest_mm=(80.0, 300.0),
+        cloud_points=(500, 5000),
+    )
+    assert from_builtins(to_builtins(config), SceneConfig, "here") == config
+    one, two = (Simulator(ANATOMY, UP, config) for _ in range(2))
+    for index in (2, 0, 1):
+        first, second = one.stage(recipe(index)), two.stage(recipe(index))
+        np.testing.assert_array_equal(first.cloud.points_mm, second.cloud.points_mm)
+        assert len(first.cloud.points_mm) >= 200

@@ -1,0 +1,151 @@
+"""Frames sent over ROS 2 from within a test, on a graph that does not leave this machine."""
+
+from __future__ import annotations
+
+import json
+import os
+import queue
+import secrets
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from unittest import mock
+
+from live_objects import PARTS, small_anatomy, small_frame
+from tumortrack.core.types import SensorCloud
+from tumortrack.live.ros.bus import Bus, open_bus
+from tumortrack.live.ros.messages import Messages
+from tumortrack.live.ros.observed import messages_seen
+from tumortrack.live.values import Seen, Source
+
+HERE = Path(__file__).parent
+N_TOPICS = 3 + len(PARTS)
+DOMAIN = str(1 + secrets.randbelow(100))  # ports of domains beyond reach into the ephemeral ones
+
+
+@contextmanager
+def own_graph() -> Iterator[None]:
+    """ROS's environment for tests: the other programs of this machine are not heard."""
+    said = {"ROS_DOMAIN_ID": DOMAIN, "ROS_LOCALHOST_ONLY": "1"}
+    with mock.patch.dict(os.environ, said):
+        os.environ.pop("CYCLONEDDS_URI", None)
+        yield
+
+
+class Frames:
+    """Sends frames on topics under ``place``."""
+
+    def __init__(self, bus: Bus, messages: Messages, place: str) -> None:
+        self._bus, self._messages, self.place = bus, messages, place
+        self._publishers: dict = {}
+
+    def send(self, seen: Seen, leave_out: tuple[str, ...] = ()) -> None:
+        """The image last: what belongs to it is there by then."""
+        for suffix, kind, message in reversed(messages_seen(seen, self._messages)):
+            if suffix in leave_out:
+                continue
+            if suffix not in self._publishers:
+                self._publishers[suffix] = self._bus.publisher(f"{self.place}/{suffix}", kind)
+            self._publishers[suffix].publish(self._messages.to_bytes(message))
+
+
+@contextmanager
+def sending(kind: str, hz: float = 50) -> Iterator[str]:
+    """Small frames (``image``) or clouds, stamped as they are sent; yields their topic."""
+    messages = Messages()
+    place = f"/camera_{secrets.token_hex(4)}"
+    over = threading.Event()
+
+    def send() -> None:
+        bus = open_bus("dds", messages)
+        frames = Frames(bus, messages, place)
+        while not over.wait(1 / hz):
+            now_ns = time.time_ns()
+            cloud = SensorCloud(small_anatomy().organ.vertices_mm, now_ns)
+            frames.send(Seen(small_frame(now_ns) if kind == "image" else cloud, now_ns))
+        bus.close()
+
+    thread = threading.Thread(target=send)
+    thread.start()
+    try:
+        yield f"{place}/{'depth/image_rect' if kind == 'image' else 'points'}"
+    finally:
+        over.set()
+        thread.join()
+
+
+def read_until(source: Source, seconds: float) -> Seen:
+    end_s = time.monotonic() + seconds
+    while time.monotonic() < end_s:
+        if (seen := source.read(0.2)) is not None:
+            return seen
+    raise AssertionError(f"nothing came in {seconds} s")
+
+
+class Other:
+    """Another process; what it says is read at once, so that it never waits for us."""
+
+    def __init__(self, *command: object) -> None:
+        self._process = subprocess.Popen(
+            [str(part) for part in command],
+            stdout=subprocess.PIPE,
+            text=True,
+            cwd=HERE,
+            start_new_session=True,
+        )
+        self._said: queue.Queue[str] = queue.Queue()
+        self._thread = threading.Thread(target=self._listen)
+        self._thread.start()
+
+    def _listen(self) -> None:
+        for line in self._process.stdout:
+            self._said.put(line)
+
+    def line(self, timeout_s: float = 20.0) -> str:
+        return self._said.get(timeout=timeout_s)
+
+    def lines_until(self, good: Callable[[dict], bool]) -> list[dict]:
+        """What it said (JSON), up to the first line that is good."""
+        said = [json.loads(self.line())]
+        while not good(said[-1]):
+            said.append(json.loads(self.line()))
+        return said
+
+    def topics_until(self, good: Callable[[dict[str, dict]], bool]) -> dict[str, dict]:
+        """The last message of each topic, once they are good together. Topics race."""
+        last: dict[str, dict] = {}
+
+        def heard(said: dict) -> bool:
+            last[said.get("topic", "")] = said
+            return len(last) >= N_TOPICS and good(last)
+
+        self.lines_until(heard)
+        return last
+
+    def signal(self, number: int) -> None:
+        os.killpg(self._process.pid, number)
+
+    def end(self) -> None:
+        self.signal(signal.SIGKILL)
+        self._process.wait()
+        self._thread.join()
+
+
+@contextmanager
+def process(*command: object) -> Iterator[Other]:
+    other = Other(*command)
+    try:
+        yield other
+    finally:
+        other.end()
+
+
+@contextmanager
+def peer(*arguments: object) -> Iterator[Other]:
+    with process(sys.executable, HERE / "ros2_peer.py", *arguments) as other:
+        yield other

@@ -1,0 +1,110 @@
+"""The other end of test_ros2_processes.py: a process that sends frames, or says what it heard.
+
+ros2_peer.py send image|cloud HZ SECONDS
+ros2_peer.py hear SECONDS
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+
+import numpy as np
+
+from live_objects import PARTS, empty_update, small_frame
+from tumortrack.core.types import DepthFrame, SensorCloud
+from tumortrack.live.ros.bus import open_bus
+from tumortrack.live.ros.dds import DdsBus
+from tumortrack.live.ros.incoming import CLOUD
+from tumortrack.live.ros.messages import Messages, stamp_of
+from tumortrack.live.ros.observed import messages_seen, plain_cloud
+from tumortrack.live.ros.outgoing import DIAGNOSTICS, MARKERS, messages_of
+from tumortrack.live.values import Seen
+
+N_POINTS = 40_000
+
+
+def points_mm() -> np.ndarray:
+    """Every point another one; whole eighths of a mm, so that metres hold them well."""
+    return (np.random.default_rng(3).integers(-800, 800, (N_POINTS, 3)) / 8).astype(np.float32)
+
+
+def frame_numbered(number: int, stamp_ns: int) -> DepthFrame:
+    """The small frame, with its number as the depth of its first pixel."""
+    depth_mm = small_frame().depth_mm.copy()
+    depth_mm[0, 0] = 100 + number % 100
+    return DepthFrame(depth_mm, small_frame().intrinsics, stamp_ns)
+
+
+def send(kind: str, hz: float, seconds: float) -> None:
+    messages = Messages()
+    bus = open_bus("dds", messages)
+    points = points_mm()
+    mask = np.arange(48 * 64).reshape(48, 64) % 3 == 0
+    publishers: dict = {}
+    end_s = time.monotonic() + seconds
+    number = 0
+    while time.monotonic() < end_s:
+        start_ns = time.time_ns()
+        if kind == "cloud":
+            header = messages.header(start_ns, "camera")
+            out = [("points", CLOUD, plain_cloud(SensorCloud(points, start_ns), header, messages))]
+        else:
+            seen = Seen(frame_numbered(number, start_ns), start_ns, mask)
+            out = list(reversed(messages_seen(seen, messages)))
+        for suffix, message_type, message in out:
+            if suffix not in publishers:
+                publishers[suffix] = bus.publisher(f"/camera/{suffix}", message_type)
+            publishers[suffix].publish(messages.to_bytes(message))
+        number += 1
+        time.sleep(max(0.0, 1 / hz - (time.time_ns() - start_ns) * 1e-9))
+    bus.close()
+
+
+def hear(seconds: float) -> None:
+    """Writes a line as soon as it listens, and one for every message."""
+    messages = Messages()
+    bus = open_bus("dds", messages)
+    _reliable = reliably(bus)
+    kinds = {one.suffix: one.message_type for one in messages_of(empty_update(), messages, PARTS)}
+    heard = {name: bus.subscriber(f"/tumortrack/{name}", kind) for name, kind in kinds.items()}
+    print(json.dumps({"listens": sorted(heard)}), flush=True)
+    end_s = time.monotonic() + seconds
+    while time.monotonic() < end_s:
+        bus.wait(0.2)
+        for name, subscriber in heard.items():
+            for cdr in subscriber.take():
+                now_ns = time.time_ns()
+                said = told(messages.from_bytes(cdr, kinds[name]), kinds[name])
+                print(json.dumps({"topic": name, "now_ns": now_ns, **said}), flush=True)
+    bus.close()
+
+
+def reliably(bus: DdsBus) -> object:
+    """A second reader of the cloud, whose writer has to wait for its acknowledgements."""
+    from cyclonedds.qos import Policy, Qos
+    from cyclonedds.sub import DataReader
+
+    topic = bus._topic("/tumortrack/cloud", CLOUD)
+    qos = Qos(Policy.Reliability.Reliable(0), Policy.History.KeepLast(1))
+    return DataReader(bus._member, topic, qos)
+
+
+def told(message: object, kind: str) -> dict:
+    if kind == MARKERS:
+        markers = [[m.ns, int(m.action), len(m.points)] for m in message.markers]
+        return {"stamp_ns": stamp_of(message.markers[0].header), "markers": markers}
+    said = {"stamp_ns": stamp_of(message.header), "frame": message.header.frame_id}
+    if kind == CLOUD:
+        return {**said, "points": int(message.width), "sum": int(message.data.sum())}
+    if kind == DIAGNOSTICS:
+        return {**said, "level": int(message.status[0].level), "text": message.status[0].message}
+    return {**said, "m": [message.point.x, message.point.y, message.point.z]}
+
+
+if __name__ == "__main__":
+    if sys.argv[1] == "send":
+        send(sys.argv[2], float(sys.argv[3]), float(sys.argv[4]))
+    else:
+        hear(float(sys.argv[2]))

@@ -1,0 +1,417 @@
+"""Points of the CT asked for by `locate --map`: reading, refusing, answering."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import trimesh
+
+from motions import CAMERA_FROM_CT, Wave
+from stories import refusal, tumortrack
+from tumortrack.cli import commands
+from tumortrack.core import store
+from tumortrack.core.errors import InputError, NoEstimate
+from tumortrack.core.estimate import Estimate
+from tumortrack.core.geometry import transform_points
+from tumortrack.core.motion import Motion, OneWay
+from tumortrack.core.types import Anatomy, CameraLabels, Mesh, OccupancyCloud
+from tumortrack.models.in_distribution import Familiar
+from tumortrack.occupancy.network import OccupancyNetwork
+from tumortrack.sense.files import read_cloud, write_cloud_ply
+from tumortrack.tracking.files import write_estimate
+from tumortrack.tracking.points import camera_table, check_near_organ, read_points
+from tumortrack.training.model import Model, save_model
+from tumortrack.training.presets import quick
+
+MIDDLE = np.array([60.0, 40.0, -300.0])
+BOX = np.stack([MIDDLE - 30, MIDDLE + 30])
+
+
+def ball(radius_mm, center_mm):
+    solid = trimesh.creation.icosphere(3, radius_mm)
+    return Mesh(solid.vertices + np.array(center_mm), solid.faces)
+
+
+def anatomy():
+    return Anatomy((ball(30, MIDDLE), ball(8, MIDDLE + [5, 0, 0])))
+
+
+def some_points(count=7):
+    return np.round(MIDDLE + np.random.default_rng(0).uniform(-30, 30, (count, 3)), 3)
+
+
+def located(motion=None):
+    """An estimate whose cloud has a point of each label."""
+    points_mm = transform_points(CAMERA_FROM_CT, MIDDLE + np.array([[0.0, 0, 0], [5, 1, 2]]))
+    labels = np.ones((2, 2, 2), np.uint8)
+    volume = CameraLabels(labels, np.eye(4))
+    parts = {"kidney": {"found": True, "volume_ml": 113.0, "center_mm": [0.0, 0.0, 100.0]}}
+    return Estimate(
+        OccupancyCloud(points_mm, np.array([1, 2]), np.array([0.9, 0.8])),
+        volume,
+        {"kidney": ball(30, [0, 0, 100])},
+        {"parts": parts, "timings": {"total": 0.1}},
+        motion,
+    )
+
+
+def rows_of(text):
+    return list(csv.DictReader(io.StringIO(text)))
+
+
+def places(rows, frame="camera"):
+    return np.array([[float(row[f"{frame}_{axis}"]) for axis in "xyz"] for row in rows])
+
+
+def written(path, text):
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+# --- motions ---
+
+
+def test_the_tests_own_motion_goes_both_ways_and_bends():
+    points = some_points(50)
+    there = Wave().carry(points)
+    assert isinstance(Wave(), Motion)
+    np.testing.assert_allclose(Wave().back(there), points, atol=1e-9)
+    assert np.linalg.norm(there - transform_points(CAMERA_FROM_CT, points), axis=1).max() > 3
+
+
+def test_one_way_is_a_motion_that_knows_no_way_back():
+    motion = OneWay(Wave().carry)
+    assert isinstance(motion, Motion)
+    np.testing.assert_array_equal(motion.carry(some_points()), Wave().carry(some_points()))
+    assert motion.back(some_points()) is None
+    assert motion.std_mm(some_points()) is None
+
+
+# --- the estimate's folder ---
+
+
+def ply_columns(path):
+    """Names and float values of a PLY's vertices, read by another program."""
+    vertex = trimesh.load(path).metadata["_ply_raw"]["vertex"]
+    return {name: vertex["data"][name].ravel() for name in vertex["properties"]}
+
+
+def test_the_occupancy_cloud_says_where_its_points_were_in_the_ct(tmp_path):
+    estimate = located(Wave())
+    write_estimate(tmp_path / "out", estimate)
+    columns = ply_columns(tmp_path / "out" / "occupancy.ply")
+    assert columns["ct_x"].dtype == np.float32
+    ct = np.stack([columns[f"ct_{axis}"] for axis in "xyz"], axis=1).astype(float)
+    camera = np.stack([columns[axis] for axis in "xyz"], axis=1).astype(float)
+    np.testing.assert_allclose(Wave().carry(ct), camera, atol=1e-3)
+    assert np.linalg.norm(ct - MIDDLE, axis=1).max() < 15
+    read_back, _ = read_cloud(tmp_path / "out" / "occupancy.ply")
+    np.testing.assert_array_equal(read_back.points_mm, estimate.cloud.points_mm)
+
+
+@pytest.mark.parametrize("motion", [None, OneWay(Wave().carry)])
+def test_without_a_way_back_the_cloud_has_no_places_in_the_ct(tmp_path, motion):
+    write_estimate(tmp_path / "out", located(motion))
+    assert "ct_x" not in ply_columns(tmp_path / "out" / "occupancy.ply")
+    assert not (tmp_path / "out" / "points.csv").exists()
+
+
+# --- CSV ---
+
+
+@pytest.mark.parametrize("names", ["x,y,z", "ct_x,ct_y,ct_z", "l,p,s", "X, Y ,Z"])
+def test_points_keep_their_columns_and_get_their_place(tmp_path, names):
+    points = some_points()
+    lines = [f'v{n},{",".join(map(str, p))},"a, b"' for n, p in enumerate(points)]
+    path = written(tmp_path / "p.csv", "\ufeff" + "\n".join([f"name,{names},why", *lines, "", ""]))
+    table = read_points(path)
+    np.testing.assert_array_equal(table.points_ct, points)
+    rows = rows_of(camera_table(table, Wave()).decode())
+    np.testing.assert_allclose(places(rows), Wave().carry(points), atol=6e-5)
+    assert list(rows[0])[0::4] == ["name", "why"]
+    assert [row["name"] for row in rows] == [f"v{n}" for n in range(len(points))]
+    assert rows[2]["why"] == "a, b"
+    assert "std_mm" not in rows[0]
+
+
+def test_ras_columns_are_turned_to_lps(tmp_path):
+    path = written(tmp_path / "p.csv", "r,a,s\n-60,-40,-300\n")
+    np.testing.assert_array_equal(read_points(path).points_ct, [[60, 40, -300]])
+
+
+def test_how_unsure_a_point_is_stands_beside_it(tmp_path):
+    path = written(tmp_path / "p.csv", "x,y,z\n60,40,-300\n-80,40,-300\n")
+    rows = rows_of(camera_table(read_points(path), Wave(sure=True)).decode())
+    assert [float(row["std_mm"]) for row in rows] == [1.1, 1.3]
+
+
+def test_an_answer_can_be_asked_again(tmp_path):
+    path = written(tmp_path / "p.csv", "name,x,y,z\nhilum,60,40,-300\n")
+    table = read_points(path)
+    first = camera_table(table, Wave(height_mm=1, sure=True))
+    again = read_points(written(tmp_path / "q.csv", first.decode()))
+    assert again.columns == table.columns
+    assert "camera_x, camera_y, camera_z, std_mm give way" in again.notes[0]
+    assert camera_table(again, Wave(height_mm=3)) == camera_table(table, Wave(height_mm=3))
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("", "is empty"),
+        ("x,y,z\n", "holds no points"),
+        ("1,2,3\n4,5,6\n", "must name the columns x,y,z"),
+        ("x,y\n1,2\n", "must name the columns x,y,z"),
+        ("x;y;z\n1;2;3\n", "separated by commas"),
+        ("x,y,z,X\n1,2,3,4\n", "different names"),
+        ("x,y,z\n1,2,3\n1,2\n", "line 3: 2 values in 3 columns"),
+        ("x,y,z\n1,2,3\n1,2,nan\n", "line 3: .* NaN"),
+        ("x,y,z\n1,inf,3\n", "line 2: .*infinity"),
+        ("x,y,z\n1,two,3\n", "line 2: '1, two, 3' is no point"),
+        ("x,y,z\n1,,3\n", "line 2"),
+        ('x,y,z\n1,2,"3\n', "line"),
+    ],
+)
+def test_tables_that_are_none_are_refused(tmp_path, text, words):
+    with pytest.raises(InputError, match=words):
+        read_points(written(tmp_path / "p.csv", text))
+
+
+def test_files_that_are_none_are_refused(tmp_path):
+    for name, content, words in (
+        ("p.txt", b"x,y,z\n1,2,3\n", "come as .csv"),
+        ("p.csv", b"x,y,z\n\xff\xfe,2,3\n", "UTF-8"),
+        ("p.fcsv", b"\x80", "UTF-8"),
+        ("p.mrk.json", b"\x80", "no markups file"),
+    ):
+        (tmp_path / name).write_bytes(content)
+        with pytest.raises(InputError, match=words):
+            read_points(tmp_path / name)
+    with pytest.raises(InputError, match="cannot be read"):
+        read_points(tmp_path / "none.csv")
+    with pytest.raises(InputError, match="cannot be read"):
+        read_points(tmp_path)
+
+
+# --- 3D Slicer ---
+
+FCSV = """# Markups fiducial file version = 4.11
+# CoordinateSystem = {}
+# columns = id,x,y,z,ow,ox,oy,oz,vis,sel,lock,label,desc,associatedNodeID
+1,{},0,0,0,1,1,1,0,hilum,"vein, left",vtkMRMLScalarVolumeNode1
+2,1,2,3,0,0,0,1,1,1,0,F-2,,,{},0
+"""
+LPS_PLACE, RAS_PLACE = "60.5,40,-300", "-60.5,-40,-300"
+
+
+@pytest.mark.parametrize(
+    ("system", "place"),
+    [("LPS", LPS_PLACE), ("RAS", RAS_PLACE), ("1", LPS_PLACE), ("0", RAS_PLACE)],
+)
+def test_fiducial_lists_honour_their_coordinate_system(tmp_path, system, place):
+    path = written(tmp_path / "F.fcsv", FCSV.format(system, place, 2))
+    table = read_points(path)
+    sign = 1 if place == LPS_PLACE else -1
+    np.testing.assert_array_equal(table.points_ct, [[60.5, 40, -300], [sign, 2 * sign, 3]])
+    rows = rows_of(camera_table(table, Wave()).decode())
+    assert (rows[0]["label"], rows[0]["description"]) == ("hilum", "vein, left")
+    np.testing.assert_array_equal(places(rows, "ct"), table.points_ct)
+    np.testing.assert_allclose(places(rows), Wave().carry(table.points_ct), atol=6e-5)
+
+
+def test_fiducials_without_a_place_are_left_out_with_a_note(tmp_path):
+    table = read_points(written(tmp_path / "F.fcsv", FCSV.format("LPS", LPS_PLACE, 0)))
+    np.testing.assert_array_equal(table.points_ct, [[60.5, 40, -300]])
+    assert "F-2" in table.notes[0]
+
+
+def markups(system="LPS", place=(60.5, 40, -300), **more):
+    points = [
+        {"id": "1", "label": "hilum", "position": list(place), "positionStatus": "defined"},
+        {"id": "2", "label": "open", "position": [0.0, 0.0, 0.0], "positionStatus": "undefined"},
+    ]
+    one = {"type": "Fiducial", "coordinateSystem": system, "controlPoints": points, **more}
+    return {"@schema": "x", "markups": [{k: v for k, v in one.items() if v is not None}]}
+
+
+@pytest.mark.parametrize(
+    ("system", "place"), [("LPS", (60.5, 40, -300)), ("RAS", (-60.5, -40, -300))]
+)
+@pytest.mark.parametrize("units", ["mm", ["mm", "mm", "mm"], None])
+def test_markups_honour_their_coordinate_system(tmp_path, system, place, units):
+    content = markups(system, place, coordinateUnits=units)
+    content["markups"] += markups("LPS", (70, 50, -310))["markups"]
+    table = read_points(written(tmp_path / "F.mrk.json", json.dumps(content)))
+    np.testing.assert_array_equal(table.points_ct, [[60.5, 40, -300], [70, 50, -310]])
+    assert table.rows[0][0] == "hilum"
+    assert "open, open" in table.notes[0]
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (markups("IJK"), "system is IJK; it must be LPS or RAS"),
+        (markups(None), "system is missing"),
+        (markups(coordinateUnits="m"), "unit is 'm'"),
+        (markups(place=(1, 2)), "point 'hilum'"),
+        (markups(place=("a", 1, 2)), "no markups file"),
+        ({"markups": []}, "holds no points"),
+        ([1], "no markups file"),
+        ({"points": []}, "no markups file"),
+    ],
+)
+def test_markups_that_say_too_little_are_refused(tmp_path, content, words):
+    with pytest.raises(InputError, match=words):
+        read_points(written(tmp_path / "F.mrk.json", json.dumps(content)))
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (FCSV.format("2", LPS_PLACE, 2), "system is 2; it must be LPS or RAS"),
+        (FCSV.replace("# CoordinateSystem = {}\n", "").format(LPS_PLACE, 2), "system is missing"),
+        (FCSV.replace("# columns", "# names").format("LPS", LPS_PLACE, 2), "lacks '# columns"),
+        (FCSV.format("LPS", "1,b,3", 2), "point 'hilum'"),
+        (FCSV.format("LPS", "1,nan,3", 2), "NaN"),
+        ("# CoordinateSystem = LPS\n# columns = id,x,y,z\n", "holds no points"),
+    ],
+)
+def test_fiducial_lists_that_say_too_little_are_refused(tmp_path, text, words):
+    with pytest.raises(InputError, match=words):
+        read_points(written(tmp_path / "F.fcsv", text))
+
+
+# --- are they about this organ ---
+
+
+def test_points_about_the_organ_pass():
+    assert check_near_organ(some_points(), BOX, "p") == ()
+    assert check_near_organ(MIDDLE[None] + [120.0, 0, 0], BOX, "p") == ()  # 90 mm from the box
+    at_origin = np.array([[-30.0, -30, -30], [30, 30, 30]])
+    assert check_near_organ(np.zeros((1, 3)), at_origin, "p") == ()
+    assert check_near_organ(np.array([[0.0, 0, 0], [12, 0, 0]]), at_origin, "p") == ()
+
+
+@pytest.mark.parametrize(
+    ("points", "words"),
+    [
+        (some_points() * [-1, -1, 1], "are RAS, it seems"),
+        (some_points() / 1000, "in metres, it seems"),
+        (some_points() + [0, 200, 0], "every point lies more than 100 mm away"),
+        (some_points() / 10, "every point lies more than 100 mm away"),
+    ],
+)
+def test_points_in_another_frame_or_unit_are_refused(points, words):
+    with pytest.raises(InputError, match=words):
+        check_near_organ(points, BOX, "p")
+
+
+def test_metres_are_seen_where_the_organ_lies_about_the_origin():
+    with pytest.raises(InputError, match="in metres"):
+        check_near_organ((some_points() - MIDDLE) / 1000, BOX - MIDDLE, "p")
+
+
+def test_single_strays_are_told_and_kept():
+    points = np.concatenate([some_points(3), MIDDLE[None] + [0, 0, 131.0]])
+    (note,) = check_near_organ(points, BOX, "p")
+    assert "1 of 4 points" in note
+
+
+def test_a_motion_without_an_answer_is_no_answer(tmp_path):
+    table = read_points(written(tmp_path / "p.csv", "x,y,z\n1,2,3\n"))
+    with pytest.raises(NoEstimate, match="no place"):
+        camera_table(table, OneWay(lambda points: points * np.nan))
+    with pytest.raises(InputError, match="does not know"):
+        write_estimate(tmp_path / "out", located(), points=table)
+    assert not (tmp_path / "out").exists()
+
+
+# --- the command ---
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory):
+    """A model of the kind that `quick` trains, untrained."""
+    folder = tmp_path_factory.mktemp("points") / "model"
+    config = quick(anatomy())
+    network = OccupancyNetwork(config.network)
+    familiar = Familiar(spread_mm=(1.0, 100.0), fit_mm=5.0)
+    box = np.array([[-80.0] * 3, [80.0] * 3])
+    with store.new_folder(folder) as aside:
+        save_model(Model(network, config, anatomy().names, box, familiar, {}), aside)
+    return folder
+
+
+@pytest.fixture
+def cloud(tmp_path):
+    points = Wave().carry(anatomy().organ.vertices_mm).astype(np.float32)
+    write_cloud_ply(tmp_path / "cloud.ply", points)
+    return tmp_path / "cloud.ply"
+
+
+def test_a_model_without_correspondences_refuses_before_any_work(model, tmp_path):
+    line = refusal(
+        tumortrack("locate", model, "no_cloud.ply", tmp_path / "out", "--map", "no_points.csv")
+    )
+    assert "--preset clinic" in line
+    assert not (tmp_path / "out").exists()
+
+
+def _block(box_mm):
+    block = trimesh.creation.box(bounds=box_mm)
+    return block.vertices, block.faces
+
+
+class Knowing:
+    """Stands in for the tracker of a model that knows correspondences."""
+
+    anatomy_ct = Anatomy((Mesh(*_block(BOX)),))
+    asked = 0
+
+    def __init__(self, model):
+        pass
+
+    def locate(self, cloud, grid, seed):
+        Knowing.asked += 1
+        return located(Wave(sure=True))
+
+
+def test_locate_writes_where_the_points_are(model, cloud, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr("tumortrack.tracking.tracker.Tracker", Knowing)
+    monkeypatch.setattr("tumortrack.training.model_folder.has_shape", lambda _: True)
+    points = np.concatenate([some_points(4), MIDDLE[None] + [0, 0, 131.0]])
+    lines = [f"{n},{','.join(map(str, p))}" for n, p in enumerate(points)]
+    asked = written(tmp_path / "asked.csv", "\n".join(["label,ct_x,ct_y,ct_z", *lines]))
+    options = commands.LocateOptions(map_points=asked)
+    commands.locate(model, cloud, tmp_path / "out", options)
+    rows = rows_of((tmp_path / "out" / "points.csv").read_text())
+    np.testing.assert_allclose(places(rows), Wave().carry(points), atol=6e-5)
+    assert float(rows[0]["std_mm"]) == pytest.approx(0.5 + abs(points[0, 0]) / 100, abs=6e-5)
+    report = json.loads((tmp_path / "out" / "report.json").read_text())
+    assert report["map"]["points"] == 5
+    assert report["map"]["sha256"] == store.sha256_of(asked)
+    assert any("1 of 5 points" in note for note in report["notes"])
+    said = capsys.readouterr().out
+    assert "1 of 5 points" in said
+    assert "points.csv" in said
+    assert "points.csv" in store.read_manifest(tmp_path / "out", "run")["files"]
+    # The answer may be asked again, into the same folder.
+    again = replace(options, map_points=tmp_path / "out" / "points.csv", overwrite=True)
+    commands.locate(model, cloud, tmp_path / "out", again)
+    assert rows_of((tmp_path / "out" / "points.csv").read_text()) == rows
+
+
+def test_points_that_cannot_be_meant_cost_no_locating(model, cloud, tmp_path, monkeypatch):
+    monkeypatch.setattr("tumortrack.tracking.tracker.Tracker", Knowing)
+    monkeypatch.setattr("tumortrack.training.model_folder.has_shape", lambda _: True)
+    monkeypatch.setattr(Knowing, "asked", 0)
+    asked = written(tmp_path / "asked.csv", "x,y,z\n-60,-40,-300\n")
+    with pytest.raises(InputError, match="RAS"):
+        commands.locate(model, cloud, tmp_path / "out", commands.LocateOptions(map_points=asked))
+    assert Knowing.asked == 0
+    assert not (tmp_path / "out").exists()

@@ -1,0 +1,249 @@
+"""Target registration error: targets in scenes, the figure in reports."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import trimesh
+
+from motions import Wave
+from stories import succeeded, tumortrack, write_phantom_case
+from tumortrack.core.config import to_builtins
+from tumortrack.core.errors import InputError, NoEstimate
+from tumortrack.core.estimate import Estimate
+from tumortrack.core.geometry import transform_points
+from tumortrack.core.motion import OneWay
+from tumortrack.core.types import (
+    Anatomy,
+    CameraLabels,
+    DepthFrame,
+    Mesh,
+    OccupancyCloud,
+    SensorCloud,
+)
+from tumortrack.imaging.case import load_case
+from tumortrack.report.metrics import label_grid, target_errors
+from tumortrack.report.page import target_text
+from tumortrack.report.protocol import evaluate_scene, evaluate_scenes, summarise, summary_table
+from tumortrack.sense.camera import d405
+from tumortrack.simulate.occupancy import labels_of
+from tumortrack.simulate.scene_folder import Scene, read_scene, write_scene
+from tumortrack.simulate.targets import Targets, draw_targets, read_targets
+from tumortrack_lab.twin.faults import faulty
+from tumortrack_lab.twin.variants import ViewConfig
+
+
+def ball(radius_mm, center_mm=(0.0, 0.0, 0.0)):
+    solid = trimesh.creation.icosphere(3, radius_mm)
+    return Mesh(solid.vertices + np.array(center_mm), solid.faces)
+
+
+def anatomy_ct():
+    return Anatomy((ball(22), ball(7, (6, 3, -2))))
+
+
+def truth():
+    return Anatomy(tuple(p.moved(Wave().carry(p.vertices_mm)) for p in anatomy_ct().parts))
+
+
+def scene(with_targets=True):
+    inner = draw_targets(anatomy_ct(), 0)
+    targets = inner.at(Wave().carry(inner.points_ct)) if with_targets else None
+    return Scene(SensorCloud(truth().organ.vertices_mm), truth(), targets=targets)
+
+
+def estimate(motion):
+    """The truth, with this motion."""
+    camera_from_index = np.eye(4)
+    camera_from_index[:3, 3] = truth().organ.box_mm[0] - 2
+    labels = label_grid(truth(), camera_from_index, (56, 56, 56))
+    points_mm = np.argwhere(labels) + camera_from_index[:3, 3]
+    meshes = dict(zip(truth().names, truth().parts, strict=True))
+    cloud = OccupancyCloud(points_mm, labels[labels > 0], np.ones(len(points_mm)))
+    return Estimate(cloud, CameraLabels(labels, camera_from_index), meshes, {}, motion)
+
+
+def shifted(distance_mm):
+    return OneWay(lambda points: Wave().carry(points) + [0.0, distance_mm, 0.0])
+
+
+# --- the figure ---
+
+
+def test_known_errors_give_known_figures():
+    ct = np.zeros((100, 3))
+    targets = Targets(ct, ct, np.ones(100, np.uint8))
+    errors = np.arange(1.0, 101.0)
+    motion = OneWay(lambda points: points + errors[:, None] * [0.6, 0.0, 0.8])
+    found = target_errors(motion, targets)
+    assert found["mean"] == pytest.approx(50.5)
+    assert found["median"] == pytest.approx(50.5)
+    assert found["rms"] == pytest.approx(np.sqrt(101 * 201 / 6))
+    assert found["p95"] == pytest.approx(95.05)
+    assert found["max"] == pytest.approx(100)
+    assert found["count"] == 100
+
+
+def test_the_true_motion_has_no_error_and_a_rigid_one_has_the_waves():
+    targets = scene().targets
+    assert target_errors(Wave(), targets)["max"] < 1e-9
+    rigid = target_errors(Wave(height_mm=0.0), targets)
+    ct = targets.points_ct
+    wave = 5 * np.abs(np.sin(ct @ [0.02, 0.05, 0.01]))
+    assert rigid["max"] == pytest.approx(wave.max())
+    assert rigid["mean"] == pytest.approx(wave.mean())
+    assert rigid["mean"] > 1
+
+
+# --- scenes hold targets ---
+
+
+def test_a_negative_seed_is_refused():
+    with pytest.raises(InputError, match="seed -1 must be 0 or more"):
+        draw_targets(anatomy_ct(), -1)
+
+
+def test_targets_come_back_from_a_scenes_folder(tmp_path):
+    made = scene()
+    write_scene(tmp_path / "scene", made)
+    back = read_scene(tmp_path / "scene").targets
+    np.testing.assert_allclose(back.points_ct, made.targets.points_ct, atol=6e-6)
+    np.testing.assert_allclose(back.points_mm, made.targets.points_mm, atol=6e-6)
+    np.testing.assert_array_equal(back.labels, made.targets.labels)
+    assert np.bincount(back.labels).tolist() == [0, 100, 100]
+    write_scene(tmp_path / "without", scene(with_targets=False))
+    assert read_scene(tmp_path / "without").targets is None
+
+
+HEAD = "label,ct_x,ct_y,ct_z,camera_x,camera_y,camera_z\n"
+
+
+def test_targets_of_other_programs_are_read(tmp_path):
+    path = tmp_path / "targets.csv"
+    path.write_text("name,camera_z,camera_y,camera_x,ct_z,ct_y,ct_x,label\na,6,5,4,3,2,1,2\n")
+    found = read_targets(path)
+    np.testing.assert_array_equal(found.points_ct, [[1, 2, 3]])
+    np.testing.assert_array_equal(found.points_mm, [[4, 5, 6]])
+    assert found.labels.tolist() == [2]
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("", "has no rows"),
+        (HEAD, "has no rows"),
+        ("label,x,y,z\n1,2,3,4\n", "lacks the columns ct_x"),
+        (HEAD + "1,2,3,4,5,6\n", "no target"),
+        (HEAD + "1,2,3,4,5,6,nan\n", "NaN"),
+        (HEAD + "1,2,3,4,5,6,seven\n", "no target"),
+        (HEAD + "0,2,3,4,5,6,7\n", "labels must be"),
+        (HEAD + "1.5,2,3,4,5,6,7\n", "labels must be"),
+        (HEAD + "-1,2,3,4,5,6,7\n", "labels must be"),
+        (HEAD + "300,2,3,4,5,6,7\n", "labels must be"),
+    ],
+)
+def test_broken_targets_are_refused_with_their_scene(tmp_path, text, words):
+    write_scene(tmp_path / "scene", scene(with_targets=False))
+    (tmp_path / "scene" / "targets.csv").write_text(text)
+    with pytest.raises(InputError, match=words):
+        read_scene(tmp_path / "scene")
+
+
+def test_simulate_writes_targets_that_follow_the_organ(tmp_path):
+    write_phantom_case(tmp_path / "case")
+    command = ["simulate", tmp_path / "case", tmp_path / "scenes", "--scenes", 2, "--squeeze"]
+    succeeded(tumortrack(*command))
+    case = load_case(tmp_path / "case")
+    first, second = (read_scene(tmp_path / "scenes" / name) for name in ("0000", "0001"))
+    np.testing.assert_array_equal(first.targets.points_ct, second.targets.points_ct)
+    for made in (first, second):
+        targets = made.targets
+        assert len(targets.labels) == 200
+        np.testing.assert_array_equal(labels_of(case.anatomy, targets.points_ct), targets.labels)
+        # Where the deformed surfaces are, not only where the pose is. Points within a hair of a
+        # triangulated surface may change sides.
+        assert (labels_of(made.reference, targets.points_mm) == targets.labels).mean() > 0.98
+        posed = transform_points(np.array(made.meta["camera_from_ct"]), targets.points_ct)
+        assert np.linalg.norm(posed - targets.points_mm, axis=1).max() > 2
+    # The same command makes the same targets.
+    before = (tmp_path / "scenes" / "0001" / "targets.csv").read_bytes()
+    folder = tmp_path / "again"
+    succeeded(tumortrack(*command[:2], folder, *command[3:]))
+    assert (folder / "0001" / "targets.csv").read_bytes() == before
+
+
+def test_a_registration_fault_moves_the_targets_with_the_truth():
+    camera = d405(424, 240)
+    depth = DepthFrame(np.full((240, 424), 130.0, np.float32), camera)
+    meta = {"view": "clean", "view_config": to_builtins(ViewConfig())}
+    clean = replace(scene(), depth=depth, meta=meta)
+    moved = faulty(clean, "registration", 3)
+    camera_from_camera = np.array(moved.meta["registration"])
+    expected = transform_points(camera_from_camera, clean.targets.points_mm)
+    np.testing.assert_allclose(moved.targets.points_mm, expected, atol=1e-12)
+    assert np.linalg.norm(moved.targets.points_mm - clean.targets.points_mm, axis=1).min() > 0.1
+    np.testing.assert_array_equal(faulty(clean, "noise", 3).targets.points_mm,
+                                  clean.targets.points_mm)  # fmt: skip
+
+
+# --- the protocol ---
+
+
+def test_an_entry_has_the_error_where_it_can_be_measured():
+    entry, _ = evaluate_scene(lambda _: estimate(shifted(2.5)), scene(), "s")
+    assert entry["tre_mm"]["mean"] == pytest.approx(2.5)
+    assert entry["tre_mm"]["max"] == pytest.approx(2.5)
+    assert entry["tre_mm"]["count"] == 200
+    assert "tre_mm" not in evaluate_scene(lambda _: estimate(None), scene(), "s")[0]
+    plain = scene(with_targets=False)
+    assert "tre_mm" not in evaluate_scene(lambda _: estimate(Wave()), plain, "s")[0]
+
+
+def nothing(_):
+    raise NoEstimate("no organ was found")
+
+
+def test_a_scene_where_nothing_was_found_is_infinitely_far():
+    failed, _ = evaluate_scene(nothing, scene(), "s")
+    assert failed["tre_mm"] is None
+    entries = [evaluate_scene(lambda _, d=d: estimate(shifted(d)), scene(), "s")[0] for d in (1, 3)]
+    assert summarise(entries)["tre_mm"]["mean"] == pytest.approx(2)
+    one = summarise([*entries, failed])["tre_mm"]
+    assert (one["median"], one["scenes"]) == (pytest.approx(3), 3)
+    assert summarise([*entries, failed, failed])["tre_mm"]["mean"] is None
+    # Without any answer there is nothing to say of a motion; without targets neither.
+    assert "tre_mm" not in summarise([failed, failed])
+    lost, _ = evaluate_scene(nothing, scene(with_targets=False), "s")
+    assert "tre_mm" not in lost
+    assert summarise([*entries, lost])["tre_mm"]["scenes"] == 2
+
+
+@pytest.fixture(scope="module")
+def evaluated(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("tre")
+    for n in range(3):
+        write_scene(folder / "scenes" / f"scene_{n}", scene())
+    answers = iter([shifted(1.25), shifted(4.5), shifted(2.0)])
+    report = evaluate_scenes(
+        lambda _: estimate(next(answers)), folder / "scenes", folder / "report"
+    )
+    return folder / "report", report
+
+
+def test_report_page_and_table_tell_the_error(evaluated):
+    out, report = evaluated
+    assert json.loads((out / "report.json").read_text()) == report
+    assert report["summary"]["tre_mm"]["mean"] == pytest.approx(2.0, abs=1e-4)
+    assert report["summary"]["tre_mm"]["scenes"] == 3
+    assert "infinite" in report["rule"]
+    page = (out / "index.html").read_text()
+    assert "Target registration error, medians over 3 scenes: mean 2.00 mm" in page
+    assert "target error 4.5 mm (mean of 200, largest 4.5 mm)" in page
+    assert target_text(report["scenes"][1]["tre_mm"]) in page
+    table = summary_table(report)
+    assert "target error 2.0 mm" in str(table.title)
+    assert [str(cell) for cell in table.columns[0].cells] == ["kidney", "tumor_1"]
+    assert "<th>tre" not in page  # the table holds parts alone
