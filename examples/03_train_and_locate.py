@@ -17,10 +17,10 @@ from tumortrack.simulate.bodies import body_for
 from tumortrack.simulate.scene import SceneRecipe, Simulator
 from tumortrack.tracking.tracker import Tracker
 from tumortrack.training.presets import clinic
-from tumortrack.training.train import Run, Status, train
+from tumortrack.training.train import TrainingRun, TrainingStatus, train
 
 
-def show(status: Status) -> None:
+def show(status: TrainingStatus) -> None:
     print(f"step {status.step}: loss {status.loss:.3f}, validation mIoU {status.miou}")
 
 
@@ -30,7 +30,7 @@ def main(out: Path, steps: int) -> None:
     config = msgspec.structs.replace(
         clinic(case.anatomy), batch_size=16, validation_pairs=8, validation_points=512
     )
-    run = Run(
+    run = TrainingRun(
         anatomy_ct=case.anatomy,
         up_lps=case.up_lps,
         case_sha256=sha256_of(out / "case" / MANIFEST),

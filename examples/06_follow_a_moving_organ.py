@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 
 from tumortrack.live.loop import Loop, LoopConfig, summary
-from tumortrack.live.sink_worker import Outlet
-from tumortrack.live.source_worker import Reader
-from tumortrack.live.sources.virtual import Virtual
-from tumortrack.live.values import Frames, Setting, Update
+from tumortrack.live.sink_worker import SinkWorker
+from tumortrack.live.source_worker import SourceWorker
+from tumortrack.live.sources.virtual import VirtualSourceConfig
+from tumortrack.live.values import PublishedFrame, SinkContext, TrackingResult
 from tumortrack.sense.cloud import CloudConfig
 from tumortrack.sense.region import RegionConfig
 from tumortrack.tracking.tracker import Tracker
@@ -23,7 +23,7 @@ from tumortrack.training.model import load_model
 class Teller:
     """A sink is any object with ``publish`` and ``close``: this one says where tumor 1 is."""
 
-    def publish(self, update: Update) -> None:
+    def publish(self, update: TrackingResult) -> None:
         placed = update.placed
         if placed is None:
             print(f"no estimate: {update.reason}")  # never the last answer again
@@ -43,15 +43,15 @@ class Teller:
 
 def main(out: Path, model_folder: Path, frames: int) -> None:
     tracker = Tracker(load_model(model_folder))
-    setting = Setting(tracker.model.parts, Frames(), tracker.anatomy_ct)
+    setting = SinkContext(tracker.model.parts, PublishedFrame(), tracker.anatomy_ct)
     # Everything that the camera sees goes in; the organ is found in it. Depths in mm.
     region = RegionConfig(crop=CloudConfig(near_mm=75, far_mm=340))
     loop = Loop(tracker, setting, LoopConfig(region=region))
     loop.warm()
-    outlet = Outlet("teller", Teller(), waiting=1)  # a slow sink gets the newest update
-    reader = Reader(Virtual(case=out / "case", fps=10).open)
+    outlet = SinkWorker("teller", Teller(), waiting=1)  # a slow sink gets the newest update
+    reader = SourceWorker(VirtualSourceConfig(case=out / "case", fps=10).open)
 
-    def enough(update: Update) -> None:
+    def enough(update: TrackingResult) -> None:
         if loop.counts["good"] + loop.counts["poor"] >= frames:
             loop.stop()
 

@@ -12,7 +12,7 @@ import numpy as np
 from tumortrack.core.errors import NoPlan
 from tumortrack.core.types import Anatomy
 from tumortrack.imaging.case import load_case
-from tumortrack.plan.arms.cell import Cell
+from tumortrack.plan.arms.cell import ArmCell
 from tumortrack.plan.arms.config import CellConfig
 from tumortrack.plan.arms.procedure import plan_motions
 from tumortrack.plan.config import ResectionConfig
@@ -66,7 +66,7 @@ def main(out: Path) -> None:
 
     draw_plan(plan, seen, out / "plan.png")
     print(f"look at {out / 'plan.png'}")
-    motions = plan_motions(plan, Cell(CellConfig(), truth.organ), truth.organ)
+    motions = plan_motions(plan, ArmCell(CellConfig(), truth.organ), truth.organ)
     print("arms: " + ", ".join(f"{stage.name} {stage.seconds:.1f} s" for stage in motions.stages))
 
 

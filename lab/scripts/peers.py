@@ -20,7 +20,7 @@ from tumortrack.simulate.scene_folder import Scene, list_scenes, read_scene
 from tumortrack_lab.peers.base import Peer
 from tumortrack_lab.peers.bcpd import Bcpd, BcpdConfig
 from tumortrack_lab.peers.cpd import Cpd
-from tumortrack_lab.peers.elastic import Elastic
+from tumortrack_lab.peers.elastic import ElasticPeer
 from tumortrack_lab.peers.rigid import Rigid, RigidConfig
 from tumortrack_lab.peers.rigid_bound import RigidBound, matched_vertices
 
@@ -32,7 +32,7 @@ def makers(case: Case, program: str | None) -> dict[str, Callable[[], Peer]]:
         "rigid": lambda: Rigid(anatomy, up),
         "rigid_any_rotation": lambda: Rigid(anatomy, up, RigidConfig(orientation="unknown")),
         "cpd": lambda: Cpd(anatomy, up),
-        "elastic": lambda: Elastic(anatomy, up),
+        "elastic": lambda: ElasticPeer(anatomy, up),
     }
     if program:
         kinds["bcpd"] = lambda: Bcpd(anatomy, up, BcpdConfig(program=program))

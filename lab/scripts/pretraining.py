@@ -29,22 +29,22 @@ from tumortrack.imaging.case import Case, load_case
 from tumortrack.phantom.digital import PhantomParameters
 from tumortrack.registration.canonical_frame import carry_over, upright_of
 from tumortrack.registration.hypotheses import best_fit, first_motions
-from tumortrack.registration.motion import WarpMotion
-from tumortrack.registration.network import WarpNetwork
-from tumortrack.registration.rest_shape import Shape, shape_of
+from tumortrack.registration.motion import ElasticMotion
+from tumortrack.registration.network import RegistrationNetwork
+from tumortrack.registration.rest_shape import RestShape, shape_of
 from tumortrack.report.drawing import new_figure, save
 from tumortrack.simulate.bodies import body_for
 from tumortrack.simulate.dataset import SceneStream
 from tumortrack.simulate.occupancy import organ_pool
 from tumortrack.simulate.scene import Simulator
-from tumortrack.training.head_start import Start, load_start
+from tumortrack.training.head_start import HeadStart, load_start
 from tumortrack.training.loader import batches
 from tumortrack.training.presets import clinic
-from tumortrack.training.registration_task import WarpCourse
-from tumortrack.training.run import Run
+from tumortrack.training.registration_task import RegistrationTask
+from tumortrack.training.run import TrainingRun
 from tumortrack.training.state import TrainingState
 from tumortrack.training.validate import ValidationScenes, mean_iou_of, validation_scenes
-from tumortrack_lab.study.book import Book
+from tumortrack_lab.study.book import ReportWriter
 from tumortrack_lab.study.markdown import table
 from tumortrack_lab.study.phantoms import phantom_case
 
@@ -106,7 +106,7 @@ def main(options: Options) -> None:
             rows += [{"case": name, "seed": seed, **row} for row in known["rows"]]
     command = shlex.join(["make", "headstart", f"ARGS={shlex.join(sys.argv[1:])}"])
     about = store.read_manifest(options.start, "pretrained")["provenance"]
-    _write(rows, about, Book(options.document, command))
+    _write(rows, about, ReportWriter(options.document, command))
 
 
 def _cases(options: Options) -> list[tuple[str, Path]]:
@@ -122,12 +122,12 @@ def _cases(options: Options) -> list[tuple[str, Path]]:
 
 
 def _curve(
-    case: Case, judge: Judge, start: Start, seed: int, lengths: tuple[int, ...]
+    case: Case, judge: Judge, start: HeadStart, seed: int, lengths: tuple[int, ...]
 ) -> list[dict]:
     """All trainings of one case and seed, side by side over the same batches."""
     device, config = torch.device("cpu"), clinic(case.anatomy)
-    run = Run(case.anatomy, case.up_lps, "", config, seed, steps=max(*lengths, 1))
-    course = WarpCourse(run, device)
+    run = TrainingRun(case.anatomy, case.up_lps, "", config, seed, steps=max(*lengths, 1))
+    course = RegistrationTask(run, device)
     shape = shape_of(case.anatomy, course.body)
     upright = upright_of(case.anatomy.organ, case.up_lps, shape.body.center_ct, shape.long_axis)
     states: dict[tuple[int, bool], TrainingState] = {}
@@ -152,7 +152,9 @@ def _curve(
     return rows
 
 
-def _row(judge: Judge, shape: Shape, state: TrainingState, steps: int, pretrained: bool) -> dict:
+def _row(
+    judge: Judge, shape: RestShape, state: TrainingState, steps: int, pretrained: bool
+) -> dict:
     row = {"steps": steps, "pretrained": pretrained, **judge.figures(state.average, shape)}
     say(" ".join(f"{k}={v if not isinstance(v, float) else round(v, 2)}" for k, v in row.items()))
     return row
@@ -170,7 +172,7 @@ class Judge:
         self._refine = config.refine
         self._scenes: ValidationScenes = validation_scenes(simulator, pool, few, UNSEEN_SEED)
 
-    def figures(self, network: WarpNetwork, shape: Shape) -> dict[str, float]:
+    def figures(self, network: RegistrationNetwork, shape: RestShape) -> dict[str, float]:
         """Target errors (a scene's mean; then the scenes' median and 90th percentile), before and
         after refinement, and mIoU of the refined labels."""
         network.eval()
@@ -195,11 +197,11 @@ class Judge:
         }
 
 
-def _error_mm(motion: WarpMotion, points_ct: np.ndarray, points_mm: np.ndarray) -> float:
+def _error_mm(motion: ElasticMotion, points_ct: np.ndarray, points_mm: np.ndarray) -> float:
     return float(np.linalg.norm(motion.carry(points_ct) - points_mm, axis=1).mean())
 
 
-def _write(rows: list[dict], about: dict, book: Book) -> None:
+def _write(rows: list[dict], about: dict, book: ReportWriter) -> None:
     """The block: one table and picture over all cases."""
     cells: dict[tuple, list[dict]] = {}
     for row in rows:

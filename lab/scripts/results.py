@@ -28,11 +28,11 @@ from tumortrack.core.errors import InputError, TumortrackError
 from tumortrack.core.store import write_json
 from tumortrack.phantom.digital import PhantomParameters, second_phantom
 from tumortrack.training.presets import clinic, quick
-from tumortrack.training.train import Status as TrainStatus
-from tumortrack_lab.study.book import Book, gallery_block, section_blocks
+from tumortrack.training.train import StudyStatus as TrainStatus
+from tumortrack_lab.study.book import ReportWriter, gallery_block, section_blocks
 from tumortrack_lab.study.bound import BOUNDS, Bound
-from tumortrack_lab.study.cells import CellStore
-from tumortrack_lab.study.measure import Job, Status, StudyCase, measure
+from tumortrack_lab.study.cells import MeasurementStore
+from tumortrack_lab.study.measure import Job, StudyCase, StudyStatus, measure
 from tumortrack_lab.study.methods import Method, Network
 from tumortrack_lab.study.models import CLINIC, MODELS, Presets, Trainer
 from tumortrack_lab.study.peer_methods import peer_method
@@ -129,8 +129,8 @@ def main(options: Options) -> None:
         document = out / "results.md"
         shutil.copyfile(options.document, document)
     given = shlex.join(sys.argv[1:])
-    book = Book(document, "make results" + (f" ARGS='{given}'" if given else ""))
-    cells = CellStore(out / "cells")
+    book = ReportWriter(document, "make results" + (f" ARGS='{given}'" if given else ""))
+    cells = MeasurementStore(out / "cells")
     studied, second = _cases(options, out)
     methods = _methods(options, plan, out)
     for section in options.sections:
@@ -252,7 +252,7 @@ class Measuring(Lines):
         super().__init__()
         self._section = section
 
-    def show(self, status: Status) -> None:
+    def show(self, status: StudyStatus) -> None:
         self.line(
             f"{self._section}: {status.done}/{status.total}, {status.seconds_per_cell:.1f} s each, "
             f"{_clock(status.seconds_left)} left ({status.name})",

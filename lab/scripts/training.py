@@ -35,7 +35,7 @@ from tumortrack.models.config import TrainConfig
 from tumortrack.occupancy.network import OccupancyNetwork
 from tumortrack.phantom.digital import PhantomParameters
 from tumortrack.registration.hypotheses import first_motions
-from tumortrack.registration.network import WarpNetwork
+from tumortrack.registration.network import RegistrationNetwork
 from tumortrack.registration.rest_shape import shape_of
 from tumortrack.report.drawing import new_figure, save
 from tumortrack.simulate.bodies import body_for
@@ -45,7 +45,7 @@ from tumortrack.simulate.scene import Simulator
 from tumortrack.training.loader import batches
 from tumortrack.training.networks import Network
 from tumortrack.training.presets import PRESETS, clinic, quick
-from tumortrack.training.run import Run
+from tumortrack.training.run import TrainingRun
 from tumortrack.training.schedule import settle_end
 from tumortrack.training.state import TrainingState
 from tumortrack.training.task import course_of
@@ -55,7 +55,7 @@ from tumortrack.training.validate import (
     mean_iou_of,
     validation_scenes,
 )
-from tumortrack_lab.study.book import Book
+from tumortrack_lab.study.book import ReportWriter
 from tumortrack_lab.study.markdown import table
 from tumortrack_lab.study.phantoms import phantom_case
 
@@ -152,13 +152,15 @@ def main(options: Options) -> None:
         last = rows[-1][1][-1]
         say(f"{setting.name}: " + " ".join(f"{k}={round(v, 3)}" for k, v in last.items()))
     given = f" ARGS='{shlex.join(sys.argv[1:])}'" if sys.argv[1:] else ""
-    _write(rows, options, Book(options.document, f"make training-speed{given}"))
+    _write(rows, options, ReportWriter(options.document, f"make training-speed{given}"))
 
 
 def _curve(case: Case, setting: Setting, judge: Judge, options: Options) -> list[dict]:
     """A training of so many seconds; judging does not count."""
     config = setting.config(case)
-    run = Run(case.anatomy, case.up_lps, "", config, setting.seed, minutes=options.seconds / 60)
+    run = TrainingRun(
+        case.anatomy, case.up_lps, "", config, setting.seed, minutes=options.seconds / 60
+    )
     course = course_of(run, CPU)
     state = TrainingState(run, CPU)
     state.know(course.teach)
@@ -207,7 +209,7 @@ class Judge:
         network.eval()
         if isinstance(network, OccupancyNetwork):
             return ValidationSet(scenes, self._parts, CPU).miou(network)
-        assert isinstance(network, WarpNetwork)
+        assert isinstance(network, RegistrationNetwork)
         assert self._shape is not None
         guesses = []
         for cloud, points_mm in zip(scenes.clouds_mm, scenes.points_mm, strict=True):
@@ -234,7 +236,7 @@ def _groups(rows: Rows) -> dict[tuple, list[list[dict]]]:
     return groups
 
 
-def _write(rows: Rows, options: Options, book: Book) -> None:
+def _write(rows: Rows, options: Options, book: ReportWriter) -> None:
     head = ["preset", "batch", "per side", "learning rate", "samples/s", "mIoU", "other kind"]
     body = []
     for (preset, batch, per_side, rate), curves in sorted(

@@ -24,11 +24,11 @@ from tumortrack_lab.bench.naive.occupancy import NaiveOccupancy
 from tumortrack_lab.bench.naive.scenes import flowed
 from tumortrack_lab.bench.plan import Wish, tasks_of
 from tumortrack_lab.bench.report import BLOCKS, write_bench
-from tumortrack_lab.bench.row import Bench, Peaks, Point, Row, Work
+from tumortrack_lab.bench.row import BenchResult, BenchRow, Peaks, Point, Work
 from tumortrack_lab.bench.subject import Subject
 from tumortrack_lab.bench.suite import GROUPS
 from tumortrack_lab.bench.tasks import Task, carry_out
-from tumortrack_lab.bench.turns import Timing, Uncounted, in_turns, timing_of
+from tumortrack_lab.bench.turns import InterleavedTiming, Uncounted, in_turns, timing_of
 from tumortrack_lab.cli import bench as benching
 from tumortrack_lab.cli.bench import BenchOptions
 from tumortrack_lab.study.markdown import closing, opening
@@ -38,7 +38,7 @@ PAPER_DECODER = MlpDecoderConfig(
 )
 
 
-def timing(median_s: float) -> Timing:
+def timing(median_s: float) -> InterleavedTiming:
     return timing_of([0.9 * median_s, median_s, 1.2 * median_s])
 
 
@@ -117,7 +117,7 @@ def test_the_naive_network_is_the_network(config: NetworkConfig) -> None:
 
 
 def test_the_naive_flow_is_the_flow() -> None:
-    from tumortrack.simulate.elastic.body import Body
+    from tumortrack.simulate.elastic.body import ElasticBody
 
     rng = np.random.default_rng(0)
     waves = np.sin(np.linspace(0, 3, 7))[:, None, None, None, None] * rng.normal(
@@ -125,7 +125,7 @@ def test_the_naive_flow_is_the_flow() -> None:
     )
     smooth = (waves + np.roll(waves, 1, 1) + np.roll(waves, 1, 2)).astype(np.float32)
     states = rng.normal(size=(5, 2)).astype(np.float32)
-    body = Body(np.zeros(3, np.float32), 20.0, np.full(3, 60.0), smooth, states)
+    body = ElasticBody(np.zeros(3, np.float32), 20.0, np.full(3, 60.0), smooth, states)
     points = rng.uniform(25, 95, (200, 3)).astype(np.float32)
     moved = body.carry(states[0], points)
     assert np.linalg.norm(moved - points, axis=1).max() > 1.0
@@ -142,8 +142,8 @@ def test_peak_memory_is_seen() -> None:
     assert 0.95 * 2**27 < held - before < 1.5 * 2**27
 
 
-def some_bench() -> Bench:
-    row = Row(
+def some_bench() -> BenchResult:
+    row = BenchRow(
         name="frame",
         what="paper",
         threads=2,
@@ -154,7 +154,9 @@ def some_bench() -> Bench:
         work=Work(flops=1.5e11, bytes=1e6, precision="bf16"),
         agreement=0.99941,
     )
-    follow = Row(name="tracking frame", what="clinic", threads=2, item="frame", ours=timing(0.006))
+    follow = BenchRow(
+        name="tracking frame", what="clinic", threads=2, item="frame", ours=timing(0.006)
+    )
     points = tuple(
         Point(curve=curve, what=what, size=size, seconds=size * 1e-4, peak_bytes=size * 10**6)
         for curve in ("queries", "batch")
@@ -164,7 +166,9 @@ def some_bench() -> Bench:
     peaks = (Peaks(threads=2, gemm={"fp32": 1e11, "bf16": 5e12}, triad=4e10),)
     machine = {"processor": "a processor", "GPU": "none at hand", "date": "2026-01-02"}
     rows = (row, follow)
-    return Bench(machine=machine, command="the command", peaks=peaks, rows=rows, points=points)
+    return BenchResult(
+        machine=machine, command="the command", peaks=peaks, rows=rows, points=points
+    )
 
 
 def test_goals_are_judged_by_what_was_measured() -> None:

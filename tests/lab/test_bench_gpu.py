@@ -6,7 +6,7 @@ import time
 from tumortrack.training.presets import quick
 from tumortrack_lab.bench import frames, gpu, turns, volume
 from tumortrack_lab.bench.goals import goals_table
-from tumortrack_lab.bench.row import Bench, Row
+from tumortrack_lab.bench.row import BenchResult, BenchRow
 from tumortrack_lab.bench.subject import Subject
 from tumortrack_lab.bench.training import WHOLE
 from tumortrack_lab.bench.turns import in_turns, timing_of
@@ -34,7 +34,7 @@ def test_long_calls_have_three_turns_the_first_among_them(monkeypatch) -> None:
 
 
 def test_goals_of_a_gpu_are_judged_where_there_is_one() -> None:
-    step = Row(
+    step = BenchRow(
         name=WHOLE,
         what="paper",
         threads=2,
@@ -43,7 +43,7 @@ def test_goals_of_a_gpu_are_judged_where_there_is_one() -> None:
         ours=timing_of([0.004, 0.005, 0.006]),
         device="cuda",
     )
-    bench = Bench(machine={"GPU": "a GPU"}, command="the command", rows=(step,))
+    bench = BenchResult(machine={"GPU": "a GPU"}, command="the command", rows=(step,))
     lines = [line for line in goals_table(bench).splitlines() if "H100" in line]
     (training,) = [line for line in lines if "training" in line]
     assert training.endswith("| 12,800/s on a GPU | yes |")

@@ -14,7 +14,7 @@ import trimesh
 from tumortrack.core.errors import InputError
 from tumortrack.core.solids import mesh_of, solid_of
 from tumortrack.core.types import Anatomy, Mesh
-from tumortrack.plan.values import Cut, Layer, ResectionPlan
+from tumortrack.plan.values import Cut, CutLayer, ResectionPlan
 from tumortrack_lab.cut.resection import cut
 from tumortrack_lab.cut.severing import Severed, pieces_of, within
 
@@ -67,7 +67,7 @@ def plan(layers, cuts=None, tumor="tumor_1"):
 
 
 def prism(ring, bottom_mm=0.0):
-    return Layer(bottom_mm, np.inf, (ring,))
+    return CutLayer(bottom_mm, np.inf, (ring,))
 
 
 @pytest.fixture(scope="module")
@@ -116,8 +116,8 @@ def test_layers_that_grow_narrower_come_away_as_a_staircase():
     truth = Anatomy((block([-20, -20, 0], [20, 20, 20]), ball(4, (0, 0, 13))))
     stairs = [
         prism(square((-12, -12), (12, 12)), 14.0),
-        Layer(9.0, 14.0, (square((-9, -9), (9, 9)),)),
-        Layer(6.0, 9.0, (square((-6, -6), (6, 6)),)),
+        CutLayer(9.0, 14.0, (square((-9, -9), (9, 9)),)),
+        CutLayer(6.0, 9.0, (square((-6, -6), (6, 6)),)),
     ]
     result = cut(truth, plan(stairs))
     assert result.detached
@@ -128,7 +128,10 @@ def test_layers_that_grow_narrower_come_away_as_a_staircase():
 
 def test_a_layer_wider_than_the_one_above_it_still_hangs_by_its_rim():
     truth = Anatomy((block([-20, -20, 0], [20, 20, 20]), ball(4, (0, 0, 10))))
-    layers = [prism(square((-6, -6), (6, 6)), 14.0), Layer(4.0, 14.0, (square((-9, -9), (9, 9)),))]
+    layers = [
+        prism(square((-6, -6), (6, 6)), 14.0),
+        CutLayer(4.0, 14.0, (square((-9, -9), (9, 9)),)),
+    ]
     result = cut(truth, plan(layers))
     assert not result.detached
     assert (result.removed_share, result.enclosed_share, result.healthy_ml) == (0.0, 1.0, 0.0)
@@ -179,7 +182,7 @@ def test_a_strand_that_tears_holds_nothing():
     """The gap is 1.5 mm wide at the top of the wall alone, where 1 mm of tissue is."""
     truth = Anatomy((block([-20, -20, 0], [20, 20, 20]), ball(5, (0, 0, 14))))
     ring = square((-10, -10), (10, 10))
-    layers = [prism(ring, 19.0), Layer(5.0, 19.0, (ring,))]
+    layers = [prism(ring, 19.0), CutLayer(5.0, 19.0, (ring,))]
     gap = np.concatenate([ring, [[-10.0, -7.5]]])
     whole = stroke(ring, 5.0)
     result = cut(truth, plan(layers, [stroke(gap, 19.0, closed=False), whole]))

@@ -19,8 +19,8 @@ from tumortrack.plan.resection import plan_resection
 from tumortrack.simulate.scene_folder import Scene, write_scene
 from tumortrack_lab.cut.resection import cut
 from tumortrack_lab.peers.base import Fit, estimate_of, rigid_carry
-from tumortrack_lab.study.book import Book, section_blocks
-from tumortrack_lab.study.cells import CellStore
+from tumortrack_lab.study.book import ReportWriter, section_blocks
+from tumortrack_lab.study.cells import MeasurementStore
 from tumortrack_lab.study.measure import Hashes, Job, StudyCase, measure, spec_of
 from tumortrack_lab.study.methods import Answer, Method
 from tumortrack_lab.study.resection import (
@@ -174,7 +174,7 @@ def test_the_margin_grows_by_what_the_estimate_is_unsure_of(case):
 
 
 def test_cells_are_measured_once_and_are_others_than_those_of_accuracy(case, tmp_path):
-    method, cells = Shifted(), CellStore(tmp_path)
+    method, cells = Shifted(), MeasurementStore(tmp_path)
     todo = jobs(case, method, variants=("D0", "D1"))
     first = measure(todo, cells, one=cut_one)
     assert len(method.calls) == 2
@@ -191,7 +191,7 @@ def test_a_scene_without_a_table_is_refused(case):
 
 def test_tables_say_what_was_removed_and_why_not(case, tmp_path):
     methods = (Truth(), Shifted(shift_mm=8.0), Shifted(nothing=True, name="M_lim"))
-    cells = measure(jobs(case, *methods), CellStore(tmp_path / "cells"), one=cut_one)
+    cells = measure(jobs(case, *methods), MeasurementStore(tmp_path / "cells"), one=cut_one)
     assert [(row.method, row.planner.method) for row in rows_of(cells)] == [
         (name, planner.method)
         for name in ("clinic", "M_lim", "truth")
@@ -206,13 +206,15 @@ def test_tables_say_what_was_removed_and_why_not(case, tmp_path):
     assert "| 1 of 1 | 1 of 1 | 0 of 1 |" in lines["clinic", "ours, 5 mm"]
     assert "| 0 of 1 | 0 of 0 | 0 of 0 | – |" in lines["M_lim", "ours, 5 mm"]
     assert "1 x M_lim, the paper's, 5 mm: the cloud shows no organ" in text
-    block = section_blocks("resection", cells, (case,), Book(tmp_path / "x.md", "make results"))
+    block = section_blocks(
+        "resection", cells, (case,), ReportWriter(tmp_path / "x.md", "make results")
+    )
     assert block["resection"].startswith("All cases:")
     assert "`make results`: 3 measurements" in block["resection"]
 
 
 def test_shares_are_never_rounded_up_to_all(case, tmp_path):
-    cells = measure(jobs(case, Truth()), CellStore(tmp_path), one=cut_one)
+    cells = measure(jobs(case, Truth()), MeasurementStore(tmp_path), one=cut_one)
     entry = {**cells[0]["plans"]["tumor_1"][OURS.name], "removed_share": 0.99996}
     cells[0]["plans"]["tumor_1"][OURS.name] = entry
     assert "| 99.9 | 99.9 |" in tables_of(cells)

@@ -16,7 +16,7 @@ from tumortrack.simulate.scene_folder import Scene
 from tumortrack_lab.peers.base import Fit, estimate_of, rigid_carry
 from tumortrack_lab.peers.bcpd import Bcpd, BcpdConfig
 from tumortrack_lab.peers.cpd import Cpd, CpdConfig
-from tumortrack_lab.peers.elastic import Elastic, ElasticConfig
+from tumortrack_lab.peers.elastic import ElasticPeer, ElasticPeerConfig
 from tumortrack_lab.peers.elastic_body import elastic_body, stiffness_matrix
 from tumortrack_lab.peers.rigid import Rigid, RigidConfig
 from tumortrack_lab.peers.rigid_bound import RigidBound, fit_over_volume, matched_vertices
@@ -44,7 +44,7 @@ def anatomy():
 
 @pytest.fixture(scope="module")
 def elastic(anatomy):
-    return Elastic(anatomy, UP, ElasticConfig(rigid=FEW, modes=40, starts=1, edge_mm=16.0))
+    return ElasticPeer(anatomy, UP, ElasticPeerConfig(rigid=FEW, modes=40, starts=1, edge_mm=16.0))
 
 
 def pose(anatomy, spin_deg=77.0):

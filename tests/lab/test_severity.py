@@ -16,7 +16,7 @@ from tumortrack.sense.noise import CLEAN, D405_NOISE
 from tumortrack.sense.render import render_depth
 from tumortrack.simulate.targets import draw_targets
 from tumortrack_lab.study import severity as study
-from tumortrack_lab.study.cells import CellSpec
+from tumortrack_lab.study.cells import MeasurementSpec
 from tumortrack_lab.study.figures import figure, part_value
 from tumortrack_lab.study.measure import StudyCase
 from tumortrack_lab.study.methods import Network
@@ -34,7 +34,7 @@ from tumortrack_lab.twin.severity import (
     scaled,
     severe,
 )
-from tumortrack_lab.twin.variants import Settled, ViewConfig, make_scene
+from tumortrack_lab.twin.variants import EquilibriumState, ViewConfig, make_scene
 
 HALF_HEIGHT = 24.0  # of the ellipsoid kidney
 TURN = np.array([[1.0, 0, 0], [0, 1, 0], [0, 0, 1]])
@@ -51,7 +51,7 @@ def clean(report=""):
     about = {"state": "D2"}
     if report:
         about["poke"] = {"tip_mm": [20.0, -4, 40], "axis": [0.0, 0, 1], "radius_mm": 4.0}
-    settled = Settled("D2", type(case)(parts), targets, BENCH_FROM_CT, about)
+    settled = EquilibriumState("D2", type(case)(parts), targets, BENCH_FROM_CT, about)
     scene, camera_mm = make_scene(settled, "D2", "clean", SMALL, 0)
     return replace(scene, targets=inner.at(camera_mm))
 
@@ -336,7 +336,7 @@ def test_the_plan_measures_each_level_once_beside_one_clean_cell(tmp_path):
 
 def test_cells_measured_before_keep_their_names():
     """Recorded before there were severities."""
-    spec = CellSpec(
+    spec = MeasurementSpec(
         case="c", case_sha256="a", scene="D2-clean", scene_sha256="b", variant="D2", view="clean",
         method={"name": "M_lim", "seed": 0}, grid=160, fault="noise", fault_seed=1,
     )  # fmt: skip

@@ -27,13 +27,13 @@ from tumortrack.simulate.scene_folder import Scene, write_scene
 from tumortrack.training.presets import clinic, quick
 from tumortrack_lab.peers.base import Fit, estimate_of, rigid_carry
 from tumortrack_lab.study import ablation, goals, paper, tables
-from tumortrack_lab.study.book import Book, gallery_block, section_blocks
-from tumortrack_lab.study.bound import BOUNDS, Bound, BoundConfig, Placed, laid_on
+from tumortrack_lab.study.book import ReportWriter, gallery_block, section_blocks
+from tumortrack_lab.study.bound import BOUNDS, Bound, BoundConfig, BoundMotion, laid_on
 from tumortrack_lab.study.caption import caption
-from tumortrack_lab.study.cells import CellStore
+from tumortrack_lab.study.cells import MeasurementStore
 from tumortrack_lab.study.figures import NOT_FOUND, Figure, figure, median, part_value
 from tumortrack_lab.study.markdown import closing, fill, opening, table
-from tumortrack_lab.study.measure import Job, Status, StudyCase, measure
+from tumortrack_lab.study.measure import Job, StudyCase, StudyStatus, measure
 from tumortrack_lab.study.methods import Answer, Method
 from tumortrack_lab.study.models import ABLATED, Presets, Trainer, train_config
 from tumortrack_lab.study.peer_methods import peer_kinds, peer_method
@@ -119,7 +119,7 @@ def jobs(case, method, grid=24):
 
 
 def test_a_killed_study_goes_on_and_measures_no_cell_twice(case, tmp_path):
-    kept = CellStore(tmp_path / "cells")
+    kept = MeasurementStore(tmp_path / "cells")
     child = os.fork()
     if child == 0:  # dies in the middle of the second cell
         measure(jobs(case, Shifted(dies_at=2)), kept)
@@ -128,7 +128,7 @@ def test_a_killed_study_goes_on_and_measures_no_cell_twice(case, tmp_path):
     assert len(list(kept.folder.rglob("*.json"))) == 1
     first = next(kept.folder.rglob("*.json")).read_bytes()
 
-    method, told = Shifted(), list[Status]()
+    method, told = Shifted(), list[StudyStatus]()
     resumed = measure(jobs(case, method), kept, told.append)
     assert len(method.calls) == 1
     assert [(s.done, s.total, s.measured) for s in told] == [(2, 2, 1)]
@@ -138,13 +138,13 @@ def test_a_killed_study_goes_on_and_measures_no_cell_twice(case, tmp_path):
     again = measure(jobs(case, method), kept)
     assert again == resumed
     assert len(method.calls) == 1
-    whole = measure(jobs(case, Shifted()), CellStore(tmp_path / "others"))
+    whole = measure(jobs(case, Shifted()), MeasurementStore(tmp_path / "others"))
     lies = paper.tumor_lies(anatomy())
     assert tables.accuracy(whole, lies, True) == tables.accuracy(resumed, lies, True)
 
 
 def test_what_decides_a_cell_makes_it_another_one(case, tmp_path):
-    kept, method = CellStore(tmp_path / "cells"), Shifted()
+    kept, method = MeasurementStore(tmp_path / "cells"), Shifted()
     measure(jobs(case, method), kept)
     measure(jobs(case, method, grid=32), kept)
     assert len(method.calls) == 4
@@ -164,7 +164,7 @@ def test_what_decides_a_cell_makes_it_another_one(case, tmp_path):
 
 
 def test_known_errors_reach_the_table(case, tmp_path):
-    kept = CellStore(tmp_path / "cells")
+    kept = MeasurementStore(tmp_path / "cells")
     seeds = [Shifted(shift_mm=shift, seed=n) for n, shift in enumerate((1.0, 2.0, 3.0))]
     cells = [cell for method in seeds for cell in measure(jobs(case, method), kept)]
     text = tables.accuracy(cells, paper.tumor_lies(anatomy()), is_paper=True)
@@ -187,13 +187,13 @@ def test_targets_are_measured_where_a_scene_has_them(case, tmp_path):
     head = "label,ct_x,ct_y,ct_z,camera_x,camera_y,camera_z"
     path = case.scene("D1", "clean") / "targets.csv"
     path.write_text("\n".join([head, *lines]) + "\n")
-    cell = measure(jobs(case, Shifted(shift_mm=3.5))[:1], CellStore(tmp_path / "cells"))[0]
+    cell = measure(jobs(case, Shifted(shift_mm=3.5))[:1], MeasurementStore(tmp_path / "cells"))[0]
     assert cell["targets_mm"]["mean"] == pytest.approx(3.5)
     assert cell["targets_mm"]["count"] == 20
 
 
 def test_parts_that_were_not_found_follow_the_rule(case, tmp_path):
-    kept = CellStore(tmp_path / "cells")
+    kept = MeasurementStore(tmp_path / "cells")
     methods = [
         Shifted(seed=0),
         Shifted(seed=1, without=("tumor_2",)),
@@ -212,7 +212,7 @@ def test_parts_that_were_not_found_follow_the_rule(case, tmp_path):
 
 
 def test_conditions_say_the_change_against_their_base(case, tmp_path):
-    kept, cells = CellStore(tmp_path / "cells"), []
+    kept, cells = MeasurementStore(tmp_path / "cells"), []
     for fault, shift in (("clean", 1.0), ("offset", 2.5)):
         measured = measure(jobs(case, Shifted(shift_mm=shift)), kept)
         cells += [{**cell, "spec": {**cell["spec"], "fault": fault}} for cell in measured]
@@ -241,7 +241,7 @@ def test_point_errors_know_depth_displacement_and_distance():
 
 
 def test_the_papers_figures_and_how_a_tumor_lies():
-    assert paper.hausdorff("D3", "M_full", "endophytic") == paper.Said("", 18.5)
+    assert paper.hausdorff("D3", "M_full", "endophytic") == paper.PaperFigure("", 18.5)
     assert paper.hausdorff("Rot90", "M_full", "exophytic").text == "≤ 13.4"
     assert paper.hausdorff("Rot90", "M_lim", "exophytic") is None
     assert paper.center("D3", "M_full") is None
@@ -376,10 +376,10 @@ def test_end_to_end_twice_gives_the_same_document(phantom, tmp_path):
     names = ["deformation", "accuracy", "peers"]
     blocks = "".join(f"{opening(n)}\n{closing(n)}\n" for n in [*names, "gallery"])
     document.write_text(f"mine\n{blocks}yours\n")
-    book = Book(document, "make results")
+    book = ReportWriter(document, "make results")
 
     def run():
-        told, trained = list[Status](), []
+        told, trained = list[StudyStatus](), []
         trainer = Trainer(
             tmp_path / "models", PRESETS, "cpu", 0, lambda name, _: trained.append(name)
         )
@@ -389,7 +389,7 @@ def test_end_to_end_twice_gives_the_same_document(phantom, tmp_path):
 
         for section in names:
             todo = jobs_of(plan, section, (phantom,), Methods(model, peer_method, model))
-            cells = measure(todo, CellStore(tmp_path / "cells"), told.append)
+            cells = measure(todo, MeasurementStore(tmp_path / "cells"), told.append)
             book.write(section_blocks(section, cells, (phantom,), book))
         bound = [Job(phantom, peer_method("rigid_bound", phantom), "D1", "clean", 24)]
         book.write(gallery_block(plan, bound, book, tmp_path / "gallery.json"))
@@ -415,7 +415,7 @@ SMALL = BodyConfig(cells=120, modes=8, responses=40, patches=60, states=20)
 
 def test_the_bound_finds_a_state_that_its_body_can_take():
     body = build_body(anatomy(), (0.0, -1.0, 0.0), SMALL, 0)
-    truth = Placed(body, TURN, np.array([3.0, -2, 130]), body.states[3].astype(float))
+    truth = BoundMotion(body, TURN, np.array([3.0, -2, 130]), body.states[3].astype(float))
     vertices = anatomy().organ.vertices_mm
     moved_mm = np.linalg.norm(body.carry(truth.coefficients, vertices) - vertices, axis=1)
     assert moved_mm.max() > 1
@@ -425,7 +425,7 @@ def test_the_bound_finds_a_state_that_its_body_can_take():
 
 
 def test_bounds_of_a_rigid_organ_are_near_zero(case, tmp_path):
-    kept = CellStore(tmp_path / "cells")
+    kept = MeasurementStore(tmp_path / "cells")
     for name in BOUNDS:
         cells = measure(jobs(case, Bound(name, case, BoundConfig(body=SMALL))), kept)
         for cell in cells:
@@ -493,7 +493,7 @@ def test_the_ablation_says_the_change_against_clinic():
 
 
 def test_captions_name_command_device_and_models(case, tmp_path):
-    cells = measure(jobs(case, Shifted()), CellStore(tmp_path / "cells"))
+    cells = measure(jobs(case, Shifted()), MeasurementStore(tmp_path / "cells"))
     text = caption(cells, "make results")
     assert text.startswith("`make results`: 2 measurements, 2 scenes (views: clean)")
     assert "24³" in text

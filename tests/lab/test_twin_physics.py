@@ -15,13 +15,13 @@ from scipy.spatial.transform import Rotation
 from tumortrack.core.errors import InputError, TumortrackError
 from tumortrack.core.types import Anatomy, Mesh
 from tumortrack_lab.tets import TetMesh, embed, tetrahedralise
-from tumortrack_lab.twin.bench import Bench, BenchConfig
-from tumortrack_lab.twin.contact import Contact, Indenter, Packing, Plate, Support
-from tumortrack_lab.twin.equilibrium import Hold, Problem, settle
-from tumortrack_lab.twin.solid import Solid
+from tumortrack_lab.twin.bench import Apparatus, ApparatusConfig
+from tumortrack_lab.twin.contact import Contact, ContactPlate, Indenter, Packing, Support
+from tumortrack_lab.twin.equilibrium import EquilibriumProblem, Hold, settle
+from tumortrack_lab.twin.solid import NeoHookeanSolid
 from tumortrack_lab.twin.states import solve
 
-SMALL = BenchConfig(edge_mm=7.0, plate_mm=20.0, sink_mm=2.0, poke_mm=4.0)
+SMALL = ApparatusConfig(edge_mm=7.0, plate_mm=20.0, sink_mm=2.0, poke_mm=4.0)
 
 
 def block(side_mm: float, cells: int) -> TetMesh:
@@ -48,15 +48,15 @@ def ellipsoid(half_mm: tuple[float, float, float], centre_mm=(0.0, 0.0, 0.0)) ->
 
 
 @pytest.fixture(scope="module")
-def bench() -> Bench:
+def bench() -> Apparatus:
     organ = ellipsoid((32.0, 18.0, 15.0))
-    return Bench(Anatomy((organ, ellipsoid((6, 6, 6), (12, 0, 4)))), (0.0, 0.0, 1.0), SMALL)
+    return Apparatus(Anatomy((organ, ellipsoid((6, 6, 6), (12, 0, 4)))), (0.0, 0.0, 1.0), SMALL)
 
 
 def test_forces_are_the_energys_slope_and_the_stiffness_is_theirs() -> None:
     mesh = block(10.0, 2)
     rng = np.random.default_rng(0)
-    solid = Solid(mesh, rng.uniform(3, 9, len(mesh.tets)), 0.45)
+    solid = NeoHookeanSolid(mesh, rng.uniform(3, 9, len(mesh.tets)), 0.45)
     bent = mesh.nodes_mm + rng.normal(0, 0.3, mesh.nodes_mm.shape)
     way = rng.normal(size=bent.shape)
     step = 1e-5
@@ -71,7 +71,7 @@ def test_forces_are_the_energys_slope_and_the_stiffness_is_theirs() -> None:
 
 def test_moving_a_solid_costs_nothing_and_turning_it_inside_out_is_impossible() -> None:
     mesh = block(10.0, 2)
-    solid = Solid(mesh, np.full(len(mesh.tets), 5.0))
+    solid = NeoHookeanSolid(mesh, np.full(len(mesh.tets), 5.0))
     turn = Rotation.from_rotvec([0.5, -1.0, 0.8]).as_matrix()
     energy, forces = solid.energy(mesh.nodes_mm @ turn.T + 7.0)
     assert energy == pytest.approx(0, abs=1e-9)
@@ -86,7 +86,7 @@ def test_a_block_between_plates_follows_theory(poisson: float) -> None:
     """Uniaxial compression to 80 %: force and bulge of the compressible neo-Hookean law."""
     side, shear = 20.0, 5.0
     mesh = block(side, 5)
-    solid = Solid(mesh, np.full(len(mesh.tets), shear), poisson)
+    solid = NeoHookeanSolid(mesh, np.full(len(mesh.tets), shear), poisson)
     bulk = 2 * shear * (1 + poisson) / (3 * (1 - 2 * poisson))
     skin = np.flatnonzero(np.isclose(mesh.nodes_mm[:, 2] % side, 0))
     rim = np.isclose(mesh.nodes_mm[skin, :2] % side, 0)
@@ -94,9 +94,9 @@ def test_a_block_between_plates_follows_theory(poisson: float) -> None:
     contact = Contact(embed(mesh, mesh.nodes_mm[skin]), area, 3000.0)
     nothing = np.zeros(len(mesh.nodes_mm))
     share = solid.node_volumes_mm3 / mesh.volumes_mm3.sum()
-    above = Plate((10.0, 10.0, 16.0 + 10), (40.0, 40.0, 10.0), 1.0)
+    above = ContactPlate((10.0, 10.0, 16.0 + 10), (40.0, 40.0, 10.0), 1.0)
     contacts = ((contact, (Support(), above)),)
-    problem = Problem(solid, contacts, nothing, Hold(mesh.nodes_mm, share))
+    problem = EquilibriumProblem(solid, contacts, nothing, Hold(mesh.nodes_mm, share))
     start = mesh.nodes_mm * [1.05, 1.05, 0.9]
     nodes, about = settle(problem, start, solid.rest_stiffness())
     assert about.residual < 1e-3
@@ -124,7 +124,7 @@ def test_a_block_between_plates_follows_theory(poisson: float) -> None:
 def test_obstacles_measure_true_distances() -> None:
     rng = np.random.default_rng(1)
     points = rng.uniform(-20, 20, (400, 3))
-    plate = Plate((1.0, -2.0, 3.0), (8.0, 12.0, 5.0), 2.0)
+    plate = ContactPlate((1.0, -2.0, 3.0), (8.0, 12.0, 5.0), 2.0)
     rod = Indenter((0.0, 0.0, -5.0), (0.0, 0.6, 0.8), 4.0)
     packing = Packing(points[:, 2] - np.linspace(-3, 3, 400))
     np.testing.assert_allclose(packing.distance(points)[0], np.linspace(-3, 3, 400), atol=1e-12)
@@ -163,11 +163,11 @@ def test_a_tetrahedral_mesh_keeps_the_surface_and_its_volume() -> None:
 
 
 @pytest.fixture(scope="module")
-def squeezed(bench: Bench):
+def squeezed(bench: Apparatus):
     return solve(bench, "D1")
 
 
-def test_plates_close_by_what_the_state_says(bench: Bench, squeezed) -> None:
+def test_plates_close_by_what_the_state_says(bench: Apparatus, squeezed) -> None:
     before, after = squeezed.report["midsection_mm"]
     assert before - after == pytest.approx(4.0, abs=0.4)
     assert squeezed.report["sunk_in_mm"] < 0.4
@@ -182,7 +182,7 @@ def test_plates_close_by_what_the_state_says(bench: Bench, squeezed) -> None:
     assert np.ptp(surface[np.abs(surface[:, 0]) < 4, 2]) == pytest.approx(after, abs=0.5)
 
 
-def test_nothing_moves_until_something_is_added(bench: Bench) -> None:
+def test_nothing_moves_until_something_is_added(bench: Apparatus) -> None:
     nodes, about = bench.settle(bench.mesh.nodes_mm, ())
     assert about.iterations == 0
     np.testing.assert_array_equal(nodes, bench.mesh.nodes_mm)
@@ -193,18 +193,18 @@ def test_nothing_moves_until_something_is_added(bench: Bench) -> None:
 
 
 def test_going_on_from_less_compression_ends_where_a_fresh_start_does(
-    bench: Bench, squeezed
+    bench: Apparatus, squeezed
 ) -> None:
     warm, cold = solve(bench, "D2", squeezed), solve(bench, "D2")
     assert np.linalg.norm(warm.nodes_mm - squeezed.nodes_mm, axis=1).max() > 3
     assert np.linalg.norm(warm.nodes_mm - cold.nodes_mm, axis=1).max() < 0.15
 
 
-def test_a_finer_mesh_says_the_same(bench: Bench, squeezed) -> None:
-    finer = BenchConfig(edge_mm=3.5, plate_mm=20.0)
+def test_a_finer_mesh_says_the_same(bench: Apparatus, squeezed) -> None:
+    finer = ApparatusConfig(edge_mm=3.5, plate_mm=20.0)
     organ_ct = ellipsoid((32.0, 18.0, 15.0))
     tumor_ct = ellipsoid((6, 6, 6), (12, 0, 4))
-    other = Bench(Anatomy((organ_ct, tumor_ct)), (0.0, 0.0, 1.0), finer)
+    other = Apparatus(Anatomy((organ_ct, tumor_ct)), (0.0, 0.0, 1.0), finer)
     assert len(other.mesh.tets) > 2 * len(bench.mesh.tets)
     points = np.random.default_rng(3).uniform(-1, 1, (400, 3))
     points = points[np.linalg.norm(points, axis=1) < 0.95] * (32, 18, 15)
@@ -215,7 +215,7 @@ def test_a_finer_mesh_says_the_same(bench: Bench, squeezed) -> None:
     assert np.linalg.norm(fine - coarse, axis=1).mean() < 0.25
 
 
-def test_gravity_sinks_the_midsection_as_far_as_asked(bench: Bench) -> None:
+def test_gravity_sinks_the_midsection_as_far_as_asked(bench: Apparatus) -> None:
     state = solve(bench, "G1")
     assert state.report["sunk_mm"] == pytest.approx(2.0, abs=0.4)
     assert sum(state.report["sides_outwards_mm"]) > 0.3
@@ -223,7 +223,7 @@ def test_gravity_sinks_the_midsection_as_far_as_asked(bench: Bench) -> None:
     assert abs(state.report["volume_change"]) < 0.02
 
 
-def test_the_rod_presses_a_dent_off_the_tumor(bench: Bench) -> None:
+def test_the_rod_presses_a_dent_off_the_tumor(bench: Apparatus) -> None:
     state = solve(bench, "P1")
     poke = state.report["poke"]
     tip = np.array(poke["tip_mm"])
@@ -241,16 +241,16 @@ def test_a_stiffer_tumor_deforms_less() -> None:
     organ, tumor = ellipsoid((32.0, 18.0, 15.0)), ellipsoid((6, 6, 6))
     heights = {}
     for ratio in (1.0, 5.0):
-        config = BenchConfig(edge_mm=7.0, plate_mm=20.0, tumor_ratio=ratio)
-        bench = Bench(Anatomy((organ, tumor)), (0.0, 0.0, 1.0), config)
+        config = ApparatusConfig(edge_mm=7.0, plate_mm=20.0, tumor_ratio=ratio)
+        bench = Apparatus(Anatomy((organ, tumor)), (0.0, 0.0, 1.0), config)
         moved = bench.carry(solve(bench, "D1"), tumor.vertices_mm)
         heights[ratio] = 12 - np.ptp(moved[:, 2])
     assert 0 < heights[5.0] < 0.8 * heights[1.0]
 
 
-def test_a_load_that_finds_no_rest_is_an_error(bench: Bench, monkeypatch) -> None:
+def test_a_load_that_finds_no_rest_is_an_error(bench: Apparatus, monkeypatch) -> None:
     monkeypatch.setattr("tumortrack_lab.twin.equilibrium._ITERATIONS", 150)
-    trap = (Plate((0.0, 0.0, 15.0), (100.0, 100.0, 14.9), 1.0),)  # swallows the organ whole
+    trap = (ContactPlate((0.0, 0.0, 15.0), (100.0, 100.0, 14.9), 1.0),)  # swallows the organ whole
     with pytest.raises(TumortrackError, match="no equilibrium"):
         bench.settle(bench.mesh.nodes_mm, trap, weight=1e6)
 

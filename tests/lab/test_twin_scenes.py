@@ -38,7 +38,7 @@ from tumortrack_lab.twin.props import Rod, rod_mesh, shaft_over
 from tumortrack_lab.twin.variants import (
     VARIANTS,
     VIEWS,
-    Settled,
+    EquilibriumState,
     ViewConfig,
     camera_from_bench,
     for_organ,
@@ -93,7 +93,7 @@ def settled(state):
     there = State(state, np.zeros((4, 3)), REPORTS[state])
     parts = tuple(p.moved(bench.carry(there, p.vertices_mm)) for p in case.parts)
     targets = bench.carry(there, draw_targets(case, 0).points_ct)
-    return Settled(state, type(case)(parts), targets, BENCH_FROM_CT, REPORTS[state])
+    return EquilibriumState(state, type(case)(parts), targets, BENCH_FROM_CT, REPORTS[state])
 
 
 def scene(variant="D0", view="clean", seed=0, config=None):

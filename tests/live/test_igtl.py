@@ -13,8 +13,8 @@ from igtl_objects import polydata_by_the_book, slow_crc
 from live_objects import STAMP_NS
 from tumortrack.core.geometry import rigid
 from tumortrack.live.igtl.content import (
+    IgtlStatus,
     Polydata,
-    Status,
     pack_polydata,
     pack_status,
     pack_string,
@@ -91,8 +91,8 @@ def test_status_byte_for_byte() -> None:
         6661722061776179 00                               far away
         """
     )
-    assert pack_status(Status(4, "no estimate", "far away", -1)) == expected
-    assert unpack_status(expected) == Status(4, "no estimate", "far away", -1)
+    assert pack_status(IgtlStatus(4, "no estimate", "far away", -1)) == expected
+    assert unpack_status(expected) == IgtlStatus(4, "no estimate", "far away", -1)
 
 
 def test_polydata_byte_for_byte() -> None:
@@ -230,7 +230,7 @@ def test_no_damage_gets_further_than_a_refusal(data: st.DataObject) -> None:
     surface = Polydata(np.eye(3), np.array([[0, 1, 2]]), np.array([[0, 2]]), {"p": np.ones(3)})
     for content, read in (
         (pack_polydata(surface), unpack_polydata),
-        (pack_status(Status(1, "good", "text")), unpack_status),
+        (pack_status(IgtlStatus(1, "good", "text")), unpack_status),
         (pack_string("text"), unpack_string),
         (pack_transform(np.eye(4)), unpack_transform),
     ):

@@ -16,9 +16,16 @@ from tumortrack.core.estimate import Following
 from tumortrack.core.types import DepthFrame, Intrinsics, SensorCloud
 from tumortrack.live.loop import Loop, LoopConfig, summary
 from tumortrack.live.quality import judge, seen_through
-from tumortrack.live.sink_worker import Outlet
-from tumortrack.live.source_worker import Reader
-from tumortrack.live.values import Controls, Frames, Seen, Setting, SourceEnded, SourceLost
+from tumortrack.live.sink_worker import SinkWorker
+from tumortrack.live.source_worker import SourceWorker
+from tumortrack.live.values import (
+    Controls,
+    Observation,
+    PublishedFrame,
+    SinkContext,
+    SourceEnded,
+    SourceLost,
+)
 from tumortrack.sense.camera import d405
 from tumortrack.sense.region import RegionConfig
 from tumortrack.sense.render import render_depth
@@ -71,7 +78,7 @@ class Script:
             return None
         if isinstance(item, BaseException):
             raise item
-        return item if isinstance(item, Seen) else Seen(item, time.time_ns())
+        return item if isinstance(item, Observation) else Observation(item, time.time_ns())
 
     def close(self):
         self._items = []
@@ -93,9 +100,9 @@ class Notes:
 def play(tracker, items, config=None, sink=None, **script):
     """Run the loop over items; the updates, and the summary."""
     sink = sink or Notes()
-    setting = Setting(tracker.model.parts, Frames(), tracker.anatomy_ct, Controls())
+    setting = SinkContext(tracker.model.parts, PublishedFrame(), tracker.anatomy_ct, Controls())
     loop = Loop(tracker, setting, config or LoopConfig(region=WHOLE))
-    outlets = [Outlet("notes", sink, 1000)]
+    outlets = [SinkWorker("notes", sink, 1000)]
     scripts = iter([Script(items, **script)])
 
     def open_once():
@@ -104,7 +111,7 @@ def play(tracker, items, config=None, sink=None, **script):
             raise SourceEnded("not again")
         return one
 
-    reader = Reader(open_once)
+    reader = SourceWorker(open_once)
     try:
         loop.run(reader, outlets, lambda _: None)
     finally:
@@ -369,11 +376,11 @@ def test_a_pick_moves_along_and_is_forgotten_when_lost(tracker, stages, monkeypa
     clouds = moving(stages[0], 3, step_mm=(6, 0, 0))
     controls = Controls()
     controls.pick(clouds[0].points_mm[5].astype(float))
-    setting = Setting(tracker.model.parts, Frames(), tracker.anatomy_ct, controls)
+    setting = SinkContext(tracker.model.parts, PublishedFrame(), tracker.anatomy_ct, controls)
     loop = Loop(tracker, setting, LoopConfig(region=WHOLE, stale_s=0.3))
     places = []
     few = [SensorCloud(clouds[2].points_mm[:9], clouds[2].stamp_ns + n) for n in (1, 2)]
-    reader = Reader(lambda: Script([*clouds, few[0], 0.4, few[1]]))
+    reader = SourceWorker(lambda: Script([*clouds, few[0], 0.4, few[1]]))
     loop.run(reader, [], lambda _: places.append((loop._place_mm, controls.picked_mm)))
     reader.close()
     assert np.linalg.norm(places[2][0] - places[0][0]) == pytest.approx(12, abs=0.5)
@@ -384,12 +391,12 @@ def test_a_pick_moves_along_and_is_forgotten_when_lost(tracker, stages, monkeypa
 def test_other_intrinsics_replace_the_sources(tracker):
     frame = small_frame()
     given = Intrinsics(64, 48, 30.0, 30.5, 31.5, 23.5)
-    setting = Setting(tracker.model.parts, Frames(), tracker.anatomy_ct, Controls())
+    setting = SinkContext(tracker.model.parts, PublishedFrame(), tracker.anatomy_ct, Controls())
     sink = Notes()
     for intrinsics, said in ((given, None), (Intrinsics(32, 48, 30, 30, 15, 23), "32 x 48")):
         loop = Loop(tracker, setting, LoopConfig(intrinsics=intrinsics))
-        outlets = [Outlet("notes", sink, 10)]
-        reader = Reader(lambda: Script([frame]))
+        outlets = [SinkWorker("notes", sink, 10)]
+        reader = SourceWorker(lambda: Script([frame]))
         loop.run(reader, outlets, lambda _: None)
         reader.close()
         outlets[0].close()
@@ -421,10 +428,10 @@ def test_a_lost_source_comes_back(tracker, stages):
     clouds = moving(stages[0], 4)
     scripts = [Script([*clouds[:2], SourceLost("the camera was unplugged")]), Script(clouds[2:])]
     sink = Notes()
-    setting = Setting(tracker.model.parts, Frames(), tracker.anatomy_ct, Controls())
+    setting = SinkContext(tracker.model.parts, PublishedFrame(), tracker.anatomy_ct, Controls())
     loop = Loop(tracker, setting, LoopConfig(region=WHOLE, stale_s=0.3))
-    outlets = [Outlet("notes", sink, 1000)]
-    reader = Reader(lambda: scripts.pop(0))
+    outlets = [SinkWorker("notes", sink, 1000)]
+    reader = SourceWorker(lambda: scripts.pop(0))
     loop.run(reader, outlets, lambda _: None)
     reader.close()
     outlets[0].close()
@@ -449,11 +456,11 @@ def test_a_full_disk_stops_nothing_but_its_sink(tracker, stages):
 def test_a_click_makes_the_loop_look_anew(tracker, stages):
     clouds = moving(stages[0], 3)
     controls = Controls()
-    setting = Setting(tracker.model.parts, Frames(), tracker.anatomy_ct, controls)
+    setting = SinkContext(tracker.model.parts, PublishedFrame(), tracker.anatomy_ct, controls)
     loop = Loop(tracker, setting, LoopConfig(region=WHOLE))
     sink = Notes()
-    outlets = [Outlet("notes", sink, 100)]
-    reader = Reader(lambda: Script(clouds))
+    outlets = [SinkWorker("notes", sink, 100)]
+    reader = SourceWorker(lambda: Script(clouds))
 
     def click(update):
         if update.sequence == 0:
@@ -468,9 +475,9 @@ def test_a_click_makes_the_loop_look_anew(tracker, stages):
 
 
 def test_stop_ends_the_loop_from_elsewhere(tracker, stages):
-    setting = Setting(tracker.model.parts, Frames(), tracker.anatomy_ct, Controls())
+    setting = SinkContext(tracker.model.parts, PublishedFrame(), tracker.anatomy_ct, Controls())
     loop = Loop(tracker, setting, LoopConfig(region=WHOLE, stale_s=0.1))
-    reader = Reader(lambda: Script([0.05] * 200))
+    reader = SourceWorker(lambda: Script([0.05] * 200))
     timer = threading.Timer(0.3, loop.stop)
     timer.start()
     started = time.monotonic()

@@ -16,10 +16,10 @@ from tumortrack.core.errors import InputError, NoEstimate, StorageError
 from tumortrack.live.calibration_file import read_frames
 from tumortrack.live.clock import StampCheck
 from tumortrack.live.meter import Histogram
-from tumortrack.live.sink_worker import Outlet
-from tumortrack.live.source_worker import Reader
+from tumortrack.live.sink_worker import SinkWorker
+from tumortrack.live.source_worker import SourceWorker
 from tumortrack.live.spec import parse_spec
-from tumortrack.live.values import Frames, Seen, SinkConfig, SourceEnded, SourceLost
+from tumortrack.live.values import Observation, PublishedFrame, SinkConfig, SourceEnded, SourceLost
 
 SECOND = 1_000_000_000
 
@@ -98,7 +98,7 @@ def test_percentiles_are_right_to_one_per_cent():
 
 
 def _seen(stamp_ns, arrived_ns=None):
-    return Seen(small_frame(stamp_ns), stamp_ns if arrived_ns is None else arrived_ns)
+    return Observation(small_frame(stamp_ns), stamp_ns if arrived_ns is None else arrived_ns)
 
 
 def test_a_stale_frame_and_one_from_the_future_are_refused():
@@ -137,7 +137,7 @@ def test_a_clock_that_was_set_back_is_believed_when_it_goes_on():
 def test_ages_count_from_where_the_source_allows(waits, host_clock, counts_from):
     script = Script([_seen(7, arrived_ns=9)], waits=waits)
     script.host_clock = host_clock
-    reader = Reader(lambda: script)
+    reader = SourceWorker(lambda: script)
     born_ns = reader.born_ns(reader.take(1.0))
     assert reader.latency_from == counts_from
     if waits:
@@ -178,7 +178,7 @@ def _wait(condition, seconds=5.0):
 
 def test_the_newest_frame_wins_and_the_others_are_counted():
     frames = [_seen(n) for n in range(1, 6)]
-    reader = Reader(lambda: Script(frames))
+    reader = SourceWorker(lambda: Script(frames))
     _wait(lambda: reader.dropped == 4)
     assert reader.take(1.0).stamp_ns == 5
     assert reader.take(0.05) is None
@@ -187,7 +187,7 @@ def test_the_newest_frame_wins_and_the_others_are_counted():
 
 def test_a_source_that_waits_loses_nothing():
     frames = [_seen(n) for n in range(1, 6)]
-    reader = Reader(lambda: Script([*frames, SourceEnded("end")], waits=True))
+    reader = SourceWorker(lambda: Script([*frames, SourceEnded("end")], waits=True))
     taken = [reader.take(1.0).stamp_ns for _ in frames]
     assert taken == [1, 2, 3, 4, 5]
     assert reader.take(1.0) is None
@@ -208,7 +208,7 @@ def test_a_lost_source_is_opened_again():
         return scripts.pop(0)
 
     first = scripts[0]
-    reader = Reader(open_next)
+    reader = SourceWorker(open_next)
     assert reader.take(1.0).stamp_ns == 1
     _wait(lambda: "unplugged" in reader.trouble)
     assert first.closed == 1
@@ -222,7 +222,7 @@ def test_a_source_that_can_never_work_ends_the_loop():
     def refuse():
         raise InputError("no such folder")
 
-    reader = Reader(refuse)
+    reader = SourceWorker(refuse)
     _wait(lambda: reader.failure is not None)
     with pytest.raises(InputError, match="no such folder"):
         reader.take(1.0)
@@ -241,7 +241,7 @@ def test_what_breaks_at_reopening_is_no_end():
             raise InputError("no 848x480@30 at USB 2")
         return Script([_seen(len(opened)), SourceLost("unplugged")], waits=True)
 
-    reader = Reader(open_next)
+    reader = SourceWorker(open_next)
     assert reader.take(1.0).stamp_ns == 1
     assert reader.take(5.0).stamp_ns == 4
     assert reader.failure is None
@@ -251,7 +251,9 @@ def test_what_breaks_at_reopening_is_no_end():
 
 
 def test_garbage_is_handed_on_and_reading_goes_on():
-    reader = Reader(lambda: Script([InputError("a message of no image"), _seen(3)], waits=True))
+    reader = SourceWorker(
+        lambda: Script([InputError("a message of no image"), _seen(3)], waits=True)
+    )
     assert "no image" in str(reader.take(1.0))
     assert reader.take(1.0).stamp_ns == 3
     reader.close()
@@ -277,7 +279,7 @@ class Notes:
 def test_a_slow_sink_gets_the_newest_and_holds_up_nobody():
     gate = threading.Event()
     sink = Notes(gate)
-    outlet = Outlet("slow", sink, waiting=1)
+    outlet = SinkWorker("slow", sink, waiting=1)
     started = time.monotonic()
     for n in range(50):
         outlet.put(small_update(n))
@@ -292,7 +294,7 @@ def test_a_slow_sink_gets_the_newest_and_holds_up_nobody():
 
 def test_a_sink_that_may_be_behind_loses_nothing():
     sink = Notes()
-    outlet = Outlet("recording", sink, waiting=64)
+    outlet = SinkWorker("recording", sink, waiting=64)
     for n in range(64):
         outlet.put(small_update(n))
     outlet.close()
@@ -307,7 +309,7 @@ def test_a_sink_that_shows_is_told_when_the_loop_hangs(monkeypatch):
             self.got.append(update)
 
     shown, kept = Shown(), Shown()
-    outlets = [Outlet("viewer", shown, 1), Outlet("recording", kept, 30)]
+    outlets = [SinkWorker("viewer", shown, 1), SinkWorker("recording", kept, 30)]
     for outlet in outlets:
         outlet.put(small_update(7))
     time.sleep(0.9)
@@ -323,7 +325,7 @@ def test_a_sink_that_fails_at_its_end_is_known():
         def close(self):
             raise StorageError("no index")
 
-    outlet = Outlet("recording", Cut(), 5)
+    outlet = SinkWorker("recording", Cut(), 5)
     outlet.close()
     assert outlet.unclosed
     assert outlet.error == "no index"
@@ -331,7 +333,7 @@ def test_a_sink_that_fails_at_its_end_is_known():
 
 def test_a_broken_sink_is_said_and_recovers():
     sink = Notes(broken=True)
-    outlet = Outlet("disk", sink, waiting=8)
+    outlet = SinkWorker("disk", sink, waiting=8)
     outlet.put(empty_update())
     _wait(lambda: outlet.failing)
     assert outlet.error == "the disk is full"
@@ -380,7 +382,7 @@ def test_estimates_are_published_in_the_robots_frame():
     turn = np.eye(4)
     turn[:3, :3] = Rotation.from_euler("y", 90, degrees=True).as_matrix()
     turn[:3, 3] = [1, 2, 3]
-    update = small_update(frames=Frames("base_link", turn))
+    update = small_update(frames=PublishedFrame("base_link", turn))
     camera = update.estimate.cloud.points_mm
     expected = np.stack([camera[:, 2] + 1, camera[:, 1] + 2, -camera[:, 0] + 3], 1)
     np.testing.assert_allclose(update.placed.points_mm, expected, atol=1e-4)

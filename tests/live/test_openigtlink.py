@@ -13,10 +13,15 @@ from igtl_objects import Heard, hear, hear_all, polydata_by_the_book
 from live_objects import STAMP_NS, empty_update, small_anatomy, small_setting, small_update
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import rigid
-from tumortrack.live.igtl.content import Status, unpack_polydata, unpack_status, unpack_transform
+from tumortrack.live.igtl.content import (
+    IgtlStatus,
+    unpack_polydata,
+    unpack_status,
+    unpack_transform,
+)
 from tumortrack.live.igtl.message import Message, pack
-from tumortrack.live.sinks.openigtlink import OpenIgtLink, OpenIgtLinkSink
-from tumortrack.live.values import Frames, Setting, Update
+from tumortrack.live.sinks.openigtlink import OpenIgtLinkSink, OpenIgtLinkSinkConfig
+from tumortrack.live.values import PublishedFrame, SinkContext, TrackingResult
 
 
 @pytest.fixture
@@ -24,8 +29,8 @@ def opened():
     """Opens sinks on free ports and receivers on them, and closes all."""
     used: list = []
 
-    def sink(setting: Setting | None = None, **options: object) -> OpenIgtLinkSink:
-        one = OpenIgtLink(port=0, **options).open(setting or small_setting())  # type: ignore[arg-type]
+    def sink(setting: SinkContext | None = None, **options: object) -> OpenIgtLinkSink:
+        one = OpenIgtLinkSinkConfig(port=0, **options).open(setting or small_setting())  # type: ignore[arg-type]
         used.append(one)
         return one
 
@@ -55,7 +60,7 @@ def test_an_update_arrives_where_slicer_has_our_files(opened) -> None:
     sink.publish(small_update(sequence=7))
     heard = hear_all(sock, ALL)
     status = heard["STATUS", "tumortrack"]
-    assert unpack_status(status.content) == Status(1, "good", "")
+    assert unpack_status(status.content) == IgtlStatus(1, "good", "")
     assert status.metadata == {
         "frame_id": "camera", "sequence": "7", "quality": "good", "latency_ms": "12.5",
     }  # fmt: skip
@@ -75,7 +80,7 @@ def test_an_update_arrives_where_slicer_has_our_files(opened) -> None:
 def test_published_frame_and_lps(opened) -> None:
     open_sink, open_receiver = opened
     quarter = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
-    frames = Frames("robot", rigid(quarter, np.array([100.0, 0, 0])))
+    frames = PublishedFrame("robot", rigid(quarter, np.array([100.0, 0, 0])))
     sink = open_sink(space="lps")
     sock = open_receiver(sink)
     sink.publish(small_update(frames=frames))
@@ -128,7 +133,7 @@ def test_no_estimate_is_said_and_leaves_nothing(opened) -> None:
     assert cloud["probability"][2][[0, -1]].tolist() == [0.5, 1.0]
     sink.publish(empty_update(reason="only 12 points lie in range"))
     heard = hear_all(sock, ALL + 1)
-    assert unpack_status(heard["STATUS", "tumortrack"].content) == Status(
+    assert unpack_status(heard["STATUS", "tumortrack"].content) == IgtlStatus(
         4, "no estimate", "only 12 points lie in range"
     )
     for (kind, _), one in heard.items():
@@ -269,7 +274,7 @@ def test_a_stranger_is_sent_away(opened, garbage: bytes) -> None:
 def test_as_a_client_it_waits_for_its_server() -> None:
     with socket.create_server(("127.0.0.1", 0)) as server:
         port = server.getsockname()[1]
-    config = OpenIgtLink(port=port, connect="127.0.0.1")
+    config = OpenIgtLinkSinkConfig(port=port, connect="127.0.0.1")
     sink = config.open(small_setting())
     try:
         sink.publish(small_update(1))
@@ -289,12 +294,12 @@ def test_what_cannot_work_is_refused(opened) -> None:
     open_sink, _ = opened
     taken = open_sink()
     with pytest.raises(InputError, match="Choose another port"):
-        OpenIgtLink(port=taken.port).open(small_setting())
+        OpenIgtLinkSinkConfig(port=taken.port).open(small_setting())
     with pytest.raises(InputError, match="there is no host"):
-        OpenIgtLink(connect="no..host").open(small_setting())
+        OpenIgtLinkSinkConfig(connect="no..host").open(small_setting())
     for bad in ({"port": 70000}, {"mesh_hz": -1.0}, {"cloud_hz": float("nan")}):
         with pytest.raises(InputError, match="must lie in"):
-            OpenIgtLink(**bad)  # type: ignore[arg-type]
+            OpenIgtLinkSinkConfig(**bad)  # type: ignore[arg-type]
 
 
 def test_a_pyigtl_client_follows_the_sink(opened) -> None:
@@ -316,7 +321,7 @@ def test_a_pyigtl_client_follows_the_sink(opened) -> None:
         client.stop()
 
 
-def large_update(n: int) -> Update:
+def large_update(n: int) -> TrackingResult:
     """40,000 points in its cloud."""
     update = small_update()
     assert update.estimate is not None

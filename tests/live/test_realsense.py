@@ -13,14 +13,14 @@ pytest.importorskip("pyrealsense2")
 from realsense_objects import HEIGHT, WIDTH, Camera, raw_depth, record
 from tumortrack.core.errors import InputError
 from tumortrack.core.types import Intrinsics
-from tumortrack.live.sources.realsense import RealSense, RealSenseSource
+from tumortrack.live.sources.realsense import RealSenseSource, RealSenseSourceConfig
 from tumortrack.live.spec import parse_spec
 from tumortrack.live.values import SourceEnded, SourceLost
 
 
 def test_a_cameras_frame_comes_out_bit_for_bit():
     camera = Camera()
-    source = RealSenseSource(camera.device, RealSense())
+    source = RealSenseSource(camera.device, RealSenseSourceConfig())
     for number in range(3):
         camera.show(number, stamp_ms=1_790_000_000_123.25 + number)
         seen = source.read(1.0)
@@ -39,7 +39,7 @@ def test_a_cameras_frame_comes_out_bit_for_bit():
 @pytest.mark.parametrize("unit_m", [0.001, 0.0001, 0.00025])
 def test_the_devices_own_unit_counts(unit_m: float):
     camera = Camera(unit_m=unit_m)
-    source = RealSenseSource(camera.device, RealSense())
+    source = RealSenseSource(camera.device, RealSenseSourceConfig())
     camera.show(5)
     seen = source.read(1.0)
     source.close()
@@ -50,7 +50,7 @@ def test_the_devices_own_unit_counts(unit_m: float):
 
 def test_every_recorded_frame_comes_back_bit_for_bit(tmp_path):
     record(str(tmp_path / "some.db3"), frames=5)
-    source = RealSense(device=str(tmp_path / "some.db3"), realtime=False).open()
+    source = RealSenseSourceConfig(device=str(tmp_path / "some.db3"), realtime=False).open()
     assert source.waits
     assert not source.host_clock
     stamps = []
@@ -70,7 +70,7 @@ def test_every_recorded_frame_comes_back_bit_for_bit(tmp_path):
 
 def test_the_newest_frame_wins_and_others_are_counted():
     camera = Camera()
-    source = RealSenseSource(camera.device, RealSense())
+    source = RealSenseSource(camera.device, RealSenseSourceConfig())
     for number in range(4):
         camera.show(number, stamp_ms=1000.0 + number)
     seen = source.read(1.0)
@@ -81,17 +81,17 @@ def test_the_newest_frame_wins_and_others_are_counted():
 
 
 def test_a_clock_of_its_own_is_not_taken_for_this_machines():
-    own = RealSenseSource(Camera(global_time=False).device, RealSense())
+    own = RealSenseSource(Camera(global_time=False).device, RealSenseSourceConfig())
     assert not own.host_clock
     own.close()
-    asked = RealSenseSource(Camera().device, RealSense(global_time=False))
+    asked = RealSenseSource(Camera().device, RealSenseSourceConfig(global_time=False))
     assert not asked.host_clock
     asked.close()
 
 
 def test_frames_before_the_clocks_are_tied_are_left_out():
     camera = Camera()
-    source = RealSenseSource(camera.device, RealSense())
+    source = RealSenseSource(camera.device, RealSenseSourceConfig())
     camera.show(0, stamp_ms=17.0, hardware_clock=True)
     assert source.read(0.5) is None
     assert source.dropped == 1
@@ -121,7 +121,7 @@ class _Unplugged:
 
 def test_an_unplugged_camera_is_lost():
     camera = Camera()
-    source = RealSenseSource(_Unplugged(camera.device), RealSense())
+    source = RealSenseSource(_Unplugged(camera.device), RealSenseSourceConfig())
     camera.show(0)
     assert source.read(0.5) is not None  # what came before counts
     with pytest.raises(SourceLost, match=r"unplugged"):
@@ -131,30 +131,32 @@ def test_an_unplugged_camera_is_lost():
 
 def test_what_a_camera_cannot_do_is_said():
     with pytest.raises(InputError, match=r"distorted"):
-        RealSenseSource(Camera(distortion=0.1).device, RealSense())
+        RealSenseSource(Camera(distortion=0.1).device, RealSenseSourceConfig())
     with pytest.raises(InputError, match=r"no 640x480@30. Allowed: 848x480@30"):
-        RealSenseSource(Camera().device, RealSense(width=640))
+        RealSenseSource(Camera().device, RealSenseSourceConfig(width=640))
     with pytest.raises(InputError, match=r"no emitter"):
-        RealSenseSource(Camera().device, RealSense(emitter=True))
+        RealSenseSource(Camera().device, RealSenseSourceConfig(emitter=True))
     with pytest.raises(InputError, match=r"Allowed: .*high_accuracy"):
-        RealSenseSource(Camera().device, RealSense(preset="best"))
+        RealSenseSource(Camera().device, RealSenseSourceConfig(preset="best"))
 
 
 def test_what_is_not_there_is_said(tmp_path, monkeypatch):
     with pytest.raises(InputError, match=r"no recording"):
-        RealSense(device=str(tmp_path / "none.db3")).open()
+        RealSenseSourceConfig(device=str(tmp_path / "none.db3")).open()
     (tmp_path / "torn.db3").write_bytes(b"x" * 5000)
     with pytest.raises(InputError, match=r"is no recording of a RealSense"):
-        RealSense(device=str(tmp_path / "torn.db3")).open()
+        RealSenseSourceConfig(device=str(tmp_path / "torn.db3")).open()
     with pytest.raises(SourceLost):
-        RealSense(device="000000000000").open()  # no camera has it
+        RealSenseSourceConfig(device="000000000000").open()  # no camera has it
     monkeypatch.setitem(sys.modules, "pyrealsense2", None)
     with pytest.raises(InputError, match=r"pip install 'tumortrack\[live\]'"):
-        RealSense().open()
+        RealSenseSourceConfig().open()
 
 
 def test_the_command_lines_text():
-    config = parse_spec("realsense:0123?fps=60&emitter=true&preset=default", (RealSense,), "source")
-    assert config == RealSense(device="0123", fps=60, emitter=True, preset="default")
+    config = parse_spec(
+        "realsense:0123?fps=60&emitter=true&preset=default", (RealSenseSourceConfig,), "source"
+    )
+    assert config == RealSenseSourceConfig(device="0123", fps=60, emitter=True, preset="default")
     assert config.recording is None
-    assert parse_spec("realsense", (RealSense,), "source") == RealSense()
+    assert parse_spec("realsense", (RealSenseSourceConfig,), "source") == RealSenseSourceConfig()

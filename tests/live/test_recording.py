@@ -36,18 +36,18 @@ from tumortrack.core.mesh_files import write_anatomy
 from tumortrack.core.types import DepthFrame, SensorCloud
 from tumortrack.live.ros.messages import Messages
 from tumortrack.live.ros.observed import messages_seen
-from tumortrack.live.sinks.recording import Recording as RecordTo
-from tumortrack.live.sources.recording import Recording
-from tumortrack.live.values import Frames, Seen, SourceEnded, SourceLost
+from tumortrack.live.sinks.recording import RecordingSinkConfig as RecordTo
+from tumortrack.live.sources.recording import RecordingSourceConfig
+from tumortrack.live.values import Observation, PublishedFrame, SourceEnded, SourceLost
 from tumortrack.sense.files import write_cloud_ply, write_depth_png, write_intrinsics
 
-TURNED = Frames("table", rigid(np.diag([-1.0, -1.0, 1.0]), np.array([50.0, -20, 9])))
+TURNED = PublishedFrame("table", rigid(np.diag([-1.0, -1.0, 1.0]), np.array([50.0, -20, 9])))
 
 
-def play(path: Path, **options) -> list[Seen | InputError]:
+def play(path: Path, **options) -> list[Observation | InputError]:
     """Everything to the end, errors in their place."""
-    source = Recording(path=path, **({"rate": 0} | options)).open()
-    got: list[Seen | InputError] = []
+    source = RecordingSourceConfig(path=path, **({"rate": 0} | options)).open()
+    got: list[Observation | InputError] = []
     try:
         while True:
             try:
@@ -175,7 +175,7 @@ def test_without_frames_there_are_estimates_only(tmp_path):
     with AnyReader([path]) as reader:
         assert all(topic.startswith("/tumortrack/") for topic in reader.topics)
     with pytest.raises(InputError, match="no depth images"):
-        Recording(path=path).open()
+        RecordingSourceConfig(path=path).open()
 
 
 def test_an_existing_folder_is_replaced_only_if_it_is_a_recording(tmp_path):
@@ -327,7 +327,7 @@ def test_stamps_of_files(tmp_path):
     for text in ("file,stamp_ns\n001.ply,77\n", "name\nx\n", "file,stamp_ns\n000.ply,soon\n"):
         (numbered / "times.csv").write_text(text)
         with pytest.raises(InputError, match=r"times\.csv"):
-            Recording(path=numbered).open()
+            RecordingSourceConfig(path=numbered).open()
 
 
 def test_clouds_in_metres(tmp_path):
@@ -348,7 +348,7 @@ def test_depth_images_beside_one_camera(tmp_path):
     assert len(got) == 3
     (tmp_path / "intrinsics.json").unlink()
     with pytest.raises(InputError, match=r"intrinsics\.json"):
-        Recording(path=tmp_path).open()
+        RecordingSourceConfig(path=tmp_path).open()
 
 
 def test_scenes_bring_their_truth(tmp_path):
@@ -383,7 +383,7 @@ def write_bag(path: Path, topics: dict[str, list], kind: str) -> Path:
             (content.stamp_ns, topic, out)
             for topic, (suffix, contents) in topics.items()
             for content in contents
-            for out in messages_seen(Seen(content, 0), messages)
+            for out in messages_seen(Observation(content, 0), messages)
             if out.suffix == suffix
         ]
         for stamp_ns, topic, out in sorted(rows, key=lambda row: row[:2]):
@@ -417,7 +417,7 @@ def test_bags_of_every_kind_are_played(tmp_path, kind):
         assert stamps(play(file)) == stamps(frames)
     for options in ({"topic": "/nowhere"}, {"info_topic": "/arm/points"}):
         with pytest.raises(InputError, match="has no"):
-            Recording(path=path, **options).open()
+            RecordingSourceConfig(path=path, **options).open()
 
 
 ROSBAG = """
@@ -458,9 +458,9 @@ def test_two_candidates_are_named_rather_than_guessed(tmp_path):
     }
     path = write_bag(tmp_path / "r", topics, "mcap")
     with pytest.raises(InputError, match="/left/depth, /right/depth"):
-        Recording(path=path).open()
+        RecordingSourceConfig(path=path).open()
     with pytest.raises(InputError, match="camera_info"):
-        Recording(path=path, topic="/left/depth").open()
+        RecordingSourceConfig(path=path, topic="/left/depth").open()
 
 
 def test_a_bad_image_in_a_bag_is_said_and_passed(tmp_path):
@@ -513,7 +513,7 @@ def test_rubbish_is_no_recording(tmp_path, name):
     (tmp_path / name).write_bytes(np.random.default_rng(1).bytes(3000))
     path = tmp_path if name == "metadata.yaml" else tmp_path / name
     with pytest.raises(InputError, match="bag"):
-        Recording(path=path).open()
+        RecordingSourceConfig(path=path).open()
 
 
 def test_what_is_no_recording_is_refused(tmp_path):
@@ -521,17 +521,17 @@ def test_what_is_no_recording_is_refused(tmp_path):
     (tmp_path / "film.avi").touch()
     for path in (tmp_path / "empty", tmp_path / "film.avi", tmp_path / "nowhere"):
         with pytest.raises(InputError):
-            Recording(path=path).open()
+            RecordingSourceConfig(path=path).open()
     for options in ({"rate": -1}, {"rate": float("nan")}, {"fps": 0}, {"unit_mm": 0}):
         with pytest.raises(InputError):
-            Recording(path=tmp_path, **options)
+            RecordingSourceConfig(path=tmp_path, **options)
 
 
 @pytest.mark.parametrize("rate", [1, 4])
 def test_frames_come_at_the_pace_of_their_stamps(tmp_path, rate):
     folder = cloud_files(tmp_path / "c", [f"{n}.ply" for n in range(5)])
     start, arrivals = time.monotonic(), []
-    source = Recording(path=folder, rate=rate, fps=10).open()
+    source = RecordingSourceConfig(path=folder, rate=rate, fps=10).open()
     assert (source.waits, source.host_clock) == (False, False)
     while len(arrivals) < 5:
         if source.read(0.05) is not None:
@@ -546,7 +546,7 @@ def test_frames_come_at_the_pace_of_their_stamps(tmp_path, rate):
 
 def test_frames_that_are_late_are_dropped_and_the_newest_given(tmp_path):
     folder = cloud_files(tmp_path / "c", [f"{n}.ply" for n in range(6)])
-    source = Recording(path=folder, fps=20).open()
+    source = RecordingSourceConfig(path=folder, fps=20).open()
     assert first_x([source.read(0)]) == [1]
     time.sleep(0.22)  # frames 2 to 5 were due meanwhile
     (x,) = first_x([source.read(0)])
@@ -555,7 +555,7 @@ def test_frames_that_are_late_are_dropped_and_the_newest_given(tmp_path):
 
 def test_a_long_pause_is_cut_short_of_a_frozen_source(tmp_path):
     folder = cloud_files(tmp_path / "c", ["1000000000000.ply", "9000000000000.ply"])
-    source = Recording(path=folder, rate=2).open()
+    source = RecordingSourceConfig(path=folder, rate=2).open()
     assert source.read(0).stamp_ns == 10**12
     start = time.monotonic()
     while (seen := source.read(0.5)) is None:
@@ -566,7 +566,7 @@ def test_a_long_pause_is_cut_short_of_a_frozen_source(tmp_path):
 
 def test_a_loop_goes_on_with_rising_stamps(tmp_path):
     folder = cloud_files(tmp_path / "c", ["1.ply", "2.ply"])
-    source = Recording(path=folder, rate=0, loop=True, fps=20).open()
+    source = RecordingSourceConfig(path=folder, rate=0, loop=True, fps=20).open()
     got = [source.read(0.1) for _ in range(6)]
     assert first_x(got) == [1, 2, 1, 2, 1, 2]
     assert set(np.diff(stamps(got))) == {50_000_000}
@@ -575,7 +575,7 @@ def test_a_loop_goes_on_with_rising_stamps(tmp_path):
 
 def test_close_ends_a_read_that_waits(tmp_path):
     folder = cloud_files(tmp_path / "c", ["1.ply", "2.ply"])
-    source = Recording(path=folder, fps=0.5).open()
+    source = RecordingSourceConfig(path=folder, fps=0.5).open()
     source.read(0)
     threading.Timer(0.1, source.close).start()
     start = time.monotonic()

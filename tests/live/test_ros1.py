@@ -23,11 +23,11 @@ from ros1_objects import (
 from tumortrack.core.errors import InputError
 from tumortrack.core.types import DepthFrame, SensorCloud
 from tumortrack.live.ros import rospy_node
-from tumortrack.live.sinks.ros1 import Ros1 as Sink
 from tumortrack.live.sinks.ros1 import Ros1Sink
-from tumortrack.live.sources.ros1 import Ros1 as Source
+from tumortrack.live.sinks.ros1 import Ros1SinkConfig as Sink
 from tumortrack.live.sources.ros1 import Ros1Source
-from tumortrack.live.values import Frames, Seen, Setting, SourceLost
+from tumortrack.live.sources.ros1 import Ros1SourceConfig as Source
+from tumortrack.live.values import Observation, PublishedFrame, SinkContext, SourceLost
 
 pytestmark = pytest.mark.filterwarnings("ignore:notifyAll:DeprecationWarning")  # rospy's own
 
@@ -41,7 +41,7 @@ def opened(source: Source) -> Ros1Source:
     return eventually(source.open, "the topic")
 
 
-def first(source: Ros1Source) -> Seen:
+def first(source: Ros1Source) -> Observation:
     return eventually(lambda: source.read(0.5), "a frame")
 
 
@@ -162,9 +162,9 @@ def test_simulated_time_is_not_this_machines(graph):
 
 def test_an_estimate_arrives_in_metres_in_its_frame_at_its_time(graph, tmp_path):
     published_from_camera = np.array([[0, -1, 0, 10], [1, 0, 0, 20], [0, 0, 1, 30], [0, 0, 0, 1.0]])
-    frames = Frames("robot_base", published_from_camera)
+    frames = PublishedFrame("robot_base", published_from_camera)
     update = small_update(frames=frames)
-    sink = Sink(namespace="/f", mesh_hz=0).open(Setting(parts=PARTS, frames=frames))
+    sink = Sink(namespace="/f", mesh_hz=0).open(SinkContext(parts=PARTS, frames=frames))
     with listener("/f", tmp_path) as heard:
         cloud = published(sink, heard, update)
         place = published(sink, heard, update, "tumor_1/center")

@@ -27,15 +27,15 @@ from tumortrack.core.errors import InputError, TumortrackError
 from tumortrack.core.types import SensorCloud
 from tumortrack.live.ros import incoming
 from tumortrack.live.ros.bus import Bus, domain_id, open_bus
-from tumortrack.live.ros.cell import JOINTS, Cell
+from tumortrack.live.ros.cell import JOINTS, WorkcellMessages
 from tumortrack.live.ros.dds_types import dds_name, idl_type, ros_name
 from tumortrack.live.ros.messages import Messages
 from tumortrack.live.ros.observed import messages_seen, plain_cloud
 from tumortrack.live.ros.outgoing import MARKERS, messages_of
-from tumortrack.live.sinks.ros2 import Ros2 as SinkRos2
-from tumortrack.live.source_worker import Reader
-from tumortrack.live.sources.ros2 import Ros2 as SourceRos2
-from tumortrack.live.values import Seen, Source
+from tumortrack.live.sinks.ros2 import Ros2SinkConfig as SinkRos2
+from tumortrack.live.source_worker import SourceWorker
+from tumortrack.live.sources.ros2 import Ros2SourceConfig as SourceRos2
+from tumortrack.live.values import Observation, Source
 from workcell_objects import with_arms, working
 
 pytest.importorskip("cyclonedds", reason="cyclonedds is not installed (tumortrack[live])")
@@ -68,10 +68,10 @@ def bus(messages: Messages) -> Iterator[Bus]:
 @pytest.mark.parametrize("kind", [incoming.CLOUD, incoming.CAMERA_INFO, MARKERS, JOINTS])
 def test_types_agree_with_a_second_encoder(kind: str, messages: Messages) -> None:
     """cyclonedds' own (slow) coding of our type gives the bytes that rosbags gives."""
-    seen = Seen(small_frame(), 0)
-    cloud = Seen(SensorCloud(points_mm()[:7], 12_000_000_034), 0)
+    seen = Observation(small_frame(), 0)
+    cloud = Observation(SensorCloud(points_mm()[:7], 12_000_000_034), 0)
     made = [*messages_seen(seen, messages), *messages_seen(cloud, messages)]
-    made += messages_of(working(), messages, PARTS, True, Cell(messages, 0))
+    made += messages_of(working(), messages, PARTS, True, WorkcellMessages(messages, 0))
     message = next(one.message for one in made if one.message_type == kind)
     cdr = bytes(messages.to_bytes(message))
     type_ = idl_type(kind, "humble")
@@ -117,7 +117,9 @@ def test_what_other_nodes_see_of_a_topic(bus: Bus) -> None:
 class Sender(Frames):
     """Sends frames from this process, until something comes of it."""
 
-    def until(self, source: Source, seen: Seen, leave_out: tuple[str, ...] = ()) -> Seen:
+    def until(
+        self, source: Source, seen: Observation, leave_out: tuple[str, ...] = ()
+    ) -> Observation:
         """Send again and again until it is seen (or refused: raises)."""
         for _ in range(100):
             self.send(seen, leave_out)
@@ -125,7 +127,9 @@ class Sender(Frames):
                 return got
         raise AssertionError("nothing came")
 
-    def refused(self, source: Source, seen: Seen, not_this: str, beside: Seen | None = None) -> str:
+    def refused(
+        self, source: Source, seen: Observation, not_this: str, beside: Observation | None = None
+    ) -> str:
         """The first refusal that does not say ``not_this``."""
         for _ in range(100):
             if beside is not None:
@@ -144,16 +148,16 @@ def test_what_belongs_to_an_image_is_asked_for(bus: Bus, messages: Messages) -> 
     now = small_frame(time.time_ns())
     old = small_frame(now.stamp_ns - 2_000_000_000)
     mask = np.ones((48, 64), bool)
-    alone = Seen(now, 0)
+    alone = Observation(now, 0)
     try:
         with pytest.raises(InputError, match=r"no camera_info on /a/depth/camera_info.*\?info="):
             frames.until(source, alone, ("depth/camera_info",))
         refused = frames.refused(source, alone, "camera_info")
         assert "no mask came on /a/mask" in refused
-        frames.send(Seen(old, 0, mask), ("depth/image_rect",))
-        refused = frames.refused(source, alone, "so far", Seen(old, 0, mask))
+        frames.send(Observation(old, 0, mask), ("depth/image_rect",))
+        refused = frames.refused(source, alone, "so far", Observation(old, 0, mask))
         assert "2.00 s older" in refused
-        assert frames.until(source, Seen(now, 0, mask)).mask is not None
+        assert frames.until(source, Observation(now, 0, mask)).mask is not None
     finally:
         source.close()
 
@@ -169,7 +173,7 @@ def test_whose_clock(offset_s: int, clock: str, host: bool, bus: Bus, messages: 
     source = SourceRos2(topic=f"{place}/points", clock=clock).open()
     stamp_ns = time.time_ns() + offset_s * 1_000_000_000
     try:
-        cloud = Seen(SensorCloud(points_mm()[:9], stamp_ns), 0)
+        cloud = Observation(SensorCloud(points_mm()[:9], stamp_ns), 0)
         seen = Sender(bus, messages, place).until(source, cloud)
         assert source.host_clock is host
         assert seen.stamp_ns == stamp_ns
@@ -180,7 +184,7 @@ def test_whose_clock(offset_s: int, clock: str, host: bool, bus: Bus, messages: 
 
 def test_the_loop_counts_ages_from_the_stamp_once_a_frame_came() -> None:
     with sending("cloud") as topic:
-        reader = Reader(SourceRos2(topic=topic).open)
+        reader = SourceWorker(SourceRos2(topic=topic).open)
         seen = reader.take(10.0)
         assert reader.latency_from == "stamp"
         assert reader.born_ns(seen) == seen.stamp_ns
@@ -199,7 +203,7 @@ def test_the_view_for_rviz_shows_what_is_published(
 ) -> None:
     """Topics, frame and reliability of docs/ros/*.rviz are the sink's."""
     view = (HERE.parent / "docs" / "ros" / name).read_text(encoding="utf-8")
-    cell = Cell(messages, 0)
+    cell = WorkcellMessages(messages, 0)
     sent = {
         f"/tumortrack/{one.suffix}" for one in messages_of(empty_update(), messages, (), cell=cell)
     }

@@ -34,9 +34,9 @@ from tumortrack.live.ros.dds_types import dds_name
 from tumortrack.live.ros.messages import Messages
 from tumortrack.live.ros.observed import messages_seen, plain_cloud
 from tumortrack.live.ros.outgoing import messages_of
-from tumortrack.live.sinks.ros2 import Ros2 as SinkRos2
-from tumortrack.live.sources.ros2 import Ros2 as SourceRos2
-from tumortrack.live.values import Seen, Sink, Source, Update
+from tumortrack.live.sinks.ros2 import Ros2SinkConfig as SinkRos2
+from tumortrack.live.sources.ros2 import Ros2SourceConfig as SourceRos2
+from tumortrack.live.values import Observation, Sink, Source, TrackingResult
 
 pytest.importorskip("cyclonedds", reason="cyclonedds is not installed (tumortrack[live])")
 
@@ -62,14 +62,14 @@ def bus(messages: Messages) -> Iterator[Bus]:
     joined.close()
 
 
-def large_update(sequence: int, n: int = 40_000) -> Update:
+def large_update(sequence: int, n: int = 40_000) -> TrackingResult:
     """An update with ``n`` points, stamped now."""
     stamp_ns = time.time_ns()
     small = small_estimate(stamp_ns)
     points = np.resize(small.cloud.points_mm, (n, 3))
     cloud = OccupancyCloud(points, np.ones(n, np.uint8), np.full(n, 0.5, np.float32), stamp_ns)
     estimate = Estimate(cloud, None, small.meshes, small.report)
-    return Update(sequence=sequence, stamp_ns=stamp_ns, estimate=estimate, quality="good")
+    return TrackingResult(sequence=sequence, stamp_ns=stamp_ns, estimate=estimate, quality="good")
 
 
 def test_depth_images_from_another_process() -> None:
@@ -105,7 +105,7 @@ def test_depth_images_from_another_process() -> None:
         source.close()
 
 
-def complete(read: Callable[[], Seen]) -> Seen:
+def complete(read: Callable[[], Observation]) -> Observation:
     """The first frame that has all it needs; what belongs to it comes on topics of its own."""
     for _ in range(100):
         with contextlib.suppress(InputError):
@@ -178,7 +178,7 @@ def at(last: dict[str, dict], stamp_ns: int) -> bool:
     return {one["stamp_ns"] for one in last.values()} == {stamp_ns}
 
 
-def publish_until(sink: Sink, other: Other, update: Update) -> dict[str, dict]:
+def publish_until(sink: Sink, other: Other, update: TrackingResult) -> dict[str, dict]:
     """Publish until the other end hears it on all topics; it may not be matched yet."""
     done = threading.Event()
 
@@ -266,7 +266,7 @@ def test_fast_dds_hears_and_is_heard(tmp_path: Path, bus: Bus, messages: Message
     """A cloud of ours arrives there byte for byte, an image from there here; noise does no harm."""
     program = built(tmp_path)
     files = []
-    for suffix, kind, message in messages_seen(Seen(small_frame(), 0), messages):
+    for suffix, kind, message in messages_seen(Observation(small_frame(), 0), messages):
         (tmp_path / suffix.replace("/", "_")).write_bytes(messages.to_bytes(message))
         files += [f"rt/fast/{suffix}", dds_name(kind), tmp_path / suffix.replace("/", "_")]
     noise = np.random.default_rng(1).integers(0, 256, 2000, np.uint8).tobytes()

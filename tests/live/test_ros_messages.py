@@ -28,13 +28,13 @@ from live_objects import (
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import rigid
 from tumortrack.core.types import SensorCloud
-from tumortrack.live.ros.cell import Cell
+from tumortrack.live.ros.cell import WorkcellMessages
 from tumortrack.live.ros.incoming import CAMERA_INFO, CLOUD, IMAGE, cloud_of, depth_of, mask_of
 from tumortrack.live.ros.markers import MARKERS, Rate
 from tumortrack.live.ros.messages import Messages, stamp_of
 from tumortrack.live.ros.observed import messages_seen
 from tumortrack.live.ros.outgoing import messages_of
-from tumortrack.live.values import Frames, Seen
+from tumortrack.live.values import Observation, PublishedFrame
 from workcell_objects import workcell
 
 HUMBLE, NOETIC = Messages("humble"), Messages("noetic")
@@ -42,7 +42,7 @@ STOCK = {HUMBLE: get_typestore(Stores.ROS2_HUMBLE), NOETIC: get_typestore(Stores
 DEBIAN = Path("/usr/lib/python3/dist-packages/sensor_msgs")
 POINTS_M = np.array([[0.01, -0.02, 0.125], [0.003, 0.004, 0.13], [-0.05, 0.0, 0.2]])
 _TURN = Rotation.from_euler("xyz", [0.3, -1, 2]).as_matrix()
-TURNED = Frames("table", rigid(_TURN, np.array([50.0, -20, 9])))
+TURNED = PublishedFrame("table", rigid(_TURN, np.array([50.0, -20, 9])))
 
 
 def cloud_message(dtype: str = "<f4", **changes) -> object:
@@ -256,7 +256,7 @@ def test_damaged_bytes_are_refused_or_read_but_nothing_else(data):
     """Cut off, or with some bytes changed: an InputError, or a cloud."""
     messages = data.draw(st.sampled_from([HUMBLE, NOETIC]))
     cloud = SensorCloud(np.float32([[1, 2, 130], [3, 4, 140]]), STAMP_NS)
-    ((_, kind, message),) = messages_seen(Seen(cloud, 0), messages)
+    ((_, kind, message),) = messages_seen(Observation(cloud, 0), messages)
     raw = bytearray(messages.to_bytes(message))
     for _ in range(data.draw(st.integers(0, 3))):
         raw[data.draw(st.integers(0, len(raw) - 1))] = data.draw(st.integers(0, 255))
@@ -272,7 +272,7 @@ def test_damaged_bytes_are_refused_or_read_but_nothing_else(data):
 def test_what_was_seen_comes_back(messages):
     mask = np.zeros((CAMERA.height, CAMERA.width), bool)
     mask[3:9, 4:40] = True
-    out = {m.suffix: m for m in messages_seen(Seen(small_frame(), 0, mask), messages, "cam")}
+    out = {m.suffix: m for m in messages_seen(Observation(small_frame(), 0, mask), messages, "cam")}
     image, info, seen_mask = (
         messages.from_bytes(messages.to_bytes(out[s].message), out[s].message_type)
         for s in ("depth/image_rect", "depth/camera_info", "mask")
@@ -287,7 +287,7 @@ def test_what_was_seen_comes_back(messages):
     np.testing.assert_array_equal(mask_of(seen_mask), mask)
 
     cloud = SensorCloud(small_estimate().cloud.points_mm, STAMP_NS)
-    ((suffix, kind, message),) = messages_seen(Seen(cloud, 0), messages)
+    ((suffix, kind, message),) = messages_seen(Observation(cloud, 0), messages)
     back = cloud_of(messages.from_bytes(messages.to_bytes(message), kind))
     assert (suffix, back.stamp_ns) == ("points", STAMP_NS)
     np.testing.assert_allclose(back.points_mm, cloud.points_mm, rtol=2e-7)
@@ -460,7 +460,7 @@ def run_ros(script: str, folder: Path) -> str:
 
 def test_ros_s_own_classes_read_what_is_sent(tmp_path):
     update, lines = replace(small_update(frames=TURNED), workcell=workcell(0.3)), []
-    for out in messages_of(update, NOETIC, PARTS, True, Cell(NOETIC, 0)):
+    for out in messages_of(update, NOETIC, PARTS, True, WorkcellMessages(NOETIC, 0)):
         name = out.suffix.replace("/", "_")
         (tmp_path / name).write_bytes(NOETIC.to_bytes(out.message))
         lines.append(f"{name} {out.message_type} {NOETIC.md5(out.message_type)}")

@@ -25,14 +25,14 @@ from tumortrack.core.colours import KIDNEY
 from tumortrack.core.estimate import Estimate
 from tumortrack.core.geometry import rigid, transform_points
 from tumortrack.core.types import OccupancyCloud
-from tumortrack.live.sinks.ros1 import Ros1
-from tumortrack.live.values import Frames, Update
+from tumortrack.live.sinks.ros1 import Ros1SinkConfig
+from tumortrack.live.values import PublishedFrame, TrackingResult
 from workcell_objects import with_arms, workcell
 
 pytestmark = pytest.mark.filterwarnings("ignore:notifyAll:DeprecationWarning")  # rospy's own
 
 
-def phantom_update(folder: Path) -> Update:
+def phantom_update(folder: Path) -> TrackingResult:
     """The built-in phantom before the camera, as a perfect tracker would see it."""
     case = write_phantom_case(folder / "case")
     camera_from_ct = looking_down(case)
@@ -53,7 +53,7 @@ def phantom_update(folder: Path) -> Update:
         STAMP_NS,
     )
     estimate = Estimate(cloud, None, meshes, {})
-    return Update(sequence=0, stamp_ns=STAMP_NS, estimate=estimate, quality="good")
+    return TrackingResult(sequence=0, stamp_ns=STAMP_NS, estimate=estimate, quality="good")
 
 
 def shown(screen: Screen) -> dict[str, int]:
@@ -80,9 +80,9 @@ def test_rviz_shows_the_tumors_through_the_kidney_and_nothing_without_an_estimat
     """With TUMORTRACK_PICTURES=docs/images it also makes the picture in the documentation."""
     ros1_graph()
     update = phantom_update(tmp_path)
-    sink = Ros1().open(small_setting())
+    sink = Ros1SinkConfig().open(small_setting())
 
-    def ask(update: Update) -> dict[str, int]:
+    def ask(update: TrackingResult) -> dict[str, int]:
         for _ in range(5):
             sink.publish(update)
             time.sleep(0.05)
@@ -120,11 +120,11 @@ def test_rviz_shows_arms_at_work_and_nothing_of_them_when_nothing_is_known(tmp_p
     assert update.estimate is not None
     # The camera looks straight down; the organ lies on the table.
     far_mm = update.estimate.meshes["kidney"].box_mm[1, 2]
-    frames = Frames("table", rigid(np.diag([1.0, -1, -1]), np.array([0.0, 0, far_mm])))
+    frames = PublishedFrame("table", rigid(np.diag([1.0, -1, -1]), np.array([0.0, 0, far_mm])))
     update = replace(update, frames=frames)
     assert update.placed is not None
     x, y, z = update.placed.meshes["tumor_2"].box_mm.mean(0)
-    sink = Ros1(mesh_hz=0).open(replace(with_arms(), frames=frames))
+    sink = Ros1SinkConfig(mesh_hz=0).open(replace(with_arms(), frames=frames))
 
     def ask(progress: float | None) -> dict[str, np.ndarray]:
         cell = None if progress is None else workcell(progress, "", (x, y, z), 25.0)

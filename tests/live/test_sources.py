@@ -20,11 +20,11 @@ from recording_objects import record, update_number
 from theatre_objects import small_theatre
 from tumortrack.core.errors import InputError
 from tumortrack.core.types import DepthFrame, SensorCloud
-from tumortrack.live.sources.realsense import RealSense, RealSenseSource
-from tumortrack.live.sources.recording import Recording
-from tumortrack.live.sources.ros1 import Ros1
+from tumortrack.live.sources.realsense import RealSenseSource, RealSenseSourceConfig
+from tumortrack.live.sources.recording import RecordingSourceConfig
+from tumortrack.live.sources.ros1 import Ros1SourceConfig
 from tumortrack.live.sources.virtual import VirtualSource
-from tumortrack.live.values import Seen, Source, SourceEnded, SourceLost
+from tumortrack.live.values import Observation, Source, SourceEnded, SourceLost
 
 SLACK_S = 0.5  # that a busy machine may take longer
 
@@ -40,19 +40,19 @@ def realsense(_folder: Path) -> Iterator[Source]:
     from realsense_objects import Camera, Streaming
 
     camera = Camera()
-    source = RealSenseSource(camera.device, RealSense())
+    source = RealSenseSource(camera.device, RealSenseSourceConfig())
     with Streaming(camera):
         yield source
 
 
 @contextmanager
 def playback(folder: Path) -> Iterator[Source]:
-    yield RealSense(device=_recording(folder)).open()
+    yield RealSenseSourceConfig(device=_recording(folder)).open()
 
 
 @contextmanager
 def playback_frame_by_frame(folder: Path) -> Iterator[Source]:
-    yield RealSense(device=_recording(folder), realtime=False).open()
+    yield RealSenseSourceConfig(device=_recording(folder), realtime=False).open()
 
 
 @contextmanager
@@ -71,10 +71,10 @@ def ros2_clouds(_folder: Path) -> Iterator[Source]:
 def _ros2(kind: str) -> Iterator[Source]:
     pytest.importorskip("cyclonedds")
     from ros2_objects import own_graph, sending
-    from tumortrack.live.sources.ros2 import Ros2
+    from tumortrack.live.sources.ros2 import Ros2SourceConfig
 
     with own_graph(), sending(kind) as topic:
-        source = Ros2(topic=topic).open()
+        source = Ros2SourceConfig(topic=topic).open()
         for _ in range(100):  # an image may be here before the first CameraInfo
             with contextlib.suppress(InputError):
                 if source.read(0.1) is not None:
@@ -97,20 +97,20 @@ def _ros1(topics: dict[str, str]) -> Iterator[Source]:
 
     ros1_graph()
     with publisher(topics):
-        yield eventually(Ros1(topic=list(topics)[-1]).open, "the topic")
+        yield eventually(Ros1SourceConfig(topic=list(topics)[-1]).open, "the topic")
 
 
 @contextmanager
 def recorded_mcap(folder: Path) -> Iterator[Source]:
     pytest.importorskip("rosbags")
     path = record(folder / "r", [update_number(n) for n in range(8)])
-    yield Recording(path=path, rate=0).open()
+    yield RecordingSourceConfig(path=path, rate=0).open()
 
 
 @contextmanager
 def recorded_files(folder: Path) -> Iterator[Source]:
     path = record(folder / "r", [update_number(n) for n in range(8)], format="files")
-    yield Recording(path=path).open()
+    yield RecordingSourceConfig(path=path).open()
 
 
 def _recording(folder: Path) -> str:
@@ -142,9 +142,9 @@ def source(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Source]:
         opened.close()
 
 
-def frames_of(source: Source, count: int) -> list[Seen]:
+def frames_of(source: Source, count: int) -> list[Observation]:
     """So many frames, or as many as come until the end."""
-    frames: list[Seen] = []
+    frames: list[Observation] = []
     patience = time.monotonic() + 10
     while len(frames) < count:
         assert time.monotonic() < patience, f"{len(frames)} frames in 10 s"
@@ -173,7 +173,7 @@ def test_frames_come_in_order_in_mm_and_read_only(source: Source):
     assert source.dropped >= 0
 
 
-def _distance(seen: Seen) -> tuple[float, np.ndarray]:
+def _distance(seen: Observation) -> tuple[float, np.ndarray]:
     if isinstance(seen.content, DepthFrame):
         return float(np.nanmedian(seen.content.depth_mm)), seen.content.depth_mm
     assert isinstance(seen.content, SensorCloud)
@@ -201,7 +201,7 @@ def test_a_read_is_back_in_time(source: Source):
             break
         finally:
             assert time.monotonic() - begin < timeout_s + SLACK_S
-        assert seen is None or isinstance(seen, Seen)
+        assert seen is None or isinstance(seen, Observation)
 
 
 def test_a_source_that_waits_loses_nothing(source: Source):

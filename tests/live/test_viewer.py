@@ -27,16 +27,16 @@ from tumortrack.core.geometry import rigid, transform_points
 from tumortrack.core.store import new_folder
 from tumortrack.core.types import Anatomy, LabelVolume, Mesh, Volume
 from tumortrack.imaging.case import Case, save_case
-from tumortrack.live.sinks.viewer import Viewer, ViewerSink
-from tumortrack.live.values import Frames, Setting, Update
+from tumortrack.live.sinks.viewer import ViewerSink, ViewerSinkConfig
+from tumortrack.live.values import PublishedFrame, SinkContext, TrackingResult
 from tumortrack.live.viewer.points import point_under
-from tumortrack.live.viewer.slices import CarriedCt, Plane, slice_picture
-from tumortrack.live.viewer.status import Status
+from tumortrack.live.viewer.slices import CarriedCt, SlicePlane, slice_picture
+from tumortrack.live.viewer.status import StatusPanel
 from tumortrack.live.viewer.surfaces import bare_faces, exact_margin, rough_margin
 from workcell_objects import REASON, virtual, with_arms, workcell, working
 
 TURN = Rotation.from_euler("xyz", [20, -35, 50], degrees=True).as_matrix()
-ROBOT = Frames("robot", rigid(TURN, np.array([400.0, -250.0, 90.0])))
+ROBOT = PublishedFrame("robot", rigid(TURN, np.array([400.0, -250.0, 90.0])))
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,7 +79,7 @@ def sloped_case(with_ct: bool = True) -> Case:
     return Case(anatomy, volume, (0.0, -1.0, 0.0), ct=ct if with_ct else None)
 
 
-def carried_update(case: Case) -> Update:
+def carried_update(case: Case) -> TrackingResult:
     """An update whose estimate is the case's anatomy, moved by ``MOTION``."""
     update = small_update()
     assert update.estimate is not None
@@ -96,8 +96,8 @@ def sinks():
     """Opens viewers at free ports, and closes them."""
     opened: list[ViewerSink] = []
 
-    def open_viewer(setting: Setting | None = None, **options) -> ViewerSink:
-        sink = Viewer(port=0, **options).open(setting or small_setting())
+    def open_viewer(setting: SinkContext | None = None, **options) -> ViewerSink:
+        sink = ViewerSinkConfig(port=0, **options).open(setting or small_setting())
         opened.append(sink)
         return sink
 
@@ -146,7 +146,7 @@ def test_slice_shows_the_ct_where_it_is_now(with_ct):
     case = sloped_case(with_ct)
     ct = CarriedCt(case)
     across, down = np.array([1.0, 0, 0]), np.array([0, 0.6, 0.8])
-    plane = Plane(MOTION.carry(np.array([[2.0, 1.0, 0.0]]))[0], across, down, 24.0)
+    plane = SlicePlane(MOTION.carry(np.array([[2.0, 1.0, 0.0]]))[0], across, down, 24.0)
     picture = slice_picture(ct, MOTION, plane, [], 48)
     assert picture is not None
     rows, columns = (axis.ravel() for axis in np.mgrid[3:36:6, 2:46:7])  # the bar is below
@@ -173,7 +173,7 @@ def test_grey_rises_with_the_ct_fades_and_ends():
 def test_section_of_a_ball_is_its_circle():
     centre = np.array([4.0, -3.0, 130.0])
     sphere = trimesh.creation.icosphere(5, 10.0)
-    plane = Plane(centre + [0, 0, 6.0], np.array([1.0, 0, 0]), np.array([0, 1.0, 0]), 50.0)
+    plane = SlicePlane(centre + [0, 0, 6.0], np.array([1.0, 0, 0]), np.array([0, 1.0, 0]), 50.0)
     segments = plane.section(Mesh(sphere.vertices + centre, sphere.faces))
     assert np.linalg.norm(segments, axis=2) == pytest.approx(8.0, abs=0.03)
     length = np.linalg.norm(segments[:, 0] - segments[:, 1], axis=1).sum()
@@ -185,7 +185,7 @@ def test_slice_outlines_lie_on_the_surface():
     tumor = ball((8, 0, 0), 6.0)
     there = tumor.moved(MOTION.carry(tumor.vertices_mm))
     middle = there.box_mm.mean(0)
-    plane = Plane(middle, np.array([1.0, 0, 0]), np.array([0, 1.0, 0]), 32.0)
+    plane = SlicePlane(middle, np.array([1.0, 0, 0]), np.array([0, 1.0, 0]), 32.0)
     picture = slice_picture(CarriedCt(case), MOTION, plane, [(there, (0, 255, 0), 1)], 128)
     assert picture is not None
     drawn = np.argwhere((picture[:, :, 1] > 200) & (picture[:, :, 0] < 60))
@@ -213,7 +213,7 @@ def test_click_means_the_foremost_point_under_it():
 @pytest.mark.parametrize("wrong", [{"port": 70_000}, {"hz": 0.0}, {"margin_mm": -1.0}])
 def test_impossible_settings_are_refused(wrong):
     with pytest.raises(InputError, match=next(iter(wrong))):
-        Viewer(**wrong)
+        ViewerSinkConfig(**wrong)
 
 
 def test_taken_port_is_refused():
@@ -222,7 +222,7 @@ def test_taken_port_is_refused():
         taken.listen()
         port = taken.getsockname()[1]
         with pytest.raises(InputError, match=rf"port {port} .*viewer:{port + 1}"):
-            Viewer(port=port).open(small_setting())
+            ViewerSinkConfig(port=port).open(small_setting())
 
 
 def test_without_estimate_nothing_stays_and_with_one_it_is_back_at_once(sinks):
@@ -276,7 +276,7 @@ def test_case_gives_slices_and_an_exact_margin_that_moves_along(sinks, tmp_path)
     case = sloped_case()
     with new_folder(tmp_path / "case") as folder:
         save_case(case, folder)
-    setting = Setting(parts=PARTS[:2], frames=Frames(), anatomy_ct=case.anatomy)
+    setting = SinkContext(parts=PARTS[:2], frames=PublishedFrame(), anatomy_ct=case.anatomy)
     sink = sinks(setting, case=str(tmp_path / "case"))
     sink.publish(carried_update(case))
     until(lambda: sink._panel._slice.visible, 3, "a slice")
@@ -347,12 +347,12 @@ def test_arms_are_shown_without_an_estimate_and_never_after_silence(sinks):
 
 def test_status_says_why_and_no_old_numbers():
     update = replace(empty_update(), reason="depth < 110 mm & hidden")
-    flag = Status("none", update, 0.1, 7).flag()
+    flag = StatusPanel("none", update, 0.1, 7).flag()
     assert "NO ESTIMATE" in flag
     assert "depth &lt; 110 mm &amp; hidden" in flag
-    stale = Status("stale", small_update(), 3.21, 8)
+    stale = StatusPanel("stale", small_update(), 3.21, 8)
     assert "3.2 s" in stale.flag()
-    assert "0.75" in Status("good", small_update(), 0.1, 8).numbers()
+    assert "0.75" in StatusPanel("good", small_update(), 0.1, 8).numbers()
     assert "0.75" not in stale.numbers()
 
 
@@ -362,7 +362,7 @@ def test_status_says_why_and_no_old_numbers():
 class Feed(threading.Thread):
     """Publishes the update that it is given, ten times a second; None: nothing."""
 
-    def __init__(self, sink: ViewerSink, update: Update) -> None:
+    def __init__(self, sink: ViewerSink, update: TrackingResult) -> None:
         super().__init__(daemon=True)
         self.sink, self.update = sink, update
         self.ended = threading.Event()
@@ -446,7 +446,7 @@ def test_page_in_a_browser(sinks):
         until(lambda: "has been silent" in browser.text(), 6, "the page's own watch")
 
 
-def check_arms(browser: Browser, feed: Feed, shown: Update, setting: Setting) -> None:
+def check_arms(browser: Browser, feed: Feed, shown: TrackingResult, setting: SinkContext) -> None:
     """Arms are seen whole, with and without an estimate; what they do is said; they are stopped."""
     assert orange(browser.picture()) < 300
     feed.update = replace(shown, workcell=workcell())
@@ -468,7 +468,7 @@ def check_arms(browser: Browser, feed: Feed, shown: Update, setting: Setting) ->
     until(lambda: "The arms were stopped for good" in browser.text(), 5, "being told so")
 
 
-def check_click(browser: Browser, setting: Setting) -> None:
+def check_click(browser: Browser, setting: SinkContext) -> None:
     """A click on the scene gives the seen point under it, in the camera's frame."""
     rect = browser.call(
         "Runtime.evaluate",

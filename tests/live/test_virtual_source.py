@@ -17,11 +17,11 @@ from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.types import LabelVolume, Mesh
 from tumortrack.imaging.case import Case, save_case
-from tumortrack.live.sources.virtual import Virtual, VirtualSource
+from tumortrack.live.sources.virtual import VirtualSource, VirtualSourceConfig
 from tumortrack.live.spec import parse_spec
 from tumortrack.sense.noise import CLEAN
 from tumortrack.simulate.elastic.body import BodyConfig
-from tumortrack.simulate.player.player import SHAFT_MM, Theatre, TheatreConfig
+from tumortrack.simulate.player.player import SHAFT_MM, ScenePlayer, ScenePlayerConfig
 from tumortrack.simulate.player.props import rod
 
 HELD_S = (3.0, 9.0, 15.0)  # a push is at its deepest
@@ -31,7 +31,7 @@ STILL = {"breath_mm": 0.0, "swell": 0.0, "sway_mm": 0.0, "sway_degrees": 0.0}
 
 def test_seed_and_time_are_all_that_a_frame_depends_on():
     theatre = small_theatre()
-    again = Theatre(organ(), UP, TheatreConfig(body=COARSE), 3)
+    again = ScenePlayer(organ(), UP, ScenePlayerConfig(body=COARSE), 3)
     for t_s in (7.3, 0.0, 2.9):
         one, other = theatre.state_at(t_s), again.state_at(t_s)
         for field in fields(one):
@@ -93,7 +93,7 @@ def test_the_instrument_touches_what_it_pushes_and_nothing_else():
     assert min(depths) == 0
 
 
-def _gap_mm(theatre: Theatre, t_s: float) -> float:
+def _gap_mm(theatre: ScenePlayer, t_s: float) -> float:
     """From the instrument's tip to the organ's surface, by a fine sampling of it."""
     instant = theatre.state_at(t_s)
     tip = (instant.camera_from_room @ instant.room_from_rod)[:3, 3]
@@ -111,7 +111,7 @@ def test_breathing_goes_down_the_body_and_back():
     np.testing.assert_allclose(places[2], places[0], atol=1e-6)
 
 
-def _in_room(theatre: Theatre, t_s: float) -> np.ndarray:
+def _in_room(theatre: ScenePlayer, t_s: float) -> np.ndarray:
     instant = theatre.state_at(t_s)
     center = theatre.anatomy_ct.organ.vertices_mm.mean(0)[None]
     before = theatre.carry(instant, center)
@@ -148,7 +148,7 @@ _EVERY = 7
 
 
 def _by_rays(
-    theatre: Theatre, camera_from_room: np.ndarray, organ_camera: Mesh, t_s: float
+    theatre: ScenePlayer, camera_from_room: np.ndarray, organ_camera: Mesh, t_s: float
 ) -> np.ndarray:
     """Depth (3, r) of organ, table and instrument in every seventh pixel."""
     lens = theatre.intrinsics
@@ -201,13 +201,13 @@ def test_parts_can_be_left_out():
 )
 def test_impossible_rooms_are_refused(wrong: dict):
     with pytest.raises(InputError):
-        TheatreConfig(**wrong)
+        ScenePlayerConfig(**wrong)
 
 
 def test_too_many_places_and_times_before_the_beginning_are_refused():
     few = BodyConfig(cells=100, modes=8, responses=20, patches=20)
     with pytest.raises(InputError, match=r"ask for fewer"):
-        Theatre(organ(), UP, TheatreConfig(body=few, places=20), 3)
+        ScenePlayer(organ(), UP, ScenePlayerConfig(body=few, places=20), 3)
     with pytest.raises(InputError, match=r"before the theatre's beginning"):
         small_theatre().state_at(-0.1)
 
@@ -248,7 +248,7 @@ def test_the_command_lines_text_opens_a_case(tmp_path):
     labels = LabelVolume(np.zeros((2, 2, 2), np.uint8), np.eye(4))
     save_case(Case(organ(), labels, UP), tmp_path)
     text = f"virtual:{tmp_path}?fps=25&instrument=false&noise=false&camera_motion=false&seed=2"
-    config = parse_spec(text, (Virtual,), "source")
+    config = parse_spec(text, (VirtualSourceConfig,), "source")
     source = config.open()
     seen = source.read(1.0)
     source.close()
@@ -262,4 +262,4 @@ def test_the_command_lines_text_opens_a_case(tmp_path):
     )
     for wrong in ({"fps": 0.0}, {"seed": -1}):
         with pytest.raises(InputError):
-            Virtual(case=tmp_path, **wrong)
+            VirtualSourceConfig(case=tmp_path, **wrong)

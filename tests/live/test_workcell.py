@@ -23,20 +23,20 @@ from recording_objects import frame_number
 from tumortrack.core.errors import InputError, TumortrackError
 from tumortrack.core.geometry import rigid, transform_points
 from tumortrack.core.mesh_files import read_mesh
-from tumortrack.live.igtl.content import Status, unpack_status, unpack_transform
-from tumortrack.live.ros.cell import Cell
+from tumortrack.live.igtl.content import IgtlStatus, unpack_status, unpack_transform
+from tumortrack.live.ros.cell import WorkcellMessages
 from tumortrack.live.ros.incoming import cloud_of
 from tumortrack.live.ros.messages import Messages, stamp_of
 from tumortrack.live.ros.outgoing import messages_of
-from tumortrack.live.sink_worker import Outlet
+from tumortrack.live.sink_worker import SinkWorker
 from tumortrack.live.sinks import SINKS
-from tumortrack.live.sinks.openigtlink import OpenIgtLink
-from tumortrack.live.sinks.recording import Recording as RecordTo
-from tumortrack.live.sinks.ur import Ur, UrSink
-from tumortrack.live.sources.recording import Recording
+from tumortrack.live.sinks.openigtlink import OpenIgtLinkSinkConfig
+from tumortrack.live.sinks.recording import RecordingSinkConfig as RecordTo
+from tumortrack.live.sinks.ur import UrSink, UrSinkConfig
+from tumortrack.live.sources.recording import RecordingSourceConfig
 from tumortrack.live.spec import parse_spec
 from tumortrack.live.ur_link import SILENT_S, UR_JOINTS
-from tumortrack.live.values import Seen, Setting, SourceEnded, Update
+from tumortrack.live.values import Observation, SinkContext, SourceEnded, TrackingResult
 from tumortrack.live.viewer.workcell import box_of
 from workcell_objects import CUT, REASON, TABLE, virtual, with_arms, workcell, working
 
@@ -45,11 +45,11 @@ STOCK = {HUMBLE: get_typestore(Stores.ROS2_HUMBLE), NOETIC: get_typestore(Stores
 NAMES = [shape.name for shape in workcell().shapes]
 
 
-def sent(update: Update, cell: Cell, messages: Messages = HUMBLE) -> dict:
+def sent(update: TrackingResult, cell: WorkcellMessages, messages: Messages = HUMBLE) -> dict:
     return {out.suffix: out.message for out in messages_of(update, messages, PARTS, True, cell)}
 
 
-def less(update: Update, *names: str) -> Update:
+def less(update: TrackingResult, *names: str) -> TrackingResult:
     """Without these shapes and lines."""
     cell = update.workcell
     assert cell is not None
@@ -63,7 +63,7 @@ def less(update: Update, *names: str) -> Update:
 
 def test_joints_and_markers_say_where_everything_stands():
     update = working(3, 0.3)
-    out, cell = sent(update, Cell(HUMBLE, 0)), update.workcell
+    out, cell = sent(update, WorkcellMessages(HUMBLE, 0)), update.workcell
     joints = out["joint_states"]
     assert dict(zip(joints.name, joints.position, strict=True)) == cell.joints_rad
     assert (stamp_of(joints.header), joints.header.frame_id) == (update.stamp_ns, "table")
@@ -99,7 +99,7 @@ def test_joints_and_markers_say_where_everything_stands():
 
 
 def test_arms_are_told_of_without_an_estimate_and_why_they_stand():
-    out = sent(virtual(halted="the tumor moved by 6 mm"), Cell(NOETIC, 0), NOETIC)
+    out = sent(virtual(halted="the tumor moved by 6 mm"), WorkcellMessages(NOETIC, 0), NOETIC)
     assert len(out["workcell"].markers) == len(NAMES) + 3
     assert [m.action for m in out["meshes"].markers] == [3]  # DELETEALL: no estimate
     assert out["workcell"].markers[-1].text == (
@@ -110,11 +110,11 @@ def test_arms_are_told_of_without_an_estimate_and_why_they_stand():
     assert {v.key: v.value for v in arms.values} == {
         "state": "sweep 1", "halted": "the tumor moved by 6 mm",
     }  # fmt: skip
-    assert sent(working(), Cell(HUMBLE, 0))["diagnostics"].status[1].level == 0
+    assert sent(working(), WorkcellMessages(HUMBLE, 0))["diagnostics"].status[1].level == 0
 
 
 def test_markers_keep_their_rate_and_changes_come_at_once():
-    cell = Cell(HUMBLE, 0.01)
+    cell = WorkcellMessages(HUMBLE, 0.01)
     assert len(sent(working(0), cell)["workcell"].markers) == len(NAMES) + 3
     later = sent(working(1, 0.2), cell)
     assert "workcell" not in later
@@ -136,14 +136,14 @@ def test_markers_keep_their_rate_and_changes_come_at_once():
 def test_what_the_camera_saw_is_sent_in_the_frame_of_the_arms():
     update = working()
     assert update.seen is not None
-    points_mm = cloud_of(sent(update, Cell(HUMBLE, 0))["observed"]).points_mm
+    points_mm = cloud_of(sent(update, WorkcellMessages(HUMBLE, 0))["observed"]).points_mm
     depth_mm = update.seen.content.depth_mm
     assert len(points_mm) == np.isfinite(depth_mm).sum()
     # The camera looks down from 160 mm: a depth of d is a height of 160 - d.
     assert np.sort(points_mm[:, 2]) == pytest.approx(
         np.sort(160 - depth_mm[np.isfinite(depth_mm)]), abs=1e-3
     )
-    slow = Cell(HUMBLE, 0.01)
+    slow = WorkcellMessages(HUMBLE, 0.01)
     assert "observed" in sent(update, slow)
     assert "observed" not in sent(update, slow)
     assert sent(virtual(), slow)["observed"].width == 0
@@ -158,7 +158,7 @@ def test_without_arms_nothing_of_them_is_announced():
 @pytest.mark.parametrize("update", [working(), virtual(), less(virtual(), *NAMES, "cut/1")])
 def test_bytes_are_those_of_plain_messages(messages, update):
     stock = STOCK[messages]
-    for out in messages_of(update, messages, PARTS, True, Cell(messages, 0)):
+    for out in messages_of(update, messages, PARTS, True, WorkcellMessages(messages, 0)):
         raw, kind = messages.to_bytes(out.message), out.message_type
         if messages is HUMBLE:
             again = stock.serialize_cdr(stock.deserialize_cdr(raw, kind), kind)
@@ -170,7 +170,7 @@ def test_bytes_are_those_of_plain_messages(messages, update):
 # Recordings
 
 
-def record(path: Path, updates: list[Update], **options) -> Path:
+def record(path: Path, updates: list[TrackingResult], **options) -> Path:
     sink = RecordTo(path=path, **options).open(with_arms())
     for update in updates:
         sink.publish(update)
@@ -178,8 +178,8 @@ def record(path: Path, updates: list[Update], **options) -> Path:
     return path
 
 
-def played(path: Path) -> list[Seen]:
-    source, got = Recording(path=path, rate=0).open(), []
+def played(path: Path) -> list[Observation]:
+    source, got = RecordingSourceConfig(path=path, rate=0).open(), []
     try:
         while True:
             if seen := source.read(0.2):
@@ -190,10 +190,10 @@ def played(path: Path) -> list[Seen]:
         source.close()
 
 
-def three() -> list[Update]:
+def three() -> list[TrackingResult]:
     """With an estimate, without one, and without a camera's picture."""
     frames = [frame_number(n) for n in (0, 1)]
-    seen = [Seen(frame, frame.stamp_ns) for frame in frames]
+    seen = [Observation(frame, frame.stamp_ns) for frame in frames]
     one = replace(working(0, 0.1), seen=seen[0], stamp_ns=frames[0].stamp_ns)
     two = replace(virtual(1, 0.2, "stale"), seen=seen[1], stamp_ns=frames[1].stamp_ns)
     return [one, two, less(virtual(2, 0.3), "table")]
@@ -249,8 +249,8 @@ def slicer() -> Iterator:
     """A sink and a receiver of it."""
     used: list = []
 
-    def opened(setting: Setting, **options):
-        sink = OpenIgtLink(port=0, **options).open(setting)
+    def opened(setting: SinkContext, **options):
+        sink = OpenIgtLinkSinkConfig(port=0, **options).open(setting)
         receiver = socket.create_connection(("127.0.0.1", sink.port))
         used.extend((receiver, sink))
         while not sink.receivers:
@@ -267,7 +267,7 @@ def test_tips_and_the_arms_state_go_to_slicer(slicer):
     update = working(4, 0.25)
     sink.publish(update)
     heard = hear_all(receiver, 6 + 3)
-    assert unpack_status(heard["STATUS", "arms"].content) == Status(1, "sweep 1", "")
+    assert unpack_status(heard["STATUS", "arms"].content) == IgtlStatus(1, "sweep 1", "")
     shapes = {shape.name: shape for shape in update.workcell.shapes}
     for name in ("cutter/tip", "holder/tip"):
         place = unpack_transform(heard["TRANSFORM", name].content)
@@ -277,7 +277,9 @@ def test_tips_and_the_arms_state_go_to_slicer(slicer):
     sink.publish(less(virtual(5, halted="it is hidden"), "cutter/tip"))
     heard = hear_all(receiver, 6 + 3)
     assert unpack_status(heard["STATUS", "tumortrack"].content).text == REASON
-    assert unpack_status(heard["STATUS", "arms"].content) == Status(13, "sweep 1", "it is hidden")
+    assert unpack_status(heard["STATUS", "arms"].content) == IgtlStatus(
+        13, "sweep 1", "it is hidden"
+    )
     states = {n: heard["TRANSFORM", n].metadata["TransformStatus"] for n in shapes if "tip" in n}
     assert states == {"cutter/tip": "MISSING", "holder/tip": "OK"}
     sink.close()
@@ -390,7 +392,7 @@ def moving(arm, monkeypatch) -> Iterator:
 
     def opened(silent_s: float = 20.0, **options) -> UrSink:
         monkeypatch.setattr("tumortrack.live.sinks.ur.SILENT_S", silent_s)
-        used.append(Ur(host="10.0.0.9", execute=True, **options).open(with_arms()))
+        used.append(UrSinkConfig(host="10.0.0.9", execute=True, **options).open(with_arms()))
         return used[-1]
 
     yield opened
@@ -402,7 +404,7 @@ def moving(arm, monkeypatch) -> Iterator:
 
 def test_by_default_nothing_is_connected_and_targets_are_counted(arm):
     config = parse_spec("ur:10.0.0.9?arm=holder", SINKS, "sink")
-    assert config == Ur(host="10.0.0.9", arm="holder", execute=False)
+    assert config == UrSinkConfig(host="10.0.0.9", arm="holder", execute=False)
     sink = config.open(with_arms())
     for n in range(5):
         sink.publish(working(n, n * 0.01))
@@ -414,7 +416,7 @@ def test_by_default_nothing_is_connected_and_targets_are_counted(arm):
 
 
 def test_an_outlet_reports_the_counts():
-    outlet = Outlet("ur", Ur(host="10.0.0.9").open(with_arms()), 5)
+    outlet = SinkWorker("ur", UrSinkConfig(host="10.0.0.9").open(with_arms()), 5)
     for n in range(3):
         outlet.put(working(n, n * 0.01))
     outlet.close()
@@ -432,7 +434,7 @@ def test_an_outlet_reports_the_counts():
     ],
 )
 def test_targets_that_an_arm_must_not_follow_are_refused(joints, words):
-    sink = Ur(host="10.0.0.9").open(with_arms())
+    sink = UrSinkConfig(host="10.0.0.9").open(with_arms())
     sink.publish(working(0))
     update = working(1)
     assert update.workcell is not None
@@ -520,7 +522,7 @@ def test_an_arm_in_a_protective_stop_is_said(arm, moving):
 def test_an_arm_that_gives_up_stops_all_arms_for_good(arm, monkeypatch, why):
     monkeypatch.setattr("tumortrack.live.sinks.ur.SILENT_S", 20.0)
     setting = with_arms()
-    sink = Ur(host="10.0.0.9", execute=True).open(setting)
+    sink = UrSinkConfig(host="10.0.0.9", execute=True).open(setting)
     sink.publish(working(0))
     if why == "halted":  # as planned: no reason to give up
         sink.publish(working(1, 0.01, "hidden"))
@@ -532,7 +534,7 @@ def test_an_arm_that_gives_up_stops_all_arms_for_good(arm, monkeypatch, why):
     sink.close()
     assert setting.controls.aborted.is_set() == (why != "halted")
     dry = with_arms()
-    checked = Ur(host="10.0.0.9").open(dry)
+    checked = UrSinkConfig(host="10.0.0.9").open(dry)
     checked.publish(working(0))
     with pytest.raises(TumortrackError, match="jumps by"):
         checked.publish(working(1, 0.99))
@@ -555,14 +557,14 @@ def test_a_broken_link_is_left_to_the_controllers_watchdog(arm, moving):
 
 def test_what_cannot_work_is_refused(arm, monkeypatch):
     with pytest.raises(InputError, match="nothing here moves an arm"):
-        Ur(host="10.0.0.9").open(small_setting())
+        UrSinkConfig(host="10.0.0.9").open(small_setting())
     for bad in ({"gain": 10.0}, {"lookahead_s": 1.0}, {"jump_deg": float("nan")}):
         with pytest.raises(InputError, match=next(iter(bad))):
-            Ur(host="10.0.0.9", **bad)
+            UrSinkConfig(host="10.0.0.9", **bad)
     arm.fails = "connect"
     with pytest.raises(InputError, match=r"arm at 10\.0\.0\.9 cannot be controlled"):
-        Ur(host="10.0.0.9", execute=True).open(with_arms())
+        UrSinkConfig(host="10.0.0.9", execute=True).open(with_arms())
     monkeypatch.setitem(sys.modules, "rtde_control", None)
     with pytest.raises(InputError, match=r"tumortrack\[ur\]"):
-        Ur(host="10.0.0.9", execute=True).open(with_arms())
+        UrSinkConfig(host="10.0.0.9", execute=True).open(with_arms())
     assert arm.told == []

@@ -30,7 +30,7 @@ from tumortrack.tracking.follower import Follower, FollowerConfig
 from tumortrack.tracking.tracker import Tracker
 from tumortrack.training.model import load_model
 from tumortrack.training.presets import quick
-from tumortrack.training.train import Run, train
+from tumortrack.training.train import TrainingRun, train
 
 STEPS = 400
 
@@ -50,7 +50,9 @@ def work(tmp_path_factory: pytest.TempPathFactory, phantom_case: Path) -> Path:
         validation_pairs=16,
     )
     case_sha256 = store.sha256_of(phantom_case / store.MANIFEST)
-    run = Run(case.anatomy, case.up_lps, case_sha256, config, steps=STEPS, workers=0, device="cpu")
+    run = TrainingRun(
+        case.anatomy, case.up_lps, case_sha256, config, steps=STEPS, workers=0, device="cpu"
+    )
     train(run, folder / "model", lambda _: None)
     return folder
 

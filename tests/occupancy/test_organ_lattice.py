@@ -7,7 +7,7 @@ import pytest
 from test_sparse_volume import Field
 
 from tumortrack.models.volume import keep_largest_pieces
-from tumortrack.occupancy.lattice import Lattice, lattice_over
+from tumortrack.occupancy.lattice import LogitLattice, lattice_over
 from tumortrack.occupancy.organ_lattice import leaves, organ_lattice
 
 BOX = np.array([[-90.0, -90, -90], [90, 90, 90]])
@@ -46,6 +46,6 @@ def test_an_island_at_the_border_is_not_the_organ():
     logits[..., 0] = 1
     logits[3:6, 3:6, 3:6, 1] = 2
     logits[0, 0, 0, 1] = logits[8, 4, 4, 1] = 2
-    assert not leaves(Lattice(np.zeros(3), 4.0, logits))
+    assert not leaves(LogitLattice(np.zeros(3), 4.0, logits))
     logits[5:, 4, 4, 1] = 2  # now the organ hangs together with it
-    assert leaves(Lattice(np.zeros(3), 4.0, logits))
+    assert leaves(LogitLattice(np.zeros(3), 4.0, logits))

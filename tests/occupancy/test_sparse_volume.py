@@ -12,7 +12,7 @@ from tumortrack.models.volume import dense_margins, grid_over, margins_on, part_
 from tumortrack.occupancy.lattice import lattice_over
 from tumortrack.occupancy.sparse import (
     START_MM,
-    Trust,
+    InterpolationLimit,
     halved_lattice,
     settled,
     sparse_logits,
@@ -149,7 +149,7 @@ def test_what_was_settled_before_is_neither_a_measure_nor_asked():
     leads = np.full(1000, np.inf, np.float32)
     leads[:100] = np.linspace(0, 1, 100)
     expected = np.zeros((1000, 2), np.float32)
-    trust = Trust()
+    trust = InterpolationLimit()
     asked = settled(expected, leads, lambda which: np.zeros((len(which), 2), np.float32), trust)
     assert np.array_equal(asked, np.isfinite(leads))
     assert trust.limit == 1

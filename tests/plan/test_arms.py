@@ -14,7 +14,7 @@ from tumortrack.core.errors import InputError, NoPlan
 from tumortrack.core.geometry import transform_points
 from tumortrack.plan.arms import dh, ik, timing, urdf
 from tumortrack.plan.arms.bases import search_bases
-from tumortrack.plan.arms.cell import Cell
+from tumortrack.plan.arms.cell import ArmCell
 from tumortrack.plan.arms.config import Base, CellConfig
 from tumortrack.plan.arms.procedure import plan_home, plan_motions
 from tumortrack.plan.arms.situation import Blocked, Situation
@@ -30,7 +30,7 @@ HOLDS = {"approach": (), "grasp": (HOLDER,), "hold": (HOLDER,), "release": (HOLD
 
 @pytest.fixture(scope="module")
 def cell():
-    return Cell().with_organ(organ())
+    return ArmCell().with_organ(organ())
 
 
 @pytest.fixture(scope="module")
@@ -289,7 +289,7 @@ def test_both_arms_go_home_together(cell, motions):
 
 
 def test_the_same_every_time(motions):
-    again = plan_motions(plan(), Cell(), organ())
+    again = plan_motions(plan(), ArmCell(), organ())
     for one, other in zip(motions.stages, again.stages, strict=True):
         assert np.array_equal(one.joints_rad, other.joints_rad)
         assert np.array_equal(one.times_s, other.times_s)
@@ -399,7 +399,7 @@ def test_places_for_the_bases_are_searched():
     far = Base(position_mm=(-900.0, -380.0, 150.0), yaw_deg=180.0)
     config = msgspec.structs.replace(CellConfig(), holder_base=far)
     with pytest.raises(NoPlan, match="does not reach"):
-        plan_motions(plan(shift), Cell(config), organ(shift))
+        plan_motions(plan(shift), ArmCell(config), organ(shift))
     cell, motions, said = search_bases(plan(shift), config, organ(shift))
     assert cell.config.holder_base != far
     assert f"{cell.config.holder_base.position_mm[0]:g}" in said

@@ -16,11 +16,11 @@ from scipy.spatial.transform import Rotation
 from live_objects import small_update
 from plan_objects import MIDDLE_MM, RADIUS_MM, TUMOR_MM, located, sphere
 from tumortrack.core.errors import InputError, NoPlan
-from tumortrack.live.values import Update
+from tumortrack.live.values import TrackingResult
 from tumortrack.plan.config import ResectionConfig
 from tumortrack.plan.execute import ABORTED, DONE, Execution
-from tumortrack.plan.motions import JOINTS, Motions, Stage
-from tumortrack.plan.operation import Operation, OperationConfig, Planned, Progress
+from tumortrack.plan.motions import JOINTS, Motions, MotionStage
+from tumortrack.plan.operation import Operation, OperationConfig, Planned, ResectionProgress
 from tumortrack.plan.resection import plan_resection
 
 STATES = ("approach", "grasp", "hold", "sweep 1", "sweep 2", "release", "home")
@@ -38,7 +38,7 @@ def motions(states=STATES, first=None):
         turn = 0.0 if name in ("hold", "release") else 0.2 * (-1) ** number
         times = np.linspace(0, 1, 11)
         way = here + turn * np.sin(np.pi / 2 * times)[:, None] * np.linspace(0.3, 1, len(JOINTS))
-        stages.append(Stage(name, times, way, np.full(11, name.startswith("sweep"))))
+        stages.append(MotionStage(name, times, way, np.full(11, name.startswith("sweep"))))
         here = way[-1]
     return Motions(tuple(stages))
 
@@ -139,7 +139,7 @@ def test_a_halt_needs_its_reason_and_new_motions_begin_where_the_arms_are():
 )
 def test_a_stage_that_is_none_is_refused(kind, bad):
     with pytest.raises(InputError, match=kind):
-        Stage("grasp", *bad)
+        MotionStage("grasp", *bad)
 
 
 class World:
@@ -305,7 +305,7 @@ def test_what_is_not_cut_yet_is_cut_in_whatever_sweeps_the_new_plan_has(degrees,
         assert first.sweeps != second.sweeps
     for sweep in range(1, first.sweeps + 1):
         done = [cut.height_mm - before for cut in first.cuts if cut.sweep < sweep]
-        progress = Progress(True, done[-1] if done else None)
+        progress = ResectionProgress(True, done[-1] if done else None)
         begin = progress.first_sweep(second, tumor)
         assert 1 <= begin <= second.sweeps
         skipped = [cut.height_mm - after for cut in second.cuts if cut.sweep < begin]
@@ -315,7 +315,7 @@ def test_what_is_not_cut_yet_is_cut_in_whatever_sweeps_the_new_plan_has(degrees,
             assert all(height <= max(done) + 0.21 for height in skipped)
         else:
             assert not skipped
-    assert Progress().first_sweep(second, tumor) is None
+    assert ResectionProgress().first_sweep(second, tumor) is None
 
 
 def test_after_the_last_sweep_no_estimate_is_needed_any_more():
@@ -407,7 +407,7 @@ def test_an_abort_by_the_user_is_final():
 def test_a_stored_plan_is_carried_out_without_looking():
     world = World()
     operation = Operation(world.planned, OperationConfig(speed=4.0), lambda joints: ())
-    update, now_s, states = Update(0, 0, reason="nothing is tracked"), 0.0, set()
+    update, now_s, states = TrackingResult(0, 0, reason="nothing is tracked"), 0.0, set()
     while not operation.ended:
         now_s += FRAME_S
         got = operation.act(update, now_s)

@@ -17,7 +17,7 @@ from tumortrack.plan.exophytic import exophytic_shares
 from tumortrack.plan.files import as_builtins, from_plain
 from tumortrack.plan.outline import arcs, concave_hull, evenly, grown, polygon_of
 from tumortrack.plan.resection import inside, plan_resection
-from tumortrack.plan.values import Layer, Located
+from tumortrack.plan.values import CutLayer, Located
 from tumortrack_lab.cut.resection import cut as cut_out
 
 PUBLISHED, OURS = ResectionConfig(method="published"), ResectionConfig()
@@ -327,7 +327,7 @@ def test_nonsense_is_refused():
     with pytest.raises(InputError, match="margin_mm is -1; allowed: 1 to 20"):
         ResectionConfig(margin_mm=-1)
     with pytest.raises(InputError, match="layer from 5 up to 5"):
-        Layer(5.0, 5.0, ())
+        CutLayer(5.0, 5.0, ())
 
 
 @pytest.mark.parametrize("off_mm", [-1.5, 0.0, 1.5])

@@ -17,11 +17,11 @@ from tumortrack.core.parallel import share
 from tumortrack.core.types import Mesh, SensorCloud
 from tumortrack.imaging.raster import cover, label_grid, winding_numbers
 from tumortrack.registration import hypotheses as locate
-from tumortrack.registration.gauss_newton import Descent, RefineConfig, _prior, refine
+from tumortrack.registration.gauss_newton import GaussNewton, GaussNewtonConfig, _prior, refine
 from tumortrack.registration.gauss_newton_kernels import normal_equations
 from tumortrack.registration.hypotheses import best_fit
-from tumortrack.registration.label_probability import Nearest, normal_table, probabilities
-from tumortrack.registration.locator import WarpLocator
+from tumortrack.registration.label_probability import NearestLookup, normal_table, probabilities
+from tumortrack.registration.locator import RegistrationLocator
 from tumortrack.simulate.elastic.flow import BLOCK, steps_for
 from tumortrack.training.model import load_model
 from warp_objects import ANATOMY, PLACE_MM, TURNED, nudged, placed, residual_rows, shape
@@ -155,7 +155,7 @@ def plainly_refined(points, start, config):
 
 @pytest.mark.parametrize("steps", [0, 3, 20])
 def test_a_refinement_is_that_of_a_plain_loop(steps):
-    config, start = RefineConfig(steps=steps), nudged(placed(), [3, -2, 5], [0.1, -0.05, 0.1])
+    config, start = GaussNewtonConfig(steps=steps), nudged(placed(), [3, -2, 5], [0.1, -0.05, 0.1])
     points = placed().carry(ANATOMY.organ.vertices_mm[::3])
     fit = refine(shape(), points, start, config)
     (rotation, centre, coefficients), cost, gone = plainly_refined(points, start, config)
@@ -171,8 +171,8 @@ def test_a_refinement_is_that_of_a_plain_loop(steps):
 def test_a_descent_goes_on_where_it_was_stopped():
     points = placed().carry(ANATOMY.organ.vertices_mm[::3])
     start = nudged(placed(), [3, -2, 5], [0.1, -0.05, 0.1])
-    whole = refine(shape(), points, start, RefineConfig())
-    halves = Descent(shape(), points, start, RefineConfig())
+    whole = refine(shape(), points, start, GaussNewtonConfig())
+    halves = GaussNewton(shape(), points, start, GaussNewtonConfig())
     halves.run(2)
     assert halves.cost > 2 * whole.cost
     for steps in (4, 0, 20, 20, 0):
@@ -188,9 +188,9 @@ def test_the_best_of_many_starts_wins_wherever_it_stands():
     points = placed().carry(ANATOMY.organ.vertices_mm[::3])
     near = nudged(placed(), [3, -2, 5], [0.1, -0.05, 0.1])
     far = [nudged(placed(), [0, 0, 30.0 * n], [0, 0, 1.0 * n]) for n in (1, 2, 3)]
-    alone = refine(shape(), points, near, RefineConfig())
+    alone = refine(shape(), points, near, GaussNewtonConfig())
     for starts in ([near, *far], [*far, near]):
-        fit = best_fit(shape(), points, starts, RefineConfig())
+        fit = best_fit(shape(), points, starts, GaussNewtonConfig())
         assert fit.cost == alone.cost
         assert fit.steps == alone.steps
 
@@ -198,7 +198,7 @@ def test_the_best_of_many_starts_wins_wherever_it_stands():
 def test_starts_that_are_far_behind_are_given_up(monkeypatch):
     gone = []
 
-    class Noted(Descent):
+    class Noted(GaussNewton):
         def run(self, steps):
             super().run(steps)
             gone.append((self, self.steps))
@@ -207,7 +207,7 @@ def test_starts_that_are_far_behind_are_given_up(monkeypatch):
     points = placed().carry(ANATOMY.organ.vertices_mm[::3])
     near = nudged(placed(), [3, -2, 5], [0.1, -0.05, 0.1])
     far = nudged(placed(), [60, 0, 60], [0, 0, 1.0])
-    steady = RefineConfig(enough_mm=0)  # never settles
+    steady = GaussNewtonConfig(enough_mm=0)  # never settles
     best_fit(shape(), points, [far, near], steady)
     most = {}
     for descent, steps in gone:
@@ -232,13 +232,13 @@ def test_the_nearest_place_is_nearest_but_for_a_nodes_width():
     rng = np.random.default_rng(5)
     places = CENTER + rng.uniform(-1, 1, (200, 3)) * RADII
     points = about(3000, 6)
-    found = np.linalg.norm(points - places[Nearest.of(places).to(points)], axis=1)
+    found = np.linalg.norm(points - places[NearestLookup.of(places).to(points)], axis=1)
     apart = np.linalg.norm(points[:, None] - places, axis=2)
     inside = ((points > places.min(0)) & (points < places.max(0))).all(1)
     assert inside.mean() > 0.2
     assert (found[inside] <= apart.min(1)[inside] + 2 * np.sqrt(3)).all()
     assert np.mean(found[inside] == apart.min(1)[inside].astype(found.dtype)) > 0.6
-    own = Nearest.of(places).to(places.astype(np.float32))
+    own = NearestLookup.of(places).to(places.astype(np.float32))
     assert np.mean(own == np.arange(200)) > 0.9
 
 
@@ -329,7 +329,7 @@ def test_open_and_nested_surfaces_wind_as_in_the_plain_form():
 
 
 def test_frames_leave_no_memory_behind(slim_model):
-    locator = WarpLocator(load_model(slim_model, "cpu"))
+    locator = RegistrationLocator(load_model(slim_model, "cpu"))
     vertices = placed().carry(ANATOMY.organ.vertices_mm)
     seen = vertices[vertices[:, 2] < np.median(vertices[:, 2])]
     rng, last, sizes = np.random.default_rng(0), None, []

@@ -22,11 +22,11 @@ from tumortrack.core.motion import Motion
 from tumortrack.core.types import Mesh
 from tumortrack.models.encoders.heightmap import HeightMapConfig, _spread, _spread_compiled, picture
 from tumortrack.occupancy.network import OccupancyNetwork, quick_network
-from tumortrack.registration.gauss_newton import RefineConfig, _prior, refine
+from tumortrack.registration.gauss_newton import GaussNewtonConfig, _prior, refine
 from tumortrack.registration.hypotheses import best_fit
-from tumortrack.registration.motion import WarpMotion
-from tumortrack.registration.network import Placement, WarpNetwork
-from tumortrack.registration.rest_shape import Shape, distance_of
+from tumortrack.registration.motion import ElasticMotion
+from tumortrack.registration.network import PoseHypothesis, RegistrationNetwork
+from tumortrack.registration.rest_shape import RestShape, distance_of
 from tumortrack.simulate.occupancy import labels_of, surface_distance
 from warp_objects import (
     ANATOMY,
@@ -118,7 +118,7 @@ def test_labels_are_those_of_the_surfaces():
 
 def test_a_shape_survives_its_arrays():
     arrays = shape().to_arrays()
-    again = Shape.from_arrays(arrays, 2)
+    again = RestShape.from_arrays(arrays, 2)
     back = again.to_arrays()
     assert back.keys() == arrays.keys()
     for name, array in arrays.items():
@@ -127,7 +127,7 @@ def test_a_shape_survives_its_arrays():
     np.testing.assert_array_equal(again.labels_at(points)[1], shape().labels_at(points)[1])
     np.testing.assert_array_equal(again.long_axis, shape().long_axis)
     with pytest.raises(InputError, match=r"1\.values_mm"):
-        Shape.from_arrays({k: v for k, v in arrays.items() if k != "1.values_mm"}, 2)
+        RestShape.from_arrays({k: v for k, v in arrays.items() if k != "1.values_mm"}, 2)
 
 
 def test_the_long_axis_is_the_ellipsoids():
@@ -170,7 +170,7 @@ def test_standard_deviations_are_those_of_random_motions():
     places = []
     for change in rng.multivariate_normal(np.zeros(26), covariance, 600):
         turn = Rotation.from_rotvec(change[3:6]).as_matrix()
-        moved = WarpMotion(
+        moved = ElasticMotion(
             base.shape,
             base.rotation @ turn,
             base.centre_mm + base.rotation @ change[:3],
@@ -193,13 +193,13 @@ def test_standard_deviations_are_those_of_random_motions():
 
 def test_more_points_make_surer_and_a_seen_side_is_surer_than_a_hidden_one():
     def deviations(points):
-        return refine(shape(), points, START, RefineConfig()).motion.std_mm(inside(100))
+        return refine(shape(), points, START, GaussNewtonConfig()).motion.std_mm(inside(100))
 
     few, more = (deviations(surface(placed(), n)) for n in (60, 300))
     assert np.all(more < few)
     vertices = ORGAN.vertices_mm
     one_end = vertices[vertices[:, 2] > CENTER[2] + 10][::4]
-    spread = refine(shape(), placed().carry(one_end), START, RefineConfig()).motion
+    spread = refine(shape(), placed().carry(one_end), START, GaussNewtonConfig()).motion
     ends = CENTER + np.array([[0, 0, 40.0], [0, 0, -40.0]])
     seen, hidden = spread.std_mm(ends)
     assert hidden > 1.5 * seen
@@ -233,7 +233,7 @@ def test_a_known_pose_and_state_are_found_again():
     truth = placed()
     points = surface(truth, 2500)
     seen, unseen = points[:1200], points[1200:]
-    fit = refine(shape(), seen, START, RefineConfig())
+    fit = refine(shape(), seen, START, GaussNewtonConfig())
     target = inside(200)
     before = np.linalg.norm(START.carry(target) - truth.carry(target), axis=1)
     after = np.linalg.norm(fit.motion.carry(target) - truth.carry(target), axis=1)
@@ -243,18 +243,18 @@ def test_a_known_pose_and_state_are_found_again():
     assert np.abs(distances.at(START.back(unseen).astype(np.float32))).mean() > 2
     assert np.abs(distances.at(fit.motion.back(unseen).astype(np.float32))).mean() < 0.15
     assert np.abs(fit.motion.coefficients - shape().body.mean).max() > 1
-    exact = refine(shape(), surface(placed(), 1200), placed(), RefineConfig())
+    exact = refine(shape(), surface(placed(), 1200), placed(), GaussNewtonConfig())
     assert np.abs(exact.distances_mm).mean() < 0.15  # and the truth stays
 
 
 def test_a_fifth_of_strays_does_not_matter():
     truth, target = placed(), inside(200)
     points = surface(truth, 1000)
-    clean = refine(shape(), points, START, RefineConfig())
+    clean = refine(shape(), points, START, GaussNewtonConfig())
     spoiled = points.copy()
     strays = np.random.default_rng(6).permutation(1000)[:200]
     spoiled[strays] = PLACE_MM + np.random.default_rng(7).uniform(-80, 80, (200, 3))
-    fit = refine(shape(), spoiled, START, RefineConfig())
+    fit = refine(shape(), spoiled, START, GaussNewtonConfig())
     apart = fit.motion.carry(target) - clean.motion.carry(target)
     assert np.linalg.norm(apart, axis=1).mean() < 0.4
     assert np.abs(fit.distances_mm[strays]).mean() > 10
@@ -262,7 +262,7 @@ def test_a_fifth_of_strays_does_not_matter():
 
 def test_every_step_lowers_the_cost_and_enough_steps_end():
     points = surface(placed(), 500)
-    steady = RefineConfig(steps=40, first_mm=3.0, last_mm=3.0)
+    steady = GaussNewtonConfig(steps=40, first_mm=3.0, last_mm=3.0)
     fits = [
         refine(shape(), points, START, msgspec.structs.replace(steady, steps=n))
         for n in (0, 1, 2, 4, 40)
@@ -277,7 +277,7 @@ def test_every_step_lowers_the_cost_and_enough_steps_end():
 
 
 def test_a_slow_general_optimiser_finds_the_same():
-    config = RefineConfig(steps=60, enough_mm=1e-4)
+    config = GaussNewtonConfig(steps=60, enough_mm=1e-4)
     points = surface(placed(), 150) + np.random.default_rng(8).normal(0, 0.5, (150, 3))
     fit = refine(shape(), points, START, config)
     root = np.linalg.cholesky(_prior(shape(), config)).T
@@ -300,7 +300,7 @@ def test_a_slow_general_optimiser_finds_the_same():
     begin = np.concatenate([shift, turn, truth.coefficients])
     scale = np.concatenate([np.ones(3), np.full(3, 0.02), np.ones(20)])
     found = least_squares(residuals, begin, diff_step=1e-2, x_scale=scale)
-    slow = WarpMotion(shape(), *moved(found.x))
+    slow = ElasticMotion(shape(), *moved(found.x))
     assert fit.cost == pytest.approx(2 * found.cost, rel=0.02)
     apart = fit.motion.carry(inside(200)) - slow.carry(inside(200))
     assert np.linalg.norm(apart, axis=1).mean() < 0.5
@@ -311,7 +311,7 @@ def test_a_slow_general_optimiser_finds_the_same():
 
 def taught(seed=0):
     torch.manual_seed(seed)
-    network = WarpNetwork(slim_network())
+    network = RegistrationNetwork(slim_network())
     network.know(shape(), UP, inside(96))
     return network
 
@@ -346,7 +346,7 @@ def test_the_network_knows_what_it_was_told():
     np.testing.assert_allclose(facing @ facing.T, np.eye(3), atol=1e-6)
     assert {"center_ct", "modes", "long_axis"} <= network.state_dict().keys()  # they travel along
     with pytest.raises(InputError, match="warp decoder"):
-        WarpNetwork(quick_network(3, 48.0))
+        RegistrationNetwork(quick_network(3, 48.0))
     with pytest.raises(InputError, match="decoder of queries"):
         OccupancyNetwork(slim_network())
 
@@ -402,7 +402,7 @@ def test_the_loss_is_nothing_at_the_truth_and_known_beside_it(monkeypatch, off_m
         few = len(aside.centre_mm)
         sure = torch.full((few,), 30.0 if few == 4 else -30.0)
         shifted = centre[:few] + torch.tensor([0.0, 0.0, off_mm])
-        return Placement(rotation[:few], shifted, coefficients[:few], sure)
+        return PoseHypothesis(rotation[:few], shifted, coefficients[:few], sure)
 
     monkeypatch.setattr(network, "forward", at_the_truth)
     loss = network.loss(points_mm, places, torch.zeros(4, 96), poses)

@@ -24,7 +24,14 @@ from tumortrack.report.page import thinned
 from tumortrack.report.pictures import FROM_CAMERA, FROM_SIDE
 from tumortrack.report.protocol import evaluate_scenes, summarise, summary_table
 from tumortrack.report.qc import PLANES, qc_picture, slice_volume
-from tumortrack.report.shade import Frame, Layer, View, frame_around, pixel_centres, shade
+from tumortrack.report.shade import (
+    Frame,
+    ShadedLayer,
+    ShadedView,
+    frame_around,
+    pixel_centres,
+    shade,
+)
 from tumortrack.simulate.scene_folder import Scene, write_scene
 
 
@@ -230,7 +237,10 @@ def test_shading_hides_what_lies_behind():
     red, green = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0)
     near, far = ball(5, (0, 0, 100)), ball(8, (0, 0, 130))
     frame = frame_around(FROM_CAMERA, far.vertices_mm)
-    for layers in ([Layer(near, red), Layer(far, green)], [Layer(far, green), Layer(near, red)]):
+    for layers in (
+        [ShadedLayer(near, red), ShadedLayer(far, green)],
+        [ShadedLayer(far, green), ShadedLayer(near, red)],
+    ):
         picture = shade(layers, FROM_CAMERA, frame)
         x, y = pixel_centres(frame, 0.3)
         middle = picture[np.abs(y).argmin(), np.abs(x).argmin()]
@@ -238,8 +248,10 @@ def test_shading_hides_what_lies_behind():
         assert middle[0] > 2 * middle[1]
         assert rim[1] > 2 * rim[0]
         np.testing.assert_array_equal(picture[0, 0], 1.0)
-    back = View("from behind", (-1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
-    behind = shade([Layer(near, red), Layer(far, green)], back, Frame(-13.0, 13.0, -13.0, 13.0))
+    back = ShadedView("from behind", (-1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
+    behind = shade(
+        [ShadedLayer(near, red), ShadedLayer(far, green)], back, Frame(-13.0, 13.0, -13.0, 13.0)
+    )
     assert behind[43, 43, 1] > 2 * behind[43, 43, 0]  # from behind the far one covers the near
 
 

@@ -14,12 +14,12 @@ from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import rigid
 from tumortrack.core.solids import mesh_of, solid_of
 from tumortrack.core.types import Mesh
-from tumortrack.live.values import Line, Shape, Workcell
-from tumortrack.plan.motions import Motions, Stage
-from tumortrack.plan.values import Cut, Layer, Located, ResectionPlan
+from tumortrack.live.values import Polyline, RigidShape, Workcell
+from tumortrack.plan.motions import Motions, MotionStage
+from tumortrack.plan.values import Cut, CutLayer, Located, ResectionPlan
 from tumortrack.report.film import film, moments_s
 from tumortrack.report.organ_surfaces import organ_surfaces, skin
-from tumortrack.report.painter import Body, Eye, corner_normals, paint, tube
+from tumortrack.report.painter import Eye, PaintedBody, corner_normals, paint, tube
 from tumortrack.report.plan_parts import parted, within
 from tumortrack.report.plan_pictures import draw_plan, plan_figure
 
@@ -61,7 +61,7 @@ def plan() -> ResectionPlan:
         label=2,
         grasp_mm=TUMOR + [0, 0, TUMOR_MM],
         cuts=(Cut(1, ring(19.0, 160.0)), Cut(2, ring(19.0, 149.0))),
-        layers=(Layer(149.0, np.inf, (ring(19.0, 0.0)[:-1, :2],)),),
+        layers=(CutLayer(149.0, np.inf, (ring(19.0, 0.0)[:-1, :2],)),),
         margin_mm=5.0,
         volumes_ml={
             "organ": 180.0,
@@ -107,12 +107,12 @@ def test_the_piece_and_the_rest_are_the_organ(located: Located) -> None:
     half = np.array([[-99.0, -99.0], [CENTRE[0], -99.0], [CENTRE[0], 99.0], [-99.0, 99.0]])
     ball = ellipsoid(CENTRE, 20.0, 4)
     piece, rest = parted(
-        ball, (Layer(CENTRE[2], np.inf, (half,)), Layer(100.0, CENTRE[2], (half,)))
+        ball, (CutLayer(CENTRE[2], np.inf, (half,)), CutLayer(100.0, CENTRE[2], (half,)))
     )
     assert piece.volume_mm3 == pytest.approx(ball.volume_mm3 / 2, rel=1e-3)
     assert rest.volume_mm3 == pytest.approx(ball.volume_mm3 / 2, rel=1e-3)
     assert piece.box_mm[1, 0] == pytest.approx(CENTRE[0])
-    quarter, _ = parted(ball, (Layer(CENTRE[2], np.inf, (half[::-1],)),))  # either way round
+    quarter, _ = parted(ball, (CutLayer(CENTRE[2], np.inf, (half[::-1],)),))  # either way round
     assert quarter.volume_mm3 == pytest.approx(ball.volume_mm3 / 4, rel=1e-3)
 
 
@@ -164,12 +164,17 @@ EYE = Eye(np.array([0.0, -400.0, 300.0]), np.zeros(3), 200.0)
 
 def test_the_nearer_body_is_seen_in_any_order() -> None:
     near, far = ellipsoid(np.array([0.0, -40.0, 30.0]), 15.0), ellipsoid(np.zeros(3), 30.0)
-    for bodies in ([Body(near, RED), Body(far, BLUE)], [Body(far, BLUE), Body(near, RED)]):
+    for bodies in (
+        [PaintedBody(near, RED), PaintedBody(far, BLUE)],
+        [PaintedBody(far, BLUE), PaintedBody(near, RED)],
+    ):
         picture = paint(bodies, EYE, (160, 120)).astype(int)
         assert picture[60, 80, 0] > picture[60, 80, 2]
         assert picture[60, 98, 2] > picture[60, 98, 0]
     behind_cut = replace(EYE, before_mm=25.0)  # the near one begins 35 mm before the target
-    picture = paint([Body(near, RED), Body(far, BLUE)], behind_cut, (160, 120)).astype(int)
+    picture = paint(
+        [PaintedBody(near, RED), PaintedBody(far, BLUE)], behind_cut, (160, 120)
+    ).astype(int)
     assert picture[60, 80, 2] > picture[60, 80, 0]
 
 
@@ -177,7 +182,7 @@ def test_the_nearer_body_is_seen_in_any_order() -> None:
 def test_a_body_covers_the_pixels_that_it_projects_to(parallel: bool) -> None:
     eye = replace(EYE, parallel=parallel)
     place = np.array([35.0, -20.0, 12.0])
-    picture = paint([Body(ellipsoid(place, 4.0), BLUE)], eye, (320, 240), (255, 255, 255))
+    picture = paint([PaintedBody(ellipsoid(place, 4.0), BLUE)], eye, (320, 240), (255, 255, 255))
     rows, columns = np.nonzero(picture[:, :, 0] < 150)
     column, row, near = eye.project(place[None], (320, 240))[0]
     np.testing.assert_allclose([columns.mean(), rows.mean()], [column, row], atol=0.6)
@@ -188,9 +193,9 @@ def test_a_body_covers_the_pixels_that_it_projects_to(parallel: bool) -> None:
 def test_see_through_bodies_tint_what_is_behind_them_alone() -> None:
     down = Eye(np.array([0.0, -1.0, 400.0]), np.zeros(3), 100.0)
     plate = solid(trimesh.creation.box((90, 90, 2)))
-    glass = Body(plate, BLUE, rigid(np.eye(3), np.array([0.0, 0.0, 20.0])), 0.4, False)
+    glass = PaintedBody(plate, BLUE, rigid(np.eye(3), np.array([0.0, 0.0, 20.0])), 0.4, False)
     under = replace(glass, world_from_mesh=rigid(np.eye(3), np.array([0.0, 0.0, -20.0])))
-    red = Body(plate, RED, None, 1.0, False)
+    red = PaintedBody(plate, RED, None, 1.0, False)
     alone, both = (paint(bodies, down, (64, 64))[32, 32] for bodies in ([red], [red, glass]))
     blue = paint([replace(glass, opacity=1.0)], down, (64, 64))[32, 32]
     np.testing.assert_allclose(both, 0.6 * alone + 0.4 * blue, atol=2.0)
@@ -198,8 +203,8 @@ def test_see_through_bodies_tint_what_is_behind_them_alone() -> None:
 
 
 def test_what_stands_in_the_light_casts_a_shadow() -> None:
-    table = Body(solid(trimesh.creation.box((600, 600, 2))), (200, 200, 200))
-    ball = Body(ellipsoid(np.array([0.0, 0.0, 60.0]), 20.0), RED)
+    table = PaintedBody(solid(trimesh.creation.box((600, 600, 2))), (200, 200, 200))
+    ball = PaintedBody(ellipsoid(np.array([0.0, 0.0, 60.0]), 20.0), RED)
     down = Eye(np.array([0.0, -1.0, 900.0]), np.zeros(3), 400.0, True)
     bare, shaded = (
         paint(bodies, down, (200, 200)).astype(int) for bodies in ([table], [table, ball])
@@ -236,7 +241,7 @@ def workcells(plan: ResectionPlan) -> list[Workcell]:
     """A table, and two arms of which one comes nearer to the organ."""
     table = solid(trimesh.creation.box((900, 600, 20)))
     rod = solid(trimesh.creation.cylinder(20, 300))
-    cuts = tuple(Line(f"cut/{c.sweep}", c.path_mm, sweep_colour(c.sweep, 2)) for c in plan.cuts)
+    cuts = tuple(Polyline(f"cut/{c.sweep}", c.path_mm, sweep_colour(c.sweep, 2)) for c in plan.cuts)
     grey, frames = (180, 190, 200), []
     for n in range(6):
         places = {
@@ -245,7 +250,7 @@ def workcells(plan: ResectionPlan) -> list[Workcell]:
             "cutter/rod": rigid(np.eye(3), np.array([300.0 - 30 * n, 0.0, 150.0])),
         }
         shapes = tuple(
-            Shape(name, table if name == "table" else rod, place, grey)
+            RigidShape(name, table if name == "table" else rod, place, grey)
             for name, place in places.items()
         )
         frames.append(Workcell("approach" if n < 3 else "sweep 1", "", {}, shapes, cuts))
@@ -292,9 +297,9 @@ def test_the_same_frames_are_the_same_film(
 
 
 def test_every_stage_has_its_moments() -> None:
-    def stage(name: str, seconds: float) -> Stage:
+    def stage(name: str, seconds: float) -> MotionStage:
         times = np.array([0.0, seconds]) if seconds else np.zeros(1)
-        return Stage(name, times, np.zeros((len(times), 12)), np.zeros(len(times), bool))
+        return MotionStage(name, times, np.zeros((len(times), 12)), np.zeros(len(times), bool))
 
     lasting = {"approach": 4.0, "grasp": 1.0, "hold": 0.0, "sweep 1": 64.0, "home": 4.0}
     motions = Motions(tuple(stage(name, seconds) for name, seconds in lasting.items()))

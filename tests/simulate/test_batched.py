@@ -15,7 +15,7 @@ from tumortrack.sense.camera import d405, project
 from tumortrack.sense.cloud import CloudConfig
 from tumortrack.sense.noise import D405_NOISE
 from tumortrack.sense.render import render_depth
-from tumortrack.simulate.batched.motion import Motion
+from tumortrack.simulate.batched.motion import BatchedMotion
 from tumortrack.simulate.batched.plan import unsupported
 from tumortrack.simulate.batched.raster import depth_images
 from tumortrack.simulate.batched.stream import DeviceStream
@@ -32,7 +32,7 @@ from tumortrack.simulate.pose import PoseConfig
 from tumortrack.simulate.scene import SceneConfig, SceneRecipe, Simulator
 from tumortrack.training.presets import paper, quick
 from tumortrack.training.scenes import batches_on, scenes_for
-from tumortrack.training.train import Run, train
+from tumortrack.training.train import TrainingRun, train
 
 ANATOMY = anatomy()
 UP = (0.0, -1.0, 0.0)
@@ -185,7 +185,7 @@ def test_motion_carries_as_the_deformation_and_pose_do(both):
     plan = device.plan(0)
     points_ct = ANATOMY.parts[1].vertices_mm
     sent = torch.tensor(points_ct.T, dtype=torch.float32)[:, None].expand(-1, SIZE, -1)
-    carried = Motion.of(plan, CPU).carry(sent).permute(1, 2, 0).numpy()
+    carried = BatchedMotion.of(plan, CPU).carry(sent).permute(1, 2, 0).numpy()
     simulator = Simulator(ANATOMY, UP, reference.config)
     moved = []
     for row in range(SIZE):
@@ -296,7 +296,7 @@ def test_a_network_learns_from_them_as_from_the_reference_s(tmp_path):
         folder = tmp_path / maker
         folder.mkdir()
         told: list[float] = []
-        run = Run(ANATOMY, UP, "", config, steps=2, device="cpu", workers=0, scenes=maker)
+        run = TrainingRun(ANATOMY, UP, "", config, steps=2, device="cpu", workers=0, scenes=maker)
         model = train(run, folder, lambda status, told=told: told.append(status.loss))
         losses.append(told[-1])
         makers.append(model.provenance["scenes"])

@@ -19,12 +19,12 @@ from tumortrack.simulate.bodies import body_for
 from tumortrack.simulate.dataset import SceneStream
 from tumortrack.simulate.deform import ChainConfig, DragConfig, ElasticConfig, StretchConfig
 from tumortrack.simulate.deform.base import View
-from tumortrack.simulate.elastic.body import Body, build_body
+from tumortrack.simulate.elastic.body import ElasticBody, build_body
 from tumortrack.simulate.elastic.finite import cube_stiffness, solid_of
-from tumortrack.simulate.elastic.lattice import CORNERS, Lattice, lattice_over
+from tumortrack.simulate.elastic.lattice import CORNERS, ElementLattice, lattice_over
 from tumortrack.simulate.elastic.loads import LOADS, Obstacle, Sag, Swell, bedded, random_state
 from tumortrack.simulate.elastic.modes import modes_of, random_loads
-from tumortrack.simulate.elastic.settle import KPA, Problem, Reduced, settle
+from tumortrack.simulate.elastic.settle import KPA, ReducedModel, ReducedProblem, settle
 from tumortrack.simulate.elastic.slabs import SlabCholesky
 from tumortrack.simulate.elastic.surface import patches_of
 from tumortrack.simulate.occupancy import OccupancyConfig, OccupancyPool
@@ -39,7 +39,7 @@ ELASTIC = SceneConfig(
 
 
 @pytest.fixture(scope="module")
-def body() -> Body:
+def body() -> ElasticBody:
     return build_body(ANATOMY, UP, SMALL, 3)
 
 
@@ -60,8 +60,8 @@ def modes(solid, patches):
 
 
 @pytest.fixture(scope="module")
-def reduced(solid, modes, patches) -> Reduced:
-    return Reduced(solid, modes, patches)
+def reduced(solid, modes, patches) -> ReducedModel:
+    return ReducedModel(solid, modes, patches)
 
 
 @pytest.mark.parametrize("poisson", [0.0, 0.3, 0.49])
@@ -115,7 +115,7 @@ def test_slabs_solve_like_a_dense_matrix():
 
 
 def test_weights_are_exact_for_linear_fields_and_constant_beyond():
-    lattice = Lattice(np.array([1.0, 2.0, 3.0]), 2.0, (4, 5, 6))
+    lattice = ElementLattice(np.array([1.0, 2.0, 3.0]), 2.0, (4, 5, 6))
     rng = np.random.default_rng(0)
     slope, points = rng.normal(size=3), [1, 2, 3] + rng.random((50, 3)) * [6, 8, 10]
     values = lattice.weights(points) @ (lattice.nodes_mm() @ slope)
@@ -166,11 +166,13 @@ def test_a_stiffer_tumor_strains_less(solid, patches):
     assert stiffest < 0.6 * stiff
 
 
-def bed(reduced: Reduced, kpa_per_mm: float = 5.0, modulus: float = 10 * KPA) -> Problem:
+def bed(
+    reduced: ReducedModel, kpa_per_mm: float = 5.0, modulus: float = 10 * KPA
+) -> ReducedProblem:
     """10 kPa tissue on springs, nothing acting yet."""
     up = np.array(UP)
     stiffness = reduced.stiffness(modulus, 2.0)
-    problem = Problem(reduced, up, modulus, stiffness, np.zeros(len(stiffness)))
+    problem = ReducedProblem(reduced, up, modulus, stiffness, np.zeros(len(stiffness)))
     springs = np.clip(-(reduced.patches.normals @ up), 0, 1) * reduced.patches.areas_mm2
     problem.touch(reduced.along(-up), np.zeros(len(springs)), kpa_per_mm * KPA * springs)
     for axis in np.eye(3):
@@ -228,7 +230,7 @@ def test_swelling_changes_the_volume_by_what_is_taken_up(reduced, solid, modes, 
     state = settle(problem)[: reduced.n_modes]
     field = solid.spread(modes.shapes)
     lattice = solid.lattice
-    swollen = Body(
+    swollen = ElasticBody(
         lattice.origin_mm.astype(np.float32),
         lattice.spacing_mm,
         solid.center_mm,
@@ -294,10 +296,10 @@ def test_no_state_folds_space(body):
 
 
 def test_points_follow_a_linear_field_to_its_exponential():
-    lattice = Lattice(np.full(3, -40.0), 8.0, (11, 11, 11))
+    lattice = ElementLattice(np.full(3, -40.0), 8.0, (11, 11, 11))
     slope = np.array([[0.1, -0.3, 0.0], [0.2, -0.15, 0.1], [0.0, 0.1, 0.05]])
     field = (lattice.nodes_mm() @ slope.T).reshape(11, 11, 11, 3, 1)
-    body = Body(
+    body = ElasticBody(
         np.full(3, -40, np.float32),
         8.0,
         np.zeros(3),
@@ -331,7 +333,7 @@ def test_a_state_that_moves_far_is_scaled_back(reduced):
 
 
 def test_a_body_survives_a_file(body):
-    back = Body.from_arrays(body.to_arrays())
+    back = ElasticBody.from_arrays(body.to_arrays())
     points = ORGAN.vertices_mm[::50]
     np.testing.assert_array_equal(
         back.carry(body.states[0], points), body.carry(body.states[0], points)
@@ -339,12 +341,12 @@ def test_a_body_survives_a_file(body):
     assert back.spacing_mm == body.spacing_mm
     lacking = {k: v for k, v in body.to_arrays().items() if k != "states"}
     with pytest.raises(InputError, match="lacks states"):
-        Body.from_arrays(lacking)
+        ElasticBody.from_arrays(lacking)
     torn = {**body.to_arrays(), "states": body.states[:, :7]}
     with pytest.raises(InputError, match="do not fit"):
-        Body.from_arrays(torn)
+        ElasticBody.from_arrays(torn)
     with pytest.raises(InputError, match="NaN"):
-        Body.from_arrays({**body.to_arrays(), "center_ct": np.full(3, np.nan)})
+        ElasticBody.from_arrays({**body.to_arrays(), "center_ct": np.full(3, np.nan)})
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,7 @@ import numpy as np
 import trimesh
 
 from tumortrack.core.types import Mesh
-from tumortrack.plan.values import Cut, Layer, ResectionPlan
+from tumortrack.plan.values import Cut, CutLayer, ResectionPlan
 
 HALF_MM = np.array([55.0, 30.0, 25.0])
 STAND_MM = 120.0
@@ -35,7 +35,7 @@ def plan(shift_mm=(0.0, 0.0, 0.0), angle_rad=0.6, radius_mm=17.0, step_mm=1.5):
         Cut(n, np.column_stack([ring, np.full(len(ring), height)]))
         for n, height in ((1, centre[2]), (2, low))
     )
-    layers = (Layer(centre[2], np.inf, (ring[:-1],)), Layer(low, centre[2], (ring[:-1],)))
+    layers = (CutLayer(centre[2], np.inf, (ring[:-1],)), CutLayer(low, centre[2], (ring[:-1],)))
     grasp = np.append(centre[:2], top)
     return ResectionPlan("published", "tumor_1", 2, grasp, cuts, layers, 5.0, {}, 0.5)
 

@@ -14,7 +14,7 @@ from tumortrack.core.types import (
     OccupancyCloud,
     SensorCloud,
 )
-from tumortrack.live.values import Frames, Seen, Setting, Update
+from tumortrack.live.values import Observation, PublishedFrame, SinkContext, TrackingResult
 
 PARTS = ("kidney", "tumor_1", "tumor_2")
 CAMERA = Intrinsics(width=64, height=48, fx=60.0, fy=61.0, cx=31.5, cy=23.5)
@@ -76,28 +76,28 @@ def small_frame(stamp_ns: int = STAMP_NS) -> DepthFrame:
 
 
 def small_update(
-    sequence: int = 0, stamp_ns: int = STAMP_NS, frames: Frames | None = None
-) -> Update:
+    sequence: int = 0, stamp_ns: int = STAMP_NS, frames: PublishedFrame | None = None
+) -> TrackingResult:
     """An update with an estimate."""
     frame = small_frame(stamp_ns)
     organ = SensorCloud(small_anatomy().organ.vertices_mm[:80], stamp_ns)
-    return Update(
+    return TrackingResult(
         sequence=sequence,
         stamp_ns=stamp_ns,
         estimate=small_estimate(stamp_ns),
         quality="good",
-        seen=Seen(frame, stamp_ns + 2_000_000),
+        seen=Observation(frame, stamp_ns + 2_000_000),
         organ=organ,
-        frames=frames or Frames(),
+        frames=frames or PublishedFrame(),
         seconds={"organ": 0.002, "encode": 0.003},
         latency_ms=12.5,
     )
 
 
-def empty_update(sequence: int = 1, reason: str = "only 12 points lie in range") -> Update:
+def empty_update(sequence: int = 1, reason: str = "only 12 points lie in range") -> TrackingResult:
     """An update without one."""
-    return Update(sequence=sequence, stamp_ns=STAMP_NS + 33_000_000, reason=reason)
+    return TrackingResult(sequence=sequence, stamp_ns=STAMP_NS + 33_000_000, reason=reason)
 
 
-def small_setting() -> Setting:
-    return Setting(parts=PARTS, frames=Frames())
+def small_setting() -> SinkContext:
+    return SinkContext(parts=PARTS, frames=PublishedFrame())

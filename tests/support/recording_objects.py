@@ -10,8 +10,8 @@ import numpy as np
 from live_objects import STAMP_NS, small_frame, small_setting, small_update
 from tumortrack.core.types import DepthFrame, SensorCloud
 from tumortrack.live import values as live
-from tumortrack.live.sinks.recording import Recording as RecordTo
-from tumortrack.live.values import Seen
+from tumortrack.live.sinks.recording import RecordingSinkConfig as RecordTo
+from tumortrack.live.values import Observation
 
 PERIOD_NS = 40_000_000
 
@@ -22,13 +22,15 @@ def frame_number(n: int) -> DepthFrame:
     return replace(frame, depth_mm=frame.depth_mm + np.float32(0.1 * n))
 
 
-def update_number(n: int, content: DepthFrame | SensorCloud | None = None, **seen) -> live.Update:
+def update_number(
+    n: int, content: DepthFrame | SensorCloud | None = None, **seen
+) -> live.TrackingResult:
     content = frame_number(n) if content is None else content
     update = small_update(n, content.stamp_ns)
-    return replace(update, seen=Seen(content, content.stamp_ns + 2_000_000, **seen))
+    return replace(update, seen=Observation(content, content.stamp_ns + 2_000_000, **seen))
 
 
-def record(path: Path, updates: list[live.Update], **options) -> Path:
+def record(path: Path, updates: list[live.TrackingResult], **options) -> Path:
     sink = RecordTo(path=path, **options).open(small_setting())
     for update in updates:
         sink.publish(update)

@@ -21,7 +21,7 @@ from tumortrack.core.types import SensorCloud
 from tumortrack.live.ros.bus import Bus, open_bus
 from tumortrack.live.ros.messages import Messages
 from tumortrack.live.ros.observed import messages_seen
-from tumortrack.live.values import Seen, Source
+from tumortrack.live.values import Observation, Source
 
 HERE = Path(__file__).parent
 N_TOPICS = 3 + len(PARTS)
@@ -44,7 +44,7 @@ class Frames:
         self._bus, self._messages, self.place = bus, messages, place
         self._publishers: dict = {}
 
-    def send(self, seen: Seen, leave_out: tuple[str, ...] = ()) -> None:
+    def send(self, seen: Observation, leave_out: tuple[str, ...] = ()) -> None:
         """The image last: what belongs to it is there by then."""
         for suffix, kind, message in reversed(messages_seen(seen, self._messages)):
             if suffix in leave_out:
@@ -67,7 +67,7 @@ def sending(kind: str, hz: float = 50) -> Iterator[str]:
         while not over.wait(1 / hz):
             now_ns = time.time_ns()
             cloud = SensorCloud(small_anatomy().organ.vertices_mm, now_ns)
-            frames.send(Seen(small_frame(now_ns) if kind == "image" else cloud, now_ns))
+            frames.send(Observation(small_frame(now_ns) if kind == "image" else cloud, now_ns))
         bus.close()
 
     thread = threading.Thread(target=send)
@@ -79,7 +79,7 @@ def sending(kind: str, hz: float = 50) -> Iterator[str]:
         thread.join()
 
 
-def read_until(source: Source, seconds: float) -> Seen:
+def read_until(source: Source, seconds: float) -> Observation:
     end_s = time.monotonic() + seconds
     while time.monotonic() < end_s:
         if (seen := source.read(0.2)) is not None:

@@ -20,7 +20,7 @@ from tumortrack.live.ros.incoming import CLOUD
 from tumortrack.live.ros.messages import Messages, stamp_of
 from tumortrack.live.ros.observed import messages_seen, plain_cloud
 from tumortrack.live.ros.outgoing import DIAGNOSTICS, MARKERS, messages_of
-from tumortrack.live.values import Seen
+from tumortrack.live.values import Observation
 
 N_POINTS = 40_000
 
@@ -51,7 +51,7 @@ def send(kind: str, hz: float, seconds: float) -> None:
             header = messages.header(start_ns, "camera")
             out = [("points", CLOUD, plain_cloud(SensorCloud(points, start_ns), header, messages))]
         else:
-            seen = Seen(frame_numbered(number, start_ns), start_ns, mask)
+            seen = Observation(frame_numbered(number, start_ns), start_ns, mask)
             out = list(reversed(messages_seen(seen, messages)))
         for suffix, message_type, message in out:
             if suffix not in publishers:

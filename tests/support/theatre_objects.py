@@ -7,12 +7,12 @@ from typing import Any
 
 from elastic_objects import UP, organ
 from tumortrack.simulate.elastic.body import BodyConfig
-from tumortrack.simulate.player.player import Theatre, TheatreConfig
+from tumortrack.simulate.player.player import ScenePlayer, ScenePlayerConfig
 
 COARSE = BodyConfig(cells=300, modes=24, responses=100, patches=250)
 
 
 @cache
-def small_theatre(seed: int = 3, **changes: Any) -> Theatre:
+def small_theatre(seed: int = 3, **changes: Any) -> ScenePlayer:
     """Of the default configuration, but for ``changes`` and a coarse body."""
-    return Theatre(organ(), UP, TheatreConfig(body=COARSE, **changes), seed)
+    return ScenePlayer(organ(), UP, ScenePlayerConfig(body=COARSE, **changes), seed)

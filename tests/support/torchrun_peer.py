@@ -18,7 +18,7 @@ from tumortrack.simulate.scene import SceneConfig
 from tumortrack.training import state
 from tumortrack.training.presets import quick
 from tumortrack.training.state import TrainingState
-from tumortrack.training.train import Run, train
+from tumortrack.training.train import TrainingRun, train
 
 STEPS = 6
 UP = (0.0, -1.0, 0.0)
@@ -34,7 +34,7 @@ def anatomy() -> Anatomy:
     return Anatomy(tuple(parts))
 
 
-def small_run() -> Run:
+def small_run() -> TrainingRun:
     """A few steps of a small ``quick``, in single precision so that a mean of halves is told from
     another sum."""
     state.has_fast_bfloat16 = lambda _: False
@@ -47,7 +47,7 @@ def small_run() -> Run:
         validation_points=256,
     )
     settings = {"steps": STEPS, "workers": 0, "device": "cpu", "checkpoint_every_s": 0.0}
-    return Run(organ, UP, "no digest", config, **settings)
+    return TrainingRun(organ, UP, "no digest", config, **settings)
 
 
 def die_at(step: int) -> None:

@@ -14,15 +14,15 @@ from tumortrack.core.types import Anatomy
 from tumortrack.models.config import TrainConfig
 from tumortrack.occupancy.network import NetworkConfig, clinic_network
 from tumortrack.registration import residual_kernels as kernels
-from tumortrack.registration.motion import WarpMotion
-from tumortrack.registration.rest_shape import Shape, shape_of
+from tumortrack.registration.motion import ElasticMotion
+from tumortrack.registration.rest_shape import RestShape, shape_of
 from tumortrack.simulate.deform import ElasticConfig
 from tumortrack.simulate.elastic.body import build_body
 from tumortrack.simulate.elastic.flow import BLOCK, block, steps_for
 from tumortrack.simulate.occupancy import OccupancyConfig
 from tumortrack.simulate.scene import SceneConfig
 from tumortrack.training.presets import clinic
-from tumortrack.training.train import Run, train
+from tumortrack.training.train import TrainingRun, train
 
 ANATOMY: Anatomy = organ()
 SCALE_MM = 48.0  # half the organ's length
@@ -31,21 +31,21 @@ PLACE_MM = np.array([8.0, -5.0, 170.0])
 
 
 @cache
-def shape() -> Shape:
+def shape() -> RestShape:
     return shape_of(ANATOMY, build_body(ANATOMY, UP, SMALL, 3))
 
 
-def placed(state: int = 73, share: float = 1.0) -> WarpMotion:
+def placed(state: int = 73, share: float = 1.0) -> ElasticMotion:
     """The organ before a camera, in a share of one of its library's states."""
     coefficients = share * shape().body.states[state].astype(float)
-    return WarpMotion(shape(), TURNED, PLACE_MM, coefficients)
+    return ElasticMotion(shape(), TURNED, PLACE_MM, coefficients)
 
 
 def nudged(motion, shift_mm, turn_rad):
     """Another place for the undeformed organ, to start from."""
     turn = Rotation.from_rotvec(turn_rad).as_matrix()
     mean = motion.shape.body.mean
-    return WarpMotion(
+    return ElasticMotion(
         motion.shape, motion.rotation @ turn, motion.centre_mm + np.array(shift_mm), mean
     )
 
@@ -96,4 +96,4 @@ def slim_clinic() -> TrainConfig:
 def train_slim(folder: Path, checkpoint_every_s: float = 30.0) -> None:
     """Write a model folder of the slim clinic."""
     setting = {"steps": 80, "workers": 0, "device": "cpu", "checkpoint_every_s": checkpoint_every_s}
-    train(Run(ANATOMY, UP, "no digest", slim_clinic(), **setting), folder, lambda _: None)
+    train(TrainingRun(ANATOMY, UP, "no digest", slim_clinic(), **setting), folder, lambda _: None)

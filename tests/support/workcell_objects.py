@@ -12,11 +12,18 @@ from scipy.spatial.transform import Rotation
 from live_objects import STAMP_NS, small_setting, small_update
 from tumortrack.core.geometry import rigid
 from tumortrack.core.types import Mesh
-from tumortrack.live.values import Frames, Line, Setting, Shape, Update, Workcell
+from tumortrack.live.values import (
+    Polyline,
+    PublishedFrame,
+    RigidShape,
+    SinkContext,
+    TrackingResult,
+    Workcell,
+)
 
 UR = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
 # The camera of the small objects looks straight down onto their middle, 130 mm away.
-TABLE = Frames("table", rigid(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 160.0])))
+TABLE = PublishedFrame("table", rigid(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 160.0])))
 CUTTER, HOLDER, TOP = (245, 150, 40), (70, 150, 240), (200, 205, 212)
 CUT = (255, 40, 160)
 REASON = "virtual execution of a stored plan: nothing is tracked"
@@ -35,15 +42,15 @@ def bar(
     end: np.ndarray,
     colour: tuple[int, int, int],
     wide: float = 60.0,
-) -> Shape:
+) -> RigidShape:
     """From one point to another; its length in whole millimetres."""
     along = end - start
     turn = Rotation.align_vectors([along / np.linalg.norm(along)], [[0, 0, 1]])[0].as_matrix()
     mesh = box(wide, wide, round(float(np.linalg.norm(along))))
-    return Shape(name, mesh, rigid(turn, (start + end) / 2), colour)
+    return RigidShape(name, mesh, rigid(turn, (start + end) / 2), colour)
 
 
-def arm(name: str, base: float, tip: np.ndarray, colour: tuple[int, int, int]) -> list[Shape]:
+def arm(name: str, base: float, tip: np.ndarray, colour: tuple[int, int, int]) -> list[RigidShape]:
     """Two bars from a base beside the table over an elbow to a tip, and the tip."""
     foot = np.array([base, 250.0, 0.0])
     elbow = np.array([0.75 * base, 200.0, 420.0])
@@ -51,7 +58,7 @@ def arm(name: str, base: float, tip: np.ndarray, colour: tuple[int, int, int]) -
         bar(f"{name}/upper_arm", foot, elbow, colour),
         bar(f"{name}/forearm", elbow, tip + [0.1 * base, 80.0, 60.0], colour),
         bar(f"{name}/tool", tip + [0.1 * base, 80.0, 60.0], tip, (200, 205, 210), 14.0),
-        Shape(f"{name}/tip", box(8.0, 8.0, 8.0), rigid(np.eye(3), tip), (250, 230, 60)),
+        RigidShape(f"{name}/tip", box(8.0, 8.0, 8.0), rigid(np.eye(3), tip), (250, 230, 60)),
     ]
 
 
@@ -68,7 +75,9 @@ def workcell(
     circle = middle + radius_mm * np.stack([np.cos(ring), np.sin(ring), 0 * ring], axis=1)
     circle, tip = circle[:-1], circle[-1]
     shapes = (
-        Shape("table", box(1300.0, 800.0, 20.0), rigid(np.eye(3), np.array([0, 0, -10.0])), TOP),
+        RigidShape(
+            "table", box(1300.0, 800.0, 20.0), rigid(np.eye(3), np.array([0, 0, -10.0])), TOP
+        ),
         *arm("cutter", 480.0, tip, CUTTER),
         *arm("holder", -480.0, middle + [0, 0, 18.0], HOLDER),
     )
@@ -77,19 +86,19 @@ def workcell(
         for one in ("cutter", "holder")
         for k, joint in enumerate(UR)
     }
-    lines = (Line("cut/1", circle, CUT, 2.0), Line("cut/2", circle - [0, 0, 8.0], CUT, 2.0))
+    lines = (Polyline("cut/1", circle, CUT, 2.0), Polyline("cut/2", circle - [0, 0, 8.0], CUT, 2.0))
     return Workcell("sweep 1", halted, joints, shapes, lines)
 
 
-def working(sequence: int = 0, progress: float = 0.0, halted: str = "") -> Update:
+def working(sequence: int = 0, progress: float = 0.0, halted: str = "") -> TrackingResult:
     """An update with an estimate and a workcell."""
     update = small_update(sequence, STAMP_NS + sequence * 33_000_000, TABLE)
     return replace(update, workcell=workcell(progress, halted))
 
 
-def virtual(sequence: int = 0, progress: float = 0.0, halted: str = "") -> Update:
+def virtual(sequence: int = 0, progress: float = 0.0, halted: str = "") -> TrackingResult:
     """A stored plan being shown: a workcell, and no estimate."""
-    return Update(
+    return TrackingResult(
         sequence,
         STAMP_NS + sequence * 33_000_000,
         reason=REASON,
@@ -98,5 +107,5 @@ def virtual(sequence: int = 0, progress: float = 0.0, halted: str = "") -> Updat
     )
 
 
-def with_arms() -> Setting:
+def with_arms() -> SinkContext:
     return replace(small_setting(), frames=TABLE, arms=True)

@@ -20,7 +20,7 @@ from tumortrack.core.estimate import Estimate
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.motion import Motion, OneWay
 from tumortrack.core.types import Anatomy, CameraLabels, Mesh, OccupancyCloud
-from tumortrack.models.in_distribution import Familiar
+from tumortrack.models.in_distribution import InDistributionRange
 from tumortrack.occupancy.network import OccupancyNetwork
 from tumortrack.sense.files import read_cloud, write_cloud_ply
 from tumortrack.tracking.files import write_estimate
@@ -340,7 +340,7 @@ def model(tmp_path_factory):
     folder = tmp_path_factory.mktemp("points") / "model"
     config = quick(anatomy())
     network = OccupancyNetwork(config.network)
-    familiar = Familiar(spread_mm=(1.0, 100.0), fit_mm=5.0)
+    familiar = InDistributionRange(spread_mm=(1.0, 100.0), fit_mm=5.0)
     box = np.array([[-80.0] * 3, [80.0] * 3])
     with store.new_folder(folder) as aside:
         save_model(Model(network, config, anatomy().names, box, familiar, {}), aside)

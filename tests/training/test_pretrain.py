@@ -27,16 +27,16 @@ from tumortrack.registration.canonical_frame import (
     generic_points,
     upright_of,
 )
-from tumortrack.registration.network import WarpNetwork, facing_rotation
+from tumortrack.registration.network import RegistrationNetwork, facing_rotation
 from tumortrack.registration.rest_shape import long_axis_of
 from tumortrack.simulate.deform import ElasticConfig
 from tumortrack.simulate.occupancy import OccupancyConfig
-from tumortrack.training.checkpoint import Progress
-from tumortrack.training.head_start import Start, load_start
+from tumortrack.training.checkpoint import TrainingProgress
+from tumortrack.training.head_start import HeadStart, load_start
 from tumortrack.training.presets import clinic, pretraining, quick
 from tumortrack.training.pretrain import KidneyStream, Pretraining, kidney_stream, pretrain
-from tumortrack.training.run import Run, provenance
-from tumortrack.training.task import Course, course_of
+from tumortrack.training.run import TrainingRun, provenance
+from tumortrack.training.task import TrainingTask, course_of
 from tumortrack.training.train import train
 
 CPU = torch.device("cpu")
@@ -74,7 +74,7 @@ def pretrained(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def start(pretrained: Path) -> Start:
+def start(pretrained: Path) -> HeadStart:
     return load_start(pretrained)
 
 
@@ -84,18 +84,20 @@ def stream() -> KidneyStream:
 
 
 @pytest.fixture(scope="module")
-def course(patient: Run) -> Course:
+def course(patient: TrainingRun) -> TrainingTask:
     return course_of(patient, CPU)
 
 
 @pytest.fixture(scope="module")
-def patient(start: Start) -> Run:
+def patient(start: HeadStart) -> TrainingRun:
     config = clinic(organ())
     network = msgspec.structs.replace(
         config.network, decoder=msgspec.structs.replace(config.network.decoder, modes=12)
     )
     config = msgspec.structs.replace(tiny(config), network=network)
-    return Run(organ(), UP, "no digest", config, steps=2, workers=0, device="cpu", start=start)
+    return TrainingRun(
+        organ(), UP, "no digest", config, steps=2, workers=0, device="cpu", start=start
+    )
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -178,9 +180,9 @@ def test_a_stream_shows_every_kidney_in_the_same_frame_and_size(stream):
 
 def test_a_patient_is_placed_as_the_pretrained_network_places_any_organ(patient, course, start):
     """Before its own training: the same rotation and place, turned and scaled into its CT."""
-    own = WarpNetwork(patient.config.network).eval()
+    own = RegistrationNetwork(patient.config.network).eval()
     course.teach(own)
-    general = WarpNetwork(start.config).eval()
+    general = RegistrationNetwork(start.config).eval()
     general.load_state_dict(start.weights)
     body = course.body
     upright = upright_of(organ().organ, UP, body.center_ct, long_axis_of(organ().organ))
@@ -196,7 +198,7 @@ def test_a_patient_is_placed_as_the_pretrained_network_places_any_organ(patient,
 
 
 def test_fields_that_are_a_patients_modes_are_taken_over_as_they_are(patient, course, start):
-    own = WarpNetwork(
+    own = RegistrationNetwork(
         msgspec.structs.replace(
             start.config,
             normalisation=patient.config.network.normalisation,
@@ -240,12 +242,12 @@ def test_a_model_says_what_it_started_from(patient, start, tmp_path):
     assert model.provenance["start_sha256"] == start.sha256
     plain = replace(patient, start=None)
     assert plain.identity != patient.identity
-    assert "start_sha256" not in provenance(plain, Progress(step=1), CPU)
+    assert "start_sha256" not in provenance(plain, TrainingProgress(step=1), CPU)
 
 
 def test_what_does_not_fit_is_refused(patient, start):
     with pytest.raises(InputError, match="--start is for the preset clinic"):
-        Run(organ(), UP, "no digest", quick(organ()), start=start)
+        TrainingRun(organ(), UP, "no digest", quick(organ()), start=start)
     network = patient.config.network
     wider = msgspec.structs.replace(
         network, decoder=msgspec.structs.replace(network.decoder, width=64)

@@ -16,11 +16,11 @@ from stories import environment
 from torchrun_peer import STEPS, UP, anatomy, small_run
 from tumortrack.core.errors import InputError
 from tumortrack.occupancy.network import clinic_network
-from tumortrack.registration.network import WarpNetwork
+from tumortrack.registration.network import RegistrationNetwork
 from tumortrack.simulate.dataset import SceneStream
 from tumortrack.simulate.occupancy import FixedPoints
 from tumortrack.simulate.scene import SceneConfig
-from tumortrack.training.distributed import RankLost, Ranks, joined
+from tumortrack.training.distributed import ProcessGroup, ProcessLost, joined
 from tumortrack.training.state import TrainingState
 from tumortrack.training.train import train
 
@@ -84,14 +84,14 @@ def test_shares_are_the_batch():
     whole = stream(4).batch(5).camera_from_ct
     parts = []
     for rank in range(2):
-        ranks = Ranks(CPU, rank, 2)
+        ranks = ProcessGroup(CPU, rank, 2)
         (number,) = ranks.numbers(range(5, 6))
         parts.append(stream(ranks.share(4)).batch(number).camera_from_ct)
     assert np.array_equal(np.concatenate(parts), whole)
-    assert Ranks(CPU).numbers(range(3, 9)) == range(3, 9)
-    assert len(Ranks(CPU, 1, 2).numbers(range(3, 9))) == 6
+    assert ProcessGroup(CPU).numbers(range(3, 9)) == range(3, 9)
+    assert len(ProcessGroup(CPU, 1, 2).numbers(range(3, 9))) == 6
     with pytest.raises(InputError, match="a batch of 4 cannot be shared by 3 processes"):
-        Ranks(CPU, 0, 3).share(4)
+        ProcessGroup(CPU, 0, 3).share(4)
 
 
 @pytest.mark.parametrize("lost_at", ["init_process_group", "all_reduce", "destroy_process_group"])
@@ -106,7 +106,7 @@ def test_a_lost_process_is_one_error_wherever_it_is_missed(monkeypatch, lost_at)
         gone = lost if name == lost_at else lambda *_, **__: None
         monkeypatch.setattr(distributed, name, gone)
     monkeypatch.setattr(distributed, "get_rank", lambda: 0)
-    with pytest.raises(RankLost, match="of this training"), joined("cpu") as ranks:
+    with pytest.raises(ProcessLost, match="of this training"), joined("cpu") as ranks:
         ranks.agreed(0.0, False)
 
 
@@ -114,7 +114,7 @@ def test_a_lost_process_is_one_error_wherever_it_is_missed(monkeypatch, lost_at)
 def test_equal_shares_of_any_size_have_the_whole_batchs_loss_and_gradient(share):
     """Which clouds are shown the wrong way round is the batch's matter, not a process's."""
     torch.manual_seed(0)
-    network = WarpNetwork(clinic_network(modes=5, scale_mm=50.0))
+    network = RegistrationNetwork(clinic_network(modes=5, scale_mm=50.0))
     network.points.normal_(std=30.0)
     network.modes.normal_()
     points_mm = torch.randn(12, 300, 3) * torch.tensor([40.0, 20.0, 5.0])

@@ -24,13 +24,13 @@ from tumortrack.core.types import Anatomy
 from tumortrack.imaging.case import load_case
 from tumortrack.models.config import TrainConfig
 from tumortrack.occupancy.network import CloudBox
-from tumortrack.training.checkpoint import Progress
+from tumortrack.training.checkpoint import TrainingProgress
 from tumortrack.training.model import load_model
 from tumortrack.training.pace import use_cores
 from tumortrack.training.presets import clinic, paper, quick
 from tumortrack.training.schedule import learning_rate, settle_end
 from tumortrack.training.state import Diverged, TrainingState
-from tumortrack.training.train import Run, train
+from tumortrack.training.train import TrainingRun, train
 from tumortrack.training.work import work_folder
 from warp_objects import train_slim
 
@@ -188,10 +188,10 @@ def test_a_history_that_cannot_be_written_is_one_clear_error(tmp_path, mode, wor
     assert done.stdout.startswith(words), done.stdout + done.stderr
 
 
-def a_run(case: Path, **changes: object) -> Run:
+def a_run(case: Path, **changes: object) -> TrainingRun:
     loaded = load_case(case)
     config = quick(loaded.anatomy)
-    run = Run(loaded.anatomy, loaded.up_lps, "no digest", config, steps=2, workers=0)
+    run = TrainingRun(loaded.anatomy, loaded.up_lps, "no digest", config, steps=2, workers=0)
     return replace(run, **changes)
 
 
@@ -335,7 +335,7 @@ def test_the_learning_rate_warms_up_holds_and_falls_to_a_hundredth(case):
     peak = config.schedule.learning_rate
 
     def rate(step: int, end: int | None) -> float:
-        return learning_rate(config, Progress(step=step, end=end))
+        return learning_rate(config, TrainingProgress(step=step, end=end))
 
     assert rate(0, 1000) == pytest.approx(peak / config.schedule.warmup_steps)
     assert rate(400, 1000) == pytest.approx(peak)
@@ -348,7 +348,7 @@ def test_the_learning_rate_warms_up_holds_and_falls_to_a_hundredth(case):
 def test_minutes_fix_the_last_step_once(case):
     config = quick(load_case(case).anatomy)
     head = 1 - config.schedule.tail
-    progress = Progress(step=300, elapsed_s=head * 60 - 1)
+    progress = TrainingProgress(step=300, elapsed_s=head * 60 - 1)
     assert not settle_end(config, progress, 1.0)
     progress.elapsed_s = head * 60 + 1
     assert settle_end(config, progress, 1.0)

@@ -73,11 +73,11 @@ def train(case_folder: Path, folder: Path, options: TrainOptions) -> None:
     from tumortrack.training.model import load_model
     from tumortrack.training.model_folder import is_finished
     from tumortrack.training.presets import PRESETS
-    from tumortrack.training.train import Run, run_identity
+    from tumortrack.training.train import TrainingRun, run_identity
     from tumortrack.training.train import train as fit
 
     keep_loaded()
-    run = Run(
+    run = TrainingRun(
         anatomy_ct=case.anatomy,
         up_lps=case.up_lps,
         case_sha256=store.sha256_of(case_folder / store.MANIFEST),

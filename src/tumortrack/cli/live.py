@@ -22,9 +22,9 @@ from tumortrack.core.errors import InputError, StorageError
 if TYPE_CHECKING:
     from tumortrack.core.types import Anatomy
     from tumortrack.live.loop import Loop, LoopConfig
-    from tumortrack.live.sink_worker import Outlet
-    from tumortrack.live.source_worker import Reader
-    from tumortrack.live.values import Frames, Setting, SinkConfig, Update
+    from tumortrack.live.sink_worker import SinkWorker
+    from tumortrack.live.source_worker import SourceWorker
+    from tumortrack.live.values import PublishedFrame, SinkConfig, SinkContext, TrackingResult
     from tumortrack.models.config import TrainConfig
     from tumortrack.plan.operation import Operation
     from tumortrack.sense.region import RegionConfig
@@ -58,7 +58,7 @@ class Arms:
     """Arms that act on what is tracked, and the frame in which everything is then published."""
 
     companion: Operation
-    frames: Frames
+    frames: PublishedFrame
     about: dict
 
 
@@ -73,19 +73,19 @@ def track(
     from tumortrack.live.calibration_file import read_frames
     from tumortrack.live.sources import SOURCES
     from tumortrack.live.spec import parse_spec
-    from tumortrack.live.values import Controls, Frames, Setting
+    from tumortrack.live.values import Controls, PublishedFrame, SinkContext
     from tumortrack.training.model_folder import read_model_manifest
 
     source_config = parse_spec(source, SOURCES, "source")
     sink_configs = parse_sinks(sinks)
-    frames = read_frames(options.frame) if options.frame else Frames()
+    frames = read_frames(options.frame) if options.frame else PublishedFrame()
     if arms is not None:
         frames = arms.frames
     read_model_manifest(model_folder)  # what is wrong is said before PyTorch's seconds
     report = place_of_report(options.report, "track")
 
     from tumortrack.live.loop import Loop
-    from tumortrack.live.source_worker import Reader
+    from tumortrack.live.source_worker import SourceWorker
     from tumortrack.tracking.tracker import Tracker
     from tumortrack.training.model import load_model
 
@@ -96,7 +96,7 @@ def track(
         say(f"note: {note}")
     tracker = Tracker(model)
     config = _loop_config(model.config, tracker.anatomy_ct, options)
-    setting = Setting(model.parts, frames, tracker.anatomy_ct, Controls(), arms is not None)
+    setting = SinkContext(model.parts, frames, tracker.anatomy_ct, Controls(), arms is not None)
     loop = Loop(tracker, setting, config, None if arms is None else arms.companion)
     about = {
         "model": model.provenance,
@@ -124,7 +124,7 @@ def track(
         screen = _Screen(loop, report, about, None if arms is None else arms.companion)
         stack.callback(screen.end)
         outlets = open_sinks(sinks, sink_configs, setting, stack)
-        reader = Reader(source_config.open)
+        reader = SourceWorker(source_config.open)
         stack.callback(reader.close)
         screen.watch(reader, outlets)
         say(f"tracking {source} in frame {frames.frame_id!r}; Ctrl-C ends it.")
@@ -143,15 +143,15 @@ def parse_sinks(sinks: tuple[str, ...]) -> list[SinkConfig]:
 
 
 def open_sinks(
-    sinks: tuple[str, ...], configs: list[SinkConfig], setting: Setting, stack: ExitStack
-) -> list[Outlet]:
+    sinks: tuple[str, ...], configs: list[SinkConfig], setting: SinkContext, stack: ExitStack
+) -> list[SinkWorker]:
     """Each at work in a thread of its own, until the stack ends."""
-    from tumortrack.live.sink_worker import Outlet
+    from tumortrack.live.sink_worker import SinkWorker
 
     outlets = []
     # Those that make a folder last: if another cannot open, none is left behind.
     for spec, config in sorted(zip(sinks, configs, strict=True), key=lambda pair: pair[1].waiting):
-        outlet = Outlet(spec, config.open(setting), config.waiting)
+        outlet = SinkWorker(spec, config.open(setting), config.waiting)
         stack.callback(outlet.close)
         outlets.append(outlet)
     return outlets
@@ -244,8 +244,8 @@ class _Screen:
         self, loop: Loop, report: Path, about: dict, arms: Operation | None = None
     ) -> None:
         self._loop, self._report, self._about, self._arms = loop, report, about, arms
-        self._reader: Reader | None = None
-        self._outlets: list[Outlet] = []
+        self._reader: SourceWorker | None = None
+        self._outlets: list[SinkWorker] = []
         self._started = self._said = self._stored = time.monotonic()
         self._before = 0
         self._state, self._changed = "", 0.0
@@ -253,11 +253,11 @@ class _Screen:
         self._errors: dict[str, str] = {}
         self._memory_mb = {"start": round(_resident_mb(), 1)}
 
-    def watch(self, reader: Reader, outlets: list[Outlet]) -> None:
+    def watch(self, reader: SourceWorker, outlets: list[SinkWorker]) -> None:
         """From here on there is something to show."""
         self._reader, self._outlets = reader, outlets
 
-    def show(self, update: Update) -> None:
+    def show(self, update: TrackingResult) -> None:
         """Called with every update."""
         state = update.reason or update.warning or "good"
         kind = "".join(c for c in state if not c.isdigit())
@@ -309,7 +309,7 @@ class _Screen:
         if lost := [outlet for outlet in self._outlets if outlet.unclosed]:
             raise StorageError(f"sink {lost[0].name} did not end well: {lost[0].error}.")
 
-    def _line(self, now: float, reader: Reader) -> None:
+    def _line(self, now: float, reader: SourceWorker) -> None:
         total = sum(self._loop.counts.values())
         rate = (total - self._before) / (now - self._said)
         self._before, self._said = total, now
@@ -322,7 +322,7 @@ class _Screen:
             f"dropped {reader.dropped}  {_resident_mb():.0f} MB"
         )
 
-    def _store(self, reader: Reader) -> None:
+    def _store(self, reader: SourceWorker) -> None:
         from tumortrack.live.loop import summary
 
         self._stored = time.monotonic()

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from tumortrack.core.types import Mesh
     from tumortrack.plan.arms.config import CellConfig
     from tumortrack.plan.config import ResectionConfig
-    from tumortrack.plan.located import Run
+    from tumortrack.plan.located import LocatedRun
     from tumortrack.plan.values import Located, ResectionPlan
 
 
@@ -127,7 +127,7 @@ def organ_of(located: Located) -> Mesh:
 
 
 def _frame(
-    run: Run, options: PlanOptions, stand_mm: float
+    run: LocatedRun, options: PlanOptions, stand_mm: float
 ) -> tuple[str, Float64[np.ndarray, "4 4"]]:
     """Frame id and ``table_from_camera``: of the calibration, or of a camera that looks down."""
     from tumortrack.live.calibration_file import read_frames

@@ -11,7 +11,7 @@ from tumortrack.core import store
 from tumortrack.core.errors import InputError
 
 if TYPE_CHECKING:
-    from tumortrack.training.head_start import Start
+    from tumortrack.training.head_start import HeadStart
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ def pretrain(folder: Path, options: PretrainOptions) -> None:
     )
 
 
-def start_of(folder: Path | None) -> Start | None:
+def start_of(folder: Path | None) -> HeadStart | None:
     """The weights that ``train --start`` names."""
     if folder is None:
         return None

@@ -21,11 +21,11 @@ from tumortrack.core.errors import Aborted, InputError, StorageError
 if TYPE_CHECKING:
     from jaxtyping import Float64
 
-    from tumortrack.live.sink_worker import Outlet
-    from tumortrack.live.values import Shape, Update, Workcell
-    from tumortrack.plan.arms.cell import Cell
+    from tumortrack.live.sink_worker import SinkWorker
+    from tumortrack.live.values import RigidShape, TrackingResult, Workcell
+    from tumortrack.plan.arms.cell import ArmCell
     from tumortrack.plan.files import PlanFolder
-    from tumortrack.plan.operation import Operation, OperationConfig, Planned, Progress
+    from tumortrack.plan.operation import Operation, OperationConfig, Planned, ResectionProgress
     from tumortrack.plan.values import Located
 
     Sinks = tuple[str, ...]
@@ -54,8 +54,8 @@ def resect(plan_folder: Path, sinks: tuple[str, ...], options: ResectOptions) ->
     """`tumortrack resect`: a plan's motions, virtually, shown by sinks or filmed."""
     from tumortrack.cli.live import parse_sinks
     from tumortrack.cli.planning import check_arms_installed
-    from tumortrack.live.sinks.ur import Ur
-    from tumortrack.plan.arms.cell import Cell
+    from tumortrack.live.sinks.ur import UrSinkConfig
+    from tumortrack.plan.arms.cell import ArmCell
     from tumortrack.plan.arms.config import CellConfig
     from tumortrack.plan.files import read_plan
     from tumortrack.plan.operation import OperationConfig
@@ -65,11 +65,13 @@ def resect(plan_folder: Path, sinks: tuple[str, ...], options: ResectOptions) ->
     if stored.motions is None or stored.cell is None:
         raise InputError(f"{plan_folder} was planned with --no-arms; plan again without it.")
     # A wrong one is said before anything heavy is loaded.
-    if options.speed > 1 and any(isinstance(s, Ur) and s.execute for s in parse_sinks(sinks)):
+    if options.speed > 1 and any(
+        isinstance(s, UrSinkConfig) and s.execute for s in parse_sinks(sinks)
+    ):
         raise InputError(f"--speed {options.speed:g} with real arms; allowed: up to 1.")
     config = OperationConfig(speed=options.speed, moved_mm=options.moved_mm)
     where = str(plan_folder)
-    cell = Cell(from_builtins(stored.cell, CellConfig, where), stored.meshes.get("kidney"))
+    cell = ArmCell(from_builtins(stored.cell, CellConfig, where), stored.meshes.get("kidney"))
     if options.film is not None:
         if options.live is not None or sinks:
             raise InputError("--film shows the stored plan; give it without sinks and --live.")
@@ -80,7 +82,9 @@ def resect(plan_folder: Path, sinks: tuple[str, ...], options: ResectOptions) ->
         _virtual(stored, cell, config, sinks, options)
 
 
-def _operation(stored: PlanFolder, cell: Cell, config: OperationConfig, **live: Any) -> Operation:
+def _operation(
+    stored: PlanFolder, cell: ArmCell, config: OperationConfig, **live: Any
+) -> Operation:
     from tumortrack.plan.operation import Operation, Planned
 
     assert stored.motions is not None
@@ -94,7 +98,7 @@ def _operation(stored: PlanFolder, cell: Cell, config: OperationConfig, **live: 
 
 
 def _live(
-    stored: PlanFolder, cell: Cell, config: OperationConfig, sinks: Sinks, options: ResectOptions
+    stored: PlanFolder, cell: ArmCell, config: OperationConfig, sinks: Sinks, options: ResectOptions
 ) -> None:
     """Beside the live loop: every estimate is looked at, and planned on where the tumor moved."""
     from concurrent.futures import Future, ProcessPoolExecutor
@@ -103,7 +107,7 @@ def _live(
     import msgspec
 
     from tumortrack.cli.live import Arms, TrackOptions, track
-    from tumortrack.live.values import Frames
+    from tumortrack.live.values import PublishedFrame
     from tumortrack.plan.located import located
     from tumortrack.plan.replanning import begin, plan_anew, ready
 
@@ -111,7 +115,7 @@ def _live(
     model, source = options.live
     _check_case(stored, model)
 
-    def locate(update: Update, unsure: bool = False) -> Located:
+    def locate(update: TrackingResult, unsure: bool = False) -> Located:
         estimate = update.estimate
         assert estimate is not None
         motion = estimate.motion if unsure else None
@@ -124,7 +128,9 @@ def _live(
     ) as planner:
 
         def replan(
-            update: Update, joints_rad: Float64[np.ndarray, " 12"], progress: Progress
+            update: TrackingResult,
+            joints_rad: Float64[np.ndarray, " 12"],
+            progress: ResectionProgress,
         ) -> Future[Planned]:
             seen = locate(update, unsure=stored.config.sigmas > 0)
             return planner.submit(plan_anew, seen, joints_rad, progress)
@@ -136,7 +142,7 @@ def _live(
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
         begun.result()
         operation = _operation(stored, cell, config, locate=locate, replan=replan)
-        frames = Frames(stored.frame_id, stored.table_from_camera)
+        frames = PublishedFrame(stored.frame_id, stored.table_from_camera)
         arms = Arms(operation, frames, {"plan_config": to_builtins(config)})
         following = TrackOptions(
             range_mm=options.range_mm,
@@ -162,20 +168,20 @@ def _check_case(stored: PlanFolder, model: Path) -> None:
 
 
 def _virtual(
-    stored: PlanFolder, cell: Cell, config: OperationConfig, sinks: Sinks, options: ResectOptions
+    stored: PlanFolder, cell: ArmCell, config: OperationConfig, sinks: Sinks, options: ResectOptions
 ) -> None:
     """Without a camera: the stored motions in real time."""
     from tumortrack.cli.live import open_sinks, parse_sinks, place_of_report, stopping
-    from tumortrack.live.values import Controls, Frames, Setting, Update
+    from tumortrack.live.values import Controls, PublishedFrame, SinkContext, TrackingResult
 
     assert stored.motions is not None
     operation = _operation(stored, cell, config)
     operation.still_life = _organ_shapes(stored)
     report = place_of_report(options.report, "resect")
-    frames = Frames(stored.frame_id, stored.table_from_camera)
+    frames = PublishedFrame(stored.frame_id, stored.table_from_camera)
     controls = Controls()
-    setting = Setting(tuple(stored.meshes), frames, None, controls, arms=True)
-    outlets: list[Outlet] = []
+    setting = SinkContext(tuple(stored.meshes), frames, None, controls, arms=True)
+    outlets: list[SinkWorker] = []
     with ExitStack() as stack:
         stack.enter_context(stopping(lambda: operation.abort(STOPPED)))
         outlets = open_sinks(sinks, parse_sinks(sinks), setting, stack)
@@ -186,7 +192,9 @@ def _virtual(
         while True:
             if controls.aborted.is_set():
                 operation.abort("stopped by the viewer, or a real arm gave up")
-            update = operation.act(Update(sequence, time.time_ns(), reason=_NOTHING, frames=frames))
+            update = operation.act(
+                TrackingResult(sequence, time.time_ns(), reason=_NOTHING, frames=frames)
+            )
             for outlet in outlets:
                 outlet.put(update)
                 if outlet.failing and errors.get(outlet.name) != outlet.error:
@@ -205,18 +213,20 @@ def _virtual(
         raise StorageError(f"sink {lost[0].name} did not end well: {lost[0].error}.")
 
 
-def _organ_shapes(stored: PlanFolder) -> tuple[Shape, ...]:
+def _organ_shapes(stored: PlanFolder) -> tuple[RigidShape, ...]:
     """Kidney and tumors as they were planned on, no surface drawn twice."""
     from tumortrack.core.colours import part_colour
     from tumortrack.core.types import Anatomy, Mesh
-    from tumortrack.live.values import Shape
+    from tumortrack.live.values import RigidShape
     from tumortrack.live.viewer.surfaces import bare_faces
 
     names = sorted(stored.meshes)  # kidney before tumors
     meshes = [stored.meshes[name] for name in names]
     meshes[0] = Mesh(meshes[0].vertices_mm, bare_faces(Anatomy(tuple(meshes))))
     return tuple(
-        Shape(f"planned/{name}", mesh, np.eye(4), part_colour(label), 1.0 if label > 1 else 0.35)
+        RigidShape(
+            f"planned/{name}", mesh, np.eye(4), part_colour(label), 1.0 if label > 1 else 0.35
+        )
         for label, (name, mesh) in enumerate(zip(names, meshes, strict=True), start=1)
     )
 
@@ -249,7 +259,7 @@ def _tell_end(operation: Operation) -> None:
     raise Aborted(f"the resection was {found['state']}: {found['halted']}.")
 
 
-def _film(stored: PlanFolder, cell: Cell, path: Path) -> None:
+def _film(stored: PlanFolder, cell: ArmCell, path: Path) -> None:
     """An animated GIF of about twelve seconds."""
     from tumortrack.plan.files import as_located
     from tumortrack.report.film import film, moments_s
@@ -269,18 +279,18 @@ def _film(stored: PlanFolder, cell: Cell, path: Path) -> None:
 
 
 def _frames(
-    stored: PlanFolder, cell: Cell, times_s: Float64[np.ndarray, " n"]
+    stored: PlanFolder, cell: ArmCell, times_s: Float64[np.ndarray, " n"]
 ) -> Iterator[Workcell]:
     """What is seen at these times; told of the time less often, the arms would halt."""
-    from tumortrack.live.values import Update
+    from tumortrack.live.values import TrackingResult
     from tumortrack.plan.operation import OperationConfig
 
     operation = _operation(stored, cell, OperationConfig())
     now_s = 0.0
     for time_s in times_s.tolist():
-        frame = operation.act(Update(0, 0, reason=_NOTHING), now_s)
+        frame = operation.act(TrackingResult(0, 0, reason=_NOTHING), now_s)
         while now_s < time_s:
             now_s = min(now_s + _FILM_STEP_S, time_s)
-            frame = operation.act(Update(0, 0, reason=_NOTHING), now_s)
+            frame = operation.act(TrackingResult(0, 0, reason=_NOTHING), now_s)
         assert frame.workcell is not None
         yield frame.workcell

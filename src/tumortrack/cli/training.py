@@ -8,9 +8,9 @@ from rich.status import Status as Spinner
 
 from tumortrack.cli.console import console, say
 from tumortrack.core.processes import is_follower
-from tumortrack.training.distributed import RankLost
+from tumortrack.training.distributed import ProcessLost
 from tumortrack.training.state import Diverged
-from tumortrack.training.train import Interrupted, Status
+from tumortrack.training.train import Interrupted, TrainingStatus
 
 _EVERY_S = 15.0  # between lines where there is no terminal
 
@@ -30,10 +30,10 @@ class TrainingScreen:
 
     def __exit__(self, _: object, error: BaseException | None, __: object) -> None:
         self._spinner.stop()
-        if is_follower() and isinstance(error, Interrupted | Diverged | RankLost):
+        if is_follower() and isinstance(error, Interrupted | Diverged | ProcessLost):
             raise SystemExit(error.exit_code)  # the first process says the same
 
-    def show(self, status: Status) -> None:
+    def show(self, status: TrainingStatus) -> None:
         if status.note != self._noted:
             say(status.note)
             self._noted = status.note
@@ -45,7 +45,7 @@ class TrainingScreen:
             self._said = time.monotonic()
 
 
-def _line(status: Status) -> str:
+def _line(status: TrainingStatus) -> str:
     end = f"/{status.end}" if status.end is not None else ""
     miou = "-" if status.miou is None else f"{status.miou:.3f}"
     left = f"{int(status.seconds_left) // 60}:{int(status.seconds_left) % 60:02d}"

@@ -11,7 +11,7 @@ from jaxtyping import Float64
 from tumortrack.core.config import Config, from_builtins
 from tumortrack.core.errors import InputError
 from tumortrack.core.store import read_json
-from tumortrack.live.values import Frames
+from tumortrack.live.values import PublishedFrame
 
 _NOT_RIGID = 1e-3  # largest deviation of a rotation from orthonormal: files have few digits
 
@@ -34,7 +34,7 @@ class CalibrationFile(Config, frozen=True, kw_only=True):
     robot_from_marker: Rows | None = None
 
 
-def read_frames(path: Path) -> Frames:
+def read_frames(path: Path) -> PublishedFrame:
     """The robot's frame of a calibration file (JSON; keys as in ``CalibrationFile``).
 
     Raises:
@@ -66,7 +66,7 @@ def read_frames(path: Path) -> Frames:
         )
     if not file.frame_id.strip():
         raise InputError(f"{path}: frame_id is empty; give the robot's frame, base_link say.")
-    return Frames(file.frame_id, robot_from_camera)
+    return PublishedFrame(file.frame_id, robot_from_camera)
 
 
 def _rigid(rows: Rows, unit: str, where: str) -> Float64[np.ndarray, "4 4"]:

@@ -26,9 +26,16 @@ from tumortrack.core.types import Anatomy, DepthFrame, Intrinsics, SensorCloud
 from tumortrack.live.clock import StampCheck
 from tumortrack.live.meter import Histogram
 from tumortrack.live.quality import judge
-from tumortrack.live.sink_worker import Outlet
-from tumortrack.live.source_worker import Reader
-from tumortrack.live.values import Companion, Quality, Seen, Setting, SourceLost, Update
+from tumortrack.live.sink_worker import SinkWorker
+from tumortrack.live.source_worker import SourceWorker
+from tumortrack.live.values import (
+    Companion,
+    Observation,
+    Quality,
+    SinkContext,
+    SourceLost,
+    TrackingResult,
+)
 from tumortrack.sense.camera import d405
 from tumortrack.sense.region import Hints, RegionConfig, organ_points
 from tumortrack.tracking.follower import Follower, FollowerConfig
@@ -74,7 +81,7 @@ class Loop:
     def __init__(
         self,
         tracker: Tracker,
-        setting: Setting,
+        setting: SinkContext,
         config: LoopConfig,
         companion: Companion | None = None,
     ) -> None:
@@ -114,7 +121,12 @@ class Loop:
         """Ask the loop to end after the frame it is at."""
         self._stop.set()
 
-    def run(self, reader: Reader, outlets: list[Outlet], seen_by: Callable[[Update], None]) -> None:
+    def run(
+        self,
+        reader: SourceWorker,
+        outlets: list[SinkWorker],
+        seen_by: Callable[[TrackingResult], None],
+    ) -> None:
         """``seen_by`` is called with every update, after the outlets have it.
 
         Raises:
@@ -129,16 +141,19 @@ class Loop:
                 self._publish(self._silence(None, 0.0, "tracking has ended"), outlets)
 
     def _run(
-        self, reader: Reader, outlets: list[Outlet], seen_by: Callable[[Update], None]
+        self,
+        reader: SourceWorker,
+        outlets: list[SinkWorker],
+        seen_by: Callable[[TrackingResult], None],
     ) -> None:
         fresh = time.monotonic()
         ends = math.inf
         while not self._stop.is_set():
             got = reader.take(self._config.stale_s)
             now = time.monotonic()
-            if isinstance(got, Seen):
+            if isinstance(got, Observation):
                 got = self._calibrated(got)
-            if isinstance(got, Seen):
+            if isinstance(got, Observation):
                 fresh = now
                 if self._config.seconds and ends == math.inf:
                     ends = now + self._config.seconds
@@ -158,7 +173,7 @@ class Loop:
                     "then start again."
                 )
 
-    def _answer(self, seen: Seen, born_ns: int, hurry: bool) -> Update:
+    def _answer(self, seen: Observation, born_ns: int, hurry: bool) -> TrackingResult:
         """The update of one frame, which came to be at ``born_ns``. ``hurry``: time goes on while
         we work, so an answer can come too late."""
         seconds: dict[str, float] = {}
@@ -190,7 +205,7 @@ class Loop:
         if estimate is None:
             quality, warning = "none", ""
         self._stamp = (seen.stamp_ns, time.monotonic_ns())
-        return Update(
+        return TrackingResult(
             self._next(),
             seen.stamp_ns,
             estimate,
@@ -204,7 +219,7 @@ class Loop:
             latency_ms=1000 * _age_s(born_ns),
         )
 
-    def _calibrated(self, seen: Seen) -> Seen | InputError:
+    def _calibrated(self, seen: Observation) -> Observation | InputError:
         """The frame as the camera that the user says it is took it."""
         given, content = self._config.intrinsics, seen.content
         if given is None or not isinstance(content, DepthFrame):
@@ -223,7 +238,7 @@ class Loop:
         if self._stamps.jumps > jumps:
             self._follower.forget()
 
-    def _hints(self, seen: Seen) -> Hints:
+    def _hints(self, seen: Observation) -> Hints:
         controls = self._setting.controls
         if controls.picked_mm is not self._picked:  # the user chose anew
             self._picked = self._place_mm = controls.picked_mm
@@ -245,10 +260,14 @@ class Loop:
             off_mm = np.linalg.norm(points_mm - np.median(points_mm, axis=0), axis=1)
             self._place_mm = points_mm[int(off_mm.argmin())]
 
-    def _silence(self, fault: TumortrackError | None, silent_s: float, trouble: str) -> Update:
+    def _silence(
+        self, fault: TumortrackError | None, silent_s: float, trouble: str
+    ) -> TrackingResult:
         """The update where there is no frame."""
         reason = str(fault) if fault is not None else trouble or f"no frame for {silent_s:.1f} s"
-        return Update(self._next(), self._now_ns(), reason=reason, frames=self._setting.frames)
+        return TrackingResult(
+            self._next(), self._now_ns(), reason=reason, frames=self._setting.frames
+        )
 
     def _now_ns(self) -> int:
         """Now, by the source's clock as far as it is known."""
@@ -257,7 +276,7 @@ class Loop:
         stamp_ns, then_ns = self._stamp
         return stamp_ns + time.monotonic_ns() - then_ns
 
-    def _publish(self, update: Update, outlets: list[Outlet]) -> Update:
+    def _publish(self, update: TrackingResult, outlets: list[SinkWorker]) -> TrackingResult:
         if self._companion is not None:
             update = self._with_arms(self._companion, update)
         for outlet in outlets:
@@ -277,7 +296,7 @@ class Loop:
             self._hold_against(update.estimate, update.seen.truth)
         return update
 
-    def _with_arms(self, arms: Companion, update: Update) -> Update:
+    def _with_arms(self, arms: Companion, update: TrackingResult) -> TrackingResult:
         try:
             if self._setting.controls.aborted.is_set():
                 arms.abort("stopped by the viewer, or a real arm gave up")
@@ -322,7 +341,7 @@ def _age_s(born_ns: int) -> float:
     return (time.time_ns() - born_ns) * 1e-9
 
 
-def summary(loop: Loop, reader: Reader, outlets: list[Outlet]) -> dict:
+def summary(loop: Loop, reader: SourceWorker, outlets: list[SinkWorker]) -> dict:
     """What the run was like (JSON types): counts, latencies and stage times in ms."""
     return {
         "updates": sum(loop.counts.values()),

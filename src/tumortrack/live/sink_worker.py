@@ -8,20 +8,20 @@ from collections import deque
 
 from tumortrack.core.errors import TumortrackError
 from tumortrack.live.meter import Histogram
-from tumortrack.live.values import Counting, Sink, Update
+from tumortrack.live.values import Counting, Sink, TrackingResult
 
 _CLOSE_S = 10.0  # to write what waits, and flush
 _SILENT_S = 2.0  # without a word from the loop: what a sink shows holds no longer
 
 
-class Outlet:
+class SinkWorker:
     """Hands updates to one sink: the newest ``waiting`` of them. What does not fit is dropped,
     oldest first, and counted; errors are counted and the last one kept."""
 
     def __init__(self, name: str, sink: Sink, waiting: int) -> None:
         self.name = name
         self._sink = sink
-        self._waiting: deque[tuple[Update, float]] = deque(maxlen=waiting)
+        self._waiting: deque[tuple[TrackingResult, float]] = deque(maxlen=waiting)
         self._lock = threading.Condition()
         self._stop = False
         self.unclosed = False  # it failed at its end
@@ -31,7 +31,7 @@ class Outlet:
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
         self._thread.start()
 
-    def put(self, update: Update) -> None:
+    def put(self, update: TrackingResult) -> None:
         """Returns at once."""
         with self._lock:
             if len(self._waiting) == self._waiting.maxlen:
@@ -61,7 +61,7 @@ class Outlet:
         }
 
     def _run(self) -> None:
-        said: Update | None = None  # the last update, until its end has been said too
+        said: TrackingResult | None = None  # the last update, until its end has been said too
         while True:
             with self._lock:
                 self._lock.wait_for(lambda: self._waiting or self._stop, _SILENT_S)
@@ -80,7 +80,7 @@ class Outlet:
             self._failed(_said(error))
             self.unclosed = True
 
-    def _guarded(self, update: Update, handed_s: float) -> None:
+    def _guarded(self, update: TrackingResult, handed_s: float) -> None:
         try:
             self._sink.publish(update)
         except Exception as error:  # whatever a sink raises must not end the loop
@@ -96,9 +96,9 @@ class Outlet:
         self.failing, self.error = True, text
 
 
-def _hung(last: Update) -> Update:
+def _hung(last: TrackingResult) -> TrackingResult:
     """What follows an update after which the loop said nothing more."""
-    return Update(
+    return TrackingResult(
         last.sequence,
         last.stamp_ns + int(_SILENT_S * 1e9),
         reason=f"the loop has said nothing for {_SILENT_S:g} s",

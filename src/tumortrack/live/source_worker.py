@@ -8,7 +8,7 @@ import traceback
 from collections.abc import Callable
 
 from tumortrack.core.errors import InputError, TumortrackError
-from tumortrack.live.values import Seen, Source, SourceEnded, SourceLost
+from tumortrack.live.values import Observation, Source, SourceEnded, SourceLost
 
 _READ_S = 0.2  # one wait for a frame: how soon the thread sees that it is to stop
 _AGAIN_S = 1.0  # between two tries to open
@@ -17,7 +17,7 @@ _DEFECTS = 5  # tracebacks that are kept
 _STOP_S = 2.0  # how long close waits for a source that hangs
 
 
-class Reader:
+class SourceWorker:
     """Reads from a thread of its own. Of frames that come faster than they are taken the newest
     stays, and the others count as dropped; a source that ``waits`` is read only as they are taken.
     """
@@ -25,7 +25,7 @@ class Reader:
     def __init__(self, open_source: Callable[[], Source]) -> None:
         self._open = open_source
         self._lock = threading.Condition()
-        self._newest: tuple[Seen | TumortrackError, str] | None = None
+        self._newest: tuple[Observation | TumortrackError, str] | None = None
         self._stop = threading.Event()
         self._passed = 0  # replaced before they were taken
         self._lost_inside = 0  # dropped by sources that are closed
@@ -45,14 +45,14 @@ class Reader:
         source = self._source
         return self._passed + self._lost_inside + (source.dropped if source else 0)
 
-    def born_ns(self, seen: Seen) -> int:
+    def born_ns(self, seen: Observation) -> int:
         """When the frame just taken came to be, by ``time.time_ns``: its stamp, or where the source
         has another clock, its arrival; of a source that waits for us, now."""
         if self.latency_from == "stamp":
             return seen.stamp_ns
         return seen.arrived_ns if self.latency_from == "arrival" else time.time_ns()
 
-    def take(self, timeout_s: float) -> Seen | TumortrackError | None:
+    def take(self, timeout_s: float) -> Observation | TumortrackError | None:
         """The newest frame, or what was wrong with it; None if none came in time or all is over.
 
         Raises whatever stopped the reading for good.
@@ -112,7 +112,7 @@ class Reader:
             came = time.monotonic()
             while not self._stop.is_set():
                 try:
-                    got: Seen | TumortrackError | None = source.read(_READ_S)
+                    got: Observation | TumortrackError | None = source.read(_READ_S)
                 except InputError as error:
                     got = error
                 if got is not None:
@@ -127,7 +127,7 @@ class Reader:
             self._source = None
             source.close()
 
-    def _put(self, got: Seen | TumortrackError, counts_from: str) -> None:
+    def _put(self, got: Observation | TumortrackError, counts_from: str) -> None:
         with self._lock:
             if counts_from == "taking":
                 self._lock.wait_for(lambda: self._newest is None or self._stop.is_set())

@@ -1,7 +1,7 @@
 """The values of the live loop: what a source saw, what is published of it, who takes part.
 
-A source hands over ``Seen``; the loop makes one ``Update`` of it; every sink gets every
-update, or the newest, if it is slow. Source and sink are each one file with a configuration
+A source hands over an ``Observation``; the loop makes one ``TrackingResult`` of it; every sink gets
+every result, or the newest if it is slow. Source and sink are each one file with a configuration
 whose ``open`` makes it: see ``live.sources`` and ``live.sinks``.
 """
 
@@ -40,7 +40,7 @@ class SourceEnded(TumortrackError):
 
 
 @dataclass(frozen=True, eq=False)
-class Seen:
+class Observation:
     """What a source saw at one instant; camera frame, mm.
 
     Attributes:
@@ -74,7 +74,7 @@ class Source(Protocol):
         """Frames that never got out of the source, as far as it knows."""
         ...
 
-    def read(self, timeout_s: float) -> Seen | None:
+    def read(self, timeout_s: float) -> Observation | None:
         """The newest frame not yet given; None if none came in time.
 
         Raises:
@@ -91,7 +91,7 @@ class Source(Protocol):
 
 
 @dataclass(frozen=True, eq=False)
-class Frames:
+class PublishedFrame:
     """In which frame results are published: ``frame_id``, and the way there from the camera."""
 
     frame_id: str = "camera"
@@ -99,7 +99,7 @@ class Frames:
 
 
 @dataclass(frozen=True, eq=False)
-class Placed:
+class TransformedEstimate:
     """An estimate in the frame in which it is published, mm."""
 
     points_mm: Float32[np.ndarray, "n 3"]
@@ -109,7 +109,7 @@ class Placed:
 
 
 @dataclass(frozen=True, eq=False)
-class Shape:
+class RigidShape:
     """A surface that moves as a whole: a link of an arm, a table, a planned piece.
 
     ``name`` is its own within a workcell, with slashes between levels (``cutter/forearm``).
@@ -125,7 +125,7 @@ class Shape:
 
 
 @dataclass(frozen=True, eq=False)
-class Line:
+class Polyline:
     """A line through points of the published frame, mm: a cut, an instrument's way."""
 
     name: str
@@ -147,12 +147,12 @@ class Workcell:
     state: str
     halted: str = ""
     joints_rad: Mapping[str, float] = field(default_factory=dict)
-    shapes: tuple[Shape, ...] = ()
-    lines: tuple[Line, ...] = ()
+    shapes: tuple[RigidShape, ...] = ()
+    lines: tuple[Polyline, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
-class Update:
+class TrackingResult:
     """What the loop says about one frame: an estimate, or the reason why there is none.
 
     Attributes:
@@ -178,15 +178,15 @@ class Update:
     reason: str = ""
     quality: Quality = "none"
     warning: str = ""
-    seen: Seen | None = None
+    seen: Observation | None = None
     organ: SensorCloud | None = None
-    frames: Frames = field(default_factory=Frames)
+    frames: PublishedFrame = field(default_factory=PublishedFrame)
     seconds: Mapping[str, float] = field(default_factory=dict)
     latency_ms: float | None = None
     workcell: Workcell | None = None
 
     @cached_property
-    def placed(self) -> Placed | None:
+    def placed(self) -> TransformedEstimate | None:
         """The estimate in the published frame: what sinks send."""
         if self.estimate is None:
             return None
@@ -197,7 +197,7 @@ class Update:
             for name, mesh in self.estimate.meshes.items()
         }
         points_mm = transform_points(way, cloud.points_mm)
-        return Placed(points_mm, cloud.labels, cloud.probability, meshes)
+        return TransformedEstimate(points_mm, cloud.labels, cloud.probability, meshes)
 
 
 @runtime_checkable
@@ -209,7 +209,7 @@ class Companion(Protocol):
         """There is nothing more to do; the loop ends too."""
         ...
 
-    def act(self, update: Update) -> Update:
+    def act(self, update: TrackingResult) -> TrackingResult:
         """The update as sinks get it, with the workcell as it is now. Called with every update,
         also where there is no estimate."""
         ...
@@ -240,13 +240,13 @@ class Controls:
 
 
 @dataclass(frozen=True, eq=False)
-class Setting:
+class SinkContext:
     """What a sink may know from the start. ``anatomy_ct``: the organ in the CT (LPS, mm), where
     the model has it: estimates then have a motion, and their meshes its triangles. ``arms``:
     updates may carry a workcell."""
 
     parts: tuple[str, ...]
-    frames: Frames
+    frames: PublishedFrame
     anatomy_ct: Anatomy | None = None
     controls: Controls = field(default_factory=Controls)
     arms: bool = False
@@ -257,7 +257,7 @@ class Sink(Protocol):
     """An open sink. ``publish`` and ``close`` are called from one thread of its own, so it may
     take its time; an error it raises is counted and said, and the loop goes on."""
 
-    def publish(self, update: Update) -> None: ...
+    def publish(self, update: TrackingResult) -> None: ...
 
     def close(self) -> None:
         """Flush and give everything back; may be called twice."""
@@ -292,5 +292,5 @@ class SinkConfig(Config, frozen=True, kw_only=True, tag_field="kind"):
     waiting: ClassVar[int] = 1
 
     @abstractmethod
-    def open(self, setting: Setting) -> Sink:
+    def open(self, setting: SinkContext) -> Sink:
         """Raises InputError where it cannot work: a port taken, a folder that exists."""

@@ -6,7 +6,7 @@ from typing import Literal
 
 from tumortrack.core.config import Config
 from tumortrack.occupancy.network import NetworkConfig
-from tumortrack.registration.gauss_newton import RefineConfig
+from tumortrack.registration.gauss_newton import GaussNewtonConfig
 from tumortrack.simulate.scene import SceneConfig
 
 
@@ -43,4 +43,4 @@ class TrainConfig(Config, frozen=True):
     validation_pairs: int = 64
     validation_points: int = 2048
     validate_every: int = 250  # steps
-    refine: RefineConfig = RefineConfig()
+    refine: GaussNewtonConfig = GaussNewtonConfig()

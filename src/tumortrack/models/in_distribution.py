@@ -13,7 +13,7 @@ from jaxtyping import Float, Float32
 from tumortrack.core.config import Config
 from tumortrack.core.errors import NoEstimate
 from tumortrack.core.types import Mesh
-from tumortrack.occupancy.lattice import Lattice
+from tumortrack.occupancy.lattice import LogitLattice
 from tumortrack.simulate.occupancy import surface_distance
 
 _SHARE = 80  # per cent of the points that must fit: a tenth may be background
@@ -34,7 +34,7 @@ _SPREAD_FACTOR = 1.5
 _RAREST = 1.25
 
 
-class Familiar(Config, frozen=True):
+class InDistributionRange(Config, frozen=True):
     """What the clouds of the validation scenes were like.
 
     ``spread_mm``: smallest and largest ``spread_mm``; ``fit_mm``: the 95th percentile over the
@@ -57,7 +57,7 @@ def fit_mm(distances_mm: Float[np.ndarray, " n"]) -> float:
 
 
 def surface_distances(
-    lattice: Lattice, points_mm: Float[np.ndarray, "n 3"]
+    lattice: LogitLattice, points_mm: Float[np.ndarray, "n 3"]
 ) -> Float32[np.ndarray, " n"]:
     """How far points (n, 3) lie from the organ's surface, camera frame, mm.
 
@@ -78,7 +78,7 @@ def surface_distances(
     return surface_distance(surface, points_mm)
 
 
-def check_familiar(familiar: Familiar, spread: float, fit: float) -> None:
+def check_familiar(familiar: InDistributionRange, spread: float, fit: float) -> None:
     """Refuse what cannot be the organ.
 
     Raises:

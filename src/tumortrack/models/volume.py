@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float16, Float64, UInt8
 
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.types import FIRST_TUMOR, ORGAN, Mesh, OccupancyCloud
-from tumortrack.occupancy.lattice import Lattice
+from tumortrack.occupancy.lattice import LogitLattice
 
 _AT_ONCE = 2**18  # queries; bounds the memory whatever the grid
 _SMALLEST_MARGIN = 1e-3  # a surface exactly through a grid point would not be closed
@@ -66,7 +66,7 @@ def dense_margins(
 
 
 def margins_on(
-    lattice: Lattice,
+    lattice: LogitLattice,
 ) -> tuple[
     Float16[np.ndarray, "parts i j k"], UInt8[np.ndarray, "i j k"], Float64[np.ndarray, "4 4"]
 ]:

@@ -46,7 +46,7 @@ class Machine(Config, frozen=True):
     instructions: tuple[str, ...]
 
 
-class Timing(Config, frozen=True):
+class ArithmeticTiming(Config, frozen=True):
     """One way, measured: median, and what differs from the network in single precision."""
 
     arithmetic: Arithmetic
@@ -64,7 +64,7 @@ class Compiled(Config, frozen=True):
     threads: int
     queries: int
     arithmetic: Arithmetic
-    timings: tuple[Timing, ...]
+    timings: tuple[ArithmeticTiming, ...]
 
 
 def this_machine() -> Machine:

@@ -10,7 +10,13 @@ import numpy as np
 import torch
 from jaxtyping import Float32
 
-from tumortrack.occupancy.compiled import SCHEMA, Arithmetic, Compiled, Timing, this_machine
+from tumortrack.occupancy.compiled import (
+    SCHEMA,
+    Arithmetic,
+    ArithmeticTiming,
+    Compiled,
+    this_machine,
+)
 from tumortrack.occupancy.inference import CHUNK, Inference, possible
 from tumortrack.occupancy.network import Latent, OccupancyNetwork
 from tumortrack.training.model import Model
@@ -47,7 +53,7 @@ def measured(model: Model, weights_sha256: str, rounds: int = _ROUNDS) -> Compil
         seconds[n].append(time.perf_counter() - start)
     right = reference(inferences[0].network, latent, queries)
     timings = [
-        Timing(
+        ArithmeticTiming(
             arithmetic=way,
             milliseconds=1000 * statistics.median(taken),
             labels_equal=float((answer.argmax(1) == right.argmax(1)).double().mean()),
@@ -66,7 +72,7 @@ def measured(model: Model, weights_sha256: str, rounds: int = _ROUNDS) -> Compil
     )
 
 
-def chosen(timings: list[Timing]) -> Timing:
+def chosen(timings: list[ArithmeticTiming]) -> ArithmeticTiming:
     """The fastest way that gives ``ENOUGH_EQUAL`` of the labels of single precision; where none
     does, the one that gives most."""
     right = [one for one in timings if one.labels_equal >= ENOUGH_EQUAL]

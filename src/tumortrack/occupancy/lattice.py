@@ -13,7 +13,7 @@ LogitsAt = Callable[[Float32[np.ndarray, "n 3"]], torch.Tensor]  # camera frame,
 
 
 @dataclass(frozen=True, eq=False)
-class Lattice:
+class LogitLattice:
     """Logits at origin + step * (i, j, k), camera frame, mm."""
 
     origin_mm: Float64[np.ndarray, " 3"]
@@ -36,10 +36,12 @@ class Lattice:
         return out
 
 
-def lattice_over(logits_at: LogitsAt, box_mm: Float64[np.ndarray, "2 3"], steps: int) -> Lattice:
+def lattice_over(
+    logits_at: LogitsAt, box_mm: Float64[np.ndarray, "2 3"], steps: int
+) -> LogitLattice:
     """Ask on a lattice over a box, ``steps`` along its longest side."""
     step = float((box_mm[1] - box_mm[0]).max()) / steps
     axes = [np.arange(low, high + step, step) for low, high in box_mm.T]
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).astype(np.float32)
     logits = logits_at(grid.reshape(-1, 3)).float().cpu().numpy()
-    return Lattice(box_mm[0].astype(float), step, logits.reshape(*grid.shape[:3], -1))
+    return LogitLattice(box_mm[0].astype(float), step, logits.reshape(*grid.shape[:3], -1))

@@ -30,7 +30,7 @@ from tumortrack.models.volume import (
     part_surfaces,
 )
 from tumortrack.occupancy.inference import Inference
-from tumortrack.occupancy.lattice import Lattice, lattice_over
+from tumortrack.occupancy.lattice import LogitLattice, lattice_over
 from tumortrack.occupancy.network import OccupancyNetwork
 from tumortrack.occupancy.organ_lattice import leaves, organ_lattice
 from tumortrack.occupancy.sparse import halved_lattice, leading, sparse_logits, sparse_margins
@@ -158,19 +158,19 @@ class _Frame:
         margin = 0.05 * (high - low) + gap / 2
         return np.stack([low - margin, high + margin])
 
-    def lattice(self, box: Box, everywhere: bool = False) -> Lattice:
+    def lattice(self, box: Box, everywhere: bool = False) -> LogitLattice:
         over = lattice_over if everywhere else organ_lattice
         with self.stage("lattice"):
             return over(self.logits_at, box, steps_over(box))
 
-    def check(self, lattice: Lattice) -> None:
+    def check(self, lattice: LogitLattice) -> None:
         """Refuse what cannot be the organ."""
         with self.stage("fit"):
             self.distances_mm = surface_distances(lattice, self.thinned.points_mm)
             spread = spread_mm(self.thinned.points_mm)
             check_familiar(self.model.familiar, spread, fit_mm(self.distances_mm))
 
-    def inside(self, lattice: Lattice) -> OccupancyCloud:
+    def inside(self, lattice: LogitLattice) -> OccupancyCloud:
         """Those of 40,000 random points in the lattice's box that lie inside."""
         with self.stage("fine"):
             low, high = lattice.box_mm

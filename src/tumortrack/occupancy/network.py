@@ -22,7 +22,7 @@ from tumortrack.models.layers import Layer
 from tumortrack.models.sampling import compiled, take
 from tumortrack.occupancy.decoders import DecoderConfig
 from tumortrack.occupancy.mlp_decoder import MlpDecoderConfig
-from tumortrack.registration.config import WarpDecoderConfig
+from tumortrack.registration.config import RegistrationHeadConfig
 
 
 class CloudBox(Config, frozen=True, tag="cloud-box"):
@@ -69,7 +69,7 @@ class NetworkConfig(Config, frozen=True):
     @property
     def warps(self) -> bool:
         """Whether the network places the pre-operative organ, instead of labelling points."""
-        return isinstance(self.decoder, WarpDecoderConfig)
+        return isinstance(self.decoder, RegistrationHeadConfig)
 
     def build(self) -> OccupancyNetwork:
         """The network, with weights from torch's global generator (``torch.manual_seed``).
@@ -278,6 +278,6 @@ def clinic_network(modes: int, scale_mm: float) -> NetworkConfig:
     comparison with the other encoders and decoders). ``modes``: of the organ's body."""
     return NetworkConfig(
         encoder=HeightMapConfig(),
-        decoder=WarpDecoderConfig(modes=modes),
+        decoder=RegistrationHeadConfig(modes=modes),
         normalisation=Aligned(scale_mm=scale_mm, reach=1.35),
     )

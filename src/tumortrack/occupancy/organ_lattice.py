@@ -8,10 +8,12 @@ import numpy as np
 from jaxtyping import Float, Float32
 
 from tumortrack.core.types import OUTSIDE
-from tumortrack.occupancy.lattice import Lattice, LogitsAt, lattice_over
+from tumortrack.occupancy.lattice import LogitLattice, LogitsAt, lattice_over
 
 
-def organ_lattice(logits_at: LogitsAt, box_mm: Float[np.ndarray, "2 3"], steps: int) -> Lattice:
+def organ_lattice(
+    logits_at: LogitsAt, box_mm: Float[np.ndarray, "2 3"], steps: int
+) -> LogitLattice:
     """``lattice_over``, asked everywhere inside of the organ and a point or two about it.
 
     Every second point along each axis is asked first, then all within two of one that lies
@@ -38,10 +40,10 @@ def organ_lattice(logits_at: LogitsAt, box_mm: Float[np.ndarray, "2 3"], steps: 
         place = np.stack(np.unravel_index(asked, shape), axis=1) * step_mm + coarse.origin_mm
         rows[asked] = logits_at(place.astype(np.float32)).float().cpu().numpy()
         asked = neighbours(shape, _inside(asked, rows), known)
-    return Lattice(coarse.origin_mm, step_mm, logits)
+    return LogitLattice(coarse.origin_mm, step_mm, logits)
 
 
-def leaves(lattice: Lattice) -> bool:
+def leaves(lattice: LogitLattice) -> bool:
     """Whether the organ, the largest piece of what lies inside, reaches the border of a lattice, or
     is not in it at all."""
     from scipy import ndimage

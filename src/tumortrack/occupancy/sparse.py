@@ -24,7 +24,7 @@ from jaxtyping import Bool, Float16, Float32, Float64, Int, UInt8
 
 from tumortrack.core.geometry import transform_points
 from tumortrack.models.volume import LARGEST_MARGIN, dense_margins, margins_of
-from tumortrack.occupancy.lattice import Lattice, LogitsAt
+from tumortrack.occupancy.lattice import LogitLattice, LogitsAt
 
 START_MM = 4.0
 _AT_ONCE = 2**18  # queries
@@ -62,7 +62,7 @@ def sparse_margins(
 
 
 def sparse_logits(
-    logits_at: LogitsAt, lattice: Lattice, points_mm: Float32[np.ndarray, "n 3"]
+    logits_at: LogitsAt, lattice: LogitLattice, points_mm: Float32[np.ndarray, "n 3"]
 ) -> Float32[np.ndarray, "n classes"]:
     """Logits at points in a lattice's box: linear where the label is plain, else asked for.
 
@@ -74,22 +74,22 @@ def sparse_logits(
     def ask(some: Int[np.ndarray, " m"]) -> Float32[np.ndarray, "m classes"]:
         return logits_at(points_mm[some]).float().cpu().numpy()
 
-    settled(logits, leading(logits)[1], ask, Trust(tail=0.99, safety=1.0))
+    settled(logits, leading(logits)[1], ask, InterpolationLimit(tail=0.99, safety=1.0))
     return logits
 
 
-def halved_lattice(logits_at: LogitsAt, lattice: Lattice) -> Lattice:
+def halved_lattice(logits_at: LogitsAt, lattice: LogitLattice) -> LogitLattice:
     """The lattice of half the step, asked where linear logits do not tell the label."""
     step_mm = lattice.step_mm / 2
     camera_from_index = np.diag([step_mm] * 3 + [1.0])
     camera_from_index[:3, 3] = lattice.origin_mm
     i, j, k = (2 * n - 1 for n in lattice.logits.shape[:3])
     finer = _Lattice(logits_at, camera_from_index, (i, j, k), 1)
-    return Lattice(lattice.origin_mm, step_mm, _halved(lattice.logits, finer))
+    return LogitLattice(lattice.origin_mm, step_mm, _halved(lattice.logits, finer))
 
 
 @dataclass(eq=False)
-class Trust:
+class InterpolationLimit:
     """How far linear logits were found to be off: a label that leads by ``limit`` is believed.
 
     ``coarser``: the limit at twice the distance, 0 where there was none. The limit is a quantile,
@@ -111,9 +111,9 @@ class Trust:
         worst = float(np.quantile(np.concatenate(self.errors), self.tail))
         self.limit = max(self.limit, self.safety * worst)
 
-    def finer(self) -> Trust:
+    def finer(self) -> InterpolationLimit:
         """At half the distance, before anything is asked: smooth logits err by a quarter."""
-        return Trust(self.limit / 4, self.limit)
+        return InterpolationLimit(self.limit / 4, self.limit)
 
 
 @dataclass(eq=False)
@@ -124,7 +124,7 @@ class _Lattice:
     camera_from_index: Float64[np.ndarray, "4 4"]
     shape: tuple[int, int, int]
     stride: int
-    trust: Trust = field(default_factory=Trust)
+    trust: InterpolationLimit = field(default_factory=InterpolationLimit)
 
     def halved(self) -> _Lattice:
         i, j, k = (2 * n - 1 for n in self.shape)
@@ -151,7 +151,7 @@ def settled(
     expected: Float32[np.ndarray, "n classes"],
     leads: Float32[np.ndarray, " n"],
     ask: Ask,
-    trust: Trust,
+    trust: InterpolationLimit,
 ) -> Bool[np.ndarray, " n"]:
     """Ask wherever the expected label leads by too little; which were asked.
 

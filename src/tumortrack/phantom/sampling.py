@@ -24,7 +24,7 @@ _EXOPHYTIC_SHARE = (0.35, 0.65)
 
 
 @dataclass(frozen=True)
-class Placement:
+class TumorPlacement:
     """How one tumor lies in the organ."""
 
     outside_share: float
@@ -33,7 +33,7 @@ class Placement:
     """Least parenchyma between tumor and organ surface; 0 where it breaks through."""
 
 
-def placements(parameters: PhantomParameters, voxel_mm: float = 1.0) -> list[Placement]:
+def placements(parameters: PhantomParameters, voxel_mm: float = 1.0) -> list[TumorPlacement]:
     """Measure every tumor, in label order, on a grid of ``voxel_mm`` by distance transform."""
     from scipy import ndimage
 
@@ -41,7 +41,7 @@ def placements(parameters: PhantomParameters, voxel_mm: float = 1.0) -> list[Pla
     inside = organ_mask(parameters, axes_mm)
     depth_mm = ndimage.distance_transform_edt(inside, sampling=voxel_mm)
     return [
-        Placement(float((mask & ~inside).sum() / mask.sum()), float(depth_mm[mask].min()))
+        TumorPlacement(float((mask & ~inside).sum() / mask.sum()), float(depth_mm[mask].min()))
         for mask in tumor_masks(parameters, axes_mm)
     ]
 

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from tumortrack.core.errors import InputError
-from tumortrack.plan.motions import Motions, Stage
+from tumortrack.plan.motions import Motions, MotionStage
 
 DONE, ABORTED = "done", "aborted"
 _BRAKE_RAD_S2 = 4.0  # of the fastest joint, where arms are halted in the middle of a motion
@@ -144,5 +144,5 @@ class Execution:
         return self._number >= len(self._motions.stages)
 
     @property
-    def _stage(self) -> Stage:
+    def _stage(self) -> MotionStage:
         return self._motions.stages[min(self._number, len(self._motions.stages) - 1)]

@@ -20,8 +20,8 @@ from tumortrack.core.errors import ArtifactError, InputError
 from tumortrack.core.mesh_files import read_mesh, write_mesh
 from tumortrack.core.types import Mesh
 from tumortrack.plan.config import ResectionConfig
-from tumortrack.plan.motions import JOINTS, Motions, Stage
-from tumortrack.plan.values import Cut, Layer, Located, ResectionPlan
+from tumortrack.plan.motions import JOINTS, Motions, MotionStage
+from tumortrack.plan.values import Cut, CutLayer, Located, ResectionPlan
 from tumortrack.sense.ply import framed_ply
 
 KIND = "plan"
@@ -155,7 +155,7 @@ def from_plain(data: dict[str, Any]) -> ResectionPlan:
             for cut in data["cuts"]
         ),
         layers=tuple(
-            Layer(
+            CutLayer(
                 float(layer["bottom_mm"]),
                 np.inf if layer["top_mm"] is None else float(layer["top_mm"]),
                 tuple(np.array(ring, float) for ring in layer["rings_mm"]),
@@ -210,7 +210,7 @@ def _read_motions(path: Path) -> Motions:
             if json.loads(named.get("joints", "[]")) != list(JOINTS):
                 raise ArtifactError(f"{path} is for other arms' joints; plan again.")
             stages = tuple(
-                Stage(
+                MotionStage(
                     name,
                     tensors.get_tensor(f"{number}.times_s"),
                     tensors.get_tensor(f"{number}.joints_rad"),

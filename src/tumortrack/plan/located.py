@@ -61,7 +61,7 @@ def located(
 
 
 @dataclass(frozen=True, eq=False)
-class Run:
+class LocatedRun:
     """What `locate` wrote, camera frame, mm. ``std_mm``: of the cloud's points, if it is known."""
 
     cloud: OccupancyCloud
@@ -82,7 +82,7 @@ class Run:
         return replace(found, std_mm=deviations)
 
 
-def read_run(folder: Path) -> Run:
+def read_run(folder: Path) -> LocatedRun:
     """
     Raises:
         ArtifactError: no run of `locate`'s, damaged, or without its cloud.
@@ -105,7 +105,7 @@ def read_run(folder: Path) -> Run:
         raise ArtifactError(
             f"{folder} has points of {', '.join(lacking)} and no {lacking[0]}.ply; locate again."
         )
-    return Run(cloud, meshes, _deviations(content, str(path)))
+    return LocatedRun(cloud, meshes, _deviations(content, str(path)))
 
 
 def _lacking(cloud: OccupancyCloud, meshes: Mapping[str, Mesh]) -> list[str]:

@@ -17,7 +17,7 @@ from tumortrack.core.errors import NoPlan
 from tumortrack.plan.config import ResectionConfig
 from tumortrack.plan.exophytic import name_of
 from tumortrack.plan.outline import arcs, evenly, polygon_of, rings_of
-from tumortrack.plan.values import Cut, Layer, Located
+from tumortrack.plan.values import Cut, CutLayer, Located
 
 # Of outlines, which are interpolated; and one surface point in each cube of that size. Both finer
 # where the margin is narrow, so that it is kept to a tenth of a millimetre.
@@ -32,7 +32,7 @@ _LEAST_MM2 = 1.0  # a smaller rest of a floor needs no stroke
 
 def margin_plan(
     located: Located, label: int, config: ResectionConfig
-) -> tuple[tuple[Layer, ...], tuple[Cut, ...], Float64[np.ndarray, " 3"]]:
+) -> tuple[tuple[CutLayer, ...], tuple[Cut, ...], Float64[np.ndarray, " 3"]]:
     """The piece, its strokes, both from the top down, and where to hold; table frame, mm.
 
     Raises:
@@ -151,7 +151,7 @@ def _layers(
     margins: Float[np.ndarray, " n"],
     columns: Columns,
     layer_mm: float,
-) -> tuple[Layer, ...]:
+) -> tuple[CutLayer, ...]:
     """Slabs from the top down; each has the outline at its upper end, where it is widest."""
     floor = float((points[:, 2] - margins).min())
     outermost = _outlines(points, margins, np.array([np.inf]))[0]
@@ -165,7 +165,7 @@ def _layers(
     tops = np.append(bottoms[1:], np.inf)
     outlines = [*_outlines(points, margins, tops[:-1]), outermost]
     layers = [
-        Layer(float(bottom), float(top), rings)
+        CutLayer(float(bottom), float(top), rings)
         for bottom, top, rings in zip(bottoms, tops, outlines, strict=True)
         if rings
     ]
@@ -199,7 +199,7 @@ def _outlines(
 
 
 def _strokes(
-    layer: Layer, below: Layer | None, columns: Columns, config: ResectionConfig
+    layer: CutLayer, below: CutLayer | None, columns: Columns, config: ResectionConfig
 ) -> list[Cut]:
     """A layer's strokes at its lower end: along its outline, and over its floor where that is not
     the next layer's."""

@@ -15,7 +15,7 @@ JOINTS = tuple(f"{arm}_{joint}" for arm in (CUTTER, HOLDER) for joint in UR_JOIN
 
 
 @dataclass(frozen=True, eq=False)
-class Stage:
+class MotionStage:
     """One state of the procedure: approach, grasp, hold, sweep 1, sweep 2, ..., release, home.
 
     Attributes:
@@ -51,7 +51,7 @@ class Stage:
 class Motions:
     """The stages in their order, each beginning where the one before ended."""
 
-    stages: tuple[Stage, ...]
+    stages: tuple[MotionStage, ...]
 
     @property
     def seconds(self) -> float:

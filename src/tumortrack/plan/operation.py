@@ -19,7 +19,7 @@ from scipy.spatial import cKDTree
 from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError, TumortrackError
 from tumortrack.core.types import Mesh
-from tumortrack.live.values import Line, Shape, Update, Workcell
+from tumortrack.live.values import Polyline, RigidShape, TrackingResult, Workcell
 from tumortrack.plan.execute import ABORTED, Execution
 from tumortrack.plan.motions import JOINTS, Motions
 from tumortrack.plan.values import Located, ResectionPlan
@@ -66,7 +66,7 @@ class Planned:
 
 
 @dataclass(frozen=True)
-class Progress:
+class ResectionProgress:
     """How far a plan was carried out: whether the grasper holds, and the height of the last sweep
     that was finished over the tumor's lowest point (None: none was)."""
 
@@ -94,9 +94,11 @@ class Progress:
 
 
 # The estimate to plan on, the arms' joints, and how far they came
-Replan = Callable[[Update, Float64[np.ndarray, " 12"], Progress], "Future[Planned]"]
-Locate = Callable[[Update], Located]
-Draw = Callable[[Float64[np.ndarray, " 12"]], tuple[Shape, ...]]
+Replan = Callable[
+    [TrackingResult, Float64[np.ndarray, " 12"], ResectionProgress], "Future[Planned]"
+]
+Locate = Callable[[TrackingResult], Located]
+Draw = Callable[[Float64[np.ndarray, " 12"]], tuple[RigidShape, ...]]
 
 
 class Operation:
@@ -126,7 +128,7 @@ class Operation:
         self._first_s = 0.0
         self._settled: tuple[Mesh, float] | None = None  # where the tumor is, and since when
         self._work: Future[Planned] | None = None
-        self.still_life: tuple[Shape, ...] = ()
+        self.still_life: tuple[RigidShape, ...] = ()
         self.log: list[dict] = []
         self.halts: Counter[str] = Counter()
         self._said = ""
@@ -146,16 +148,16 @@ class Operation:
         return self._execution.joints_rad
 
     @property
-    def progress(self) -> Progress:
+    def progress(self) -> ResectionProgress:
         """How far it came."""
         if not self._execution.holds:
-            return Progress()
+            return ResectionProgress()
         done = [cut for cut in self._planned.plan.cuts if cut.sweep < self._execution.sweep]
         if not done:
-            return Progress(holds=True)
-        return Progress(True, done[-1].height_mm - float(self._planned.tumor.box_mm[0, 2]))
+            return ResectionProgress(holds=True)
+        return ResectionProgress(True, done[-1].height_mm - float(self._planned.tumor.box_mm[0, 2]))
 
-    def act(self, update: Update, now_s: float | None = None) -> Update:
+    def act(self, update: TrackingResult, now_s: float | None = None) -> TrackingResult:
         """The update with what the arms do now. ``now_s``: a steady clock's time."""
         now_s = time.monotonic() if now_s is None else now_s
         self._pass(now_s)
@@ -199,7 +201,7 @@ class Operation:
             self._execution.halt("no word from the loop")
             self._execution.step((passed_s - _BLIND_S) * speed)
 
-    def _look(self, update: Update, now_s: float) -> None:
+    def _look(self, update: TrackingResult, now_s: float) -> None:
         """Go on, or halt and why."""
         execution = self._execution
         if self._work is not None:
@@ -218,7 +220,7 @@ class Operation:
         else:
             self._compare(update, self._locate(update), now_s)
 
-    def _compare(self, update: Update, located: Located, now_s: float) -> None:
+    def _compare(self, update: TrackingResult, located: Located, now_s: float) -> None:
         execution, config = self._execution, self._config
         name = self._planned.plan.tumor
         tumor = located.meshes.get(name)
@@ -283,14 +285,14 @@ class Operation:
         entry = {"state": self._execution.state, "at_s": round(now_s - self._first_s, 3)}
         self.log.append({**entry, "event": what} if what else entry)
 
-    def _lines(self) -> tuple[Line, ...]:
+    def _lines(self) -> tuple[Polyline, ...]:
         sweep, plan = self._execution.sweep, self._planned.plan
         lines = []
         for number, cut in enumerate(plan.cuts, start=1):
             colour = CUT if cut.sweep < sweep else NOW if cut.sweep == sweep else TO_CUT
-            lines.append(Line(f"cut/{number}", cut.path_mm, colour, 0.8))
+            lines.append(Polyline(f"cut/{number}", cut.path_mm, colour, 0.8))
         above = plan.grasp_mm + np.array([[0.0, 0.0, 40.0], [0.0, 0.0, 0.0]])
-        return (*lines, Line("grasp", above, (90, 200, 255), 0.8))
+        return (*lines, Polyline("grasp", above, (90, 200, 255), 0.8))
 
 
 def apart_mm(a: Mesh, b: Mesh) -> float:

@@ -7,12 +7,12 @@ from jaxtyping import Float64
 
 from tumortrack.plan.config import ResectionConfig
 from tumortrack.plan.outline import common, concave_hull, evenly, grown, rings_of
-from tumortrack.plan.values import Cut, Layer, Located
+from tumortrack.plan.values import Cut, CutLayer, Located
 
 
 def published_plan(
     located: Located, label: int, config: ResectionConfig
-) -> tuple[tuple[Layer, ...], tuple[Cut, ...], Float64[np.ndarray, " 3"]]:
+) -> tuple[tuple[CutLayer, ...], tuple[Cut, ...], Float64[np.ndarray, " 3"]]:
     """The piece, the two sweeps, and where to hold; table frame, mm.
 
     The tumor's points are projected on the table's plane; their concave hull, grown by the margin
@@ -35,4 +35,4 @@ def published_plan(
         for sweep, height in enumerate(((low + high) / 2, low), start=1)
     )
     x, y, _ = tumor.mean(0)
-    return (Layer(low, np.inf, (ring,)),), cuts, np.array([x, y, high], float)
+    return (CutLayer(low, np.inf, (ring,)),), cuts, np.array([x, y, high], float)

@@ -8,21 +8,21 @@ import numpy as np
 from jaxtyping import Float64
 
 from tumortrack.core.errors import NoPlan
-from tumortrack.plan.arms.cell import Cell
+from tumortrack.plan.arms.cell import ArmCell
 from tumortrack.plan.arms.config import CellConfig
 from tumortrack.plan.arms.procedure import plan_motions
 from tumortrack.plan.config import ResectionConfig
-from tumortrack.plan.operation import Planned, Progress
+from tumortrack.plan.operation import Planned, ResectionProgress
 from tumortrack.plan.resection import plan_resection
 from tumortrack.plan.values import Located
 
-_given: list[tuple[ResectionConfig, Cell]] = []
+_given: list[tuple[ResectionConfig, ArmCell]] = []
 
 
 def begin(config: ResectionConfig, cell: CellConfig) -> None:
     """Called once in the new process. Ctrl-C is the live loop's affair, not ours."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    _given.append((config, Cell(cell)))
+    _given.append((config, ArmCell(cell)))
 
 
 def ready() -> None:
@@ -31,7 +31,9 @@ def ready() -> None:
     import toppra  # noqa: F401
 
 
-def plan_anew(seen: Located, joints_rad: Float64[np.ndarray, " 12"], progress: Progress) -> Planned:
+def plan_anew(
+    seen: Located, joints_rad: Float64[np.ndarray, " 12"], progress: ResectionProgress
+) -> Planned:
     """The plan for the organ as it lies now, from where the arms are; see ``plan_motions``.
 
     Raises:

@@ -15,7 +15,7 @@ from tumortrack.plan.exophytic import chosen_tumor, name_of
 from tumortrack.plan.margin import margin_plan
 from tumortrack.plan.outline import polygon_of
 from tumortrack.plan.published import published_plan
-from tumortrack.plan.values import Layer, Located, ResectionPlan
+from tumortrack.plan.values import CutLayer, Located, ResectionPlan
 
 _A_COLUMN = 30  # points in a column, about
 _WHOLE, _TOUCHED = 0.99, 0.02  # of another tumor's points
@@ -56,7 +56,7 @@ def plan_resection(located: Located, config: ResectionConfig) -> ResectionPlan:
 
 
 def inside(
-    layers: tuple[Layer, ...], points_mm: Float[np.ndarray, "n 3"]
+    layers: tuple[CutLayer, ...], points_mm: Float[np.ndarray, "n 3"]
 ) -> Bool[np.ndarray, " n"]:
     """Which points lie in the piece that the layers make up."""
     import shapely

@@ -53,7 +53,7 @@ class Located:
 
 
 @dataclass(frozen=True, eq=False)
-class Layer:
+class CutLayer:
     """A slab of what is to come away: this outline between two heights.
 
     ``rings_mm``: closed polygons (n, 2), x and y, the first point not repeated; several where the
@@ -119,7 +119,7 @@ class ResectionPlan:
     label: int
     grasp_mm: Float64[np.ndarray, " 3"]
     cuts: tuple[Cut, ...]
-    layers: tuple[Layer, ...]
+    layers: tuple[CutLayer, ...]
     margin_mm: float
     volumes_ml: dict[str, float]
     exophytic: float

@@ -17,7 +17,7 @@ import torch
 from jaxtyping import Float
 
 from tumortrack.core.types import Mesh
-from tumortrack.registration.network import POSE_OUTPUTS, WarpNetwork, facing_rotation
+from tumortrack.registration.network import POSE_OUTPUTS, RegistrationNetwork, facing_rotation
 
 UPRIGHT_MM = 55.0  # half the length of every organ in its upright frame
 FIELDS = 24  # second degree: 30 vector fields, less 6 of rigid motion
@@ -29,7 +29,7 @@ _ERROR_MM = 1.0  # to which the fields are matched by the modes
 
 
 @dataclass(frozen=True, eq=False)
-class Upright:
+class CanonicalFrame:
     """An organ's upright frame: x upright = ``scale`` * ``facing`` (x_ct - ``center_ct``)."""
 
     facing: Float[np.ndarray, "3 3"]
@@ -56,11 +56,11 @@ def upright_of(
     up_lps: tuple[float, float, float],
     center_ct: Float[np.ndarray, " 3"],
     long_axis: Float[np.ndarray, " 3"],
-) -> Upright:
+) -> CanonicalFrame:
     """The upright frame of an organ."""
     lower, upper = organ_ct.box_mm
     half_mm = float((upper - lower).max()) / 2
-    return Upright(facing_rotation(up_lps, long_axis), center_ct, UPRIGHT_MM / half_mm)
+    return CanonicalFrame(facing_rotation(up_lps, long_axis), center_ct, UPRIGHT_MM / half_mm)
 
 
 def generic_points(count: int) -> Float[np.ndarray, "p 3"]:
@@ -99,7 +99,7 @@ def _monomials(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "m 30"]:
     return fields.transpose(0, 2, 1).reshape(3 * len(x), -1)
 
 
-def know_any(network: WarpNetwork) -> None:
+def know_any(network: RegistrationNetwork) -> None:
     """Tell a network to be pretrained what it places: the points and fields of any organ."""
     points = generic_points(len(network.points))
     network.points.copy_(torch.as_tensor(points.astype(np.float32)))
@@ -107,7 +107,9 @@ def know_any(network: WarpNetwork) -> None:
 
 
 @torch.no_grad()
-def carry_over(network: WarpNetwork, weights: dict[str, torch.Tensor], upright: Upright) -> None:
+def carry_over(
+    network: RegistrationNetwork, weights: dict[str, torch.Tensor], upright: CanonicalFrame
+) -> None:
     """Start a network that knows its organ (``know``) from pretrained weights.
 
     Encoder, hidden layers and pose are taken as they are; each field becomes the state of the

@@ -6,7 +6,7 @@ from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError
 
 
-class WarpDecoderConfig(Config, frozen=True, tag="warp"):
+class RegistrationHeadConfig(Config, frozen=True, tag="warp"):
     """Two hidden layers of ``width``, then a rotation, a place, ``modes`` coefficients and whether
     the cloud lies the right way round. The loss compares the places of ``points`` points."""
 

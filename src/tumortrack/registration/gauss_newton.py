@@ -21,11 +21,11 @@ from jaxtyping import Float, Float64
 
 from tumortrack.core.config import Config
 from tumortrack.registration.gauss_newton_kernels import descend
-from tumortrack.registration.motion import WarpMotion
-from tumortrack.registration.rest_shape import Shape
+from tumortrack.registration.motion import ElasticMotion
+from tumortrack.registration.rest_shape import RestShape
 
 
-class RefineConfig(Config, frozen=True):
+class GaussNewtonConfig(Config, frozen=True):
     """``n_effective``: independent points that a cloud is worth: neighbours err alike.
 
     ``sigma_mm``: of a point that belongs to the organ, model errors included. ``first_mm`` and
@@ -45,41 +45,41 @@ class RefineConfig(Config, frozen=True):
 
 
 @dataclass(frozen=True, eq=False)
-class Refined:
+class RegistrationResult:
     """A motion, the squared error it minimises, and the distances left (signed, mm)."""
 
-    motion: WarpMotion
+    motion: ElasticMotion
     cost: float
     distances_mm: Float[np.ndarray, " n"]
     steps: int
 
 
 def refine(
-    shape: Shape,
+    shape: RestShape,
     points_mm: Float[np.ndarray, "n 3"],
-    start: WarpMotion,
-    config: RefineConfig,
-) -> Refined:
+    start: ElasticMotion,
+    config: GaussNewtonConfig,
+) -> RegistrationResult:
     """The motion near ``start`` that fits points (camera frame, mm) and the library best."""
-    descent = Descent(shape, points_mm, start, config)
+    descent = GaussNewton(shape, points_mm, start, config)
     descent.run(config.steps)
     return descent.refined()
 
 
-class Descent:
+class GaussNewton:
     """A refinement that can be stopped on its way and gone on with.
 
     Attributes:
-        cost: of where it is, as ``Refined`` has it; infinite before the first step.
+        cost: of where it is, as ``RegistrationResult`` has it; infinite before the first step.
         steps: gone so far; ``settled``: more would not move it.
     """
 
     def __init__(
         self,
-        shape: Shape,
+        shape: RestShape,
         points_mm: Float[np.ndarray, "n 3"],
-        start: WarpMotion,
-        config: RefineConfig,
+        start: ElasticMotion,
+        config: GaussNewtonConfig,
     ) -> None:
         body, field, count = shape.body, shape.distances[0], len(points_mm)
         self._shape, self._points = shape, np.ascontiguousarray(points_mm, np.float32)
@@ -106,16 +106,16 @@ class Descent:
         whole = self._organ, self._points, self._rules, self._state, self._left
         self.steps, self.settled, self.cost = descend(*whole, self.steps, steps)
 
-    def refined(self) -> Refined:
+    def refined(self) -> RegistrationResult:
         """Where it is."""
         distances_mm, curvature, _ = self._left
         rotation, centre_mm, coefficients, _ = (part.copy() for part in self._state)
         covariance = np.linalg.inv(curvature)
-        motion = WarpMotion(self._shape, rotation, centre_mm, coefficients, covariance)
-        return Refined(motion, self.cost, distances_mm.copy(), self.steps)
+        motion = ElasticMotion(self._shape, rotation, centre_mm, coefficients, covariance)
+        return RegistrationResult(motion, self.cost, distances_mm.copy(), self.steps)
 
 
-def _prior(shape: Shape, config: RefineConfig) -> Float64[np.ndarray, "p p"]:
+def _prior(shape: RestShape, config: GaussNewtonConfig) -> Float64[np.ndarray, "p p"]:
     modes = len(shape.body.mean)
     precision = np.zeros((6 + modes, 6 + modes))
     precision[:3, :3] = np.eye(3) / config.shift_mm**2

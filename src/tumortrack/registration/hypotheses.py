@@ -12,10 +12,10 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from tumortrack.core.parallel import share
-from tumortrack.registration.gauss_newton import Descent, RefineConfig, Refined
-from tumortrack.registration.motion import WarpMotion
-from tumortrack.registration.network import Placement, WarpNetwork
-from tumortrack.registration.rest_shape import Shape
+from tumortrack.registration.gauss_newton import GaussNewton, GaussNewtonConfig, RegistrationResult
+from tumortrack.registration.motion import ElasticMotion
+from tumortrack.registration.network import PoseHypothesis, RegistrationNetwork
+from tumortrack.registration.rest_shape import RestShape
 
 _SURE = 6.0  # logits: the other way round is not even tried
 _TURNS = 8  # of a start that does not fit
@@ -45,8 +45,8 @@ def _one_thread() -> Iterator[None]:
 
 @torch.no_grad()
 def first_motions(
-    network: WarpNetwork, shape: Shape, points_mm: Float[np.ndarray, "n 3"]
-) -> list[WarpMotion]:
+    network: RegistrationNetwork, shape: RestShape, points_mm: Float[np.ndarray, "n 3"]
+) -> list[ElasticMotion]:
     """What the network sees in a cloud (camera frame, mm), the likelier way round first; the other
     one only where it may be right."""
     device = next(network.parameters()).device
@@ -59,12 +59,12 @@ def first_motions(
 
 
 def best_fit(
-    shape: Shape,
+    shape: RestShape,
     points_mm: Float[np.ndarray, "n 3"],
-    starts: list[WarpMotion],
-    config: RefineConfig,
+    starts: list[ElasticMotion],
+    config: GaussNewtonConfig,
     usual_cost: float = math.inf,
-) -> Refined:
+) -> RegistrationResult:
     """The refined start of the least cost; where that is more than usual, also the likeliest start
     turned about the camera's axis, which repairs most starts that are wrong altogether."""
     fit = _best(shape, points_mm, starts, config)
@@ -72,25 +72,25 @@ def best_fit(
 
 
 def repaired(
-    shape: Shape,
+    shape: RestShape,
     points_mm: Float[np.ndarray, "n 3"],
-    start: WarpMotion,
-    config: RefineConfig,
-    fit: Refined,
-) -> Refined:
+    start: ElasticMotion,
+    config: GaussNewtonConfig,
+    fit: RegistrationResult,
+) -> RegistrationResult:
     """The best of a fit and those of a start turned about the camera's axis."""
     turned = _best(shape, points_mm, _turned(start), config)
     return min(fit, turned, key=lambda fit: fit.cost)
 
 
 def _best(
-    shape: Shape,
+    shape: RestShape,
     points_mm: Float[np.ndarray, "n 3"],
-    starts: list[WarpMotion],
-    config: RefineConfig,
-) -> Refined:
+    starts: list[ElasticMotion],
+    config: GaussNewtonConfig,
+) -> RegistrationResult:
     """The refined start of the least cost. All go some steps; then those go on that may win."""
-    left = [Descent(shape, points_mm, start, config) for start in starts]
+    left = [GaussNewton(shape, points_mm, start, config) for start in starts]
     for steps in (min(_HEAT, config.steps), config.steps):
         least = min(descent.cost for descent in left)
         left = [descent for descent in left if descent.cost <= _BEHIND * least]
@@ -98,7 +98,7 @@ def _best(
     return min(left, key=lambda descent: descent.cost).refined()
 
 
-def _all_run(descents: list[Descent], steps: int) -> None:
+def _all_run(descents: list[GaussNewton], steps: int) -> None:
     def run(part: slice) -> None:
         for descent in descents[part]:
             descent.run(steps)
@@ -106,16 +106,18 @@ def _all_run(descents: list[Descent], steps: int) -> None:
     share(run, len(descents), 1)
 
 
-def _turned(start: WarpMotion) -> list[WarpMotion]:
+def _turned(start: ElasticMotion) -> list[ElasticMotion]:
     """The undeformed organ in the same place, turned all around the camera's axis."""
     angles = np.arange(_TURNS) * 360 / _TURNS
     turns = Rotation.from_euler("z", angles[:, None], degrees=True).as_matrix()
     rest = start.shape.body.mean
-    return [WarpMotion(start.shape, turn @ start.rotation, start.centre_mm, rest) for turn in turns]
+    return [
+        ElasticMotion(start.shape, turn @ start.rotation, start.centre_mm, rest) for turn in turns
+    ]
 
 
-def _motion(way: Placement, shape: Shape) -> WarpMotion:
+def _motion(way: PoseHypothesis, shape: RestShape) -> ElasticMotion:
     rotation, centre, coefficients = (
         value[0].double().cpu().numpy() for value in (way.rotation, way.centre_mm, way.coefficients)
     )
-    return WarpMotion(shape, rotation, centre, coefficients)
+    return ElasticMotion(shape, rotation, centre, coefficients)

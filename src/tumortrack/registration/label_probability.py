@@ -34,7 +34,7 @@ def probabilities(margins, per_std, which, table):  # type: ignore[no-untyped-de
 
 
 @dataclass(frozen=True, eq=False)
-class Nearest:
+class NearestLookup:
     """Which of some places is nearest, for every place in a box: that of the nearest node of a
     lattice, which may be another one where two are about as near."""
 
@@ -42,7 +42,7 @@ class Nearest:
     nearest: Int32[np.ndarray, "i j k"]
 
     @classmethod
-    def of(cls, places_mm: Float[np.ndarray, "k 3"]) -> Nearest:
+    def of(cls, places_mm: Float[np.ndarray, "k 3"]) -> NearestLookup:
         """Over the places' box and a node beyond; what is farther out counts as on its border."""
         from scipy.spatial import cKDTree
 

@@ -15,11 +15,11 @@ from tumortrack.imaging.raster import label_grid
 from tumortrack.models.in_distribution import check_familiar, check_likely, fit_mm, spread_mm
 from tumortrack.models.report import fit_report, report_head, stage
 from tumortrack.models.volume import describe_parts, grid_over
-from tumortrack.registration.gauss_newton import Refined, refine
+from tumortrack.registration.gauss_newton import RegistrationResult, refine
 from tumortrack.registration.hypotheses import best_fit, first_motions
-from tumortrack.registration.label_probability import Nearest, normal_table, probabilities
-from tumortrack.registration.motion import WarpMotion, blend
-from tumortrack.registration.network import WarpNetwork
+from tumortrack.registration.label_probability import NearestLookup, normal_table, probabilities
+from tumortrack.registration.motion import ElasticMotion, blend
+from tumortrack.registration.network import RegistrationNetwork
 from tumortrack.sense.cloud import check_cloud, thin_cloud
 from tumortrack.training.model import Model
 
@@ -47,18 +47,18 @@ class _Placed:
     """A fit that can be this organ's: its motion, the surfaces that it moves (camera frame), and
     one standard deviation (mm) at the known places and at the middle of each part's box."""
 
-    fit: Refined
-    motion: WarpMotion
+    fit: RegistrationResult
+    motion: ElasticMotion
     meshes: dict[str, Mesh]
     known_std_mm: Float[np.ndarray, " k"]
     middles_std_mm: Float[np.ndarray, " parts"]
 
 
-class WarpLocator:
+class RegistrationLocator:
     """Locates by a warp network and its refinement; its estimates have a motion."""
 
     def __init__(self, model: Model) -> None:
-        assert isinstance(model.network, WarpNetwork)
+        assert isinstance(model.network, RegistrationNetwork)
         assert model.shape is not None
         assert model.trust is not None
         self._model, self._network, self._shape = model, model.network, model.shape
@@ -73,7 +73,7 @@ class WarpLocator:
         self._known_ct = np.concatenate(
             [organ.vertices_mm[::few], *(v[:: max(1, len(v) // 64)] for v in inner)]
         )
-        self._nearest_known = Nearest.of(self._known_ct)
+        self._nearest_known = NearestLookup.of(self._known_ct)
         self._middles_ct = np.array([part.box_mm.mean(0) for part in anatomy.parts])
         vertices = np.concatenate([part.vertices_mm for part in anatomy.parts])
         self._vertices_ct = vertices.astype(np.float32)
@@ -111,7 +111,7 @@ class WarpLocator:
         points = self._thinned(cloud, rng)
         start = last.unsmoothed if last is not None else None
         usual, fits = self._trust.usual_cost, []
-        if isinstance(start, WarpMotion):
+        if isinstance(start, ElasticMotion):
             with stage(seconds, "follow", self._device):
                 fits.append(refine(self._shape, points, start, self._near))
         if not fits or how.thorough or fits[0].cost > usual:
@@ -123,7 +123,7 @@ class WarpLocator:
                 fits.append(best_fit(self._shape, points, starts, config, enough))
         fit = min(fits, key=lambda fit: fit.cost)
         unsmoothed, lag_s = fit.motion, 0.0
-        if last is not None and isinstance(last.motion, WarpMotion) and how.smoothing_s > 0:
+        if last is not None and isinstance(last.motion, ElasticMotion) and how.smoothing_s > 0:
             past_s = (cloud.stamp_ns - last.cloud.stamp_ns) * 1e-9
             share = -math.expm1(-past_s / how.smoothing_s)
             smooth = blend(last.motion, unsmoothed, share)
@@ -140,7 +140,7 @@ class WarpLocator:
 
     def warm(self) -> None:
         """See ``tracking.tracker.Tracker.warm``."""
-        rest = WarpMotion(
+        rest = ElasticMotion(
             self._shape, np.eye(3), np.array([0.0, 0.0, 150.0]), self._shape.body.mean
         )
         cloud = SensorCloud(rest.carry(self._shape.anatomy_ct.organ.vertices_mm))
@@ -154,7 +154,7 @@ class WarpLocator:
         return thin_cloud(cloud, self._model.config.scene.cloud.n_points, rng).points_mm
 
     def _placed(
-        self, points: Float32[np.ndarray, "n 3"], fit: Refined, seconds: dict[str, float]
+        self, points: Float32[np.ndarray, "n 3"], fit: RegistrationResult, seconds: dict[str, float]
     ) -> _Placed:
         """What a fit says, if it can be this organ's."""
         check_familiar(self._model.familiar, spread_mm(points), fit_mm(np.abs(fit.distances_mm)))
@@ -162,7 +162,7 @@ class WarpLocator:
         with stage(seconds, "surfaces", self._device):
             return self._moved(fit)
 
-    def _moved(self, fit: Refined) -> _Placed:
+    def _moved(self, fit: RegistrationResult) -> _Placed:
         motion = replace(fit.motion, std_scale=self._trust.std_scale)
         anatomy = self._shape.anatomy_ct
         moved = motion.carry(self._vertices_ct)

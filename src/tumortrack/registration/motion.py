@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from tumortrack.core.parallel import share
 from tumortrack.registration import residual_kernels as kernels
-from tumortrack.registration.rest_shape import Shape
+from tumortrack.registration.rest_shape import RestShape
 from tumortrack.simulate.elastic.flow import steps_for
 
 Flow = tuple[tuple[np.ndarray, np.ndarray, np.floating], int]  # lattice and steps of the kernels
@@ -22,7 +22,7 @@ _FEW = 64  # as well, where each takes longer
 
 
 @dataclass(frozen=True, eq=False)
-class WarpMotion:
+class ElasticMotion:
     """``core.motion.Motion`` of a shape: x -> rotation (flow(x) - center_ct) + centre_mm.
 
     Attributes:
@@ -34,7 +34,7 @@ class WarpMotion:
             scenes.
     """
 
-    shape: Shape
+    shape: RestShape
     rotation: Float64[np.ndarray, "3 3"]
     centre_mm: Float64[np.ndarray, " 3"]
     coefficients: Float64[np.ndarray, " m"]
@@ -101,7 +101,7 @@ class WarpMotion:
         return np.linalg.cholesky(self.covariance).astype(np.float32)
 
 
-def blend(a: WarpMotion, b: WarpMotion, share: float) -> WarpMotion:
+def blend(a: ElasticMotion, b: ElasticMotion, share: float) -> ElasticMotion:
     """Between two motions of one shape: ``share`` 0 is at ``a``, 1 at ``b``, whose covariance it
     keeps."""
     turn = Rotation.from_matrix(a.rotation.T @ b.rotation).as_rotvec()

@@ -21,8 +21,8 @@ from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import rotation_onto
 from tumortrack.models.layers import Layer
 from tumortrack.occupancy.network import Aligned, NetworkConfig, alignment, turned, without_strays
-from tumortrack.registration.config import WarpDecoderConfig
-from tumortrack.registration.rest_shape import Shape
+from tumortrack.registration.config import RegistrationHeadConfig
+from tumortrack.registration.rest_shape import RestShape
 
 _LARGEST = 4.0  # coefficients lie within so many standard deviations of the library's mean
 _SMALL_START = 0.3  # of the last layer's weights
@@ -36,24 +36,24 @@ _WRONG_SHARE = 4  # one cloud in so many is shown the wrong way round as well
 
 
 @dataclass(frozen=True, eq=False)
-class Aside:
+class AlignedCloud:
     """A batch of clouds in the network's frame: centred, scaled, turned."""
 
     points: Tensor  # (B, N, 3)
     centre_mm: Tensor  # (B, 3), camera frame
     turn: Tensor  # (2, B, 1): cosine and sine of the turn about z
 
-    def other_way(self, sign: Tensor) -> Aside:
+    def other_way(self, sign: Tensor) -> AlignedCloud:
         """Half a turn about z where ``sign`` (B,) is -1."""
         flip = torch.stack([sign, sign, torch.ones_like(sign)], -1)[:, None]
-        return Aside(self.points * flip, self.centre_mm, self.turn * sign[None, :, None])
+        return AlignedCloud(self.points * flip, self.centre_mm, self.turn * sign[None, :, None])
 
-    def __getitem__(self, rows: slice) -> Aside:
-        return Aside(self.points[rows], self.centre_mm[rows], self.turn[:, rows])
+    def __getitem__(self, rows: slice) -> AlignedCloud:
+        return AlignedCloud(self.points[rows], self.centre_mm[rows], self.turn[:, rows])
 
 
 @dataclass(frozen=True, eq=False)
-class Placement:
+class PoseHypothesis:
     """Where organs lie and how they are deformed: rotation and centre (camera frame, mm), so that
     a point x of the CT, deformed to y, lies at ``rotation (y - center_ct) + centre_mm``."""
 
@@ -62,13 +62,13 @@ class Placement:
     coefficients: Tensor  # (B, M)
     right_way: Tensor  # (B,), logit
 
-    def __getitem__(self, rows: slice) -> Placement:
-        return Placement(
+    def __getitem__(self, rows: slice) -> PoseHypothesis:
+        return PoseHypothesis(
             self.rotation[rows], self.centre_mm[rows], self.coefficients[rows], self.right_way[rows]
         )
 
 
-class WarpNetwork(nn.Module):
+class RegistrationNetwork(nn.Module):
     """Clouds -> placements; the buffers that name the organ are set by ``know``."""
 
     center_ct: Tensor
@@ -81,7 +81,7 @@ class WarpNetwork(nn.Module):
 
     def __init__(self, config: NetworkConfig) -> None:
         super().__init__()
-        if not isinstance(config.decoder, WarpDecoderConfig) or not isinstance(
+        if not isinstance(config.decoder, RegistrationHeadConfig) or not isinstance(
             config.normalisation, Aligned
         ):
             raise InputError("a warp network needs the warp decoder and aligned clouds.")
@@ -107,7 +107,7 @@ class WarpNetwork(nn.Module):
 
     def know(
         self,
-        shape: Shape,
+        shape: RestShape,
         up_lps: tuple[float, float, float],
         points_ct: Float[np.ndarray, "p 3"],
     ) -> None:
@@ -127,27 +127,27 @@ class WarpNetwork(nn.Module):
         for name, value in known.items():
             getattr(self, name).copy_(torch.as_tensor(np.array(value, np.float32)))
 
-    def aside(self, points_mm: Tensor) -> Aside:
+    def aside(self, points_mm: Tensor) -> AlignedCloud:
         """Clouds (B, N, 3), camera frame, mm, in the network's frame."""
         near = without_strays(points_mm, self.reach * self.scale_mm)
         centre_mm = near.mean(dim=1, keepdim=True)
         points = (near - centre_mm) / self.scale_mm
         turn = alignment(points)
-        return Aside(turned(points, turn), centre_mm[:, 0], turn)
+        return AlignedCloud(turned(points, turn), centre_mm[:, 0], turn)
 
-    def right_sign(self, aside: Aside, rotation: Tensor) -> Tensor:
+    def right_sign(self, aside: AlignedCloud, rotation: Tensor) -> Tensor:
         """+1 where the organ's long axis points to +x in the network's frame, else -1; (B,)."""
         axis = rotation @ self.long_axis
         along = axis[:, 0] * aside.turn[0, :, 0] + axis[:, 1] * aside.turn[1, :, 0]
         return torch.where(along >= 0, 1.0, -1.0)
 
-    def forward(self, aside: Aside) -> Placement:
+    def forward(self, aside: AlignedCloud) -> PoseHypothesis:
         """What is seen, if the clouds lie the right way round."""
         out = self.output(self.hidden(self.encoder(aside.points)))
         with torch.autocast(out.device.type, enabled=False):  # bf16 would round to 0.2 mm
             return self._placement(out.float(), aside)
 
-    def _placement(self, out: Tensor, aside: Aside) -> Placement:
+    def _placement(self, out: Tensor, aside: AlignedCloud) -> PoseHypothesis:
         first = functional.normalize(out[:, :3] + out.new_tensor([1.0, 0.0, 0.0]), dim=1)
         second = out[:, 3:6] + out.new_tensor([0.0, 1.0, 0.0])
         second = second - (first * second).sum(1, keepdim=True) * first
@@ -158,7 +158,7 @@ class WarpNetwork(nn.Module):
         place = (out[:, 6:9] * _STEP + out.new_tensor([0.0, 0.0, _BEHIND])) * self.scale_mm
         centre_mm = aside.centre_mm + (back @ place[..., None])[..., 0]
         bounded = _LARGEST * torch.tanh(out[:, POSE_OUTPUTS:] / _LARGEST)
-        return Placement(rotation, centre_mm, self.mean + self.std * bounded, out[:, 9])
+        return PoseHypothesis(rotation, centre_mm, self.mean + self.std * bounded, out[:, 9])
 
     def loss(
         self,
@@ -191,7 +191,7 @@ class WarpNetwork(nn.Module):
             told = functional.softplus(-placed.right_way).mean() + told_wrong
             return error + _RIGID_SHARE * rigid_error + _WAY_SHARE * told
 
-    def _told_wrong(self, wrong: Aside, first: int) -> Tensor:
+    def _told_wrong(self, wrong: AlignedCloud, first: int) -> Tensor:
         """How well the wrong way round is told, by some of the clouds: the same ones in every
         sharing of the batch, so that a small share may have none."""
         few = wrong[slice(-first % _WRONG_SHARE, None, _WRONG_SHARE)]
@@ -200,13 +200,13 @@ class WarpNetwork(nn.Module):
         told = functional.softplus(self(few).right_way).sum()
         return told / (len(wrong.points) / _WRONG_SHARE)
 
-    def both_ways(self, points_mm: Tensor) -> tuple[Placement, Placement]:
+    def both_ways(self, points_mm: Tensor) -> tuple[PoseHypothesis, PoseHypothesis]:
         """Placements for the clouds as they were turned, and for half a turn more."""
         one = self.aside(points_mm)
         other = one.other_way(-torch.ones_like(one.centre_mm[:, 0]))
         # One batch: a network this small takes as long for two clouds as for one.
         both = self(
-            Aside(
+            AlignedCloud(
                 torch.cat([one.points, other.points]),
                 torch.cat([one.centre_mm, other.centre_mm]),
                 torch.cat([one.turn, other.turn], 1),

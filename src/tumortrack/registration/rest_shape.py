@@ -12,7 +12,7 @@ from jaxtyping import Float32, Float64, UInt8
 from tumortrack.core.errors import InputError
 from tumortrack.core.parallel import share
 from tumortrack.core.types import Anatomy, Mesh
-from tumortrack.simulate.elastic.body import Body
+from tumortrack.simulate.elastic.body import ElasticBody
 from tumortrack.simulate.occupancy import contains, surface_distance
 
 _STEPS = 40  # of a distance field, along the part's longest side
@@ -23,7 +23,7 @@ _BODY = "body."
 
 
 @dataclass(frozen=True, eq=False)
-class Distance:
+class DistanceField:
     """Signed distance to one closed surface (mm, negative inside) on a lattice, CT frame."""
 
     origin_mm: Float32[np.ndarray, " 3"]
@@ -42,7 +42,7 @@ class Distance:
         return _distance(self.values_mm, self.origin_mm, spacing, points_ct)
 
 
-def distance_of(mesh: Mesh) -> Distance:
+def distance_of(mesh: Mesh) -> DistanceField:
     """Distances to a closed surface, right to a tenth of a millimetre near it."""
     lower, upper = mesh.box_mm
     step = float(np.clip((upper - lower).max() / _STEPS, _FINEST_MM, _COARSEST_MM))
@@ -54,16 +54,16 @@ def distance_of(mesh: Mesh) -> Distance:
     inside = np.zeros(len(nodes), bool)
     inside[near] = contains(mesh, nodes[near])
     values = np.where(inside, -distance, distance).reshape(tuple(shape))
-    return Distance(origin.astype(np.float32), step, values)
+    return DistanceField(origin.astype(np.float32), step, values)
 
 
 @dataclass(frozen=True, eq=False)
-class Shape:
+class RestShape:
     """The organ at rest (CT frame, LPS mm): ``distances`` has one field per part."""
 
     anatomy_ct: Anatomy
-    body: Body
-    distances: tuple[Distance, ...]
+    body: ElasticBody
+    distances: tuple[DistanceField, ...]
 
     @cached_property
     def long_axis(self) -> Float64[np.ndarray, " 3"]:
@@ -101,7 +101,7 @@ class Shape:
         return arrays
 
     @classmethod
-    def from_arrays(cls, arrays: dict[str, np.ndarray], n_parts: int) -> Shape:
+    def from_arrays(cls, arrays: dict[str, np.ndarray], n_parts: int) -> RestShape:
         """The inverse of ``to_arrays``.
 
         Raises:
@@ -113,7 +113,7 @@ class Shape:
             for n in range(n_parts):
                 parts.append(Mesh(arrays[f"{n}.vertices_mm"], arrays[f"{n}.faces"]))
                 fields.append(
-                    Distance(
+                    DistanceField(
                         np.asarray(arrays[f"{n}.origin_mm"], np.float32),
                         float(arrays[f"{n}.spacing_mm"]),
                         np.ascontiguousarray(arrays[f"{n}.values_mm"], np.float32),
@@ -121,7 +121,7 @@ class Shape:
                 )
         except KeyError as error:
             raise InputError(f"the organ's shape lacks {error}; train the model again.") from error
-        return cls(Anatomy(tuple(parts)), Body.from_arrays(body), tuple(fields))
+        return cls(Anatomy(tuple(parts)), ElasticBody.from_arrays(body), tuple(fields))
 
 
 def long_axis_of(organ: Mesh) -> Float64[np.ndarray, " 3"]:
@@ -132,9 +132,9 @@ def long_axis_of(organ: Mesh) -> Float64[np.ndarray, " 3"]:
     return axis if ((spread @ axis) ** 3).sum() >= 0 else -axis
 
 
-def shape_of(anatomy_ct: Anatomy, body: Body) -> Shape:
+def shape_of(anatomy_ct: Anatomy, body: ElasticBody) -> RestShape:
     """The shape of an anatomy with its body; seconds."""
-    return Shape(anatomy_ct, body, tuple(distance_of(part) for part in anatomy_ct.parts))
+    return RestShape(anatomy_ct, body, tuple(distance_of(part) for part in anatomy_ct.parts))
 
 
 @numba.njit(cache=True, fastmath=True, nogil=True)

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float
 from tumortrack.core.store import write_atomically
 from tumortrack.core.types import Mesh
 from tumortrack.imaging.raster import voxelise
-from tumortrack.report.shade import Frame, View, pixel_centres
+from tumortrack.report.shade import Frame, ShadedView, pixel_centres
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -47,7 +47,7 @@ def save(figure: Figure, path: Path) -> None:
 
 
 def section(
-    mesh: Mesh, view: View, through_mm: Float[np.ndarray, " 3"]
+    mesh: Mesh, view: ShadedView, through_mm: Float[np.ndarray, " 3"]
 ) -> Float[np.ndarray, "n 2 2"]:
     """Outline of a mesh in the view's plane through a point: segments as (right, down) mm."""
     flat = view.project(mesh.vertices_mm)
@@ -122,7 +122,7 @@ def blank(axes: Axes, frame: Frame, background: str = "white") -> None:
 
 
 def section_mask(
-    mesh: Mesh, view: View, frame: Frame, through_mm: Float[np.ndarray, " 3"]
+    mesh: Mesh, view: ShadedView, frame: Frame, through_mm: Float[np.ndarray, " 3"]
 ) -> Bool[np.ndarray, "h w"]:
     """Pixels of a frame that lie inside a closed mesh, in the view's plane through a point."""
     x, y = pixel_centres(frame)

@@ -19,11 +19,11 @@ from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.store import write_atomically
 from tumortrack.core.types import Mesh
-from tumortrack.live.values import Line, Workcell
+from tumortrack.live.values import Polyline, Workcell
 from tumortrack.plan.motions import Motions
 from tumortrack.plan.values import Located
 from tumortrack.report.organ_surfaces import organ_surfaces
-from tumortrack.report.painter import Body, Eye, paint, tube
+from tumortrack.report.painter import Eye, PaintedBody, paint, tube
 
 if TYPE_CHECKING:
     from PIL import Image, ImageDraw, ImageFont
@@ -134,7 +134,9 @@ class _Stage:
     def __init__(self, frames: list[Workcell], located: Located, size: tuple[int, int]) -> None:
         self._frames, self._size = frames, size
         self._organ = [
-            Body(mesh, part_colour(label), None, _ORGAN_OPACITY if label == 1 else 1.0, False)
+            PaintedBody(
+                mesh, part_colour(label), None, _ORGAN_OPACITY if label == 1 else 1.0, False
+            )
             for label, mesh in sorted(organ_surfaces(located).items())
         ]
         self._close_size = round(_CLOSE[0] * size[0]), round(_CLOSE[1] * size[1])
@@ -143,7 +145,7 @@ class _Stage:
         flat = self._far.project(self._organ[0].mesh.vertices_mm, size)[:, :2]
         self._spot = (*(flat.min(0) - 4).round().tolist(), *(flat.max(0) + 4).round().tolist())
         self._letters = _letters(size[1] // 20), _letters(size[1] // 34)
-        self._tubes: dict[tuple[int, float], tuple[Line, Mesh]] = {}
+        self._tubes: dict[tuple[int, float], tuple[Polyline, Mesh]] = {}
 
     def picture(self, n: int) -> Image.Image:
         """Frame n, in full colour."""
@@ -164,17 +166,18 @@ class _Stage:
     def _seen(self, cell: Workcell, eye: Eye, size: tuple[int, int]) -> UInt8[np.ndarray, "h w 3"]:
         shaded = eye is self._far  # the arms' shadows would darken the close-up
         shapes = [
-            Body(s.mesh, s.colour, s.published_from_shape, s.opacity, shaded) for s in cell.shapes
+            PaintedBody(s.mesh, s.colour, s.published_from_shape, s.opacity, shaded)
+            for s in cell.shapes
         ]
         least_mm = _LEAST_PIXELS * eye.width_mm / size[0]
         lines = [
-            Body(self._tube(line, max(line.width_mm, least_mm)), line.colour, shaded=False)
+            PaintedBody(self._tube(line, max(line.width_mm, least_mm)), line.colour, shaded=False)
             for line in cell.lines
             if len(line.points_mm) > 1
         ]
         return paint(shapes + lines + self._organ, eye, size)
 
-    def _tube(self, line: Line, width_mm: float) -> Mesh:
+    def _tube(self, line: Polyline, width_mm: float) -> Mesh:
         key = id(line.points_mm), width_mm  # the line is kept, so its points' id stays theirs
         if key not in self._tubes:
             self._tubes[key] = line, tube(line.points_mm, width_mm / 2)

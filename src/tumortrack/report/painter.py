@@ -28,7 +28,7 @@ Colour = tuple[int, int, int]
 
 
 @dataclass(frozen=True, eq=False)
-class Body:
+class PaintedBody:
     """A surface somewhere in the world; colour in 0..255.
 
     ``opacity``: where seen face on; edges are denser. ``shaded``: whether other bodies cast
@@ -112,7 +112,7 @@ class _Shadow(NamedTuple):
 
 
 def paint(
-    bodies: list[Body], eye: Eye, size: tuple[int, int], backdrop: Colour = (238, 241, 244)
+    bodies: list[PaintedBody], eye: Eye, size: tuple[int, int], backdrop: Colour = (238, 241, 244)
 ) -> UInt8[np.ndarray, "h w 3"]:
     """The bodies as the eye sees them; ``size`` is width and height in pixels."""
     width, height = (_SHARPER * n for n in size)
@@ -127,8 +127,8 @@ def paint(
     return shrunk(picture, _SHARPER)
 
 
-def _far_first(bodies: list[Body], eye: Eye) -> list[Body]:
-    def distance(body: Body) -> float:
+def _far_first(bodies: list[PaintedBody], eye: Eye) -> list[PaintedBody]:
+    def distance(body: PaintedBody) -> float:
         middle = body.mesh.box_mm.mean(0)[None]
         if body.world_from_mesh is not None:
             middle = transform_points(body.world_from_mesh, middle)
@@ -137,7 +137,7 @@ def _far_first(bodies: list[Body], eye: Eye) -> list[Body]:
     return sorted(bodies, key=distance)
 
 
-def _join(bodies: list[Body]) -> _Triangles:
+def _join(bodies: list[PaintedBody]) -> _Triangles:
     places, faces, normals, count = [np.zeros((0, 3))], [np.zeros((0, 3), int)], [], 0
     for body in bodies:
         vertices, normal = body.mesh.vertices_mm, corner_normals(body.mesh)

@@ -30,8 +30,8 @@ from tumortrack.report.drawing import (
 )
 from tumortrack.report.qc import qc_picture
 from tumortrack.report.shade import (
-    Layer,
-    View,
+    ShadedLayer,
+    ShadedView,
     frame_around,
     pixel_centres,
     shade,
@@ -45,8 +45,8 @@ if TYPE_CHECKING:
 
 __all__ = ["qc_picture", "scene_picture"]
 
-FROM_CAMERA = View("seen from the camera", (1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
-FROM_SIDE = View("seen from the side, camera above", (1.0, 0.0, 0.0), (0.0, 0.0, 1.0))
+FROM_CAMERA = ShadedView("seen from the camera", (1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
+FROM_SIDE = ShadedView("seen from the side, camera above", (1.0, 0.0, 0.0), (0.0, 0.0, 1.0))
 _CAMERA_AXES = {
     FROM_CAMERA: {"x": (1.0, 0.0), "y": (0.0, 1.0)},
     FROM_SIDE: {"x": (1.0, 0.0), "z": (0.0, 1.0)},
@@ -90,16 +90,16 @@ def scene_picture(scene: Scene, estimate: Estimate | None, entry: dict, path: Pa
     save(figure, path)
 
 
-def _solid_view(axes: Axes, scene: Scene, estimate: Estimate | None, view: View) -> None:
+def _solid_view(axes: Axes, scene: Scene, estimate: Estimate | None, view: ShadedView) -> None:
     shown = estimate.meshes if estimate else {}
     everything = [*scene.reference.parts, *shown.values()]
     points_mm = scene.cloud.points_mm.astype(float)
     frame = widened(
         frame_around(view, np.concatenate([m.vertices_mm for m in everything]), 6.0), 1.7
     )
-    layers = [Layer(mesh, ESTIMATED) for name, mesh in shown.items() if name != "kidney"]
+    layers = [ShadedLayer(mesh, ESTIMATED) for name, mesh in shown.items() if name != "kidney"]
     if "kidney" in shown:
-        layers.append(Layer(shown["kidney"], KIDNEY, 0.36))
+        layers.append(ShadedLayer(shown["kidney"], KIDNEY, 0.36))
     axes.imshow(shade(layers, view, frame), extent=frame.extent, zorder=2, interpolation="bilinear")
     flat = view.project(points_mm)
     axes.scatter(flat[:, 0], flat[:, 1], s=2.5, color=OBSERVED, alpha=0.55, linewidths=0, zorder=3)
@@ -117,7 +117,9 @@ def _solid_view(axes: Axes, scene: Scene, estimate: Estimate | None, view: View)
     axes.set_title(view.name, fontsize=11)
 
 
-def _slice_view(axes: Axes, scene: Scene, estimate: Estimate | None, name: str, view: View) -> None:
+def _slice_view(
+    axes: Axes, scene: Scene, estimate: Estimate | None, name: str, view: ShadedView
+) -> None:
     truth = dict(zip(scene.reference.names, scene.reference.parts, strict=True))
     shown = estimate.meshes if estimate else {}
     through_mm = truth[name].box_mm.mean(0)
@@ -138,7 +140,7 @@ def _slice_view(axes: Axes, scene: Scene, estimate: Estimate | None, name: str, 
     axis_arrows(axes, frame, _CAMERA_AXES[view])
 
 
-def _slice_name(view: View) -> str:
+def _slice_name(view: ShadedView) -> str:
     return "across the view" if view is FROM_CAMERA else "along the view"
 
 

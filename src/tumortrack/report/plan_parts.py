@@ -8,12 +8,12 @@ from jaxtyping import Bool
 from tumortrack.core.solids import mesh_of, solid_of
 from tumortrack.core.types import Mesh
 from tumortrack.imaging.raster import voxelise
-from tumortrack.plan.values import Cut, Layer
+from tumortrack.plan.values import Cut, CutLayer
 
 _INSIDE_MM = 1.0  # cells in which a stroke is said to be in the organ
 
 
-def parted(organ: Mesh, layers: tuple[Layer, ...]) -> tuple[Mesh, Mesh]:
+def parted(organ: Mesh, layers: tuple[CutLayer, ...]) -> tuple[Mesh, Mesh]:
     """The piece that comes away, and what stays."""
     import manifold3d
 

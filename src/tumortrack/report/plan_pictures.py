@@ -18,8 +18,8 @@ from tumortrack.report.organ_surfaces import organ_surfaces
 from tumortrack.report.plan_parts import parted, within
 from tumortrack.report.shade import (
     Frame,
-    Layer,
-    View,
+    ShadedLayer,
+    ShadedView,
     depth_of,
     frame_around,
     pixel_centres,
@@ -32,8 +32,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-FROM_ABOVE = View("from above", (1.0, 0.0, 0.0), (0.0, -1.0, 0.0))
-FROM_SIDE = View("from the side", (1.0, 0.0, 0.0), (0.0, 0.0, -1.0))
+FROM_ABOVE = ShadedView("from above", (1.0, 0.0, 0.0), (0.0, -1.0, 0.0))
+FROM_SIDE = ShadedView("from the side", (1.0, 0.0, 0.0), (0.0, 0.0, -1.0))
 _ARROWS = {
     FROM_ABOVE: {"x": (1.0, 0.0), "y": (0.0, -1.0)},
     FROM_SIDE: {"x": (1.0, 0.0), "z": (0.0, -1.0)},
@@ -102,11 +102,11 @@ def plan_figure(plan: ResectionPlan, located: Located) -> Figure:
 
 
 def _draw_bodies(
-    axes: Axes, view: View, frame: Frame, tumors: dict[int, Mesh], piece: Mesh, rest: Mesh
+    axes: Axes, view: ShadedView, frame: Frame, tumors: dict[int, Mesh], piece: Mesh, rest: Mesh
 ) -> None:
-    parts = [Layer(mesh, _unit(part_colour(label))) for label, mesh in tumors.items()]
-    parts.append(Layer(rest, _unit(part_colour(ORGAN)), _ORGAN_OPACITY))
-    parts.append(Layer(piece, _PIECE, _PIECE_OPACITY))
+    parts = [ShadedLayer(mesh, _unit(part_colour(label))) for label, mesh in tumors.items()]
+    parts.append(ShadedLayer(rest, _unit(part_colour(ORGAN)), _ORGAN_OPACITY))
+    parts.append(ShadedLayer(piece, _PIECE, _PIECE_OPACITY))
     axes.imshow(shade(parts, view, frame), extent=frame.extent, interpolation="bilinear")
     if len(piece.faces):
         x, y = np.meshgrid(*pixel_centres(frame))
@@ -119,14 +119,14 @@ def _unit(colour: Colour) -> tuple[float, float, float]:
     return red, green, blue
 
 
-def _frame(view: View, surfaces: dict[int, Mesh], plan: ResectionPlan) -> Frame:
+def _frame(view: ShadedView, surfaces: dict[int, Mesh], plan: ResectionPlan) -> Frame:
     reach = plan.grasp_mm + np.array([0.0, 0.0, _APPROACH_MM])
     points = [surfaces[ORGAN].vertices_mm, *(cut.path_mm for cut in plan.cuts), reach[None]]
     return widened(frame_around(view, np.concatenate(points), 7.0), _ASPECT)
 
 
 def _behind(
-    cut: Cut, depth: Float[np.ndarray, "h w"], view: View, frame: Frame
+    cut: Cut, depth: Float[np.ndarray, "h w"], view: ShadedView, frame: Frame
 ) -> Bool[np.ndarray, " n"]:
     """Which points of a stroke are hidden by what lies at that depth."""
     x, y = pixel_centres(frame)
@@ -141,7 +141,7 @@ def _draw_cuts(
     plan: ResectionPlan,
     in_organ: list[Bool[np.ndarray, " _"]],
     hidden: list[Bool[np.ndarray, " _"]],
-    view: View,
+    view: ShadedView,
 ) -> None:
     """The lowest first and, from above, widest, so that strokes above each other all show; what
     lies behind a tumor is faint."""
@@ -192,7 +192,7 @@ def _draw_arrows(
         )
 
 
-def _draw_numbers(axes: Axes, plan: ResectionPlan, view: View, frame: Frame) -> None:
+def _draw_numbers(axes: Axes, plan: ResectionPlan, view: ShadedView, frame: Frame) -> None:
     """Where sweeps start, seen from above; beside the picture, at their heights, from the side.
     The first and the last, and those between with room."""
     first = {cut.sweep: cut for cut in reversed(plan.cuts)}
@@ -216,7 +216,7 @@ def _draw_numbers(axes: Axes, plan: ResectionPlan, view: View, frame: Frame) -> 
         )  # fmt: skip
 
 
-def _draw_grasp(axes: Axes, plan: ResectionPlan, view: View) -> None:
+def _draw_grasp(axes: Axes, plan: ResectionPlan, view: ShadedView) -> None:
     """The cup, and from the side the way it comes."""
     u, v, _ = view.project(plan.grasp_mm[None])[0]
     if view is FROM_ABOVE:

@@ -22,8 +22,8 @@ from tumortrack.report.drawing import (
 )
 from tumortrack.report.shade import (
     Frame,
-    Layer,
-    View,
+    ShadedLayer,
+    ShadedView,
     frame_around,
     pixel_centres,
     shade,
@@ -42,10 +42,10 @@ _MOST_ROWS = 6  # tumors with slices of their own
 
 
 @dataclass(frozen=True)
-class Plane:
+class QcPlane:
     """One of the three slices: its view in LPS, and the letters at its borders."""
 
-    view: View
+    view: ShadedView
 
     @property
     def letters(self) -> dict[str, str]:
@@ -59,16 +59,16 @@ class Plane:
 # Radiological convention: the patient's right is on the picture's left (axial seen from the feet,
 # coronal from the front); sagittal with anterior on the left.
 PLANES = (
-    Plane(View("axial", (1.0, 0.0, 0.0), (0.0, 1.0, 0.0))),
-    Plane(View("coronal", (1.0, 0.0, 0.0), (0.0, 0.0, -1.0))),
-    Plane(View("sagittal", (0.0, 1.0, 0.0), (0.0, 0.0, -1.0))),
+    QcPlane(ShadedView("axial", (1.0, 0.0, 0.0), (0.0, 1.0, 0.0))),
+    QcPlane(ShadedView("coronal", (1.0, 0.0, 0.0), (0.0, 0.0, -1.0))),
+    QcPlane(ShadedView("sagittal", (0.0, 1.0, 0.0), (0.0, 0.0, -1.0))),
 )
 
 
 def slice_volume(
     array: Shaped[np.ndarray, "i j k"],
     lps_from_index: Float[np.ndarray, "4 4"],
-    view: View,
+    view: ShadedView,
     frame: Frame,
     through_mm: Float[np.ndarray, " 3"],
 ) -> Float[np.ndarray, "h w"]:
@@ -141,7 +141,7 @@ def _qc_slice(
     axes: Axes,
     background: tuple[Volume | LabelVolume, tuple[float, float]],
     anatomy: Anatomy,
-    plane: Plane,
+    plane: QcPlane,
     through_mm: Float[np.ndarray, " 3"],
 ) -> None:
     frame = _same_scale(plane, anatomy)
@@ -164,8 +164,8 @@ def _qc_slice(
 def _qc_solid(axes: Axes, anatomy: Anatomy) -> None:
     plane = PLANES[1]
     frame = widened(frame_around(plane.view, anatomy.organ.vertices_mm, 8.0), 1.22)
-    layers = [Layer(tumor, tumor_color(n)) for n, tumor in enumerate(anatomy.tumors)]
-    layers.append(Layer(anatomy.organ, KIDNEY, 0.38))
+    layers = [ShadedLayer(tumor, tumor_color(n)) for n, tumor in enumerate(anatomy.tumors)]
+    layers.append(ShadedLayer(anatomy.organ, KIDNEY, 0.38))
     axes.imshow(shade(layers, plane.view, frame), extent=frame.extent, interpolation="bilinear")
     blank(axes, frame)
     scale_bar(axes, frame)
@@ -173,7 +173,7 @@ def _qc_solid(axes: Axes, anatomy: Anatomy) -> None:
     axes.set_title("3-D, seen from the front", fontsize=10.5)
 
 
-def _write_letters(axes: Axes, plane: Plane, color: str) -> None:
+def _write_letters(axes: Axes, plane: QcPlane, color: str) -> None:
     places = {
         "left": (0.025, 0.5),
         "right": (0.975, 0.5),
@@ -199,7 +199,7 @@ def tumor_color(number: int) -> tuple[float, float, float]:
     return _TUMOR_COLORS[number % len(_TUMOR_COLORS)]
 
 
-def _same_scale(plane: Plane, anatomy: Anatomy) -> Frame:
+def _same_scale(plane: QcPlane, anatomy: Anatomy) -> Frame:
     """A frame about the organ, equally large in all planes, so that lengths compare."""
     size_mm = float(np.ptp(anatomy.organ.box_mm, axis=0).max()) + 2 * _MARGIN_MM
     right, down, _ = plane.view.project(anatomy.organ.box_mm.mean(0)[None])[0].tolist()

@@ -20,7 +20,7 @@ _SHARPER = 2  # pixels drawn per pixel shown, each way: smooth edges
 
 
 @dataclass(frozen=True)
-class View:
+class ShadedView:
     """A parallel projection: unit vectors of the picture's right and down in the data's frame."""
 
     name: str
@@ -49,7 +49,7 @@ class Frame:
 
 
 @dataclass(frozen=True)
-class Layer:
+class ShadedLayer:
     """One mesh with its colour (0..1) and opacity where seen face on; edges are always denser."""
 
     mesh: Mesh
@@ -57,7 +57,9 @@ class Layer:
     opacity: float = 1.0
 
 
-def frame_around(view: View, points_mm: Float[np.ndarray, "n 3"], margin_mm: float = 5.0) -> Frame:
+def frame_around(
+    view: ShadedView, points_mm: Float[np.ndarray, "n 3"], margin_mm: float = 5.0
+) -> Frame:
     """The frame that shows all these points."""
     flat = view.project(points_mm)
     low, high = flat.min(0) - margin_mm, flat.max(0) + margin_mm
@@ -75,7 +77,7 @@ def widened(frame: Frame, aspect: float) -> Frame:
 
 
 def shade(
-    layers: list[Layer], view: View, frame: Frame, pixel_mm: float = 0.3
+    layers: list[ShadedLayer], view: ShadedView, frame: Frame, pixel_mm: float = 0.3
 ) -> Float[np.ndarray, "h w 3"]:
     """Paint the layers in this order, each over the ones before it (organ last).
 
@@ -115,20 +117,21 @@ def _pixels(frame: Frame, pixel_mm: float) -> tuple[int, int]:
     return max(height, 1), max(width, 1)
 
 
-def silhouette(mesh: Mesh, view: View, frame: Frame, pixel_mm: float = 0.25) -> np.ndarray:
+def silhouette(mesh: Mesh, view: ShadedView, frame: Frame, pixel_mm: float = 0.25) -> np.ndarray:
     """Where the mesh covers the picture: 1.0 or 0.0 per pixel (h, w), for a contour at 0.5."""
     return np.isfinite(depth_of(mesh, view, frame, pixel_mm)).astype(float)
 
 
 def depth_of(
-    mesh: Mesh, view: View, frame: Frame, pixel_mm: float = 0.25
+    mesh: Mesh, view: ShadedView, frame: Frame, pixel_mm: float = 0.25
 ) -> Float[np.ndarray, "h w"]:
-    """Of the surface that is seen, mm away from the viewer as ``View.project``; inf: nothing."""
+    """Of the surface that is seen, mm away from the viewer as ``ShadedView.project`` has it; where
+    nothing is seen, infinite."""
     return _trace(mesh, view, frame, _pixels(frame, pixel_mm), pixel_mm)[0]
 
 
 def _trace(
-    mesh: Mesh, view: View, frame: Frame, shape: tuple[int, int], pixel_mm: float
+    mesh: Mesh, view: ShadedView, frame: Frame, shape: tuple[int, int], pixel_mm: float
 ) -> tuple[Float[np.ndarray, "h w"], Float[np.ndarray, "h w 3"]]:
     """Depth (inf: nothing) and unit normal, turned to the viewer, of the nearest surface."""
     flat = view.project(mesh.vertices_mm)

@@ -7,13 +7,13 @@ import msgspec
 from tumortrack.core.errors import InputError
 from tumortrack.core.types import Anatomy
 from tumortrack.simulate.deform import ChainConfig, DeformConfig, ElasticConfig
-from tumortrack.simulate.elastic.body import Body, BodyConfig, build_body
+from tumortrack.simulate.elastic.body import BodyConfig, ElasticBody, build_body
 from tumortrack.simulate.scene import SceneConfig
 
 
 def body_for(
     anatomy_ct: Anatomy, up_lps: tuple[float, float, float], config: SceneConfig, seed: int
-) -> Body | None:
+) -> ElasticBody | None:
     """The organ's body where a deformation of the configuration needs it, else None.
 
     Where every rotation of the organ is shown (``full``), its bed lies on any side of it.

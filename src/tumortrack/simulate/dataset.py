@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float32, UInt8
 
 from tumortrack.core.types import Anatomy
-from tumortrack.simulate.elastic.body import Body
+from tumortrack.simulate.elastic.body import ElasticBody
 from tumortrack.simulate.occupancy import PointSource
 from tumortrack.simulate.scene import SceneConfig, SceneRecipe, Simulator
 
@@ -37,7 +37,7 @@ class SceneStream:
     seed: int
     stream: Literal["train", "validation", "test"]
     batch_size: int
-    body: Body | None = None  # built once by the caller, for elastic deformations
+    body: ElasticBody | None = None  # built once by the caller, for elastic deformations
 
     @cached_property
     def _simulator(self) -> Simulator:  # built where it is used: ray trees do not travel

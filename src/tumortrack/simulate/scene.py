@@ -36,7 +36,7 @@ from tumortrack.sense.occlusion import OcclusionConfig, occlude
 from tumortrack.sense.render import Visibility, render_depth
 from tumortrack.simulate.deform import DeformConfig, DragConfig
 from tumortrack.simulate.deform.base import Deformation, View
-from tumortrack.simulate.elastic.body import Body
+from tumortrack.simulate.elastic.body import ElasticBody
 from tumortrack.simulate.occupancy import OccupancyConfig, PointSource
 from tumortrack.simulate.pose import PoseConfig, sample_pose
 
@@ -118,7 +118,7 @@ class Drawn:
 
 
 @dataclass(frozen=True, eq=False)
-class Stage:
+class RenderedScene:
     """A scene before points are asked for: what lies where, and what the camera gets of it."""
 
     camera_from_ct: Float64[np.ndarray, "4 4"]
@@ -140,7 +140,7 @@ class Simulator:
         anatomy_ct: Anatomy,
         up_lps: tuple[float, float, float],
         config: SceneConfig,
-        body: Body | None = None,
+        body: ElasticBody | None = None,
     ) -> None:
         self.anatomy_ct = anatomy_ct
         self._body = body
@@ -159,17 +159,17 @@ class Simulator:
         samples = OccupancySamples(stage.carry(points_ct), labels)
         return Pair(recipe, stage.cloud, samples, stage.camera_from_ct)
 
-    def stage(self, recipe: SceneRecipe) -> Stage:
+    def stage(self, recipe: SceneRecipe) -> RenderedScene:
         """Pose, deformation, depth image and cloud of a recipe."""
         return self._stage(recipe)[0]
 
-    def reference(self, stage: Stage) -> Anatomy:
+    def reference(self, stage: RenderedScene) -> Anatomy:
         """The anatomy as it lies in the scene, camera frame."""
         return Anatomy(
             tuple(part.moved(stage.carry(part.vertices_mm)) for part in self.anatomy_ct.parts)
         )
 
-    def _stage(self, recipe: SceneRecipe) -> tuple[Stage, np.random.Generator]:
+    def _stage(self, recipe: SceneRecipe) -> tuple[RenderedScene, np.random.Generator]:
         for attempt in range(ATTEMPTS):
             rng = recipe.generator(attempt)
             try:
@@ -189,7 +189,7 @@ class Simulator:
         view = View(self.anatomy_ct, visible, self._body)
         return Drawn(free, camera_from_ct, model.sample(view, rng))
 
-    def _attempt(self, rng: np.random.Generator) -> Stage:
+    def _attempt(self, rng: np.random.Generator) -> RenderedScene:
         config, organ = self.config, self.anatomy_ct.organ
         drawn = self.draw(rng)
         camera_from_ct, deformation = drawn.camera_from_ct, drawn.deformation
@@ -200,7 +200,7 @@ class Simulator:
         frame = miscalibrate(frame, config.calibration, rng)
         frame = add_noise(frame, config.noise, rng)
         crop = crop_of(config, drawn.free, rng)
-        return Stage(camera_from_ct, deformation, frame, cloud_from_depth(frame, crop, rng))
+        return RenderedScene(camera_from_ct, deformation, frame, cloud_from_depth(frame, crop, rng))
 
 
 def shows_nothing(recipe: SceneRecipe) -> TumortrackError:

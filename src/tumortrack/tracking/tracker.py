@@ -9,7 +9,7 @@ from tumortrack.core.errors import InputError
 from tumortrack.core.estimate import Estimate, Following
 from tumortrack.core.types import Anatomy, SensorCloud
 from tumortrack.occupancy.locator import OccupancyLocator
-from tumortrack.registration.locator import WarpLocator
+from tumortrack.registration.locator import RegistrationLocator
 from tumortrack.training.model import Model
 
 _ALONE = Following()
@@ -38,7 +38,7 @@ class Tracker:
         keep_small_blocks()
         self.model = model
         self._locator: Locator = (
-            WarpLocator(model) if model.config.network.warps else OccupancyLocator(model)
+            RegistrationLocator(model) if model.config.network.warps else OccupancyLocator(model)
         )
 
     @property

@@ -17,7 +17,7 @@ _FILE = "checkpoint.safetensors"
 
 
 @dataclass
-class Progress:
+class TrainingProgress:
     """Where a run stands. ``end`` is the step it will stop at; None while minutes decide."""
 
     step: int = 0
@@ -27,7 +27,10 @@ class Progress:
 
 
 def save_checkpoint(
-    folder: Path, progress: Progress, groups: dict[str, dict[str, torch.Tensor]], identity: str
+    folder: Path,
+    progress: TrainingProgress,
+    groups: dict[str, dict[str, torch.Tensor]],
+    identity: str,
 ) -> None:
     """Write progress and tensors; ``identity`` names the run they belong to.
 
@@ -45,7 +48,7 @@ def save_checkpoint(
 
 def load_checkpoint(
     folder: Path, identity: str
-) -> tuple[Progress, dict[str, dict[str, torch.Tensor]]] | None:
+) -> tuple[TrainingProgress, dict[str, dict[str, torch.Tensor]]] | None:
     """The last checkpoint, or None where there is none.
 
     Raises:
@@ -58,7 +61,7 @@ def load_checkpoint(
     try:
         with safe_open(path, framework="pt") as file:
             metadata = file.metadata() or {}
-            progress = Progress(**json.loads(metadata["progress"]))
+            progress = TrainingProgress(**json.loads(metadata["progress"]))
             for key in file.keys():  # noqa: SIM118 - safe_open is no dict
                 group, name = key.split("/", 1)
                 groups.setdefault(group, {})[name] = file.get_tensor(key)

@@ -24,12 +24,12 @@ from tumortrack.training.model import choose_device
 _PATIENCE = timedelta(hours=1)  # while the first process validates, the others wait
 
 
-class RankLost(TumortrackError):
+class ProcessLost(TumortrackError):
     """Another process of this training has ended."""
 
 
 @dataclass(frozen=True)
-class Ranks:
+class ProcessGroup:
     """Which of how many processes this is, and the device it computes on."""
 
     device: torch.device
@@ -111,7 +111,7 @@ class Ranks:
         try:
             yield
         except RuntimeError as error:
-            raise RankLost(
+            raise ProcessLost(
                 f"process {self.rank} of {self.size} stops: another one of this training has "
                 "ended; what it said is the reason. The last checkpoint is whole, and the same "
                 "command goes on from it."
@@ -119,7 +119,7 @@ class Ranks:
 
 
 @contextmanager
-def joined(device: str) -> Iterator[Ranks]:
+def joined(device: str) -> Iterator[ProcessGroup]:
     """All processes that torchrun started, by NCCL on GPUs and Gloo on CPUs; else this one alone.
 
     Raises:
@@ -129,7 +129,7 @@ def joined(device: str) -> Iterator[Ranks]:
     chosen = choose_device(device)
     size = int(os.environ["WORLD_SIZE"]) if "TORCHELASTIC_RUN_ID" in os.environ else 1
     if size == 1:
-        yield Ranks(chosen)
+        yield ProcessGroup(chosen)
         return
     place, on_machine = int(os.environ["LOCAL_RANK"]), int(os.environ["LOCAL_WORLD_SIZE"])
     if chosen.type == "cuda":
@@ -144,12 +144,14 @@ def joined(device: str) -> Iterator[Ranks]:
     try:
         distributed.init_process_group(backend, timeout=_PATIENCE)
     except (RuntimeError, ValueError) as error:
-        raise RankLost(f"the processes of this training do not find each other: {error}") from error
-    ranks = Ranks(chosen, distributed.get_rank(), size, on_machine)
+        raise ProcessLost(
+            f"the processes of this training do not find each other: {error}"
+        ) from error
+    ranks = ProcessGroup(chosen, distributed.get_rank(), size, on_machine)
     try:
         yield ranks
     except BaseException:
-        with suppress(RankLost):  # what ended this process is to be told, not what follows
+        with suppress(ProcessLost):  # what ended this process is to be told, not what follows
             ranks.leave()
         raise
     ranks.leave()

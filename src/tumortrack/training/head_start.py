@@ -20,7 +20,7 @@ _WEIGHTS = "weights.safetensors"
 
 
 @dataclass(frozen=True, eq=False)
-class Start:
+class HeadStart:
     """Weights of a network that knows organs in general; ``sha256`` names them."""
 
     sha256: str
@@ -59,7 +59,7 @@ def save_start(
     store.seal(folder, KIND, content, frame="camera")
 
 
-def load_start(folder: Path) -> Start:
+def load_start(folder: Path) -> HeadStart:
     """Read a folder that `pretrain` wrote.
 
     Raises:
@@ -75,4 +75,4 @@ def load_start(folder: Path) -> Start:
             f"{folder} holds no whole pretrained weights of this version: {error}. Make them "
             "again: tumortrack pretrain OUT."
         ) from error
-    return Start(store.sha256_of(folder / _WEIGHTS), config, weights)
+    return HeadStart(store.sha256_of(folder / _WEIGHTS), config, weights)

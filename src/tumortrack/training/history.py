@@ -9,7 +9,7 @@ from types import TracebackType
 
 from tumortrack.core.errors import StorageError
 from tumortrack.core.store import write_atomically
-from tumortrack.training.checkpoint import Progress
+from tumortrack.training.checkpoint import TrainingProgress
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class History:
         StorageError: the disk is full. On leaving after another error, that one is kept.
     """
 
-    def __init__(self, folder: Path, progress: Progress) -> None:
+    def __init__(self, folder: Path, progress: TrainingProgress) -> None:
         self._path = folder / "history.jsonl"
         self._folder = folder
         self._resumed_at = progress.step
@@ -64,7 +64,7 @@ class History:
         if refused and error is None:
             raise self._refused(refused[0]) from refused[0]
 
-    def write(self, progress: Progress, record: Record) -> None:
+    def write(self, progress: TrainingProgress, record: Record) -> None:
         """One validation's record."""
         line = {
             "step": progress.step,

@@ -16,14 +16,14 @@ from tumortrack.core import store
 from tumortrack.core.config import Config, from_builtins, to_builtins
 from tumortrack.core.errors import ArtifactError, InputError
 from tumortrack.models.config import TrainConfig
-from tumortrack.models.in_distribution import Familiar
+from tumortrack.models.in_distribution import InDistributionRange
 from tumortrack.occupancy.compiled import Arithmetic, find
-from tumortrack.registration.rest_shape import Shape
+from tumortrack.registration.rest_shape import RestShape
 from tumortrack.training.model_folder import KIND, SHAPE, WEIGHTS, read_model_manifest
 from tumortrack.training.networks import Network, network_of
 
 
-class Trust(Config, frozen=True):
+class UncertaintyCalibration(Config, frozen=True):
     """What validation taught of a warp's own figures: its standard deviations are to be multiplied
     by ``std_scale``; a fit that costs more than ``usual_cost`` is tried from other starts."""
 
@@ -45,10 +45,10 @@ class Model:
     config: TrainConfig
     parts: tuple[str, ...]
     query_box_mm: Float64[np.ndarray, "2 3"]
-    familiar: Familiar
+    familiar: InDistributionRange
     provenance: dict
-    shape: Shape | None = None
-    trust: Trust | None = None
+    shape: RestShape | None = None
+    trust: UncertaintyCalibration | None = None
     arithmetic: Arithmetic | None = None
     notes: tuple[str, ...] = ()
 
@@ -85,12 +85,12 @@ def load_model(folder: Path, device: str = "auto") -> Model:
         network = network_of(config.network)
         network.load_state_dict(load((folder / WEIGHTS).read_bytes()))
         weights_sha256 = str(manifest["files"][WEIGHTS])
-        familiar = from_builtins(manifest["familiar"], Familiar, f"{folder}: familiar")
+        familiar = from_builtins(manifest["familiar"], InDistributionRange, f"{folder}: familiar")
         provenance = dict(manifest["provenance"])
         shape, trust = None, None
         if config.network.warps:
-            shape = Shape.from_arrays(load_arrays((folder / SHAPE).read_bytes()), len(parts))
-            trust = from_builtins(manifest["trust"], Trust, f"{folder}: trust")
+            shape = RestShape.from_arrays(load_arrays((folder / SHAPE).read_bytes()), len(parts))
+            trust = from_builtins(manifest["trust"], UncertaintyCalibration, f"{folder}: trust")
     except InputError as error:
         raise ArtifactError(
             f"{error} The model was trained by another version of tumortrack; train it again."

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from tumortrack.occupancy.network import NetworkConfig, OccupancyNetwork
-from tumortrack.registration.network import WarpNetwork
+from tumortrack.registration.network import RegistrationNetwork
 
-Network = OccupancyNetwork | WarpNetwork
+Network = OccupancyNetwork | RegistrationNetwork
 
 
 def network_of(config: NetworkConfig) -> Network:
     """A network with weights from torch's global generator (``torch.manual_seed``)."""
-    return WarpNetwork(config) if config.warps else OccupancyNetwork(config)
+    return RegistrationNetwork(config) if config.warps else OccupancyNetwork(config)

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 from tumortrack.core.errors import InputError
 from tumortrack.occupancy.network import OccupancyNetwork
-from tumortrack.registration.network import WarpNetwork
+from tumortrack.registration.network import RegistrationNetwork
 from tumortrack.training.model import Model
 
 _OPSET = 18
@@ -26,7 +26,7 @@ class _BothWays(nn.Module):
     """A cloud (1, N, 3) -> the placements' four arrays, (2, ...) each: as the cloud was turned, and
     half a turn more."""
 
-    def __init__(self, network: WarpNetwork) -> None:
+    def __init__(self, network: RegistrationNetwork) -> None:
         super().__init__()
         self.network = network
 

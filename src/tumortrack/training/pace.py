@@ -16,7 +16,7 @@ import torch
 from tumortrack.core.allocator import keep_freed_memory
 from tumortrack.core.cores import available_cores
 from tumortrack.core.errors import TumortrackError
-from tumortrack.training.checkpoint import Progress
+from tumortrack.training.checkpoint import TrainingProgress
 
 REPORT_EVERY_S = 5.0
 _Item = TypeVar("_Item")
@@ -24,7 +24,7 @@ MOST_THREADS = 16  # more only wait for each other in layers this small
 
 
 @dataclass(frozen=True)
-class Status:
+class TrainingStatus:
     """What the loop tells while it runs; ``end`` is None while minutes decide."""
 
     step: int
@@ -63,10 +63,10 @@ def use_cores(device: torch.device, workers: int, sharing: int = 1) -> None:
         )
 
 
-class Clock:
+class TrainingClock:
     """Time spent in all sessions of a run, and when things are due again."""
 
-    def __init__(self, progress: Progress) -> None:
+    def __init__(self, progress: TrainingProgress) -> None:
         self._start, self._first_step = time.monotonic(), progress.step
         self._before = progress.elapsed_s
         self._last: dict[str, float] = {}
@@ -90,7 +90,7 @@ class Clock:
     def elapsed(self) -> float:
         return self._before + time.monotonic() - self._start
 
-    def rate(self, progress: Progress) -> float:
+    def rate(self, progress: TrainingProgress) -> float:
         """Steps per second in this session."""
         return (progress.step - self._first_step) / max(time.monotonic() - self._start, 1e-9)
 

@@ -24,19 +24,31 @@ from tumortrack.core.errors import InputError
 from tumortrack.core.types import Anatomy
 from tumortrack.models.config import TrainConfig
 from tumortrack.phantom.kidneys import random_anatomy
-from tumortrack.registration.canonical_frame import Upright, generic_points, know_any, upright_of
-from tumortrack.registration.config import WarpDecoderConfig
-from tumortrack.registration.network import WarpNetwork
+from tumortrack.registration.canonical_frame import (
+    CanonicalFrame,
+    generic_points,
+    know_any,
+    upright_of,
+)
+from tumortrack.registration.config import RegistrationHeadConfig
+from tumortrack.registration.network import RegistrationNetwork
 from tumortrack.registration.rest_shape import long_axis_of
 from tumortrack.simulate.bodies import body_for
 from tumortrack.simulate.dataset import Batch, SceneStream
-from tumortrack.simulate.elastic.body import Body
+from tumortrack.simulate.elastic.body import ElasticBody
 from tumortrack.simulate.occupancy import FixedPoints
 from tumortrack.training.head_start import save_start
 from tumortrack.training.loader import batches, default_workers, network_leaves
 from tumortrack.training.model import choose_device
 from tumortrack.training.networks import Network
-from tumortrack.training.pace import REPORT_EVERY_S, Clock, Interrupted, Status, ctrl_c, use_cores
+from tumortrack.training.pace import (
+    REPORT_EVERY_S,
+    Interrupted,
+    TrainingClock,
+    TrainingStatus,
+    ctrl_c,
+    use_cores,
+)
 from tumortrack.training.state import TrainingState
 from tumortrack.training.work import work_folder
 
@@ -87,12 +99,12 @@ class UprightStream:
 
     anatomy_ct: Anatomy
     up_lps: tuple[float, float, float]
-    body: Body
+    body: ElasticBody
     config: TrainConfig
     seed: int
 
     @cached_property
-    def upright(self) -> Upright:
+    def upright(self) -> CanonicalFrame:
         """The organ's upright frame."""
         organ = self.anatomy_ct.organ
         return upright_of(organ, self.up_lps, self.body.center_ct, long_axis_of(organ))
@@ -100,7 +112,7 @@ class UprightStream:
     @cached_property
     def _scenes(self) -> SceneStream:
         decoder = self.config.network.decoder
-        assert isinstance(decoder, WarpDecoderConfig)
+        assert isinstance(decoder, RegistrationHeadConfig)
         points = self.upright.in_ct(generic_points(decoder.points)).astype(np.float32)
         return SceneStream(
             self.anatomy_ct,
@@ -150,7 +162,7 @@ def kidney_stream(run: Pretraining) -> KidneyStream:
     return KidneyStream(tuple(organs))
 
 
-def pretrain(run: Pretraining, folder: Path, report: Callable[[Status], None]) -> dict:
+def pretrain(run: Pretraining, folder: Path, report: Callable[[TrainingStatus], None]) -> dict:
     """Train until the end, resuming what lies in ``folder``; leaves a folder of weights, and
     returns its provenance.
 
@@ -160,14 +172,16 @@ def pretrain(run: Pretraining, folder: Path, report: Callable[[Status], None]) -
         return _pretrain(run, folder, work, report)
 
 
-def _pretrain(run: Pretraining, folder: Path, work: Path, report: Callable[[Status], None]) -> dict:
+def _pretrain(
+    run: Pretraining, folder: Path, work: Path, report: Callable[[TrainingStatus], None]
+) -> dict:
     device = choose_device(run.device)
     workers = default_workers() if run.workers is None else run.workers
     use_cores(device, network_leaves(workers))
     state = TrainingState(run, device)
     state.know(_teach)
     state.resume(work)
-    progress, clock = state.progress, Clock(state.progress)
+    progress, clock = state.progress, TrainingClock(state.progress)
     steps = range(progress.step, run.steps)
     source = closing(batches(kidney_stream(run), steps, 0, workers, device))
     with ctrl_c() as stopped, source as loaded:
@@ -180,7 +194,7 @@ def _pretrain(run: Pretraining, folder: Path, work: Path, report: Callable[[Stat
             if done or clock.due("report", REPORT_EVERY_S):
                 rate = clock.rate(progress)
                 left, speed = (run.steps - progress.step) / rate, rate * run.config.batch_size
-                report(Status(progress.step, run.steps, left, speed, loss, None))
+                report(TrainingStatus(progress.step, run.steps, left, speed, loss, None))
             if stop and not done:
                 raise Interrupted.at(progress.step, folder)
     about = {
@@ -195,5 +209,5 @@ def _pretrain(run: Pretraining, folder: Path, work: Path, report: Callable[[Stat
 
 
 def _teach(network: Network) -> None:
-    assert isinstance(network, WarpNetwork)
+    assert isinstance(network, RegistrationNetwork)
     know_any(network)

@@ -10,21 +10,21 @@ import torch
 from jaxtyping import Float
 
 from tumortrack.core.errors import InputError
-from tumortrack.models.in_distribution import Familiar, fit_mm, spread_mm
+from tumortrack.models.in_distribution import InDistributionRange, fit_mm, spread_mm
 from tumortrack.registration.canonical_frame import carry_over, upright_of
-from tumortrack.registration.config import WarpDecoderConfig
-from tumortrack.registration.gauss_newton import Refined
+from tumortrack.registration.config import RegistrationHeadConfig
+from tumortrack.registration.gauss_newton import RegistrationResult
 from tumortrack.registration.hypotheses import best_fit, first_motions, repaired
-from tumortrack.registration.motion import WarpMotion
-from tumortrack.registration.network import WarpNetwork
+from tumortrack.registration.motion import ElasticMotion
+from tumortrack.registration.network import RegistrationNetwork
 from tumortrack.registration.rest_shape import shape_of
 from tumortrack.simulate.bodies import body_for
 from tumortrack.simulate.occupancy import FixedPoints, organ_pool
 from tumortrack.simulate.scene import Simulator
 from tumortrack.simulate.targets import draw_targets
-from tumortrack.training.model import Model, Trust
+from tumortrack.training.model import Model, UncertaintyCalibration
 from tumortrack.training.networks import Network
-from tumortrack.training.run import Run
+from tumortrack.training.run import TrainingRun
 from tumortrack.training.validate import ValidationScenes, mean_iou_of, validation_scenes
 
 _USUAL = 90  # per cent of the validation scenes have no more than the usual cost
@@ -33,10 +33,10 @@ _RADIUS = 1.878
 _AT_SURFACE = 0.5  # of the points whose places are learnt; the others lie inside the parts
 
 
-class WarpCourse:
+class RegistrationTask:
     """Where fixed points of the organ go in each scene."""
 
-    def __init__(self, run: Run, device: torch.device) -> None:
+    def __init__(self, run: TrainingRun, device: torch.device) -> None:
         self._run = run
         body = body_for(run.anatomy_ct, run.up_lps, run.config.scene, run.seed)
         if body is None:
@@ -46,7 +46,7 @@ class WarpCourse:
         self.body = body
         self._shape = shape_of(run.anatomy_ct, body)
         self.points = _points(run)
-        self._last: tuple[bytes, list[tuple[WarpMotion, Refined]]] | None = None
+        self._last: tuple[bytes, list[tuple[ElasticMotion, RegistrationResult]]] | None = None
 
     @cached_property
     def _scenes(self) -> ValidationScenes:
@@ -56,7 +56,7 @@ class WarpCourse:
         return validation_scenes(simulator, pool, run.config, run.seed)
 
     def teach(self, network: Network) -> None:
-        assert isinstance(network, WarpNetwork)
+        assert isinstance(network, RegistrationNetwork)
         run, shape = self._run, self._shape
         network.know(shape, run.up_lps, self.points.points_ct)
         if run.start is not None:
@@ -80,13 +80,13 @@ class WarpCourse:
             judged.familiar,
             {**provenance, "validation_tre_mm": round(judged.tre_mm, 3)},
             self._shape,
-            Trust(std_scale=judged.std_scale, usual_cost=usual_cost),
+            UncertaintyCalibration(std_scale=judged.std_scale, usual_cost=usual_cost),
         )
 
-    def _fits(self, network: Network) -> list[tuple[WarpMotion, Refined]]:
+    def _fits(self, network: Network) -> list[tuple[ElasticMotion, RegistrationResult]]:
         """The likeliest start and the best fit in each validation scene; of the same weights once,
         since the last ones are mostly the best."""
-        assert isinstance(network, WarpNetwork)
+        assert isinstance(network, RegistrationNetwork)
         weights = b"".join(w.numpy(force=True).tobytes() for w in network.state_dict().values())
         if self._last is None or self._last[0] != weights:
             network.eval()
@@ -97,7 +97,9 @@ class WarpCourse:
             self._last = weights, fits
         return self._last[1]
 
-    def _repaired(self, fits: list[tuple[WarpMotion, Refined]], usual_cost: float) -> list[Refined]:
+    def _repaired(
+        self, fits: list[tuple[ElasticMotion, RegistrationResult]], usual_cost: float
+    ) -> list[RegistrationResult]:
         """The fits as the model will make them, which knows the usual cost."""
         shape, config = self._shape, self._run.config.refine
         return [
@@ -105,7 +107,7 @@ class WarpCourse:
             for cloud, (start, fit) in zip(self._scenes.clouds_mm, fits, strict=True)
         ]
 
-    def _judged(self, fits: list[Refined]) -> Judged:
+    def _judged(self, fits: list[RegistrationResult]) -> ValidationSummary:
         """Labels, places and trust over all validation scenes."""
         scenes, shape = self._scenes, self._shape
         guesses, errors, deviations = [], [], []
@@ -119,11 +121,11 @@ class WarpCourse:
             deviations.append(deviation)
         spreads = [spread_mm(cloud) for cloud in scenes.clouds_mm]
         off = [fit_mm(np.abs(fit.distances_mm)) for fit in fits]
-        familiar = Familiar(
+        familiar = InDistributionRange(
             spread_mm=(min(spreads), max(spreads)), fit_mm=float(np.percentile(off, 95))
         )
         ratios = np.concatenate(errors) / np.concatenate(deviations)
-        return Judged(
+        return ValidationSummary(
             mean_iou_of(np.stack(guesses), scenes.labels, len(shape.anatomy_ct.parts) + 1),
             float(np.median([part.mean() for part in errors])),
             float(np.quantile(ratios, _COVERED)) / _RADIUS,
@@ -132,28 +134,30 @@ class WarpCourse:
 
 
 @dataclass(frozen=True)
-class Judged:
+class ValidationSummary:
     """What validation says: labels, the median scene's error of places, how the estimated
     standard deviations have to be scaled, and what clouds are like."""
 
     miou: float
     tre_mm: float
     std_scale: float
-    familiar: Familiar
+    familiar: InDistributionRange
 
 
 def _errors(
-    fit: Refined, points_ct: Float[np.ndarray, "n 3"], points_mm: Float[np.ndarray, "n 3"]
+    fit: RegistrationResult,
+    points_ct: Float[np.ndarray, "n 3"],
+    points_mm: Float[np.ndarray, "n 3"],
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
     deviation = fit.motion.std_mm(points_ct)
     assert deviation is not None
     return np.linalg.norm(fit.motion.carry(points_ct) - points_mm, axis=1), deviation
 
 
-def _points(run: Run) -> FixedPoints:
+def _points(run: TrainingRun) -> FixedPoints:
     """Points of the organ's surface, evenly drawn vertices, and of the parts' insides."""
     decoder = run.config.network.decoder
-    assert isinstance(decoder, WarpDecoderConfig)
+    assert isinstance(decoder, RegistrationHeadConfig)
     count = decoder.points
     rng = np.random.default_rng([run.seed, 0x9A49])
     vertices = run.anatomy_ct.organ.vertices_mm

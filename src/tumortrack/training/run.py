@@ -14,12 +14,12 @@ from tumortrack.core.config import identity
 from tumortrack.core.errors import InputError
 from tumortrack.core.types import Anatomy
 from tumortrack.models.config import TrainConfig
-from tumortrack.training.checkpoint import Progress
-from tumortrack.training.head_start import Start
+from tumortrack.training.checkpoint import TrainingProgress
+from tumortrack.training.head_start import HeadStart
 
 
 @dataclass(frozen=True)
-class Run:
+class TrainingRun:
     """What to train, on what, for how long: to the end of ``steps``, or about ``minutes``."""
 
     anatomy_ct: Anatomy
@@ -32,7 +32,7 @@ class Run:
     device: Literal["auto", "cpu", "cuda"] = "auto"
     workers: int | None = None  # processes that make scenes; None: as the machine allows
     checkpoint_every_s: float = 30.0
-    start: Start | None = None  # pretrained weights, for warps
+    start: HeadStart | None = None  # pretrained weights, for warps
     scenes: Literal["auto", "workers", "device"] = "auto"  # who makes them; see ``training.scenes``
 
     def __post_init__(self) -> None:
@@ -57,7 +57,7 @@ class Run:
         return run_identity(self)
 
 
-def run_identity(run: Run) -> str:
+def run_identity(run: TrainingRun) -> str:
     """sha256 of all that decides the weights, so that a resumed run is the same run."""
     content = {
         "case": run.case_sha256,
@@ -72,7 +72,7 @@ def run_identity(run: Run) -> str:
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
 
-def provenance(run: Run, progress: Progress, device: torch.device) -> dict:
+def provenance(run: TrainingRun, progress: TrainingProgress, device: torch.device) -> dict:
     about = {
         "seed": run.seed,
         "steps": progress.step,

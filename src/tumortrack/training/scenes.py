@@ -12,7 +12,7 @@ import torch
 from torch.utils.data import DataLoader, Dataset
 
 from tumortrack.core.errors import InputError
-from tumortrack.simulate.batched.plan import Plan
+from tumortrack.simulate.batched.plan import BatchPlan
 from tumortrack.simulate.batched.stream import Chosen, DeviceStream, Pictured, why_not
 from tumortrack.simulate.dataset import SceneStream
 from tumortrack.training.loader import Tensors, batches, quiet_worker
@@ -62,11 +62,11 @@ def scenes_for(
     return Scenes(by_workers, f"{workers} processes", note)
 
 
-class _Plans(Dataset[Plan]):
+class _Plans(Dataset[BatchPlan]):
     def __init__(self, stream: DeviceStream) -> None:
         self._stream = stream
 
-    def __getitem__(self, indices: tuple[int, ...]) -> Plan:
+    def __getitem__(self, indices: tuple[int, ...]) -> BatchPlan:
         return self._stream.plan(*indices)
 
 
@@ -105,7 +105,7 @@ def batches_on(
 
 
 def _finished(
-    stream: DeviceStream, plans: Iterable[Plan], thread: ThreadPoolExecutor
+    stream: DeviceStream, plans: Iterable[BatchPlan], thread: ThreadPoolExecutor
 ) -> Iterator[Tensors]:
     """The batches of these plans; the pictures of each are taken before the last is handed out."""
     before: tuple[Pictured, Future[Chosen]] | None = None

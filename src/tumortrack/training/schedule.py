@@ -5,12 +5,12 @@ from __future__ import annotations
 import math
 
 from tumortrack.models.config import TrainConfig
-from tumortrack.training.checkpoint import Progress
+from tumortrack.training.checkpoint import TrainingProgress
 
 _FLOOR = 0.01  # of the peak rate, at the end of the tail
 
 
-def learning_rate(config: TrainConfig, progress: Progress) -> float:
+def learning_rate(config: TrainConfig, progress: TrainingProgress) -> float:
     """The learning rate of the step that comes next."""
     schedule, step = config.schedule, progress.step
     peak = schedule.learning_rate
@@ -24,7 +24,7 @@ def learning_rate(config: TrainConfig, progress: Progress) -> float:
     return peak * warm * (_FLOOR + (1 - _FLOOR) * (1 + math.cos(math.pi * through)) / 2)
 
 
-def settle_end(config: TrainConfig, progress: Progress, minutes: float | None) -> bool:
+def settle_end(config: TrainConfig, progress: TrainingProgress, minutes: float | None) -> bool:
     """With a limit in minutes: when the tail's time has come, fix the step that the run will end
     at, from its pace so far; True when that happened now. From then on the schedule depends on
     steps alone, so that a resumed run repeats it."""

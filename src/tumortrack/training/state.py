@@ -14,13 +14,13 @@ from torch import Tensor
 from tumortrack.core.errors import TumortrackError
 from tumortrack.models.config import TrainConfig
 from tumortrack.training.checkpoint import (
-    Progress,
+    TrainingProgress,
     load_checkpoint,
     optimizer_tensors,
     restore_optimizer,
     save_checkpoint,
 )
-from tumortrack.training.distributed import Ranks
+from tumortrack.training.distributed import ProcessGroup
 from tumortrack.training.loader import Tensors
 from tumortrack.training.model import has_fast_bfloat16
 from tumortrack.training.networks import Network, network_of
@@ -37,7 +37,7 @@ class Diverged(TumortrackError):
         )
 
 
-class Plan(Protocol):
+class RunSettings(Protocol):
     """What the state has to know of a run."""
 
     @property
@@ -57,9 +57,11 @@ class Plan(Protocol):
 class TrainingState:
     """All that changes while training, and nothing else."""
 
-    def __init__(self, run: Plan, device: torch.device, ranks: Ranks | None = None) -> None:
+    def __init__(
+        self, run: RunSettings, device: torch.device, ranks: ProcessGroup | None = None
+    ) -> None:
         self._run, self._device = run, device
-        self._ranks = ranks or Ranks(device)
+        self._ranks = ranks or ProcessGroup(device)
         self._bf16 = has_fast_bfloat16(device)
         config = run.config
         torch.manual_seed(run.seed)
@@ -73,7 +75,7 @@ class TrainingState:
             fused=True,  # a twentieth of the quick step on a CPU
         )
         end = run.steps or (config.steps if run.minutes is None else None)
-        self.progress = Progress(end=end)
+        self.progress = TrainingProgress(end=end)
         self._best: dict[str, Tensor] = {}
         self.learning_rate = 0.0  # of the last step
 

@@ -9,17 +9,17 @@ import torch
 
 from tumortrack.occupancy.network import OccupancyNetwork
 from tumortrack.simulate.bodies import body_for
-from tumortrack.simulate.elastic.body import Body
+from tumortrack.simulate.elastic.body import ElasticBody
 from tumortrack.simulate.occupancy import OccupancyPool, PointSource
 from tumortrack.simulate.scene import Simulator
 from tumortrack.training.model import Model
 from tumortrack.training.networks import Network
-from tumortrack.training.registration_task import WarpCourse
-from tumortrack.training.run import Run
+from tumortrack.training.registration_task import RegistrationTask
+from tumortrack.training.run import TrainingRun
 from tumortrack.training.validate import ValidationScenes, ValidationSet, validation_scenes
 
 
-class Course(Protocol):
+class TrainingTask(Protocol):
     """What training asks of a kind of model."""
 
     @property
@@ -28,7 +28,7 @@ class Course(Protocol):
         ...
 
     @property
-    def body(self) -> Body | None:
+    def body(self) -> ElasticBody | None:
         """The organ's, where scenes or model need it."""
         ...
 
@@ -45,19 +45,19 @@ class Course(Protocol):
         ...
 
 
-def course_of(run: Run, device: torch.device) -> Course:
+def course_of(run: TrainingRun, device: torch.device) -> TrainingTask:
     """The course of a run's kind of network.
 
     Raises:
         InputError: a part too small to be learnt, deformations that do not fit the network.
     """
-    return WarpCourse(run, device) if run.config.network.warps else OccupancyCourse(run, device)
+    return RegistrationTask(run, device) if run.config.network.warps else OccupancyTask(run, device)
 
 
-class OccupancyCourse:
+class OccupancyTask:
     """Labels of points about surfaces, in the paper's way."""
 
-    def __init__(self, run: Run, device: torch.device) -> None:
+    def __init__(self, run: TrainingRun, device: torch.device) -> None:
         self._run, self._device = run, device
         self.points = OccupancyPool(run.anatomy_ct, run.config.scene.occupancy, run.seed)
         self.body = body_for(run.anatomy_ct, run.up_lps, run.config.scene, run.seed)

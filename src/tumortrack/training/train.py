@@ -13,23 +13,30 @@ from dataclasses import replace
 from pathlib import Path
 
 from tumortrack.simulate.dataset import SceneStream
-from tumortrack.training.checkpoint import Progress
-from tumortrack.training.distributed import Ranks, joined
+from tumortrack.training.checkpoint import TrainingProgress
+from tumortrack.training.distributed import ProcessGroup, joined
 from tumortrack.training.history import History, Record
 from tumortrack.training.loader import default_workers, network_leaves
 from tumortrack.training.model import Model, load_model, save_model
-from tumortrack.training.pace import REPORT_EVERY_S, Clock, Interrupted, Status, ctrl_c, use_cores
-from tumortrack.training.run import Run, provenance, run_identity
+from tumortrack.training.pace import (
+    REPORT_EVERY_S,
+    Interrupted,
+    TrainingClock,
+    TrainingStatus,
+    ctrl_c,
+    use_cores,
+)
+from tumortrack.training.run import TrainingRun, provenance, run_identity
 from tumortrack.training.scenes import scenes_for
 from tumortrack.training.schedule import settle_end
 from tumortrack.training.state import TrainingState
 from tumortrack.training.task import course_of
 from tumortrack.training.work import work_folder
 
-__all__ = ["Interrupted", "Run", "Status", "run_identity", "train"]
+__all__ = ["Interrupted", "TrainingRun", "TrainingStatus", "run_identity", "train"]
 
 
-def train(run: Run, folder: Path, report: Callable[[Status], None]) -> Model:
+def train(run: TrainingRun, folder: Path, report: Callable[[TrainingStatus], None]) -> Model:
     """Train until the end, resuming what lies in ``folder``; leaves a model folder.
 
     Raises:
@@ -48,7 +55,11 @@ def train(run: Run, folder: Path, report: Callable[[Status], None]) -> Model:
 
 
 def _train(
-    run: Run, folder: Path, work: Path, ranks: Ranks, report: Callable[[Status], None]
+    run: TrainingRun,
+    folder: Path,
+    work: Path,
+    ranks: ProcessGroup,
+    report: Callable[[TrainingStatus], None],
 ) -> Model | None:
     """The model, in the process that leads."""
     config, device = run.config, ranks.device
@@ -71,7 +82,7 @@ def _train(
     steps = ranks.numbers(range(state.progress.step, state.progress.end or config.steps))
     period = config.training_pairs // config.batch_size * ranks.size
 
-    progress, clock, miou = state.progress, Clock(state.progress), None
+    progress, clock, miou = state.progress, TrainingClock(state.progress), None
     scenes = scenes_for(stream, steps, period, workers, device, run.scenes)
     source = closing(scenes.batches)
     written: AbstractContextManager[History | None] = (
@@ -108,9 +119,11 @@ def _train(
     return model
 
 
-def _status(run: Run, progress: Progress, rate: float, loss: float, miou: float | None) -> Status:
+def _status(
+    run: TrainingRun, progress: TrainingProgress, rate: float, loss: float, miou: float | None
+) -> TrainingStatus:
     left = ((progress.end or run.config.steps) - progress.step) / rate
     if progress.end is None and run.minutes is not None:
         left = min(left, run.minutes * 60 - progress.elapsed_s)
     speed = rate * run.config.batch_size
-    return Status(progress.step, progress.end, max(left, 0.0), speed, loss, miou)
+    return TrainingStatus(progress.step, progress.end, max(left, 0.0), speed, loss, miou)

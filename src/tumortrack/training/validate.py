@@ -12,7 +12,7 @@ from tumortrack.core.errors import NoEstimate
 from tumortrack.models.config import TrainConfig
 from tumortrack.models.in_distribution import (
     FIT_STEPS,
-    Familiar,
+    InDistributionRange,
     fit_mm,
     spread_mm,
     surface_distances,
@@ -97,7 +97,7 @@ class ValidationSet:
         return mean_iou_of(guess, self._labels, self._n_classes)
 
     @torch.no_grad()
-    def familiar(self, network: OccupancyNetwork) -> Familiar:
+    def familiar(self, network: OccupancyNetwork) -> InDistributionRange:
         """What the clouds are like, and how far they lie from the surfaces that a network sees."""
         network.eval()
         spreads, fits = [], []
@@ -117,7 +117,7 @@ class ValidationSet:
                 fits.append(fit_mm(surface_distances(lattice, points_mm)))
             except NoEstimate:  # a network of a few steps sees no organ
                 fits.append(spreads[-1])
-        return Familiar(
+        return InDistributionRange(
             spread_mm=(min(spreads), max(spreads)), fit_mm=float(np.percentile(fits, 95))
         )
 

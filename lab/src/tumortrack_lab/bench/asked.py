@@ -15,7 +15,7 @@ from tumortrack_lab.bench.counts import (
     weight_bytes,
 )
 from tumortrack_lab.bench.row import Precision, Work
-from tumortrack_lab.bench.turns import Call, Timing
+from tumortrack_lab.bench.turns import Call, InterleavedTiming
 
 if TYPE_CHECKING:
     import torch
@@ -34,7 +34,7 @@ NAIVE = "single precision, latent beside every query, Python loops, one piece"
 
 
 @dataclass(eq=False)
-class Asked:
+class OccupancyWorkload:
     """An occupancy network with a cloud and queries about it: ours and the naive form.
 
     ``naive_frame_s``: of the naive form's frame, once that was measured."""
@@ -42,7 +42,7 @@ class Asked:
     model: Model
     points_mm: np.ndarray
     device: str = "cpu"
-    naive_frame_s: Timing | None = None
+    naive_frame_s: InterleavedTiming | None = None
     _labelled: dict[int, np.ndarray] = field(default_factory=dict)
 
     @cached_property
@@ -180,8 +180,10 @@ class Asked:
         return labels
 
 
-def asked_of(subject: Subject, preset: str) -> Asked:
+def asked_of(subject: Subject, preset: str) -> OccupancyWorkload:
     """Of a preset: one for all groups of rows, whose naive form then labels its queries once."""
     if preset not in subject.asked:
-        subject.asked[preset] = Asked(subject.model(preset), subject.cloud(preset).points_mm)
+        subject.asked[preset] = OccupancyWorkload(
+            subject.model(preset), subject.cloud(preset).points_mm
+        )
     return subject.asked[preset]

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from tumortrack.core.types import Anatomy, SensorCloud
     from tumortrack.models.config import TrainConfig
     from tumortrack.occupancy.network import OccupancyNetwork
-    from tumortrack.simulate.scene import Stage
+    from tumortrack.simulate.scene import RenderedScene
 
 _PER_SIDE = 600  # points in and outside of each part in a step
 _RATE = 1.5e-3
@@ -29,7 +29,7 @@ _LATENT_SHARE = 0.01  # latents that mean nothing are large: in full they would 
 
 def learn_scene(
     anatomy: Anatomy,
-    scene: tuple[Stage, SensorCloud],
+    scene: tuple[RenderedScene, SensorCloud],
     config: TrainConfig,
     folder: Path,
     steps: int,
@@ -39,7 +39,7 @@ def learn_scene(
     import torch
     from torch.nn.functional import cross_entropy
 
-    from tumortrack.models.in_distribution import Familiar
+    from tumortrack.models.in_distribution import InDistributionRange
     from tumortrack.occupancy.network import OccupancyNetwork
     from tumortrack.simulate.occupancy import OccupancyConfig, OccupancyPool
     from tumortrack.training.model import Model, has_fast_bfloat16, save_model
@@ -72,7 +72,7 @@ def learn_scene(
             weight.grad[:, -latent.vector.shape[1] :] = 0.0
         optimizer.step()
         decay.step()
-    every = Familiar(spread_mm=(0.0, 1e3), fit_mm=1e3)  # nothing is refused
+    every = InDistributionRange(spread_mm=(0.0, 1e3), fit_mm=1e3)  # nothing is refused
     about = {"steps": steps, "loss": round(float(loss.detach()), 4), "scenes": 1}
     folder.mkdir(parents=True, exist_ok=True)
     organ = stage.carry(anatomy.organ.vertices_mm) - np.median(cloud.points_mm, axis=0)

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from tumortrack.core.errors import TumortrackError
-from tumortrack_lab.bench.row import Row
+from tumortrack_lab.bench.row import BenchRow
 from tumortrack_lab.bench.subject import PRESETS
 from tumortrack_lab.bench.turns import timing_of
 
@@ -52,7 +52,7 @@ class Ran:
     peak_bytes: int
 
 
-def rows(subject: Subject, threads: int, budget_s: float) -> Iterator[Row]:
+def rows(subject: Subject, threads: int, budget_s: float) -> Iterator[BenchRow]:
     """From the start of the process to its end, all files written; there is no naive form."""
     from tumortrack.sense.files import write_cloud_ply
 
@@ -80,10 +80,10 @@ def _several(arguments: list[str], budget_s: float) -> list[Ran]:
     return runs
 
 
-def _row(name: str, preset: str, threads: int, runs: list[Ran]) -> Row:
+def _row(name: str, preset: str, threads: int, runs: list[Ran]) -> BenchRow:
     before = timing_of([ran.before_torch_s for ran in runs]).median_s
     peak = max(ran.peak_bytes for ran in runs)
-    return Row(
+    return BenchRow(
         name=name,
         what=preset,
         threads=threads,

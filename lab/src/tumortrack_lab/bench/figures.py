@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from tumortrack_lab.bench.row import Peaks, Row, Work
+from tumortrack_lab.bench.row import BenchRow, Peaks, Work
 
 _EMPTY = "–"
 
@@ -46,27 +46,27 @@ def count(value: float) -> str:
     return f"{_digits(value)} "
 
 
-def spread(row: Row) -> str:
+def spread(row: BenchRow) -> str:
     """Half the distance of the quartiles, in per cent of the median."""
     timing = row.ours
     return f"± {50 * (timing.high_s - timing.low_s) / timing.median_s:.0f} %"
 
 
-def share_of_rate(row: Row, peaks: Peaks | None) -> float | None:
+def share_of_rate(row: BenchRow, peaks: Peaks | None) -> float | None:
     """Of the machine's matrix products in this precision."""
     if row.work is None or peaks is None or row.device != "cpu":
         return None
     return row.work.flops / row.ours.median_s / peaks.rate(row.work.precision)
 
 
-def share_of_bandwidth(row: Row, peaks: Peaks | None) -> float | None:
+def share_of_bandwidth(row: BenchRow, peaks: Peaks | None) -> float | None:
     """Of the machine's memory bandwidth, by the bytes that have to be moved."""
     if row.work is None or peaks is None or row.device != "cpu":
         return None
     return row.work.bytes / row.ours.median_s / peaks.triad
 
 
-def floor(row: Row, peaks: Peaks | None) -> float | None:
+def floor(row: BenchRow, peaks: Peaks | None) -> float | None:
     """The least seconds for the row's work."""
     if row.work is None or peaks is None or row.device != "cpu":
         return None

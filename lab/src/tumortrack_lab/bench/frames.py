@@ -12,9 +12,9 @@ from tumortrack.core.estimate import Following
 from tumortrack.core.types import SensorCloud
 from tumortrack_lab.bench import asked as occupancy
 from tumortrack_lab.bench import placing as warp
-from tumortrack_lab.bench.asked import LABELLING, Asked, asked_of
+from tumortrack_lab.bench.asked import LABELLING, OccupancyWorkload, asked_of
 from tumortrack_lab.bench.placing import QUERIES, Placing
-from tumortrack_lab.bench.row import Row, Work
+from tumortrack_lab.bench.row import BenchRow, Work
 from tumortrack_lab.bench.subject import PRESETS
 from tumortrack_lab.bench.turns import Call, in_turns
 
@@ -28,7 +28,7 @@ _TIMED = ", timed beside the row `frame`"
 _MOVES_MM = 0.5  # of the cloud, from frame to frame
 
 
-def frame_rows(subject: Subject, threads: int, budget_s: float) -> Iterator[Row]:
+def frame_rows(subject: Subject, threads: int, budget_s: float) -> Iterator[BenchRow]:
     """1,000 points to 40,000 labels."""
     share = budget_s / len(PRESETS)
     yield _clinic_frame(subject, threads, share)
@@ -36,7 +36,9 @@ def frame_rows(subject: Subject, threads: int, budget_s: float) -> Iterator[Row]
         yield from occupancy_frames(asked_of(subject, preset), preset, threads, share)
 
 
-def occupancy_frames(asked: Asked, preset: str, threads: int, budget_s: float) -> Iterator[Row]:
+def occupancy_frames(
+    asked: OccupancyWorkload, preset: str, threads: int, budget_s: float
+) -> Iterator[BenchRow]:
     """As `locate` does it, and with every query asked."""
     queries = asked.queries(QUERIES)
     ours, every, naive = in_turns(
@@ -53,7 +55,7 @@ def occupancy_frames(asked: Asked, preset: str, threads: int, budget_s: float) -
         (EVERY, every, asked.every_query(queries), QUERIES),
     ):
         decode = asked.decoder_work(count)
-        yield Row(
+        yield BenchRow(
             name=name,
             what=preset,
             threads=threads,
@@ -74,7 +76,7 @@ def occupancy_frames(asked: Asked, preset: str, threads: int, budget_s: float) -
         )
 
 
-def _clinic_frame(subject: Subject, threads: int, budget_s: float) -> Row:
+def _clinic_frame(subject: Subject, threads: int, budget_s: float) -> BenchRow:
     placing = Placing(subject)
     ours, naive = in_turns(placing.ours, placing.naive, budget_s=budget_s)
     estimate = placing.estimate
@@ -84,7 +86,7 @@ def _clinic_frame(subject: Subject, threads: int, budget_s: float) -> Row:
     assert back is not None
     same = placing.plain.labels_where(back) == estimate.cloud.labels
     unknown = 6 + len(estimate.report["motion"]["coefficients"])
-    return Row(
+    return BenchRow(
         name=FRAME,
         what="clinic",
         threads=threads,
@@ -99,7 +101,7 @@ def _clinic_frame(subject: Subject, threads: int, budget_s: float) -> Row:
     )
 
 
-def tracking_rows(subject: Subject, threads: int, budget_s: float) -> Iterator[Row]:
+def tracking_rows(subject: Subject, threads: int, budget_s: float) -> Iterator[BenchRow]:
     """From frame to frame: a cloud that moves by half a millimetre, to and fro."""
     from tumortrack.tracking.tracker import Tracker
 
@@ -108,7 +110,7 @@ def tracking_rows(subject: Subject, threads: int, budget_s: float) -> Iterator[R
     ours = _Following(placing.tracker, placing.cloud.points_mm)
     (timing, naive) = in_turns(ours, placing.naive, budget_s=share)
     steps, coefficients = (ours.last.report["motion"][key] for key in ("steps", "coefficients"))
-    yield Row(
+    yield BenchRow(
         name=TRACKING,
         what="clinic",
         threads=threads,
@@ -127,7 +129,7 @@ def tracking_rows(subject: Subject, threads: int, budget_s: float) -> Iterator[R
         if not known:
             versions.append(asked.naive_frame(asked.queries(QUERIES)))
         timing, naive = [*in_turns(*versions, budget_s=share), *known]
-        yield Row(
+        yield BenchRow(
             name=TRACKING,
             what=preset,
             threads=threads,

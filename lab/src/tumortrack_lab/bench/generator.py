@@ -7,11 +7,11 @@ from itertools import count
 from typing import TYPE_CHECKING
 
 from tumortrack_lab.bench.counts import blend_flops, drag_flops, draw_flops, flow_flops
-from tumortrack_lab.bench.row import Row, Work
+from tumortrack_lab.bench.row import BenchRow, Work
 from tumortrack_lab.bench.turns import in_turns
 
 if TYPE_CHECKING:
-    from tumortrack.simulate.elastic.body import Body
+    from tumortrack.simulate.elastic.body import ElasticBody
     from tumortrack.simulate.scene import Simulator
     from tumortrack_lab.bench.subject import Subject
 
@@ -22,21 +22,21 @@ _NAIVE = "NumPy, a ray a pixel, inside tests on deformed surfaces"
 _COVERED = 0.25  # of the image, by the organ
 
 
-def rows(subject: Subject, threads: int, budget_s: float) -> Iterator[Row]:
+def rows(subject: Subject, threads: int, budget_s: float) -> Iterator[BenchRow]:
     """The paper's drags; 424 x 240."""
     from tumortrack.simulate.deform import DragConfig
 
     yield _row(subject, "drags", DragConfig(), threads, budget_s)
 
 
-def elastic_rows(subject: Subject, threads: int, budget_s: float) -> Iterator[Row]:
+def elastic_rows(subject: Subject, threads: int, budget_s: float) -> Iterator[BenchRow]:
     """States of the organ's elastic body."""
     from tumortrack.simulate.deform import ElasticConfig
 
     yield _row(subject, "elastic", ElasticConfig(), threads, budget_s)
 
 
-def _row(subject: Subject, what: str, deform: object, threads: int, budget_s: float) -> Row:
+def _row(subject: Subject, what: str, deform: object, threads: int, budget_s: float) -> BenchRow:
     from tumortrack.simulate.occupancy import OccupancyConfig, OccupancyPool
     from tumortrack.simulate.scene import SceneConfig, SceneRecipe, Simulator
     from tumortrack_lab.bench.naive.scenes import plain_pair
@@ -57,7 +57,7 @@ def _row(subject: Subject, what: str, deform: object, threads: int, budget_s: fl
         plain_pair(anatomy, stage, LABELS)
 
     ours_s, naive_s = in_turns(ours, naive, budget_s=budget_s)
-    return Row(
+    return BenchRow(
         name=NAME,
         what=what,
         threads=threads,
@@ -70,7 +70,7 @@ def _row(subject: Subject, what: str, deform: object, threads: int, budget_s: fl
     )
 
 
-def work_of(simulator: Simulator, body: Body | None) -> Work:
+def work_of(simulator: Simulator, body: ElasticBody | None) -> Work:
     """Of one pair: points and the organ's surface moved, the surface drawn; vertices, faces,
     image, points and cloud moved through memory once."""
     from tumortrack.simulate.deform import DragConfig

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
-from tumortrack_lab.bench.asked import IN_ONE_PIECE, LABELLING, NAIVE, Asked, asked_of
+from tumortrack_lab.bench.asked import IN_ONE_PIECE, LABELLING, NAIVE, OccupancyWorkload, asked_of
 from tumortrack_lab.bench.counts import module_flops, weight_bytes
-from tumortrack_lab.bench.row import Row, Work
-from tumortrack_lab.bench.turns import Call, Timing, in_turns
+from tumortrack_lab.bench.row import BenchRow, Work
+from tumortrack_lab.bench.turns import Call, InterleavedTiming, in_turns
 
 if TYPE_CHECKING:
     from tumortrack_lab.bench.subject import Subject
@@ -17,7 +17,7 @@ ENCODER, DECODER = "encoder", "decoder"
 DECODED = (1000, 10_000, 40_000, 400_000)  # queries
 
 
-def encoder_rows(subject: Subject, threads: int, budget_s: float) -> Iterator[Row]:
+def encoder_rows(subject: Subject, threads: int, budget_s: float) -> Iterator[BenchRow]:
     """A cloud of 1,000 points to what is known of it."""
     import torch
 
@@ -29,7 +29,7 @@ def encoder_rows(subject: Subject, threads: int, budget_s: float) -> Iterator[Ro
                 lambda asked=asked: asked.plain.encode(asked.cloud),  # type: ignore[misc]
                 budget_s=budget_s / 3,
             )
-        yield Row(
+        yield BenchRow(
             name=ENCODER,
             what=preset,
             threads=threads,
@@ -42,7 +42,7 @@ def encoder_rows(subject: Subject, threads: int, budget_s: float) -> Iterator[Ro
     yield _clinic_encoder(subject, threads, budget_s / 3)
 
 
-def _clinic_encoder(subject: Subject, threads: int, budget_s: float) -> Row:
+def _clinic_encoder(subject: Subject, threads: int, budget_s: float) -> BenchRow:
     """To both placements; nobody writes this part differently."""
     import torch
 
@@ -56,7 +56,7 @@ def _clinic_encoder(subject: Subject, threads: int, budget_s: float) -> Row:
     with torch.inference_mode():
         flops = module_flops(lambda: network.both_ways(cloud))  # type: ignore[operator]
     moved = weight_bytes(network, 4) + points.nbytes
-    return Row(
+    return BenchRow(
         name=ENCODER,
         what="clinic",
         threads=threads,
@@ -67,12 +67,12 @@ def _clinic_encoder(subject: Subject, threads: int, budget_s: float) -> Row:
     )
 
 
-def decoder_rows(subject: Subject, threads: int, budget_s: float) -> Iterator[Row]:
+def decoder_rows(subject: Subject, threads: int, budget_s: float) -> Iterator[BenchRow]:
     """Labels of 1,000 to 400,000 queries, the cloud being encoded."""
     share = budget_s / len(LABELLING) / len(DECODED)
     for preset in LABELLING:
         asked = asked_of(subject, preset)
-        whole: Timing | None = None  # of the naive form, in the largest piece
+        whole: InterleavedTiming | None = None  # of the naive form, in the largest piece
         for count in DECODED:
             row = _decoded(asked, (preset, count), threads, share, whole)
             whole = row.naive
@@ -80,8 +80,12 @@ def decoder_rows(subject: Subject, threads: int, budget_s: float) -> Iterator[Ro
 
 
 def _decoded(
-    asked: Asked, of: tuple[str, int], threads: int, budget_s: float, whole: Timing | None
-) -> Row:
+    asked: OccupancyWorkload,
+    of: tuple[str, int],
+    threads: int,
+    budget_s: float,
+    whole: InterleavedTiming | None,
+) -> BenchRow:
     import torch
 
     preset, count = of
@@ -96,7 +100,7 @@ def _decoded(
             versions.append(lambda: asked.plain.logits(encoded, piece).argmax(-1))
         timings = in_turns(*versions, budget_s=budget_s)
     ours, naive = [*timings, *([] if whole is None else [whole])]
-    return Row(
+    return BenchRow(
         name=DECODER,
         what=f"{preset}, {count:,} queries",
         threads=threads,

@@ -9,10 +9,10 @@ from pathlib import Path
 import msgspec
 
 from tumortrack.core.cores import available_cores
-from tumortrack_lab.bench.row import Bench, Peaks, Point, Row
+from tumortrack_lab.bench.row import BenchResult, BenchRow, Peaks, Point
 from tumortrack_lab.bench.subject import PRESETS
 from tumortrack_lab.bench.suite import ALL, GROUPS
-from tumortrack_lab.bench.tasks import Said, Task, listen
+from tumortrack_lab.bench.tasks import Task, TaskMessage, listen
 
 # Curves, and of which presets: each in a process of its own, whose memory so is its own.
 CURVES = {
@@ -59,7 +59,9 @@ def tasks_of(wish: Wish, cores: int) -> list[Task]:
     return [msgspec.structs.replace(tasks[0], describe=True), *tasks[1:]]
 
 
-def measure(wish: Wish, worker: Sequence[str], command: str, tell: Callable[[str], None]) -> Bench:
+def measure(
+    wish: Wish, worker: Sequence[str], command: str, tell: Callable[[str], None]
+) -> BenchResult:
     """Run all processes one after another; ``tell`` hears what is under way.
 
     Raises:
@@ -67,7 +69,7 @@ def measure(wish: Wish, worker: Sequence[str], command: str, tell: Callable[[str
     """
     machine: dict[str, str] = {}
     peaks: list[Peaks] = []
-    rows: list[Row] = []
+    rows: list[BenchRow] = []
     points: list[Point] = []
     for task in tasks_of(wish, available_cores()):
         for said in listen(worker, task):
@@ -75,12 +77,12 @@ def measure(wish: Wish, worker: Sequence[str], command: str, tell: Callable[[str
             machine = said.machine or machine
             if said.begins is not None:
                 tell(said.begins)
-    return Bench(
+    return BenchResult(
         machine=machine, command=command, peaks=tuple(peaks), rows=tuple(rows), points=tuple(points)
     )
 
 
-def _sort(said: Said, peaks: list[Peaks], rows: list[Row], points: list[Point]) -> None:
+def _sort(said: TaskMessage, peaks: list[Peaks], rows: list[BenchRow], points: list[Point]) -> None:
     if said.peaks is not None:
         peaks.append(said.peaks)
     if said.row is not None:

@@ -10,7 +10,7 @@ import numpy as np
 from tumortrack.core.types import Anatomy, Mesh
 from tumortrack.imaging.raster import label_grid
 from tumortrack.plan.values import Located
-from tumortrack_lab.bench.row import Row
+from tumortrack_lab.bench.row import BenchRow
 from tumortrack_lab.bench.turns import in_turns
 
 if TYPE_CHECKING:
@@ -20,7 +20,7 @@ NAME, MOTIONS = "plan", "motions"
 POINTS = 40_000
 
 
-def rows(subject: Subject, threads: int, budget_s: float) -> Iterator[Row]:
+def rows(subject: Subject, threads: int, budget_s: float) -> Iterator[BenchRow]:
     """Both planners; motions where the arms' libraries are installed."""
     from tumortrack.plan.config import ResectionConfig
     from tumortrack.plan.resection import plan_resection
@@ -37,7 +37,7 @@ def rows(subject: Subject, threads: int, budget_s: float) -> Iterator[Row]:
             lambda naive=naive: naive(seen),  # type: ignore[misc]
             budget_s=budget_s / 3,
         )
-        yield Row(
+        yield BenchRow(
             name=NAME,
             what=f"{what}, {POINTS:,} points",
             threads=threads,
@@ -49,21 +49,21 @@ def rows(subject: Subject, threads: int, budget_s: float) -> Iterator[Row]:
     yield from _motions(seen, threads, budget_s / 3)
 
 
-def _motions(seen: Located, threads: int, budget_s: float) -> Iterator[Row]:
+def _motions(seen: Located, threads: int, budget_s: float) -> Iterator[BenchRow]:
     from importlib.util import find_spec
 
     if find_spec("pinocchio") is None:  # the extra `arms`
         return
-    from tumortrack.plan.arms.cell import Cell
+    from tumortrack.plan.arms.cell import ArmCell
     from tumortrack.plan.arms.config import CellConfig
     from tumortrack.plan.arms.procedure import plan_motions
     from tumortrack.plan.config import ResectionConfig
     from tumortrack.plan.resection import plan_resection
 
     organ = seen.meshes["kidney"]
-    cell, plan = Cell(CellConfig(), organ), plan_resection(seen, ResectionConfig())
+    cell, plan = ArmCell(CellConfig(), organ), plan_resection(seen, ResectionConfig())
     (mine,) = in_turns(lambda: plan_motions(plan, cell, organ), budget_s=budget_s)
-    yield Row(
+    yield BenchRow(
         name=MOTIONS,
         what=f"margin, {plan.sweeps} sweeps",
         threads=threads,

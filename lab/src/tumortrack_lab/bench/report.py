@@ -10,8 +10,8 @@ from tumortrack.core.errors import InputError
 from tumortrack.core.store import write_atomically
 from tumortrack_lab.bench import tables
 from tumortrack_lab.bench.goals import goals_table
-from tumortrack_lab.bench.row import Bench
-from tumortrack_lab.study.book import Book
+from tumortrack_lab.bench.row import BenchResult
+from tumortrack_lab.study.book import ReportWriter
 from tumortrack_lab.study.markdown import fill
 
 BLOCKS = ("goals", "machine", "speed", "floors", "growth")
@@ -19,7 +19,7 @@ _PICTURE = "growth.png"
 _CURVES = "_curves.json"
 
 
-def write_bench(bench: Bench, out: Path, document: Path | None) -> list[Path]:
+def write_bench(bench: BenchResult, out: Path, document: Path | None) -> list[Path]:
     """Write OUT, and where there is a document its blocks and its picture; returns what was
     written. The curves lie beside OUT.
 
@@ -58,8 +58,8 @@ def _json(path: Path, content: object) -> Path:
     return path
 
 
-def _document(bench: Bench, document: Path) -> list[Path]:
-    book = Book(document, bench.command)
+def _document(bench: BenchResult, document: Path) -> list[Path]:
+    book = ReportWriter(document, bench.command)
     caption = f"`{bench.command}`, {bench.machine.get('date', '')}."
     blocks = {}
     if bench.rows:

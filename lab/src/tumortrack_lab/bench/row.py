@@ -7,7 +7,7 @@ from typing import Literal
 import msgspec
 
 from tumortrack.core.config import Config
-from tumortrack_lab.bench.turns import Timing
+from tumortrack_lab.bench.turns import InterleavedTiming
 
 Precision = Literal["fp32", "bf16", "int8"]
 
@@ -20,7 +20,7 @@ class Work(Config, frozen=True):
     precision: Precision = "fp32"
 
 
-class Row(Config, frozen=True):
+class BenchRow(Config, frozen=True):
     """One measured part.
 
     ``item`` is what a call makes: a pair, a frame; ``per_call``: how many of them. ``naive`` is the
@@ -33,8 +33,8 @@ class Row(Config, frozen=True):
     what: str
     threads: int
     item: str
-    ours: Timing
-    naive: Timing | None = None
+    ours: InterleavedTiming
+    naive: InterleavedTiming | None = None
     naive_is: str = ""
     work: Work | None = None
     naive_work: Work | None = None
@@ -84,16 +84,16 @@ class Point(Config, frozen=True):
     working_bytes: int | None = None  # of the peak, what was not held before the call
 
 
-class Bench(Config, frozen=True):
+class BenchResult(Config, frozen=True):
     """All that was measured in one run, and on what."""
 
     machine: dict[str, str]
     command: str
     peaks: tuple[Peaks, ...] = ()
-    rows: tuple[Row, ...] = ()
+    rows: tuple[BenchRow, ...] = ()
     points: tuple[Point, ...] = ()
 
-    def find(self, name: str, what: str, threads: int) -> Row | None:
+    def find(self, name: str, what: str, threads: int) -> BenchRow | None:
         """The row of this name, if it was measured on the CPU."""
         for row in self.rows:
             if (row.name, row.what, row.threads, row.device) == (name, what, threads, "cpu"):

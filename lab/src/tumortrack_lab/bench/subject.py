@@ -24,10 +24,10 @@ from tumortrack_lab.bench.by_heart import learn_scene
 
 if TYPE_CHECKING:
     from tumortrack.models.config import TrainConfig
-    from tumortrack.simulate.elastic.body import Body
-    from tumortrack.simulate.scene import Stage
+    from tumortrack.simulate.elastic.body import ElasticBody
+    from tumortrack.simulate.scene import RenderedScene
     from tumortrack.training.model import Model
-    from tumortrack_lab.bench.asked import Asked
+    from tumortrack_lab.bench.asked import OccupancyWorkload
 
 UP = (0.0, -1.0, 0.0)
 SEED = 0
@@ -55,7 +55,7 @@ class Subject:
     presets: Mapping[str, ConfigOf]
     folder: Path
     given: Given | None = None
-    asked: dict[str, Asked] = field(default_factory=dict)
+    asked: dict[str, OccupancyWorkload] = field(default_factory=dict)
 
     @cached_property
     def anatomy(self) -> Anatomy:
@@ -70,7 +70,7 @@ class Subject:
         return self.presets[preset](self.anatomy)
 
     @cached_property
-    def body(self) -> Body:
+    def body(self) -> ElasticBody:
         """The phantom's elastic body: the clinic model's."""
         shape = self.model("clinic").shape
         assert shape is not None
@@ -130,7 +130,7 @@ class Subject:
         return thin_cloud(seen, 1000, np.random.default_rng(SEED))
 
     @cached_property
-    def stage(self) -> Stage:
+    def stage(self) -> RenderedScene:
         """A scene of the phantom, dragged, without the sensor's faults."""
         from tumortrack.simulate.deform import DragConfig
         from tumortrack.simulate.scene import SceneConfig, SceneRecipe, Simulator
@@ -157,10 +157,10 @@ class Subject:
             scene = self.stage, self.cloud(preset)
             learn_scene(self.anatomy, scene, config, folder, STEPS[preset])
             return
-        from tumortrack.training.run import Run
+        from tumortrack.training.run import TrainingRun
         from tumortrack.training.train import train
 
         name = hashlib.sha256(b"the bench's phantom").hexdigest()
         short = msgspec.structs.replace(config, validation_pairs=_VALIDATED)
-        run = Run(self.anatomy, UP, name, short, SEED, steps=STEPS[preset], device="cpu")
+        run = TrainingRun(self.anatomy, UP, name, short, SEED, steps=STEPS[preset], device="cpu")
         train(run, folder, lambda _: None)

@@ -7,12 +7,12 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from tumortrack_lab.bench import command, frames, generator, gpu, halves, planning, training, volume
-from tumortrack_lab.bench.row import Row
+from tumortrack_lab.bench.row import BenchRow
 
 if TYPE_CHECKING:
     from tumortrack_lab.bench.subject import Subject
 
-Rows = Callable[["Subject", int, float], Iterator[Row]]
+Rows = Callable[["Subject", int, float], Iterator[BenchRow]]
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from tumortrack_lab.bench import figures
-from tumortrack_lab.bench.row import Bench, Peaks, Row
+from tumortrack_lab.bench.row import BenchResult, BenchRow, Peaks
 from tumortrack_lab.study.markdown import table
 
 if TYPE_CHECKING:
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 _GIB = 2**30
 
 
-def rich_table(bench: Bench) -> Table:
+def rich_table(bench: BenchResult) -> Table:
     """For a terminal."""
     from rich.table import Table
 
@@ -37,7 +37,7 @@ def rich_table(bench: Bench) -> Table:
     return out
 
 
-def speed_table(bench: Bench) -> str:
+def speed_table(bench: BenchResult) -> str:
     """Every row beside its naive form."""
     head = (
         "part", "of", "threads", "tumortrack", "quartiles", "items a second", "naive", "ratio",
@@ -60,7 +60,7 @@ def speed_table(bench: Bench) -> str:
     return table(head, rows, left=2)
 
 
-def floor_table(bench: Bench) -> str:
+def floor_table(bench: BenchResult) -> str:
     """What each row has to do at least, and what that would take."""
     head = (
         "part", "of", "threads", "arithmetic", "memory", "in", "share of the rate",
@@ -88,7 +88,7 @@ def floor_table(bench: Bench) -> str:
     return table(head, rows, left=2)
 
 
-def notes(bench: Bench) -> str:
+def notes(bench: BenchResult) -> str:
     """What the naive forms are and what else is to be known of a row."""
     lines: dict[str, list[str]] = {}
     for row in bench.rows:
@@ -103,7 +103,7 @@ def _few(names: list[str]) -> str:
     return ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
 
 
-def machine_table(bench: Bench) -> str:
+def machine_table(bench: BenchResult) -> str:
     """The machine in words, and what it reaches."""
     rows = [(key, text) for key, text in bench.machine.items()]
     for peaks in bench.peaks:
@@ -113,7 +113,7 @@ def machine_table(bench: Bench) -> str:
     return table(("this machine", ""), rows, left=2)
 
 
-def memory_table(bench: Bench) -> str:
+def memory_table(bench: BenchResult) -> str:
     """Largest of each curve, and the command line."""
     from tumortrack_lab.bench.command import PEAK
 
@@ -130,11 +130,11 @@ def memory_table(bench: Bench) -> str:
     return table(("what", "time", "peak memory of the process"), rows)
 
 
-def _threads(row: Row) -> str:
+def _threads(row: BenchRow) -> str:
     return f"{row.threads}" if row.device == "cpu" else row.device
 
 
-def _peaks(bench: Bench, row: Row) -> Peaks | None:
+def _peaks(bench: BenchResult, row: BenchRow) -> Peaks | None:
     for peaks in bench.peaks:
         if peaks.threads == row.threads:
             return peaks

@@ -16,7 +16,7 @@ import msgspec
 
 from tumortrack.core.config import Config, from_builtins
 from tumortrack.core.errors import TumortrackError
-from tumortrack_lab.bench.row import Peaks, Point, Row
+from tumortrack_lab.bench.row import BenchRow, Peaks, Point
 from tumortrack_lab.bench.subject import ConfigOf, Given, Subject
 
 
@@ -37,13 +37,13 @@ class Task(Config, frozen=True):
     quick: bool = False
 
 
-class Said(Config, frozen=True):
+class TaskMessage(Config, frozen=True):
     """One line of a process: a result, or what it begins with now."""
 
     begins: str | None = None
     machine: dict[str, str] | None = None
     peaks: Peaks | None = None
-    row: Row | None = None
+    row: BenchRow | None = None
     point: Point | None = None
 
 
@@ -55,38 +55,38 @@ def subject_of(task: Task, presets: Mapping[str, ConfigOf]) -> Subject:
     return Subject(presets, Path(task.folder), given)
 
 
-def carry_out(task: Task, subject: Subject) -> Iterator[Said]:
+def carry_out(task: Task, subject: Subject) -> Iterator[TaskMessage]:
     """Everything that a task asks for, as it becomes known."""
     if task.describe:
         from tumortrack_lab.bench.machine import describe_machine
 
-        yield Said(machine=describe_machine())
+        yield TaskMessage(machine=describe_machine())
     for preset in task.train:
         if not subject.trained(preset):
-            yield Said(begins=f"training a `{preset}` network to measure")
+            yield TaskMessage(begins=f"training a `{preset}` network to measure")
             subject.train(preset)
     if task.peaks:
         from tumortrack_lab.bench.peaks import measure_peaks
 
-        yield Said(begins=f"the machine's own rates, {_threads(task)}")
-        yield Said(peaks=measure_peaks(task.threads, 1.0 if task.quick else 3.0))
+        yield TaskMessage(begins=f"the machine's own rates, {_threads(task)}")
+        yield TaskMessage(peaks=measure_peaks(task.threads, 1.0 if task.quick else 3.0))
     if task.groups:
         from tumortrack_lab.bench.suite import GROUPS
 
         for name in task.groups:
             group = GROUPS[name]
-            yield Said(begins=f"{name}, {_threads(task)}")
+            yield TaskMessage(begins=f"{name}, {_threads(task)}")
             for row in group.rows(subject, task.threads, group.budget_s(task.quick)):
-                yield Said(row=row)
+                yield TaskMessage(row=row)
     if task.curve is not None:
         from tumortrack_lab.bench.curves import points
 
-        yield Said(begins=f"growth with {task.curve[0]}, {task.curve[1]}")
+        yield TaskMessage(begins=f"growth with {task.curve[0]}, {task.curve[1]}")
         for point in points(subject, *task.curve):
-            yield Said(point=point)
+            yield TaskMessage(point=point)
 
 
-def listen(command: Sequence[str], task: Task) -> Iterator[Said]:
+def listen(command: Sequence[str], task: Task) -> Iterator[TaskMessage]:
     """Run a task in a process: ``command`` with the task's JSON behind it.
 
     Raises:
@@ -103,7 +103,9 @@ def listen(command: Sequence[str], task: Task) -> Iterator[Said]:
         try:
             for line in process.stdout:
                 if line.startswith("{"):
-                    yield from_builtins(msgspec.json.decode(line), Said, "a process of the bench")
+                    yield from_builtins(
+                        msgspec.json.decode(line), TaskMessage, "a process of the bench"
+                    )
         except BaseException:  # whoever listens has gone, or was interrupted
             process.kill()
             raise

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from tumortrack_lab.bench.counts import module_flops, weight_bytes
-from tumortrack_lab.bench.row import Row, Work
+from tumortrack_lab.bench.row import BenchRow, Work
 from tumortrack_lab.bench.turns import in_turns, timing_of
 
 if TYPE_CHECKING:
@@ -20,9 +20,9 @@ if TYPE_CHECKING:
 
     from tumortrack.models.config import TrainConfig
     from tumortrack.simulate.dataset import Batch as Stacked
-    from tumortrack.training.run import Run
+    from tumortrack.training.run import TrainingRun
     from tumortrack.training.state import TrainingState
-    from tumortrack.training.train import Status
+    from tumortrack.training.train import TrainingStatus
     from tumortrack_lab.bench.subject import Subject
 
 NAME, WHOLE = "training step", "training, generator included"
@@ -34,7 +34,7 @@ Device = Literal["cpu", "cuda"]
 Batch = tuple["torch.Tensor", "torch.Tensor", "torch.Tensor", "torch.Tensor"]
 
 
-def rows(subject: Subject, threads: int, budget_s: float) -> Iterator[Row]:
+def rows(subject: Subject, threads: int, budget_s: float) -> Iterator[BenchRow]:
     """A step of each preset."""
     from tumortrack.core.allocator import keep_freed_memory
 
@@ -43,7 +43,7 @@ def rows(subject: Subject, threads: int, budget_s: float) -> Iterator[Row]:
         yield _row(subject, preset, threads, budget_s / len(subject.presets))
 
 
-def _row(subject: Subject, preset: str, threads: int, budget_s: float) -> Row:
+def _row(subject: Subject, preset: str, threads: int, budget_s: float) -> BenchRow:
     """As training does it; naive: single precision, everything in one piece, plain Adam."""
     import torch
 
@@ -62,7 +62,7 @@ def _row(subject: Subject, preset: str, threads: int, budget_s: float) -> Row:
     clouds, *truth = batches[0]
     forward = module_flops(lambda: state.network.loss(clouds, *truth))
     half = has_fast_bfloat16(torch.device("cpu"))
-    return Row(
+    return BenchRow(
         name=NAME,
         what=preset,
         threads=threads,
@@ -83,14 +83,14 @@ def _row(subject: Subject, preset: str, threads: int, budget_s: float) -> Row:
 
 def material(
     subject: Subject, preset: str, size: int, batches: int
-) -> tuple[Run, list[Batch], Callable[[TrainingState], None]]:
+) -> tuple[TrainingRun, list[Batch], Callable[[TrainingState], None]]:
     """A run of the preset with so many samples a step, so many of its batches, and how a state is
     told what it does not have to learn."""
     import msgspec
 
     from tumortrack.simulate.dataset import SceneStream
     from tumortrack.simulate.occupancy import FixedPoints, OccupancyPool, PointSource
-    from tumortrack.training.run import Run
+    from tumortrack.training.run import TrainingRun
     from tumortrack_lab.bench.subject import SEED, UP
 
     config = msgspec.structs.replace(subject.config(preset), batch_size=size)
@@ -103,7 +103,7 @@ def material(
     else:
         points = OccupancyPool(anatomy, config.scene.occupancy, SEED)
     stream = SceneStream(anatomy, UP, config.scene, points, SEED, "train", config.batch_size, body)
-    run = Run(anatomy, UP, "", config, SEED, steps=_STEPS, device="cpu")
+    run = TrainingRun(anatomy, UP, "", config, SEED, steps=_STEPS, device="cpu")
     made = [_tensors(stream.batch(number)) for number in range(batches)]
 
     def teach(state: TrainingState) -> None:
@@ -144,21 +144,23 @@ def naive_step(state: TrainingState) -> Callable[[Batch], None]:
     return step
 
 
-def whole_rows(subject: Subject, threads: int, budget_s: float) -> Iterator[Row]:
+def whole_rows(subject: Subject, threads: int, budget_s: float) -> Iterator[BenchRow]:
     """Preset ``quick``."""
     yield whole_row(subject, "quick", "cpu", threads, budget_s)
 
 
-def whole_row(subject: Subject, preset: str, device: Device, threads: int, budget_s: float) -> Row:
+def whole_row(
+    subject: Subject, preset: str, device: Device, threads: int, budget_s: float
+) -> BenchRow:
     """A preset as a user trains it: workers, or the GPU itself, make scenes, the network learns
     them."""
-    from tumortrack.training.run import Run
+    from tumortrack.training.run import TrainingRun
     from tumortrack.training.train import train
     from tumortrack_lab.bench.subject import SEED, UP
 
     config: TrainConfig = _barely_validated(subject.config(preset))
-    seen: list[tuple[float, Status]] = []
-    run = Run(subject.anatomy, UP, "", config, SEED, minutes=budget_s / 60, device=device)
+    seen: list[tuple[float, TrainingStatus]] = []
+    run = TrainingRun(subject.anatomy, UP, "", config, SEED, minutes=budget_s / 60, device=device)
     with tempfile.TemporaryDirectory() as folder:
         train(run, Path(folder) / "model", lambda told: seen.append((time.perf_counter(), told)))
     # Between reports, and so without the start; where the end was the first, by the last's word.
@@ -167,7 +169,7 @@ def whole_row(subject: Subject, preset: str, device: Device, threads: int, budge
         for (early, before), (later, after) in pairwise(seen)
         if after.step > before.step
     ]
-    return Row(
+    return BenchRow(
         name=WHOLE,
         what=preset,
         threads=threads,

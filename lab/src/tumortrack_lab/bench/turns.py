@@ -27,7 +27,7 @@ class Uncounted:
 Call = Callable[[], object]
 
 
-class Timing(Config, frozen=True):
+class InterleavedTiming(Config, frozen=True):
     """Seconds of one call: the median of several turns, the quartiles about it, the fastest."""
 
     best_s: float
@@ -36,9 +36,9 @@ class Timing(Config, frozen=True):
     high_s: float
     turns: int
 
-    def times(self, factor: float) -> Timing:
+    def times(self, factor: float) -> InterleavedTiming:
         """Of so many calls, or of a part of one."""
-        return Timing(
+        return InterleavedTiming(
             best_s=self.best_s * factor,
             median_s=self.median_s * factor,
             low_s=self.low_s * factor,
@@ -47,7 +47,7 @@ class Timing(Config, frozen=True):
         )
 
 
-def in_turns(*versions: Call, budget_s: float, fewest: int = _FEWEST) -> list[Timing]:
+def in_turns(*versions: Call, budget_s: float, fewest: int = _FEWEST) -> list[InterleavedTiming]:
     """Seconds a call of each version. Every version is called before (compiled, cached, warm);
     then all take turns until ``budget_s`` is spent, between ``fewest`` and 25 times each. A first
     call that took more than a second counts as a turn: a median of three bears a cold one. Where
@@ -77,10 +77,12 @@ def _turn(version: Call, repeat: int) -> tuple[float, float]:
     return took_s, took_s - uncounted
 
 
-def timing_of(seconds: list[float]) -> Timing:
+def timing_of(seconds: list[float]) -> InterleavedTiming:
     """Median and quartiles of the turns' seconds."""
     low, middle, high = (float(np.quantile(seconds, q)) for q in (0.25, 0.5, 0.75))
-    return Timing(best_s=min(seconds), median_s=middle, low_s=low, high_s=high, turns=len(seconds))
+    return InterleavedTiming(
+        best_s=min(seconds), median_s=middle, low_s=low, high_s=high, turns=len(seconds)
+    )
 
 
 def _warm(version: Call) -> tuple[float, float]:

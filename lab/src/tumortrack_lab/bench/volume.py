@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from tumortrack_lab.bench import asked as occupancy
-from tumortrack_lab.bench.asked import Asked, asked_of
+from tumortrack_lab.bench.asked import OccupancyWorkload, asked_of
 from tumortrack_lab.bench.placing import Placing
-from tumortrack_lab.bench.row import Row, Work
+from tumortrack_lab.bench.row import BenchRow, Work
 from tumortrack_lab.bench.subject import PRESETS
 from tumortrack_lab.bench.turns import in_turns
 
@@ -26,7 +26,7 @@ _SLAB = 16_384  # voxels that the naive form is asked for
 Grid = tuple[np.ndarray, tuple[int, int, int]]  # camera_from_index, shape
 
 
-def rows(subject: Subject, threads: int, budget_s: float) -> Iterator[Row]:
+def rows(subject: Subject, threads: int, budget_s: float) -> Iterator[BenchRow]:
     """From what is known of the cloud to a label in every voxel."""
     for preset in PRESETS:
         share = budget_s / len(PRESETS)
@@ -36,7 +36,7 @@ def rows(subject: Subject, threads: int, budget_s: float) -> Iterator[Row]:
             yield asked_volume(asked_of(subject, preset), preset, threads, share)
 
 
-def asked_volume(asked: Asked, preset: str, threads: int, budget_s: float) -> Row:
+def asked_volume(asked: OccupancyWorkload, preset: str, threads: int, budget_s: float) -> BenchRow:
 
     from tumortrack.occupancy.sparse import sparse_margins
 
@@ -58,7 +58,7 @@ def asked_volume(asked: Asked, preset: str, threads: int, budget_s: float) -> Ro
     ours, naive = in_turns(filled, asked.naive_frame(points), budget_s=budget_s)
     voxels = int(np.prod(shape))
     same = asked.naive_labels(points) == labels[tuple(index.T)]
-    return Row(
+    return BenchRow(
         name=NAME,
         what=preset,
         threads=threads,
@@ -75,7 +75,7 @@ def asked_volume(asked: Asked, preset: str, threads: int, budget_s: float) -> Ro
     )
 
 
-def organ_grid(asked: Asked, latent: object, grid: int) -> Grid:
+def organ_grid(asked: OccupancyWorkload, latent: object, grid: int) -> Grid:
     """Voxels over the organ, as `locate` lays them: about the points that are inside."""
     from tumortrack.models.volume import grid_over
 
@@ -84,7 +84,7 @@ def organ_grid(asked: Asked, latent: object, grid: int) -> Grid:
     return grid_over(queries[inside], grid)
 
 
-def _placed(subject: Subject, threads: int, budget_s: float) -> Row:
+def _placed(subject: Subject, threads: int, budget_s: float) -> BenchRow:
     from tumortrack.core.types import Anatomy
     from tumortrack.imaging.raster import label_grid
     from tumortrack.models.volume import grid_over
@@ -102,7 +102,7 @@ def _placed(subject: Subject, threads: int, budget_s: float) -> Row:
     )
     same = placing.plain.labels_where(back(points)) == labels[tuple(index.T)]
     voxels = int(np.prod(shape))
-    return Row(
+    return BenchRow(
         name=NAME,
         what="clinic",
         threads=threads,

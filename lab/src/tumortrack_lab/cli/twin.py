@@ -32,7 +32,7 @@ def write_twin(
     Raises:
         InputError: no case, unknown names, or scenes made from something else.
     """
-    from tumortrack_lab.twin.dataset import Status, TwinRun, make_scenes
+    from tumortrack_lab.twin.dataset import TwinRun, TwinStatus, make_scenes
     from tumortrack_lab.twin.variants import VARIANTS, VIEWS
 
     columns = (
@@ -46,7 +46,7 @@ def write_twin(
         task = progress.add_task("twin", total=1.0)
         said = -_EVERY_S
 
-        def show(status: Status) -> None:
+        def show(status: TwinStatus) -> None:
             nonlocal said
             progress.update(task, completed=status.share, description=status.text)
             if not console.is_terminal and time.monotonic() - said >= _EVERY_S:

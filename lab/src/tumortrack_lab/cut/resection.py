@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float, Float64, Int, UInt8
 from tumortrack.core.errors import InputError
 from tumortrack.core.types import ORGAN, Anatomy, Mesh
 from tumortrack.imaging.raster import label_grid
-from tumortrack.plan.values import Cut, Layer, ResectionPlan
+from tumortrack.plan.values import Cut, CutLayer, ResectionPlan
 from tumortrack.report.metrics import _to_surface
 from tumortrack_lab.cut.severing import Flat, Mask, Severed, Voxels, pieces_of, within
 
@@ -30,7 +30,7 @@ _ML = 1e-3  # of a mm3
 
 Points = Float[np.ndarray, "_ 3"]
 Box = Float64[np.ndarray, "2 3"]
-Walls = list[tuple[Cut, Layer]]
+Walls = list[tuple[Cut, CutLayer]]
 
 
 @dataclass(frozen=True)
@@ -122,7 +122,7 @@ class _Grid:
     voxel_mm: float
     labels: UInt8[np.ndarray, "i j k"]
 
-    def rings(self, layer: Layer) -> tuple[Flat, ...]:
+    def rings(self, layer: CutLayer) -> tuple[Flat, ...]:
         """A layer's rings in voxels."""
         return tuple((ring - self.low_mm[:2]) / self.voxel_mm for ring in layer.rings_mm)
 
@@ -131,7 +131,7 @@ class _Grid:
         level = np.ceil((height_mm - self.low_mm[2]) / self.voxel_mm)
         return int(np.clip(level, 0, self.labels.shape[2]))
 
-    def columns(self, layer: Layer) -> Mask:
+    def columns(self, layer: CutLayer) -> Mask:
         """Which columns of voxels lie within a layer."""
         return within(self.rings(layer), self.labels.shape[:2])
 
@@ -144,7 +144,7 @@ class _Grid:
         return out
 
 
-def _grid_for(truth: Anatomy, layers: Sequence[Layer], voxel_mm: float) -> _Grid:
+def _grid_for(truth: Anatomy, layers: Sequence[CutLayer], voxel_mm: float) -> _Grid:
     """Over the whole anatomy; the lowest layer's bottom lies midway between two levels, so that
     half a voxel all over the largest sheet is no bias of the volumes."""
     corners = np.concatenate([part.box_mm for part in truth.parts])
@@ -173,12 +173,12 @@ def _walls_of(plan: ResectionPlan) -> Walls:
     return walls
 
 
-def _below(layer: Layer, layers: Sequence[Layer]) -> list[Layer]:
+def _below(layer: CutLayer, layers: Sequence[CutLayer]) -> list[CutLayer]:
     """The layers whose top is this one's bottom."""
     return [other for other in layers if abs(other.top_mm - layer.bottom_mm) < _SAME_MM]
 
 
-def _severed(grid: _Grid, walls: Walls, layers: Sequence[Layer], torn: bool) -> Severed:
+def _severed(grid: _Grid, walls: Walls, layers: Sequence[CutLayer], torn: bool) -> Severed:
     """A sheet reaches one voxel further than its outlines, for the strokes' chords leave those.
     ``torn``: what the strokes left of the outlines is severed too."""
     from scipy.ndimage import binary_dilation, binary_erosion
@@ -198,7 +198,7 @@ def _severed(grid: _Grid, walls: Walls, layers: Sequence[Layer], torn: bool) -> 
     return severed
 
 
-def _enclosed(grid: _Grid, layers: Sequence[Layer]) -> Voxels:
+def _enclosed(grid: _Grid, layers: Sequence[CutLayer]) -> Voxels:
     """What lies within the layers."""
     inside = np.zeros(grid.labels.shape, bool)
     for layer in layers:
@@ -207,14 +207,14 @@ def _enclosed(grid: _Grid, layers: Sequence[Layer]) -> Voxels:
     return inside
 
 
-def _cut_surface(walls: Walls, layers: Sequence[Layer], box_mm: Box) -> Points:
+def _cut_surface(walls: Walls, layers: Sequence[CutLayer], box_mm: Box) -> Points:
     """Points all over walls and sheets, SAMPLES_MM apart."""
     points = [_curtain(stroke.path_mm[:, :2], layer, box_mm) for stroke, layer in walls]
     points += [_flat(layer, _below(layer, layers), layer.bottom_mm, box_mm) for layer in layers]
     return np.concatenate(points)
 
 
-def _bridge_mm2(grid: _Grid, walls: Walls, layers: Sequence[Layer], box_mm: Box) -> float:
+def _bridge_mm2(grid: _Grid, walls: Walls, layers: Sequence[CutLayer], box_mm: Box) -> float:
     """Area within tissue of what encloses the piece and was not cut: of outlines, that no stroke
     goes along; and where a layer is wider than the one above it, that rim."""
     from scipy.spatial import cKDTree
@@ -243,14 +243,14 @@ def _even(path: Flat) -> Flat:
     return np.column_stack([np.interp(at, way, axis) for axis in path.T])
 
 
-def _curtain(path: Flat, layer: Layer, box_mm: Box) -> Points:
+def _curtain(path: Flat, layer: CutLayer, box_mm: Box) -> Points:
     """Points on the wall over a line, from the layer's bottom to its top, within the box."""
     low, high = max(layer.bottom_mm, box_mm[0, 2]), min(layer.top_mm, box_mm[1, 2])
     heights, flat = np.arange(low + SAMPLES_MM / 2, high, SAMPLES_MM), _even(path)
     return np.column_stack([np.tile(flat, (len(heights), 1)), np.repeat(heights, len(flat))])
 
 
-def _flat(layer: Layer, without: Sequence[Layer], height_mm: float, box_mm: Box) -> Points:
+def _flat(layer: CutLayer, without: Sequence[CutLayer], height_mm: float, box_mm: Box) -> Points:
     """Points level within a layer and outside others, within the box."""
     low, high = box_mm[:, :2]
     shape = tuple((np.ceil((high - low) / SAMPLES_MM).astype(int) + 1).tolist())

@@ -22,7 +22,7 @@ from tumortrack.core.geometry import rigid, transform_points
 from tumortrack.core.types import Anatomy
 from tumortrack.simulate.scene_folder import Scene
 from tumortrack_lab.peers.base import Carry, Fit, stopwatch
-from tumortrack_lab.peers.elastic_body import ElasticBody, elastic_body
+from tumortrack_lab.peers.elastic_body import PeerElasticBody, elastic_body
 from tumortrack_lab.peers.rigid import CROP_PERCENT, PoseSearch, RigidConfig
 from tumortrack_lab.peers.surface import SurfacePoints, seen_from
 from tumortrack_lab.tets import tetrahedralise
@@ -36,7 +36,7 @@ _SETTLED_MM = 0.05  # a step smaller than this ends the iteration
 _FREE = 1e-6  # the pose's precision: as good as none
 
 
-class ElasticConfig(Config, frozen=True):
+class ElasticPeerConfig(Config, frozen=True):
     """Settings of the elastic fit.
 
     The weight of strain energy against data is not tuned but stated in mm: among the
@@ -77,7 +77,7 @@ class _Pairs:
     share: Float64[np.ndarray, " n"]
 
 
-class Elastic:
+class ElasticPeer:
     """The elastic surface fit as a peer."""
 
     name = "elastic"
@@ -86,9 +86,9 @@ class Elastic:
         self,
         anatomy_ct: Anatomy,
         up_lps: tuple[float, float, float],
-        config: ElasticConfig | None = None,
+        config: ElasticPeerConfig | None = None,
     ) -> None:
-        self.config = config or ElasticConfig()
+        self.config = config or ElasticPeerConfig()
         with stopwatch() as watch:
             self._search = PoseSearch(anatomy_ct, up_lps, self.config.rigid)
             mesh = tetrahedralise(anatomy_ct.organ, self.config.edge_mm, _ENVELOPE)
@@ -205,7 +205,7 @@ class Elastic:
 class RidingSurface:
     """Points of the organ's fine surface that ride on the body's modes, with their normals."""
 
-    def __init__(self, body: ElasticBody, search: PoseSearch) -> None:
+    def __init__(self, body: PeerElasticBody, search: PoseSearch) -> None:
         rest = search.surface
         self._rest, self._visibility = rest, search.visibility
         self.middle = rest.points_mm.mean(0)

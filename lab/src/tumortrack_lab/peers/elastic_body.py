@@ -20,7 +20,7 @@ _RIGID_MODES = 6
 
 
 @dataclass(frozen=True, eq=False)
-class ElasticBody:
+class PeerElasticBody:
     """An organ's quadratic mesh and its modes.
 
     Attributes:
@@ -82,7 +82,7 @@ def stiffness_matrix(tets: TetMesh, poisson: float) -> tuple[Any, Any]:
     return linear_elasticity(*lame_parameters(1.0, poisson)).assemble(basis), basis
 
 
-def elastic_body(tets: TetMesh, poisson: float, modes: int) -> ElasticBody:
+def elastic_body(tets: TetMesh, poisson: float, modes: int) -> PeerElasticBody:
     """The body with its softest surface modes, rigid motions left out.
 
     Modes solve K u = s M u with K the stiffness and M the mass of the *surface* (Steklov's
@@ -120,7 +120,7 @@ def elastic_body(tets: TetMesh, poisson: float, modes: int) -> ElasticBody:
     node_dofs = np.empty((numbers.max() + 1, 3), int)
     for axis in range(3):
         node_dofs[numbers, axis] = basis.element_dofs[axis::3].T
-    return ElasticBody(
+    return PeerElasticBody(
         corners_mm=basis.mesh.p.T[basis.mesh.t.T],
         nodes=numbers,
         modes=vectors[node_dofs][:, :, _RIGID_MODES:],

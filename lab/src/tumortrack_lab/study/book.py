@@ -24,7 +24,7 @@ TURNED = "Rot"  # how the names of turned variants begin
 
 
 @dataclass(frozen=True)
-class Book:
+class ReportWriter:
     """A document with markers, the folder it lies in, and the command that its blocks name."""
 
     document: Path
@@ -61,10 +61,10 @@ class Book:
 
 
 def section_blocks(
-    section: Section, cells: list[dict], cases: tuple[StudyCase, ...], book: Book
+    section: Section, cells: list[dict], cases: tuple[StudyCase, ...], book: ReportWriter
 ) -> dict[str, str]:
     """The block of one section, its pictures drawn: name -> markdown."""
-    makers: dict[Section, Callable[[list[dict], StudyCase, Book], str]] = {
+    makers: dict[Section, Callable[[list[dict], StudyCase, ReportWriter], str]] = {
         "accuracy": _accuracy,
         "ablation": _ablation,
         "deformation": _deformation,
@@ -90,7 +90,7 @@ def section_blocks(
     return {section: "\n\n".join(texts)}
 
 
-def _below(section: Section, cells: list[dict], book: Book) -> str:
+def _below(section: Section, cells: list[dict], book: ReportWriter) -> str:
     return f"{caption(cells, book.command)} {_RULES[section]}"
 
 
@@ -112,7 +112,7 @@ _RULES: dict[Section, str] = {
 }
 
 
-def _accuracy(cells: list[dict], case: StudyCase, book: Book) -> str:
+def _accuracy(cells: list[dict], case: StudyCase, book: ReportWriter) -> str:
     lies = tumor_lies(case.anatomy_ct)
     image = book.image(f"variants_{case.name}")
     plots.error_per_variant(cells, lies, image)
@@ -125,15 +125,15 @@ def _accuracy(cells: list[dict], case: StudyCase, book: Book) -> str:
     )
 
 
-def _ablation(cells: list[dict], case: StudyCase, book: Book) -> str:
+def _ablation(cells: list[dict], case: StudyCase, book: ReportWriter) -> str:
     return ablation.table_of(cells)
 
 
-def _deformation(cells: list[dict], case: StudyCase, book: Book) -> str:
+def _deformation(cells: list[dict], case: StudyCase, book: ReportWriter) -> str:
     return tables.deformation(cells)
 
 
-def _peers(cells: list[dict], case: StudyCase, book: Book) -> str:
+def _peers(cells: list[dict], case: StudyCase, book: ReportWriter) -> str:
     lies = tumor_lies(case.anatomy_ct)
     turned = [cell for cell in cells if cell["spec"]["variant"].startswith(TURNED)]
     upright = [cell for cell in cells if not cell["spec"]["variant"].startswith(TURNED)]
@@ -149,22 +149,24 @@ def _peers(cells: list[dict], case: StudyCase, book: Book) -> str:
     return "\n\n".join(texts)
 
 
-def _faults(cells: list[dict], case: StudyCase, book: Book) -> str:
+def _faults(cells: list[dict], case: StudyCase, book: ReportWriter) -> str:
     return tables.conditions(cells, "fault", "clean")
 
 
-def _views(cells: list[dict], case: StudyCase, book: Book) -> str:
+def _views(cells: list[dict], case: StudyCase, book: ReportWriter) -> str:
     return tables.conditions(cells, "view", "clean")
 
 
-def _severity(cells: list[dict], case: StudyCase, book: Book) -> str:
+def _severity(cells: list[dict], case: StudyCase, book: ReportWriter) -> str:
     image = book.image("severity")
     severity.curves(cells, image)
     picture = _picture(book, image, f"{case.name}: tumor error against severity")
     return f"{picture}\n\n{severity.table_of(cells)}"
 
 
-def gallery_block(plan: StudyPlan, jobs: list[Job], book: Book, memory: Path) -> dict[str, str]:
+def gallery_block(
+    plan: StudyPlan, jobs: list[Job], book: ReportWriter, memory: Path
+) -> dict[str, str]:
     """The gallery of these jobs (one case; methods x scenes), drawn again only where the methods
     or scenes have changed since ``memory`` was written."""
     image = book.image("gallery")
@@ -180,5 +182,5 @@ def gallery_block(plan: StudyPlan, jobs: list[Job], book: Book, memory: Path) ->
     return {"gallery": f"{_picture(book, image, 'estimate over truth')}\n\n{text}"}
 
 
-def _picture(book: Book, image: Path, words: str) -> str:
+def _picture(book: ReportWriter, image: Path, words: str) -> str:
     return f"![{words}]({image.relative_to(book.document.parent)})"

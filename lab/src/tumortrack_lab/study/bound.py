@@ -25,7 +25,7 @@ from tumortrack.core.motion import OneWay
 from tumortrack.core.types import Anatomy, Mesh
 from tumortrack.sense.camera import project
 from tumortrack.sense.render import Visibility
-from tumortrack.simulate.elastic.body import Body, BodyConfig, build_body
+from tumortrack.simulate.elastic.body import BodyConfig, ElasticBody, build_body
 from tumortrack.simulate.scene_folder import Scene
 from tumortrack_lab.peers.base import Fit, estimate_of, stopwatch
 from tumortrack_lab.peers.rigid_bound import kabsch, matched_vertices
@@ -50,10 +50,10 @@ class BoundConfig(Config, frozen=True):
 
 
 @dataclass(frozen=True, eq=False)
-class Placed:
+class BoundMotion:
     """An organ's pose and elastic state: x -> rotation (flow(x) - center_ct) + centre_mm."""
 
-    body: Body
+    body: ElasticBody
     rotation: Float64[np.ndarray, "3 3"]
     centre_mm: Float64[np.ndarray, " 3"]
     coefficients: Float64[np.ndarray, " m"]
@@ -138,11 +138,11 @@ def seen_vertices(organ_camera: Mesh, scene: Scene) -> Bool[np.ndarray, " v"]:
 
 
 def laid_on(
-    body: Body,
+    body: ElasticBody,
     known_ct: Float[np.ndarray, "n 3"],
     known_mm: Float[np.ndarray, "n 3"],
     config: BoundConfig,
-) -> Placed:
+) -> BoundMotion:
     """The pose and state that carry known points of the CT to their places most likely, by
     Gauss-Newton from the best rigid pose and the library's mean.
 
@@ -172,7 +172,7 @@ def laid_on(
         centre = centre + rotation @ change[:3]
         rotation = rotation @ Rotation.from_rotvec(change[3:6]).as_matrix()
         coefficients = coefficients + change[6:]
-    return Placed(body, rotation, centre, coefficients)
+    return BoundMotion(body, rotation, centre, coefficients)
 
 
 def _crosses(vectors: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 3 3"]:
@@ -181,7 +181,7 @@ def _crosses(vectors: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 3 3"
 
 
 @cache
-def _body_of(case: StudyCase, config: BoundConfig) -> tuple[Body, float]:
+def _body_of(case: StudyCase, config: BoundConfig) -> tuple[ElasticBody, float]:
     """The case's elastic body, and the seconds that it took; one for both bounds."""
     with stopwatch() as watch:
         body = build_body(case.anatomy_ct, case.up_lps, config.body, config.seed)

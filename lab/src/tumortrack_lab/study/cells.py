@@ -21,7 +21,7 @@ from tumortrack.core.errors import StorageError
 CELL_SCHEMA = 1  # raise it when a cell's metrics change their meaning
 
 
-class CellSpec(Config, frozen=True):
+class MeasurementSpec(Config, frozen=True):
     """What decides a cell's numbers, and the names under which tables find it."""
 
     case: str
@@ -42,18 +42,18 @@ class CellSpec(Config, frozen=True):
         return hashlib.sha256(json.dumps(to_builtins(self), sort_keys=True).encode()).hexdigest()
 
 
-class CellStore:
+class MeasurementStore:
     """The folder of all cells: CASE/METHOD/SCENE-FAULT-GRID-DIGEST.json."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
 
-    def path(self, spec: CellSpec) -> Path:
+    def path(self, spec: MeasurementSpec) -> Path:
         method = f"{spec.method['name']}-{spec.method.get('seed', 0)}"
         file = f"{spec.scene}-{spec.fault}-{spec.grid}-{spec.digest[:16]}.json"
         return self.folder / spec.case / method / file
 
-    def read(self, spec: CellSpec) -> dict | None:
+    def read(self, spec: MeasurementSpec) -> dict | None:
         """The cell with exactly this specification, None where it has not been measured.
 
         Raises:
@@ -65,7 +65,7 @@ class CellStore:
         cell = store.read_json(path)
         return cell if cell.get("spec") == to_builtins(spec) else None
 
-    def write(self, spec: CellSpec, measured: dict) -> dict:
+    def write(self, spec: MeasurementSpec, measured: dict) -> dict:
         """Keep a cell, in one step.
 
         Raises:

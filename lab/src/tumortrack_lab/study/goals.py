@@ -40,7 +40,7 @@ _NOTHING = "–"
 
 
 @dataclass(frozen=True)
-class Goal:
+class StudyGoal:
     """One figure: how it is read from one method's cells, and what it should be at most (or at
     least, ``high``)."""
 
@@ -103,7 +103,7 @@ def tables_of(cells: list[dict], lies: Lies) -> str:
     return f"{whole}\n\nEach case of {CLINIC}:\n\n{table(['figure', *cases], each)}"
 
 
-def goals_of(cells: list[dict], lies: Lies) -> list[Goal]:
+def goals_of(cells: list[dict], lies: Lies) -> list[StudyGoal]:
     """Every goal, as it is read from these cells' kind."""
     goals = []
     kinds: tuple[Kind, ...] = ("exophytic", "endophytic")
@@ -113,19 +113,21 @@ def goals_of(cells: list[dict], lies: Lies) -> list[Goal]:
             for words, key in (("one-sided", "hausdorff_one_sided_mm"), ("HD", "hausdorff_mm")):
                 read = partial(_distance, variant=variant, kind=kind, key=key, lies=lies)
                 shown = said.text if said and words == "one-sided" else EMPTY
-                goals.append(Goal(f"tumor {words}, {variant}, {kind}", read, limit, shown))
+                goals.append(StudyGoal(f"tumor {words}, {variant}, {kind}", read, limit, shown))
     return [
         *goals,
-        Goal("tumor centre, worst variant of any case", _worst_center, 2.5, "< 10"),
-        Goal("mIoU, deformed variants", partial(_miou, deformed=True), 0.90, "0.71", high=True),
-        Goal("mIoU, all variants", partial(_miou, deformed=False), 0.90, high=True),
-        Goal("target error, deformed variants", partial(_targets, deformed=True), 2.0),
-        Goal("target error, all variants", partial(_targets, deformed=False), 2.0),
-        Goal("target error, worst variant of any case", _worst_target),
-        Goal("hidden surface: tumor HD, times", partial(_ratio, of=_tumor_distances), 1.3),
-        Goal("hidden surface: target error, times", partial(_ratio, of=_target_errors), 1.3),
-        Goal("training, minutes", _training, _training_limit(cells), "120 (RTX 4090)"),
-        Goal("scenes with a part not found, %", _failed),
+        StudyGoal("tumor centre, worst variant of any case", _worst_center, 2.5, "< 10"),
+        StudyGoal(
+            "mIoU, deformed variants", partial(_miou, deformed=True), 0.90, "0.71", high=True
+        ),
+        StudyGoal("mIoU, all variants", partial(_miou, deformed=False), 0.90, high=True),
+        StudyGoal("target error, deformed variants", partial(_targets, deformed=True), 2.0),
+        StudyGoal("target error, all variants", partial(_targets, deformed=False), 2.0),
+        StudyGoal("target error, worst variant of any case", _worst_target),
+        StudyGoal("hidden surface: tumor HD, times", partial(_ratio, of=_tumor_distances), 1.3),
+        StudyGoal("hidden surface: target error, times", partial(_ratio, of=_target_errors), 1.3),
+        StudyGoal("training, minutes", _training, _training_limit(cells), "120 (RTX 4090)"),
+        StudyGoal("scenes with a part not found, %", _failed),
     ]
 
 
@@ -249,13 +251,13 @@ def _worst(values: Iterable[float | None], per: float = 1.0) -> float | None:
     return max(finite) / per if len(finite) == len(values) else None
 
 
-def _limit(goal: Goal) -> str:
+def _limit(goal: StudyGoal) -> str:
     if goal.limit is None:
         return EMPTY
     return f"{'≥' if goal.high else '≤'} {goal.limit:g}"
 
 
-def _with_verdict(goal: Goal, cells: list[dict]) -> str:
+def _with_verdict(goal: StudyGoal, cells: list[dict]) -> str:
     verdict = goal.verdict(cells)
     value = goal.value(cells, ours=True)
     return value if verdict == _NOTHING else f"{value} ({verdict})"

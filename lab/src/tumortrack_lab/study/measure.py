@@ -15,7 +15,7 @@ from tumortrack.core.estimate import Estimate
 from tumortrack.core.types import Anatomy
 from tumortrack.report.protocol import evaluate_scene
 from tumortrack.simulate.scene_folder import Scene, read_scene
-from tumortrack_lab.study.cells import CellSpec, CellStore, provenance
+from tumortrack_lab.study.cells import MeasurementSpec, MeasurementStore, provenance
 from tumortrack_lab.study.methods import Answer, Method
 from tumortrack_lab.study.points import point_errors, visible_points
 
@@ -51,7 +51,7 @@ class Job:
 
 
 @dataclass(frozen=True)
-class Status:
+class StudyStatus:
     """Where the measuring stands, told after each cell measured."""
 
     done: int
@@ -64,8 +64,8 @@ class Status:
 
 def measure(
     jobs: Iterable[Job],
-    cells: CellStore,
-    report: Callable[[Status], None] | None = None,
+    cells: MeasurementStore,
+    report: Callable[[StudyStatus], None] | None = None,
     one: Callable[[Job, str], dict] | None = None,
 ) -> list[dict]:
     """The cells of these jobs in their order; only those that are not kept yet are measured,
@@ -90,12 +90,12 @@ def measure(
             done = len(kept) - len(todo) + number
             name = f"{spec.case} {spec.method['name']} {spec.scene} {spec.fault}"
             name = name.removesuffix(" none")
-            report(Status(done, len(kept), number, name, pace.mean(), pace.left()))
+            report(StudyStatus(done, len(kept), number, name, pace.mean(), pace.left()))
     found = [kept[spec.digest] for spec in specs]
     return [cell for cell in found if cell is not None]
 
 
-def spec_of(job: Job, hashes: Hashes) -> CellSpec:
+def spec_of(job: Job, hashes: Hashes) -> MeasurementSpec:
     """The job's full specification, inputs hashed."""
     folder = job.case.scene(job.variant, job.view)
     if not folder.is_dir():
@@ -103,7 +103,7 @@ def spec_of(job: Job, hashes: Hashes) -> CellSpec:
             f"{folder} does not exist; make the scenes with: tumortrack twin "
             f"{job.case.folder} {job.case.scenes}"
         )
-    return CellSpec(
+    return MeasurementSpec(
         case=job.case.name,
         case_sha256=hashes.of(job.case.folder / store.MANIFEST),
         scene=folder.name,
@@ -166,7 +166,7 @@ class Hashes:
         return self._known[path]
 
 
-def _kind_of(spec: CellSpec) -> str:
+def _kind_of(spec: MeasurementSpec) -> str:
     return f"{spec.case} {spec.method['name']} {spec.grid}"
 
 

@@ -19,13 +19,13 @@ from tumortrack.simulate.deform import DragConfig
 from tumortrack.simulate.deform.drag import CONFIGURATIONS
 from tumortrack.simulate.scene import SceneConfig
 from tumortrack.training.model_folder import is_finished
-from tumortrack.training.train import Run, Status, run_identity, train
+from tumortrack.training.train import TrainingRun, TrainingStatus, run_identity, train
 from tumortrack_lab.study.measure import StudyCase
 from tumortrack_lab.study.methods import Network
 
 # A preset: anatomy and rotations (limited, full) -> training configuration.
 Preset = Callable[[Anatomy, str], TrainConfig]
-Report = Callable[[str, Status], None]
+Report = Callable[[str, TrainingStatus], None]
 MODELS = {"M_lim": "limited", "M_full": "full"}  # of the preset quick
 CLINIC = "clinic"
 UNREFINED = "_unrefined"  # how the names of models end whose warps are not laid on the cloud
@@ -132,7 +132,7 @@ class Trainer:
 
         trained = name.removesuffix(UNREFINED)
         folder = self.folder / case.name / f"{trained}-seed{seed}-{steps}steps"
-        run = Run(
+        run = TrainingRun(
             anatomy_ct=case.anatomy_ct,
             up_lps=case.up_lps,
             case_sha256=store.sha256_of(case.folder / store.MANIFEST),
@@ -149,12 +149,12 @@ class Trainer:
             torch.set_num_threads(threads)  # training leaves some cores to its workers
         return Network(name, folder, self._device, unrefined=trained != name)
 
-    def _tell(self, name: str, status: Status) -> None:
+    def _tell(self, name: str, status: TrainingStatus) -> None:
         if self._report:
             self._report(name, status)
 
 
-def _same(folder: Path, run: Run) -> bool:
+def _same(folder: Path, run: TrainingRun) -> bool:
     """Whether a finished model is this run's; else training refuses it with a clear text."""
     manifest = store.read_json(folder / store.MANIFEST)
     return manifest["provenance"].get("run_sha256") == run_identity(run)

@@ -22,7 +22,7 @@ CONFIGURATION_MIOU = {1: 0.70, 2: 0.65, 3: 0.71, 4: 0.71, 5: 0.68, 6: 0.66}
 
 
 @dataclass(frozen=True)
-class Said:
+class PaperFigure:
     """A figure of the paper with its sign: ``""``, ``"~"``, ``"<="`` or ``"<"``."""
 
     sign: str
@@ -34,26 +34,26 @@ class Said:
         return f"{signs[self.sign]}{self.value_mm:g}"
 
 
-def hausdorff(variant: str, model: str, kind: Kind) -> Said | None:
+def hausdorff(variant: str, model: str, kind: Kind) -> PaperFigure | None:
     """The paper's tumor distance (estimate to reference), mm, where the text gives one."""
     first = kind == "exophytic"
     if variant == "D1":
-        return Said("~", 4.0 if first else 7.0)
+        return PaperFigure("~", 4.0 if first else 7.0)
     if variant == "D2":
-        return Said("~", 6.0 if first else 9.0)
+        return PaperFigure("~", 6.0 if first else 9.0)
     if variant == "D3" and model == "M_lim":
-        return Said("", 11.3 if first else 12.9)
+        return PaperFigure("", 11.3 if first else 12.9)
     if variant == "D3" and model == "M_full":
-        return Said("", 15.4 if first else 18.5)
+        return PaperFigure("", 15.4 if first else 18.5)
     if variant.startswith("Rot") and model == "M_full":
-        return Said("<=", 13.4)
+        return PaperFigure("<=", 13.4)
     return None
 
 
-def center(variant: str, model: str) -> Said | None:
+def center(variant: str, model: str) -> PaperFigure | None:
     """The paper's bound on the distance of the tumors' centres, mm."""
     told = variant in ("D1", "D2", "D3") or variant.startswith("Rot")
-    return Said("<", 10.0) if told and (variant, model) != ("D3", "M_full") else None
+    return PaperFigure("<", 10.0) if told and (variant, model) != ("D3", "M_full") else None
 
 
 EXPOSED_MM = 0.5  # a tumor's surface this close to the organ's is the organ's surface

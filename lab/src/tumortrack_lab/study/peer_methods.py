@@ -123,7 +123,7 @@ def peer_kinds(bcpd: Path | None = None) -> dict[str, PeerKind]:
     """
     from tumortrack_lab.peers.bcpd import Bcpd, BcpdConfig
     from tumortrack_lab.peers.cpd import Cpd, CpdConfig
-    from tumortrack_lab.peers.elastic import Elastic, ElasticConfig
+    from tumortrack_lab.peers.elastic import ElasticPeer, ElasticPeerConfig
     from tumortrack_lab.peers.rigid import Rigid, RigidConfig
     from tumortrack_lab.peers.rigid_bound import RigidBound
 
@@ -132,7 +132,7 @@ def peer_kinds(bcpd: Path | None = None) -> dict[str, PeerKind]:
         "rigid": PeerKind(Rigid, RigidConfig(), ("small_gicp",)),
         "rigid_any_rotation": PeerKind(Rigid, RigidConfig(orientation="unknown"), ("small_gicp",)),
         "cpd": PeerKind(Cpd, CpdConfig(), ("pycpd", "small_gicp")),
-        "elastic": PeerKind(Elastic, ElasticConfig(), ("pytetwild", "scipy", "small_gicp")),
+        "elastic": PeerKind(ElasticPeer, ElasticPeerConfig(), ("pytetwild", "scipy", "small_gicp")),
     }
     if bcpd is not None:
         if not bcpd.is_file():

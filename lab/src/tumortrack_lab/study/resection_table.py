@@ -41,7 +41,7 @@ RULE = (
 
 
 @dataclass(frozen=True)
-class Row:
+class ResectionRow:
     """One planner on the estimates of one method: the entries of its plans, made or refused."""
 
     method: str
@@ -93,7 +93,7 @@ def tables_of(cells: list[dict]) -> str:
     return "\n\n".join([*texts, _refused(cells), *_hurt(cells)])
 
 
-def rows_of(cells: list[dict]) -> list[Row]:
+def rows_of(cells: list[dict]) -> list[ResectionRow]:
     """In the order of methods, the truth last, and of planners."""
     methods = sorted(names(cells, "method"), key=lambda name: name == TRUTH)
     rows = []
@@ -102,7 +102,7 @@ def rows_of(cells: list[dict]) -> list[Row]:
         for planner in PLANNERS:
             entries = [plan[planner.name] for plan in plans if planner.name in plan]
             if entries:
-                rows.append(Row(method, planner, entries))
+                rows.append(ResectionRow(method, planner, entries))
     return rows
 
 

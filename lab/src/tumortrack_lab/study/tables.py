@@ -181,7 +181,7 @@ def _mean_miou(cells: list[dict]) -> Figure:
     return Figure(tuple(sum(values) / len(values) for values in seeds.values()))
 
 
-def _said(said: paper.Said | None) -> str:
+def _said(said: paper.PaperFigure | None) -> str:
     return EMPTY if said is None else said.text
 
 

@@ -26,14 +26,14 @@ from tumortrack.core.geometry import rigid, rotation_onto, transform_points
 from tumortrack.core.types import Anatomy, Mesh
 from tumortrack.report.metrics import label_grid, surface_samples
 from tumortrack_lab.tets import TetMesh, embed, tetrahedralise
-from tumortrack_lab.twin.contact import Contact, Obstacle, Packing, Support
+from tumortrack_lab.twin.contact import Contact, ContactSurface, Packing, Support
 from tumortrack_lab.twin.equilibrium import (
     Convergence,
+    EquilibriumProblem,
     Hold,
-    Problem,
     settle,
 )
-from tumortrack_lab.twin.solid import Solid
+from tumortrack_lab.twin.solid import NeoHookeanSolid
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_matrix
@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 GRAVITY_KPA_PER_MM = 9.81e-6  # of 1 kg/m^3
 
 
-class BenchConfig(Config, frozen=True, kw_only=True):
+class ApparatusConfig(Config, frozen=True, kw_only=True):
     """Material and apparatus.
 
     youngs_kpa: of the organ; kidney and soft PVA gels lie near 5..30 kPa.
@@ -85,11 +85,11 @@ class State:
     report: dict
 
 
-class Bench:
+class Apparatus:
     """The apparatus with one case on it."""
 
     def __init__(
-        self, anatomy_ct: Anatomy, up_lps: tuple[float, float, float], config: BenchConfig
+        self, anatomy_ct: Anatomy, up_lps: tuple[float, float, float], config: ApparatusConfig
     ) -> None:
         self.config = config
         self.bench_from_ct = _bench_from_ct(anatomy_ct.organ, up_lps)
@@ -102,7 +102,7 @@ class Bench:
         self.mesh = tetrahedralise(self.anatomy.organ, config.edge_mm)
         ratio = 1 + (config.tumor_ratio - 1) * _tumor_share(self.mesh, self.anatomy)
         shear_kpa = config.youngs_kpa * ratio / (2 * (1 + config.poisson))
-        self.solid = Solid(self.mesh, shear_kpa, config.poisson)
+        self.solid = NeoHookeanSolid(self.mesh, shear_kpa, config.poisson)
         points_mm, areas_mm2 = _contact_points(self.anatomy.organ)
         self.contact = Contact(embed(self.mesh, points_mm), areas_mm2, config.contact_kpa_mm)
         volumes = self.solid.node_volumes_mm3
@@ -121,14 +121,14 @@ class Bench:
 
     def _packed(
         self, points_mm: np.ndarray, areas_mm2: np.ndarray
-    ) -> tuple[Contact, tuple[Obstacle, ...]]:
+    ) -> tuple[Contact, tuple[ContactSurface, ...]]:
         under = _faces_down(self.anatomy.organ, points_mm)
         surface = embed(self.mesh, points_mm[under])
         contact = Contact(surface, areas_mm2[under], self.config.packing_kpa_mm)
         return contact, (Packing(points_mm[under, 2]),)
 
     def settle(
-        self, nodes_mm: np.ndarray, obstacles: tuple[Obstacle, ...], weight: float = 0.0
+        self, nodes_mm: np.ndarray, obstacles: tuple[ContactSurface, ...], weight: float = 0.0
     ) -> tuple[np.ndarray, Convergence]:
         """One load step: the nodes at rest in their bed among obstacles, under so many weights
         more than in the CT.
@@ -138,7 +138,7 @@ class Bench:
         """
         load = weight * self._weight_mn
         contacts = ((self.contact, (Support(), *obstacles)), self._packing)
-        problem = Problem(self.solid, contacts, load, self._hold)
+        problem = EquilibriumProblem(self.solid, contacts, load, self._hold)
         return settle(problem, nodes_mm, self._stiffness)
 
     def midsection(self, nodes_mm: np.ndarray) -> tuple[float, float]:

@@ -24,7 +24,7 @@ Distances = Float64[np.ndarray, " n"]
 
 
 @runtime_checkable
-class Obstacle(Protocol):
+class ContactSurface(Protocol):
     """A rigid body; frame and unit are the bench's (mm)."""
 
     def distance(self, points_mm: Points) -> tuple[Distances, Points]:
@@ -53,7 +53,7 @@ class Packing:
 
 
 @dataclass(frozen=True)
-class Plate:
+class ContactPlate:
     """A box along the axes with rounded edges; ``half_mm`` includes the rounding."""
 
     centre_mm: tuple[float, float, float]
@@ -98,7 +98,7 @@ class Contact:
     stiffness_kpa_mm: float
 
     def energy(
-        self, nodes_mm: Points, obstacles: tuple[Obstacle, ...]
+        self, nodes_mm: Points, obstacles: tuple[ContactSurface, ...]
     ) -> tuple[float, Float64[np.ndarray, "n 3"]]:
         """Penalty energy (uJ) and its gradient at the nodes (mN)."""
         points = self.surface.carry(nodes_mm)
@@ -113,18 +113,18 @@ class Contact:
             np.add.at(gradient, self.surface.nodes[hit], force)
         return energy, gradient
 
-    def load_mn(self, nodes_mm: Points, obstacle: Obstacle) -> Float64[np.ndarray, " 3"]:
+    def load_mn(self, nodes_mm: Points, obstacle: ContactSurface) -> Float64[np.ndarray, " 3"]:
         """Total force on the body by one obstacle, mN."""
         distance, normal = obstacle.distance(self.surface.carry(nodes_mm))
         push = self.stiffness_kpa_mm * self.areas_mm2 * np.minimum(distance, 0)
         return -(push @ normal)
 
-    def depth_mm(self, nodes_mm: Points, obstacles: tuple[Obstacle, ...]) -> float:
+    def depth_mm(self, nodes_mm: Points, obstacles: tuple[ContactSurface, ...]) -> float:
         """How far the surface sinks into an obstacle at worst."""
         points = self.surface.carry(nodes_mm)
         return max(0.0, *(-float(o.distance(points)[0].min()) for o in obstacles))
 
-    def stiffness(self, nodes_mm: Points, obstacles: tuple[Obstacle, ...]) -> csr_matrix:
+    def stiffness(self, nodes_mm: Points, obstacles: tuple[ContactSurface, ...]) -> csr_matrix:
         """Hessian of the penalty, the obstacles' curvature left out: (3 n, 3 n), mN/mm."""
         from scipy.sparse import coo_matrix
 

@@ -24,14 +24,14 @@ from tumortrack.core.types import Anatomy
 from tumortrack.imaging.case import load_case
 from tumortrack.simulate.scene_folder import write_scene_files
 from tumortrack.simulate.targets import TARGETS, InnerPoints, draw_targets
-from tumortrack_lab.twin.bench import Bench, BenchConfig, State
+from tumortrack_lab.twin.bench import Apparatus, ApparatusConfig, State
 from tumortrack_lab.twin.pictures import twin_picture
 from tumortrack_lab.twin.states import solve
-from tumortrack_lab.twin.stock import Stock
+from tumortrack_lab.twin.stock import StateCache
 from tumortrack_lab.twin.variants import (
     VARIANTS,
     VIEWS,
-    Settled,
+    EquilibriumState,
     View,
     ViewConfig,
     for_organ,
@@ -42,7 +42,7 @@ KIND = "twin"
 _STATES = "states"
 _STATE_SHARE = 15.0  # a state takes about as long as so many scenes
 
-Build = Callable[[Anatomy, tuple[float, float, float], BenchConfig], Any]
+Build = Callable[[Anatomy, tuple[float, float, float], ApparatusConfig], Any]
 
 
 @dataclass(frozen=True)
@@ -50,15 +50,15 @@ class TwinRun:
     """What decides every file: a case, the bench, the views, one seed (of views and targets)."""
 
     case_folder: Path
-    bench: BenchConfig = field(default_factory=BenchConfig)
+    bench: ApparatusConfig = field(default_factory=ApparatusConfig)
     view: ViewConfig = field(default_factory=ViewConfig)
     seed: int = 0
-    build: Build = Bench  # these two have stand-ins in tests
+    build: Build = Apparatus  # these two have stand-ins in tests
     solve: Callable[..., State] = solve
 
 
 @dataclass(frozen=True)
-class Status:
+class TwinStatus:
     """Where the work stands: share of it done (a guess), and what was done last."""
 
     share: float
@@ -70,7 +70,7 @@ def make_scenes(
     out: Path,
     variants: Sequence[str] = tuple(VARIANTS),
     views: Sequence[View] = VIEWS,
-    report: Callable[[Status], None] | None = None,
+    report: Callable[[TwinStatus], None] | None = None,
 ) -> list[Path]:
     """The scenes of these variants in these views; those that are there already stay.
 
@@ -91,7 +91,7 @@ def make_scenes(
     identity = _claim(run, out)
     todo = [(v, w) for v, w in wanted if not (out / f"{v}-{w}").exists()]
     states = list(dict.fromkeys(VARIANTS[v].state for v, _ in todo))
-    stock = Stock(
+    stock = StateCache(
         out / _STATES,
         case.anatomy,
         targets.points_ct,
@@ -162,7 +162,7 @@ def _claim(run: TwinRun, out: Path) -> dict:
 
 def _write(
     folder: Path,
-    settled: Settled,
+    settled: EquilibriumState,
     run: TwinRun,
     targets: InnerPoints,
     anatomy_ct: Anatomy,
@@ -184,13 +184,13 @@ def _write(
 class _Pace:
     """Turns pieces of work done into a share of all."""
 
-    def __init__(self, report: Callable[[Status], None] | None, total: float) -> None:
+    def __init__(self, report: Callable[[TwinStatus], None] | None, total: float) -> None:
         self._report = report or (lambda status: None)
         self._total = max(total, 1.0)
         self._done = 0.0
 
     def say(self, text: str) -> None:
-        self._report(Status(self._done / self._total, text))
+        self._report(TwinStatus(self._done / self._total, text))
 
     def add(self, amount: float, text: str) -> None:
         self._done += amount

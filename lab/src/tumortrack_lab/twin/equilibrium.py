@@ -16,8 +16,8 @@ import numpy as np
 from jaxtyping import Float64
 
 from tumortrack.core.errors import TumortrackError
-from tumortrack_lab.twin.contact import Contact, Obstacle
-from tumortrack_lab.twin.solid import Solid
+from tumortrack_lab.twin.contact import Contact, ContactSurface
+from tumortrack_lab.twin.solid import NeoHookeanSolid
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_matrix
@@ -60,14 +60,14 @@ class Hold:
 
 
 @dataclass(frozen=True, eq=False)
-class Problem:
+class EquilibriumProblem:
     """A solid among obstacles under its weight. Units: mm, kPa, mN, uJ.
 
     ``contacts``: surfaces (of a stiffness each) and the obstacles that push them back.
     """
 
-    solid: Solid
-    contacts: tuple[tuple[Contact, tuple[Obstacle, ...]], ...]
+    solid: NeoHookeanSolid
+    contacts: tuple[tuple[Contact, tuple[ContactSurface, ...]], ...]
     weight_mn: Float64[np.ndarray, " n"]  # along -z
     hold: Hold | None = None
 
@@ -100,7 +100,7 @@ class Convergence:
 
 
 def settle(
-    problem: Problem, start_mm: Nodes, rest_stiffness: csr_matrix
+    problem: EquilibriumProblem, start_mm: Nodes, rest_stiffness: csr_matrix
 ) -> tuple[Nodes, Convergence]:
     """Nodes at rest, from a start in which no element is turned over.
 
@@ -157,7 +157,7 @@ def _two_loop(
 
 
 def _factorised(
-    problem: Problem, nodes: Nodes, rest_stiffness: csr_matrix
+    problem: EquilibriumProblem, nodes: Nodes, rest_stiffness: csr_matrix
 ) -> Callable[[np.ndarray], np.ndarray]:
     """Solves with the rest stiffness and the contacts as they are now."""
     from scipy.sparse import eye

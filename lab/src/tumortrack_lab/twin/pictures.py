@@ -19,8 +19,8 @@ from tumortrack.report.drawing import (
 )
 from tumortrack.report.shade import (
     Frame,
-    Layer,
-    View,
+    ShadedLayer,
+    ShadedView,
     frame_around,
     pixel_centres,
     shade,
@@ -29,14 +29,14 @@ from tumortrack.report.shade import (
 )
 from tumortrack.sense.camera import project
 from tumortrack.simulate.scene_folder import Scene
-from tumortrack_lab.twin.variants import Settled
+from tumortrack_lab.twin.variants import EquilibriumState
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-FROM_CAMERA = View("seen from the camera", (1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
-FROM_FRONT = View("bench from the front", (1.0, 0.0, 0.0), (0.0, 0.0, -1.0))
-FROM_END = View("bench from its end", (0.0, 1.0, 0.0), (0.0, 0.0, -1.0))
+FROM_CAMERA = ShadedView("seen from the camera", (1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
+FROM_FRONT = ShadedView("bench from the front", (1.0, 0.0, 0.0), (0.0, 0.0, -1.0))
+FROM_END = ShadedView("bench from its end", (0.0, 1.0, 0.0), (0.0, 0.0, -1.0))
 _STEEL = (0.62, 0.65, 0.7)
 _REST = "0.35"
 _AROUND_MM = 14.0  # of the organ: background beside it shows, points far off do not
@@ -44,7 +44,7 @@ _ROD_SHOWN_MM = 45.0
 _PLATE_SHOWN_MM = 9.0
 
 
-def twin_picture(scene: Scene, settled: Settled, rest_organ: Mesh, path: Path) -> None:
+def twin_picture(scene: Scene, settled: EquilibriumState, rest_organ: Mesh, path: Path) -> None:
     """Depth image, cloud over truth, and two side views of the bench.
 
     Args:
@@ -120,7 +120,7 @@ def _cloud_view(axes: Axes, scene: Scene) -> None:
     axes.set_title(f"{FROM_CAMERA.name}: {len(points_mm)} points over the truth", fontsize=11)
 
 
-def _bench_view(axes: Axes, settled: Settled, rest_organ: Mesh, view: View) -> None:
+def _bench_view(axes: Axes, settled: EquilibriumState, rest_organ: Mesh, view: ShadedView) -> None:
     anatomy = settled.anatomy
     everything = np.concatenate([anatomy.organ.vertices_mm, rest_organ.vertices_mm])
     everything = np.concatenate([everything, everything.mean(0)[None] * [1, 1, 0] + [0, 0, -12.0]])
@@ -136,12 +136,12 @@ def _bench_view(axes: Axes, settled: Settled, rest_organ: Mesh, view: View) -> N
     axes.set_title(view.name, fontsize=11)
 
 
-def _paint(axes: Axes, tumors: list[Mesh], organ: Mesh, view: View, frame: Frame) -> None:
-    layers = [*(Layer(tumor, TRUE) for tumor in tumors), Layer(organ, KIDNEY, 0.4)]
+def _paint(axes: Axes, tumors: list[Mesh], organ: Mesh, view: ShadedView, frame: Frame) -> None:
+    layers = [*(ShadedLayer(tumor, TRUE) for tumor in tumors), ShadedLayer(organ, KIDNEY, 0.4)]
     axes.imshow(shade(layers, view, frame), extent=frame.extent, zorder=2, interpolation="bilinear")
 
 
-def _apparatus(axes: Axes, report: dict, view: View) -> None:
+def _apparatus(axes: Axes, report: dict, view: ShadedView) -> None:
     """Plate and rod, where the state has them; their far ends are left out."""
     from matplotlib.patches import FancyBboxPatch, Polygon
 
@@ -188,7 +188,7 @@ def _what(scene: Scene) -> str:
     return _TEXT[variant]
 
 
-def _numbers(scene: Scene, settled: Settled) -> str:
+def _numbers(scene: Scene, settled: EquilibriumState) -> str:
     """What was measured of this scene, in one line."""
     said = []
     if (change := settled.report.get("volume_change")) is not None:

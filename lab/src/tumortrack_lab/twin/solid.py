@@ -28,7 +28,7 @@ PER_TET = 0.05  # share of the bulk modulus that is kept per tetrahedron
 
 
 @dataclass(frozen=True, eq=False)
-class Solid:
+class NeoHookeanSolid:
     """An unloaded mesh and its stiffness.
 
     Attributes:

@@ -17,8 +17,8 @@ import numpy as np
 from jaxtyping import Float64
 
 from tumortrack.core.errors import InputError, TumortrackError
-from tumortrack_lab.twin.bench import Bench, State
-from tumortrack_lab.twin.contact import Indenter, Obstacle, Plate, Support
+from tumortrack_lab.twin.bench import Apparatus, State
+from tumortrack_lab.twin.contact import ContactPlate, ContactSurface, Indenter, Support
 from tumortrack_lab.twin.equilibrium import Convergence
 
 STATES = ("D0", "D1", "D2", "D3", "G1", "P1")
@@ -32,7 +32,7 @@ Nodes = Float64[np.ndarray, "n 3"]
 
 
 def solve(
-    bench: Bench, name: str, warm: State | None = None, progress: Progress | None = None
+    bench: Apparatus, name: str, warm: State | None = None, progress: Progress | None = None
 ) -> State:
     """Bring the organ into a state.
 
@@ -80,13 +80,13 @@ def solve(
 class _Run:
     """The load steps of one state."""
 
-    def __init__(self, bench: Bench, progress: Progress) -> None:
+    def __init__(self, bench: Apparatus, progress: Progress) -> None:
         self.bench = bench
         self.log: list[Convergence] = []
         self._progress = progress
 
     def step(
-        self, nodes: Nodes, obstacles: tuple[Obstacle, ...], text: str, weight: float = 0.0
+        self, nodes: Nodes, obstacles: tuple[ContactSurface, ...], text: str, weight: float = 0.0
     ) -> Nodes:
         nodes, convergence = self.bench.settle(nodes, obstacles, weight)
         self.log.append(convergence)
@@ -103,7 +103,7 @@ def _compress(run: _Run, by_mm: float, warm: State | None) -> tuple[Nodes, dict]
     half = (config.plate_mm / 2, 200.0, 10.0)  # wider than any organ
     steps = max(1, round((by_mm - done_mm) / config.load_step_mm))
     for amount in np.linspace(done_mm, by_mm, steps + 1)[1:].tolist():
-        above = Plate((0.0, 0.0, high - amount + half[2]), half, config.rounding_mm)
+        above = ContactPlate((0.0, 0.0, high - amount + half[2]), half, config.rounding_mm)
         nodes = run.step(nodes, (above,), f"plate lowered by {amount:.1f} mm")
     now_low, now_high = bench.midsection(nodes)
     return nodes, {
@@ -165,7 +165,7 @@ def _poke(run: _Run) -> tuple[Nodes, dict]:
     }
 
 
-def poke_point(bench: Bench) -> Float64[np.ndarray, " 3"]:
+def poke_point(bench: Apparatus) -> Float64[np.ndarray, " 3"]:
     """Where the surface faces up and is farthest from every tumor and from the organ's rim."""
     from scipy.spatial import cKDTree
 

@@ -16,13 +16,13 @@ from tumortrack.core.store import write_atomically
 from tumortrack.core.types import Anatomy
 from tumortrack_lab.twin.bench import State
 from tumortrack_lab.twin.states import solve
-from tumortrack_lab.twin.variants import Settled
+from tumortrack_lab.twin.variants import EquilibriumState
 
 # More compression goes on from less: the same answer in fewer load steps.
 _GOES_ON_FROM = {"D2": "D1", "D3": "D2"}
 
 
-class Stock:
+class StateCache:
     """The states of one case in a folder; the bench is built when the first one is needed."""
 
     def __init__(
@@ -44,7 +44,7 @@ class Stock:
         """Is it solved already?"""
         return self._path(state).exists()
 
-    def get(self, state: str, say: Callable[[str], None]) -> Settled:
+    def get(self, state: str, say: Callable[[str], None]) -> EquilibriumState:
         """The state, solved and kept if it is not there yet; ``say`` hears of each load step.
 
         Raises:
@@ -59,7 +59,7 @@ class Stock:
             part.moved(tensors[name])
             for name, part in zip(self._anatomy_ct.names, self._anatomy_ct.parts, strict=True)
         )
-        return Settled(
+        return EquilibriumState(
             state, Anatomy(parts), tensors["targets"], tensors["bench_from_ct"], about["report"]
         )
 

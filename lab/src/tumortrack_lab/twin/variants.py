@@ -88,7 +88,7 @@ def for_organ(config: ViewConfig, height_mm: float) -> ViewConfig:
 
 
 @dataclass(frozen=True, eq=False)
-class Settled:
+class EquilibriumState:
     """The anatomy at rest in one state, bench frame, mm, in the case's order of vertices.
 
     ``targets_mm`` (n, 3) are the case's target points there; ``report`` is the state's, plain
@@ -118,7 +118,7 @@ def camera_from_bench(config: ViewConfig, turn_degrees: int = 0) -> Float64[np.n
 
 
 def make_scene(
-    settled: Settled, name: str, view: View, config: ViewConfig, seed: int
+    settled: EquilibriumState, name: str, view: View, config: ViewConfig, seed: int
 ) -> tuple[Scene, Float64[np.ndarray, "n 3"]]:
     """One variant's scene in one view, and the targets before its camera, mm.
 

@@ -22,7 +22,7 @@ _POINT_SCALARS = 0x00
 
 
 @dataclass(frozen=True)
-class Status:
+class IgtlStatus:
     """How the sender is: ``code`` 1 is well; ``name`` at most 20 characters."""
 
     code: int
@@ -61,19 +61,19 @@ def unpack_transform(content: bytes) -> Float[np.ndarray, "4 4"]:
     return b_from_a
 
 
-def pack_status(status: Status) -> bytes:
+def pack_status(status: IgtlStatus) -> bytes:
     """The text ends with a zero byte, as the protocol's own library writes it."""
     name = status.name.encode("ascii", "replace")[:20]
     return _STATUS.pack(status.code, status.sub_code, name) + status.text.encode() + b"\0"
 
 
-def unpack_status(content: bytes) -> Status:
+def unpack_status(content: bytes) -> IgtlStatus:
     """Raises ProtocolError: shorter than 30 bytes."""
     if len(content) < _STATUS.size:
         raise ProtocolError(f"STATUS has at least {_STATUS.size} bytes, not {len(content)}.")
     code, sub_code, name = _STATUS.unpack_from(content)
     text = content[_STATUS.size :].split(b"\0")[0].decode("utf-8", "replace")
-    return Status(code, name.split(b"\0")[0].decode("latin-1"), text, sub_code)
+    return IgtlStatus(code, name.split(b"\0")[0].decode("latin-1"), text, sub_code)
 
 
 def pack_string(text: str) -> bytes:

@@ -15,7 +15,7 @@ import time
 from dataclasses import dataclass, field
 
 from tumortrack.core.errors import InputError
-from tumortrack.live.igtl.content import CHECKSUM_ERROR, Status, pack_status
+from tumortrack.live.igtl.content import CHECKSUM_ERROR, IgtlStatus, pack_status
 from tumortrack.live.igtl.crc64 import crc64
 from tumortrack.live.igtl.message import (
     HEADER_SIZE,
@@ -228,7 +228,7 @@ class Link:
         try:
             asked = unpack(header, body)
         except ProtocolError as error:
-            wrong = Status(CHECKSUM_ERROR, "checksum", str(error))
+            wrong = IgtlStatus(CHECKSUM_ERROR, "checksum", str(error))
             return {("STATUS", ""): pack(Message("STATUS", "", 0, pack_status(wrong)))}
         verb, _, kind = asked.type.partition("_")
         if not kind or verb not in ("GET", "STT", "STP"):

@@ -16,7 +16,7 @@ from tumortrack.core.mesh_files import write_mesh
 from tumortrack.core.types import DepthFrame, Mesh
 from tumortrack.live.recording.folders import CLOUD, DEPTH, FRAMES, INTRINSICS, MASK, REPORT
 from tumortrack.live.recording.metadata import facts, report
-from tumortrack.live.values import Seen, Shape, Update, Workcell
+from tumortrack.live.values import Observation, RigidShape, TrackingResult, Workcell
 from tumortrack.sense.files import DEPTH_UNIT_MM, depth_png, intrinsics_json
 from tumortrack.sense.ply import cloud_ply
 
@@ -46,7 +46,7 @@ class FrameFolders:
         self._surfaces: dict[str, tuple[Mesh, str]] = {}  # by shape: the last, and its file
         self._written = 0
 
-    def write(self, update: Update) -> None:
+    def write(self, update: TrackingResult) -> None:
         folder = self._root / f"{update.sequence:08d}"
         try:
             folder.mkdir()
@@ -96,7 +96,7 @@ class FrameFolders:
         }
         path.write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", encoding="utf-8")
 
-    def _surface(self, shape: Shape) -> str:
+    def _surface(self, shape: RigidShape) -> str:
         """The name of the file with a shape's surface, written when it comes first."""
         mesh, name = self._surfaces.get(shape.name, (None, ""))
         if mesh is not shape.mesh:
@@ -108,7 +108,7 @@ class FrameFolders:
         return name
 
 
-def _write_seen(folder: Path, seen: Seen) -> None:
+def _write_seen(folder: Path, seen: Observation) -> None:
     frame = seen.content
     if not isinstance(frame, DepthFrame):
         (folder / CLOUD).write_bytes(cloud_ply(frame.points_mm))

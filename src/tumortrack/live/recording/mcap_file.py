@@ -13,12 +13,12 @@ import numpy as np
 
 from tumortrack.core.errors import StorageError
 from tumortrack.live.recording.metadata import camera_frame, report
-from tumortrack.live.ros.cell import Cell
+from tumortrack.live.ros.cell import WorkcellMessages
 from tumortrack.live.ros.markers import Rate
 from tumortrack.live.ros.messages import Messages
 from tumortrack.live.ros.observed import MM_PER_M, Outgoing, messages_seen
 from tumortrack.live.ros.outgoing import messages_of
-from tumortrack.live.values import Frames, Setting, Update
+from tumortrack.live.values import PublishedFrame, SinkContext, TrackingResult
 
 # A killed program loses what is in no chunk yet.
 _CHUNK_S = 0.5
@@ -35,12 +35,14 @@ class McapFile:
         StorageError: the disk refused. Whole chunks stay, in a file without an end.
     """
 
-    def __init__(self, folder: Path, setting: Setting, frames: bool, meshes_hz: float) -> None:
+    def __init__(self, folder: Path, setting: SinkContext, frames: bool, meshes_hz: float) -> None:
         self._messages, self._setting = Messages("humble"), setting
         from rosbags.rosbag2 import StoragePlugin, Writer
 
         self._frames, self._meshes = frames, Rate(meshes_hz)
-        self._cell = Cell(self._messages, meshes_hz, observed=False) if setting.arms else None
+        self._cell = (
+            WorkcellMessages(self._messages, meshes_hz, observed=False) if setting.arms else None
+        )
         self._connections: dict[str, Any] = {}
         self._last_ns, self._chunk_s = 0, time.monotonic()
         writer: Any = Writer(folder, version=8, storage_plugin=StoragePlugin.MCAP)  # 8: Humble's
@@ -50,7 +52,7 @@ class McapFile:
         self._storage.bio = self._file = _WholeWrites(self._storage.path)
         self._whole = self._file.tell()  # behind the last whole chunk
 
-    def write(self, update: Update) -> None:
+    def write(self, update: TrackingResult) -> None:
         for out in self._messages_of(update):
             topic = out.suffix if out.suffix.startswith("/") else f"/tumortrack/{out.suffix}"
             self._write(topic, out, self._time_of(update))
@@ -66,7 +68,7 @@ class McapFile:
         except OSError as error:
             self._give_up(error)
 
-    def _messages_of(self, update: Update) -> list[Outgoing]:
+    def _messages_of(self, update: TrackingResult) -> list[Outgoing]:
         messages, published = self._messages, update.frames
         due = self._meshes.due()
         out = messages_of(update, messages, self._setting.parts, due, self._cell)
@@ -81,7 +83,7 @@ class McapFile:
                 out.append(_transform(update.stamp_ns, published, camera, messages))
         return out
 
-    def _time_of(self, update: Update) -> int:
+    def _time_of(self, update: TrackingResult) -> int:
         now_ns = time.time_ns() if update.seen is None else update.seen.arrived_ns
         self._last_ns = max(self._last_ns, now_ns)
         return self._last_ns
@@ -140,7 +142,7 @@ class _WholeWrites(io.FileIO):
         return size
 
 
-def _transform(stamp_ns: int, frames: Frames, camera: str, messages: Messages) -> Outgoing:
+def _transform(stamp_ns: int, frames: PublishedFrame, camera: str, messages: Messages) -> Outgoing:
     """Where the camera stands in the published frame."""
     from scipy.spatial.transform import Rotation
 

@@ -7,12 +7,12 @@ import numpy as np
 import tumortrack
 from tumortrack.core.types import SensorCloud
 from tumortrack.live.ros.observed import CAMERA_FRAME
-from tumortrack.live.values import Frames, Update
+from tumortrack.live.values import PublishedFrame, TrackingResult
 
 KIND = "recording"
 
 
-def facts(update: Update) -> dict:
+def facts(update: TrackingResult) -> dict:
     """One line about an update (JSON types)."""
     seen = None
     if update.seen is not None:
@@ -29,7 +29,7 @@ def facts(update: Update) -> dict:
     }
 
 
-def report(update: Update) -> dict:
+def report(update: TrackingResult) -> dict:
     """Everything about an update: its facts, times of stages, and the estimate's own report, or
     null with the reason."""
     return {
@@ -40,7 +40,7 @@ def report(update: Update) -> dict:
     }
 
 
-def about(form: str, parts: tuple[str, ...], frames: Frames) -> dict:
+def about(form: str, parts: tuple[str, ...], frames: PublishedFrame) -> dict:
     """What a recording is: recording.json."""
     return {
         "kind": KIND,
@@ -54,7 +54,7 @@ def about(form: str, parts: tuple[str, ...], frames: Frames) -> dict:
     }
 
 
-def camera_frame(frames: Frames) -> str:
+def camera_frame(frames: PublishedFrame) -> str:
     """The name of the camera's frame: the published one's where it is the same."""
     if np.array_equal(frames.published_from_camera, np.eye(4)):
         return frames.frame_id

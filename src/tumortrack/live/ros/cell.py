@@ -27,7 +27,7 @@ from tumortrack.live.ros.markers import (
 )
 from tumortrack.live.ros.messages import Messages, PointBlock
 from tumortrack.live.ros.observed import MM_PER_M, Outgoing, plain_cloud
-from tumortrack.live.values import Line, Shape, Update, Workcell
+from tumortrack.live.values import Polyline, RigidShape, TrackingResult, Workcell
 from tumortrack.live.viewer.points import MOST_SEEN, seen_points, thinned
 from tumortrack.live.viewer.workcell import box_of, wxyz_of
 
@@ -40,7 +40,7 @@ _TEXT_HEIGHT_M = 0.04
 _TEXT_ABOVE_MM = 60.0
 
 
-class Cell:
+class WorkcellMessages:
     """A publisher's memory of what it showed, so that what is gone is deleted.
 
     ``hz``: markers and observed points at most so often (0: each time), but at once where the
@@ -54,7 +54,7 @@ class Cell:
         self._shown: set[str] = set()
         self._said: tuple[str, bool] | None = None
 
-    def outgoing(self, update: Update, header: Any) -> list[Outgoing]:
+    def outgoing(self, update: TrackingResult, header: Any) -> list[Outgoing]:
         """``joint_states`` (JointState; no names without arms) and ``workcell`` (MarkerArray: a
         list of triangles per shape with its pose, a strip per line, the state as text above all;
         namespaces are their names; everything deleted without a workcell); and ``observed``
@@ -70,7 +70,7 @@ class Cell:
             out.append(Outgoing("observed", CLOUD, points))
         return out
 
-    def status(self, update: Update) -> Any:
+    def status(self, update: TrackingResult) -> Any:
         """A DiagnosticStatus: OK with the state, WARN where the arms are halted, STALE without a
         workcell."""
         cell = update.workcell
@@ -100,7 +100,7 @@ class Cell:
             position=np.array(list(joints.values()), np.float64),
         )
 
-    def _points(self, update: Update, header: Any) -> Any | None:
+    def _points(self, update: TrackingResult, header: Any) -> Any | None:
         """None: it is not their turn."""
         points_mm = np.zeros((0, 3), np.float32)
         if update.seen is not None:
@@ -110,7 +110,7 @@ class Cell:
             points_mm = transform_points(update.frames.published_from_camera, points_mm)
         return plain_cloud(SensorCloud(points_mm, update.stamp_ns), header, self._messages)
 
-    def _markers(self, update: Update, header: Any) -> list[Any] | None:
+    def _markers(self, update: TrackingResult, header: Any) -> list[Any] | None:
         """All or, if it is not their turn, None: receivers that are slow keep the newest message
         alone, so each must be whole."""
         messages, cell = self._messages, update.workcell
@@ -132,7 +132,7 @@ class Cell:
         ]
 
 
-def verdict(update: Update) -> str:
+def verdict(update: TrackingResult) -> str:
     """How good the estimate is, or why there is none."""
     if update.estimate is None:
         return f"no estimate: {update.reason}"
@@ -144,7 +144,7 @@ def words(cell: Workcell) -> str:
     return f"{cell.state}, halted: {cell.halted}" if cell.halted else cell.state
 
 
-def _surfaces(shapes: tuple[Shape, ...], header: Any, messages: Messages) -> Iterator[Any]:
+def _surfaces(shapes: tuple[RigidShape, ...], header: Any, messages: Messages) -> Iterator[Any]:
     ways = np.array([shape.published_from_shape for shape in shapes]).reshape(-1, 4, 4)
     turns = wxyz_of(ways[:, :3, :3]) if shapes else ()
     scale = messages.make("geometry_msgs/msg/Vector3", x=1.0, y=1.0, z=1.0)
@@ -163,7 +163,7 @@ def _surfaces(shapes: tuple[Shape, ...], header: Any, messages: Messages) -> Ite
         )
 
 
-def _strip(line: Line, header: Any, messages: Messages) -> Any:
+def _strip(line: Polyline, header: Any, messages: Messages) -> Any:
     return marker(
         messages,
         header,
@@ -177,7 +177,7 @@ def _strip(line: Line, header: Any, messages: Messages) -> Any:
     )
 
 
-def _text(update: Update, cell: Workcell, header: Any, messages: Messages) -> Any:
+def _text(update: TrackingResult, cell: Workcell, header: Any, messages: Messages) -> Any:
     """Above everything: where arms are, z is up."""
     said = words(cell) if update.estimate is not None else f"{words(cell)}\n{verdict(update)}"
     box = box_of(cell)

@@ -10,7 +10,7 @@ import numpy as np
 from tumortrack.core.types import DepthFrame, SensorCloud
 from tumortrack.live.ros.incoming import CAMERA_INFO, CLOUD, IMAGE
 from tumortrack.live.ros.messages import Messages
-from tumortrack.live.values import Seen
+from tumortrack.live.values import Observation
 
 CAMERA_FRAME = "camera"
 MM_PER_M = 1000
@@ -25,7 +25,9 @@ class Outgoing(NamedTuple):
     message: Any
 
 
-def messages_seen(seen: Seen, messages: Messages, frame_id: str = CAMERA_FRAME) -> list[Outgoing]:
+def messages_seen(
+    seen: Observation, messages: Messages, frame_id: str = CAMERA_FRAME
+) -> list[Outgoing]:
     """What the source saw, in the camera's frame: ``depth/image_rect`` (32FC1, metres: float32
     there and back is exact to one part in 10 million, 1e-5 mm at 150 mm) and
     ``depth/camera_info``, or ``points``; and ``mask`` (mono8) where there is one.

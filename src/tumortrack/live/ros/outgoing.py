@@ -13,7 +13,7 @@ import numpy as np
 from tumortrack.core.colours import GOOD, NONE, POOR, Colour, label_colours, part_colour
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.types import Mesh
-from tumortrack.live.ros.cell import Cell, verdict
+from tumortrack.live.ros.cell import WorkcellMessages, verdict
 from tumortrack.live.ros.incoming import CLOUD
 from tumortrack.live.ros.markers import (
     ADD,
@@ -29,7 +29,7 @@ from tumortrack.live.ros.markers import (
 )
 from tumortrack.live.ros.messages import Messages, PointBlock
 from tumortrack.live.ros.observed import FLOAT32, MM_PER_M, UINT8, Outgoing, cloud_message
-from tumortrack.live.values import Placed, Quality, Update
+from tumortrack.live.values import Quality, TrackingResult, TransformedEstimate
 
 DIAGNOSTICS = "diagnostic_msgs/msg/DiagnosticArray"
 PLACE = "geometry_msgs/msg/PointStamped"
@@ -50,11 +50,11 @@ _POINT = np.dtype(
 
 
 def messages_of(
-    update: Update,
+    update: TrackingResult,
     messages: Messages,
     parts: tuple[str, ...] = (),
     meshes: bool = True,
-    cell: Cell | None = None,
+    cell: WorkcellMessages | None = None,
 ) -> list[Outgoing]:
     """What is published of one update.
 
@@ -87,9 +87,9 @@ def messages_of(
     ]
 
 
-def ended(last: Update) -> Update:
+def ended(last: TrackingResult) -> TrackingResult:
     """What is published at the end, so that no estimate stays on a screen."""
-    return Update(
+    return TrackingResult(
         sequence=last.sequence + 1,
         stamp_ns=last.stamp_ns + 1,
         reason="tracking has ended",
@@ -97,7 +97,7 @@ def ended(last: Update) -> Update:
     )
 
 
-def _labelled_cloud(placed: Placed | None, header: Any, messages: Messages) -> Any:
+def _labelled_cloud(placed: TransformedEstimate | None, header: Any, messages: Messages) -> Any:
     n = 0 if placed is None else len(placed.points_mm)
     table = np.zeros(n, _POINT)
     if placed is not None:
@@ -114,7 +114,7 @@ def _labelled_cloud(placed: Placed | None, header: Any, messages: Messages) -> A
 
 
 def _markers(
-    update: Update, names: tuple[str, ...], header: Any, messages: Messages, meshes: bool
+    update: TrackingResult, names: tuple[str, ...], header: Any, messages: Messages, meshes: bool
 ) -> Any:
     """Triangles per part and a text about their quality; everything deleted without estimate."""
     placed, markers = update.placed, []
@@ -146,7 +146,7 @@ def _triangles(mesh: Mesh, name: str, label: int, header: Any, messages: Message
     )
 
 
-def _text(update: Update, header: Any, messages: Messages) -> Any:
+def _text(update: TrackingResult, header: Any, messages: Messages) -> Any:
     """Above the organ, as the camera sees it; without one, before the camera."""
     way, above_mm = update.frames.published_from_camera, np.array([[0.0, 0.0, 150.0]])
     if update.estimate is not None and (organ := update.estimate.meshes.get("kidney")):
@@ -165,7 +165,7 @@ def _text(update: Update, header: Any, messages: Messages) -> Any:
     )
 
 
-def _center(update: Update, name: str, header: Any, messages: Messages) -> Any:
+def _center(update: TrackingResult, name: str, header: Any, messages: Messages) -> Any:
     mesh = None if update.estimate is None else update.estimate.meshes.get(name)
     middle_m = np.full(3, np.nan)
     if mesh is not None:
@@ -174,7 +174,9 @@ def _center(update: Update, name: str, header: Any, messages: Messages) -> Any:
     return messages.make(PLACE, header=header, point=point(messages, middle_m))
 
 
-def _diagnostics(update: Update, header: Any, messages: Messages, cell: Cell | None) -> Any:
+def _diagnostics(
+    update: TrackingResult, header: Any, messages: Messages, cell: WorkcellMessages | None
+) -> Any:
     said: dict[str, Any] = {
         "quality": update.quality,
         "sequence": update.sequence,

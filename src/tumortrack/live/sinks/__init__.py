@@ -4,11 +4,18 @@ A sink's configuration is what the command line writes as ``kind:target?key=valu
 makes the sink (``live.values.Sink``). To add one: write its file, add its configuration here.
 """
 
-from tumortrack.live.sinks.openigtlink import OpenIgtLink
-from tumortrack.live.sinks.recording import Recording
-from tumortrack.live.sinks.ros1 import Ros1
-from tumortrack.live.sinks.ros2 import Ros2
-from tumortrack.live.sinks.ur import Ur
-from tumortrack.live.sinks.viewer import Viewer
+from tumortrack.live.sinks.openigtlink import OpenIgtLinkSinkConfig
+from tumortrack.live.sinks.recording import RecordingSinkConfig
+from tumortrack.live.sinks.ros1 import Ros1SinkConfig
+from tumortrack.live.sinks.ros2 import Ros2SinkConfig
+from tumortrack.live.sinks.ur import UrSinkConfig
+from tumortrack.live.sinks.viewer import ViewerSinkConfig
 
-SINKS = (Viewer, Recording, Ros2, Ros1, OpenIgtLink, Ur)
+SINKS = (
+    ViewerSinkConfig,
+    RecordingSinkConfig,
+    Ros2SinkConfig,
+    Ros1SinkConfig,
+    OpenIgtLinkSinkConfig,
+    UrSinkConfig,
+)

@@ -21,15 +21,15 @@ from tumortrack.live.igtl.content import (
     NOT_PRESENT,
     NOT_READY,
     OK,
+    IgtlStatus,
     Polydata,
-    Status,
     pack_polydata,
     pack_status,
     pack_transform,
 )
 from tumortrack.live.igtl.link import Link
 from tumortrack.live.igtl.message import Message
-from tumortrack.live.values import Placed, Setting, SinkConfig, Update
+from tumortrack.live.values import SinkConfig, SinkContext, TrackingResult, TransformedEstimate
 
 STATUS_DEVICE, CT_DEVICE, CLOUD_DEVICE, ARMS_DEVICE = "tumortrack", "ct", "occupancy", "arms"
 _TIP = "/tip"  # how the names of shapes at the tips of tools end
@@ -37,7 +37,7 @@ _NOWHERE = np.eye(4)
 _NO_POINTS, _NO_FACES = np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32)
 
 
-class OpenIgtLink(SinkConfig, frozen=True, kw_only=True, tag="openigtlink"):
+class OpenIgtLinkSinkConfig(SinkConfig, frozen=True, kw_only=True, tag="openigtlink"):
     """A server that 3D Slicer connects to, or, with ``connect``, a client of one.
 
     Attributes:
@@ -65,7 +65,7 @@ class OpenIgtLink(SinkConfig, frozen=True, kw_only=True, tag="openigtlink"):
             if not 0 <= value <= 1000:
                 raise InputError(f"openigtlink: {name} {value} must lie in 0..1000.")
 
-    def open(self, setting: Setting) -> OpenIgtLinkSink:
+    def open(self, setting: SinkContext) -> OpenIgtLinkSink:
         """Serve, or begin to try to connect.
 
         Raises:
@@ -88,7 +88,7 @@ class OpenIgtLinkSink:
     (``cutter/tip``): from the tip's own frame, and MISSING once it is gone.
     """
 
-    def __init__(self, config: OpenIgtLink, setting: Setting) -> None:
+    def __init__(self, config: OpenIgtLinkSinkConfig, setting: SinkContext) -> None:
         self._parts, self._frames = setting.parts, setting.frames
         self._axes = RAS_FROM_LPS if config.space == "ras" else np.eye(4)
         self._link = Link(config.host, config.port, config.connect)
@@ -106,7 +106,7 @@ class OpenIgtLinkSink:
         """How many are connected."""
         return self._link.receivers
 
-    def publish(self, update: Update) -> None:
+    def publish(self, update: TrackingResult) -> None:
         code = OK if update.estimate is not None else NOT_FOUND
         self._link.send(self._said(update, code))
         self._next = update.sequence + 1
@@ -116,40 +116,40 @@ class OpenIgtLinkSink:
         if not self._closed:
             self._closed = True
             reason = "tracking has ended"
-            over = Update(self._next, time.time_ns(), reason=reason, frames=self._frames)
+            over = TrackingResult(self._next, time.time_ns(), reason=reason, frames=self._frames)
             self._link.send(self._said(over, EXITING))
             self._link.close()
 
-    def _said(self, update: Update, code: int) -> list[Message]:
+    def _said(self, update: TrackingResult, code: int) -> list[Message]:
         arms = [self._arms_status(update)] if self._arms else []
         status = self._status(update, code)
         return [status, *arms, *self._transforms(update), *self._surfaces(update)]
 
     def _message(
-        self, kind: str, device: str, update: Update, content: bytes, **more: str
+        self, kind: str, device: str, update: TrackingResult, content: bytes, **more: str
     ) -> Message:
         metadata = {"frame_id": update.frames.frame_id, "sequence": str(update.sequence), **more}
         return Message(kind, device, update.stamp_ns, content, metadata)
 
-    def _status(self, update: Update, code: int) -> Message:
+    def _status(self, update: TrackingResult, code: int) -> Message:
         found = update.estimate is not None
         name, text = (update.quality, update.warning) if found else ("no estimate", update.reason)
         more = {"quality": str(update.quality)}
         if update.latency_ms is not None:
             more["latency_ms"] = f"{update.latency_ms:.1f}"
-        content = pack_status(Status(code, name, text))
+        content = pack_status(IgtlStatus(code, name, text))
         return self._message("STATUS", STATUS_DEVICE, update, content, **more)
 
-    def _arms_status(self, update: Update) -> Message:
+    def _arms_status(self, update: TrackingResult) -> Message:
         cell = update.workcell
         if cell is None:
-            status = Status(NOT_PRESENT, "unknown", "nothing is known of the arms")
+            status = IgtlStatus(NOT_PRESENT, "unknown", "nothing is known of the arms")
             return self._message("STATUS", ARMS_DEVICE, update, pack_status(status))
-        status = Status(NOT_READY if cell.halted else OK, cell.state, cell.halted)
+        status = IgtlStatus(NOT_READY if cell.halted else OK, cell.state, cell.halted)
         content = pack_status(status)
         return self._message("STATUS", ARMS_DEVICE, update, content, state=cell.state)
 
-    def _transforms(self, update: Update) -> Iterator[Message]:
+    def _transforms(self, update: TrackingResult) -> Iterator[Message]:
         way, pose = update.frames.published_from_camera, _camera_from_ct(update)
         places: dict[str, Float64[np.ndarray, "4 4"] | None] = dict.fromkeys(self._parts[1:])
         if self._has_ct:
@@ -171,7 +171,7 @@ class OpenIgtLinkSink:
             content = pack_transform(turned)
             yield self._message("TRANSFORM", name, update, content, TransformStatus=known)
 
-    def _surfaces(self, update: Update) -> Iterator[Message]:
+    def _surfaces(self, update: TrackingResult) -> Iterator[Message]:
         placed = update.placed
         meshes, mesh_due = (placed.meshes, self._meshes.due()) if placed else ({}, True)
         contents: dict[str, Polydata] = {}
@@ -189,7 +189,7 @@ class OpenIgtLinkSink:
         for name, content in contents.items():
             yield self._message("POLYDATA", name, update, pack_polydata(content))
 
-    def _points(self, placed: Placed) -> Polydata:
+    def _points(self, placed: TransformedEstimate) -> Polydata:
         """Each point as a line without length: Slicer shows points of cells only, and its reader
         does not bear cells of one point."""
         number = np.arange(len(placed.points_mm))
@@ -218,7 +218,7 @@ class _Pace:
         return True
 
 
-def _camera_from_ct(update: Update) -> Float64[np.ndarray, "4 4"] | None:
+def _camera_from_ct(update: TrackingResult) -> Float64[np.ndarray, "4 4"] | None:
     """The organ's pose without its deformation, where the method knows one."""
     if update.estimate is None or "motion" not in update.estimate.report:
         return None

@@ -13,12 +13,12 @@ from tumortrack.live.recording.folders import FRAMES
 from tumortrack.live.recording.frame_folders import INDEX, SHAPES, FrameFolders
 from tumortrack.live.recording.mcap_file import McapFile
 from tumortrack.live.recording.metadata import KIND, about
-from tumortrack.live.values import Setting, SinkConfig, Update
+from tumortrack.live.values import SinkConfig, SinkContext, TrackingResult
 
 _ABOUT = "recording.json"
 
 
-class Recording(SinkConfig, frozen=True, kw_only=True, tag="recording"):
+class RecordingSinkConfig(SinkConfig, frozen=True, kw_only=True, tag="recording"):
     """A new folder with every update.
 
     Attributes:
@@ -42,7 +42,7 @@ class Recording(SinkConfig, frozen=True, kw_only=True, tag="recording"):
         if not 0 <= self.meshes_hz <= 1000:
             raise InputError(f"recording: meshes_hz is {self.meshes_hz:g}; allowed: 0..1000.")
 
-    def open(self, setting: Setting) -> RecordingSink:
+    def open(self, setting: SinkContext) -> RecordingSink:
         """
         Raises:
             InputError: the folder exists, and is no recording or ``overwrite`` was not given.
@@ -75,7 +75,7 @@ class RecordingSink:
         self._refused: StorageError | None = None
         self._closed = False
 
-    def publish(self, update: Update) -> None:
+    def publish(self, update: TrackingResult) -> None:
         if self._refused is not None:
             raise StorageError(str(self._refused))
         try:

@@ -7,19 +7,19 @@ from typing import Any, ClassVar
 
 from tumortrack.core.errors import InputError
 from tumortrack.live.ros import rospy_node
-from tumortrack.live.ros.cell import Cell
+from tumortrack.live.ros.cell import WorkcellMessages
 from tumortrack.live.ros.markers import Rate
 from tumortrack.live.ros.messages import Messages
 from tumortrack.live.ros.observed import Outgoing
 from tumortrack.live.ros.outgoing import ended, messages_of
-from tumortrack.live.values import Setting, SinkConfig, Update
+from tumortrack.live.values import SinkConfig, SinkContext, TrackingResult
 
 _CHECK_S = 1.0  # how often the master is asked whether it knows the topics
 _CHECK_SHARE = 0.1  # and at most so much of the time is spent waiting for its answer
 _FLUSH_S = 0.2  # what was published last leaves within that time
 
 
-class Ros1(SinkConfig, frozen=True, kw_only=True, tag="ros1"):
+class Ros1SinkConfig(SinkConfig, frozen=True, kw_only=True, tag="ros1"):
     """Topics under ``namespace``: see ``live.ros.outgoing``.
 
     Attributes:
@@ -36,7 +36,7 @@ class Ros1(SinkConfig, frozen=True, kw_only=True, tag="ros1"):
         if not 0 <= self.mesh_hz <= 1000:
             raise InputError(f"ros1: mesh_hz {self.mesh_hz:g} must lie in 0..1000.")
 
-    def open(self, setting: Setting) -> Ros1Sink:
+    def open(self, setting: SinkContext) -> Ros1Sink:
         """Advertise.
 
         Raises:
@@ -52,21 +52,21 @@ class Ros1Sink:
     """Whoever subscribes gets the newest update as fast as it takes them. At the end, and whenever
     there is no estimate, all topics say so."""
 
-    def __init__(self, config: Ros1, setting: Setting, node: rospy_node.Node) -> None:
+    def __init__(self, config: Ros1SinkConfig, setting: SinkContext, node: rospy_node.Node) -> None:
         self._node, self._parts = node, setting.parts
         self._messages = Messages("noetic")
         self._mesh_rate = Rate(config.mesh_hz)
-        self._cell = Cell(self._messages, config.mesh_hz) if setting.arms else None
-        self._last: Update | None = None
+        self._cell = WorkcellMessages(self._messages, config.mesh_hz) if setting.arms else None
+        self._last: TrackingResult | None = None
         self._lost = ""
-        nothing = Update(sequence=0, stamp_ns=0, frames=setting.frames)
+        nothing = TrackingResult(sequence=0, stamp_ns=0, frames=setting.frames)
         self._publishers: dict[str, Any] = {
             suffix: self._advertise(f"{config.namespace}/{suffix}", message_type)
             for suffix, message_type, _ in self._messages_of(nothing)
         }
         self._check_at_s = time.monotonic() + _CHECK_S
 
-    def publish(self, update: Update) -> None:
+    def publish(self, update: TrackingResult) -> None:
         """Send what is known of this update.
 
         Raises:
@@ -99,7 +99,7 @@ class Ros1Sink:
             for one in publishers.values():
                 one.unregister()
 
-    def _messages_of(self, update: Update, meshes: bool = True) -> list[Outgoing]:
+    def _messages_of(self, update: TrackingResult, meshes: bool = True) -> list[Outgoing]:
         return messages_of(update, self._messages, self._parts, meshes, self._cell)
 
     def _advertise(self, topic: str, message_type: str) -> Any:

@@ -7,17 +7,17 @@ from typing import ClassVar
 
 from tumortrack.core.errors import InputError, TumortrackError
 from tumortrack.live.ros.bus import Bus, Publisher, Via, check_topic, open_bus
-from tumortrack.live.ros.cell import Cell
+from tumortrack.live.ros.cell import WorkcellMessages
 from tumortrack.live.ros.markers import Rate
 from tumortrack.live.ros.messages import Messages
 from tumortrack.live.ros.observed import Outgoing
 from tumortrack.live.ros.outgoing import ended, messages_of
-from tumortrack.live.values import Setting, SinkConfig, Update
+from tumortrack.live.values import SinkConfig, SinkContext, TrackingResult
 
 _FLUSH_S = 0.2  # what was published last leaves within that time
 
 
-class Ros2(SinkConfig, frozen=True, kw_only=True, tag="ros2"):
+class Ros2SinkConfig(SinkConfig, frozen=True, kw_only=True, tag="ros2"):
     """Topics under ``namespace``: see ``live.ros.outgoing``.
 
     Attributes:
@@ -36,7 +36,7 @@ class Ros2(SinkConfig, frozen=True, kw_only=True, tag="ros2"):
         if not 0 <= self.mesh_hz <= 1000:
             raise InputError(f"ros2: mesh_hz {self.mesh_hz:g} must lie in 0..1000.")
 
-    def open(self, setting: Setting) -> Ros2Sink:
+    def open(self, setting: SinkContext) -> Ros2Sink:
         """Join the graph and announce the topics.
 
         Raises:
@@ -50,18 +50,20 @@ class Ros2Sink:
     """Whoever subscribes gets the newest update; one that is slow misses some and holds up nobody.
     At the end, and whenever there is no estimate, all topics say so."""
 
-    def __init__(self, config: Ros2, setting: Setting, bus: Bus, messages: Messages) -> None:
+    def __init__(
+        self, config: Ros2SinkConfig, setting: SinkContext, bus: Bus, messages: Messages
+    ) -> None:
         self._bus, self._messages, self._parts = bus, messages, setting.parts
         self._mesh_rate = Rate(config.mesh_hz)
-        self._cell = Cell(messages, config.mesh_hz) if setting.arms else None
-        self._last: Update | None = None
-        nothing = Update(sequence=0, stamp_ns=0, frames=setting.frames)
+        self._cell = WorkcellMessages(messages, config.mesh_hz) if setting.arms else None
+        self._last: TrackingResult | None = None
+        nothing = TrackingResult(sequence=0, stamp_ns=0, frames=setting.frames)
         self._publishers: dict[str, Publisher] = {
             suffix: bus.publisher(f"{config.namespace}/{suffix}", message_type)
             for suffix, message_type, _ in self._messages_of(nothing)
         }
 
-    def publish(self, update: Update) -> None:
+    def publish(self, update: TrackingResult) -> None:
         """Send it on every topic, the others too where one fails.
 
         Raises:
@@ -95,5 +97,5 @@ class Ros2Sink:
             self._publishers = {}
             self._bus.close()
 
-    def _messages_of(self, update: Update, meshes: bool = True) -> list[Outgoing]:
+    def _messages_of(self, update: TrackingResult, meshes: bool = True) -> list[Outgoing]:
         return messages_of(update, self._messages, self._parts, meshes, self._cell)

@@ -17,7 +17,7 @@ from jaxtyping import Float64
 
 from tumortrack.core.errors import InputError, TumortrackError
 from tumortrack.live.ur_link import SILENT_S, UR_JOINTS, UrLink, connected
-from tumortrack.live.values import Controls, Setting, SinkConfig, Update
+from tumortrack.live.values import Controls, SinkConfig, SinkContext, TrackingResult
 
 # Of UR5, UR5e, UR10 and UR10e (data sheets): a turn either way; the larger ones' first two joints
 # are the slower ones, and their limits hold for all here.
@@ -28,7 +28,7 @@ _TICK_S = 0.02  # of the watchdog
 _SHORTEST_S, _LONGEST_S = 0.008, 0.1  # that the controller follows one target
 
 
-class Ur(SinkConfig, frozen=True, kw_only=True, tag="ur"):
+class UrSinkConfig(SinkConfig, frozen=True, kw_only=True, tag="ur"):
     """One arm at ``host``.
 
     Attributes:
@@ -57,7 +57,7 @@ class Ur(SinkConfig, frozen=True, kw_only=True, tag="ur"):
             if not low <= value <= high:
                 raise InputError(f"ur: {name} {value:g} must lie in {low:g}..{high:g}.")
 
-    def open(self, setting: Setting) -> UrSink:
+    def open(self, setting: SinkContext) -> UrSink:
         """Nothing, or with ``execute`` the connection to the arm, which does not move yet.
 
         Raises:
@@ -76,7 +76,7 @@ class UrSink:
     this process die, the arm's controller stops it within 0.2 s by itself (setWatchdog).
     """
 
-    def __init__(self, config: Ur, link: UrLink | None, controls: Controls) -> None:
+    def __init__(self, config: UrSinkConfig, link: UrLink | None, controls: Controls) -> None:
         self._config, self._link, self._controls = config, link, controls
         self._names = tuple(f"{config.arm}_{joint}" for joint in UR_JOINTS)
         self._last: tuple[Float64[np.ndarray, " 6"], float, int] | None = None
@@ -96,7 +96,7 @@ class UrSink:
         with self._lock:
             return dict(self._counts)
 
-    def publish(self, update: Update) -> None:
+    def publish(self, update: TrackingResult) -> None:
         """Send the target, or check it.
 
         Raises:

@@ -19,14 +19,14 @@ from tumortrack.core import colours
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.types import Mesh
-from tumortrack.live.values import Setting, SinkConfig, Update
+from tumortrack.live.values import SinkConfig, SinkContext, TrackingResult
 from tumortrack.live.viewer.panel import Actions, Panel
 from tumortrack.live.viewer.points import point_under, seen_points
-from tumortrack.live.viewer.scene import Scene
+from tumortrack.live.viewer.scene import ViewerScene
 from tumortrack.live.viewer.server import close_server, open_server
 from tumortrack.live.viewer.slices import load_ct, plane_through, slice_picture
-from tumortrack.live.viewer.status import State, Status, backdrop
-from tumortrack.live.viewer.workcell import Cell
+from tumortrack.live.viewer.status import State, StatusPanel, backdrop
+from tumortrack.live.viewer.workcell import WorkcellView
 
 if TYPE_CHECKING:
     from viser import SceneClickEvent
@@ -36,7 +36,7 @@ _TICK_S = 0.2  # the status grows older, and slices are renewed, this often
 _SLICE_PIXELS = 320
 
 
-class Viewer(SinkConfig, frozen=True, kw_only=True, tag="viewer"):
+class ViewerSinkConfig(SinkConfig, frozen=True, kw_only=True, tag="viewer"):
     """A page at ``http://host:port``.
 
     Attributes:
@@ -64,7 +64,7 @@ class Viewer(SinkConfig, frozen=True, kw_only=True, tag="viewer"):
         if not 0 < self.hz <= 60:
             raise InputError(f"viewer: hz={self.hz:g}; allowed are more than 0 and up to 60.")
 
-    def open(self, setting: Setting) -> ViewerSink:
+    def open(self, setting: SinkContext) -> ViewerSink:
         """The page, ready for visitors.
 
         Raises:
@@ -77,14 +77,14 @@ class Viewer(SinkConfig, frozen=True, kw_only=True, tag="viewer"):
 class ViewerSink:
     """See ``live.values.Sink``. ``port``: where the page is."""
 
-    def __init__(self, config: Viewer, setting: Setting) -> None:
+    def __init__(self, config: ViewerSinkConfig, setting: SinkContext) -> None:
         ct = load_ct(config.case, setting) if config.case else None
         self._config, self._setting, self._ct = config, setting, ct
         self._server = open_server(config.host, config.port)
         self.port: int = self._server.get_port()
         self._lock = threading.RLock()  # round every change of the page
-        self._update: Update | None = None  # the last that came
-        self._shown: Update | None = None  # whose estimate is visible
+        self._update: TrackingResult | None = None  # the last that came
+        self._shown: TrackingResult | None = None  # whose estimate is visible
         self._came = self._drawn = -np.inf
         self._spells = 0  # how often estimates were hidden: a slice of an earlier spell is void
         self._beat = 0
@@ -92,8 +92,8 @@ class ViewerSink:
         self._asked = False
         self._state: State | None = None
         self._behind: tuple[State, bool] | None = None
-        self._scene = Scene(self._server, setting, config.margin_mm)
-        self._cell = Cell(self._server)
+        self._scene = ViewerScene(self._server, setting, config.margin_mm)
+        self._cell = WorkcellView(self._server)
         turn = self._scene.look.turn
         actions = Actions(self._changed, self._ask, self._forget, turn, self._abort)
         self._panel = Panel(self._server, setting.parts, actions, ct is not None, setting.arms)
@@ -102,7 +102,7 @@ class ViewerSink:
         self._watch = threading.Thread(target=self._keep_watch, name="viewer", daemon=True)
         self._watch.start()
 
-    def publish(self, update: Update) -> None:
+    def publish(self, update: TrackingResult) -> None:
         """Show it: without an estimate at once, with one not more often than ``hz``; arms each
         time."""
         if self._closing.is_set():
@@ -134,7 +134,7 @@ class ViewerSink:
         with self._lock, self._server.atomic():
             yield
 
-    def _draw(self, update: Update) -> None:
+    def _draw(self, update: TrackingResult) -> None:
         try:
             self._scene.observe(update)
             if update.estimate is None:
@@ -150,7 +150,7 @@ class ViewerSink:
             self._say("none")
             raise
 
-    def _draw_cell(self, update: Update) -> None:
+    def _draw_cell(self, update: TrackingResult) -> None:
         try:
             if update.workcell is None:
                 self._cell.hide()
@@ -174,7 +174,7 @@ class ViewerSink:
         age_s = time.monotonic() - self._came if update is not None else 0.0
         if update is not None and update.latency_ms is not None:
             age_s += update.latency_ms / 1000
-        status = Status(state, update, age_s, self._beat, self._setting.arms)
+        status = StatusPanel(state, update, age_s, self._beat, self._setting.arms)
         if (behind := (state, status.loud)) != self._behind:
             self._behind = behind
             self._server.scene.set_background_image(backdrop(*behind))
@@ -216,7 +216,7 @@ class ViewerSink:
                 if picture is not None and plane is not None:
                     self._scene.put_slice(picture, plane, update.frames)
 
-    def _outlines(self, update: Update) -> list[tuple[Mesh, colours.Colour, int]]:
+    def _outlines(self, update: TrackingResult) -> list[tuple[Mesh, colours.Colour, int]]:
         assert update.estimate is not None
         back = np.linalg.inv(update.frames.published_from_camera)
         outlines = []

@@ -5,10 +5,16 @@ A source's configuration is what the command line writes as ``kind:target?key=va
 configuration here.
 """
 
-from tumortrack.live.sources.realsense import RealSense
-from tumortrack.live.sources.recording import Recording
-from tumortrack.live.sources.ros1 import Ros1
-from tumortrack.live.sources.ros2 import Ros2
-from tumortrack.live.sources.virtual import Virtual
+from tumortrack.live.sources.realsense import RealSenseSourceConfig
+from tumortrack.live.sources.recording import RecordingSourceConfig
+from tumortrack.live.sources.ros1 import Ros1SourceConfig
+from tumortrack.live.sources.ros2 import Ros2SourceConfig
+from tumortrack.live.sources.virtual import VirtualSourceConfig
 
-SOURCES = (Virtual, RealSense, Recording, Ros2, Ros1)
+SOURCES = (
+    VirtualSourceConfig,
+    RealSenseSourceConfig,
+    RecordingSourceConfig,
+    Ros2SourceConfig,
+    Ros1SourceConfig,
+)

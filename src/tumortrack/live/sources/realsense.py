@@ -19,14 +19,14 @@ import numpy as np
 
 from tumortrack.core.errors import InputError
 from tumortrack.core.types import DepthFrame, Intrinsics
-from tumortrack.live.values import Seen, SourceConfig, SourceEnded, SourceLost
+from tumortrack.live.values import Observation, SourceConfig, SourceEnded, SourceLost
 
 _RECORDINGS = (".db3", ".bag")
 _LAST_S = 0.2  # after a recording's end: its last frame may still be on its way
 _MOST_UNTIMED = 150  # frames before the camera's clock is tied to this machine's
 
 
-class RealSense(SourceConfig, frozen=True, kw_only=True, tag="realsense"):
+class RealSenseSourceConfig(SourceConfig, frozen=True, kw_only=True, tag="realsense"):
     """The first RealSense, the one with a serial number, or a recording (.db3, .bag).
 
     Attributes:
@@ -72,8 +72,8 @@ class RealSense(SourceConfig, frozen=True, kw_only=True, tag="realsense"):
 class RealSenseSource:
     """Depth frames of an SDK device: camera, playback or software device."""
 
-    def __init__(self, device: Any, config: RealSense) -> None:
-        """Start streaming; raises as ``RealSense.open``."""
+    def __init__(self, device: Any, config: RealSenseSourceConfig) -> None:
+        """Start streaming; raises as ``RealSenseSourceConfig.open``."""
         rs = _sdk()
         self.dropped = 0
         self._device = device
@@ -94,7 +94,7 @@ class RealSenseSource:
         self._sensor.open(profile)
         self._sensor.start(self._take)
 
-    def read(self, timeout_s: float) -> Seen | None:
+    def read(self, timeout_s: float) -> Observation | None:
         """The newest frame not yet given; None if none came in time.
 
         Raises:
@@ -105,7 +105,7 @@ class RealSenseSource:
         with _while_connected():
             return self._read(timeout_s)
 
-    def _read(self, timeout_s: float) -> Seen | None:
+    def _read(self, timeout_s: float) -> Observation | None:
         came = self._next(timeout_s)
         if came is None and self._is_over():
             came = self._next(_LAST_S)
@@ -123,7 +123,7 @@ class RealSenseSource:
         raw = np.asarray(frame.get_data())
         depth_mm = raw * np.float32(self._unit_mm)
         depth_mm[raw == 0] = np.nan  # the sensor's way to say: no return
-        return Seen(DepthFrame(depth_mm, self._intrinsics, stamp_ns), arrived_ns)
+        return Observation(DepthFrame(depth_mm, self._intrinsics, stamp_ns), arrived_ns)
 
     def close(self) -> None:
         """Stop the stream; may be called twice."""
@@ -218,7 +218,9 @@ def _connected(rs: ModuleType, serial: str) -> Any:
     return devices[serial]
 
 
-def _depth_stream(rs: ModuleType, device: Any, wanted: RealSense | None) -> tuple[Any, Any]:
+def _depth_stream(
+    rs: ModuleType, device: Any, wanted: RealSenseSourceConfig | None
+) -> tuple[Any, Any]:
     """The sensor and profile of the depth stream: the only one, or as ``wanted``."""
     there = [
         (sensor, profile.as_video_stream_profile())
@@ -248,7 +250,7 @@ def _intrinsics(profile: Any) -> Intrinsics:
     return Intrinsics(given.width, given.height, given.fx, given.fy, given.ppx, given.ppy)
 
 
-def _set_up(rs: ModuleType, sensor: Any, config: RealSense) -> None:
+def _set_up(rs: ModuleType, sensor: Any, config: RealSenseSourceConfig) -> None:
     if config.preset:
         presets = rs.rs400_visual_preset.__members__
         if config.preset not in presets:

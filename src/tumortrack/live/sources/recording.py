@@ -13,14 +13,14 @@ from tumortrack.core.errors import InputError
 from tumortrack.live.recording.bags import BagChoice, BagReel, is_bag
 from tumortrack.live.recording.folders import open_folder
 from tumortrack.live.recording.shots import Content, Reel, Shot
-from tumortrack.live.values import Seen, SourceConfig, SourceEnded, SourceLost
+from tumortrack.live.values import Observation, SourceConfig, SourceEnded, SourceLost
 
 # Less than what the loop takes for a frozen source.
 _LONGEST_WAIT_S = 2.0
 _PERIOD_NS = 33_333_333  # of a recording of one frame that is played again
 
 
-class Recording(SourceConfig, frozen=True, kw_only=True, tag="recording"):
+class RecordingSourceConfig(SourceConfig, frozen=True, kw_only=True, tag="recording"):
     """Frames from disk: a folder (clouds, depth images, scene folders), a rosbag2 or ROS 1 bag,
     or what the sink ``recording`` wrote.
 
@@ -94,7 +94,7 @@ class RecordingSource:
         self._closed = threading.Event()
         self._lock = threading.Lock()  # close may come while a frame is being read
 
-    def read(self, timeout_s: float) -> Seen | None:
+    def read(self, timeout_s: float) -> Observation | None:
         """
         Raises:
             InputError: this frame is damaged.
@@ -111,7 +111,7 @@ class RecordingSource:
             return None
         with self._lock:
             content = shot.load()
-        return Seen(content.frame, time.time_ns(), content.mask, content.truth)
+        return Observation(content.frame, time.time_ns(), content.mask, content.truth)
 
     def close(self) -> None:
         self._closed.set()

@@ -9,7 +9,7 @@ from tumortrack.core.errors import InputError
 from tumortrack.live.ros import incoming, rospy_node
 from tumortrack.live.ros.messages import Messages
 from tumortrack.live.ros.newest import Newest, Raw
-from tumortrack.live.values import Seen, SourceConfig, SourceLost
+from tumortrack.live.values import Observation, SourceConfig, SourceLost
 
 _BUFFER = 2**21  # bytes taken from the socket at once: a cloud in one go
 _ALIVE_S = 1.0  # without a frame for so long: the master is asked
@@ -17,7 +17,7 @@ _SOON_S = 1.0  # after opening: the first CameraInfo and mask may still be on th
 _ANY = "*/msg/"  # the type of a topic that so far is only subscribed to
 
 
-class Ros1(SourceConfig, frozen=True, kw_only=True, tag="ros1"):
+class Ros1SourceConfig(SourceConfig, frozen=True, kw_only=True, tag="ros1"):
     """A PointCloud2, or a depth Image with its CameraInfo; the master says which.
 
     Attributes:
@@ -67,7 +67,9 @@ class Ros1Source:
 
     waits = False
 
-    def __init__(self, config: Ros1, node: rospy_node.Node, topic: str, kind: str) -> None:
+    def __init__(
+        self, config: Ros1SourceConfig, node: rospy_node.Node, topic: str, kind: str
+    ) -> None:
         self.host_clock = config.clock == "host" or (
             config.clock == "auto" and not node.master.simulated_time()
         )
@@ -88,7 +90,7 @@ class Ros1Source:
     def dropped(self) -> int:
         return self._frames.replaced
 
-    def read(self, timeout_s: float) -> Seen | None:
+    def read(self, timeout_s: float) -> Observation | None:
         """The newest frame, as ``Source`` says; lost when nothing comes and the master is gone or
         was started anew. Frames go from node to node: with the master gone they may still come.
         """
@@ -101,7 +103,7 @@ class Ros1Source:
             return None
         self._heard_s = time.monotonic()
         if self._kind == incoming.CLOUD:
-            return Seen(incoming.cloud_of(self._parsed(raw, incoming.CLOUD)), raw.arrived_ns)
+            return Observation(incoming.cloud_of(self._parsed(raw, incoming.CLOUD)), raw.arrived_ns)
         info = self._beside(self._infos, self._info, until_s)
         mask = self._beside(self._masks, self._config.mask, until_s)
         if info is None or (mask is None and self._config.mask):
@@ -113,9 +115,9 @@ class Ros1Source:
             self._config.unit_mm,
         )
         if mask is None:
-            return Seen(frame, raw.arrived_ns)
+            return Observation(frame, raw.arrived_ns)
         image = self._parsed(mask, incoming.IMAGE)
-        return Seen(frame, raw.arrived_ns, incoming.mask_for(frame, image, mask.topic))
+        return Observation(frame, raw.arrived_ns, incoming.mask_for(frame, image, mask.topic))
 
     def close(self) -> None:
         """Unsubscribe."""

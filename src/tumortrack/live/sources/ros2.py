@@ -11,7 +11,7 @@ from tumortrack.core.types import DepthFrame
 from tumortrack.live.ros import incoming
 from tumortrack.live.ros.bus import Bus, Subscriber, Via, check_topic, open_bus
 from tumortrack.live.ros.messages import Messages, stamp_of
-from tumortrack.live.values import Seen, SourceConfig, SourceLost
+from tumortrack.live.values import Observation, SourceConfig, SourceLost
 
 _KINDS = {"image": incoming.IMAGE, "cloud": incoming.CLOUD}
 _LOOK_S = 0.1  # how often the graph is asked for the topic's type, until it is known
@@ -19,7 +19,7 @@ _LOOK_S = 0.1  # how often the graph is asked for the topic's type, until it is 
 _SAME_CLOCK_NS = 24 * 3600 * 1_000_000_000
 
 
-class Ros2(SourceConfig, frozen=True, kw_only=True, tag="ros2"):
+class Ros2SourceConfig(SourceConfig, frozen=True, kw_only=True, tag="ros2"):
     """A PointCloud2, or a depth Image with its CameraInfo.
 
     Attributes:
@@ -72,7 +72,7 @@ class Ros2Source:
 
     waits = False
 
-    def __init__(self, config: Ros2, bus: Bus, messages: Messages) -> None:
+    def __init__(self, config: Ros2SourceConfig, bus: Bus, messages: Messages) -> None:
         self.host_clock = config.clock == "host"
         self._clock_known = config.clock != "auto"
         self._config, self._bus, self._messages = config, bus, messages
@@ -89,7 +89,7 @@ class Ros2Source:
     def dropped(self) -> int:
         return self._passed + (self._frames.lost if self._frames else 0)
 
-    def read(self, timeout_s: float) -> Seen | None:
+    def read(self, timeout_s: float) -> Observation | None:
         """As ``Source`` says."""
         until_s = time.monotonic() + timeout_s
         while True:
@@ -153,13 +153,13 @@ class Ros2Source:
     def _ready(self) -> bool:
         return self._kind == incoming.CLOUD or incoming.CAMERA_INFO in self._latest
 
-    def _seen(self, raw: bytes | memoryview, arrived_ns: int) -> Seen:
+    def _seen(self, raw: bytes | memoryview, arrived_ns: int) -> Observation:
         message = self._messages.from_bytes(raw, self._kind)
         if not self._clock_known:
             self._clock_known = True
             self.host_clock = abs(arrived_ns - stamp_of(message.header)) < _SAME_CLOCK_NS
         if self._kind == incoming.CLOUD:
-            return Seen(incoming.cloud_of(message), arrived_ns)
+            return Observation(incoming.cloud_of(message), arrived_ns)
         info = self._latest.get(incoming.CAMERA_INFO)
         if info is None:
             raise InputError(
@@ -167,7 +167,7 @@ class Ros2Source:
                 f"Name its topic: ros2:{self._config.topic}?info=/.../camera_info."
             )
         frame = incoming.depth_of(message, info, self._config.rectified, self._config.unit_mm)
-        return Seen(frame, arrived_ns, self._mask_for(frame) if self._config.mask else None)
+        return Observation(frame, arrived_ns, self._mask_for(frame) if self._config.mask else None)
 
     def _mask_for(self, frame: DepthFrame) -> Any:
         image = self._latest.get(incoming.IMAGE)

@@ -8,13 +8,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
 from tumortrack.core.errors import InputError
-from tumortrack.live.values import Seen, SourceConfig, SourceLost
+from tumortrack.live.values import Observation, SourceConfig, SourceLost
 
 if TYPE_CHECKING:
-    from tumortrack.simulate.player.player import Theatre
+    from tumortrack.simulate.player.player import ScenePlayer
 
 
-class Virtual(SourceConfig, frozen=True, kw_only=True, tag="virtual"):
+class VirtualSourceConfig(SourceConfig, frozen=True, kw_only=True, tag="virtual"):
     """A case folder in motion (``simulate.player``).
 
     Attributes:
@@ -48,7 +48,7 @@ class Virtual(SourceConfig, frozen=True, kw_only=True, tag="virtual"):
         if self.seed < 0:
             raise InputError(f"virtual: seed is {self.seed}; it must be 0 or more.")
 
-    def theatre(self) -> Theatre:
+    def theatre(self) -> ScenePlayer:
         """The room that this shows; building it takes some seconds.
 
         Raises:
@@ -57,10 +57,10 @@ class Virtual(SourceConfig, frozen=True, kw_only=True, tag="virtual"):
         """
         from tumortrack.imaging.case import load_case
         from tumortrack.sense.noise import CLEAN, D405_NOISE
-        from tumortrack.simulate.player.player import Theatre, TheatreConfig
+        from tumortrack.simulate.player.player import ScenePlayer, ScenePlayerConfig
 
-        normal = TheatreConfig()
-        config = TheatreConfig(
+        normal = ScenePlayerConfig()
+        config = ScenePlayerConfig(
             width=self.width,
             height=self.height,
             distance_mm=self.distance_mm,
@@ -74,7 +74,7 @@ class Virtual(SourceConfig, frozen=True, kw_only=True, tag="virtual"):
             noise=D405_NOISE if self.noise else CLEAN,
         )
         case = load_case(self.case)
-        return Theatre(case.anatomy, case.up_lps, config, self.seed)
+        return ScenePlayer(case.anatomy, case.up_lps, config, self.seed)
 
     def open(self) -> VirtualSource:
         """Build the room; its time begins with the first read.
@@ -87,12 +87,13 @@ class Virtual(SourceConfig, frozen=True, kw_only=True, tag="virtual"):
 
 
 class VirtualSource:
-    """Renders the theatre as it is now, ``fps`` times a second; ``Seen.truth`` has its surfaces."""
+    """Renders the scene as it is now, ``fps`` times a second; ``Observation.truth`` has its
+    surfaces."""
 
     host_clock = True
     waits = False
 
-    def __init__(self, theatre: Theatre, fps: float) -> None:
+    def __init__(self, theatre: ScenePlayer, fps: float) -> None:
         self.theatre = theatre
         self.dropped = 0
         self._period_s = 1 / fps
@@ -100,7 +101,7 @@ class VirtualSource:
         self._next = 0  # number of the frame that is due next
         self._closed = threading.Event()
 
-    def read(self, timeout_s: float) -> Seen | None:
+    def read(self, timeout_s: float) -> Observation | None:
         """The frame that is due, once it is; None if that is later. Frames whose time passed
         unread are dropped.
 
@@ -121,12 +122,12 @@ class VirtualSource:
         self._next = max(number, self._next) + 1
         return self.at(t_s, stamp_ns)
 
-    def at(self, t_s: float, stamp_ns: int) -> Seen:
+    def at(self, t_s: float, stamp_ns: int) -> Observation:
         """The theatre at a time since its beginning: what ``read`` gives, without a clock."""
         instant = self.theatre.state_at(t_s)
         truth = self.theatre.truth(instant)
         frame = self.theatre.frame(instant, truth, stamp_ns)
-        return Seen(frame, arrived_ns=time.time_ns(), truth=truth)
+        return Observation(frame, arrived_ns=time.time_ns(), truth=truth)
 
     def close(self) -> None:
         """Wake who reads, and end; may be called twice."""

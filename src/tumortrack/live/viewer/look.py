@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from tumortrack.core.types import Mesh
-from tumortrack.live.values import Frames, Workcell
+from tumortrack.live.values import PublishedFrame, Workcell
 from tumortrack.live.viewer.workcell import box_of
 
 if TYPE_CHECKING:
@@ -28,7 +28,7 @@ _LIGHTS = (("/light", 2.6, (-60.0, -120.0, -130.0)), ("/light_behind", 1.5, (60.
 class Look:
     """New visitors look from the depth camera's place along its axis, its y axis down."""
 
-    def __init__(self, server: ViserServer, frames: Frames) -> None:
+    def __init__(self, server: ViserServer, frames: PublishedFrame) -> None:
         way = frames.published_from_camera
         self._server = server
         self._aimed = False
@@ -50,7 +50,7 @@ class Look:
             server.scene.add_light_directional(name, intensity=intensity, position=(x, y, z))
         server.on_client_connect(self._follow)
 
-    def aim(self, frames: Frames, depth_mm: float) -> None:
+    def aim(self, frames: PublishedFrame, depth_mm: float) -> None:
         """Turn about the organ from now on, once its distance is known."""
         if self._aimed:
             return

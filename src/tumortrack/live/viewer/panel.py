@@ -10,9 +10,9 @@ import numpy as np
 from jaxtyping import UInt8
 
 from tumortrack.live.viewer.look import View
-from tumortrack.live.viewer.scene import Options
+from tumortrack.live.viewer.scene import DisplayOptions
 from tumortrack.live.viewer.slices import ORIENTATIONS
-from tumortrack.live.viewer.status import Status
+from tumortrack.live.viewer.status import StatusPanel
 
 if TYPE_CHECKING:
     from viser import ClientHandle, GuiEvent, ViserServer
@@ -75,12 +75,12 @@ class Panel:
                 self._plane = gui.add_dropdown("Plane", tuple(ORIENTATIONS))
                 self._in_scene = gui.add_checkbox("In the scene", False)
         with gui.add_folder("Show"):
-            self._kidney = gui.add_slider("Kidney", 0.0, 1.0, 0.05, Options.kidney)
-            self._margin = gui.add_checkbox("Margins", Options.margin)
-            self._observed = gui.add_checkbox("Observed points", Options.observed)
+            self._kidney = gui.add_slider("Kidney", 0.0, 1.0, 0.05, DisplayOptions.kidney)
+            self._margin = gui.add_checkbox("Margins", DisplayOptions.margin)
+            self._observed = gui.add_checkbox("Observed points", DisplayOptions.observed)
             self._points = gui.add_dropdown("Labelled points", ("none", "tumors", "all"))
             self._colour = gui.add_dropdown("Coloured by", ("label", "probability"))
-            self._helpers = gui.add_checkbox("Axes, region", Options.helpers)
+            self._helpers = gui.add_checkbox("Axes, region", DisplayOptions.helpers)
         self._connect(actions, slices)
 
     def _connect(self, actions: Actions, slices: bool) -> None:
@@ -98,8 +98,8 @@ class Panel:
         self._forget.on_click(lambda _: actions.forget())
 
     @property
-    def options(self) -> Options:
-        return Options(
+    def options(self) -> DisplayOptions:
+        return DisplayOptions(
             observed=self._observed.value,
             kidney=self._kidney.value,
             margin=self._margin.value,
@@ -114,7 +114,7 @@ class Panel:
         """The part and the orientation that the user chose."""
         return self._through.value, self._plane.value
 
-    def say(self, status: Status) -> None:
+    def say(self, status: StatusPanel) -> None:
         # Both before either: what cannot be said leaves the page as it was.
         flag, numbers = status.flag(), status.numbers()
         self._flag.content, self._numbers.content = flag, numbers

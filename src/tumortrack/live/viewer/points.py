@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float, Float32
 
 from tumortrack.core.types import DepthFrame, SensorCloud
-from tumortrack.live.values import Update
+from tumortrack.live.values import TrackingResult
 from tumortrack.sense.camera import deproject_pixels
 
 MOST_SEEN = 20_000  # points shown
@@ -14,7 +14,7 @@ _SAME_MM = 2.0  # points this near the ray are all under the pointer: the foremo
 _MISSED_MM = 10.0
 
 
-def seen_points(update: Update) -> Float32[np.ndarray, "n 3"]:
+def seen_points(update: TrackingResult) -> Float32[np.ndarray, "n 3"]:
     """Points that the frame shows, thinned while they are still pixels; camera frame."""
     assert update.seen is not None
     content = update.seen.content

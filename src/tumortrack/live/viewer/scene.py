@@ -15,10 +15,10 @@ from jaxtyping import Float, UInt8
 from tumortrack.core import colours
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.types import Mesh
-from tumortrack.live.values import Frames, Placed, Setting, Update
+from tumortrack.live.values import PublishedFrame, SinkContext, TrackingResult, TransformedEstimate
 from tumortrack.live.viewer.look import Look
 from tumortrack.live.viewer.points import MOST_SEEN, seen_points, thinned
-from tumortrack.live.viewer.slices import Plane
+from tumortrack.live.viewer.slices import SlicePlane
 from tumortrack.live.viewer.surfaces import bare_faces, exact_margin, rough_margin
 from tumortrack.live.viewer.workcell import wxyz_of
 
@@ -33,7 +33,7 @@ _EDGES = [(a, b) for a in range(8) for b in range(a) if abs(_CORNERS[a] - _CORNE
 
 
 @dataclass(frozen=True, kw_only=True)
-class Options:
+class DisplayOptions:
     """What the user wants to see."""
 
     observed: bool = True
@@ -45,10 +45,10 @@ class Options:
     helpers: bool = True  # axes and the region of the organ's points
 
 
-class Scene:
+class ViewerScene:
     """viser's nodes, and what goes into them."""
 
-    def __init__(self, server: ViserServer, setting: Setting, margin_mm: float) -> None:
+    def __init__(self, server: ViserServer, setting: SinkContext, margin_mm: float) -> None:
         self._nodes = server.scene
         self._margin_mm = margin_mm
         self._anatomy_ct, self._margins_ct = setting.anatomy_ct, None
@@ -57,16 +57,16 @@ class Scene:
             if margin_mm > 0:
                 tumors = setting.anatomy_ct.tumors
                 self._margins_ct = tuple(exact_margin(tumor, margin_mm) for tumor in tumors)
-        self.options = Options()
+        self.options = DisplayOptions()
         self.margins: dict[str, Mesh] = {}  # of the shown estimate, published frame
-        self._placed: Placed | None = None
+        self._placed: TransformedEstimate | None = None
         self._has_organ = self._has_slice = False
         self._parts: dict[str, MeshHandle] = {}
         self._shells: dict[str, MeshHandle] = {}
         self.look = Look(server, setting.frames)
         self._make_nodes(setting)
 
-    def observe(self, update: Update) -> None:
+    def observe(self, update: TrackingResult) -> None:
         """Show what this update saw; nothing, if it saw nothing."""
         way = update.frames.published_from_camera
         seen = np.zeros((0, 3), np.float32) if update.seen is None else seen_points(update)
@@ -82,7 +82,7 @@ class Scene:
             self.look.aim(update.frames, float(np.median(organ[:, 2])))
         self._has_organ = len(organ) > 0
 
-    def show(self, update: Update) -> None:
+    def show(self, update: TrackingResult) -> None:
         """Show this update's estimate, which it must have."""
         placed = update.placed
         assert placed is not None
@@ -129,7 +129,9 @@ class Scene:
             self._put_labelled(self._placed)
             self.apply()
 
-    def put_slice(self, picture: UInt8[np.ndarray, "h w 3"], plane: Plane, frames: Frames) -> None:
+    def put_slice(
+        self, picture: UInt8[np.ndarray, "h w 3"], plane: SlicePlane, frames: PublishedFrame
+    ) -> None:
         """The slice as a plane of the scene, at its true place."""
         if not self.options.slice_plane:
             self._has_slice = False  # what was there is old by the time it is asked for
@@ -145,14 +147,14 @@ class Scene:
         self._has_slice = True
         self.apply()
 
-    def mark(self, point_mm: Float[np.ndarray, " 3"] | None, frames: Frames) -> None:
+    def mark(self, point_mm: Float[np.ndarray, " 3"] | None, frames: PublishedFrame) -> None:
         """Where the user clicked (camera frame); None: nowhere."""
         self._picked.visible = point_mm is not None
         if point_mm is not None:
             there = transform_points(frames.published_from_camera, np.asarray(point_mm)[None])
             self._picked.position = there[0]
 
-    def _make_nodes(self, setting: Setting) -> None:
+    def _make_nodes(self, setting: SinkContext) -> None:
         nodes = self._nodes
         self._axes = nodes.add_frame("/camera", axes_length=_AXES_MM, axes_radius=0.35)
         self._seen = self._cloud("/seen", 0.2, colours.SEEN)
@@ -217,7 +219,7 @@ class Scene:
         node.points = points.astype(np.float32)
         node.colors = np.asarray(colour, np.uint8)
 
-    def _put_labelled(self, placed: Placed) -> None:
+    def _put_labelled(self, placed: TransformedEstimate) -> None:
         if self.options.points == "none":
             return
         least = 2 if self.options.points == "tumors" else 1
@@ -228,7 +230,7 @@ class Scene:
             colour = colours.label_colours(placed.labels[some])
         self._put_points(self._points, placed.points_mm[some], colour)
 
-    def _margins_of(self, update: Update, placed: Placed) -> dict[str, Mesh]:
+    def _margins_of(self, update: TrackingResult, placed: TransformedEstimate) -> dict[str, Mesh]:
         assert update.estimate is not None
         tumors = {n: m for n, m in placed.meshes.items() if n in self._shells}
         motion = update.estimate.motion

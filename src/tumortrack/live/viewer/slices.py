@@ -15,7 +15,7 @@ from tumortrack.core.geometry import spacing_mm, transform_points
 from tumortrack.core.motion import Motion
 from tumortrack.core.types import Mesh
 from tumortrack.imaging.case import Case, load_case
-from tumortrack.live.values import Setting, Update
+from tumortrack.live.values import SinkContext, TrackingResult
 
 # Directions of the image's columns and rows in the camera frame (x right, y down, z forward).
 ORIENTATIONS: dict[str, tuple[tuple[float, ...], tuple[float, ...]]] = {
@@ -33,7 +33,7 @@ _COARSER = 2  # the CT is sampled coarser: a pixel in the panel is less than a v
 
 
 @dataclass(frozen=True, eq=False)
-class Plane:
+class SlicePlane:
     """A square in the camera frame: centre, unit directions of columns and rows, side; mm."""
 
     centre_mm: Float64[np.ndarray, " 3"]
@@ -105,7 +105,7 @@ class CarriedCt:
 def slice_picture(
     ct: CarriedCt,
     motion: Motion,
-    plane: Plane,
+    plane: SlicePlane,
     outlines: Iterable[tuple[Mesh, Colour, int]],
     pixels: int,
 ) -> UInt8[np.ndarray, "h w 3"] | None:
@@ -153,7 +153,7 @@ def _window(hu: Float32[np.ndarray, " n"]) -> tuple[float, float]:
     return float(low) - room, float(high) + room
 
 
-def load_ct(case: str, setting: Setting) -> CarriedCt:
+def load_ct(case: str, setting: SinkContext) -> CarriedCt:
     """
     Raises:
         InputError: the model knows no motion, or the case is another patient's.
@@ -174,7 +174,7 @@ def load_ct(case: str, setting: Setting) -> CarriedCt:
     return CarriedCt(loaded)
 
 
-def plane_through(update: Update, part: str, orientation: str) -> Plane | None:
+def plane_through(update: TrackingResult, part: str, orientation: str) -> SlicePlane | None:
     """Through the middle of a part's present surface; centred on the organ, and as large."""
     assert update.estimate is not None
     meshes = update.estimate.meshes
@@ -185,4 +185,4 @@ def plane_through(update: Update, part: str, orientation: str) -> Plane | None:
     centre, middle = (meshes[name].box_mm.mean(0) for name in ("kidney", part))
     everything = np.concatenate([mesh.box_mm for mesh in meshes.values()])
     side = _SLICE_ROOM * float(np.ptp(everything, axis=0).max())
-    return Plane(centre + normal * (normal @ (middle - centre)), across, down, side)
+    return SlicePlane(centre + normal * (normal @ (middle - centre)), across, down, side)

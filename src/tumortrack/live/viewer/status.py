@@ -12,7 +12,7 @@ from jaxtyping import UInt8
 
 from tumortrack.core import colours
 from tumortrack.core.colours import Colour, css, part_colour
-from tumortrack.live.values import Update, Workcell
+from tumortrack.live.values import TrackingResult, Workcell
 
 State = Literal["waiting", "good", "poor", "none", "stale"]
 
@@ -48,12 +48,12 @@ _WATCH = f"""
 
 
 @dataclass(frozen=True, eq=False)
-class Status:
+class StatusPanel:
     """What is to be said now. ``update``: the last; ``age_s``: since its frame; ``beat`` differs
     from message to message; ``arms``: there may be some."""
 
     state: State
-    update: Update | None
+    update: TrackingResult | None
     age_s: float
     beat: int
     arms: bool = False

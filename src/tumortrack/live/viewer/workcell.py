@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Float, Float64
 
-from tumortrack.live.values import Line, Shape, Workcell
+from tumortrack.live.values import Polyline, RigidShape, Workcell
 
 if TYPE_CHECKING:
     from viser import FrameHandle, LineSegmentsHandle, MeshHandle, ViserServer
@@ -20,14 +20,14 @@ if TYPE_CHECKING:
 _ROOT = "/workcell"
 
 
-class Cell:
+class WorkcellView:
     """viser's nodes under ``/workcell``: ``shape/NAME`` and ``line/NAME``."""
 
     def __init__(self, server: ViserServer) -> None:
         self._nodes = server.scene
         self._root: FrameHandle = self._nodes.add_frame(_ROOT, show_axes=False, visible=False)
-        self._shapes: dict[str, tuple[Shape, MeshHandle]] = {}
-        self._lines: dict[str, tuple[Line, LineSegmentsHandle]] = {}
+        self._shapes: dict[str, tuple[RigidShape, MeshHandle]] = {}
+        self._lines: dict[str, tuple[Polyline, LineSegmentsHandle]] = {}
 
     def show(self, cell: Workcell) -> None:
         """Show this, and nothing of what was shown before."""
@@ -48,7 +48,7 @@ class Cell:
         """Nothing of it stays visible."""
         self._root.visible = False
 
-    def _put_shape(self, shape: Shape, wxyz: Float64[np.ndarray, " 4"]) -> None:
+    def _put_shape(self, shape: RigidShape, wxyz: Float64[np.ndarray, " 4"]) -> None:
         before, node = self._shapes.get(shape.name, (None, None))
         if before is None or node is None or not _looks_alike(before, shape):
             node = self._nodes.add_mesh_simple(
@@ -68,7 +68,7 @@ class Cell:
             node.position, node.wxyz = way[:3, 3], wxyz
         self._shapes[shape.name] = shape, node
 
-    def _put_line(self, line: Line) -> None:
+    def _put_line(self, line: Polyline) -> None:
         points = line.points_mm.astype(np.float32)
         segments = np.stack([points[:-1], points[1:]], axis=1)
         before, node = self._lines.get(line.name, (None, None))
@@ -108,16 +108,16 @@ def _node(kind: str, name: str) -> str:
     return f"{_ROOT}/{kind}/{name.replace('/', ':')}"
 
 
-def _gone(shown: Iterable[str], now: Iterable[Shape | Line]) -> set[str]:
+def _gone(shown: Iterable[str], now: Iterable[RigidShape | Polyline]) -> set[str]:
     return set(shown) - {one.name for one in now}
 
 
-def _looks_alike(one: Shape, two: Shape) -> bool:
+def _looks_alike(one: RigidShape, two: RigidShape) -> bool:
     """Whether they differ in their place alone."""
     shades = one.colour == two.colour and one.opacity == two.opacity
     return shades and one.mesh is two.mesh
 
 
-def _drawn_alike(one: Line, two: Line) -> bool:
+def _drawn_alike(one: Polyline, two: Polyline) -> bool:
     """Whether they differ in their points alone."""
     return one.colour == two.colour and one.width_mm == two.width_mm

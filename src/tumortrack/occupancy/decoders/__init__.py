@@ -4,8 +4,8 @@
 """
 
 from tumortrack.occupancy.mlp_decoder import MlpDecoderConfig
-from tumortrack.registration.config import WarpDecoderConfig
+from tumortrack.registration.config import RegistrationHeadConfig
 
-DecoderConfig = MlpDecoderConfig | WarpDecoderConfig
+DecoderConfig = MlpDecoderConfig | RegistrationHeadConfig
 
 __all__ = ["DecoderConfig"]

@@ -10,7 +10,7 @@ import numpy as np
 
 from tumortrack.core.errors import NoPlan
 from tumortrack.core.types import Mesh
-from tumortrack.plan.arms.cell import Cell
+from tumortrack.plan.arms.cell import ArmCell
 from tumortrack.plan.arms.config import Base, CellConfig
 from tumortrack.plan.arms.procedure import plan_motions
 from tumortrack.plan.arms.situation import Situation
@@ -30,7 +30,7 @@ _EDGE_MM = 120.0  # a base's middle is no nearer to the table's edge
 
 def search_bases(
     plan: ResectionPlan, config: CellConfig, organ: Mesh, seed: int = 0
-) -> tuple[Cell, Motions, str]:
+) -> tuple[ArmCell, Motions, str]:
     """The motions from where the arms stand, or else from elsewhere round the table.
 
     A small fixed grid of places for both bases, on their pedestals and facing as they do: first
@@ -44,7 +44,7 @@ def search_bases(
     Raises:
         NoPlan: from none of them; the reason is that of the places they stand in.
     """
-    cell = Cell(config, organ)
+    cell = ArmCell(config, organ)
     try:
         return cell, plan_motions(plan, cell, organ, seed=seed), ""
     except NoPlan as failure:
@@ -52,7 +52,7 @@ def search_bases(
     for tried, elsewhere in enumerate(_elsewhere(plan, config)):
         if tried == _MOST_TRIED:
             break
-        cell = Cell(elsewhere, organ)
+        cell = ArmCell(elsewhere, organ)
         if cell.collisions(cell.home_rad) is not None:
             continue
         try:
@@ -71,7 +71,7 @@ def _elsewhere(plan: ResectionPlan, config: CellConfig) -> Iterator[CellConfig]:
     good: dict[str, list[Base]] = {CUTTER: [], HOLDER: []}
     for arm, bases in places.items():
         for base in bases:
-            tried = Cell(_with(config, {arm: base}))
+            tried = ArmCell(_with(config, {arm: base}))
             if all(_reaches(tried, arm, target) for target in targets[arm]):
                 good[arm].append(base)
     pairs = itertools.product(enumerate(good[CUTTER]), enumerate(good[HOLDER]))
@@ -101,7 +101,7 @@ def _places(config: CellConfig, arm: str, middle_mm: np.ndarray) -> list[Base]:
     return bases
 
 
-def _reaches(cell: Cell, arm: str, target_mm: np.ndarray) -> bool:
+def _reaches(cell: ArmCell, arm: str, target_mm: np.ndarray) -> bool:
     """Whether the tip comes there, pointing in any direction."""
     situation = Situation(cell, arm, cell.home_rad)
     yaws = np.linspace(0, 2 * np.pi, _YAWS if arm == CUTTER else 1, endpoint=False)

@@ -17,9 +17,9 @@ from tumortrack.plan.arms.urdf import cell_urdf
 from tumortrack.plan.motions import CUTTER, HOLDER
 
 if TYPE_CHECKING:
-    from tumortrack.live.values import Shape
+    from tumortrack.live.values import RigidShape
 
-__all__ = ["Base", "Cell", "CellConfig"]
+__all__ = ["ArmCell", "Base", "CellConfig"]
 
 ORGAN = "organ"
 ARMS = (CUTTER, HOLDER)
@@ -28,7 +28,7 @@ TOUCHES = {CUTTER: "cutter/electrode", HOLDER: "holder/cup"}  # what of a tool m
 _THICK_MM = 10.0  # of what a tool is made of, about its own axis
 
 
-class Cell:
+class ArmCell:
     """Both arms with their tools over the table, and the organ once it is known.
 
     Values do not change after construction, but the buffers of pinocchio do: one thread at a time.
@@ -65,9 +65,9 @@ class Cell:
         self._states: dict[tuple, Any] = {}
         self._looks: Any = None
 
-    def with_organ(self, organ: Mesh | None) -> Cell:
+    def with_organ(self, organ: Mesh | None) -> ArmCell:
         """The same cell with this organ on its post (table frame, mm)."""
-        return Cell(self.config, organ)
+        return ArmCell(self.config, organ)
 
     @property
     def home_rad(self) -> Float64[np.ndarray, " 12"]:
@@ -157,7 +157,7 @@ class Cell:
         n = pin.computeDistances(self._solids, state)
         return 1000 * state.distanceResults[n].min_distance, self._pairs[n]
 
-    def shapes(self, joints_rad: Float64[np.ndarray, " 12"]) -> tuple[Shape, ...]:
+    def shapes(self, joints_rad: Float64[np.ndarray, " 12"]) -> tuple[RigidShape, ...]:
         """Everything as surfaces in the table frame, and a bead at each tip (``cutter/tip``); the
         organ is not among them."""
         import pinocchio as pin

@@ -10,7 +10,7 @@ from jaxtyping import Float64
 from tumortrack.plan.arms.situation import Blocked, Situation
 from tumortrack.plan.arms.strokes import Leg, Surroundings, leg, level_poses
 from tumortrack.plan.arms.tracks import follow, solve
-from tumortrack.plan.arms.trajectory import Course
+from tumortrack.plan.arms.trajectory import TrajectoryBuilder
 from tumortrack.plan.arms.transfer import connect
 from tumortrack.plan.motions import CUTTER, HOLDER
 
@@ -24,7 +24,9 @@ _LONG_WAYS = 4  # directions for which a long way round is searched
 DETOURS_MM = ((60.0, 0.0), (0.0, 70.0), (60.0, 70.0), (0.0, 140.0))
 
 
-def cut_pass(course: Course, way_mm: Float64[np.ndarray, "n 3"], around: Surroundings) -> None:
+def cut_pass(
+    course: TrajectoryBuilder, way_mm: Float64[np.ndarray, "n 3"], around: Surroundings
+) -> None:
     """The instrument along a pass: in one direction all along if that is possible, else in as few
     legs as are; between them it leaves and comes from another side.
 
@@ -39,7 +41,7 @@ def cut_pass(course: Course, way_mm: Float64[np.ndarray, "n 3"], around: Surroun
     raise Blocked(f"a cut would need more than {_MOST_LEGS} directions of the {CUTTER}")
 
 
-def _cut_leg(course: Course, way_mm: np.ndarray, around: Surroundings) -> int:
+def _cut_leg(course: TrajectoryBuilder, way_mm: np.ndarray, around: Surroundings) -> int:
     """The first leg, as long as it can be; returns the number of the point where it ended."""
     away, inside = course.situation(CUTTER, (HOLDER,)), course.situation(CUTTER, (CUTTER, HOLDER))
     reasons: list[Blocked] = []
@@ -118,7 +120,9 @@ def aside(
     return found[np.abs(found - situation.here_rad).max(1).argmin()]
 
 
-def _carry_out(course: Course, one: Leg, way_rad: np.ndarray, path_rad: np.ndarray) -> None:
+def _carry_out(
+    course: TrajectoryBuilder, one: Leg, way_rad: np.ndarray, path_rad: np.ndarray
+) -> None:
     course.go(CUTTER, way_rad)
     for run, cutting in one.runs:
         course.go(CUTTER, path_rad[run], course.cell.config.cutting_mm_s, cutting)

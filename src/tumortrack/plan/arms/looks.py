@@ -10,7 +10,7 @@ from jaxtyping import Float64
 
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.types import Mesh
-from tumortrack.live.values import Shape
+from tumortrack.live.values import RigidShape
 from tumortrack.plan.arms.body import YELLOW, Part
 
 _SIDES = 28
@@ -25,17 +25,17 @@ class Looks:
         self._meshes = tuple(_surface(part) for part in self._parts)
         self.links = tuple(dict.fromkeys(part.link for part in self._parts))
 
-    def shapes(self, places: Mapping[str, Float64[np.ndarray, "4 4"]]) -> tuple[Shape, ...]:
+    def shapes(self, places: Mapping[str, Float64[np.ndarray, "4 4"]]) -> tuple[RigidShape, ...]:
         """All of them where ``places`` (``table_from_link``, mm) puts their links."""
         return tuple(
-            Shape(part.whose, mesh, places[part.link], part.colour)
+            RigidShape(part.whose, mesh, places[part.link], part.colour)
             for part, mesh in zip(self._parts, self._meshes, strict=True)
         )
 
 
-def tip(arm: str, table_from_tip: Float64[np.ndarray, "4 4"]) -> Shape:
+def tip(arm: str, table_from_tip: Float64[np.ndarray, "4 4"]) -> RigidShape:
     """A bead where a tool ends, by the name that sinks know tips by: ``cutter/tip``."""
-    return Shape(f"{arm}/tip", _bead(), table_from_tip, YELLOW)
+    return RigidShape(f"{arm}/tip", _bead(), table_from_tip, YELLOW)
 
 
 @cache

@@ -10,12 +10,12 @@ from jaxtyping import Float64
 from tumortrack.core.errors import InputError, NoPlan
 from tumortrack.core.types import Mesh
 from tumortrack.plan.arms import timing
-from tumortrack.plan.arms.cell import TOUCHES, Cell
+from tumortrack.plan.arms.cell import TOUCHES, ArmCell
 from tumortrack.plan.arms.cutting import DETOURS_MM, aside, cut_pass
 from tumortrack.plan.arms.situation import Blocked
 from tumortrack.plan.arms.strokes import Surroundings, leg, level_poses, passes
 from tumortrack.plan.arms.tracks import follow, solve
-from tumortrack.plan.arms.trajectory import Course
+from tumortrack.plan.arms.trajectory import TrajectoryBuilder
 from tumortrack.plan.arms.transfer import connect
 from tumortrack.plan.motions import CUTTER, HOLDER, JOINTS, Motions
 from tumortrack.plan.values import ResectionPlan
@@ -29,7 +29,7 @@ _GRIPS = 4  # ways of holding that are tried
 
 def plan_motions(
     plan: ResectionPlan,
-    cell: Cell,
+    cell: ArmCell,
     organ: Mesh,
     start_rad: Float64[np.ndarray, " 12"] | None = None,
     from_sweep: int | None = None,
@@ -66,7 +66,7 @@ def plan_motions(
 
 
 def plan_home(
-    cell: Cell, organ: Mesh, start_rad: Float64[np.ndarray, " 12"], seed: int = 0
+    cell: ArmCell, organ: Mesh, start_rad: Float64[np.ndarray, " 12"], seed: int = 0
 ) -> Motions:
     """From anywhere: out of the tissue, let go, and home.
 
@@ -82,15 +82,17 @@ def plan_home(
         raise NoPlan(f"the arms can't go home by themselves: {blocked}.") from blocked
 
 
-def _begin(cell: Cell, organ: Mesh, start_rad: np.ndarray | None, seed: int) -> Course:
+def _begin(
+    cell: ArmCell, organ: Mesh, start_rad: np.ndarray | None, seed: int
+) -> TrajectoryBuilder:
     cell = cell if cell.organ is organ else cell.with_organ(organ)
     start = cell.home_rad if start_rad is None else np.array(start_rad, float)
     if start.shape != (len(JOINTS),) or not (np.abs(start) <= cell.limits_rad).all():
         raise InputError("the arms' start must be twelve joint angles within their limits.")
-    return Course(cell, start, np.random.default_rng(seed))
+    return TrajectoryBuilder(cell, start, np.random.default_rng(seed))
 
 
-def _grasp_and_cut(course: Course, plan: ResectionPlan, around: Surroundings) -> Motions:
+def _grasp_and_cut(course: TrajectoryBuilder, plan: ResectionPlan, around: Surroundings) -> Motions:
     """With whichever way of holding leaves the instrument its way; the reason is the first's."""
     deep_mm = around.depth_mm(plan.grasp_mm)
     if deep_mm > course.cell.config.cup_mm:
@@ -113,7 +115,7 @@ def _down(grasp_mm: np.ndarray, yaw_rad: float) -> np.ndarray:
     return level_poses(grasp_mm + heights[:, None] * [0.0, 0.0, 1.0], yaw_rad)
 
 
-def _grips(course: Course, grasp_mm: np.ndarray) -> Iterator[np.ndarray]:
+def _grips(course: TrajectoryBuilder, grasp_mm: np.ndarray) -> Iterator[np.ndarray]:
     """Joint paths (n, 6) straight down onto the grasp, those near the arm's present place first.
 
     How the cup is turned does not matter: it is round, and turns about the last joint alone.
@@ -143,7 +145,7 @@ def _grips(course: Course, grasp_mm: np.ndarray) -> Iterator[np.ndarray]:
         raise reason
 
 
-def _grasp(course: Course, grip_rad: np.ndarray) -> Course:
+def _grasp(course: TrajectoryBuilder, grip_rad: np.ndarray) -> TrajectoryBuilder:
     """Approach, grasp and hold."""
     course.go(HOLDER, connect(course.situation(HOLDER), grip_rad[0], course.rng))
     course.close("approach")
@@ -155,7 +157,7 @@ def _grasp(course: Course, grip_rad: np.ndarray) -> Course:
 
 
 def _cut_and_finish(
-    course: Course, plan: ResectionPlan, around: Surroundings, first: int
+    course: TrajectoryBuilder, plan: ResectionPlan, around: Surroundings, first: int
 ) -> Motions:
     for sweep in range(first, plan.sweeps + 1):
         for way in passes(tuple(cut for cut in plan.cuts if cut.sweep == sweep)):
@@ -166,7 +168,7 @@ def _cut_and_finish(
     return _home(course)
 
 
-def _withdraw(course: Course, around: Surroundings, holding: bool) -> None:
+def _withdraw(course: TrajectoryBuilder, around: Surroundings, holding: bool) -> None:
     """Straight back with an instrument that is in tissue or at it, and up with a cup on it."""
     pair = course.cell.collisions(course.joints_rad, (HOLDER,))
     if pair is not None and TOUCHES[CUTTER] in pair:
@@ -179,7 +181,7 @@ def _withdraw(course: Course, around: Surroundings, holding: bool) -> None:
         _let_go(course)
 
 
-def _let_go(course: Course) -> None:
+def _let_go(course: TrajectoryBuilder) -> None:
     """Vacuum off, then straight up."""
     course.still(LET_GO_S)
     tip = course.cell.tips(course.joints_rad)[HOLDER]
@@ -187,7 +189,7 @@ def _let_go(course: Course) -> None:
     course.follow(HOLDER, _down(tip[:3, 3], yaw)[::-1], course.cell.config.grasping_mm_s)
 
 
-def _home(course: Course) -> Motions:
+def _home(course: TrajectoryBuilder) -> Motions:
     """Both arms at once: the straight way if it is free."""
     both, home = course.situation(None), course.cell.home_rad
     for place in (both.joints_rad, home):

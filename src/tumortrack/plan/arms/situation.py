@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from tumortrack.core.errors import NoPlan
-from tumortrack.plan.arms.cell import ARMS, Cell
+from tumortrack.plan.arms.cell import ARMS, ArmCell
 
 
 class Blocked(NoPlan):
@@ -32,7 +32,7 @@ class Situation:
         touching: arms that may touch the organ with their electrode or cup.
     """
 
-    cell: Cell
+    cell: ArmCell
     arm: str | None
     joints_rad: Float64[np.ndarray, " 12"]
     touching: Collection[str] = ()

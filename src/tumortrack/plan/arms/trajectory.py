@@ -9,25 +9,25 @@ import numpy as np
 from jaxtyping import Float64
 
 from tumortrack.plan.arms import timing
-from tumortrack.plan.arms.cell import Cell
+from tumortrack.plan.arms.cell import ArmCell
 from tumortrack.plan.arms.situation import Situation
 from tumortrack.plan.arms.tracks import follow
-from tumortrack.plan.motions import Motions, Stage
+from tumortrack.plan.motions import Motions, MotionStage
 
 _THERE_RAD = 1e-6  # a thousandth of a millimetre at the tip: no motion to be timed
 
 
-class Course:
+class TrajectoryBuilder:
     """Where both arms are by now (``joints_rad``), and how they came there."""
 
     def __init__(
-        self, cell: Cell, start_rad: Float64[np.ndarray, " 12"], rng: np.random.Generator
+        self, cell: ArmCell, start_rad: Float64[np.ndarray, " 12"], rng: np.random.Generator
     ) -> None:
         self.cell, self.joints_rad, self.rng = cell, start_rad, rng
-        self._stages: tuple[Stage, ...] = ()
+        self._stages: tuple[MotionStage, ...] = ()
         self._pieces: tuple[tuple[np.ndarray, np.ndarray, bool], ...] = ()
 
-    def copy(self) -> Course:
+    def copy(self) -> TrajectoryBuilder:
         """The same so far; what is added to either is not in the other."""
         return copy(self)
 
@@ -87,7 +87,9 @@ class Course:
             times.append(times[-1][-1] + piece_times[1:])
             joints.append(piece_joints[1:])
             cutting.append(np.full(len(piece_times) - 1, cuts))
-        stage = Stage(name, np.concatenate(times), np.concatenate(joints), np.concatenate(cutting))
+        stage = MotionStage(
+            name, np.concatenate(times), np.concatenate(joints), np.concatenate(cutting)
+        )
         self._stages += (stage,)
         self._pieces = ()
 

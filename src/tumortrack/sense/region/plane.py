@@ -27,7 +27,7 @@ _NARROWEST_MM = 120.0  # extent of a background across its long side
 
 
 @dataclass(frozen=True)
-class Plane:
+class BackgroundPlane:
     """Points with ``normal @ point = offset_mm``; the unit normal points to the camera, so that
     ``normal @ point - offset_mm`` is the height above it. ``half_mm``: what is lower is the
     plane's."""
@@ -37,7 +37,9 @@ class Plane:
     half_mm: float
 
 
-def remove_plane(picture: Picture, config: RegionConfig, rng: np.random.Generator) -> Plane | None:
+def remove_plane(
+    picture: Picture, config: RegionConfig, rng: np.random.Generator
+) -> BackgroundPlane | None:
     """Take the background plane and what lies behind it, where there is one."""
     plane = find_plane(picture, config, rng)
     if plane is not None:
@@ -53,7 +55,9 @@ def remove_plane(picture: Picture, config: RegionConfig, rng: np.random.Generato
     return plane
 
 
-def find_plane(picture: Picture, config: RegionConfig, rng: np.random.Generator) -> Plane | None:
+def find_plane(
+    picture: Picture, config: RegionConfig, rng: np.random.Generator
+) -> BackgroundPlane | None:
     """The background plane, seen in all pixels (also those that other steps have taken)."""
     points = _some_points(picture, config.crop.far_mm + _BEYOND_MM, rng)
     if len(points) < 50:
@@ -87,7 +91,7 @@ def find_plane(picture: Picture, config: RegionConfig, rng: np.random.Generator)
         and behind <= _MOST_BEHIND * on
         and wide_mm >= _NARROWEST_MM
     )
-    return Plane(normal.astype(np.float64), offset, half_mm) if good else None
+    return BackgroundPlane(normal.astype(np.float64), offset, half_mm) if good else None
 
 
 def _some_points(picture: Picture, far_mm: float, rng: np.random.Generator) -> np.ndarray:

@@ -13,13 +13,13 @@ import torch
 from jaxtyping import Float32
 from torch import Tensor
 
-from tumortrack.simulate.batched.plan import Plan
+from tumortrack.simulate.batched.plan import BatchPlan
 
 _FARTHEST = -12.0  # where a drag's factor is below exp(-12) = 6e-6, it is left out
 
 
 @dataclass(frozen=True, eq=False)
-class Motion:
+class BatchedMotion:
     """The maps of b scenes from the CT frame to their cameras', as tensors on a device."""
 
     centres_ct: Float32[Tensor, "3 b k"]
@@ -29,7 +29,7 @@ class Motion:
     camera_from_ct: Float32[Tensor, "b 4 4"]
 
     @classmethod
-    def of(cls, plan: Plan, device: torch.device) -> Motion:
+    def of(cls, plan: BatchPlan, device: torch.device) -> BatchedMotion:
         def sent(array: np.ndarray) -> Tensor:
             return torch.from_numpy(array.astype(np.float32)).to(device, non_blocking=True)
 

@@ -47,7 +47,7 @@ def _in_steps(model: DeformConfig) -> bool:
 
 
 @dataclass(frozen=True, eq=False)
-class Plan:
+class BatchPlan:
     """A batch of b scenes, k drags each (shift 0: none); mm. Picklable."""
 
     recipes: np.ndarray  # of SceneRecipe
@@ -62,19 +62,19 @@ class Plan:
     n_points: Int64[np.ndarray, " b"]
     states: np.ndarray  # of the generators, for what is drawn after the picture
 
-    def replaced(self, rows: Int64[np.ndarray, " r"], others: Plan) -> Plan:
+    def replaced(self, rows: Int64[np.ndarray, " r"], others: BatchPlan) -> BatchPlan:
         """The plan with other scenes in these rows."""
         arrays = {}
         for field in fields(self):
             array = getattr(self, field.name).copy()
             array[rows] = getattr(others, field.name)
             arrays[field.name] = array
-        return Plan(**arrays)
+        return BatchPlan(**arrays)
 
 
 def plan_scenes(
     simulator: Simulator, recipes: Sequence[SceneRecipe], attempts: Sequence[int]
-) -> Plan:
+) -> BatchPlan:
     """Draw the scenes of these recipes, each at this attempt."""
     config = simulator.config
     n_drags = max(map(_count_drags, config.deform))
@@ -91,7 +91,7 @@ def plan_scenes(
     cameras, centres, shifts, sigmas, stretches, near, far, n_points, states = zip(
         *rows, strict=True
     )
-    return Plan(
+    return BatchPlan(
         np.array(recipes, object),
         np.array(attempts),
         np.stack(cameras),

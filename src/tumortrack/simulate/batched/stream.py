@@ -13,8 +13,8 @@ from torch import Tensor
 from tumortrack.core.errors import InputError
 from tumortrack.sense.camera import d405
 from tumortrack.sense.cloud import FEWEST_POINTS, draw_some
-from tumortrack.simulate.batched.motion import Motion
-from tumortrack.simulate.batched.plan import Plan, plan_scenes, unsupported
+from tumortrack.simulate.batched.motion import BatchedMotion
+from tumortrack.simulate.batched.plan import BatchPlan, plan_scenes, unsupported
 from tumortrack.simulate.batched.raster import depth_images
 from tumortrack.simulate.batched.sampling import DevicePool, clouds_from_depth, count_in_range
 from tumortrack.simulate.dataset import SceneStream, refill
@@ -30,7 +30,7 @@ class Pictured:
     """A plan whose images show enough; those, their pixels in range up to each (on the device) and
     in all (on the host)."""
 
-    plan: Plan
+    plan: BatchPlan
     depth_mm: Float32[Tensor, "b h w"]
     counted: Int32[Tensor, "b hw"]
     available: Int32[np.ndarray, " b"]
@@ -91,7 +91,7 @@ class DeviceStream:
         pictured = self.pictured(self.plan(index))
         return self.finished(pictured, self.chosen(pictured))
 
-    def plan(self, *indices: int) -> Plan:
+    def plan(self, *indices: int) -> BatchPlan:
         """What chance decides in the batches with these numbers, up to their pictures; no device
         is needed. Several are made together, their scenes one batch's after another's."""
         size, seed, name = self._stream.batch_size, self._stream.seed, self._stream.stream
@@ -100,7 +100,7 @@ class DeviceStream:
         return plan_scenes(self._simulator, recipes, [0] * len(recipes))
 
     @torch.no_grad()
-    def pictured(self, plan: Plan) -> Pictured:
+    def pictured(self, plan: BatchPlan) -> Pictured:
         """The plan's depth images, with another attempt at scenes that show too little.
 
         Raises:
@@ -142,18 +142,18 @@ class DeviceStream:
         ranks = self._sent(chosen.ranks)
         clouds_mm = clouds_from_depth(pictured.depth_mm, pictured.counted, ranks, self._intrinsics)
         points_ct, labels = self._pool.take(self._sent(windows), windows[:, :, 1].max(0).tolist())
-        points_mm = Motion.of(plan, self._device).carry(points_ct)
+        points_mm = BatchedMotion.of(plan, self._device).carry(points_ct)
         poses = self._sent(plan.camera_from_ct.astype(np.float32))
         return clouds_mm, points_mm.permute(1, 2, 0).contiguous(), labels, poses
 
-    def depth_images(self, plan: Plan) -> Float32[Tensor, "b h w"]:
+    def depth_images(self, plan: BatchPlan) -> Float32[Tensor, "b h w"]:
         """What the cameras of a plan see of the organ: depth in mm, NaN where there is nothing."""
         vertices_ct, faces = self._organ
         everywhere = vertices_ct[:, None].expand(-1, len(plan.recipes), -1)
-        vertices_mm = Motion.of(plan, self._device).carry(everywhere)
+        vertices_mm = BatchedMotion.of(plan, self._device).carry(everywhere)
         return depth_images(vertices_mm, faces, self._intrinsics)
 
-    def _picture(self, plan: Plan) -> tuple[Float32[Tensor, "b h w"], Int32[Tensor, "b hw"]]:
+    def _picture(self, plan: BatchPlan) -> tuple[Float32[Tensor, "b h w"], Int32[Tensor, "b hw"]]:
         depth_mm = self.depth_images(plan)
         near, far = self._sent(plan.near_mm), self._sent(plan.far_mm)
         return depth_mm, count_in_range(depth_mm, near, far)

@@ -12,7 +12,7 @@ from jaxtyping import Float
 from tumortrack.core.types import Anatomy
 
 if TYPE_CHECKING:
-    from tumortrack.simulate.elastic.body import Body
+    from tumortrack.simulate.elastic.body import ElasticBody
 
 
 @dataclass(frozen=True)
@@ -22,7 +22,9 @@ class View:
     anatomy_ct: Anatomy
     # visible(points_ct) -> bool each: nothing before the point, and the point in the picture
     visible: Callable[[np.ndarray], np.ndarray]
-    body: Body | None = None  # what the organ can do elastically, where a deformation needs it
+    body: ElasticBody | None = (
+        None  # what the organ can do elastically, where a deformation needs it
+    )
 
 
 class Deformation(Protocol):

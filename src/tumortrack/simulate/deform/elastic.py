@@ -14,14 +14,14 @@ from jaxtyping import Float, Float32
 from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError
 from tumortrack.simulate.deform.base import View
-from tumortrack.simulate.elastic.body import Body, BodyConfig
+from tumortrack.simulate.elastic.body import BodyConfig, ElasticBody
 
 
 @dataclass(frozen=True, eq=False)
-class Elastic:
+class ElasticDeformation:
     """Points follow the velocity field of some coefficients of a body's modes."""
 
-    body: Body
+    body: ElasticBody
     coefficients: Float32[np.ndarray, " m"]
 
     @cached_property
@@ -44,7 +44,7 @@ class ElasticConfig(Config, frozen=True, tag="elastic"):
     second_scale: tuple[float, float] = (0.1, 0.6)
     body: BodyConfig = BodyConfig()
 
-    def sample(self, view: View, rng: np.random.Generator) -> Elastic:
+    def sample(self, view: View, rng: np.random.Generator) -> ElasticDeformation:
         """Draw states and scales uniformly.
 
         Raises:
@@ -59,4 +59,4 @@ class ElasticConfig(Config, frozen=True, tag="elastic"):
         state = states[rng.integers(len(states))] * rng.uniform(*self.scale)
         if rng.uniform() < self.mixed:
             state = state + states[rng.integers(len(states))] * rng.uniform(*self.second_scale)
-        return Elastic(view.body, view.body.within_reach(state.astype(np.float32)))
+        return ElasticDeformation(view.body, view.body.within_reach(state.astype(np.float32)))

@@ -16,7 +16,7 @@ from tumortrack.core.types import Anatomy
 from tumortrack.simulate.elastic.flow import combine, follow, project, steps_for
 
 if TYPE_CHECKING:
-    from tumortrack.simulate.elastic.settle import Reduced
+    from tumortrack.simulate.elastic.settle import ReducedModel
 
 _RIDGE = 1e-4  # mm2, on the covariance: no coefficient is ever known for sure
 _ARRAYS = ("origin_mm", "spacing_mm", "center_ct", "modes", "states")
@@ -37,7 +37,7 @@ class BodyConfig(Config, frozen=True):
 
 
 @dataclass(frozen=True, eq=False)
-class Body:
+class ElasticBody:
     """Modes of an organ (CT frame, LPS mm) and a library of states under random loads.
 
     A state is a vector of coefficients; points follow the velocity ``modes @ coefficients`` for
@@ -135,7 +135,7 @@ class Body:
         return {name: np.asarray(getattr(self, name)) for name in _ARRAYS}
 
     @classmethod
-    def from_arrays(cls, arrays: dict[str, np.ndarray]) -> Body:
+    def from_arrays(cls, arrays: dict[str, np.ndarray]) -> ElasticBody:
         """The inverse of ``to_arrays``.
 
         Raises:
@@ -158,7 +158,7 @@ def build_body(
     up_lps: tuple[float, float, float],
     config: BodyConfig,
     seed: int,
-) -> Body:
+) -> ElasticBody:
     """Finite elements of an organ, its modes, and a library of states under random loads.
 
     Takes seconds on one core. The same anatomy, configuration and seed give the same body on the
@@ -188,7 +188,7 @@ def reduced_organ(
     up: Float64[np.ndarray, " 3"],
     config: BodyConfig,
     rng: np.random.Generator,
-) -> Reduced:
+) -> ReducedModel:
     """An organ in the space of its modes, ready for loads; ``up`` is a unit vector.
 
     Raises:
@@ -198,7 +198,7 @@ def reduced_organ(
     from tumortrack.simulate.elastic.finite import solid_of
     from tumortrack.simulate.elastic.lattice import lattice_over
     from tumortrack.simulate.elastic.modes import modes_of, random_loads
-    from tumortrack.simulate.elastic.settle import Reduced
+    from tumortrack.simulate.elastic.settle import ReducedModel
     from tumortrack.simulate.elastic.surface import patches_of
 
     organ = anatomy_ct.organ
@@ -206,13 +206,15 @@ def reduced_organ(
     solid = solid_of(anatomy_ct, lattice_over(organ.box_mm, spacing), config.poisson)
     patches = patches_of(organ, config.patches, rng)
     loads = random_loads(solid, patches, up, config.responses, rng)
-    return Reduced(solid, modes_of(solid, patches, config.modes, config.contrasts, loads), patches)
+    return ReducedModel(
+        solid, modes_of(solid, patches, config.modes, config.contrasts, loads), patches
+    )
 
 
-def body_of(reduced: Reduced, states: Float32[np.ndarray, "s m"]) -> Body:
+def body_of(reduced: ReducedModel, states: Float32[np.ndarray, "s m"]) -> ElasticBody:
     """The body of a reduced organ with these states as its library."""
     solid = reduced.solid
-    return Body(
+    return ElasticBody(
         solid.lattice.origin_mm.astype(np.float32),
         solid.lattice.spacing_mm,
         solid.center_mm,

@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Float, Float64, Int
 
 from tumortrack.core.types import Anatomy, Mesh
-from tumortrack.simulate.elastic.lattice import CORNERS, Lattice
+from tumortrack.simulate.elastic.lattice import CORNERS, ElementLattice
 from tumortrack.simulate.elastic.slabs import SlabCholesky
 from tumortrack.simulate.occupancy import contains
 
@@ -67,7 +67,7 @@ def _strain(x: Float64[np.ndarray, " 3"]) -> Float64[np.ndarray, "6 24"]:
     return strain.reshape(6, 24)
 
 
-def filled(mesh: Mesh, lattice: Lattice) -> Float64[np.ndarray, " c"]:
+def filled(mesh: Mesh, lattice: ElementLattice) -> Float64[np.ndarray, " c"]:
     """The share of each cell that lies in a closed surface."""
     n, s = np.array(lattice.cells), _SUBCELLS
     fine = np.indices(tuple(n * s)).reshape(3, -1).T
@@ -80,11 +80,11 @@ def filled(mesh: Mesh, lattice: Lattice) -> Float64[np.ndarray, " c"]:
 
 
 @dataclass(frozen=True, eq=False)
-class Solid:
+class LatticeSolid:
     """An organ on its lattice. Cells far from it are left out; arrays run over the ``nodes``
     that remain, ordered in slabs along the lattice's longest axis."""
 
-    lattice: Lattice
+    lattice: ElementLattice
     poisson: float
     organ: Float64[np.ndarray, " c"]  # share of each cell that is left
     tumor: Float64[np.ndarray, " c"]
@@ -154,7 +154,7 @@ class Solid:
         return (3 * self.cells[:, :, None] + np.arange(3)).reshape(len(self.cells), 24)
 
 
-def solid_of(anatomy_ct: Anatomy, lattice: Lattice, poisson: float) -> Solid:
+def solid_of(anatomy_ct: Anatomy, lattice: ElementLattice, poisson: float) -> LatticeSolid:
     """The organ and its tumors on a lattice; cells that do not touch a filled one are left out."""
     from scipy.ndimage import binary_dilation
 
@@ -172,7 +172,7 @@ def solid_of(anatomy_ct: Anatomy, lattice: Lattice, poisson: float) -> Solid:
     number = np.empty(int(np.prod(lattice.shape)), int)
     number[nodes] = np.arange(len(nodes))
     first = np.flatnonzero(np.diff(slab[order], prepend=-1))
-    return Solid(
+    return LatticeSolid(
         lattice,
         poisson,
         organ[near],

@@ -16,7 +16,7 @@ CORNERS = np.array([[i, j, k] for i in (0, 1) for j in (0, 1) for k in (0, 1)])
 
 
 @dataclass(frozen=True, eq=False)
-class Lattice:
+class ElementLattice:
     """Nodes ``origin_mm + spacing_mm * (i, j, k)``; node numbers run with the last axis fastest."""
 
     origin_mm: Float64[np.ndarray, " 3"]
@@ -56,9 +56,11 @@ class Lattice:
 
 def lattice_over(
     box_mm: Float64[np.ndarray, "2 3"], spacing_mm: float, margin: float = 2.0
-) -> Lattice:
+) -> ElementLattice:
     """The lattice about a box with a margin of so many cells on every side."""
     extent = box_mm[1] - box_mm[0]
     cells = np.ceil(extent / spacing_mm + 2 * margin).astype(int)
     origin = box_mm.mean(0) - cells * spacing_mm / 2
-    return Lattice(origin, spacing_mm, (int(cells[0]) + 1, int(cells[1]) + 1, int(cells[2]) + 1))
+    return ElementLattice(
+        origin, spacing_mm, (int(cells[0]) + 1, int(cells[1]) + 1, int(cells[2]) + 1)
+    )

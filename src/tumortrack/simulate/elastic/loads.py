@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float64
 from scipy.spatial.transform import Rotation
 
-from tumortrack.simulate.elastic.settle import KPA, Problem, Reduced, settle
+from tumortrack.simulate.elastic.settle import KPA, ReducedModel, ReducedProblem, settle
 
 _OBSTACLE = 100 * KPA  # N/mm3, of plates and instruments
 _GRIP = 50 * KPA  # N/mm3, of what holds a place
@@ -27,10 +27,10 @@ SWELLING = 0.025  # largest change of volume: leaves room below 3 % for what mod
 class Load(Protocol):
     @classmethod
     def draw(
-        cls, organ: Reduced, up: Float64[np.ndarray, " 3"], rng: np.random.Generator
+        cls, organ: ReducedModel, up: Float64[np.ndarray, " 3"], rng: np.random.Generator
     ) -> Load: ...
 
-    def add(self, problem: Problem) -> None: ...
+    def add(self, problem: ReducedProblem) -> None: ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,7 +42,7 @@ class Obstacle:
     height_mm: float
     foot: Float64[np.ndarray, " p"]
 
-    def add(self, problem: Problem) -> None:
+    def add(self, problem: ReducedProblem) -> None:
         patches = problem.organ.patches
         depth = patches.points_mm @ self.outward - self.height_mm
         springs = _OBSTACLE * patches.areas_mm2 * self.foot
@@ -53,7 +53,7 @@ class Plate(Obstacle):
     """A plate or strip pressed down on the organ, a little tilted."""
 
     @classmethod
-    def draw(cls, organ: Reduced, up: np.ndarray, rng: np.random.Generator) -> Plate:
+    def draw(cls, organ: ReducedModel, up: np.ndarray, rng: np.random.Generator) -> Plate:
         return cls(*_strip(organ, _tilted(up, 0.15, rng), rng))
 
 
@@ -61,7 +61,7 @@ class Side(Obstacle):
     """A retractor or plate that presses from the side."""
 
     @classmethod
-    def draw(cls, organ: Reduced, up: np.ndarray, rng: np.random.Generator) -> Side:
+    def draw(cls, organ: ReducedModel, up: np.ndarray, rng: np.random.Generator) -> Side:
         outward = rng.normal(size=3)
         outward -= up * (outward @ up) * rng.uniform(0.5, 1)
         return cls(*_strip(organ, _unit(outward), rng))
@@ -71,7 +71,7 @@ class Poke(Obstacle):
     """A blunt instrument pressed into the surface that does not look down."""
 
     @classmethod
-    def draw(cls, organ: Reduced, up: np.ndarray, rng: np.random.Generator) -> Poke:
+    def draw(cls, organ: ReducedModel, up: np.ndarray, rng: np.random.Generator) -> Poke:
         tip = _reachable(organ, up, rng)
         outward = _tilted_by(organ.patches.normals[tip], 0.25, rng)
         return cls.at(organ, tip, outward, rng.uniform(3, 10), rng.uniform(1, 14))
@@ -79,7 +79,7 @@ class Poke(Obstacle):
     @classmethod
     def at(
         cls,
-        organ: Reduced,
+        organ: ReducedModel,
         patch: int,
         outward: Float64[np.ndarray, " 3"],
         radius_mm: float,
@@ -100,7 +100,7 @@ class Grip:
     hold: Float64[np.ndarray, " p"]  # springs per patch, N/mm
     shift_mm: Float64[np.ndarray, " 3"]
 
-    def add(self, problem: Problem) -> None:
+    def add(self, problem: ReducedProblem) -> None:
         for axis, shift in zip(np.eye(3), self.shift_mm, strict=True):
             problem.tie(problem.organ.along(axis), shift, self.hold)
 
@@ -109,7 +109,7 @@ class Pull(Grip):
     """Forceps draw at the surface."""
 
     @classmethod
-    def draw(cls, organ: Reduced, up: np.ndarray, rng: np.random.Generator) -> Pull:
+    def draw(cls, organ: ReducedModel, up: np.ndarray, rng: np.random.Generator) -> Pull:
         place = _reachable(organ, up, rng)
         hold = _region(organ, place, rng.uniform(4, 9))
         along = _tilted_by(organ.patches.normals[place], 0.6, rng)
@@ -120,7 +120,7 @@ class Lift(Grip):
     """A pole is raised or led aside, mostly upwards."""
 
     @classmethod
-    def draw(cls, organ: Reduced, up: np.ndarray, rng: np.random.Generator) -> Lift:
+    def draw(cls, organ: ReducedModel, up: np.ndarray, rng: np.random.Generator) -> Lift:
         outward = rng.normal(size=3)
         outward -= 0.7 * up * (outward @ up)
         place = int(np.argmax(organ.patches.points_mm @ outward))
@@ -137,10 +137,10 @@ class Sag:
     share: float  # of the weight
 
     @classmethod
-    def draw(cls, organ: Reduced, up: np.ndarray, rng: np.random.Generator) -> Sag:
+    def draw(cls, organ: ReducedModel, up: np.ndarray, rng: np.random.Generator) -> Sag:
         return cls(_tilted(-up, 0.15, rng), float(rng.uniform(0.2, 1)))
 
-    def add(self, problem: Problem) -> None:
+    def add(self, problem: ReducedProblem) -> None:
         problem.forces += self.share * _WEIGHT * (self.down @ problem.organ.volume_moves)
 
 
@@ -151,10 +151,10 @@ class Swell:
     strain: float  # of the volume, if nothing hinders it
 
     @classmethod
-    def draw(cls, organ: Reduced, up: np.ndarray, rng: np.random.Generator) -> Swell:
+    def draw(cls, organ: ReducedModel, up: np.ndarray, rng: np.random.Generator) -> Swell:
         return cls(float(rng.uniform(-SWELLING, SWELLING)))
 
-    def add(self, problem: Problem) -> None:
+    def add(self, problem: ReducedProblem) -> None:
         problem.forces += problem.modulus * self.strain * problem.organ.swelling
 
 
@@ -169,12 +169,14 @@ LOADS: tuple[tuple[type[Load], float], ...] = (
 )
 
 
-def bedded(organ: Reduced, up: Float64[np.ndarray, " 3"], rng: np.random.Generator) -> Problem:
+def bedded(
+    organ: ReducedModel, up: Float64[np.ndarray, " 3"], rng: np.random.Generator
+) -> ReducedProblem:
     """An organ of random tissue (3-30 kPa, tumors 0.8-8 times that) in a random bed: springs of
     0.5-20 kPa/mm on the underside, in some states only against sinking, in others both ways."""
     modulus = KPA * _log_uniform(3, 30, rng)
     stiffness = organ.stiffness(modulus, _log_uniform(0.8, 8, rng))
-    problem = Problem(organ, up, modulus, stiffness, np.zeros(len(stiffness)))
+    problem = ReducedProblem(organ, up, modulus, stiffness, np.zeros(len(stiffness)))
     patches = organ.patches
     below = np.clip(-(patches.normals @ up), 0, 1) * patches.areas_mm2
     springs = below * KPA * _log_uniform(0.5, 20, rng)
@@ -192,7 +194,7 @@ def bedded(organ: Reduced, up: Float64[np.ndarray, " 3"], rng: np.random.Generat
 
 
 def random_state(
-    organ: Reduced, up: Float64[np.ndarray, " 3"], anywhere: float, rng: np.random.Generator
+    organ: ReducedModel, up: Float64[np.ndarray, " 3"], anywhere: float, rng: np.random.Generator
 ) -> Float64[np.ndarray, " k"] | None:
     """Coefficients of the modes after one or two random loads; None for states that do not come
     to rest or move a place by more than 24 mm. What moves by 16 to 24 mm is scaled to 16.
@@ -217,7 +219,7 @@ def random_state(
 
 
 def _strip(
-    organ: Reduced, outward: np.ndarray, rng: np.random.Generator
+    organ: ReducedModel, outward: np.ndarray, rng: np.random.Generator
 ) -> tuple[np.ndarray, float, np.ndarray]:
     """A strip 10-70 mm wide across a random line, pressed in by up to ``DEEPEST``."""
     points = organ.patches.points_mm
@@ -236,12 +238,12 @@ def _faded(inward_mm: np.ndarray) -> np.ndarray:
     return np.clip(inward_mm / _EDGE_MM + 0.5, 0, 1)
 
 
-def _region(organ: Reduced, place: int, radius_mm: float) -> np.ndarray:
+def _region(organ: ReducedModel, place: int, radius_mm: float) -> np.ndarray:
     square = ((organ.patches.points_mm - organ.patches.points_mm[place]) ** 2).sum(1)
     return _GRIP * organ.patches.areas_mm2 * np.exp(-0.5 * square / radius_mm**2)
 
 
-def _reachable(organ: Reduced, up: np.ndarray, rng: np.random.Generator) -> int:
+def _reachable(organ: ReducedModel, up: np.ndarray, rng: np.random.Generator) -> int:
     return int(rng.choice(np.flatnonzero(organ.patches.normals @ up > -0.2)))
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float64
 from scipy.spatial.transform import Rotation
 
-from tumortrack.simulate.elastic.finite import Solid
+from tumortrack.simulate.elastic.finite import LatticeSolid
 from tumortrack.simulate.elastic.surface import Patches
 
 
@@ -30,7 +30,7 @@ class Modes:
 class _Rigid:
     """The rigid motions of a solid and the projections that remove them."""
 
-    def __init__(self, solid: Solid) -> None:
+    def __init__(self, solid: LatticeSolid) -> None:
         arms = solid.nodes_mm - solid.center_mm
         turns = [np.cross(axis, arms).ravel() for axis in np.eye(3)]
         shifts = [np.tile(axis, len(arms)) for axis in np.eye(3)]
@@ -50,7 +50,7 @@ class _Rigid:
 
 
 def modes_of(
-    solid: Solid,
+    solid: LatticeSolid,
     patches: Patches,
     count: int,
     contrasts: tuple[float, ...],
@@ -82,7 +82,7 @@ def modes_of(
 
 
 def random_loads(
-    solid: Solid, patches: Patches, up: Float64[np.ndarray, " 3"], count: int,
+    solid: LatticeSolid, patches: Patches, up: Float64[np.ndarray, " 3"], count: int,
     rng: np.random.Generator,
 ) -> Float64[np.ndarray, "f n"]:  # fmt: skip
     """Forces at the nodes, one column a load: squeezed, poked, pulled, hanging, bent, sheared.

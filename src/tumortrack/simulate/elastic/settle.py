@@ -13,7 +13,7 @@ import numba
 import numpy as np
 from jaxtyping import Float64
 
-from tumortrack.simulate.elastic.finite import Solid
+from tumortrack.simulate.elastic.finite import LatticeSolid
 from tumortrack.simulate.elastic.modes import Modes
 from tumortrack.simulate.elastic.surface import Patches
 
@@ -24,10 +24,10 @@ _MOST_STEPS = 20
 _SETTLED_MM = 1e-2
 
 
-class Reduced:
+class ReducedModel:
     """A solid in the space of its modes and six rigid motions (k + 6 unknowns)."""
 
-    def __init__(self, solid: Solid, modes: Modes, patches: Patches) -> None:
+    def __init__(self, solid: LatticeSolid, modes: Modes, patches: Patches) -> None:
         k, n = modes.shapes.shape[1], len(solid.nodes)
         self.solid, self.modes, self.patches = solid, modes, patches
         self.n_modes = k
@@ -59,10 +59,10 @@ class Reduced:
 
 
 @dataclass(eq=False)
-class Problem:
+class ReducedProblem:
     """What acts on the organ, gathered by the loads: energy z' H z / 2 - g z + springs' energy."""
 
-    organ: Reduced
+    organ: ReducedModel
     up: Float64[np.ndarray, " 3"]
     modulus: float  # of the tissue, N/mm2
     stiffness: Float64[np.ndarray, "m m"]  # H
@@ -79,7 +79,7 @@ class Problem:
         add_springs(self.stiffness, self.forces, rows, springs * target_mm, springs)
 
 
-def settle(problem: Problem) -> Float64[np.ndarray, " m"] | None:
+def settle(problem: ReducedProblem) -> Float64[np.ndarray, " m"] | None:
     """The unknowns at rest; None where the contacts do not come to rest."""
     none = (np.zeros((0, len(problem.forces))), np.zeros(0), np.zeros(0))
     rows, depth, springs = (

@@ -36,7 +36,7 @@ _AWAY = PchipInterpolator([0.0, 0.2, 0.85, 1.0], [1.0, 0.0, 0.0, 1.0])
 _DEPTH = PchipInterpolator([0.0, 0.2, 0.45, 0.6, 0.85, 1.0], [0.0, 0.0, 1.0, 1.0, 0.0, 0.0])
 
 
-class TheatreConfig(Config, frozen=True, kw_only=True):
+class ScenePlayerConfig(Config, frozen=True, kw_only=True):
     """What moves and what is seen; a length of zero switches its part off.
 
     Attributes:
@@ -93,7 +93,7 @@ class Instant:
             raise InputError(f"time {self.t_s} s is before the theatre's beginning, 0 s.")
 
 
-class Theatre:
+class ScenePlayer:
     """One case in motion. Building it solves the elastic states: some seconds.
 
     Raises:
@@ -104,7 +104,7 @@ class Theatre:
         self,
         anatomy_ct: Anatomy,
         up_lps: tuple[float, float, float],
-        config: TheatreConfig,
+        config: ScenePlayerConfig,
         seed: int,
     ) -> None:
         rng = np.random.default_rng([seed, 0x57A6E])
@@ -203,7 +203,7 @@ class Theatre:
         return swayed @ self._camera_from_ct
 
 
-def _pushes(bed: Bed, config: TheatreConfig, rng: np.random.Generator) -> tuple[Push, ...]:
+def _pushes(bed: Bed, config: ScenePlayerConfig, rng: np.random.Generator) -> tuple[Push, ...]:
     if config.push_mm == 0:
         return ()
     return pushes_on(bed, config.places, SHAFT_MM, config.push_mm, rng)

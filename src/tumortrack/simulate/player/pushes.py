@@ -16,7 +16,7 @@ from scipy.interpolate import PchipInterpolator
 
 from tumortrack.core.errors import InputError
 from tumortrack.simulate.elastic.loads import Load, Poke, Swell, bedded
-from tumortrack.simulate.elastic.settle import Reduced, settle
+from tumortrack.simulate.elastic.settle import ReducedModel, settle
 
 _KEY_STATES = 7
 _FOOT_MM = 2.0  # the tissue is held down so far beyond the instrument's radius
@@ -45,7 +45,7 @@ class Push:
 class Bed:
     """An organ of fixed tissue on a fixed bed, both drawn by a seed, that takes loads."""
 
-    def __init__(self, organ: Reduced, up: Float64[np.ndarray, " 3"], seed: int) -> None:
+    def __init__(self, organ: ReducedModel, up: Float64[np.ndarray, " 3"], seed: int) -> None:
         self.organ, self.up = organ, up
         self._seed = seed
 

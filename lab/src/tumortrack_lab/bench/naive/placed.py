@@ -13,7 +13,7 @@ import trimesh
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from tumortrack.registration.network import WarpNetwork
+from tumortrack.registration.network import RegistrationNetwork
 from tumortrack.simulate.occupancy import labels_of
 from tumortrack.training.model import Model
 from tumortrack_lab.bench.naive.scenes import flowed, sampled
@@ -25,7 +25,7 @@ class NaivePlaced:
     """Places the organ of one model in clouds (camera frame, mm)."""
 
     def __init__(self, model: Model) -> None:
-        assert isinstance(model.network, WarpNetwork)
+        assert isinstance(model.network, RegistrationNetwork)
         assert model.shape is not None
         self._network, self._config = model.network, model.config.refine
         self._anatomy, self.body = model.shape.anatomy_ct, model.shape.body

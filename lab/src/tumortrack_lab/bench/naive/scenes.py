@@ -9,15 +9,15 @@ from scipy.ndimage import map_coordinates
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.types import Anatomy
 from tumortrack.simulate.deform.drag import Drags
-from tumortrack.simulate.deform.elastic import Elastic
-from tumortrack.simulate.elastic.body import Body
+from tumortrack.simulate.deform.elastic import ElasticDeformation
+from tumortrack.simulate.elastic.body import ElasticBody
 from tumortrack.simulate.occupancy import labels_of
-from tumortrack.simulate.scene import Stage
+from tumortrack.simulate.scene import RenderedScene
 
 FLOW_STEPS = 12
 
 
-def plain_pair(anatomy_ct: Anatomy, stage: Stage, labels: int) -> np.ndarray:
+def plain_pair(anatomy_ct: Anatomy, stage: RenderedScene, labels: int) -> np.ndarray:
     """All surfaces deformed, a ray a pixel through a tree that is built anew, and random points
     labelled by inside tests on the deformed surfaces."""
     parts = [part.moved(_carried(stage, part.vertices_mm)) for part in anatomy_ct.parts]
@@ -31,12 +31,12 @@ def plain_pair(anatomy_ct: Anatomy, stage: Stage, labels: int) -> np.ndarray:
     return labels_of(Anatomy(tuple(parts)), points)
 
 
-def _carried(stage: Stage, points_ct: np.ndarray) -> np.ndarray:
+def _carried(stage: RenderedScene, points_ct: np.ndarray) -> np.ndarray:
     deformation = stage.deformation
     if isinstance(deformation, Drags):
         moved = _dragged(deformation, points_ct)
     else:
-        assert isinstance(deformation, Elastic)
+        assert isinstance(deformation, ElasticDeformation)
         moved = flowed(deformation.body, deformation.coefficients, points_ct)
     return transform_points(stage.camera_from_ct, moved)
 
@@ -51,7 +51,7 @@ def _dragged(drags: Drags, points_ct: np.ndarray) -> np.ndarray:
     return moved
 
 
-def flowed(body: Body, coefficients: np.ndarray, points: np.ndarray) -> np.ndarray:
+def flowed(body: ElasticBody, coefficients: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Points (n, 3) of the CT frame after one unit of time in a body's velocity: midpoint rule,
     SciPy's interpolation."""
     field = np.moveaxis(body.velocity(coefficients), 3, 0)
@@ -62,7 +62,7 @@ def flowed(body: Body, coefficients: np.ndarray, points: np.ndarray) -> np.ndarr
     return moved
 
 
-def sampled(body: Body, fields: np.ndarray, points: np.ndarray) -> np.ndarray:
+def sampled(body: ElasticBody, fields: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Fields (f, i, j, k) on a body's lattice at points (n, 3) -> (n, f)."""
     place = (points - body.origin_mm).T / body.spacing_mm
     return np.stack([map_coordinates(f, place, order=1, mode="nearest") for f in fields], 1)
