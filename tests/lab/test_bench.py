@@ -13,9 +13,11 @@ import torch
 from stories import tumortrack
 from tumortrack.core.errors import InputError, TumortrackError
 from tumortrack.core.types import Anatomy, Mesh
+from tumortrack.models.config import MlpDecoderConfig, NetworkConfig
 from tumortrack.models.encoders.pointnet2 import PointNet2Config, SetAbstraction
-from tumortrack.occupancy.mlp_decoder import MlpDecoderConfig
-from tumortrack.occupancy.network import CloudBox, NetworkConfig, OccupancyNetwork, quick_network
+from tumortrack.models.normalisation import CloudBox
+from tumortrack.occupancy.network import OccupancyNetwork
+from tumortrack.training.presets import quick_network
 from tumortrack_lab.bench.counts import module_flops
 from tumortrack_lab.bench.goals import GOALS, goals_table
 from tumortrack_lab.bench.growth import draw_growth

@@ -14,22 +14,18 @@ from torch import Tensor
 from tumortrack.cli.compiling import compile_model
 from tumortrack.cli.inspection import describe
 from tumortrack.core.config import to_builtins
+from tumortrack.models.config import MlpDecoderConfig, NetworkConfig
+from tumortrack.models.normalisation import CloudBox
 from tumortrack.occupancy.compiled import Arithmetic, find, place_of, read, save, this_machine
 from tumortrack.occupancy.compiled import describe as describe_compiled
 from tumortrack.occupancy.compiling import like_an_organ, measured, reference
 from tumortrack.occupancy.inference import Inference, possible, usual
 from tumortrack.occupancy.locator import OccupancyLocator
-from tumortrack.occupancy.mlp_decoder import MlpDecoderConfig
-from tumortrack.occupancy.network import (
-    CloudBox,
-    NetworkConfig,
-    OccupancyNetwork,
-    paper_network,
-    quick_network,
-)
+from tumortrack.occupancy.network import OccupancyNetwork
 from tumortrack.occupancy.packed import can_pack
 from tumortrack.occupancy.quantized import QuantizedDecoder, gap, shift
 from tumortrack.training.model import load_model
+from tumortrack.training.presets import paper_network, quick_network
 
 CPU = torch.device("cpu")
 QUERIES = 6000  # enough for 8 bits, and no whole number of chunks

@@ -8,23 +8,22 @@ import torch
 from tumortrack.core.config import from_builtins, to_builtins
 from tumortrack.core.errors import InputError
 from tumortrack.models import sampling
+from tumortrack.models.config import MlpDecoderConfig, NetworkConfig
 from tumortrack.models.encoders.pointnet2 import PointNet2Config, SetAbstraction, _Level
-from tumortrack.models.pooling import greatest_above_zero
-from tumortrack.models.sampling import ball_query, farthest_points, strided_points, take
-from tumortrack.occupancy.mlp_decoder import MlpDecoder, MlpDecoderConfig, octave_features
-from tumortrack.occupancy.network import (
+from tumortrack.models.normalisation import (
     Aligned,
     CloudBox,
     FixedScale,
-    NetworkConfig,
-    OccupancyNetwork,
     _without_strays,
     alignment,
-    paper_network,
-    quick_network,
     turned,
     without_strays,
 )
+from tumortrack.models.pooling import greatest_above_zero
+from tumortrack.models.sampling import ball_query, farthest_points, strided_points, take
+from tumortrack.occupancy.mlp_decoder import MlpDecoder, octave_features
+from tumortrack.occupancy.network import OccupancyNetwork
+from tumortrack.training.presets import paper_network, quick_network
 
 
 def slim_paper() -> NetworkConfig:

@@ -7,11 +7,11 @@ import onnxruntime
 import pytest
 import torch
 
+from tumortrack.models.config import MlpDecoderConfig, NetworkConfig
 from tumortrack.models.encoders.pointnet2 import PointNet2Config, SetAbstraction
-from tumortrack.occupancy.mlp_decoder import MlpDecoderConfig
-from tumortrack.occupancy.network import Aligned, NetworkConfig
+from tumortrack.models.normalisation import Aligned
+from tumortrack.models.onnx_file import onnx_bytes
 from tumortrack.training.model import load_model
-from tumortrack.training.onnx_file import onnx_bytes
 
 
 def answers(content: bytes, **inputs: np.ndarray) -> list[np.ndarray]:

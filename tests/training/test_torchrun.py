@@ -15,12 +15,12 @@ from torch import distributed
 from stories import environment
 from torchrun_peer import STEPS, UP, anatomy, small_run
 from tumortrack.core.errors import InputError
-from tumortrack.occupancy.network import clinic_network
 from tumortrack.registration.network import RegistrationNetwork
 from tumortrack.simulate.dataset import SceneStream
 from tumortrack.simulate.occupancy import FixedPoints
 from tumortrack.simulate.scene import SceneConfig
 from tumortrack.training.distributed import ProcessGroup, ProcessLost, joined
+from tumortrack.training.presets import clinic_network
 from tumortrack.training.state import TrainingState
 from tumortrack.training.train import train
 

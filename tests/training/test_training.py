@@ -23,7 +23,7 @@ from tumortrack.core.errors import ArtifactError, InputError
 from tumortrack.core.types import Anatomy
 from tumortrack.imaging.case import load_case
 from tumortrack.models.config import TrainConfig
-from tumortrack.occupancy.network import CloudBox
+from tumortrack.models.normalisation import CloudBox
 from tumortrack.training.checkpoint import TrainingProgress
 from tumortrack.training.model import load_model
 from tumortrack.training.pace import use_cores

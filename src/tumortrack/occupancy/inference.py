@@ -13,11 +13,11 @@ import torch
 from jaxtyping import Float32
 from torch import Tensor
 
+from tumortrack.models.hardware import has_fast_bfloat16
 from tumortrack.occupancy.compiled import Arithmetic, Numbers
 from tumortrack.occupancy.network import Latent, OccupancyNetwork
 from tumortrack.occupancy.packed import PackedDecoder, can_pack, pack_stacks
 from tumortrack.occupancy.quantized import QuantizedDecoder, can_quantize
-from tumortrack.training.model import has_fast_bfloat16
 
 CHUNK = 2048  # queries at once and core: their activations (2 MB at 512 channels) stay near it
 _CHUNK_GPU = 2**17

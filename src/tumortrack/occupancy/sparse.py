@@ -23,8 +23,8 @@ import torch
 from jaxtyping import Bool, Float16, Float32, Float64, Int, UInt8
 
 from tumortrack.core.geometry import transform_points
-from tumortrack.models.volume import LARGEST_MARGIN, dense_margins, margins_of
 from tumortrack.occupancy.lattice import LogitLattice, LogitsAt
+from tumortrack.occupancy.volume import LARGEST_MARGIN, dense_margins, margins_of
 
 START_MM = 4.0
 _AT_ONCE = 2**18  # queries

@@ -2,30 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Protocol, runtime_checkable
-
 from tumortrack.core.allocator import keep_small_blocks
 from tumortrack.core.errors import InputError
 from tumortrack.core.estimate import Estimate, Following
 from tumortrack.core.types import Anatomy, SensorCloud
-from tumortrack.occupancy.locator import OccupancyLocator
-from tumortrack.registration.locator import RegistrationLocator
-from tumortrack.training.model import Model
+from tumortrack.models.model import Model
 
 _ALONE = Following()
-
-
-@runtime_checkable
-class Locator(Protocol):
-    """One kind of model at work."""
-
-    anatomy_ct: Anatomy | None
-
-    def locate(self, cloud: SensorCloud, grid: int, seed: int) -> Estimate: ...
-
-    def follow(self, cloud: SensorCloud, last: Estimate | None, how: Following) -> Estimate: ...
-
-    def warm(self) -> None: ...
 
 
 class Tracker:
@@ -37,9 +20,7 @@ class Tracker:
     def __init__(self, model: Model) -> None:
         keep_small_blocks()
         self.model = model
-        self._locator: Locator = (
-            RegistrationLocator(model) if model.config.network.warps else OccupancyLocator(model)
-        )
+        self._locator = model.locator()
 
     @property
     def anatomy_ct(self) -> Anatomy | None:

@@ -21,8 +21,8 @@ if TYPE_CHECKING:
     import torch
 
     from tumortrack.occupancy.inference import Inference
+    from tumortrack.occupancy.model import OccupancyModel
     from tumortrack.occupancy.network import OccupancyNetwork
-    from tumortrack.training.model import Model
     from tumortrack_lab.bench.naive.occupancy import NaiveOccupancy
     from tumortrack_lab.bench.subject import Subject
 
@@ -39,7 +39,7 @@ class OccupancyWorkload:
 
     ``naive_frame_s``: of the naive form's frame, once that was measured."""
 
-    model: Model
+    model: OccupancyModel
     points_mm: np.ndarray
     device: str = "cpu"
     naive_frame_s: InterleavedTiming | None = None
@@ -47,9 +47,6 @@ class OccupancyWorkload:
 
     @cached_property
     def network(self) -> OccupancyNetwork:
-        from tumortrack.occupancy.network import OccupancyNetwork
-
-        assert isinstance(self.model.network, OccupancyNetwork)
         return self.model.network.to(self.device)
 
     @cached_property
@@ -100,7 +97,7 @@ class OccupancyWorkload:
         """Of the encoder."""
         import torch
 
-        from tumortrack.training.model import has_fast_bfloat16
+        from tumortrack.models.hardware import has_fast_bfloat16
 
         return "bf16" if has_fast_bfloat16(torch.device(self.device)) else "fp32"
 
@@ -182,8 +179,10 @@ class OccupancyWorkload:
 
 def asked_of(subject: Subject, preset: str) -> OccupancyWorkload:
     """Of a preset: one for all groups of rows, whose naive form then labels its queries once."""
+    from tumortrack.occupancy.model import OccupancyModel
+
     if preset not in subject.asked:
-        subject.asked[preset] = OccupancyWorkload(
-            subject.model(preset), subject.cloud(preset).points_mm
-        )
+        model = subject.model(preset)
+        assert isinstance(model, OccupancyModel)
+        subject.asked[preset] = OccupancyWorkload(model, subject.cloud(preset).points_mm)
     return subject.asked[preset]

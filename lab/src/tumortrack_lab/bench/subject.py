@@ -24,9 +24,10 @@ from tumortrack_lab.bench.by_heart import learn_scene
 
 if TYPE_CHECKING:
     from tumortrack.models.config import TrainConfig
+    from tumortrack.models.model import Model
+    from tumortrack.registration.model import RegistrationModel
     from tumortrack.simulate.elastic.body import ElasticBody
     from tumortrack.simulate.scene import RenderedScene
-    from tumortrack.training.model import Model
     from tumortrack_lab.bench.asked import OccupancyWorkload
 
 UP = (0.0, -1.0, 0.0)
@@ -72,9 +73,16 @@ class Subject:
     @cached_property
     def body(self) -> ElasticBody:
         """The phantom's elastic body: the clinic model's."""
-        shape = self.model("clinic").shape
-        assert shape is not None
-        return shape.body
+        return self.clinic.shape.body
+
+    @cached_property
+    def clinic(self) -> RegistrationModel:
+        """The trained model of that preset."""
+        from tumortrack.registration.model import RegistrationModel
+
+        model = self.model("clinic")
+        assert isinstance(model, RegistrationModel)
+        return model
 
     @cached_property
     def _models(self) -> dict[str, Model]:
