@@ -53,7 +53,7 @@ def config(request) -> NetworkConfig:
 
 def seeded(config: NetworkConfig, seed: int = 0) -> OccupancyNetwork:
     torch.manual_seed(seed)
-    return config.build()
+    return OccupancyNetwork(config)
 
 
 def scene(batch: int = 2, n: int = 300, q: int = 50) -> tuple[torch.Tensor, torch.Tensor]:
@@ -406,7 +406,7 @@ def test_configurations_survive_json(config: NetworkConfig) -> None:
 
 
 def test_paper_network_has_the_papers_numbers() -> None:
-    network = paper_network(4).build()
+    network = OccupancyNetwork(paper_network(4))
     widths = [layer.linear.out_features for layer in network.decoder.layers]
     normed = [n for n, layer in enumerate(network.decoder.layers, 1) if layer.norm is not None]
     assert widths == [512] * 8

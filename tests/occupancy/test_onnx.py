@@ -34,7 +34,7 @@ def cloud():
 def occupancy(clinic_model):
     """The presets' kind, small: farthest points, balls, a skip, norms, octaves, alignment."""
     torch.manual_seed(0)
-    network = NetworkConfig(
+    config = NetworkConfig(
         encoder=PointNet2Config(
             levels=(SetAbstraction(ratio=0.25, radius=0.5, neighbours=16, widths=(16, 32)),),
             widths=(64,),
@@ -49,7 +49,8 @@ def occupancy(clinic_model):
             octaves=(0,),
         ),
         normalisation=Aligned(scale_mm=50.0, reach=1.35),
-    ).build()
+    )
+    network = OccupancyNetwork(config)
     model = replace(load_model(clinic_model, "cpu"), network=network.eval())
     return network, onnx_bytes(model)
 

@@ -5,14 +5,12 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Protocol, TypeVar, runtime_checkable
+from typing import Any, TypeVar
 
 import numpy as np
 from jaxtyping import Float64
 from torch import Tensor, nn
 
-from tumortrack.core.estimate import Estimate, Following
-from tumortrack.core.types import Anatomy, SensorCloud
 from tumortrack.models.config import NetworkConfig, TrainConfig
 from tumortrack.models.in_distribution import InDistributionRange
 
@@ -39,19 +37,6 @@ class Network(nn.Module):
         raise NotImplementedError
 
 
-@runtime_checkable
-class Locator(Protocol):
-    """A model at work; ``tracking.tracker.Tracker`` documents the methods."""
-
-    anatomy_ct: Anatomy | None
-
-    def locate(self, cloud: SensorCloud, grid: int, seed: int) -> Estimate: ...
-
-    def follow(self, cloud: SensorCloud, last: Estimate | None, how: Following) -> Estimate: ...
-
-    def warm(self) -> None: ...
-
-
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Model(ABC):
     """A network in evaluation mode and what it was trained for.
@@ -76,10 +61,6 @@ class Model(ABC):
     @abstractmethod
     def new_network(cls, config: NetworkConfig) -> Network:
         """A network with weights from torch's global generator (``torch.manual_seed``)."""
-
-    @abstractmethod
-    def locator(self) -> Locator:
-        """The method that uses this model."""
 
     def extra_files(self) -> dict[str, bytes]:
         """Files of a model folder besides the weights, by name."""

@@ -10,14 +10,9 @@ import numpy as np
 import torch
 from jaxtyping import Float32
 
-from tumortrack.occupancy.compiled import (
-    SCHEMA,
-    Arithmetic,
-    ArithmeticTiming,
-    Compiled,
-    this_machine,
-)
-from tumortrack.occupancy.inference import CHUNK, Inference, possible
+from tumortrack.occupancy.arithmetic import CHUNK, Arithmetic, possible
+from tumortrack.occupancy.compiled import SCHEMA, ArithmeticTiming, Compiled, this_machine
+from tumortrack.occupancy.inference import Inference
 from tumortrack.occupancy.model import OccupancyModel
 from tumortrack.occupancy.network import Latent, OccupancyNetwork
 

@@ -8,7 +8,7 @@ from typing import Any
 
 from tumortrack.models.config import NetworkConfig
 from tumortrack.models.folder import WEIGHTS
-from tumortrack.models.model import Locator, Model
+from tumortrack.models.model import Model
 from tumortrack.occupancy.compiled import Arithmetic, find
 from tumortrack.occupancy.network import OccupancyNetwork
 
@@ -23,11 +23,6 @@ class OccupancyModel(Model):
     @classmethod
     def new_network(cls, config: NetworkConfig) -> OccupancyNetwork:
         return OccupancyNetwork(config)
-
-    def locator(self) -> Locator:
-        from tumortrack.occupancy.locator import OccupancyLocator
-
-        return OccupancyLocator(self)
 
     @classmethod
     def from_folder(cls, folder: Path, manifest: dict, **common: Any) -> OccupancyModel:

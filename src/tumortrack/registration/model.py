@@ -11,7 +11,7 @@ from safetensors.numpy import load, save
 from tumortrack.core.config import Config, from_builtins, to_builtins
 from tumortrack.models.config import NetworkConfig
 from tumortrack.models.folder import SHAPE
-from tumortrack.models.model import Locator, Model
+from tumortrack.models.model import Model
 from tumortrack.registration.network import RegistrationNetwork
 from tumortrack.registration.registration import Registration
 from tumortrack.registration.rest_shape import RestShape
@@ -40,11 +40,6 @@ class RegistrationModel(Model):
     def registration(self) -> Registration:
         """The method, with this model's network and organ."""
         return Registration(self.network, self.shape, self.config.refine)
-
-    def locator(self) -> Locator:
-        from tumortrack.registration.locator import RegistrationLocator
-
-        return RegistrationLocator(self)
 
     def extra_files(self) -> dict[str, bytes]:
         return {SHAPE: save(self.shape.to_arrays())}
