@@ -38,10 +38,10 @@ from tumortrack.simulate.dataset import SceneStream
 from tumortrack.simulate.occupancy import organ_pool
 from tumortrack.simulate.scene import Simulator
 from tumortrack.training.head_start import HeadStart, load_start
-from tumortrack.training.loader import batches
 from tumortrack.training.presets import clinic
 from tumortrack.training.registration_task import RegistrationTask
 from tumortrack.training.run import TrainingRun
+from tumortrack.training.scenes import batches
 from tumortrack.training.state import TrainingState
 from tumortrack.training.validate import ValidationScenes, mean_iou_of, validation_scenes
 from tumortrack_lab.study.book import ReportWriter

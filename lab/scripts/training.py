@@ -43,10 +43,9 @@ from tumortrack.simulate.bodies import body_for
 from tumortrack.simulate.dataset import SceneStream
 from tumortrack.simulate.occupancy import organ_pool
 from tumortrack.simulate.scene import Simulator
-from tumortrack.training.loader import batches
 from tumortrack.training.presets import PRESETS, clinic, quick
-from tumortrack.training.run import TrainingRun
-from tumortrack.training.schedule import settle_end
+from tumortrack.training.run import TrainingRun, settle_end
+from tumortrack.training.scenes import batches
 from tumortrack.training.state import TrainingState
 from tumortrack.training.task import task_of
 from tumortrack.training.validate import (

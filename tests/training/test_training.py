@@ -24,14 +24,13 @@ from tumortrack.core.types import Anatomy
 from tumortrack.imaging.case import load_case
 from tumortrack.models.config import TrainConfig
 from tumortrack.models.normalisation import CloudBox
-from tumortrack.training.checkpoint import TrainingProgress
+from tumortrack.training.checkpoint import TrainingProgress, work_folder
 from tumortrack.training.model import load_model
 from tumortrack.training.pace import use_cores
 from tumortrack.training.presets import clinic, paper, quick
-from tumortrack.training.schedule import learning_rate, settle_end
+from tumortrack.training.run import learning_rate, settle_end
 from tumortrack.training.state import Diverged, TrainingState
 from tumortrack.training.train import TrainingRun, train
-from tumortrack.training.work import work_folder
 from warp_objects import train_slim
 
 
@@ -232,7 +231,7 @@ def test_two_trainings_in_one_folder_are_refused_and_a_dead_ones_lock_is_not(tmp
     assert (work / "something").exists()
     hold = (
         "import sys, os, signal; from pathlib import Path;"
-        "from tumortrack.training.work import work_folder\n"
+        "from tumortrack.training.checkpoint import work_folder\n"
         "with work_folder(Path(sys.argv[1])): os.kill(os.getpid(), signal.SIGKILL)"
     )
     assert subprocess.run([sys.executable, "-c", hold, str(model)]).returncode == -signal.SIGKILL

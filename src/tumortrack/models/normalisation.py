@@ -68,7 +68,7 @@ def without_strays(points_mm: Tensor, reach_mm: float) -> Tensor:
     5 mm). The order of the points that stay is kept.
     """
     if compiled(points_mm) and not points_mm.requires_grad:
-        from tumortrack.models.stray_kernels import near as gathered
+        from tumortrack.models.kernels import near as gathered
 
         out = torch.empty_like(points_mm, memory_format=torch.contiguous_format)
         gathered(points_mm.contiguous().numpy(), np.float32(reach_mm), out.numpy())

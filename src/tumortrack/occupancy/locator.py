@@ -16,9 +16,8 @@ from tumortrack.core.types import Anatomy, CameraLabels, OccupancyCloud, SensorC
 from tumortrack.models.in_distribution import check_familiar, fit_mm, spread_mm
 from tumortrack.models.report import describe_parts, fit_report, grid_over, report_head, stage
 from tumortrack.occupancy.inference import Inference
-from tumortrack.occupancy.lattice import LogitLattice, lattice_over
+from tumortrack.occupancy.lattice import LogitLattice, lattice_over, leaves, organ_lattice
 from tumortrack.occupancy.model import OccupancyModel
-from tumortrack.occupancy.organ_lattice import leaves, organ_lattice
 from tumortrack.occupancy.sparse import halved_lattice, leading, sparse_logits, sparse_margins
 from tumortrack.occupancy.volume import (
     FIT_STEPS,

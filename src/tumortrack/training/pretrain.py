@@ -36,8 +36,8 @@ from tumortrack.simulate.bodies import body_for
 from tumortrack.simulate.dataset import Batch, SceneStream
 from tumortrack.simulate.elastic.body import ElasticBody
 from tumortrack.simulate.occupancy import FixedPoints
+from tumortrack.training.checkpoint import work_folder
 from tumortrack.training.head_start import save_start
-from tumortrack.training.loader import batches, default_workers, network_leaves
 from tumortrack.training.pace import (
     REPORT_EVERY_S,
     Interrupted,
@@ -46,8 +46,8 @@ from tumortrack.training.pace import (
     ctrl_c,
     use_cores,
 )
+from tumortrack.training.scenes import batches, default_workers, network_leaves
 from tumortrack.training.state import TrainingState
-from tumortrack.training.work import work_folder
 
 
 @dataclass(frozen=True)

@@ -23,9 +23,9 @@ from tumortrack.training.checkpoint import (
     save_checkpoint,
 )
 from tumortrack.training.distributed import ProcessGroup
-from tumortrack.training.loader import Tensors
 from tumortrack.training.model import model_class
-from tumortrack.training.schedule import learning_rate
+from tumortrack.training.run import learning_rate
+from tumortrack.training.scenes import Tensors
 
 
 class Diverged(TumortrackError):

@@ -14,10 +14,9 @@ from pathlib import Path
 
 from tumortrack.models.model import Model
 from tumortrack.simulate.dataset import SceneStream
-from tumortrack.training.checkpoint import TrainingProgress
+from tumortrack.training.checkpoint import TrainingProgress, work_folder
 from tumortrack.training.distributed import ProcessGroup, joined
 from tumortrack.training.history import History, Record
-from tumortrack.training.loader import default_workers, network_leaves
 from tumortrack.training.model import load_model, save_model
 from tumortrack.training.pace import (
     REPORT_EVERY_S,
@@ -27,12 +26,10 @@ from tumortrack.training.pace import (
     ctrl_c,
     use_cores,
 )
-from tumortrack.training.run import TrainingRun, provenance, run_identity
-from tumortrack.training.scenes import scenes_for
-from tumortrack.training.schedule import settle_end
+from tumortrack.training.run import TrainingRun, provenance, run_identity, settle_end
+from tumortrack.training.scenes import default_workers, network_leaves, scenes_for
 from tumortrack.training.state import TrainingState
 from tumortrack.training.task import task_of
-from tumortrack.training.work import work_folder
 
 __all__ = ["Interrupted", "TrainingRun", "TrainingStatus", "run_identity", "train"]
 
