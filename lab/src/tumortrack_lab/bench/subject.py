@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from tumortrack.registration.model import RegistrationModel
     from tumortrack.simulate.elastic.body import ElasticBody
     from tumortrack.simulate.scene import RenderedScene
+    from tumortrack.training.train import TrainingStatus
     from tumortrack_lab.bench.asked import OccupancyWorkload
 
 UP = (0.0, -1.0, 0.0)
@@ -157,8 +158,8 @@ class Subject:
             return False
         return True
 
-    def train(self, preset: str) -> None:
-        """Train the preset's model into its folder, on the CPU."""
+    def train(self, preset: str, tell: Callable[[TrainingStatus], None] = lambda _: None) -> None:
+        """Train the preset's model into its folder, on the CPU; ``tell`` hears how far it is."""
         folder, config = self.model_folder(preset), self.config(preset)
         shutil.rmtree(folder, ignore_errors=True)
         if preset == "paper":
@@ -171,4 +172,4 @@ class Subject:
         name = hashlib.sha256(b"the bench's phantom").hexdigest()
         short = msgspec.structs.replace(config, validation_pairs=_VALIDATED)
         run = TrainingRun(self.anatomy, UP, name, short, SEED, steps=STEPS[preset], device="cpu")
-        train(run, folder, lambda _: None)
+        train(run, folder, tell)
