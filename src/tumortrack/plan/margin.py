@@ -1,4 +1,4 @@
-"""Our planner: the margin kept in all directions, as wide as the estimate is unsure.
+"""Our method: the margin kept in all directions, wider where the estimate is uncertain.
 
 The tumor is grown by its margin as a solid; what lies straight above that comes away too, so that
 the piece can be lifted. Its side is cut in level layers from the top down, only where there is
@@ -11,13 +11,16 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Float, Float64
+import shapely
+from jaxtyping import Float, Float64, Int
+from scipy.ndimage import binary_closing, minimum_filter
+from skimage.measure import find_contours
 
 from tumortrack.core.errors import NoPlan
 from tumortrack.plan.config import ResectionConfig
-from tumortrack.plan.exophytic import name_of
-from tumortrack.plan.outline import arcs, evenly, polygon_of, rings_of
-from tumortrack.plan.values import Cut, CutLayer, Located
+from tumortrack.plan.margin_kernels import outline_fields
+from tumortrack.plan.outline import arcs, evenly, first_in_cell, polygon_of, rings_of
+from tumortrack.plan.values import Cut, CutLayer, Located, StrokeKind, name_of
 
 # Of outlines, which are interpolated; and one surface point in each cube of that size. Both finer
 # where the margin is narrow, so that it is kept to a tenth of a millimetre.
@@ -58,12 +61,12 @@ def margin_plan(
 def grown_tumor(
     located: Located, label: int, config: ResectionConfig
 ) -> tuple[Float64[np.ndarray, "n 3"], Float64[np.ndarray, " n"]]:
-    """Points of the tumor's surface (of its inside too, where there is no mesh) and the margin
-    that each needs, mm.
+    """Points of the tumor's surface (also inside it, where there is no mesh) and the margin that
+    each needs, mm.
 
     Raises:
-        NoPlan: a margin is wider than ``most_margin_mm``; an uncertainty is asked for that the
-            estimate does not know.
+        NoPlan: a margin is wider than ``most_margin_mm``; the estimate has no uncertainty, and it
+            is asked for.
     """
     name = name_of(label)
     mesh = located.meshes.get(name)
@@ -84,17 +87,14 @@ def grown_tumor(
     size_mm = min(_THIN_MM, _THIN_SHARE * float(margins.min()))
     widest_first = np.argsort(-margins, kind="stable")
     points, margins = points[widest_first], margins[widest_first]  # of each cube, this one stays
-    cube = np.floor(points / size_mm).astype(np.int64)
-    cube -= cube.min(0)
-    size = cube.max(0) + 1
-    keep = np.unique((cube[:, 0] * size[1] + cube[:, 1]) * size[2] + cube[:, 2], return_index=True)
-    return points[keep[1]], margins[keep[1]]
+    keep = first_in_cell(np.floor(points / size_mm).astype(np.int64))
+    return points[keep], margins[keep]
 
 
 @dataclass(frozen=True, eq=False)
 class Columns:
-    """The organ's lowest and highest point over a grid of the table's plane, mm; NaN where it is
-    not. ``first_mm``: the middle of the first cell."""
+    """The organ's lowest and highest point over a grid of the table's plane, mm; NaN outside it.
+    ``first_mm``: the middle of the first cell."""
 
     first_mm: Float64[np.ndarray, " 2"]
     lowest_mm: Float64[np.ndarray, "i j"]
@@ -108,10 +108,7 @@ class Columns:
         low = points[:, :2].min(0) - 2 * _COLUMN_MM
         cell = np.round((points[:, :2] - low) / _COLUMN_MM).astype(int)
         shape = cell.max(0) + 3
-        flat = cell[:, 0] * shape[1] + cell[:, 1]
-        lowest, highest = np.full(shape, np.inf), np.full(shape, -np.inf)
-        np.minimum.at(lowest.reshape(-1), flat, points[:, 2])
-        np.maximum.at(highest.reshape(-1), flat, points[:, 2])
+        lowest, highest = column_extremes(cell, shape, points[:, 2])
         return cls(low, _spread(lowest), -_spread(-highest))
 
     def at(
@@ -135,10 +132,18 @@ class Columns:
         return (high + _SLACK_MM > bottom_mm) & (low - _SLACK_MM < top_mm)  # False at NaN
 
 
-def _spread(values: Float[np.ndarray, "i j"]) -> Float64[np.ndarray, "i j"]:
-    """Cells that nothing fell into take the least of their neighbours, if those surround them."""
-    from scipy.ndimage import binary_closing, minimum_filter
+def column_extremes(
+    cells: Int[np.ndarray, "n 2"], shape: np.ndarray, heights: Float[np.ndarray, " n"]
+) -> tuple[Float64[np.ndarray, "i j"], Float64[np.ndarray, "i j"]]:
+    """The lowest and the highest point in each cell of a grid; inf and -inf where none is."""
+    lowest, highest = np.full(shape, np.inf), np.full(shape, -np.inf)
+    np.minimum.at(lowest, tuple(cells.T), heights)
+    np.maximum.at(highest, tuple(cells.T), heights)
+    return lowest, highest
 
+
+def _spread(values: Float[np.ndarray, "i j"]) -> Float64[np.ndarray, "i j"]:
+    """Empty cells take the least of their neighbours, if those surround them."""
     known = np.isfinite(values)
     closed = binary_closing(known, iterations=2) | known
     near = minimum_filter(np.where(known, values, np.inf), 5)
@@ -179,9 +184,6 @@ def _outlines(
 ) -> list[tuple[Float64[np.ndarray, "m 2"], ...]]:
     """Rings of what comes away at each height."""
     import shapely
-    from skimage.measure import find_contours
-
-    from tumortrack.plan.margin_kernels import outline_fields
 
     cell = min(_CELL_MM, _CELL_SHARE * float(margins.min()))
     room = float(margins.max()) + 4 * cell
@@ -203,8 +205,6 @@ def _strokes(
 ) -> list[Cut]:
     """A layer's strokes at its lower end: along its outline, and over its floor where that is not
     the next layer's."""
-    import shapely
-
     area = polygon_of(layer.rings_mm)
     open_floor = area if below is None else area.difference(polygon_of(below.rings_mm))
     z, lead = layer.bottom_mm, int(np.ceil(config.lead_mm / config.spacing_mm))
@@ -212,20 +212,15 @@ def _strokes(
     for ring in layer.rings_mm:
         flat = evenly(np.concatenate([ring, ring[:1]]), config.spacing_mm)[:-1]
         there = columns.within(flat, z, layer.top_mm)
-        strokes += [_cut(line, z, "wall") for line in arcs(flat, there, lead)]
+        strokes += [Cut.level(1, line, z, "wall") for line in arcs(flat, there, lead)]
     inset = area.buffer(-config.stroke_mm, quad_segs=4)
     while inset.intersection(open_floor).area > _LEAST_MM2:
         for ring in rings_of(inset):
             flat = evenly(np.concatenate([ring, ring[:1]]), config.spacing_mm)[:-1]
             there = shapely.contains_xy(open_floor, *flat.T) & columns.within(flat, z, z)
-            strokes += [_cut(line, z, "floor") for line in arcs(flat, there, lead)]
+            strokes += [Cut.level(1, line, z, "floor") for line in arcs(flat, there, lead)]
         inset = inset.buffer(-config.stroke_mm, quad_segs=4)
     return strokes
-
-
-def _cut(flat: Float[np.ndarray, "n 2"], z: float, kind: str) -> Cut:
-    path = np.column_stack([flat, np.full(len(flat), z)])
-    return Cut(1, path, "wall" if kind == "wall" else "floor")
 
 
 def _in_turn(
@@ -236,26 +231,22 @@ def _in_turn(
 ) -> list[Cut]:
     """Walls first, then the floor; each time the stroke that begins nearest to where the one before
     ended. Outlines run anticlockwise, seen from above."""
-    ways = {"shortest": (1, -1), "clockwise": (-1,), "anticlockwise": (1,)}[direction]
+    turns = {"shortest": (1, -1), "clockwise": (-1,), "anticlockwise": (1,)}[direction]
+    kinds: tuple[StrokeKind, ...] = ("wall", "floor")
     ordered = []
-    for kind in ("wall", "floor"):
-        left = [stroke for stroke in strokes if stroke.kind == kind]
+    for kind in kinds:
+        left = [stroke.path_mm for stroke in strokes if stroke.kind == kind]
         while left:
             gaps = [
-                (0.0 if last is None else _gap_mm(stroke.path_mm[::way], last), number, -way)
-                for number, stroke in enumerate(left)
-                for way in ways
+                (0.0 if last is None else float(np.linalg.norm(path[::turn][0] - last)), n, -turn)
+                for n, path in enumerate(left)
+                for turn in turns
             ]
-            _, number, turned = min(gaps)
-            stroke = left.pop(number)
-            path = stroke.path_mm[::-turned]
-            ordered.append(Cut(sweep, path, stroke.kind))
+            _, n, turned = min(gaps)
+            path = left.pop(n)[::-turned]
+            ordered.append(Cut(sweep, path, kind))
             last = path[-1]
     return ordered
-
-
-def _gap_mm(path_mm: Float[np.ndarray, "n 3"], from_mm: Float[np.ndarray, " 3"]) -> float:
-    return float(np.linalg.norm(path_mm[0] - from_mm))
 
 
 def _grasp(tumor: Float[np.ndarray, "n 3"], columns: Columns) -> Float64[np.ndarray, " 3"]:

@@ -1,4 +1,4 @@
-"""Other places for the arms, where they can't carry a plan out from where they stand."""
+"""Other places for the arms' bases, where a plan is out of reach from where they stand."""
 
 from __future__ import annotations
 
@@ -10,13 +10,11 @@ import numpy as np
 
 from tumortrack.core.errors import NoPlan
 from tumortrack.core.types import Mesh
-from tumortrack.plan.arms.cell import ArmCell
+from tumortrack.plan.arms.cell import ArmCell, PlanningGroup
 from tumortrack.plan.arms.config import Base, CellConfig
+from tumortrack.plan.arms.kinematics import level_pose
 from tumortrack.plan.arms.procedure import plan_motions
-from tumortrack.plan.arms.situation import Situation
-from tumortrack.plan.arms.strokes import level_poses
-from tumortrack.plan.arms.tracks import solve
-from tumortrack.plan.motions import CUTTER, HOLDER, Motions
+from tumortrack.plan.motions import ARMS, CUTTER, HOLDER, Motions
 from tumortrack.plan.values import ResectionPlan
 
 # Round the organ: how far off the base stands, as a share of the arm's reach, and on which side
@@ -49,9 +47,7 @@ def search_bases(
         return cell, plan_motions(plan, cell, organ, seed=seed), ""
     except NoPlan as failure:
         reason = failure
-    for tried, elsewhere in enumerate(_elsewhere(plan, config)):
-        if tried == _MOST_TRIED:
-            break
+    for elsewhere in itertools.islice(_elsewhere(plan, config), _MOST_TRIED):
         cell = ArmCell(elsewhere, organ)
         if cell.collisions(cell.home_rad) is not None:
             continue
@@ -59,29 +55,22 @@ def search_bases(
             motions = plan_motions(plan, cell, organ, seed=seed)
         except NoPlan:
             continue
-        return cell, motions, _said(elsewhere)
+        return cell, motions, _note(elsewhere)
     raise NoPlan(f"{reason} Other places for the arms round the table were tried in vain.")
 
 
 def _elsewhere(plan: ResectionPlan, config: CellConfig) -> Iterator[CellConfig]:
     """Configurations in which both arms reach all they have to, the least change first."""
-    targets = {CUTTER: _strokes(plan), HOLDER: plan.grasp_mm[None] + [[0, 0, 0], [0, 0, 60.0]]}
-    middle = plan.grasp_mm[:2]
-    places = {arm: _places(config, arm, middle) for arm in (CUTTER, HOLDER)}
-    good: dict[str, list[Base]] = {CUTTER: [], HOLDER: []}
-    for arm, bases in places.items():
-        for base in bases:
-            tried = ArmCell(_with(config, {arm: base}))
-            if all(_reaches(tried, arm, target) for target in targets[arm]):
-                good[arm].append(base)
+    # Ends and middles of all strokes
+    strokes = np.concatenate([cut.path_mm[[0, len(cut.path_mm) // 2, -1]] for cut in plan.cuts])
+    targets = {CUTTER: strokes, HOLDER: plan.grasp_mm[None] + [[0, 0, 0], [0, 0, 60.0]]}
+    good: dict[str, list[Base]] = {}
+    for arm in ARMS:
+        places = _places(config, arm, plan.grasp_mm[:2])
+        good[arm] = [base for base in places if _reaches(_with(config, {arm: base}), arm, targets)]
     pairs = itertools.product(enumerate(good[CUTTER]), enumerate(good[HOLDER]))
     for (_, cutter), (_, holder) in sorted(pairs, key=lambda pair: pair[0][0] + pair[1][0]):
         yield _with(config, {CUTTER: cutter, HOLDER: holder})
-
-
-def _strokes(plan: ResectionPlan) -> np.ndarray:
-    """Ends and middles of all strokes (n, 3)."""
-    return np.concatenate([cut.path_mm[[0, len(cut.path_mm) // 2, -1]] for cut in plan.cuts])
 
 
 def _places(config: CellConfig, arm: str, middle_mm: np.ndarray) -> list[Base]:
@@ -101,20 +90,24 @@ def _places(config: CellConfig, arm: str, middle_mm: np.ndarray) -> list[Base]:
     return bases
 
 
-def _reaches(cell: ArmCell, arm: str, target_mm: np.ndarray) -> bool:
-    """Whether the tip comes there, pointing in any direction."""
-    situation = Situation(cell, arm, cell.home_rad)
+def _reaches(config: CellConfig, arm: str, targets_mm: dict[str, np.ndarray]) -> bool:
+    """Whether the arm's tip comes to all its targets, each time pointing in any direction."""
+    cell = ArmCell(config)
+    group = PlanningGroup(cell, arm, cell.home_rad)
     yaws = np.linspace(0, 2 * np.pi, _YAWS if arm == CUTTER else 1, endpoint=False)
-    return any(len(solve(situation, level_poses(target_mm[None], yaw)[0])) for yaw in yaws)
+    return all(
+        any(len(group.inverse_kinematics(level_pose(target, yaw))) for yaw in yaws)
+        for target in targets_mm[arm]
+    )
 
 
 def _with(config: CellConfig, bases: dict[str, Base]) -> CellConfig:
     return msgspec.structs.replace(config, **{f"{arm}_base": base for arm, base in bases.items()})
 
 
-def _said(config: CellConfig) -> str:
+def _note(config: CellConfig) -> str:
     places = []
-    for arm in (CUTTER, HOLDER):
+    for arm in ARMS:
         base = config.base(arm)
         x, y, z = base.position_mm
         places.append(
