@@ -27,7 +27,7 @@ HOLDS = {"approach": (), "grasp": (HOLDER,), "hold": (HOLDER,), "release": (HOLD
 
 @pytest.fixture(scope="module")
 def cell():
-    return ArmCell().with_organ(organ())
+    return ArmCell(organ=organ())
 
 
 @pytest.fixture(scope="module")

@@ -7,20 +7,20 @@ organ, and its floor by strokes side by side.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Literal
+from dataclasses import dataclass, replace
 
 import numpy as np
 import shapely
 from jaxtyping import Float, Float64, Int
+from numpy.linalg import norm
 from scipy.ndimage import binary_closing, minimum_filter
 from skimage.measure import find_contours
 
 from tumortrack.core.errors import NoPlan
-from tumortrack.plan.config import ResectionConfig
+from tumortrack.plan.config import Direction, ResectionConfig
 from tumortrack.plan.margin_kernels import outline_fields
-from tumortrack.plan.outline import arcs, evenly, first_in_cell, polygon_of, rings_of
-from tumortrack.plan.values import Cut, CutLayer, Located, StrokeKind, name_of
+from tumortrack.plan.outline import arcs, evenly_round, first_in_cell, polygon_of, rings_of
+from tumortrack.plan.values import Cut, CutLayer, Located, MethodResult, name_of
 
 # Of outlines, which are interpolated; and one surface point in each cube of that size. Both finer
 # where the margin is narrow, so that it is kept to a tenth of a millimetre.
@@ -33,9 +33,7 @@ _FAR_MM = 1e3
 _LEAST_MM2 = 1.0  # a smaller rest of a floor needs no stroke
 
 
-def margin_plan(
-    located: Located, label: int, config: ResectionConfig
-) -> tuple[tuple[CutLayer, ...], tuple[Cut, ...], Float64[np.ndarray, " 3"]]:
+def margin_plan(located: Located, label: int, config: ResectionConfig) -> MethodResult:
     """The piece, its strokes, both from the top down, and where to hold; table frame, mm.
 
     Raises:
@@ -44,15 +42,11 @@ def margin_plan(
     points, margins = grown_tumor(located, label, config)
     columns = Columns.of(located)
     layers = _layers(points, margins, columns, config.layer_mm)
-    below = (*layers[1:], None)
-    slabs = list(zip(layers, below, strict=True))
+    slabs = list(zip(layers, (*layers[1:], None), strict=True))
     cuts: list[Cut] = []
-    for layer, under in slabs if config.order == "down" else reversed(slabs):
-        strokes = _strokes(layer, under, columns, config)
-        if strokes:
-            sweep = cuts[-1].sweep + 1 if cuts else 1
-            last = cuts[-1].path_mm[-1] if cuts else None
-            cuts += _in_turn(strokes, sweep, last, config.direction)
+    for layer, below in slabs if config.order == "down" else reversed(slabs):
+        sweep, last = (cuts[-1].sweep + 1, cuts[-1].path_mm[-1]) if cuts else (1, None)
+        cuts += _in_turn(_strokes(layer, below, columns, config), sweep, last, config.direction)
     if not cuts:
         raise NoPlan("the organ does not reach the tumor's margin; there is nothing to cut.")
     return layers, tuple(cuts), _grasp(located.of(label), columns)
@@ -183,8 +177,6 @@ def _outlines(
     levels_mm: Float[np.ndarray, " k"],
 ) -> list[tuple[Float64[np.ndarray, "m 2"], ...]]:
     """Rings of what comes away at each height."""
-    import shapely
-
     cell = min(_CELL_MM, _CELL_SHARE * float(margins.min()))
     room = float(margins.max()) + 4 * cell
     first = points[:, :2].min(0) - room
@@ -210,13 +202,13 @@ def _strokes(
     z, lead = layer.bottom_mm, int(np.ceil(config.lead_mm / config.spacing_mm))
     strokes = []
     for ring in layer.rings_mm:
-        flat = evenly(np.concatenate([ring, ring[:1]]), config.spacing_mm)[:-1]
+        flat = evenly_round(ring, config.spacing_mm)
         there = columns.within(flat, z, layer.top_mm)
         strokes += [Cut.level(1, line, z, "wall") for line in arcs(flat, there, lead)]
     inset = area.buffer(-config.stroke_mm, quad_segs=4)
     while inset.intersection(open_floor).area > _LEAST_MM2:
         for ring in rings_of(inset):
-            flat = evenly(np.concatenate([ring, ring[:1]]), config.spacing_mm)[:-1]
+            flat = evenly_round(ring, config.spacing_mm)
             there = shapely.contains_xy(open_floor, *flat.T) & columns.within(flat, z, z)
             strokes += [Cut.level(1, line, z, "floor") for line in arcs(flat, there, lead)]
         inset = inset.buffer(-config.stroke_mm, quad_segs=4)
@@ -224,28 +216,24 @@ def _strokes(
 
 
 def _in_turn(
-    strokes: list[Cut],
-    sweep: int,
-    last: Float[np.ndarray, " 3"] | None,
-    direction: Literal["shortest", "clockwise", "anticlockwise"],
+    strokes: list[Cut], sweep: int, last: Float[np.ndarray, " 3"] | None, direction: Direction
 ) -> list[Cut]:
     """Walls first, then the floor; each time the stroke that begins nearest to where the one before
     ended. Outlines run anticlockwise, seen from above."""
     turns = {"shortest": (1, -1), "clockwise": (-1,), "anticlockwise": (1,)}[direction]
-    kinds: tuple[StrokeKind, ...] = ("wall", "floor")
     ordered = []
-    for kind in kinds:
-        left = [stroke.path_mm for stroke in strokes if stroke.kind == kind]
+    for floor in (False, True):
+        left = [stroke for stroke in strokes if (stroke.kind == "floor") == floor]
         while left:
             gaps = [
-                (0.0 if last is None else float(np.linalg.norm(path[::turn][0] - last)), n, -turn)
-                for n, path in enumerate(left)
+                (0.0 if last is None else float(norm(stroke.path_mm[::turn][0] - last)), n, -turn)
+                for n, stroke in enumerate(left)
                 for turn in turns
             ]
             _, n, turned = min(gaps)
-            path = left.pop(n)[::-turned]
-            ordered.append(Cut(sweep, path, kind))
-            last = path[-1]
+            stroke = left.pop(n)
+            ordered.append(replace(stroke, sweep=sweep, path_mm=stroke.path_mm[::-turned]))
+            last = ordered[-1].path_mm[-1]
     return ordered
 
 

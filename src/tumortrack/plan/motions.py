@@ -15,6 +15,7 @@ from tumortrack.live.ur_link import UR_JOINTS
 
 CUTTER, HOLDER = "cutter", "holder"  # UR10e with the instrument, UR5 with the vacuum grasper
 ARMS = (CUTTER, HOLDER)
+Joints = Float64[np.ndarray, " 12"]  # radians, in the order of ``JOINTS``
 JOINTS = tuple(f"{arm}_{joint}" for arm in ARMS for joint in UR_JOINTS)
 DONE, ABORTED = "done", "aborted"
 _BRAKE_RAD_S2 = 4.0  # of the fastest joint, where arms are halted in the middle of a motion
@@ -53,7 +54,7 @@ class MotionStage:
         """The number of the sweep that this stage is, from 1; 0: it is none."""
         return int(self.name.removeprefix("sweep ")) if self.name.startswith("sweep ") else 0
 
-    def at(self, time_s: float) -> Float64[np.ndarray, " 12"]:
+    def at(self, time_s: float) -> Joints:
         """Joint angles so long after the stage began."""
         return np.array([np.interp(time_s, self.times_s, joint) for joint in self.joints_rad.T])
 
@@ -118,7 +119,7 @@ class Execution:
         return "hold" not in names or self._number >= names.index("hold")
 
     @property
-    def joints_rad(self) -> Float64[np.ndarray, " 12"]:
+    def joints_rad(self) -> Joints:
         return self._stage.at(self._time_s)
 
     def go(self) -> None:

@@ -20,7 +20,7 @@ from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError, TumortrackError
 from tumortrack.core.types import Mesh
 from tumortrack.live.values import Polyline, RigidShape, TrackingResult, Workcell
-from tumortrack.plan.motions import ABORTED, JOINTS, Execution, Motions
+from tumortrack.plan.motions import ABORTED, JOINTS, Execution, Joints, Motions
 from tumortrack.plan.values import Located, ResectionPlan
 
 TO_CUT: Colour = (0, 120, 240)
@@ -98,11 +98,9 @@ class ResectionProgress:
 
 
 # The estimate to plan on, the arms' joints, and how far they came
-Replan = Callable[
-    [TrackingResult, Float64[np.ndarray, " 12"], ResectionProgress], "Future[Planned]"
-]
+Replan = Callable[[TrackingResult, Joints, ResectionProgress], "Future[Planned]"]
 Locate = Callable[[TrackingResult], Located]
-Draw = Callable[[Float64[np.ndarray, " 12"]], tuple[RigidShape, ...]]
+Draw = Callable[[Joints], tuple[RigidShape, ...]]
 
 
 class Operation:

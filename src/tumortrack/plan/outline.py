@@ -70,12 +70,15 @@ def common(a: Polygon, b: Polygon) -> Polygon:
 def evenly(ring_mm: Float[np.ndarray, "n 2"], spacing_mm: float) -> Float64[np.ndarray, "m 2"]:
     """Points at equal distances along a line, ends included; at most ``spacing_mm`` apart."""
     steps = np.linalg.norm(np.diff(ring_mm, axis=0), axis=1)
-    keep = np.concatenate([[True], steps > 1e-9])
-    line = np.asarray(ring_mm, float)[keep]
-    way = np.concatenate([[0.0], np.cumsum(steps[steps > 1e-9])])
-    n = max(2, int(np.ceil(way[-1] / spacing_mm)) + 1)
-    at = np.linspace(0.0, way[-1], n)
-    return np.stack([np.interp(at, way, line[:, axis]) for axis in range(2)], axis=1)
+    line = np.asarray(ring_mm, float)[np.r_[True, steps > 1e-9]]
+    along = np.concatenate([[0.0], np.cumsum(steps[steps > 1e-9])])
+    at = np.linspace(0.0, along[-1], max(2, int(np.ceil(along[-1] / spacing_mm)) + 1))
+    return np.stack([np.interp(at, along, axis) for axis in line.T], axis=1)
+
+
+def evenly_round(ring: Float[np.ndarray, "n 2"], spacing: float) -> Float64[np.ndarray, "m 2"]:
+    """The same on a closed ring, whose first point is not repeated."""
+    return evenly(np.concatenate([ring, ring[:1]]), spacing)[:-1]
 
 
 def arcs(

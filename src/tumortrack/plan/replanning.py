@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import signal
 
-import numpy as np
-from jaxtyping import Float64
-
 from tumortrack.core.errors import NoPlan
 from tumortrack.plan.arms.cell import ArmCell
 from tumortrack.plan.arms.config import CellConfig
 from tumortrack.plan.arms.procedure import plan_motions
 from tumortrack.plan.config import ResectionConfig
+from tumortrack.plan.motions import Joints
 from tumortrack.plan.operation import Planned, ResectionProgress
 from tumortrack.plan.resection import plan_resection
 from tumortrack.plan.values import Located
@@ -31,9 +29,7 @@ def warm_up() -> None:
     import toppra  # noqa: F401
 
 
-def replan(
-    located: Located, joints_rad: Float64[np.ndarray, " 12"], progress: ResectionProgress
-) -> Planned:
+def replan(located: Located, joints_rad: Joints, progress: ResectionProgress) -> Planned:
     """The plan for the organ as it lies now, from where the arms are; see ``plan_motions``.
 
     Raises:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 import shapely
-from jaxtyping import Bool, Float, Float64
+from jaxtyping import Bool, Float
 from scipy.spatial import ConvexHull, QhullError
 
 from tumortrack.core.errors import InputError, NoPlan
@@ -15,7 +15,7 @@ from tumortrack.core.types import FIRST_TUMOR, ORGAN
 from tumortrack.plan.config import ResectionConfig
 from tumortrack.plan.margin import column_extremes, margin_plan
 from tumortrack.plan.outline import common, concave_hull, evenly, grown, polygon_of, rings_of
-from tumortrack.plan.values import Cut, CutLayer, Located, ResectionPlan, name_of
+from tumortrack.plan.values import Cut, CutLayer, Located, MethodResult, ResectionPlan, name_of
 
 _DIRECTIONS, _MOST = 192, 12_000  # of the hull, points it is made of: a kidney's is off by 0.5 mm
 _FEWEST = 30  # points that define a tumor's shape
@@ -57,9 +57,7 @@ def plan_resection(located: Located, config: ResectionConfig) -> ResectionPlan:
     )
 
 
-def published_plan(
-    located: Located, label: int, config: ResectionConfig
-) -> tuple[tuple[CutLayer, ...], tuple[Cut, ...], Float64[np.ndarray, " 3"]]:
+def published_plan(located: Located, label: int, config: ResectionConfig) -> MethodResult:
     """The paper's method: the piece, two sweeps, and where to hold (its section II-D).
 
     The tumor's points are projected on the table's plane; their concave hull, grown by the margin

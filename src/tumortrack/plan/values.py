@@ -142,3 +142,7 @@ class ResectionPlan:
     def sweeps(self) -> int:
         """How many sweeps there are."""
         return max(cut.sweep for cut in self.cuts)
+
+
+# What a method of planning returns: layers, cuts, and where to grasp (table frame, mm)
+MethodResult = tuple[tuple[CutLayer, ...], tuple[Cut, ...], Float64[np.ndarray, " 3"]]

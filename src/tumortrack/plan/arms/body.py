@@ -7,20 +7,16 @@ lateral offsets are ours, rounded up from the maker's drawings.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cache
 from typing import Literal, NamedTuple
 
 import numpy as np
-from jaxtyping import Float64
 
 from tumortrack.core.colours import Colour
 from tumortrack.core.geometry import rigid, rotation_onto, transform_points
 from tumortrack.core.types import Mesh
-from tumortrack.live.values import RigidShape
 from tumortrack.plan.arms.config import CellConfig
-from tumortrack.plan.arms.kinematics import ArmModel
+from tumortrack.plan.arms.kinematics import ArmModel, Pose
 from tumortrack.plan.motions import ARMS, CUTTER, HOLDER
 
 Use = Literal["both", "collision", "picture"]
@@ -44,16 +40,16 @@ class Part:
     Attributes:
         name: within its link's arm: ``forearm``, ``electrode``.
         link: the URDF's link.
-        kind, size_mm: box (x, y, z) or cylinder (radius, length), its axis along z.
+        kind, size_mm: box (x, y, z), cylinder (radius, length; its axis along z), ball (radius).
         link_from_part: mm.
         use: what it is for: collisions, pictures, or both.
     """
 
     name: str
     link: str
-    kind: Literal["box", "cylinder"]
+    kind: Literal["box", "cylinder", "ball"]
     size_mm: tuple[float, ...]
-    link_from_part: Float64[np.ndarray, "4 4"]
+    link_from_part: Pose
     colour: Colour
     use: Use = "both"
 
@@ -173,32 +169,15 @@ def cell_parts(config: CellConfig) -> tuple[Part, ...]:
     return (*surroundings(config), *arms, *tool_parts(config))
 
 
-class DisplaySurfaces:
-    """The visible parts, each with its surface in its link's frame; made once."""
-
-    def __init__(self, parts: tuple[Part, ...]) -> None:
-        self._surfaces = [(part, _surface(part)) for part in parts if part.use != "collision"]
-        self.links = tuple(dict.fromkeys(part.link for part, _ in self._surfaces))
-
-    def shapes(self, places: Mapping[str, Float64[np.ndarray, "4 4"]]) -> tuple[RigidShape, ...]:
-        """All of them where ``places`` (``table_from_link``, mm) puts their links."""
-        return tuple(
-            RigidShape(part.whose, mesh, places[part.link], part.colour)
-            for part, mesh in self._surfaces
-        )
-
-
-def tip_shape(arm: str, table_from_tip: Float64[np.ndarray, "4 4"]) -> RigidShape:
-    """A bead where a tool ends, by the name that sinks know tips by: ``cutter/tip``."""
-    return RigidShape(f"{arm}/tip", _bead(), table_from_tip, YELLOW)
-
-
-@cache
-def _bead() -> Mesh:
+def display_surfaces(config: CellConfig) -> list[tuple[Part, Mesh]]:
+    """The visible parts, each with its surface in its link's frame, and a bead at each tip."""
     import trimesh
 
     ball = trimesh.creation.icosphere(1, _BEAD_MM)
-    return Mesh(np.array(ball.vertices), ball.faces)
+    bead = Mesh(np.array(ball.vertices), ball.faces)
+    parts = [part for part in cell_parts(config) if part.use != "collision"]
+    tips = [Part("tip", f"{arm}_tip", "ball", (_BEAD_MM,), np.eye(4), YELLOW) for arm in ARMS]
+    return [*((part, _surface(part)) for part in parts), *((tip, bead) for tip in tips)]
 
 
 def _surface(part: Part) -> Mesh:

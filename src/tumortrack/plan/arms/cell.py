@@ -18,13 +18,14 @@ from tumortrack.core.types import Mesh
 from tumortrack.live.values import RigidShape
 from tumortrack.plan.arms import body
 from tumortrack.plan.arms.config import CellConfig
-from tumortrack.plan.arms.kinematics import ArmModel, inverse_kinematics, nearest_turn
+from tumortrack.plan.arms.kinematics import ArmModel, Pose, inverse_kinematics, nearest_turn
 from tumortrack.plan.arms.urdf import cell_urdf
-from tumortrack.plan.motions import ARMS, CUTTER, HOLDER
+from tumortrack.plan.motions import ARMS, CUTTER, HOLDER, Joints
 
 ORGAN = "organ"
 TOOLS = {CUTTER: ("bracket", "pencil", "electrode"), HOLDER: ("rod", "cup")}
 TOUCHES = {CUTTER: "cutter/electrode", HOLDER: "holder/cup"}  # what of a tool may touch the organ
+Pair = tuple[str, str]
 _THICK_MM = 10.0  # of what a tool is made of, about its own axis
 
 
@@ -53,32 +54,22 @@ class ArmCell:
             self.solids.addCollisionPair(pin.CollisionPair(index[one], index[other]))
         self._states: dict[tuple, Any] = {}
 
-    @cached_property
-    def _surfaces(self) -> body.DisplaySurfaces:
-        return body.DisplaySurfaces(body.cell_parts(self.config))
-
-    def with_organ(self, organ: Mesh | None) -> ArmCell:
-        """The same workcell with this organ on its post (table frame, mm)."""
-        return ArmCell(self.config, organ)
-
     @property
-    def home_rad(self) -> Float64[np.ndarray, " 12"]:
+    def home_rad(self) -> Joints:
         return np.array(self.config.home_rad)
 
     @cached_property
-    def limits_rad(self) -> Float64[np.ndarray, " 12"]:
+    def limits_rad(self) -> Joints:
         """The joints' limits in both directions."""
         return np.concatenate([self.config.model(arm).limits_rad for arm in ARMS])
 
     @cached_property
-    def speeds_rad_s(self) -> Float64[np.ndarray, " 12"]:
+    def speeds_rad_s(self) -> Joints:
         """The maximum speeds planned with."""
         makers = np.concatenate([self.config.model(arm).speeds_rad_s for arm in ARMS])
         return self.config.speed_share * makers
 
-    def levers_mm(
-        self, start_rad: Float64[np.ndarray, " 12"], goal_rad: Float64[np.ndarray, " 12"]
-    ) -> Float64[np.ndarray, " 12"]:
+    def levers_mm(self, start_rad: Joints, goal_rad: Joints) -> Joints:
         """On the straight segment between two configurations, no point of an arm or its tool moves
         farther than this per radian of each of its joints."""
         levers: list[float] = []
@@ -97,22 +88,26 @@ class ArmCell:
             levers += [shoulder, shoulder, np.hypot(lower, d4) + wrist, wrist, hand, ahead]
         return np.array(levers)
 
-    def tips(self, joints_rad: Float64[np.ndarray, " 12"]) -> dict[str, Float64[np.ndarray, "4 4"]]:
+    def tips(self, joints_rad: Joints) -> dict[str, Pose]:
         """``table_from_tip`` (mm) of ``cutter`` and ``holder``: z up; the instrument points along
         its x."""
         places = self._frames(joints_rad, [f"{arm}_tip" for arm in ARMS])
         return dict(zip(ARMS, places.values(), strict=True))
 
-    def shapes(self, joints_rad: Float64[np.ndarray, " 12"]) -> tuple[RigidShape, ...]:
+    @cached_property
+    def _surfaces(self) -> list[tuple[body.Part, Mesh]]:
+        return body.display_surfaces(self.config)
+
+    def shapes(self, joints_rad: Joints) -> tuple[RigidShape, ...]:
         """Everything as surfaces in the table frame, and a bead at each tip (``cutter/tip``); the
         organ is not among them."""
-        links = self._frames(joints_rad, self._surfaces.links)
-        beads = (body.tip_shape(arm, place) for arm, place in self.tips(joints_rad).items())
-        return (*self._surfaces.shapes(links), *beads)
+        places = self._frames(joints_rad, {part.link for part, _ in self._surfaces})
+        return tuple(
+            RigidShape(part.whose, mesh, places[part.link], part.colour)
+            for part, mesh in self._surfaces
+        )
 
-    def _frames(
-        self, joints_rad: np.ndarray, names: Collection[str]
-    ) -> dict[str, Float64[np.ndarray, "4 4"]]:
+    def _frames(self, joints_rad: np.ndarray, names: Collection[str]) -> dict[str, Pose]:
         """``table_from_frame`` (mm) of links by their names, by forward kinematics."""
         pin.framesForwardKinematics(self.model, self._data, joints_rad)
         places = {}
@@ -122,11 +117,8 @@ class ArmCell:
         return places
 
     def collisions(
-        self,
-        joints_rad: Float64[np.ndarray, " 12"],
-        touching: Collection[str] = (),
-        moving: str | None = None,
-    ) -> tuple[str, str] | None:
+        self, joints_rad: Joints, touching: Collection[str] = (), moving: str | None = None
+    ) -> Pair | None:
         """Names of the first pair that comes nearer than its clearance, or None.
 
         Args:
@@ -154,7 +146,7 @@ class ArmCell:
             self._states[touching, moving] = state
         return self._states[touching, moving]
 
-    def _margin_mm(self, pair: tuple[str, str], touching: tuple[str, ...]) -> float:
+    def _margin_mm(self, pair: Pair, touching: tuple[str, ...]) -> float:
         """How near these two may come."""
         if ORGAN in pair or (body.STAND in pair and TOUCHES[CUTTER] in pair):
             return self.config.organ_clearance_mm
@@ -166,12 +158,12 @@ class Blocked(NoPlan):
     """No motion this way; perhaps there is another. The text says where and why; ``pair``: what
     would collide, if that is the reason."""
 
-    def __init__(self, text: str, pair: tuple[str, str] | None = None) -> None:
+    def __init__(self, text: str, pair: Pair | None = None) -> None:
         super().__init__(text)
         self.pair = pair
 
     @classmethod
-    def by(cls, pair: tuple[str, str], where: str = "") -> Blocked:
+    def by(cls, pair: Pair, where: str = "") -> Blocked:
         """By a collision of these two."""
         return cls(f"{pair[0]} would meet {pair[1]}{where}", pair)
 
@@ -188,7 +180,7 @@ class PlanningGroup:
 
     cell: ArmCell
     arm: str | None
-    joints_rad: Float64[np.ndarray, " 12"]
+    joints_rad: Joints
     touching: Collection[str] = ()
 
     @cached_property
@@ -211,28 +203,26 @@ class PlanningGroup:
         """The type of the moving arm."""
         return self.cell.config.model(str(self.arm))
 
-    def all_joints(self, own_rad: Float64[np.ndarray, " d"]) -> Float64[np.ndarray, " 12"]:
+    def all_joints(self, own_rad: Float64[np.ndarray, " d"]) -> Joints:
         """All twelve joints, the moving ones being these."""
         joints = self.joints_rad.copy()
         joints[self.own] = own_rad
         return joints
 
-    def inverse_kinematics(
-        self, table_from_tip: Float64[np.ndarray, "4 4"]
-    ) -> Float64[np.ndarray, "k 6"]:
+    def inverse_kinematics(self, table_from_tip: Pose) -> Float64[np.ndarray, "k 6"]:
         """All branches that bring the moving arm's tip to a pose, collisions not regarded, each
         joint turned to be near where it is."""
         base_from_table, tip_from_flange = self._frames
         flange = base_from_table @ table_from_tip @ tip_from_flange
         return nearest_turn(self.model, inverse_kinematics(self.model, flange), self.current_rad)
 
-    def collides(self, own_rad: Float64[np.ndarray, " d"]) -> tuple[str, str] | None:
+    def collides(self, own_rad: Float64[np.ndarray, " d"]) -> Pair | None:
         """What comes nearer than allowed to what."""
         return self.cell.collisions(self.all_joints(own_rad), self.touching, self.arm)
 
     def segment_collides(
         self, start_rad: np.ndarray, goal_rad: np.ndarray, spacing: float = 1.0
-    ) -> tuple[str, str] | None:
+    ) -> Pair | None:
         """The same between two free configurations, on the straight segment in joint space.
 
         With ``spacing`` 1 no point of an arm moves by more than twice the least clearance in one
@@ -249,7 +239,7 @@ class PlanningGroup:
         return None
 
     @cached_property
-    def _frames(self) -> tuple[Float64[np.ndarray, "4 4"], Float64[np.ndarray, "4 4"]]:
+    def _frames(self) -> tuple[Pose, Pose]:
         """``base_from_table`` and ``tip_from_flange``, mm."""
         config, arm = self.cell.config, str(self.arm)
         table_from_base, flange_from_tip = config.base(arm).table_from_base, config.flange_from_tip
@@ -264,7 +254,7 @@ def _solid_names(solids: Any, parts: tuple[body.Part, ...]) -> list[str]:
     return [next(by_link[solid.name.rsplit("_", 1)[0]]) for solid in solids.geometryObjects]
 
 
-def _pairs() -> list[tuple[str, str]]:
+def _pairs() -> list[Pair]:
     """All that could ever meet. Links next to each other are left out, and of an arm with itself
     what its joints' offsets keep apart."""
     moving = {arm: [f"{arm}/{name}" for name in (*body.LINKS[2:], *TOOLS[arm])] for arm in ARMS}

@@ -5,12 +5,11 @@ from __future__ import annotations
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Float64
 
 from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import rigid
-from tumortrack.plan.arms.kinematics import MODELS, ArmModel, level_pose
+from tumortrack.plan.arms.kinematics import MODELS, ArmModel, Pose, level_pose
 from tumortrack.plan.motions import CUTTER, JOINTS
 
 _DOWN = np.diag([1.0, -1.0, -1.0])  # a flange that points down, over a tip whose z is up
@@ -27,7 +26,7 @@ class Base(Config, frozen=True, kw_only=True):
     yaw_deg: float
 
     @property
-    def table_from_base(self) -> Float64[np.ndarray, "4 4"]:
+    def table_from_base(self) -> Pose:
         return level_pose(np.array(self.position_mm), np.radians(self.yaw_deg))
 
 
@@ -115,7 +114,7 @@ class CellConfig(Config, frozen=True, kw_only=True):
     def base(self, arm: str) -> Base:
         return self.cutter_base if arm == CUTTER else self.holder_base
 
-    def flange_from_tip(self, arm: str) -> Float64[np.ndarray, "4 4"]:
+    def flange_from_tip(self, arm: str) -> Pose:
         """The tip's frame: z up where the flange points down; the instrument points along x."""
         if arm == CUTTER:
             ahead_mm = self.pencil_mm + self.electrode_mm

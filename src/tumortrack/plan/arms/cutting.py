@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from tumortrack.plan.arms.cell import Blocked, PlanningGroup
-from tumortrack.plan.arms.kinematics import level_pose, yaw_of
+from tumortrack.plan.arms.kinematics import Pose, level_pose, yaw_of
 from tumortrack.plan.arms.paths import connect, follow
 from tumortrack.plan.arms.strokes import Leg, Surroundings, leg
 from tumortrack.plan.arms.trajectory import TrajectoryBuilder
@@ -107,7 +107,7 @@ def _detours(group: PlanningGroup, one: Leg) -> list[np.ndarray]:
 
 
 def aside(
-    group: PlanningGroup, table_from_tip: Float64[np.ndarray, "4 4"], back_mm: float, up_mm: float
+    group: PlanningGroup, table_from_tip: Pose, back_mm: float, up_mm: float
 ) -> Float64[np.ndarray, " d"]:
     """The moving arm with its tip so far back and up from a pose; empty if that is out of reach."""
     moved = table_from_tip.copy()

@@ -15,6 +15,7 @@ from jaxtyping import Float64
 
 from tumortrack.core.geometry import rigid
 
+Pose = Float64[np.ndarray, "4 4"]  # of frame b in frame a: ``a_from_b``, mm
 TURN = 2 * np.pi
 _QUARTER = np.pi / 2
 _EXACT_MM, _EXACT_RAD = 1e-3, 1e-5  # of inverse kinematics
@@ -66,9 +67,7 @@ ACCELERATION_RAD_S2 = 1.4
 JERK_RAD_S3 = 10.0
 
 
-def inverse_kinematics(
-    model: ArmModel, base_from_flange: Float64[np.ndarray, "4 4"]
-) -> Float64[np.ndarray, "k 6"]:
+def inverse_kinematics(model: ArmModel, base_from_flange: Pose) -> Float64[np.ndarray, "k 6"]:
     """Joint angles (k, 6) in -pi..pi, k from 0 to 8, that bring the flange to a pose (mm).
 
     Shoulder left or right, elbow up or down, wrist flipped or not. Each is kept only if forward
@@ -103,14 +102,12 @@ def nearest_turn(
     return np.where(turned < -model.limits_rad, turned + TURN, turned)
 
 
-def level_pose(
-    position_mm: Float64[np.ndarray, " 3"], yaw_rad: float
-) -> Float64[np.ndarray, "4 4"]:
+def level_pose(position_mm: Float64[np.ndarray, " 3"], yaw_rad: float) -> Pose:
     """``table_from_frame`` of a frame whose z is up and whose x points towards the yaw."""
     c, s = np.cos(yaw_rad), np.sin(yaw_rad)
     return rigid(np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]), position_mm)
 
 
-def yaw_of(table_from_frame: Float64[np.ndarray, "4 4"]) -> float:
+def yaw_of(table_from_frame: Pose) -> float:
     """Where a level frame's x points, radians."""
     return float(np.arctan2(table_from_frame[1, 0], table_from_frame[0, 0]))

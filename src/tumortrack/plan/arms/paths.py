@@ -14,8 +14,8 @@ import numpy as np
 from jaxtyping import Float64
 from scipy.interpolate import BSpline
 
-from tumortrack.plan.arms.cell import Blocked, PlanningGroup
-from tumortrack.plan.arms.kinematics import TURN, nearest_turn, wrapped
+from tumortrack.plan.arms.cell import Blocked, Pair, PlanningGroup
+from tumortrack.plan.arms.kinematics import TURN, Pose, nearest_turn, wrapped
 
 _FEW = 12  # every so many poses are checked before all are
 _JUMP_RAD = 0.35  # more than any joint turns between neighbouring poses of one branch
@@ -47,7 +47,7 @@ def follow(
     joints = _branches(group, poses)
     barred = np.isnan(joints[..., 0])
     tested = np.zeros_like(barred)
-    pair: tuple[str, str] | None = None
+    pair: Pair | None = None
     while (choice := _cheapest(joints, barred, near)) is not None:
         hit = _first_hit(group, joints, choice, tested)
         if hit is None:
@@ -69,7 +69,7 @@ def _reject_early(group: PlanningGroup, poses: np.ndarray) -> None:
     """
     for branches in _branches(group, poses[_FEW // 2 :: _FEW]):
         pairs = (group.collides(joints) for joints in branches[~np.isnan(branches[:, 0])])
-        pair: tuple[str, str] | None = None
+        pair: Pair | None = None
         for pair in pairs:
             if pair is None:
                 break
@@ -89,7 +89,7 @@ def _branches(group: PlanningGroup, poses: np.ndarray) -> np.ndarray:
     return joints
 
 
-def out_of_reach(group: PlanningGroup, table_from_tip: Float64[np.ndarray, "4 4"]) -> Blocked:
+def out_of_reach(group: PlanningGroup, table_from_tip: Pose) -> Blocked:
     """By a pose of the tip for which there is no inverse kinematics."""
     x, y, z = table_from_tip[:3, 3]
     return Blocked(f"the {group.arm} does not reach ({x:.0f}, {y:.0f}, {z:.0f}) mm")
@@ -115,7 +115,7 @@ def _cheapest(joints: np.ndarray, barred: np.ndarray, near_rad: np.ndarray) -> n
 
 def _first_hit(
     group: PlanningGroup, joints: np.ndarray, choice: np.ndarray, tested: np.ndarray
-) -> tuple[int, tuple[str, str]] | None:
+) -> tuple[int, Pair] | None:
     """A collision on this path: coarsely first, since what blocks rarely blocks one pose alone."""
     for n in (n for stride in (16, 4, 1) for n in range(0, len(choice), stride)):
         if not tested[n, choice[n]]:

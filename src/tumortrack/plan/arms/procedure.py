@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
-from jaxtyping import Float64
 
 from tumortrack.core.errors import InputError, NoPlan
 from tumortrack.core.types import Mesh
@@ -15,7 +14,7 @@ from tumortrack.plan.arms.kinematics import yaw_of
 from tumortrack.plan.arms.paths import connect, follow, out_of_reach
 from tumortrack.plan.arms.strokes import Surroundings, leg, level_poses, passes
 from tumortrack.plan.arms.trajectory import TrajectoryBuilder, along, together
-from tumortrack.plan.motions import CUTTER, HOLDER, JOINTS, Motions
+from tumortrack.plan.motions import CUTTER, HOLDER, JOINTS, Joints, Motions
 from tumortrack.plan.values import ResectionPlan
 
 _SETTLE_S = 0.5  # until the vacuum holds
@@ -29,7 +28,7 @@ def plan_motions(
     plan: ResectionPlan,
     cell: ArmCell,
     organ: Mesh,
-    start_rad: Float64[np.ndarray, " 12"] | None = None,
+    start_rad: Joints | None = None,
     from_sweep: int | None = None,
     seed: int = 0,
 ) -> Motions:
@@ -46,7 +45,7 @@ def plan_motions(
         NoPlan: a place out of reach, or a collision that could not be avoided, and what to do.
         InputError: an invalid start.
     """
-    cell = cell if cell.organ is organ else cell.with_organ(organ)
+    cell = cell if cell.organ is organ else ArmCell(cell.config, organ)
     start = cell.home_rad if start_rad is None else np.array(start_rad, float)
     if start.shape != (len(JOINTS),) or not (np.abs(start) <= cell.limits_rad).all():
         raise InputError("the arms' start must be twelve joint angles within their limits.")

@@ -16,9 +16,9 @@ import numpy as np
 from jaxtyping import Float64
 
 from tumortrack.plan.arms.cell import ArmCell, Blocked, PlanningGroup
-from tumortrack.plan.arms.kinematics import ACCELERATION_RAD_S2, JERK_RAD_S3
+from tumortrack.plan.arms.kinematics import ACCELERATION_RAD_S2, JERK_RAD_S3, Pose
 from tumortrack.plan.arms.paths import arc_lengths, follow
-from tumortrack.plan.motions import CUTTER, HOLDER, Motions, MotionStage
+from tumortrack.plan.motions import CUTTER, HOLDER, Joints, Motions, MotionStage
 
 _STEP_S = 0.02  # between two samples; straight segments between them stay within 0.05 mm
 _TIP_SPEED_UP_S = 0.2  # until a tip has its speed
@@ -34,9 +34,7 @@ Timed = tuple[Float64[np.ndarray, " n"], Float64[np.ndarray, "n d"]]
 class TrajectoryBuilder:
     """Where both arms are by now (``joints_rad``), and how they came there, stage by stage."""
 
-    def __init__(
-        self, cell: ArmCell, start_rad: Float64[np.ndarray, " 12"], rng: np.random.Generator
-    ) -> None:
+    def __init__(self, cell: ArmCell, start_rad: Joints, rng: np.random.Generator) -> None:
         self.cell, self.joints_rad, self.rng = cell, start_rad, rng
         self._stages: tuple[MotionStage, ...] = ()
         self._pieces: tuple[tuple[np.ndarray, np.ndarray, bool], ...] = ()
@@ -49,7 +47,7 @@ class TrajectoryBuilder:
         """This arm (None: both) moves from here."""
         return PlanningGroup(self.cell, arm, self.joints_rad, touching)
 
-    def tip(self, arm: str) -> Float64[np.ndarray, "4 4"]:
+    def tip(self, arm: str) -> Pose:
         """``table_from_tip`` now, mm."""
         return self.cell.tips(self.joints_rad)[arm]
 

@@ -11,11 +11,10 @@ import xml.etree.ElementTree as ET
 from collections.abc import Iterable
 
 import numpy as np
-from jaxtyping import Float64
 
 from tumortrack.plan.arms.body import LINKS, TABLE, Part, cell_parts
 from tumortrack.plan.arms.config import CellConfig
-from tumortrack.plan.arms.kinematics import ArmModel
+from tumortrack.plan.arms.kinematics import ArmModel, Pose
 from tumortrack.plan.motions import ARMS, UR_JOINTS
 
 
@@ -71,7 +70,7 @@ def _add_mount(robot: ET.Element, parent: str, child: str, place: np.ndarray) ->
     _add_place(_add_joint(robot, f"{child}_mount", "fixed", parent, child), place)
 
 
-def _add_place(element: ET.Element, place: Float64[np.ndarray, "4 4"]) -> None:
+def _add_place(element: ET.Element, place: Pose) -> None:
     """A rigid transform (mm) as the origin of an element."""
     turn = place[:3, :3]
     level = np.hypot(turn[0, 0], turn[1, 0])
