@@ -13,11 +13,10 @@ from arm_objects import CREEPING_MRAD, bare, flange_pose, nearest_mm, organ, pla
 from tumortrack.core.errors import InputError, NoPlan
 from tumortrack.core.geometry import transform_points
 from tumortrack.plan.arms import kinematics, trajectory, urdf
-from tumortrack.plan.arms.bases import search_bases
 from tumortrack.plan.arms.cell import ArmCell, Blocked, PlanningGroup
 from tumortrack.plan.arms.config import Base, CellConfig
 from tumortrack.plan.arms.paths import connect
-from tumortrack.plan.arms.procedure import plan_motions
+from tumortrack.plan.arms.procedure import plan_motions, search_bases
 from tumortrack.plan.motions import CUTTER, HOLDER, JOINTS
 from tumortrack.plan.values import Cut
 
