@@ -102,8 +102,9 @@ class Columns:
         low = points[:, :2].min(0) - 2 * _COLUMN_MM
         cell = np.round((points[:, :2] - low) / _COLUMN_MM).astype(int)
         shape = cell.max(0) + 3
-        lowest, highest = column_extremes(cell, shape, points[:, 2])
-        return cls(low, _spread(lowest), -_spread(-highest))
+        flat = cell[:, 0] * shape[1] + cell[:, 1]
+        lowest, highest = column_extremes(flat, points[:, 2], shape.prod())
+        return cls(low, _spread(lowest.reshape(shape)), -_spread(-highest.reshape(shape)))
 
     def at(
         self, points_mm: Float[np.ndarray, "n 2"]
@@ -127,12 +128,12 @@ class Columns:
 
 
 def column_extremes(
-    cells: Int[np.ndarray, "n 2"], shape: np.ndarray, heights: Float[np.ndarray, " n"]
-) -> tuple[Float64[np.ndarray, "i j"], Float64[np.ndarray, "i j"]]:
-    """The lowest and the highest point in each cell of a grid; inf and -inf where none is."""
-    lowest, highest = np.full(shape, np.inf), np.full(shape, -np.inf)
-    np.minimum.at(lowest, tuple(cells.T), heights)
-    np.maximum.at(highest, tuple(cells.T), heights)
+    columns: Int[np.ndarray, " n"], heights: Float[np.ndarray, " n"], n_columns: int
+) -> tuple[Float64[np.ndarray, " c"], Float64[np.ndarray, " c"]]:
+    """The lowest and the highest point of each column; inf and -inf where none is."""
+    lowest, highest = np.full(n_columns, np.inf), np.full(n_columns, -np.inf)
+    np.minimum.at(lowest, columns, heights)
+    np.maximum.at(highest, columns, heights)
     return lowest, highest
 
 

@@ -12,7 +12,6 @@ from concurrent.futures import Future
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float64
 from scipy.spatial import cKDTree
 
 from tumortrack.core.colours import Colour
@@ -299,11 +298,8 @@ def apart_mm(a: Mesh, b: Mesh) -> float:
     if np.array_equal(a.faces, b.faces):
         off = a.vertices_mm - b.vertices_mm
         return float(np.sqrt((off**2).sum(axis=1).mean()))
-    squares = [_nearest_mm(a, b) ** 2, _nearest_mm(b, a) ** 2]
-    return float(np.sqrt(np.concatenate(squares).mean()))
-
-
-def _nearest_mm(a: Mesh, b: Mesh) -> Float64[np.ndarray, " n"]:
-    """Distances of some of a's vertices to b's."""
-    some = a.vertices_mm[:: max(1, len(a.vertices_mm) // _COMPARED)]
-    return cKDTree(b.vertices_mm).query(some)[0]
+    apart = []
+    for one, other in ((a.vertices_mm, b.vertices_mm), (b.vertices_mm, a.vertices_mm)):
+        some = one[:: max(1, len(one) // _COMPARED)]
+        apart.append(cKDTree(other).query(some)[0])
+    return float(np.sqrt((np.concatenate(apart) ** 2).mean()))

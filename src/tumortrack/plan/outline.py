@@ -138,10 +138,10 @@ def _largest(area: Any) -> Polygon:
 
 def first_in_cell(cells: Int[np.ndarray, "n d"]) -> Int[np.ndarray, " m"]:
     """Numbers of the points that are the first in their cells, ordered by cell."""
-    if not len(cells):
-        return np.zeros(0, int)
-    shifted = cells - cells.min(0)
-    key = np.ravel_multi_index(tuple(shifted.T), tuple(shifted.max(0) + 1))
+    shifted = cells - cells.min(0, initial=0)
+    key = np.zeros(len(cells), np.int64)
+    for axis, size in zip(shifted.T, shifted.max(0, initial=0) + 1, strict=True):
+        key = key * size + axis
     return np.unique(key, return_index=True)[1]
 
 

@@ -176,9 +176,9 @@ def _cloud_volume_mm3(points_mm: Float[np.ndarray, "n 3"]) -> float:
     side_mm = float(np.sqrt(_A_COLUMN * np.ptp(flat, axis=0).prod() / len(flat)))
     cell = (flat / side_mm).astype(int)
     shape = cell.max(0) + 1
-    low, high = column_extremes(cell, shape, points_mm[:, 2])
-    count = np.zeros(shape, int)
-    np.add.at(count, tuple(cell.T), 1)
+    column = cell[:, 0] * shape[1] + cell[:, 1]
+    low, high = column_extremes(column, points_mm[:, 2], shape.prod())
+    count = np.bincount(column, minlength=len(low))
     some = count >= 2
     span = (high - low)[some] * (count[some] + 1) / (count[some] - 1)
     # A column at the edge is not full: it counts by how dense its points are.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator
+from copy import copy
 
 import msgspec
 import numpy as np
@@ -92,7 +93,9 @@ def _grasp_and_cut(
     reason: Blocked | None = None
     for grip in _grips(builder, plan.grasp_mm):
         try:
-            return _cut_and_finish(_grasp(builder.copy(), grip), plan, around, 1)
+            attempt = copy(builder)
+            _grasp(attempt, grip)
+            return _cut_and_finish(attempt, plan, around, 1)
         except Blocked as blocked:
             reason = reason or blocked
             if blocked.pair and not any(name.startswith(HOLDER) for name in blocked.pair):
@@ -135,7 +138,7 @@ def _grips(builder: TrajectoryBuilder, grasp_mm: np.ndarray) -> Iterator[np.ndar
         raise reason
 
 
-def _grasp(builder: TrajectoryBuilder, grip_rad: np.ndarray) -> TrajectoryBuilder:
+def _grasp(builder: TrajectoryBuilder, grip_rad: np.ndarray) -> None:
     """Approach, grasp and hold."""
     builder.go(HOLDER, connect(builder.group(HOLDER), grip_rad[0], builder.rng))
     builder.close("approach")
@@ -143,7 +146,6 @@ def _grasp(builder: TrajectoryBuilder, grip_rad: np.ndarray) -> TrajectoryBuilde
     builder.close("grasp")
     builder.wait(_SETTLE_S)
     builder.close("hold")
-    return builder
 
 
 def _cut_and_finish(

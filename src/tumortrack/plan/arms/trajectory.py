@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Collection
-from copy import copy
 from typing import Any
 
 import numpy as np
@@ -32,16 +31,15 @@ Timed = tuple[Float64[np.ndarray, " n"], Float64[np.ndarray, "n d"]]
 
 
 class TrajectoryBuilder:
-    """Where both arms are by now (``joints_rad``), and how they came there, stage by stage."""
+    """Where both arms are by now (``joints_rad``), and how they came there, stage by stage.
+
+    What is added to a copy (``copy.copy``) is not in the original.
+    """
 
     def __init__(self, cell: ArmCell, start_rad: Joints, rng: np.random.Generator) -> None:
         self.cell, self.joints_rad, self.rng = cell, start_rad, rng
         self._stages: tuple[MotionStage, ...] = ()
         self._pieces: tuple[tuple[np.ndarray, np.ndarray, bool], ...] = ()
-
-    def copy(self) -> TrajectoryBuilder:
-        """The same so far; what is added to either is not in the other."""
-        return copy(self)
 
     def group(self, arm: str | None, touching: Collection[str] = ()) -> PlanningGroup:
         """This arm (None: both) moves from here."""
