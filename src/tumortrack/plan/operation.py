@@ -266,7 +266,7 @@ class Operation:
             self._log(now_s, {"event": "planned anew"})
         elif isinstance(failure, TumortrackError):
             execution.abort(f"no new plan: {failure}")
-        else:  # a defect of ours must stop the arms, and say so
+        else:  # a defect of the planner must stop the arms, and be reported
             execution.abort(f"internal error, {type(failure).__name__}: {failure}")
 
     def _note(self, now_s: float) -> None:

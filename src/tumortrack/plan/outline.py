@@ -19,8 +19,8 @@ _CELL = (
     2.0  # of a grid that separates inner points from outer ones, in sqrt(area / number of points)
 )
 _EDGE = 5.0  # longest edge of a hull, in sqrt(area / number of points)
-_SPARSE = 6  # of inner cells, one point in so many each way stays
-_MOST = 10_000  # points that are looked at
+_SPARSE = 6  # of inner points, one in each block of so many cells stays
+_MOST = 10_000  # points that are used
 _SAME_MM = 0.01  # points nearer to each other are one
 _LEAST_MM2 = 1.0  # smaller pieces of an outline are none
 _SMOOTH = 16  # corners of a quarter circle: 5 mm of margin are exact to 0.01 mm
@@ -29,8 +29,8 @@ _SMOOTH = 16  # corners of a quarter circle: 5 mm of margin are exact to 0.01 mm
 def concave_hull(points_mm: Float[np.ndarray, "n 2"]) -> Polygon:
     """The outline of a cloud's largest cluster.
 
-    Edges may be as long as 5 sqrt(A / n), A being the convex hull's area: the ratio that GEOS
-    takes means another length at every density.
+    Edges may be as long as 5 sqrt(A / n), A being the convex hull's area: a fixed ratio, which GEOS
+    takes, would mean another length at every density.
 
     Raises:
         NoPlan: fewer than three points, or all on a line.

@@ -25,7 +25,7 @@ from tumortrack.plan.motions import ARMS, CUTTER, HOLDER, Joints
 ORGAN = "organ"
 TOOLS = {CUTTER: ("bracket", "pencil", "electrode"), HOLDER: ("rod", "cup")}
 TOUCHES = {CUTTER: "cutter/electrode", HOLDER: "holder/cup"}  # what of a tool may touch the organ
-Pair = tuple[str, str]
+CollidingPair = tuple[str, str]
 _THICK_MM = 10.0  # of what a tool is made of, about its own axis
 
 
@@ -118,7 +118,7 @@ class ArmCell:
 
     def collisions(
         self, joints_rad: Joints, touching: Collection[str] = (), moving: str | None = None
-    ) -> Pair | None:
+    ) -> CollidingPair | None:
         """Names of the first pair that comes nearer than its clearance, or None.
 
         Args:
@@ -146,7 +146,7 @@ class ArmCell:
             self._states[touching, moving] = state
         return self._states[touching, moving]
 
-    def _margin_mm(self, pair: Pair, touching: tuple[str, ...]) -> float:
+    def _margin_mm(self, pair: CollidingPair, touching: tuple[str, ...]) -> float:
         """How near these two may come."""
         if ORGAN in pair or (body.STAND in pair and TOUCHES[CUTTER] in pair):
             return self.config.organ_clearance_mm
@@ -155,15 +155,15 @@ class ArmCell:
 
 
 class Blocked(NoPlan):
-    """No motion this way; perhaps there is another. The text says where and why; ``pair``: what
-    would collide, if that is the reason."""
+    """This motion is impossible; perhaps another is not. The text says where and why; ``pair``:
+    what would collide, if that is the reason."""
 
-    def __init__(self, text: str, pair: Pair | None = None) -> None:
+    def __init__(self, text: str, pair: CollidingPair | None = None) -> None:
         super().__init__(text)
         self.pair = pair
 
     @classmethod
-    def by(cls, pair: Pair, where: str = "") -> Blocked:
+    def by(cls, pair: CollidingPair, where: str = "") -> Blocked:
         """By a collision of these two."""
         return cls(f"{pair[0]} would meet {pair[1]}{where}", pair)
 
@@ -216,13 +216,13 @@ class PlanningGroup:
         flange = base_from_table @ table_from_tip @ tip_from_flange
         return nearest_turn(self.model, inverse_kinematics(self.model, flange), self.current_rad)
 
-    def collides(self, own_rad: Float64[np.ndarray, " d"]) -> Pair | None:
+    def collides(self, own_rad: Float64[np.ndarray, " d"]) -> CollidingPair | None:
         """What comes nearer than allowed to what."""
         return self.cell.collisions(self.all_joints(own_rad), self.touching, self.arm)
 
     def segment_collides(
         self, start_rad: np.ndarray, goal_rad: np.ndarray, spacing: float = 1.0
-    ) -> Pair | None:
+    ) -> CollidingPair | None:
         """The same between two free configurations, on the straight segment in joint space.
 
         With ``spacing`` 1 no point of an arm moves by more than twice the least clearance in one
@@ -254,7 +254,7 @@ def _solid_names(solids: Any, parts: tuple[body.Part, ...]) -> list[str]:
     return [next(by_link[solid.name.rsplit("_", 1)[0]]) for solid in solids.geometryObjects]
 
 
-def _pairs() -> list[Pair]:
+def _pairs() -> list[CollidingPair]:
     """All that could ever meet. Links next to each other are left out, and of an arm with itself
     what its joints' offsets keep apart."""
     moving = {arm: [f"{arm}/{name}" for name in (*body.LINKS[2:], *TOOLS[arm])] for arm in ARMS}

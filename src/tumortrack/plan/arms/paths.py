@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float64
 from scipy.interpolate import BSpline
 
-from tumortrack.plan.arms.cell import Blocked, Pair, PlanningGroup
+from tumortrack.plan.arms.cell import Blocked, CollidingPair, PlanningGroup
 from tumortrack.plan.arms.kinematics import TURN, Pose, nearest_turn, wrapped
 
 _FEW = 12  # every so many poses are checked before all are
@@ -47,7 +47,7 @@ def follow(
     joints = _branches(group, poses)
     barred = np.isnan(joints[..., 0])
     tested = np.zeros_like(barred)
-    pair: Pair | None = None
+    pair: CollidingPair | None = None
     while (choice := _cheapest(joints, barred, near)) is not None:
         hit = _first_hit(group, joints, choice, tested)
         if hit is None:
@@ -69,7 +69,7 @@ def _reject_early(group: PlanningGroup, poses: np.ndarray) -> None:
     """
     for branches in _branches(group, poses[_FEW // 2 :: _FEW]):
         pairs = (group.collides(joints) for joints in branches[~np.isnan(branches[:, 0])])
-        pair: Pair | None = None
+        pair: CollidingPair | None = None
         for pair in pairs:
             if pair is None:
                 break
@@ -115,7 +115,7 @@ def _cheapest(joints: np.ndarray, barred: np.ndarray, near_rad: np.ndarray) -> n
 
 def _first_hit(
     group: PlanningGroup, joints: np.ndarray, choice: np.ndarray, tested: np.ndarray
-) -> tuple[int, Pair] | None:
+) -> tuple[int, CollidingPair] | None:
     """A collision on this path: coarsely first, since what blocks rarely blocks one pose alone."""
     for n in (n for stride in (16, 4, 1) for n in range(0, len(choice), stride)):
         if not tested[n, choice[n]]:
