@@ -208,11 +208,11 @@ def search_bases(
     the whole procedure can be planned.
 
     Returns:
-        The cell (with the organ) that serves, the motions, and what was changed, for the user:
+        The workcell (with the organ), the motions, and a note for the user on what was changed:
         empty where nothing was.
 
     Raises:
-        NoPlan: from none of them; the reason is that of the places they stand in.
+        NoPlan: no place will do; the reason is the one for the places where the arms stand now.
     """
     cell = ArmCell(config, organ)
     try:
