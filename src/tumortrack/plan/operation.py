@@ -226,16 +226,11 @@ class Operation:
         if tumor is None:
             self._halt_in_doubt(f"{name} was not found")
             return
-        moved = [
-            (apart_mm(located.meshes[part], mesh), part)
-            for part, mesh in self.planned.meshes.items()
-            if part in located.meshes
-        ]
-        far = [
-            (off_mm, part)
-            for off_mm, part in moved
-            if off_mm > config.moved_mm * (1.0 if part == name else _OTHERS)
-        ]
+        far = []
+        for part in self.planned.meshes.keys() & located.meshes.keys():
+            off_mm = apart_mm(located.meshes[part], self.planned.meshes[part])
+            if off_mm > config.moved_mm * (1.0 if part == name else _OTHERS):
+                far.append((off_mm, part))
         if not far:
             self._settled = None
             execution.go()

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
+from functools import cache
 
 import numpy as np
 from jaxtyping import Float64
@@ -46,16 +47,18 @@ def follow(
     _reject_early(group, poses)
     joints = _branches(group, poses)
     barred = np.isnan(joints[..., 0])
-    tested = np.zeros_like(barred)
+    collides = cache(lambda n, branch: group.collides(joints[n, branch]))
     pair: CollidingPair | None = None
     while (choice := _cheapest(joints, barred, near)) is not None:
-        hit = _first_hit(group, joints, choice, tested)
+        # Coarsely first, since what blocks rarely blocks one pose alone
+        order = (n for stride in (16, 4, 1) for n in range(0, len(choice), stride))
+        hit = next((n for n in order if collides(n, choice[n])), None)
         if hit is None:
             path = np.unwrap(joints[np.arange(len(choice)), choice], axis=0)
             path += nearest_turn(group.model, path[0], near) - path[0]
             return _checked(group, path)
-        at, pair = hit
-        barred[at, choice[at]] = True
+        pair = collides(hit, choice[hit])
+        barred[hit, choice[hit]] = True
     if pair is None:
         raise Blocked(f"the {group.arm} would have to jump between two configurations")
     raise Blocked.by(pair)
@@ -111,18 +114,6 @@ def _cheapest(joints: np.ndarray, barred: np.ndarray, near_rad: np.ndarray) -> n
     for n in range(len(joints) - 1, 0, -1):
         choice.append(int(came[n][choice[-1]]))
     return np.array(choice[::-1])
-
-
-def _first_hit(
-    group: PlanningGroup, joints: np.ndarray, choice: np.ndarray, tested: np.ndarray
-) -> tuple[int, CollidingPair] | None:
-    """A collision on this path: coarsely first, since what blocks rarely blocks one pose alone."""
-    for n in (n for stride in (16, 4, 1) for n in range(0, len(choice), stride)):
-        if not tested[n, choice[n]]:
-            if pair := group.collides(joints[n, choice[n]]):
-                return n, pair
-            tested[n, choice[n]] = True
-    return None
 
 
 def _checked(group: PlanningGroup, path_rad: np.ndarray) -> np.ndarray:
