@@ -20,7 +20,7 @@ from tumortrack.core.errors import NoPlan
 from tumortrack.plan.config import Direction, ResectionConfig
 from tumortrack.plan.margin_kernels import outline_fields
 from tumortrack.plan.outline import arcs, evenly_round, first_in_cell, polygon_of, rings_of
-from tumortrack.plan.values import Cut, CutLayer, Located, MethodResult, name_of
+from tumortrack.plan.values import Cut, CutLayer, Located, MethodResult, Rings, name_of
 
 # Of outlines, which are interpolated; and one surface point in each cube of that size. Both finer
 # where the margin is narrow, so that it is kept to a tenth of a millimetre.
@@ -32,6 +32,10 @@ _SMOOTH_MM = 0.05  # outlines lose corners smaller than this
 _FAR_MM = 1e3
 _LEAST_MM2 = 1.0  # a smaller rest of a floor needs no stroke
 
+Heights = tuple[Float64[np.ndarray, " n"], Float64[np.ndarray, " n"]]  # lowest and highest, mm
+# Points of the tumor, and the margin that each needs, mm
+Grown = tuple[Float64[np.ndarray, "n 3"], Float64[np.ndarray, " n"]]
+
 
 def margin_plan(located: Located, label: int, config: ResectionConfig) -> MethodResult:
     """The piece, its strokes, both from the top down, and where to hold; table frame, mm.
@@ -39,9 +43,8 @@ def margin_plan(located: Located, label: int, config: ResectionConfig) -> Method
     Raises:
         NoPlan: the margin with its uncertainty is wider than allowed; there is nothing to cut.
     """
-    points, margins = grown_tumor(located, label, config)
     columns = Columns.of(located)
-    layers = _layers(points, margins, columns, config.layer_mm)
+    layers = _layers(_grown_tumor(located, label, config), columns, config.layer_mm)
     slabs = list(zip(layers, (*layers[1:], None), strict=True))
     cuts: list[Cut] = []
     for layer, below in slabs if config.order == "down" else reversed(slabs):
@@ -52,9 +55,7 @@ def margin_plan(located: Located, label: int, config: ResectionConfig) -> Method
     return layers, tuple(cuts), _grasp(located.of(label), columns)
 
 
-def grown_tumor(
-    located: Located, label: int, config: ResectionConfig
-) -> tuple[Float64[np.ndarray, "n 3"], Float64[np.ndarray, " n"]]:
+def _grown_tumor(located: Located, label: int, config: ResectionConfig) -> Grown:
     """Points of the tumor's surface (also inside it, where there is no mesh) and the margin that
     each needs, mm.
 
@@ -106,17 +107,14 @@ class Columns:
         lowest, highest = column_extremes(flat, points[:, 2], shape.prod())
         return cls(low, _spread(lowest.reshape(shape)), -_spread(-highest.reshape(shape)))
 
-    def at(
-        self, points_mm: Float[np.ndarray, "n 2"]
-    ) -> tuple[Float64[np.ndarray, " n"], Float64[np.ndarray, " n"]]:
+    def at(self, points_mm: Float[np.ndarray, "n 2"]) -> Heights:
         """Lowest and highest point of the organ below and above each place."""
         cell = np.round((points_mm - self.first_mm) / _COLUMN_MM).astype(int)
         shape = np.array(self.lowest_mm.shape)
         inside = ((cell >= 0) & (cell < shape)).all(1)
         i, j = np.clip(cell, 0, shape - 1).T
-        low, high = self.lowest_mm[i, j].copy(), self.highest_mm[i, j].copy()
-        low[~inside], high[~inside] = np.nan, np.nan
-        return low, high
+        low, high = self.lowest_mm[i, j], self.highest_mm[i, j]
+        return np.where(inside, low, np.nan), np.where(inside, high, np.nan)
 
     def within(
         self, points_mm: Float[np.ndarray, "n 2"], bottom_mm: float, top_mm: float
@@ -129,7 +127,7 @@ class Columns:
 
 def column_extremes(
     columns: Int[np.ndarray, " n"], heights: Float[np.ndarray, " n"], n_columns: int
-) -> tuple[Float64[np.ndarray, " c"], Float64[np.ndarray, " c"]]:
+) -> Heights:
     """The lowest and the highest point of each column; inf and -inf where none is."""
     lowest, highest = np.full(n_columns, np.inf), np.full(n_columns, -np.inf)
     np.minimum.at(lowest, columns, heights)
@@ -146,15 +144,11 @@ def _spread(values: Float[np.ndarray, "i j"]) -> Float64[np.ndarray, "i j"]:
     return np.where(closed & np.isfinite(filled), filled, np.nan)
 
 
-def _layers(
-    points: Float[np.ndarray, "n 3"],
-    margins: Float[np.ndarray, " n"],
-    columns: Columns,
-    layer_mm: float,
-) -> tuple[CutLayer, ...]:
+def _layers(grown: Grown, columns: Columns, layer_mm: float) -> tuple[CutLayer, ...]:
     """Slabs from the top down; each has the outline at its upper end, where it is widest."""
+    points, margins = grown
     floor = float((points[:, 2] - margins).min())
-    outermost = _outlines(points, margins, np.array([np.inf]))[0]
+    outermost = _outlines(grown, np.array([np.inf]))[0]
     if not outermost:
         raise NoPlan("the tumor's outline has no area; locate it again with more points.")
     high = columns.at(np.concatenate(outermost))[1]
@@ -163,7 +157,7 @@ def _layers(
     n = max(1, int(np.ceil((np.nanmax(high) - floor) / layer_mm)))
     bottoms = floor + (np.nanmax(high) - floor) / n * np.arange(n)
     tops = np.append(bottoms[1:], np.inf)
-    outlines = [*_outlines(points, margins, tops[:-1]), outermost]
+    outlines = [*_outlines(grown, tops[:-1]), outermost]
     layers = [
         CutLayer(float(bottom), float(top), rings)
         for bottom, top, rings in zip(bottoms, tops, outlines, strict=True)
@@ -172,12 +166,9 @@ def _layers(
     return tuple(reversed(layers))
 
 
-def _outlines(
-    points: Float[np.ndarray, "n 3"],
-    margins: Float[np.ndarray, " n"],
-    levels_mm: Float[np.ndarray, " k"],
-) -> list[tuple[Float64[np.ndarray, "m 2"], ...]]:
+def _outlines(grown: Grown, levels_mm: Float[np.ndarray, " k"]) -> list[Rings]:
     """Rings of what comes away at each height."""
+    points, margins = grown
     cell = min(_CELL_MM, _CELL_SHARE * float(margins.min()))
     room = float(margins.max()) + 4 * cell
     first = points[:, :2].min(0) - room

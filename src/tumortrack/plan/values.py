@@ -18,6 +18,7 @@ from tumortrack.core.types import FIRST_TUMOR, Mesh, part_names
 
 Method = Literal["published", "margin"]
 StrokeKind = Literal["wall", "floor"]
+Rings = tuple[Float64[np.ndarray, "n 2"], ...]
 
 
 def name_of(label: int) -> str:
@@ -67,7 +68,7 @@ class CutLayer:
 
     bottom_mm: float
     top_mm: float
-    rings_mm: tuple[Float64[np.ndarray, "n 2"], ...]
+    rings_mm: Rings
 
     def __post_init__(self) -> None:
         if not self.bottom_mm < self.top_mm:
