@@ -23,10 +23,10 @@ class RigidBound:
     """
 
     name = "rigid_bound"
+    prepare_s = 0.0
 
-    def __init__(self, anatomy_ct: Anatomy) -> None:
+    def __init__(self, anatomy_ct: Anatomy, up_lps: tuple[float, float, float]) -> None:
         self._organ = anatomy_ct.organ
-        self.prepare_s = 0.0
 
     def fit(self, scene: Scene) -> Fit:
         """The pose, from ``scene.reference``.
