@@ -18,7 +18,7 @@ from tumortrack.imaging.case import Case, load_case
 from tumortrack.simulate.scene_folder import Scene, list_scenes, read_scene
 from tumortrack_lab.peers.base import Peer
 from tumortrack_lab.peers.kinds import peer_kinds
-from tumortrack_lab.peers.rigid_bound import matched_vertices
+from tumortrack_lab.peers.rigid import matched_vertices
 
 
 def line(peer: Peer, case: Case, scene: Scene, name: str) -> dict:

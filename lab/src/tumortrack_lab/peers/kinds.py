@@ -58,8 +58,7 @@ def peer_kinds(bcpd: Path | None = None) -> dict[str, PeerKind]:
     from tumortrack_lab.peers.elastic import ElasticPeer, ElasticPeerConfig
     from tumortrack_lab.peers.point_drift import Bcpd, BcpdConfig, Cpd, CpdConfig
     from tumortrack_lab.peers.pose_search import RigidConfig
-    from tumortrack_lab.peers.rigid import Rigid
-    from tumortrack_lab.peers.rigid_bound import RigidBound
+    from tumortrack_lab.peers.rigid import Rigid, RigidBound
 
     kinds = {
         "rigid_bound": PeerKind(RigidBound),
