@@ -23,7 +23,7 @@ from tumortrack.core.estimate import Estimate
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.types import Anatomy, CameraLabels, OccupancyCloud
 from tumortrack.imaging.raster import label_grid
-from tumortrack.models.volume import describe_parts, grid_over
+from tumortrack.models.report import describe_parts, grid_over
 from tumortrack.simulate.scene_folder import Scene
 from tumortrack_lab.peers.pose_search import Points, PoseSearch, Transform
 
