@@ -1,6 +1,5 @@
 """Voxels that no longer hang together after a cut: faces between them are severed, not voxels
 taken out, so that a cut takes no tissue with it and leaves no way around a corner.
-
 """
 
 from __future__ import annotations

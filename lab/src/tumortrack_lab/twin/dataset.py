@@ -96,7 +96,7 @@ def make_scenes(
     identity = _claim(run, out)
     todo = [(v, w) for v, w in wanted if not (out / f"{v}-{w}").exists()]
     states = list(dict.fromkeys(VARIANTS[v].state for v, _ in todo))
-    cache = _StateCache(out / _STATES, run, case, targets)
+    cache = StateCache(out / _STATES, run, case, targets)
     unsolved = sum(not cache.has(state) for state in states)
     progress = _Progress(report, len(todo) + _STATE_SHARE * unsolved)
     for name in states:
@@ -171,7 +171,7 @@ def _write(
         twin_picture(scene, state, rest, aside / "scene.png")
 
 
-class _StateCache:
+class StateCache:
     """The states of one case on disk, one file each, so that none is solved twice; the apparatus
     is built when the first one is needed."""
 
