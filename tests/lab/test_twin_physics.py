@@ -259,8 +259,9 @@ def test_a_load_that_finds_no_rest_is_an_error(bench: Apparatus, monkeypatch) ->
 
 def test_the_twin_shares_no_code_with_the_training_deformations() -> None:
     code = (
-        "import sys, tumortrack_lab.twin.states\n"
-        "print([m for m in sys.modules if m.startswith('tumortrack.simulate.deform')])"
+        "import sys, tumortrack_lab.twin.dataset, tumortrack_lab.twin.faults\n"
+        "training = ('tumortrack.simulate.deform', 'tumortrack.simulate.elastic')\n"
+        "print([m for m in sys.modules if m.startswith(training)])"
     )
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert out.stdout.strip() == "[]"

@@ -1,9 +1,8 @@
-"""A plan made on the estimate cuts the true anatomy: what comes away, and how close it came.
+"""A plan made on the estimate cuts the true anatomy: what is removed, and the margins.
 
-Nothing of the planner's own reckoning of volumes is used. The true organ is voxelised, faces
-between voxels are severed where a stroke or a level sheet passes between their centres, and what
-then still hangs together with most of the organ stays. Tissue neither moves nor gives way while
-it is cut, and nobody pulls at it.
+The planner's own volumes are not used. The true organ is voxelised, faces between voxels are
+severed where a stroke or a level sheet passes between their centres, and the largest connected
+piece is what stays. Tissue does not move while it is cut.
 """
 
 from __future__ import annotations

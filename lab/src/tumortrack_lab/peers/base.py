@@ -25,7 +25,7 @@ from tumortrack.core.types import Anatomy, CameraLabels, OccupancyCloud
 from tumortrack.imaging.raster import label_grid
 from tumortrack.models.report import describe_parts, grid_over
 from tumortrack.simulate.scene_folder import Scene
-from tumortrack_lab.peers.pose_search import Points, PoseSearch, Transform
+from tumortrack_lab.peers.pose_search import Direction, Points, PoseSearch, Transform
 
 CLOUD_POINTS = 40_000  # of an estimate, as many as the tracker asks for
 
@@ -55,10 +55,10 @@ class Peer(Protocol):
     prepare_s: float  # spent before the first frame
 
     def fit(self, scene: Scene) -> Fit:
-        """Locate the anatomy in a scene. All but the bound look at ``scene.cloud`` alone.
+        """Locate the anatomy in a scene. All but the bound use ``scene.cloud`` alone.
 
         Raises:
-            NoEstimate: the cloud says too little.
+            NoEstimate: the cloud has too little information.
             InputError: the cloud or the peer's settings cannot be used.
         """
         ...
@@ -79,7 +79,7 @@ def estimate_of(fit: Fit, anatomy_ct: Anatomy, stamp_ns: int = 0, grid: int = 16
         grid: voxels along the longest side of the dense volume, as in ``Tracker.locate``.
 
     Raises:
-        InputError: the fit carries points to places that are no numbers.
+        InputError: the fit carries points to NaN or infinity.
     """
     carried = [np.asarray(fit.carry(part.vertices_mm)) for part in anatomy_ct.parts]
     if not all(np.isfinite(points_mm).all() for points_mm in carried):
@@ -123,8 +123,8 @@ def stopwatch() -> Iterator[Stopwatch]:
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """A deformable fit from one pose: its map, its error beside other starts' (any unit), its
-    report."""
+    """A deformable fit from one pose: its map, the error by which fits are compared (any unit), and
+    its report."""
 
     carry: Carry
     error: float
@@ -140,9 +140,7 @@ class DeformablePeer(ABC):
     name: str
     config: Any
 
-    def __init__(
-        self, anatomy_ct: Anatomy, up_lps: tuple[float, float, float], config: Any
-    ) -> None:
+    def __init__(self, anatomy_ct: Anatomy, up_lps: Direction, config: Any) -> None:
         self.config = config
         with stopwatch() as watch:
             self._search = PoseSearch(anatomy_ct, up_lps, config.rigid)

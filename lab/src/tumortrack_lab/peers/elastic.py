@@ -34,7 +34,7 @@ from tumortrack_lab.peers.pose_search import (
 )
 from tumortrack_lab.tets import tetrahedralise
 
-# Of the diagonal: the mesh may cut corners by 1 mm, for the organ's own surface rides on it.
+# Of the diagonal: the mesh may err by 1 mm, for the organ's own surface is embedded in it.
 _ENVELOPE = 7e-3
 _STEP_MM = 1.0  # along the surface, for the normals of the deformed one
 _BESIDE_MM = 2.0  # spacing: partners lie this far apart along the surface
@@ -77,9 +77,9 @@ class _State:
 
 @dataclass(frozen=True, eq=False)
 class _Pairs:
-    """Each cloud point's equation: how its distance along the surface normal follows from a small
-    step (``rows``), the distance now, whether it counts (1) or is an outlier (0), and how much it
-    would."""
+    """One equation a pair: the derivative of its distance along the surface normal by a step
+    (``rows``), the distance now, its Tukey weight (0: an outlier), and a constant weight
+    (``share``)."""
 
     rows: Float64[np.ndarray, "n unknowns"]
     residual_mm: Float64[np.ndarray, " n"]
@@ -96,12 +96,12 @@ class ElasticPeer(DeformablePeer):
     def _prepare(self, anatomy_ct: Anatomy) -> None:
         mesh = tetrahedralise(anatomy_ct.organ, self.config.edge_mm, _ENVELOPE)
         self.body = elastic_body(mesh, self.config.poisson, self.config.modes)
-        self._surface = RidingSurface(self.body, self._search)
+        self._surface = EmbeddedSurface(self.body, self._search)
         variance = self.config.displacement_mm**2 * self.body.area_mm2
         self._precision = self.body.stiffness * (1 / self.body.stiffness).sum() / variance
 
     def _fit_from(self, camera_from_ct: Transform, cloud: Points) -> Candidate:
-        """The points' reach shrinks while the body finds its place."""
+        """The limit beyond which points are outliers shrinks during the iteration."""
         config = self.config
         state = _State(camera_from_ct, np.zeros(len(self._precision)))
         reach = np.geomspace(config.first_outlier_mm, config.outlier_mm, config.iterations // 2)
@@ -173,8 +173,8 @@ class ElasticPeer(DeformablePeer):
         return float(np.sqrt(amplitudes @ amplitudes / self.body.area_mm2))
 
 
-class RidingSurface:
-    """Points of the organ's fine surface that ride on the body's modes, with their normals."""
+class EmbeddedSurface:
+    """Points of the organ's fine surface that move with the body's modes, and their normals."""
 
     def __init__(self, body: PeerElasticBody, search: PoseSearch) -> None:
         rest = search.surface
@@ -204,7 +204,7 @@ class RidingSurface:
     ) -> Int[np.ndarray, " m"]:
         """Some of the points that the camera should see above a depth, evenly spread.
 
-        Hidden is what the undeformed organ hides; which way it turns, the deformed one says.
+        Occlusion is that of the undeformed organ; orientation is that of the deformed one.
         """
         seen = seen_from(self._visibility, self._rest, camera_from_ct)
         seen &= shape.faces(np.linalg.inv(camera_from_ct)[:3, 3])

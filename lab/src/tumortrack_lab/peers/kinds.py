@@ -17,6 +17,7 @@ from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError
 from tumortrack.core.types import Anatomy
 from tumortrack_lab.peers.base import Peer
+from tumortrack_lab.peers.pose_search import Direction
 
 GROUP = "tumortrack.peers"
 
@@ -42,7 +43,7 @@ class PeerKind:
     def versions(self) -> dict[str, str]:
         return {package: version(package) for package in self.packages}
 
-    def made_for(self, anatomy_ct: Anatomy, up_lps: tuple[float, float, float]) -> Peer:
+    def made_for(self, anatomy_ct: Anatomy, up_lps: Direction) -> Peer:
         """The peer, ready for a patient (anatomy in LPS, mm; the direction facing the camera)."""
         settings = () if self.config is None else (self.config,)
         return self.make(anatomy_ct, up_lps, *settings)

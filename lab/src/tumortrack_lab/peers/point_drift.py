@@ -1,7 +1,7 @@
-"""Coherent point drift and its Bayesian kin, non-rigid, from rigid starts.
+"""Coherent point drift, classic and Bayesian: non-rigid, from rigid starts.
 
 The observed cloud is the data, the part of the model's surface that the camera should see is the
-drifting set: drawing the whole organ onto one side of it would fail at once. Displacements are
+moving set: the whole organ would be pulled onto one side of the cloud. Displacements are
 interpolated into the depth by the methods' own Gaussian kernel.
 
 CPD: Myronenko, Song 2010, doi 10.1109/TPAMI.2010.46 (pycpd). BCPD: Hirose 2021, doi
@@ -27,7 +27,13 @@ from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.types import Anatomy
 from tumortrack_lab.peers.base import Candidate, DeformablePeer
-from tumortrack_lab.peers.pose_search import Points, RigidConfig, Transform, trimmed_mean
+from tumortrack_lab.peers.pose_search import (
+    Direction,
+    Points,
+    RigidConfig,
+    Transform,
+    trimmed_mean,
+)
 
 _KEPT = 0.9  # of the distances
 _PATIENCE_S = 120.0
@@ -38,8 +44,8 @@ class CpdConfig(Config, frozen=True):
 
     ``kernel_mm`` is the paper's beta, the distance over which points move together; ``smooth``
     its lambda, the weight of smoothness (of points scaled to a spread of 1, as the paper scales
-    them); ``outliers`` its w. ``first_sigma_mm`` starts the
-    annealing at the error that a rigid pose leaves, instead of at the size of the cloud.
+    them); ``outliers`` its w. ``first_sigma_mm`` starts the annealing at the error that a rigid
+    pose leaves, instead of at the size of the cloud.
     """
 
     rigid: RigidConfig = RigidConfig()
@@ -141,9 +147,7 @@ class Bcpd(_PointDrift):
     name = "bcpd"
     config: BcpdConfig
 
-    def __init__(
-        self, anatomy_ct: Anatomy, up_lps: tuple[float, float, float], config: BcpdConfig
-    ) -> None:
+    def __init__(self, anatomy_ct: Anatomy, up_lps: Direction, config: BcpdConfig) -> None:
         if not Path(config.program).is_file():
             raise InputError(
                 f"BCPD's program {config.program!r} does not exist. Get the source from "

@@ -32,6 +32,7 @@ Transform = Float64[np.ndarray, "4 4"]
 Points = Float64[np.ndarray, "_ 3"]
 Point = Float64[np.ndarray, " 3"]
 Rotation3 = Float64[np.ndarray, "3 3"]
+Direction = tuple[float, float, float]
 
 
 class RigidConfig(Config, frozen=True):
@@ -101,11 +102,9 @@ class Pose:
 
 
 class PoseSearch:
-    """Starts, ICP and choice, with everything prepared that does not need a cloud."""
+    """Starts, ICP and selection; what needs no cloud is prepared on construction."""
 
-    def __init__(
-        self, anatomy_ct: Anatomy, up_lps: tuple[float, float, float], config: RigidConfig
-    ) -> None:
+    def __init__(self, anatomy_ct: Anatomy, up_lps: Direction, config: RigidConfig) -> None:
         import small_gicp
 
         self.config = config
@@ -151,7 +150,7 @@ class PoseSearch:
 
     def error_mm(self, points: Points, camera_from_ct: Transform) -> float:
         """Trimmed mean distance of the cloud to the surface, and of what the camera should see
-        of the surface to the cloud: a cloud alone may hide anywhere in a larger flat side."""
+        of the surface to the cloud: a cloud alone fits anywhere on a larger flat side."""
         ct_from_camera = np.linalg.inv(camera_from_ct)
         points_ct = transform_points(ct_from_camera, points)
         out = self._tree.query(points_ct)[0]
@@ -163,8 +162,8 @@ class PoseSearch:
         return trimmed_mean(out, config.cloud_share) + trimmed_mean(back, config.seen_share)
 
     def seen(self, points: Points, camera_from_ct: Transform) -> Points:
-        """The surface that the camera should see above the depth where the cloud was cropped,
-        camera frame, for the organ as it was in the CT."""
+        """Points of the undeformed surface that the camera should see and that lie nearer than the
+        depth where the cloud was cropped; camera frame."""
         seen = seen_from(self.visibility, self.surface, camera_from_ct)
         placed = transform_points(camera_from_ct, self.surface.points_mm[seen])
         return placed[placed[:, 2] < np.percentile(points[:, 2], CROP_PERCENT)]
@@ -198,8 +197,8 @@ class PoseSearch:
         return np.linalg.inv(ct_from_camera)
 
     def _polished(self, points: Points, camera_from_ct: Transform, reach_mm: float) -> Transform:
-        """Point-to-plane once more, with the mesh's own normals and Tukey weights: small_gicp
-        estimates normals from neighbours, and those leave half a millimetre."""
+        """Point-to-plane ICP with the mesh's own normals and Tukey weights: small_gicp estimates
+        normals from neighbours, which leaves an error of half a millimetre."""
         middle = self._middle
         for _ in range(_POLISH):
             placed = transform_points(np.linalg.inv(camera_from_ct), points)

@@ -10,7 +10,7 @@ from tumortrack.core.geometry import rigid, transform_points
 from tumortrack.core.types import Anatomy, Mesh
 from tumortrack.simulate.scene_folder import Scene
 from tumortrack_lab.peers.base import Fit, rigid_carry, stopwatch
-from tumortrack_lab.peers.pose_search import Points, PoseSearch, RigidConfig, Transform
+from tumortrack_lab.peers.pose_search import Direction, Points, PoseSearch, RigidConfig, Transform
 
 # Barycentric points of a tetrahedron that integrate quadratics exactly (Keast 1986, 4 points).
 _NEAR, _FAR = 0.1381966011250105, 0.5854101966249685
@@ -19,9 +19,7 @@ _NEAR, _FAR = 0.1381966011250105, 0.5854101966249685
 class Rigid:
     """The best rigid pose as a peer."""
 
-    def __init__(
-        self, anatomy_ct: Anatomy, up_lps: tuple[float, float, float], config: RigidConfig
-    ) -> None:
+    def __init__(self, anatomy_ct: Anatomy, up_lps: Direction, config: RigidConfig) -> None:
         self.name = "rigid" if config.orientation == "facing" else "rigid_any_rotation"
         with stopwatch() as watch:
             self._search = PoseSearch(anatomy_ct, up_lps, config)
@@ -50,7 +48,7 @@ class RigidBound:
     name = "rigid_bound"
     prepare_s = 0.0
 
-    def __init__(self, anatomy_ct: Anatomy, up_lps: tuple[float, float, float]) -> None:
+    def __init__(self, anatomy_ct: Anatomy, up_lps: Direction) -> None:
         self._organ = anatomy_ct.organ
 
     def fit(self, scene: Scene) -> Fit:
@@ -92,8 +90,8 @@ def fit_over_volume(source: Mesh, target: Mesh) -> tuple[Transform, float]:
     """``target_from_source`` with the least squared displacement over the source's volume.
 
     The integral over the volume is exact for a displacement that is linear in each tetrahedron
-    (reference point, triangle); the sum does not depend on the reference point but through the
-    displacement given to it, for which the vertices' mean is taken.
+    (reference point, triangle). The reference point matters only through its own displacement, for
+    which the vertices' mean is taken.
 
     Returns:
         The 4 x 4 rigid transform and the root mean square displacement it leaves, mm.

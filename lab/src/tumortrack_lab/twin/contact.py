@@ -1,7 +1,7 @@
-"""Rigid obstacles, frictionless: the signed distance of points to them, and what they push with.
+"""Frictionless contact with rigid obstacles: signed distances and penalty forces.
 
-Contact is measured at the points of the anatomy's own fine surface, which ride on the
-tetrahedra: a penalty of stiffness x depth^2 / 2 per area (kPa/mm). What sinks in is reported.
+Contact is evaluated at points of the anatomy's own fine surface, which are embedded in the
+tetrahedra: a penalty of stiffness x depth^2 / 2 per area (kPa/mm). The penetration is reported.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from tumortrack_lab.tets import Embedding
 if TYPE_CHECKING:
     from scipy.sparse import csr_matrix
 
-_TOUCHING_MM = 1e-6  # what just touches will push back
+_TOUCHING_MM = 1e-6  # what only touches counts in the stiffness
 
 Points = Float64[np.ndarray, "n 3"]
 Distances = Float64[np.ndarray, " n"]
@@ -92,7 +92,7 @@ class Rod:
 
 @dataclass(frozen=True, eq=False)
 class Contact:
-    """A surface (points riding on nodes, an area each) that obstacles push back."""
+    """A surface (embedded points, an area each) that obstacles push back."""
 
     surface: Embedding
     areas_mm2: Float64[np.ndarray, " m"]
@@ -119,7 +119,7 @@ class Contact:
         return -(push @ normal)
 
     def depth_mm(self, nodes_mm: Points, obstacles: Obstacles) -> float:
-        """How far the surface sinks into an obstacle at worst."""
+        """The deepest penetration of the surface into an obstacle."""
         points = self.surface.carry(nodes_mm)
         return max(0.0, *(-float(o.distance(points)[0].min()) for o in obstacles))
 

@@ -184,7 +184,7 @@ class StateCache:
         return self._path(name).exists()
 
     def get(self, name: str, say: Callable[[str], None]) -> EquilibriumState:
-        """The state, solved and kept if it is not there yet; ``say`` hears of each load step."""
+        """The state, solved and kept if it is not there yet; ``say`` gets a line per load step."""
         if not self.has(name):
             self._solve(name, say)
         tensors, about = self._read(name)

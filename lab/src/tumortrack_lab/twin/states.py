@@ -1,4 +1,4 @@
-"""What is done to the organ on the bench: one function per kind of experiment.
+"""The experiments on the organ: one function per kind.
 
 After the paper's section Experiments, and Altamar et al. 2011 (doi 10.1117/12.877992) for G1.
 D0: as in the CT, taken free of stress. D1, D2, D3: the midsection pressed to 4, 8, 12 mm less
