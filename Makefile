@@ -6,7 +6,7 @@ SETUP := .venv/.installed
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: help setup debian demo test check bench soak results headstart training-speed clean
+.PHONY: help setup debian demo test check replay bench soak results headstart training-speed clean
 
 help:  ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 10
@@ -33,6 +33,9 @@ debian:  ## what tests need of Debian (ROS, RViz, Chromium), where it can be ins
 
 test: check debian  ## check, then all tests
 	OMP_NUM_THREADS=1 $(BIN)/pytest -n 3 --dist loadfile --no-loadscope-reorder
+
+replay: setup  ## has any number changed since runs/replay.json? Without that file: record it (4 minutes; ARGS=--quick)
+	$(BIN)/python tools/replay.py either runs/replay.json $(ARGS)
 
 bench: setup  ## speed of every part beside its naive form; fills docs/performance.md (10 to 13 minutes; ARGS=--quick)
 	$(BIN)/tumortrack bench --curves --document docs/performance.md $(ARGS)
