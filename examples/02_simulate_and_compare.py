@@ -30,7 +30,7 @@ def main(out: Path) -> None:
     drags = DragConfig(steps=CONFIGURATIONS[2])  # of the paper's six; 3 is milder
     config = SceneConfig(noise=D405_NOISE, deform=(drags,))
     simulator = Simulator(case.anatomy, case.up_lps, config)
-    stage = simulator.stage(SceneRecipe(seed=3, stream="test", index=0))
+    stage = simulator.render(SceneRecipe(seed=3, stream="test", index=0))
     scene = Scene(stage.cloud, simulator.reference(stage), stage.frame)
     if not (out / "scene").exists():
         write_scene(out / "scene", scene)

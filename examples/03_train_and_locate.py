@@ -13,8 +13,7 @@ import msgspec
 
 from tumortrack.core.store import MANIFEST, sha256_of
 from tumortrack.imaging.case import load_case
-from tumortrack.simulate.bodies import body_for
-from tumortrack.simulate.scene import SceneRecipe, Simulator
+from tumortrack.simulate.scene import SceneRecipe, Simulator, body_for
 from tumortrack.tracking.tracker import Tracker
 from tumortrack.training.presets import clinic
 from tumortrack.training.train import TrainingRun, TrainingStatus, train
@@ -45,7 +44,7 @@ def main(out: Path, steps: int) -> None:
     # Another seed: other states of the organ's elastic body than those that training drew.
     body = body_for(case.anatomy, case.up_lps, config.scene, seed=1)
     simulator = Simulator(case.anatomy, case.up_lps, config.scene, body)
-    stage = simulator.stage(SceneRecipe(seed=1, stream="test", index=0))
+    stage = simulator.render(SceneRecipe(seed=1, stream="test", index=0))
     estimate = Tracker(model).locate(stage.cloud, grid=48)
     for name, part in estimate.report["parts"].items():
         x, y, z = part["center_mm"]

@@ -15,9 +15,8 @@ from tumortrack.sense.camera import d405, project
 from tumortrack.sense.cloud import CloudConfig
 from tumortrack.sense.noise import D405_NOISE
 from tumortrack.sense.render import render_depth
-from tumortrack.simulate.batched.motion import BatchedMotion
 from tumortrack.simulate.batched.plan import unsupported
-from tumortrack.simulate.batched.raster import depth_images
+from tumortrack.simulate.batched.render import BatchedMotion, depth_images
 from tumortrack.simulate.batched.stream import DeviceStream
 from tumortrack.simulate.dataset import SceneStream
 from tumortrack.simulate.deform import (
@@ -72,10 +71,10 @@ def both(request, pool):
     return reference, DeviceStream(reference, CPU)
 
 
-def reference_stages(reference, index):
+def rendered(reference, index):
     simulator = Simulator(ANATOMY, UP, reference.config)
     recipes = [SceneRecipe(5, "train", i) for i in range(index * SIZE, (index + 1) * SIZE)]
-    return [simulator.stage(recipe) for recipe in recipes]
+    return [simulator.render(recipe) for recipe in recipes]
 
 
 def test_a_batch_is_the_reference_s(both):
@@ -100,15 +99,15 @@ def test_depth_images_are_the_reference_s_but_for_single_pixels(both):
     reference, device = both
     pictured = device.pictured(device.plan(1))
     plan, depth_mm = pictured.plan, pictured.depth_mm
-    for row, stage in enumerate(reference_stages(reference, 1)):
-        seen, expected = depth_mm[row].numpy(), stage.frame.depth_mm
+    for row, scene in enumerate(rendered(reference, 1)):
+        seen, expected = depth_mm[row].numpy(), scene.frame.depth_mm
         assert np.sum(np.isnan(seen) != np.isnan(expected)) <= 2
         off = np.abs(seen - expected)
         assert np.nanmedian(off) < 1e-4
         assert np.nansum(off > 0.01) <= 2
         assert np.isfinite(expected).sum() > 300
         near, far = plan.near_mm[row], plan.far_mm[row]
-        assert np.sum((expected > near) & (expected < far)) >= len(stage.cloud.points_mm)
+        assert np.sum((expected > near) & (expected < far)) >= len(scene.cloud.points_mm)
 
 
 def test_labelled_points_keep_their_order_by_part_and_side(both, pool):
@@ -136,8 +135,8 @@ def test_scenes_that_show_too_little_are_drawn_again(pool):
     assert (pictured.available >= 200).all()
     same = (plan.camera_from_ct == first.camera_from_ct).all(axis=(1, 2))
     np.testing.assert_array_equal(same, ~again)
-    for pose, stage in zip(plan.camera_from_ct, reference_stages(reference, 0), strict=True):
-        np.testing.assert_array_equal(pose, stage.camera_from_ct)
+    for pose, scene in zip(plan.camera_from_ct, rendered(reference, 0), strict=True):
+        np.testing.assert_array_equal(pose, scene.camera_from_ct)
 
 
 def test_a_range_that_shows_nothing_is_an_error(pool):

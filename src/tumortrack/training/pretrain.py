@@ -33,10 +33,10 @@ from tumortrack.registration.canonical_frame import (
 from tumortrack.registration.config import RegistrationHeadConfig
 from tumortrack.registration.network import RegistrationNetwork
 from tumortrack.registration.rest_shape import long_axis_of
-from tumortrack.simulate.bodies import body_for
 from tumortrack.simulate.dataset import Batch, SceneStream
 from tumortrack.simulate.elastic.body import ElasticBody
 from tumortrack.simulate.occupancy import FixedPoints
+from tumortrack.simulate.scene import body_for
 from tumortrack.training.head_start import save_start
 from tumortrack.training.loader import batches, default_workers, network_leaves
 from tumortrack.training.model import choose_device

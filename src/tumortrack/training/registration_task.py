@@ -18,9 +18,8 @@ from tumortrack.registration.hypotheses import best_fit, first_motions, repaired
 from tumortrack.registration.motion import ElasticMotion
 from tumortrack.registration.network import RegistrationNetwork
 from tumortrack.registration.rest_shape import shape_of
-from tumortrack.simulate.bodies import body_for
 from tumortrack.simulate.occupancy import FixedPoints, organ_pool
-from tumortrack.simulate.scene import Simulator
+from tumortrack.simulate.scene import Simulator, body_for
 from tumortrack.simulate.targets import draw_targets
 from tumortrack.training.model import Model, UncertaintyCalibration
 from tumortrack.training.networks import Network

@@ -8,10 +8,9 @@ from typing import Protocol
 import torch
 
 from tumortrack.occupancy.network import OccupancyNetwork
-from tumortrack.simulate.bodies import body_for
 from tumortrack.simulate.elastic.body import ElasticBody
 from tumortrack.simulate.occupancy import OccupancyPool, PointSource
-from tumortrack.simulate.scene import Simulator
+from tumortrack.simulate.scene import Simulator, body_for
 from tumortrack.training.model import Model
 from tumortrack.training.networks import Network
 from tumortrack.training.registration_task import RegistrationTask

@@ -1,4 +1,9 @@
-"""The addressable stream of training batches, made on a device."""
+"""The addressable stream of training batches, made on a device.
+
+Random numbers are drawn on the host, scene by scene (``plan``), so that a recipe is the same scene
+however it is made. Work on every vertex, pixel and point runs batched (``render``). The compiled
+scenes of ``simulate.scene`` are the reference.
+"""
 
 from __future__ import annotations
 
@@ -7,18 +12,17 @@ from functools import cached_property
 
 import numpy as np
 import torch
-from jaxtyping import Float32, Int32, Int64
+from jaxtyping import Float32, Int32, Int64, UInt8
 from torch import Tensor
 
 from tumortrack.core.errors import InputError
+from tumortrack.core.types import Intrinsics
 from tumortrack.sense.camera import d405
 from tumortrack.sense.cloud import FEWEST_POINTS, draw_some
-from tumortrack.simulate.batched.motion import BatchedMotion
 from tumortrack.simulate.batched.plan import BatchPlan, plan_scenes, unsupported
-from tumortrack.simulate.batched.raster import depth_images
-from tumortrack.simulate.batched.sampling import DevicePool, clouds_from_depth, count_in_range
+from tumortrack.simulate.batched.render import BatchedMotion, depth_images
 from tumortrack.simulate.dataset import SceneStream, refill
-from tumortrack.simulate.occupancy import OccupancyPool
+from tumortrack.simulate.occupancy import OccupancyPool, PartPool
 from tumortrack.simulate.scene import ATTEMPTS, SceneRecipe, Simulator, shows_nothing
 
 # clouds_mm (b, n, 3), points_mm (b, q, 3), labels (b, q), camera_from_ct (b, 4, 4)
@@ -27,8 +31,8 @@ Tensors = tuple[Tensor, Tensor, Tensor, Tensor]
 
 @dataclass(frozen=True, eq=False)
 class Pictured:
-    """A plan whose images show enough; those, their pixels in range up to each (on the device) and
-    in all (on the host)."""
+    """A plan whose images show enough, these images, and their pixels in range: counted up to each
+    pixel (on the device) and in total (on the host)."""
 
     plan: BatchPlan
     depth_mm: Float32[Tensor, "b h w"]
@@ -38,8 +42,8 @@ class Pictured:
 
 @dataclass(frozen=True, eq=False)
 class Chosen:
-    """Which of its pixels in range become a scene's cloud, and which points of the pools (first,
-    count; the last of those anywhere) it looks at."""
+    """The pixels in range that become a scene's cloud, and the points of the pools (first, count;
+    the last of those anywhere) that it considers."""
 
     ranks: Int32[np.ndarray, "b n"]
     windows: Int64[np.ndarray, "b w 2"]
@@ -48,11 +52,11 @@ class Chosen:
 class DeviceStream:
     """The batches of a ``SceneStream`` as tensors on a device.
 
-    Float32 rounding apart, which may turn a pixel on a silhouette, a batch has the stream's
+    Apart from float32 rounding, which may flip a pixel on a silhouette, a batch has the stream's
     values; a scene's labelled points come in another order. A batch is made in four steps, so that
-    others can work ahead: ``plan`` (host), ``pictured`` (device), ``chosen`` (host), ``finished``
-    (device). All that comes back from the device is each scene's number of pixels in range, on
-    which the random choice among them depends.
+    they can be pipelined: ``plan`` (host), ``pictured`` (device), ``chosen`` (host), ``finished``
+    (device). Only each scene's number of pixels in range returns from the device; the random
+    choice among them depends on it.
 
     Raises:
         InputError: a configuration that ``unsupported`` refuses.
@@ -92,8 +96,8 @@ class DeviceStream:
         return self.finished(pictured, self.chosen(pictured))
 
     def plan(self, *indices: int) -> BatchPlan:
-        """What chance decides in the batches with these numbers, up to their pictures; no device
-        is needed. Several are made together, their scenes one batch's after another's."""
+        """The random part of the batches with these numbers, up to their images; no device is
+        needed. Several are made together, their scenes batch after batch."""
         size, seed, name = self._stream.batch_size, self._stream.seed, self._stream.stream
         numbers = (index * size + row for index in indices for row in range(size))
         recipes = [SceneRecipe(seed, name, number) for number in numbers]
@@ -101,7 +105,7 @@ class DeviceStream:
 
     @torch.no_grad()
     def pictured(self, plan: BatchPlan) -> Pictured:
-        """The plan's depth images, with another attempt at scenes that show too little.
+        """The plan's depth images; scenes that show too little are drawn again.
 
         Raises:
             TumortrackError: no pose of a scene shows enough of the organ.
@@ -121,7 +125,7 @@ class DeviceStream:
             depth_mm[rows], counted[rows] = self._picture(again)
 
     def chosen(self, pictured: Pictured) -> Chosen:
-        """What is drawn after the pictures. Needs no device, so that a thread can do it beside
+        """What is drawn after the images. Needs no device, so that a thread can do it alongside
         the device's work."""
         assert isinstance(self._stream.pool, OccupancyPool)
         plan, n = pictured.plan, self._stream.config.cloud.n_points
@@ -147,7 +151,7 @@ class DeviceStream:
         return clouds_mm, points_mm.permute(1, 2, 0).contiguous(), labels, poses
 
     def depth_images(self, plan: BatchPlan) -> Float32[Tensor, "b h w"]:
-        """What the cameras of a plan see of the organ: depth in mm, NaN where there is nothing."""
+        """The organ's depth images of a plan, mm, NaN where there is nothing."""
         vertices_ct, faces = self._organ
         everywhere = vertices_ct[:, None].expand(-1, len(plan.recipes), -1)
         vertices_mm = BatchedMotion.of(plan, self._device).carry(everywhere)
@@ -167,3 +171,81 @@ def why_not(stream: SceneStream) -> str | None:
     if not isinstance(stream.pool, OccupancyPool):
         return "Points that are the same in every scene: made on the CPU alone"
     return unsupported(stream.config)
+
+
+def count_in_range(
+    depth_mm: Float32[Tensor, "b h w"],
+    near_mm: Float32[Tensor, " b"],
+    far_mm: Float32[Tensor, " b"],
+) -> Int32[Tensor, "b hw"]:
+    """The running count, in row-major order, of each image's pixels strictly within its depths."""
+    flat = depth_mm.flatten(1)
+    inside = (flat > near_mm[:, None]) & (flat < far_mm[:, None])
+    return inside.cumsum(1, dtype=torch.int32)
+
+
+def clouds_from_depth(
+    depth_mm: Float32[Tensor, "b h w"],
+    counted: Int32[Tensor, "b hw"],
+    ranks: Int32[Tensor, "b n"],
+    intrinsics: Intrinsics,
+) -> Float32[Tensor, "b n 3"]:
+    """The points of the pixels in range with these ranks, camera frame, mm; ``counted`` is what
+    ``count_in_range`` returned."""
+    pixel = torch.searchsorted(counted, ranks + 1)
+    z = depth_mm.flatten(1).gather(1, pixel).double()
+    row = pixel.div(intrinsics.width, rounding_mode="floor")
+    x = (pixel - row * intrinsics.width - intrinsics.cx) * (z / intrinsics.fx)
+    y = (row - intrinsics.cy) * (z / intrinsics.fy)
+    return torch.stack([x, y, z], -1).float()
+
+
+class DevicePool:
+    """An ``OccupancyPool`` on a device."""
+
+    def __init__(self, pool: OccupancyPool, device: torch.device) -> None:
+        self._per_side = pool.config.per_side
+        self._parts = [_DevicePart(part, device) for part in pool.parts]
+        self._far_points_ct = torch.tensor(pool.far_points_ct.T, device=device)
+        self._far_labels = torch.tensor(pool.far_labels, device=device)
+
+    def take(
+        self, windows: Int64[Tensor, "b w 2"], widest: list[int]
+    ) -> tuple[Float32[Tensor, "3 b q"], UInt8[Tensor, "b q"]]:
+        """The points (undeformed CT frame) and labels that ``OccupancyPool.draw`` takes from these
+        windows (first, count); on each side of a part the nearest first. ``widest`` is each
+        column's greatest count."""
+        points, labels = [], []
+        for part, window, width in zip(self._parts, windows.unbind(1), widest, strict=False):
+            chosen = part.nearest(window, width, self._per_side)
+            points.append(part.points_ct[:, chosen])
+            labels.append(part.labels[chosen])
+        far = _neighbours(windows[:, -1, 0], widest[-1], len(self._far_labels))
+        points.append(self._far_points_ct[:, far])
+        labels.append(self._far_labels[far])
+        return torch.cat(points, -1), torch.cat(labels, -1)
+
+
+class _DevicePart:
+    def __init__(self, part: PartPool, device: torch.device) -> None:
+        self.points_ct = torch.tensor(part.points_ct.T, device=device)
+        self.labels = torch.tensor(part.labels, device=device)
+        self._distance_mm = torch.tensor(part.distance_mm, device=device)
+        self._inside = torch.tensor(part.inside, device=device)
+
+    def nearest(self, window: Int64[Tensor, "b 2"], width: int, k: int) -> Int64[Tensor, "b 2k"]:
+        """Of the window's points the k inside that are nearest to the surface, and k outside, the
+        nearest first."""
+        index = _neighbours(window[:, 0], width, len(self.labels))
+        beyond = torch.arange(width, device=index.device) >= window[:, 1:]
+        distance, inside = self._distance_mm[index], self._inside[index]
+        sides = []
+        for other in (~inside, inside):
+            left_out = distance.masked_fill(other | beyond, torch.inf)
+            nearest = left_out.topk(k, dim=1, largest=False).indices
+            sides.append(index.gather(1, nearest))
+        return torch.cat(sides, 1)
+
+
+def _neighbours(first: Int64[Tensor, " b"], count: int, total: int) -> Int64[Tensor, "b count"]:
+    return (first[:, None] + torch.arange(count, device=first.device)) % total

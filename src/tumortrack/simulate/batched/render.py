@@ -1,20 +1,98 @@
-"""Depth images of a batch of surfaces with the same triangles: a z-buffer of scattered maxima.
+"""Points and depth images of a batch of scenes as tensors.
 
-Every triangle that faces the camera is spread over the pixels of its box, and each pixel keeps the
-greatest 1/z: precision and tolerance are those of ``sense.render``, so that the same vertices
-give the same image, in whatever order a device works.
+Motion (drags, squeeze and bend, the camera's pose) is written component by component: matrix
+products may be rounded to fewer bits by a device's settings (TF32, autocast), which at a tumor's
+distance is a tenth of a millimetre.
+
+Depth images of surfaces with the same triangles are a z-buffer of scattered maxima: every triangle
+that faces the camera is spread over the pixels of its box, and each pixel keeps the greatest 1/z.
+Precision and tolerance are those of ``sense.render``, so that the same vertices give the same
+image, in whatever order a device works.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
+import numpy as np
 import torch
 from jaxtyping import Float32, Float64, Int64
 from torch import Tensor
 
 from tumortrack.core.types import Intrinsics
+from tumortrack.simulate.batched.plan import BatchPlan
 
+_SMALLEST = -12.0  # a drag's exponents below, factors of 6e-6, count as zero
 _NEAREST_MM = 1.0
-_EDGE = -1e-5  # weights of a point on an edge may be so much below 0
+_EDGE = -1e-5  # barycentric weights of a point on an edge may be this far below 0
+
+
+@dataclass(frozen=True, eq=False)
+class BatchedMotion:
+    """The maps of b scenes from the CT frame to their cameras', as tensors on a device."""
+
+    centres_ct: Float32[Tensor, "3 b k"]
+    shifts_mm: Float32[Tensor, "3 b k"]
+    sigmas_mm: Float32[Tensor, "b k"]
+    stretches: Float32[Tensor, "s 20 b"]
+    camera_from_ct: Float32[Tensor, "b 4 4"]
+
+    @classmethod
+    def of(cls, plan: BatchPlan, device: torch.device) -> BatchedMotion:
+        def sent(array: np.ndarray) -> Tensor:
+            return torch.from_numpy(array.astype(np.float32)).to(device, non_blocking=True)
+
+        return cls(
+            sent(plan.centres_ct).permute(2, 0, 1),
+            sent(plan.shifts_mm).permute(2, 0, 1),
+            sent(plan.sigmas_mm),
+            sent(plan.stretches).permute(1, 2, 0),
+            sent(plan.camera_from_ct),
+        )
+
+    def carry(self, points_ct: Float32[Tensor, "3 b n"]) -> Float32[Tensor, "3 b n"]:
+        """Points of the undeformed CT frame at their places before the cameras, mm."""
+        points = drag(points_ct, self.centres_ct, self.shifts_mm, self.sigmas_mm)
+        for numbers in self.stretches:
+            points = _stretch(points, numbers[:, :, None])
+        return _affine(points, self.camera_from_ct)
+
+
+def drag(
+    points_ct: Float32[Tensor, "3 b n"],
+    centres_ct: Float32[Tensor, "3 b k"],
+    shifts_mm: Float32[Tensor, "3 b k"],
+    sigmas_mm: Float32[Tensor, "b k"],
+) -> Float32[Tensor, "3 b n"]:
+    """k drags one after the other, as ``simulate.deform.drag``."""
+    points = points_ct.clone()
+    scales = -0.5 / (sigmas_mm * sigmas_mm)
+    for k in range(sigmas_mm.shape[1]):
+        offset = points - centres_ct[:, :, k, None]
+        exponent = offset.square_().sum(0).mul_(scales[:, k, None])
+        factor = torch.threshold_(exponent, _SMALLEST, -torch.inf).exp_()
+        points.addcmul_(factor, shifts_mm[:, :, k, None])
+    return points
+
+
+def _stretch(
+    points: Float32[Tensor, "3 b n"], numbers: Float32[Tensor, "20 b 1"]
+) -> Float32[Tensor, "3 b n"]:
+    """A squeeze and bend, as ``simulate.deform.stretch``."""
+    centre, rows = numbers[:3], numbers[3:12].unflatten(0, (3, 3))
+    along, across, sagitta, reach = numbers[12:15], numbers[15:18], numbers[18], numbers[19]
+    offset = points - centre
+    bend = sagitta * ((offset * along).sum(0) / reach).square()
+    offset = offset + bend * across
+    return torch.stack([(offset * row).sum(0) for row in rows]) + centre
+
+
+def _affine(
+    points: Float32[Tensor, "3 b n"], b_from_a: Float32[Tensor, "b 4 4"]
+) -> Float32[Tensor, "3 b n"]:
+    x, y, z = points
+    rows = b_from_a[:, :3, :, None].unbind(1)
+    return torch.stack([x * r[:, 0] + y * r[:, 1] + z * r[:, 2] + r[:, 3] for r in rows])
 
 
 def depth_images(
@@ -43,8 +121,8 @@ def _planes(
     left: Int64[Tensor, " t"],
     top: Int64[Tensor, " t"],
 ) -> Float64[Tensor, "3 3 t"]:
-    """The weights of corners a and b, and 1/z: at a box's first pixel, by how much a column adds
-    to them, by how much a row."""
+    """The barycentric weights of corners a and b, and 1/z: at a box's first pixel, their increment
+    by column and by row."""
     (ua, va, wa), (ub, vb, wb), (uc, vc, wc) = (
         corners.double().unflatten(1, (3, 3)).permute(1, 2, 0)
     )
@@ -97,7 +175,7 @@ def _front(
 def _pixels(
     wide: Int64[Tensor, " t"], high: Int64[Tensor, " t"]
 ) -> tuple[Int64[Tensor, " p"], Int64[Tensor, " p"], Int64[Tensor, " p"]]:
-    """All pixels of all boxes: whose, and which column and row of it."""
+    """All pixels of all boxes: their triangle, and their column and row in its box."""
     count = wide * high
     triangle = torch.repeat_interleave(count)
     place = torch.arange(len(triangle), device=wide.device) - (count.cumsum(0) - count)[triangle]
