@@ -16,7 +16,7 @@ from tumortrack.sense.cloud import CloudConfig
 from tumortrack.sense.noise import D405_NOISE
 from tumortrack.sense.render import render_depth
 from tumortrack.simulate.batched.plan import unsupported
-from tumortrack.simulate.batched.render import BatchedMotion, depth_images
+from tumortrack.simulate.batched.render import carried, depth_images
 from tumortrack.simulate.batched.stream import DeviceStream
 from tumortrack.simulate.dataset import SceneStream
 from tumortrack.simulate.deform import (
@@ -184,14 +184,14 @@ def test_motion_carries_as_the_deformation_and_pose_do(both):
     plan = device.plan(0)
     points_ct = ANATOMY.parts[1].vertices_mm
     sent = torch.tensor(points_ct.T, dtype=torch.float32)[:, None].expand(-1, SIZE, -1)
-    carried = BatchedMotion.of(plan, CPU).carry(sent).permute(1, 2, 0).numpy()
+    placed = carried(plan, sent).permute(1, 2, 0).numpy()
     simulator = Simulator(ANATOMY, UP, reference.config)
     moved = []
     for row in range(SIZE):
         drawn = simulator.draw(plan.recipes[row].generator(int(plan.attempts[row])))
         deformed = drawn.deformation.apply(points_ct)
         expected = transform_points(drawn.camera_from_ct, deformed)
-        np.testing.assert_allclose(carried[row], expected, atol=2e-4)
+        np.testing.assert_allclose(placed[row], expected, atol=2e-4)
         moved.append(np.abs(deformed - points_ct).max())
     assert max(moved) > 0.5
 

@@ -24,10 +24,10 @@ from tumortrack.simulate.elastic.finite import (
     CORNERS,
     BlockCholesky,
     ElementLattice,
+    LatticeSolid,
     cube_stiffness,
-    solid_of,
 )
-from tumortrack.simulate.elastic.loads import LOADS, Obstacle, Sag, Swell, in_bed, random_state
+from tumortrack.simulate.elastic.loads import LOADS, expand, in_bed, press, random_state, weigh
 from tumortrack.simulate.elastic.modes import modes_of, patches_of, random_loads
 from tumortrack.simulate.occupancy import OccupancyConfig, OccupancyPool
 from tumortrack.simulate.pose import PoseConfig
@@ -47,7 +47,7 @@ def body() -> ElasticBody:
 
 @pytest.fixture(scope="module")
 def solid():
-    return solid_of(ANATOMY, ElementLattice.around(ORGAN.box_mm, 9.0), 0.49)
+    return LatticeSolid(ANATOMY, ElementLattice.around(ORGAN.box_mm, 9.0), 0.49)
 
 
 @pytest.fixture(scope="module")
@@ -89,7 +89,7 @@ def test_a_pulled_block_stretches_and_narrows_as_theory_says():
     size = np.array([60.0, 30.0, 20.0])
     box = trimesh.creation.box(size)
     block = Anatomy((Mesh(box.vertices, box.faces),))
-    solid = solid_of(block, ElementLattice.around(block.organ.box_mm, 5.0), 0.4)
+    solid = LatticeSolid(block, ElementLattice.around(block.organ.box_mm, 5.0), 0.4)
     assert solid.volume_mm3.sum() == pytest.approx(size.prod())
     side = np.stack(np.meshgrid(*[np.arange(-s / 2 + 0.5, s / 2) for s in size[1:]]), -1)
     face = np.insert(side.reshape(-1, 2), 0, size[0] / 2, axis=1)  # a point each mm2
@@ -200,7 +200,7 @@ def bed(
 def test_a_plate_flattens_the_organ_against_its_bed(reduced):
     problem, up, patches = bed(reduced), np.array(UP), reduced.patches
     top = float((patches.points_mm @ up).max())
-    Obstacle(up, top - 8.0, (patches.normals @ up > 0).astype(float)).add(problem)
+    press(problem, up, top - 8.0, (patches.normals @ up > 0).astype(float))
     z = problem.equilibrium()
     assert z is not None
     rise = reduced.along(up) @ z
@@ -226,7 +226,7 @@ def test_weight_that_is_no_longer_borne_makes_the_organ_sink_and_flatten(reduced
     up, patches, sunk = np.array(UP), reduced.patches, []
     for modulus in (3 * KPA, 30 * KPA):
         problem = bed(reduced, 2.0, modulus)
-        Sag(-up, 1.0).add(problem)
+        weigh(problem, -up, 1.0)
         z = problem.equilibrium()
         rise = reduced.along(up) @ z
         above = rise[patches.normals @ up > 0.8].mean()
@@ -243,7 +243,7 @@ def test_weight_that_is_no_longer_borne_makes_the_organ_sink_and_flatten(reduced
 @pytest.mark.parametrize("strain", [-0.02, 0.02])
 def test_swelling_changes_the_volume_by_what_is_taken_up(reduced, solid, modes, strain):
     problem = bed(reduced, 0.1)
-    Swell(strain).add(problem)
+    expand(problem, strain)
     state = problem.equilibrium()[: reduced.n_modes]
     field = solid.spread(modes)
     lattice = solid.lattice
@@ -258,13 +258,13 @@ def test_swelling_changes_the_volume_by_what_is_taken_up(reduced, solid, modes, 
     assert moved.volume_mm3 / ORGAN.volume_mm3 - 1 == pytest.approx(strain, rel=0.15)
 
 
-@pytest.mark.parametrize("draw", [draw for draw, _ in LOADS])
-def test_every_load_moves_the_organ_and_none_does_not(reduced, draw):
+@pytest.mark.parametrize("load", [load for load, _ in LOADS])
+def test_every_load_moves_the_organ_and_none_does_not(reduced, load):
     rng, moved = np.random.default_rng(5), []
     for _ in range(12):
         problem = in_bed(reduced, np.array(UP), rng)
         np.testing.assert_allclose(problem.equilibrium(), 0, atol=1e-12)
-        draw(reduced, np.array(UP), rng).add(problem)
+        load(problem, rng)
         z = problem.equilibrium()
         if z is not None:
             moved.append(np.linalg.norm(z[: reduced.n_modes]))

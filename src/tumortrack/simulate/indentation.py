@@ -17,7 +17,7 @@ from scipy.interpolate import PchipInterpolator
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import perpendicular
 from tumortrack.simulate.elastic.equilibrium import ReducedModel
-from tumortrack.simulate.elastic.loads import Load, in_bed, indenter
+from tumortrack.simulate.elastic.loads import in_bed, indent
 
 _DEPTHS = 7
 _FOOT_MM = 2.0  # the tissue is held down this far beyond the instrument's radius
@@ -34,14 +34,15 @@ class Bed:
     up: Float64[np.ndarray, " 3"]
     seed: int
 
-    def under(self, load: Load, what: str) -> Float64[np.ndarray, " m"]:
-        """The unknowns at rest under a load; ``what`` names it in the error.
+    def under(self, what: str, load: Callable[..., None], *how: object) -> np.ndarray:
+        """The unknowns at rest under a load of ``elastic.loads`` with its arguments; ``what`` names
+        it in the error.
 
         Raises:
             InputError: this organ finds no equilibrium.
         """
         problem = in_bed(self.organ, self.up, np.random.default_rng([self.seed, 0xBED]))
-        load.add(problem)
+        load(problem, *how)
         found = problem.equilibrium()
         if found is None:
             raise InputError(
@@ -92,9 +93,8 @@ def indentations(
 
 def _indentation(bed: Bed, patch: int, radius_mm: float, deepest_mm: float) -> Indentation:
     points, outward = bed.organ.patches.points_mm, bed.organ.patches.normals[patch]
-    depths, foot_mm = np.linspace(0, deepest_mm, _DEPTHS), radius_mm + _FOOT_MM
-    loads = [indenter(bed.organ, patch, outward, foot_mm, depth) for depth in depths.tolist()]
-    states = np.stack([bed.under(load, "poke") for load in loads])
+    depths, how = np.linspace(0, deepest_mm, _DEPTHS), (patch, outward, radius_mm + _FOOT_MM)
+    states = np.stack([bed.under("poke", indent, *how, depth) for depth in depths.tolist()])
     axis = _clearest_axis(points, points[patch], outward)
     return Indentation(points[patch], axis, PchipInterpolator(depths, states - states[0]))
 

@@ -22,7 +22,7 @@ from tumortrack.sense.noise import D405_NOISE, NoiseConfig, add_noise
 from tumortrack.sense.render import render_depth
 from tumortrack.simulate.elastic.body import BodyConfig, body_of, reduced_organ
 from tumortrack.simulate.elastic.equilibrium import LEVER_MM
-from tumortrack.simulate.elastic.loads import Swell
+from tumortrack.simulate.elastic.loads import expand
 from tumortrack.simulate.indentation import Bed, Indentation, indentations
 from tumortrack.simulate.pose import PoseConfig, sample_pose
 
@@ -130,7 +130,7 @@ class ScenePlayer:
         near_mm = (config.distance_mm, config.distance_mm)
         self._camera_from_ct = sample_pose(pose, anatomy_ct.organ, up_lps, near_mm, rng)
         bed = Bed(reduced_organ(anatomy_ct, up, config.body, rng), up, seed)
-        self._swollen = bed.under(Swell(config.swell), "swell")
+        self._swollen = bed.under("swell", expand, config.swell)
         self._pushes: tuple[Indentation, ...] = ()
         if config.push_mm > 0:
             self._pushes = indentations(bed, config.places, SHAFT_MM, config.push_mm, rng)

@@ -12,8 +12,6 @@ image, in whatever order a device works.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 import torch
 from jaxtyping import Float32, Float64, Int64
@@ -22,50 +20,37 @@ from torch import Tensor
 from tumortrack.core.types import Intrinsics
 from tumortrack.simulate.batched.plan import BatchPlan
 
+Points = Float32[Tensor, "3 b n"]
+PerFace = Int64[Tensor, " t"]
 _SMALLEST = -12.0  # a drag's exponents below, factors of 6e-6, count as zero
 _NEAREST_MM = 1.0
 _EDGE = -1e-5  # barycentric weights of a point on an edge may be this far below 0
 
 
-@dataclass(frozen=True, eq=False)
-class BatchedMotion:
-    """The maps of b scenes from the CT frame to their cameras', as tensors on a device."""
+def carried(plan: BatchPlan, points_ct: Points) -> Points:
+    """Points of the undeformed CT frame at their places before the plan's cameras, mm."""
 
-    centres_ct: Float32[Tensor, "3 b k"]
-    shifts_mm: Float32[Tensor, "3 b k"]
-    sigmas_mm: Float32[Tensor, "b k"]
-    stretches: Float32[Tensor, "s 20 b"]
-    camera_from_ct: Float32[Tensor, "b 4 4"]
+    def sent(array: np.ndarray) -> Tensor:
+        sent = torch.from_numpy(array.astype(np.float32))
+        return sent.to(points_ct.device, non_blocking=True)
 
-    @classmethod
-    def of(cls, plan: BatchPlan, device: torch.device) -> BatchedMotion:
-        def sent(array: np.ndarray) -> Tensor:
-            return torch.from_numpy(array.astype(np.float32)).to(device, non_blocking=True)
-
-        return cls(
-            sent(plan.centres_ct).permute(2, 0, 1),
-            sent(plan.shifts_mm).permute(2, 0, 1),
-            sent(plan.sigmas_mm),
-            sent(plan.stretches).permute(1, 2, 0),
-            sent(plan.camera_from_ct),
-        )
-
-    def carry(self, points_ct: Float32[Tensor, "3 b n"]) -> Float32[Tensor, "3 b n"]:
-        """Points of the undeformed CT frame at their places before the cameras, mm."""
-        points = drag(points_ct, self.centres_ct, self.shifts_mm, self.sigmas_mm)
-        for numbers in self.stretches:
-            points = _stretch(points, numbers[:, :, None])
-        return _affine(points, self.camera_from_ct)
+    drags = map(sent, (plan.centres_ct, plan.shifts_mm, plan.sigmas_mm))
+    points = _dragged(points_ct.clone(), *drags)
+    for numbers in sent(plan.stretches).permute(1, 2, 0):
+        points = _stretched(points, numbers[:, :, None])
+    x, y, z = points
+    rows = sent(plan.camera_from_ct)[:, :3, :, None].unbind(1)
+    return torch.stack([x * r[:, 0] + y * r[:, 1] + z * r[:, 2] + r[:, 3] for r in rows])
 
 
-def drag(
-    points_ct: Float32[Tensor, "3 b n"],
-    centres_ct: Float32[Tensor, "3 b k"],
-    shifts_mm: Float32[Tensor, "3 b k"],
+def _dragged(
+    points: Points,
+    centres_ct: Float32[Tensor, "b k 3"],
+    shifts_mm: Float32[Tensor, "b k 3"],
     sigmas_mm: Float32[Tensor, "b k"],
-) -> Float32[Tensor, "3 b n"]:
-    """k drags one after the other, as ``simulate.deform.drag``."""
-    points = points_ct.clone()
+) -> Points:
+    """k drags one after the other, in place, as ``simulate.deform.drag``."""
+    centres_ct, shifts_mm = centres_ct.permute(2, 0, 1), shifts_mm.permute(2, 0, 1)
     scales = -0.5 / (sigmas_mm * sigmas_mm)
     for k in range(sigmas_mm.shape[1]):
         offset = points - centres_ct[:, :, k, None]
@@ -75,9 +60,7 @@ def drag(
     return points
 
 
-def _stretch(
-    points: Float32[Tensor, "3 b n"], numbers: Float32[Tensor, "20 b 1"]
-) -> Float32[Tensor, "3 b n"]:
+def _stretched(points: Points, numbers: Float32[Tensor, "20 b 1"]) -> Points:
     """A squeeze and bend, as ``simulate.deform.stretch``."""
     centre, rows = numbers[:3], numbers[3:12].unflatten(0, (3, 3))
     along, across, sagitta, reach = numbers[12:15], numbers[15:18], numbers[18], numbers[19]
@@ -87,21 +70,12 @@ def _stretch(
     return torch.stack([(offset * row).sum(0) for row in rows]) + centre
 
 
-def _affine(
-    points: Float32[Tensor, "3 b n"], b_from_a: Float32[Tensor, "b 4 4"]
-) -> Float32[Tensor, "3 b n"]:
-    x, y, z = points
-    rows = b_from_a[:, :3, :, None].unbind(1)
-    return torch.stack([x * r[:, 0] + y * r[:, 1] + z * r[:, 2] + r[:, 3] for r in rows])
-
-
 def depth_images(
     points_mm: Float32[Tensor, "3 b v"], faces: Int64[Tensor, "f 3"], intrinsics: Intrinsics
 ) -> Float32[Tensor, "b h w"]:
     """Depth along z (mm, NaN where nothing is hit) of b closed surfaces, camera frame."""
     height, width = intrinsics.height, intrinsics.width
-    batch = points_mm.shape[1]
-    corners, area, box = _front(_projected(points_mm, intrinsics), faces, intrinsics)
+    corners, area, box = _front(points_mm, faces, intrinsics)
     scene, left, top, wide, high = box.unbind(1)
     planes = _planes(corners, area, left, top)
     triangle, column, row = _pixels(wide, high)
@@ -110,53 +84,22 @@ def depth_images(
     least = torch.minimum(torch.minimum(share_a, share_b), 1.0 - share_a - share_b)
     here = torch.where(least >= _EDGE, inverse, 0.0).float()
     pixel = ((scene * height + top) * width + left)[triangle] + row * width + column
-    nearest = here.new_zeros(batch * height * width).scatter_reduce_(0, pixel, here, "amax")
-    depth_mm = torch.where(nearest > 0, 1.0 / nearest, torch.nan)
-    return depth_mm.view(batch, height, width)
-
-
-def _planes(
-    corners: Float32[Tensor, "t 9"],
-    area: Float32[Tensor, " t"],
-    left: Int64[Tensor, " t"],
-    top: Int64[Tensor, " t"],
-) -> Float64[Tensor, "3 3 t"]:
-    """The barycentric weights of corners a and b, and 1/z: at a box's first pixel, their increment
-    by column and by row."""
-    (ua, va, wa), (ub, vb, wb), (uc, vc, wc) = (
-        corners.double().unflatten(1, (3, 3)).permute(1, 2, 0)
-    )
-    share = 1.0 / area.double()
-    start_a = ((ub - left) * (vc - top) - (vb - top) * (uc - left)) * share
-    start_b = ((uc - left) * (va - top) - (vc - top) * (ua - left)) * share
-    across_a, across_b = (vb - vc) * share, (vc - va) * share
-    down_a, down_b = (uc - ub) * share, (ua - uc) * share
-    from_a, from_b = wa - wc, wb - wc
-    start = wc + start_a * from_a + start_b * from_b
-    across = across_a * from_a + across_b * from_b
-    down = down_a * from_a + down_b * from_b
-    rows = (start_a, start_b, start, across_a, across_b, across, down_a, down_b, down)
-    return torch.stack(rows).unflatten(0, (3, 3))
-
-
-def _projected(
-    points_mm: Float32[Tensor, "3 b v"], intrinsics: Intrinsics
-) -> Float32[Tensor, "b v 3"]:
-    """Column, row and 1/z (linear in the image, unlike z; -1 behind the camera)."""
-    x, y, z = points_mm
-    before = z > _NEAREST_MM
-    inverse = torch.where(before, 1.0 / z, -1.0)
-    w = inverse.double()
-    u = intrinsics.fx * x.double() * w + intrinsics.cx
-    v = intrinsics.fy * y.double() * w + intrinsics.cy
-    return torch.stack([u.float(), v.float(), inverse], -1)
+    nearest = here.new_zeros(points_mm.shape[1] * height * width)
+    nearest.scatter_reduce_(0, pixel, here, "amax")
+    return torch.where(nearest > 0, 1.0 / nearest, torch.nan).view(-1, height, width)
 
 
 def _front(
-    projected: Float32[Tensor, "b v 3"], faces: Int64[Tensor, "f 3"], intrinsics: Intrinsics
+    points_mm: Float32[Tensor, "3 b v"], faces: Int64[Tensor, "f 3"], intrinsics: Intrinsics
 ) -> tuple[Float32[Tensor, "t 9"], Float32[Tensor, " t"], Int64[Tensor, "t 5"]]:
-    """Of the triangles that face the camera and touch a pixel: corners, area, and box (scene,
-    left, top, width, height)."""
+    """Of the triangles that face the camera and touch a pixel: corners (column, row and 1/z, which
+    is linear in the image; -1 behind the camera), area, and box (scene, left, top, width,
+    height)."""
+    x, y, z = points_mm
+    inverse = torch.where(z > _NEAREST_MM, 1.0 / z, -1.0)
+    u = intrinsics.fx * x.double() * inverse.double() + intrinsics.cx
+    v = intrinsics.fy * y.double() * inverse.double() + intrinsics.cy
+    projected = torch.stack([u.float(), v.float(), inverse], -1)
     corners = projected[:, faces.flatten()].unflatten(1, (-1, 3))  # b f 3 3
     u, v, w = corners.unbind(-1)
     (ua, ub, uc), (va, vb, vc) = u.unbind(-1), v.unbind(-1)
@@ -172,9 +115,30 @@ def _front(
     return corners[scene, face].flatten(1), area[scene, face], torch.cat([scene[:, None], box], 1)
 
 
-def _pixels(
-    wide: Int64[Tensor, " t"], high: Int64[Tensor, " t"]
-) -> tuple[Int64[Tensor, " p"], Int64[Tensor, " p"], Int64[Tensor, " p"]]:
+def _planes(
+    corners: Float32[Tensor, "t 9"],
+    area: Float32[Tensor, " t"],
+    left: PerFace,
+    top: PerFace,
+) -> Float64[Tensor, "3 3 t"]:
+    """The barycentric weights of corners a and b, and 1/z: at a box's first pixel, their increment
+    by column and by row."""
+    parts = corners.double().unflatten(1, (3, 3)).permute(1, 2, 0)
+    (ua, va, wa), (ub, vb, wb), (uc, vc, wc) = parts
+    share = 1.0 / area.double()
+    start_a = ((ub - left) * (vc - top) - (vb - top) * (uc - left)) * share
+    start_b = ((uc - left) * (va - top) - (vc - top) * (ua - left)) * share
+    across_a, across_b = (vb - vc) * share, (vc - va) * share
+    down_a, down_b = (uc - ub) * share, (ua - uc) * share
+    from_a, from_b = wa - wc, wb - wc
+    start = wc + start_a * from_a + start_b * from_b
+    across = across_a * from_a + across_b * from_b
+    down = down_a * from_a + down_b * from_b
+    rows = (start_a, start_b, start, across_a, across_b, across, down_a, down_b, down)
+    return torch.stack(rows).unflatten(0, (3, 3))
+
+
+def _pixels(wide: PerFace, high: PerFace) -> tuple[Int64[Tensor, " p"], ...]:
     """All pixels of all boxes: their triangle, and their column and row in its box."""
     count = wide * high
     triangle = torch.repeat_interleave(count)

@@ -12,17 +12,16 @@ from functools import cached_property
 
 import numpy as np
 import torch
-from jaxtyping import Float32, Int32, Int64, UInt8
+from jaxtyping import Float32, Int32, Int64
 from torch import Tensor
 
 from tumortrack.core.errors import InputError
-from tumortrack.core.types import Intrinsics
 from tumortrack.sense.camera import d405
 from tumortrack.sense.cloud import FEWEST_POINTS, draw_some
 from tumortrack.simulate.batched.plan import BatchPlan, plan_scenes, unsupported
-from tumortrack.simulate.batched.render import BatchedMotion, depth_images
+from tumortrack.simulate.batched.render import carried, depth_images
 from tumortrack.simulate.dataset import SceneStream, refill
-from tumortrack.simulate.occupancy import OccupancyPool, PartPool
+from tumortrack.simulate.occupancy import OccupancyPool
 from tumortrack.simulate.scene import ATTEMPTS, SceneRecipe, Simulator, shows_nothing
 
 # clouds_mm (b, n, 3), points_mm (b, q, 3), labels (b, q), camera_from_ct (b, 4, 4)
@@ -86,9 +85,9 @@ class DeviceStream:
         return vertices, torch.tensor(organ.faces, dtype=torch.int64, device=self._device)
 
     @cached_property
-    def _pool(self) -> DevicePool:
+    def _pool(self) -> _DevicePool:
         assert isinstance(self._stream.pool, OccupancyPool)
-        return DevicePool(self._stream.pool, self._device)
+        return _DevicePool(self._stream.pool, self._device)
 
     def batch(self, index: int) -> Tensors:
         """The batch with this number."""
@@ -131,9 +130,8 @@ class DeviceStream:
         plan, n = pictured.plan, self._stream.config.cloud.n_points
         rng = np.random.default_rng()
         ranks, windows = [], []
-        for state, count, wanted in zip(
-            plan.states, pictured.available.tolist(), plan.n_points.tolist(), strict=True
-        ):
+        counts = pictured.available.tolist(), plan.n_points.tolist()
+        for state, count, wanted in zip(plan.states, *counts, strict=True):
             rng.bit_generator.state = state
             ranks.append(refill(draw_some(count, wanted, rng), n))
             windows.append(self._stream.pool.windows(rng))
@@ -143,24 +141,31 @@ class DeviceStream:
     def finished(self, pictured: Pictured, chosen: Chosen) -> Tensors:
         """The clouds, and labelled points at their places."""
         plan, windows = pictured.plan, chosen.windows
-        ranks = self._sent(chosen.ranks)
-        clouds_mm = clouds_from_depth(pictured.depth_mm, pictured.counted, ranks, self._intrinsics)
+        clouds_mm = self._clouds(pictured, self._sent(chosen.ranks))
         points_ct, labels = self._pool.take(self._sent(windows), windows[:, :, 1].max(0).tolist())
-        points_mm = BatchedMotion.of(plan, self._device).carry(points_ct)
+        points_mm = carried(plan, points_ct)
         poses = self._sent(plan.camera_from_ct.astype(np.float32))
         return clouds_mm, points_mm.permute(1, 2, 0).contiguous(), labels, poses
 
-    def depth_images(self, plan: BatchPlan) -> Float32[Tensor, "b h w"]:
-        """The organ's depth images of a plan, mm, NaN where there is nothing."""
+    def _picture(self, plan: BatchPlan) -> tuple[Float32[Tensor, "b h w"], Int32[Tensor, "b hw"]]:
+        """Depth images (mm, NaN where there is nothing), and the running count, in row-major order,
+        of their pixels strictly within the plan's depths."""
         vertices_ct, faces = self._organ
         everywhere = vertices_ct[:, None].expand(-1, len(plan.recipes), -1)
-        vertices_mm = BatchedMotion.of(plan, self._device).carry(everywhere)
-        return depth_images(vertices_mm, faces, self._intrinsics)
+        depth_mm = depth_images(carried(plan, everywhere), faces, self._intrinsics)
+        near, far = self._sent(plan.near_mm)[:, None], self._sent(plan.far_mm)[:, None]
+        flat = depth_mm.flatten(1)
+        return depth_mm, ((flat > near) & (flat < far)).cumsum(1, dtype=torch.int32)
 
-    def _picture(self, plan: BatchPlan) -> tuple[Float32[Tensor, "b h w"], Int32[Tensor, "b hw"]]:
-        depth_mm = self.depth_images(plan)
-        near, far = self._sent(plan.near_mm), self._sent(plan.far_mm)
-        return depth_mm, count_in_range(depth_mm, near, far)
+    def _clouds(self, pictured: Pictured, ranks: Int32[Tensor, "b n"]) -> Float32[Tensor, "b n 3"]:
+        """The points of the pixels in range with these ranks, camera frame, mm."""
+        camera = self._intrinsics
+        pixel = torch.searchsorted(pictured.counted, ranks + 1)
+        z = pictured.depth_mm.flatten(1).gather(1, pixel).double()
+        row = pixel.div(camera.width, rounding_mode="floor")
+        x = (pixel - row * camera.width - camera.cx) * (z / camera.fx)
+        y = (row - camera.cy) * (z / camera.fy)
+        return torch.stack([x, y, z], -1).float()
 
     def _sent(self, array: np.ndarray) -> Tensor:
         return torch.from_numpy(array).to(self._device, non_blocking=True)
@@ -173,79 +178,43 @@ def why_not(stream: SceneStream) -> str | None:
     return unsupported(stream.config)
 
 
-def count_in_range(
-    depth_mm: Float32[Tensor, "b h w"],
-    near_mm: Float32[Tensor, " b"],
-    far_mm: Float32[Tensor, " b"],
-) -> Int32[Tensor, "b hw"]:
-    """The running count, in row-major order, of each image's pixels strictly within its depths."""
-    flat = depth_mm.flatten(1)
-    inside = (flat > near_mm[:, None]) & (flat < far_mm[:, None])
-    return inside.cumsum(1, dtype=torch.int32)
-
-
-def clouds_from_depth(
-    depth_mm: Float32[Tensor, "b h w"],
-    counted: Int32[Tensor, "b hw"],
-    ranks: Int32[Tensor, "b n"],
-    intrinsics: Intrinsics,
-) -> Float32[Tensor, "b n 3"]:
-    """The points of the pixels in range with these ranks, camera frame, mm; ``counted`` is what
-    ``count_in_range`` returned."""
-    pixel = torch.searchsorted(counted, ranks + 1)
-    z = depth_mm.flatten(1).gather(1, pixel).double()
-    row = pixel.div(intrinsics.width, rounding_mode="floor")
-    x = (pixel - row * intrinsics.width - intrinsics.cx) * (z / intrinsics.fx)
-    y = (row - intrinsics.cy) * (z / intrinsics.fy)
-    return torch.stack([x, y, z], -1).float()
-
-
-class DevicePool:
+class _DevicePool:
     """An ``OccupancyPool`` on a device."""
 
     def __init__(self, pool: OccupancyPool, device: torch.device) -> None:
+        def sent(array: np.ndarray) -> Tensor:
+            return torch.tensor(array, device=device)
+
         self._per_side = pool.config.per_side
-        self._parts = [_DevicePart(part, device) for part in pool.parts]
-        self._far_points_ct = torch.tensor(pool.far_points_ct.T, device=device)
-        self._far_labels = torch.tensor(pool.far_labels, device=device)
+        points = [(part.points_ct, part.labels) for part in pool.parts]
+        points.append((pool.far_points_ct, pool.far_labels))
+        self._points = [(sent(points_ct.T), sent(labels)) for points_ct, labels in points]
+        self._sides = [(sent(part.distance_mm), sent(part.inside)) for part in pool.parts]
 
-    def take(
-        self, windows: Int64[Tensor, "b w 2"], widest: list[int]
-    ) -> tuple[Float32[Tensor, "3 b q"], UInt8[Tensor, "b q"]]:
-        """The points (undeformed CT frame) and labels that ``OccupancyPool.draw`` takes from these
-        windows (first, count); on each side of a part the nearest first. ``widest`` is each
-        column's greatest count."""
-        points, labels = [], []
-        for part, window, width in zip(self._parts, windows.unbind(1), widest, strict=False):
-            chosen = part.nearest(window, width, self._per_side)
-            points.append(part.points_ct[:, chosen])
-            labels.append(part.labels[chosen])
-        far = _neighbours(windows[:, -1, 0], widest[-1], len(self._far_labels))
-        points.append(self._far_points_ct[:, far])
-        labels.append(self._far_labels[far])
-        return torch.cat(points, -1), torch.cat(labels, -1)
+    def take(self, windows: Int64[Tensor, "b w 2"], widest: list[int]) -> tuple[Tensor, Tensor]:
+        """The points (3 b q, undeformed CT frame) and labels (b q) that ``OccupancyPool.draw``
+        takes from these windows (first, count); on each side of a part the nearest first.
+        ``widest`` is each column's greatest count."""
+        chosen = []
+        for n, ((_, labels), width) in enumerate(zip(self._points, widest, strict=True)):
+            step = torch.arange(width, device=windows.device)
+            index = (windows[:, n, :1] + step) % len(labels)
+            if n < len(self._sides):
+                index = self._nearest(index, step >= windows[:, n, 1:], *self._sides[n])
+            chosen.append(index)
+        pairs = list(zip(self._points, chosen, strict=True))
+        points = torch.cat([points[:, index] for (points, _), index in pairs], -1)
+        return points, torch.cat([labels[index] for (_, labels), index in pairs], -1)
 
-
-class _DevicePart:
-    def __init__(self, part: PartPool, device: torch.device) -> None:
-        self.points_ct = torch.tensor(part.points_ct.T, device=device)
-        self.labels = torch.tensor(part.labels, device=device)
-        self._distance_mm = torch.tensor(part.distance_mm, device=device)
-        self._inside = torch.tensor(part.inside, device=device)
-
-    def nearest(self, window: Int64[Tensor, "b 2"], width: int, k: int) -> Int64[Tensor, "b 2k"]:
-        """Of the window's points the k inside that are nearest to the surface, and k outside, the
+    def _nearest(
+        self, index: Int64[Tensor, "b w"], beyond: Tensor, distance_mm: Tensor, inside: Tensor
+    ) -> Int64[Tensor, "b 2k"]:
+        """Of a window's points the k inside that are nearest to the surface, and k outside, the
         nearest first."""
-        index = _neighbours(window[:, 0], width, len(self.labels))
-        beyond = torch.arange(width, device=index.device) >= window[:, 1:]
-        distance, inside = self._distance_mm[index], self._inside[index]
+        distance, within = distance_mm[index], inside[index]
         sides = []
-        for other in (~inside, inside):
+        for other in (~within, within):
             left_out = distance.masked_fill(other | beyond, torch.inf)
-            nearest = left_out.topk(k, dim=1, largest=False).indices
+            nearest = left_out.topk(self._per_side, dim=1, largest=False).indices
             sides.append(index.gather(1, nearest))
         return torch.cat(sides, 1)
-
-
-def _neighbours(first: Int64[Tensor, " b"], count: int, total: int) -> Int64[Tensor, "b count"]:
-    return (first[:, None] + torch.arange(count, device=first.device)) % total

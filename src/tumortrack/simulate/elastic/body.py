@@ -191,13 +191,13 @@ def reduced_organ(
     """
     _check(anatomy_ct, config)
     from tumortrack.simulate.elastic.equilibrium import ReducedModel
-    from tumortrack.simulate.elastic.finite import ElementLattice, solid_of
+    from tumortrack.simulate.elastic.finite import ElementLattice, LatticeSolid
     from tumortrack.simulate.elastic.modes import modes_of, patches_of, random_loads
 
     organ = anatomy_ct.organ
     spacing_mm = float(np.cbrt(organ.volume_mm3 / config.cells))
     lattice = ElementLattice.around(organ.box_mm, spacing_mm)
-    solid = solid_of(anatomy_ct, lattice, config.poisson)
+    solid = LatticeSolid(anatomy_ct, lattice, config.poisson)
     patches = patches_of(organ, config.patches, rng)
     loads = random_loads(solid, patches, up, config.responses, rng)
     modes = modes_of(solid, patches, config.modes, config.contrasts, loads)

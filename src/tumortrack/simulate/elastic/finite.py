@@ -120,33 +120,41 @@ def _filled(mesh: Mesh, lattice: ElementLattice) -> Float64[np.ndarray, " c"]:
     return inside.reshape(n[0], s, n[1], s, n[2], s).mean((1, 3, 5)).ravel()
 
 
-@dataclass(frozen=True, eq=False)
 class LatticeSolid:
-    """An organ on its lattice. Cells far from it are left out; arrays run over the ``nodes``
-    that remain, ordered by layers along the lattice's longest axis."""
+    """An organ and its tumors on a lattice. Cells that do not touch a filled one are left out.
 
-    lattice: ElementLattice
-    poisson: float
-    organ: Float64[np.ndarray, " c"]  # filled fraction of each remaining cell
-    tumor: Float64[np.ndarray, " c"]
-    cells: Int[np.ndarray, "c 8"]  # indices into ``nodes``
-    nodes: Int[np.ndarray, " n"]  # numbers in the lattice
-    bounds: list[int]  # first node of each layer, and the end
+    Attributes:
+        organ, tumor: filled fraction of each remaining cell.
+        cells: (c, 8), each cell's corners as indices into ``nodes``.
+        nodes: numbers in the lattice, ordered by layers along the lattice's longest axis.
+        bounds: the first node of each layer, and the end.
+        volume_mm3: the organ's volume, distributed over the nodes.
+        center_mm: the organ's centre of mass.
+    """
 
-    @cached_property
-    def volume_mm3(self) -> Float64[np.ndarray, " n"]:
-        """The organ's volume, distributed over the nodes."""
-        share = np.repeat(self.organ * self.lattice.spacing_mm**3 / 8, 8)
-        return np.bincount(self.cells.ravel(), share, len(self.nodes))
-
-    @cached_property
-    def nodes_mm(self) -> Float64[np.ndarray, "n 3"]:
-        return self.lattice.nodes_mm()[self.nodes]
-
-    @cached_property
-    def center_mm(self) -> Float64[np.ndarray, " 3"]:
-        """The organ's centre of mass."""
-        return self.volume_mm3 @ self.nodes_mm / self.volume_mm3.sum()
+    def __init__(self, anatomy_ct: Anatomy, lattice: ElementLattice, poisson: float) -> None:
+        organ = _filled(anatomy_ct.organ, lattice)
+        tumor = np.zeros_like(organ)
+        for part in anatomy_ct.tumors:
+            tumor = np.maximum(tumor, _filled(part, lattice))
+        near = binary_dilation((organ > 0).reshape(lattice.cells), np.ones((3, 3, 3))).ravel()
+        self.lattice, self.poisson = lattice, poisson
+        self.organ, self.tumor = organ[near], np.minimum(tumor, organ)[near]
+        corners = lattice.cell_nodes()[near]
+        used = np.unique(corners)
+        layer = np.unravel_index(used, lattice.shape)[int(np.argmax(lattice.shape))]
+        order = np.argsort(layer, kind="stable")
+        self.nodes = used[order]
+        starts = np.flatnonzero(np.diff(layer[order], prepend=-1))
+        self.bounds = [*starts.tolist(), len(self.nodes)]
+        number = np.empty(int(np.prod(lattice.shape)), int)
+        number[self.nodes] = np.arange(len(self.nodes))
+        self.cells = number[corners]
+        self.unknowns = (3 * self.cells[:, :, None] + np.arange(3)).reshape(-1, 24)
+        volume = np.repeat(self.organ * lattice.spacing_mm**3 / 8, 8)
+        self.volume_mm3 = np.bincount(self.cells.ravel(), volume, len(self.nodes))
+        self.nodes_mm = lattice.nodes_mm()[self.nodes]
+        self.center_mm = self.volume_mm3 @ self.nodes_mm / self.volume_mm3.sum()
 
     @cached_property
     def swelling(self) -> Float64[np.ndarray, " f"]:
@@ -154,7 +162,7 @@ class LatticeSolid:
         _, dilatation = cube_stiffness(self.poisson)
         force = self.organ * self.lattice.spacing_mm**2 / (3 * (1 - 2 * self.poisson))
         weights = np.outer(force, dilatation).ravel()
-        return np.bincount(self._unknowns.ravel(), weights, 3 * len(self.nodes))
+        return np.bincount(self.unknowns.ravel(), weights, 3 * len(self.nodes))
 
     def weights(self, points_mm: Float[np.ndarray, "p 3"]) -> csr_matrix:
         """Sparse (p, n): values at points from values at the solid's nodes."""
@@ -164,7 +172,7 @@ class LatticeSolid:
         """The stiffness matrix for a Young's modulus (N/mm2) in each cell."""
         cube, _ = cube_stiffness(self.poisson)
         values = (moduli * self.lattice.spacing_mm)[:, None] * cube.ravel()
-        rows, columns = np.repeat(self._unknowns, 24, 1), np.tile(self._unknowns, (1, 24))
+        rows, columns = np.repeat(self.unknowns, 24, 1), np.tile(self.unknowns, (1, 24))
         size = 3 * len(self.nodes)
         entries = (values.ravel(), (rows.ravel(), columns.ravel()))
         return coo_matrix(entries, (size, size)).tocsr()
@@ -186,30 +194,6 @@ class LatticeSolid:
         number = np.empty(self.lattice.shape, int)
         number.ravel()[self.nodes] = np.arange(len(self.nodes))
         return values.reshape(len(self.nodes), 3, -1)[number[tuple(nearest)]]
-
-    @property
-    def _unknowns(self) -> Int[np.ndarray, "c 24"]:
-        return (3 * self.cells[:, :, None] + np.arange(3)).reshape(len(self.cells), 24)
-
-
-def solid_of(anatomy_ct: Anatomy, lattice: ElementLattice, poisson: float) -> LatticeSolid:
-    """The organ and its tumors on a lattice; cells that do not touch a filled one are left out."""
-    organ = _filled(anatomy_ct.organ, lattice)
-    tumor = np.zeros_like(organ)
-    for part in anatomy_ct.tumors:
-        tumor = np.maximum(tumor, _filled(part, lattice))
-    near = binary_dilation((organ > 0).reshape(lattice.cells), np.ones((3, 3, 3))).ravel()
-    corners = lattice.cell_nodes()[near]
-    axis = int(np.argmax(lattice.shape))
-    used = np.unique(corners)
-    layer = np.unravel_index(used, lattice.shape)[axis]
-    order = np.argsort(layer, kind="stable")
-    nodes = used[order]
-    number = np.empty(int(np.prod(lattice.shape)), int)
-    number[nodes] = np.arange(len(nodes))
-    bounds = [*np.flatnonzero(np.diff(layer[order], prepend=-1)).tolist(), len(nodes)]
-    tumor = np.minimum(tumor, organ)[near]
-    return LatticeSolid(lattice, poisson, organ[near], tumor, number[corners], nodes, bounds)
 
 
 class BlockCholesky:
