@@ -15,9 +15,8 @@ from tumortrack.sense.camera import d405, project
 from tumortrack.sense.cloud import CloudConfig
 from tumortrack.sense.noise import D405_NOISE
 from tumortrack.sense.render import render_depth
-from tumortrack.simulate.batched.plan import unsupported
 from tumortrack.simulate.batched.render import carried, depth_images
-from tumortrack.simulate.batched.stream import DeviceStream
+from tumortrack.simulate.batched.stream import DeviceStream, why_not
 from tumortrack.simulate.dataset import SceneStream
 from tumortrack.simulate.deform import (
     ChainConfig,
@@ -229,13 +228,13 @@ def test_clouds_lie_in_range_and_on_pixels(both):
 
 def test_what_it_cannot_make_it_refuses_by_name(pool):
     for config in CONFIGS.values():
-        assert unsupported(config) is None
+        assert why_not(stream(pool, config)) is None
     for config, name in (
         (SceneConfig(noise=D405_NOISE), "sensor noise"),
         (SceneConfig(deform=(ElasticConfig(),)), "deformations"),
         (SceneConfig(deform=(ChainConfig(links=(StretchConfig(), DragConfig())),)), "deformations"),
     ):
-        assert name in (unsupported(config) or "")
+        assert name in (why_not(stream(pool, config)) or "")
         with pytest.raises(InputError, match=name):
             DeviceStream(stream(pool, config), CPU)
     fixed = FixedPoints(np.zeros((4, 3), np.float32), np.zeros(4, np.uint8))

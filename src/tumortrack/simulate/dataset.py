@@ -40,17 +40,18 @@ class SceneStream:
     body: ElasticBody | None = None  # built once by the caller, for elastic deformations
 
     @cached_property
-    def _simulator(self) -> Simulator:  # built where it is used: ray trees cannot be pickled
+    def simulator(self) -> Simulator:
+        """Built where it is used: ray trees cannot be pickled."""
         return Simulator(self.anatomy_ct, self.up_lps, self.config, self.body)
 
     def __getstate__(self) -> dict:
-        return {k: v for k, v in self.__dict__.items() if k != "_simulator"}
+        return {k: v for k, v in self.__dict__.items() if k != "simulator"}
 
     def batch(self, index: int) -> Batch:
         """The batch with this number."""
         first = index * self.batch_size
         pairs = [
-            self._simulator.pair(SceneRecipe(self.seed, self.stream, i), self.pool)
+            self.simulator.pair(SceneRecipe(self.seed, self.stream, i), self.pool)
             for i in range(first, first + self.batch_size)
         ]
         n = self.config.cloud.n_points

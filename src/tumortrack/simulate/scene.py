@@ -112,11 +112,9 @@ class SceneDraw:
 
 
 @dataclass(frozen=True, eq=False)
-class RenderedScene:
+class RenderedScene(SceneDraw):
     """A scene before points are labelled: where the organ lies, and what the camera sees of it."""
 
-    camera_from_ct: Float64[np.ndarray, "4 4"]
-    deformation: Deformation
     frame: DepthFrame
     cloud: SensorCloud
 
@@ -125,24 +123,20 @@ class RenderedScene:
         return transform_points(self.camera_from_ct, self.deformation.apply(points_ct))
 
 
+@dataclass(eq=False)
 class Simulator:
     """Makes the scenes of one anatomy (CT frame, LPS mm); ``body`` where the configuration has
     elastic deformations (``body_for`` builds it)."""
 
-    def __init__(
-        self,
-        anatomy_ct: Anatomy,
-        up_lps: tuple[float, float, float],
-        config: SceneConfig,
-        body: ElasticBody | None = None,
-    ) -> None:
-        self.anatomy_ct = anatomy_ct
-        self._body = body
-        self.config = config
-        self._up_lps = up_lps
-        self._intrinsics = d405(config.width, config.height)
-        self._visibility = Visibility(anatomy_ct.organ)
-        vertices = anatomy_ct.organ.vertices_mm
+    anatomy_ct: Anatomy
+    up_lps: tuple[float, float, float]
+    config: SceneConfig
+    body: ElasticBody | None = None
+
+    def __post_init__(self) -> None:
+        self._intrinsics = d405(self.config.width, self.config.height)
+        self._visibility = Visibility(self.anatomy_ct.organ)
+        vertices = self.anatomy_ct.organ.vertices_mm
         corners = vertices[ConvexHull(vertices).vertices]  # the farthest in any direction
         self._hull_ct = Mesh(corners, np.empty((0, 3)))
 
@@ -168,10 +162,9 @@ class Simulator:
         config = self.config
         free = bool(rng.uniform() < config.free_range)
         nearest = config.free_nearest_mm if free else config.pose.nearest_mm
-        camera_from_ct = sample_pose(config.pose, self._hull_ct, self._up_lps, nearest, rng)
+        camera_from_ct = sample_pose(config.pose, self._hull_ct, self.up_lps, nearest, rng)
         model = config.deform[rng.integers(len(config.deform))]
-        view = self._view(camera_from_ct)
-        return SceneDraw(free, camera_from_ct, model.sample(view, rng))
+        return SceneDraw(free, camera_from_ct, model.sample(self._view(camera_from_ct), rng))
 
     def _render(self, recipe: SceneRecipe) -> tuple[RenderedScene, np.random.Generator]:
         for attempt in range(ATTEMPTS):
@@ -183,17 +176,16 @@ class Simulator:
         raise shows_nothing(recipe)
 
     def _attempt(self, rng: np.random.Generator) -> RenderedScene:
-        config, organ = self.config, self.anatomy_ct.organ
-        drawn = self.draw(rng)
-        camera_from_ct, deformation = drawn.camera_from_ct, drawn.deformation
-        vertices = transform_points(camera_from_ct, deformation.apply(organ.vertices_mm))
+        config, organ, drawn = self.config, self.anatomy_ct.organ, self.draw(rng)
+        deformed = drawn.deformation.apply(organ.vertices_mm)
+        vertices = transform_points(drawn.camera_from_ct, deformed)
         frame = render_depth(vertices, organ.faces, self._intrinsics)
         frame = add_clutter(frame, config.clutter, rng)
         frame = occlude(frame, config.occlusion, rng)  # hides background too
         frame = miscalibrate(frame, config.calibration, rng)
         frame = add_noise(frame, config.noise, rng)
-        crop = crop_of(config, drawn.free, rng)
-        return RenderedScene(camera_from_ct, deformation, frame, cloud_from_depth(frame, crop, rng))
+        cloud = cloud_from_depth(frame, crop_of(config, drawn.free, rng), rng)
+        return RenderedScene(**vars(drawn), frame=frame, cloud=cloud)
 
     def _view(self, camera_from_ct: Float64[np.ndarray, "4 4"]) -> View:
         eye_ct, camera = np.linalg.inv(camera_from_ct)[:3, 3], self._intrinsics
@@ -204,7 +196,7 @@ class Simulator:
             pictured = ((pixels > -0.5) & (pixels < size - 0.5)).all(1) & (depth > 0)
             return pictured & self._visibility(points_ct, eye_ct)
 
-        return View(self.anatomy_ct, visible, self._body)
+        return View(self.anatomy_ct, visible, self.body)
 
 
 def shows_nothing(recipe: SceneRecipe) -> TumortrackError:

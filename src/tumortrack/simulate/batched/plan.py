@@ -8,36 +8,15 @@ from dataclasses import dataclass, fields
 import numpy as np
 from jaxtyping import Float32, Float64, Int64
 
-from tumortrack.sense.calibration import CALIBRATED
-from tumortrack.sense.noise import CLEAN
-from tumortrack.simulate.deform import DragConfig, RestConfig, StretchConfig
+from tumortrack.simulate.deform import DragConfig, StretchConfig
 from tumortrack.simulate.deform.base import Deformation
 from tumortrack.simulate.deform.chain import Chain, links_of
 from tumortrack.simulate.deform.drag import Drags
 from tumortrack.simulate.deform.stretch import Stretch
-from tumortrack.simulate.scene import SceneConfig, SceneRecipe, Simulator, crop_of
+from tumortrack.simulate.scene import SceneRecipe, Simulator, crop_of
 
 # A stretch as 20 numbers: centre (3), matrix (9), along (3), across (3), sagitta, reach.
 _NO_STRETCH = np.array([*[0] * 3, *np.eye(3).ravel(), 1, 0, 0, 0, 1, 0, 0, 1], np.float32)
-
-
-def unsupported(config: SceneConfig) -> str | None:
-    """Why scenes of this configuration cannot be made in batches; None where they can."""
-    occlusion = config.occlusion
-    parts = {
-        "sensor noise": config.noise != CLEAN,
-        "background": config.clutter.scenes > 0,
-        "occlusion": occlusion.scenes > 0 and occlusion.largest_share > 0,
-        "cameras out of calibration": config.calibration != CALIBRATED,
-        "deformations other than drags, squeezing and bending": any(
-            # Some drags, and then at most one squeeze and bend.
-            not all(isinstance(link, DragConfig) for link in first)
-            or not isinstance(last, DragConfig | StretchConfig | RestConfig)
-            for *first, last in map(links_of, config.deform)
-        ),
-    }
-    lacks = [what for what, on in parts.items() if on]
-    return f"{', '.join(lacks)}: made on the CPU alone" if lacks else None
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,13 +16,17 @@ from jaxtyping import Float32, Int32, Int64
 from torch import Tensor
 
 from tumortrack.core.errors import InputError
+from tumortrack.sense.calibration import CALIBRATED
 from tumortrack.sense.camera import d405
 from tumortrack.sense.cloud import FEWEST_POINTS, draw_some
-from tumortrack.simulate.batched.plan import BatchPlan, plan_scenes, unsupported
+from tumortrack.sense.noise import CLEAN
+from tumortrack.simulate.batched.plan import BatchPlan, plan_scenes
 from tumortrack.simulate.batched.render import carried, depth_images
 from tumortrack.simulate.dataset import SceneStream, refill
+from tumortrack.simulate.deform import DragConfig, RestConfig, StretchConfig
+from tumortrack.simulate.deform.chain import links_of
 from tumortrack.simulate.occupancy import OccupancyPool
-from tumortrack.simulate.scene import ATTEMPTS, SceneRecipe, Simulator, shows_nothing
+from tumortrack.simulate.scene import ATTEMPTS, SceneRecipe, shows_nothing
 
 # clouds_mm (b, n, 3), points_mm (b, q, 3), labels (b, q), camera_from_ct (b, 4, 4)
 Tensors = tuple[Tensor, Tensor, Tensor, Tensor]
@@ -58,7 +62,7 @@ class DeviceStream:
     choice among them depends on it.
 
     Raises:
-        InputError: a configuration that ``unsupported`` refuses.
+        InputError: scenes that ``why_not`` refuses.
     """
 
     def __init__(self, stream: SceneStream, device: torch.device) -> None:
@@ -72,11 +76,6 @@ class DeviceStream:
     def __getstate__(self) -> dict:
         held = ("_stream", "_device", "_intrinsics")
         return {name: self.__dict__[name] for name in held}
-
-    @cached_property
-    def _simulator(self) -> Simulator:
-        stream = self._stream
-        return Simulator(stream.anatomy_ct, stream.up_lps, stream.config, stream.body)
 
     @cached_property
     def _organ(self) -> tuple[Float32[Tensor, "3 v"], Tensor]:
@@ -100,7 +99,7 @@ class DeviceStream:
         size, seed, name = self._stream.batch_size, self._stream.seed, self._stream.stream
         numbers = (index * size + row for index in indices for row in range(size))
         recipes = [SceneRecipe(seed, name, number) for number in numbers]
-        return plan_scenes(self._simulator, recipes, [0] * len(recipes))
+        return plan_scenes(self._stream.simulator, recipes, [0] * len(recipes))
 
     @torch.no_grad()
     def pictured(self, plan: BatchPlan) -> Pictured:
@@ -118,7 +117,9 @@ class DeviceStream:
             attempts = plan.attempts[few] + 1
             if attempts.max() >= ATTEMPTS:
                 raise shows_nothing(plan.recipes[few[attempts.argmax()]])
-            again = plan_scenes(self._simulator, plan.recipes[few].tolist(), attempts.tolist())
+            again = plan_scenes(
+                self._stream.simulator, plan.recipes[few].tolist(), attempts.tolist()
+            )
             plan = plan.replaced(few, again)
             rows = self._sent(few)
             depth_mm[rows], counted[rows] = self._picture(again)
@@ -175,7 +176,21 @@ def why_not(stream: SceneStream) -> str | None:
     """Why a stream's batches cannot be made on a device; None where they can."""
     if not isinstance(stream.pool, OccupancyPool):
         return "Points that are the same in every scene: made on the CPU alone"
-    return unsupported(stream.config)
+    config = stream.config
+    parts = {
+        "sensor noise": config.noise != CLEAN,
+        "background": config.clutter.scenes > 0,
+        "occlusion": config.occlusion.scenes > 0 and config.occlusion.largest_share > 0,
+        "cameras out of calibration": config.calibration != CALIBRATED,
+        "deformations other than drags, squeezing and bending": not all(
+            # Some drags, and then at most one squeeze and bend.
+            all(isinstance(link, DragConfig) for link in first)
+            and isinstance(last, DragConfig | StretchConfig | RestConfig)
+            for *first, last in map(links_of, config.deform)
+        ),
+    }
+    lacks = [what for what, on in parts.items() if on]
+    return f"{', '.join(lacks)}: made on the CPU alone" if lacks else None
 
 
 class _DevicePool:
