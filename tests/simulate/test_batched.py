@@ -96,8 +96,8 @@ def test_a_batch_is_the_reference_s(both):
 
 def test_depth_images_are_the_reference_s_but_for_single_pixels(both):
     reference, device = both
-    pictured = device.pictured(device.plan(1))
-    plan, depth_mm = pictured.plan, pictured.depth_mm
+    images = device.render(device.plan(1))
+    plan, depth_mm = images.plan, images.depth_mm
     for row, scene in enumerate(rendered(reference, 1)):
         seen, expected = depth_mm[row].numpy(), scene.frame.depth_mm
         assert np.sum(np.isnan(seen) != np.isnan(expected)) <= 2
@@ -127,11 +127,11 @@ def test_scenes_that_show_too_little_are_drawn_again(pool):
     reference = stream(pool, CONFIGS["far"])
     device = DeviceStream(reference, CPU)
     first = device.plan(0)
-    pictured = device.pictured(first)
-    plan = pictured.plan
+    images = device.render(first)
+    plan = images.plan
     again = plan.attempts > 0
     assert 0 < again.sum() < SIZE
-    assert (pictured.available >= 200).all()
+    assert (images.available >= 200).all()
     same = (plan.camera_from_ct == first.camera_from_ct).all(axis=(1, 2))
     np.testing.assert_array_equal(same, ~again)
     for pose, scene in zip(plan.camera_from_ct, rendered(reference, 0), strict=True):
@@ -153,8 +153,8 @@ def test_batches_do_not_depend_on_their_size_or_who_plans(pool):
     device.batch(7)
     elsewhere = pickle.loads(pickle.dumps(device))
     plans = [pickle.loads(pickle.dumps(elsewhere.plan(index))) for index in (2, 3)]
-    pictured = [device.pictured(plan) for plan in plans]
-    made = [device.finished(p, device.chosen(p)) for p in pictured]
+    images = [device.render(plan) for plan in plans]
+    made = [device.assemble(p, device.sample(p)) for p in images]
     small = [torch.cat(parts) for parts in zip(*made, strict=True)]
     for one, two in zip(large, small, strict=True):
         torch.testing.assert_close(one, two, atol=1e-3, rtol=0)
@@ -215,14 +215,14 @@ def test_of_the_same_vertices_the_image_is_the_same_to_the_last_bit(away_mm):
 def test_clouds_lie_in_range_and_on_pixels(both):
     reference, device = both
     clouds, _, _, _ = device.batch(4)
-    pictured = device.pictured(device.plan(4))
-    plan = pictured.plan
+    images = device.render(device.plan(4))
+    plan = images.plan
     for row, cloud in enumerate(clouds.numpy()):
         assert (cloud[:, 2] > plan.near_mm[row]).all()
         assert (cloud[:, 2] < plan.far_mm[row]).all()
         pixels, _ = project(cloud, d405(reference.config.width, reference.config.height))
         np.testing.assert_allclose(pixels, np.rint(pixels), atol=1e-3)
-        wanted = min(int(plan.n_points[row]), int(pictured.available[row]), len(cloud))
+        wanted = min(int(plan.n_points[row]), int(images.available[row]), len(cloud))
         assert len(np.unique(cloud, axis=0)) == wanted
 
 

@@ -188,10 +188,10 @@ class ScenePlayer:
     def frame(self, instant: Instant, truth: Anatomy, stamp_ns: int) -> DepthFrame:
         """What the sensor sees at an instant with these true surfaces. Its noise follows from seed
         and time."""
-        about = transform_points(instant.room_from_rod, self._rod.vertices_mm)
-        about = np.concatenate([self._drape.vertices_mm, about])
-        about = transform_points(instant.camera_from_room, about)
-        vertices = np.concatenate([truth.organ.vertices_mm, about])
+        others = transform_points(instant.room_from_rod, self._rod.vertices_mm)
+        others = np.concatenate([self._drape.vertices_mm, others])
+        others = transform_points(instant.camera_from_room, others)
+        vertices = np.concatenate([truth.organ.vertices_mm, others])
         clean = render_depth(vertices, self._faces, self.intrinsics, stamp_ns)
         if self.config.table:
             table_mm = self._table.depth_mm(instant.camera_from_room, self.intrinsics)

@@ -33,7 +33,7 @@ Tensors = tuple[Tensor, Tensor, Tensor, Tensor]
 
 
 @dataclass(frozen=True, eq=False)
-class Pictured:
+class RenderedBatch:
     """A plan whose images show enough, these images, and their pixels in range: counted up to each
     pixel (on the device) and in total (on the host)."""
 
@@ -44,7 +44,7 @@ class Pictured:
 
 
 @dataclass(frozen=True, eq=False)
-class Chosen:
+class SampleChoice:
     """The pixels in range that become a scene's cloud, and the points of the pools (first, count;
     the last of those anywhere) that it considers."""
 
@@ -57,7 +57,7 @@ class DeviceStream:
 
     Apart from float32 rounding, which may flip a pixel on a silhouette, a batch has the stream's
     values; a scene's labelled points come in another order. A batch is made in four steps, so that
-    they can be pipelined: ``plan`` (host), ``pictured`` (device), ``chosen`` (host), ``finished``
+    they can be pipelined: ``plan`` (host), ``render`` (device), ``sample`` (host), ``assemble``
     (device). Only each scene's number of pixels in range returns from the device; the random
     choice among them depends on it.
 
@@ -90,8 +90,8 @@ class DeviceStream:
 
     def batch(self, index: int) -> Tensors:
         """The batch with this number."""
-        pictured = self.pictured(self.plan(index))
-        return self.finished(pictured, self.chosen(pictured))
+        rendered = self.render(self.plan(index))
+        return self.assemble(rendered, self.sample(rendered))
 
     def plan(self, *indices: int) -> BatchPlan:
         """The random part of the batches with these numbers, up to their images; no device is
@@ -102,18 +102,18 @@ class DeviceStream:
         return plan_scenes(self._stream.simulator, recipes, [0] * len(recipes))
 
     @torch.no_grad()
-    def pictured(self, plan: BatchPlan) -> Pictured:
+    def render(self, plan: BatchPlan) -> RenderedBatch:
         """The plan's depth images; scenes that show too little are drawn again.
 
         Raises:
             TumortrackError: no pose of a scene shows enough of the organ.
         """
-        depth_mm, counted = self._picture(plan)
+        depth_mm, counted = self._render(plan)
         while True:
             available = counted[:, -1].cpu().numpy()
             few = np.flatnonzero(available < FEWEST_POINTS)
             if len(few) == 0:
-                return Pictured(plan, depth_mm, counted, available)
+                return RenderedBatch(plan, depth_mm, counted, available)
             attempts = plan.attempts[few] + 1
             if attempts.max() >= ATTEMPTS:
                 raise shows_nothing(plan.recipes[few[attempts.argmax()]])
@@ -122,33 +122,38 @@ class DeviceStream:
             )
             plan = plan.replaced(few, again)
             rows = self._sent(few)
-            depth_mm[rows], counted[rows] = self._picture(again)
+            depth_mm[rows], counted[rows] = self._render(again)
 
-    def chosen(self, pictured: Pictured) -> Chosen:
+    def sample(self, rendered: RenderedBatch) -> SampleChoice:
         """What is drawn after the images. Needs no device, so that a thread can do it alongside
         the device's work."""
         assert isinstance(self._stream.pool, OccupancyPool)
-        plan, n = pictured.plan, self._stream.config.cloud.n_points
+        plan, n = rendered.plan, self._stream.config.cloud.n_points
         rng = np.random.default_rng()
         ranks, windows = [], []
-        counts = pictured.available.tolist(), plan.n_points.tolist()
+        counts = rendered.available.tolist(), plan.n_points.tolist()
         for state, count, wanted in zip(plan.states, *counts, strict=True):
             rng.bit_generator.state = state
             ranks.append(refill(draw_some(count, wanted, rng), n))
             windows.append(self._stream.pool.windows(rng))
-        return Chosen(np.stack(ranks).astype(np.int32), np.array(windows))
+        return SampleChoice(np.stack(ranks).astype(np.int32), np.array(windows))
 
     @torch.no_grad()
-    def finished(self, pictured: Pictured, chosen: Chosen) -> Tensors:
-        """The clouds, and labelled points at their places."""
-        plan, windows = pictured.plan, chosen.windows
-        clouds_mm = self._clouds(pictured, self._sent(chosen.ranks))
+    def assemble(self, rendered: RenderedBatch, chosen: SampleChoice) -> Tensors:
+        """The clouds of the chosen pixels, and labelled points at their places, camera frame."""
+        camera, plan, windows = self._intrinsics, rendered.plan, chosen.windows
+        pixel = torch.searchsorted(rendered.counted, self._sent(chosen.ranks) + 1)
+        z = rendered.depth_mm.flatten(1).gather(1, pixel).double()
+        row = pixel.div(camera.width, rounding_mode="floor")
+        x = (pixel - row * camera.width - camera.cx) * (z / camera.fx)
+        y = (row - camera.cy) * (z / camera.fy)
+        clouds_mm = torch.stack([x, y, z], -1).float()
         points_ct, labels = self._pool.take(self._sent(windows), windows[:, :, 1].max(0).tolist())
         points_mm = carried(plan, points_ct)
         poses = self._sent(plan.camera_from_ct.astype(np.float32))
         return clouds_mm, points_mm.permute(1, 2, 0).contiguous(), labels, poses
 
-    def _picture(self, plan: BatchPlan) -> tuple[Float32[Tensor, "b h w"], Int32[Tensor, "b hw"]]:
+    def _render(self, plan: BatchPlan) -> tuple[Float32[Tensor, "b h w"], Int32[Tensor, "b hw"]]:
         """Depth images (mm, NaN where there is nothing), and the running count, in row-major order,
         of their pixels strictly within the plan's depths."""
         vertices_ct, faces = self._organ
@@ -157,16 +162,6 @@ class DeviceStream:
         near, far = self._sent(plan.near_mm)[:, None], self._sent(plan.far_mm)[:, None]
         flat = depth_mm.flatten(1)
         return depth_mm, ((flat > near) & (flat < far)).cumsum(1, dtype=torch.int32)
-
-    def _clouds(self, pictured: Pictured, ranks: Int32[Tensor, "b n"]) -> Float32[Tensor, "b n 3"]:
-        """The points of the pixels in range with these ranks, camera frame, mm."""
-        camera = self._intrinsics
-        pixel = torch.searchsorted(pictured.counted, ranks + 1)
-        z = pictured.depth_mm.flatten(1).gather(1, pixel).double()
-        row = pixel.div(camera.width, rounding_mode="floor")
-        x = (pixel - row * camera.width - camera.cx) * (z / camera.fx)
-        y = (row - camera.cy) * (z / camera.fy)
-        return torch.stack([x, y, z], -1).float()
 
     def _sent(self, array: np.ndarray) -> Tensor:
         return torch.from_numpy(array).to(self._device, non_blocking=True)
