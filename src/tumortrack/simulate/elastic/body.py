@@ -101,12 +101,9 @@ class ElasticBody:
         return combine(self.modes, np.asarray(coefficients, np.float32))
 
     def carry(self, coefficients: Float[np.ndarray, " m"], points_ct: Points) -> Moved:
-        """Where points of the undeformed organ or near it are in a state."""
+        """Where points of the undeformed organ or near it are in a state; the negative coefficients
+        move them back."""
         return self.follow(self.velocity(coefficients), points_ct)
-
-    def back(self, coefficients: Float[np.ndarray, " m"], points: Points) -> Moved:
-        """The inverse of ``carry``."""
-        return self.carry(-coefficients, points)
 
     def follow(self, velocity_mm: Field, points: Points, steps: int | None = None) -> Moved:
         """Where points are after one unit of time in a velocity field on this body's lattice,
