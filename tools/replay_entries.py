@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from safetensors.numpy import load_file
 
-from tumortrack.cli.main import COMMANDS, run
+from tumortrack.cli.main import run
 from tumortrack.core import store
 from tumortrack.core.types import SensorCloud
 from tumortrack.imaging.case import Case, load_case, save_case
@@ -36,13 +36,17 @@ from tumortrack.tracking.tracker import Tracker
 from tumortrack.training.model import load_model
 from tumortrack.training.presets import PRESETS, pretraining
 from tumortrack.training.pretrain import Pretraining, kidney_stream
-from tumortrack.training.task import course_of
+from tumortrack.training.task import task_of
 from tumortrack.training.train import TrainingRun, train
 from tumortrack_lab.twin.bench import Apparatus, ApparatusConfig
 from tumortrack_lab.twin.stock import StateCache
 from tumortrack_lab.twin.variants import VIEWS, ViewConfig, make_scene
 
 Entries = Iterable[tuple[str, object]]
+COMMANDS = (
+    *("demo", "prepare", "export", "train", "pretrain", "locate", "track", "plan", "resect"),
+    *("simulate", "twin", "evaluate", "bench", "compile", "onnx", "inspect", "doctor"),
+)
 STEPS = {"clinic": 60, "quick": 100}
 CPU, CLOUD = ("--device", "cpu"), Path("scenes/drag/0000/cloud.ply")
 
@@ -133,7 +137,7 @@ def scene() -> Entries:
     yield from under("test", files("scenes"))
     for preset in PRESETS:
         about = of_case(preset, batch_size=2)
-        course, config = course_of(about, torch.device("cpu")), about.config.scene
+        course, config = task_of(about, torch.device("cpu")), about.config.scene
         given = (about.anatomy_ct, about.up_lps, config, course.points, 0, "train", 2)
         stream = SceneStream(*given, course.body)  # type: ignore[arg-type]
         for index in (0, 7):
@@ -209,7 +213,8 @@ def paper() -> Entries:
     """So short a training finds no organ: logits at fixed points stand for the estimate."""
     yield from under("weights", files(model("paper"), "*"))
     points_mm = read_cloud(CLOUD)[0].points_mm
-    rng, inference = np.random.default_rng(0), Inference(load_model(Path("paper"), "cpu").network)
+    trained: Any = load_model(Path("paper"), "cpu")
+    rng, inference = np.random.default_rng(0), Inference(trained.network)
     queries = rng.normal(points_mm.mean(0), 30, (5000, 3)).astype(np.float32)
     yield "logits-for-an-estimate", inference.logits(inference.encode(points_mm), queries)
 
