@@ -32,10 +32,10 @@ from tumortrack.registration.canonical_frame import (
     upright_of,
 )
 from tumortrack.registration.rest_shape import long_axis_of
-from tumortrack.simulate.bodies import body_for
 from tumortrack.simulate.dataset import Batch, SceneStream
 from tumortrack.simulate.elastic.body import ElasticBody
 from tumortrack.simulate.occupancy import FixedPoints
+from tumortrack.simulate.scene import body_for
 from tumortrack.training.checkpoint import work_folder
 from tumortrack.training.head_start import save_start
 from tumortrack.training.pace import (

@@ -19,9 +19,8 @@ from tumortrack.registration.motion import ElasticMotion
 from tumortrack.registration.network import RegistrationNetwork
 from tumortrack.registration.registration import Registration
 from tumortrack.registration.rest_shape import shape_of
-from tumortrack.simulate.bodies import body_for
 from tumortrack.simulate.occupancy import FixedPoints, organ_pool
-from tumortrack.simulate.scene import Simulator
+from tumortrack.simulate.scene import Simulator, body_for
 from tumortrack.simulate.targets import draw_targets
 from tumortrack.training.run import TrainingRun
 from tumortrack.training.validate import ValidationScenes, mean_iou_of, validation_scenes
