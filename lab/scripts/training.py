@@ -28,8 +28,8 @@ import tyro
 
 from tumortrack.cli.console import say
 from tumortrack.core import store
-from tumortrack.core.allocator import keep_freed_memory
 from tumortrack.core.errors import TumortrackError
+from tumortrack.core.process import keep_freed_memory
 from tumortrack.imaging.case import Case, load_case
 from tumortrack.models.config import TrainConfig
 from tumortrack.occupancy.network import OccupancyNetwork

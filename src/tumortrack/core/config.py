@@ -18,6 +18,17 @@ class Config(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
 
     LATER: ClassVar[tuple[str, ...]] = ()
 
+    def check_ranges(self, what: str, least: str = "0 (off)", **most: float) -> None:
+        """Refuse each named field that is not in 0..most; ``what`` names the configuration.
+
+        Raises:
+            InputError: with the allowed range, its lower end written as ``least``.
+        """
+        for name, limit in most.items():
+            value = getattr(self, name)
+            if not 0 <= value <= limit:
+                raise InputError(f"{what} {name} is {value}; allowed: {least} to {limit:g}.")
+
 
 C = TypeVar("C", bound=msgspec.Struct)
 

@@ -186,6 +186,11 @@ class DepthFrame:
     def __post_init__(self) -> None:
         _freeze(self, "depth_mm", np.float32, (self.intrinsics.height, self.intrinsics.width))
 
+    def with_depth(self, depth_mm: Float32[np.ndarray, "h w"]) -> DepthFrame:
+        """The same camera and stamp with another depth, taken over: the array becomes read-only."""
+        depth_mm.flags.writeable = False
+        return DepthFrame(depth_mm, self.intrinsics, self.stamp_ns)
+
 
 @dataclass(frozen=True, eq=False)
 class SensorCloud:

@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from tumortrack.core.parallel import share
+from tumortrack.core.process import parallel_for
 from tumortrack.registration.gauss_newton import GaussNewton, GaussNewtonConfig, RegistrationResult
 from tumortrack.registration.motion import ElasticMotion
 from tumortrack.registration.network import PoseHypothesis, RegistrationNetwork
@@ -103,7 +103,7 @@ def _all_run(descents: list[GaussNewton], steps: int) -> None:
         for descent in descents[part]:
             descent.run(steps)
 
-    share(run, len(descents), 1)
+    parallel_for(run, len(descents), 1)
 
 
 def _turned(start: ElasticMotion) -> list[ElasticMotion]:

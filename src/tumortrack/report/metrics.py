@@ -13,8 +13,8 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from tumortrack.core.errors import InputError
+from tumortrack.core.estimate import Motion
 from tumortrack.core.geometry import transform_points
-from tumortrack.core.motion import Motion
 from tumortrack.core.types import Anatomy, CameraLabels, Mesh
 from tumortrack.imaging.raster import _expand
 

@@ -27,11 +27,10 @@ from tumortrack.core.types import (
     OccupancySamples,
     SensorCloud,
 )
-from tumortrack.sense.calibration import CalibrationConfig, miscalibrate
 from tumortrack.sense.camera import d405, project
 from tumortrack.sense.cloud import FEWEST_POINTS, CloudConfig, cloud_from_depth
 from tumortrack.sense.clutter import ClutterConfig, add_clutter
-from tumortrack.sense.noise import NoiseConfig, add_noise
+from tumortrack.sense.noise import CalibrationConfig, NoiseConfig, add_noise, miscalibrate
 from tumortrack.sense.occlusion import OcclusionConfig, occlude
 from tumortrack.sense.render import Visibility, render_depth
 from tumortrack.simulate.deform import DeformConfig, DragConfig

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Protocol, runtime_checkable
 
-from tumortrack.core.allocator import keep_small_blocks
 from tumortrack.core.errors import InputError
 from tumortrack.core.estimate import Estimate, Following
+from tumortrack.core.process import keep_small_blocks
 from tumortrack.core.types import Anatomy, SensorCloud
 from tumortrack.occupancy.locator import OccupancyLocator
 from tumortrack.registration.locator import RegistrationLocator

@@ -11,7 +11,7 @@ from typing import Protocol
 import torch
 from torch.utils.data import DataLoader, Dataset
 
-from tumortrack.core.cores import available_cores
+from tumortrack.core.process import available_cores
 from tumortrack.simulate.dataset import Batch
 
 __all__ = ["Stream", "Tensors", "available_cores", "batches", "default_workers"]

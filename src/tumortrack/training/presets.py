@@ -11,9 +11,8 @@ from tumortrack.core.types import Anatomy
 from tumortrack.models.config import Schedule, TrainConfig
 from tumortrack.occupancy.network import clinic_network, paper_network, quick_network
 from tumortrack.registration.canonical_frame import FIELDS, UPRIGHT_MM
-from tumortrack.sense.calibration import CalibrationConfig
 from tumortrack.sense.clutter import ClutterConfig
-from tumortrack.sense.noise import D405_NOISE
+from tumortrack.sense.noise import D405_NOISE, CalibrationConfig
 from tumortrack.sense.occlusion import OcclusionConfig
 from tumortrack.simulate.deform import ChainConfig, DragConfig, ElasticConfig, StretchConfig
 from tumortrack.simulate.deform.drag import CONFIGURATIONS

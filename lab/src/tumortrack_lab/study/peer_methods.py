@@ -15,7 +15,7 @@ import tumortrack
 from tumortrack.core import store
 from tumortrack.core.config import Config, to_builtins
 from tumortrack.core.errors import InputError
-from tumortrack.core.motion import OneWay
+from tumortrack.core.estimate import OneWay
 from tumortrack.core.types import Anatomy
 from tumortrack.simulate.scene_folder import Scene
 from tumortrack_lab.peers.base import estimate_of

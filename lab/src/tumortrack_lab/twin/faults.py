@@ -128,11 +128,11 @@ def _outliers(frame: DepthFrame, config: ViewConfig, rng: np.random.Generator) -
 
 def _distortion(frame: DepthFrame, config: ViewConfig, rng: np.random.Generator) -> DepthFrame:
     """The sensor model's slow field at its full height, in every scene."""
-    from tumortrack.sense.noise_kernels import slow_field
+    from tumortrack.sense.kernels import slow_shape
 
     shape = (frame.intrinsics.height, frame.intrinsics.width)
-    depth_mm = frame.depth_mm + slow_field(shape, DISTORTION_MM, rng)
-    return DepthFrame(depth_mm, frame.intrinsics, frame.stamp_ns)
+    field, scale = slow_shape(shape, DISTORTION_MM, rng)
+    return frame.with_depth(frame.depth_mm + field * scale)
 
 
 def _noise(frame: DepthFrame, config: ViewConfig, rng: np.random.Generator) -> DepthFrame:

@@ -8,8 +8,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 from jaxtyping import Float32, Float64, Int64
 
-from tumortrack.sense.calibration import CALIBRATED
-from tumortrack.sense.noise import CLEAN
+from tumortrack.sense.noise import CALIBRATED, CLEAN
 from tumortrack.simulate.deform import ChainConfig, DeformConfig, DragConfig, RestConfig
 from tumortrack.simulate.deform.base import Deformation
 from tumortrack.simulate.deform.chain import Chain
