@@ -101,9 +101,7 @@ def _look(frame: DepthFrame, rng: np.random.Generator) -> _View:
     return _View(columns, rows, depth_mm, some, width_px, frame.intrinsics.fx)
 
 
-def _hide(
-    seen: _View, most: int, config: OcclusionConfig, rng: np.random.Generator
-) -> np.ndarray:
+def _hide(seen: _View, most: int, config: OcclusionConfig, rng: np.random.Generator) -> np.ndarray:
     """Which pixels are hidden: by shafts, patches, or shafts and patches."""
     from tumortrack.sense.kernels import take_first
 

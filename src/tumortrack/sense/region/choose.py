@@ -4,13 +4,13 @@ what continues it behind something nearer; and what lies in the last estimate's 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
-import numba
 import numpy as np
 
 from tumortrack.core.errors import NoEstimate
 from tumortrack.sense.region.config import RegionConfig
-from tumortrack.sense.region.picture import FLYING, LAST_BOX, Picture
+from tumortrack.sense.region.picture import FLYING, LAST_BOX, Picture, is_inside, jit
 from tumortrack.sense.region.pieces import Edges
 
 PICK_REACH_MM = 10.0  # from the picked point to the piece it means
@@ -60,12 +60,17 @@ def under_box(
     return int(inside.argmax()) if inside.max() > 0 else None
 
 
-@dataclass(frozen=True, eq=False)
-class Sizes:
-    """Of every piece (count + 1,): ``area_mm2`` across the line of sight, longest extent
-    ``wide_mm``, and ``cut``: how much of it goes on outside what is looked at, as the width there
-    over the square root of the area, 0..1; ``thick_mm``: diameter of the largest disc in it;
-    ``aside``: tangent of the angle between its middle and the optical axis."""
+class Sizes(NamedTuple):
+    """Of every piece (count + 1,); entry 0 is not used.
+
+    Attributes:
+        area_mm2: across the line of sight.
+        wide_mm: longest extent.
+        cut: 0..1, how much of it goes on outside what is looked at: the width there over the
+            square root of the area.
+        thick_mm: diameter of the largest disc in it.
+        aside: tangent of the angle between its middle and the optical axis.
+    """
 
     area_mm2: np.ndarray
     wide_mm: np.ndarray
@@ -75,9 +80,7 @@ class Sizes:
 
 
 def sizes(picture: Picture, edges: Edges, pieces: np.ndarray, count: int) -> Sizes:
-    return Sizes(
-        *_measure(picture.depth_mm, edges.distance, picture.taken, pieces, picture.pinhole, count)
-    )
+    return _measure(picture.depth_mm, edges.distance, picture.taken, pieces, picture.pinhole, count)
 
 
 def likeliest(these: Sizes, config: RegionConfig) -> int | None:
@@ -161,7 +164,7 @@ def _like_an_organ(these: Sizes, config: RegionConfig) -> np.ndarray:
     return fits * thick * aimed * (1 - 0.95 * these.cut) ** 4 * (these.wide_mm > low)
 
 
-@numba.njit(cache=True, nogil=True)
+@jit
 def _nearest(depth_mm, pieces, pinhole, point):  # type: ignore[no-untyped-def]
     fx, fy, cx, cy = pinhole
     best, piece = np.inf, 0
@@ -176,21 +179,19 @@ def _nearest(depth_mm, pieces, pinhole, point):  # type: ignore[no-untyped-def]
     return best, piece
 
 
-@numba.njit(cache=True, nogil=True)
+@jit
 def _area_inside(depth_mm, pieces, pinhole, low, high, count):  # type: ignore[no-untyped-def]
-    fx, fy, cx, cy = pinhole
     area = np.zeros(count)
     for v in range(len(depth_mm)):
         for u in range(depth_mm.shape[1]):
             if pieces[v, u]:
                 z = depth_mm[v, u]
-                x, y = (u - cx) / fx * z, (v - cy) / fy * z
-                if low[2] < z < high[2] and low[1] < y < high[1] and low[0] < x < high[0]:
-                    area[pieces[v, u]] += z * z / (fx * fy)
+                if is_inside(pinhole, u, v, z, low, high):
+                    area[pieces[v, u]] += z * z / (pinhole.fx * pinhole.fy)
     return area
 
 
-@numba.njit(cache=True, nogil=True)
+@jit
 def _measure(depth_mm, distance, taken, pieces, pinhole, count):  # type: ignore[no-untyped-def]
     fx, fy, cx, cy = pinhole
     height, width = depth_mm.shape
@@ -232,10 +233,11 @@ def _measure(depth_mm, distance, taken, pieces, pinhole, count):  # type: ignore
         if area[piece] > 0:
             wide[piece] = (high[piece] - low[piece]).max()
             cut[piece] = min(border[piece] / np.sqrt(area[piece]), 1.0)
-    return area, wide, cut, 2 * disc, np.sqrt((middle**2).sum(1)) / np.maximum(pixels, 1)
+    aside = np.sqrt((middle**2).sum(1)) / np.maximum(pixels, 1)
+    return Sizes(area, wide, cut, 2 * disc, aside)
 
 
-@numba.njit(cache=True, nogil=True)
+@jit
 def _goes_on(depth_mm, taken, z, v, u):  # type: ignore[no-untyped-def]
     """Beyond the image's border, or as the same surface beyond the last estimate's surroundings.
     Range, box and mask don't count: they are there to cut around the organ."""
@@ -245,7 +247,7 @@ def _goes_on(depth_mm, taken, z, v, u):  # type: ignore[no-untyped-def]
     return taken[v, u] == LAST_BOX and abs(depth_mm[v, u] - z) < _SAME_MM
 
 
-@numba.njit(cache=True, nogil=True)
+@jit
 def _continuing(depth_mm, taken, pieces, gap, footprint, count):  # type: ignore[no-untyped-def]
     """Along which length (count, count), mm, one piece goes on as another after a gap in which
     something is nearer and nothing is farther."""

@@ -1,4 +1,4 @@
-"""Depth image or cloud -> the working picture that all steps look at; and back to points."""
+"""Depth image or cloud -> the working picture that all steps share; and back to points."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 
 from tumortrack.core.errors import InputError
 from tumortrack.core.types import DepthFrame, SensorCloud
-from tumortrack.sense.camera import deproject_pixels
+from tumortrack.sense.camera import Pinhole, deproject_pixels
 
 MOST_PIXELS = 110_000  # of a working picture: 424 x 240, and every second pixel of 848 x 480
 _POINTS_PER_PIXEL = 2
@@ -32,6 +32,9 @@ STEPS = (
 )
 
 
+jit = numba.njit(cache=True, nogil=True)
+
+
 @dataclass(frozen=True, eq=False)
 class Picture:
     """A depth image at working size, and what the steps have decided about its pixels so far.
@@ -39,21 +42,21 @@ class Picture:
     Attributes:
         depth_mm: (h, w) float32, NaN where there was no return.
         taken: (h, w) uint8, one of the numbers above; the steps write into it.
-        pinhole: fx, fy, cx, cy of the working picture, px.
+        pinhole: of the working picture.
         left: ``taken`` -> which points of the content are still called ORGAN, (n,) int.
         points: some of these -> points (n, 3), camera frame, mm, float32.
     """
 
     depth_mm: np.ndarray
     taken: np.ndarray
-    pinhole: tuple[float, float, float, float]
+    pinhole: Pinhole
     left: Callable[[np.ndarray], np.ndarray]
     points: Callable[[np.ndarray], np.ndarray]
 
     @property
     def footprint(self) -> float:
         """Width of a pixel at distance 1."""
-        return 2 / (self.pinhole[0] + self.pinhole[1])
+        return 2 / (self.pinhole.fx + self.pinhole.fy)
 
     def take(self, where: np.ndarray, step: int) -> None:
         """Give the pixels (h, w, bool) that nobody has taken yet to a step."""
@@ -70,7 +73,7 @@ class Picture:
     def part(self, window: tuple[slice, slice]) -> Picture:
         """Those rows and columns alone; what is decided there must be written back."""
         fx, fy, cx, cy = self.pinhole
-        pinhole = (fx, fy, cx - window[1].start, cy - window[0].start)
+        pinhole = Pinhole(fx, fy, cx - window[1].start, cy - window[0].start)
         depth_mm, taken = self.depth_mm[window].copy(), self.taken[window].copy()
         return Picture(depth_mm, taken, pinhole, self.left, self.points)
 
@@ -100,7 +103,7 @@ def picture_of_frame(frame: DepthFrame, mask: np.ndarray | None) -> Picture:
         seen_mm = frame.depth_mm[row, column].astype(np.float64)
         return deproject_pixels(row * camera.width + column, seen_mm, camera)
 
-    pinhole = (
+    pinhole = Pinhole(
         camera.fx / step,
         camera.fy / step,
         (camera.cx - step // 2) / step,
@@ -129,7 +132,7 @@ def picture_of_cloud(cloud: SensorCloud) -> Picture:
     most = np.prod(high - low + 1e-3) / MOST_PIXELS
     size = float(np.sqrt(max(np.prod(inner + 1e-3) / pixels, most)))
     width, height = (int(n) for n in np.floor((high - low) / size) + 1)
-    pinhole = (1 / size, 1 / size, float(-low[0] / size), float(-low[1] / size))
+    pinhole = Pinhole(1 / size, 1 / size, float(-low[0] / size), float(-low[1] / size))
     depth_mm, pixel = _rasterise(tangents, points_mm[:, 2].copy(), pinhole, height, width)
     taken = np.isnan(depth_mm).view(np.uint8) * np.uint8(NO_RETURN)
 
@@ -142,7 +145,29 @@ def picture_of_cloud(cloud: SensorCloud) -> Picture:
     return Picture(depth_mm, taken, pinhole, left, lambda some: points_mm[some])
 
 
-@numba.njit(cache=True, nogil=True)
+def keep_inside(picture: Picture, corners_mm: np.ndarray, step: int) -> None:
+    """Take everything outside a box: two corners (2, 3), camera frame, mm, in any order."""
+    low, high = np.sort(np.asarray(corners_mm, np.float64), axis=0)
+    _keep_inside(picture.depth_mm, picture.taken, picture.pinhole, low, high, step)
+
+
+@jit
+def _keep_inside(depth_mm, taken, pinhole, low, high, step):  # type: ignore[no-untyped-def]
+    height, width = depth_mm.shape
+    for v in range(height):
+        for u in range(width):
+            if not taken[v, u] and not is_inside(pinhole, u, v, depth_mm[v, u], low, high):
+                taken[v, u] = step
+
+
+@numba.njit(cache=True, inline="always")
+def is_inside(pinhole, u, v, z, low, high):  # type: ignore[no-untyped-def]
+    """Whether the point that a pixel sees lies strictly within a box."""
+    x, y = (u - pinhole.cx) / pinhole.fx * z, (v - pinhole.cy) / pinhole.fy * z
+    return low[2] < z < high[2] and low[1] < y < high[1] and low[0] < x < high[0]
+
+
+@jit
 def _spread(points_mm, widest):  # type: ignore[no-untyped-def]
     """x / z and y / z (n, 2), NaN where not before the camera or wider than ``widest``; their
     extremes (2,) and (2,); and how far the middle 96 % spread (2,), from a histogram: the order of
@@ -178,7 +203,7 @@ def _spread(points_mm, widest):  # type: ignore[no-untyped-def]
     return tangents, low, high, inner
 
 
-@numba.njit(cache=True, nogil=True)
+@jit
 def _rasterise(tangents, z_mm, pinhole, height, width):  # type: ignore[no-untyped-def]
     """The nearest depth in each pixel (h, w), and each point's pixel (n,), -1 outside."""
     fx, fy, cx, cy = pinhole
@@ -197,7 +222,7 @@ def _rasterise(tangents, z_mm, pinhole, height, width):  # type: ignore[no-untyp
     return depth_mm.reshape(height, width), pixel
 
 
-@numba.njit(cache=True, nogil=True)
+@jit
 def _count(taken, kinds):  # type: ignore[no-untyped-def]
     found = np.zeros(kinds, np.int64)
     for v in range(len(taken)):
