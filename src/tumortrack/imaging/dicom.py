@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from tumortrack.core.errors import InputError
-from tumortrack.imaging.voxels import RawVolume, check_affine, check_size
+from tumortrack.imaging.grid import RawVolume, check_affine, check_size
 
 MIN_SLICES = 10
 _MAX_FILES = 20_000

@@ -1,8 +1,7 @@
 """Random kidneys with random tumors, as many as wanted: what pretraining learns from.
 
 Each is the built-in phantom's implicit surface with parameters of its own, turned at random in the
-CT and seen from a random side; they differ more than `sampling`'s phantoms, which stay near the
-paper's. Nothing in them comes from a patient.
+CT and seen from a random side. Nothing in them comes from a patient.
 """
 
 from __future__ import annotations
