@@ -22,7 +22,7 @@ from tumortrack.core.types import Mesh
 from tumortrack.plan.config import ResectionConfig
 from tumortrack.plan.motions import JOINTS, Motions, MotionStage
 from tumortrack.plan.values import Cut, CutLayer, Located, ResectionPlan
-from tumortrack.sense.ply import framed_ply
+from tumortrack.sense.ply import cloud_ply
 
 KIND = "plan"
 _NAME, _STROKES, _MOTIONS = "plan.json", "strokes.ply", "motions.safetensors"
@@ -185,7 +185,7 @@ def _write_strokes(path: Path, plan: ResectionPlan) -> None:
         "stroke": np.array(strokes, np.int32),
         "floor": np.array(floor, np.uint8),
     }
-    table = framed_ply(np.concatenate(points), properties, "table (z up)")
+    table = cloud_ply(np.concatenate(points), properties, "table (z up)")
     store.write_atomically(path, table)
 
 

@@ -7,6 +7,7 @@ against the file and a limit before anything is allocated; nothing here loads pi
 from __future__ import annotations
 
 import io
+import math
 import struct
 import zipfile
 from pathlib import Path
@@ -17,7 +18,7 @@ import numpy as np
 from tumortrack.core.errors import InputError
 from tumortrack.core.store import read_json, write_atomically, write_json
 from tumortrack.core.types import DepthFrame, Intrinsics, SensorCloud
-from tumortrack.sense.ply import parse_ply_points, write_cloud_ply
+from tumortrack.sense.ply import parse_ply_properties, write_cloud_ply
 
 __all__ = [
     "read_cloud",
@@ -31,6 +32,8 @@ __all__ = [
 CLOUD_SUFFIXES = (".ply", ".pcd", ".npz")
 DEPTH_UNIT_MM = 0.1  # the D405's default
 LARGEST_FILE = 256 * 2**20  # bytes, also of what a compressed file unpacks to
+_PINHOLE_KEYS = ("width", "height", "fx", "fy", "cx", "cy")
+_OTHER_KEYS = {"cx": "ppx", "cy": "ppy"}
 _DISTORTION_KEYS = (
     *("coeffs", "distortion", "distortion_coefficients", "dist_coeffs", "D"),
     *("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2"),
@@ -40,10 +43,10 @@ _DISTORTION_KEYS = (
 def read_cloud(path: Path, unit: Literal["mm", "m"] = "mm") -> tuple[SensorCloud, tuple[str, ...]]:
     """A cloud in the camera frame from .ply, .pcd (all three encodings) or .npz, and notes.
 
-    An .npz holds ``points_mm``, or ``points``, or one array (n, 3) of any name. Points that
-    stand for "no return" (NaN, infinite, or exactly 0, 0, 0, as RealSense and organised clouds
-    have them) are dropped, and a note says how many. Whether the rest can be an organ in mm is
-    ``cloud.check_cloud``'s question.
+    An .npz holds ``points_mm``, or ``points``, or one array (n, 3) of any name. Points without
+    return (NaN, infinite, or exactly 0, 0, 0, as RealSense and organised clouds have them) are
+    dropped, and a note says how many. ``cloud.check_cloud`` then tells whether the rest can be
+    an organ in mm.
 
     Raises:
         InputError: missing, too large, damaged, of another kind, or without any point.
@@ -69,7 +72,7 @@ def _raw_points(path: Path, unit: str) -> np.ndarray:
         raise InputError(f"unit {unit!r} is not understood. Allowed: mm, m.")
     content = _read_bytes(path)
     if suffix == ".ply":
-        return parse_ply_points(content, str(path))
+        return parse_ply_properties(content, str(path))
     if suffix == ".pcd":
         return _pcd_points(content, str(path))
     points, key = _npz_points(content, str(path))
@@ -156,11 +159,7 @@ def _npz_points(content: bytes, name: str) -> tuple[np.ndarray, str]:
         raise
     except Exception as error:  # zipfile and numpy raise anything on a damaged file
         raise InputError(f"{name} cannot be read as .npz: {error or type(error)}.") from error
-    clouds = [
-        key
-        for key, array in found.items()
-        if array.ndim == 2 and array.shape[1] == 3 and array.dtype.kind in "fiu"
-    ]
+    clouds = [key for key, a in found.items() if a.shape[1:] == (3,) and a.dtype.kind in "fiu"]
     if len(clouds) != 1:
         shapes = ", ".join(f"{key} {array.shape}" for key, array in found.items())
         raise InputError(
@@ -177,15 +176,10 @@ def _check_npz_size(archive: zipfile.ZipFile, name: str) -> None:
     for member in archive.infolist():
         with archive.open(member) as stream:
             major, _ = np.lib.format.read_magic(stream)
-            read_header = (
-                np.lib.format.read_array_header_1_0
-                if major == 1
-                else np.lib.format.read_array_header_2_0
-            )
-            shape, _, dtype = read_header(stream)
-        claimed = dtype.itemsize
-        for length in shape:
-            claimed *= length
+            headers = np.lib.format
+            read = headers.read_array_header_1_0 if major == 1 else headers.read_array_header_2_0
+            shape, _, dtype = read(stream)
+        claimed = math.prod((dtype.itemsize, *shape))
         if claimed > member.file_size or min(shape, default=0) < 0:
             raise InputError(f"{name}: {member.filename} claims more than the file holds.")
 
@@ -214,24 +208,15 @@ def _intrinsics(data: dict, path: Path) -> Intrinsics:
                 "Give the rectified depth stream (a D405's is) and its intrinsics."
             )
     values = {}
-    for key, other in {
-        "width": "",
-        "height": "",
-        "fx": "",
-        "fy": "",
-        "cx": "ppx",
-        "cy": "ppy",
-    }.items():
-        found = data.get(key, data.get(other))
+    for key in _PINHOLE_KEYS:
+        found = data.get(key, data.get(_OTHER_KEYS.get(key, "")))
         if found is None or isinstance(found, list):
             needed = "width, height, fx, fy, cx (or ppx), cy (or ppy)"
             raise InputError(f"{path} lacks the number {key!r}; it must have {needed}, in pixels.")
         values[key] = _numbers(found, key, path)[0]
-    for key in ("width", "height"):
-        if not values[key].is_integer():
+        if key in ("width", "height") and not values[key].is_integer():
             raise InputError(f"{path}: {key} is {values[key]}; it must be a whole number.")
-    width, height = int(values.pop("width")), int(values.pop("height"))
-    return Intrinsics(width, height, **values)
+    return Intrinsics(int(values.pop("width")), int(values.pop("height")), **values)
 
 
 def _numbers(value: object, key: str, path: Path) -> list[float]:
@@ -258,8 +243,7 @@ def write_intrinsics(
 
 def intrinsics_json(intrinsics: Intrinsics, depth_unit_mm: float = DEPTH_UNIT_MM) -> dict:
     """What ``write_intrinsics`` writes."""
-    names = ("width", "height", "fx", "fy", "cx", "cy")
-    values = {name: getattr(intrinsics, name) for name in names}
+    values = {key: getattr(intrinsics, key) for key in _PINHOLE_KEYS}
     return {**values, "depth_unit_mm": depth_unit_mm}
 
 
@@ -268,7 +252,7 @@ def read_depth_png(
 ) -> DepthFrame:
     """A 16-bit depth image; 0 is no return.
 
-    One step is ``depth_unit_mm``, or what the intrinsics file says under that name, or 0.1 mm.
+    One step is ``depth_unit_mm``, else what the intrinsics file states, else 0.1 mm.
 
     Raises:
         InputError: not a single-channel 16-bit PNG, or of another size than the intrinsics.

@@ -1,7 +1,7 @@
-"""What lies between camera and organ: instrument shafts, patches of fat, drapes.
+"""Occluders between camera and organ: instrument shafts, patches of fat, drapes.
 
-They are taken to be segmented out, so the organ has no return there; a segmentation that misses
-one end of them leaves its points in. Works on the image alone, in pixels and the organ's own width.
+They are assumed to be segmented out, so the organ has no return there; a segmentation that misses
+one end of them leaves its points in. All is done in the image: pixels and the organ's own width.
 """
 
 from __future__ import annotations

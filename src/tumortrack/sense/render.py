@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from tumortrack.core.types import DepthFrame, Intrinsics, Mesh
+from tumortrack.sense.camera import pinhole_of
 
 
 def render_depth(
@@ -20,21 +21,17 @@ def render_depth(
     Vertices (v, 3) in the camera frame, faces (f, 3) turned outward. Only triangles that face
     the camera are drawn; a triangle that reaches behind the camera is left out.
     """
-    depth = _z_buffer(
-        np.ascontiguousarray(vertices_camera_mm, np.float32),
-        np.ascontiguousarray(faces, np.int32),
-        intrinsics.width,
-        intrinsics.height,
-        intrinsics.fx,
-        intrinsics.fy,
-        intrinsics.cx,
-        intrinsics.cy,
-    )
+    vertices = np.ascontiguousarray(vertices_camera_mm, np.float32)
+    shape = (intrinsics.height, intrinsics.width)
+    faces = np.ascontiguousarray(faces, np.int32)
+    depth = _z_buffer(vertices, faces, shape, pinhole_of(intrinsics))
     return DepthFrame(depth, intrinsics, stamp_ns)
 
 
 @numba.njit(cache=True, nogil=True)
-def _z_buffer(vertices, faces, width, height, fx, fy, cx, cy):  # type: ignore[no-untyped-def]
+def _z_buffer(vertices, faces, shape, pinhole):  # type: ignore[no-untyped-def]
+    fx, fy, cx, cy = pinhole
+    height, width = shape
     n = len(vertices)
     u = np.zeros(n, np.float32)
     v = np.zeros(n, np.float32)
