@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import RAS_FROM_LPS, transform_points
 from tumortrack.core.mesh_files import SUFFIXES, read_mesh
-from tumortrack.core.solids import mesh_of, solid_of
 from tumortrack.core.types import FIRST_TUMOR, ORGAN, Anatomy, LabelVolume, Mesh, part_names
 from tumortrack.imaging.grid import grid_round
 from tumortrack.imaging.raster import winding_numbers
@@ -261,3 +261,27 @@ def is_simple(mesh: Mesh, step_mm: float) -> bool:
         if wrong.sum() > 2:
             return False
     return True
+
+
+def solid_of(mesh: Mesh, name: str) -> Any:
+    """A closed mesh as a ``manifold3d.Manifold``; ``name`` stands in the error.
+
+    Raises:
+        InputError: open, crossing itself beyond use, or inside out.
+    """
+    import manifold3d
+
+    raw = manifold3d.Mesh64(mesh.vertices_mm.copy(), mesh.faces.astype(np.uint64))
+    solid = manifold3d.Manifold(raw)
+    if solid.status() != manifold3d.Error.NoError or solid.volume() <= 0:
+        raise InputError(
+            f"{name} is not a closed surface with faces turned outward "
+            f"({solid.status().name}). Repair the mesh and try again."
+        )
+    return solid
+
+
+def mesh_of(solid: Any) -> Mesh:
+    """A ``manifold3d.Manifold``'s surface, faces outward."""
+    out = solid.to_mesh64()
+    return Mesh(out.vert_properties[:, :3], out.tri_verts)

@@ -41,7 +41,7 @@ class Surroundings:
     """What is where at a height: organ, piece and grasper, as polygons seen from above."""
 
     def __init__(self, organ: Mesh, config: CellConfig, plan: ResectionPlan | None = None) -> None:
-        from tumortrack.core.solids import solid_of
+        from tumortrack.imaging.meshes import solid_of
 
         self._solid = solid_of(organ, "the organ's surface")
         self._layers = () if plan is None else plan.layers
