@@ -105,7 +105,7 @@ def _run_all(runners: list[GaussNewton], steps: int) -> None:
         for runner in runners[part]:
             runner.run(steps)
 
-    share(run, len(runners), 1)
+    parallel_for(run, len(runners), 1)
 
 
 @contextmanager
