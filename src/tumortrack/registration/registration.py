@@ -22,6 +22,7 @@ import torch
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
+from tumortrack.core.process import parallel_for
 from tumortrack.models.config import GaussNewtonConfig
 from tumortrack.registration.gauss_newton import GaussNewton, RegistrationResult
 from tumortrack.registration.motion import ElasticMotion
