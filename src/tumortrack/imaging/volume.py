@@ -114,28 +114,31 @@ def volume_of(raw: RawVolume, path: Path) -> Volume:
 
 def labels_of(raw: RawVolume, path: Path) -> LabelVolume:
     """Raw voxels as labels; ``path`` names them in errors."""
-    array = raw.array
-    low, high = float(array.min()), float(array.max())
+    low, high = float(raw.array.min()), float(raw.array.max())
     if not (low >= 0 and high <= 255):
         raise InputError(
             f"{path} is no label map: values from {low:g} to {high:g}; whole numbers from 0 to "
             "255 are allowed."
         )
-    labels = array.astype(np.uint8)
-    if array.dtype.kind == "f" and not np.array_equal(labels, array):
+    labels = _whole_numbers(raw.array)
+    if labels is None:
         raise InputError(f"{path} is no label map: it has fractions. Whole numbers are needed.")
     return LabelVolume(labels, raw.lps_from_index)
 
 
 def is_label_map(raw: RawVolume) -> bool:
     """True for whole numbers within 0..255 of which at most 32 occur: no CT looks like that."""
-    array = raw.array
-    if not (array.min() >= 0 and array.max() <= 255):
+    if not (raw.array.min() >= 0 and raw.array.max() <= 255):
         return False
+    labels = _whole_numbers(raw.array)
+    return labels is not None and int(np.count_nonzero(label_counts(labels))) <= _MOST_LABELS
+
+
+def _whole_numbers(array: np.ndarray) -> np.ndarray | None:
+    """Numbers in 0..255 as uint8; None where one has a fraction."""
     labels = array.astype(np.uint8)
-    if array.dtype.kind == "f" and not np.array_equal(labels, array):
-        return False
-    return int(np.count_nonzero(label_counts(labels))) <= _MOST_LABELS
+    whole = array.dtype.kind != "f" or np.array_equal(labels, array)
+    return labels if whole else None
 
 
 def _read_nrrd(path: Path) -> RawVolume:

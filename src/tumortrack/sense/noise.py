@@ -138,20 +138,22 @@ def add_noise(frame: DepthFrame, config: NoiseConfig, rng: np.random.Generator) 
     seen = seen_pixels(true_mm)
     depths_mm = true_mm.ravel()[seen.pixels]
     scatter = _scatter(true_mm, seen.pixels, depths_mm, config, np.random.default_rng((seed, 0)))
-    _err_at_edges(frame, depths_mm, seen, config, seed)
-    _err_everywhere(true_mm.shape, depths_mm, seen, config, seed)
+    _disturb(frame, depths_mm, seen, config, seed)
     out_mm = np.full(true_mm.shape, np.nan, np.float32)
     for pixels, values_mm in ((seen.pixels, depths_mm), scatter):
         out_mm.ravel()[pixels] = _quantised(values_mm, config.quantum_mm)
     return frame.with_depth(out_mm)
 
 
-def _err_at_edges(
+def _disturb(
     frame: DepthFrame, depths_mm: np.ndarray, seen: Seen, config: NoiseConfig, seed: int
 ) -> None:
+    """Change the seen depths in place: edges, slow distortion, noise, holes."""
+    from scipy.special import ndtri
+
     from tumortrack.sense import kernels
 
-    true_mm = frame.depth_mm
+    true_mm, shape = frame.depth_mm, frame.depth_mm.shape
     if config.flying_share:
         edge = (config.edge_px, config.edge_mm)
         kernels.fly(true_mm, depths_mm, seen, seed + 1, config.flying_share, config.flying_mm, edge)
@@ -159,19 +161,9 @@ def _err_at_edges(
         grazing = (config.grazing_share, config.grazing_degrees)
         pinhole = pinhole_of(frame.intrinsics)
         kernels.lose_grazing(true_mm, depths_mm, seen, seed + 2, grazing, pinhole)
-
-
-def _err_everywhere(
-    shape: tuple[int, int], depths_mm: np.ndarray, seen: Seen, config: NoiseConfig, seed: int
-) -> None:
-    from scipy.special import ndtri
-
-    from tumortrack.sense import kernels
-
     if config.distortion_mm:
         rng = np.random.default_rng((seed, 1))
-        peak_mm = config.distortion_mm * rng.random()
-        field, scale = kernels.slow_shape(shape, peak_mm, rng)
+        field, scale = kernels.slow_shape(shape, config.distortion_mm * rng.random(), rng)
         depths_mm += field.ravel()[seen.pixels] * scale
     if config.axial_mm:
         relative = config.axial_mm / REFERENCE_MM**2
