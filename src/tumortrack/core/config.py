@@ -34,13 +34,13 @@ C = TypeVar("C", bound=msgspec.Struct)
 
 
 def to_builtins(config: msgspec.Struct) -> dict:
-    """The configuration as what JSON would give back, every key written out."""
+    """The configuration as JSON would return it, every key written out."""
     return msgspec.json.decode(msgspec.json.encode(config))
 
 
 def identity(config: msgspec.Struct) -> dict:
-    """``to_builtins`` to be hashed: fields named in ``LATER`` are left out where they have their
-    default, so that what was made before there was such a field is still known as the same."""
+    """``to_builtins`` for hashing: fields named in ``LATER`` are left out at their default, so
+    that artifacts from before there was such a field keep their hash."""
     written = to_builtins(config)
     _drop_later(config, written)
     return written

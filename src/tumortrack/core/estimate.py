@@ -1,4 +1,4 @@
-"""What the tracker says about one cloud: points, labelled grid, surfaces, motion and numbers."""
+"""What is located in one cloud: points, labelled grid, surfaces, motion and numbers."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class Motion(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class OneWay:
-    """The motion of a method that knows the way from the CT to the camera and nothing else."""
+    """The motion of a method that knows only the way from the CT to the camera."""
 
     carry: Carry
 

@@ -26,7 +26,7 @@ _AT_ONCE = 2**16  # labels: counting makes eight bytes of each
 class RawVolume:
     """Voxels in the file's own number type; axes (i, j, k); ``lps_from_index``: index -> LPS mm.
 
-    ``notes`` say what lay beside them and was left out.
+    ``notes`` name what was beside them and was left out.
     """
 
     array: np.ndarray

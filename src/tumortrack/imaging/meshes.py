@@ -28,7 +28,7 @@ _RULE = (
 
 
 def read_mesh_folder(folder: Path, unit: str | None = None) -> tuple[Anatomy, list[str]]:
-    """Read one organ and its tumors; LPS mm unless a file's comment says ``SPACE=RAS``.
+    """Read one organ and its tumors; LPS mm unless a file's comment states ``SPACE=RAS``.
 
     Small holes, doubled faces, inside-out surfaces and crossings are repaired with a note. The
     organ becomes the union of organ and tumors.
@@ -159,8 +159,8 @@ def _union(organ: Mesh, tumor: Mesh, name: str) -> Mesh:
 def closed_mesh(mesh: Mesh, name: str, notes: list[str]) -> Mesh:
     """Repair what can be repaired safely; every change adds a note that names the file.
 
-    Doubled faces go, small holes (up to 10 mm across) are closed, faces are turned outward, and
-    a mesh that crosses itself is remeshed from its winding numbers.
+    Doubled faces are removed, holes up to 10 mm across are closed, faces are turned outward, and a
+    mesh that crosses itself is remeshed from its winding numbers.
 
     Raises:
         InputError: open beyond that, or not a surface.
@@ -264,7 +264,7 @@ def is_simple(mesh: Mesh, step_mm: float) -> bool:
 
 
 def solid_of(mesh: Mesh, name: str) -> Any:
-    """A closed mesh as a ``manifold3d.Manifold``; ``name`` stands in the error.
+    """A closed mesh as a ``manifold3d.Manifold``; ``name`` is for the error.
 
     Raises:
         InputError: open, crossing itself beyond use, or inside out.

@@ -20,13 +20,7 @@ from jaxtyping import Float, Num
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import RAS_FROM_LPS
 from tumortrack.core.store import write_atomically
-from tumortrack.imaging.grid import (
-    RawVolume,
-    check_affine,
-    check_numbers,
-    check_size,
-    check_stored,
-)
+from tumortrack.imaging import grid
 
 GZIP_LEVEL = 4  # higher ones take several times longer and save little
 _HEADER = np.dtype(  # what is written of it; all else is 0
@@ -38,7 +32,7 @@ _HEADER = np.dtype(  # what is written of it; all else is 0
         + ["<f4", "u1", "<i2", "<i2", ("<f4", 3), ("<f4", 3)]
         + [("<f4", (3, 4)), "S4"],
         "offsets": [0, 40, 70, 72, 76, 108, 112, 123, 252, 254, 256, 268, 280, 344],
-        "itemsize": 352,  # with four bytes that say: no extension follows
+        "itemsize": 352,  # the last four bytes: no extension follows
     }
 )
 _TYPES = {"u1": 2, "i2": 4, "i4": 8, "f4": 16, "f8": 64, "i1": 256, "u2": 512, "u4": 768}
@@ -46,7 +40,7 @@ _MM, _SCANNER = 2, 1
 _MAX_OFFSET = 16 * 2**20  # bytes of header and extensions before the voxels
 
 
-def read_nifti(path: Path) -> RawVolume:
+def read_nifti(path: Path) -> grid.RawVolume:
     """Read .nii or .nii.gz. The sform places it, or the qform where there is no sform.
 
     Raises:
@@ -75,26 +69,26 @@ def read_nifti(path: Path) -> RawVolume:
         raise InputError(f"{path}: the header puts the voxels at byte {offset:g}; it is damaged.")
     while len(shape) > 3 and shape[-1] == 1:
         shape = shape[:-1]
-    check_size(path, shape, dtype.itemsize)
-    check_numbers(path, dtype)
+    grid.check_size(path, shape, dtype.itemsize)
+    grid.check_numbers(path, dtype)
     compressed = path.suffix.lower() == ".gz"
-    check_stored(path, math.prod(shape) * dtype.itemsize, compressed)
+    grid.check_stored(path, math.prod(shape) * dtype.itemsize, compressed)
     if units not in ("mm", "unknown"):
         raise InputError(
             f"{path} states its unit as {units}; millimetres are needed. Export it in mm."
         )
     lps_from_index = _lps_from_index(path, header)
-    check_affine(path, lps_from_index)
+    grid.check_affine(path, lps_from_index)
     try:
         array = np.asarray(image.dataobj).reshape(shape)
     except Exception as error:
         raise InputError(f"{path} is truncated or damaged: {error}.") from error
-    return RawVolume(array, lps_from_index)
+    return grid.RawVolume(array, lps_from_index)
 
 
 @contextmanager
 def _silent(logger: logging.Logger) -> Iterator[None]:
-    """nibabel mends some headers and says so; what is wrong with a file, we say ourselves."""
+    """Without nibabel's log of headers that it mends: errors here name what is wrong."""
     level = logger.level
     logger.setLevel(logging.CRITICAL)
     try:

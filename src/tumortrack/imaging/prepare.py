@@ -20,17 +20,17 @@ from tumortrack.imaging.select import MIN_TUMOR_ML, select_labels
 from tumortrack.imaging.surface import surfaces
 from tumortrack.imaging.volume import is_label_map, labels_of, read_raw, volume_of
 
-# Which options only one kind of input asks for.
+# Options that only one kind of input uses.
 _OF_CT = ("kidney_hu", "tumor_hu")
 _OF_LABELS = ("labels", "side", "organ", "tumor")
 _OF_DICOM, _OF_MESHES = ("series",), ("unit",)
 
-_MOST_CHANGE_PERCENT = 1.0  # of a part's volume, by smoothing; more is told
+_MOST_CHANGE_PERCENT = 1.0  # of a part's volume, by smoothing; more is noted
 
 
 @dataclass(frozen=True)
 class PrepareOptions:
-    """What the user may say about an input.
+    """What the user may state about an input.
 
     Attributes:
         kidney_hu, tumor_hu: half-open HU windows [low, high) for a CT.
@@ -69,7 +69,7 @@ def prepare(input: Path, options: PrepareOptions | None = None) -> Case:
     """Read any supported input and make a case of it; nothing is written.
 
     Raises:
-        InputError: nothing usable there; the message says what was wrong and what to do.
+        InputError: no usable input there.
     """
     options = options or PrepareOptions()
     up = direction_lps(options.up)
@@ -89,7 +89,7 @@ def prepare(input: Path, options: PrepareOptions | None = None) -> Case:
 
 
 def _refuse_unused(what: str, options: PrepareOptions, unused: tuple[str, ...]) -> None:
-    """An option that this kind of input never asks for would be ignored: say so instead."""
+    """Refuse options that this kind of input would ignore."""
     usual = PrepareOptions()
     given = [name for name in unused if getattr(options, name) != getattr(usual, name)]
     if given:

@@ -52,7 +52,7 @@ def segment_ct(
 ) -> tuple[LabelVolume, list[str]]:
     """Segment a phantom's CT by HU windows (half open, [low, high)), as in the paper.
 
-    Table, registration block, air and specks go: see ``_find_organ`` for the rule. A piece
+    Table, registration block, air and specks are dropped: see ``_find_organ``. A piece
     of the tumor window counts as a tumor when parenchyma fills at least 8 % of the shell 3 mm
     about it (a block beside the phantom has none: its own rim is too thin to be parenchyma).
     The rim between an exophytic tumor and air falls into the kidney's window by partial volume;
@@ -145,7 +145,7 @@ def _tumors_of(
 
 
 def _opened(mask: np.ndarray, steps_mm: np.ndarray, radius_mm: float) -> np.ndarray:
-    """Morphological opening by a ball: what is thinner than twice the radius goes."""
+    """Morphological opening by a ball: what is thinner than twice the radius is removed."""
     from scipy import ndimage
 
     inner = depth_mm(mask, steps_mm) > radius_mm
@@ -190,7 +190,7 @@ def _find_organ(
     fills two thirds of its convex hull, does not touch the scan's edge, is mostly kidney window
     and was cut along at most a quarter of its surface, and is no sheet (shortest over longest
     principal spread above 0.28). The largest such piece is the kidney; a deeper cut replaces it
-    only where that frees it of a sheet. Attached sheets thinner than 6 mm go.
+    only where that frees it of a sheet. Attached sheets thinner than 6 mm are removed.
 
     Args:
         dense: the part of ``solid`` in the tumor window.
@@ -301,7 +301,7 @@ def _is_kidney(region: np.ndarray, grid: _Grid) -> bool:
 
 
 def _contact(region: np.ndarray, solid: np.ndarray) -> float:
-    """Share of the region's surface faces behind which the solid goes on."""
+    """Share of the region's surface faces behind which the solid continues."""
     faces = cut = 0
     for axis in range(3):
         a, b = (np.moveaxis(x, axis, 0) for x in (region, solid))
@@ -337,7 +337,7 @@ def _solidity(region: np.ndarray, steps_mm: np.ndarray) -> float:
 def _refine(
     region: np.ndarray, other: np.ndarray, solid: np.ndarray, factors: np.ndarray
 ) -> Bool[np.ndarray, "i j k"]:
-    """Carry the coarse decision to the voxels: cells that were neither ask their nearest cell."""
+    """The coarse decision on the voxels; a cell that was neither takes its nearest cell's."""
     from scipy import ndimage
 
     label = np.where(region, 1, np.where(other, 2, 0)).astype(np.uint8)

@@ -11,14 +11,7 @@ from jaxtyping import Float, Int32, UInt8
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import spacing_mm
 from tumortrack.core.types import FIRST_TUMOR, ORGAN, LabelVolume
-from tumortrack.imaging.grid import (
-    bounding_box,
-    components,
-    cropped,
-    label_counts,
-    moved_origin,
-    voxel_ml,
-)
+from tumortrack.imaging import grid
 
 MIN_TUMOR_ML = 0.2
 _GAP_MM = 3.0  # annotators and resampling leave such gaps; a thicker slice counts as one voxel
@@ -57,7 +50,7 @@ class _Pieces:
     def _ml(self, values: tuple[int, ...]) -> Float[np.ndarray, " n"]:
         inside = self.numbers[np.isin(self.labels, values)]
         count = np.bincount(inside, minlength=int(self.numbers.max()) + 1)
-        return count * voxel_ml(self.lps_from_index)
+        return count * grid.voxel_ml(self.lps_from_index)
 
 
 @dataclass(frozen=True)
@@ -75,14 +68,14 @@ def select_labels(
     tumor: int | None = None,
     min_tumor_ml: float = MIN_TUMOR_ML,
 ) -> tuple[LabelVolume, list[str]]:
-    """Keep one kidney (label 1) and its tumors (2, 3, ...), cropped with a margin.
+    """Keep one kidney (label 1) and its tumors (2, 3, ...), grid.cropped with a margin.
 
     A kidney is a connected piece of organ and tumor voxels with at least 10 ml of organ and a
     tenth of the largest one's volume (where there is none, the piece with most organ). A tumor
-    within 3 mm of a kidney belongs to it: see ``_attach_tumors``. One farther off is left
-    out with a note; other pieces are specks and go. A tumor is a piece of one tumor label inside
-    that kidney; smaller ones than ``min_tumor_ml`` become organ. Different tumor labels keep
-    their order; the pieces of one label follow each other, largest first.
+    within 3 mm of a kidney belongs to it: see ``_attach_tumors``. One farther off is left out with
+    a note; other pieces are specks and dropped. A tumor is a piece of one tumor label inside that
+    kidney; smaller ones than ``min_tumor_ml`` become organ. Different tumor labels keep their
+    order; the pieces of one label follow each other, largest first.
 
     Args:
         side: the PATIENT's ``left`` or ``right``; None takes the kidney with most tumor.
@@ -97,12 +90,12 @@ def select_labels(
             tumor but one apart from every kidney.
     """
     labels = label_volume.labels
-    present = [int(n) for n in np.flatnonzero(label_counts(labels)) if n > 0]
+    present = [int(n) for n in np.flatnonzero(grid.label_counts(labels)) if n > 0]
     tumors = _tumor_labels(present, organ, tumor)
     affine = label_volume.lps_from_index
-    box = bounding_box(np.isin(labels, [organ, *tumors]), affine, 2.0)
-    affine = moved_origin(affine, box)
-    numbered, _ = components(np.isin(labels[box], [organ, *tumors]))
+    box = grid.bounding_box(np.isin(labels, [organ, *tumors]), affine, 2.0)
+    affine = grid.moved_origin(affine, box)
+    numbered, _ = grid.components(np.isin(labels[box], [organ, *tumors]))
     pieces = _Pieces(labels[box], numbered, affine, organ, tuple(tumors))
     numbers = _kidney_pieces(pieces)
     pieces, notes, apart = _attach_tumors(pieces, numbers, min_tumor_ml)
@@ -117,14 +110,14 @@ def select_labels(
             f"{_MIN_KIDNEY_ML:g} to {_MAX_KIDNEY_ML:g} ml. Check --organ, --tumor and the spacing."
         )
     kidney = pieces.numbers == chosen.piece
-    box = bounding_box(kidney, affine, 2.0)
+    box = grid.bounding_box(kidney, affine, 2.0)
     out, more = _number_tumors(
         np.where(kidney, pieces.labels, 0)[box].astype(np.uint8),
         tumors,
-        voxel_ml(affine),
+        grid.voxel_ml(affine),
         min_tumor_ml,
     )
-    return cropped(out, moved_origin(affine, box)), notes + more
+    return grid.cropped(out, grid.moved_origin(affine, box)), notes + more
 
 
 def _tumor_labels(present: list[int], organ: int, tumor: int | None) -> list[int]:
@@ -210,7 +203,7 @@ def _joined(
 
     spacing = spacing_mm(pieces.lps_from_index)
     reach_mm = max(_GAP_MM, float(spacing.max()))
-    box = bounding_box(
+    box = grid.bounding_box(
         pieces.numbers == number, pieces.lps_from_index, reach_mm + 2 * float(spacing.max())
     )
     numbers = pieces.numbers[box]
@@ -232,7 +225,7 @@ def _joined(
     joined, labels = pieces.numbers.copy(), pieces.labels.copy()
     joined[box][own | bridge] = numbers[there]
     labels[box][bridge] = pieces.organ
-    ml = float(bridge.sum()) * voxel_ml(pieces.lps_from_index)
+    ml = float(bridge.sum()) * grid.voxel_ml(pieces.lps_from_index)
     return replace(pieces, labels=labels, numbers=joined), gap_mm, ml
 
 
@@ -284,7 +277,7 @@ def _choose_kidney(
         name = "left" if best.x_mm > middle_x_mm else "right"
         return best, [f"the patient's {name} kidney was chosen: it bears most tumor"]
     sign = 1 if side == "left" else -1
-    # One kidney alone says nothing of the midline but the image's: near it, trust the user.
+    # With one kidney only the image's midline is known: near it, trust the user.
     slack = _MIDLINE_MARGIN_MM if len(kidneys) == 1 else 0.0
     fitting = [k for k in kidneys if sign * (k.x_mm - middle_x_mm) > -slack]
     if not fitting:
@@ -313,7 +306,7 @@ def _number_tumors(
         notes.append(f"holes of {filled_ml:.2f} ml inside the organ filled")
     number = FIRST_TUMOR
     for value in tumors:
-        pieces, counts = components(labels == value)
+        pieces, counts = grid.components(labels == value)
         kept = [n for n in range(len(counts)) if counts[n] * voxel_volume_ml >= min_tumor_ml]
         if lost := len(counts) - len(kept):
             lost_ml = float(counts[len(kept) :].sum()) * voxel_volume_ml

@@ -101,7 +101,7 @@ def _surface(name: str, mask: np.ndarray, affine: np.ndarray, step_mm: float) ->
 def _keep_volume(
     volume_error: Callable[[float], tuple[Mesh, float]], level: float, highest: float
 ) -> Mesh:
-    """The mesh whose volume errs least: secant steps on the level, halving where they go astray.
+    """The mesh whose volume errs least: secant steps on the level, bisection where they fail.
 
     Volume falls with the level, but may jump where a piece comes off; then no level is right.
     """
@@ -173,7 +173,7 @@ def _boundary_distance(mesh: Mesh, mask: np.ndarray, affine: np.ndarray) -> np.n
 
 def largest_shell(mesh: Mesh) -> Mesh:
     """The piece that encloses most (by the size of its signed volume); shells inside it and
-    specks go."""
+    specks are dropped."""
     if len(mesh.faces) == 0:
         return mesh
     piece = _piece_of_face(mesh)

@@ -16,14 +16,8 @@ from jaxtyping import Float
 
 from tumortrack.core.errors import InputError
 from tumortrack.core.types import LabelVolume, Volume
+from tumortrack.imaging import grid
 from tumortrack.imaging.dicom import read_dicom
-from tumortrack.imaging.grid import (
-    RawVolume,
-    check_affine,
-    check_size,
-    check_stored,
-    label_counts,
-)
 from tumortrack.imaging.nifti import read_nifti
 
 _DETACHED = (".nhdr", ".mhd", ".hdr", ".img")
@@ -50,7 +44,7 @@ _LPS_FROM_SPACE = {
 }
 
 
-def read_raw(path: Path, series: str | None = None) -> RawVolume:
+def read_raw(path: Path, series: str | None = None) -> grid.RawVolume:
     """Read the voxels of any supported volume in their stored type.
 
     Raises:
@@ -99,7 +93,7 @@ def read_labels(path: Path) -> LabelVolume:
     return labels_of(read_raw(path), path)
 
 
-def volume_of(raw: RawVolume, path: Path) -> Volume:
+def volume_of(raw: grid.RawVolume, path: Path) -> Volume:
     """Raw voxels as a CT; ``path`` names them in errors."""
     hu = raw.array.astype(np.float32, copy=False)
     low, high = float(hu.min()), float(hu.max())
@@ -112,7 +106,7 @@ def volume_of(raw: RawVolume, path: Path) -> Volume:
     return Volume(hu, raw.lps_from_index)
 
 
-def labels_of(raw: RawVolume, path: Path) -> LabelVolume:
+def labels_of(raw: grid.RawVolume, path: Path) -> LabelVolume:
     """Raw voxels as labels; ``path`` names them in errors."""
     low, high = float(raw.array.min()), float(raw.array.max())
     if not (low >= 0 and high <= 255):
@@ -126,12 +120,12 @@ def labels_of(raw: RawVolume, path: Path) -> LabelVolume:
     return LabelVolume(labels, raw.lps_from_index)
 
 
-def is_label_map(raw: RawVolume) -> bool:
+def is_label_map(raw: grid.RawVolume) -> bool:
     """True for whole numbers within 0..255 of which at most 32 occur: no CT looks like that."""
     if not (raw.array.min() >= 0 and raw.array.max() <= 255):
         return False
     labels = _whole_numbers(raw.array)
-    return labels is not None and int(np.count_nonzero(label_counts(labels))) <= _MOST_LABELS
+    return labels is not None and int(np.count_nonzero(grid.label_counts(labels))) <= _MOST_LABELS
 
 
 def _whole_numbers(array: np.ndarray) -> np.ndarray | None:
@@ -141,7 +135,7 @@ def _whole_numbers(array: np.ndarray) -> np.ndarray | None:
     return labels if whole else None
 
 
-def _read_nrrd(path: Path) -> RawVolume:
+def _read_nrrd(path: Path) -> grid.RawVolume:
     """Read an attached .nrrd (raw, gzip or bzip2) with a stated patient space.
 
     Raises:
@@ -157,8 +151,8 @@ def _read_nrrd(path: Path) -> RawVolume:
         raise InputError(
             f"{path}: the NRRD header is damaged or lacks a field ({error}). Export it again."
         ) from error
-    check_size(path, shape, dtype.itemsize)
-    check_affine(path, lps_from_index)
+    grid.check_size(path, shape, dtype.itemsize)
+    grid.check_affine(path, lps_from_index)
     if dtype.itemsize > 1:
         if fields.get("endian", "").lower() not in ("little", "big"):
             raise InputError(f"{path}: the NRRD header states no byte order. Export it again.")
@@ -167,10 +161,10 @@ def _read_nrrd(path: Path) -> RawVolume:
         raise InputError(f"{path}: encoding {encoding!r} is not read. Export as raw or gzip.")
     n_bytes = math.prod(shape) * dtype.itemsize
     if encoding in ("raw", "gzip", "gz"):
-        check_stored(path, n_bytes, compressed=encoding != "raw")
+        grid.check_stored(path, n_bytes, compressed=encoding != "raw")
     data = _voxels(path, start, encoding, n_bytes)
     array = np.frombuffer(data, dtype).reshape(shape, order="F")
-    return RawVolume(array.astype(dtype.newbyteorder("="), copy=False), lps_from_index)
+    return grid.RawVolume(array.astype(dtype.newbyteorder("="), copy=False), lps_from_index)
 
 
 def _header(path: Path) -> tuple[dict[str, str], int]:

@@ -15,7 +15,7 @@ from tumortrack.core.config import Config
 from tumortrack.core.types import DepthFrame
 
 _STEEPEST = 0.6  # slope of a plane: 30 degrees
-_LOOK_AT = 400  # pixels tell where the organ lies
+_SAMPLED = 400  # pixels that show where the organ lies
 _MOST = 0.5  # share of all points
 
 
@@ -82,7 +82,7 @@ def add_clutter(frame: DepthFrame, config: ClutterConfig, rng: np.random.Generat
 
 
 def _where(frame: DepthFrame, seen: np.ndarray, rng: np.random.Generator) -> _Organ:
-    pixels = seen[rng.integers(len(seen), size=_LOOK_AT)]
+    pixels = seen[rng.integers(len(seen), size=_SAMPLED)]
     row, column = np.divmod(pixels, frame.intrinsics.width)
     depth_mm = frame.depth_mm.flat[pixels]
     width_px = float(max(np.ptp(column), np.ptp(row), 1))

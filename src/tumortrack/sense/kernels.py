@@ -112,7 +112,7 @@ def _slope(before, here, after):  # type: ignore[no-untyped-def]
 def fly(true_mm, depths_mm, seen, key, share, flying_mm, edge):  # type: ignore[no-untyped-def]
     """Send ``share`` of the edge pixels backwards; ``edge``: (how near in px, depth step in mm).
 
-    The image's own border is no edge: what it cuts off goes on outside.
+    The image's own border is no edge: what it cuts off continues outside.
     """
     near, step_mm = edge
     pixels, starts = seen
@@ -220,7 +220,7 @@ def _lowest_cosines(n: int) -> np.ndarray:
 def order_shaft(columns, rows, tip, towards, half, taper):  # type: ignore[no-untyped-def]
     """A straight band that comes in against ``towards`` (unit vector, px) and ends round at
     ``tip`` (px), ``half`` wide there to either side and wider by ``taper`` a pixel outwards.
-    What lies farthest out goes first, as when it is pushed in."""
+    What lies farthest out comes first, as when it is pushed in."""
     order = np.full(len(columns), np.inf, np.float32)
     for i in range(len(columns)):
         du, dv = columns[i] - tip[0], rows[i] - tip[1]

@@ -15,10 +15,10 @@ from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError
 from tumortrack.core.types import DepthFrame
 
-_LOOK_AT = 200  # pixels tell where the organ lies
+_SAMPLED = 200  # pixels that show where the organ lies
 _STEEPEST = 0.6  # slope of what is left in: 30 degrees
 _MOST_SHAFTS, _MOST_PATCHES = 2, 2
-_CROSSES = 0.25  # share of shafts that go on over the whole organ
+_CROSSES = 0.25  # share of shafts that cross the whole organ
 _WIDER = 0.3  # a shaft that rises towards the camera looks wider by up to this an organ's width
 _WAVES = 3
 _PATCHES_ALONE, _SHAFTS_ALONE = 0.4, 0.2  # shares of images; the others have both
@@ -94,7 +94,7 @@ def _look(frame: DepthFrame, rng: np.random.Generator) -> _View:
     pixels, starts = seen_pixels(frame.depth_mm)
     rows = np.repeat(np.arange(len(starts) - 1, dtype=np.int32), np.diff(starts))
     columns = pixels - rows * np.int32(frame.intrinsics.width)
-    chosen = rng.integers(max(len(pixels), 1), size=_LOOK_AT if len(pixels) else 0)
+    chosen = rng.integers(max(len(pixels), 1), size=_SAMPLED if len(pixels) else 0)
     some = np.stack([columns[chosen], rows[chosen]], axis=1).astype(float)
     width_px = float(np.ptp(some, axis=0).max(initial=1.0)) if len(some) else 1.0
     depth_mm = frame.depth_mm.ravel()[pixels]

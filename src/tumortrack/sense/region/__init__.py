@@ -73,7 +73,7 @@ def organ_points(
     points.
 
     Raises:
-        NoEstimate: fewer than 200 points are left; says which step took how many.
+        NoEstimate: fewer than 200 points are left; the message lists which step took how many.
         InputError: the mask is not of the image's size, or was given with a cloud.
     """
     start = time.perf_counter()
@@ -111,8 +111,8 @@ def organ_points(
 def _take_one_piece(picture: Picture, config: RegionConfig, hints: Hints) -> None:
     """Leave one piece (and what continues it) to the organ.
 
-    A hand that touches the organ makes one large piece with it, which goes on outside the picture.
-    Then the opening is widened until fingers are too narrow to connect.
+    A hand that touches the organ makes one large piece with it that leaves the picture. Then the
+    opening is widened until fingers are too narrow to connect.
     """
     edges = find_edges(picture, config)
     best: Choice | None = None

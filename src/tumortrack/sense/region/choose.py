@@ -1,5 +1,5 @@
-"""Which pieces are the organ: the one that the user points at, the one seen last, or the likeliest;
-what continues it behind something nearer; and what lies in the last estimate's box alone."""
+"""Which pieces are the organ: the one picked by the user, the last one seen, or the likeliest; what
+continues it behind something nearer; and what lies wholly in the last estimate's box."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ class Sizes(NamedTuple):
     Attributes:
         area_mm2: across the line of sight.
         wide_mm: longest extent.
-        cut: 0..1, how much of it goes on outside what is looked at: the width there over the
+        cut: 0..1, how much of it continues outside the examined part: the width there over the
             square root of the area.
         thick_mm: diameter of the largest disc in it.
         aside: tangent of the angle between its middle and the optical axis.
@@ -145,8 +145,8 @@ def choice(
 
 
 def parts_of(picture: Picture, taken: Choice, corners_mm: np.ndarray) -> np.ndarray:
-    """Further pieces (count + 1,), bool, that lie in the last estimate's box (2, 3) alone, not at
-    its far side, and are no thin thing: a tumor that stands out, what a crease parts."""
+    """Further pieces (count + 1,), bool, that lie wholly in the last estimate's box (2, 3), not at
+    its far side, and are not thin: a tumor that stands out, a part beyond a crease."""
     low, high = np.sort(np.asarray(corners_mm, np.float64), axis=0)
     high[2] -= _FAR_SIDE * (high[2] - low[2])
     low, high = low - _BOX_MM, high + _BOX_MM
@@ -249,7 +249,7 @@ def _goes_on(depth_mm, taken, z, v, u):  # type: ignore[no-untyped-def]
 
 @jit
 def _continuing(depth_mm, taken, pieces, gap, footprint, count):  # type: ignore[no-untyped-def]
-    """Along which length (count, count), mm, one piece goes on as another after a gap in which
+    """Length (count, count), mm, along which one piece continues as another after a gap in which
     something is nearer and nothing is farther."""
     lines = np.zeros((count, count))
     height, width = depth_mm.shape

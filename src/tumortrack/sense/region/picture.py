@@ -19,16 +19,8 @@ _WIDEST = 2.0  # tangent of the largest angle from the optical axis in a rasteri
 # What became of a pixel: still the organ's, or the step that took it.
 ORGAN, NO_RETURN, RANGE, BOX, MASK, LAST_BOX, PLANE, FLYING, THIN, PIECES = range(10)
 STEPS = (
-    "organ",
-    "no return",
-    "range",
-    "box",
-    "mask",
-    "last box",
-    "plane",
-    "flying",
-    "thin",
-    "other pieces",
+    *("organ", "no return", "range", "box", "mask"),
+    *("last box", "plane", "flying", "thin", "other pieces"),
 )
 
 
@@ -59,7 +51,7 @@ class Picture:
         return 2 / (self.pinhole.fx + self.pinhole.fy)
 
     def take(self, where: np.ndarray, step: int) -> None:
-        """Give the pixels (h, w, bool) that nobody has taken yet to a step."""
+        """Give the pixels (h, w, bool) that are still the organ's to a step."""
         self.taken[where & (self.taken == ORGAN)] = step
 
     def remaining(self) -> tuple[slice, slice]:

@@ -15,7 +15,7 @@ import numpy as np
 from tumortrack.sense.region.config import RegionConfig
 from tumortrack.sense.region.picture import NO_RETURN, PLANE, Picture, jit
 
-_LOOK_AT = 1200  # pixels
+_SAMPLED = 1200  # pixels
 _TRIES = 150
 _BEYOND_MM = 120.0  # so far behind the range there may be something to fit to
 _STEEPEST = 0.35  # cosine of the largest angle between the plane's normal and the optical axis
@@ -87,9 +87,9 @@ def find_plane(
 def _some_points(picture: Picture, far_mm: float, rng: np.random.Generator) -> np.ndarray:
     """Points (n, 3), float32, of random pixels not farther than ``far_mm``."""
     height, width = picture.depth_mm.shape
-    pixel = rng.integers(height * width, size=3 * _LOOK_AT)
+    pixel = rng.integers(height * width, size=3 * _SAMPLED)
     z = picture.depth_mm.ravel()[pixel]
-    good = np.flatnonzero((picture.taken.ravel()[pixel] != NO_RETURN) & (z < far_mm))[:_LOOK_AT]
+    good = np.flatnonzero((picture.taken.ravel()[pixel] != NO_RETURN) & (z < far_mm))[:_SAMPLED]
     row, column = np.divmod(pixel[good], width)
     fx, fy, cx, cy = picture.pinhole
     z = z[good]
@@ -101,7 +101,7 @@ def _some_points(picture: Picture, far_mm: float, rng: np.random.Generator) -> n
 @jit
 def _consensus(points, triples, tolerance):  # type: ignore[no-untyped-def]
     """The plane through three points with the best score: normal and offset. A tenth of the
-    points tells which planes are hopeless."""
+    points rejects hopeless planes."""
     best, best_offset = -np.inf, 0.0
     best_normal = np.zeros(3, np.float32)
     few = len(points) // 10
@@ -111,7 +111,7 @@ def _consensus(points, triples, tolerance):  # type: ignore[no-untyped-def]
         cx, cy, cz = c[0] - a[0], c[1] - a[1], c[2] - a[2]
         nx, ny, nz = by * cz - bz * cy, bz * cx - bx * cz, bx * cy - by * cx
         length = np.sqrt(nx * nx + ny * ny + nz * nz)
-        if length < 100.0 or abs(nz) < _STEEPEST * length:  # mm^2: a sliver says nothing
+        if length < 100.0 or abs(nz) < _STEEPEST * length:  # mm^2: slivers are ill-conditioned
             continue
         to_camera = -1 / length if nz > 0 else 1 / length
         nx, ny, nz = nx * to_camera, ny * to_camera, nz * to_camera
