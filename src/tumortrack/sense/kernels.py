@@ -108,13 +108,23 @@ def _slope(before, here, after):  # type: ignore[no-untyped-def]
     return here - before if math.isnan(after) else (after - before) * np.float32(0.5)
 
 
+class Flying(NamedTuple):
+    """Flying pixels: the share of edge pixels, how far behind the edge they end up at most, and
+    what is an edge: within ``near_px`` the depth falls back by ``step_mm`` or more, or ends."""
+
+    share: float
+    reach_mm: float
+    near_px: int
+    step_mm: float
+
+
 @_jit
-def fly(true_mm, depths_mm, seen, key, share, flying_mm, edge):  # type: ignore[no-untyped-def]
-    """Send ``share`` of the edge pixels backwards; ``edge``: (how near in px, depth step in mm).
+def fly(true_mm, depths_mm, seen, key, flying):  # type: ignore[no-untyped-def]
+    """Send edge pixels backwards, as ``Flying`` states.
 
     The image's own border is no edge: what it cuts off continues outside.
     """
-    near, step_mm = edge
+    share, flying_mm, near, step_mm = flying
     pixels, starts = seen
     height, width = true_mm.shape
     for v in range(height):

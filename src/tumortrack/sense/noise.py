@@ -156,7 +156,8 @@ def _disturb(
     true_mm, shape = frame.depth_mm, frame.depth_mm.shape
     if config.flying_share:
         edge = (config.edge_px, config.edge_mm)
-        kernels.fly(true_mm, depths_mm, seen, seed + 1, config.flying_share, config.flying_mm, edge)
+        flying = kernels.Flying(config.flying_share, config.flying_mm, *edge)
+        kernels.fly(true_mm, depths_mm, seen, seed + 1, flying)
     if config.grazing_share:
         grazing = (config.grazing_share, config.grazing_degrees)
         pinhole = pinhole_of(frame.intrinsics)

@@ -24,12 +24,15 @@ def render_depth(
     vertices = np.ascontiguousarray(vertices_camera_mm, np.float32)
     shape = (intrinsics.height, intrinsics.width)
     faces = np.ascontiguousarray(faces, np.int32)
-    depth = _z_buffer(vertices, faces, shape, pinhole_of(intrinsics))
+    nearest = _z_buffer(vertices, faces, shape, pinhole_of(intrinsics))
+    depth = np.full(shape, np.nan, np.float32)
+    np.divide(np.float32(1.0), nearest, out=depth, where=nearest > 0)
     return DepthFrame(depth, intrinsics, stamp_ns)
 
 
 @numba.njit(cache=True, nogil=True)
 def _z_buffer(vertices, faces, shape, pinhole):  # type: ignore[no-untyped-def]
+    """The greatest 1/z in each pixel (h, w), 0 where nothing is hit."""
     fx, fy, cx, cy = pinhole
     height, width = shape
     n = len(vertices)
@@ -44,7 +47,7 @@ def _z_buffer(vertices, faces, shape, pinhole):  # type: ignore[no-untyped-def]
             v[i] = fy * vertices[i, 1] * w[i] + cy
         else:
             w[i] = -1.0
-    nearest = np.zeros((height, width), np.float32)  # greatest 1/z so far
+    nearest = np.zeros((height, width), np.float32)
     for f in range(len(faces)):
         a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
         ua, ub, uc, va, vb, vc = u[a], u[b], u[c], v[a], v[b], v[c]
@@ -69,12 +72,7 @@ def _z_buffer(vertices, faces, shape, pinhole):  # type: ignore[no-untyped-def]
                 # No branch: half of these pixels lie outside, at random.
                 here = here if min(pa, pb, pc) >= -1e-5 else np.float32(0.0)
                 nearest[y, x] = max(nearest[y, x], here)
-    depth = np.full((height, width), np.nan, np.float32)
-    for y in range(height):
-        for x in range(width):
-            if nearest[y, x] > 0:
-                depth[y, x] = 1.0 / nearest[y, x]
-    return depth
+    return nearest
 
 
 class Visibility:

@@ -256,30 +256,39 @@ def _continuing(depth_mm, taken, pieces, gap, footprint, count):  # type: ignore
     for v in range(height):
         for u in range(width):
             piece = pieces[v, u]
-            if piece == 0:
-                continue
-            z = depth_mm[v, u]
-            longest = int(gap / z)
-            for dv, du in ((0, 1), (1, 0)):
-                nearer, farther, last, y, x = 0, 0, piece, v, u
-                for length in range(1, longest + 2):
-                    y, x = y + dv, x + du
-                    if y >= height or x >= width or pieces[y, x] == piece:
-                        break
-                    if taken[y, x] == FLYING:  # anywhere in depth
-                        continue
-                    there, other = depth_mm[y, x], pieces[y, x]
-                    most = _STEP_MM + _STEEPEST_GAP * length * footprint * z
-                    if there > z + most:
-                        farther += 1
-                        if farther > _STRAY:
-                            break
-                        continue
-                    farther = 0
-                    # Where another piece begins, not in its midst: that one is itself in front.
-                    if other and other != last and nearer >= 2 and abs(there - z) < most:
-                        lines[piece, other] += z * footprint
-                        break
-                    nearer += there < z - _STEP_MM
-                    last = other
+            if piece:
+                for step in ((0, 1), (1, 0)):
+                    other = _beyond_gap(depth_mm, taken, pieces, (v, u), step, (gap, footprint))
+                    if other:
+                        lines[piece, other] += depth_mm[v, u] * footprint
     return lines
+
+
+@jit
+def _beyond_gap(depth_mm, taken, pieces, start, step, scale):  # type: ignore[no-untyped-def]
+    """The piece that continues the one at ``start``, a few pixels on; 0 for none. ``scale``: the
+    longest gap in px at distance 1, and a pixel's width there."""
+    gap, footprint = scale
+    y, x = start
+    z, piece = depth_mm[y, x], pieces[y, x]
+    nearer, farther, last = 0, 0, piece
+    for length in range(1, int(gap / z) + 2):
+        y, x = y + step[0], x + step[1]
+        if y >= depth_mm.shape[0] or x >= depth_mm.shape[1] or pieces[y, x] == piece:
+            return 0
+        if taken[y, x] == FLYING:  # anywhere in depth
+            continue
+        there, other = depth_mm[y, x], pieces[y, x]
+        most = _STEP_MM + _STEEPEST_GAP * length * footprint * z
+        if there > z + most:
+            farther += 1
+            if farther > _STRAY:
+                return 0
+            continue
+        farther = 0
+        # Where another piece begins, not in its midst: that one is itself in front.
+        if other and other != last and nearer >= 2 and abs(there - z) < most:
+            return other
+        nearer += there < z - _STEP_MM
+        last = other
+    return 0

@@ -178,6 +178,11 @@ def _spread(points_mm, widest):  # type: ignore[no-untyped-def]
                 count += 1
     if count == 0:
         return tangents, np.zeros(2), np.zeros(2), np.zeros(2)
+    return tangents, low, high, _inner_spread(tangents, low, high, count)
+
+
+@jit
+def _inner_spread(tangents, low, high, count):  # type: ignore[no-untyped-def]
     bins = 1000
     found = np.zeros((2, bins), np.int64)
     for i in range(len(tangents)):
@@ -192,7 +197,7 @@ def _spread(points_mm, widest):  # type: ignore[no-untyped-def]
             total += one
             if 0.02 * count < total < 0.98 * count:
                 inner[k] += (high[k] - low[k]) / bins
-    return tangents, low, high, inner
+    return inner
 
 
 @jit
