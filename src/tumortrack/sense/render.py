@@ -24,9 +24,7 @@ def render_depth(
     vertices = np.ascontiguousarray(vertices_camera_mm, np.float32)
     shape = (intrinsics.height, intrinsics.width)
     faces = np.ascontiguousarray(faces, np.int32)
-    nearest = _z_buffer(vertices, faces, shape, pinhole_of(intrinsics))
-    depth = np.full(shape, np.nan, np.float32)
-    np.divide(np.float32(1.0), nearest, out=depth, where=nearest > 0)
+    depth = _to_depth(_z_buffer(vertices, faces, shape, pinhole_of(intrinsics)))
     return DepthFrame(depth, intrinsics, stamp_ns)
 
 
@@ -73,6 +71,16 @@ def _z_buffer(vertices, faces, shape, pinhole):  # type: ignore[no-untyped-def]
                 here = here if min(pa, pb, pc) >= -1e-5 else np.float32(0.0)
                 nearest[y, x] = max(nearest[y, x], here)
     return nearest
+
+
+@numba.njit(cache=True, nogil=True)
+def _to_depth(nearest):  # type: ignore[no-untyped-def]
+    depth = np.full(nearest.shape, np.nan, np.float32)
+    for y in range(len(nearest)):
+        for x in range(nearest.shape[1]):
+            if nearest[y, x] > 0:
+                depth[y, x] = 1.0 / nearest[y, x]
+    return depth
 
 
 class Visibility:

@@ -10,7 +10,7 @@ import numpy as np
 
 from tumortrack.core.errors import NoEstimate
 from tumortrack.sense.region.config import RegionConfig
-from tumortrack.sense.region.picture import FLYING, LAST_BOX, Picture, is_inside, jit
+from tumortrack.sense.region.picture import FLYING, LAST_BOX, Picture, jit
 from tumortrack.sense.region.pieces import Edges
 
 PICK_REACH_MM = 10.0  # from the picked point to the piece it means
@@ -181,13 +181,15 @@ def _nearest(depth_mm, pieces, pinhole, point):  # type: ignore[no-untyped-def]
 
 @jit
 def _area_inside(depth_mm, pieces, pinhole, low, high, count):  # type: ignore[no-untyped-def]
+    fx, fy, cx, cy = pinhole
     area = np.zeros(count)
     for v in range(len(depth_mm)):
         for u in range(depth_mm.shape[1]):
             if pieces[v, u]:
                 z = depth_mm[v, u]
-                if is_inside(pinhole, u, v, z, low, high):
-                    area[pieces[v, u]] += z * z / (pinhole.fx * pinhole.fy)
+                x, y = (u - cx) / fx * z, (v - cy) / fy * z
+                if low[2] < z < high[2] and low[1] < y < high[1] and low[0] < x < high[0]:
+                    area[pieces[v, u]] += z * z / (fx * fy)
     return area
 
 

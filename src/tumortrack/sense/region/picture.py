@@ -145,18 +145,18 @@ def keep_inside(picture: Picture, corners_mm: np.ndarray, step: int) -> None:
 
 @jit
 def _keep_inside(depth_mm, taken, pinhole, low, high, step):  # type: ignore[no-untyped-def]
+    fx, fy, cx, cy = pinhole
     height, width = depth_mm.shape
     for v in range(height):
+        slope_y = (v - cy) / fy
         for u in range(width):
-            if not taken[v, u] and not is_inside(pinhole, u, v, depth_mm[v, u], low, high):
+            if taken[v, u]:
+                continue
+            z = depth_mm[v, u]
+            x, y = (u - cx) / fx * z, slope_y * z
+            inside = low[2] < z < high[2] and low[1] < y < high[1] and low[0] < x < high[0]
+            if not inside:
                 taken[v, u] = step
-
-
-@numba.njit(cache=True, inline="always")
-def is_inside(pinhole, u, v, z, low, high):  # type: ignore[no-untyped-def]
-    """Whether the point that a pixel sees lies strictly within a box."""
-    x, y = (u - pinhole.cx) / pinhole.fx * z, (v - pinhole.cy) / pinhole.fy * z
-    return low[2] < z < high[2] and low[1] < y < high[1] and low[0] < x < high[0]
 
 
 @jit
