@@ -28,7 +28,7 @@ from tumortrack.phantom.kidneys import random_anatomy
 from tumortrack.registration.canonical_frame import (
     CanonicalFrame,
     generic_points,
-    know_any,
+    initialize_canonical,
     upright_of,
 )
 from tumortrack.registration.rest_shape import long_axis_of
@@ -176,7 +176,7 @@ def _pretrain(
     workers = default_workers() if run.workers is None else run.workers
     use_cores(device, network_leaves(workers))
     state = TrainingState(run, device)
-    state.know(know_any)
+    state.know(initialize_canonical)
     state.resume(work)
     progress, clock = state.progress, TrainingClock(state.progress)
     steps = range(progress.step, run.steps)

@@ -56,7 +56,7 @@ class RegistrationTask:
 
     def teach(self, network: RegistrationNetwork) -> None:
         run, shape = self._run, self._shape
-        network.know(shape, run.up_lps, self.points.points_ct)
+        network.initialize(shape, run.up_lps, self.points.points_ct)
         if run.start is not None:
             upright = upright_of(
                 run.anatomy_ct.organ, run.up_lps, shape.body.center_ct, shape.long_axis
