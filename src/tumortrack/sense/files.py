@@ -214,7 +214,8 @@ def _intrinsics(data: dict, path: Path) -> Intrinsics:
             needed = "width, height, fx, fy, cx (or ppx), cy (or ppy)"
             raise InputError(f"{path} lacks the number {key!r}; it must have {needed}, in pixels.")
         values[key] = _numbers(found, key, path)[0]
-        if key in ("width", "height") and not values[key].is_integer():
+    for key in ("width", "height"):
+        if not values[key].is_integer():
             raise InputError(f"{path}: {key} is {values[key]}; it must be a whole number.")
     return Intrinsics(int(values.pop("width")), int(values.pop("height")), **values)
 
