@@ -29,8 +29,8 @@ from tumortrack.training.networks import Network
 
 from tumortrack.cli.console import say
 from tumortrack.core import store
-from tumortrack.core.allocator import keep_freed_memory
 from tumortrack.core.errors import TumortrackError
+from tumortrack.core.process import keep_freed_memory
 from tumortrack.imaging.case import Case, load_case
 from tumortrack.models.config import GaussNewtonConfig, TrainConfig
 from tumortrack.occupancy.network import OccupancyNetwork

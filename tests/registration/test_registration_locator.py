@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from elastic_objects import CENTER, UP
 from stories import succeeded, tumortrack
 from tumortrack.core.errors import InputError, NoEstimate
-from tumortrack.core.motion import Motion
+from tumortrack.core.estimate import Motion
 from tumortrack.core.types import SensorCloud
 from tumortrack.sense.files import write_cloud_ply
 from tumortrack.simulate.occupancy import labels_of, surface_distance

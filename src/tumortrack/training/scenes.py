@@ -14,8 +14,8 @@ from typing import Literal, Protocol
 import torch
 from torch.utils.data import DataLoader, Dataset
 
-from tumortrack.core.cores import available_cores
 from tumortrack.core.errors import InputError
+from tumortrack.core.process import available_cores
 from tumortrack.simulate.batched.plan import BatchPlan
 from tumortrack.simulate.batched.stream import DeviceStream, RenderedBatch, SampleChoice, why_not
 from tumortrack.simulate.dataset import Batch, SceneStream

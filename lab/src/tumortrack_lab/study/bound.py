@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 import tumortrack
 from tumortrack.core.config import Config, to_builtins
 from tumortrack.core.errors import InputError, NoEstimate
-from tumortrack.core.motion import OneWay
+from tumortrack.core.estimate import OneWay
 from tumortrack.core.types import Anatomy, Mesh
 from tumortrack.sense.camera import project
 from tumortrack.sense.render import Visibility

@@ -12,7 +12,7 @@ from pathlib import Path
 import tumortrack
 from tumortrack.core.config import to_builtins
 from tumortrack.core.errors import InputError
-from tumortrack.core.motion import OneWay
+from tumortrack.core.estimate import OneWay
 from tumortrack.simulate.scene_folder import Scene
 from tumortrack_lab.peers.base import Peer, estimate_of
 from tumortrack_lab.peers.kinds import PeerKind, peer_kinds
