@@ -47,13 +47,13 @@ from tumortrack.training.presets import PRESETS, clinic, quick
 from tumortrack.training.run import TrainingRun, settle_end
 from tumortrack.training.scenes import batches
 from tumortrack.training.state import TrainingState
-from tumortrack.training.task import task_of
-from tumortrack.training.validate import (
+from tumortrack.training.task import (
     ValidationScenes,
     ValidationSet,
     mean_iou_of,
     validation_scenes,
 )
+from tumortrack.training.train import task_of
 from tumortrack_lab.study.book import ReportWriter
 from tumortrack_lab.study.markdown import table
 from tumortrack_lab.study.phantoms import phantom_case
@@ -162,7 +162,7 @@ def _curve(case: Case, setting: Setting, judge: Judge, options: Options) -> list
     )
     course = task_of(run, CPU)
     state = TrainingState(run, CPU)
-    state.know(course.teach)
+    state.initialize(course.initialize)
     stream = SceneStream(
         case.anatomy, case.up_lps, config.scene, course.points, setting.seed, "train",
         setting.batch, course.body,

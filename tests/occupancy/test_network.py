@@ -21,8 +21,7 @@ from tumortrack.models.normalisation import (
 )
 from tumortrack.models.pooling import greatest_above_zero
 from tumortrack.models.sampling import ball_query, farthest_points, strided_points, take
-from tumortrack.occupancy.mlp_decoder import MlpDecoder, octave_features
-from tumortrack.occupancy.network import OccupancyNetwork
+from tumortrack.occupancy.network import MlpDecoder, OccupancyNetwork, octave_features
 from tumortrack.training.presets import paper_network, quick_network
 
 

@@ -44,7 +44,7 @@ class Model(ABC):
     Attributes:
         query_box_mm: where the organ can lie, relative to the median of the observed points,
             camera frame (lower and upper corner).
-        familiar: what tells clouds of this organ from others.
+        in_distribution: what tells clouds of this organ from others.
         provenance: seeds, steps, hashes.
         notes: for the user, about this machine.
     """
@@ -53,7 +53,7 @@ class Model(ABC):
     config: TrainConfig
     parts: tuple[str, ...]
     query_box_mm: Float64[np.ndarray, "2 3"]
-    familiar: InDistributionRange
+    in_distribution: InDistributionRange
     provenance: dict = field(default_factory=dict)
     notes: tuple[str, ...] = ()
 

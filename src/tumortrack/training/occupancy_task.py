@@ -1,4 +1,4 @@
-"""Training an occupancy network: labels of points about surfaces, judged by their IoU."""
+"""Training an occupancy network: labels of points near surfaces, validated by their IoU."""
 
 from __future__ import annotations
 
@@ -9,15 +9,14 @@ import torch
 
 from tumortrack.core.errors import NoEstimate
 from tumortrack.models.in_distribution import InDistributionRange, fit_mm, spread_mm
-from tumortrack.occupancy.lattice import lattice_over
 from tumortrack.occupancy.model import OccupancyModel
 from tumortrack.occupancy.network import Latent, OccupancyNetwork
-from tumortrack.occupancy.volume import FIT_STEPS, surface_distances
+from tumortrack.occupancy.volume import FIT_STEPS, lattice_over, surface_distances
 from tumortrack.simulate.bodies import body_for
 from tumortrack.simulate.occupancy import OccupancyPool
 from tumortrack.simulate.scene import Simulator
 from tumortrack.training.run import TrainingRun
-from tumortrack.training.validate import ValidationScenes, grown_box, mean_iou_of, validation_scenes
+from tumortrack.training.task import ValidationScenes, grown_box, mean_iou_of, validation_scenes
 
 _AT_ONCE = 32  # scenes
 _FIT_ON = 32  # scenes
@@ -25,7 +24,7 @@ _QUERIES = 2**13  # at once: bounds the memory
 
 
 class OccupancyTask:
-    """Labels of points about surfaces, in the paper's way."""
+    """Labels of points near surfaces, as in the paper."""
 
     def __init__(self, run: TrainingRun, device: torch.device) -> None:
         self._run, self._device = run, device
@@ -42,8 +41,8 @@ class OccupancyTask:
     def _validation(self) -> ValidationSet:
         return ValidationSet(self._scenes, len(self._run.anatomy_ct.parts) + 1, self._device)
 
-    def teach(self, network: OccupancyNetwork) -> None:
-        """An occupancy network starts with nothing."""
+    def initialize(self, network: OccupancyNetwork) -> None:
+        """An occupancy network knows nothing at first."""
 
     def miou(self, network: OccupancyNetwork) -> float:
         return self._validation.miou(network)
@@ -54,7 +53,7 @@ class OccupancyTask:
             config=self._run.config,
             parts=self._run.anatomy_ct.names,
             query_box_mm=self._scenes.query_box_mm,
-            familiar=self._validation.familiar(network),
+            in_distribution=self._validation.in_distribution(network),
             provenance=provenance,
         )
 
@@ -79,8 +78,8 @@ class ValidationSet:
         return mean_iou_of(guess, self._labels, self._n_classes)
 
     @torch.no_grad()
-    def familiar(self, network: OccupancyNetwork) -> InDistributionRange:
-        """What the clouds are like, and how far they lie from the surfaces that a network sees."""
+    def in_distribution(self, network: OccupancyNetwork) -> InDistributionRange:
+        """How far the clouds spread, and how far they lie from the surface that the network sees."""
         network.eval()
         spreads, fits = [], []
         for cloud, box_mm in zip(self._clouds[:_FIT_ON], self._boxes_mm, strict=False):
@@ -97,7 +96,7 @@ class ValidationSet:
             try:
                 lattice = lattice_over(logits_at, around, FIT_STEPS)
                 fits.append(fit_mm(surface_distances(lattice, points_mm)))
-            except NoEstimate:  # a network of a few steps sees no organ
+            except NoEstimate:  # after a few steps a network finds no organ
                 fits.append(spreads[-1])
         return InDistributionRange(
             spread_mm=(min(spreads), max(spreads)), fit_mm=float(np.percentile(fits, 95))
