@@ -43,13 +43,13 @@ from tumortrack.simulate.bodies import body_for
 from tumortrack.simulate.dataset import SceneStream
 from tumortrack.simulate.occupancy import organ_pool
 from tumortrack.simulate.scene import Simulator
+from tumortrack.training.occupancy_task import label_miou
 from tumortrack.training.presets import PRESETS, clinic, quick
 from tumortrack.training.run import TrainingRun, settle_end
 from tumortrack.training.scenes import batches
 from tumortrack.training.state import TrainingState
 from tumortrack.training.task import (
     ValidationScenes,
-    ValidationSet,
     mean_iou_of,
     validation_scenes,
 )
@@ -207,7 +207,7 @@ class Judge:
     def _miou(self, network: Network, scenes: ValidationScenes) -> float:
         network.eval()
         if isinstance(network, OccupancyNetwork):
-            return ValidationSet(scenes, self._parts, CPU).miou(network)
+            return label_miou(network, scenes, self._parts, CPU)
         assert isinstance(network, RegistrationNetwork)
         assert self._shape is not None
         guesses = []

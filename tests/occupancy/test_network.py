@@ -10,6 +10,7 @@ from tumortrack.core.errors import InputError
 from tumortrack.models import sampling
 from tumortrack.models.config import MlpDecoderConfig, NetworkConfig
 from tumortrack.models.encoders.pointnet2 import PointNet2Config, SetAbstraction, _Level
+from tumortrack.models.layers import greatest_above_zero
 from tumortrack.models.normalisation import (
     Aligned,
     CloudBox,
@@ -19,7 +20,6 @@ from tumortrack.models.normalisation import (
     turned,
     without_strays,
 )
-from tumortrack.models.pooling import greatest_above_zero
 from tumortrack.models.sampling import ball_query, farthest_points, strided_points, take
 from tumortrack.occupancy.network import MlpDecoder, OccupancyNetwork, octave_features
 from tumortrack.training.presets import paper_network, quick_network

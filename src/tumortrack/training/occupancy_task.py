@@ -37,15 +37,11 @@ class OccupancyTask:
         simulator = Simulator(run.anatomy_ct, run.up_lps, run.config.scene, self.body)
         return validation_scenes(simulator, self.points.parts[0], run.config, run.seed)
 
-    @cached_property
-    def _validation(self) -> ValidationSet:
-        return ValidationSet(self._scenes, len(self._run.anatomy_ct.parts) + 1, self._device)
-
     def initialize(self, network: OccupancyNetwork) -> None:
         """An occupancy network knows nothing at first."""
 
     def miou(self, network: OccupancyNetwork) -> float:
-        return self._validation.miou(network)
+        return label_miou(network, self._scenes, len(self._run.anatomy_ct.parts) + 1, self._device)
 
     def model(self, network: OccupancyNetwork, provenance: dict) -> OccupancyModel:
         return OccupancyModel(
@@ -53,42 +49,22 @@ class OccupancyTask:
             config=self._run.config,
             parts=self._run.anatomy_ct.names,
             query_box_mm=self._scenes.query_box_mm,
-            in_distribution=self._validation.in_distribution(network),
+            in_distribution=self._in_distribution(network),
             provenance=provenance,
         )
 
-
-class ValidationSet:
-    """How good an occupancy network is on validation scenes."""
-
-    def __init__(self, scenes: ValidationScenes, n_classes: int, device: torch.device) -> None:
-        self._labels, self._n_classes, self._boxes_mm = scenes.labels, n_classes, scenes.boxes_mm
-        self._clouds = torch.from_numpy(scenes.clouds_mm).to(device)
-        self._points = torch.from_numpy(scenes.points_mm).to(device)
-
     @torch.no_grad()
-    def miou(self, network: OccupancyNetwork) -> float:
-        """``mean_iou_of`` the network's labels."""
-        network.eval()
-        guesses = []
-        for i in range(0, len(self._clouds), _AT_ONCE):
-            latent = network.encode(self._clouds[i : i + _AT_ONCE])
-            guesses.append(network.query(latent, self._points[i : i + _AT_ONCE]).argmax(-1))
-        guess = torch.cat(guesses).to(torch.uint8).cpu().numpy()
-        return mean_iou_of(guess, self._labels, self._n_classes)
-
-    @torch.no_grad()
-    def in_distribution(self, network: OccupancyNetwork) -> InDistributionRange:
-        """How far the clouds spread, and how far they lie from the surface that the network sees."""
+    def _in_distribution(self, network: OccupancyNetwork) -> InDistributionRange:
+        """How far the clouds spread, and how far they lie from the network's surface."""
         network.eval()
         spreads, fits = [], []
-        for cloud, box_mm in zip(self._clouds[:_FIT_ON], self._boxes_mm, strict=False):
-            latent = network.encode(cloud[None])
-            points_mm = cloud.cpu().numpy()
+        scenes = self._scenes
+        for points_mm, box_mm in zip(scenes.clouds_mm[:_FIT_ON], scenes.boxes_mm, strict=False):
+            latent = network.encode(torch.from_numpy(points_mm).to(self._device)[None])
             around = grown_box(box_mm[None] + np.median(points_mm, axis=0))
 
             def logits_at(queries_mm: np.ndarray, latent: Latent = latent) -> torch.Tensor:
-                queries = torch.from_numpy(queries_mm).to(self._clouds.device)[None]
+                queries = torch.from_numpy(queries_mm).to(self._device)[None]
                 parts = queries.split(_QUERIES, dim=1)
                 return torch.cat([network.query(latent, part)[0] for part in parts])
 
@@ -101,3 +77,15 @@ class ValidationSet:
         return InDistributionRange(
             spread_mm=(min(spreads), max(spreads)), fit_mm=float(np.percentile(fits, 95))
         )
+
+
+@torch.no_grad()
+def label_miou(
+    network: OccupancyNetwork, scenes: ValidationScenes, n_classes: int, device: torch.device
+) -> float:
+    """``mean_iou_of`` the network's labels."""
+    network.eval()
+    clouds, points = (torch.from_numpy(v).to(device) for v in (scenes.clouds_mm, scenes.points_mm))
+    pairs = zip(clouds.split(_AT_ONCE), points.split(_AT_ONCE), strict=True)
+    guess = torch.cat([network(*pair).argmax(-1) for pair in pairs])
+    return mean_iou_of(guess.to(torch.uint8).cpu().numpy(), scenes.labels, n_classes)

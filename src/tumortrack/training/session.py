@@ -241,10 +241,9 @@ class History:
     def write(self, progress: TrainingProgress, record: Record) -> None:
         """One validation's record."""
         values = asdict(record)
-        rounded = {
-            name: float(f"{values[name]:{digits}}") for name, (_, digits) in _SCALARS.items()
-        }
-        line = {"step": progress.step, "elapsed_s": round(progress.elapsed_s, 1), **rounded}
+        line = {"step": progress.step, "elapsed_s": round(progress.elapsed_s, 1)}
+        for name, (_, digits) in _SCALARS.items():
+            line[name] = float(f"{values[name]:{digits}}")
         try:
             self._lines.write(json.dumps(line) + "\n")
             for name, (tag, _) in _SCALARS.items():

@@ -9,8 +9,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from tumortrack.core.config import Config
-from tumortrack.models.layers import Layer, Norm, stack
-from tumortrack.models.pooling import greatest, greatest_above_zero
+from tumortrack.models.layers import Layer, Norm, greatest, greatest_above_zero, stack
 from tumortrack.models.sampling import (
     Sampling,
     ball_query,
