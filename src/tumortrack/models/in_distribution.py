@@ -1,8 +1,8 @@
-"""Whether a cloud looks like the organ that a network knows, and how well the answer fits it.
+"""Whether a cloud looks like the organ of the training scenes, and how well the answer fits it.
 
-A network answers whatever it is shown. Two numbers tell an organ from something else: how far
-the points spread, and how far they lie from the surface that the network sees. Both are taken
-from four fifths of the points, so that background and strays do not count.
+A network gives an answer for any input. Two numbers tell the organ from something else: how far
+the points spread, and how far they lie from the estimated surface. Both are percentiles over four
+fifths of the points, so that background and strays do not count.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from tumortrack.core.errors import NoEstimate
 
 _SHARE = 80  # per cent of the points that must fit: a tenth may be background
 
-# Validation scenes hold noise, background and deformation, yet what they hold is not all there is.
+# Validation scenes hold noise, background and deformation, yet not all that occurs.
 # Organs dragged by 20 mm or stretched by 30 %, which training never shows, lie within 1.0 (a model
 # of 10,000 steps) to 1.7 times (of 1,500) the validation's fit; tables, cubes and balls of any
 # size but the organ's own lie 3 to 20 times as far.
@@ -76,7 +76,7 @@ def check_in_distribution(known: InDistributionRange, spread: float, fit: float)
 
 
 def check_likely(mahalanobis_2: float) -> None:
-    """Refuse what only an absurd deformation of the organ explains.
+    """Refuse what only an implausible deformation of the organ explains.
 
     Args:
         mahalanobis_2: the state's squared Mahalanobis distance, in units of the library's mean.

@@ -22,7 +22,7 @@ _INTEGER = {torch.bfloat16: torch.int16, torch.float32: torch.int32}  # of the s
 
 
 class Layer(nn.Module):
-    """Linear, batch norm where asked for, ReLU; over the last axis of any array.
+    """Linear, optional batch norm, ReLU; over the last axis of any array.
 
     Weights start as He's, biases at zero: without a norm the signal then keeps its size through
     many layers, which torch's default start does not give.

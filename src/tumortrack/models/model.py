@@ -1,4 +1,4 @@
-"""A trained model as a value: what both methods share, and what each of them adds."""
+"""A trained model as a value: what both methods have in common, and what each of them adds."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from tumortrack.models.in_distribution import InDistributionRange
 
 
 class Network(nn.Module):
-    """A network as training sees it."""
+    """A network that can be trained and exported."""
 
     def loss(
         self,
@@ -29,7 +29,7 @@ class Network(nn.Module):
     ) -> Tensor:
         """What a batch costs: clouds (B, N, 3), the scenes' points (B, P, 3) with their labels
         (B, P), poses (B, 4, 4); camera frame, mm. ``first``: the first cloud's number in a batch
-        that several processes share."""
+        that is split over several processes."""
         raise NotImplementedError
 
     def onnx_parts(self, cloud_mm: Tensor) -> tuple[nn.Module, tuple[Tensor, ...], dict[str, Any]]:
@@ -44,7 +44,7 @@ class Model(ABC):
     Attributes:
         query_box_mm: where the organ can lie, relative to the median of the observed points,
             camera frame (lower and upper corner).
-        in_distribution: what tells clouds of this organ from others.
+        in_distribution: range of clouds of this organ.
         provenance: seeds, steps, hashes.
         notes: for the user, about this machine.
     """

@@ -29,7 +29,7 @@ def onnx_bytes(model: Model) -> bytes:
         InputError: the package onnx is not installed.
     """
     try:
-        import onnx  # noqa: F401  PyTorch needs it, and says so in many words
+        import onnx  # noqa: F401  PyTorch needs it; its own message is long
     except ImportError as error:
         raise InputError(
             "writing ONNX needs the package onnx: pip install 'tumortrack[onnx]'."
@@ -37,7 +37,7 @@ def onnx_bytes(model: Model) -> bytes:
     points, generator = model.config.scene.cloud.n_points, torch.Generator().manual_seed(0)
     cloud = torch.randn(1, points, 3, generator=generator) * 20 + torch.tensor([0.0, 0.0, 130.0])
     module, inputs, names = model.network.onnx_parts(cloud)
-    content: Any = io.BytesIO()  # a file as good as a path, whatever the annotation says
+    content: Any = io.BytesIO()  # the annotation lacks files, which work as well
     with torch.no_grad(), warnings.catch_warnings():
         warnings.simplefilter("ignore")  # shapes are constants here: on purpose
         torch.onnx.export(

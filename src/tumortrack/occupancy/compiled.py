@@ -66,7 +66,7 @@ class Compiled(Config, frozen=True):
 
 
 def this_machine() -> Machine:
-    """The processor at hand and the PyTorch that drives it."""
+    """This processor and PyTorch."""
     has = torch.cpu.get_capabilities()
     vector = ("avx", "amx", "asimd", "sve")
     return Machine(

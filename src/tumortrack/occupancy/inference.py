@@ -173,8 +173,8 @@ class PackedDecoder:
     def __init__(self, network: OccupancyNetwork, dtype: torch.dtype, rows: int) -> None:
         decoder, output = network.decoder, network.decoder.output
         self._octaves, self._dtype, self._rows = decoder.config.octaves, dtype, rows
-        # Per layer: weights of the layer before, weights of the query, bias. The latent's share
-        # comes as the bias of layers that see the query.
+        # Per layer: weights of the layer before, weights of the query, bias. The bias of
+        # layers that see the query comes with the latent.
         self._layers: list[tuple[PackedLinear | None, PackedLinear | None, Tensor]] = []
         n_hidden = 0
         for layer in decoder.hidden_layers():

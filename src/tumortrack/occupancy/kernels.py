@@ -166,8 +166,8 @@ def filled(coarse, labels, plain, fine, first, last):  # type: ignore[no-untyped
 
 @numba.njit(cache=True, nogil=True)
 def neighbours(shape, frontier, known):  # type: ignore[no-untyped-def]
-    """The voxels that touch these and are not known yet: flat indices; they are marked as known,
-    for whoever asks them now."""
+    """The voxels that touch these and are not known yet: flat indices. They are marked as known,
+    since the caller queries them next."""
     n_i, n_j, n_k = shape
     found = np.empty(max(26 * len(frontier), 1), np.int64)
     count = 0
@@ -187,7 +187,7 @@ def neighbours(shape, frontier, known):  # type: ignore[no-untyped-def]
 
 @numba.njit(nogil=True, inline="always")
 def _cell(at, size):  # type: ignore[no-untyped-def]
-    """The cell that a place along one axis lies in, and how far along it."""
+    """The cell of a coordinate along one axis, and the fraction of the cell up to it."""
     at = min(max(at, np.float32(0)), np.float32(size - 1))
     low = min(int(at), size - 2)
     return low, at - np.float32(low)
@@ -195,8 +195,8 @@ def _cell(at, size):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def between(values, place, out):  # type: ignore[no-untyped-def]
-    """Values (a, b, c, n) at places (m, 3), in steps of the lattice, by trilinear weights; outside
-    those of the nearest border. ``out``: (m, n), filled."""
+    """Trilinear values (a, b, c, n) at places (m, 3), in steps of the lattice; outside those of the
+    nearest border. ``out``: (m, n), filled."""
     for m in range(len(place)):
         i, x = _cell(place[m, 0], values.shape[0])
         j, y = _cell(place[m, 1], values.shape[1])

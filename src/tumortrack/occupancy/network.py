@@ -37,7 +37,7 @@ class Latent:
     centre_mm: Tensor  # (B, 1, 3), camera frame
     scale_mm: Tensor  # (B, 1, 1)
     turn: Tensor | None  # (2, B, 1): cosine and sine of the turn about z; None: no turn
-    terms: tuple[Tensor, ...]  # the decoder's share, computed once per cloud
+    terms: tuple[Tensor, ...]  # the decoder's part, computed once per cloud
 
     def normalised(self, queries_mm: Tensor) -> Tensor:
         """Queries (B, Q, 3), camera frame, mm -> the decoder's input."""
@@ -46,7 +46,7 @@ class Latent:
 
 
 class MlpDecoder(nn.Module):
-    """An MLP on [latent, query] (Mescheder et al., CVPR 2019), the latent's share computed once
+    """An MLP on [latent, query] (Mescheder et al., CVPR 2019), the latent's part computed once
     per cloud.
 
     Inputs of a hidden layer are ordered [hidden, query, latent]; W [h, q, z] + b is computed as

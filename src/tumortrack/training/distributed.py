@@ -46,7 +46,7 @@ class ProcessGroup:
         """How many samples of a batch are this process's.
 
         Raises:
-            InputError: the batch cannot be shared equally.
+            InputError: the batch cannot be split equally.
         """
         if batch_size % self.size:
             raise InputError(

@@ -61,7 +61,7 @@ def load_model(folder: Path, device: str = "auto") -> Model:
 
     Raises:
         ArtifactError: missing, of another schema, damaged, or weights changed since training.
-        InputError: CUDA asked for where there is none.
+        InputError: CUDA is requested where there is none.
     """
     manifest = read_model_manifest(folder)
     where = choose_device(device)

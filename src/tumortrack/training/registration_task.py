@@ -29,7 +29,7 @@ from tumortrack.training.task import ValidationScenes, mean_iou_of, validation_s
 _USUAL = 90  # per cent of the validation scenes have no more than the usual cost
 _COVERED = 0.683  # of all errors lie within this radius if each axis errs normally by 1
 _RADIUS = 1.878
-_AT_SURFACE = 0.5  # of the points whose places are learnt; the others lie inside the parts
+_AT_SURFACE = 0.5  # of the points whose positions are learnt; the others lie inside the parts
 
 
 class RegistrationTask:

@@ -58,7 +58,7 @@ def check_settings(run: RunSettings, **smallest: int) -> None:
     """Refuse numbers smaller than these, and impossible times between checkpoints.
 
     Raises:
-        InputError: as it says.
+        InputError: one of them is out of range.
     """
     for name, least in smallest.items():
         value = getattr(run, name)

@@ -38,7 +38,7 @@ class Stream(Protocol):
 @dataclass(frozen=True)
 class Scenes:
     """Batches in the order of their steps, who makes them, and what a user should know of that
-    (empty where there is nothing to say). Close the generator to end its processes."""
+    (may be empty). Close the generator to end its processes."""
 
     batches: Generator[Tensors, None, None]
     maker: str
@@ -105,7 +105,7 @@ def batches_on(
 def _finished(
     stream: DeviceStream, plans: Iterable[BatchPlan], thread: ThreadPoolExecutor
 ) -> Iterator[Tensors]:
-    """The batches of these plans; the pictures of each are taken before the last is handed out."""
+    """The batches of these plans; the next pictures are taken before a batch is returned."""
     before: tuple[Pictured, Future[Chosen]] | None = None
     for plan in plans:
         pictured = stream.pictured(plan)
@@ -170,11 +170,11 @@ def _loading(workers: int, ahead: int) -> dict[str, Any]:
 
 
 def quiet_worker(_: int) -> None:
-    """What a process that makes data does first."""
+    """Prepare a process that makes data."""
     for number in (signal.SIGINT, signal.SIGTERM):  # the parent's to handle
         signal.signal(number, signal.SIG_IGN)
-    os.nice(_LOWER_PRIORITY)  # a batch is made ahead, a step waits for nobody
-    # A worker has nothing to put in order at its end, and native libraries' threads can abort a
+    os.nice(_LOWER_PRIORITY)  # batches are made ahead, the network comes first
+    # A worker has nothing to clean up at its end, and native libraries' threads can abort a
     # process that is taken down piece by piece.
     atexit.register(os._exit, 0)
     torch.set_num_threads(1)

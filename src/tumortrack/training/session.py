@@ -157,7 +157,7 @@ class TrainingClock:
 
 @contextmanager
 def ctrl_c() -> Iterator[Callable[[], bool]]:
-    """Turns Ctrl-C and SIGTERM into a question that the loop asks after each step."""
+    """Turns Ctrl-C and SIGTERM into a flag that the loop checks after each step."""
     received: list[int] = []
     before = {
         number: signal.signal(number, lambda number, _: received.append(number))
