@@ -39,10 +39,9 @@ from tumortrack.registration.network import RegistrationNetwork
 from tumortrack.registration.registration import Registration
 from tumortrack.registration.rest_shape import shape_of
 from tumortrack.report.drawing import new_figure, save
-from tumortrack.simulate.bodies import body_for
 from tumortrack.simulate.dataset import SceneStream
 from tumortrack.simulate.occupancy import organ_pool
-from tumortrack.simulate.scene import Simulator
+from tumortrack.simulate.scene import Simulator, body_for
 from tumortrack.training.occupancy_task import label_miou
 from tumortrack.training.presets import PRESETS, clinic, quick
 from tumortrack.training.run import TrainingRun, settle_end

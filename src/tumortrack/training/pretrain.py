@@ -22,14 +22,14 @@ from tumortrack.phantom.kidneys import random_anatomy
 from tumortrack.registration.canonical_frame import (
     CanonicalFrame,
     generic_points,
-    know_any,
+    initialize_canonical,
     upright_of,
 )
 from tumortrack.registration.rest_shape import long_axis_of
-from tumortrack.simulate.bodies import body_for
 from tumortrack.simulate.dataset import Batch, SceneStream
 from tumortrack.simulate.elastic.body import ElasticBody
 from tumortrack.simulate.occupancy import FixedPoints
+from tumortrack.simulate.scene import body_for
 from tumortrack.training.model import save_start
 from tumortrack.training.run import check_settings, settings_sha256
 from tumortrack.training.scenes import Scenes, batches
@@ -139,7 +139,7 @@ def pretrain(run: Pretraining, folder: Path, report: Report) -> dict:
         device = choose_device(run.device)
         workers = divide_cores(device, run.workers)
         state = TrainingState(run, device)
-        state.initialize(know_any)
+        state.initialize(initialize_canonical)
         state.resume(work)
         steps = range(state.progress.step, run.steps)
         made = batches(kidney_stream(run), steps, 0, workers, device)

@@ -16,7 +16,7 @@ from torch.utils.data import DataLoader, Dataset
 
 from tumortrack.core.errors import InputError
 from tumortrack.simulate.batched.plan import BatchPlan
-from tumortrack.simulate.batched.stream import Chosen, DeviceStream, Pictured, why_not
+from tumortrack.simulate.batched.stream import DeviceStream, RenderedBatch, SampleChoice, why_not
 from tumortrack.simulate.dataset import Batch, SceneStream
 
 _LOWER_PRIORITY = 10  # of the workers
@@ -106,15 +106,15 @@ def _finished(
     stream: DeviceStream, plans: Iterable[BatchPlan], thread: ThreadPoolExecutor
 ) -> Iterator[Tensors]:
     """The batches of these plans; the next pictures are taken before a batch is returned."""
-    before: tuple[Pictured, Future[Chosen]] | None = None
+    before: tuple[RenderedBatch, Future[SampleChoice]] | None = None
     for plan in plans:
-        pictured = stream.pictured(plan)
-        coming = pictured, thread.submit(stream.chosen, pictured)
+        rendered = stream.render(plan)
+        coming = rendered, thread.submit(stream.sample, rendered)
         if before is not None:
-            yield stream.finished(before[0], before[1].result())
+            yield stream.assemble(before[0], before[1].result())
         before = coming
     if before is not None:
-        yield stream.finished(before[0], before[1].result())
+        yield stream.assemble(before[0], before[1].result())
 
 
 def batches(
