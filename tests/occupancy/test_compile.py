@@ -16,11 +16,19 @@ from tumortrack.cli.inspection import describe
 from tumortrack.core.config import to_builtins
 from tumortrack.models.config import MlpDecoderConfig, NetworkConfig
 from tumortrack.models.normalisation import CloudBox
-from tumortrack.occupancy.arithmetic import Arithmetic, can_pack, possible, usual
+from tumortrack.occupancy.compiled import (
+    Compiled,
+    find,
+    like_an_organ,
+    measured,
+    place_of,
+    read,
+    reference,
+    save,
+    this_machine,
+)
 from tumortrack.occupancy.compiled import describe as describe_compiled
-from tumortrack.occupancy.compiled import find, place_of, read, save, this_machine
-from tumortrack.occupancy.compiling import like_an_organ, measured, reference
-from tumortrack.occupancy.inference import Inference
+from tumortrack.occupancy.inference import Arithmetic, Inference, can_pack, possible, usual
 from tumortrack.occupancy.locator import OccupancyLocator
 from tumortrack.occupancy.network import OccupancyNetwork
 from tumortrack.training.model import load_model
@@ -121,7 +129,7 @@ def test_compiled_is_found_again_and_not_where_anything_differs(quick_model, tmp
     arithmetic, notice = find(folder, "weights")
     assert arithmetic is None
     assert "tumortrack compile" in notice
-    compiled = measured(load_model(quick_model, "cpu"), "weights", rounds=1)
+    compiled = measured_once(quick_model)
     assert {timing.arithmetic.numbers for timing in compiled.timings} == set(possible(CPU))
     assert all(timing.labels_equal > 0.99 for timing in compiled.timings)
     path = save(folder, compiled)
@@ -131,6 +139,12 @@ def test_compiled_is_found_again_and_not_where_anything_differs(quick_model, tmp
         arithmetic, notice = find(changed(folder, tmp_path / change, change), "weights")
         assert arithmetic is None
         assert "tumortrack compile" in notice
+
+
+def measured_once(folder: Path) -> Compiled:
+    model = load_model(folder, "cpu")
+    half_mm = model.in_distribution.spread_mm[1]
+    return measured(model.network, model.query_box_mm, half_mm, "weights", rounds=1)
 
 
 def changed(folder: Path, copy: Path, what: str) -> Path:
@@ -155,7 +169,7 @@ def changed(folder: Path, copy: Path, what: str) -> Path:
 
 def test_each_number_of_threads_has_its_own_choice(quick_model, tmp_path, monkeypatch):
     """What is fastest on one core need not be on two."""
-    alone = measured(load_model(quick_model, "cpu"), "weights", rounds=1)
+    alone = measured_once(quick_model)
     many = msgspec.structs.replace(
         alone, threads=alone.threads + 1, arithmetic=other_than(alone.arithmetic)
     )

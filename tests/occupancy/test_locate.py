@@ -23,7 +23,7 @@ from tumortrack.core.geometry import transform_points
 from tumortrack.core.mesh_files import read_mesh
 from tumortrack.core.types import Anatomy, SensorCloud
 from tumortrack.imaging.case import load_case
-from tumortrack.occupancy.arithmetic import Arithmetic, can_pack, possible
+from tumortrack.occupancy.inference import Arithmetic, can_pack, possible
 from tumortrack.tracking.follower import Follower, FollowerConfig
 from tumortrack.tracking.tracker import Tracker
 from tumortrack.training.model import load_model

@@ -340,7 +340,7 @@ def model(tmp_path_factory):
     folder = tmp_path_factory.mktemp("points") / "model"
     config = quick(anatomy())
     network = OccupancyNetwork(config.network)
-    familiar = InDistributionRange(spread_mm=(1.0, 100.0), fit_mm=5.0)
+    in_distribution = InDistributionRange(spread_mm=(1.0, 100.0), fit_mm=5.0)
     box = np.array([[-80.0] * 3, [80.0] * 3])
     with store.new_folder(folder) as aside:
         save_model(
@@ -349,7 +349,7 @@ def model(tmp_path_factory):
                 config=config,
                 parts=anatomy().names,
                 query_box_mm=box,
-                familiar=familiar,
+                in_distribution=in_distribution,
             ),
             aside,
         )

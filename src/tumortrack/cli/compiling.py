@@ -15,8 +15,7 @@ from tumortrack.core.errors import NoEstimate
 from tumortrack.core.types import SensorCloud
 from tumortrack.models.folder import WEIGHTS
 from tumortrack.models.model import Model
-from tumortrack.occupancy.compiled import Compiled, save
-from tumortrack.occupancy.compiling import measured
+from tumortrack.occupancy.compiled import Compiled, measured, save
 from tumortrack.occupancy.model import OccupancyModel
 from tumortrack.occupancy.sparse import sparse_margins
 from tumortrack.tracking.tracker import Tracker
@@ -45,7 +44,8 @@ def compile_model(folder: Path, device: str) -> None:
         say("network: runs as it is on a GPU; arithmetic is chosen on a CPU only.")
         return
     weights = store.read_json(folder / store.MANIFEST)["files"][WEIGHTS]
-    compiled = measured(model, weights)
+    half_mm = model.in_distribution.spread_mm[1]
+    compiled = measured(model.network, model.query_box_mm, half_mm, weights)
     path = save(folder, compiled)
     console.print(_table(compiled))
     best = compiled.arithmetic

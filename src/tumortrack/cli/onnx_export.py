@@ -29,7 +29,7 @@ def write_onnx(folder: Path, out: Path, overwrite: bool) -> None:
     if find_spec("onnx") is None:  # so far said before PyTorch's seconds
         raise InputError("writing ONNX needs the package onnx: pip install 'tumortrack[onnx]'.")
 
-    from tumortrack.models.onnx_file import onnx_bytes
+    from tumortrack.models.model import onnx_bytes
     from tumortrack.training.model import load_model
 
     model = load_model(folder, "cpu")

@@ -11,7 +11,7 @@ from tumortrack.core import store
 from tumortrack.core.errors import InputError
 
 if TYPE_CHECKING:
-    from tumortrack.training.head_start import HeadStart
+    from tumortrack.training.model import PretrainedWeights
 
 
 @dataclass(frozen=True)
@@ -27,7 +27,7 @@ class PretrainOptions:
 def pretrain(folder: Path, options: PretrainOptions) -> None:
     """Pretrained weights into ``folder``, resumed where a run was begun."""
     from tumortrack.cli.training import TrainingScreen
-    from tumortrack.training.head_start import KIND
+    from tumortrack.training.model import PRETRAINED
     from tumortrack.training.presets import pretraining
     from tumortrack.training.pretrain import Pretraining
     from tumortrack.training.pretrain import pretrain as fit
@@ -42,7 +42,7 @@ def pretrain(folder: Path, options: PretrainOptions) -> None:
         options.checkpoint_every_s,
     )
     if (folder / store.MANIFEST).is_file():
-        done = store.read_manifest(folder, KIND).get("provenance", {})
+        done = store.read_manifest(folder, PRETRAINED).get("provenance", {})
         if done.get("run_sha256") != run.identity:
             raise InputError(
                 f"{folder} holds weights of other options or another seed. Choose another folder."
@@ -58,10 +58,10 @@ def pretrain(folder: Path, options: PretrainOptions) -> None:
     )
 
 
-def start_of(folder: Path | None) -> HeadStart | None:
+def start_of(folder: Path | None) -> PretrainedWeights | None:
     """The weights that ``train --start`` names."""
     if folder is None:
         return None
-    from tumortrack.training.head_start import load_start
+    from tumortrack.training.model import load_start
 
     return load_start(folder)
