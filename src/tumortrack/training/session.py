@@ -15,9 +15,8 @@ from typing import TypeVar
 
 import torch
 
-from tumortrack.core.allocator import keep_freed_memory
-from tumortrack.core.cores import available_cores
 from tumortrack.core.errors import InputError, StorageError, TumortrackError
+from tumortrack.core.process import available_cores, keep_freed_memory
 from tumortrack.core.store import write_atomically
 from tumortrack.training.state import TrainingProgress
 
