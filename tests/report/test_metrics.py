@@ -11,8 +11,8 @@ from tumortrack.core.errors import InputError
 from tumortrack.core.types import Anatomy, CameraLabels, Mesh
 from tumortrack.imaging.raster import cover, voxelise
 from tumortrack.report.metrics import (
-    _to_surface,
     box_center_distance,
+    distance_to_surface,
     label_grid,
     label_ious,
     mean_iou,
@@ -135,7 +135,7 @@ def test_nearest_triangle_is_found_among_the_few(target):
     exact = np.array(
         [triangle_distance(np.tile(p, (len(triangles), 1)), triangles).min() for p in points]
     )
-    found = _to_surface(points, target)
+    found = distance_to_surface(points, target)
     assert exact.max() > 1.0
     assert (found >= exact - 1e-9).all()
     np.testing.assert_allclose(found, exact, atol=0.01)

@@ -16,10 +16,7 @@ from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.motion import Motion
 from tumortrack.core.types import Anatomy, CameraLabels, Mesh
-from tumortrack.imaging.raster import _expand
-
-# Peers take it from here; their cells are kept by the text of their code.
-from tumortrack.imaging.raster import label_grid as label_grid
+from tumortrack.imaging.raster import label_grid  # peers' kept results name it as ours
 from tumortrack.simulate.targets import Targets
 
 # Vertices are sampled too, so the maximum misses at most s^2 / (8 R) where a flat piece of size s
@@ -59,7 +56,8 @@ def surface_samples(
     edges = triangles - np.roll(triangles, 1, axis=1)
     cuts = np.maximum(np.ceil(np.linalg.norm(edges, axis=2).max(1) / spacing_mm), 1).astype(int)
     area = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1) / 2
-    face, cell = _expand(cuts**2)
+    face, first = np.repeat(np.arange(len(cuts)), cuts**2), np.cumsum(cuts**2) - cuts**2
+    cell = np.arange(len(face)) - first[face]
     n = cuts[face]
     # Row r of the cut triangle holds 2 r + 1 cells, pointing up (even) and down (odd) in turn.
     row = np.floor(np.sqrt(cell)).astype(int)
@@ -112,7 +110,10 @@ def surface_distances(
         raise InputError("surface distances need two surfaces with triangles; one is empty.")
     points_out, weights_out, _ = surface_samples(estimate, spacing_mm)
     points_back, weights_back, _ = surface_samples(reference, spacing_mm)
-    out, back = _to_surface(points_out, reference), _to_surface(points_back, estimate)
+    out, back = (
+        distance_to_surface(points_out, reference),
+        distance_to_surface(points_back, estimate),
+    )
     return SurfaceDistances(
         symmetric_mm=float(max(out.max(), back.max())),
         one_sided_mm=float(out.max()),
@@ -125,7 +126,9 @@ def surface_distances(
     )
 
 
-def _to_surface(points_mm: Float[np.ndarray, "n 3"], target: Mesh) -> Float[np.ndarray, " n"]:
+def distance_to_surface(
+    points_mm: Float[np.ndarray, "n 3"], target: Mesh
+) -> Float[np.ndarray, " n"]:
     """Distance of every point to a surface: exact to the triangles of the nearest few samples, and
     to one at the nearest corner, whose triangles may be too thin for samples near it.
 
