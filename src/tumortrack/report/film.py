@@ -72,15 +72,17 @@ def film(
         InputError: no frame, or another kind of file, speed or size.
         StorageError: the disk refused.
     """
+    from PIL import Image
+
     cells = list(frames)
     _check(cells, path, fps, size)
     painter = _FramePainter(cells, located, size)
     chosen = np.linspace(0, len(cells) - 1, min(_SAMPLES, len(cells))).astype(int).tolist()
-    palette, index_of = _palette([painter.picture(n) for n in chosen])
+    palette = _palette([painter.picture(n) for n in chosen])
 
     def indexed() -> Iterator[Image.Image]:
         for n in range(len(cells)):
-            yield _indexed(painter.picture(n), palette, index_of)
+            yield painter.picture(n).quantize(palette=palette, dither=Image.Dither.NONE)
             if progress is not None:
                 progress(n + 1, len(cells))
 
@@ -94,7 +96,7 @@ def film(
         append_images=pictures,
         duration=[each_ms] * (len(cells) - 1) + [each_ms + round(1000 * _LAST_S)],
         loop=0,
-        palette=palette.tobytes(),
+        palette=bytes(palette.getpalette() or ()),
         transparency=_COLOURS,
         disposal=1,
         optimize=True,
@@ -255,35 +257,12 @@ def _close_viewpoint(organ: Mesh, size: tuple[int, int]) -> Viewpoint:
     return Viewpoint.towards(target, place, near.width_mm, parallel=True, before_mm=before_mm)
 
 
-def _palette(
-    pictures: list[Image.Image],
-) -> tuple[UInt8[np.ndarray, "256 3"], UInt8[np.ndarray, "64 64 64"]]:
-    """Colours that suit these pictures, and for every colour (6 bits each) the nearest of them."""
+def _palette(pictures: list[Image.Image]) -> Image.Image:
+    """An image of the colours that suit these pictures."""
     from PIL import Image
-    from scipy.spatial import cKDTree
 
     sheet = Image.fromarray(np.concatenate([np.asarray(one)[::2, ::2] for one in pictures]))
-    few = sheet.quantize(_COLOURS, Image.Quantize.MEDIANCUT, kmeans=2, dither=Image.Dither.NONE)
-    colours = np.array(few.getpalette(), np.uint8).reshape(-1, 3)[:_COLOURS]
-    palette = np.zeros((256, 3), np.uint8)
-    palette[: len(colours)] = colours
-    shades = (np.arange(64) * 4 + 2).astype(float)
-    cube = np.stack(np.meshgrid(shades, shades, shades, indexing="ij"), -1).reshape(-1, 3)
-    _, nearest = cKDTree(colours.astype(float)).query(cube)
-    return palette, nearest.astype(np.uint8).reshape(64, 64, 64)
-
-
-def _indexed(
-    picture: Image.Image,
-    palette: UInt8[np.ndarray, "256 3"],
-    index_of: UInt8[np.ndarray, "64 64 64"],
-) -> Image.Image:
-    from PIL import Image
-
-    red, green, blue = np.moveaxis(np.asarray(picture) >> 2, -1, 0)
-    out = Image.fromarray(index_of[red, green, blue])
-    out.putpalette(palette.tobytes())
-    return out
+    return sheet.quantize(_COLOURS, Image.Quantize.MEDIANCUT, kmeans=2, dither=Image.Dither.NONE)
 
 
 def tube(points_mm: Float[np.ndarray, "n 3"], radius_mm: float, sides: int = 6) -> Mesh:

@@ -7,6 +7,7 @@ import html
 import io
 import json
 from dataclasses import dataclass
+from importlib import resources
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +16,6 @@ from jaxtyping import Float
 from tumortrack.core.estimate import Estimate
 from tumortrack.core.store import write_atomically
 from tumortrack.core.types import Mesh
-from tumortrack.report.page_template import PAGE
 from tumortrack.simulate.scene_folder import Scene
 
 _KIDNEY_CELL_MM, _TUMOR_CELL_MM = 2.5, 2.0
@@ -78,7 +78,8 @@ def write_page(report: dict, scenes: list[PageScene], path: Path) -> None:
     ]
     embedded = json.dumps(data, allow_nan=False).replace("</", "<\\/")
     # The texts that are long or hold braces go in by position, never through a formatter.
-    page = PAGE.replace("@SUMMARY@", _summary_table(report["summary"]))
+    page = resources.files("tumortrack.report").joinpath("page.html").read_text("utf-8")
+    page = page.replace("@SUMMARY@", _summary_table(report["summary"]))
     page = page.replace("@COUNTS@", html.escape(_counts(report["summary"])))
     page = page.replace("@RULE@", html.escape(report["rule"]))
     head, script = page.split("@PLOTLY@")

@@ -146,6 +146,11 @@ def _draw_cuts(
 
 def _draw_arrows(axes: Axes, flat: Float[np.ndarray, "n 3"], colour: RGB) -> None:
     """Heads along a stroke, where it is on the side towards the viewer."""
+    arrow = {
+        "arrowstyle": "simple,head_width=0.85,head_length=0.9,tail_width=0.01",
+        **{"mutation_scale": 13, "shrinkA": 0, "shrinkB": 0},
+        **{"facecolor": colour, "edgecolor": "white", "linewidth": 0.6},
+    }
     steps = np.linalg.norm(np.diff(flat[:, :2], axis=0), axis=1)
     near = flat[:-1, 2] <= (flat[:, 2].min() + flat[:, 2].max()) / 2 + 1e-6
     good = np.flatnonzero(near & (steps >= 0.6 * steps[near].max()))
@@ -153,21 +158,7 @@ def _draw_arrows(axes: Axes, flat: Float[np.ndarray, "n 3"], colour: RGB) -> Non
     for n in good[(len(good) * (np.arange(count) + 0.5) / count).astype(int)]:
         along = flat[n + 1, :2] - flat[n, :2]
         tip = flat[n, :2] + along / np.linalg.norm(along) * _HEAD_MM / 2
-        axes.annotate(
-            "",
-            tip,
-            2 * flat[n, :2] - tip,
-            arrowprops={
-                "arrowstyle": "simple,head_width=0.85,head_length=0.9,tail_width=0.01",
-                "mutation_scale": 13,
-                "shrinkA": 0,
-                "shrinkB": 0,
-                "facecolor": colour,
-                "edgecolor": "white",
-                "linewidth": 0.6,
-            },
-            zorder=8,
-        )
+        axes.annotate("", tip, 2 * flat[n, :2] - tip, arrowprops=arrow, zorder=8)
 
 
 def _draw_numbers(axes: Axes, plan: ResectionPlan, view: ParallelView, frame: Frame) -> None:
@@ -184,14 +175,11 @@ def _draw_numbers(axes: Axes, plan: ResectionPlan, view: ParallelView, frame: Fr
             continue
         taken.append(spot)
         if view is FROM_SIDE:
-            axes.plot(
-                [flat[:, 0].max(), spot[0]], [spot[1]] * 2, ":", color=colour, lw=0.9, zorder=4
-            )
-        axes.annotate(
-            str(sweep), tuple(spot), color="white", fontsize=7.5, weight="bold",
-            ha="center", va="center", zorder=10,
-            bbox={"boxstyle": "circle,pad=0.22", "facecolor": colour, "edgecolor": "white"},
-        )  # fmt: skip
+            x = [flat[:, 0].max(), spot[0]]
+            axes.plot(x, [spot[1]] * 2, ":", color=colour, lw=0.9, zorder=4)
+        badge = {"boxstyle": "circle,pad=0.22", "facecolor": colour, "edgecolor": "white"}
+        style = {"fontsize": 7.5, "weight": "bold", "ha": "center", "va": "center", "zorder": 10}
+        axes.annotate(str(sweep), tuple(spot), color="white", bbox=badge, **style)
 
 
 def _draw_grasp(axes: Axes, plan: ResectionPlan, view: ParallelView) -> None:
@@ -203,17 +191,10 @@ def _draw_grasp(axes: Axes, plan: ResectionPlan, view: ParallelView) -> None:
             x, y = u + radius * np.cos(turn), v + radius * np.sin(turn)
             axes.plot(x, y, color=_GRASP, linewidth=width, zorder=9)
         return
-    axes.fill(
-        u + _CUP_MM * np.array([-1, 1, 0.5, -0.5]), v - np.array([0, 0, 4, 4]),
-        color=_GRASP, zorder=9,
-    )  # fmt: skip
-    axes.annotate(
-        "",
-        (u, v - 4.0),
-        (u, v - _APPROACH_MM),
-        arrowprops={"arrowstyle": "-|>", "color": _GRASP, "linewidth": 1.8, "mutation_scale": 14},
-        zorder=9,
-    )
+    x, y = u + _CUP_MM * np.array([-1, 1, 0.5, -0.5]), v - np.array([0, 0, 4, 4])
+    axes.fill(x, y, color=_GRASP, zorder=9)
+    arrow = {"arrowstyle": "-|>", "color": _GRASP, "linewidth": 1.8, "mutation_scale": 14}
+    axes.annotate("", (u, v - 4.0), (u, v - _APPROACH_MM), arrowprops=arrow, zorder=9)
 
 
 def _words(figure: Figure, plan: ResectionPlan) -> None:
@@ -225,14 +206,11 @@ def _words(figure: Figure, plan: ResectionPlan) -> None:
         x=0.014, y=0.975, ha="left", fontsize=13, fontweight="bold",
     )  # fmt: skip
     share = ml["healthy"] / ml["parenchyma"]
-    figure.text(
-        0.014,
-        0.055,
+    line = (
         f"{ml['piece']:.1f} ml come away: {ml['tumor']:.1f} ml tumor and {ml['healthy']:.1f} ml "
-        f"healthy tissue ({share:.0%} of the organ's)",
-        fontsize=11,
-        va="center",
+        f"healthy tissue ({share:.0%} of the organ's)"
     )
+    figure.text(0.014, 0.055, line, fontsize=11, va="center")
     about = [
         f"margin {plan.margin_mm:g} mm",
         f"{plan.exophytic:.0%} of the tumor outside the organ's hull",

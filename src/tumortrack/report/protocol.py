@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from dataclasses import asdict, fields
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -15,6 +16,7 @@ from tumortrack.core.estimate import Estimate
 from tumortrack.core.store import write_json
 from tumortrack.core.types import SensorCloud
 from tumortrack.report.metrics import (
+    SurfaceDistances,
     box_center_distance,
     label_ious,
     mean_iou,
@@ -28,13 +30,7 @@ from tumortrack.simulate.scene_folder import Scene, list_scenes, read_scene
 if TYPE_CHECKING:
     from rich.table import Table
 
-DISTANCES = (
-    "hausdorff_mm",
-    "hausdorff_one_sided_mm",
-    "hausdorff_95_mm",
-    "surface_mm",
-    "center_mm",
-)
+DISTANCES = (*(field.name for field in fields(SurfaceDistances)), "center_mm")
 RULE = (
     "Medians over all scenes that have the part. A part that was not found counts as infinitely "
     "far and with IoU 0; a median that is infinite is written as null. A scene with a part "
@@ -139,20 +135,11 @@ def compare(estimate: Estimate, scene: Scene) -> dict[str, dict]:
     ious = label_ious(estimate.volume, scene.reference)
     parts: dict[str, dict] = {}
     for name, reference in zip(scene.reference.names, scene.reference.parts, strict=True):
-        parts[name] = {"found": False, "iou": ious[name]}
-        mesh = estimate.meshes.get(name)
-        if mesh is None or len(mesh.faces) == 0:
-            continue
-        distances = surface_distances(mesh, reference)
-        parts[name] = {
-            "found": True,
-            "hausdorff_mm": distances.symmetric_mm,
-            "hausdorff_one_sided_mm": distances.one_sided_mm,
-            "hausdorff_95_mm": distances.percentile_95_mm,
-            "surface_mm": distances.mean_mm,
-            "center_mm": box_center_distance(mesh, reference),
-            "iou": ious[name],
-        }
+        mesh, distances = estimate.meshes.get(name), {}
+        if found := mesh is not None and len(mesh.faces) > 0:
+            distances = asdict(surface_distances(mesh, reference))
+            distances["center_mm"] = box_center_distance(mesh, reference)
+        parts[name] = {"found": found, **distances, "iou": ious[name]}
     return parts
 
 

@@ -23,7 +23,6 @@ from tumortrack.report.renderer_kernels import (
     crease,
     nearest,
     shade,
-    shrunk,
 )
 
 _SHARPER = 2  # pixels drawn per pixel shown, each way: smooth edges
@@ -217,6 +216,8 @@ def render(
 
     Opaque bodies hide each other by depth; translucent ones tint what lies behind them.
     """
+    from PIL import Image
+
     width, height = (_SHARPER * n for n in size)
     solid = _join([body for body in bodies if body.opacity >= 1])
     light = _light(solid if solid.shadowed.any() else _join([]), viewpoint)
@@ -233,7 +234,8 @@ def render(
 
     for body in sorted((body for body in bodies if body.opacity < 1), key=far_first):
         _lay(picture, near, _join([body]), viewpoint, light, body.opacity)
-    return shrunk(picture, _SHARPER)
+    sharp = Image.fromarray(np.rint(255 * picture).astype(np.uint8))
+    return np.asarray(sharp.reduce(_SHARPER))
 
 
 def _join(bodies: list[Body]) -> Triangles:

@@ -179,19 +179,3 @@ def shade(picture, hits, triangles, light, opacity):  # type: ignore[no-untyped-
             for d in range(3):
                 own = min(triangles.colors[t, d] * strength + gloss, 1.0)
                 picture[y, x, d] += cover * (own - picture[y, x, d])
-
-
-@numba.njit(cache=True, nogil=True)
-def shrunk(picture, step):  # type: ignore[no-untyped-def]
-    """Means of step x step pixels, in 0..255."""
-    height, width = picture.shape[0] // step, picture.shape[1] // step
-    out = np.empty((height, width, 3), np.uint8)
-    for y in range(height):
-        for x in range(width):
-            for d in range(3):
-                total = 0.0
-                for i in range(step):
-                    for j in range(step):
-                        total += picture[y * step + i, x * step + j, d]
-                out[y, x, d] = int(255 * min(max(total / step**2, 0.0), 1.0) + 0.5)
-    return out
