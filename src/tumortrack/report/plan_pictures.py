@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import textwrap
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -178,7 +178,13 @@ def _draw_numbers(axes: Axes, plan: ResectionPlan, view: ParallelView, frame: Fr
             x = [flat[:, 0].max(), spot[0]]
             axes.plot(x, [spot[1]] * 2, ":", color=colour, lw=0.9, zorder=4)
         badge = {"boxstyle": "circle,pad=0.22", "facecolor": colour, "edgecolor": "white"}
-        style = {"fontsize": 7.5, "weight": "bold", "ha": "center", "va": "center", "zorder": 10}
+        style: dict[str, Any] = {
+            "fontsize": 7.5,
+            "weight": "bold",
+            "ha": "center",
+            "va": "center",
+            "zorder": 10,
+        }
         axes.annotate(str(sweep), tuple(spot), color="white", bbox=badge, **style)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float, Shaped
@@ -158,7 +158,13 @@ def _draw_solid(axes: Axes, anatomy: Anatomy) -> None:
 
 
 def _write_letters(axes: Axes, plane: QcPlane, color: str) -> None:
-    style = {"ha": "center", "va": "center", "fontsize": 13, "fontweight": "bold", "color": color}
+    style: dict[str, Any] = {
+        "ha": "center",
+        "va": "center",
+        "fontsize": 13,
+        "fontweight": "bold",
+        "color": color,
+    }
     for border, letter in plane.letters.items():
         axes.text(*_BORDERS[border], letter, transform=axes.transAxes, gid=border, **style)
 

@@ -16,14 +16,7 @@ from jaxtyping import Float, Float32, UInt8
 from tumortrack.core.colours import Colour
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.types import Mesh
-from tumortrack.report.renderer_kernels import (
-    Hits,
-    Light,
-    Triangles,
-    crease,
-    nearest,
-    shade,
-)
+from tumortrack.report.renderer_kernels import Hits, Light, Triangles, crease, nearest, shade
 
 _SHARPER = 2  # pixels drawn per pixel shown, each way: smooth edges
 _CREASE = np.cos(np.radians(40.0))  # faces that meet at a sharper angle keep their edge
