@@ -83,7 +83,7 @@ class Doctor:
 
         import torch
 
-        from tumortrack.training.model import has_fast_bfloat16
+        from tumortrack.models.hardware import has_fast_bfloat16
 
         fast = has_fast_bfloat16(torch.device("cpu"))
         bf16 = "in hardware, used" if fast else "not in hardware; fp32 is used (slower)"

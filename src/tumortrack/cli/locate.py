@@ -14,9 +14,9 @@ from tumortrack.core.errors import InputError
 
 if TYPE_CHECKING:
     from tumortrack.core.types import DepthFrame, SensorCloud
+    from tumortrack.models.model import Model
     from tumortrack.sense.cloud import CloudConfig
     from tumortrack.tracking.points import PointTable
-    from tumortrack.training.model import Model
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -104,8 +104,8 @@ class Locate:
     def _points(self) -> PointTable | None:
         """The points of --map; model and points are checked before there is anything to wait
         for."""
+        from tumortrack.models.folder import has_shape, read_model_manifest
         from tumortrack.tracking.points import read_points
-        from tumortrack.training.model_folder import has_shape, read_model_manifest
 
         manifest = read_model_manifest(self.model)
         if self.map is None:
@@ -175,8 +175,8 @@ class Evaluate:
 
     def run(self) -> None:
         """Model x scenes -> report folder."""
+        from tumortrack.models.folder import read_model_manifest
         from tumortrack.simulate.scene_folder import list_scenes
-        from tumortrack.training.model_folder import read_model_manifest
 
         _check_grid(self.grid)
         if (self.report / store.MANIFEST).exists():

@@ -17,8 +17,8 @@ from tumortrack.core.errors import InputError, NoEstimate
 if TYPE_CHECKING:
     from rich.table import Table
 
+    from tumortrack.models.model import Model
     from tumortrack.occupancy.compiled import Compiled
-    from tumortrack.training.model import Model
 
 _GRID = 32
 
@@ -42,15 +42,16 @@ class Compile:
             ArtifactError: no model.
             StorageError: the disk refused.
         """
+        from tumortrack.models.folder import WEIGHTS
         from tumortrack.occupancy.compiled import save
         from tumortrack.occupancy.compiling import measured
+        from tumortrack.occupancy.model import OccupancyModel
         from tumortrack.training.model import load_model
-        from tumortrack.training.model_folder import WEIGHTS
 
         model = load_model(self.model, self.device)
         _warm(model)
         say("kernels: compiled and kept for every model of this machine.")
-        if model.config.network.warps:
+        if not isinstance(model, OccupancyModel):
             say(
                 "network: nothing to choose. It runs once a frame, on one cloud, in about a "
                 "millisecond; the rest of a frame is the kernels."
@@ -90,7 +91,7 @@ class Onnx:
             ArtifactError: no model.
             StorageError: the disk refused.
         """
-        from tumortrack.training.model_folder import read_model_manifest
+        from tumortrack.models.folder import read_model_manifest
 
         out = self.out
         if out.suffix != ".onnx":
@@ -103,8 +104,8 @@ class Onnx:
         if find_spec("onnx") is None:  # reported before PyTorch's seconds
             raise InputError("writing ONNX needs the package onnx: pip install 'tumortrack[onnx]'.")
 
+        from tumortrack.models.onnx_file import onnx_bytes
         from tumortrack.training.model import load_model
-        from tumortrack.training.onnx_file import onnx_bytes
 
         model = load_model(self.model, "cpu")
         content = onnx_bytes(model)

@@ -95,7 +95,7 @@ class Track:
         from tumortrack.live.sources import SOURCES
         from tumortrack.live.spec import parse_spec
         from tumortrack.live.values import Controls, PublishedFrame, SinkContext
-        from tumortrack.training.model_folder import read_model_manifest
+        from tumortrack.models.folder import read_model_manifest
 
         source_config = parse_spec(self.source, SOURCES, "source")
         sink_configs = parse_sinks(self.sinks)

@@ -61,9 +61,9 @@ class Train:
         self._check_numbers()
         case = load_case(self.case)  # report what is wrong so far before PyTorch's seconds
 
+        from tumortrack.models.folder import is_finished
         from tumortrack.training.head_start import load_start
         from tumortrack.training.model import load_model
-        from tumortrack.training.model_folder import is_finished
         from tumortrack.training.presets import PRESETS
         from tumortrack.training.train import TrainingRun, run_identity, train
 

@@ -130,7 +130,7 @@ def _scale_bar(axes: Axes, frame: Frame, color: str) -> None:
     length = max(n for n in (1, 2, 5, 10, 20, 50, 100) if n <= max(0.3 * width, 1))
     x, y = frame.left + 0.05 * width, frame.bottom - 0.05 * height
     axes.plot([x, x + length], [y, y], color=color, linewidth=3, solid_capstyle="butt")
-    style = {"color": color, "ha": "center", "va": "bottom", "fontsize": 9}
+    style: dict[str, Any] = {"color": color, "ha": "center", "va": "bottom", "fontsize": 9}
     axes.text(x + length / 2, y - 0.015 * height, f"{length} mm", **style)
 
 
@@ -140,7 +140,7 @@ def _axis_arrows(axes: Axes, frame: Frame, arrows: dict[str, tuple[float, float]
     rises = any(down < 0 for _, down in arrows.values())
     x, y = frame.left + 0.6 * span, frame.top + (2.1 if rises else 0.6) * span
     arrow = {"arrowstyle": "->", "color": "0.35", "shrinkA": 0, "shrinkB": 0}
-    style = {"color": "0.35", "fontsize": 8, "ha": "center", "va": "center"}
+    style: dict[str, Any] = {"color": "0.35", "fontsize": 8, "ha": "center", "va": "center"}
     for letter, (right, down) in arrows.items():
         axes.annotate("", (x + right * span, y + down * span), (x, y), arrowprops=arrow)
         axes.text(x + 1.5 * right * span, y + 1.5 * down * span, letter, **style)

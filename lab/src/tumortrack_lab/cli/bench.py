@@ -55,7 +55,7 @@ class Bench:
         from tumortrack_lab.bench.plan import CURVES, Wish, measure
         from tumortrack_lab.bench.report import check_document, write_bench
         from tumortrack_lab.bench.suite import GROUPS
-        from tumortrack_lab.bench.tables import rich_table
+        from tumortrack_lab.bench.tables import line, rich_table
 
         if (self.model is None) != (self.cloud is None):
             raise InputError(
@@ -73,7 +73,8 @@ class Bench:
         )
         with console.status("starting ...") as status:
             report = status.update if console.is_terminal else say
-            found = measure(wish, _WORKER, self._command(), report)
+            command = self._command()
+            found = measure(wish, _WORKER, command, report, lambda row: say(line(row)))
         shown = console if console.is_terminal else Console(width=_WIDE)
         shown.print(rich_table(found))
         for path in write_bench(found, self.out, self.document):
@@ -91,7 +92,7 @@ def _work(task_json: str) -> None:
     import msgspec
 
     from tumortrack.core.config import from_builtins
-    from tumortrack_lab.bench.tasks import Task, carry_out, keep_to_cores, subject_of
+    from tumortrack_lab.bench.tasks import Task, TaskMessage, carry_out, keep_to_cores, subject_of
 
     task = from_builtins(msgspec.json.decode(task_json), Task, "the bench's task")
     keep_to_cores(task.threads)
@@ -102,9 +103,12 @@ def _work(task_json: str) -> None:
         return lambda anatomy: PRESETS[name](anatomy, "limited")
 
     presets = {name: limited(name) for name in PRESETS}
-    for said in carry_out(task, subject_of(task, presets)):
-        sys.stdout.write(msgspec.json.encode(said).decode() + "\n")
-        sys.stdout.flush()
+
+    def tell(said: TaskMessage) -> None:
+        print(msgspec.json.encode(said).decode(), flush=True)
+
+    for said in carry_out(task, subject_of(task, presets), tell):
+        tell(said)
 
 
 if __name__ == "__main__":
