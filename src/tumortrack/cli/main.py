@@ -90,11 +90,9 @@ def _commands() -> dict[str, Callable[..., Command]]:
         command.__name__.lower(): command for command in _COMMANDS
     }
     found |= {name: point.load() for name, point in sorted(others.items())}
-    return {name: found[name] for name in sorted(found, key=_place)}
-
-
-def _place(name: str) -> int:
-    return _ORDER.index(name) if name in _ORDER else len(_ORDER)
+    names = [name for name in _ORDER if name in found]
+    names += [name for name in found if name not in _ORDER]
+    return {name: found[name] for name in names}
 
 
 def _parse(arguments: list[str]) -> Command:

@@ -194,7 +194,11 @@ class Resect:
                 for sink in sinks:
                     sink.put(result)
                 say_failures(sinks, errors)
-                shown = _say_state(result.workcell, shown)
+                assert result.workcell is not None
+                text = result.workcell.state
+                text += f": {result.workcell.halted}" if result.workcell.halted else ""
+                if text != shown:
+                    say(shown := text)
                 if operation.ended:
                     break
                 sequence += 1
@@ -256,14 +260,6 @@ def _organ_shapes(stored: PlanFolder) -> tuple[RigidShape, ...]:
         )
         for label, (name, mesh) in enumerate(zip(names, meshes, strict=True), start=1)
     )
-
-
-def _say_state(cell: Workcell | None, shown: str) -> str:
-    assert cell is not None
-    state = cell.state + (f": {cell.halted}" if cell.halted else "")
-    if state != shown:
-        say(state)
-    return state
 
 
 def _say_end(operation: Operation) -> None:

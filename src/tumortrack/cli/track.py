@@ -91,6 +91,7 @@ class Track:
 
     def run(self, arms: Arms | None = None) -> None:
         """Until the source ends, the time is up, the arms have ended, or Ctrl-C."""
+        from tumortrack.core.config import to_builtins
         from tumortrack.live.calibration_file import read_frames
         from tumortrack.live.sources import SOURCES
         from tumortrack.live.spec import parse_spec
@@ -134,27 +135,20 @@ class Track:
             about = {
                 "model": model.provenance,
                 "notes": list(model.notes),
-                **self._about(config, frames),
+                "model_sha256": store.sha256_of(self.model / store.MANIFEST),
+                "source": self.source,
+                "sinks": list(self.sinks),
+                "config": to_builtins(config),
+                "frame": {
+                    "frame_id": frames.frame_id,
+                    "published_from_camera": frames.published_from_camera.tolist(),
+                },
                 **({} if arms is None else arms.about),
             }
             screen = _Screen(loop, source, sinks, report, about, companion)
             ending.callback(screen.end)  # once all workers have flushed
             say(f"tracking {self.source} in frame {frames.frame_id!r}; Ctrl-C ends it.")
             loop.run(source, sinks, screen.show)
-
-    def _about(self, config: LoopConfig, frames: PublishedFrame) -> dict:
-        from tumortrack.core.config import to_builtins
-
-        return {
-            "model_sha256": store.sha256_of(self.model / store.MANIFEST),
-            "source": self.source,
-            "sinks": list(self.sinks),
-            "config": to_builtins(config),
-            "frame": {
-                "frame_id": frames.frame_id,
-                "published_from_camera": frames.published_from_camera.tolist(),
-            },
-        }
 
     def _loop_config(self, trained: TrainConfig, anatomy_ct: Anatomy | None) -> LoopConfig:
         from tumortrack.live.loop import LoopConfig

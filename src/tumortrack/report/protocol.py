@@ -23,7 +23,7 @@ from tumortrack.report.metrics import (
     surface_distances,
     target_errors,
 )
-from tumortrack.report.page import PageScene, page_scene, part_rows, write_page
+from tumortrack.report.page import number, page_scene, part_rows, write_page
 from tumortrack.report.pictures import scene_picture
 from tumortrack.simulate.scene_folder import Scene, list_scenes, read_scene
 
@@ -76,7 +76,7 @@ def evaluate_scenes(
     except OSError as error:
         raise StorageError(f"cannot write {out}: {error.strerror}.") from error
     entries: list[dict] = []
-    shown: list[PageScene] = []
+    shown: list[dict] = []
     for done, folder in enumerate(folders, start=1):
         scene = read_scene(folder)
         entry, estimate = evaluate_scene(locate, scene, folder.name)
@@ -178,27 +178,20 @@ def summary_table(report: dict) -> Table:
     from rich.table import Table
 
     summary = report["summary"]
+    errors = summary.get("tre_mm")
+    targets = f", target error {number(errors['mean'], 1)} mm" if errors else ""
     table = Table(
         title=f"{summary['scenes']} scenes, {summary['failed']} failed, "
-        f"mIoU {summary['miou']:.3f}{_targets_text(summary)} (medians)"
+        f"mIoU {summary['miou']:.3f}{targets} (medians)"
     )
     table.add_column("part")
     for head in ("found", "HD mm", "one-sided", "HD95", "surface", "centre", "IoU"):
         table.add_column(head, justify="right")
     for name, part in part_rows(summary).items():
-        numbers = [_text(part[key], 1 if key != "surface_mm" else 2) for key in DISTANCES]
+        numbers = [number(part[key], 1 if key != "surface_mm" else 2) for key in DISTANCES]
         found = f"{part['found']}/{part['scenes']}"
-        table.add_row(name, found, *numbers, _text(part["iou"], 2))
+        table.add_row(name, found, *numbers, number(part["iou"]))
     return table
-
-
-def _targets_text(summary: dict) -> str:
-    errors = summary.get("tre_mm")
-    return f", target error {_text(errors['mean'], 1)} mm" if errors else ""
-
-
-def _text(value: float | None, digits: int) -> str:
-    return "none" if value is None else f"{value:.{digits}f}"
 
 
 def _median(values: list[float]) -> float | None:

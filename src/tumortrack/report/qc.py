@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -39,28 +38,21 @@ _BORDERS = {
 }
 
 
-@dataclass(frozen=True)
-class QcPlane:
-    """One of the three slices: its view in LPS, and the letters at its borders."""
-
-    view: ParallelView
-
-    @property
-    def letters(self) -> dict[str, str]:
-        """Where the patient's sides lie: left, right, top, bottom of the picture -> L R A P S I."""
-        right, down, _ = self.view.axes
-        towards = {"right": right, "left": -right, "bottom": down, "top": -down}
-        names = {tuple(np.array(v)): n[0].upper() for n, v in DIRECTIONS_LPS.items()}
-        return {border: names[tuple(v)] for border, v in towards.items()}
-
-
-# Radiological convention: the patient's right is on the picture's left (axial seen from the feet,
-# coronal from the front); sagittal with anterior on the left.
+# The slices' views in LPS. Radiological convention: the patient's right is on the picture's left
+# (axial seen from the feet, coronal from the front); sagittal with anterior on the left.
 PLANES = (
-    QcPlane(ParallelView("axial", (1.0, 0.0, 0.0), (0.0, 1.0, 0.0))),
-    QcPlane(ParallelView("coronal", (1.0, 0.0, 0.0), (0.0, 0.0, -1.0))),
-    QcPlane(ParallelView("sagittal", (0.0, 1.0, 0.0), (0.0, 0.0, -1.0))),
+    ParallelView("axial", (1.0, 0.0, 0.0), (0.0, 1.0, 0.0)),
+    ParallelView("coronal", (1.0, 0.0, 0.0), (0.0, 0.0, -1.0)),
+    ParallelView("sagittal", (0.0, 1.0, 0.0), (0.0, 0.0, -1.0)),
 )
+
+
+def border_letters(view: ParallelView) -> dict[str, str]:
+    """Where the patient's sides lie: left, right, top, bottom of the picture -> L R A P S I."""
+    right, down, _ = view.axes
+    towards = {"right": right, "left": -right, "bottom": down, "top": -down}
+    names = {tuple(np.array(v)): n[0].upper() for n, v in DIRECTIONS_LPS.items()}
+    return {border: names[tuple(v)] for border, v in towards.items()}
 
 
 def slice_volume(
@@ -109,9 +101,9 @@ def qc_picture(case_labels: LabelVolume, ct: Volume | None, anatomy: Anatomy, pa
     shown: LabelVolume | Volume = ct if ct is not None else case_labels
     window = _window(shown, anatomy)
     for row, (title, part) in enumerate(zip(titles, through, strict=True)):
-        for column, plane in enumerate(PLANES):
+        for column, view in enumerate(PLANES):
             axes = figure.add_subplot(grid[row, column])
-            _draw_slice(axes, (shown, window), anatomy, plane, part.box_mm.mean(0))
+            _draw_slice(axes, (shown, window), anatomy, view, part.box_mm.mean(0))
             if column == 0:
                 axes.set_ylabel(f"through {title}", fontsize=12, fontweight="bold")
     _draw_solid(figure.add_subplot(grid[:, 3]), anatomy)
@@ -127,37 +119,37 @@ def _draw_slice(
     axes: Axes,
     background: tuple[Volume | LabelVolume, tuple[float, float]],
     anatomy: Anatomy,
-    plane: QcPlane,
+    view: ParallelView,
     through_mm: Float[np.ndarray, " 3"],
 ) -> None:
-    frame = _same_scale(plane, anatomy)
+    frame = _same_scale(view, anatomy)
     shown, (low, high) = background
     array = shown.hu if isinstance(shown, Volume) else shown.labels
-    values = slice_volume(array, shown.lps_from_index, plane.view, frame, through_mm)
+    values = slice_volume(array, shown.lps_from_index, view, frame, through_mm)
     axes.imshow(np.ma.masked_invalid(values), cmap="gray", vmin=low, vmax=high, extent=frame.extent)
     colors = (_ORGAN_LINE, *(_tumor_color(n) for n in range(len(anatomy.tumors))))
     for color, part in zip(colors, anatomy.parts, strict=True):
-        draw_lines(axes, section(part, plane.view, through_mm), color=color, linewidth=1.7)
+        draw_lines(axes, section(part, view, through_mm), color=color, linewidth=1.7)
     finish_view(axes, frame, background="black")
-    _write_letters(axes, plane, "white")
-    axis = int(np.argmax(np.abs(plane.view.axes[2])))
+    _write_letters(axes, view, "white")
+    axis = int(np.argmax(np.abs(view.axes[2])))
     letter = ("LPS" if through_mm[axis] >= 0 else "RAI")[axis]
     where = f"{letter} {abs(through_mm[axis]):.1f} mm"
-    axes.set_title(f"{plane.view.name}, {where}", fontsize=10.5)
+    axes.set_title(f"{view.name}, {where}", fontsize=10.5)
 
 
 def _draw_solid(axes: Axes, anatomy: Anatomy) -> None:
-    plane = PLANES[1]
-    frame = plane.view.frame_around(anatomy.organ.vertices_mm, 8.0).widened(_ASPECT)
+    view = PLANES[1]
+    frame = view.frame_around(anatomy.organ.vertices_mm, 8.0).widened(_ASPECT)
     bodies = [Body(tumor, _tumor_color(n)) for n, tumor in enumerate(anatomy.tumors)]
-    picture = plane.view.draw([*bodies, Body(anatomy.organ, KIDNEY, 0.38)], frame)
+    picture = view.draw([*bodies, Body(anatomy.organ, KIDNEY, 0.38)], frame)
     axes.imshow(picture, extent=frame.extent, interpolation="bilinear")
     finish_view(axes, frame)
-    _write_letters(axes, plane, "black")
+    _write_letters(axes, view, "black")
     axes.set_title("3-D, seen from the front", fontsize=10.5)
 
 
-def _write_letters(axes: Axes, plane: QcPlane, color: str) -> None:
+def _write_letters(axes: Axes, view: ParallelView, color: str) -> None:
     style: dict[str, Any] = {
         "ha": "center",
         "va": "center",
@@ -165,7 +157,7 @@ def _write_letters(axes: Axes, plane: QcPlane, color: str) -> None:
         "fontweight": "bold",
         "color": color,
     }
-    for border, letter in plane.letters.items():
+    for border, letter in border_letters(view).items():
         axes.text(*_BORDERS[border], letter, transform=axes.transAxes, gid=border, **style)
 
 
@@ -173,10 +165,10 @@ def _tumor_color(number: int) -> RGB:
     return _TUMOR_COLORS[number % len(_TUMOR_COLORS)]
 
 
-def _same_scale(plane: QcPlane, anatomy: Anatomy) -> Frame:
+def _same_scale(view: ParallelView, anatomy: Anatomy) -> Frame:
     """A frame about the organ, equally large in all planes, so that lengths compare."""
     size_mm = float(np.ptp(anatomy.organ.box_mm, axis=0).max()) + 2 * _MARGIN_MM
-    right, down, _ = plane.view.project(anatomy.organ.box_mm.mean(0)[None])[0].tolist()
+    right, down, _ = view.project(anatomy.organ.box_mm.mean(0)[None])[0].tolist()
     half = size_mm / 2
     return Frame(right - _ASPECT * half, right + _ASPECT * half, down - half, down + half)
 
