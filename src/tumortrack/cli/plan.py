@@ -82,7 +82,7 @@ class Plan:
         _say_plan(resection)
         motions, cell_used = None, None
         if self.arms:
-            from tumortrack.plan.arms.bases import search_bases
+            from tumortrack.plan.arms.procedure import search_bases
 
             start = time.perf_counter()
             placed, motions, moved = search_bases(resection, cell_config, _organ_of(located))

@@ -84,7 +84,6 @@ class Resect:
         """A plan's motions, virtually, shown by sinks or filmed."""
         from tumortrack.core.config import from_builtins
         from tumortrack.live.sinks.ur import UrSinkConfig
-        from tumortrack.plan.arms.cell import ArmCell
         from tumortrack.plan.arms.config import CellConfig
         from tumortrack.plan.files import read_plan
         from tumortrack.plan.operation import OperationConfig
@@ -99,6 +98,9 @@ class Resect:
             raise InputError(f"--speed {self.speed:g} with real arms; allowed: up to 1.")
         config = OperationConfig(speed=self.speed, moved_mm=self.moved)
         cell_config = from_builtins(stored.cell, CellConfig, str(self.plan))
+
+        from tumortrack.plan.arms.cell import ArmCell
+
         cell = ArmCell(cell_config, stored.meshes.get("kidney"))
         if self.film is not None:
             if self.live is not None or self.sinks:
@@ -121,8 +123,8 @@ class Resect:
 
         from tumortrack.core.config import to_builtins
         from tumortrack.live.values import PublishedFrame
+        from tumortrack.plan import replanning
         from tumortrack.plan.located import located
-        from tumortrack.plan.replanning import begin, plan_anew, ready
 
         _check_case(stored, model)
 
@@ -135,7 +137,7 @@ class Resect:
         again = msgspec.structs.replace(stored.config, tumor=stored.plan.tumor)
         # In a process of its own: planning for a second must not hold up a frame.
         with ProcessPoolExecutor(
-            1, get_context("spawn"), initializer=begin, initargs=(again, cell.config)
+            1, get_context("spawn"), replanning.initialize, (again, cell.config)
         ) as planner:
 
             def replan(
@@ -144,12 +146,12 @@ class Resect:
                 progress: ResectionProgress,
             ) -> Future[Planned]:
                 seen = locate(result, unsure=stored.config.sigmas > 0)
-                return planner.submit(plan_anew, seen, joints_rad, progress)
+                return planner.submit(replanning.replan, seen, joints_rad, progress)
 
             say("starting the replanning worker ...")
             # The worker does not hear of Ctrl-C: that is the live loop's affair.
             before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-            begun = planner.submit(ready)
+            begun = planner.submit(replanning.warm_up)
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
             begun.result()
             operation = _operation(stored, cell, config, locate=locate, replan=replan)
