@@ -95,8 +95,12 @@ class Export:
             StorageError: the disk refused.
         """
         from tumortrack.imaging.case import load_case
-        from tumortrack.imaging.dicom_seg import write_dicom_seg
-        from tumortrack.imaging.segmentation import SIDES, segments, write_seg_nrrd
+        from tumortrack.imaging.segmentation import (
+            SIDES,
+            segments,
+            write_dicom_seg,
+            write_seg_nrrd,
+        )
 
         if self.series is not None and self.dicom is None:
             raise InputError("--series says which series of --dicom; give that folder too.")
@@ -187,8 +191,7 @@ class Simulate:
         """
         from tumortrack.core.config import to_builtins
         from tumortrack.imaging.case import load_case
-        from tumortrack.simulate.bodies import body_for
-        from tumortrack.simulate.scene import SceneRecipe, Simulator
+        from tumortrack.simulate.scene import SceneRecipe, Simulator, body_for
         from tumortrack.simulate.scene_folder import Scene, write_scene
         from tumortrack.simulate.targets import draw_targets
 
@@ -212,7 +215,7 @@ class Simulate:
                 if folder.exists():
                     _check_same(folder, made_from)
                 else:
-                    stage = simulator.stage(recipe)
+                    stage = simulator.render(recipe)
                     meta = {
                         **made_from,
                         "camera_from_ct": stage.camera_from_ct.tolist(),

@@ -9,7 +9,7 @@ from typing import Literal
 
 from rich.console import Console
 
-from tumortrack.core.processes import is_follower
+from tumortrack.core.process import is_follower
 
 Device = Literal["auto", "cpu", "cuda"]
 

@@ -14,8 +14,8 @@ from tyro.conf import Positional
 
 from tumortrack.cli.console import say
 from tumortrack.core import store
-from tumortrack.core.cores import available_cores
 from tumortrack.core.errors import InputError
+from tumortrack.core.process import available_cores
 
 _NAMES = {"pretrained": "pretrained weights"}  # where the kind is no noun
 _LIBRARIES = {

@@ -14,7 +14,7 @@ from tyro.conf import Positional
 from tumortrack.cli.console import Device, console, keep_loaded, say
 from tumortrack.core import store
 from tumortrack.core.errors import InputError
-from tumortrack.core.processes import is_follower
+from tumortrack.core.process import is_follower
 
 if TYPE_CHECKING:
     from tumortrack.training.train import TrainingStatus

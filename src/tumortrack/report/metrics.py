@@ -13,10 +13,10 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from tumortrack.core.errors import InputError
+from tumortrack.core.estimate import Motion
 from tumortrack.core.geometry import transform_points
-from tumortrack.core.motion import Motion
 from tumortrack.core.types import Anatomy, CameraLabels, Mesh
-from tumortrack.imaging.raster import label_grid  # peers' kept results name it as ours
+from tumortrack.imaging.raster import expand, label_grid
 from tumortrack.simulate.targets import Targets
 
 # Vertices are sampled too, so the maximum misses at most s^2 / (8 R) where a flat piece of size s
@@ -56,8 +56,7 @@ def surface_samples(
     edges = triangles - np.roll(triangles, 1, axis=1)
     cuts = np.maximum(np.ceil(np.linalg.norm(edges, axis=2).max(1) / spacing_mm), 1).astype(int)
     area = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1) / 2
-    face, first = np.repeat(np.arange(len(cuts)), cuts**2), np.cumsum(cuts**2) - cuts**2
-    cell = np.arange(len(face)) - first[face]
+    face, cell = expand(cuts**2)
     n = cuts[face]
     # Row r of the cut triangle holds 2 r + 1 cells, pointing up (even) and down (odd) in turn.
     row = np.floor(np.sqrt(cell)).astype(int)

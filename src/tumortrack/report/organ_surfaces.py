@@ -6,8 +6,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from tumortrack.core.errors import InputError
-from tumortrack.core.solids import mesh_of, solid_of
 from tumortrack.core.types import ORGAN, Mesh
+from tumortrack.imaging.meshes import mesh_of, solid_of
 from tumortrack.imaging.raster import voxelise
 from tumortrack.plan.values import Cut, CutLayer, Located
 

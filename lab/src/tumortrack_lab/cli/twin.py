@@ -54,7 +54,7 @@ class Twin:
         )
 
         from tumortrack_lab.twin.dataset import TwinRun, make_scenes
-        from tumortrack_lab.twin.variants import VARIANTS, VIEWS
+        from tumortrack_lab.twin.views import VARIANTS, VIEWS
 
         columns = (
             TextColumn("{task.description}"),
