@@ -11,8 +11,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from tumortrack.cli.compiling import compile_model
 from tumortrack.cli.inspection import describe
+from tumortrack.cli.models import Compile
 from tumortrack.core.config import to_builtins
 from tumortrack.models.config import MlpDecoderConfig, NetworkConfig
 from tumortrack.models.normalisation import CloudBox
@@ -203,7 +203,7 @@ def test_compile_is_used_by_the_next_load_and_named_by_inspect(quick_model, tmp_
     before = load_model(folder, "cpu")
     assert before.arithmetic is None
     assert "tumortrack compile" in before.notes[0]
-    compile_model(folder, "cpu")
+    Compile(model=folder, device="cpu").run()
     said = capsys.readouterr().out
     assert all(numbers in said for numbers in possible(CPU))
     after = load_model(folder, "cpu")
@@ -215,7 +215,7 @@ def test_compile_is_used_by_the_next_load_and_named_by_inspect(quick_model, tmp_
 
 
 def test_there_is_nothing_to_choose_for_a_model_that_places_the_organ(clinic_model, capsys):
-    compile_model(clinic_model, "cpu")
+    Compile(model=clinic_model, device="cpu").run()
     assert "nothing to choose" in capsys.readouterr().out
     assert not (clinic_model / "compiled").exists()
     assert load_model(clinic_model, "cpu").notes == ()

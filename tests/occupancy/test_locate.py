@@ -15,7 +15,7 @@ import trimesh
 
 from stories import cloud_by_rays, looking_down, refusal, succeeded, tumortrack
 from tumortrack.cli.inspection import describe
-from tumortrack.cli.scenes import check_case
+from tumortrack.cli.locate import check_case
 from tumortrack.core import store
 from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.estimate import Following

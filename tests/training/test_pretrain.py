@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from elastic_objects import SMALL, UP, organ
 from stories import refusal, tumortrack, write_phantom_case
-from tumortrack.cli import commands
+from tumortrack.cli.training import Train
 from tumortrack.core.errors import ArtifactError, InputError
 from tumortrack.core.types import Mesh
 from tumortrack.phantom.kidneys import random_anatomy
@@ -266,15 +266,15 @@ def test_the_commands_refuse_what_is_no_start_for_them(pretrained, tmp_path):
     case, model = tmp_path / "case", tmp_path / "model"
     write_phantom_case(case)
     with pytest.raises(InputError, match="for the preset clinic"):
-        commands.train(case, model, commands.TrainOptions(preset="quick", start=pretrained))
+        Train(case=case, model=model, preset="quick", start=pretrained).run()
     with pytest.raises(ArtifactError, match="a 'pretrained' is needed"):
-        commands.train(case, model, commands.TrainOptions(start=case))
+        Train(case=case, model=model, start=case).run()
     damaged = tmp_path / "damaged"
     shutil.copytree(pretrained, damaged)
     with (damaged / "weights.safetensors").open("ab") as file:
         file.write(b"x")
     with pytest.raises(ArtifactError, match="changed after it was written"):
-        commands.train(case, model, commands.TrainOptions(start=damaged))
+        Train(case=case, model=model, start=damaged).run()
     assert not model.exists()
 
 
