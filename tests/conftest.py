@@ -2,6 +2,7 @@
 
 import fcntl
 import os
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -10,24 +11,18 @@ from jaxtyping import install_import_hook
 
 ROOT = Path(__file__).parents[1]
 PACKAGES = (ROOT / "src" / "tumortrack", ROOT / "lab" / "src" / "tumortrack_lab")
-CHECKED = (
-    *("core/geometry.py", "core/estimate.py", "imaging/*.py", "phantom/*.py", "models/[rv]*.py"),
-    *("*/locator.py", "occupancy/[os]*.py", "tracking/*.py", "live/*.py", "report/*.py"),
-    *("bench/**/*.py", "study/*.py", "twin/*.py", "peers/*.py", "cut/*.py", "tets.py"),
-)
 
 # Left out: modules with numba kernels (numba compiles the plain function), and core.types, whose
 # constructors convert and check shapes themselves, always.
-install_import_hook(
-    [
-        ".".join(path.relative_to(package.parent).with_suffix("").parts)
-        for package in PACKAGES
-        for pattern in CHECKED
-        for path in sorted(package.glob(pattern))
-        if path.name != "__init__.py" and "import numba" not in path.read_text(encoding="utf-8")
-    ],
-    "beartype.beartype",
-)
+CHECKED = [
+    ".".join(path.relative_to(package.parent).with_suffix("").parts)
+    for package in PACKAGES
+    for path in sorted(package.rglob("*.py"))
+    if path.name not in ("__init__.py", "__main__.py")
+    and path != PACKAGES[0] / "core" / "types.py"
+    and not re.search("^ *import numba", path.read_text(encoding="utf-8"), re.M)
+]
+install_import_hook(CHECKED, "beartype.beartype")
 
 
 # The longest files first: with few workers none is left alone with one at the end.

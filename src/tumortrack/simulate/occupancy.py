@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int64, UInt8
@@ -32,6 +32,7 @@ class OccupancyConfig(Config, frozen=True):
     pool: int = 100_000  # points per part whose labels are worked out once
 
 
+@runtime_checkable
 class PointSource(Protocol):
     """Where the points of scenes come from."""
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -38,6 +38,7 @@ class Diverged(TumortrackError):
         )
 
 
+@runtime_checkable
 class RunSettings(Protocol):
     """What the state has to know of a run."""
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Protocol, TypeVar
+from typing import Any, Protocol, TypeVar, runtime_checkable
 
 import torch
 
@@ -17,6 +17,7 @@ from tumortrack.training.run import TrainingRun
 N = TypeVar("N", bound=Network, contravariant=True)
 
 
+@runtime_checkable
 class TrainingTask(Protocol[N]):
     """What training asks of a method."""
 

@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float, Float64
@@ -45,6 +45,7 @@ class Fit:
     report: dict = field(default_factory=dict)
 
 
+@runtime_checkable
 class Peer(Protocol):
     """A method made ready for one patient."""
 

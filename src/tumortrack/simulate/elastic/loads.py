@@ -7,7 +7,7 @@ one is a new class and a line in ``LOADS``.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float64
@@ -24,6 +24,7 @@ FARTHEST_MM = 16.0  # that a place of the surface moves
 SWELLING = 0.025  # largest change of volume: leaves room below 3 % for what modes do to it
 
 
+@runtime_checkable
 class Load(Protocol):
     @classmethod
     def draw(
