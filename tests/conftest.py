@@ -6,8 +6,8 @@ import re
 from collections.abc import Callable
 from pathlib import Path
 
+import jaxtyping
 import pytest
-from jaxtyping import install_import_hook
 
 ROOT = Path(__file__).parents[1]
 PACKAGES = (ROOT / "src" / "tumortrack", ROOT / "lab" / "src" / "tumortrack_lab")
@@ -22,7 +22,7 @@ CHECKED = [
     and path != PACKAGES[0] / "core" / "types.py"
     and not re.search("^ *import numba", path.read_text(encoding="utf-8"), re.M)
 ]
-install_import_hook(CHECKED, "beartype.beartype")
+jaxtyping.install_import_hook(CHECKED, "checking.checked")
 
 
 # The longest files first: with few workers none is left alone with one at the end.
@@ -42,6 +42,12 @@ SLOWEST = (
 def pytest_collection_modifyitems(items):
     order = {name: n for n, name in enumerate(SLOWEST)}
     items.sort(key=lambda item: order.get(item.path.name, len(order)))
+
+
+@pytest.fixture
+def unchecked(monkeypatch):
+    """As in use: annotations are not executed, so that a function's own refusal is met."""
+    monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)
 
 
 @pytest.fixture(scope="session")

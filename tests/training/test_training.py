@@ -22,7 +22,7 @@ from tumortrack.core.cores import available_cores
 from tumortrack.core.errors import ArtifactError, InputError
 from tumortrack.core.types import Anatomy
 from tumortrack.imaging.case import load_case
-from tumortrack.models.config import TrainConfig
+from tumortrack.models.config import RegistrationHeadConfig, TrainConfig
 from tumortrack.models.normalisation import CloudBox
 from tumortrack.training.checkpoint import TrainingProgress, work_folder
 from tumortrack.training.model import load_model
@@ -154,7 +154,7 @@ HISTORY_ON_A_FULL_DISK = """
 import resource, sys
 from pathlib import Path
 from tumortrack.core.errors import InputError, StorageError
-from tumortrack.training.checkpoint import Progress
+from tumortrack.training.checkpoint import TrainingProgress as Progress
 from tumortrack.training.history import History, Record
 
 folder, mode = Path(sys.argv[1]), sys.argv[2]
@@ -324,11 +324,10 @@ def test_presets_survive_json_and_refuse_unknown_keys(case):
     assert paper(anatomy).steps == 155_000
     assert paper(anatomy).scene.clutter.scenes == 0
     assert quick(anatomy).scene.clutter.scenes == 0.5
-    assert [preset(anatomy).network.warps for preset in (clinic, paper, quick)] == [
-        True,
-        False,
-        False,
-    ]
+    assert [
+        isinstance(preset(anatomy).network.decoder, RegistrationHeadConfig)
+        for preset in (clinic, paper, quick)
+    ] == [True, False, False]
     assert isinstance(paper(anatomy).network.normalisation, CloudBox)
     assert paper(anatomy).scene.cloud.n_points == 1000
 

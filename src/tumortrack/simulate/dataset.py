@@ -7,7 +7,7 @@ from functools import cached_property
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Float32, UInt8
+from jaxtyping import Float32, Num, UInt8
 
 from tumortrack.core.types import Anatomy
 from tumortrack.simulate.elastic.body import ElasticBody
@@ -65,7 +65,7 @@ class SceneStream:
         )
 
 
-def refill(points_mm: Float32[np.ndarray, "m 3"], n: int) -> Float32[np.ndarray, "n 3"]:
+def refill(points_mm: Num[np.ndarray, m * row], n: int) -> Num[np.ndarray, n * row]:
     """A cloud smaller than ``n`` repeats its points, so that clouds stack; a network that pools
     by maximum does not notice."""
     return points_mm[np.arange(n) % len(points_mm)]

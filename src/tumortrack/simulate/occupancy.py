@@ -90,7 +90,7 @@ class PartPool:
         return np.concatenate([_nearest(self, drawn[side], k) for side in (inside, ~inside)])
 
     @cached_property
-    def _inside_before(self) -> Int64[np.ndarray, " n+1"]:
+    def _inside_before(self) -> Int64[np.ndarray, " m"]:
         return np.concatenate([[0], np.cumsum(self.inside)])
 
     @cached_property
