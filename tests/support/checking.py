@@ -5,10 +5,10 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from beartype import BeartypeConf, BeartypeHintOverrides, beartype
+from beartype import BeartypeConf, FrozenDict, beartype
 
 # mypy checks numbers; NumPy's and whole ones may stand for Python's here as they do there.
-_NUMBERS = BeartypeHintOverrides({int: int | np.integer, float: float | int | np.number})
+_NUMBERS = FrozenDict({int: int | np.integer, float: float | int | np.number})
 _checked = beartype(conf=BeartypeConf(hint_overrides=_NUMBERS))
 
 

@@ -126,7 +126,7 @@ class Columns:
 
 
 def column_extremes(
-    columns: Int[np.ndarray, " n"], heights: Float[np.ndarray, " n"], n_columns: int
+    columns: Int[np.ndarray, " m"], heights: Float[np.ndarray, " m"], n_columns: int
 ) -> Heights:
     """The lowest and the highest point of each column; inf and -inf where none is."""
     lowest, highest = np.full(n_columns, np.inf), np.full(n_columns, -np.inf)

@@ -82,7 +82,7 @@ class PartPool:
         before = self._inside_before
         return int(rounds * before[-1] + before[last] - before[first])
 
-    def nearest(self, first: int, count: int, k: int) -> Int64[np.ndarray, " 2k"]:
+    def nearest(self, first: int, count: int, k: int) -> Int64[np.ndarray, " 2*{k}"]:
         """Of these neighbours the ``k`` inside that are nearest to the surface, and ``k`` outside;
         on a side in any order."""
         drawn = self.neighbours(first, count)

@@ -70,7 +70,7 @@ class _DevicePart:
         self._distance_mm = torch.tensor(part.distance_mm, device=device)
         self._inside = torch.tensor(part.inside, device=device)
 
-    def nearest(self, window: Int64[Tensor, "b 2"], width: int, k: int) -> Int64[Tensor, "b 2k"]:
+    def nearest(self, window: Int64[Tensor, "b 2"], width: int, k: int) -> Int64[Tensor, "b 2*{k}"]:
         """Of the window's points the k inside that are nearest to the surface, and k outside, the
         nearest first."""
         index = _neighbours(window[:, 0], width, len(self.labels))
