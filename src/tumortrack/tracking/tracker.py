@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, Protocol, runtime_checkable
 
-from tumortrack.core.allocator import keep_small_blocks
 from tumortrack.core.errors import InputError
 from tumortrack.core.estimate import Estimate, Following
+from tumortrack.core.process import keep_small_blocks
 from tumortrack.core.types import Anatomy, SensorCloud
 from tumortrack.models.model import Model
 from tumortrack.occupancy.locator import OccupancyLocator
