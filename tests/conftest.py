@@ -107,6 +107,15 @@ def quick_model(once, phantom_case) -> Path:
 
 
 @pytest.fixture(scope="session")
+def learnt_model(once, phantom_case) -> Path:
+    """A model folder of the phantom: a ``quick`` that has learnt enough to be right by millimetres
+    and sure of its labels."""
+    from stories import train_learnt
+
+    return once("learnt_model", lambda model: train_learnt(phantom_case, model))
+
+
+@pytest.fixture(scope="session")
 def slim_model(once) -> Path:
     """A model folder of the elastic objects' organ: a slim clinic, trained for seconds."""
     from warp_objects import train_slim

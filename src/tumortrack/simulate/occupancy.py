@@ -74,7 +74,7 @@ class PartPool:
         """Indices of ``count`` points from ``first`` on; after the last comes the first."""
         return (first + np.arange(count)) % len(self.labels)
 
-    def nearest(self, first: int, count: int, k: int) -> Int64[np.ndarray, " 2*{k}"]:
+    def nearest(self, first: int, count: int, k: int) -> Int64[np.ndarray, " m"]:
         """Of these neighbours the ``k`` inside that are nearest to the surface, and ``k`` outside;
         on a side in any order."""
         drawn = self.neighbours(first, count)
