@@ -25,6 +25,9 @@ CHECKED = [
 jaxtyping.install_import_hook(CHECKED, "checking.checked")
 
 
+# What needs a model is slow: it may be the one that trains it.
+TRAINED = {"clinic_model", "quick_model", "learnt_model", "slim_model"}
+
 # The longest files first: with few workers none is left alone with one at the end.
 SLOWEST = (
     "test_soak.py",
@@ -39,7 +42,11 @@ SLOWEST = (
 )
 
 
+@pytest.hookimpl(tryfirst=True)  # before -m chooses
 def pytest_collection_modifyitems(items):
+    for item in items:
+        if TRAINED.intersection(item.fixturenames):
+            item.add_marker(pytest.mark.slow)
     order = {name: n for n, name in enumerate(SLOWEST)}
     items.sort(key=lambda item: order.get(item.path.name, len(order)))
 

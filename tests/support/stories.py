@@ -62,7 +62,7 @@ def write_phantom_case(folder: Path) -> Case:
     return case
 
 
-STEPS = {"clinic": 20, "quick": 30}
+STEPS = {"clinic": 20, "quick": 12}
 
 
 def train_command(case: Path, model: Path, preset: str = "quick") -> list[object]:

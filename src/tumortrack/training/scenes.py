@@ -171,7 +171,8 @@ def batches(
         worker_init_fn=quiet_worker,
         pin_memory=device.type == "cuda",  # copies then overlap with the work before
     )
-    yield from loader
+    for clouds, points, labels, poses in loader:  # lists, where tuples went in
+        yield clouds, points, labels, poses
 
 
 def default_workers(sharing: int = 1) -> int:
