@@ -123,8 +123,8 @@ def test_compiled_is_found_again_and_not_where_anything_differs(learnt_model, tm
     assert "tumortrack compile" in notice
     compiled = measured(load_model(learnt_model, "cpu"), "weights", rounds=1)
     assert {timing.arithmetic.numbers for timing in compiled.timings} == set(possible(CPU))
-    # bfloat16 keeps 8 bits: of a logit some 1 % of their spread is lost, and labels differ where two
-    # classes lead by less than that. A model that has learnt has few such places.
+    # bfloat16 keeps 8 bits: some 1 % of the logits' spread is lost, and labels differ where two
+    # classes are nearer than that. A model that has learnt has few such places.
     assert all(timing.labels_equal > 0.99 for timing in compiled.timings)
     path = save(folder, compiled)
     assert read(path) == compiled
