@@ -123,14 +123,16 @@ def test_usual_arithmetic_is_one_that_the_processor_has():
     assert usual(CPU).numbers == possible(CPU)[-1]
 
 
-def test_compiled_is_found_again_and_not_where_anything_differs(quick_model, tmp_path):
+def test_compiled_is_found_again_and_not_where_anything_differs(learnt_model, tmp_path):
     folder = tmp_path / "model"
     folder.mkdir()
     arithmetic, notice = find(folder, "weights")
     assert arithmetic is None
     assert "tumortrack compile" in notice
-    compiled = measured_once(quick_model)
+    compiled = measured_once(learnt_model)
     assert {timing.arithmetic.numbers for timing in compiled.timings} == set(possible(CPU))
+    # bfloat16 keeps 8 bits: some 1 % of the logits' spread is lost, and labels differ where two
+    # classes are nearer than that. A model that has learnt has few such places.
     assert all(timing.labels_equal > 0.99 for timing in compiled.timings)
     path = save(folder, compiled)
     assert read(path) == compiled
@@ -167,9 +169,9 @@ def changed(folder: Path, copy: Path, what: str) -> Path:
     return copy
 
 
-def test_each_number_of_threads_has_its_own_choice(quick_model, tmp_path, monkeypatch):
+def test_each_number_of_threads_has_its_own_choice(learnt_model, tmp_path, monkeypatch):
     """What is fastest on one core need not be on two."""
-    alone = measured_once(quick_model)
+    alone = measured_once(learnt_model)
     many = msgspec.structs.replace(
         alone, threads=alone.threads + 1, arithmetic=other_than(alone.arithmetic)
     )
@@ -198,8 +200,8 @@ def test_arithmetic_is_read_as_written():
     assert to_builtins(one) == {"numbers": "bfloat16", "chunk": 2048}
 
 
-def test_compile_is_used_by_the_next_load_and_named_by_inspect(quick_model, tmp_path, capsys):
-    folder = shutil.copytree(quick_model, tmp_path / "model")
+def test_compile_is_used_by_the_next_load_and_named_by_inspect(learnt_model, tmp_path, capsys):
+    folder = shutil.copytree(learnt_model, tmp_path / "model")
     before = load_model(folder, "cpu")
     assert before.arithmetic is None
     assert "tumortrack compile" in before.notes[0]

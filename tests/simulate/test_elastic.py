@@ -351,7 +351,7 @@ def test_a_state_that_moves_far_is_scaled_back(reduced):
     assert 10 < max(farthest) <= 16 + 1e-9
 
 
-def test_a_body_survives_a_file(body):
+def test_a_body_survives_a_file(body, unchecked):
     back = ElasticBody.from_arrays(body.to_arrays())
     points = ORGAN.vertices_mm[::50]
     np.testing.assert_array_equal(

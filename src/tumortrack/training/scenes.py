@@ -9,7 +9,7 @@ from collections.abc import Generator, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import islice
-from typing import Any, Literal, Protocol
+from typing import Any, Literal, Protocol, runtime_checkable
 
 import torch
 from torch.utils.data import DataLoader, Dataset
@@ -27,6 +27,7 @@ Tensors = tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]
 Maker = Literal["auto", "workers", "device"]
 
 
+@runtime_checkable
 class Stream(Protocol):
     """Batches by number. Picklable; the same number gives the same batch."""
 
@@ -122,12 +123,14 @@ def batches(
 ) -> Generator[Tensors, None, None]:
     """The batches of these steps, in order, for any number of workers; after ``period`` steps (0:
     never) they repeat. Close the generator to end the workers."""
-    yield from DataLoader(
+    loader = DataLoader(
         _Batches(stream),
         sampler=_numbers(steps, period),
         pin_memory=device.type == "cuda",  # copies then overlap with the work before
         **_loading(workers, ahead=4),
     )
+    for clouds, points, labels, poses in loader:  # lists, where tuples went in
+        yield clouds, points, labels, poses
 
 
 def _numbers(steps: range, period: int) -> Iterator[int]:

@@ -11,7 +11,7 @@ import math
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -52,6 +52,7 @@ class Diverged(TumortrackError):
         )
 
 
+@runtime_checkable
 class RunSettings(Protocol):
     """What training needs to know of a run."""
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol, TypeVar
+from typing import Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float32, Float64, UInt8
@@ -18,6 +18,7 @@ from tumortrack.simulate.scene import SceneRecipe, Simulator
 N = TypeVar("N", bound=Network, contravariant=True)
 
 
+@runtime_checkable
 class TrainingTask(Protocol[N]):
     """What a method learns, how it is validated, and the model it leaves; a class per method."""
 
