@@ -129,8 +129,8 @@ def batches(
         pin_memory=device.type == "cuda",  # copies then overlap with the work before
         **_loading(workers, ahead=4),
     )
-    for clouds, points, labels, poses in loader:  # lists, where tuples went in
-        yield clouds, points, labels, poses
+    for batch in loader:
+        yield tuple(batch)  # a loader without workers hands on tuples, one with workers lists
 
 
 def _numbers(steps: range, period: int) -> Iterator[int]:
