@@ -18,14 +18,12 @@ from tumortrack.core import store
 from tumortrack.core.errors import InputError, StorageError
 
 if TYPE_CHECKING:
-    from tumortrack.core.types import Anatomy
     from tumortrack.live.loop import Loop, LoopConfig
     from tumortrack.live.sink_worker import SinkWorker
     from tumortrack.live.source_worker import SourceWorker
     from tumortrack.live.values import PublishedFrame, SinkConfig, SinkContext, TrackingResult
-    from tumortrack.models.config import TrainConfig
+    from tumortrack.models.model import Model
     from tumortrack.plan.operation import Operation
-    from tumortrack.sense.region import RegionConfig
 
 _SAY_S, _SAY_PLAIN_S = 1.0, 5.0  # between two lines of state: on a terminal, in a file
 STOPPED = "stopped by the user"  # why arms stand
@@ -116,7 +114,7 @@ class Track:
         model = load_model(self.model, self.device)
         say_notes(model.notes)
         tracker = Tracker(model)
-        config = self._loop_config(model.config, tracker.anatomy_ct)
+        config = self._loop_config(model)
         context = SinkContext(model.parts, frames, tracker.anatomy_ct, Controls(), arms is not None)
         companion = None if arms is None else arms.companion
         loop = Loop(tracker, context, config, companion)
@@ -150,13 +148,15 @@ class Track:
             say(f"tracking {self.source} in frame {frames.frame_id!r}; Ctrl-C ends it.")
             loop.run(source, sinks, screen.show)
 
-    def _loop_config(self, trained: TrainConfig, anatomy_ct: Anatomy | None) -> LoopConfig:
+    def _loop_config(self, model: Model) -> LoopConfig:
         from tumortrack.live.loop import LoopConfig
         from tumortrack.sense.files import read_intrinsics
         from tumortrack.tracking.follower import FollowerConfig
+        from tumortrack.tracking.region import region_for
 
+        box = None if self.box is None else (self.box[:3], self.box[3:])
         return LoopConfig(
-            region=self._region(trained, anatomy_ct),
+            region=region_for(model, range_mm=self.range, box_mm=box, whole=self.whole),
             follower=FollowerConfig(
                 rescan_s=self.rescan, smoothing_s=self.smoothing, seed=self.seed
             ),
@@ -165,37 +165,6 @@ class Track:
             give_up_s=self.give_up,
             seconds=self.seconds,
         )
-
-    def _region(self, trained: TrainConfig, anatomy_ct: Anatomy | None) -> RegionConfig:
-        """Depths that training showed, unless the user says others; where it showed any distance,
-        its farthest organ still lies in them whole. Pieces of about the organ's size, if that is
-        known."""
-        import numpy as np
-
-        from tumortrack.sense.cloud import CloudConfig
-        from tumortrack.sense.region import RegionConfig
-
-        scene = trained.scene
-        near, far = scene.cloud.near_mm, scene.cloud.far_mm
-        if scene.free_range > 0:
-            nearest, farthest = scene.free_nearest_mm
-            near, far = min(near, nearest - 5), max(far, farthest + far - near)
-        if self.range is not None:
-            near, far = self.range
-        crop = CloudConfig(near_mm=near, far_mm=far, n_points=scene.cloud.n_points)
-        box = None
-        if self.box is not None:
-            ax, ay, az, bx, by, bz = self.box
-            box = ((ax, ay, az), (bx, by, bz))
-        if self.whole:
-            return RegionConfig(crop=crop, box_mm=box, plane=False, flying=False, pieces=False)
-        if anatomy_ct is None:
-            return RegionConfig(crop=crop, box_mm=box)
-        vertices = anatomy_ct.organ.vertices_mm
-        axes = np.linalg.svd(vertices - vertices.mean(0), full_matrices=False)[2]
-        extents_mm = np.ptp(vertices @ axes.T, axis=0)
-        size_mm = (0.7 * float(extents_mm.min()), 1.25 * float(extents_mm.max()))
-        return RegionConfig(crop=crop, box_mm=box, organ_mm=size_mm)
 
 
 def parse_sinks(sinks: tuple[str, ...]) -> list[SinkConfig]:
