@@ -21,6 +21,9 @@ import msgspec
 import numpy as np
 import torch
 import tyro
+from tumortrack_lab.study.book import ReportWriter
+from tumortrack_lab.study.markdown import table
+from tumortrack_lab.study.phantoms import phantom_case
 
 from tumortrack.cli.console import say
 from tumortrack.core import store
@@ -44,9 +47,6 @@ from tumortrack.training.registration_task import RegistrationTask
 from tumortrack.training.run import TrainingRun
 from tumortrack.training.state import TrainingState
 from tumortrack.training.validate import ValidationScenes, mean_iou_of, validation_scenes
-from tumortrack_lab.study.book import ReportWriter
-from tumortrack_lab.study.markdown import table
-from tumortrack_lab.study.phantoms import phantom_case
 
 BLOCK = "pretraining"
 UNSEEN_SEED = 1_000_003  # of the measured scenes and their library of states

@@ -22,6 +22,10 @@ os.environ.setdefault("GOMP_SPINCOUNT", "1000")
 
 import msgspec
 import tyro
+from tumortrack_lab.study.book import ReportWriter, gallery_block, section_blocks
+from tumortrack_lab.study.cells import MeasurementStore
+from tumortrack_lab.study.peer_methods import peer_method
+from tumortrack_lab.study.phantoms import phantom_case, study_case
 
 from tumortrack.cli.console import say
 from tumortrack.core.errors import InputError, TumortrackError
@@ -29,14 +33,10 @@ from tumortrack.core.store import write_json
 from tumortrack.phantom.digital import PhantomParameters, second_phantom
 from tumortrack.training.presets import clinic, quick
 from tumortrack.training.train import StudyStatus as TrainStatus
-from tumortrack_lab.study.book import ReportWriter, gallery_block, section_blocks
 from tumortrack_lab.study.bound import BOUNDS, Bound
-from tumortrack_lab.study.cells import MeasurementStore
 from tumortrack_lab.study.measure import Job, StudyCase, StudyStatus, measure
 from tumortrack_lab.study.methods import Method, Network
 from tumortrack_lab.study.models import CLINIC, MODELS, Presets, Trainer
-from tumortrack_lab.study.peer_methods import peer_method
-from tumortrack_lab.study.phantoms import phantom_case, study_case
 from tumortrack_lab.study.plan import (
     FULL,
     QUICK,

@@ -25,6 +25,9 @@ import msgspec
 import numpy as np
 import torch
 import tyro
+from tumortrack_lab.study.book import ReportWriter
+from tumortrack_lab.study.markdown import table
+from tumortrack_lab.study.phantoms import phantom_case
 
 from tumortrack.cli.console import say
 from tumortrack.core import store
@@ -55,9 +58,6 @@ from tumortrack.training.validate import (
     mean_iou_of,
     validation_scenes,
 )
-from tumortrack_lab.study.book import ReportWriter
-from tumortrack_lab.study.markdown import table
-from tumortrack_lab.study.phantoms import phantom_case
 
 BLOCK = "training-speed"
 CPU = torch.device("cpu")

@@ -18,20 +18,17 @@ from tumortrack.occupancy.mlp_decoder import MlpDecoderConfig
 from tumortrack.occupancy.network import CloudBox, NetworkConfig, OccupancyNetwork, quick_network
 from tumortrack_lab.bench.counts import module_flops
 from tumortrack_lab.bench.goals import GOALS, goals_table
-from tumortrack_lab.bench.growth import draw_growth
-from tumortrack_lab.bench.memory import forget_peak, peak_bytes
+from tumortrack_lab.bench.machine import forget_peak, peak_bytes
 from tumortrack_lab.bench.naive.occupancy import NaiveOccupancy
 from tumortrack_lab.bench.naive.scenes import flowed
-from tumortrack_lab.bench.plan import Wish, tasks_of
-from tumortrack_lab.bench.report import BLOCKS, write_bench
-from tumortrack_lab.bench.row import BenchResult, BenchRow, Peaks, Point, Work
-from tumortrack_lab.bench.subject import Subject
-from tumortrack_lab.bench.suite import GROUPS
-from tumortrack_lab.bench.tasks import Task, carry_out
-from tumortrack_lab.bench.turns import InterleavedTiming, Uncounted, in_turns, timing_of
+from tumortrack_lab.bench.report import BLOCKS, draw_growth, write_bench
+from tumortrack_lab.bench.rows import BenchResult, BenchRow, Peaks, Point, Work
+from tumortrack_lab.bench.run import GROUPS, BenchRequest, Task, TaskMessage, carry_out, tasks_of
+from tumortrack_lab.bench.subject import BenchSubject
+from tumortrack_lab.bench.timing import InterleavedTiming, Uncounted, interleaved, timing_of
 from tumortrack_lab.cli import bench as benching
 from tumortrack_lab.cli.bench import BenchOptions
-from tumortrack_lab.study.markdown import closing, opening
+from tumortrack_lab.study.document import closing, opening
 
 PAPER_DECODER = MlpDecoderConfig(
     n_classes=4, width=512, hidden_layers=8, skip_layer=5, norm_layers=(5, 8)
@@ -54,7 +51,7 @@ def test_turns_are_fair_and_what_is_not_counted_is_left_out() -> None:
         time.sleep(0.015)
         return Uncounted(0.01)
 
-    slow_s, fast_s = in_turns(slow, fast, budget_s=0.2)
+    slow_s, fast_s = interleaved(slow, fast, budget_s=0.2)
     assert slow_s.median_s >= 0.02
     assert 0.004 <= fast_s.median_s < slow_s.median_s  # a hundredth is not counted
     assert order[4:8] == ["slow", "fast", "slow", "fast"]  # after two calls of each to warm up
@@ -200,7 +197,7 @@ def test_a_document_is_filled_and_the_rest_of_it_stays(tmp_path) -> None:
     draw_growth(some_bench().points[:4], tmp_path / "one.png")  # a single curve is a picture too
 
 
-def small_subject(folder: Path) -> Subject:
+def small_subject(folder: Path) -> BenchSubject:
     """The bench's subject with a ball and a tumor in place of the phantom."""
     import trimesh
 
@@ -208,16 +205,18 @@ def small_subject(folder: Path) -> Subject:
         sphere = trimesh.creation.icosphere(2, radius_mm)
         return Mesh(sphere.vertices + [x_mm, 0, 0], sphere.faces)
 
-    subject = Subject({}, folder)
+    subject = BenchSubject({}, folder)
     subject.__dict__["anatomy"] = Anatomy((ball(30.0, 0.0), ball(8.0, 10.0)))
     return subject
 
 
 def test_a_process_measures_a_part(tmp_path) -> None:
+    messages_of_trainings: list[TaskMessage] = []
     task = Task(threads=1, folder=str(tmp_path), describe=True, peaks=True, quick=True)
     task = msgspec.structs.replace(task, groups=("generator",))
-    said = list(carry_out(task, small_subject(tmp_path)))
-    (row,) = [one.row for one in said if one.row is not None]
+    messages = list(carry_out(task, small_subject(tmp_path), messages_of_trainings.append))
+    assert not messages_of_trainings
+    (row,) = [one.row for one in messages if one.row is not None]
     ours, naive = row.ours, row.naive
     assert naive is not None
     assert 1e-5 < ours.best_s <= ours.low_s <= ours.median_s <= ours.high_s
@@ -228,12 +227,12 @@ def test_a_process_measures_a_part(tmp_path) -> None:
     # 18 drags of 2,000 points and 162 vertices, 640 triangles' front half, a quarter of the image.
     by_hand = 16 * 18 * 2162 + 60 * 160 + 2 * 20 * 424 * 240 / 4
     assert row.work.flops == by_hand
-    (peaks,) = [one.peaks for one in said if one.peaks is not None]
+    (peaks,) = [one.peaks for one in messages if one.peaks is not None]
     assert peaks.triad > 1e9
     assert peaks.gemm["fp32"] > 1e9
-    (machine,) = [one.machine for one in said if one.machine is not None]
+    (machine,) = [one.machine for one in messages if one.machine is not None]
     assert int(machine["cores"]) >= 1
-    assert [one.begins for one in said if one.begins] == [
+    assert [one.begins for one in messages if one.begins] == [
         "the machine's own rates, one core",
         "generator, one core",
     ]
@@ -249,7 +248,10 @@ if task["describe"]:
     print(json.dumps({"machine": {"date": "today"}}))
 for group in task["groups"]:
     time = dict(best_s=1.0, median_s=2.0, low_s=1.5, high_s=3.0, turns=3)
-    print(json.dumps({"row": dict(name=group, what="", threads=1, item="pair", ours=time)}))
+    row = dict(name=group, what="", threads=1, item="pair", ours=time)
+    if group == "planning":
+        row["naive"] = {**time, "median_s": 4.0}
+    print(json.dumps({"row": row}))
 if "encoder" in task["groups"]:
     sys.exit("the encoder is broken")
 """
@@ -263,21 +265,27 @@ def test_the_command_gathers_what_processes_find(tmp_path, monkeypatch, capfd) -
     assert [row["name"] for row in found["rows"]] == ["generator", "planning"]
     assert found["machine"] == {"date": "today"}
     assert found["command"] == "tumortrack bench --only generator planning --quick"
-    assert "2.00 s" in capfd.readouterr().out
+    shown = capfd.readouterr().out
+    assert "something; about" in shown  # and so many seconds left
+    assert shown.index("  generator") < shown.index("  planning") < shown.index("written to")
+    first, second = (line for line in shown.splitlines() if "2.00 s a pair" in line)
+    assert "naive" not in first  # each as soon as it was measured
+    assert first.endswith(" left")
+    assert "; naive 4.00 s, 2.00 x; about " in second
     with pytest.raises(TumortrackError, match="the encoder is broken"):
         benching.bench(BenchOptions(only=("encoder",), out=tmp_path / "none.json"))
     assert not (tmp_path / "none.json").exists()
 
 
 def test_each_process_has_its_own_threads_and_only_needed_models_are_trained(tmp_path) -> None:
-    wish = Wish(("generator", "frame", "tracking"), ("grid",), False, tmp_path)
-    first, one, two, *curves = tasks_of(wish, cores=4)
+    request = BenchRequest(("generator", "frame", "tracking"), ("grid",), False, tmp_path)
+    first, one, two, *curves = tasks_of(request, cores=4)
     assert (first.threads, first.train) == (2, ("clinic", "paper", "quick"))
     assert first.describe
     assert (one.threads, one.groups) == (1, ("generator", "frame", "tracking"))
     assert (two.threads, two.groups) == (2, ("frame", "tracking"))
     assert [task.curve for task in curves] == [("grid", p) for p in ("clinic", "quick", "paper")]
-    (alone,) = tasks_of(Wish(("generator",), (), False, tmp_path), cores=1)
+    (alone,) = tasks_of(BenchRequest(("generator",), (), False, tmp_path), cores=1)
     assert alone.describe
     assert alone.train == ()
 
@@ -296,6 +304,6 @@ def test_what_cannot_be_measured_is_refused(tmp_path) -> None:
 def test_the_command_line_names_every_part() -> None:
     from typing import get_args, get_type_hints
 
-    from tumortrack.cli.main import bench as command
+    from tumortrack_lab.cli.commands import bench as command
 
     assert set(get_args(get_args(get_type_hints(command)["only"])[0])) == set(GROUPS)

@@ -4,17 +4,16 @@ import shutil
 import time
 
 from tumortrack.training.presets import quick
-from tumortrack_lab.bench import frames, gpu, turns, volume
+from tumortrack_lab.bench import gpu, networks, timing
 from tumortrack_lab.bench.goals import goals_table
-from tumortrack_lab.bench.row import BenchResult, BenchRow
-from tumortrack_lab.bench.subject import Subject
-from tumortrack_lab.bench.training import WHOLE
-from tumortrack_lab.bench.turns import in_turns, timing_of
+from tumortrack_lab.bench.rows import EVERY, FRAME, TRAINING, VOLUME, BenchResult, BenchRow
+from tumortrack_lab.bench.subject import BenchSubject
+from tumortrack_lab.bench.timing import interleaved, timing_of
 
 
 def test_long_calls_have_three_turns_the_first_among_them(monkeypatch) -> None:
-    monkeypatch.setattr(turns, "_LONG_S", 0.01)
-    monkeypatch.setattr(turns, "_LONGER_S", 0.01)
+    monkeypatch.setattr(timing, "_LONG_S", 0.01)
+    monkeypatch.setattr(timing, "_LONGER_S", 0.01)
     seconds = iter([0.08, 0.02, 0.03, 0.5])  # the first is cold
     order = []
 
@@ -26,7 +25,7 @@ def test_long_calls_have_three_turns_the_first_among_them(monkeypatch) -> None:
         order.append("ours")
         time.sleep(0.002)
 
-    ours_s, naive_s = in_turns(ours, naive, budget_s=0.01)
+    ours_s, naive_s = interleaved(ours, naive, budget_s=0.01)
     assert order.count("naive") == naive_s.turns == ours_s.turns == 3
     assert order[:4] == ["ours", "ours", "naive", "ours"]
     assert 0.03 <= naive_s.median_s < 0.08 <= naive_s.best_s + 0.07
@@ -35,7 +34,7 @@ def test_long_calls_have_three_turns_the_first_among_them(monkeypatch) -> None:
 
 def test_goals_of_a_gpu_are_judged_where_there_is_one() -> None:
     step = BenchRow(
-        name=WHOLE,
+        name=TRAINING,
         what="paper",
         threads=2,
         item="step",
@@ -52,15 +51,13 @@ def test_goals_of_a_gpu_are_judged_where_there_is_one() -> None:
 
 def test_rows_of_a_gpu_are_measured_on_any_device(quick_model, tmp_path, monkeypatch) -> None:
     monkeypatch.setattr(gpu, "LABELLING", ("quick",))
-    for module, name, small in (
-        (volume, "GRID", 24),
-        (volume, "_SLAB", 99),
-        (frames, "QUERIES", 999),
-    ):
-        monkeypatch.setattr(module, name, small)
-    subject = Subject({"quick": lambda anatomy: quick(anatomy, "limited")}, tmp_path)
+    for name, small in (("GRID", 24), ("_SLAB", 99), ("QUERIES", 999)):
+        monkeypatch.setattr(networks, name, small)
+    presets = {"quick": lambda anatomy: quick(anatomy, "limited")}
+    subject = BenchSubject(presets, tmp_path)
     shutil.copytree(quick_model, tmp_path / "quick")
-    found = {row.name: row for row in gpu.rows_on(subject, "cpu", 1, 0.5)}
-    assert set(found) == {frames.FRAME, frames.EVERY, volume.NAME, WHOLE}
+    every = gpu.workloads_on(subject, "cpu", 0.5)
+    found = {row.name: row for workload in every for row in workload.rows(1, 0.5)}
+    assert set(found) == {FRAME, EVERY, VOLUME, TRAINING}
     assert all(row.device == "cpu" and row.what == "quick" for row in found.values())
-    assert found[WHOLE].per_s > 1
+    assert found[TRAINING].per_s > 0

@@ -1,28 +1,39 @@
-"""What can be measured: something with an identity that turns a scene's cloud into an estimate."""
+"""What can be measured: trained models and peers, as methods that locate.
+
+A method has an identity, and turns a scene's cloud into an estimate. Nothing heavy is made or
+loaded before a measurement needs it.
+"""
 
 from __future__ import annotations
 
+import ast
+import hashlib
 import math
 from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from functools import cached_property
+from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 import msgspec
 
+import tumortrack
+import tumortrack_lab.peers
 from tumortrack.core import store
+from tumortrack.core.config import Config, to_builtins
 from tumortrack.core.errors import InputError
 from tumortrack.core.estimate import Estimate
+from tumortrack.core.motion import OneWay
+from tumortrack.core.types import Anatomy
 from tumortrack.simulate.scene_folder import Scene
 from tumortrack.tracking.tracker import Tracker
 from tumortrack.training.model import Model, load_model
+from tumortrack_lab.peers.base import Fit, estimate_of
+from tumortrack_lab.study.cases import StudyCase
 
-LIVE_STAGES = (
-    "encode",
-    "coarse",
-    "refine",
-    "fine",
-)  # what a live frame takes; the dense volume is extra
+_LIVE_STAGES = ("encode", "coarse", "refine", "fine")  # of a live frame: without the dense volume
 
 
 @dataclass(frozen=True)
@@ -34,7 +45,7 @@ class Answer:
 
 
 class Method(ABC):
-    """One way to locate, for one patient. Nothing heavy is made or loaded before it is needed."""
+    """One way to locate, for one patient."""
 
     @property
     @abstractmethod
@@ -42,9 +53,9 @@ class Method(ABC):
         """``kind``, ``name`` and everything else that decides the answers (JSON)."""
 
     @property
-    @abstractmethod
     def device(self) -> str:
         """What it runs on."""
+        return "cpu"
 
     @property
     @abstractmethod
@@ -52,9 +63,9 @@ class Method(ABC):
         """Spent once for a patient, before the first frame: training, or a peer's own work."""
 
     @property
-    @abstractmethod
     def about(self) -> dict:
         """What else a reader wants to know of it (JSON)."""
+        return {"prepare_s": self.prepare_s}
 
     @abstractmethod
     def locate(self, scene: Scene, grid: int) -> Answer:
@@ -64,6 +75,12 @@ class Method(ABC):
             NoEstimate: nothing can be said of the scene.
             InputError: the cloud cannot be used.
         """
+
+
+def answer_of(fit: Fit, anatomy_ct: Anatomy, scene: Scene, grid: int) -> Answer:
+    """The answer of a method that carries the CT's points."""
+    estimate = estimate_of(fit, anatomy_ct, scene.cloud.stamp_ns, grid)
+    return Answer(replace(estimate, motion=OneWay(fit.carry)), fit.seconds)
 
 
 @dataclass(frozen=True)
@@ -80,7 +97,7 @@ class Network(Method):
     @cached_property
     def identity(self) -> dict:
         about = self.provenance
-        named = {"unrefined": True} if self.unrefined else {}  # older cells have no such word
+        named = {"unrefined": True} if self.unrefined else {}  # older measurements have no such key
         return {
             "kind": "network",
             "name": self.name,
@@ -97,17 +114,13 @@ class Network(Method):
         return store.read_json(self.folder / store.MANIFEST)["provenance"]
 
     @cached_property
-    def _model(self) -> Model:
-        model = load_model(self.folder, self.want_device)
-        return without_refinement(model) if self.unrefined else model
-
-    @cached_property
     def _tracker(self) -> Tracker:
-        return Tracker(self._model)
+        model = load_model(self.folder, self.want_device)
+        return Tracker(without_refinement(model) if self.unrefined else model)
 
     @property
     def device(self) -> str:
-        return str(next(self._model.network.parameters()).device.type)
+        return str(next(self._tracker.model.network.parameters()).device.type)
 
     @property
     def prepare_s(self) -> float | None:
@@ -122,7 +135,7 @@ class Network(Method):
     def locate(self, scene: Scene, grid: int) -> Answer:
         estimate = self._tracker.locate(scene.cloud, grid, self.locate_seed)
         seconds = estimate.report["timings"]
-        return Answer(estimate, sum(seconds.get(stage, 0.0) for stage in LIVE_STAGES))
+        return Answer(estimate, sum(seconds.get(stage, 0.0) for stage in _LIVE_STAGES))
 
 
 def without_refinement(model: Model) -> Model:
@@ -141,3 +154,107 @@ def without_refinement(model: Model) -> Model:
     familiar = msgspec.structs.replace(model.familiar, fit_mm=math.inf)
     trust = msgspec.structs.replace(model.trust, usual_cost=math.inf)
     return replace(model, config=config, familiar=familiar, trust=trust)
+
+
+@dataclass(frozen=True)
+class PeerKind:
+    """How a peer is made: its class, its settings (None where it has none), and the packages and
+    the outside program that its answers depend on."""
+
+    make: Callable[..., Any]
+    config: Config | None = None
+    packages: tuple[str, ...] = ()
+    program_sha256: str | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class PeerMethod(Method):
+    """A peer of one patient as a method. Its identity names its settings, the peers' code by its
+    sha256, and the versions of the packages it rests on."""
+
+    name: str
+    kind: PeerKind
+    case: StudyCase
+
+    @cached_property
+    def identity(self) -> dict:
+        settings = to_builtins(self.kind.config) if self.kind.config else {}
+        if self.kind.program_sha256:
+            settings["program"] = self.kind.program_sha256  # wherever it lies
+        return {
+            "kind": "peer",
+            "name": self.name,
+            "settings": settings,
+            "code_sha256": code_sha256(Path(tumortrack_lab.peers.__path__[0]).glob("*.py")),
+            "versions": {package: version(package) for package in self.kind.packages},
+            "tumortrack": tumortrack.__version__,
+        }
+
+    @cached_property
+    def peer(self) -> Any:  # a Peer
+        """Made ready for the patient."""
+        if self.kind.config is None:
+            return self.kind.make(self.case.anatomy_ct)
+        return self.kind.make(self.case.anatomy_ct, self.case.up_lps, self.kind.config)
+
+    @property
+    def prepare_s(self) -> float | None:
+        return self.peer.prepare_s
+
+    def locate(self, scene: Scene, grid: int) -> Answer:
+        return answer_of(self.peer.fit(scene), self.case.anatomy_ct, scene, grid)
+
+
+def code_sha256(paths: Iterable[Path]) -> str:
+    """Of files of code without comments and docstrings: after a change of what they do, it is
+    measured anew; after a change of words it is not."""
+    digest = hashlib.sha256()
+    for path in sorted(paths):
+        tree = ast.parse(path.read_text(encoding="utf-8"))
+        for node in ast.walk(tree):
+            if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef) and ast.get_docstring(
+                node
+            ):
+                node.body = node.body[1:]
+        digest.update(f"{path.name}\0{ast.dump(tree)}\n".encode())
+    return digest.hexdigest()
+
+
+def peer_method(name: str, case: StudyCase, bcpd: Path | None = None) -> PeerMethod:
+    """The peer with this name for a case; ``bcpd`` is the built program of that peer.
+
+    Raises:
+        InputError: no such peer, or no program for ``bcpd``.
+    """
+    kinds = peer_kinds(bcpd)
+    if name not in kinds:
+        raise InputError(f"peer {name!r} is unknown. Allowed: {', '.join(kinds)}.")
+    return PeerMethod(name, kinds[name], case)
+
+
+def peer_kinds(bcpd: Path | None = None) -> dict[str, PeerKind]:
+    """Every peer there is; ``bcpd`` only with its program.
+
+    Raises:
+        InputError: the program does not exist.
+    """
+    from tumortrack_lab.peers.bcpd import Bcpd, BcpdConfig
+    from tumortrack_lab.peers.cpd import Cpd, CpdConfig
+    from tumortrack_lab.peers.elastic import ElasticPeer, ElasticPeerConfig
+    from tumortrack_lab.peers.rigid import Rigid, RigidConfig
+    from tumortrack_lab.peers.rigid_bound import RigidBound
+
+    icp = ("small_gicp",)
+    kinds = {
+        "rigid_bound": PeerKind(RigidBound),
+        "rigid": PeerKind(Rigid, RigidConfig(), icp),
+        "rigid_any_rotation": PeerKind(Rigid, RigidConfig(orientation="unknown"), icp),
+        "cpd": PeerKind(Cpd, CpdConfig(), ("pycpd", *icp)),
+        "elastic": PeerKind(ElasticPeer, ElasticPeerConfig(), ("pytetwild", "scipy", *icp)),
+    }
+    if bcpd is not None:
+        if not bcpd.is_file():
+            raise InputError(f"{bcpd} does not exist; give the built program of BCPD, or none.")
+        config = BcpdConfig(program=str(bcpd))
+        kinds["bcpd"] = PeerKind(Bcpd, config, icp, store.sha256_of(bcpd))
+    return kinds

@@ -4,29 +4,21 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import numpy as np
+import torch
 
-from tumortrack_lab.bench.counts import (
-    ball_flops,
-    farthest_flops,
-    module_flops,
-    weight_bytes,
-)
-from tumortrack_lab.bench.row import Precision, Work
-from tumortrack_lab.bench.turns import Call, InterleavedTiming
+from tumortrack.occupancy.inference import Inference
+from tumortrack.occupancy.locator import steps_over
+from tumortrack.occupancy.network import OccupancyNetwork
+from tumortrack.occupancy.organ_lattice import organ_lattice
+from tumortrack.occupancy.sparse import sparse_logits
+from tumortrack.training.model import Model, has_fast_bfloat16
+from tumortrack_lab.bench.counts import ball_flops, farthest_flops, module_flops, weight_bytes
+from tumortrack_lab.bench.naive.occupancy import NaiveOccupancy
+from tumortrack_lab.bench.rows import Precision, Work
+from tumortrack_lab.bench.timing import Call, InterleavedTiming
 
-if TYPE_CHECKING:
-    import torch
-
-    from tumortrack.occupancy.inference import Inference
-    from tumortrack.occupancy.network import OccupancyNetwork
-    from tumortrack.training.model import Model
-    from tumortrack_lab.bench.naive.occupancy import NaiveOccupancy
-    from tumortrack_lab.bench.subject import Subject
-
-LABELLING = ("quick", "paper")  # the presets that label points
 IN_ONE_PIECE = 40_000  # queries of the naive form: of more the latent's copies fill the memory
 _PRECISIONS: dict[str, Precision] = {"float32": "fp32", "bfloat16": "bf16", "int8": "int8"}
 _BYTES: dict[Precision, int] = {"fp32": 4, "bf16": 2, "int8": 1}
@@ -45,30 +37,12 @@ class OccupancyWorkload:
     naive_frame_s: InterleavedTiming | None = None
     _labelled: dict[int, np.ndarray] = field(default_factory=dict)
 
-    @cached_property
-    def network(self) -> OccupancyNetwork:
-        from tumortrack.occupancy.network import OccupancyNetwork
-
+    def __post_init__(self) -> None:
         assert isinstance(self.model.network, OccupancyNetwork)
-        return self.model.network.to(self.device)
-
-    @cached_property
-    def inference(self) -> Inference:
-        from tumortrack.occupancy.inference import Inference
-
-        return Inference(self.network, self.model.arithmetic)
-
-    @cached_property
-    def plain(self) -> NaiveOccupancy:
-        from tumortrack_lab.bench.naive.occupancy import NaiveOccupancy
-
-        return NaiveOccupancy(self.network)
-
-    @cached_property
-    def cloud(self) -> torch.Tensor:
-        import torch
-
-        return torch.tensor(self.points_mm)[None].to(self.device)
+        self.network = self.model.network.to(self.device)
+        self.inference = Inference(self.network, self.model.arithmetic)
+        self.plain = NaiveOccupancy(self.network)
+        self.cloud = torch.tensor(self.points_mm)[None].to(self.device)
 
     def queries(self, count: int) -> np.ndarray:
         """Evenly in the box about the cloud where the organ can be."""
@@ -77,15 +51,15 @@ class OccupancyWorkload:
         rng = np.random.default_rng(0)
         return rng.uniform(lower, upper, (count, 3)).astype(np.float32)
 
+    def on_device(self, queries: np.ndarray) -> torch.Tensor:
+        return torch.from_numpy(queries)[None].to(self.device)
+
+    @torch.inference_mode()
     def naive_labels(self, queries: np.ndarray) -> np.ndarray:
         """In single precision, piece by piece."""
-        import torch
-
-        asked = torch.from_numpy(queries)[None].to(self.device)
-        with torch.inference_mode():
-            encoded = self.plain.encode(self.cloud)
-            pieces = asked.split(IN_ONE_PIECE, dim=1)
-            labels = [self.plain.logits(encoded, piece)[0].argmax(-1) for piece in pieces]
+        encoded = self.plain.encode(self.cloud)
+        pieces = self.on_device(queries).split(IN_ONE_PIECE, dim=1)
+        labels = [self.plain.logits(encoded, piece)[0].argmax(-1) for piece in pieces]
         return torch.cat(labels).cpu().numpy()
 
     def agreement(self, labels: np.ndarray) -> float:
@@ -98,10 +72,6 @@ class OccupancyWorkload:
     @cached_property
     def precision(self) -> Precision:
         """Of the encoder."""
-        import torch
-
-        from tumortrack.training.model import has_fast_bfloat16
-
         return "bf16" if has_fast_bfloat16(torch.device(self.device)) else "fp32"
 
     @property
@@ -120,70 +90,71 @@ class OccupancyWorkload:
         moved = weight_bytes(folded.encoder, _BYTES[self.precision]) + self.points_mm.nbytes
         return Work(flops=flops, bytes=moved, precision=self.precision)
 
-    def decoder_work(self, queries: int) -> Work:
-        """The latent's share once a frame; queries in, logits out."""
-        import torch
-
+    def decoder_work(self, queries: int, voxels: int = 0) -> Work:
+        """The latent's share once a frame; queries in, logits out; a label to every voxel."""
         folded = self.network.folded()
-        latent = folded.encode(self.cloud)
-        some = torch.from_numpy(self.queries(100))[None].to(self.device)
+        latent, some = folded.encode(self.cloud), self.on_device(self.queries(100))
         flops = module_flops(lambda: folded.query(latent, some)) * queries / 100
-        classes = len(self.model.parts) + 1
-        moved = weight_bytes(folded.decoder, _BYTES[self.decoder_precision]) + queries * (
-            12 + 4 * classes
-        )
+        moved = weight_bytes(folded.decoder, _BYTES[self.decoder_precision]) + voxels
+        moved += queries * (12 + 4 * (len(self.model.parts) + 1))
         return Work(flops=flops, bytes=moved, precision=self.decoder_precision)
 
-    def naive_decoder_work(self, queries: int) -> Work:
-        import torch
+    def frame_work(self, queries: int) -> Work:
+        encode, decode = self.encoder_work(), self.decoder_work(queries)
+        return Work(
+            flops=encode.flops + decode.flops,
+            bytes=encode.bytes + decode.bytes,
+            precision=decode.precision,
+        )
 
-        with torch.inference_mode():
-            encoded = self.plain.encode(self.cloud)
-            some = torch.from_numpy(self.queries(100))[None].to(self.device)
-            flops = module_flops(lambda: self.plain.logits(encoded, some)) * queries / 100
+    @torch.inference_mode()
+    def naive_decoder_work(self, queries: int) -> Work:
+        encoded, some = self.plain.encode(self.cloud), self.on_device(self.queries(100))
+        flops = module_flops(lambda: self.plain.logits(encoded, some)) * queries / 100
         return Work(flops=flops, bytes=weight_bytes(self.network.decoder, 4))
 
-    def naive_frame(self, queries: np.ndarray) -> Call:
-        import torch
+    def naive_encoding(self) -> Call:
+        return torch.inference_mode()(lambda: self.plain.encode(self.cloud))
 
-        asked = torch.from_numpy(queries)[None].to(self.device)
+    def naive_decoding(self, queries: np.ndarray) -> Call:
+        """The cloud being encoded."""
+        asked = self.on_device(queries)
+        with torch.inference_mode():
+            encoded = self.plain.encode(self.cloud)
+        return torch.inference_mode()(lambda: self.plain.logits(encoded, asked).argmax(-1))
+
+    def naive_frame(self, queries: np.ndarray) -> Call:
+        asked = self.on_device(queries)
 
         @torch.inference_mode()
         def once() -> None:
-            encoded = self.plain.encode(self.cloud)
-            self.plain.logits(encoded, asked).argmax(-1).cpu()
+            self.plain.logits(self.plain.encode(self.cloud), asked).argmax(-1).cpu()
 
         return once
 
     def our_frame(self, queries: np.ndarray) -> tuple[np.ndarray, int]:
         """Labels as `locate` finds them, and how many places were asked for: logits on a lattice
         over the queries' box, linear between its points where that is plain, else asked."""
-        from tumortrack.occupancy.locator import steps_over
-        from tumortrack.occupancy.organ_lattice import organ_lattice
-        from tumortrack.occupancy.sparse import sparse_logits
-
-        latent, asked = self.inference.encode(self.points_mm), 0
-
-        def logits_at(points_mm: np.ndarray) -> torch.Tensor:
-            nonlocal asked
-            asked += len(points_mm)
-            return self.inference.logits(latent, points_mm)
-
+        asked = self.asking()
         box = np.stack([queries.min(0), queries.max(0)]).astype(float)
-        lattice = organ_lattice(logits_at, box, steps_over(box))
-        return sparse_logits(logits_at, lattice, queries).argmax(-1), asked
+        lattice = organ_lattice(asked, box, steps_over(box))
+        return sparse_logits(asked, lattice, queries).argmax(-1), asked.places
+
+    def asking(self) -> CountedQueries:
+        return CountedQueries(self.inference, self.inference.encode(self.points_mm))
 
     def every_query(self, queries: np.ndarray) -> np.ndarray:
         """Labels by asking at every place."""
-        latent = self.inference.encode(self.points_mm)
-        labels: np.ndarray = self.inference.logits(latent, queries).argmax(-1).cpu().numpy()
+        labels: np.ndarray = self.asking()(queries).argmax(-1).cpu().numpy()
         return labels
 
 
-def asked_of(subject: Subject, preset: str) -> OccupancyWorkload:
-    """Of a preset: one for all groups of rows, whose naive form then labels its queries once."""
-    if preset not in subject.asked:
-        subject.asked[preset] = OccupancyWorkload(
-            subject.model(preset), subject.cloud(preset).points_mm
-        )
-    return subject.asked[preset]
+class CountedQueries:
+    """Logits at places (n, 3), mm; ``places``: how many were asked for."""
+
+    def __init__(self, inference: Inference, latent: object) -> None:
+        self._inference, self._latent, self.places = inference, latent, 0
+
+    def __call__(self, points_mm: np.ndarray) -> torch.Tensor:
+        self.places += len(points_mm)
+        return self._inference.logits(self._latent, points_mm)  # type: ignore[arg-type]

@@ -1,8 +1,8 @@
-"""Cells: one method on one scene under one fault, measured once and kept as one JSON file.
+"""Measurements: one method on one scene under one fault, measured once and kept as one JSON file.
 
-A cell's name holds the hash of everything that decides its numbers (case, scene, fault, method,
-grid), so that a study that was killed goes on where it stopped, and a cell made from other inputs
-is never taken for this one.
+A file's name holds the hash of everything that decides its numbers (case, scene, fault, method,
+grid), so that a study that was killed goes on where it stopped, and a measurement made from other
+inputs is never taken for this one.
 """
 
 from __future__ import annotations
@@ -10,19 +10,19 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-import platform
 from pathlib import Path
 
 import tumortrack
 from tumortrack.core import store
 from tumortrack.core.config import Config, to_builtins
 from tumortrack.core.errors import StorageError
+from tumortrack_lab.bench.machine import cpu_name
 
-CELL_SCHEMA = 1  # raise it when a cell's metrics change their meaning
+_SCHEMA = 1  # raise it when a measurement's metrics change their meaning
 
 
 class MeasurementSpec(Config, frozen=True):
-    """What decides a cell's numbers, and the names under which tables find it."""
+    """What decides a measurement's numbers, and the names under which tables find it."""
 
     case: str
     case_sha256: str
@@ -34,7 +34,7 @@ class MeasurementSpec(Config, frozen=True):
     grid: int
     fault: str = "none"
     fault_seed: int = 0
-    schema: int = CELL_SCHEMA
+    schema: int = _SCHEMA
 
     @property
     def digest(self) -> str:
@@ -43,7 +43,7 @@ class MeasurementSpec(Config, frozen=True):
 
 
 class MeasurementStore:
-    """The folder of all cells: CASE/METHOD/SCENE-FAULT-GRID-DIGEST.json."""
+    """The folder of all measurements: CASE/METHOD/SCENE-FAULT-GRID-DIGEST.json."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -54,7 +54,7 @@ class MeasurementStore:
         return self.folder / spec.case / method / file
 
     def read(self, spec: MeasurementSpec) -> dict | None:
-        """The cell with exactly this specification, None where it has not been measured.
+        """What was measured with exactly this specification; None where nothing was.
 
         Raises:
             ArtifactError: its file is damaged.
@@ -62,11 +62,11 @@ class MeasurementStore:
         path = self.path(spec)
         if not path.exists():
             return None
-        cell = store.read_json(path)
-        return cell if cell.get("spec") == to_builtins(spec) else None
+        measurement = store.read_json(path)
+        return measurement if measurement.get("spec") == to_builtins(spec) else None
 
     def write(self, spec: MeasurementSpec, measured: dict) -> dict:
-        """Keep a cell, in one step.
+        """Keep a measurement, in one step.
 
         Raises:
             StorageError: the disk refused.
@@ -76,13 +76,13 @@ class MeasurementStore:
             path.parent.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise StorageError(f"cannot write {path.parent}: {error.strerror}.") from error
-        cell = {"spec": to_builtins(spec), **measured}
-        store.write_json(path, cell)
-        return cell
+        measurement = {"spec": to_builtins(spec), **measured}
+        store.write_json(path, measurement)
+        return measurement
 
 
 def provenance(device: str) -> dict:
-    """Where and by what a cell is measured; ``load`` is how busy the machine was."""
+    """Where and by what something is measured; ``load`` is how busy the machine was."""
     import torch
 
     return {
@@ -93,11 +93,3 @@ def provenance(device: str) -> dict:
         "threads": torch.get_num_threads(),
         "load": round(os.getloadavg()[0], 2) if hasattr(os, "getloadavg") else None,
     }
-
-
-def cpu_name() -> str:
-    """The processor as the system names it."""
-    info = Path("/proc/cpuinfo")
-    lines = info.read_text(encoding="utf-8").splitlines() if info.exists() else []
-    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
-    return names[0] if names else platform.processor() or platform.machine()
