@@ -47,80 +47,50 @@ class StudyPlan(Config, frozen=True):
     curves. None: the same as the phantom's."""
 
     name: str
+    # In accuracy, peers and views: M_lim, M_full, clinic
     models: tuple[str, ...] = ("M_lim", "M_full", CLINIC)
-    """In accuracy, peers and views: M_lim, M_full, clinic."""
-    steps: int = 12_000
-    """Of training M_lim and M_full."""
-    clinic_steps: int = 6_000
-    """Of training clinic (the preset's)."""
+    steps: int = 12_000  # Of training M_lim and M_full
+    clinic_steps: int = 6_000  # Of training clinic (the preset's)
+    # Of training in the deformation study (as many as --steps)
     configuration_steps: int | None = None
-    """Of training in the deformation study (as many as --steps)."""
-    seeds: tuple[int, ...] = (0, 1, 2)
-    """Of training."""
-    case_seeds: tuple[int, ...] | None = None
-    """Of training for --case (the same as the phantom's)."""
+    seeds: tuple[int, ...] = (0, 1, 2)  # Of training
+    case_seeds: tuple[int, ...] | None = None  # Of training for --case (the same as the phantom's)
+    # Of training in the deformation study (the same as the phantom's)
     configuration_seeds: tuple[int, ...] | None = None
-    """Of training in the deformation study (the same as the phantom's)."""
-    variants: tuple[str, ...] = VARIANTS
-    """Of every table that names no others."""
-    view: str = "noise"
-    """Of every table but those of faults and views."""
-    grid: int = 400
-    """Voxels along the longest side, in the table of accuracy."""
-    case_grid: int | None = None
-    """The same for --case (as for the phantom)."""
-    coarse_grid: int = 160
-    """The same in every other table."""
-    configurations: tuple[int, ...] = (1, 2, 3, 4, 5, 6)
-    """Rows of the paper's deformation table."""
-    configuration_variants: tuple[str, ...] = ("D0", "D1", "D2", "D3")
-    """In the deformation study."""
-    configuration_view: str = "noise"
-    """In the deformation study."""
-    peers: tuple[str, ...] = ("rigid_bound", "rigid", "cpd", "elastic")
-    """Methods beside the models."""
-    case_peers: tuple[str, ...] | None = None
-    """Peers for --case (as for the phantom)."""
-    faults: tuple[str, ...] = FAULTS
-    """Error sources."""
-    fault_seeds: tuple[int, ...] = (0, 1, 2)
-    """Of the random part of each fault."""
-    fault_models: tuple[str, ...] = ("M_lim", CLINIC)
-    """Models in the table of faults."""
-    fault_peers: tuple[str, ...] = ("elastic",)
-    """Peers in the table of faults."""
-    fault_variants: tuple[str, ...] = ("D1", "D2", "D3", "G1", "P1")
-    """In the table of faults."""
-    views: tuple[str, ...] = VIEWS
-    """In the table of views."""
+    variants: tuple[str, ...] = VARIANTS  # Of every table that names no others
+    view: str = "noise"  # Of every table but those of faults and views
+    grid: int = 400  # Voxels along the longest side, in the table of accuracy
+    case_grid: int | None = None  # The same for --case (as for the phantom)
+    coarse_grid: int = 160  # The same in every other table
+    configurations: tuple[int, ...] = (1, 2, 3, 4, 5, 6)  # Rows of the paper's deformation table
+    configuration_variants: tuple[str, ...] = ("D0", "D1", "D2", "D3")  # In the deformation study
+    configuration_view: str = "noise"  # In the deformation study
+    peers: tuple[str, ...] = ("rigid_bound", "rigid", "cpd", "elastic")  # Methods beside the models
+    case_peers: tuple[str, ...] | None = None  # Peers for --case (as for the phantom)
+    faults: tuple[str, ...] = FAULTS  # Error sources
+    fault_seeds: tuple[int, ...] = (0, 1, 2)  # Of the random part of each fault
+    fault_models: tuple[str, ...] = ("M_lim", CLINIC)  # Models in the table of faults
+    fault_peers: tuple[str, ...] = ("elastic",)  # Peers in the table of faults
+    fault_variants: tuple[str, ...] = ("D1", "D2", "D3", "G1", "P1")  # In the table of faults
+    views: tuple[str, ...] = VIEWS  # In the table of views
+    # Faults and their levels, such as visible=60 (those of the plan)
     severities: tuple[str, ...] = SEVERITIES
-    """Faults and their levels, such as visible=60 (those of the plan)."""
-    severity_seeds: tuple[int, ...] = (0, 1, 2)
-    """Of the random part of each severity."""
-    severity_variants: tuple[str, ...] = ("D2", "G1")
-    """In the severities."""
-    severity_models: tuple[str, ...] = ("M_lim", CLINIC)
-    """Models beside the severities' peers."""
-    severity_peers: tuple[str, ...] = ("rigid",)
-    """Peers in the severities."""
-    goal_models: tuple[str, ...] = ("M_lim", CLINIC)
-    """Models in the table of goals."""
-    goal_peers: tuple[str, ...] = ("elastic",)
-    """Peers in the table of goals."""
+    severity_seeds: tuple[int, ...] = (0, 1, 2)  # Of the random part of each severity
+    severity_variants: tuple[str, ...] = ("D2", "G1")  # In the severities
+    severity_models: tuple[str, ...] = ("M_lim", CLINIC)  # Models beside the severities' peers
+    severity_peers: tuple[str, ...] = ("rigid",)  # Peers in the severities
+    goal_models: tuple[str, ...] = ("M_lim", CLINIC)  # Models in the table of goals
+    goal_peers: tuple[str, ...] = ("elastic",)  # Peers in the table of goals
+    # Models whose estimates are planned on and cut, beside the truth
     resection_models: tuple[str, ...] = ("M_lim", CLINIC)
-    """Models whose estimates are planned on and cut, beside the truth."""
-    ablation_models: tuple[str, ...] = _ABLATION
-    """Rows of the ablation."""
+    ablation_models: tuple[str, ...] = _ABLATION  # Rows of the ablation
+    # Cases of the ablation, of those that are given
     ablation_cases: tuple[str, ...] = ("phantom", "case_00000")
-    """Cases of the ablation, of those that are given."""
+    # Training scenes of each model in the ablation, whatever its batches
     ablation_scenes: int = 32_000
-    """Training scenes of each model in the ablation, whatever its batches."""
-    ablation_seeds: tuple[int, ...] = (0, 1, 2)
-    """Of training in the ablation."""
-    ablation_views: tuple[str, ...] = ("noise", "shaft")
-    """Views in the ablation."""
-    ablation_variants: tuple[str, ...] = ("D1", "D2", "D3", "G1", "P1")
-    """In the ablation."""
+    ablation_seeds: tuple[int, ...] = (0, 1, 2)  # Of training in the ablation
+    ablation_views: tuple[str, ...] = ("noise", "shaft")  # Views in the ablation
+    ablation_variants: tuple[str, ...] = ("D1", "D2", "D3", "G1", "P1")  # In the ablation
 
 
 FULL = StudyPlan(name="full")
