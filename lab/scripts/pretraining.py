@@ -10,6 +10,8 @@ elastic states are of a library that no training has seen. Measurements are kept
 from __future__ import annotations
 
 import os
+import shlex
+import sys
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -41,7 +43,7 @@ from tumortrack.training.validate import ValidationScenes, mean_iou_of
 from tumortrack_lab.study.cases import named_folders, phantom_case
 from tumortrack_lab.study.document import ReportWriter, table
 from tumortrack_lab.study.frame import text as seeds_text
-from tumortrack_lab.study.trainings import kept, make_command, run, unseen_scenes
+from tumortrack_lab.study.trainings import kept, run, unseen_scenes
 
 BLOCK = "pretraining"
 TITLES = {
@@ -100,8 +102,9 @@ def main(options: Options) -> None:
                 lambda: _curve(case, scenes(), start, seed, options.steps),  # noqa: B023 (called now)
             )  # fmt: skip
             rows += [{"case": name, "seed": seed, **row} for row in curve]
+    command = shlex.join(["make", "headstart", f"ARGS={shlex.join(sys.argv[1:])}"])
     about = store.read_manifest(options.start, "pretrained")["provenance"]
-    _write(pd.DataFrame(rows), about, ReportWriter(options.document, make_command("headstart")))
+    _write(pd.DataFrame(rows), about, ReportWriter(options.document, command))
 
 
 def _curve(
@@ -132,7 +135,8 @@ def _curve(
             if length == steps:
                 row = {"steps": steps, "pretrained": pretrained}
                 row |= _errors(state.average, shape, scenes, config.refine)
-                say(" ".join(f"{k}={v if v is pretrained else round(v, 2)}" for k, v in row.items()))
+                figures = (f"{key}={round(row[key], 2)}" for key in TITLES)
+                say(f"steps={steps} pretrained={pretrained} {' '.join(figures)}")
                 rows.append(row)
 
     judge(0)
