@@ -33,8 +33,7 @@ from tumortrack_lab.study import plan as studies
 from tumortrack_lab.study.bound import BOUNDS, Bound
 from tumortrack_lab.study.cases import StudyCase, named_folders, phantom_case, study_case
 from tumortrack_lab.study.document import ReportWriter
-from tumortrack_lab.study.measure import Job, StudyStatus, measure
-from tumortrack_lab.study.measurements import MeasurementStore
+from tumortrack_lab.study.measure import Job, MeasurementStore, StudyStatus, measure
 from tumortrack_lab.study.methods import Method, Network, peer_method
 from tumortrack_lab.study.models import CLINIC, MODELS, Presets, Trainer
 from tumortrack_lab.study.report import gallery_block, section_blocks

@@ -4,7 +4,7 @@ import shutil
 import time
 
 from tumortrack.training.presets import quick
-from tumortrack_lab.bench import gpu, networks, timing
+from tumortrack_lab.bench import networks, timing, training
 from tumortrack_lab.bench.goals import goals_table
 from tumortrack_lab.bench.rows import EVERY, FRAME, TRAINING, VOLUME, BenchResult, BenchRow
 from tumortrack_lab.bench.subject import BenchSubject
@@ -50,13 +50,13 @@ def test_goals_of_a_gpu_are_judged_where_there_is_one() -> None:
 
 
 def test_rows_of_a_gpu_are_measured_on_any_device(quick_model, tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr(gpu, "LABELLING", ("quick",))
+    monkeypatch.setattr(training, "LABELLING", ("quick",))
     for name, small in (("GRID", 24), ("_SLAB", 99), ("QUERIES", 999)):
         monkeypatch.setattr(networks, name, small)
     presets = {"quick": lambda anatomy: quick(anatomy, "limited")}
     subject = BenchSubject(presets, tmp_path)
     shutil.copytree(quick_model, tmp_path / "quick")
-    every = gpu.workloads_on(subject, "cpu", 0.5)
+    every = training.on_device(subject, "cpu", 0.5)
     found = {row.name: row for workload in every for row in workload.rows(1, 0.5)}
     assert set(found) == {FRAME, EVERY, VOLUME, TRAINING}
     assert all(row.device == "cpu" and row.what == "quick" for row in found.values())

@@ -22,8 +22,7 @@ from tumortrack_lab.peers.base import Fit, estimate_of, rigid_carry
 from tumortrack_lab.study.cases import StudyCase
 from tumortrack_lab.study.document import ReportWriter
 from tumortrack_lab.study.frame import groups
-from tumortrack_lab.study.measure import Job, measure, spec_of
-from tumortrack_lab.study.measurements import MeasurementStore
+from tumortrack_lab.study.measure import Job, MeasurementStore, measure, spec_of
 from tumortrack_lab.study.methods import Answer, Method
 from tumortrack_lab.study.report import section_blocks
 from tumortrack_lab.study.resection import (

@@ -17,7 +17,7 @@ from tumortrack.sense.render import render_depth
 from tumortrack.simulate.targets import draw_targets
 from tumortrack_lab.study.cases import StudyCase
 from tumortrack_lab.study.frame import by_seed, text, tidy
-from tumortrack_lab.study.measurements import MeasurementSpec
+from tumortrack_lab.study.measure import MeasurementSpec
 from tumortrack_lab.study.methods import Network, peer_method
 from tumortrack_lab.study.plan import FULL, QUICK, Methods, jobs_of, scenes_of
 from tumortrack_lab.study.plots import severity_curves

@@ -35,12 +35,12 @@ from tumortrack_lab.study.frame import NOT_FOUND, by_seed, text, tidy
 from tumortrack_lab.study.goals import goal_tables
 from tumortrack_lab.study.measure import (
     Job,
+    MeasurementStore,
     StudyStatus,
     displacements,
     measure,
     point_errors,
 )
-from tumortrack_lab.study.measurements import MeasurementStore
 from tumortrack_lab.study.methods import Answer, Method, peer_kinds, peer_method
 from tumortrack_lab.study.models import ABLATED, Presets, Trainer, train_config
 from tumortrack_lab.study.plan import FULL, QUICK, SECTIONS, Methods, StudyPlan, jobs_of

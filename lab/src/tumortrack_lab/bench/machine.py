@@ -61,9 +61,8 @@ def cpu_name() -> str:
 
 def _processor() -> str:
     info = _cpu_info()
-    family = info.get("cpu family")
-    more = "" if family is None else f" (family {family}, model {info.get('model')})"
-    return (info.get("model name", platform.machine()) if info else cpu_name()) + more
+    family, model = info.get("cpu family"), info.get("model")
+    return cpu_name() + ("" if family is None else f" (family {family}, model {model})")
 
 
 def _cpu_info() -> dict[str, str]:

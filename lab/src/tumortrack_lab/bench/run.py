@@ -22,7 +22,7 @@ import msgspec
 from tumortrack.core.config import Config, from_builtins
 from tumortrack.core.cores import available_cores
 from tumortrack.core.errors import TumortrackError
-from tumortrack_lab.bench.rows import BenchResult, BenchRow, Peaks, Point, Workload
+from tumortrack_lab.bench.rows import BenchResult, BenchRow, Peaks, Point
 
 if TYPE_CHECKING:  # with PyTorch, whose threads are settled when it is imported
     from tumortrack.training.train import TrainingStatus
@@ -54,9 +54,10 @@ class Group:
     def expected_s(self, quick: bool) -> float:
         return 2 * self.rows * self.budget_s(quick) * max(1, len(self.needs))
 
-    def workloads(self, subject: BenchSubject, quick: bool) -> Iterator[Workload]:
-        found = resolve_name(f"{__package__}.{self.source}")(subject, self.budget_s(quick))
-        yield from found
+    def measured(self, subject: BenchSubject, task: Task) -> Iterator[BenchRow]:
+        budget_s = self.budget_s(task.quick)
+        for workload in resolve_name(f"{__package__}.{self.source}")(subject, budget_s):
+            yield from workload.rows(task.threads, budget_s)
 
 
 # Training comes last: it tells the C library to keep freed memory, which stays so.
@@ -72,7 +73,7 @@ GROUPS: dict[str, Group] = {
     "planning": Group("planning:workloads", (1,), 3, 3.0, 0.7),
     "training": Group("training:steps", (1,), 3, 5.0, 1.0, ("clinic",)),
     "whole-training": Group("training:whole", (2,), 1, 20.0, 12.0),
-    "gpu": Group("gpu:workloads", (2,), 6, 10.0, 3.4, PRESETS),
+    "gpu": Group("training:on_gpu", (2,), 6, 10.0, 3.4, PRESETS),
 }
 # Curves, and of which presets: each in a process of its own, whose memory so is its own.
 CURVES = {
@@ -239,11 +240,9 @@ def carry_out(
         yield TaskMessage(begins=f"the machine's own rates, {threads}")
         yield TaskMessage(peaks=measure_peaks(task.threads, 1.0 if task.quick else 3.0))
     for name in task.groups:
-        group = GROUPS[name]
         yield TaskMessage(begins=f"{name}, {threads}")
-        for workload in group.workloads(subject, task.quick):
-            for row in workload.rows(task.threads, group.budget_s(task.quick)):
-                yield TaskMessage(row=row)
+        for row in GROUPS[name].measured(subject, task):
+            yield TaskMessage(row=row)
     if task.curve is not None:
         yield TaskMessage(begins=f"growth with {task.curve[0]}, {task.curve[1]}")
         for point in points_of(subject, *task.curve):

@@ -1,4 +1,4 @@
-"""Workloads of training: the scene generator, an optimizer step, a whole training."""
+"""Workloads of training: the scene generator, an optimizer step, a whole training; and of a GPU."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from tumortrack.simulate.occupancy import (
     PointSource,
 )
 from tumortrack.simulate.scene import SceneConfig, SceneRecipe, Simulator
-from tumortrack.training.model import has_fast_bfloat16
+from tumortrack.training.model import has_fast_bfloat16, load_model
 from tumortrack.training.run import TrainingRun
 from tumortrack.training.state import TrainingState
 from tumortrack.training.train import TrainingStatus, train
@@ -42,8 +42,10 @@ from tumortrack_lab.bench.counts import (
 )
 from tumortrack_lab.bench.naive.occupancy import NaiveOccupancy
 from tumortrack_lab.bench.naive.scenes import plain_pair
+from tumortrack_lab.bench.networks import occupancy_frames, occupancy_volume
+from tumortrack_lab.bench.occupancy import OccupancyWorkload
 from tumortrack_lab.bench.rows import GENERATOR, STEP, TRAINING, Work, Workload
-from tumortrack_lab.bench.subject import SEED, UP, BenchSubject
+from tumortrack_lab.bench.subject import LABELLING, SEED, UP, BenchSubject
 from tumortrack_lab.bench.timing import timing_of
 
 _LABELS = 2000
@@ -54,6 +56,7 @@ _BATCHES = 4  # made before and used again
 _STEPS = 10**6  # never reached
 CPU = torch.device("cpu")
 
+Device = Literal["cpu", "cuda"]
 Batch = tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]
 
 
@@ -189,9 +192,7 @@ def whole(subject: BenchSubject, budget_s: float) -> Iterator[Workload]:
     yield whole_training(subject, "quick", "cpu", budget_s)
 
 
-def whole_training(
-    subject: BenchSubject, preset: str, device: Literal["cpu", "cuda"], budget_s: float
-) -> Workload:
+def whole_training(subject: BenchSubject, preset: str, device: Device, budget_s: float) -> Workload:
     """A preset as a user trains it: workers, or the GPU itself, make scenes, the network learns
     them."""
     config = replace(subject.config(preset), validation_pairs=4)
@@ -212,3 +213,20 @@ def whole_training(
     }
     took = timing_of(spans or [config.batch_size / seen[-1][1].samples_per_s])
     return Workload(TRAINING, preset, "step", took, facts=lambda: facts)
+
+
+def on_gpu(subject: BenchSubject, budget_s: float) -> Iterator[Workload]:
+    """Those of ``on_device``, if PyTorch sees a GPU; else none."""
+    if torch.cuda.is_available():
+        yield from on_device(subject, "cuda", budget_s)
+
+
+def on_device(subject: BenchSubject, device: Device, budget_s: float) -> Iterator[Workload]:
+    """Frame and volume of the presets that label points, and a training of each, generator
+    included. Both forms bring their labels back to the host, which waits for the device."""
+    for preset in LABELLING:
+        model = load_model(subject.model_folder(preset), device)
+        asked = OccupancyWorkload(model, subject.cloud(preset).points_mm, device)
+        yield from occupancy_frames(asked, preset)
+        yield occupancy_volume(asked, preset)
+        yield whole_training(subject, preset, device, budget_s)

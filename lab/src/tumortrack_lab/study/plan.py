@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import product
-from typing import Literal, get_args
+from typing import Literal, TypeVar, get_args
 
 from tumortrack.core.config import Config
 from tumortrack_lab.study.bound import BOUNDS
@@ -39,7 +39,7 @@ Section = Literal[
     "resection",
 ]  # fmt: skip
 SECTIONS: tuple[Section, ...] = get_args(Section)
-Draws = tuple[tuple[str, int], ...]  # faults, and the seeds of their random part
+T = TypeVar("T")
 
 
 class StudyPlan(Config, frozen=True):
@@ -117,29 +117,29 @@ QUICK = StudyPlan(
     ablation_variants=("D2", "G1"),
 )
 
-Peers = Callable[[str, StudyCase], Method]
-Models = Callable[[StudyCase, str, int], Network]
-
 
 @dataclass(frozen=True)
 class Methods:
     """Where methods come from: trained models, those of the ablation, peers (and bounds) made
     ready for a patient."""
 
-    model: Models
-    peer: Peers
-    ablated: Models
+    model: Callable[[StudyCase, str, int], Network]
+    peer: Callable[[str, StudyCase], Method]
+    ablated: Callable[[StudyCase, str, int], Network]
+
+
+Made = Callable[[Methods], Iterable[Method]]  # making methods trains
 
 
 @dataclass(frozen=True)
 class _Block:
-    """Every method on every scene under every fault. The methods come last: making them trains."""
+    """Every method on every scene under every fault (with the seed of its random part)."""
 
-    methods: Callable[[Methods], Iterable[Method]]
+    methods: Made
     variants: tuple[str, ...]
     views: tuple[str, ...]
     grid: int
-    faults: Draws = (("none", 0),)
+    faults: tuple[tuple[str, int], ...] = (("none", 0),)
 
     def jobs(self, case: StudyCase, methods: Methods) -> Iterator[Job]:
         made = list(self.methods(methods))
@@ -158,7 +158,7 @@ def jobs_of(
     return by_method(
         job
         for case in cases
-        for block in _blocks(plan, section, case)
+        for block in _Blocks(plan, case).of(section)
         for job in block.jobs(case, methods)
     )
 
@@ -168,84 +168,95 @@ def scenes_of(
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Variants and views that a section needs; the clean view always, for it says what is
     visible."""
-    blocks = _blocks(plan, section, case)
-    variants = (variant for block in blocks for variant in block.variants)
-    views = (view for block in blocks for view in block.views)
-    return tuple(dict.fromkeys(variants)), tuple(dict.fromkeys((CLEAN_VIEW, *views)))
+    blocks = _Blocks(plan, case).of(section)
+    variants = dict.fromkeys(variant for block in blocks for variant in block.variants)
+    views = dict.fromkeys(view for block in blocks for view in block.views)
+    return tuple(variants), tuple(dict.fromkeys((CLEAN_VIEW, *views)))
 
 
-def _blocks(plan: StudyPlan, section: Section, case: StudyCase) -> list[_Block]:
-    def other(ours: tuple, theirs: tuple | None) -> tuple:
-        return ours if case.is_paper or theirs is None else theirs
+class _Blocks:
+    """The blocks of each section, by its name."""
 
-    seeds = other(plan.seeds, plan.case_seeds)
-    grid, views = plan.coarse_grid, (plan.view,)
+    def __init__(self, plan: StudyPlan, case: StudyCase) -> None:
+        self._plan, self._case = plan, case
+        self._seeds = self._for_case(plan.seeds, plan.case_seeds)
 
-    def made(
-        models: Sequence[str], peers: Sequence[str] = (), seeds: Sequence[int] = seeds
-    ) -> Callable[[Methods], Iterable[Method]]:
+    def of(self, section: Section) -> list[_Block]:
+        blocks: list[_Block] = getattr(self, section)()
+        return blocks
+
+    def accuracy(self) -> list[_Block]:
+        grid = self._for_case(self._plan.grid, self._plan.case_grid)
+        return [self._usual(self._made(self._plan.models), grid)]
+
+    def goals(self) -> list[_Block]:
+        """Hidden surface is for methods that have to find the organ: bounds see no cloud."""
+        models, peers = self._plan.goal_models, self._plan.goal_peers
+        hidden = self._disturbed(self._made(models, peers), (_HIDDEN,))
+        return [self._usual(self._made(models, (*peers, *BOUNDS))), hidden]
+
+    def ablation(self) -> list[_Block]:
+        plan, case = self._plan, self._case
+        if case.name not in plan.ablation_cases:
+            return []
+        models = list(product(plan.ablation_models, plan.ablation_seeds))
+        made: Made = lambda methods: [methods.ablated(case, *model) for model in models]  # noqa: E731
+        return [_Block(made, plan.ablation_variants, plan.ablation_views, plan.coarse_grid)]
+
+    def deformation(self) -> list[_Block]:
+        plan = self._plan
+        names = [f"configuration_{number}" for number in plan.configurations]
+        seeds = plan.seeds if plan.configuration_seeds is None else plan.configuration_seeds
+        views = (plan.configuration_view,)
+        made = self._made(names, seeds=seeds)
+        return [_Block(made, plan.configuration_variants, views, plan.coarse_grid)]
+
+    def peers(self) -> list[_Block]:
+        peers = self._for_case(self._plan.peers, self._plan.case_peers)
+        return [self._usual(self._made(self._plan.models, peers))]
+
+    def faults(self) -> list[_Block]:
+        plan = self._plan
+        draws = [(f, s) for f in plan.faults for s in (plan.fault_seeds if f != "clean" else (0,))]
+        made = self._one_seed(plan.fault_models, plan.fault_peers)
+        return [_Block(made, plan.fault_variants, (CLEAN_VIEW,), plan.coarse_grid, tuple(draws))]
+
+    def views(self) -> list[_Block]:
+        plan = self._plan
+        return [_Block(self._one_seed(plan.models), plan.variants, plan.views, plan.coarse_grid)]
+
+    def severity(self) -> list[_Block]:
+        made = self._one_seed(self._plan.severity_models, self._plan.severity_peers)
+        return [self._disturbed(made, self._plan.severities)]
+
+    def resection(self) -> list[_Block]:
+        located_by = self._one_seed(self._plan.resection_models)
+        return [self._usual(lambda methods: map(Cutting, [*located_by(methods), Truth()]))]
+
+    def _for_case(self, ours: T, theirs: T | None) -> T:
+        return ours if self._case.is_paper or theirs is None else theirs
+
+    def _usual(self, methods: Made, grid: int | None = None) -> _Block:
+        plan = self._plan
+        return _Block(methods, plan.variants, (plan.view,), grid or plan.coarse_grid)
+
+    def _disturbed(self, methods: Made, severities: Sequence[str]) -> _Block:
+        plan = self._plan
+        draws = (("clean", 0), *product(severities, plan.severity_seeds))
+        return _Block(methods, plan.severity_variants, (CLEAN_VIEW,), plan.coarse_grid, draws)
+
+    def _one_seed(self, models: Sequence[str], peers: Sequence[str] = ()) -> Made:
+        known = [name for name in peers if name in self._plan.peers]
+        return self._made(models, known, self._seeds[:1])
+
+    def _made(
+        self,
+        models: Sequence[str],
+        peers: Sequence[str] = (),
+        seeds: Sequence[int] | None = None,
+    ) -> Made:
+        case, every = self._case, list(product(models, self._seeds if seeds is None else seeds))
         return lambda methods: [
-            *(methods.model(case, name, seed) for name in models for seed in seeds),
+            *(methods.model(case, *model) for model in every),
             *(methods.peer(name, case) for name in peers),
         ]
-
-    def one_seed(
-        models: Sequence[str], peers: Sequence[str] = ()
-    ) -> Callable[[Methods], Iterable[Method]]:
-        return made(models, [name for name in peers if name in plan.peers], seeds[:1])
-
-    def disturbed(
-        methods: Callable[[Methods], Iterable[Method]], severities: Sequence[str]
-    ) -> _Block:
-        draws = (("clean", 0), *product(severities, plan.severity_seeds))
-        return _Block(methods, plan.severity_variants, (CLEAN_VIEW,), grid, draws)
-
-    if section == "accuracy":
-        coarser = None if case.is_paper else plan.case_grid
-        return [_Block(made(plan.models), plan.variants, views, coarser or plan.grid)]
-    if section == "goals":
-        # Hidden surface is for methods that have to find the organ: bounds do not see the cloud.
-        finding = made(plan.goal_models, plan.goal_peers)
-        everything = made(plan.goal_models, (*plan.goal_peers, *BOUNDS))
-        return [_Block(everything, plan.variants, views, grid), disturbed(finding, (_HIDDEN,))]
-    if section == "ablation":
-        return [
-            _Block(
-                lambda methods: (
-                    methods.ablated(case, name, seed)
-                    for name, seed in product(plan.ablation_models, plan.ablation_seeds)
-                ),
-                plan.ablation_variants,
-                plan.ablation_views,
-                grid,
-            )
-        ] * (case.name in plan.ablation_cases)
-    if section == "deformation":
-        names = [f"configuration_{number}" for number in plan.configurations]
-        theirs = plan.seeds if plan.configuration_seeds is None else plan.configuration_seeds
-        networks = made(names, seeds=theirs)
-        return [_Block(networks, plan.configuration_variants, (plan.configuration_view,), grid)]
-    if section == "peers":
-        peers = other(plan.peers, plan.case_peers)
-        return [_Block(made(plan.models, peers), plan.variants, views, grid)]
-    if section == "faults":
-        draws = tuple(
-            (fault, seed)
-            for fault in plan.faults
-            for seed in (plan.fault_seeds if fault != "clean" else (0,))
-        )
-        methods = one_seed(plan.fault_models, plan.fault_peers)
-        return [_Block(methods, plan.fault_variants, (CLEAN_VIEW,), grid, draws)]
-    if section == "views":
-        return [_Block(one_seed(plan.models), plan.variants, plan.views, grid)]
-    if section == "severity":
-        return [disturbed(one_seed(plan.severity_models, plan.severity_peers), plan.severities)]
-    located_by = one_seed(plan.resection_models)
-    return [
-        _Block(
-            lambda methods: map(Cutting, [*located_by(methods), Truth()]),
-            plan.variants,
-            views,
-            grid,
-        )
-    ]

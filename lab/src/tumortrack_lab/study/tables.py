@@ -258,36 +258,34 @@ def _paper_text(figure: paper.PaperFigure | None) -> str:
 def caption(measurements: list[dict], command: str) -> str:
     """What stands below a block: command, scenes, models with their steps and training time,
     device, load (seconds mean little without it), grid; from the measurements."""
-    specs = [one["spec"] for one in measurements]
-    about = [one["provenance"] for one in measurements]
-    count = len({(s["case"], s["scene"], s["fault"], s["fault_seed"]) for s in specs})
-    grids = [f"{grid}³" for grid in sorted({s["grid"] for s in specs})]
-    loads = [load for one in about if (load := one["load"]) is not None]
-    busy = f"load average {min(loads):.1f} to {max(loads):.1f}" if loads else "load not known"
+    about = pd.json_normalize([{k: one[k] for k in _CAPTION} for one in measurements])
+    scenes = about.drop_duplicates([f"spec.{key}" for key in _SCENE])
+    loads = about["provenance.load"].dropna()
+    busy = (
+        f"load average {loads.min():.1f} to {loads.max():.1f}" if len(loads) else "load not known"
+    )
     return (
-        f"`{command}`: {len(measurements)} measurements, {count} scenes (views: "
-        f"{_listed(s['view'] for s in specs)}), volumes of {', '.join(grids)} voxels at most. "
-        f"{_training(measurements)}Measured on {_listed(map(_device, about))}, {busy}."
+        f"`{command}`: {len(about)} measurements, {len(scenes)} scenes (views: "
+        f"{_listed(about['spec.view'])}), volumes of {_listed(about['spec.grid'], '{}³')} voxels "
+        f"at most. {_training(about[about['spec.method.kind'] == 'network'])}Measured on "
+        f"{_listed(_device(one['provenance']) for one in measurements)}, {busy}."
     )
 
 
-def _training(measurements: list[dict]) -> str:
+_CAPTION, _SCENE = ("spec", "method", "provenance"), ("case", "scene", "fault", "fault_seed")
+
+
+def _training(about: pd.DataFrame) -> str:
     """One sentence about the models, if there are any."""
-    models = {
-        one["spec"]["method"]["model_sha256"]: one["method"]
-        for one in measurements
-        if one["spec"]["method"]["kind"] == "network"
-    }
-    if not models:
+    if about.empty:
         return ""
-    about = list(models.values())
-    minutes = [one["training_s"] / 60 for one in about]
-    steps = _listed(f"{one['steps']:,}" for one in about)
-    seeds = ", ".join(map(str, sorted({one["seed"] for one in about})))
+    models = about.drop_duplicates("spec.method.model_sha256", keep="last")
+    minutes = models["method.training_s"] / 60
     return (
-        f"Models: {len(about)} of {steps} steps, seed {seeds}, trained on "
-        f"{_listed(one['device'] for one in about)} in {min(minutes):.1f} to {max(minutes):.1f} "
-        "minutes each. "
+        f"Models: {len(models)} of {_listed(f'{n:,.0f}' for n in models['method.steps'])} steps, "
+        f"seed {_listed(models['method.seed'].astype(int))}, trained on "
+        f"{_listed(models['method.device'])} in {minutes.min():.1f} to {minutes.max():.1f} minutes "
+        "each. "
     )
 
 
@@ -297,5 +295,5 @@ def _device(about: dict) -> str:
     return f"{about['cpu']} ({about['cores']} cores, PyTorch on {about['threads']})"
 
 
-def _listed(items: Iterable[str]) -> str:
-    return ", ".join(sorted(set(items)))
+def _listed(items: Iterable[object], form: str = "{}") -> str:
+    return ", ".join(map(form.format, sorted(set(items))))  # type: ignore[type-var]
