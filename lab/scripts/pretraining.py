@@ -25,19 +25,20 @@ import torch
 from tumortrack.cli.console import say
 from tumortrack.core import store
 from tumortrack.imaging.case import Case, load_case
+from tumortrack.models.config import GaussNewtonConfig
 from tumortrack.phantom.digital import PhantomParameters
 from tumortrack.registration.canonical_frame import carry_over, upright_of
-from tumortrack.registration.hypotheses import best_fit, first_motions
 from tumortrack.registration.motion import ElasticMotion
 from tumortrack.registration.network import RegistrationNetwork
+from tumortrack.registration.registration import Registration
 from tumortrack.registration.rest_shape import RestShape, shape_of
 from tumortrack.report.drawing import new_figure, save
 from tumortrack.simulate.dataset import SceneStream
 from tumortrack.training.head_start import HeadStart, load_start
-from tumortrack.training.loader import batches
 from tumortrack.training.presets import clinic
 from tumortrack.training.registration_task import RegistrationTask
 from tumortrack.training.run import TrainingRun
+from tumortrack.training.scenes import batches
 from tumortrack.training.state import TrainingState
 from tumortrack.training.validate import ValidationScenes, mean_iou_of
 from tumortrack_lab.study.cases import named_folders, phantom_case
@@ -149,17 +150,21 @@ def _curve(
 
 
 def _errors(
-    network: RegistrationNetwork, shape: RestShape, scenes: ValidationScenes, refine: object
+    network: RegistrationNetwork,
+    shape: RestShape,
+    scenes: ValidationScenes,
+    refine: GaussNewtonConfig,
 ) -> dict[str, float]:
     """Target errors (a scene's mean; then the scenes' median and 90th percentile), before and
     after refinement, and mIoU of the refined labels."""
     network.eval()
+    method = Registration(network, shape, refine)
     first, refined, guesses = [], [], []
     for cloud, points_mm, points_ct, labels in zip(
         scenes.clouds_mm, scenes.points_mm, scenes.points_ct, scenes.labels, strict=True
     ):
-        starts = first_motions(network, shape, cloud)
-        motion = best_fit(shape, cloud, starts, refine).motion
+        starts = method.propose(cloud)
+        motion = method.best_fit(cloud, starts).motion
         inside = labels > 0
         first.append(_error_mm(starts[0], points_ct[inside], points_mm[inside]))
         refined.append(_error_mm(motion, points_ct[inside], points_mm[inside]))

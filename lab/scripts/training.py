@@ -29,22 +29,21 @@ from tumortrack.cli.console import say
 from tumortrack.core import store
 from tumortrack.core.allocator import keep_freed_memory
 from tumortrack.imaging.case import Case, load_case
-from tumortrack.models.config import TrainConfig
+from tumortrack.models.config import GaussNewtonConfig, TrainConfig
+from tumortrack.models.model import Network
 from tumortrack.occupancy.network import OccupancyNetwork
 from tumortrack.phantom.digital import PhantomParameters
-from tumortrack.registration.hypotheses import first_motions
 from tumortrack.registration.network import RegistrationNetwork
+from tumortrack.registration.registration import Registration
 from tumortrack.registration.rest_shape import shape_of
 from tumortrack.report.drawing import new_figure, save
 from tumortrack.simulate.bodies import body_for
 from tumortrack.simulate.dataset import SceneStream
-from tumortrack.training.loader import batches
-from tumortrack.training.networks import Network
 from tumortrack.training.presets import PRESETS
-from tumortrack.training.run import TrainingRun
-from tumortrack.training.schedule import settle_end
+from tumortrack.training.run import TrainingRun, settle_end
+from tumortrack.training.scenes import batches
 from tumortrack.training.state import TrainingState
-from tumortrack.training.task import course_of
+from tumortrack.training.task import task_of
 from tumortrack.training.validate import ValidationScenes, ValidationSet, mean_iou_of
 from tumortrack_lab.study.cases import phantom_case
 from tumortrack_lab.study.document import ReportWriter, table
@@ -147,7 +146,7 @@ def _curve(case: Case, setting: Setting, judge: Judge, options: Options) -> list
     training = TrainingRun(
         case.anatomy, case.up_lps, "", config, setting.seed, minutes=options.seconds / 60
     )
-    task = course_of(training, CPU)
+    task = task_of(training, CPU)
     state = TrainingState(training, CPU)
     state.know(task.teach)
     stream = SceneStream(
@@ -200,7 +199,7 @@ class Judge:
         assert self._shape is not None
         guesses = []
         for cloud, points_mm in zip(scenes.clouds_mm, scenes.points_mm, strict=True):
-            motion = first_motions(network, self._shape, cloud)[0]
+            motion = Registration(network, self._shape, GaussNewtonConfig()).propose(cloud)[0]
             guesses.append(self._shape.labels_at(motion.back(points_mm).astype(np.float32))[0])
         return mean_iou_of(np.stack(guesses), scenes.labels, self._parts)
 

@@ -74,7 +74,7 @@ def track(
     from tumortrack.live.sources import SOURCES
     from tumortrack.live.spec import parse_spec
     from tumortrack.live.values import Controls, PublishedFrame, SinkContext
-    from tumortrack.training.model_folder import read_model_manifest
+    from tumortrack.models.folder import read_model_manifest
 
     source_config = parse_spec(source, SOURCES, "source")
     sink_configs = parse_sinks(sinks)

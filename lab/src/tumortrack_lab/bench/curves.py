@@ -11,11 +11,10 @@ import torch
 from tumortrack.core.allocator import keep_freed_memory
 from tumortrack.core.types import Anatomy
 from tumortrack.imaging.raster import label_grid
-from tumortrack.models.volume import grid_over
+from tumortrack.models.report import grid_over
 from tumortrack.occupancy.inference import Inference
 from tumortrack.occupancy.network import OccupancyNetwork
 from tumortrack.occupancy.sparse import sparse_margins
-from tumortrack.registration.hypotheses import first_motions
 from tumortrack.simulate.occupancy import OccupancyPool, contains
 from tumortrack.simulate.scene import SceneConfig, SceneRecipe, Simulator
 from tumortrack_lab.bench.machine import forget_peak, peak_bytes
@@ -52,16 +51,16 @@ def points_of(subject: BenchSubject, curve: str, preset: str) -> Iterator[Point]
 
 
 def _queries(subject: BenchSubject, preset: str) -> Calls:
-    """Labels of queries, the cloud being encoded or the organ placed."""
+    """Labels of queries, the cloud being encoded or the organ registered."""
     if preset == "clinic":
-        placed = subject.registration
+        registered = subject.registration
         for size in _QUERIES:
-            yield preset, size, partial(placed.labels, placed.places(size))
+            yield preset, size, partial(registered.labels, registered.places(size))
         return
-    asked = subject.occupancy(preset)
-    logits = asked.asking()
+    labeller = subject.occupancy(preset)
+    logits = labeller.counted()
     for size in _QUERIES:
-        yield preset, size, partial(_labels, logits, asked.queries(size))
+        yield preset, size, partial(_labels, logits, labeller.queries(size))
 
 
 def _labels(logits: CountedQueries, queries: np.ndarray) -> None:
@@ -72,11 +71,10 @@ def _points(subject: BenchSubject, preset: str) -> Calls:
     """A cloud of so many points encoded."""
     cloud = subject.scene.cloud.points_mm
     rng = np.random.default_rng(SEED)
-    model = subject.model(preset)
     for size in _POINTS:
         seen = cloud[rng.integers(len(cloud), size=size)]
         if preset == "clinic":
-            yield preset, size, partial(first_motions, model.network, model.shape, seen)  # type: ignore[arg-type]
+            yield preset, size, partial(subject.clinic.registration().propose, seen)
         else:
             yield preset, size, partial(subject.occupancy(preset).inference.encode, seen)
 
@@ -84,7 +82,7 @@ def _points(subject: BenchSubject, preset: str) -> Calls:
 def _tumors(subject: BenchSubject, _: str) -> Calls:
     """An organ with so many tumors: a training pair, a labelled volume, labels of queries by an
     untrained network of so many classes (which takes as long as a trained one)."""
-    asked = subject.occupancy("quick")
+    labeller = subject.occupancy("quick")
     for size in _TUMORS:
         anatomy, config = with_tumors(subject.anatomy, size), SceneConfig()
         pool = OccupancyPool(anatomy, config.occupancy, SEED)
@@ -95,8 +93,8 @@ def _tumors(subject: BenchSubject, _: str) -> Calls:
         torch.manual_seed(SEED)
         network = OccupancyNetwork(subject.presets["quick"](anatomy).network)
         inference = Inference(network.eval())
-        logits = CountedQueries(inference, inference.encode(asked.points_mm))
-        call = partial(_labels, logits, asked.queries(40_000))
+        logits = CountedQueries(inference, inference.encode(labeller.points_mm))
+        call = partial(_labels, logits, labeller.queries(40_000))
         yield "quick, 40,000 queries", size, call
 
 
@@ -118,10 +116,10 @@ def _grids(subject: BenchSubject, preset: str) -> Calls:
             grid = grid_over(anatomy.organ.vertices_mm, size)
             yield preset, size, partial(label_grid, anatomy, *grid)
         return
-    asked = subject.occupancy(preset)
-    logits = asked.asking()
+    labeller = subject.occupancy(preset)
+    logits = labeller.counted()
     for size in _GRIDS:
-        yield preset, size, partial(sparse_margins, logits, *organ_grid(asked, size))
+        yield preset, size, partial(sparse_margins, logits, *organ_grid(labeller, size))
 
 
 def _batches(subject: BenchSubject, preset: str) -> Calls:

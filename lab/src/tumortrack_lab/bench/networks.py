@@ -13,9 +13,8 @@ from tumortrack.core.estimate import Following
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.types import Anatomy, SensorCloud
 from tumortrack.imaging.raster import label_grid
-from tumortrack.models.volume import grid_over
+from tumortrack.models.report import grid_over
 from tumortrack.occupancy.sparse import sparse_margins
-from tumortrack.registration.hypotheses import first_motions
 from tumortrack.tracking.tracker import Tracker
 from tumortrack_lab.bench import occupancy, registration
 from tumortrack_lab.bench.counts import module_flops, weight_bytes
@@ -45,56 +44,55 @@ Grid = tuple[np.ndarray, tuple[int, int, int]]  # camera_from_index, shape
 def encoders(subject: BenchSubject, _: float) -> Iterator[Workload]:
     """A cloud of 1,000 points to what is known of it."""
     for preset in LABELLING:
-        asked = subject.occupancy(preset)
+        labeller = subject.occupancy(preset)
         yield Workload(
             ENCODER, preset, "cloud",
-            ours=partial(asked.inference.encode, asked.points_mm),
-            naive=asked.naive_encoding(),
+            ours=partial(labeller.inference.encode, labeller.points_mm),
+            naive=labeller.naive_encoding(),
             naive_is="single precision, Python loop of farthest points, neighbours by sorting",
-            facts=lambda asked=asked: {"work": asked.encoder_work()},  # type: ignore[misc]
+            facts=lambda labeller=labeller: {"work": labeller.encoder_work()},  # type: ignore[misc]
         )  # fmt: skip
-    model, points = subject.model("clinic"), subject.cloud("clinic").points_mm
-    assert model.shape is not None
+    method, points = subject.clinic.registration(), subject.cloud("clinic").points_mm
 
     @torch.inference_mode()
     def facts() -> dict:
-        flops = module_flops(lambda: model.network.both_ways(torch.tensor(points)[None]))  # type: ignore[operator]
-        moved = weight_bytes(model.network, 4) + points.nbytes
+        flops = module_flops(lambda: method.network.both_ways(torch.tensor(points)[None]))
+        moved = weight_bytes(method.network, 4) + points.nbytes
         return {"work": Work(flops=flops, bytes=moved), "note": "both ways round"}
 
-    ours = partial(first_motions, model.network, model.shape, points)  # type: ignore[arg-type]
+    ours = partial(method.propose, points)
     yield Workload(ENCODER, "clinic", "cloud", ours, facts=facts)  # nobody writes it differently
 
 
 def decoders(subject: BenchSubject, _: float) -> Iterator[Workload]:
     """Labels of 1,000 to 400,000 queries, the cloud being encoded."""
     for preset in LABELLING:
-        asked = subject.occupancy(preset)
+        labeller = subject.occupancy(preset)
         whole: object = None  # seconds of the naive form, in the largest piece
         for count in _DECODED:
-            one = _decoder(asked, preset, count, whole)
+            one = _decoder(labeller, preset, count, whole)
             yield one
             whole = one.naive
 
 
-def _decoder(asked: OccupancyWorkload, preset: str, count: int, whole: object) -> Workload:
-    logits, queries = asked.asking(), asked.queries(count)
+def _decoder(labeller: OccupancyWorkload, preset: str, count: int, whole: object) -> Workload:
+    logits, queries = labeller.counted(), labeller.queries(count)
     first = queries[:IN_ONE_PIECE]
     scaled = count / len(first)
     known = whole if scaled != 1 and isinstance(whole, InterleavedTiming) else None
 
     def facts() -> dict:
         return {
-            "work": asked.decoder_work(count),
-            "naive_work": asked.naive_decoder_work(count),
-            "agreement": asked.agreement(asked.every_query(first)),
+            "work": labeller.decoder_work(count),
+            "naive_work": labeller.naive_decoder_work(count),
+            "agreement": labeller.agreement(labeller.every_query(first)),
             "note": "" if scaled == 1 else f"naive: that of {IN_ONE_PIECE:,}, scaled",
         }
 
     return Workload(
         DECODER, f"{preset}, {count:,} queries", "decoding",
         ours=lambda: logits(queries).argmax(-1),
-        naive=known or asked.naive_decoding(first),
+        naive=known or labeller.naive_decoding(first),
         naive_is=occupancy.NAIVE,
         naive_share=scaled,
         facts=facts,
@@ -103,11 +101,11 @@ def _decoder(asked: OccupancyWorkload, preset: str, count: int, whole: object) -
 
 def frames(subject: BenchSubject, _: float) -> Iterator[Workload]:
     """1,000 points to 40,000 labels."""
-    placed = subject.registration
+    registered = subject.registration
     yield Workload(
-        FRAME, "clinic", "frame", placed.ours, placed.naive, registration.NAIVE,
+        FRAME, "clinic", "frame", registered.ours, registered.naive, registration.NAIVE,
         facts=lambda: {
-            "work": placed.work(placed.estimate.report, QUERIES),
+            "work": registered.work(registered.estimate.report, QUERIES),
             "agreement": _inside_agreement(subject),
             "note": "`locate` without its volume: labels, probabilities, surfaces, report; "
             "agreement: points inside, at our motion, against inside tests",
@@ -118,63 +116,65 @@ def frames(subject: BenchSubject, _: float) -> Iterator[Workload]:
 
 
 def _inside_agreement(subject: BenchSubject) -> float:
-    placed = subject.registration
-    cloud = placed.estimate.cloud
-    back = placed.back(cloud.points_mm.astype(float))
-    return float((placed.plain.labels_where(back) == cloud.labels).mean())
+    registered = subject.registration
+    cloud = registered.estimate.cloud
+    back = registered.back(cloud.points_mm.astype(float))
+    return float((registered.plain.labels_where(back) == cloud.labels).mean())
 
 
-def occupancy_frames(asked: OccupancyWorkload, preset: str) -> Iterator[Workload]:
-    """As `locate` does it, and with every query asked."""
-    queries = asked.queries(QUERIES)
+def occupancy_frames(labeller: OccupancyWorkload, preset: str) -> Iterator[Workload]:
+    """As `locate` does it, and with every query labeller."""
+    queries = labeller.queries(QUERIES)
 
     def facts(every: bool) -> dict:
-        found, places = (asked.every_query(queries), QUERIES) if every else asked.our_frame(queries)
+        found, places = (
+            (labeller.every_query(queries), QUERIES) if every else labeller.our_frame(queries)
+        )
         return {
-            "work": asked.frame_work(places),
-            "naive_work": asked.naive_decoder_work(QUERIES),
-            "agreement": asked.agreement(found),
+            "work": labeller.frame_work(places),
+            "naive_work": labeller.naive_decoder_work(QUERIES),
+            "agreement": labeller.agreement(found),
             "others": {"asked": places},
             "note": "" if every else f"{places:,} places asked for {QUERIES:,} labels",
-            "device": asked.device,
+            "device": labeller.device,
         }
 
     every = Workload(
-        EVERY, preset, "frame", partial(asked.every_query, queries), facts=partial(facts, True)
+        EVERY, preset, "frame", partial(labeller.every_query, queries), facts=partial(facts, True)
     )
     one = Workload(
         FRAME, preset, "frame",
-        ours=partial(asked.our_frame, queries),
-        naive=asked.naive_frame(queries),
+        ours=partial(labeller.our_frame, queries),
+        naive=labeller.naive_frame(queries),
         naive_is=occupancy.NAIVE,
         facts=partial(facts, False),
         beside=(every,),
     )  # fmt: skip
     yield one
     assert isinstance(one.naive, InterleavedTiming)
-    asked.naive_frame_s = one.naive
+    labeller.naive_frame_s = one.naive
 
 
 def tracking(subject: BenchSubject, _: float) -> Iterator[Workload]:
     """From frame to frame: a cloud that moves by half a millimetre, to and fro."""
-    placed = subject.registration
-    ours = _LiveFrames(placed.tracker, placed.cloud.points_mm)
+    registered = subject.registration
+    ours = _LiveFrames(registered.tracker, registered.cloud.points_mm)
 
     def facts() -> dict:
         steps = ours.last.report["motion"]["steps"]
         note = f"steady state: {steps} refinement steps, points carried, surfaces, report"
-        return {"work": placed.work(ours.last.report, _CARRIED), "note": note}
+        return {"work": registered.work(ours.last.report, _CARRIED), "note": note}
 
     naive_is = registration.NAIVE + ", every frame from the start"
-    yield Workload(TRACKING, "clinic", "frame", ours, placed.naive, naive_is, facts=facts)
+    yield Workload(TRACKING, "clinic", "frame", ours, registered.naive, naive_is, facts=facts)
     for preset in LABELLING:
-        asked = subject.occupancy(preset)
-        known = asked.naive_frame_s
+        labeller = subject.occupancy(preset)
+        known = labeller.naive_frame_s
         beside = ", timed beside the row `frame`" if known else ""
         yield Workload(
             TRACKING, preset, "frame",
-            ours=_LiveFrames(Tracker(subject.model(preset)), asked.points_mm),
-            naive=known or asked.naive_frame(asked.queries(QUERIES)),
+            ours=_LiveFrames(Tracker(subject.model(preset)), labeller.points_mm),
+            naive=known or labeller.naive_frame(labeller.queries(QUERIES)),
             naive_is=f"{occupancy.NAIVE}; every frame from the start{beside}",
             facts=lambda: {"note": "steady state: labels, surfaces, report"},
         )  # fmt: skip
@@ -201,12 +201,12 @@ def volumes(subject: BenchSubject, _: float) -> Iterator[Workload]:
 
 
 def _registered_volume(subject: BenchSubject) -> Workload:
-    placed = subject.registration
-    anatomy = Anatomy(tuple(placed.estimate.meshes.values()))
+    registered = subject.registration
+    anatomy = Anatomy(tuple(registered.estimate.meshes.values()))
     grid = grid_over(anatomy.organ.vertices_mm, GRID)
     index, points = _slab(grid)
     voxels, faces = int(np.prod(grid[1])), sum(len(part.faces) for part in anatomy.parts)
-    motion, plain = placed.estimate.report["motion"], placed.plain
+    motion, plain = registered.estimate.report["motion"], registered.plain
     camera_from_ct, state = (np.array(motion[k]) for k in ("camera_from_ct", "coefficients"))
 
     def naive() -> np.ndarray:
@@ -233,10 +233,10 @@ def _registered_volume(subject: BenchSubject) -> Workload:
     )  # fmt: skip
 
 
-def occupancy_volume(asked: OccupancyWorkload, preset: str) -> Workload:
-    grid = organ_grid(asked, GRID)
+def occupancy_volume(labeller: OccupancyWorkload, preset: str) -> Workload:
+    grid = organ_grid(labeller, GRID)
     index, points = _slab(grid)
-    voxels, logits, labels = int(np.prod(grid[1])), asked.asking(), np.zeros(0, np.uint8)
+    voxels, logits, labels = int(np.prod(grid[1])), labeller.counted(), np.zeros(0, np.uint8)
 
     def filled() -> None:
         nonlocal labels
@@ -245,29 +245,29 @@ def occupancy_volume(asked: OccupancyWorkload, preset: str) -> Workload:
 
     def facts() -> dict:
         return {
-            "work": asked.decoder_work(logits.places, voxels),
-            "naive_work": asked.naive_decoder_work(voxels),
-            "agreement": float((asked.naive_labels(points) == labels[tuple(index.T)]).mean()),
+            "work": labeller.decoder_work(logits.places, voxels),
+            "naive_work": labeller.naive_decoder_work(voxels),
+            "agreement": float((labeller.naive_labels(points) == labels[tuple(index.T)]).mean()),
             "others": {"voxels": voxels, "asked": logits.places},
             "note": f"{logits.places:,} of {voxels:,} voxels asked",
-            "device": asked.device,
+            "device": labeller.device,
         }
 
     spread = f"{len(points):,} voxels spread over the volume, scaled"
     return Workload(
         VOLUME, preset, "volume",
         ours=filled,
-        naive=asked.naive_frame(points),
+        naive=labeller.naive_frame(points),
         naive_is=f"dense; {occupancy.NAIVE}; {spread}",
         naive_share=voxels / len(points),
         facts=facts,
     )  # fmt: skip
 
 
-def organ_grid(asked: OccupancyWorkload, grid: int) -> Grid:
+def organ_grid(labeller: OccupancyWorkload, grid: int) -> Grid:
     """Voxels over the organ, as `locate` lays them: about the points that are inside."""
-    queries = asked.queries(QUERIES)
-    return grid_over(queries[asked.every_query(queries) > 0], grid)
+    queries = labeller.queries(QUERIES)
+    return grid_over(queries[labeller.every_query(queries) > 0], grid)
 
 
 def _slab(grid: Grid) -> tuple[np.ndarray, np.ndarray]:

@@ -8,12 +8,12 @@ from functools import cached_property
 import numpy as np
 import torch
 
+from tumortrack.models.hardware import has_fast_bfloat16
 from tumortrack.occupancy.inference import Inference
+from tumortrack.occupancy.lattice import organ_lattice
 from tumortrack.occupancy.locator import steps_over
-from tumortrack.occupancy.network import OccupancyNetwork
-from tumortrack.occupancy.organ_lattice import organ_lattice
+from tumortrack.occupancy.model import OccupancyModel
 from tumortrack.occupancy.sparse import sparse_logits
-from tumortrack.training.model import Model, has_fast_bfloat16
 from tumortrack_lab.bench.counts import ball_flops, farthest_flops, module_flops, weight_bytes
 from tumortrack_lab.bench.naive.occupancy import NaiveOccupancy
 from tumortrack_lab.bench.rows import Precision, Work
@@ -31,14 +31,13 @@ class OccupancyWorkload:
 
     ``naive_frame_s``: of the naive form's frame, once that was measured."""
 
-    model: Model
+    model: OccupancyModel
     points_mm: np.ndarray
     device: str = "cpu"
     naive_frame_s: InterleavedTiming | None = None
     _labelled: dict[int, np.ndarray] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        assert isinstance(self.model.network, OccupancyNetwork)
         self.network = self.model.network.to(self.device)
         self.inference = Inference(self.network, self.model.arithmetic)
         self.plain = NaiveOccupancy(self.network)
@@ -118,34 +117,34 @@ class OccupancyWorkload:
 
     def naive_decoding(self, queries: np.ndarray) -> Call:
         """The cloud being encoded."""
-        asked = self.on_device(queries)
+        tensor = self.on_device(queries)
         with torch.inference_mode():
             encoded = self.plain.encode(self.cloud)
-        return torch.inference_mode()(lambda: self.plain.logits(encoded, asked).argmax(-1))
+        return torch.inference_mode()(lambda: self.plain.logits(encoded, tensor).argmax(-1))
 
     def naive_frame(self, queries: np.ndarray) -> Call:
-        asked = self.on_device(queries)
+        tensor = self.on_device(queries)
 
         @torch.inference_mode()
         def once() -> None:
-            self.plain.logits(self.plain.encode(self.cloud), asked).argmax(-1).cpu()
+            self.plain.logits(self.plain.encode(self.cloud), tensor).argmax(-1).cpu()
 
         return once
 
     def our_frame(self, queries: np.ndarray) -> tuple[np.ndarray, int]:
         """Labels as `locate` finds them, and how many places were asked for: logits on a lattice
         over the queries' box, linear between its points where that is plain, else asked."""
-        asked = self.asking()
+        logits = self.counted()
         box = np.stack([queries.min(0), queries.max(0)]).astype(float)
-        lattice = organ_lattice(asked, box, steps_over(box))
-        return sparse_logits(asked, lattice, queries).argmax(-1), asked.places
+        lattice = organ_lattice(logits, box, steps_over(box))
+        return sparse_logits(logits, lattice, queries).argmax(-1), logits.places
 
-    def asking(self) -> CountedQueries:
+    def counted(self) -> CountedQueries:
         return CountedQueries(self.inference, self.inference.encode(self.points_mm))
 
     def every_query(self, queries: np.ndarray) -> np.ndarray:
         """Labels by asking at every place."""
-        labels: np.ndarray = self.asking()(queries).argmax(-1).cpu().numpy()
+        labels: np.ndarray = self.counted()(queries).argmax(-1).cpu().numpy()
         return labels
 
 

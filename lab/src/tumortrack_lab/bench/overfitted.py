@@ -17,11 +17,13 @@ from torch.nn.functional import cross_entropy
 
 from tumortrack.core.types import Anatomy, SensorCloud
 from tumortrack.models.config import TrainConfig
+from tumortrack.models.hardware import has_fast_bfloat16
 from tumortrack.models.in_distribution import InDistributionRange
+from tumortrack.occupancy.model import OccupancyModel
 from tumortrack.occupancy.network import OccupancyNetwork
 from tumortrack.simulate.occupancy import OccupancyConfig, OccupancyPool
 from tumortrack.simulate.scene import RenderedScene
-from tumortrack.training.model import Model, has_fast_bfloat16, save_model
+from tumortrack.training.model import save_model
 
 _PER_SIDE = 600  # points in and outside of each part in a step
 _RATE = 1.5e-3
@@ -71,7 +73,11 @@ def overfit_scene(
     folder.mkdir(parents=True, exist_ok=True)
     organ = scene.carry(anatomy.organ.vertices_mm) - np.median(cloud.points_mm, axis=0)
     box = np.array([organ.min(0), organ.max(0)], float)
-    save_model(Model(network.eval(), config, anatomy.names, box, every, about), folder)
+    model = OccupancyModel(
+        network=network.eval(), config=config, parts=anatomy.names, query_box_mm=box,
+        familiar=every, provenance=about,
+    )  # fmt: skip
+    save_model(model, folder)
 
 
 def _settled(network: OccupancyNetwork, cloud: Tensor) -> list[Tensor]:

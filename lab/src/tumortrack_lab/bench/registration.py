@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from tumortrack.core.types import SensorCloud
+from tumortrack.registration.model import RegistrationModel
 from tumortrack.tracking.tracker import Tracker
-from tumortrack.training.model import Model
 from tumortrack_lab.bench.counts import flow_flops, refine_flops
 from tumortrack_lab.bench.naive.registration import NaiveRegistration
 from tumortrack_lab.bench.rows import Work
@@ -20,8 +20,7 @@ _FLOW_STEPS = 6
 class RegistrationWorkload:
     """A registration model with a cloud: ours and the naive form."""
 
-    def __init__(self, model: Model, cloud: SensorCloud, queries: int) -> None:
-        assert model.shape is not None
+    def __init__(self, model: RegistrationModel, cloud: SensorCloud, queries: int) -> None:
         self.model, self.shape, self.cloud = model, model.shape, cloud
         self.tracker, self.plain = Tracker(model), NaiveRegistration(model)
         self.estimate = self.tracker.locate(cloud, _NO_VOLUME, 0)

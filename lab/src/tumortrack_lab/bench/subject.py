@@ -21,13 +21,16 @@ from tumortrack.core.errors import ArtifactError, InputError
 from tumortrack.core.types import Anatomy, SensorCloud
 from tumortrack.imaging.surface import surfaces
 from tumortrack.models.config import TrainConfig
+from tumortrack.models.model import Model
+from tumortrack.occupancy.model import OccupancyModel
 from tumortrack.phantom.digital import PhantomParameters, phantom_labels
+from tumortrack.registration.model import RegistrationModel
 from tumortrack.sense.cloud import thin_cloud
 from tumortrack.sense.files import read_cloud
 from tumortrack.simulate.deform import DragConfig
 from tumortrack.simulate.elastic.body import ElasticBody
 from tumortrack.simulate.scene import RenderedScene, SceneConfig, SceneRecipe, Simulator
-from tumortrack.training.model import Model, load_model
+from tumortrack.training.model import load_model
 from tumortrack.training.run import TrainingRun
 from tumortrack.training.train import TrainingStatus, train
 from tumortrack_lab.bench.occupancy import OccupancyWorkload
@@ -67,23 +70,29 @@ class BenchSubject:
     @cached_property
     def body(self) -> ElasticBody:
         """The phantom's elastic body: the clinic model's."""
-        shape = self.model("clinic").shape
-        assert shape is not None
-        return shape.body
+        return self.clinic.shape.body
 
     def model(self, preset: str) -> Model:
         """The trained model of a preset, on the CPU."""
         return _loaded(self.model_folder(preset))
 
+    @property
+    def clinic(self) -> RegistrationModel:
+        model = self.model("clinic")
+        assert isinstance(model, RegistrationModel)
+        return model
+
     @cache  # noqa: B019 (a subject lives as long as its process)
     def occupancy(self, preset: str) -> OccupancyWorkload:
         """Of a preset: one for all groups of rows, whose naive form then labels its queries
         once."""
-        return OccupancyWorkload(self.model(preset), self.cloud(preset).points_mm)
+        model = self.model(preset)
+        assert isinstance(model, OccupancyModel)
+        return OccupancyWorkload(model, self.cloud(preset).points_mm)
 
     @cached_property
     def registration(self) -> RegistrationWorkload:
-        return RegistrationWorkload(self.model("clinic"), self.cloud("clinic"), QUERIES)
+        return RegistrationWorkload(self.clinic, self.cloud("clinic"), QUERIES)
 
     def model_folder(self, preset: str) -> Path:
         """Of the trained or given model of a preset."""

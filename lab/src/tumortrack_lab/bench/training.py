@@ -17,6 +17,8 @@ from msgspec.structs import replace
 from torch.nn import functional
 
 from tumortrack.core.allocator import keep_freed_memory
+from tumortrack.models.hardware import has_fast_bfloat16
+from tumortrack.occupancy.model import OccupancyModel
 from tumortrack.occupancy.network import OccupancyNetwork
 from tumortrack.simulate.dataset import SceneStream
 from tumortrack.simulate.deform import DragConfig, ElasticConfig
@@ -28,7 +30,7 @@ from tumortrack.simulate.occupancy import (
     PointSource,
 )
 from tumortrack.simulate.scene import SceneConfig, SceneRecipe, Simulator
-from tumortrack.training.model import has_fast_bfloat16, load_model
+from tumortrack.training.model import load_model
 from tumortrack.training.run import TrainingRun
 from tumortrack.training.state import TrainingState
 from tumortrack.training.train import TrainingStatus, train
@@ -145,7 +147,7 @@ def training_state(
     config = replace(subject.config(preset), batch_size=size)
     anatomy, body, known = subject.anatomy, None, {}
     points: PointSource
-    if config.network.warps:
+    if preset == "clinic":
         body, known = subject.body, subject.model(preset).network.state_dict()
         places = (known["points"] + known["center_ct"]).numpy()
         points = FixedPoints(places, np.zeros(len(places), np.uint8))
@@ -226,7 +228,8 @@ def on_device(subject: BenchSubject, device: Device, budget_s: float) -> Iterato
     included. Both forms bring their labels back to the host, which waits for the device."""
     for preset in LABELLING:
         model = load_model(subject.model_folder(preset), device)
-        asked = OccupancyWorkload(model, subject.cloud(preset).points_mm, device)
-        yield from occupancy_frames(asked, preset)
-        yield occupancy_volume(asked, preset)
+        assert isinstance(model, OccupancyModel)
+        labeller = OccupancyWorkload(model, subject.cloud(preset).points_mm, device)
+        yield from occupancy_frames(labeller, preset)
+        yield occupancy_volume(labeller, preset)
         yield whole_training(subject, preset, device, budget_s)
