@@ -50,6 +50,10 @@ class Scene:
     meta: dict = field(default_factory=dict)
     targets: Targets | None = None
 
+    def write(self, folder: str | Path) -> None:
+        """See ``write_scene``."""
+        write_scene(Path(folder), self)
+
 
 def write_scene(folder: Path, scene: Scene) -> None:
     """Write a scene folder, all or nothing.
