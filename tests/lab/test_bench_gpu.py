@@ -124,7 +124,7 @@ def test_every_workload_becomes_a_row(quick_model, clinic_model, tmp_path, monke
     by_name = dict(zip(found, rows, strict=True))
     one, two = (by_name[DECODER, f"quick, {count} queries"] for count in (100, 200))
     assert one.naive is not None
-    assert two.naive == one.naive.times(2)  # timed once, scaled
+    assert two.naive == one.naive.times(2.0)  # timed once, scaled
     assert by_name[TRACKING, "quick"].naive == by_name[FRAME, "quick"].naive
     assert by_name[VOLUME, "clinic"].agreement > 0.95
     assert by_name[FRAME, "clinic"].agreement > 0.95

@@ -13,8 +13,7 @@ from pathlib import Path
 
 from tumortrack.core.errors import TumortrackError
 from tumortrack.sense.files import write_cloud_ply
-from tumortrack_lab.bench.rows import BEFORE_TORCH, COMMAND, LARGE, PEAK, Workload
-from tumortrack_lab.bench.run import PRESETS
+from tumortrack_lab.bench.rows import BEFORE_TORCH, COMMAND, LARGE, PEAK, PRESETS, Workload
 from tumortrack_lab.bench.subject import BenchSubject
 from tumortrack_lab.bench.timing import timing_of
 

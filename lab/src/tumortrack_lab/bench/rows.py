@@ -12,6 +12,7 @@ import msgspec
 from tumortrack.core.config import Config
 from tumortrack_lab.bench.timing import Call, InterleavedTiming, interleaved
 
+PRESETS = ("clinic", "quick", "paper")
 # What rows are called.
 GENERATOR, ENCODER, DECODER = "generator", "encoder", "decoder"
 FRAME, EVERY, TRACKING = "frame", "frame, every query asked", "tracking frame"

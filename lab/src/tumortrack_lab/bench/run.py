@@ -22,13 +22,12 @@ import msgspec
 from tumortrack.core.config import Config, from_builtins
 from tumortrack.core.cores import available_cores
 from tumortrack.core.errors import TumortrackError
-from tumortrack_lab.bench.rows import BenchResult, BenchRow, Peaks, Point
+from tumortrack_lab.bench.rows import PRESETS, BenchResult, BenchRow, Peaks, Point
 
 if TYPE_CHECKING:  # with PyTorch, whose threads are settled when it is imported
     from tumortrack.training.train import TrainingStatus
     from tumortrack_lab.bench.subject import BenchSubject
 
-PRESETS = ("clinic", "quick", "paper")
 _TRAINING_S, _PEAKS_S, _CURVE_S = 60.0, 5.0, 20.0  # see ``_expected_s``
 
 

@@ -36,7 +36,7 @@ from tumortrack.training.train import TrainingStatus, train
 from tumortrack_lab.bench.occupancy import OccupancyWorkload
 from tumortrack_lab.bench.overfitted import overfit_scene
 from tumortrack_lab.bench.registration import RegistrationWorkload
-from tumortrack_lab.bench.run import PRESETS
+from tumortrack_lab.bench.rows import PRESETS
 
 UP = (0.0, -1.0, 0.0)
 SEED = 0
