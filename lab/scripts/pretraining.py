@@ -187,7 +187,7 @@ def _write(frame: pd.DataFrame, about: dict, writer: ReportWriter) -> None:
         + [seeds_text(rows[key], 2 if key == "miou" else 1) for key in TITLES]
         for (case, steps, pretrained), rows in frame.groupby(KEYS)
     ]
-    image = writer.image(BLOCK)
+    image = writer.image(f"results_{BLOCK}")
     _draw(frame, image)
     text = (
         f"`{writer.command}`: pretrained for {about['steps']:,} steps on {about['anatomies']} "

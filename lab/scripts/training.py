@@ -39,12 +39,13 @@ from tumortrack.registration.rest_shape import shape_of
 from tumortrack.report.drawing import new_figure, save
 from tumortrack.simulate.bodies import body_for
 from tumortrack.simulate.dataset import SceneStream
+from tumortrack.training.occupancy_task import ValidationSet
 from tumortrack.training.presets import PRESETS
 from tumortrack.training.run import TrainingRun, settle_end
 from tumortrack.training.scenes import batches
 from tumortrack.training.state import TrainingState
 from tumortrack.training.task import task_of
-from tumortrack.training.validate import ValidationScenes, ValidationSet, mean_iou_of
+from tumortrack.training.validate import ValidationScenes, mean_iou_of
 from tumortrack_lab.study.cases import phantom_case
 from tumortrack_lab.study.document import ReportWriter, table
 from tumortrack_lab.study.trainings import kept, make_command, run, unseen_scenes

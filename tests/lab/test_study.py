@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import runpy
 import signal
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -46,6 +47,7 @@ from tumortrack_lab.study.models import ABLATED, Presets, Trainer, train_config
 from tumortrack_lab.study.plan import FULL, QUICK, SECTIONS, Methods, StudyPlan, jobs_of
 from tumortrack_lab.study.report import gallery_block, section_blocks
 
+ROOT = Path(__file__).parents[2]
 TURN = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
 CAMERA_FROM_CT = rigid(TURN, np.array([3.0, -2, 130]))
 
@@ -282,9 +284,18 @@ def test_blocks_are_replaced_and_the_rest_stays():
 
 
 def test_the_document_has_a_place_for_every_section():
-    document = (Path(__file__).parents[2] / "docs" / "results.md").read_text(encoding="utf-8")
+    document = (ROOT / "docs" / "results.md").read_text(encoding="utf-8")
     names = [*SECTIONS, "gallery"]
     assert fill(document, {name: "x" for name in names}).count("\nx\n<!-- /results:") == len(names)
+
+
+@pytest.mark.parametrize("name", ["results", "pretraining", "training", "peers", "soak"])
+def test_scripts_are_imported_and_say_what_they_do(name, monkeypatch, capsys):
+    monkeypatch.setattr("sys.argv", [f"{name}.py", "--help"])
+    with pytest.raises(SystemExit) as stopped:
+        runpy.run_path(str(ROOT / "lab" / "scripts" / f"{name}.py"), run_name="__main__")
+    assert stopped.value.code == 0
+    assert "usage:" in capsys.readouterr().out
 
 
 def test_plans_name_what_there_is():
