@@ -37,8 +37,8 @@ from tumortrack.registration.network import RegistrationNetwork
 from tumortrack.registration.registration import Registration
 from tumortrack.registration.rest_shape import shape_of
 from tumortrack.report.drawing import new_figure, save
-from tumortrack.simulate.bodies import body_for
 from tumortrack.simulate.dataset import SceneStream
+from tumortrack.simulate.scene import body_for
 from tumortrack.training.occupancy_task import ValidationSet
 from tumortrack.training.presets import PRESETS
 from tumortrack.training.run import TrainingRun, settle_end

@@ -142,9 +142,8 @@ def simulate_scenes(
         ``targets`` (inner points in both frames), ``meta`` (``camera_from_ct``, the recipe).
     """
     from tumortrack.sense.noise import CLEAN, D405_NOISE
-    from tumortrack.simulate.bodies import body_for
     from tumortrack.simulate.deform import DragConfig, ElasticConfig
-    from tumortrack.simulate.scene import SceneConfig, SceneRecipe, Simulator
+    from tumortrack.simulate.scene import SceneConfig, SceneRecipe, Simulator, body_for
     from tumortrack.simulate.scene_folder import Scene
     from tumortrack.simulate.targets import Targets, draw_targets
 
@@ -156,7 +155,7 @@ def simulate_scenes(
     inner = draw_targets(case.anatomy, seed)
     scenes = []
     for index in range(count):
-        made = simulator.stage(SceneRecipe(seed, "test", index))
+        made = simulator.render(SceneRecipe(seed, "test", index))
         meta = {
             "camera_from_ct": made.camera_from_ct.tolist(),
             "recipe": {"seed": seed, "stream": "test", "index": index},

@@ -28,6 +28,7 @@ from tumortrack.simulate.scene import SceneConfig, SceneRecipe, Simulator
 from tumortrack.simulate.scene_folder import Scene, write_scene
 from tumortrack.training.presets import clinic, quick
 from tumortrack_lab.peers.base import Fit, estimate_of, rigid_carry
+from tumortrack_lab.peers.kinds import peer_kinds
 from tumortrack_lab.study import paper, tables
 from tumortrack_lab.study.bound import BOUNDS, Bound, BoundConfig, BoundMotion, laid_on
 from tumortrack_lab.study.cases import StudyCase, study_case
@@ -42,7 +43,7 @@ from tumortrack_lab.study.measure import (
     measure,
     point_errors,
 )
-from tumortrack_lab.study.methods import Answer, Method, peer_kinds, peer_method
+from tumortrack_lab.study.methods import Answer, Method, peer_method
 from tumortrack_lab.study.models import ABLATED, Presets, Trainer, train_config
 from tumortrack_lab.study.plan import FULL, QUICK, SECTIONS, Methods, StudyPlan, jobs_of
 from tumortrack_lab.study.report import gallery_block, section_blocks
@@ -329,7 +330,7 @@ def phantom(tmp_path_factory):
     case = write_phantom_case(root / "case")
     simulator = Simulator(case.anatomy, case.up_lps, SceneConfig(deform=(RestConfig(),)))
     for number, variant in enumerate(("D0", "D1")):
-        stage = simulator.stage(SceneRecipe(3, "test", number))
+        stage = simulator.render(SceneRecipe(3, "test", number))
         scene = Scene(stage.cloud, simulator.reference(stage), stage.frame)
         write_scene(root / "scenes" / f"{variant}-clean", scene)
     return study_case("phantom", root / "case", root / "scenes", is_paper=True)

@@ -33,7 +33,7 @@ from tumortrack.simulate.occupancy import labels_of
 from tumortrack.simulate.scene_folder import Scene, read_scene, write_scene
 from tumortrack.simulate.targets import Targets, draw_targets, read_targets
 from tumortrack_lab.twin.faults import faulty
-from tumortrack_lab.twin.variants import ViewConfig
+from tumortrack_lab.twin.views import ViewConfig
 
 
 def ball(radius_mm, center_mm=(0.0, 0.0, 0.0)):

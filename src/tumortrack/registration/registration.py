@@ -60,7 +60,9 @@ class Registration:
         device = next(self.network.parameters()).device
         cloud = torch.tensor(np.asarray(points_mm, np.float32), device=device)[None]
         with _one_thread() if device.type == "cpu" else nullcontext():
-            ways = sorted(self.network.both_ways(cloud), key=lambda way: -float(way.right_way))
+            ways = sorted(
+                self.network.flip_hypotheses(cloud), key=lambda way: -float(way.right_way)
+            )
         if float(ways[0].right_way - ways[1].right_way) > _SURE:
             ways = ways[:1]
         return [self._motion(way) for way in ways]

@@ -56,7 +56,7 @@ def encoders(subject: BenchSubject, _: float) -> Iterator[Workload]:
 
     @torch.inference_mode()
     def facts() -> dict:
-        flops = module_flops(lambda: method.network.both_ways(torch.tensor(points)[None]))
+        flops = module_flops(lambda: method.network.flip_hypotheses(torch.tensor(points)[None]))
         moved = weight_bytes(method.network, 4) + points.nbytes
         return {"work": Work(flops=flops, bytes=moved), "note": "both ways round"}
 

@@ -128,7 +128,7 @@ class BenchSubject:
     def scene(self) -> RenderedScene:
         """A scene of the phantom, dragged, without the sensor's faults."""
         config = SceneConfig(deform=(DragConfig(),))
-        return Simulator(self.anatomy, UP, config).stage(SceneRecipe(SEED, "test", 0))
+        return Simulator(self.anatomy, UP, config).render(SceneRecipe(SEED, "test", 0))
 
     def trained(self, preset: str) -> bool:
         """Whether there is a whole model of this version."""

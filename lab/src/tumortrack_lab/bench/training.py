@@ -83,7 +83,7 @@ def _generator(subject: BenchSubject, what: str, deform: object) -> Workload:
             simulator.pair(SceneRecipe(SEED, "train", next(index)), pool)
 
     def naive() -> None:
-        plain_pair(anatomy, simulator.stage(SceneRecipe(SEED, "train", next(index))), _LABELS)
+        plain_pair(anatomy, simulator.render(SceneRecipe(SEED, "train", next(index))), _LABELS)
 
     facts = {
         "work": generator_work(simulator, body),

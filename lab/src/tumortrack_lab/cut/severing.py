@@ -1,6 +1,5 @@
-"""Voxels that no longer hang together after a cut: faces between them are severed, not voxels
-taken out, so that a cut takes no tissue with it and leaves no way around a corner.
-
+"""Connected pieces of tissue after a cut. Faces between voxels are severed and no voxels removed,
+so that a cut has no volume and leaves no diagonal way through.
 """
 
 from __future__ import annotations
@@ -14,8 +13,8 @@ Flat = Float[np.ndarray, "_ 2"]
 Mask = Bool[np.ndarray, "i j"]
 Voxels = Bool[np.ndarray, "i j k"]
 
-# In voxels: no line that anyone draws then runs through a voxel's very centre, where rounding would
-# have to say which side it passes on. Closed lines so separate inside from outside.
+# In voxels: with this offset no line that anyone draws runs exactly through a voxel's centre, where
+# rounding would decide on which side it passes. So closed lines separate inside from outside.
 _ASIDE = 1e-7 * np.sqrt([2.0, 3.0])
 
 
@@ -68,8 +67,8 @@ def _crossings(path: Flat, shape: tuple[int, int]) -> Int[np.ndarray, "i j"]:
 
 
 def pieces_of(tissue: Voxels, severed: Severed) -> Int[np.ndarray, "i j k"]:
-    """What hangs together over faces that are not severed: 1 in the largest piece, 2, 3, ... in
-    the others, 0 where there is no tissue."""
+    """Pieces connected over faces that are not severed: 1 is the largest, then 2, 3, ...; 0 where
+    there is no tissue."""
     from scipy.ndimage import label
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components

@@ -25,7 +25,7 @@ from tumortrack.sense.render import Visibility
 from tumortrack.simulate.elastic.body import BodyConfig, ElasticBody, build_body
 from tumortrack.simulate.scene_folder import Scene
 from tumortrack_lab.peers.base import Fit, stopwatch
-from tumortrack_lab.peers.rigid_bound import kabsch, matched_vertices
+from tumortrack_lab.peers.rigid import kabsch, matched_vertices
 from tumortrack_lab.study.cases import StudyCase
 from tumortrack_lab.study.methods import Answer, Method, answer_of, code_sha256
 

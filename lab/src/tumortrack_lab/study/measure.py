@@ -31,7 +31,7 @@ from tumortrack.report.protocol import evaluate_scene
 from tumortrack.sense.camera import deproject
 from tumortrack.simulate.scene_folder import Scene, read_scene
 from tumortrack_lab.bench.machine import cpu_name
-from tumortrack_lab.peers.rigid_bound import kabsch
+from tumortrack_lab.peers.rigid import kabsch
 from tumortrack_lab.study.cases import StudyCase
 from tumortrack_lab.study.methods import Answer, Method
 
@@ -228,7 +228,7 @@ def about_answer(job: Job, answer: Answer | None) -> dict:
 
 def measure_one(job: Job) -> dict:
     """One measurement's numbers: the protocol's metrics, errors at points, target errors, times."""
-    from tumortrack_lab.twin.severity import MOVED, disturbed
+    from tumortrack_lab.twin.faults import MOVED, disturbed
 
     scene = read_scene(job.scene)
     if job.fault != "none":

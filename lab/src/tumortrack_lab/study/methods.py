@@ -10,19 +10,17 @@ import ast
 import hashlib
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import cached_property
-from importlib.metadata import version
 from pathlib import Path
-from typing import Any
 
 import msgspec
 
 import tumortrack
 import tumortrack_lab.peers
 from tumortrack.core import store
-from tumortrack.core.config import Config, to_builtins
+from tumortrack.core.config import to_builtins
 from tumortrack.core.errors import InputError
 from tumortrack.core.estimate import Estimate
 from tumortrack.core.motion import OneWay
@@ -32,7 +30,8 @@ from tumortrack.registration.model import RegistrationModel
 from tumortrack.simulate.scene_folder import Scene
 from tumortrack.tracking.tracker import Tracker
 from tumortrack.training.model import load_model
-from tumortrack_lab.peers.base import Fit, estimate_of
+from tumortrack_lab.peers.base import Fit, Peer, estimate_of
+from tumortrack_lab.peers.kinds import PeerKind, peer_kinds
 from tumortrack_lab.study.cases import StudyCase
 
 _LIVE_STAGES = ("encode", "coarse", "refine", "fine")  # of a live frame: without the dense volume
@@ -158,17 +157,6 @@ def without_refinement(model: Model) -> RegistrationModel:
     return replace(model, config=config, familiar=familiar, calibration=calibration)
 
 
-@dataclass(frozen=True)
-class PeerKind:
-    """How a peer is made: its class, its settings (None where it has none), and the packages and
-    the outside program that its answers depend on."""
-
-    make: Callable[..., Any]
-    config: Config | None = None
-    packages: tuple[str, ...] = ()
-    program_sha256: str | None = None
-
-
 @dataclass(frozen=True, eq=False)
 class PeerMethod(Method):
     """A peer of one patient as a method. Its identity names its settings, the peers' code by its
@@ -188,16 +176,14 @@ class PeerMethod(Method):
             "name": self.name,
             "settings": settings,
             "code_sha256": code_sha256(Path(tumortrack_lab.peers.__path__[0]).glob("*.py")),
-            "versions": {package: version(package) for package in self.kind.packages},
+            "versions": self.kind.versions,
             "tumortrack": tumortrack.__version__,
         }
 
     @cached_property
-    def peer(self) -> Any:  # a Peer
+    def peer(self) -> Peer:
         """Made ready for the patient."""
-        if self.kind.config is None:
-            return self.kind.make(self.case.anatomy_ct)
-        return self.kind.make(self.case.anatomy_ct, self.case.up_lps, self.kind.config)
+        return self.kind.made_for(self.case.anatomy_ct, self.case.up_lps)
 
     @property
     def prepare_s(self) -> float | None:
@@ -232,31 +218,3 @@ def peer_method(name: str, case: StudyCase, bcpd: Path | None = None) -> PeerMet
     if name not in kinds:
         raise InputError(f"peer {name!r} is unknown. Allowed: {', '.join(kinds)}.")
     return PeerMethod(name, kinds[name], case)
-
-
-def peer_kinds(bcpd: Path | None = None) -> dict[str, PeerKind]:
-    """Every peer there is; ``bcpd`` only with its program.
-
-    Raises:
-        InputError: the program does not exist.
-    """
-    from tumortrack_lab.peers.bcpd import Bcpd, BcpdConfig
-    from tumortrack_lab.peers.cpd import Cpd, CpdConfig
-    from tumortrack_lab.peers.elastic import ElasticPeer, ElasticPeerConfig
-    from tumortrack_lab.peers.rigid import Rigid, RigidConfig
-    from tumortrack_lab.peers.rigid_bound import RigidBound
-
-    icp = ("small_gicp",)
-    kinds = {
-        "rigid_bound": PeerKind(RigidBound),
-        "rigid": PeerKind(Rigid, RigidConfig(), icp),
-        "rigid_any_rotation": PeerKind(Rigid, RigidConfig(orientation="unknown"), icp),
-        "cpd": PeerKind(Cpd, CpdConfig(), ("pycpd", *icp)),
-        "elastic": PeerKind(ElasticPeer, ElasticPeerConfig(), ("pytetwild", "scipy", *icp)),
-    }
-    if bcpd is not None:
-        if not bcpd.is_file():
-            raise InputError(f"{bcpd} does not exist; give the built program of BCPD, or none.")
-        config = BcpdConfig(program=str(bcpd))
-        kinds["bcpd"] = PeerKind(Bcpd, config, icp, store.sha256_of(bcpd))
-    return kinds

@@ -22,7 +22,7 @@ from tumortrack_lab.study import paper
 from tumortrack_lab.study.frame import ORGAN, by_seed, groups, names, tumors
 from tumortrack_lab.study.measure import Job
 from tumortrack_lab.study.tables import FALLING, SEVERITIES, label_of, levels_of, spaced
-from tumortrack_lab.twin.severity import KINDS
+from tumortrack_lab.twin.faults import KINDS
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

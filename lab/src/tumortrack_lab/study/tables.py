@@ -20,7 +20,7 @@ from tumortrack_lab.study.frame import (
     tumors,
 )
 from tumortrack_lab.study.models import CLINIC
-from tumortrack_lab.twin.severity import KINDS, clean_level, parse
+from tumortrack_lab.twin.faults import KINDS, clean_level, parse
 
 METHODS = {
     "rigid_bound": "true rigid pose (bound)",

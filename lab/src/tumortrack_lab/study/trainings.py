@@ -15,9 +15,8 @@ from tumortrack.core import store
 from tumortrack.core.errors import TumortrackError
 from tumortrack.imaging.case import Case
 from tumortrack.models.config import TrainConfig
-from tumortrack.simulate.bodies import body_for
 from tumortrack.simulate.occupancy import organ_pool
-from tumortrack.simulate.scene import Simulator
+from tumortrack.simulate.scene import Simulator, body_for
 from tumortrack.training.validate import ValidationScenes, validation_scenes
 
 Options = TypeVar("Options")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 from jaxtyping import Float64
@@ -18,10 +18,12 @@ from tumortrack.sense.cloud import CloudConfig, cloud_from_depth
 from tumortrack.sense.noise import D405_NOISE, NoiseConfig, add_noise
 from tumortrack.sense.render import render_depth
 from tumortrack.simulate.scene_folder import Scene
-from tumortrack_lab.twin.props import Rod, add_background, occlude, shaft_over
+from tumortrack_lab.twin.apparatus import moved
+from tumortrack_lab.twin.contact import Rod, three
+from tumortrack_lab.twin.occluders import add_background, occlude, shaft_over
 
 View = Literal["clean", "noise", "shaft", "clutter"]
-VIEWS: tuple[View, ...] = ("clean", "noise", "shaft", "clutter")
+VIEWS: tuple[View, ...] = get_args(View)
 
 
 @dataclass(frozen=True)
@@ -33,15 +35,9 @@ class Variant:
 
 
 VARIANTS = {
-    "D0": Variant("D0"),
-    "D1": Variant("D1"),
-    "D2": Variant("D2"),
-    "D3": Variant("D3"),
-    "Rot90": Variant("D0", 90),
-    "Rot180": Variant("D0", 180),
-    "Rot270": Variant("D0", 270),
-    "G1": Variant("G1"),
-    "P1": Variant("P1"),
+    **{state: Variant(state) for state in ("D0", "D1", "D2", "D3")},
+    **{f"Rot{turn}": Variant("D0", turn) for turn in (90, 180, 270)},
+    **{state: Variant(state) for state in ("G1", "P1")},
 }
 
 
@@ -118,7 +114,7 @@ def camera_from_bench(config: ViewConfig, turn_degrees: int = 0) -> Float64[np.n
 
 
 def make_scene(
-    settled: EquilibriumState, name: str, view: View, config: ViewConfig, seed: int
+    state: EquilibriumState, name: str, view: View, config: ViewConfig, seed: int
 ) -> tuple[Scene, Float64[np.ndarray, "n 3"]]:
     """One variant's scene in one view, and the targets before its camera, mm.
 
@@ -130,16 +126,14 @@ def make_scene(
     """
     variant = VARIANTS[name]
     to_camera = camera_from_bench(config, variant.turn_degrees)
-    reference = Anatomy(
-        tuple(p.moved(transform_points(to_camera, p.vertices_mm)) for p in settled.anatomy.parts)
-    )
+    reference = moved(state.anatomy, to_camera)
     camera = d405(config.width, config.height)
     frame = render_depth(reference.organ.vertices_mm, reference.organ.faces, camera)
     pixels, _ = project(reference.organ.vertices_mm, camera)
     size = np.array([camera.width, camera.height])
     seen = {"in_image_share": float(((pixels > -0.5) & (pixels < size - 0.5)).all(1).mean())}
-    if "poke" in settled.report:
-        frame, seen["rod_covers_share"] = occlude(frame, _rod(settled.report["poke"], to_camera))
+    if "poke" in state.report:
+        frame, seen["rod_covers_share"] = occlude(frame, _rod(state.report["poke"], to_camera))
     rng = np.random.default_rng([seed, list(VARIANTS).index(name), VIEWS.index(view)])
     frame, more = _disturbed(frame, view, config, rng)
     cloud = cloud_from_depth(frame, config.crop, rng)
@@ -147,14 +141,14 @@ def make_scene(
         "variant": name,
         "view": view,
         "seed": seed,
-        "state": settled.report,
-        "camera_from_ct": (to_camera @ settled.bench_from_ct).tolist(),
+        "state": state.report,
+        "camera_from_ct": (to_camera @ state.bench_from_ct).tolist(),
         "camera_from_bench": to_camera.tolist(),
         "crop_mm": [config.near_mm, config.far_mm],
         "seen": {**seen, **more},
         "view_config": to_builtins(config),
     }
-    return Scene(cloud, reference, frame, meta), transform_points(to_camera, settled.targets_mm)
+    return Scene(cloud, reference, frame, meta), transform_points(to_camera, state.targets_mm)
 
 
 def _disturbed(
@@ -174,6 +168,6 @@ def _disturbed(
 
 def _rod(poke: dict, to_camera: Float64[np.ndarray, "4 4"]) -> Rod:
     """The bench's rod in the camera frame."""
-    x, y, z = transform_points(to_camera, np.array([poke["tip_mm"]], float))[0].tolist()
-    u, v, w = (to_camera[:3, :3] @ np.array(poke["axis"], float)).tolist()
-    return Rod((x, y, z), (u, v, w), float(poke["radius_mm"]))
+    tip_mm = transform_points(to_camera, np.array([poke["tip_mm"]], float))[0]
+    axis = to_camera[:3, :3] @ np.array(poke["axis"], float)
+    return Rod(three(tip_mm), three(axis), float(poke["radius_mm"]))

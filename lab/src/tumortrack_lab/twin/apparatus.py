@@ -15,7 +15,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Bool, Float, Float64
@@ -26,17 +25,9 @@ from tumortrack.core.geometry import rigid, rotation_onto, transform_points
 from tumortrack.core.types import Anatomy, Mesh
 from tumortrack.report.metrics import label_grid, surface_samples
 from tumortrack_lab.tets import TetMesh, embed, tetrahedralise
-from tumortrack_lab.twin.contact import Contact, ContactSurface, Packing, Support
-from tumortrack_lab.twin.equilibrium import (
-    Convergence,
-    EquilibriumProblem,
-    Hold,
-    settle,
-)
+from tumortrack_lab.twin.contact import Contact, Obstacles, Support
+from tumortrack_lab.twin.equilibrium import Convergence, EquilibriumProblem, Hold, settle
 from tumortrack_lab.twin.solid import NeoHookeanSolid
-
-if TYPE_CHECKING:
-    from scipy.sparse import csr_matrix
 
 GRAVITY_KPA_PER_MM = 9.81e-6  # of 1 kg/m^3
 
@@ -93,12 +84,7 @@ class Apparatus:
     ) -> None:
         self.config = config
         self.bench_from_ct = _bench_from_ct(anatomy_ct.organ, up_lps)
-        self.anatomy = Anatomy(
-            tuple(
-                part.moved(transform_points(self.bench_from_ct, part.vertices_mm))
-                for part in anatomy_ct.parts
-            )
-        )
+        self.anatomy = moved(anatomy_ct, self.bench_from_ct)
         self.mesh = tetrahedralise(self.anatomy.organ, config.edge_mm)
         ratio = 1 + (config.tumor_ratio - 1) * _tumor_share(self.mesh, self.anatomy)
         shear_kpa = config.youngs_kpa * ratio / (2 * (1 + config.poisson))
@@ -107,7 +93,10 @@ class Apparatus:
         self.contact = Contact(embed(self.mesh, points_mm), areas_mm2, config.contact_kpa_mm)
         volumes = self.solid.node_volumes_mm3
         self._weight_mn = config.density_kg_m3 * GRAVITY_KPA_PER_MM * volumes
-        self._packing = self._packed(points_mm, areas_mm2)
+        under = _faces_down(self.anatomy.organ, points_mm)
+        surface = embed(self.mesh, points_mm[under])
+        packing = Contact(surface, areas_mm2[under], config.packing_kpa_mm)
+        self._packing = packing, (Support(points_mm[under, 2]),)
         self._hold = Hold(self.mesh.nodes_mm, volumes / volumes.sum())
 
     def carry(
@@ -115,20 +104,11 @@ class Apparatus:
     ) -> Float64[np.ndarray, "m 3"]:
         """Points in or on the organ (CT frame) at their place on the bench, mm."""
         points = transform_points(self.bench_from_ct, np.asarray(points_ct, np.float64))
-        moved = embed(self.mesh, points)
         # The displacement is carried, not the point: D0 is then exact to the last digit.
-        return points + moved.carry(state.nodes_mm - self.mesh.nodes_mm)
-
-    def _packed(
-        self, points_mm: np.ndarray, areas_mm2: np.ndarray
-    ) -> tuple[Contact, tuple[ContactSurface, ...]]:
-        under = _faces_down(self.anatomy.organ, points_mm)
-        surface = embed(self.mesh, points_mm[under])
-        contact = Contact(surface, areas_mm2[under], self.config.packing_kpa_mm)
-        return contact, (Packing(points_mm[under, 2]),)
+        return points + embed(self.mesh, points).carry(state.nodes_mm - self.mesh.nodes_mm)
 
     def settle(
-        self, nodes_mm: np.ndarray, obstacles: tuple[ContactSurface, ...], weight: float = 0.0
+        self, nodes_mm: np.ndarray, obstacles: Obstacles, weight: float = 0.0
     ) -> tuple[np.ndarray, Convergence]:
         """One load step: the nodes at rest in their bed among obstacles, under so many weights
         more than in the CT.
@@ -136,10 +116,10 @@ class Apparatus:
         Raises:
             TumortrackError: no equilibrium was found.
         """
-        load = weight * self._weight_mn
         contacts = ((self.contact, (Support(), *obstacles)), self._packing)
-        problem = EquilibriumProblem(self.solid, contacts, load, self._hold)
-        return settle(problem, nodes_mm, self._stiffness)
+        load_mn = weight * self._weight_mn
+        problem = EquilibriumProblem(self.solid, contacts, load_mn, self._hold)
+        return settle(problem, nodes_mm)
 
     def midsection(self, nodes_mm: np.ndarray) -> tuple[float, float]:
         """Lowest and highest z of the surface under the middle half of the plate, mm."""
@@ -157,9 +137,18 @@ class Apparatus:
         at_rest = self.contact.surface.carry(self.mesh.nodes_mm)
         return np.abs(at_rest[:, 0]) < self.config.plate_mm / 4
 
-    @cached_property
-    def _stiffness(self) -> csr_matrix:
-        return self.solid.rest_stiffness()
+
+def moved(anatomy: Anatomy, b_from_a: Float64[np.ndarray, "4 4"]) -> Anatomy:
+    """An anatomy in another frame."""
+    return Anatomy(
+        tuple(part.moved(transform_points(b_from_a, part.vertices_mm)) for part in anatomy.parts)
+    )
+
+
+def triangles(mesh: Mesh) -> tuple[Float64[np.ndarray, "f 3"], Float64[np.ndarray, "f 3"]]:
+    """Each triangle's middle and outward normal, twice its area long."""
+    a, b, c = (mesh.vertices_mm[mesh.faces[:, i]] for i in range(3))
+    return (a + b + c) / 3, np.cross(b - a, c - a)
 
 
 def _bench_from_ct(organ_ct: Mesh, up_lps: tuple[float, float, float]) -> np.ndarray:
@@ -188,10 +177,9 @@ def _faces_down(
     """Which points of the surface lie on its underside, where the slope is at most so much."""
     from scipy.spatial import cKDTree
 
-    a, b, c = (organ.vertices_mm[organ.faces[:, i]] for i in range(3))
-    normal = np.cross(b - a, c - a)
+    middle, normal = triangles(organ)
     down = -normal[:, 2] > np.linalg.norm(normal, axis=1) / np.hypot(1, steepest)
-    return np.asarray(down[cKDTree((a + b + c) / 3).query(points_mm)[1]])
+    return np.asarray(down[cKDTree(middle).query(points_mm)[1]])
 
 
 def _tumor_share(mesh: TetMesh, anatomy: Anatomy) -> Float64[np.ndarray, " t"]:

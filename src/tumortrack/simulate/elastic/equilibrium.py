@@ -8,42 +8,44 @@ that the last one left closed. Lengths in mm, stress in N/mm2 (1 kPa = 1e-3).
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numba
 import numpy as np
 from jaxtyping import Float64
 
 from tumortrack.simulate.elastic.finite import LatticeSolid
-from tumortrack.simulate.elastic.modes import Modes
-from tumortrack.simulate.elastic.surface import Patches
+from tumortrack.simulate.elastic.modes import Patches
 
 KPA = 1e-3  # N/mm2
-LEVER_MM = 50.0  # a rigid turn's unknown is the motion at this arm
+LEVER_MM = 50.0  # a rotation's unknown is the motion at this lever arm
 _FREE = 1e-4  # N/mm: keeps the rigid motions solvable where nothing touches
 _MOST_STEPS = 20
-_SETTLED_MM = 1e-2
+_CONVERGED_MM = 1e-2
 
 
 class ReducedModel:
     """A solid in the space of its modes and six rigid motions (k + 6 unknowns)."""
 
-    def __init__(self, solid: LatticeSolid, modes: Modes, patches: Patches) -> None:
-        k, n = modes.shapes.shape[1], len(solid.nodes)
+    def __init__(
+        self, solid: LatticeSolid, modes: Float64[np.ndarray, "f k"], patches: Patches
+    ) -> None:
+        k, n = modes.shape[1], len(solid.nodes)
         self.solid, self.modes, self.patches = solid, modes, patches
         self.n_modes = k
-        weights = solid.lattice.weights(patches.points_mm)[:, solid.nodes]
-        bent = (weights @ modes.shapes.reshape(n, -1)).reshape(-1, 3, k)
+        weights = solid.weights(patches.points_mm)
+        bent = (weights @ modes.reshape(n, -1)).reshape(-1, 3, k)
         arms = (patches.points_mm - solid.center_mm) / LEVER_MM
         turned = np.stack([np.cross(axis, arms) for axis in np.eye(3)], -1)
         shifted = np.broadcast_to(np.eye(3), turned.shape)
         self.moves = np.concatenate([bent, shifted, turned], -1)  # (p, 3, k + 6)
         volume = solid.volume_mm3
-        mean = np.tensordot(volume, modes.shapes.reshape(n, 3, k), 1)
+        mean = np.tensordot(volume, modes.reshape(n, 3, k), 1)
         rigid = np.concatenate([np.eye(3) * volume.sum(), np.zeros((3, 3))], 1)
         self.volume_moves = np.concatenate([mean, rigid], 1)  # (3, k + 6), mm3
-        self.swelling = np.append(modes.shapes.T @ solid.swelling, np.zeros(6))
-        self._tissue = modes.shapes.T @ (solid.stiffness(solid.organ) @ modes.shapes)
-        self._tumors = modes.shapes.T @ (solid.stiffness(solid.tumor) @ modes.shapes)
+        self.swelling = np.append(modes.T @ solid.swelling, np.zeros(6))
+        self._tissue = modes.T @ (solid.stiffness(solid.organ) @ modes)
+        self._tumors = modes.T @ (solid.stiffness(solid.tumor) @ modes)
 
     def stiffness(self, modulus: float, contrast: float) -> Float64[np.ndarray, "m m"]:
         """For the tissue's Young's modulus (N/mm2) and how many times stiffer the tumors are."""
@@ -58,6 +60,14 @@ class ReducedModel:
         return np.einsum("d,pdm->pm", direction, self.moves)
 
 
+class Contacts(NamedTuple):
+    """Springs that push where ``depth_mm + rows @ z`` is above zero."""
+
+    rows: Float64[np.ndarray, "p m"]
+    depth_mm: Float64[np.ndarray, " p"]
+    springs: Float64[np.ndarray, " p"]  # N/mm
+
+
 @dataclass(eq=False)
 class ReducedProblem:
     """What acts on the organ, gathered by the loads: energy z' H z / 2 - g z + springs' energy."""
@@ -67,32 +77,30 @@ class ReducedProblem:
     modulus: float  # of the tissue, N/mm2
     stiffness: Float64[np.ndarray, "m m"]  # H
     forces: Float64[np.ndarray, " m"]  # g
-    one_sided: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = field(default_factory=list)
+    contacts: list[Contacts] = field(default_factory=list)
 
     def touch(self, rows: np.ndarray, depth_mm: np.ndarray, springs: np.ndarray) -> None:
-        """Springs (N/mm) that push where ``depth_mm + rows @ z`` is above zero."""
+        """Add ``Contacts`` with springs in N/mm."""
         near = springs > 0
-        self.one_sided.append((rows[near], depth_mm[near], springs[near]))
+        self.contacts.append(Contacts(rows[near], depth_mm[near], springs[near]))
 
     def tie(self, rows: np.ndarray, target_mm: np.ndarray | float, springs: np.ndarray) -> None:
         """Springs (N/mm) that hold ``rows @ z`` at a target, both ways."""
-        add_springs(self.stiffness, self.forces, rows, springs * target_mm, springs)
+        _add_springs(self.stiffness, self.forces, rows, springs * target_mm, springs)
+
+    def equilibrium(self) -> Float64[np.ndarray, " m"] | None:
+        """The unknowns at rest; None where the contacts do not converge."""
+        none = Contacts(np.zeros((0, len(self.forces))), np.zeros(0), np.zeros(0))
+        contacts = Contacts(*map(np.concatenate, zip(none, *self.contacts, strict=True)))
+        z, converged = _equilibrium(self.stiffness, self.forces, contacts)
+        return z if converged else None
 
 
-def settle(problem: ReducedProblem) -> Float64[np.ndarray, " m"] | None:
-    """The unknowns at rest; None where the contacts do not come to rest."""
-    none = (np.zeros((0, len(problem.forces))), np.zeros(0), np.zeros(0))
-    rows, depth, springs = (
-        np.concatenate(parts) for parts in zip(none, *problem.one_sided, strict=True)
-    )
-    z, settled = _settle(problem.stiffness, problem.forces, rows, depth, springs)
-    return z if settled else None
-
-
-# Own loops for all that is small: BLAS would ask every thread to each product, which on a busy
+# Own loops for small matrices: BLAS would wake every thread for each product, which on a busy
 # machine takes many times longer than the product; and most springs are open.
 @numba.njit(cache=True, nogil=True)
-def _settle(stiffness, forces, rows, depth, springs):  # type: ignore[no-untyped-def]
+def _equilibrium(stiffness, forces, contacts):  # type: ignore[no-untyped-def]
+    rows, depth, springs = contacts.rows, contacts.depth_mm, contacts.springs
     z = np.zeros(len(forces))
     for step in range(_MOST_STEPS):
         closed, loads = np.zeros(len(rows)), np.zeros(len(rows))
@@ -104,20 +112,20 @@ def _settle(stiffness, forces, rows, depth, springs):  # type: ignore[no-untyped
                 closed[p] = springs[p]
                 loads[p] = -springs[p] * depth[p]
         matrix, found = stiffness.copy(), forces.copy()
-        add_springs(matrix, found, rows, loads, closed)
+        _add_springs(matrix, found, rows, loads, closed)
         _solve(matrix, found)
         farthest = 0.0
         for a in range(len(z)):
             move = found[a] - z[a]
             farthest = max(farthest, abs(move))
             z[a] += move if step < 6 else 0.6 * move  # contacts that open and close in turns
-        if farthest < _SETTLED_MM:
+        if farthest < _CONVERGED_MM:
             return found, True
     return z, False
 
 
 @numba.njit(cache=True, nogil=True)
-def add_springs(matrix, right, rows, loads, springs):  # type: ignore[no-untyped-def]
+def _add_springs(matrix, right, rows, loads, springs):  # type: ignore[no-untyped-def]
     """matrix += rows' diag(springs) rows and right += rows' loads, in place."""
     for p in range(len(rows)):
         if springs[p] == 0.0:
