@@ -34,13 +34,13 @@ from tumortrack.registration.registration import Registration
 from tumortrack.registration.rest_shape import RestShape, shape_of
 from tumortrack.report.drawing import new_figure, save
 from tumortrack.simulate.dataset import SceneStream
-from tumortrack.training.head_start import HeadStart, load_start
+from tumortrack.training.model import PretrainedWeights, load_start
 from tumortrack.training.presets import clinic
 from tumortrack.training.registration_task import RegistrationTask
 from tumortrack.training.run import TrainingRun
 from tumortrack.training.scenes import batches
 from tumortrack.training.state import TrainingState
-from tumortrack.training.validate import ValidationScenes, mean_iou_of
+from tumortrack.training.task import ValidationScenes, mean_iou_of
 from tumortrack_lab.study.cases import named_folders, phantom_case
 from tumortrack_lab.study.document import ReportWriter, table
 from tumortrack_lab.study.frame import text as seeds_text
@@ -109,7 +109,11 @@ def main(options: Options) -> None:
 
 
 def _curve(
-    case: Case, scenes: ValidationScenes, start: HeadStart, seed: int, lengths: tuple[int, ...]
+    case: Case,
+    scenes: ValidationScenes,
+    start: PretrainedWeights,
+    seed: int,
+    lengths: tuple[int, ...],
 ) -> list[dict]:
     """All trainings of one case and seed, side by side over the same batches."""
     device, config = torch.device("cpu"), clinic(case.anatomy)
@@ -121,9 +125,9 @@ def _curve(
     for length in lengths:
         for pretrained in (False, True):
             state = TrainingState(replace(training, steps=max(length, 1)), device)
-            state.know(task.teach)
+            state.initialize(task.initialize)
             if pretrained:
-                state.know(lambda network: carry_over(network, start.weights, upright))
+                state.initialize(lambda network: carry_over(network, start.weights, upright))
             states[length, pretrained] = state
     stream = SceneStream(
         case.anatomy, case.up_lps, config.scene, task.points, seed, "train", config.batch_size,

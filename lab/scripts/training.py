@@ -27,7 +27,7 @@ from msgspec.structs import replace
 
 from tumortrack.cli.console import say
 from tumortrack.core import store
-from tumortrack.core.allocator import keep_freed_memory
+from tumortrack.core.process import keep_freed_memory
 from tumortrack.imaging.case import Case, load_case
 from tumortrack.models.config import GaussNewtonConfig, TrainConfig
 from tumortrack.models.model import Network
@@ -39,13 +39,13 @@ from tumortrack.registration.rest_shape import shape_of
 from tumortrack.report.drawing import new_figure, save
 from tumortrack.simulate.dataset import SceneStream
 from tumortrack.simulate.scene import body_for
-from tumortrack.training.occupancy_task import ValidationSet
+from tumortrack.training.occupancy_task import label_miou
 from tumortrack.training.presets import PRESETS
 from tumortrack.training.run import TrainingRun, settle_end
 from tumortrack.training.scenes import batches
 from tumortrack.training.state import TrainingState
-from tumortrack.training.task import task_of
-from tumortrack.training.validate import ValidationScenes, mean_iou_of
+from tumortrack.training.task import ValidationScenes, mean_iou_of
+from tumortrack.training.train import task_of
 from tumortrack_lab.study.cases import phantom_case
 from tumortrack_lab.study.document import ReportWriter, table
 from tumortrack_lab.study.trainings import kept, make_command, run, unseen_scenes
@@ -149,7 +149,7 @@ def _curve(case: Case, setting: Setting, judge: Judge, options: Options) -> list
     )
     task = task_of(training, CPU)
     state = TrainingState(training, CPU)
-    state.know(task.teach)
+    state.initialize(task.initialize)
     stream = SceneStream(
         case.anatomy, case.up_lps, config.scene, task.points, setting.seed, "train",
         setting.batch, task.body,
@@ -195,7 +195,7 @@ class Judge:
     def _miou(self, network: Network, scenes: ValidationScenes) -> float:
         network.eval()
         if isinstance(network, OccupancyNetwork):
-            return ValidationSet(scenes, self._parts, CPU).miou(network)
+            return label_miou(network, scenes, self._parts, CPU)
         assert isinstance(network, RegistrationNetwork)
         assert self._shape is not None
         guesses = []

@@ -8,6 +8,7 @@ import msgspec
 import numpy as np
 import pytest
 import torch
+from tumortrack.occupancy.mlp_decoder import MlpDecoder
 
 from clock import Clock
 from stories import tumortrack
@@ -16,7 +17,6 @@ from tumortrack.core.types import Anatomy, Mesh
 from tumortrack.models.config import MlpDecoderConfig, NetworkConfig
 from tumortrack.models.encoders.pointnet2 import PointNet2Config, SetAbstraction
 from tumortrack.models.normalisation import CloudBox
-from tumortrack.occupancy.mlp_decoder import MlpDecoder
 from tumortrack.occupancy.network import OccupancyNetwork
 from tumortrack.training.presets import quick_network
 from tumortrack_lab.bench import timing as interleaving
@@ -31,7 +31,7 @@ from tumortrack_lab.bench.run import GROUPS, BenchRequest, Task, TaskMessage, ca
 from tumortrack_lab.bench.subject import BenchSubject
 from tumortrack_lab.bench.timing import InterleavedTiming, Uncounted, interleaved, timing_of
 from tumortrack_lab.cli import bench as benching
-from tumortrack_lab.cli.bench import BenchOptions
+from tumortrack_lab.cli.bench import Bench
 from tumortrack_lab.study.document import closing, opening
 
 PAPER_DECODER = MlpDecoderConfig(
@@ -265,7 +265,7 @@ if "encoder" in task["groups"]:
 def test_the_command_gathers_what_processes_find(tmp_path, monkeypatch, capfd) -> None:
     monkeypatch.setattr(benching, "_WORKER", [sys.executable, "-c", WORKER])
     out = tmp_path / "new" / "found.json"
-    benching.bench(BenchOptions(only=("generator", "planning"), quick=True, out=out))
+    Bench(only=("generator", "planning"), quick=True, out=out).run()
     found = json.loads(out.read_text())
     assert [row["name"] for row in found["rows"]] == ["generator", "planning"]
     assert found["machine"] == {"date": "today"}
@@ -278,7 +278,7 @@ def test_the_command_gathers_what_processes_find(tmp_path, monkeypatch, capfd) -
     assert first.endswith(" left")
     assert "; naive 4.00 s, 2.00 x; about " in second
     with pytest.raises(TumortrackError, match="the encoder is broken"):
-        benching.bench(BenchOptions(only=("encoder",), out=tmp_path / "none.json"))
+        Bench(only=("encoder",), out=tmp_path / "none.json").run()
     assert not (tmp_path / "none.json").exists()
 
 
@@ -298,17 +298,15 @@ def test_each_process_has_its_own_threads_and_only_needed_models_are_trained(tmp
 def test_what_cannot_be_measured_is_refused(tmp_path) -> None:
     assert "nonsense" in tumortrack("bench", "--only", "nonsense").stderr
     with pytest.raises(InputError, match="belong together"):
-        benching.bench(BenchOptions(model=tmp_path))
+        Bench(model=tmp_path).run()
     with pytest.raises(InputError, match="cannot be read"):
-        benching.bench(BenchOptions(document=tmp_path / "none.md"))
+        Bench(document=tmp_path / "none.md").run()
     (tmp_path / "bare.md").write_text("no markers")
     with pytest.raises(InputError, match="results:goals"):
-        benching.bench(BenchOptions(document=tmp_path / "bare.md"))
+        Bench(document=tmp_path / "bare.md").run()
 
 
 def test_the_command_line_names_every_part() -> None:
     from typing import get_args, get_type_hints
 
-    from tumortrack_lab.cli.commands import bench as command
-
-    assert set(get_args(get_args(get_type_hints(command)["only"])[0])) == set(GROUPS)
+    assert set(get_args(get_args(get_type_hints(Bench)["only"])[0])) == set(GROUPS)

@@ -81,6 +81,7 @@ def test_rows_of_a_gpu_are_measured_on_any_device(quick_model, tmp_path, monkeyp
     assert found[TRAINING].per_s > 0
 
 
+@pytest.mark.slow
 def test_every_workload_becomes_a_row(quick_model, clinic_model, tmp_path, monkeypatch) -> None:
     for module in (networks, training):
         monkeypatch.setattr(module, "LABELLING", ("quick",))

@@ -17,8 +17,8 @@ import trimesh
 from stories import write_phantom_case
 from tumortrack.core import store
 from tumortrack.core.errors import ArtifactError, InputError, NoEstimate
+from tumortrack.core.estimate import OneWay
 from tumortrack.core.geometry import rigid
-from tumortrack.core.motion import OneWay
 from tumortrack.core.types import Anatomy, Mesh, SensorCloud
 from tumortrack.simulate.deform import RestConfig
 from tumortrack.simulate.deform.drag import CONFIGURATIONS

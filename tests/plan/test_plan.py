@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 
 from plan_objects import HALF_MM, MIDDLE_MM, RADIUS_MM, TUMOR_MM, located, sphere
 from tumortrack.core.errors import InputError, NoPlan
-from tumortrack.core.solids import mesh_of, solid_of
 from tumortrack.core.types import Anatomy, Mesh
+from tumortrack.imaging.meshes import mesh_of, solid_of
 from tumortrack.plan.config import ResectionConfig
 from tumortrack.plan.files import as_builtins, from_plain
 from tumortrack.plan.outline import arcs, concave_hull, evenly, grown, polygon_of

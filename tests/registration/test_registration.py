@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from elastic_objects import CENTER, RADII, UP
 from tumortrack.core.errors import InputError
-from tumortrack.core.motion import Motion
+from tumortrack.core.estimate import Motion
 from tumortrack.core.types import Mesh
 from tumortrack.models.config import GaussNewtonConfig
 from tumortrack.models.encoders.heightmap import HeightMapConfig, _spread, _spread_compiled, picture

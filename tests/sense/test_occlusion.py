@@ -11,10 +11,9 @@ from render_objects import anatomy
 from tumortrack.core.config import from_builtins, identity, to_builtins
 from tumortrack.core.errors import InputError
 from tumortrack.core.types import DepthFrame
-from tumortrack.sense import occlusion_kernels as kernels
-from tumortrack.sense.calibration import CalibrationConfig, miscalibrate
+from tumortrack.sense import kernels
 from tumortrack.sense.clutter import ClutterConfig
-from tumortrack.sense.noise import D405_NOISE
+from tumortrack.sense.noise import D405_NOISE, CalibrationConfig, miscalibrate
 from tumortrack.sense.occlusion import OcclusionConfig, occlude
 from tumortrack.simulate import scene as scene_module
 from tumortrack.simulate.dataset import SceneStream
@@ -69,7 +68,7 @@ def test_a_shaft_is_as_wide_as_asked_and_ends_at_its_tip(seed):
     rng = np.random.default_rng(seed)
     angle = rng.uniform(0, 2 * np.pi)
     towards = np.array([np.cos(angle), np.sin(angle)])
-    columns, rows, _ = kernels.seen_pixels(dome().depth_mm)
+    rows, columns = np.divmod(kernels.seen_pixels(dome().depth_mm).pixels, dome().intrinsics.width)
     tip = np.array([SMALL.cx, SMALL.cy])
     order = kernels.order_shaft(columns, rows, tip, towards, 7.0, 0.0)
     inside = np.isfinite(order)

@@ -13,9 +13,8 @@ from motions import Wave
 from stories import succeeded, tumortrack, write_phantom_case
 from tumortrack.core.config import to_builtins
 from tumortrack.core.errors import InputError, NoEstimate
-from tumortrack.core.estimate import Estimate
+from tumortrack.core.estimate import Estimate, OneWay
 from tumortrack.core.geometry import transform_points
-from tumortrack.core.motion import OneWay
 from tumortrack.core.types import (
     Anatomy,
     CameraLabels,

@@ -22,7 +22,7 @@ from tumortrack.core.types import Mesh
 from tumortrack.plan.config import ResectionConfig
 from tumortrack.plan.motions import JOINTS, Motions, MotionStage
 from tumortrack.plan.values import Cut, CutLayer, Located, ResectionPlan
-from tumortrack.sense.ply import framed_ply
+from tumortrack.sense.ply import cloud_ply
 
 KIND = "plan"
 _NAME, _STROKES, _MOTIONS = "plan.json", "strokes.ply", "motions.safetensors"
@@ -185,7 +185,7 @@ def _strokes(plan: ResectionPlan) -> bytes:
         "stroke": of_points(range(1, len(cuts) + 1), np.int32),
         "floor": of_points((cut.kind == "floor" for cut in cuts), np.uint8),
     }
-    return framed_ply(np.concatenate(points), properties, "table (z up)")
+    return cloud_ply(np.concatenate(points), properties, "table (z up)")
 
 
 def _write_motions(path: Path, motions: Motions) -> None:

@@ -11,9 +11,9 @@ from jaxtyping import Float, Float64
 from scipy.spatial import cKDTree
 
 from tumortrack.core.errors import ArtifactError, InputError
+from tumortrack.core.estimate import Motion
 from tumortrack.core.geometry import rigid, transform_points
 from tumortrack.core.mesh_files import read_mesh
-from tumortrack.core.motion import Motion
 from tumortrack.core.store import read_json, read_manifest
 from tumortrack.core.types import Mesh, OccupancyCloud
 from tumortrack.plan.values import Located, name_of

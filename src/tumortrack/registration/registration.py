@@ -22,7 +22,7 @@ import torch
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from tumortrack.core.parallel import share
+from tumortrack.core.process import parallel_for
 from tumortrack.models.config import GaussNewtonConfig
 from tumortrack.registration.gauss_newton import GaussNewton, RegistrationResult
 from tumortrack.registration.motion import ElasticMotion
@@ -108,7 +108,7 @@ def _run_all(runners: list[GaussNewton], steps: int) -> None:
         for runner in runners[part]:
             runner.run(steps)
 
-    share(run, len(runners), 1)
+    parallel_for(run, len(runners), 1)
 
 
 @contextmanager

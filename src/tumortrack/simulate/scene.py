@@ -20,11 +20,10 @@ from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError, NoEstimate, TumortrackError
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.types import Anatomy, DepthFrame, Mesh, OccupancySamples, SensorCloud
-from tumortrack.sense.calibration import CalibrationConfig, miscalibrate
 from tumortrack.sense.camera import d405, project
 from tumortrack.sense.cloud import FEWEST_POINTS, CloudConfig, cloud_from_depth
 from tumortrack.sense.clutter import ClutterConfig, add_clutter
-from tumortrack.sense.noise import NoiseConfig, add_noise
+from tumortrack.sense.noise import CalibrationConfig, NoiseConfig, add_noise, miscalibrate
 from tumortrack.sense.occlusion import OcclusionConfig, occlude
 from tumortrack.sense.render import Visibility, render_depth
 from tumortrack.simulate import deform as deformations

@@ -14,9 +14,9 @@ import numpy as np
 
 from tumortrack.core.errors import InputError
 from tumortrack.core.mesh_files import read_anatomy, write_anatomy
-from tumortrack.core.solids import mesh_of, solid_of
 from tumortrack.core.store import new_folder, read_json, write_json
 from tumortrack.core.types import Anatomy, DepthFrame, SensorCloud
+from tumortrack.imaging.meshes import mesh_of, solid_of
 from tumortrack.sense.files import (
     read_cloud,
     read_depth_png,

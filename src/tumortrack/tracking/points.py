@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float, Float64
 
 from tumortrack.core.errors import InputError, NoEstimate
-from tumortrack.core.motion import Motion
+from tumortrack.core.estimate import Motion
 
 FAR_MM = 100.0  # from the organ's box: such a point is hardly meant
 _NEAR_MM = 20.0  # a point about the organ, where another reading of the file is weighed

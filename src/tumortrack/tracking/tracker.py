@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
-from tumortrack.core.allocator import keep_small_blocks
 from tumortrack.core.errors import InputError
 from tumortrack.core.estimate import Estimate, Following
+from tumortrack.core.process import keep_small_blocks
 from tumortrack.core.types import Anatomy, SensorCloud
 from tumortrack.models.model import Model
 from tumortrack.occupancy.locator import OccupancyLocator
@@ -18,6 +18,7 @@ from tumortrack.registration.model import RegistrationModel
 _ALONE = Following()
 
 
+@runtime_checkable
 class Locator(Protocol):
     """One method at work; ``Tracker`` documents the calls."""
 

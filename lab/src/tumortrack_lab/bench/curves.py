@@ -8,7 +8,7 @@ from functools import partial
 import numpy as np
 import torch
 
-from tumortrack.core.allocator import keep_freed_memory
+from tumortrack.core.process import keep_freed_memory
 from tumortrack.core.types import Anatomy
 from tumortrack.imaging.raster import label_grid
 from tumortrack.models.report import grid_over

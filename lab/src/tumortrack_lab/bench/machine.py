@@ -11,7 +11,7 @@ from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
 
-from tumortrack.core.cores import available_cores
+from tumortrack.core.process import available_cores
 from tumortrack_lab.bench.rows import Peaks
 from tumortrack_lab.bench.timing import interleaved
 

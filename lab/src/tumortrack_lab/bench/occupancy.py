@@ -10,10 +10,9 @@ import torch
 
 from tumortrack.models.hardware import has_fast_bfloat16
 from tumortrack.occupancy.inference import Inference
-from tumortrack.occupancy.lattice import organ_lattice
 from tumortrack.occupancy.locator import steps_over
 from tumortrack.occupancy.model import OccupancyModel
-from tumortrack.occupancy.sparse import sparse_logits
+from tumortrack.occupancy.sparse import organ_lattice, sparse_logits
 from tumortrack_lab.bench.counts import ball_flops, farthest_flops, module_flops, weight_bytes
 from tumortrack_lab.bench.naive.occupancy import NaiveOccupancy
 from tumortrack_lab.bench.rows import Precision, Work

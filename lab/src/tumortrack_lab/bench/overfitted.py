@@ -75,7 +75,7 @@ def overfit_scene(
     box = np.array([organ.min(0), organ.max(0)], float)
     model = OccupancyModel(
         network=network.eval(), config=config, parts=anatomy.names, query_box_mm=box,
-        familiar=every, provenance=about,
+        in_distribution=every, provenance=about,
     )  # fmt: skip
     save_model(model, folder)
 

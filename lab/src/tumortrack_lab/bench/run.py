@@ -20,8 +20,8 @@ from typing import TYPE_CHECKING
 import msgspec
 
 from tumortrack.core.config import Config, from_builtins
-from tumortrack.core.cores import available_cores
 from tumortrack.core.errors import TumortrackError
+from tumortrack.core.process import available_cores
 from tumortrack_lab.bench.rows import PRESETS, BenchResult, BenchRow, Peaks, Point
 
 if TYPE_CHECKING:  # with PyTorch, whose threads are settled when it is imported

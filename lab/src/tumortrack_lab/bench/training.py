@@ -16,7 +16,7 @@ import torch
 from msgspec.structs import replace
 from torch.nn import functional
 
-from tumortrack.core.allocator import keep_freed_memory
+from tumortrack.core.process import keep_freed_memory
 from tumortrack.models.hardware import has_fast_bfloat16
 from tumortrack.occupancy.model import OccupancyModel
 from tumortrack.occupancy.network import OccupancyNetwork

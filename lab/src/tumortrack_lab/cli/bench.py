@@ -5,21 +5,39 @@ from __future__ import annotations
 import sys
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
-import msgspec
 from rich.console import Console
 
 from tumortrack.core.errors import InputError, TumortrackError
-from tumortrack_lab.bench.rows import BenchRow
 
 TRAINED = Path("runs/bench")  # models trained to be measured
 _WIDE = 150  # characters of a table that goes to a file
 _WORKER = [sys.executable, "-m", "tumortrack_lab.cli.bench"]
 
 
-@dataclass(frozen=True)
-class BenchOptions:
-    only: tuple[str, ...] = ()
+@dataclass(frozen=True, kw_only=True)
+class Bench:
+    """Measure the speed of every part on this machine, each beside its naive form, in turns.
+
+    Attributes:
+        only: which parts; default: all.
+        quick: shorter measurements, about a minute in all once there are models.
+        curves: also how time and memory grow with queries, points, tumors, voxels and batch.
+        model: folder that `train` wrote, to be measured instead of the one that the bench trains
+            (kept in runs/bench).
+        cloud: of that model's organ, freed of its background; .ply, .pcd or .npz in mm.
+        out: JSON file to write; curves lie beside it.
+        document: Markdown file whose marked blocks are to be filled, such as docs/performance.md.
+    """
+
+    only: tuple[
+        Literal[
+            "generator", "elastic-generator", "encoder", "decoder", "frame", "tracking", "volume",
+            "command", "planning", "gpu", "training", "whole-training",
+        ],
+        ...,
+    ] = ()  # fmt: skip
     quick: bool = False
     curves: bool = False
     model: Path | None = None
@@ -27,55 +45,55 @@ class BenchOptions:
     out: Path = Path("runs/bench.json")
     document: Path | None = None
 
+    def run(self) -> None:
+        """Measure, show, write.
 
-def bench(options: BenchOptions) -> None:
-    """Measure, show, write.
+        Raises:
+            InputError: a model without a cloud or the other way, a document without its markers.
+        """
+        from tumortrack.cli.console import console, say
+        from tumortrack_lab.bench.report import BLOCKS, write_bench
+        from tumortrack_lab.bench.run import CURVES, GROUPS, BenchRequest, measure
+        from tumortrack_lab.bench.tables import line, rich_table
+        from tumortrack_lab.study.document import ReportWriter
 
-    Raises:
-        InputError: a model without a cloud or the other way, a document without its markers.
-    """
-    from tumortrack.cli.console import console, say
-    from tumortrack_lab.bench.report import BLOCKS, write_bench
-    from tumortrack_lab.bench.run import CURVES, GROUPS, BenchRequest, measure
-    from tumortrack_lab.bench.tables import line, rich_table
-    from tumortrack_lab.study.document import ReportWriter
+        if (self.model is None) != (self.cloud is None):
+            raise InputError(
+                "--model and --cloud belong together: a model, and a cloud of its organ."
+            )
+        command, given = self._command(), None
+        if self.model is not None and self.cloud is not None:
+            given = self.model, self.cloud
+        if self.document is not None:
+            ReportWriter(self.document, command).check(BLOCKS)
+        request = BenchRequest(
+            groups=self.only or tuple(GROUPS),
+            curves=tuple(CURVES) if self.curves else (),
+            quick=self.quick,
+            folder=TRAINED,
+            given=given,
+        )
+        with console.status("starting ...") as status:
+            report = status.update if console.is_terminal else say
+            found = measure(
+                request, _WORKER, command, report, lambda row, left: say(line(row, left))
+            )
+        shown = console if console.is_terminal else Console(width=_WIDE)
+        shown.print(rich_table(found))
+        for path in write_bench(found, self.out, self.document):
+            say(f"written to {path}")
 
-    if (options.model is None) != (options.cloud is None):
-        raise InputError("--model and --cloud belong together: a model, and a cloud of its organ.")
-    command, given = _command(options), None
-    if options.model is not None and options.cloud is not None:
-        given = options.model, options.cloud
-    if options.document is not None:
-        ReportWriter(options.document, command).check(BLOCKS)
-    request = BenchRequest(
-        groups=options.only or tuple(GROUPS),
-        curves=tuple(CURVES) if options.curves else (),
-        quick=options.quick,
-        folder=TRAINED,
-        given=given,
-    )
-
-    def show(row: BenchRow, left: str) -> None:
-        say(line(row, left))
-
-    with console.status("starting ...") as status:
-        report = status.update if console.is_terminal else say
-        found = measure(request, _WORKER, command, report, show)
-    shown = console if console.is_terminal else Console(width=_WIDE)
-    shown.print(rich_table(found))
-    for path in write_bench(found, options.out, options.document):
-        say(f"written to {path}")
-
-
-def _command(options: BenchOptions) -> str:
-    words = ["tumortrack bench"]
-    words += ["--only", *options.only] if options.only else []
-    words += [f"--{name}" for name in ("quick", "curves") if getattr(options, name)]
-    return " ".join(words)
+    def _command(self) -> str:
+        words = ["tumortrack bench"]
+        words += ["--only", *self.only] if self.only else []
+        words += [f"--{name}" for name in ("quick", "curves") if getattr(self, name)]
+        return " ".join(words)
 
 
 def _work(task_json: str) -> None:
     """A process of the bench: carries one task out and writes each result as a line of JSON."""
+    import msgspec
+
     from tumortrack.core.config import from_builtins
     from tumortrack_lab.bench.run import Task, TaskMessage, carry_out, keep_to_cores
 

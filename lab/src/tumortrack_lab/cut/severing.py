@@ -7,7 +7,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from tumortrack.imaging.raster import _expand
+from tumortrack.imaging.raster import expand
 
 Flat = Float[np.ndarray, "_ 2"]
 Mask = Bool[np.ndarray, "i j"]
@@ -57,7 +57,7 @@ def _crossings(path: Flat, shape: tuple[int, int]) -> Int[np.ndarray, "i j"]:
     low, high = np.minimum(start[:, 1], end[:, 1]), np.maximum(start[:, 1], end[:, 1])
     first = np.clip(np.ceil(low), 0, shape[1]).astype(int)
     stop = np.clip(np.ceil(high), 0, shape[1]).astype(int)
-    part, step = _expand(np.maximum(stop - first, 0))
+    part, step = expand(np.maximum(stop - first, 0))
     row = first[part] + step
     share = (row - start[part, 1]) / (end[part, 1] - start[part, 1])
     at = start[part, 0] + share * (end[part, 0] - start[part, 0])

@@ -22,8 +22,7 @@ import tumortrack_lab.peers
 from tumortrack.core import store
 from tumortrack.core.config import to_builtins
 from tumortrack.core.errors import InputError
-from tumortrack.core.estimate import Estimate
-from tumortrack.core.motion import OneWay
+from tumortrack.core.estimate import Estimate, OneWay
 from tumortrack.core.types import Anatomy
 from tumortrack.models.model import Model
 from tumortrack.registration.model import RegistrationModel
@@ -152,9 +151,9 @@ def without_refinement(model: Model) -> RegistrationModel:
     config = msgspec.structs.replace(
         model.config, refine=msgspec.structs.replace(model.config.refine, steps=0)
     )
-    familiar = msgspec.structs.replace(model.familiar, fit_mm=math.inf)
+    in_distribution = msgspec.structs.replace(model.in_distribution, fit_mm=math.inf)
     calibration = msgspec.structs.replace(model.calibration, usual_cost=math.inf)
-    return replace(model, config=config, familiar=familiar, calibration=calibration)
+    return replace(model, config=config, in_distribution=in_distribution, calibration=calibration)
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,7 +15,7 @@ import pandas as pd
 from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.estimate import Estimate
 from tumortrack.report.drawing import new_figure, save
-from tumortrack.report.pictures import FROM_SIDE, _legend, _solid_view
+from tumortrack.report.pictures import FROM_SIDE, draw_solid_view, scene_legend
 from tumortrack.report.protocol import compare
 from tumortrack.simulate.scene_folder import Scene, read_scene
 from tumortrack_lab.study import paper
@@ -288,10 +288,14 @@ def gallery(jobs: list[Job], path: Path) -> None:
                 title = "nothing found"
             else:
                 title = _numbers(estimate, scene)
-            _solid_view(axes, scene, estimate, FROM_SIDE)
+            draw_solid_view(axes, scene, estimate, FROM_SIDE)
             axes.set_title(title, fontsize=9.5)
     drawing.legend(
-        handles=_legend(), loc="upper right", ncols=4, frameon=False, bbox_to_anchor=(0.99, 0.999)
+        handles=scene_legend(),
+        loc="upper right",
+        ncols=4,
+        frameon=False,
+        bbox_to_anchor=(0.99, 0.999),
     )
     save(drawing, path)
 

@@ -17,7 +17,7 @@ from tumortrack.imaging.case import Case
 from tumortrack.models.config import TrainConfig
 from tumortrack.simulate.occupancy import organ_pool
 from tumortrack.simulate.scene import Simulator, body_for
-from tumortrack.training.validate import ValidationScenes, validation_scenes
+from tumortrack.training.task import ValidationScenes, validation_scenes
 
 Options = TypeVar("Options")
 _UNSEEN_SEED = 1_000_003  # of the judged scenes and their library of states

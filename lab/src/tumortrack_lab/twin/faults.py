@@ -232,10 +232,11 @@ def _nearer(frame: DepthFrame, by_mm: float) -> DepthFrame:
 
 def _distortion(frame: DepthFrame, config: ViewConfig, rng: np.random.Generator) -> DepthFrame:
     """The sensor model's slow field at its full height, in every scene."""
-    from tumortrack.sense.noise_kernels import slow_field
+    from tumortrack.sense.kernels import slow_shape
 
     shape = (frame.intrinsics.height, frame.intrinsics.width)
-    return replace(frame, depth_mm=frame.depth_mm + slow_field(shape, DISTORTION_MM, rng))
+    field, scale = slow_shape(shape, DISTORTION_MM, rng)
+    return frame.with_depth(frame.depth_mm + field * scale)
 
 
 # First what lies before the sensor, then the sensor itself, stored steps last.

@@ -41,7 +41,7 @@ class Polydata:
     points: Float[np.ndarray, "n 3"]
     triangles: Int[np.ndarray, "f 3"]
     segments: Int[np.ndarray, "s 2"] = field(default_factory=lambda: np.zeros((0, 2), np.int32))
-    scalars: dict[str, Float[np.ndarray, " n"]] = field(default_factory=dict)
+    scalars: dict[str, Num[np.ndarray, " n"]] = field(default_factory=dict)
 
 
 def pack_transform(b_from_a: Float[np.ndarray, "4 4"]) -> bytes:

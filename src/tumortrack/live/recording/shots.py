@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import NoReturn, Protocol
+from typing import NoReturn, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Bool
@@ -31,6 +31,7 @@ class Shot:
     load: Callable[[], Content]
 
 
+@runtime_checkable
 class Reel(Protocol):
     """An open recording."""
 

@@ -12,8 +12,8 @@ import numpy as np
 import shapely
 from jaxtyping import Bool, Float64
 
-from tumortrack.core.solids import solid_of
 from tumortrack.core.types import Mesh
+from tumortrack.imaging.meshes import solid_of
 from tumortrack.plan.arms.body import ELECTRODE_RADIUS_MM, PENCIL_RADIUS_MM
 from tumortrack.plan.arms.cell import Blocked, PlanningGroup
 from tumortrack.plan.arms.config import CellConfig

@@ -16,10 +16,9 @@ from jaxtyping import Float32, Int32, Int64
 from torch import Tensor
 
 from tumortrack.core.errors import InputError
-from tumortrack.sense.calibration import CALIBRATED
 from tumortrack.sense.camera import d405
 from tumortrack.sense.cloud import FEWEST_POINTS, draw_some
-from tumortrack.sense.noise import CLEAN
+from tumortrack.sense.noise import CALIBRATED, CLEAN
 from tumortrack.simulate.batched.plan import BatchPlan, plan_scenes
 from tumortrack.simulate.batched.render import carried, depth_images
 from tumortrack.simulate.dataset import SceneStream, refill
@@ -218,7 +217,7 @@ class _DevicePool:
 
     def _nearest(
         self, index: Int64[Tensor, "b w"], beyond: Tensor, distance_mm: Tensor, inside: Tensor
-    ) -> Int64[Tensor, "b 2k"]:
+    ) -> Int64[Tensor, "b m"]:
         """Of a window's points the k inside that are nearest to the surface, and k outside, the
         nearest first."""
         distance, within = distance_mm[index], inside[index]

@@ -1,23 +1,21 @@
-"""The parts of the noise model, compiled; opened by ``noise.add_noise`` on first use.
+"""The per-pixel work of ``noise`` and ``occlusion``, compiled; imported on first use.
 
-Random numbers come from hashing (key, pixel) with SplitMix64 (Steele, Lea and Flood 2014,
-doi 10.1145/2660193.2660195): no state, a few ns each, and a pixel's number does not depend on
-what happened to the others.
-
-An organ fills a tenth of an image: kernels go through the pixels with a return, which
+An organ fills a tenth of an image: kernels visit only the pixels with a return, which
 ``seen_pixels`` finds once, and change a list of their depths.
+
+Noise is hashed from (key, pixel) with SplitMix64 (Steele, Lea and Flood 2014,
+doi 10.1145/2660193.2660195): no state, a few ns each, and no pixel's number depends on the others.
 """
 
 from __future__ import annotations
 
 import math
 from functools import lru_cache
+from typing import NamedTuple
 
 import numba
 import numpy as np
 from scipy.special import ndtri
-
-from tumortrack.core.types import Intrinsics
 
 # Quantiles of the normal distribution: a hash's low 14 bits choose one. Scaled to variance 1.
 _QUANTILES = ndtri((np.arange(2**14) + 0.5) / 2**14)
@@ -29,8 +27,17 @@ _LOW_14, _LOW_32 = np.uint64(0x3FFF), np.uint64(0xFFFFFFFF)
 _TO_UNIT = 2.0**-32
 
 _NO_RETURN = np.float32(np.nan)
+_BINS = 1024  # of the histogram in ``take_first``
 
 _jit = numba.njit(cache=True, nogil=True)  # no fast-math: a frame replays on every machine
+
+
+class Seen(NamedTuple):
+    """The n pixels with a return: their flat indices, row by row (n,), and where each of the h
+    rows starts among them (h + 1,); both int32."""
+
+    pixels: np.ndarray
+    starts: np.ndarray
 
 
 @numba.njit(cache=True, inline="always")
@@ -43,8 +50,7 @@ def _bits(key, counter):  # type: ignore[no-untyped-def]
 
 @_jit
 def seen_pixels(depth_mm):  # type: ignore[no-untyped-def]
-    """Flat indices (n,) of the pixels with a return, row by row, and where each of the h rows
-    starts among them (h + 1,)."""
+    """The pixels of ``depth_mm`` (h, w) that are not NaN, as ``Seen``."""
     height, width = depth_mm.shape
     starts = np.zeros(height + 1, np.int32)
     for v in range(height):
@@ -60,16 +66,18 @@ def seen_pixels(depth_mm):  # type: ignore[no-untyped-def]
             pixels[at] = v * width + u
             at += not math.isnan(depth_mm[v, u])
             u += 1
-    return pixels, starts
+    return Seen(pixels, starts)
 
 
 @_jit
-def lose_grazing(true_mm, depths_mm, seen, key, share, degrees, pinhole):  # type: ignore[no-untyped-def]
-    """Drop ``share`` of the pixels whose normal is over ``degrees`` from the line of sight.
+def lose_grazing(true_mm, depths_mm, seen, key, grazing, pinhole):  # type: ignore[no-untyped-def]
+    """Drop pixels that see a surface at grazing angles; ``grazing``: (share that is dropped, from
+    how many degrees between the normal and the line of sight).
 
     With the depth's slopes (p, q) per pixel the surface normal is n = (fx p, fy q,
     -(z + (u - cx) p + (v - cy) q)), and its product with the line of sight r is -z.
     """
+    share, degrees = grazing
     fx, fy, cx, cy = pinhole
     pixels, starts = seen
     height, width = true_mm.shape
@@ -100,13 +108,23 @@ def _slope(before, here, after):  # type: ignore[no-untyped-def]
     return here - before if math.isnan(after) else (after - before) * np.float32(0.5)
 
 
-@_jit
-def fly(true_mm, depths_mm, seen, key, share, flying_mm, edge):  # type: ignore[no-untyped-def]
-    """Send ``share`` of the edge pixels backwards; ``edge``: (how near in px, depth step in mm).
+class Flying(NamedTuple):
+    """Flying pixels: the share of edge pixels, how far behind the edge they end up at most, and
+    what is an edge: within ``near_px`` the depth falls back by ``step_mm`` or more, or ends."""
 
-    The image's own border is no edge: what it cuts off goes on outside.
+    share: float
+    reach_mm: float
+    near_px: int
+    step_mm: float
+
+
+@_jit
+def fly(true_mm, depths_mm, seen, key, flying):  # type: ignore[no-untyped-def]
+    """Send edge pixels backwards, as ``Flying`` states.
+
+    The image's own border is no edge: what it cuts off continues outside.
     """
-    near, step_mm = edge
+    share, flying_mm, near, step_mm = flying
     pixels, starts = seen
     height, width = true_mm.shape
     for v in range(height):
@@ -131,17 +149,6 @@ def fly(true_mm, depths_mm, seen, key, share, flying_mm, edge):  # type: ignore[
                     depths_mm[i] = z + (bits >> _S32) * _TO_UNIT * min(gap, flying_mm)
 
 
-@_jit
-def normal_grid(height, width, step, key):  # type: ignore[no-untyped-def]
-    """Standard normal values on every ``step``-th pixel, one node beyond the image."""
-    rows, columns = height // step + 2, width // step + 2
-    grid = np.empty((rows, columns), np.float32)
-    for i in range(rows):
-        for j in range(columns):
-            grid[i, j] = _QUANTILES[_bits(key, i * columns + j) & _LOW_14]
-    return grid
-
-
 @numba.njit(cache=True, inline="always")
 def _weights(step):  # type: ignore[no-untyped-def]
     """Linear interpolation scaled so that the variance stays 1 between the nodes too."""
@@ -151,15 +158,6 @@ def _weights(step):  # type: ignore[no-untyped-def]
         length = math.sqrt((1 - a) ** 2 + a**2)
         first[phase], second[phase] = (1 - a) / length, a / length
     return first, second
-
-
-@_jit
-def distort(depths_mm, seen, field, scale):  # type: ignore[no-untyped-def]
-    """Add ``scale`` times the field."""
-    pixels, _ = seen
-    flat = field.ravel()
-    for i in range(len(pixels)):
-        depths_mm[i] += flat[pixels[i]] * scale
 
 
 @_jit
@@ -176,10 +174,23 @@ def jitter(depths_mm, seen, key, relative, correlated_share, smooth):  # type: i
 
 
 @_jit
-def smooth_at(seen, grid, step, shape):  # type: ignore[no-untyped-def]
-    """The smooth field that the grid spans (each pixel standard normal) at the pixels."""
+def _normal_grid(height, width, step, key):  # type: ignore[no-untyped-def]
+    """Standard normal values on every ``step``-th pixel, one node beyond the image."""
+    rows, columns = height // step + 2, width // step + 2
+    grid = np.empty((rows, columns), np.float32)
+    for i in range(rows):
+        for j in range(columns):
+            grid[i, j] = _QUANTILES[_bits(key, i * columns + j) & _LOW_14]
+    return grid
+
+
+@_jit
+def smooth_at(seen, shape, step, key):  # type: ignore[no-untyped-def]
+    """A smooth random field, correlated over ``step`` pixels and standard normal in each, at the
+    seen pixels of an image of that shape."""
     pixels, starts = seen
     height, width = shape
+    grid = _normal_grid(height, width, step, key)
     first, second = _weights(step)
     out = np.empty(len(pixels), np.float32)
     row = np.empty(width + step, np.float32)
@@ -198,16 +209,11 @@ def smooth_at(seen, grid, step, shape):  # type: ignore[no-untyped-def]
     return out
 
 
-def slow_field(shape: tuple[int, int], peak: float, rng: np.random.Generator) -> np.ndarray:
-    """A random sum of the lowest 3 x 3 cosines over the image, its largest magnitude ``peak``."""
-    field, scale = slow_shape(shape, peak, rng)
-    return field * scale
-
-
 def slow_shape(
     shape: tuple[int, int], peak: float, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.float32]:
-    """``slow_field`` as (field, factor), for those who need few of its pixels."""
+    """A random sum of the lowest 3 x 3 cosines over the image, as (field, factor): their product
+    has ``peak`` as its largest magnitude, and callers that need few pixels multiply only those."""
     rows, columns = (_lowest_cosines(n) for n in shape)
     field = (rows @ rng.standard_normal((3, 3), np.float32)) @ columns.T
     return field, np.float32(peak) / max(field.max(), -field.min())
@@ -220,6 +226,77 @@ def _lowest_cosines(n: int) -> np.ndarray:
     return waves
 
 
-def pinhole(intrinsics: Intrinsics) -> tuple[float, float, float, float]:
-    """(fx, fy, cx, cy), as the kernels take it."""
-    return intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy
+@_jit
+def order_shaft(columns, rows, tip, towards, half, taper):  # type: ignore[no-untyped-def]
+    """A straight band that comes in against ``towards`` (unit vector, px) and ends round at
+    ``tip`` (px), ``half`` wide there to either side and wider by ``taper`` a pixel outwards.
+    What lies farthest out comes first, as when it is pushed in."""
+    order = np.full(len(columns), np.inf, np.float32)
+    for i in range(len(columns)):
+        du, dv = columns[i] - tip[0], rows[i] - tip[1]
+        along = du * towards[0] + dv * towards[1]
+        across = abs(dv * towards[0] - du * towards[1])
+        if along >= 0:
+            if across < half + taper * along:
+                order[i] = -along
+        elif du * du + dv * dv < half * half:
+            order[i] = -along
+    return order
+
+
+@_jit
+def order_patch(columns, rows, start, axes, round_one, waves):  # type: ignore[no-untyped-def]
+    """A patch with a wavy edge that grows from ``start`` (px): a blob or a half plane.
+
+    ``axes`` (2, 2), 1/px: a blob's two lengths and directions; a half plane grows along the first.
+    ``waves`` (2, k, 3): frequency (rad/px), phase and height of the edge's waves along the columns
+    and along the rows.
+    """
+    along_u, along_v = _wave(columns.max() + 1, waves[0]), _wave(rows[-1] + 1, waves[1])
+    order = np.empty(len(columns), np.float32)
+    for i in range(len(columns)):
+        du, dv = columns[i] - start[0], rows[i] - start[1]
+        a = du * axes[0, 0] + dv * axes[0, 1]
+        b = du * axes[1, 0] + dv * axes[1, 1]
+        distance = math.sqrt(a * a + b * b) if round_one else a
+        order[i] = distance + along_u[columns[i]] + along_v[rows[i]]
+    return order
+
+
+@_jit
+def _wave(length, waves):  # type: ignore[no-untyped-def]
+    out = np.zeros(length, np.float32)
+    for frequency, phase, height in waves:
+        for place in range(length):
+            out[place] += height * math.cos(frequency * place + phase)
+    return out
+
+
+@_jit
+def take_first(order, taken, count):  # type: ignore[no-untyped-def]
+    """Mark in ``taken`` the ``count`` pixels of lowest ``order`` that are not taken yet, or a few
+    less (whole bins of a histogram only); infinite ones never. Returns how many."""
+    low, high, room = np.float32(np.inf), np.float32(-np.inf), 0
+    for i in range(len(order)):
+        if not taken[i] and order[i] < np.inf:
+            low, high = min(low, order[i]), max(high, order[i])
+            room += 1
+    if room == 0:
+        return 0
+    scale = (_BINS - 1) / max(high - low, np.float32(1e-6))
+    last = _BINS - 1
+    if room > count:
+        histogram = np.zeros(_BINS, np.int64)
+        for i in range(len(order)):
+            if not taken[i] and order[i] < np.inf:
+                histogram[int((order[i] - low) * scale)] += 1
+        total, last = 0, -1
+        while total + histogram[last + 1] <= count:
+            last += 1
+            total += histogram[last]
+    marked = 0
+    for i in range(len(order)):
+        if not taken[i] and order[i] < np.inf and int((order[i] - low) * scale) <= last:
+            taken[i] = True
+            marked += 1
+    return marked
