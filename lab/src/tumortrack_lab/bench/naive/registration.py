@@ -1,6 +1,6 @@
-"""A warp's frame in the plain way: nearest vertices by a tree, SciPy's interpolation, inside tests.
+"""A registration frame in the plain way: nearest vertices by a tree, SciPy, inside tests.
 
-The same method: the network's placements both ways round, each laid on the points by Gauss-Newton
+The same method: the network's placements both ways round, each fitted to the points by Gauss-Newton
 steps to the end, the better one kept; then every query carried back and tested against the CT's
 surfaces.
 """
@@ -20,7 +20,7 @@ from tumortrack_lab.bench.naive.scenes import flowed, sampled
 _Fit = tuple[float, np.ndarray, np.ndarray, np.ndarray]  # cost, rotation, centre, coefficients
 
 
-class NaivePlaced:
+class NaiveRegistration:
     """Places the organ of one model in clouds (camera frame, mm)."""
 
     def __init__(self, model: RegistrationModel) -> None:
@@ -42,7 +42,7 @@ class NaivePlaced:
             [part[0].double().numpy() for part in (way.rotation, way.centre_mm, way.coefficients)]
             for way in ways
         ]
-        best = min((self._laid(points_mm, *start) for start in starts), key=lambda fit: fit[0])
+        best = min((self._refined(points_mm, *start) for start in starts), key=lambda fit: fit[0])
         return self._labelled(best, queries_mm)
 
     def labels_where(self, motion_back: np.ndarray) -> np.ndarray:
@@ -54,7 +54,7 @@ class NaivePlaced:
         moved = (queries_mm - centre) @ rotation + self.body.center_ct
         return self.labels_where(flowed(self.body, -coefficients, moved))
 
-    def _laid(
+    def _refined(
         self, points: np.ndarray, rotation: np.ndarray, centre: np.ndarray, state: np.ndarray
     ) -> _Fit:
         config, body = self._config, self.body

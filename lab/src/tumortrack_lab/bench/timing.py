@@ -1,4 +1,4 @@
-"""Timing several versions in turns, so that what else the machine does meets all of them."""
+"""Interleaved timing: versions take turns, so that what else the machine does meets all of them."""
 
 from __future__ import annotations
 
@@ -38,16 +38,15 @@ class InterleavedTiming(Config, frozen=True):
 
     def times(self, factor: float) -> InterleavedTiming:
         """Of so many calls, or of a part of one."""
+        best, median, low, high = (
+            seconds * factor for seconds in (self.best_s, self.median_s, self.low_s, self.high_s)
+        )
         return InterleavedTiming(
-            best_s=self.best_s * factor,
-            median_s=self.median_s * factor,
-            low_s=self.low_s * factor,
-            high_s=self.high_s * factor,
-            turns=self.turns,
+            best_s=best, median_s=median, low_s=low, high_s=high, turns=self.turns
         )
 
 
-def in_turns(*versions: Call, budget_s: float, fewest: int = _FEWEST) -> list[InterleavedTiming]:
+def interleaved(*versions: Call, budget_s: float, fewest: int = _FEWEST) -> list[InterleavedTiming]:
     """Seconds a call of each version. Every version is called before (compiled, cached, warm);
     then all take turns until ``budget_s`` is spent, between ``fewest`` and 25 times each. A first
     call that took more than a second counts as a turn: a median of three bears a cold one. Where
@@ -71,8 +70,8 @@ def _turn(version: Call, repeat: int) -> tuple[float, float]:
     """Seconds of so many calls: in all, and those that count."""
     start, uncounted = time.perf_counter(), 0.0
     for _ in range(repeat):
-        told = version()
-        uncounted += told.seconds if isinstance(told, Uncounted) else 0.0
+        result = version()
+        uncounted += result.seconds if isinstance(result, Uncounted) else 0.0
     took_s = time.perf_counter() - start
     return took_s, took_s - uncounted
 
