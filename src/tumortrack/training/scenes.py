@@ -171,7 +171,7 @@ def batches(
         worker_init_fn=quiet_worker,
         pin_memory=device.type == "cuda",  # copies then overlap with the work before
     )
-    for clouds, points, labels, poses in loader:  # lists, where tuples went in
+    for clouds, points, labels, poses in loader:  # noqa: UP028 (it makes lists of tuples)
         yield clouds, points, labels, poses
 
 
