@@ -14,7 +14,7 @@ import trimesh
 
 from stories import cloud_by_rays, looking_down, refusal, succeeded, tumortrack
 from tumortrack.cli.inspection import describe
-from tumortrack.cli.scenes import check_case
+from tumortrack.cli.locate import check_case
 from tumortrack.core import store
 from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.estimate import Following
@@ -22,7 +22,7 @@ from tumortrack.core.geometry import transform_points
 from tumortrack.core.mesh_files import read_mesh
 from tumortrack.core.types import Anatomy, SensorCloud
 from tumortrack.imaging.case import load_case
-from tumortrack.occupancy.arithmetic import Arithmetic, can_pack, possible
+from tumortrack.occupancy.inference import Arithmetic, can_pack, possible
 from tumortrack.tracking.follower import Follower, FollowerConfig
 from tumortrack.tracking.tracker import Tracker
 from tumortrack.training.model import load_model
