@@ -12,8 +12,9 @@ import pytest
 ROOT = Path(__file__).parents[1]
 PACKAGES = (ROOT / "src" / "tumortrack", ROOT / "lab" / "src" / "tumortrack_lab")
 
-# Left out: modules with numba kernels (numba compiles the plain function), and core.types, whose
-# constructors convert and check shapes themselves, always.
+# Left out: modules with numba kernels (numba compiles the plain function); core.types, whose
+# constructors convert and check shapes themselves, always; and packages' __init__.py, with whom
+# all below them would be hooked.
 CHECKED = [
     ".".join(path.relative_to(package.parent).with_suffix("").parts)
     for package in PACKAGES

@@ -1,12 +1,14 @@
 """Core: transforms, values and configuration."""
 
 import json
+import sys
 
 import jaxtyping
 import msgspec
 import numpy as np
 import pytest
 import trimesh
+from conftest import CHECKED
 from hypothesis import example, given
 from hypothesis import strategies as st
 
@@ -40,6 +42,14 @@ def box(extents=(2, 3, 4), center=(0, 0, 0)):
 
 
 # geometry
+
+
+def test_every_module_without_compiled_kernels_is_checked():
+    checked = sorted(name for name in CHECKED if name in sys.modules)
+    assert "tumortrack.core.geometry" in checked
+    for name in checked:
+        assert type(sys.modules[name].__spec__.loader).__module__.startswith("jaxtyping"), name
+    assert len(CHECKED) > 200  # of both packages
 
 
 def test_shapes_in_annotations_are_executed():

@@ -26,6 +26,7 @@ def ct_of(labels: LabelVolume) -> np.ndarray:
     return np.choose(labels.labels, [-1000, 40, 570, 570]).astype(np.int16)
 
 
+@pytest.mark.slow
 def test_the_same_organ_through_every_door_is_the_same_case(tmp_path):
     """DICOM, NIfTI and NRRD CT, a label map, and meshes: the same parts at the same places."""
     truth = kidney_labels((1.0, 1.0, 1.5))
@@ -90,6 +91,7 @@ def test_missing_empty_and_foreign_inputs(tmp_path):
         prepare(tmp_path, PrepareOptions(up="sideways"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "side", "kidney_ml", "tumor_ml"),
     [

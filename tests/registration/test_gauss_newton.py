@@ -189,7 +189,7 @@ def test_a_descent_goes_on_where_it_was_stopped():
     assert start.centre_mm[2] == nudged(placed(), [3, -2, 5], [0, 0, 0]).centre_mm[2]
 
 
-def test_the_best_of_many_starts_wins_wherever_it_stands():
+def test_the_best_of_many_starts_wins_wherever_it_stands(unchecked):
     points = placed().carry(ANATOMY.organ.vertices_mm[::3])
     near = nudged(placed(), [3, -2, 5], [0.1, -0.05, 0.1])
     far = [nudged(placed(), [0, 0, 30.0 * n], [0, 0, 1.0 * n]) for n in (1, 2, 3)]
@@ -200,7 +200,7 @@ def test_the_best_of_many_starts_wins_wherever_it_stands():
         assert fit.steps == alone.steps
 
 
-def test_starts_that_are_far_behind_are_given_up(monkeypatch):
+def test_starts_that_are_far_behind_are_given_up(monkeypatch, unchecked):
     gone = []
 
     class Noted(GaussNewton):

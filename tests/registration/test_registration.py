@@ -262,7 +262,7 @@ def test_a_fifth_of_strays_does_not_matter():
     assert np.abs(fit.distances_mm[strays]).mean() > 10
 
 
-def test_every_step_lowers_the_cost_and_enough_steps_end():
+def test_every_step_lowers_the_cost_and_enough_steps_end(unchecked):
     points = surface(placed(), 500)
     steady = GaussNewtonConfig(steps=40, first_mm=3.0, last_mm=3.0)
     fits = [

@@ -7,7 +7,7 @@ import os
 import sys
 from collections.abc import Callable
 from importlib.metadata import entry_points
-from typing import NoReturn, Protocol
+from typing import NoReturn, Protocol, runtime_checkable
 
 import tyro
 
@@ -23,6 +23,7 @@ from tumortrack.cli.training import Pretrain, Train
 from tumortrack.core.errors import TumortrackError
 
 
+@runtime_checkable
 class Command(Protocol):
     """The parsed options of a command."""
 

@@ -58,9 +58,7 @@ class LogitLattice:
         return bool(sizes[largest] > (pieces[1:-1, 1:-1, 1:-1] == largest).sum())
 
 
-def lattice_over(
-    logits_at: LogitsAt, box_mm: Float64[np.ndarray, "2 3"], steps: int
-) -> LogitLattice:
+def lattice_over(logits_at: LogitsAt, box_mm: Float[np.ndarray, "2 3"], steps: int) -> LogitLattice:
     """A lattice over a box, ``steps`` along its longest side, queried at every point."""
     step = float((box_mm[1] - box_mm[0]).max()) / steps
     axes = [np.arange(low, high + step, step) for low, high in box_mm.T]
