@@ -24,14 +24,14 @@ class Teller:
     """A sink is any object with ``publish`` and ``close``: this one says where tumor 1 is."""
 
     def publish(self, update: TrackingResult) -> None:
-        placed = update.placed
+        placed = update.transformed
         if placed is None:
             print(f"no estimate: {update.reason}")  # never the last answer again
             return
         middle = placed.meshes["tumor_1"].box_mm.mean(0)
         off_mm = np.nan
-        if update.seen is not None and update.seen.truth is not None:
-            off_mm = np.linalg.norm(middle - update.seen.truth.tumors[0].box_mm.mean(0))
+        if update.observation is not None and update.observation.truth is not None:
+            off_mm = np.linalg.norm(middle - update.observation.truth.tumors[0].box_mm.mean(0))
         print(
             f"frame {update.sequence} ({update.quality}): tumor 1 at {middle.round(1)} mm, off by "
             f"{off_mm:.1f} mm; {update.latency_ms:.0f} ms after the frame"
@@ -48,17 +48,17 @@ def main(out: Path, model_folder: Path, frames: int) -> None:
     region = RegionConfig(crop=CloudConfig(near_mm=75, far_mm=340))
     loop = Loop(tracker, setting, LoopConfig(region=region))
     loop.warm()
-    outlet = SinkWorker("teller", Teller(), waiting=1)  # a slow sink gets the newest update
-    reader = SourceWorker(VirtualSourceConfig(case=out / "case", fps=10).open)
+    sink_worker = SinkWorker("teller", Teller(), waiting=1)  # a slow sink gets the newest update
+    source_worker = SourceWorker(VirtualSourceConfig(case=out / "case", fps=10).open)
 
     def enough(update: TrackingResult) -> None:
         if loop.counts["good"] + loop.counts["poor"] >= frames:
             loop.stop()
 
-    loop.run(reader, [outlet], enough)
-    reader.close()
-    outlet.close()
-    told = summary(loop, reader, [outlet])
+    loop.run(source_worker, [sink_worker], enough)
+    source_worker.close()
+    sink_worker.close()
+    told = summary(loop, source_worker, [sink_worker])
     print(f"latency p50 {told['latency_ms']['p50']} ms, {told['dropped']} frames dropped")
 
 

@@ -67,7 +67,7 @@ class Script:
     dropped = 0
 
     def __init__(self, items, waits=True, host_clock=False):
-        self._items, self.waits, self.host_clock = list(items), waits, host_clock
+        self._items, self.lossless, self.host_clock = list(items), waits, host_clock
 
     def read(self, timeout_s):
         if not self._items:
@@ -267,7 +267,7 @@ def test_the_same_recording_gives_the_same_estimates(tracker, stages):
     clouds = moving(stages[1], 4)
     once, again = (play(tracker, clouds)[0] for _ in range(2))
     for a, b in zip(once, again, strict=True):
-        np.testing.assert_array_equal(a.placed.points_mm, b.placed.points_mm)
+        np.testing.assert_array_equal(a.transformed.points_mm, b.transformed.points_mm)
 
 
 def test_what_is_no_organ_gives_no_estimate_and_no_old_one(tracker, stages):
@@ -401,7 +401,7 @@ def test_other_intrinsics_replace_the_sources(tracker):
         reader.close()
         outlets[0].close()
         if said is None:
-            assert sink.updates[-1].seen.content.intrinsics == given
+            assert sink.updates[-1].observation.content.intrinsics == given
         else:
             assert said in sink.updates[-1].reason
 

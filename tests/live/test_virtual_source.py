@@ -18,7 +18,7 @@ from tumortrack.core.geometry import transform_points
 from tumortrack.core.types import LabelVolume, Mesh
 from tumortrack.imaging.case import Case, save_case
 from tumortrack.live.sources.virtual import VirtualSource, VirtualSourceConfig
-from tumortrack.live.spec import parse_spec
+from tumortrack.live.spec import SOURCES
 from tumortrack.sense.noise import CLEAN
 from tumortrack.simulate.elastic.body import BodyConfig
 from tumortrack.simulate.player.player import SHAFT_MM, ScenePlayer, ScenePlayerConfig
@@ -248,7 +248,7 @@ def test_the_command_lines_text_opens_a_case(tmp_path):
     labels = LabelVolume(np.zeros((2, 2, 2), np.uint8), np.eye(4))
     save_case(Case(organ(), labels, UP), tmp_path)
     text = f"virtual:{tmp_path}?fps=25&instrument=false&noise=false&camera_motion=false&seed=2"
-    config = parse_spec(text, (VirtualSourceConfig,), "source")
+    config = SOURCES.parse(text)
     source = config.open()
     seen = source.read(1.0)
     source.close()

@@ -71,12 +71,11 @@ def track(
 ) -> None:
     """Runs until the source ends, the time is up, the arms have ended, or Ctrl-C."""
     from tumortrack.live.calibration_file import read_frames
-    from tumortrack.live.sources import SOURCES
-    from tumortrack.live.spec import parse_spec
+    from tumortrack.live.spec import SOURCES
     from tumortrack.live.values import Controls, PublishedFrame, SinkContext
     from tumortrack.training.model_folder import read_model_manifest
 
-    source_config = parse_spec(source, SOURCES, "source")
+    source_config = SOURCES.parse(source)
     sink_configs = parse_sinks(sinks)
     frames = read_frames(options.frame) if options.frame else PublishedFrame()
     if arms is not None:
@@ -96,8 +95,8 @@ def track(
         say(f"note: {note}")
     tracker = Tracker(model)
     config = _loop_config(model.config, tracker.anatomy_ct, options)
-    setting = SinkContext(model.parts, frames, tracker.anatomy_ct, Controls(), arms is not None)
-    loop = Loop(tracker, setting, config, None if arms is None else arms.companion)
+    context = SinkContext(model.parts, frames, tracker.anatomy_ct, Controls(), arms is not None)
+    loop = Loop(tracker, context, config, None if arms is None else arms.companion)
     about = {
         "model": model.provenance,
         "notes": list(model.notes),
@@ -123,38 +122,38 @@ def track(
         stack.enter_context(stopping(stop))  # first in, last out: also while sinks flush
         screen = _Screen(loop, report, about, None if arms is None else arms.companion)
         stack.callback(screen.end)
-        outlets = open_sinks(sinks, sink_configs, setting, stack)
-        reader = SourceWorker(source_config.open)
-        stack.callback(reader.close)
-        screen.watch(reader, outlets)
+        sink_workers = open_sinks(sinks, sink_configs, context, stack)
+        source_worker = SourceWorker(source_config.open)
+        stack.callback(source_worker.close)
+        screen.watch(source_worker, sink_workers)
         say(f"tracking {source} in frame {frames.frame_id!r}; Ctrl-C ends it.")
-        loop.run(reader, outlets, screen.show)
+        loop.run(source_worker, sink_workers, screen.show)
 
 
 def parse_sinks(sinks: tuple[str, ...]) -> list[SinkConfig]:
     """Configurations of what was written on the command line."""
-    from tumortrack.live.sinks import SINKS
-    from tumortrack.live.spec import parse_spec
+    from tumortrack.live.spec import SINKS
 
-    configs = [parse_spec(sink, SINKS, "sink") for sink in sinks]
+    configs = [SINKS.parse(sink) for sink in sinks]
     if doubled := sorted({sink for sink in sinks if sinks.count(sink) > 1}):
         raise InputError(f"sink {doubled[0]!r} is given twice.")
     return configs
 
 
 def open_sinks(
-    sinks: tuple[str, ...], configs: list[SinkConfig], setting: SinkContext, stack: ExitStack
+    sinks: tuple[str, ...], configs: list[SinkConfig], context: SinkContext, stack: ExitStack
 ) -> list[SinkWorker]:
     """Each at work in a thread of its own, until the stack ends."""
     from tumortrack.live.sink_worker import SinkWorker
 
-    outlets = []
+    sink_workers = []
     # Those that make a folder last: if another cannot open, none is left behind.
-    for spec, config in sorted(zip(sinks, configs, strict=True), key=lambda pair: pair[1].waiting):
-        outlet = SinkWorker(spec, config.open(setting), config.waiting)
-        stack.callback(outlet.close)
-        outlets.append(outlet)
-    return outlets
+    pairs = zip(sinks, configs, strict=True)
+    for spec, config in sorted(pairs, key=lambda pair: pair[1].queue_size):
+        worker = SinkWorker(spec, config.open(context), config.queue_size)
+        stack.callback(worker.close)
+        sink_workers.append(worker)
+    return sink_workers
 
 
 def _loop_config(
@@ -244,8 +243,8 @@ class _Screen:
         self, loop: Loop, report: Path, about: dict, arms: Operation | None = None
     ) -> None:
         self._loop, self._report, self._about, self._arms = loop, report, about, arms
-        self._reader: SourceWorker | None = None
-        self._outlets: list[SinkWorker] = []
+        self._source_worker: SourceWorker | None = None
+        self._sink_workers: list[SinkWorker] = []
         self._started = self._said = self._stored = time.monotonic()
         self._before = 0
         self._state, self._changed = "", 0.0
@@ -253,9 +252,9 @@ class _Screen:
         self._errors: dict[str, str] = {}
         self._memory_mb = {"start": round(_resident_mb(), 1)}
 
-    def watch(self, reader: SourceWorker, outlets: list[SinkWorker]) -> None:
+    def watch(self, source_worker: SourceWorker, sink_workers: list[SinkWorker]) -> None:
         """From here on there is something to show."""
-        self._reader, self._outlets = reader, outlets
+        self._source_worker, self._sink_workers = source_worker, sink_workers
 
     def show(self, update: TrackingResult) -> None:
         """Called with every update."""
@@ -268,48 +267,48 @@ class _Screen:
         if kind != self._state and now - self._changed >= _SAY_S:
             self._state, self._changed = kind, now
             say(f"{update.quality}: {state}")
-        for outlet in self._outlets:
-            if outlet.failing and self._errors.get(outlet.name) != outlet.error:
-                self._errors[outlet.name] = outlet.error
-                say(f"sink {outlet.name}: {outlet.error}")
-        reader = self._reader
-        assert reader is not None
+        for worker in self._sink_workers:
+            if worker.failing and self._errors.get(worker.name) != worker.error:
+                self._errors[worker.name] = worker.error
+                say(f"sink {worker.name}: {worker.error}")
+        source_worker = self._source_worker
+        assert source_worker is not None
         every_s = _SAY_S if console.is_terminal else _SAY_PLAIN_S
         if now - self._said >= every_s:
-            self._line(now, reader)
+            self._line(now, source_worker)
         if now - self._stored >= _STORE_S:
-            self._store(reader)
+            self._store(source_worker)
 
     def end(self) -> None:
         """The last lines."""
-        reader, loop = self._reader, self._loop
-        if reader is None:
+        source_worker, loop = self._source_worker, self._loop
+        if source_worker is None:
             return  # nothing was tracked: a sink could not be opened
-        self._store(reader)
+        self._store(source_worker)
         estimates = loop.counts["good"] + loop.counts["poor"]
         say(
             f"{estimates} estimates ({loop.counts['poor']} poor), {loop.counts['none']} times "
-            f"none, {reader.dropped} frames dropped."
+            f"none, {source_worker.dropped} frames dropped."
         )
         if len(loop.latency):
             times = loop.latency.summary()
             say(
-                f"latency from {reader.latency_from} to published estimate: p50 "
+                f"latency from {source_worker.latency_from} to published estimate: p50 "
                 f"{times['p50']:.1f}, p95 {times['p95']:.1f}, p99.9 {times['p99.9']:.1f} ms."
             )
-        for outlet in self._outlets:
-            if outlet.dropped or outlet.errors:
-                last = f"; the last: {outlet.error}" if outlet.error else ""
-                say(f"sink {outlet.name}: {outlet.dropped} missed, {outlet.errors} errors{last}.")
+        for worker in self._sink_workers:
+            if worker.dropped or worker.errors:
+                last = f"; the last: {worker.error}" if worker.error else ""
+                say(f"sink {worker.name}: {worker.dropped} missed, {worker.errors} errors{last}.")
         for name, errors in loop.errors.items():
             off = errors.summary()
             say(f"{name}: centre off by {off['p50']:.1f} mm (median; 95 %: {off['p95']:.1f} mm).")
         if not self._unwritten:
             say(f"written to {self._report}.")
-        if lost := [outlet for outlet in self._outlets if outlet.unclosed]:
+        if lost := [worker for worker in self._sink_workers if worker.unclosed]:
             raise StorageError(f"sink {lost[0].name} did not end well: {lost[0].error}.")
 
-    def _line(self, now: float, reader: SourceWorker) -> None:
+    def _line(self, now: float, source_worker: SourceWorker) -> None:
         total = sum(self._loop.counts.values())
         rate = (total - self._before) / (now - self._said)
         self._before, self._said = total, now
@@ -319,10 +318,10 @@ class _Screen:
         say(
             f"{now - self._started:6.0f} s  {rate:5.1f} updates/s  latency p50 "
             f"{latency.percentile(50):.1f} p95 {latency.percentile(95):.1f} ms  "
-            f"dropped {reader.dropped}  {_resident_mb():.0f} MB"
+            f"dropped {source_worker.dropped}  {_resident_mb():.0f} MB"
         )
 
-    def _store(self, reader: SourceWorker) -> None:
+    def _store(self, source_worker: SourceWorker) -> None:
         from tumortrack.live.loop import summary
 
         self._stored = time.monotonic()
@@ -334,7 +333,7 @@ class _Screen:
             **self._about,
             "seconds": round(self._stored - self._started, 2),
             "memory_mb": self._memory_mb,
-            **summary(self._loop, reader, self._outlets),
+            **summary(self._loop, source_worker, self._sink_workers),
             **({} if self._arms is None else {"resection": self._arms.summary()}),
         }
         try:

@@ -180,11 +180,11 @@ def _virtual(
     report = place_of_report(options.report, "resect")
     frames = PublishedFrame(stored.frame_id, stored.table_from_camera)
     controls = Controls()
-    setting = SinkContext(tuple(stored.meshes), frames, None, controls, arms=True)
-    outlets: list[SinkWorker] = []
+    context = SinkContext(tuple(stored.meshes), frames, None, controls, arms=True)
+    sink_workers: list[SinkWorker] = []
     with ExitStack() as stack:
         stack.enter_context(stopping(lambda: operation.abort(STOPPED)))
-        outlets = open_sinks(sinks, parse_sinks(sinks), setting, stack)
+        sink_workers = open_sinks(sinks, parse_sinks(sinks), context, stack)
         say(f"{stored.motions.seconds / config.speed:.0f} s in frame {frames.frame_id!r}; "
             "Ctrl-C stops the arms.")  # fmt: skip
         errors: dict[str, str] = {}
@@ -193,23 +193,25 @@ def _virtual(
             if controls.aborted.is_set():
                 operation.abort("stopped by the viewer, or a real arm gave up")
             update = operation.act(
-                TrackingResult(sequence, time.time_ns(), reason=_NOTHING, frames=frames)
+                TrackingResult(sequence, time.time_ns(), reason=_NOTHING, published_frame=frames)
             )
-            for outlet in outlets:
-                outlet.put(update)
-                if outlet.failing and errors.get(outlet.name) != outlet.error:
-                    errors[outlet.name] = outlet.error
-                    say(f"sink {outlet.name}: {outlet.error}")
+            for worker in sink_workers:
+                worker.put(update)
+                if worker.failing and errors.get(worker.name) != worker.error:
+                    errors[worker.name] = worker.error
+                    say(f"sink {worker.name}: {worker.error}")
             said = _say_state(update.workcell, said)
             if operation.ended:
                 break
             sequence += 1
             next_s += 1 / _FPS
             time.sleep(max(0.0, next_s - time.monotonic()))
-    _write_report(report, stored, operation, {outlet.name: outlet.summary() for outlet in outlets})
+    _write_report(
+        report, stored, operation, {worker.name: worker.summary() for worker in sink_workers}
+    )
     say(f"written to {report}.")
     _tell_end(operation)
-    if lost := [outlet for outlet in outlets if outlet.unclosed]:
+    if lost := [worker for worker in sink_workers if worker.unclosed]:
         raise StorageError(f"sink {lost[0].name} did not end well: {lost[0].error}.")
 
 

@@ -29,7 +29,7 @@ from tumortrack.live.quality import judge
 from tumortrack.live.sink_worker import SinkWorker
 from tumortrack.live.source_worker import SourceWorker
 from tumortrack.live.values import (
-    Companion,
+    ArmsController,
     Observation,
     Quality,
     SinkContext,
@@ -81,11 +81,11 @@ class Loop:
     def __init__(
         self,
         tracker: Tracker,
-        setting: SinkContext,
+        context: SinkContext,
         config: LoopConfig,
-        companion: Companion | None = None,
+        companion: ArmsController | None = None,
     ) -> None:
-        self._config, self._setting, self._companion = config, setting, companion
+        self._config, self._context, self._companion = config, context, companion
         self._follower = Follower(tracker, config.follower)
         self._stamps = StampCheck(config.stale_s)
         self._stop = threading.Event()
@@ -123,33 +123,33 @@ class Loop:
 
     def run(
         self,
-        reader: SourceWorker,
-        outlets: list[SinkWorker],
+        source_worker: SourceWorker,
+        sink_workers: list[SinkWorker],
         seen_by: Callable[[TrackingResult], None],
     ) -> None:
-        """``seen_by`` is called with every update, after the outlets have it.
+        """``seen_by`` is called with every update, after the sink_workers have it.
 
         Raises:
             SourceLost: no frame came for ``give_up_s``.
             TumortrackError: the source can never work (as its ``open`` said).
         """
         try:
-            self._run(reader, outlets, seen_by)
+            self._run(source_worker, sink_workers, seen_by)
         finally:
             if self._companion is not None and not self._companion.ended:
                 self._companion.abort("tracking has ended")
-                self._publish(self._silence(None, 0.0, "tracking has ended"), outlets)
+                self._publish(self._silence(None, 0.0, "tracking has ended"), sink_workers)
 
     def _run(
         self,
-        reader: SourceWorker,
-        outlets: list[SinkWorker],
+        source_worker: SourceWorker,
+        sink_workers: list[SinkWorker],
         seen_by: Callable[[TrackingResult], None],
     ) -> None:
         fresh = time.monotonic()
         ends = math.inf
         while not self._stop.is_set():
-            got = reader.take(self._config.stale_s)
+            got = source_worker.take(self._config.stale_s)
             now = time.monotonic()
             if isinstance(got, Observation):
                 got = self._calibrated(got)
@@ -157,17 +157,19 @@ class Loop:
                 fresh = now
                 if self._config.seconds and ends == math.inf:
                     ends = now + self._config.seconds
-                update = self._answer(got, reader.born_ns(got), reader.latency_from != "taking")
-            elif got is None and reader.ended:
+                update = self._answer(
+                    got, source_worker.born_ns(got), source_worker.latency_from != "taking"
+                )
+            elif got is None and source_worker.ended:
                 return
             else:
-                update = self._silence(got, now - fresh, reader.trouble)
-            update = self._publish(update, outlets)
+                update = self._silence(got, now - fresh, source_worker.trouble)
+            update = self._publish(update, sink_workers)
             seen_by(update)
             if now >= ends or (self._companion is not None and self._companion.ended):
                 return
             if now - fresh > self._config.give_up_s:
-                trouble = f": {reader.trouble}" if reader.trouble else ""
+                trouble = f": {source_worker.trouble}" if source_worker.trouble else ""
                 raise SourceLost(
                     f"no frame for {now - fresh:.0f} s{trouble}. Look at the camera or the topic, "
                     "then start again."
@@ -214,7 +216,7 @@ class Loop:
             warning,
             seen,
             organ,
-            self._setting.frames,
+            self._context.published_frame,
             seconds,
             latency_ms=1000 * _age_s(born_ns),
         )
@@ -239,7 +241,7 @@ class Loop:
             self._follower.forget()
 
     def _hints(self, seen: Observation) -> Hints:
-        controls = self._setting.controls
+        controls = self._context.controls
         if controls.picked_mm is not self._picked:  # the user chose anew
             self._picked = self._place_mm = controls.picked_mm
             self._found_s = time.monotonic()
@@ -266,7 +268,10 @@ class Loop:
         """The update where there is no frame."""
         reason = str(fault) if fault is not None else trouble or f"no frame for {silent_s:.1f} s"
         return TrackingResult(
-            self._next(), self._now_ns(), reason=reason, frames=self._setting.frames
+            self._next(),
+            self._now_ns(),
+            reason=reason,
+            published_frame=self._context.published_frame,
         )
 
     def _now_ns(self) -> int:
@@ -276,11 +281,11 @@ class Loop:
         stamp_ns, then_ns = self._stamp
         return stamp_ns + time.monotonic_ns() - then_ns
 
-    def _publish(self, update: TrackingResult, outlets: list[SinkWorker]) -> TrackingResult:
+    def _publish(self, update: TrackingResult, sink_workers: list[SinkWorker]) -> TrackingResult:
         if self._companion is not None:
             update = self._with_arms(self._companion, update)
-        for outlet in outlets:
-            outlet.put(update)
+        for sink_worker in sink_workers:
+            sink_worker.put(update)
         self.counts[update.quality] += 1
         if update.reason:
             self._count_reason(update.reason)
@@ -289,16 +294,16 @@ class Loop:
         for name, stage_s in update.seconds.items():
             self.stages.setdefault(name, Histogram()).add(1000 * stage_s)
         if (
-            update.seen is not None
-            and update.seen.truth is not None
+            update.observation is not None
+            and update.observation.truth is not None
             and update.estimate is not None
         ):
-            self._hold_against(update.estimate, update.seen.truth)
+            self._hold_against(update.estimate, update.observation.truth)
         return update
 
-    def _with_arms(self, arms: Companion, update: TrackingResult) -> TrackingResult:
+    def _with_arms(self, arms: ArmsController, update: TrackingResult) -> TrackingResult:
         try:
-            if self._setting.controls.aborted.is_set():
+            if self._context.controls.aborted.is_set():
                 arms.abort("stopped by the viewer, or a real arm gave up")
             return arms.act(update)
         except Exception as error:  # a defect there: no arms move, and the organ is still seen
@@ -341,20 +346,20 @@ def _age_s(born_ns: int) -> float:
     return (time.time_ns() - born_ns) * 1e-9
 
 
-def summary(loop: Loop, reader: SourceWorker, outlets: list[SinkWorker]) -> dict:
+def summary(loop: Loop, source_worker: SourceWorker, sink_workers: list[SinkWorker]) -> dict:
     """What the run was like (JSON types): counts, latencies and stage times in ms."""
     return {
         "updates": sum(loop.counts.values()),
         "estimates": {"good": loop.counts["good"], "poor": loop.counts["poor"]},
         "no_estimate": loop.counts["none"],
         "reasons": dict(loop.reasons.most_common()),
-        "dropped": reader.dropped,
-        "opened": reader.opened,
+        "dropped": source_worker.dropped,
+        "opened": source_worker.opened,
         "clock_jumps": loop.clock_jumps,
-        "latency_from": reader.latency_from,
+        "latency_from": source_worker.latency_from,
         "latency_ms": loop.latency.summary(),
         "stages_ms": {name: times.summary() for name, times in loop.stages.items()},
         "center_error_mm": {name: errors.summary() for name, errors in loop.errors.items()},
-        "sinks": {outlet.name: outlet.summary() for outlet in outlets},
-        "defects": [*loop.defects, *reader.defects],
+        "sinks": {sink_worker.name: sink_worker.summary() for sink_worker in sink_workers},
+        "defects": [*loop.defects, *source_worker.defects],
     }

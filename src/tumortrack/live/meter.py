@@ -1,6 +1,8 @@
-"""How long things take and how far they are off, over hours, in a memory that does not grow."""
+"""How often things happen, how long they take, and how large errors are."""
 
 from __future__ import annotations
+
+import time
 
 import numpy as np
 
@@ -9,7 +11,8 @@ _STEP = 1.01  # one bin to the next: percentiles are right to 1 %
 
 
 class Histogram:
-    """Positive numbers (times in ms, errors in mm), counted in bins that widen by 1 %."""
+    """Positive numbers (times in ms, errors in mm), counted in bins that widen by 1 %: over hours
+    in constant memory."""
 
     def __init__(self) -> None:
         bins = int(np.ceil(np.log(_COARSEST / _FINEST) / np.log(_STEP))) + 1
@@ -40,3 +43,19 @@ class Histogram:
             return {"count": 0}
         marks = {f"p{mark:g}": round(self.percentile(mark), 3) for mark in (50.0, 95.0, 99.0, 99.9)}
         return {"count": len(self), **marks, "max": round(self._largest, 3)}
+
+
+class Rate:
+    """Lets things happen at most ``hz`` times a second on average; 0: each time."""
+
+    def __init__(self, hz: float) -> None:
+        self._period_s = 1 / hz if hz > 0 else 0.0
+        self._next_s = 0.0
+
+    def due(self) -> bool:
+        now = time.monotonic()
+        if now < self._next_s:
+            return False
+        in_step = now < self._next_s + self._period_s
+        self._next_s = (self._next_s if in_step else now) + self._period_s
+        return True

@@ -8,7 +8,7 @@ from collections import deque
 
 from tumortrack.core.errors import TumortrackError
 from tumortrack.live.meter import Histogram
-from tumortrack.live.values import Counting, Sink, TrackingResult
+from tumortrack.live.values import CountingSink, Sink, TrackingResult
 
 _CLOSE_S = 10.0  # to write what waits, and flush
 _SILENT_S = 2.0  # without a word from the loop: what a sink shows holds no longer
@@ -57,7 +57,7 @@ class SinkWorker:
             "errors": self.errors,
             "last_error": self.error,
             "latency_ms": self.latency.summary(),
-            **({"counts": self._sink.counts} if isinstance(self._sink, Counting) else {}),
+            **({"counts": self._sink.counts} if isinstance(self._sink, CountingSink) else {}),
         }
 
     def _run(self) -> None:
@@ -102,7 +102,7 @@ def _hung(last: TrackingResult) -> TrackingResult:
         last.sequence,
         last.stamp_ns + int(_SILENT_S * 1e9),
         reason=f"the loop has said nothing for {_SILENT_S:g} s",
-        frames=last.frames,
+        published_frame=last.published_frame,
     )
 
 

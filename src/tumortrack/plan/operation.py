@@ -102,7 +102,7 @@ Draw = Callable[[Float64[np.ndarray, " 12"]], tuple[RigidShape, ...]]
 
 
 class Operation:
-    """``live.values.Companion``: arms that act on estimates.
+    """``live.values.ArmsController``: arms that act on estimates.
 
     Args:
         planned: what to begin with.

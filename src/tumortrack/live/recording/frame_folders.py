@@ -1,4 +1,4 @@
-"""Updates into plain files: a folder each, and one line each in index.jsonl. Camera frame, mm."""
+"""Results as plain files: a folder each, and one line each in index.jsonl. Camera frame, mm."""
 
 from __future__ import annotations
 
@@ -13,9 +13,8 @@ import numpy as np
 from tumortrack.core.errors import StorageError, TumortrackError
 from tumortrack.core.estimate import Estimate
 from tumortrack.core.mesh_files import write_mesh
-from tumortrack.core.types import DepthFrame, Mesh
+from tumortrack.core.types import DepthFrame, Mesh, SensorCloud
 from tumortrack.live.recording.folders import CLOUD, DEPTH, FRAMES, INTRINSICS, MASK, REPORT
-from tumortrack.live.recording.metadata import facts, report
 from tumortrack.live.values import Observation, RigidShape, TrackingResult, Workcell
 from tumortrack.sense.files import DEPTH_UNIT_MM, depth_png, intrinsics_json
 from tumortrack.sense.ply import cloud_ply
@@ -50,8 +49,8 @@ class FrameFolders:
         folder = self._root / f"{update.sequence:08d}"
         try:
             folder.mkdir()
-            if self._frames and update.seen is not None:
-                _write_seen(folder, update.seen)
+            if self._frames and update.observation is not None:
+                _write_seen(folder, update.observation)
             if update.estimate is not None:
                 _write_estimate(folder / _ESTIMATE, update.estimate)
             if update.workcell is not None:
@@ -133,3 +132,31 @@ def _write_estimate(folder: Path, estimate: Estimate) -> None:
     (folder / "occupancy.ply").write_bytes(points)
     for name, mesh in estimate.meshes.items():
         write_mesh(folder / f"{name}.ply", mesh)
+
+
+def facts(update: TrackingResult) -> dict:
+    """One line about an update (JSON types)."""
+    seen = None
+    if update.observation is not None:
+        seen = "cloud" if isinstance(update.observation.content, SensorCloud) else "depth"
+    return {
+        "sequence": update.sequence,
+        "stamp_ns": update.stamp_ns,
+        "arrived_ns": None if update.observation is None else update.observation.arrived_ns,
+        "seen": seen,
+        "quality": update.quality,
+        "reason": update.reason,
+        "warning": update.warning,
+        "latency_ms": update.latency_ms,
+    }
+
+
+def report(update: TrackingResult) -> dict:
+    """Everything about an update: its facts, times of stages, and the estimate's own report, or
+    null with the reason."""
+    return {
+        **facts(update),
+        "organ_points": None if update.organ is None else len(update.organ.points_mm),
+        "seconds": dict(update.seconds),
+        "estimate": None if update.estimate is None else update.estimate.report,
+    }

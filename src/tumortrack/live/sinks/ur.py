@@ -57,15 +57,15 @@ class UrSinkConfig(SinkConfig, frozen=True, kw_only=True, tag="ur"):
             if not low <= value <= high:
                 raise InputError(f"ur: {name} {value:g} must lie in {low:g}..{high:g}.")
 
-    def open(self, setting: SinkContext) -> UrSink:
+    def open(self, context: SinkContext) -> UrSink:
         """Nothing, or with ``execute`` the connection to the arm, which does not move yet.
 
         Raises:
             InputError: no arms in this run; with ``execute``: see ``connected``.
         """
-        if not setting.arms:
+        if not context.arms:
             raise InputError("ur: nothing here moves an arm; it is for `tumortrack resect`.")
-        return UrSink(self, connected(self.host) if self.execute else None, setting.controls)
+        return UrSink(self, connected(self.host) if self.execute else None, context.controls)
 
 
 class UrSink:

@@ -19,13 +19,13 @@ from tumortrack.core import colours
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.types import Mesh
+from tumortrack.live.display import seen_points
 from tumortrack.live.values import SinkConfig, SinkContext, TrackingResult
-from tumortrack.live.viewer.panel import Actions, Panel
-from tumortrack.live.viewer.points import point_under, seen_points
+from tumortrack.live.viewer.look import point_under
+from tumortrack.live.viewer.panel import Actions, Panel, State, StatusPanel, backdrop
 from tumortrack.live.viewer.scene import ViewerScene
 from tumortrack.live.viewer.server import close_server, open_server
 from tumortrack.live.viewer.slices import load_ct, plane_through, slice_picture
-from tumortrack.live.viewer.status import State, StatusPanel, backdrop
 from tumortrack.live.viewer.workcell import WorkcellView
 
 if TYPE_CHECKING:
@@ -64,22 +64,22 @@ class ViewerSinkConfig(SinkConfig, frozen=True, kw_only=True, tag="viewer"):
         if not 0 < self.hz <= 60:
             raise InputError(f"viewer: hz={self.hz:g}; allowed are more than 0 and up to 60.")
 
-    def open(self, setting: SinkContext) -> ViewerSink:
+    def open(self, context: SinkContext) -> ViewerSink:
         """The page, ready for visitors.
 
         Raises:
             InputError: the port is taken, viser is missing, or the case is another patient's.
             ArtifactError: ``case`` is no case.
         """
-        return ViewerSink(self, setting)
+        return ViewerSink(self, context)
 
 
 class ViewerSink:
     """See ``live.values.Sink``. ``port``: where the page is."""
 
-    def __init__(self, config: ViewerSinkConfig, setting: SinkContext) -> None:
-        ct = load_ct(config.case, setting) if config.case else None
-        self._config, self._setting, self._ct = config, setting, ct
+    def __init__(self, config: ViewerSinkConfig, context: SinkContext) -> None:
+        ct = load_ct(config.case, context) if config.case else None
+        self._config, self._context, self._ct = config, context, ct
         self._server = open_server(config.host, config.port)
         self.port: int = self._server.get_port()
         self._lock = threading.RLock()  # round every change of the page
@@ -92,11 +92,11 @@ class ViewerSink:
         self._asked = False
         self._state: State | None = None
         self._behind: tuple[State, bool] | None = None
-        self._scene = ViewerScene(self._server, setting, config.margin_mm)
+        self._scene = ViewerScene(self._server, context, config.margin_mm)
         self._cell = WorkcellView(self._server)
         turn = self._scene.look.turn
         actions = Actions(self._changed, self._ask, self._forget, turn, self._abort)
-        self._panel = Panel(self._server, setting.parts, actions, ct is not None, setting.arms)
+        self._panel = Panel(self._server, context.parts, actions, ct is not None, context.arms)
         self._say("waiting")
         self._closing = threading.Event()
         self._watch = threading.Thread(target=self._keep_watch, name="viewer", daemon=True)
@@ -174,7 +174,7 @@ class ViewerSink:
         age_s = time.monotonic() - self._came if update is not None else 0.0
         if update is not None and update.latency_ms is not None:
             age_s += update.latency_ms / 1000
-        status = StatusPanel(state, update, age_s, self._beat, self._setting.arms)
+        status = StatusPanel(state, update, age_s, self._beat, self._context.arms)
         if (behind := (state, status.loud)) != self._behind:
             self._behind = behind
             self._server.scene.set_background_image(backdrop(*behind))
@@ -214,13 +214,13 @@ class ViewerSink:
             if spell == self._spells:
                 self._panel.put_slice(picture)
                 if picture is not None and plane is not None:
-                    self._scene.put_slice(picture, plane, update.frames)
+                    self._scene.put_slice(picture, plane, update.published_frame)
 
     def _outlines(self, update: TrackingResult) -> list[tuple[Mesh, colours.Colour, int]]:
         assert update.estimate is not None
-        back = np.linalg.inv(update.frames.published_from_camera)
+        back = np.linalg.inv(update.published_frame.published_from_camera)
         outlines = []
-        for label, name in enumerate(self._setting.parts, start=1):
+        for label, name in enumerate(self._context.parts, start=1):
             colour = colours.part_colour(label)
             if name in update.estimate.meshes:
                 outlines.append((update.estimate.meshes[name], colour, 2 if label > 1 else 1))
@@ -243,7 +243,7 @@ class ViewerSink:
                 self._server.scene.on_click()(self._clicked)
             else:
                 self._server.scene.remove_click_callback(self._clicked)
-            self._panel.picking(self._asked, self._setting.controls.picked_mm is not None)
+            self._panel.picking(self._asked, self._context.controls.picked_mm is not None)
 
     def _clicked(self, event: SceneClickEvent) -> None:
         with self._lock:
@@ -251,27 +251,27 @@ class ViewerSink:
                 return
             self._ask()
             update = self._update
-            if update is None or update.seen is None:
+            if update is None or update.observation is None:
                 event.client.add_notification("Nothing is seen at present", "Click again later.")
                 return
-            back = np.linalg.inv(update.frames.published_from_camera)
+            back = np.linalg.inv(update.published_frame.published_from_camera)
             origin = transform_points(back, np.array([event.ray_origin]))[0]
             direction = back[:3, :3] @ np.array(event.ray_direction)
-            point = point_under(seen_points(update).astype(float), origin, direction)
+            point = point_under(seen_points(update.observation).astype(float), origin, direction)
             if point is None:
                 event.client.add_notification("No observed point there", "Click on the points.")
                 return
-            self._setting.controls.pick(point)
-            self._scene.mark(point, update.frames)
+            self._context.controls.pick(point)
+            self._scene.mark(point, update.published_frame)
             self._panel.picking(False, True)
 
     def _forget(self) -> None:
         with self._lock:
-            self._setting.controls.pick(None)
-            self._scene.mark(None, self._setting.frames)
+            self._context.controls.pick(None)
+            self._scene.mark(None, self._context.published_frame)
             self._panel.picking(self._asked, False)
 
     def _abort(self) -> None:
         with self._lock:
-            self._setting.controls.aborted.set()
+            self._context.controls.aborted.set()
             self._panel.aborted()

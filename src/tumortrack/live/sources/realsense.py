@@ -78,7 +78,7 @@ class RealSenseSource:
         self.dropped = 0
         self._device = device
         self._playback = device.as_playback() if device.is_playback() else None
-        self.waits = self._playback is not None and not config.realtime
+        self.lossless = self._playback is not None and not config.realtime
         self._room = threading.Condition()
         self._newest: tuple[Any, int] | None = None  # the SDK's frame, and when it came
         self._closed = False
@@ -143,7 +143,7 @@ class RealSenseSource:
         if not frame.is_depth_frame():
             return
         with self._room:
-            if self.waits:
+            if self.lossless:
                 self._room.wait_for(lambda: self._newest is None or self._closed)
             if self._closed:
                 return

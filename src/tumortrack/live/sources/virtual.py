@@ -91,7 +91,7 @@ class VirtualSource:
     surfaces."""
 
     host_clock = True
-    waits = False
+    lossless = False
 
     def __init__(self, theatre: ScenePlayer, fps: float) -> None:
         self.theatre = theatre
