@@ -11,6 +11,7 @@ from pathlib import Path
 
 from tumortrack.cli.console import say
 from tumortrack.core.cores import available_cores
+from tumortrack.live.spec import extensions
 
 _LIBRARIES = {
     "torch": "training and locating",
@@ -55,6 +56,9 @@ def examine() -> None:
             say(f"BROKEN   {name} ({purpose}): {error}")
     for name, purpose in _OPTIONAL.items():
         say(f"{'ok      ' if find_spec(name) else 'absent  '} {name} ({purpose})")
+    for one in extensions():
+        state, fault = ("BROKEN  ", f": {one.fault}") if one.fault else ("ok      ", "")
+        say(f"{state} {one.what} {one.kind} of the package {one.package}{fault}")
     _examine_torch()
 
 
