@@ -8,7 +8,7 @@ import sys
 import numpy as np
 import pytest
 
-from extension_objects import distribution, installed_example
+from extension_objects import EXAMPLE, distribution, installed_example
 from live_objects import small_frame, small_setting, small_update
 from stories import environment, succeeded, tumortrack
 from tumortrack.core.errors import InputError
@@ -108,3 +108,8 @@ def test_doctor_names_what_other_packages_add(example, monkeypatch, tmp_path):
     assert "ok       sink csv of the package tumortrack-example" in said
     assert "BROKEN   source lost of the package acme-sources: " in said
     assert "no_such_module" in said
+
+
+def test_the_documentation_shows_the_example_as_it_is():
+    shown = (EXAMPLE.parents[2] / "docs" / "live.md").read_text()
+    assert (EXAMPLE / "tumortrack_example" / "csv.py").read_text() in shown
