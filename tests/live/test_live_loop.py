@@ -31,8 +31,7 @@ from tumortrack.sense.region import RegionConfig
 from tumortrack.sense.render import render_depth
 from tumortrack.simulate.bodies import body_for
 from tumortrack.simulate.scene import SceneRecipe, Simulator
-from tumortrack.tracking.follower import Follower, FollowerConfig
-from tumortrack.tracking.tracker import Tracker
+from tumortrack.tracking.tracker import Follower, FollowerConfig, Tracker
 from tumortrack.training.model import load_model
 from warp_objects import ANATOMY, placed, slim_clinic
 

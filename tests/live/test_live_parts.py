@@ -14,8 +14,8 @@ from scipy.spatial.transform import Rotation
 from live_objects import empty_update, small_frame, small_update
 from tumortrack.core.errors import InputError, NoEstimate, StorageError
 from tumortrack.live.calibration_file import read_frames
-from tumortrack.live.clock import StampCheck
 from tumortrack.live.meter import Histogram
+from tumortrack.live.quality import StampCheck
 from tumortrack.live.sink_worker import SinkWorker
 from tumortrack.live.source_worker import SourceWorker
 from tumortrack.live.spec import Registry

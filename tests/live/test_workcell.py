@@ -32,10 +32,9 @@ from tumortrack.live.ros.workcell import WorkcellMessages
 from tumortrack.live.sink_worker import SinkWorker
 from tumortrack.live.sinks.openigtlink import OpenIgtLinkSinkConfig
 from tumortrack.live.sinks.recording import RecordingSinkConfig as RecordTo
-from tumortrack.live.sinks.ur import UrSink, UrSinkConfig
+from tumortrack.live.sinks.ur import SILENT_S, UR_JOINTS, UrSink, UrSinkConfig
 from tumortrack.live.sources.recording import RecordingSourceConfig
 from tumortrack.live.spec import SINKS
-from tumortrack.live.ur_link import SILENT_S, UR_JOINTS
 from tumortrack.live.values import Observation, SinkContext, SourceEnded, TrackingResult
 from workcell_objects import CUT, REASON, TABLE, virtual, with_arms, workcell, working
 

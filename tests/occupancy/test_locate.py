@@ -26,8 +26,7 @@ from tumortrack.imaging.case import load_case
 from tumortrack.occupancy.compiled import Arithmetic
 from tumortrack.occupancy.inference import possible
 from tumortrack.occupancy.packed import can_pack
-from tumortrack.tracking.follower import Follower, FollowerConfig
-from tumortrack.tracking.tracker import Tracker
+from tumortrack.tracking.tracker import Follower, FollowerConfig, Tracker
 from tumortrack.training.model import load_model
 from tumortrack.training.presets import quick
 from tumortrack.training.train import TrainingRun, train

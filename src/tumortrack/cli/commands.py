@@ -19,7 +19,7 @@ from tumortrack.core.types import Anatomy, DepthFrame, SensorCloud
 if TYPE_CHECKING:
     from tumortrack.imaging.prepare import PrepareOptions
     from tumortrack.sense.cloud import CloudConfig
-    from tumortrack.tracking.points import PointTable
+    from tumortrack.tracking.point_table import PointTable
 
 Device = Literal["auto", "cpu", "cuda"]
 

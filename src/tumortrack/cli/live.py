@@ -161,7 +161,7 @@ def _loop_config(
 ) -> LoopConfig:
     from tumortrack.live.loop import LoopConfig
     from tumortrack.sense.files import read_intrinsics
-    from tumortrack.tracking.follower import FollowerConfig
+    from tumortrack.tracking.tracker import FollowerConfig
 
     return LoopConfig(
         region=_region(trained, anatomy_ct, options),

@@ -23,9 +23,8 @@ from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError, NoEstimate, TumortrackError
 from tumortrack.core.estimate import Estimate
 from tumortrack.core.types import Anatomy, DepthFrame, Intrinsics, SensorCloud
-from tumortrack.live.clock import StampCheck
 from tumortrack.live.meter import Histogram
-from tumortrack.live.quality import judge
+from tumortrack.live.quality import StampCheck, judge
 from tumortrack.live.sink_worker import SinkWorker
 from tumortrack.live.source_worker import SourceWorker
 from tumortrack.live.values import (
@@ -38,8 +37,7 @@ from tumortrack.live.values import (
 )
 from tumortrack.sense.camera import d405
 from tumortrack.sense.region import Hints, RegionConfig, organ_points
-from tumortrack.tracking.follower import Follower, FollowerConfig
-from tumortrack.tracking.tracker import Tracker
+from tumortrack.tracking.tracker import Follower, FollowerConfig, Tracker
 
 _KINDS = 50  # of reasons that are counted apart
 _DEFECTS = 5  # tracebacks that are kept

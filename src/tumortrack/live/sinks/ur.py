@@ -16,9 +16,20 @@ import numpy as np
 from jaxtyping import Float64
 
 from tumortrack.core.errors import InputError, TumortrackError
-from tumortrack.live.ur_link import SILENT_S, UR_JOINTS, UrLink, connected
 from tumortrack.live.values import Controls, SinkConfig, SinkContext, TrackingResult
 
+UR_JOINTS = (
+    "shoulder_pan_joint",
+    "shoulder_lift_joint",
+    "elbow_joint",
+    "wrist_1_joint",
+    "wrist_2_joint",
+    "wrist_3_joint",
+)
+_WATCHDOG_S = 0.2  # of silence: the controller stops the arm by itself
+SILENT_S = _WATCHDOG_S  # and so does the sink
+OFF_DEG = 2.0  # between the arm and the plan, before it may move
+_STOP_M_S2 = 10.0  # servoStop's deceleration: ur_rtde's own
 # Of UR5, UR5e, UR10 and UR10e (data sheets): a turn either way; the larger ones' first two joints
 # are the slower ones, and their limits hold for all here.
 LIMIT_RAD = 2 * np.pi
@@ -229,3 +240,69 @@ def _check_step(step: Float64[np.ndarray, " 6"], seconds: float, jump_deg: float
             f"{UR_JOINTS[joint]} would turn at {np.degrees(abs(step[joint]) / seconds):.0f} "
             f"degrees/s; allowed: {np.degrees(SPEED_RAD_S[joint]):.0f}"
         )
+
+
+class UrLink:
+    """ur_rtde's two interfaces to one arm. Not for two threads at once."""
+
+    def __init__(self, control: Any, receive: Any) -> None:
+        self._control, self._receive = control, receive
+        control.setWatchdog(1 / _WATCHDOG_S)
+
+    def check(self) -> None:
+        """Raises TumortrackError where the arm cannot follow."""
+        if self._receive.isEmergencyStopped() or self._receive.isProtectiveStopped():
+            raise TumortrackError("the arm is in an emergency or protective stop; release it there")
+        if not self._control.isProgramRunning():
+            raise TumortrackError("the arm runs no program any more; start again")
+
+    def compare(self, target: Float64[np.ndarray, " 6"]) -> None:
+        """Raises TumortrackError where the arm is not where the plan has it."""
+        off_deg = np.degrees(np.abs(np.array(self._receive.getActualQ()) - target))
+        if not off_deg.max() <= OFF_DEG:
+            raise TumortrackError(
+                f"{UR_JOINTS[int(off_deg.argmax())]} is {off_deg.max():.1f} degrees from the plan; "
+                f"allowed: {OFF_DEG:g}. Move the arm there first"
+            )
+
+    def servo(
+        self, target: Float64[np.ndarray, " 6"], follow_s: float, lookahead_s: float, gain: float
+    ) -> None:
+        if not self._control.servoJ(target.tolist(), 0.0, 0.0, follow_s, lookahead_s, gain):
+            raise TumortrackError("the arm did not take the target")
+
+    def stop(self) -> None:
+        if not self._control.servoStop(_STOP_M_S2):
+            raise TumortrackError("the arm did not take the order to stop")
+
+    def kick(self) -> None:
+        self._control.kickWatchdog()
+
+    def close(self) -> None:
+        self._control.stopScript()
+        self._control.disconnect()
+        self._receive.disconnect()
+
+
+def connected(host: str) -> UrLink:
+    """The controller of an arm, through ur_rtde.
+
+    Raises:
+        InputError: ur_rtde is missing, or the arm cannot be reached or controlled.
+    """
+    try:
+        import rtde_control
+        import rtde_receive
+    except ImportError as error:
+        raise InputError(
+            "ur with execute=true needs the package ur_rtde: pip install 'tumortrack[ur]'."
+        ) from error
+    try:
+        receive = rtde_receive.RTDEReceiveInterface(host)
+        control = rtde_control.RTDEControlInterface(host)
+    except RuntimeError as error:
+        raise InputError(
+            f"ur: the arm at {host} cannot be controlled ({error}). Is it on, released, in remote "
+            "control, and reachable on port 30004?"
+        ) from error
+    return UrLink(control, receive)
