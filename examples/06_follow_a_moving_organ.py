@@ -52,7 +52,7 @@ def main(out: Path, model_folder: Path, frames: int) -> None:
     source_worker = SourceWorker(VirtualSourceConfig(case=out / "case", fps=10).open)
 
     def enough(update: TrackingResult) -> None:
-        if loop.counts["good"] + loop.counts["poor"] >= frames:
+        if loop.statistics.counts["good"] + loop.statistics.counts["poor"] >= frames:
             loop.stop()
 
     loop.run(source_worker, [sink_worker], enough)

@@ -239,7 +239,7 @@ def test_a_frame_is_not_given_before_its_time():
 def test_truth_is_of_the_frames_own_instant():
     source = VirtualSource(small_theatre(), fps=30)
     seen = source.at(4.25, stamp_ns=99)
-    again = source.theatre.truth(source.theatre.state_at(4.25))
+    again = source.player.truth(source.player.state_at(4.25))
     assert seen.stamp_ns == 99
     np.testing.assert_array_equal(seen.truth.organ.vertices_mm, again.organ.vertices_mm)
 
@@ -253,8 +253,8 @@ def test_the_command_lines_text_opens_a_case(tmp_path):
     seen = source.read(1.0)
     source.close()
     assert seen is not None
-    assert source.theatre.config.push_mm == 0
-    assert source.theatre.config.noise == CLEAN
+    assert source.player.config.push_mm == 0
+    assert source.player.config.noise == CLEAN
     np.testing.assert_allclose(
         seen.content.depth_mm[np.isfinite(seen.content.depth_mm)].min(),
         seen.truth.organ.vertices_mm[:, 2].min(),

@@ -285,13 +285,13 @@ class _Screen:
         if source_worker is None:
             return  # nothing was tracked: a sink could not be opened
         self._store(source_worker)
-        estimates = loop.counts["good"] + loop.counts["poor"]
+        counts, latency = loop.statistics.counts, loop.statistics.latency
         say(
-            f"{estimates} estimates ({loop.counts['poor']} poor), {loop.counts['none']} times "
-            f"none, {source_worker.dropped} frames dropped."
+            f"{counts['good'] + counts['poor']} estimates ({counts['poor']} poor), "
+            f"{counts['none']} times none, {source_worker.dropped} frames dropped."
         )
-        if len(loop.latency):
-            times = loop.latency.summary()
+        if len(latency):
+            times = latency.summary()
             say(
                 f"latency from {source_worker.latency_from} to published estimate: p50 "
                 f"{times['p50']:.1f}, p95 {times['p95']:.1f}, p99.9 {times['p99.9']:.1f} ms."
@@ -300,7 +300,7 @@ class _Screen:
             if worker.dropped or worker.errors:
                 last = f"; the last: {worker.error}" if worker.error else ""
                 say(f"sink {worker.name}: {worker.dropped} missed, {worker.errors} errors{last}.")
-        for name, errors in loop.errors.items():
+        for name, errors in loop.statistics.errors.items():
             off = errors.summary()
             say(f"{name}: centre off by {off['p50']:.1f} mm (median; 95 %: {off['p95']:.1f} mm).")
         if not self._unwritten:
@@ -309,10 +309,10 @@ class _Screen:
             raise StorageError(f"sink {lost[0].name} did not end well: {lost[0].error}.")
 
     def _line(self, now: float, source_worker: SourceWorker) -> None:
-        total = sum(self._loop.counts.values())
+        total = sum(self._loop.statistics.counts.values())
         rate = (total - self._before) / (now - self._said)
         self._before, self._said = total, now
-        latency = self._loop.latency
+        latency = self._loop.statistics.latency
         if not len(latency):
             return
         say(

@@ -91,10 +91,10 @@ class StampCheck:
         self._stale_s = stale_s
         self._last_ns: int | None = None
         self._behind: list[int] = []
-        self.jumps = 0
 
-    def check(self, stamp_ns: int, age_s: float) -> None:
-        """``age_s``: how long ago the frame was made, or came, as well as one can tell.
+    def check(self, stamp_ns: int, age_s: float) -> bool:
+        """True if the clock was set back. ``age_s``: how long ago the frame was made, or came, as
+        far as is known.
 
         Raises:
             NoEstimate: stale, or out of order.
@@ -110,17 +110,13 @@ class StampCheck:
             )
         if stamp_ns < 0:
             raise NoEstimate(f"the frame's stamp is {stamp_ns} ns; it must be 0 or more")
-        self._in_order(stamp_ns)
-
-    def _in_order(self, stamp_ns: int) -> None:
         if self._last_ns is None or stamp_ns > self._last_ns:
             self._last_ns, self._behind = stamp_ns, []
-            return
+            return False
         grows = not self._behind or stamp_ns > self._behind[-1]
         self._behind = [*self._behind, stamp_ns] if grows else [stamp_ns]
         back_s = (self._last_ns - stamp_ns) * 1e-9
-        if len(self._behind) >= _ACCEPTED_AFTER:
-            self._last_ns, self._behind = stamp_ns, []
-            self.jumps += 1
-            return
-        raise NoEstimate(f"the frame's stamp went back by {back_s:.3f} s")
+        if len(self._behind) < _ACCEPTED_AFTER:
+            raise NoEstimate(f"the frame's stamp went back by {back_s:.3f} s")
+        self._last_ns, self._behind = stamp_ns, []
+        return True

@@ -22,6 +22,15 @@ from tumortrack.live.values import SinkConfig, SourceConfig
 C = TypeVar("C", bound=Config)
 
 
+class Extension(NamedTuple):
+    """A source or sink of another package; ``fault``: why it cannot be used, empty if it can."""
+
+    what: str
+    kind: str
+    package: str
+    fault: str
+
+
 @dataclass(frozen=True)
 class Registry(Generic[C]):
     """All kinds of source, or of sink: ``built_in`` (``module:class`` by kind), and those of
@@ -44,8 +53,8 @@ class Registry(Generic[C]):
         config = self._class(kind, f"{self.what} {text!r}")
         return _filled(config, target, options, f"{self.what} {text!r}")
 
-    def offered(self) -> Iterator[tuple[EntryPoint, str]]:
-        """What other packages offer, and what is wrong with it; empty: nothing."""
+    def extensions(self) -> Iterator[Extension]:
+        """What other packages offer; each class is imported."""
         for entry in self._entry_points():
             fault = ""
             try:
@@ -54,7 +63,7 @@ class Registry(Generic[C]):
                     fault = f"{entry.name!r} is built in, and cannot be replaced"
             except InputError as error:
                 fault = str(error)
-            yield entry, fault
+            yield Extension(self.what, entry.name, package_of(entry), fault)
 
     def _class(self, kind: str, where: str) -> type[C]:
         """Raises InputError, which ``where`` opens."""
@@ -120,22 +129,9 @@ SINKS = Registry[SinkConfig](
 )
 
 
-class Extension(NamedTuple):
-    """A source or sink of another package; ``fault``: why it cannot be used, empty if it can."""
-
-    what: str
-    kind: str
-    package: str
-    fault: str
-
-
 def extensions() -> list[Extension]:
-    """Every source and sink that installed packages offer; each is imported."""
-    return [
-        Extension(registry.what, entry.name, package_of(entry), fault)
-        for registry in (SOURCES, SINKS)
-        for entry, fault in registry.offered()
-    ]
+    """Every source and sink that installed packages offer."""
+    return [*SOURCES.extensions(), *SINKS.extensions()]
 
 
 def package_of(entry: EntryPoint) -> str:

@@ -34,7 +34,7 @@ _MOST_ANSWERS = 100  # that wait for a receiver: one that only asks gets no more
 _STALLED_S = 10.0  # a receiver that takes nothing for so long is gone
 _RETRY_S = 1.0  # between tries to connect
 _PIECE = 2**18  # bytes handed to the socket in one go
-_BUFFER = 2**19  # of the socket: about one update, so that what waits there is not old
+_BUFFER = 2**19  # of the socket: about one result, so that what waits there is not old
 
 Key = tuple[str, str]  # type and device
 
@@ -168,7 +168,7 @@ class Link:
         receiver.socket.close()
 
     def _update_interest(self) -> None:
-        """Ask to be told when those with something waiting can take more; drop the dead."""
+        """Wait for receivers that have something to take; drop the dead ones."""
         now = time.monotonic()
         for receiver in list(self._receivers.values()):
             with self._lock:

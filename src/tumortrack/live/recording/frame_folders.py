@@ -45,19 +45,19 @@ class FrameFolders:
         self._surfaces: dict[str, tuple[Mesh, str]] = {}  # by shape: the last, and its file
         self._written = 0
 
-    def write(self, update: TrackingResult) -> None:
-        folder = self._root / f"{update.sequence:08d}"
+    def write(self, result: TrackingResult) -> None:
+        folder = self._root / f"{result.sequence:08d}"
         try:
             folder.mkdir()
-            if self._frames and update.observation is not None:
-                _write_seen(folder, update.observation)
-            if update.estimate is not None:
-                _write_estimate(folder / _ESTIMATE, update.estimate)
-            if update.workcell is not None:
-                self._write_workcell(folder / WORKCELL, update.workcell)
-            text = json.dumps(report(update), indent=1, allow_nan=False)
+            if self._frames and result.observation is not None:
+                _write_seen(folder, result.observation)
+            if result.estimate is not None:
+                _write_estimate(folder / _ESTIMATE, result.estimate)
+            if result.workcell is not None:
+                self._write_workcell(folder / WORKCELL, result.workcell)
+            text = json.dumps(report(result), indent=1, allow_nan=False)
             (folder / REPORT).write_text(text + "\n", encoding="utf-8")
-            line = json.dumps({**facts(update), "folder": folder.name}) + "\n"
+            line = json.dumps({**facts(result), "folder": folder.name}) + "\n"
             self._index.write(line.encode())
         except (OSError, StorageError) as error:
             shutil.rmtree(folder, ignore_errors=True)
@@ -134,29 +134,29 @@ def _write_estimate(folder: Path, estimate: Estimate) -> None:
         write_mesh(folder / f"{name}.ply", mesh)
 
 
-def facts(update: TrackingResult) -> dict:
-    """One line about an update (JSON types)."""
+def facts(result: TrackingResult) -> dict:
+    """One line about a result (JSON types)."""
     seen = None
-    if update.observation is not None:
-        seen = "cloud" if isinstance(update.observation.content, SensorCloud) else "depth"
+    if result.observation is not None:
+        seen = "cloud" if isinstance(result.observation.content, SensorCloud) else "depth"
     return {
-        "sequence": update.sequence,
-        "stamp_ns": update.stamp_ns,
-        "arrived_ns": None if update.observation is None else update.observation.arrived_ns,
+        "sequence": result.sequence,
+        "stamp_ns": result.stamp_ns,
+        "arrived_ns": None if result.observation is None else result.observation.arrived_ns,
         "seen": seen,
-        "quality": update.quality,
-        "reason": update.reason,
-        "warning": update.warning,
-        "latency_ms": update.latency_ms,
+        "quality": result.quality,
+        "reason": result.reason,
+        "warning": result.warning,
+        "latency_ms": result.latency_ms,
     }
 
 
-def report(update: TrackingResult) -> dict:
-    """Everything about an update: its facts, times of stages, and the estimate's own report, or
+def report(result: TrackingResult) -> dict:
+    """Everything about a result: its facts, times of stages, and the estimate's own report, or
     null with the reason."""
     return {
-        **facts(update),
-        "organ_points": None if update.organ is None else len(update.organ.points_mm),
-        "seconds": dict(update.seconds),
-        "estimate": None if update.estimate is None else update.estimate.report,
+        **facts(result),
+        "organ_points": None if result.organ is None else len(result.organ.points_mm),
+        "seconds": dict(result.seconds),
+        "estimate": None if result.estimate is None else result.estimate.report,
     }

@@ -52,10 +52,10 @@ class McapFile:
         self._storage.bio = self._file = _WholeWrites(self._storage.path)
         self._whole = self._file.tell()  # behind the last whole chunk
 
-    def write(self, update: TrackingResult) -> None:
-        for out in self._messages_of(update):
+    def write(self, result: TrackingResult) -> None:
+        for out in self._messages_of(result):
             topic = out.suffix if out.suffix.startswith("/") else f"/tumortrack/{out.suffix}"
-            self._write(topic, out, self._time_of(update))
+            self._write(topic, out, self._time_of(result))
         if time.monotonic() - self._chunk_s >= _CHUNK_S:
             self._flush()
 
@@ -68,23 +68,23 @@ class McapFile:
         except OSError as error:
             self._give_up(error)
 
-    def _messages_of(self, update: TrackingResult) -> list[Outgoing]:
-        messages, published = self._messages, update.published_frame
+    def _messages_of(self, result: TrackingResult) -> list[Outgoing]:
+        messages, published = self._messages, result.published_frame
         due = self._meshes.due()
-        out = messages_of(update, messages, self._context.parts, due, self._workcell)
-        text = json.dumps(report(update), allow_nan=False)
+        out = messages_of(result, messages, self._context.parts, due, self._workcell)
+        text = json.dumps(report(result), allow_nan=False)
         string = "std_msgs/msg/String"
         out.append(Outgoing("report", string, messages.make(string, data=text)))
-        if self._frames and update.observation is not None:
+        if self._frames and result.observation is not None:
             camera = _camera_frame(published)
-            seen = messages_seen(update.observation, messages, camera)
+            seen = messages_seen(result.observation, messages, camera)
             out = [*(one._replace(suffix=f"/camera/{one.suffix}") for one in seen), *out]
             if camera != published.frame_id:
-                out.append(_transform(update.stamp_ns, published, camera, messages))
+                out.append(_transform(result.stamp_ns, published, camera, messages))
         return out
 
-    def _time_of(self, update: TrackingResult) -> int:
-        now_ns = time.time_ns() if update.observation is None else update.observation.arrived_ns
+    def _time_of(self, result: TrackingResult) -> int:
+        now_ns = time.time_ns() if result.observation is None else result.observation.arrived_ns
         self._last_ns = max(self._last_ns, now_ns)
         return self._last_ns
 

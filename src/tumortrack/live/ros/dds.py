@@ -24,7 +24,7 @@ from tumortrack.live.ros.messages import Messages
 # 500 kB: beside a reliable subscriber that hangs, one call in twenty took 25 ms instead of 2. The
 # newest message alone is kept, so the limit set here is never reached. The receive buffer holds a
 # few clouds; the kernel cuts it to net.core.rmem_max. Where there is no multicast, programs with
-# another maker's DDS that start later are found only by being told: each second, not every 8.
+# another maker's DDS that start later are found by announcements alone: each second, not every 8.
 _TUNING = (
     "<CycloneDDS><Domain><Internal><Watermarks><WhcHigh>64MB</WhcHigh></Watermarks>"
     '<SocketReceiveBufferSize max="16MB"/></Internal>'
@@ -46,7 +46,7 @@ _NUMBERS = (
     *("float32", "float64"),
 )
 
-# A domain is set up once per process and outlives its participants: made anew, it would cut off
+# A domain is set up once per process and outlives its participants: made again, it would cut off
 # whoever else uses it.
 _domains: dict[int, Any] = {}
 _setting_up = threading.Lock()
@@ -224,7 +224,7 @@ class DdsSubscriber:
 
     @property
     def lost(self) -> int:
-        """Asked for, and not told by a listener: that would make the thread that empties the
+        """Asked for, not reported to a listener: that would make the thread that empties the
         socket wait for Python's lock."""
         from cyclonedds.internal import DDS, dds_c_t
 

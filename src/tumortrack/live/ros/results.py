@@ -117,7 +117,7 @@ def _markers(
             colour, opacity = part_colour(label), _KIDNEY_OPACITY if label == 1 else 1.0
             at = pose(np.zeros(3))
             markers.append(triangles_marker(header, name, corners_mm, at, colour, opacity))
-    if estimate is not None or result.workcell is None:  # else said with what the arms do
+    if estimate is not None or result.workcell is None:  # else the workcell's text says it
         markers.append(_quality_text(result, header))
     return markers
 

@@ -152,7 +152,6 @@ class Node:
         self.rospy = rospy
         self.name: str = rospy.get_name()
         self.master = Master(master_uri, self.name)
-        self._uri: str = rospy.get_node_uri()
 
     def resolved(self, topic: str) -> str:
         """The topic's full name in this node's namespace."""
@@ -162,19 +161,6 @@ class Node:
         """Whether the master knows that this node subscribes; a new master does not."""
         _, subscribers, _ = self.master.call("getSystemState")
         return self.name in dict(subscribers).get(topic, ())
-
-    def register_again(self, publishers: list[Any]) -> None:
-        """Make publishers known to a master that does not know them; whoever listens already
-        stays connected.
-
-        Raises:
-            MasterLost: no answer.
-        """
-        known, *_ = self.master.call("getSystemState")
-        known = dict(known)
-        for one in publishers:
-            if self.name not in known.get(one.resolved_name, ()):
-                self.master.call("registerPublisher", one.resolved_name, one.type, self._uri)
 
 
 def node() -> Node:
@@ -287,7 +273,13 @@ class RospyBus:
         Raises:
             MasterLost: no answer.
         """
-        self.node.register_again([one.handle for one in self._publishers])
+        node = self.node
+        known, *_ = node.master.call("getSystemState")
+        known = dict(known)
+        for handle in (one.handle for one in self._publishers):
+            if node.name not in known.get(handle.resolved_name, ()):
+                address = node.rospy.get_node_uri()
+                node.master.call("registerPublisher", handle.resolved_name, handle.type, address)
 
     def close(self) -> None:
         with self._arrived:

@@ -81,7 +81,7 @@ class RecordingSinkConfig(SinkConfig, frozen=True, kw_only=True, tag="recording"
 class RecordingSink:
     """Writes until the disk refuses.
 
-    An MCAP is then left as it is, and every later update raises the same StorageError: it is not
+    An MCAP is then left as it is, and every later result raises the same StorageError: it is not
     in the recording. Plain files go on with the next frame.
     """
 
@@ -90,11 +90,11 @@ class RecordingSink:
         self._refused: StorageError | None = None
         self._closed = False
 
-    def publish(self, update: TrackingResult) -> None:
+    def publish(self, result: TrackingResult) -> None:
         if self._refused is not None:
             raise StorageError(str(self._refused))
         try:
-            self._writer.write(update)
+            self._writer.write(result)
         except StorageError as error:
             if isinstance(self._writer, McapFile):
                 self._refused = error

@@ -81,7 +81,7 @@ class UrSinkConfig(SinkConfig, frozen=True, kw_only=True, tag="ur"):
 
 class UrSink:
     """Sends one arm's joints as they come, and stops it (servoStop) where the arms are halted,
-    there is no workcell, a target is refused, 0.2 s pass without an update, or it is closed.
+    there is no workcell, a target is refused, 0.2 s pass without a result, or it is closed.
 
     Whenever it stood still, it begins only where the arm is within 2 degrees of the target. Should
     this process die, the arm's controller stops it within 0.2 s by itself (setWatchdog).
@@ -107,7 +107,7 @@ class UrSink:
         with self._lock:
             return dict(self._counts)
 
-    def publish(self, update: TrackingResult) -> None:
+    def publish(self, result: TrackingResult) -> None:
         """Send the target, or check it.
 
         Raises:
@@ -118,14 +118,14 @@ class UrSink:
                 return
             if self._fault:
                 raise TumortrackError(self._fault)
-            cell = update.workcell
+            cell = result.workcell
             try:
                 if cell is None or cell.halted:
                     self._counts["no arms" if cell is None else "halted"] += 1
                     self._stop()
                 else:
                     self._heed_silence()
-                    self._go(_target(cell.joints_rad, self._names), update.stamp_ns)
+                    self._go(_target(cell.joints_rad, self._names), result.stamp_ns)
             except TumortrackError as error:
                 self._counts["refused"] += 1
                 self._give_up()

@@ -37,7 +37,7 @@ _COLOURS: dict[State, Colour] = {
 }
 _HEADING: dict[State, str] = {"waiting": "WAITING", "none": "NO ESTIMATE", "stale": "STALE"}
 
-# The page's own watch: every message replaces this element and so starts its clock anew. When
+# The page's own watch: every message replaces this element and so restarts its clock. When
 # none comes (the program was killed, the network is gone) it shows itself, by the browser alone;
 # as a popover it lies above all, where the panel has been dimmed too.
 _WATCH = f"""
@@ -59,17 +59,17 @@ _WATCH = f"""
 
 @dataclass(frozen=True, eq=False)
 class StatusPanel:
-    """What is to be said now. ``update``: the last; ``age_s``: since its frame; ``beat`` differs
-    from message to message; ``arms``: there may be some."""
+    """What the panel says now. ``result``: the last; ``age_s``: since its frame; ``counter``:
+    another with each message; ``arms``: there may be some."""
 
     state: State
-    update: TrackingResult | None
+    result: TrackingResult | None
     age_s: float
-    beat: int
+    counter: int
     arms: bool = False
 
     @property
-    def loud(self) -> bool:
+    def alarming(self) -> bool:
         """There is nothing that may be looked at. Arms that go on without an estimate are meant
         to, as of a plan that is only shown: they would be halted."""
         cell = self._cell
@@ -78,15 +78,15 @@ class StatusPanel:
     @property
     def _cell(self) -> Workcell | None:
         """What arms do, as far as it is still true."""
-        if self.update is None or self.state in ("waiting", "stale"):
+        if self.result is None or self.state in ("waiting", "stale"):
             return None
-        return self.update.workcell
+        return self.result.workcell
 
     def flag(self) -> str:
         """How good, in one line; over the page a banner with the reason, and the page's watch."""
         text = {"good": "GOOD", "poor": "POOR"}.get(self.state) or _HEADING[self.state]
         return (
-            f"<i hidden>{self.beat}</i>{_WATCH}{self._banner()}"
+            f"<i hidden>{self.counter}</i>{_WATCH}{self._banner()}"
             f"{_box(text, _COLOURS[self.state])}{self._arms() if self.arms else ''}"
         )
 
@@ -96,7 +96,7 @@ class StatusPanel:
         if cell is None:
             return _box("ARMS: nothing is known of them", colours.STALE)
         colour = colours.NONE if cell.halted else colours.ARMS
-        said = f"ARMS: {escape(cell.state)}"
+        text = f"ARMS: {escape(cell.state)}"
         why = f"<div style='font-weight:400'>{escape(cell.halted)}</div>" if cell.halted else ""
         over = (
             "<div style='position:fixed;bottom:18px;left:18px;right:378px;z-index:9998;"
@@ -105,27 +105,27 @@ class StatusPanel:
             f"text-align:center;font:700 20px/1.25 system-ui,sans-serif'>{escape(cell.state)}"
             f"{': HALTED' if cell.halted else ''}{why}</div></div>"
         )
-        return over + _box(f"{said}{', HALTED' if cell.halted else ''}", colour)
+        return over + _box(f"{text}{', HALTED' if cell.halted else ''}", colour)
 
     def numbers(self) -> str:
         """Probabilities, age, latency and the stages' times."""
-        update = self.update
-        if update is None:
+        result = self.result
+        if result is None:
             return ""
-        latency = "–" if update.latency_ms is None else f"{update.latency_ms:.0f} ms"
+        latency = "–" if result.latency_ms is None else f"{result.latency_ms:.0f} ms"
         parts = ""
-        if update.estimate is not None and self.state in ("good", "poor"):
-            report = update.estimate.report
+        if result.estimate is not None and self.state in ("good", "poor"):
+            report = result.estimate.report
             parts = _parts(report.get("parts", {}))
             lag_ms = report.get("smoothing", {}).get("lag_ms", 0.0)
             latency += f" + {lag_ms:.0f} smoothing" if lag_ms >= 0.5 else ""
-        stages = {k: v for k, v in update.seconds.items() if "." not in k}  # "a.b" is a part of a
+        stages = {k: v for k, v in result.seconds.items() if "." not in k}  # "a.b" is a part of a
         times = " · ".join(f"{escape(k)} {1000 * v:.1f}" for k, v in stages.items())
         return (
             "<div style='margin:4px 14px 10px;font-size:13px;font-variant-numeric:tabular-nums'>"
             f"{parts}<div style='display:flex;justify-content:space-between;margin-top:6px'>"
             f"<span>latency <b>{latency}</b></span><span>last frame <b>{self.age_s:.1f} s</b> ago"
-            f"</span><span>no. {update.sequence}</span></div>"
+            f"</span><span>no. {result.sequence}</span></div>"
             "<div style='opacity:0.65;font-size:12px;min-height:36px'>"
             f"{times and 'stages, ms: '}{times}</div></div>"
         )
@@ -135,14 +135,14 @@ class StatusPanel:
             return "no frame has come yet"
         if self.state == "stale":
             return f"nothing has come for {self.age_s:.1f} s; the last estimate is hidden"
-        assert self.update is not None
-        return self.update.reason if self.state == "none" else self.update.warning
+        assert self.result is not None
+        return self.result.reason if self.state == "none" else self.result.warning
 
     def _banner(self) -> str:
         """Over the scene: big where there is nothing to see."""
         if self.state == "good":
             return ""
-        size = 44 if self.loud else 20
+        size = 44 if self.alarming else 20
         why = f"<div style='font-size:19px;font-weight:400'>{escape(self._reason())}</div>"
         return (
             "<div style='position:fixed;top:18px;left:18px;right:378px;z-index:9998;"
@@ -161,12 +161,12 @@ def _box(text: str, colour: Colour) -> str:
     )
 
 
-def backdrop(state: State, loud: bool) -> UInt8[np.ndarray, "h w 3"]:
-    """What lies behind the scene: dark; where it is ``loud``, a warning colour and the word, so
+def backdrop(state: State, alarming: bool) -> UInt8[np.ndarray, "h w 3"]:
+    """What lies behind the scene: dark; where it is ``alarming``, a warning colour and the word, so
     that it is read with the panel closed too."""
     from PIL import Image, ImageDraw
 
-    if not loud:
+    if not alarming:
         return np.full((4, 4, 3), colours.BACKGROUND, np.uint8)
     dark = colours.BACKGROUND_NONE if state == "none" else colours.BACKGROUND_STALE
     image = Image.new("RGB", (960, 800), dark)
@@ -298,7 +298,7 @@ class Panel:
         return self._through.value, self._plane.value
 
     def say(self, status: StatusPanel) -> None:
-        # Both before either: what cannot be said leaves the page as it was.
+        # Both before either: an error leaves the page as it was.
         flag, numbers = status.flag(), status.numbers()
         self._flag.content, self._numbers.content = flag, numbers
 

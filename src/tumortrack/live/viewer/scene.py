@@ -65,15 +65,15 @@ class ViewerScene:
         self.look = Look(server, context.published_frame)
         self._make_nodes(context)
 
-    def observe(self, update: TrackingResult) -> None:
-        """Show what this update saw; nothing, if it saw nothing."""
-        way = update.published_frame.published_from_camera
+    def observe(self, result: TrackingResult) -> None:
+        """Show what this result saw; nothing, if it saw nothing."""
+        way = result.published_frame.published_from_camera
         seen = (
             np.zeros((0, 3), np.float32)
-            if update.observation is None
-            else seen_points(update.observation)
+            if result.observation is None
+            else seen_points(result.observation)
         )
-        organ = np.zeros((0, 3), np.float32) if update.organ is None else update.organ.points_mm
+        organ = np.zeros((0, 3), np.float32) if result.organ is None else result.organ.points_mm
         self._put_points(self._seen, transform_points(way, thinned(seen, MOST_SEEN)), colours.SEEN)
         organ_there = transform_points(way, thinned(organ, MOST_SEEN))
         self._put_points(self._organ, organ_there, colours.ORGAN)
@@ -82,15 +82,15 @@ class ViewerScene:
             lower, upper = organ.min(0), organ.max(0)
             corners = transform_points(way, lower + _CORNERS * (upper - lower))
             self._region.points = corners[_EDGES].astype(np.float32)
-            self.look.aim(update.published_frame, float(np.median(organ[:, 2])))
+            self.look.aim(result.published_frame, float(np.median(organ[:, 2])))
         self._has_organ = len(organ) > 0
 
-    def show(self, update: TrackingResult) -> None:
-        """Show this update's estimate, which it must have."""
-        placed = update.transformed
+    def show(self, result: TrackingResult) -> None:
+        """Show this result's estimate, which it must have."""
+        placed = result.transformed
         assert placed is not None
         self._put_labelled(placed)
-        self.margins = self._margins_of(update, placed)
+        self.margins = self._margins_of(result, placed)
         for name, mesh in placed.meshes.items():
             if name in self._parts:
                 shown = self.look.last_drawn(self._bare(mesh)) if name == "kidney" else mesh
@@ -233,13 +233,13 @@ class ViewerScene:
             colour = colours.label_colours(placed.labels[some])
         self._put_points(self._points, placed.points_mm[some], colour)
 
-    def _margins_of(self, update: TrackingResult, placed: TransformedEstimate) -> dict[str, Mesh]:
-        assert update.estimate is not None
+    def _margins_of(self, result: TrackingResult, placed: TransformedEstimate) -> dict[str, Mesh]:
+        assert result.estimate is not None
         tumors = {n: m for n, m in placed.meshes.items() if n in self._shells}
-        motion = update.estimate.motion
+        motion = result.estimate.motion
         if self._margins_ct is None or motion is None:
             return {name: rough_margin(mesh, self._margin_mm) for name, mesh in tumors.items()}
-        way = update.published_frame.published_from_camera
+        way = result.published_frame.published_from_camera
         at_rest = dict(zip(self._shells, self._margins_ct, strict=True))
         return {
             name: at_rest[name].moved(

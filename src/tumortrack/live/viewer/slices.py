@@ -174,10 +174,10 @@ def load_ct(case: str, context: SinkContext) -> CarriedCt:
     return CarriedCt(loaded)
 
 
-def plane_through(update: TrackingResult, part: str, orientation: str) -> SlicePlane | None:
+def plane_through(result: TrackingResult, part: str, orientation: str) -> SlicePlane | None:
     """Through the middle of a part's present surface; centred on the organ, and as large."""
-    assert update.estimate is not None
-    meshes = update.estimate.meshes
+    assert result.estimate is not None
+    meshes = result.estimate.meshes
     if part not in meshes or "kidney" not in meshes:
         return None
     across, down = (np.array(axis) for axis in ORIENTATIONS[orientation])
