@@ -6,7 +6,7 @@ SETUP := .venv/.installed
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: help setup debian demo test check bench soak results headstart training-speed clean
+.PHONY: help setup debian demo test test-hard check replay bench soak results headstart training-speed clean
 
 help:  ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 10
@@ -31,8 +31,16 @@ check: setup  ## lint, types, import order
 debian:  ## what tests need of Debian (ROS, RViz, Chromium), where it can be installed
 	tools/debian.sh
 
-test: check debian  ## check, then all tests
+test: check  ## check, then all tests (those of ROS, RViz and Chromium after `make debian`)
 	OMP_NUM_THREADS=1 $(BIN)/pytest -n 3 --dist loadfile --no-loadscope-reorder
+
+replay: setup  ## has any number changed since runs/replay.json? Without that file: record it (4 minutes; ARGS=--quick)
+	$(BIN)/python tools/replay.py either runs/replay.json $(ARGS)
+
+test-hard: setup  ## tests on narrow vector units beside two busy processes (ARGS=tests/...)
+	@$(BIN)/python -c 'while True: pass' & one=$$!; $(BIN)/python -c 'while True: pass' & two=$$!; \
+	trap "kill $$one $$two" EXIT; ONEDNN_MAX_CPU_ISA=AVX2 ATEN_CPU_CAPABILITY=avx2 \
+	NUMBA_CPU_NAME=haswell OMP_NUM_THREADS=1 $(BIN)/pytest $(ARGS)
 
 bench: setup  ## speed of every part beside its naive form; fills docs/performance.md (10 to 13 minutes; ARGS=--quick)
 	$(BIN)/tumortrack bench --curves --document docs/performance.md $(ARGS)

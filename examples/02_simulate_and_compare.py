@@ -15,7 +15,7 @@ from tumortrack.core.estimate import Estimate
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.types import Anatomy, CameraLabels, OccupancyCloud, SensorCloud
 from tumortrack.imaging.case import load_case
-from tumortrack.models.volume import grid_over
+from tumortrack.models.report import grid_over
 from tumortrack.report.metrics import label_grid
 from tumortrack.report.pictures import scene_picture
 from tumortrack.report.protocol import evaluate_scene

@@ -28,9 +28,9 @@ from tumortrack.core.errors import InputError, TumortrackError
 from tumortrack.imaging.case import Case, load_case
 from tumortrack.phantom.digital import PhantomParameters
 from tumortrack.registration.canonical_frame import carry_over, upright_of
-from tumortrack.registration.hypotheses import best_fit, first_motions
 from tumortrack.registration.motion import ElasticMotion
 from tumortrack.registration.network import RegistrationNetwork
+from tumortrack.registration.registration import Registration
 from tumortrack.registration.rest_shape import RestShape, shape_of
 from tumortrack.report.drawing import new_figure, save
 from tumortrack.simulate.bodies import body_for
@@ -38,10 +38,10 @@ from tumortrack.simulate.dataset import SceneStream
 from tumortrack.simulate.occupancy import organ_pool
 from tumortrack.simulate.scene import Simulator
 from tumortrack.training.head_start import HeadStart, load_start
-from tumortrack.training.loader import batches
 from tumortrack.training.presets import clinic
 from tumortrack.training.registration_task import RegistrationTask
 from tumortrack.training.run import TrainingRun
+from tumortrack.training.scenes import batches
 from tumortrack.training.state import TrainingState
 from tumortrack.training.validate import ValidationScenes, mean_iou_of, validation_scenes
 from tumortrack_lab.study.book import ReportWriter
@@ -181,8 +181,7 @@ class Judge:
         for cloud, points_mm, points_ct, labels in zip(
             scenes.clouds_mm, scenes.points_mm, scenes.points_ct, scenes.labels, strict=True
         ):
-            starts = first_motions(network, shape, cloud)
-            motion = best_fit(shape, cloud, starts, self._refine).motion
+            motion = Registration(network, shape, self._refine).register(cloud).motion
             inside = labels > 0
             first.append(_error_mm(starts[0], points_ct[inside], points_mm[inside]))
             refined.append(_error_mm(motion, points_ct[inside], points_mm[inside]))

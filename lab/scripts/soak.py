@@ -27,6 +27,7 @@ def main() -> int:
             *(sys.executable, "-m", "tumortrack.cli.main", "track"),
             *(str(options.model), f"virtual:{options.case}?fps={options.fps:g}", *options.sinks),
             *("--seconds", str(60 * options.minutes), "--report", str(report)),
+            *("--stale", str(options.stale)),
         ]
         print(" ".join(command), flush=True)
         if subprocess.run(command).returncode:
@@ -93,6 +94,7 @@ def _options() -> argparse.Namespace:
     parser.add_argument("--minutes", type=float, default=60.0)
     parser.add_argument("--fps", type=float, default=30.0)
     parser.add_argument("--error", type=float, default=3.0, help="largest median error, mm")
+    parser.add_argument("--stale", type=float, default=0.5, help="answers so late are none, s")
     parser.add_argument("--sinks", nargs="*", default=[])
     parser.add_argument("--report", type=Path, default=None)
     return parser.parse_args()

@@ -25,30 +25,29 @@ import msgspec
 import numpy as np
 import torch
 import tyro
+from tumortrack.training.networks import Network
 
 from tumortrack.cli.console import say
 from tumortrack.core import store
 from tumortrack.core.allocator import keep_freed_memory
 from tumortrack.core.errors import TumortrackError
 from tumortrack.imaging.case import Case, load_case
-from tumortrack.models.config import TrainConfig
+from tumortrack.models.config import GaussNewtonConfig, TrainConfig
 from tumortrack.occupancy.network import OccupancyNetwork
 from tumortrack.phantom.digital import PhantomParameters
-from tumortrack.registration.hypotheses import first_motions
 from tumortrack.registration.network import RegistrationNetwork
+from tumortrack.registration.registration import Registration
 from tumortrack.registration.rest_shape import shape_of
 from tumortrack.report.drawing import new_figure, save
 from tumortrack.simulate.bodies import body_for
 from tumortrack.simulate.dataset import SceneStream
 from tumortrack.simulate.occupancy import organ_pool
 from tumortrack.simulate.scene import Simulator
-from tumortrack.training.loader import batches
-from tumortrack.training.networks import Network
 from tumortrack.training.presets import PRESETS, clinic, quick
-from tumortrack.training.run import TrainingRun
-from tumortrack.training.schedule import settle_end
+from tumortrack.training.run import TrainingRun, settle_end
+from tumortrack.training.scenes import batches
 from tumortrack.training.state import TrainingState
-from tumortrack.training.task import course_of
+from tumortrack.training.task import task_of
 from tumortrack.training.validate import (
     ValidationScenes,
     ValidationSet,
@@ -161,7 +160,7 @@ def _curve(case: Case, setting: Setting, judge: Judge, options: Options) -> list
     run = TrainingRun(
         case.anatomy, case.up_lps, "", config, setting.seed, minutes=options.seconds / 60
     )
-    course = course_of(run, CPU)
+    course = task_of(run, CPU)
     state = TrainingState(run, CPU)
     state.know(course.teach)
     stream = SceneStream(
@@ -213,7 +212,7 @@ class Judge:
         assert self._shape is not None
         guesses = []
         for cloud, points_mm in zip(scenes.clouds_mm, scenes.points_mm, strict=True):
-            motion = first_motions(network, self._shape, cloud)[0]
+            motion = Registration(network, self._shape, GaussNewtonConfig()).propose(cloud)[0]
             guesses.append(self._shape.labels_at(motion.back(points_mm).astype(np.float32))[0])
         return mean_iou_of(np.stack(guesses), scenes.labels, self._parts)
 

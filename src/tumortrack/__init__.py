@@ -4,4 +4,4 @@ Millimetres everywhere; a transform is named ``b_from_a``. See docs/conventions.
 Importing this package imports neither torch nor any other heavy library.
 """
 
-__version__ = "0.2.0"
+__version__ = "0.1.0"

@@ -6,6 +6,8 @@ import json
 import os
 import re
 
+import pytest
+
 from stories import succeeded, tumortrack
 from tumortrack.cli.doctor import examine
 from tumortrack.cli.inspection import describe
@@ -14,6 +16,7 @@ from tumortrack.imaging.case import load_case
 from tumortrack.simulate.scene_folder import list_scenes, read_scene
 
 
+@pytest.mark.slow
 def test_the_demo_tells_the_whole_story(tmp_path):
     out = tmp_path / "demo"
     said = succeeded(tumortrack("demo", "--out", out, "--minutes", 0.03, "--scenes", 2))

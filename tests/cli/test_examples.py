@@ -16,6 +16,8 @@ from tumortrack.imaging.case import load_case
 from tumortrack.simulate.occupancy import surface_distance
 from tumortrack.simulate.scene_folder import read_scene
 
+pytestmark = pytest.mark.slow
+
 EXAMPLES = sorted((Path(__file__).parents[2] / "examples").glob("[0-9]*.py"))
 
 

@@ -2,7 +2,6 @@
 
 import json
 import sys
-import time
 from pathlib import Path
 
 import msgspec
@@ -10,12 +9,16 @@ import numpy as np
 import pytest
 import torch
 
+from clock import Clock
 from stories import tumortrack
 from tumortrack.core.errors import InputError, TumortrackError
 from tumortrack.core.types import Anatomy, Mesh
+from tumortrack.models.config import MlpDecoderConfig, NetworkConfig
 from tumortrack.models.encoders.pointnet2 import PointNet2Config, SetAbstraction
-from tumortrack.occupancy.mlp_decoder import MlpDecoderConfig
-from tumortrack.occupancy.network import CloudBox, NetworkConfig, OccupancyNetwork, quick_network
+from tumortrack.models.normalisation import CloudBox
+from tumortrack.occupancy.network import OccupancyNetwork
+from tumortrack.training.presets import quick_network
+from tumortrack_lab.bench import turns
 from tumortrack_lab.bench.counts import module_flops
 from tumortrack_lab.bench.goals import GOALS, goals_table
 from tumortrack_lab.bench.growth import draw_growth
@@ -42,21 +45,22 @@ def timing(median_s: float) -> InterleavedTiming:
     return timing_of([0.9 * median_s, median_s, 1.2 * median_s])
 
 
-def test_turns_are_fair_and_what_is_not_counted_is_left_out() -> None:
-    order = []
+def test_turns_are_fair_and_what_is_not_counted_is_left_out(monkeypatch) -> None:
+    clock, order = Clock(), []
+    monkeypatch.setattr(turns, "time", clock)
 
     def slow() -> None:
         order.append("slow")
-        time.sleep(0.02)
+        clock.sleep(0.02)
 
     def fast() -> Uncounted:
         order.append("fast")
-        time.sleep(0.015)
+        clock.sleep(0.015)
         return Uncounted(0.01)
 
     slow_s, fast_s = in_turns(slow, fast, budget_s=0.2)
-    assert slow_s.median_s >= 0.02
-    assert 0.004 <= fast_s.median_s < slow_s.median_s  # a hundredth is not counted
+    assert slow_s.median_s == pytest.approx(0.02)
+    assert fast_s.median_s == pytest.approx(0.005)  # a hundredth is not counted
     assert order[4:8] == ["slow", "fast", "slow", "fast"]  # after two calls of each to warm up
     assert 3 <= slow_s.turns <= 6
     for one in (slow_s, fast_s):
@@ -229,8 +233,8 @@ def test_a_process_measures_a_part(tmp_path) -> None:
     by_hand = 16 * 18 * 2162 + 60 * 160 + 2 * 20 * 424 * 240 / 4
     assert row.work.flops == by_hand
     (peaks,) = [one.peaks for one in said if one.peaks is not None]
-    assert peaks.triad > 1e9
-    assert peaks.gemm["fp32"] > 1e9
+    assert peaks.triad > 1e7  # a thousandth of what any machine reaches, however loaded
+    assert peaks.gemm["fp32"] > 1e7
     (machine,) = [one.machine for one in said if one.machine is not None]
     assert int(machine["cores"]) >= 1
     assert [one.begins for one in said if one.begins] == [
@@ -263,7 +267,10 @@ def test_the_command_gathers_what_processes_find(tmp_path, monkeypatch, capfd) -
     assert [row["name"] for row in found["rows"]] == ["generator", "planning"]
     assert found["machine"] == {"date": "today"}
     assert found["command"] == "tumortrack bench --only generator planning --quick"
-    assert "2.00 s" in capfd.readouterr().out
+    said = capfd.readouterr().out
+    assert "something; about" in said  # and so many seconds left
+    assert said.index("  generator") < said.index("  planning") < said.index("written to")
+    assert said.count("2.00 s a pair") == 2  # each as soon as it was measured
     with pytest.raises(TumortrackError, match="the encoder is broken"):
         benching.bench(BenchOptions(only=("encoder",), out=tmp_path / "none.json"))
     assert not (tmp_path / "none.json").exists()

@@ -21,6 +21,8 @@ from tumortrack_lab.twin.equilibrium import EquilibriumProblem, Hold, settle
 from tumortrack_lab.twin.solid import NeoHookeanSolid
 from tumortrack_lab.twin.states import solve
 
+pytestmark = pytest.mark.slow
+
 SMALL = ApparatusConfig(edge_mm=7.0, plate_mm=20.0, sink_mm=2.0, poke_mm=4.0)
 
 

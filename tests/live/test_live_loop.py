@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import threading
 import time
 from itertools import pairwise
@@ -9,6 +10,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from clock import PATIENCE_S, Clock, until
 from elastic_objects import UP
 from live_objects import small_frame
 from tumortrack.core.errors import InputError, NoEstimate, StorageError
@@ -44,6 +46,16 @@ def tracker(slim_model):
     return Tracker(load_model(slim_model, "cpu"))
 
 
+@pytest.fixture
+def clock(monkeypatch):
+    """The loop's, its reader's and the script's, which the test turns."""
+    one = Clock()
+    monkeypatch.setattr(sys.modules[__name__], "time", one)
+    for module in ("loop", "reader"):
+        monkeypatch.setattr(f"tumortrack.tracking.{module}.time", one)
+    return one
+
+
 @pytest.fixture(scope="module")
 def stages():
     config = slim_clinic().scene
@@ -61,7 +73,7 @@ def moving(stage, n, start_ns=10**15, step_mm=(0.4, -0.2, 0.1)):
 
 
 class Script:
-    """A source that gives items in order: clouds, errors to raise, numbers of seconds to wait."""
+    """A source that gives items in order: clouds, errors to raise, things to do first."""
 
     dropped = 0
 
@@ -69,12 +81,11 @@ class Script:
         self._items, self.lossless, self.host_clock = list(items), waits, host_clock
 
     def read(self, timeout_s):
+        while self._items and callable(self._items[0]):
+            self._items.pop(0)()
         if not self._items:
             raise SourceEnded("that was all")
         item = self._items.pop(0)
-        if isinstance(item, float):
-            time.sleep(item)
-            return None
         if isinstance(item, BaseException):
             raise item
         return item if isinstance(item, Observation) else Observation(item, time.time_ns())
@@ -100,7 +111,7 @@ def play(tracker, items, config=None, sink=None, **script):
     """Run the loop over items; the updates, and the summary."""
     sink = sink or Notes()
     setting = SinkContext(tracker.model.parts, PublishedFrame(), tracker.anatomy_ct, Controls())
-    loop = Loop(tracker, setting, config or LoopConfig(region=WHOLE))
+    loop = Loop(tracker, setting, config or LoopConfig(region=WHOLE, stale_s=PATIENCE_S / 2))
     outlets = [SinkWorker("notes", sink, 1000)]
     scripts = iter([Script(items, **script)])
 
@@ -323,34 +334,41 @@ def test_a_clock_that_jumps_back_costs_frames_and_no_more(tracker, stages):
     assert told["clock_jumps"] == 1
 
 
-def test_stale_frames_are_refused(tracker, stages):
-    now = time.time_ns()
+def test_stale_frames_are_refused(tracker, stages, clock):
+    now = clock.time_ns()
     fresh = SensorCloud(stages[0].cloud.points_mm, now + 150_000_000)
-    old = SensorCloud(stages[0].cloud.points_mm, now - 3_000_000_000)
-    config = LoopConfig(region=WHOLE, stale_s=2.0)
-    updates, told = play(tracker, [old, 0.2, fresh], config, host_clock=True, waits=False)
+    old = SensorCloud(stages[0].cloud.points_mm, now - 21_000_000_000)
+    config = LoopConfig(region=WHOLE, stale_s=20.0)
+    sink = Notes()
+
+    def later():
+        until(lambda: sink.updates)
+        clock.sleep(0.2)
+
+    updates, told = play(tracker, [old, later, fresh], config, sink, host_clock=True, waits=False)
     assert "stale" in updates[0].reason
     assert updates[0].estimate is None
     assert updates[1].estimate is not None
     assert told["latency_from"] == "stamp"
-    assert updates[0].latency_ms > 3000
+    assert updates[0].latency_ms == pytest.approx(21_000)
 
 
-def test_an_answer_that_comes_too_late_is_none_and_yet_a_start(tracker, stages):
+def test_an_answer_that_comes_too_late_is_none_and_yet_a_start(tracker, stages, clock):
     class Slow(Tracker):
         def follow(self, cloud, last=None, how=Following()):  # noqa: B008
             helped.append(last is not None)
-            time.sleep(0.4 if len(helped) == 1 else 0)
+            clock.sleep(21 if len(helped) == 1 else 0)
             return super().follow(cloud, last, how)
 
-    helped = []
-    now = time.time_ns()
+    helped, sink = [], Notes()
+    now = clock.time_ns()
     clouds = [
         SensorCloud(stages[0].cloud.points_mm, now),
         SensorCloud(stages[0].cloud.points_mm, now + 600_000_000),
     ]
-    config = LoopConfig(region=WHOLE, stale_s=0.3)
-    updates, _ = play(Slow(tracker.model), [clouds[0], 0.6, clouds[1]], config, waits=False)
+    config = LoopConfig(region=WHOLE, stale_s=20.0)
+    items = [clouds[0], lambda: until(lambda: sink.updates), clouds[1]]
+    updates, _ = play(Slow(tracker.model), items, config, sink, waits=False)
     assert "too late" in updates[0].reason
     assert updates[0].estimate is None
     assert updates[-1].estimate is not None
@@ -370,16 +388,20 @@ def test_smoothing_never_lags_by_much(tracker, stages):
     assert found.report["smoothing"]["lag_ms"] == 0
 
 
-def test_a_pick_moves_along_and_is_forgotten_when_lost(tracker, stages, monkeypatch):
-    monkeypatch.setattr("tumortrack.live.loop._PICK_S", 0.2)
+def test_a_pick_moves_along_and_is_forgotten_when_lost(tracker, stages, clock):
     clouds = moving(stages[0], 3, step_mm=(6, 0, 0))
     controls = Controls()
     controls.pick(clouds[0].points_mm[5].astype(float))
     setting = SinkContext(tracker.model.parts, PublishedFrame(), tracker.anatomy_ct, controls)
-    loop = Loop(tracker, setting, LoopConfig(region=WHOLE, stale_s=0.3))
+    loop = Loop(tracker, setting, LoopConfig(region=WHOLE, stale_s=PATIENCE_S / 2))
     places = []
     few = [SensorCloud(clouds[2].points_mm[:9], clouds[2].stamp_ns + n) for n in (1, 2)]
-    reader = SourceWorker(lambda: Script([*clouds, few[0], 0.4, few[1]]))
+
+    def later():
+        until(lambda: len(places) == 4)
+        clock.sleep(3.1)
+
+    reader = SourceWorker(lambda: Script([*clouds, few[0], later, few[1]]))
     loop.run(reader, [], lambda _: places.append((loop._place_mm, controls.picked_mm)))
     reader.close()
     assert np.linalg.norm(places[2][0] - places[0][0]) == pytest.approx(12, abs=0.5)
@@ -407,8 +429,12 @@ def test_other_intrinsics_replace_the_sources(tracker):
 
 def test_a_frozen_source_is_said_again_and_again_and_its_return_is_seen(tracker, stages):
     clouds = moving(stages[0], 3)
-    config = LoopConfig(region=WHOLE, stale_s=0.1)
-    updates, _ = play(tracker, [clouds[0], 0.35, *clouds[1:]], config)
+    config, sink = LoopConfig(region=WHOLE, stale_s=0.1), Notes()
+
+    def wait():
+        until(lambda: sum(u.estimate is None for u in sink.updates) >= 2)
+
+    updates, _ = play(tracker, [clouds[0], wait, *clouds[1:]], config, sink)
     silent = [u for u in updates if u.estimate is None]
     assert len(silent) >= 2
     assert all("no frame for" in u.reason for u in silent)
@@ -420,7 +446,7 @@ def test_a_frozen_source_is_said_again_and_again_and_its_return_is_seen(tracker,
 def test_a_source_that_stays_away_ends_the_loop(tracker):
     config = LoopConfig(region=WHOLE, stale_s=0.1, give_up_s=0.4)
     with pytest.raises(SourceLost, match=r"Look at the camera"):
-        play(tracker, [0.2] * 10, config)
+        play(tracker, [threading.Event().wait], config)
 
 
 def test_a_lost_source_comes_back(tracker, stages):
@@ -428,7 +454,7 @@ def test_a_lost_source_comes_back(tracker, stages):
     scripts = [Script([*clouds[:2], SourceLost("the camera was unplugged")]), Script(clouds[2:])]
     sink = Notes()
     setting = SinkContext(tracker.model.parts, PublishedFrame(), tracker.anatomy_ct, Controls())
-    loop = Loop(tracker, setting, LoopConfig(region=WHOLE, stale_s=0.3))
+    loop = Loop(tracker, setting, LoopConfig(region=WHOLE, stale_s=0.3, give_up_s=PATIENCE_S))
     outlets = [SinkWorker("notes", sink, 1000)]
     reader = SourceWorker(lambda: scripts.pop(0))
     loop.run(reader, outlets, lambda _: None)
@@ -476,12 +502,10 @@ def test_a_click_makes_the_loop_look_anew(tracker, stages):
 def test_stop_ends_the_loop_from_elsewhere(tracker, stages):
     setting = SinkContext(tracker.model.parts, PublishedFrame(), tracker.anatomy_ct, Controls())
     loop = Loop(tracker, setting, LoopConfig(region=WHOLE, stale_s=0.1))
-    reader = SourceWorker(lambda: Script([0.05] * 200))
-    timer = threading.Timer(0.3, loop.stop)
-    timer.start()
-    started = time.monotonic()
+    reader = SourceWorker(lambda: Script([threading.Event().wait]))  # for ever
+    threading.Timer(0.3, loop.stop).start()
     loop.run(reader, [], lambda _: None)
-    assert time.monotonic() - started < 2
+    assert not reader.ended
     reader.close()
 
 

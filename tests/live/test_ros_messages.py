@@ -458,9 +458,9 @@ for name, message in (("cloud", cloud), ("image", image), ("info", info)):
 
 def run_ros(script: str, folder: Path) -> str:
     if not DEBIAN.is_dir():
-        pytest.skip("Debian's ROS packages are not installed (make debian)")
+        pytest.skip("Debian's ROS packages are not installed: `make debian`")
     command = ["/usr/bin/python3", "-c", script, str(folder)]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
     assert done.returncode == 0, done.stderr
     return done.stdout
 

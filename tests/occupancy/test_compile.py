@@ -14,22 +14,17 @@ from torch import Tensor
 from tumortrack.cli.compiling import compile_model
 from tumortrack.cli.inspection import describe
 from tumortrack.core.config import to_builtins
-from tumortrack.occupancy.compiled import Arithmetic, find, place_of, read, save, this_machine
+from tumortrack.models.config import MlpDecoderConfig, NetworkConfig
+from tumortrack.models.normalisation import CloudBox
+from tumortrack.occupancy.arithmetic import Arithmetic, can_pack, possible, usual
 from tumortrack.occupancy.compiled import describe as describe_compiled
+from tumortrack.occupancy.compiled import find, place_of, read, save, this_machine
 from tumortrack.occupancy.compiling import like_an_organ, measured, reference
-from tumortrack.occupancy.inference import Inference, possible, usual
+from tumortrack.occupancy.inference import Inference
 from tumortrack.occupancy.locator import OccupancyLocator
-from tumortrack.occupancy.mlp_decoder import MlpDecoderConfig
-from tumortrack.occupancy.network import (
-    CloudBox,
-    NetworkConfig,
-    OccupancyNetwork,
-    paper_network,
-    quick_network,
-)
-from tumortrack.occupancy.packed import can_pack
-from tumortrack.occupancy.quantized import QuantizedDecoder, gap, shift
+from tumortrack.occupancy.network import OccupancyNetwork
 from tumortrack.training.model import load_model
+from tumortrack.training.presets import quick_network
 
 CPU = torch.device("cpu")
 QUERIES = 6000  # enough for 8 bits, and no whole number of chunks
@@ -69,7 +64,7 @@ def learnt(config: NetworkConfig) -> Learnt:
     cloud = like_an_organ(50.0, rng)
     lower, upper = cloud.min(0) - 10, cloud.max(0) + 40
     queries = rng.uniform(lower, upper, (QUERIES, 3)).astype(np.float32)
-    out = config.build().eval()
+    out = OccupancyNetwork(config).eval()
     with torch.no_grad():
         latent = out.encode(torch.from_numpy(cloud)[None])
     out.decoder.train()
@@ -99,7 +94,7 @@ def test_fast_arithmetic_gives_the_labels_of_single_precision(numbers, known):
     answer = inference.logits(latent, known.queries)
     assert answer.dtype == torch.float32
     equal = (answer.argmax(1) == right.argmax(1)).double().mean()
-    assert equal >= (0.9995 if numbers == "int8" else 0.99)
+    assert equal >= 0.99
     near = 0.08 * float(right.std())
     assert (answer - right).square().mean().sqrt() < near
     few = inference.logits(latent, known.queries[:7])
@@ -116,31 +111,8 @@ def test_folding_and_splitting_change_nothing_but_rounding(known):
     torch.testing.assert_close(inference.logits(latent, known.queries), whole, atol=1e-3, rtol=1e-4)
 
 
-@pytest.mark.skipif("int8" not in possible(CPU), reason="this processor has no 8-bit products")
-def test_what_8_bits_may_get_wrong_is_asked_again(known):
-    """Alone they change labels, where the lead is within the error; of those none is left."""
-    inference = Inference(known.network, Arithmetic(numbers="int8", chunk=2048))
-    decode = inference._decode
-    assert isinstance(decode, QuantizedDecoder)
-    latent = inference.encode(known.cloud)
-    right = reference(inference.network, latent, known.queries)
-    with torch.inference_mode():
-        features = decode.packed.features(latent, torch.from_numpy(known.queries)[None])
-        peaks: list[float] = []
-        decode.exact.logits(decode.exact.terms(latent), features, peaks)
-        alone = decode.logits(latent, features, [peak / 255 for peak in peaks])
-    wrong = alone.argmax(1) != right.argmax(1)
-    assert wrong.any()
-    assert gap(alone)[wrong].max() <= shift(right, alone).max()
-    answer = inference.logits(latent, known.queries)
-    assert (answer.argmax(1) != right.argmax(1)).sum() <= max(1, 0.1 * wrong.sum())
-
-
 def test_usual_arithmetic_is_one_that_the_processor_has():
-    wide, slim = (config.build() for config in (paper_network(3), quick_network(3, 50.0)))
-    assert usual(wide, CPU).numbers == possible(CPU)[-1]
-    assert usual(slim, CPU).numbers in possible(CPU)
-    assert usual(slim, CPU).numbers != "int8"
+    assert usual(CPU).numbers == possible(CPU)[-1]
 
 
 def test_compiled_is_found_again_and_not_where_anything_differs(quick_model, tmp_path):
@@ -208,8 +180,8 @@ def other_than(arithmetic: Arithmetic) -> Arithmetic:
 
 
 def test_arithmetic_is_read_as_written():
-    one = Arithmetic(numbers="int8", chunk=2048)
-    assert to_builtins(one) == {"numbers": "int8", "chunk": 2048}
+    one = Arithmetic(numbers="bfloat16", chunk=2048)
+    assert to_builtins(one) == {"numbers": "bfloat16", "chunk": 2048}
 
 
 def test_compile_is_used_by_the_next_load_and_named_by_inspect(quick_model, tmp_path, capsys):

@@ -9,10 +9,10 @@ import trimesh
 
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.types import OccupancyCloud
-from tumortrack.models.volume import (
+from tumortrack.models.report import grid_over
+from tumortrack.occupancy.volume import (
     dense_margins,
     drop_islands,
-    grid_over,
     keep_largest_pieces,
     part_surfaces,
 )

@@ -8,23 +8,22 @@ import torch
 from tumortrack.core.config import from_builtins, to_builtins
 from tumortrack.core.errors import InputError
 from tumortrack.models import sampling
+from tumortrack.models.config import MlpDecoderConfig, NetworkConfig
 from tumortrack.models.encoders.pointnet2 import PointNet2Config, SetAbstraction, _Level
-from tumortrack.models.pooling import greatest_above_zero
-from tumortrack.models.sampling import ball_query, farthest_points, strided_points, take
-from tumortrack.occupancy.mlp_decoder import MlpDecoder, MlpDecoderConfig, octave_features
-from tumortrack.occupancy.network import (
+from tumortrack.models.normalisation import (
     Aligned,
     CloudBox,
     FixedScale,
-    NetworkConfig,
-    OccupancyNetwork,
     _without_strays,
     alignment,
-    paper_network,
-    quick_network,
     turned,
     without_strays,
 )
+from tumortrack.models.pooling import greatest_above_zero
+from tumortrack.models.sampling import ball_query, farthest_points, strided_points, take
+from tumortrack.occupancy.mlp_decoder import MlpDecoder, octave_features
+from tumortrack.occupancy.network import OccupancyNetwork
+from tumortrack.training.presets import paper_network, quick_network
 
 
 def slim_paper() -> NetworkConfig:
@@ -54,7 +53,7 @@ def config(request) -> NetworkConfig:
 
 def seeded(config: NetworkConfig, seed: int = 0) -> OccupancyNetwork:
     torch.manual_seed(seed)
-    return config.build()
+    return OccupancyNetwork(config)
 
 
 def scene(batch: int = 2, n: int = 300, q: int = 50) -> tuple[torch.Tensor, torch.Tensor]:
@@ -407,7 +406,7 @@ def test_configurations_survive_json(config: NetworkConfig) -> None:
 
 
 def test_paper_network_has_the_papers_numbers() -> None:
-    network = paper_network(4).build()
+    network = OccupancyNetwork(paper_network(4))
     widths = [layer.linear.out_features for layer in network.decoder.layers]
     normed = [n for n, layer in enumerate(network.decoder.layers, 1) if layer.norm is not None]
     assert widths == [512] * 8

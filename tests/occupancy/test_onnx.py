@@ -7,11 +7,11 @@ import onnxruntime
 import pytest
 import torch
 
+from tumortrack.models.config import MlpDecoderConfig, NetworkConfig
 from tumortrack.models.encoders.pointnet2 import PointNet2Config, SetAbstraction
-from tumortrack.occupancy.mlp_decoder import MlpDecoderConfig
-from tumortrack.occupancy.network import Aligned, NetworkConfig
+from tumortrack.models.normalisation import Aligned
+from tumortrack.models.onnx_file import onnx_bytes
 from tumortrack.training.model import load_model
-from tumortrack.training.onnx_file import onnx_bytes
 
 
 def answers(content: bytes, **inputs: np.ndarray) -> list[np.ndarray]:
@@ -34,7 +34,7 @@ def cloud():
 def occupancy(clinic_model):
     """The presets' kind, small: farthest points, balls, a skip, norms, octaves, alignment."""
     torch.manual_seed(0)
-    network = NetworkConfig(
+    config = NetworkConfig(
         encoder=PointNet2Config(
             levels=(SetAbstraction(ratio=0.25, radius=0.5, neighbours=16, widths=(16, 32)),),
             widths=(64,),
@@ -49,7 +49,8 @@ def occupancy(clinic_model):
             octaves=(0,),
         ),
         normalisation=Aligned(scale_mm=50.0, reach=1.35),
-    ).build()
+    )
+    network = OccupancyNetwork(config)
     model = replace(load_model(clinic_model, "cpu"), network=network.eval())
     return network, onnx_bytes(model)
 

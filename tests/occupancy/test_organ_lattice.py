@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 from test_sparse_volume import Field
 
-from tumortrack.models.volume import keep_largest_pieces
-from tumortrack.occupancy.lattice import LogitLattice, lattice_over
-from tumortrack.occupancy.organ_lattice import leaves, organ_lattice
+from tumortrack.occupancy.lattice import LogitLattice, lattice_over, leaves, organ_lattice
+from tumortrack.occupancy.volume import keep_largest_pieces
 
 BOX = np.array([[-90.0, -90, -90], [90, 90, 90]])
 

@@ -8,7 +8,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tumortrack.models.volume import dense_margins, grid_over, margins_on, part_surfaces
+from tumortrack.models.report import grid_over
 from tumortrack.occupancy.lattice import lattice_over
 from tumortrack.occupancy.sparse import (
     START_MM,
@@ -18,6 +18,7 @@ from tumortrack.occupancy.sparse import (
     sparse_logits,
     sparse_margins,
 )
+from tumortrack.occupancy.volume import dense_margins, margins_on, part_surfaces
 
 NAMES = ("kidney", "tumor_1", "tumor_2")
 

@@ -16,12 +16,14 @@ from tumortrack.core.estimate import Following
 from tumortrack.core.parallel import share
 from tumortrack.core.types import Mesh, SensorCloud
 from tumortrack.imaging.raster import cover, label_grid, winding_numbers
-from tumortrack.registration import hypotheses as locate
-from tumortrack.registration.gauss_newton import GaussNewton, GaussNewtonConfig, _prior, refine
-from tumortrack.registration.gauss_newton_kernels import normal_equations
-from tumortrack.registration.hypotheses import best_fit
+from tumortrack.models.config import GaussNewtonConfig
+from tumortrack.registration import gauss_newton_kernels as kernels
+from tumortrack.registration import registration
+from tumortrack.registration.gauss_newton import GaussNewton, _prior, refine
 from tumortrack.registration.label_probability import NearestLookup, normal_table, probabilities
 from tumortrack.registration.locator import RegistrationLocator
+from tumortrack.registration.registration import Registration
+from tumortrack.registration.residual_kernels import DistanceLattice, Flow, Pose
 from tumortrack.simulate.elastic.flow import BLOCK, steps_for
 from tumortrack.training.model import load_model
 from warp_objects import ANATOMY, PLACE_MM, TURNED, nudged, placed, residual_rows, shape
@@ -93,20 +95,22 @@ def test_sums_are_those_of_the_rows_and_rows_those_of_plain_arithmetic(state):
     pose = (motion.rotation, motion.centre_mm, 0.9 * motion.coefficients)
     rows = residual_rows(points, pose).astype(float)
     unknowns, field, velocity = rows.shape[1] - 1, shape().distances[0], body.velocity(-pose[2])
-    left = (
+    left = kernels.Residuals(
         np.empty(len(points), np.float32),
         np.empty((unknowns, unknowns)),
         np.empty(unknowns),
     )
-    normal_equations(
-        (velocity, body.origin_mm, np.float32(body.spacing_mm)),
-        steps_for(velocity, body.spacing_mm),
-        body.modes,
-        (body.center_ct, *pose[:2]),
-        (field.values_mm, field.origin_mm, np.float32(field.spacing_mm)),
+    lattice = body.origin_mm, np.float32(body.spacing_mm)
+    distances = DistanceLattice(field.values_mm, field.origin_mm, np.float32(field.spacing_mm))
+    kernels.normal_equations(
+        Flow(velocity, *lattice, steps_for(velocity, body.spacing_mm)),
+        kernels.Organ(body.modes, *lattice, body.center_ct, distances, np.eye(2), body.mean),
+        Pose(body.center_ct, *pose[:2]),
         np.float32(2),
         points,
-        (np.empty((BLOCK, unknowns + 1), np.float32), np.zeros((28, 300), np.float32)),
+        kernels.Workspace(
+            np.empty((BLOCK, unknowns + 1), np.float32), np.zeros((28, 300), np.float32)
+        ),
         left,
     )
     np.testing.assert_array_equal(left[0], rows[:, -1])
@@ -177,7 +181,7 @@ def test_a_descent_goes_on_where_it_was_stopped():
     assert halves.cost > 2 * whole.cost
     for steps in (4, 0, 20, 20, 0):
         halves.run(steps)
-    again = halves.refined()
+    again = halves.result()
     assert (again.cost, again.steps) == (whole.cost, whole.steps)
     np.testing.assert_array_equal(again.motion.coefficients, whole.motion.coefficients)
     np.testing.assert_array_equal(again.motion.covariance, whole.motion.covariance)
@@ -190,7 +194,7 @@ def test_the_best_of_many_starts_wins_wherever_it_stands():
     far = [nudged(placed(), [0, 0, 30.0 * n], [0, 0, 1.0 * n]) for n in (1, 2, 3)]
     alone = refine(shape(), points, near, GaussNewtonConfig())
     for starts in ([near, *far], [*far, near]):
-        fit = best_fit(shape(), points, starts, GaussNewtonConfig())
+        fit = Registration(None, shape(), GaussNewtonConfig()).best_fit(points, starts)
         assert fit.cost == alone.cost
         assert fit.steps == alone.steps
 
@@ -203,12 +207,12 @@ def test_starts_that_are_far_behind_are_given_up(monkeypatch):
             super().run(steps)
             gone.append((self, self.steps))
 
-    monkeypatch.setattr(locate, "Descent", Noted)
+    monkeypatch.setattr(registration, "GaussNewton", Noted)
     points = placed().carry(ANATOMY.organ.vertices_mm[::3])
     near = nudged(placed(), [3, -2, 5], [0.1, -0.05, 0.1])
     far = nudged(placed(), [60, 0, 60], [0, 0, 1.0])
     steady = GaussNewtonConfig(enough_mm=0)  # never settles
-    best_fit(shape(), points, [far, near], steady)
+    Registration(None, shape(), steady).best_fit(points, [far, near])
     most = {}
     for descent, steps in gone:
         most[descent] = max(steps, most.get(descent, 0))

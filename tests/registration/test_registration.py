@@ -20,14 +20,16 @@ from elastic_objects import CENTER, RADII, UP
 from tumortrack.core.errors import InputError
 from tumortrack.core.motion import Motion
 from tumortrack.core.types import Mesh
+from tumortrack.models.config import GaussNewtonConfig
 from tumortrack.models.encoders.heightmap import HeightMapConfig, _spread, _spread_compiled, picture
-from tumortrack.occupancy.network import OccupancyNetwork, quick_network
-from tumortrack.registration.gauss_newton import GaussNewtonConfig, _prior, refine
-from tumortrack.registration.hypotheses import best_fit
+from tumortrack.occupancy.network import OccupancyNetwork
+from tumortrack.registration.gauss_newton import _prior, refine
 from tumortrack.registration.motion import ElasticMotion
 from tumortrack.registration.network import PoseHypothesis, RegistrationNetwork
+from tumortrack.registration.registration import Registration
 from tumortrack.registration.rest_shape import RestShape, distance_of
 from tumortrack.simulate.occupancy import labels_of, surface_distance
+from tumortrack.training.presets import quick_network
 from warp_objects import (
     ANATOMY,
     PLACE_MM,
@@ -272,7 +274,9 @@ def test_every_step_lowers_the_cost_and_enough_steps_end():
     assert costs[4] <= costs[3] * 1.001
     assert costs[4] < 0.1 * costs[0]
     assert fits[4].steps < 40
-    best = best_fit(shape(), points, [nudged(placed(), [0, 0, 60], [0, 0, 0]), START], steady)
+    best = Registration(None, shape(), steady).best_fit(
+        points, [nudged(placed(), [0, 0, 60], [0, 0, 0]), START]
+    )
     assert best.cost == refine(shape(), points, START, steady).cost
 
 
@@ -493,14 +497,15 @@ def test_neither_order_nor_number_of_a_clouds_points_matters_much():
 _FITTED = """
 import sys
 import numpy as np
-from tumortrack.registration.motion import WarpMotion
-from tumortrack.registration.gauss_newton import RefineConfig, refine
-from tumortrack.registration.rest_shape import Shape
+from tumortrack.registration.motion import ElasticMotion
+from tumortrack.models.config import GaussNewtonConfig
+from tumortrack.registration.gauss_newton import refine
+from tumortrack.registration.rest_shape import RestShape
 given = dict(np.load(sys.argv[1]))
 points, rotation, centre = (given.pop(name) for name in ("points", "rotation", "centre"))
-shape = Shape.from_arrays(given, 2)
-start = WarpMotion(shape, rotation, centre, shape.body.mean)
-print(refine(shape, points, start, RefineConfig(steps=3)).motion.coefficients.tobytes().hex())
+shape = RestShape.from_arrays(given, 2)
+start = ElasticMotion(shape, rotation, centre, shape.body.mean)
+print(refine(shape, points, start, GaussNewtonConfig(steps=3)).motion.coefficients.tobytes().hex())
 """
 
 
@@ -511,7 +516,7 @@ def test_the_first_answer_of_a_machine_is_that_of_all_others(tmp_path):
     environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "cache")}
     words = [sys.executable, "-c", _FITTED, str(tmp_path / "shape.npz")]
     compiled, found = (
-        subprocess.run(words, env=environment, capture_output=True, check=True, timeout=300).stdout
+        subprocess.run(words, env=environment, capture_output=True, check=True, timeout=600).stdout
         for _ in range(2)
     )
     assert len(compiled) > 300

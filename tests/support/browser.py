@@ -10,15 +10,15 @@ import shutil
 import signal
 import subprocess
 import tempfile
-import time
 import urllib.request
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from PIL import Image
+
+from clock import PATIENCE_S, until
 
 FLAGS = (
     "--headless",
@@ -41,7 +41,7 @@ def chromium() -> str:
     for name in ("chromium", "chromium-browser", "google-chrome"):
         if found := shutil.which(name):
             return found
-    pytest.skip("no Chromium: apt-get install chromium (tools/debian-packages.txt)")
+    pytest.skip("Chromium is not installed: `make debian`")
 
 
 class Browser:
@@ -81,9 +81,11 @@ class Browser:
         from websockets.sync.client import connect
 
         port_file = Path(self._folder) / "DevToolsActivePort"
-        until(lambda: port_file.exists() and port_file.read_text().count("\n") >= 1, 20)
+        until(lambda: port_file.exists() and port_file.read_text().count("\n") >= 1, "Chromium")
         port = port_file.read_text().split()[0]
-        with urllib.request.urlopen(f"http://127.0.0.1:{port}/json/list", timeout=10) as answer:
+        with urllib.request.urlopen(
+            f"http://127.0.0.1:{port}/json/list", timeout=PATIENCE_S
+        ) as answer:
             pages = [target for target in json.load(answer) if target["type"] == "page"]
         return connect(pages[0]["webSocketDebuggerUrl"], max_size=2**26, proxy=None)
 
@@ -97,7 +99,7 @@ class Browser:
         self._ids += 1
         self._socket.send(json.dumps({"id": self._ids, "method": method, "params": params}))
         while True:
-            answer = json.loads(self._socket.recv(timeout=30))
+            answer = json.loads(self._socket.recv(timeout=PATIENCE_S))
             if answer.get("id") == self._ids:
                 assert "error" not in answer, answer["error"]
                 return answer["result"]
@@ -138,13 +140,3 @@ class Browser:
         place = self.call("Runtime.evaluate", expression=script, returnByValue=True)["result"]
         assert "value" in place, f"no button says {text!r}"
         self.click(*place["value"])
-
-
-def until(met: Callable[[], Any], seconds: float, what: str = "it") -> Any:
-    """Wait for something to be true, and give it back."""
-    end = time.monotonic() + seconds
-    while time.monotonic() < end:
-        if found := met():
-            return found
-        time.sleep(0.05)
-    raise AssertionError(f"{what} did not happen within {seconds:g} s")

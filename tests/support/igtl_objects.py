@@ -8,6 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from clock import PATIENCE_S
+
 
 def slow_crc(data: bytes) -> int:
     """CRC-64 of ECMA-182 bit by bit: polynomial 42F0E1EBA9EA3693, register 0."""
@@ -59,7 +61,7 @@ def hear(sock: socket.socket) -> Heard:
     return Heard(kind, device, seconds, body[12:end], metadata)
 
 
-def hear_all(sock: socket.socket, wanted: int, wait_s: float = 5.0) -> dict[tuple, Heard]:
+def hear_all(sock: socket.socket, wanted: int, wait_s: float = PATIENCE_S) -> dict[tuple, Heard]:
     """Messages by type and device, until there are ``wanted`` different ones."""
     sock.settimeout(wait_s)
     found: dict[tuple, Heard] = {}

@@ -8,6 +8,8 @@ import time
 import numpy as np
 import pyrealsense2 as rs
 
+from clock import PATIENCE_S
+
 WIDTH, HEIGHT, UNIT_M = 848, 480, 0.0001
 
 
@@ -88,7 +90,7 @@ def record(path: str, frames: int) -> None:
     begin_ms = time.time() * 1e3
     for number in range(frames):
         camera.show(number, begin_ms + 20 * number)
-        assert came.acquire(timeout=5)
+        assert came.acquire(timeout=PATIENCE_S)
         time.sleep(0.02)  # a recording's pace is that of its making
     sensor.stop()
     sensor.close()

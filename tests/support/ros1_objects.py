@@ -19,13 +19,12 @@ from typing import Any, TypeVar
 
 import pytest
 
+from clock import PATIENCE_S
 from tumortrack.core.errors import InputError, TumortrackError
 from tumortrack.live.ros.rospy_node import Master, rospy_module
 
 PEER = Path(__file__).with_name("ros1_peer.py")
 PYTHON = "/usr/bin/python3"
-PATIENCE_S = 40.0  # of a loaded machine
-
 T = TypeVar("T")
 
 
@@ -122,11 +121,11 @@ def _only_graph() -> Graph:
 def ros1_graph() -> Graph:
     """This process's graph, running: rospy knows one master a process. Skips without ROS 1."""
     if shutil.which("roscore") is None:
-        pytest.skip("no roscore here: tools/debian.sh installs it")
+        pytest.skip("ROS 1 (roscore) is not installed: `make debian`")
     try:
         rospy_module()
     except InputError as error:
-        pytest.skip(str(error))
+        pytest.skip(f"ROS 1's Python is not installed: `make debian` ({error})")
     graph = _only_graph()
     graph.start()
     return graph

@@ -52,7 +52,7 @@ def rviz(folder: Path, configuration: str | Path = "tumortrack_ros1.rviz") -> It
     """RViz with a configuration, by default a shipped one. Skips where there is no RViz."""
     for program in ("rviz", "Xvfb", "import"):
         if shutil.which(program) is None:
-            pytest.skip(f"no {program} here: tools/debian.sh installs it")
+            pytest.skip(f"{program} is not installed: `make debian`")
     reading, writing = os.pipe()
     server = subprocess.Popen(
         ["Xvfb", "-displayfd", str(writing), "-screen", "0", _SIZE, "-nolisten", "tcp"],

@@ -16,6 +16,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from unittest import mock
 
+from clock import PATIENCE_S, until
 from live_objects import PARTS, small_anatomy, small_frame
 from tumortrack.core.types import SensorCloud
 from tumortrack.live.ros.bus import Bus, open_bus
@@ -79,12 +80,8 @@ def sending(kind: str, hz: float = 50) -> Iterator[str]:
         thread.join()
 
 
-def read_until(source: Source, seconds: float) -> Observation:
-    end_s = time.monotonic() + seconds
-    while time.monotonic() < end_s:
-        if (seen := source.read(0.2)) is not None:
-            return seen
-    raise AssertionError(f"nothing came in {seconds} s")
+def read_until(source: Source) -> Observation:
+    return until(lambda: source.read(0.2), "a frame")
 
 
 class Other:
@@ -106,7 +103,7 @@ class Other:
         for line in self._process.stdout:
             self._said.put(line)
 
-    def line(self, timeout_s: float = 20.0) -> str:
+    def line(self, timeout_s: float = PATIENCE_S) -> str:
         return self._said.get(timeout=timeout_s)
 
     def lines_until(self, good: Callable[[dict], bool]) -> list[dict]:

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+import warm
 from tumortrack.core import store
 from tumortrack.imaging.case import Case, save_case
 from tumortrack.imaging.surface import surfaces
@@ -18,7 +19,9 @@ COMMAND = [sys.executable, "-m", "tumortrack.cli.main"]
 
 
 def tumortrack(*arguments: object, **options: object) -> subprocess.CompletedProcess[str]:
-    """Run a command to its end."""
+    """Run a command to its end; with options of ``subprocess.run``, as a process started anew."""
+    if not options and hasattr(os, "fork"):
+        return warm.run([str(one) for one in arguments], environment())
     return subprocess.run(
         [*COMMAND, *map(str, arguments)],
         capture_output=True,

@@ -11,8 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from elastic_objects import SMALL, UP, organ
 from tumortrack.core.types import Anatomy
-from tumortrack.models.config import TrainConfig
-from tumortrack.occupancy.network import NetworkConfig, clinic_network
+from tumortrack.models.config import NetworkConfig, TrainConfig
 from tumortrack.registration import residual_kernels as kernels
 from tumortrack.registration.motion import ElasticMotion
 from tumortrack.registration.rest_shape import RestShape, shape_of
@@ -21,7 +20,7 @@ from tumortrack.simulate.elastic.body import build_body
 from tumortrack.simulate.elastic.flow import BLOCK, block, steps_for
 from tumortrack.simulate.occupancy import OccupancyConfig
 from tumortrack.simulate.scene import SceneConfig
-from tumortrack.training.presets import clinic
+from tumortrack.training.presets import clinic, clinic_network
 from tumortrack.training.train import TrainingRun, train
 
 ANATOMY: Anatomy = organ()
@@ -56,12 +55,12 @@ def residual_rows(points_mm, pose) -> np.ndarray:
     body, field = shape().body, shape().distances[0]
     velocity = body.velocity(-coefficients)
     rows = np.empty((len(points_mm), kernels.POSE + len(coefficients) + 1), np.float32)
+    spacing_mm = np.float32(body.spacing_mm)
     known = (
-        (velocity, body.origin_mm, np.float32(body.spacing_mm)),
-        steps_for(velocity, body.spacing_mm),
+        kernels.Flow(velocity, body.origin_mm, spacing_mm, steps_for(velocity, body.spacing_mm)),
         body.modes,
-        (body.center_ct, rotation, centre_mm),
-        (field.values_mm, field.origin_mm, np.float32(field.spacing_mm)),
+        kernels.Pose(body.center_ct, rotation, centre_mm),
+        kernels.DistanceLattice(field.values_mm, field.origin_mm, np.float32(field.spacing_mm)),
     )
     points = np.ascontiguousarray(points_mm, np.float32)
     for first in range(0, len(points), BLOCK):

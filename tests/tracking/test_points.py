@@ -21,11 +21,12 @@ from tumortrack.core.geometry import transform_points
 from tumortrack.core.motion import Motion, OneWay
 from tumortrack.core.types import Anatomy, CameraLabels, Mesh, OccupancyCloud
 from tumortrack.models.in_distribution import InDistributionRange
+from tumortrack.occupancy.model import OccupancyModel
 from tumortrack.occupancy.network import OccupancyNetwork
 from tumortrack.sense.files import read_cloud, write_cloud_ply
 from tumortrack.tracking.files import write_estimate
 from tumortrack.tracking.points import camera_table, check_near_organ, read_points
-from tumortrack.training.model import Model, save_model
+from tumortrack.training.model import save_model
 from tumortrack.training.presets import quick
 
 MIDDLE = np.array([60.0, 40.0, -300.0])
@@ -343,7 +344,16 @@ def model(tmp_path_factory):
     familiar = InDistributionRange(spread_mm=(1.0, 100.0), fit_mm=5.0)
     box = np.array([[-80.0] * 3, [80.0] * 3])
     with store.new_folder(folder) as aside:
-        save_model(Model(network, config, anatomy().names, box, familiar, {}), aside)
+        save_model(
+            OccupancyModel(
+                network=network,
+                config=config,
+                parts=anatomy().names,
+                query_box_mm=box,
+                familiar=familiar,
+            ),
+            aside,
+        )
     return folder
 
 
@@ -383,7 +393,7 @@ class Knowing:
 
 def test_locate_writes_where_the_points_are(model, cloud, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr("tumortrack.tracking.tracker.Tracker", Knowing)
-    monkeypatch.setattr("tumortrack.training.model_folder.has_shape", lambda _: True)
+    monkeypatch.setattr("tumortrack.models.folder.has_shape", lambda _: True)
     points = np.concatenate([some_points(4), MIDDLE[None] + [0, 0, 131.0]])
     lines = [f"{n},{','.join(map(str, p))}" for n, p in enumerate(points)]
     asked = written(tmp_path / "asked.csv", "\n".join(["label,ct_x,ct_y,ct_z", *lines]))
@@ -408,7 +418,7 @@ def test_locate_writes_where_the_points_are(model, cloud, tmp_path, monkeypatch,
 
 def test_points_that_cannot_be_meant_cost_no_locating(model, cloud, tmp_path, monkeypatch):
     monkeypatch.setattr("tumortrack.tracking.tracker.Tracker", Knowing)
-    monkeypatch.setattr("tumortrack.training.model_folder.has_shape", lambda _: True)
+    monkeypatch.setattr("tumortrack.models.folder.has_shape", lambda _: True)
     monkeypatch.setattr(Knowing, "asked", 0)
     asked = written(tmp_path / "asked.csv", "x,y,z\n-60,-40,-300\n")
     with pytest.raises(InputError, match="RAS"):

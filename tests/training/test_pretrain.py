@@ -36,7 +36,7 @@ from tumortrack.training.head_start import HeadStart, load_start
 from tumortrack.training.presets import clinic, pretraining, quick
 from tumortrack.training.pretrain import KidneyStream, Pretraining, kidney_stream, pretrain
 from tumortrack.training.run import TrainingRun, provenance
-from tumortrack.training.task import TrainingTask, course_of
+from tumortrack.training.task import TrainingTask, task_of
 from tumortrack.training.train import train
 
 CPU = torch.device("cpu")
@@ -85,7 +85,7 @@ def stream() -> KidneyStream:
 
 @pytest.fixture(scope="module")
 def course(patient: TrainingRun) -> TrainingTask:
-    return course_of(patient, CPU)
+    return task_of(patient, CPU)
 
 
 @pytest.fixture(scope="module")

@@ -15,12 +15,12 @@ from torch import distributed
 from stories import environment
 from torchrun_peer import STEPS, UP, anatomy, small_run
 from tumortrack.core.errors import InputError
-from tumortrack.occupancy.network import clinic_network
 from tumortrack.registration.network import RegistrationNetwork
 from tumortrack.simulate.dataset import SceneStream
 from tumortrack.simulate.occupancy import FixedPoints
 from tumortrack.simulate.scene import SceneConfig
 from tumortrack.training.distributed import ProcessGroup, ProcessLost, joined
+from tumortrack.training.presets import clinic_network
 from tumortrack.training.state import TrainingState
 from tumortrack.training.train import train
 
@@ -34,10 +34,11 @@ def torchrun(*arguments: object) -> subprocess.CompletedProcess[str]:
     command += ["--rdzv-backend=c10d", "--rdzv-endpoint=localhost:0"]  # any free port
     command += [str(HERE / "torchrun_peer.py"), *map(str, arguments)]
     return subprocess.run(
-        command, capture_output=True, text=True, timeout=300, env=environment(), cwd=HERE
+        command, capture_output=True, text=True, timeout=600, env=environment(), cwd=HERE
     )
 
 
+@pytest.mark.slow
 def test_two_processes_end_with_the_weights_of_one(tmp_path, monkeypatch):
     """Rank 1 is killed on the way; the same command goes on."""
     folder = tmp_path / "two"
@@ -61,10 +62,16 @@ def test_two_processes_end_with_the_weights_of_one(tmp_path, monkeypatch):
     two = load_file(folder / "weights.safetensors")
     start = train_start()
     assert one.keys() == two.keys()
-    moved = max(np.abs(one[name] - start[name]).max() for name in start)
-    apart = max(np.abs(one[name] - two[name]).max() for name in one)
-    assert moved > 1e-4
-    assert apart < 1e-2 * moved
+    moved, apart = (
+        np.concatenate([(one[name] - other[name]).ravel() for name in start])
+        for other in (start, two)
+    )
+    assert np.abs(moved).max() > 1e-4
+    # Adam divides a gradient by its own size: where a weight's gradient is no more than what a sum
+    # in another order rounds it by, its step is a toss-up, and one of 200,000 always is. Of all
+    # steps together, a share eta = 1.2e-7 * sqrt(10,000 summands) of the usual gradient leaves
+    # sqrt(2 * eta) = 0.5 % open (measured: 0.04 %). A mean left out leaves more than half.
+    assert np.linalg.norm(apart) < 0.01 * np.linalg.norm(moved)
 
 
 def train_start() -> dict[str, np.ndarray]:
@@ -140,6 +147,6 @@ def test_equal_shares_of_any_size_have_the_whole_batchs_loss_and_gradient(share)
 
 def test_the_package_is_a_command():
     command = [sys.executable, "-m", "tumortrack", "train", "no-case", "model", "--steps", "0"]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300)
     assert done.returncode == 2
     assert done.stderr == "tumortrack: --steps 0 must be at least 1.\n"

@@ -23,15 +23,14 @@ from tumortrack.core.errors import ArtifactError, InputError
 from tumortrack.core.types import Anatomy
 from tumortrack.imaging.case import load_case
 from tumortrack.models.config import TrainConfig
-from tumortrack.occupancy.network import CloudBox
-from tumortrack.training.checkpoint import TrainingProgress
+from tumortrack.models.normalisation import CloudBox
+from tumortrack.training.checkpoint import TrainingProgress, work_folder
 from tumortrack.training.model import load_model
 from tumortrack.training.pace import use_cores
 from tumortrack.training.presets import clinic, paper, quick
-from tumortrack.training.schedule import learning_rate, settle_end
+from tumortrack.training.run import learning_rate, settle_end
 from tumortrack.training.state import Diverged, TrainingState
 from tumortrack.training.train import TrainingRun, train
-from tumortrack.training.work import work_folder
 from warp_objects import train_slim
 
 
@@ -46,8 +45,7 @@ def kill_at_first_checkpoint(command: list[object], model: Path) -> None:
         [str(word) for word in command],
         stdout=subprocess.DEVNULL,
         env=environment(),
-        cwd=Path(__file__).parents[1]
-        / "support",  # for what this folder's files import from each other
+        cwd=Path(__file__).parents[1] / "support",  # whose files import each other
     ) as process:
         checkpoint = model / "training" / "checkpoint.safetensors"
         deadline = time.monotonic() + 300
@@ -62,6 +60,7 @@ def same_files(model: Path, other: Path, *names: str) -> bool:
     return all((model / name).read_bytes() == (other / name).read_bytes() for name in names)
 
 
+@pytest.mark.slow
 def test_a_killed_run_ends_with_the_weights_of_one_that_was_not(case, quick_model, tmp_path):
     model = tmp_path / "killed"
     command = train_command(case, model)
@@ -72,6 +71,7 @@ def test_a_killed_run_ends_with_the_weights_of_one_that_was_not(case, quick_mode
     assert not (model / "shape.safetensors").exists()
 
 
+@pytest.mark.slow
 def test_a_killed_warp_ends_with_the_weights_and_shape_of_one_that_was_not(slim_model, tmp_path):
     model = tmp_path / "killed"
     train = "import sys, pathlib, warp_objects as w; w.train_slim(pathlib.Path(sys.argv[1]), 0.0)"
@@ -80,6 +80,7 @@ def test_a_killed_warp_ends_with_the_weights_and_shape_of_one_that_was_not(slim_
     assert same_files(model, slim_model, "weights.safetensors", "shape.safetensors")
 
 
+@pytest.mark.slow
 def test_ctrl_c_keeps_the_state_and_says_how_to_go_on(case, tmp_path):
     model = tmp_path / "stopped"
     options = ["--preset", "quick", "--steps", "100000"]
@@ -90,7 +91,7 @@ def test_ctrl_c_keeps_the_state_and_says_how_to_go_on(case, tmp_path):
         assert process.stdout is not None
         assert "samples/s" in process.stdout.readline()
         process.send_signal(signal.SIGINT)
-        _, errors = process.communicate(timeout=60)
+        _, errors = process.communicate(timeout=300)
     assert process.returncode == 130
     assert "The same command goes on" in errors
     assert "Traceback" not in errors
@@ -99,6 +100,7 @@ def test_ctrl_c_keeps_the_state_and_says_how_to_go_on(case, tmp_path):
     assert "another case, preset, seed or option" in message
 
 
+@pytest.mark.slow
 def test_the_model_says_what_it_was_made_from(case, quick_model):
     about = load_model(quick_model).provenance
     assert about["steps"] == STEPS["quick"]
@@ -106,7 +108,7 @@ def test_the_model_says_what_it_was_made_from(case, quick_model):
     lines = (quick_model / "training" / "history.jsonl").read_text().splitlines()
     last = json.loads(lines[-1])
     assert last["step"] == STEPS["quick"]
-    assert last["samples_per_s"] > 1
+    assert last["samples_per_s"] > 0
     assert 0 < last["learning_rate"] < 1e-3  # the schedule has nearly ended
     assert list((quick_model / "training" / "tensorboard").iterdir())
     again = tumortrack(*train_command(case, quick_model))
@@ -134,6 +136,7 @@ def test_a_changed_weights_file_or_schema_is_refused(quick_model, tmp_path):
         load_model(model)
 
 
+@pytest.mark.slow
 def test_a_full_disk_stops_training_and_spares_the_last_checkpoint(case, tmp_path):
     model = tmp_path / "full"
 
@@ -182,7 +185,7 @@ def test_a_history_that_cannot_be_written_is_one_clear_error(tmp_path, mode, wor
         [sys.executable, "-c", HISTORY_ON_A_FULL_DISK, str(tmp_path), mode],
         capture_output=True,
         text=True,
-        timeout=120,
+        timeout=300,
     )
     assert done.returncode == 0, done.stderr
     assert done.stdout.startswith(words), done.stdout + done.stderr
@@ -232,7 +235,7 @@ def test_two_trainings_in_one_folder_are_refused_and_a_dead_ones_lock_is_not(tmp
     assert (work / "something").exists()
     hold = (
         "import sys, os, signal; from pathlib import Path;"
-        "from tumortrack.training.work import work_folder\n"
+        "from tumortrack.training.checkpoint import work_folder\n"
         "with work_folder(Path(sys.argv[1])): os.kill(os.getpid(), signal.SIGKILL)"
     )
     assert subprocess.run([sys.executable, "-c", hold, str(model)]).returncode == -signal.SIGKILL

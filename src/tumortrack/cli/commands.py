@@ -70,8 +70,8 @@ def train(case_folder: Path, folder: Path, options: TrainOptions) -> None:
     case = load_case(case_folder)  # what is wrong so far is said before PyTorch's seconds
 
     from tumortrack.cli.training import TrainingScreen
+    from tumortrack.models.folder import is_finished
     from tumortrack.training.model import load_model
-    from tumortrack.training.model_folder import is_finished
     from tumortrack.training.presets import PRESETS
     from tumortrack.training.train import TrainingRun, run_identity
     from tumortrack.training.train import train as fit
@@ -167,8 +167,8 @@ def locate(model_folder: Path, source: Path, out: Path, options: LocateOptions) 
 
 def _asked(path: Path | None, model_folder: Path) -> PointTable | None:
     """The points of --map; model and points are checked before there is anything to wait for."""
+    from tumortrack.models.folder import has_shape, read_model_manifest
     from tumortrack.tracking.points import read_points
-    from tumortrack.training.model_folder import has_shape, read_model_manifest
 
     manifest = read_model_manifest(model_folder)
     if path is None:
@@ -238,8 +238,8 @@ def evaluate(
     model_folder: Path, scenes: Path, report: Path, grid: int, seed: int, device: Device
 ) -> None:
     """`tumortrack evaluate`: model x scenes -> report folder."""
+    from tumortrack.models.folder import read_model_manifest
     from tumortrack.simulate.scene_folder import list_scenes
-    from tumortrack.training.model_folder import read_model_manifest
 
     _check_grid(grid)
     if (report / store.MANIFEST).exists():

@@ -13,12 +13,14 @@ from tumortrack.cli.console import console, say
 from tumortrack.core import store
 from tumortrack.core.errors import NoEstimate
 from tumortrack.core.types import SensorCloud
+from tumortrack.models.folder import WEIGHTS
+from tumortrack.models.model import Model
 from tumortrack.occupancy.compiled import Compiled, save
 from tumortrack.occupancy.compiling import measured
+from tumortrack.occupancy.model import OccupancyModel
 from tumortrack.occupancy.sparse import sparse_margins
 from tumortrack.tracking.tracker import Tracker
-from tumortrack.training.model import Model, load_model
-from tumortrack.training.model_folder import WEIGHTS
+from tumortrack.training.model import load_model
 
 _GRID = 32
 
@@ -33,7 +35,7 @@ def compile_model(folder: Path, device: str) -> None:
     model = load_model(folder, device)
     _warm(model)
     say("kernels: compiled and kept for every model of this machine.")
-    if model.config.network.warps:
+    if not isinstance(model, OccupancyModel):
         say(
             "network: nothing to choose. It runs once a frame, on one cloud, in about a "
             "millisecond; the rest of a frame is the kernels."

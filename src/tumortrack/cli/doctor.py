@@ -65,7 +65,7 @@ def examine() -> None:
 def _examine_torch() -> None:
     import torch
 
-    from tumortrack.training.model import has_fast_bfloat16
+    from tumortrack.models.hardware import has_fast_bfloat16
 
     fast = has_fast_bfloat16(torch.device("cpu"))
     say(f"CPU bf16: {'in hardware, used' if fast else 'not in hardware; fp32 is used (slower)'}")

@@ -73,7 +73,7 @@ def track(
     from tumortrack.live.calibration_file import read_frames
     from tumortrack.live.spec import SOURCES
     from tumortrack.live.values import Controls, PublishedFrame, SinkContext
-    from tumortrack.training.model_folder import read_model_manifest
+    from tumortrack.models.folder import read_model_manifest
 
     source_config = SOURCES.parse(source)
     sink_configs = parse_sinks(sinks)

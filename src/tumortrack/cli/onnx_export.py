@@ -8,7 +8,7 @@ from pathlib import Path
 from tumortrack.cli.console import say
 from tumortrack.core import store
 from tumortrack.core.errors import InputError
-from tumortrack.training.model_folder import read_model_manifest
+from tumortrack.models.folder import read_model_manifest
 
 
 def write_onnx(folder: Path, out: Path, overwrite: bool) -> None:
@@ -29,8 +29,8 @@ def write_onnx(folder: Path, out: Path, overwrite: bool) -> None:
     if find_spec("onnx") is None:  # so far said before PyTorch's seconds
         raise InputError("writing ONNX needs the package onnx: pip install 'tumortrack[onnx]'.")
 
+    from tumortrack.models.onnx_file import onnx_bytes
     from tumortrack.training.model import load_model
-    from tumortrack.training.onnx_file import onnx_bytes
 
     model = load_model(folder, "cpu")
     content = onnx_bytes(model)

@@ -12,8 +12,8 @@ from tumortrack.core.config import to_builtins
 from tumortrack.core.errors import InputError
 
 if TYPE_CHECKING:
+    from tumortrack.models.model import Model
     from tumortrack.simulate.scene import SceneConfig
-    from tumortrack.training.model import Model
 
 _TEST_BODY = 2**20  # and the seed: elastic states that training with the same seed never sees
 

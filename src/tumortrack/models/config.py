@@ -1,13 +1,79 @@
-"""What a training run is, as one value."""
+"""What a network and its training are, as frozen values: every preset is one ``TrainConfig``."""
 
 from __future__ import annotations
 
 from typing import Literal
 
 from tumortrack.core.config import Config
-from tumortrack.occupancy.network import NetworkConfig
-from tumortrack.registration.gauss_newton import GaussNewtonConfig
+from tumortrack.core.errors import InputError
+from tumortrack.models.encoders import EncoderConfig
+from tumortrack.models.normalisation import Aligned, CloudBox, FixedScale
 from tumortrack.simulate.scene import SceneConfig
+
+
+class MlpDecoderConfig(Config, frozen=True, tag="mlp"):
+    """``hidden_layers`` of ``width`` with ReLU, then one linear layer to the classes' logits.
+
+    ``skip_layer``: this hidden layer (counted from 1) sees [latent, query] again; None: no skip.
+    ``norm_layers``: hidden layers (from 1) with batch norm between linear part and ReLU.
+    ``octaves``: k of sin and cos(2^k pi q) that join each raw coordinate q; () for raw alone.
+    """
+
+    n_classes: int
+    width: int
+    hidden_layers: int
+    skip_layer: int | None = None
+    norm_layers: tuple[int, ...] = ()
+    octaves: tuple[int, ...] = ()
+
+    def __post_init__(self) -> None:
+        allowed = range(1, self.hidden_layers + 1)
+        named = (*self.norm_layers, *(() if self.skip_layer is None else (self.skip_layer,)))
+        if self.n_classes < 2 or self.width < 1 or not set(named) <= set(allowed):
+            raise InputError(
+                f"decoder: layers {named} must lie in 1..{self.hidden_layers}, the width must be "
+                "positive and there must be at least 2 classes."
+            )
+
+
+class RegistrationHeadConfig(Config, frozen=True, tag="warp"):
+    """Two hidden layers of ``width``, then a rotation, a place, ``modes`` coefficients and whether
+    the cloud lies the right way round. The loss compares the places of ``points`` points."""
+
+    modes: int
+    width: int = 256
+    points: int = 96
+
+    def __post_init__(self) -> None:
+        if min(self.modes, self.width, self.points) < 1:
+            raise InputError("warp: modes, width and points must be positive.")
+
+
+class NetworkConfig(Config, frozen=True):
+    """A network as data; which method it serves follows from the kind of its decoder."""
+
+    encoder: EncoderConfig
+    decoder: MlpDecoderConfig | RegistrationHeadConfig
+    normalisation: CloudBox | FixedScale | Aligned
+
+
+class GaussNewtonConfig(Config, frozen=True):
+    """``n_effective``: independent points that a cloud is worth: neighbours err alike.
+
+    ``sigma_mm``: of a point that belongs to the organ, model errors included. ``first_mm`` and
+    ``last_mm``: the distance where a point's pull is greatest falls from the one to the other;
+    points far beyond do not count. ``shift_mm``, ``turn_rad``: how far the start may be off.
+    """
+
+    steps: int = 20
+    n_effective: float = 300.0
+    sigma_mm: float = 1.0
+    first_mm: float = 5.0
+    last_mm: float = 1.0
+    narrowing: float = 0.7
+    shift_mm: float = 20.0
+    turn_rad: float = 0.5
+    enough_mm: float = 0.02  # a step that moves less is the last
 
 
 class Schedule(Config, frozen=True):

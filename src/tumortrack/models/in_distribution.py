@@ -8,17 +8,12 @@ from four fifths of the points, so that background and strays do not count.
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Float, Float32
+from jaxtyping import Float
 
 from tumortrack.core.config import Config
 from tumortrack.core.errors import NoEstimate
-from tumortrack.core.types import Mesh
-from tumortrack.occupancy.lattice import LogitLattice
-from tumortrack.simulate.occupancy import surface_distance
 
 _SHARE = 80  # per cent of the points that must fit: a tenth may be background
-FIT_STEPS = 24  # of the lattice, along the box's longest side
-_LARGEST_MARGIN = 30.0  # logits
 
 # Validation scenes hold noise, background and deformation, yet what they hold is not all there is.
 # Organs dragged by 20 mm or stretched by 30 %, which training never shows, lie within 1.0 (a model
@@ -54,28 +49,6 @@ def spread_mm(points_mm: Float[np.ndarray, "n 3"]) -> float:
 def fit_mm(distances_mm: Float[np.ndarray, " n"]) -> float:
     """The distance within which four fifths of the points lie from the surface."""
     return float(np.percentile(distances_mm, _SHARE))
-
-
-def surface_distances(
-    lattice: LogitLattice, points_mm: Float[np.ndarray, "n 3"]
-) -> Float32[np.ndarray, " n"]:
-    """How far points (n, 3) lie from the organ's surface, camera frame, mm.
-
-    The surface is that of the network's margin, linear between the lattice's points: right to
-    half a mm or so for an organ on ``FIT_STEPS``.
-
-    Raises:
-        NoEstimate: there is no surface in the lattice's box.
-    """
-    from skimage import measure
-
-    logits = lattice.logits
-    field = (logits[..., 1:].max(-1) - logits[..., 0]).clip(-_LARGEST_MARGIN, _LARGEST_MARGIN)
-    if not field.min() < 0 < field.max():
-        raise NoEstimate("no organ was found: its surface is nowhere near the cloud.")
-    corners, faces, _, _ = measure.marching_cubes(field, 0.0)
-    surface = Mesh(corners * lattice.step_mm + lattice.origin_mm, faces)
-    return surface_distance(surface, points_mm)
 
 
 def check_familiar(familiar: InDistributionRange, spread: float, fit: float) -> None:

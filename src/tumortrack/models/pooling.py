@@ -41,7 +41,7 @@ class _Greatest(Function):
 
     @staticmethod
     def forward(ctx: Any, values: Tensor) -> Tensor:
-        from tumortrack.models.pooling_kernels import greatest
+        from tumortrack.models.kernels import greatest
 
         batch, m, k, channels = ctx.shape = values.shape
         whole = values.detach().contiguous().view(_WHOLE[values.dtype])
@@ -60,7 +60,7 @@ class _Greatest(Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *gradients: Tensor) -> Tensor:
-        from tumortrack.models.pooling_kernels import handed_back
+        from tumortrack.models.kernels import handed_back
 
         (chosen,) = ctx.saved_tensors
         (gradient,) = gradients

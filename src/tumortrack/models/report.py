@@ -8,10 +8,10 @@ from contextlib import contextmanager
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Float64
 
 import tumortrack
-from tumortrack.core.types import SensorCloud
+from tumortrack.core.types import Mesh, OccupancyCloud, SensorCloud
 
 
 def report_head(cloud: SensorCloud, seed: int) -> dict:
@@ -42,3 +42,48 @@ def stage(seconds: dict[str, float], name: str, device: torch.device) -> Iterato
     if device.type == "cuda":  # kernels run on behind the call
         torch.cuda.synchronize(device)
     seconds[name] = time.perf_counter() - start
+
+
+def grid_over(
+    points_mm: np.ndarray, grid: int
+) -> tuple[Float64[np.ndarray, "4 4"], tuple[int, int, int]]:
+    """``camera_from_index`` and shape of cubic voxels over the points' box, 4 % larger, with
+    ``grid`` voxels along its longest side."""
+    lower, upper = points_mm.min(0).astype(float), points_mm.max(0).astype(float)
+    margin = 0.02 * (upper - lower).max()
+    lower, upper = lower - margin, upper + margin
+    voxel = (upper - lower).max() / grid
+    shape = np.maximum(np.ceil((upper - lower) / voxel - 1e-9).astype(int), 2)
+    camera_from_index = np.diag([voxel, voxel, voxel, 1.0])
+    camera_from_index[:3, 3] = (lower + upper) / 2 - voxel * (shape - 1) / 2
+    i, j, k = (int(n) for n in shape)
+    return camera_from_index, (i, j, k)
+
+
+def describe_parts(
+    names: tuple[str, ...], meshes: dict[str, Mesh], inside: OccupancyCloud
+) -> dict[str, dict]:
+    """Per part: volume, centre, box and how sure the labels inside it are (JSON types).
+
+    The kidney's numbers are those of the whole organ, tumors included.
+    """
+    parts: dict[str, dict] = {}
+    counts = np.bincount(inside.labels, minlength=len(names) + 1)
+    sums = np.bincount(inside.labels, inside.probability, len(names) + 1)
+    for n, name in enumerate(names):
+        mine = slice(1, None) if n == 0 else n + 1
+        points = int(counts[mine].sum())
+        if name not in meshes:
+            parts[name] = {"label": n + 1, "found": False}
+            continue
+        mesh = meshes[name]
+        parts[name] = {
+            "label": n + 1,
+            "found": True,
+            "volume_ml": mesh.volume_mm3 / 1000,
+            "center_mm": mesh.box_mm.mean(0).tolist(),
+            "box_mm": mesh.box_mm.tolist(),
+            "points": points,
+            "probability": float(sums[mine].sum() / points) if points else None,
+        }
+    return parts

@@ -37,7 +37,7 @@ def farthest_points(points: Tensor, k: int) -> Tensor:
     centre = points.mean(dim=1, keepdim=True)
     newest = _squared_distance(x, y, z, *centre.unbind(-1)).argmax(dim=1, keepdim=True)
     if compiled(points):
-        from tumortrack.models.sampling_kernels import farthest
+        from tumortrack.models.kernels import farthest
 
         farthest(_rows(points), newest[:, 0].numpy(), chosen.numpy())
         return chosen
@@ -87,7 +87,7 @@ def ball_query(points: Tensor, centres: Tensor, radius: float, k: int) -> Tensor
     Source: Qi et al., PointNet++, NIPS 2017, section 3.2.
     """
     if compiled(points):
-        from tumortrack.models.sampling_kernels import balls
+        from tumortrack.models.kernels import balls
 
         found = torch.empty((*centres.shape[:2], k), dtype=torch.int64)
         balls(_rows(points), _rows(centres), np.float32(radius**2), found.numpy())

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import hashlib
 from pathlib import Path
-from typing import Literal
 
 import msgspec
 import torch
@@ -18,24 +17,10 @@ import torch
 from tumortrack.core import store
 from tumortrack.core.config import Config, from_builtins, to_builtins
 from tumortrack.core.errors import ArtifactError, InputError, StorageError
+from tumortrack.occupancy.arithmetic import Arithmetic, possible
 
 FOLDER = "compiled"
 SCHEMA = 2
-_CHUNKS = (16, 2**14)  # fewest and most queries at once and core
-
-Numbers = Literal["network", "float32", "bfloat16", "int8"]
-
-
-class Arithmetic(Config, frozen=True):
-    """How queries are answered: ``network`` is the network as it is (``torch.autocast``), the
-    others are in ``packed`` and ``quantized``; ``chunk``: queries at once and core."""
-
-    numbers: Numbers
-    chunk: int
-
-    def __post_init__(self) -> None:
-        if not _CHUNKS[0] <= self.chunk <= _CHUNKS[1]:
-            raise InputError(f"chunk is {self.chunk}; {_CHUNKS[0]} to {_CHUNKS[1]} are allowed.")
 
 
 class Machine(Config, frozen=True):
@@ -125,10 +110,6 @@ def find(folder: Path, weights_sha256: str) -> tuple[Arithmetic | None, str | No
     measured = (compiled.weights_sha256, compiled.machine, compiled.threads)
     if measured != (weights_sha256, machine, threads):
         return None, f"this model was compiled for other weights; {again}"
-    from tumortrack.occupancy.inference import (
-        possible,  # which knows the ways and needs this module
-    )
-
     if compiled.arithmetic.numbers not in possible(torch.device("cpu")):
         return None, f"{path} names arithmetic that this processor does not have; {again}"
     return compiled.arithmetic, None

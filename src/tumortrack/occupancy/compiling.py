@@ -10,16 +10,11 @@ import numpy as np
 import torch
 from jaxtyping import Float32
 
-from tumortrack.occupancy.compiled import (
-    SCHEMA,
-    Arithmetic,
-    ArithmeticTiming,
-    Compiled,
-    this_machine,
-)
-from tumortrack.occupancy.inference import CHUNK, Inference, possible
+from tumortrack.occupancy.arithmetic import CHUNK, Arithmetic, possible
+from tumortrack.occupancy.compiled import SCHEMA, ArithmeticTiming, Compiled, this_machine
+from tumortrack.occupancy.inference import Inference
+from tumortrack.occupancy.model import OccupancyModel
 from tumortrack.occupancy.network import Latent, OccupancyNetwork
-from tumortrack.training.model import Model
 
 QUERIES = 10_000
 _CHUNKS = (1024, 2048, 4096)
@@ -30,14 +25,13 @@ _DISTANCE_MM = 130.0
 _FLATTER = (1.0, 0.6, 0.45)  # half axes of a kidney's upper side, about
 
 
-def measured(model: Model, weights_sha256: str, rounds: int = _ROUNDS) -> Compiled:
+def measured(model: OccupancyModel, weights_sha256: str, rounds: int = _ROUNDS) -> Compiled:
     """Every way that this machine offers, in turns, on a cloud of about the organ's size.
 
     How fast products of matrices are does not depend on what is in them, so no real cloud is
     needed; the labels compared are those of the network in single precision.
     """
     network = model.network
-    assert isinstance(network, OccupancyNetwork)
     rng = np.random.default_rng(0)
     cloud = like_an_organ(model.familiar.spread_mm[1], rng)
     ways = _ways(next(network.parameters()).device)

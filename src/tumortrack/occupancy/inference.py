@@ -13,15 +13,10 @@ import torch
 from jaxtyping import Float32
 from torch import Tensor
 
-from tumortrack.occupancy.compiled import Arithmetic, Numbers
+from tumortrack.models.hardware import has_fast_bfloat16
+from tumortrack.occupancy.arithmetic import Arithmetic, usual
 from tumortrack.occupancy.network import Latent, OccupancyNetwork
-from tumortrack.occupancy.packed import PackedDecoder, can_pack, pack_stacks
-from tumortrack.occupancy.quantized import QuantizedDecoder, can_quantize
-from tumortrack.training.model import has_fast_bfloat16
-
-CHUNK = 2048  # queries at once and core: their activations (2 MB at 512 channels) stay near it
-_CHUNK_GPU = 2**17
-_QUANTIZED_WIDTH = 256  # narrower layers lose to what surrounds them what 8 bits gain
+from tumortrack.occupancy.packed import PackedDecoder, pack_stacks
 
 # Latent and queries (1, Q, 3), mm -> logits (1, Q, classes), float32
 Decode = Callable[[Latent, Tensor], Tensor]
@@ -37,7 +32,7 @@ class Inference:
     def __init__(self, network: OccupancyNetwork, arithmetic: Arithmetic | None = None) -> None:
         self.network = network.folded()
         self.device = next(network.parameters()).device
-        self.arithmetic = arithmetic or usual(self.network, self.device)
+        self.arithmetic = arithmetic or usual(self.device)
         self._decode = decoder(self.network, self.arithmetic)
         packed = self.arithmetic.numbers != "network"
         if packed:
@@ -58,24 +53,6 @@ class Inference:
         return self._decode(latent, queries.to(self.device))[0]
 
 
-def possible(device: torch.device) -> tuple[Numbers, ...]:
-    """What the device has fast instructions for."""
-    if not can_pack(device):
-        return ("network",)
-    fast: Numbers = "bfloat16" if has_fast_bfloat16(device) else "float32"
-    return ("network", fast, "int8") if can_quantize() else ("network", fast)
-
-
-def usual(network: OccupancyNetwork, device: torch.device) -> Arithmetic:
-    """What is fastest on most machines; `tumortrack compile` measures."""
-    if device.type == "cuda":
-        return Arithmetic(numbers="network", chunk=_CHUNK_GPU)
-    *rest, best = possible(device)
-    if best == "int8" and network.decoder.config.width < _QUANTIZED_WIDTH:
-        best = rest[-1]
-    return Arithmetic(numbers=best, chunk=CHUNK)
-
-
 def decoder(network: OccupancyNetwork, arithmetic: Arithmetic) -> Decode:
     """What answers queries by a folded network; any number of them at once."""
     rows = arithmetic.chunk
@@ -83,13 +60,8 @@ def decoder(network: OccupancyNetwork, arithmetic: Arithmetic) -> Decode:
         rows *= torch.get_num_threads()
     if arithmetic.numbers == "network":
         return _as_it_is(network, rows)
-    if arithmetic.numbers == "float32":
-        return PackedDecoder(network, torch.float32, rows)
-    fast = torch.bfloat16 if has_fast_bfloat16(torch.device("cpu")) else torch.float32
-    packed = PackedDecoder(network, fast, rows)
-    if arithmetic.numbers == "bfloat16":
-        return packed
-    return QuantizedDecoder(packed, PackedDecoder(network, torch.float32, rows))
+    numbers = torch.bfloat16 if arithmetic.numbers == "bfloat16" else torch.float32
+    return PackedDecoder(network, numbers, rows)
 
 
 def _as_it_is(network: OccupancyNetwork, rows: int) -> Decode:

@@ -13,29 +13,21 @@ from jaxtyping import Float, Float16, Float32, Float64, UInt8
 from tumortrack.core.errors import NoEstimate
 from tumortrack.core.estimate import Estimate, Following
 from tumortrack.core.types import Anatomy, CameraLabels, OccupancyCloud, SensorCloud
-from tumortrack.models.in_distribution import (
+from tumortrack.models.in_distribution import check_familiar, fit_mm, spread_mm
+from tumortrack.models.report import describe_parts, fit_report, grid_over, report_head, stage
+from tumortrack.occupancy.inference import Inference
+from tumortrack.occupancy.lattice import LogitLattice, lattice_over, leaves, organ_lattice
+from tumortrack.occupancy.model import OccupancyModel
+from tumortrack.occupancy.sparse import halved_lattice, leading, sparse_logits, sparse_margins
+from tumortrack.occupancy.volume import (
     FIT_STEPS,
-    check_familiar,
-    fit_mm,
-    spread_mm,
-    surface_distances,
-)
-from tumortrack.models.report import fit_report, report_head, stage
-from tumortrack.models.volume import (
-    describe_parts,
     drop_islands,
-    grid_over,
     keep_largest_pieces,
     margins_on,
     part_surfaces,
+    surface_distances,
 )
-from tumortrack.occupancy.inference import Inference
-from tumortrack.occupancy.lattice import LogitLattice, lattice_over
-from tumortrack.occupancy.network import OccupancyNetwork
-from tumortrack.occupancy.organ_lattice import leaves, organ_lattice
-from tumortrack.occupancy.sparse import halved_lattice, leading, sparse_logits, sparse_margins
 from tumortrack.sense.cloud import check_cloud, thin_cloud
-from tumortrack.training.model import Model
 
 COARSE_QUERIES = 10_000
 FINE_QUERIES = 40_000
@@ -51,8 +43,7 @@ class OccupancyLocator:
 
     anatomy_ct: Anatomy | None = None
 
-    def __init__(self, model: Model) -> None:
-        assert isinstance(model.network, OccupancyNetwork)
+    def __init__(self, model: OccupancyModel) -> None:
         self.model = model
         self._inference = Inference(model.network, model.arithmetic)
 
@@ -122,7 +113,7 @@ def steps_over(box: Box) -> int:
 class _Frame:
     """One cloud's work, from its latent to the estimate."""
 
-    model: Model
+    model: OccupancyModel
     inference: Inference
     cloud: SensorCloud
     seed: int

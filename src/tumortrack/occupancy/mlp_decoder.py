@@ -8,38 +8,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from tumortrack.core.config import Config
-from tumortrack.core.errors import InputError
+from tumortrack.models.config import MlpDecoderConfig
 from tumortrack.models.layers import Layer, Norm
-
-
-class MlpDecoderConfig(Config, frozen=True, tag="mlp"):
-    """``hidden_layers`` of ``width`` with ReLU, then one linear layer to the classes' logits.
-
-    ``skip_layer``: this hidden layer (counted from 1) sees [latent, query] again; None: no skip.
-    ``norm_layers``: hidden layers (from 1) with batch norm between linear part and ReLU.
-    ``octaves``: k of sin and cos(2^k pi q) that join each raw coordinate q; () for raw alone.
-    """
-
-    n_classes: int
-    width: int
-    hidden_layers: int
-    skip_layer: int | None = None
-    norm_layers: tuple[int, ...] = ()
-    octaves: tuple[int, ...] = ()
-
-    def __post_init__(self) -> None:
-        allowed = range(1, self.hidden_layers + 1)
-        named = (*self.norm_layers, *(() if self.skip_layer is None else (self.skip_layer,)))
-        if self.n_classes < 2 or self.width < 1 or not set(named) <= set(allowed):
-            raise InputError(
-                f"decoder: layers {named} must lie in 1..{self.hidden_layers}, the width must be "
-                "positive and there must be at least 2 classes."
-            )
-
-    def build(self, latent_size: int) -> MlpDecoder:
-        """The network, with weights from torch's global generator."""
-        return MlpDecoder(self, latent_size)
 
 
 class MlpDecoder(nn.Module):

@@ -7,25 +7,18 @@ AOTInductor, measured beside it, was no faster.
 
 from __future__ import annotations
 
-import platform
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
 from tumortrack.models.layers import Layer
-from tumortrack.occupancy.mlp_decoder import MlpDecoder, octave_features
+from tumortrack.occupancy.mlp_decoder import octave_features
 from tumortrack.occupancy.network import Latent, OccupancyNetwork, normalised
 
 _ENCODER_ROWS = 4096
 _ROUND = 512  # rows
-
-
-def can_pack(device: torch.device) -> bool:
-    """Whether these layers exist for the device: oneDNN on an x86 processor."""
-    x86 = platform.machine().lower() in ("x86_64", "amd64")
-    return device.type == "cpu" and x86 and torch.backends.mkldnn.is_available()
 
 
 class PackedLinear:
@@ -38,12 +31,9 @@ class PackedLinear:
         held = weight.detach().to(dtype).contiguous()
         self.packed = torch.ops.mkldnn._reorder_linear_weight(held, rows)
 
-    def __call__(
-        self, x: Tensor, bias: Tensor, after: str = "none", limits: tuple[float, ...] = ()
-    ) -> Tensor:
-        """Rows (n, in) and (out,) -> (n, out), after it "none", "relu" or "hardtanh" (with its
-        two limits)."""
-        out: Tensor = torch.ops.mkldnn._linear_pointwise(x, self.packed, bias, after, limits, "")
+    def __call__(self, x: Tensor, bias: Tensor, after: str = "none") -> Tensor:
+        """Rows (n, in) and (out,) -> (n, out), after it "none" or "relu"."""
+        out: Tensor = torch.ops.mkldnn._linear_pointwise(x, self.packed, bias, after, (), "")
         return out
 
     def onto(self, x: Tensor, added: Tensor) -> Tensor:
@@ -88,30 +78,28 @@ def pack_stacks(encoder: nn.Module) -> None:
                     module[n] = PackedLayer(layer)
 
 
-@dataclass(frozen=True, eq=False)
-class Step:
-    """A hidden layer's parts: ``of_hidden`` (out, hidden) and, where it sees the query,
-    ``of_query`` (out, query); ``bias`` None where the latent's term has it."""
-
-    of_hidden: Tensor | None
-    of_query: Tensor | None
-    bias: Tensor | None
+# What the layer before gave (Q, width), queries with what rounding took, terms of the latent
+_HiddenLayer = Callable[[Tensor, Tensor, Iterator[Tensor]], Tensor]
 
 
-def steps_of(decoder: MlpDecoder) -> list[Step]:
-    """The hidden layers of a folded decoder, their latent's share left to ``prepare``."""
-    steps, n_hidden = [], 0
-    for layer in decoder.layers:
-        linear = layer.linear
-        assert isinstance(linear, nn.Linear)
-        weight = linear.weight.detach()
-        if weight.shape[1] == n_hidden:
-            steps.append(Step(weight, None, linear.bias.detach()))
-        else:
-            query = weight[:, n_hidden : n_hidden + decoder.query_size]
-            steps.append(Step(weight[:, :n_hidden] if n_hidden else None, query, None))
-        n_hidden = decoder.config.width
-    return steps
+def _hidden_layer(
+    linear: nn.Linear, n_hidden: int, query_size: int, rows: int, dtype: torch.dtype
+) -> _HiddenLayer:
+    """One hidden layer of a folded decoder; its latent's share comes as a term instead."""
+    weight = linear.weight.detach()
+    if weight.shape[1] == n_hidden:
+        plain, bias = PackedLinear(weight, rows, dtype), linear.bias.detach().to(dtype)
+        return lambda hidden, query, terms: plain(hidden, bias, "relu")
+    columns = weight[:, n_hidden : n_hidden + query_size]
+    of_query = PackedLinear(torch.cat([columns, columns[:, :3]], 1), rows, dtype)
+    if not n_hidden:
+        return lambda hidden, query, terms: of_query(query, next(terms), "relu")
+    of_hidden = PackedLinear(weight[:, :n_hidden], rows, dtype)
+
+    def skip(hidden: Tensor, query: Tensor, terms: Iterator[Tensor]) -> Tensor:
+        return functional.relu(of_hidden.onto(hidden, of_query(query, next(terms))), True)
+
+    return skip
 
 
 class PackedDecoder:
@@ -125,77 +113,30 @@ class PackedDecoder:
     """
 
     def __init__(self, network: OccupancyNetwork, dtype: torch.dtype, rows: int) -> None:
-        self.network, self.dtype, self.rows = network, dtype, rows
-        self.steps = steps_of(network.decoder)
-        output = network.decoder.output
+        decoder, output = network.decoder, network.decoder.output
+        self._octaves, self._dtype, self._rows = decoder.config.octaves, dtype, rows
+        hidden = [0] + [decoder.config.width] * (len(decoder.layers) - 1)
+        self._layers = [
+            _hidden_layer(layer.linear, n, decoder.query_size, rows, dtype)
+            for n, layer in zip(hidden, decoder.layers, strict=True)
+            if isinstance(layer, Layer)
+        ]
         self._output = PackedLinear(output.weight, rows, dtype)
         self._output_bias = output.bias.detach().to(dtype)
-        self._hidden = [self._packed(step.of_hidden) for step in self.steps]
-        self._query = [
-            None
-            if step.of_query is None
-            else self._packed(torch.cat([step.of_query, step.of_query[:, :3]], 1))
-            for step in self.steps
-        ]
-        self._biases = [None if s.bias is None else s.bias.to(dtype) for s in self.steps]
-
-    def _packed(self, weight: Tensor | None) -> PackedLinear | None:
-        return None if weight is None else PackedLinear(weight, self.rows, self.dtype)
 
     def __call__(self, latent: Latent, queries_mm: Tensor) -> Tensor:
         """One cloud's latent and queries (1, Q, 3), mm -> logits (1, Q, classes), float32."""
-        terms, n = self.terms(latent), queries_mm.shape[1]
-        parts = [
-            self.logits(terms, self.features(latent, part))
-            for part in filled_up(queries_mm).split(self.rows, dim=1)
-        ]
+        terms = [term[0, 0].to(self._dtype) for term in latent.terms]
+        queries, n = normalised(latent, filled_up(queries_mm))[0], queries_mm.shape[1]
+        parts = [self._logits(iter(terms), part) for part in queries.split(self._rows)]
         return torch.cat(parts)[None, :n]
 
-    def terms(self, latent: Latent) -> list[Tensor]:
-        """The latent's share of the layers that see it, (width,) each."""
-        return [term[0, 0].to(self.dtype) for term in latent.terms]
-
-    def features(self, latent: Latent, queries_mm: Tensor) -> Tensor:
-        """Queries (1, Q, 3) -> what layers see of them, (Q, query size), float32."""
-        queries = normalised(latent, queries_mm)[0]
-        return octave_features(queries, self.network.decoder.config.octaves)
-
-    def rounded(self, features: Tensor) -> Tensor:
-        """Features in ``dtype``, (Q, query size + 3): positions with what rounding took of them."""
-        rounded = features.to(self.dtype)
-        return torch.cat([rounded, (features[:, :3] - rounded[:, :3]).to(self.dtype)], 1)
-
-    def logits(
-        self, terms: list[Tensor], features: Tensor, peaks: list[float] | None = None
-    ) -> Tensor:
-        """Logits (Q, classes), float32; ``peaks`` takes every hidden layer's greatest value."""
-        remaining, rounded = list(terms), self.rounded(features)
-        hidden: Tensor | None = None
-        for number in range(len(self.steps)):
-            hidden = self._layer(number, hidden, rounded, remaining)
-            if peaks is not None:
-                peaks.append(float(hidden.max()))
-        assert hidden is not None
+    def _logits(self, terms: Iterator[Tensor], queries: Tensor) -> Tensor:
+        """Normalised queries (Q, 3) -> logits (Q, classes), float32."""
+        features = octave_features(queries, self._octaves)
+        rounded = features.to(self._dtype)
+        lost = (features[:, :3] - rounded[:, :3]).to(self._dtype)
+        query = hidden = torch.cat([rounded, lost], 1)
+        for layer in self._layers:
+            hidden = layer(hidden, query, terms)
         return self._output(hidden, self._output_bias).float()
-
-    def _layer(
-        self, number: int, hidden: Tensor | None, rounded: Tensor, remaining: list[Tensor]
-    ) -> Tensor:
-        of_hidden, of_query = self._hidden[number], self._query[number]
-        if of_query is None:
-            assert of_hidden is not None
-            assert hidden is not None
-            bias = self._biases[number]
-            assert bias is not None
-            return of_hidden(hidden, bias, "relu")
-        term = remaining.pop(0)
-        if of_hidden is None:
-            return of_query(rounded, term, "relu")
-        assert hidden is not None
-        return functional.relu(of_hidden.onto(hidden, self.seen(number, rounded, term)), True)
-
-    def seen(self, number: int, rounded: Tensor, term: Tensor) -> Tensor:
-        """What layer ``number`` makes of query and latent, (Q, width), before its ReLU."""
-        of_query = self._query[number]
-        assert of_query is not None
-        return of_query(rounded, term)

@@ -23,8 +23,8 @@ import torch
 from jaxtyping import Bool, Float16, Float32, Float64, Int, UInt8
 
 from tumortrack.core.geometry import transform_points
-from tumortrack.models.volume import LARGEST_MARGIN, dense_margins, margins_of
 from tumortrack.occupancy.lattice import LogitLattice, LogitsAt
+from tumortrack.occupancy.volume import LARGEST_MARGIN, dense_margins, margins_of
 
 START_MM = 4.0
 _AT_ONCE = 2**18  # queries
@@ -183,7 +183,7 @@ def _halved(
     coarse: Float32[np.ndarray, "a b c classes"], lattice: _Lattice
 ) -> Float32[np.ndarray, "i j k classes"]:
     """The logits of a lattice from those of the one before."""
-    from tumortrack.occupancy.sparse_kernels import halved
+    from tumortrack.occupancy.kernels import halved
 
     fine = np.empty((*lattice.shape, coarse.shape[3]), np.float32)
     _in_slabs(partial(halved, coarse, fine), len(fine))
@@ -200,7 +200,7 @@ def _voxels(
     coarse: Float32[np.ndarray, "a b c classes"], lattice: _Lattice
 ) -> tuple[Float16[np.ndarray, "parts i j k"], UInt8[np.ndarray, "i j k"]]:
     """Margins and labels of the voxels, from the lattice of twice their distance."""
-    from tumortrack.occupancy.sparse_kernels import filled
+    from tumortrack.occupancy.kernels import filled
 
     classes = coarse.shape[3]
     sure, leads = (v.reshape(coarse.shape[:3]) for v in leading(coarse.reshape(-1, classes)))
@@ -229,7 +229,7 @@ def _margins(
     logits: Float32[np.ndarray, "n classes"],
 ) -> Float16[np.ndarray, "parts i j k"]:
     """The largest everywhere but at these places (flat), whose logits are known."""
-    from tumortrack.occupancy.sparse_kernels import spread
+    from tumortrack.occupancy.kernels import spread
 
     margins = np.empty((logits.shape[1] - 1, *labels.shape), np.float16)
     inside, outside = np.array([LARGEST_MARGIN, -LARGEST_MARGIN], np.float16).view(np.uint16)
@@ -255,7 +255,7 @@ def _about_surprises(
         flat, found: the asked ones, and their logits.
         coarse: the logits that the lattice's were expected from.
     """
-    from tumortrack.occupancy.sparse_kernels import expected_at, neighbours, surprising
+    from tumortrack.occupancy.kernels import expected_at, neighbours, surprising
 
     def surprises_among(flat: np.ndarray, found: np.ndarray) -> np.ndarray:
         expected = np.empty_like(found)
@@ -281,7 +281,7 @@ def _about_surprises(
 
 def leading(rows: Float32[np.ndarray, "n classes"]) -> tuple[np.ndarray, np.ndarray]:
     """The label that leads in every row, and by how much."""
-    from tumortrack.occupancy.sparse_kernels import best
+    from tumortrack.occupancy.kernels import best
 
     labels, leads = np.empty(len(rows), np.uint8), np.empty(len(rows), np.float32)
     best(rows, labels, leads)

@@ -1,98 +1,129 @@
-"""Kernels of the refinement: Gauss-Newton steps without a word to Python in between.
+"""Kernels of the refinement: all Gauss-Newton iterations in one compiled call.
 
-A step needs less than half a millisecond, of which calls from Python would take as much again,
-and two starts that go down at once would wait for each other's. See ``refine`` for what is
+A step takes less than half a millisecond; calling Python in between would take as long again, and
+two starts refined on two cores would wait for each other's. See ``gauss_newton`` for what is
 minimised.
 """
 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numba
 import numpy as np
 
-from tumortrack.registration.residual_kernels import POSE, add_rows
+from tumortrack.registration.residual_kernels import POSE, DistanceLattice, Flow, Pose, add_rows
 from tumortrack.simulate.elastic.flow import BLOCK, block, combine, steps_of
 
 _AT_ONCE = 256  # points whose rows stay in the cache; also so many are summed in single precision
 _APART = 16  # numbers between rows of sums: rows a power of two apart share a cache's lines
 
 
+class Organ(NamedTuple):
+    """The organ at rest, and the prior of its motion; CT frame, mm."""
+
+    modes: np.ndarray  # (i, j, k, 3, m), float32
+    origin_mm: np.ndarray  # (3,)
+    spacing_mm: np.float32
+    center_ct: np.ndarray  # (3,), float64
+    distances: DistanceLattice
+    precision: np.ndarray  # (p, p), float64
+    mean: np.ndarray  # (m,), float64
+
+
+class Options(NamedTuple):
+    """See ``GaussNewtonConfig``; ``weight`` of one point's squared distance."""
+
+    weight: float
+    first_mm: float
+    last_mm: float
+    narrowing: float
+    enough_mm: float
+
+
+class State(NamedTuple):
+    """What is refined, float64, changed in place."""
+
+    rotation: np.ndarray  # (3, 3)
+    centre_mm: np.ndarray  # (3,)
+    coefficients: np.ndarray  # (m,)
+    moved: np.ndarray  # (6,): shift and turn since the start
+
+
+class Residuals(NamedTuple):
+    """Of the last state, changed in place."""
+
+    distances_mm: np.ndarray  # (n,), float32
+    curvature: np.ndarray  # (p, p), float64
+    gradient: np.ndarray  # (p,), float64
+
+
+class Workspace(NamedTuple):
+    """Memory of ``normal_equations``."""
+
+    rows: np.ndarray  # (BLOCK, p + 1), float32
+    columns: np.ndarray  # (p + 1 or more, _AT_ONCE + _APART), float32, zero
+
+
 @numba.njit(cache=True, fastmath=True, nogil=True)
-def descend(organ, points, rules, state, left, first, last):  # type: ignore[no-untyped-def]
-    """Steps ``first`` to ``last`` of a refinement, fewer if it settles.
+def descend(organ, points, options, state, residuals, first, last):  # type: ignore[no-untyped-def]
+    """Steps ``first`` to ``last`` of a refinement, fewer if it converges.
 
     Args:
-        organ: (modes, origin, spacing, center_ct, field, precision, mean); ``field`` is (values,
-            origin, spacing) of the distances, ``precision`` (p, p) and ``mean`` (m,) the prior's.
+        organ: ``Organ``; options: ``Options``; state: ``State``.
         points: observed, (n, 3), camera frame, mm, float32.
-        rules: (weight, first_mm, last_mm, narrowing, enough_mm) as numbers.
-        state: rotation (3, 3), centre (3,), coefficients (m,), and how far the pose is from the
-            start's, shift and turn (6,); float64, changed in place.
-        left: distances (n,), curvature (p, p) and gradient (p,) of the last state; where ``first``
-            is not 0, what ran up to there has left them.
+        residuals: ``Residuals``; where ``first`` is not 0, those that the steps before have left.
 
     Returns:
-        The number of steps gone, whether it has settled, and the last state's cost.
+        The number of steps taken, whether it has converged, and the last state's cost.
     """
-    rotation, centre, coefficients, moved = state
-    _, curvature, gradient = left
-    unknowns, last_mm, enough_mm = len(gradient), rules[2], rules[4]
+    unknowns = len(residuals.gradient)
     rows = np.empty((BLOCK, unknowns + 1), np.float32)
-    across = np.zeros((-(-(unknowns + 1) // 4) * 4, _AT_ONCE + _APART), np.float32)
-    room, cost = (rows, across), 0.0
+    columns = np.zeros((-(-(unknowns + 1) // 4) * 4, _AT_ONCE + _APART), np.float32)
+    room, cost = Workspace(rows, columns), 0.0
     if first == 0:
-        cost = _equations(organ, points, rules, state, _width(rules, 0), room, left)
+        cost = _equations(organ, points, options, state, _width(options, 0), room, residuals)
     for step in range(first, last):
-        change = np.linalg.solve(curvature, gradient)
-        _turn(rotation, centre, change)
+        change = np.linalg.solve(residuals.curvature, residuals.gradient)
+        _turn(state.rotation, state.centre_mm, change)
         for n in range(POSE):
-            moved[n] -= change[n]
-        for n in range(len(coefficients)):
-            coefficients[n] -= change[POSE + n]
-        cost = _equations(organ, points, rules, state, _width(rules, step + 1), room, left)
-        if np.abs(change).max() < enough_mm and _width(rules, step) == last_mm:
+            state.moved[n] -= change[n]
+        for n in range(len(state.coefficients)):
+            state.coefficients[n] -= change[POSE + n]
+        cost = _equations(organ, points, options, state, _width(options, step + 1), room, residuals)
+        small = np.abs(change).max() < options.enough_mm
+        if small and _width(options, step) == options.last_mm:
             return step + 1, True, cost
     return last, False, cost
 
 
 @numba.njit(cache=True, nogil=True)
-def _width(rules, step):  # type: ignore[no-untyped-def]
+def _width(options, step):  # type: ignore[no-untyped-def]
     """The distance (mm) where a point's pull is greatest, after so many steps."""
-    _, first_mm, last_mm, narrowing, _ = rules
-    return max(last_mm, first_mm * narrowing**step)
+    return max(options.last_mm, options.first_mm * options.narrowing**step)
 
 
 @numba.njit(cache=True, fastmath=True, nogil=True, inline="always")
-def _equations(organ, points, rules, state, width, room, left):  # type: ignore[no-untyped-def]
-    """Distances, curvature and gradient of the cost at a state into ``left``; the cost."""
-    modes, origin, spacing, center, field, precision, mean = organ
-    rotation, centre, coefficients, moved = state
-    distances, curvature, gradient = left
-    weight, last_mm = rules[0], rules[2]
-    velocity = combine(modes, (-coefficients).astype(np.float32))
-    lattice = velocity, origin, spacing
-    pose = center, rotation, centre
-    normal_equations(
-        lattice,
-        steps_of(velocity, spacing),
-        modes,
-        pose,
-        field,
-        np.float32(width),
-        points,
-        room,
-        left,
-    )
+def _equations(  # type: ignore[no-untyped-def]
+    organ, points, options, state, width, room, residuals
+):
+    """Distances, curvature and gradient of the cost at a state into ``residuals``; the cost."""
+    distances, curvature, gradient = residuals
+    weight, last_mm, precision = options.weight, options.last_mm, organ.precision
+    velocity = combine(organ.modes, (-state.coefficients).astype(np.float32))
+    steps = steps_of(velocity, organ.spacing_mm)
+    flow = Flow(velocity, organ.origin_mm, organ.spacing_mm, steps)
+    pose = Pose(organ.center_ct, state.rotation, state.centre_mm)
+    normal_equations(flow, organ, pose, np.float32(width), points, room, residuals)
     unknowns, cost = len(gradient), 0.0
     for p in range(len(distances)):
         square = (np.float64(distances[p]) / last_mm) ** 2
         cost += square / (1.0 + square)
     cost *= weight * last_mm**2
     off = np.empty(unknowns)
-    off[:POSE] = moved
-    off[POSE:] = coefficients - mean
+    off[:POSE] = state.moved
+    off[POSE:] = state.coefficients - organ.mean
     for n in range(unknowns):
         pull = 0.0
         for m in range(unknowns):
@@ -104,12 +135,10 @@ def _equations(organ, points, rules, state, width, room, left):  # type: ignore[
 
 
 @numba.njit(cache=True, fastmath=True, nogil=True, inline="always")
-def normal_equations(  # type: ignore[no-untyped-def]
-    lattice, steps, modes, pose, field, width, points, room, out
-):
-    """Distances as ``kernels.add_rows`` gives them (n,), and the sums over points of ``pull * row
-    * row'`` (p, p) and of ``pull * row * distance`` (p,), float64: ``out``; ``pull`` is
-    1 / (1 + (distance / width)^2)^2. ``room`` is overwritten."""
+def normal_equations(flow, organ, pose, width, points, room, out):  # type: ignore[no-untyped-def]
+    """Distances as ``add_rows`` gives them, and the sums over points of ``pull * row * row'`` and
+    of ``pull * row * distance`` into ``out`` (``Residuals``); ``pull`` is
+    1 / (1 + (distance / width)^2)^2. ``flow`` has the opposite velocity."""
     rows, across = room
     distances, square, mixed = out
     unknowns = len(mixed)
@@ -120,7 +149,9 @@ def normal_equations(  # type: ignore[no-untyped-def]
         count = min(_AT_ONCE, len(points) - start)
         for first in range(start, start + count, BLOCK):
             some = points[first : min(first + BLOCK, start + count)]
-            add_rows(lattice, steps, modes, pose, field, some, (places, speeds, middles), rows)
+            add_rows(
+                flow, organ.modes, pose, organ.distances, some, (places, speeds, middles), rows
+            )
             for p in range(len(some)):
                 distance = rows[p, unknowns]
                 distances[first + p] = distance

@@ -1,4 +1,4 @@
-"""Locating with a warp: place the pre-operative organ, then read everything off it."""
+"""Clouds -> estimates with a registered organ: everything is read off the motion."""
 
 from __future__ import annotations
 
@@ -13,15 +13,12 @@ from tumortrack.core.estimate import Estimate, Following
 from tumortrack.core.types import Anatomy, CameraLabels, Mesh, OccupancyCloud, SensorCloud
 from tumortrack.imaging.raster import label_grid
 from tumortrack.models.in_distribution import check_familiar, check_likely, fit_mm, spread_mm
-from tumortrack.models.report import fit_report, report_head, stage
-from tumortrack.models.volume import describe_parts, grid_over
+from tumortrack.models.report import describe_parts, fit_report, grid_over, report_head, stage
 from tumortrack.registration.gauss_newton import RegistrationResult, refine
-from tumortrack.registration.hypotheses import best_fit, first_motions
 from tumortrack.registration.label_probability import NearestLookup, normal_table, probabilities
+from tumortrack.registration.model import RegistrationModel
 from tumortrack.registration.motion import ElasticMotion, blend
-from tumortrack.registration.network import RegistrationNetwork
 from tumortrack.sense.cloud import check_cloud, thin_cloud
-from tumortrack.training.model import Model
 
 QUERIES = 40_000  # as many as the paper asks
 CARRIED = 20_000  # points of the undeformed organ that live estimates carry along
@@ -55,14 +52,11 @@ class _Placed:
 
 
 class RegistrationLocator:
-    """Locates by a warp network and its refinement; its estimates have a motion."""
+    """Locates by ``Registration``; its estimates have a motion."""
 
-    def __init__(self, model: Model) -> None:
-        assert isinstance(model.network, RegistrationNetwork)
-        assert model.shape is not None
-        assert model.trust is not None
-        self._model, self._network, self._shape = model, model.network, model.shape
-        self._trust = model.trust
+    def __init__(self, model: RegistrationModel) -> None:
+        self._model, self._shape, self._calibration = model, model.shape, model.calibration
+        self._registration = model.registration()
         self._device = next(model.network.parameters()).device
         self._near = msgspec.structs.replace(model.config.refine, first_mm=_MOVED_MM)
         anatomy = model.shape.anatomy_ct
@@ -85,10 +79,9 @@ class RegistrationLocator:
         seconds: dict[str, float] = {}
         points = self._thinned(cloud, rng)
         with stage(seconds, "encode", self._device):
-            starts = first_motions(self._network, self._shape, points)
+            starts = self._registration.propose(points)
         with stage(seconds, "refine", self._device):
-            refine, usual_cost = self._model.config.refine, self._trust.usual_cost
-            fit = best_fit(self._shape, points, starts, refine, usual_cost)
+            fit = self._registration.best_fit(points, starts, self._calibration.usual_cost)
         placed = self._placed(points, fit, seconds)
         meshes = placed.meshes
         organ = meshes[self._model.parts[0]]
@@ -110,17 +103,16 @@ class RegistrationLocator:
         seconds: dict[str, float] = {}
         points = self._thinned(cloud, rng)
         start = last.unsmoothed if last is not None else None
-        usual, fits = self._trust.usual_cost, []
+        usual, fits = self._calibration.usual_cost, []
         if isinstance(start, ElasticMotion):
             with stage(seconds, "follow", self._device):
                 fits.append(refine(self._shape, points, start, self._near))
         if not fits or how.thorough or fits[0].cost > usual:
             with stage(seconds, "encode", self._device):
-                starts = first_motions(self._network, self._shape, points)
+                starts = self._registration.propose(points)
             with stage(seconds, "refine", self._device):
                 enough = usual if how.thorough or not fits else np.inf
-                config = self._model.config.refine
-                fits.append(best_fit(self._shape, points, starts, config, enough))
+                fits.append(self._registration.best_fit(points, starts, enough))
         fit = min(fits, key=lambda fit: fit.cost)
         unsmoothed, lag_s = fit.motion, 0.0
         if last is not None and isinstance(last.motion, ElasticMotion) and how.smoothing_s > 0:
@@ -145,7 +137,7 @@ class RegistrationLocator:
         )
         cloud = SensorCloud(rest.carry(self._shape.anatomy_ct.organ.vertices_mm))
         points = self._thinned(cloud, np.random.default_rng(0))
-        first_motions(self._network, self._shape, points)
+        self._registration.propose(points)
         fit = refine(self._shape, points, rest, self._near)
         self._carry(self._moved(fit), 0)
 
@@ -163,7 +155,7 @@ class RegistrationLocator:
             return self._moved(fit)
 
     def _moved(self, fit: RegistrationResult) -> _Placed:
-        motion = replace(fit.motion, std_scale=self._trust.std_scale)
+        motion = replace(fit.motion, std_scale=self._calibration.std_scale)
         anatomy = self._shape.anatomy_ct
         moved = motion.carry(self._vertices_ct)
         ends = np.cumsum([len(part.vertices_mm) for part in anatomy.parts])[:-1]
@@ -184,7 +176,7 @@ class RegistrationLocator:
         return {
             **head,
             "fit_mm": fit_report(np.abs(fit.distances_mm)),
-            "fit_cost": {"now": fit.cost, "usual": self._trust.usual_cost},
+            "fit_cost": {"now": fit.cost, "usual": self._calibration.usual_cost},
             "parts": parts,
             "motion": {
                 "camera_from_ct": motion.camera_from_ct.tolist(),

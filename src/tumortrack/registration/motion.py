@@ -12,10 +12,9 @@ from scipy.spatial.transform import Rotation
 
 from tumortrack.core.parallel import share
 from tumortrack.registration import residual_kernels as kernels
+from tumortrack.registration.residual_kernels import Flow, Pose
 from tumortrack.registration.rest_shape import RestShape
 from tumortrack.simulate.elastic.flow import steps_for
-
-Flow = tuple[tuple[np.ndarray, np.ndarray, np.floating], int]  # lattice and steps of the kernels
 
 _AT_ONCE = 4096  # points: a thread's part
 _FEW = 64  # as well, where each takes longer
@@ -61,15 +60,15 @@ class ElasticMotion:
 
     def back(self, points_camera: Float[np.ndarray, "n 3"], /) -> Float64[np.ndarray, "n 3"]:
         """Camera frame (mm) -> CT (LPS, mm)."""
-        (velocity, origin, spacing), steps = self._flow
-        return self._gone(kernels.back, ((-velocity, origin, spacing), steps), points_camera)
+        opposite = self._flow._replace(velocity=-self._flow.velocity)
+        return self._gone(kernels.back, opposite, points_camera)
 
     def std_mm(self, points_ct: Float[np.ndarray, "n 3"], /) -> Float64[np.ndarray, " n"] | None:
         """One standard deviation along any axis, mm: the pose's and the state's, to first order."""
         if self.covariance is None:
             return None
         body, points = self.shape.body, np.ascontiguousarray(points_ct, np.float32)
-        known = *self._flow, body.modes, body.center_ct.astype(np.float32), self._root
+        known = self._flow, body.modes, body.center_ct.astype(np.float32), self._root
         variance = np.empty(len(points), np.float32)
         share(
             lambda part: kernels.variances(*known, points[part], variance[part]), len(points), _FEW
@@ -80,20 +79,17 @@ class ElasticMotion:
         self, kernel: Callable, flow: Flow, points_mm: Float[np.ndarray, "n 3"]
     ) -> Float64[np.ndarray, "n 3"]:
         points, out = np.ascontiguousarray(points_mm, np.float32), np.empty((len(points_mm), 3))
-        way = *flow, self.shape.body.center_ct, self.rotation, self.centre_mm
-        share(lambda part: kernel(*way, points[part], out[part]), len(out), _AT_ONCE)
+        pose = Pose(self.shape.body.center_ct, self.rotation, self.centre_mm)
+        share(lambda part: kernel(flow, pose, points[part], out[part]), len(out), _AT_ONCE)
         return out
 
     @cached_property
-    def _velocity(self) -> Float32[np.ndarray, "i j k 3"]:
-        return self.shape.body.velocity(self.coefficients)
-
-    @cached_property
     def _flow(self) -> Flow:
-        """What the kernels follow, and in how many steps."""
+        """What the kernels follow."""
         body = self.shape.body
-        lattice = (self._velocity, body.origin_mm, np.float32(body.spacing_mm))
-        return lattice, steps_for(self._velocity, body.spacing_mm)
+        velocity = body.velocity(self.coefficients)
+        steps = steps_for(velocity, body.spacing_mm)
+        return Flow(velocity, body.origin_mm, np.float32(body.spacing_mm), steps)
 
     @cached_property
     def _root(self) -> Float32[np.ndarray, "p p"]:

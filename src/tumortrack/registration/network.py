@@ -9,6 +9,7 @@ wrong turn by absurd deformations.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -19,11 +20,13 @@ from torch.nn import functional
 
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import rotation_onto
+from tumortrack.models.config import NetworkConfig, RegistrationHeadConfig
 from tumortrack.models.layers import Layer
-from tumortrack.occupancy.network import Aligned, NetworkConfig, alignment, turned, without_strays
-from tumortrack.registration.config import RegistrationHeadConfig
+from tumortrack.models.model import Network
+from tumortrack.models.normalisation import Aligned, alignment, turned, without_strays
 from tumortrack.registration.rest_shape import RestShape
 
+_PLACES = ("rotation", "centre_mm", "coefficients", "right_way")
 _LARGEST = 4.0  # coefficients lie within so many standard deviations of the library's mean
 _SMALL_START = 0.3  # of the last layer's weights
 _STEP = 0.5  # of the organ's half length: what an output of 1 moves it by
@@ -68,7 +71,7 @@ class PoseHypothesis:
         )
 
 
-class RegistrationNetwork(nn.Module):
+class RegistrationNetwork(Network):
     """Clouds -> placements; the buffers that name the organ are set by ``know``."""
 
     center_ct: Tensor
@@ -200,6 +203,11 @@ class RegistrationNetwork(nn.Module):
         told = functional.softplus(self(few).right_way).sum()
         return told / (len(wrong.points) / _WRONG_SHARE)
 
+    def onnx_parts(self, cloud_mm: Tensor) -> tuple[nn.Module, tuple[Tensor, ...], dict[str, Any]]:
+        """See ``Network``: clouds in, hypotheses of both ways round out."""
+        names = {"input_names": ["cloud_mm"], "output_names": list(_PLACES)}
+        return _BothWays(self).cpu().eval(), (cloud_mm,), names
+
     def both_ways(self, points_mm: Tensor) -> tuple[PoseHypothesis, PoseHypothesis]:
         """Placements for the clouds as they were turned, and for half a turn more."""
         one = self.aside(points_mm)
@@ -213,6 +221,19 @@ class RegistrationNetwork(nn.Module):
             )
         )
         return both[: len(points_mm)], both[len(points_mm) :]
+
+
+class _BothWays(nn.Module):
+    """A cloud (1, N, 3) -> the hypotheses' four arrays, (2, ...) each: as the cloud was turned, and
+    half a turn more."""
+
+    def __init__(self, network: RegistrationNetwork) -> None:
+        super().__init__()
+        self.network = network
+
+    def forward(self, cloud_mm: Tensor) -> tuple[Tensor, ...]:
+        ways = self.network.both_ways(cloud_mm)
+        return tuple(torch.cat([getattr(way, name) for way in ways]) for name in _PLACES)
 
 
 def facing_rotation(

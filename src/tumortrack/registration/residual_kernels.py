@@ -1,11 +1,12 @@
-"""Kernels of a warp: points carried to the camera or back, with what every unknown does to them.
+"""Kernels of a motion: points carried to the camera and back, and derivatives by every unknown.
 
-``lattice`` is (velocity, origin, spacing) of the field that points follow; ``modes`` are on the
-same lattice. Unknowns are shift, turn and coefficients, in this order. Derivatives by coefficients
-are to first order: the modes halfway along a point's path.
+Modes lie on the flow's lattice. Unknowns are shift, turn and coefficients, in this order.
+Derivatives by coefficients are to first order: the modes halfway along a point's path.
 """
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import numba
 import numpy as np
@@ -16,10 +17,36 @@ from tumortrack.simulate.elastic.flow import BLOCK, add_modes, block, enter, tra
 POSE = 6  # unknowns before the coefficients
 
 
+class Flow(NamedTuple):
+    """The velocity field that points follow for one unit of time, in ``steps``."""
+
+    velocity: np.ndarray  # (i, j, k, 3), mm, float32
+    origin_mm: np.ndarray  # (3,)
+    spacing_mm: np.float32
+    steps: int
+
+
+class Pose(NamedTuple):
+    """x -> rotation (x - center_ct) + centre_mm; float64."""
+
+    center_ct: np.ndarray  # (3,)
+    rotation: np.ndarray  # (3, 3)
+    centre_mm: np.ndarray  # (3,)
+
+
+class DistanceLattice(NamedTuple):
+    """Signed distances to a surface on a lattice, CT frame, mm, float32."""
+
+    values_mm: np.ndarray  # (i, j, k)
+    origin_mm: np.ndarray  # (3,)
+    spacing_mm: np.float32
+
+
 @numba.njit(cache=True, fastmath=True, nogil=True)
-def carry(lattice, steps, center, turn, to, points, out):  # type: ignore[no-untyped-def]
-    """``turn (flow(point) - center) + to`` of points (n, 3), float32; the rest float64."""
-    velocity, origin, spacing = lattice
+def carry(flow, pose, points, out):  # type: ignore[no-untyped-def]
+    """The pose of where the flow carries points (n, 3), float32, into ``out``, float64."""
+    velocity, origin, spacing, steps = flow
+    center, turn, to = pose
     places, speeds, middles = block()
     for first in range(0, len(points), BLOCK):
         some = points[first : first + BLOCK]
@@ -35,9 +62,10 @@ def carry(lattice, steps, center, turn, to, points, out):  # type: ignore[no-unt
 
 
 @numba.njit(cache=True, fastmath=True, nogil=True)
-def back(lattice, steps, center, turn, to, points, out):  # type: ignore[no-untyped-def]
-    """The inverse of ``carry``, if ``lattice`` has the opposite velocity."""
-    velocity, origin, spacing = lattice
+def back(flow, pose, points, out):  # type: ignore[no-untyped-def]
+    """The inverse of ``carry``, if ``flow`` has the opposite velocity."""
+    velocity, origin, spacing, steps = flow
+    center, turn, to = pose
     per_cell = np.float32(1) / spacing
     places, speeds, middles = block()
     for first in range(0, len(points), BLOCK):
@@ -55,10 +83,10 @@ def back(lattice, steps, center, turn, to, points, out):  # type: ignore[no-unty
 
 
 @numba.njit(cache=True, fastmath=True, nogil=True)
-def variances(lattice, steps, modes, center, root, points, out):  # type: ignore[no-untyped-def]
+def variances(flow, modes, center, root, points, out):  # type: ignore[no-untyped-def]
     """The mean over x, y, z of each point's variance (n,), if ``root @ root.T`` (p, p) is the
     covariance of the unknowns: their effects times the root, squared. All float32."""
-    velocity, origin, spacing = lattice
+    velocity, origin, spacing, steps = flow
     places, speeds, middles = block()
     along = np.eye(3, dtype=np.float32)
     row, mixed = np.empty(len(root), np.float32), np.empty(len(root), np.float32)
@@ -91,16 +119,15 @@ def variances(lattice, steps, modes, center, root, points, out):  # type: ignore
 
 
 @numba.njit(cache=True, fastmath=True, nogil=True, inline="always")
-def add_rows(lattice, steps, modes, pose, field, points, room, rows):  # type: ignore[no-untyped-def]
+def add_rows(flow, modes, pose, field, points, room, rows):  # type: ignore[no-untyped-def]
     """What each unknown does to the signed distance of one block of points (n, 3; camera frame,
     mm), carried back, to a surface at rest; the distance itself stands in the last column of
     ``rows`` (n, p + 1).
 
-    ``lattice`` has the opposite velocity; ``pose`` is (center_ct, rotation, centre_mm), ``field``
-    (values, origin, spacing) of the distances; ``room`` is ``flow.block()``. ``pose`` is float64,
-    all else float32.
+    ``flow`` has the opposite velocity; ``field`` is the surface's ``DistanceLattice``; ``room`` is
+    ``elastic.flow.block()``.
     """
-    velocity, origin, spacing = lattice
+    velocity, origin, spacing, steps = flow
     center, rotation, centre = pose
     values, corner, width = field
     places, speeds, middles = room

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Protocol, runtime_checkable
+from collections.abc import Callable
+from typing import Any, Protocol
 
 import numpy as np
 from jaxtyping import Float64
@@ -12,16 +13,17 @@ from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError
 from tumortrack.core.estimate import Estimate, Following
 from tumortrack.core.types import Anatomy, SensorCloud
+from tumortrack.models.model import Model
 from tumortrack.occupancy.locator import OccupancyLocator
+from tumortrack.occupancy.model import OccupancyModel
 from tumortrack.registration.locator import RegistrationLocator
-from tumortrack.training.model import Model
+from tumortrack.registration.model import RegistrationModel
 
 _ALONE = Following()
 
 
-@runtime_checkable
 class Locator(Protocol):
-    """One kind of model at work."""
+    """One method at work; ``Tracker`` documents the calls."""
 
     anatomy_ct: Anatomy | None
 
@@ -30,6 +32,12 @@ class Locator(Protocol):
     def follow(self, cloud: SensorCloud, last: Estimate | None, how: Following) -> Estimate: ...
 
     def warm(self) -> None: ...
+
+
+_LOCATORS: dict[type[Model], Callable[[Any], Locator]] = {
+    RegistrationModel: RegistrationLocator,
+    OccupancyModel: OccupancyLocator,
+}
 
 
 class Tracker:
@@ -41,9 +49,7 @@ class Tracker:
     def __init__(self, model: Model) -> None:
         keep_small_blocks()
         self.model = model
-        self._locator: Locator = (
-            RegistrationLocator(model) if model.config.network.warps else OccupancyLocator(model)
-        )
+        self._locator = _LOCATORS[type(model)](model)
 
     @property
     def anatomy_ct(self) -> Anatomy | None:

@@ -19,7 +19,7 @@ import torch
 from torch import Tensor, distributed, nn
 
 from tumortrack.core.errors import InputError, TumortrackError
-from tumortrack.training.model import choose_device
+from tumortrack.models.hardware import choose_device
 
 _PATIENCE = timedelta(hours=1)  # while the first process validates, the others wait
 

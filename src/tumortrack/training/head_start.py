@@ -12,8 +12,9 @@ from safetensors.torch import load, save
 from tumortrack.core import store
 from tumortrack.core.config import from_builtins, to_builtins
 from tumortrack.core.errors import ArtifactError, InputError
-from tumortrack.occupancy.network import Aligned, NetworkConfig
-from tumortrack.training.networks import network_of
+from tumortrack.models.config import NetworkConfig, RegistrationHeadConfig
+from tumortrack.models.normalisation import Aligned
+from tumortrack.training.model import model_class
 
 KIND = "pretrained"
 _WEIGHTS = "weights.safetensors"
@@ -33,7 +34,7 @@ class HeadStart:
         Raises:
             InputError: another kind of network, or other sizes.
         """
-        if not network.warps:
+        if not isinstance(network.decoder, RegistrationHeadConfig):
             raise InputError("--start is for the preset clinic; quick and paper have none.")
         if _shared(self.config) != _shared(network):
             raise InputError(
@@ -69,7 +70,7 @@ def load_start(folder: Path) -> HeadStart:
     try:
         config = from_builtins(manifest["config"], NetworkConfig, f"{folder}: config")
         weights = load((folder / _WEIGHTS).read_bytes())
-        network_of(config).load_state_dict(weights)
+        model_class(config).new_network(config).load_state_dict(weights)
     except (InputError, KeyError, RuntimeError, SafetensorError, OSError) as error:
         raise ArtifactError(
             f"{folder} holds no whole pretrained weights of this version: {error}. Make them "

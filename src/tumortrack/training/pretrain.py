@@ -22,7 +22,8 @@ from tumortrack.core import store
 from tumortrack.core.config import identity
 from tumortrack.core.errors import InputError
 from tumortrack.core.types import Anatomy
-from tumortrack.models.config import TrainConfig
+from tumortrack.models.config import RegistrationHeadConfig, TrainConfig
+from tumortrack.models.hardware import choose_device
 from tumortrack.phantom.kidneys import random_anatomy
 from tumortrack.registration.canonical_frame import (
     CanonicalFrame,
@@ -30,17 +31,13 @@ from tumortrack.registration.canonical_frame import (
     know_any,
     upright_of,
 )
-from tumortrack.registration.config import RegistrationHeadConfig
-from tumortrack.registration.network import RegistrationNetwork
 from tumortrack.registration.rest_shape import long_axis_of
 from tumortrack.simulate.bodies import body_for
 from tumortrack.simulate.dataset import Batch, SceneStream
 from tumortrack.simulate.elastic.body import ElasticBody
 from tumortrack.simulate.occupancy import FixedPoints
+from tumortrack.training.checkpoint import work_folder
 from tumortrack.training.head_start import save_start
-from tumortrack.training.loader import batches, default_workers, network_leaves
-from tumortrack.training.model import choose_device
-from tumortrack.training.networks import Network
 from tumortrack.training.pace import (
     REPORT_EVERY_S,
     Interrupted,
@@ -49,8 +46,8 @@ from tumortrack.training.pace import (
     ctrl_c,
     use_cores,
 )
+from tumortrack.training.scenes import batches, default_workers, network_leaves
 from tumortrack.training.state import TrainingState
-from tumortrack.training.work import work_folder
 
 
 @dataclass(frozen=True)
@@ -179,7 +176,7 @@ def _pretrain(
     workers = default_workers() if run.workers is None else run.workers
     use_cores(device, network_leaves(workers))
     state = TrainingState(run, device)
-    state.know(_teach)
+    state.know(know_any)
     state.resume(work)
     progress, clock = state.progress, TrainingClock(state.progress)
     steps = range(progress.step, run.steps)
@@ -206,8 +203,3 @@ def _pretrain(
     }
     save_start(state.average, run.config.network, about, folder)
     return about
-
-
-def _teach(network: Network) -> None:
-    assert isinstance(network, RegistrationNetwork)
-    know_any(network)

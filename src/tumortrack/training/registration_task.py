@@ -10,20 +10,19 @@ import torch
 from jaxtyping import Float
 
 from tumortrack.core.errors import InputError
+from tumortrack.models.config import RegistrationHeadConfig
 from tumortrack.models.in_distribution import InDistributionRange, fit_mm, spread_mm
 from tumortrack.registration.canonical_frame import carry_over, upright_of
-from tumortrack.registration.config import RegistrationHeadConfig
 from tumortrack.registration.gauss_newton import RegistrationResult
-from tumortrack.registration.hypotheses import best_fit, first_motions, repaired
+from tumortrack.registration.model import RegistrationModel, UncertaintyCalibration
 from tumortrack.registration.motion import ElasticMotion
 from tumortrack.registration.network import RegistrationNetwork
+from tumortrack.registration.registration import Registration
 from tumortrack.registration.rest_shape import shape_of
 from tumortrack.simulate.bodies import body_for
 from tumortrack.simulate.occupancy import FixedPoints, organ_pool
 from tumortrack.simulate.scene import Simulator
 from tumortrack.simulate.targets import draw_targets
-from tumortrack.training.model import Model, UncertaintyCalibration
-from tumortrack.training.networks import Network
 from tumortrack.training.run import TrainingRun
 from tumortrack.training.validate import ValidationScenes, mean_iou_of, validation_scenes
 
@@ -55,8 +54,7 @@ class RegistrationTask:
         simulator = Simulator(run.anatomy_ct, run.up_lps, run.config.scene, self.body)
         return validation_scenes(simulator, pool, run.config, run.seed)
 
-    def teach(self, network: Network) -> None:
-        assert isinstance(network, RegistrationNetwork)
+    def teach(self, network: RegistrationNetwork) -> None:
         run, shape = self._run, self._shape
         network.know(shape, run.up_lps, self.points.points_ct)
         if run.start is not None:
@@ -65,45 +63,50 @@ class RegistrationTask:
             )
             carry_over(network, run.start.weights, upright)
 
-    def miou(self, network: Network) -> float:
+    def miou(self, network: RegistrationNetwork) -> float:
         return self._judged([fit for _, fit in self._fits(network)]).miou
 
-    def model(self, network: Network, provenance: dict) -> Model:
+    def model(self, network: RegistrationNetwork, provenance: dict) -> RegistrationModel:
         fits = self._fits(network)
         usual_cost = float(np.percentile([fit.cost for _, fit in fits], _USUAL))
-        judged = self._judged(self._repaired(fits, usual_cost))
-        return Model(
-            network,
-            self._run.config,
-            self._run.anatomy_ct.names,
-            self._scenes.query_box_mm,
-            judged.familiar,
-            {**provenance, "validation_tre_mm": round(judged.tre_mm, 3)},
-            self._shape,
-            UncertaintyCalibration(std_scale=judged.std_scale, usual_cost=usual_cost),
+        judged = self._judged(self._repaired(network, fits, usual_cost))
+        return RegistrationModel(
+            network=network,
+            config=self._run.config,
+            parts=self._run.anatomy_ct.names,
+            query_box_mm=self._scenes.query_box_mm,
+            familiar=judged.familiar,
+            provenance={**provenance, "validation_tre_mm": round(judged.tre_mm, 3)},
+            shape=self._shape,
+            calibration=UncertaintyCalibration(std_scale=judged.std_scale, usual_cost=usual_cost),
         )
 
-    def _fits(self, network: Network) -> list[tuple[ElasticMotion, RegistrationResult]]:
+    def _fits(self, network: RegistrationNetwork) -> list[tuple[ElasticMotion, RegistrationResult]]:
         """The likeliest start and the best fit in each validation scene; of the same weights once,
         since the last ones are mostly the best."""
-        assert isinstance(network, RegistrationNetwork)
         weights = b"".join(w.numpy(force=True).tobytes() for w in network.state_dict().values())
         if self._last is None or self._last[0] != weights:
             network.eval()
-            shape, config, fits = self._shape, self._run.config.refine, []
+            registration, fits = self._registration(network), []
             for cloud in self._scenes.clouds_mm:
-                starts = first_motions(network, shape, cloud)
-                fits.append((starts[0], best_fit(shape, cloud, starts, config)))
+                starts = registration.propose(cloud)
+                fits.append((starts[0], registration.best_fit(cloud, starts)))
             self._last = weights, fits
         return self._last[1]
 
+    def _registration(self, network: RegistrationNetwork) -> Registration:
+        return Registration(network, self._shape, self._run.config.refine)
+
     def _repaired(
-        self, fits: list[tuple[ElasticMotion, RegistrationResult]], usual_cost: float
+        self,
+        network: RegistrationNetwork,
+        fits: list[tuple[ElasticMotion, RegistrationResult]],
+        usual_cost: float,
     ) -> list[RegistrationResult]:
         """The fits as the model will make them, which knows the usual cost."""
-        shape, config = self._shape, self._run.config.refine
+        repaired = self._registration(network).repaired
         return [
-            repaired(shape, cloud, start, config, fit) if fit.cost > usual_cost else fit
+            repaired(cloud, start, fit) if fit.cost > usual_cost else fit
             for cloud, (start, fit) in zip(self._scenes.clouds_mm, fits, strict=True)
         ]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 import torch
@@ -13,6 +13,8 @@ from torch import Tensor
 
 from tumortrack.core.errors import TumortrackError
 from tumortrack.models.config import TrainConfig
+from tumortrack.models.hardware import has_fast_bfloat16
+from tumortrack.models.model import Network
 from tumortrack.training.checkpoint import (
     TrainingProgress,
     load_checkpoint,
@@ -21,10 +23,9 @@ from tumortrack.training.checkpoint import (
     save_checkpoint,
 )
 from tumortrack.training.distributed import ProcessGroup
-from tumortrack.training.loader import Tensors
-from tumortrack.training.model import has_fast_bfloat16
-from tumortrack.training.networks import Network, network_of
-from tumortrack.training.schedule import learning_rate
+from tumortrack.training.model import model_class
+from tumortrack.training.run import learning_rate
+from tumortrack.training.scenes import Tensors
 
 
 class Diverged(TumortrackError):
@@ -65,8 +66,9 @@ class TrainingState:
         self._bf16 = has_fast_bfloat16(device)
         config = run.config
         torch.manual_seed(run.seed)
-        self.network = network_of(config.network).to(device)
-        self.average = network_of(config.network).to(device).eval().requires_grad_(False)
+        new_network = model_class(config.network).new_network
+        self.network = new_network(config.network).to(device)
+        self.average = new_network(config.network).to(device).eval().requires_grad_(False)
         self.average.load_state_dict(self.network.state_dict())
         self.optimizer = torch.optim.Adam(
             self.network.parameters(),
@@ -79,7 +81,7 @@ class TrainingState:
         self._best: dict[str, Tensor] = {}
         self.learning_rate = 0.0  # of the last step
 
-    def know(self, teach: Callable[[Network], None]) -> None:
+    def know(self, teach: Callable[[Any], None]) -> None:
         """Give both networks what does not have to be learnt."""
         teach(self.network)
         teach(self.average)

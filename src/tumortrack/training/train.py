@@ -12,12 +12,12 @@ from contextlib import AbstractContextManager, closing, nullcontext
 from dataclasses import replace
 from pathlib import Path
 
+from tumortrack.models.model import Model
 from tumortrack.simulate.dataset import SceneStream
-from tumortrack.training.checkpoint import TrainingProgress
+from tumortrack.training.checkpoint import TrainingProgress, work_folder
 from tumortrack.training.distributed import ProcessGroup, joined
 from tumortrack.training.history import History, Record
-from tumortrack.training.loader import default_workers, network_leaves
-from tumortrack.training.model import Model, load_model, save_model
+from tumortrack.training.model import load_model, save_model
 from tumortrack.training.pace import (
     REPORT_EVERY_S,
     Interrupted,
@@ -26,12 +26,10 @@ from tumortrack.training.pace import (
     ctrl_c,
     use_cores,
 )
-from tumortrack.training.run import TrainingRun, provenance, run_identity
-from tumortrack.training.scenes import scenes_for
-from tumortrack.training.schedule import settle_end
+from tumortrack.training.run import TrainingRun, provenance, run_identity, settle_end
+from tumortrack.training.scenes import default_workers, network_leaves, scenes_for
 from tumortrack.training.state import TrainingState
-from tumortrack.training.task import course_of
-from tumortrack.training.work import work_folder
+from tumortrack.training.task import task_of
 
 __all__ = ["Interrupted", "TrainingRun", "TrainingStatus", "run_identity", "train"]
 
@@ -65,19 +63,19 @@ def _train(
     config, device = run.config, ranks.device
     workers = default_workers(ranks.on_machine) if run.workers is None else run.workers
     use_cores(device, network_leaves(workers, ranks.on_machine), ranks.on_machine)
-    course = course_of(run, device)
+    task = task_of(run, device)
     state = TrainingState(run, device, ranks)
-    state.know(course.teach)
+    state.know(task.teach)
     state.resume(work)
     stream = SceneStream(
         run.anatomy_ct,
         run.up_lps,
         config.scene,
-        course.points,
+        task.points,
         run.seed,
         "train",
         ranks.share(config.batch_size),
-        course.body,
+        task.body,
     )
     steps = ranks.numbers(range(state.progress.step, state.progress.end or config.steps))
     period = config.training_pairs // config.batch_size * ranks.size
@@ -95,7 +93,7 @@ def _train(
             settled = settle_end(config, progress, run.minutes)
             done = progress.step == progress.end
             if history and (done or progress.step % config.validate_every == 0):
-                miou = course.miou(state.average)
+                miou = task.miou(state.average)
                 state.keep_if_best(miou)
                 speed = clock.rate(progress) * config.batch_size
                 record = Record(loss, miou, speed, state.learning_rate, clock.waiting)
@@ -114,7 +112,7 @@ def _train(
     if not ranks.leads:
         return None
     origin = {**provenance(run, progress, device), "scenes": scenes.maker}
-    model = course.model(state.best_network(), origin)
+    model = task.model(state.best_network(), origin)
     save_model(model, folder)
     return model
 

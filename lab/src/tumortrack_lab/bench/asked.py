@@ -21,8 +21,8 @@ if TYPE_CHECKING:
     import torch
 
     from tumortrack.occupancy.inference import Inference
+    from tumortrack.occupancy.model import OccupancyModel
     from tumortrack.occupancy.network import OccupancyNetwork
-    from tumortrack.training.model import Model
     from tumortrack_lab.bench.naive.occupancy import NaiveOccupancy
     from tumortrack_lab.bench.subject import Subject
 
@@ -39,7 +39,7 @@ class OccupancyWorkload:
 
     ``naive_frame_s``: of the naive form's frame, once that was measured."""
 
-    model: Model
+    model: OccupancyModel
     points_mm: np.ndarray
     device: str = "cpu"
     naive_frame_s: InterleavedTiming | None = None
@@ -47,9 +47,6 @@ class OccupancyWorkload:
 
     @cached_property
     def network(self) -> OccupancyNetwork:
-        from tumortrack.occupancy.network import OccupancyNetwork
-
-        assert isinstance(self.model.network, OccupancyNetwork)
         return self.model.network.to(self.device)
 
     @cached_property
@@ -100,7 +97,7 @@ class OccupancyWorkload:
         """Of the encoder."""
         import torch
 
-        from tumortrack.training.model import has_fast_bfloat16
+        from tumortrack.models.hardware import has_fast_bfloat16
 
         return "bf16" if has_fast_bfloat16(torch.device(self.device)) else "fp32"
 
@@ -158,8 +155,8 @@ class OccupancyWorkload:
     def our_frame(self, queries: np.ndarray) -> tuple[np.ndarray, int]:
         """Labels as `locate` finds them, and how many places were asked for: logits on a lattice
         over the queries' box, linear between its points where that is plain, else asked."""
+        from tumortrack.occupancy.lattice import organ_lattice
         from tumortrack.occupancy.locator import steps_over
-        from tumortrack.occupancy.organ_lattice import organ_lattice
         from tumortrack.occupancy.sparse import sparse_logits
 
         latent, asked = self.inference.encode(self.points_mm), 0
@@ -182,8 +179,10 @@ class OccupancyWorkload:
 
 def asked_of(subject: Subject, preset: str) -> OccupancyWorkload:
     """Of a preset: one for all groups of rows, whose naive form then labels its queries once."""
+    from tumortrack.occupancy.model import OccupancyModel
+
     if preset not in subject.asked:
-        subject.asked[preset] = OccupancyWorkload(
-            subject.model(preset), subject.cloud(preset).points_mm
-        )
+        model = subject.model(preset)
+        assert isinstance(model, OccupancyModel)
+        subject.asked[preset] = OccupancyWorkload(model, subject.cloud(preset).points_mm)
     return subject.asked[preset]

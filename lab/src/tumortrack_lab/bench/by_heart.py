@@ -39,10 +39,12 @@ def learn_scene(
     import torch
     from torch.nn.functional import cross_entropy
 
+    from tumortrack.models.hardware import has_fast_bfloat16
     from tumortrack.models.in_distribution import InDistributionRange
+    from tumortrack.occupancy.model import OccupancyModel
     from tumortrack.occupancy.network import OccupancyNetwork
     from tumortrack.simulate.occupancy import OccupancyConfig, OccupancyPool
-    from tumortrack.training.model import Model, has_fast_bfloat16, save_model
+    from tumortrack.training.model import save_model
 
     pool = OccupancyPool(anatomy, OccupancyConfig(per_side=_PER_SIDE), 0)
     rng = np.random.default_rng(0)
@@ -77,7 +79,17 @@ def learn_scene(
     folder.mkdir(parents=True, exist_ok=True)
     organ = stage.carry(anatomy.organ.vertices_mm) - np.median(cloud.points_mm, axis=0)
     box = np.array([organ.min(0), organ.max(0)], float)
-    save_model(Model(network.eval(), config, anatomy.names, box, every, about), folder)
+    save_model(
+        OccupancyModel(
+            network=network.eval(),
+            config=config,
+            parts=anatomy.names,
+            query_box_mm=box,
+            familiar=every,
+            provenance=about,
+        ),
+        folder,
+    )
 
 
 def _settled(network: OccupancyNetwork, seen: Tensor) -> list[Tensor]:

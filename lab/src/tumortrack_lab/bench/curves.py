@@ -68,15 +68,12 @@ def _labels(logits, queries: np.ndarray) -> None:  # type: ignore[no-untyped-def
 
 def _points(subject: Subject, preset: str) -> Iterator[Point]:
     """A cloud of so many points encoded."""
-    from tumortrack.registration.hypotheses import first_motions
-
     cloud = subject.stage.cloud.points_mm
     rng = np.random.default_rng(SEED)
-    model = subject.model(preset)
     for size in _POINTS:
         seen = cloud[rng.integers(len(cloud), size=size)]
         if preset == "clinic":
-            call: Call = partial(first_motions, model.network, model.shape, seen)  # type: ignore[arg-type]
+            call: Call = partial(subject.clinic.registration().propose, seen)
         else:
             call = partial(asked_of(subject, preset).inference.encode, seen)
         yield _measured("points", preset, size, call)
@@ -88,7 +85,7 @@ def _tumors(subject: Subject, _: str) -> Iterator[Point]:
     import torch
 
     from tumortrack.imaging.raster import label_grid
-    from tumortrack.models.volume import grid_over
+    from tumortrack.models.report import grid_over
     from tumortrack.occupancy.inference import Inference
     from tumortrack.occupancy.network import OccupancyNetwork
     from tumortrack.simulate.occupancy import OccupancyPool
@@ -128,7 +125,7 @@ def _grids(subject: Subject, preset: str) -> Iterator[Point]:
     """The labelled volume."""
     from tumortrack.core.types import Anatomy
     from tumortrack.imaging.raster import label_grid
-    from tumortrack.models.volume import grid_over
+    from tumortrack.models.report import grid_over
     from tumortrack.occupancy.sparse import sparse_margins
     from tumortrack_lab.bench.volume import organ_grid
 

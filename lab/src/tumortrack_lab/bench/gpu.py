@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from tumortrack_lab.bench.asked import LABELLING, OccupancyWorkload
 from tumortrack_lab.bench.frames import occupancy_frames
@@ -32,7 +32,7 @@ def rows_on(subject: Subject, device: Device, threads: int, budget_s: float) -> 
 
     share = budget_s / len(LABELLING) / 3
     for preset in LABELLING:
-        model = load_model(subject.model_folder(preset), device)
+        model: Any = load_model(subject.model_folder(preset), device)  # labels points
         asked = OccupancyWorkload(model, subject.cloud(preset).points_mm, device)
         yield from occupancy_frames(asked, preset, threads, share)
         yield asked_volume(asked, preset, threads, share)

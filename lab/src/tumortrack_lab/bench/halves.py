@@ -46,15 +46,12 @@ def _clinic_encoder(subject: Subject, threads: int, budget_s: float) -> BenchRow
     """To both placements; nobody writes this part differently."""
     import torch
 
-    from tumortrack.registration.hypotheses import first_motions
-
-    model, points = subject.model("clinic"), subject.cloud("clinic").points_mm
-    assert model.shape is not None
-    shape, network = model.shape, model.network
-    (ours,) = in_turns(lambda: first_motions(network, shape, points), budget_s=budget_s)  # type: ignore[arg-type]
+    registration, points = subject.clinic.registration(), subject.cloud("clinic").points_mm
+    network = registration.network
+    (ours,) = in_turns(lambda: registration.propose(points), budget_s=budget_s)
     cloud = torch.tensor(points)[None]
     with torch.inference_mode():
-        flops = module_flops(lambda: network.both_ways(cloud))  # type: ignore[operator]
+        flops = module_flops(lambda: network.both_ways(cloud))
     moved = weight_bytes(network, 4) + points.nbytes
     return BenchRow(
         name=ENCODER,

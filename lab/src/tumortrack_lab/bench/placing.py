@@ -32,7 +32,7 @@ class Placing:
         from tumortrack.tracking.tracker import Tracker
         from tumortrack_lab.bench.naive.placed import NaivePlaced
 
-        self.model = self.subject.model("clinic")
+        self.model = self.subject.clinic
         self.tracker: Tracker = Tracker(self.model)
         self.plain: NaivePlaced = NaivePlaced(self.model)
         self.cloud = self.subject.cloud("clinic")
@@ -48,7 +48,6 @@ class Placing:
         """Of places before the camera, at our motion."""
         motion, shape = self.estimate.motion, self.model.shape
         assert motion is not None
-        assert shape is not None
         back = motion.back(places_mm)
         assert back is not None
         return shape.labels_at(back.astype(np.float32))[0]
@@ -63,7 +62,6 @@ class Placing:
     def work(self, unknown: int, steps: int, queries: int) -> Work:
         """Refinement of one start, field and flow of the queries, the surfaces moved."""
         shape, points = self.model.shape, len(self.cloud.points_mm)
-        assert shape is not None
         vertices = sum(len(part.vertices_mm) for part in shape.anatomy_ct.parts)
         flops = refine_flops(points, unknown, steps, _FLOW_STEPS)
         flops += flow_flops(queries + vertices, _FLOW_STEPS)

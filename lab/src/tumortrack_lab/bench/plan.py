@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,6 +23,9 @@ CURVES = {
     "grid": PRESETS,
     "batch": PRESETS,
 }
+
+
+_TRAINING_S, _PEAKS_S, _CURVE_S = 60.0, 5.0, 20.0  # see ``_expected_s``
 
 
 @dataclass(frozen=True)
@@ -60,9 +64,14 @@ def tasks_of(wish: Wish, cores: int) -> list[Task]:
 
 
 def measure(
-    wish: Wish, worker: Sequence[str], command: str, tell: Callable[[str], None]
+    wish: Wish,
+    worker: Sequence[str],
+    command: str,
+    tell: Callable[[str], None],
+    show: Callable[[BenchRow], None],
 ) -> BenchResult:
-    """Run all processes one after another; ``tell`` hears what is under way.
+    """Run all processes one after another; ``tell`` hears what is under way and about how long all
+    will still take, ``show`` gets each row once it is measured.
 
     Raises:
         TumortrackError: one of them failed.
@@ -71,15 +80,42 @@ def measure(
     peaks: list[Peaks] = []
     rows: list[BenchRow] = []
     points: list[Point] = []
-    for task in tasks_of(wish, available_cores()):
+    tasks = tasks_of(wish, available_cores())
+    left_s, past_s, begun_s = sum(sum(_expected_s(task)) for task in tasks), 0.0, time.monotonic()
+    for task in tasks:
+        expected = _expected_s(task)
+        ahead_s = left_s - sum(expected)  # what later tasks take
         for said in listen(worker, task):
             _sort(said, peaks, rows, points)
             machine = said.machine or machine
+            if said.row is not None:
+                show(said.row)
+            if said.under_way is not None:
+                tell(said.under_way)
             if said.begins is not None:
-                tell(said.begins)
+                pace = (time.monotonic() - begun_s) / past_s if past_s else 1.0
+                tell(f"{said.begins}; about {_minutes(pace * left_s)} left")
+                part_s = expected.pop(0) if expected else 0.0
+                left_s, past_s = left_s - part_s, past_s + part_s
+        past_s, left_s = past_s + sum(expected), ahead_s  # models that were there already
     return BenchResult(
         machine=machine, command=command, peaks=tuple(peaks), rows=tuple(rows), points=tuple(points)
     )
+
+
+def _expected_s(task: Task) -> list[float]:
+    """Of each thing that a task begins with, roughly, on a machine of two cores."""
+    groups = [GROUPS[name] for name in task.groups]
+    return [
+        *(_TRAINING_S for _ in task.train),
+        *([_PEAKS_S] if task.peaks else []),
+        *(2 * group.budget_s(task.quick) * max(1, len(group.needs)) for group in groups),
+        *([_CURVE_S] if task.curve is not None else []),
+    ]
+
+
+def _minutes(seconds: float) -> str:
+    return f"{seconds:.0f} s" if seconds < 100 else f"{seconds / 60:.0f} minutes"
 
 
 def _sort(said: TaskMessage, peaks: list[Peaks], rows: list[BenchRow], points: list[Point]) -> None:

@@ -24,9 +24,11 @@ from tumortrack_lab.bench.by_heart import learn_scene
 
 if TYPE_CHECKING:
     from tumortrack.models.config import TrainConfig
+    from tumortrack.models.model import Model
+    from tumortrack.registration.model import RegistrationModel
     from tumortrack.simulate.elastic.body import ElasticBody
     from tumortrack.simulate.scene import RenderedScene
-    from tumortrack.training.model import Model
+    from tumortrack.training.train import TrainingStatus
     from tumortrack_lab.bench.asked import OccupancyWorkload
 
 UP = (0.0, -1.0, 0.0)
@@ -72,9 +74,16 @@ class Subject:
     @cached_property
     def body(self) -> ElasticBody:
         """The phantom's elastic body: the clinic model's."""
-        shape = self.model("clinic").shape
-        assert shape is not None
-        return shape.body
+        return self.clinic.shape.body
+
+    @cached_property
+    def clinic(self) -> RegistrationModel:
+        """The trained model of that preset."""
+        from tumortrack.registration.model import RegistrationModel
+
+        model = self.model("clinic")
+        assert isinstance(model, RegistrationModel)
+        return model
 
     @cached_property
     def _models(self) -> dict[str, Model]:
@@ -149,8 +158,8 @@ class Subject:
             return False
         return True
 
-    def train(self, preset: str) -> None:
-        """Train the preset's model into its folder, on the CPU."""
+    def train(self, preset: str, tell: Callable[[TrainingStatus], None] = lambda _: None) -> None:
+        """Train the preset's model into its folder, on the CPU; ``tell`` hears how far it is."""
         folder, config = self.model_folder(preset), self.config(preset)
         shutil.rmtree(folder, ignore_errors=True)
         if preset == "paper":
@@ -163,4 +172,4 @@ class Subject:
         name = hashlib.sha256(b"the bench's phantom").hexdigest()
         short = msgspec.structs.replace(config, validation_pairs=_VALIDATED)
         run = TrainingRun(self.anatomy, UP, name, short, SEED, steps=STEPS[preset], device="cpu")
-        train(run, folder, lambda _: None)
+        train(run, folder, tell)

@@ -37,6 +37,15 @@ def rich_table(bench: BenchResult) -> Table:
     return out
 
 
+def line(row: BenchRow) -> str:
+    """One row, as soon as it is measured."""
+    naive = "" if row.naive is None else f"; naive {figures.seconds(row.naive.median_s)}"
+    return (
+        f"  {row.name} {row.what}, threads {_threads(row)}: {figures.seconds(row.ours.median_s)} "
+        f"a {row.item}{naive}"
+    )
+
+
 def speed_table(bench: BenchResult) -> str:
     """Every row beside its naive form."""
     head = (

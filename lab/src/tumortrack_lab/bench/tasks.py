@@ -9,8 +9,9 @@ from __future__ import annotations
 import os
 import subprocess
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import msgspec
 
@@ -18,6 +19,9 @@ from tumortrack.core.config import Config, from_builtins
 from tumortrack.core.errors import TumortrackError
 from tumortrack_lab.bench.row import BenchRow, Peaks, Point
 from tumortrack_lab.bench.subject import ConfigOf, Given, Subject
+
+if TYPE_CHECKING:
+    from tumortrack.training.train import TrainingStatus
 
 
 class Task(Config, frozen=True):
@@ -38,9 +42,10 @@ class Task(Config, frozen=True):
 
 
 class TaskMessage(Config, frozen=True):
-    """One line of a process: a result, or what it begins with now."""
+    """One line of a process: a result, what it begins with now, or how far that is."""
 
     begins: str | None = None
+    under_way: str | None = None
     machine: dict[str, str] | None = None
     peaks: Peaks | None = None
     row: BenchRow | None = None
@@ -55,8 +60,14 @@ def subject_of(task: Task, presets: Mapping[str, ConfigOf]) -> Subject:
     return Subject(presets, Path(task.folder), given)
 
 
-def carry_out(task: Task, subject: Subject) -> Iterator[TaskMessage]:
-    """Everything that a task asks for, as it becomes known."""
+def carry_out(
+    task: Task, subject: Subject, tell: Callable[[TaskMessage], None] = lambda _: None
+) -> Iterator[TaskMessage]:
+    """Everything that a task asks for, as it becomes known; ``tell``: how far trainings are."""
+
+    def under_way(status: TrainingStatus) -> None:
+        tell(TaskMessage(under_way=f"  step {status.step} of {status.end}"))
+
     if task.describe:
         from tumortrack_lab.bench.machine import describe_machine
 
@@ -64,7 +75,7 @@ def carry_out(task: Task, subject: Subject) -> Iterator[TaskMessage]:
     for preset in task.train:
         if not subject.trained(preset):
             yield TaskMessage(begins=f"training a `{preset}` network to measure")
-            subject.train(preset)
+            subject.train(preset, under_way)
     if task.peaks:
         from tumortrack_lab.bench.peaks import measure_peaks
 

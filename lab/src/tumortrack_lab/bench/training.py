@@ -47,7 +47,7 @@ def _row(subject: Subject, preset: str, threads: int, budget_s: float) -> BenchR
     """As training does it; naive: single precision, everything in one piece, plain Adam."""
     import torch
 
-    from tumortrack.training.model import has_fast_bfloat16
+    from tumortrack.models.hardware import has_fast_bfloat16
     from tumortrack.training.state import TrainingState
 
     size = BATCH[preset]
@@ -96,7 +96,7 @@ def material(
     config = msgspec.structs.replace(subject.config(preset), batch_size=size)
     anatomy, body, known = subject.anatomy, None, {}
     points: PointSource
-    if config.network.warps:
+    if preset == "clinic":
         body, known = subject.body, subject.model(preset).network.state_dict()
         places = (known["points"] + known["center_ct"]).numpy()
         points = FixedPoints(places, np.zeros(len(places), np.uint8))

@@ -77,7 +77,7 @@ def asked_volume(asked: OccupancyWorkload, preset: str, threads: int, budget_s: 
 
 def organ_grid(asked: OccupancyWorkload, latent: object, grid: int) -> Grid:
     """Voxels over the organ, as `locate` lays them: about the points that are inside."""
-    from tumortrack.models.volume import grid_over
+    from tumortrack.models.report import grid_over
 
     queries = asked.queries(40_000)
     inside = asked.inference.logits(latent, queries).argmax(-1).cpu().numpy() > 0  # type: ignore[arg-type]
@@ -87,7 +87,7 @@ def organ_grid(asked: OccupancyWorkload, latent: object, grid: int) -> Grid:
 def _placed(subject: Subject, threads: int, budget_s: float) -> BenchRow:
     from tumortrack.core.types import Anatomy
     from tumortrack.imaging.raster import label_grid
-    from tumortrack.models.volume import grid_over
+    from tumortrack.models.report import grid_over
 
     placing = Placing(subject)
     anatomy = Anatomy(tuple(placing.estimate.meshes.values()))

@@ -36,7 +36,7 @@ def bench(options: BenchOptions) -> None:
     from tumortrack_lab.bench.plan import CURVES, Wish, measure
     from tumortrack_lab.bench.report import check_document, write_bench
     from tumortrack_lab.bench.suite import GROUPS
-    from tumortrack_lab.bench.tables import rich_table
+    from tumortrack_lab.bench.tables import line, rich_table
 
     if (options.model is None) != (options.cloud is None):
         raise InputError("--model and --cloud belong together: a model, and a cloud of its organ.")
@@ -52,7 +52,7 @@ def bench(options: BenchOptions) -> None:
     )
     with console.status("starting ...") as status:
         told = status.update if console.is_terminal else say
-        found = measure(wish, _WORKER, _command(options), told)
+        found = measure(wish, _WORKER, _command(options), told, lambda row: say(line(row)))
     shown = console if console.is_terminal else Console(width=_WIDE)
     shown.print(rich_table(found))
     for path in write_bench(found, options.out, options.document):
@@ -71,7 +71,7 @@ def _work(task_json: str) -> None:
     import msgspec
 
     from tumortrack.core.config import from_builtins
-    from tumortrack_lab.bench.tasks import Task, carry_out, keep_to_cores, subject_of
+    from tumortrack_lab.bench.tasks import Task, TaskMessage, carry_out, keep_to_cores, subject_of
 
     task = from_builtins(msgspec.json.decode(task_json), Task, "the bench's task")
     keep_to_cores(task.threads)
@@ -82,9 +82,12 @@ def _work(task_json: str) -> None:
         return lambda anatomy: PRESETS[name](anatomy, "limited")
 
     presets = {name: limited(name) for name in PRESETS}
-    for said in carry_out(task, subject_of(task, presets)):
-        sys.stdout.write(msgspec.json.encode(said).decode() + "\n")
-        sys.stdout.flush()
+
+    def tell(said: TaskMessage) -> None:
+        print(msgspec.json.encode(said).decode(), flush=True)
+
+    for said in carry_out(task, subject_of(task, presets), tell):
+        tell(said)
 
 
 if __name__ == "__main__":

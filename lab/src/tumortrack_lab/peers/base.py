@@ -21,7 +21,7 @@ from tumortrack.core.errors import InputError
 from tumortrack.core.estimate import Estimate
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.types import Anatomy, CameraLabels, OccupancyCloud
-from tumortrack.models.volume import describe_parts, grid_over
+from tumortrack.models.report import describe_parts, grid_over
 from tumortrack.report.metrics import label_grid
 from tumortrack.simulate.scene_folder import Scene
 

@@ -13,9 +13,11 @@ import msgspec
 from tumortrack.core import store
 from tumortrack.core.errors import InputError
 from tumortrack.core.estimate import Estimate
+from tumortrack.models.model import Model
+from tumortrack.registration.model import RegistrationModel
 from tumortrack.simulate.scene_folder import Scene
 from tumortrack.tracking.tracker import Tracker
-from tumortrack.training.model import Model, load_model
+from tumortrack.training.model import load_model
 
 LIVE_STAGES = (
     "encode",
@@ -125,7 +127,7 @@ class Network(Method):
         return Answer(estimate, sum(seconds.get(stage, 0.0) for stage in LIVE_STAGES))
 
 
-def without_refinement(model: Model) -> Model:
+def without_refinement(model: Model) -> RegistrationModel:
     """The warp model that takes its network's word; only which way round an organ lies, where the
     network is in doubt, is still decided by the cloud. Any fit is familiar and usual to it, for
     validation knew refined ones.
@@ -133,11 +135,11 @@ def without_refinement(model: Model) -> Model:
     Raises:
         InputError: the model is no warp.
     """
-    if model.trust is None:
+    if not isinstance(model, RegistrationModel):
         raise InputError("only warps are refined; an occupancy model has no unrefined form.")
     config = msgspec.structs.replace(
         model.config, refine=msgspec.structs.replace(model.config.refine, steps=0)
     )
     familiar = msgspec.structs.replace(model.familiar, fit_mm=math.inf)
-    trust = msgspec.structs.replace(model.trust, usual_cost=math.inf)
-    return replace(model, config=config, familiar=familiar, trust=trust)
+    trust = msgspec.structs.replace(model.calibration, usual_cost=math.inf)
+    return replace(model, config=config, familiar=familiar, calibration=trust)

@@ -12,13 +12,13 @@ from tumortrack.core import store
 from tumortrack.core.errors import InputError
 from tumortrack.core.types import Anatomy
 from tumortrack.models.config import TrainConfig
+from tumortrack.models.folder import is_finished
 from tumortrack.sense.calibration import CalibrationConfig
 from tumortrack.sense.clutter import ClutterConfig
 from tumortrack.sense.occlusion import OcclusionConfig
 from tumortrack.simulate.deform import DragConfig
 from tumortrack.simulate.deform.drag import CONFIGURATIONS
 from tumortrack.simulate.scene import SceneConfig
-from tumortrack.training.model_folder import is_finished
 from tumortrack.training.train import TrainingRun, TrainingStatus, run_identity, train
 from tumortrack_lab.study.measure import StudyCase
 from tumortrack_lab.study.methods import Network

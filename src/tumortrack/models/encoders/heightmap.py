@@ -105,7 +105,7 @@ def _spread(place: Tensor, heights: Tensor, pixels: int) -> tuple[Tensor, Tensor
 
 def _spread_compiled(place: Tensor, heights: Tensor, pixels: int) -> tuple[Tensor, Tensor]:
     """The same in one pass on a CPU."""
-    from tumortrack.models.encoders.heightmap_kernels import spread
+    from tumortrack.models.kernels import spread
 
     weight, height = place.new_zeros(2, len(place), pixels, pixels)
     spread(place.numpy(), heights.numpy(), weight.numpy(), height.numpy())

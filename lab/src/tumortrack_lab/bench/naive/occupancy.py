@@ -17,17 +17,18 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from tumortrack.models.config import MlpDecoderConfig
 from tumortrack.models.encoders.pointnet2 import PointNet2Config
-from tumortrack.occupancy.mlp_decoder import MlpDecoderConfig, octave_features
-from tumortrack.occupancy.network import (
+from tumortrack.models.normalisation import (
     Aligned,
     CloudBox,
-    OccupancyNetwork,
     alignment,
     normalisation,
     turned,
     without_strays,
 )
+from tumortrack.occupancy.mlp_decoder import octave_features
+from tumortrack.occupancy.network import OccupancyNetwork
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,9 +13,8 @@ import trimesh
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from tumortrack.registration.network import RegistrationNetwork
+from tumortrack.registration.model import RegistrationModel
 from tumortrack.simulate.occupancy import labels_of
-from tumortrack.training.model import Model
 from tumortrack_lab.bench.naive.scenes import flowed, sampled
 
 _Fit = tuple[float, np.ndarray, np.ndarray, np.ndarray]  # cost, rotation, centre, coefficients
@@ -24,9 +23,7 @@ _Fit = tuple[float, np.ndarray, np.ndarray, np.ndarray]  # cost, rotation, centr
 class NaivePlaced:
     """Places the organ of one model in clouds (camera frame, mm)."""
 
-    def __init__(self, model: Model) -> None:
-        assert isinstance(model.network, RegistrationNetwork)
-        assert model.shape is not None
+    def __init__(self, model: RegistrationModel) -> None:
         self._network, self._config = model.network, model.config.refine
         self._anatomy, self.body = model.shape.anatomy_ct, model.shape.body
         organ = self._anatomy.organ

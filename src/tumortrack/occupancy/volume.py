@@ -6,31 +6,18 @@ from collections.abc import Callable
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float16, Float64, UInt8
+from jaxtyping import Bool, Float, Float16, Float32, Float64, UInt8
 
+from tumortrack.core.errors import NoEstimate
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.types import FIRST_TUMOR, ORGAN, Mesh, OccupancyCloud
 from tumortrack.occupancy.lattice import LogitLattice
+from tumortrack.simulate.occupancy import surface_distance
 
 _AT_ONCE = 2**18  # queries; bounds the memory whatever the grid
 _SMALLEST_MARGIN = 1e-3  # a surface exactly through a grid point would not be closed
+FIT_STEPS = 24  # of a lattice for surface_distances, along the box's longest side
 LARGEST_MARGIN = 30.0  # logits beyond say no more about where a surface lies
-
-
-def grid_over(
-    points_mm: np.ndarray, grid: int
-) -> tuple[Float64[np.ndarray, "4 4"], tuple[int, int, int]]:
-    """``camera_from_index`` and shape of cubic voxels over the points' box, 4 % larger, with
-    ``grid`` voxels along its longest side."""
-    lower, upper = points_mm.min(0).astype(float), points_mm.max(0).astype(float)
-    margin = 0.02 * (upper - lower).max()
-    lower, upper = lower - margin, upper + margin
-    voxel = (upper - lower).max() / grid
-    shape = np.maximum(np.ceil((upper - lower) / voxel - 1e-9).astype(int), 2)
-    camera_from_index = np.diag([voxel, voxel, voxel, 1.0])
-    camera_from_index[:3, 3] = (lower + upper) / 2 - voxel * (shape - 1) / 2
-    i, j, k = (int(n) for n in shape)
-    return camera_from_index, (i, j, k)
 
 
 def dense_margins(
@@ -182,30 +169,23 @@ def _surface(
     return mesh if mesh.volume_mm3 > 0 else Mesh(mesh.vertices_mm, faces[:, ::-1])
 
 
-def describe_parts(
-    names: tuple[str, ...], meshes: dict[str, Mesh], inside: OccupancyCloud
-) -> dict[str, dict]:
-    """Per part: volume, centre, box and how sure the labels inside it are (JSON types).
+def surface_distances(
+    lattice: LogitLattice, points_mm: Float[np.ndarray, "n 3"]
+) -> Float32[np.ndarray, " n"]:
+    """How far points (n, 3) lie from the organ's surface, camera frame, mm.
 
-    The kidney's numbers are those of the whole organ, tumors included.
+    The surface is that of the network's margin, linear between the lattice's points: right to
+    half a mm or so for an organ on ``FIT_STEPS``.
+
+    Raises:
+        NoEstimate: there is no surface in the lattice's box.
     """
-    parts: dict[str, dict] = {}
-    counts = np.bincount(inside.labels, minlength=len(names) + 1)
-    sums = np.bincount(inside.labels, inside.probability, len(names) + 1)
-    for n, name in enumerate(names):
-        mine = slice(1, None) if n == 0 else n + 1
-        points = int(counts[mine].sum())
-        if name not in meshes:
-            parts[name] = {"label": n + 1, "found": False}
-            continue
-        mesh = meshes[name]
-        parts[name] = {
-            "label": n + 1,
-            "found": True,
-            "volume_ml": mesh.volume_mm3 / 1000,
-            "center_mm": mesh.box_mm.mean(0).tolist(),
-            "box_mm": mesh.box_mm.tolist(),
-            "points": points,
-            "probability": float(sums[mine].sum() / points) if points else None,
-        }
-    return parts
+    from skimage import measure
+
+    logits = lattice.logits
+    field = (logits[..., 1:].max(-1) - logits[..., 0]).clip(-LARGEST_MARGIN, LARGEST_MARGIN)
+    if not field.min() < 0 < field.max():
+        raise NoEstimate("no organ was found: its surface is nowhere near the cloud.")
+    corners, faces, _, _ = measure.marching_cubes(field, 0.0)
+    surface = Mesh(corners * lattice.step_mm + lattice.origin_mm, faces)
+    return surface_distance(surface, points_mm)

@@ -1,0 +1,160 @@
+"""Kernels of encoders, compiled on a CPU: farthest points, balls, maxima, strays, height maps."""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+
+_MAXIMUM = {"nnan", "nsz"}  # lets a maximum be taken in lanes; sums stay as they are written
+
+
+@numba.njit(cache=True, nogil=True, fastmath=_MAXIMUM)
+def farthest(points, first, chosen):  # type: ignore[no-untyped-def]
+    """Farthest points of every cloud.
+
+    Args:
+        points: (B, 3, N), float32.
+        first: (B,), the first choice.
+        chosen: (B, k), int64; filled.
+    """
+    n_clouds, _, n = points.shape
+    nearest = np.empty(n, np.float32)
+    for cloud in range(n_clouds):
+        x, y, z = points[cloud, 0], points[cloud, 1], points[cloud, 2]
+        nearest[:] = np.inf
+        newest = first[cloud]
+        for step in range(chosen.shape[1]):
+            chosen[cloud, step] = newest
+            cx, cy, cz = x[newest], y[newest], z[newest]
+            for i in range(n):
+                dx, dy, dz = x[i] - cx, y[i] - cy, z[i] - cz
+                nearest[i] = min(nearest[i], dx * dx + dy * dy + dz * dz)
+            most = np.float32(-1.0)
+            for i in range(n):
+                most = max(most, nearest[i])
+            newest = 0
+            while newest < n - 1 and nearest[newest] != most:
+                newest += 1
+
+
+@numba.njit(cache=True, nogil=True)
+def balls(points, centres, radius_2, found):  # type: ignore[no-untyped-def]
+    """The first points within a radius of every centre, the first repeated where they are few.
+
+    Args:
+        points: (B, 3, N), float32.
+        centres: (B, 3, M), float32.
+        radius_2: squared.
+        found: (B, M, k), int64; filled.
+    """
+    n_clouds, _, n = points.shape
+    k = found.shape[2]
+    square = np.empty(n, np.float32)
+    for cloud in range(n_clouds):
+        x, y, z = points[cloud, 0], points[cloud, 1], points[cloud, 2]
+        for m in range(centres.shape[2]):
+            cx, cy, cz = centres[cloud, 0, m], centres[cloud, 1, m], centres[cloud, 2, m]
+            for i in range(n):
+                dx, dy, dz = x[i] - cx, y[i] - cy, z[i] - cz
+                square[i] = dx * dx + dy * dy + dz * dz
+            row = found[cloud, m]
+            count = 0
+            for i in range(n):
+                if square[i] <= radius_2:
+                    row[count] = i
+                    count += 1
+                    if count == k:
+                        break
+            rest = row[0] if count else 0
+            for i in range(count, k):
+                row[i] = rest
+
+
+@numba.njit(cache=True, nogil=True)
+def greatest(values, infinity, out, chosen):  # type: ignore[no-untyped-def]
+    """The greatest of every K numbers or zero; what is no number counts as greater than all.
+
+    Args:
+        values: (M, K, C).
+        infinity: as such an integer, of the same type.
+        out: (M, C); filled.
+        chosen: (M, C), as ``values``: the first of the K that is so great, -1 for zero; filled.
+    """
+    n, k, channels = values.shape
+    for m in range(n):
+        best, which = out[m], chosen[m]
+        for c in range(channels):
+            best[c] = 0
+            which[c] = -1
+        for number in range(k):
+            row = values[m, number]
+            for c in range(channels):
+                bare = row[c] & (infinity | (infinity - 1))  # without its sign
+                value = bare if bare > infinity else row[c]
+                better = value > best[c]
+                best[c] = value if better else best[c]
+                which[c] = number if better else which[c]
+
+
+@numba.njit(cache=True, nogil=True)
+def handed_back(gradient, chosen, out):  # type: ignore[no-untyped-def]
+    """Every gradient (M, C) to the one of K that was chosen, zero to the others: ``out``
+    (M, K, C) is filled."""
+    n, k, channels = out.shape
+    for m in range(n):
+        for number in range(k):
+            row = out[m, number]
+            for c in range(channels):
+                row[c] = gradient[m, c] if chosen[m, c] == number else 0
+
+
+@numba.njit(cache=True, nogil=True)
+def near(points, reach, out):  # type: ignore[no-untyped-def]
+    """``network.without_strays`` of clouds (B, N, 3) into ``out``; all float32."""
+    n = points.shape[1]
+    which = np.empty(n, np.int64)
+    for b in range(len(points)):
+        middle = np.empty(3, np.float32)
+        for axis in range(3):
+            middle[axis] = np.partition(points[b, :, axis].copy(), (n - 1) // 2)[(n - 1) // 2]
+        for _ in range(2):
+            count = 0
+            for p in range(n):
+                x, y = points[b, p, 0] - middle[0], points[b, p, 1] - middle[1]
+                z = points[b, p, 2] - middle[2]
+                if not x * x + y * y + z * z > reach * reach:
+                    which[count] = p
+                    count += 1
+            if count == 0:  # all are strays: the first stands for them
+                which[0], count = 0, 1
+            total = np.zeros(3)
+            for p in range(n):
+                for axis in range(3):
+                    out[b, p, axis] = points[b, which[p % count], axis]
+                    total[axis] += out[b, p, axis]
+            for axis in range(3):
+                middle[axis] = total[axis] / n
+
+
+@numba.njit(cache=True, nogil=True)
+def spread(places, heights, weight, height):  # type: ignore[no-untyped-def]
+    """Share each point among the four pixels about it: add the shares to ``weight`` and share times
+    height to ``height`` (B, rows, columns). ``places`` (B, N, 2) are columns and rows; float32."""
+    one = np.float32(1)
+    rows, columns = weight.shape[1:]
+    for b in range(len(places)):
+        for p in range(places.shape[1]):
+            x, y = places[b, p, 0], places[b, p, 1]
+            left, upper = np.floor(x), np.floor(y)
+            along, down = x - left, y - upper
+            for below in range(2):
+                row = int(upper) + below
+                if not 0 <= row < rows:
+                    continue
+                part = down if below else one - down
+                for right in range(2):
+                    column = int(left) + right
+                    if 0 <= column < columns:
+                        share = part * (along if right else one - along)
+                        weight[b, row, column] += share
+                        height[b, row, column] += share * heights[b, p]

@@ -1,0 +1,113 @@
+"""Clouds into a network's frame: centred, scaled, turned, freed of strays."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from tumortrack.core.config import Config
+from tumortrack.core.errors import InputError
+from tumortrack.models.sampling import compiled, take
+
+
+class CloudBox(Config, frozen=True, tag="cloud-box"):
+    """Centre and half the longest side of the observed cloud's bounding box (the follow-up's)."""
+
+
+class FixedScale(Config, frozen=True, tag="fixed"):
+    """Scale: a constant, so that size is not lost. Centre: the mean of the points that lie
+    within ``reach`` scales of it; the others are strays, and nothing sees them.
+
+    The mean and not the box's centre: one stray point within reach moves it by 1 / N of its
+    distance, the box by half.
+    """
+
+    scale_mm: float
+    reach: float
+
+    def __post_init__(self) -> None:
+        for name in ("scale_mm", "reach"):
+            if not 0 < getattr(self, name) < float("inf"):
+                raise InputError(f"{name} must be positive, not {getattr(self, name)}.")
+
+
+class Aligned(Config, frozen=True, tag="aligned"):
+    """As ``FixedScale``, and turned about the camera's axis until the cloud's longest direction
+    across it is x, its heavier tail at +x.
+
+    Turning the organ or the camera about that axis then changes nothing, so that the network
+    need not learn it: most of what varies between ``limited`` poses is gone.
+    """
+
+    scale_mm: float
+    reach: float
+
+    def __post_init__(self) -> None:
+        FixedScale(scale_mm=self.scale_mm, reach=self.reach)
+
+
+def normalisation(
+    points_mm: Tensor, kind: CloudBox | FixedScale | Aligned
+) -> tuple[Tensor, Tensor]:
+    """Centre (B, 1, 3) and scale (B, 1, 1), both mm, of clouds (B, N, 3)."""
+    if not isinstance(kind, CloudBox):
+        centre_mm = points_mm.mean(dim=1, keepdim=True)
+        return centre_mm, points_mm.new_full((len(points_mm), 1, 1), kind.scale_mm)
+    low = points_mm.amin(dim=1, keepdim=True)
+    high = points_mm.amax(dim=1, keepdim=True)
+    return (low + high) / 2, ((high - low) / 2).amax(dim=2, keepdim=True).clamp_min(1e-6)
+
+
+def without_strays(points_mm: Tensor, reach_mm: float) -> Tensor:
+    """Clouds (B, N, 3) with every point that is not within reach of the others' middle replaced
+    by one that is: a repeated point changes no maximum, and is never a farthest one.
+
+    The middle is the coordinates' median, then twice the mean of the points within reach, so
+    that background moves it little (10 % of a plane behind a kidney: 0.5 mm, the mean of all by
+    5 mm). The order of the points that stay is kept.
+    """
+    if compiled(points_mm) and not points_mm.requires_grad:
+        from tumortrack.models.kernels import near as gathered
+
+        out = torch.empty_like(points_mm, memory_format=torch.contiguous_format)
+        gathered(points_mm.contiguous().numpy(), np.float32(reach_mm), out.numpy())
+        return out
+    return _without_strays(points_mm, reach_mm)
+
+
+def _without_strays(points_mm: Tensor, reach_mm: float) -> Tensor:
+    """The reference, for every device."""
+    n = points_mm.shape[1]
+    if torch.jit.is_tracing():  # ONNX has no median
+        middle = points_mm.sort(dim=1).values[:, (n - 1) // 2, None]
+    else:
+        middle = points_mm.median(dim=1, keepdim=True).values
+    near = points_mm
+    for _ in range(2):
+        stray = (points_mm - middle).square().sum(dim=2) > reach_mm**2
+        # No two keys are equal, so that any sorting keeps the order.
+        row = torch.arange(n, device=points_mm.device)
+        order = (stray * n + row).argsort(dim=1)
+        count = (~stray).sum(dim=1, keepdim=True).clamp_min(1)
+        near = take(points_mm, order.gather(1, row % count))
+        middle = near.mean(dim=1, keepdim=True)
+    return near
+
+
+def alignment(points: Tensor) -> Tensor:
+    """Cosine and sine (2, B, 1) of the angle about z of the principal direction of the centred
+    points (B, N, 3) across z, pointing to their heavier tail."""
+    x, y = points[..., 0], points[..., 1]
+    angle = torch.atan2(2 * (x * y).mean(1), (x * x - y * y).mean(1)) / 2
+    direction = torch.stack([torch.cos(angle), torch.sin(angle)])[..., None]
+    along = x * direction[0] + y * direction[1]
+    return direction * torch.where((along**3).mean(1) < 0, -1.0, 1.0)[:, None]
+
+
+def turned(points: Tensor, turn: Tensor) -> Tensor:
+    """Points (B, N, 3) turned by minus the angle. Not as a matrix product: that would be rounded
+    to bf16, a tenth of a millimetre."""
+    x, y, z = points.unbind(-1)
+    cosine, sine = turn
+    return torch.stack([x * cosine + y * sine, y * cosine - x * sine, z], dim=-1)

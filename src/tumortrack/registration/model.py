@@ -1,0 +1,55 @@
+"""A `clinic` model: the network, the organ at rest, and how far its own figures can be trusted."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from safetensors.numpy import load, save
+
+from tumortrack.core.config import Config, from_builtins, to_builtins
+from tumortrack.models.config import NetworkConfig
+from tumortrack.models.folder import SHAPE
+from tumortrack.models.model import Model
+from tumortrack.registration.network import RegistrationNetwork
+from tumortrack.registration.registration import Registration
+from tumortrack.registration.rest_shape import RestShape
+
+
+class UncertaintyCalibration(Config, frozen=True):
+    """What validation scenes taught: standard deviations are multiplied by ``std_scale``; a fit
+    that costs more than ``usual_cost`` is tried from other starts."""
+
+    std_scale: float
+    usual_cost: float
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class RegistrationModel(Model):
+    """See ``Model``; ``shape`` is the organ of the CT with its elastic body."""
+
+    network: RegistrationNetwork
+    shape: RestShape
+    calibration: UncertaintyCalibration
+
+    @classmethod
+    def new_network(cls, config: NetworkConfig) -> RegistrationNetwork:
+        return RegistrationNetwork(config)
+
+    def registration(self) -> Registration:
+        """The method, with this model's network and organ."""
+        return Registration(self.network, self.shape, self.config.refine)
+
+    def extra_files(self) -> dict[str, bytes]:
+        return {SHAPE: save(self.shape.to_arrays())}
+
+    def extra_entries(self) -> dict[str, Any]:
+        return {"trust": to_builtins(self.calibration)}
+
+    @classmethod
+    def from_folder(cls, folder: Path, manifest: dict, **common: Any) -> RegistrationModel:
+        shape = RestShape.from_arrays(load((folder / SHAPE).read_bytes()), len(common["parts"]))
+        where = f"{folder}: trust"
+        calibration = from_builtins(manifest["trust"], UncertaintyCalibration, where)
+        return cls(shape=shape, calibration=calibration, **common)

@@ -1,0 +1,93 @@
+"""Commands as processes of their own that need not import PyTorch each: forked by one that has.
+
+As a script: that one. It takes orders (JSON lines) and answers each with its exit code.
+"""
+
+from __future__ import annotations
+
+import gc
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import traceback
+from collections.abc import Callable
+from functools import cache
+
+PRELOADED = (
+    "torch",
+    "scipy.optimize",
+    "scipy.spatial.transform",
+    "skimage.measure",
+    "tumortrack.cli.main",
+    "tumortrack.training.presets",
+    "tumortrack.report.protocol",
+    "tumortrack.imaging.case",
+    "tumortrack.training.train",
+    "tumortrack.simulate.scene",
+    "tumortrack.tracking.tracker",
+)
+
+
+@cache
+def _server() -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        [sys.executable, __file__],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+        env={**os.environ, "GOMP_SPINCOUNT": "1000", "OPENBLAS_NUM_THREADS": "1"},  # as ``main``
+    )
+
+
+def run(arguments: list[str], environment: dict[str, str]) -> subprocess.CompletedProcess[str]:
+    """``tumortrack ARGUMENTS`` to its end."""
+    server = _server()
+    assert server.stdin is not None
+    assert server.stdout is not None
+    with tempfile.NamedTemporaryFile("r") as out, tempfile.NamedTemporaryFile("r") as errors:
+        order = [arguments, environment, os.getcwd(), out.name, errors.name]
+        print(json.dumps(order), file=server.stdin, flush=True)
+        code = int(server.stdout.readline())
+        return subprocess.CompletedProcess(arguments, code, out.read(), errors.read())
+
+
+def _serve() -> Callable[[], None]:
+    """Fork for every order; returns what a fork has to do."""
+    import importlib
+
+    for name in PRELOADED:
+        importlib.import_module(name)
+    gc.freeze()  # nothing of it is looked through, and copied, in a fork
+    while line := sys.stdin.readline():
+        if not (pid := os.fork()):
+            arguments, environment, folder, out, errors = json.loads(line)
+            os.environ.clear()
+            os.environ.update(environment)
+            os.chdir(folder)
+            for name, number in ((os.devnull, 0), (out, 1), (errors, 2)):
+                os.dup2(os.open(name, os.O_RDWR | os.O_APPEND), number)
+            sys.argv = ["tumortrack", *arguments]
+            return _command
+        print(os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]), flush=True)
+    return sys.exit
+
+
+def _command() -> None:
+    """The command, and out at once: to take apart all that was imported takes seconds."""
+    try:
+        sys.modules["tumortrack.cli.main"].main()
+        code = 0
+    except SystemExit as ended:
+        code = ended.code if isinstance(ended.code, int) else 1
+    except BaseException:
+        traceback.print_exc()
+        code = 1
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(code)
+
+
+if __name__ == "__main__":
+    _serve()()
