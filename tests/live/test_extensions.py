@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import os
+import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from extension_objects import EXAMPLE, distribution, installed_example
 from live_objects import small_frame, small_setting, small_update
-from stories import environment, succeeded, tumortrack
+from stories import COMMAND, environment, succeeded
 from tumortrack.core.errors import InputError
 from tumortrack.live.spec import SINKS, SOURCES, extensions
 from tumortrack.live.values import Sink, Source
@@ -25,6 +27,18 @@ def example(tmp_path, monkeypatch):
     yield folders
     for name in [name for name in sys.modules if name.startswith("tumortrack_example")]:
         del sys.modules[name]
+
+
+def with_packages(folders: list[Path], *arguments: object) -> subprocess.CompletedProcess[str]:
+    """A command of a new process that finds these packages."""
+    paths = [*map(str, folders), os.environ.get("PYTHONPATH", "")]
+    return subprocess.run(
+        [*COMMAND, *map(str, arguments)],
+        capture_output=True,
+        text=True,
+        timeout=600,
+        env={**environment(), "PYTHONPATH": os.pathsep.join(filter(None, paths))},
+    )
 
 
 def test_an_installed_package_adds_a_source(example, tmp_path):
@@ -52,14 +66,12 @@ def test_an_installed_package_adds_a_sink(example, tmp_path):
     np.testing.assert_allclose([x, y, z], small_update().center_mm("tumor_1"), atol=0.051)
 
 
-def test_track_uses_it_by_its_text(phantom_case, clinic_model, tmp_path, monkeypatch):
+def test_track_uses_it_by_its_text(phantom_case, clinic_model, tmp_path):
     folders = installed_example(tmp_path / "site")
-    paths = [*map(str, folders), environment().get("PYTHONPATH", "")]
-    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(filter(None, paths)))
     table = tmp_path / "centres.csv"
     arguments = (f"virtual:{phantom_case}?fps=10", f"csv:{table}", "--seconds", 2)
     report = ("--report", tmp_path / "report.json")
-    succeeded(tumortrack("track", clinic_model, *arguments, *report))
+    succeeded(with_packages(folders, "track", clinic_model, *arguments, *report))
     rows = [line.split(",") for line in table.read_text().splitlines()[1:]]
     assert {row[2] for row in rows} >= {"kidney", "tumor_1"}
     assert len({row[0] for row in rows}) > 5
@@ -99,12 +111,13 @@ def test_two_packages_with_one_kind_are_both_named(example, tmp_path, monkeypatc
         SINKS.parse(f"csv:{tmp_path}/a.csv")
 
 
-def test_doctor_names_what_other_packages_add(example, monkeypatch, tmp_path):
+def test_doctor_names_what_other_packages_add(tmp_path):
     broken = {"tumortrack.sources": {"lost": "no_such_module:Source"}}
-    folders = [*example, distribution(tmp_path / "other", "acme-sources", broken)]
-    paths = [*map(str, folders), environment().get("PYTHONPATH", "")]
-    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(filter(None, paths)))
-    said = succeeded(tumortrack("doctor"))
+    folders = [
+        *installed_example(tmp_path / "site"),
+        distribution(tmp_path / "other", "acme-sources", broken),
+    ]
+    said = succeeded(with_packages(folders, "doctor"))
     assert "ok       sink csv of the package tumortrack-example" in said
     assert "BROKEN   source lost of the package acme-sources: " in said
     assert "no_such_module" in said

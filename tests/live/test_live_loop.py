@@ -51,8 +51,8 @@ def clock(monkeypatch):
     """The loop's, its reader's and the script's, which the test turns."""
     one = Clock()
     monkeypatch.setattr(sys.modules[__name__], "time", one)
-    for module in ("loop", "reader"):
-        monkeypatch.setattr(f"tumortrack.tracking.{module}.time", one)
+    for module in ("loop", "source_worker"):
+        monkeypatch.setattr(f"tumortrack.live.{module}.time", one)
     return one
 
 
@@ -289,7 +289,7 @@ def test_what_is_no_organ_gives_no_estimate_and_no_old_one(tracker, stages):
     assert [u.estimate is not None for u in updates] == [True, True, False, True, False, True]
     for n in (2, 4):
         assert updates[n].quality == "none"
-        assert updates[n].placed is None
+        assert updates[n].transformed is None
     assert "does not show this model's organ" in updates[2].reason
     assert "at least 200" in updates[4].reason
     assert told["no_estimate"] == 2
