@@ -6,7 +6,7 @@ SETUP := .venv/.installed
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: help setup debian demo test test-hard check replay bench soak results headstart training-speed clean
+.PHONY: help setup debian demo test test-hard check replay bench soak wheel results headstart training-speed clean
 
 help:  ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 10
@@ -16,7 +16,7 @@ setup: $(SETUP)  ## install everything into .venv
 $(SETUP): pyproject.toml lab/pyproject.toml constraints.txt
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "tumortrack needs Python 3.11 or newer; give make PYTHON=python3.11")'
 	$(PYTHON) -m venv .venv
-	$(BIN)/pip install --quiet --disable-pip-version-check --no-compile -c constraints.txt -e '.[dev,live,arms,onnx]' -e lab
+	$(BIN)/pip install --quiet --disable-pip-version-check --no-compile -c constraints.txt -e '.[dev,report,tensorboard,pcd,live,arms,onnx]' -e lab
 	touch $@
 
 demo: setup  ## CT -> tumors located in unseen deformed scenes (about 5 minutes)
@@ -56,6 +56,9 @@ headstart: setup  ## accuracy against training steps from pretrained weights (AR
 
 training-speed: setup  ## accuracy reached per second, by batch, learning rate and queries (half an hour)
 	$(BIN)/python lab/scripts/training.py $(ARGS)
+
+wheel: setup  ## build the wheels of product and laboratory into dist/
+	$(BIN)/pip wheel --quiet --no-deps --wheel-dir dist . ./lab
 
 clean:  ## remove .venv and caches (runs/ stays)
 	rm -rf .venv .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache

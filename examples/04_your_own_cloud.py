@@ -6,29 +6,23 @@ Run after 02 and 03: python examples/04_your_own_cloud.py [FOLDER] [MODEL] [CLOU
 import sys
 from pathlib import Path
 
-from tumortrack.core.errors import NoEstimate
-from tumortrack.sense.cloud import crop_cloud
-from tumortrack.sense.files import read_cloud
-from tumortrack.tracking.files import write_estimate
-from tumortrack.tracking.tracker import Tracker
-from tumortrack.training.model import load_model
+import tumortrack as tt
 
 
 def main(out: Path, model_folder: Path, cloud_file: Path) -> None:
-    cloud, notes = read_cloud(cloud_file, unit="mm")  # .ply, .pcd or .npz; "m" converts
-    print(f"{len(cloud.points_mm)} points", *notes)
-    # The cloud must show the organ alone. Where depth is enough to free it of its background:
-    cloud = crop_cloud(cloud, near_mm=50, far_mm=400)
+    cloud = tt.read_cloud(cloud_file, unit="mm")  # .ply, .pcd or .npz; "m" converts
+    print(f"{len(cloud.points_mm)} points")
+    # The cloud must show the organ alone; ``tt.find_organ`` frees it of table and instruments.
 
-    tracker = Tracker(load_model(model_folder))  # once; then one call per cloud
+    tracker = tt.Tracker(tt.load_model(model_folder))  # once; then one call per cloud
     try:
         estimate = tracker.locate(cloud, grid=48, seed=0)
-    except NoEstimate as error:  # said aloud, never a made-up answer
+    except tt.errors.NoEstimate as error:  # said aloud, never a made-up answer
         sys.exit(f"nothing found: {error}")
     for name, mesh in estimate.meshes.items():
         x, y, z = mesh.box_mm.mean(0)
         print(f"{name}: {mesh.volume_mm3 / 1000:.1f} ml at ({x:.1f}, {y:.1f}, {z:.1f}) mm")
-    write_estimate(out / "located", estimate, overwrite=True)
+    tt.save_estimate(estimate, out / "located", overwrite=True)
     print(f"surfaces, labelled volume and report are in {out / 'located'}")
 
 
@@ -38,5 +32,5 @@ if __name__ == "__main__":
     main(
         folder,
         given[1] if len(given) > 1 else folder / "model_60",
-        given[2] if len(given) > 2 else folder / "scene" / "cloud.ply",
+        given[2] if len(given) > 2 else folder / "scenes" / "dragged" / "cloud.ply",
     )

@@ -38,9 +38,8 @@ from tumortrack.training.presets import PRESETS, pretraining
 from tumortrack.training.pretrain import Pretraining, kidney_stream
 from tumortrack.training.task import task_of
 from tumortrack.training.train import TrainingRun, train
-from tumortrack_lab.twin.bench import Apparatus, ApparatusConfig
-from tumortrack_lab.twin.stock import StateCache
-from tumortrack_lab.twin.variants import VIEWS, ViewConfig, make_scene
+from tumortrack_lab.twin.dataset import StateCache, TwinRun
+from tumortrack_lab.twin.views import VIEWS, ViewConfig, make_scene
 
 Entries = Iterable[tuple[str, object]]
 COMMANDS = (
@@ -221,17 +220,15 @@ def paper() -> Entries:
 
 def twin(states: Path, recording: bool) -> Entries:
     """Views of a state that was solved when the digests were recorded."""
-    anatomy, targets = case().anatomy, draw_targets(case().anatomy, 0).points_ct
-    stock = StateCache(
-        states, anatomy, targets, lambda: Apparatus(anatomy, case().up_lps, ApparatusConfig())
-    )
-    if not (recording or stock.has("D1")):
+    targets = draw_targets(case().anatomy, 0)
+    cache = StateCache(states, TwinRun(Path("case")), case(), targets)
+    if not (recording or cache.has("D1")):
         print(f"twin: NOT COMPARED, for {states} has no state D1", flush=True)
         return
     states.mkdir(parents=True, exist_ok=True)
-    settled = stock.get("D1", lambda line: None)
+    state = cache.get("D1", lambda line: None)
     for view in VIEWS:
-        scene, targets_mm = make_scene(settled, "D1", view, ViewConfig(), 0)
+        scene, targets_mm = make_scene(state, "D1", view, ViewConfig(), 0)
         write_scene(Path("twin", view), scene)
         yield f"{view}/targets", targets_mm
     yield from files("twin")

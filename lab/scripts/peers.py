@@ -1,6 +1,6 @@
 """Seconds and errors of every peer on a folder of scenes, as JSON lines.
 
-    python bench/peers.py CASE SCENES [--only NAME ...] [--bcpd PROGRAM]
+    python lab/scripts/peers.py CASE SCENES [--only NAME ...] [--bcpd PROGRAM]
 
 The errors are mean distances of a part's vertices to their true places, in mm: scenes must be made
 from the case, so that their meshes keep its triangles.
@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -18,25 +17,8 @@ import numpy as np
 from tumortrack.imaging.case import Case, load_case
 from tumortrack.simulate.scene_folder import Scene, list_scenes, read_scene
 from tumortrack_lab.peers.base import Peer
-from tumortrack_lab.peers.bcpd import Bcpd, BcpdConfig
-from tumortrack_lab.peers.cpd import Cpd
-from tumortrack_lab.peers.elastic import ElasticPeer
-from tumortrack_lab.peers.rigid import Rigid, RigidConfig
-from tumortrack_lab.peers.rigid_bound import RigidBound, matched_vertices
-
-
-def makers(case: Case, program: str | None) -> dict[str, Callable[[], Peer]]:
-    anatomy, up = case.anatomy, case.up_lps
-    kinds: dict[str, Callable[[], Peer]] = {
-        "rigid_bound": lambda: RigidBound(anatomy),
-        "rigid": lambda: Rigid(anatomy, up),
-        "rigid_any_rotation": lambda: Rigid(anatomy, up, RigidConfig(orientation="unknown")),
-        "cpd": lambda: Cpd(anatomy, up),
-        "elastic": lambda: ElasticPeer(anatomy, up),
-    }
-    if program:
-        kinds["bcpd"] = lambda: Bcpd(anatomy, up, BcpdConfig(program=program))
-    return kinds
+from tumortrack_lab.peers.kinds import peer_kinds
+from tumortrack_lab.peers.rigid import matched_vertices
 
 
 def line(peer: Peer, case: Case, scene: Scene, name: str) -> dict:
@@ -65,12 +47,12 @@ def main() -> None:
     parser.add_argument("case", type=Path)
     parser.add_argument("scenes", type=Path)
     parser.add_argument("--only", nargs="*", default=None)
-    parser.add_argument("--bcpd", default=None)
+    parser.add_argument("--bcpd", type=Path, default=None)
     given = parser.parse_args()
     case = load_case(given.case)
-    for name, make in makers(case, given.bcpd).items():
+    for name, kind in peer_kinds(given.bcpd).items():
         if given.only is None or name in given.only:
-            peer = make()
+            peer = kind.made_for(case.anatomy, case.up_lps)
             for folder in list_scenes(given.scenes):
                 print(json.dumps(line(peer, case, read_scene(folder), folder.name)), flush=True)
 

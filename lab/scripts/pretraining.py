@@ -33,10 +33,9 @@ from tumortrack.registration.network import RegistrationNetwork
 from tumortrack.registration.registration import Registration
 from tumortrack.registration.rest_shape import RestShape, shape_of
 from tumortrack.report.drawing import new_figure, save
-from tumortrack.simulate.bodies import body_for
 from tumortrack.simulate.dataset import SceneStream
 from tumortrack.simulate.occupancy import organ_pool
-from tumortrack.simulate.scene import Simulator
+from tumortrack.simulate.scene import Simulator, body_for
 from tumortrack.training.head_start import HeadStart, load_start
 from tumortrack.training.presets import clinic
 from tumortrack.training.registration_task import RegistrationTask

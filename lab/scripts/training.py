@@ -29,8 +29,8 @@ from tumortrack.training.networks import Network
 
 from tumortrack.cli.console import say
 from tumortrack.core import store
-from tumortrack.core.allocator import keep_freed_memory
 from tumortrack.core.errors import TumortrackError
+from tumortrack.core.process import keep_freed_memory
 from tumortrack.imaging.case import Case, load_case
 from tumortrack.models.config import GaussNewtonConfig, TrainConfig
 from tumortrack.occupancy.network import OccupancyNetwork
@@ -39,10 +39,9 @@ from tumortrack.registration.network import RegistrationNetwork
 from tumortrack.registration.registration import Registration
 from tumortrack.registration.rest_shape import shape_of
 from tumortrack.report.drawing import new_figure, save
-from tumortrack.simulate.bodies import body_for
 from tumortrack.simulate.dataset import SceneStream
 from tumortrack.simulate.occupancy import organ_pool
-from tumortrack.simulate.scene import Simulator
+from tumortrack.simulate.scene import Simulator, body_for
 from tumortrack.training.presets import PRESETS, clinic, quick
 from tumortrack.training.run import TrainingRun, settle_end
 from tumortrack.training.scenes import batches

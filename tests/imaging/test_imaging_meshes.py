@@ -7,9 +7,8 @@ import trimesh
 from imaging_objects import OBLIQUE
 from tumortrack.core.errors import InputError
 from tumortrack.core.types import Mesh
-from tumortrack.imaging.meshes import label_meshes, read_mesh_folder
+from tumortrack.imaging.meshes import is_simple, label_meshes, read_mesh_folder
 from tumortrack.imaging.raster import winding_numbers
-from tumortrack.imaging.winding import is_simple
 
 
 def ball(radius, centre, stretch=(1.0, 1.0, 1.0)):

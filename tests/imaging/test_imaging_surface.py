@@ -7,9 +7,9 @@ import trimesh
 from imaging_objects import OBLIQUE, kidney_labels
 from tumortrack.core.errors import InputError
 from tumortrack.core.types import LabelVolume
+from tumortrack.imaging.nifti import write_nifti
 from tumortrack.imaging.prepare import prepare
 from tumortrack.imaging.surface import surfaces
-from tumortrack.imaging.volume import write_labels_nifti
 
 
 def solid(mesh):
@@ -95,6 +95,6 @@ def test_volume_that_no_level_keeps_is_kept_as_well_as_can_be(slice_mm, most, tm
     affine = np.diag([0.8, 0.8, slice_mm, 1.0]) if slice_mm > 1 else np.eye(4)
     _, report = surfaces(LabelVolume(labels, affine))
     assert 1 < abs(report.change_percent[0]) < most
-    write_labels_nifti(tmp_path / "labels.nii.gz", labels, affine, lps=True)
+    write_nifti(tmp_path / "labels.nii.gz", labels, affine, lps=True)
     notes = prepare(tmp_path / "labels.nii.gz").report["notes"]
     assert any("kidney: the surface's volume is" in note for note in notes)

@@ -19,13 +19,12 @@ from imaging_objects import (
 )
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import spacing_mm
+from tumortrack.imaging import nifti
 from tumortrack.imaging.volume import (
     is_label_map,
     read_labels,
     read_raw,
     read_volume,
-    write_labels_nifti,
-    write_volume_nifti,
 )
 
 GRIDS = {
@@ -142,12 +141,12 @@ def test_truncated_dicom_pixels_are_an_input_error(tmp_path):
 def test_labels_and_ct_survive_writing(tmp_path, affine):
     array = blob_array(affine, SHAPE)
     labels = (array // 100).astype(np.uint8)
-    write_labels_nifti(tmp_path / "l.nii.gz", labels, affine, lps=True)
+    nifti.write_nifti(tmp_path / "l.nii.gz", labels, affine, lps=True)
     again = read_labels(tmp_path / "l.nii.gz")
     assert np.array_equal(again.labels, labels)
     assert np.allclose(again.lps_from_index, affine, atol=1e-4)
     for hu in (array, array + np.float32(0.25)):
-        write_volume_nifti(tmp_path / "v.nii.gz", hu, affine)
+        nifti.write_volume_nifti(tmp_path / "v.nii.gz", hu, affine)
         assert np.array_equal(read_volume(tmp_path / "v.nii.gz").hu, hu)
 
 
@@ -156,7 +155,7 @@ def test_camera_labels_keep_their_affine_verbatim(tmp_path):
 
     affine = np.diag([0.5, 0.6, 0.7, 1.0])
     affine[:3, 3] = [-30, -20, 110]
-    write_labels_nifti(tmp_path / "l.nii.gz", np.ones((3, 4, 5), np.uint8), affine, lps=False)
+    nifti.write_nifti(tmp_path / "l.nii.gz", np.ones((3, 4, 5), np.uint8), affine, lps=False)
     assert np.allclose(nibabel.load(tmp_path / "l.nii.gz").affine, affine, atol=1e-5)
 
 
@@ -168,10 +167,8 @@ SHEARED = np.eye(4) + np.eye(4, k=1) * [0, 0.2, 0.1, 12.0]
 def test_a_written_header_is_what_nibabel_reads_and_would_write(tmp_path, affine, number):
     import nibabel
 
-    from tumortrack.core.nifti import write_nifti
-
     array = blob_array(affine, SHAPE).astype(number)
-    write_nifti(tmp_path / "v.nii", array, affine, lps=False)
+    nifti.write_nifti(tmp_path / "v.nii", array, affine, lps=False)
     found = nibabel.load(tmp_path / "v.nii")
     assert np.array_equal(np.asarray(found.dataobj), array)
     assert found.get_data_dtype() == number

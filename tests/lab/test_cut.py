@@ -12,8 +12,8 @@ import pytest
 import trimesh
 
 from tumortrack.core.errors import InputError
-from tumortrack.core.solids import mesh_of, solid_of
 from tumortrack.core.types import Anatomy, Mesh
+from tumortrack.imaging.meshes import mesh_of, solid_of
 from tumortrack.plan.values import Cut, CutLayer, ResectionPlan
 from tumortrack_lab.cut.resection import cut
 from tumortrack_lab.cut.severing import Severed, pieces_of, within

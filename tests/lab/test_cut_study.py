@@ -12,8 +12,8 @@ import trimesh
 from tumortrack.core import store
 from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.geometry import rigid, transform_points
-from tumortrack.core.solids import mesh_of, solid_of
 from tumortrack.core.types import Anatomy, Mesh, SensorCloud
+from tumortrack.imaging.meshes import mesh_of, solid_of
 from tumortrack.plan.located import located
 from tumortrack.plan.resection import plan_resection
 from tumortrack.simulate.scene_folder import Scene, write_scene

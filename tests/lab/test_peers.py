@@ -14,13 +14,14 @@ from tumortrack.report.protocol import compare
 from tumortrack.sense.render import Visibility
 from tumortrack.simulate.scene_folder import Scene
 from tumortrack_lab.peers.base import Fit, estimate_of, rigid_carry
-from tumortrack_lab.peers.bcpd import Bcpd, BcpdConfig
-from tumortrack_lab.peers.cpd import Cpd, CpdConfig
 from tumortrack_lab.peers.elastic import ElasticPeer, ElasticPeerConfig
 from tumortrack_lab.peers.elastic_body import elastic_body, stiffness_matrix
-from tumortrack_lab.peers.rigid import Rigid, RigidConfig
-from tumortrack_lab.peers.rigid_bound import RigidBound, fit_over_volume, matched_vertices
-from tumortrack_lab.peers.surface import seen_from, surface_points
+from tumortrack_lab.peers.kinds import peer_kinds
+from tumortrack_lab.peers.point_drift import Bcpd, BcpdConfig, Cpd, CpdConfig
+from tumortrack_lab.peers.pose_search import RigidConfig, seen_from, surface_points
+from tumortrack_lab.peers.rigid import Rigid, RigidBound, fit_over_volume, matched_vertices
+from tumortrack_lab.study.measure import StudyCase
+from tumortrack_lab.study.peer_methods import peer_method
 from tumortrack_lab.tets import tetrahedralise
 
 UP = (0.0, -1.0, 0.0)
@@ -97,7 +98,7 @@ def errors(anatomy, scene, fit):
 
 def test_bound_is_exact_for_rigid_motion(anatomy):
     scene = scene_of(anatomy, still, pose(anatomy))
-    fit = RigidBound(anatomy).fit(scene)
+    fit = RigidBound(anatomy, UP).fit(scene)
     assert max(errors(anatomy, scene, fit)) < 1e-9
     assert fit.report["residual_mm"] < 1e-6
 
@@ -249,6 +250,59 @@ def test_a_fit_becomes_an_estimate_that_the_protocol_measures(anatomy):
     assert off["tumor_1"]["center_mm"] == pytest.approx(3.0, abs=1e-6)
     with pytest.raises(InputError, match="diverged"):
         estimate_of(Fit(lambda points: points * np.nan, 0.1), anatomy)
+
+
+# Peers of other packages -------------------------------------------------------------------
+
+ACME = """
+from tumortrack_lab.peers.kinds import PeerKind
+from tumortrack_lab.peers.base import Fit
+
+
+class Shifted:
+    name, prepare_s = "shifted", 0.0
+
+    def __init__(self, anatomy_ct, up_lps):
+        self.middle = anatomy_ct.organ.box_mm.mean(0)
+
+    def fit(self, scene):
+        to = scene.cloud.points_mm.mean(0)
+        return Fit(lambda points: points - self.middle + to, 0.25)
+
+
+PEER = PeerKind(Shifted)
+"""
+
+
+@pytest.fixture
+def acme(tmp_path, monkeypatch):
+    """A distribution that is installed as far as anyone can tell."""
+    info = tmp_path / "acme_peers-1.2.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: acme-peers\nVersion: 1.2\n")
+    (info / "entry_points.txt").write_text("[tumortrack.peers]\nshifted = acme_peers:PEER\n")
+    (tmp_path / "acme_peers.py").write_text(ACME)
+    monkeypatch.syspath_prepend(tmp_path)
+    yield info
+    sys.modules.pop("acme_peers", None)
+
+
+def test_another_package_adds_a_peer_by_an_entry_point(anatomy, acme, tmp_path):
+    assert list(peer_kinds())[:2] == ["rigid_bound", "rigid"]
+    method = peer_method("shifted", StudyCase("x", tmp_path, tmp_path, anatomy, UP))
+    assert method.identity["versions"] == {"acme-peers": "1.2"}
+    scene = scene_of(anatomy, still, pose(anatomy))
+    answer = method.locate(scene, 40)
+    kidney = answer.estimate.meshes["kidney"].vertices_mm
+    shift = scene.cloud.points_mm.mean(0) - anatomy.organ.box_mm.mean(0)
+    np.testing.assert_allclose(kidney, anatomy.organ.vertices_mm + shift)
+    assert answer.frame_s == 0.25
+    (acme / "entry_points.txt").write_text("[tumortrack.peers]\nrigid = acme_peers:PEER\n")
+    with pytest.raises(InputError, match="'rigid' of acme-peers has the name of one of ours"):
+        peer_kinds()
+    (acme / "entry_points.txt").write_text("[tumortrack.peers]\nbare = acme_peers:Shifted\n")
+    with pytest.raises(InputError, match=r"acme_peers:Shifted of acme-peers is no PeerKind"):
+        peer_kinds()
 
 
 # BCPD by its program -----------------------------------------------------------------------

@@ -22,9 +22,8 @@ from tumortrack_lab.study.measure import StudyCase
 from tumortrack_lab.study.methods import Network
 from tumortrack_lab.study.peer_methods import peer_method
 from tumortrack_lab.study.plan import FULL, QUICK, Methods, jobs_of, scenes_of
-from tumortrack_lab.twin.cover import cover
-from tumortrack_lab.twin.faults import FAULTS
-from tumortrack_lab.twin.severity import (
+from tumortrack_lab.twin.faults import (
+    FAULTS,
     KINDS,
     MOVED,
     SCALED,
@@ -34,7 +33,8 @@ from tumortrack_lab.twin.severity import (
     scaled,
     severe,
 )
-from tumortrack_lab.twin.variants import EquilibriumState, ViewConfig, make_scene
+from tumortrack_lab.twin.occluders import hide_share
+from tumortrack_lab.twin.views import EquilibriumState, ViewConfig, make_scene
 
 HALF_HEIGHT = 24.0  # of the ellipsoid kidney
 TURN = np.array([[1.0, 0, 0], [0, 1, 0], [0, 0, 1]])
@@ -167,7 +167,7 @@ def test_shafts_lumps_and_drapes_take_part_and_come_from_any_side():
     depth = clean().depth
     middles = []
     for seed in range(12):
-        half, share = cover(depth, 0.5, 4.0, np.random.default_rng(seed))
+        half, share = hide_share(depth, 0.5, 4.0, np.random.default_rng(seed))
         assert share == pytest.approx(0.5, abs=0.01)
         lost = np.isfinite(depth.depth_mm) & np.isnan(half.depth_mm)
         row, column = np.nonzero(lost)
@@ -176,10 +176,10 @@ def test_shafts_lumps_and_drapes_take_part_and_come_from_any_side():
     assert right.min() < -5 < 5 < right.max()
     assert down.min() < -2 < 2 < down.max()
     with pytest.raises(InputError, match=r"0 to 0\.9"):
-        cover(depth, 0.95, 4.0, np.random.default_rng(0))
+        hide_share(depth, 0.95, 4.0, np.random.default_rng(0))
     empty = type(depth)(np.full_like(depth.depth_mm, np.nan), depth.intrinsics)
     with pytest.raises(InputError, match="no return"):
-        cover(empty, 0.5, 4.0, np.random.default_rng(0))
+        hide_share(empty, 0.5, 4.0, np.random.default_rng(0))
 
 
 # --- another camera ---

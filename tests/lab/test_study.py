@@ -15,8 +15,8 @@ import trimesh
 from stories import write_phantom_case
 from tumortrack.core import store
 from tumortrack.core.errors import ArtifactError, InputError, NoEstimate
+from tumortrack.core.estimate import OneWay
 from tumortrack.core.geometry import rigid
-from tumortrack.core.motion import OneWay
 from tumortrack.core.types import Anatomy, Mesh, SensorCloud
 from tumortrack.simulate.deform import RestConfig
 from tumortrack.simulate.deform.drag import CONFIGURATIONS
@@ -310,7 +310,7 @@ def phantom(tmp_path_factory):
     case = write_phantom_case(root / "case")
     simulator = Simulator(case.anatomy, case.up_lps, SceneConfig(deform=(RestConfig(),)))
     for number, variant in enumerate(("D0", "D1")):
-        stage = simulator.stage(SceneRecipe(3, "test", number))
+        stage = simulator.render(SceneRecipe(3, "test", number))
         scene = Scene(stage.cloud, simulator.reference(stage), stage.frame)
         write_scene(root / "scenes" / f"{variant}-clean", scene)
     return study_case("phantom", root / "case", root / "scenes", is_paper=True)

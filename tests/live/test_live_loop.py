@@ -31,8 +31,7 @@ from tumortrack.live.values import (
 from tumortrack.sense.camera import d405
 from tumortrack.sense.region import RegionConfig
 from tumortrack.sense.render import render_depth
-from tumortrack.simulate.bodies import body_for
-from tumortrack.simulate.scene import SceneRecipe, Simulator
+from tumortrack.simulate.scene import SceneRecipe, Simulator, body_for
 from tumortrack.tracking.tracker import Follower, FollowerConfig, Tracker
 from tumortrack.training.model import load_model
 from warp_objects import ANATOMY, placed, slim_clinic
@@ -60,7 +59,7 @@ def clock(monkeypatch):
 def stages():
     config = slim_clinic().scene
     simulator = Simulator(ANATOMY, UP, config, body_for(ANATOMY, UP, config, 77))
-    return [simulator.stage(SceneRecipe(5, "test", index)) for index in range(4)]
+    return [simulator.render(SceneRecipe(5, "test", index)) for index in range(4)]
 
 
 def moving(stage, n, start_ns=10**15, step_mm=(0.4, -0.2, 0.1)):

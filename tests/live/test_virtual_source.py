@@ -22,8 +22,7 @@ from tumortrack.live.sources.virtual import VirtualSource, VirtualSourceConfig
 from tumortrack.live.spec import SOURCES
 from tumortrack.sense.noise import CLEAN
 from tumortrack.simulate.elastic.body import BodyConfig
-from tumortrack.simulate.player.player import SHAFT_MM, ScenePlayer, ScenePlayerConfig
-from tumortrack.simulate.player.props import rod
+from tumortrack.simulate.player import SHAFT_MM, ScenePlayer, ScenePlayerConfig, rod
 
 HELD_S = (3.0, 9.0, 15.0)  # a push is at its deepest
 ROUND_S = 18.0  # all places were pushed once
@@ -209,7 +208,7 @@ def test_too_many_places_and_times_before_the_beginning_are_refused():
     few = BodyConfig(cells=100, modes=8, responses=20, patches=20)
     with pytest.raises(InputError, match=r"ask for fewer"):
         ScenePlayer(organ(), UP, ScenePlayerConfig(body=few, places=20), 3)
-    with pytest.raises(InputError, match=r"before the theatre's beginning"):
+    with pytest.raises(InputError, match=r"before the scene's beginning"):
         small_theatre().state_at(-0.1)
 
 

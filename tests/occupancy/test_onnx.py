@@ -11,6 +11,7 @@ from tumortrack.models.config import MlpDecoderConfig, NetworkConfig
 from tumortrack.models.encoders.pointnet2 import PointNet2Config, SetAbstraction
 from tumortrack.models.normalisation import Aligned
 from tumortrack.models.onnx_file import onnx_bytes
+from tumortrack.occupancy.network import OccupancyNetwork
 from tumortrack.training.model import load_model
 
 
@@ -72,7 +73,7 @@ def test_a_network_that_places_the_organ_gives_the_same_placements(clinic_model,
     model = load_model(clinic_model, "cpu")
     found = answers(onnx_bytes(model), cloud_mm=cloud)
     with torch.inference_mode():
-        ways = model.network.both_ways(torch.from_numpy(cloud))
+        ways = model.network.flip_hypotheses(torch.from_numpy(cloud))
     names = ("rotation", "centre_mm", "coefficients", "right_way")
     for name, value in zip(names, found, strict=True):
         right = torch.cat([getattr(way, name) for way in ways]).numpy()

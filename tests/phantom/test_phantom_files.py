@@ -1,4 +1,4 @@
-"""The phantom's CT as DICOM series and NIfTI."""
+"""The phantom's CT as DICOM series, and as NIfTI."""
 
 import numpy as np
 import pytest
@@ -6,7 +6,8 @@ import pytest
 from phantom_objects import QUICK_SCAN, first_labels
 from tumortrack.core.errors import InputError
 from tumortrack.core.types import Volume
-from tumortrack.phantom.dicom import write_dicom_series, write_nifti
+from tumortrack.imaging.nifti import write_nifti, write_volume_nifti
+from tumortrack.phantom.dicom import write_dicom_series
 from tumortrack.phantom.scanner import scan
 from volume_points import lps_of, read_at
 
@@ -86,7 +87,7 @@ def test_dicom_is_deterministic_by_seed(series, oblique, tmp_path):
 def test_nifti_and_dicom_agree_in_the_patient(series, oblique, labels, tmp_path):
     import nibabel
 
-    write_nifti(oblique, tmp_path / "ct.nii.gz")
+    write_volume_nifti(tmp_path / "ct.nii.gz", oblique.hu, oblique.lps_from_index)
     image = nibabel.load(tmp_path / "ct.nii.gz")
     dicom = read_series(series)
     index = np.random.default_rng(1).integers(1, np.array(oblique.hu.shape) - 1, (500, 3))
@@ -94,7 +95,7 @@ def test_nifti_and_dicom_agree_in_the_patient(series, oblique, labels, tmp_path)
     hu = np.asarray(image.dataobj)[tuple(index.T)]
     assert np.array_equal(hu, read_at(dicom, ras * [-1, -1, 1]))
     # Not mirrored: the exophytic tumor lies right, anterior and inferior of the endophytic one.
-    write_nifti(labels, tmp_path / "labels.nii")
+    write_nifti(tmp_path / "labels.nii", labels.labels, labels.lps_from_index, lps=True)
     stored = nibabel.load(tmp_path / "labels.nii")
     centers = [
         nibabel.affines.apply_affine(stored.affine, np.argwhere(stored.get_fdata() == n).mean(0))
@@ -107,7 +108,7 @@ def test_nifti_and_dicom_agree_in_the_patient(series, oblique, labels, tmp_path)
 def test_nifti_is_read_alike_by_simpleitk(oblique, tmp_path):
     import SimpleITK as sitk  # noqa: N813
 
-    write_nifti(oblique, tmp_path / "ct.nii.gz")
+    write_volume_nifti(tmp_path / "ct.nii.gz", oblique.hu, oblique.lps_from_index)
     back = by_simpleitk(sitk.ReadImage(str(tmp_path / "ct.nii.gz")))
     assert np.abs(back.lps_from_index - oblique.lps_from_index).max() < 1e-4
     assert np.array_equal(back.hu, oblique.hu)
@@ -118,15 +119,12 @@ def test_files_refuse_what_they_cannot_hold(oblique, tmp_path):
     with pytest.raises(InputError, match="DICOM"):
         write_dicom_series(hot, tmp_path / "hot")
     holes = Volume(np.full((3, 3, 3), np.nan), np.eye(4))
-    for write, name in ((write_dicom_series, "a"), (write_nifti, "a.nii")):
-        with pytest.raises(InputError, match="finite"):
-            write(holes, tmp_path / name)
+    with pytest.raises(InputError, match="finite"):
+        write_dicom_series(holes, tmp_path / "a")
     sheared = np.eye(4)
     sheared[0, 1] = 0.2
     with pytest.raises(InputError, match="perpendicular"):
         write_dicom_series(Volume(np.zeros((3, 3, 3)), sheared), tmp_path / "b")
-    with pytest.raises(InputError, match="nii"):
-        write_nifti(oblique, tmp_path / "ct.img")
     with pytest.raises(InputError, match="exists"):
         write_dicom_series(oblique, tmp_path)
     assert list(tmp_path.iterdir()) == []

@@ -9,28 +9,24 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from arm_objects import CREEPING_MRAD, organ, plan
+from arm_objects import CREEPING_MRAD, bare, flange_pose, nearest_mm, organ, plan
 from tumortrack.core.errors import InputError, NoPlan
 from tumortrack.core.geometry import transform_points
-from tumortrack.plan.arms import dh, ik, timing, urdf
-from tumortrack.plan.arms.bases import search_bases
-from tumortrack.plan.arms.cell import ArmCell
+from tumortrack.plan.arms import kinematics, trajectory, urdf
+from tumortrack.plan.arms.cell import ArmCell, Blocked, PlanningGroup
 from tumortrack.plan.arms.config import Base, CellConfig
-from tumortrack.plan.arms.procedure import plan_home, plan_motions
-from tumortrack.plan.arms.situation import Blocked, Situation
-from tumortrack.plan.arms.strokes import level_poses
-from tumortrack.plan.arms.tracks import solve
-from tumortrack.plan.arms.transfer import connect
+from tumortrack.plan.arms.paths import connect
+from tumortrack.plan.arms.procedure import plan_motions, search_bases
 from tumortrack.plan.motions import CUTTER, HOLDER, JOINTS
 from tumortrack.plan.values import Cut
 
-MODELS = pytest.mark.parametrize("model", dh.MODELS.values(), ids=lambda model: model.name)
+MODELS = pytest.mark.parametrize("model", kinematics.MODELS.values(), ids=lambda model: model.name)
 HOLDS = {"approach": (), "grasp": (HOLDER,), "hold": (HOLDER,), "release": (HOLDER,), "home": ()}
 
 
 @pytest.fixture(scope="module")
 def cell():
-    return ArmCell().with_organ(organ())
+    return ArmCell(organ=organ())
 
 
 @pytest.fixture(scope="module")
@@ -41,9 +37,9 @@ def motions(cell):
 def _at_tip(cell, arm, tip_mm, yaw_rad, joints_rad=None):
     """All twelve joints with an arm's tip there, for each branch."""
     joints_rad = cell.home_rad if joints_rad is None else joints_rad
-    situation = Situation(cell, arm, joints_rad)
-    pose = level_poses(np.array([tip_mm], float), yaw_rad)[0]
-    return [situation.whole(found) for found in solve(situation, pose)]
+    group = PlanningGroup(cell, arm, joints_rad)
+    pose = kinematics.level_pose(np.array(tip_mm, float), yaw_rad)
+    return [group.all_joints(found) for found in group.inverse_kinematics(pose)]
 
 
 def _cutting_tips(cell, motions, between=4):
@@ -64,20 +60,22 @@ def test_three_sources_of_kinematics_agree(model):
     import pinocchio as pin
     import ur_analytic_ik
 
-    built = pin.buildModelFromXML(urdf.arm_urdf(model, "one"))
-    data, flange = built.createData(), built.getFrameId("one_flange")
+    built = pin.buildModelFromXML(urdf.cell_urdf(CellConfig(cutter_model=model.name)))
+    data = built.createData()
+    base, flange = (built.getFrameId(f"cutter_{link}") for link in ("base_link", "flange"))
     for joints in np.random.default_rng(1).uniform(-np.pi, np.pi, (50, 6)):
-        plain = dh.flange_pose(model, joints)
+        plain = flange_pose(model, joints)
         plain[:3, 3] /= 1000
-        pin.framesForwardKinematics(built, data, joints)
-        assert np.abs(data.oMf[flange].homogeneous - plain).max() < 1e-9
+        pin.framesForwardKinematics(built, data, np.r_[joints, np.zeros(6)])
+        found = data.oMf[base].inverse() * data.oMf[flange]
+        assert np.abs(found.homogeneous - plain).max() < 1e-9
         other = getattr(ur_analytic_ik, model.name).forward_kinematics(*joints)
         assert np.abs(other - plain).max() < 1e-9
 
 
 @MODELS
 def test_an_arm_stretched_out_reaches_what_its_lengths_add_up_to(model):
-    flange = dh.flange_pose(model, np.zeros(6))
+    flange = flange_pose(model, np.zeros(6))
     assert flange[0, 3] == pytest.approx(model.a_mm[1] + model.a_mm[2])
     assert abs(flange[0, 3]) == pytest.approx(model.reach_mm, rel=0.1)
 
@@ -85,26 +83,26 @@ def test_an_arm_stretched_out_reaches_what_its_lengths_add_up_to(model):
 @MODELS
 def test_inverse_kinematics_come_back(model):
     for joints in np.random.default_rng(2).uniform(-np.pi, np.pi, (200, 6)):
-        pose = dh.flange_pose(model, joints)
-        found = ik.branches(model, pose)
+        pose = flange_pose(model, joints)
+        found = kinematics.inverse_kinematics(model, pose)
         assert 1 <= len(found) <= 8
         assert np.abs(found - joints).max(1).min() < 1e-6
         for branch in found:
-            assert np.abs(dh.flange_pose(model, branch) - pose).max() < 1e-6
+            assert np.abs(flange_pose(model, branch) - pose).max() < 1e-6
 
 
 @MODELS
 def test_nothing_reaches_beyond_the_arm(model):
     pose = np.eye(4)
     pose[:3, 3] = [1.5 * model.reach_mm, 0.0, 200.0]
-    assert ik.branches(model, pose).shape == (0, 6)
+    assert kinematics.inverse_kinematics(model, pose).shape == (0, 6)
 
 
 def test_turns_by_whole_turns_stay_within_limits():
     rng = np.random.default_rng(3)
     joints, near = rng.uniform(-np.pi, np.pi, (50, 6)), rng.uniform(-6, 6, 6)
-    turned = ik.nearest_turn(dh.UR5, joints, near)
-    assert (np.abs(turned) <= dh.UR5.limits_rad).all()
+    turned = kinematics.nearest_turn(kinematics.UR5, joints, near)
+    assert (np.abs(turned) <= kinematics.UR5.limits_rad).all()
     assert np.allclose(np.exp(1j * turned), np.exp(1j * joints))
     assert (np.abs(turned - near)[:, :2] <= np.abs(joints - near)[:, :2] + 1e-9).all()
 
@@ -126,7 +124,7 @@ def test_the_cell_s_description_names_the_joints_and_agrees_with_the_numbers(cel
     joints = np.random.default_rng(4).uniform(-3, 3, 12)
     for n, arm in enumerate((CUTTER, HOLDER)):
         config = cell.config
-        flange = dh.flange_pose(config.model(arm), joints[6 * n : 6 * n + 6])
+        flange = flange_pose(config.model(arm), joints[6 * n : 6 * n + 6])
         expected = config.base(arm).table_from_base @ flange @ config.flange_from_tip(arm)
         assert np.abs(cell.tips(joints)[arm] - expected).max() < 1e-6
 
@@ -177,16 +175,16 @@ def test_only_the_electrode_and_the_cup_may_touch_the_organ(cell):
 
 
 def test_clearances_agree_with_distances(cell):
-    rng, seen = np.random.default_rng(5), set()
+    rng, seen, touch = np.random.default_rng(5), set(), bare(cell)
     for joints in cell.home_rad + rng.normal(0, 0.25, (80, 12)):
-        bare, wide = cell.collisions(joints, clearance=False), cell.collisions(joints)
-        distance_mm, _ = cell.nearest(joints)
-        assert (bare is not None) == (distance_mm <= 1e-6)
+        met, near = touch.collisions(joints), cell.collisions(joints)
+        distance_mm = nearest_mm(cell, joints)
+        assert (met is not None) == (distance_mm <= 1e-6)
         if distance_mm > cell.config.clearance_mm + 0.01:
-            assert wide is None
+            assert near is None
         elif distance_mm < cell.config.organ_clearance_mm - 0.01:
-            assert wide is not None
-        seen.add((bare is None, wide is None))
+            assert near is not None
+        seen.add((met is None, near is None))
     assert seen == {(True, True), (True, False), (False, False)}
 
 
@@ -238,16 +236,17 @@ def test_joints_keep_their_limits(cell, motions):
         assert (np.abs(speeds) <= 1.01 * cell.speeds_rad_s).all()
         between_s = (steps_s[1:] + steps_s[:-1]) / 2
         accelerations = np.diff(speeds, axis=0) / between_s
-        assert np.abs(accelerations).max(initial=0) <= 1.05 * dh.ACCELERATION_RAD_S2
+        assert np.abs(accelerations).max(initial=0) <= 1.05 * kinematics.ACCELERATION_RAD_S2
         for end in (speeds[:1], speeds[-1:]):  # it begins and ends at rest
-            assert np.abs(end).max() <= dh.ACCELERATION_RAD_S2 * steps_s.max() + 1e-9
+            assert np.abs(end).max() <= kinematics.ACCELERATION_RAD_S2 * steps_s.max() + 1e-9
 
 
 def test_nothing_collides_between_the_tested_places(cell, motions):
+    touch = bare(cell)
     for stage in motions.stages:
         touching = HOLDS.get(stage.name, (CUTTER, HOLDER))
         for time_s in np.arange(0, stage.seconds, 0.013):
-            assert cell.collisions(stage.at(time_s), touching, clearance=False) is None
+            assert touch.collisions(stage.at(time_s), touching) is None
 
 
 def test_the_instrument_is_level_and_on_its_path(cell, motions):
@@ -304,8 +303,9 @@ def test_a_cut_round_the_cup_is_made_from_several_sides(cell):
     assert len(begins) >= 2
     tips = np.array([tip[:3, 3] for _, tip in _cutting_tips(cell, motions)])
     assert cKDTree(tips).query(above)[0].max() < 0.2
+    touch = bare(cell)
     for time_s in np.arange(0, sweep.seconds, 0.03):
-        assert cell.collisions(sweep.at(time_s), (CUTTER, HOLDER), clearance=False) is None
+        assert touch.collisions(sweep.at(time_s), (CUTTER, HOLDER)) is None
 
 
 @pytest.mark.parametrize(
@@ -337,27 +337,19 @@ def test_arms_begin_anew_in_the_middle_of_a_cut(cell, motions):
     ahead = tips[0][:3, 0]
     assert (back @ ahead < 1e-6).all()
     assert np.abs(back - np.outer(back @ ahead, ahead)).max() < 0.1  # straight back
-    home = plan_home(cell, cell.organ, middle)
-    assert [stage.name for stage in home.stages] == ["release", "home"]
-    assert np.array_equal(home.stages[0].joints_rad[0], middle)
-    assert np.allclose(home.stages[-1].joints_rad[-1], cell.home_rad)
+    whole = plan_motions(plan((0, 3, 0)), cell, organ((0, 3, 0)), middle)
+    assert [stage.name for stage in whole.stages] == [stage.name for stage in motions.stages]
+    assert np.array_equal(whole.stages[0].joints_rad[0], middle)  # both withdraw first
     only = plan_motions(plan(), cell, cell.organ, motions.stages[5].joints_rad[0], from_sweep=3)
     assert [stage.name for stage in only.stages] == ["release", "home"]
-
-
-def test_arms_at_home_stay_there(cell):
-    home = plan_home(cell, cell.organ, cell.home_rad)
-    assert home.seconds < 0.1
-    for stage in home.stages:
-        assert np.abs(stage.joints_rad - cell.home_rad).max() < 1e-9
 
 
 @pytest.mark.parametrize("turn_rad", [2e-6, 1e-4, 0.1, 3.0])
 def test_ways_of_any_length_are_timed(turn_rad):
     path = np.linspace(np.zeros(6), turn_rad * np.arange(1, 7) / 6, 3)
     for times, joints in (
-        timing.along(path, np.ones(6)),
-        timing.together(path[0], path[-1], np.ones(6)),
+        trajectory.along(path, np.ones(6)),
+        trajectory.together(path[0], path[-1], np.ones(6)),
     ):
         assert (np.diff(times) > 0).all()
         assert np.allclose(joints[[0, -1]], path[[0, -1]], atol=1e-9)
@@ -381,17 +373,18 @@ def test_a_way_round_is_found_and_the_same_for_the_same_seed(cell):
         found = _at_tip(cell, CUTTER, [30.0, y, 290.0], -np.sign(y) * np.pi / 2, holding)
         sides.append([joints for joints in found if cell.collisions(joints) is None])
     start, goal = min(itertools.product(*sides), key=lambda pair: np.abs(pair[0] - pair[1]).max())
-    situation = Situation(cell, CUTTER, start)
+    group = PlanningGroup(cell, CUTTER, start)
     with pytest.raises(Blocked, match="on the way"):
-        connect(situation, goal[:6])  # straight
-    ways = [connect(situation, goal[:6], np.random.default_rng(7)) for _ in range(2)]
+        connect(group, goal[:6])  # straight
+    ways = [connect(group, goal[:6], np.random.default_rng(7)) for _ in range(2)]
     assert np.array_equal(*ways)
     assert np.array_equal(ways[0][0], start[:6])
     assert np.allclose(ways[0][-1], goal[:6])
+    touch = bare(cell)
     for one, other in itertools.pairwise(ways[0]):
         for share in np.linspace(0, 1, 20):
-            joints = situation.whole(one + share * (other - one))
-            assert cell.collisions(joints, clearance=False) is None
+            joints = group.all_joints(one + share * (other - one))
+            assert touch.collisions(joints) is None
 
 
 def test_places_for_the_bases_are_searched():
@@ -412,9 +405,9 @@ def test_places_for_the_bases_are_searched():
 
 def test_no_motion_creeps(monkeypatch):
     path_rad, speeds_rad_s = CREEPING_MRAD / 1000, np.radians([60.0, 60, 90, 90, 90, 90])
-    times_s, joints_rad = timing.along(path_rad, speeds_rad_s)
+    times_s, joints_rad = trajectory.along(path_rad, speeds_rad_s)
     assert times_s[-1] < 4
     speed = np.abs(np.diff(joints_rad, axis=0)) / np.diff(times_s)[:, None]
     assert (speed <= 1.001 * speeds_rad_s).all()
-    monkeypatch.setattr(timing, "_FINER", (1.0,))
-    assert timing.along(path_rad, speeds_rad_s)[0][-1] > 100  # else this path shows nothing
+    monkeypatch.setattr(trajectory, "_FINER", (1.0,))
+    assert trajectory.along(path_rad, speeds_rad_s)[0][-1] > 100  # else this path shows nothing

@@ -10,13 +10,12 @@ from hypothesis import strategies as st
 
 from plan_objects import HALF_MM, MIDDLE_MM, RADIUS_MM, TUMOR_MM, located, sphere
 from tumortrack.core.errors import InputError, NoPlan
-from tumortrack.core.solids import mesh_of, solid_of
 from tumortrack.core.types import Anatomy, Mesh
+from tumortrack.imaging.meshes import mesh_of, solid_of
 from tumortrack.plan.config import ResectionConfig
-from tumortrack.plan.exophytic import exophytic_shares
 from tumortrack.plan.files import as_builtins, from_plain
 from tumortrack.plan.outline import arcs, concave_hull, evenly, grown, polygon_of
-from tumortrack.plan.resection import inside, plan_resection
+from tumortrack.plan.resection import exophytic_shares, inside, plan_resection
 from tumortrack.plan.values import CutLayer, Located
 from tumortrack_lab.cut.resection import cut as cut_out
 

@@ -13,7 +13,7 @@ from scipy.special import ndtr
 
 from elastic_objects import CENTER, RADII
 from tumortrack.core.estimate import Following
-from tumortrack.core.parallel import share
+from tumortrack.core.process import parallel_for
 from tumortrack.core.types import Mesh, SensorCloud
 from tumortrack.imaging.raster import cover, label_grid, winding_numbers
 from tumortrack.models.config import GaussNewtonConfig
@@ -78,10 +78,10 @@ def test_points_go_where_a_plain_loop_takes_them(count):
 
 def test_parts_are_all_done_once_and_errors_come_back():
     done = np.zeros(10_000, int)
-    share(lambda part: done.__setitem__(part, done[part] + 1), len(done), 300)
+    parallel_for(lambda part: done.__setitem__(part, done[part] + 1), len(done), 300)
     assert (done == 1).all()
     with pytest.raises(ZeroDivisionError):
-        share(lambda part: 1 // (part.start - 9900), len(done), 300)
+        parallel_for(lambda part: 1 // (part.start - 9900), len(done), 300)
 
 
 # --- refinement ---

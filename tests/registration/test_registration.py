@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from elastic_objects import CENTER, RADII, UP
 from tumortrack.core.errors import InputError
-from tumortrack.core.motion import Motion
+from tumortrack.core.estimate import Motion
 from tumortrack.core.types import Mesh
 from tumortrack.models.config import GaussNewtonConfig
 from tumortrack.models.encoders.heightmap import HeightMapConfig, _spread, _spread_compiled, picture
@@ -316,7 +316,7 @@ def test_a_slow_general_optimiser_finds_the_same():
 def taught(seed=0):
     torch.manual_seed(seed)
     network = RegistrationNetwork(slim_network())
-    network.know(shape(), UP, inside(96))
+    network.initialize(shape(), UP, inside(96))
     return network
 
 
@@ -364,8 +364,8 @@ def test_placements_move_with_the_cloud(degrees):
     )
     shift_mm = torch.tensor([12.0, -30.0, 60.0])
     with torch.no_grad():
-        before = network(network.aside(points_mm))
-        after = network(network.aside(points_mm @ turn.T + shift_mm))
+        before = network(network.align(points_mm))
+        after = network(network.align(points_mm @ turn.T + shift_mm))
     close = {"atol": 2e-2, "rtol": 0}
     torch.testing.assert_close(after.centre_mm, before.centre_mm @ turn.T + shift_mm, **close)
     torch.testing.assert_close(after.rotation, turn @ before.rotation, atol=2e-3, rtol=0)
@@ -379,16 +379,16 @@ def test_placements_move_with_the_cloud(degrees):
 def test_of_two_ways_round_one_is_right():
     network = taught()
     points_mm, poses, _ = clouds()
-    aside = network.aside(points_mm)
-    sign = network.right_sign(aside, poses[:, :3, :3])
+    aligned = network.align(points_mm)
+    sign = network.flip_sign(aligned, poses[:, :3, :3])
     assert set(sign.tolist()) <= {-1.0, 1.0}
-    right = aside.other_way(sign)
-    assert network.right_sign(right, poses[:, :3, :3]).tolist() == [1.0] * 4
-    wrong = aside.other_way(-sign)
-    assert network.right_sign(wrong, poses[:, :3, :3]).tolist() == [-1.0] * 4
+    right = aligned.flipped(sign)
+    assert network.flip_sign(right, poses[:, :3, :3]).tolist() == [1.0] * 4
+    wrong = aligned.flipped(-sign)
+    assert network.flip_sign(wrong, poses[:, :3, :3]).tolist() == [-1.0] * 4
     half_turn = torch.tensor([-1.0, -1.0, 1.0])
     torch.testing.assert_close(wrong.points, right.points * half_turn)
-    one, other = network.both_ways(points_mm)
+    one, other = network.flip_hypotheses(points_mm)
     assert not torch.allclose(one.centre_mm, other.centre_mm, atol=1e-2)
 
 
@@ -402,8 +402,8 @@ def test_the_loss_is_nothing_at_the_truth_and_known_beside_it(monkeypatch, off_m
     centre = rotation @ network.center_ct + poses[:, :3, 3]
     places = moved @ rotation.transpose(1, 2) + centre[:, None]
 
-    def at_the_truth(aside):
-        few = len(aside.centre_mm)
+    def at_the_truth(aligned):
+        few = len(aligned.centre_mm)
         sure = torch.full((few,), 30.0 if few == 4 else -30.0)
         shifted = centre[:few] + torch.tensor([0.0, 0.0, off_mm])
         return PoseHypothesis(rotation[:few], shifted, coefficients[:few], sure)

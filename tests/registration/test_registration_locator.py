@@ -13,12 +13,11 @@ from scipy.spatial.transform import Rotation
 from elastic_objects import CENTER, UP
 from stories import succeeded, tumortrack
 from tumortrack.core.errors import InputError, NoEstimate
-from tumortrack.core.motion import Motion
+from tumortrack.core.estimate import Motion
 from tumortrack.core.types import SensorCloud
 from tumortrack.sense.files import write_cloud_ply
-from tumortrack.simulate.bodies import body_for
 from tumortrack.simulate.occupancy import labels_of, surface_distance
-from tumortrack.simulate.scene import SceneRecipe, Simulator
+from tumortrack.simulate.scene import SceneRecipe, Simulator, body_for
 from tumortrack.simulate.targets import draw_targets
 from tumortrack.tracking.tracker import Tracker
 from tumortrack.training.model import load_model, save_model
@@ -40,7 +39,7 @@ def stages():
     """Scenes that training never showed, of a body with other states."""
     config = slim_clinic().scene
     simulator = Simulator(ANATOMY, UP, config, body_for(ANATOMY, UP, config, 77))
-    return [simulator.stage(SceneRecipe(5, "test", index)) for index in range(8)]
+    return [simulator.render(SceneRecipe(5, "test", index)) for index in range(8)]
 
 
 @pytest.fixture(scope="module")

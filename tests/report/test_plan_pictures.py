@@ -12,8 +12,8 @@ from PIL import Image
 from tumortrack.core.colours import sweep_colour
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import rigid
-from tumortrack.core.solids import mesh_of, solid_of
 from tumortrack.core.types import Mesh
+from tumortrack.imaging.meshes import mesh_of, solid_of
 from tumortrack.live.values import Polyline, RigidShape, Workcell
 from tumortrack.plan.motions import Motions, MotionStage
 from tumortrack.plan.values import Cut, CutLayer, Located, ResectionPlan

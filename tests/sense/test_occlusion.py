@@ -11,10 +11,9 @@ from render_objects import anatomy
 from tumortrack.core.config import from_builtins, identity, to_builtins
 from tumortrack.core.errors import InputError
 from tumortrack.core.types import DepthFrame
-from tumortrack.sense import occlusion_kernels as kernels
-from tumortrack.sense.calibration import CalibrationConfig, miscalibrate
+from tumortrack.sense import kernels
 from tumortrack.sense.clutter import ClutterConfig
-from tumortrack.sense.noise import D405_NOISE
+from tumortrack.sense.noise import D405_NOISE, CalibrationConfig, miscalibrate
 from tumortrack.sense.occlusion import OcclusionConfig, occlude
 from tumortrack.simulate import scene as scene_module
 from tumortrack.simulate.dataset import SceneStream
@@ -69,7 +68,7 @@ def test_a_shaft_is_as_wide_as_asked_and_ends_at_its_tip(seed):
     rng = np.random.default_rng(seed)
     angle = rng.uniform(0, 2 * np.pi)
     towards = np.array([np.cos(angle), np.sin(angle)])
-    columns, rows, _ = kernels.seen_pixels(dome().depth_mm)
+    rows, columns = np.divmod(kernels.seen_pixels(dome().depth_mm).pixels, dome().intrinsics.width)
     tip = np.array([SMALL.cx, SMALL.cy])
     order = kernels.order_shaft(columns, rows, tip, towards, 7.0, 0.0)
     inside = np.isfinite(order)
@@ -198,7 +197,7 @@ def recipe(index):
 def test_presets_draw_the_scenes_they_drew_before_these_faults_existed(preset, monkeypatch):
     config = preset(ANATOMY).scene
     simulator = Simulator(ANATOMY, UP, config)
-    now = [simulator.stage(recipe(i)) for i in range(6)]
+    now = [simulator.render(recipe(i)) for i in range(6)]
     for name in ("occlude", "miscalibrate"):
         monkeypatch.setattr(scene_module, name, lambda frame, config, rng: frame)
     monkeypatch.setattr(
@@ -209,7 +208,7 @@ def test_presets_draw_the_scenes_they_drew_before_these_faults_existed(preset, m
         ),
     )
     for index, stage in enumerate(now):
-        before = simulator.stage(recipe(index))
+        before = simulator.render(recipe(index))
         np.testing.assert_array_equal(stage.cloud.points_mm, before.cloud.points_mm)
         np.testing.assert_array_equal(stage.frame.depth_mm, before.frame.depth_mm)
 
@@ -220,12 +219,12 @@ def test_hidden_scenes_lie_where_they_lay_and_their_clouds_lose_points():
     one, two = (Simulator(ANATOMY, UP, config) for config in (plain, on))
     lost = 0
     for index in range(8):
-        before, after = one.stage(recipe(index)), two.stage(recipe(index))
+        before, after = one.render(recipe(index)), two.render(recipe(index))
         np.testing.assert_array_equal(before.camera_from_ct, after.camera_from_ct)
         kept = np.isfinite(after.frame.depth_mm)
         np.testing.assert_array_equal(after.frame.depth_mm[kept], before.frame.depth_mm[kept])
         lost += np.isfinite(before.frame.depth_mm).sum() - kept.sum()
-        again = two.stage(recipe(index))
+        again = two.render(recipe(index))
         np.testing.assert_array_equal(after.cloud.points_mm, again.cloud.points_mm)
     assert lost > 5000
 
@@ -233,7 +232,7 @@ def test_hidden_scenes_lie_where_they_lay_and_their_clouds_lose_points():
 def test_clouds_have_a_random_number_of_points_and_batches_stay_whole():
     config = SceneConfig(occupancy=SMALL_POOL, cloud_points=(300, 3000), free_range=0.5)
     simulator = Simulator(ANATOMY, UP, config)
-    counts = np.array([len(simulator.stage(recipe(i)).cloud.points_mm) for i in range(60)])
+    counts = np.array([len(simulator.render(recipe(i)).cloud.points_mm) for i in range(60)])
     assert counts.min() >= 300
     assert counts.max() <= 3000
     assert 15 < (counts < math.sqrt(300 * 3000)).sum() < 45  # even on a logarithmic scale
@@ -258,6 +257,6 @@ def test_everything_at_once_replays():
     assert from_builtins(to_builtins(config), SceneConfig, "here") == config
     one, two = (Simulator(ANATOMY, UP, config) for _ in range(2))
     for index in (2, 0, 1):
-        first, second = one.stage(recipe(index)), two.stage(recipe(index))
+        first, second = one.render(recipe(index)), two.render(recipe(index))
         np.testing.assert_array_equal(first.cloud.points_mm, second.cloud.points_mm)
         assert len(first.cloud.points_mm) >= 200

@@ -18,8 +18,8 @@ from tumortrack.sense.cloud import (
     thin_cloud,
 )
 from tumortrack.sense.clutter import ClutterConfig, add_clutter
+from tumortrack.sense.kernels import seen_pixels
 from tumortrack.sense.noise import CLEAN, D405_NOISE, NoiseConfig, add_noise
-from tumortrack.sense.noise_kernels import seen_pixels
 
 
 def rows(points):

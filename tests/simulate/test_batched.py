@@ -15,10 +15,8 @@ from tumortrack.sense.camera import d405, project
 from tumortrack.sense.cloud import CloudConfig
 from tumortrack.sense.noise import D405_NOISE
 from tumortrack.sense.render import render_depth
-from tumortrack.simulate.batched.motion import BatchedMotion
-from tumortrack.simulate.batched.plan import unsupported
-from tumortrack.simulate.batched.raster import depth_images
-from tumortrack.simulate.batched.stream import DeviceStream
+from tumortrack.simulate.batched.render import carried, depth_images
+from tumortrack.simulate.batched.stream import DeviceStream, why_not
 from tumortrack.simulate.dataset import SceneStream
 from tumortrack.simulate.deform import (
     ChainConfig,
@@ -72,10 +70,10 @@ def both(request, pool):
     return reference, DeviceStream(reference, CPU)
 
 
-def reference_stages(reference, index):
+def rendered(reference, index):
     simulator = Simulator(ANATOMY, UP, reference.config)
     recipes = [SceneRecipe(5, "train", i) for i in range(index * SIZE, (index + 1) * SIZE)]
-    return [simulator.stage(recipe) for recipe in recipes]
+    return [simulator.render(recipe) for recipe in recipes]
 
 
 def test_a_batch_is_the_reference_s(both):
@@ -98,17 +96,17 @@ def test_a_batch_is_the_reference_s(both):
 
 def test_depth_images_are_the_reference_s_but_for_single_pixels(both):
     reference, device = both
-    pictured = device.pictured(device.plan(1))
-    plan, depth_mm = pictured.plan, pictured.depth_mm
-    for row, stage in enumerate(reference_stages(reference, 1)):
-        seen, expected = depth_mm[row].numpy(), stage.frame.depth_mm
+    images = device.render(device.plan(1))
+    plan, depth_mm = images.plan, images.depth_mm
+    for row, scene in enumerate(rendered(reference, 1)):
+        seen, expected = depth_mm[row].numpy(), scene.frame.depth_mm
         assert np.sum(np.isnan(seen) != np.isnan(expected)) <= 2
         off = np.abs(seen - expected)
         assert np.nanmedian(off) < 1e-4
         assert np.nansum(off > 0.01) <= 2
         assert np.isfinite(expected).sum() > 300
         near, far = plan.near_mm[row], plan.far_mm[row]
-        assert np.sum((expected > near) & (expected < far)) >= len(stage.cloud.points_mm)
+        assert np.sum((expected > near) & (expected < far)) >= len(scene.cloud.points_mm)
 
 
 def test_labelled_points_keep_their_order_by_part_and_side(both, pool):
@@ -129,15 +127,15 @@ def test_scenes_that_show_too_little_are_drawn_again(pool):
     reference = stream(pool, CONFIGS["far"])
     device = DeviceStream(reference, CPU)
     first = device.plan(0)
-    pictured = device.pictured(first)
-    plan = pictured.plan
+    images = device.render(first)
+    plan = images.plan
     again = plan.attempts > 0
     assert 0 < again.sum() < SIZE
-    assert (pictured.available >= 200).all()
+    assert (images.available >= 200).all()
     same = (plan.camera_from_ct == first.camera_from_ct).all(axis=(1, 2))
     np.testing.assert_array_equal(same, ~again)
-    for pose, stage in zip(plan.camera_from_ct, reference_stages(reference, 0), strict=True):
-        np.testing.assert_array_equal(pose, stage.camera_from_ct)
+    for pose, scene in zip(plan.camera_from_ct, rendered(reference, 0), strict=True):
+        np.testing.assert_array_equal(pose, scene.camera_from_ct)
 
 
 def test_a_range_that_shows_nothing_is_an_error(pool):
@@ -155,8 +153,8 @@ def test_batches_do_not_depend_on_their_size_or_who_plans(pool):
     device.batch(7)
     elsewhere = pickle.loads(pickle.dumps(device))
     plans = [pickle.loads(pickle.dumps(elsewhere.plan(index))) for index in (2, 3)]
-    pictured = [device.pictured(plan) for plan in plans]
-    made = [device.finished(p, device.chosen(p)) for p in pictured]
+    images = [device.render(plan) for plan in plans]
+    made = [device.assemble(p, device.sample(p)) for p in images]
     small = [torch.cat(parts) for parts in zip(*made, strict=True)]
     for one, two in zip(large, small, strict=True):
         torch.testing.assert_close(one, two, atol=1e-3, rtol=0)
@@ -185,14 +183,14 @@ def test_motion_carries_as_the_deformation_and_pose_do(both):
     plan = device.plan(0)
     points_ct = ANATOMY.parts[1].vertices_mm
     sent = torch.tensor(points_ct.T, dtype=torch.float32)[:, None].expand(-1, SIZE, -1)
-    carried = BatchedMotion.of(plan, CPU).carry(sent).permute(1, 2, 0).numpy()
+    placed = carried(plan, sent).permute(1, 2, 0).numpy()
     simulator = Simulator(ANATOMY, UP, reference.config)
     moved = []
     for row in range(SIZE):
         drawn = simulator.draw(plan.recipes[row].generator(int(plan.attempts[row])))
         deformed = drawn.deformation.apply(points_ct)
         expected = transform_points(drawn.camera_from_ct, deformed)
-        np.testing.assert_allclose(carried[row], expected, atol=2e-4)
+        np.testing.assert_allclose(placed[row], expected, atol=2e-4)
         moved.append(np.abs(deformed - points_ct).max())
     assert max(moved) > 0.5
 
@@ -217,26 +215,26 @@ def test_of_the_same_vertices_the_image_is_the_same_to_the_last_bit(away_mm):
 def test_clouds_lie_in_range_and_on_pixels(both):
     reference, device = both
     clouds, _, _, _ = device.batch(4)
-    pictured = device.pictured(device.plan(4))
-    plan = pictured.plan
+    images = device.render(device.plan(4))
+    plan = images.plan
     for row, cloud in enumerate(clouds.numpy()):
         assert (cloud[:, 2] > plan.near_mm[row]).all()
         assert (cloud[:, 2] < plan.far_mm[row]).all()
         pixels, _ = project(cloud, d405(reference.config.width, reference.config.height))
         np.testing.assert_allclose(pixels, np.rint(pixels), atol=1e-3)
-        wanted = min(int(plan.n_points[row]), int(pictured.available[row]), len(cloud))
+        wanted = min(int(plan.n_points[row]), int(images.available[row]), len(cloud))
         assert len(np.unique(cloud, axis=0)) == wanted
 
 
 def test_what_it_cannot_make_it_refuses_by_name(pool):
     for config in CONFIGS.values():
-        assert unsupported(config) is None
+        assert why_not(stream(pool, config)) is None
     for config, name in (
         (SceneConfig(noise=D405_NOISE), "sensor noise"),
         (SceneConfig(deform=(ElasticConfig(),)), "deformations"),
         (SceneConfig(deform=(ChainConfig(links=(StretchConfig(), DragConfig())),)), "deformations"),
     ):
-        assert name in (unsupported(config) or "")
+        assert name in (why_not(stream(pool, config)) or "")
         with pytest.raises(InputError, match=name):
             DeviceStream(stream(pool, config), CPU)
     fixed = FixedPoints(np.zeros((4, 3), np.float32), np.zeros(4, np.uint8))

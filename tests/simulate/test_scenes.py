@@ -56,7 +56,7 @@ def test_a_recipe_replays_bit_for_bit(pool):
     for i in (3, 0, 2, 1):  # in any order
         assert same(first[i], two.pair(recipe(i), pool))
         np.testing.assert_array_equal(
-            two.stage(recipe(i)).cloud.points_mm, first[i].cloud.points_mm
+            two.render(recipe(i)).cloud.points_mm, first[i].cloud.points_mm
         )
 
 
@@ -80,13 +80,13 @@ def test_configuration_survives_json_and_names_its_deformations():
 
 @pytest.mark.parametrize("index", [0, 1])
 def test_the_cloud_lies_on_the_deformed_surface(simulator, index):
-    stage = simulator.stage(recipe(index))
-    truth = simulator.reference(stage)
+    scene = simulator.render(recipe(index))
+    truth = simulator.reference(scene)
     assert (
-        np.abs(stage.deformation.apply(ANATOMY.organ.vertices_mm) - ANATOMY.organ.vertices_mm).max()
+        np.abs(scene.deformation.apply(ANATOMY.organ.vertices_mm) - ANATOMY.organ.vertices_mm).max()
         > 1
     )
-    points = stage.cloud.points_mm[:400].astype(float)
+    points = scene.cloud.points_mm[:400].astype(float)
     hits = np.concatenate(
         [ray_hits(np.zeros(3), p, truth.organ, 1e-3) for p in np.split(points, 4)]
     )
@@ -97,12 +97,12 @@ def test_the_cloud_lies_on_the_deformed_surface(simulator, index):
 
 def test_the_cloud_is_a_unique_draw_of_the_image_in_range(simulator):
     for index in range(4):
-        stage = simulator.stage(recipe(index))
-        points = stage.cloud.points_mm
+        scene = simulator.render(recipe(index))
+        points = scene.cloud.points_mm
         assert len(np.unique(points, axis=0)) == len(points) == 1000
         assert points[:, 2].min() > 110
         assert points[:, 2].max() < 150
-        pixels = {tuple(p) for p in deproject(stage.frame).tolist()}
+        pixels = {tuple(p) for p in deproject(scene.frame).tolist()}
         assert {tuple(p) for p in points.tolist()} <= pixels
 
 
@@ -111,8 +111,8 @@ def test_free_scenes_are_seen_from_anywhere_and_keep_their_depth():
     free = Simulator(ANATOMY, UP, config)
     nearest = []
     for index in range(30):
-        stage = free.stage(recipe(index))
-        image, z = stage.frame.depth_mm, stage.cloud.points_mm[:, 2]
+        scene = free.render(recipe(index))
+        image, z = scene.frame.depth_mm, scene.cloud.points_mm[:, 2]
         nearest.append(np.nanmin(image))
         assert 80 - 0.5 < nearest[-1] < 250 + 8  # the image's border may cut the nearest point
         span = np.nanmax(image) - np.nanmin(image)
@@ -123,14 +123,14 @@ def test_free_scenes_are_seen_from_anywhere_and_keep_their_depth():
 
 def test_the_share_of_free_scenes_is_as_asked():
     half = Simulator(ANATOMY, UP, SceneConfig(occupancy=SMALL, free_range=0.5))
-    nearest = [np.nanmin(half.stage(recipe(i)).frame.depth_mm) for i in range(60)]
+    nearest = [np.nanmin(half.render(recipe(i)).frame.depth_mm) for i in range(60)]
     # Free ones start at 80..250 mm, the others at 110..125: 91 % of the free ones show.
     assert 15 < np.sum((np.array(nearest) < 105) | (np.array(nearest) > 132)) < 40
 
 
 def test_labelled_points_lie_in_the_scene_as_the_reference_does(simulator, pool):
-    pair, stage = simulator.pair(recipe(3), pool), simulator.stage(recipe(3))
-    reference = simulator.reference(stage)
+    pair, scene = simulator.pair(recipe(3), pool), simulator.render(recipe(3))
+    reference = simulator.reference(scene)
     for label, part in enumerate(reference.parts, start=1):
         own = pair.samples.points_mm[pair.samples.labels == label]
         lower, upper = part.box_mm
@@ -147,7 +147,7 @@ def test_labelled_points_lie_in_the_scene_as_the_reference_does(simulator, pool)
 def test_deformations_are_chosen_with_equal_chance():
     both = SceneConfig(deform=(RestConfig(), DragConfig()), width=160, height=90, occupancy=SMALL)
     simulator = Simulator(ANATOMY, UP, both)
-    kinds = [simulator.stage(recipe(i)).deformation.record()["kind"] for i in range(60)]
+    kinds = [simulator.render(recipe(i)).deformation.record()["kind"] for i in range(60)]
     assert 18 < kinds.count("drag") < 42
     assert kinds.count("drag") + kinds.count("rest") == 60
 
@@ -161,7 +161,7 @@ def test_background_joins_a_scene_and_changes_nothing_else():
     )
     added = []
     for index in range(12):
-        one, two = clean.stage(recipe(index)), spoiled.stage(recipe(index))
+        one, two = clean.render(recipe(index)), spoiled.render(recipe(index))
         assert one.deformation.record() == two.deformation.record()
         np.testing.assert_array_equal(one.camera_from_ct, two.camera_from_ct)
         seen = np.isfinite(one.frame.depth_mm)
@@ -181,7 +181,7 @@ def test_recipes_are_numbered_from_zero():
 def test_a_range_that_shows_nothing_is_an_error():
     far = SceneConfig(pose=PoseConfig(nearest_mm=(400.0, 410.0)), occupancy=SMALL)
     with pytest.raises(TumortrackError, match="no pose in 20"):
-        Simulator(ANATOMY, UP, far).stage(recipe(0))
+        Simulator(ANATOMY, UP, far).render(recipe(0))
 
 
 # batches

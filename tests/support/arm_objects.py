@@ -1,9 +1,10 @@
 """A kidney-like ellipsoid with a tumor at its side, and a plan to cut it out in two sweeps."""
 
+import msgspec
 import numpy as np
-import trimesh
 
 from tumortrack.core.types import Mesh
+from tumortrack.plan.arms.cell import ArmCell
 from tumortrack.plan.values import Cut, CutLayer, ResectionPlan
 
 HALF_MM = np.array([55.0, 30.0, 25.0])
@@ -40,9 +41,42 @@ def plan(shift_mm=(0.0, 0.0, 0.0), angle_rad=0.6, radius_mm=17.0, step_mm=1.5):
     return ResectionPlan("published", "tumor_1", 2, grasp, cuts, layers, 5.0, {}, 0.5)
 
 
-def sphere(radius_mm, centre_mm):
-    ball = trimesh.creation.icosphere(3, radius_mm)
-    return Mesh(np.array(ball.vertices) + centre_mm, ball.faces)
+def bare(cell):
+    """The same workcell without clearances: only what touches collides."""
+    config = msgspec.structs.replace(cell.config)
+    for name in ("clearance_mm", "organ_clearance_mm", "contact_mm"):
+        msgspec.structs.force_setattr(config, name, 0.0)
+    return ArmCell(config, cell.organ)
+
+
+def nearest_mm(cell, joints_rad):
+    """The least distance of any pair that is checked, mm (negative: how deep)."""
+    import pinocchio as pin
+
+    data, state = cell.model.createData(), pin.GeometryData(cell.solids)
+    pin.updateGeometryPlacements(cell.model, data, cell.solids, state, joints_rad)
+    n = pin.computeDistances(cell.solids, state)
+    return 1000 * state.distanceResults[n].min_distance
+
+
+def flange_pose(model, joints_rad):
+    """``base_from_flange``, mm, by the plain product of the six Denavit-Hartenberg transforms.
+
+    Slow, and independent of every library: what the others are checked against.
+    """
+    base_from_flange = np.eye(4)
+    rows = zip(joints_rad, model.a_mm, model.d_mm, model.alpha_rad, strict=True)
+    for theta, a, d, alpha in rows:
+        (ct, st), (ca, sa) = (np.cos(theta), np.sin(theta)), (np.cos(alpha), np.sin(alpha))
+        base_from_flange = base_from_flange @ np.array(
+            [
+                [ct, -st * ca, st * sa, a * ct],
+                [st, ct * ca, -ct * sa, a * st],
+                [0.0, sa, ca, d],
+                [0.0, 0.0, 0.0, 1.0],
+            ]
+        )
+    return base_from_flange
 
 
 # A way between two strokes (milliradians) on which toppra, on its first grid, creeps for minutes.

@@ -3,8 +3,8 @@
 import numpy as np
 import trimesh
 
-from tumortrack.core.solids import mesh_of, solid_of
 from tumortrack.core.types import Mesh
+from tumortrack.imaging.meshes import mesh_of, solid_of
 from tumortrack.plan.values import Located
 
 HALF_MM = np.array([55.0, 30.0, 25.0])  # of the organ's axes

@@ -16,9 +16,8 @@ from stories import refusal, tumortrack
 from tumortrack.cli import commands
 from tumortrack.core import store
 from tumortrack.core.errors import InputError, NoEstimate
-from tumortrack.core.estimate import Estimate
+from tumortrack.core.estimate import Estimate, Motion, OneWay
 from tumortrack.core.geometry import transform_points
-from tumortrack.core.motion import Motion, OneWay
 from tumortrack.core.types import Anatomy, CameraLabels, Mesh, OccupancyCloud
 from tumortrack.models.in_distribution import InDistributionRange
 from tumortrack.occupancy.model import OccupancyModel

@@ -13,9 +13,8 @@ from motions import Wave
 from stories import succeeded, tumortrack, write_phantom_case
 from tumortrack.core.config import to_builtins
 from tumortrack.core.errors import InputError, NoEstimate
-from tumortrack.core.estimate import Estimate
+from tumortrack.core.estimate import Estimate, OneWay
 from tumortrack.core.geometry import transform_points
-from tumortrack.core.motion import OneWay
 from tumortrack.core.types import (
     Anatomy,
     CameraLabels,
@@ -33,7 +32,7 @@ from tumortrack.simulate.occupancy import labels_of
 from tumortrack.simulate.scene_folder import Scene, read_scene, write_scene
 from tumortrack.simulate.targets import Targets, draw_targets, read_targets
 from tumortrack_lab.twin.faults import faulty
-from tumortrack_lab.twin.variants import ViewConfig
+from tumortrack_lab.twin.views import ViewConfig
 
 
 def ball(radius_mm, center_mm=(0.0, 0.0, 0.0)):

@@ -18,8 +18,8 @@ import torch
 
 from stories import COMMAND, STEPS, environment, refusal, succeeded, train_command, tumortrack
 from tumortrack.core.config import from_builtins, to_builtins
-from tumortrack.core.cores import available_cores
 from tumortrack.core.errors import ArtifactError, InputError
+from tumortrack.core.process import available_cores
 from tumortrack.core.types import Anatomy
 from tumortrack.imaging.case import load_case
 from tumortrack.models.config import TrainConfig

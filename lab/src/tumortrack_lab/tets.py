@@ -1,4 +1,4 @@
-"""Tetrahedral meshes of closed surfaces, and points that ride on them."""
+"""Tetrahedral meshes of closed surfaces, and points embedded in them."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class TetMesh:
         return tet_volumes(self.nodes_mm, self.tets)
 
     def lump(self, per_tet: Float[np.ndarray, " t"]) -> Float64[np.ndarray, " n"]:
-        """Sums over the nodes of what each tetrahedron shares out to its four in equal parts."""
+        """Per node, the sum of what each tetrahedron gives to its four in equal parts."""
         return np.bincount(self.tets.ravel(), np.repeat(per_tet / 4, 4), len(self.nodes_mm))
 
 
@@ -48,8 +48,8 @@ def tetrahedralise(surface: Mesh, edge_mm: float, envelope: float = 2e-3) -> Tet
     """Fill a closed surface with tetrahedra (Hu et al. 2020, doi 10.1145/3386569.3392385).
 
     The mesh's own surface keeps within ``envelope`` times the diagonal (0.002: about 0.3 mm on a
-    kidney) of the given one. Even on one thread fTetWild does not repeat itself exactly: a result
-    that is to be repeated keeps its mesh.
+    kidney) of the given one. fTetWild is not reproducible even on one thread: keep the mesh
+    where results must be.
 
     Raises:
         InputError: nothing could be filled (an open or inverted surface).
@@ -88,7 +88,7 @@ class Embedding:
 
 def embed(mesh: TetMesh, points_mm: Float[np.ndarray, "m 3"]) -> Embedding:
     """Find each point's tetrahedron. A point just outside the mesh (its surface is coarser than
-    the anatomy's) rides on the nearest one, its weights extrapolated."""
+    the anatomy's) is held by the nearest one, its weights extrapolated."""
     owner, weights = find(mesh.nodes_mm[mesh.tets], points_mm)
     return Embedding(mesh.tets[owner], weights)
 

@@ -15,7 +15,7 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
-from tumortrack.core.processes import is_follower
+from tumortrack.core.process import is_follower
 
 # Of one training's processes the first alone speaks.
 console = Console(soft_wrap=True, highlight=False, quiet=is_follower())

@@ -10,7 +10,7 @@ from importlib.util import find_spec
 from pathlib import Path
 
 from tumortrack.cli.console import say
-from tumortrack.core.cores import available_cores
+from tumortrack.core.process import available_cores
 from tumortrack.live.spec import extensions
 
 _LIBRARIES = {

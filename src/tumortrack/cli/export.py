@@ -8,8 +8,7 @@ from tumortrack.cli.console import say
 from tumortrack.core import store
 from tumortrack.core.errors import InputError
 from tumortrack.imaging.case import load_case
-from tumortrack.imaging.dicom_seg import write_dicom_seg
-from tumortrack.imaging.segmentation import SIDES, segments, write_seg_nrrd
+from tumortrack.imaging.segmentation import SIDES, segments, write_dicom_seg, write_seg_nrrd
 
 
 def export(case_folder: Path, out: Path, dicom: Path | None, series: str | None) -> None:

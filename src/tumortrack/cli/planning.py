@@ -70,7 +70,7 @@ def plan(run_folder: Path, folder: Path, config: ResectionConfig, options: PlanO
     _tell(resection)
     motions, cell_used = None, None
     if options.arms:
-        from tumortrack.plan.arms.bases import search_bases
+        from tumortrack.plan.arms.procedure import search_bases
 
         start = time.perf_counter()
         placed, motions, moved = search_bases(resection, cell_config, organ_of(located))

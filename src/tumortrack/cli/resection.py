@@ -55,7 +55,6 @@ def resect(plan_folder: Path, sinks: tuple[str, ...], options: ResectOptions) ->
     from tumortrack.cli.live import parse_sinks
     from tumortrack.cli.planning import check_arms_installed
     from tumortrack.live.sinks.ur import UrSinkConfig
-    from tumortrack.plan.arms.cell import ArmCell
     from tumortrack.plan.arms.config import CellConfig
     from tumortrack.plan.files import read_plan
     from tumortrack.plan.operation import OperationConfig
@@ -71,6 +70,8 @@ def resect(plan_folder: Path, sinks: tuple[str, ...], options: ResectOptions) ->
         raise InputError(f"--speed {options.speed:g} with real arms; allowed: up to 1.")
     config = OperationConfig(speed=options.speed, moved_mm=options.moved_mm)
     where = str(plan_folder)
+    from tumortrack.plan.arms.cell import ArmCell
+
     cell = ArmCell(from_builtins(stored.cell, CellConfig, where), stored.meshes.get("kidney"))
     if options.film is not None:
         if options.live is not None or sinks:
@@ -108,8 +109,8 @@ def _live(
 
     from tumortrack.cli.live import Arms, TrackOptions, track
     from tumortrack.live.values import PublishedFrame
+    from tumortrack.plan import replanning
     from tumortrack.plan.located import located
-    from tumortrack.plan.replanning import begin, plan_anew, ready
 
     assert options.live is not None
     model, source = options.live
@@ -124,7 +125,7 @@ def _live(
     again = msgspec.structs.replace(stored.config, tumor=stored.plan.tumor)
     # In a process of its own: planning for a second must not hold up a frame.
     with ProcessPoolExecutor(
-        1, get_context("spawn"), initializer=begin, initargs=(again, cell.config)
+        1, get_context("spawn"), replanning.initialize, (again, cell.config)
     ) as planner:
 
         def replan(
@@ -133,12 +134,12 @@ def _live(
             progress: ResectionProgress,
         ) -> Future[Planned]:
             seen = locate(update, unsure=stored.config.sigmas > 0)
-            return planner.submit(plan_anew, seen, joints_rad, progress)
+            return planner.submit(replanning.replan, seen, joints_rad, progress)
 
         say("making ready to plan anew ...")
         # The process that begins here does not hear of Ctrl-C: that is the live loop's affair.
         before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-        begun = planner.submit(ready)
+        begun = planner.submit(replanning.warm_up)
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
         begun.result()
         operation = _operation(stored, cell, config, locate=locate, replan=replan)

@@ -69,8 +69,7 @@ def write_scenes(
         InputError: no case, or scenes that are not of this case, seed and options.
     """
     from tumortrack.imaging.case import load_case
-    from tumortrack.simulate.bodies import body_for
-    from tumortrack.simulate.scene import SceneRecipe, Simulator
+    from tumortrack.simulate.scene import SceneRecipe, Simulator, body_for
     from tumortrack.simulate.scene_folder import Scene, write_scene
     from tumortrack.simulate.targets import draw_targets
 
@@ -95,7 +94,7 @@ def write_scenes(
             if folder.exists():
                 _check_same(folder, made_from)
             else:
-                stage = simulator.stage(recipe)
+                stage = simulator.render(recipe)
                 meta = {
                     **made_from,
                     "camera_from_ct": stage.camera_from_ct.tolist(),

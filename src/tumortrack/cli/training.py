@@ -7,7 +7,7 @@ import time
 from rich.status import Status as Spinner
 
 from tumortrack.cli.console import console, say
-from tumortrack.core.processes import is_follower
+from tumortrack.core.process import is_follower
 from tumortrack.training.distributed import ProcessLost
 from tumortrack.training.state import Diverged
 from tumortrack.training.train import Interrupted, TrainingStatus

@@ -18,18 +18,29 @@ class Config(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
 
     LATER: ClassVar[tuple[str, ...]] = ()
 
+    def check_ranges(self, what: str, least: str = "0 (off)", **most: float) -> None:
+        """Refuse each named field that is not in 0..most; ``what`` names the configuration.
+
+        Raises:
+            InputError: with the allowed range, its lower end written as ``least``.
+        """
+        for name, limit in most.items():
+            value = getattr(self, name)
+            if not 0 <= value <= limit:
+                raise InputError(f"{what} {name} is {value}; allowed: {least} to {limit:g}.")
+
 
 C = TypeVar("C", bound=msgspec.Struct)
 
 
 def to_builtins(config: msgspec.Struct) -> dict:
-    """The configuration as what JSON would give back, every key written out."""
+    """The configuration as JSON would return it, every key written out."""
     return msgspec.json.decode(msgspec.json.encode(config))
 
 
 def identity(config: msgspec.Struct) -> dict:
-    """``to_builtins`` to be hashed: fields named in ``LATER`` are left out where they have their
-    default, so that what was made before there was such a field is still known as the same."""
+    """``to_builtins`` for hashing: fields named in ``LATER`` are left out at their default, so
+    that artifacts from before there was such a field keep their hash."""
     written = to_builtins(config)
     _drop_later(config, written)
     return written

@@ -24,19 +24,19 @@ class ArtifactError(InputError):
 
 
 class NoEstimate(TumortrackError):
-    """The input is well formed, but nothing can be said from it (too few points, no organ)."""
+    """The input is well formed but allows no answer (too few points, no organ)."""
 
     exit_code = 3
 
 
 class NoPlan(TumortrackError):
-    """What was located can't be cut out as asked, and why."""
+    """What was located cannot be cut out as requested, and why."""
 
     exit_code = 3
 
 
 class Aborted(TumortrackError):
-    """Arms were stopped for good before they had ended, and why."""
+    """Arms were stopped for good before they had finished, and why."""
 
     exit_code = 3
 

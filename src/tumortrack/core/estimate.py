@@ -1,21 +1,64 @@
-"""What the tracker says about one cloud: points, labelled grid, surfaces and numbers."""
+"""What is located in one cloud: points, labelled grid, surfaces, motion and numbers."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+from jaxtyping import Float
 
 from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError
-from tumortrack.core.motion import Motion
 from tumortrack.core.types import CameraLabels, Mesh, OccupancyCloud
 
 LARGEST_GRID = 400
+Points = Float[np.ndarray, "n 3"]
+Carry = Callable[[Points], Points]
+
+
+@runtime_checkable
+class Motion(Protocol):
+    """One frame's correspondence: undeformed CT (LPS, mm) <-> camera frame (mm).
+
+    It takes any finite points, also outside the organ, and returns finite ones.
+    """
+
+    def carry(self, points_ct: Points, /) -> Points:
+        """CT points in the camera frame."""
+        ...
+
+    def back(self, points_camera: Points, /) -> Points | None:
+        """Camera points in the undeformed CT; None if the method knows only ``carry``."""
+        ...
+
+    def std_mm(self, points_ct: Points, /) -> Float[np.ndarray, " n"] | None:
+        """Uncertainty of ``carry`` at each point: one standard deviation along any axis, mm; None
+        where the method does not know it."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class OneWay:
+    """The motion of a method that knows only the way from the CT to the camera."""
+
+    carry: Carry
+
+    def back(self, points_camera: Points, /) -> None:
+        return None
+
+    def std_mm(self, points_ct: Points, /) -> None:
+        return None
 
 
 class Following(Config, frozen=True, kw_only=True):
-    """How one frame of many is located. ``thorough``: also search as if there were no last
-    estimate, and take what fits better: a search near the last answer alone keeps what was wrong
-    in it. ``smoothing_s``: time constant of the mean over past estimates; 0: none."""
+    """How one frame of many is located.
+
+    thorough: also search without the last estimate, and keep the better fit: a search near the
+        last answer alone would keep its error.
+    smoothing_s: time constant of the mean over past estimates; 0: none.
+    """
 
     thorough: bool = False
     smoothing_s: float = 0.0
@@ -32,12 +75,14 @@ class Following(Config, frozen=True, kw_only=True):
 class Estimate:
     """Organ and tumors located in one sensor cloud, all in the camera frame, in mm.
 
-    ``meshes`` maps kidney, tumor_1, ... to closed surfaces; a part that was not found is absent.
-    The kidney's surface is the whole organ, tumors included, as in ``Anatomy``. ``report`` is
-    plain JSON: per part volume, centre, box and probability, and ``timings`` in seconds.
-    ``volume`` is None where nobody asked for it (live). ``motion`` says where every point of the
-    CT is, where the method knows that; ``unsmoothed`` the same before a mean over past frames was
-    taken: where the next frame's search starts.
+    Attributes:
+        volume: None where it was not requested (live).
+        meshes: kidney, tumor_1, ... -> closed surfaces; a part that was not found is absent. The
+            kidney's surface is the whole organ, tumors included, as in ``Anatomy``.
+        report: plain JSON: per part volume, centre, box and probability; ``timings`` in seconds.
+        motion: where every point of the CT is, if the method knows that.
+        unsmoothed: the motion before the mean over past frames: the next frame's search starts
+            from it.
     """
 
     cloud: OccupancyCloud

@@ -79,3 +79,13 @@ def direction_lps(text: str) -> tuple[float, float, float]:
 def spacing_mm(frame_from_index: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, " 3"]:
     """Voxel edge lengths in mm along the three array axes."""
     return np.linalg.norm(frame_from_index[:3, :3], axis=0)
+
+
+def unit(vector: Float[np.ndarray, " 3"]) -> Float[np.ndarray, " 3"]:
+    """The same direction with length 1."""
+    return vector / np.linalg.norm(vector)
+
+
+def perpendicular(vector: Float[np.ndarray, " 3"]) -> Float[np.ndarray, " 3"]:
+    """Some unit vector at right angles to a vector."""
+    return unit(np.cross(vector, np.eye(3)[np.argmin(np.abs(vector))]))

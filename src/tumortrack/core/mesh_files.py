@@ -1,4 +1,4 @@
-"""Mesh files: PLY out without a library; all else through trimesh, whose import takes long."""
+"""Mesh files: PLY is written by own code; the rest uses trimesh, which is slow to import."""
 
 from __future__ import annotations
 
@@ -50,8 +50,8 @@ def read_mesh(path: Path) -> Mesh:
 def write_mesh(path: Path, mesh: Mesh) -> None:
     """Write a binary PLY (or STL, by suffix), vertices in mm, in the mesh's own frame.
 
-    The header says ``SPACE=LPS``, the words that 3D Slicer looks for. Of a mesh before the camera
-    too: as all files of a run, it is shown as if its frame were the patient's.
+    The header states ``SPACE=LPS``, which 3D Slicer looks for; also for meshes in the camera frame:
+    Slicer shows all files of a run as if their frame were the patient's.
 
     Raises:
         StorageError: the disk refused.

@@ -22,7 +22,7 @@ def _freeze(value: object, name: str, dtype: npt.DTypeLike, shape: tuple[int | N
     """Convert one field to a read-only array and check its shape (None: any length)."""
     given = np.asarray(getattr(value, name))
     if given.dtype == dtype and given.flags.owndata and not given.flags.writeable:
-        array = given  # frozen already, by another value: nobody can change it
+        array = given  # frozen already, by another value
     else:
         array = given.astype(dtype)  # a copy: the caller's stays writable
     if array.dtype.kind in "iu" and array.dtype != given.dtype and (array != given).any():
@@ -185,6 +185,11 @@ class DepthFrame:
 
     def __post_init__(self) -> None:
         _freeze(self, "depth_mm", np.float32, (self.intrinsics.height, self.intrinsics.width))
+
+    def with_depth(self, depth_mm: Float32[np.ndarray, "h w"]) -> DepthFrame:
+        """The same camera and stamp with another depth, taken over: the array becomes read-only."""
+        depth_mm.flags.writeable = False
+        return DepthFrame(depth_mm, self.intrinsics, self.stamp_ns)
 
 
 @dataclass(frozen=True, eq=False)

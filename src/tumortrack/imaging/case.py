@@ -9,12 +9,8 @@ from tumortrack.core import store
 from tumortrack.core.errors import ArtifactError, StorageError
 from tumortrack.core.mesh_files import read_anatomy, write_anatomy
 from tumortrack.core.types import Anatomy, LabelVolume, Volume
-from tumortrack.imaging.volume import (
-    read_labels,
-    read_volume,
-    write_labels_nifti,
-    write_volume_nifti,
-)
+from tumortrack.imaging.nifti import write_nifti, write_volume_nifti
+from tumortrack.imaging.volume import read_labels, read_volume
 
 KIND = "case"
 
@@ -51,7 +47,7 @@ def save_case(case: Case, folder: Path) -> None:
     except OSError as error:
         raise StorageError(f"cannot write into {folder}: {error.strerror}.") from error
     labels = case.labels
-    write_labels_nifti(folder / "labels.nii.gz", labels.labels, labels.lps_from_index, lps=True)
+    write_nifti(folder / "labels.nii.gz", labels.labels, labels.lps_from_index, lps=True)
     if case.ct is not None:
         write_volume_nifti(folder / "ct.nii.gz", case.ct.hu, case.ct.lps_from_index)
     content = {

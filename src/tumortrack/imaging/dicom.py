@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from tumortrack.core.errors import InputError
-from tumortrack.imaging.voxels import RawVolume, check_affine, check_size
+from tumortrack.imaging.grid import RawVolume, check_affine, check_size
 
 MIN_SLICES = 10
 _MAX_FILES = 20_000
@@ -147,7 +147,7 @@ def _read_tags(path: Path) -> _Slice | str:
     import pydicom
 
     try:
-        with warnings.catch_warnings():  # what matters of a damaged header, we say ourselves
+        with warnings.catch_warnings():  # a damaged header gets our own errors
             warnings.simplefilter("ignore")
             tags = pydicom.dcmread(path, stop_before_pixels=True, specific_tags=_TAGS)
             if int(tags.get("NumberOfFrames") or 1) > 1:
@@ -167,7 +167,7 @@ def _read_tags(path: Path) -> _Slice | str:
 
 
 def _printable(value: object) -> str:
-    """A tag's text as it may go to a terminal."""
+    """A tag's text, safe to print on a terminal."""
     return "".join(c if c.isprintable() else "?" for c in str(value or ""))
 
 

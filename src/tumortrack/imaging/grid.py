@@ -1,16 +1,117 @@
-"""Small operations on label grids that several files of this package need."""
+"""Voxel grids: the checks that hold for every file format, and operations that many files need."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from pathlib import Path
+
 import numpy as np
+import numpy.typing as npt
 from jaxtyping import Bool, Float, Int32, Int64, UInt8
 
+from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import spacing_mm
 from tumortrack.core.types import LabelVolume
 
 Box = tuple[slice, slice, slice]
 
+_MAX_VOXELS = 2**30
+_MAX_BYTES = 8 * 2**30
+_SPACING_RANGE_MM = (0.05, 10.0)
+_GZIP_BEST = 1100  # deflate cannot compress better than 1032 : 1
 _AT_ONCE = 2**16  # labels: counting makes eight bytes of each
+
+
+@dataclass(frozen=True, eq=False)
+class RawVolume:
+    """Voxels in the file's own number type; axes (i, j, k); ``lps_from_index``: index -> LPS mm.
+
+    ``notes`` name what was beside them and was left out.
+    """
+
+    array: np.ndarray
+    lps_from_index: Float[np.ndarray, "4 4"]
+    notes: tuple[str, ...] = ()
+
+
+def check_size(path: Path, shape: tuple[int, ...], bytes_per_voxel: int) -> None:
+    """Refuse a shape that is no volume or too large, before anything is allocated.
+
+    Raises:
+        InputError: not three axes, fewer than two voxels along one, or above the limits.
+    """
+    dims = " x ".join(str(n) for n in shape)
+    if len(shape) != 3:
+        raise InputError(
+            f"{path} has {len(shape)} axes ({dims}); one 3-D volume is needed. Export a single "
+            "phase or channel."
+        )
+    if min(shape) < 2:
+        raise InputError(f"{path} is {dims} voxels: a flat image. Give a whole 3-D volume.")
+    voxels = 1
+    for n in shape:
+        voxels *= int(n)
+    if voxels > _MAX_VOXELS or voxels * bytes_per_voxel > _MAX_BYTES:
+        raise InputError(
+            f"{path} claims {dims} voxels of {bytes_per_voxel} bytes; the limit is {_MAX_VOXELS} "
+            "voxels and 8 GiB. Crop or resample the volume round the kidney."
+        )
+
+
+def check_stored(path: Path, needed_bytes: int, compressed: bool) -> None:
+    """Refuse a file too short to hold what its header claims, before allocating it.
+
+    Raises:
+        InputError: the file is truncated, or its header is damaged.
+    """
+    most = path.stat().st_size * (_GZIP_BEST if compressed else 1)
+    if most < needed_bytes:
+        raise InputError(
+            f"{path} is shorter than its header says ({needed_bytes} bytes of voxels): truncated "
+            "or damaged. Copy or export it again."
+        )
+
+
+def check_affine(path: Path, lps_from_index: Float[np.ndarray, "4 4"]) -> None:
+    """Refuse a NaN or singular affine, and spacing that is not plausibly millimetres.
+
+    Raises:
+        InputError: with the reason; metres are recognised.
+    """
+    linear = lps_from_index[:3, :3]
+    if not np.isfinite(lps_from_index).all():
+        raise InputError(f"{path}: the affine has NaN or infinite numbers. Export it again.")
+    if np.abs(lps_from_index).max() > 1e6:
+        raise InputError(f"{path}: the affine puts voxels kilometres away. Export it again.")
+    steps = spacing_mm(lps_from_index)
+    if min(steps) <= 0 or abs(np.linalg.det(linear / np.where(steps > 0, steps, 1))) < 0.1:
+        raise InputError(
+            f"{path}: the affine is singular (its axes do not span space). Export it again."
+        )
+    low, high = _SPACING_RANGE_MM
+    if min(steps) < low or max(steps) > high:
+        text = " x ".join(f"{s:.6g}" for s in steps)
+        metres = low <= 1000 * min(steps) and 1000 * max(steps) <= high
+        hint = (
+            "This looks like metres: multiply the spacing by 1000 and export again."
+            if metres
+            else "Correct the header and export again."
+        )
+        raise InputError(
+            f"{path}: voxels of {text} mm; allowed are {low:g} to {high:g} mm on each axis. {hint}"
+        )
+
+
+def check_numbers(path: Path, dtype: npt.DTypeLike) -> None:
+    """Refuse voxels that are not plain integers or real numbers.
+
+    Raises:
+        InputError: colours, complex numbers or structures.
+    """
+    if np.dtype(dtype).kind not in "iuf":
+        raise InputError(
+            f"{path}: voxels are {np.dtype(dtype)}; a CT or a label map of plain numbers is needed."
+        )
 
 
 def voxel_ml(lps_from_index: Float[np.ndarray, "4 4"]) -> float:
@@ -44,6 +145,22 @@ def components(mask: Bool[np.ndarray, "i j k"]) -> tuple[Int32[np.ndarray, "i j 
     return rank[pieces], counts[order]
 
 
+def tight_box(mask: Bool[np.ndarray, "i j k"]) -> Box:
+    """The slices that hold every True voxel; there must be one."""
+    hits = [np.flatnonzero(mask.any(axis=axes)) for axes in ((1, 2), (0, 2), (0, 1))]
+    i, j, k = (slice(int(hit[0]), int(hit[-1]) + 1) for hit in hits)
+    return i, j, k
+
+
+def grown_box(box: tuple[slice, ...], shape: tuple[int, ...], margin: np.ndarray) -> Box:
+    """A box grown on every side by a margin (3,) in voxels, within the grid."""
+    i, j, k = (
+        slice(max(0, s.start - m), min(n, s.stop + m))
+        for s, n, m in zip(box, shape, margin.tolist(), strict=True)
+    )
+    return i, j, k
+
+
 def bounding_box(
     mask: Bool[np.ndarray, "i j k"],
     lps_from_index: Float[np.ndarray, "4 4"],
@@ -51,12 +168,19 @@ def bounding_box(
 ) -> Box:
     """The slices that hold every True voxel and a margin, within the grid."""
     margin = np.ceil(margin_mm / spacing_mm(lps_from_index)).astype(int)
-    box = []
-    for axis in range(3):
-        hit = np.flatnonzero(mask.any(axis=tuple(a for a in range(3) if a != axis)))
-        lower = max(0, int(hit[0]) - int(margin[axis]))
-        box.append(slice(lower, min(mask.shape[axis], int(hit[-1]) + 1 + int(margin[axis]))))
-    return (box[0], box[1], box[2])
+    return grown_box(tight_box(mask), mask.shape, margin)
+
+
+def extent_mm(box: tuple[slice, ...], steps_mm: np.ndarray) -> Float[np.ndarray, " 3"]:
+    """Edge lengths of a box of voxels."""
+    return np.array([s.stop - s.start for s in box]) * steps_mm
+
+
+def depth_mm(mask: Bool[np.ndarray, "i j k"], steps_mm: np.ndarray) -> Float[np.ndarray, "i j k"]:
+    """Distance of each True voxel to the nearest False one or to the grid's edge."""
+    from scipy import ndimage
+
+    return ndimage.distance_transform_edt(np.pad(mask, 1), sampling=steps_mm)[1:-1, 1:-1, 1:-1]
 
 
 def moved_origin(lps_from_index: Float[np.ndarray, "4 4"], box: Box) -> Float[np.ndarray, "4 4"]:
@@ -72,8 +196,18 @@ def cropped(
     margin_mm: float = 8.0,
 ) -> LabelVolume:
     """The labels round everything labelled, with a margin of zeros on every side."""
-    box = bounding_box(labels > 0, lps_from_index, 0.0)
+    box = tight_box(labels > 0)
     margin = np.ceil(margin_mm / spacing_mm(lps_from_index)).astype(int)
     affine = moved_origin(lps_from_index, box)
     affine[:3, 3] -= lps_from_index[:3, :3] @ margin
     return LabelVolume(np.pad(labels[box], [(m, m) for m in margin.tolist()]), affine)
+
+
+def grid_round(
+    box_mm: Float[np.ndarray, "2 3"], step_mm: float, margin_mm: float
+) -> tuple[Float[np.ndarray, "4 4"], tuple[int, int, int]]:
+    """``frame_from_index`` and shape of an axis-aligned grid that holds a box and a margin."""
+    frame_from_index = np.diag([step_mm, step_mm, step_mm, 1.0])
+    frame_from_index[:3, 3] = box_mm[0] - margin_mm
+    counts = np.ceil((box_mm[1] - box_mm[0] + 2 * margin_mm) / step_mm).astype(int) + 1
+    return frame_from_index, (int(counts[0]), int(counts[1]), int(counts[2]))

@@ -1,25 +1,26 @@
-"""Anatomy from a folder of surface meshes (STL, OBJ, PLY)."""
+"""Anatomy from a folder of surface meshes (STL, OBJ, PLY), which are repaired or refused."""
 
 from __future__ import annotations
 
 import re
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import RAS_FROM_LPS, transform_points
 from tumortrack.core.mesh_files import SUFFIXES, read_mesh
-from tumortrack.core.solids import mesh_of, solid_of
 from tumortrack.core.types import FIRST_TUMOR, ORGAN, Anatomy, LabelVolume, Mesh, part_names
+from tumortrack.imaging.grid import grid_round
 from tumortrack.imaging.raster import winding_numbers
-from tumortrack.imaging.repair import closed_mesh
-from tumortrack.imaging.shells import largest_shell
-from tumortrack.imaging.winding import grid_round
+from tumortrack.imaging.surface import largest_shell, surfaces
 
 _ORGAN_WORDS, _TUMOR_WORDS = ("kidney", "organ"), ("tumor", "tumour", "lesion", "mass")
 _ORGAN_MM = (20.0, 400.0)  # plausible longest extent
 _VOXEL_MM = 1.0
+_LARGEST_HOLE_MM = 10.0  # across; larger ones would invent anatomy
+_LARGEST_REMESH = 1.5  # change of volume that a remesh may make, as a ratio
 _RULE = (
     "The rule: one file whose name contains kidney or organ is the organ; names with tumor, lesion "
     "or mass are tumors, in order of name."
@@ -27,7 +28,7 @@ _RULE = (
 
 
 def read_mesh_folder(folder: Path, unit: str | None = None) -> tuple[Anatomy, list[str]]:
-    """Read one organ and its tumors; LPS mm unless a file's comment says ``SPACE=RAS``.
+    """Read one organ and its tumors; LPS mm unless a file's comment states ``SPACE=RAS``.
 
     Small holes, doubled faces, inside-out surfaces and crossings are repaired with a note. The
     organ becomes the union of organ and tumors.
@@ -153,3 +154,134 @@ def _union(organ: Mesh, tumor: Mesh, name: str) -> Mesh:
             "all meshes share one frame and unit."
         )
     return largest_shell(mesh_of(outer[0]))
+
+
+def closed_mesh(mesh: Mesh, name: str, notes: list[str]) -> Mesh:
+    """Repair what can be repaired safely; every change adds a note that names the file.
+
+    Doubled faces are removed, holes up to 10 mm across are closed, faces are turned outward, and a
+    mesh that crosses itself is remeshed from its winding numbers.
+
+    Raises:
+        InputError: open beyond that, or not a surface.
+    """
+    import trimesh
+
+    size = float(np.ptp(mesh.box_mm, axis=0).max())
+    if not size > 0:
+        raise InputError(f"{name} has no extent; it is damaged.")
+    faces = _unique_faces(mesh.faces)
+    if doubled := len(mesh.faces) - len(faces):
+        notes.append(f"{name}: {doubled} doubled faces removed")
+    out = Mesh(mesh.vertices_mm, faces)
+    work = trimesh.Trimesh(out.vertices_mm, out.faces, process=False)
+    if not work.is_winding_consistent:
+        trimesh.repair.fix_winding(work)
+        notes.append(f"{name}: faces turned the same way round")
+        out = Mesh(out.vertices_mm, np.asarray(work.faces))
+    out = _close_holes(out, name, notes)
+    if not trimesh.Trimesh(out.vertices_mm, out.faces, process=False).is_watertight:
+        raise InputError(
+            f"{name} is not a closed surface (edges with one or more than two faces). Repair it, "
+            "for instance with Blender's 3D-Print toolbox, or give a label map."
+        )
+    if out.volume_mm3 < 0:
+        out = Mesh(out.vertices_mm, out.faces[:, ::-1])
+        notes.append(f"{name}: it was inside out; faces turned outward")
+    if abs(out.volume_mm3) < 1e-9 * size**3:
+        raise InputError(f"{name} encloses no volume; it is no solid.")
+    if not is_simple(out, size / 80):
+        out = _remesh(out, name, size)
+        notes.append(f"{name}: it crossed itself; remeshed at {size / 120:.2g} mm")
+    return out
+
+
+def _unique_faces(faces: np.ndarray) -> np.ndarray:
+    _, first = np.unique(np.sort(faces, axis=1), axis=0, return_index=True)
+    return faces[np.sort(first)]
+
+
+def _close_holes(mesh: Mesh, name: str, notes: list[str]) -> Mesh:
+    """Fan every boundary loop from its centre, if all are small."""
+    edges = np.concatenate([mesh.faces[:, [0, 1]], mesh.faces[:, [1, 2]], mesh.faces[:, [2, 0]]])
+    codes = edges[:, 0].astype(np.int64) * len(mesh.vertices_mm) + edges[:, 1]
+    back = edges[:, 1].astype(np.int64) * len(mesh.vertices_mm) + edges[:, 0]
+    border = edges[~np.isin(codes, back)]
+    if len(border) == 0:
+        return mesh
+    following = {int(a): int(b) for a, b in border}
+    if len(following) != len(border):
+        raise InputError(f"{name} has holes that meet in one point; repair the mesh first.")
+    vertices, faces, widest, n_loops = [mesh.vertices_mm], [mesh.faces], 0.0, 0
+    while following:
+        loop = [next(iter(following))]
+        while (ahead := following.pop(loop[-1], None)) is not None and ahead != loop[0]:
+            loop.append(ahead)
+        if ahead is None:
+            raise InputError(f"{name} has a border that does not close; repair the mesh first.")
+        ring = mesh.vertices_mm[loop]
+        widest = max(widest, float(np.ptp(ring, axis=0).max()))
+        centre = len(mesh.vertices_mm) + n_loops
+        vertices.append(ring.mean(0, keepdims=True))
+        # The border runs as its faces do; the new ones run against it.
+        faces.append(
+            np.array([[b, a, centre] for a, b in zip(loop, [*loop[1:], loop[0]], strict=True)])
+        )
+        n_loops += 1
+    if widest > _LARGEST_HOLE_MM:
+        raise InputError(
+            f"{name} is open: {n_loops} holes, the widest {widest:.1f} mm (up to "
+            f"{_LARGEST_HOLE_MM:g} mm are closed). Close the mesh, or give a label map."
+        )
+    notes.append(f"{name}: {n_loops} holes closed, the widest {widest:.1f} mm")
+    return Mesh(np.concatenate(vertices), np.concatenate(faces))
+
+
+def _remesh(mesh: Mesh, name: str, size: float) -> Mesh:
+    """March the region of positive winding number: crossings and inner walls vanish."""
+    step = size / 120
+    affine, shape = grid_round(mesh.box_mm, step, 4 * step)
+    inside = winding_numbers(mesh, affine, shape) > 0
+    if not inside.any():
+        raise InputError(f"{name} crosses itself and encloses nothing; repair it first.")
+    out = surfaces(LabelVolume(inside.astype(np.uint8), affine))[0].organ
+    ratio = out.volume_mm3 / mesh.volume_mm3
+    if not 1 / _LARGEST_REMESH < ratio < _LARGEST_REMESH:
+        raise InputError(f"{name} crosses itself too much to be repaired; repair it first.")
+    return out
+
+
+def is_simple(mesh: Mesh, step_mm: float) -> bool:
+    """True where rays along all three axes find only winding numbers 0 and 1."""
+    for turn in range(3):
+        turned = mesh.moved(np.roll(mesh.vertices_mm, turn, axis=1))
+        numbers = winding_numbers(turned, *grid_round(turned.box_mm, step_mm, 2 * step_mm))
+        # Slivers thinner than rounding may swap their two faces: single columns do not decide.
+        wrong = ((numbers < 0) | (numbers > 1)).any(2) | (numbers[:, :, -1] != 0)
+        if wrong.sum() > 2:
+            return False
+    return True
+
+
+def solid_of(mesh: Mesh, name: str) -> Any:
+    """A closed mesh as a ``manifold3d.Manifold``; ``name`` is for the error.
+
+    Raises:
+        InputError: open, crossing itself beyond use, or inside out.
+    """
+    import manifold3d
+
+    raw = manifold3d.Mesh64(mesh.vertices_mm.copy(), mesh.faces.astype(np.uint64))
+    solid = manifold3d.Manifold(raw)
+    if solid.status() != manifold3d.Error.NoError or solid.volume() <= 0:
+        raise InputError(
+            f"{name} is not a closed surface with faces turned outward "
+            f"({solid.status().name}). Repair the mesh and try again."
+        )
+    return solid
+
+
+def mesh_of(solid: Any) -> Mesh:
+    """A ``manifold3d.Manifold``'s surface, faces outward."""
+    out = solid.to_mesh64()
+    return Mesh(out.vert_properties[:, :3], out.tri_verts)

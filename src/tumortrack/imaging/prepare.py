@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -20,17 +20,17 @@ from tumortrack.imaging.select import MIN_TUMOR_ML, select_labels
 from tumortrack.imaging.surface import surfaces
 from tumortrack.imaging.volume import is_label_map, labels_of, read_raw, volume_of
 
-# Which options only one kind of input asks for.
+# Options that only one kind of input uses.
 _OF_CT = ("kidney_hu", "tumor_hu")
 _OF_LABELS = ("labels", "side", "organ", "tumor")
 _OF_DICOM, _OF_MESHES = ("series",), ("unit",)
 
-_MOST_CHANGE_PERCENT = 1.0  # of a part's volume, by smoothing; more is told
+_MOST_CHANGE_PERCENT = 1.0  # of a part's volume, by smoothing; more is noted
 
 
 @dataclass(frozen=True)
 class PrepareOptions:
-    """What the user may say about an input.
+    """What the user may state about an input.
 
     Attributes:
         kidney_hu, tumor_hu: half-open HU windows [low, high) for a CT.
@@ -69,7 +69,7 @@ def prepare(input: Path, options: PrepareOptions | None = None) -> Case:
     """Read any supported input and make a case of it; nothing is written.
 
     Raises:
-        InputError: nothing usable there; the message says what was wrong and what to do.
+        InputError: no usable input there.
     """
     options = options or PrepareOptions()
     up = direction_lps(options.up)
@@ -83,17 +83,13 @@ def prepare(input: Path, options: PrepareOptions | None = None) -> Case:
         source_sha256 = store.sha256_of(input)
     except OSError as error:
         raise InputError(f"{input} cannot be read: {error.strerror or error}.") from error
-    report = {
-        **case.report,
-        "source": input.name,
-        "source_sha256": source_sha256,
-        "options": {k: list(v) if isinstance(v, tuple) else v for k, v in asdict(options).items()},
-    }
-    return Case(case.anatomy, case.labels, up, report, case.ct)
+    given = {k: list(v) if isinstance(v, tuple) else v for k, v in asdict(options).items()}
+    origin = {"source": input.name, "source_sha256": source_sha256, "options": given}
+    return replace(case, up_lps=up, report={**case.report, **origin})
 
 
 def _refuse_unused(what: str, options: PrepareOptions, unused: tuple[str, ...]) -> None:
-    """An option that this kind of input never asks for would be ignored: say so instead."""
+    """Refuse options that this kind of input would ignore."""
     usual = PrepareOptions()
     given = [name for name in unused if getattr(options, name) != getattr(usual, name)]
     if given:
@@ -106,63 +102,60 @@ def _from_volume(path: Path, options: PrepareOptions) -> Case:
         _refuse_unused(f"{path} is one file", options, _OF_DICOM)
     raw = read_raw(path, options.series)
     as_labels = options.labels or (path.is_file() and is_label_map(raw))
-    ct = None
-    found = list(raw.notes)
+    ct, notes = None, list(raw.notes)
     if as_labels:
         _refuse_unused(f"{path} is read as a label map", options, _OF_CT + _OF_MESHES)
-    else:
-        what = f"{path} is read as a CT (a label map needs --labels)"
-        _refuse_unused(what, options, _OF_LABELS + _OF_MESHES)
-    if as_labels:
-        source = labels_of(raw, path)
         if not options.labels:
-            found.append("few distinct whole numbers: read as a label map, not as a CT")
+            notes.append("few distinct whole numbers: read as a label map, not as a CT")
+        source = labels_of(raw, path)
         del raw  # the largest maps are gigabytes: one copy is enough
-        labels, notes = select_labels(
+        labels, more = select_labels(
             source, options.side, options.organ, options.tumor, options.min_tumor_ml
         )
     else:
+        what = f"{path} is read as a CT (a label map needs --labels)"
+        _refuse_unused(what, options, _OF_LABELS + _OF_MESHES)
         volume = volume_of(raw, path)
         del raw
-        labels, notes = segment_ct(
-            volume, options.kidney_hu, options.tumor_hu, options.min_tumor_ml
-        )
+        labels, more = segment_ct(volume, options.kidney_hu, options.tumor_hu, options.min_tumor_ml)
         ct = _crop_ct(volume, labels)
     anatomy, surface = surfaces(labels)
+    notes += more
     notes += [
         f"{name}: the surface's volume is {change:+.1f} % off its labels'; it is too thin or hangs "
         "together by too little for a smooth surface. Look at qc.png"
         for name, change in zip(surface.names, surface.change_percent, strict=True)
         if abs(change) > _MOST_CHANGE_PERCENT
     ]
-    report = {
-        "kind": "label map" if as_labels else "ct",
-        "notes": found + notes,
-        "volumes_ml": volumes_ml(labels),
-        "surface": {k: list(v) for k, v in asdict(surface).items()},
-        "spacing_mm": spacing_mm(labels.lps_from_index).tolist(),
-    }
-    return Case(anatomy, labels, (0.0, -1.0, 0.0), report, ct)
+    measured = {key: list(values) for key, values in asdict(surface).items()}
+    return _case("label map" if as_labels else "ct", anatomy, labels, measured, notes, ct)
 
 
 def _from_meshes(folder: Path, options: PrepareOptions) -> Case:
-    _refuse_unused(
-        f"{folder} holds meshes", options, (*_OF_CT, *_OF_LABELS, *_OF_DICOM, "min_tumor_ml")
-    )
+    unused = (*_OF_CT, *_OF_LABELS, *_OF_DICOM, "min_tumor_ml")
+    _refuse_unused(f"{folder} holds meshes", options, unused)
     anatomy, notes = read_mesh_folder(folder, options.unit)
-    labels = label_meshes(anatomy)
-    return Case(anatomy, labels, (0.0, -1.0, 0.0), _mesh_report(anatomy, labels, notes))
-
-
-def _mesh_report(anatomy: Anatomy, labels: LabelVolume, notes: list[str]) -> dict:
     mesh_ml = [part.volume_mm3 / 1000 for part in anatomy.parts]
-    return {
-        "kind": "meshes",
+    surface = {"names": list(anatomy.names), "mesh_ml": mesh_ml}
+    return _case("meshes", anatomy, label_meshes(anatomy), surface, notes)
+
+
+def _case(
+    kind: str,
+    anatomy: Anatomy,
+    labels: LabelVolume,
+    surface: dict,
+    notes: list[str],
+    ct: Volume | None = None,
+) -> Case:
+    report = {
+        "kind": kind,
         "notes": notes,
         "volumes_ml": volumes_ml(labels),
-        "surface": {"names": list(anatomy.names), "mesh_ml": mesh_ml},
+        "surface": surface,
         "spacing_mm": spacing_mm(labels.lps_from_index).tolist(),
     }
+    return Case(anatomy, labels, (0.0, -1.0, 0.0), report, ct)
 
 
 def volumes_ml(labels: LabelVolume) -> dict[str, float]:

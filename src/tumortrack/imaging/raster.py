@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
+from typing import NamedTuple
 
+import numba
 import numpy as np
 from jaxtyping import Bool, Float, Int, Int16, UInt8
 
@@ -15,10 +18,10 @@ _CHUNK = 2_000_000  # candidate pixels held at once
 _MOST_CELLS = 2**28  # of a grid
 
 
-def _expand(
+def expand(
     counts: Int[np.ndarray, " n"],
 ) -> tuple[Int[np.ndarray, " m"], Int[np.ndarray, " m"]]:
-    """Item and running number within the item, for ``counts[item]`` entries each."""
+    """``counts[item]`` entries for each item: the item and the running number within it."""
     item = np.repeat(np.arange(len(counts)), counts)
     return item, np.arange(len(item)) - np.repeat(np.cumsum(counts) - counts, counts)
 
@@ -55,7 +58,7 @@ def _cover_chunk(
     x = triangles[:, :, 0]
     first = np.clip(np.ceil(x.min(1)), 0, shape[0]).astype(int)
     stop = np.clip(np.ceil(x.max(1)), 0, shape[0]).astype(int)
-    tri, step = _expand(np.maximum(stop - first, 0))
+    tri, step = expand(np.maximum(stop - first, 0))
     i = first[tri] + step
     low, high = np.full(len(tri), np.nan), np.full(len(tri), np.nan)
     for a, b in ((0, 1), (1, 2), (2, 0)):
@@ -69,7 +72,7 @@ def _cover_chunk(
         low, high = np.fmin(low, at), np.fmax(high, at)
     left = np.clip(np.ceil(low), 0, shape[1]).astype(int)
     right = np.clip(np.ceil(high), 0, shape[1]).astype(int)
-    row, step = _expand(right - left)
+    row, step = expand(right - left)
     tri, i, j = tri[row], i[row], left[row] + step
     corner = triangles[:, 0]
     normal = np.cross(triangles[:, 1] - corner, triangles[:, 2] - corner)
@@ -129,10 +132,23 @@ def _room(shape: tuple[int, int, int], dtype: type) -> np.ndarray:
     return np.zeros(shape, dtype)
 
 
-def _fill(mesh: Mesh, frame_from_index: np.ndarray, out: np.ndarray, value: int) -> None:
-    """See ``raster_kernels.fill``."""
-    from tumortrack.imaging import raster_kernels  # compiled: imports numba
+class Crossings(NamedTuple):
+    """Where the m crossings of a surface lie on the rays along a grid's last axis.
 
+    Attributes:
+        first: (rays + 1,) where each ray's crossings begin in the arrays below.
+        behind: (m,) the first voxel behind each crossing.
+        sign: (m,) +1 where a face is entered, -1 where it is left.
+    """
+
+    first: np.ndarray
+    behind: np.ndarray
+    sign: np.ndarray
+
+
+def _fill(mesh: Mesh, frame_from_index: np.ndarray, out: np.ndarray, value: int) -> None:
+    """``value`` into the voxels of ``out`` whose winding number is not 0, or that number itself
+    where ``value`` is 0; others stay as they are."""
     if len(mesh.faces) == 0:
         return
     index = transform_points(np.linalg.inv(frame_from_index), mesh.vertices_mm)
@@ -143,15 +159,99 @@ def _fill(mesh: Mesh, frame_from_index: np.ndarray, out: np.ndarray, value: int)
     high[2] = out.shape[2]  # of an open mesh the rays do not leave what they entered
     triangles = (index - low)[mesh.faces]
     i, j, k = (high - low).tolist()
-    nothing = np.zeros(0, np.int32), np.zeros(0, np.int8)
-    first = np.zeros(i * j + 1, np.int64)
-    raster_kernels.crossings(triangles, (i, j, k), first, *nothing)
-    np.cumsum(first, out=first)
-    behind, sign = np.empty(first[-1], np.int32), np.empty(first[-1], np.int8)
-    if len(behind) == 0:
+    found = Crossings(np.zeros(i * j + 1, np.int64), np.zeros(0, np.int32), np.zeros(0, np.int8))
+    _find_crossings(triangles, (i, j, k), found)
+    first = np.cumsum(found.first)
+    if first[-1] == 0:
         return
-    raster_kernels.crossings(triangles, (i, j, k), first[:-1].copy(), behind, sign)
-    if np.linalg.det(frame_from_index[:3, :3]) < 0:
-        sign = -sign
+    found = Crossings(first.copy(), np.empty(first[-1], np.int32), np.empty(first[-1], np.int8))
+    _find_crossings(triangles, (i, j, k), found)
+    sign = -found.sign if np.linalg.det(frame_from_index[:3, :3]) < 0 else found.sign
     box = tuple(slice(a, b) for a, b in zip(low.tolist(), high.tolist(), strict=True))
-    raster_kernels.fill(first, behind, sign, value, out[box])
+    _fill_along_rays(Crossings(first, found.behind, sign), value, out[box])
+
+
+@numba.njit(cache=True, nogil=True)  # no fast math: each number is rounded as in ``cover``
+def _find_crossings(triangles, shape, found):  # type: ignore[no-untyped-def]
+    """Where rays along the last axis pass triangles (t, 3, 3), in cells, into ``Crossings``.
+
+    Called twice. With ``behind`` empty it counts, ``first[i * shape[1] + j + 1]`` for the ray
+    (i, j). With their cumulative sum in ``first`` it writes the crossings and advances ``first``.
+    """
+    first, k, sign = found
+    fill = len(k) > 0
+    for t in range(len(triangles)):
+        tri = triangles[t]
+        ax, ay = tri[1, 0] - tri[0, 0], tri[1, 1] - tri[0, 1]
+        bx, by = tri[2, 0] - tri[0, 0], tri[2, 1] - tri[0, 1]
+        area = ax * by - ay * bx
+        turned = np.int8(area < 0) - np.int8(area > 0)
+        # As numpy's cross product: the same products, in the same order.
+        az, bz = tri[1, 2] - tri[0, 2], tri[2, 2] - tri[0, 2]
+        along = area if area != 0 else 1.0
+        slope_i, slope_j = (ay * bz - az * by) / along, (az * bx - ax * bz) / along
+        lowest = min(tri[0, 2], tri[1, 2], tri[2, 2])
+        highest = max(tri[0, 2], tri[1, 2], tri[2, 2])
+        start = max(math.ceil(min(tri[0, 0], tri[1, 0], tri[2, 0])), 0)
+        stop = min(math.ceil(max(tri[0, 0], tri[1, 0], tri[2, 0])), shape[0])
+        for i in range(start, stop):
+            low, high = _span(tri, i)
+            left = min(max(math.ceil(low), 0), shape[1])
+            right = min(max(math.ceil(high), 0), shape[1])
+            for j in range(left, right):
+                depth = tri[0, 2] - slope_i * (i - tri[0, 0])
+                depth -= slope_j * (j - tri[0, 1])
+                depth = min(max(depth, lowest), highest)
+                behind = max(math.ceil(depth), 0)
+                if behind >= shape[2]:
+                    continue
+                ray = i * shape[1] + j
+                if fill:
+                    at = first[ray]
+                    k[at], sign[at] = behind, turned
+                    first[ray] = at + 1
+                else:
+                    first[ray + 1] += 1
+
+
+@numba.njit(cache=True, nogil=True)
+def _span(tri, i):  # type: ignore[no-untyped-def]
+    """Where a triangle begins and ends on the line ``i`` of its first axis."""
+    low, high = np.inf, -np.inf
+    for edge in range(3):
+        a, b = edge, (edge + 1) % 3
+        if tri[a, 0] > tri[b, 0]:  # the same direction, hence the same rounding, from both sides
+            a, b = b, a
+        if tri[a, 0] <= i and tri[b, 0] > i:
+            at = tri[a, 1] + (i - tri[a, 0]) * (tri[b, 1] - tri[a, 1]) / (tri[b, 0] - tri[a, 0])
+            low, high = min(low, at), max(high, at)
+    return low, high
+
+
+@numba.njit(cache=True, nogil=True)
+def _fill_along_rays(found, value, out):  # type: ignore[no-untyped-def]
+    """See ``_fill``; ``found`` as ``Crossings``."""
+    first, k, sign = found
+    for i in range(out.shape[0]):
+        for j in range(out.shape[1]):
+            ray = i * out.shape[1] + j
+            begin, end = first[ray], first[ray + 1]
+            _in_order(k, sign, begin, end)
+            winding = 0
+            for at in range(begin, end):
+                winding += sign[at]
+                stop = k[at + 1] if at + 1 < end else out.shape[2]
+                if winding != 0:
+                    out[i, j, k[at] : stop] = value if value != 0 else winding
+
+
+@numba.njit(cache=True, nogil=True)
+def _in_order(k, sign, begin, end):  # type: ignore[no-untyped-def]
+    """Sort one ray's crossings, a handful, by ``k``."""
+    for at in range(begin + 1, end):
+        here, its = k[at], sign[at]
+        before = at - 1
+        while before >= begin and k[before] > here:
+            k[before + 1], sign[before + 1] = k[before], sign[before]
+            before -= 1
+        k[before + 1], sign[before + 1] = here, its

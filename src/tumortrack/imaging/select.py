@@ -2,26 +2,55 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Float, Int32, UInt8
 
 from tumortrack.core.errors import InputError
+from tumortrack.core.geometry import spacing_mm
 from tumortrack.core.types import FIRST_TUMOR, ORGAN, LabelVolume
-from tumortrack.imaging.grid import (
-    bounding_box,
-    components,
-    cropped,
-    label_counts,
-    moved_origin,
-    voxel_ml,
-)
-from tumortrack.imaging.pieces import GAP_MM, Pieces, attach_tumors, find_pieces
+from tumortrack.imaging import grid
 
 MIN_TUMOR_ML = 0.2
-MIN_KIDNEY_ML, MAX_KIDNEY_ML = 10.0, 2500.0  # a polycystic kidney can pass 2 litres
+_GAP_MM = 3.0  # annotators and resampling leave such gaps; a thicker slice counts as one voxel
+_MIN_KIDNEY_ML, _MAX_KIDNEY_ML = 10.0, 2500.0  # a polycystic kidney can pass 2 litres
 _MIDLINE_MARGIN_MM = 20.0
+
+
+@dataclass(frozen=True, eq=False)
+class _Pieces:
+    """Connected pieces of organ and tumor voxels, numbered 1, 2, ... largest first; 0 outside.
+
+    ``labels`` keep the map's own values; ``organ`` and ``tumors`` name those that count.
+    """
+
+    labels: UInt8[np.ndarray, "i j k"]
+    numbers: Int32[np.ndarray, "i j k"]
+    lps_from_index: Float[np.ndarray, "4 4"]
+    organ: int
+    tumors: tuple[int, ...]
+
+    @cached_property
+    def organ_ml(self) -> Float[np.ndarray, " n"]:
+        """Organ volume by piece number (entry 0 is the outside's: 0)."""
+        return self._ml((self.organ,))
+
+    @cached_property
+    def tumor_ml(self) -> Float[np.ndarray, " n"]:
+        """Tumor volume by piece number."""
+        return self._ml(self.tumors)
+
+    @property
+    def whole_ml(self) -> Float[np.ndarray, " n"]:
+        """Volume by piece number."""
+        return self.organ_ml + self.tumor_ml
+
+    def _ml(self, values: tuple[int, ...]) -> Float[np.ndarray, " n"]:
+        inside = self.numbers[np.isin(self.labels, values)]
+        count = np.bincount(inside, minlength=int(self.numbers.max()) + 1)
+        return count * grid.voxel_ml(self.lps_from_index)
 
 
 @dataclass(frozen=True)
@@ -39,14 +68,14 @@ def select_labels(
     tumor: int | None = None,
     min_tumor_ml: float = MIN_TUMOR_ML,
 ) -> tuple[LabelVolume, list[str]]:
-    """Keep one kidney (label 1) and its tumors (2, 3, ...), cropped with a margin.
+    """Keep one kidney (label 1) and its tumors (2, 3, ...), grid.cropped with a margin.
 
     A kidney is a connected piece of organ and tumor voxels with at least 10 ml of organ and a
     tenth of the largest one's volume (where there is none, the piece with most organ). A tumor
-    within 3 mm of a kidney belongs to it: see ``pieces.attach_tumors``. One farther off is left
-    out with a note; other pieces are specks and go. A tumor is a piece of one tumor label inside
-    that kidney; smaller ones than ``min_tumor_ml`` become organ. Different tumor labels keep
-    their order; the pieces of one label follow each other, largest first.
+    within 3 mm of a kidney belongs to it: see ``_attach_tumors``. One farther off is left out with
+    a note; other pieces are specks and dropped. A tumor is a piece of one tumor label inside that
+    kidney; smaller ones than ``min_tumor_ml`` become organ. Different tumor labels keep their
+    order; the pieces of one label follow each other, largest first.
 
     Args:
         side: the PATIENT's ``left`` or ``right``; None takes the kidney with most tumor.
@@ -61,33 +90,34 @@ def select_labels(
             tumor but one apart from every kidney.
     """
     labels = label_volume.labels
-    present = [int(n) for n in np.flatnonzero(label_counts(labels)) if n > 0]
+    present = [int(n) for n in np.flatnonzero(grid.label_counts(labels)) if n > 0]
     tumors = _tumor_labels(present, organ, tumor)
     affine = label_volume.lps_from_index
-    box = bounding_box(np.isin(labels, [organ, *tumors]), affine, 2.0)
-    affine = moved_origin(affine, box)
-    pieces = find_pieces(labels[box], affine, organ, tumors)
+    box = grid.bounding_box(np.isin(labels, [organ, *tumors]), affine, 2.0)
+    affine = grid.moved_origin(affine, box)
+    numbered, _ = grid.components(np.isin(labels[box], [organ, *tumors]))
+    pieces = _Pieces(labels[box], numbered, affine, organ, tuple(tumors))
     numbers = _kidney_pieces(pieces)
-    pieces, notes, apart = attach_tumors(pieces, numbers, min_tumor_ml)
+    pieces, notes, apart = _attach_tumors(pieces, numbers, min_tumor_ml)
     kidneys = _kidneys(pieces, numbers)
     notes += _left_out(pieces, kidneys, apart, min_tumor_ml)
     middle = label_volume.lps_from_index @ [*(np.array(labels.shape) / 2), 1]
     chosen, more = _choose_kidney(kidneys, side, float(middle[0]))
     notes += more
-    if not MIN_KIDNEY_ML <= chosen.ml <= MAX_KIDNEY_ML:
+    if not _MIN_KIDNEY_ML <= chosen.ml <= _MAX_KIDNEY_ML:
         raise InputError(
             f"label {organ} and its tumors fill {chosen.ml:.1f} ml; a kidney has "
-            f"{MIN_KIDNEY_ML:g} to {MAX_KIDNEY_ML:g} ml. Check --organ, --tumor and the spacing."
+            f"{_MIN_KIDNEY_ML:g} to {_MAX_KIDNEY_ML:g} ml. Check --organ, --tumor and the spacing."
         )
     kidney = pieces.numbers == chosen.piece
-    box = bounding_box(kidney, affine, 2.0)
+    box = grid.bounding_box(kidney, affine, 2.0)
     out, more = _number_tumors(
         np.where(kidney, pieces.labels, 0)[box].astype(np.uint8),
         tumors,
-        voxel_ml(affine),
+        grid.voxel_ml(affine),
         min_tumor_ml,
     )
-    return cropped(out, moved_origin(affine, box)), notes + more
+    return grid.cropped(out, grid.moved_origin(affine, box)), notes + more
 
 
 def _tumor_labels(present: list[int], organ: int, tumor: int | None) -> list[int]:
@@ -109,16 +139,16 @@ def _tumor_labels(present: list[int], organ: int, tumor: int | None) -> list[int
     return [tumor]
 
 
-def _kidney_pieces(pieces: Pieces) -> list[int]:
+def _kidney_pieces(pieces: _Pieces) -> list[int]:
     """The numbers of the pieces that hold enough organ to be a kidney, largest first."""
     whole_ml = pieces.whole_ml
-    large = [n for n in range(1, len(whole_ml)) if pieces.organ_ml[n] >= MIN_KIDNEY_ML]
+    large = [n for n in range(1, len(whole_ml)) if pieces.organ_ml[n] >= _MIN_KIDNEY_ML]
     if not large:  # a kidney nearly eaten up by its tumor, or a very small one
         return [int(pieces.organ_ml.argmax())]
     return [n for n in large if whole_ml[n] >= whole_ml[large].max() / 10]
 
 
-def _kidneys(pieces: Pieces, numbers: list[int]) -> list[_Kidney]:
+def _kidneys(pieces: _Pieces, numbers: list[int]) -> list[_Kidney]:
     from scipy import ndimage
 
     whole_ml = pieces.whole_ml
@@ -132,8 +162,75 @@ def _kidneys(pieces: Pieces, numbers: list[int]) -> list[_Kidney]:
     return out
 
 
+def _attach_tumors(
+    pieces: _Pieces, kidneys: list[int], min_tumor_ml: float
+) -> tuple[_Pieces, list[str], list[int]]:
+    """Join every piece with a tumor of at least ``min_tumor_ml`` to a kidney within 3 mm.
+
+    The gap (up to 3 mm, or one voxel where voxels are larger) is filled with organ, no wider
+    than the two face each other, so that organ and tumor have one surface.
+
+    Args:
+        kidneys: the numbers of the pieces that are kidneys.
+
+    Returns:
+        The pieces with joined ones numbered as their kidney, notes, and the numbers of the
+        pieces that lie farther off.
+    """
+    notes: list[str] = []
+    apart: list[int] = []
+    for number in range(1, len(pieces.tumor_ml)):
+        ml = float(pieces.tumor_ml[number])
+        if number in kidneys or ml == 0 or ml < min_tumor_ml:
+            continue
+        joined = _joined(pieces, kidneys, number)
+        if joined is None:
+            apart.append(number)
+        else:
+            pieces, gap_mm, bridge_ml = joined
+            notes.append(
+                f"a tumor of {ml:.2f} ml lies {gap_mm:.1f} mm off the kidney's labels: taken as "
+                f"the kidney's, the gap filled with {bridge_ml:.2f} ml of organ"
+            )
+    return pieces, notes, apart
+
+
+def _joined(
+    pieces: _Pieces, kidneys: list[int], number: int
+) -> tuple[_Pieces, float, float] | None:
+    """The pieces with one joined to its nearest kidney, the gap in mm and what fills it in ml."""
+    from scipy import ndimage
+
+    spacing = spacing_mm(pieces.lps_from_index)
+    reach_mm = max(_GAP_MM, float(spacing.max()))
+    box = grid.bounding_box(
+        pieces.numbers == number, pieces.lps_from_index, reach_mm + 2 * float(spacing.max())
+    )
+    numbers = pieces.numbers[box]
+    own, kidney = numbers == number, np.isin(numbers, kidneys)
+    if not kidney.any():
+        return None
+    to_kidney, nearest = ndimage.distance_transform_edt(
+        ~kidney, sampling=spacing, return_indices=True
+    )
+    here = np.unravel_index(np.where(own, to_kidney, np.inf).argmin(), own.shape)
+    there = tuple(int(axis[here]) for axis in nearest)
+    steps = np.abs(np.subtract(here, there))
+    gap_mm = float(np.linalg.norm(np.maximum(steps - 1, 0) * spacing))  # between voxels' faces
+    if gap_mm > reach_mm:
+        return None
+    to_own = ndimage.distance_transform_edt(~own, sampling=spacing)
+    between = to_kidney + to_own <= float(to_kidney[here]) + float(np.median(spacing))
+    bridge = between & (numbers == 0)
+    joined, labels = pieces.numbers.copy(), pieces.labels.copy()
+    joined[box][own | bridge] = numbers[there]
+    labels[box][bridge] = pieces.organ
+    ml = float(bridge.sum()) * grid.voxel_ml(pieces.lps_from_index)
+    return replace(pieces, labels=labels, numbers=joined), gap_mm, ml
+
+
 def _left_out(
-    pieces: Pieces, kidneys: list[_Kidney], apart: list[int], min_tumor_ml: float
+    pieces: _Pieces, kidneys: list[_Kidney], apart: list[int], min_tumor_ml: float
 ) -> list[str]:
     """Notes on tumors that no kidney is near, and on specks; refused where no other tumor is."""
     notes: list[str] = []
@@ -147,11 +244,11 @@ def _left_out(
     text = " and ".join(f"{pieces.tumor_ml[n]:.1f} ml" for n in apart[:5])
     if not any(k.tumor_ml > 0 and k.tumor_ml >= min_tumor_ml for k in kidneys):
         raise InputError(
-            f"the only tumor ({text}) lies more than {GAP_MM:g} mm from every kidney. Check the "
+            f"the only tumor ({text}) lies more than {_GAP_MM:g} mm from every kidney. Check the "
             "labels and --organ, or give --tumor 0 to leave it out."
         )
     notes.append(
-        f"LEFT OUT: tumor of {text}, more than {GAP_MM:g} mm from every kidney. If it belongs to "
+        f"LEFT OUT: tumor of {text}, more than {_GAP_MM:g} mm from every kidney. If it belongs to "
         "the kidney, close the gap in the label map"
     )
     return notes
@@ -180,7 +277,7 @@ def _choose_kidney(
         name = "left" if best.x_mm > middle_x_mm else "right"
         return best, [f"the patient's {name} kidney was chosen: it bears most tumor"]
     sign = 1 if side == "left" else -1
-    # One kidney alone says nothing of the midline but the image's: near it, trust the user.
+    # With one kidney only the image's midline is known: near it, trust the user.
     slack = _MIDLINE_MARGIN_MM if len(kidneys) == 1 else 0.0
     fitting = [k for k in kidneys if sign * (k.x_mm - middle_x_mm) > -slack]
     if not fitting:
@@ -209,7 +306,7 @@ def _number_tumors(
         notes.append(f"holes of {filled_ml:.2f} ml inside the organ filled")
     number = FIRST_TUMOR
     for value in tumors:
-        pieces, counts = components(labels == value)
+        pieces, counts = grid.components(labels == value)
         kept = [n for n in range(len(counts)) if counts[n] * voxel_volume_ml >= min_tumor_ml]
         if lost := len(counts) - len(kept):
             lost_ml = float(counts[len(kept) :].sum()) * voxel_volume_ml

@@ -10,13 +10,12 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Int
 
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import spacing_mm, transform_points
 from tumortrack.core.types import FIRST_TUMOR, Anatomy, LabelVolume, Mesh, part_names
-from tumortrack.imaging.grid import bounding_box, voxel_ml
-from tumortrack.imaging.shells import largest_shell
+from tumortrack.imaging.grid import extent_mm, tight_box, voxel_ml
 
 _TRIANGLES = 28_000  # aimed at for the organ
 _BLUR_VOXELS = 0.9  # enough to melt steps of one voxel, too little to lose a small tumor
@@ -76,9 +75,8 @@ def _surface(name: str, mask: np.ndarray, affine: np.ndarray, step_mm: float) ->
     from scipy import ndimage
 
     spacing = spacing_mm(affine)
-    box = bounding_box(mask, affine, 0.0)
-    extent = np.array([s.stop - s.start for s in box]) * spacing
-    step_mm = min(step_mm, float(extent.min()) / _STEPS_ACROSS)
+    box = tight_box(mask)
+    step_mm = min(step_mm, float(extent_mm(box, spacing).min()) / _STEPS_ACROSS)
     blur = np.maximum(_BLUR_VOXELS, 0.6 * step_mm / spacing)
     margin = np.ceil(4 * blur + 2).astype(int)
     field = np.pad(mask[box].astype(np.float32), [(m, m) for m in margin.tolist()])
@@ -103,7 +101,7 @@ def _surface(name: str, mask: np.ndarray, affine: np.ndarray, step_mm: float) ->
 def _keep_volume(
     volume_error: Callable[[float], tuple[Mesh, float]], level: float, highest: float
 ) -> Mesh:
-    """The mesh whose volume errs least: secant steps on the level, halving where they go astray.
+    """The mesh whose volume errs least: secant steps on the level, bisection where they fail.
 
     Volume falls with the level, but may jump where a piece comes off; then no level is right.
     """
@@ -159,7 +157,7 @@ def _boundary_distance(mesh: Mesh, mask: np.ndarray, affine: np.ndarray) -> np.n
     """
     from scipy.spatial import cKDTree
 
-    box = bounding_box(mask, affine, 0.0)
+    box = tight_box(mask)
     padded = np.pad(mask[box], 1)
     raster = np.stack(np.meshgrid(*[np.linspace(-0.4, 0.4, 5)] * 2), -1).reshape(-1, 2)
     points = []
@@ -171,3 +169,26 @@ def _boundary_distance(mesh: Mesh, mask: np.ndarray, affine: np.ndarray) -> np.n
     tree = cKDTree(transform_points(affine, np.concatenate(points)))
     vertices = mesh.vertices_mm[:: max(1, len(mesh.vertices_mm) // 4000)]
     return tree.query(vertices)[0] / float(spacing_mm(affine).max())
+
+
+def largest_shell(mesh: Mesh) -> Mesh:
+    """The piece that encloses most (by the size of its signed volume); shells inside it and
+    specks are dropped."""
+    if len(mesh.faces) == 0:
+        return mesh
+    piece = _piece_of_face(mesh)
+    a, b, c = (mesh.vertices_mm[mesh.faces[:, n]] - mesh.vertices_mm[0] for n in range(3))
+    volumes = np.bincount(piece, np.einsum("ij,ij->i", a, np.cross(b, c)))
+    used, compact = np.unique(mesh.faces[piece == np.abs(volumes).argmax()], return_inverse=True)
+    return Mesh(mesh.vertices_mm[used], compact.reshape(-1, 3))
+
+
+def _piece_of_face(mesh: Mesh) -> Int[np.ndarray, " f"]:
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    a, b, c = mesh.faces.T
+    n = len(mesh.vertices_mm)
+    graph = coo_array((np.ones(2 * len(a), np.int8), (np.r_[a, b], np.r_[b, c])), shape=(n, n))
+    _, piece = connected_components(graph, directed=False)
+    return piece[a]

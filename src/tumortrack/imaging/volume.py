@@ -1,35 +1,50 @@
-"""Volumes from files: a DICOM folder, NIfTI or NRRD -> Volume or LabelVolume, LPS mm."""
+"""Volumes from files: a DICOM folder, NIfTI or NRRD -> Volume or LabelVolume, LPS mm.
+
+NRRD is read here, so that nothing is trusted before it is checked; its format:
+https://teem.sourceforge.net/nrrd/format.html.
+"""
 
 from __future__ import annotations
 
+import bz2
+import math
+import zlib
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Float
 
 from tumortrack.core.errors import InputError
 from tumortrack.core.types import LabelVolume, Volume
+from tumortrack.imaging import grid
 from tumortrack.imaging.dicom import read_dicom
-from tumortrack.imaging.grid import label_counts
-from tumortrack.imaging.nifti import read_nifti, write_labels_nifti, write_volume_nifti
-from tumortrack.imaging.nrrd import read_nrrd
-from tumortrack.imaging.voxels import RawVolume
-
-__all__ = [
-    "is_label_map",
-    "labels_of",
-    "read_labels",
-    "read_raw",
-    "read_volume",
-    "volume_of",
-    "write_labels_nifti",
-    "write_volume_nifti",
-]
+from tumortrack.imaging.nifti import read_nifti
 
 _DETACHED = (".nhdr", ".mhd", ".hdr", ".img")
 _MOST_LABELS = 32  # distinct values that still look like a label map
+_MAX_HEADER = 2**20
+_TYPES = {
+    **dict.fromkeys(("signed char", "int8", "int8_t"), "i1"),
+    **dict.fromkeys(("uchar", "unsigned char", "uint8", "uint8_t"), "u1"),
+    **dict.fromkeys(
+        ("short", "short int", "signed short", "signed short int", "int16", "int16_t"), "i2"
+    ),
+    **dict.fromkeys(("ushort", "unsigned short", "unsigned short int", "uint16", "uint16_t"), "u2"),
+    **dict.fromkeys(("int", "signed int", "int32", "int32_t"), "i4"),
+    **dict.fromkeys(("uint", "unsigned int", "uint32", "uint32_t"), "u4"),
+    **dict.fromkeys(("longlong", "long long", "int64", "int64_t"), "i8"),
+    **dict.fromkeys(("ulonglong", "unsigned long long", "uint64", "uint64_t"), "u8"),
+    "float": "f4",
+    "double": "f8",
+}
+_LPS_FROM_SPACE = {
+    **dict.fromkeys(("lps", "left-posterior-superior"), (1.0, 1.0, 1.0)),
+    **dict.fromkeys(("ras", "right-anterior-superior"), (-1.0, -1.0, 1.0)),
+    **dict.fromkeys(("las", "left-anterior-superior"), (1.0, -1.0, 1.0)),
+}
 
 
-def read_raw(path: Path, series: str | None = None) -> RawVolume:
+def read_raw(path: Path, series: str | None = None) -> grid.RawVolume:
     """Read the voxels of any supported volume in their stored type.
 
     Raises:
@@ -45,7 +60,7 @@ def read_raw(path: Path, series: str | None = None) -> RawVolume:
     if name.endswith((".nii", ".nii.gz")):
         return read_nifti(path)
     if name.endswith(".nrrd"):
-        return read_nrrd(path)
+        return _read_nrrd(path)
     if name.endswith(_DETACHED):
         raise InputError(
             f"{path} is a header whose voxels lie in another file; detached data are refused. "
@@ -78,7 +93,7 @@ def read_labels(path: Path) -> LabelVolume:
     return labels_of(read_raw(path), path)
 
 
-def volume_of(raw: RawVolume, path: Path) -> Volume:
+def volume_of(raw: grid.RawVolume, path: Path) -> Volume:
     """Raw voxels as a CT; ``path`` names them in errors."""
     hu = raw.array.astype(np.float32, copy=False)
     low, high = float(hu.min()), float(hu.max())
@@ -91,27 +106,130 @@ def volume_of(raw: RawVolume, path: Path) -> Volume:
     return Volume(hu, raw.lps_from_index)
 
 
-def labels_of(raw: RawVolume, path: Path) -> LabelVolume:
+def labels_of(raw: grid.RawVolume, path: Path) -> LabelVolume:
     """Raw voxels as labels; ``path`` names them in errors."""
-    array = raw.array
-    low, high = float(array.min()), float(array.max())
+    low, high = float(raw.array.min()), float(raw.array.max())
     if not (low >= 0 and high <= 255):
         raise InputError(
             f"{path} is no label map: values from {low:g} to {high:g}; whole numbers from 0 to "
             "255 are allowed."
         )
-    labels = array.astype(np.uint8)
-    if array.dtype.kind == "f" and not np.array_equal(labels, array):
+    labels = _whole_numbers(raw.array)
+    if labels is None:
         raise InputError(f"{path} is no label map: it has fractions. Whole numbers are needed.")
     return LabelVolume(labels, raw.lps_from_index)
 
 
-def is_label_map(raw: RawVolume) -> bool:
+def is_label_map(raw: grid.RawVolume) -> bool:
     """True for whole numbers within 0..255 of which at most 32 occur: no CT looks like that."""
-    array = raw.array
-    if not (array.min() >= 0 and array.max() <= 255):
+    if not (raw.array.min() >= 0 and raw.array.max() <= 255):
         return False
+    labels = _whole_numbers(raw.array)
+    return labels is not None and int(np.count_nonzero(grid.label_counts(labels))) <= _MOST_LABELS
+
+
+def _whole_numbers(array: np.ndarray) -> np.ndarray | None:
+    """Numbers in 0..255 as uint8; None where one has a fraction."""
     labels = array.astype(np.uint8)
-    if array.dtype.kind == "f" and not np.array_equal(labels, array):
-        return False
-    return int(np.count_nonzero(label_counts(labels))) <= _MOST_LABELS
+    whole = array.dtype.kind != "f" or np.array_equal(labels, array)
+    return labels if whole else None
+
+
+def _read_nrrd(path: Path) -> grid.RawVolume:
+    """Read an attached .nrrd (raw, gzip or bzip2) with a stated patient space.
+
+    Raises:
+        InputError: damaged, detached, not 3-D, too large, without orientation, not in mm.
+    """
+    fields, start = _header(path)
+    try:
+        shape = tuple(int(n) for n in fields["sizes"].split())
+        dtype = np.dtype(_TYPES[fields["type"].lower()])
+        encoding = fields.get("encoding", "raw").lower()
+        lps_from_index = _lps_from_index(path, fields) if len(shape) == 3 else np.eye(4)
+    except (KeyError, ValueError, OverflowError) as error:
+        raise InputError(
+            f"{path}: the NRRD header is damaged or lacks a field ({error}). Export it again."
+        ) from error
+    grid.check_size(path, shape, dtype.itemsize)
+    grid.check_affine(path, lps_from_index)
+    if dtype.itemsize > 1:
+        if fields.get("endian", "").lower() not in ("little", "big"):
+            raise InputError(f"{path}: the NRRD header states no byte order. Export it again.")
+        dtype = dtype.newbyteorder("<" if fields["endian"].lower() == "little" else ">")
+    if encoding not in ("raw", "gzip", "gz", "bzip2", "bz2"):
+        raise InputError(f"{path}: encoding {encoding!r} is not read. Export as raw or gzip.")
+    n_bytes = math.prod(shape) * dtype.itemsize
+    if encoding in ("raw", "gzip", "gz"):
+        grid.check_stored(path, n_bytes, compressed=encoding != "raw")
+    data = _voxels(path, start, encoding, n_bytes)
+    array = np.frombuffer(data, dtype).reshape(shape, order="F")
+    return grid.RawVolume(array.astype(dtype.newbyteorder("="), copy=False), lps_from_index)
+
+
+def _header(path: Path) -> tuple[dict[str, str], int]:
+    """The fields up to the empty line, and the byte where the voxels start."""
+    with path.open("rb") as stream:
+        head = stream.read(_MAX_HEADER)
+    text, gap, _ = head.replace(b"\r\n", b"\n").partition(b"\n\n")
+    if not head.startswith(b"NRRD000"):
+        raise InputError(f"{path} is not a NRRD file. Export it again.")
+    fields: dict[str, str] = {}
+    for line in text.decode("latin-1").split("\n")[1:]:
+        if line.startswith("#") or ":=" in line:
+            continue
+        name, _, value = line.partition(":")
+        fields[name.strip().lower()] = value.strip()
+    if not gap or "data file" in fields or "datafile" in fields:
+        raise InputError(
+            f"{path}: its voxels lie in another file; detached data are refused. Export one "
+            "attached .nrrd file."
+        )
+    if any(fields.get(name, "0") != "0" for name in ("line skip", "byte skip", "lineskip")):
+        raise InputError(f"{path}: skipped lines or bytes are not read. Export it again.")
+    ends = [(head.find(mark), len(mark)) for mark in (b"\n\n", b"\r\n\r\n")]
+    position, length = min((at, n) for at, n in ends if at >= 0)
+    return fields, position + length
+
+
+def _lps_from_index(path: Path, fields: dict[str, str]) -> Float[np.ndarray, "4 4"]:
+    sign = _LPS_FROM_SPACE.get(fields.get("space", "").lower())
+    if sign is None or "space directions" not in fields:
+        raise InputError(
+            f"{path} states no patient orientation (space {fields.get('space')!r}), so left and "
+            "right are unknown. Export it with space left-posterior-superior or RAS."
+        )
+    units = [u for u in fields.get("space units", "").replace('"', " ").split() if u]
+    if any(unit.lower() not in ("mm", "millimeter", "millimetre") for unit in units):
+        raise InputError(f"{path} states its units as {units}; millimetres are needed.")
+    columns = [_vector(part) for part in fields["space directions"].split(")") if part.strip()]
+    lps_from_index = np.eye(4)
+    lps_from_index[:3, :3] = np.array(columns).T
+    lps_from_index[:3, 3] = _vector(fields.get("space origin", "(0,0,0)").rstrip(") "))
+    return np.diag([*sign, 1.0]) @ lps_from_index
+
+
+def _vector(text: str) -> list[float]:
+    numbers = [float(part) for part in text.strip().lstrip("(").split(",")]
+    if len(numbers) != 3:
+        raise ValueError(f"{text!r} is no 3-vector")
+    return numbers
+
+
+def _voxels(path: Path, start: int, encoding: str, n_bytes: int) -> bytes:
+    """At most ``n_bytes`` of voxels: a compressed file cannot unpack to more."""
+    with path.open("rb") as stream:
+        stream.seek(start)
+        stored = stream.read()
+    try:
+        if encoding == "raw":
+            data = stored[:n_bytes]
+        elif encoding in ("gzip", "gz"):
+            data = zlib.decompressobj(wbits=31).decompress(stored, n_bytes)
+        else:
+            data = bz2.BZ2Decompressor().decompress(stored, n_bytes)
+    except (zlib.error, OSError, EOFError) as error:
+        raise InputError(f"{path}: its compressed voxels are damaged: {error}.") from error
+    if len(data) < n_bytes:
+        raise InputError(f"{path} is truncated: {len(data)} of {n_bytes} bytes of voxels.")
+    return data

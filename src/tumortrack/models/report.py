@@ -11,7 +11,12 @@ import torch
 from jaxtyping import Float, Float64
 
 import tumortrack
-from tumortrack.core.types import Mesh, OccupancyCloud, SensorCloud
+from tumortrack.core.estimate import Estimate
+from tumortrack.core.geometry import transform_points
+from tumortrack.core.types import Anatomy, CameraLabels, Mesh, OccupancyCloud, SensorCloud
+from tumortrack.imaging.raster import label_grid
+
+CLOUD_POINTS = 40_000  # of an estimate made of surfaces
 
 
 def report_head(cloud: SensorCloud, seed: int) -> dict:
@@ -87,3 +92,38 @@ def describe_parts(
             "probability": float(sums[mine].sum() / points) if points else None,
         }
     return parts
+
+
+def estimate_of(
+    meshes: dict[str, Mesh], grid: int = 160, stamp_ns: int = 0, **report: object
+) -> Estimate:
+    """Surfaces of any method (camera frame, mm) as an estimate: labels are voxelised from them,
+    points are evenly chosen voxels with probability 1.
+
+    Args:
+        grid: voxels along the longest side of the labelled volume.
+        report: further entries of the estimate's report.
+    """
+    anatomy = Anatomy(tuple(meshes.values()))
+    camera_from_index, shape = grid_over(anatomy.organ.vertices_mm, grid)
+    labels = label_grid(anatomy, camera_from_index, shape)
+    voxels = np.flatnonzero(labels)
+    voxels = voxels[:: max(1, len(voxels) // CLOUD_POINTS)]
+    index = np.stack(np.unravel_index(voxels, labels.shape), 1).astype(float)
+    points_mm = transform_points(camera_from_index, index)
+    sure = np.ones(len(voxels))
+    inside = OccupancyCloud(points_mm, labels.reshape(-1)[voxels], sure, stamp_ns)
+    return Estimate(
+        inside,
+        CameraLabels(labels, camera_from_index),
+        meshes,
+        {
+            "tumortrack": tumortrack.__version__,
+            "units": "mm",
+            "frame": "camera",
+            "stamp_ns": stamp_ns,
+            "voxel_mm": float(camera_from_index[0, 0]),
+            "parts": describe_parts(tuple(meshes), meshes, inside),
+            **report,
+        },
+    )

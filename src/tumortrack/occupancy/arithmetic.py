@@ -33,7 +33,10 @@ class Arithmetic(Config, frozen=True):
 def can_pack(device: torch.device) -> bool:
     """Whether packed layers exist for the device: oneDNN on an x86 processor."""
     x86 = platform.machine().lower() in ("x86_64", "amd64")
-    return device.type == "cpu" and x86 and torch.backends.mkldnn.is_available()
+    if device.type != "cpu" or not x86 or not torch.backends.mkldnn.is_available():
+        return False
+    operators = torch.ops.mkldnn  # private: another PyTorch may lack them
+    return all(hasattr(operators, name) for name in ("_reorder_linear_weight", "_linear_pointwise"))
 
 
 def possible(device: torch.device) -> tuple[Numbers, ...]:

@@ -1,4 +1,4 @@
-"""Volumes as scanners and research tools store them: a DICOM CT series, and NIfTI."""
+"""A CT as scanners store it: a DICOM series."""
 
 from __future__ import annotations
 
@@ -8,11 +8,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tumortrack.core import nifti as core_nifti
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import spacing_mm
 from tumortrack.core.store import new_folder
-from tumortrack.core.types import LabelVolume, Volume
+from tumortrack.core.types import Volume
 
 if TYPE_CHECKING:
     from pydicom.dataset import Dataset
@@ -45,25 +44,6 @@ def write_dicom_series(
             dataset = _header(entropy, description)
             _put_slice(dataset, volume, k, entropy)
             dcmwrite(aside / f"CT{name:05d}.dcm", dataset, enforce_file_format=True)
-
-
-def write_nifti(volume: Volume | LabelVolume, path: Path) -> None:
-    """Write NIfTI-1 (.nii or .nii.gz): HU as int16, labels as uint8; LPS turned into RAS.
-
-    Raises:
-        InputError: another suffix, or HU outside int16.
-        StorageError: the disk refused; an older file at ``path`` is untouched.
-    """
-    path = Path(path)
-    if not path.name.endswith((".nii", ".nii.gz")):
-        raise InputError(f"{path}: a NIfTI file's name must end in .nii or .nii.gz.")
-    if isinstance(volume, LabelVolume):
-        data = np.asarray(volume.labels)
-    else:
-        if not (np.abs(volume.hu) <= 32767).all():
-            raise InputError("HU must be finite and within -32767..32767 to be stored.")
-        data = np.rint(volume.hu).astype(np.int16)
-    core_nifti.write_nifti(path, data, volume.lps_from_index, lps=True)
 
 
 def _check(volume: Volume) -> None:

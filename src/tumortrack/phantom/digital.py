@@ -13,7 +13,7 @@ import itertools
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError
@@ -129,9 +129,10 @@ def phantom_labels(parameters: PhantomParameters, voxel_mm: float = 0.8) -> Labe
     start_mm = (lower_mm + upper_mm) / 2 - (counts - 1) / 2 * voxel_mm
     x, y, z = (s + voxel_mm * np.arange(n) for s, n in zip(start_mm, counts, strict=True))
     axes = (x, y, z)
-    inside = organ_mask(parameters, axes)
+    inside = organ_field(parameters, axes) < 0
     labels = np.where(inside, ORGAN, 0).astype(np.uint8)
-    for n, mask in enumerate(tumor_masks(parameters, axes)):
+    for n, field in enumerate(tumor_fields(parameters, axes)):
+        mask = field < 0
         if not (mask & inside).any():
             raise InputError(
                 f"tumor {n + 1} lies wholly outside the organ; move its center_mm inwards."
@@ -155,11 +156,6 @@ def gap_mm(one: TumorParameters, other: TumorParameters) -> float:
     """A lower bound of the distance between two tumors' surfaces."""
     radii_mm = [tumor.diameter_mm / 2 * (1 + tumor.lobulation) for tumor in (one, other)]
     return float(np.linalg.norm(np.subtract(one.center_mm, other.center_mm)) - sum(radii_mm))
-
-
-def organ_mask(parameters: PhantomParameters, axes_mm: Axes) -> Bool[np.ndarray, "i j k"]:
-    """Where the organ is, tumors aside, on the grid of three axes (organ frame, mm)."""
-    return organ_field(parameters, axes_mm) < 0
 
 
 def organ_field(parameters: PhantomParameters, axes_mm: Axes) -> Float[np.ndarray, "i j k"]:
@@ -236,11 +232,6 @@ def _lumps(parameters: PhantomParameters, point_mm: tuple[np.ndarray, ...]) -> n
         angle = sum(w * p for w, p in zip(wave, point_mm, strict=True))
         total += np.sin(angle + phase) * parameters.lump_mm / 4
     return total
-
-
-def tumor_masks(parameters: PhantomParameters, axes_mm: Axes) -> list[Bool[np.ndarray, "i j k"]]:
-    """Where each tumor is, in label order, on the grid of three axes (organ frame, mm)."""
-    return [field < 0 for field in tumor_fields(parameters, axes_mm)]
 
 
 def tumor_fields(parameters: PhantomParameters, axes_mm: Axes) -> list[Float[np.ndarray, "i j k"]]:

@@ -1,8 +1,7 @@
 """Random kidneys with random tumors, as many as wanted: what pretraining learns from.
 
 Each is the built-in phantom's implicit surface with parameters of its own, turned at random in the
-CT and seen from a random side; they differ more than `sampling`'s phantoms, which stay near the
-paper's. Nothing in them comes from a patient.
+CT and seen from a random side. Nothing in them comes from a patient.
 """
 
 from __future__ import annotations
@@ -13,16 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from tumortrack.core.errors import TumortrackError
 from tumortrack.core.types import Anatomy, Mesh
-from tumortrack.phantom.digital import (
-    SMALLEST_GAP_MM,
-    Axes,
-    PhantomParameters,
-    TumorParameters,
-    gap_mm,
-    organ_field,
-    sorted_tumors,
-    tumor_fields,
-)
+from tumortrack.phantom import digital
 
 _STEP_MM = 2.0  # of the grid that surfaces are drawn from
 _MARGIN_MM = 6.0
@@ -42,24 +32,23 @@ def random_anatomy(seed: int) -> tuple[Anatomy, tuple[float, float, float]]:
         InputError: a negative seed.
     """
     rng = np.random.default_rng([seed, 0x81D])
-    parameters = random_parameters(rng)
+    parameters = _random_parameters(rng)
     turn = Rotation.random(rng=rng).as_matrix()
     if rng.uniform() < 0.5:  # a left kidney: the mirror image
         turn = turn @ np.diag([-1.0, 1.0, 1.0])
     centre = rng.uniform(-100, 100, 3)
-    parts = tuple(
-        _placed(_surface(field, axes), turn, centre) for field, axes in _fields(parameters)
-    )
+    fields, axes = _fields(parameters)
+    parts = tuple(_placed(_surface(field, axes), turn, centre) for field in fields)
     aside = Rotation.from_euler("z", rng.uniform(-_SIDEWAYS_DEG, _SIDEWAYS_DEG), degrees=True)
     x, y, z = turn @ aside.apply([0.0, -1.0, 0.0])
     return Anatomy(parts), (float(x), float(y), float(z))
 
 
-def random_parameters(rng: np.random.Generator) -> PhantomParameters:
+def _random_parameters(rng: np.random.Generator) -> digital.PhantomParameters:
     """The shape of a random kidney and its tumors."""
     length = rng.uniform(90, 130)
     size = (length * rng.uniform(0.45, 0.62), length * rng.uniform(0.38, 0.52), length)
-    return PhantomParameters(
+    return digital.PhantomParameters(
         size_mm=size,
         bend_mm=rng.uniform(2, 18),
         taper=rng.uniform(0, 0.25),
@@ -72,37 +61,38 @@ def random_parameters(rng: np.random.Generator) -> PhantomParameters:
 
 def _random_tumors(
     size_mm: tuple[float, float, float], rng: np.random.Generator
-) -> tuple[TumorParameters, ...]:
+) -> tuple[digital.TumorParameters, ...]:
     """Tumors that keep apart: centres anywhere from the middle out to the organ's surface."""
     wanted = int(rng.integers(1, _MOST_TUMORS + 1))
-    tumors: list[TumorParameters] = []
+    tumors: list[digital.TumorParameters] = []
     for _ in range(_ATTEMPTS):
         direction = rng.normal(size=3)
         depth = rng.uniform(0.1, 0.95) * np.array(size_mm) / 2
         x, y, z = direction / np.linalg.norm(direction) * depth
         diameter = float(np.exp(rng.uniform(np.log(10), np.log(45))))
-        tumor = TumorParameters(diameter_mm=diameter, center_mm=(x, y, z))
-        if all(gap_mm(tumor, other) >= SMALLEST_GAP_MM for other in tumors):
+        tumor = digital.TumorParameters(diameter_mm=diameter, center_mm=(x, y, z))
+        if all(digital.gap_mm(tumor, other) >= digital.SMALLEST_GAP_MM for other in tumors):
             tumors.append(tumor)
         if len(tumors) == wanted:
             break
     return tuple(tumors)
 
 
-def _fields(parameters: PhantomParameters) -> list[tuple[Float[np.ndarray, "i j k"], Axes]]:
-    """About the signed distance to the whole organ and to each tumor, on a grid about it."""
+def _fields(
+    parameters: digital.PhantomParameters,
+) -> tuple[list[Float[np.ndarray, "i j k"]], digital.Axes]:
+    """About the signed distance to the whole organ and to each tumor, on a grid round them."""
     reach = np.array(parameters.size_mm) / 2
-    for tumor in sorted_tumors(parameters):
+    for tumor in digital.sorted_tumors(parameters):
         reach = np.maximum(reach, np.abs(tumor.center_mm) + 0.6 * tumor.diameter_mm)
     reach = reach + _MARGIN_MM
     x, y, z = (np.arange(-length, length + _STEP_MM, _STEP_MM) for length in reach)
-    axes = (x, y, z)
-    tumors = tumor_fields(parameters, axes)
-    whole = np.minimum.reduce([organ_field(parameters, axes), *tumors])
-    return [(field, axes) for field in (whole, *tumors)]
+    tumors = digital.tumor_fields(parameters, (x, y, z))
+    whole = np.minimum.reduce([digital.organ_field(parameters, (x, y, z)), *tumors])
+    return [whole, *tumors], (x, y, z)
 
 
-def _surface(field_mm: Float[np.ndarray, "i j k"], axes: Axes) -> Mesh:
+def _surface(field_mm: Float[np.ndarray, "i j k"], axes: digital.Axes) -> Mesh:
     """The closed zero surface of a field, its largest piece, organ frame."""
     import trimesh
     from skimage.measure import marching_cubes

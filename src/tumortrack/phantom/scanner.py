@@ -91,13 +91,10 @@ def scan(labels: LabelVolume, parameters: ScannerParameters, seed: int) -> Volum
 
 def _crop(labels: LabelVolume) -> tuple[np.ndarray, np.ndarray]:
     """The box round all labels with one empty voxel about it, and its lps_from_index."""
-    bounds = []
-    for axis in range(3):
-        rest = tuple(other for other in range(3) if other != axis)
-        filled = np.flatnonzero(labels.labels.any(axis=rest))
-        if len(filled) == 0:
-            raise InputError("the label map is empty (0 everywhere); there is nothing to scan.")
-        bounds.append(slice(filled[0], filled[-1] + 1))
+    if not labels.labels.any():
+        raise InputError("the label map is empty (0 everywhere); there is nothing to scan.")
+    hits = [np.flatnonzero(labels.labels.any(axis=rest)) for rest in ((1, 2), (0, 2), (0, 1))]
+    bounds = [slice(hit[0], hit[-1] + 1) for hit in hits]
     lps_from_crop = labels.lps_from_index.copy()
     first = np.array([b.start - 1 for b in bounds])
     lps_from_crop[:3, 3] += lps_from_crop[:3, :3] @ first
@@ -141,7 +138,7 @@ def _field_of_view(
     objects: list[tuple[np.ndarray, np.ndarray, float]],
     parameters: ScannerParameters,
 ) -> tuple[np.ndarray, tuple[int, int, int]]:
-    """lps_from_index and shape of a grid that holds everything, tilted as asked for."""
+    """lps_from_index and shape of a grid that holds everything, tilted as requested."""
     from scipy.spatial.transform import Rotation
 
     lower = np.min([box_mm[0] - parameters.margin_mm, *(o[0] - 4 for o in objects)], axis=0)

@@ -8,6 +8,7 @@ from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError
 from tumortrack.plan.values import Method
 
+Direction = Literal["shortest", "clockwise", "anticlockwise"]
 _ALLOWED = {
     "margin_mm": (1.0, 20.0),
     "sigmas": (0.0, 10.0),
@@ -29,17 +30,17 @@ class ResectionConfig(Config, frozen=True, kw_only=True):
             keep the margin in all directions.
         tumor: its part's name (tumor_1, ...); empty: the one that lies farthest out.
         margin_mm: least distance between tumor and cut (the paper's 5).
-        sigmas: so many standard deviations of the estimate's own uncertainty are added to it.
+        sigmas: standard deviations of the estimate's own uncertainty that are added to the margin.
         spacing_mm: between points of a stroke.
         layer_mm: height of a layer, where the method is ``margin``.
-        stroke_mm: how wide a sheet one stroke of the horizontal instrument cuts.
+        stroke_mm: width that one stroke of the horizontal instrument cuts.
         order: of layers, from the top down or from the floor up.
         direction: of strokes, seen from above; shortest: each from the end that is nearer to where
             the one before ended.
         lead_mm: strokes begin and end so far outside the organ.
         least_exophytic: a tumor with a smaller share outside the organ's hull lies wholly inside.
-        most_healthy: no plan takes more of the organ's healthy tissue, as a share.
-        most_margin_mm: nor is the margin with its uncertainty wider anywhere.
+        most_healthy: the largest share of the organ's healthy tissue that a plan may take.
+        most_margin_mm: the widest margin, with its uncertainty, anywhere.
     """
 
     method: Method = "margin"
@@ -50,7 +51,7 @@ class ResectionConfig(Config, frozen=True, kw_only=True):
     layer_mm: float = 4.0
     stroke_mm: float = 6.0
     order: Literal["down", "up"] = "down"
-    direction: Literal["shortest", "clockwise", "anticlockwise"] = "shortest"
+    direction: Direction = "shortest"
     lead_mm: float = 5.0
     least_exophytic: float = 0.05
     most_healthy: float = 0.5

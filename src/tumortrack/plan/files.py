@@ -6,7 +6,7 @@ Everything in it is in the table's frame, mm; ``plan.json`` has ``table_from_cam
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,7 +22,7 @@ from tumortrack.core.types import Mesh
 from tumortrack.plan.config import ResectionConfig
 from tumortrack.plan.motions import JOINTS, Motions, MotionStage
 from tumortrack.plan.values import Cut, CutLayer, Located, ResectionPlan
-from tumortrack.sense.ply import framed_ply
+from tumortrack.sense.ply import cloud_ply
 
 KIND = "plan"
 _NAME, _STROKES, _MOTIONS = "plan.json", "strokes.ply", "motions.safetensors"
@@ -30,9 +30,9 @@ _NAME, _STROKES, _MOTIONS = "plan.json", "strokes.ply", "motions.safetensors"
 
 @dataclass(frozen=True, eq=False)
 class PlanFolder:
-    """What a plan's folder holds. ``cell``: the configuration of table and arms that the motions
-    are for, as JSON would give it; motions and cell are None where no arms were planned.
-    ``case_sha256``: of the case that the organ was located by; empty where nobody said."""
+    """What a plan's folder holds. ``cell``: the workcell's configuration that the motions are for,
+    as JSON; motions and cell are None where no arms were planned. ``case_sha256``: of the case that
+    the organ was located by; empty where unknown."""
 
     plan: ResectionPlan
     config: ResectionConfig
@@ -52,7 +52,7 @@ def write_plan(
     overwrite: bool = False,
 ) -> None:
     """All or nothing. ``inputs``: sha256 of what it was made from; ``more`` adds files (pictures)
-    to the folder that is given to it.
+    to the folder given to it.
 
     Raises:
         InputError: the folder exists and ``overwrite`` is False.
@@ -70,7 +70,7 @@ def write_plan(
             "seconds": None if content.motions is None else content.motions.seconds,
         }
         store.write_json(aside / _NAME, data)
-        _write_strokes(aside / _STROKES, plan)
+        store.write_atomically(aside / _STROKES, _strokes(plan))
         for name, mesh in content.meshes.items():
             write_mesh(aside / f"{name}.ply", mesh)
         if content.motions is not None:
@@ -81,8 +81,8 @@ def write_plan(
 
 def as_located(content: PlanFolder) -> Located:
     """What the plan was made on, without its cloud: for pictures."""
-    none = np.zeros((0, 3))
-    return Located(none, np.zeros(0, np.uint8), content.meshes, stamp_ns=content.plan.stamp_ns)
+    points, labels = np.zeros((0, 3)), np.zeros(0, np.uint8)
+    return Located(points, labels, content.meshes, stamp_ns=content.plan.stamp_ns)
 
 
 def read_plan(folder: Path) -> PlanFolder:
@@ -110,7 +110,7 @@ def read_plan(folder: Path) -> PlanFolder:
 
 
 def as_builtins(plan: ResectionPlan) -> dict[str, Any]:
-    """The plan as what JSON would give back; an infinite height is null."""
+    """The plan as JSON holds it; an infinite height is null."""
     return {
         "method": plan.method,
         "tumor": plan.tumor,
@@ -144,24 +144,16 @@ def as_builtins(plan: ResectionPlan) -> dict[str, Any]:
 
 
 def from_plain(data: dict[str, Any]) -> ResectionPlan:
-    """What ``as_builtins`` took apart. Raises KeyError, TypeError or ValueError if it did not."""
+    """The inverse of ``as_builtins``; raises KeyError, TypeError or ValueError for other data."""
     return ResectionPlan(
         method=data["method"],
         tumor=data["tumor"],
         label=int(data["label"]),
-        grasp_mm=np.array(data["grasp_mm"], float),
+        grasp_mm=_array(data["grasp_mm"]),
         cuts=tuple(
-            Cut(int(cut["sweep"]), np.array(cut["path_mm"], float), cut["kind"])
-            for cut in data["cuts"]
+            Cut(int(cut["sweep"]), _array(cut["path_mm"]), cut["kind"]) for cut in data["cuts"]
         ),
-        layers=tuple(
-            CutLayer(
-                float(layer["bottom_mm"]),
-                np.inf if layer["top_mm"] is None else float(layer["top_mm"]),
-                tuple(np.array(ring, float) for ring in layer["rings_mm"]),
-            )
-            for layer in data["layers"]
-        ),
+        layers=tuple(_layer(layer) for layer in data["layers"]),
         margin_mm=float(data["margin_mm"]),
         volumes_ml={name: float(value) for name, value in data["volumes_ml"].items()},
         exophytic=float(data["exophytic"]),
@@ -170,33 +162,39 @@ def from_plain(data: dict[str, Any]) -> ResectionPlan:
     )
 
 
-def _write_strokes(path: Path, plan: ResectionPlan) -> None:
+def _layer(data: dict[str, Any]) -> CutLayer:
+    top_mm = np.inf if data["top_mm"] is None else float(data["top_mm"])
+    return CutLayer(float(data["bottom_mm"]), top_mm, tuple(map(_array, data["rings_mm"])))
+
+
+def _array(values: Any) -> np.ndarray:
+    return np.array(values, float)
+
+
+def _strokes(plan: ResectionPlan) -> bytes:
     """The strokes' points in their order, each with its sweep, its stroke and whether it is one of
     the floor; the grasp point last, with sweep 0."""
-    points, sweeps, strokes, floor = [plan.grasp_mm[None]], [0], [0], [0]
-    for number, cut in reversed(list(enumerate(plan.cuts, start=1))):
-        n = len(cut.path_mm)
-        points.insert(0, cut.path_mm)
-        sweeps = [cut.sweep] * n + sweeps
-        strokes = [number] * n + strokes
-        floor = [int(cut.kind == "floor")] * n + floor
-    properties: dict[str, np.ndarray] = {
-        "sweep": np.array(sweeps, np.int32),
-        "stroke": np.array(strokes, np.int32),
-        "floor": np.array(floor, np.uint8),
+    cuts = plan.cuts
+    points = [*(cut.path_mm for cut in cuts), plan.grasp_mm[None]]
+
+    def of_points(of_strokes: Iterable[int], kind: type) -> np.ndarray:
+        return np.repeat(np.array([*of_strokes, 0], kind), [len(each) for each in points])
+
+    properties = {
+        "sweep": of_points((cut.sweep for cut in cuts), np.int32),
+        "stroke": of_points(range(1, len(cuts) + 1), np.int32),
+        "floor": of_points((cut.kind == "floor" for cut in cuts), np.uint8),
     }
-    table = framed_ply(np.concatenate(points), properties, "table (z up)")
-    store.write_atomically(path, table)
+    return cloud_ply(np.concatenate(points), properties, "table (z up)")
 
 
 def _write_motions(path: Path, motions: Motions) -> None:
     from safetensors.numpy import save
 
-    tensors = {}
-    for number, stage in enumerate(motions.stages):
-        tensors[f"{number}.times_s"] = stage.times_s
-        tensors[f"{number}.joints_rad"] = stage.joints_rad
-        tensors[f"{number}.cutting"] = np.asarray(stage.cutting, np.uint8)
+    tensors: dict[str, np.ndarray] = {}
+    for n, stage in enumerate(motions.stages):
+        tensors |= {f"{n}.times_s": stage.times_s, f"{n}.joints_rad": stage.joints_rad}
+        tensors[f"{n}.cutting"] = np.asarray(stage.cutting, np.uint8)
     names = {"stages": json.dumps([s.name for s in motions.stages]), "joints": json.dumps(JOINTS)}
     store.write_atomically(path, save(tensors, metadata=names))
 

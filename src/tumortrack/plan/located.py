@@ -11,15 +11,15 @@ from jaxtyping import Float, Float64
 from scipy.spatial import cKDTree
 
 from tumortrack.core.errors import ArtifactError, InputError
+from tumortrack.core.estimate import Motion
 from tumortrack.core.geometry import rigid, transform_points
 from tumortrack.core.mesh_files import read_mesh
-from tumortrack.core.motion import Motion
 from tumortrack.core.store import read_json, read_manifest
-from tumortrack.core.types import Mesh, OccupancyCloud, part_names
-from tumortrack.plan.values import Located
+from tumortrack.core.types import Mesh, OccupancyCloud
+from tumortrack.plan.values import Located, name_of
 from tumortrack.sense.ply import parse_ply_properties
 
-STAND_MM = 120.0  # the organ's lowest point over the table, where nobody says where the table is
+STAND_MM = 120.0  # the organ's lowest point over the table, where it is not known
 
 
 def table_below(points_mm: Float[np.ndarray, "n 3"], stand_mm: float) -> Float64[np.ndarray, "4 4"]:
@@ -44,20 +44,16 @@ def located(
     motion: Motion | None,
     table_from_camera: Float[np.ndarray, "4 4"],
 ) -> Located:
-    """An estimate's parts (camera frame) in the table's frame, with how unsure it is of tumors."""
-    names = [name for name in meshes if name != "kidney"]
-    deviations = {}
-    for name in names:
-        std_mm = None if motion is None else _std_mm(motion, meshes[name])
+    """An estimate's parts (camera frame) in the table's frame, with the tumors' uncertainty."""
+    deviations, moved = {}, {}
+    for name, mesh in meshes.items():
+        moved[name] = mesh.moved(transform_points(table_from_camera, mesh.vertices_mm))
+        places = None if motion is None or name == "kidney" else motion.back(mesh.vertices_mm)
+        std_mm = None if motion is None or places is None else motion.std_mm(places)
         if std_mm is not None:
             deviations[name] = std_mm
-    return Located(
-        transform_points(table_from_camera, cloud.points_mm),
-        cloud.labels,
-        _moved(meshes, table_from_camera),
-        deviations,
-        cloud.stamp_ns,
-    )
+    points_mm = transform_points(table_from_camera, cloud.points_mm)
+    return Located(points_mm, cloud.labels, moved, deviations, cloud.stamp_ns)
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,7 +65,7 @@ class LocatedRun:
     std_mm: Float64[np.ndarray, " n"] | None
 
     def located(self, table_from_camera: Float[np.ndarray, "4 4"]) -> Located:
-        """In the table's frame; a surface is as unsure as the cloud's points next to it."""
+        """In the table's frame; a surface's uncertainty is that of the nearest points."""
         found = located(self.cloud, self.meshes, None, table_from_camera)
         if self.std_mm is None:
             return found
@@ -85,7 +81,7 @@ class LocatedRun:
 def read_run(folder: Path) -> LocatedRun:
     """
     Raises:
-        ArtifactError: no run of `locate`'s, damaged, or without its cloud.
+        ArtifactError: not a run of `locate`, damaged, or without its cloud.
     """
     manifest = read_manifest(folder, "run")
     path = folder / "occupancy.ply"
@@ -101,33 +97,14 @@ def read_run(folder: Path) -> LocatedRun:
     )
     names = [f.removesuffix(".ply") for f in manifest["files"] if f.endswith(".ply")]
     meshes = {name: read_mesh(folder / f"{name}.ply") for name in names if name != path.stem}
-    if meshes and (lacking := _lacking(cloud, meshes)):
+    found = [name_of(label) for label in np.unique(cloud.labels) if label]
+    lacking = [name for name in found if name not in meshes]
+    if meshes and lacking:
         raise ArtifactError(
             f"{folder} has points of {', '.join(lacking)} and no {lacking[0]}.ply; locate again."
         )
-    return LocatedRun(cloud, meshes, _deviations(content, str(path)))
-
-
-def _lacking(cloud: OccupancyCloud, meshes: Mapping[str, Mesh]) -> list[str]:
-    labels = np.unique(cloud.labels)
-    names = part_names(int(labels.max(initial=0)))
-    return [names[label - 1] for label in labels if label and names[label - 1] not in meshes]
-
-
-def _deviations(content: bytes, name: str) -> Float64[np.ndarray, " n"] | None:
     try:
-        return parse_ply_properties(content, name, ("std_mm",))[:, 0]
-    except InputError:  # a method that does not know
-        return None
-
-
-def _std_mm(motion: Motion, mesh: Mesh) -> Float64[np.ndarray, " v"] | None:
-    places = motion.back(mesh.vertices_mm)
-    return None if places is None else motion.std_mm(places)
-
-
-def _moved(meshes: Mapping[str, Mesh], b_from_a: Float[np.ndarray, "4 4"]) -> dict[str, Mesh]:
-    return {
-        name: mesh.moved(transform_points(b_from_a, mesh.vertices_mm))
-        for name, mesh in meshes.items()
-    }
+        std_mm = parse_ply_properties(content, str(path), ("std_mm",))[:, 0]
+    except InputError:  # a method without uncertainty
+        std_mm = None
+    return LocatedRun(cloud, meshes, std_mm)

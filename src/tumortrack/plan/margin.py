@@ -1,4 +1,4 @@
-"""Our planner: the margin kept in all directions, as wide as the estimate is unsure.
+"""Our method: the margin kept in all directions, wider where the estimate is uncertain.
 
 The tumor is grown by its margin as a solid; what lies straight above that comes away too, so that
 the piece can be lifted. Its side is cut in level layers from the top down, only where there is
@@ -7,17 +7,20 @@ organ, and its floor by strokes side by side.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Literal
+from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float, Float64
+import shapely
+from jaxtyping import Float, Float64, Int
+from numpy.linalg import norm
+from scipy.ndimage import binary_closing, minimum_filter
+from skimage.measure import find_contours
 
 from tumortrack.core.errors import NoPlan
-from tumortrack.plan.config import ResectionConfig
-from tumortrack.plan.exophytic import name_of
-from tumortrack.plan.outline import arcs, evenly, polygon_of, rings_of
-from tumortrack.plan.values import Cut, CutLayer, Located
+from tumortrack.plan.config import Direction, ResectionConfig
+from tumortrack.plan.margin_kernels import outline_fields
+from tumortrack.plan.outline import arcs, evenly_round, first_in_cell, polygon_of, rings_of
+from tumortrack.plan.values import Cut, CutLayer, Located, MethodResult, Rings, name_of
 
 # Of outlines, which are interpolated; and one surface point in each cube of that size. Both finer
 # where the margin is narrow, so that it is kept to a tenth of a millimetre.
@@ -29,41 +32,36 @@ _SMOOTH_MM = 0.05  # outlines lose corners smaller than this
 _FAR_MM = 1e3
 _LEAST_MM2 = 1.0  # a smaller rest of a floor needs no stroke
 
+Heights = tuple[Float64[np.ndarray, " n"], Float64[np.ndarray, " n"]]  # lowest and highest, mm
+# Points of the tumor, and the margin that each needs, mm
+Grown = tuple[Float64[np.ndarray, "n 3"], Float64[np.ndarray, " n"]]
 
-def margin_plan(
-    located: Located, label: int, config: ResectionConfig
-) -> tuple[tuple[CutLayer, ...], tuple[Cut, ...], Float64[np.ndarray, " 3"]]:
+
+def margin_plan(located: Located, label: int, config: ResectionConfig) -> MethodResult:
     """The piece, its strokes, both from the top down, and where to hold; table frame, mm.
 
     Raises:
         NoPlan: the margin with its uncertainty is wider than allowed; there is nothing to cut.
     """
-    points, margins = grown_tumor(located, label, config)
     columns = Columns.of(located)
-    layers = _layers(points, margins, columns, config.layer_mm)
-    below = (*layers[1:], None)
-    slabs = list(zip(layers, below, strict=True))
+    layers = _layers(_grown_tumor(located, label, config), columns, config.layer_mm)
+    slabs = list(zip(layers, (*layers[1:], None), strict=True))
     cuts: list[Cut] = []
-    for layer, under in slabs if config.order == "down" else reversed(slabs):
-        strokes = _strokes(layer, under, columns, config)
-        if strokes:
-            sweep = cuts[-1].sweep + 1 if cuts else 1
-            last = cuts[-1].path_mm[-1] if cuts else None
-            cuts += _in_turn(strokes, sweep, last, config.direction)
+    for layer, below in slabs if config.order == "down" else reversed(slabs):
+        sweep, last = (cuts[-1].sweep + 1, cuts[-1].path_mm[-1]) if cuts else (1, None)
+        cuts += _in_turn(_strokes(layer, below, columns, config), sweep, last, config.direction)
     if not cuts:
         raise NoPlan("the organ does not reach the tumor's margin; there is nothing to cut.")
     return layers, tuple(cuts), _grasp(located.of(label), columns)
 
 
-def grown_tumor(
-    located: Located, label: int, config: ResectionConfig
-) -> tuple[Float64[np.ndarray, "n 3"], Float64[np.ndarray, " n"]]:
-    """Points of the tumor's surface (of its inside too, where there is no mesh) and the margin
-    that each needs, mm.
+def _grown_tumor(located: Located, label: int, config: ResectionConfig) -> Grown:
+    """Points of the tumor's surface (also inside it, where there is no mesh) and the margin that
+    each needs, mm.
 
     Raises:
-        NoPlan: a margin is wider than ``most_margin_mm``; an uncertainty is asked for that the
-            estimate does not know.
+        NoPlan: a margin is wider than ``most_margin_mm``; the estimate has no uncertainty, and it
+            is asked for.
     """
     name = name_of(label)
     mesh = located.meshes.get(name)
@@ -84,17 +82,14 @@ def grown_tumor(
     size_mm = min(_THIN_MM, _THIN_SHARE * float(margins.min()))
     widest_first = np.argsort(-margins, kind="stable")
     points, margins = points[widest_first], margins[widest_first]  # of each cube, this one stays
-    cube = np.floor(points / size_mm).astype(np.int64)
-    cube -= cube.min(0)
-    size = cube.max(0) + 1
-    keep = np.unique((cube[:, 0] * size[1] + cube[:, 1]) * size[2] + cube[:, 2], return_index=True)
-    return points[keep[1]], margins[keep[1]]
+    keep = first_in_cell(np.floor(points / size_mm).astype(np.int64))
+    return points[keep], margins[keep]
 
 
 @dataclass(frozen=True, eq=False)
 class Columns:
-    """The organ's lowest and highest point over a grid of the table's plane, mm; NaN where it is
-    not. ``first_mm``: the middle of the first cell."""
+    """The organ's lowest and highest point over a grid of the table's plane, mm; NaN outside it.
+    ``first_mm``: the middle of the first cell."""
 
     first_mm: Float64[np.ndarray, " 2"]
     lowest_mm: Float64[np.ndarray, "i j"]
@@ -109,22 +104,17 @@ class Columns:
         cell = np.round((points[:, :2] - low) / _COLUMN_MM).astype(int)
         shape = cell.max(0) + 3
         flat = cell[:, 0] * shape[1] + cell[:, 1]
-        lowest, highest = np.full(shape, np.inf), np.full(shape, -np.inf)
-        np.minimum.at(lowest.reshape(-1), flat, points[:, 2])
-        np.maximum.at(highest.reshape(-1), flat, points[:, 2])
-        return cls(low, _spread(lowest), -_spread(-highest))
+        lowest, highest = column_extremes(flat, points[:, 2], shape.prod())
+        return cls(low, _spread(lowest.reshape(shape)), -_spread(-highest.reshape(shape)))
 
-    def at(
-        self, points_mm: Float[np.ndarray, "n 2"]
-    ) -> tuple[Float64[np.ndarray, " n"], Float64[np.ndarray, " n"]]:
+    def at(self, points_mm: Float[np.ndarray, "n 2"]) -> Heights:
         """Lowest and highest point of the organ below and above each place."""
         cell = np.round((points_mm - self.first_mm) / _COLUMN_MM).astype(int)
         shape = np.array(self.lowest_mm.shape)
         inside = ((cell >= 0) & (cell < shape)).all(1)
         i, j = np.clip(cell, 0, shape - 1).T
-        low, high = self.lowest_mm[i, j].copy(), self.highest_mm[i, j].copy()
-        low[~inside], high[~inside] = np.nan, np.nan
-        return low, high
+        low, high = self.lowest_mm[i, j], self.highest_mm[i, j]
+        return np.where(inside, low, np.nan), np.where(inside, high, np.nan)
 
     def within(
         self, points_mm: Float[np.ndarray, "n 2"], bottom_mm: float, top_mm: float
@@ -135,10 +125,18 @@ class Columns:
         return (high + _SLACK_MM > bottom_mm) & (low - _SLACK_MM < top_mm)  # False at NaN
 
 
-def _spread(values: Float[np.ndarray, "i j"]) -> Float64[np.ndarray, "i j"]:
-    """Cells that nothing fell into take the least of their neighbours, if those surround them."""
-    from scipy.ndimage import binary_closing, minimum_filter
+def column_extremes(
+    columns: Int[np.ndarray, " n"], heights: Float[np.ndarray, " n"], n_columns: int
+) -> Heights:
+    """The lowest and the highest point of each column; inf and -inf where none is."""
+    lowest, highest = np.full(n_columns, np.inf), np.full(n_columns, -np.inf)
+    np.minimum.at(lowest, columns, heights)
+    np.maximum.at(highest, columns, heights)
+    return lowest, highest
 
+
+def _spread(values: Float[np.ndarray, "i j"]) -> Float64[np.ndarray, "i j"]:
+    """Empty cells take the least of their neighbours, if those surround them."""
     known = np.isfinite(values)
     closed = binary_closing(known, iterations=2) | known
     near = minimum_filter(np.where(known, values, np.inf), 5)
@@ -146,15 +144,11 @@ def _spread(values: Float[np.ndarray, "i j"]) -> Float64[np.ndarray, "i j"]:
     return np.where(closed & np.isfinite(filled), filled, np.nan)
 
 
-def _layers(
-    points: Float[np.ndarray, "n 3"],
-    margins: Float[np.ndarray, " n"],
-    columns: Columns,
-    layer_mm: float,
-) -> tuple[CutLayer, ...]:
+def _layers(grown: Grown, columns: Columns, layer_mm: float) -> tuple[CutLayer, ...]:
     """Slabs from the top down; each has the outline at its upper end, where it is widest."""
+    points, margins = grown
     floor = float((points[:, 2] - margins).min())
-    outermost = _outlines(points, margins, np.array([np.inf]))[0]
+    outermost = _outlines(grown, np.array([np.inf]))[0]
     if not outermost:
         raise NoPlan("the tumor's outline has no area; locate it again with more points.")
     high = columns.at(np.concatenate(outermost))[1]
@@ -163,7 +157,7 @@ def _layers(
     n = max(1, int(np.ceil((np.nanmax(high) - floor) / layer_mm)))
     bottoms = floor + (np.nanmax(high) - floor) / n * np.arange(n)
     tops = np.append(bottoms[1:], np.inf)
-    outlines = [*_outlines(points, margins, tops[:-1]), outermost]
+    outlines = [*_outlines(grown, tops[:-1]), outermost]
     layers = [
         CutLayer(float(bottom), float(top), rings)
         for bottom, top, rings in zip(bottoms, tops, outlines, strict=True)
@@ -172,17 +166,9 @@ def _layers(
     return tuple(reversed(layers))
 
 
-def _outlines(
-    points: Float[np.ndarray, "n 3"],
-    margins: Float[np.ndarray, " n"],
-    levels_mm: Float[np.ndarray, " k"],
-) -> list[tuple[Float64[np.ndarray, "m 2"], ...]]:
+def _outlines(grown: Grown, levels_mm: Float[np.ndarray, " k"]) -> list[Rings]:
     """Rings of what comes away at each height."""
-    import shapely
-    from skimage.measure import find_contours
-
-    from tumortrack.plan.margin_kernels import outline_fields
-
+    points, margins = grown
     cell = min(_CELL_MM, _CELL_SHARE * float(margins.min()))
     room = float(margins.max()) + 4 * cell
     first = points[:, :2].min(0) - room
@@ -203,59 +189,44 @@ def _strokes(
 ) -> list[Cut]:
     """A layer's strokes at its lower end: along its outline, and over its floor where that is not
     the next layer's."""
-    import shapely
-
     area = polygon_of(layer.rings_mm)
     open_floor = area if below is None else area.difference(polygon_of(below.rings_mm))
     z, lead = layer.bottom_mm, int(np.ceil(config.lead_mm / config.spacing_mm))
     strokes = []
     for ring in layer.rings_mm:
-        flat = evenly(np.concatenate([ring, ring[:1]]), config.spacing_mm)[:-1]
+        flat = evenly_round(ring, config.spacing_mm)
         there = columns.within(flat, z, layer.top_mm)
-        strokes += [_cut(line, z, "wall") for line in arcs(flat, there, lead)]
+        strokes += [Cut.level(1, line, z, "wall") for line in arcs(flat, there, lead)]
     inset = area.buffer(-config.stroke_mm, quad_segs=4)
     while inset.intersection(open_floor).area > _LEAST_MM2:
         for ring in rings_of(inset):
-            flat = evenly(np.concatenate([ring, ring[:1]]), config.spacing_mm)[:-1]
+            flat = evenly_round(ring, config.spacing_mm)
             there = shapely.contains_xy(open_floor, *flat.T) & columns.within(flat, z, z)
-            strokes += [_cut(line, z, "floor") for line in arcs(flat, there, lead)]
+            strokes += [Cut.level(1, line, z, "floor") for line in arcs(flat, there, lead)]
         inset = inset.buffer(-config.stroke_mm, quad_segs=4)
     return strokes
 
 
-def _cut(flat: Float[np.ndarray, "n 2"], z: float, kind: str) -> Cut:
-    path = np.column_stack([flat, np.full(len(flat), z)])
-    return Cut(1, path, "wall" if kind == "wall" else "floor")
-
-
 def _in_turn(
-    strokes: list[Cut],
-    sweep: int,
-    last: Float[np.ndarray, " 3"] | None,
-    direction: Literal["shortest", "clockwise", "anticlockwise"],
+    strokes: list[Cut], sweep: int, last: Float[np.ndarray, " 3"] | None, direction: Direction
 ) -> list[Cut]:
     """Walls first, then the floor; each time the stroke that begins nearest to where the one before
     ended. Outlines run anticlockwise, seen from above."""
-    ways = {"shortest": (1, -1), "clockwise": (-1,), "anticlockwise": (1,)}[direction]
+    turns = {"shortest": (1, -1), "clockwise": (-1,), "anticlockwise": (1,)}[direction]
     ordered = []
-    for kind in ("wall", "floor"):
-        left = [stroke for stroke in strokes if stroke.kind == kind]
+    for floor in (False, True):
+        left = [stroke for stroke in strokes if (stroke.kind == "floor") == floor]
         while left:
             gaps = [
-                (0.0 if last is None else _gap_mm(stroke.path_mm[::way], last), number, -way)
-                for number, stroke in enumerate(left)
-                for way in ways
+                (0.0 if last is None else float(norm(stroke.path_mm[::turn][0] - last)), n, -turn)
+                for n, stroke in enumerate(left)
+                for turn in turns
             ]
-            _, number, turned = min(gaps)
-            stroke = left.pop(number)
-            path = stroke.path_mm[::-turned]
-            ordered.append(Cut(sweep, path, stroke.kind))
-            last = path[-1]
+            _, n, turned = min(gaps)
+            stroke = left.pop(n)
+            ordered.append(replace(stroke, sweep=sweep, path_mm=stroke.path_mm[::-turned]))
+            last = ordered[-1].path_mm[-1]
     return ordered
-
-
-def _gap_mm(path_mm: Float[np.ndarray, "n 3"], from_mm: Float[np.ndarray, " 3"]) -> float:
-    return float(np.linalg.norm(path_mm[0] - from_mm))
 
 
 def _grasp(tumor: Float[np.ndarray, "n 3"], columns: Columns) -> Float64[np.ndarray, " 3"]:

@@ -1,5 +1,4 @@
-"""A plan carried out beside the live loop: halted by every doubt, planned anew where the tumor
-has moved.
+"""A plan carried out beside the live loop: halted by every doubt, replanned where the tumor moved.
 
 No torch here, and no clock but the updates' own arrival: ``act`` is called with every update.
 """
@@ -13,18 +12,16 @@ from concurrent.futures import Future
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float64
 from scipy.spatial import cKDTree
 
+from tumortrack.core.colours import Colour
 from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError, TumortrackError
 from tumortrack.core.types import Mesh
 from tumortrack.live.values import Polyline, RigidShape, TrackingResult, Workcell
-from tumortrack.plan.execute import ABORTED, Execution
-from tumortrack.plan.motions import JOINTS, Motions
+from tumortrack.plan.motions import ABORTED, JOINTS, Execution, Joints, Motions
 from tumortrack.plan.values import Located, ResectionPlan
 
-Colour = tuple[int, int, int]
 TO_CUT: Colour = (0, 120, 240)
 NOW: Colour = (255, 90, 30)
 CUT: Colour = (120, 40, 40)
@@ -35,9 +32,15 @@ _BLIND_S = 0.2  # without an update for longer, the arms halt by themselves
 
 
 class OperationConfig(Config, frozen=True, kw_only=True):
-    """``moved_mm``: the tumor is elsewhere than planned if its surface moved by so much (root mean
-    square). ``settled_mm``, ``settled_s``: it is planned anew once it has moved no more than that
-    for so long; before, the arms wait. ``speed``: of the arms' time."""
+    """When the arms halt and when it is replanned.
+
+    Attributes:
+        moved_mm: the tumor has moved if its surface is so far from where it was planned (root mean
+            square).
+        settled_mm, settled_s: it is replanned once the tumor has moved no more than that for so
+            long; until then the arms wait.
+        speed: of the arms' time.
+    """
 
     moved_mm: float = 2.0
     settled_mm: float = 0.7
@@ -67,17 +70,17 @@ class Planned:
 
 @dataclass(frozen=True)
 class ResectionProgress:
-    """How far a plan was carried out: whether the grasper holds, and the height of the last sweep
-    that was finished over the tumor's lowest point (None: none was)."""
+    """How far a plan was carried out: whether the grasper holds, and the height of the last
+    finished sweep over the tumor's lowest point (None: none is finished)."""
 
     holds: bool = False
     done_mm: float | None = None
 
     def first_sweep(self, planned: ResectionPlan, tumor: Mesh) -> int | None:
-        """With which sweep another plan goes on: the first that lies beyond what was finished, in
-        the order in which it cuts, and never past the last; None: from the approach.
+        """The sweep with which another plan goes on: the first that lies beyond what is finished,
+        in the order in which it cuts, and never past the last; None: from the approach.
 
-        Sweeps are not the same from plan to plan, and so are told apart by their height.
+        Sweeps are not the same from plan to plan, so they are matched by their height.
         """
         if not self.holds:
             return None
@@ -94,11 +97,9 @@ class ResectionProgress:
 
 
 # The estimate to plan on, the arms' joints, and how far they came
-Replan = Callable[
-    [TrackingResult, Float64[np.ndarray, " 12"], ResectionProgress], "Future[Planned]"
-]
+Replan = Callable[[TrackingResult, Joints, ResectionProgress], "Future[Planned]"]
 Locate = Callable[[TrackingResult], Located]
-Draw = Callable[[Float64[np.ndarray, " 12"]], tuple[RigidShape, ...]]
+Draw = Callable[[Joints], tuple[RigidShape, ...]]
 
 
 class Operation:
@@ -107,10 +108,14 @@ class Operation:
     Args:
         planned: what to begin with.
         draw: the arms, table and tools as shapes, for twelve joint angles.
-        locate: an update's estimate in the table's frame; None: a stored plan is carried out and
-            nothing is looked at.
-        replan: begins a new plan elsewhere, so that the loop goes on meanwhile.
+        locate: an update's estimate in the table's frame; None: a stored plan is carried out
+            without regard to estimates.
+        replan: begins a new plan in another process, so that the loop goes on meanwhile.
+
+    Attributes:
+        planned: what is carried out now.
         still_life: shapes that are shown all the time.
+        log: states and when they began. ``halts``: how often each reason halted the arms.
     """
 
     def __init__(
@@ -121,7 +126,7 @@ class Operation:
         locate: Locate | None = None,
         replan: Replan | None = None,
     ) -> None:
-        self._planned, self._config = planned, config
+        self.planned, self._config = planned, config
         self._draw, self._locate, self._replan = draw, locate, replan
         self._execution = Execution(planned.motions)
         self._last_s: float | None = None
@@ -131,37 +136,27 @@ class Operation:
         self.still_life: tuple[RigidShape, ...] = ()
         self.log: list[dict] = []
         self.halts: Counter[str] = Counter()
-        self._said = ""
+        self._counted = ""  # the reason, without its numbers, that ``halts`` has counted
 
     @property
     def ended(self) -> bool:
         return self._execution.ended
 
     @property
-    def planned(self) -> Planned:
-        """What is carried out now."""
-        return self._planned
-
-    @property
-    def joints_rad(self) -> Float64[np.ndarray, " 12"]:
-        """In the order of ``motions.JOINTS``."""
-        return self._execution.joints_rad
-
-    @property
     def progress(self) -> ResectionProgress:
         """How far it came."""
         if not self._execution.holds:
             return ResectionProgress()
-        done = [cut for cut in self._planned.plan.cuts if cut.sweep < self._execution.sweep]
+        done = [cut for cut in self.planned.plan.cuts if cut.sweep < self._execution.sweep]
         if not done:
             return ResectionProgress(holds=True)
-        return ResectionProgress(True, done[-1].height_mm - float(self._planned.tumor.box_mm[0, 2]))
+        return ResectionProgress(True, done[-1].height_mm - float(self.planned.tumor.box_mm[0, 2]))
 
     def act(self, update: TrackingResult, now_s: float | None = None) -> TrackingResult:
         """The update with what the arms do now. ``now_s``: a steady clock's time."""
         now_s = time.monotonic() if now_s is None else now_s
-        self._pass(now_s)
-        self._look(update, now_s)
+        self._advance(now_s)
+        self._decide(update, now_s)
         self._note(now_s)
         return replace(update, workcell=self.workcell())
 
@@ -170,7 +165,7 @@ class Operation:
         self._execution.abort(reason)
 
     def workcell(self) -> Workcell:
-        """What is seen of it."""
+        """State, joints and drawing of the arms."""
         execution = self._execution
         joints = execution.joints_rad
         return Workcell(
@@ -182,7 +177,7 @@ class Operation:
         )
 
     def summary(self) -> dict:
-        """For the report: states and when they began, halts, plans made anew."""
+        """For the report: states and when they began, halts, new plans."""
         return {
             "state": self._execution.state,
             "halted": self._execution.halted,
@@ -190,7 +185,7 @@ class Operation:
             "log": self.log,
         }
 
-    def _pass(self, now_s: float) -> None:
+    def _advance(self, now_s: float) -> None:
         """Let the time since the last update go by."""
         if self._last_s is None:
             self._last_s = self._first_s = now_s
@@ -201,43 +196,41 @@ class Operation:
             self._execution.halt("no word from the loop")
             self._execution.step((passed_s - _BLIND_S) * speed)
 
-    def _look(self, update: TrackingResult, now_s: float) -> None:
+    def _decide(self, update: TrackingResult, now_s: float) -> None:
         """Go on, or halt and why."""
         execution = self._execution
         if self._work is not None:
-            self._take_work(now_s)
+            self._take_work(self._work, now_s)
         over = execution.ended or execution.state == ABORTED
-        if self._locate is None or over or execution.sweep > self._planned.plan.sweeps:
-            execution.go()  # nothing is looked at, nothing moves any more, or it is cut out
+        if self._locate is None or over or execution.sweep > self.planned.plan.sweeps:
+            execution.go()  # nothing is compared, nothing moves any more, or all is cut
         elif update.estimate is None:
-            self._settled = None
-            execution.halt(f"no estimate: {update.reason}")
+            self._halt_in_doubt(f"no estimate: {update.reason}")
         elif update.quality != "good":
-            self._settled = None
-            execution.halt(f"{update.quality} estimate: {update.warning}")
+            self._halt_in_doubt(f"{update.quality} estimate: {update.warning}")
         elif self._work is not None:
             execution.halt("planning anew")
         else:
             self._compare(update, self._locate(update), now_s)
 
+    def _halt_in_doubt(self, reason: str) -> None:
+        """Halt where it is not known where the tumor is."""
+        self._settled = None
+        self._execution.halt(reason)
+
     def _compare(self, update: TrackingResult, located: Located, now_s: float) -> None:
+        """Go on where everything lies as planned; else halt, and replan once it has settled."""
         execution, config = self._execution, self._config
-        name = self._planned.plan.tumor
+        name = self.planned.plan.tumor
         tumor = located.meshes.get(name)
         if tumor is None:
-            self._settled = None
-            execution.halt(f"{name} was not found")
+            self._halt_in_doubt(f"{name} was not found")
             return
-        moved = [
-            (apart_mm(located.meshes[part], mesh), part)
-            for part, mesh in self._planned.meshes.items()
-            if part in located.meshes
-        ]
-        far = [
-            (off_mm, part)
-            for off_mm, part in moved
-            if off_mm > config.moved_mm * (1.0 if part == name else _OTHERS)
-        ]
+        far = []
+        for part in self.planned.meshes.keys() & located.meshes.keys():
+            off_mm = apart_mm(located.meshes[part], self.planned.meshes[part])
+            if off_mm > config.moved_mm * (1.0 if part == name else _OTHERS):
+                far.append((off_mm, part))
         if not far:
             self._settled = None
             execution.go()
@@ -251,9 +244,9 @@ class Operation:
             if self._replan is not None:
                 self._work = self._replan(update, execution.joints_rad, self.progress)
 
-    def _take_work(self, now_s: float) -> None:
-        work, execution = self._work, self._execution
-        assert work is not None
+    def _take_work(self, work: Future[Planned], now_s: float) -> None:
+        """The new plan, if it is ready; where there is none, stop for good."""
+        execution = self._execution
         if execution.state == ABORTED:
             self._work = None
             work.cancel()
@@ -263,30 +256,29 @@ class Operation:
         self._work = None
         failure = work.exception()
         if failure is None:
-            self._planned = work.result()
-            execution.replace(self._planned.motions)
-            self._log(now_s, "planned anew")
+            self.planned = work.result()
+            execution.replace(self.planned.motions)
+            self._log(now_s, {"event": "planned anew"})
         elif isinstance(failure, TumortrackError):
             execution.abort(f"no new plan: {failure}")
-        else:  # a defect of ours must stop the arms, and say so
+        else:  # a defect of the planner must stop the arms, and be reported
             execution.abort(f"internal error, {type(failure).__name__}: {failure}")
 
     def _note(self, now_s: float) -> None:
-        state = self._execution.state
-        if not self.log or self.log[-1]["state"] != state:
-            self._log(now_s, "")
+        if not self.log or self.log[-1]["state"] != self._execution.state:
+            self._log(now_s, {})
         halted = "".join(c for c in self._execution.halted if not (c.isdigit() or c == "."))
-        if halted != self._said:
-            self._said = halted
+        if halted != self._counted:
+            self._counted = halted
             if halted:
                 self.halts[halted] += 1
 
-    def _log(self, now_s: float, what: str) -> None:
-        entry = {"state": self._execution.state, "at_s": round(now_s - self._first_s, 3)}
-        self.log.append({**entry, "event": what} if what else entry)
+    def _log(self, now_s: float, event: dict[str, str]) -> None:
+        at_s = round(now_s - self._first_s, 3)
+        self.log.append({"state": self._execution.state, "at_s": at_s, **event})
 
     def _lines(self) -> tuple[Polyline, ...]:
-        sweep, plan = self._execution.sweep, self._planned.plan
+        sweep, plan = self._execution.sweep, self.planned.plan
         lines = []
         for number, cut in enumerate(plan.cuts, start=1):
             colour = CUT if cut.sweep < sweep else NOW if cut.sweep == sweep else TO_CUT
@@ -301,11 +293,8 @@ def apart_mm(a: Mesh, b: Mesh) -> float:
     if np.array_equal(a.faces, b.faces):
         off = a.vertices_mm - b.vertices_mm
         return float(np.sqrt((off**2).sum(axis=1).mean()))
-    squares = [_nearest_mm(a, b) ** 2, _nearest_mm(b, a) ** 2]
-    return float(np.sqrt(np.concatenate(squares).mean()))
-
-
-def _nearest_mm(a: Mesh, b: Mesh) -> Float64[np.ndarray, " n"]:
-    """Distances of some of a's vertices to b's."""
-    some = a.vertices_mm[:: max(1, len(a.vertices_mm) // _COMPARED)]
-    return cKDTree(b.vertices_mm).query(some)[0]
+    apart = []
+    for one, other in ((a.vertices_mm, b.vertices_mm), (b.vertices_mm, a.vertices_mm)):
+        some = one[:: max(1, len(one) // _COMPARED)]
+        apart.append(cKDTree(other).query(some)[0])
+    return float(np.sqrt((np.concatenate(apart) ** 2).mean()))

@@ -1,22 +1,26 @@
-"""Outlines in the table's plane: hulls of projected points, grown, cut, and walked along."""
+"""Outlines in the table's plane: hulls of projected points, grown, clipped, and sampled."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Float64
+import shapely
+from jaxtyping import Bool, Float, Float64, Int
+from scipy.ndimage import binary_erosion, label
+from scipy.spatial import ConvexHull, Delaunay, QhullError
+from shapely import Polygon
+from shapely.geometry.polygon import orient
 
 from tumortrack.core.errors import NoPlan
 
-if TYPE_CHECKING:
-    from shapely import Polygon
-
-_CELL = 2.0  # of a grid that tells inner points from outer ones, in sqrt(area / number of points)
+_CELL = (
+    2.0  # of a grid that separates inner points from outer ones, in sqrt(area / number of points)
+)
 _EDGE = 5.0  # longest edge of a hull, in sqrt(area / number of points)
-_SPARSE = 6  # of inner cells, one point in so many each way stays
-_MOST = 10_000  # points that are looked at
+_SPARSE = 6  # of inner points, one in each block of so many cells stays
+_MOST = 10_000  # points that are used
 _SAME_MM = 0.01  # points nearer to each other are one
 _LEAST_MM2 = 1.0  # smaller pieces of an outline are none
 _SMOOTH = 16  # corners of a quarter circle: 5 mm of margin are exact to 0.01 mm
@@ -25,19 +29,17 @@ _SMOOTH = 16  # corners of a quarter circle: 5 mm of margin are exact to 0.01 mm
 def concave_hull(points_mm: Float[np.ndarray, "n 2"]) -> Polygon:
     """The outline of a cloud's largest cluster.
 
-    Edges may be as long as 5 sqrt(A / n), A being the convex hull's area: the ratio that GEOS
-    takes means another length at every density.
+    Edges may be as long as 5 sqrt(A / n), A being the convex hull's area: a fixed ratio, which GEOS
+    takes, would mean another length at every density.
 
     Raises:
         NoPlan: fewer than three points, or all on a line.
     """
-    import shapely
-    from scipy.spatial import ConvexHull, Delaunay, QhullError
-
     points = np.asarray(points_mm, float)
-    if len(points) > _MOST:  # in whatever order they come
+    if len(points) > _MOST:
         points = points[np.linspace(0, len(points) - 1, _MOST).astype(int)]
-    points = _told_apart(points)
+    # Points of a grid lie on each other when they are projected, and would count as many.
+    points = points[first_in_cell(np.round(points / _SAME_MM).astype(np.int64))]
     try:
         if len(points) < 3:
             raise ValueError("too few")
@@ -68,19 +70,22 @@ def common(a: Polygon, b: Polygon) -> Polygon:
 def evenly(ring_mm: Float[np.ndarray, "n 2"], spacing_mm: float) -> Float64[np.ndarray, "m 2"]:
     """Points at equal distances along a line, ends included; at most ``spacing_mm`` apart."""
     steps = np.linalg.norm(np.diff(ring_mm, axis=0), axis=1)
-    keep = np.concatenate([[True], steps > 1e-9])
-    line = np.asarray(ring_mm, float)[keep]
-    way = np.concatenate([[0.0], np.cumsum(steps[steps > 1e-9])])
-    n = max(2, int(np.ceil(way[-1] / spacing_mm)) + 1)
-    at = np.linspace(0.0, way[-1], n)
-    return np.stack([np.interp(at, way, line[:, axis]) for axis in range(2)], axis=1)
+    line = np.asarray(ring_mm, float)[np.r_[True, steps > 1e-9]]
+    along = np.concatenate([[0.0], np.cumsum(steps[steps > 1e-9])])
+    at = np.linspace(0.0, along[-1], max(2, int(np.ceil(along[-1] / spacing_mm)) + 1))
+    return np.stack([np.interp(at, along, axis) for axis in line.T], axis=1)
+
+
+def evenly_round(ring: Float[np.ndarray, "n 2"], spacing: float) -> Float64[np.ndarray, "m 2"]:
+    """The same on a closed ring, whose first point is not repeated."""
+    return evenly(np.concatenate([ring, ring[:1]]), spacing)[:-1]
 
 
 def arcs(
     ring_mm: Float[np.ndarray, "n 2"], wanted: Bool[np.ndarray, " n"], lead: int
 ) -> list[Float64[np.ndarray, "m 2"]]:
-    """The runs of a closed ring's points that are wanted, each longer by ``lead`` points at both
-    ends; the whole ring, closed, where that leaves no gap.
+    """The runs of a closed ring's wanted points, each longer by ``lead`` points at both ends; the
+    whole ring, closed, where that leaves no gap.
 
     Args:
         ring_mm: evenly spaced, the first point not repeated.
@@ -103,57 +108,49 @@ def arcs(
 def rings_of(area: Any) -> tuple[Float64[np.ndarray, "n 2"], ...]:
     """The outer rings of a polygon or several, anticlockwise, first points not repeated, largest
     first."""
-    from shapely.geometry.polygon import orient
-
-    pieces = [p for p in polygons(area) if p.area >= _LEAST_MM2]
+    pieces = [p for p in _polygons(area) if p.area >= _LEAST_MM2]
     pieces.sort(key=lambda piece: -piece.area)
     return tuple(np.array(orient(piece).exterior.coords)[:-1, :2] for piece in pieces)
 
 
 def polygon_of(rings_mm: Iterable[Float[np.ndarray, "n 2"]]) -> Any:
-    """What ``rings_of`` took apart."""
-    import shapely
-
+    """The inverse of ``rings_of``."""
     pieces = [shapely.Polygon(ring) for ring in rings_mm]
     if len(pieces) == 1 and pieces[0].is_valid:
         return pieces[0]
     return shapely.union_all([shapely.make_valid(piece) for piece in pieces])
 
 
-def polygons(area: Any) -> list[Polygon]:
-    """The polygons in a geometry of whatever kind."""
+def _polygons(area: Any) -> list[Polygon]:
+    """The polygons in a geometry of any kind."""
     if area.geom_type == "Polygon":
         return [] if area.is_empty else [area]
     return [piece for piece in getattr(area, "geoms", ()) if piece.geom_type == "Polygon"]
 
 
 def _largest(area: Any) -> Polygon:
-    import shapely
-
-    pieces = polygons(area)
+    pieces = _polygons(area)
     if not pieces or max(piece.area for piece in pieces) < _LEAST_MM2:
         raise NoPlan("the outline has no area; there is no contour to cut along.")
     largest = max(pieces, key=lambda piece: piece.area)
     return shapely.Polygon(largest.exterior)  # what lies in a hole comes away too
 
 
-def _told_apart(points: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "m 2"]:
-    """One of each: points of a grid lie on each other when they are projected, and would count as
-    many."""
-    rounded = np.round(points / _SAME_MM).astype(np.int64)
-    rounded -= rounded.min(0, initial=0)
-    key = rounded[:, 0] * (rounded[:, 1].max(initial=0) + 1) + rounded[:, 1]
-    return points[np.unique(key, return_index=True)[1]]
+def first_in_cell(cells: Int[np.ndarray, "n d"]) -> Int[np.ndarray, " m"]:
+    """Numbers of the points that are the first in their cells, ordered by cell."""
+    shifted = cells - cells.min(0, initial=0)
+    key = np.zeros(len(cells), np.int64)
+    for axis, size in zip(shifted.T, shifted.max(0, initial=0) + 1, strict=True):
+        key = key * size + axis
+    return np.unique(key, return_index=True)[1]
 
 
 def _outer(points: Float[np.ndarray, "n 2"], cell_mm: float) -> Float[np.ndarray, "m 2"]:
-    """Of the largest cluster, the points that say something of its outline: those in cells that
-    have an empty one beside them, and a few of the others.
+    """Of the largest cluster, the points that matter for its outline: those in cells next to an
+    empty one, and a few of the others.
 
     A cell holds about four points; clusters are cells that touch each other.
     """
-    from scipy.ndimage import binary_erosion, label
-
     i, j = ((points - points.min(0)) / cell_mm).astype(int).T
     some = np.zeros((int(i.max()) + 1, int(j.max()) + 1), bool)
     some[i, j] = True
@@ -162,5 +159,5 @@ def _outer(points: Float[np.ndarray, "n 2"], cell_mm: float) -> Float[np.ndarray
     i, j = i[mine], j[mine]
     deep = binary_erosion(some, np.ones((3, 3)))[i, j]
     keep = ~deep
-    keep[np.unique((i // _SPARSE) * some.shape[1] + j // _SPARSE, return_index=True)[1]] = True
+    keep[first_in_cell(np.stack([i, j], axis=1) // _SPARSE)] = True
     return points[mine[keep]]

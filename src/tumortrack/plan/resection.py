@@ -1,22 +1,24 @@
 """From what was located to what is cut: which tumor, where to hold it, along which lines.
 
-The paper's planner (its section "Integration with Robotic Resection") and ours, by ``method``.
+Two methods: the paper's (its section "Integration with Robotic Resection") and ``plan.margin``.
 """
 
 from __future__ import annotations
 
 import numpy as np
+import shapely
 from jaxtyping import Bool, Float
+from scipy.spatial import ConvexHull, QhullError
 
-from tumortrack.core.errors import NoPlan
-from tumortrack.core.types import FIRST_TUMOR
+from tumortrack.core.errors import InputError, NoPlan
+from tumortrack.core.types import FIRST_TUMOR, ORGAN
 from tumortrack.plan.config import ResectionConfig
-from tumortrack.plan.exophytic import chosen_tumor, name_of
-from tumortrack.plan.margin import margin_plan
-from tumortrack.plan.outline import polygon_of
-from tumortrack.plan.published import published_plan
-from tumortrack.plan.values import CutLayer, Located, ResectionPlan
+from tumortrack.plan.margin import column_extremes, margin_plan
+from tumortrack.plan.outline import common, concave_hull, evenly, grown, polygon_of, rings_of
+from tumortrack.plan.values import Cut, CutLayer, Located, MethodResult, ResectionPlan, name_of
 
+_DIRECTIONS, _MOST = 192, 12_000  # of the hull, points it is made of: a kidney's is off by 0.5 mm
+_FEWEST = 30  # points that define a tumor's shape
 _A_COLUMN = 30  # points in a column, about
 _WHOLE, _TOUCHED = 0.99, 0.02  # of another tumor's points
 
@@ -28,7 +30,7 @@ def plan_resection(located: Located, config: ResectionConfig) -> ResectionPlan:
         InputError: no such tumor.
         NoPlan: nothing to cut, or not as asked; why.
     """
-    label, share = chosen_tumor(located, config)
+    label, share = _chosen_tumor(located, config)
     method = published_plan if config.method == "published" else margin_plan
     layers, cuts, grasp_mm = method(located, label, config)
     taken = inside(layers, located.points_mm)
@@ -55,12 +57,88 @@ def plan_resection(located: Located, config: ResectionConfig) -> ResectionPlan:
     )
 
 
+def published_plan(located: Located, label: int, config: ResectionConfig) -> MethodResult:
+    """The paper's method: the piece, two sweeps, and where to hold (its section II-D).
+
+    The tumor's points are projected on the table's plane; their concave hull, grown by the margin
+    and clipped to the organ's projection, is cut along twice: at the middle of the tumor's bounding
+    box, and on the box's lower face. Held is the tumor's centre of mass, carried up to the top of
+    the box.
+
+    Raises:
+        NoPlan: there is no contour.
+    """
+    tumor = located.of(label)
+    low, high = float(tumor[:, 2].min()), float(tumor[:, 2].max())
+    zone = common(
+        grown(concave_hull(tumor[:, :2]), config.margin_mm), concave_hull(located.points_mm[:, :2])
+    )
+    ring = rings_of(zone)[0]
+    flat = evenly(np.concatenate([ring, ring[:1]]), config.spacing_mm)
+    cuts = (Cut.level(1, flat, (low + high) / 2), Cut.level(2, flat, low))
+    x, y, _ = tumor.mean(0)
+    return (CutLayer(low, np.inf, (ring,)),), cuts, np.array([x, y, high], float)
+
+
+def _chosen_tumor(located: Located, config: ResectionConfig) -> tuple[int, float]:
+    """Label of the tumor to cut out, and its share outside the organ's hull.
+
+    Raises:
+        InputError: no such tumor.
+        NoPlan: nothing was located; the tumor lies wholly inside; too few points.
+    """
+    if len(located.of(ORGAN)) < _FEWEST:
+        raise NoPlan("no organ was located, so nothing can be planned. Locate it first.")
+    if not located.tumors:
+        raise NoPlan("no tumor was located, so there is nothing to cut out.")
+    names = {name_of(label): label for label in located.tumors}
+    if config.tumor and config.tumor not in names:
+        raise InputError(f"there is no {config.tumor!r}; located were {', '.join(names)}.")
+    candidates = [names[config.tumor]] if config.tumor else list(names.values())
+    shares = exophytic_shares(located, candidates)
+    label = max(shares, key=lambda one: shares[one])
+    name, n = name_of(label), len(located.of(label))
+    if n < _FEWEST:
+        raise NoPlan(f"{name} has only {n} points; {_FEWEST} are needed. Locate with more points.")
+    if shares[label] < config.least_exophytic:
+        inside = f"{name} lies" if len(candidates) == 1 else "all tumors lie"
+        raise NoPlan(
+            f"{inside} wholly inside the organ ({shares[label]:.0%} outside its hull, "
+            f"{config.least_exophytic:.0%} are needed): there is no contour to cut along."
+        )
+    return label, shares[label]
+
+
+def exophytic_shares(located: Located, labels: list[int]) -> dict[int, float]:
+    """How much of each tumor lies outside the convex hull of the organ without tumors."""
+    organ = located.of(ORGAN)
+    try:
+        hull = ConvexHull(_outermost(organ[:: 1 + len(organ) // _MOST]))
+    except QhullError as error:
+        raise NoPlan("the organ's points lie in a plane; locate it anew.") from error
+    normals, offsets = np.split(hull.equations.astype(np.float32), [3], axis=1)
+    shares = {}
+    for label in labels:
+        points = located.of(label).astype(np.float32)
+        shares[label] = float(((normals @ points.T + offsets).max(axis=0) > 0).mean())
+    return shares
+
+
+def _outermost(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "m 3"]:
+    """The farthest point in each of many directions: what a hull needs of a dense cloud."""
+    n = np.arange(_DIRECTIONS)
+    z = 1 - (2 * n + 1) / _DIRECTIONS  # a Fibonacci sphere
+    turn = n * np.pi * (3 - np.sqrt(5))
+    ring = np.sqrt(1 - z * z)
+    directions = np.stack([ring * np.cos(turn), ring * np.sin(turn), z], axis=1)
+    farthest = (directions.astype(np.float32) @ points.T.astype(np.float32)).argmax(axis=1)
+    return points[np.unique(farthest)].astype(np.float64)
+
+
 def inside(
     layers: tuple[CutLayer, ...], points_mm: Float[np.ndarray, "n 3"]
 ) -> Bool[np.ndarray, " n"]:
     """Which points lie in the piece that the layers make up."""
-    import shapely
-
     found = np.zeros(len(points_mm), bool)
     for layer in layers:
         area = polygon_of(layer.rings_mm)
@@ -78,7 +156,7 @@ def inside(
 def _volumes_ml(located: Located, label: int, taken: Bool[np.ndarray, " n"]) -> dict[str, float]:
     """By counting points, which lie evenly in the organ."""
     kidney = located.meshes.get("kidney")
-    organ_mm3 = cloud_volume_mm3(located.points_mm) if kidney is None else kidney.volume_mm3
+    organ_mm3 = _cloud_volume_mm3(located.points_mm) if kidney is None else kidney.volume_mm3
     organ_ml = organ_mm3 / 1000
     each_ml = organ_ml / len(located.points_mm)
     tumor, healthy = located.labels == label, located.labels < FIRST_TUMOR
@@ -91,18 +169,16 @@ def _volumes_ml(located: Located, label: int, taken: Bool[np.ndarray, " n"]) -> 
     }
 
 
-def cloud_volume_mm3(points_mm: Float[np.ndarray, "n 3"]) -> float:
-    """Of a body that points lie evenly in, without overhangs: the sum over columns of their area
+def _cloud_volume_mm3(points_mm: Float[np.ndarray, "n 3"]) -> float:
+    """Of a body evenly filled with points, without overhangs: the sum over columns of their area
     times the height that k points' span stands for, (k + 1) / (k - 1) of it."""
     flat = points_mm[:, :2] - points_mm[:, :2].min(0)
     side_mm = float(np.sqrt(_A_COLUMN * np.ptp(flat, axis=0).prod() / len(flat)))
     cell = (flat / side_mm).astype(int)
     shape = cell.max(0) + 1
-    index = cell[:, 0] * shape[1] + cell[:, 1]
-    low, high = np.full(shape.prod(), np.inf), np.full(shape.prod(), -np.inf)
-    np.minimum.at(low, index, points_mm[:, 2])
-    np.maximum.at(high, index, points_mm[:, 2])
-    count = np.bincount(index, minlength=len(low))
+    column = cell[:, 0] * shape[1] + cell[:, 1]
+    low, high = column_extremes(column, points_mm[:, 2], shape.prod())
+    count = np.bincount(column, minlength=len(low))
     some = count >= 2
     span = (high - low)[some] * (count[some] + 1) / (count[some] - 1)
     # A column at the edge is not full: it counts by how dense its points are.

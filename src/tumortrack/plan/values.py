@@ -1,4 +1,4 @@
-"""The values of planning: what was located, where to cut, and what then comes away.
+"""The values of planning: what was located, where to cut, and what comes away.
 
 All in the ``table`` frame, mm: z up against gravity, its origin on the table's top. The paper's
 'transverse plane' is the table's plane, its 'superior' is up and its 'posterior' is down.
@@ -14,21 +14,27 @@ import numpy as np
 from jaxtyping import Float, Float64, UInt8
 
 from tumortrack.core.errors import InputError
-from tumortrack.core.types import FIRST_TUMOR, Mesh
+from tumortrack.core.types import FIRST_TUMOR, Mesh, part_names
 
 Method = Literal["published", "margin"]
+StrokeKind = Literal["wall", "floor"]
+Rings = tuple[Float64[np.ndarray, "n 2"], ...]
+
+
+def name_of(label: int) -> str:
+    """The part's name: 1 is kidney, 2 is tumor_1."""
+    return part_names(label)[label - 1]
 
 
 @dataclass(frozen=True, eq=False)
 class Located:
-    """Kidney and tumors as they were located, table frame, mm.
+    """Kidney and tumors as located, table frame, mm.
 
     Attributes:
         points_mm, labels: the labelled cloud: label 1 organ without tumors, 2, 3, ... tumors.
-        meshes: kidney (the whole organ, tumors included), tumor_1, ...: closed; those that there
-            are.
+        meshes: closed surfaces, as far as known: kidney (tumors included), tumor_1, ...
         std_mm: per tumor, the standard deviation of each of its mesh's vertices along any axis;
-            without where the estimate does not know it.
+            left out where the estimate has none.
     """
 
     points_mm: Float[np.ndarray, "n 3"]
@@ -54,7 +60,7 @@ class Located:
 
 @dataclass(frozen=True, eq=False)
 class CutLayer:
-    """A slab of what is to come away: this outline between two heights.
+    """A slab of the piece to be removed: this outline between two heights.
 
     ``rings_mm``: closed polygons (n, 2), x and y, the first point not repeated; several where the
     slab is in pieces. ``top_mm`` is infinite in the uppermost.
@@ -62,7 +68,7 @@ class CutLayer:
 
     bottom_mm: float
     top_mm: float
-    rings_mm: tuple[Float64[np.ndarray, "n 2"], ...]
+    rings_mm: Rings
 
     def __post_init__(self) -> None:
         if not self.bottom_mm < self.top_mm:
@@ -75,14 +81,21 @@ class Cut:
 
     Attributes:
         sweep: which sweep it belongs to, from 1.
-        path_mm: the tip's way (n, 3), evenly spaced, all at one height, in the order in which it
-            goes; of a closed one the first point is repeated at the end.
+        path_mm: of the tip (n, 3), evenly spaced, all at one height, in the order of motion; of a
+            closed stroke the first point is repeated at the end.
         kind: wall: along the outline of a layer; floor: the sheet below the piece.
     """
 
     sweep: int
     path_mm: Float64[np.ndarray, "n 3"]
-    kind: Literal["wall", "floor"] = "wall"
+    kind: StrokeKind = "wall"
+
+    @classmethod
+    def level(
+        cls, sweep: int, flat: Float64[np.ndarray, "n 2"], height: float, kind: StrokeKind = "wall"
+    ) -> Cut:
+        """From its x and y, and its height, mm."""
+        return cls(sweep, np.column_stack([flat, np.full(len(flat), height)]), kind)
 
     @property
     def height_mm(self) -> float:
@@ -99,7 +112,7 @@ class Cut:
 
 @dataclass(frozen=True, eq=False)
 class ResectionPlan:
-    """Where to hold, where to cut, and what comes away if the estimate is right.
+    """Where to grasp, where to cut, and what comes away if the estimate is right.
 
     Attributes:
         tumor: its part's name (tumor_1, ...) and ``label``.
@@ -130,3 +143,7 @@ class ResectionPlan:
     def sweeps(self) -> int:
         """How many sweeps there are."""
         return max(cut.sweep for cut in self.cuts)
+
+
+# What a method of planning returns: layers, cuts, and where to grasp (table frame, mm)
+MethodResult = tuple[tuple[CutLayer, ...], tuple[Cut, ...], Float64[np.ndarray, " 3"]]

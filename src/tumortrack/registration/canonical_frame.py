@@ -99,7 +99,7 @@ def _monomials(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "m 30"]:
     return fields.transpose(0, 2, 1).reshape(3 * len(x), -1)
 
 
-def know_any(network: RegistrationNetwork) -> None:
+def initialize_canonical(network: RegistrationNetwork) -> None:
     """Tell a network to be pretrained what it places: the points and fields of any organ."""
     points = generic_points(len(network.points))
     network.points.copy_(torch.as_tensor(points.astype(np.float32)))

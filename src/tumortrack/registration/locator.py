@@ -22,33 +22,33 @@ from tumortrack.sense.cloud import check_cloud, thin_cloud
 
 QUERIES = 40_000  # as many as the paper asks
 CARRIED = 20_000  # points of the undeformed organ that live estimates carry along
-_KNOWN_AT = 256  # places where the uncertainty is worked out; others take the nearest's
+_SAMPLES = 256  # places where the uncertainty is computed; other points take the nearest's
 _FIELD_MM = 0.3  # error of the distance fields and surfaces themselves
-_MOVED_MM = 2.5  # from one live frame to the next: more is found again from the start
-_BEHIND_MM = 2.0  # that a mean may lie behind: beyond, it begins anew
+_MOVED_MM = 2.5  # between live frames: what moves farther is found again from the start
+_BEHIND_MM = 2.0  # a smoothed motion that lags by more starts again
 
 
 @dataclass(frozen=True, eq=False)
-class _Inside:
-    """Points of the undeformed organ: where (CT, mm), label, distance to the nearest surface that
-    bounds it, and which place of known uncertainty is nearest."""
+class _OrganPoints:
+    """Points of the undeformed organ: place (CT, mm), label, distance to the nearest surface that
+    bounds it, and the number of the nearest sample of uncertainty."""
 
     points_ct: Float32[np.ndarray, "n 3"]
     labels: UInt8[np.ndarray, " n"]
     margin_mm: Float32[np.ndarray, " n"]
-    known: Int32[np.ndarray, " n"]
+    sample: Int32[np.ndarray, " n"]
 
 
 @dataclass(frozen=True, eq=False)
-class _Placed:
-    """A fit that can be this organ's: its motion, the surfaces that it moves (camera frame), and
-    one standard deviation (mm) at the known places and at the middle of each part's box."""
+class _Registered:
+    """A fit that can be this organ's: its motion, the moved surfaces (camera frame), and one
+    standard deviation (mm) at the samples and at the middle of each part's box."""
 
     fit: RegistrationResult
     motion: ElasticMotion
     meshes: dict[str, Mesh]
-    known_std_mm: Float[np.ndarray, " k"]
-    middles_std_mm: Float[np.ndarray, " parts"]
+    sample_std_mm: Float[np.ndarray, " k"]
+    middle_std_mm: Float[np.ndarray, " parts"]
 
 
 class RegistrationLocator:
@@ -62,16 +62,16 @@ class RegistrationLocator:
         anatomy = model.shape.anatomy_ct
         organ = anatomy.organ
         self.anatomy_ct: Anatomy | None = anatomy
-        few = max(1, len(organ.vertices_mm) // (_KNOWN_AT // 2))
+        few = max(1, len(organ.vertices_mm) // (_SAMPLES // 2))
         inner = [part.vertices_mm for part in anatomy.tumors]
-        self._known_ct = np.concatenate(
+        self._samples_ct = np.concatenate(
             [organ.vertices_mm[::few], *(v[:: max(1, len(v) // 64)] for v in inner)]
         )
-        self._nearest_known = NearestLookup.of(self._known_ct)
+        self._nearest_sample = NearestLookup.of(self._samples_ct)
         self._middles_ct = np.array([part.box_mm.mean(0) for part in anatomy.parts])
         vertices = np.concatenate([part.vertices_mm for part in anatomy.parts])
         self._vertices_ct = vertices.astype(np.float32)
-        self._carried: _Inside | None = None
+        self._carried: _OrganPoints | None = None
 
     def locate(self, cloud: SensorCloud, grid: int, seed: int) -> Estimate:
         """See ``tracking.tracker.Tracker.locate``."""
@@ -82,11 +82,11 @@ class RegistrationLocator:
             starts = self._registration.propose(points)
         with stage(seconds, "refine", self._device):
             fit = self._registration.best_fit(points, starts, self._calibration.usual_cost)
-        placed = self._placed(points, fit, seconds)
+        placed = self._checked(points, fit, seconds)
         meshes = placed.meshes
         organ = meshes[self._model.parts[0]]
         with stage(seconds, "fine", self._device):
-            inside = self._asked(placed, organ, cloud.stamp_ns, rng)
+            inside = self._drawn(placed, organ, cloud.stamp_ns, rng)
         with stage(seconds, "volume", self._device):
             camera_from_index, shape = grid_over(organ.vertices_mm, grid)
             anatomy = Anatomy(tuple(meshes.values()))
@@ -119,11 +119,11 @@ class RegistrationLocator:
             past_s = (cloud.stamp_ns - last.cloud.stamp_ns) * 1e-9
             share = -math.expm1(-past_s / how.smoothing_s)
             smooth = blend(last.motion, unsmoothed, share)
-            behind = smooth.carry(self._known_ct) - unsmoothed.carry(self._known_ct)
+            behind = smooth.carry(self._samples_ct) - unsmoothed.carry(self._samples_ct)
             if np.linalg.norm(behind, axis=1).max() < _BEHIND_MM:
                 fit = replace(fit, motion=smooth)
                 lag_s = past_s * (1 - share) / share  # of what moves steadily
-        placed = self._placed(points, fit, seconds)
+        placed = self._checked(points, fit, seconds)
         with stage(seconds, "carry", self._device):
             inside = self._carry(placed, cloud.stamp_ns)
         report = self._report(report_head(cloud, how.seed), placed, inside, seconds)
@@ -145,33 +145,33 @@ class RegistrationLocator:
         check_cloud(cloud)
         return thin_cloud(cloud, self._model.config.scene.cloud.n_points, rng).points_mm
 
-    def _placed(
+    def _checked(
         self, points: Float32[np.ndarray, "n 3"], fit: RegistrationResult, seconds: dict[str, float]
-    ) -> _Placed:
+    ) -> _Registered:
         """What a fit says, if it can be this organ's."""
         check_familiar(self._model.familiar, spread_mm(points), fit_mm(np.abs(fit.distances_mm)))
         check_likely(fit.motion.rarity)
         with stage(seconds, "surfaces", self._device):
             return self._moved(fit)
 
-    def _moved(self, fit: RegistrationResult) -> _Placed:
+    def _moved(self, fit: RegistrationResult) -> _Registered:
         motion = replace(fit.motion, std_scale=self._calibration.std_scale)
         anatomy = self._shape.anatomy_ct
         moved = motion.carry(self._vertices_ct)
         ends = np.cumsum([len(part.vertices_mm) for part in anatomy.parts])[:-1]
         parts = zip(anatomy.names, anatomy.parts, np.split(moved, ends), strict=True)
         meshes = {name: part.moved(places) for name, part, places in parts}
-        deviation = motion.std_mm(np.concatenate([self._known_ct, self._middles_ct]))
+        deviation = motion.std_mm(np.concatenate([self._samples_ct, self._middles_ct]))
         assert deviation is not None
-        known = len(self._known_ct)
-        return _Placed(fit, motion, meshes, deviation[:known], deviation[known:])
+        count = len(self._samples_ct)
+        return _Registered(fit, motion, meshes, deviation[:count], deviation[count:])
 
     def _report(
-        self, head: dict, placed: _Placed, inside: OccupancyCloud, seconds: dict[str, float]
+        self, head: dict, placed: _Registered, inside: OccupancyCloud, seconds: dict[str, float]
     ) -> dict:
         fit, motion = placed.fit, placed.motion
         parts = describe_parts(self._model.parts, placed.meshes, inside)
-        for part, std_mm in zip(parts.values(), placed.middles_std_mm, strict=True):
+        for part, std_mm in zip(parts.values(), placed.middle_std_mm, strict=True):
             part["center_std_mm"] = float(std_mm)
         return {
             **head,
@@ -187,8 +187,8 @@ class RegistrationLocator:
             "timings": {**seconds, "total": sum(seconds.values())},
         }
 
-    def _asked(
-        self, placed: _Placed, organ: Mesh, stamp_ns: int, rng: np.random.Generator
+    def _drawn(
+        self, placed: _Registered, organ: Mesh, stamp_ns: int, rng: np.random.Generator
     ) -> OccupancyCloud:
         """Random points of the organ's box that lie inside, with label and probability."""
         lower, upper = organ.box_mm
@@ -199,7 +199,7 @@ class RegistrationLocator:
         probability = _probability(placed, mine)
         return OccupancyCloud(points.take(inside, 0), mine.labels, probability, stamp_ns)
 
-    def _carry(self, placed: _Placed, stamp_ns: int) -> OccupancyCloud:
+    def _carry(self, placed: _Registered, stamp_ns: int) -> OccupancyCloud:
         """The same points of the organ in every frame: labels stay, places and probabilities are
         new."""
         if self._carried is None:
@@ -215,16 +215,17 @@ class RegistrationLocator:
 
     def _inside(
         self, points_ct: Float32[np.ndarray, "n 3"]
-    ) -> tuple[Int64[np.ndarray, " m"], _Inside]:
-        """Which points lie inside, and what is known of those."""
+    ) -> tuple[Int64[np.ndarray, " m"], _OrganPoints]:
+        """The numbers of the points that lie inside, and what is known of these points."""
         labels, margin_mm = self._shape.labels_at(points_ct)
         inside = np.flatnonzero(labels)
         mine = points_ct.take(inside, 0)  # much faster than by a mask
-        known = self._nearest_known.to(mine)
-        return inside, _Inside(mine, labels[inside], margin_mm[inside], known)
+        sample = self._nearest_sample.to(mine)
+        return inside, _OrganPoints(mine, labels[inside], margin_mm[inside], sample)
 
 
-def _probability(placed: _Placed, mine: _Inside) -> Float32[np.ndarray, " n"]:
-    """That the nearest surface does not lie on a point's other side, errors being normal."""
-    per_std = 1 / np.hypot(placed.known_std_mm, _FIELD_MM)
-    return probabilities(mine.margin_mm, per_std, mine.known, normal_table())
+def _probability(placed: _Registered, mine: _OrganPoints) -> Float32[np.ndarray, " n"]:
+    """The chance that each point lies on the side of the nearest surface where it was found, if
+    errors are normal."""
+    per_std = 1 / np.hypot(placed.sample_std_mm, _FIELD_MM)
+    return probabilities(mine.margin_mm, per_std, mine.sample, normal_table())

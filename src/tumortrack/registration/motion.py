@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float, Float32, Float64
 from scipy.spatial.transform import Rotation
 
-from tumortrack.core.parallel import share
+from tumortrack.core.process import parallel_for
 from tumortrack.registration import residual_kernels as kernels
 from tumortrack.registration.residual_kernels import Flow, Pose
 from tumortrack.registration.rest_shape import RestShape
@@ -22,7 +22,7 @@ _FEW = 64  # as well, where each takes longer
 
 @dataclass(frozen=True, eq=False)
 class ElasticMotion:
-    """``core.motion.Motion`` of a shape: x -> rotation (flow(x) - center_ct) + centre_mm.
+    """``core.estimate.Motion`` of a shape: x -> rotation (flow(x) - center_ct) + centre_mm.
 
     Attributes:
         rotation, centre_mm: where the organ's centre and axes are before the camera.
@@ -70,7 +70,7 @@ class ElasticMotion:
         body, points = self.shape.body, np.ascontiguousarray(points_ct, np.float32)
         known = self._flow, body.modes, body.center_ct.astype(np.float32), self._root
         variance = np.empty(len(points), np.float32)
-        share(
+        parallel_for(
             lambda part: kernels.variances(*known, points[part], variance[part]), len(points), _FEW
         )
         return self.std_scale * np.sqrt(variance.astype(float))
@@ -80,7 +80,7 @@ class ElasticMotion:
     ) -> Float64[np.ndarray, "n 3"]:
         points, out = np.ascontiguousarray(points_mm, np.float32), np.empty((len(points_mm), 3))
         pose = Pose(self.shape.body.center_ct, self.rotation, self.centre_mm)
-        share(lambda part: kernel(flow, pose, points[part], out[part]), len(out), _AT_ONCE)
+        parallel_for(lambda part: kernel(flow, pose, points[part], out[part]), len(out), _AT_ONCE)
         return out
 
     @cached_property

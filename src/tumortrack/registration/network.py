@@ -1,9 +1,9 @@
-"""From a cloud to a first pose and elastic state of the pre-operative organ.
+"""The network: from a cloud to two hypotheses of the organ's pose and elastic state.
 
 The cloud is turned about the camera's axis until its longest direction is x. That leaves two ways
-round; the network is shown both, says how likely each is the right one (the organ's long axis
-pointing to +x), and is trained to locate only in the right one. Without that it learns to undo a
-wrong turn by absurd deformations.
+round, half a turn apart. The network sees both, says how likely each is the right one (the organ's
+long axis pointing to +x), and is trained to locate only in the right one: otherwise it learns to
+undo a wrong turn by absurd deformations.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ POSE_OUTPUTS = 10  # before the coefficients: rotation 6, place 3, way round 1
 _HUBER_MM = 5.0  # errors beyond count by their size, not its square
 _RIGID_SHARE = 0.5  # of the loss: the organ's pose without its deformation
 _WAY_SHARE = 0.2  # of the loss: which way round is right
-_WRONG_SHARE = 4  # one cloud in so many is shown the wrong way round as well
+_FLIPPED_SHARE = 4  # one cloud in so many is shown the wrong way round as well
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,7 +46,7 @@ class AlignedCloud:
     centre_mm: Tensor  # (B, 3), camera frame
     turn: Tensor  # (2, B, 1): cosine and sine of the turn about z
 
-    def other_way(self, sign: Tensor) -> AlignedCloud:
+    def flipped(self, sign: Tensor) -> AlignedCloud:
         """Half a turn about z where ``sign`` (B,) is -1."""
         flip = torch.stack([sign, sign, torch.ones_like(sign)], -1)[:, None]
         return AlignedCloud(self.points * flip, self.centre_mm, self.turn * sign[None, :, None])
@@ -72,7 +72,7 @@ class PoseHypothesis:
 
 
 class RegistrationNetwork(Network):
-    """Clouds -> placements; the buffers that name the organ are set by ``know``."""
+    """Clouds -> hypotheses; the buffers that describe the organ are set by ``initialize``."""
 
     center_ct: Tensor
     points: Tensor
@@ -87,7 +87,7 @@ class RegistrationNetwork(Network):
         if not isinstance(config.decoder, RegistrationHeadConfig) or not isinstance(
             config.normalisation, Aligned
         ):
-            raise InputError("a warp network needs the warp decoder and aligned clouds.")
+            raise InputError("a registration network needs the warp decoder and aligned clouds.")
         self.config = config
         self.scale_mm, self.reach = config.normalisation.scale_mm, config.normalisation.reach
         modes, width = config.decoder.modes, config.decoder.width
@@ -108,7 +108,7 @@ class RegistrationNetwork(Network):
         self.register_buffer("facing", torch.eye(3))
         self.register_buffer("long_axis", torch.tensor([1.0, 0.0, 0.0]))
 
-    def know(
+    def initialize(
         self,
         shape: RestShape,
         up_lps: tuple[float, float, float],
@@ -130,7 +130,7 @@ class RegistrationNetwork(Network):
         for name, value in known.items():
             getattr(self, name).copy_(torch.as_tensor(np.array(value, np.float32)))
 
-    def aside(self, points_mm: Tensor) -> AlignedCloud:
+    def align(self, points_mm: Tensor) -> AlignedCloud:
         """Clouds (B, N, 3), camera frame, mm, in the network's frame."""
         near = without_strays(points_mm, self.reach * self.scale_mm)
         centre_mm = near.mean(dim=1, keepdim=True)
@@ -138,28 +138,28 @@ class RegistrationNetwork(Network):
         turn = alignment(points)
         return AlignedCloud(turned(points, turn), centre_mm[:, 0], turn)
 
-    def right_sign(self, aside: AlignedCloud, rotation: Tensor) -> Tensor:
+    def flip_sign(self, aligned: AlignedCloud, rotation: Tensor) -> Tensor:
         """+1 where the organ's long axis points to +x in the network's frame, else -1; (B,)."""
         axis = rotation @ self.long_axis
-        along = axis[:, 0] * aside.turn[0, :, 0] + axis[:, 1] * aside.turn[1, :, 0]
+        along = axis[:, 0] * aligned.turn[0, :, 0] + axis[:, 1] * aligned.turn[1, :, 0]
         return torch.where(along >= 0, 1.0, -1.0)
 
-    def forward(self, aside: AlignedCloud) -> PoseHypothesis:
+    def forward(self, aligned: AlignedCloud) -> PoseHypothesis:
         """What is seen, if the clouds lie the right way round."""
-        out = self.output(self.hidden(self.encoder(aside.points)))
+        out = self.output(self.hidden(self.encoder(aligned.points)))
         with torch.autocast(out.device.type, enabled=False):  # bf16 would round to 0.2 mm
-            return self._placement(out.float(), aside)
+            return self._placement(out.float(), aligned)
 
-    def _placement(self, out: Tensor, aside: AlignedCloud) -> PoseHypothesis:
+    def _placement(self, out: Tensor, aligned: AlignedCloud) -> PoseHypothesis:
         first = functional.normalize(out[:, :3] + out.new_tensor([1.0, 0.0, 0.0]), dim=1)
         second = out[:, 3:6] + out.new_tensor([0.0, 1.0, 0.0])
         second = second - (first * second).sum(1, keepdim=True) * first
         second = functional.normalize(second, dim=1)
         third = torch.cross(first, second, dim=1)
-        back = _about_z(aside.turn)
+        back = _about_z(aligned.turn)
         rotation = back @ torch.stack([first, second, third], -1) @ self.facing
         place = (out[:, 6:9] * _STEP + out.new_tensor([0.0, 0.0, _BEHIND])) * self.scale_mm
-        centre_mm = aside.centre_mm + (back @ place[..., None])[..., 0]
+        centre_mm = aligned.centre_mm + (back @ place[..., None])[..., 0]
         bounded = _LARGEST * torch.tanh(out[:, POSE_OUTPUTS:] / _LARGEST)
         return PoseHypothesis(rotation, centre_mm, self.mean + self.std * bounded, out[:, 9])
 
@@ -179,13 +179,13 @@ class RegistrationNetwork(Network):
         ``first``: the first cloud's number in a batch that several processes share; the mean of
         equal shares' losses is the whole batch's.
         """
-        aside = self.aside(clouds_mm)
+        aligned = self.align(clouds_mm)
         with torch.autocast(clouds_mm.device.type, enabled=False):
             true_rotation = camera_from_ct[:, :3, :3]
             true_centre = true_rotation @ self.center_ct + camera_from_ct[:, :3, 3]
-            sign = self.right_sign(aside, true_rotation)
-        placed = self(aside.other_way(sign))
-        told_wrong = self._told_wrong(aside.other_way(-sign), first)
+            sign = self.flip_sign(aligned, true_rotation)
+        placed = self(aligned.flipped(sign))
+        told_wrong = self._flipped_loss(aligned.flipped(-sign), first)
         with torch.autocast(clouds_mm.device.type, enabled=False):
             moved = self.points + torch.einsum("pdm,bm->bpd", self.modes, placed.coefficients)
             error = _size(_placed(moved, placed.rotation, placed.centre_mm) - points_mm)
@@ -194,24 +194,24 @@ class RegistrationNetwork(Network):
             told = functional.softplus(-placed.right_way).mean() + told_wrong
             return error + _RIGID_SHARE * rigid_error + _WAY_SHARE * told
 
-    def _told_wrong(self, wrong: AlignedCloud, first: int) -> Tensor:
+    def _flipped_loss(self, wrong: AlignedCloud, first: int) -> Tensor:
         """How well the wrong way round is told, by some of the clouds: the same ones in every
         sharing of the batch, so that a small share may have none."""
-        few = wrong[slice(-first % _WRONG_SHARE, None, _WRONG_SHARE)]
+        few = wrong[slice(-first % _FLIPPED_SHARE, None, _FLIPPED_SHARE)]
         if not len(few.points):
             return wrong.points.new_zeros(())
         told = functional.softplus(self(few).right_way).sum()
-        return told / (len(wrong.points) / _WRONG_SHARE)
+        return told / (len(wrong.points) / _FLIPPED_SHARE)
 
     def onnx_parts(self, cloud_mm: Tensor) -> tuple[nn.Module, tuple[Tensor, ...], dict[str, Any]]:
         """See ``Network``: clouds in, hypotheses of both ways round out."""
         names = {"input_names": ["cloud_mm"], "output_names": list(_PLACES)}
-        return _BothWays(self).cpu().eval(), (cloud_mm,), names
+        return _FlipHypotheses(self).cpu().eval(), (cloud_mm,), names
 
-    def both_ways(self, points_mm: Tensor) -> tuple[PoseHypothesis, PoseHypothesis]:
+    def flip_hypotheses(self, points_mm: Tensor) -> tuple[PoseHypothesis, PoseHypothesis]:
         """Placements for the clouds as they were turned, and for half a turn more."""
-        one = self.aside(points_mm)
-        other = one.other_way(-torch.ones_like(one.centre_mm[:, 0]))
+        one = self.align(points_mm)
+        other = one.flipped(-torch.ones_like(one.centre_mm[:, 0]))
         # One batch: a network this small takes as long for two clouds as for one.
         both = self(
             AlignedCloud(
@@ -223,7 +223,7 @@ class RegistrationNetwork(Network):
         return both[: len(points_mm)], both[len(points_mm) :]
 
 
-class _BothWays(nn.Module):
+class _FlipHypotheses(nn.Module):
     """A cloud (1, N, 3) -> the hypotheses' four arrays, (2, ...) each: as the cloud was turned, and
     half a turn more."""
 
@@ -232,7 +232,7 @@ class _BothWays(nn.Module):
         self.network = network
 
     def forward(self, cloud_mm: Tensor) -> tuple[Tensor, ...]:
-        ways = self.network.both_ways(cloud_mm)
+        ways = self.network.flip_hypotheses(cloud_mm)
         return tuple(torch.cat([getattr(way, name) for way in ways]) for name in _PLACES)
 
 

@@ -22,7 +22,7 @@ import torch
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from tumortrack.core.parallel import share
+from tumortrack.core.process import parallel_for
 from tumortrack.models.config import GaussNewtonConfig
 from tumortrack.registration.gauss_newton import GaussNewton, RegistrationResult
 from tumortrack.registration.motion import ElasticMotion
@@ -60,7 +60,9 @@ class Registration:
         device = next(self.network.parameters()).device
         cloud = torch.tensor(np.asarray(points_mm, np.float32), device=device)[None]
         with _one_thread() if device.type == "cpu" else nullcontext():
-            ways = sorted(self.network.both_ways(cloud), key=lambda way: -float(way.right_way))
+            ways = sorted(
+                self.network.flip_hypotheses(cloud), key=lambda way: -float(way.right_way)
+            )
         if float(ways[0].right_way - ways[1].right_way) > _SURE:
             ways = ways[:1]
         return [self._motion(way) for way in ways]
@@ -106,7 +108,7 @@ def _run_all(runners: list[GaussNewton], steps: int) -> None:
         for runner in runners[part]:
             runner.run(steps)
 
-    share(run, len(runners), 1)
+    parallel_for(run, len(runners), 1)
 
 
 @contextmanager

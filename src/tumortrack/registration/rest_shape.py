@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float32, Float64, UInt8
 
 from tumortrack.core.errors import InputError
-from tumortrack.core.parallel import share
+from tumortrack.core.process import parallel_for
 from tumortrack.core.types import Anatomy, Mesh
 from tumortrack.simulate.elastic.body import ElasticBody
 from tumortrack.simulate.occupancy import contains, surface_distance
@@ -84,7 +84,7 @@ class RestShape:
                 lattice = field.values_mm, field.origin_mm, np.float32(field.spacing_mm)
                 _mark(*lattice, np.uint8(label), *some)
 
-        share(mark, len(points_ct), _AT_ONCE)
+        parallel_for(mark, len(points_ct), _AT_ONCE)
         return labels, margin_mm
 
     def to_arrays(self) -> dict[str, np.ndarray]:

@@ -13,10 +13,10 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from tumortrack.core.errors import InputError
+from tumortrack.core.estimate import Motion
 from tumortrack.core.geometry import transform_points
-from tumortrack.core.motion import Motion
 from tumortrack.core.types import Anatomy, CameraLabels, Mesh
-from tumortrack.imaging.raster import _expand
+from tumortrack.imaging.raster import expand
 
 # Peers take it from here; their cells are kept by the text of their code.
 from tumortrack.imaging.raster import label_grid as label_grid
@@ -59,7 +59,7 @@ def surface_samples(
     edges = triangles - np.roll(triangles, 1, axis=1)
     cuts = np.maximum(np.ceil(np.linalg.norm(edges, axis=2).max(1) / spacing_mm), 1).astype(int)
     area = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1) / 2
-    face, cell = _expand(cuts**2)
+    face, cell = expand(cuts**2)
     n = cuts[face]
     # Row r of the cut triangle holds 2 r + 1 cells, pointing up (even) and down (odd) in turn.
     row = np.floor(np.sqrt(cell)).astype(int)

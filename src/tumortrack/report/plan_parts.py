@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Bool
 
-from tumortrack.core.solids import mesh_of, solid_of
 from tumortrack.core.types import Mesh
+from tumortrack.imaging.meshes import mesh_of, solid_of
 from tumortrack.imaging.raster import voxelise
 from tumortrack.plan.values import Cut, CutLayer
 

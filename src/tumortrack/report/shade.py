@@ -149,8 +149,8 @@ def _trace(
     corners = triangles[winner[hit]]
     spot = np.stack([hit // shape[1], hit % shape[1]], axis=1)
     share = _barycentric(corners[:, :, :2], spot.astype(float))
-    vertex_normals = _vertex_normals(flat, mesh.faces)[mesh.faces[winner[hit]]]
-    normal = np.einsum("nc,ncd->nd", share, vertex_normals)
+    corner_normals = vertex_normals(flat, mesh.faces)[mesh.faces[winner[hit]]]
+    normal = np.einsum("nc,ncd->nd", share, corner_normals)
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
     normal *= np.where(normal[:, 2:] > 0, -1, 1)
     normals = np.zeros((shape[0] * shape[1], 3))
@@ -170,7 +170,10 @@ def _barycentric(
     return np.clip(np.stack([1 - v - w, v, w], axis=1), 0, 1)
 
 
-def _vertex_normals(vertices: Float[np.ndarray, "v 3"], faces: np.ndarray) -> np.ndarray:
+def vertex_normals(
+    vertices: Float[np.ndarray, "v 3"], faces: np.ndarray
+) -> Float[np.ndarray, "v 3"]:
+    """Unit normals (outward where faces turn outward), each the mean of its triangles' by area."""
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     normals = np.zeros_like(vertices)
     for corner in range(3):

@@ -7,6 +7,7 @@ so the image spans -0.5 .. width - 0.5; librealsense uses the same convention.
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Float32, Float64, Integer
@@ -42,6 +43,19 @@ def d405(width: int = 848, height: int = 480) -> Intrinsics:
         cx=(width - 1) / 2,
         cy=(height - 1) / 2,
     )
+
+
+class Pinhole(NamedTuple):
+    """The numbers of ``Intrinsics`` that project a point, as compiled kernels take them; px."""
+
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+
+
+def pinhole_of(intrinsics: Intrinsics) -> Pinhole:
+    return Pinhole(intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy)
 
 
 def deproject_pixels(

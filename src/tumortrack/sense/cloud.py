@@ -9,7 +9,7 @@ from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.types import DepthFrame, SensorCloud
 from tumortrack.sense.camera import deproject_pixels
 
-FEWEST_POINTS = 200  # fewer say too little about an organ's shape and pose
+FEWEST_POINTS = 200  # fewer do not determine an organ's shape and pose
 
 
 class CloudConfig(Config, frozen=True, kw_only=True):
@@ -106,8 +106,8 @@ def check_cloud(cloud: SensorCloud) -> None:
 
 
 def _count_different(points_mm: np.ndarray, ordered_x: np.ndarray) -> int:
-    """How many points differ; a count of 200 and more may be too small."""
-    count = 1 + int(np.count_nonzero(np.diff(ordered_x)))  # mostly tells, and costs little
+    """How many points differ; a count of 200 or more is a lower bound."""
+    count = 1 + int(np.count_nonzero(np.diff(ordered_x)))  # mostly decides, and is cheap
     if count >= FEWEST_POINTS:
         return count
     for some in (points_mm[:2000], points_mm):  # sorting all of a large cloud takes a while

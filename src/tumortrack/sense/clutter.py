@@ -12,11 +12,10 @@ import numpy as np
 from jaxtyping import Float
 
 from tumortrack.core.config import Config
-from tumortrack.core.errors import InputError
 from tumortrack.core.types import DepthFrame
 
 _STEEPEST = 0.6  # slope of a plane: 30 degrees
-_LOOK_AT = 400  # pixels tell where the organ lies
+_SAMPLED = 400  # pixels that show where the organ lies
 _MOST = 0.5  # share of all points
 
 
@@ -28,10 +27,7 @@ class ClutterConfig(Config, frozen=True, kw_only=True):
     largest_share: float = 0.0
 
     def __post_init__(self) -> None:
-        for name, most in (("scenes", 1.0), ("largest_share", _MOST)):
-            value = getattr(self, name)
-            if not 0 <= value <= most:
-                raise InputError(f"clutter {name} is {value}; allowed: 0 (off) to {most:g}.")
+        self.check_ranges("clutter", scenes=1.0, largest_share=_MOST)
 
 
 @dataclass(frozen=True)
@@ -82,12 +78,11 @@ def add_clutter(frame: DepthFrame, config: ClutterConfig, rng: np.random.Generat
     chosen = np.flatnonzero(free)[:count]
     depth_mm = frame.depth_mm.copy()
     depth_mm[row[chosen], column[chosen]] = patch.depth_mm[chosen]
-    depth_mm.flags.writeable = False  # nobody else's: taken over without a copy
-    return DepthFrame(depth_mm, camera, frame.stamp_ns)
+    return frame.with_depth(depth_mm)
 
 
 def _where(frame: DepthFrame, seen: np.ndarray, rng: np.random.Generator) -> _Organ:
-    pixels = seen[rng.integers(len(seen), size=_LOOK_AT)]
+    pixels = seen[rng.integers(len(seen), size=_SAMPLED)]
     row, column = np.divmod(pixels, frame.intrinsics.width)
     depth_mm = frame.depth_mm.flat[pixels]
     width_px = float(max(np.ptp(column), np.ptp(row), 1))

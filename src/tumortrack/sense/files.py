@@ -7,6 +7,9 @@ against the file and a limit before anything is allocated; nothing here loads pi
 from __future__ import annotations
 
 import io
+import math
+import struct
+import zipfile
 from pathlib import Path
 from typing import Literal
 
@@ -15,9 +18,7 @@ import numpy as np
 from tumortrack.core.errors import InputError
 from tumortrack.core.store import read_json, write_atomically, write_json
 from tumortrack.core.types import DepthFrame, Intrinsics, SensorCloud
-from tumortrack.sense.npz import parse_npz_points
-from tumortrack.sense.pcd import parse_pcd_points
-from tumortrack.sense.ply import parse_ply_points, write_cloud_ply
+from tumortrack.sense.ply import parse_ply_properties, write_cloud_ply
 
 __all__ = [
     "read_cloud",
@@ -31,6 +32,8 @@ __all__ = [
 CLOUD_SUFFIXES = (".ply", ".pcd", ".npz")
 DEPTH_UNIT_MM = 0.1  # the D405's default
 LARGEST_FILE = 256 * 2**20  # bytes, also of what a compressed file unpacks to
+_PINHOLE_KEYS = ("width", "height", "fx", "fy", "cx", "cy")
+_OTHER_KEYS = {"cx": "ppx", "cy": "ppy"}
 _DISTORTION_KEYS = (
     *("coeffs", "distortion", "distortion_coefficients", "dist_coeffs", "D"),
     *("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2"),
@@ -40,10 +43,10 @@ _DISTORTION_KEYS = (
 def read_cloud(path: Path, unit: Literal["mm", "m"] = "mm") -> tuple[SensorCloud, tuple[str, ...]]:
     """A cloud in the camera frame from .ply, .pcd (all three encodings) or .npz, and notes.
 
-    An .npz holds ``points_mm``, or ``points``, or one array (n, 3) of any name. Points that
-    stand for "no return" (NaN, infinite, or exactly 0, 0, 0, as RealSense and organised clouds
-    have them) are dropped, and a note says how many. Whether the rest can be an organ in mm is
-    ``cloud.check_cloud``'s question.
+    An .npz holds ``points_mm``, or ``points``, or one array (n, 3) of any name. Points without
+    return (NaN, infinite, or exactly 0, 0, 0, as RealSense and organised clouds have them) are
+    dropped, and a note says how many. ``cloud.check_cloud`` then tells whether the rest can be
+    an organ in mm.
 
     Raises:
         InputError: missing, too large, damaged, of another kind, or without any point.
@@ -69,10 +72,10 @@ def _raw_points(path: Path, unit: str) -> np.ndarray:
         raise InputError(f"unit {unit!r} is not understood. Allowed: mm, m.")
     content = _read_bytes(path)
     if suffix == ".ply":
-        return parse_ply_points(content, str(path))
+        return parse_ply_properties(content, str(path))
     if suffix == ".pcd":
-        return parse_pcd_points(content, str(path), LARGEST_FILE)
-    points, key = parse_npz_points(content, str(path), LARGEST_FILE)
+        return _pcd_points(content, str(path))
+    points, key = _npz_points(content, str(path))
     if unit == "m" and key == "points_mm":
         raise InputError(f"{path}: 'points_mm' is in mm by its name; leave out --unit m.")
     return points
@@ -89,6 +92,96 @@ def _read_bytes(path: Path) -> bytes:
     if len(content) > LARGEST_FILE:
         raise InputError(f"{path} is larger than 256 MiB; thin it first.")
     return content
+
+
+def _pcd_points(content: bytes, name: str) -> np.ndarray:
+    """The points' x, y, z as floats (n, 3), in the file's unit; ascii, binary or compressed.
+
+    Raises:
+        InputError: no PCD, damaged, larger than 256 MiB unpacked, or no x, y, z.
+    """
+    from pypcd4 import PointCloud
+
+    _check_pcd_size(content, name)
+    try:
+        cloud = PointCloud.from_fileobj(io.BufferedReader(io.BytesIO(content)))
+        table = np.atleast_1d(cloud.pc_data)
+        points = np.stack([table[axis].astype(np.float64) for axis in "xyz"], axis=1)
+    except Exception as error:  # pypcd4 raises anything on a damaged file
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise InputError(f"{name} cannot be read as PCD with x, y and z: {reason}.") from error
+    if len(points) != cloud.metadata.points:
+        raise InputError(
+            f"{name} claims {cloud.metadata.points} points but holds {len(points)}; it is "
+            "damaged. Export it again."
+        )
+    return points
+
+
+def _check_pcd_size(content: bytes, name: str) -> None:
+    """Hold the claimed size against the limit, before pypcd4 allocates it."""
+    header, found, body = content[: 64 * 1024].partition(b"\nDATA ")
+    fields = {line.split()[0]: line.split()[1:] for line in header.splitlines() if line.split()}
+    try:
+        points = int(fields[b"POINTS"][0])
+        sizes = [int(size) for size in fields[b"SIZE"]]
+        counts = [int(count) for count in fields.get(b"COUNT", [b"1"] * len(sizes))]
+        claimed = points * sum(size * n for size, n in zip(sizes, counts, strict=True))
+        start = len(header) + len(found) + body.index(b"\n") + 1
+    except (KeyError, ValueError, IndexError) as error:
+        raise InputError(f"{name} is no PCD file (its header lacks or garbles a line).") from error
+    if body.startswith(b"binary_compressed"):
+        packed, unpacked = struct.unpack_from("<II", content[start : start + 8].ljust(8, b"\0"))
+        too_large = unpacked > LARGEST_FILE or packed > len(content) - start - 8
+        too_large |= claimed > unpacked
+    else:  # ascii: at least a digit and a blank for each number
+        room = len(content) - start
+        numbers = 2 * points * sum(counts)
+        too_large = (claimed > room) if body.startswith(b"binary") else (numbers > room + 1)
+    if too_large or points < 0 or claimed > LARGEST_FILE or sum(counts) > 1000:
+        raise InputError(f"{name} claims {points} points but has no room for them; it is damaged.")
+
+
+def _npz_points(content: bytes, name: str) -> tuple[np.ndarray, str]:
+    """The points (n, 3), in the file's unit, and the name of their array: ``points_mm``, else
+    ``points``, else the only one of that shape.
+
+    Raises:
+        InputError: no .npz, damaged, larger than 256 MiB unpacked, or no such array.
+    """
+    try:
+        with zipfile.ZipFile(io.BytesIO(content)) as archive:
+            _check_npz_size(archive, name)
+        with np.load(io.BytesIO(content), allow_pickle=False) as arrays:
+            preferred = [key for key in ("points_mm", "points") if key in arrays.files]
+            found = {key: arrays[key] for key in preferred[:1] or arrays.files}
+    except InputError:
+        raise
+    except Exception as error:  # zipfile and numpy raise anything on a damaged file
+        raise InputError(f"{name} cannot be read as .npz: {error or type(error)}.") from error
+    clouds = [key for key, a in found.items() if a.shape[1:] == (3,) and a.dtype.kind in "fiu"]
+    if len(clouds) != 1:
+        shapes = ", ".join(f"{key} {array.shape}" for key, array in found.items())
+        raise InputError(
+            f"{name} must hold points_mm, points, or exactly one (n, 3) array of numbers; "
+            f"it has: {shapes or 'nothing'}."
+        )
+    return found[clouds[0]], clouds[0]
+
+
+def _check_npz_size(archive: zipfile.ZipFile, name: str) -> None:
+    """Hold each array's claimed shape against its bytes; numpy allocates what a header claims."""
+    if sum(member.file_size for member in archive.infolist()) > LARGEST_FILE:
+        raise InputError(f"{name} unpacks to more than 256 MiB; thin the cloud first.")
+    for member in archive.infolist():
+        with archive.open(member) as stream:
+            major, _ = np.lib.format.read_magic(stream)
+            headers = np.lib.format
+            read = headers.read_array_header_1_0 if major == 1 else headers.read_array_header_2_0
+            shape, _, dtype = read(stream)
+        claimed = math.prod((dtype.itemsize, *shape))
+        if claimed > member.file_size or min(shape, default=0) < 0:
+            raise InputError(f"{name}: {member.filename} claims more than the file holds.")
 
 
 def read_intrinsics(path: Path) -> Intrinsics:
@@ -115,15 +208,8 @@ def _intrinsics(data: dict, path: Path) -> Intrinsics:
                 "Give the rectified depth stream (a D405's is) and its intrinsics."
             )
     values = {}
-    for key, other in {
-        "width": "",
-        "height": "",
-        "fx": "",
-        "fy": "",
-        "cx": "ppx",
-        "cy": "ppy",
-    }.items():
-        found = data.get(key, data.get(other))
+    for key in _PINHOLE_KEYS:
+        found = data.get(key, data.get(_OTHER_KEYS.get(key, "")))
         if found is None or isinstance(found, list):
             needed = "width, height, fx, fy, cx (or ppx), cy (or ppy)"
             raise InputError(f"{path} lacks the number {key!r}; it must have {needed}, in pixels.")
@@ -131,8 +217,7 @@ def _intrinsics(data: dict, path: Path) -> Intrinsics:
     for key in ("width", "height"):
         if not values[key].is_integer():
             raise InputError(f"{path}: {key} is {values[key]}; it must be a whole number.")
-    width, height = int(values.pop("width")), int(values.pop("height"))
-    return Intrinsics(width, height, **values)
+    return Intrinsics(int(values.pop("width")), int(values.pop("height")), **values)
 
 
 def _numbers(value: object, key: str, path: Path) -> list[float]:
@@ -159,8 +244,7 @@ def write_intrinsics(
 
 def intrinsics_json(intrinsics: Intrinsics, depth_unit_mm: float = DEPTH_UNIT_MM) -> dict:
     """What ``write_intrinsics`` writes."""
-    names = ("width", "height", "fx", "fy", "cx", "cy")
-    values = {name: getattr(intrinsics, name) for name in names}
+    values = {key: getattr(intrinsics, key) for key in _PINHOLE_KEYS}
     return {**values, "depth_unit_mm": depth_unit_mm}
 
 
@@ -169,7 +253,7 @@ def read_depth_png(
 ) -> DepthFrame:
     """A 16-bit depth image; 0 is no return.
 
-    One step is ``depth_unit_mm``, or what the intrinsics file says under that name, or 0.1 mm.
+    One step is ``depth_unit_mm``, else what the intrinsics file states, else 0.1 mm.
 
     Raises:
         InputError: not a single-channel 16-bit PNG, or of another size than the intrinsics.

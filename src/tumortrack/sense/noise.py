@@ -1,4 +1,4 @@
-"""Sensor noise of a stereo depth camera, each part switchable (zero = off).
+"""Sensor errors of a stereo depth camera, each switchable (zero = off): noise and calibration.
 
 Order as in the sensor: the matcher errs at edges (flying pixels) and everywhere (noise growing
 with z^2, slow distortion), fails in places (holes), invents some matches (scattered points), and
@@ -12,15 +12,54 @@ one matching window spans several pixels, so near pixels err together.
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError
 from tumortrack.core.types import DepthFrame
+from tumortrack.sense.camera import pinhole_of
 
-Seen = tuple[np.ndarray, np.ndarray]  # ``noise_kernels.seen_pixels``
+if TYPE_CHECKING:
+    from tumortrack.sense.kernels import Seen
 
 REFERENCE_MM = 150.0  # the distance at which ``axial_mm`` is stated
+
+
+class CalibrationConfig(Config, frozen=True, kw_only=True):
+    """Largest errors of a camera out of calibration; zero switches it off.
+
+    Stereo cameras drift with temperature and shocks until they are calibrated again. Each frame
+    draws its own error, uniformly to either side and the same for all pixels: no averaging
+    removes it.
+
+    offset_mm: added to every depth.
+    scale: share of the depth, 0..0.2.
+    """
+
+    offset_mm: float = 0.0
+    scale: float = 0.0
+
+    def __post_init__(self) -> None:
+        self.check_ranges("calibration", offset_mm=20.0, scale=0.2)
+
+
+CALIBRATED = CalibrationConfig()
+
+
+def miscalibrate(
+    frame: DepthFrame, config: CalibrationConfig, rng: np.random.Generator
+) -> DepthFrame:
+    """The frame as a camera out of calibration would measure it.
+
+    ``rng`` is left as it was. Where it is off, nothing is drawn and the frame itself comes back.
+    """
+    if config == CALIBRATED:
+        return frame
+    offset, scale = rng.spawn(1)[0].uniform(-1, 1, 2)
+    factor = np.float32(1 + scale * config.scale)
+    return frame.with_depth(frame.depth_mm * factor + np.float32(offset * config.offset_mm))
 
 
 class NoiseConfig(Config, frozen=True, kw_only=True):
@@ -93,57 +132,46 @@ def add_noise(frame: DepthFrame, config: NoiseConfig, rng: np.random.Generator) 
     seed = int(rng.integers(2**62))
     if config == CLEAN:
         return frame
-    from tumortrack.sense.noise_kernels import seen_pixels
+    from tumortrack.sense.kernels import seen_pixels
 
     true_mm = frame.depth_mm
     seen = seen_pixels(true_mm)
-    depths_mm = true_mm.ravel()[seen[0]]
-    scatter = _scatter(true_mm, seen[0], depths_mm, config, np.random.default_rng((seed, 0)))
-    _err_at_edges(frame, depths_mm, seen, config, seed)
-    _err_everywhere(true_mm.shape, depths_mm, seen, config, seed)
+    depths_mm = true_mm.ravel()[seen.pixels]
+    scatter = _scatter(true_mm, seen.pixels, depths_mm, config, np.random.default_rng((seed, 0)))
+    _disturb(frame, depths_mm, seen, config, seed)
     out_mm = np.full(true_mm.shape, np.nan, np.float32)
-    for pixels, values_mm in ((seen[0], depths_mm), scatter):
-        out_mm.ravel()[pixels] = _whole(values_mm, config.quantum_mm)
-    out_mm.flags.writeable = False  # nobody else's: taken over without a copy
-    return DepthFrame(out_mm, frame.intrinsics, frame.stamp_ns)
+    for pixels, values_mm in ((seen.pixels, depths_mm), scatter):
+        out_mm.ravel()[pixels] = _quantised(values_mm, config.quantum_mm)
+    return frame.with_depth(out_mm)
 
 
-def _err_at_edges(
+def _disturb(
     frame: DepthFrame, depths_mm: np.ndarray, seen: Seen, config: NoiseConfig, seed: int
 ) -> None:
-    from tumortrack.sense import noise_kernels as kernels
-
-    true_mm = frame.depth_mm
-    if config.flying_share:
-        edge = (config.edge_px, config.edge_mm)
-        kernels.fly(true_mm, depths_mm, seen, seed + 1, config.flying_share, config.flying_mm, edge)
-    if config.grazing_share:
-        pinhole = kernels.pinhole(frame.intrinsics)
-        angle = config.grazing_degrees
-        kernels.lose_grazing(
-            true_mm, depths_mm, seen, seed + 2, config.grazing_share, angle, pinhole
-        )
-
-
-def _err_everywhere(
-    shape: tuple[int, int], depths_mm: np.ndarray, seen: Seen, config: NoiseConfig, seed: int
-) -> None:
+    """Change the seen depths in place: edges, slow distortion, noise, holes."""
     from scipy.special import ndtri
 
-    from tumortrack.sense import noise_kernels as kernels
+    from tumortrack.sense import kernels
 
+    true_mm, shape = frame.depth_mm, frame.depth_mm.shape
+    if config.flying_share:
+        edge = (config.edge_px, config.edge_mm)
+        flying = kernels.Flying(config.flying_share, config.flying_mm, *edge)
+        kernels.fly(true_mm, depths_mm, seen, seed + 1, flying)
+    if config.grazing_share:
+        grazing = (config.grazing_share, config.grazing_degrees)
+        pinhole = pinhole_of(frame.intrinsics)
+        kernels.lose_grazing(true_mm, depths_mm, seen, seed + 2, grazing, pinhole)
     if config.distortion_mm:
         rng = np.random.default_rng((seed, 1))
-        peak_mm = config.distortion_mm * rng.random()
-        kernels.distort(depths_mm, seen, *kernels.slow_shape(shape, peak_mm, rng))
+        field, scale = kernels.slow_shape(shape, config.distortion_mm * rng.random(), rng)
+        depths_mm += field.ravel()[seen.pixels] * scale
     if config.axial_mm:
         relative = config.axial_mm / REFERENCE_MM**2
-        grid = kernels.normal_grid(*shape, config.correlation_px, seed + 3)
-        smooth = kernels.smooth_at(seen, grid, config.correlation_px, shape)
+        smooth = kernels.smooth_at(seen, shape, config.correlation_px, seed + 3)
         kernels.jitter(depths_mm, seen, seed + 4, relative, config.correlated_share, smooth)
     if config.hole_share:
-        grid = kernels.normal_grid(*shape, config.hole_px, seed + 5)
-        smooth = kernels.smooth_at(seen, grid, config.hole_px, shape)
+        smooth = kernels.smooth_at(seen, shape, config.hole_px, seed + 5)
         depths_mm[smooth < ndtri(config.hole_share)] = np.nan
 
 
@@ -167,8 +195,8 @@ def _scatter(
     return pixels, values_mm.astype(np.float32)
 
 
-def _whole(values_mm: np.ndarray, quantum_mm: float) -> np.ndarray:
-    """Rounded to whole quanta, in place; as they are where there is none."""
+def _quantised(values_mm: np.ndarray, quantum_mm: float) -> np.ndarray:
+    """Rounded to whole quanta, in place; unchanged where the quantum is 0."""
     if quantum_mm:
         values_mm /= np.float32(quantum_mm)
         np.rint(values_mm, out=values_mm)

@@ -1,7 +1,7 @@
-"""What lies between camera and organ: instrument shafts, patches of fat, drapes.
+"""Occluders between camera and organ: instrument shafts, patches of fat, drapes.
 
-They are taken to be segmented out, so the organ has no return there; a segmentation that misses
-one end of them leaves its points in. Works on the image alone, in pixels and the organ's own width.
+They are assumed to be segmented out, so the organ has no return there; a segmentation that misses
+one end of them leaves its points in. All is done in the image: pixels and the organ's own width.
 """
 
 from __future__ import annotations
@@ -15,10 +15,10 @@ from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError
 from tumortrack.core.types import DepthFrame
 
-_LOOK_AT = 200  # pixels tell where the organ lies
+_SAMPLED = 200  # pixels that show where the organ lies
 _STEEPEST = 0.6  # slope of what is left in: 30 degrees
 _MOST_SHAFTS, _MOST_PATCHES = 2, 2
-_CROSSES = 0.25  # share of shafts that go on over the whole organ
+_CROSSES = 0.25  # share of shafts that cross the whole organ
 _WIDER = 0.3  # a shaft that rises towards the camera looks wider by up to this an organ's width
 _WAVES = 3
 _PATCHES_ALONE, _SHAFTS_ALONE = 0.4, 0.2  # shares of images; the others have both
@@ -43,10 +43,7 @@ class OcclusionConfig(Config, frozen=True, kw_only=True):
     nearer_mm: tuple[float, float] = (5.0, 40.0)
 
     def __post_init__(self) -> None:
-        for name, most in (("scenes", 1.0), ("largest_share", 0.9), ("left_in", 1.0)):
-            value = getattr(self, name)
-            if not 0 <= value <= most:
-                raise InputError(f"occlusion {name} is {value}; allowed: 0 (off) to {most:g}.")
+        self.check_ranges("occlusion", scenes=1.0, largest_share=0.9, left_in=1.0)
         for name in ("shaft_mm", "nearer_mm"):
             low, high = getattr(self, name)
             if not 0 < low <= high < np.inf:
@@ -56,8 +53,8 @@ class OcclusionConfig(Config, frozen=True, kw_only=True):
 
 
 @dataclass(frozen=True)
-class _Seen:
-    """The pixels with a return, and where they lie in the image."""
+class _View:
+    """The pixels with a return and what they see."""
 
     columns: Int32[np.ndarray, " n"]
     rows: Int32[np.ndarray, " n"]
@@ -88,23 +85,25 @@ def occlude(frame: DepthFrame, config: OcclusionConfig, rng: np.random.Generator
     left = int(rng.uniform(0, config.left_in) * hidden.sum())
     if left:
         _leave_in(out_mm, seen, hidden, left, config, rng)
-    out_mm.flags.writeable = False  # nobody else's: taken over without a copy
-    return DepthFrame(out_mm, frame.intrinsics, frame.stamp_ns)
+    return frame.with_depth(out_mm)
 
 
-def _look(frame: DepthFrame, rng: np.random.Generator) -> _Seen:
-    from tumortrack.sense import occlusion_kernels as kernels
+def _look(frame: DepthFrame, rng: np.random.Generator) -> _View:
+    from tumortrack.sense.kernels import seen_pixels
 
-    columns, rows, depth_mm = kernels.seen_pixels(frame.depth_mm)
-    chosen = rng.integers(max(len(columns), 1), size=_LOOK_AT if len(columns) else 0)
+    pixels, starts = seen_pixels(frame.depth_mm)
+    rows = np.repeat(np.arange(len(starts) - 1, dtype=np.int32), np.diff(starts))
+    columns = pixels - rows * np.int32(frame.intrinsics.width)
+    chosen = rng.integers(max(len(pixels), 1), size=_SAMPLED if len(pixels) else 0)
     some = np.stack([columns[chosen], rows[chosen]], axis=1).astype(float)
     width_px = float(np.ptp(some, axis=0).max(initial=1.0)) if len(some) else 1.0
-    return _Seen(columns, rows, depth_mm, some, width_px, frame.intrinsics.fx)
+    depth_mm = frame.depth_mm.ravel()[pixels]
+    return _View(columns, rows, depth_mm, some, width_px, frame.intrinsics.fx)
 
 
-def _hide(seen: _Seen, most: int, config: OcclusionConfig, rng: np.random.Generator) -> np.ndarray:
+def _hide(seen: _View, most: int, config: OcclusionConfig, rng: np.random.Generator) -> np.ndarray:
     """Which pixels are hidden: by shafts, patches, or shafts and patches."""
-    from tumortrack.sense.occlusion_kernels import take_first
+    from tumortrack.sense.kernels import take_first
 
     hidden = np.zeros(len(seen.depth_mm), np.bool_)
     left, kind = most, rng.uniform()
@@ -118,9 +117,9 @@ def _hide(seen: _Seen, most: int, config: OcclusionConfig, rng: np.random.Genera
     return hidden
 
 
-def _shaft(seen: _Seen, config: OcclusionConfig, rng: np.random.Generator) -> np.ndarray:
+def _shaft(seen: _View, config: OcclusionConfig, rng: np.random.Generator) -> np.ndarray:
     """A straight shaft from any side, its tip over a random pixel of the organ or beyond it."""
-    from tumortrack.sense.occlusion_kernels import order_shaft
+    from tumortrack.sense.kernels import order_shaft
 
     at = rng.integers(len(seen.depth_mm))
     towards = _direction(rng)
@@ -133,9 +132,9 @@ def _shaft(seen: _Seen, config: OcclusionConfig, rng: np.random.Generator) -> np
     return order_shaft(seen.columns, seen.rows, tip, towards, half, taper)
 
 
-def _patch(seen: _Seen, rng: np.random.Generator) -> np.ndarray:
+def _patch(seen: _View, rng: np.random.Generator) -> np.ndarray:
     """Fat or a drape: a blob or a half plane, from any border of the organ inwards."""
-    from tumortrack.sense.occlusion_kernels import order_patch
+    from tumortrack.sense.kernels import order_patch
 
     inwards = _direction(rng)
     across = np.array([-inwards[1], inwards[0]])
@@ -151,14 +150,14 @@ def _patch(seen: _Seen, rng: np.random.Generator) -> np.ndarray:
 
 def _leave_in(
     out_mm: np.ndarray,
-    seen: _Seen,
+    seen: _View,
     hidden: np.ndarray,
     count: int,
     config: OcclusionConfig,
     rng: np.random.Generator,
 ) -> None:
     """The occluder's own surface, a tilted plane, at one end of what it hides."""
-    from tumortrack.sense.occlusion_kernels import take_first
+    from tumortrack.sense.kernels import take_first
 
     columns, rows, organ_mm = seen.columns[hidden], seen.rows[hidden], seen.depth_mm[hidden]
     shown = np.zeros(len(organ_mm), np.bool_)

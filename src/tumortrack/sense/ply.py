@@ -26,17 +26,9 @@ CAMERA = "camera (x right, y down, z forward)"
 _LONGEST_HEADER = 64 * 1024  # bytes
 
 
-def parse_ply_points(content: bytes, name: str) -> np.ndarray:
-    """The vertices' x, y, z as floats (n, 3), in the file's unit; faces are not looked at.
-
-    Raises:
-        InputError: not a PLY, fewer bytes than the header claims, no x, y, z.
-    """
-    return parse_ply_properties(content, name, "xyz")
-
-
-def parse_ply_properties(content: bytes, name: str, wanted: Sequence[str]) -> np.ndarray:
-    """The wanted properties of the vertices as floats (n, len(wanted)), in the file's unit.
+def parse_ply_properties(content: bytes, name: str, wanted: Sequence[str] = "xyz") -> np.ndarray:
+    """The wanted properties of the vertices as floats (n, len(wanted)), in the file's unit; faces
+    are not looked at.
 
     Raises:
         InputError: not a PLY, fewer bytes than the header claims, a property that is not there.
@@ -110,32 +102,20 @@ def _cut_off(name: str, claimed: int, held: int) -> str:
 
 
 def write_cloud_ply(path: Path, points_mm: np.ndarray, **point_properties: np.ndarray) -> None:
-    """Write points (n, 3) of the camera frame as binary little-endian PLY, float32 mm, with further
-    properties.
-
-    Each property is an array (n,) of uint8, int32, float32 or float64 (``label=``,
-    ``probability=``).
+    """Write points (n, 3) of the camera frame; see ``cloud_ply``.
 
     Raises:
         InputError: a property of another length or type.
         StorageError: the disk refused.
     """
-    write_atomically(path, cloud_ply(points_mm, **point_properties))
+    write_atomically(path, cloud_ply(points_mm, point_properties))
 
 
-def cloud_ply(points_mm: np.ndarray, **point_properties: np.ndarray) -> bytes:
-    """What ``write_cloud_ply`` writes.
-
-    Raises:
-        InputError: a property of another length or type.
-    """
-    return framed_ply(points_mm, point_properties, CAMERA)
-
-
-def framed_ply(
-    points_mm: np.ndarray, point_properties: Mapping[str, np.ndarray], frame: str
+def cloud_ply(
+    points_mm: np.ndarray, point_properties: Mapping[str, np.ndarray], frame: str = CAMERA
 ) -> bytes:
-    """The same in another frame, which is named in a comment.
+    """Points (n, 3) as binary little-endian PLY, float32 mm, with further properties (``label``,
+    ``probability``): arrays (n,) of uint8, int32, float32 or float64. A comment names the frame.
 
     Raises:
         InputError: a property of another length or type.
@@ -149,10 +129,8 @@ def framed_ply(
                 f"uint8, int32, float32, float64, and one value for each of {len(points)} points."
             )
         columns.append((name, values))
-    codes = [values.dtype.str[1:] for _, values in columns]
-    table = np.empty(
-        len(points), [(name, "<" + code) for (name, _), code in zip(columns, codes, strict=True)]
-    )
+    codes = {name: values.dtype.str[1:] for name, values in columns}
+    table = np.empty(len(points), [(name, "<" + code) for name, code in codes.items()])
     for name, values in columns:
         table[name] = values
     header = [
@@ -160,10 +138,7 @@ def framed_ply(
         "format binary_little_endian 1.0",
         f"comment frame {frame}, unit mm",
         f"element vertex {len(points)}",
-        *(
-            f"property {_NAMES[code]} {name}"
-            for (name, _), code in zip(columns, codes, strict=True)
-        ),
+        *(f"property {_NAMES[code]} {name}" for name, code in codes.items()),
         "end_header\n",
     ]
     return "\n".join(header).encode() + table.tobytes()

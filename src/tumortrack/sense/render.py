@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from tumortrack.core.types import DepthFrame, Intrinsics, Mesh
+from tumortrack.sense.camera import pinhole_of
 
 
 def render_depth(
@@ -20,21 +21,18 @@ def render_depth(
     Vertices (v, 3) in the camera frame, faces (f, 3) turned outward. Only triangles that face
     the camera are drawn; a triangle that reaches behind the camera is left out.
     """
-    depth = _z_buffer(
-        np.ascontiguousarray(vertices_camera_mm, np.float32),
-        np.ascontiguousarray(faces, np.int32),
-        intrinsics.width,
-        intrinsics.height,
-        intrinsics.fx,
-        intrinsics.fy,
-        intrinsics.cx,
-        intrinsics.cy,
-    )
+    vertices = np.ascontiguousarray(vertices_camera_mm, np.float32)
+    shape = (intrinsics.height, intrinsics.width)
+    faces = np.ascontiguousarray(faces, np.int32)
+    depth = _to_depth(_z_buffer(vertices, faces, shape, pinhole_of(intrinsics)))
     return DepthFrame(depth, intrinsics, stamp_ns)
 
 
 @numba.njit(cache=True, nogil=True)
-def _z_buffer(vertices, faces, width, height, fx, fy, cx, cy):  # type: ignore[no-untyped-def]
+def _z_buffer(vertices, faces, shape, pinhole):  # type: ignore[no-untyped-def]
+    """The greatest 1/z in each pixel (h, w), 0 where nothing is hit."""
+    fx, fy, cx, cy = pinhole
+    height, width = shape
     n = len(vertices)
     u = np.zeros(n, np.float32)
     v = np.zeros(n, np.float32)
@@ -47,7 +45,7 @@ def _z_buffer(vertices, faces, width, height, fx, fy, cx, cy):  # type: ignore[n
             v[i] = fy * vertices[i, 1] * w[i] + cy
         else:
             w[i] = -1.0
-    nearest = np.zeros((height, width), np.float32)  # greatest 1/z so far
+    nearest = np.zeros((height, width), np.float32)
     for f in range(len(faces)):
         a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
         ua, ub, uc, va, vb, vc = u[a], u[b], u[c], v[a], v[b], v[c]
@@ -72,9 +70,14 @@ def _z_buffer(vertices, faces, width, height, fx, fy, cx, cy):  # type: ignore[n
                 # No branch: half of these pixels lie outside, at random.
                 here = here if min(pa, pb, pc) >= -1e-5 else np.float32(0.0)
                 nearest[y, x] = max(nearest[y, x], here)
-    depth = np.full((height, width), np.nan, np.float32)
-    for y in range(height):
-        for x in range(width):
+    return nearest
+
+
+@numba.njit(cache=True, nogil=True)
+def _to_depth(nearest):  # type: ignore[no-untyped-def]
+    depth = np.full(nearest.shape, np.nan, np.float32)
+    for y in range(len(nearest)):
+        for x in range(nearest.shape[1]):
             if nearest[y, x] > 0:
                 depth[y, x] = 1.0 / nearest[y, x]
     return depth

@@ -27,8 +27,8 @@ class Batch:
 
 @dataclass(frozen=True, eq=False)
 class SceneStream:
-    """Batch ``i`` holds the recipes ``i * size ... i * size + size - 1``, whoever asks and
-    whenever: worker processes and resumed runs see the same data. Picklable."""
+    """Batch ``i`` holds the recipes ``i * size ... i * size + size - 1``, so that worker processes
+    and resumed runs see the same data. Picklable."""
 
     anatomy_ct: Anatomy
     up_lps: tuple[float, float, float]
@@ -40,20 +40,18 @@ class SceneStream:
     body: ElasticBody | None = None  # built once by the caller, for elastic deformations
 
     @cached_property
-    def _simulator(self) -> Simulator:  # built where it is used: ray trees do not travel
+    def simulator(self) -> Simulator:
+        """Built where it is used: ray trees cannot be pickled."""
         return Simulator(self.anatomy_ct, self.up_lps, self.config, self.body)
 
     def __getstate__(self) -> dict:
-        return {k: v for k, v in self.__dict__.items() if k != "_simulator"}
-
-    def __setstate__(self, state: dict) -> None:
-        self.__dict__.update(state)
+        return {k: v for k, v in self.__dict__.items() if k != "simulator"}
 
     def batch(self, index: int) -> Batch:
         """The batch with this number."""
         first = index * self.batch_size
         pairs = [
-            self._simulator.pair(SceneRecipe(self.seed, self.stream, i), self.pool)
+            self.simulator.pair(SceneRecipe(self.seed, self.stream, i), self.pool)
             for i in range(first, first + self.batch_size)
         ]
         n = self.config.cloud.n_points
@@ -66,6 +64,6 @@ class SceneStream:
 
 
 def refill(points_mm: Float32[np.ndarray, "m 3"], n: int) -> Float32[np.ndarray, "n 3"]:
-    """A cloud smaller than ``n`` repeats its points, so that clouds stack; a network that pools
-    by maximum does not notice."""
+    """A cloud of fewer than ``n`` points repeats them, so that clouds stack; max pooling is not
+    affected."""
     return points_mm[np.arange(n) % len(points_mm)]

@@ -1,10 +1,10 @@
-"""Where the network is asked during training, and the right answers: SortSample.
+"""Query points of training and their labels: SortSample.
 
 Source: LOOC (IEEE Access 2025, doi 10.1109/ACCESS.2025.3543736), the improved form: per part
 draw uniformly in its box x 1.5 until at least k points lie inside and k outside, drop those in
 a thin wall about the surface, keep the k nearest of each; add 15 % far points. Points are drawn
-in the undeformed CT frame, where labels are known, and *pushed* through the deformation, which
-carries labels along exactly. Distances are those before the deformation.
+in the undeformed CT frame, where labels are known, and moved by the deformation together with
+their labels. Distances are those before the deformation.
 """
 
 from __future__ import annotations
@@ -20,6 +20,10 @@ from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError
 from tumortrack.core.types import Anatomy, Mesh
 
+Points = Float[np.ndarray, "n 3"]
+Labels = UInt8[np.ndarray, " n"]
+_WITHIN_MM = 0.1  # of ``surface_distance``
+
 
 class OccupancyConfig(Config, frozen=True):
     """SortSample's numbers."""
@@ -29,45 +33,39 @@ class OccupancyConfig(Config, frozen=True):
     wall_mm: float = 0.2
     far_share: float = 0.15
     far_reach: float = 1.2  # half of the far points: a cube of +- this times the organ's diagonal
-    pool: int = 100_000  # points per part whose labels are worked out once
+    pool: int = 100_000  # points per part that are labelled once
 
 
 class PointSource(Protocol):
     """Where the points of scenes come from."""
 
-    def draw(
-        self, rng: np.random.Generator
-    ) -> tuple[Float[np.ndarray, "n 3"], UInt8[np.ndarray, " n"]]:
+    def draw(self, rng: np.random.Generator) -> tuple[Points, Labels]:
         """One scene's points (CT frame, undeformed) and labels; the same number every time."""
         ...
 
 
 @dataclass(frozen=True, eq=False)
 class FixedPoints:
-    """The same points in every scene: where each of them goes is what is learnt."""
+    """The same points in every scene, to learn where each of them goes."""
 
     points_ct: Float32[np.ndarray, "n 3"]
-    labels: UInt8[np.ndarray, " n"]
+    labels: Labels
 
-    def draw(
-        self, rng: np.random.Generator
-    ) -> tuple[Float32[np.ndarray, "n 3"], UInt8[np.ndarray, " n"]]:
+    def draw(self, rng: np.random.Generator) -> tuple[Points, Labels]:
         return self.points_ct, self.labels
 
 
 @dataclass(frozen=True, eq=False)
 class PartPool:
-    """Points about one part: CT frame, distance to its surface, inside it or not, label."""
+    """Points around one part: CT frame, distance to its surface, inside it or not, label."""
 
-    points_ct: Float[np.ndarray, "n 3"]
+    points_ct: Points
     distance_mm: Float[np.ndarray, " n"]
     inside: Bool[np.ndarray, " n"]
-    labels: UInt8[np.ndarray, " n"]
+    labels: Labels
 
-    def draw_evenly(
-        self, rng: np.random.Generator, count: int
-    ) -> tuple[Float[np.ndarray, "n 3"], UInt8[np.ndarray, " n"]]:
-        """Points spread evenly over the part's enlarged box: shares of them are volumes."""
+    def draw_evenly(self, rng: np.random.Generator, count: int) -> tuple[Points, Labels]:
+        """Points uniform in the part's enlarged box: fractions of them measure volumes."""
         chosen = self.neighbours(int(rng.integers(len(self.labels))), count)
         return self.points_ct[chosen], self.labels[chosen]
 
@@ -75,32 +73,43 @@ class PartPool:
         """Indices of ``count`` points from ``first`` on; after the last comes the first."""
         return (first + np.arange(count)) % len(self.labels)
 
-    def inside_of(self, first: int, count: int) -> int:
-        """How many of these neighbours lie inside the part."""
-        rounds, last = divmod(first + count, len(self.labels))
-        before = self._inside_before
-        return int(rounds * before[-1] + before[last] - before[first])
-
     def nearest(self, first: int, count: int, k: int) -> Int64[np.ndarray, " 2k"]:
         """Of these neighbours the ``k`` inside that are nearest to the surface, and ``k`` outside;
         on a side in any order."""
         drawn = self.neighbours(first, count)
         inside = self.inside[drawn]
-        return np.concatenate([_nearest(self, drawn[side], k) for side in (inside, ~inside)])
+        return np.concatenate([self._nearest(drawn[side], k) for side in (inside, ~inside)])
+
+    def window(self, k: int, rng: np.random.Generator) -> tuple[int, int]:
+        """A random first point and so many neighbours that ``k`` lie on either side."""
+        count = int(k / self._rarer * 1.1)
+        while True:
+            first = int(rng.integers(len(self.inside)))
+            rounds, last = divmod(first + count, len(self.labels))
+            before = self._inside_before
+            inside = int(rounds * before[-1] + before[last] - before[first])
+            if min(inside, count - inside) >= k:
+                return first, count
+            count = min(2 * count, len(self.inside))
+
+    def _nearest(self, drawn: np.ndarray, k: int) -> np.ndarray:
+        if len(drawn) == k:
+            return drawn
+        return drawn[np.argpartition(self.distance_mm[drawn], k)[:k]]
 
     @cached_property
     def _inside_before(self) -> Int64[np.ndarray, " n+1"]:
         return np.concatenate([[0], np.cumsum(self.inside)])
 
     @cached_property
-    def rarer_share(self) -> float:
-        """Of the points, those on the side that has fewer."""
-        share = float(self.inside.mean())
-        return min(share, 1 - share)
+    def _rarer(self) -> float:
+        """Fraction of the points on the side that has fewer."""
+        inside = float(self.inside.mean())
+        return min(inside, 1 - inside)
 
 
 class OccupancyPool:
-    """Labelled points of one undeformed anatomy, worked out once; every scene draws from them."""
+    """Labelled points of one undeformed anatomy, computed once; every scene draws from them."""
 
     def __init__(self, anatomy_ct: Anatomy, config: OccupancyConfig, seed: int) -> None:
         rng = _pool_generator(seed)
@@ -115,50 +124,28 @@ class OccupancyPool:
         points = rng.permutation(np.concatenate([near, far])).astype(np.float32)
         self.far_points_ct, self.far_labels = points, labels_of(anatomy_ct, points)
 
-    def draw(
-        self, rng: np.random.Generator
-    ) -> tuple[Float[np.ndarray, "n 3"], UInt8[np.ndarray, " n"]]:
+    def draw(self, rng: np.random.Generator) -> tuple[Points, Labels]:
         """One scene's points (CT frame, undeformed) and labels; the same number every time."""
         *near, (first, count) = self.windows(rng)
-        chosen = [
-            part.nearest(*window, self.config.per_side)
-            for part, window in zip(self.parts, near, strict=True)
-        ]
-        far = (first + np.arange(count)) % len(self.far_labels)
-        pairs = list(zip(self.parts, chosen, strict=True))
+        k, far = self.config.per_side, (first + np.arange(count)) % len(self.far_labels)
+        chosen = [(p, p.nearest(*window, k)) for p, window in zip(self.parts, near, strict=True)]
         return (
-            np.concatenate([*(p.points_ct[c] for p, c in pairs), self.far_points_ct[far]]),
-            np.concatenate([*(p.labels[c] for p, c in pairs), self.far_labels[far]]),
+            np.concatenate([*(p.points_ct[c] for p, c in chosen), self.far_points_ct[far]]),
+            np.concatenate([*(p.labels[c] for p, c in chosen), self.far_labels[far]]),
         )
 
     def windows(self, rng: np.random.Generator) -> list[tuple[int, int]]:
-        """Which points of the pool a scene looks at, as (first, count): of each part so many that
-        enough lie on either side of its surface; last those anywhere. The pool is in random order,
-        so that neighbours are a random draw, without its cost."""
-        windows = [self._wide_enough(part, rng) for part in self.parts]
+        """Which points of the pool a scene considers, as (first, count): of each part enough on
+        either side of its surface; last those anywhere. The pool is in random order, so that
+        neighbours are a random draw, without its cost."""
+        windows = [part.window(self.config.per_side, rng) for part in self.parts]
         near = 2 * self.config.per_side * len(self.parts)
         count = round(near * self.config.far_share / (1 - self.config.far_share))
         return [*windows, (int(rng.integers(len(self.far_labels))), count)]
 
-    def _wide_enough(self, part: PartPool, rng: np.random.Generator) -> tuple[int, int]:
-        k = self.config.per_side
-        count = int(k / part.rarer_share * 1.1)
-        while True:
-            first = int(rng.integers(len(part.inside)))
-            inside = part.inside_of(first, count)
-            if min(inside, count - inside) >= k:
-                return first, count
-            count = min(2 * count, len(part.inside))
-
-
-def _nearest(part: PartPool, drawn: np.ndarray, k: int) -> np.ndarray:
-    if len(drawn) == k:
-        return drawn
-    return drawn[np.argpartition(part.distance_mm[drawn], k)[:k]]
-
 
 def organ_pool(anatomy_ct: Anatomy, config: OccupancyConfig, seed: int) -> PartPool:
-    """The first part of an ``OccupancyPool``, for those who need no other."""
+    """The first part of an ``OccupancyPool`` alone."""
     return _part_pool(anatomy_ct, anatomy_ct.organ, config, _pool_generator(seed))
 
 
@@ -186,14 +173,14 @@ def _part_pool(
     return PartPool(points, distance, inside, labels_of(anatomy_ct, points))
 
 
-def contains(mesh: Mesh, points_mm: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
+def contains(mesh: Mesh, points_mm: Points) -> Bool[np.ndarray, " n"]:
     """True for points inside a closed mesh (ray parity by Embree, two directions)."""
     import trimesh
 
     return trimesh.Trimesh(mesh.vertices_mm, mesh.faces, process=False).contains(points_mm)
 
 
-def labels_of(anatomy: Anatomy, points_mm: Float[np.ndarray, "n 3"]) -> UInt8[np.ndarray, " n"]:
+def labels_of(anatomy: Anatomy, points_mm: Points) -> Labels:
     """Labels of points in the anatomy's frame: a tumor wins over the organ, a later tumor over
     an earlier one."""
     labels = np.zeros(len(points_mm), np.uint8)
@@ -202,16 +189,13 @@ def labels_of(anatomy: Anatomy, points_mm: Float[np.ndarray, "n 3"]) -> UInt8[np
     return labels
 
 
-_WITHIN_MM = 0.1
-
-
-def surface_distance(mesh: Mesh, points_mm: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
+def surface_distance(mesh: Mesh, points_mm: Points) -> Float[np.ndarray, " n"]:
     """Distance to the surface in mm, by the nearest of dense surface points (within 0.1 mm or
     so: it orders points and thins a wall, it is no metric)."""
     corners = mesh.vertices_mm[mesh.faces]
     edge = float(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(initial=0))
     distance = _nearest_of(mesh.vertices_mm, points_mm)
-    # From farther away d + edge^2 / 6 d is all that vertices alone say: in a fifth of the time.
+    # Farther away, vertices alone are exact to edge^2 / 6 d, in a fifth of the time.
     near = distance < edge**2 / 6 / _WITHIN_MM + edge
     weights = [(1, 1, 1), (4, 1, 1), (1, 4, 1), (1, 1, 4), (1, 1, 0), (0, 1, 1), (1, 0, 1)]
     dense = [np.einsum("fkx,k->fx", corners, np.array(w) / sum(w)) for w in weights]
@@ -220,12 +204,12 @@ def surface_distance(mesh: Mesh, points_mm: Float[np.ndarray, "n 3"]) -> Float[n
 
 
 def _nearest_of(
-    places_mm: Float[np.ndarray, "p 3"], points_mm: Float[np.ndarray, "n 3"]
+    samples_mm: Float[np.ndarray, "p 3"], points_mm: Points
 ) -> Float32[np.ndarray, " n"]:
     from scipy.spatial import cKDTree
 
     # Points far from a surface have many almost nearest ones: large, loose leaves are six times
     # faster here than scipy's usual tree, with the same distances.
-    tree = cKDTree(places_mm, leafsize=100, balanced_tree=False, compact_nodes=False)
+    tree = cKDTree(samples_mm, leafsize=100, balanced_tree=False, compact_nodes=False)
     distance: np.ndarray = tree.query(points_mm, workers=-1)[0].astype(np.float32)
     return distance

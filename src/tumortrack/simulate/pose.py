@@ -17,7 +17,7 @@ from tumortrack.core.types import Mesh
 class PoseConfig(Config, frozen=True):
     """Random poses of the organ.
 
-    ``full``: every rotation, uniformly (the paper's M_full). ``limited``: any turn about the
+    ``full``: every rotation, uniformly (the paper's M_full). ``limited``: any rotation about the
     camera's axis, tilts about X and Y uniform within ``tilt_deg`` of the direction that faces
     the camera (the paper's M_lim, section Experiments).
     """
@@ -42,7 +42,7 @@ def sample_pose(
         spin = rng.uniform(0, 360)
         tilt_x, tilt_y = rng.uniform(-config.tilt_deg, config.tilt_deg, 2)
         rotation = _turn(*np.radians([tilt_x, tilt_y, spin])) @ _facing(up_lps)
-    rotated = rotation @ organ_ct.vertices_mm.T  # (3, v): extremes along rows are fast
+    rotated = rotation @ organ_ct.vertices_mm.T  # (3, v): minima along rows are fast
     lower, upper = rotated.min(1), rotated.max(1)
     offset = rng.uniform(-config.sideways_mm, config.sideways_mm, 2)
     nearest = rng.uniform(*nearest_mm)
@@ -51,8 +51,8 @@ def sample_pose(
 
 
 def _turn(about_x: float, about_y: float, about_z: float) -> Float64[np.ndarray, "3 3"]:
-    """A turn about z, then y, then x, all fixed axes; radians. (Scipy's Rotation is for many:
-    one costs it a twentieth of a scene.)"""
+    """A rotation about z, then y, then x, all fixed axes; radians. (Scipy's Rotation takes a
+    twentieth of a scene's time for a single one.)"""
     sx, sy, sz = np.sin([about_x, about_y, about_z]).tolist()
     cx, cy, cz = np.cos([about_x, about_y, about_z]).tolist()
     return np.array(
@@ -66,7 +66,7 @@ def _turn(about_x: float, about_y: float, about_z: float) -> Float64[np.ndarray,
 
 @lru_cache(maxsize=64)
 def _facing(up_lps: tuple[float, float, float]) -> Float64[np.ndarray, "3 3"]:
-    """The organ's upper side towards the camera."""
+    """The rotation that turns the organ's upper side towards the camera."""
     turn = rotation_onto(np.array(up_lps), np.array([0.0, 0.0, -1.0]))
     turn.flags.writeable = False
     return turn

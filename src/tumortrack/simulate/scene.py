@@ -1,42 +1,36 @@
 """One scene from a recipe: pose, deformation, depth image, cloud, labelled points.
 
 A recipe is (seed, stream, index); with the case and the configuration it replays bit for bit on
-the same machine and the same versions. Elsewhere last digits may differ: compiled code may order
-its sums, and the exponential of a drag, as the processor likes.
+the same machine and versions. Elsewhere last digits may differ: compiled code may reorder sums,
+and evaluate the exponential of a drag differently.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
+import msgspec
 import numpy as np
-from jaxtyping import Float, Float64
+from jaxtyping import Float64
 from scipy.spatial import ConvexHull
 
 from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError, NoEstimate, TumortrackError
 from tumortrack.core.geometry import transform_points
-from tumortrack.core.types import (
-    Anatomy,
-    DepthFrame,
-    Intrinsics,
-    Mesh,
-    OccupancySamples,
-    SensorCloud,
-)
-from tumortrack.sense.calibration import CalibrationConfig, miscalibrate
+from tumortrack.core.types import Anatomy, DepthFrame, Mesh, OccupancySamples, SensorCloud
 from tumortrack.sense.camera import d405, project
 from tumortrack.sense.cloud import FEWEST_POINTS, CloudConfig, cloud_from_depth
 from tumortrack.sense.clutter import ClutterConfig, add_clutter
-from tumortrack.sense.noise import NoiseConfig, add_noise
+from tumortrack.sense.noise import CalibrationConfig, NoiseConfig, add_noise, miscalibrate
 from tumortrack.sense.occlusion import OcclusionConfig, occlude
 from tumortrack.sense.render import Visibility, render_depth
-from tumortrack.simulate.deform import DeformConfig, DragConfig
-from tumortrack.simulate.deform.base import Deformation, View
-from tumortrack.simulate.elastic.body import ElasticBody
+from tumortrack.simulate import deform as deformations
+from tumortrack.simulate.deform import DragConfig
+from tumortrack.simulate.deform.base import Deformation, Points, View
+from tumortrack.simulate.deform.chain import links_of
+from tumortrack.simulate.elastic.body import BodyConfig, ElasticBody, build_body
 from tumortrack.simulate.occupancy import OccupancyConfig, PointSource
 from tumortrack.simulate.pose import PoseConfig, sample_pose
 
@@ -47,10 +41,10 @@ ATTEMPTS = 20  # draws of a recipe until one shows enough of the organ
 class SceneConfig(Config, frozen=True):
     """How scenes are made.
 
-    A share ``free_range`` of them is seen from any distance and not cropped by depth: a cloud
-    that a user has freed of its background himself. The others follow the paper: near 15 cm,
-    cropped to 11..15 cm. With ``cloud_points`` each scene's cloud has at most a number of points
-    drawn from that range, evenly on a logarithmic scale, instead of ``cloud.n_points``.
+    A fraction ``free_range`` of them is seen from any distance and not cropped by depth, like a
+    cloud whose background the user has removed. The others follow the paper: near 15 cm, cropped
+    to 11..15 cm. With ``cloud_points`` the largest number of points of each scene's cloud is drawn
+    from that range, log-uniformly, instead of ``cloud.n_points``.
     """
 
     LATER = ("occlusion", "calibration", "cloud_points")
@@ -58,7 +52,7 @@ class SceneConfig(Config, frozen=True):
     width: int = 424
     height: int = 240
     pose: PoseConfig = PoseConfig()
-    deform: tuple[DeformConfig, ...] = (DragConfig(),)  # each scene takes one, with equal chance
+    deform: tuple[deformations.DeformConfig, ...] = (DragConfig(),)  # one a scene, drawn uniformly
     clutter: ClutterConfig = ClutterConfig()
     noise: NoiseConfig = NoiseConfig()
     cloud: CloudConfig = CloudConfig()
@@ -99,18 +93,17 @@ class SceneRecipe:
 
 
 @dataclass(frozen=True, eq=False)
-class Pair:
+class TrainingPair:
     """What training needs of a scene."""
 
-    recipe: SceneRecipe
     cloud: SensorCloud
     samples: OccupancySamples
-    camera_from_ct: Float64[np.ndarray, "4 4"]  # the organ's pose, its deformation left out
+    camera_from_ct: Float64[np.ndarray, "4 4"]  # the organ's pose, without its deformation
 
 
 @dataclass(frozen=True, eq=False)
-class Drawn:
-    """What is drawn before a picture is taken."""
+class SceneDraw:
+    """What is drawn before the image is rendered."""
 
     free: bool  # seen from any distance and not cropped
     camera_from_ct: Float64[np.ndarray, "4 4"]
@@ -118,58 +111,61 @@ class Drawn:
 
 
 @dataclass(frozen=True, eq=False)
-class RenderedScene:
-    """A scene before points are asked for: what lies where, and what the camera gets of it."""
+class RenderedScene(SceneDraw):
+    """A scene before points are labelled: where the organ lies, and what the camera sees of it."""
 
-    camera_from_ct: Float64[np.ndarray, "4 4"]
-    deformation: Deformation
     frame: DepthFrame
     cloud: SensorCloud
 
-    def carry(self, points_ct: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+    def carry(self, points_ct: Points) -> Points:
         """Points of the undeformed CT frame at their place before the camera."""
         return transform_points(self.camera_from_ct, self.deformation.apply(points_ct))
 
 
+@dataclass(eq=False)
 class Simulator:
     """Makes the scenes of one anatomy (CT frame, LPS mm); ``body`` where the configuration has
-    elastic deformations (``simulate.bodies.body_for`` builds it)."""
+    elastic deformations (``body_for`` builds it)."""
 
-    def __init__(
-        self,
-        anatomy_ct: Anatomy,
-        up_lps: tuple[float, float, float],
-        config: SceneConfig,
-        body: ElasticBody | None = None,
-    ) -> None:
-        self.anatomy_ct = anatomy_ct
-        self._body = body
-        self.config = config
-        self._up_lps = up_lps
-        self._intrinsics = d405(config.width, config.height)
-        self._visibility = Visibility(anatomy_ct.organ)
-        vertices = anatomy_ct.organ.vertices_mm
-        corners = vertices[ConvexHull(vertices).vertices]  # no others are its farthest anywhere
+    anatomy_ct: Anatomy
+    up_lps: tuple[float, float, float]
+    config: SceneConfig
+    body: ElasticBody | None = None
+
+    def __post_init__(self) -> None:
+        self._intrinsics = d405(self.config.width, self.config.height)
+        self._visibility = Visibility(self.anatomy_ct.organ)
+        vertices = self.anatomy_ct.organ.vertices_mm
+        corners = vertices[ConvexHull(vertices).vertices]  # the farthest in any direction
         self._hull_ct = Mesh(corners, np.empty((0, 3)))
 
-    def pair(self, recipe: SceneRecipe, pool: PointSource) -> Pair:
+    def pair(self, recipe: SceneRecipe, pool: PointSource) -> TrainingPair:
         """The scene's cloud and its labelled points, camera frame."""
-        stage, rng = self._stage(recipe)
+        scene, rng = self._render(recipe)
         points_ct, labels = pool.draw(rng)
-        samples = OccupancySamples(stage.carry(points_ct), labels)
-        return Pair(recipe, stage.cloud, samples, stage.camera_from_ct)
+        samples = OccupancySamples(scene.carry(points_ct), labels)
+        return TrainingPair(scene.cloud, samples, scene.camera_from_ct)
 
-    def stage(self, recipe: SceneRecipe) -> RenderedScene:
+    def render(self, recipe: SceneRecipe) -> RenderedScene:
         """Pose, deformation, depth image and cloud of a recipe."""
-        return self._stage(recipe)[0]
+        return self._render(recipe)[0]
 
-    def reference(self, stage: RenderedScene) -> Anatomy:
+    def reference(self, scene: RenderedScene) -> Anatomy:
         """The anatomy as it lies in the scene, camera frame."""
         return Anatomy(
-            tuple(part.moved(stage.carry(part.vertices_mm)) for part in self.anatomy_ct.parts)
+            tuple(part.moved(scene.carry(part.vertices_mm)) for part in self.anatomy_ct.parts)
         )
 
-    def _stage(self, recipe: SceneRecipe) -> tuple[RenderedScene, np.random.Generator]:
+    def draw(self, rng: np.random.Generator) -> SceneDraw:
+        """Pose and deformation of the next scene of this generator."""
+        config = self.config
+        free = bool(rng.uniform() < config.free_range)
+        nearest = config.free_nearest_mm if free else config.pose.nearest_mm
+        camera_from_ct = sample_pose(config.pose, self._hull_ct, self.up_lps, nearest, rng)
+        model = config.deform[rng.integers(len(config.deform))]
+        return SceneDraw(free, camera_from_ct, model.sample(self._view(camera_from_ct), rng))
+
+    def _render(self, recipe: SceneRecipe) -> tuple[RenderedScene, np.random.Generator]:
         for attempt in range(ATTEMPTS):
             rng = recipe.generator(attempt)
             try:
@@ -178,29 +174,28 @@ class Simulator:
                 continue
         raise shows_nothing(recipe)
 
-    def draw(self, rng: np.random.Generator) -> Drawn:
-        """Pose and deformation of the next scene of this generator."""
-        config = self.config
-        free = bool(rng.uniform() < config.free_range)
-        nearest = config.free_nearest_mm if free else config.pose.nearest_mm
-        camera_from_ct = sample_pose(config.pose, self._hull_ct, self._up_lps, nearest, rng)
-        model = config.deform[rng.integers(len(config.deform))]
-        visible = _visible_from(self._visibility, self._intrinsics, camera_from_ct)
-        view = View(self.anatomy_ct, visible, self._body)
-        return Drawn(free, camera_from_ct, model.sample(view, rng))
-
     def _attempt(self, rng: np.random.Generator) -> RenderedScene:
-        config, organ = self.config, self.anatomy_ct.organ
-        drawn = self.draw(rng)
-        camera_from_ct, deformation = drawn.camera_from_ct, drawn.deformation
-        vertices = transform_points(camera_from_ct, deformation.apply(organ.vertices_mm))
+        config, organ, drawn = self.config, self.anatomy_ct.organ, self.draw(rng)
+        deformed = drawn.deformation.apply(organ.vertices_mm)
+        vertices = transform_points(drawn.camera_from_ct, deformed)
         frame = render_depth(vertices, organ.faces, self._intrinsics)
         frame = add_clutter(frame, config.clutter, rng)
         frame = occlude(frame, config.occlusion, rng)  # hides background too
         frame = miscalibrate(frame, config.calibration, rng)
         frame = add_noise(frame, config.noise, rng)
-        crop = crop_of(config, drawn.free, rng)
-        return RenderedScene(camera_from_ct, deformation, frame, cloud_from_depth(frame, crop, rng))
+        cloud = cloud_from_depth(frame, crop_of(config, drawn.free, rng), rng)
+        return RenderedScene(**vars(drawn), frame=frame, cloud=cloud)
+
+    def _view(self, camera_from_ct: Float64[np.ndarray, "4 4"]) -> View:
+        eye_ct, camera = np.linalg.inv(camera_from_ct)[:3, 3], self._intrinsics
+
+        def visible(points_ct: np.ndarray) -> np.ndarray:
+            pixels, depth = project(transform_points(camera_from_ct, points_ct), camera)
+            size = np.array([camera.width, camera.height])
+            pictured = ((pixels > -0.5) & (pixels < size - 0.5)).all(1) & (depth > 0)
+            return pictured & self._visibility(points_ct, eye_ct)
+
+        return View(self.anatomy_ct, visible, self.body)
 
 
 def shows_nothing(recipe: SceneRecipe) -> TumortrackError:
@@ -211,7 +206,7 @@ def shows_nothing(recipe: SceneRecipe) -> TumortrackError:
 
 
 def crop_of(config: SceneConfig, free: bool, rng: np.random.Generator) -> CloudConfig:
-    """What of this scene's image becomes the cloud."""
+    """The depth range and number of points of this scene's cloud."""
     near_mm, far_mm = (1.0, 1e4) if free else (config.cloud.near_mm, config.cloud.far_mm)
     n_points = config.cloud.n_points
     if config.cloud_points is not None:
@@ -220,15 +215,27 @@ def crop_of(config: SceneConfig, free: bool, rng: np.random.Generator) -> CloudC
     return CloudConfig(near_mm=near_mm, far_mm=far_mm, n_points=n_points)
 
 
-def _visible_from(
-    visibility: Visibility, intrinsics: Intrinsics, camera_from_ct: Float64[np.ndarray, "4 4"]
-) -> Callable[[np.ndarray], np.ndarray]:
-    eye_ct = np.linalg.inv(camera_from_ct)[:3, 3]
+def body_for(
+    anatomy_ct: Anatomy, up_lps: tuple[float, float, float], config: SceneConfig, seed: int
+) -> ElasticBody | None:
+    """The organ's elastic body where a deformation of the configuration needs it, else None.
 
-    def visible(points_ct: np.ndarray) -> np.ndarray:
-        pixels, depth = project(transform_points(camera_from_ct, points_ct), intrinsics)
-        size = np.array([intrinsics.width, intrinsics.height])
-        pictured = ((pixels > -0.5) & (pixels < size - 0.5)).all(1) & (depth > 0)
-        return pictured & visibility(points_ct, eye_ct)
+    Where every rotation of the organ is shown (``full``), its bed lies on any side of it.
 
-    return visible
+    Raises:
+        InputError: elastic deformations that ask for different bodies.
+    """
+    links = (link for model in config.deform for link in links_of(model))
+    asked = (getattr(link, "body", None) for link in links)
+    wanted = {body for body in asked if isinstance(body, BodyConfig)}
+    if len(wanted) > 1:
+        raise InputError(
+            "the scene configuration has elastic deformations with different bodies; give them "
+            "all the same `body`."
+        )
+    if not wanted:
+        return None
+    kind = wanted.pop()
+    if config.pose.rotations == "full":
+        kind = msgspec.structs.replace(kind, bed_anywhere=1.0)
+    return build_body(anatomy_ct, up_lps, kind, seed)

@@ -14,9 +14,9 @@ import numpy as np
 
 from tumortrack.core.errors import InputError
 from tumortrack.core.mesh_files import read_anatomy, write_anatomy
-from tumortrack.core.solids import mesh_of, solid_of
 from tumortrack.core.store import new_folder, read_json, write_json
 from tumortrack.core.types import Anatomy, DepthFrame, SensorCloud
+from tumortrack.imaging.meshes import mesh_of, solid_of
 from tumortrack.sense.files import (
     read_cloud,
     read_depth_png,
@@ -26,12 +26,11 @@ from tumortrack.sense.files import (
 )
 from tumortrack.simulate.targets import Targets, read_targets, write_targets
 
-# Our own scenes say in meta.json that kidney.ply is the whole organ, tumors included.
+# Our own scenes state in meta.json that kidney.ply is the whole organ, tumors included.
 _UNITED = "organ_includes_tumors"
 _STAMP = "stamp_ns"
 _TARGETS = "targets.csv"
-# Of a tumor's volume: smoothing alone lets a surface stick out by less than this.
-_STICKS_OUT = 0.02
+_STICKS_OUT = 0.02  # of a tumor's volume: smoothing alone lets it stick out by less
 _ORGAN_SIZE_MM = (5.0, 1000.0)
 
 
@@ -41,7 +40,7 @@ class Scene:
 
     ``reference.parts[0]`` is the whole organ, tumors included. ``depth`` is the image that the
     cloud was taken from, where it is known; ``meta`` is plain JSON (recipe, origin, ...);
-    ``targets`` are inner points whose way from the CT is known.
+    ``targets`` are inner points with known positions in the CT.
     """
 
     cloud: SensorCloud
@@ -49,6 +48,10 @@ class Scene:
     depth: DepthFrame | None = None
     meta: dict = field(default_factory=dict)
     targets: Targets | None = None
+
+    def write(self, folder: str | Path) -> None:
+        """See ``write_scene``."""
+        write_scene(Path(folder), self)
 
 
 def write_scene(folder: Path, scene: Scene) -> None:
@@ -161,13 +164,10 @@ def _check_parts(folder: Path, anatomy: Anatomy) -> None:
 
 def _united(folder: Path, anatomy: Anatomy) -> Anatomy:
     """The same anatomy with every tumor that sticks out made part of the organ's surface."""
-    organ = solid_of(anatomy.organ, str(folder / "kidney.ply"))
-    sticks_out = False
+    whole = organ = solid_of(anatomy.organ, str(folder / "kidney.ply"))
     for name, mesh in zip(anatomy.names[1:], anatomy.tumors, strict=True):
         tumor = solid_of(mesh, str(folder / f"{name}.ply"))
         joined = organ + tumor
         if joined.volume() - organ.volume() > _STICKS_OUT * tumor.volume():
-            organ, sticks_out = joined, True
-    if not sticks_out:
-        return anatomy
-    return Anatomy((mesh_of(organ), *anatomy.tumors))
+            organ = joined
+    return anatomy if organ is whole else Anatomy((mesh_of(organ), *anatomy.tumors))

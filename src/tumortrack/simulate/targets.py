@@ -1,4 +1,4 @@
-"""Target points: places inside the organ whose way from the CT to the camera is known.
+"""Target points: points inside the organ with known positions in the CT and before the camera.
 
 targets.csv of a scene: label, ct_x, ct_y, ct_z (LPS, mm), camera_x, camera_y, camera_z (mm).
 """
@@ -57,10 +57,8 @@ def draw_targets(anatomy_ct: Anatomy, seed: int, count: int = TARGETS) -> InnerP
     inside = count // 2 if n_tumors else count
     each = np.full(n_tumors, (count - inside) // max(n_tumors, 1))
     each[: count - inside - each.sum()] += 1
-    points, labels = [], []
-    for label, (part, wanted) in enumerate(
-        zip(anatomy_ct.parts, [inside, *each.tolist()], strict=True), start=1
-    ):
+    points, counts = [], [inside, *each.tolist()]
+    for label, (part, wanted) in enumerate(zip(anatomy_ct.parts, counts, strict=True), start=1):
         found = np.zeros((0, 3))
         for _ in range(40):
             if len(found) >= wanted:
@@ -73,8 +71,8 @@ def draw_targets(anatomy_ct: Anatomy, seed: int, count: int = TARGETS) -> InnerP
             name = anatomy_ct.names[label - 1]
             raise InputError(f"{name} has no room for target points: other tumors cover it.")
         points.append(found[:wanted])
-        labels.append(np.full(wanted, label, np.uint8))
-    return InnerPoints(np.concatenate(points), np.concatenate(labels))
+    labels = np.repeat(np.arange(1, len(counts) + 1, dtype=np.uint8), counts)
+    return InnerPoints(np.concatenate(points), labels)
 
 
 def write_targets(path: Path, targets: Targets) -> None:

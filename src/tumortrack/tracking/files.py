@@ -9,8 +9,8 @@ import numpy as np
 from tumortrack.core import store
 from tumortrack.core.estimate import Estimate
 from tumortrack.core.mesh_files import write_mesh
+from tumortrack.imaging.nifti import write_nifti
 from tumortrack.imaging.segmentation import segments, write_seg_nrrd
-from tumortrack.imaging.volume import write_labels_nifti
 from tumortrack.sense.ply import write_cloud_ply
 from tumortrack.tracking.point_table import PointTable
 from tumortrack.tracking.points import camera_table
@@ -40,9 +40,7 @@ def write_estimate(
         )
         volume = estimate.volume
         assert volume is not None  # live estimates are the recording sink's
-        write_labels_nifti(
-            aside / "labels.nii.gz", volume.labels, volume.camera_from_index, lps=False
-        )
+        write_nifti(aside / "labels.nii.gz", volume.labels, volume.camera_from_index, lps=False)
         write_seg_nrrd(
             aside / "labels.seg.nrrd",
             volume.labels,

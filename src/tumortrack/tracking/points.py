@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float
 
 from tumortrack.core.errors import InputError, NoEstimate
-from tumortrack.core.motion import Motion
+from tumortrack.core.estimate import Motion
 from tumortrack.tracking.markups import parse_fcsv, parse_markups_json
 from tumortrack.tracking.point_table import PointTable, numbers_of, text_of
 

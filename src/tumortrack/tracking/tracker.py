@@ -8,10 +8,10 @@ from typing import Any, Protocol
 import numpy as np
 from jaxtyping import Float64
 
-from tumortrack.core.allocator import keep_small_blocks
 from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError
 from tumortrack.core.estimate import Estimate, Following
+from tumortrack.core.process import keep_small_blocks
 from tumortrack.core.types import Anatomy, SensorCloud
 from tumortrack.models.model import Model
 from tumortrack.occupancy.locator import OccupancyLocator

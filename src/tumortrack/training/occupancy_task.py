@@ -13,9 +13,8 @@ from tumortrack.occupancy.lattice import lattice_over
 from tumortrack.occupancy.model import OccupancyModel
 from tumortrack.occupancy.network import Latent, OccupancyNetwork
 from tumortrack.occupancy.volume import FIT_STEPS, surface_distances
-from tumortrack.simulate.bodies import body_for
 from tumortrack.simulate.occupancy import OccupancyPool
-from tumortrack.simulate.scene import Simulator
+from tumortrack.simulate.scene import Simulator, body_for
 from tumortrack.training.run import TrainingRun
 from tumortrack.training.validate import ValidationScenes, grown_box, mean_iou_of, validation_scenes
 

@@ -13,9 +13,8 @@ from typing import TypeVar
 
 import torch
 
-from tumortrack.core.allocator import keep_freed_memory
-from tumortrack.core.cores import available_cores
 from tumortrack.core.errors import TumortrackError
+from tumortrack.core.process import available_cores, keep_freed_memory
 from tumortrack.training.checkpoint import TrainingProgress
 
 REPORT_EVERY_S = 5.0

@@ -19,9 +19,8 @@ from tumortrack.models.encoders.heightmap import HeightMapConfig
 from tumortrack.models.encoders.pointnet2 import PointNet2Config, SetAbstraction
 from tumortrack.models.normalisation import Aligned, CloudBox
 from tumortrack.registration.canonical_frame import FIELDS, UPRIGHT_MM
-from tumortrack.sense.calibration import CalibrationConfig
 from tumortrack.sense.clutter import ClutterConfig
-from tumortrack.sense.noise import D405_NOISE
+from tumortrack.sense.noise import D405_NOISE, CalibrationConfig
 from tumortrack.sense.occlusion import OcclusionConfig
 from tumortrack.simulate.deform import ChainConfig, DragConfig, ElasticConfig, StretchConfig
 from tumortrack.simulate.deform.drag import CONFIGURATIONS

@@ -28,14 +28,14 @@ from tumortrack.phantom.kidneys import random_anatomy
 from tumortrack.registration.canonical_frame import (
     CanonicalFrame,
     generic_points,
-    know_any,
+    initialize_canonical,
     upright_of,
 )
 from tumortrack.registration.rest_shape import long_axis_of
-from tumortrack.simulate.bodies import body_for
 from tumortrack.simulate.dataset import Batch, SceneStream
 from tumortrack.simulate.elastic.body import ElasticBody
 from tumortrack.simulate.occupancy import FixedPoints
+from tumortrack.simulate.scene import body_for
 from tumortrack.training.checkpoint import work_folder
 from tumortrack.training.head_start import save_start
 from tumortrack.training.pace import (
@@ -176,7 +176,7 @@ def _pretrain(
     workers = default_workers() if run.workers is None else run.workers
     use_cores(device, network_leaves(workers))
     state = TrainingState(run, device)
-    state.know(know_any)
+    state.know(initialize_canonical)
     state.resume(work)
     progress, clock = state.progress, TrainingClock(state.progress)
     steps = range(progress.step, run.steps)

@@ -19,9 +19,8 @@ from tumortrack.registration.motion import ElasticMotion
 from tumortrack.registration.network import RegistrationNetwork
 from tumortrack.registration.registration import Registration
 from tumortrack.registration.rest_shape import shape_of
-from tumortrack.simulate.bodies import body_for
 from tumortrack.simulate.occupancy import FixedPoints, organ_pool
-from tumortrack.simulate.scene import Simulator
+from tumortrack.simulate.scene import Simulator, body_for
 from tumortrack.simulate.targets import draw_targets
 from tumortrack.training.run import TrainingRun
 from tumortrack.training.validate import ValidationScenes, mean_iou_of, validation_scenes
@@ -56,7 +55,7 @@ class RegistrationTask:
 
     def teach(self, network: RegistrationNetwork) -> None:
         run, shape = self._run, self._shape
-        network.know(shape, run.up_lps, self.points.points_ct)
+        network.initialize(shape, run.up_lps, self.points.points_ct)
         if run.start is not None:
             upright = upright_of(
                 run.anatomy_ct.organ, run.up_lps, shape.body.center_ct, shape.long_axis

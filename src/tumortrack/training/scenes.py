@@ -14,10 +14,10 @@ from typing import Literal, Protocol
 import torch
 from torch.utils.data import DataLoader, Dataset
 
-from tumortrack.core.cores import available_cores
 from tumortrack.core.errors import InputError
+from tumortrack.core.process import available_cores
 from tumortrack.simulate.batched.plan import BatchPlan
-from tumortrack.simulate.batched.stream import Chosen, DeviceStream, Pictured, why_not
+from tumortrack.simulate.batched.stream import DeviceStream, RenderedBatch, SampleChoice, why_not
 from tumortrack.simulate.dataset import Batch, SceneStream
 
 Maker = Literal["auto", "workers", "device"]
@@ -111,15 +111,15 @@ def _finished(
     stream: DeviceStream, plans: Iterable[BatchPlan], thread: ThreadPoolExecutor
 ) -> Iterator[Tensors]:
     """The batches of these plans; the pictures of each are taken before the last is handed out."""
-    before: tuple[Pictured, Future[Chosen]] | None = None
+    before: tuple[RenderedBatch, Future[SampleChoice]] | None = None
     for plan in plans:
-        pictured = stream.pictured(plan)
-        coming = pictured, thread.submit(stream.chosen, pictured)
+        rendered = stream.render(plan)
+        coming = rendered, thread.submit(stream.sample, rendered)
         if before is not None:
-            yield stream.finished(before[0], before[1].result())
+            yield stream.assemble(before[0], before[1].result())
         before = coming
     if before is not None:
-        yield stream.finished(before[0], before[1].result())
+        yield stream.assemble(before[0], before[1].result())
 
 
 __all__ = ["Stream", "Tensors", "available_cores", "batches", "default_workers"]

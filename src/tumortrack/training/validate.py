@@ -46,7 +46,7 @@ def validation_scenes(
     rows = []
     for index in range(config.validation_pairs):
         recipe = SceneRecipe(seed, "validation", index)
-        stage = simulator.stage(recipe)
+        stage = simulator.render(recipe)
         drawn, answer = pool.draw_evenly(recipe.generator(999), config.validation_points)
         observed = stage.cloud.points_mm
         organ = stage.carry(vertices) - np.median(observed, axis=0)

@@ -147,7 +147,7 @@ def _batches(subject: Subject, preset: str) -> Iterator[Point]:
     """One training step of so many samples."""
     import torch
 
-    from tumortrack.core.allocator import keep_freed_memory
+    from tumortrack.core.process import keep_freed_memory
     from tumortrack.training.state import TrainingState
     from tumortrack_lab.bench.training import material
 

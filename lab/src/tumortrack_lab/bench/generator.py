@@ -53,7 +53,7 @@ def _row(subject: Subject, what: str, deform: object, threads: int, budget_s: fl
             simulator.pair(SceneRecipe(SEED, "train", next(index)), pool)
 
     def naive() -> None:
-        stage = simulator.stage(SceneRecipe(SEED, "train", next(index)))
+        stage = simulator.render(SceneRecipe(SEED, "train", next(index)))
         plain_pair(anatomy, stage, LABELS)
 
     ours_s, naive_s = in_turns(ours, naive, budget_s=budget_s)

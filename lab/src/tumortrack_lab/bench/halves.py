@@ -51,7 +51,7 @@ def _clinic_encoder(subject: Subject, threads: int, budget_s: float) -> BenchRow
     (ours,) = in_turns(lambda: registration.propose(points), budget_s=budget_s)
     cloud = torch.tensor(points)[None]
     with torch.inference_mode():
-        flops = module_flops(lambda: network.both_ways(cloud))
+        flops = module_flops(lambda: network.flip_hypotheses(cloud))
     moved = weight_bytes(network, 4) + points.nbytes
     return BenchRow(
         name=ENCODER,

@@ -8,7 +8,7 @@ from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
 
-from tumortrack.core.cores import available_cores
+from tumortrack.core.process import available_cores
 
 _FEATURES = {
     "avx2": "AVX2",

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import msgspec
 
-from tumortrack.core.cores import available_cores
+from tumortrack.core.process import available_cores
 from tumortrack_lab.bench.row import BenchResult, BenchRow, Peaks, Point
 from tumortrack_lab.bench.subject import PRESETS
 from tumortrack_lab.bench.suite import ALL, GROUPS

@@ -145,7 +145,7 @@ class Subject:
         from tumortrack.simulate.scene import SceneConfig, SceneRecipe, Simulator
 
         config = SceneConfig(deform=(DragConfig(),))
-        return Simulator(self.anatomy, UP, config).stage(SceneRecipe(SEED, "test", 0))
+        return Simulator(self.anatomy, UP, config).render(SceneRecipe(SEED, "test", 0))
 
     def trained(self, preset: str) -> bool:
         """Whether there is a whole model of this version."""

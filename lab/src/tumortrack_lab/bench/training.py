@@ -36,7 +36,7 @@ Batch = tuple["torch.Tensor", "torch.Tensor", "torch.Tensor", "torch.Tensor"]
 
 def rows(subject: Subject, threads: int, budget_s: float) -> Iterator[BenchRow]:
     """A step of each preset."""
-    from tumortrack.core.allocator import keep_freed_memory
+    from tumortrack.core.process import keep_freed_memory
 
     keep_freed_memory()  # as training does
     for preset in subject.presets:

@@ -19,7 +19,7 @@ from rich.progress import (
 from tumortrack.cli.console import console, say
 
 if TYPE_CHECKING:
-    from tumortrack_lab.twin.variants import View
+    from tumortrack_lab.twin.views import View
 
 _EVERY_S = 15.0  # between lines where there is no terminal
 
@@ -33,7 +33,7 @@ def write_twin(
         InputError: no case, unknown names, or scenes made from something else.
     """
     from tumortrack_lab.twin.dataset import TwinRun, TwinStatus, make_scenes
-    from tumortrack_lab.twin.variants import VARIANTS, VIEWS
+    from tumortrack_lab.twin.views import VARIANTS, VIEWS
 
     columns = (
         TextColumn("{task.description}"),

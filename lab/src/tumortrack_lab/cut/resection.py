@@ -1,9 +1,8 @@
-"""A plan made on the estimate cuts the true anatomy: what comes away, and how close it came.
+"""A plan made on the estimate cuts the true anatomy: what is removed, and the margins.
 
-Nothing of the planner's own reckoning of volumes is used. The true organ is voxelised, faces
-between voxels are severed where a stroke or a level sheet passes between their centres, and what
-then still hangs together with most of the organ stays. Tissue neither moves nor gives way while
-it is cut, and nobody pulls at it.
+The planner's own volumes are not used. The true organ is voxelised, faces between voxels are
+severed where a stroke or a level sheet passes between their centres, and the largest connected
+piece is what stays. Tissue does not move while it is cut.
 """
 
 from __future__ import annotations
@@ -12,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, Float64, Int, UInt8
+from jaxtyping import Bool, Float, Float64, UInt8
 
 from tumortrack.core.errors import InputError
 from tumortrack.core.types import ORGAN, Anatomy, Mesh
@@ -30,7 +29,6 @@ _ML = 1e-3  # of a mm3
 
 Points = Float[np.ndarray, "_ 3"]
 Box = Float64[np.ndarray, "2 3"]
-Walls = list[tuple[Cut, CutLayer]]
 
 
 @dataclass(frozen=True)
@@ -83,16 +81,15 @@ def cut(truth: Anatomy, plan: ResectionPlan, voxel_mm: float = VOXEL_MM) -> CutR
             f"the plan is for {plan.tumor}, which is not among the anatomy's parts: "
             f"{', '.join(truth.names)}."
         )
-    grid, walls = _grid_for(truth, plan.layers, voxel_mm), _walls_of(plan)
-    tissue, number = grid.labels > 0, truth.names.index(plan.tumor)
-    bridge_mm2 = _bridge_mm2(grid, walls, plan.layers, truth.organ.box_mm)
-    severed = _severed(grid, walls, plan.layers, torn=bridge_mm2 < _TEARS_MM2)
-    pieces = pieces_of(tissue, severed)
-    enclosed = _enclosed(grid, plan.layers) & tissue
-    largest = _largest(pieces[enclosed])
+    cutting = _Cutting(_grid_for(truth, plan.layers, voxel_mm), plan, truth.organ.box_mm)
+    grid, number = cutting.grid, truth.names.index(plan.tumor)
+    bridge_mm2 = cutting.bridge_mm2()
+    tissue, tumor = grid.labels > 0, grid.labels == ORGAN + number
+    pieces = pieces_of(tissue, cutting.severed(torn=bridge_mm2 < _TEARS_MM2))
+    enclosed = cutting.enclosed() & tissue
+    largest = int(np.bincount(pieces[enclosed], minlength=1).argmax())  # 0: nothing enclosed
     piece = pieces == largest if largest > 1 else np.zeros_like(tissue)
-    tumor = grid.labels == ORGAN + number
-    surface = _cut_surface(walls, plan.layers, truth.organ.box_mm)
+    surface = cutting.surface()
     found = grid.at(surface)
     surface, found = surface[found > 0], found[found > 0]
     voxel_ml = voxel_mm**3 * _ML
@@ -157,83 +154,108 @@ def _grid_for(truth: Anatomy, layers: Sequence[CutLayer], voxel_mm: float) -> _G
     return _Grid(low_mm, voxel_mm, label_grid(truth, table_from_index, shape))
 
 
-def _walls_of(plan: ResectionPlan) -> Walls:
-    """Each stroke along an outline, with the layer whose wall it cuts."""
-    walls = []
-    for stroke in (stroke for stroke in plan.cuts if stroke.kind == "wall"):
-        height = stroke.height_mm
-        here = [
-            layer
-            for layer in plan.layers
-            if layer.bottom_mm - _SAME_MM <= height < layer.top_mm - _SAME_MM
-        ]
-        if not here:
-            raise InputError(f"a stroke at {height:g} mm lies in none of the plan's layers.")
-        walls.append((stroke, here[0]))
-    return walls
+class _Cutting:
+    """A plan in the true anatomy.
 
+    Attributes:
+        walls: each stroke along an outline, with the layer whose wall it cuts.
+        box_mm: of the organ; beyond it nothing is looked at.
+    """
 
-def _below(layer: CutLayer, layers: Sequence[CutLayer]) -> list[CutLayer]:
-    """The layers whose top is this one's bottom."""
-    return [other for other in layers if abs(other.top_mm - layer.bottom_mm) < _SAME_MM]
+    def __init__(self, grid: _Grid, plan: ResectionPlan, box_mm: Box) -> None:
+        self.grid, self.layers, self.box_mm = grid, plan.layers, box_mm
+        self.walls: list[tuple[Cut, CutLayer]] = []
+        for stroke in (stroke for stroke in plan.cuts if stroke.kind == "wall"):
+            height = stroke.height_mm
+            here = [
+                layer
+                for layer in plan.layers
+                if layer.bottom_mm - _SAME_MM <= height < layer.top_mm - _SAME_MM
+            ]
+            if not here:
+                raise InputError(f"a stroke at {height:g} mm lies in none of the plan's layers.")
+            self.walls.append((stroke, here[0]))
 
+    def severed(self, torn: bool) -> Severed:
+        """A sheet reaches one voxel further than its outlines, for the strokes' chords leave those.
+        ``torn``: what the strokes left of the outlines is severed too."""
+        from scipy.ndimage import binary_dilation, binary_erosion
 
-def _severed(grid: _Grid, walls: Walls, layers: Sequence[CutLayer], torn: bool) -> Severed:
-    """A sheet reaches one voxel further than its outlines, for the strokes' chords leave those.
-    ``torn``: what the strokes left of the outlines is severed too."""
-    from scipy.ndimage import binary_dilation, binary_erosion
+        grid, near = self.grid, np.ones((3, 3), bool)
+        severed = Severed(grid.labels.shape)
+        for stroke, layer in self.walls:
+            path = (stroke.path_mm[:, :2] - grid.low_mm[:2]) / grid.voxel_mm
+            severed.wall(path, grid.level(layer.bottom_mm), grid.level(layer.top_mm))
+        for layer in self.layers:
+            for ring in grid.rings(layer) if torn else ():
+                closed = np.concatenate([ring, ring[:1]])
+                severed.wall(closed, grid.level(layer.bottom_mm), grid.level(layer.top_mm))
+            sheet = binary_dilation(grid.columns(layer), near)
+            for lower in self._below(layer):
+                sheet &= ~binary_erosion(grid.columns(lower), near)
+            severed.sheet(sheet, grid.level(layer.bottom_mm))
+        return severed
 
-    severed, near = Severed(grid.labels.shape), np.ones((3, 3), bool)
-    for stroke, layer in walls:
-        path = (stroke.path_mm[:, :2] - grid.low_mm[:2]) / grid.voxel_mm
-        severed.wall(path, grid.level(layer.bottom_mm), grid.level(layer.top_mm))
-    for layer in layers:
-        for ring in grid.rings(layer) if torn else ():
-            closed = np.concatenate([ring, ring[:1]])
-            severed.wall(closed, grid.level(layer.bottom_mm), grid.level(layer.top_mm))
-        sheet = binary_dilation(grid.columns(layer), near)
-        for lower in _below(layer, layers):
-            sheet &= ~binary_erosion(grid.columns(lower), near)
-        severed.sheet(sheet, grid.level(layer.bottom_mm))
-    return severed
+    def enclosed(self) -> Voxels:
+        """What lies within the layers."""
+        grid = self.grid
+        inside = np.zeros(grid.labels.shape, bool)
+        for layer in self.layers:
+            levels = slice(grid.level(layer.bottom_mm), grid.level(layer.top_mm))
+            inside[:, :, levels] |= grid.columns(layer)[:, :, None]
+        return inside
 
+    def surface(self) -> Points:
+        """Points all over walls and sheets, SAMPLES_MM apart."""
+        points = [self._curtain(stroke.path_mm[:, :2], layer) for stroke, layer in self.walls]
+        points += [self._flat(layer, self._below(layer), layer.bottom_mm) for layer in self.layers]
+        return np.concatenate(points)
 
-def _enclosed(grid: _Grid, layers: Sequence[CutLayer]) -> Voxels:
-    """What lies within the layers."""
-    inside = np.zeros(grid.labels.shape, bool)
-    for layer in layers:
-        levels = slice(grid.level(layer.bottom_mm), grid.level(layer.top_mm))
-        inside[:, :, levels] |= grid.columns(layer)[:, :, None]
-    return inside
+    def bridge_mm2(self) -> float:
+        """Area within tissue of what encloses the piece and was not cut: of outlines, that no
+        stroke goes along; and where a layer is wider than the one above it, that rim."""
+        from scipy.spatial import cKDTree
 
+        held = 0
+        for layer in self.layers:
+            strokes = [_even(s.path_mm[:, :2]) for s, wall in self.walls if wall is layer]
+            for ring in layer.rings_mm:
+                points = self._curtain(np.concatenate([ring, ring[:1]]), layer)
+                points = points[self.grid.at(points) > 0]
+                if strokes and len(points):
+                    beside = cKDTree(np.concatenate(strokes)).query(points[:, :2])[0]
+                    points = points[beside > _BESIDE_MM]
+                held += len(points)
+            above = [other for other in self.layers if layer in self._below(other)]
+            if np.isfinite(layer.top_mm):
+                rim = self._flat(layer, above, layer.top_mm)
+                held += int((self.grid.at(rim) > 0).sum())
+        return held * SAMPLES_MM**2
 
-def _cut_surface(walls: Walls, layers: Sequence[CutLayer], box_mm: Box) -> Points:
-    """Points all over walls and sheets, SAMPLES_MM apart."""
-    points = [_curtain(stroke.path_mm[:, :2], layer, box_mm) for stroke, layer in walls]
-    points += [_flat(layer, _below(layer, layers), layer.bottom_mm, box_mm) for layer in layers]
-    return np.concatenate(points)
+    def _below(self, layer: CutLayer) -> list[CutLayer]:
+        """The layers whose top is this one's bottom."""
+        return [other for other in self.layers if abs(other.top_mm - layer.bottom_mm) < _SAME_MM]
 
+    def _curtain(self, path: Flat, layer: CutLayer) -> Points:
+        """Points on the wall over a line, from the layer's bottom to its top, within the box."""
+        low = max(layer.bottom_mm, self.box_mm[0, 2]) + SAMPLES_MM / 2
+        heights = np.arange(low, min(layer.top_mm, self.box_mm[1, 2]), SAMPLES_MM)
+        flat = _even(path)
+        return np.column_stack([np.tile(flat, (len(heights), 1)), np.repeat(heights, len(flat))])
 
-def _bridge_mm2(grid: _Grid, walls: Walls, layers: Sequence[CutLayer], box_mm: Box) -> float:
-    """Area within tissue of what encloses the piece and was not cut: of outlines, that no stroke
-    goes along; and where a layer is wider than the one above it, that rim."""
-    from scipy.spatial import cKDTree
+    def _flat(self, layer: CutLayer, without: list[CutLayer], height_mm: float) -> Points:
+        """Points level within a layer and outside others, within the box."""
+        low, high = self.box_mm[:, :2]
+        shape = tuple((np.ceil((high - low) / SAMPLES_MM).astype(int) + 1).tolist())
 
-    held = 0
-    for layer in layers:
-        strokes = [_even(s.path_mm[:, :2]) for s, wall in walls if wall is layer]
-        for ring in layer.rings_mm:
-            points = _curtain(np.concatenate([ring, ring[:1]]), layer, box_mm)
-            points = points[grid.at(points) > 0]
-            if strokes and len(points):
-                beside = cKDTree(np.concatenate(strokes)).query(points[:, :2])[0]
-                points = points[beside > _BESIDE_MM]
-            held += len(points)
-        above = [other for other in layers if layer in _below(other, layers)]
-        if np.isfinite(layer.top_mm):
-            rim = _flat(layer, above, layer.top_mm, box_mm)
-            held += int((grid.at(rim) > 0).sum())
-    return held * SAMPLES_MM**2
+        def inside(layer: CutLayer) -> Mask:
+            return within(tuple((ring - low) / SAMPLES_MM for ring in layer.rings_mm), shape)
+
+        kept = inside(layer)
+        for other in without:
+            kept &= ~inside(other)
+        heights = np.full(kept.sum(), height_mm)
+        return np.column_stack([low + SAMPLES_MM * np.argwhere(kept), heights])
 
 
 def _even(path: Flat) -> Flat:
@@ -243,23 +265,6 @@ def _even(path: Flat) -> Flat:
     return np.column_stack([np.interp(at, way, axis) for axis in path.T])
 
 
-def _curtain(path: Flat, layer: CutLayer, box_mm: Box) -> Points:
-    """Points on the wall over a line, from the layer's bottom to its top, within the box."""
-    low, high = max(layer.bottom_mm, box_mm[0, 2]), min(layer.top_mm, box_mm[1, 2])
-    heights, flat = np.arange(low + SAMPLES_MM / 2, high, SAMPLES_MM), _even(path)
-    return np.column_stack([np.tile(flat, (len(heights), 1)), np.repeat(heights, len(flat))])
-
-
-def _flat(layer: CutLayer, without: Sequence[CutLayer], height_mm: float, box_mm: Box) -> Points:
-    """Points level within a layer and outside others, within the box."""
-    low, high = box_mm[:, :2]
-    shape = tuple((np.ceil((high - low) / SAMPLES_MM).astype(int) + 1).tolist())
-    kept = within(tuple((ring - low) / SAMPLES_MM for ring in layer.rings_mm), shape)
-    for other in without:
-        kept &= ~within(tuple((ring - low) / SAMPLES_MM for ring in other.rings_mm), shape)
-    return np.column_stack([low + SAMPLES_MM * np.argwhere(kept), np.full(kept.sum(), height_mm)])
-
-
 def _margin_mm(surface: Points, inside: Bool[np.ndarray, " n"], tumor: Mesh) -> float | None:
     """Signed distance of the nearest, or else the deepest, of the cut's points."""
     if not len(surface):
@@ -267,11 +272,6 @@ def _margin_mm(surface: Points, inside: Bool[np.ndarray, " n"], tumor: Mesh) -> 
     if inside.any():
         return -float(_to_surface(surface[inside], tumor).max())
     return float(_to_surface(surface, tumor).min())
-
-
-def _largest(numbers: Int[np.ndarray, " n"]) -> int:
-    """The number that occurs most often; 0 where there is none."""
-    return int(np.bincount(numbers, minlength=1).argmax())
 
 
 def _share(of: Voxels, whole: Voxels) -> float:

@@ -1,6 +1,5 @@
-"""Voxels that no longer hang together after a cut: faces between them are severed, not voxels
-taken out, so that a cut takes no tissue with it and leaves no way around a corner.
-
+"""Connected pieces of tissue after a cut. Faces between voxels are severed and no voxels removed,
+so that a cut has no volume and leaves no diagonal way through.
 """
 
 from __future__ import annotations
@@ -8,14 +7,14 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from tumortrack.imaging.raster import _expand
+from tumortrack.imaging.raster import expand
 
 Flat = Float[np.ndarray, "_ 2"]
 Mask = Bool[np.ndarray, "i j"]
 Voxels = Bool[np.ndarray, "i j k"]
 
-# In voxels: no line that anyone draws then runs through a voxel's very centre, where rounding would
-# have to say which side it passes on. Closed lines so separate inside from outside.
+# In voxels: with this offset no line that anyone draws runs exactly through a voxel's centre, where
+# rounding would decide on which side it passes. So closed lines separate inside from outside.
 _ASIDE = 1e-7 * np.sqrt([2.0, 3.0])
 
 
@@ -58,7 +57,7 @@ def _crossings(path: Flat, shape: tuple[int, int]) -> Int[np.ndarray, "i j"]:
     low, high = np.minimum(start[:, 1], end[:, 1]), np.maximum(start[:, 1], end[:, 1])
     first = np.clip(np.ceil(low), 0, shape[1]).astype(int)
     stop = np.clip(np.ceil(high), 0, shape[1]).astype(int)
-    part, step = _expand(np.maximum(stop - first, 0))
+    part, step = expand(np.maximum(stop - first, 0))
     row = first[part] + step
     share = (row - start[part, 1]) / (end[part, 1] - start[part, 1])
     at = start[part, 0] + share * (end[part, 0] - start[part, 0])
@@ -68,8 +67,8 @@ def _crossings(path: Flat, shape: tuple[int, int]) -> Int[np.ndarray, "i j"]:
 
 
 def pieces_of(tissue: Voxels, severed: Severed) -> Int[np.ndarray, "i j k"]:
-    """What hangs together over faces that are not severed: 1 in the largest piece, 2, 3, ... in
-    the others, 0 where there is no tissue."""
+    """Pieces connected over faces that are not severed: 1 is the largest, then 2, 3, ...; 0 where
+    there is no tissue."""
     from scipy.ndimage import label
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components

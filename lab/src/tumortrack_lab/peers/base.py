@@ -8,22 +8,24 @@ follow; so peers and network are compared by the same ``report.protocol.compare`
 from __future__ import annotations
 
 import time
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Float, Float64
+from jaxtyping import Float
 
 import tumortrack
 from tumortrack.core.errors import InputError
 from tumortrack.core.estimate import Estimate
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.types import Anatomy, CameraLabels, OccupancyCloud
+from tumortrack.imaging.raster import label_grid
 from tumortrack.models.report import describe_parts, grid_over
-from tumortrack.report.metrics import label_grid
 from tumortrack.simulate.scene_folder import Scene
+from tumortrack_lab.peers.pose_search import Direction, Points, PoseSearch, Transform
 
 CLOUD_POINTS = 40_000  # of an estimate, as many as the tracker asks for
 
@@ -45,6 +47,7 @@ class Fit:
     report: dict = field(default_factory=dict)
 
 
+@runtime_checkable
 class Peer(Protocol):
     """A method made ready for one patient."""
 
@@ -52,16 +55,16 @@ class Peer(Protocol):
     prepare_s: float  # spent before the first frame
 
     def fit(self, scene: Scene) -> Fit:
-        """Locate the anatomy in a scene. All but the bound look at ``scene.cloud`` alone.
+        """Locate the anatomy in a scene. All but the bound use ``scene.cloud`` alone.
 
         Raises:
-            NoEstimate: the cloud says too little.
+            NoEstimate: the cloud has too little information.
             InputError: the cloud or the peer's settings cannot be used.
         """
         ...
 
 
-def rigid_carry(camera_from_ct: Float64[np.ndarray, "4 4"]) -> Carry:
+def rigid_carry(camera_from_ct: Transform) -> Carry:
     """The map of points of a rigid pose."""
     return lambda points_ct: transform_points(camera_from_ct, points_ct)
 
@@ -76,14 +79,21 @@ def estimate_of(fit: Fit, anatomy_ct: Anatomy, stamp_ns: int = 0, grid: int = 16
         grid: voxels along the longest side of the dense volume, as in ``Tracker.locate``.
 
     Raises:
-        InputError: the fit carries points to places that are no numbers.
+        InputError: the fit carries points to NaN or infinity.
     """
-    moved = Anatomy(
-        tuple(part.moved(_finite(fit.carry(part.vertices_mm))) for part in anatomy_ct.parts)
-    )
+    carried = [np.asarray(fit.carry(part.vertices_mm)) for part in anatomy_ct.parts]
+    if not all(np.isfinite(points_mm).all() for points_mm in carried):
+        raise InputError("the fit diverged: it carries points to NaN or infinity.")
+    pairs = zip(anatomy_ct.parts, carried, strict=True)
+    moved = Anatomy(tuple(part.moved(points_mm) for part, points_mm in pairs))
     camera_from_index, shape = grid_over(moved.organ.vertices_mm, grid)
     labels = label_grid(moved, camera_from_index, shape)
-    inside = _cloud_of(labels, camera_from_index, stamp_ns)
+    inside = np.flatnonzero(labels)
+    inside = inside[:: max(1, len(inside) // CLOUD_POINTS)]  # spread evenly
+    index = np.stack(np.unravel_index(inside, labels.shape), 1).astype(float)
+    points_mm = transform_points(camera_from_index, index)
+    # A peer knows no probabilities but 1.
+    cloud = OccupancyCloud(points_mm, labels.reshape(-1)[inside], np.ones(len(inside)), stamp_ns)
     meshes = dict(zip(moved.names, moved.parts, strict=True))
     report = {
         "tumortrack": tumortrack.__version__,
@@ -91,28 +101,11 @@ def estimate_of(fit: Fit, anatomy_ct: Anatomy, stamp_ns: int = 0, grid: int = 16
         "frame": "camera",
         "stamp_ns": stamp_ns,
         "voxel_mm": float(camera_from_index[0, 0]),
-        "parts": describe_parts(moved.names, meshes, inside),
+        "parts": describe_parts(moved.names, meshes, cloud),
         "timings": {"total": fit.seconds},
         "fit": fit.report,
     }
-    return Estimate(inside, CameraLabels(labels, camera_from_index), meshes, report)
-
-
-def _finite(points_mm: np.ndarray) -> np.ndarray:
-    if not np.isfinite(points_mm).all():
-        raise InputError("the fit diverged: it carries points to NaN or infinity.")
-    return points_mm
-
-
-def _cloud_of(
-    labels: np.ndarray, camera_from_index: Float64[np.ndarray, "4 4"], stamp_ns: int
-) -> OccupancyCloud:
-    """Evenly chosen voxels inside; a peer knows no probabilities but 1."""
-    inside = np.flatnonzero(labels)
-    inside = inside[:: max(1, len(inside) // CLOUD_POINTS)]
-    index = np.stack(np.unravel_index(inside, labels.shape), 1).astype(float)
-    points_mm = transform_points(camera_from_index, index)
-    return OccupancyCloud(points_mm, labels.reshape(-1)[inside], np.ones(len(inside)), stamp_ns)
+    return Estimate(cloud, CameraLabels(labels, camera_from_index), meshes, report)
 
 
 class Stopwatch:
@@ -126,3 +119,51 @@ def stopwatch() -> Iterator[Stopwatch]:
     watch, start = Stopwatch(), time.perf_counter()
     yield watch
     watch.seconds = time.perf_counter() - start
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """A deformable fit from one pose: its map, the error by which fits are compared (any unit), and
+    its report."""
+
+    carry: Carry
+    error: float
+    report: dict
+
+
+class DeformablePeer(ABC):
+    """A peer that fits from each of the best rigid poses and keeps the fit of least error.
+
+    Its configuration has ``rigid`` (of the pose search) and ``starts`` (how many poses).
+    """
+
+    name: str
+    config: Any
+
+    def __init__(self, anatomy_ct: Anatomy, up_lps: Direction, config: Any) -> None:
+        self.config = config
+        with stopwatch() as watch:
+            self._search = PoseSearch(anatomy_ct, up_lps, config.rigid)
+            self._prepare(anatomy_ct)
+        self.prepare_s = watch.seconds
+
+    def fit(self, scene: Scene) -> Fit:
+        """See ``Peer.fit``.
+
+        Raises:
+            NoEstimate: fewer than 20 points.
+        """
+        cloud = scene.cloud.points_mm.astype(float)
+        with stopwatch() as watch:
+            poses = self._search.poses(scene.cloud)[: self.config.starts]
+            fits = [self._fit_from(pose.camera_from_ct, cloud) for pose in poses]
+            best = int(np.argmin([fit.error for fit in fits]))
+        report = {"start": poses[best].start, **fits[best].report}
+        return Fit(fits[best].carry, watch.seconds, report)
+
+    def _prepare(self, anatomy_ct: Anatomy) -> None:  # noqa: B027, nothing by default
+        """What else can be done before a cloud is seen."""
+
+    @abstractmethod
+    def _fit_from(self, camera_from_ct: Transform, cloud: Points) -> Candidate:
+        """The fit from one pose to the cloud (camera frame, mm)."""

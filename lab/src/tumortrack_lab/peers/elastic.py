@@ -2,9 +2,9 @@
 
 The family of methods that does best on the Sparse Data Challenge (BCF-FEM, arXiv 2403.09964): the
 organ is an elastic body, unknown forces act on its surface, and its deformed surface must pass
-through the observed points. Own formulation: the pose is
-a true rotation, the displacement relative to it a sum of the body's softest surface modes, and
-both follow from one small least-squares problem, iterated with new closest points.
+through the observed points. Own formulation: the pose is a true rotation, the displacement
+relative to it a sum of the body's softest surface modes, and both follow from one small
+least-squares problem, iterated with new closest points.
 """
 
 from __future__ import annotations
@@ -15,25 +15,35 @@ import numpy as np
 from jaxtyping import Float64, Int
 from scipy.linalg import cho_factor, cho_solve
 from scipy.spatial import cKDTree
-from scipy.spatial.transform import Rotation
 
 from tumortrack.core.config import Config
-from tumortrack.core.geometry import rigid, transform_points
+from tumortrack.core.geometry import transform_points
 from tumortrack.core.types import Anatomy
-from tumortrack.simulate.scene_folder import Scene
-from tumortrack_lab.peers.base import Carry, Fit, stopwatch
+from tumortrack_lab.peers.base import Candidate, DeformablePeer
 from tumortrack_lab.peers.elastic_body import PeerElasticBody, elastic_body
-from tumortrack_lab.peers.rigid import CROP_PERCENT, PoseSearch, RigidConfig
-from tumortrack_lab.peers.surface import SurfacePoints, seen_from
+from tumortrack_lab.peers.pose_search import (
+    CROP_PERCENT,
+    Points,
+    PoseSearch,
+    RigidConfig,
+    SurfacePoints,
+    Transform,
+    seen_from,
+    tukey,
+    turned_about,
+)
 from tumortrack_lab.tets import tetrahedralise
 
-# Of the diagonal: the mesh may cut corners by 1 mm, for the organ's own surface rides on it.
+# Of the diagonal: the mesh may err by 1 mm, for the organ's own surface is embedded in it.
 _ENVELOPE = 7e-3
 _STEP_MM = 1.0  # along the surface, for the normals of the deformed one
 _BESIDE_MM = 2.0  # spacing: partners lie this far apart along the surface
 _SEEN_POINTS = 500  # of the visible surface that look for their place in the cloud
-_SETTLED_MM = 0.05  # a step smaller than this ends the iteration
+_CONVERGED_MM = 0.05  # a step smaller than this ends the iteration
 _FREE = 1e-6  # the pose's precision: as good as none
+
+Amplitudes = Float64[np.ndarray, " modes"]
+Step = Float64[np.ndarray, " unknowns"]  # turn and shift (CT frame, about the middle), amplitudes
 
 
 class ElasticPeerConfig(Config, frozen=True):
@@ -61,15 +71,15 @@ class ElasticPeerConfig(Config, frozen=True):
 class _State:
     """Where the body lies and how it is deformed: camera = pose (ct + modes @ amplitudes)."""
 
-    camera_from_ct: Float64[np.ndarray, "4 4"]
-    amplitudes: Float64[np.ndarray, " modes"]
+    camera_from_ct: Transform
+    amplitudes: Amplitudes
 
 
 @dataclass(frozen=True, eq=False)
 class _Pairs:
-    """Each cloud point's equation: how its distance along the surface normal follows from a small
-    turn, shift and change of amplitudes (``rows``), the distance now, whether it counts (1) or is
-    an outlier (0), and how much it would."""
+    """One equation a pair: the derivative of its distance along the surface normal by a step
+    (``rows``), the distance now, its Tukey weight (0: an outlier), and a constant weight
+    (``share``)."""
 
     rows: Float64[np.ndarray, "n unknowns"]
     residual_mm: Float64[np.ndarray, " n"]
@@ -77,75 +87,57 @@ class _Pairs:
     share: Float64[np.ndarray, " n"]
 
 
-class ElasticPeer:
+class ElasticPeer(DeformablePeer):
     """The elastic surface fit as a peer."""
 
     name = "elastic"
+    config: ElasticPeerConfig
 
-    def __init__(
-        self,
-        anatomy_ct: Anatomy,
-        up_lps: tuple[float, float, float],
-        config: ElasticPeerConfig | None = None,
-    ) -> None:
-        self.config = config or ElasticPeerConfig()
-        with stopwatch() as watch:
-            self._search = PoseSearch(anatomy_ct, up_lps, self.config.rigid)
-            mesh = tetrahedralise(anatomy_ct.organ, self.config.edge_mm, _ENVELOPE)
-            self.body = elastic_body(mesh, self.config.poisson, self.config.modes)
-            self._surface = RidingSurface(self.body, self._search)
-            variance = self.config.displacement_mm**2 * self.body.area_mm2
-            self._precision = self.body.stiffness * (1 / self.body.stiffness).sum() / variance
-        self.prepare_s = watch.seconds
+    def _prepare(self, anatomy_ct: Anatomy) -> None:
+        mesh = tetrahedralise(anatomy_ct.organ, self.config.edge_mm, _ENVELOPE)
+        self.body = elastic_body(mesh, self.config.poisson, self.config.modes)
+        self._surface = EmbeddedSurface(self.body, self._search)
+        variance = self.config.displacement_mm**2 * self.body.area_mm2
+        self._precision = self.body.stiffness * (1 / self.body.stiffness).sum() / variance
 
-    def fit(self, scene: Scene) -> Fit:
-        """The best of the elastic fits from the best rigid poses.
-
-        Raises:
-            NoEstimate: fewer than 20 points.
-        """
-        points = scene.cloud.points_mm.astype(float)
-        with stopwatch() as watch:
-            poses = self._search.poses(scene.cloud)[: self.config.starts]
-            fits = [self._from(pose.camera_from_ct, points) for pose in poses]
-            costs = [self._cost(state, points) for state, _ in fits]
-            best = int(np.argmin([cost for cost, _ in costs]))
-        state, iterations = fits[best]
-        report = {
-            "start": poses[best].start,
-            "iterations": iterations,
-            "cost": costs[best][0],
-            "residual_mm": costs[best][1],
-            "displacement_mm": self._surface_rms(state.amplitudes),
-        }
-        return Fit(self._carry(state), watch.seconds, report)
-
-    def _carry(self, state: _State) -> Carry:
-        def carry(points_ct: np.ndarray) -> np.ndarray:
-            moved = points_ct + self.body.displacement(points_ct, state.amplitudes)
-            return transform_points(state.camera_from_ct, moved)
-
-        return carry
-
-    def _from(
-        self, camera_from_ct: Float64[np.ndarray, "4 4"], points: Float64[np.ndarray, "n 3"]
-    ) -> tuple[_State, int]:
-        """Fit from one pose; the points' reach shrinks while the body finds its place."""
+    def _fit_from(self, camera_from_ct: Transform, cloud: Points) -> Candidate:
+        """The limit beyond which points are outliers shrinks during the iteration."""
         config = self.config
         state = _State(camera_from_ct, np.zeros(len(self._precision)))
         reach = np.geomspace(config.first_outlier_mm, config.outlier_mm, config.iterations // 2)
         for iteration in range(config.iterations):
             last = iteration >= len(reach)
             outlier_mm = config.outlier_mm if last else float(reach[iteration])
-            step = self._step(self._pairs(state, points, outlier_mm), state.amplitudes)
-            state = self._moved(state, step)
-            if last and self._surface_rms(step[6:]) + np.linalg.norm(step[3:6]) < _SETTLED_MM:
+            step = self._step(self._pairs(state, cloud, outlier_mm), state.amplitudes)
+            moved = state.camera_from_ct @ turned_about(self._surface.middle, step[:6])
+            state = _State(moved, state.amplitudes + step[6:])
+            if last and self._surface_rms(step[6:]) + np.linalg.norm(step[3:6]) < _CONVERGED_MM:
                 break
-        return state, iteration + 1
+        return self._candidate(state, cloud, iteration + 1)
 
-    def _pairs(
-        self, state: _State, points: Float64[np.ndarray, "n 3"], outlier_mm: float
-    ) -> _Pairs:
+    def _candidate(self, state: _State, cloud: Points, iterations: int) -> Candidate:
+        """Starts are compared by the cost (data, Tukey's, and strain energy); the residual is the
+        root mean square distance of the points that count."""
+
+        def carry(points_ct: np.ndarray) -> np.ndarray:
+            moved = points_ct + self.body.displacement(points_ct, state.amplitudes)
+            return transform_points(state.camera_from_ct, moved)
+
+        pairs = self._pairs(state, cloud, self.config.outlier_mm)
+        data = (self.config.outlier_mm / self.config.noise_mm) ** 2 / 6
+        cost = data * (pairs.share @ (1 - pairs.weight**1.5))
+        cost += self._precision @ state.amplitudes**2 / 2
+        kept = pairs.weight > 0
+        residual = np.sqrt((pairs.residual_mm[kept] ** 2).mean()) if kept.any() else np.inf
+        report = {
+            "iterations": iterations,
+            "cost": float(cost),
+            "residual_mm": float(residual),
+            "displacement_mm": self._surface_rms(state.amplitudes),
+        }
+        return Candidate(carry, report["cost"], report)
+
+    def _pairs(self, state: _State, points: Points, outlier_mm: float) -> _Pairs:
         """Cloud points and the surface points nearest to them; then the other way round, for the
         surface that the camera should see: the cloud's rim says where the organ ends."""
         ct_from_camera = np.linalg.inv(state.camera_from_ct)
@@ -162,48 +154,27 @@ class ElasticPeer:
         residual = np.einsum("ij,ij->i", normal, apart)
         # Partners beside the surface's end have no place on it: their distance counts too.
         off = np.maximum(np.abs(residual), np.linalg.norm(apart, axis=1) - _BESIDE_MM)
-        weight = (1 - np.minimum(off / outlier_mm, 1) ** 2) ** 2
-        share = np.concatenate(
-            [np.ones(len(placed)), np.full(len(seen), len(placed) / max(len(seen), 1))]
-        )
+        alike = np.full(len(seen), len(placed) / max(len(seen), 1))  # both ways weigh the same
         turn = np.cross(shape.points_mm[index] - self._surface.middle, normal)
         bend = np.einsum("ij,ijk->ik", normal, self._surface.modes[index])
         rows = np.concatenate([turn, normal, bend], axis=1)
-        return _Pairs(rows, residual, weight, share)
+        share = np.concatenate([np.ones(len(placed)), alike])
+        return _Pairs(rows, residual, tukey(off, outlier_mm), share)
 
-    def _step(
-        self, pairs: _Pairs, amplitudes: Float64[np.ndarray, " modes"]
-    ) -> Float64[np.ndarray, " unknowns"]:
-        """Gauss-Newton: turn and shift (in the CT frame, about the middle), then amplitudes."""
+    def _step(self, pairs: _Pairs, amplitudes: Amplitudes) -> Step:
+        """One Gauss-Newton step."""
         precision = np.concatenate([np.full(6, _FREE), self._precision])
         pull = np.concatenate([np.zeros(6), self._precision * amplitudes])
         scaled = pairs.rows * (pairs.weight * pairs.share / self.config.noise_mm**2)[:, None]
         system = scaled.T @ pairs.rows + np.diag(precision)
         return cho_solve(cho_factor(system), scaled.T @ pairs.residual_mm - pull)
 
-    def _moved(self, state: _State, step: Float64[np.ndarray, " unknowns"]) -> _State:
-        rotation = Rotation.from_rotvec(step[:3]).as_matrix()
-        middle = self._surface.middle
-        turned = rigid(rotation, middle + step[3:6] - rotation @ middle)
-        return _State(state.camera_from_ct @ turned, state.amplitudes + step[6:])
-
-    def _cost(self, state: _State, points: Float64[np.ndarray, "n 3"]) -> tuple[float, float]:
-        """What the starts are compared by (data, Tukey's, and strain energy), and the root mean
-        square distance of the points that count, mm."""
-        pairs = self._pairs(state, points, self.config.outlier_mm)
-        data = (self.config.outlier_mm / self.config.noise_mm) ** 2 / 6
-        cost = data * (pairs.share @ (1 - pairs.weight**1.5))
-        cost += self._precision @ state.amplitudes**2 / 2
-        kept = pairs.weight > 0
-        residual = np.sqrt((pairs.residual_mm[kept] ** 2).mean()) if kept.any() else np.inf
-        return float(cost), float(residual)
-
-    def _surface_rms(self, amplitudes: Float64[np.ndarray, " modes"]) -> float:
+    def _surface_rms(self, amplitudes: Amplitudes) -> float:
         return float(np.sqrt(amplitudes @ amplitudes / self.body.area_mm2))
 
 
-class RidingSurface:
-    """Points of the organ's fine surface that ride on the body's modes, with their normals."""
+class EmbeddedSurface:
+    """Points of the organ's fine surface that move with the body's modes, and their normals."""
 
     def __init__(self, body: PeerElasticBody, search: PoseSearch) -> None:
         rest = search.surface
@@ -220,22 +191,20 @@ class RidingSurface:
             for along in self._tangents
         )
 
-    def shape(self, amplitudes: Float64[np.ndarray, " modes"]) -> SurfacePoints:
+    def shape(self, amplitudes: Amplitudes) -> SurfacePoints:
         """The deformed surface, CT frame."""
-        first, second = (
-            along + slope @ amplitudes
-            for along, slope in zip(self._tangents, self._slopes, strict=True)
-        )
+        pairs = zip(self._tangents, self._slopes, strict=True)
+        first, second = (along + slope @ amplitudes for along, slope in pairs)
         normal = np.cross(first, second)
         normal /= np.linalg.norm(normal, axis=1, keepdims=True)
         return SurfacePoints(self._rest.points_mm + self.modes @ amplitudes, normal)
 
     def seen(
-        self, shape: SurfacePoints, camera_from_ct: Float64[np.ndarray, "4 4"], deepest_mm: float
+        self, shape: SurfacePoints, camera_from_ct: Transform, deepest_mm: float
     ) -> Int[np.ndarray, " m"]:
         """Some of the points that the camera should see above a depth, evenly spread.
 
-        Hidden is what the undeformed organ hides; which way it turns, the deformed one says.
+        Occlusion is that of the undeformed organ; orientation is that of the deformed one.
         """
         seen = seen_from(self._visibility, self._rest, camera_from_ct)
         seen &= shape.faces(np.linalg.inv(camera_from_ct)[:3, 3])

@@ -95,9 +95,12 @@ def elastic_body(tets: TetMesh, poisson: float, modes: int) -> PeerElasticBody:
     """
     from scipy.sparse import csc_matrix
     from scipy.sparse.linalg import LinearOperator, eigsh, splu
+    from skfem import BilinearForm, FacetBasis
+    from skfem.helpers import dot
 
     K, basis = stiffness_matrix(tets, poisson)
-    M = _surface_mass(basis)
+    facets = FacetBasis(basis.mesh, basis.elem, intorder=4)
+    M = BilinearForm(lambda u, v, _: dot(u, v)).assemble(facets)
     if modes + _RIGID_MODES >= len(basis.get_dofs().flatten()):
         raise InputError(f"{modes} modes are more than this mesh's surface has; refine the mesh.")
     # K alone is singular; a shift of the size of the softest mode makes it definite.
@@ -116,28 +119,15 @@ def elastic_body(tets: TetMesh, poisson: float, modes: int) -> PeerElasticBody:
     )
     if values[_RIGID_MODES] < 1e-6 * values[-1]:
         raise InputError("the organ's mesh is in several pieces; one is needed.")
-    numbers = _node_numbers(basis)
+    mesh = basis.mesh
+    numbers = np.concatenate([mesh.t, mesh.t2e + mesh.p.shape[1]]).T  # of corners, then of edges
     node_dofs = np.empty((numbers.max() + 1, 3), int)
     for axis in range(3):
         node_dofs[numbers, axis] = basis.element_dofs[axis::3].T
     return PeerElasticBody(
-        corners_mm=basis.mesh.p.T[basis.mesh.t.T],
+        corners_mm=mesh.p.T[mesh.t.T],
         nodes=numbers,
         modes=vectors[node_dofs][:, :, _RIGID_MODES:],
         stiffness=values[_RIGID_MODES:],
         area_mm2=area,
     )
-
-
-def _surface_mass(basis: Any) -> Any:
-    from skfem import BilinearForm, FacetBasis
-    from skfem.helpers import dot
-
-    facets = FacetBasis(basis.mesh, basis.elem, intorder=4)
-    return BilinearForm(lambda u, v, _: dot(u, v)).assemble(facets)
-
-
-def _node_numbers(basis: Any) -> Int[np.ndarray, "t 10"]:
-    """Node numbers by element: corners as in the mesh, then its edges."""
-    mesh = basis.mesh
-    return np.concatenate([mesh.t, mesh.t2e + mesh.p.shape[1]]).T

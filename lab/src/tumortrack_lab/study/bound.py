@@ -21,14 +21,14 @@ from scipy.spatial.transform import Rotation
 import tumortrack
 from tumortrack.core.config import Config, to_builtins
 from tumortrack.core.errors import InputError, NoEstimate
-from tumortrack.core.motion import OneWay
+from tumortrack.core.estimate import OneWay
 from tumortrack.core.types import Anatomy, Mesh
 from tumortrack.sense.camera import project
 from tumortrack.sense.render import Visibility
 from tumortrack.simulate.elastic.body import BodyConfig, ElasticBody, build_body
 from tumortrack.simulate.scene_folder import Scene
 from tumortrack_lab.peers.base import Fit, estimate_of, stopwatch
-from tumortrack_lab.peers.rigid_bound import kabsch, matched_vertices
+from tumortrack_lab.peers.rigid import kabsch, matched_vertices
 from tumortrack_lab.study.measure import StudyCase
 from tumortrack_lab.study.methods import Answer, Method
 

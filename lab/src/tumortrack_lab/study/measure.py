@@ -121,7 +121,7 @@ def measure_one(job: Job, name: str) -> dict:
     """One cell's numbers: the protocol's metrics, errors at points, target errors, times."""
     scene = read_scene(job.case.scene(job.variant, job.view))
     if job.fault != "none":
-        from tumortrack_lab.twin.severity import disturbed
+        from tumortrack_lab.twin.faults import disturbed
 
         scene = disturbed(scene, job.fault, job.fault_seed)
     answers: list[Answer] = []
@@ -147,7 +147,7 @@ def measure_one(job: Job, name: str) -> dict:
 
 
 def _points(job: Job, scene: Scene, estimate: Estimate) -> dict:
-    from tumortrack_lab.twin.severity import MOVED
+    from tumortrack_lab.twin.faults import MOVED
 
     clean = job.case.scene(job.variant, CLEAN_VIEW)
     seen = scene if MOVED in scene.meta or not clean.is_dir() else read_scene(clean)

@@ -13,8 +13,8 @@ from tumortrack.core.errors import InputError
 from tumortrack.core.types import Anatomy
 from tumortrack.models.config import TrainConfig
 from tumortrack.models.folder import is_finished
-from tumortrack.sense.calibration import CalibrationConfig
 from tumortrack.sense.clutter import ClutterConfig
+from tumortrack.sense.noise import CalibrationConfig
 from tumortrack.sense.occlusion import OcclusionConfig
 from tumortrack.simulate.deform import DragConfig
 from tumortrack.simulate.deform.drag import CONFIGURATIONS

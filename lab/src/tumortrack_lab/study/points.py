@@ -14,7 +14,7 @@ from tumortrack.core.types import Anatomy, Mesh
 from tumortrack.report.metrics import _to_surface
 from tumortrack.sense.camera import deproject
 from tumortrack.simulate.scene_folder import Scene
-from tumortrack_lab.peers.rigid_bound import kabsch
+from tumortrack_lab.peers.rigid import kabsch
 
 POINTS = 120  # vertices drawn of each tumor
 _NEAR_MM, _FAR_MM = 50.0, 400.0  # of a depth image: what can be the organ at all

@@ -17,7 +17,7 @@ from tumortrack_lab.study.tables import (
     target_text,
     tumors_of,
 )
-from tumortrack_lab.twin.severity import KINDS, clean_level, parse
+from tumortrack_lab.twin.faults import KINDS, clean_level, parse
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -1,7 +1,7 @@
-"""Rigid obstacles, frictionless: the signed distance of points to them, and what they push with.
+"""Frictionless contact with rigid obstacles: signed distances and penalty forces.
 
-Contact is measured at the points of the anatomy's own fine surface, which ride on the
-tetrahedra: a penalty of stiffness x depth^2 / 2 per area (kPa/mm). What sinks in is reported.
+Contact is evaluated at points of the anatomy's own fine surface, which are embedded in the
+tetrahedra: a penalty of stiffness x depth^2 / 2 per area (kPa/mm). The penetration is reported.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from tumortrack_lab.tets import Embedding
 if TYPE_CHECKING:
     from scipy.sparse import csr_matrix
 
-_TOUCHING_MM = 1e-6  # what just touches will push back
+_TOUCHING_MM = 1e-6  # what only touches counts in the stiffness
 
 Points = Float64[np.ndarray, "n 3"]
 Distances = Float64[np.ndarray, " n"]
@@ -31,25 +31,18 @@ class ContactSurface(Protocol):
         """Distance (negative inside) and its gradient: outwards, of length 1 where it is true."""
 
 
-@dataclass(frozen=True)
-class Support:
-    """Everything below z = height."""
-
-    height_mm: float = 0.0
-
-    def distance(self, points_mm: Points) -> tuple[Distances, Points]:
-        return points_mm[:, 2] - self.height_mm, np.tile([0.0, 0.0, 1.0], (len(points_mm), 1))
+Obstacles = tuple[ContactSurface, ...]
 
 
 @dataclass(frozen=True, eq=False)
-class Packing:
-    """Bears each point of a surface from below at the height where it lay; one height a point."""
+class Support:
+    """Everything below z = height: a plane, or packing that bears each point of a surface at the
+    height where it lay (one height a point)."""
 
-    heights_mm: Distances
+    height_mm: float | Distances = 0.0
 
     def distance(self, points_mm: Points) -> tuple[Distances, Points]:
-        upwards = np.tile([0.0, 0.0, 1.0], (len(points_mm), 1))
-        return points_mm[:, 2] - self.heights_mm, upwards
+        return points_mm[:, 2] - self.height_mm, np.tile([0.0, 0.0, 1.0], (len(points_mm), 1))
 
 
 @dataclass(frozen=True)
@@ -73,13 +66,21 @@ class ContactPlate:
         return distance, normal * np.where(offset < 0, -1.0, 1.0)
 
 
+def three(vector: Float64[np.ndarray, " 3"]) -> tuple[float, float, float]:
+    """A point or direction as a ``Rod`` holds it."""
+    x, y, z = vector.tolist()
+    return x, y, z
+
+
 @dataclass(frozen=True)
-class Indenter:
-    """A rod with a hemispherical end: the tip touches ``tip_mm``, ``axis`` points away from it."""
+class Rod:
+    """A rod with a hemispherical end: the tip touches ``tip_mm``, the unit vector ``axis`` points
+    away from it along the rod. For contact it is endless."""
 
     tip_mm: tuple[float, float, float]
     axis: tuple[float, float, float]
     radius_mm: float
+    length_mm: float = 250.0
 
     def distance(self, points_mm: Points) -> tuple[Distances, Points]:
         axis = np.array(self.axis)
@@ -91,15 +92,13 @@ class Indenter:
 
 @dataclass(frozen=True, eq=False)
 class Contact:
-    """A surface (points riding on nodes, an area each) that obstacles push back."""
+    """A surface (embedded points, an area each) that obstacles push back."""
 
     surface: Embedding
     areas_mm2: Float64[np.ndarray, " m"]
     stiffness_kpa_mm: float
 
-    def energy(
-        self, nodes_mm: Points, obstacles: tuple[ContactSurface, ...]
-    ) -> tuple[float, Float64[np.ndarray, "n 3"]]:
+    def energy(self, nodes_mm: Points, obstacles: Obstacles) -> tuple[float, Points]:
         """Penalty energy (uJ) and its gradient at the nodes (mN)."""
         points = self.surface.carry(nodes_mm)
         gradient = np.zeros_like(nodes_mm)
@@ -119,12 +118,12 @@ class Contact:
         push = self.stiffness_kpa_mm * self.areas_mm2 * np.minimum(distance, 0)
         return -(push @ normal)
 
-    def depth_mm(self, nodes_mm: Points, obstacles: tuple[ContactSurface, ...]) -> float:
-        """How far the surface sinks into an obstacle at worst."""
+    def depth_mm(self, nodes_mm: Points, obstacles: Obstacles) -> float:
+        """The deepest penetration of the surface into an obstacle."""
         points = self.surface.carry(nodes_mm)
         return max(0.0, *(-float(o.distance(points)[0].min()) for o in obstacles))
 
-    def stiffness(self, nodes_mm: Points, obstacles: tuple[ContactSurface, ...]) -> csr_matrix:
+    def stiffness(self, nodes_mm: Points, obstacles: Obstacles) -> csr_matrix:
         """Hessian of the penalty, the obstacles' curvature left out: (3 n, 3 n), mN/mm."""
         from scipy.sparse import coo_matrix
 

@@ -9,8 +9,11 @@ SCENES/
 
 from __future__ import annotations
 
+import hashlib
+import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -18,17 +21,16 @@ import numpy as np
 
 from tumortrack.core import store
 from tumortrack.core.config import to_builtins
-from tumortrack.core.errors import InputError, StorageError
+from tumortrack.core.errors import ArtifactError, InputError, StorageError
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.types import Anatomy
-from tumortrack.imaging.case import load_case
+from tumortrack.imaging.case import Case, load_case
 from tumortrack.simulate.scene_folder import write_scene_files
 from tumortrack.simulate.targets import TARGETS, InnerPoints, draw_targets
-from tumortrack_lab.twin.bench import Apparatus, ApparatusConfig, State
+from tumortrack_lab.twin.apparatus import Apparatus, ApparatusConfig, State
 from tumortrack_lab.twin.pictures import twin_picture
 from tumortrack_lab.twin.states import solve
-from tumortrack_lab.twin.stock import StateCache
-from tumortrack_lab.twin.variants import (
+from tumortrack_lab.twin.views import (
     VARIANTS,
     VIEWS,
     EquilibriumState,
@@ -41,6 +43,8 @@ from tumortrack_lab.twin.variants import (
 KIND = "twin"
 _STATES = "states"
 _STATE_SHARE = 15.0  # a state takes about as long as so many scenes
+# More compression goes on from less: the same answer in fewer load steps.
+_GOES_ON_FROM = {"D2": "D1", "D3": "D2"}
 
 Build = Callable[[Anatomy, tuple[float, float, float], ApparatusConfig], Any]
 
@@ -82,6 +86,7 @@ def make_scenes(
     Raises:
         InputError: no case; an unknown variant or view; ``out`` holds something else, or scenes
             made from another case, seed or configuration.
+        ArtifactError: a kept state is damaged.
         TumortrackError: a state has no equilibrium.
         StorageError: the disk refused.
     """
@@ -91,36 +96,22 @@ def make_scenes(
     identity = _claim(run, out)
     todo = [(v, w) for v, w in wanted if not (out / f"{v}-{w}").exists()]
     states = list(dict.fromkeys(VARIANTS[v].state for v, _ in todo))
-    stock = StateCache(
-        out / _STATES,
-        case.anatomy,
-        targets.points_ct,
-        lambda: run.build(case.anatomy, case.up_lps, run.bench),
-        run.solve,
-    )
-    pace = _Pace(report, len(todo) + _STATE_SHARE * sum(not stock.has(s) for s in states))
-    for state in states:
-        fresh = not stock.has(state)
-        settled = stock.get(state, pace.say)
-        if fresh:
-            pace.add(_STATE_SHARE, f"{state}: settled")
+    cache = StateCache(out / _STATES, run, case, targets)
+    unsolved = sum(not cache.has(state) for state in states)
+    progress = _Progress(report, len(todo) + _STATE_SHARE * unsolved)
+    for name in states:
+        is_new = not cache.has(name)
+        state = cache.get(name, progress.say)
+        if is_new:
+            progress.add(_STATE_SHARE, f"{name}: settled")
         for variant, view in todo:
-            if VARIANTS[variant].state == state:
-                _write(out / f"{variant}-{view}", settled, run, targets, case.anatomy, identity)
-                pace.add(1.0, f"{variant}-{view}")
-    seal_scenes(out, identity)
-    return [out / f"{v}-{w}" for v, w in wanted]
-
-
-def seal_scenes(out: Path, identity: dict) -> None:
-    """Write the manifest over all finished scenes.
-
-    Raises:
-        StorageError: the disk refused.
-    """
+            if VARIANTS[variant].state == name:
+                _write(out / f"{variant}-{view}", state, run, targets, case.anatomy, identity)
+                progress.add(1.0, f"{variant}-{view}")
     names = [f"{variant}-{view}" for variant in VARIANTS for view in VIEWS]
     scenes = {name: store.sha256_of(out / name) for name in names if (out / name).is_dir()}
     store.seal(out, KIND, {**identity, "scenes": scenes}, frame="camera")
+    return [out / f"{v}-{w}" for v, w in wanted]
 
 
 def _known(names: Sequence[Any], allowed: Sequence[str] | dict) -> list:
@@ -162,7 +153,7 @@ def _claim(run: TwinRun, out: Path) -> dict:
 
 def _write(
     folder: Path,
-    settled: EquilibriumState,
+    state: EquilibriumState,
     run: TwinRun,
     targets: InnerPoints,
     anatomy_ct: Anatomy,
@@ -170,18 +161,88 @@ def _write(
 ) -> None:
     """One scene's folder with targets and picture, all or nothing."""
     variant, _, view = folder.name.partition("-")
-    height_mm = float(np.ptp(anatomy_ct.organ.vertices_mm @ settled.bench_from_ct[2, :3]))
-    config = for_organ(run.view, height_mm)
-    scene, targets_mm = make_scene(settled, variant, view, config, run.seed)  # type: ignore[arg-type]
+    rest = anatomy_ct.organ
+    config = for_organ(run.view, float(np.ptp(rest.vertices_mm @ state.bench_from_ct[2, :3])))
+    scene, targets_mm = make_scene(state, variant, view, config, run.seed)  # type: ignore[arg-type]
     scene = replace(scene, meta={**identity, **scene.meta}, targets=targets.at(targets_mm))
+    rest = rest.moved(transform_points(state.bench_from_ct, rest.vertices_mm))
     with store.new_folder(folder) as aside:
         write_scene_files(aside, scene)
-        rest = anatomy_ct.organ
-        rest = rest.moved(transform_points(settled.bench_from_ct, rest.vertices_mm))
-        twin_picture(scene, settled, rest, aside / "scene.png")
+        twin_picture(scene, state, rest, aside / "scene.png")
 
 
-class _Pace:
+class StateCache:
+    """The states of one case on disk, one file each, so that none is solved twice; the apparatus
+    is built when the first one is needed."""
+
+    def __init__(self, folder: Path, run: TwinRun, case: Case, targets: InnerPoints) -> None:
+        self._folder, self._run, self._case, self._targets = folder, run, case, targets
+        self._parts = dict(zip(case.anatomy.names, case.anatomy.parts, strict=True))
+
+    def has(self, name: str) -> bool:
+        """Is it solved already?"""
+        return self._path(name).exists()
+
+    def get(self, name: str, say: Callable[[str], None]) -> EquilibriumState:
+        """The state, solved and kept if it is not there yet; ``say`` gets a line per load step."""
+        if not self.has(name):
+            self._solve(name, say)
+        tensors, about = self._read(name)
+        parts = tuple(part.moved(tensors[key]) for key, part in self._parts.items())
+        targets_mm, bench_from_ct = tensors["targets"], tensors["bench_from_ct"]
+        return EquilibriumState(name, Anatomy(parts), targets_mm, bench_from_ct, about["report"])
+
+    @cached_property
+    def _bench(self) -> Any:
+        return self._run.build(self._case.anatomy, self._case.up_lps, self._run.bench)
+
+    def _solve(self, name: str, say: Callable[[str], None]) -> None:
+        from safetensors.numpy import save
+
+        if "_bench" not in self.__dict__:
+            say("bench: filling the organ with tetrahedra")
+        bench = self._bench
+        mesh = hashlib.sha256(np.ascontiguousarray(bench.mesh.nodes_mm).tobytes()).hexdigest()
+        warm = self._warm(name, mesh)
+        solved = self._run.solve(bench, name, warm, lambda line: say(f"{name}: {line}"))
+        tensors = {
+            **{key: bench.carry(solved, part.vertices_mm) for key, part in self._parts.items()},
+            "targets": bench.carry(solved, self._targets.points_ct),
+            "bench_from_ct": bench.bench_from_ct,
+            "nodes": solved.nodes_mm,
+        }
+        metadata = {"report": json.dumps(solved.report, allow_nan=False), "mesh": mesh}
+        contiguous = {key: np.ascontiguousarray(array) for key, array in tensors.items()}
+        store.write_atomically(self._path(name), save(contiguous, metadata))
+
+    def _warm(self, name: str, mesh: str) -> State | None:
+        """The kept state to go on from, where it was solved on the same tetrahedra."""
+        before = _GOES_ON_FROM.get(name)
+        if before is None or not self.has(before):
+            return None
+        tensors, about = self._read(before)
+        return State(before, tensors["nodes"], about["report"]) if about["mesh"] == mesh else None
+
+    def _read(self, name: str) -> tuple[dict[str, np.ndarray], dict]:
+        from safetensors import SafetensorError, safe_open
+
+        path = self._path(name)
+        try:
+            with safe_open(path, framework="np") as file:
+                keys = (*self._parts, "targets", "bench_from_ct", "nodes")
+                tensors = {key: file.get_tensor(key) for key in keys}
+                metadata = file.metadata() or {}
+            return tensors, {"report": json.loads(metadata["report"]), "mesh": metadata["mesh"]}
+        except (SafetensorError, KeyError, ValueError, OSError) as error:
+            raise ArtifactError(
+                f"{path} is damaged: {error}. Remove it, and the state is solved again."
+            ) from error
+
+    def _path(self, name: str) -> Path:
+        return self._folder / f"{name}.safetensors"
+
+
+class _Progress:
     """Turns pieces of work done into a share of all."""
 
     def __init__(self, report: Callable[[TwinStatus], None] | None, total: float) -> None:

@@ -10,17 +10,13 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float64
 
 from tumortrack.core.errors import TumortrackError
-from tumortrack_lab.twin.contact import Contact, ContactSurface
+from tumortrack_lab.twin.contact import Contact, Obstacles
 from tumortrack_lab.twin.solid import NeoHookeanSolid
-
-if TYPE_CHECKING:
-    from scipy.sparse import csr_matrix
 
 TOLERANCE = 1e-3  # largest unbalanced force (2-norm over nodes), share of the load
 _LEAST_LOAD_MN = 1.0  # a tenth of a gram: less is no load
@@ -30,6 +26,8 @@ _MEMORY = 10
 _LONGEST_MM, _SHORTEST_MM = 2.0, 1e-9  # step of any node
 
 Nodes = Float64[np.ndarray, "n 3"]
+Pairs = deque[tuple[np.ndarray, np.ndarray]]  # steps, and what the gradient changed by
+Solve = Callable[[np.ndarray], np.ndarray]
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,7 +65,7 @@ class EquilibriumProblem:
     """
 
     solid: NeoHookeanSolid
-    contacts: tuple[tuple[Contact, tuple[ContactSurface, ...]], ...]
+    contacts: tuple[tuple[Contact, Obstacles], ...]
     weight_mn: Float64[np.ndarray, " n"]  # along -z
     hold: Hold | None = None
 
@@ -99,9 +97,7 @@ class Convergence:
     residual: float  # unbalanced force / load
 
 
-def settle(
-    problem: EquilibriumProblem, start_mm: Nodes, rest_stiffness: csr_matrix
-) -> tuple[Nodes, Convergence]:
+def settle(problem: EquilibriumProblem, start_mm: Nodes) -> tuple[Nodes, Convergence]:
     """Nodes at rest, from a start in which no element is turned over.
 
     Raises:
@@ -109,14 +105,14 @@ def settle(
     """
     nodes, evaluations = start_mm, 0
     energy, gradient = problem.energy(nodes)
-    precondition = _factorised(problem, nodes, rest_stiffness)
-    pairs: deque[tuple[np.ndarray, np.ndarray]] = deque(maxlen=_MEMORY)
+    precondition = _factorised(problem, nodes)
+    pairs: Pairs = deque(maxlen=_MEMORY)
     for iteration in range(_ITERATIONS):
         residual = float(np.linalg.norm(gradient)) / max(problem.load_mn(nodes), _LEAST_LOAD_MN)
         if residual < TOLERANCE:
             return nodes, Convergence(iteration, evaluations, residual)
         if iteration and iteration % _REFRESH_AFTER == 0:
-            precondition = _factorised(problem, nodes, rest_stiffness)
+            precondition = _factorised(problem, nodes)
             pairs.clear()
         step = -_two_loop(gradient.ravel(), pairs, precondition).reshape(-1, 3)
         slope = float((gradient * step).sum())
@@ -139,11 +135,7 @@ def settle(
     raise TumortrackError(_stuck(_ITERATIONS, residual))
 
 
-def _two_loop(
-    gradient: np.ndarray,
-    pairs: deque[tuple[np.ndarray, np.ndarray]],
-    precondition: Callable[[np.ndarray], np.ndarray],
-) -> np.ndarray:
+def _two_loop(gradient: np.ndarray, pairs: Pairs, precondition: Solve) -> np.ndarray:
     """Inverse Hessian times gradient (Nocedal and Wright, Numerical Optimization, alg. 7.4)."""
     out = gradient.copy()
     amounts = []
@@ -156,16 +148,14 @@ def _two_loop(
     return out
 
 
-def _factorised(
-    problem: EquilibriumProblem, nodes: Nodes, rest_stiffness: csr_matrix
-) -> Callable[[np.ndarray], np.ndarray]:
+def _factorised(problem: EquilibriumProblem, nodes: Nodes) -> Solve:
     """Solves with the rest stiffness and the contacts as they are now."""
     from scipy.sparse import eye
     from scipy.sparse.linalg import splu
 
+    matrix = problem.solid.rest_stiffness
     # A little on the diagonal stands for the hold: it alone has no motion free of force.
-    ground = 1e-3 * rest_stiffness.diagonal().mean()
-    matrix = rest_stiffness
+    ground = 1e-3 * matrix.diagonal().mean()
     for contact, obstacles in problem.contacts:
         matrix = matrix + contact.stiffness(nodes, obstacles)
     factors = splu(

@@ -1,39 +1,40 @@
-"""Single sources of error, made from a clean scene of the twin: each alone, and all together.
+"""Faults of the sensor and the view, made from a clean scene of the twin.
 
-They answer what the paper could not: how much of the error is the sensor's.
+A fault such as ``noise`` is a single source of error at its usual size, or all of them together:
+how much of the error is the sensor's. A severity such as ``noise=2`` or ``visible=60`` is one kind
+of fault in degrees: how the error grows. All levels of a kind share their random draws, so that
+the same shaft reaches farther, and the same noise grows.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
 import numpy as np
 from jaxtyping import Float64
+from msgspec import structs
 from scipy.spatial.transform import Rotation
 
 from tumortrack.core.config import from_builtins
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import rigid, transform_points
 from tumortrack.core.types import Anatomy, DepthFrame
-from tumortrack.sense.cloud import cloud_from_depth
+from tumortrack.sense.cloud import CloudConfig, cloud_from_depth, thin_cloud
 from tumortrack.sense.noise import D405_NOISE, NoiseConfig, add_noise
+from tumortrack.sense.render import render_depth
 from tumortrack.simulate.scene_folder import Scene
-from tumortrack_lab.twin.props import add_background, occlude, shaft_over
-from tumortrack_lab.twin.variants import ViewConfig
+from tumortrack_lab.twin.apparatus import moved
+from tumortrack_lab.twin.occluders import add_background, hide_share, occlude, shaft_over
+from tumortrack_lab.twin.views import ViewConfig
 
 Fault = Literal[
-    "clean",
-    "noise",
-    "distortion",
-    "offset",
-    "occlusion",
-    "outliers",
-    "registration",
-    "all",
+    "clean", "noise", "distortion", "offset", "occlusion", "outliers", "registration", "all"
 ]
 FAULTS: tuple[Fault, ...] = get_args(Fault)
+Kind = Literal["noise", "visible", "outliers", "points", "offset", "distance", "tilt"]
+KINDS: tuple[Kind, ...] = get_args(Kind)  # their order is that of their random streams: append only
 
 # The axial noise and depth steps of the D405 model, and nothing else of it.
 AXIAL_NOISE = NoiseConfig(
@@ -45,7 +46,89 @@ DISTORTION_MM = 1.0  # largest slow depth error in the image
 OFFSET_MM = 2.0  # towards the camera: the thickness of the paper's soft cardboard
 REGISTRATION_MM, REGISTRATION_DEGREES = 1.0, 1.0
 
-_Change = Callable[[DepthFrame, ViewConfig, np.random.Generator], DepthFrame]
+# Lowest and highest level allowed, and the level that is the clean scene (None: no level is).
+_LIMITS: dict[str, tuple[float, float, float | None]] = {
+    "noise": (0.0, 10.0, 0.0),
+    "visible": (10.0, 100.0, 100.0),
+    "outliers": (0.0, 40.0, 0.0),
+    "points": (200.0, 5000.0, 5000.0),
+    "offset": (-20.0, 20.0, 0.0),
+    "distance": (60.0, 500.0, None),
+    "tilt": (0.0, 75.0, 0.0),
+}
+SCALED = (
+    "axial_mm", "flying_share", "hole_share", "grazing_share", "distortion_mm", "scatter_share"
+)  # fmt: skip
+MOVED = "camera_from_clean"  # in meta: the camera is another one
+
+Transform = Float64[np.ndarray, "4 4"]
+
+
+@dataclass(frozen=True)
+class Severity:
+    """A kind of fault and its level.
+
+    - noise: the sensor model's amplitudes, times the level (shares end at 1).
+    - visible: percent of the visible surface that is left; a shaft, a lump and a drape hide the
+      rest.
+    - outliers: percent of all points that are background.
+    - points: how many the cloud has.
+    - offset: mm that every depth is too small.
+    - distance: mm from the camera to the organ's nearest point, along its axis.
+    - tilt: degrees by which the camera is turned about the organ's centre, about a random axis of
+      the image plane.
+    """
+
+    kind: Kind
+    level: float
+
+    def __post_init__(self) -> None:
+        low, high, _ = _LIMITS[self.kind]
+        if not low <= self.level <= high:
+            raise InputError(f"{self.kind} is {self.level:g}; allowed: {low:g} to {high:g}.")
+
+    @property
+    def name(self) -> str:
+        """As a cell names its fault, and ``parse`` reads it."""
+        return f"{self.kind}={self.level:g}"
+
+    @property
+    def is_clean(self) -> bool:
+        """Is this level the clean scene itself?"""
+        return self.level == clean_level(self.kind)
+
+
+def clean_level(kind: str) -> float | None:
+    """The level at which a kind is the clean scene, None where there is none."""
+    return _LIMITS[kind][2]
+
+
+def parse(name: str) -> Severity | None:
+    """The severity of this name, None where it is none (``noise`` is a fault).
+
+    Raises:
+        InputError: an unknown kind, or a level that is no number or not allowed.
+    """
+    kind, equals, level = name.partition("=")
+    if not equals:
+        return None
+    if kind not in KINDS:
+        raise InputError(f"severity {kind!r} is not known; allowed: {', '.join(KINDS)}.")
+    try:
+        number = float(level)
+    except ValueError:
+        raise InputError(f"severity {name!r}: {level!r} is no number.") from None
+    return Severity(kind, number)
+
+
+def disturbed(clean: Scene, fault: str, seed: int) -> Scene:
+    """The scene with this fault, by the name of a severity or of one of ``FAULTS``.
+
+    Raises:
+        InputError: no such fault; no clean scene of the twin with its depth image.
+    """
+    severity = parse(fault)
+    return faulty(clean, fault, seed) if severity is None else severe(clean, severity, seed)
 
 
 def faulty(clean: Scene, fault: str, seed: int) -> Scene:
@@ -70,23 +153,44 @@ def faulty(clean: Scene, fault: str, seed: int) -> Scene:
     frame, config = clean_view(clean)
     if fault == "clean":
         return clean
-    for name, change in _IN_ORDER.items():
+    for name, change in _CHANGES.items():
         if fault in (name, "all"):
             frame = change(frame, config, _rng(seed, name))
     cloud = clean.cloud
     if frame is not clean.depth:
         cloud = cloud_from_depth(frame, config.crop, np.random.default_rng([seed, len(FAULTS)]))
-    reference, targets = clean.reference, clean.targets
     meta = {**clean.meta, "fault": fault, "fault_seed": seed}
     if fault in ("registration", "all"):
-        moved = registration_error(clean.reference, _rng(seed, "registration"))
-        reference = Anatomy(
-            tuple(p.moved(transform_points(moved, p.vertices_mm)) for p in reference.parts)
-        )
-        if targets:
-            targets = replace(targets, points_mm=transform_points(moved, targets.points_mm))
-        meta["registration"] = moved.tolist()
-    return Scene(cloud, reference, frame, meta, targets)
+        error = registration_error(clean.reference, _rng(seed, "registration"))
+        clean = _truth_moved(clean, error)
+        meta["registration"] = error.tolist()
+    return replace(clean, cloud=cloud, depth=frame, meta=meta)
+
+
+def severe(clean: Scene, severity: Severity, seed: int) -> Scene:
+    """The scene as it would have been with this fault so severe; ``clean`` itself where it is no
+    fault at that level.
+
+    Random numbers depend on seed and kind alone. The cloud is drawn again from the depth image by
+    the scene's own crop; a camera that moved has the surfaces rendered again and crops nothing.
+
+    Raises:
+        InputError: no clean scene of the twin; or another camera for a scene with a rod in view.
+        NoEstimate: fewer than 200 points are left.
+    """
+    frame, config = clean_view(clean)
+    if severity.is_clean:
+        return clean
+    meta = {**clean.meta, "fault": severity.name, "fault_seed": seed}
+    rng = np.random.default_rng([seed, 7000 + KINDS.index(severity.kind)])
+    draw = np.random.default_rng([seed, 7000 + len(_LIMITS) + KINDS.index(severity.kind)])
+    if severity.kind == "points":
+        return replace(clean, cloud=thin_cloud(clean.cloud, int(severity.level), draw), meta=meta)
+    if severity.kind in _MOVES:
+        camera_from_clean = _MOVES[severity.kind](clean, severity.level, rng)
+        return _seen_from(replace(clean, meta=meta), camera_from_clean, config, draw)
+    frame = _LEVELS[severity.kind](frame, severity.level, config, rng)
+    return replace(clean, cloud=cloud_from_depth(frame, config.crop, draw), depth=frame, meta=meta)
 
 
 def clean_view(clean: Scene) -> tuple[DepthFrame, ViewConfig]:
@@ -104,7 +208,7 @@ def clean_view(clean: Scene) -> tuple[DepthFrame, ViewConfig]:
     return clean.depth, config
 
 
-def registration_error(reference: Anatomy, rng: np.random.Generator) -> Float64[np.ndarray, "4 4"]:
+def registration_error(reference: Anatomy, rng: np.random.Generator) -> Transform:
     """A rigid motion by 1 mm and 1 degree about the organ's centre, both directions uniform."""
     centre = reference.organ.box_mm.mean(0)
     shift, axis = rng.standard_normal((2, 3))
@@ -114,40 +218,101 @@ def registration_error(reference: Anatomy, rng: np.random.Generator) -> Float64[
     return rigid(rotation, centre + shift - rotation @ centre)
 
 
-def _offset(frame: DepthFrame, config: ViewConfig, rng: np.random.Generator) -> DepthFrame:
-    return DepthFrame(frame.depth_mm - OFFSET_MM, frame.intrinsics, frame.stamp_ns)
+def scaled(noise: NoiseConfig, factor: float) -> NoiseConfig:
+    """The noise with every amplitude times a factor; shares end at 1, lengths and the depth unit
+    stay."""
+    amplitudes = {name: factor * getattr(noise, name) for name in SCALED}
+    limited = {k: min(v, 1.0) if k.endswith("_share") else v for k, v in amplitudes.items()}
+    return structs.replace(noise, **limited)
 
 
-def _occlusion(frame: DepthFrame, config: ViewConfig, rng: np.random.Generator) -> DepthFrame:
-    return occlude(frame, shaft_over(frame, config.shaft_radius_mm, rng))[0]
-
-
-def _outliers(frame: DepthFrame, config: ViewConfig, rng: np.random.Generator) -> DepthFrame:
-    return add_background(frame, config.clutter_share, config.far_mm, rng)[0]
+def _nearer(frame: DepthFrame, by_mm: float) -> DepthFrame:
+    return replace(frame, depth_mm=frame.depth_mm - np.float32(by_mm))
 
 
 def _distortion(frame: DepthFrame, config: ViewConfig, rng: np.random.Generator) -> DepthFrame:
     """The sensor model's slow field at its full height, in every scene."""
-    from tumortrack.sense.noise_kernels import slow_field
+    from tumortrack.sense.kernels import slow_shape
 
     shape = (frame.intrinsics.height, frame.intrinsics.width)
-    depth_mm = frame.depth_mm + slow_field(shape, DISTORTION_MM, rng)
-    return DepthFrame(depth_mm, frame.intrinsics, frame.stamp_ns)
-
-
-def _noise(frame: DepthFrame, config: ViewConfig, rng: np.random.Generator) -> DepthFrame:
-    return add_noise(frame, AXIAL_NOISE, rng)
+    field, scale = slow_shape(shape, DISTORTION_MM, rng)
+    return frame.with_depth(frame.depth_mm + field * scale)
 
 
 # First what lies before the sensor, then the sensor itself, stored steps last.
-_IN_ORDER: dict[str, _Change] = {
-    "offset": _offset,
-    "occlusion": _occlusion,
-    "outliers": _outliers,
+_CHANGES: dict[str, Callable[[DepthFrame, ViewConfig, np.random.Generator], DepthFrame]] = {
+    "offset": lambda frame, config, rng: _nearer(frame, OFFSET_MM),
+    "occlusion": lambda frame, config, rng: occlude(
+        frame, shaft_over(frame, config.shaft_radius_mm, rng)
+    )[0],
+    "outliers": lambda frame, config, rng: add_background(
+        frame, config.clutter_share, config.far_mm, rng
+    )[0],
     "distortion": _distortion,
-    "noise": _noise,
+    "noise": lambda frame, config, rng: add_noise(frame, AXIAL_NOISE, rng),
+}
+_LEVELS: dict[str, Callable[[DepthFrame, float, ViewConfig, np.random.Generator], DepthFrame]] = {
+    "noise": lambda frame, level, config, rng: add_noise(frame, scaled(config.noise, level), rng),
+    "visible": lambda frame, level, config, rng: hide_share(
+        frame, 1 - level / 100, config.shaft_radius_mm, rng
+    )[0],
+    "outliers": lambda frame, level, config, rng: add_background(
+        frame, level / 100, config.far_mm, rng
+    )[0],
+    "offset": lambda frame, level, config, rng: _nearer(frame, level),
 }
 
 
-def _rng(seed: int, fault: Fault | str) -> np.random.Generator:
+def _rng(seed: int, fault: str) -> np.random.Generator:
     return np.random.default_rng([seed, list(FAULTS).index(fault)])  # type: ignore[arg-type]
+
+
+def _distance(clean: Scene, level: float, rng: np.random.Generator) -> Transform:
+    nearest_mm = float(clean.reference.organ.vertices_mm[:, 2].min())
+    return rigid(np.eye(3), np.array([0.0, 0.0, level - nearest_mm]))
+
+
+def _tilt(clean: Scene, level: float, rng: np.random.Generator) -> Transform:
+    angle = rng.uniform(0, 2 * np.pi)
+    axis = np.array([np.cos(angle), np.sin(angle), 0.0])
+    turn = Rotation.from_rotvec(np.deg2rad(level) * axis).as_matrix()
+    centre = clean.reference.organ.box_mm.mean(0)
+    return rigid(turn, centre - turn @ centre)
+
+
+_Move = Callable[[Scene, float, np.random.Generator], Transform]
+_MOVES: dict[str, _Move] = {"distance": _distance, "tilt": _tilt}
+
+
+def _seen_from(
+    clean: Scene,
+    camera_from_clean: Transform,
+    config: ViewConfig,
+    draw: np.random.Generator,
+) -> Scene:
+    """The same state of the organ before another camera of the same make."""
+    if "poke" in clean.meta.get("state", {}):
+        raise InputError(
+            "a scene with a rod in view cannot be seen from elsewhere; choose another state."
+        )
+    if clean.depth is None:
+        raise InputError("the scene has no depth image.")
+    turned = _truth_moved(clean, camera_from_clean)
+    organ = turned.reference.organ
+    frame = render_depth(
+        organ.vertices_mm, organ.faces, clean.depth.intrinsics, clean.depth.stamp_ns
+    )
+    crop = CloudConfig(near_mm=1.0, far_mm=1e4, n_points=config.n_points)
+    meta = {**clean.meta, MOVED: camera_from_clean.tolist()}
+    for name in ("camera_from_ct", "camera_from_bench"):
+        if name in meta:
+            meta[name] = (camera_from_clean @ np.array(meta[name])).tolist()
+    return replace(turned, cloud=cloud_from_depth(frame, crop, draw), depth=frame, meta=meta)
+
+
+def _truth_moved(scene: Scene, b_from_a: Transform) -> Scene:
+    """The scene with its surfaces and targets moved, and nothing else."""
+    targets = scene.targets
+    if targets:
+        targets = replace(targets, points_mm=transform_points(b_from_a, targets.points_mm))
+    return replace(scene, reference=moved(scene.reference, b_from_a), targets=targets)

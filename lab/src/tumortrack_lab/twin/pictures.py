@@ -7,16 +7,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tumortrack.core.types import Mesh
-from tumortrack.report.drawing import (
-    KIDNEY,
-    OBSERVED,
-    TRUE,
-    blank,
-    new_figure,
-    save,
-    scale_bar,
-)
+from tumortrack.core.types import Anatomy, Mesh
+from tumortrack.report.drawing import KIDNEY, OBSERVED, TRUE, blank, new_figure, save, scale_bar
+from tumortrack.report.pictures import FROM_CAMERA
 from tumortrack.report.shade import (
     Frame,
     ShadedLayer,
@@ -29,12 +22,12 @@ from tumortrack.report.shade import (
 )
 from tumortrack.sense.camera import project
 from tumortrack.simulate.scene_folder import Scene
-from tumortrack_lab.twin.variants import EquilibriumState
+from tumortrack_lab.twin.states import COMPRESSION_MM
+from tumortrack_lab.twin.views import EquilibriumState
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-FROM_CAMERA = ShadedView("seen from the camera", (1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
 FROM_FRONT = ShadedView("bench from the front", (1.0, 0.0, 0.0), (0.0, 0.0, -1.0))
 FROM_END = ShadedView("bench from its end", (0.0, 1.0, 0.0), (0.0, 0.0, -1.0))
 _STEEL = (0.62, 0.65, 0.7)
@@ -44,12 +37,12 @@ _ROD_SHOWN_MM = 45.0
 _PLATE_SHOWN_MM = 9.0
 
 
-def twin_picture(scene: Scene, settled: EquilibriumState, rest_organ: Mesh, path: Path) -> None:
+def twin_picture(scene: Scene, state: EquilibriumState, rest_organ: Mesh, path: Path) -> None:
     """Depth image, cloud over truth, and two side views of the bench.
 
     Args:
         scene: with its depth image, camera frame.
-        settled: the state on the bench, bench frame.
+        state: the state on the bench, bench frame.
         rest_organ: the undeformed organ on the bench, for its outline.
         path: PNG to write, atomically.
     """
@@ -60,13 +53,13 @@ def twin_picture(scene: Scene, settled: EquilibriumState, rest_organ: Mesh, path
     _cloud_view(figure.add_subplot(grid[0, 1]), scene)
     for column, view in enumerate((FROM_FRONT, FROM_END)):
         axes = figure.add_subplot(grid[1, column])
-        _bench_view(axes, settled, rest_organ, view)
-        _apparatus(axes, {**scene.meta["bench_config"], **settled.report}, view)
+        _bench_view(axes, state, rest_organ, view)
+        _apparatus(axes, {**scene.meta["bench_config"], **state.report}, view)
     figure.suptitle(
-        f"{scene.meta['variant']}, {scene.meta['view']}: {_what(scene)}",
+        f"{scene.meta['variant']}, {scene.meta['view']}: {_TEXT[scene.meta['variant']]}",
         x=0.02, y=0.985, ha="left", fontsize=13, fontweight="bold",
     )  # fmt: skip
-    figure.text(0.02, 0.945, _numbers(scene, settled), ha="left", va="top", fontsize=10)
+    figure.text(0.02, 0.945, _numbers(scene, state), ha="left", va="top", fontsize=10)
     figure.legend(
         handles=_legend(),
         loc="upper right",
@@ -112,7 +105,7 @@ def _depth_view(axes: Axes, scene: Scene) -> None:
 def _cloud_view(axes: Axes, scene: Scene) -> None:
     points_mm = scene.cloud.points_mm.astype(float)
     frame = widened(frame_around(FROM_CAMERA, scene.reference.organ.vertices_mm, _AROUND_MM), 1.6)
-    _paint(axes, list(scene.reference.tumors), scene.reference.organ, FROM_CAMERA, frame)
+    _paint(axes, scene.reference, FROM_CAMERA, frame)
     flat = FROM_CAMERA.project(points_mm)
     axes.scatter(flat[:, 0], flat[:, 1], s=2.0, color=OBSERVED, alpha=0.5, linewidths=0, zorder=3)
     blank(axes, frame)
@@ -120,12 +113,12 @@ def _cloud_view(axes: Axes, scene: Scene) -> None:
     axes.set_title(f"{FROM_CAMERA.name}: {len(points_mm)} points over the truth", fontsize=11)
 
 
-def _bench_view(axes: Axes, settled: EquilibriumState, rest_organ: Mesh, view: ShadedView) -> None:
-    anatomy = settled.anatomy
+def _bench_view(axes: Axes, state: EquilibriumState, rest_organ: Mesh, view: ShadedView) -> None:
+    anatomy = state.anatomy
     everything = np.concatenate([anatomy.organ.vertices_mm, rest_organ.vertices_mm])
     everything = np.concatenate([everything, everything.mean(0)[None] * [1, 1, 0] + [0, 0, -12.0]])
     frame = widened(frame_around(view, everything, 8.0), 1.75)
-    _paint(axes, list(anatomy.tumors), anatomy.organ, view, frame)
+    _paint(axes, anatomy, view, frame)
     x, y = np.meshgrid(*pixel_centres(frame))
     mask = silhouette(rest_organ, view, frame)
     axes.contour(x, y, mask, levels=[0.5], colors=[_REST], linewidths=1.3, linestyles=["dashed"])
@@ -136,8 +129,9 @@ def _bench_view(axes: Axes, settled: EquilibriumState, rest_organ: Mesh, view: S
     axes.set_title(view.name, fontsize=11)
 
 
-def _paint(axes: Axes, tumors: list[Mesh], organ: Mesh, view: ShadedView, frame: Frame) -> None:
-    layers = [*(ShadedLayer(tumor, TRUE) for tumor in tumors), ShadedLayer(organ, KIDNEY, 0.4)]
+def _paint(axes: Axes, anatomy: Anatomy, view: ShadedView, frame: Frame) -> None:
+    layers = [ShadedLayer(tumor, TRUE) for tumor in anatomy.tumors]
+    layers.append(ShadedLayer(anatomy.organ, KIDNEY, 0.4))
     axes.imshow(shade(layers, view, frame), extent=frame.extent, zorder=2, interpolation="bilinear")
 
 
@@ -173,36 +167,26 @@ def _apparatus(axes: Axes, report: dict, view: ShadedView) -> None:
 
 _TEXT = {
     "D0": "undeformed",
-    "D1": "midsection compressed by 4 mm",
-    "D2": "midsection compressed by 8 mm",
-    "D3": "midsection compressed by 12 mm",
+    **{name: f"midsection compressed by {mm:g} mm" for name, mm in COMPRESSION_MM.items()},
+    **{f"Rot{n}": f"undeformed, turned by {n} degrees" for n in (90, 180, 270)},
     "G1": "sunk after an incision",
     "P1": "poked by a rod",
 }
 
 
-def _what(scene: Scene) -> str:
-    variant = scene.meta["variant"]
-    if variant.startswith("Rot"):
-        return f"undeformed, turned by {variant[3:]} degrees"
-    return _TEXT[variant]
-
-
-def _numbers(scene: Scene, settled: EquilibriumState) -> str:
+def _numbers(scene: Scene, state: EquilibriumState) -> str:
     """What was measured of this scene, in one line."""
-    said = []
-    if (change := settled.report.get("volume_change")) is not None:
-        said.append(f"volume {100 * change:+.2f} %")
-    if (largest := settled.report.get("largest_displacement_mm")) is not None:
-        said.append(f"largest displacement {largest:.1f} mm")
-    for key, text in (
-        ("rod_covers_share", "rod hides {:.1%} of what is visible"),
-        ("shaft_covers_share", "shaft hides {:.1%} of what is visible"),
-        ("background_share", "{:.1%} background points"),
-    ):
-        if key in scene.meta["seen"]:
-            said.append(text.format(scene.meta["seen"][key]))
-    return "   ".join(said)
+    measured = {**state.report, **scene.meta["seen"]}
+    if (change := measured.get("volume_change")) is not None:
+        measured["volume_change"] = 100 * change
+    texts = {
+        "volume_change": "volume {:+.2f} %",
+        "largest_displacement_mm": "largest displacement {:.1f} mm",
+        "rod_covers_share": "rod hides {:.1%} of what is visible",
+        "shaft_covers_share": "shaft hides {:.1%} of what is visible",
+        "background_share": "{:.1%} background points",
+    }
+    return "   ".join(text.format(measured[key]) for key, text in texts.items() if key in measured)
 
 
 def _legend() -> list:

@@ -13,11 +13,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numba
 import numpy as np
-from jaxtyping import Float, Float64
+from jaxtyping import Float, Float64, Int32
 
 from tumortrack_lab.tets import TetMesh
 
@@ -25,6 +25,20 @@ if TYPE_CHECKING:
     from scipy.sparse import csr_matrix
 
 PER_TET = 0.05  # share of the bulk modulus that is kept per tetrahedron
+
+Nodes = Float64[np.ndarray, "n 3"]
+
+
+class _RestElements(NamedTuple):
+    """What the energy needs of the unloaded mesh. ``inner``: rows say how the corners 1, 2, 3 move
+    the field's gradient (1/mm); corner 0 balances them."""
+
+    tets: Int32[np.ndarray, "t 4"]
+    inner: Float64[np.ndarray, "t 3 3"]
+    volumes_mm3: Float64[np.ndarray, " t"]
+    node_volumes_mm3: Float64[np.ndarray, " n"]
+    shear_kpa: Float64[np.ndarray, " t"]
+    bulk_kpa: Float64[np.ndarray, " n"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,37 +67,34 @@ class NeoHookeanSolid:
         return held / self.node_volumes_mm3
 
     @cached_property
-    def _gradients(self) -> Float64[np.ndarray, "t 3 3"]:
-        """Rows: how the corners 1, 2, 3 move the field's gradient (1/mm); corner 0 balances."""
+    def _rest(self) -> _RestElements:
         corners = self.mesh.nodes_mm[self.mesh.tets]
         edges = (corners[:, 1:] - corners[:, :1]).transpose(0, 2, 1)
-        return np.ascontiguousarray(np.linalg.inv(edges))
+        return _RestElements(
+            tets=self.mesh.tets,
+            inner=np.ascontiguousarray(np.linalg.inv(edges)),
+            volumes_mm3=self.mesh.volumes_mm3,
+            node_volumes_mm3=self.node_volumes_mm3,
+            shear_kpa=np.asarray(self.shear_kpa, np.float64),
+            bulk_kpa=self.bulk_kpa,
+        )
 
-    def energy(
-        self, nodes_mm: Float64[np.ndarray, "n 3"]
-    ) -> tuple[float, Float64[np.ndarray, "n 3"]]:
+    def energy(self, nodes_mm: Nodes) -> tuple[float, Nodes]:
         """Elastic energy (uJ) and its gradient (mN); infinite where an element has turned over."""
         gradient = np.zeros_like(nodes_mm)
-        energy = _neo_hookean(
-            nodes_mm,
-            self.mesh.tets,
-            self._gradients,
-            (self.mesh.volumes_mm3, self.node_volumes_mm3),
-            (np.asarray(self.shear_kpa, np.float64), self.bulk_kpa),
-            gradient,
-        )
-        return energy, gradient
+        return _neo_hookean(nodes_mm, self._rest, gradient), gradient
 
-    def stretch(self, nodes_mm: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, " t"]:
+    def stretch(self, nodes_mm: Nodes) -> Float64[np.ndarray, " t"]:
         """J of each tetrahedron: present over rest volume."""
         return TetMesh(nodes_mm, self.mesh.tets).volumes_mm3 / self.mesh.volumes_mm3
 
+    @cached_property
     def rest_stiffness(self) -> csr_matrix:
         """The energy's Hessian at rest, (3 n, 3 n), mN/mm, unknowns node by node."""
         from scipy.sparse import csr_matrix, diags
 
         tets, volumes = self.mesh.tets, self.mesh.volumes_mm3
-        inner = self._gradients
+        inner = self._rest.inner
         shape = np.concatenate([-inner.sum(1, keepdims=True), inner], axis=1)  # (t, 4, 3)
         mu = self.shear_kpa * volumes
         bulk = PER_TET * self.bulk_kpa[tets].mean(1) * volumes
@@ -126,9 +137,9 @@ def _deformation(nodes, tet, inner, out):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True)
-def _neo_hookean(nodes, tets, inner, volumes, moduli, gradient):  # type: ignore[no-untyped-def]
-    volume, node_volume = volumes
-    shear, bulk = moduli
+def _neo_hookean(nodes, rest, gradient):  # type: ignore[no-untyped-def]
+    """The energy; fills its gradient."""
+    tets, inner, volume, node_volume, shear, bulk = rest
     F, P = np.empty((3, 3)), np.empty((3, 3))
     pressure = np.zeros(len(nodes))  # first the present volume of each node
     for t in range(len(tets)):

@@ -1,4 +1,4 @@
-"""What is done to the organ on the bench: one function per kind of experiment.
+"""The experiments on the organ: one function per kind.
 
 After the paper's section Experiments, and Altamar et al. 2011 (doi 10.1117/12.877992) for G1.
 D0: as in the CT, taken free of stress. D1, D2, D3: the midsection pressed to 4, 8, 12 mm less
@@ -17,8 +17,8 @@ import numpy as np
 from jaxtyping import Float64
 
 from tumortrack.core.errors import InputError, TumortrackError
-from tumortrack_lab.twin.bench import Apparatus, State
-from tumortrack_lab.twin.contact import ContactPlate, ContactSurface, Indenter, Support
+from tumortrack_lab.twin.apparatus import Apparatus, State, triangles
+from tumortrack_lab.twin.contact import ContactPlate, Obstacles, Rod, Support
 from tumortrack_lab.twin.equilibrium import Convergence
 
 STATES = ("D0", "D1", "D2", "D3", "G1", "P1")
@@ -49,9 +49,9 @@ def solve(
     if name not in STATES:
         raise InputError(f"state {name!r} is not known; allowed: {', '.join(STATES)}.")
     start = time.perf_counter()
-    run = _Run(bench, progress or (lambda line: None))
     if name == "D0":
         return State(name, bench.mesh.nodes_mm, {"state": name, "volume_change": 0.0})
+    run = _Run(bench, progress or (lambda line: None))
     if name == "G1":
         nodes, about = _sink(run)
     elif name == "P1":
@@ -85,13 +85,17 @@ class _Run:
         self.log: list[Convergence] = []
         self._progress = progress
 
-    def step(
-        self, nodes: Nodes, obstacles: tuple[ContactSurface, ...], text: str, weight: float = 0.0
-    ) -> Nodes:
+    def step(self, nodes: Nodes, obstacles: Obstacles, text: str, weight: float = 0.0) -> Nodes:
         nodes, convergence = self.bench.settle(nodes, obstacles, weight)
         self.log.append(convergence)
         self._progress(f"{text}: {convergence.iterations} iterations")
         return nodes
+
+
+def _increments(start_mm: float, end_mm: float, step_mm: float) -> list[float]:
+    """From start (exclusive) to end in equal steps of about that length."""
+    count = max(1, round((end_mm - start_mm) / step_mm))
+    return np.linspace(start_mm, end_mm, count + 1)[1:].tolist()
 
 
 def _compress(run: _Run, by_mm: float, warm: State | None) -> tuple[Nodes, dict]:
@@ -101,8 +105,7 @@ def _compress(run: _Run, by_mm: float, warm: State | None) -> tuple[Nodes, dict]
         nodes, done_mm = warm.nodes_mm, COMPRESSION_MM[warm.name]
     low, high = bench.midsection(bench.mesh.nodes_mm)
     half = (config.plate_mm / 2, 200.0, 10.0)  # wider than any organ
-    steps = max(1, round((by_mm - done_mm) / config.load_step_mm))
-    for amount in np.linspace(done_mm, by_mm, steps + 1)[1:].tolist():
+    for amount in _increments(done_mm, by_mm, config.load_step_mm):
         above = ContactPlate((0.0, 0.0, high - amount + half[2]), half, config.rounding_mm)
         nodes = run.step(nodes, (above,), f"plate lowered by {amount:.1f} mm")
     now_low, now_high = bench.midsection(nodes)
@@ -125,8 +128,7 @@ def _sink(run: _Run) -> tuple[Nodes, dict]:
     nodes, added, sunk = bench.mesh.nodes_mm, 4.0, 0.0
     less, more = (0.0, 0.0), (np.inf, np.inf)  # weights added, and how far it sank
     for _ in range(_SINK_STEPS):
-        text = f"softer by {1 + added:.1f}, sunk {sunk:.1f} mm before"
-        nodes = run.step(nodes, (), text, added)
+        nodes = run.step(nodes, (), f"softer by {1 + added:.1f}, sunk {sunk:.1f} mm before", added)
         sunk = height - bench.midsection(nodes)[1]
         if abs(sunk - wanted) < _SINK_TOLERANCE_MM:
             return nodes, {
@@ -151,9 +153,8 @@ def _poke(run: _Run) -> tuple[Nodes, dict]:
     radius = config.poke_diameter_mm / 2
     x, y, z = poke_point(bench).tolist()
     nodes = bench.mesh.nodes_mm
-    steps = max(1, round(2 * config.poke_mm / config.load_step_mm))
-    for depth in np.linspace(0, config.poke_mm, steps + 1)[1:].tolist():
-        rod = Indenter((x, y, z - depth), (0.0, 0.0, 1.0), radius)
+    for depth in _increments(0.0, config.poke_mm, config.load_step_mm / 2):
+        rod = Rod((x, y, z - depth), (0.0, 0.0, 1.0), radius)
         nodes = run.step(nodes, (rod,), f"rod pressed in by {depth:.1f} mm")
     load_n = -float(bench.contact.load_mn(nodes, rod)[2]) / 1000
     if load_n <= 0:
@@ -169,11 +170,8 @@ def poke_point(bench: Apparatus) -> Float64[np.ndarray, " 3"]:
     """Where the surface faces up and is farthest from every tumor and from the organ's rim."""
     from scipy.spatial import cKDTree
 
-    organ = bench.anatomy.organ
-    a, b, c = (organ.vertices_mm[organ.faces[:, i]] for i in range(3))
-    normal = np.cross(b - a, c - a)
+    middle, normal = triangles(bench.anatomy.organ)
     facing = normal[:, 2] / np.maximum(np.linalg.norm(normal, axis=1), 1e-12)
-    middle = (a + b + c) / 3
     top = (facing > min(0.85, float(facing.max()))) & (middle[:, 2] > middle[:, 2].mean())
     room = cKDTree(middle[facing < 0.5]).query(middle[top])[0]
     for tumor in bench.anatomy.tumors:

@@ -110,7 +110,7 @@ class FrameFolders:
 def _write_seen(folder: Path, seen: Observation) -> None:
     frame = seen.content
     if not isinstance(frame, DepthFrame):
-        (folder / CLOUD).write_bytes(cloud_ply(frame.points_mm))
+        (folder / CLOUD).write_bytes(cloud_ply(frame.points_mm, {}))
         return
     steps = np.rint(frame.depth_mm / DEPTH_UNIT_MM)
     held = np.where((steps >= 1) & (steps <= 65535), frame.depth_mm, np.nan)
@@ -128,7 +128,8 @@ def _write_seen(folder: Path, seen: Observation) -> None:
 def _write_estimate(folder: Path, estimate: Estimate) -> None:
     folder.mkdir()
     cloud = estimate.cloud
-    points = cloud_ply(cloud.points_mm, label=cloud.labels, probability=cloud.probability)
+    properties = {"label": cloud.labels, "probability": cloud.probability}
+    points = cloud_ply(cloud.points_mm, properties)
     (folder / "occupancy.ply").write_bytes(points)
     for name, mesh in estimate.meshes.items():
         write_mesh(folder / f"{name}.ply", mesh)

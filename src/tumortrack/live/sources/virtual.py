@@ -11,7 +11,7 @@ from tumortrack.core.errors import InputError
 from tumortrack.live.values import Observation, SourceConfig, SourceLost
 
 if TYPE_CHECKING:
-    from tumortrack.simulate.player.player import ScenePlayer
+    from tumortrack.simulate.player import ScenePlayer
 
 
 class VirtualSourceConfig(SourceConfig, frozen=True, kw_only=True, tag="virtual"):
@@ -57,7 +57,7 @@ class VirtualSourceConfig(SourceConfig, frozen=True, kw_only=True, tag="virtual"
         """
         from tumortrack.imaging.case import load_case
         from tumortrack.sense.noise import CLEAN, D405_NOISE
-        from tumortrack.simulate.player.player import ScenePlayer, ScenePlayerConfig
+        from tumortrack.simulate.player import ScenePlayer, ScenePlayerConfig
 
         normal = ScenePlayerConfig()
         config = ScenePlayerConfig(

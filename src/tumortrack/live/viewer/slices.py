@@ -11,8 +11,8 @@ from jaxtyping import Float, Float32, Float64, UInt8
 
 from tumortrack.core.colours import Colour
 from tumortrack.core.errors import InputError
+from tumortrack.core.estimate import Motion
 from tumortrack.core.geometry import spacing_mm, transform_points
-from tumortrack.core.motion import Motion
 from tumortrack.core.types import Mesh
 from tumortrack.imaging.case import Case, load_case
 from tumortrack.live.values import SinkContext, TrackingResult

@@ -1,28 +1,33 @@
-"""What arms, tools and surroundings are made of: simple solids on links.
+"""Arms, tools and surroundings as simple solids on links, and as surfaces for display.
 
-One list serves all: collisions (the plain solids that enclose), URDF and pictures. Link frames
-are those of the URDF: z along the link's own joint, before its Denavit-Hartenberg transform.
-Sizes are ours, rounded up from the maker's drawings; lateral offsets likewise.
+One list serves collision checking (plain solids that enclose), URDF and display. Link frames are
+those of the URDF: z along the link's own joint, before its Denavit-Hartenberg transform. Sizes and
+lateral offsets are ours, rounded up from the maker's drawings.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
-from jaxtyping import Float64
 
-from tumortrack.core.geometry import rigid, rotation_onto
+from tumortrack.core.colours import Colour
+from tumortrack.core.geometry import rigid, rotation_onto, transform_points
+from tumortrack.core.types import Mesh
 from tumortrack.plan.arms.config import CellConfig
-from tumortrack.plan.arms.dh import ArmModel
-from tumortrack.plan.motions import CUTTER, HOLDER
+from tumortrack.plan.arms.kinematics import ArmModel, Pose
+from tumortrack.plan.motions import ARMS, CUTTER, HOLDER
+
+Use = Literal["both", "collision", "picture"]
+_Ends = tuple[tuple[float, float, float], tuple[float, float, float]]
 
 GREY, DARK, BLUE = (206, 210, 214), (92, 98, 106), (104, 160, 196)
 STEEL, YELLOW, CUP = (176, 182, 190), (222, 190, 80), (70, 76, 92)
 WOOD, POST = (226, 229, 232), (150, 158, 166)
 
 PENCIL_RADIUS_MM, ELECTRODE_RADIUS_MM = 6.5, 1.2
+_BEAD_MM, _SIDES = 1.5, 28  # of display surfaces
 
 LINKS = ("base", "shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3")
 TABLE, STAND, CAMERA, PEDESTAL = "table", "stand", "camera", "pedestal"
@@ -35,18 +40,18 @@ class Part:
     Attributes:
         name: within its link's arm: ``forearm``, ``electrode``.
         link: the URDF's link.
-        kind, size_mm: box (x, y, z) or cylinder (radius, length), its axis along z.
+        kind, size_mm: box (x, y, z), cylinder (radius, length; its axis along z), ball (radius).
         link_from_part: mm.
         use: what it is for: collisions, pictures, or both.
     """
 
     name: str
     link: str
-    kind: Literal["box", "cylinder"]
+    kind: Literal["box", "cylinder", "ball"]
     size_mm: tuple[float, ...]
-    link_from_part: Float64[np.ndarray, "4 4"]
-    colour: tuple[int, int, int]
-    use: Literal["both", "collision", "picture"] = "both"
+    link_from_part: Pose
+    colour: Colour
+    use: Use = "both"
 
     @property
     def whose(self) -> str:
@@ -54,10 +59,8 @@ class Part:
         return self.name if self.link == TABLE else f"{self.link.split('_')[0]}/{self.name}"
 
 
-@dataclass(frozen=True)
-class _Girth:
-    """Radii and lateral offsets of one type of arm, mm: offsets of upper arm and forearm along
-    their joints' axes."""
+class _Girth(NamedTuple):
+    """Radii of one type of arm, and its links' offsets along their joints' axes, mm."""
 
     base: float
     joint: float
@@ -75,12 +78,7 @@ _GIRTHS = {
 
 
 def _rod(
-    name: str,
-    link: str,
-    ends_mm: tuple[tuple[float, float, float], tuple[float, float, float]],
-    radius_mm: float,
-    colour: tuple[int, int, int],
-    use: Literal["both", "collision", "picture"] = "both",
+    name: str, link: str, ends_mm: _Ends, radius_mm: float, colour: Colour, use: Use = "both"
 ) -> Part:
     """A cylinder between two points of its link."""
     start, end = np.array(ends_mm, float)
@@ -91,12 +89,14 @@ def _rod(
 
 
 def arm_parts(arm: str, model: ArmModel) -> tuple[Part, ...]:
-    """The seven links of an arm: one enclosing cylinder each, and finer ones for the eye."""
+    """The seven links of an arm: one enclosing cylinder each, and finer ones for display."""
     g, (_, a2, a3, *_) = _GIRTHS[model.name], model.a_mm
     d1, _, _, d4, d5, d6 = model.d_mm
     up, low, r, w = g.upper_offset, g.forearm_offset, g.joint, g.wrist
-    solid, look = "collision", "picture"
-    rows = [
+    cap = up + 0.9 * r
+    solid: Use = "collision"
+    look: Use = "picture"
+    rows: list[tuple[str, str, _Ends, float, Colour, Use]] = [
         ("base", "base", ((0, 0, 0), (0, 0, d1 - r)), g.base, DARK, "both"),
         ("shoulder", "shoulder", ((0, r, d1), (0, r - up, d1)), r, GREY, solid),
         ("shoulder", "shoulder", ((0, 0, d1 - r), (0, 0, d1 + 0.8 * r)), r, GREY, look),
@@ -107,14 +107,7 @@ def arm_parts(arm: str, model: ArmModel) -> tuple[Part, ...]:
         ("upper_arm_joint", "upper_arm", ((0, 0, up - r), (0, 0, up + 0.8 * r)), r, GREY, look),
         ("upper_arm_cap", "upper_arm", ((0, 0, up + 0.8 * r), (0, 0, up + r)), 0.9 * r, BLUE, look),
         ("elbow", "upper_arm", ((a2, 0, up - r), (a2, 0, up + 0.7 * r)), 0.9 * r, GREY, look),
-        (
-            "elbow_cap",
-            "upper_arm",
-            ((a2, 0, up + 0.7 * r), (a2, 0, up + 0.9 * r)),
-            0.8 * r,
-            BLUE,
-            look,
-        ),
+        ("elbow_cap", "upper_arm", ((a2, 0, up + 0.7 * r), (a2, 0, cap)), 0.8 * r, BLUE, look),
         ("forearm", "forearm", ((w, 0, low), (a3 - w, 0, low)), g.forearm, GREY, solid),
         ("forearm", "forearm", ((0, 0, low), (a3, 0, low)), 0.85 * g.forearm, GREY, look),
         ("forearm_joint", "forearm", ((0, 0, up - r), (0, 0, low - 0.8 * w)), 0.85 * r, GREY, look),
@@ -128,65 +121,78 @@ def arm_parts(arm: str, model: ArmModel) -> tuple[Part, ...]:
         ("wrist_3", "wrist_3", ((0, 0, 0.3 * w), (0, 0, d6)), 0.9 * w, DARK, "both"),
     ]
     return tuple(
-        _rod(name, f"{arm}_{link}_link", ends, radius, colour, use)  # type: ignore[arg-type]
+        _rod(name, f"{arm}_{link}_link", ends, radius, colour, use)
         for name, link, ends, radius, colour, use in rows
     )
 
 
 def tool_parts(config: CellConfig) -> tuple[Part, ...]:
     """Instrument and grasper, on their arms' flanges (z out of the flange)."""
-    c, link = config, f"{CUTTER}_tool"
-    ahead, down = c.pencil_mm, c.bracket_mm
-    cutter = (
-        _rod("bracket", link, ((0, 0, 0), (0, 0, down)), 10.0, STEEL),
-        _rod("pencil", link, ((-10, 0, down), (ahead, 0, down)), PENCIL_RADIUS_MM, BLUE),
-        _rod(
-            "electrode",
-            link,
-            ((ahead, 0, down), (ahead + c.electrode_mm, 0, down)),
-            ELECTRODE_RADIUS_MM,
-            YELLOW,
-        ),
+    hand, ahead, down = f"{CUTTER}_tool", config.pencil_mm, config.bracket_mm
+    end = ahead + config.electrode_mm
+    grasper, shaft, cup = f"{HOLDER}_tool", config.rod_mm - config.cup_mm, config.cup_radius_mm
+    wire = ELECTRODE_RADIUS_MM
+    return (
+        _rod("bracket", hand, ((0, 0, 0), (0, 0, down)), 10.0, STEEL),
+        _rod("pencil", hand, ((-10, 0, down), (ahead, 0, down)), PENCIL_RADIUS_MM, BLUE),
+        _rod("electrode", hand, ((ahead, 0, down), (end, 0, down)), wire, YELLOW),
+        _rod("rod", grasper, ((0, 0, 0), (0, 0, shaft)), 6.0, STEEL),
+        _rod("cup", grasper, ((0, 0, shaft), (0, 0, config.rod_mm)), cup, CUP),
     )
-    link, shaft = f"{HOLDER}_tool", c.rod_mm - c.cup_mm
-    holder = (
-        _rod("rod", link, ((0, 0, 0), (0, 0, shaft)), 6.0, STEEL),
-        _rod("cup", link, ((0, 0, shaft), (0, 0, c.rod_mm)), c.cup_radius_mm, CUP),
-    )
-    return cutter + holder
 
 
 def surroundings(config: CellConfig) -> tuple[Part, ...]:
-    """Table, the organ's post, the arms' pedestals and a camera in the way, in the table frame."""
-    width, depth = config.table_mm
-    middle = np.array(config.middle_mm)
+    """Table, the organ's post, pedestals of arms above the table, and a camera that is an obstacle,
+    in the table frame."""
+    middle, (x, y, top) = np.array(config.middle_mm), config.middle_mm
     slab = rigid(np.eye(3), middle - [0.0, 0.0, 20.0])
-    table = Part(TABLE, TABLE, "box", (width, depth, 40.0), slab, WOOD)
     # The post ends a little below the organ, which must not count as touched by its own support.
-    x, y, z = config.middle_mm
-    ends = ((x, y, z), (x, y, z + config.stand_mm - 3))
-    post = _rod(STAND, TABLE, ends, config.stand_radius_mm, POST)
-    parts = [table, post, *_pedestals(config)]
+    post = ((x, y, top), (x, y, top + config.stand_mm - 3))
+    parts = [
+        Part(TABLE, TABLE, "box", (*config.table_mm, 40.0), slab, WOOD),
+        _rod(STAND, TABLE, post, config.stand_radius_mm, POST),
+    ]
+    for arm in ARMS:
+        x, y, z = config.base(arm).position_mm
+        if z > top:
+            radius = 1.15 * _GIRTHS[config.model(arm).name].base
+            parts.append(_rod(f"{arm}/{PEDESTAL}", TABLE, ((x, y, top), (x, y, z)), radius, POST))
     if config.camera_is_obstacle:
         place = rigid(np.eye(3), middle + config.camera_mm)
         parts.append(Part(CAMERA, TABLE, "box", (42.0, 23.0, 42.0), place, DARK))
     return tuple(parts)
 
 
-def _pedestals(config: CellConfig) -> list[Part]:
-    """What bases above the table stand on."""
-    pedestals = []
-    for arm in (CUTTER, HOLDER):
-        x, y, z = config.base(arm).position_mm
-        top = config.middle_mm[2]
-        if z > top:
-            radius = 1.15 * _GIRTHS[config.model(arm).name].base
-            ends = ((x, y, top), (x, y, z))
-            pedestals.append(_rod(f"{arm}/{PEDESTAL}", TABLE, ends, radius, POST))
-    return pedestals
-
-
 def cell_parts(config: CellConfig) -> tuple[Part, ...]:
-    """Everything that the cell is made of."""
-    arms = (part for arm in (CUTTER, HOLDER) for part in arm_parts(arm, config.model(arm)))
+    """Everything that the workcell is made of."""
+    arms = (part for arm in ARMS for part in arm_parts(arm, config.model(arm)))
     return (*surroundings(config), *arms, *tool_parts(config))
+
+
+def display_surfaces(config: CellConfig) -> list[tuple[Part, Mesh]]:
+    """The visible parts, each with its surface in its link's frame, and a bead at each tip."""
+    import trimesh
+
+    ball = trimesh.creation.icosphere(1, _BEAD_MM)
+    bead = Mesh(np.array(ball.vertices), ball.faces)
+    parts = [part for part in cell_parts(config) if part.use != "collision"]
+    tips = [Part("tip", f"{arm}_tip", "ball", (_BEAD_MM,), np.eye(4), YELLOW) for arm in ARMS]
+    return [*((part, _surface(part)) for part in parts), *((tip, bead) for tip in tips)]
+
+
+def _surface(part: Part) -> Mesh:
+    """A box, or a cylinder with its rims rounded off."""
+    import trimesh
+
+    if part.kind == "box":
+        solid = trimesh.creation.box(part.size_mm)
+    else:
+        radius, length = part.size_mm
+        round_mm = min(0.25 * radius, 0.25 * length, 12.0)
+        angle = np.linspace(0, np.pi / 2, 5)
+        sin, cos = round_mm * np.sin(angle), round_mm * np.cos(angle)
+        lower = np.stack([radius - round_mm + sin, round_mm - cos - length / 2], 1)
+        upper = np.stack([radius - round_mm + cos, length / 2 - round_mm + sin], 1)
+        outline = np.concatenate([[[0.0, -length / 2]], lower, upper, [[0.0, length / 2]]])
+        solid = trimesh.creation.revolve(outline, sections=_SIDES)
+    return Mesh(transform_points(part.link_from_part, np.array(solid.vertices)), solid.faces)

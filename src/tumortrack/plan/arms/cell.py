@@ -1,30 +1,31 @@
-"""The cell, built once: where the tips are, what collides with what, how near things are."""
+"""The workcell for kinematics and collision checking, and the group of its joints that moves."""
 
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator
+from dataclasses import dataclass
 from functools import cached_property
 from itertools import product
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import coal
 import numpy as np
+import pinocchio as pin
 from jaxtyping import Float64
 
+from tumortrack.core.errors import NoPlan
 from tumortrack.core.types import Mesh
-from tumortrack.plan.arms.body import CAMERA, LINKS, PEDESTAL, STAND, TABLE, Part, cell_parts
-from tumortrack.plan.arms.config import Base, CellConfig
+from tumortrack.live.values import RigidShape
+from tumortrack.plan.arms import body
+from tumortrack.plan.arms.config import CellConfig
+from tumortrack.plan.arms.kinematics import ArmModel, Pose, inverse_kinematics, nearest_turn
 from tumortrack.plan.arms.urdf import cell_urdf
-from tumortrack.plan.motions import CUTTER, HOLDER
-
-if TYPE_CHECKING:
-    from tumortrack.live.values import RigidShape
-
-__all__ = ["ArmCell", "Base", "CellConfig"]
+from tumortrack.plan.motions import ARMS, CUTTER, HOLDER, Joints
 
 ORGAN = "organ"
-ARMS = (CUTTER, HOLDER)
 TOOLS = {CUTTER: ("bracket", "pencil", "electrode"), HOLDER: ("rod", "cup")}
 TOUCHES = {CUTTER: "cutter/electrode", HOLDER: "holder/cup"}  # what of a tool may touch the organ
+CollidingPair = tuple[str, str]
 _THICK_MM = 10.0  # of what a tool is made of, about its own axis
 
 
@@ -32,62 +33,44 @@ class ArmCell:
     """Both arms with their tools over the table, and the organ once it is known.
 
     Values do not change after construction, but the buffers of pinocchio do: one thread at a time.
+    ``model`` and ``solids`` are pinocchio's, in metres.
     """
 
     def __init__(self, config: CellConfig | None = None, organ: Mesh | None = None) -> None:
-        import pinocchio as pin
-
         self.config = config or CellConfig()
         self.organ = organ
-        text = cell_urdf(self.config)
-        self._model = pin.buildModelFromXML(text)
-        self._data = self._model.createData()
-        self._solids = pin.buildGeomFromUrdfString(self._model, text, pin.GeometryType.COLLISION)
-        self._names = _name_solids(self._solids, cell_parts(self.config))
+        text, parts = cell_urdf(self.config), body.cell_parts(self.config)
+        self.model = pin.buildModelFromXML(text)
+        self.solids = pin.buildGeomFromUrdfString(self.model, text, pin.GeometryType.COLLISION)
+        self._data = self.model.createData()
+        names = _solid_names(self.solids, parts)
         if organ is not None:
             surface = _bounding_volumes(organ)
-            self._solids.addGeometryObject(
-                pin.GeometryObject(ORGAN, 0, pin.SE3.Identity(), surface)
-            )
-            self._names.append(ORGAN)
-        index = {name: n for n, name in enumerate(self._names)}
+            self.solids.addGeometryObject(pin.GeometryObject(ORGAN, 0, pin.SE3.Identity(), surface))
+            names.append(ORGAN)
+        index = {name: n for n, name in enumerate(names)}
         self._pairs = [pair for pair in _pairs() if pair[0] in index and pair[1] in index]
         for one, other in self._pairs:
-            self._solids.addCollisionPair(pin.CollisionPair(index[one], index[other]))
-        self._tips = {arm: self._model.getFrameId(f"{arm}_tip") for arm in ARMS}
-        self._around = {
-            arm: (
-                np.linalg.inv(self.config.base(arm).table_from_base),
-                np.linalg.inv(self.config.flange_from_tip(arm)),
-            )
-            for arm in ARMS
-        }
+            self.solids.addCollisionPair(pin.CollisionPair(index[one], index[other]))
         self._states: dict[tuple, Any] = {}
-        self._looks: Any = None
-
-    def with_organ(self, organ: Mesh | None) -> ArmCell:
-        """The same cell with this organ on its post (table frame, mm)."""
-        return ArmCell(self.config, organ)
 
     @property
-    def home_rad(self) -> Float64[np.ndarray, " 12"]:
+    def home_rad(self) -> Joints:
         return np.array(self.config.home_rad)
 
     @cached_property
-    def limits_rad(self) -> Float64[np.ndarray, " 12"]:
-        """Each joint may turn so far both ways."""
+    def limits_rad(self) -> Joints:
+        """The joints' limits in both directions."""
         return np.concatenate([self.config.model(arm).limits_rad for arm in ARMS])
 
     @cached_property
-    def speeds_rad_s(self) -> Float64[np.ndarray, " 12"]:
-        """Greatest speeds planned with."""
+    def speeds_rad_s(self) -> Joints:
+        """The maximum speeds planned with."""
         makers = np.concatenate([self.config.model(arm).speeds_rad_s for arm in ARMS])
         return self.config.speed_share * makers
 
-    def levers_mm(
-        self, start_rad: Float64[np.ndarray, " 12"], goal_rad: Float64[np.ndarray, " 12"]
-    ) -> Float64[np.ndarray, " 12"]:
-        """On the straight way between two configurations, no point of an arm or its tool moves
+    def levers_mm(self, start_rad: Joints, goal_rad: Joints) -> Joints:
+        """On the straight segment between two configurations, no point of an arm or its tool moves
         farther than this per radian of each of its joints."""
         levers: list[float] = []
         for arm, elbow in zip(ARMS, (2, 8), strict=True):
@@ -105,101 +88,165 @@ class ArmCell:
             levers += [shoulder, shoulder, np.hypot(lower, d4) + wrist, wrist, hand, ahead]
         return np.array(levers)
 
-    def around_arm(self, arm: str) -> tuple[Float64[np.ndarray, "4 4"], Float64[np.ndarray, "4 4"]]:
-        """``base_from_table`` and ``tip_from_flange``, mm."""
-        return self._around[arm]
-
-    def tips(self, joints_rad: Float64[np.ndarray, " 12"]) -> dict[str, Float64[np.ndarray, "4 4"]]:
+    def tips(self, joints_rad: Joints) -> dict[str, Pose]:
         """``table_from_tip`` (mm) of ``cutter`` and ``holder``: z up; the instrument points along
         its x."""
-        import pinocchio as pin
+        places = self._frames(joints_rad, [f"{arm}_tip" for arm in ARMS])
+        return dict(zip(ARMS, places.values(), strict=True))
 
-        pin.framesForwardKinematics(self._model, self._data, joints_rad)
+    @cached_property
+    def _surfaces(self) -> list[tuple[body.Part, Mesh]]:
+        return body.display_surfaces(self.config)
+
+    def shapes(self, joints_rad: Joints) -> tuple[RigidShape, ...]:
+        """Everything as surfaces in the table frame, and a bead at each tip (``cutter/tip``); the
+        organ is not among them."""
+        places = self._frames(joints_rad, {part.link for part, _ in self._surfaces})
+        return tuple(
+            RigidShape(part.whose, mesh, places[part.link], part.colour)
+            for part, mesh in self._surfaces
+        )
+
+    def _frames(self, joints_rad: np.ndarray, names: Collection[str]) -> dict[str, Pose]:
+        """``table_from_frame`` (mm) of links by their names, by forward kinematics."""
+        pin.framesForwardKinematics(self.model, self._data, joints_rad)
         places = {}
-        for arm, frame in self._tips.items():
-            place = self._data.oMf[frame].homogeneous.copy()
-            place[:3, 3] *= 1000
-            places[arm] = place
+        for name in names:
+            places[name] = self._data.oMf[self.model.getFrameId(name)].homogeneous.copy()
+            places[name][:3, 3] *= 1000
         return places
 
     def collisions(
-        self,
-        joints_rad: Float64[np.ndarray, " 12"],
-        touching: Collection[str] = (),
-        clearance: bool = True,
-        moving: str | None = None,
-    ) -> tuple[str, str] | None:
-        """Names of the first pair that collides, or None.
+        self, joints_rad: Joints, touching: Collection[str] = (), moving: str | None = None
+    ) -> CollidingPair | None:
+        """Names of the first pair that comes nearer than its clearance, or None.
 
         Args:
             touching: arms whose electrode or cup may be on or in the organ now.
-            clearance: things that come nearer than the configured clearances collide too.
             moving: the arm that moves, if the rest is known to be free; None: test everything.
         """
-        import pinocchio as pin
-
-        state = self._state(tuple(sorted(touching)), clearance, moving)
-        pin.updateGeometryPlacements(self._model, self._data, self._solids, state, joints_rad)
-        if not pin.computeCollisions(self._solids, state, True):
+        state = self._state(tuple(sorted(touching)), moving)
+        pin.updateGeometryPlacements(self.model, self._data, self.solids, state, joints_rad)
+        if not pin.computeCollisions(self.solids, state, True):
             return None
         # It stops at the first; results beyond that are of earlier calls.
         results = zip(self._pairs, state.activeCollisionPairs, state.collisionResults, strict=True)
         return next(pair for pair, active, one in results if active and one.isCollision())
 
-    def nearest(
-        self, joints_rad: Float64[np.ndarray, " 12"], touching: Collection[str] = ()
-    ) -> tuple[float, tuple[str, str]]:
-        """The least distance of any pair, mm (negative: how deep), and its names."""
-        import pinocchio as pin
-
-        state = self._state(tuple(sorted(touching)), False, None)
-        pin.updateGeometryPlacements(self._model, self._data, self._solids, state, joints_rad)
-        n = pin.computeDistances(self._solids, state)
-        return 1000 * state.distanceResults[n].min_distance, self._pairs[n]
-
-    def shapes(self, joints_rad: Float64[np.ndarray, " 12"]) -> tuple[RigidShape, ...]:
-        """Everything as surfaces in the table frame, and a bead at each tip (``cutter/tip``); the
-        organ is not among them."""
-        import pinocchio as pin
-
-        from tumortrack.plan.arms.looks import Looks, tip
-
-        if self._looks is None:
-            self._looks = Looks(cell_parts(self.config))
-        pin.framesForwardKinematics(self._model, self._data, joints_rad)
-        places = {}
-        for link in self._looks.links:
-            place = self._data.oMf[self._model.getFrameId(link)].homogeneous.copy()
-            place[:3, 3] *= 1000
-            places[link] = place
-        tips = (tip(arm, place) for arm, place in self.tips(joints_rad).items())
-        return (*self._looks.shapes(places), *tips)
-
-    def _state(self, touching: tuple[str, ...], clearance: bool, moving: str | None) -> Any:
+    def _state(self, touching: tuple[str, ...], moving: str | None) -> Any:
         """Collision buffers in which only the pairs that matter are active."""
-        key = (touching, clearance, moving)
-        if key not in self._states:
-            import pinocchio as pin
-
-            state, ends = pin.GeometryData(self._solids), {TOUCHES[arm] for arm in touching}
+        if (touching, moving) not in self._states:
+            state, ends = pin.GeometryData(self.solids), {TOUCHES[arm] for arm in touching}
             for n, pair in enumerate(self._pairs):
                 still = moving is not None and not any(moving in name for name in pair)
                 if still or (ORGAN in pair and ends & set(pair)):
                     state.deactivateCollisionPair(n)
-                margin = self._margin_mm(pair, touching)
-                state.collisionRequests[n].security_margin = margin / 1000 if clearance else 0.0
-            self._states[key] = state
-        return self._states[key]
+                margin_mm = self._margin_mm(pair, touching)
+                state.collisionRequests[n].security_margin = margin_mm / 1000
+            self._states[touching, moving] = state
+        return self._states[touching, moving]
 
-    def _margin_mm(self, pair: tuple[str, str], touching: tuple[str, ...]) -> float:
+    def _margin_mm(self, pair: CollidingPair, touching: tuple[str, ...]) -> float:
         """How near these two may come."""
-        if ORGAN in pair or (STAND in pair and TOUCHES[CUTTER] in pair):
+        if ORGAN in pair or (body.STAND in pair and TOUCHES[CUTTER] in pair):
             return self.config.organ_clearance_mm
         tools = pair[0] == TOUCHES[CUTTER] and pair[1].removeprefix("holder/") in TOOLS[HOLDER]
         return self.config.contact_mm if tools and len(touching) == 2 else self.config.clearance_mm
 
 
-def _name_solids(solids: Any, parts: tuple[Part, ...]) -> list[str]:
+class Blocked(NoPlan):
+    """This motion is impossible; perhaps another is not. The text says where and why; ``pair``:
+    what would collide, if that is the reason."""
+
+    def __init__(self, text: str, pair: CollidingPair | None = None) -> None:
+        super().__init__(text)
+        self.pair = pair
+
+    @classmethod
+    def by(cls, pair: CollidingPair, where: str = "") -> Blocked:
+        """By a collision of these two."""
+        return cls(f"{pair[0]} would meet {pair[1]}{where}", pair)
+
+
+@dataclass(frozen=True, eq=False)
+class PlanningGroup:
+    """The joints that move while the others stand still.
+
+    Attributes:
+        arm: cutter or holder; None: both move.
+        joints_rad: where both are (12,).
+        touching: arms that may touch the organ with their electrode or cup.
+    """
+
+    cell: ArmCell
+    arm: str | None
+    joints_rad: Joints
+    touching: Collection[str] = ()
+
+    @cached_property
+    def own(self) -> slice:
+        """The moving joints among the twelve."""
+        first = 6 * ARMS.index(self.arm or CUTTER)
+        return slice(first, first + 6 if self.arm else 6 * len(ARMS))
+
+    @property
+    def current_rad(self) -> Float64[np.ndarray, " d"]:
+        """The moving joints now."""
+        return self.joints_rad[self.own]
+
+    @property
+    def limits_rad(self) -> Float64[np.ndarray, " d"]:
+        return self.cell.limits_rad[self.own]
+
+    @property
+    def model(self) -> ArmModel:
+        """The type of the moving arm."""
+        return self.cell.config.model(str(self.arm))
+
+    def all_joints(self, own_rad: Float64[np.ndarray, " d"]) -> Joints:
+        """All twelve joints, the moving ones being these."""
+        joints = self.joints_rad.copy()
+        joints[self.own] = own_rad
+        return joints
+
+    def inverse_kinematics(self, table_from_tip: Pose) -> Float64[np.ndarray, "k 6"]:
+        """All branches that bring the moving arm's tip to a pose, collisions not regarded, each
+        joint turned to be near where it is."""
+        base_from_table, tip_from_flange = self._frames
+        flange = base_from_table @ table_from_tip @ tip_from_flange
+        return nearest_turn(self.model, inverse_kinematics(self.model, flange), self.current_rad)
+
+    def collides(self, own_rad: Float64[np.ndarray, " d"]) -> CollidingPair | None:
+        """What comes nearer than allowed to what."""
+        return self.cell.collisions(self.all_joints(own_rad), self.touching, self.arm)
+
+    def segment_collides(
+        self, start_rad: np.ndarray, goal_rad: np.ndarray, spacing: float = 1.0
+    ) -> CollidingPair | None:
+        """The same between two free configurations, on the straight segment in joint space.
+
+        With ``spacing`` 1 no point of an arm moves by more than twice the least clearance in one
+        step, so that what is free of collisions with that clearance at both ends is free between.
+        """
+        least_mm = min(self.cell.config.clearance_mm, self.cell.config.organ_clearance_mm)
+        levers_mm = self.cell.levers_mm(self.all_joints(start_rad), self.all_joints(goal_rad))
+        moved_mm = float(np.abs(goal_rad - start_rad) @ levers_mm[self.own])
+        n = int(np.ceil(moved_mm / (2 * least_mm * spacing)))
+        # From the middle outward: what blocks is rarely near the ends.
+        for k in sorted(range(1, n), key=lambda k: abs(2 * k - n)):
+            if pair := self.collides(start_rad + (goal_rad - start_rad) * (k / n)):
+                return pair
+        return None
+
+    @cached_property
+    def _frames(self) -> tuple[Pose, Pose]:
+        """``base_from_table`` and ``tip_from_flange``, mm."""
+        config, arm = self.cell.config, str(self.arm)
+        table_from_base, flange_from_tip = config.base(arm).table_from_base, config.flange_from_tip
+        return np.linalg.inv(table_from_base), np.linalg.inv(flange_from_tip(arm))
+
+
+def _solid_names(solids: Any, parts: tuple[body.Part, ...]) -> list[str]:
     """Our names in pinocchio's order, which is that of each link's collision elements."""
     by_link: dict[str, Iterator[str]] = {}
     for link in {part.link for part in parts}:
@@ -207,17 +254,17 @@ def _name_solids(solids: Any, parts: tuple[Part, ...]) -> list[str]:
     return [next(by_link[solid.name.rsplit("_", 1)[0]]) for solid in solids.geometryObjects]
 
 
-def _pairs() -> list[tuple[str, str]]:
+def _pairs() -> list[CollidingPair]:
     """All that could ever meet. Links next to each other are left out, and of an arm with itself
     what its joints' offsets keep apart."""
-    moving = {arm: [f"{arm}/{name}" for name in (*LINKS[2:], *TOOLS[arm])] for arm in ARMS}
+    moving = {arm: [f"{arm}/{name}" for name in (*body.LINKS[2:], *TOOLS[arm])] for arm in ARMS}
     pairs = list(product(moving[CUTTER], moving[HOLDER]))
     for arm, other in (ARMS, ARMS[::-1]):
         own = moving[arm]
-        still = [f"{arm}/{name}" for name in LINKS[:2]]
-        pairs += product(own, [f"{other}/{name}" for name in (PEDESTAL, *LINKS[:2])])
-        pairs += product(own[1:], (f"{arm}/{PEDESTAL}",))
-        pairs += product(own, (TABLE, STAND, CAMERA))
+        still = [f"{arm}/{name}" for name in body.LINKS[:2]]
+        pairs += product(own, [f"{other}/{name}" for name in (body.PEDESTAL, *body.LINKS[:2])])
+        pairs += product(own[1:], (f"{arm}/{body.PEDESTAL}",))
+        pairs += product(own, (body.TABLE, body.STAND, body.CAMERA))
         pairs += product(own[1:], (ORGAN,))
         pairs += product(own[1:], still)
         pairs += product(own[2:], own[:1])  # the upper arm
@@ -227,8 +274,6 @@ def _pairs() -> list[tuple[str, str]]:
 
 def _bounding_volumes(organ: Mesh) -> Any:
     """The organ's surface as coal's tree of boxes, metres."""
-    import coal
-
     surface = coal.BVHModelOBBRSS()
     surface.beginModel(len(organ.faces), len(organ.vertices_mm))
     surface.addVertices(np.array(organ.vertices_mm / 1000))

@@ -1,19 +1,22 @@
-"""The cell as one value: two arms, their tools, table, stand and camera."""
+"""The workcell as one value: two arms, their tools, table, stand and camera."""
 
 from __future__ import annotations
 
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Float64
 
 from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import rigid
-from tumortrack.plan.arms.dh import MODELS, ArmModel
+from tumortrack.plan.arms.kinematics import MODELS, ArmModel, Pose, level_pose
 from tumortrack.plan.motions import CUTTER, JOINTS
 
 _DOWN = np.diag([1.0, -1.0, -1.0])  # a flange that points down, over a tip whose z is up
+_LENGTHS = (
+    *("bracket_mm", "pencil_mm", "electrode_mm", "rod_mm", "cup_mm", "cup_radius_mm"),
+    *("stand_mm", "stand_radius_mm", "cutting_mm_s", "grasping_mm_s"),
+)
 
 
 class Base(Config, frozen=True, kw_only=True):
@@ -23,10 +26,8 @@ class Base(Config, frozen=True, kw_only=True):
     yaw_deg: float
 
     @property
-    def table_from_base(self) -> Float64[np.ndarray, "4 4"]:
-        yaw = np.radians(self.yaw_deg)
-        turn = [[np.cos(yaw), -np.sin(yaw), 0], [np.sin(yaw), np.cos(yaw), 0], [0, 0, 1]]
-        return rigid(np.array(turn), np.array(self.position_mm))
+    def table_from_base(self) -> Pose:
+        return level_pose(np.array(self.position_mm), np.radians(self.yaw_deg))
 
 
 class CellConfig(Config, frozen=True, kw_only=True):
@@ -46,14 +47,14 @@ class CellConfig(Config, frozen=True, kw_only=True):
         stand_mm: height of the organ's lowest point above the table; ``stand_radius_mm``: of the
             post that carries it.
         camera_mm: middle of the camera's box over ``middle_mm``, if ``camera_is_obstacle``. By
-            default it is none and not there: a camera that looks straight down from 150 mm is where
-            the arms work, so it is taken to be swung away while they do.
-        clearance_mm: what arms keep from each other, from themselves and from all that stands;
-            ``organ_clearance_mm``: what they keep from the organ, but for electrode and cup while
-            they work; ``contact_mm``: what the electrode then keeps from the soft cup.
-        cutting_mm_s: the tip's greatest speed on a cut and in tissue; ``grasping_mm_s``: on the
-            straight way to the grasp and back.
-        speed_share: joints go no faster than this share of what the maker allows.
+            default it is no obstacle: a camera that looks straight down from 150 mm is where the
+            arms work, so it is assumed to be swung away while they do.
+        clearance_mm: the arms' least distance from each other, themselves and all that stands;
+            ``organ_clearance_mm``: from the organ, except for electrode and cup at work;
+            ``contact_mm``: of the electrode from the soft cup then.
+        cutting_mm_s: the tip's maximum speed on a cut and in tissue; ``grasping_mm_s``: on the
+            straight path to the grasp and back.
+        speed_share: of the maker's maximum joint speeds.
     """
 
     cutter_model: Literal["ur10e", "ur5"] = "ur10e"
@@ -86,8 +87,7 @@ class CellConfig(Config, frozen=True, kw_only=True):
     def __post_init__(self) -> None:
         if len(self.home_rad) != len(JOINTS):
             raise InputError(f"home has {len(self.home_rad)} joints; give {len(JOINTS)} angles.")
-        lengths = ("bracket_mm", "pencil_mm", "electrode_mm", "rod_mm", "cup_mm", "cup_radius_mm")
-        for name in (*lengths, "stand_mm", "stand_radius_mm", "cutting_mm_s", "grasping_mm_s"):
+        for name in _LENGTHS:
             if not 0 < getattr(self, name) < 1000:
                 raise InputError(
                     f"cell: {name} is {getattr(self, name):g}; allowed: over 0 to 1000."
@@ -114,7 +114,7 @@ class CellConfig(Config, frozen=True, kw_only=True):
     def base(self, arm: str) -> Base:
         return self.cutter_base if arm == CUTTER else self.holder_base
 
-    def flange_from_tip(self, arm: str) -> Float64[np.ndarray, "4 4"]:
+    def flange_from_tip(self, arm: str) -> Pose:
         """The tip's frame: z up where the flange points down; the instrument points along x."""
         if arm == CUTTER:
             ahead_mm = self.pencil_mm + self.electrode_mm

@@ -2,36 +2,51 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator
+from copy import copy
 
+import msgspec
 import numpy as np
-from jaxtyping import Float64
 
 from tumortrack.core.errors import InputError, NoPlan
 from tumortrack.core.types import Mesh
-from tumortrack.plan.arms import timing
-from tumortrack.plan.arms.cell import TOUCHES, ArmCell
-from tumortrack.plan.arms.cutting import DETOURS_MM, aside, cut_pass
-from tumortrack.plan.arms.situation import Blocked
-from tumortrack.plan.arms.strokes import Surroundings, leg, level_poses, passes
-from tumortrack.plan.arms.tracks import follow, solve
-from tumortrack.plan.arms.trajectory import TrajectoryBuilder
-from tumortrack.plan.arms.transfer import connect
-from tumortrack.plan.motions import CUTTER, HOLDER, JOINTS, Motions
+from tumortrack.plan.arms.cell import TOUCHES, ArmCell, Blocked, PlanningGroup
+from tumortrack.plan.arms.config import Base, CellConfig
+from tumortrack.plan.arms.cutting import (
+    DETOURS_MM,
+    Surroundings,
+    aside,
+    cut_pass,
+    leg,
+    level_poses,
+    passes,
+)
+from tumortrack.plan.arms.kinematics import level_pose, yaw_of
+from tumortrack.plan.arms.paths import connect, follow, out_of_reach
+from tumortrack.plan.arms.trajectory import TrajectoryBuilder, along, together
+from tumortrack.plan.motions import ARMS, CUTTER, HOLDER, JOINTS, Joints, Motions
 from tumortrack.plan.values import ResectionPlan
 
-SETTLE_S = 0.5  # until the vacuum holds
-LET_GO_S = 0.3
+_SETTLE_S = 0.5  # until the vacuum holds
+_LET_GO_S = 0.3
 _ABOVE_MM = 60.0  # the cup comes from here, and goes back
 _STEP_MM = 5.0
 _GRIPS = 4  # ways of holding that are tried
+# Round the organ: how far off the base stands, as a share of the arm's reach, and on which side
+# (degrees from where it stands now). The first are tried first.
+_DISTANCES = (0.65, 0.5, 0.8)
+_SIDES_DEG = (0.0, 30.0, -30.0, 60.0, -60.0)
+_YAWS = 8  # in which the instrument is asked to reach
+_MOST_TRIED = 8  # pairs of places for which motions are planned
+_EDGE_MM = 120.0  # a base's middle is no nearer to the table's edge
 
 
 def plan_motions(
     plan: ResectionPlan,
     cell: ArmCell,
     organ: Mesh,
-    start_rad: Float64[np.ndarray, " 12"] | None = None,
+    start_rad: Joints | None = None,
     from_sweep: int | None = None,
     seed: int = 0,
 ) -> Motions:
@@ -46,18 +61,21 @@ def plan_motions(
 
     Raises:
         NoPlan: a place out of reach, or a collision that could not be avoided, and what to do.
-        InputError: a start that is none.
+        InputError: an invalid start.
     """
-    course = _begin(cell, organ, start_rad, seed)
-    around = Surroundings(organ, course.cell.config, plan)
+    cell = cell if cell.organ is organ else ArmCell(cell.config, organ)
+    start = cell.home_rad if start_rad is None else np.array(start_rad, float)
+    if start.shape != (len(JOINTS),) or not (np.abs(start) <= cell.limits_rad).all():
+        raise InputError("the arms' start must be twelve joint angles within their limits.")
+    if from_sweep is not None and start_rad is None:
+        raise InputError("from_sweep needs start_rad: where the arms are while one holds.")
+    builder = TrajectoryBuilder(cell, start, np.random.default_rng(seed))
+    around = Surroundings(organ, cell.config, plan)
     try:
+        _withdraw(builder, around, holding=from_sweep is not None)
         if from_sweep is not None:
-            if start_rad is None:
-                raise InputError("from_sweep needs start_rad: where the arms are while one holds.")
-            _withdraw(course, around, holding=True)
-            return _cut_and_finish(course, plan, around, from_sweep)
-        _withdraw(course, around, holding=False)
-        return _grasp_and_cut(course, plan, around)
+            return _cut_and_finish(builder, plan, around, from_sweep)
+        return _grasp_and_cut(builder, plan, around)
     except Blocked as blocked:
         raise NoPlan(
             f"the arms can't carry this out: {blocked}. Place the arms or the organ otherwise, or "
@@ -65,42 +83,19 @@ def plan_motions(
         ) from blocked
 
 
-def plan_home(
-    cell: ArmCell, organ: Mesh, start_rad: Float64[np.ndarray, " 12"], seed: int = 0
+def _grasp_and_cut(
+    builder: TrajectoryBuilder, plan: ResectionPlan, around: Surroundings
 ) -> Motions:
-    """From anywhere: out of the tissue, let go, and home.
-
-    Raises:
-        NoPlan: something is in the way.
-    """
-    course = _begin(cell, organ, start_rad, seed)
-    try:
-        _withdraw(course, Surroundings(organ, course.cell.config), holding=False)
-        course.close("release")
-        return _home(course)
-    except Blocked as blocked:
-        raise NoPlan(f"the arms can't go home by themselves: {blocked}.") from blocked
-
-
-def _begin(
-    cell: ArmCell, organ: Mesh, start_rad: np.ndarray | None, seed: int
-) -> TrajectoryBuilder:
-    cell = cell if cell.organ is organ else cell.with_organ(organ)
-    start = cell.home_rad if start_rad is None else np.array(start_rad, float)
-    if start.shape != (len(JOINTS),) or not (np.abs(start) <= cell.limits_rad).all():
-        raise InputError("the arms' start must be twelve joint angles within their limits.")
-    return TrajectoryBuilder(cell, start, np.random.default_rng(seed))
-
-
-def _grasp_and_cut(course: TrajectoryBuilder, plan: ResectionPlan, around: Surroundings) -> Motions:
-    """With whichever way of holding leaves the instrument its way; the reason is the first's."""
+    """By whichever grip leaves the instrument its path; the reason is the first grip's."""
     deep_mm = around.depth_mm(plan.grasp_mm)
-    if deep_mm > course.cell.config.cup_mm:
+    if deep_mm > builder.cell.config.cup_mm:
         raise Blocked(f"the grasp point lies {deep_mm:.0f} mm below the organ's surface")
     reason: Blocked | None = None
-    for grip in _grips(course, plan.grasp_mm):
+    for grip in _grips(builder, plan.grasp_mm):
         try:
-            return _cut_and_finish(_grasp(course.copy(), grip), plan, around, 1)
+            attempt = copy(builder)
+            _grasp(attempt, grip)
+            return _cut_and_finish(attempt, plan, around, 1)
         except Blocked as blocked:
             reason = reason or blocked
             if blocked.pair and not any(name.startswith(HOLDER) for name in blocked.pair):
@@ -109,13 +104,13 @@ def _grasp_and_cut(course: TrajectoryBuilder, plan: ResectionPlan, around: Surro
     raise reason
 
 
-def _down(grasp_mm: np.ndarray, yaw_rad: float) -> np.ndarray:
+def _lowering(grasp_mm: np.ndarray, yaw_rad: float) -> np.ndarray:
     """Poses of the cup from above down to where it holds."""
     heights = np.linspace(_ABOVE_MM, 0, int(_ABOVE_MM / _STEP_MM) + 1)
     return level_poses(grasp_mm + heights[:, None] * [0.0, 0.0, 1.0], yaw_rad)
 
 
-def _grips(course: TrajectoryBuilder, grasp_mm: np.ndarray) -> Iterator[np.ndarray]:
+def _grips(builder: TrajectoryBuilder, grasp_mm: np.ndarray) -> Iterator[np.ndarray]:
     """Joint paths (n, 6) straight down onto the grasp, those near the arm's present place first.
 
     How the cup is turned does not matter: it is round, and turns about the last joint alone.
@@ -123,18 +118,16 @@ def _grips(course: TrajectoryBuilder, grasp_mm: np.ndarray) -> Iterator[np.ndarr
     Raises:
         Blocked: none at all, and why.
     """
-    situation = course.situation(HOLDER, touching=(HOLDER,))
-    tip = course.cell.tips(course.joints_rad)[HOLDER]
-    poses = _down(grasp_mm, float(np.arctan2(tip[1, 0], tip[0, 0])))
-    starts = solve(situation, poses[0])
+    group = builder.group(HOLDER, touching=(HOLDER,))
+    poses = _lowering(grasp_mm, yaw_of(builder.tip(HOLDER)))
+    starts = group.inverse_kinematics(poses[0])
     if not len(starts):
-        x, y, z = poses[0][:3, 3]
-        raise Blocked(f"the {HOLDER} does not reach ({x:.0f}, {y:.0f}, {z:.0f}) mm")
+        raise out_of_reach(group, poses[0])
     reason: Blocked | None = None
     found = 0
-    for start in sorted(starts, key=lambda start: np.abs(start - situation.here_rad).max()):
+    for start in sorted(starts, key=lambda start: np.abs(start - group.current_rad).max()):
         try:
-            path = follow(situation, poses, start)
+            path = follow(group, poses, start)
         except Blocked as blocked:
             reason = reason or blocked
             continue
@@ -145,64 +138,151 @@ def _grips(course: TrajectoryBuilder, grasp_mm: np.ndarray) -> Iterator[np.ndarr
         raise reason
 
 
-def _grasp(course: TrajectoryBuilder, grip_rad: np.ndarray) -> TrajectoryBuilder:
+def _grasp(builder: TrajectoryBuilder, grip_rad: np.ndarray) -> None:
     """Approach, grasp and hold."""
-    course.go(HOLDER, connect(course.situation(HOLDER), grip_rad[0], course.rng))
-    course.close("approach")
-    course.go(HOLDER, grip_rad, course.cell.config.grasping_mm_s)
-    course.close("grasp")
-    course.still(SETTLE_S)
-    course.close("hold")
-    return course
+    builder.go(HOLDER, connect(builder.group(HOLDER), grip_rad[0], builder.rng))
+    builder.close("approach")
+    builder.go(HOLDER, grip_rad, builder.cell.config.grasping_mm_s)
+    builder.close("grasp")
+    builder.wait(_SETTLE_S)
+    builder.close("hold")
 
 
 def _cut_and_finish(
-    course: TrajectoryBuilder, plan: ResectionPlan, around: Surroundings, first: int
+    builder: TrajectoryBuilder, plan: ResectionPlan, around: Surroundings, first: int
 ) -> Motions:
     for sweep in range(first, plan.sweeps + 1):
-        for way in passes(tuple(cut for cut in plan.cuts if cut.sweep == sweep)):
-            cut_pass(course, way, around)
-        course.close(f"sweep {sweep}")
-    _let_go(course)
-    course.close("release")
-    return _home(course)
+        for path_mm in passes(tuple(cut for cut in plan.cuts if cut.sweep == sweep)):
+            cut_pass(builder, path_mm, around)
+        builder.close(f"sweep {sweep}")
+    _let_go(builder)
+    builder.close("release")
+    return _home(builder)
 
 
-def _withdraw(course: TrajectoryBuilder, around: Surroundings, holding: bool) -> None:
+def _withdraw(builder: TrajectoryBuilder, around: Surroundings, holding: bool) -> None:
     """Straight back with an instrument that is in tissue or at it, and up with a cup on it."""
-    pair = course.cell.collisions(course.joints_rad, (HOLDER,))
+    pair = builder.cell.collisions(builder.joints_rad, (HOLDER,))
     if pair is not None and TOUCHES[CUTTER] in pair:
-        tip = course.cell.tips(course.joints_rad)[CUTTER]
-        yaw = float(np.arctan2(tip[1, 0], tip[0, 0]))
+        tip = builder.tip(CUTTER)
+        yaw = yaw_of(tip)
         leave = leg(tip[None, :3, 3], yaw, around).leave_mm
-        course.follow(CUTTER, level_poses(leave, yaw), course.cell.config.cutting_mm_s)
-    pair = course.cell.collisions(course.joints_rad, (CUTTER,))
+        builder.follow(CUTTER, level_poses(leave, yaw), builder.cell.config.cutting_mm_s)
+    pair = builder.cell.collisions(builder.joints_rad, (CUTTER,))
     if not holding and pair is not None and TOUCHES[HOLDER] in pair:
-        _let_go(course)
+        _let_go(builder)
 
 
-def _let_go(course: TrajectoryBuilder) -> None:
+def _let_go(builder: TrajectoryBuilder) -> None:
     """Vacuum off, then straight up."""
-    course.still(LET_GO_S)
-    tip = course.cell.tips(course.joints_rad)[HOLDER]
-    yaw = float(np.arctan2(tip[1, 0], tip[0, 0]))
-    course.follow(HOLDER, _down(tip[:3, 3], yaw)[::-1], course.cell.config.grasping_mm_s)
+    builder.wait(_LET_GO_S)
+    tip = builder.tip(HOLDER)
+    rising = _lowering(tip[:3, 3], yaw_of(tip))[::-1]
+    builder.follow(HOLDER, rising, builder.cell.config.grasping_mm_s)
 
 
-def _home(course: TrajectoryBuilder) -> Motions:
-    """Both arms at once: the straight way if it is free."""
-    both, home = course.situation(None), course.cell.home_rad
+def _home(builder: TrajectoryBuilder) -> Motions:
+    """Both arms at once: straight in joint space if that is free."""
+    both, home, speeds = builder.group(None), builder.cell.home_rad, builder.cell.speeds_rad_s
     for place in (both.joints_rad, home):
         if pair := both.collides(place):
-            raise Blocked(f"{pair[0]} would meet {pair[1]} on the way home", pair)
-    if both.way_collides(both.joints_rad, home) is None:
-        course.add(timing.together(both.joints_rad, home, course.cell.speeds_rad_s))
+            raise Blocked.by(pair, " on the way home")
+    if both.segment_collides(both.joints_rad, home) is None:
+        builder.add(together(both.joints_rad, home, speeds))
     else:
-        cutter = course.situation(CUTTER)
-        tip = course.cell.tips(course.joints_rad)[CUTTER]
+        cutter, tip = builder.group(CUTTER), builder.tip(CUTTER)
         corners = [aside(cutter, tip, *by) for by in DETOURS_MM]
-        detours = [cutter.whole(corner)[None] for corner in corners if len(corner)]
-        way = connect(both, home, course.rng, detours)
-        course.add(timing.along(way, course.cell.speeds_rad_s))
-    course.close("home")
-    return course.motions()
+        detours = [cutter.all_joints(corner)[None] for corner in corners if len(corner)]
+        builder.add(along(connect(both, home, builder.rng, detours), speeds))
+    builder.close("home")
+    return builder.motions()
+
+
+def search_bases(
+    plan: ResectionPlan, config: CellConfig, organ: Mesh, seed: int = 0
+) -> tuple[ArmCell, Motions, str]:
+    """The motions from where the arms stand, or else from elsewhere round the table.
+
+    A small fixed grid of places for both bases, on their pedestals and facing as they do: first
+    those within reach of every stroke, near to where the arms stand now; then the first for which
+    the whole procedure can be planned.
+
+    Returns:
+        The workcell (with the organ), the motions, and a note for the user on what was changed:
+        empty where nothing was.
+
+    Raises:
+        NoPlan: no place will do; the reason is the one for the places where the arms stand now.
+    """
+    cell = ArmCell(config, organ)
+    try:
+        return cell, plan_motions(plan, cell, organ, seed=seed), ""
+    except NoPlan as failure:
+        reason = failure
+    for elsewhere in itertools.islice(_elsewhere(plan, config), _MOST_TRIED):
+        cell = ArmCell(elsewhere, organ)
+        if cell.collisions(cell.home_rad) is not None:
+            continue
+        try:
+            motions = plan_motions(plan, cell, organ, seed=seed)
+        except NoPlan:
+            continue
+        return cell, motions, _note(elsewhere)
+    raise NoPlan(f"{reason} Other places for the arms round the table were tried in vain.")
+
+
+def _elsewhere(plan: ResectionPlan, config: CellConfig) -> Iterator[CellConfig]:
+    """Configurations in which both arms reach all they have to, the least change first."""
+    # Ends and middles of all strokes
+    strokes = np.concatenate([cut.path_mm[[0, len(cut.path_mm) // 2, -1]] for cut in plan.cuts])
+    targets = {CUTTER: strokes, HOLDER: plan.grasp_mm[None] + [[0, 0, 0], [0, 0, 60.0]]}
+    good: dict[str, list[Base]] = {}
+    for arm in ARMS:
+        places = _places(config, arm, plan.grasp_mm[:2])
+        good[arm] = [base for base in places if _reaches(_with(config, {arm: base}), arm, targets)]
+    pairs = itertools.product(enumerate(good[CUTTER]), enumerate(good[HOLDER]))
+    for (_, cutter), (_, holder) in sorted(pairs, key=lambda pair: pair[0][0] + pair[1][0]):
+        yield _with(config, {CUTTER: cutter, HOLDER: holder})
+
+
+def _places(config: CellConfig, arm: str, middle_mm: np.ndarray) -> list[Base]:
+    """Where this arm could stand on the table, its present place first."""
+    now = config.base(arm)
+    off = np.array(now.position_mm[:2]) - middle_mm
+    facing = np.arctan2(off[1], off[0])
+    half = np.array(config.table_mm) / 2 - _EDGE_MM
+    bases = [now]
+    for side, share in itertools.product(_SIDES_DEG, _DISTANCES):
+        angle = facing + np.radians(side)
+        far = share * config.model(arm).reach_mm
+        x, y = middle_mm + far * np.array([np.cos(angle), np.sin(angle)])
+        if abs(x - config.middle_mm[0]) <= half[0] and abs(y - config.middle_mm[1]) <= half[1]:
+            place = (round(float(x)), round(float(y)), now.position_mm[2])
+            bases.append(Base(position_mm=place, yaw_deg=now.yaw_deg + side))
+    return bases
+
+
+def _reaches(config: CellConfig, arm: str, targets_mm: dict[str, np.ndarray]) -> bool:
+    """Whether the arm's tip comes to all its targets, each time pointing in any direction."""
+    cell = ArmCell(config)
+    group = PlanningGroup(cell, arm, cell.home_rad)
+    yaws = np.linspace(0, 2 * np.pi, _YAWS if arm == CUTTER else 1, endpoint=False)
+    return all(
+        any(len(group.inverse_kinematics(level_pose(target, yaw))) for yaw in yaws)
+        for target in targets_mm[arm]
+    )
+
+
+def _with(config: CellConfig, bases: dict[str, Base]) -> CellConfig:
+    return msgspec.structs.replace(config, **{f"{arm}_base": base for arm, base in bases.items()})
+
+
+def _note(config: CellConfig) -> str:
+    places = []
+    for arm in ARMS:
+        base = config.base(arm)
+        x, y, z = base.position_mm
+        places.append(
+            f"{arm}'s base at ({x:g}, {y:g}, {z:g}) mm, turned by {base.yaw_deg:g} degrees"
+        )
+    return f"the arms do not manage from where they stand; planned with the {', the '.join(places)}"

@@ -1,39 +1,53 @@
-"""Motions as they come about: piece after piece, stage after stage."""
+"""From paths to trajectories: as fast as joints may turn and accelerate, and no faster than asked.
+
+Pham and Pham 2018, 'A new approach to time-optimal path parameterization based on reachability
+analysis' (toppra), DOI 10.1109/TRO.2018.2819195; Berscheid and Kroeger 2021, 'Jerk-limited
+real-time trajectory generation with arbitrary target states' (ruckig), arXiv:2105.04830.
+"""
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Collection
-from copy import copy
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float64
 
-from tumortrack.plan.arms import timing
-from tumortrack.plan.arms.cell import ArmCell
-from tumortrack.plan.arms.situation import Situation
-from tumortrack.plan.arms.tracks import follow
-from tumortrack.plan.motions import Motions, MotionStage
+from tumortrack.plan.arms.cell import ArmCell, Blocked, PlanningGroup
+from tumortrack.plan.arms.kinematics import ACCELERATION_RAD_S2, JERK_RAD_S3, Pose
+from tumortrack.plan.arms.paths import arc_lengths, follow
+from tumortrack.plan.motions import CUTTER, HOLDER, Joints, Motions, MotionStage
 
+_STEP_S = 0.02  # between two samples; straight segments between them stay within 0.05 mm
+_TIP_SPEED_UP_S = 0.2  # until a tip has its speed
+_GRID = 80
+_FINER = (1.0, 1.7, 2.9, 4.3)  # grids that are tried, in points of the first
+_CRAWL, _CRAWL_S = 2.0, 3.0  # a motion longer than so many times the least, and so much, crawls
+_SLACK = 0.97  # of the acceleration: toppra keeps its limits at grid points only
 _THERE_RAD = 1e-6  # a thousandth of a millimetre at the tip: no motion to be timed
+
+Timed = tuple[Float64[np.ndarray, " n"], Float64[np.ndarray, "n d"]]
 
 
 class TrajectoryBuilder:
-    """Where both arms are by now (``joints_rad``), and how they came there."""
+    """Where both arms are by now (``joints_rad``), and how they came there, stage by stage.
 
-    def __init__(
-        self, cell: ArmCell, start_rad: Float64[np.ndarray, " 12"], rng: np.random.Generator
-    ) -> None:
+    What is added to a copy (``copy.copy``) is not in the original.
+    """
+
+    def __init__(self, cell: ArmCell, start_rad: Joints, rng: np.random.Generator) -> None:
         self.cell, self.joints_rad, self.rng = cell, start_rad, rng
         self._stages: tuple[MotionStage, ...] = ()
         self._pieces: tuple[tuple[np.ndarray, np.ndarray, bool], ...] = ()
 
-    def copy(self) -> TrajectoryBuilder:
-        """The same so far; what is added to either is not in the other."""
-        return copy(self)
-
-    def situation(self, arm: str | None, touching: Collection[str] = ()) -> Situation:
+    def group(self, arm: str | None, touching: Collection[str] = ()) -> PlanningGroup:
         """This arm (None: both) moves from here."""
-        return Situation(self.cell, arm, self.joints_rad, touching)
+        return PlanningGroup(self.cell, arm, self.joints_rad, touching)
+
+    def tip(self, arm: str) -> Pose:
+        """``table_from_tip`` now, mm."""
+        return self.cell.tips(self.joints_rad)[arm]
 
     def go(
         self,
@@ -42,33 +56,32 @@ class TrajectoryBuilder:
         tip_mm_s: float | None = None,
         cutting: bool = False,
     ) -> None:
-        """One arm along a path that begins where it is; its tip no faster than said."""
-        situation = self.situation(arm)
+        """One arm along a path that begins where it is; its tip no faster than ``tip_mm_s``."""
+        group = self.group(arm)
         if np.ptp(path_rad, axis=0).max() < _THERE_RAD:
             return
-        speeds = self.cell.speeds_rad_s[situation.own]
+        speeds = self.cell.speeds_rad_s[group.own]
         if tip_mm_s is None:
-            times, own = timing.along(path_rad, speeds)
+            times, own = along(path_rad, speeds)
         else:
-            tips = [self.cell.tips(situation.whole(joints))[arm][:3, 3] for joints in path_rad]
-            times, own = timing.along(path_rad, speeds, np.array(tips), tip_mm_s)
+            tips = [self.cell.tips(group.all_joints(joints))[arm][:3, 3] for joints in path_rad]
+            times, own = along(path_rad, speeds, np.array(tips), tip_mm_s)
         joints = np.repeat(self.joints_rad[None], len(times), axis=0)
-        joints[:, situation.own] = own
+        joints[:, group.own] = own
         self.add((times, joints), cutting)
 
     def follow(self, arm: str, poses: Float64[np.ndarray, "n 4 4"], tip_mm_s: float) -> None:
         """One arm's tip along poses that begin where it is, on or in the organ or not.
 
         Raises:
-            Blocked: as ``tracks.follow``.
+            Blocked: as ``paths.follow``.
         """
-        situation = self.situation(arm, ("cutter", "holder"))
-        self.go(arm, follow(situation, poses), tip_mm_s)
+        self.go(arm, follow(self.group(arm, (CUTTER, HOLDER)), poses), tip_mm_s)
 
-    def still(self, seconds: float) -> None:
+    def wait(self, seconds: float) -> None:
         self.add((np.array([0.0, seconds]), np.repeat(self.joints_rad[None], 2, axis=0)))
 
-    def add(self, timed: timing.Timed, cutting: bool = False) -> None:
+    def add(self, timed: Timed, cutting: bool = False) -> None:
         """All twelve joints (n, 12) over time, from where they are."""
         times, joints = timed
         joints[0] = self.joints_rad
@@ -77,21 +90,104 @@ class TrajectoryBuilder:
 
     def close(self, name: str) -> None:
         """What was added since the last stage is the stage of this name."""
-        times, joints = (
-            [np.zeros(1)],
-            [self._pieces[0][1][:1] if self._pieces else self.joints_rad[None]],
-        )
-        cutting = [np.array([bool(self._pieces) and self._pieces[0][2]])]
-        for piece_times, piece_joints, cuts in self._pieces:
-            cutting[-1][-1] |= cuts  # a corner between way in and cut is on the cut
+        pieces = self._pieces
+        times = [np.zeros(1)]
+        joints = [pieces[0][1][:1] if pieces else self.joints_rad[None]]
+        cutting = [np.array([bool(pieces) and pieces[0][2]])]
+        for piece_times, piece_joints, cuts in pieces:
+            cutting[-1][-1] |= cuts  # a corner between lead-in and cut is on the cut
             times.append(times[-1][-1] + piece_times[1:])
             joints.append(piece_joints[1:])
             cutting.append(np.full(len(piece_times) - 1, cuts))
-        stage = MotionStage(
-            name, np.concatenate(times), np.concatenate(joints), np.concatenate(cutting)
-        )
-        self._stages += (stage,)
+        arrays = (np.concatenate(parts) for parts in (times, joints, cutting))
+        self._stages += (MotionStage(name, *arrays),)
         self._pieces = ()
 
     def motions(self) -> Motions:
         return Motions(self._stages)
+
+
+def along(
+    path_rad: Float64[np.ndarray, "m d"],
+    speeds_rad_s: Float64[np.ndarray, " d"],
+    tip_mm: Float64[np.ndarray, "m 3"] | None = None,
+    tip_mm_s: float = 0.0,
+) -> Timed:
+    """Times from 0 and joints (n, d) along a path, at rest at both ends.
+
+    Args:
+        tip_mm: where the tip is at each point; its speed stays below ``tip_mm_s``.
+
+    Raises:
+        Blocked: no such motion (the path has a kink that can't be taken).
+    """
+    import toppra
+    from toppra import algorithm, constraint
+
+    logging.getLogger("toppra").setLevel(logging.ERROR)
+    width = path_rad.shape[1]
+    acceleration = np.full(width, _SLACK * ACCELERATION_RAD_S2)
+    knots = arc_lengths(path_rad if tip_mm is None else tip_mm)
+    if tip_mm is not None:
+        # The tip's arc length is one more joint, with limits of its own.
+        path_rad = np.column_stack([path_rad, knots])
+        speeds_rad_s = np.append(speeds_rad_s, tip_mm_s)
+        acceleration = np.append(acceleration, tip_mm_s / _TIP_SPEED_UP_S)
+    keep = np.r_[True, np.diff(knots) > 1e-9 * knots[-1]]
+    curve = toppra.SplineInterpolator(knots[keep], path_rad[keep])
+    limits = [
+        constraint.JointVelocityConstraint(np.column_stack([-speeds_rad_s, speeds_rad_s])),
+        constraint.JointAccelerationConstraint(np.column_stack([-acceleration, acceleration])),
+    ]
+    # No motion is shorter: each step at its slowest joint's full speed. On some grids toppra crawls
+    # through a place for minutes; another grid does not share it.
+    least_s = float((np.abs(np.diff(path_rad, axis=0)) / speeds_rad_s).max(axis=1).sum())
+    best: Any = None
+    for finer in _FINER:
+        grid = np.linspace(0, knots[-1], round(finer * max(_GRID, keep.sum())))
+        solver = algorithm.TOPPRA(
+            limits, curve, gridpoints=grid, parametrizer="ParametrizeConstAccel"
+        )
+        found = solver.compute_trajectory(0, 0)
+        if found is not None and (best is None or found.duration < best.duration):
+            best = found
+        if best is not None and best.duration < _CRAWL * least_s + _CRAWL_S:
+            break
+    if best is None:
+        raise Blocked("a path can't be gone within the joints' limits")
+    times = _samples(best.duration)
+    return times, best(times)[:, :width]
+
+
+def together(
+    start_rad: Float64[np.ndarray, " d"],
+    goal_rad: Float64[np.ndarray, " d"],
+    speeds_rad_s: Float64[np.ndarray, " d"],
+) -> Timed:
+    """Every joint leaves at the same time and arrives at the same time, on the straight segment.
+
+    Raises:
+        Blocked: no such motion.
+    """
+    import ruckig
+
+    # One joint that goes from 0 to 1, as slowly as the slowest of them needs: so all are on the
+    # straight segment that was tested, which synchronised ends alone would not mean.
+    turns = np.maximum(np.abs(goal_rad - start_rad), 1e-9)
+    longest = float(turns.max())
+    wish = ruckig.InputParameter(1)
+    wish.current_position, wish.target_position = [0.0], [1.0]
+    wish.max_velocity = [float((speeds_rad_s / turns).min())]
+    wish.max_acceleration = [ACCELERATION_RAD_S2 / longest]
+    wish.max_jerk = [JERK_RAD_S3 / longest]
+    found = ruckig.Trajectory(1)
+    outcome = ruckig.Ruckig(1).calculate(wish, found)
+    if outcome not in (ruckig.Result.Working, ruckig.Result.Finished):
+        raise Blocked(f"no synchronous motion ({outcome})")
+    times = _samples(found.duration)
+    share = np.array([found.at_time(time)[0] for time in times]).reshape(-1, 1)
+    return times, start_rad + share * (goal_rad - start_rad)
+
+
+def _samples(seconds: float) -> Float64[np.ndarray, " n"]:
+    return np.linspace(0, seconds, int(np.ceil(seconds / _STEP_S)) + 1)

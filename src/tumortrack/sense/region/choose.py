@@ -1,16 +1,16 @@
-"""Which pieces are the organ: the one that the user points at, the one seen last, or the likeliest;
-what continues it behind something nearer; and what lies in the last estimate's box alone."""
+"""Which pieces are the organ: the one picked by the user, the last one seen, or the likeliest; what
+continues it behind something nearer; and what lies wholly in the last estimate's box."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
-import numba
 import numpy as np
 
 from tumortrack.core.errors import NoEstimate
 from tumortrack.sense.region.config import RegionConfig
-from tumortrack.sense.region.picture import FLYING, LAST_BOX, Picture
+from tumortrack.sense.region.picture import FLYING, LAST_BOX, Picture, jit
 from tumortrack.sense.region.pieces import Edges
 
 PICK_REACH_MM = 10.0  # from the picked point to the piece it means
@@ -60,12 +60,17 @@ def under_box(
     return int(inside.argmax()) if inside.max() > 0 else None
 
 
-@dataclass(frozen=True, eq=False)
-class Sizes:
-    """Of every piece (count + 1,): ``area_mm2`` across the line of sight, longest extent
-    ``wide_mm``, and ``cut``: how much of it goes on outside what is looked at, as the width there
-    over the square root of the area, 0..1; ``thick_mm``: diameter of the largest disc in it;
-    ``aside``: tangent of the angle between its middle and the optical axis."""
+class Sizes(NamedTuple):
+    """Of every piece (count + 1,); entry 0 is not used.
+
+    Attributes:
+        area_mm2: across the line of sight.
+        wide_mm: longest extent.
+        cut: 0..1, how much of it continues outside the examined part: the width there over the
+            square root of the area.
+        thick_mm: diameter of the largest disc in it.
+        aside: tangent of the angle between its middle and the optical axis.
+    """
 
     area_mm2: np.ndarray
     wide_mm: np.ndarray
@@ -75,9 +80,7 @@ class Sizes:
 
 
 def sizes(picture: Picture, edges: Edges, pieces: np.ndarray, count: int) -> Sizes:
-    return Sizes(
-        *_measure(picture.depth_mm, edges.distance, picture.taken, pieces, picture.pinhole, count)
-    )
+    return _measure(picture.depth_mm, edges.distance, picture.taken, pieces, picture.pinhole, count)
 
 
 def likeliest(these: Sizes, config: RegionConfig) -> int | None:
@@ -142,8 +145,8 @@ def choice(
 
 
 def parts_of(picture: Picture, taken: Choice, corners_mm: np.ndarray) -> np.ndarray:
-    """Further pieces (count + 1,), bool, that lie in the last estimate's box (2, 3) alone, not at
-    its far side, and are no thin thing: a tumor that stands out, what a crease parts."""
+    """Further pieces (count + 1,), bool, that lie wholly in the last estimate's box (2, 3), not at
+    its far side, and are not thin: a tumor that stands out, a part beyond a crease."""
     low, high = np.sort(np.asarray(corners_mm, np.float64), axis=0)
     high[2] -= _FAR_SIDE * (high[2] - low[2])
     low, high = low - _BOX_MM, high + _BOX_MM
@@ -161,7 +164,7 @@ def _like_an_organ(these: Sizes, config: RegionConfig) -> np.ndarray:
     return fits * thick * aimed * (1 - 0.95 * these.cut) ** 4 * (these.wide_mm > low)
 
 
-@numba.njit(cache=True, nogil=True)
+@jit
 def _nearest(depth_mm, pieces, pinhole, point):  # type: ignore[no-untyped-def]
     fx, fy, cx, cy = pinhole
     best, piece = np.inf, 0
@@ -176,7 +179,7 @@ def _nearest(depth_mm, pieces, pinhole, point):  # type: ignore[no-untyped-def]
     return best, piece
 
 
-@numba.njit(cache=True, nogil=True)
+@jit
 def _area_inside(depth_mm, pieces, pinhole, low, high, count):  # type: ignore[no-untyped-def]
     fx, fy, cx, cy = pinhole
     area = np.zeros(count)
@@ -190,7 +193,7 @@ def _area_inside(depth_mm, pieces, pinhole, low, high, count):  # type: ignore[n
     return area
 
 
-@numba.njit(cache=True, nogil=True)
+@jit
 def _measure(depth_mm, distance, taken, pieces, pinhole, count):  # type: ignore[no-untyped-def]
     fx, fy, cx, cy = pinhole
     height, width = depth_mm.shape
@@ -232,10 +235,11 @@ def _measure(depth_mm, distance, taken, pieces, pinhole, count):  # type: ignore
         if area[piece] > 0:
             wide[piece] = (high[piece] - low[piece]).max()
             cut[piece] = min(border[piece] / np.sqrt(area[piece]), 1.0)
-    return area, wide, cut, 2 * disc, np.sqrt((middle**2).sum(1)) / np.maximum(pixels, 1)
+    aside = np.sqrt((middle**2).sum(1)) / np.maximum(pixels, 1)
+    return Sizes(area, wide, cut, 2 * disc, aside)
 
 
-@numba.njit(cache=True, nogil=True)
+@jit
 def _goes_on(depth_mm, taken, z, v, u):  # type: ignore[no-untyped-def]
     """Beyond the image's border, or as the same surface beyond the last estimate's surroundings.
     Range, box and mask don't count: they are there to cut around the organ."""
@@ -245,39 +249,48 @@ def _goes_on(depth_mm, taken, z, v, u):  # type: ignore[no-untyped-def]
     return taken[v, u] == LAST_BOX and abs(depth_mm[v, u] - z) < _SAME_MM
 
 
-@numba.njit(cache=True, nogil=True)
+@jit
 def _continuing(depth_mm, taken, pieces, gap, footprint, count):  # type: ignore[no-untyped-def]
-    """Along which length (count, count), mm, one piece goes on as another after a gap in which
+    """Length (count, count), mm, along which one piece continues as another after a gap in which
     something is nearer and nothing is farther."""
     lines = np.zeros((count, count))
     height, width = depth_mm.shape
     for v in range(height):
         for u in range(width):
             piece = pieces[v, u]
-            if piece == 0:
-                continue
-            z = depth_mm[v, u]
-            longest = int(gap / z)
-            for dv, du in ((0, 1), (1, 0)):
-                nearer, farther, last, y, x = 0, 0, piece, v, u
-                for length in range(1, longest + 2):
-                    y, x = y + dv, x + du
-                    if y >= height or x >= width or pieces[y, x] == piece:
-                        break
-                    if taken[y, x] == FLYING:  # anywhere in depth
-                        continue
-                    there, other = depth_mm[y, x], pieces[y, x]
-                    most = _STEP_MM + _STEEPEST_GAP * length * footprint * z
-                    if there > z + most:
-                        farther += 1
-                        if farther > _STRAY:
-                            break
-                        continue
-                    farther = 0
-                    # Where another piece begins, not in its midst: that one is itself in front.
-                    if other and other != last and nearer >= 2 and abs(there - z) < most:
-                        lines[piece, other] += z * footprint
-                        break
-                    nearer += there < z - _STEP_MM
-                    last = other
+            if piece:
+                for step in ((0, 1), (1, 0)):
+                    other = _beyond_gap(depth_mm, taken, pieces, (v, u), step, (gap, footprint))
+                    if other:
+                        lines[piece, other] += depth_mm[v, u] * footprint
     return lines
+
+
+@jit
+def _beyond_gap(depth_mm, taken, pieces, start, step, scale):  # type: ignore[no-untyped-def]
+    """The piece that continues the one at ``start``, a few pixels on; 0 for none. ``scale``: the
+    longest gap in px at distance 1, and a pixel's width there."""
+    gap, footprint = scale
+    y, x = start
+    z, piece = depth_mm[y, x], pieces[y, x]
+    nearer, farther, last = 0, 0, piece
+    for length in range(1, int(gap / z) + 2):
+        y, x = y + step[0], x + step[1]
+        if y >= depth_mm.shape[0] or x >= depth_mm.shape[1] or pieces[y, x] == piece:
+            return 0
+        if taken[y, x] == FLYING:  # anywhere in depth
+            continue
+        there, other = depth_mm[y, x], pieces[y, x]
+        most = _STEP_MM + _STEEPEST_GAP * length * footprint * z
+        if there > z + most:
+            farther += 1
+            if farther > _STRAY:
+                return 0
+            continue
+        farther = 0
+        # Where another piece begins, not in its midst: that one is itself in front.
+        if other and other != last and nearer >= 2 and abs(there - z) < most:
+            return other
+        nearer += there < z - _STEP_MM
+        last = other
+    return 0

@@ -1,4 +1,4 @@
-"""What is taken for the organ in a depth image of everything: as one value."""
+"""The switches of finding the organ in a whole depth image."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class RegionConfig(Config, frozen=True, kw_only=True):
     steepest_degrees: neighbouring pixels whose depths differ by more than a surface turned away by
         this much (and noise) would explain are parted.
     noise_mm: standard deviation of depth at 150 mm; grows with z^2.
-    organ_mm: longest and shortest extent of pieces that may be the organ, where nobody says which.
+    organ_mm: longest and shortest extent of pieces that may be the organ, if no hint names it.
     """
 
     crop: CloudConfig = CloudConfig()

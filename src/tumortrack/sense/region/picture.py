@@ -1,4 +1,4 @@
-"""Depth image or cloud -> the working picture that all steps look at; and back to points."""
+"""Depth image or cloud -> the working picture that all steps share; and back to points."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 
 from tumortrack.core.errors import InputError
 from tumortrack.core.types import DepthFrame, SensorCloud
-from tumortrack.sense.camera import deproject_pixels
+from tumortrack.sense.camera import Pinhole, deproject_pixels
 
 MOST_PIXELS = 110_000  # of a working picture: 424 x 240, and every second pixel of 848 x 480
 _POINTS_PER_PIXEL = 2
@@ -19,17 +19,12 @@ _WIDEST = 2.0  # tangent of the largest angle from the optical axis in a rasteri
 # What became of a pixel: still the organ's, or the step that took it.
 ORGAN, NO_RETURN, RANGE, BOX, MASK, LAST_BOX, PLANE, FLYING, THIN, PIECES = range(10)
 STEPS = (
-    "organ",
-    "no return",
-    "range",
-    "box",
-    "mask",
-    "last box",
-    "plane",
-    "flying",
-    "thin",
-    "other pieces",
+    *("organ", "no return", "range", "box", "mask"),
+    *("last box", "plane", "flying", "thin", "other pieces"),
 )
+
+
+jit = numba.njit(cache=True, nogil=True)
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,24 +34,24 @@ class Picture:
     Attributes:
         depth_mm: (h, w) float32, NaN where there was no return.
         taken: (h, w) uint8, one of the numbers above; the steps write into it.
-        pinhole: fx, fy, cx, cy of the working picture, px.
+        pinhole: of the working picture.
         left: ``taken`` -> which points of the content are still called ORGAN, (n,) int.
         points: some of these -> points (n, 3), camera frame, mm, float32.
     """
 
     depth_mm: np.ndarray
     taken: np.ndarray
-    pinhole: tuple[float, float, float, float]
+    pinhole: Pinhole
     left: Callable[[np.ndarray], np.ndarray]
     points: Callable[[np.ndarray], np.ndarray]
 
     @property
     def footprint(self) -> float:
         """Width of a pixel at distance 1."""
-        return 2 / (self.pinhole[0] + self.pinhole[1])
+        return 2 / (self.pinhole.fx + self.pinhole.fy)
 
     def take(self, where: np.ndarray, step: int) -> None:
-        """Give the pixels (h, w, bool) that nobody has taken yet to a step."""
+        """Give the pixels (h, w, bool) that are still the organ's to a step."""
         self.taken[where & (self.taken == ORGAN)] = step
 
     def remaining(self) -> tuple[slice, slice]:
@@ -70,7 +65,7 @@ class Picture:
     def part(self, window: tuple[slice, slice]) -> Picture:
         """Those rows and columns alone; what is decided there must be written back."""
         fx, fy, cx, cy = self.pinhole
-        pinhole = (fx, fy, cx - window[1].start, cy - window[0].start)
+        pinhole = Pinhole(fx, fy, cx - window[1].start, cy - window[0].start)
         depth_mm, taken = self.depth_mm[window].copy(), self.taken[window].copy()
         return Picture(depth_mm, taken, pinhole, self.left, self.points)
 
@@ -100,7 +95,7 @@ def picture_of_frame(frame: DepthFrame, mask: np.ndarray | None) -> Picture:
         seen_mm = frame.depth_mm[row, column].astype(np.float64)
         return deproject_pixels(row * camera.width + column, seen_mm, camera)
 
-    pinhole = (
+    pinhole = Pinhole(
         camera.fx / step,
         camera.fy / step,
         (camera.cx - step // 2) / step,
@@ -129,7 +124,7 @@ def picture_of_cloud(cloud: SensorCloud) -> Picture:
     most = np.prod(high - low + 1e-3) / MOST_PIXELS
     size = float(np.sqrt(max(np.prod(inner + 1e-3) / pixels, most)))
     width, height = (int(n) for n in np.floor((high - low) / size) + 1)
-    pinhole = (1 / size, 1 / size, float(-low[0] / size), float(-low[1] / size))
+    pinhole = Pinhole(1 / size, 1 / size, float(-low[0] / size), float(-low[1] / size))
     depth_mm, pixel = _rasterise(tangents, points_mm[:, 2].copy(), pinhole, height, width)
     taken = np.isnan(depth_mm).view(np.uint8) * np.uint8(NO_RETURN)
 
@@ -142,7 +137,29 @@ def picture_of_cloud(cloud: SensorCloud) -> Picture:
     return Picture(depth_mm, taken, pinhole, left, lambda some: points_mm[some])
 
 
-@numba.njit(cache=True, nogil=True)
+def keep_inside(picture: Picture, corners_mm: np.ndarray, step: int) -> None:
+    """Take everything outside a box: two corners (2, 3), camera frame, mm, in any order."""
+    low, high = np.sort(np.asarray(corners_mm, np.float64), axis=0)
+    _keep_inside(picture.depth_mm, picture.taken, picture.pinhole, low, high, step)
+
+
+@jit
+def _keep_inside(depth_mm, taken, pinhole, low, high, step):  # type: ignore[no-untyped-def]
+    fx, fy, cx, cy = pinhole
+    height, width = depth_mm.shape
+    for v in range(height):
+        slope_y = (v - cy) / fy
+        for u in range(width):
+            if taken[v, u]:
+                continue
+            z = depth_mm[v, u]
+            x, y = (u - cx) / fx * z, slope_y * z
+            inside = low[2] < z < high[2] and low[1] < y < high[1] and low[0] < x < high[0]
+            if not inside:
+                taken[v, u] = step
+
+
+@jit
 def _spread(points_mm, widest):  # type: ignore[no-untyped-def]
     """x / z and y / z (n, 2), NaN where not before the camera or wider than ``widest``; their
     extremes (2,) and (2,); and how far the middle 96 % spread (2,), from a histogram: the order of
@@ -161,6 +178,11 @@ def _spread(points_mm, widest):  # type: ignore[no-untyped-def]
                 count += 1
     if count == 0:
         return tangents, np.zeros(2), np.zeros(2), np.zeros(2)
+    return tangents, low, high, _inner_spread(tangents, low, high, count)
+
+
+@jit
+def _inner_spread(tangents, low, high, count):  # type: ignore[no-untyped-def]
     bins = 1000
     found = np.zeros((2, bins), np.int64)
     for i in range(len(tangents)):
@@ -175,10 +197,10 @@ def _spread(points_mm, widest):  # type: ignore[no-untyped-def]
             total += one
             if 0.02 * count < total < 0.98 * count:
                 inner[k] += (high[k] - low[k]) / bins
-    return tangents, low, high, inner
+    return inner
 
 
-@numba.njit(cache=True, nogil=True)
+@jit
 def _rasterise(tangents, z_mm, pinhole, height, width):  # type: ignore[no-untyped-def]
     """The nearest depth in each pixel (h, w), and each point's pixel (n,), -1 outside."""
     fx, fy, cx, cy = pinhole
@@ -197,7 +219,7 @@ def _rasterise(tangents, z_mm, pinhole, height, width):  # type: ignore[no-untyp
     return depth_mm.reshape(height, width), pixel
 
 
-@numba.njit(cache=True, nogil=True)
+@jit
 def _count(taken, kinds):  # type: ignore[no-untyped-def]
     found = np.zeros(kinds, np.int64)
     for v in range(len(taken)):

@@ -9,31 +9,35 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
-import numba
 import numpy as np
 
+from tumortrack.sense.noise import REFERENCE_MM
 from tumortrack.sense.region.config import RegionConfig
-from tumortrack.sense.region.picture import FLYING, ORGAN, Picture
+from tumortrack.sense.region.picture import FLYING, ORGAN, Picture, jit
 
-REFERENCE_MM = 150.0  # the distance at which ``noise_mm`` is stated
 _CREASE_REACH_MM = 4.0
 _FEWEST_NEIGHBOURS = 3  # of 8; a straight edge leaves 5, a right angle 3
 _LONGEST_HOLE = 5  # px; failed matches, not a gap
 
-_jit = numba.njit(cache=True, nogil=True)
 
-
-def jump_scale(picture: Picture, config: RegionConfig) -> tuple[float, float]:
+class Jump(NamedTuple):
     """Neighbouring pixels at depth z belong together if their depths differ by less than
-    ``first * z + second * z**2``: slope, and four standard deviations of noise."""
+    ``slope * z + noise * z**2``: the steepest surface, and four standard deviations of noise."""
+
+    slope: float
+    noise: float
+
+
+def _jump(picture: Picture, config: RegionConfig) -> Jump:
     slope = math.tan(math.radians(config.steepest_degrees)) * picture.footprint
-    return slope, 4 * config.noise_mm / REFERENCE_MM**2
+    return Jump(slope, 4 * config.noise_mm / REFERENCE_MM**2)
 
 
 def remove_flying(picture: Picture, config: RegionConfig) -> None:
     """Take pixels with hardly a neighbour at their depth: between two surfaces, or alone."""
-    _take_lonely(picture.depth_mm, picture.taken, jump_scale(picture, config), FLYING)
+    _take_lonely(picture.depth_mm, picture.taken, _jump(picture, config))
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,12 +47,12 @@ class Edges:
 
     depth_mm: np.ndarray
     distance: np.ndarray
-    jump: tuple[float, float]
+    jump: Jump
 
 
 def find_edges(picture: Picture, config: RegionConfig) -> Edges:
     """Edges between what is left of the picture."""
-    jump = jump_scale(picture, config)
+    jump = _jump(picture, config)
     depth_mm = _without_holes(picture.depth_mm, picture.taken, jump)
     crease = (config.crease_mm, _CREASE_REACH_MM / picture.footprint)
     return Edges(depth_mm, _edge_distance(depth_mm, jump, crease), jump)
@@ -65,8 +69,8 @@ def find_pieces(picture: Picture, edges: Edges, opening_mm: float) -> tuple[np.n
     return pieces, count
 
 
-@_jit
-def _take_lonely(depth_mm, taken, jump, step):  # type: ignore[no-untyped-def]
+@jit
+def _take_lonely(depth_mm, taken, jump):  # type: ignore[no-untyped-def]
     height, width = depth_mm.shape
     lonely = np.zeros((height, width), np.bool_)
     for v in range(height):
@@ -74,7 +78,7 @@ def _take_lonely(depth_mm, taken, jump, step):  # type: ignore[no-untyped-def]
             if taken[v, u]:
                 continue
             z = depth_mm[v, u]
-            most = jump[0] * z + jump[1] * z * z
+            most = jump.slope * z + jump.noise * z * z
             near = 0
             for dv in range(-1, 2):
                 for du in range(-1, 2):
@@ -82,15 +86,15 @@ def _take_lonely(depth_mm, taken, jump, step):  # type: ignore[no-untyped-def]
                     if 0 <= y < height and 0 <= x < width:
                         near += taken[y, x] == 0 and abs(depth_mm[y, x] - z) < most
                     else:
-                        near += 1  # outside: nobody knows
+                        near += 1  # outside: unknown
             lonely[v, u] = near - 1 < _FEWEST_NEIGHBOURS
     for v in range(height):
         for u in range(width):
             if lonely[v, u]:
-                taken[v, u] = step
+                taken[v, u] = FLYING
 
 
-@_jit
+@jit
 def _without_holes(depth_mm, taken, jump):  # type: ignore[no-untyped-def]
     """What is left (NaN elsewhere), with short failures along a row bridged where both ends
     agree."""
@@ -105,14 +109,14 @@ def _without_holes(depth_mm, taken, jump):  # type: ignore[no-untyped-def]
             out[v, u] = z
             if last >= 0 and 1 < u - last <= _LONGEST_HOLE + 1:
                 before = depth_mm[v, last]
-                if abs(before - z) < jump[0] * z + jump[1] * z * z:
+                if abs(before - z) < jump.slope * z + jump.noise * z * z:
                     for x in range(last + 1, u):
                         out[v, x] = before + (z - before) * (x - last) / (u - last)
             last = u
     return out
 
 
-@_jit
+@jit
 def _edge_distance(depth_mm, jump, crease):  # type: ignore[no-untyped-def]
     """Chamfer distance (Borgefors 1986, doi 10.1016/S0734-189X(86)80047-0) in px to the nearest
     edge; 0 on edges and where nothing is left. The image's border is no edge: the frame of pixels
@@ -120,9 +124,9 @@ def _edge_distance(depth_mm, jump, crease):  # type: ignore[no-untyped-def]
     height, width = depth_mm.shape
     far = np.float32(height + width)
     out = np.full((height + 2, width + 2), far, np.float32)
-    _mark_jumps(depth_mm, out, np.float32(jump[0]), np.float32(jump[1]))
+    _mark_jumps(depth_mm, out, np.float32(jump.slope), np.float32(jump.noise))
     if crease[0] > 0:
-        _mark_creases(depth_mm, out, np.float32(jump[1]), crease)
+        _mark_creases(depth_mm, out, np.float32(jump.noise), crease)
     one, oblique = np.float32(0.955), np.float32(1.369)
     for v in range(1, height + 1):
         for u in range(1, width + 1):
@@ -137,7 +141,7 @@ def _edge_distance(depth_mm, jump, crease):  # type: ignore[no-untyped-def]
     return out[1:-1, 1:-1].copy()
 
 
-@_jit
+@jit
 def _mark_jumps(depth_mm, out, slope, noise):  # type: ignore[no-untyped-def]
     """Zero what is missing, and both sides of a jump; ``out`` is larger by 1 on every side."""
     height, width = depth_mm.shape
@@ -153,7 +157,7 @@ def _mark_jumps(depth_mm, out, slope, noise):  # type: ignore[no-untyped-def]
                 out[v + 1, u + 1] = out[v + 2, u + 1] = 0
 
 
-@_jit
+@jit
 def _mark_creases(depth_mm, out, noise, crease):  # type: ignore[no-untyped-def]
     """Zero where the surface lies deeper than its neighbourhood to both sides."""
     height, width = depth_mm.shape
@@ -177,7 +181,7 @@ def _mark_creases(depth_mm, out, noise, crease):  # type: ignore[no-untyped-def]
                 out[v + 1, u + 1] = 0
 
 
-@_jit
+@jit
 def _grow(depth_mm, pieces, jump, radius):  # type: ignore[no-untyped-def]
     """Grow all cores at the same pace, a pixel a round, never over a jump."""
     height, width = depth_mm.shape
@@ -202,7 +206,7 @@ def _grow(depth_mm, pieces, jump, radius):  # type: ignore[no-untyped-def]
         z = depth_mm[v, u]
         if rounds[place] >= 1.4 * radius / z + 2:
             continue
-        most = jump[0] * z + jump[1] * z * z
+        most = jump.slope * z + jump.noise * z * z
         for dv in range(-1, 2):
             for du in range(-1, 2):
                 y, x = v + dv, u + du

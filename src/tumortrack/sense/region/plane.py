@@ -8,15 +8,14 @@ little behind a plane speak against it.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
-import numba
 import numpy as np
 
 from tumortrack.sense.region.config import RegionConfig
-from tumortrack.sense.region.picture import NO_RETURN, PLANE, Picture
+from tumortrack.sense.region.picture import NO_RETURN, PLANE, Picture, jit
 
-_LOOK_AT = 1200  # pixels
+_SAMPLED = 1200  # pixels
 _TRIES = 150
 _BEYOND_MM = 120.0  # so far behind the range there may be something to fit to
 _STEEPEST = 0.35  # cosine of the largest angle between the plane's normal and the optical axis
@@ -26,11 +25,10 @@ _MOST_BEHIND = 0.03  # of the points on the plane: more is a cavity, and the org
 _NARROWEST_MM = 120.0  # extent of a background across its long side
 
 
-@dataclass(frozen=True)
-class BackgroundPlane:
+class BackgroundPlane(NamedTuple):
     """Points with ``normal @ point = offset_mm``; the unit normal points to the camera, so that
-    ``normal @ point - offset_mm`` is the height above it. ``half_mm``: what is lower is the
-    plane's."""
+    ``normal @ point - offset_mm`` is the height above it. ``half_mm``: what is lower belongs to
+    the plane."""
 
     normal: np.ndarray
     offset_mm: float
@@ -43,15 +41,7 @@ def remove_plane(
     """Take the background plane and what lies behind it, where there is one."""
     plane = find_plane(picture, config, rng)
     if plane is not None:
-        _take_below(
-            picture.depth_mm,
-            picture.taken,
-            picture.pinhole,
-            plane.normal,
-            plane.offset_mm,
-            plane.half_mm,
-            PLANE,
-        )
+        _take_below(picture.depth_mm, picture.taken, picture.pinhole, plane)
     return plane
 
 
@@ -97,9 +87,9 @@ def find_plane(
 def _some_points(picture: Picture, far_mm: float, rng: np.random.Generator) -> np.ndarray:
     """Points (n, 3), float32, of random pixels not farther than ``far_mm``."""
     height, width = picture.depth_mm.shape
-    pixel = rng.integers(height * width, size=3 * _LOOK_AT)
+    pixel = rng.integers(height * width, size=3 * _SAMPLED)
     z = picture.depth_mm.ravel()[pixel]
-    good = np.flatnonzero((picture.taken.ravel()[pixel] != NO_RETURN) & (z < far_mm))[:_LOOK_AT]
+    good = np.flatnonzero((picture.taken.ravel()[pixel] != NO_RETURN) & (z < far_mm))[:_SAMPLED]
     row, column = np.divmod(pixel[good], width)
     fx, fy, cx, cy = picture.pinhole
     z = z[good]
@@ -108,10 +98,10 @@ def _some_points(picture: Picture, far_mm: float, rng: np.random.Generator) -> n
     return out
 
 
-@numba.njit(cache=True, nogil=True)
+@jit
 def _consensus(points, triples, tolerance):  # type: ignore[no-untyped-def]
     """The plane through three points with the best score: normal and offset. A tenth of the
-    points tells which planes are hopeless."""
+    points rejects hopeless planes."""
     best, best_offset = -np.inf, 0.0
     best_normal = np.zeros(3, np.float32)
     few = len(points) // 10
@@ -121,7 +111,7 @@ def _consensus(points, triples, tolerance):  # type: ignore[no-untyped-def]
         cx, cy, cz = c[0] - a[0], c[1] - a[1], c[2] - a[2]
         nx, ny, nz = by * cz - bz * cy, bz * cx - bx * cz, bx * cy - by * cx
         length = np.sqrt(nx * nx + ny * ny + nz * nz)
-        if length < 100.0 or abs(nz) < _STEEPEST * length:  # mm^2: a sliver says nothing
+        if length < 100.0 or abs(nz) < _STEEPEST * length:  # mm^2: slivers are ill-conditioned
             continue
         to_camera = -1 / length if nz > 0 else 1 / length
         nx, ny, nz = nx * to_camera, ny * to_camera, nz * to_camera
@@ -136,7 +126,7 @@ def _consensus(points, triples, tolerance):  # type: ignore[no-untyped-def]
     return best, best_normal, best_offset
 
 
-@numba.njit(cache=True, nogil=True)
+@jit
 def _score(points, nx, ny, nz, offset, tolerance):  # type: ignore[no-untyped-def]
     score = np.float32(0)
     for i in range(len(points)):
@@ -149,9 +139,10 @@ def _score(points, nx, ny, nz, offset, tolerance):  # type: ignore[no-untyped-de
     return score
 
 
-@numba.njit(cache=True, nogil=True)
-def _take_below(depth_mm, taken, pinhole, normal, offset, half, step):  # type: ignore[no-untyped-def]
+@jit
+def _take_below(depth_mm, taken, pinhole, plane):  # type: ignore[no-untyped-def]
     fx, fy, cx, cy = pinhole
+    normal, offset, half = plane
     height, width = depth_mm.shape
     for v in range(height):
         across = normal[1] * (v - cy) / fy + normal[2]
@@ -159,4 +150,4 @@ def _take_below(depth_mm, taken, pinhole, normal, offset, half, step):  # type: 
             if taken[v, u] == 0:
                 above = depth_mm[v, u] * (normal[0] * (u - cx) / fx + across) - offset
                 if above < half:
-                    taken[v, u] = step
+                    taken[v, u] = PLANE

@@ -14,6 +14,8 @@ from tumortrack.core.types import Anatomy
 if TYPE_CHECKING:
     from tumortrack.simulate.elastic.body import ElasticBody
 
+Points = Float[np.ndarray, "n 3"]
+
 
 @dataclass(frozen=True)
 class View:
@@ -22,16 +24,14 @@ class View:
     anatomy_ct: Anatomy
     # visible(points_ct) -> bool each: nothing before the point, and the point in the picture
     visible: Callable[[np.ndarray], np.ndarray]
-    body: ElasticBody | None = (
-        None  # what the organ can do elastically, where a deformation needs it
-    )
+    body: ElasticBody | None = None  # where the deformation's configuration asks for one
 
 
 class Deformation(Protocol):
     """A sampled deformation, a map of space."""
 
-    def apply(self, points_ct: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-        """New positions (float32) of points (n, 3), CT frame, mm."""
+    def apply(self, points_ct: Points) -> Points:
+        """New positions (float32) of points, CT frame, mm."""
         ...
 
     def record(self) -> dict:

@@ -1,4 +1,4 @@
-"""The paper's deformation: drag visible vertices, neighbours follow with Gaussian falloff.
+"""The paper's deformation: visible vertices are dragged, neighbours follow with Gaussian falloff.
 
 Source: the paper, section Localization and table "compare_deformations". The table calls its
 third number sigma^2. Its values are 100/3, 50/3, 35/3, 30/3, 20/3 and 10/3: radii of 100 ...
@@ -17,11 +17,11 @@ from typing import Literal
 
 import numba
 import numpy as np
-from jaxtyping import Float, Float32
+from jaxtyping import Float32
 
 from tumortrack.core.config import Config
 from tumortrack.core.errors import TumortrackError
-from tumortrack.simulate.deform.base import View
+from tumortrack.simulate.deform.base import Points, View
 
 # (largest distance in mm, falloff, repeats), table "compare_deformations"
 Step = tuple[float, float, int]
@@ -31,16 +31,8 @@ CONFIGURATIONS: dict[int, tuple[Step, ...]] = {
     3: ((8, 11.7, 1), (6, 10, 1), (4, 6.7, 1), (4, 3.3, 5), (2, 3.3, 10)),
     4: ((16, 13.3, 1), (16, 10, 1), (16, 6.7, 1)),
     5: ((10, 33.3, 1), (16, 13.3, 1), (16, 6.7, 1)),
-    6: (
-        (16, 33.3, 1),
-        (16, 16.7, 1),
-        (8, 11.7, 1),
-        (6, 10, 1),
-        (4, 6.7, 1),
-        (4, 3.3, 5),
-        (2, 3.3, 10),
-    ),
 }
+CONFIGURATIONS[6] = (*CONFIGURATIONS[2], *CONFIGURATIONS[3][1:])
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,16 +43,11 @@ class Drags:
     shifts_mm: Float32[np.ndarray, "k 3"]
     sigmas_mm: Float32[np.ndarray, " k"]
 
-    def apply(self, points_ct: Float[np.ndarray, "n 3"]) -> Float32[np.ndarray, "n 3"]:
+    def apply(self, points_ct: Points) -> Float32[np.ndarray, "n 3"]:
         return _drag(points_ct.astype(np.float32), self.centres_ct, self.shifts_mm, self.sigmas_mm)
 
     def record(self) -> dict:
-        return {
-            "kind": "drag",
-            "centres_ct": self.centres_ct.tolist(),
-            "shifts_mm": self.shifts_mm.tolist(),
-            "sigmas_mm": self.sigmas_mm.tolist(),
-        }
+        return {"kind": "drag"} | {name: value.tolist() for name, value in vars(self).items()}
 
 
 class DragConfig(Config, frozen=True, tag="drag"):
@@ -73,8 +60,7 @@ class DragConfig(Config, frozen=True, tag="drag"):
         """Draw centres among the visible vertices of the undeformed organ, uniformly; a
         distance uniform up to the step's; a direction uniform on the sphere."""
         steps = [(d, s) for d, s, times in self.steps for _ in range(times)]
-        distances = np.array([d for d, _ in steps])
-        sigmas = np.array([s for _, s in steps])
+        distances, sigmas = np.array(steps, float).reshape(-1, 2).T
         if self.falloff == "variance":
             sigmas = np.sqrt(sigmas)
         start = _visible_vertices(view, len(steps), rng).astype(np.float32)
@@ -96,8 +82,8 @@ def _visible_vertices(view: View, count: int, rng: np.random.Generator) -> np.nd
     raise TumortrackError("the camera sees none of the organ's vertices; check the pose range.")
 
 
-_BLOCK = 1024  # points whose coordinates stay in the first cache through all drags
-_SMALLEST = np.float32(-12.0)  # exponents below, factors of 6e-6, count as none
+_BLOCK = 1024  # points whose coordinates stay in the L1 cache through all drags
+_SMALLEST = np.float32(-12.0)  # exponents below, factors of 6e-6, count as zero
 _LOG2_E = np.float32(1.4426950408889634)
 # 2^r = sum of (r ln 2)^k / k!, within 1.2e-7 for r in -0.5 ... 0.5
 _T1, _T2, _T3, _T4, _T5, _T6 = (
@@ -109,7 +95,7 @@ _T1, _T2, _T3, _T4, _T5, _T6 = (
 # bit on the machine that made it, and elsewhere to that precision.
 @numba.njit(cache=True, nogil=True, fastmath=True, inline="always")
 def _exp(x):  # type: ignore[no-untyped-def]
-    """For -80 < x <= 0. Unlike the C library's it is done for many points at once."""
+    """For -80 < x <= 0. Unlike the C library's it is vectorized over points."""
     binary = x * _LOG2_E
     whole = np.floor(binary + np.float32(0.5))
     r = binary - whole

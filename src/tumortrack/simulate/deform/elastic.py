@@ -1,7 +1,4 @@
-"""Deformations that the organ's own elastic body makes: states of a library, scaled and mixed.
-
-The body (``simulate.elastic``) is built once for an anatomy and reaches the model by the view.
-"""
+"""Deformations of the organ's own elastic body: states of its library, scaled and mixed."""
 
 from __future__ import annotations
 
@@ -9,11 +6,11 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from jaxtyping import Float, Float32
+from jaxtyping import Float32
 
 from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError
-from tumortrack.simulate.deform.base import View
+from tumortrack.simulate.deform.base import Points, View
 from tumortrack.simulate.elastic.body import BodyConfig, ElasticBody
 
 
@@ -28,7 +25,7 @@ class ElasticDeformation:
     def _velocity(self) -> Float32[np.ndarray, "i j k 3"]:
         return self.body.velocity(self.coefficients)
 
-    def apply(self, points_ct: Float[np.ndarray, "n 3"]) -> Float32[np.ndarray, "n 3"]:
+    def apply(self, points_ct: Points) -> Float32[np.ndarray, "n 3"]:
         return self.body.follow(self._velocity, points_ct)
 
     def record(self) -> dict:
@@ -36,8 +33,8 @@ class ElasticDeformation:
 
 
 class ElasticConfig(Config, frozen=True, tag="elastic"):
-    """A random state of the body's library times ``scale``; a share ``mixed`` of scenes adds a
-    second one times ``second_scale``. ``body`` says how the library is made."""
+    """A random state of the body's library times ``scale``; a fraction ``mixed`` of scenes
+    adds a second one times ``second_scale``. ``body`` says how the library is made."""
 
     scale: tuple[float, float] = (0.2, 1.1)
     mixed: float = 0.25

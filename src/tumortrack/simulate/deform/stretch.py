@@ -1,9 +1,9 @@
-"""Global, volume-keeping deformation: squeeze along one axis, bulge across it, and bend.
+"""Global, volume-preserving deformation: squeeze along one axis, bulge across it, and bend.
 
 Ours, not the paper's: drags of single vertices never make an organ flatter or more curved as a
-whole, which is what plates, gravity and a pushing instrument do. Both maps keep every volume
-element: the stretch has determinant 1, and the bend moves points across the direction that its
-amount depends on.
+whole, which is what plates, gravity and a pushing instrument do. Both maps preserve volume: the
+stretch has determinant 1, and the bend moves points perpendicular to the direction on which its
+amount depends.
 """
 
 from __future__ import annotations
@@ -12,11 +12,11 @@ from dataclasses import dataclass
 
 import numba
 import numpy as np
-from jaxtyping import Float, Float32, Float64
+from jaxtyping import Float32, Float64
 from scipy.spatial.transform import Rotation
 
 from tumortrack.core.config import Config
-from tumortrack.simulate.deform.base import View
+from tumortrack.simulate.deform.base import Points, View
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,20 +30,13 @@ class Stretch:
     sagitta_mm: float
     reach_mm: float
 
-    def apply(self, points_ct: Float[np.ndarray, "n 3"]) -> Float32[np.ndarray, "n 3"]:
+    def apply(self, points_ct: Points) -> Float32[np.ndarray, "n 3"]:
         bend = self.along / self.reach_mm, self.sagitta_mm * self.across
         return _moved(points_ct, self.centre_ct, self.matrix, *bend)
 
     def record(self) -> dict:
-        return {
-            "kind": "stretch",
-            "centre_ct": self.centre_ct.tolist(),
-            "matrix": self.matrix.tolist(),
-            "along": self.along.tolist(),
-            "across": self.across.tolist(),
-            "sagitta_mm": self.sagitta_mm,
-            "reach_mm": self.reach_mm,
-        }
+        numbers = {name: np.asarray(value).tolist() for name, value in vars(self).items()}
+        return {"kind": "stretch"} | numbers
 
 
 class StretchConfig(Config, frozen=True, tag="stretch"):
@@ -73,7 +66,7 @@ class StretchConfig(Config, frozen=True, tag="stretch"):
 
 @numba.njit(cache=True, nogil=True)
 def _moved(points, centre, matrix, along, bend):  # type: ignore[no-untyped-def]
-    """One pass over the points, a fifth of the time of as many arrays as there are terms."""
+    """One pass over the points: a fifth of the time of NumPy's one array per term."""
     out = np.empty(points.shape, np.float32)
     cx, cy, cz = centre
     ax, ay, az = along

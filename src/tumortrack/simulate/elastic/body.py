@@ -1,4 +1,10 @@
-"""A body: what an organ can do elastically, as numbers small enough for every scene and frame."""
+"""An elastic body: an organ's displacement modes and typical states, small enough for every frame.
+
+Finite elements (``finite``) of the organ respond to random loads; the principal components of the
+responses are its modes (``modes``). In their space the organ takes loads in its bed
+(``equilibrium``, ``loads``), which gives a library of states. See docs/method.md, section "Elastic
+deformations".
+"""
 
 from __future__ import annotations
 
@@ -12,21 +18,25 @@ from jaxtyping import Float, Float32, Float64
 
 from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError
+from tumortrack.core.geometry import unit
 from tumortrack.core.types import Anatomy
-from tumortrack.simulate.elastic.flow import combine, follow, project, steps_for
+from tumortrack.simulate.elastic.flow import LatticeField, combine, follow, project, steps_for
 
 if TYPE_CHECKING:
-    from tumortrack.simulate.elastic.settle import ReducedModel
+    from tumortrack.simulate.elastic.equilibrium import ReducedModel
 
+Points = Float[np.ndarray, "n 3"]
+Moved = Float32[np.ndarray, "n 3"]
+Field = Float32[np.ndarray, "i j k 3"]
 _RIDGE = 1e-4  # mm2, on the covariance: no coefficient is ever known for sure
 _ARRAYS = ("origin_mm", "spacing_mm", "center_ct", "modes", "states")
 
 
 class BodyConfig(Config, frozen=True):
-    """How an organ's body is built. ``bed_anywhere``: share of states whose bed lies on any side
+    """How an organ's body is built. ``bed_anywhere``: fraction of states whose bed lies on any side
     of the organ, instead of opposite to the direction that faces the camera."""
 
-    cells: int = 1000  # so many cubes have the organ's volume: decides the spacing
+    cells: int = 1000  # cubes in the organ's volume: decides the spacing
     modes: int = 48
     responses: int = 480
     contrasts: tuple[float, ...] = (1.0, 3.0, 10.0)  # of tumors' stiffness, among the responses
@@ -86,49 +96,37 @@ class ElasticBody:
         """The inverse of ``covariance``."""
         return np.linalg.inv(self.covariance)
 
-    def velocity(self, coefficients: Float[np.ndarray, " m"]) -> Float32[np.ndarray, "i j k 3"]:
+    def velocity(self, coefficients: Float[np.ndarray, " m"]) -> Field:
         """The field that points follow, mm per unit of time, at the lattice's nodes."""
         return combine(self.modes, np.asarray(coefficients, np.float32))
 
-    def carry(
-        self, coefficients: Float[np.ndarray, " m"], points_ct: Float[np.ndarray, "n 3"]
-    ) -> Float32[np.ndarray, "n 3"]:
-        """Where points of the undeformed organ or about it are in a state."""
+    def carry(self, coefficients: Float[np.ndarray, " m"], points_ct: Points) -> Moved:
+        """Where points of the undeformed organ or near it are in a state; the negative coefficients
+        move them back."""
         return self.follow(self.velocity(coefficients), points_ct)
 
-    def back(
-        self, coefficients: Float[np.ndarray, " m"], points: Float[np.ndarray, "n 3"]
-    ) -> Float32[np.ndarray, "n 3"]:
-        """The inverse of ``carry``."""
-        return self.carry(-coefficients, points)
+    def follow(self, velocity_mm: Field, points: Points, steps: int | None = None) -> Moved:
+        """Where points are after one unit of time in a velocity field on this body's lattice,
+        integrated in ``steps`` (None: as many as the field needs)."""
+        if steps is None:
+            steps = steps_for(velocity_mm, self.spacing_mm)
+        return follow(self._field(velocity_mm), np.ascontiguousarray(points, np.float32), steps)
 
-    def follow(
-        self, velocity_mm: Float32[np.ndarray, "i j k 3"], points: Float[np.ndarray, "n 3"]
-    ) -> Float32[np.ndarray, "n 3"]:
-        """Where points are after one unit of time in a field on this body's lattice."""
-        start = np.ascontiguousarray(points, np.float32)
-        steps = steps_for(velocity_mm, self.spacing_mm)
-        return follow(velocity_mm, self.origin_mm, np.float32(self.spacing_mm), start, steps)
-
-    def modes_at(self, points: Float[np.ndarray, "n 3"]) -> Float32[np.ndarray, "n 3 m"]:
+    def modes_at(self, points: Points) -> Float32[np.ndarray, "n 3 m"]:
         """The modes at points of the CT frame."""
-        eye = np.eye(3, dtype=np.float32)
-        along = [self.modes_along(points, np.tile(axis, (len(points), 1))) for axis in eye]
+        place, field = np.ascontiguousarray(points, np.float32), self._field(self.modes)
+        axes = np.eye(3, dtype=np.float32)
+        along = [project(field, place, np.tile(axis, (len(place), 1))) for axis in axes]
         return np.stack(along, 1)
-
-    def modes_along(
-        self, points: Float[np.ndarray, "n 3"], directions: Float[np.ndarray, "n 3"]
-    ) -> Float32[np.ndarray, "n m"]:
-        """The modes at points of the CT frame, each along a direction of the point's own."""
-        place = np.ascontiguousarray(points, np.float32)
-        along = np.ascontiguousarray(directions, np.float32)
-        return project(self.modes, self.origin_mm, np.float32(self.spacing_mm), place, along)
 
     def within_reach(self, coefficients: Float32[np.ndarray, " m"]) -> Float32[np.ndarray, " m"]:
         """The same with no more swelling or shrinking than the library has."""
         kept = coefficients.copy()
         kept[-1] = np.clip(kept[-1], self.states[:, -1].min(), self.states[:, -1].max())
         return kept
+
+    def _field(self, values: Float32[np.ndarray, "i j k ..."]) -> LatticeField:
+        return LatticeField(values, self.origin_mm, np.float32(self.spacing_mm))
 
     def to_arrays(self) -> dict[str, np.ndarray]:
         """Everything as named arrays, for a file."""
@@ -154,10 +152,7 @@ class ElasticBody:
 
 
 def build_body(
-    anatomy_ct: Anatomy,
-    up_lps: tuple[float, float, float],
-    config: BodyConfig,
-    seed: int,
+    anatomy_ct: Anatomy, up_lps: tuple[float, float, float], config: BodyConfig, seed: int
 ) -> ElasticBody:
     """Finite elements of an organ, its modes, and a library of states under random loads.
 
@@ -171,7 +166,7 @@ def build_body(
     from tumortrack.simulate.elastic.loads import random_state
 
     rng = np.random.default_rng([seed, 0xE1A57])
-    up = np.asarray(up_lps, float) / np.linalg.norm(up_lps)
+    up = unit(np.asarray(up_lps, float))
     reduced = reduced_organ(anatomy_ct, up, config, rng)
     drawn = (random_state(reduced, up, config.bed_anywhere, rng) for _ in range(2 * config.states))
     states = list(islice((state for state in drawn if state is not None), config.states))
@@ -184,10 +179,7 @@ def build_body(
 
 
 def reduced_organ(
-    anatomy_ct: Anatomy,
-    up: Float64[np.ndarray, " 3"],
-    config: BodyConfig,
-    rng: np.random.Generator,
+    anatomy_ct: Anatomy, up: Float64[np.ndarray, " 3"], config: BodyConfig, rng: np.random.Generator
 ) -> ReducedModel:
     """An organ in the space of its modes, ready for loads; ``up`` is a unit vector.
 
@@ -195,20 +187,18 @@ def reduced_organ(
         InputError: a surface that turns inside, or numbers that make no body.
     """
     _check(anatomy_ct, config)
-    from tumortrack.simulate.elastic.finite import solid_of
-    from tumortrack.simulate.elastic.lattice import lattice_over
-    from tumortrack.simulate.elastic.modes import modes_of, random_loads
-    from tumortrack.simulate.elastic.settle import ReducedModel
-    from tumortrack.simulate.elastic.surface import patches_of
+    from tumortrack.simulate.elastic.equilibrium import ReducedModel
+    from tumortrack.simulate.elastic.finite import ElementLattice, LatticeSolid
+    from tumortrack.simulate.elastic.modes import modes_of, patches_of, random_loads
 
     organ = anatomy_ct.organ
-    spacing = float(np.cbrt(organ.volume_mm3 / config.cells))
-    solid = solid_of(anatomy_ct, lattice_over(organ.box_mm, spacing), config.poisson)
+    spacing_mm = float(np.cbrt(organ.volume_mm3 / config.cells))
+    lattice = ElementLattice.around(organ.box_mm, spacing_mm)
+    solid = LatticeSolid(anatomy_ct, lattice, config.poisson)
     patches = patches_of(organ, config.patches, rng)
     loads = random_loads(solid, patches, up, config.responses, rng)
-    return ReducedModel(
-        solid, modes_of(solid, patches, config.modes, config.contrasts, loads), patches
-    )
+    modes = modes_of(solid, patches, config.modes, config.contrasts, loads)
+    return ReducedModel(solid, modes, patches)
 
 
 def body_of(reduced: ReducedModel, states: Float32[np.ndarray, "s m"]) -> ElasticBody:
@@ -218,7 +208,7 @@ def body_of(reduced: ReducedModel, states: Float32[np.ndarray, "s m"]) -> Elasti
         solid.lattice.origin_mm.astype(np.float32),
         solid.lattice.spacing_mm,
         solid.center_mm,
-        solid.spread(reduced.modes.shapes).astype(np.float32),
+        solid.spread(reduced.modes).astype(np.float32),
         states,
     )
 

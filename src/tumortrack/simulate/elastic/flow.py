@@ -1,4 +1,4 @@
-"""Kernels: a velocity on a lattice, sampled and followed.
+"""Kernels: a velocity field on a lattice, sampled and integrated.
 
 The deformation is the exponential of a stationary velocity field (Arsigny et al. 2006, doi
 10.1007/11866565_113): points follow the field for one unit of time. It is one-to-one, its inverse
@@ -8,6 +8,7 @@ follows the opposite field, and a field without divergence keeps volumes, howeve
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numba
 import numpy as np
@@ -18,8 +19,17 @@ _FEWEST, _MOST = 3, 24
 BLOCK = 64  # points that take each step together: one alone waits for its last step's numbers
 
 
+class LatticeField(NamedTuple):
+    """Values at the nodes ``origin_mm + spacing_mm * (i, j, k)``, all float32: a velocity
+    (i, j, k, 3) in mm per unit of time, or modes (i, j, k, 3, m)."""
+
+    values: Float32[np.ndarray, "i j k ..."]
+    origin_mm: Float32[np.ndarray, " 3"]
+    spacing_mm: np.float32
+
+
 def steps_for(velocity: Float32[np.ndarray, "i j k 3"], spacing_mm: float) -> int:
-    """Steps that a field needs: as many as points beside each other part from each other."""
+    """Steps that a field needs: the more, the faster neighbouring points move apart."""
     return int(steps_of(velocity, np.float32(spacing_mm)))
 
 
@@ -59,8 +69,8 @@ def steps_of(velocity, spacing):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, fastmath=True, nogil=True)
 def combine(modes, coefficients):  # type: ignore[no-untyped-def]
-    """``modes @ coefficients``, (..., m) by (m,), float32. A library's product would wake threads
-    that then wait busily, in the way of those that carry points."""
+    """``modes @ coefficients``, (..., m) by (m,), float32. BLAS would wake threads that then wait
+    busily, in the way of those that move points."""
     rows = modes.reshape(-1, len(coefficients))
     out = np.empty(len(rows), np.float32)
     for n in range(len(rows)):
@@ -74,7 +84,7 @@ def combine(modes, coefficients):  # type: ignore[no-untyped-def]
 @numba.njit(cache=True, fastmath=True, nogil=True, error_model="numpy")
 def advance(velocity, places, speeds, count, half, move):  # type: ignore[no-untyped-def]
     """One step of ``count`` points: ``places`` and ``speeds`` (3, BLOCK), in cells and mm per unit
-    of time; the speed at ``places + half * speeds`` carries a place on by ``move`` of it.
+    of time. A place moves by ``move`` times the speed at ``places + half * speeds``.
 
     Trilinear; beyond the lattice the value of its nearest border.
     """
@@ -83,7 +93,7 @@ def advance(velocity, places, speeds, count, half, move):  # type: ignore[no-unt
     most_x = np.float32(velocity.shape[0]) - most
     most_y = np.float32(velocity.shape[1]) - most
     most_z = np.float32(velocity.shape[2]) - most
-    # Unsigned indices: no question of whether one counts from the end.
+    # Unsigned indices: no check for negative ones, which count from the end.
     row = np.uint32(3 * velocity.shape[2])
     plane = np.uint32(velocity.shape[1] * row)
     for p in range(count):
@@ -110,14 +120,14 @@ def advance(velocity, places, speeds, count, half, move):  # type: ignore[no-unt
 
 @numba.njit(cache=True, fastmath=True, nogil=True)
 def block():  # type: ignore[no-untyped-def]
-    """Room for the places, speeds and places halfway of one block of points."""
+    """Buffers for the places, speeds and places halfway of one block of points."""
     room = np.empty((3, 3, BLOCK), np.float32)
     return room[0], room[1], room[2]
 
 
 @numba.njit(cache=True, fastmath=True, nogil=True)
 def enter(points, origin, spacing, places):  # type: ignore[no-untyped-def]
-    """Take up to ``BLOCK`` points (n, 3), mm, as places in cells."""
+    """Write up to ``BLOCK`` points (n, 3), mm, as places in cells."""
     per_cell = np.float32(1) / spacing
     for p in range(len(points)):
         for axis in range(3):
@@ -126,7 +136,7 @@ def enter(points, origin, spacing, places):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, fastmath=True, nogil=True)
 def travel(velocity, spacing, steps, count, places, speeds, middles):  # type: ignore[no-untyped-def]
-    """Move ``count`` places of a block for one unit of time, noting where they were halfway.
+    """Move ``count`` places of a block for one unit of time; ``middles`` are those halfway.
 
     Midpoint rule, with the middle of a step predicted from the last step's velocity: of second
     order for one sample a step, and nearly symmetric, so that the opposite field leads back to
@@ -138,7 +148,7 @@ def travel(velocity, spacing, steps, count, places, speeds, middles):  # type: i
     speeds[:, :count] = zero
     advance(velocity, places, speeds, count, half, zero)
     for step in range(steps):
-        if step == steps // 2:  # half of the time has gone, or will have in the middle of this step
+        if step == steps // 2:  # half of the time has passed, or will in the middle of this step
             past = half if steps % 2 else zero
             for axis in range(3):
                 for p in range(count):
@@ -147,11 +157,10 @@ def travel(velocity, spacing, steps, count, places, speeds, middles):  # type: i
 
 
 @numba.njit(cache=True, fastmath=True, nogil=True)
-def follow(velocity, origin, spacing, points, steps):  # type: ignore[no-untyped-def]
-    """Where points (n, 3) are after one unit of time, all float32; see ``travel``.
-
-    ``velocity`` (i, j, k, 3) is in mm, ``origin`` (3,) and ``spacing`` in mm.
-    """
+def follow(field, points, steps):  # type: ignore[no-untyped-def]
+    """Where points (n, 3), mm, float32, are after one unit of time in a velocity field; see
+    ``travel``."""
+    velocity, origin, spacing = field.values, field.origin_mm, field.spacing_mm
     out = np.empty_like(points)
     places, speeds, middles = block()
     for first in range(0, len(points), BLOCK):
@@ -165,9 +174,10 @@ def follow(velocity, origin, spacing, points, steps):  # type: ignore[no-untyped
 
 
 @numba.njit(cache=True, fastmath=True, nogil=True)
-def project(modes, origin, spacing, points, directions):  # type: ignore[no-untyped-def]
-    """Trilinear values of modes (i, j, k, 3, m) at points (n, 3), each along a direction (n, 3);
-    all float32. Beyond the lattice those of its nearest border."""
+def project(field, points, directions):  # type: ignore[no-untyped-def]
+    """Trilinear values (n, m) of modes at points (n, 3), mm, each along a direction (n, 3); all
+    float32. Beyond the lattice those of its nearest border."""
+    modes, origin, spacing = field.values, field.origin_mm, field.spacing_mm
     n, m = len(points), modes.shape[4]
     out = np.zeros((n, m), np.float32)
     per_cell = np.float32(1) / spacing

@@ -1,177 +1,126 @@
-"""What is done to an organ on the table: one class a load, and the state that several lead to.
+"""What is done to an organ on the table: one function a load, and the state that several lead to.
 
-A load is drawn (``draw``) for an organ in its bed and adds itself to the problem (``add``). A new
-one is a new class and a line in ``LOADS``.
+A random load is a function in ``LOADS`` that adds itself to the problem of an organ in its bed.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Protocol
+from collections.abc import Callable
 
 import numpy as np
 from jaxtyping import Float64
 from scipy.spatial.transform import Rotation
 
-from tumortrack.simulate.elastic.settle import KPA, ReducedModel, ReducedProblem, settle
+from tumortrack.core.geometry import perpendicular, unit
+from tumortrack.simulate.elastic.equilibrium import KPA, ReducedModel, ReducedProblem
 
+Vector = Float64[np.ndarray, " 3"]
 _OBSTACLE = 100 * KPA  # N/mm3, of plates and instruments
 _GRIP = 50 * KPA  # N/mm3, of what holds a place
 _WEIGHT = 1.05e-6 * 9.81  # N/mm3
 _EDGE_MM = 4.0  # over which an obstacle's edge fades
-DEEPEST = 0.28  # of the organ's thickness, that a plate goes
-FARTHEST_MM = 16.0  # that a place of the surface moves
-SWELLING = 0.025  # largest change of volume: leaves room below 3 % for what modes do to it
+_DEEPEST = 0.28  # of the organ's thickness, that a plate goes
+_FARTHEST_MM = 16.0  # that a place of the surface moves
+_SWELLING = 0.025  # largest change of volume: leaves room below 3 % for what modes do to it
 
 
-class Load(Protocol):
-    @classmethod
-    def draw(
-        cls, organ: ReducedModel, up: Float64[np.ndarray, " 3"], rng: np.random.Generator
-    ) -> Load: ...
-
-    def add(self, problem: ReducedProblem) -> None: ...
-
-
-@dataclass(frozen=True, eq=False)
-class Obstacle:
-    """Something hard that comes from ``outward`` and stops at ``height_mm`` along it, felt by a
-    share ``foot`` of each patch."""
-
-    outward: Float64[np.ndarray, " 3"]
-    height_mm: float
-    foot: Float64[np.ndarray, " p"]
-
-    def add(self, problem: ReducedProblem) -> None:
-        patches = problem.organ.patches
-        depth = patches.points_mm @ self.outward - self.height_mm
-        springs = _OBSTACLE * patches.areas_mm2 * self.foot
-        problem.touch(problem.organ.along(self.outward), depth, springs)
+def press(
+    problem: ReducedProblem, outward: Vector, height_mm: float, foot: Float64[np.ndarray, " p"]
+) -> None:
+    """Something hard comes from ``outward`` (a unit vector) and stops at ``height_mm`` along it,
+    felt by a fraction ``foot`` of each patch."""
+    patches = problem.organ.patches
+    depth = patches.points_mm @ outward - height_mm
+    problem.touch(problem.organ.along(outward), depth, _OBSTACLE * patches.areas_mm2 * foot)
 
 
-class Plate(Obstacle):
+def indent(
+    problem: ReducedProblem, patch: int, outward: Vector, radius_mm: float, depth_mm: float
+) -> None:
+    """An instrument of a radius is pressed to a depth at a patch, against a unit vector."""
+    points, normals = problem.organ.patches.points_mm, problem.organ.patches.normals
+    offset = points - points[patch]
+    aside = np.linalg.norm(offset - np.outer(offset @ outward, outward), axis=1)
+    foot = _faded(radius_mm - aside) * (normals @ outward > 0)
+    press(problem, outward, float(points[patch] @ outward - depth_mm), foot)
+
+
+def hold(problem: ReducedProblem, patch: int, radius_mm: float, shift_mm: Vector) -> None:
+    """A region around a patch is held at a shift."""
+    patches = problem.organ.patches
+    square = ((patches.points_mm - patches.points_mm[patch]) ** 2).sum(1)
+    springs = _GRIP * patches.areas_mm2 * np.exp(-0.5 * square / radius_mm**2)
+    for axis, shift in zip(np.eye(3), shift_mm, strict=True):
+        problem.tie(problem.organ.along(axis), shift, springs)
+
+
+def weigh(problem: ReducedProblem, down: Vector, fraction: float) -> None:
+    """A fraction of the weight that the tissue bore in the CT is no longer borne."""
+    problem.forces += fraction * _WEIGHT * (down @ problem.organ.volume_moves)
+
+
+def expand(problem: ReducedProblem, strain: float) -> None:
+    """The organ takes up or loses fluid: a strain of its volume, if nothing hinders it."""
+    problem.forces += problem.modulus * strain * problem.organ.swelling
+
+
+def plate(problem: ReducedProblem, rng: np.random.Generator) -> None:
     """A plate or strip pressed down on the organ, a little tilted."""
-
-    @classmethod
-    def draw(cls, organ: ReducedModel, up: np.ndarray, rng: np.random.Generator) -> Plate:
-        return cls(*_strip(organ, _tilted(up, 0.15, rng), rng))
+    _press_strip(problem, _turned(problem.up, 0.15, rng), rng)
 
 
-class Side(Obstacle):
+def side(problem: ReducedProblem, rng: np.random.Generator) -> None:
     """A retractor or plate that presses from the side."""
-
-    @classmethod
-    def draw(cls, organ: ReducedModel, up: np.ndarray, rng: np.random.Generator) -> Side:
-        outward = rng.normal(size=3)
-        outward -= up * (outward @ up) * rng.uniform(0.5, 1)
-        return cls(*_strip(organ, _unit(outward), rng))
+    outward = rng.normal(size=3)
+    outward -= problem.up * (outward @ problem.up) * rng.uniform(0.5, 1)
+    _press_strip(problem, unit(outward), rng)
 
 
-class Poke(Obstacle):
-    """A blunt instrument pressed into the surface that does not look down."""
-
-    @classmethod
-    def draw(cls, organ: ReducedModel, up: np.ndarray, rng: np.random.Generator) -> Poke:
-        tip = _reachable(organ, up, rng)
-        outward = _tilted_by(organ.patches.normals[tip], 0.25, rng)
-        return cls.at(organ, tip, outward, rng.uniform(3, 10), rng.uniform(1, 14))
-
-    @classmethod
-    def at(
-        cls,
-        organ: ReducedModel,
-        patch: int,
-        outward: Float64[np.ndarray, " 3"],
-        radius_mm: float,
-        depth_mm: float,
-    ) -> Poke:
-        """An instrument so wide that goes in so deep at a patch, against a unit vector."""
-        points, normals = organ.patches.points_mm, organ.patches.normals
-        offset = points - points[patch]
-        aside = np.linalg.norm(offset - np.outer(offset @ outward, outward), axis=1)
-        foot = _faded(radius_mm - aside) * (normals @ outward > 0)
-        return cls(outward, float(points[patch] @ outward - depth_mm), foot)
+def poke(problem: ReducedProblem, rng: np.random.Generator) -> None:
+    """A blunt instrument pressed into the surface that does not face down."""
+    tip = _reachable(problem, rng)
+    outward = unit(problem.organ.patches.normals[tip] + rng.normal(0, 0.25, 3))
+    indent(problem, tip, outward, rng.uniform(3, 10), rng.uniform(1, 14))
 
 
-@dataclass(frozen=True, eq=False)
-class Grip:
-    """A region held at a place some way off."""
-
-    hold: Float64[np.ndarray, " p"]  # springs per patch, N/mm
-    shift_mm: Float64[np.ndarray, " 3"]
-
-    def add(self, problem: ReducedProblem) -> None:
-        for axis, shift in zip(np.eye(3), self.shift_mm, strict=True):
-            problem.tie(problem.organ.along(axis), shift, self.hold)
+def pull(problem: ReducedProblem, rng: np.random.Generator) -> None:
+    """Forceps pull at the surface."""
+    place, radius_mm = _reachable(problem, rng), rng.uniform(4, 9)
+    along = unit(problem.organ.patches.normals[place] + rng.normal(0, 0.6, 3))
+    hold(problem, place, radius_mm, along * rng.uniform(1, 12))
 
 
-class Pull(Grip):
-    """Forceps draw at the surface."""
-
-    @classmethod
-    def draw(cls, organ: ReducedModel, up: np.ndarray, rng: np.random.Generator) -> Pull:
-        place = _reachable(organ, up, rng)
-        hold = _region(organ, place, rng.uniform(4, 9))
-        along = _tilted_by(organ.patches.normals[place], 0.6, rng)
-        return cls(hold, along * rng.uniform(1, 12))
+def lift(problem: ReducedProblem, rng: np.random.Generator) -> None:
+    """A pole is raised or moved aside, mostly upwards."""
+    outward, up = rng.normal(size=3), problem.up
+    outward -= 0.7 * up * (outward @ up)
+    place, radius_mm = int(np.argmax(problem.organ.patches.points_mm @ outward)), rng.uniform(8, 20)
+    hold(problem, place, radius_mm, unit(rng.normal(size=3) + 0.7 * up) * rng.uniform(1, 12))
 
 
-class Lift(Grip):
-    """A pole is raised or led aside, mostly upwards."""
-
-    @classmethod
-    def draw(cls, organ: ReducedModel, up: np.ndarray, rng: np.random.Generator) -> Lift:
-        outward = rng.normal(size=3)
-        outward -= 0.7 * up * (outward @ up)
-        place = int(np.argmax(organ.patches.points_mm @ outward))
-        hold = _region(organ, place, rng.uniform(8, 20))
-        return cls(hold, _unit(rng.normal(size=3) + 0.7 * up) * rng.uniform(1, 12))
+def sag(problem: ReducedProblem, rng: np.random.Generator) -> None:
+    """Tissue softened, or cut open and without its turgor."""
+    weigh(problem, _turned(-problem.up, 0.15, rng), float(rng.uniform(0.2, 1)))
 
 
-@dataclass(frozen=True, eq=False)
-class Sag:
-    """Weight that the tissue bore in the CT and no longer does: softened, or cut open and with
-    its turgor lost."""
-
-    down: Float64[np.ndarray, " 3"]
-    share: float  # of the weight
-
-    @classmethod
-    def draw(cls, organ: ReducedModel, up: np.ndarray, rng: np.random.Generator) -> Sag:
-        return cls(_tilted(-up, 0.15, rng), float(rng.uniform(0.2, 1)))
-
-    def add(self, problem: ReducedProblem) -> None:
-        problem.forces += self.share * _WEIGHT * (self.down @ problem.organ.volume_moves)
+def swell(problem: ReducedProblem, rng: np.random.Generator) -> None:
+    """Fluid taken up or lost."""
+    expand(problem, float(rng.uniform(-_SWELLING, _SWELLING)))
 
 
-@dataclass(frozen=True, eq=False)
-class Swell:
-    """The organ takes up or loses fluid."""
-
-    strain: float  # of the volume, if nothing hinders it
-
-    @classmethod
-    def draw(cls, organ: ReducedModel, up: np.ndarray, rng: np.random.Generator) -> Swell:
-        return cls(float(rng.uniform(-SWELLING, SWELLING)))
-
-    def add(self, problem: ReducedProblem) -> None:
-        problem.forces += problem.modulus * self.strain * problem.organ.swelling
-
-
-LOADS: tuple[tuple[type[Load], float], ...] = (
-    (Plate, 0.32),
-    (Side, 0.11),
-    (Poke, 0.16),
-    (Pull, 0.12),
-    (Lift, 0.10),
-    (Sag, 0.14),
-    (Swell, 0.05),
+# Each with its probability.
+LOADS: tuple[tuple[Callable[[ReducedProblem, np.random.Generator], None], float], ...] = (
+    (plate, 0.32),
+    (side, 0.11),
+    (poke, 0.16),
+    (pull, 0.12),
+    (lift, 0.10),
+    (sag, 0.14),
+    (swell, 0.05),
 )
 
 
-def bedded(
-    organ: ReducedModel, up: Float64[np.ndarray, " 3"], rng: np.random.Generator
-) -> ReducedProblem:
+def in_bed(organ: ReducedModel, up: Vector, rng: np.random.Generator) -> ReducedProblem:
     """An organ of random tissue (3-30 kPa, tumors 0.8-8 times that) in a random bed: springs of
     0.5-20 kPa/mm on the underside, in some states only against sinking, in others both ways."""
     modulus = KPA * _log_uniform(3, 30, rng)
@@ -187,50 +136,48 @@ def bedded(
     else:
         problem.tie(down, 0.0, springs)
     grip = rng.uniform(0, 0.3)
-    one = _unit(np.cross(up, np.eye(3)[np.argmin(np.abs(up))]))
+    one = perpendicular(up)
     for aside in (one, np.cross(up, one)):
         problem.tie(organ.along(aside), 0.0, grip * springs)
     return problem
 
 
 def random_state(
-    organ: ReducedModel, up: Float64[np.ndarray, " 3"], anywhere: float, rng: np.random.Generator
+    organ: ReducedModel, up: Vector, anywhere: float, rng: np.random.Generator
 ) -> Float64[np.ndarray, " k"] | None:
-    """Coefficients of the modes after one or two random loads; None for states that do not come
-    to rest or move a place by more than 24 mm. What moves by 16 to 24 mm is scaled to 16.
+    """Coefficients of the modes after one or two random loads; None for states that find no
+    equilibrium or move a place by more than 24 mm. Motions of 16 to 24 mm are scaled to 16.
 
     Args:
-        anywhere: share of states with the bed on any side, instead of opposite to ``up``.
+        anywhere: fraction of states with the bed on any side, instead of opposite to ``up``.
     """
     if rng.uniform() < anywhere:
-        up = _unit(rng.normal(size=3))
-    problem = bedded(organ, _tilted(up, 0.12, rng), rng)
+        up = unit(rng.normal(size=3))
+    problem = in_bed(organ, _turned(up, 0.12, rng), rng)
     shares = np.array([share for _, share in LOADS])
     for n in rng.choice(len(LOADS), 1 + (rng.uniform() < 0.35), p=shares / shares.sum()):
-        LOADS[n][0].draw(organ, problem.up, rng).add(problem)
-    found = settle(problem)
+        LOADS[n][0](problem, rng)
+    found = problem.equilibrium()
     if found is None:
         return None
     state = found[: organ.n_modes]
     farthest = np.linalg.norm(organ.moves[:, :, : organ.n_modes] @ state, axis=1).max()
-    if farthest > 1.5 * FARTHEST_MM:
+    if farthest > 1.5 * _FARTHEST_MM:
         return None
-    return state * min(1.0, FARTHEST_MM / farthest)
+    return state * min(1.0, _FARTHEST_MM / farthest)
 
 
-def _strip(
-    organ: ReducedModel, outward: np.ndarray, rng: np.random.Generator
-) -> tuple[np.ndarray, float, np.ndarray]:
-    """A strip 10-70 mm wide across a random line, pressed in by up to ``DEEPEST``."""
-    points = organ.patches.points_mm
-    across = points @ _unit(np.cross(outward, rng.normal(size=3)))
+def _press_strip(problem: ReducedProblem, outward: np.ndarray, rng: np.random.Generator) -> None:
+    """A strip 10-70 mm wide across a random line, pressed in by up to ``_DEEPEST``."""
+    patches = problem.organ.patches
+    across = patches.points_mm @ unit(np.cross(outward, rng.normal(size=3)))
     low, high = np.percentile(across, [15, 85])
     middle, width = rng.uniform(low, high), rng.uniform(10, 70)
-    foot = _faded(width / 2 - np.abs(across - middle)) * (organ.patches.normals @ outward > 0)
-    height = points @ outward
-    depth = rng.uniform(0.02, DEEPEST) * np.ptp(height)
+    foot = _faded(width / 2 - np.abs(across - middle)) * (patches.normals @ outward > 0)
+    height = patches.points_mm @ outward
+    depth = rng.uniform(0.02, _DEEPEST) * np.ptp(height)
     touched = height[foot > 0] if (foot > 0).any() else height
-    return outward, float(touched.max() - depth), foot
+    press(problem, outward, float(touched.max() - depth), foot)
 
 
 def _faded(inward_mm: np.ndarray) -> np.ndarray:
@@ -238,26 +185,14 @@ def _faded(inward_mm: np.ndarray) -> np.ndarray:
     return np.clip(inward_mm / _EDGE_MM + 0.5, 0, 1)
 
 
-def _region(organ: ReducedModel, place: int, radius_mm: float) -> np.ndarray:
-    square = ((organ.patches.points_mm - organ.patches.points_mm[place]) ** 2).sum(1)
-    return _GRIP * organ.patches.areas_mm2 * np.exp(-0.5 * square / radius_mm**2)
+def _reachable(problem: ReducedProblem, rng: np.random.Generator) -> int:
+    """A patch that does not face down."""
+    return int(rng.choice(np.flatnonzero(problem.organ.patches.normals @ problem.up > -0.2)))
 
 
-def _reachable(organ: ReducedModel, up: np.ndarray, rng: np.random.Generator) -> int:
-    return int(rng.choice(np.flatnonzero(organ.patches.normals @ up > -0.2)))
-
-
-def _tilted(direction: np.ndarray, std_rad: float, rng: np.random.Generator) -> np.ndarray:
+def _turned(direction: np.ndarray, std_rad: float, rng: np.random.Generator) -> np.ndarray:
     return Rotation.from_rotvec(rng.normal(0, std_rad, 3)).apply(direction)
-
-
-def _tilted_by(direction: np.ndarray, std: float, rng: np.random.Generator) -> np.ndarray:
-    return _unit(direction + rng.normal(0, std, 3))
 
 
 def _log_uniform(low: float, high: float, rng: np.random.Generator) -> float:
     return float(np.exp(rng.uniform(np.log(low), np.log(high))))
-
-
-def _unit(vector: np.ndarray) -> np.ndarray:
-    return vector / np.linalg.norm(vector)

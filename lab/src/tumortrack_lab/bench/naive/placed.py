@@ -37,7 +37,7 @@ class NaivePlaced:
     def labels(self, points_mm: np.ndarray, queries_mm: np.ndarray) -> np.ndarray:
         """A cloud (n, 3) -> labels of queries (q, 3)."""
         with torch.inference_mode():
-            ways = self._network.both_ways(torch.tensor(points_mm)[None])
+            ways = self._network.flip_hypotheses(torch.tensor(points_mm)[None])
         starts = [
             [part[0].double().numpy() for part in (way.rotation, way.centre_mm, way.coefficients)]
             for way in ways

@@ -1,0 +1,91 @@
+"""Peers by name: ours, and those of other installed packages.
+
+Another package adds a peer by an entry point of the group ``tumortrack.peers`` that names a
+``PeerKind``; nothing changes here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from importlib.metadata import entry_points, version
+from pathlib import Path
+from typing import Any
+
+from tumortrack.core import store
+from tumortrack.core.config import Config
+from tumortrack.core.errors import InputError
+from tumortrack.core.types import Anatomy
+from tumortrack_lab.peers.base import Peer
+from tumortrack_lab.peers.pose_search import Direction
+
+GROUP = "tumortrack.peers"
+
+
+@dataclass(frozen=True)
+class PeerKind:
+    """How a peer is made for a patient.
+
+    Attributes:
+        make: ``make(anatomy_ct, up_lps, config)``, or ``make(anatomy_ct, up_lps)`` without
+            ``config``, gives a ``Peer``.
+        config: all settings. Answers depend on these, on the versions of ``packages`` and on an
+            outside program.
+        packages: names of distributions; an entry point's own is added to them.
+    """
+
+    make: Callable[..., Any]
+    config: Config | None = None
+    packages: tuple[str, ...] = ()
+    program_sha256: str | None = None
+
+    @property
+    def versions(self) -> dict[str, str]:
+        return {package: version(package) for package in self.packages}
+
+    def made_for(self, anatomy_ct: Anatomy, up_lps: Direction) -> Peer:
+        """The peer, ready for a patient (anatomy in LPS, mm; the direction facing the camera)."""
+        settings = () if self.config is None else (self.config,)
+        return self.make(anatomy_ct, up_lps, *settings)
+
+
+def peer_kinds(bcpd: Path | None = None) -> dict[str, PeerKind]:
+    """Every peer there is; ``bcpd`` only with its program.
+
+    Raises:
+        InputError: the program does not exist; an entry point that names no ``PeerKind``, or takes
+            the name of a peer of ours.
+    """
+    from tumortrack_lab.peers.elastic import ElasticPeer, ElasticPeerConfig
+    from tumortrack_lab.peers.point_drift import Bcpd, BcpdConfig, Cpd, CpdConfig
+    from tumortrack_lab.peers.pose_search import RigidConfig
+    from tumortrack_lab.peers.rigid import Rigid, RigidBound
+
+    kinds = {
+        "rigid_bound": PeerKind(RigidBound),
+        "rigid": PeerKind(Rigid, RigidConfig(), ("small_gicp",)),
+        "rigid_any_rotation": PeerKind(Rigid, RigidConfig(orientation="unknown"), ("small_gicp",)),
+        "cpd": PeerKind(Cpd, CpdConfig(), ("pycpd", "small_gicp")),
+        "elastic": PeerKind(ElasticPeer, ElasticPeerConfig(), ("pytetwild", "scipy", "small_gicp")),
+    }
+    if bcpd is not None:
+        if not bcpd.is_file():
+            raise InputError(f"{bcpd} does not exist; give the built program of BCPD, or none.")
+        config = BcpdConfig(program=str(bcpd))
+        kinds["bcpd"] = PeerKind(Bcpd, config, ("small_gicp",), store.sha256_of(bcpd))
+    return kinds | _others({*kinds, "bcpd"})
+
+
+def _others(ours: set[str]) -> dict[str, PeerKind]:
+    kinds = {}
+    for point in entry_points(group=GROUP):
+        kind, origin = point.load(), point.dist.name if point.dist else point.value
+        if point.name in ours:
+            raise InputError(
+                f"peer {point.name!r} of {origin} has the name of one of ours; rename it."
+            )
+        if not isinstance(kind, PeerKind):
+            raise InputError(f"peer {point.name!r}: {point.value} of {origin} is no PeerKind.")
+        extra = (point.dist.name,) if point.dist else ()
+        kinds[point.name] = replace(kind, packages=(*kind.packages, *extra))
+    return kinds

@@ -1,0 +1,212 @@
+"""Coherent point drift, classic and Bayesian: non-rigid, from rigid starts.
+
+The observed cloud is the data, the part of the model's surface that the camera should see is the
+moving set: the whole organ would be pulled onto one side of the cloud. Displacements are
+interpolated into the depth by the methods' own Gaussian kernel.
+
+CPD: Myronenko, Song 2010, doi 10.1109/TPAMI.2010.46 (pycpd). BCPD: Hirose 2021, doi
+10.1109/TPAMI.2020.2971687; there is no Python package of it, so the author's public program,
+https://github.com/ohirose/bcpd (MIT), is driven through its text files.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import tempfile
+from abc import abstractmethod
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float64
+from scipy.spatial import cKDTree
+from scipy.spatial.distance import cdist
+
+from tumortrack.core.config import Config
+from tumortrack.core.errors import InputError, NoEstimate
+from tumortrack.core.geometry import transform_points
+from tumortrack.core.types import Anatomy
+from tumortrack_lab.peers.base import Candidate, DeformablePeer
+from tumortrack_lab.peers.pose_search import (
+    Direction,
+    Points,
+    RigidConfig,
+    Transform,
+    trimmed_mean,
+)
+
+_KEPT = 0.9  # of the distances
+_PATIENCE_S = 120.0
+
+
+class CpdConfig(Config, frozen=True):
+    """Settings of CPD, lengths in mm.
+
+    ``kernel_mm`` is the paper's beta, the distance over which points move together; ``smooth``
+    its lambda, the weight of smoothness (of points scaled to a spread of 1, as the paper scales
+    them); ``outliers`` its w. ``first_sigma_mm`` starts the annealing at the error that a rigid
+    pose leaves, instead of at the size of the cloud.
+    """
+
+    rigid: RigidConfig = RigidConfig()
+    starts: int = 2  # the best rigid poses, each fitted
+    kernel_mm: float = 50.0
+    smooth: float = 1000.0
+    outliers: float = 0.1
+    first_sigma_mm: float = 6.0
+    iterations: int = 60
+    points: int = 400  # of the visible surface
+
+
+class BcpdConfig(Config, frozen=True):
+    """Settings of BCPD under the names of its options; lengths in units of the cloud's spread
+    (the root mean square of its coordinates about their mean).
+
+    ``program`` is the path of the built binary. ``kernel`` (beta) is the reach of the Gaussian
+    over which points move together; ``length`` (lambda): the expected displacement is
+    sqrt(3 / lambda); ``outliers`` (omega); ``near`` (gamma): small where the start is good.
+    """
+
+    program: str = ""
+    rigid: RigidConfig = RigidConfig()
+    starts: int = 3  # the best rigid poses, each fitted
+    kernel: float = 1.2
+    length: float = 50.0
+    outliers: float = 0.1
+    near: float = 0.1
+    iterations: int = 300
+    points: int = 700  # of the visible surface
+    ridge: float = 1e-2  # of the interpolation of displacements into the depth
+
+
+@dataclass(frozen=True, eq=False)
+class Drift:
+    """Displacements that drift coherently, v(z) = sum over n of G(z, y_n) w_n, and a similarity
+    after them; camera frame, mm."""
+
+    points_mm: Float64[np.ndarray, "n 3"]
+    weights: Float64[np.ndarray, "n 3"]
+    kernel_mm: float
+    matrix: Float64[np.ndarray, "3 3"] | None = None  # none: displacements alone
+    shift_mm: Float64[np.ndarray, " 3"] | None = None
+
+    def __call__(self, at_mm: Points) -> Points:
+        """The mapped points."""
+        moved = at_mm + _gaussian(at_mm, self.points_mm, self.kernel_mm) @ self.weights
+        return moved if self.matrix is None else moved @ self.matrix.T + self.shift_mm
+
+
+class _PointDrift(DeformablePeer):
+    config: CpdConfig | BcpdConfig
+
+    def _fit_from(self, camera_from_ct: Transform, cloud: Points) -> Candidate:
+        source = self._search.seen(cloud, camera_from_ct)
+        source = source[:: max(1, len(source) // self.config.points)]
+        drift, iterations = self._drift(source, cloud)
+        error_mm = _mutual_error_mm(drift(source), cloud)
+        report = {"iterations": iterations, "residual_mm": error_mm}
+        return Candidate(
+            lambda points_ct: drift(transform_points(camera_from_ct, points_ct)), error_mm, report
+        )
+
+    @abstractmethod
+    def _drift(self, source: Points, cloud: Points) -> tuple[Drift, int]:
+        """The drift of a rigidly placed surface onto a cloud, and the iterations it took."""
+
+
+class Cpd(_PointDrift):
+    """Coherent point drift as a peer."""
+
+    name = "cpd"
+    config: CpdConfig
+
+    def _drift(self, source: Points, cloud: Points) -> tuple[Drift, int]:
+        from pycpd import DeformableRegistration
+
+        config = self.config
+        registration = DeformableRegistration(
+            X=cloud,
+            Y=source,
+            sigma2=config.first_sigma_mm**2,
+            alpha=config.smooth / ((cloud - cloud.mean(0)) ** 2).mean(),
+            beta=config.kernel_mm,
+            w=config.outliers,
+            max_iterations=config.iterations,
+        )
+        registration.register()
+        return Drift(source, registration.W, config.kernel_mm), int(registration.iteration)
+
+
+class Bcpd(_PointDrift):
+    """Bayesian coherent point drift as a peer.
+
+    Raises:
+        InputError: ``config.program`` is not given or is no file.
+    """
+
+    name = "bcpd"
+    config: BcpdConfig
+
+    def __init__(self, anatomy_ct: Anatomy, up_lps: Direction, config: BcpdConfig) -> None:
+        if not Path(config.program).is_file():
+            raise InputError(
+                f"BCPD's program {config.program!r} does not exist. Get the source from "
+                "https://github.com/ohirose/bcpd, install OpenBLAS, run make, and give the path "
+                "of the binary that it builds."
+            )
+        super().__init__(anatomy_ct, up_lps, config)
+
+    def _drift(self, source: Points, cloud: Points) -> tuple[Drift, int]:
+        """The program's displacements v, interpolated by its own Gaussian process (Hirose 2021b,
+        doi 10.1109/TPAMI.2020.3043769), then the similarity that carries y + v to its shape y'.
+
+        Raises:
+            NoEstimate: the program failed on these points.
+        """
+        config = self.config
+        displacement, shape, loops = self._run(source, cloud)
+        kernel_mm = config.kernel * float(np.sqrt(((cloud - cloud.mean(0)) ** 2).mean()))
+        kernel = _gaussian(source, source, kernel_mm) + config.ridge * np.eye(len(source))
+        weights = np.linalg.solve(kernel, displacement)
+        moved = np.pad(source + displacement, ((0, 0), (0, 1)), constant_values=1)
+        affine = np.linalg.lstsq(moved, shape, rcond=None)[0]
+        return Drift(source, weights, kernel_mm, affine[:3].T, affine[3]), loops
+
+    def _run(self, source: Points, cloud: Points) -> tuple[Points, Points, int]:
+        """One run of the program: its displacements v and shape y, and its count of loops."""
+        config = self.config
+        with tempfile.TemporaryDirectory() as name:
+            folder = Path(name)
+            np.savetxt(folder / "x.txt", cloud, fmt="%.6f", delimiter="\t")
+            np.savetxt(folder / "y.txt", source, fmt="%.6f", delimiter="\t")
+            command = [
+                *[str(Path(config.program).resolve()), "-xx.txt", "-yy.txt", "-oout_", "-q", "-sv"],
+                *[f"-w{config.outliers}", f"-l{config.length}", f"-b{config.kernel}"],
+                *[f"-g{config.near}", "-ux", "-c1e-5", f"-n{config.iterations}", "-r1"],
+            ]
+            try:
+                done = subprocess.run(
+                    command, cwd=folder, capture_output=True, text=True, timeout=_PATIENCE_S
+                )
+                displacement = np.loadtxt(folder / "out_v.txt", ndmin=2)
+                shape = np.loadtxt(folder / "out_y.txt", ndmin=2)
+            except (OSError, ValueError, subprocess.TimeoutExpired) as error:
+                raise NoEstimate(f"BCPD's program gave no answer: {error}.") from error
+            if done.returncode or shape.shape != source.shape or not np.isfinite(shape).all():
+                raise NoEstimate(f"BCPD's program failed: {done.stderr.strip()[-300:]}.")
+            info = folder / "out_info.txt"
+            lines = info.read_text().splitlines() if info.is_file() else []
+            loops = (int(line.split()[1]) for line in lines if line.startswith("loops"))
+            return displacement, shape, next(loops, 0)
+
+
+def _mutual_error_mm(moved: Points, cloud: Points) -> float:
+    """Trimmed mean distance of the drifted surface to the cloud and back: it compares starts."""
+    out, back = cKDTree(moved).query(cloud)[0], cKDTree(cloud).query(moved)[0]
+    return (trimmed_mean(out, _KEPT) + trimmed_mean(back, _KEPT)) / 2
+
+
+def _gaussian(
+    a_mm: Float64[np.ndarray, "n 3"], b_mm: Float64[np.ndarray, "m 3"], reach_mm: float
+) -> Float64[np.ndarray, "n m"]:
+    return np.exp(-cdist(a_mm, b_mm, "sqeuclidean") / (2 * reach_mm**2))

@@ -1,0 +1,113 @@
+"""Kinematics of UR5 and UR10e: their maker's published numbers, and analytic inverse kinematics.
+
+Lengths and angles: Universal Robots, 'DH parameters for calculations of kinematics and dynamics',
+https://www.universal-robots.com/articles/ur/application-installation/
+dh-parameters-for-calculations-of-kinematics-and-dynamics/. A real arm differs from them by its
+calibration: one to two millimetres at the flange, which the arm's own controller knows.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float64
+
+from tumortrack.core.geometry import rigid
+
+Pose = Float64[np.ndarray, "4 4"]  # of frame b in frame a: ``a_from_b``, mm
+TURN = 2 * np.pi
+_QUARTER = np.pi / 2
+_EXACT_MM, _EXACT_RAD = 1e-3, 1e-5  # of inverse kinematics
+_ALPHA = np.array([_QUARTER, 0.0, 0.0, _QUARTER, -_QUARTER, 0.0])
+# All joints turn +-360 degrees; an elbow beyond 180 would pass through its own arm, so it is kept
+# within (as Universal Robots' own ROS description does).
+_LIMITS = np.array([TURN, TURN, np.pi, TURN, TURN, TURN])
+
+
+class ArmModel(NamedTuple):
+    """One type of arm, standard Denavit-Hartenberg: Rz(joint) Tz(d) Tx(a) Rx(alpha) per joint.
+
+    Attributes:
+        name: as ``ur_analytic_ik`` calls it.
+        a_mm, d_mm, alpha_rad: per joint (6,).
+        limits_rad: of the joints, in both directions (6,).
+        speeds_rad_s: the maker's maximum (6,).
+        reach_mm: the maker's figure, from the base to the flange's middle.
+    """
+
+    name: str
+    a_mm: Float64[np.ndarray, " 6"]
+    d_mm: Float64[np.ndarray, " 6"]
+    speeds_rad_s: Float64[np.ndarray, " 6"]
+    reach_mm: float
+    alpha_rad: Float64[np.ndarray, " 6"] = _ALPHA
+    limits_rad: Float64[np.ndarray, " 6"] = _LIMITS
+
+
+UR5 = ArmModel(
+    name="ur5",
+    a_mm=np.array([0.0, -425.0, -392.25, 0.0, 0.0, 0.0]),
+    d_mm=np.array([89.159, 0.0, 0.0, 109.15, 94.65, 82.3]),
+    speeds_rad_s=np.radians([180.0] * 6),
+    reach_mm=850.0,
+)
+UR10E = ArmModel(
+    name="ur10e",
+    a_mm=np.array([0.0, -612.7, -571.55, 0.0, 0.0, 0.0]),
+    d_mm=np.array([180.7, 0.0, 0.0, 174.15, 119.85, 116.55]),
+    speeds_rad_s=np.radians([120.0, 120.0, 180.0, 180.0, 180.0, 180.0]),
+    reach_mm=1300.0,
+)
+MODELS = {model.name: model for model in (UR5, UR10E)}
+
+# The maker states no limit of acceleration. 1.4 rad/s^2 is its controller's default for a joint
+# move (URScript manual, movej): a pace for work beside people, far below what either arm can do.
+ACCELERATION_RAD_S2 = 1.4
+JERK_RAD_S3 = 10.0
+
+
+def inverse_kinematics(model: ArmModel, base_from_flange: Pose) -> Float64[np.ndarray, "k 6"]:
+    """Joint angles (k, 6) in -pi..pi, k from 0 to 8, that bring the flange to a pose (mm).
+
+    Shoulder left or right, elbow up or down, wrist flipped or not. Each is kept only if forward
+    kinematics lead back to the pose: at singular poses the closed form yields others too.
+    """
+    import ur_analytic_ik
+
+    solver, pose_m = getattr(ur_analytic_ik, model.name), np.array(base_from_flange, order="C")
+    pose_m[:3, 3] /= 1000
+
+    def reaches(joints_rad: np.ndarray) -> bool:
+        off = np.abs(solver.forward_kinematics(*joints_rad) - pose_m)
+        off[:3, 3] *= _EXACT_RAD / (_EXACT_MM / 1000)
+        return bool(off.max() < _EXACT_RAD)  # False where there is a NaN
+
+    joints = np.array([j for j in solver.inverse_kinematics(pose_m) if reaches(j)]).reshape(-1, 6)
+    return wrapped(joints)
+
+
+def wrapped(angles_rad: np.ndarray) -> np.ndarray:
+    """The same angles in -pi..pi."""
+    return angles_rad - TURN * np.round(angles_rad / TURN)
+
+
+def nearest_turn(
+    model: ArmModel, joints_rad: Float64[np.ndarray, "... 6"], near_rad: Float64[np.ndarray, " 6"]
+) -> Float64[np.ndarray, "... 6"]:
+    """The same poses, each joint turned by whole turns to lie nearest to ``near_rad`` within its
+    limits."""
+    turned = joints_rad + TURN * np.round((near_rad - joints_rad) / TURN)
+    turned = np.where(turned > model.limits_rad, turned - TURN, turned)
+    return np.where(turned < -model.limits_rad, turned + TURN, turned)
+
+
+def level_pose(position_mm: Float64[np.ndarray, " 3"], yaw_rad: float) -> Pose:
+    """``table_from_frame`` of a frame whose z is up and whose x points towards the yaw."""
+    c, s = np.cos(yaw_rad), np.sin(yaw_rad)
+    return rigid(np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]), position_mm)
+
+
+def yaw_of(table_from_frame: Pose) -> float:
+    """Where a level frame's x points, radians."""
+    return float(np.arctan2(table_from_frame[1, 0], table_from_frame[0, 0]))

@@ -1,0 +1,305 @@
+"""A scene in motion: an organ that breathes and is pushed on its table, before a camera.
+
+``ScenePlayer`` is a function of time: the same seed and time give the same state, depth image and
+true surfaces.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from jaxtyping import Float, Float32, Float64
+from scipy.interpolate import PchipInterpolator
+from scipy.spatial.transform import Rotation
+
+from tumortrack.core.config import Config
+from tumortrack.core.errors import InputError
+from tumortrack.core.geometry import perpendicular, rigid, rotation_onto, transform_points, unit
+from tumortrack.core.types import Anatomy, DepthFrame, Intrinsics, Mesh
+from tumortrack.sense.camera import d405
+from tumortrack.sense.noise import D405_NOISE, NoiseConfig, add_noise
+from tumortrack.sense.render import render_depth
+from tumortrack.simulate.elastic.body import BodyConfig, body_of, reduced_organ
+from tumortrack.simulate.elastic.equilibrium import LEVER_MM
+from tumortrack.simulate.elastic.loads import expand
+from tumortrack.simulate.indentation import Bed, Indentation, indentations
+from tumortrack.simulate.pose import PoseConfig, sample_pose
+
+SHAFT_MM = 4.0  # an instrument's radius
+_SHAFT_LENGTH_MM = 200.0
+_AWAY_MM = 160.0  # along its shaft: an instrument out of the picture
+_STEPS = 3  # along the body's field: within 0.02 mm of the exact position, for states as here
+_SWAY_S = (17.0, 23.0, 29.0, 19.0, 13.0, 31.0)  # periods of the camera's rotations and shifts
+# A push in fractions of its time: the instrument's distance from the organ, then its depth.
+_AWAY = PchipInterpolator([0.0, 0.2, 0.85, 1.0], [1.0, 0.0, 0.0, 1.0])
+_DEPTH = PchipInterpolator([0.0, 0.2, 0.45, 0.6, 0.85, 1.0], [0.0, 0.0, 1.0, 1.0, 0.0, 0.0])
+
+_REACH_MM = 400.0  # of the drape to every side
+_CELLS = 40  # of the drape along each edge
+_WAVES = 5
+_RING_MM = 4.0
+_SECTIONS = 24
+_FARTHEST_MM = 500.0  # that the sensor sees of a table
+_NOTHING = Mesh(np.empty((0, 3)), np.empty((0, 3), np.int32))
+_RANGES = {
+    "distance_mm": (60, 400),
+    "breath_mm": (0, 30),
+    "breath_s": (1, 20),
+    "swell": (0, 0.025),
+    "push_mm": (0, 14),
+    "push_s": (2, 60),
+    "places": (1, 20),
+    "sway_mm": (0, 30),
+    "sway_degrees": (0, 20),
+}
+
+
+class ScenePlayerConfig(Config, frozen=True, kw_only=True):
+    """What moves and what is seen; a length of zero switches its part off.
+
+    Attributes:
+        distance_mm: depth of the organ's nearest point, at rest and before the camera sways.
+        breath_mm: the organ's motion down the body and back, every ``breath_s``; ``swell`` is the
+            strain of its volume that goes with it.
+        push_mm: how deep an instrument presses, one push every ``push_s`` at one of ``places``.
+        sway_mm, sway_degrees: the camera's slow motion along and about each axis.
+    """
+
+    width: int = 424
+    height: int = 240
+    distance_mm: float = 118.0
+    breath_mm: float = 6.0
+    breath_s: float = 4.0
+    swell: float = 0.01
+    push_mm: float = 8.0
+    push_s: float = 6.0
+    places: int = 3
+    sway_mm: float = 3.0
+    sway_degrees: float = 3.0
+    table: bool = True
+    drape: bool = False
+    noise: NoiseConfig = D405_NOISE
+    body: BodyConfig = BodyConfig()
+
+    def __post_init__(self) -> None:
+        for name, (low, high) in _RANGES.items():
+            value = getattr(self, name)
+            if not low <= value <= high:
+                raise InputError(f"{name} is {value:g}; it must lie in {low:g}..{high:g}.")
+        d405(self.width, self.height)
+
+
+@dataclass(frozen=True, eq=False)
+class Instant:
+    """The scene at a time. The room's frame is the CT's, with the organ where it lay there."""
+
+    t_s: float
+    camera_from_room: Float64[np.ndarray, "4 4"]
+    room_from_organ: Float64[np.ndarray, "4 4"]  # the organ's rigid motion, after its deformation
+    coefficients: Float64[np.ndarray, " m"]  # of the body's modes
+    velocity: Float32[np.ndarray, "i j k 3"]  # the field of these, which points of the CT follow
+    depth_mm: float  # of the push
+    room_from_rod: Float64[np.ndarray, "4 4"] = field(default_factory=lambda: np.eye(4))
+
+    def __post_init__(self) -> None:
+        if not self.t_s >= 0:
+            raise InputError(f"time {self.t_s} s is before the scene's beginning, 0 s.")
+
+
+class ScenePlayer:
+    """One case in motion. Building it solves the elastic states: some seconds.
+
+    Raises:
+        InputError: a case that makes no elastic body, or a configuration that doesn't fit it.
+    """
+
+    def __init__(
+        self,
+        anatomy_ct: Anatomy,
+        up_lps: tuple[float, float, float],
+        config: ScenePlayerConfig,
+        seed: int,
+    ) -> None:
+        rng = np.random.default_rng([seed, 0x57A6E])
+        up = unit(np.asarray(up_lps, float))
+        self.anatomy_ct, self.config = anatomy_ct, config
+        self.intrinsics = d405(config.width, config.height)
+        self._seed = seed
+        pose = PoseConfig(tilt_deg=8.0, sideways_mm=5.0)
+        near_mm = (config.distance_mm, config.distance_mm)
+        self._camera_from_ct = sample_pose(pose, anatomy_ct.organ, up_lps, near_mm, rng)
+        bed = Bed(reduced_organ(anatomy_ct, up, config.body, rng), up, seed)
+        self._swollen = bed.under("swell", expand, config.swell)
+        self._pushes: tuple[Indentation, ...] = ()
+        if config.push_mm > 0:
+            self._pushes = indentations(bed, config.places, SHAFT_MM, config.push_mm, rng)
+        states = [self._swollen, *(push.unknowns(config.push_mm) for push in self._pushes)]
+        self._body = body_of(bed.organ, np.array(states, np.float32)[:, : bed.organ.n_modes])
+        self._down_the_body = _down_the_body(up)
+        self._vertices = np.concatenate([part.vertices_mm for part in anatomy_ct.parts])
+        self._table = Table.under(anatomy_ct.organ, up)
+        self._drape = drape(self._table, rng) if config.drape else _NOTHING
+        self._rod = rod(SHAFT_MM, _SHAFT_LENGTH_MM) if self._pushes else _NOTHING
+        shown = (anatomy_ct.organ, self._drape, self._rod)
+        first = np.cumsum([0, *(len(mesh.vertices_mm) for mesh in shown)])
+        self._faces = np.concatenate(
+            [mesh.faces + n for mesh, n in zip(shown, first, strict=False)]
+        )
+
+    def state_at(self, t_s: float) -> Instant:
+        """Everything at a time from 0 s on. A pure function: no clock, no memory."""
+        config = self.config
+        breath = np.sin(np.pi * t_s / config.breath_s) ** 4  # Lujan 1999, doi 10.1118/1.598577
+        unknowns = breath * self._swollen
+        depth_mm, away_mm, push = self._push_at(t_s)
+        if push is not None:
+            unknowns = unknowns + push.unknowns(depth_mm)
+        modes = self._body.modes.shape[-1]
+        coefficients, shift, turn = np.split(unknowns, [modes, modes + 3])
+        rotation = Rotation.from_rotvec(turn / LEVER_MM).as_matrix()
+        center = self._body.center_ct
+        moved = shift + config.breath_mm * breath * self._down_the_body
+        room_from_organ = rigid(rotation, center - rotation @ center + moved)
+        velocity = self._body.velocity(coefficients)
+        camera_from_room = self._camera_at(t_s)
+        instant = Instant(t_s, camera_from_room, room_from_organ, coefficients, velocity, depth_mm)
+        if push is None:
+            return instant
+        place = self._deformed(instant, push.place_ct[None])
+        tip = transform_points(room_from_organ, place)[0] + away_mm * push.axis
+        upright = rigid(rotation_onto(np.array([0.0, 0.0, 1.0]), push.axis), tip)
+        return replace(instant, room_from_rod=upright)
+
+    def carry(
+        self, instant: Instant, points_ct: Float[np.ndarray, "n 3"]
+    ) -> Float64[np.ndarray, "n 3"]:
+        """Where points of the CT are before the camera."""
+        camera_from_organ = instant.camera_from_room @ instant.room_from_organ
+        return transform_points(camera_from_organ, self._deformed(instant, points_ct))
+
+    def truth(self, instant: Instant) -> Anatomy:
+        """The true surfaces, camera frame."""
+        parts = self.anatomy_ct.parts
+        ends = np.cumsum([len(part.vertices_mm) for part in parts])
+        vertices = np.split(self.carry(instant, self._vertices), ends[:-1])
+        return Anatomy(tuple(part.moved(v) for part, v in zip(parts, vertices, strict=True)))
+
+    def frame(self, instant: Instant, truth: Anatomy, stamp_ns: int) -> DepthFrame:
+        """What the sensor sees at an instant with these true surfaces. Its noise follows from seed
+        and time."""
+        others = transform_points(instant.room_from_rod, self._rod.vertices_mm)
+        others = np.concatenate([self._drape.vertices_mm, others])
+        others = transform_points(instant.camera_from_room, others)
+        vertices = np.concatenate([truth.organ.vertices_mm, others])
+        clean = render_depth(vertices, self._faces, self.intrinsics, stamp_ns)
+        if self.config.table:
+            table_mm = self._table.depth_mm(instant.camera_from_room, self.intrinsics)
+            clean = DepthFrame(np.fmin(clean.depth_mm, table_mm), self.intrinsics, stamp_ns)
+        rng = np.random.default_rng([self._seed, round(instant.t_s * 1e6)])
+        return add_noise(clean, self.config.noise, rng)
+
+    def _deformed(self, instant: Instant, points_ct: np.ndarray) -> Float64[np.ndarray, "n 3"]:
+        return self._body.follow(instant.velocity, points_ct, _STEPS).astype(np.float64)
+
+    def _push_at(self, t_s: float) -> tuple[float, float, Indentation | None]:
+        """Depth, distance from the organ (mm), and which push it is."""
+        if not self._pushes:
+            return 0.0, 0.0, None
+        number, phase = divmod(t_s / self.config.push_s, 1)
+        push = self._pushes[int(number) % len(self._pushes)]
+        return self.config.push_mm * float(_DEPTH(phase)), _AWAY_MM * float(_AWAY(phase)), push
+
+    def _camera_at(self, t_s: float) -> Float64[np.ndarray, "4 4"]:
+        """A slow sway about the organ's centre."""
+        sway = np.sin(2 * np.pi * t_s / np.array(_SWAY_S))
+        turn = Rotation.from_rotvec(self.config.sway_degrees * sway[:3], degrees=True).as_matrix()
+        center = transform_points(self._camera_from_ct, self._body.center_ct[None])[0]
+        swayed = rigid(turn, center - turn @ center + self.config.sway_mm * sway[3:])
+        return swayed @ self._camera_from_ct
+
+
+def _down_the_body(up: Float64[np.ndarray, " 3"]) -> Float64[np.ndarray, " 3"]:
+    """Inferior along the table; for a body that stands, any direction along it."""
+    inferior = np.array([0.0, 0.0, -1.0])
+    along = inferior - (inferior @ up) * up
+    return perpendicular(up) if np.linalg.norm(along) < 0.1 else unit(along)
+
+
+@dataclass(frozen=True, eq=False)
+class Table:
+    """The plane under an organ, and how the organ rises over it; CT frame."""
+
+    origin: Float64[np.ndarray, " 3"]  # under the organ's middle
+    up: Float64[np.ndarray, " 3"]
+    organ_height_mm: float
+    organ_radius_mm: float
+
+    @classmethod
+    def under(cls, organ: Mesh, up: Float64[np.ndarray, " 3"]) -> Table:
+        """The plane on which an organ lies; ``up`` is a unit vector."""
+        heights, middle = organ.vertices_mm @ up, organ.box_mm.mean(0)
+        offset = organ.vertices_mm - middle
+        radius_mm = np.linalg.norm(offset - np.outer(offset @ up, up), axis=1).mean()
+        origin = middle - up * (middle @ up - heights.min())
+        return cls(origin, up, float(np.ptp(heights)), float(radius_mm))
+
+    def depth_mm(
+        self, camera_from_room: Float64[np.ndarray, "4 4"], intrinsics: Intrinsics
+    ) -> Float32[np.ndarray, "h w"]:
+        """Depth of the bare plane, NaN where the camera looks past it: 1/z is linear in the
+        image."""
+        normal = camera_from_room[:3, :3] @ self.up
+        origin = camera_from_room[:3, :3] @ self.origin + camera_from_room[:3, 3]
+        across = normal[0] * (np.arange(intrinsics.width) - intrinsics.cx) / intrinsics.fx
+        downward = normal[1] * (np.arange(intrinsics.height) - intrinsics.cy) / intrinsics.fy
+        rows = ((downward + normal[2]) / (normal @ origin)).astype(np.float32)
+        columns = (across / (normal @ origin)).astype(np.float32)
+        nearness = rows[:, None] + columns
+        nearness[nearness < 1 / _FARTHEST_MM] = np.nan
+        return np.float32(1) / nearness
+
+
+# Surfaces are cut into small triangles, as the renderer leaves out those that reach behind the
+# camera.
+def drape(table: Table, rng: np.random.Generator) -> Mesh:
+    """A cloth with folds, seen from above only: next to the organ nearly half as high as it,
+    farther off it falls to the table."""
+    steps = np.linspace(-_REACH_MM, _REACH_MM, _CELLS + 1)
+    x, y = np.meshgrid(steps, steps, indexing="ij")
+    beyond = np.clip(np.hypot(x, y) - table.organ_radius_mm, 0, None)
+    height = 0.45 * table.organ_height_mm * np.exp(-0.5 * (beyond / 60) ** 2) + 4.0
+    for _ in range(_WAVES):
+        angle, phase = rng.uniform(0, 2 * np.pi, 2)
+        length_mm = rng.uniform(25, 70)
+        along = np.cos(angle) * x + np.sin(angle) * y
+        height += rng.uniform(0.3, 1.2) * np.sin(2 * np.pi * along / length_mm + phase)
+    one = perpendicular(table.up)
+    places = np.stack([x, y, np.maximum(height, 0.5)], -1)
+    places = places @ np.stack([one, np.cross(table.up, one), table.up])
+    number = np.arange(x.size).reshape(x.shape)
+    a, b, c, d = number[:-1, :-1], number[1:, :-1], number[1:, 1:], number[:-1, 1:]
+    faces = np.stack([a, b, c, a, c, d], -1).reshape(-1, 3)
+    return Mesh(table.origin + places.reshape(-1, 3), faces)
+
+
+def rod(radius_mm: float, length_mm: float) -> Mesh:
+    """A shaft along +z whose round tip touches the origin."""
+    angle = np.linspace(0, np.pi / 2, 7)[1:]
+    along = np.linspace(radius_mm, length_mm, int(np.ceil(length_mm / _RING_MM)) + 1)[1:]
+    radius = np.concatenate([radius_mm * np.sin(angle), np.full(len(along), radius_mm)])
+    height = np.concatenate([radius_mm * (1 - np.cos(angle)), along])
+    turn = np.arange(_SECTIONS) * 2 * np.pi / _SECTIONS
+    x, y = radius[:, None] * np.cos(turn), radius[:, None] * np.sin(turn)
+    circles = np.stack([x, y, np.repeat(height[:, None], _SECTIONS, 1)], -1).reshape(-1, 3)
+    vertices = np.concatenate([circles, [[0.0, 0.0, 0.0], [0.0, 0.0, length_mm]]])
+    ring = np.arange(len(circles)).reshape(x.shape)
+    beside = np.roll(ring, -1, axis=1)
+    tip, end = np.full((2, _SECTIONS), [[len(circles)], [len(circles) + 1]])
+    corners = [
+        (ring[:-1], beside[:-1], ring[1:]),
+        (beside[:-1], beside[1:], ring[1:]),
+        (tip, beside[0], ring[0]),
+        (end, ring[-1], beside[-1]),
+    ]
+    return Mesh(vertices, np.concatenate([np.stack(abc, -1).reshape(-1, 3) for abc in corners]))

@@ -1,0 +1,72 @@
+"""The wheel, installed as a user does: its command line and its API, without the laboratory."""
+
+import os
+import subprocess
+import sys
+import sysconfig
+import venv
+import zipfile
+from pathlib import Path
+
+import pytest
+
+pytestmark = pytest.mark.slow
+ROOT = Path(__file__).parents[2]
+
+
+def run(*command, **options):
+    done = subprocess.run(
+        [str(word) for word in command], capture_output=True, text=True, timeout=600, **options
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("wheel")
+    build = [sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "--wheel-dir", folder]
+    run(*build, ROOT)
+    return next(folder.glob("tumortrack-*.whl"))
+
+
+@pytest.fixture(scope="module")
+def environment(wheel, tmp_path_factory):
+    """A new environment that holds the wheel and, by links, what it depends on."""
+    place = tmp_path_factory.mktemp("environment")
+    venv.create(place, with_pip=False, symlinks=True)
+    (packages,) = place.glob("lib/python3*/site-packages")
+    (linked := place / "dependencies").mkdir()
+    for path in Path(sysconfig.get_path("purelib")).iterdir():
+        if "tumortrack" not in path.name:
+            (linked / path.name).symlink_to(path)
+    (packages / "dependencies.pth").write_text(f"{linked}\n")
+    with zipfile.ZipFile(wheel) as archive:
+        archive.extractall(packages)
+    return place
+
+
+def test_commands_and_an_example_run_from_the_wheel(environment, tmp_path):
+    python = environment / "bin" / "python"
+    clean = {k: v for k, v in os.environ.items() if not k.startswith("PYTHON")}
+    code = "import tumortrack; print(tumortrack.__file__)"
+    assert str(environment) in run(python, "-c", code, env=clean)
+    command = [python, "-m", "tumortrack"]
+    assert "--minutes" in run(*command, "demo", "--help", env=clean)
+    said = run(*command, "doctor", env=clean)
+    assert "ok       torch" in said
+    assert "BROKEN" not in said
+    listed = run(*command, "--help", env=clean)
+    assert "locate" in listed
+    assert "twin" not in listed  # the laboratory's
+    example = ROOT / "examples" / "01_prepare_and_look.py"
+    assert "kidney: 1" in run(python, example, tmp_path, env=clean, cwd=tmp_path)
+    assert (tmp_path / "case" / "qc.png").stat().st_size > 10_000
+
+
+def test_the_wheel_holds_the_package_alone(wheel):
+    names = zipfile.ZipFile(wheel).namelist()
+    tops = {name.split("/")[0] for name in names}
+    assert {top.split("-")[0] for top in tops} == {"tumortrack"}
+    assert "tumortrack/py.typed" in names
+    assert any(name.endswith("LICENSE") for name in names)

@@ -1,0 +1,80 @@
+"""The public names: what there is, how it is called, and that importing it is light."""
+
+import inspect
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+import tumortrack as tt
+from live_objects import ball
+
+# A name or a parameter that goes or changes its meaning breaks users' scripts: think twice.
+SIGNATURES = {
+    "estimate_from_surfaces": "surfaces grid=160",
+    "evaluate": "locate scenes report=None",
+    "find_organ": "content model=None range_mm=None box_mm=None mask=None picked_mm=None seed=0",
+    "load_case": "folder",
+    "load_model": "folder device='auto'",
+    "plan_resection": "located picture=None stand_mm=None options",
+    "prepare": "source folder=None overwrite=False options",
+    "read_cloud": "path unit='mm'",
+    "save_estimate": "estimate folder overwrite=False",
+    "scan_phantom": "folder seed=1",
+    "simulate_scenes": "case count=1 seed=0 elastic=True noise=True",
+    "track": "tracker source sinks=() until=None seconds=0.0 range_mm=None",
+    "train": "case folder preset='clinic' config=None minutes=None steps=None seed=0 "
+    "device='auto' workers=None report=None",
+}
+VALUES = {"Case", "DepthFrame", "Estimate", "Intrinsics", "SensorCloud", "Tracker"}
+MODULES = {"errors", "presets"}
+
+
+def test_the_public_names_and_their_parameters():
+    assert set(tt.__all__) == set(SIGNATURES) | VALUES | MODULES
+    for name, wanted in SIGNATURES.items():
+        given = [
+            parameter.name
+            + ("" if parameter.default is parameter.empty else f"={parameter.default!r}")
+            for parameter in inspect.signature(getattr(tt, name)).parameters.values()
+        ]
+        assert " ".join(given) == wanted, name
+
+
+@pytest.mark.parametrize("name", sorted(set(tt.__all__) - MODULES))
+def test_every_name_has_a_docstring_with_what_it_raises(name):
+    text = inspect.getdoc(getattr(tt, name)) or ""
+    assert len(text) > 40
+    if name in SIGNATURES and name not in ("estimate_from_surfaces", "simulate_scenes"):
+        assert "Raises:" in text
+
+
+def test_importing_the_package_loads_nothing_heavy():
+    code = "import sys, tumortrack; dir(tumortrack); print(*sys.modules)"
+    said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert not {"torch", "numpy", "scipy", "numba"} & set(said.stdout.split())
+
+
+def test_an_unknown_name_is_an_attribute_error():
+    with pytest.raises(AttributeError, match="no attribute 'prepair'"):
+        tt.prepair  # noqa: B018
+
+
+def test_unknown_options_are_refused_with_those_there_are(tmp_path):
+    with pytest.raises(tt.errors.InputError, match=r"no 'kidney'.*kidney_hu"):
+        tt.prepare(tmp_path, kidney=(1, 2))
+    with pytest.raises(tt.errors.InputError, match="preset 'fast'; allowed: clinic"):
+        tt.train(tmp_path, tmp_path, preset="fast")
+
+
+def test_surfaces_become_an_estimate_that_compares_as_equal():
+    organ = ball((0.0, 0.0, 150.0), 30.0)
+    tumor = ball((20.0, 0.0, 150.0), 8.0)
+    made = tt.estimate_from_surfaces({"kidney": organ, "tumor_1": tumor}, grid=80)
+    inside = made.report["parts"]
+    assert inside["kidney"]["volume_ml"] == pytest.approx(organ.volume_mm3 / 1000)
+    voxel_ml = made.report["voxel_mm"] ** 3 / 1000
+    counted = np.bincount(made.volume.labels.reshape(-1))[1:] * voxel_ml
+    assert counted.sum() == pytest.approx(organ.volume_mm3 / 1000, rel=0.02)
+    assert counted[1] == pytest.approx(tumor.volume_mm3 / 1000, rel=0.05)
