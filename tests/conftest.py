@@ -2,33 +2,31 @@
 
 import fcntl
 import os
+import re
 from collections.abc import Callable
 from pathlib import Path
 
+import jaxtyping
 import pytest
-from jaxtyping import install_import_hook
 
 ROOT = Path(__file__).parents[1]
 PACKAGES = (ROOT / "src" / "tumortrack", ROOT / "lab" / "src" / "tumortrack_lab")
-CHECKED = (
-    *("core/geometry.py", "core/estimate.py", "imaging/*.py", "phantom/*.py", "models/[rv]*.py"),
-    *("*/locator.py", "occupancy/[os]*.py", "tracking/*.py", "live/*.py", "report/*.py"),
-    *("bench/**/*.py", "study/*.py", "twin/*.py", "peers/*.py", "cut/*.py", "tets.py"),
-)
 
 # Left out: modules with numba kernels (numba compiles the plain function), and core.types, whose
 # constructors convert and check shapes themselves, always.
-install_import_hook(
-    [
-        ".".join(path.relative_to(package.parent).with_suffix("").parts)
-        for package in PACKAGES
-        for pattern in CHECKED
-        for path in sorted(package.glob(pattern))
-        if path.name != "__init__.py" and "import numba" not in path.read_text(encoding="utf-8")
-    ],
-    "beartype.beartype",
-)
+CHECKED = [
+    ".".join(path.relative_to(package.parent).with_suffix("").parts)
+    for package in PACKAGES
+    for path in sorted(package.rglob("*.py"))
+    if path.name not in ("__init__.py", "__main__.py")
+    and path != PACKAGES[0] / "core" / "types.py"
+    and not re.search("^ *import numba", path.read_text(encoding="utf-8"), re.M)
+]
+jaxtyping.install_import_hook(CHECKED, "checking.checked")
 
+
+# What needs a model is slow: it may be the one that trains it.
+TRAINED = {"clinic_model", "quick_model", "learnt_model", "slim_model"}
 
 # The longest files first: with few workers none is left alone with one at the end.
 SLOWEST = (
@@ -44,9 +42,19 @@ SLOWEST = (
 )
 
 
+@pytest.hookimpl(tryfirst=True)  # before -m chooses
 def pytest_collection_modifyitems(items):
+    for item in items:
+        if TRAINED.intersection(item.fixturenames):
+            item.add_marker(pytest.mark.slow)
     order = {name: n for n, name in enumerate(SLOWEST)}
     items.sort(key=lambda item: order.get(item.path.name, len(order)))
+
+
+@pytest.fixture
+def unchecked(monkeypatch):
+    """As in use: annotations are not executed, so that a function's own refusal is met."""
+    monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)
 
 
 @pytest.fixture(scope="session")
@@ -103,6 +111,15 @@ def quick_model(once, phantom_case) -> Path:
     from stories import trained
 
     return once("quick_model", lambda model: trained(phantom_case, model, "quick"))
+
+
+@pytest.fixture(scope="session")
+def learnt_model(once, phantom_case) -> Path:
+    """A model folder of the phantom: a ``quick`` that has learnt enough to be right by millimetres
+    and sure of its labels."""
+    from stories import train_learnt
+
+    return once("learnt_model", lambda model: train_learnt(phantom_case, model))
 
 
 @pytest.fixture(scope="session")

@@ -36,8 +36,7 @@ from tumortrack.tracking.tracker import Tracker
 from tumortrack.training.model import load_model
 from tumortrack.training.presets import PRESETS, pretraining
 from tumortrack.training.pretrain import Pretraining, kidney_stream
-from tumortrack.training.task import task_of
-from tumortrack.training.train import TrainingRun, train
+from tumortrack.training.train import TrainingRun, task_of, train
 from tumortrack_lab.twin.dataset import StateCache, TwinRun
 from tumortrack_lab.twin.views import VIEWS, ViewConfig, make_scene
 

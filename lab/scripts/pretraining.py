@@ -36,13 +36,13 @@ from tumortrack.report.drawing import new_figure, save
 from tumortrack.simulate.dataset import SceneStream
 from tumortrack.simulate.occupancy import organ_pool
 from tumortrack.simulate.scene import Simulator, body_for
-from tumortrack.training.head_start import HeadStart, load_start
+from tumortrack.training.model import PretrainedWeights, load_start
 from tumortrack.training.presets import clinic
 from tumortrack.training.registration_task import RegistrationTask
 from tumortrack.training.run import TrainingRun
 from tumortrack.training.scenes import batches
 from tumortrack.training.state import TrainingState
-from tumortrack.training.validate import ValidationScenes, mean_iou_of, validation_scenes
+from tumortrack.training.task import ValidationScenes, mean_iou_of, validation_scenes
 from tumortrack_lab.study.book import ReportWriter
 from tumortrack_lab.study.markdown import table
 from tumortrack_lab.study.phantoms import phantom_case
@@ -121,7 +121,7 @@ def _cases(options: Options) -> list[tuple[str, Path]]:
 
 
 def _curve(
-    case: Case, judge: Judge, start: HeadStart, seed: int, lengths: tuple[int, ...]
+    case: Case, judge: Judge, start: PretrainedWeights, seed: int, lengths: tuple[int, ...]
 ) -> list[dict]:
     """All trainings of one case and seed, side by side over the same batches."""
     device, config = torch.device("cpu"), clinic(case.anatomy)
@@ -133,9 +133,9 @@ def _curve(
     for length in lengths:
         for pretrained in (False, True):
             state = TrainingState(replace(run, steps=max(length, 1)), device)
-            state.know(course.teach)
+            state.initialize(course.initialize)
             if pretrained:
-                state.know(lambda network: carry_over(network, start.weights, upright))
+                state.initialize(lambda network: carry_over(network, start.weights, upright))
             states[length, pretrained] = state
     stream = SceneStream(
         case.anatomy, case.up_lps, config.scene, course.points, seed, "train",

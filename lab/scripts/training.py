@@ -42,17 +42,17 @@ from tumortrack.report.drawing import new_figure, save
 from tumortrack.simulate.dataset import SceneStream
 from tumortrack.simulate.occupancy import organ_pool
 from tumortrack.simulate.scene import Simulator, body_for
+from tumortrack.training.occupancy_task import label_miou
 from tumortrack.training.presets import PRESETS, clinic, quick
 from tumortrack.training.run import TrainingRun, settle_end
 from tumortrack.training.scenes import batches
 from tumortrack.training.state import TrainingState
-from tumortrack.training.task import task_of
-from tumortrack.training.validate import (
+from tumortrack.training.task import (
     ValidationScenes,
-    ValidationSet,
     mean_iou_of,
     validation_scenes,
 )
+from tumortrack.training.train import task_of
 from tumortrack_lab.study.book import ReportWriter
 from tumortrack_lab.study.markdown import table
 from tumortrack_lab.study.phantoms import phantom_case
@@ -161,7 +161,7 @@ def _curve(case: Case, setting: Setting, judge: Judge, options: Options) -> list
     )
     course = task_of(run, CPU)
     state = TrainingState(run, CPU)
-    state.know(course.teach)
+    state.initialize(course.initialize)
     stream = SceneStream(
         case.anatomy, case.up_lps, config.scene, course.points, setting.seed, "train",
         setting.batch, course.body,
@@ -206,7 +206,7 @@ class Judge:
     def _miou(self, network: Network, scenes: ValidationScenes) -> float:
         network.eval()
         if isinstance(network, OccupancyNetwork):
-            return ValidationSet(scenes, self._parts, CPU).miou(network)
+            return label_miou(network, scenes, self._parts, CPU)
         assert isinstance(network, RegistrationNetwork)
         assert self._shape is not None
         guesses = []

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from tumortrack.plan.values import ResectionPlan
     from tumortrack.simulate.scene_folder import Scene
     from tumortrack.tracking.tracker import Tracker
-    from tumortrack.training.pace import TrainingStatus
+    from tumortrack.training.train import TrainingStatus
 
 __all__ = [
     "Case",

@@ -10,8 +10,9 @@ import pytest
 import trimesh
 
 from stories import refusal, succeeded, tumortrack
-from tumortrack.cli import commands
-from tumortrack.cli.demo import run_demo
+from tumortrack.cli.cases import Prepare
+from tumortrack.cli.demo import Demo
+from tumortrack.cli.training import Train
 from tumortrack.core.errors import InputError
 from tumortrack.imaging.prepare import PrepareOptions, prepare
 
@@ -180,14 +181,13 @@ def test_an_unreadable_input_is_named_and_no_folder_stays(tmp_path, monkeypatch)
 
     monkeypatch.setattr("tumortrack.imaging.prepare.read_raw", refuse)
     with pytest.raises(InputError, match=r"ball\.nii cannot be read: Permission denied"):
-        commands.prepare(source, tmp_path / "new" / "dir" / "case", PrepareOptions(), False)
+        Prepare(input=source, case=tmp_path / "new" / "dir" / "case").run()
     assert sorted(p.name for p in tmp_path.iterdir()) == ["ball.nii"]
 
 
 def test_train_wants_one_end(tmp_path):
-    both = commands.TrainOptions(minutes=1.0, steps=10)
     with pytest.raises(InputError, match="--minutes and --steps"):
-        commands.train(tmp_path / "case", tmp_path / "model", both)
+        Train(case=tmp_path / "case", model=tmp_path / "model", minutes=1.0, steps=10).run()
 
 
 @pytest.mark.parametrize(
@@ -196,7 +196,7 @@ def test_train_wants_one_end(tmp_path):
 )
 def test_a_demo_of_nothing_is_refused_at_once(minutes, scenes, words, tmp_path):
     with pytest.raises(InputError, match=words):
-        run_demo(tmp_path / "demo", minutes, scenes)
+        Demo(out=tmp_path / "demo", minutes=minutes, scenes=scenes).run()
     assert list(tmp_path.iterdir()) == []
 
 
@@ -212,15 +212,15 @@ def test_the_demo_replaces_nothing_but_a_demo(tmp_path, monkeypatch):
     before = sorted(tmp_path.rglob("*"))
     for out, words in ((mine, "no demo wrote"), (tmp_path / "file", "is a file")):
         with pytest.raises(InputError, match=words):
-            run_demo(out, 1.0, 1)
+            Demo(out=out, scenes=1).run()
     assert sorted(tmp_path.rglob("*")) == before
     demo = tmp_path / "demo"
     with pytest.raises(KeyboardInterrupt):
-        run_demo(demo, 1.0, 1)
+        Demo(out=demo, scenes=1).run()
     (demo / "case").mkdir()  # what a demo that was stopped left there
     with pytest.raises(KeyboardInterrupt):
-        run_demo(demo, 1.0, 1)
+        Demo(out=demo, scenes=1).run()
     assert [p.name for p in demo.iterdir()] == ["demo.json"]
     (demo / "notes.txt").write_text("dear")
     with pytest.raises(InputError, match=r"notes\.txt"):
-        run_demo(demo, 1.0, 1)
+        Demo(out=demo, scenes=1).run()

@@ -9,8 +9,7 @@ import re
 import pytest
 
 from stories import succeeded, tumortrack
-from tumortrack.cli.doctor import examine
-from tumortrack.cli.inspection import describe
+from tumortrack.cli.inspection import Doctor, describe
 from tumortrack.core import store
 from tumortrack.imaging.case import load_case
 from tumortrack.simulate.scene_folder import list_scenes, read_scene
@@ -44,7 +43,7 @@ def test_the_demo_tells_the_whole_story(tmp_path):
 
 def test_the_doctor_finds_everything_also_where_the_system_tells_no_affinity(monkeypatch, capsys):
     monkeypatch.delattr(os, "sched_getaffinity", raising=False)  # as on macOS
-    examine()
+    Doctor().run()
     said = capsys.readouterr().out
     assert int(re.search(r"cores: (\d+)", said).group(1)) >= 1
     assert "BROKEN" not in said

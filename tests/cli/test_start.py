@@ -84,7 +84,7 @@ def test_an_answer_needs_none_of_the_slow_libraries(slim_model, tmp_path):
 
 
 def test_a_command_ends_well_where_nobody_reads_its_errors():
-    words = "from tumortrack.cli.loading import leave; print(1, flush=True); leave(); print(2)"
+    words = "from tumortrack.cli.main import leave; print(1, flush=True); leave(); print(2)"
     closed = f"exec {sys.executable} -c '{words}' 2>&-"
     done = subprocess.run(["sh", "-c", closed], stdout=subprocess.PIPE, timeout=300, check=True)
     assert done.stdout == b"1\n"

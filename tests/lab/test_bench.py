@@ -33,7 +33,7 @@ from tumortrack_lab.bench.suite import GROUPS
 from tumortrack_lab.bench.tasks import Task, carry_out
 from tumortrack_lab.bench.turns import InterleavedTiming, Uncounted, in_turns, timing_of
 from tumortrack_lab.cli import bench as benching
-from tumortrack_lab.cli.bench import BenchOptions
+from tumortrack_lab.cli.bench import Bench
 from tumortrack_lab.study.markdown import closing, opening
 
 PAPER_DECODER = MlpDecoderConfig(
@@ -262,7 +262,7 @@ if "encoder" in task["groups"]:
 def test_the_command_gathers_what_processes_find(tmp_path, monkeypatch, capfd) -> None:
     monkeypatch.setattr(benching, "_WORKER", [sys.executable, "-c", WORKER])
     out = tmp_path / "new" / "found.json"
-    benching.bench(BenchOptions(only=("generator", "planning"), quick=True, out=out))
+    Bench(only=("generator", "planning"), quick=True, out=out).run()
     found = json.loads(out.read_text())
     assert [row["name"] for row in found["rows"]] == ["generator", "planning"]
     assert found["machine"] == {"date": "today"}
@@ -272,7 +272,7 @@ def test_the_command_gathers_what_processes_find(tmp_path, monkeypatch, capfd) -
     assert said.index("  generator") < said.index("  planning") < said.index("written to")
     assert said.count("2.00 s a pair") == 2  # each as soon as it was measured
     with pytest.raises(TumortrackError, match="the encoder is broken"):
-        benching.bench(BenchOptions(only=("encoder",), out=tmp_path / "none.json"))
+        Bench(only=("encoder",), out=tmp_path / "none.json").run()
     assert not (tmp_path / "none.json").exists()
 
 
@@ -292,17 +292,15 @@ def test_each_process_has_its_own_threads_and_only_needed_models_are_trained(tmp
 def test_what_cannot_be_measured_is_refused(tmp_path) -> None:
     assert "nonsense" in tumortrack("bench", "--only", "nonsense").stderr
     with pytest.raises(InputError, match="belong together"):
-        benching.bench(BenchOptions(model=tmp_path))
+        Bench(model=tmp_path).run()
     with pytest.raises(InputError, match="cannot be read"):
-        benching.bench(BenchOptions(document=tmp_path / "none.md"))
+        Bench(document=tmp_path / "none.md").run()
     (tmp_path / "bare.md").write_text("no markers")
     with pytest.raises(InputError, match="results:goals"):
-        benching.bench(BenchOptions(document=tmp_path / "bare.md"))
+        Bench(document=tmp_path / "bare.md").run()
 
 
 def test_the_command_line_names_every_part() -> None:
     from typing import get_args, get_type_hints
 
-    from tumortrack.cli.main import bench as command
-
-    assert set(get_args(get_args(get_type_hints(command)["only"])[0])) == set(GROUPS)
+    assert set(get_args(get_args(get_type_hints(Bench)["only"])[0])) == set(GROUPS)

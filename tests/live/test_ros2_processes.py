@@ -272,6 +272,7 @@ def built(folder: Path) -> Path:
     return made
 
 
+@pytest.mark.slow
 def test_fast_dds_hears_and_is_heard(tmp_path: Path, bus: Bus, messages: Messages) -> None:
     """A cloud of ours arrives there byte for byte, an image from there here; noise does no harm."""
     program = built(tmp_path)

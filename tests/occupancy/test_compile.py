@@ -11,16 +11,24 @@ import pytest
 import torch
 from torch import Tensor
 
-from tumortrack.cli.compiling import compile_model
 from tumortrack.cli.inspection import describe
+from tumortrack.cli.models import Compile
 from tumortrack.core.config import to_builtins
 from tumortrack.models.config import MlpDecoderConfig, NetworkConfig
 from tumortrack.models.normalisation import CloudBox
-from tumortrack.occupancy.arithmetic import Arithmetic, can_pack, possible, usual
+from tumortrack.occupancy.compiled import (
+    Compiled,
+    find,
+    like_an_organ,
+    measured,
+    place_of,
+    read,
+    reference,
+    save,
+    this_machine,
+)
 from tumortrack.occupancy.compiled import describe as describe_compiled
-from tumortrack.occupancy.compiled import find, place_of, read, save, this_machine
-from tumortrack.occupancy.compiling import like_an_organ, measured, reference
-from tumortrack.occupancy.inference import Inference
+from tumortrack.occupancy.inference import Arithmetic, Inference, can_pack, possible, usual
 from tumortrack.occupancy.locator import OccupancyLocator
 from tumortrack.occupancy.network import OccupancyNetwork
 from tumortrack.training.model import load_model
@@ -115,14 +123,16 @@ def test_usual_arithmetic_is_one_that_the_processor_has():
     assert usual(CPU).numbers == possible(CPU)[-1]
 
 
-def test_compiled_is_found_again_and_not_where_anything_differs(quick_model, tmp_path):
+def test_compiled_is_found_again_and_not_where_anything_differs(learnt_model, tmp_path):
     folder = tmp_path / "model"
     folder.mkdir()
     arithmetic, notice = find(folder, "weights")
     assert arithmetic is None
     assert "tumortrack compile" in notice
-    compiled = measured(load_model(quick_model, "cpu"), "weights", rounds=1)
+    compiled = measured_once(learnt_model)
     assert {timing.arithmetic.numbers for timing in compiled.timings} == set(possible(CPU))
+    # bfloat16 keeps 8 bits: some 1 % of the logits' spread is lost, and labels differ where two
+    # classes are nearer than that. A model that has learnt has few such places.
     assert all(timing.labels_equal > 0.99 for timing in compiled.timings)
     path = save(folder, compiled)
     assert read(path) == compiled
@@ -131,6 +141,12 @@ def test_compiled_is_found_again_and_not_where_anything_differs(quick_model, tmp
         arithmetic, notice = find(changed(folder, tmp_path / change, change), "weights")
         assert arithmetic is None
         assert "tumortrack compile" in notice
+
+
+def measured_once(folder: Path) -> Compiled:
+    model = load_model(folder, "cpu")
+    half_mm = model.in_distribution.spread_mm[1]
+    return measured(model.network, model.query_box_mm, half_mm, "weights", rounds=1)
 
 
 def changed(folder: Path, copy: Path, what: str) -> Path:
@@ -153,9 +169,9 @@ def changed(folder: Path, copy: Path, what: str) -> Path:
     return copy
 
 
-def test_each_number_of_threads_has_its_own_choice(quick_model, tmp_path, monkeypatch):
+def test_each_number_of_threads_has_its_own_choice(learnt_model, tmp_path, monkeypatch):
     """What is fastest on one core need not be on two."""
-    alone = measured(load_model(quick_model, "cpu"), "weights", rounds=1)
+    alone = measured_once(learnt_model)
     many = msgspec.structs.replace(
         alone, threads=alone.threads + 1, arithmetic=other_than(alone.arithmetic)
     )
@@ -184,12 +200,12 @@ def test_arithmetic_is_read_as_written():
     assert to_builtins(one) == {"numbers": "bfloat16", "chunk": 2048}
 
 
-def test_compile_is_used_by_the_next_load_and_named_by_inspect(quick_model, tmp_path, capsys):
-    folder = shutil.copytree(quick_model, tmp_path / "model")
+def test_compile_is_used_by_the_next_load_and_named_by_inspect(learnt_model, tmp_path, capsys):
+    folder = shutil.copytree(learnt_model, tmp_path / "model")
     before = load_model(folder, "cpu")
     assert before.arithmetic is None
     assert "tumortrack compile" in before.notes[0]
-    compile_model(folder, "cpu")
+    Compile(model=folder, device="cpu").run()
     said = capsys.readouterr().out
     assert all(numbers in said for numbers in possible(CPU))
     after = load_model(folder, "cpu")
@@ -201,7 +217,7 @@ def test_compile_is_used_by_the_next_load_and_named_by_inspect(quick_model, tmp_
 
 
 def test_there_is_nothing_to_choose_for_a_model_that_places_the_organ(clinic_model, capsys):
-    compile_model(clinic_model, "cpu")
+    Compile(model=clinic_model, device="cpu").run()
     assert "nothing to choose" in capsys.readouterr().out
     assert not (clinic_model / "compiled").exists()
     assert load_model(clinic_model, "cpu").notes == ()

@@ -6,7 +6,6 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
-import msgspec
 import nibabel
 import numpy as np
 import pytest
@@ -15,7 +14,7 @@ import trimesh
 
 from stories import cloud_by_rays, looking_down, refusal, succeeded, tumortrack
 from tumortrack.cli.inspection import describe
-from tumortrack.cli.scenes import check_case
+from tumortrack.cli.locate import check_case
 from tumortrack.core import store
 from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.estimate import Following
@@ -23,36 +22,20 @@ from tumortrack.core.geometry import transform_points
 from tumortrack.core.mesh_files import read_mesh
 from tumortrack.core.types import Anatomy, SensorCloud
 from tumortrack.imaging.case import load_case
-from tumortrack.occupancy.arithmetic import Arithmetic, can_pack, possible
+from tumortrack.occupancy.inference import Arithmetic, can_pack, possible
 from tumortrack.tracking.tracker import Follower, FollowerConfig, Tracker
 from tumortrack.training.model import load_model
-from tumortrack.training.presets import quick
-from tumortrack.training.train import TrainingRun, train
 
 pytestmark = pytest.mark.slow
-
-STEPS = 400
-
 
 STATM = Path("/proc/self/statm")
 
 
 @pytest.fixture(scope="module")
-def work(tmp_path_factory: pytest.TempPathFactory, phantom_case: Path) -> Path:
+def work(tmp_path_factory: pytest.TempPathFactory, phantom_case: Path, learnt_model: Path) -> Path:
     folder = tmp_path_factory.mktemp("locate")
     (folder / "case").symlink_to(phantom_case)
-    case = load_case(phantom_case)
-    preset = quick(case.anatomy)
-    config = msgspec.structs.replace(  # with small pictures: less than a minute
-        preset,
-        scene=msgspec.structs.replace(preset.scene, width=212, height=120),
-        validation_pairs=16,
-    )
-    case_sha256 = store.sha256_of(phantom_case / store.MANIFEST)
-    run = TrainingRun(
-        case.anatomy, case.up_lps, case_sha256, config, steps=STEPS, workers=0, device="cpu"
-    )
-    train(run, folder / "model", lambda _: None)
+    (folder / "model").symlink_to(learnt_model)
     return folder
 
 

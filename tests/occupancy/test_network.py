@@ -10,6 +10,7 @@ from tumortrack.core.errors import InputError
 from tumortrack.models import sampling
 from tumortrack.models.config import MlpDecoderConfig, NetworkConfig
 from tumortrack.models.encoders.pointnet2 import PointNet2Config, SetAbstraction, _Level
+from tumortrack.models.layers import greatest_above_zero
 from tumortrack.models.normalisation import (
     Aligned,
     CloudBox,
@@ -19,10 +20,8 @@ from tumortrack.models.normalisation import (
     turned,
     without_strays,
 )
-from tumortrack.models.pooling import greatest_above_zero
 from tumortrack.models.sampling import ball_query, farthest_points, strided_points, take
-from tumortrack.occupancy.mlp_decoder import MlpDecoder, octave_features
-from tumortrack.occupancy.network import OccupancyNetwork
+from tumortrack.occupancy.network import MlpDecoder, OccupancyNetwork, octave_features
 from tumortrack.training.presets import paper_network, quick_network
 
 

@@ -9,8 +9,8 @@ import torch
 
 from tumortrack.models.config import MlpDecoderConfig, NetworkConfig
 from tumortrack.models.encoders.pointnet2 import PointNet2Config, SetAbstraction
+from tumortrack.models.model import onnx_bytes
 from tumortrack.models.normalisation import Aligned
-from tumortrack.models.onnx_file import onnx_bytes
 from tumortrack.occupancy.network import OccupancyNetwork
 from tumortrack.training.model import load_model
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from test_sparse_volume import Field
 
-from tumortrack.occupancy.lattice import LogitLattice, lattice_over, leaves, organ_lattice
-from tumortrack.occupancy.volume import keep_largest_pieces
+from tumortrack.occupancy.sparse import organ_lattice
+from tumortrack.occupancy.volume import LogitLattice, keep_largest_pieces, lattice_over
 
 BOX = np.array([[-90.0, -90, -90], [90, 90, 90]])
 
@@ -33,11 +33,11 @@ def test_a_small_tumor_is_met_wherever_it_lies_in_the_organ():
         assert (organ_lattice(field, BOX, 40).logits.argmax(-1) == 3).any()
 
 
-def test_an_organ_that_reaches_the_border_or_is_not_there_leaves():
+def test_an_organ_that_reaches_the_border_or_is_not_there_is_cut_off():
     field = Field(2)
-    assert not leaves(organ_lattice(field, BOX, 40))
-    assert leaves(organ_lattice(field, BOX + [80, 0, 0], 40))
-    assert leaves(organ_lattice(field, BOX + 400, 40))
+    assert not organ_lattice(field, BOX, 40).cut_off()
+    assert organ_lattice(field, BOX + [80, 0, 0], 40).cut_off()
+    assert organ_lattice(field, BOX + 400, 40).cut_off()
 
 
 def test_an_island_at_the_border_is_not_the_organ():
@@ -45,6 +45,6 @@ def test_an_island_at_the_border_is_not_the_organ():
     logits[..., 0] = 1
     logits[3:6, 3:6, 3:6, 1] = 2
     logits[0, 0, 0, 1] = logits[8, 4, 4, 1] = 2
-    assert not leaves(LogitLattice(np.zeros(3), 4.0, logits))
+    assert not LogitLattice(np.zeros(3), 4.0, logits).cut_off()
     logits[5:, 4, 4, 1] = 2  # now the organ hangs together with it
-    assert leaves(LogitLattice(np.zeros(3), 4.0, logits))
+    assert LogitLattice(np.zeros(3), 4.0, logits).cut_off()

@@ -9,16 +9,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tumortrack.models.report import grid_over
-from tumortrack.occupancy.lattice import lattice_over
 from tumortrack.occupancy.sparse import (
     START_MM,
     InterpolationLimit,
     halved_lattice,
-    settled,
+    query_uncertain,
     sparse_logits,
     sparse_margins,
 )
-from tumortrack.occupancy.volume import dense_margins, margins_on, part_surfaces
+from tumortrack.occupancy.volume import dense_margins, lattice_over, margins_on, part_surfaces
 
 NAMES = ("kidney", "tumor_1", "tumor_2")
 
@@ -150,10 +149,12 @@ def test_what_was_settled_before_is_neither_a_measure_nor_asked():
     leads = np.full(1000, np.inf, np.float32)
     leads[:100] = np.linspace(0, 1, 100)
     expected = np.zeros((1000, 2), np.float32)
-    trust = InterpolationLimit()
-    asked = settled(expected, leads, lambda which: np.zeros((len(which), 2), np.float32), trust)
-    assert np.array_equal(asked, np.isfinite(leads))
-    assert trust.limit == 1
+    limit = InterpolationLimit()
+    queried = query_uncertain(
+        expected, leads, lambda which: np.zeros((len(which), 2), np.float32), limit
+    )
+    assert np.array_equal(queried, np.isfinite(leads))
+    assert limit.limit == 1
 
 
 def test_no_point_of_the_coarse_lattice_is_asked_again():

@@ -136,7 +136,7 @@ def test_a_halt_needs_its_reason_and_new_motions_begin_where_the_arms_are():
         ("times must rise", (np.array([0, 1, 1.0]), np.zeros((3, 12)), np.zeros(3, bool))),
     ],
 )
-def test_a_stage_that_is_none_is_refused(kind, bad):
+def test_a_stage_that_is_none_is_refused(kind, bad, unchecked):
     with pytest.raises(InputError, match=kind):
         MotionStage("grasp", *bad)
 

@@ -79,7 +79,7 @@ def test_a_loaded_model_says_the_same_bit_for_bit(model, stages, tmp_path, estim
     save_model(model, tmp_path / "again")
     again = load_model(tmp_path / "again", "cpu")
     assert again.calibration == model.calibration
-    assert again.familiar == model.familiar
+    assert again.in_distribution == model.in_distribution
     found = Tracker(again).locate(stages[0].cloud, grid=48, seed=3)
     np.testing.assert_array_equal(found.cloud.points_mm, estimate.cloud.points_mm)
     np.testing.assert_array_equal(found.cloud.probability, estimate.cloud.probability)

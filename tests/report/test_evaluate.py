@@ -23,15 +23,8 @@ from tumortrack.report.metrics import label_grid
 from tumortrack.report.page import thinned
 from tumortrack.report.pictures import FROM_CAMERA, FROM_SIDE
 from tumortrack.report.protocol import evaluate_scenes, summarise, summary_table
-from tumortrack.report.qc import PLANES, qc_picture, slice_volume
-from tumortrack.report.shade import (
-    Frame,
-    ShadedLayer,
-    ShadedView,
-    frame_around,
-    pixel_centres,
-    shade,
-)
+from tumortrack.report.qc import PLANES, border_letters, qc_picture, slice_volume
+from tumortrack.report.renderer import Body, Frame, ParallelView
 from tumortrack.simulate.scene_folder import Scene, write_scene
 
 
@@ -235,24 +228,35 @@ def test_sections_of_a_ball_are_circles_of_the_right_size():
 
 def test_shading_hides_what_lies_behind():
     red, green = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0)
-    near, far = ball(5, (0, 0, 100)), ball(8, (0, 0, 130))
-    frame = frame_around(FROM_CAMERA, far.vertices_mm)
-    for layers in (
-        [ShadedLayer(near, red), ShadedLayer(far, green)],
-        [ShadedLayer(far, green), ShadedLayer(near, red)],
-    ):
-        picture = shade(layers, FROM_CAMERA, frame)
-        x, y = pixel_centres(frame, 0.3)
+    near, far = Body(ball(5, (0, 0, 100)), red), Body(ball(8, (0, 0, 130)), green)
+    frame = FROM_CAMERA.frame_around(far.mesh.vertices_mm)
+    for bodies in ([near, far], [far, near]):
+        picture = FROM_CAMERA.draw(bodies, frame).astype(int)
+        x, y = frame.pixel_centres(0.3)
         middle = picture[np.abs(y).argmin(), np.abs(x).argmin()]
         rim = picture[np.abs(y).argmin(), np.abs(x - 6.5).argmin()]
         assert middle[0] > 2 * middle[1]
         assert rim[1] > 2 * rim[0]
-        np.testing.assert_array_equal(picture[0, 0], 1.0)
-    back = ShadedView("from behind", (-1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
-    behind = shade(
-        [ShadedLayer(near, red), ShadedLayer(far, green)], back, Frame(-13.0, 13.0, -13.0, 13.0)
-    )
+        np.testing.assert_array_equal(picture[0, 0], 255)
+    back = ParallelView("from behind", (-1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
+    behind = back.draw([near, far], Frame(-13.0, 13.0, -13.0, 13.0)).astype(int)
     assert behind[43, 43, 1] > 2 * behind[43, 43, 0]  # from behind the far one covers the near
+
+
+@pytest.mark.parametrize("view", [FROM_CAMERA, FROM_SIDE, PLANES[1], PLANES[2]])
+def test_depths_and_outlines_are_those_of_the_mesh(view):
+    middle = np.array([30.0, -40.0, 150.0])
+    mesh = ball(10, middle, subdivisions=5)
+    right, down, depth = view.project(middle[None])[0]
+    frame = view.frame_around(mesh.vertices_mm).widened(1.5)
+    found = view.depth_of(mesh, frame)
+    x, y = np.meshgrid(*frame.pixel_centres())
+    away = np.hypot(x - right, y - down)
+    np.testing.assert_array_equal(view.silhouette(mesh, frame)[np.abs(away - 10) > 0.3],
+                                  (away < 10)[np.abs(away - 10) > 0.3])  # fmt: skip
+    inner = away < 9
+    expected = depth - np.sqrt(100 - away[inner] ** 2)
+    np.testing.assert_allclose(found[inner], expected, atol=0.06)
 
 
 # A marker on each side of the patient must appear at its own letter.
@@ -267,8 +271,8 @@ ORIENTATIONS = {
 
 
 @pytest.mark.parametrize("name", ORIENTATIONS)
-@pytest.mark.parametrize("plane", PLANES, ids=lambda plane: plane.view.name)
-def test_letters_stand_where_the_patients_sides_are(plane, name):
+@pytest.mark.parametrize("view", PLANES, ids=lambda view: view.name)
+def test_letters_stand_where_the_patients_sides_are(view, name):
     turn, size, step = ORIENTATIONS[name], 64, 1.5
     lps_from_index = np.eye(4)
     lps_from_index[:3, :3] = turn * step
@@ -276,22 +280,22 @@ def test_letters_stand_where_the_patients_sides_are(plane, name):
     lps_from_index[:3, 3] = center - lps_from_index[:3, :3] @ np.full(3, (size - 1) / 2)
     index = np.stack(np.meshgrid(*[np.arange(size)] * 3, indexing="ij"), axis=-1)
     lps = index @ lps_from_index[:3, :3].T + lps_from_index[:3, 3] - center
-    frame = Frame(*(center @ plane.view.right + [-45, 45]), *(center @ plane.view.down + [-45, 45]))
-    x, y = pixel_centres(frame)
+    frame = Frame(*(center @ view.right + [-45, 45]), *(center @ view.down + [-45, 45]))
+    x, y = frame.pixel_centres()
     edges = {"left": x < x.mean(), "right": x > x.mean()}
     rows = {"top": y < y.mean(), "bottom": y > y.mean()}
-    for border, letter in plane.letters.items():
+    for border, letter in border_letters(view).items():
         mark = (np.linalg.norm(lps - MARKS[letter], axis=-1) < 8).astype(np.uint8)
-        picture = slice_volume(mark, lps_from_index, plane.view, frame, center) == 1
+        picture = slice_volume(mark, lps_from_index, view, frame, center) == 1
         side = picture[:, edges[border]] if border in edges else picture[rows[border]]
         assert picture.sum() > 1000
         assert side.sum() == picture.sum()
-    hidden = set("LRAPSI") - set(plane.letters.values())
+    hidden = set("LRAPSI") - set(border_letters(view).values())
     assert len(hidden) == 2
 
 
 def test_radiological_convention():
-    axial, coronal, sagittal = (plane.letters for plane in PLANES)
+    axial, coronal, sagittal = (border_letters(view) for view in PLANES)
     assert axial == {"left": "R", "right": "L", "top": "A", "bottom": "P"}
     assert coronal == {"left": "R", "right": "L", "top": "S", "bottom": "I"}
     assert sagittal == {"left": "A", "right": "P", "top": "S", "bottom": "I"}

@@ -11,8 +11,8 @@ from tumortrack.core.errors import InputError
 from tumortrack.core.types import Anatomy, CameraLabels, Mesh
 from tumortrack.imaging.raster import cover, voxelise
 from tumortrack.report.metrics import (
-    _to_surface,
     box_center_distance,
+    distance_to_surface,
     label_grid,
     label_ious,
     mean_iou,
@@ -49,26 +49,31 @@ def grid(low_mm, step_mm):
 
 def test_concentric_spheres_are_their_radii_apart():
     found = surface_distances(sphere(20), sphere(23))
-    for value in (found.symmetric_mm, found.one_sided_mm, found.percentile_95_mm, found.mean_mm):
+    for value in (
+        found.hausdorff_mm,
+        found.hausdorff_one_sided_mm,
+        found.hausdorff_95_mm,
+        found.surface_mm,
+    ):
         assert value == pytest.approx(3.0, abs=0.03)
 
 
 def test_a_shifted_sphere_is_its_shift_away():
     found = surface_distances(sphere(20, (4, 0, 0)), sphere(20))
-    assert found.symmetric_mm == pytest.approx(4.0, abs=0.02)
+    assert found.hausdorff_mm == pytest.approx(4.0, abs=0.02)
     # |d(p)| = 4 |cos| about, over the sphere: mean 2, and 95 % of the area below 0.95 * 4.
-    assert found.mean_mm == pytest.approx(2.0, abs=0.05)
-    assert found.percentile_95_mm == pytest.approx(3.8, abs=0.05)
+    assert found.surface_mm == pytest.approx(2.0, abs=0.05)
+    assert found.hausdorff_95_mm == pytest.approx(3.8, abs=0.05)
 
 
 def test_cube_and_inscribed_sphere():
     # The corners are sqrt(3) a from the middle; every point of the sphere lies near a face.
     found = surface_distances(box((20, 20, 20)), sphere(10))
     corner_mm = 10 * (np.sqrt(3) - 1)
-    assert found.one_sided_mm == pytest.approx(corner_mm, abs=0.03)
+    assert found.hausdorff_one_sided_mm == pytest.approx(corner_mm, abs=0.03)
     back = surface_distances(sphere(10), box((20, 20, 20)))
-    assert back.one_sided_mm == pytest.approx(10 * (1 - 1 / np.sqrt(3)), abs=0.02)
-    assert back.symmetric_mm == found.symmetric_mm == pytest.approx(corner_mm, abs=0.03)
+    assert back.hausdorff_one_sided_mm == pytest.approx(10 * (1 - 1 / np.sqrt(3)), abs=0.02)
+    assert back.hausdorff_mm == found.hausdorff_mm == pytest.approx(corner_mm, abs=0.03)
 
 
 def test_one_sided_asks_whether_the_estimate_lies_near_the_truth():
@@ -77,8 +82,8 @@ def test_one_sided_asks_whether_the_estimate_lies_near_the_truth():
         [trimesh.Trimesh(m.vertices_mm, m.faces) for m in (part, whole)]
     )
     estimate = Mesh(both.vertices, both.faces)
-    assert surface_distances(estimate, whole).one_sided_mm == pytest.approx(30, abs=0.1)
-    assert surface_distances(whole, estimate).one_sided_mm == pytest.approx(0, abs=1e-6)
+    assert surface_distances(estimate, whole).hausdorff_one_sided_mm == pytest.approx(30, abs=0.1)
+    assert surface_distances(whole, estimate).hausdorff_one_sided_mm == pytest.approx(0, abs=1e-6)
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
@@ -89,9 +94,9 @@ def test_hausdorff_agrees_with_scipy_on_dense_samples(seed):
     )[0] for m in (a, b))  # fmt: skip
     there, back = directed_hausdorff(dense_a, dense_b)[0], directed_hausdorff(dense_b, dense_a)[0]
     found = surface_distances(a, b)
-    assert found.one_sided_mm == pytest.approx(there, abs=0.12)
-    assert found.symmetric_mm == pytest.approx(max(there, back), abs=0.12)
-    assert found.symmetric_mm > 1.0
+    assert found.hausdorff_one_sided_mm == pytest.approx(there, abs=0.12)
+    assert found.hausdorff_mm == pytest.approx(max(there, back), abs=0.12)
+    assert found.hausdorff_mm > 1.0
 
 
 def test_hausdorff_agrees_with_simpleitk_on_label_maps():
@@ -108,7 +113,7 @@ def test_hausdorff_agrees_with_simpleitk_on_label_maps():
     judge = sitk.HausdorffDistanceImageFilter()
     judge.Execute(*images)
     found = surface_distances(a, b)
-    assert found.symmetric_mm == pytest.approx(judge.GetHausdorffDistance(), abs=2 * step_mm)
+    assert found.hausdorff_mm == pytest.approx(judge.GetHausdorffDistance(), abs=2 * step_mm)
 
 
 @given(st.integers(0, 10_000))
@@ -117,14 +122,14 @@ def test_hausdorff_agrees_with_simpleitk_on_label_maps():
 def test_distances_obey_their_laws(seed):
     a, b = (Mesh(m.vertices_mm, m.faces) for m in (lumpy(seed), lumpy(seed + 1)))
     there, back = surface_distances(a, b, 2.0), surface_distances(b, a, 2.0)
-    assert there.symmetric_mm == back.symmetric_mm
-    assert there.symmetric_mm == max(there.one_sided_mm, back.one_sided_mm)
-    assert there.mean_mm == pytest.approx(back.mean_mm)
-    assert there.mean_mm < there.percentile_95_mm <= there.symmetric_mm
-    assert surface_distances(a, a, 2.0).symmetric_mm < 1e-6
+    assert there.hausdorff_mm == back.hausdorff_mm
+    assert there.hausdorff_mm == max(there.hausdorff_one_sided_mm, back.hausdorff_one_sided_mm)
+    assert there.surface_mm == pytest.approx(back.surface_mm)
+    assert there.surface_mm < there.hausdorff_95_mm <= there.hausdorff_mm
+    assert surface_distances(a, a, 2.0).hausdorff_mm < 1e-6
     turn = trimesh.transformations.rotation_matrix(1.0, (1, 2, 3))[:3, :3]
     turned = [m.moved(m.vertices_mm @ turn.T + 100) for m in (a, b)]
-    assert surface_distances(*turned, 2.0).symmetric_mm == pytest.approx(there.symmetric_mm)
+    assert surface_distances(*turned, 2.0).hausdorff_mm == pytest.approx(there.hausdorff_mm)
 
 
 @pytest.mark.parametrize("target", [lumpy(7), box((22, 25, 28), (2, 1, 0))], ids=["fine", "coarse"])
@@ -135,7 +140,7 @@ def test_nearest_triangle_is_found_among_the_few(target):
     exact = np.array(
         [triangle_distance(np.tile(p, (len(triangles), 1)), triangles).min() for p in points]
     )
-    found = _to_surface(points, target)
+    found = distance_to_surface(points, target)
     assert exact.max() > 1.0
     assert (found >= exact - 1e-9).all()
     np.testing.assert_allclose(found, exact, atol=0.01)

@@ -17,11 +17,10 @@ from tumortrack.imaging.meshes import mesh_of, solid_of
 from tumortrack.live.values import Polyline, RigidShape, Workcell
 from tumortrack.plan.motions import Motions, MotionStage
 from tumortrack.plan.values import Cut, CutLayer, Located, ResectionPlan
-from tumortrack.report.film import film, moments_s
-from tumortrack.report.organ_surfaces import organ_surfaces, skin
-from tumortrack.report.painter import Eye, PaintedBody, corner_normals, paint, tube
-from tumortrack.report.plan_parts import parted, within
+from tumortrack.report.film import film, moments_s, tube
+from tumortrack.report.organ_surfaces import organ_surfaces, parted, skin, within
 from tumortrack.report.plan_pictures import draw_plan, plan_figure
+from tumortrack.report.renderer import Body, Viewpoint, corner_normals, render
 
 CENTRE, RADII = np.array([0.0, 0.0, 145.0]), np.array([55.0, 30.0, 25.0])
 TUMOR, TUMOR_MM = np.array([18.0, -6.0, 163.0]), 14.0
@@ -158,63 +157,62 @@ def test_surfaces_are_by_label(located: Located) -> None:
         assert mesh.volume_mm3 == pytest.approx(meshes[label].volume_mm3, rel=0.25)
 
 
-BLUE, RED = (40, 60, 220), (220, 50, 40)
-EYE = Eye(np.array([0.0, -400.0, 300.0]), np.zeros(3), 200.0)
+BLUE, RED = (0.16, 0.24, 0.86), (0.86, 0.2, 0.16)
+OBLIQUE = Viewpoint.towards(np.zeros(3), np.array([0.0, -400.0, 300.0]), 200.0)
 
 
 def test_the_nearer_body_is_seen_in_any_order() -> None:
     near, far = ellipsoid(np.array([0.0, -40.0, 30.0]), 15.0), ellipsoid(np.zeros(3), 30.0)
     for bodies in (
-        [PaintedBody(near, RED), PaintedBody(far, BLUE)],
-        [PaintedBody(far, BLUE), PaintedBody(near, RED)],
+        [Body(near, RED), Body(far, BLUE)],
+        [Body(far, BLUE), Body(near, RED)],
     ):
-        picture = paint(bodies, EYE, (160, 120)).astype(int)
+        picture = render(bodies, OBLIQUE, (160, 120)).astype(int)
         assert picture[60, 80, 0] > picture[60, 80, 2]
         assert picture[60, 98, 2] > picture[60, 98, 0]
-    behind_cut = replace(EYE, before_mm=25.0)  # the near one begins 35 mm before the target
-    picture = paint(
-        [PaintedBody(near, RED), PaintedBody(far, BLUE)], behind_cut, (160, 120)
-    ).astype(int)
+    behind_cut = replace(OBLIQUE, before_mm=25.0)  # the near one begins 35 mm before the target
+    picture = render([Body(near, RED), Body(far, BLUE)], behind_cut, (160, 120)).astype(int)
     assert picture[60, 80, 2] > picture[60, 80, 0]
 
 
 @pytest.mark.parametrize("parallel", [False, True])
 def test_a_body_covers_the_pixels_that_it_projects_to(parallel: bool) -> None:
-    eye = replace(EYE, parallel=parallel)
+    viewpoint = replace(OBLIQUE, parallel=parallel)
     place = np.array([35.0, -20.0, 12.0])
-    picture = paint([PaintedBody(ellipsoid(place, 4.0), BLUE)], eye, (320, 240), (255, 255, 255))
+    picture = render([Body(ellipsoid(place, 4.0), BLUE)], viewpoint, (320, 240))
     rows, columns = np.nonzero(picture[:, :, 0] < 150)
-    column, row, near = eye.project(place[None], (320, 240))[0]
+    column, row, near = viewpoint.project(place[None], (320, 240))[0]
     np.testing.assert_allclose([columns.mean(), rows.mean()], [column, row], atol=0.6)
-    mm = eye.width_mm / 320 / (1.0 if parallel else eye.distance_mm * near)
+    mm = viewpoint.width_mm / 320 / (1.0 if parallel else viewpoint.distance_mm * near)
     assert len(rows) == pytest.approx(np.pi * (4 / mm) ** 2, rel=0.06)
 
 
 def test_see_through_bodies_tint_what_is_behind_them_alone() -> None:
-    down = Eye(np.array([0.0, -1.0, 400.0]), np.zeros(3), 100.0)
+    down = Viewpoint.towards(np.zeros(3), np.array([0.0, -1.0, 400.0]), 100.0)
     plate = solid(trimesh.creation.box((90, 90, 2)))
-    glass = PaintedBody(plate, BLUE, rigid(np.eye(3), np.array([0.0, 0.0, 20.0])), 0.4, False)
+    glass = Body(plate, BLUE, 0.4, rigid(np.eye(3), np.array([0.0, 0.0, 20.0])))
     under = replace(glass, world_from_mesh=rigid(np.eye(3), np.array([0.0, 0.0, -20.0])))
-    red = PaintedBody(plate, RED, None, 1.0, False)
-    alone, both = (paint(bodies, down, (64, 64))[32, 32] for bodies in ([red], [red, glass]))
-    blue = paint([replace(glass, opacity=1.0)], down, (64, 64))[32, 32]
+    red = Body(plate, RED)
+    alone, both = (render(bodies, down, (64, 64))[32, 32] for bodies in ([red], [red, glass]))
+    blue = render([replace(glass, opacity=1.0)], down, (64, 64))[32, 32]
     np.testing.assert_allclose(both, 0.6 * alone + 0.4 * blue, atol=2.0)
-    np.testing.assert_array_equal(paint([red, under], down, (64, 64))[32, 32], alone)
+    np.testing.assert_array_equal(render([red, under], down, (64, 64))[32, 32], alone)
 
 
 def test_what_stands_in_the_light_casts_a_shadow() -> None:
-    table = PaintedBody(solid(trimesh.creation.box((600, 600, 2))), (200, 200, 200))
-    ball = PaintedBody(ellipsoid(np.array([0.0, 0.0, 60.0]), 20.0), RED)
-    down = Eye(np.array([0.0, -1.0, 900.0]), np.zeros(3), 400.0, True)
+    plate = solid(trimesh.creation.box((600, 600, 2)))
+    table = Body(plate, (0.8, 0.8, 0.8), shadowed=True)
+    ball = Body(ellipsoid(np.array([0.0, 0.0, 60.0]), 20.0), RED)
+    down = Viewpoint.towards(np.zeros(3), np.array([0.0, -1.0, 900.0]), 400.0, parallel=True)
     bare, shaded = (
-        paint(bodies, down, (200, 200)).astype(int) for bodies in ([table], [table, ball])
+        render(bodies, down, (200, 200)).astype(int) for bodies in ([table], [table, ball])
     )
     darker = (bare - shaded > 40).all(2) & (np.ptp(shaded, axis=2) < 10)  # and not the ball
     rows, columns = np.nonzero(darker)
     # The light comes from the left and the front: the shadow falls to the right and the back.
     assert columns.mean() > 105
     assert rows.mean() < 95
-    unlit = paint([replace(table, shaded=False), ball], down, (200, 200)).astype(int)
+    unlit = render([replace(table, shadowed=False), ball], down, (200, 200)).astype(int)
     np.testing.assert_array_equal(unlit[darker], bare[darker])
 
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import pickle
+from dataclasses import replace
+from pathlib import Path
 
 import msgspec
 import numpy as np
@@ -11,7 +13,7 @@ import trimesh
 from scipy.linalg import expm
 
 from elastic_objects import CENTER, RADII, SMALL, UP, organ
-from tumortrack.cli.scenes import SimulateOptions
+from tumortrack.cli.cases import Simulate
 from tumortrack.core.config import from_builtins, to_builtins
 from tumortrack.core.errors import InputError
 from tumortrack.core.types import Anatomy, Mesh
@@ -349,7 +351,7 @@ def test_a_state_that_moves_far_is_scaled_back(reduced):
     assert 10 < max(farthest) <= 16 + 1e-9
 
 
-def test_a_body_survives_a_file(body):
+def test_a_body_survives_a_file(body, unchecked):
     back = ElasticBody.from_arrays(body.to_arrays())
     points = ORGAN.vertices_mm[::50]
     np.testing.assert_array_equal(
@@ -434,8 +436,9 @@ def test_a_body_is_built_where_it_is_needed_and_once():
 
 
 def test_simulate_makes_elastic_scenes_on_request():
-    assert SimulateOptions(elastic=True).scene_config().deform == (ElasticConfig(),)
-    (chain,) = SimulateOptions(elastic=True, squeeze=True).scene_config().deform
+    simulate = Simulate(case=Path("case"), dataset=Path("dataset"), elastic=True)
+    assert simulate.scene_config().deform == (ElasticConfig(),)
+    (chain,) = replace(simulate, squeeze=True).scene_config().deform
     assert chain == ChainConfig(links=(ElasticConfig(), StretchConfig()))
 
 

@@ -62,7 +62,7 @@ def write_phantom_case(folder: Path) -> Case:
     return case
 
 
-STEPS = {"clinic": 20, "quick": 30}
+STEPS = {"clinic": 20, "quick": 12}
 
 
 def train_command(case: Path, model: Path, preset: str = "quick") -> list[object]:
@@ -74,6 +74,24 @@ def train_command(case: Path, model: Path, preset: str = "quick") -> list[object
 def trained(case: Path, model: Path, preset: str) -> None:
     """Write a model folder."""
     succeeded(tumortrack(*train_command(case, model, preset)))
+
+
+def train_learnt(case_folder: Path, model: Path) -> None:
+    """Write a model folder of a ``quick`` with small pictures and batches, trained for a minute."""
+    from msgspec.structs import replace
+
+    from tumortrack.imaging.case import load_case
+    from tumortrack.training.presets import quick
+    from tumortrack.training.train import TrainingRun, train
+
+    case = load_case(case_folder)
+    preset = quick(case.anatomy)
+    scene = replace(preset.scene, width=212, height=120)
+    config = replace(preset, scene=scene, batch_size=12, validation_pairs=4)
+    digest = store.sha256_of(case_folder / store.MANIFEST)
+    settings = {"steps": 240, "workers": 0, "device": "cpu"}
+    run = TrainingRun(case.anatomy, case.up_lps, digest, config, **settings)  # type: ignore[arg-type]
+    train(run, model, lambda _: None)
 
 
 def looking_down(case: Case, distance_mm: float = 130.0, spin_degrees: float = 30.0) -> np.ndarray:

@@ -13,7 +13,7 @@ import trimesh
 
 from motions import CAMERA_FROM_CT, Wave
 from stories import refusal, tumortrack
-from tumortrack.cli import commands
+from tumortrack.cli.locate import Locate
 from tumortrack.core import store
 from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.estimate import Estimate, Motion, OneWay
@@ -340,7 +340,7 @@ def model(tmp_path_factory):
     folder = tmp_path_factory.mktemp("points") / "model"
     config = quick(anatomy())
     network = OccupancyNetwork(config.network)
-    familiar = InDistributionRange(spread_mm=(1.0, 100.0), fit_mm=5.0)
+    in_distribution = InDistributionRange(spread_mm=(1.0, 100.0), fit_mm=5.0)
     box = np.array([[-80.0] * 3, [80.0] * 3])
     with store.new_folder(folder) as aside:
         save_model(
@@ -349,7 +349,7 @@ def model(tmp_path_factory):
                 config=config,
                 parts=anatomy().names,
                 query_box_mm=box,
-                familiar=familiar,
+                in_distribution=in_distribution,
             ),
             aside,
         )
@@ -396,8 +396,8 @@ def test_locate_writes_where_the_points_are(model, cloud, tmp_path, monkeypatch,
     points = np.concatenate([some_points(4), MIDDLE[None] + [0, 0, 131.0]])
     lines = [f"{n},{','.join(map(str, p))}" for n, p in enumerate(points)]
     asked = written(tmp_path / "asked.csv", "\n".join(["label,ct_x,ct_y,ct_z", *lines]))
-    options = commands.LocateOptions(map_points=asked)
-    commands.locate(model, cloud, tmp_path / "out", options)
+    locate = Locate(model=model, cloud=cloud, out=tmp_path / "out", map=asked)
+    locate.run()
     rows = rows_of((tmp_path / "out" / "points.csv").read_text())
     np.testing.assert_allclose(places(rows), Wave().carry(points), atol=6e-5)
     assert float(rows[0]["std_mm"]) == pytest.approx(0.5 + abs(points[0, 0]) / 100, abs=6e-5)
@@ -410,8 +410,7 @@ def test_locate_writes_where_the_points_are(model, cloud, tmp_path, monkeypatch,
     assert "points.csv" in said
     assert "points.csv" in store.read_manifest(tmp_path / "out", "run")["files"]
     # The answer may be asked again, into the same folder.
-    again = replace(options, map_points=tmp_path / "out" / "points.csv", overwrite=True)
-    commands.locate(model, cloud, tmp_path / "out", again)
+    replace(locate, map=tmp_path / "out" / "points.csv", overwrite=True).run()
     assert rows_of((tmp_path / "out" / "points.csv").read_text()) == rows
 
 
@@ -421,6 +420,6 @@ def test_points_that_cannot_be_meant_cost_no_locating(model, cloud, tmp_path, mo
     monkeypatch.setattr(Knowing, "asked", 0)
     asked = written(tmp_path / "asked.csv", "x,y,z\n-60,-40,-300\n")
     with pytest.raises(InputError, match="RAS"):
-        commands.locate(model, cloud, tmp_path / "out", commands.LocateOptions(map_points=asked))
+        Locate(model=model, cloud=cloud, out=tmp_path / "out", map=asked).run()
     assert Knowing.asked == 0
     assert not (tmp_path / "out").exists()

@@ -296,7 +296,7 @@ def test_without_highdicom_it_says_what_to_install(
 
 
 def test_export_writes_both(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
-    from tumortrack.cli.export import export
+    from tumortrack.cli.cases import Export
 
     labels = kidney_labels((2.0, 2.0, 2.0))
     anatomy, _ = surfaces(labels)
@@ -305,7 +305,7 @@ def test_export_writes_both(tmp_path: Path, capsys: pytest.CaptureFixture) -> No
     save_case(case, tmp_path / "case")
     hu = np.where(labels.labels > 0, 100, -100).astype(np.float32)
     write_dicom_series(Volume(hu, labels.lps_from_index), tmp_path / "ct")
-    export(tmp_path / "case", tmp_path / "out", tmp_path / "ct", None)
+    Export(case=tmp_path / "case", out=tmp_path / "out", dicom=tmp_path / "ct").run()
     assert "segmentation.dcm" in capsys.readouterr().out
     again = read_labels(tmp_path / "out" / "case.seg.nrrd")
     np.testing.assert_array_equal(again.labels, labels.labels)
@@ -314,9 +314,9 @@ def test_export_writes_both(tmp_path: Path, capsys: pytest.CaptureFixture) -> No
     places = seg_voxels_lps(tmp_path / "out" / "segmentation.dcm")
     counts = np.bincount(labels.labels.ravel())
     assert [len(places[n]) for n in (1, 2, 3)] == counts[1:].tolist()
-    export(tmp_path / "case", tmp_path / "plain", None, None)
+    Export(case=tmp_path / "case", out=tmp_path / "plain").run()
     assert [p.name for p in (tmp_path / "plain").iterdir()] == ["case.seg.nrrd"]
     with pytest.raises(InputError, match="exists already"):
-        export(tmp_path / "case", tmp_path / "out", None, None)
+        Export(case=tmp_path / "case", out=tmp_path / "out").run()
     with pytest.raises(InputError, match="--series"):
-        export(tmp_path / "case", tmp_path / "new", None, "1")
+        Export(case=tmp_path / "case", out=tmp_path / "new", series="1").run()

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from elastic_objects import SMALL, UP, organ
 from stories import refusal, tumortrack, write_phantom_case
-from tumortrack.cli import commands
+from tumortrack.cli.training import Train
 from tumortrack.core.errors import ArtifactError, InputError
 from tumortrack.core.types import Mesh
 from tumortrack.phantom.kidneys import random_anatomy
@@ -31,13 +31,13 @@ from tumortrack.registration.network import RegistrationNetwork, facing_rotation
 from tumortrack.registration.rest_shape import long_axis_of
 from tumortrack.simulate.deform import ElasticConfig
 from tumortrack.simulate.occupancy import OccupancyConfig
-from tumortrack.training.checkpoint import TrainingProgress
-from tumortrack.training.head_start import HeadStart, load_start
+from tumortrack.training.model import PretrainedWeights, load_start
 from tumortrack.training.presets import clinic, pretraining, quick
 from tumortrack.training.pretrain import KidneyStream, Pretraining, kidney_stream, pretrain
 from tumortrack.training.run import TrainingRun, provenance
-from tumortrack.training.task import TrainingTask, task_of
-from tumortrack.training.train import train
+from tumortrack.training.state import TrainingProgress
+from tumortrack.training.task import TrainingTask
+from tumortrack.training.train import task_of, train
 
 CPU = torch.device("cpu")
 TINY_BODY = msgspec.structs.replace(SMALL, modes=12, responses=24, patches=80, states=8)
@@ -74,7 +74,7 @@ def pretrained(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def start(pretrained: Path) -> HeadStart:
+def start(pretrained: Path) -> PretrainedWeights:
     return load_start(pretrained)
 
 
@@ -84,12 +84,12 @@ def stream() -> KidneyStream:
 
 
 @pytest.fixture(scope="module")
-def course(patient: TrainingRun) -> TrainingTask:
+def task(patient: TrainingRun) -> TrainingTask:
     return task_of(patient, CPU)
 
 
 @pytest.fixture(scope="module")
-def patient(start: HeadStart) -> TrainingRun:
+def patient(start: PretrainedWeights) -> TrainingRun:
     config = clinic(organ())
     network = msgspec.structs.replace(
         config.network, decoder=msgspec.structs.replace(config.network.decoder, modes=12)
@@ -178,13 +178,13 @@ def test_a_stream_shows_every_kidney_in_the_same_frame_and_size(stream):
         assert (down[:, 2] < -0.7).all()
 
 
-def test_a_patient_is_placed_as_the_pretrained_network_places_any_organ(patient, course, start):
+def test_a_patient_is_placed_as_the_pretrained_network_places_any_organ(patient, task, start):
     """Before its own training: the same rotation and place, turned and scaled into its CT."""
     own = RegistrationNetwork(patient.config.network).eval()
-    course.teach(own)
+    task.initialize(own)
     general = RegistrationNetwork(start.config).eval()
     general.load_state_dict(start.weights)
-    body = course.body
+    body = task.body
     upright = upright_of(organ().organ, UP, body.center_ct, long_axis_of(organ().organ))
     cloud = 20 * torch.randn(3, 300, 3, generator=torch.Generator().manual_seed(0))
     cloud = cloud * torch.tensor([2.0, 1.0, 0.3]) + torch.tensor([0, 0, 130.0])
@@ -200,14 +200,14 @@ def test_a_patient_is_placed_as_the_pretrained_network_places_any_organ(patient,
     torch.testing.assert_close(mine.right_way, theirs.right_way, atol=1e-3, rtol=0)
 
 
-def test_fields_that_are_a_patients_modes_are_taken_over_as_they_are(patient, course, start):
+def test_fields_that_are_a_patients_modes_are_taken_over_as_they_are(patient, task, start):
     own = RegistrationNetwork(
         msgspec.structs.replace(
             start.config,
             normalisation=patient.config.network.normalisation,
         )
     )
-    upright = upright_of(organ().organ, UP, course.body.center_ct, long_axis_of(organ().organ))
+    upright = upright_of(organ().organ, UP, task.body.center_ct, long_axis_of(organ().organ))
     points = generic_points(len(own.points))
     fields = generic_fields(points)
     turned = np.einsum("pdf,dc->pcf", fields, upright.facing) / upright.scale
@@ -229,7 +229,7 @@ def test_a_crashed_pretraining_ends_with_the_weights_of_one_that_was_not(
     broken = tmp_path / "broken"
     monkeypatch.setattr("tumortrack.training.pretrain.kidney_stream", lambda _: stream)
     with monkeypatch.context() as patch:
-        patch.setattr("tumortrack.training.pretrain.REPORT_EVERY_S", 0.0)  # after the first step
+        patch.setattr("tumortrack.training.train.REPORT_EVERY_S", 0.0)  # after the first step
         with pytest.raises(RuntimeError, match="power cut"):
             pretrain(run, broken, crash)
     assert (broken / "training" / "checkpoint.safetensors").is_file()
@@ -266,15 +266,15 @@ def test_the_commands_refuse_what_is_no_start_for_them(pretrained, tmp_path):
     case, model = tmp_path / "case", tmp_path / "model"
     write_phantom_case(case)
     with pytest.raises(InputError, match="for the preset clinic"):
-        commands.train(case, model, commands.TrainOptions(preset="quick", start=pretrained))
+        Train(case=case, model=model, preset="quick", start=pretrained).run()
     with pytest.raises(ArtifactError, match="a 'pretrained' is needed"):
-        commands.train(case, model, commands.TrainOptions(start=case))
+        Train(case=case, model=model, start=case).run()
     damaged = tmp_path / "damaged"
     shutil.copytree(pretrained, damaged)
     with (damaged / "weights.safetensors").open("ab") as file:
         file.write(b"x")
     with pytest.raises(ArtifactError, match="changed after it was written"):
-        commands.train(case, model, commands.TrainOptions(start=damaged))
+        Train(case=case, model=model, start=damaged).run()
     assert not model.exists()
 
 

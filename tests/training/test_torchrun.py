@@ -19,7 +19,7 @@ from tumortrack.registration.network import RegistrationNetwork
 from tumortrack.simulate.dataset import SceneStream
 from tumortrack.simulate.occupancy import FixedPoints
 from tumortrack.simulate.scene import SceneConfig
-from tumortrack.training.distributed import ProcessGroup, ProcessLost, joined
+from tumortrack.training.distributed import ProcessGroup, ProcessLost, process_group
 from tumortrack.training.presets import clinic_network
 from tumortrack.training.state import TrainingState
 from tumortrack.training.train import train
@@ -91,14 +91,14 @@ def test_shares_are_the_batch():
     whole = stream(4).batch(5).camera_from_ct
     parts = []
     for rank in range(2):
-        ranks = ProcessGroup(CPU, rank, 2)
-        (number,) = ranks.numbers(range(5, 6))
-        parts.append(stream(ranks.share(4)).batch(number).camera_from_ct)
+        group = ProcessGroup(CPU, rank, 2)
+        (number,) = group.local_batches(range(5, 6))
+        parts.append(stream(group.local_size(4)).batch(number).camera_from_ct)
     assert np.array_equal(np.concatenate(parts), whole)
-    assert ProcessGroup(CPU).numbers(range(3, 9)) == range(3, 9)
-    assert len(ProcessGroup(CPU, 1, 2).numbers(range(3, 9))) == 6
+    assert ProcessGroup(CPU).local_batches(range(3, 9)) == range(3, 9)
+    assert len(ProcessGroup(CPU, 1, 2).local_batches(range(3, 9))) == 6
     with pytest.raises(InputError, match="a batch of 4 cannot be shared by 3 processes"):
-        ProcessGroup(CPU, 0, 3).share(4)
+        ProcessGroup(CPU, 0, 3).local_size(4)
 
 
 @pytest.mark.parametrize("lost_at", ["init_process_group", "all_reduce", "destroy_process_group"])
@@ -113,8 +113,8 @@ def test_a_lost_process_is_one_error_wherever_it_is_missed(monkeypatch, lost_at)
         gone = lost if name == lost_at else lambda *_, **__: None
         monkeypatch.setattr(distributed, name, gone)
     monkeypatch.setattr(distributed, "get_rank", lambda: 0)
-    with pytest.raises(ProcessLost, match="of this training"), joined("cpu") as ranks:
-        ranks.agreed(0.0, False)
+    with pytest.raises(ProcessLost, match="of this training"), process_group("cpu") as group:
+        group.all_reduce(0.0, False)
 
 
 @pytest.mark.parametrize("share", [1, 3, 6])

@@ -22,14 +22,13 @@ from tumortrack.core.errors import ArtifactError, InputError
 from tumortrack.core.process import available_cores
 from tumortrack.core.types import Anatomy
 from tumortrack.imaging.case import load_case
-from tumortrack.models.config import TrainConfig
+from tumortrack.models.config import RegistrationHeadConfig, TrainConfig
 from tumortrack.models.normalisation import CloudBox
-from tumortrack.training.checkpoint import TrainingProgress, work_folder
 from tumortrack.training.model import load_model
-from tumortrack.training.pace import use_cores
 from tumortrack.training.presets import clinic, paper, quick
-from tumortrack.training.run import learning_rate, settle_end
-from tumortrack.training.state import Diverged, TrainingState
+from tumortrack.training.run import settle_end
+from tumortrack.training.session import use_cores, work_folder
+from tumortrack.training.state import Diverged, TrainingProgress, TrainingState, learning_rate
 from tumortrack.training.train import TrainingRun, train
 from warp_objects import train_slim
 
@@ -154,8 +153,8 @@ HISTORY_ON_A_FULL_DISK = """
 import resource, sys
 from pathlib import Path
 from tumortrack.core.errors import InputError, StorageError
-from tumortrack.training.checkpoint import Progress
-from tumortrack.training.history import History, Record
+from tumortrack.training.session import History, Record
+from tumortrack.training.state import TrainingProgress
 
 folder, mode = Path(sys.argv[1]), sys.argv[2]
 import torch.utils.tensorboard  # its own caches are not the point
@@ -163,12 +162,12 @@ resource.setrlimit(resource.RLIMIT_FSIZE, (300, 300))
 import signal
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 try:
-    with History(folder, Progress()) as history:
+    with History(folder, TrainingProgress()) as history:
         if mode == "other":
-            history.write(Progress(step=1), Record(1.0, 0.5, 100.0, 1e-3))
+            history.write(TrainingProgress(step=1), Record(1.0, 0.5, 100.0, 1e-3))
             raise InputError("the first error")
         for step in range(200):
-            history.write(Progress(step=step), Record(1.0, 0.5, 100.0, 1e-3))
+            history.write(TrainingProgress(step=step), Record(1.0, 0.5, 100.0, 1e-3))
 except StorageError as error:
     print("storage:", error)
 except InputError as error:
@@ -235,7 +234,7 @@ def test_two_trainings_in_one_folder_are_refused_and_a_dead_ones_lock_is_not(tmp
     assert (work / "something").exists()
     hold = (
         "import sys, os, signal; from pathlib import Path;"
-        "from tumortrack.training.checkpoint import work_folder\n"
+        "from tumortrack.training.session import work_folder\n"
         "with work_folder(Path(sys.argv[1])): os.kill(os.getpid(), signal.SIGKILL)"
     )
     assert subprocess.run([sys.executable, "-c", hold, str(model)]).returncode == -signal.SIGKILL
@@ -300,7 +299,7 @@ def test_the_network_gets_the_cores_that_workers_and_openmp_leave(
 ):
     before = torch.get_num_threads()
     monkeypatch.setenv("OMP_NUM_THREADS", granted)
-    monkeypatch.setattr("tumortrack.training.pace.available_cores", lambda: 6)
+    monkeypatch.setattr("tumortrack.training.session.available_cores", lambda: 6)
     use_cores(torch.device("cpu"), workers)
     try:
         assert torch.get_num_threads() == threads
@@ -324,11 +323,8 @@ def test_presets_survive_json_and_refuse_unknown_keys(case):
     assert paper(anatomy).steps == 155_000
     assert paper(anatomy).scene.clutter.scenes == 0
     assert quick(anatomy).scene.clutter.scenes == 0.5
-    assert [preset(anatomy).network.warps for preset in (clinic, paper, quick)] == [
-        True,
-        False,
-        False,
-    ]
+    decoders = [preset(anatomy).network.decoder for preset in (clinic, paper, quick)]
+    assert [isinstance(one, RegistrationHeadConfig) for one in decoders] == [True, False, False]
     assert isinstance(paper(anatomy).network.normalisation, CloudBox)
     assert paper(anatomy).scene.cloud.n_points == 1000
 

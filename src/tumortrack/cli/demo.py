@@ -3,60 +3,83 @@
 from __future__ import annotations
 
 import shutil
-from dataclasses import replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import tumortrack
-from tumortrack.cli import commands
+from tumortrack.cli.cases import Prepare, Simulate
 from tumortrack.cli.console import say
+from tumortrack.cli.locate import Evaluate
+from tumortrack.cli.training import Train
 from tumortrack.core import store
 from tumortrack.core.errors import InputError, StorageError
 
-CT_SEED, SCENE_SEED = 1, 2
-# Deformations of a kind that training does not show: two of the paper's configurations of drags,
-# the one that the paper trains with and the one with the most drags, and squeezed and bent as a
-# whole. And elastic ones, of a library of states that training did not draw from.
-DRAGGED = commands.SimulateOptions(seed=SCENE_SEED, configurations=(3, 6), squeeze=True)
-ELASTIC = commands.SimulateOptions(seed=SCENE_SEED, elastic=True)
+_CT_SEED, _SCENE_SEED = 1, 2
 _MARKER = "demo.json"  # says that what lies beside it is a demo's and may be replaced
 _MINE = ("ct_dicom", "case", "model", "dataset", "scenes", "report.json", "index.html")
 
 
-def run_demo(out: Path, minutes: float, scenes: int) -> None:
-    """Write everything below ``out``; the report is OUT/report.json, the page OUT/index.html.
+@dataclass(frozen=True, kw_only=True)
+class Demo:
+    """The whole story on the built-in phantom, in a few minutes.
 
-    Raises:
-        InputError: ``out`` is a file or holds what no demo made; no minutes or scenes.
+    Attributes:
+        out: folder for everything the demo makes; what an earlier demo left there is replaced.
+        minutes: of training.
+        scenes: unseen deformed scenes to locate tumors in.
     """
-    from tumortrack.imaging.prepare import PrepareOptions
-    from tumortrack.phantom.dicom import write_dicom_series
-    from tumortrack.phantom.digital import PhantomParameters, phantom_labels
-    from tumortrack.phantom.scanner import ScannerParameters, scan
 
-    if not 0 < minutes < float("inf"):
-        raise InputError(f"--minutes {minutes:g} must be more than 0.")
-    if scenes < 1:
-        raise InputError(f"--scenes {scenes} must be at least 1.")
-    _clear(out)
-    say("1/5 scanning the built-in kidney phantom (virtual CT, DICOM)")
-    ct = scan(phantom_labels(PhantomParameters()), ScannerParameters(), CT_SEED)
-    write_dicom_series(ct, out / "ct_dicom")
-    say("2/5 segmenting the CT, making surfaces")
-    commands.prepare(out / "ct_dicom", out / "case", PrepareOptions(), overwrite=False)
-    say(f"3/5 training for {minutes:g} minutes")
-    commands.train(out / "case", out / "model", commands.TrainOptions(minutes=minutes))
-    dragged, elastic = scenes // 2, scenes - scenes // 2
-    say(
-        f"4/5 simulating {scenes} unseen scenes: {elastic} deformed as an elastic body, {dragged} "
-        "dragged, squeezed and bent as no training scene is"
-    )
-    for kind, count, options in (("elastic", elastic, ELASTIC), ("dragged", dragged, DRAGGED)):
-        if count > 0:
-            made = replace(options, scenes=count)
-            commands.write_scenes(out / "case", out / "dataset", made, f"{kind}-")
-    say("5/5 locating kidney and tumors in each from one depth image")
-    commands.evaluate(out / "model", out / "dataset", out, grid=128, seed=0, device="auto")
-    say(f"open {out / 'index.html'} in a browser: estimate over truth, in 3-D, scene by scene.")
+    out: Path = Path("runs/demo")
+    minutes: float = 2.0
+    scenes: int = 20
+
+    def run(self) -> None:
+        """Write everything below ``out``; the report is OUT/report.json, the page OUT/index.html.
+
+        Raises:
+            InputError: ``out`` is a file or holds what no demo made; no minutes or scenes.
+        """
+        from tumortrack.phantom.dicom import write_dicom_series
+        from tumortrack.phantom.digital import PhantomParameters, phantom_labels
+        from tumortrack.phantom.scanner import ScannerParameters, scan
+
+        if not 0 < self.minutes < float("inf"):
+            raise InputError(f"--minutes {self.minutes:g} must be more than 0.")
+        if self.scenes < 1:
+            raise InputError(f"--scenes {self.scenes} must be at least 1.")
+        out = self.out
+        _clear(out)
+        say("1/5 scanning the built-in kidney phantom (virtual CT, DICOM)")
+        ct = scan(phantom_labels(PhantomParameters()), ScannerParameters(), _CT_SEED)
+        write_dicom_series(ct, out / "ct_dicom")
+        say("2/5 segmenting the CT, making surfaces")
+        Prepare(input=out / "ct_dicom", case=out / "case").run()
+        say(f"3/5 training for {self.minutes:g} minutes")
+        Train(case=out / "case", model=out / "model", minutes=self.minutes).run()
+        dragged, elastic = self.scenes // 2, self.scenes - self.scenes // 2
+        say(
+            f"4/5 simulating {self.scenes} unseen scenes: {elastic} deformed as an elastic body, "
+            f"{dragged} dragged, squeezed and bent as no training scene is"
+        )
+        # Elastic ones are of states that training did not draw from. Training shows no drags; these
+        # are of two of the paper's configurations, the one it trains with and the one with the most
+        # drags, and squeezed and bent as a whole.
+        kinds: tuple[tuple[str, int, dict], ...] = (
+            ("elastic", elastic, {"elastic": True}),
+            ("dragged", dragged, {"configuration": (3, 6), "squeeze": True}),
+        )
+        for kind, count, options in kinds:
+            if count > 0:
+                Simulate(
+                    case=out / "case",
+                    dataset=out / "dataset",
+                    scenes=count,
+                    seed=_SCENE_SEED,
+                    **options,
+                ).write(f"{kind}-")
+        say("5/5 locating kidney and tumors in each from one depth image")
+        Evaluate(model=out / "model", variants=out / "dataset", report=out, grid=128).run()
+        say(f"open {out / 'index.html'} in a browser: estimate over truth, in 3-D, scene by scene.")
 
 
 def _clear(out: Path) -> None:

@@ -1,48 +1,202 @@
-"""Training as the user sees it: a live line on a terminal, a line now and then elsewhere."""
+"""Training: `train`, `pretrain`, and what is seen of them."""
 
 from __future__ import annotations
 
 import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
 
-from rich.status import Status as Spinner
+from tyro.conf import Positional
 
-from tumortrack.cli.console import console, say
+from tumortrack.cli.console import Device, console, keep_loaded, say
+from tumortrack.core import store
+from tumortrack.core.errors import InputError
 from tumortrack.core.process import is_follower
-from tumortrack.training.distributed import ProcessLost
-from tumortrack.training.state import Diverged
-from tumortrack.training.train import Interrupted, TrainingStatus
+
+if TYPE_CHECKING:
+    from tumortrack.training.train import TrainingStatus
 
 _EVERY_S = 15.0  # between lines where there is no terminal
 
 
-class TrainingScreen:
-    """Shows each status it is given."""
+@dataclass(frozen=True, kw_only=True)
+class Train:
+    """Train a model for a case; the same command resumes after Ctrl-C or a crash.
 
-    def __init__(self) -> None:
-        self._spinner = Spinner("making labelled points, starting workers ...", console=console)
-        self._said = -_EVERY_S
-        self._noted = ""
+    Attributes:
+        case: folder that `prepare` wrote.
+        model: folder to write.
+        preset: network and rules of training: clinic places the organ of the CT (default), quick
+            and paper label points.
+        rotations: poses to learn: any turn about the camera's axis and tilts up to 15 degrees
+            (clinic: 30), or every rotation.
+        minutes: stop after about so long (default: the preset's end).
+        steps: stop after exactly so many steps.
+        seed: of weights and scenes.
+        device: auto takes CUDA where it is.
+        workers: processes that make scenes (default: as the machine allows).
+        checkpoint_every: seconds; a crash loses at most the steps since.
+        start: folder that `pretrain` wrote: learn the patient from there (preset clinic).
+    """
 
-    def __enter__(self) -> TrainingScreen:
-        if console.is_terminal:
-            self._spinner.start()
-        return self
+    case: Positional[Path]
+    model: Positional[Path]
+    preset: Literal["clinic", "quick", "paper"] = "clinic"
+    rotations: Literal["limited", "full"] = "limited"
+    minutes: float | None = None
+    steps: int | None = None
+    seed: int = 0
+    device: Device = "auto"
+    workers: int | None = None
+    checkpoint_every: float = 30.0
+    start: Path | None = None
 
-    def __exit__(self, _: object, error: BaseException | None, __: object) -> None:
-        self._spinner.stop()
-        if is_follower() and isinstance(error, Interrupted | Diverged | ProcessLost):
-            raise SystemExit(error.exit_code)  # the first process says the same
+    def run(self) -> None:
+        """Case -> model folder, resumed where one was begun."""
+        from tumortrack.imaging.case import load_case
 
-    def show(self, status: TrainingStatus) -> None:
-        if status.note != self._noted:
+        self._check_numbers()
+        case = load_case(self.case)  # report what is wrong so far before PyTorch's seconds
+
+        from tumortrack.models.folder import is_finished
+        from tumortrack.training.model import load_model, load_start
+        from tumortrack.training.presets import PRESETS
+        from tumortrack.training.train import TrainingRun, run_identity, train
+
+        keep_loaded()
+        run = TrainingRun(
+            anatomy_ct=case.anatomy,
+            up_lps=case.up_lps,
+            case_sha256=store.sha256_of(self.case / store.MANIFEST),
+            config=PRESETS[self.preset](case.anatomy, self.rotations),
+            seed=self.seed,
+            steps=self.steps,
+            minutes=self.minutes,
+            device=self.device,
+            workers=self.workers,
+            checkpoint_every_s=self.checkpoint_every,
+            start=None if self.start is None else load_start(self.start),
+        )
+        if is_finished(self.model):
+            done = load_model(self.model).provenance
+            if done.get("run_sha256") != run_identity(run):
+                raise InputError(
+                    f"{self.model} holds a model of another case, preset, seed or option. Choose "
+                    "another MODEL folder."
+                )
+            say(f"{self.model} is trained already ({done['steps']} steps).")
+            return
+        with _training_screen() as show:
+            about = train(run, self.model, show).provenance
+        say(
+            f"model written to {self.model}: {about['steps']} steps in {about['training_s']:.0f} "
+            f"s, validation mIoU {about['validation_miou']:.3f}."
+        )
+
+    def _check_numbers(self) -> None:
+        if self.minutes is not None and not self.minutes > 0:
+            raise InputError(f"--minutes {self.minutes} must be more than 0.")
+        if self.steps is not None and self.steps < 1:
+            raise InputError(f"--steps {self.steps} must be at least 1.")
+        if self.minutes is not None and self.steps is not None:
+            raise InputError("--minutes and --steps both say when to stop; give one of them.")
+        if self.workers is not None and self.workers < 0:
+            raise InputError(f"--workers {self.workers} must be 0 or more.")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Pretrain:
+    """Teach a network on random kidneys, as a start for `train`; the same command resumes.
+
+    Attributes:
+        out: folder to write.
+        anatomies: how many random kidneys.
+        steps: stop after exactly so many steps.
+        seed: of kidneys, weights and scenes.
+        device: auto takes CUDA where it is.
+        workers: processes that make scenes (default: as the machine allows).
+        checkpoint_every: seconds; a crash loses at most the steps since.
+    """
+
+    out: Positional[Path]
+    anatomies: int = 40
+    steps: int = 6000
+    seed: int = 0
+    device: Device = "auto"
+    workers: int | None = None
+    checkpoint_every: float = 30.0
+
+    def run(self) -> None:
+        """Pretrained weights into OUT, resumed where a run was begun."""
+        from tumortrack.training.model import PRETRAINED
+        from tumortrack.training.presets import pretraining
+        from tumortrack.training.pretrain import Pretraining, pretrain
+
+        run = Pretraining(
+            config=pretraining(),
+            anatomies=self.anatomies,
+            steps=self.steps,
+            seed=self.seed,
+            device=self.device,
+            workers=self.workers,
+            checkpoint_every_s=self.checkpoint_every,
+        )
+        if (self.out / store.MANIFEST).is_file():
+            done = store.read_manifest(self.out, PRETRAINED).get("provenance", {})
+            if done.get("run_sha256") != run.identity:
+                raise InputError(
+                    f"{self.out} holds weights of other options or another seed. Choose another "
+                    "folder."
+                )
+            say(f"{self.out} is pretrained already ({done['steps']} steps).")
+            return
+        with _training_screen() as show:
+            about = pretrain(run, self.out, show)
+        say(
+            f"weights written to {self.out}: {about['steps']} steps over {about['anatomies']} "
+            f"random kidneys in {about['training_s']:.0f} s. Use them: tumortrack train CASE MODEL "
+            f"--start {self.out}"
+        )
+
+
+@contextmanager
+def _training_screen() -> Iterator[Callable[[TrainingStatus], None]]:
+    """Yields a function that shows a status: on a terminal one live line, elsewhere a line now and
+    then."""
+    from rich.status import Status as Spinner
+
+    from tumortrack.training.distributed import ProcessLost
+    from tumortrack.training.state import Diverged
+    from tumortrack.training.train import Interrupted
+
+    spinner = Spinner("making labelled points, starting workers ...", console=console)
+    shown_s, noted = -_EVERY_S, ""
+
+    def show(status: TrainingStatus) -> None:
+        nonlocal shown_s, noted
+        if status.note != noted:
             say(status.note)
-            self._noted = status.note
+            noted = status.note
         text = _line(status)
         if console.is_terminal:
-            self._spinner.update(text)
-        elif time.monotonic() - self._said >= _EVERY_S or status.step == status.end:
+            spinner.update(text)
+        elif time.monotonic() - shown_s >= _EVERY_S or status.step == status.end:
             say(text)
-            self._said = time.monotonic()
+            shown_s = time.monotonic()
+
+    if console.is_terminal:
+        spinner.start()
+    try:
+        yield show
+    except (Interrupted, Diverged, ProcessLost) as error:
+        if is_follower():  # the first process reports the same
+            raise SystemExit(error.exit_code) from error
+        raise
+    finally:
+        spinner.stop()
 
 
 def _line(status: TrainingStatus) -> str:

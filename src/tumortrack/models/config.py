@@ -1,4 +1,4 @@
-"""What a network and its training are, as frozen values: every preset is one ``TrainConfig``."""
+"""A network and its training as frozen values: every preset is one ``TrainConfig``."""
 
 from __future__ import annotations
 
@@ -37,8 +37,8 @@ class MlpDecoderConfig(Config, frozen=True, tag="mlp"):
 
 
 class RegistrationHeadConfig(Config, frozen=True, tag="warp"):
-    """Two hidden layers of ``width``, then a rotation, a place, ``modes`` coefficients and whether
-    the cloud lies the right way round. The loss compares the places of ``points`` points."""
+    """Two hidden layers of ``width``, then a rotation, a centre, ``modes`` coefficients and whether
+    the cloud lies the right way round. The loss compares the positions of ``points`` points."""
 
     modes: int
     width: int = 256
@@ -58,7 +58,7 @@ class NetworkConfig(Config, frozen=True):
 
 
 class GaussNewtonConfig(Config, frozen=True):
-    """``n_effective``: independent points that a cloud is worth: neighbours err alike.
+    """``n_effective``: independent points in a cloud: errors of neighbours are correlated.
 
     ``sigma_mm``: of a point that belongs to the organ, model errors included. ``first_mm`` and
     ``last_mm``: the distance where a point's pull is greatest falls from the one to the other;
@@ -93,7 +93,7 @@ class Schedule(Config, frozen=True):
 
 class TrainConfig(Config, frozen=True):
     """Everything that decides the weights, apart from case, seed and number of steps; ``refine``
-    is how a warp is laid on the cloud, in validation and in use."""
+    is how an elastic body is fitted to the cloud, in validation and in use."""
 
     LATER = ("refine",)
 
@@ -102,7 +102,7 @@ class TrainConfig(Config, frozen=True):
     schedule: Schedule
     batch_size: int
     steps: int  # the preset's end
-    drop_points: float = 0.0  # each batch loses a random share, up to this, of what is encoded
+    drop_points: float = 0.0  # each batch loses a random fraction, up to this, of what is encoded
     weight_decay: float = 0.0
     ema: float = 0.999  # 0: the plain weights are kept
     training_pairs: int = 0  # 0: endless; else scenes repeat after so many

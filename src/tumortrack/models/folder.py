@@ -1,4 +1,4 @@
-"""Whether a folder holds a model, said without PyTorch, whose import takes a second."""
+"""Whether a folder holds a model; without PyTorch, whose import takes a second."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a device offers to networks."""
+"""Devices for networks and their arithmetic."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ def choose_device(device: str) -> torch.device:
     """``auto`` takes CUDA if it is available.
 
     Raises:
-        InputError: ``cuda`` was asked for and is not available.
+        InputError: ``cuda`` is requested and not available.
     """
     if device == "cuda" and not torch.cuda.is_available():
         raise InputError("--device cuda: PyTorch sees no CUDA GPU here. Use --device cpu or auto.")
@@ -21,7 +21,7 @@ def choose_device(device: str) -> torch.device:
 
 
 def has_fast_bfloat16(device: torch.device) -> bool:
-    """Whether bf16 matrix products run in hardware, and so pay."""
+    """Whether bf16 matrix products run in hardware."""
     if device.type == "cuda":
         return torch.cuda.is_bf16_supported(including_emulation=False)
     capability = torch.cpu.get_capabilities()

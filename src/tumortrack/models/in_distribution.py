@@ -1,8 +1,8 @@
-"""Whether a cloud looks like the organ that a network knows, and how well the answer fits it.
+"""Whether a cloud looks like the organ of the training scenes, and how well the answer fits it.
 
-A network answers whatever it is shown. Two numbers tell an organ from something else: how far
-the points spread, and how far they lie from the surface that the network sees. Both are taken
-from four fifths of the points, so that background and strays do not count.
+A network gives an answer for any input. Two numbers tell the organ from something else: how far
+the points spread, and how far they lie from the estimated surface. Both are percentiles over four
+fifths of the points, so that background and strays do not count.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from tumortrack.core.errors import NoEstimate
 
 _SHARE = 80  # per cent of the points that must fit: a tenth may be background
 
-# Validation scenes hold noise, background and deformation, yet what they hold is not all there is.
+# Validation scenes hold noise, background and deformation, yet not all that occurs.
 # Organs dragged by 20 mm or stretched by 30 %, which training never shows, lie within 1.0 (a model
 # of 10,000 steps) to 1.7 times (of 1,500) the validation's fit; tables, cubes and balls of any
 # size but the organ's own lie 3 to 20 times as far.
@@ -23,10 +23,10 @@ _FIT_FACTOR = 2.0
 _SMALLEST_LIMIT_MM = 4.0  # a depth camera's own errors may exceed those of clean training scenes
 _SPREAD_FACTOR = 1.5
 
-# An elastic state's rarity is 1 on average over the library it is judged by. Fits of the
+# An elastic state's squared Mahalanobis distance is 1 on average over its library. Fits of the
 # digital twin's worst states have 0.4, of the paper's drags, which no library holds, up to 0.9;
 # flat tables of the organ's size, to which it can be bent, 1.4 to 2.4.
-_RAREST = 1.25
+_LARGEST_MAHALANOBIS_2 = 1.25
 
 
 class InDistributionRange(Config, frozen=True):
@@ -51,21 +51,21 @@ def fit_mm(distances_mm: Float[np.ndarray, " n"]) -> float:
     return float(np.percentile(distances_mm, _SHARE))
 
 
-def check_familiar(familiar: InDistributionRange, spread: float, fit: float) -> None:
+def check_in_distribution(known: InDistributionRange, spread: float, fit: float) -> None:
     """Refuse what cannot be the organ.
 
     Raises:
         NoEstimate: the points spread over much more or less than in any validation scene, or
             lie much farther from the estimated surface.
     """
-    low, high = familiar.spread_mm[0] / _SPREAD_FACTOR, familiar.spread_mm[1] * _SPREAD_FACTOR
+    low, high = known.spread_mm[0] / _SPREAD_FACTOR, known.spread_mm[1] * _SPREAD_FACTOR
     if not low <= spread <= high:
         raise NoEstimate(
             f"the cloud does not show this model's organ: four fifths of its points lie within "
             f"{spread:.0f} mm of their middle, in this model's scenes within {low:.0f} to "
             f"{high:.0f} mm. Remove the background (--range NEAR FAR), and check the unit."
         )
-    limit = max(familiar.fit_mm * _FIT_FACTOR, _SMALLEST_LIMIT_MM)
+    limit = max(known.fit_mm * _FIT_FACTOR, _SMALLEST_LIMIT_MM)
     if fit > limit:
         raise NoEstimate(
             f"the cloud does not show this model's organ: a fifth of its points lie more than "
@@ -75,17 +75,19 @@ def check_familiar(familiar: InDistributionRange, spread: float, fit: float) -> 
         )
 
 
-def check_likely(rarity: float) -> None:
-    """Refuse what only an absurd deformation of the organ explains.
+def check_likely(mahalanobis_2: float) -> None:
+    """Refuse what only an implausible deformation of the organ explains.
+
+    Args:
+        mahalanobis_2: the state's squared Mahalanobis distance, in units of the library's mean.
 
     Raises:
-        NoEstimate: the state's squared Mahalanobis distance, in units of the library's mean, is
-            too large.
+        NoEstimate: it is too large.
     """
-    if rarity > _RAREST:
+    if mahalanobis_2 > _LARGEST_MAHALANOBIS_2:
         raise NoEstimate(
-            f"the cloud does not show this model's organ: only a deformation {rarity:.1f} times "
-            f"as rare as usual would fit it, where {_RAREST:g} times is the most to expect. Remove "
-            "the background (--range NEAR FAR), and check that the model is of this patient and "
-            "the frame is the camera's."
+            f"the cloud does not show this model's organ: only a deformation {mahalanobis_2:.1f} "
+            f"times as rare as usual would fit it, where {_LARGEST_MAHALANOBIS_2:g} times is the "
+            "most to expect. Remove the background (--range NEAR FAR), and check that the model is "
+            "of this patient and the frame is the camera's."
         )

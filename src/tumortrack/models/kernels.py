@@ -72,7 +72,7 @@ def balls(points, centres, radius_2, found):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def greatest(values, infinity, out, chosen):  # type: ignore[no-untyped-def]
-    """The greatest of every K numbers or zero; what is no number counts as greater than all.
+    """The greatest of every K numbers or zero; NaN counts as greater than all.
 
     Args:
         values: (M, K, C).
@@ -138,8 +138,9 @@ def near(points, reach, out):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def spread(places, heights, weight, height):  # type: ignore[no-untyped-def]
-    """Share each point among the four pixels about it: add the shares to ``weight`` and share times
-    height to ``height`` (B, rows, columns). ``places`` (B, N, 2) are columns and rows; float32."""
+    """Spread each point over the four pixels about it, bilinearly: add the fractions to ``weight``
+    and fraction times height to ``height`` (B, rows, columns). ``places`` (B, N, 2) are columns and
+    rows; float32."""
     one = np.float32(1)
     rows, columns = weight.shape[1:]
     for b in range(len(places)):
@@ -155,6 +156,6 @@ def spread(places, heights, weight, height):  # type: ignore[no-untyped-def]
                 for right in range(2):
                     column = int(left) + right
                     if 0 <= column < columns:
-                        share = part * (along if right else one - along)
-                        weight[b, row, column] += share
-                        height[b, row, column] += share * heights[b, p]
+                        fraction = part * (along if right else one - along)
+                        weight[b, row, column] += fraction
+                        height[b, row, column] += fraction * heights[b, p]

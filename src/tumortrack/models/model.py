@@ -1,22 +1,28 @@
-"""A trained model as a value: what both methods share, and what each of them adds."""
+"""A trained model as a value: what both methods have in common, and what each of them adds."""
 
 from __future__ import annotations
 
+import io
+import warnings
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
+import torch
 from jaxtyping import Float64
 from torch import Tensor, nn
 
+from tumortrack.core.errors import InputError
 from tumortrack.models.config import NetworkConfig, TrainConfig
 from tumortrack.models.in_distribution import InDistributionRange
 
+_OPSET = 18  # of ONNX files
+
 
 class Network(nn.Module):
-    """A network as training sees it."""
+    """A network that can be trained and exported."""
 
     def loss(
         self,
@@ -29,7 +35,7 @@ class Network(nn.Module):
     ) -> Tensor:
         """What a batch costs: clouds (B, N, 3), the scenes' points (B, P, 3) with their labels
         (B, P), poses (B, 4, 4); camera frame, mm. ``first``: the first cloud's number in a batch
-        that several processes share."""
+        that is split over several processes."""
         raise NotImplementedError
 
     def onnx_parts(self, cloud_mm: Tensor) -> tuple[nn.Module, tuple[Tensor, ...], dict[str, Any]]:
@@ -44,7 +50,7 @@ class Model(ABC):
     Attributes:
         query_box_mm: where the organ can lie, relative to the median of the observed points,
             camera frame (lower and upper corner).
-        familiar: what tells clouds of this organ from others.
+        in_distribution: range of clouds of this organ.
         provenance: seeds, steps, hashes.
         notes: for the user, about this machine.
     """
@@ -53,7 +59,7 @@ class Model(ABC):
     config: TrainConfig
     parts: tuple[str, ...]
     query_box_mm: Float64[np.ndarray, "2 3"]
-    familiar: InDistributionRange
+    in_distribution: InDistributionRange
     provenance: dict = field(default_factory=dict)
     notes: tuple[str, ...] = ()
 
@@ -81,3 +87,31 @@ class Model(ABC):
 
 
 M = TypeVar("M", bound=Model)
+
+
+def onnx_bytes(model: Model) -> bytes:
+    """A model's network as an ONNX file, in single precision, for other programs.
+
+    Farthest points and balls are written out in plain operators; the number of queries is free, the
+    number of points is the one that the model was trained with (repeat the points of a smaller
+    cloud). Occupancy networks: ``cloud_mm`` (1, N, 3) and ``queries_mm`` (1, Q, 3) -> ``logits``
+    (1, Q, classes). Networks that place the organ: ``cloud_mm`` -> ``rotation`` (2, 3, 3),
+    ``centre_mm`` (2, 3), ``coefficients`` (2, M), ``right_way`` (2,). Camera frame, mm, float32.
+
+    Raises:
+        InputError: the package onnx is not installed.
+    """
+    try:
+        import onnx  # noqa: F401  PyTorch needs it; its own message is long
+    except ImportError as error:
+        raise InputError(
+            "writing ONNX needs the package onnx: pip install 'tumortrack[onnx]'."
+        ) from error
+    points, generator = model.config.scene.cloud.n_points, torch.Generator().manual_seed(0)
+    cloud = torch.randn(1, points, 3, generator=generator) * 20 + torch.tensor([0.0, 0.0, 130.0])
+    module, inputs, names = model.network.onnx_parts(cloud)
+    content: Any = io.BytesIO()  # the annotation lacks files, which work as well
+    with torch.no_grad(), warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # shapes are constants here: on purpose
+        torch.onnx.export(module, inputs, content, dynamo=False, opset_version=_OPSET, **names)
+    return content.getvalue()

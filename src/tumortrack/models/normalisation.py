@@ -1,4 +1,4 @@
-"""Clouds into a network's frame: centred, scaled, turned, freed of strays."""
+"""Clouds in a network's frame: centred, scaled, aligned, without strays."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class FixedScale(Config, frozen=True, tag="fixed"):
                 raise InputError(f"{name} must be positive, not {getattr(self, name)}.")
 
 
-class Aligned(Config, frozen=True, tag="aligned"):
+class Aligned(FixedScale, frozen=True, tag="aligned"):
     """As ``FixedScale``, and turned about the camera's axis until the cloud's longest direction
     across it is x, its heavier tail at +x.
 
@@ -40,16 +40,8 @@ class Aligned(Config, frozen=True, tag="aligned"):
     need not learn it: most of what varies between ``limited`` poses is gone.
     """
 
-    scale_mm: float
-    reach: float
 
-    def __post_init__(self) -> None:
-        FixedScale(scale_mm=self.scale_mm, reach=self.reach)
-
-
-def normalisation(
-    points_mm: Tensor, kind: CloudBox | FixedScale | Aligned
-) -> tuple[Tensor, Tensor]:
+def normalisation(points_mm: Tensor, kind: CloudBox | FixedScale) -> tuple[Tensor, Tensor]:
     """Centre (B, 1, 3) and scale (B, 1, 1), both mm, of clouds (B, N, 3)."""
     if not isinstance(kind, CloudBox):
         centre_mm = points_mm.mean(dim=1, keepdim=True)

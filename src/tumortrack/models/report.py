@@ -1,4 +1,4 @@
-"""What every kind of locator says about its work in the same words."""
+"""The parts of report.json that are the same for both kinds of locator."""
 
 from __future__ import annotations
 
@@ -41,10 +41,10 @@ def fit_report(distances_mm: Float[np.ndarray, " n"]) -> dict:
 
 @contextmanager
 def stage(seconds: dict[str, float], name: str, device: torch.device) -> Iterator[None]:
-    """Notes how long a ``with`` block took."""
+    """Time a ``with`` block."""
     start = time.perf_counter()
     yield
-    if device.type == "cuda":  # kernels run on behind the call
+    if device.type == "cuda":  # kernels run asynchronously
         torch.cuda.synchronize(device)
     seconds[name] = time.perf_counter() - start
 

@@ -1,4 +1,4 @@
-"""Kernels of lattices of logits: halving, filling, looking for surprises."""
+"""Compiled kernels on lattices of logits: refinement, filling, trilinear interpolation."""
 
 from __future__ import annotations
 
@@ -6,26 +6,33 @@ import numba
 import numpy as np
 
 
+@numba.njit(nogil=True, inline="always")
+def _linear(coarse, low, high, n):  # type: ignore[no-untyped-def]
+    """Logit ``n`` in the middle of two coarse points, equal along axes where it lies on one."""
+    i, j, k = low
+    i1, j1, k1 = high
+    near = coarse[i, j, k, n] + coarse[i, j, k1, n]
+    near += coarse[i, j1, k, n] + coarse[i, j1, k1, n]
+    far = coarse[i1, j, k, n] + coarse[i1, j, k1, n]
+    far += coarse[i1, j1, k, n] + coarse[i1, j1, k1, n]
+    return np.float32(0.125) * (near + far)
+
+
 @numba.njit(cache=True, nogil=True)
 def halved(coarse, fine, first, last):  # type: ignore[no-untyped-def]
-    """Logits at half the distance, linear between the coarse ones; planes ``first`` to ``last``.
+    """Logits at half the step, linear between the coarse ones; planes ``first`` to ``last``.
 
     Args:
         coarse: (a, b, c, classes), float32.
         fine: (2a - 1, 2b - 1, 2c - 1, classes); filled.
     """
     for i in range(first, last):
-        i0, i1 = i // 2, (i + 1) // 2
         for j in range(fine.shape[1]):
-            j0, j1 = j // 2, (j + 1) // 2
             for k in range(fine.shape[2]):
-                k0, k1 = k // 2, (k + 1) // 2
+                low = i // 2, j // 2, k // 2
+                high = (i + 1) // 2, (j + 1) // 2, (k + 1) // 2
                 for n in range(fine.shape[3]):
-                    near = coarse[i0, j0, k0, n] + coarse[i0, j0, k1, n]
-                    near += coarse[i0, j1, k0, n] + coarse[i0, j1, k1, n]
-                    far = coarse[i1, j0, k0, n] + coarse[i1, j0, k1, n]
-                    far += coarse[i1, j1, k0, n] + coarse[i1, j1, k1, n]
-                    fine[i, j, k, n] = np.float32(0.125) * (near + far)
+                    fine[i, j, k, n] = _linear(coarse, low, high, n)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -45,8 +52,8 @@ def best(logits, labels, leads):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def surprising(expected, found, limit):  # type: ignore[no-untyped-def]
-    """Which rows (n, classes) have another label than was expected, and the two labels' distance
-    off by more than the limit: (n,)."""
+    """Which rows (n, classes) have another label than expected, the difference of the two labels'
+    logits being off by more than the limit: (n,)."""
     out = np.zeros(len(expected), np.bool_)
     for row in range(len(expected)):
         thought, label = 0, 0
@@ -97,6 +104,19 @@ def spread(labels, inside, outside, margins, first, last):  # type: ignore[no-un
                         out[k] = inside if row[k] == part + 1 else outside
 
 
+@numba.njit(nogil=True, inline="always")
+def _confident_row(plain, i, j, labels):  # type: ignore[no-untyped-def]
+    """The label on which the eight corners of each cell agree, 255 where there is none."""
+    i1, j1 = min(i + 1, plain.shape[0] - 1), min(j + 1, plain.shape[1] - 1)
+    for k in range(plain.shape[2]):
+        one = plain[i, j, k]
+        same = one == plain[i, j1, k] and one == plain[i1, j, k] and one == plain[i1, j1, k]
+        labels[k] = one if same else 255
+    for k in range(plain.shape[2] - 1):
+        if labels[k] != labels[k + 1]:
+            labels[k] = 255
+
+
 @numba.njit(cache=True, nogil=True)
 def filled(coarse, labels, plain, fine, first, last):  # type: ignore[no-untyped-def]
     """The voxels between the points of the last lattice but one, cell by cell.
@@ -114,49 +134,30 @@ def filled(coarse, labels, plain, fine, first, last):  # type: ignore[no-untyped
         Flat indices (n,) of the listed voxels, their linear logits (n, classes), and whether they
         lie between coarse points.
     """
-    classes = coarse.shape[3]
-    n_i, n_j, n_k = fine.shape
-    count = 0
-    listed = np.empty(4096, np.int64)
-    expected = np.empty((4096, classes), np.float32)
-    between = np.empty(4096, np.bool_)
-    together = np.empty(coarse.shape[2], np.uint8)
+    _, n_j, n_k = fine.shape
+    confident = np.empty(coarse.shape[2], np.uint8)
+    cells = 0
     for i in range(first, last):
         for j in range(coarse.shape[1]):
-            i1, j1 = min(i + 1, coarse.shape[0] - 1), min(j + 1, coarse.shape[1] - 1)
-            for k in range(coarse.shape[2]):  # 255: not sure of one label
-                one = plain[i, j, k]
-                same = one == plain[i, j1, k] and one == plain[i1, j, k] and one == plain[i1, j1, k]
-                together[k] = one if same else 255
+            _confident_row(plain, i, j, confident)
+            cells += (confident == 255).sum()
+    listed = np.empty(8 * cells, np.int64)
+    expected = np.empty((8 * cells, coarse.shape[3]), np.float32)
+    between = np.empty(8 * cells, np.bool_)
+    count = 0
+    for i in range(first, last):
+        for j in range(coarse.shape[1]):
+            _confident_row(plain, i, j, confident)
             for k in range(coarse.shape[2]):
-                k1 = min(k + 1, coarse.shape[2] - 1)
-                label = labels[i, j, k]
-                sure = together[k] == together[k1] and together[k] != 255
-                if count + 8 > len(listed):
-                    longer = np.empty(2 * len(listed), np.int64)
-                    longer[:count] = listed[:count]
-                    listed = longer
-                    more = np.empty((len(listed), classes), np.float32)
-                    more[:count] = expected[:count]
-                    expected = more
-                    wider = np.empty(len(listed), np.bool_)
-                    wider[:count] = between[:count]
-                    between = wider
-                for a in range(2 * i, min(2 * i + 2, n_i)):
-                    ia = (a + 1) // 2
+                for a in range(2 * i, min(2 * i + 2, fine.shape[0])):
                     for b in range(2 * j, min(2 * j + 2, n_j)):
-                        jb = (b + 1) // 2
                         for c in range(2 * k, min(2 * k + 2, n_k)):
-                            fine[a, b, c] = label
-                            if sure:
+                            fine[a, b, c] = labels[i, j, k]
+                            if confident[k] != 255:
                                 continue
-                            kc = (c + 1) // 2
-                            for n in range(classes):
-                                near = coarse[i, j, k, n] + coarse[i, j, kc, n]
-                                near += coarse[i, jb, k, n] + coarse[i, jb, kc, n]
-                                far = coarse[ia, j, k, n] + coarse[ia, j, kc, n]
-                                far += coarse[ia, jb, k, n] + coarse[ia, jb, kc, n]
-                                expected[count, n] = np.float32(0.125) * (near + far)
+                            high = (a + 1) // 2, (b + 1) // 2, (c + 1) // 2
+                            for n in range(coarse.shape[3]):
+                                expected[count, n] = _linear(coarse, (i, j, k), high, n)
                             listed[count] = (a * n_j + b) * n_k + c
                             between[count] = a % 2 + b % 2 + c % 2 > 0
                             count += 1
@@ -165,8 +166,8 @@ def filled(coarse, labels, plain, fine, first, last):  # type: ignore[no-untyped
 
 @numba.njit(cache=True, nogil=True)
 def neighbours(shape, frontier, known):  # type: ignore[no-untyped-def]
-    """The voxels that touch these and are not known yet: flat indices; they are marked as known,
-    for whoever asks them now."""
+    """The voxels that touch these and are not known yet: flat indices. They are marked as known,
+    since the caller queries them next."""
     n_i, n_j, n_k = shape
     found = np.empty(max(26 * len(frontier), 1), np.int64)
     count = 0
@@ -186,7 +187,7 @@ def neighbours(shape, frontier, known):  # type: ignore[no-untyped-def]
 
 @numba.njit(nogil=True, inline="always")
 def _cell(at, size):  # type: ignore[no-untyped-def]
-    """The cell that a place along one axis lies in, and how far along it."""
+    """The cell of a coordinate along one axis, and the fraction of the cell up to it."""
     at = min(max(at, np.float32(0)), np.float32(size - 1))
     low = min(int(at), size - 2)
     return low, at - np.float32(low)
@@ -194,8 +195,8 @@ def _cell(at, size):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def between(values, place, out):  # type: ignore[no-untyped-def]
-    """Values (a, b, c, n) at places (m, 3), in steps of the lattice, by trilinear weights; outside
-    those of the nearest border. ``out``: (m, n), filled."""
+    """Trilinear values (a, b, c, n) at places (m, 3), in steps of the lattice; outside those of the
+    nearest border. ``out``: (m, n), filled."""
     for m in range(len(place)):
         i, x = _cell(place[m, 0], values.shape[0])
         j, y = _cell(place[m, 1], values.shape[1])

@@ -1,4 +1,4 @@
-"""Locating with an occupancy network: ask for labels, coarse first, then where it is not plain."""
+"""Locating with an occupancy network: labels of queries, coarse first, then where it matters."""
 
 from __future__ import annotations
 
@@ -13,16 +13,23 @@ from jaxtyping import Float, Float16, Float32, Float64, UInt8
 from tumortrack.core.errors import NoEstimate
 from tumortrack.core.estimate import Estimate, Following
 from tumortrack.core.types import Anatomy, CameraLabels, OccupancyCloud, SensorCloud
-from tumortrack.models.in_distribution import check_familiar, fit_mm, spread_mm
+from tumortrack.models.in_distribution import check_in_distribution, fit_mm, spread_mm
 from tumortrack.models.report import describe_parts, fit_report, grid_over, report_head, stage
 from tumortrack.occupancy.inference import Inference
-from tumortrack.occupancy.lattice import LogitLattice, lattice_over, leaves, organ_lattice
 from tumortrack.occupancy.model import OccupancyModel
-from tumortrack.occupancy.sparse import halved_lattice, leading, sparse_logits, sparse_margins
+from tumortrack.occupancy.sparse import (
+    halved_lattice,
+    leading,
+    organ_lattice,
+    sparse_logits,
+    sparse_margins,
+)
 from tumortrack.occupancy.volume import (
     FIT_STEPS,
+    LogitLattice,
     drop_islands,
     keep_largest_pieces,
+    lattice_over,
     margins_on,
     part_surfaces,
     surface_distances,
@@ -50,8 +57,8 @@ class OccupancyLocator:
     def locate(self, cloud: SensorCloud, grid: int, seed: int) -> Estimate:
         """See ``tracking.tracker.Tracker.locate``.
 
-        The two passes of queries follow the follow-up (LUDO): 10,000 coarse ones where the organ
-        can be, then labels of 40,000 points in the box of those inside, enlarged.
+        The two passes of queries are those of the follow-up (LUDO): 10,000 coarse ones where the
+        organ can be, then labels of 40,000 points in the enlarged box of those inside.
         """
         frame = _Frame(self.model, self._inference, cloud, seed, np.random.default_rng(seed))
         lattice = frame.lattice(frame.coarse_box())
@@ -65,11 +72,11 @@ class OccupancyLocator:
     def follow(self, cloud: SensorCloud, last: Estimate | None, how: Following) -> Estimate:
         """See ``tracking.tracker.Tracker.follow``.
 
-        The last organ's box, enlarged, stands for the coarse queries, and in it the lattice is
-        asked only where the organ is (``organ_lattice``). Where this frame's organ reaches the
-        box's border, without a last estimate, or with ``thorough``, the organ is looked for as in
-        a first frame, and the lattice asked everywhere. The surfaces' grid is twice as fine as
-        the lattice, and asked only about surfaces.
+        The enlarged box of the last organ replaces the coarse queries, and its lattice is queried
+        only where the organ is (``organ_lattice``). Where this frame's organ reaches the box's
+        border, without a last estimate, or with ``thorough``, the organ is searched for as in a
+        first frame, and the lattice queried everywhere. The surfaces' grid is twice as fine as
+        the lattice, and queried only about surfaces.
         """
         rng = np.random.default_rng((how.seed, cloud.stamp_ns))
         frame = _Frame(self.model, self._inference, cloud, how.seed, rng)
@@ -78,9 +85,7 @@ class OccupancyLocator:
             low, high = last.cloud.points_mm.min(0), last.cloud.points_mm.max(0)
             margin = _LIVE_MARGIN * float((high - low).max())
             lattice = frame.lattice(np.stack([low - margin, high + margin]).astype(float))
-            if leaves(lattice):
-                lattice = None
-        if lattice is None:
+        if lattice is None or lattice.cut_off():
             lattice = frame.lattice(frame.coarse_box(), everywhere=True)
         frame.check(lattice)
         with frame.stage("volume"):
@@ -105,13 +110,13 @@ class OccupancyLocator:
 
 
 def steps_over(box: Box) -> int:
-    """Of the lattice along a box's longest side."""
+    """Steps of the lattice along a box's longest side."""
     return max(FIT_STEPS, math.ceil(float((box[1] - box[0]).max()) / _LATTICE_MM))
 
 
 @dataclass(eq=False)
 class _Frame:
-    """One cloud's work, from its latent to the estimate."""
+    """The work on one cloud, from its latent to the estimate."""
 
     model: OccupancyModel
     inference: Inference
@@ -134,7 +139,7 @@ class _Frame:
         return self.inference.logits(self.latent, points_mm)
 
     def coarse_box(self) -> Box:
-        """Where the organ is."""
+        """Where the organ is, by coarse random queries."""
         lower, upper = self.model.query_box_mm + np.median(self.cloud.points_mm, axis=0)
         points = self.rng.uniform(lower, upper, (COARSE_QUERIES, 3)).astype(np.float32)
         with self.stage("coarse"):
@@ -159,7 +164,7 @@ class _Frame:
         with self.stage("fit"):
             self.distances_mm = surface_distances(lattice, self.thinned.points_mm)
             spread = spread_mm(self.thinned.points_mm)
-            check_familiar(self.model.familiar, spread, fit_mm(self.distances_mm))
+            check_in_distribution(self.model.in_distribution, spread, fit_mm(self.distances_mm))
 
     def inside(self, lattice: LogitLattice) -> OccupancyCloud:
         """Those of 40,000 random points in the lattice's box that lie inside."""

@@ -9,7 +9,8 @@ from typing import Any
 from tumortrack.models.config import NetworkConfig
 from tumortrack.models.folder import WEIGHTS
 from tumortrack.models.model import Model
-from tumortrack.occupancy.compiled import Arithmetic, find
+from tumortrack.occupancy.compiled import find
+from tumortrack.occupancy.inference import Arithmetic
 from tumortrack.occupancy.network import OccupancyNetwork
 
 

@@ -1,38 +1,123 @@
-"""The dense answer from few questions: coarse first, then only where it is not plain.
+"""The answer on fine lattices from few queries: coarse points first, then only where they do not
+settle the label.
 
-A lattice of at most ``START_MM`` is asked. Halfway between its points the logits are first taken as
-linear, then asked for wherever the label that leads does so by less than linear logits were found
-to err (``settled``); and so on, down to the voxels. Where an answer is another label than was
-expected, and by more than noise, the voxels about it are asked as well.
+Every rule refines the same way (``refined``): halfway between the points of a lattice logits are
+first taken as linear; then a policy queries the network where that is not enough.
 
-What it may miss: a part that no lattice point lies in and that does not show in the logits about it
-either. A ball of START_MM times the square root of 3 always holds a lattice point: 6.9 mm, 0.17 ml,
-where ``prepare`` drops tumors of less than 0.2 ml unless it is told otherwise.
+- ``_connected`` queries the organ and a point or two about it: all that touches what lies inside.
+- ``_uncertain`` queries where the leading label leads by less than linear logits were found to be
+  off. Where an answer is another label than expected, and by more than noise, the points about it
+  are queried as well.
+
+``sparse_margins`` goes on so from a lattice of at most ``START_MM`` down to voxels. What it may
+miss: a part that no lattice point lies in and that does not show in the logits about it either. A
+ball of START_MM times the square root of 3 always holds a lattice point: 6.9 mm, 0.17 ml, where
+``prepare`` drops tumors of less than 0.2 ml by default.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import partial
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float16, Float32, Float64, Int, UInt8
+from jaxtyping import Bool, Float, Float16, Float32, Float64, Int, UInt8
 
-from tumortrack.core.geometry import transform_points
-from tumortrack.occupancy.lattice import LogitLattice, LogitsAt
-from tumortrack.occupancy.volume import LARGEST_MARGIN, dense_margins, margins_of
+from tumortrack.core.types import OUTSIDE
+from tumortrack.occupancy.volume import (
+    AT_ONCE,
+    LARGEST_MARGIN,
+    LogitLattice,
+    LogitsAt,
+    dense_margins,
+    lattice_over,
+    margins_of,
+)
 
 START_MM = 4.0
-_AT_ONCE = 2**18  # queries
-_PROBE = 512  # of the least sure points, asked to learn how much linear logits err
-_SURPRISE = 0.5  # of what is believed of linear logits
+_PROBE = 512  # of the least certain points, queried to learn how far linear logits are off
+_SURPRISE = 0.5  # of the interpolation limit
 _FIRST_SEEN = 0.1  # of a first lattice's points may lie near a surface
 
-Ask = Callable[[Int[np.ndarray, " n"]], Float32[np.ndarray, "n classes"]]
+Query = Callable[[Int[np.ndarray, " n"]], Float32[np.ndarray, "n classes"]]
+
+
+@dataclass(frozen=True, eq=False)
+class _Level:
+    """A lattice of half the step of a ``coarse`` one, which can be queried at flat indices."""
+
+    logits_at: LogitsAt
+    coarse: LogitLattice
+    shape: tuple[int, int, int]
+
+    @property
+    def step_mm(self) -> float:
+        return self.coarse.step_mm / 2
+
+    def query(self, flat: Int[np.ndarray, " n"]) -> Float32[np.ndarray, "n classes"]:
+        return _query(self.logits_at, self.coarse.origin_mm, self.step_mm, self.shape, flat)
+
+    def query_some(
+        self, flat: Int[np.ndarray, " n"], some: Int[np.ndarray, " m"]
+    ) -> Float32[np.ndarray, "m classes"]:
+        return self.query(flat[some])
+
+    def known(self) -> Bool[np.ndarray, " n"]:
+        """The coarse points."""
+        known = np.zeros(self.shape, bool)
+        known[::2, ::2, ::2] = True
+        return known.ravel()
+
+
+Policy = Callable[[_Level, Float32[np.ndarray, "n classes"]], None]  # replaces rows by answers
+
+
+def _query(
+    logits_at: LogitsAt,
+    origin_mm: Float64[np.ndarray, " 3"],
+    step_mm: float,
+    shape: tuple[int, int, int],
+    flat: Int[np.ndarray, " n"],
+) -> Float32[np.ndarray, "n classes"]:
+    """The network's logits at flat indices of a lattice."""
+    parts = []
+    for first in range(0, len(flat), AT_ONCE):
+        index = np.unravel_index(flat[first : first + AT_ONCE], shape)
+        points = np.stack(index, axis=1) * step_mm + origin_mm
+        parts.append(logits_at(points.astype(np.float32)).float().cpu().numpy())
+    return np.concatenate(parts)
+
+
+def refined(logits_at: LogitsAt, coarse: LogitLattice, policy: Policy) -> LogitLattice:
+    """The lattice of half the step: linear logits, the network's where the policy queries it."""
+    from tumortrack.occupancy.kernels import halved
+
+    i, j, k = (2 * n - 1 for n in coarse.logits.shape[:3])
+    level = _Level(logits_at, coarse, (i, j, k))
+    logits = np.empty((i, j, k, coarse.logits.shape[3]), np.float32)
+    _in_slabs(partial(halved, coarse.logits, logits), i)
+    policy(level, logits.reshape(-1, logits.shape[3]))
+    return LogitLattice(coarse.origin_mm, level.step_mm, logits)
+
+
+def organ_lattice(
+    logits_at: LogitsAt, box_mm: Float[np.ndarray, "2 3"], steps: int
+) -> LogitLattice:
+    """``lattice_over``, queried everywhere inside the organ and a point or two about it.
+
+    Every second point along each axis is queried first. Whatever is connected to a part that
+    holds one of these points is found as if all were queried; what lies apart and between them is
+    not, and would be dropped (``volume.keep_largest_pieces``).
+    """
+    return refined(logits_at, lattice_over(logits_at, box_mm, -(-steps // 2)), _connected)
+
+
+def halved_lattice(logits_at: LogitsAt, lattice: LogitLattice) -> LogitLattice:
+    """The lattice of half the step, queried where linear logits do not settle the label."""
+    return refined(logits_at, lattice, partial(_uncertain, InterpolationLimit()))
 
 
 def sparse_margins(
@@ -42,57 +127,50 @@ def sparse_margins(
     start_mm: float = START_MM,
 ) -> tuple[Float16[np.ndarray, "parts i j k"], UInt8[np.ndarray, "i j k"]]:
     """What ``dense_margins`` returns; far from all surfaces margins are the largest there are,
-    between them and the asked voxels linear.
+    between them and the queried voxels linear.
 
     Args:
-        start_mm: distance of the first lattice's points at the most.
+        camera_from_index: of cubic voxels along the camera's axes.
+        start_mm: largest step of the first lattice.
     """
-    voxel_mm = float(camera_from_index[0, 0])
+    voxel_mm, origin_mm = float(camera_from_index[0, 0]), camera_from_index[:3, 3]
     levels = max(0, int(np.floor(np.log2(max(start_mm / voxel_mm, 1.0)))))
     if levels == 0:
         return dense_margins(logits_at, camera_from_index, shape)
     stride = 2**levels
     i, j, k = ((n - 2) // stride + 2 for n in shape)  # the last lies on the grid's end or past it
-    lattice = _Lattice(logits_at, camera_from_index, (i, j, k), stride)
-    logits = lattice.ask(np.arange(i * j * k)).reshape(i, j, k, -1)
+    step_mm, every = voxel_mm * stride, np.arange(i * j * k)
+    logits = _query(logits_at, origin_mm, step_mm, (i, j, k), every)
+    lattice = LogitLattice(origin_mm, step_mm, logits.reshape(i, j, k, -1))
+    limit = InterpolationLimit()
     for _ in range(levels - 1):
-        lattice = lattice.halved()
-        logits = _halved(logits, lattice)
-    return _voxels(logits, replace(lattice.halved(), shape=shape))
+        limit = limit.finer()
+        lattice = refined(logits_at, lattice, partial(_uncertain, limit))
+    return _voxels(_Level(logits_at, lattice, shape), limit.finer())
 
 
 def sparse_logits(
     logits_at: LogitsAt, lattice: LogitLattice, points_mm: Float32[np.ndarray, "n 3"]
 ) -> Float32[np.ndarray, "n classes"]:
-    """Logits at points in a lattice's box: linear where the label is plain, else asked for.
+    """Logits at points in a lattice's box: linear where the label is certain, else queried.
 
     Scattered points are counted, nobody sees one alone: less care than for voxels, half of the
-    questions (networks tried: none to three of 40,000 labels other than those of asking all).
+    queries (networks tried: none to three of 40,000 labels other than those of querying all).
     """
     logits = lattice.between(points_mm)
 
-    def ask(some: Int[np.ndarray, " m"]) -> Float32[np.ndarray, "m classes"]:
+    def query(some: Int[np.ndarray, " m"]) -> Float32[np.ndarray, "m classes"]:
         return logits_at(points_mm[some]).float().cpu().numpy()
 
-    settled(logits, leading(logits)[1], ask, InterpolationLimit(tail=0.99, safety=1.0))
+    query_uncertain(logits, leading(logits)[1], query, InterpolationLimit(tail=0.99, safety=1.0))
     return logits
-
-
-def halved_lattice(logits_at: LogitsAt, lattice: LogitLattice) -> LogitLattice:
-    """The lattice of half the step, asked where linear logits do not tell the label."""
-    step_mm = lattice.step_mm / 2
-    camera_from_index = np.diag([step_mm] * 3 + [1.0])
-    camera_from_index[:3, 3] = lattice.origin_mm
-    i, j, k = (2 * n - 1 for n in lattice.logits.shape[:3])
-    finer = _Lattice(logits_at, camera_from_index, (i, j, k), 1)
-    return LogitLattice(lattice.origin_mm, step_mm, _halved(lattice.logits, finer))
 
 
 @dataclass(eq=False)
 class InterpolationLimit:
-    """How far linear logits were found to be off: a label that leads by ``limit`` is believed.
+    """How far linear logits were found to be off: a label that leads by more is accepted.
 
-    ``coarser``: the limit at twice the distance, 0 where there was none. The limit is a quantile,
+    ``coarser``: the limit at twice the step, 0 where there was none. The limit is a quantile,
     ``tail``, of the errors found, times ``safety``.
     """
 
@@ -102,7 +180,7 @@ class InterpolationLimit:
     safety: float = 1.5
     errors: list[np.ndarray] = field(default_factory=list)
 
-    def learn(self, expected: np.ndarray, found: np.ndarray) -> None:
+    def update(self, expected: np.ndarray, found: np.ndarray) -> None:
         """From logits (n, classes) that were expected, and those that were found."""
         rows, order = np.arange(len(expected)), np.argpartition(expected, -2, axis=1)
         first, second = order[:, -1], order[:, -2]
@@ -112,112 +190,92 @@ class InterpolationLimit:
         self.limit = max(self.limit, self.safety * worst)
 
     def finer(self) -> InterpolationLimit:
-        """At half the distance, before anything is asked: smooth logits err by a quarter."""
+        """At half the step, before any query: errors of smooth logits are a quarter."""
         return InterpolationLimit(self.limit / 4, self.limit)
 
 
-@dataclass(eq=False)
-class _Lattice:
-    """Points that can be asked, ``stride`` voxels apart; ``trust`` in linear logits there."""
-
-    logits_at: LogitsAt
-    camera_from_index: Float64[np.ndarray, "4 4"]
-    shape: tuple[int, int, int]
-    stride: int
-    trust: InterpolationLimit = field(default_factory=InterpolationLimit)
-
-    def halved(self) -> _Lattice:
-        i, j, k = (2 * n - 1 for n in self.shape)
-        stride = self.stride // 2
-        finer = self.trust.finer()
-        return _Lattice(self.logits_at, self.camera_from_index, (i, j, k), stride, finer)
-
-    def ask_some(
-        self, flat: Int[np.ndarray, " n"], some: Int[np.ndarray, " m"]
-    ) -> Float32[np.ndarray, "m classes"]:
-        return self.ask(flat[some])
-
-    def ask(self, flat: Int[np.ndarray, " n"]) -> Float32[np.ndarray, "n classes"]:
-        parts = []
-        for first in range(0, len(flat), _AT_ONCE):
-            index = np.unravel_index(flat[first : first + _AT_ONCE], self.shape)
-            places = np.stack(index, axis=1) * float(self.stride)
-            points = transform_points(self.camera_from_index, places)
-            parts.append(self.logits_at(points.astype(np.float32)).float().cpu().numpy())
-        return np.concatenate(parts)
-
-
-def settled(
+def query_uncertain(
     expected: Float32[np.ndarray, "n classes"],
     leads: Float32[np.ndarray, " n"],
-    ask: Ask,
-    trust: InterpolationLimit,
+    query: Query,
+    limit: InterpolationLimit,
 ) -> Bool[np.ndarray, " n"]:
-    """Ask wherever the expected label leads by too little; which were asked.
+    """Query wherever the expected label leads by too little; which were queried.
 
-    The least sure points are asked first. How far their logits lie from the expected ones tells
-    what the others may err by, and so which of them have to be asked as well, until none is left.
+    The least certain points come first. How far their logits are off tells which of the others
+    have to be queried as well, until none is left.
 
     Args:
-        expected: logits; where asked, they are replaced by the answer.
-        leads: by how much the largest is larger than the second.
-        ask: indices (m,) -> logits (m, classes).
-        trust: what is known of the errors; learns.
+        expected: logits; replaced by the answers.
+        leads: by how much the largest exceeds the second; infinite where it is known already.
+        query: indices (m,) -> logits (m, classes).
+        limit: updated by the answers.
     """
-    asked = np.zeros(len(leads), bool)
-    uncertain = int(np.isfinite(leads).sum())  # others were settled before
-    if uncertain:
-        least = min(_PROBE, uncertain) - 1
-        trust.limit = max(trust.limit, float(np.partition(leads, least)[least]))
+    queried = np.zeros(len(leads), bool)
+    open_points = int(np.isfinite(leads).sum())
+    if open_points:
+        least = min(_PROBE, open_points) - 1
+        limit.limit = max(limit.limit, float(np.partition(leads, least)[least]))
     while True:
-        now = np.flatnonzero((leads <= trust.limit) & ~asked)
+        now = np.flatnonzero((leads <= limit.limit) & ~queried)
         if not len(now):
-            return asked
-        found = ask(now)
-        trust.learn(expected[now], found)
+            return queried
+        found = query(now)
+        limit.update(expected[now], found)
         expected[now] = found
-        asked[now] = True
+        queried[now] = True
 
 
-def _halved(
-    coarse: Float32[np.ndarray, "a b c classes"], lattice: _Lattice
-) -> Float32[np.ndarray, "i j k classes"]:
-    """The logits of a lattice from those of the one before."""
-    from tumortrack.occupancy.kernels import halved
+def _connected(level: _Level, rows: Float32[np.ndarray, "n classes"]) -> None:
+    """Query all points within two of a coarse one that lies inside, then all about those that turn
+    out to lie inside, until none is left."""
+    from tumortrack.occupancy.kernels import neighbours
 
-    fine = np.empty((*lattice.shape, coarse.shape[3]), np.float32)
-    _in_slabs(partial(halved, coarse, fine), len(fine))
-    rows = fine.reshape(-1, coarse.shape[3])
+    def inside(flat: np.ndarray) -> np.ndarray:
+        return flat[rows[flat].argmax(1) != OUTSIDE]
+
+    known = level.known()
+    first = neighbours(level.shape, inside(np.flatnonzero(known)), known)
+    frontier = np.concatenate([first, neighbours(level.shape, first, known)])
+    while len(frontier):
+        rows[frontier] = level.query(frontier)
+        frontier = neighbours(level.shape, inside(frontier), known)
+
+
+def _uncertain(
+    limit: InterpolationLimit, level: _Level, rows: Float32[np.ndarray, "n classes"]
+) -> None:
+    """Query where linear logits do not settle the label, and about surprises."""
     leads = leading(rows)[1]
-    leads.reshape(lattice.shape)[::2, ::2, ::2] = np.inf  # the coarse points: settled before
-    asked = np.flatnonzero(settled(rows, leads, lattice.ask, lattice.trust))
-    flat, found = _about_surprises(asked, rows[asked], coarse, lattice)
+    leads[level.known()] = np.inf
+    queried = np.flatnonzero(query_uncertain(rows, leads, level.query, limit))
+    flat, found = _about_surprises(level, limit.limit, queried, rows[queried])
     rows[flat] = found
-    return fine
 
 
 def _voxels(
-    coarse: Float32[np.ndarray, "a b c classes"], lattice: _Lattice
+    level: _Level, limit: InterpolationLimit
 ) -> tuple[Float16[np.ndarray, "parts i j k"], UInt8[np.ndarray, "i j k"]]:
-    """Margins and labels of the voxels, from the lattice of twice their distance."""
+    """Margins and labels of the voxels. As ``_uncertain``, but logits of voxels far from surfaces
+    are never held: a cell whose corners lead clearly is filled with their label."""
     from tumortrack.occupancy.kernels import filled
 
-    classes = coarse.shape[3]
-    sure, leads = (v.reshape(coarse.shape[:3]) for v in leading(coarse.reshape(-1, classes)))
-    labels = np.empty(lattice.shape, np.uint8)
-    trust = lattice.trust
-    seen = trust.coarser or float(np.quantile(leads, _FIRST_SEEN))
+    coarse = level.coarse.logits
+    rows = coarse.reshape(-1, coarse.shape[3])
+    certain, leads = (values.reshape(coarse.shape[:3]) for values in leading(rows))
+    labels = np.empty(level.shape, np.uint8)
+    seen = limit.coarser or float(np.quantile(leads, _FIRST_SEEN))
     while True:
-        plain = np.where(leads >= np.float32(seen), sure, np.uint8(255))
-        lists = _in_slabs(partial(filled, coarse, sure, plain, labels), len(coarse))
+        plain = np.where(leads >= np.float32(seen), certain, np.uint8(255))
+        lists = _in_slabs(partial(filled, coarse, certain, plain, labels), len(coarse))
         flat, expected, between = (np.concatenate(column) for column in zip(*lists, strict=True))
         lead = leading(expected)[1]
-        lead[~between] = np.inf  # the coarse points: settled before
-        asked = settled(expected, lead, partial(lattice.ask_some, flat), trust)
-        if trust.limit <= seen:
+        lead[~between] = np.inf
+        queried = query_uncertain(expected, lead, partial(level.query_some, flat), limit)
+        if limit.limit <= seen:
             break
-        seen = 2 * trust.limit  # voxels that lead by less were filled unseen
-    more, found = _about_surprises(flat[asked], expected[asked], coarse, lattice)
+        seen = 2 * limit.limit  # voxels that lead by less were filled unseen
+    more, found = _about_surprises(level, limit.limit, flat[queried], expected[queried])
     places, logits = np.concatenate([flat, more]), np.concatenate([expected, found])
     labels.reshape(-1)[places] = leading(logits)[0]
     return _margins(labels, places, logits), labels
@@ -241,40 +299,38 @@ def _margins(
 
 
 def _about_surprises(
+    level: _Level,
+    limit: float,
     flat: Int[np.ndarray, " n"],
     found: Float32[np.ndarray, "n classes"],
-    coarse: Float32[np.ndarray, "a b c classes"],
-    lattice: _Lattice,
 ) -> tuple[Int[np.ndarray, " m"], Float32[np.ndarray, "m classes"]]:
-    """Ask about every point that touches a surprise, until there is none: what else was asked.
+    """Query every point that touches a surprise, until there is none; indices and logits.
 
-    A surprise is another label than was expected, and not only by what linear logits are off
-    everywhere: by more than ``_SURPRISE`` of what is believed of them.
+    A surprise is another label than expected, by more than ``_SURPRISE`` of the ``limit``, since
+    linear logits are a little off everywhere.
 
     Args:
-        flat, found: the asked ones, and their logits.
-        coarse: the logits that the lattice's were expected from.
+        flat, found: the points queried before, and their logits.
     """
     from tumortrack.occupancy.kernels import expected_at, neighbours, surprising
 
     def surprises_among(flat: np.ndarray, found: np.ndarray) -> np.ndarray:
         expected = np.empty_like(found)
-        expected_at(coarse, lattice.shape, flat, expected)
-        return flat[surprising(expected, found, np.float32(_SURPRISE * lattice.trust.limit))]
+        expected_at(level.coarse.logits, level.shape, flat, expected)
+        return flat[surprising(expected, found, np.float32(_SURPRISE * limit))]
 
     more, logits = [np.zeros(0, np.int64)], [found[:0]]
     surprises = surprises_among(flat, found)
     if not len(surprises):
         return more[0], logits[0]
-    known = np.zeros(math.prod(lattice.shape), bool)
+    known = level.known()
     known[flat] = True
-    known.reshape(lattice.shape)[::2, ::2, ::2] = True  # the coarse points: settled before
     while len(surprises):
-        frontier = neighbours(lattice.shape, surprises, known)
+        frontier = neighbours(level.shape, surprises, known)
         if not len(frontier):
             break
         more.append(frontier)
-        logits.append(lattice.ask(frontier))
+        logits.append(level.query(frontier))
         surprises = surprises_among(frontier, logits[-1])
     return np.concatenate(more), np.concatenate(logits)
 

@@ -1,8 +1,9 @@
-"""The dense answer: labels on a voxel grid, smooth closed surfaces, and numbers per part."""
+"""What is read off logits on a grid: labels, smooth closed surfaces, distances."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -10,44 +11,83 @@ from jaxtyping import Bool, Float, Float16, Float32, Float64, UInt8
 
 from tumortrack.core.errors import NoEstimate
 from tumortrack.core.geometry import transform_points
-from tumortrack.core.types import FIRST_TUMOR, ORGAN, Mesh, OccupancyCloud
-from tumortrack.occupancy.lattice import LogitLattice
+from tumortrack.core.types import FIRST_TUMOR, ORGAN, OUTSIDE, Mesh, OccupancyCloud
 from tumortrack.simulate.occupancy import surface_distance
 
-_AT_ONCE = 2**18  # queries; bounds the memory whatever the grid
+AT_ONCE = 2**18  # queries; bounds the memory for any grid
 _SMALLEST_MARGIN = 1e-3  # a surface exactly through a grid point would not be closed
 FIT_STEPS = 24  # of a lattice for surface_distances, along the box's longest side
-LARGEST_MARGIN = 30.0  # logits beyond say no more about where a surface lies
+LARGEST_MARGIN = 30.0  # larger logits say no more about where a surface lies
+
+LogitsAt = Callable[[Float32[np.ndarray, "n 3"]], torch.Tensor]  # camera frame, mm -> (n, classes)
+
+
+@dataclass(frozen=True, eq=False)
+class LogitLattice:
+    """Logits at origin + step * (i, j, k), camera frame, mm."""
+
+    origin_mm: Float64[np.ndarray, " 3"]
+    step_mm: float
+    logits: Float32[np.ndarray, "i j k classes"]
+
+    @property
+    def box_mm(self) -> Float64[np.ndarray, "2 3"]:
+        """From the first point to the last."""
+        size = np.array(self.logits.shape[:3]) - 1
+        return np.stack([self.origin_mm, self.origin_mm + self.step_mm * size])
+
+    def between(self, points_mm: Float32[np.ndarray, "n 3"]) -> Float32[np.ndarray, "n classes"]:
+        """Trilinear logits at points; outside the lattice those of its border."""
+        from tumortrack.occupancy.kernels import between
+
+        out = np.empty((len(points_mm), self.logits.shape[3]), np.float32)
+        place = ((points_mm - self.origin_mm) / self.step_mm).astype(np.float32)
+        between(self.logits, place, out)
+        return out
+
+    def cut_off(self) -> bool:
+        """Whether the organ, the largest piece of what lies inside, reaches the border or is not
+        there at all."""
+        from scipy import ndimage
+
+        pieces, count = ndimage.label(self.logits.argmax(-1) != OUTSIDE)
+        if not count:
+            return True
+        sizes = np.bincount(pieces.ravel())
+        largest = 1 + int(sizes[1:].argmax())
+        return bool(sizes[largest] > (pieces[1:-1, 1:-1, 1:-1] == largest).sum())
+
+
+def lattice_over(
+    logits_at: LogitsAt, box_mm: Float64[np.ndarray, "2 3"], steps: int
+) -> LogitLattice:
+    """A lattice over a box, ``steps`` along its longest side, queried at every point."""
+    step = float((box_mm[1] - box_mm[0]).max()) / steps
+    axes = [np.arange(low, high + step, step) for low, high in box_mm.T]
+    grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).astype(np.float32)
+    logits = logits_at(grid.reshape(-1, 3)).float().cpu().numpy()
+    return LogitLattice(box_mm[0].astype(float), step, logits.reshape(*grid.shape[:3], -1))
 
 
 def dense_margins(
-    logits_at: Callable[[np.ndarray], torch.Tensor],
-    camera_from_index: Float64[np.ndarray, "4 4"],
-    shape: tuple[int, int, int],
+    logits_at: LogitsAt, camera_from_index: Float64[np.ndarray, "4 4"], shape: tuple[int, int, int]
 ) -> tuple[Float16[np.ndarray, "parts i j k"], UInt8[np.ndarray, "i j k"]]:
-    """Ask at every voxel centre; labels, and per part by how much it wins (positive inside).
+    """Query every voxel centre; ``margins_of`` the parts and labels.
 
-    The organ's margin is that of the best label inside against the outside, so that its zero
-    set is the whole organ's surface; a tumor's is against the best other label. Half precision:
-    2 bytes a voxel and part, 0.4 GB at 400^3 with two tumors.
+    Half precision: 2 bytes a voxel and part, 0.4 GB at 400^3 with two tumors.
     """
-    i, j, k = shape
     labels = np.empty(shape, np.uint8)
     margins: np.ndarray | None = None
-    slabs = max(1, _AT_ONCE // (j * k))
-    plane = np.stack(np.meshgrid(np.arange(j), np.arange(k), indexing="ij"), -1).reshape(-1, 2)
-    for first in range(0, i, slabs):
-        rows = np.arange(first, min(first + slabs, i))
-        index = np.empty((len(rows), len(plane), 3))
-        index[:, :, 0], index[:, :, 1:] = rows[:, None], plane
-        points = transform_points(camera_from_index, index.reshape(-1, 3)).astype(np.float32)
-        logits = logits_at(points)
+    planes = max(1, AT_ONCE // (shape[1] * shape[2]))
+    for first in range(0, shape[0], planes):
+        block = (min(planes, shape[0] - first), *shape[1:])
+        index = np.indices(block).reshape(3, -1).T + np.array([first, 0.0, 0.0])
+        logits = logits_at(transform_points(camera_from_index, index).astype(np.float32))
         won = margins_of(logits)
         if margins is None:
             margins = np.empty((won.shape[1], *shape), np.float16)
-        block = (len(rows), j, k)
-        labels[rows] = logits.argmax(-1).to(torch.uint8).cpu().numpy().reshape(block)
-        margins[:, rows] = won.T.reshape(-1, *block)
+        labels[first : first + planes] = logits.argmax(-1).byte().cpu().numpy().reshape(block)
+        margins[:, first : first + planes] = won.T.reshape(-1, *block)
     assert margins is not None
     return margins, labels
 
@@ -57,7 +97,7 @@ def margins_on(
 ) -> tuple[
     Float16[np.ndarray, "parts i j k"], UInt8[np.ndarray, "i j k"], Float64[np.ndarray, "4 4"]
 ]:
-    """The same of a lattice, and its ``camera_from_index``."""
+    """``margins_of`` the parts, labels and ``camera_from_index`` of a lattice."""
     logits = torch.from_numpy(lattice.logits.reshape(-1, lattice.logits.shape[3]))
     shape = lattice.logits.shape[:3]
     labels = logits.argmax(-1).to(torch.uint8).numpy().reshape(shape)
@@ -68,7 +108,11 @@ def margins_on(
 
 
 def margins_of(logits: torch.Tensor) -> Float16[np.ndarray, "n parts"]:
-    """By how much each part wins: (n, classes) -> (n, parts)."""
+    """By how much each part's logit wins (positive inside): (n, classes) -> (n, parts).
+
+    The organ's margin is that of the best label inside against the outside, so that its zero
+    set is the whole organ's surface; a tumor's is against the best other label.
+    """
     columns = [logits[:, 1:].amax(1) - logits[:, 0]]
     for label in range(FIRST_TUMOR, logits.shape[1]):
         others = torch.cat([logits[:, :label], logits[:, label + 1 :]], 1).amax(1)
@@ -94,9 +138,9 @@ def drop_islands(
     kept: UInt8[np.ndarray, "i j k"],
     camera_from_index: Float64[np.ndarray, "4 4"],
 ) -> OccupancyCloud:
-    """The cloud without what ``keep_largest_pieces`` dropped from ``found``: points of an organ's
-    island are left out, those of a tumor's become organ. A point belongs to a piece if one of
-    the voxels next to it does."""
+    """The cloud without what ``keep_largest_pieces`` dropped from ``found``: points of an island of
+    the organ are left out, those of a tumor become organ. A point belongs to a piece if one of the
+    voxels next to it does."""
     if np.array_equal(found, kept):
         return cloud
     index_from_camera = np.linalg.inv(camera_from_index)
@@ -142,7 +186,7 @@ def part_surfaces(
     camera_from_index: Float64[np.ndarray, "4 4"],
     names: tuple[str, ...],
 ) -> dict[str, Mesh]:
-    """Each part of labels in one piece as a closed surface; parts without a voxel are left out."""
+    """Each part, in one piece, as a closed surface; parts without a voxel are left out."""
     meshes = {}
     for n, name in enumerate(names):
         mask = labels > 0 if n == 0 else labels == n + 1
@@ -174,8 +218,8 @@ def surface_distances(
 ) -> Float32[np.ndarray, " n"]:
     """How far points (n, 3) lie from the organ's surface, camera frame, mm.
 
-    The surface is that of the network's margin, linear between the lattice's points: right to
-    half a mm or so for an organ on ``FIT_STEPS``.
+    The surface is the zero of the margin, linear between the lattice's points: accurate to about
+    half a mm for an organ on ``FIT_STEPS``.
 
     Raises:
         NoEstimate: there is no surface in the lattice's box.

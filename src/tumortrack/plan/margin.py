@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import shapely
-from jaxtyping import Float, Float64, Int
+from jaxtyping import Float, Float64, Int, Num
 from numpy.linalg import norm
 from scipy.ndimage import binary_closing, minimum_filter
 from skimage.measure import find_contours
@@ -34,7 +34,7 @@ _LEAST_MM2 = 1.0  # a smaller rest of a floor needs no stroke
 
 Heights = tuple[Float64[np.ndarray, " n"], Float64[np.ndarray, " n"]]  # lowest and highest, mm
 # Points of the tumor, and the margin that each needs, mm
-Grown = tuple[Float64[np.ndarray, "n 3"], Float64[np.ndarray, " n"]]
+Grown = tuple[Float64[np.ndarray, "n 3"], Num[np.ndarray, " n"]]
 
 
 def margin_plan(located: Located, label: int, config: ResectionConfig) -> MethodResult:
@@ -126,7 +126,7 @@ class Columns:
 
 
 def column_extremes(
-    columns: Int[np.ndarray, " n"], heights: Float[np.ndarray, " n"], n_columns: int
+    columns: Int[np.ndarray, " m"], heights: Float[np.ndarray, " m"], n_columns: int
 ) -> Heights:
     """The lowest and the highest point of each column; inf and -inf where none is."""
     lowest, highest = np.full(n_columns, np.inf), np.full(n_columns, -np.inf)

@@ -18,7 +18,7 @@ from tumortrack.core.types import FIRST_TUMOR, Mesh, part_names
 
 Method = Literal["published", "margin"]
 StrokeKind = Literal["wall", "floor"]
-Rings = tuple[Float64[np.ndarray, "n 2"], ...]
+Rings = tuple[Float64[np.ndarray, "_ 2"], ...]
 
 
 def name_of(label: int) -> str:

@@ -12,7 +12,12 @@ from jaxtyping import Float, Float32, Int32, Int64, UInt8
 from tumortrack.core.estimate import Estimate, Following
 from tumortrack.core.types import Anatomy, CameraLabels, Mesh, OccupancyCloud, SensorCloud
 from tumortrack.imaging.raster import label_grid
-from tumortrack.models.in_distribution import check_familiar, check_likely, fit_mm, spread_mm
+from tumortrack.models.in_distribution import (
+    check_in_distribution,
+    check_likely,
+    fit_mm,
+    spread_mm,
+)
 from tumortrack.models.report import describe_parts, fit_report, grid_over, report_head, stage
 from tumortrack.registration.gauss_newton import RegistrationResult, refine
 from tumortrack.registration.label_probability import NearestLookup, normal_table, probabilities
@@ -149,7 +154,9 @@ class RegistrationLocator:
         self, points: Float32[np.ndarray, "n 3"], fit: RegistrationResult, seconds: dict[str, float]
     ) -> _Registered:
         """What a fit says, if it can be this organ's."""
-        check_familiar(self._model.familiar, spread_mm(points), fit_mm(np.abs(fit.distances_mm)))
+        check_in_distribution(
+            self._model.in_distribution, spread_mm(points), fit_mm(np.abs(fit.distances_mm))
+        )
         check_likely(fit.motion.rarity)
         with stage(seconds, "surfaces", self._device):
             return self._moved(fit)

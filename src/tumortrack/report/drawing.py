@@ -9,16 +9,17 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Bool, Float
 
+from tumortrack.core import colours
 from tumortrack.core.store import write_atomically
 from tumortrack.core.types import Mesh
 from tumortrack.imaging.raster import voxelise
-from tumortrack.report.shade import Frame, ShadedView, pixel_centres
+from tumortrack.report.renderer import RGB, Frame, ParallelView, rgb
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-KIDNEY = (185 / 255, 102 / 255, 83 / 255)
+KIDNEY = rgb(colours.KIDNEY)
 ESTIMATED = (230 / 255, 140 / 255, 0.0)
 TRUE = (0.0, 90 / 255, 160 / 255)
 OBSERVED = (0.25, 0.25, 0.25)
@@ -35,6 +36,14 @@ def new_figure(width_in: float, height_in: float) -> Figure:
     return figure
 
 
+def show_legend(
+    figure: Figure, handles: list, columns: int, corner: tuple[float, float], **style: Any
+) -> None:
+    """A legend without a frame; ``corner`` is its upper right one, as shares of the figure."""
+    style = {"loc": "upper right", "frameon": False, "fontsize": 9.5, **style}
+    figure.legend(handles=handles, ncols=columns, bbox_to_anchor=corner, **style)
+
+
 def save(figure: Figure, path: Path) -> None:
     """Write the PNG atomically.
 
@@ -47,7 +56,7 @@ def save(figure: Figure, path: Path) -> None:
 
 
 def section(
-    mesh: Mesh, view: ShadedView, through_mm: Float[np.ndarray, " 3"]
+    mesh: Mesh, view: ParallelView, through_mm: Float[np.ndarray, " 3"]
 ) -> Float[np.ndarray, "n 2 2"]:
     """Outline of a mesh in the view's plane through a point: segments as (right, down) mm."""
     flat = view.project(mesh.vertices_mm)
@@ -55,88 +64,83 @@ def section(
     side = np.where(side == 0, 1e-9, side)  # no corner lies in the plane: always two crossings
     up = side[mesh.faces] > 0
     cut = mesh.faces[up.any(1) & ~up.all(1)]
-    ends = []
-    for a, b in ((0, 1), (1, 2), (2, 0)):
-        start, end = cut[:, a], cut[:, b]
-        gap = np.where(side[start] * side[end] < 0, side[start] - side[end], np.nan)
-        share = (side[start] / gap)[:, None]
-        ends.append(flat[start, :2] + share * (flat[end, :2] - flat[start, :2]))
-    both = np.stack(ends, axis=1)
-    return both[~np.isnan(both[:, :, 0])].reshape(-1, 2, 2)
+    start, end = cut, np.roll(cut, -1, axis=1)  # (face, edge)
+    gap = np.where(side[start] * side[end] < 0, side[start] - side[end], np.nan)
+    share = (side[start] / gap)[..., None]
+    ends = flat[start, :2] + share * (flat[end, :2] - flat[start, :2])
+    return ends[~np.isnan(gap)].reshape(-1, 2, 2)
+
+
+def section_mask(
+    mesh: Mesh, view: ParallelView, frame: Frame, through_mm: Float[np.ndarray, " 3"]
+) -> Bool[np.ndarray, "h w"]:
+    """Pixels of a frame that lie inside a closed mesh, in the view's plane through a point."""
+    (x, y), axes = frame.pixel_centres(), view.axes.T[:, [1, 0, 2]]
+    data_from_index = np.eye(4)
+    data_from_index[:3, :3] = axes * [y[1] - y[0], x[1] - x[0], 1.0]
+    data_from_index[:3, 3] = axes @ [y[0], x[0], view.project(through_mm[None])[0, 2]]
+    return voxelise(mesh, data_from_index, (len(y), len(x), 1))[:, :, 0]
+
+
+def outline(
+    axes: Axes, mesh: Mesh, view: ParallelView, frame: Frame, color: RGB | str, width: float,
+    **style: Any,
+) -> None:  # fmt: skip
+    """Draw the contour of what the mesh covers."""
+    x, y = np.meshgrid(*frame.pixel_centres())
+    mask = view.silhouette(mesh, frame)
+    axes.contour(x, y, mask, levels=[0.5], colors=[color], linewidths=width, **style)
 
 
 def draw_lines(axes: Axes, segments: Float[np.ndarray, "n 2 2"], **style: Any) -> None:
-    """Draw an outline's segments as one collection."""
+    """Draw a section's segments as one collection."""
     from matplotlib.collections import LineCollection
 
     axes.add_collection(LineCollection(list(segments), capstyle="round", **style))
 
 
-def scale_bar(axes: Axes, frame: Frame, color: str = "black") -> None:
-    """A bar of a round length in mm, in the lower left corner."""
-    width, height = frame.right - frame.left, frame.bottom - frame.top
-    length = max(n for n in (1, 2, 5, 10, 20, 50, 100) if n <= max(0.3 * width, 1))
-    x, y = frame.left + 0.05 * width, frame.bottom - 0.05 * height
-    axes.plot([x, x + length], [y, y], color=color, linewidth=3, solid_capstyle="butt")
-    axes.text(
-        x + length / 2,
-        y - 0.015 * height,
-        f"{length} mm",
-        color=color,
-        ha="center",
-        va="bottom",
-        fontsize=9,
-    )
-
-
-def axis_arrows(axes: Axes, frame: Frame, arrows: dict[str, tuple[float, float]]) -> None:
-    """Small arrows that name the frame's axes, by their letters and directions (right, down), in
-    the upper left corner; those that point up begin lower."""
-    span = 0.07 * min(frame.right - frame.left, frame.bottom - frame.top)
-    rises = any(down < 0 for _, down in arrows.values())
-    x, y = frame.left + 0.6 * span, frame.top + (2.1 if rises else 0.6) * span
-    for letter, (right, down) in arrows.items():
-        axes.annotate(
-            "",
-            (x + right * span, y + down * span),
-            (x, y),
-            arrowprops={"arrowstyle": "->", "color": "0.35", "shrinkA": 0, "shrinkB": 0},
-        )
-        axes.text(
-            x + 1.5 * right * span,
-            y + 1.5 * down * span,
-            letter,
-            color="0.35",
-            fontsize=8,
-            ha="center",
-            va="center",
-        )
-
-
-def blank(axes: Axes, frame: Frame, background: str = "white") -> None:
-    """Axes in mm, down pointing down, equal scales, without ticks."""
-    axes.set(xlim=(frame.left, frame.right), ylim=(frame.bottom, frame.top), aspect="equal")
-    axes.set(xticks=[], yticks=[], facecolor=background)
-    for spine in axes.spines.values():
-        spine.set_color("0.8")
-
-
-def section_mask(
-    mesh: Mesh, view: ShadedView, frame: Frame, through_mm: Float[np.ndarray, " 3"]
-) -> Bool[np.ndarray, "h w"]:
-    """Pixels of a frame that lie inside a closed mesh, in the view's plane through a point."""
-    x, y = pixel_centres(frame)
-    axes = np.stack([view.down, view.right, np.cross(view.right, view.down)], axis=1).astype(float)
-    depth = view.project(through_mm[None])[0, 2]
-    data_from_index = np.eye(4)
-    data_from_index[:3, :3] = axes * [y[1] - y[0], x[1] - x[0], 1.0]
-    data_from_index[:3, 3] = axes @ [y[0], x[0], depth]
-    return voxelise(mesh, data_from_index, (len(y), len(x), 1))[:, :, 0]
-
-
-def tint(axes: Axes, mask: Bool[np.ndarray, "h w"], frame: Frame, color: tuple[float, ...]) -> None:
+def tint(axes: Axes, mask: Bool[np.ndarray, "h w"], frame: Frame, color: RGB) -> None:
     """Lay a translucent colour over the mask."""
     picture = np.empty((*mask.shape, 4))
     picture[...] = (*color, 0.0)
     picture[mask, 3] = 0.25
     axes.imshow(picture, extent=frame.extent, zorder=1)
+
+
+def finish_view(
+    axes: Axes,
+    frame: Frame,
+    arrows: dict[str, tuple[float, float]] | None = None,
+    background: str = "white",
+) -> None:
+    """Axes in mm, down pointing down, equal scales, without ticks; a scale bar in the lower left
+    corner. ``arrows`` name the frame's axes by letter and direction (right, down)."""
+    axes.set(xlim=(frame.left, frame.right), ylim=(frame.bottom, frame.top), aspect="equal")
+    axes.set(xticks=[], yticks=[], facecolor=background)
+    for spine in axes.spines.values():
+        spine.set_color("0.8")
+    _scale_bar(axes, frame, "black" if background == "white" else "white")
+    if arrows:
+        _axis_arrows(axes, frame, arrows)
+
+
+def _scale_bar(axes: Axes, frame: Frame, color: str) -> None:
+    """Of a round length in mm."""
+    width, height = frame.right - frame.left, frame.bottom - frame.top
+    length = max(n for n in (1, 2, 5, 10, 20, 50, 100) if n <= max(0.3 * width, 1))
+    x, y = frame.left + 0.05 * width, frame.bottom - 0.05 * height
+    axes.plot([x, x + length], [y, y], color=color, linewidth=3, solid_capstyle="butt")
+    style: dict[str, Any] = {"color": color, "ha": "center", "va": "bottom", "fontsize": 9}
+    axes.text(x + length / 2, y - 0.015 * height, f"{length} mm", **style)
+
+
+def _axis_arrows(axes: Axes, frame: Frame, arrows: dict[str, tuple[float, float]]) -> None:
+    """In the upper left corner; those that point up begin lower."""
+    span = 0.07 * min(frame.right - frame.left, frame.bottom - frame.top)
+    rises = any(down < 0 for _, down in arrows.values())
+    x, y = frame.left + 0.6 * span, frame.top + (2.1 if rises else 0.6) * span
+    arrow = {"arrowstyle": "->", "color": "0.35", "shrinkA": 0, "shrinkB": 0}
+    style: dict[str, Any] = {"color": "0.35", "fontsize": 8, "ha": "center", "va": "center"}
+    for letter, (right, down) in arrows.items():
+        axes.annotate("", (x + right * span, y + down * span), (x, y), arrowprops=arrow)
+        axes.text(x + 1.5 * right * span, y + 1.5 * down * span, letter, **style)

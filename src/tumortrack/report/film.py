@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Callable, Iterable, Iterator
-from itertools import groupby
+from itertools import groupby, pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -18,28 +18,29 @@ from tumortrack.core.colours import BACKGROUND, NONE, part_colour
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.store import write_atomically
-from tumortrack.core.types import Mesh
+from tumortrack.core.types import ORGAN, Mesh
 from tumortrack.live.values import Polyline, Workcell
 from tumortrack.plan.motions import Motions
 from tumortrack.plan.values import Located
 from tumortrack.report.organ_surfaces import organ_surfaces
-from tumortrack.report.painter import Eye, PaintedBody, paint, tube
+from tumortrack.report.renderer import Body, Viewpoint, render, rgb
 
 if TYPE_CHECKING:
     from PIL import Image, ImageDraw, ImageFont
 
-_FROM = np.array([-0.36, -0.8, 0.48])  # where the eye is, seen from the middle: left, front, above
+_FROM = np.array([-0.36, -0.8, 0.48])  # where the viewer is: to the left, in front, above
 _CLOSE_FROM = np.array([-0.36, -0.72, 0.6])
-_AWAY = 2.6  # the eye's distance in radii of what it sees: a natural perspective
+_AWAY = 2.6  # the viewer's distance in radii of what is seen: a natural perspective
 _CLOSE = 0.47, 0.42  # the close-up's share of width and height, in the lower right corner
 _ARMS = 0.97, 0.62  # and that of the arms, above it
-_CLOSE_MM = 40.0  # the close-up cuts away what is nearer to the eye than the organ by this
+_CLOSE_MM = 40.0  # the close-up cuts away what is nearer to the viewer than the organ by this
 _ORGAN_OPACITY = 0.42
 _FRAME = (90, 96, 106)
+_BACKDROP = rgb((238, 241, 244))
 _LEAST_PIXELS = 2.0  # width of a line
 _COLOURS = 255  # and one for what did not change
 _SAMPLES = 8  # frames from which the colours are chosen
-_LOOKED_AT, _EVERY = 40, 3  # frames, and every which vertex, from which the eye's place is chosen
+_LOOKED_AT, _EVERY = 40, 3  # frames, and every which vertex, that the viewpoint is chosen from
 _LEAST_FRAMES = 2  # of a stage
 _LAST_S = 1.5  # the last picture stays
 _FASTEST, _SMALLEST = 50, 160
@@ -71,17 +72,19 @@ def film(
         InputError: no frame, or another kind of file, speed or size.
         StorageError: the disk refused.
     """
-    told = list(frames)
-    _check(told, path, fps, size)
-    stage = _Stage(told, located, size)
-    chosen = np.linspace(0, len(told) - 1, min(_SAMPLES, len(told))).astype(int).tolist()
-    palette, index_of = _palette([stage.picture(n) for n in chosen])
+    from PIL import Image
+
+    cells = list(frames)
+    _check(cells, path, fps, size)
+    painter = _FramePainter(cells, located, size)
+    chosen = np.linspace(0, len(cells) - 1, min(_SAMPLES, len(cells))).astype(int).tolist()
+    palette = _palette([painter.picture(n) for n in chosen])
 
     def indexed() -> Iterator[Image.Image]:
-        for n in range(len(told)):
-            yield _indexed(stage.picture(n), palette, index_of)
+        for n in range(len(cells)):
+            yield painter.picture(n).quantize(palette=palette, dither=Image.Dither.NONE)
             if progress is not None:
-                progress(n + 1, len(told))
+                progress(n + 1, len(cells))
 
     pictures = indexed()
     each_ms = round(100 / fps) * 10  # a GIF counts hundredths of a second
@@ -91,9 +94,9 @@ def film(
         format="GIF",
         save_all=True,
         append_images=pictures,
-        duration=[each_ms] * (len(told) - 1) + [each_ms + round(1000 * _LAST_S)],
+        duration=[each_ms] * (len(cells) - 1) + [each_ms + round(1000 * _LAST_S)],
         loop=0,
-        palette=palette.tobytes(),
+        palette=bytes(palette.getpalette() or ()),
         transparency=_COLOURS,
         disposal=1,
         optimize=True,
@@ -128,20 +131,18 @@ def _check(frames: list[Workcell], path: Path, fps: int, size: tuple[int, int]) 
         raise InputError("there is no frame to film: the arms did nothing.")
 
 
-class _Stage:
-    """What stays the same in all pictures: eyes, organ, letters."""
+class _FramePainter:
+    """Draws frame by frame; viewpoints, organ and letters stay the same."""
 
     def __init__(self, frames: list[Workcell], located: Located, size: tuple[int, int]) -> None:
         self._frames, self._size = frames, size
         self._organ = [
-            PaintedBody(
-                mesh, part_colour(label), None, _ORGAN_OPACITY if label == 1 else 1.0, False
-            )
+            Body(mesh, rgb(part_colour(label)), _ORGAN_OPACITY if label == ORGAN else 1.0)
             for label, mesh in sorted(organ_surfaces(located).items())
         ]
         self._close_size = round(_CLOSE[0] * size[0]), round(_CLOSE[1] * size[1])
-        self._far = _eye_around(_reach(frames), _FROM, size, _ARMS)
-        self._near = _close_eye(self._organ[0].mesh, self._close_size)
+        self._far = _viewpoint_of(_reach(frames), _FROM, size, _ARMS)
+        self._near = _close_viewpoint(self._organ[0].mesh, self._close_size)
         flat = self._far.project(self._organ[0].mesh.vertices_mm, size)[:, :2]
         self._spot = (*(flat.min(0) - 4).round().tolist(), *(flat.max(0) + 4).round().tolist())
         self._letters = _letters(size[1] // 20), _letters(size[1] // 34)
@@ -163,19 +164,21 @@ class _Stage:
         self._say(draw, n)
         return out
 
-    def _seen(self, cell: Workcell, eye: Eye, size: tuple[int, int]) -> UInt8[np.ndarray, "h w 3"]:
-        shaded = eye is self._far  # the arms' shadows would darken the close-up
+    def _seen(
+        self, cell: Workcell, viewpoint: Viewpoint, size: tuple[int, int]
+    ) -> UInt8[np.ndarray, "h w 3"]:
+        shadowed = viewpoint is self._far  # the arms' shadows would darken the close-up
         shapes = [
-            PaintedBody(s.mesh, s.colour, s.published_from_shape, s.opacity, shaded)
+            Body(s.mesh, rgb(s.colour), s.opacity, s.published_from_shape, shadowed)
             for s in cell.shapes
         ]
-        least_mm = _LEAST_PIXELS * eye.width_mm / size[0]
+        least_mm = _LEAST_PIXELS * viewpoint.width_mm / size[0]
         lines = [
-            PaintedBody(self._tube(line, max(line.width_mm, least_mm)), line.colour, shaded=False)
+            Body(self._tube(line, max(line.width_mm, least_mm)), rgb(line.colour))
             for line in cell.lines
             if len(line.points_mm) > 1
         ]
-        return paint(shapes + lines + self._organ, eye, size)
+        return render(shapes + lines + self._organ, viewpoint, size, _BACKDROP)
 
     def _tube(self, line: Polyline, width_mm: float) -> Mesh:
         key = id(line.points_mm), width_mm  # the line is kept, so its points' id stays theirs
@@ -211,77 +214,78 @@ def _letters(pixels: int) -> ImageFont.FreeTypeFont:
 
 def _reach(frames: list[Workcell]) -> Float[np.ndarray, "n 3"]:
     """Points of all parts of arms in frames of all stages; of everything, where there are none."""
-    told = frames[:: max(1, len(frames) // _LOOKED_AT)]
-    arms = [shape for cell in told for shape in cell.shapes if "/" in shape.name]
+    some = frames[:: max(1, len(frames) // _LOOKED_AT)]
+    shapes = [shape for cell in some for shape in cell.shapes]
+    if not shapes:
+        raise InputError("the frames show no arms and no table: nothing to film.")
     points = [
         transform_points(shape.published_from_shape, shape.mesh.vertices_mm[::_EVERY])
-        for shape in arms or [shape for cell in told for shape in cell.shapes]
+        for shape in [shape for shape in shapes if "/" in shape.name] or shapes
     ]
-    if not points:
-        raise InputError("the frames show no arms and no table: nothing to film.")
     return np.concatenate(points)
 
 
-def _eye_around(
+def _viewpoint_of(
     points_mm: Float[np.ndarray, "n 3"],
-    direction: np.ndarray,
+    direction: Float[np.ndarray, " 3"],
     size: tuple[int, int],
     share: tuple[float, float] = (0.9, 0.9),
-) -> Eye:
-    """The eye in this direction that sees all points as large as they can be in the uppermost
+) -> Viewpoint:
+    """The one in this direction that shows all points as large as they can be in the uppermost
     ``share`` of the picture."""
     target = (points_mm.min(0) + points_mm.max(0)) / 2
     radius = float(np.linalg.norm(points_mm - target, axis=1).max())
     away = _AWAY * radius * direction / np.linalg.norm(direction)
-    eye = Eye(target + away, target, 2 * radius)
-    right = np.cross([0.0, 0.0, 1.0], away)
-    right /= np.linalg.norm(right)
-    down = np.cross(right, away) / np.linalg.norm(away)
+    viewpoint = Viewpoint.towards(target, target + away, 2 * radius)
     room = np.array(size) * share
     middle = np.array([size[0] / 2, (room[1] + (1 - max(share)) * size[1]) / 2])
     for _ in range(6):  # moved and widened until it fits
-        flat = eye.project(points_mm, size)[:, :2]
+        flat = viewpoint.project(points_mm, size)[:, :2]
         low, high = flat.min(0), flat.max(0)
-        off = ((low + high) / 2 - middle) * eye.width_mm / size[0]
-        target = target + off[0] * right + off[1] * down
-        width = eye.width_mm * float(((high - low) / room).max())
-        eye = Eye(target + away, target, width)
-    return eye
+        off = ((low + high) / 2 - middle) * viewpoint.width_mm / size[0]
+        target = target + off @ viewpoint.axes[:2]
+        width = viewpoint.width_mm * float(((high - low) / room).max())
+        viewpoint = Viewpoint.towards(target, target + away, width)
+    return viewpoint
 
 
-def _close_eye(organ: Mesh, size: tuple[int, int]) -> Eye:
-    eye = _eye_around(organ.vertices_mm, _CLOSE_FROM, size)
-    away = eye.place_mm - eye.target_mm
+def _close_viewpoint(organ: Mesh, size: tuple[int, int]) -> Viewpoint:
+    near = _viewpoint_of(organ.vertices_mm, _CLOSE_FROM, size)
+    target = near.place_mm + near.distance_mm * near.axes[2]
     radius = float(np.linalg.norm(organ.vertices_mm - organ.box_mm.mean(0), axis=1).max())
-    return Eye(eye.target_mm + 10 * away, eye.target_mm, eye.width_mm, True, radius + _CLOSE_MM)
+    place, before_mm = target + 10 * (near.place_mm - target), radius + _CLOSE_MM
+    return Viewpoint.towards(target, place, near.width_mm, parallel=True, before_mm=before_mm)
 
 
-def _palette(
-    pictures: list[Image.Image],
-) -> tuple[UInt8[np.ndarray, "256 3"], UInt8[np.ndarray, "64 64 64"]]:
-    """Colours that suit these pictures, and for every colour (6 bits each) the nearest of them."""
+def _palette(pictures: list[Image.Image]) -> Image.Image:
+    """An image of the colours that suit these pictures."""
     from PIL import Image
-    from scipy.spatial import cKDTree
 
     sheet = Image.fromarray(np.concatenate([np.asarray(one)[::2, ::2] for one in pictures]))
-    few = sheet.quantize(_COLOURS, Image.Quantize.MEDIANCUT, kmeans=2, dither=Image.Dither.NONE)
-    colours = np.array(few.getpalette(), np.uint8).reshape(-1, 3)[:_COLOURS]
-    palette = np.zeros((256, 3), np.uint8)
-    palette[: len(colours)] = colours
-    shades = (np.arange(64) * 4 + 2).astype(float)
-    cube = np.stack(np.meshgrid(shades, shades, shades, indexing="ij"), -1).reshape(-1, 3)
-    _, nearest = cKDTree(colours.astype(float)).query(cube)
-    return palette, nearest.astype(np.uint8).reshape(64, 64, 64)
+    return sheet.quantize(_COLOURS, Image.Quantize.MEDIANCUT, kmeans=2, dither=Image.Dither.NONE)
 
 
-def _indexed(
-    picture: Image.Image,
-    palette: UInt8[np.ndarray, "256 3"],
-    index_of: UInt8[np.ndarray, "64 64 64"],
-) -> Image.Image:
-    from PIL import Image
-
-    red, green, blue = np.moveaxis(np.asarray(picture) >> 2, -1, 0)
-    out = Image.fromarray(index_of[red, green, blue])
-    out.putpalette(palette.tobytes())
-    return out
+def tube(points_mm: Float[np.ndarray, "n 3"], radius_mm: float, sides: int = 6) -> Mesh:
+    """A polyline as a thin closed tube; its joints are mitred."""
+    step = np.diff(points_mm, axis=0)
+    step /= np.maximum(np.linalg.norm(step, axis=1, keepdims=True), 1e-9)
+    along = np.concatenate([step[:1], step[:-1] + step[1:], step[-1:]])
+    along /= np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-9)
+    least = np.eye(3)[np.abs(along).argmin(1)]  # the axis most across
+    a = np.cross(along, least)
+    for one, two in pairwise(range(len(a))):  # carried along, so that the tube does not twist
+        a[two] = a[one] - along[two] * (a[one] @ along[two])
+        a[two] /= max(float(np.linalg.norm(a[two])), 1e-9)
+    a[0] /= np.linalg.norm(a[0])
+    b = np.cross(along, a)
+    turn = 2 * np.pi * np.arange(sides) / sides
+    ring = np.cos(turn)[None, :, None] * a[:, None] + np.sin(turn)[None, :, None] * b[:, None]
+    vertices = (points_mm[:, None] + radius_mm * ring).reshape(-1, 3)
+    n = len(points_mm)
+    first = sides * np.arange(n - 1)[:, None] + np.arange(sides)
+    next_ = sides * np.arange(n - 1)[:, None] + (np.arange(sides) + 1) % sides
+    low = np.stack([first, next_, next_ + sides], -1).reshape(-1, 3)
+    high = np.stack([first, next_ + sides, first + sides], -1).reshape(-1, 3)
+    fan = np.stack([np.zeros(sides - 2), np.arange(1, sides - 1), np.arange(2, sides)], -1)
+    ends = [fan[:, ::-1], fan + sides * (n - 1)]
+    return Mesh(vertices, np.concatenate([low, high, *ends]).astype(np.int32))

@@ -16,10 +16,7 @@ from tumortrack.core.errors import InputError
 from tumortrack.core.estimate import Motion
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.types import Anatomy, CameraLabels, Mesh
-from tumortrack.imaging.raster import expand
-
-# Peers take it from here; their cells are kept by the text of their code.
-from tumortrack.imaging.raster import label_grid as label_grid
+from tumortrack.imaging.raster import expand, label_grid
 from tumortrack.simulate.targets import Targets
 
 # Vertices are sampled too, so the maximum misses at most s^2 / (8 R) where a flat piece of size s
@@ -33,18 +30,18 @@ _NEIGHBOURS = 4  # triangles tried exactly for each sample
 class SurfaceDistances:
     """Distances between an estimated and a reference surface, mm.
 
-    With d(p, S) the distance of a point to the nearest point of a surface, E the estimate, R the
+    With d(p, S) the distance of a point to the nearest point of a surface S, E the estimate, R the
     reference:
-    one_sided: max over p in E of d(p, R), the paper's measure;
-    symmetric: max of that and of the max over p in R of d(p, E), the Hausdorff distance;
-    percentile_95: the larger of the two directed 95th percentiles, each over surface area;
-    mean: the mean of the two directed means, each over surface area.
+    hausdorff: the larger of the two directed maxima, over p in E of d(p, R) and the other way;
+    hausdorff_one_sided: the first of them alone, the paper's measure;
+    hausdorff_95: the larger of the two directed 95th percentiles, each over surface area;
+    surface: the mean of the two directed means, each over surface area.
     """
 
-    symmetric_mm: float
-    one_sided_mm: float
-    percentile_95_mm: float
-    mean_mm: float
+    hausdorff_mm: float
+    hausdorff_one_sided_mm: float
+    hausdorff_95_mm: float
+    surface_mm: float
 
 
 def surface_samples(
@@ -112,20 +109,25 @@ def surface_distances(
         raise InputError("surface distances need two surfaces with triangles; one is empty.")
     points_out, weights_out, _ = surface_samples(estimate, spacing_mm)
     points_back, weights_back, _ = surface_samples(reference, spacing_mm)
-    out, back = _to_surface(points_out, reference), _to_surface(points_back, estimate)
+    out, back = (
+        distance_to_surface(points_out, reference),
+        distance_to_surface(points_back, estimate),
+    )
     return SurfaceDistances(
-        symmetric_mm=float(max(out.max(), back.max())),
-        one_sided_mm=float(out.max()),
-        percentile_95_mm=max(
+        hausdorff_mm=float(max(out.max(), back.max())),
+        hausdorff_one_sided_mm=float(out.max()),
+        hausdorff_95_mm=max(
             weighted_percentile(out, weights_out, 95.0),
             weighted_percentile(back, weights_back, 95.0),
         ),
-        mean_mm=float(np.average(out, weights=weights_out) / 2)
+        surface_mm=float(np.average(out, weights=weights_out) / 2)
         + float(np.average(back, weights=weights_back) / 2),
     )
 
 
-def _to_surface(points_mm: Float[np.ndarray, "n 3"], target: Mesh) -> Float[np.ndarray, " n"]:
+def distance_to_surface(
+    points_mm: Float[np.ndarray, "n 3"], target: Mesh
+) -> Float[np.ndarray, " n"]:
     """Distance of every point to a surface: exact to the triangles of the nearest few samples, and
     to one at the nearest corner, whose triangles may be too thin for samples near it.
 

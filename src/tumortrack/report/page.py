@@ -6,7 +6,7 @@ import base64
 import html
 import io
 import json
-from dataclasses import dataclass
+from importlib import resources
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +15,6 @@ from jaxtyping import Float
 from tumortrack.core.estimate import Estimate
 from tumortrack.core.store import write_atomically
 from tumortrack.core.types import Mesh
-from tumortrack.report.page_template import PAGE
 from tumortrack.simulate.scene_folder import Scene
 
 _KIDNEY_CELL_MM, _TUMOR_CELL_MM = 2.5, 2.0
@@ -30,17 +29,9 @@ _COLUMNS = {
 _SHOWN_POINTS = 4000
 
 
-@dataclass(frozen=True, eq=False)
-class PageScene:
-    """What the page shows of one scene, small: thinned meshes and a compressed picture."""
-
-    name: str
-    layers: tuple[dict, ...]
-    picture_webp: bytes
-
-
-def page_scene(name: str, scene: Scene, estimate: Estimate | None, picture: Path) -> PageScene:
-    """Thin a scene for the page; ``picture`` is the PNG that ``scene_picture`` wrote."""
+def page_scene(name: str, scene: Scene, estimate: Estimate | None, picture: Path) -> dict:
+    """What the page shows of a scene, small (JSON types): ``layers``, thinned meshes, and
+    ``picture``, the PNG that ``scene_picture`` wrote, compressed."""
     points_mm = scene.cloud.points_mm
     step = -(-len(points_mm) // _SHOWN_POINTS)
     layers = [{"kind": "points", "name": "observed points", "v": _packed(points_mm[::step])}]
@@ -50,15 +41,15 @@ def page_scene(name: str, scene: Scene, estimate: Estimate | None, picture: Path
     for part, mesh in zip(scene.reference.names, scene.reference.parts, strict=True):
         kind = "truth" if part == "kidney" else "wire"
         layers.append(_layer(kind, f"{part} (truth)", part, mesh))
-    return PageScene(name, tuple(layers), _webp(picture))
+    return {"name": name, "layers": layers, "picture": _webp(picture)}
 
 
-def write_page(report: dict, scenes: list[PageScene], path: Path) -> None:
+def write_page(report: dict, scenes: list[dict], path: Path) -> None:
     """Write the page; it holds plotly itself and loads nothing from anywhere.
 
     Args:
         report: as ``evaluate_scenes`` returns it.
-        scenes: in the order of the report's scenes.
+        scenes: of ``page_scene``, in the order of the report's.
         path: HTML file to write, atomically.
 
     Raises:
@@ -67,18 +58,13 @@ def write_page(report: dict, scenes: list[PageScene], path: Path) -> None:
     from plotly.offline import get_plotlyjs
 
     data = [
-        {
-            "name": scene.name,
-            "rows": _scene_table(entry),
-            "note": html.escape(_note(entry)),
-            "layers": scene.layers,
-            "picture": base64.b64encode(scene.picture_webp).decode(),
-        }
+        {**scene, "rows": _scene_table(entry), "note": html.escape(_note(entry))}
         for entry, scene in zip(report["scenes"], scenes, strict=True)
     ]
     embedded = json.dumps(data, allow_nan=False).replace("</", "<\\/")
     # The texts that are long or hold braces go in by position, never through a formatter.
-    page = PAGE.replace("@SUMMARY@", _summary_table(report["summary"]))
+    page = resources.files("tumortrack.report").joinpath("page.html").read_text("utf-8")
+    page = page.replace("@SUMMARY@", _summary_table(report["summary"]))
     page = page.replace("@COUNTS@", html.escape(_counts(report["summary"])))
     page = page.replace("@RULE@", html.escape(report["rule"]))
     head, script = page.split("@PLOTLY@")
@@ -107,13 +93,8 @@ def thinned(mesh: Mesh, cell_mm: float) -> Mesh:
 def _layer(kind: str, name: str, part: str, mesh: Mesh) -> dict:
     small = thinned(mesh, _KIDNEY_CELL_MM if part == "kidney" else _TUMOR_CELL_MM)
     faces = base64.b64encode(small.faces.astype("<u4").tobytes()).decode()
-    return {
-        "kind": kind,
-        "part": part,
-        "name": name.replace("_", " "),
-        "v": _packed(small.vertices_mm),
-        "f": faces,
-    }
+    about = {"kind": kind, "part": part, "name": name.replace("_", " ")}
+    return {**about, "v": _packed(small.vertices_mm), "f": faces}
 
 
 def _packed(points_mm: Float[np.ndarray, "n 3"]) -> str:
@@ -121,34 +102,30 @@ def _packed(points_mm: Float[np.ndarray, "n 3"]) -> str:
     return base64.b64encode(np.round(points_mm, 2).astype("<f4").tobytes()).decode()
 
 
-def _webp(picture: Path) -> bytes:
+def _webp(picture: Path) -> str:
+    """In base64."""
     from PIL import Image  # matplotlib brings it
 
     buffer = io.BytesIO()
     with Image.open(picture) as image:
         image.convert("RGB").save(buffer, "WEBP", quality=82)
-    return buffer.getvalue()
+    return base64.b64encode(buffer.getvalue()).decode()
 
 
 def _counts(summary: dict) -> str:
     counts = f"{summary['scenes']} scenes, {summary['failed']} failed."
-    return f"{counts} Median mIoU {summary['miou']:.3f}.{_summary_targets(summary)}"
-
-
-def _summary_targets(summary: dict) -> str:
-    errors = summary.get("tre_mm")
-    if not errors:
-        return ""
-    mean, p95, largest = (_number(errors[key]) for key in ("mean", "p95", "max"))
+    text = f"{counts} Median mIoU {summary['miou']:.3f}."
+    if not (errors := summary.get("tre_mm")):
+        return text
+    mean, p95, largest = (number(errors[key]) for key in ("mean", "p95", "max"))
     return (
-        f" Target registration error, medians over {errors['scenes']} scenes: mean {mean} mm, "
-        f"95th percentile {p95} mm, largest {largest} mm."
+        f"{text} Target registration error, medians over {errors['scenes']} scenes: mean {mean} "
+        f"mm, 95th percentile {p95} mm, largest {largest} mm."
     )
 
 
 def _note(entry: dict) -> str:
-    seconds = entry.get("seconds")
-    took = "" if seconds is None else f", located in {seconds:.2f} s"
+    took = f", located in {entry['seconds']:.2f} s" if "seconds" in entry else ""
     failed = "" if entry["failed"] is None else f", FAILED: {entry['failed']}"
     errors = entry.get("tre_mm")
     targets = "" if not errors else f", {target_text(errors)}"
@@ -183,11 +160,11 @@ def _table(parts: dict[str, dict], found: dict[str, str]) -> str:
     head = "".join(f"<th>{title}</th>" for title in ("part", "found", *_COLUMNS.values()))
     rows = []
     for name, part in parts.items():
-        cells = "".join(f"<td>{_number(part.get(key))}</td>" for key in _COLUMNS)
+        cells = "".join(f"<td>{number(part.get(key))}</td>" for key in _COLUMNS)
         label = html.escape(name.replace("_", " "))
         rows.append(f"<tr><th>{label}</th><td>{found[name]}</td>{cells}</tr>")
     return f"<table><thead><tr>{head}</tr></thead><tbody>{''.join(rows)}</tbody></table>"
 
 
-def _number(value: float | None) -> str:
-    return "none" if value is None else f"{value:.2f}"
+def number(value: float | None, digits: int = 2) -> str:
+    return "none" if value is None else f"{value:.{digits}f}"

@@ -18,26 +18,18 @@ from tumortrack.report.drawing import (
     KIDNEY,
     OBSERVED,
     TRUE,
-    axis_arrows,
-    blank,
     draw_lines,
+    finish_view,
     new_figure,
+    outline,
     save,
-    scale_bar,
     section,
     section_mask,
+    show_legend,
     tint,
 )
 from tumortrack.report.qc import qc_picture
-from tumortrack.report.shade import (
-    ShadedLayer,
-    ShadedView,
-    frame_around,
-    pixel_centres,
-    shade,
-    silhouette,
-    widened,
-)
+from tumortrack.report.renderer import Body, ParallelView
 from tumortrack.simulate.scene_folder import Scene
 
 if TYPE_CHECKING:
@@ -45,12 +37,13 @@ if TYPE_CHECKING:
 
 __all__ = ["qc_picture", "scene_picture"]
 
-FROM_CAMERA = ShadedView("seen from the camera", (1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
-FROM_SIDE = ShadedView("seen from the side, camera above", (1.0, 0.0, 0.0), (0.0, 0.0, 1.0))
+FROM_CAMERA = ParallelView("seen from the camera", (1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
+FROM_SIDE = ParallelView("seen from the side, camera above", (1.0, 0.0, 0.0), (0.0, 0.0, 1.0))
 _CAMERA_AXES = {
     FROM_CAMERA: {"x": (1.0, 0.0), "y": (0.0, 1.0)},
     FROM_SIDE: {"x": (1.0, 0.0), "z": (0.0, 1.0)},
 }
+_SLICES = {FROM_CAMERA: "across the view", FROM_SIDE: "along the view"}
 
 
 def scene_picture(scene: Scene, estimate: Estimate | None, entry: dict, path: Path) -> None:
@@ -62,69 +55,59 @@ def scene_picture(scene: Scene, estimate: Estimate | None, entry: dict, path: Pa
         entry: this scene's entry of the report (name, parts, miou, failed), for the titles.
         path: PNG to write, atomically.
     """
-    tumors = scene.reference.names[1:]
-    slices = [(name, view) for name in tumors for view in (FROM_CAMERA, FROM_SIDE)]
+    slices = [(name, view) for name in scene.reference.names[1:] for view in _SLICES]
     rows = -(-len(slices) // 4)
     height_in = 5.1 + 4.05 * rows
     figure = new_figure(14.0, height_in)
     figure.subplots_adjust(top=1 - 0.85 / height_in, bottom=0.15 / height_in)
     outer = figure.add_gridspec(2, 1, height_ratios=[4.1, 3.95 * max(rows, 0.01)], hspace=0.13)
     top = outer[0].subgridspec(1, 2, wspace=0.04)
-    for column, view in enumerate((FROM_CAMERA, FROM_SIDE)):
-        _solid_view(figure.add_subplot(top[column]), scene, estimate, view)
+    for column, view in enumerate(_SLICES):
+        draw_solid_view(figure.add_subplot(top[column]), scene, estimate, view)
     below = outer[1].subgridspec(max(rows, 1), 4, wspace=0.06, hspace=0.2)
     for n, (name, view) in enumerate(slices):
         axes = figure.add_subplot(below[n // 4, n % 4])
-        _slice_view(axes, scene, estimate, name, view)
-        what = f"{name.replace('_', ' ')}: {_slice_name(view)}"
+        _draw_slice(axes, scene, estimate, name, view)
+        what = f"{name.replace('_', ' ')}: {_SLICES[view]}"
         axes.set_title(f"{what}\n{_distances(entry, name)}", fontsize=9.5)
     figure.suptitle(_headline(entry), x=0.02, ha="left", fontsize=13, fontweight="bold")
-    figure.legend(
-        handles=_legend(),
-        loc="upper right",
-        ncols=4,
-        fontsize=9.5,
-        frameon=False,
-        bbox_to_anchor=(0.985, 0.995),
-    )
+    show_legend(figure, scene_legend(), 4, (0.985, 0.995))
     save(figure, path)
 
 
-def _solid_view(axes: Axes, scene: Scene, estimate: Estimate | None, view: ShadedView) -> None:
+def draw_solid_view(
+    axes: Axes, scene: Scene, estimate: Estimate | None, view: ParallelView
+) -> None:
+    """The estimate's surfaces, the truth's outlines and the observed points."""
     shown = estimate.meshes if estimate else {}
     everything = [*scene.reference.parts, *shown.values()]
-    points_mm = scene.cloud.points_mm.astype(float)
-    frame = widened(
-        frame_around(view, np.concatenate([m.vertices_mm for m in everything]), 6.0), 1.7
-    )
-    layers = [ShadedLayer(mesh, ESTIMATED) for name, mesh in shown.items() if name != "kidney"]
+    frame = view.frame_around(np.concatenate([m.vertices_mm for m in everything]), 6.0)
+    frame = frame.widened(1.7)
+    bodies = [Body(mesh, ESTIMATED) for name, mesh in shown.items() if name != "kidney"]
     if "kidney" in shown:
-        layers.append(ShadedLayer(shown["kidney"], KIDNEY, 0.36))
-    axes.imshow(shade(layers, view, frame), extent=frame.extent, zorder=2, interpolation="bilinear")
-    flat = view.project(points_mm)
+        bodies.append(Body(shown["kidney"], KIDNEY, 0.36))
+    picture = view.draw(bodies, frame)
+    axes.imshow(picture, extent=frame.extent, zorder=2, interpolation="bilinear")
+    flat = view.project(scene.cloud.points_mm.astype(float))
     axes.scatter(flat[:, 0], flat[:, 1], s=2.5, color=OBSERVED, alpha=0.55, linewidths=0, zorder=3)
-    x, y = np.meshgrid(*pixel_centres(frame))
     for n, part in enumerate(scene.reference.parts):
-        mask = silhouette(part, view, frame)
-        axes.contour(x, y, mask, levels=[0.5], colors=[TRUE], linewidths=1.2 if n == 0 else 2.2)
+        outline(axes, part, view, frame, TRUE, 1.2 if n == 0 else 2.2)
     for name, mesh in shown.items():
         if name != "kidney":
             u, v = view.project(mesh.box_mm.mean(0)[None])[0, :2]
             axes.text(u, v, name.split("_")[-1], ha="center", va="center", fontweight="bold")
-    blank(axes, frame)
-    scale_bar(axes, frame)
-    axis_arrows(axes, frame, _CAMERA_AXES[view])
+    finish_view(axes, frame, _CAMERA_AXES[view])
     axes.set_title(view.name, fontsize=11)
 
 
-def _slice_view(
-    axes: Axes, scene: Scene, estimate: Estimate | None, name: str, view: ShadedView
+def _draw_slice(
+    axes: Axes, scene: Scene, estimate: Estimate | None, name: str, view: ParallelView
 ) -> None:
     truth = dict(zip(scene.reference.names, scene.reference.parts, strict=True))
     shown = estimate.meshes if estimate else {}
     through_mm = truth[name].box_mm.mean(0)
     around = [truth[name].vertices_mm] + ([shown[name].vertices_mm] if name in shown else [])
-    frame = widened(frame_around(view, np.concatenate(around), 12.0), 1.0)
+    frame = view.frame_around(np.concatenate(around), 12.0).widened(1.0)
     for part, mesh in shown.items():
         color, width = (KIDNEY, 1.4) if part == "kidney" else (ESTIMATED, 2.4)
         tint(axes, section_mask(mesh, view, frame, through_mm), frame, color)
@@ -135,13 +118,7 @@ def _slice_view(
     flat, middle = view.project(scene.cloud.points_mm.astype(float)), view.project(through_mm[None])
     near = np.abs(flat[:, 2] - middle[0, 2]) < 1.5
     axes.scatter(flat[near, 0], flat[near, 1], s=7, color=OBSERVED, linewidths=0, zorder=5)
-    blank(axes, frame)
-    scale_bar(axes, frame)
-    axis_arrows(axes, frame, _CAMERA_AXES[view])
-
-
-def _slice_name(view: ShadedView) -> str:
-    return "across the view" if view is FROM_CAMERA else "along the view"
+    finish_view(axes, frame, _CAMERA_AXES[view])
 
 
 def _distances(entry: dict, name: str) -> str:
@@ -161,7 +138,8 @@ def _headline(entry: dict) -> str:
     return f"{entry['name']}   mIoU {entry['miou']:.2f}{targets}{failed}"
 
 
-def _legend() -> list:
+def scene_legend() -> list:
+    """Handles of what ``draw_solid_view`` shows."""
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 

@@ -4,36 +4,25 @@ from __future__ import annotations
 
 import textwrap
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Bool, Float
 
-from tumortrack.core.colours import Colour, part_colour, sweep_colour
+from tumortrack.core.colours import part_colour, sweep_colour
 from tumortrack.core.errors import InputError
 from tumortrack.core.types import ORGAN, Mesh
 from tumortrack.plan.values import Cut, Located, ResectionPlan
-from tumortrack.report.drawing import axis_arrows, blank, new_figure, save, scale_bar
-from tumortrack.report.organ_surfaces import organ_surfaces
-from tumortrack.report.plan_parts import parted, within
-from tumortrack.report.shade import (
-    Frame,
-    ShadedLayer,
-    ShadedView,
-    depth_of,
-    frame_around,
-    pixel_centres,
-    shade,
-    silhouette,
-    widened,
-)
+from tumortrack.report.drawing import finish_view, new_figure, outline, save, show_legend
+from tumortrack.report.organ_surfaces import organ_surfaces, parted, within
+from tumortrack.report.renderer import RGB, Body, Frame, ParallelView, rgb
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-FROM_ABOVE = ShadedView("from above", (1.0, 0.0, 0.0), (0.0, -1.0, 0.0))
-FROM_SIDE = ShadedView("from the side", (1.0, 0.0, 0.0), (0.0, 0.0, -1.0))
+FROM_ABOVE = ParallelView("from above", (1.0, 0.0, 0.0), (0.0, -1.0, 0.0))
+FROM_SIDE = ParallelView("from the side", (1.0, 0.0, 0.0), (0.0, 0.0, -1.0))
 _ARROWS = {
     FROM_ABOVE: {"x": (1.0, 0.0), "y": (0.0, -1.0)},
     FROM_SIDE: {"x": (1.0, 0.0), "z": (0.0, -1.0)},
@@ -84,7 +73,7 @@ def plan_figure(plan: ResectionPlan, located: Located) -> Figure:
         frame = _frame(view, surfaces, plan)
         tumors = {label: mesh for label, mesh in surfaces.items() if label != ORGAN}
         _draw_bodies(axes, view, frame, tumors, piece, rest)
-        depth = np.min([depth_of(mesh, view, frame) for mesh in tumors.values()], axis=0)
+        depth = np.min([view.depth_of(mesh, frame) for mesh in tumors.values()], axis=0)
         hidden = [_behind(cut, depth, view, frame) for cut in plan.cuts]
         _draw_cuts(axes, plan, in_organ, hidden, view)
         _draw_numbers(axes, plan, view, frame)
@@ -93,43 +82,34 @@ def plan_figure(plan: ResectionPlan, located: Located) -> Figure:
             if label != plan.label:
                 u, v = view.project(mesh.box_mm.mean(0)[None])[0, :2]
                 axes.text(u, v, f"tumor {label - ORGAN}", ha="center", va="center", zorder=3)
-        blank(axes, frame)
-        scale_bar(axes, frame)
-        axis_arrows(axes, frame, _ARROWS[view])
+        finish_view(axes, frame, _ARROWS[view])
         axes.set_title(view.name, fontsize=11)
     _words(figure, plan)
     return figure
 
 
 def _draw_bodies(
-    axes: Axes, view: ShadedView, frame: Frame, tumors: dict[int, Mesh], piece: Mesh, rest: Mesh
+    axes: Axes, view: ParallelView, frame: Frame, tumors: dict[int, Mesh], piece: Mesh, rest: Mesh
 ) -> None:
-    parts = [ShadedLayer(mesh, _unit(part_colour(label))) for label, mesh in tumors.items()]
-    parts.append(ShadedLayer(rest, _unit(part_colour(ORGAN)), _ORGAN_OPACITY))
-    parts.append(ShadedLayer(piece, _PIECE, _PIECE_OPACITY))
-    axes.imshow(shade(parts, view, frame), extent=frame.extent, interpolation="bilinear")
+    bodies = [Body(mesh, rgb(part_colour(label))) for label, mesh in tumors.items()]
+    bodies.append(Body(rest, rgb(part_colour(ORGAN)), _ORGAN_OPACITY))
+    bodies.append(Body(piece, _PIECE, _PIECE_OPACITY))
+    axes.imshow(view.draw(bodies, frame), extent=frame.extent, interpolation="bilinear")
     if len(piece.faces):
-        x, y = np.meshgrid(*pixel_centres(frame))
-        mask = silhouette(piece, view, frame)
-        axes.contour(x, y, mask, levels=[0.5], colors=[_PIECE], linewidths=0.9)
+        outline(axes, piece, view, frame, _PIECE, 0.9)
 
 
-def _unit(colour: Colour) -> tuple[float, float, float]:
-    red, green, blue = (value / 255 for value in colour)
-    return red, green, blue
-
-
-def _frame(view: ShadedView, surfaces: dict[int, Mesh], plan: ResectionPlan) -> Frame:
+def _frame(view: ParallelView, surfaces: dict[int, Mesh], plan: ResectionPlan) -> Frame:
     reach = plan.grasp_mm + np.array([0.0, 0.0, _APPROACH_MM])
     points = [surfaces[ORGAN].vertices_mm, *(cut.path_mm for cut in plan.cuts), reach[None]]
-    return widened(frame_around(view, np.concatenate(points), 7.0), _ASPECT)
+    return view.frame_around(np.concatenate(points), 7.0).widened(_ASPECT)
 
 
 def _behind(
-    cut: Cut, depth: Float[np.ndarray, "h w"], view: ShadedView, frame: Frame
+    cut: Cut, depth: Float[np.ndarray, "h w"], view: ParallelView, frame: Frame
 ) -> Bool[np.ndarray, " n"]:
     """Which points of a stroke are hidden by what lies at that depth."""
-    x, y = pixel_centres(frame)
+    x, y = frame.pixel_centres()
     flat = view.project(cut.path_mm)
     column = np.rint((flat[:, 0] - x[0]) / (x[1] - x[0])).astype(int)
     row = np.rint((flat[:, 1] - y[0]) / (y[1] - y[0])).astype(int)
@@ -141,7 +121,7 @@ def _draw_cuts(
     plan: ResectionPlan,
     in_organ: list[Bool[np.ndarray, " _"]],
     hidden: list[Bool[np.ndarray, " _"]],
-    view: ShadedView,
+    view: ParallelView,
 ) -> None:
     """The lowest first and, from above, widest, so that strokes above each other all show; what
     lies behind a tumor is faint."""
@@ -151,7 +131,7 @@ def _draw_cuts(
     every += 1 - every % 2  # odd: strokes go to and fro, and that is to be seen
     for cut, inside, behind in reversed(list(zip(plan.cuts, in_organ, hidden, strict=True))):
         flat = view.project(cut.path_mm)
-        colour = _unit(sweep_colour(cut.sweep, plan.sweeps))
+        colour = rgb(sweep_colour(cut.sweep, plan.sweeps))
         low = (cut.sweep - 1) / max(plan.sweeps - 1, 1) if view is FROM_ABOVE else 0.5
         width = (1.9 + 2.8 * low) * (1.0 if cut.kind == "wall" else 0.6)
         casing = [Stroke(linewidth=width + 1.2, foreground="white", alpha=0.8), Normal()]
@@ -164,10 +144,13 @@ def _draw_cuts(
             _draw_arrows(axes, flat, colour)
 
 
-def _draw_arrows(
-    axes: Axes, flat: Float[np.ndarray, "n 3"], colour: tuple[float, float, float]
-) -> None:
+def _draw_arrows(axes: Axes, flat: Float[np.ndarray, "n 3"], colour: RGB) -> None:
     """Heads along a stroke, where it is on the side towards the viewer."""
+    arrow = {
+        "arrowstyle": "simple,head_width=0.85,head_length=0.9,tail_width=0.01",
+        **{"mutation_scale": 13, "shrinkA": 0, "shrinkB": 0},
+        **{"facecolor": colour, "edgecolor": "white", "linewidth": 0.6},
+    }
     steps = np.linalg.norm(np.diff(flat[:, :2], axis=0), axis=1)
     near = flat[:-1, 2] <= (flat[:, 2].min() + flat[:, 2].max()) / 2 + 1e-6
     good = np.flatnonzero(near & (steps >= 0.6 * steps[near].max()))
@@ -175,24 +158,10 @@ def _draw_arrows(
     for n in good[(len(good) * (np.arange(count) + 0.5) / count).astype(int)]:
         along = flat[n + 1, :2] - flat[n, :2]
         tip = flat[n, :2] + along / np.linalg.norm(along) * _HEAD_MM / 2
-        axes.annotate(
-            "",
-            tip,
-            2 * flat[n, :2] - tip,
-            arrowprops={
-                "arrowstyle": "simple,head_width=0.85,head_length=0.9,tail_width=0.01",
-                "mutation_scale": 13,
-                "shrinkA": 0,
-                "shrinkB": 0,
-                "facecolor": colour,
-                "edgecolor": "white",
-                "linewidth": 0.6,
-            },
-            zorder=8,
-        )
+        axes.annotate("", tip, 2 * flat[n, :2] - tip, arrowprops=arrow, zorder=8)
 
 
-def _draw_numbers(axes: Axes, plan: ResectionPlan, view: ShadedView, frame: Frame) -> None:
+def _draw_numbers(axes: Axes, plan: ResectionPlan, view: ParallelView, frame: Frame) -> None:
     """Where sweeps start, seen from above; beside the picture, at their heights, from the side.
     The first and the last, and those between with room."""
     first = {cut.sweep: cut for cut in reversed(plan.cuts)}
@@ -200,23 +169,26 @@ def _draw_numbers(axes: Axes, plan: ResectionPlan, view: ShadedView, frame: Fram
     order = sorted(first, key=lambda sweep: (sweep not in (1, plan.sweeps), sweep))
     for sweep in order:
         flat = view.project(first[sweep].path_mm)[:, :2]
-        colour = _unit(sweep_colour(sweep, plan.sweeps))
+        colour = rgb(sweep_colour(sweep, plan.sweeps))
         spot = flat[0] if view is FROM_ABOVE else np.array([frame.right - 6.0, flat[0, 1]])
         if any(np.linalg.norm(spot - other) < _BADGE_MM for other in taken):
             continue
         taken.append(spot)
         if view is FROM_SIDE:
-            axes.plot(
-                [flat[:, 0].max(), spot[0]], [spot[1]] * 2, ":", color=colour, lw=0.9, zorder=4
-            )
-        axes.annotate(
-            str(sweep), tuple(spot), color="white", fontsize=7.5, weight="bold",
-            ha="center", va="center", zorder=10,
-            bbox={"boxstyle": "circle,pad=0.22", "facecolor": colour, "edgecolor": "white"},
-        )  # fmt: skip
+            x = [flat[:, 0].max(), spot[0]]
+            axes.plot(x, [spot[1]] * 2, ":", color=colour, lw=0.9, zorder=4)
+        badge = {"boxstyle": "circle,pad=0.22", "facecolor": colour, "edgecolor": "white"}
+        style: dict[str, Any] = {
+            "fontsize": 7.5,
+            "weight": "bold",
+            "ha": "center",
+            "va": "center",
+            "zorder": 10,
+        }
+        axes.annotate(str(sweep), tuple(spot), color="white", bbox=badge, **style)
 
 
-def _draw_grasp(axes: Axes, plan: ResectionPlan, view: ShadedView) -> None:
+def _draw_grasp(axes: Axes, plan: ResectionPlan, view: ParallelView) -> None:
     """The cup, and from the side the way it comes."""
     u, v, _ = view.project(plan.grasp_mm[None])[0]
     if view is FROM_ABOVE:
@@ -225,17 +197,10 @@ def _draw_grasp(axes: Axes, plan: ResectionPlan, view: ShadedView) -> None:
             x, y = u + radius * np.cos(turn), v + radius * np.sin(turn)
             axes.plot(x, y, color=_GRASP, linewidth=width, zorder=9)
         return
-    axes.fill(
-        u + _CUP_MM * np.array([-1, 1, 0.5, -0.5]), v - np.array([0, 0, 4, 4]),
-        color=_GRASP, zorder=9,
-    )  # fmt: skip
-    axes.annotate(
-        "",
-        (u, v - 4.0),
-        (u, v - _APPROACH_MM),
-        arrowprops={"arrowstyle": "-|>", "color": _GRASP, "linewidth": 1.8, "mutation_scale": 14},
-        zorder=9,
-    )
+    x, y = u + _CUP_MM * np.array([-1, 1, 0.5, -0.5]), v - np.array([0, 0, 4, 4])
+    axes.fill(x, y, color=_GRASP, zorder=9)
+    arrow = {"arrowstyle": "-|>", "color": _GRASP, "linewidth": 1.8, "mutation_scale": 14}
+    axes.annotate("", (u, v - 4.0), (u, v - _APPROACH_MM), arrowprops=arrow, zorder=9)
 
 
 def _words(figure: Figure, plan: ResectionPlan) -> None:
@@ -247,14 +212,11 @@ def _words(figure: Figure, plan: ResectionPlan) -> None:
         x=0.014, y=0.975, ha="left", fontsize=13, fontweight="bold",
     )  # fmt: skip
     share = ml["healthy"] / ml["parenchyma"]
-    figure.text(
-        0.014,
-        0.055,
+    line = (
         f"{ml['piece']:.1f} ml come away: {ml['tumor']:.1f} ml tumor and {ml['healthy']:.1f} ml "
-        f"healthy tissue ({share:.0%} of the organ's)",
-        fontsize=11,
-        va="center",
+        f"healthy tissue ({share:.0%} of the organ's)"
     )
+    figure.text(0.014, 0.055, line, fontsize=11, va="center")
     about = [
         f"margin {plan.margin_mm:g} mm",
         f"{plan.exophytic:.0%} of the tumor outside the organ's hull",
@@ -263,30 +225,22 @@ def _words(figure: Figure, plan: ResectionPlan) -> None:
     ]
     line = textwrap.shorten(" · ".join(about), 190)
     figure.text(0.014, 0.021, line, fontsize=9.5, va="center", color="0.35")
-    figure.legend(
-        handles=_legend(plan),
-        loc="upper right",
-        ncols=6,
-        fontsize=9.5,
-        frameon=False,
-        columnspacing=1.2,
-        handlelength=1.6,
-        bbox_to_anchor=(0.992, 0.945),
-    )
+    style = {"columnspacing": 1.2, "handlelength": 1.6}
+    show_legend(figure, _legend(plan), 6, (0.992, 0.945), **style)
 
 
 def _legend(plan: ResectionPlan) -> list:
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
-    kidney = _unit(part_colour(ORGAN))
+    kidney = rgb(part_colour(ORGAN))
     ends = sorted({1, plan.sweeps})
     return [
         Patch(facecolor=(*kidney, 0.5), label="kidney"),
-        Patch(facecolor=_unit(part_colour(plan.label)), label=plan.tumor.replace("_", " ")),
+        Patch(facecolor=rgb(part_colour(plan.label)), label=plan.tumor.replace("_", " ")),
         Patch(facecolor=(*_PIECE, 0.45), edgecolor=_PIECE, label="comes away"),
         *(
-            Line2D([], [], color=_unit(sweep_colour(n, plan.sweeps)), lw=2.8, label=f"sweep {n}")
+            Line2D([], [], color=rgb(sweep_colour(n, plan.sweeps)), lw=2.8, label=f"sweep {n}")
             for n in ends
         ),
         Line2D([], [], color=_GRASP, marker="o", mfc="none", mew=1.8, ls="", label="grasp"),

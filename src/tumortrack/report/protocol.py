@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from dataclasses import asdict, fields
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -15,26 +16,21 @@ from tumortrack.core.estimate import Estimate
 from tumortrack.core.store import write_json
 from tumortrack.core.types import SensorCloud
 from tumortrack.report.metrics import (
+    SurfaceDistances,
     box_center_distance,
     label_ious,
     mean_iou,
     surface_distances,
     target_errors,
 )
-from tumortrack.report.page import PageScene, page_scene, part_rows, write_page
+from tumortrack.report.page import number, page_scene, part_rows, write_page
 from tumortrack.report.pictures import scene_picture
 from tumortrack.simulate.scene_folder import Scene, list_scenes, read_scene
 
 if TYPE_CHECKING:
     from rich.table import Table
 
-DISTANCES = (
-    "hausdorff_mm",
-    "hausdorff_one_sided_mm",
-    "hausdorff_95_mm",
-    "surface_mm",
-    "center_mm",
-)
+DISTANCES = (*(field.name for field in fields(SurfaceDistances)), "center_mm")
 RULE = (
     "Medians over all scenes that have the part. A part that was not found counts as infinitely "
     "far and with IoU 0; a median that is infinite is written as null. A scene with a part "
@@ -80,7 +76,7 @@ def evaluate_scenes(
     except OSError as error:
         raise StorageError(f"cannot write {out}: {error.strerror}.") from error
     entries: list[dict] = []
-    shown: list[PageScene] = []
+    shown: list[dict] = []
     for done, folder in enumerate(folders, start=1):
         scene = read_scene(folder)
         entry, estimate = evaluate_scene(locate, scene, folder.name)
@@ -139,20 +135,11 @@ def compare(estimate: Estimate, scene: Scene) -> dict[str, dict]:
     ious = label_ious(estimate.volume, scene.reference)
     parts: dict[str, dict] = {}
     for name, reference in zip(scene.reference.names, scene.reference.parts, strict=True):
-        parts[name] = {"found": False, "iou": ious[name]}
-        mesh = estimate.meshes.get(name)
-        if mesh is None or len(mesh.faces) == 0:
-            continue
-        distances = surface_distances(mesh, reference)
-        parts[name] = {
-            "found": True,
-            "hausdorff_mm": distances.symmetric_mm,
-            "hausdorff_one_sided_mm": distances.one_sided_mm,
-            "hausdorff_95_mm": distances.percentile_95_mm,
-            "surface_mm": distances.mean_mm,
-            "center_mm": box_center_distance(mesh, reference),
-            "iou": ious[name],
-        }
+        mesh, distances = estimate.meshes.get(name), {}
+        if found := mesh is not None and len(mesh.faces) > 0:
+            distances = asdict(surface_distances(mesh, reference))
+            distances["center_mm"] = box_center_distance(mesh, reference)
+        parts[name] = {"found": found, **distances, "iou": ious[name]}
     return parts
 
 
@@ -191,27 +178,20 @@ def summary_table(report: dict) -> Table:
     from rich.table import Table
 
     summary = report["summary"]
+    errors = summary.get("tre_mm")
+    targets = f", target error {number(errors['mean'], 1)} mm" if errors else ""
     table = Table(
         title=f"{summary['scenes']} scenes, {summary['failed']} failed, "
-        f"mIoU {summary['miou']:.3f}{_targets_text(summary)} (medians)"
+        f"mIoU {summary['miou']:.3f}{targets} (medians)"
     )
     table.add_column("part")
     for head in ("found", "HD mm", "one-sided", "HD95", "surface", "centre", "IoU"):
         table.add_column(head, justify="right")
     for name, part in part_rows(summary).items():
-        numbers = [_text(part[key], 1 if key != "surface_mm" else 2) for key in DISTANCES]
+        numbers = [number(part[key], 1 if key != "surface_mm" else 2) for key in DISTANCES]
         found = f"{part['found']}/{part['scenes']}"
-        table.add_row(name, found, *numbers, _text(part["iou"], 2))
+        table.add_row(name, found, *numbers, number(part["iou"]))
     return table
-
-
-def _targets_text(summary: dict) -> str:
-    errors = summary.get("tre_mm")
-    return f", target error {_text(errors['mean'], 1)} mm" if errors else ""
-
-
-def _text(value: float | None, digits: int) -> str:
-    return "none" if value is None else f"{value:.{digits}f}"
 
 
 def _median(values: list[float]) -> float | None:

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float, Shaped
@@ -13,22 +12,14 @@ from tumortrack.core.geometry import DIRECTIONS_LPS, transform_points
 from tumortrack.core.types import Anatomy, LabelVolume, Volume
 from tumortrack.report.drawing import (
     KIDNEY,
-    blank,
     draw_lines,
+    finish_view,
     new_figure,
     save,
-    scale_bar,
     section,
+    show_legend,
 )
-from tumortrack.report.shade import (
-    Frame,
-    ShadedLayer,
-    ShadedView,
-    frame_around,
-    pixel_centres,
-    shade,
-    widened,
-)
+from tumortrack.report.renderer import RGB, Body, Frame, ParallelView
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -37,59 +28,53 @@ if TYPE_CHECKING:
 _ORGAN_LINE = (1.0, 0.62, 0.45)
 _TUMOR_COLORS = ((0.97, 0.88, 0.22), (0.34, 0.71, 0.91), (0.56, 0.93, 0.56), (0.85, 0.55, 0.75))
 _SOFT_TISSUE_HU = (-160.0, 240.0)
-_MARGIN_MM = 18.0
+_MARGIN_MM, _ASPECT = 18.0, 1.22
 _MOST_ROWS = 6  # tumors with slices of their own
+_BORDERS = {
+    "left": (0.025, 0.5),
+    "right": (0.975, 0.5),
+    "top": (0.5, 0.965),
+    "bottom": (0.5, 0.035),
+}
 
 
-@dataclass(frozen=True)
-class QcPlane:
-    """One of the three slices: its view in LPS, and the letters at its borders."""
-
-    view: ShadedView
-
-    @property
-    def letters(self) -> dict[str, str]:
-        """Where the patient's sides lie: left, right, top, bottom of the picture -> L R A P S I."""
-        right, down = np.array(self.view.right), np.array(self.view.down)
-        towards = {"right": right, "left": -right, "bottom": down, "top": -down}
-        names = {tuple(np.array(v)): n[0].upper() for n, v in DIRECTIONS_LPS.items()}
-        return {border: names[tuple(v.astype(float))] for border, v in towards.items()}
-
-
-# Radiological convention: the patient's right is on the picture's left (axial seen from the feet,
-# coronal from the front); sagittal with anterior on the left.
+# The slices' views in LPS. Radiological convention: the patient's right is on the picture's left
+# (axial seen from the feet, coronal from the front); sagittal with anterior on the left.
 PLANES = (
-    QcPlane(ShadedView("axial", (1.0, 0.0, 0.0), (0.0, 1.0, 0.0))),
-    QcPlane(ShadedView("coronal", (1.0, 0.0, 0.0), (0.0, 0.0, -1.0))),
-    QcPlane(ShadedView("sagittal", (0.0, 1.0, 0.0), (0.0, 0.0, -1.0))),
+    ParallelView("axial", (1.0, 0.0, 0.0), (0.0, 1.0, 0.0)),
+    ParallelView("coronal", (1.0, 0.0, 0.0), (0.0, 0.0, -1.0)),
+    ParallelView("sagittal", (0.0, 1.0, 0.0), (0.0, 0.0, -1.0)),
 )
+
+
+def border_letters(view: ParallelView) -> dict[str, str]:
+    """Where the patient's sides lie: left, right, top, bottom of the picture -> L R A P S I."""
+    right, down, _ = view.axes
+    towards = {"right": right, "left": -right, "bottom": down, "top": -down}
+    names = {tuple(np.array(v)): n[0].upper() for n, v in DIRECTIONS_LPS.items()}
+    return {border: names[tuple(v)] for border, v in towards.items()}
 
 
 def slice_volume(
     array: Shaped[np.ndarray, "i j k"],
     lps_from_index: Float[np.ndarray, "4 4"],
-    view: ShadedView,
+    view: ParallelView,
     frame: Frame,
     through_mm: Float[np.ndarray, " 3"],
 ) -> Float[np.ndarray, "h w"]:
     """A volume's values (nearest voxel, NaN outside) in the view's plane through a point.
 
-    Row 0 is the frame's top, column 0 its left, as in ``shade``.
+    Row 0 is the frame's top, column 0 its left, as in ``ParallelView.draw``.
     """
-    x, y = pixel_centres(frame)
-    normal = np.cross(view.right, view.down)
+    x, y = np.meshgrid(*frame.pixel_centres())
     depth = view.project(through_mm[None])[0, 2]
-    lps = (
-        x[None, :, None] * np.array(view.right, float)
-        + y[:, None, None] * np.array(view.down, float)
-        + depth * normal
-    )
-    index = transform_points(np.linalg.inv(lps_from_index), lps.reshape(-1, 3))
+    lps = np.stack([x, y, np.full_like(x, depth)], axis=-1).reshape(-1, 3) @ view.axes
+    index = transform_points(np.linalg.inv(lps_from_index), lps)
     index = np.floor(index + 0.5).astype(int)
     inside = ((index >= 0) & (index < array.shape)).all(1)
     values = np.full(len(index), np.nan)
     values[inside] = array[tuple(index[inside].T)]
-    return values.reshape(len(y), len(x))
+    return values.reshape(x.shape)
 
 
 def qc_picture(case_labels: LabelVolume, ct: Volume | None, anatomy: Anatomy, path: Path) -> None:
@@ -116,95 +101,76 @@ def qc_picture(case_labels: LabelVolume, ct: Volume | None, anatomy: Anatomy, pa
     shown: LabelVolume | Volume = ct if ct is not None else case_labels
     window = _window(shown, anatomy)
     for row, (title, part) in enumerate(zip(titles, through, strict=True)):
-        for column, plane in enumerate(PLANES):
+        for column, view in enumerate(PLANES):
             axes = figure.add_subplot(grid[row, column])
-            _qc_slice(axes, (shown, window), anatomy, plane, part.box_mm.mean(0))
+            _draw_slice(axes, (shown, window), anatomy, view, part.box_mm.mean(0))
             if column == 0:
                 axes.set_ylabel(f"through {title}", fontsize=12, fontweight="bold")
-    _qc_solid(figure.add_subplot(grid[:, 3]), anatomy)
+    _draw_solid(figure.add_subplot(grid[:, 3]), anatomy)
     what = "CT" if ct is not None else "label map"
     dropped = len(order) - len(rows)
     more = f" (slices through the {_MOST_ROWS} largest of {len(order)} tumors)" if dropped else ""
     figure.suptitle(f"Prepared case over its {what}{more}", x=0.015, ha="left", fontweight="bold")
-    figure.legend(
-        handles=_qc_legend(anatomy),
-        loc="upper right",
-        ncols=6,
-        frameon=False,
-        fontsize=9.5,
-        bbox_to_anchor=(0.99, 0.995),
-    )
+    show_legend(figure, _legend(anatomy), 6, (0.99, 0.995))
     save(figure, path)
 
 
-def _qc_slice(
+def _draw_slice(
     axes: Axes,
     background: tuple[Volume | LabelVolume, tuple[float, float]],
     anatomy: Anatomy,
-    plane: QcPlane,
+    view: ParallelView,
     through_mm: Float[np.ndarray, " 3"],
 ) -> None:
-    frame = _same_scale(plane, anatomy)
+    frame = _same_scale(view, anatomy)
     shown, (low, high) = background
     array = shown.hu if isinstance(shown, Volume) else shown.labels
-    values = slice_volume(array, shown.lps_from_index, plane.view, frame, through_mm)
+    values = slice_volume(array, shown.lps_from_index, view, frame, through_mm)
     axes.imshow(np.ma.masked_invalid(values), cmap="gray", vmin=low, vmax=high, extent=frame.extent)
-    colors = (_ORGAN_LINE, *(tumor_color(n) for n in range(len(anatomy.tumors))))
+    colors = (_ORGAN_LINE, *(_tumor_color(n) for n in range(len(anatomy.tumors))))
     for color, part in zip(colors, anatomy.parts, strict=True):
-        draw_lines(axes, section(part, plane.view, through_mm), color=color, linewidth=1.7)
-    blank(axes, frame, "black")
-    scale_bar(axes, frame, "white")
-    _write_letters(axes, plane, "white")
-    axis = int(np.argmax(np.abs(np.cross(plane.view.right, plane.view.down))))
+        draw_lines(axes, section(part, view, through_mm), color=color, linewidth=1.7)
+    finish_view(axes, frame, background="black")
+    _write_letters(axes, view, "white")
+    axis = int(np.argmax(np.abs(view.axes[2])))
     letter = ("LPS" if through_mm[axis] >= 0 else "RAI")[axis]
     where = f"{letter} {abs(through_mm[axis]):.1f} mm"
-    axes.set_title(f"{plane.view.name}, {where}", fontsize=10.5)
+    axes.set_title(f"{view.name}, {where}", fontsize=10.5)
 
 
-def _qc_solid(axes: Axes, anatomy: Anatomy) -> None:
-    plane = PLANES[1]
-    frame = widened(frame_around(plane.view, anatomy.organ.vertices_mm, 8.0), 1.22)
-    layers = [ShadedLayer(tumor, tumor_color(n)) for n, tumor in enumerate(anatomy.tumors)]
-    layers.append(ShadedLayer(anatomy.organ, KIDNEY, 0.38))
-    axes.imshow(shade(layers, plane.view, frame), extent=frame.extent, interpolation="bilinear")
-    blank(axes, frame)
-    scale_bar(axes, frame)
-    _write_letters(axes, plane, "black")
+def _draw_solid(axes: Axes, anatomy: Anatomy) -> None:
+    view = PLANES[1]
+    frame = view.frame_around(anatomy.organ.vertices_mm, 8.0).widened(_ASPECT)
+    bodies = [Body(tumor, _tumor_color(n)) for n, tumor in enumerate(anatomy.tumors)]
+    picture = view.draw([*bodies, Body(anatomy.organ, KIDNEY, 0.38)], frame)
+    axes.imshow(picture, extent=frame.extent, interpolation="bilinear")
+    finish_view(axes, frame)
+    _write_letters(axes, view, "black")
     axes.set_title("3-D, seen from the front", fontsize=10.5)
 
 
-def _write_letters(axes: Axes, plane: QcPlane, color: str) -> None:
-    places = {
-        "left": (0.025, 0.5),
-        "right": (0.975, 0.5),
-        "top": (0.5, 0.965),
-        "bottom": (0.5, 0.035),
+def _write_letters(axes: Axes, view: ParallelView, color: str) -> None:
+    style: dict[str, Any] = {
+        "ha": "center",
+        "va": "center",
+        "fontsize": 13,
+        "fontweight": "bold",
+        "color": color,
     }
-    for border, letter in plane.letters.items():
-        axes.text(
-            *places[border],
-            letter,
-            transform=axes.transAxes,
-            color=color,
-            ha="center",
-            va="center",
-            fontsize=13,
-            fontweight="bold",
-            gid=border,
-        )
+    for border, letter in border_letters(view).items():
+        axes.text(*_BORDERS[border], letter, transform=axes.transAxes, gid=border, **style)
 
 
-def tumor_color(number: int) -> tuple[float, float, float]:
-    """Colour of the tumor with this number, counted from 0."""
+def _tumor_color(number: int) -> RGB:
     return _TUMOR_COLORS[number % len(_TUMOR_COLORS)]
 
 
-def _same_scale(plane: QcPlane, anatomy: Anatomy) -> Frame:
+def _same_scale(view: ParallelView, anatomy: Anatomy) -> Frame:
     """A frame about the organ, equally large in all planes, so that lengths compare."""
     size_mm = float(np.ptp(anatomy.organ.box_mm, axis=0).max()) + 2 * _MARGIN_MM
-    right, down, _ = plane.view.project(anatomy.organ.box_mm.mean(0)[None])[0].tolist()
+    right, down, _ = view.project(anatomy.organ.box_mm.mean(0)[None])[0].tolist()
     half = size_mm / 2
-    return Frame(right - 1.22 * half, right + 1.22 * half, down - half, down + half)
+    return Frame(right - _ASPECT * half, right + _ASPECT * half, down - half, down + half)
 
 
 def _window(shown: Volume | LabelVolume, anatomy: Anatomy) -> tuple[float, float]:
@@ -219,15 +185,11 @@ def _window(shown: Volume | LabelVolume, anatomy: Anatomy) -> tuple[float, float
     return low, max(high, 1.15 * brightest)
 
 
-def _qc_legend(anatomy: Anatomy) -> list:
+def _legend(anatomy: Anatomy) -> list:
     from matplotlib.patches import Patch
 
-    handles = [Patch(facecolor=_ORGAN_LINE, label=_volume_text("kidney", anatomy.organ.volume_mm3))]
-    for n, (name, mesh) in enumerate(zip(anatomy.names[1:], anatomy.tumors, strict=True)):
-        text = _volume_text(name.replace("_", " "), mesh.volume_mm3)
-        handles.append(Patch(facecolor=tumor_color(n), label=text))
-    return handles
-
-
-def _volume_text(name: str, volume_mm3: float) -> str:
-    return f"{name} {volume_mm3 / 1000:.1f} ml"
+    colors = [_ORGAN_LINE, *(_tumor_color(n) for n in range(len(anatomy.tumors)))]
+    return [
+        Patch(facecolor=color, label=f"{name.replace('_', ' ')} {part.volume_mm3 / 1000:.1f} ml")
+        for color, name, part in zip(colors, anatomy.names, anatomy.parts, strict=True)
+    ]

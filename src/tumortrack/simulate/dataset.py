@@ -7,7 +7,7 @@ from functools import cached_property
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Float32, UInt8
+from jaxtyping import Float32, Num, UInt8
 
 from tumortrack.core.types import Anatomy
 from tumortrack.simulate.elastic.body import ElasticBody
@@ -63,7 +63,7 @@ class SceneStream:
         )
 
 
-def refill(points_mm: Float32[np.ndarray, "m 3"], n: int) -> Float32[np.ndarray, "n 3"]:
+def refill(points_mm: Num[np.ndarray, m * row], n: int) -> Num[np.ndarray, n * row]:
     """A cloud of fewer than ``n`` points repeats them, so that clouds stack; max pooling is not
     affected."""
     return points_mm[np.arange(n) % len(points_mm)]

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int64, UInt8
@@ -36,6 +36,7 @@ class OccupancyConfig(Config, frozen=True):
     pool: int = 100_000  # points per part that are labelled once
 
 
+@runtime_checkable
 class PointSource(Protocol):
     """Where the points of scenes come from."""
 
@@ -73,7 +74,7 @@ class PartPool:
         """Indices of ``count`` points from ``first`` on; after the last comes the first."""
         return (first + np.arange(count)) % len(self.labels)
 
-    def nearest(self, first: int, count: int, k: int) -> Int64[np.ndarray, " 2k"]:
+    def nearest(self, first: int, count: int, k: int) -> Int64[np.ndarray, " m"]:
         """Of these neighbours the ``k`` inside that are nearest to the surface, and ``k`` outside;
         on a side in any order."""
         drawn = self.neighbours(first, count)
@@ -98,7 +99,7 @@ class PartPool:
         return drawn[np.argpartition(self.distance_mm[drawn], k)[:k]]
 
     @cached_property
-    def _inside_before(self) -> Int64[np.ndarray, " n+1"]:
+    def _inside_before(self) -> Int64[np.ndarray, " m"]:
         return np.concatenate([[0], np.cumsum(self.inside)])
 
     @cached_property

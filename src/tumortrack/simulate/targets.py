@@ -27,7 +27,7 @@ class Targets:
     """Points in the undeformed CT (LPS, mm), their true places before the camera (mm), labels."""
 
     points_ct: Float64[np.ndarray, "n 3"]
-    points_mm: Float64[np.ndarray, "n 3"]
+    points_mm: Float[np.ndarray, "n 3"]
     labels: UInt8[np.ndarray, " n"]
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float64
@@ -22,6 +22,7 @@ from tumortrack.registration.model import RegistrationModel
 _ALONE = Following()
 
 
+@runtime_checkable
 class Locator(Protocol):
     """One method at work; ``Tracker`` documents the calls."""
 

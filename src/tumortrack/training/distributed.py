@@ -1,10 +1,10 @@
-"""One training by several processes, as torchrun starts them: each takes its share of every batch.
+"""One training by several processes, as torchrun starts them: each takes its part of every batch.
 
     torchrun --nproc_per_node=2 -m tumortrack train CASE MODEL
 
 All processes hold the same weights and take the same steps: the mean of their gradients is the
 whole batch's, so that the number of processes changes results by rounding alone. A batch norm is
-the exception: it sees its process's share. The first process alone validates, writes and reports.
+the exception: it sees its process's part. The main process alone validates, writes and reports.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from torch import Tensor, distributed, nn
 from tumortrack.core.errors import InputError, TumortrackError
 from tumortrack.models.hardware import choose_device
 
-_PATIENCE = timedelta(hours=1)  # while the first process validates, the others wait
+_PATIENCE = timedelta(hours=1)  # while the main process validates, the others wait
 
 
 class ProcessLost(TumortrackError):
@@ -38,15 +38,15 @@ class ProcessGroup:
     on_machine: int = 1  # of ``size``, those that share this machine's cores
 
     @property
-    def leads(self) -> bool:
+    def is_main(self) -> bool:
         """Whether this process validates, writes and reports."""
         return self.rank == 0
 
-    def share(self, batch_size: int) -> int:
+    def local_size(self, batch_size: int) -> int:
         """How many samples of a batch are this process's.
 
         Raises:
-            InputError: the batch cannot be shared equally.
+            InputError: the batch cannot be split equally.
         """
         if batch_size % self.size:
             raise InputError(
@@ -55,17 +55,17 @@ class ProcessGroup:
             )
         return batch_size // self.size
 
-    def numbers(self, steps: range) -> range:
-        """The numbers of this process's shares of these steps' batches, in a stream of shares."""
+    def local_batches(self, steps: range) -> range:
+        """This process's parts of these steps' batches, as numbers in a stream of such parts."""
         return range(
             steps.start * self.size + self.rank, steps.stop * self.size + self.rank, self.size
         )
 
     def mean(self, parameters: Iterable[nn.Parameter], value: Tensor) -> Tensor:
-        """Replace gradients by the mean over all processes; returns the value's.
+        """Replace gradients by their mean over all processes; returns the mean of ``value``.
 
         Raises:
-            RankLost: another process has ended.
+            ProcessLost: another process has ended.
         """
         if self.size == 1:
             return value
@@ -78,53 +78,53 @@ class ProcessGroup:
             gradient.copy_(part.view_as(gradient))
         return parts[-1][0]
 
-    def agreed(self, elapsed_s: float, stop: bool) -> tuple[float, bool]:
-        """The first process's time, and whether any process was asked to stop.
+    def all_reduce(self, elapsed_s: float, stop: bool) -> tuple[float, bool]:
+        """The main process's time, and whether any process is to stop.
 
         Raises:
-            RankLost: another process has ended.
+            ProcessLost: another process has ended.
         """
         if self.size == 1:
             return elapsed_s, stop
-        told = torch.tensor([elapsed_s if self.leads else 0.0, float(stop)], dtype=torch.float64)
-        told = told.to(self.device)
-        self._sum(told)
-        elapsed_s, asked = told.tolist()
-        return elapsed_s, asked > 0
+        mine = [elapsed_s if self.is_main else 0.0, float(stop)]
+        total = torch.tensor(mine, dtype=torch.float64).to(self.device)
+        self._sum(total)
+        elapsed_s, stops = total.tolist()
+        return elapsed_s, stops > 0
 
     def _sum(self, values: Tensor) -> None:
-        with self._others_there():
+        with self._lost_process():
             distributed.all_reduce(values)
 
-    def leave(self) -> None:
-        """Part from the others.
+    def close(self) -> None:
+        """Leave the group.
 
         Raises:
-            RankLost: another process has ended.
+            ProcessLost: another process has ended.
         """
-        with self._others_there():
+        with self._lost_process():
             distributed.destroy_process_group()
 
     @contextmanager
-    def _others_there(self) -> Iterator[None]:
-        """Says in our words what Gloo and NCCL say of a process that is gone."""
+    def _lost_process(self) -> Iterator[None]:
+        """One error for what Gloo and NCCL raise where a process is gone."""
         try:
             yield
         except RuntimeError as error:
             raise ProcessLost(
                 f"process {self.rank} of {self.size} stops: another one of this training has "
-                "ended; what it said is the reason. The last checkpoint is whole, and the same "
+                "ended; its message is the reason. The last checkpoint is whole, and the same "
                 "command goes on from it."
             ) from error
 
 
 @contextmanager
-def joined(device: str) -> Iterator[ProcessGroup]:
+def process_group(device: str) -> Iterator[ProcessGroup]:
     """All processes that torchrun started, by NCCL on GPUs and Gloo on CPUs; else this one alone.
 
     Raises:
-        InputError: CUDA asked for where there is none, or more processes than GPUs.
-        RankLost: the processes do not find each other.
+        InputError: CUDA is requested where there is none, or more processes than GPUs.
+        ProcessLost: the processes do not find each other.
     """
     chosen = choose_device(device)
     size = int(os.environ["WORLD_SIZE"]) if "TORCHELASTIC_RUN_ID" in os.environ else 1
@@ -147,11 +147,11 @@ def joined(device: str) -> Iterator[ProcessGroup]:
         raise ProcessLost(
             f"the processes of this training do not find each other: {error}"
         ) from error
-    ranks = ProcessGroup(chosen, distributed.get_rank(), size, on_machine)
+    group = ProcessGroup(chosen, distributed.get_rank(), size, on_machine)
     try:
-        yield ranks
+        yield group
     except BaseException:
-        with suppress(ProcessLost):  # what ended this process is to be told, not what follows
-            ranks.leave()
+        with suppress(ProcessLost):  # the first error counts, not what follows from it
+            group.close()
         raise
-    ranks.leave()
+    group.close()

@@ -1,11 +1,15 @@
-"""Model folders: weights.safetensors and a manifest with all that the weights depend on."""
+"""Folders of models and of pretrained weights: weights.safetensors and a manifest with all that
+the weights depend on."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from safetensors import SafetensorError
 from safetensors.torch import load, save
+from torch import Tensor, nn
 
 from tumortrack.core import store
 from tumortrack.core.config import from_builtins, to_builtins
@@ -20,8 +24,11 @@ from tumortrack.models.folder import KIND, WEIGHTS, read_model_manifest
 from tumortrack.models.hardware import choose_device
 from tumortrack.models.in_distribution import InDistributionRange
 from tumortrack.models.model import Model
+from tumortrack.models.normalisation import Aligned
 from tumortrack.occupancy.model import OccupancyModel
 from tumortrack.registration.model import RegistrationModel
+
+PRETRAINED = "pretrained"  # kind of a folder
 
 _KINDS: dict[type, type[Model]] = {
     MlpDecoderConfig: OccupancyModel,
@@ -36,14 +43,13 @@ def model_class(config: NetworkConfig) -> type[Model]:
 
 def save_model(model: Model, folder: Path) -> None:
     """Write weights and manifest into an existing folder, the manifest last."""
-    weights = {k: v.contiguous() for k, v in model.network.state_dict().items()}
-    for name, data in {WEIGHTS: save(weights), **model.extra_files()}.items():
+    for name, data in {WEIGHTS: _weights(model.network), **model.extra_files()}.items():
         store.write_atomically(folder / name, data)
     content = {
         "parts": list(model.parts),
         **model.extra_entries(),
         "query_box_mm": model.query_box_mm.tolist(),
-        "familiar": to_builtins(model.familiar),
+        "familiar": to_builtins(model.in_distribution),
         "provenance": model.provenance,
         "config": to_builtins(model.config),
     }
@@ -55,7 +61,7 @@ def load_model(folder: Path, device: str = "auto") -> Model:
 
     Raises:
         ArtifactError: missing, of another schema, damaged, or weights changed since training.
-        InputError: CUDA asked for where there is none.
+        InputError: CUDA is requested where there is none.
     """
     manifest = read_model_manifest(folder)
     where = choose_device(device)
@@ -71,7 +77,7 @@ def load_model(folder: Path, device: str = "auto") -> Model:
             config=config,
             parts=tuple(manifest["parts"]),
             query_box_mm=np.array(manifest["query_box_mm"], float).reshape(2, 3),
-            familiar=from_builtins(
+            in_distribution=from_builtins(
                 manifest["familiar"], InDistributionRange, f"{folder}: familiar"
             ),
             provenance=dict(manifest["provenance"]),
@@ -84,3 +90,63 @@ def load_model(folder: Path, device: str = "auto") -> Model:
         raise ArtifactError(
             f"{folder} is not a whole model of this version: {error}. Train it again."
         ) from error
+
+
+def _weights(network: nn.Module) -> bytes:
+    return save({k: v.detach().cpu().contiguous() for k, v in network.state_dict().items()})
+
+
+@dataclass(frozen=True, eq=False)
+class PretrainedWeights:
+    """Weights of a network for organs in general; ``sha256`` names them."""
+
+    sha256: str
+    config: NetworkConfig
+    weights: dict[str, Tensor]
+
+    def check(self, network: NetworkConfig) -> None:
+        """Refuse a network that these weights do not fit.
+
+        Raises:
+            InputError: another kind of network, or other sizes.
+        """
+        if not isinstance(network.decoder, RegistrationHeadConfig):
+            raise InputError("--start is for the preset clinic; quick and paper have none.")
+        if _shared(self.config) != _shared(network):
+            raise InputError(
+                "--start: these weights are of another network than the preset's (encoder, width "
+                "or reach differ). Pretrain again with this version: tumortrack pretrain OUT."
+            )
+
+
+def _shared(config: NetworkConfig) -> tuple:
+    """What must be the same for weights to fit; modes, points and size are the patient's."""
+    normalisation = config.normalisation
+    reach = normalisation.reach if isinstance(normalisation, Aligned) else None
+    return config.encoder, getattr(config.decoder, "width", None), reach
+
+
+def save_start(network: nn.Module, config: NetworkConfig, provenance: dict, folder: Path) -> None:
+    """Write weights and manifest into an existing folder, the manifest last."""
+    store.write_atomically(folder / WEIGHTS, _weights(network))
+    content = {"provenance": provenance, "config": to_builtins(config)}
+    store.seal(folder, PRETRAINED, content, frame="camera")
+
+
+def load_start(folder: Path) -> PretrainedWeights:
+    """Read a folder that `pretrain` wrote.
+
+    Raises:
+        ArtifactError: missing, another kind, damaged, or not of this version.
+    """
+    manifest = store.read_manifest(folder, PRETRAINED)
+    try:
+        config = from_builtins(manifest["config"], NetworkConfig, f"{folder}: config")
+        weights = load((folder / WEIGHTS).read_bytes())
+        model_class(config).new_network(config).load_state_dict(weights)
+    except (InputError, KeyError, RuntimeError, SafetensorError, OSError) as error:
+        raise ArtifactError(
+            f"{folder} holds no whole pretrained weights of this version: {error}. Make them "
+            "again: tumortrack pretrain OUT."
+        ) from error
+    return PretrainedWeights(store.sha256_of(folder / WEIGHTS), config, weights)

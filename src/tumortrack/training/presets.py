@@ -74,16 +74,16 @@ def quick(anatomy: Anatomy, rotations: Rotations = "limited") -> TrainConfig:
 
 
 def clinic(anatomy: Anatomy, rotations: Rotations = "limited") -> TrainConfig:
-    """The default: a warp of the organ's elastic body, learnt in minutes from scenes with faulty
-    sensors, hidden surface and background."""
+    """The default: registration of the organ's elastic body, learnt in minutes from scenes with
+    sensor errors, occlusion and background."""
     lower, upper = anatomy.organ.box_mm
     elastic = ElasticConfig()
     return _clinic(elastic, elastic.body.modes, float(np.max(upper - lower)) / 2, rotations)
 
 
 def pretraining(rotations: Rotations = "limited") -> TrainConfig:
-    """What ``clinic`` sees and learns, for many organs in their common frame: each with a small
-    elastic body that takes half a second to build."""
+    """The scenes and network of ``clinic``, for many organs in their common frame, each with a
+    small elastic body that takes half a second to build."""
     elastic = ElasticConfig(
         body=BodyConfig(cells=500, modes=24, responses=120, patches=250, states=200)
     )
@@ -167,7 +167,7 @@ def quick_network(n_classes: int, scale_mm: float) -> NetworkConfig:
 
 
 def clinic_network(modes: int, scale_mm: float) -> NetworkConfig:
-    """Height map to warp: learns in minutes, runs in milliseconds (docs/results.md has the
+    """Height map to registration: learns in minutes, runs in milliseconds (docs/results.md has the
     comparison with the other encoders and decoders). ``modes``: of the organ's body."""
     return NetworkConfig(
         encoder=HeightMapConfig(),

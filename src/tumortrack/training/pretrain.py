@@ -1,16 +1,12 @@
-"""One network taught on many random kidneys: a start for every patient's own training.
+"""One network trained on many random kidneys: a start for every patient's own training.
 
 Each batch shows one kidney. Its scenes are made at true size, then turned and scaled into the
-upright frame that all organs share (``warp.generic``), so that one network learns where any organ
-lies and how it is bent.
+upright frame that all organs share (``registration.canonical_frame``), so that one network learns
+where any organ lies and how it is bent.
 """
 
 from __future__ import annotations
 
-import hashlib
-import json
-from collections.abc import Callable
-from contextlib import closing
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -18,8 +14,6 @@ from typing import Literal
 
 import numpy as np
 
-from tumortrack.core import store
-from tumortrack.core.config import identity
 from tumortrack.core.errors import InputError
 from tumortrack.core.types import Anatomy
 from tumortrack.models.config import RegistrationHeadConfig, TrainConfig
@@ -36,18 +30,12 @@ from tumortrack.simulate.dataset import Batch, SceneStream
 from tumortrack.simulate.elastic.body import ElasticBody
 from tumortrack.simulate.occupancy import FixedPoints
 from tumortrack.simulate.scene import body_for
-from tumortrack.training.checkpoint import work_folder
-from tumortrack.training.head_start import save_start
-from tumortrack.training.pace import (
-    REPORT_EVERY_S,
-    Interrupted,
-    TrainingClock,
-    TrainingStatus,
-    ctrl_c,
-    use_cores,
-)
-from tumortrack.training.scenes import batches, default_workers, network_leaves
+from tumortrack.training.model import save_start
+from tumortrack.training.run import check_settings, settings_sha256
+from tumortrack.training.scenes import Scenes, batches
+from tumortrack.training.session import divide_cores, work_folder
 from tumortrack.training.state import TrainingState
+from tumortrack.training.train import Report, run_steps
 
 
 @dataclass(frozen=True)
@@ -64,30 +52,12 @@ class Pretraining:
     minutes: None = field(default=None, init=False)  # steps alone decide
 
     def __post_init__(self) -> None:
-        for name, value, fewest in (
-            ("anatomies", self.anatomies, 1),
-            ("steps", self.steps, 1),
-            ("seed", self.seed, 0),
-            ("workers", self.workers, 0),
-        ):
-            if value is not None and value < fewest:
-                raise InputError(f"{name} is {value}; it must be at least {fewest}.")
-        if not 0 <= self.checkpoint_every_s < float("inf"):
-            raise InputError(
-                f"--checkpoint-every is {self.checkpoint_every_s}; give seconds, 0 or more."
-            )
+        check_settings(self, anatomies=1, steps=1, seed=0, workers=0)
 
     @property
     def identity(self) -> str:
         """sha256 of all that decides the weights."""
-        content = {
-            "config": identity(self.config),
-            "anatomies": self.anatomies,
-            "steps": self.steps,
-            "seed": self.seed,
-            "schema": store.SCHEMA,
-        }
-        return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+        return settings_sha256(self, anatomies=self.anatomies)
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,47 +129,27 @@ def kidney_stream(run: Pretraining) -> KidneyStream:
     return KidneyStream(tuple(organs))
 
 
-def pretrain(run: Pretraining, folder: Path, report: Callable[[TrainingStatus], None]) -> dict:
+def pretrain(run: Pretraining, folder: Path, report: Report) -> dict:
     """Train until the end, resuming what lies in ``folder``; leaves a folder of weights, and
     returns its provenance.
 
     Raises: as ``train``.
     """
     with work_folder(folder) as work:
-        return _pretrain(run, folder, work, report)
-
-
-def _pretrain(
-    run: Pretraining, folder: Path, work: Path, report: Callable[[TrainingStatus], None]
-) -> dict:
-    device = choose_device(run.device)
-    workers = default_workers() if run.workers is None else run.workers
-    use_cores(device, network_leaves(workers))
-    state = TrainingState(run, device)
-    state.know(initialize_canonical)
-    state.resume(work)
-    progress, clock = state.progress, TrainingClock(state.progress)
-    steps = range(progress.step, run.steps)
-    source = closing(batches(kidney_stream(run), steps, 0, workers, device))
-    with ctrl_c() as stopped, source as loaded:
-        for batch in loaded:
-            loss = state.step(batch)
-            progress.elapsed_s = clock.elapsed()
-            done, stop = progress.step == run.steps, stopped()
-            if done or stop or clock.due("checkpoint", run.checkpoint_every_s):
-                state.save(work)
-            if done or clock.due("report", REPORT_EVERY_S):
-                rate = clock.rate(progress)
-                left, speed = (run.steps - progress.step) / rate, rate * run.config.batch_size
-                report(TrainingStatus(progress.step, run.steps, left, speed, loss, None))
-            if stop and not done:
-                raise Interrupted.at(progress.step, folder)
-    about = {
-        "seed": run.seed,
-        "anatomies": run.anatomies,
-        "steps": progress.step,
-        "training_s": round(progress.elapsed_s, 1),
-        "run_sha256": run.identity,
-    }
-    save_start(state.average, run.config.network, about, folder)
-    return about
+        device = choose_device(run.device)
+        workers = divide_cores(device, run.workers)
+        state = TrainingState(run, device)
+        state.initialize(initialize_canonical)
+        state.resume(work)
+        steps = range(state.progress.step, run.steps)
+        made = batches(kidney_stream(run), steps, 0, workers, device)
+        run_steps(state, Scenes(made, f"{workers} processes"), work, report)
+        about = {
+            "seed": run.seed,
+            "anatomies": run.anatomies,
+            "steps": state.progress.step,
+            "training_s": round(state.progress.elapsed_s, 1),
+            "run_sha256": run.identity,
+        }
+        save_start(state.average, run.config.network, about, folder)
+        return about

@@ -1,4 +1,4 @@
-"""Teaching a warp network: correspondences are shown, the refined motion is judged."""
+"""Training a registration network: it learns correspondences; the refined motion is validated."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ from tumortrack.simulate.occupancy import FixedPoints, organ_pool
 from tumortrack.simulate.scene import Simulator, body_for
 from tumortrack.simulate.targets import draw_targets
 from tumortrack.training.run import TrainingRun
-from tumortrack.training.validate import ValidationScenes, mean_iou_of, validation_scenes
+from tumortrack.training.task import ValidationScenes, mean_iou_of, validation_scenes
 
 _USUAL = 90  # per cent of the validation scenes have no more than the usual cost
 _COVERED = 0.683  # of all errors lie within this radius if each axis errs normally by 1
 _RADIUS = 1.878
-_AT_SURFACE = 0.5  # of the points whose places are learnt; the others lie inside the parts
+_AT_SURFACE = 0.5  # of the points whose positions are learnt; the others lie inside the parts
 
 
 class RegistrationTask:
@@ -53,7 +53,7 @@ class RegistrationTask:
         simulator = Simulator(run.anatomy_ct, run.up_lps, run.config.scene, self.body)
         return validation_scenes(simulator, pool, run.config, run.seed)
 
-    def teach(self, network: RegistrationNetwork) -> None:
+    def initialize(self, network: RegistrationNetwork) -> None:
         run, shape = self._run, self._shape
         network.initialize(shape, run.up_lps, self.points.points_ct)
         if run.start is not None:
@@ -63,25 +63,25 @@ class RegistrationTask:
             carry_over(network, run.start.weights, upright)
 
     def miou(self, network: RegistrationNetwork) -> float:
-        return self._judged([fit for _, fit in self._fits(network)]).miou
+        return self._summary([fit for _, fit in self._fits(network)]).miou
 
     def model(self, network: RegistrationNetwork, provenance: dict) -> RegistrationModel:
         fits = self._fits(network)
         usual_cost = float(np.percentile([fit.cost for _, fit in fits], _USUAL))
-        judged = self._judged(self._repaired(network, fits, usual_cost))
+        summary = self._summary(self._repaired(network, fits, usual_cost))
         return RegistrationModel(
             network=network,
             config=self._run.config,
             parts=self._run.anatomy_ct.names,
             query_box_mm=self._scenes.query_box_mm,
-            familiar=judged.familiar,
-            provenance={**provenance, "validation_tre_mm": round(judged.tre_mm, 3)},
+            in_distribution=summary.in_distribution,
+            provenance={**provenance, "validation_tre_mm": round(summary.tre_mm, 3)},
             shape=self._shape,
-            calibration=UncertaintyCalibration(std_scale=judged.std_scale, usual_cost=usual_cost),
+            calibration=UncertaintyCalibration(std_scale=summary.std_scale, usual_cost=usual_cost),
         )
 
     def _fits(self, network: RegistrationNetwork) -> list[tuple[ElasticMotion, RegistrationResult]]:
-        """The likeliest start and the best fit in each validation scene; of the same weights once,
+        """The likeliest start and the best fit in each validation scene; kept for the same weights,
         since the last ones are mostly the best."""
         weights = b"".join(w.numpy(force=True).tobytes() for w in network.state_dict().values())
         if self._last is None or self._last[0] != weights:
@@ -102,15 +102,15 @@ class RegistrationTask:
         fits: list[tuple[ElasticMotion, RegistrationResult]],
         usual_cost: float,
     ) -> list[RegistrationResult]:
-        """The fits as the model will make them, which knows the usual cost."""
+        """The fits as the model will make them, knowing the usual cost."""
         repaired = self._registration(network).repaired
         return [
             repaired(cloud, start, fit) if fit.cost > usual_cost else fit
             for cloud, (start, fit) in zip(self._scenes.clouds_mm, fits, strict=True)
         ]
 
-    def _judged(self, fits: list[RegistrationResult]) -> ValidationSummary:
-        """Labels, places and trust over all validation scenes."""
+    def _summary(self, fits: list[RegistrationResult]) -> ValidationSummary:
+        """Labels, positions and calibration over all validation scenes."""
         scenes, shape = self._scenes, self._shape
         guesses, errors, deviations = [], [], []
         for fit, points_mm, points_ct, labels in zip(
@@ -123,7 +123,7 @@ class RegistrationTask:
             deviations.append(deviation)
         spreads = [spread_mm(cloud) for cloud in scenes.clouds_mm]
         off = [fit_mm(np.abs(fit.distances_mm)) for fit in fits]
-        familiar = InDistributionRange(
+        in_distribution = InDistributionRange(
             spread_mm=(min(spreads), max(spreads)), fit_mm=float(np.percentile(off, 95))
         )
         ratios = np.concatenate(errors) / np.concatenate(deviations)
@@ -131,19 +131,19 @@ class RegistrationTask:
             mean_iou_of(np.stack(guesses), scenes.labels, len(shape.anatomy_ct.parts) + 1),
             float(np.median([part.mean() for part in errors])),
             float(np.quantile(ratios, _COVERED)) / _RADIUS,
-            familiar,
+            in_distribution,
         )
 
 
 @dataclass(frozen=True)
 class ValidationSummary:
-    """What validation says: labels, the median scene's error of places, how the estimated
-    standard deviations have to be scaled, and what clouds are like."""
+    """IoU of labels, the median scene's target registration error, the factor by which estimated
+    standard deviations are to be scaled, and what the clouds are like."""
 
     miou: float
     tre_mm: float
     std_scale: float
-    familiar: InDistributionRange
+    in_distribution: InDistributionRange
 
 
 def _errors(

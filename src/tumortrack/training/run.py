@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import math
 from dataclasses import dataclass
 from typing import Literal
 
@@ -15,8 +14,8 @@ from tumortrack.core.config import identity
 from tumortrack.core.errors import InputError
 from tumortrack.core.types import Anatomy
 from tumortrack.models.config import TrainConfig
-from tumortrack.training.checkpoint import TrainingProgress
-from tumortrack.training.head_start import HeadStart
+from tumortrack.training.model import PretrainedWeights
+from tumortrack.training.state import RunSettings, TrainingProgress
 
 
 @dataclass(frozen=True)
@@ -33,43 +32,48 @@ class TrainingRun:
     device: Literal["auto", "cpu", "cuda"] = "auto"
     workers: int | None = None  # processes that make scenes; None: as the machine allows
     checkpoint_every_s: float = 30.0
-    start: HeadStart | None = None  # pretrained weights, for warps
+    start: PretrainedWeights | None = None  # of a registration network
     scenes: Literal["auto", "workers", "device"] = "auto"  # who makes them; see ``training.scenes``
 
     def __post_init__(self) -> None:
-        for name, value, fewest in (
-            ("seed", self.seed, 0),
-            ("steps", self.steps, 1),
-            ("workers", self.workers, 0),
-        ):
-            if value is not None and value < fewest:
-                raise InputError(f"{name} is {value}; it must be at least {fewest}.")
+        check_settings(self, seed=0, steps=1, workers=0)
         if self.minutes is not None and not 0 < self.minutes < float("inf"):
             raise InputError(f"minutes is {self.minutes}; it must be positive.")
-        if not 0 <= self.checkpoint_every_s < float("inf"):
-            raise InputError(
-                f"--checkpoint-every is {self.checkpoint_every_s}; give seconds, 0 or more."
-            )
         if self.start is not None:
             self.start.check(self.config.network)
 
     @property
     def identity(self) -> str:
-        return run_identity(self)
+        """sha256 of all that decides the weights, so that a resumed run is the same run."""
+        start = {} if self.start is None else {"start": self.start.sha256}
+        return settings_sha256(self, case=self.case_sha256, minutes=self.minutes, **start)
 
 
 def run_identity(run: TrainingRun) -> str:
-    """sha256 of all that decides the weights, so that a resumed run is the same run."""
-    content = {
-        "case": run.case_sha256,
-        "config": identity(run.config),
-        "seed": run.seed,
-        "steps": run.steps,
-        "minutes": run.minutes,
-        "schema": store.SCHEMA,
-    }
-    if run.start is not None:
-        content["start"] = run.start.sha256
+    """``run.identity``."""
+    return run.identity
+
+
+def check_settings(run: RunSettings, **smallest: int) -> None:
+    """Refuse numbers smaller than these, and impossible times between checkpoints.
+
+    Raises:
+        InputError: one of them is out of range.
+    """
+    for name, least in smallest.items():
+        value = getattr(run, name)
+        if value is not None and value < least:
+            raise InputError(f"{name} is {value}; it must be at least {least}.")
+    if not 0 <= run.checkpoint_every_s < float("inf"):
+        raise InputError(
+            f"--checkpoint-every is {run.checkpoint_every_s}; give seconds, 0 or more."
+        )
+
+
+def settings_sha256(run: RunSettings, **more: object) -> str:
+    """sha256 of the configuration, the seed, the number of steps, and of ``more``."""
+    content = {"config": identity(run.config), "seed": run.seed, "steps": run.steps, **more}
+    content["schema"] = store.SCHEMA
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
 
@@ -81,34 +85,17 @@ def provenance(run: TrainingRun, progress: TrainingProgress, device: torch.devic
         "validation_miou": round(progress.best_miou, 4),
         "device": torch.cuda.get_device_name(device) if device.type == "cuda" else "cpu",
         "threads": torch.get_num_threads(),
-        "run_sha256": run_identity(run),
+        "run_sha256": run.identity,
         "case_sha256": run.case_sha256,
         "up_lps": list(run.up_lps),
     }
     return about if run.start is None else {**about, "start_sha256": run.start.sha256}
 
 
-_FLOOR = 0.01  # of the peak rate, at the end of the tail
-
-
-def learning_rate(config: TrainConfig, progress: TrainingProgress) -> float:
-    """The learning rate of the step that comes next."""
-    schedule, step = config.schedule, progress.step
-    peak = schedule.learning_rate
-    if schedule.kind == "exponential":
-        return peak * schedule.gamma ** (step * config.batch_size // schedule.epoch_pairs)
-    warm = min(1.0, (step + 1) / schedule.warmup_steps)
-    if progress.end is None:
-        return peak * warm
-    begin = progress.end * (1 - schedule.tail)
-    through = min(max((step - begin) / max(progress.end - begin, 1), 0.0), 1.0)
-    return peak * warm * (_FLOOR + (1 - _FLOOR) * (1 + math.cos(math.pi * through)) / 2)
-
-
 def settle_end(config: TrainConfig, progress: TrainingProgress, minutes: float | None) -> bool:
-    """With a limit in minutes: when the tail's time has come, fix the step that the run will end
-    at, from its pace so far; True when that happened now. From then on the schedule depends on
-    steps alone, so that a resumed run repeats it."""
+    """With a limit in minutes: fix the last step, from the pace so far, once the schedule's tail
+    has to begin; True when that happened now. From then on the schedule depends on steps alone, so
+    that a resumed run repeats it."""
     if progress.end is not None or minutes is None:
         return False
     head = 1 - config.schedule.tail

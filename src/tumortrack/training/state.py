@@ -1,35 +1,49 @@
-"""All that changes while training: weights, their average, the optimizer, the best so far."""
+"""All that changes while training: weights, their average, the optimizer, the best so far; and the
+checkpoint that holds it.
+
+A checkpoint is one file, written atomically: kill -9 loses the steps since the last one.
+"""
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Callable
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save
 from torch import Tensor
 
-from tumortrack.core.errors import TumortrackError
+from tumortrack.core.errors import ArtifactError, TumortrackError
+from tumortrack.core.store import write_atomically
 from tumortrack.models.config import TrainConfig
 from tumortrack.models.hardware import has_fast_bfloat16
 from tumortrack.models.model import Network
-from tumortrack.training.checkpoint import (
-    TrainingProgress,
-    load_checkpoint,
-    optimizer_tensors,
-    restore_optimizer,
-    save_checkpoint,
-)
 from tumortrack.training.distributed import ProcessGroup
 from tumortrack.training.model import model_class
-from tumortrack.training.run import learning_rate
 from tumortrack.training.scenes import Tensors
+
+_FILE = "checkpoint.safetensors"
+_FLOOR = 0.01  # of the peak learning rate, at the end of the tail
+
+
+@dataclass
+class TrainingProgress:
+    """Where a run stands. ``end`` is the step it will stop at; None while minutes decide."""
+
+    step: int = 0
+    elapsed_s: float = 0.0
+    end: int | None = None
+    best_miou: float = -1.0
 
 
 class Diverged(TumortrackError):
-    """The loss or a weight is no number any more; the last checkpoint is from before."""
+    """The loss or a weight is not finite any more; the last checkpoint is from before."""
 
     def __init__(self, step: int) -> None:
         super().__init__(
@@ -38,8 +52,9 @@ class Diverged(TumortrackError):
         )
 
 
+@runtime_checkable
 class RunSettings(Protocol):
-    """What the state has to know of a run."""
+    """What training needs to know of a run."""
 
     @property
     def config(self) -> TrainConfig: ...
@@ -50,6 +65,8 @@ class RunSettings(Protocol):
     @property
     def minutes(self) -> float | None: ...
     @property
+    def checkpoint_every_s(self) -> float: ...
+    @property
     def identity(self) -> str:
         """sha256 of all that decides the weights."""
         ...
@@ -59,10 +76,10 @@ class TrainingState:
     """All that changes while training, and nothing else."""
 
     def __init__(
-        self, run: RunSettings, device: torch.device, ranks: ProcessGroup | None = None
+        self, run: RunSettings, device: torch.device, group: ProcessGroup | None = None
     ) -> None:
-        self._run, self._device = run, device
-        self._ranks = ranks or ProcessGroup(device)
+        self.run, self._device = run, device
+        self.group = group or ProcessGroup(device)
         self._bf16 = has_fast_bfloat16(device)
         config = run.config
         torch.manual_seed(run.seed)
@@ -81,47 +98,85 @@ class TrainingState:
         self._best: dict[str, Tensor] = {}
         self.learning_rate = 0.0  # of the last step
 
-    def know(self, teach: Callable[[Any], None]) -> None:
+    def initialize(self, initialize: Callable[[Any], None]) -> None:
         """Give both networks what does not have to be learnt."""
-        teach(self.network)
-        teach(self.average)
+        initialize(self.network)
+        initialize(self.average)
 
     def resume(self, work: Path) -> None:
-        """Take up the last checkpoint, if there is one."""
-        found = load_checkpoint(work, self._run.identity)
-        if found is None:
+        """Restore the last checkpoint, if there is one.
+
+        Raises:
+            ArtifactError: it is damaged, or belongs to a run with another case, configuration or
+                seed.
+        """
+        path = work / _FILE
+        if not path.exists():
             return
-        self.progress, groups = found
+        groups: dict[str, dict[str, Tensor]] = {}
+        try:
+            with safe_open(path, framework="pt") as file:
+                metadata = file.metadata() or {}
+                progress = TrainingProgress(**json.loads(metadata["progress"]))
+                for key in file.keys():  # noqa: SIM118 - safe_open is no dict
+                    group, name = key.split("/", 1)
+                    groups.setdefault(group, {})[name] = file.get_tensor(key)
+        except (SafetensorError, KeyError, TypeError, ValueError, OSError) as error:
+            raise ArtifactError(
+                f"{path} is damaged: {error}. Remove {work.parent} and train again."
+            ) from error
+        if metadata.get("identity") != self.run.identity:
+            raise ArtifactError(
+                f"{work.parent} holds a run with another case, preset, seed or option. Give the "
+                "same command to resume it, or another MODEL folder to start a new one."
+            )
+        self.progress = progress
         self.network.load_state_dict(groups["network"])
         self.average.load_state_dict(groups["average"])
-        restore_optimizer(self.optimizer, groups["optimizer"])
+        moments: dict[int, dict[str, Tensor]] = {}
+        for key, value in groups["optimizer"].items():
+            index, name = key.split(".", 1)
+            moments.setdefault(int(index), {})[name] = value
+        self.optimizer.load_state_dict({**self.optimizer.state_dict(), "state": moments})
         self._best = groups.get("best", {})
 
     def save(self, work: Path) -> None:
         """Write the checkpoint.
 
         Raises:
-            Diverged: a weight is no number; the checkpoint before stays.
+            Diverged: a weight is not finite; the checkpoint before stays.
             StorageError: the disk is full; the checkpoint before stays.
         """
         if not all(bool(p.isfinite().all()) for p in self.network.parameters()):
             raise Diverged(self.progress.step)
+        moments = self.optimizer.state_dict()["state"]  # Adam's, and step counts, by parameter
         groups = {
             "network": self.network.state_dict(),
             "average": self.average.state_dict(),
-            "optimizer": optimizer_tensors(self.optimizer),
+            "optimizer": {
+                f"{index}.{name}": value
+                for index, state in moments.items()
+                for name, value in state.items()
+            },
             "best": self._best,
         }
-        save_checkpoint(work, self.progress, groups, self._run.identity)
+        tensors = {
+            f"{group}/{name}": tensor.detach().cpu().contiguous()
+            for group, members in groups.items()
+            for name, tensor in members.items()
+        }
+        progress = json.dumps(asdict(self.progress))
+        metadata = {"progress": progress, "identity": self.run.identity}
+        write_atomically(work / _FILE, save(tensors, metadata))
 
     def step(self, batch: Tensors) -> float:
-        """One optimizer step on this process's share of the batch; returns the whole one's loss.
+        """One optimizer step on this process's part of the batch; returns the whole batch's loss.
 
         Raises:
-            Diverged: the loss is no number; the weights are as they were.
-            RankLost: another process of this training has ended.
+            Diverged: the loss is not finite; the weights are as they were.
+            ProcessLost: another process of this training has ended.
         """
-        config, progress = self._run.config, self.progress
+        config, progress = self.run.config, self.progress
         clouds, points, labels, poses = (part.to(self._device, non_blocking=True) for part in batch)
         clouds = clouds[:, : self.points_kept(clouds.shape[1])]
         self.learning_rate = learning_rate(config, progress)
@@ -129,36 +184,38 @@ class TrainingState:
             group["lr"] = self.learning_rate
         self.network.train()
         with torch.autocast(self._device.type, torch.bfloat16, enabled=self._bf16):
-            first = self._ranks.rank * len(clouds)  # in the whole batch
+            first = self.group.rank * len(clouds)  # in the whole batch
             loss = self.network.loss(clouds, points, labels, poses, first=first)
         self.optimizer.zero_grad(set_to_none=True)
         loss.backward()
-        value = float(self._ranks.mean(self.network.parameters(), loss.detach()))
+        value = float(self.group.mean(self.network.parameters(), loss.detach()))
         if not math.isfinite(value):
             raise Diverged(progress.step)
         self.optimizer.step()
-        self._follow()
+        self._update_average()
         progress.step += 1
         return value
 
     def points_kept(self, n_points: int) -> int:
         """How many of a batch's points this step sees: those that the encoder takes, less a
-        random share. Clouds are in random order, so that the first ones are a random draw."""
-        config = self._run.config
-        rng = np.random.default_rng([self._run.seed, 0xD20, self.progress.step])
-        share = rng.uniform(0, config.drop_points)
+        random fraction. Clouds are in random order, so that the first ones are a random draw."""
+        config = self.run.config
+        rng = np.random.default_rng([self.run.seed, 0xD20, self.progress.step])
+        dropped = rng.uniform(0, config.drop_points)
         encoded = min(n_points, config.network.encoder.n_points or n_points)
-        return max(round(encoded * (1 - share)), 64)
+        return max(round(encoded * (1 - dropped)), 64)
 
     @torch.no_grad()
-    def _follow(self) -> None:
+    def _update_average(self) -> None:
         """Exponential moving average of weights and running statistics; short memory at first."""
-        decay = min(self._run.config.ema, (1 + self.progress.step) / (10 + self.progress.step))
+        decay = min(self.run.config.ema, (1 + self.progress.step) / (10 + self.progress.step))
         pairs = zip(
             self.average.state_dict().values(), self.network.state_dict().values(), strict=True
         )
-        floats = [(mine, theirs) for mine, theirs in pairs if mine.is_floating_point()]
-        torch._foreach_lerp_([m for m, _ in floats], [t for _, t in floats], 1 - decay)
+        averages, weights = zip(
+            *(pair for pair in pairs if pair[0].is_floating_point()), strict=True
+        )
+        torch._foreach_lerp_(averages, weights, 1 - decay)
 
     def keep_if_best(self, miou: float) -> None:
         if miou > self.progress.best_miou:
@@ -169,3 +226,17 @@ class TrainingState:
         """The averaged weights of the best validation."""
         self.average.load_state_dict(self._best)
         return self.average
+
+
+def learning_rate(config: TrainConfig, progress: TrainingProgress) -> float:
+    """The learning rate of the step that comes next."""
+    schedule, step = config.schedule, progress.step
+    peak = schedule.learning_rate
+    if schedule.kind == "exponential":
+        return peak * schedule.gamma ** (step * config.batch_size // schedule.epoch_pairs)
+    warm = min(1.0, (step + 1) / schedule.warmup_steps)
+    if progress.end is None:
+        return peak * warm
+    begin = progress.end * (1 - schedule.tail)
+    through = min(max((step - begin) / max(progress.end - begin, 1), 0.0), 1.0)
+    return peak * warm * (_FLOOR + (1 - _FLOOR) * (1 + math.cos(math.pi * through)) / 2)

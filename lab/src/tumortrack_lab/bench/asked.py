@@ -155,9 +155,8 @@ class OccupancyWorkload:
     def our_frame(self, queries: np.ndarray) -> tuple[np.ndarray, int]:
         """Labels as `locate` finds them, and how many places were asked for: logits on a lattice
         over the queries' box, linear between its points where that is plain, else asked."""
-        from tumortrack.occupancy.lattice import organ_lattice
         from tumortrack.occupancy.locator import steps_over
-        from tumortrack.occupancy.sparse import sparse_logits
+        from tumortrack.occupancy.sparse import organ_lattice, sparse_logits
 
         latent, asked = self.inference.encode(self.points_mm), 0
 

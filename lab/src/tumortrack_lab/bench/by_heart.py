@@ -85,7 +85,7 @@ def learn_scene(
             config=config,
             parts=anatomy.names,
             query_box_mm=box,
-            familiar=every,
+            in_distribution=every,
             provenance=about,
         ),
         folder,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 from rich.console import Console
 
@@ -15,9 +16,28 @@ _WIDE = 150  # characters of a table that goes to a file
 _WORKER = [sys.executable, "-m", "tumortrack_lab.cli.bench"]
 
 
-@dataclass(frozen=True)
-class BenchOptions:
-    only: tuple[str, ...] = ()
+@dataclass(frozen=True, kw_only=True)
+class Bench:
+    """Measure the speed of every part on this machine, each beside its naive form, in turns.
+
+    Attributes:
+        only: which parts; default: all.
+        quick: shorter measurements, about a minute in all once there are models.
+        curves: also how time and memory grow with queries, points, tumors, voxels and batch.
+        model: folder that `train` wrote, to be measured instead of the one that the bench trains
+            (kept in runs/bench).
+        cloud: of that model's organ, freed of its background; .ply, .pcd or .npz in mm.
+        out: JSON file to write; curves lie beside it.
+        document: Markdown file whose marked blocks are to be filled, such as docs/performance.md.
+    """
+
+    only: tuple[
+        Literal[
+            "generator", "elastic-generator", "encoder", "decoder", "frame", "tracking", "volume",
+            "command", "planning", "gpu", "training", "whole-training",
+        ],
+        ...,
+    ] = ()  # fmt: skip
     quick: bool = False
     curves: bool = False
     model: Path | None = None
@@ -25,45 +45,46 @@ class BenchOptions:
     out: Path = Path("runs/bench.json")
     document: Path | None = None
 
+    def run(self) -> None:
+        """Measure, show, write.
 
-def bench(options: BenchOptions) -> None:
-    """Measure, show, write.
+        Raises:
+            InputError: a model without a cloud or the other way, a document without its markers.
+        """
+        from tumortrack.cli.console import console, say
+        from tumortrack_lab.bench.plan import CURVES, Wish, measure
+        from tumortrack_lab.bench.report import check_document, write_bench
+        from tumortrack_lab.bench.suite import GROUPS
+        from tumortrack_lab.bench.tables import line, rich_table
 
-    Raises:
-        InputError: a model without a cloud or the other way, a document without its markers.
-    """
-    from tumortrack.cli.console import console, say
-    from tumortrack_lab.bench.plan import CURVES, Wish, measure
-    from tumortrack_lab.bench.report import check_document, write_bench
-    from tumortrack_lab.bench.suite import GROUPS
-    from tumortrack_lab.bench.tables import line, rich_table
+        if (self.model is None) != (self.cloud is None):
+            raise InputError(
+                "--model and --cloud belong together: a model, and a cloud of its organ."
+            )
+        if self.document is not None:
+            check_document(self.document)
+        wish = Wish(
+            groups=self.only or tuple(GROUPS),
+            curves=tuple(CURVES) if self.curves else (),
+            quick=self.quick,
+            folder=TRAINED,
+            model=self.model,
+            cloud=self.cloud,
+        )
+        with console.status("starting ...") as status:
+            report = status.update if console.is_terminal else say
+            command = self._command()
+            found = measure(wish, _WORKER, command, report, lambda row: say(line(row)))
+        shown = console if console.is_terminal else Console(width=_WIDE)
+        shown.print(rich_table(found))
+        for path in write_bench(found, self.out, self.document):
+            say(f"written to {path}")
 
-    if (options.model is None) != (options.cloud is None):
-        raise InputError("--model and --cloud belong together: a model, and a cloud of its organ.")
-    if options.document is not None:
-        check_document(options.document)
-    wish = Wish(
-        groups=options.only or tuple(GROUPS),
-        curves=tuple(CURVES) if options.curves else (),
-        quick=options.quick,
-        folder=TRAINED,
-        model=options.model,
-        cloud=options.cloud,
-    )
-    with console.status("starting ...") as status:
-        told = status.update if console.is_terminal else say
-        found = measure(wish, _WORKER, _command(options), told, lambda row: say(line(row)))
-    shown = console if console.is_terminal else Console(width=_WIDE)
-    shown.print(rich_table(found))
-    for path in write_bench(found, options.out, options.document):
-        say(f"written to {path}")
-
-
-def _command(options: BenchOptions) -> str:
-    words = ["tumortrack bench"]
-    words += ["--only", *options.only] if options.only else []
-    words += [f"--{name}" for name in ("quick", "curves") if getattr(options, name)]
-    return " ".join(words)
+    def _command(self) -> str:
+        words = ["tumortrack bench"]
+        words += ["--only", *self.only] if self.only else []
+        words += [f"--{name}" for name in ("quick", "curves") if getattr(self, name)]
+        return " ".join(words)
 
 
 def _work(task_json: str) -> None:

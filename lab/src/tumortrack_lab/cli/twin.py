@@ -4,55 +4,77 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
-from rich.progress import (
-    BarColumn,
-    Progress,
-    TaskProgressColumn,
-    TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
-)
+from tyro.conf import Positional
 
 from tumortrack.cli.console import console, say
 
 if TYPE_CHECKING:
-    from tumortrack_lab.twin.views import View
+    from tumortrack_lab.twin.dataset import TwinStatus
 
 _EVERY_S = 15.0  # between lines where there is no terminal
 
 
-def write_twin(
-    case: Path, scenes: Path, seed: int, variants: Sequence[str], views: Sequence[View]
-) -> None:
-    """Make what is missing of these variants and views; empty means all.
+@dataclass(frozen=True, kw_only=True)
+class Twin:
+    """Squeeze, turn, sink and poke a case by finite elements, and write the scenes with truth.
 
-    Raises:
-        InputError: no case, unknown names, or scenes made from something else.
+    Attributes:
+        case: folder that `prepare` wrote.
+        scenes: folder to write: what `evaluate` reads. The same command resumes.
+        seed: of noise, instruments, background and target points.
+        states: which of them; default: all.
+        views: which of them; default: all.
     """
-    from tumortrack_lab.twin.dataset import TwinRun, TwinStatus, make_scenes
-    from tumortrack_lab.twin.views import VARIANTS, VIEWS
 
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        TaskProgressColumn(),
-        TimeElapsedColumn(),
-        TimeRemainingColumn(),
-    )
-    with Progress(*columns, console=console, transient=True) as progress:
-        task = progress.add_task("twin", total=1.0)
-        said = -_EVERY_S
+    case: Positional[Path]
+    scenes: Positional[Path]
+    seed: int = 0
+    states: tuple[
+        Literal["D0", "D1", "D2", "D3", "Rot90", "Rot180", "Rot270", "G1", "P1"], ...
+    ] = ()
+    views: tuple[Literal["clean", "noise", "shaft", "clutter"], ...] = ()
 
-        def show(status: TwinStatus) -> None:
-            nonlocal said
-            progress.update(task, completed=status.share, description=status.text)
-            if not console.is_terminal and time.monotonic() - said >= _EVERY_S:
-                say(f"{status.share:.0%} {status.text}")
-                said = time.monotonic()
+    def run(self) -> None:
+        """Make what is missing of these states and views; empty means all.
 
-        run = TwinRun(case, seed=seed)
-        made = make_scenes(run, scenes, variants or tuple(VARIANTS), views or VIEWS, show)
-    say(f"{len(made)} scenes in {scenes}; look at the scene.png in each.")
+        Raises:
+            InputError: no case, unknown names, or scenes made from something else.
+        """
+        from rich.progress import (
+            BarColumn,
+            Progress,
+            TaskProgressColumn,
+            TextColumn,
+            TimeElapsedColumn,
+            TimeRemainingColumn,
+        )
+
+        from tumortrack_lab.twin.dataset import TwinRun, make_scenes
+        from tumortrack_lab.twin.views import VARIANTS, VIEWS
+
+        columns = (
+            TextColumn("{task.description}"),
+            BarColumn(),
+            TaskProgressColumn(),
+            TimeElapsedColumn(),
+            TimeRemainingColumn(),
+        )
+        with Progress(*columns, console=console, transient=True) as progress:
+            task = progress.add_task("twin", total=1.0)
+            shown_s = -_EVERY_S
+
+            def show(status: TwinStatus) -> None:
+                nonlocal shown_s
+                progress.update(task, completed=status.share, description=status.text)
+                if not console.is_terminal and time.monotonic() - shown_s >= _EVERY_S:
+                    say(f"{status.share:.0%} {status.text}")
+                    shown_s = time.monotonic()
+
+            states: Sequence[str] = self.states or tuple(VARIANTS)
+            views = self.views or VIEWS
+            made = make_scenes(TwinRun(self.case, seed=self.seed), self.scenes, states, views, show)
+        say(f"{len(made)} scenes in {self.scenes}; look at the scene.png in each.")

@@ -17,7 +17,7 @@ from tumortrack.core.errors import InputError
 from tumortrack.core.types import ORGAN, Anatomy, Mesh
 from tumortrack.imaging.raster import label_grid
 from tumortrack.plan.values import Cut, CutLayer, ResectionPlan
-from tumortrack.report.metrics import _to_surface
+from tumortrack.report.metrics import distance_to_surface
 from tumortrack_lab.cut.severing import Flat, Mask, Severed, Voxels, pieces_of, within
 
 VOXEL_MM = 0.5
@@ -270,8 +270,8 @@ def _margin_mm(surface: Points, inside: Bool[np.ndarray, " n"], tumor: Mesh) -> 
     if not len(surface):
         return None
     if inside.any():
-        return -float(_to_surface(surface[inside], tumor).max())
-    return float(_to_surface(surface, tumor).min())
+        return -float(distance_to_surface(surface[inside], tumor).max())
+    return float(distance_to_surface(surface, tumor).min())
 
 
 def _share(of: Voxels, whole: Voxels) -> float:

@@ -18,7 +18,6 @@ from tumortrack.core.config import Config
 from tumortrack.core.errors import NoEstimate
 from tumortrack.core.geometry import rigid, rotation_onto, transform_points
 from tumortrack.core.types import Anatomy, Mesh, SensorCloud
-from tumortrack.report.shade import vertex_normals
 from tumortrack.sense.render import Visibility
 
 _TOWARDS_CAMERA = np.array([0.0, 0.0, -1.0])
@@ -72,7 +71,12 @@ def surface_points(mesh: Mesh, spacing_mm: float) -> SurfacePoints:
     cube = np.floor(mesh.vertices_mm / spacing_mm).astype(np.int64)
     _, first = np.unique(cube, axis=0, return_index=True)
     kept = np.sort(first)
-    return SurfacePoints(mesh.vertices_mm[kept], vertex_normals(mesh.vertices_mm, mesh.faces)[kept])
+    a, b, c = (mesh.vertices_mm[mesh.faces[:, k]] for k in range(3))
+    normals = np.zeros_like(mesh.vertices_mm)  # the mean of each vertex's triangles, by area
+    for corner in range(3):
+        np.add.at(normals, mesh.faces[:, corner], np.cross(b - a, c - a))
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+    return SurfacePoints(mesh.vertices_mm[kept], normals[kept])
 
 
 def seen_from(

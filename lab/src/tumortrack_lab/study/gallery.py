@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.estimate import Estimate
 from tumortrack.report.drawing import new_figure, save
-from tumortrack.report.pictures import FROM_SIDE, _legend, _solid_view
+from tumortrack.report.pictures import FROM_SIDE, draw_solid_view, scene_legend
 from tumortrack.report.protocol import compare
 from tumortrack.simulate.scene_folder import Scene, read_scene
 from tumortrack_lab.study.measure import StudyCase
@@ -59,7 +59,11 @@ def gallery(
                     fontweight="bold",
                 )
     drawing.legend(
-        handles=_legend(), loc="upper right", ncols=4, frameon=False, bbox_to_anchor=(0.99, 0.999)
+        handles=scene_legend(),
+        loc="upper right",
+        ncols=4,
+        frameon=False,
+        bbox_to_anchor=(0.99, 0.999),
     )
     save(drawing, path)
 
@@ -72,7 +76,7 @@ def _panel(axes: Axes, scene: Scene, method: Method, grid: int) -> None:
         title = "nothing found"
     else:
         title = _numbers(estimate, scene)
-    _solid_view(axes, scene, estimate, FROM_SIDE)
+    draw_solid_view(axes, scene, estimate, FROM_SIDE)
     axes.set_title(title, fontsize=9.5)
 
 

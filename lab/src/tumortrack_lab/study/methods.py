@@ -140,6 +140,6 @@ def without_refinement(model: Model) -> RegistrationModel:
     config = msgspec.structs.replace(
         model.config, refine=msgspec.structs.replace(model.config.refine, steps=0)
     )
-    familiar = msgspec.structs.replace(model.familiar, fit_mm=math.inf)
+    in_distribution = msgspec.structs.replace(model.in_distribution, fit_mm=math.inf)
     trust = msgspec.structs.replace(model.calibration, usual_cost=math.inf)
-    return replace(model, config=config, familiar=familiar, calibration=trust)
+    return replace(model, config=config, in_distribution=in_distribution, calibration=trust)

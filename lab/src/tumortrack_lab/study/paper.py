@@ -13,7 +13,7 @@ from typing import Literal
 import numpy as np
 
 from tumortrack.core.types import Anatomy
-from tumortrack.report.metrics import _to_surface, surface_samples
+from tumortrack.report.metrics import distance_to_surface, surface_samples
 
 Kind = Literal["exophytic", "endophytic"]
 
@@ -79,7 +79,7 @@ def tumor_lies(anatomy: Anatomy) -> dict[str, Lie]:
     lies = {}
     for name, tumor in zip(anatomy.names[1:], anatomy.tumors, strict=True):
         points, area, _ = surface_samples(tumor)
-        distance = _to_surface(points, anatomy.organ)
+        distance = distance_to_surface(points, anatomy.organ)
         share = float(area[distance < EXPOSED_MM].sum() / area.sum())
         lies[name] = Lie(share, float(np.min(distance)))
     return lies

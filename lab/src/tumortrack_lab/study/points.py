@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.types import Anatomy, Mesh
-from tumortrack.report.metrics import _to_surface
+from tumortrack.report.metrics import distance_to_surface
 from tumortrack.sense.camera import deproject
 from tumortrack.simulate.scene_folder import Scene
 from tumortrack_lab.peers.rigid import kabsch
@@ -57,7 +57,10 @@ def point_errors(
         corners = part.faces.reshape(-1)
         chosen = np.random.default_rng(0).integers(len(corners), size=POINTS)
         points = part.vertices_mm[corners[chosen]]
-        columns = {"depth_mm": seen.query(points)[0], "error_mm": _to_surface(points, meshes[name])}
+        columns = {
+            "depth_mm": seen.query(points)[0],
+            "error_mm": distance_to_surface(points, meshes[name]),
+        }
         if name in moves:
             columns["displacement_mm"] = moves[name][chosen]
         out[name] = {key: np.round(values, 2).tolist() for key, values in columns.items()}

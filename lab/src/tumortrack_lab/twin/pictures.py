@@ -8,18 +8,18 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from tumortrack.core.types import Anatomy, Mesh
-from tumortrack.report.drawing import KIDNEY, OBSERVED, TRUE, blank, new_figure, save, scale_bar
-from tumortrack.report.pictures import FROM_CAMERA
-from tumortrack.report.shade import (
-    Frame,
-    ShadedLayer,
-    ShadedView,
-    frame_around,
-    pixel_centres,
-    shade,
-    silhouette,
-    widened,
+from tumortrack.report.drawing import (
+    KIDNEY,
+    OBSERVED,
+    TRUE,
+    finish_view,
+    new_figure,
+    outline,
+    save,
+    show_legend,
 )
+from tumortrack.report.pictures import FROM_CAMERA
+from tumortrack.report.renderer import Body, Frame, ParallelView
 from tumortrack.sense.camera import project
 from tumortrack.simulate.scene_folder import Scene
 from tumortrack_lab.twin.states import COMPRESSION_MM
@@ -28,8 +28,8 @@ from tumortrack_lab.twin.views import EquilibriumState
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-FROM_FRONT = ShadedView("bench from the front", (1.0, 0.0, 0.0), (0.0, 0.0, -1.0))
-FROM_END = ShadedView("bench from its end", (0.0, 1.0, 0.0), (0.0, 0.0, -1.0))
+FROM_FRONT = ParallelView("bench from the front", (1.0, 0.0, 0.0), (0.0, 0.0, -1.0))
+FROM_END = ParallelView("bench from its end", (0.0, 1.0, 0.0), (0.0, 0.0, -1.0))
 _STEEL = (0.62, 0.65, 0.7)
 _REST = "0.35"
 _AROUND_MM = 14.0  # of the organ: background beside it shows, points far off do not
@@ -60,14 +60,7 @@ def twin_picture(scene: Scene, state: EquilibriumState, rest_organ: Mesh, path: 
         x=0.02, y=0.985, ha="left", fontsize=13, fontweight="bold",
     )  # fmt: skip
     figure.text(0.02, 0.945, _numbers(scene, state), ha="left", va="top", fontsize=10)
-    figure.legend(
-        handles=_legend(),
-        loc="upper right",
-        ncols=5,
-        fontsize=9.5,
-        frameon=False,
-        bbox_to_anchor=(0.99, 1.0),
-    )
+    show_legend(figure, _legend(), 5, (0.99, 1.0))
     save(figure, path)
 
 
@@ -86,8 +79,8 @@ def _depth_view(axes: Axes, scene: Scene) -> None:
         pixels, _ = project(tumor.vertices_mm, scene.depth.intrinsics)
         flat = Mesh(np.column_stack([pixels, np.zeros(len(pixels))]), tumor.faces)
         frame = Frame(-0.5, width - 0.5, -0.5, height - 0.5)
-        mask = silhouette(flat, FROM_CAMERA, frame, 2.0)
-        x, y = np.meshgrid(*pixel_centres(frame, 2.0))
+        mask = FROM_CAMERA.silhouette(flat, frame, 2.0)
+        x, y = np.meshgrid(*frame.pixel_centres(2.0))
         for color, line in (("white", 3.2), (TRUE, 1.4)):  # a halo: seen on any depth
             axes.contour(x, y, mask, levels=[0.5], colors=[color], linewidths=line)
     axes.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), xticks=[], yticks=[])
@@ -104,38 +97,34 @@ def _depth_view(axes: Axes, scene: Scene) -> None:
 
 def _cloud_view(axes: Axes, scene: Scene) -> None:
     points_mm = scene.cloud.points_mm.astype(float)
-    frame = widened(frame_around(FROM_CAMERA, scene.reference.organ.vertices_mm, _AROUND_MM), 1.6)
+    frame = FROM_CAMERA.frame_around(scene.reference.organ.vertices_mm, _AROUND_MM).widened(1.6)
     _paint(axes, scene.reference, FROM_CAMERA, frame)
     flat = FROM_CAMERA.project(points_mm)
     axes.scatter(flat[:, 0], flat[:, 1], s=2.0, color=OBSERVED, alpha=0.5, linewidths=0, zorder=3)
-    blank(axes, frame)
-    scale_bar(axes, frame)
+    finish_view(axes, frame)
     axes.set_title(f"{FROM_CAMERA.name}: {len(points_mm)} points over the truth", fontsize=11)
 
 
-def _bench_view(axes: Axes, state: EquilibriumState, rest_organ: Mesh, view: ShadedView) -> None:
+def _bench_view(axes: Axes, state: EquilibriumState, rest_organ: Mesh, view: ParallelView) -> None:
     anatomy = state.anatomy
     everything = np.concatenate([anatomy.organ.vertices_mm, rest_organ.vertices_mm])
     everything = np.concatenate([everything, everything.mean(0)[None] * [1, 1, 0] + [0, 0, -12.0]])
-    frame = widened(frame_around(view, everything, 8.0), 1.75)
+    frame = view.frame_around(everything, 8.0).widened(1.75)
     _paint(axes, anatomy, view, frame)
-    x, y = np.meshgrid(*pixel_centres(frame))
-    mask = silhouette(rest_organ, view, frame)
-    axes.contour(x, y, mask, levels=[0.5], colors=[_REST], linewidths=1.3, linestyles=["dashed"])
+    outline(axes, rest_organ, view, frame, _REST, 1.3, linestyles=["dashed"])
     axes.axhspan(0, frame.bottom, color="0.3", alpha=0.13, zorder=2.2, linewidth=0)
     axes.axhline(0, color="0.45", linewidth=1.2, zorder=2.5)
-    blank(axes, frame)
-    scale_bar(axes, frame)
+    finish_view(axes, frame)
     axes.set_title(view.name, fontsize=11)
 
 
-def _paint(axes: Axes, anatomy: Anatomy, view: ShadedView, frame: Frame) -> None:
-    layers = [ShadedLayer(tumor, TRUE) for tumor in anatomy.tumors]
-    layers.append(ShadedLayer(anatomy.organ, KIDNEY, 0.4))
-    axes.imshow(shade(layers, view, frame), extent=frame.extent, zorder=2, interpolation="bilinear")
+def _paint(axes: Axes, anatomy: Anatomy, view: ParallelView, frame: Frame) -> None:
+    bodies = [*(Body(tumor, TRUE) for tumor in anatomy.tumors), Body(anatomy.organ, KIDNEY, 0.4)]
+    picture = view.draw(bodies, frame)
+    axes.imshow(picture, extent=frame.extent, zorder=2, interpolation="bilinear")
 
 
-def _apparatus(axes: Axes, report: dict, view: ShadedView) -> None:
+def _apparatus(axes: Axes, report: dict, view: ParallelView) -> None:
     """Plate and rod, where the state has them; their far ends are left out."""
     from matplotlib.patches import FancyBboxPatch, Polygon
 

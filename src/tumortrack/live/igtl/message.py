@@ -14,7 +14,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, Num
 
 from tumortrack.core.errors import InputError
 
@@ -176,7 +176,7 @@ class Polydata:
     points: Float[np.ndarray, "n 3"]
     triangles: Int[np.ndarray, "f 3"]
     segments: Int[np.ndarray, "s 2"] = field(default_factory=lambda: np.zeros((0, 2), np.int32))
-    scalars: dict[str, Float[np.ndarray, " n"]] = field(default_factory=dict)
+    scalars: dict[str, Num[np.ndarray, " n"]] = field(default_factory=dict)
 
 
 def pack_transform(b_from_a: Float[np.ndarray, "4 4"]) -> bytes:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from tumortrack.live.values import Observation
 
@@ -18,6 +18,7 @@ class RecordedFrame:
     load: Callable[[], Observation]
 
 
+@runtime_checkable
 class Recording(Protocol):
     """An open recording."""
 

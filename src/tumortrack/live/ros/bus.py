@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import importlib.util
 import os
-from typing import Literal, Protocol
+from typing import Literal, Protocol, runtime_checkable
 
 from tumortrack.core.errors import InputError
 from tumortrack.live.ros.messages import Messages
@@ -19,6 +19,7 @@ Via = Literal["auto", "dds", "rclpy"]
 _LARGEST_DOMAIN = 232
 
 
+@runtime_checkable
 class Publisher(Protocol):
     """One topic out: reliable, volatile, the newest message only, as ROS 2 nodes publish."""
 
@@ -40,6 +41,7 @@ class Publisher(Protocol):
         ...
 
 
+@runtime_checkable
 class Subscriber(Protocol):
     """One topic in, from reliable and best effort publishers alike."""
 
@@ -57,6 +59,7 @@ class Subscriber(Protocol):
         ...
 
 
+@runtime_checkable
 class Bus(Protocol):
     """A participant of the graph. Used by one thread; ``close`` perhaps from another."""
 

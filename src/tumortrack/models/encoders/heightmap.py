@@ -1,7 +1,7 @@
 """A cloud seen from one side is a height map: rasterised, then a small convolutional network.
 
-One view shows every line of sight once, so that nothing is lost in the picture; neither centres nor
-neighbours have to be searched, which is most of what PointNet++ costs.
+One view has one point per line of sight, so that the picture loses nothing; neither centres nor
+neighbours have to be searched, which is most of the cost of PointNet++.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ class HeightMap(nn.Module):
         if limit is not None:
             points = points[:, :limit]
         seen = picture(points, self.config.pixels)
-        # In the order that convolutions work in: else each of them would change it and back.
+        # The memory order of convolutions: else each of them would convert to it and back.
         latent: Tensor = self.layers(seen.to(memory_format=torch.channels_last)).flatten(1)
         return latent
 
@@ -70,7 +70,7 @@ def picture(points: Tensor, pixels: int) -> Tensor:
     """Points (B, N, 3) -> (B, 4, pixels, pixels): seen or not and mean height, by pixel, and the
     same over a pixel and its eight neighbours, which closes the gaps between points.
 
-    A point is shared by the four pixels about it, so that heights change smoothly with it.
+    A point is spread over the four pixels about it, so that heights change smoothly with it.
     """
     place = (points[..., :2] + _HALF) / (2 * _HALF) * pixels - 0.5
     spread = _spread_compiled if compiled(points) and not points.requires_grad else _spread
@@ -84,21 +84,21 @@ def picture(points: Tensor, pixels: int) -> Tensor:
 
 
 def _spread(place: Tensor, heights: Tensor, pixels: int) -> tuple[Tensor, Tensor]:
-    """Shares of points (B, N, 2) and shares times heights (B, N), by pixel, (B, 1, P, P)."""
+    """Weights of points (B, N, 2) and weights times heights (B, N), by pixel, (B, 1, P, P)."""
     lowest = place.floor()
     part = place - lowest
     weight = place.new_zeros(len(place), pixels * pixels)
     height = torch.zeros_like(weight)
     for right in (0, 1):
         for down in (0, 1):
-            share = (part[..., 0] if right else 1 - part[..., 0]) * (
+            fraction = (part[..., 0] if right else 1 - part[..., 0]) * (
                 part[..., 1] if down else 1 - part[..., 1]
             )
             x, y = lowest[..., 0].long() + right, lowest[..., 1].long() + down
-            share = share * ((x >= 0) & (x < pixels) & (y >= 0) & (y < pixels))
+            fraction = fraction * ((x >= 0) & (x < pixels) & (y >= 0) & (y < pixels))
             index = y.clamp(0, pixels - 1) * pixels + x.clamp(0, pixels - 1)
-            weight.scatter_add_(1, index, share)
-            height.scatter_add_(1, index, share * heights)
+            weight.scatter_add_(1, index, fraction)
+            height.scatter_add_(1, index, fraction * heights)
     shape = len(place), 1, pixels, pixels
     return weight.view(shape), height.view(shape)
 

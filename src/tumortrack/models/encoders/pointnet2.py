@@ -9,8 +9,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from tumortrack.core.config import Config
-from tumortrack.models.layers import Layer, Norm, stack
-from tumortrack.models.pooling import greatest, greatest_above_zero
+from tumortrack.models.layers import Layer, Norm, greatest, greatest_above_zero, stack
 from tumortrack.models.sampling import (
     Sampling,
     ball_query,
@@ -103,28 +102,28 @@ class _Level(nn.Module):
         chosen = choose_points(points, math.ceil(level.ratio * n), self.sampling)
         centres = take(points, chosen)
         neighbours = ball_query(points, centres, level.radius, level.neighbours)
-        weight, shared = self.first.linear.weight, None
+        weight, projected = self.first.linear.weight, None
         if features is not None:
-            shared = functional.linear(features, weight[:, 3:])
+            projected = functional.linear(features, weight[:, 3:])
         if torch.is_grad_enabled() or traced() or points.device.type != "cpu":
-            return centres, self._described(points, centres, neighbours, shared)
-        # For use alone: what a part of the centres needs stays in the cache.
+            return centres, self._describe(points, centres, neighbours, projected)
+        # In inference, by parts of the centres that fit in the cache.
         pairs = zip(centres.split(_AT_ONCE, 1), neighbours.split(_AT_ONCE, 1), strict=True)
-        return centres, torch.cat([self._described(points, *pair, shared) for pair in pairs], 1)
+        return centres, torch.cat([self._describe(points, *pair, projected) for pair in pairs], 1)
 
-    def _described(
-        self, points: Tensor, centres: Tensor, neighbours: Tensor, shared: Tensor | None
+    def _describe(
+        self, points: Tensor, centres: Tensor, neighbours: Tensor, projected: Tensor | None
     ) -> Tensor:
         """Features (B, M, G) of centres (B, M, 3) from their neighbours (B, M, K)."""
         offsets = (take(points, neighbours) - centres[:, :, None]) / self.level.radius
         linear = self.first.linear
         grouped = functional.linear(offsets, linear.weight[:, :3], linear.bias)
-        if shared is not None:
-            grouped = grouped + take(shared, neighbours)
+        if projected is not None:
+            grouped = grouped + take(projected, neighbours)
         hidden = self.first.activate(grouped)
         layers = [layer for layer in self.rest if isinstance(layer, Layer)]
-        learns = torch.is_grad_enabled() and len(layers) == len(self.rest)
-        if not learns:  # for use, others may have taken the layers' place
+        training = torch.is_grad_enabled() and len(layers) == len(self.rest)
+        if not training:  # in inference, packed layers may replace these
             return greatest(self.rest(hidden))
         for layer in layers[:-1]:
             hidden = layer(hidden)

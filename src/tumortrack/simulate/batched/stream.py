@@ -217,7 +217,7 @@ class _DevicePool:
 
     def _nearest(
         self, index: Int64[Tensor, "b w"], beyond: Tensor, distance_mm: Tensor, inside: Tensor
-    ) -> Int64[Tensor, "b 2k"]:
+    ) -> Int64[Tensor, "b m"]:
         """Of a window's points the k inside that are nearest to the surface, and k outside, the
         nearest first."""
         distance, within = distance_mm[index], inside[index]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float
@@ -27,6 +27,7 @@ class View:
     body: ElasticBody | None = None  # where the deformation's configuration asks for one
 
 
+@runtime_checkable
 class Deformation(Protocol):
     """A sampled deformation, a map of space."""
 

@@ -27,8 +27,7 @@ from tumortrack.models.normalisation import (
     turned,
     without_strays,
 )
-from tumortrack.occupancy.mlp_decoder import octave_features
-from tumortrack.occupancy.network import OccupancyNetwork
+from tumortrack.occupancy.network import OccupancyNetwork, octave_features
 
 
 @dataclass(frozen=True, eq=False)

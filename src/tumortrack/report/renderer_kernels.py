@@ -1,11 +1,45 @@
-"""The painter's inner loops: which triangle a pixel sees, and in what light."""
+"""The renderer's inner loops: which triangle a pixel sees, and in what light."""
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numba
 import numpy as np
+from jaxtyping import Bool, Float32, Int32
 
 _SHADOW_BIAS = 4.0  # pixels of the shadow's picture: a surface doesn't shade itself
+
+
+class Triangles(NamedTuple):
+    """Many bodies as one, world frame, mm: vertices, and of each triangle its corners, their
+    normals, its colour, and whether others cast shadows on it."""
+
+    places: Float32[np.ndarray, "v 3"]
+    faces: Int32[np.ndarray, "t 3"]
+    normals: Float32[np.ndarray, "t 3 3"]
+    colors: Float32[np.ndarray, "t 3"]
+    shadowed: Bool[np.ndarray, " t"]
+
+
+class Light(NamedTuple):
+    """A light, and what it sees: how far up towards it each pixel's first surface lies."""
+
+    axes: Float32[np.ndarray, "3 3"]  # rows: across, down, towards the light
+    up: Float32[np.ndarray, " 3"]  # where the rest of the light comes from
+    near: Float32[np.ndarray, "s s"]
+    corner: Float32[np.ndarray, " 2"]  # of its first pixel, mm along across and down
+    pixel_mm: float
+
+
+class Hits(NamedTuple):
+    """Which triangle each pixel sees (-1: none), from where, and the column, row and nearness of
+    all vertices."""
+
+    winner: Int32[np.ndarray, "h w"]
+    corners: Float32[np.ndarray, "v 3"]
+    perspective: bool
+    place: Float32[np.ndarray, " 3"]
 
 
 @numba.njit(cache=True, nogil=True)
@@ -97,33 +131,32 @@ def _mixed(one, two, three, shares):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def _dark(spot, shadow):  # type: ignore[no-untyped-def]
+def _dark(spot, light):  # type: ignore[no-untyped-def]
     """Whether something lies between this place and the light."""
-    axes, step = shadow.axes, shadow.pixel_mm
-    u = (axes[0, 0] * spot[0] + axes[0, 1] * spot[1] + axes[0, 2] * spot[2]) - shadow.corner[0]
-    v = (axes[1, 0] * spot[0] + axes[1, 1] * spot[1] + axes[1, 2] * spot[2]) - shadow.corner[1]
-    up = axes[2, 0] * spot[0] + axes[2, 1] * spot[1] + axes[2, 2] * spot[2]
+    axes, step = light.axes, light.pixel_mm
+    u = (axes[0, 0] * spot[0] + axes[0, 1] * spot[1] + axes[0, 2] * spot[2]) - light.corner[0]
+    v = (axes[1, 0] * spot[0] + axes[1, 1] * spot[1] + axes[1, 2] * spot[2]) - light.corner[1]
+    toward = axes[2, 0] * spot[0] + axes[2, 1] * spot[1] + axes[2, 2] * spot[2]
     column, row = int(np.rint(u / step)), int(np.rint(v / step))
-    side = shadow.near.shape[0]
+    side = light.near.shape[0]
     if not (0 <= column < side and 0 <= row < side):
         return False
-    return shadow.near[row, column] > up + _SHADOW_BIAS * step
+    return light.near[row, column] > toward + _SHADOW_BIAS * step
 
 
 @numba.njit(cache=True, nogil=True)
-def light(  # type: ignore[no-untyped-def]
-    picture, winner, seen, perspective, place, opacity, triangles, shadow
-):
+def shade(picture, hits, triangles, light, opacity):  # type: ignore[no-untyped-def]
     """Lay each pixel's triangle over what is there; a diffuse light, a little gloss."""
-    lx, ly, lz = shadow.axes[2]
-    places = triangles.places
-    for y in range(winner.shape[0]):
-        for x in range(winner.shape[1]):
-            t = winner[y, x]
+    lx, ly, lz = light.axes[2]
+    ux, uy, uz = light.up
+    places, place = triangles.places, hits.place
+    for y in range(hits.winner.shape[0]):
+        for x in range(hits.winner.shape[1]):
+            t = hits.winner[y, x]
             if t < 0:
                 continue
             face, corner = triangles.faces[t], triangles.normals[t]
-            shares = _shares(seen, face, x, y, perspective)
+            shares = _shares(hits.corners, face, x, y, hits.perspective)
             spot = _mixed(places[face[0]], places[face[1]], places[face[2]], shares)
             nx, ny, nz = _mixed(corner[0], corner[1], corner[2], shares)
             vx, vy, vz = place[0] - spot[0], place[1] - spot[1], place[2] - spot[2]
@@ -134,31 +167,15 @@ def light(  # type: ignore[no-untyped-def]
             scale = scale if toward >= 0 else -scale  # of a surface seen from behind
             nx, ny, nz = nx * scale, ny * scale, nz * scale
             lit, gloss = max(nx * lx + ny * ly + nz * lz, 0.0), 0.0
-            if lit > 0 and triangles.shaded[t] and _dark(spot, shadow):
+            if lit > 0 and triangles.shadowed[t] and _dark(spot, light):
                 lit = 0.0
             elif lit > 0:
                 hx, hy, hz = lx + vx, ly + vy, lz + vz
                 gloss = (nx * hx + ny * hy + nz * hz) / np.sqrt(hx * hx + hy * hy + hz * hz)
                 gloss = 0.16 * max(gloss, 0.0) ** 40
-            strength = 0.46 + 0.1 * nz + 0.5 * lit
+            strength = 0.46 + 0.1 * (nx * ux + ny * uy + nz * uz) + 0.5 * lit
             slant = 1 - abs(toward)
             cover = opacity + (1 - opacity) * 0.75 * slant * slant
             for d in range(3):
-                own = min(triangles.colours[t, d] * strength + gloss, 1.0)
+                own = min(triangles.colors[t, d] * strength + gloss, 1.0)
                 picture[y, x, d] += cover * (own - picture[y, x, d])
-
-
-@numba.njit(cache=True, nogil=True)
-def shrunk(picture, step):  # type: ignore[no-untyped-def]
-    """Means of step x step pixels, in 0..255."""
-    height, width = picture.shape[0] // step, picture.shape[1] // step
-    out = np.empty((height, width, 3), np.uint8)
-    for y in range(height):
-        for x in range(width):
-            for d in range(3):
-                total = 0.0
-                for i in range(step):
-                    for j in range(step):
-                        total += picture[y * step + i, x * step + j, d]
-                out[y, x, d] = int(255 * min(max(total / step**2, 0.0), 1.0) + 0.5)
-    return out

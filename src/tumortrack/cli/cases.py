@@ -1,0 +1,236 @@
+"""Cases and scenes: `prepare`, `export`, `simulate`."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+from tyro.conf import Positional
+
+from tumortrack.cli.console import progress_bar, say, say_notes
+from tumortrack.core import store
+from tumortrack.core.errors import InputError
+
+if TYPE_CHECKING:
+    from tumortrack.simulate.scene import SceneConfig
+
+_TEST_BODY = 2**20  # and the seed: elastic states that training with the same seed never sees
+
+
+@dataclass(frozen=True, kw_only=True)
+class Prepare:
+    """Make a case from a CT, a label map or a folder of meshes.
+
+    Attributes:
+        input: DICOM folder, CT volume or label map (.nii, .nii.gz, .nrrd), or folder of meshes.
+        case: folder to write.
+        kidney_hu: HU window of the kidney in a CT: low (inclusive) and high.
+        tumor_hu: HU window of the tumors in a CT.
+        labels: INPUT is a label map (recognised by itself where that is plain).
+        side: the patient's kidney to take; default: the one with the largest tumor.
+        organ: label number of the kidney.
+        tumor: label number of the tumors; default: every label from 2 up. 0: none.
+        up: patient direction that faces the camera: anterior, left, ... or "x,y,z" in LPS.
+        series: which DICOM series, if the folder holds several (UID or number in the list).
+        unit: of mesh files.
+        min_tumor_ml: smaller tumors are reported and dropped.
+        overwrite: replace CASE if it exists.
+    """
+
+    input: Positional[Path]
+    case: Positional[Path]
+    kidney_hu: tuple[float, float] = (-300.0, 300.0)
+    tumor_hu: tuple[float, float] = (300.0, 1000.0)
+    labels: bool = False
+    side: Literal["left", "right"] | None = None
+    organ: int = 1
+    tumor: int | None = None
+    up: str = "anterior"
+    series: str | None = None
+    unit: Literal["mm", "m"] | None = None
+    min_tumor_ml: float = 0.2
+    overwrite: bool = False
+
+    def run(self) -> None:
+        """Input -> case folder with a picture to check it by."""
+        from tumortrack.imaging.case import KIND, save_case
+        from tumortrack.imaging.prepare import PrepareOptions, prepare
+        from tumortrack.report.qc import qc_picture
+
+        options = {field.name: getattr(self, field.name) for field in fields(PrepareOptions)}
+        store.check_place(self.case, KIND, self.overwrite)
+        case = prepare(self.input, PrepareOptions(**options))
+        with store.new_folder(self.case, self.overwrite) as aside:
+            qc_picture(case.labels, case.ct, case.anatomy, aside / "qc.png")
+            save_case(case, aside)
+        say_notes(case.report.get("notes", []))
+        for name, part in zip(case.anatomy.names, case.anatomy.parts, strict=True):
+            say(f"{name}: {part.volume_mm3 / 1000:.1f} ml")
+        say(f"case written to {self.case}; look at {self.case / 'qc.png'} before you rely on it.")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Export:
+    """Write a case's segmentation for 3D Slicer and, with its CT, as DICOM.
+
+    Attributes:
+        case: folder that `prepare` wrote.
+        out: folder to write: case.seg.nrrd and, with --dicom, segmentation.dcm.
+        dicom: folder of the CT's slices that the case's voxels come from.
+        series: which of its series, if the folder holds several (UID or number in the list).
+    """
+
+    case: Positional[Path]
+    out: Positional[Path]
+    dicom: Path | None = None
+    series: str | None = None
+
+    def run(self) -> None:
+        """Write OUT; all or nothing.
+
+        Raises:
+            InputError: OUT exists; ``series`` without ``dicom``; see ``write_dicom_seg``.
+            ArtifactError: no case.
+            StorageError: the disk refused.
+        """
+        from tumortrack.imaging.case import load_case
+        from tumortrack.imaging.segmentation import (
+            SIDES,
+            segments,
+            write_dicom_seg,
+            write_seg_nrrd,
+        )
+
+        if self.series is not None and self.dicom is None:
+            raise InputError("--series says which series of --dicom; give that folder too.")
+        case = load_case(self.case)
+        options = case.report.get("options", {})
+        side = options.get("side")
+        parts = segments(case.anatomy.names, side if side in SIDES else None)
+        labels = case.labels
+        notes: tuple[str, ...] = ()
+        with store.new_folder(self.out) as aside:
+            write_seg_nrrd(aside / "case.seg.nrrd", labels.labels, labels.lps_from_index, parts)
+            if self.dicom is not None:
+                series = self.series or options.get("series")
+                file = aside / "segmentation.dcm"
+                notes = write_dicom_seg(file, labels, parts, self.dicom, series)
+        say_notes(notes)
+        say(f"written to {self.out}: {', '.join(sorted(p.name for p in self.out.iterdir()))}.")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Simulate:
+    """Write deformed scenes of a case with their truth: what `evaluate` reads.
+
+    Attributes:
+        case: folder that `prepare` wrote.
+        dataset: folder to write.
+        scenes: how many.
+        seed: of the scenes; they are never those that training sees.
+        configuration: of the paper's deformation table; several are mixed.
+        falloff: how the table's third number is read (docs/method.md).
+        rotations: poses, as in `train`.
+        squeeze: also squeeze and bend the organ as a whole.
+        noise: with the depth sensor's noise.
+        elastic: deform the organ as an elastic body in its bed does (plates, instruments, pulls,
+            weight, swelling), instead of by the paper's table.
+    """
+
+    case: Positional[Path]
+    dataset: Positional[Path]
+    scenes: int = 20
+    seed: int = 0
+    configuration: tuple[Literal[1, 2, 3, 4, 5, 6], ...] = (3,)
+    falloff: Literal["sigma", "variance"] = "sigma"
+    rotations: Literal["limited", "full"] = "limited"
+    squeeze: bool = False
+    noise: bool = True
+    elastic: bool = False
+
+    def run(self) -> None:
+        """Case -> folder of scenes, one folder each."""
+        self.write()
+        say(f"{self.scenes} scenes written to {self.dataset}.")
+
+    def scene_config(self) -> SceneConfig:
+        from tumortrack.sense.noise import CLEAN, D405_NOISE
+        from tumortrack.simulate.deform import (
+            ChainConfig,
+            DeformConfig,
+            DragConfig,
+            ElasticConfig,
+            StretchConfig,
+        )
+        from tumortrack.simulate.deform.drag import CONFIGURATIONS
+        from tumortrack.simulate.pose import PoseConfig
+        from tumortrack.simulate.scene import SceneConfig
+
+        models: list[DragConfig | ElasticConfig] = [ElasticConfig()]
+        if not self.elastic:
+            table = (CONFIGURATIONS[number] for number in self.configuration)
+            models = [DragConfig(steps=steps, falloff=self.falloff) for steps in table]
+        deform: tuple[DeformConfig, ...] = tuple(
+            ChainConfig(links=(model, StretchConfig())) if self.squeeze else model
+            for model in models
+        )
+        return SceneConfig(
+            width=848,
+            height=480,
+            pose=PoseConfig(rotations=self.rotations),
+            deform=deform,
+            noise=D405_NOISE if self.noise else CLEAN,
+        )
+
+    def write(self, prefix: str = "") -> None:
+        """Scenes PREFIX0000, PREFIX0001, ... of the ``test`` stream; those that are there stay.
+
+        Raises:
+            InputError: no case, or scenes that are not of this case, seed and options.
+        """
+        from tumortrack.core.config import to_builtins
+        from tumortrack.imaging.case import load_case
+        from tumortrack.simulate.scene import SceneRecipe, Simulator, body_for
+        from tumortrack.simulate.scene_folder import Scene, write_scene
+        from tumortrack.simulate.targets import draw_targets
+
+        if self.scenes < 1:
+            raise InputError(f"--scenes {self.scenes} must be at least 1.")
+        case = load_case(self.case)
+        config = self.scene_config()
+        body = body_for(case.anatomy, case.up_lps, config, _TEST_BODY + self.seed)
+        simulator = Simulator(case.anatomy, case.up_lps, config, body)
+        targets = draw_targets(case.anatomy, self.seed)
+        about = {
+            "case_sha256": store.sha256_of(self.case / store.MANIFEST),
+            "case_volumes_mm3": [part.volume_mm3 for part in case.anatomy.parts],
+            "config": to_builtins(config),
+        }
+        with progress_bar("simulate", self.scenes) as advance:
+            for index in range(self.scenes):
+                folder = self.dataset / f"{prefix}{index:04d}"
+                recipe = SceneRecipe(self.seed, "test", index)
+                made_from = {**about, "recipe": asdict(recipe)}
+                if folder.exists():
+                    _check_same(folder, made_from)
+                else:
+                    stage = simulator.render(recipe)
+                    meta = {
+                        **made_from,
+                        "camera_from_ct": stage.camera_from_ct.tolist(),
+                        "deformation": stage.deformation.record(),
+                    }
+                    truth = simulator.reference(stage)
+                    placed = targets.at(stage.carry(targets.points_ct))
+                    write_scene(folder, Scene(stage.cloud, truth, stage.frame, meta, placed))
+                advance()
+
+
+def _check_same(folder: Path, made_from: dict) -> None:
+    """Refuse to continue a dataset of another case, seed or options."""
+    meta = store.read_json(folder / "meta.json")
+    if {key: meta.get(key) for key in made_from} != made_from:
+        raise InputError(
+            f"{folder} is a scene of another case, seed or option. Choose another DATASET folder."
+        )

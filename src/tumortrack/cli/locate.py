@@ -1,0 +1,241 @@
+"""A model on clouds: `locate` and `evaluate`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+from tyro.conf import Positional
+
+from tumortrack.cli.console import Device, console, keep_loaded, progress_bar, say, say_notes
+from tumortrack.core import store
+from tumortrack.core.errors import InputError
+
+if TYPE_CHECKING:
+    from tumortrack.core.types import DepthFrame, SensorCloud
+    from tumortrack.models.model import Model
+    from tumortrack.sense.cloud import CloudConfig
+    from tumortrack.tracking.points import PointTable
+
+
+@dataclass(frozen=True, kw_only=True)
+class Locate:
+    """Locate kidney and tumors in one cloud or depth image.
+
+    Attributes:
+        model: folder that `train` wrote.
+        cloud: .ply, .pcd or .npz in the camera frame, or a depth .png (with --intrinsics).
+        out: folder to write.
+        grid: voxels along the longest side of the labelled volume, up to 400.
+        seed: of the random points and queries.
+        range: keep depths between NEAR and FAR mm; a cloud is else used as it is, a depth image
+            cropped by the range the model was trained for.
+        unit: of the cloud's numbers.
+        intrinsics: JSON with width, height, fx, fy, cx, cy in pixels.
+        map: points of the CT, to be found before the camera (OUT/points.csv): a .csv with columns
+            x,y,z (LPS, mm), or 3D Slicer's .mrk.json or .fcsv. Needs a model of preset clinic.
+        device: auto takes CUDA where it is.
+        overwrite: replace OUT if it exists.
+    """
+
+    model: Positional[Path]
+    cloud: Positional[Path]
+    out: Positional[Path]
+    grid: int = 160
+    seed: int = 0
+    range: tuple[float, float] | None = None
+    unit: Literal["mm", "m"] = "mm"
+    intrinsics: Path | None = None
+    map: Path | None = None
+    device: Device = "auto"
+    overwrite: bool = False
+
+    def run(self) -> None:
+        """One cloud or depth image -> run folder."""
+        _check_grid(self.grid)
+        store.check_place(self.out, "run", self.overwrite)
+        points = self._points()
+        seen, notes = self._read()  # report what is wrong so far before PyTorch's seconds
+
+        from tumortrack.tracking.files import write_estimate
+        from tumortrack.tracking.points import check_near_organ
+        from tumortrack.tracking.tracker import Tracker
+        from tumortrack.training.model import load_model
+
+        keep_loaded()
+        model = load_model(self.model, self.device)
+        tracker, notes = Tracker(model), (*notes, *model.notes)
+        if points is not None:
+            assert tracker.anatomy_ct is not None  # a model with a shape
+            box_mm = tracker.anatomy_ct.organ.box_mm
+            far = check_near_organ(points.points_ct, box_mm, str(self.map))
+            points = replace(points, notes=(*points.notes, *far))
+        cloud = self._cropped(seen, model.config.scene.cloud)
+        estimate = tracker.locate(cloud, self.grid, self.seed)
+        if points is not None and self.map is not None:
+            notes = (*notes, *points.notes)
+            estimate.report["map"] = {
+                "points": len(points.points_ct),
+                "from": "lps",
+                "to": "camera",
+                "sha256": store.sha256_of(self.map),
+            }
+        estimate.report.update(
+            notes=list(notes),
+            model=model.provenance,
+            model_sha256=store.sha256_of(self.model / store.MANIFEST),
+            cloud_sha256=store.sha256_of(self.cloud),
+        )
+        write_estimate(self.out, estimate, self.overwrite, points)
+        say_notes(notes)
+        for name, part in estimate.report["parts"].items():
+            if part["found"]:
+                x, y, z = part["center_mm"]
+                say(f"{name}: {part['volume_ml']:.1f} ml, centre ({x:.1f}, {y:.1f}, {z:.1f}) mm")
+            else:
+                say(f"{name}: not found")
+        if points is not None:
+            count, file = len(points.points_ct), self.out / "points.csv"
+            say(f"{count} points of the CT: their places are in {file}")
+        seconds = estimate.report["timings"]["total"]
+        say(f"written to {self.out} (camera frame, mm) in {seconds:.2f} s.")
+
+    def _points(self) -> PointTable | None:
+        """The points of --map; model and points are checked before there is anything to wait
+        for."""
+        from tumortrack.models.folder import has_shape, read_model_manifest
+        from tumortrack.tracking.points import read_points
+
+        manifest = read_model_manifest(self.model)
+        if self.map is None:
+            return None
+        if not has_shape(manifest):
+            raise InputError(
+                f"--map: {self.model} says what is where, but not which point of the CT lies "
+                "there. A model of the preset clinic knows: tumortrack train CASE MODEL --preset "
+                "clinic."
+            )
+        return read_points(self.map)
+
+    def _read(self) -> tuple[SensorCloud | DepthFrame, tuple[str, ...]]:
+        """What the file holds, and notes."""
+        from tumortrack.sense.cloud import check_cloud
+        from tumortrack.sense.files import read_cloud, read_depth_png
+
+        if self.cloud.suffix.lower() == ".png":
+            if self.intrinsics is None:
+                raise InputError(
+                    f"{self.cloud} is a depth image: give --intrinsics FILE.json with it."
+                )
+            if self.unit != "mm":
+                raise InputError(
+                    "--unit is for clouds; a depth image's unit stands in its intrinsics file as "
+                    "depth_unit_mm (mm per step)."
+                )
+            return read_depth_png(self.cloud, self.intrinsics), ()
+        if self.intrinsics is not None:
+            raise InputError(f"--intrinsics is for depth images (.png); {self.cloud} is a cloud.")
+        cloud, notes = read_cloud(self.cloud, self.unit)
+        check_cloud(cloud)  # before the crop, which would only say that nothing lies in range
+        return cloud, notes
+
+    def _cropped(self, seen: SensorCloud | DepthFrame, trained: CloudConfig) -> SensorCloud:
+        import numpy as np
+
+        from tumortrack.core.types import SensorCloud
+        from tumortrack.sense.cloud import CloudConfig, cloud_from_depth, crop_cloud
+
+        near, far = self.range or (trained.near_mm, trained.far_mm)
+        if isinstance(seen, SensorCloud):
+            return crop_cloud(seen, near, far) if self.range else seen
+        crop = CloudConfig(near_mm=near, far_mm=far, n_points=trained.n_points)
+        return cloud_from_depth(seen, crop, np.random.default_rng(self.seed))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Evaluate:
+    """Locate in every scene of a folder and compare with the truth.
+
+    Attributes:
+        model: folder that `train` wrote.
+        variants: folder of scene folders.
+        report: folder to write: report.json, index.html, pictures.
+        grid: voxels along the longest side of the labelled volume.
+        seed: of the random points and queries.
+        device: auto takes CUDA where it is.
+    """
+
+    model: Positional[Path]
+    variants: Positional[Path]
+    report: Positional[Path]
+    grid: int = 160
+    seed: int = 0
+    device: Device = "auto"
+
+    def run(self) -> None:
+        """Model x scenes -> report folder."""
+        from tumortrack.models.folder import read_model_manifest
+        from tumortrack.simulate.scene_folder import list_scenes
+
+        _check_grid(self.grid)
+        if (self.report / store.MANIFEST).exists():
+            raise InputError(
+                f"{self.report} is a case, model or run; choose another REPORT folder."
+            )
+        read_model_manifest(self.model)
+        folders = list_scenes(self.variants)  # report what is wrong before PyTorch's seconds
+
+        from tumortrack.report.protocol import evaluate_scenes, summary_table
+        from tumortrack.tracking.tracker import Tracker
+        from tumortrack.training.model import load_model
+
+        keep_loaded()
+        model = load_model(self.model, self.device)
+        check_case(model, folders)
+        about = {
+            "model": model.provenance,
+            "model_sha256": store.sha256_of(self.model / store.MANIFEST),
+            "scenes_folder": str(self.variants),
+            "grid": self.grid,
+            "seed": self.seed,
+        }
+        tracker = Tracker(model)
+        say_notes(model.notes)
+        with progress_bar("evaluate", len(folders)) as advance:
+            result = evaluate_scenes(
+                lambda cloud: tracker.locate(cloud, self.grid, self.seed),
+                self.variants,
+                self.report,
+                progress=lambda *_: advance(),
+                about=about,
+            )
+        console.print(summary_table(result))
+        say(f"written to {self.report / 'report.json'}; look at {self.report / 'index.html'}.")
+
+
+def check_case(model: Model, folders: list[Path]) -> None:
+    """Refuse scenes that are known to show another anatomy than the model's.
+
+    Scenes of other programs do not say which case they show; they pass.
+
+    Raises:
+        InputError: a scene that `simulate` made of another case.
+    """
+    wanted = model.provenance.get("case_sha256")
+    for folder in folders:
+        path = folder / "meta.json"
+        stated = store.read_json(path).get("case_sha256") if path.is_file() else None
+        if wanted is not None and stated is not None and stated != wanted:
+            raise InputError(
+                f"{folder} shows another case than the one this model was trained for, so the "
+                "figures would mean nothing. Make scenes of the model's own case with: "
+                "tumortrack simulate CASE DATASET."
+            )
+
+
+def _check_grid(grid: int) -> None:
+    from tumortrack.core.estimate import LARGEST_GRID
+
+    if not 8 <= grid <= LARGEST_GRID:
+        raise InputError(f"--grid {grid} is not allowed; choose 8 to {LARGEST_GRID}.")

@@ -1,0 +1,217 @@
+"""`plan`: a run -> strokes, motions of two arms, pictures."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+from tyro.conf import Positional
+
+from tumortrack.cli.console import say, say_notes
+from tumortrack.core import store
+from tumortrack.core.errors import InputError, NoPlan
+
+if TYPE_CHECKING:
+    import numpy as np
+    from jaxtyping import Float64
+
+    from tumortrack.core.types import Mesh
+    from tumortrack.plan.arms.config import CellConfig
+    from tumortrack.plan.config import ResectionConfig
+    from tumortrack.plan.located import LocatedRun
+    from tumortrack.plan.values import Located, ResectionPlan
+
+
+@dataclass(frozen=True, kw_only=True)
+class Plan:
+    """Plan how to cut a located tumor out, and how two arms do it.
+
+    Attributes:
+        run_folder: folder that `locate` wrote.
+        plan: folder to write: plan.json, strokes.ply, plan.png, motions, the cell as URDF.
+        method: margin (default) keeps the margin in all directions; published is the paper's
+            planner.
+        tumor: which one (tumor_1, ...; default: the one that lies farthest out of the organ).
+        margin: least distance between tumor and cut in mm (default 5).
+        sigmas: add so many standard deviations of the estimate's own uncertainty to the margin
+            (default 0).
+        config: JSON file with these and all other choices of the planner (docs/resection.md).
+        frame: JSON file that says where the camera is; the plan is then in the robot's frame, whose
+            z must point up. Without, the camera looks straight down.
+        stand: height of the organ's lowest point over the table in mm, where no frame is given.
+        cell: JSON file with arms, tools, table and their places (docs/resection.md).
+        arms: also plan the motions of both arms.
+        overwrite: replace PLAN if it exists.
+    """
+
+    run_folder: Positional[Path]
+    plan: Positional[Path]
+    method: Literal["margin", "published"] | None = None
+    tumor: str | None = None
+    margin: float | None = None
+    sigmas: float | None = None
+    config: Path | None = None
+    frame: Path | None = None
+    stand: float | None = None
+    cell: Path | None = None
+    arms: bool = True
+    overwrite: bool = False
+
+    def run(self) -> None:
+        """A run -> strokes, motions, pictures."""
+        from tumortrack.core.config import to_builtins
+        from tumortrack.plan.files import KIND, PlanFolder, write_plan
+        from tumortrack.plan.located import read_run
+        from tumortrack.plan.resection import plan_resection
+        from tumortrack.report.plan_pictures import draw_plan
+
+        config = self._resection_config()
+        store.check_place(self.plan, KIND, self.overwrite)
+        cell_config = self._cell_config()
+        if self.arms:
+            check_arms_installed()
+        run = read_run(self.run_folder)
+        frame_id, table_from_camera = self._frame(run, cell_config.stand_mm)
+        located = run.located(table_from_camera)
+        if self.arms:
+            cell_config = _below(_organ_of(located), cell_config)
+        resection = plan_resection(located, config)
+        _say_plan(resection)
+        motions, cell_used = None, None
+        if self.arms:
+            from tumortrack.plan.arms.procedure import search_bases
+
+            start = time.perf_counter()
+            placed, motions, moved = search_bases(resection, cell_config, _organ_of(located))
+            cell_used = to_builtins(placed.config)
+            say(
+                f"arms: {len(motions.stages)} stages, {motions.seconds:.0f} s; planned in "
+                f"{time.perf_counter() - start:.1f} s."
+            )
+            if moved:
+                say(f"note: {moved}")
+        content = PlanFolder(
+            resection,
+            config,
+            table_from_camera,
+            frame_id,
+            located.meshes,
+            cell_used,
+            motions,
+            _case_of(self.run_folder),
+        )
+
+        def pictures(aside: Path) -> None:
+            draw_plan(resection, located, aside / "plan.png")
+            if self.arms:
+                from tumortrack.plan.arms.urdf import cell_urdf
+
+                store.write_atomically(aside / "cell.urdf", cell_urdf(placed.config).encode())
+
+        digest = store.sha256_of(self.run_folder / store.MANIFEST)
+        write_plan(self.plan, content, {"run": digest}, pictures, self.overwrite)
+        say(f"written to {self.plan} (frame {frame_id!r}, mm); look at {self.plan / 'plan.png'}.")
+
+    def _resection_config(self) -> ResectionConfig:
+        """What the file says, and over that what was given on the command line."""
+        from tumortrack.core.config import from_builtins
+        from tumortrack.plan.config import ResectionConfig
+
+        written = {} if self.config is None else store.read_json(self.config)
+        options = {
+            "method": self.method,
+            "tumor": self.tumor,
+            "margin_mm": self.margin,
+            "sigmas": self.sigmas,
+        }
+        given = {key: value for key, value in options.items() if value is not None}
+        return from_builtins({**written, **given}, ResectionConfig, str(self.config or "options"))
+
+    def _cell_config(self) -> CellConfig:
+        import msgspec
+
+        from tumortrack.core.config import from_builtins
+        from tumortrack.plan.arms.config import CellConfig
+
+        config = CellConfig()
+        if self.cell is not None:
+            config = from_builtins(store.read_json(self.cell), CellConfig, str(self.cell))
+        if self.stand is not None:
+            config = msgspec.structs.replace(config, stand_mm=self.stand)
+        return config
+
+    def _frame(self, run: LocatedRun, stand_mm: float) -> tuple[str, Float64[np.ndarray, "4 4"]]:
+        """Frame id and ``table_from_camera``: of the calibration, or of a camera that looks
+        down."""
+        from tumortrack.live.calibration_file import read_frames
+        from tumortrack.plan.located import table_below
+
+        if self.frame is None:
+            kidney = run.meshes.get("kidney")
+            points_mm = run.cloud.points_mm if kidney is None else kidney.vertices_mm
+            return "table", table_below(points_mm, stand_mm)
+        frames = read_frames(self.frame)
+        if frames.published_from_camera[2, 2] >= 0:  # cuts are planned from above
+            raise InputError(
+                f"{self.frame}: the camera looks up in this frame (its z axis does not point up, "
+                "against gravity), so 'above' would be behind the organ. Give a frame whose z "
+                "points up."
+            )
+        if self.arms and self.cell is None:
+            raise InputError(
+                "--frame: where do the arms stand in that frame? Say it with --cell FILE "
+                "(docs/resection.md), or plan the cuts alone with --no-arms."
+            )
+        return frames.frame_id, frames.published_from_camera
+
+
+def check_arms_installed() -> None:
+    """Raises InputError where a library that motions need is missing."""
+    needed = ("pinocchio", "coal", "toppra", "ruckig", "ur_analytic_ik")
+    if missing := [name for name in needed if find_spec(name) is None]:
+        raise InputError(f"arms need {', '.join(missing)}: pip install 'tumortrack[arms]'.")
+
+
+def _organ_of(located: Located) -> Mesh:
+    """The organ's surface, which arms must not touch.
+
+    Raises:
+        NoPlan: the run has none.
+    """
+    if "kidney" not in located.meshes:
+        raise NoPlan("the run has no kidney.ply, so arms can't keep clear of it; give --no-arms.")
+    return located.meshes["kidney"]
+
+
+def _below(organ: Mesh, config: CellConfig) -> CellConfig:
+    """The table below the organ, unless the cell's file says where it is."""
+    import msgspec
+
+    if any(config.middle_mm):
+        return config
+    x, y = organ.box_mm.mean(0)[:2].tolist()
+    middle_mm = (x, y, float(organ.box_mm[0, 2]) - config.stand_mm)
+    return msgspec.structs.replace(config, middle_mm=middle_mm)
+
+
+def _case_of(run_folder: Path) -> str:
+    model = store.read_json(run_folder / "report.json").get("model")
+    return str(model.get("case_sha256", "")) if isinstance(model, dict) else ""
+
+
+def _say_plan(resection: ResectionPlan) -> None:
+    volumes = resection.volumes_ml
+    say(
+        f"{resection.tumor} ({volumes['tumor']:.1f} ml, {resection.exophytic:.0%} outside the "
+        f"organ's hull): {len(resection.cuts)} strokes in {resection.sweeps} sweeps, "
+        f"{sum(cut.length_mm for cut in resection.cuts):.0f} mm."
+    )
+    say(
+        f"margin {resection.margin_mm:g} mm; {volumes['piece']:.1f} ml come away, of that "
+        f"{volumes['healthy']:.1f} ml healthy tissue "
+        f"({volumes['healthy'] / volumes['parenchyma']:.0%} of the organ's)."
+    )
+    say_notes(resection.notes)

@@ -1,0 +1,383 @@
+"""`track`: source -> loop -> sinks, and what the user sees of it."""
+
+from __future__ import annotations
+
+import signal
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from tyro.conf import Positional
+
+from tumortrack.cli.console import Device, console, keep_loaded, say, say_notes
+from tumortrack.core import store
+from tumortrack.core.errors import InputError, StorageError
+
+if TYPE_CHECKING:
+    from tumortrack.core.types import Anatomy
+    from tumortrack.live.loop import Loop, LoopConfig
+    from tumortrack.live.sink_worker import SinkWorker
+    from tumortrack.live.source_worker import SourceWorker
+    from tumortrack.live.values import PublishedFrame, SinkConfig, SinkContext, TrackingResult
+    from tumortrack.models.config import TrainConfig
+    from tumortrack.plan.operation import Operation
+    from tumortrack.sense.region import RegionConfig
+
+_SAY_S, _SAY_PLAIN_S = 1.0, 5.0  # between two lines of state: on a terminal, in a file
+STOPPED = "stopped by the user"  # why arms stand
+_ENDS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+_SETTLED_S = 60.0  # by then all buffers have their size: memory that grows on is a leak
+_STORE_S = 10.0  # between two writings of the report: kill -9 loses no more
+
+
+@dataclass(frozen=True, eq=False)
+class Arms:
+    """Arms that act on what is tracked, and the frame in which everything is then published."""
+
+    companion: Operation
+    frames: PublishedFrame
+    about: dict
+
+
+@dataclass(frozen=True, kw_only=True)
+class Track:
+    """Follow kidney and tumors live, from a camera to viewers, recordings and robots.
+
+    Sources and sinks are written kind:target?option=value&option=value. Sources: virtual:CASE,
+    recording:PATH, realsense[:SERIAL|FILE], ros2:TOPIC, ros1:TOPIC. Sinks: viewer[:PORT],
+    recording:FOLDER, ros2[:TOPIC], ros1[:TOPIC], openigtlink[:PORT]. A wrong one is answered with
+    its options. docs/live.md has examples.
+
+    Attributes:
+        model: folder that `train` wrote.
+        source: where frames come from.
+        sinks: where estimates go; any number.
+        range: keep depths between NEAR and FAR mm (default: those that the model has learned).
+        box: keep what lies in a box: two opposite corners X Y Z X Y Z, camera frame, mm.
+        whole: what is in range and box is the organ alone; do not look for it among other things.
+        frame: JSON file that says where the camera is; results are then in the robot's frame.
+        intrinsics: JSON with the camera's width, height, fx, fy, cx, cy in pixels, instead of what
+            the source says.
+        smoothing: time constant in s of a mean over past estimates; the lag is in the report.
+        rescan: every so many s, look for the organ as in a first frame.
+        stale: frames older than so many s are refused, and a pause so long is said.
+        give_up: end after so many s without a frame.
+        seconds: end so many s after the first frame; 0: never.
+        report: file for latencies, counts and reasons (default: runs/track-TIME.json).
+        seed: of the random points.
+        device: auto takes CUDA where it is.
+    """
+
+    model: Positional[Path]
+    source: Positional[str]
+    sinks: Positional[tuple[str, ...]] = ()
+    range: tuple[float, float] | None = None
+    box: tuple[float, float, float, float, float, float] | None = None
+    whole: bool = False
+    frame: Path | None = None
+    intrinsics: Path | None = None
+    smoothing: float = 0.0
+    rescan: float = 1.0
+    stale: float = 0.5
+    give_up: float = 60.0
+    seconds: float = 0.0
+    report: Path | None = None
+    seed: int = 0
+    device: Device = "auto"
+
+    def run(self, arms: Arms | None = None) -> None:
+        """Until the source ends, the time is up, the arms have ended, or Ctrl-C."""
+        from tumortrack.core.config import to_builtins
+        from tumortrack.live.calibration_file import read_frames
+        from tumortrack.live.spec import SOURCES
+        from tumortrack.live.values import Controls, PublishedFrame, SinkContext
+        from tumortrack.models.folder import read_model_manifest
+
+        source_config = SOURCES.parse(self.source)
+        sink_configs = parse_sinks(self.sinks)
+        frames = read_frames(self.frame) if self.frame else PublishedFrame()
+        if arms is not None:
+            frames = arms.frames
+        read_model_manifest(self.model)  # report what is wrong before PyTorch's seconds
+        report = report_path(self.report, "track")
+
+        from tumortrack.live.loop import Loop
+        from tumortrack.live.source_worker import SourceWorker
+        from tumortrack.tracking.tracker import Tracker
+        from tumortrack.training.model import load_model
+
+        if arms is None:
+            keep_loaded()
+        model = load_model(self.model, self.device)
+        say_notes(model.notes)
+        tracker = Tracker(model)
+        config = self._loop_config(model.config, tracker.anatomy_ct)
+        context = SinkContext(model.parts, frames, tracker.anatomy_ct, Controls(), arms is not None)
+        companion = None if arms is None else arms.companion
+        loop = Loop(tracker, context, config, companion)
+
+        def stop() -> None:
+            if companion is not None:
+                companion.abort(STOPPED)
+            loop.stop()
+
+        say("warming up ...")
+        loop.warm()
+        with stopping(stop), ExitStack() as ending, ExitStack() as workers:
+            sinks = open_sinks(self.sinks, sink_configs, context, workers)
+            source = SourceWorker(source_config.open)
+            workers.callback(source.close)
+            about = {
+                "model": model.provenance,
+                "notes": list(model.notes),
+                "model_sha256": store.sha256_of(self.model / store.MANIFEST),
+                "source": self.source,
+                "sinks": list(self.sinks),
+                "config": to_builtins(config),
+                "frame": {
+                    "frame_id": frames.frame_id,
+                    "published_from_camera": frames.published_from_camera.tolist(),
+                },
+                **({} if arms is None else arms.about),
+            }
+            screen = _Screen(loop, source, sinks, report, about, companion)
+            ending.callback(screen.end)  # once all workers have flushed
+            say(f"tracking {self.source} in frame {frames.frame_id!r}; Ctrl-C ends it.")
+            loop.run(source, sinks, screen.show)
+
+    def _loop_config(self, trained: TrainConfig, anatomy_ct: Anatomy | None) -> LoopConfig:
+        from tumortrack.live.loop import LoopConfig
+        from tumortrack.sense.files import read_intrinsics
+        from tumortrack.tracking.tracker import FollowerConfig
+
+        return LoopConfig(
+            region=self._region(trained, anatomy_ct),
+            follower=FollowerConfig(
+                rescan_s=self.rescan, smoothing_s=self.smoothing, seed=self.seed
+            ),
+            intrinsics=None if self.intrinsics is None else read_intrinsics(self.intrinsics),
+            stale_s=self.stale,
+            give_up_s=self.give_up,
+            seconds=self.seconds,
+        )
+
+    def _region(self, trained: TrainConfig, anatomy_ct: Anatomy | None) -> RegionConfig:
+        """Depths that training showed, unless the user says others; where it showed any distance,
+        its farthest organ still lies in them whole. Pieces of about the organ's size, if that is
+        known."""
+        import numpy as np
+
+        from tumortrack.sense.cloud import CloudConfig
+        from tumortrack.sense.region import RegionConfig
+
+        scene = trained.scene
+        near, far = scene.cloud.near_mm, scene.cloud.far_mm
+        if scene.free_range > 0:
+            nearest, farthest = scene.free_nearest_mm
+            near, far = min(near, nearest - 5), max(far, farthest + far - near)
+        if self.range is not None:
+            near, far = self.range
+        crop = CloudConfig(near_mm=near, far_mm=far, n_points=scene.cloud.n_points)
+        box = None
+        if self.box is not None:
+            ax, ay, az, bx, by, bz = self.box
+            box = ((ax, ay, az), (bx, by, bz))
+        if self.whole:
+            return RegionConfig(crop=crop, box_mm=box, plane=False, flying=False, pieces=False)
+        if anatomy_ct is None:
+            return RegionConfig(crop=crop, box_mm=box)
+        vertices = anatomy_ct.organ.vertices_mm
+        axes = np.linalg.svd(vertices - vertices.mean(0), full_matrices=False)[2]
+        extents_mm = np.ptp(vertices @ axes.T, axis=0)
+        size_mm = (0.7 * float(extents_mm.min()), 1.25 * float(extents_mm.max()))
+        return RegionConfig(crop=crop, box_mm=box, organ_mm=size_mm)
+
+
+def parse_sinks(sinks: tuple[str, ...]) -> list[SinkConfig]:
+    """Configurations of what was written on the command line."""
+    from tumortrack.live.spec import SINKS
+
+    configs = [SINKS.parse(sink) for sink in sinks]
+    if doubled := sorted({sink for sink in sinks if sinks.count(sink) > 1}):
+        raise InputError(f"sink {doubled[0]!r} is given twice.")
+    return configs
+
+
+def open_sinks(
+    sinks: tuple[str, ...], configs: list[SinkConfig], context: SinkContext, stack: ExitStack
+) -> list[SinkWorker]:
+    """Each at work in a thread of its own, until the stack ends."""
+    from tumortrack.live.sink_worker import SinkWorker
+
+    workers = []
+    # Those that make a folder last: if another cannot open, none is left behind.
+    pairs = zip(sinks, configs, strict=True)
+    for spec, config in sorted(pairs, key=lambda pair: pair[1].queue_size):
+        worker = SinkWorker(spec, config.open(context), config.queue_size)
+        stack.callback(worker.close)
+        workers.append(worker)
+    return workers
+
+
+def say_failures(sinks: list[SinkWorker], known: dict[str, str]) -> None:
+    """The error of each failing sink, unless it is ``known``, where it is then kept."""
+    for sink in sinks:
+        if sink.failing and known.get(sink.name) != sink.error:
+            known[sink.name] = sink.error
+            say(f"sink {sink.name}: {sink.error}")
+
+
+def check_closed(sinks: list[SinkWorker]) -> None:
+    """Raises StorageError where a sink failed at its end."""
+    if lost := [sink for sink in sinks if sink.unclosed]:
+        raise StorageError(f"sink {lost[0].name} did not end well: {lost[0].error}.")
+
+
+def report_path(path: Path | None, command: str) -> Path:
+    """Where the report goes; its folder is made."""
+    if path is None:
+        path = Path("runs") / f"{command}-{datetime.now(UTC):%Y%m%dT%H%M%SZ}.json"
+    elif path.exists():
+        raise InputError(f"{path} exists already. Choose another file for --report.")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"--report {path}: {error.strerror}.") from error
+    return path
+
+
+@contextmanager
+def stopping(end: Callable[[], None]) -> Iterator[None]:
+    """Ctrl-C, SIGTERM and a terminal that goes call ``end``, which lets the loop end after the
+    frame it is at, and sinks flush; a second Ctrl-C interrupts."""
+
+    def stop(number: int, _: object) -> None:
+        end()
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+
+    before = {number: signal.signal(number, stop) for number in _ENDS}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+class _Screen:
+    """One line of state now and then, every change of quality, and the report."""
+
+    def __init__(
+        self,
+        loop: Loop,
+        source: SourceWorker,
+        sinks: list[SinkWorker],
+        report: Path,
+        about: dict,
+        arms: Operation | None,
+    ) -> None:
+        self._loop, self._source, self._sinks = loop, source, sinks
+        self._report, self._about, self._arms = report, about, arms
+        self._started = self._shown = self._stored = time.monotonic()
+        self._before = 0
+        self._state, self._changed = "", 0.0
+        self._unwritten = ""
+        self._errors: dict[str, str] = {}
+        self._memory_mb = {"start": round(_resident_mb(), 1)}
+
+    def show(self, result: TrackingResult) -> None:
+        """Called with every result."""
+        state = result.reason or result.warning or "good"
+        kind = _without_digits(state)
+        if (cell := result.workcell) is not None:
+            state += f"; arms: {cell.state}" + (f" ({cell.halted})" if cell.halted else "")
+            kind += cell.state + _without_digits(cell.halted)
+        now = time.monotonic()
+        if kind != self._state and now - self._changed >= _SAY_S:
+            self._state, self._changed = kind, now
+            say(f"{result.quality}: {state}")
+        say_failures(self._sinks, self._errors)
+        if now - self._shown >= (_SAY_S if console.is_terminal else _SAY_PLAIN_S):
+            self._line(now)
+        if now - self._stored >= _STORE_S:
+            self._store()
+
+    def end(self) -> None:
+        """The last lines."""
+        source, loop = self._source, self._loop
+        self._store()
+        counts, latency = loop.statistics.counts, loop.statistics.latency
+        say(
+            f"{counts['good'] + counts['poor']} estimates ({counts['poor']} poor), "
+            f"{counts['none']} times none, {source.dropped} frames dropped."
+        )
+        if len(latency):
+            times = latency.summary()
+            say(
+                f"latency from {source.latency_from} to published estimate: p50 "
+                f"{times['p50']:.1f}, p95 {times['p95']:.1f}, p99.9 {times['p99.9']:.1f} ms."
+            )
+        for sink in self._sinks:
+            if sink.dropped or sink.errors:
+                last = f"; the last: {sink.error}" if sink.error else ""
+                say(f"sink {sink.name}: {sink.dropped} missed, {sink.errors} errors{last}.")
+        for name, errors in loop.statistics.errors.items():
+            off = errors.summary()
+            say(f"{name}: centre off by {off['p50']:.1f} mm (median; 95 %: {off['p95']:.1f} mm).")
+        if not self._unwritten:
+            say(f"written to {self._report}.")
+        check_closed(self._sinks)
+
+    def _line(self, now: float) -> None:
+        total = sum(self._loop.statistics.counts.values())
+        rate = (total - self._before) / (now - self._shown)
+        self._before, self._shown = total, now
+        latency = self._loop.statistics.latency
+        if not len(latency):
+            return
+        say(
+            f"{now - self._started:6.0f} s  {rate:5.1f} updates/s  latency p50 "
+            f"{latency.percentile(50):.1f} p95 {latency.percentile(95):.1f} ms  "
+            f"dropped {self._source.dropped}  {_resident_mb():.0f} MB"
+        )
+
+    def _store(self) -> None:
+        from tumortrack.live.loop import summary
+
+        self._stored = time.monotonic()
+        now_mb = round(_resident_mb(), 1)
+        self._memory_mb["now"] = now_mb
+        if self._stored - self._started > _SETTLED_S:
+            self._memory_mb.setdefault("settled", now_mb)
+        content = {
+            **self._about,
+            "seconds": round(self._stored - self._started, 2),
+            "memory_mb": self._memory_mb,
+            **summary(self._loop, self._source, self._sinks),
+            **({} if self._arms is None else {"resection": self._arms.summary()}),
+        }
+        try:
+            store.write_json(self._report, content)
+            self._unwritten = ""
+        except StorageError as error:  # a full disk must not end what is seen live
+            if not self._unwritten:
+                say(f"report: {error}")
+            self._unwritten = str(error)
+
+
+def _without_digits(text: str) -> str:
+    return "".join(character for character in text if not character.isdigit())
+
+
+def _resident_mb() -> float:
+    """Memory of this process now, or its peak so far where the system offers no more."""
+    import resource
+
+    try:
+        pages = int(Path("/proc/self/statm").read_text().split()[1])
+    except OSError:
+        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    return pages * resource.getpagesize() / 2**20

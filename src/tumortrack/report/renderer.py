@@ -1,0 +1,310 @@
+"""Shaded pictures of meshes without a display: stills in mm, and the frames of a film.
+
+A z-buffer in perspective or parallel, normals that are smooth but for creases, one light, shadows
+on bodies that ask for them, and translucent bodies over the opaque ones. (matplotlib's own 3-D
+surfaces sort triangles by their middle, which shows tumors in front of the organ that hides them.)
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from weakref import WeakKeyDictionary
+
+import numpy as np
+from jaxtyping import Float, Float32, UInt8
+
+from tumortrack.core.colours import Colour
+from tumortrack.core.geometry import transform_points
+from tumortrack.core.types import Mesh
+from tumortrack.report.renderer_kernels import Hits, Light, Triangles, crease, nearest, shade
+
+_SHARPER = 2  # pixels drawn per pixel shown, each way: smooth edges
+_CREASE = np.cos(np.radians(40.0))  # faces that meet at a sharper angle keep their edge
+_WORLD_LIGHT = np.array([-0.42, -0.5, 1.0])  # towards it: from the left, the front and above
+_VIEW_LIGHT = np.array([-0.35, -0.55, -1.0])  # right, down, away: over the viewer's left shoulder
+_SHADOW_PIXELS = 1024
+_SAME_MM = 0.6  # a translucent surface that close over an opaque one is the same one
+_FAR_MM = 10_000.0  # the viewer of a parallel view
+
+RGB = tuple[float, float, float]  # each in 0..1
+WHITE: RGB = (1.0, 1.0, 1.0)
+
+
+def rgb(colour: Colour) -> RGB:
+    """The same in 0..1."""
+    red, green, blue = (value / 255 for value in colour)
+    return red, green, blue
+
+
+@dataclass(frozen=True, eq=False)
+class Body:
+    """A surface somewhere in the world.
+
+    ``opacity``: where seen face on; edges are denser. ``shadowed``: whether others cast shadows
+    on it.
+    """
+
+    mesh: Mesh
+    color: RGB
+    opacity: float = 1.0
+    world_from_mesh: Float[np.ndarray, "4 4"] | None = None
+    shadowed: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class Viewpoint:
+    """From where one looks; world frame, mm.
+
+    Attributes:
+        axes: rows right, down and forward in the world.
+        distance_mm: to the plane that the picture's width spans ``width_mm`` of.
+        light: towards it; ``up``: where the rest of the light comes from.
+        parallel: without perspective.
+        before_mm: what is nearer to the viewer than that plane by more is not shown.
+    """
+
+    place_mm: Float[np.ndarray, " 3"]
+    axes: Float[np.ndarray, "3 3"]
+    distance_mm: float
+    width_mm: float
+    light: Float[np.ndarray, " 3"]
+    up: Float[np.ndarray, " 3"]
+    parallel: bool = False
+    before_mm: float = np.inf
+
+    @staticmethod
+    def towards(
+        target_mm: Float[np.ndarray, " 3"],
+        place_mm: Float[np.ndarray, " 3"],
+        width_mm: float,
+        parallel: bool = False,
+        before_mm: float = np.inf,
+    ) -> Viewpoint:
+        """Of a viewer who stands upright in a world whose z points up."""
+        distance_mm = float(np.linalg.norm(target_mm - place_mm))
+        forward = (target_mm - place_mm) / distance_mm
+        right = np.cross(forward, [0.0, 0.0, 1.0])
+        right /= np.linalg.norm(right)
+        axes = np.stack([right, np.cross(forward, right), forward])
+        light = _WORLD_LIGHT / np.linalg.norm(_WORLD_LIGHT)
+        up = np.array([0.0, 0.0, 1.0])
+        return Viewpoint(place_mm, axes, distance_mm, width_mm, light, up, parallel, before_mm)
+
+    def project(
+        self, points_mm: Float[np.ndarray, "*n 3"], size: tuple[int, int]
+    ) -> Float[np.ndarray, "*n 3"]:
+        """Column, row and nearness (greater is nearer, linear in the picture) of points.
+
+        Nearness is 1/distance along the axis in perspective, not above 0 behind the viewer; minus
+        the distance in parallel.
+        """
+        x, y, z = np.moveaxis((points_mm - self.place_mm) @ self.axes.T, -1, 0)
+        width, height = size
+        near = -z if self.parallel else 1 / np.where(np.abs(z) < 1e-6, 1e-6, z)
+        scale = width / self.width_mm * (1.0 if self.parallel else self.distance_mm * near)
+        middle = (width - 1) / 2, (height - 1) / 2
+        return np.stack([scale * x + middle[0], scale * y + middle[1], near], axis=-1)
+
+    @property
+    def limit(self) -> float:
+        """The greatest nearness shown."""
+        distance = max(self.distance_mm - self.before_mm, 1.0)
+        return -distance if self.parallel else 1 / distance
+
+
+@dataclass(frozen=True)
+class Frame:
+    """What part of a parallel view is shown: left, right, top, bottom in mm along right, down."""
+
+    left: float
+    right: float
+    top: float
+    bottom: float
+
+    @property
+    def extent(self) -> tuple[float, float, float, float]:
+        """As matplotlib's imshow wants it, down pointing down."""
+        return (self.left, self.right, self.bottom, self.top)
+
+    def size(self, pixel_mm: float) -> tuple[int, int]:
+        """Width and height in pixels."""
+        width = int(np.ceil((self.right - self.left) / pixel_mm))
+        height = int(np.ceil((self.bottom - self.top) / pixel_mm))
+        return max(width, 1), max(height, 1)
+
+    def pixel_centres(self, pixel_mm: float = 0.25) -> tuple[np.ndarray, np.ndarray]:
+        """Positions along right (w,) and down (h,) of the pixels of a picture of it, mm."""
+        width, height = self.size(pixel_mm)
+        return (
+            self.left + (np.arange(width) + 0.5) * pixel_mm,
+            self.top + (np.arange(height) + 0.5) * pixel_mm,
+        )
+
+    def widened(self, aspect: float) -> Frame:
+        """The smallest about the same middle with width = aspect * height that holds this one."""
+        half_height = max(self.bottom - self.top, (self.right - self.left) / aspect) / 2
+        half_width = aspect * half_height
+        x, y = (self.left + self.right) / 2, (self.top + self.bottom) / 2
+        return Frame(x - half_width, x + half_width, y - half_height, y + half_height)
+
+
+@dataclass(frozen=True)
+class ParallelView:
+    """A parallel projection: unit vectors of the picture's right and down in the data's frame."""
+
+    name: str
+    right: tuple[float, float, float]
+    down: tuple[float, float, float]
+
+    @property
+    def axes(self) -> Float[np.ndarray, "3 3"]:
+        """Rows right, down and away from the viewer."""
+        return np.stack([self.right, self.down, np.cross(self.right, self.down)]).astype(float)
+
+    def project(self, points_mm: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+        """(right, down, depth away from the viewer) of each point, mm."""
+        return points_mm @ self.axes.T
+
+    def frame_around(self, points_mm: Float[np.ndarray, "n 3"], margin_mm: float = 5.0) -> Frame:
+        """The frame that shows all these points."""
+        flat = self.project(points_mm)
+        low, high = flat.min(0) - margin_mm, flat.max(0) + margin_mm
+        return Frame(float(low[0]), float(high[0]), float(low[1]), float(high[1]))
+
+    def viewpoint(self, frame: Frame, pixel_mm: float) -> Viewpoint:
+        """From where ``frame.size(pixel_mm)`` pixels show the frame."""
+        half = np.array(frame.size(pixel_mm)) * pixel_mm / 2
+        axes = self.axes
+        place_mm = np.array([frame.left + half[0], frame.top + half[1], -_FAR_MM]) @ axes
+        light = _VIEW_LIGHT @ axes / np.linalg.norm(_VIEW_LIGHT)
+        return Viewpoint(place_mm, axes, _FAR_MM, 2 * half[0], light, -axes[2], parallel=True)
+
+    def draw(
+        self, bodies: list[Body], frame: Frame, pixel_mm: float = 0.3
+    ) -> UInt8[np.ndarray, "h w 3"]:
+        """The bodies on white, row 0 at the frame's top: for ``imshow`` with ``frame.extent``."""
+        return render(bodies, self.viewpoint(frame, pixel_mm), frame.size(pixel_mm))
+
+    def depth_of(
+        self, mesh: Mesh, frame: Frame, pixel_mm: float = 0.25
+    ) -> Float[np.ndarray, "h w"]:
+        """Of the surface that is seen, mm away from the viewer as ``project`` has it; where nothing
+        is seen, infinite."""
+        viewpoint, size = self.viewpoint(frame, pixel_mm), frame.size(pixel_mm)
+        corners = viewpoint.project(mesh.vertices_mm, size).astype(np.float32)
+        near, _ = nearest(corners, mesh.faces.astype(np.int32), *size, np.inf, False)
+        return -near.astype(float) - _FAR_MM
+
+    def silhouette(
+        self, mesh: Mesh, frame: Frame, pixel_mm: float = 0.25
+    ) -> Float[np.ndarray, "h w"]:
+        """Where the mesh covers the picture: 1.0 or 0.0 per pixel, for a contour at 0.5."""
+        return np.isfinite(self.depth_of(mesh, frame, pixel_mm)).astype(float)
+
+
+def render(
+    bodies: list[Body], viewpoint: Viewpoint, size: tuple[int, int], backdrop: RGB = WHITE
+) -> UInt8[np.ndarray, "h w 3"]:
+    """The bodies as they are seen; ``size`` is width and height in pixels.
+
+    Opaque bodies hide each other by depth; translucent ones tint what lies behind them.
+    """
+    from PIL import Image
+
+    width, height = (_SHARPER * n for n in size)
+    solid = _join([body for body in bodies if body.opacity >= 1])
+    light = _light(solid if solid.shadowed.any() else _join([]), viewpoint)
+    picture = np.empty((height, width, 3), np.float32)
+    picture[:] = np.array(backdrop)
+    near = np.full((height, width), -np.inf, np.float32)
+    near = _lay(picture, near, solid, viewpoint, light, 1.0)
+
+    def far_first(body: Body) -> float:
+        middle = body.mesh.box_mm.mean(0)[None]
+        if body.world_from_mesh is not None:
+            middle = transform_points(body.world_from_mesh, middle)
+        return -float(np.linalg.norm(middle[0] - viewpoint.place_mm))
+
+    for body in sorted((body for body in bodies if body.opacity < 1), key=far_first):
+        _lay(picture, near, _join([body]), viewpoint, light, body.opacity)
+    sharp = Image.fromarray(np.rint(255 * picture).astype(np.uint8))
+    return np.asarray(sharp.reduce(_SHARPER))
+
+
+def _join(bodies: list[Body]) -> Triangles:
+    places, faces, count = [np.zeros((0, 3))], [np.zeros((0, 3), int)], 0
+    normals = [np.zeros((0, 3, 3), np.float32)]
+    for body in bodies:
+        vertices, normal = body.mesh.vertices_mm, corner_normals(body.mesh)
+        if (way := body.world_from_mesh) is not None:
+            vertices = transform_points(way, vertices)
+            normal = (normal.reshape(-1, 3) @ way[:3, :3].T.astype(np.float32)).reshape(-1, 3, 3)
+        places.append(vertices)
+        faces.append(body.mesh.faces + count)
+        normals.append(normal)
+        count += len(vertices)
+    each = [len(body.mesh.faces) for body in bodies]
+    colors = np.array([body.color for body in bodies], np.float32).reshape(-1, 3)
+    return Triangles(
+        np.concatenate(places).astype(np.float32),
+        np.concatenate(faces).astype(np.int32),
+        np.concatenate(normals),
+        np.repeat(colors, each, axis=0),
+        np.repeat(np.array([body.shadowed for body in bodies], bool), each),
+    )
+
+
+_NORMALS: WeakKeyDictionary[Mesh, np.ndarray] = WeakKeyDictionary()  # a link's never change
+
+
+def corner_normals(mesh: Mesh) -> Float32[np.ndarray, "f 3 3"]:
+    """Unit normal at each face's corners: the mean of the faces about the same place that make no
+    crease with this one, weighted by their areas."""
+    if (known := _NORMALS.get(mesh)) is not None:
+        return known
+    a, b, c = (mesh.vertices_mm[mesh.faces[:, k]] for k in range(3))
+    area = np.cross(b - a, c - a)
+    unit = area / np.maximum(np.linalg.norm(area, axis=1, keepdims=True), 1e-12)
+    _, place = np.unique(mesh.vertices_mm, axis=0, return_inverse=True)
+    corner = place.reshape(-1)[mesh.faces].reshape(-1)
+    order = np.argsort(corner, kind="stable")
+    first = np.searchsorted(corner[order], np.arange(corner.max(initial=-1) + 2))
+    normals = crease(area, unit, corner, order // 3, first, _CREASE)
+    _NORMALS[mesh] = normals.reshape(-1, 3, 3).astype(np.float32)
+    return _NORMALS[mesh]
+
+
+def _light(triangles: Triangles, viewpoint: Viewpoint) -> Light:
+    """The light, and what stands in its way around the middle of the picture."""
+    across = np.cross([0.0, 1.0, 0.0], viewpoint.light)
+    across /= np.linalg.norm(across)
+    down = np.cross(viewpoint.light, across)
+    axes = np.stack([across, down, viewpoint.light]).astype(np.float32)
+    target_mm = viewpoint.place_mm + viewpoint.distance_mm * viewpoint.axes[2]
+    pixel_mm = 1.6 * viewpoint.width_mm / _SHADOW_PIXELS
+    middle = axes[:2] @ target_mm.astype(np.float32)
+    corner = (middle - pixel_mm * _SHADOW_PIXELS / 2).astype(np.float32)
+    seen = triangles.places @ axes.T
+    seen[:, :2] = (seen[:, :2] - corner) / pixel_mm
+    near, _ = nearest(seen, triangles.faces, _SHADOW_PIXELS, _SHADOW_PIXELS, np.inf, False)
+    return Light(axes, viewpoint.up.astype(np.float32), near, corner, pixel_mm)
+
+
+def _lay(
+    picture: Float32[np.ndarray, "h w 3"],
+    below: Float32[np.ndarray, "h w"],
+    triangles: Triangles,
+    viewpoint: Viewpoint,
+    light: Light,
+    opacity: float,
+) -> Float32[np.ndarray, "h w"]:
+    """Paint them where nothing in ``below`` is nearer; returns their nearness (-inf: nothing)."""
+    size = picture.shape[1], picture.shape[0]
+    corners = viewpoint.project(triangles.places.astype(float), size).astype(np.float32)
+    perspective = not viewpoint.parallel
+    near, winner = nearest(corners, triangles.faces, *size, viewpoint.limit, perspective)
+    one_mm = near**2 if perspective else np.float32(1.0)  # of nearness
+    winner[near - _SAME_MM * one_mm <= below] = -1
+    hits = Hits(winner, corners, perspective, viewpoint.place_mm.astype(np.float32))
+    shade(picture, hits, triangles, light, opacity)
+    return near

@@ -1,0 +1,17 @@
+"""Beartype as jaxtyping's import hook calls it: what annotations say of arrays is executed."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from beartype import BeartypeConf, FrozenDict, beartype
+
+# mypy checks numbers; NumPy's and whole ones may stand for Python's here as they do there.
+_NUMBERS = FrozenDict({int: int | np.integer, float: float | int | np.number})
+_checked = beartype(conf=BeartypeConf(hint_overrides=_NUMBERS))
+
+
+def checked(function: Any) -> Any:
+    """The typechecker that the hook is given."""
+    return _checked(function)
