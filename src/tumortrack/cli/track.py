@@ -91,12 +91,11 @@ class Track:
         """Until the source ends, the time is up, the arms have ended, or Ctrl-C."""
         from tumortrack.core.config import to_builtins
         from tumortrack.live.calibration_file import read_frames
-        from tumortrack.live.sources import SOURCES
-        from tumortrack.live.spec import parse_spec
+        from tumortrack.live.spec import SOURCES
         from tumortrack.live.values import Controls, PublishedFrame, SinkContext
         from tumortrack.models.folder import read_model_manifest
 
-        source_config = parse_spec(self.source, SOURCES, "source")
+        source_config = SOURCES.parse(self.source)
         sink_configs = parse_sinks(self.sinks)
         frames = read_frames(self.frame) if self.frame else PublishedFrame()
         if arms is not None:
@@ -151,8 +150,8 @@ class Track:
     def _loop_config(self, model: Model) -> LoopConfig:
         from tumortrack.live.loop import LoopConfig
         from tumortrack.sense.files import read_intrinsics
-        from tumortrack.tracking.follower import FollowerConfig
         from tumortrack.tracking.region import region_for
+        from tumortrack.tracking.tracker import FollowerConfig
 
         box = None if self.box is None else (self.box[:3], self.box[3:])
         return LoopConfig(
@@ -169,10 +168,9 @@ class Track:
 
 def parse_sinks(sinks: tuple[str, ...]) -> list[SinkConfig]:
     """Configurations of what was written on the command line."""
-    from tumortrack.live.sinks import SINKS
-    from tumortrack.live.spec import parse_spec
+    from tumortrack.live.spec import SINKS
 
-    configs = [parse_spec(sink, SINKS, "sink") for sink in sinks]
+    configs = [SINKS.parse(sink) for sink in sinks]
     if doubled := sorted({sink for sink in sinks if sinks.count(sink) > 1}):
         raise InputError(f"sink {doubled[0]!r} is given twice.")
     return configs
@@ -186,8 +184,9 @@ def open_sinks(
 
     workers = []
     # Those that make a folder last: if another cannot open, none is left behind.
-    for spec, config in sorted(zip(sinks, configs, strict=True), key=lambda pair: pair[1].waiting):
-        worker = SinkWorker(spec, config.open(context), config.waiting)
+    pairs = zip(sinks, configs, strict=True)
+    for spec, config in sorted(pairs, key=lambda pair: pair[1].queue_size):
+        worker = SinkWorker(spec, config.open(context), config.queue_size)
         stack.callback(worker.close)
         workers.append(worker)
     return workers
@@ -279,13 +278,13 @@ class _Screen:
         """The last lines."""
         source, loop = self._source, self._loop
         self._store()
-        estimates = loop.counts["good"] + loop.counts["poor"]
+        counts, latency = loop.statistics.counts, loop.statistics.latency
         say(
-            f"{estimates} estimates ({loop.counts['poor']} poor), {loop.counts['none']} times "
-            f"none, {source.dropped} frames dropped."
+            f"{counts['good'] + counts['poor']} estimates ({counts['poor']} poor), "
+            f"{counts['none']} times none, {source.dropped} frames dropped."
         )
-        if len(loop.latency):
-            times = loop.latency.summary()
+        if len(latency):
+            times = latency.summary()
             say(
                 f"latency from {source.latency_from} to published estimate: p50 "
                 f"{times['p50']:.1f}, p95 {times['p95']:.1f}, p99.9 {times['p99.9']:.1f} ms."
@@ -294,7 +293,7 @@ class _Screen:
             if sink.dropped or sink.errors:
                 last = f"; the last: {sink.error}" if sink.error else ""
                 say(f"sink {sink.name}: {sink.dropped} missed, {sink.errors} errors{last}.")
-        for name, errors in loop.errors.items():
+        for name, errors in loop.statistics.errors.items():
             off = errors.summary()
             say(f"{name}: centre off by {off['p50']:.1f} mm (median; 95 %: {off['p95']:.1f} mm).")
         if not self._unwritten:
@@ -302,10 +301,10 @@ class _Screen:
         check_closed(self._sinks)
 
     def _line(self, now: float) -> None:
-        total = sum(self._loop.counts.values())
+        total = sum(self._loop.statistics.counts.values())
         rate = (total - self._before) / (now - self._shown)
         self._before, self._shown = total, now
-        latency = self._loop.latency
+        latency = self._loop.statistics.latency
         if not len(latency):
             return
         say(

@@ -1,52 +1,67 @@
-"""What messages carry: TRANSFORM, STATUS, POLYDATA, STRING as values and as bytes.
-
-Source: the protocol's Documents/Protocol/transform.md, status.md, polydata.md and string.md.
-"""
+"""Reads OpenIGTLink messages with the tests' own code, built on the product's header alone."""
 
 from __future__ import annotations
 
 import struct
-from dataclasses import dataclass, field
 
 import numpy as np
 from jaxtyping import Float, Int, Num, UInt32
 
-from tumortrack.live.igtl.message import ProtocolError
+from tumortrack.live.igtl.message import (
+    Header,
+    IgtlStatus,
+    Message,
+    Polydata,
+    ProtocolError,
+    check_body,
+)
 
-# STATUS codes
-OK, NOT_FOUND, CHECKSUM_ERROR, NOT_READY, NOT_PRESENT, EXITING = 1, 4, 9, 13, 16, 19
+_EXTENDED = struct.Struct("> H H I I")
+_ENTRY = struct.Struct("> H H I")
+_UTF8 = 106
 _STATUS = struct.Struct("> H q 20s")
 _POLYDATA = struct.Struct("> 10I")
 _ATTRIBUTE = struct.Struct("> B B I")
 _POINT_SCALARS = 0x00
 
 
-@dataclass(frozen=True)
-class IgtlStatus:
-    """How the sender is: ``code`` 1 is well; ``name`` at most 20 characters."""
+def unpack(header: Header, body: bytes) -> Message:
+    """The message of a header and the body that followed it.
 
-    code: int
-    name: str
-    text: str
-    sub_code: int = 0
-
-
-@dataclass(frozen=True, eq=False)
-class Polydata:
-    """Points (n, 3) and cells over them; ``scalars``: one number a point, by name.
-
-    ``triangles`` (f, 3) and ``segments`` (s, 2) hold point numbers.
+    Raises:
+        ProtocolError: a wrong length or checksum, or sizes inside that do not fit.
     """
+    check_body(header, body)
+    content, metadata = body, {}
+    if header.version > 1:
+        try:
+            size, keys_size, values_size, _ = _EXTENDED.unpack_from(body)
+        except struct.error as error:
+            raise ProtocolError(f"{header.type}: its extended header is cut short.") from error
+        end = len(body) - keys_size - values_size
+        if not _EXTENDED.size <= size <= end:
+            raise ProtocolError(f"{header.type}: its extended header's sizes do not fit.")
+        content = body[size:end]
+        if keys_size:
+            metadata = _read_metadata(body[end : end + keys_size], body[end + keys_size :])
+    return Message(header.type, header.device, header.stamp_ns, content, metadata)
 
-    points: Float[np.ndarray, "n 3"]
-    triangles: Int[np.ndarray, "f 3"]
-    segments: Int[np.ndarray, "s 2"] = field(default_factory=lambda: np.zeros((0, 2), np.int32))
-    scalars: dict[str, Num[np.ndarray, " n"]] = field(default_factory=dict)
 
-
-def pack_transform(b_from_a: Float[np.ndarray, "4 4"]) -> bytes:
-    """Its upper three rows, column by column, float32."""
-    return np.asarray(b_from_a)[:3].T.astype(">f4").tobytes()
+def _read_metadata(index: bytes, texts: bytes) -> dict[str, str]:
+    found, at = {}, 0
+    try:
+        (count,) = struct.unpack_from("> H", index)
+        for n in range(count):
+            key_size, charset, value_size = _ENTRY.unpack_from(index, 2 + n * _ENTRY.size)
+            key = texts[at : at + key_size].decode("ascii")
+            value = texts[at + key_size : at + key_size + value_size]
+            at += key_size + value_size
+            found[key] = value.decode("utf-8" if charset == _UTF8 else "latin-1")
+    except (struct.error, UnicodeDecodeError) as error:
+        raise ProtocolError(f"the message's metadata are damaged: {error}.") from error
+    if at != len(texts):
+        raise ProtocolError(f"the metadata's sizes add up to {at} of {len(texts)} bytes.")
+    return found
 
 
 def unpack_transform(content: bytes) -> Float[np.ndarray, "4 4"]:
@@ -61,12 +76,6 @@ def unpack_transform(content: bytes) -> Float[np.ndarray, "4 4"]:
     return b_from_a
 
 
-def pack_status(status: IgtlStatus) -> bytes:
-    """The text ends with a zero byte, as the protocol's own library writes it."""
-    name = status.name.encode("ascii", "replace")[:20]
-    return _STATUS.pack(status.code, status.sub_code, name) + status.text.encode() + b"\0"
-
-
 def unpack_status(content: bytes) -> IgtlStatus:
     """Raises ProtocolError: shorter than 30 bytes."""
     if len(content) < _STATUS.size:
@@ -74,52 +83,6 @@ def unpack_status(content: bytes) -> IgtlStatus:
     code, sub_code, name = _STATUS.unpack_from(content)
     text = content[_STATUS.size :].split(b"\0")[0].decode("utf-8", "replace")
     return IgtlStatus(code, name.split(b"\0")[0].decode("latin-1"), text, sub_code)
-
-
-def pack_string(text: str) -> bytes:
-    """UTF-8. Raises ProtocolError: more than 65535 bytes."""
-    data = text.encode()
-    if len(data) > 65535:
-        raise ProtocolError(f"STRING holds at most 65535 bytes, not {len(data)}.")
-    return struct.pack("> H H", 3 if text.isascii() else 106, len(data)) + data
-
-
-def unpack_string(content: bytes) -> str:
-    """Raises ProtocolError: its length does not fit, or it is no UTF-8."""
-    try:
-        _, size = struct.unpack_from("> H H", content)
-        if size != len(content) - 4:
-            raise ProtocolError(f"STRING says {size} bytes and has {len(content) - 4}.")
-        return content[4:].decode()
-    except (struct.error, UnicodeDecodeError) as error:
-        raise ProtocolError(f"STRING is damaged: {error}.") from error
-
-
-def pack_polydata(data: Polydata) -> bytes:
-    """Triangles are sent as polygons, segments as lines."""
-    lines, polygons = _cells(data.segments), _cells(data.triangles)
-    head = _POLYDATA.pack(
-        len(data.points),
-        *(0, 0),  # vertices: 3D Slicer's reader writes past its memory at the second one
-        *(len(data.segments), len(lines)),
-        *(len(data.triangles), len(polygons)),
-        *(0, 0),  # triangle strips
-        len(data.scalars),
-    )
-    points = np.asarray(data.points).astype(">f4").tobytes()
-    kinds = [_ATTRIBUTE.pack(_POINT_SCALARS, 1, len(values)) for values in data.scalars.values()]
-    names = b"".join(name.encode("ascii") + b"\0" for name in data.scalars)
-    values = [np.asarray(values).astype(">f4").tobytes() for values in data.scalars.values()]
-    padding = bytes(len(names) % 2)
-    return b"".join((head, points, lines, polygons, *kinds, names, padding, *values))
-
-
-def _cells(cells: np.ndarray) -> bytes:
-    """Each cell as its number of points and their numbers."""
-    count, size = cells.shape
-    out = np.empty((count, 1 + size), ">u4")
-    out[:, 0], out[:, 1:] = size, cells
-    return out.tobytes()
 
 
 def unpack_polydata(content: bytes) -> Polydata:
