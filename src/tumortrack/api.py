@@ -310,7 +310,7 @@ def evaluate(
     locate: Tracker | Callable[[SensorCloud], Estimate],
     scenes: StrPath | Sequence[Scene],
     report: StrPath | None = None,
-) -> dict:
+) -> dict[str, Any]:
     """Locate in every scene and compare with the truth.
 
     Args:
@@ -344,7 +344,7 @@ def track(
     until: Callable[[TrackingResult], bool] | None = None,
     seconds: float = 0.0,
     range_mm: tuple[float, float] | None = None,
-) -> dict:
+) -> dict[str, Any]:
     """Follow the organ live, from a source to sinks, until the source ends.
 
     Args:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from tyro.conf import Positional
 
@@ -222,7 +222,7 @@ class Simulate:
                 advance()
 
 
-def _check_same(folder: Path, made_from: dict) -> None:
+def _check_same(folder: Path, made_from: dict[str, Any]) -> None:
     """Refuse to continue a dataset of another case, seed or options."""
     meta = store.read_json(folder / "meta.json")
     if {key: meta.get(key) for key in made_from} != made_from:

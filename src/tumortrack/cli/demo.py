@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import tumortrack
 from tumortrack.cli.cases import Prepare, Simulate
@@ -64,7 +65,7 @@ class Demo:
         # Elastic ones are of states that training did not draw from. Training shows no drags; these
         # are of two of the paper's configurations, the one it trains with and the one with the most
         # drags, and squeezed and bent as a whole.
-        kinds: tuple[tuple[str, int, dict], ...] = (
+        kinds: tuple[tuple[str, int, dict[str, Any]], ...] = (
             ("elastic", elastic, {"elastic": True}),
             ("dragged", dragged, {"configuration": (3, 6), "squeeze": True}),
         )

@@ -9,6 +9,7 @@ from importlib import import_module
 from importlib.metadata import version
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 from tyro.conf import Positional
 
@@ -159,7 +160,7 @@ def _artifact(folder: Path) -> list[str]:
     return [*lines, f"  files: {', '.join(manifest['files'])}"]
 
 
-def _kind_of_model(manifest: dict) -> str:
+def _kind_of_model(manifest: dict[str, Any]) -> str:
     network = manifest.get("config", {}).get("network", {})
     kinds = [network.get(part, {}).get("type", "?") for part in ("encoder", "decoder")]
     if kinds[1] == "warp":
@@ -169,7 +170,7 @@ def _kind_of_model(manifest: dict) -> str:
     return f"  {kinds[0]} + {kinds[1]}: {does}"
 
 
-def _sealed_scenes(folder: Path, scenes: dict) -> list[str]:
+def _sealed_scenes(folder: Path, scenes: dict[str, Any]) -> list[str]:
     """What became of the scenes that a manifest lists."""
     changed = [
         name

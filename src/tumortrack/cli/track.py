@@ -9,7 +9,7 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from tyro.conf import Positional
 
@@ -38,7 +38,7 @@ class Arms:
 
     companion: Operation
     frames: PublishedFrame
-    about: dict
+    about: dict[str, Any]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -245,7 +245,7 @@ class _Screen:
         source: SourceWorker,
         sinks: list[SinkWorker],
         report: Path,
-        about: dict,
+        about: dict[str, Any],
         arms: Operation | None,
     ) -> None:
         self._loop, self._source, self._sinks = loop, source, sinks

@@ -33,12 +33,12 @@ class Config(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
 C = TypeVar("C", bound=msgspec.Struct)
 
 
-def to_builtins(config: msgspec.Struct) -> dict:
+def to_builtins(config: msgspec.Struct) -> dict[str, Any]:
     """The configuration as JSON would return it, every key written out."""
     return msgspec.json.decode(msgspec.json.encode(config))
 
 
-def identity(config: msgspec.Struct) -> dict:
+def identity(config: msgspec.Struct) -> dict[str, Any]:
     """``to_builtins`` for hashing: fields named in ``LATER`` are left out at their default, so
     that artifacts from before there was such a field keep their hash."""
     written = to_builtins(config)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float
@@ -88,6 +88,6 @@ class Estimate:
     cloud: OccupancyCloud
     volume: CameraLabels | None
     meshes: dict[str, Mesh]
-    report: dict
+    report: dict[str, Any]
     motion: Motion | None = None
     unsmoothed: Motion | None = None

@@ -14,6 +14,7 @@ import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import tumortrack
 from tumortrack.core.errors import ArtifactError, InputError, StorageError
@@ -59,7 +60,7 @@ def write_json(path: Path, data: object) -> None:
     write_atomically(path, (json.dumps(data, indent=1, allow_nan=False) + "\n").encode())
 
 
-def read_json(path: Path) -> dict:
+def read_json(path: Path) -> dict[str, Any]:
     """Read a JSON object.
 
     Raises:
@@ -76,7 +77,7 @@ def read_json(path: Path) -> dict:
     return data
 
 
-def seal(folder: Path, kind: str, content: dict, frame: str) -> None:
+def seal(folder: Path, kind: str, content: dict[str, Any], frame: str) -> None:
     """Write the folder's manifest over the files that lie in it now (sub-folders not counted)."""
     files = {
         p.name: sha256_of(p)
@@ -176,7 +177,7 @@ def _remove(path: Path) -> None:
         path.unlink(missing_ok=True)
 
 
-def read_manifest(folder: Path, kind: str) -> dict:
+def read_manifest(folder: Path, kind: str) -> dict[str, Any]:
     """The manifest of an artifact of this kind, every file's sha256 checked.
 
     Raises:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from tumortrack.core import store
 from tumortrack.core.errors import ArtifactError, StorageError
@@ -30,7 +31,7 @@ class Case:
     anatomy: Anatomy
     labels: LabelVolume
     up_lps: tuple[float, float, float]
-    report: dict = field(default_factory=dict)
+    report: dict[str, Any] = field(default_factory=dict)
     ct: Volume | None = None
 
 

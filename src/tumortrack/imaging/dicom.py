@@ -9,6 +9,7 @@ from __future__ import annotations
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -38,7 +39,7 @@ class _Slice:
     orientation: tuple[float, ...]  # along a row, along a column
 
     @property
-    def group(self) -> tuple:
+    def group(self) -> tuple[Any, ...]:
         return (self.uid, self.shape, tuple(round(c, 3) for c in self.orientation))
 
 
@@ -106,7 +107,7 @@ def _groups(folder: Path) -> tuple[list[list[_Slice]], tuple[str, ...]]:
     files = sorted(p for p in folder.iterdir() if p.is_file() and not p.name.startswith("."))
     if len(files) > _MAX_FILES:
         raise InputError(f"{folder} holds {len(files)} files; the limit is {_MAX_FILES}.")
-    found: dict[tuple, list[_Slice]] = {}
+    found: dict[tuple[Any, ...], list[_Slice]] = {}
     left_out: dict[str, list[Path]] = {_NO_SLICE: [], _MULTI_FRAME: []}
     for file in files:
         one = _read_tags(file)

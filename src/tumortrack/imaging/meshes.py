@@ -96,7 +96,7 @@ def _files_by_name(folder: Path) -> tuple[Path, list[Path]]:
     return organs[0], sorted(tumors, key=_natural)
 
 
-def _natural(path: Path) -> list:
+def _natural(path: Path) -> list[Any]:
     """tumor_2 before tumor_10."""
     return [int(p) if p.isdigit() else p for p in re.split(r"(\d+)", path.stem.lower())]
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -144,7 +145,7 @@ def _case(
     kind: str,
     anatomy: Anatomy,
     labels: LabelVolume,
-    surface: dict,
+    surface: dict[str, Any],
     notes: list[str],
     ct: Volume | None = None,
 ) -> Case:

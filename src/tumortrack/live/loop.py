@@ -12,6 +12,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float64
@@ -299,7 +300,9 @@ def _age_s(born_ns: int) -> float:
     return (time.time_ns() - born_ns) * 1e-9
 
 
-def summary(loop: Loop, source_worker: SourceWorker, sink_workers: list[SinkWorker]) -> dict:
+def summary(
+    loop: Loop, source_worker: SourceWorker, sink_workers: list[SinkWorker]
+) -> dict[str, Any]:
     """The report of a run (JSON types): counts, latencies and stage times in ms."""
     return loop.statistics.summary() | {
         "dropped": source_worker.dropped,

@@ -6,6 +6,7 @@ import re
 import time
 import traceback
 from collections import Counter
+from typing import Any
 
 import numpy as np
 
@@ -105,7 +106,7 @@ class RunStatistics:
         if len(self.defects) < _DEFECTS:
             self.defects.append("".join(traceback.format_exception(error)))
 
-    def summary(self) -> dict:
+    def summary(self) -> dict[str, Any]:
         """JSON types; latencies and stage times in ms."""
         return {
             "updates": sum(self.counts.values()),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections import deque
+from typing import Any
 
 from tumortrack.core.errors import TumortrackError
 from tumortrack.live.meter import Histogram
@@ -49,7 +50,7 @@ class SinkWorker:
             self._failed(f"it did not finish within {_CLOSE_S:g} s")
             self.unclosed = True
 
-    def summary(self) -> dict:
+    def summary(self) -> dict[str, Any]:
         """What became of the results (JSON types)."""
         return {
             "delivered": self.delivered,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 from tumortrack.core import store
 from tumortrack.core.errors import ArtifactError
@@ -17,7 +18,7 @@ def is_finished(folder: Path) -> bool:
     return (folder / store.MANIFEST).is_file()
 
 
-def read_model_manifest(folder: Path) -> dict:
+def read_model_manifest(folder: Path) -> dict[str, Any]:
     """The manifest of a finished model.
 
     Raises:
@@ -31,6 +32,6 @@ def read_model_manifest(folder: Path) -> dict:
     return store.read_manifest(folder, KIND)
 
 
-def has_shape(manifest: dict) -> bool:
+def has_shape(manifest: dict[str, Any]) -> bool:
     """Whether the model knows the organ's shape, and so which point of the CT lies where."""
     return SHAPE in manifest["files"]

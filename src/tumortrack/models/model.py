@@ -60,7 +60,7 @@ class Model(ABC):
     parts: tuple[str, ...]
     query_box_mm: Float64[np.ndarray, "2 3"]
     in_distribution: InDistributionRange
-    provenance: dict = field(default_factory=dict)
+    provenance: dict[str, Any] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
 
     @classmethod
@@ -78,7 +78,7 @@ class Model(ABC):
 
     @classmethod
     @abstractmethod
-    def from_folder(cls: type[M], folder: Path, manifest: dict, **common: Any) -> M:
+    def from_folder(cls: type[M], folder: Path, manifest: dict[str, Any], **common: Any) -> M:
         """The model of a folder whose fields ``common`` are read already.
 
         Raises:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import Any
 
 import numpy as np
 import torch
@@ -19,7 +20,7 @@ from tumortrack.imaging.raster import label_grid
 CLOUD_POINTS = 40_000  # of an estimate made of surfaces
 
 
-def report_head(cloud: SensorCloud, seed: int) -> dict:
+def report_head(cloud: SensorCloud, seed: int) -> dict[str, Any]:
     """The first entries of report.json."""
     return {
         "tumortrack": tumortrack.__version__,
@@ -31,7 +32,7 @@ def report_head(cloud: SensorCloud, seed: int) -> dict:
     }
 
 
-def fit_report(distances_mm: Float[np.ndarray, " n"]) -> dict:
+def fit_report(distances_mm: Float[np.ndarray, " n"]) -> dict[str, Any]:
     """How far the observed points lie from the estimated surface."""
     return {
         "median": float(np.median(distances_mm)),
@@ -67,12 +68,12 @@ def grid_over(
 
 def describe_parts(
     names: tuple[str, ...], meshes: dict[str, Mesh], inside: OccupancyCloud
-) -> dict[str, dict]:
+) -> dict[str, dict[str, Any]]:
     """Per part: volume, centre, box and how sure the labels inside it are (JSON types).
 
     The kidney's numbers are those of the whole organ, tumors included.
     """
-    parts: dict[str, dict] = {}
+    parts: dict[str, dict[str, Any]] = {}
     counts = np.bincount(inside.labels, minlength=len(names) + 1)
     sums = np.bincount(inside.labels, inside.probability, len(names) + 1)
     for n, name in enumerate(names):

@@ -26,7 +26,7 @@ class OccupancyModel(Model):
         return OccupancyNetwork(config)
 
     @classmethod
-    def from_folder(cls, folder: Path, manifest: dict, **common: Any) -> OccupancyModel:
+    def from_folder(cls, folder: Path, manifest: dict[str, Any], **common: Any) -> OccupancyModel:
         if next(common["network"].parameters()).device.type != "cpu":
             return cls(**common)
         arithmetic, note = find(folder, str(manifest["files"][WEIGHTS]))

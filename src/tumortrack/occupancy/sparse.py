@@ -21,6 +21,7 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from functools import partial
+from typing import Any
 
 import numpy as np
 import torch
@@ -344,7 +345,7 @@ def leading(rows: Float32[np.ndarray, "n classes"]) -> tuple[np.ndarray, np.ndar
     return labels, leads
 
 
-def _in_slabs(work: Callable[[int, int], object], planes: int) -> list:
+def _in_slabs(work: Callable[[int, int], object], planes: int) -> list[Any]:
     """What ``work(first, last)`` returns for slabs of planes, one a thread."""
     cuts = np.linspace(0, planes, torch.get_num_threads() + 1).astype(int)
     with ThreadPoolExecutor(len(cuts) - 1) as pool:

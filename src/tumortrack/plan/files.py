@@ -39,7 +39,7 @@ class PlanFolder:
     table_from_camera: Float64[np.ndarray, "4 4"]
     frame_id: str
     meshes: dict[str, Mesh]
-    cell: dict | None = None
+    cell: dict[str, Any] | None = None
     motions: Motions | None = None
     case_sha256: str = ""
 

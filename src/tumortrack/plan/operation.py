@@ -10,6 +10,7 @@ from collections import Counter
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -134,7 +135,7 @@ class Operation:
         self._settled: tuple[Mesh, float] | None = None  # where the tumor is, and since when
         self._work: Future[Planned] | None = None
         self.still_life: tuple[RigidShape, ...] = ()
-        self.log: list[dict] = []
+        self.log: list[dict[str, Any]] = []
         self.halts: Counter[str] = Counter()
         self._counted = ""  # the reason, without its numbers, that ``halts`` has counted
 
@@ -176,7 +177,7 @@ class Operation:
             self._lines(),
         )
 
-    def summary(self) -> dict:
+    def summary(self) -> dict[str, Any]:
         """For the report: states and when they began, halts, new plans."""
         return {
             "state": self._execution.state,

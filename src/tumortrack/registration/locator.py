@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -174,8 +175,12 @@ class RegistrationLocator:
         return _Registered(fit, motion, meshes, deviation[:count], deviation[count:])
 
     def _report(
-        self, head: dict, placed: _Registered, inside: OccupancyCloud, seconds: dict[str, float]
-    ) -> dict:
+        self,
+        head: dict[str, Any],
+        placed: _Registered,
+        inside: OccupancyCloud,
+        seconds: dict[str, float],
+    ) -> dict[str, Any]:
         fit, motion = placed.fit, placed.motion
         parts = describe_parts(self._model.parts, placed.meshes, inside)
         for part, std_mm in zip(parts.values(), placed.middle_std_mm, strict=True):

@@ -48,7 +48,9 @@ class RegistrationModel(Model):
         return {"trust": to_builtins(self.calibration)}
 
     @classmethod
-    def from_folder(cls, folder: Path, manifest: dict, **common: Any) -> RegistrationModel:
+    def from_folder(
+        cls, folder: Path, manifest: dict[str, Any], **common: Any
+    ) -> RegistrationModel:
         shape = RestShape.from_arrays(load((folder / SHAPE).read_bytes()), len(common["parts"]))
         where = f"{folder}: trust"
         calibration = from_builtins(manifest["trust"], UncertaintyCalibration, where)

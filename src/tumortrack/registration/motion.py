@@ -76,7 +76,7 @@ class ElasticMotion:
         return self.std_scale * np.sqrt(variance.astype(float))
 
     def _gone(
-        self, kernel: Callable, flow: Flow, points_mm: Float[np.ndarray, "n 3"]
+        self, kernel: Callable[..., None], flow: Flow, points_mm: Float[np.ndarray, "n 3"]
     ) -> Float64[np.ndarray, "n 3"]:
         points, out = np.ascontiguousarray(points_mm, np.float32), np.empty((len(points_mm), 3))
         pose = Pose(self.shape.body.center_ct, self.rotation, self.centre_mm)

@@ -37,7 +37,7 @@ def new_figure(width_in: float, height_in: float) -> Figure:
 
 
 def show_legend(
-    figure: Figure, handles: list, columns: int, corner: tuple[float, float], **style: Any
+    figure: Figure, handles: list[Any], columns: int, corner: tuple[float, float], **style: Any
 ) -> None:
     """A legend without a frame; ``corner`` is its upper right one, as shares of the figure."""
     style = {"loc": "upper right", "frameon": False, "fontsize": 9.5, **style}

@@ -8,6 +8,7 @@ import io
 import json
 from importlib import resources
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -29,7 +30,7 @@ _COLUMNS = {
 _SHOWN_POINTS = 4000
 
 
-def page_scene(name: str, scene: Scene, estimate: Estimate | None, picture: Path) -> dict:
+def page_scene(name: str, scene: Scene, estimate: Estimate | None, picture: Path) -> dict[str, Any]:
     """What the page shows of a scene, small (JSON types): ``layers``, thinned meshes, and
     ``picture``, the PNG that ``scene_picture`` wrote, compressed."""
     points_mm = scene.cloud.points_mm
@@ -44,7 +45,7 @@ def page_scene(name: str, scene: Scene, estimate: Estimate | None, picture: Path
     return {"name": name, "layers": layers, "picture": _webp(picture)}
 
 
-def write_page(report: dict, scenes: list[dict], path: Path) -> None:
+def write_page(report: dict[str, Any], scenes: list[dict[str, Any]], path: Path) -> None:
     """Write the page; it holds plotly itself and loads nothing from anywhere.
 
     Args:
@@ -90,7 +91,7 @@ def thinned(mesh: Mesh, cell_mm: float) -> Mesh:
     return Mesh(np.stack(means, axis=1), faces[times[kind.reshape(-1)] % 2 == 1])
 
 
-def _layer(kind: str, name: str, part: str, mesh: Mesh) -> dict:
+def _layer(kind: str, name: str, part: str, mesh: Mesh) -> dict[str, Any]:
     small = thinned(mesh, _KIDNEY_CELL_MM if part == "kidney" else _TUMOR_CELL_MM)
     faces = base64.b64encode(small.faces.astype("<u4").tobytes()).decode()
     about = {"kind": kind, "part": part, "name": name.replace("_", " ")}
@@ -112,7 +113,7 @@ def _webp(picture: Path) -> str:
     return base64.b64encode(buffer.getvalue()).decode()
 
 
-def _counts(summary: dict) -> str:
+def _counts(summary: dict[str, Any]) -> str:
     counts = f"{summary['scenes']} scenes, {summary['failed']} failed."
     text = f"{counts} Median mIoU {summary['miou']:.3f}."
     if not (errors := summary.get("tre_mm")):
@@ -124,7 +125,7 @@ def _counts(summary: dict) -> str:
     )
 
 
-def _note(entry: dict) -> str:
+def _note(entry: dict[str, Any]) -> str:
     took = f", located in {entry['seconds']:.2f} s" if "seconds" in entry else ""
     failed = "" if entry["failed"] is None else f", FAILED: {entry['failed']}"
     errors = entry.get("tre_mm")
@@ -132,7 +133,7 @@ def _note(entry: dict) -> str:
     return f"mIoU {entry['miou']:.3f}{targets}{took}{failed}"
 
 
-def target_text(errors: dict) -> str:
+def target_text(errors: dict[str, Any]) -> str:
     """A scene's target errors in a few words."""
     return (
         f"target error {errors['mean']:.1f} mm (mean of {errors['count']}, "
@@ -140,23 +141,23 @@ def target_text(errors: dict) -> str:
     )
 
 
-def part_rows(summary: dict) -> dict[str, dict]:
+def part_rows(summary: dict[str, Any]) -> dict[str, dict[str, Any]]:
     """What the summary says of parts, by name."""
     return {k: row for k, row in summary.items() if isinstance(row, dict) and "found" in row}
 
 
-def _summary_table(summary: dict) -> str:
+def _summary_table(summary: dict[str, Any]) -> str:
     parts = part_rows(summary)
     found = {name: f"{part['found']}/{part['scenes']}" for name, part in parts.items()}
     return _table(parts, found)
 
 
-def _scene_table(entry: dict) -> str:
+def _scene_table(entry: dict[str, Any]) -> str:
     parts = entry["parts"]
     return _table(parts, {name: "yes" if part["found"] else "no" for name, part in parts.items()})
 
 
-def _table(parts: dict[str, dict], found: dict[str, str]) -> str:
+def _table(parts: dict[str, dict[str, Any]], found: dict[str, str]) -> str:
     head = "".join(f"<th>{title}</th>" for title in ("part", "found", *_COLUMNS.values()))
     rows = []
     for name, part in parts.items():

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import textwrap
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -46,7 +46,9 @@ _CAMERA_AXES = {
 _SLICES = {FROM_CAMERA: "across the view", FROM_SIDE: "along the view"}
 
 
-def scene_picture(scene: Scene, estimate: Estimate | None, entry: dict, path: Path) -> None:
+def scene_picture(
+    scene: Scene, estimate: Estimate | None, entry: dict[str, Any], path: Path
+) -> None:
     """Estimate over truth: two 3-D views, and two slices through each true tumor's centre.
 
     Args:
@@ -121,7 +123,7 @@ def _draw_slice(
     finish_view(axes, frame, _CAMERA_AXES[view])
 
 
-def _distances(entry: dict, name: str) -> str:
+def _distances(entry: dict[str, Any], name: str) -> str:
     part = entry.get("parts", {}).get(name)
     if not part or not part["found"]:
         return "not found"
@@ -131,14 +133,14 @@ def _distances(entry: dict, name: str) -> str:
     )
 
 
-def _headline(entry: dict) -> str:
+def _headline(entry: dict[str, Any]) -> str:
     failed = "" if entry["failed"] is None else f"   {textwrap.shorten(entry['failed'], 60)}"
     errors = entry.get("tre_mm")
     targets = f"   target error {errors['mean']:.1f} mm" if errors else ""
     return f"{entry['name']}   mIoU {entry['miou']:.2f}{targets}{failed}"
 
 
-def scene_legend() -> list:
+def scene_legend() -> list[Any]:
     """Handles of what ``draw_solid_view`` shows."""
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch

@@ -229,7 +229,7 @@ def _words(figure: Figure, plan: ResectionPlan) -> None:
     show_legend(figure, _legend(plan), 6, (0.992, 0.945), **style)
 
 
-def _legend(plan: ResectionPlan) -> list:
+def _legend(plan: ResectionPlan) -> list[Any]:
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 

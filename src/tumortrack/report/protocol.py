@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable
 from dataclasses import asdict, fields
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -47,8 +47,8 @@ def evaluate_scenes(
     scenes_dir: Path,
     out: Path,
     progress: Progress | None = None,
-    about: dict | None = None,
-) -> dict:
+    about: dict[str, Any] | None = None,
+) -> dict[str, Any]:
     """Evaluate ``locate`` on every scene of a folder.
 
     Writes OUT/scenes/NAME.png, OUT/index.html and, last, OUT/report.json (each atomically; a
@@ -75,8 +75,8 @@ def evaluate_scenes(
         (out / "report.json").unlink(missing_ok=True)  # never an old table beside new pictures
     except OSError as error:
         raise StorageError(f"cannot write {out}: {error.strerror}.") from error
-    entries: list[dict] = []
-    shown: list[dict] = []
+    entries: list[dict[str, Any]] = []
+    shown: list[dict[str, Any]] = []
     for done, folder in enumerate(folders, start=1):
         scene = read_scene(folder)
         entry, estimate = evaluate_scene(locate, scene, folder.name)
@@ -100,7 +100,9 @@ def evaluate_scenes(
     return report
 
 
-def evaluate_scene(locate: Locate, scene: Scene, name: str) -> tuple[dict, Estimate | None]:
+def evaluate_scene(
+    locate: Locate, scene: Scene, name: str
+) -> tuple[dict[str, Any], Estimate | None]:
     """One scene's entry: name, parts -> metrics, miou, seconds, timings, and failed (or null).
 
     ``tre_mm`` is there where the scene has targets and the estimate a motion; null where the scene
@@ -129,11 +131,11 @@ def evaluate_scene(locate: Locate, scene: Scene, name: str) -> tuple[dict, Estim
     return entry, estimate
 
 
-def compare(estimate: Estimate, scene: Scene) -> dict[str, dict]:
+def compare(estimate: Estimate, scene: Scene) -> dict[str, dict[str, Any]]:
     """Metrics of every part of the truth; a part that was not found has only found and iou."""
     assert estimate.volume is not None
     ious = label_ious(estimate.volume, scene.reference)
-    parts: dict[str, dict] = {}
+    parts: dict[str, dict[str, Any]] = {}
     for name, reference in zip(scene.reference.names, scene.reference.parts, strict=True):
         mesh, distances = estimate.meshes.get(name), {}
         if found := mesh is not None and len(mesh.faces) > 0:
@@ -143,13 +145,13 @@ def compare(estimate: Estimate, scene: Scene) -> dict[str, dict]:
     return parts
 
 
-def summarise(entries: list[dict]) -> dict:
+def summarise(entries: list[dict[str, Any]]) -> dict[str, Any]:
     """Medians per part, ``miou`` (median over scenes), ``failed`` and ``scenes`` (counts).
 
     ``tre_mm`` holds the medians of the scenes' target errors and how many ``scenes`` count, where
     the method knows a motion. The rule for parts that were not found is ``RULE``.
     """
-    summary: dict = {}
+    summary: dict[str, Any] = {}
     names = sorted({part for entry in entries for part in entry["parts"]}, key=_part_order)
     for name in names:
         rows = [entry["parts"][name] for entry in entries if name in entry["parts"]]
@@ -173,7 +175,7 @@ def summarise(entries: list[dict]) -> dict:
     return summary
 
 
-def summary_table(report: dict) -> Table:
+def summary_table(report: dict[str, Any]) -> Table:
     """The summary as a table for the terminal."""
     from rich.table import Table
 

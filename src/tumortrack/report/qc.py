@@ -185,7 +185,7 @@ def _window(shown: Volume | LabelVolume, anatomy: Anatomy) -> tuple[float, float
     return low, max(high, 1.15 * brightest)
 
 
-def _legend(anatomy: Anatomy) -> list:
+def _legend(anatomy: Anatomy) -> list[Any]:
     from matplotlib.patches import Patch
 
     colors = [_ORGAN_LINE, *(_tumor_color(n) for n in range(len(anatomy.tumors)))]

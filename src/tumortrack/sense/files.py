@@ -11,7 +11,7 @@ import math
 import struct
 import zipfile
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -193,14 +193,14 @@ def read_intrinsics(path: Path) -> Intrinsics:
     return _intrinsics(_read_camera_json(path), path)
 
 
-def _read_camera_json(path: Path) -> dict:
+def _read_camera_json(path: Path) -> dict[str, Any]:
     try:
         return read_json(path)
     except (ValueError, RecursionError) as error:  # numbers of thousands of digits, deep nesting
         raise InputError(f"{path} cannot be read as JSON: {error}.") from error
 
 
-def _intrinsics(data: dict, path: Path) -> Intrinsics:
+def _intrinsics(data: dict[str, Any], path: Path) -> Intrinsics:
     for key in _DISTORTION_KEYS:
         if np.any(np.array(_numbers(data.get(key, 0), key, path)) != 0):
             raise InputError(
@@ -242,7 +242,7 @@ def write_intrinsics(
     write_json(path, intrinsics_json(intrinsics, depth_unit_mm))
 
 
-def intrinsics_json(intrinsics: Intrinsics, depth_unit_mm: float = DEPTH_UNIT_MM) -> dict:
+def intrinsics_json(intrinsics: Intrinsics, depth_unit_mm: float = DEPTH_UNIT_MM) -> dict[str, Any]:
     """What ``write_intrinsics`` writes."""
     values = {key: getattr(intrinsics, key) for key in _PINHOLE_KEYS}
     return {**values, "depth_unit_mm": depth_unit_mm}

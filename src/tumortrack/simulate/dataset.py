@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float32, Num, UInt8
@@ -44,7 +44,7 @@ class SceneStream:
         """Built where it is used: ray trees cannot be pickled."""
         return Simulator(self.anatomy_ct, self.up_lps, self.config, self.body)
 
-    def __getstate__(self) -> dict:
+    def __getstate__(self) -> dict[str, Any]:
         return {k: v for k, v in self.__dict__.items() if k != "simulator"}
 
     def batch(self, index: int) -> Batch:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -46,7 +47,7 @@ class Scene:
     cloud: SensorCloud
     reference: Anatomy
     depth: DepthFrame | None = None
-    meta: dict = field(default_factory=dict)
+    meta: dict[str, Any] = field(default_factory=dict)
     targets: Targets | None = None
 
     def write(self, folder: str | Path) -> None:

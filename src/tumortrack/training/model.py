@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from safetensors import SafetensorError
@@ -119,14 +120,16 @@ class PretrainedWeights:
             )
 
 
-def _shared(config: NetworkConfig) -> tuple:
+def _shared(config: NetworkConfig) -> tuple[Any, ...]:
     """What must be the same for weights to fit; modes, points and size are the patient's."""
     normalisation = config.normalisation
     reach = normalisation.reach if isinstance(normalisation, Aligned) else None
     return config.encoder, getattr(config.decoder, "width", None), reach
 
 
-def save_start(network: nn.Module, config: NetworkConfig, provenance: dict, folder: Path) -> None:
+def save_start(
+    network: nn.Module, config: NetworkConfig, provenance: dict[str, Any], folder: Path
+) -> None:
     """Write weights and manifest into an existing folder, the manifest last."""
     store.write_atomically(folder / WEIGHTS, _weights(network))
     content = {"provenance": provenance, "config": to_builtins(config)}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import torch
@@ -42,7 +43,7 @@ class OccupancyTask:
     def miou(self, network: OccupancyNetwork) -> float:
         return label_miou(network, self._scenes, len(self._run.anatomy_ct.parts) + 1, self._device)
 
-    def model(self, network: OccupancyNetwork, provenance: dict) -> OccupancyModel:
+    def model(self, network: OccupancyNetwork, provenance: dict[str, Any]) -> OccupancyModel:
         return OccupancyModel(
             network=network,
             config=self._run.config,

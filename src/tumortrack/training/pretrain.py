@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -129,7 +129,7 @@ def kidney_stream(run: Pretraining) -> KidneyStream:
     return KidneyStream(tuple(organs))
 
 
-def pretrain(run: Pretraining, folder: Path, report: Report) -> dict:
+def pretrain(run: Pretraining, folder: Path, report: Report) -> dict[str, Any]:
     """Train until the end, resuming what lies in ``folder``; leaves a folder of weights, and
     returns its provenance.
 

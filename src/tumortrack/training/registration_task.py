@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import torch
@@ -65,7 +66,7 @@ class RegistrationTask:
     def miou(self, network: RegistrationNetwork) -> float:
         return self._summary([fit for _, fit in self._fits(network)]).miou
 
-    def model(self, network: RegistrationNetwork, provenance: dict) -> RegistrationModel:
+    def model(self, network: RegistrationNetwork, provenance: dict[str, Any]) -> RegistrationModel:
         fits = self._fits(network)
         usual_cost = float(np.percentile([fit.cost for _, fit in fits], _USUAL))
         summary = self._summary(self._repaired(network, fits, usual_cost))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 
@@ -77,7 +77,9 @@ def settings_sha256(run: RunSettings, **more: object) -> str:
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
 
-def provenance(run: TrainingRun, progress: TrainingProgress, device: torch.device) -> dict:
+def provenance(
+    run: TrainingRun, progress: TrainingProgress, device: torch.device
+) -> dict[str, Any]:
     about = {
         "seed": run.seed,
         "steps": progress.step,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol, TypeVar, runtime_checkable
+from typing import Any, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float32, Float64, UInt8
@@ -40,7 +40,7 @@ class TrainingTask(Protocol[N]):
         """On the validation scenes."""
         ...
 
-    def model(self, network: N, provenance: dict) -> Model:
+    def model(self, network: N, provenance: dict[str, Any]) -> Model:
         """The finished model of the network."""
         ...
 

@@ -23,7 +23,8 @@ from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import rigid, rotation_onto, transform_points
 from tumortrack.core.types import Anatomy, Mesh
-from tumortrack.report.metrics import label_grid, surface_samples
+from tumortrack.imaging.raster import label_grid
+from tumortrack.report.metrics import surface_samples
 from tumortrack_lab.tets import TetMesh, embed, tetrahedralise
 from tumortrack_lab.twin.contact import Contact, Obstacles, Support
 from tumortrack_lab.twin.equilibrium import Convergence, EquilibriumProblem, Hold, settle

@@ -7,6 +7,7 @@ import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -135,7 +136,7 @@ def _write_estimate(folder: Path, estimate: Estimate) -> None:
         write_mesh(folder / f"{name}.ply", mesh)
 
 
-def facts(result: TrackingResult) -> dict:
+def facts(result: TrackingResult) -> dict[str, Any]:
     """One line about a result (JSON types)."""
     seen = None
     if result.observation is not None:
@@ -152,7 +153,7 @@ def facts(result: TrackingResult) -> dict:
     }
 
 
-def report(result: TrackingResult) -> dict:
+def report(result: TrackingResult) -> dict[str, Any]:
     """Everything about a result: its facts, times of stages, and the estimate's own report, or
     null with the reason."""
     return {

@@ -39,7 +39,7 @@ class Outgoing(NamedTuple):
     message: Any
 
 
-class PointBlock(Sequence):
+class PointBlock(Sequence[Any]):
     """Points of a marker as one array, written in one piece.
 
     It replaces a list of point messages: tens of thousands of objects would take a tenth of a
@@ -163,11 +163,13 @@ class Messages:
         stamp = {"sec": seconds, "nanosec": nanoseconds}
         return self.make("std_msgs/msg/Header", stamp=stamp, frame_id=frame_id)
 
-    def markers(self, markers: list[dict]) -> Any:
+    def markers(self, markers: list[dict[str, Any]]) -> Any:
         """A MarkerArray; see ``marker``."""
         return self.make(MARKERS, markers=markers)
 
-    def diagnostic(self, level: int, name: str, message: str, id: str, values: dict) -> Any:
+    def diagnostic(
+        self, level: int, name: str, message: str, id: str, values: dict[str, Any]
+    ) -> Any:
         """A DiagnosticStatus with its values as text."""
         return self.make(
             "diagnostic_msgs/msg/DiagnosticStatus",
@@ -179,14 +181,14 @@ class Messages:
         )
 
 
-def marker(header: Any, **values: Any) -> dict:
+def marker(header: Any, **values: Any) -> dict[str, Any]:
     """A Marker's fields."""
     return {"header": header, "lifetime": {"sec": MARKER_LIFETIME_S}, **values}
 
 
 def text_marker(
     header: Any, ns: str, text: str, place_mm: np.ndarray, height_m: float, colour: Colour
-) -> dict:
+) -> dict[str, Any]:
     """A Marker of text that faces the viewer."""
     return marker(
         header,
@@ -201,8 +203,8 @@ def text_marker(
 
 
 def triangles_marker(
-    header: Any, ns: str, corners_mm: np.ndarray, at: dict, colour: Colour, opacity: float
-) -> dict:
+    header: Any, ns: str, corners_mm: np.ndarray, at: dict[str, Any], colour: Colour, opacity: float
+) -> dict[str, Any]:
     """A Marker of triangles, three corners each, at a pose."""
     return marker(
         header,
@@ -216,18 +218,20 @@ def triangles_marker(
     )
 
 
-def pose(place_mm: Float[np.ndarray, " 3"], wxyz: Float[np.ndarray, " 4"] | None = None) -> dict:
+def pose(
+    place_mm: Float[np.ndarray, " 3"], wxyz: Float[np.ndarray, " 4"] | None = None
+) -> dict[str, Any]:
     """A Pose's fields; without a quaternion not turned."""
     turn = {"w": 1.0} if wxyz is None else dict(zip("wxyz", wxyz.tolist(), strict=True))
     return {"position": xyz(place_mm / MM_PER_M), "orientation": turn}
 
 
-def xyz(numbers: Iterable[float]) -> dict:
+def xyz(numbers: Iterable[float]) -> dict[str, Any]:
     """The fields of a Point or a Vector3."""
     return dict(zip("xyz", map(float, numbers), strict=True))
 
 
-def rgba(colour: Colour, opacity: float = 1.0) -> dict:
+def rgba(colour: Colour, opacity: float = 1.0) -> dict[str, Any]:
     """A ColorRGBA's fields."""
     return {**dict(zip("rgb", (value / 255 for value in colour), strict=True)), "a": opacity}
 

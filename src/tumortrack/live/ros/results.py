@@ -103,7 +103,7 @@ def _labelled_cloud(estimate: TransformedEstimate | None, header: Any, messages:
 
 def _markers(
     result: TrackingResult, names: tuple[str, ...], header: Any, meshes: bool
-) -> list[dict]:
+) -> list[dict[str, Any]]:
     """Triangles per part and a text about their quality; everything deleted without estimate."""
     estimate, markers = result.transformed, []
     if estimate is None:
@@ -122,7 +122,7 @@ def _markers(
     return markers
 
 
-def _quality_text(result: TrackingResult, header: Any) -> dict:
+def _quality_text(result: TrackingResult, header: Any) -> dict[str, Any]:
     """Above the organ, as the camera sees it; without one, in front of the camera."""
     above_mm = np.array([[0.0, 0.0, 150.0]])
     if result.estimate is not None and (organ := result.estimate.meshes.get("kidney")):

@@ -92,7 +92,7 @@ class WorkcellMessages:
             points_mm = transform_points(result.published_frame.published_from_camera, points_mm)
         return plain_cloud(SensorCloud(points_mm, result.stamp_ns), header, self._messages)
 
-    def _markers(self, result: TrackingResult, header: Any) -> list[dict] | None:
+    def _markers(self, result: TrackingResult, header: Any) -> list[dict[str, Any]] | None:
         """All of them or, if they are not due, None: a slow receiver keeps the newest message
         alone, so each must be whole."""
         cell = result.workcell
@@ -130,7 +130,7 @@ def describe(cell: Workcell) -> str:
     return f"{cell.state}, halted: {cell.halted}" if cell.halted else cell.state
 
 
-def _surfaces(shapes: tuple[RigidShape, ...], header: Any) -> list[dict]:
+def _surfaces(shapes: tuple[RigidShape, ...], header: Any) -> list[dict[str, Any]]:
     if not shapes:
         return []
     poses = np.array([shape.published_from_shape for shape in shapes])
@@ -147,7 +147,7 @@ def _surfaces(shapes: tuple[RigidShape, ...], header: Any) -> list[dict]:
     ]
 
 
-def _state_text(result: TrackingResult, cell: Workcell, header: Any) -> dict:
+def _state_text(result: TrackingResult, cell: Workcell, header: Any) -> dict[str, Any]:
     """Above everything: where arms are, z is up."""
     text = describe(cell)
     if result.estimate is None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from pathlib import Path
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 import tumortrack
 from tumortrack.core.errors import InputError, StorageError
@@ -63,7 +63,7 @@ class RecordingSinkConfig(SinkConfig, frozen=True, kw_only=True, tag="recording"
             raise StorageError(f"cannot write {self.path}: {error.strerror or error}.") from error
         return RecordingSink(writer)
 
-    def _about(self, context: SinkContext) -> dict:
+    def _about(self, context: SinkContext) -> dict[str, Any]:
         """What the recording is: recording.json."""
         frame = context.published_frame
         return {

@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from html import escape
-from typing import TYPE_CHECKING, Literal, get_args
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
 from jaxtyping import UInt8
@@ -176,7 +176,7 @@ def backdrop(state: State, alarming: bool) -> UInt8[np.ndarray, "h w 3"]:
     return np.asarray(image)
 
 
-def _parts(parts: Mapping[str, dict]) -> str:
+def _parts(parts: Mapping[str, dict[str, Any]]) -> str:
     """A row per part: colour, name, probability as a bar and number, volume, deviation."""
     rows = []
     for name, part in parts.items():
@@ -244,7 +244,7 @@ class Panel:
             views = gui.add_button_group("Look at", get_args(View))
 
             @views.on_click
-            def _(event: GuiEvent) -> None:
+            def _(event: GuiEvent[Any]) -> None:
                 if event.client is not None:  # nobody's click otherwise: set by the program
                     actions.look(event.client, event.target.value)
 

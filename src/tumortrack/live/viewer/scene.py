@@ -217,7 +217,10 @@ class ViewerScene:
         )
 
     def _put_points(
-        self, node: PointCloudHandle, points: np.ndarray, colour: UInt8[np.ndarray, "n 3"] | tuple
+        self,
+        node: PointCloudHandle,
+        points: np.ndarray,
+        colour: np.ndarray | tuple[int, ...],
     ) -> None:
         node.points = points.astype(np.float32)
         node.colors = np.asarray(colour, np.uint8)

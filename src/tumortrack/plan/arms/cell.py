@@ -52,7 +52,7 @@ class ArmCell:
         self._pairs = [pair for pair in _pairs() if pair[0] in index and pair[1] in index]
         for one, other in self._pairs:
             self.solids.addCollisionPair(pin.CollisionPair(index[one], index[other]))
-        self._states: dict[tuple, Any] = {}
+        self._states: dict[tuple[Any, ...], Any] = {}
 
     @property
     def home_rad(self) -> Joints:

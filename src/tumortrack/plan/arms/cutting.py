@@ -293,7 +293,7 @@ def level_poses(
     return np.array([level_pose(tip, yaw_rad) for tip in tips_mm])
 
 
-def _at(section: Any, tips_mm: np.ndarray) -> list:
+def _at(section: Any, tips_mm: np.ndarray) -> list[Any]:
     return [section(float(height)) for height in tips_mm[:, 2]]
 
 

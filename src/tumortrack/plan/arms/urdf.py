@@ -12,10 +12,11 @@ from collections.abc import Iterable
 
 import numpy as np
 
+from tumortrack.live.sinks.ur import UR_JOINTS
 from tumortrack.plan.arms.body import LINKS, TABLE, Part, cell_parts
 from tumortrack.plan.arms.config import CellConfig
 from tumortrack.plan.arms.kinematics import ArmModel, Pose
-from tumortrack.plan.motions import ARMS, UR_JOINTS
+from tumortrack.plan.motions import ARMS
 
 
 def cell_urdf(config: CellConfig) -> str:

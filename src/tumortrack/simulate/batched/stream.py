@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import torch
@@ -72,7 +73,7 @@ class DeviceStream:
         self._device = device
         self._intrinsics = d405(stream.config.width, stream.config.height)
 
-    def __getstate__(self) -> dict:
+    def __getstate__(self) -> dict[str, Any]:
         held = ("_stream", "_device", "_intrinsics")
         return {name: self.__dict__[name] for name in held}
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float
@@ -35,6 +35,6 @@ class Deformation(Protocol):
         """New positions (float32) of points, CT frame, mm."""
         ...
 
-    def record(self) -> dict:
+    def record(self) -> dict[str, Any]:
         """The sampled parameters as JSON types."""
         ...

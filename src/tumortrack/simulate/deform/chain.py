@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -22,7 +23,7 @@ class Chain:
             points_ct = link.apply(points_ct)
         return points_ct
 
-    def record(self) -> dict:
+    def record(self) -> dict[str, Any]:
         return {"kind": "chain", "links": [link.record() for link in self.links]}
 
 
@@ -46,7 +47,7 @@ class Rest:
     def apply(self, points_ct: Points) -> Points:
         return points_ct.astype(np.float32)
 
-    def record(self) -> dict:
+    def record(self) -> dict[str, Any]:
         return {"kind": "rest"}
 
 

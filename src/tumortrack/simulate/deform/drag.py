@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numba
 import numpy as np
@@ -46,7 +46,7 @@ class Drags:
     def apply(self, points_ct: Points) -> Float32[np.ndarray, "n 3"]:
         return _drag(points_ct.astype(np.float32), self.centres_ct, self.shifts_mm, self.sigmas_mm)
 
-    def record(self) -> dict:
+    def record(self) -> dict[str, Any]:
         return {"kind": "drag"} | {name: value.tolist() for name, value in vars(self).items()}
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float32
@@ -28,7 +29,7 @@ class ElasticDeformation:
     def apply(self, points_ct: Points) -> Float32[np.ndarray, "n 3"]:
         return self.body.follow(self._velocity, points_ct)
 
-    def record(self) -> dict:
+    def record(self) -> dict[str, Any]:
         return {"kind": "elastic", "coefficients": self.coefficients.tolist()}
 
 

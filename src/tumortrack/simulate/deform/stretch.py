@@ -9,6 +9,7 @@ amount depends.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numba
 import numpy as np
@@ -34,7 +35,7 @@ class Stretch:
         bend = self.along / self.reach_mm, self.sagitta_mm * self.across
         return _moved(points_ct, self.centre_ct, self.matrix, *bend)
 
-    def record(self) -> dict:
+    def record(self) -> dict[str, Any]:
         numbers = {name: np.asarray(value).tolist() for name, value in vars(self).items()}
         return {"kind": "stretch"} | numbers
 
