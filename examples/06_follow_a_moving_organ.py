@@ -19,14 +19,14 @@ class PrintingSink:
     estimates = 0
 
     def publish(self, result: Any) -> None:
-        placed = result.placed
+        placed = result.transformed
         if placed is None:
             print(f"no estimate: {result.reason}")  # never the last answer again
             return
         self.estimates += 1
         middle, off_mm = placed.meshes["tumor_1"].box_mm.mean(0), np.nan
-        if result.seen is not None and result.seen.truth is not None:
-            off_mm = np.linalg.norm(middle - result.seen.truth.tumors[0].box_mm.mean(0))
+        if result.observation is not None and result.observation.truth is not None:
+            off_mm = np.linalg.norm(middle - result.observation.truth.tumors[0].box_mm.mean(0))
         print(
             f"frame {result.sequence} ({result.quality}): tumor 1 at {middle.round(1)} mm, off by "
             f"{off_mm:.1f} mm; {result.latency_ms:.0f} ms after the frame"

@@ -31,8 +31,7 @@ from tumortrack.simulate.batched.stream import DeviceStream, why_not
 from tumortrack.simulate.dataset import SceneStream
 from tumortrack.simulate.scene_folder import write_scene
 from tumortrack.simulate.targets import draw_targets
-from tumortrack.tracking.follower import Follower, FollowerConfig
-from tumortrack.tracking.tracker import Tracker
+from tumortrack.tracking.tracker import Follower, FollowerConfig, Tracker
 from tumortrack.training.model import load_model
 from tumortrack.training.presets import PRESETS, pretraining
 from tumortrack.training.pretrain import Pretraining, kidney_stream

@@ -5,7 +5,7 @@ scikit-image marches it, Open3D casts the camera's rays. Open3D (400 MB) lives i
 of its own:
 
     python -m venv o3d && o3d/bin/pip install open3d nibabel scikit-image scipy
-    o3d/bin/python bench/open3d_check.py --tumortrack .venv/bin/tumortrack \
+    o3d/bin/python lab/scripts/open3d_check.py --tumortrack .venv/bin/tumortrack \
         LABELS.nii.gz MODEL [LABELS.nii.gz MODEL ...] [--seeds 5]
 
 MODEL was trained on the case that `tumortrack prepare LABELS.nii.gz CASE` made. The organ is

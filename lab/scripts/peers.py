@@ -14,32 +14,11 @@ from pathlib import Path
 
 import numpy as np
 
-from tumortrack.imaging.case import Case, load_case
-from tumortrack.simulate.scene_folder import Scene, list_scenes, read_scene
-from tumortrack_lab.peers.base import Peer
+from tumortrack.simulate.scene_folder import list_scenes, read_scene
 from tumortrack_lab.peers.kinds import peer_kinds
 from tumortrack_lab.peers.rigid import matched_vertices
-
-
-def line(peer: Peer, case: Case, scene: Scene, name: str) -> dict:
-    fit = peer.fit(scene)
-    errors = {
-        part: float(np.linalg.norm(fit.carry(mesh.vertices_mm) - true, axis=1).mean())
-        for part, mesh, true in (
-            (part, mesh, matched_vertices(mesh, reference))
-            for part, mesh, reference in zip(
-                case.anatomy.names, case.anatomy.parts, scene.reference.parts, strict=True
-            )
-        )
-    }
-    return {
-        "peer": peer.name,
-        "scene": name,
-        "error_mm": errors,
-        "seconds": fit.seconds,
-        "prepare_s": peer.prepare_s,
-        "report": fit.report,
-    }
+from tumortrack_lab.study.cases import study_case
+from tumortrack_lab.study.methods import peer_method
 
 
 def main() -> None:
@@ -49,12 +28,21 @@ def main() -> None:
     parser.add_argument("--only", nargs="*", default=None)
     parser.add_argument("--bcpd", type=Path, default=None)
     given = parser.parse_args()
-    case = load_case(given.case)
-    for name, kind in peer_kinds(given.bcpd).items():
-        if given.only is None or name in given.only:
-            peer = kind.made_for(case.anatomy, case.up_lps)
-            for folder in list_scenes(given.scenes):
-                print(json.dumps(line(peer, case, read_scene(folder), folder.name)), flush=True)
+    case = study_case("case", given.case, given.scenes)
+    rest = case.anatomy_ct
+    for name in peer_kinds(given.bcpd):
+        if given.only is not None and name not in given.only:
+            continue
+        peer = peer_method(name, case, given.bcpd).peer
+        for folder in list_scenes(given.scenes):
+            scene = read_scene(folder)
+            fit, errors = peer.fit(scene), {}
+            for part, mesh, true in zip(rest.names, rest.parts, scene.reference.parts, strict=True):
+                off = fit.carry(mesh.vertices_mm) - matched_vertices(mesh, true)
+                errors[part] = float(np.linalg.norm(off, axis=1).mean())
+            line = {"peer": peer.name, "scene": folder.name, "error_mm": errors}
+            line |= {"seconds": fit.seconds, "prepare_s": peer.prepare_s, "report": fit.report}
+            print(json.dumps(line), flush=True)
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """Hours of tracking: does memory grow, do frames get late, does the estimate stay right?
 
-    python bench/soak.py MODEL CASE [--minutes 60] [--fps 30] [--sinks viewer:8090 ...]
+    make soak ARGS="MODEL CASE [--minutes 60] [--fps 30] [--sinks viewer:8090 ...]"
 
 Runs `tumortrack track` on a moving case, keeps its report, and prints what became of memory
 (after the first minute), latency, dropped frames and errors. Fails if memory grew by more than
@@ -20,7 +20,16 @@ GROWN_MB = 20.0
 
 
 def main() -> int:
-    options = _options()
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("model", type=Path, nargs="?", default=Path("runs/demo/model"))
+    parser.add_argument("case", type=Path, nargs="?", default=Path("runs/demo/case"))
+    parser.add_argument("--minutes", type=float, default=60.0)
+    parser.add_argument("--fps", type=float, default=30.0)
+    parser.add_argument("--error", type=float, default=3.0, help="largest median error, mm")
+    parser.add_argument("--stale", type=float, default=0.5, help="answers so late are none, s")
+    parser.add_argument("--sinks", nargs="*", default=[])
+    parser.add_argument("--report", type=Path, default=None)
+    options = parser.parse_args()
     with tempfile.TemporaryDirectory(prefix="tumortrack-soak-") as folder:
         report = options.report or Path(folder) / "report.json"
         command = [
@@ -63,41 +72,24 @@ def judge(found: dict, most_mm: float) -> list[str]:
 
 def table(found: dict) -> str:
     """The run in a few lines."""
-    latency, memory = found["latency_ms"], found["memory_mb"]
-    estimates = found["estimates"]
-    lines = [
-        f"seconds              {found['seconds']:.0f}",
-        f"estimates            {estimates['good']} good, {estimates['poor']} poor, "
+    latency, memory, estimates = found["latency_ms"], found["memory_mb"], found["estimates"]
+    percentiles = ", ".join(f"{key} {latency[key]}" for key in ("p50", "p95", "p99.9", "max"))
+    rows = {
+        "seconds": f"{found['seconds']:.0f}",
+        "estimates": f"{estimates['good']} good, {estimates['poor']} poor, "
         f"{found['no_estimate']} none",
-        f"frames dropped       {found['dropped']}",
-        f"latency from {found['latency_from']}, ms   p50 {latency['p50']}, p95 {latency['p95']}, "
-        f"p99.9 {latency['p99.9']}, max {latency['max']}",
-        f"memory, MB           {memory['start']} at start, {memory.get('settled')} after a minute, "
+        "frames dropped": str(found["dropped"]),
+        f"latency from {found['latency_from']}, ms": percentiles,
+        "memory, MB": f"{memory['start']} at start, {memory.get('settled')} after a minute, "
         f"{memory['now']} at the end",
-    ]
-    lines += [
-        f"{name:20} centre off by {errors['p50']} mm (median), {errors['p95']} (95 %)"
-        for name, errors in found["center_error_mm"].items()
-    ]
-    lines += [
-        f"{name:20} {sink['delivered']} delivered, {sink['dropped']} dropped, p50 "
-        f"{sink['latency_ms'].get('p50')}, p99.9 {sink['latency_ms'].get('p99.9')} ms"
-        for name, sink in found["sinks"].items()
-    ]
-    return "\n".join(lines)
-
-
-def _options() -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("model", type=Path, nargs="?", default=Path("runs/demo/model"))
-    parser.add_argument("case", type=Path, nargs="?", default=Path("runs/demo/case"))
-    parser.add_argument("--minutes", type=float, default=60.0)
-    parser.add_argument("--fps", type=float, default=30.0)
-    parser.add_argument("--error", type=float, default=3.0, help="largest median error, mm")
-    parser.add_argument("--stale", type=float, default=0.5, help="answers so late are none, s")
-    parser.add_argument("--sinks", nargs="*", default=[])
-    parser.add_argument("--report", type=Path, default=None)
-    return parser.parse_args()
+    }
+    for name, errors in found["center_error_mm"].items():
+        rows[name] = f"centre off by {errors['p50']} mm (median), {errors['p95']} (95 %)"
+    for name, sink in found["sinks"].items():
+        late = sink["latency_ms"]
+        rows[name] = f"{sink['delivered']} delivered, {sink['dropped']} dropped, p50 "
+        rows[name] += f"{late.get('p50')}, p99.9 {late.get('p99.9')} ms"
+    return "\n".join(f"{name:20} {row}" for name, row in rows.items())
 
 
 if __name__ == "__main__":

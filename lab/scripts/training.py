@@ -11,28 +11,26 @@ kept under --out, and what is there is not measured again.
 from __future__ import annotations
 
 import os
-import shlex
-import sys
 import time
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
+from functools import cache
 from pathlib import Path
 from typing import Literal
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
-import msgspec
 import numpy as np
+import pandas as pd
 import torch
-import tyro
-from tumortrack.training.networks import Network
+from msgspec.structs import replace
 
 from tumortrack.cli.console import say
 from tumortrack.core import store
-from tumortrack.core.errors import TumortrackError
 from tumortrack.core.process import keep_freed_memory
 from tumortrack.imaging.case import Case, load_case
 from tumortrack.models.config import GaussNewtonConfig, TrainConfig
+from tumortrack.models.model import Network
 from tumortrack.occupancy.network import OccupancyNetwork
 from tumortrack.phantom.digital import PhantomParameters
 from tumortrack.registration.network import RegistrationNetwork
@@ -40,26 +38,20 @@ from tumortrack.registration.registration import Registration
 from tumortrack.registration.rest_shape import shape_of
 from tumortrack.report.drawing import new_figure, save
 from tumortrack.simulate.dataset import SceneStream
-from tumortrack.simulate.occupancy import organ_pool
-from tumortrack.simulate.scene import Simulator, body_for
+from tumortrack.simulate.scene import body_for
 from tumortrack.training.occupancy_task import label_miou
-from tumortrack.training.presets import PRESETS, clinic, quick
+from tumortrack.training.presets import PRESETS
 from tumortrack.training.run import TrainingRun, settle_end
 from tumortrack.training.scenes import batches
 from tumortrack.training.state import TrainingState
-from tumortrack.training.task import (
-    ValidationScenes,
-    mean_iou_of,
-    validation_scenes,
-)
+from tumortrack.training.task import ValidationScenes, mean_iou_of
 from tumortrack.training.train import task_of
-from tumortrack_lab.study.book import ReportWriter
-from tumortrack_lab.study.markdown import table
-from tumortrack_lab.study.phantoms import phantom_case
+from tumortrack_lab.study.cases import phantom_case
+from tumortrack_lab.study.document import ReportWriter, table
+from tumortrack_lab.study.trainings import kept, make_command, run, unseen_scenes
 
 BLOCK = "training-speed"
 CPU = torch.device("cpu")
-UNSEEN_SEED = 1_000_003  # of the judged scenes and their library of states
 BATCHES = (8, 16, 32, 64)
 USUAL_BATCH = {"quick": 16, "clinic": 32}
 COLORS = dict(zip(BATCHES, ("#D55E00", "#0072B2", "#009E73", "#CC79A7"), strict=True))
@@ -102,7 +94,6 @@ class Setting:
     def config(self, case: Case) -> TrainConfig:
         """The preset with this setting's numbers."""
         config = PRESETS[self.preset](case.anatomy, "limited")
-        replace = msgspec.structs.replace
         occupancy = replace(config.scene.occupancy, per_side=self.per_side)
         return replace(
             config,
@@ -130,41 +121,38 @@ def main(options: Options) -> None:
     """Every setting, then the block."""
     torch.set_num_threads(1)
     keep_freed_memory()
-    folder = options.out / "phantom"
-    phantom_case(folder, PhantomParameters(), 0.8)
-    case, judges, rows = load_case(folder), {}, []
+    folder = phantom_case(options.out / "phantom", PhantomParameters())
+    case, rows = load_case(folder), []
+    judge = cache(lambda preset: Judge(case, preset, options.scenes))
     for setting in settings(case, options):
         about = {
             "setting": asdict(setting),
             "case_sha256": store.sha256_of(folder / store.MANIFEST),
             **{name: getattr(options, name) for name in ("seconds", "scenes", "looks")},
         }
-        cell = options.out / f"{setting.name}.json"
-        if not (cell.is_file() and (known := store.read_json(cell))["about"] == about):
-            if setting.preset not in judges:
-                judges[setting.preset] = Judge(case, setting.preset, options.scenes)
-            curve = _curve(case, setting, judges[setting.preset], options)
-            known = {"about": about, "curve": curve}
-            store.write_json(cell, known)
-        rows.append((setting, known["curve"]))
-        last = rows[-1][1][-1]
-        say(f"{setting.name}: " + " ".join(f"{k}={round(v, 3)}" for k, v in last.items()))
-    given = f" ARGS='{shlex.join(sys.argv[1:])}'" if sys.argv[1:] else ""
-    _write(rows, options, ReportWriter(options.document, f"make training-speed{given}"))
+        curve = kept(
+            options.out / f"{setting.name}.json", about,
+            lambda: _curve(case, setting, judge(setting.preset), options),  # noqa: B023 (called now)
+        )  # fmt: skip
+        rows += [{**asdict(setting), **row} for row in curve]
+        say(f"{setting.name}: " + " ".join(f"{k}={round(v, 3)}" for k, v in curve[-1].items()))
+    frame = pd.DataFrame(rows)
+    frame["both"] = (frame.miou + frame.other_miou) / 2
+    _write(frame, options, ReportWriter(options.document, make_command(BLOCK)))
 
 
 def _curve(case: Case, setting: Setting, judge: Judge, options: Options) -> list[dict]:
     """A training of so many seconds; judging does not count."""
     config = setting.config(case)
-    run = TrainingRun(
+    training = TrainingRun(
         case.anatomy, case.up_lps, "", config, setting.seed, minutes=options.seconds / 60
     )
-    course = task_of(run, CPU)
-    state = TrainingState(run, CPU)
-    state.initialize(course.initialize)
+    task = task_of(training, CPU)
+    state = TrainingState(training, CPU)
+    state.initialize(task.initialize)
     stream = SceneStream(
-        case.anatomy, case.up_lps, config.scene, course.points, setting.seed, "train",
-        setting.batch, course.body,
+        case.anatomy, case.up_lps, config.scene, task.points, setting.seed, "train",
+        setting.batch, task.body,
     )  # fmt: skip
     stream.batch(0)  # compiled kernels and ray trees are there before the clock starts
     progress, curve, spent = state.progress, [], 0.0
@@ -172,7 +160,7 @@ def _curve(case: Case, setting: Setting, judge: Judge, options: Options) -> list
     for batch in batches(stream, range(10**9), 0, 0, CPU):
         state.step(batch)
         progress.elapsed_s = spent + time.perf_counter() - began
-        settle_end(config, progress, run.minutes)
+        settle_end(config, progress, training.minutes)
         done = progress.step == progress.end
         if done or progress.elapsed_s >= options.seconds * (len(curve) + 1) / options.looks:
             spent = progress.elapsed_s
@@ -189,12 +177,13 @@ class Judge:
 
     def __init__(self, case: Case, preset: Preset, scenes: int) -> None:
         own = PRESETS[preset](case.anatomy, "limited")
-        few = msgspec.structs.replace(own, validation_pairs=scenes)
-        other = (clinic if preset == "quick" else quick)(case.anatomy, "limited").scene.deform
-        scene = msgspec.structs.replace(own.scene, deform=other[-1:])
-        strange = msgspec.structs.replace(few, scene=scene)
+        other = PRESETS["clinic" if preset == "quick" else "quick"](case.anatomy, "limited")
+        scene = replace(own.scene, deform=other.scene.deform[-1:])
         self._parts = len(case.anatomy.parts) + 1
-        self._sets = {"miou": _scenes(case, few), "other_miou": _scenes(case, strange)}
+        self._sets = {
+            "miou": unseen_scenes(case, own, scenes),
+            "other_miou": unseen_scenes(case, replace(own, scene=scene), scenes),
+        }
         body = body_for(case.anatomy, case.up_lps, own.scene, 0)
         self._shape = None if body is None else shape_of(case.anatomy, body)
 
@@ -216,72 +205,49 @@ class Judge:
         return mean_iou_of(np.stack(guesses), scenes.labels, self._parts)
 
 
-def _scenes(case: Case, config: TrainConfig) -> ValidationScenes:
-    body = body_for(case.anatomy, case.up_lps, config.scene, UNSEEN_SEED)
-    simulator = Simulator(case.anatomy, case.up_lps, config.scene, body)
-    pool = organ_pool(case.anatomy, config.scene.occupancy, UNSEEN_SEED)
-    return validation_scenes(simulator, pool, config, UNSEEN_SEED)
-
-
-Rows = list[tuple[Setting, list[dict]]]
-
-
-def _groups(rows: Rows) -> dict[tuple, list[list[dict]]]:
-    """Curves of the seeds of each setting."""
-    groups: dict[tuple, list[list[dict]]] = {}
-    for s, curve in rows:
-        groups.setdefault((s.preset, s.batch, s.per_side, s.learning_rate), []).append(curve)
-    return groups
-
-
-def _write(rows: Rows, options: Options, book: ReportWriter) -> None:
-    head = ["preset", "batch", "per side", "learning rate", "samples/s", "mIoU", "other kind"]
+def _write(frame: pd.DataFrame, options: Options, writer: ReportWriter) -> None:
+    setting = ["preset", "batch", "per_side", "learning_rate"]
+    last = frame.groupby([*setting, "seed"], sort=False).last().reset_index()
+    groups = sorted(last.groupby(setting, sort=False), key=lambda g: (g[0][0], -g[1].both.mean()))
     body = []
-    for (preset, batch, per_side, rate), curves in sorted(
-        _groups(rows).items(), key=lambda item: (item[0][0], -_reached(item[1]))
-    ):
-        speed = np.mean([curve[-1]["samples"] / curve[-1]["seconds"] for curve in curves])
-        keys = ("miou", "other_miou")
-        last = [" / ".join(f"{curve[-1][key]:.3f}" for curve in curves) for key in keys]
+    for (preset, batch, per_side, rate), seeds in groups:
+        speed = (seeds.samples / seeds.seconds).mean()
+        each = [" / ".join(f"{v:.3f}" for v in seeds[key]) for key in ("miou", "other_miou")]
         sides = str(per_side) if preset == "quick" else "-"
-        body.append([preset, str(batch), sides, f"{rate:g}", f"{speed:.0f}", *last])
-    image = book.images / "training_speed.png"
-    _draw(rows, image)
+        body.append([preset, str(batch), sides, f"{rate:g}", f"{speed:.0f}", *each])
+    image = writer.image("training_speed")
+    _draw(frame, image)
     text = (
-        f"`{book.command}`: {options.seconds:g} s of training each, on one core, scenes included "
+        f"`{writer.command}`: {options.seconds:g} s of training each, on one core, scenes included "
         f"(phantom; judging not counted), then mIoU on {options.scenes} unseen scenes of the "
         f"kinds trained on and on {options.scenes} of another kind (quick: elastic states; "
         "clinic: drags, squeezed and bent); of clinic as its network places the organ, before any "
         "refinement. Several numbers: one a seed. Best first, by the mean of both kinds."
     )
-    picture = f"![mIoU against seconds of training](images/{image.name})"
-    book.write({BLOCK: f"{picture}\n\n{table(head, body)}\n\n{text}"})
+    head = ["preset", "batch", "per side", "learning rate", "samples/s", "mIoU", "other kind"]
+    picture = writer.link(image, "mIoU against seconds of training")
+    writer.write({BLOCK: f"{picture}\n\n{table(head, body)}\n\n{text}"})
 
 
-def _reached(curves: list[list[dict]]) -> float:
-    return float(np.mean([curve[-1]["miou"] + curve[-1]["other_miou"] for curve in curves])) / 2
-
-
-def _draw(rows: Rows, path: Path) -> None:
+def _draw(frame: pd.DataFrame, path: Path) -> None:
     """The mean of both kinds against seconds, by batch and rate, and by queries a scene."""
     figure = new_figure(13.5, 4.6)
-    for number, (preset, what) in enumerate(
-        (("quick", "batch"), ("quick", "queries"), ("clinic", "batch")), start=1
-    ):
+    panels = (("quick", "batch"), ("quick", "queries"), ("clinic", "batch"))
+    for number, (preset, what) in enumerate(panels, start=1):
         axes = figure.add_subplot(1, 3, number)
-        usual = next(s for s, _ in rows if s.preset == preset and s.batch == USUAL_BATCH[preset])
-        for s, curve in rows:
-            by_batch = what == "batch" and s.per_side == usual.per_side
-            alike = (s.batch, s.learning_rate) == (usual.batch, usual.learning_rate)
-            if s.preset != preset or not (by_batch or (what == "queries" and alike)):
+        mine = frame[frame.preset == preset]
+        usual = mine[mine.batch == USUAL_BATCH[preset]].iloc[0]
+        keys = ["seed", "batch", "per_side", "learning_rate"]
+        for (_, batch, per_side, rate), curve in mine.groupby(keys, sort=False):
+            by_batch = what == "batch" and per_side == usual.per_side
+            alike = (batch, rate) == (usual.batch, usual.learning_rate)
+            if not (by_batch or (what == "queries" and alike)):
                 continue
-            label = f"batch {s.batch}, rate {s.learning_rate:g}" if by_batch else None
-            color = COLORS[s.batch] if by_batch else f"C{(32, 64, 128).index(s.per_side)}"
             axes.plot(
-                [row["seconds"] for row in curve],
-                [(row["miou"] + row["other_miou"]) / 2 for row in curve],
-                "-" if s.learning_rate == usual.learning_rate else "--",
-                color=color, marker=".", label=label or f"{s.per_side} per side",
+                curve.seconds, curve.both, "-" if rate == usual.learning_rate else "--",
+                color=COLORS[batch] if by_batch else f"C{(32, 64, 128).index(per_side)}",
+                marker=".",
+                label=f"batch {batch}, rate {rate:g}" if by_batch else f"{per_side} per side",
             )  # fmt: skip
         axes.set(title=f"{preset}: {what}", xlabel="seconds of training, one core")
         axes.set_ylabel("mIoU, mean of both kinds of scenes")
@@ -289,16 +255,8 @@ def _draw(rows: Rows, path: Path) -> None:
         # Below: in the picture it covers a line, wherever it stands.
         axes.legend(fontsize=7, ncols=2, loc="upper center", bbox_to_anchor=(0.5, -0.16))
     figure.tight_layout()
-    path.parent.mkdir(parents=True, exist_ok=True)
     save(figure, path)
 
 
 if __name__ == "__main__":
-    try:
-        main(tyro.cli(Options))
-    except TumortrackError as error:
-        print(f"training: {error}", file=sys.stderr)
-        sys.exit(error.exit_code)
-    except KeyboardInterrupt:
-        print("training: stopped; the same command goes on.", file=sys.stderr)
-        sys.exit(130)
+    run(main, Options)

@@ -364,14 +364,12 @@ def track(
     """
     from tumortrack.live.loop import Loop, LoopConfig, summary
     from tumortrack.live.sink_worker import SinkWorker
-    from tumortrack.live.sinks import SINKS
     from tumortrack.live.source_worker import SourceWorker
-    from tumortrack.live.sources import SOURCES
-    from tumortrack.live.spec import parse_spec
+    from tumortrack.live.spec import SINKS, SOURCES
     from tumortrack.live.values import PublishedFrame, SinkConfig, SinkContext
     from tumortrack.tracking.region import region_for
 
-    config = parse_spec(source, SOURCES, "source") if isinstance(source, str) else source
+    config = SOURCES.parse(source) if isinstance(source, str) else source
     context = SinkContext(tracker.model.parts, PublishedFrame(), tracker.anatomy_ct)
     region = region_for(tracker.model, range_mm=range_mm)
     loop = Loop(tracker, context, LoopConfig(region=region, seconds=seconds))
@@ -385,8 +383,8 @@ def track(
         workers = []
         for number, sink in enumerate(sinks):
             name = sink if isinstance(sink, str) else f"sink {number}"
-            made = parse_spec(sink, SINKS, "sink") if isinstance(sink, str) else sink
-            waiting = made.waiting if isinstance(made, SinkConfig) else 1
+            made = SINKS.parse(sink) if isinstance(sink, str) else sink
+            waiting = made.queue_size if isinstance(made, SinkConfig) else 1
             opened = made.open(context) if isinstance(made, SinkConfig) else made
             workers.append(SinkWorker(name, opened, waiting))
             stack.callback(workers[-1].close)

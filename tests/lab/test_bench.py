@@ -8,6 +8,7 @@ import msgspec
 import numpy as np
 import pytest
 import torch
+from tumortrack.occupancy.mlp_decoder import MlpDecoder
 
 from clock import Clock
 from stories import tumortrack
@@ -18,23 +19,20 @@ from tumortrack.models.encoders.pointnet2 import PointNet2Config, SetAbstraction
 from tumortrack.models.normalisation import CloudBox
 from tumortrack.occupancy.network import OccupancyNetwork
 from tumortrack.training.presets import quick_network
-from tumortrack_lab.bench import turns
+from tumortrack_lab.bench import timing as interleaving
 from tumortrack_lab.bench.counts import module_flops
 from tumortrack_lab.bench.goals import GOALS, goals_table
-from tumortrack_lab.bench.growth import draw_growth
-from tumortrack_lab.bench.memory import forget_peak, peak_bytes
+from tumortrack_lab.bench.machine import forget_peak, peak_bytes
 from tumortrack_lab.bench.naive.occupancy import NaiveOccupancy
 from tumortrack_lab.bench.naive.scenes import flowed
-from tumortrack_lab.bench.plan import Wish, tasks_of
-from tumortrack_lab.bench.report import BLOCKS, write_bench
-from tumortrack_lab.bench.row import BenchResult, BenchRow, Peaks, Point, Work
-from tumortrack_lab.bench.subject import Subject
-from tumortrack_lab.bench.suite import GROUPS
-from tumortrack_lab.bench.tasks import Task, carry_out
-from tumortrack_lab.bench.turns import InterleavedTiming, Uncounted, in_turns, timing_of
+from tumortrack_lab.bench.report import BLOCKS, draw_growth, write_bench
+from tumortrack_lab.bench.rows import BenchResult, BenchRow, Peaks, Point, Work
+from tumortrack_lab.bench.run import GROUPS, BenchRequest, Task, TaskMessage, carry_out, tasks_of
+from tumortrack_lab.bench.subject import BenchSubject
+from tumortrack_lab.bench.timing import InterleavedTiming, Uncounted, interleaved, timing_of
 from tumortrack_lab.cli import bench as benching
 from tumortrack_lab.cli.bench import Bench
-from tumortrack_lab.study.markdown import closing, opening
+from tumortrack_lab.study.document import closing, opening
 
 PAPER_DECODER = MlpDecoderConfig(
     n_classes=4, width=512, hidden_layers=8, skip_layer=5, norm_layers=(5, 8)
@@ -47,7 +45,7 @@ def timing(median_s: float) -> InterleavedTiming:
 
 def test_turns_are_fair_and_what_is_not_counted_is_left_out(monkeypatch) -> None:
     clock, order = Clock(), []
-    monkeypatch.setattr(turns, "time", clock)
+    monkeypatch.setattr(interleaving, "time", clock)
 
     def slow() -> None:
         order.append("slow")
@@ -58,7 +56,7 @@ def test_turns_are_fair_and_what_is_not_counted_is_left_out(monkeypatch) -> None
         clock.sleep(0.015)
         return Uncounted(0.01)
 
-    slow_s, fast_s = in_turns(slow, fast, budget_s=0.2)
+    slow_s, fast_s = interleaved(slow, fast, budget_s=0.2)
     assert slow_s.median_s == pytest.approx(0.02)
     assert fast_s.median_s == pytest.approx(0.005)  # a hundredth is not counted
     assert order[4:8] == ["slow", "fast", "slow", "fast"]  # after two calls of each to warm up
@@ -68,7 +66,7 @@ def test_turns_are_fair_and_what_is_not_counted_is_left_out(monkeypatch) -> None
 
 
 def test_arithmetic_is_that_of_the_layers() -> None:
-    decoder = PAPER_DECODER.build(latent_size=1024).eval()
+    decoder = MlpDecoder(PAPER_DECODER, latent_size=1024).eval()
     for layer in decoder.layers:
         layer.fold()
     terms = decoder.prepare(torch.zeros(1, 1024))
@@ -204,7 +202,7 @@ def test_a_document_is_filled_and_the_rest_of_it_stays(tmp_path) -> None:
     draw_growth(some_bench().points[:4], tmp_path / "one.png")  # a single curve is a picture too
 
 
-def small_subject(folder: Path) -> Subject:
+def small_subject(folder: Path) -> BenchSubject:
     """The bench's subject with a ball and a tumor in place of the phantom."""
     import trimesh
 
@@ -212,16 +210,18 @@ def small_subject(folder: Path) -> Subject:
         sphere = trimesh.creation.icosphere(2, radius_mm)
         return Mesh(sphere.vertices + [x_mm, 0, 0], sphere.faces)
 
-    subject = Subject({}, folder)
+    subject = BenchSubject({}, folder)
     subject.__dict__["anatomy"] = Anatomy((ball(30.0, 0.0), ball(8.0, 10.0)))
     return subject
 
 
 def test_a_process_measures_a_part(tmp_path) -> None:
+    messages_of_trainings: list[TaskMessage] = []
     task = Task(threads=1, folder=str(tmp_path), describe=True, peaks=True, quick=True)
     task = msgspec.structs.replace(task, groups=("generator",))
-    said = list(carry_out(task, small_subject(tmp_path)))
-    (row,) = [one.row for one in said if one.row is not None]
+    messages = list(carry_out(task, small_subject(tmp_path), messages_of_trainings.append))
+    assert not messages_of_trainings
+    (row,) = [one.row for one in messages if one.row is not None]
     ours, naive = row.ours, row.naive
     assert naive is not None
     assert 1e-5 < ours.best_s <= ours.low_s <= ours.median_s <= ours.high_s
@@ -232,12 +232,12 @@ def test_a_process_measures_a_part(tmp_path) -> None:
     # 18 drags of 2,000 points and 162 vertices, 640 triangles' front half, a quarter of the image.
     by_hand = 16 * 18 * 2162 + 60 * 160 + 2 * 20 * 424 * 240 / 4
     assert row.work.flops == by_hand
-    (peaks,) = [one.peaks for one in said if one.peaks is not None]
+    (peaks,) = [one.peaks for one in messages if one.peaks is not None]
     assert peaks.triad > 1e7  # a thousandth of what any machine reaches, however loaded
     assert peaks.gemm["fp32"] > 1e7
-    (machine,) = [one.machine for one in said if one.machine is not None]
+    (machine,) = [one.machine for one in messages if one.machine is not None]
     assert int(machine["cores"]) >= 1
-    assert [one.begins for one in said if one.begins] == [
+    assert [one.begins for one in messages if one.begins] == [
         "the machine's own rates, one core",
         "generator, one core",
     ]
@@ -253,7 +253,10 @@ if task["describe"]:
     print(json.dumps({"machine": {"date": "today"}}))
 for group in task["groups"]:
     time = dict(best_s=1.0, median_s=2.0, low_s=1.5, high_s=3.0, turns=3)
-    print(json.dumps({"row": dict(name=group, what="", threads=1, item="pair", ours=time)}))
+    row = dict(name=group, what="", threads=1, item="pair", ours=time)
+    if group == "planning":
+        row["naive"] = {**time, "median_s": 4.0}
+    print(json.dumps({"row": row}))
 if "encoder" in task["groups"]:
     sys.exit("the encoder is broken")
 """
@@ -267,24 +270,27 @@ def test_the_command_gathers_what_processes_find(tmp_path, monkeypatch, capfd) -
     assert [row["name"] for row in found["rows"]] == ["generator", "planning"]
     assert found["machine"] == {"date": "today"}
     assert found["command"] == "tumortrack bench --only generator planning --quick"
-    said = capfd.readouterr().out
-    assert "something; about" in said  # and so many seconds left
-    assert said.index("  generator") < said.index("  planning") < said.index("written to")
-    assert said.count("2.00 s a pair") == 2  # each as soon as it was measured
+    shown = capfd.readouterr().out
+    assert "something; about" in shown  # and so many seconds left
+    assert shown.index("  generator") < shown.index("  planning") < shown.index("written to")
+    first, second = (line for line in shown.splitlines() if "2.00 s a pair" in line)
+    assert "naive" not in first  # each as soon as it was measured
+    assert first.endswith(" left")
+    assert "; naive 4.00 s, 2.00 x; about " in second
     with pytest.raises(TumortrackError, match="the encoder is broken"):
         Bench(only=("encoder",), out=tmp_path / "none.json").run()
     assert not (tmp_path / "none.json").exists()
 
 
 def test_each_process_has_its_own_threads_and_only_needed_models_are_trained(tmp_path) -> None:
-    wish = Wish(("generator", "frame", "tracking"), ("grid",), False, tmp_path)
-    first, one, two, *curves = tasks_of(wish, cores=4)
+    request = BenchRequest(("generator", "frame", "tracking"), ("grid",), False, tmp_path)
+    first, one, two, *curves = tasks_of(request, cores=4)
     assert (first.threads, first.train) == (2, ("clinic", "paper", "quick"))
     assert first.describe
     assert (one.threads, one.groups) == (1, ("generator", "frame", "tracking"))
     assert (two.threads, two.groups) == (2, ("frame", "tracking"))
     assert [task.curve for task in curves] == [("grid", p) for p in ("clinic", "quick", "paper")]
-    (alone,) = tasks_of(Wish(("generator",), (), False, tmp_path), cores=1)
+    (alone,) = tasks_of(BenchRequest(("generator",), (), False, tmp_path), cores=1)
     assert alone.describe
     assert alone.train == ()
 

@@ -1,24 +1,36 @@
 """The bench: calls that take seconds, and what only a GPU is asked for."""
 
 import shutil
+from functools import partial
 
 import pytest
 
 from clock import Clock
-from tumortrack.training.presets import quick
-from tumortrack_lab.bench import frames, gpu, turns, volume
+from tumortrack.training.presets import PRESETS, quick
+from tumortrack_lab.bench import curves, networks, timing, training
 from tumortrack_lab.bench.goals import goals_table
-from tumortrack_lab.bench.row import BenchResult, BenchRow
-from tumortrack_lab.bench.subject import Subject
-from tumortrack_lab.bench.training import WHOLE
-from tumortrack_lab.bench.turns import in_turns, timing_of
+from tumortrack_lab.bench.rows import (
+    DECODER,
+    ENCODER,
+    EVERY,
+    FRAME,
+    GENERATOR,
+    STEP,
+    TRACKING,
+    TRAINING,
+    VOLUME,
+    BenchResult,
+    BenchRow,
+)
+from tumortrack_lab.bench.subject import BenchSubject
+from tumortrack_lab.bench.timing import interleaved, timing_of
 
 
 def test_long_calls_have_three_turns_the_first_among_them(monkeypatch) -> None:
-    monkeypatch.setattr(turns, "_LONG_S", 0.01)
-    monkeypatch.setattr(turns, "_LONGER_S", 0.01)
+    monkeypatch.setattr(timing, "_LONG_S", 0.01)
+    monkeypatch.setattr(timing, "_LONGER_S", 0.01)
     clock = Clock()
-    monkeypatch.setattr(turns, "time", clock)
+    monkeypatch.setattr(timing, "time", clock)
     seconds = iter([0.08, 0.02, 0.03, 0.5])  # the first is cold
     order = []
 
@@ -30,7 +42,7 @@ def test_long_calls_have_three_turns_the_first_among_them(monkeypatch) -> None:
         order.append("ours")
         clock.sleep(0.002)
 
-    ours_s, naive_s = in_turns(ours, naive, budget_s=0.01)
+    ours_s, naive_s = interleaved(ours, naive, budget_s=0.01)
     assert order.count("naive") == naive_s.turns == ours_s.turns == 3
     assert order[:4] == ["ours", "ours", "naive", "ours"]
     assert naive_s.median_s == pytest.approx(0.03)  # of 0.08, 0.02 and 0.03
@@ -40,7 +52,7 @@ def test_long_calls_have_three_turns_the_first_among_them(monkeypatch) -> None:
 
 def test_goals_of_a_gpu_are_judged_where_there_is_one() -> None:
     step = BenchRow(
-        name=WHOLE,
+        name=TRAINING,
         what="paper",
         threads=2,
         item="step",
@@ -56,16 +68,73 @@ def test_goals_of_a_gpu_are_judged_where_there_is_one() -> None:
 
 
 def test_rows_of_a_gpu_are_measured_on_any_device(quick_model, tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr(gpu, "LABELLING", ("quick",))
-    for module, name, small in (
-        (volume, "GRID", 24),
-        (volume, "_SLAB", 99),
-        (frames, "QUERIES", 999),
-    ):
-        monkeypatch.setattr(module, name, small)
-    subject = Subject({"quick": lambda anatomy: quick(anatomy, "limited")}, tmp_path)
+    monkeypatch.setattr(training, "LABELLING", ("quick",))
+    for name, small in (("GRID", 24), ("_SLAB", 99), ("QUERIES", 999)):
+        monkeypatch.setattr(networks, name, small)
+    presets = {"quick": lambda anatomy: quick(anatomy, "limited")}
+    subject = BenchSubject(presets, tmp_path)
     shutil.copytree(quick_model, tmp_path / "quick")
-    found = {row.name: row for row in gpu.rows_on(subject, "cpu", 1, 0.5)}
-    assert set(found) == {frames.FRAME, frames.EVERY, volume.NAME, WHOLE}
+    every = training.on_device(subject, "cpu", 0.5)
+    found = {row.name: row for workload in every for row in workload.rows(1, 0.5)}
+    assert set(found) == {FRAME, EVERY, VOLUME, TRAINING}
     assert all(row.device == "cpu" and row.what == "quick" for row in found.values())
-    assert found[WHOLE].per_s > 0
+    assert found[TRAINING].per_s > 0
+
+
+@pytest.mark.slow
+def test_every_workload_becomes_a_row(quick_model, clinic_model, tmp_path, monkeypatch) -> None:
+    for module in (networks, training):
+        monkeypatch.setattr(module, "LABELLING", ("quick",))
+    small = {"GRID": 24, "_SLAB": 99, "QUERIES": 999, "_DECODED": (100, 200), "IN_ONE_PIECE": 100}
+    for name, value in small.items():
+        monkeypatch.setattr(networks, name, value)
+    monkeypatch.setattr(training, "_SAMPLES", {"clinic": 2, "quick": 2})
+    presets = {name: partial(PRESETS[name], rotations="limited") for name in ("clinic", "quick")}
+    for name, folder in (("clinic", clinic_model), ("quick", quick_model)):
+        shutil.copytree(folder, tmp_path / name)
+    subject = BenchSubject(presets, tmp_path)
+    rows = [
+        row
+        for source in (
+            networks.encoders,
+            networks.decoders,
+            networks.frames,
+            networks.tracking,
+            networks.volumes,
+            training.elastic,
+            training.steps,
+        )
+        for workload in source(subject, 0.01)
+        for row in workload.rows(1, 0.01)
+    ]
+    found = [(row.name, row.what) for row in rows]
+    both = [(name, what) for name in (TRACKING, VOLUME) for what in ("clinic", "quick")]
+    assert found == [
+        (ENCODER, "quick"),
+        (ENCODER, "clinic"),
+        (DECODER, "quick, 100 queries"),
+        (DECODER, "quick, 200 queries"),
+        (FRAME, "clinic"),
+        (FRAME, "quick"),
+        (EVERY, "quick"),
+        *both,
+        (GENERATOR, "elastic"),
+        (STEP, "clinic"),
+        (STEP, "quick"),
+    ]
+    by_name = dict(zip(found, rows, strict=True))
+    one, two = (by_name[DECODER, f"quick, {count} queries"] for count in (100, 200))
+    assert one.naive is not None
+    assert two.naive == one.naive.times(2.0)  # timed once, scaled
+    assert by_name[TRACKING, "quick"].naive == by_name[FRAME, "quick"].naive
+    assert by_name[VOLUME, "clinic"].agreement > 0.95
+    assert by_name[FRAME, "clinic"].agreement > 0.95
+    assert all(row.work is not None for row in rows if row.name != TRACKING)
+    assert all(row.naive is not None for row in rows if row != by_name[ENCODER, "clinic"])
+    for name in ("_QUERIES", "_POINTS", "_GRIDS", "_BATCHES"):
+        monkeypatch.setattr(curves, name, (20, 40))
+    for curve in ("queries", "points", "grid", "batch"):
+        for preset in presets:
+            points = list(curves.points_of(subject, curve, preset))
+            assert [point.size for point in points] == [20, 40]
+            assert all(point.seconds > 0 for point in points)

@@ -1,4 +1,4 @@
-"""Plans made on estimates cut the truth: cells kept, and what the tables say of them."""
+"""Plans made on estimates cut the truth: kept, and what the tables say of them."""
 
 from __future__ import annotations
 
@@ -19,10 +19,12 @@ from tumortrack.plan.resection import plan_resection
 from tumortrack.simulate.scene_folder import Scene, write_scene
 from tumortrack_lab.cut.resection import cut
 from tumortrack_lab.peers.base import Fit, estimate_of, rigid_carry
-from tumortrack_lab.study.book import ReportWriter, section_blocks
-from tumortrack_lab.study.cells import MeasurementStore
-from tumortrack_lab.study.measure import Hashes, Job, StudyCase, measure, spec_of
+from tumortrack_lab.study.cases import StudyCase
+from tumortrack_lab.study.document import ReportWriter
+from tumortrack_lab.study.frame import groups
+from tumortrack_lab.study.measure import Job, MeasurementStore, measure, spec_of
 from tumortrack_lab.study.methods import Answer, Method
+from tumortrack_lab.study.report import section_blocks
 from tumortrack_lab.study.resection import (
     PLANNERS,
     Cutting,
@@ -31,8 +33,9 @@ from tumortrack_lab.study.resection import (
     cut_one,
     exophytic_tumors,
     scattered,
+    tables_of,
+    tidy_plans,
 )
-from tumortrack_lab.study.resection_table import rows_of, tables_of
 
 CAMERA_FROM_TABLE = rigid(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 150.0]))
 PUBLISHED, OURS = Planner(method="published"), Planner(method="margin")
@@ -149,19 +152,19 @@ def test_only_exophytic_tumors_are_cut(case):
 
 
 def test_an_estimate_that_is_off_costs_as_much_margin(case):
-    here = cut_one(jobs(case, Shifted())[0], "D0")["plans"]["tumor_1"]
-    off = cut_one(jobs(case, Shifted(shift_mm=3.0))[0], "D0")["plans"]["tumor_1"]
+    here = cut_one(jobs(case, Shifted())[0])["plans"]["tumor_1"]
+    off = cut_one(jobs(case, Shifted(shift_mm=3.0))[0])["plans"]["tumor_1"]
     assert here[OURS.name]["removed_share"] == off[OURS.name]["removed_share"] == 1.0
     assert here[OURS.name]["margin_mm"] == pytest.approx(5.0, abs=0.4)
     assert off[OURS.name]["margin_mm"] == pytest.approx(5.0 - 3.0, abs=0.5)
-    far = cut_one(jobs(case, Shifted(shift_mm=8.0))[0], "D0")["plans"]["tumor_1"]
+    far = cut_one(jobs(case, Shifted(shift_mm=8.0))[0])["plans"]["tumor_1"]
     assert far[OURS.name]["margin_mm"] == pytest.approx(5.0 - 8.0, abs=0.6)
     assert far[OURS.name]["removed_share"] < 0.97
     assert far[OURS.name]["left_ml"] > 0.1
 
 
 def test_the_margin_grows_by_what_the_estimate_is_unsure_of(case):
-    plans = cut_one(jobs(case, Shifted(std_mm=0.5))[0], "D0")["plans"]["tumor_1"]
+    plans = cut_one(jobs(case, Shifted(std_mm=0.5))[0])["plans"]["tumor_1"]
     assert list(plans) == [planner.name for planner in PLANNERS]
     wider = Planner(method="margin", sigmas=2.0)
     gained = plans[wider.name]["margin_mm"] - plans[OURS.name]["margin_mm"]
@@ -169,35 +172,35 @@ def test_the_margin_grows_by_what_the_estimate_is_unsure_of(case):
     assert plans[wider.name]["healthy_ml"] > plans[OURS.name]["healthy_ml"] + 0.2
     paper = Planner(method="published", sigmas=2.0)
     assert plans[paper.name]["healthy_ml"] > plans[PUBLISHED.name]["healthy_ml"] + 0.2
-    without = cut_one(jobs(case, Shifted())[0], "D0")["plans"]["tumor_1"]
+    without = cut_one(jobs(case, Shifted())[0])["plans"]["tumor_1"]
     assert list(without) == [PUBLISHED.name, OURS.name]
 
 
-def test_cells_are_measured_once_and_are_others_than_those_of_accuracy(case, tmp_path):
-    method, cells = Shifted(), MeasurementStore(tmp_path)
+def test_plans_are_measured_once_and_apart_from_accuracy(case, tmp_path):
+    method, kept = Shifted(), MeasurementStore(tmp_path)
     todo = jobs(case, method, variants=("D0", "D1"))
-    first = measure(todo, cells, one=cut_one)
+    first = measure(todo, kept, one=cut_one)
     assert len(method.calls) == 2
-    assert measure(todo, cells, one=cut_one) == first
+    assert measure(todo, kept, one=cut_one) == first
     assert len(method.calls) == 2
     plain = replace(todo[0], method=method)
-    assert spec_of(plain, Hashes()).digest != spec_of(todo[0], Hashes()).digest
+    assert spec_of(plain).digest != spec_of(todo[0]).digest
 
 
 def test_a_scene_without_a_table_is_refused(case):
     with pytest.raises(InputError, match="where its table is"):
-        cut_one(Job(case, Cutting(Truth()), "G1", "noise", 64), "G1-noise")
+        cut_one(Job(case, Cutting(Truth()), "G1", "noise", 64))
 
 
 def test_tables_say_what_was_removed_and_why_not(case, tmp_path):
     methods = (Truth(), Shifted(shift_mm=8.0), Shifted(nothing=True, name="M_lim"))
-    cells = measure(jobs(case, *methods), MeasurementStore(tmp_path / "cells"), one=cut_one)
-    assert [(row.method, row.planner.method) for row in rows_of(cells)] == [
-        (name, planner.method)
+    found = measure(jobs(case, *methods), MeasurementStore(tmp_path / "cells"), one=cut_one)
+    assert [group for group, _ in groups(tidy_plans(found), "method", "planner")] == [
+        (name, planner.name)
         for name in ("clinic", "M_lim", "truth")
         for planner in (PLANNERS if name == "M_lim" else (PUBLISHED, OURS))
     ]
-    text = tables_of(cells)
+    text = tables_of(found)
     lines = {
         tuple(cell.strip() for cell in line.split("|")[1:3]): line for line in text.split("\n")
     }
@@ -207,14 +210,14 @@ def test_tables_say_what_was_removed_and_why_not(case, tmp_path):
     assert "| 0 of 1 | 0 of 0 | 0 of 0 | – |" in lines["M_lim", "ours, 5 mm"]
     assert "1 x M_lim, the paper's, 5 mm: the cloud shows no organ" in text
     block = section_blocks(
-        "resection", cells, (case,), ReportWriter(tmp_path / "x.md", "make results")
+        "resection", found, (case,), ReportWriter(tmp_path / "x.md", "make results")
     )
     assert block["resection"].startswith("All cases:")
     assert "`make results`: 3 measurements" in block["resection"]
 
 
 def test_shares_are_never_rounded_up_to_all(case, tmp_path):
-    cells = measure(jobs(case, Truth()), MeasurementStore(tmp_path), one=cut_one)
-    entry = {**cells[0]["plans"]["tumor_1"][OURS.name], "removed_share": 0.99996}
-    cells[0]["plans"]["tumor_1"][OURS.name] = entry
-    assert "| 99.9 | 99.9 |" in tables_of(cells)
+    found = measure(jobs(case, Truth()), MeasurementStore(tmp_path), one=cut_one)
+    entry = {**found[0]["plans"]["tumor_1"][OURS.name], "removed_share": 0.99996}
+    found[0]["plans"]["tumor_1"][OURS.name] = entry
+    assert "| 99.9 | 99.9 |" in tables_of(found)

@@ -15,13 +15,13 @@ from tumortrack.sense.camera import project
 from tumortrack.sense.noise import CLEAN, D405_NOISE
 from tumortrack.sense.render import render_depth
 from tumortrack.simulate.targets import draw_targets
-from tumortrack_lab.study import severity as study
-from tumortrack_lab.study.cells import MeasurementSpec
-from tumortrack_lab.study.figures import figure, part_value
-from tumortrack_lab.study.measure import StudyCase
-from tumortrack_lab.study.methods import Network
-from tumortrack_lab.study.peer_methods import peer_method
+from tumortrack_lab.study.cases import StudyCase
+from tumortrack_lab.study.frame import by_seed, text, tidy
+from tumortrack_lab.study.measure import MeasurementSpec
+from tumortrack_lab.study.methods import Network, peer_method
 from tumortrack_lab.study.plan import FULL, QUICK, Methods, jobs_of, scenes_of
+from tumortrack_lab.study.plots import severity_curves
+from tumortrack_lab.study.tables import levels_of, severities
 from tumortrack_lab.twin.faults import (
     FAULTS,
     KINDS,
@@ -242,8 +242,8 @@ def test_a_rod_in_view_cannot_be_seen_from_elsewhere():
 # --- the study ---
 
 
-def cell(fault, draw, error_mm, variant="D2", seed=0, method="M_lim", target=None):
-    """A measured cell; ``error_mm`` None: tumor 2 was not found."""
+def measurement(fault, draw, error_mm, variant="D2", seed=0, method="M_lim", target=None):
+    """A measurement; ``error_mm`` None: tumor 2 was not found."""
     part = {"found": True, "iou": 0.5}
     keys = ("hausdorff_mm", "hausdorff_one_sided_mm", "center_mm")
     first = {**part, **dict.fromkeys(keys, 1.5)}
@@ -251,7 +251,8 @@ def cell(fault, draw, error_mm, variant="D2", seed=0, method="M_lim", target=Non
     second = lost if error_mm is None else {**part, **dict.fromkeys(keys, error_mm)}
     return {
         "spec": {
-            "case": "x", "variant": variant, "view": "clean", "fault": fault, "fault_seed": draw,
+            "case": "x", "scene": f"{variant}-clean", "variant": variant, "view": "clean",
+            "fault": fault, "fault_seed": draw,
             "method": {"name": method, "seed": seed},
         },
         "parts": {"kidney": part, "tumor_1": first, "tumor_2": second},
@@ -261,23 +262,26 @@ def cell(fault, draw, error_mm, variant="D2", seed=0, method="M_lim", target=Non
     }  # fmt: skip
 
 
-CELLS = [
-    cell("clean", 0, 1.0),
-    cell("clean", 0, 3.0, "G1"),
-    *(cell("visible=40", n, error) for n, error in enumerate((4.0, 10.0, 40.0))),
-    *(cell("noise=2", n, error) for n, error in enumerate((None, None, 7.0))),
-    cell("distance=200", 0, 2.5),
-    cell("clean", 0, 2.0, method="rigid", target=2.2),
-    cell("visible=40", 0, 20.0, method="rigid", target=8.8),
+MEASUREMENTS = [
+    measurement("clean", 0, 1.0),
+    measurement("clean", 0, 3.0, "G1"),
+    *(measurement("visible=40", n, error) for n, error in enumerate((4.0, 10.0, 40.0))),
+    *(measurement("noise=2", n, error) for n, error in enumerate((None, None, 7.0))),
+    measurement("distance=200", 0, 2.5),
+    measurement("clean", 0, 2.0, method="rigid", target=2.2),
+    measurement("visible=40", 0, 20.0, method="rigid", target=8.8),
 ]
 
 
 def test_curves_begin_at_the_clean_scene():
-    mine = [c for c in CELLS if c["spec"]["method"]["name"] == "M_lim"]
-    value = part_value("tumor_2", "hausdorff_mm")
+    frame = tidy(MEASUREMENTS)
+    mine = frame[frame.method == "M_lim"]
 
     def curve(kind):
-        return [(at, figure(here, value).text()) for at, here in study.levels_of(mine, kind)]
+        return [
+            (at, text(by_seed(here[here.part == "tumor_2"], "hausdorff_mm")))
+            for at, here in levels_of(mine, kind)
+        ]
 
     assert curve("visible") == [(100.0, "2.0"), (40.0, "10.0")]
     assert curve("distance") == [(200.0, "2.5")]
@@ -288,7 +292,7 @@ def test_curves_begin_at_the_clean_scene():
 def test_the_table_has_a_row_for_every_level():
     rows = [
         [one.strip() for one in line.strip("|").split("|")]
-        for line in study.table_of(CELLS).splitlines()[2:]
+        for line in severities(tidy(MEASUREMENTS)).splitlines()[2:]
     ]
     assert len(rows) == 2 + 2 + 1 + 2
     first, second = rows[0], rows[1]
@@ -307,13 +311,14 @@ def test_the_table_has_a_row_for_every_level():
 
 def test_the_picture_is_drawn_even_where_nothing_was_found(tmp_path):
     path = tmp_path / "severity.png"
-    study.curves(CELLS, path)
+    severity_curves(tidy(MEASUREMENTS), path)
     assert path.stat().st_size > 10_000
-    study.curves([cell("clean", 0, None), cell("tilt=30", 0, None)], path)
+    lost = [measurement("clean", 0, None), measurement("tilt=30", 0, None)]
+    severity_curves(tidy(lost), path)
     assert path.stat().st_size > 5_000
 
 
-def test_the_plan_measures_each_level_once_beside_one_clean_cell(tmp_path):
+def test_the_plan_measures_each_level_once_beside_one_clean_scene(tmp_path):
     case = StudyCase("x", tmp_path, tmp_path, render_objects.anatomy(2), (0.0, -1.0, 0.0), True)
     made = []
 
@@ -331,10 +336,10 @@ def test_the_plan_measures_each_level_once_beside_one_clean_cell(tmp_path):
     assert sorted(made) == [("M_lim", 0), ("clinic", 0), ("rigid",)]
     assert len({(id(j.method), j.variant, j.fault, j.fault_seed) for j in jobs}) == len(jobs)
     assert {job.view for job in jobs} == {"clean"}
-    assert scenes_of(FULL, "severity") == (("D2", "G1"), ("clean",))
+    assert scenes_of(FULL, "severity", case) == (("D2", "G1"), ("clean",))
 
 
-def test_cells_measured_before_keep_their_names():
+def test_earlier_measurements_keep_their_names():
     """Recorded before there were severities."""
     spec = MeasurementSpec(
         case="c", case_sha256="a", scene="D2-clean", scene_sha256="b", variant="D2", view="clean",

@@ -1,14 +1,16 @@
-"""The study: cells measured once, known numbers in tables, blocks replaced and nothing else."""
+"""The study: what is measured once, known numbers in tables, blocks replaced and nothing else."""
 
 from __future__ import annotations
 
 import os
+import runpy
 import signal
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import msgspec
 import numpy as np
+import pandas as pd
 import pytest
 import trimesh
 
@@ -26,21 +28,27 @@ from tumortrack.simulate.scene import SceneConfig, SceneRecipe, Simulator
 from tumortrack.simulate.scene_folder import Scene, write_scene
 from tumortrack.training.presets import clinic, quick
 from tumortrack_lab.peers.base import Fit, estimate_of, rigid_carry
-from tumortrack_lab.study import ablation, goals, paper, tables
-from tumortrack_lab.study.book import ReportWriter, gallery_block, section_blocks
+from tumortrack_lab.peers.kinds import peer_kinds
+from tumortrack_lab.study import paper, tables
 from tumortrack_lab.study.bound import BOUNDS, Bound, BoundConfig, BoundMotion, laid_on
-from tumortrack_lab.study.caption import caption
-from tumortrack_lab.study.cells import MeasurementStore
-from tumortrack_lab.study.figures import NOT_FOUND, Figure, figure, median, part_value
-from tumortrack_lab.study.markdown import closing, fill, opening, table
-from tumortrack_lab.study.measure import Job, StudyCase, StudyStatus, measure
-from tumortrack_lab.study.methods import Answer, Method
+from tumortrack_lab.study.cases import StudyCase, study_case
+from tumortrack_lab.study.document import ReportWriter, closing, fill, opening, table
+from tumortrack_lab.study.frame import NOT_FOUND, by_seed, text, tidy
+from tumortrack_lab.study.goals import goal_tables
+from tumortrack_lab.study.measure import (
+    Job,
+    MeasurementStore,
+    StudyStatus,
+    displacements,
+    measure,
+    point_errors,
+)
+from tumortrack_lab.study.methods import Answer, Method, peer_method
 from tumortrack_lab.study.models import ABLATED, Presets, Trainer, train_config
-from tumortrack_lab.study.peer_methods import peer_kinds, peer_method
-from tumortrack_lab.study.phantoms import study_case
 from tumortrack_lab.study.plan import FULL, QUICK, SECTIONS, Methods, StudyPlan, jobs_of
-from tumortrack_lab.study.points import displacements, point_errors
+from tumortrack_lab.study.report import gallery_block, section_blocks
 
+ROOT = Path(__file__).parents[2]
 TURN = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
 CAMERA_FROM_CT = rigid(TURN, np.array([3.0, -2, 130]))
 
@@ -118,10 +126,10 @@ def jobs(case, method, grid=24):
     return [Job(case, method, variant, "clean", grid) for variant in ("D1", "D2")]
 
 
-def test_a_killed_study_goes_on_and_measures_no_cell_twice(case, tmp_path):
+def test_a_killed_study_goes_on_and_measures_nothing_twice(case, tmp_path):
     kept = MeasurementStore(tmp_path / "cells")
     child = os.fork()
-    if child == 0:  # dies in the middle of the second cell
+    if child == 0:  # dies in the middle of the second measurement
         measure(jobs(case, Shifted(dies_at=2)), kept)
         os._exit(0)
     assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == -signal.SIGKILL
@@ -140,10 +148,10 @@ def test_a_killed_study_goes_on_and_measures_no_cell_twice(case, tmp_path):
     assert len(method.calls) == 1
     whole = measure(jobs(case, Shifted()), MeasurementStore(tmp_path / "others"))
     lies = paper.tumor_lies(anatomy())
-    assert tables.accuracy(whole, lies, True) == tables.accuracy(resumed, lies, True)
+    assert tables.accuracy(tidy(whole), lies, True) == tables.accuracy(tidy(resumed), lies, True)
 
 
-def test_what_decides_a_cell_makes_it_another_one(case, tmp_path):
+def test_what_decides_a_measurement_makes_it_another_one(case, tmp_path):
     kept, method = MeasurementStore(tmp_path / "cells"), Shifted()
     measure(jobs(case, method), kept)
     measure(jobs(case, method, grid=32), kept)
@@ -166,16 +174,17 @@ def test_what_decides_a_cell_makes_it_another_one(case, tmp_path):
 def test_known_errors_reach_the_table(case, tmp_path):
     kept = MeasurementStore(tmp_path / "cells")
     seeds = [Shifted(shift_mm=shift, seed=n) for n, shift in enumerate((1.0, 2.0, 3.0))]
-    cells = [cell for method in seeds for cell in measure(jobs(case, method), kept)]
-    text = tables.accuracy(cells, paper.tumor_lies(anatomy()), is_paper=True)
-    row = next(line for line in text.splitlines() if line.startswith("| D2 | M_lim"))
+    found = [one for method in seeds for one in measure(jobs(case, method), kept)]
+    lies = paper.tumor_lies(anatomy())
+    accuracy = tables.accuracy(tidy(found), lies, is_paper=True)
+    row = next(line for line in accuracy.splitlines() if line.startswith("| D2 | M_lim"))
     columns = [column.strip() for column in row.strip("|").split("|")]
     assert columns[2] == "1, endophytic"
     assert columns[3] == "2.0 ± 1.0"  # one-sided
     assert columns[4] == "≈ 9"
     assert columns[7] == "2.0 ± 1.0"  # centre
     assert columns[8] == "< 10"
-    compared = tables.methods(cells, paper.tumor_lies(anatomy()))
+    compared = tables.methods(tidy(found), lies)
     assert "| 2.0 ± 1.0 | 0 of 6 | 0.250 ± 0.000 | 60.0 ± 0.0 |" not in compared  # no targets.csv
     assert "| – | 0 of 6 | 0.250 ± 0.000 | 60.0 ± 0.0 |" in compared
 
@@ -187,9 +196,10 @@ def test_targets_are_measured_where_a_scene_has_them(case, tmp_path):
     head = "label,ct_x,ct_y,ct_z,camera_x,camera_y,camera_z"
     path = case.scene("D1", "clean") / "targets.csv"
     path.write_text("\n".join([head, *lines]) + "\n")
-    cell = measure(jobs(case, Shifted(shift_mm=3.5))[:1], MeasurementStore(tmp_path / "cells"))[0]
-    assert cell["targets_mm"]["mean"] == pytest.approx(3.5)
-    assert cell["targets_mm"]["count"] == 20
+    kept = MeasurementStore(tmp_path / "cells")
+    (one,) = measure(jobs(case, Shifted(shift_mm=3.5))[:1], kept)
+    assert one["targets_mm"]["mean"] == pytest.approx(3.5)
+    assert one["targets_mm"]["count"] == 20
 
 
 def test_parts_that_were_not_found_follow_the_rule(case, tmp_path):
@@ -199,26 +209,27 @@ def test_parts_that_were_not_found_follow_the_rule(case, tmp_path):
         Shifted(seed=1, without=("tumor_2",)),
         Shifted(seed=2, nothing=True),
     ]
-    cells = [cell for method in methods for cell in measure(jobs(case, method), kept)]
-    center = {n: part_value(f"tumor_{n}", "center_mm") for n in (1, 2)}
-    assert figure(cells, center[1]).text() == "2.0 (2 of 3)"
-    assert figure(cells, center[2]).text() == NOT_FOUND
-    assert figure(cells, part_value("tumor_2", "iou")).values[2] == 0.0
-    assert "4 of 6" in tables.methods(cells, paper.tumor_lies(anatomy()))
-    assert median([1.0, None, 3.0]) == 3.0
-    assert median([1.0, None]) is None
-    assert Figure((1.0, 2.0, 4.5)).text() == "2.5 ± 1.8"
-    assert Figure((1.0,)).text(2) == "1.00"
+    frame = tidy([one for method in methods for one in measure(jobs(case, method), kept)])
+    first, second = (frame[frame.part == f"tumor_{n}"] for n in (1, 2))
+    assert text(by_seed(first, "center_mm")) == "2.0 (2 of 3)"
+    assert text(by_seed(second, "center_mm")) == NOT_FOUND
+    assert by_seed(second, "iou")[2] == 0.0
+    assert "4 of 6" in tables.methods(frame, paper.tumor_lies(anatomy()))
+    seeds = pd.DataFrame({"seed": [0, 0, 0, 1, 1], "mm": [1.0, np.inf, 3.0, 1.0, np.inf]})
+    assert list(by_seed(seeds, "mm")) == [3.0, np.inf]
+    assert text(pd.Series([1.0, 2.0, 4.5])) == "2.5 ± 1.8"
+    assert text(pd.Series([1.0]), 2) == "1.00"
+    assert text(pd.Series([], dtype=float)) == "–"
 
 
 def test_conditions_say_the_change_against_their_base(case, tmp_path):
-    kept, cells = MeasurementStore(tmp_path / "cells"), []
+    kept, found = MeasurementStore(tmp_path / "cells"), []
     for fault, shift in (("clean", 1.0), ("offset", 2.5)):
         measured = measure(jobs(case, Shifted(shift_mm=shift)), kept)
-        cells += [{**cell, "spec": {**cell["spec"], "fault": fault}} for cell in measured]
-    text = tables.conditions(cells, "fault", "clean")
-    assert "| M_lim | none (clean depth) | 1.0 | 1.0 |" in text
-    assert "| systematic 2 mm offset | 2.5 (+1.5) | 2.5 (+1.5) |" in text
+        found += [{**one, "spec": {**one["spec"], "fault": fault}} for one in measured]
+    conditions = tables.conditions(tidy(found), "fault", "clean")
+    assert "| M_lim | none (clean depth) | 1.0 | 1.0 |" in conditions
+    assert "| systematic 2 mm offset | 2.5 (+1.5) | 2.5 (+1.5) |" in conditions
 
 
 def test_point_errors_know_depth_displacement_and_distance():
@@ -274,9 +285,18 @@ def test_blocks_are_replaced_and_the_rest_stays():
 
 
 def test_the_document_has_a_place_for_every_section():
-    document = (Path(__file__).parents[2] / "docs" / "results.md").read_text(encoding="utf-8")
+    document = (ROOT / "docs" / "results.md").read_text(encoding="utf-8")
     names = [*SECTIONS, "gallery"]
     assert fill(document, {name: "x" for name in names}).count("\nx\n<!-- /results:") == len(names)
+
+
+@pytest.mark.parametrize("name", ["results", "pretraining", "training", "peers", "soak"])
+def test_scripts_are_imported_and_say_what_they_do(name, monkeypatch, capsys):
+    monkeypatch.setattr("sys.argv", [f"{name}.py", "--help"])
+    with pytest.raises(SystemExit) as stopped:
+        runpy.run_path(str(ROOT / "lab" / "scripts" / f"{name}.py"), run_name="__main__")
+    assert stopped.value.code == 0
+    assert "usage:" in capsys.readouterr().out
 
 
 def test_plans_name_what_there_is():
@@ -376,7 +396,7 @@ def test_end_to_end_twice_gives_the_same_document(phantom, tmp_path):
     names = ["deformation", "accuracy", "peers"]
     blocks = "".join(f"{opening(n)}\n{closing(n)}\n" for n in [*names, "gallery"])
     document.write_text(f"mine\n{blocks}yours\n")
-    book = ReportWriter(document, "make results")
+    writer = ReportWriter(document, "make results")
 
     def run():
         told, trained = list[StudyStatus](), []
@@ -389,14 +409,14 @@ def test_end_to_end_twice_gives_the_same_document(phantom, tmp_path):
 
         for section in names:
             todo = jobs_of(plan, section, (phantom,), Methods(model, peer_method, model))
-            cells = measure(todo, MeasurementStore(tmp_path / "cells"), told.append)
-            book.write(section_blocks(section, cells, (phantom,), book))
+            found = measure(todo, MeasurementStore(tmp_path / "cells"), told.append)
+            writer.write(section_blocks(section, found, (phantom,), writer))
         bound = [Job(phantom, peer_method("rigid_bound", phantom), "D1", "clean", 24)]
-        book.write(gallery_block(plan, bound, book, tmp_path / "gallery.json"))
+        writer.write(gallery_block(bound, 0, writer, tmp_path / "gallery.json"))
         return told, trained
 
     told, trained = run()
-    assert len(told) == 1 + 4 + 2  # peers: the networks' cells are those of accuracy
+    assert len(told) == 1 + 4 + 2  # peers: the networks' are those of accuracy
     assert len(trained) == 1
     first = document.read_text()
     assert first.startswith("mine\n")
@@ -427,10 +447,9 @@ def test_the_bound_finds_a_state_that_its_body_can_take():
 def test_bounds_of_a_rigid_organ_are_near_zero(case, tmp_path):
     kept = MeasurementStore(tmp_path / "cells")
     for name in BOUNDS:
-        cells = measure(jobs(case, Bound(name, case, BoundConfig(body=SMALL))), kept)
-        for cell in cells:
-            assert cell["parts"]["tumor_2"]["hausdorff_mm"] < 0.4
-            assert cell["failed"] is None
+        for one in measure(jobs(case, Bound(name, case, BoundConfig(body=SMALL))), kept):
+            assert one["parts"]["tumor_2"]["hausdorff_mm"] < 0.4
+            assert one["failed"] is None
     other = replace(case, anatomy_ct=Anatomy((ball(30), ball(8))))
     with pytest.raises(InputError, match="other parts"):
         Bound("basis_bound", other, BoundConfig(body=SMALL)).locate(
@@ -438,8 +457,8 @@ def test_bounds_of_a_rigid_organ_are_near_zero(case, tmp_path):
         )
 
 
-def goal_cell(method, variant, hd, **spec):
-    """A cell of a case with one tumor, with what the goals read."""
+def goal_measurement(method, variant, hd, **spec):
+    """A measurement of a case with one tumor, with what the goals read."""
     found = {"found": True, "iou": 0.9}
     shares = {"hausdorff_mm": 1.0, "hausdorff_one_sided_mm": 0.5, "center_mm": 0.25}
     near = {key: share * hd for key, share in shares.items()} if hd else {}
@@ -459,16 +478,16 @@ def goal_cell(method, variant, hd, **spec):
 
 def test_goals_are_judged_by_exact_numbers_and_never_rounded_in_our_favour():
     lies = {"one": {"tumor_1": paper.Lie(0.0, 5.0)}}
-    cells = [
-        goal_cell("clinic", "D1", 1.9 + 0.1001 * 2 * seed, seed=seed) for seed in (0, 1)
+    found = [
+        goal_measurement("clinic", "D1", 1.9 + 0.1001 * 2 * seed, seed=seed) for seed in (0, 1)
     ]  # mean 2.0001
-    cells += [goal_cell("clinic", "D2", 2.9999), goal_cell("clinic", "Rot90", 0.1)]
-    cells += [goal_cell("M_lim", "D1", 1.994)]
-    cells += [goal_cell("clinic", "D2", 2.0, fault="clean")]
+    found += [goal_measurement("clinic", "D2", 2.9999), goal_measurement("clinic", "Rot90", 0.1)]
+    found += [goal_measurement("M_lim", "D1", 1.994)]
+    found += [goal_measurement("clinic", "D2", 2.0, fault="clean")]
     hidden = {"fault": "visible=60"}
-    cells += [goal_cell("clinic", "D2", 2.7, **hidden, fault_seed=n) for n in (0, 1)]
-    text = goals.tables_of(cells, lies)
-    rows = {line.split("|")[1].strip(): line for line in reversed(text.splitlines()) if "|" in line}
+    found += [goal_measurement("clinic", "D2", 2.7, **hidden, fault_seed=n) for n in (0, 1)]
+    lines = goal_tables(tidy(found), lies).splitlines()
+    rows = {line.split("|")[1].strip(): line for line in reversed(lines) if "|" in line}
     assert "| 1.99 | 2.01 | ≤ 2 | no |" in rows["tumor HD, D1, endophytic"]
     assert "| – | 3.00 | ≤ 3 | yes |" in rows["tumor HD, D2, endophytic"]
     assert "| ≈ 7 | 1.00 | 1.01 | ≤ 2 | yes |" in rows["tumor one-sided, D1, endophytic"]
@@ -479,22 +498,26 @@ def test_goals_are_judged_by_exact_numbers_and_never_rounded_in_our_favour():
     assert "| 1.35 | ≤ 1.3 | no |" in rows["hidden surface: tumor HD, times"]
     assert "| 14.98 | 14.99 | ≤ 15 | yes |" in rows["training, minutes"]
 
-    lost = [*cells, goal_cell("clinic", "D3", None)]
-    worst = next(line for line in goals.tables_of(lost, lies).splitlines() if "worst" in line)
+    lost = [*found, goal_measurement("clinic", "D3", None)]
+    lines = goal_tables(tidy(lost), lies).splitlines()
+    worst = next(line for line in lines if "worst" in line)
     assert "| not found | ≤ 2.5 | no |" in worst
 
 
 def test_the_ablation_says_the_change_against_clinic():
-    cells = [goal_cell("clinic", "D2", 2.0), goal_cell("clinic", "G1", 3.0)]
-    cells += [goal_cell("clinic_unrefined", "D2", 4.0), goal_cell("clinic_unrefined", "G1", 4.4)]
-    text = ablation.table_of(cells)
-    assert "| clinic | 899 | 0.100 | 2.5 | 0.6 | 2.5 | 0.90 | 0 of 2 |" in text
-    assert "| 4.2 (+1.7) | 1.1 (+0.4) | 4.2 (+1.7) | 0.90 | 0 of 2 |" in text
+    found = [goal_measurement("clinic", "D2", 2.0), goal_measurement("clinic", "G1", 3.0)]
+    found += [
+        goal_measurement("clinic_unrefined", "D2", 4.0),
+        goal_measurement("clinic_unrefined", "G1", 4.4),
+    ]
+    ablation = tables.ablation(tidy(found))
+    assert "| clinic | 899 | 0.100 | 2.5 | 0.6 | 2.5 | 0.90 | 0 of 2 |" in ablation
+    assert "| 4.2 (+1.7) | 1.1 (+0.4) | 4.2 (+1.7) | 0.90 | 0 of 2 |" in ablation
 
 
 def test_captions_name_command_device_and_models(case, tmp_path):
-    cells = measure(jobs(case, Shifted()), MeasurementStore(tmp_path / "cells"))
-    text = caption(cells, "make results")
-    assert text.startswith("`make results`: 2 measurements, 2 scenes (views: clean)")
-    assert "24³" in text
-    assert "cores" in text
+    found = measure(jobs(case, Shifted()), MeasurementStore(tmp_path / "cells"))
+    caption = tables.caption(found, "make results")
+    assert caption.startswith("`make results`: 2 measurements, 2 scenes (views: clean)")
+    assert "24³" in caption
+    assert "cores" in caption

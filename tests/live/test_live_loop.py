@@ -32,8 +32,7 @@ from tumortrack.sense.camera import d405
 from tumortrack.sense.region import RegionConfig
 from tumortrack.sense.render import render_depth
 from tumortrack.simulate.scene import SceneRecipe, Simulator, body_for
-from tumortrack.tracking.follower import Follower, FollowerConfig
-from tumortrack.tracking.tracker import Tracker
+from tumortrack.tracking.tracker import Follower, FollowerConfig, Tracker
 from tumortrack.training.model import load_model
 from warp_objects import ANATOMY, placed, slim_clinic
 
@@ -51,8 +50,8 @@ def clock(monkeypatch):
     """The loop's, its reader's and the script's, which the test turns."""
     one = Clock()
     monkeypatch.setattr(sys.modules[__name__], "time", one)
-    for module in ("loop", "reader"):
-        monkeypatch.setattr(f"tumortrack.tracking.{module}.time", one)
+    for module in ("loop", "source_worker"):
+        monkeypatch.setattr(f"tumortrack.live.{module}.time", one)
     return one
 
 
@@ -78,7 +77,7 @@ class Script:
     dropped = 0
 
     def __init__(self, items, waits=True, host_clock=False):
-        self._items, self.waits, self.host_clock = list(items), waits, host_clock
+        self._items, self.lossless, self.host_clock = list(items), waits, host_clock
 
     def read(self, timeout_s):
         while self._items and callable(self._items[0]):
@@ -277,7 +276,7 @@ def test_the_same_recording_gives_the_same_estimates(tracker, stages):
     clouds = moving(stages[1], 4)
     once, again = (play(tracker, clouds)[0] for _ in range(2))
     for a, b in zip(once, again, strict=True):
-        np.testing.assert_array_equal(a.placed.points_mm, b.placed.points_mm)
+        np.testing.assert_array_equal(a.transformed.points_mm, b.transformed.points_mm)
 
 
 def test_what_is_no_organ_gives_no_estimate_and_no_old_one(tracker, stages):
@@ -289,7 +288,7 @@ def test_what_is_no_organ_gives_no_estimate_and_no_old_one(tracker, stages):
     assert [u.estimate is not None for u in updates] == [True, True, False, True, False, True]
     for n in (2, 4):
         assert updates[n].quality == "none"
-        assert updates[n].placed is None
+        assert updates[n].transformed is None
     assert "does not show this model's organ" in updates[2].reason
     assert "at least 200" in updates[4].reason
     assert told["no_estimate"] == 2
@@ -422,7 +421,7 @@ def test_other_intrinsics_replace_the_sources(tracker):
         reader.close()
         outlets[0].close()
         if said is None:
-            assert sink.updates[-1].seen.content.intrinsics == given
+            assert sink.updates[-1].observation.content.intrinsics == given
         else:
             assert said in sink.updates[-1].reason
 

@@ -11,16 +11,11 @@ import pytest
 
 from clock import PATIENCE_S, until
 from igtl_objects import Heard, hear, hear_all, polydata_by_the_book
+from igtl_reader import unpack_polydata, unpack_status, unpack_transform
 from live_objects import STAMP_NS, empty_update, small_anatomy, small_setting, small_update
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import rigid
-from tumortrack.live.igtl.content import (
-    IgtlStatus,
-    unpack_polydata,
-    unpack_status,
-    unpack_transform,
-)
-from tumortrack.live.igtl.message import Message, pack
+from tumortrack.live.igtl.message import IgtlStatus, Message, pack
 from tumortrack.live.sinks.openigtlink import OpenIgtLinkSink, OpenIgtLinkSinkConfig
 from tumortrack.live.values import PublishedFrame, SinkContext, TrackingResult
 
@@ -339,5 +334,7 @@ def test_forty_thousand_points_flow(opened) -> None:
             pass
         assert one.metadata["sequence"] == str(n)
         points = unpack_polydata(one.content).points
-        assert update.placed is not None
-        np.testing.assert_array_equal(points, update.placed.points_mm * np.float32([-1, -1, 1]))
+        assert update.transformed is not None
+        np.testing.assert_array_equal(
+            points, update.transformed.points_mm * np.float32([-1, -1, 1])
+        )

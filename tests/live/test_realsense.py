@@ -15,7 +15,7 @@ from realsense_objects import HEIGHT, WIDTH, Camera, raw_depth, record
 from tumortrack.core.errors import InputError
 from tumortrack.core.types import Intrinsics
 from tumortrack.live.sources.realsense import RealSenseSource, RealSenseSourceConfig
-from tumortrack.live.spec import parse_spec
+from tumortrack.live.spec import SOURCES
 from tumortrack.live.values import SourceEnded, SourceLost
 
 
@@ -33,7 +33,7 @@ def test_a_cameras_frame_comes_out_bit_for_bit():
         np.testing.assert_allclose(depth_mm[raw > 0], raw[raw > 0] / 10, rtol=2e-7)
     assert seen.content.intrinsics == Intrinsics(WIDTH, HEIGHT, 446.25, 447.5, 423.75, 238.5)
     assert source.host_clock
-    assert not source.waits
+    assert not source.lossless
     source.close()
 
 
@@ -52,7 +52,7 @@ def test_the_devices_own_unit_counts(unit_m: float):
 def test_every_recorded_frame_comes_back_bit_for_bit(tmp_path):
     record(str(tmp_path / "some.db3"), frames=5)
     source = RealSenseSourceConfig(device=str(tmp_path / "some.db3"), realtime=False).open()
-    assert source.waits
+    assert source.lossless
     assert not source.host_clock
     stamps = []
     for number in range(5):
@@ -154,9 +154,7 @@ def test_what_is_not_there_is_said(tmp_path, monkeypatch):
 
 
 def test_the_command_lines_text():
-    config = parse_spec(
-        "realsense:0123?fps=60&emitter=true&preset=default", (RealSenseSourceConfig,), "source"
-    )
+    config = SOURCES.parse("realsense:0123?fps=60&emitter=true&preset=default")
     assert config == RealSenseSourceConfig(device="0123", fps=60, emitter=True, preset="default")
     assert config.recording is None
-    assert parse_spec("realsense", (RealSenseSourceConfig,), "source") == RealSenseSourceConfig()
+    assert SOURCES.parse("realsense") == RealSenseSourceConfig()

@@ -37,7 +37,7 @@ from tumortrack.core.mesh_files import write_anatomy
 from tumortrack.core.types import DepthFrame, SensorCloud
 from tumortrack.live.recording.mcap_file import _CHUNK_S
 from tumortrack.live.ros.messages import Messages
-from tumortrack.live.ros.observed import messages_seen
+from tumortrack.live.ros.sensors import messages_seen
 from tumortrack.live.sinks.recording import RecordingSinkConfig as RecordTo
 from tumortrack.live.sources.recording import RecordingSourceConfig
 from tumortrack.live.values import Observation, PublishedFrame, SourceEnded, SourceLost
@@ -107,8 +107,8 @@ def test_a_playing_of_a_playing_is_the_same(tmp_path):
 
 def test_an_mcap_is_read_by_rosbags_with_its_estimates(tmp_path):
     updates = [update_number(0), empty_update(1, "the drape hides it"), update_number(2)]
-    updates = [replace(update, frames=TURNED) for update in updates]
-    path = record(tmp_path / "r", updates, meshes_hz=0)
+    updates = [replace(update, published_frame=TURNED) for update in updates]
+    path = record(tmp_path / "r", updates, meshes_hz=0.0)
     with AnyReader([path]) as reader:
         counts = {topic: about.msgcount for topic, about in reader.topics.items()}
         said = {
@@ -545,7 +545,7 @@ def test_frames_come_at_the_pace_of_their_stamps(tmp_path, clock, rate):
     folder = cloud_files(tmp_path / "c", [f"{n}.ply" for n in range(5)])
     start, arrivals = clock.monotonic(), []
     source = clock.of(RecordingSourceConfig(path=folder, rate=rate, fps=10).open())
-    assert (source.waits, source.host_clock) == (False, False)
+    assert (source.lossless, source.host_clock) == (False, False)
     while len(arrivals) < 5:
         if source.read(0.05) is not None:
             arrivals.append((clock.monotonic() - start) * rate)

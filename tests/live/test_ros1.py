@@ -24,10 +24,10 @@ from ros1_objects import (
 from tumortrack.core.errors import InputError
 from tumortrack.core.types import DepthFrame, SensorCloud
 from tumortrack.live.ros import rospy_node
-from tumortrack.live.sinks.ros1 import Ros1Sink
-from tumortrack.live.sinks.ros1 import Ros1SinkConfig as Sink
-from tumortrack.live.sources.ros1 import Ros1Source
-from tumortrack.live.sources.ros1 import Ros1SourceConfig as Source
+from tumortrack.live.sinks.ros import Ros1Sink
+from tumortrack.live.sinks.ros import Ros1SinkConfig as Sink
+from tumortrack.live.sources.ros import Ros1Source
+from tumortrack.live.sources.ros import Ros1SourceConfig as Source
 from tumortrack.live.values import Observation, PublishedFrame, SinkContext, SourceLost
 
 pytestmark = pytest.mark.filterwarnings("ignore:notifyAll:DeprecationWarning")  # rospy's own
@@ -123,7 +123,7 @@ def test_what_cannot_be_used_is_refused_with_what_there_is(graph):
             Source(topic="/d/points", mask="/d/mask").open()
         source = opened(Source(topic="/d/image"))
         said = refusal_of(lambda: source.read(0.5), InputError)
-        assert "images come on /d/image, but nothing on /d/camera_info" in said
+        assert "images come on /d/image, but no camera_info on /d/camera_info" in said
         source.close()
     for bad in ("", "with space", "/a//b", "/a/", "1st"):
         with pytest.raises(InputError, match="no ROS topic"):
@@ -165,7 +165,7 @@ def test_an_estimate_arrives_in_metres_in_its_frame_at_its_time(graph, tmp_path)
     published_from_camera = np.array([[0, -1, 0, 10], [1, 0, 0, 20], [0, 0, 1, 30], [0, 0, 0, 1.0]])
     frames = PublishedFrame("robot_base", published_from_camera)
     update = small_update(frames=frames)
-    sink = Sink(namespace="/f", mesh_hz=0).open(SinkContext(parts=PARTS, frames=frames))
+    sink = Sink(namespace="/f", mesh_hz=0.0).open(SinkContext(parts=PARTS, published_frame=frames))
     with listener("/f", tmp_path) as heard:
         cloud = published(sink, heard, update)
         place = published(sink, heard, update, "tumor_1/center")
@@ -175,7 +175,7 @@ def test_an_estimate_arrives_in_metres_in_its_frame_at_its_time(graph, tmp_path)
     sink.close()
     assert cloud["frame"] == place["frame"] == said["frame"] == "robot_base"
     assert cloud["stamp_ns"] == STAMP_NS
-    placed = update.placed
+    placed = update.transformed
     xyz = np.column_stack([cloud["x"], cloud["y"], cloud["z"]])
     np.testing.assert_allclose(xyz * 1000, placed.points_mm, atol=1e-4)
     assert cloud["label"] == placed.labels.tolist()
@@ -191,7 +191,7 @@ def test_an_estimate_arrives_in_metres_in_its_frame_at_its_time(graph, tmp_path)
 
 
 def test_without_an_estimate_everything_is_taken_off_and_the_reason_said(graph, tmp_path):
-    sink = Sink(namespace="/g", mesh_hz=0).open(small_setting())
+    sink = Sink(namespace="/g", mesh_hz=0.0).open(small_setting())
     nothing = empty_update(reason="only 12 points lie in range")
     with listener("/g", tmp_path) as heard:
         assert len(published(sink, heard, small_update())["x"]) == 500

@@ -26,16 +26,16 @@ from ros2_objects import Frames, own_graph, read_until, sending
 from ros2_peer import points_mm
 from tumortrack.core.errors import InputError, TumortrackError
 from tumortrack.core.types import SensorCloud
-from tumortrack.live.ros import incoming
+from tumortrack.live.ros import sensors
 from tumortrack.live.ros.bus import Bus, domain_id, open_bus
-from tumortrack.live.ros.cell import JOINTS, WorkcellMessages
-from tumortrack.live.ros.dds_types import dds_name, idl_type, ros_name
-from tumortrack.live.ros.messages import Messages
-from tumortrack.live.ros.observed import messages_seen, plain_cloud
-from tumortrack.live.ros.outgoing import MARKERS, messages_of
-from tumortrack.live.sinks.ros2 import Ros2SinkConfig as SinkRos2
+from tumortrack.live.ros.dds import dds_name, idl_type, ros_name
+from tumortrack.live.ros.messages import MARKERS, Messages
+from tumortrack.live.ros.results import messages_of
+from tumortrack.live.ros.sensors import messages_seen, plain_cloud
+from tumortrack.live.ros.workcell import JOINTS, WorkcellMessages
+from tumortrack.live.sinks.ros import Ros2SinkConfig as SinkRos2
 from tumortrack.live.source_worker import SourceWorker
-from tumortrack.live.sources.ros2 import Ros2SourceConfig as SourceRos2
+from tumortrack.live.sources.ros import Ros2SourceConfig as SourceRos2
 from tumortrack.live.values import Observation, Source
 from workcell_objects import with_arms, working
 
@@ -66,19 +66,19 @@ def bus(messages: Messages) -> Iterator[Bus]:
 # --- types ---------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("kind", [incoming.CLOUD, incoming.CAMERA_INFO, MARKERS, JOINTS])
+@pytest.mark.parametrize("kind", [sensors.CLOUD, sensors.CAMERA_INFO, MARKERS, JOINTS])
 def test_types_agree_with_a_second_encoder(kind: str, messages: Messages) -> None:
     """cyclonedds' own (slow) coding of our type gives the bytes that rosbags gives."""
     seen = Observation(small_frame(), 0)
     cloud = Observation(SensorCloud(points_mm()[:7], 12_000_000_034), 0)
     made = [*messages_seen(seen, messages), *messages_seen(cloud, messages)]
-    made += messages_of(working(), messages, PARTS, True, WorkcellMessages(messages, 0))
+    made += messages_of(working(), messages, PARTS, True, WorkcellMessages(messages, 0.0))
     message = next(one.message for one in made if one.message_type == kind)
     cdr = bytes(messages.to_bytes(message))
     type_ = idl_type(kind, "humble")
     value = type_.deserialize(cdr)
     assert value.serialize(use_version_2=False)[: len(cdr)] == cdr
-    if kind == incoming.CLOUD:
+    if kind == sensors.CLOUD:
         assert (value.header.stamp.sec, value.header.stamp.nanosec, value.width) == (12, 34, 7)
     assert type_.__idl__.idl_transformed_typename == dds_name(kind)
     assert ros_name(dds_name(kind)) == kind
@@ -95,11 +95,11 @@ def test_what_other_nodes_see_of_a_topic(bus: Bus) -> None:
     """Name, type, type hash and QoS are those that a ROS 2 node announces."""
     from cyclonedds.qos import Policy
 
-    publisher = bus.publisher("/seen/points", incoming.CLOUD)
+    publisher = bus.publisher("/seen/points", sensors.CLOUD)
     known = lambda: [o for o in bus._published.read(100) if o.topic_name == "rt/seen/points"]  # noqa: E731
     (one,) = until(known)
     assert one.type_name == CLOUD_DDS
-    assert bus.types_of("/seen/points") == {incoming.CLOUD}
+    assert bus.types_of("/seen/points") == {sensors.CLOUD}
     # As `ros2 topic info -v` prints it for sensor_msgs/msg/PointCloud2.
     said = "9198cabf7da3796ae6fe19c4cb3bdd3525492988c70522628af5daa124bae2b5"
     assert one.qos[Policy.Userdata].data == f"typehash=RIHS01_{said};".encode()
@@ -202,9 +202,10 @@ def test_the_view_for_rviz_shows_what_is_published(
 ) -> None:
     """Topics, frame and reliability of docs/ros/*.rviz are the sink's."""
     view = (HERE.parents[1] / "docs" / "ros" / name).read_text(encoding="utf-8")
-    cell = WorkcellMessages(messages, 0)
+    cell = WorkcellMessages(messages, 0.0)
     sent = {
-        f"/tumortrack/{one.suffix}" for one in messages_of(empty_update(), messages, (), cell=cell)
+        f"/tumortrack/{one.suffix}"
+        for one in messages_of(empty_update(), messages, (), workcell=cell)
     }
     shown = set(re.findall(r"Value: (/tumortrack\S+)", view))
     assert sorted(shown) == [f"/tumortrack/{topic}" for topic in topics]
@@ -219,7 +220,7 @@ def test_the_view_for_rviz_shows_what_is_published(
 def test_arms_travel_over_dds(bus: Bus, messages: Messages) -> None:
     kinds = {"joint_states": JOINTS, "workcell": MARKERS}
     heard = {name: bus.subscriber(f"/arms/{name}", kind) for name, kind in kinds.items()}
-    sink = SinkRos2(namespace="/arms", mesh_hz=0, via="dds").open(with_arms())
+    sink = SinkRos2(namespace="/arms", mesh_hz=0.0, via="dds").open(with_arms())
     came: dict = {}
     for n in range(200):
         update = working(n, 0.25)
@@ -256,7 +257,7 @@ def test_other_types_are_refused(bus: Bus, messages: Messages) -> None:
 def test_damaged_bytes_are_not_sent(bus: Bus, messages: Messages) -> None:
     header = messages.header(5, "camera")
     cdr = bytes(messages.to_bytes(plain_cloud(SensorCloud(points_mm()[:9]), header, messages)))
-    publisher = bus.publisher("/points", incoming.CLOUD)
+    publisher = bus.publisher("/points", sensors.CLOUD)
     publisher.publish(cdr)
     with pytest.raises(TumortrackError, match=r"/points: a message of \d+ bytes was not sent"):
         publisher.publish(cdr[:60])
@@ -323,7 +324,7 @@ def test_the_way_through_rclpy(monkeypatch: pytest.MonkeyPatch, messages: Messag
                     for came in list(callbacks.values()):
                         came(bytes(messages.to_bytes(cloud)))
                 if name == "get_publishers_info_by_topic":
-                    return [types.SimpleNamespace(topic_type=incoming.CLOUD)]
+                    return [types.SimpleNamespace(topic_type=sensors.CLOUD)]
                 return Recorded(name)
 
             return call

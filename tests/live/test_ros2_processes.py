@@ -29,14 +29,14 @@ from ros2_peer import frame_numbered, points_mm
 from tumortrack.core.errors import InputError
 from tumortrack.core.estimate import Estimate
 from tumortrack.core.types import OccupancyCloud, SensorCloud
-from tumortrack.live.ros import incoming
+from tumortrack.live.ros import sensors
 from tumortrack.live.ros.bus import Bus, open_bus
-from tumortrack.live.ros.dds_types import dds_name
+from tumortrack.live.ros.dds import dds_name
 from tumortrack.live.ros.messages import Messages
-from tumortrack.live.ros.observed import messages_seen, plain_cloud
-from tumortrack.live.ros.outgoing import messages_of
-from tumortrack.live.sinks.ros2 import Ros2SinkConfig as SinkRos2
-from tumortrack.live.sources.ros2 import Ros2SourceConfig as SourceRos2
+from tumortrack.live.ros.results import messages_of
+from tumortrack.live.ros.sensors import messages_seen, plain_cloud
+from tumortrack.live.sinks.ros import Ros2SinkConfig as SinkRos2
+from tumortrack.live.sources.ros import Ros2SourceConfig as SourceRos2
 from tumortrack.live.values import Observation, Sink, Source, TrackingResult
 
 pytest.importorskip("cyclonedds", reason="cyclonedds is not installed (tumortrack[live])")
@@ -143,7 +143,7 @@ def test_clouds_of_40_000_points_at_30_hz() -> None:
 
 
 def test_updates_reach_another_process(messages: Messages) -> None:
-    sink = SinkRos2(mesh_hz=0).open(small_setting())
+    sink = SinkRos2(mesh_hz=0.0).open(small_setting())
     assert isinstance(sink, Sink)
     update = small_update()
     expected = {one.suffix: one.message for one in messages_of(update, messages, PARTS)}
@@ -155,7 +155,9 @@ def test_updates_reach_another_process(messages: Messages) -> None:
             assert (cloud["points"], cloud["frame"]) == (500, "camera")
             assert cloud["sum"] == int(expected["cloud"].data.sum())
             assert cloud["stamp_ns"] == update.stamp_ns
-            corners = {name: 3 * len(mesh.faces) for name, mesh in update.placed.meshes.items()}
+            corners = {
+                name: 3 * len(mesh.faces) for name, mesh in update.transformed.meshes.items()
+            }
             triangles = {ns: n for ns, _, n in by_topic["meshes"]["markers"] if ns in PARTS}
             assert triangles == corners
             centre_m = by_topic["tumor_1/center"]["m"]
@@ -205,7 +207,7 @@ def publish_until(sink: Sink, other: Other, update: TrackingResult) -> dict[str,
 
 def test_subscribers_that_hang_die_and_come_late_hold_up_nobody() -> None:
     """40,000 points at 30 Hz go on whatever subscribers do."""
-    sink = SinkRos2(mesh_hz=10).open(small_setting())
+    sink = SinkRos2(mesh_hz=10.0).open(small_setting())
     try:
         with peer("hear", 600) as lively, peer("hear", 600) as other:
             for one in (lively, other):
@@ -285,7 +287,7 @@ def test_fast_dds_hears_and_is_heard(tmp_path: Path, bus: Bus, messages: Message
     header = messages.header(5, "camera")
     cloud = SensorCloud(points_mm()[:2000])
     cdr = bytes(messages.to_bytes(plain_cloud(cloud, header, messages)))
-    ours = bus.publisher("/tumortrack/cloud", incoming.CLOUD)
+    ours = bus.publisher("/tumortrack/cloud", sensors.CLOUD)
     image = SourceRos2(topic="/fast/depth/image_rect").open()
     damaged = SourceRos2(topic="/fast/noise").open()
     heard = tmp_path / "heard"

@@ -28,12 +28,19 @@ from live_objects import (
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import rigid
 from tumortrack.core.types import SensorCloud
-from tumortrack.live.ros.cell import WorkcellMessages
-from tumortrack.live.ros.incoming import CAMERA_INFO, CLOUD, IMAGE, cloud_of, depth_of, mask_of
-from tumortrack.live.ros.markers import MARKERS, Rate
-from tumortrack.live.ros.messages import Messages, stamp_of
-from tumortrack.live.ros.observed import messages_seen
-from tumortrack.live.ros.outgoing import messages_of
+from tumortrack.live.meter import Rate
+from tumortrack.live.ros.messages import MARKERS, Messages, stamp_of
+from tumortrack.live.ros.results import messages_of
+from tumortrack.live.ros.sensors import (
+    CAMERA_INFO,
+    CLOUD,
+    IMAGE,
+    cloud_of,
+    depth_of,
+    mask_of,
+    messages_seen,
+)
+from tumortrack.live.ros.workcell import WorkcellMessages
 from tumortrack.live.values import Observation, PublishedFrame
 from workcell_objects import workcell
 
@@ -307,7 +314,7 @@ def headers_of(message) -> list:
 
 
 @pytest.mark.parametrize(
-    "update", [small_update(frames=TURNED), replace(empty_update(), frames=TURNED)]
+    "update", [small_update(frames=TURNED), replace(empty_update(), published_frame=TURNED)]
 )
 def test_every_message_has_the_update_s_stamp_and_frame(update):
     headers = [h for message in by_suffix(update).values() for h in headers_of(message)]
@@ -318,7 +325,7 @@ def test_every_message_has_the_update_s_stamp_and_frame(update):
 
 def test_an_estimate_is_sent_in_metres_in_the_published_frame():
     update = small_update(frames=TURNED)
-    out, placed = by_suffix(update), update.placed
+    out, placed = by_suffix(update), update.transformed
     np.testing.assert_allclose(cloud_of(out["cloud"]).points_mm, placed.points_mm, rtol=1e-5)
     table = np.frombuffer(
         out["cloud"].data,
@@ -380,7 +387,7 @@ def test_a_part_that_was_not_found_is_deleted_and_meshes_may_wait():
 
 
 def test_a_rate_lets_pass_the_first_and_then_waits():
-    slow, always = Rate(0.01), Rate(0)
+    slow, always = Rate(0.01), Rate(0.0)
     assert [slow.due() for _ in range(3)] == [True, False, False]
     assert all(always.due() for _ in range(3))
 
@@ -388,7 +395,7 @@ def test_a_rate_lets_pass_the_first_and_then_waits():
 @pytest.mark.parametrize("stamp_ns", [-1, 2**31 * 10**9])
 def test_stamps_that_ros_cannot_say_are_refused(stamp_ns):
     with pytest.raises(InputError, match="2038"):
-        HUMBLE.time(stamp_ns)
+        HUMBLE.header(stamp_ns, "camera")
 
 
 @pytest.mark.parametrize("messages", [HUMBLE, NOETIC])
@@ -460,18 +467,18 @@ def run_ros(script: str, folder: Path) -> str:
 
 def test_ros_s_own_classes_read_what_is_sent(tmp_path):
     update, lines = replace(small_update(frames=TURNED), workcell=workcell(0.3)), []
-    for out in messages_of(update, NOETIC, PARTS, True, WorkcellMessages(NOETIC, 0)):
+    for out in messages_of(update, NOETIC, PARTS, True, WorkcellMessages(NOETIC, 0.0)):
         name = out.suffix.replace("/", "_")
         (tmp_path / name).write_bytes(NOETIC.to_bytes(out.message))
         lines.append(f"{name} {out.message_type} {NOETIC.md5(out.message_type)}")
-    for n, out in enumerate(messages_seen(update.seen, NOETIC)):
+    for n, out in enumerate(messages_seen(update.observation, NOETIC)):
         (tmp_path / f"seen_{n}").write_bytes(NOETIC.to_bytes(out.message))
         lines.append(f"seen_{n} {out.message_type} {NOETIC.md5(out.message_type)}")
     (tmp_path / "list").write_text("\n".join(lines))
     said = json.loads(run_ros(RECEIVER, tmp_path))
     assert len(said) == len(lines) == 11
     assert all(entry["same"] and entry["md5"] for entry in said.values())
-    placed, points = update.placed, np.array(said["cloud"]["points"])
+    placed, points = update.transformed, np.array(said["cloud"]["points"])
     np.testing.assert_allclose(points[:, :3] * 1000, placed.points_mm, atol=1e-4)
     np.testing.assert_array_equal(points[:, 3], placed.labels)
     np.testing.assert_allclose(points[:, 4], placed.probability)

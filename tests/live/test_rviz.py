@@ -25,7 +25,7 @@ from tumortrack.core.colours import KIDNEY
 from tumortrack.core.estimate import Estimate
 from tumortrack.core.geometry import rigid, transform_points
 from tumortrack.core.types import OccupancyCloud
-from tumortrack.live.sinks.ros1 import Ros1SinkConfig
+from tumortrack.live.sinks.ros import Ros1SinkConfig
 from tumortrack.live.values import PublishedFrame, TrackingResult
 from workcell_objects import with_arms, workcell
 
@@ -125,10 +125,10 @@ def test_rviz_shows_arms_at_work_and_nothing_of_them_when_nothing_is_known(tmp_p
     # The camera looks straight down; the organ lies on the table.
     far_mm = update.estimate.meshes["kidney"].box_mm[1, 2]
     frames = PublishedFrame("table", rigid(np.diag([1.0, -1, -1]), np.array([0.0, 0, far_mm])))
-    update = replace(update, frames=frames)
-    assert update.placed is not None
-    x, y, z = update.placed.meshes["tumor_2"].box_mm.mean(0)
-    sink = Ros1SinkConfig(mesh_hz=0).open(replace(with_arms(), frames=frames))
+    update = replace(update, published_frame=frames)
+    assert update.transformed is not None
+    x, y, z = update.transformed.meshes["tumor_2"].box_mm.mean(0)
+    sink = Ros1SinkConfig(mesh_hz=0.0).open(replace(with_arms(), published_frame=frames))
 
     def ask(progress: float | None) -> dict[str, np.ndarray]:
         cell = None if progress is None else workcell(progress, "", (x, y, z), 25.0)

@@ -23,7 +23,7 @@ from tumortrack.core.errors import InputError
 from tumortrack.core.types import DepthFrame, SensorCloud
 from tumortrack.live.sources.realsense import RealSenseSource, RealSenseSourceConfig
 from tumortrack.live.sources.recording import RecordingSourceConfig
-from tumortrack.live.sources.ros1 import Ros1SourceConfig
+from tumortrack.live.sources.ros import Ros1SourceConfig
 from tumortrack.live.sources.virtual import VirtualSource
 from tumortrack.live.values import Observation, Source, SourceEnded, SourceLost
 
@@ -72,7 +72,7 @@ def ros2_clouds(_folder: Path) -> Iterator[Source]:
 def _ros2(kind: str) -> Iterator[Source]:
     pytest.importorskip("cyclonedds")
     from ros2_objects import own_graph, sending
-    from tumortrack.live.sources.ros2 import Ros2SourceConfig
+    from tumortrack.live.sources.ros import Ros2SourceConfig
 
     with own_graph(), sending(kind) as topic:
         source = Ros2SourceConfig(topic=topic).open()
@@ -209,7 +209,7 @@ def test_a_read_is_back_in_time(source: Source):
 
 
 def test_a_source_that_waits_loses_nothing(source: Source):
-    if not source.waits:
+    if not source.lossless:
         pytest.skip("the newest frame counts here")
     everything = 0
     for _ in range(1000):

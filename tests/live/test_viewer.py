@@ -30,9 +30,9 @@ from tumortrack.core.types import Anatomy, LabelVolume, Mesh, Volume
 from tumortrack.imaging.case import Case, save_case
 from tumortrack.live.sinks.viewer import ViewerSink, ViewerSinkConfig
 from tumortrack.live.values import PublishedFrame, SinkContext, TrackingResult
-from tumortrack.live.viewer.points import point_under
+from tumortrack.live.viewer.look import point_under
+from tumortrack.live.viewer.panel import StatusPanel
 from tumortrack.live.viewer.slices import CarriedCt, SlicePlane, slice_picture
-from tumortrack.live.viewer.status import StatusPanel
 from tumortrack.live.viewer.surfaces import bare_faces, exact_margin, rough_margin
 from workcell_objects import REASON, virtual, with_arms, workcell, working
 
@@ -276,8 +276,8 @@ def test_estimate_that_cannot_be_shown_hides_the_one_before(sinks, clock):
     with pytest.raises(KeyError):
         sink.publish(replace(update, sequence=1, estimate=broken))
     assert not sink._server.scene.get_handle_by_name("/estimate").visible
-    beat = sink._beat
-    until(lambda: sink._beat > beat, "the watch's next word")
+    beat = sink._counter
+    until(lambda: sink._counter > beat, "the watch's next word")
     assert "NO ESTIMATE" in sink._panel._flag.content
     assert "cannot be shown" in sink._panel._flag.content
 
@@ -286,7 +286,9 @@ def test_case_gives_slices_and_an_exact_margin_that_moves_along(sinks, clock, tm
     case = sloped_case()
     with new_folder(tmp_path / "case") as folder:
         save_case(case, folder)
-    setting = SinkContext(parts=PARTS[:2], frames=PublishedFrame(), anatomy_ct=case.anatomy)
+    setting = SinkContext(
+        parts=PARTS[:2], published_frame=PublishedFrame(), anatomy_ct=case.anatomy
+    )
     sink = sinks(setting, case=str(tmp_path / "case"))
     sink.publish(carried_update(case))
     until(lambda: sink._panel._slice.visible, "a slice")
@@ -411,10 +413,10 @@ def orange(picture: np.ndarray) -> int:
 def test_page_in_a_browser(sinks, monkeypatch):
     # A feed that a loaded machine holds up for seconds isn't stale yet.
     monkeypatch.setattr("tumortrack.live.sinks.viewer._STALE_S", 5.0)
-    setting = replace(small_setting(), frames=ROBOT, arms=True)
+    setting = replace(small_setting(), published_frame=ROBOT, arms=True)
     sink = sinks(setting)
     shown = small_update(frames=ROBOT)
-    hidden = replace(empty_update(reason="only 12 points lie in range"), frames=ROBOT)
+    hidden = replace(empty_update(reason="only 12 points lie in range"), published_frame=ROBOT)
     with Browser(780, 480) as browser:
         feed = Feed(sink, shown)
         try:
@@ -465,7 +467,7 @@ def check_arms(browser: Browser, feed: Feed, shown: TrackingResult, setting: Sin
     feed.update = replace(shown, workcell=workcell())
     until(lambda: "ARMS: sweep 1" in browser.text(), "the arms' state")
     until(lambda: orange(browser.picture()) > 1000, "an arm")
-    feed.update = replace(virtual(), frames=ROBOT)
+    feed.update = replace(virtual(), published_frame=ROBOT)
     until(lambda: REASON in browser.text(), "why there is no estimate")
     until(lambda: "NO ESTIMATE" in browser.text())
     until(lambda: orange(browser.picture()) > 1000)

@@ -19,7 +19,7 @@ from tumortrack.core.geometry import transform_points
 from tumortrack.core.types import LabelVolume, Mesh
 from tumortrack.imaging.case import Case, save_case
 from tumortrack.live.sources.virtual import VirtualSource, VirtualSourceConfig
-from tumortrack.live.spec import parse_spec
+from tumortrack.live.spec import SOURCES
 from tumortrack.sense.noise import CLEAN
 from tumortrack.simulate.elastic.body import BodyConfig
 from tumortrack.simulate.player import SHAFT_MM, ScenePlayer, ScenePlayerConfig, rod
@@ -236,7 +236,7 @@ def test_a_frame_is_not_given_before_its_time():
 def test_truth_is_of_the_frames_own_instant():
     source = VirtualSource(small_theatre(), fps=30)
     seen = source.at(4.25, stamp_ns=99)
-    again = source.theatre.truth(source.theatre.state_at(4.25))
+    again = source.player.truth(source.player.state_at(4.25))
     assert seen.stamp_ns == 99
     np.testing.assert_array_equal(seen.truth.organ.vertices_mm, again.organ.vertices_mm)
 
@@ -245,13 +245,13 @@ def test_the_command_lines_text_opens_a_case(tmp_path):
     labels = LabelVolume(np.zeros((2, 2, 2), np.uint8), np.eye(4))
     save_case(Case(organ(), labels, UP), tmp_path)
     text = f"virtual:{tmp_path}?fps=25&instrument=false&noise=false&camera_motion=false&seed=2"
-    config = parse_spec(text, (VirtualSourceConfig,), "source")
+    config = SOURCES.parse(text)
     source = config.open()
     seen = source.read(1.0)
     source.close()
     assert seen is not None
-    assert source.theatre.config.push_mm == 0
-    assert source.theatre.config.noise == CLEAN
+    assert source.player.config.push_mm == 0
+    assert source.player.config.noise == CLEAN
     np.testing.assert_allclose(
         seen.content.depth_mm[np.isfinite(seen.content.depth_mm)].min(),
         seen.truth.organ.vertices_mm[:, 2].min(),

@@ -19,26 +19,24 @@ from scipy.spatial.transform import Rotation
 
 from clock import Clock, until
 from igtl_objects import hear_all
+from igtl_reader import unpack_status, unpack_transform
 from live_objects import PARTS, small_setting, small_update
 from recording_objects import frame_number
 from tumortrack.core.errors import InputError, TumortrackError
 from tumortrack.core.geometry import rigid, transform_points
 from tumortrack.core.mesh_files import read_mesh
-from tumortrack.live.igtl.content import IgtlStatus, unpack_status, unpack_transform
-from tumortrack.live.ros.cell import WorkcellMessages
-from tumortrack.live.ros.incoming import cloud_of
+from tumortrack.live.igtl.message import IgtlStatus
 from tumortrack.live.ros.messages import Messages, stamp_of
-from tumortrack.live.ros.outgoing import messages_of
+from tumortrack.live.ros.results import messages_of
+from tumortrack.live.ros.sensors import cloud_of
+from tumortrack.live.ros.workcell import WorkcellMessages
 from tumortrack.live.sink_worker import SinkWorker
-from tumortrack.live.sinks import SINKS
 from tumortrack.live.sinks.openigtlink import OpenIgtLinkSinkConfig
 from tumortrack.live.sinks.recording import RecordingSinkConfig as RecordTo
-from tumortrack.live.sinks.ur import UrSink, UrSinkConfig
+from tumortrack.live.sinks.ur import SILENT_S, UR_JOINTS, UrSink, UrSinkConfig
 from tumortrack.live.sources.recording import RecordingSourceConfig
-from tumortrack.live.spec import parse_spec
-from tumortrack.live.ur_link import SILENT_S, UR_JOINTS
+from tumortrack.live.spec import SINKS
 from tumortrack.live.values import Observation, SinkContext, SourceEnded, TrackingResult
-from tumortrack.live.viewer.workcell import box_of
 from workcell_objects import CUT, REASON, TABLE, virtual, with_arms, workcell, working
 
 HUMBLE, NOETIC = Messages("humble"), Messages("noetic")
@@ -64,7 +62,7 @@ def less(update: TrackingResult, *names: str) -> TrackingResult:
 
 def test_joints_and_markers_say_where_everything_stands():
     update = working(3, 0.3)
-    out, cell = sent(update, WorkcellMessages(HUMBLE, 0)), update.workcell
+    out, cell = sent(update, WorkcellMessages(HUMBLE, 0.0)), update.workcell
     joints = out["joint_states"]
     assert dict(zip(joints.name, joints.position, strict=True)) == cell.joints_rad
     assert (stamp_of(joints.header), joints.header.frame_id) == (update.stamp_ns, "table")
@@ -93,14 +91,14 @@ def test_joints_and_markers_say_where_everything_stands():
     everything = np.concatenate(
         [transform_points(s.published_from_shape, s.mesh.vertices_mm) for s in cell.shapes]
     )
-    np.testing.assert_allclose(box_of(cell), [everything.min(0), everything.max(0)], atol=1e-9)
+    np.testing.assert_allclose(cell.box_mm, [everything.min(0), everything.max(0)], atol=1e-9)
     place, middle = text.pose.position, everything.min(0) / 2 + everything.max(0) / 2
     assert [place.x * 1000, place.y * 1000] == pytest.approx(middle[:2])
     assert place.z * 1000 == pytest.approx(everything[:, 2].max() + 60)
 
 
 def test_arms_are_told_of_without_an_estimate_and_why_they_stand():
-    out = sent(virtual(halted="the tumor moved by 6 mm"), WorkcellMessages(NOETIC, 0), NOETIC)
+    out = sent(virtual(halted="the tumor moved by 6 mm"), WorkcellMessages(NOETIC, 0.0), NOETIC)
     assert len(out["workcell"].markers) == len(NAMES) + 3
     assert [m.action for m in out["meshes"].markers] == [3]  # DELETEALL: no estimate
     assert out["workcell"].markers[-1].text == (
@@ -111,7 +109,7 @@ def test_arms_are_told_of_without_an_estimate_and_why_they_stand():
     assert {v.key: v.value for v in arms.values} == {
         "state": "sweep 1", "halted": "the tumor moved by 6 mm",
     }  # fmt: skip
-    assert sent(working(), WorkcellMessages(HUMBLE, 0))["diagnostics"].status[1].level == 0
+    assert sent(working(), WorkcellMessages(HUMBLE, 0.0))["diagnostics"].status[1].level == 0
 
 
 def test_markers_keep_their_rate_and_changes_come_at_once():
@@ -136,9 +134,9 @@ def test_markers_keep_their_rate_and_changes_come_at_once():
 
 def test_what_the_camera_saw_is_sent_in_the_frame_of_the_arms():
     update = working()
-    assert update.seen is not None
-    points_mm = cloud_of(sent(update, WorkcellMessages(HUMBLE, 0))["observed"]).points_mm
-    depth_mm = update.seen.content.depth_mm
+    assert update.observation is not None
+    points_mm = cloud_of(sent(update, WorkcellMessages(HUMBLE, 0.0))["observed"]).points_mm
+    depth_mm = update.observation.content.depth_mm
     assert len(points_mm) == np.isfinite(depth_mm).sum()
     # The camera looks down from 160 mm: a depth of d is a height of 160 - d.
     assert np.sort(points_mm[:, 2]) == pytest.approx(
@@ -159,7 +157,7 @@ def test_without_arms_nothing_of_them_is_announced():
 @pytest.mark.parametrize("update", [working(), virtual(), less(virtual(), *NAMES, "cut/1")])
 def test_bytes_are_those_of_plain_messages(messages, update):
     stock = STOCK[messages]
-    for out in messages_of(update, messages, PARTS, True, WorkcellMessages(messages, 0)):
+    for out in messages_of(update, messages, PARTS, True, WorkcellMessages(messages, 0.0)):
         raw, kind = messages.to_bytes(out.message), out.message_type
         if messages is HUMBLE:
             again = stock.serialize_cdr(stock.deserialize_cdr(raw, kind), kind)
@@ -195,13 +193,13 @@ def three() -> list[TrackingResult]:
     """With an estimate, without one, and without a camera's picture."""
     frames = [frame_number(n) for n in (0, 1)]
     seen = [Observation(frame, frame.stamp_ns) for frame in frames]
-    one = replace(working(0, 0.1), seen=seen[0], stamp_ns=frames[0].stamp_ns)
-    two = replace(virtual(1, 0.2, "stale"), seen=seen[1], stamp_ns=frames[1].stamp_ns)
+    one = replace(working(0, 0.1), observation=seen[0], stamp_ns=frames[0].stamp_ns)
+    two = replace(virtual(1, 0.2, "stale"), observation=seen[1], stamp_ns=frames[1].stamp_ns)
     return [one, two, less(virtual(2, 0.3), "table")]
 
 
 def test_an_mcap_holds_the_arms_and_plays_again(tmp_path):
-    path = record(tmp_path / "r", three(), meshes_hz=0)
+    path = record(tmp_path / "r", three(), meshes_hz=0.0)
     with AnyReader([path]) as reader:
         said: dict[str, list] = {}
         for connection, _, raw in reader.messages():
@@ -403,7 +401,7 @@ def moving(arm, monkeypatch) -> Iterator:
 
 
 def test_by_default_nothing_is_connected_and_targets_are_counted(arm):
-    config = parse_spec("ur:10.0.0.9?arm=holder", SINKS, "sink")
+    config = SINKS.parse("ur:10.0.0.9?arm=holder")
     assert config == UrSinkConfig(host="10.0.0.9", arm="holder", execute=False)
     sink = config.open(with_arms())
     for n in range(5):

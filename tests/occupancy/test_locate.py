@@ -23,8 +23,7 @@ from tumortrack.core.mesh_files import read_mesh
 from tumortrack.core.types import Anatomy, SensorCloud
 from tumortrack.imaging.case import load_case
 from tumortrack.occupancy.inference import Arithmetic, can_pack, possible
-from tumortrack.tracking.follower import Follower, FollowerConfig
-from tumortrack.tracking.tracker import Tracker
+from tumortrack.tracking.tracker import Follower, FollowerConfig, Tracker
 from tumortrack.training.model import load_model
 
 pytestmark = pytest.mark.slow

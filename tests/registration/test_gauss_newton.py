@@ -11,11 +11,12 @@ from scipy.interpolate import RegularGridInterpolator
 from scipy.spatial.transform import Rotation
 from scipy.special import ndtr
 
+from covering import cover
 from elastic_objects import CENTER, RADII
 from tumortrack.core.estimate import Following
 from tumortrack.core.process import parallel_for
 from tumortrack.core.types import Mesh, SensorCloud
-from tumortrack.imaging.raster import cover, label_grid, winding_numbers
+from tumortrack.imaging.raster import label_grid, winding_numbers
 from tumortrack.models.config import GaussNewtonConfig
 from tumortrack.registration import gauss_newton_kernels as kernels
 from tumortrack.registration import registration

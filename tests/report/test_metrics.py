@@ -7,9 +7,10 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from scipy.spatial.distance import directed_hausdorff
 
+from covering import cover
 from tumortrack.core.errors import InputError
 from tumortrack.core.types import Anatomy, CameraLabels, Mesh
-from tumortrack.imaging.raster import cover, voxelise
+from tumortrack.imaging.raster import voxelise
 from tumortrack.report.metrics import (
     box_center_distance,
     distance_to_surface,

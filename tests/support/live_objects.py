@@ -86,9 +86,9 @@ def small_update(
         stamp_ns=stamp_ns,
         estimate=small_estimate(stamp_ns),
         quality="good",
-        seen=Observation(frame, stamp_ns + 2_000_000),
+        observation=Observation(frame, stamp_ns + 2_000_000),
         organ=organ,
-        frames=frames or PublishedFrame(),
+        published_frame=frames or PublishedFrame(),
         seconds={"organ": 0.002, "encode": 0.003},
         latency_ms=12.5,
     )
@@ -100,4 +100,4 @@ def empty_update(sequence: int = 1, reason: str = "only 12 points lie in range")
 
 
 def small_setting() -> SinkContext:
-    return SinkContext(parts=PARTS, frames=PublishedFrame())
+    return SinkContext(parts=PARTS, published_frame=PublishedFrame())

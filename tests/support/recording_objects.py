@@ -27,7 +27,7 @@ def update_number(
 ) -> live.TrackingResult:
     content = frame_number(n) if content is None else content
     update = small_update(n, content.stamp_ns)
-    return replace(update, seen=Observation(content, content.stamp_ns + 2_000_000, **seen))
+    return replace(update, observation=Observation(content, content.stamp_ns + 2_000_000, **seen))
 
 
 def record(path: Path, updates: list[live.TrackingResult], **options) -> Path:

@@ -21,7 +21,7 @@ from live_objects import PARTS, small_anatomy, small_frame
 from tumortrack.core.types import SensorCloud
 from tumortrack.live.ros.bus import Bus, open_bus
 from tumortrack.live.ros.messages import Messages
-from tumortrack.live.ros.observed import messages_seen
+from tumortrack.live.ros.sensors import messages_seen
 from tumortrack.live.values import Observation, Source
 
 HERE = Path(__file__).parent

@@ -16,10 +16,9 @@ from live_objects import PARTS, empty_update, small_frame
 from tumortrack.core.types import DepthFrame, SensorCloud
 from tumortrack.live.ros.bus import open_bus
 from tumortrack.live.ros.dds import DdsBus
-from tumortrack.live.ros.incoming import CLOUD
-from tumortrack.live.ros.messages import Messages, stamp_of
-from tumortrack.live.ros.observed import messages_seen, plain_cloud
-from tumortrack.live.ros.outgoing import DIAGNOSTICS, MARKERS, messages_of
+from tumortrack.live.ros.messages import MARKERS, Messages, stamp_of
+from tumortrack.live.ros.results import DIAGNOSTICS, messages_of
+from tumortrack.live.ros.sensors import CLOUD, messages_seen, plain_cloud
 from tumortrack.live.values import Observation
 
 N_POINTS = 40_000

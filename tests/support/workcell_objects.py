@@ -102,10 +102,10 @@ def virtual(sequence: int = 0, progress: float = 0.0, halted: str = "") -> Track
         sequence,
         STAMP_NS + sequence * 33_000_000,
         reason=REASON,
-        frames=TABLE,
+        published_frame=TABLE,
         workcell=workcell(progress, halted),
     )
 
 
 def with_arms() -> SinkContext:
-    return replace(small_setting(), frames=TABLE, arms=True)
+    return replace(small_setting(), published_frame=TABLE, arms=True)

@@ -54,16 +54,11 @@ class Prepare:
 
     def run(self) -> None:
         """Input -> case folder with a picture to check it by."""
-        from tumortrack.imaging.case import KIND, save_case
-        from tumortrack.imaging.prepare import PrepareOptions, prepare
-        from tumortrack.report.qc import qc_picture
+        from tumortrack.api import prepare
+        from tumortrack.imaging.prepare import PrepareOptions
 
         options = {field.name: getattr(self, field.name) for field in fields(PrepareOptions)}
-        store.check_place(self.case, KIND, self.overwrite)
-        case = prepare(self.input, PrepareOptions(**options))
-        with store.new_folder(self.case, self.overwrite) as aside:
-            qc_picture(case.labels, case.ct, case.anatomy, aside / "qc.png")
-            save_case(case, aside)
+        case = prepare(self.input, self.case, overwrite=self.overwrite, **options)
         say_notes(case.report.get("notes", []))
         for name, part in zip(case.anatomy.names, case.anatomy.parts, strict=True):
             say(f"{name}: {part.volume_mm3 / 1000:.1f} ml")

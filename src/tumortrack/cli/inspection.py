@@ -68,6 +68,8 @@ class Doctor:
 
     def run(self) -> None:
         """Print the machine, each library by importing it, and what bf16 and CUDA offer."""
+        from tumortrack.live.spec import extensions
+
         say(f"tumortrack {version('tumortrack')}, Python {platform.python_version()}")
         say(f"cores: {available_cores()}, {platform.machine()}, {platform.system()}")
         free = shutil.disk_usage(Path.cwd()).free / 2**30
@@ -80,6 +82,9 @@ class Doctor:
                 say(f"BROKEN   {name} ({purpose}): {error}")
         for name, purpose in _OPTIONAL.items():
             say(f"{'ok      ' if find_spec(name) else 'absent  '} {name} ({purpose})")
+        for one in extensions():
+            state, fault = ("BROKEN  ", f": {one.fault}") if one.fault else ("ok      ", "")
+            say(f"{state} {one.what} {one.kind} of the package {one.package}{fault}")
 
         import torch
 

@@ -191,7 +191,9 @@ class Resect:
                 if controls.aborted.is_set():
                     operation.abort("stopped by the viewer, or a real arm gave up")
                 result = operation.act(
-                    TrackingResult(sequence, time.time_ns(), reason=_NOTHING, frames=frames)
+                    TrackingResult(
+                        sequence, time.time_ns(), reason=_NOTHING, published_frame=frames
+                    )
                 )
                 for sink in sinks:
                     sink.put(result)

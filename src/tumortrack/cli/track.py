@@ -18,14 +18,12 @@ from tumortrack.core import store
 from tumortrack.core.errors import InputError, StorageError
 
 if TYPE_CHECKING:
-    from tumortrack.core.types import Anatomy
     from tumortrack.live.loop import Loop, LoopConfig
     from tumortrack.live.sink_worker import SinkWorker
     from tumortrack.live.source_worker import SourceWorker
     from tumortrack.live.values import PublishedFrame, SinkConfig, SinkContext, TrackingResult
-    from tumortrack.models.config import TrainConfig
+    from tumortrack.models.model import Model
     from tumortrack.plan.operation import Operation
-    from tumortrack.sense.region import RegionConfig
 
 _SAY_S, _SAY_PLAIN_S = 1.0, 5.0  # between two lines of state: on a terminal, in a file
 STOPPED = "stopped by the user"  # why arms stand
@@ -93,12 +91,11 @@ class Track:
         """Until the source ends, the time is up, the arms have ended, or Ctrl-C."""
         from tumortrack.core.config import to_builtins
         from tumortrack.live.calibration_file import read_frames
-        from tumortrack.live.sources import SOURCES
-        from tumortrack.live.spec import parse_spec
+        from tumortrack.live.spec import SOURCES
         from tumortrack.live.values import Controls, PublishedFrame, SinkContext
         from tumortrack.models.folder import read_model_manifest
 
-        source_config = parse_spec(self.source, SOURCES, "source")
+        source_config = SOURCES.parse(self.source)
         sink_configs = parse_sinks(self.sinks)
         frames = read_frames(self.frame) if self.frame else PublishedFrame()
         if arms is not None:
@@ -116,7 +113,7 @@ class Track:
         model = load_model(self.model, self.device)
         say_notes(model.notes)
         tracker = Tracker(model)
-        config = self._loop_config(model.config, tracker.anatomy_ct)
+        config = self._loop_config(model)
         context = SinkContext(model.parts, frames, tracker.anatomy_ct, Controls(), arms is not None)
         companion = None if arms is None else arms.companion
         loop = Loop(tracker, context, config, companion)
@@ -150,13 +147,15 @@ class Track:
             say(f"tracking {self.source} in frame {frames.frame_id!r}; Ctrl-C ends it.")
             loop.run(source, sinks, screen.show)
 
-    def _loop_config(self, trained: TrainConfig, anatomy_ct: Anatomy | None) -> LoopConfig:
+    def _loop_config(self, model: Model) -> LoopConfig:
         from tumortrack.live.loop import LoopConfig
         from tumortrack.sense.files import read_intrinsics
-        from tumortrack.tracking.follower import FollowerConfig
+        from tumortrack.tracking.region import region_for
+        from tumortrack.tracking.tracker import FollowerConfig
 
+        box = None if self.box is None else (self.box[:3], self.box[3:])
         return LoopConfig(
-            region=self._region(trained, anatomy_ct),
+            region=region_for(model, range_mm=self.range, box_mm=box, whole=self.whole),
             follower=FollowerConfig(
                 rescan_s=self.rescan, smoothing_s=self.smoothing, seed=self.seed
             ),
@@ -166,44 +165,12 @@ class Track:
             seconds=self.seconds,
         )
 
-    def _region(self, trained: TrainConfig, anatomy_ct: Anatomy | None) -> RegionConfig:
-        """Depths that training showed, unless the user says others; where it showed any distance,
-        its farthest organ still lies in them whole. Pieces of about the organ's size, if that is
-        known."""
-        import numpy as np
-
-        from tumortrack.sense.cloud import CloudConfig
-        from tumortrack.sense.region import RegionConfig
-
-        scene = trained.scene
-        near, far = scene.cloud.near_mm, scene.cloud.far_mm
-        if scene.free_range > 0:
-            nearest, farthest = scene.free_nearest_mm
-            near, far = min(near, nearest - 5), max(far, farthest + far - near)
-        if self.range is not None:
-            near, far = self.range
-        crop = CloudConfig(near_mm=near, far_mm=far, n_points=scene.cloud.n_points)
-        box = None
-        if self.box is not None:
-            ax, ay, az, bx, by, bz = self.box
-            box = ((ax, ay, az), (bx, by, bz))
-        if self.whole:
-            return RegionConfig(crop=crop, box_mm=box, plane=False, flying=False, pieces=False)
-        if anatomy_ct is None:
-            return RegionConfig(crop=crop, box_mm=box)
-        vertices = anatomy_ct.organ.vertices_mm
-        axes = np.linalg.svd(vertices - vertices.mean(0), full_matrices=False)[2]
-        extents_mm = np.ptp(vertices @ axes.T, axis=0)
-        size_mm = (0.7 * float(extents_mm.min()), 1.25 * float(extents_mm.max()))
-        return RegionConfig(crop=crop, box_mm=box, organ_mm=size_mm)
-
 
 def parse_sinks(sinks: tuple[str, ...]) -> list[SinkConfig]:
     """Configurations of what was written on the command line."""
-    from tumortrack.live.sinks import SINKS
-    from tumortrack.live.spec import parse_spec
+    from tumortrack.live.spec import SINKS
 
-    configs = [parse_spec(sink, SINKS, "sink") for sink in sinks]
+    configs = [SINKS.parse(sink) for sink in sinks]
     if doubled := sorted({sink for sink in sinks if sinks.count(sink) > 1}):
         raise InputError(f"sink {doubled[0]!r} is given twice.")
     return configs
@@ -217,8 +184,9 @@ def open_sinks(
 
     workers = []
     # Those that make a folder last: if another cannot open, none is left behind.
-    for spec, config in sorted(zip(sinks, configs, strict=True), key=lambda pair: pair[1].waiting):
-        worker = SinkWorker(spec, config.open(context), config.waiting)
+    pairs = zip(sinks, configs, strict=True)
+    for spec, config in sorted(pairs, key=lambda pair: pair[1].queue_size):
+        worker = SinkWorker(spec, config.open(context), config.queue_size)
         stack.callback(worker.close)
         workers.append(worker)
     return workers
@@ -310,13 +278,13 @@ class _Screen:
         """The last lines."""
         source, loop = self._source, self._loop
         self._store()
-        estimates = loop.counts["good"] + loop.counts["poor"]
+        counts, latency = loop.statistics.counts, loop.statistics.latency
         say(
-            f"{estimates} estimates ({loop.counts['poor']} poor), {loop.counts['none']} times "
-            f"none, {source.dropped} frames dropped."
+            f"{counts['good'] + counts['poor']} estimates ({counts['poor']} poor), "
+            f"{counts['none']} times none, {source.dropped} frames dropped."
         )
-        if len(loop.latency):
-            times = loop.latency.summary()
+        if len(latency):
+            times = latency.summary()
             say(
                 f"latency from {source.latency_from} to published estimate: p50 "
                 f"{times['p50']:.1f}, p95 {times['p95']:.1f}, p99.9 {times['p99.9']:.1f} ms."
@@ -325,7 +293,7 @@ class _Screen:
             if sink.dropped or sink.errors:
                 last = f"; the last: {sink.error}" if sink.error else ""
                 say(f"sink {sink.name}: {sink.dropped} missed, {sink.errors} errors{last}.")
-        for name, errors in loop.errors.items():
+        for name, errors in loop.statistics.errors.items():
             off = errors.summary()
             say(f"{name}: centre off by {off['p50']:.1f} mm (median; 95 %: {off['p95']:.1f} mm).")
         if not self._unwritten:
@@ -333,10 +301,10 @@ class _Screen:
         check_closed(self._sinks)
 
     def _line(self, now: float) -> None:
-        total = sum(self._loop.counts.values())
+        total = sum(self._loop.statistics.counts.values())
         rate = (total - self._before) / (now - self._shown)
         self._before, self._shown = total, now
-        latency = self._loop.latency
+        latency = self._loop.statistics.latency
         if not len(latency):
             return
         say(

@@ -1,17 +1,14 @@
 """The live loop: newest frame -> organ's points -> estimate -> every sink.
 
-Each frame gives exactly one update; where nothing can be said, it says so and why, and no older
-answer is ever given again.
+Each frame gives exactly one result; without an estimate it has the reason, and no older
+estimate is ever repeated.
 """
 
 from __future__ import annotations
 
 import math
-import re
 import threading
 import time
-import traceback
-from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import replace
@@ -21,15 +18,13 @@ from jaxtyping import Float64
 
 from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError, NoEstimate, TumortrackError
-from tumortrack.core.estimate import Estimate
-from tumortrack.core.types import Anatomy, DepthFrame, Intrinsics, SensorCloud
-from tumortrack.live.clock import StampCheck
-from tumortrack.live.meter import Histogram
-from tumortrack.live.quality import judge
+from tumortrack.core.types import DepthFrame, Intrinsics, SensorCloud
+from tumortrack.live.meter import RunStatistics
+from tumortrack.live.quality import StampCheck, judge
 from tumortrack.live.sink_worker import SinkWorker
 from tumortrack.live.source_worker import SourceWorker
 from tumortrack.live.values import (
-    Companion,
+    ArmsController,
     Observation,
     Quality,
     SinkContext,
@@ -38,11 +33,8 @@ from tumortrack.live.values import (
 )
 from tumortrack.sense.camera import d405
 from tumortrack.sense.region import Hints, RegionConfig, organ_points
-from tumortrack.tracking.follower import Follower, FollowerConfig
-from tumortrack.tracking.tracker import Tracker
+from tumortrack.tracking.tracker import Follower, FollowerConfig, Tracker
 
-_KINDS = 50  # of reasons that are counted apart
-_DEFECTS = 5  # tracebacks that are kept
 _PICK_S = 3.0  # without the organ: a pick is forgotten
 
 
@@ -81,11 +73,11 @@ class Loop:
     def __init__(
         self,
         tracker: Tracker,
-        setting: SinkContext,
+        context: SinkContext,
         config: LoopConfig,
-        companion: Companion | None = None,
+        arms: ArmsController | None = None,
     ) -> None:
-        self._config, self._setting, self._companion = config, setting, companion
+        self._config, self._context, self._arms = config, context, arms
         self._follower = Follower(tracker, config.follower)
         self._stamps = StampCheck(config.stale_s)
         self._stop = threading.Event()
@@ -94,17 +86,7 @@ class Loop:
         self._place_mm: Float64[np.ndarray, " 3"] | None = None  # where that is by now
         self._found_s = time.monotonic()
         self._stamp: tuple[int, int] | None = None  # of the last frame, and when that was here
-        self.latency = Histogram()
-        self.stages: dict[str, Histogram] = {}
-        self.errors: dict[str, Histogram] = {}  # mm, of a source that knows the truth
-        self.counts: Counter[str] = Counter()
-        self.reasons: Counter[str] = Counter()
-        self.defects: list[str] = []
-
-    @property
-    def clock_jumps(self) -> int:
-        """How often the source's clock was set back."""
-        return self._stamps.jumps
+        self.statistics = RunStatistics()
 
     def warm(self) -> None:
         """Do once what every frame needs, so that the first does not wait for it."""
@@ -123,33 +105,33 @@ class Loop:
 
     def run(
         self,
-        reader: SourceWorker,
-        outlets: list[SinkWorker],
-        seen_by: Callable[[TrackingResult], None],
+        source_worker: SourceWorker,
+        sink_workers: list[SinkWorker],
+        on_result: Callable[[TrackingResult], None],
     ) -> None:
-        """``seen_by`` is called with every update, after the outlets have it.
+        """``on_result`` is called with every result, after the sink_workers have it.
 
         Raises:
             SourceLost: no frame came for ``give_up_s``.
             TumortrackError: the source can never work (as its ``open`` said).
         """
         try:
-            self._run(reader, outlets, seen_by)
+            self._run(source_worker, sink_workers, on_result)
         finally:
-            if self._companion is not None and not self._companion.ended:
-                self._companion.abort("tracking has ended")
-                self._publish(self._silence(None, 0.0, "tracking has ended"), outlets)
+            if self._arms is not None and not self._arms.ended:
+                self._arms.abort("tracking has ended")
+                self._publish(self._without_frame(None, 0.0, "tracking has ended"), sink_workers)
 
     def _run(
         self,
-        reader: SourceWorker,
-        outlets: list[SinkWorker],
-        seen_by: Callable[[TrackingResult], None],
+        source_worker: SourceWorker,
+        sink_workers: list[SinkWorker],
+        on_result: Callable[[TrackingResult], None],
     ) -> None:
         fresh = time.monotonic()
         ends = math.inf
         while not self._stop.is_set():
-            got = reader.take(self._config.stale_s)
+            got = source_worker.take(self._config.stale_s)
             now = time.monotonic()
             if isinstance(got, Observation):
                 got = self._calibrated(got)
@@ -157,30 +139,32 @@ class Loop:
                 fresh = now
                 if self._config.seconds and ends == math.inf:
                     ends = now + self._config.seconds
-                update = self._answer(got, reader.born_ns(got), reader.latency_from != "taking")
-            elif got is None and reader.ended:
+                result = self._answer(
+                    got, source_worker.born_ns(got), source_worker.latency_from != "taking"
+                )
+            elif got is None and source_worker.ended:
                 return
             else:
-                update = self._silence(got, now - fresh, reader.trouble)
-            update = self._publish(update, outlets)
-            seen_by(update)
-            if now >= ends or (self._companion is not None and self._companion.ended):
+                result = self._without_frame(got, now - fresh, source_worker.trouble)
+            result = self._publish(result, sink_workers)
+            on_result(result)
+            if now >= ends or (self._arms is not None and self._arms.ended):
                 return
             if now - fresh > self._config.give_up_s:
-                trouble = f": {reader.trouble}" if reader.trouble else ""
+                trouble = f": {source_worker.trouble}" if source_worker.trouble else ""
                 raise SourceLost(
                     f"no frame for {now - fresh:.0f} s{trouble}. Look at the camera or the topic, "
                     "then start again."
                 )
 
     def _answer(self, seen: Observation, born_ns: int, hurry: bool) -> TrackingResult:
-        """The update of one frame, which came to be at ``born_ns``. ``hurry``: time goes on while
+        """The result of one frame, which came to be at ``born_ns``. ``hurry``: time goes on while
         we work, so an answer can come too late."""
         seconds: dict[str, float] = {}
         organ, estimate, reason, warning = None, None, "", ""
         quality: Quality = "none"
         try:
-            self._believe(seen.stamp_ns, _age_s(born_ns))
+            self._check_stamp(seen.stamp_ns, _age_s(born_ns))
             with timed(seconds, "organ"):
                 rng = np.random.default_rng((self._config.follower.seed, seen.stamp_ns))
                 region = organ_points(seen.content, self._config.region, self._hints(seen), rng)
@@ -198,9 +182,9 @@ class Loop:
         except TumortrackError as error:
             self._follower.forget()
             estimate, reason = None, str(error)
-        except Exception as error:  # a defect of ours: said, kept, and the next frame is tried
+        except Exception as error:  # a defect of ours: reported, kept, and the next frame is tried
             self._follower.forget()
-            self._remember(error)
+            self.statistics.add_defect(error)
             estimate, reason = None, f"internal error, {type(error).__name__}: {error}"
         if estimate is None:
             quality, warning = "none", ""
@@ -214,7 +198,7 @@ class Loop:
             warning,
             seen,
             organ,
-            self._setting.frames,
+            self._context.published_frame,
             seconds,
             latency_ms=1000 * _age_s(born_ns),
         )
@@ -232,15 +216,14 @@ class Loop:
             )
         return replace(seen, content=DepthFrame(content.depth_mm, given, content.stamp_ns))
 
-    def _believe(self, stamp_ns: int, age_s: float) -> None:
-        jumps = self._stamps.jumps
-        self._stamps.check(stamp_ns, age_s)
-        if self._stamps.jumps > jumps:
+    def _check_stamp(self, stamp_ns: int, age_s: float) -> None:
+        if self._stamps.check(stamp_ns, age_s):
+            self.statistics.clock_jumps += 1
             self._follower.forget()
 
     def _hints(self, seen: Observation) -> Hints:
-        controls = self._setting.controls
-        if controls.picked_mm is not self._picked:  # the user chose anew
+        controls = self._context.controls
+        if controls.picked_mm is not self._picked:  # the user chose again
             self._picked = self._place_mm = controls.picked_mm
             self._found_s = time.monotonic()
             self._follower.forget()
@@ -260,13 +243,16 @@ class Loop:
             off_mm = np.linalg.norm(points_mm - np.median(points_mm, axis=0), axis=1)
             self._place_mm = points_mm[int(off_mm.argmin())]
 
-    def _silence(
+    def _without_frame(
         self, fault: TumortrackError | None, silent_s: float, trouble: str
     ) -> TrackingResult:
-        """The update where there is no frame."""
+        """The result where there is no frame."""
         reason = str(fault) if fault is not None else trouble or f"no frame for {silent_s:.1f} s"
         return TrackingResult(
-            self._next(), self._now_ns(), reason=reason, frames=self._setting.frames
+            self._next(),
+            self._now_ns(),
+            reason=reason,
+            published_frame=self._context.published_frame,
         )
 
     def _now_ns(self) -> int:
@@ -276,51 +262,23 @@ class Loop:
         stamp_ns, then_ns = self._stamp
         return stamp_ns + time.monotonic_ns() - then_ns
 
-    def _publish(self, update: TrackingResult, outlets: list[SinkWorker]) -> TrackingResult:
-        if self._companion is not None:
-            update = self._with_arms(self._companion, update)
-        for outlet in outlets:
-            outlet.put(update)
-        self.counts[update.quality] += 1
-        if update.reason:
-            self._count_reason(update.reason)
-        if update.latency_ms is not None and update.estimate is not None:
-            self.latency.add(update.latency_ms)
-        for name, stage_s in update.seconds.items():
-            self.stages.setdefault(name, Histogram()).add(1000 * stage_s)
-        if (
-            update.seen is not None
-            and update.seen.truth is not None
-            and update.estimate is not None
-        ):
-            self._hold_against(update.estimate, update.seen.truth)
-        return update
+    def _publish(self, result: TrackingResult, sink_workers: list[SinkWorker]) -> TrackingResult:
+        if self._arms is not None:
+            result = self._act(self._arms, result)
+        for sink_worker in sink_workers:
+            sink_worker.put(result)
+        self.statistics.add(result)
+        return result
 
-    def _with_arms(self, arms: Companion, update: TrackingResult) -> TrackingResult:
+    def _act(self, arms: ArmsController, result: TrackingResult) -> TrackingResult:
         try:
-            if self._setting.controls.aborted.is_set():
+            if self._context.controls.aborted.is_set():
                 arms.abort("stopped by the viewer, or a real arm gave up")
-            return arms.act(update)
+            return arms.act(result)
         except Exception as error:  # a defect there: no arms move, and the organ is still seen
-            self._remember(error)
+            self.statistics.add_defect(error)
             arms.abort(f"internal error, {type(error).__name__}: {error}")
-            return update
-
-    def _hold_against(self, estimate: Estimate, truth: Anatomy) -> None:
-        for name, true in zip(truth.names, truth.parts, strict=True):
-            if name in estimate.meshes:
-                off = estimate.meshes[name].box_mm.mean(0) - true.box_mm.mean(0)
-                self.errors.setdefault(name, Histogram()).add(float(np.linalg.norm(off)))
-
-    def _count_reason(self, reason: str) -> None:
-        kind = re.sub(r"-?[0-9]+([.,][0-9]+)?", "#", reason)
-        if kind not in self.reasons and len(self.reasons) >= _KINDS:
-            kind = "other reasons"
-        self.reasons[kind] += 1
-
-    def _remember(self, error: Exception) -> None:
-        if len(self.defects) < _DEFECTS:
-            self.defects.append("".join(traceback.format_exception(error)))
+            return result
 
     def _next(self) -> int:
         self._sequence += 1
@@ -341,20 +299,12 @@ def _age_s(born_ns: int) -> float:
     return (time.time_ns() - born_ns) * 1e-9
 
 
-def summary(loop: Loop, reader: SourceWorker, outlets: list[SinkWorker]) -> dict:
-    """What the run was like (JSON types): counts, latencies and stage times in ms."""
-    return {
-        "updates": sum(loop.counts.values()),
-        "estimates": {"good": loop.counts["good"], "poor": loop.counts["poor"]},
-        "no_estimate": loop.counts["none"],
-        "reasons": dict(loop.reasons.most_common()),
-        "dropped": reader.dropped,
-        "opened": reader.opened,
-        "clock_jumps": loop.clock_jumps,
-        "latency_from": reader.latency_from,
-        "latency_ms": loop.latency.summary(),
-        "stages_ms": {name: times.summary() for name, times in loop.stages.items()},
-        "center_error_mm": {name: errors.summary() for name, errors in loop.errors.items()},
-        "sinks": {outlet.name: outlet.summary() for outlet in outlets},
-        "defects": [*loop.defects, *reader.defects],
+def summary(loop: Loop, source_worker: SourceWorker, sink_workers: list[SinkWorker]) -> dict:
+    """The report of a run (JSON types): counts, latencies and stage times in ms."""
+    return loop.statistics.summary() | {
+        "dropped": source_worker.dropped,
+        "opened": source_worker.opened,
+        "latency_from": source_worker.latency_from,
+        "sinks": {worker.name: worker.summary() for worker in sink_workers},
+        "defects": [*loop.statistics.defects, *source_worker.defects],
     }

@@ -1,15 +1,25 @@
-"""How long things take and how far they are off, over hours, in a memory that does not grow."""
+"""How often things happen, how long they take, and how large errors are."""
 
 from __future__ import annotations
 
+import re
+import time
+import traceback
+from collections import Counter
+
 import numpy as np
 
+from tumortrack.live.values import TrackingResult
+
 _FINEST, _COARSEST = 0.01, 1e6
+_KINDS = 50  # of reasons that are counted apart
+_DEFECTS = 5  # tracebacks that are kept
 _STEP = 1.01  # one bin to the next: percentiles are right to 1 %
 
 
 class Histogram:
-    """Positive numbers (times in ms, errors in mm), counted in bins that widen by 1 %."""
+    """Positive numbers (times in ms, errors in mm), counted in bins that widen by 1 %: over hours
+    in constant memory."""
 
     def __init__(self) -> None:
         bins = int(np.ceil(np.log(_COARSEST / _FINEST) / np.log(_STEP))) + 1
@@ -40,3 +50,70 @@ class Histogram:
             return {"count": 0}
         marks = {f"p{mark:g}": round(self.percentile(mark), 3) for mark in (50.0, 95.0, 99.0, 99.9)}
         return {"count": len(self), **marks, "max": round(self._largest, 3)}
+
+
+class Rate:
+    """Lets things happen at most ``hz`` times a second on average; 0: each time."""
+
+    def __init__(self, hz: float) -> None:
+        self._period_s = 1 / hz if hz > 0 else 0.0
+        self._next_s = 0.0
+
+    def due(self) -> bool:
+        now = time.monotonic()
+        if now < self._next_s:
+            return False
+        in_step = now < self._next_s + self._period_s
+        self._next_s = (self._next_s if in_step else now) + self._period_s
+        return True
+
+
+class RunStatistics:
+    """What a run was like: how often, why not, how fast, how exact."""
+
+    def __init__(self) -> None:
+        self.latency = Histogram()
+        self.stages: dict[str, Histogram] = {}
+        self.errors: dict[str, Histogram] = {}  # mm, of a source that knows the truth
+        self.counts: Counter[str] = Counter()  # by quality
+        self.reasons: Counter[str] = Counter()
+        self.clock_jumps = 0  # how often the source's clock was set back
+        self.defects: list[str] = []
+
+    def add(self, result: TrackingResult) -> None:
+        self.counts[result.quality] += 1
+        if result.reason:
+            kind = re.sub(r"-?[0-9]+([.,][0-9]+)?", "#", result.reason)
+            if kind not in self.reasons and len(self.reasons) >= _KINDS:
+                kind = "other reasons"
+            self.reasons[kind] += 1
+        for name, stage_s in result.seconds.items():
+            self.stages.setdefault(name, Histogram()).add(1000 * stage_s)
+        if result.estimate is None:
+            return
+        if result.latency_ms is not None:
+            self.latency.add(result.latency_ms)
+        if result.observation is not None and (truth := result.observation.truth) is not None:
+            meshes = result.estimate.meshes
+            for name, true in zip(truth.names, truth.parts, strict=True):
+                if name in meshes:
+                    off = meshes[name].box_mm.mean(0) - true.box_mm.mean(0)
+                    self.errors.setdefault(name, Histogram()).add(float(np.linalg.norm(off)))
+
+    def add_defect(self, error: Exception) -> None:
+        """Keep the traceback of an internal error."""
+        if len(self.defects) < _DEFECTS:
+            self.defects.append("".join(traceback.format_exception(error)))
+
+    def summary(self) -> dict:
+        """JSON types; latencies and stage times in ms."""
+        return {
+            "updates": sum(self.counts.values()),
+            "estimates": {"good": self.counts["good"], "poor": self.counts["poor"]},
+            "no_estimate": self.counts["none"],
+            "reasons": dict(self.reasons.most_common()),
+            "clock_jumps": self.clock_jumps,
+            "latency_ms": self.latency.summary(),
+            "stages_ms": {name: times.summary() for name, times in self.stages.items()},
+            "center_error_mm": {name: errors.summary() for name, errors in self.errors.items()},
+        }

@@ -1,4 +1,4 @@
-"""Whether a live estimate should be relied on, and if not, why."""
+"""Whether a frame's stamp is valid, and whether a live estimate should be relied on."""
 
 from __future__ import annotations
 
@@ -10,6 +10,8 @@ from tumortrack.core.types import DepthFrame, Intrinsics, SensorCloud
 from tumortrack.live.values import Quality
 from tumortrack.sense.render import render_depth
 
+_AHEAD_S = 0.1  # what two clocks may differ by
+_ACCEPTED_AFTER = 3  # frames whose stamps increase: then the clock was set back
 _UNSURE_MM = 3.0  # standard deviation of a tumor's middle
 # Shares of the organ's picture. Right estimates have up to 0.03 (moving and pushed, on tables, in
 # beds and cavities, among instruments and hands), an organ upside down 0.12 to 0.16, one laid on
@@ -80,3 +82,41 @@ def seen_through(estimate: Estimate, frame: DepthFrame) -> float:
     if not both.any():
         return 0.0
     return float((seen_mm[both] > organ_mm[both] + _THROUGH_MM).mean())
+
+
+class StampCheck:
+    """Refuses stale frames, and stamps that go back unless the clock was set back."""
+
+    def __init__(self, stale_s: float) -> None:
+        self._stale_s = stale_s
+        self._last_ns: int | None = None
+        self._behind: list[int] = []
+
+    def check(self, stamp_ns: int, age_s: float) -> bool:
+        """True if the clock was set back. ``age_s``: how long ago the frame was made, or came, as
+        far as is known.
+
+        Raises:
+            NoEstimate: stale, or out of order.
+        """
+        if age_s > self._stale_s:
+            raise NoEstimate(
+                f"the frame is stale: {age_s:.2f} s old, if the clocks of camera and computer agree"
+            )
+        if age_s < -_AHEAD_S:
+            raise NoEstimate(
+                f"the frame's stamp lies {-age_s:.2f} s in the future: the clocks of camera and "
+                "computer disagree"
+            )
+        if stamp_ns < 0:
+            raise NoEstimate(f"the frame's stamp is {stamp_ns} ns; it must be 0 or more")
+        if self._last_ns is None or stamp_ns > self._last_ns:
+            self._last_ns, self._behind = stamp_ns, []
+            return False
+        grows = not self._behind or stamp_ns > self._behind[-1]
+        self._behind = [*self._behind, stamp_ns] if grows else [stamp_ns]
+        back_s = (self._last_ns - stamp_ns) * 1e-9
+        if len(self._behind) < _ACCEPTED_AFTER:
+            raise NoEstimate(f"the frame's stamp went back by {back_s:.3f} s")
+        self._last_ns, self._behind = stamp_ns, []
+        return True

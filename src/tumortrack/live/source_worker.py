@@ -119,7 +119,7 @@ class SourceWorker:
                     came = time.monotonic()
                     # Asked for again: some know whose clock it is from the first frame on only.
                     clock = "stamp" if source.host_clock else "arrival"
-                    self._put(got, "taking" if source.waits else clock)
+                    self._put(got, "taking" if source.lossless else clock)
                 elif time.monotonic() - came > _FROZEN_S:
                     raise SourceLost(f"no frame for {_FROZEN_S:g} s; the source is opened again")
         finally:

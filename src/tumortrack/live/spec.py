@@ -1,52 +1,165 @@
-"""``kind:target?key=value&key=value`` -> the configuration of a source or sink."""
+"""``kind:target?key=value&key=value`` -> the configuration of a source or sink.
+
+A kind is a class: one of those listed here, or one that an installed package offers by an entry
+point in ``tumortrack.sources`` or ``tumortrack.sinks``, named as the class's ``tag``. Only the
+kind that is asked for is imported, so a broken package harms no other kind.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, Generic, NamedTuple, TypeVar
 
 import msgspec
 
 from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError
+from tumortrack.live.values import SinkConfig, SourceConfig
 
 C = TypeVar("C", bound=Config)
 
 
-def parse_spec(text: str, kinds: Sequence[type[C]], what: str) -> C:
-    """One of ``kinds`` (each with a ``target``), its fields filled from text; ``what`` names it in
-    errors.
+class Extension(NamedTuple):
+    """A source or sink of another package; ``fault``: why it cannot be used, empty if it can."""
 
-    Raises:
-        InputError: no such kind, key or value; the message lists what there is.
-    """
-    head, _, options = text.partition("?")
-    kind, _, target = head.partition(":")
-    by_name = {str(k.__struct_config__.tag): k for k in kinds}
-    if kind not in by_name:
-        raise InputError(f"{what} {text!r}: there is no kind {kind!r}. Allowed: {_all(by_name)}.")
-    config = by_name[kind]
+    what: str
+    kind: str
+    package: str
+    fault: str
+
+
+@dataclass(frozen=True)
+class Registry(Generic[C]):
+    """All kinds of source, or of sink: ``built_in`` (``module:class`` by kind), and those of
+    ``group``. ``what`` names one in messages; ``base`` is what its class must be derived from."""
+
+    what: str
+    group: str
+    base: Any
+    built_in: Mapping[str, str]
+
+    def parse(self, text: str) -> C:
+        """The configuration that ``text`` describes.
+
+        Raises:
+            InputError: no such kind, key or value: the message lists what there is; or the package
+                that offers the kind is broken.
+        """
+        head, _, options = text.partition("?")
+        kind, _, target = head.partition(":")
+        config = self._class(kind, f"{self.what} {text!r}")
+        return _filled(config, target, options, f"{self.what} {text!r}")
+
+    def extensions(self) -> Iterator[Extension]:
+        """What other packages offer; each class is imported."""
+        for entry in self._entry_points():
+            fault = ""
+            try:
+                self._class(entry.name, f"{self.what} {entry.name!r}")
+                if entry.name in self.built_in:
+                    fault = f"{entry.name!r} is built in, and cannot be replaced"
+            except InputError as error:
+                fault = str(error)
+            yield Extension(self.what, entry.name, package_of(entry), fault)
+
+    def _class(self, kind: str, where: str) -> type[C]:
+        """Raises InputError, which ``where`` opens."""
+        if kind in self.built_in:
+            return EntryPoint(kind, self.built_in[kind], self.group).load()
+        entries = self._entry_points()
+        found = [entry for entry in entries if entry.name == kind]
+        if not found:
+            allowed = sorted({*self.built_in, *(entry.name for entry in entries)})
+            raise InputError(f"{where}: there is no kind {kind!r}. Allowed: {', '.join(allowed)}.")
+        if len(found) > 1:
+            packages = " and ".join(sorted(map(package_of, found)))
+            raise InputError(f"{where}: {packages} both offer {kind!r}. Uninstall one of them.")
+        package = package_of(found[0])
+        try:
+            config: type[C] = found[0].load()
+        except Exception as error:  # a foreign package raises anything
+            raise InputError(
+                f"{where}: the package {package} offers {kind!r}, but it cannot be imported "
+                f"({type(error).__name__}: {error}). Repair or uninstall it."
+            ) from error
+        if not (isinstance(config, type) and issubclass(config, self.base)):
+            raise InputError(
+                f"{where}: the package {package} offers {found[0].value}, which is no "
+                f"{self.base.__name__} of tumortrack. Repair or uninstall it."
+            )
+        if config.__struct_config__.tag != kind:
+            raise InputError(
+                f"{where}: the package {package} names its entry point {kind!r}, and its class "
+                f"{config.__struct_config__.tag!r}; both must be the same. Repair or uninstall it."
+            )
+        return config
+
+    def _entry_points(self) -> list[EntryPoint]:
+        return sorted(entry_points(group=self.group), key=lambda entry: entry.name)
+
+
+_LIVE = "tumortrack.live"
+SOURCES = Registry[SourceConfig](
+    "source",
+    "tumortrack.sources",
+    SourceConfig,
+    {
+        "virtual": f"{_LIVE}.sources.virtual:VirtualSourceConfig",
+        "realsense": f"{_LIVE}.sources.realsense:RealSenseSourceConfig",
+        "recording": f"{_LIVE}.sources.recording:RecordingSourceConfig",
+        "ros2": f"{_LIVE}.sources.ros:Ros2SourceConfig",
+        "ros1": f"{_LIVE}.sources.ros:Ros1SourceConfig",
+    },
+)
+SINKS = Registry[SinkConfig](
+    "sink",
+    "tumortrack.sinks",
+    SinkConfig,
+    {
+        "viewer": f"{_LIVE}.sinks.viewer:ViewerSinkConfig",
+        "recording": f"{_LIVE}.sinks.recording:RecordingSinkConfig",
+        "ros2": f"{_LIVE}.sinks.ros:Ros2SinkConfig",
+        "ros1": f"{_LIVE}.sinks.ros:Ros1SinkConfig",
+        "openigtlink": f"{_LIVE}.sinks.openigtlink:OpenIgtLinkSinkConfig",
+        "ur": f"{_LIVE}.sinks.ur:UrSinkConfig",
+    },
+)
+
+
+def extensions() -> list[Extension]:
+    """Every source and sink that installed packages offer."""
+    return [*SOURCES.extensions(), *SINKS.extensions()]
+
+
+def package_of(entry: EntryPoint) -> str:
+    """The distribution that declares an entry point."""
+    return entry.dist.name if entry.dist is not None else entry.value
+
+
+def _filled(config: type[C], target: str, options: str, where: str) -> C:
     given: dict[str, str] = {}
     for option in filter(None, options.split("&")):
         key, _, value = option.partition("=")  # as it is: paths may hold + and %
         if key in given:
-            raise InputError(f"{what} {text!r}: {key!r} is given twice.")
+            raise InputError(f"{where}: {key!r} is given twice.")
         given[key] = value
     names = {field.name: field for field in msgspec.structs.fields(config)}
     target_name = getattr(config, "target", "")
     if target and (not target_name or target_name in given):
-        raise InputError(f"{what} {text!r}: {target!r} has no place there. {usage(config)}")
+        raise InputError(f"{where}: {target!r} has no place there. {usage(config)}")
     if target:
         given[target_name] = target
     if unknown := [key for key in given if key not in names]:
-        raise InputError(f"{what} {text!r}: {unknown[0]!r} is no option. {usage(config)}")
+        raise InputError(f"{where}: {unknown[0]!r} is no option. {usage(config)}")
     if missing := [n for n, f in names.items() if f.required and n not in given]:
-        raise InputError(f"{what} {text!r} lacks its {missing[0]}. {usage(config)}")
+        raise InputError(f"{where} lacks its {missing[0]}. {usage(config)}")
     try:
         return msgspec.convert(given, config, strict=False, dec_hook=_path)
     except msgspec.ValidationError as error:
-        raise InputError(f"{what} {text!r}: {error}. {usage(config)}") from error
+        raise InputError(f"{where}: {error}. {usage(config)}") from error
 
 
 def _path(kind: type, value: object) -> object:
@@ -58,9 +171,9 @@ def _path(kind: type, value: object) -> object:
 def usage(config: type[Config]) -> str:
     """How a kind is written, with its options' defaults."""
     kind, target = str(config.__struct_config__.tag), getattr(config, "target", "")
-    fields = [f for f in msgspec.structs.fields(config) if f.name != target]
-    options = "&".join(f"{f.name}={_text(f.default)}" for f in fields)
-    first = next((f for f in msgspec.structs.fields(config) if f.name == target), None)
+    fields = {field.name: field for field in msgspec.structs.fields(config)}
+    first = fields.pop(target, None)
+    options = "&".join(f"{name}={_text(field.default)}" for name, field in fields.items())
     place = "" if first is None else (f":{target.upper()}" if first.required else f"[:{target}]")
     return f"Write {kind}{place}" + (f"[?{options}]" if options else "") + "."
 
@@ -69,7 +182,3 @@ def _text(value: object) -> str:
     if isinstance(value, bool):
         return str(value).lower()
     return "" if value is None or value is msgspec.NODEFAULT else str(value)
-
-
-def _all(by_name: dict[str, type[C]]) -> str:
-    return ", ".join(sorted(by_name))

@@ -1,8 +1,8 @@
-"""The values of the live loop: what a source saw, what is published of it, who takes part.
+"""The values of live tracking, and what a source and a sink must be.
 
-A source hands over an ``Observation``; the loop makes one ``TrackingResult`` of it; every sink gets
-every result, or the newest if it is slow. Source and sink are each one file with a configuration
-whose ``open`` makes it: see ``live.sources`` and ``live.sinks``.
+A source hands over an ``Observation``. The loop makes one ``TrackingResult`` of it. Every sink gets
+every result or, if it is slow, the newest. A source or sink is one file: a configuration whose
+``open`` makes it. Other packages add their own: see ``live.spec`` and docs/live.md.
 """
 
 from __future__ import annotations
@@ -27,27 +27,27 @@ Quality = Literal["good", "poor", "none"]
 
 
 class SourceLost(TumortrackError):
-    """The source is gone for now: unplugged, killed, its file unreadable. Opening it again may
-    help, and the loop tries."""
+    """The source is gone for now: unplugged, killed, its file unreadable. The loop tries to open it
+    again."""
 
     exit_code = 3
 
 
 class SourceEnded(TumortrackError):
-    """The source has nothing more to give, as a recording at its end. No fault."""
+    """The source has nothing more to give, as a recording at its end. Not a fault."""
 
     exit_code = 0
 
 
 @dataclass(frozen=True, eq=False)
 class Observation:
-    """What a source saw at one instant; camera frame, mm.
+    """What a source observed at one instant; camera frame, mm.
 
     Attributes:
         content: a depth image or a cloud, with the ``stamp_ns`` of its exposure.
         arrived_ns: when it reached this program, by ``time.time_ns``.
-        mask: of a depth image, True where the organ may be; None where nobody said.
-        truth: the true surfaces, where the source makes its own world.
+        mask: of a depth image: True where the organ may be; None: anywhere.
+        truth: the true surfaces, where the source simulates them.
     """
 
     content: DepthFrame | SensorCloud
@@ -62,37 +62,37 @@ class Observation:
 
 @runtime_checkable
 class Source(Protocol):
-    """An open source. ``read`` is called from one thread, ``close`` perhaps from another."""
+    """An open source. One thread calls ``read``; another may call ``close``."""
 
-    # Stamps are this machine's time.time_ns: the frame's age is known. True of the frame read last;
-    # before the first one it may not be known.
+    # True: stamps are this machine's time.time_ns, so the age of a frame is known. Holds for the
+    # frame read last; before the first one it may not be known.
     host_clock: bool
-    waits: bool  # every frame counts: the loop takes each, instead of the newest
+    lossless: bool  # every frame is processed, not only the newest: the source waits for the loop
 
     @property
     def dropped(self) -> int:
-        """Frames that never got out of the source, as far as it knows."""
+        """Frames lost inside the source, as far as it knows."""
         ...
 
     def read(self, timeout_s: float) -> Observation | None:
-        """The newest frame not yet given; None if none came in time.
+        """The newest frame that was not read before; None if none came in time.
 
         Raises:
-            SourceLost: there is nothing to wait for any more.
-            SourceEnded: that was all.
-            InputError: what came can't be used (a message of another kind, say); the loop says so
+            SourceLost: the source is gone; the loop opens it again.
+            SourceEnded: there are no more frames.
+            InputError: this frame cannot be used (another message type, say); the loop reports it
                 and reads on.
         """
         ...
 
     def close(self) -> None:
-        """Give everything back; may be called twice."""
+        """Release everything; may be called twice."""
         ...
 
 
 @dataclass(frozen=True, eq=False)
 class PublishedFrame:
-    """In which frame results are published: ``frame_id``, and the way there from the camera."""
+    """The coordinate frame in which results are published, and the transform there."""
 
     frame_id: str = "camera"
     published_from_camera: Float64[np.ndarray, "4 4"] = field(default_factory=lambda: np.eye(4))
@@ -100,7 +100,7 @@ class PublishedFrame:
 
 @dataclass(frozen=True, eq=False)
 class TransformedEstimate:
-    """An estimate in the frame in which it is published, mm."""
+    """An estimate in the published frame, mm."""
 
     points_mm: Float32[np.ndarray, "n 3"]
     labels: UInt8[np.ndarray, " n"]
@@ -110,11 +110,10 @@ class TransformedEstimate:
 
 @dataclass(frozen=True, eq=False)
 class RigidShape:
-    """A surface that moves as a whole: a link of an arm, a table, a planned piece.
+    """A surface that moves rigidly: a link of an arm, a table, a planned piece.
 
-    ``name`` is its own within a workcell, with slashes between levels (``cutter/forearm``).
-    Sinks send the surface again only where ``mesh`` is another object than before, and else its
-    place alone.
+    ``name`` is unique within a workcell, with slashes between levels (``cutter/forearm``). Sinks
+    send the surface again only if ``mesh`` is another object than before, otherwise its pose alone.
     """
 
     name: str
@@ -126,7 +125,7 @@ class RigidShape:
 
 @dataclass(frozen=True, eq=False)
 class Polyline:
-    """A line through points of the published frame, mm: a cut, an instrument's way."""
+    """A line through points of the published frame, mm: a cut, an instrument's path."""
 
     name: str
     points_mm: Float64[np.ndarray, "n 3"]
@@ -136,12 +135,12 @@ class Polyline:
 
 @dataclass(frozen=True, eq=False)
 class Workcell:
-    """What arms do at this moment, and what is shown with them; published frame, mm.
+    """What the arms do now, and what is shown with them; published frame, mm.
 
     Attributes:
         state: of the procedure: approach, grasp, hold, sweep 1, ...
-        halted: why the arms stand still though they have not ended; empty: they don't.
-        joints_rad: angle by joint's name; empty without arms.
+        halted: why the arms stand still before their end; empty: they do not.
+        joints_rad: angle by the joint's name; empty without arms.
     """
 
     state: str
@@ -150,26 +149,42 @@ class Workcell:
     shapes: tuple[RigidShape, ...] = ()
     lines: tuple[Polyline, ...] = ()
 
+    @property
+    def drawn_lines(self) -> list[Polyline]:
+        """The lines that have a length."""
+        return [line for line in self.lines if len(line.points_mm) > 1]
+
+    @property
+    def box_mm(self) -> Float64[np.ndarray, "2 3"] | None:
+        """The box round the boxes of all shapes, where they are now; None without any."""
+        if not self.shapes:
+            return None
+        boxes = np.array([shape.mesh.box_mm for shape in self.shapes])  # (n, 2, 3)
+        poses = np.array([shape.published_from_shape for shape in self.shapes])
+        middles = np.einsum("nij,nj->ni", poses[:, :3, :3], boxes.mean(1)) + poses[:, :3, 3]
+        halves = np.einsum("nij,nj->ni", np.abs(poses[:, :3, :3]), np.ptp(boxes, axis=1) / 2)
+        return np.stack([(middles - halves).min(0), (middles + halves).max(0)])
+
 
 @dataclass(frozen=True, eq=False)
 class TrackingResult:
-    """What the loop says about one frame: an estimate, or the reason why there is none.
+    """The loop's result for one frame: an estimate, or the reason why there is none.
 
     Attributes:
-        sequence: counts up by one an update, from 0.
-        stamp_ns: of the frame; where none came, of the moment, by ``time.time_ns``.
+        sequence: number of the result, from 0.
+        stamp_ns: of the frame; if none came, the present by ``time.time_ns``.
         estimate: camera frame, mm; None where nothing can be said. Never an older one.
         reason: why there is no estimate; empty with one.
-        quality: none without an estimate; poor where it should not be relied on: ``warning``
+        quality: ``none`` without an estimate; ``poor`` if it should not be relied on: ``warning``
             then says why.
-        seen, organ: the frame, and those of its points that were taken for the organ's; camera
-            frame.
-        frames: where it is published.
-        seconds: time of each stage.
-        workcell: what arms do with it; None without arms.
-        latency_ms: from the stamp (of a source without this machine's clock: from the arrival; of
-            one that waits for the loop: from the taking) to the moment at which the update was
-            handed to the sinks; None where no frame came.
+        observation: what the source saw; None if no frame came.
+        organ: the points of the observation that belong to the organ; camera frame.
+        published_frame: where sinks publish it.
+        seconds: duration of each stage.
+        latency_ms: until the result was handed to the sinks, from the stamp (if the source does
+            not have this machine's clock: from the arrival; if it waits for the loop: from the
+            reading); None if no frame came.
+        workcell: what the arms do with it; None without arms.
     """
 
     sequence: int
@@ -178,58 +193,72 @@ class TrackingResult:
     reason: str = ""
     quality: Quality = "none"
     warning: str = ""
-    seen: Observation | None = None
+    observation: Observation | None = None
     organ: SensorCloud | None = None
-    frames: PublishedFrame = field(default_factory=PublishedFrame)
+    published_frame: PublishedFrame = field(default_factory=PublishedFrame)
     seconds: Mapping[str, float] = field(default_factory=dict)
     latency_ms: float | None = None
     workcell: Workcell | None = None
 
     @cached_property
-    def placed(self) -> TransformedEstimate | None:
+    def transformed(self) -> TransformedEstimate | None:
         """The estimate in the published frame: what sinks send."""
         if self.estimate is None:
             return None
-        way = self.frames.published_from_camera
+        published_from_camera = self.published_frame.published_from_camera
         cloud = self.estimate.cloud
         meshes = {
-            name: mesh.moved(transform_points(way, mesh.vertices_mm))
+            name: mesh.moved(transform_points(published_from_camera, mesh.vertices_mm))
             for name, mesh in self.estimate.meshes.items()
         }
-        points_mm = transform_points(way, cloud.points_mm)
+        points_mm = transform_points(published_from_camera, cloud.points_mm)
         return TransformedEstimate(points_mm, cloud.labels, cloud.probability, meshes)
+
+    def center_mm(self, part: str) -> Float64[np.ndarray, " 3"] | None:
+        """The centre of a part's box (of its axes in the camera frame), in the published frame."""
+        mesh = None if self.estimate is None else self.estimate.meshes.get(part)
+        if mesh is None:
+            return None
+        center_mm = mesh.box_mm.mean(0, keepdims=True)
+        return transform_points(self.published_frame.published_from_camera, center_mm)[0]
+
+    def describe(self) -> str:
+        """How good the estimate is, or why there is none."""
+        if self.estimate is None:
+            return f"no estimate: {self.reason}"
+        return f"{self.quality}: {self.warning}" if self.warning else self.quality
 
 
 @runtime_checkable
-class Companion(Protocol):
-    """Who acts on estimates as part of the loop: arms. Called from the loop's thread alone."""
+class ArmsController(Protocol):
+    """Moves arms by the results. The loop calls it from its own thread alone."""
 
     @property
     def ended(self) -> bool:
-        """There is nothing more to do; the loop ends too."""
+        """The procedure is over; the loop ends too."""
         ...
 
-    def act(self, update: TrackingResult) -> TrackingResult:
-        """The update as sinks get it, with the workcell as it is now. Called with every update,
-        also where there is no estimate."""
+    def act(self, result: TrackingResult) -> TrackingResult:
+        """The result with the present workcell, as sinks get it. Called with every result, with and
+        without an estimate."""
         ...
 
     def abort(self, reason: str) -> None:
-        """Stop for good."""
+        """Stop the arms for good."""
         ...
 
 
 class Controls:
-    """What the user asks of the running loop, from whichever thread."""
+    """What the user asks of the running loop; from any thread."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self.aborted = threading.Event()  # arms stop for good
+        self.aborted = threading.Event()  # set: the arms stop for good
         self._picked_mm: Float64[np.ndarray, " 3"] | None = None
 
     def pick(self, point_mm: Float64[np.ndarray, " 3"] | None) -> None:
-        """This point (camera frame, mm) lies on the organ: take the piece that it is on. None:
-        choose again without."""
+        """This point (camera frame, mm) lies on the organ: track the piece that it is on. None:
+        choose the organ without it again."""
         with self._lock:
             self._picked_mm = point_mm
 
@@ -241,12 +270,18 @@ class Controls:
 
 @dataclass(frozen=True, eq=False)
 class SinkContext:
-    """What a sink may know from the start. ``anatomy_ct``: the organ in the CT (LPS, mm), where
-    the model has it: estimates then have a motion, and their meshes its triangles. ``arms``:
-    updates may carry a workcell."""
+    """What a sink knows when it is opened.
+
+    Attributes:
+        parts: the model's parts, the organ first.
+        anatomy_ct: the organ in the CT (LPS, mm), if the model has it: estimates then have a
+            motion, and their meshes its triangles.
+        controls: what a sink with buttons can ask of the loop.
+        arms: results may have a workcell.
+    """
 
     parts: tuple[str, ...]
-    frames: PublishedFrame
+    published_frame: PublishedFrame
     anatomy_ct: Anatomy | None = None
     controls: Controls = field(default_factory=Controls)
     arms: bool = False
@@ -254,43 +289,45 @@ class SinkContext:
 
 @runtime_checkable
 class Sink(Protocol):
-    """An open sink. ``publish`` and ``close`` are called from one thread of its own, so it may
-    take its time; an error it raises is counted and said, and the loop goes on."""
+    """An open sink. Both methods are called from one thread of its own, so they may take their
+    time. Errors are counted and reported, and the loop goes on."""
 
-    def publish(self, update: TrackingResult) -> None: ...
+    def publish(self, result: TrackingResult) -> None: ...
 
     def close(self) -> None:
-        """Flush and give everything back; may be called twice."""
+        """Flush and release everything; may be called twice."""
         ...
 
 
 @runtime_checkable
-class Counting(Protocol):
-    """A sink that has more to say of its updates, for the run's report."""
+class CountingSink(Protocol):
+    """A sink with counts of its own for the run's report."""
 
     @property
     def counts(self) -> dict[str, int]: ...
 
 
 class SourceConfig(Config, frozen=True, kw_only=True, tag_field="kind"):
-    """Base of every source's configuration. ``target`` names the field that stands before the
-    question mark in ``kind:target?key=value``; empty: the kind has none."""
+    """Base of every source's configuration; its fields are the options on the command line.
+
+    The class's ``tag`` is the kind's name. ``target`` names the field that stands before the
+    question mark in ``kind:target?key=value``; empty: there is none.
+    """
 
     target: ClassVar[str] = ""
 
     @abstractmethod
     def open(self) -> Source:
-        """Raises SourceLost where what it needs is not there now, InputError where it never can
-        be."""
+        """Raises SourceLost if what it needs is missing now, InputError if it can never work."""
 
 
 class SinkConfig(Config, frozen=True, kw_only=True, tag_field="kind"):
-    """Base of every sink's configuration; ``target`` as in ``SourceConfig``. ``waiting``: how many
-    updates may wait for it before it loses some; 1: it gets the newest."""
+    """Base of every sink's configuration, as ``SourceConfig``. ``queue_size``: how many results
+    wait for a slow sink before the oldest is dropped; 1: it gets the newest."""
 
     target: ClassVar[str] = ""
-    waiting: ClassVar[int] = 1
+    queue_size: ClassVar[int] = 1
 
     @abstractmethod
-    def open(self, setting: SinkContext) -> Sink:
-        """Raises InputError where it cannot work: a port taken, a folder that exists."""
+    def open(self, context: SinkContext) -> Sink:
+        """Raises InputError if it cannot work: a port is taken, a folder exists."""

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from tumortrack.core.errors import InputError
-from tumortrack.live.ur_link import UR_JOINTS
+from tumortrack.live.sinks.ur import UR_JOINTS
 
 CUTTER, HOLDER = "cutter", "holder"  # UR10e with the instrument, UR5 with the vacuum grasper
 ARMS = (CUTTER, HOLDER)

@@ -103,7 +103,7 @@ Draw = Callable[[Joints], tuple[RigidShape, ...]]
 
 
 class Operation:
-    """``live.values.Companion``: arms that act on estimates.
+    """``live.values.ArmsController``: arms that act on estimates.
 
     Args:
         planned: what to begin with.

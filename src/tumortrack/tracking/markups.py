@@ -15,7 +15,7 @@ import msgspec
 import numpy as np
 
 from tumortrack.core.errors import InputError
-from tumortrack.tracking.points import PointTable, numbers_of
+from tumortrack.tracking.point_table import PointTable, numbers_of
 
 _LPS_FROM = {"LPS": (1.0, 1.0, 1.0), "RAS": (-1.0, -1.0, 1.0)}
 _OLD_NUMBERS = {"0": "RAS", "1": "LPS"}  # how .fcsv named them before Slicer 4.11

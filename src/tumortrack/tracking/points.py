@@ -9,14 +9,15 @@ from __future__ import annotations
 
 import csv
 import io
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, Float64
+from jaxtyping import Float
 
 from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.estimate import Motion
+from tumortrack.tracking.markups import parse_fcsv, parse_markups_json
+from tumortrack.tracking.point_table import PointTable, numbers_of, text_of
 
 FAR_MM = 100.0  # from the organ's box: such a point is hardly meant
 _NEAR_MM = 20.0  # a point about the organ, where another reading of the file is weighed
@@ -30,19 +31,6 @@ _NAMINGS: dict[tuple[str, str, str], tuple[int, int, int]] = {
 _ANSWER = ("camera_x", "camera_y", "camera_z", "std_mm")
 
 
-@dataclass(frozen=True, eq=False)
-class PointTable:
-    """Points of the CT (LPS, mm) and what their file says of each, as text.
-
-    ``notes`` tell what a user must know of how the file was read.
-    """
-
-    points_ct: Float64[np.ndarray, "n 3"]
-    columns: tuple[str, ...]
-    rows: tuple[tuple[str, ...], ...]
-    notes: tuple[str, ...] = ()
-
-
 def read_points(path: Path) -> PointTable:
     """Read points.csv, or a 3D Slicer markups file (.fcsv, .mrk.json).
 
@@ -50,8 +38,6 @@ def read_points(path: Path) -> PointTable:
         InputError: no such file, another format, no points, a value that is no finite number, or
             a Slicer file whose coordinate system is neither LPS nor RAS.
     """
-    from tumortrack.tracking import markups as slicer
-
     try:
         if path.stat().st_size > _MOST_BYTES:
             raise InputError(f"{path} is larger than 64 MiB; give the points in several files.")
@@ -60,9 +46,9 @@ def read_points(path: Path) -> PointTable:
         raise InputError(f"{path} cannot be read: {error.strerror}.") from error
     name = path.name.lower()
     if name.endswith(".json"):
-        table = slicer.parse_markups_json(content, str(path))
+        table = parse_markups_json(content, str(path))
     elif name.endswith(".fcsv"):
-        table = slicer.parse_fcsv(text_of(content, str(path)), str(path))
+        table = parse_fcsv(text_of(content, str(path)), str(path))
     elif name.endswith(".csv"):
         table = _parse_csv(text_of(content, str(path)), str(path))
     else:
@@ -70,34 +56,6 @@ def read_points(path: Path) -> PointTable:
     if len(table.points_ct) == 0:
         raise InputError(f"{path} holds no points.")
     return table
-
-
-def text_of(content: bytes, name: str) -> str:
-    """UTF-8 text, with or without a byte order mark.
-
-    Raises:
-        InputError: it is none.
-    """
-    try:
-        return content.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise InputError(f"{name} is no text in UTF-8: {error}. Save it as CSV (UTF-8).") from error
-
-
-def numbers_of(texts: list[str], where: str) -> tuple[float, float, float]:
-    """Three finite numbers; ``where`` names the place in the file.
-
-    Raises:
-        InputError: fewer, more, or something else.
-    """
-    shown = ", ".join(texts)[:80]
-    try:
-        x, y, z = (float(text) for text in texts)
-    except ValueError as error:
-        raise InputError(f"{where}: {shown!r} is no point: it takes x, y, z as numbers.") from error
-    if not np.isfinite([x, y, z]).all():
-        raise InputError(f"{where}: {shown!r} has NaN or infinity; remove the point.")
-    return x, y, z
 
 
 def _parse_csv(text: str, name: str) -> PointTable:

@@ -1,14 +1,19 @@
-"""What the figures were measured on."""
+"""What the figures were measured on: the machine in words, its best rates, a process's memory."""
 
 from __future__ import annotations
 
+import ctypes
+import gc
 import os
 import platform
+from collections.abc import Callable
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
 
 from tumortrack.core.process import available_cores
+from tumortrack_lab.bench.rows import Peaks
+from tumortrack_lab.bench.timing import interleaved
 
 _FEATURES = {
     "avx2": "AVX2",
@@ -19,6 +24,10 @@ _FEATURES = {
     "amx_int8": "AMX int8",
 }
 NO_GPU = "none at hand"
+_SIZE = 1024  # of the square matrices
+_LONG = 2**24  # floats in each of the triad's three arrays (64 MB: far more than any cache)
+_STATUS, _CLEAR = Path("/proc/self/status"), Path("/proc/self/clear_refs")
+_RESET_PEAK = "5"  # Documentation/filesystems/proc: resets VmHWM to what is resident now
 _LIBRARIES = ("tumortrack", "torch", "numba", "numpy", "scipy")
 
 
@@ -45,17 +54,25 @@ def describe_machine() -> dict[str, str]:
     }
 
 
+def cpu_name() -> str:
+    """The processor as the system names it."""
+    return _cpu_info().get("model name") or platform.processor() or platform.machine()
+
+
 def _processor() -> str:
+    info = _cpu_info()
+    family, model = info.get("cpu family"), info.get("model")
+    return cpu_name() + ("" if family is None else f" (family {family}, model {model})")
+
+
+def _cpu_info() -> dict[str, str]:
+    """Of the first core, as Linux tells it."""
     info = Path("/proc/cpuinfo")
-    if not info.exists():
-        return platform.processor() or platform.machine()
-    wanted: dict[str, str] = {}
-    for line in info.read_text(encoding="utf-8").splitlines():
+    found: dict[str, str] = {}
+    for line in info.read_text(encoding="utf-8").splitlines() if info.exists() else ():
         key, _, value = line.partition(":")
-        wanted.setdefault(key.strip(), value.strip())
-    name = wanted.get("model name", platform.machine())
-    family = wanted.get("cpu family")
-    return name if family is None else f"{name} (family {family}, model {wanted.get('model')})"
+        found.setdefault(key.strip(), value.strip())
+    return found
 
 
 def _caches() -> str:
@@ -69,3 +86,69 @@ def _caches() -> str:
         if kind != "Instruction":
             found.append(f"L{level} {size}")
     return ", ".join(found) or "not known"
+
+
+def measure_peaks(threads: int, budget_s: float) -> Peaks:
+    """The best rates of torch's own products of square matrices, and of ``a = b + s c`` (STREAM's
+    triad, McCalpin 1995: three arrays' bytes, as it counts them)."""
+    import torch
+
+    with torch.inference_mode():
+        products = _products()
+        a, b, c = (torch.zeros(_LONG) for _ in range(3))
+        calls = [*products.values(), lambda: torch.add(b, c, alpha=0.5, out=a)]
+        *timings, triad = interleaved(*calls, budget_s=budget_s)
+    flops = 2.0 * _SIZE**3
+    gemm = {name: flops / timing.best_s for name, timing in zip(products, timings, strict=True)}
+    return Peaks(threads=threads, gemm=gemm, triad=3 * 4 * _LONG / triad.best_s)
+
+
+def _products() -> dict[str, Callable[[], object]]:
+    """Products by precision; those that this PyTorch refuses here are left out."""
+    import torch
+
+    torch.manual_seed(0)
+    single = torch.randn(_SIZE, _SIZE), torch.randn(_SIZE, _SIZE)
+    half = tuple(matrix.bfloat16() for matrix in single)
+    whole = tuple(torch.randint(-99, 99, (_SIZE, _SIZE), dtype=torch.int8) for _ in range(2))
+    calls: dict[str, Callable[[], object]] = {
+        "fp32": lambda: torch.mm(*single),
+        "bf16": lambda: torch.mm(*half),
+        "int8": lambda: torch._int_mm(*whole),
+    }
+    offered = {}
+    for name, call in calls.items():
+        try:
+            call()
+        except RuntimeError:  # not made for this processor
+            continue
+        offered[name] = call
+    return offered
+
+
+def forget_peak() -> int | None:
+    """Give freed memory back and restart the count; bytes resident now, None where the system
+    does not say."""
+    gc.collect()
+    if not _CLEAR.exists():
+        return None
+    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
+    if trim is not None:
+        trim(0)
+    try:
+        _CLEAR.write_text(_RESET_PEAK, encoding="ascii")
+    except PermissionError:  # a container may forbid it
+        return None
+    return _of("VmRSS")
+
+
+def peak_bytes() -> int | None:
+    """The most that was resident since ``forget_peak``."""
+    return _of("VmHWM") if _STATUS.exists() else None
+
+
+def _of(name: str) -> int:
+    for line in _STATUS.read_text(encoding="ascii").splitlines():
+        if line.startswith(name + ":"):
+            return int(line.split()[1]) * 1024
+    raise OSError(f"{_STATUS} does not tell {name}.")

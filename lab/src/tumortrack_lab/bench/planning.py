@@ -1,81 +1,51 @@
-"""Rows of planning a resection: the plan, and the arms' motions."""
+"""Workloads of planning a resection: the plan, and the arms' motions."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import TYPE_CHECKING
+from functools import partial
+from importlib.util import find_spec
 
 import numpy as np
 
 from tumortrack.core.types import Anatomy, Mesh
 from tumortrack.imaging.raster import label_grid
+from tumortrack.plan.config import ResectionConfig
+from tumortrack.plan.located import STAND_MM
+from tumortrack.plan.resection import plan_resection
 from tumortrack.plan.values import Located
-from tumortrack_lab.bench.row import BenchRow
-from tumortrack_lab.bench.turns import in_turns
+from tumortrack_lab.bench.naive import plans
+from tumortrack_lab.bench.rows import MOTIONS, PLAN, Workload
+from tumortrack_lab.bench.subject import BenchSubject
 
-if TYPE_CHECKING:
-    from tumortrack_lab.bench.subject import Subject
-
-NAME, MOTIONS = "plan", "motions"
-POINTS = 40_000
+_POINTS = 40_000
 
 
-def rows(subject: Subject, threads: int, budget_s: float) -> Iterator[BenchRow]:
+def workloads(subject: BenchSubject, _: float) -> Iterator[Workload]:
     """Both planners; motions where the arms' libraries are installed."""
-    from tumortrack.plan.config import ResectionConfig
-    from tumortrack.plan.resection import plan_resection
-    from tumortrack_lab.bench.naive import plans
-
     seen = on_its_stand(subject.anatomy)
     published, ours = ResectionConfig(method="published"), ResectionConfig()
-    for what, config, naive, is_what in (
+    for what, config, naive, naive_is in (
         ("published", published, plans.published, "hulls and a triangulation of all points"),
         ("margin", ours, plans.margin, "the same, and the grown tumor on voxels of 0.5 mm"),
     ):
-        mine, plain = in_turns(
-            lambda config=config: plan_resection(seen, config),  # type: ignore[misc]
-            lambda naive=naive: naive(seen),  # type: ignore[misc]
-            budget_s=budget_s / 3,
-        )
-        yield BenchRow(
-            name=NAME,
-            what=f"{what}, {POINTS:,} points",
-            threads=threads,
-            item="plan",
-            ours=mine,
-            naive=plain,
-            naive_is=is_what,
-        )
-    yield from _motions(seen, threads, budget_s / 3)
-
-
-def _motions(seen: Located, threads: int, budget_s: float) -> Iterator[BenchRow]:
-    from importlib.util import find_spec
-
+        call = partial(plan_resection, seen, config)
+        what = f"{what}, {_POINTS:,} points"
+        yield Workload(PLAN, what, "plan", call, partial(naive, seen), naive_is)
     if find_spec("pinocchio") is None:  # the extra `arms`
         return
     from tumortrack.plan.arms.cell import ArmCell
     from tumortrack.plan.arms.config import CellConfig
     from tumortrack.plan.arms.procedure import plan_motions
-    from tumortrack.plan.config import ResectionConfig
-    from tumortrack.plan.resection import plan_resection
 
     organ = seen.meshes["kidney"]
-    cell, plan = ArmCell(CellConfig(), organ), plan_resection(seen, ResectionConfig())
-    (mine,) = in_turns(lambda: plan_motions(plan, cell, organ), budget_s=budget_s)
-    yield BenchRow(
-        name=MOTIONS,
-        what=f"margin, {plan.sweeps} sweeps",
-        threads=threads,
-        item="plan",
-        ours=mine,
-    )
+    cell, plan = ArmCell(CellConfig(), organ), plan_resection(seen, ours)
+    motions = partial(plan_motions, plan, cell, organ)
+    yield Workload(MOTIONS, f"margin, {plan.sweeps} sweeps", "plan", motions)
 
 
 def on_its_stand(anatomy_ct: Anatomy) -> Located:
     """An organ with its front up: 40,000 points inside, and its surfaces."""
-    from tumortrack.plan.located import STAND_MM
-
     turn = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])  # LPS, its front up
     parts = [part.vertices_mm @ turn.T for part in anatomy_ct.parts]
     middle = -(parts[0].min(0) + parts[0].max(0)) / 2
@@ -91,6 +61,6 @@ def on_its_stand(anatomy_ct: Anatomy) -> Located:
     grid = label_grid(Anatomy(tuple(meshes.values())), table_from_index, (i, j, k))
     rng = np.random.default_rng(0)
     cells = np.argwhere(grid > 0)
-    chosen = cells[rng.integers(len(cells), size=POINTS)]
+    chosen = cells[rng.integers(len(cells), size=_POINTS)]
     points = chosen + rng.uniform(-0.5, 0.5, chosen.shape) + low
     return Located(points, grid[tuple(chosen.T)], meshes)

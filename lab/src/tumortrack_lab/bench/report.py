@@ -2,21 +2,39 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import msgspec
 
-from tumortrack.core.errors import InputError
 from tumortrack.core.store import write_atomically
+from tumortrack.report.drawing import new_figure, save
 from tumortrack_lab.bench import tables
 from tumortrack_lab.bench.goals import goals_table
-from tumortrack_lab.bench.row import BenchResult
-from tumortrack_lab.study.book import ReportWriter
-from tumortrack_lab.study.markdown import fill
+from tumortrack_lab.bench.rows import BenchResult, Point
+from tumortrack_lab.study.document import ReportWriter
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 BLOCKS = ("goals", "machine", "speed", "floors", "growth")
-_PICTURE = "growth.png"
-_CURVES = "_curves.json"
+# Okabe and Ito's colours; each curve has a marker of its own too.
+_STYLES = {
+    "clinic": ("#D55E00", "*"),
+    "quick": ("#0072B2", "o"),
+    "paper": ("#009E73", "s"),
+    "training": ("#000000", "v"),
+}
+_ALONG = {
+    "queries": "queries",
+    "points": "points of the cloud",
+    "tumors": "tumors",
+    "grid": "voxels along the longest side",
+    "batch": "samples in a training step",
+}
+_MIB = 2**20
+_LINEAR = "tumors"  # the other axes are logarithmic
 
 
 def write_bench(bench: BenchResult, out: Path, document: Path | None) -> list[Path]:
@@ -29,27 +47,13 @@ def write_bench(bench: BenchResult, out: Path, document: Path | None) -> list[Pa
     """
     written = []
     if bench.rows:
-        rows = msgspec.structs.replace(bench, points=())
-        written.append(_json(out, msgspec.to_builtins(rows)))
+        written.append(_json(out, msgspec.structs.replace(bench, points=())))
     if bench.points:
-        curves = {"machine": bench.machine, "points": msgspec.to_builtins(bench.points)}
-        written.append(_json(out.with_name(out.stem + _CURVES), curves))
+        curves = {"machine": bench.machine, "points": bench.points}
+        written.append(_json(out.with_name(out.stem + "_curves.json"), curves))
     if document is not None:
         written += _document(bench, document)
     return written
-
-
-def check_document(document: Path) -> None:
-    """Before anything is measured: the document can be filled.
-
-    Raises:
-        InputError: it is not there, or a marker is missing.
-    """
-    try:
-        text = document.read_text(encoding="utf-8")
-    except OSError as error:
-        raise InputError(f"{document} cannot be read: {error.strerror}.") from error
-    fill(text, dict.fromkeys(BLOCKS, ""))
 
 
 def _json(path: Path, content: object) -> Path:
@@ -59,7 +63,7 @@ def _json(path: Path, content: object) -> Path:
 
 
 def _document(bench: BenchResult, document: Path) -> list[Path]:
-    book = ReportWriter(document, bench.command)
+    writer, written = ReportWriter(document, bench.command), [document]
     caption = f"`{bench.command}`, {bench.machine.get('date', '')}."
     blocks = {}
     if bench.rows:
@@ -69,15 +73,55 @@ def _document(bench: BenchResult, document: Path) -> list[Path]:
             "speed": f"{tables.speed_table(bench)}\n\n{tables.notes(bench)}\n\n{caption}",
             "floors": tables.floor_table(bench),
         }
-    written = []
     if bench.points:
-        from tumortrack_lab.bench.growth import draw_growth
-
-        picture = book.images / _PICTURE
-        picture.parent.mkdir(parents=True, exist_ok=True)
+        picture = writer.image("growth")
         draw_growth(bench.points, picture)
-        link = f"![time and memory as the work grows]({book.images.name}/{_PICTURE})"
+        link = writer.link(picture, "time and memory as the work grows")
         blocks["growth"] = f"{link}\n\n{tables.memory_table(bench)}\n\n{caption}"
         written.append(picture)
-    book.write(blocks)
-    return [document, *written]
+    writer.write(blocks)
+    return written
+
+
+def draw_growth(points: Sequence[Point], path: Path) -> None:
+    """The curves as one picture: time above, memory below, a column for each kind of work."""
+    curves = [curve for curve in _ALONG if any(point.curve == curve for point in points)]
+    drawing = new_figure(3.6 * len(curves), 6.4)
+    width = 1 / len(curves)
+    for column, curve in enumerate(curves):
+        mine = [point for point in points if point.curve == curve]
+        left = (column + 0.2) * width
+        above = drawing.add_axes((left, 0.55, 0.76 * width, 0.4))
+        below = drawing.add_axes((left, 0.09, 0.76 * width, 0.36))
+        _lines(above, mine, [point.seconds for point in mine])
+        _lines(below, mine, [(point.peak_bytes or 0) / _MIB for point in mine])
+        above.set_yscale("log")
+        below.set_ylim(bottom=0)
+        below.set_xlabel(_ALONG[curve])
+        above.legend(fontsize=7, frameon=False)
+        if column == 0:
+            above.set_ylabel("seconds, one core")
+            below.set_ylabel("peak memory of the process, MiB")
+    save(drawing, path)
+
+
+def _lines(axes: Axes, points: Sequence[Point], values: list[float]) -> None:
+    names = dict.fromkeys(point.what for point in points)
+    for name in names:
+        color, marker = _STYLES[name.replace(",", " ").split()[0]]
+        chosen = [(p.size, v) for p, v in zip(points, values, strict=True) if p.what == name]
+        axes.plot(*zip(*chosen, strict=True), color=color, marker=marker, label=name, linewidth=1.5)
+    sizes = sorted({point.size for point in points})
+    if points[0].curve != _LINEAR:
+        axes.set_xscale("log")
+    axes.set_xticks(sizes, [_short(size) for size in sizes])
+    axes.minorticks_off()
+    axes.grid(alpha=0.25)
+    axes.tick_params(labelsize=8)
+
+
+def _short(size: int) -> str:
+    for unit, name in ((10**6, "M"), (10**3, "k")):
+        if size >= unit:
+            return f"{size / unit:g}{name}"
+    return str(size)

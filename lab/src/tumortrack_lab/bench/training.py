@@ -1,99 +1,150 @@
-"""Rows of training: one optimizer step, and a whole training with its generator."""
+"""Workloads of training: the scene generator, an optimizer step, a whole training; and of a GPU."""
 
 from __future__ import annotations
 
+import copy
 import tempfile
 import time
 from collections.abc import Callable, Iterator
-from itertools import cycle, pairwise
+from functools import partial
+from itertools import count, cycle, pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
+import torch
+from msgspec.structs import replace
+from torch.nn import functional
 
-from tumortrack_lab.bench.counts import module_flops, weight_bytes
-from tumortrack_lab.bench.row import BenchRow, Work
-from tumortrack_lab.bench.turns import in_turns, timing_of
+from tumortrack.core.process import keep_freed_memory
+from tumortrack.models.hardware import has_fast_bfloat16
+from tumortrack.occupancy.model import OccupancyModel
+from tumortrack.occupancy.network import OccupancyNetwork
+from tumortrack.simulate.dataset import SceneStream
+from tumortrack.simulate.deform import DragConfig, ElasticConfig
+from tumortrack.simulate.elastic.body import ElasticBody
+from tumortrack.simulate.occupancy import (
+    FixedPoints,
+    OccupancyConfig,
+    OccupancyPool,
+    PointSource,
+)
+from tumortrack.simulate.scene import SceneConfig, SceneRecipe, Simulator
+from tumortrack.training.model import load_model
+from tumortrack.training.run import TrainingRun
+from tumortrack.training.state import TrainingState
+from tumortrack.training.train import TrainingStatus, train
+from tumortrack_lab.bench.counts import (
+    blend_flops,
+    drag_flops,
+    draw_flops,
+    flow_flops,
+    module_flops,
+    weight_bytes,
+)
+from tumortrack_lab.bench.naive.occupancy import NaiveOccupancy
+from tumortrack_lab.bench.naive.scenes import plain_pair
+from tumortrack_lab.bench.networks import occupancy_frames, occupancy_volume
+from tumortrack_lab.bench.occupancy import OccupancyWorkload
+from tumortrack_lab.bench.rows import GENERATOR, STEP, TRAINING, Work, Workload
+from tumortrack_lab.bench.subject import LABELLING, SEED, UP, BenchSubject
+from tumortrack_lab.bench.timing import timing_of
 
-if TYPE_CHECKING:
-    import torch
-
-    from tumortrack.models.config import TrainConfig
-    from tumortrack.simulate.dataset import Batch as Stacked
-    from tumortrack.training.run import TrainingRun
-    from tumortrack.training.state import TrainingState
-    from tumortrack.training.train import TrainingStatus
-    from tumortrack_lab.bench.subject import Subject
-
-NAME, WHOLE = "training step", "training, generator included"
-BATCH = {"clinic": 32, "quick": 16, "paper": 8}  # samples in a step here
+_LABELS = 2000
+_PAIRS = 20  # in one call of ours
+_COVERED = 0.25  # of the image, by the organ
+_SAMPLES = {"clinic": 32, "quick": 16, "paper": 8}  # in a step here
 _BATCHES = 4  # made before and used again
 _STEPS = 10**6  # never reached
+CPU = torch.device("cpu")
 
 Device = Literal["cpu", "cuda"]
-Batch = tuple["torch.Tensor", "torch.Tensor", "torch.Tensor", "torch.Tensor"]
+Batch = tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]
 
 
-def rows(subject: Subject, threads: int, budget_s: float) -> Iterator[BenchRow]:
-    """A step of each preset."""
-    from tumortrack.core.process import keep_freed_memory
+def drags(subject: BenchSubject, _: float) -> Iterator[Workload]:
+    """A pair of depth image (424 x 240) and 2,000 labels, by the paper's drags."""
+    yield _generator(subject, "drags", DragConfig())
 
+
+def elastic(subject: BenchSubject, _: float) -> Iterator[Workload]:
+    """States of the organ's elastic body."""
+    yield _generator(subject, "elastic", ElasticConfig())
+
+
+def _generator(subject: BenchSubject, what: str, deform: object) -> Workload:
+    anatomy, config = subject.anatomy, OccupancyConfig(per_side=283)
+    body = subject.body if what == "elastic" else None
+    simulator = Simulator(anatomy, UP, SceneConfig(occupancy=config, deform=(deform,)), body)  # type: ignore[arg-type]
+    pool, index = OccupancyPool(anatomy, config, SEED), count()
+
+    def ours() -> None:
+        for _ in range(_PAIRS):
+            simulator.pair(SceneRecipe(SEED, "train", next(index)), pool)
+
+    def naive() -> None:
+        plain_pair(anatomy, simulator.render(SceneRecipe(SEED, "train", next(index))), _LABELS)
+
+    facts = {
+        "work": generator_work(simulator, body),
+        "note": "one thread whatever there is: workers are processes",
+    }
+    naive_is = "NumPy, a ray a pixel, inside tests on deformed surfaces"
+    return Workload(GENERATOR, what, "pair", ours, naive, naive_is, _PAIRS, facts=lambda: facts)
+
+
+def generator_work(simulator: Simulator, body: ElasticBody | None) -> Work:
+    """Of one pair: points and the organ's surface moved, the surface drawn; vertices, faces,
+    image, points and cloud moved through memory once."""
+    config, organ = simulator.config, simulator.anatomy_ct.organ
+    moved, pixels = len(organ.vertices_mm) + _LABELS, config.width * config.height
+    moved_bytes = 2 * 12 * moved + 12 * len(organ.faces) + 4 * pixels + 12 * 1000
+    if body is None:
+        flops = drag_flops(moved, sum(times for _, _, times in DragConfig().steps))
+    else:
+        values, modes = body.modes[..., 0].size, body.modes.shape[-1]
+        flops = blend_flops(values, modes) + flow_flops(moved, steps=6)
+        moved_bytes += body.modes.nbytes
+    flops += draw_flops(len(organ.faces) // 2, round(_COVERED * pixels))
+    return Work(flops=flops, bytes=float(moved_bytes))
+
+
+def steps(subject: BenchSubject, _: float) -> Iterator[Workload]:
+    """A step of each preset, as training does it; naive: single precision, everything in one
+    piece, plain Adam."""
     keep_freed_memory()  # as training does
     for preset in subject.presets:
-        yield _row(subject, preset, threads, budget_s / len(subject.presets))
+        state, batches = training_state(subject, preset, _SAMPLES[preset], _BATCHES)
+        yield Workload(
+            STEP, preset, "step",
+            ours=_over(batches, state.step),
+            naive=_over(batches, naive_step(state)),
+            naive_is="single precision, latent beside every query, Python loops, plain Adam",
+            facts=partial(_step_facts, state, batches[0], _SAMPLES[preset]),
+        )  # fmt: skip
 
 
-def _row(subject: Subject, preset: str, threads: int, budget_s: float) -> BenchRow:
-    """As training does it; naive: single precision, everything in one piece, plain Adam."""
-    import torch
+def _over(batches: list[Batch], step: Callable[[Batch], object]) -> Callable[[], object]:
+    turns = cycle(batches)
+    return lambda: step(next(turns))
 
-    from tumortrack.models.hardware import has_fast_bfloat16
-    from tumortrack.training.state import TrainingState
 
-    size = BATCH[preset]
-    run, batches, teach = material(subject, preset, size, _BATCHES)
-    state = TrainingState(run, torch.device("cpu"))
-    teach(state)
-    plain = naive_step(state)
-    turns, other = cycle(batches), cycle(batches)
-    ours, naive = in_turns(
-        lambda: state.step(next(turns)), lambda: plain(next(other)), budget_s=budget_s
-    )
-    clouds, *truth = batches[0]
+def _step_facts(state: TrainingState, batch: Batch, samples: int) -> dict:
+    clouds, *truth = batch
     forward = module_flops(lambda: state.network.loss(clouds, *truth))
-    half = has_fast_bfloat16(torch.device("cpu"))
-    return BenchRow(
-        name=NAME,
-        what=preset,
-        threads=threads,
-        item="step",
-        per_call=size,
-        ours=ours,
-        naive=naive,
-        naive_is="single precision, latent beside every query, Python loops, plain Adam",
-        # Backward costs twice the forward pass; Adam reads and writes weights and two moments.
-        work=Work(
-            flops=3 * forward,
-            bytes=7 * weight_bytes(state.network, 4) + 3 * sum(t.nbytes for t in batches[0]),
-            precision="bf16" if half else "fp32",
-        ),
-        note=f"{size} samples a step",
-    )
+    # Backward costs twice the forward pass; Adam reads and writes weights and two moments.
+    moved = 7 * weight_bytes(state.network, 4) + 3 * sum(t.nbytes for t in batch)
+    precision: Literal["bf16", "fp32"] = "bf16" if has_fast_bfloat16(CPU) else "fp32"
+    work = Work(flops=3 * forward, bytes=moved, precision=precision)
+    return {"work": work, "per_call": samples, "note": f"{samples} samples a step"}
 
 
-def material(
-    subject: Subject, preset: str, size: int, batches: int
-) -> tuple[TrainingRun, list[Batch], Callable[[TrainingState], None]]:
-    """A run of the preset with so many samples a step, so many of its batches, and how a state is
-    told what it does not have to learn."""
-    import msgspec
-
-    from tumortrack.simulate.dataset import SceneStream
-    from tumortrack.simulate.occupancy import FixedPoints, OccupancyPool, PointSource
-    from tumortrack.training.run import TrainingRun
-    from tumortrack_lab.bench.subject import SEED, UP
-
-    config = msgspec.structs.replace(subject.config(preset), batch_size=size)
+def training_state(
+    subject: BenchSubject, preset: str, size: int, batches: int
+) -> tuple[TrainingState, list[Batch]]:
+    """Of the preset with so many samples a step, told what it does not have to learn; and so many
+    of its batches."""
+    config = replace(subject.config(preset), batch_size=size)
     anatomy, body, known = subject.anatomy, None, {}
     points: PointSource
     if preset == "clinic":
@@ -102,28 +153,22 @@ def material(
         points = FixedPoints(places, np.zeros(len(places), np.uint8))
     else:
         points = OccupancyPool(anatomy, config.scene.occupancy, SEED)
-    stream = SceneStream(anatomy, UP, config.scene, points, SEED, "train", config.batch_size, body)
+    stream = SceneStream(anatomy, UP, config.scene, points, SEED, "train", size, body)
     run = TrainingRun(anatomy, UP, "", config, SEED, steps=_STEPS, device="cpu")
-    made = [_tensors(stream.batch(number)) for number in range(batches)]
-
-    def teach(state: TrainingState) -> None:
-        for network in (state.network, state.average) if known else ():
-            for name, buffer in network.named_buffers():
-                buffer.copy_(known[name])
-
-    return run, made, teach
+    made = []
+    for number in range(batches):
+        one = stream.batch(number)
+        arrays = one.clouds_mm, one.points_mm, one.labels, one.camera_from_ct
+        made.append(tuple(map(torch.from_numpy, arrays)))
+    state = TrainingState(run, CPU)
+    for network in (state.network, state.average) if known else ():
+        for name, buffer in network.named_buffers():
+            buffer.copy_(known[name])
+    return state, made  # type: ignore[return-value]
 
 
 def naive_step(state: TrainingState) -> Callable[[Batch], None]:
     """One step in the plain way, on weights of its own."""
-    import copy
-
-    import torch
-    from torch.nn import functional
-
-    from tumortrack.occupancy.network import OccupancyNetwork
-    from tumortrack_lab.bench.naive.occupancy import NaiveOccupancy
-
     network = copy.deepcopy(state.network).train()
     optimizer = torch.optim.Adam(network.parameters(), 1e-4, foreach=False)
     plain = None
@@ -144,55 +189,47 @@ def naive_step(state: TrainingState) -> Callable[[Batch], None]:
     return step
 
 
-def whole_rows(subject: Subject, threads: int, budget_s: float) -> Iterator[BenchRow]:
+def whole(subject: BenchSubject, budget_s: float) -> Iterator[Workload]:
     """Preset ``quick``."""
-    yield whole_row(subject, "quick", "cpu", threads, budget_s)
+    yield whole_training(subject, "quick", "cpu", budget_s)
 
 
-def whole_row(
-    subject: Subject, preset: str, device: Device, threads: int, budget_s: float
-) -> BenchRow:
+def whole_training(subject: BenchSubject, preset: str, device: Device, budget_s: float) -> Workload:
     """A preset as a user trains it: workers, or the GPU itself, make scenes, the network learns
     them."""
-    from tumortrack.training.run import TrainingRun
-    from tumortrack.training.train import train
-    from tumortrack_lab.bench.subject import SEED, UP
-
-    config: TrainConfig = _barely_validated(subject.config(preset))
+    config = replace(subject.config(preset), validation_pairs=4)
     seen: list[tuple[float, TrainingStatus]] = []
     run = TrainingRun(subject.anatomy, UP, "", config, SEED, minutes=budget_s / 60, device=device)
     with tempfile.TemporaryDirectory() as folder:
-        train(run, Path(folder) / "model", lambda told: seen.append((time.perf_counter(), told)))
+        train(run, Path(folder) / "model", lambda now: seen.append((time.perf_counter(), now)))
     # Between reports, and so without the start; where the end was the first, by the last's word.
     spans = [
         (later - early) / (after.step - before.step)
         for (early, before), (later, after) in pairwise(seen)
         if after.step > before.step
     ]
-    return BenchRow(
-        name=WHOLE,
-        what=preset,
-        threads=threads,
-        item="step",
-        per_call=config.batch_size,
-        ours=timing_of(spans or [config.batch_size / seen[-1][1].samples_per_s]),
-        note=f"`train` for {budget_s:.0f} s, {config.batch_size} samples a step",
-        device=device,
-    )
+    facts = {
+        "per_call": config.batch_size,
+        "note": f"`train` for {budget_s:.0f} s, {config.batch_size} samples a step",
+        "device": device,
+    }
+    took = timing_of(spans or [config.batch_size / seen[-1][1].samples_per_s])
+    return Workload(TRAINING, preset, "step", took, facts=lambda: facts)
 
 
-def _barely_validated(config: TrainConfig) -> TrainConfig:
-    import msgspec
+def on_gpu(subject: BenchSubject, budget_s: float) -> Iterator[Workload]:
+    """Those of ``on_device``, if PyTorch sees a GPU; else none."""
+    if torch.cuda.is_available():
+        yield from on_device(subject, "cuda", budget_s)
 
-    return msgspec.structs.replace(config, validation_pairs=4)
 
-
-def _tensors(batch: Stacked) -> Batch:
-    import torch
-
-    return (
-        torch.from_numpy(batch.clouds_mm),
-        torch.from_numpy(batch.points_mm),
-        torch.from_numpy(batch.labels),
-        torch.from_numpy(batch.camera_from_ct),
-    )
+def on_device(subject: BenchSubject, device: Device, budget_s: float) -> Iterator[Workload]:
+    """Frame and volume of the presets that label points, and a training of each, generator
+    included. Both forms bring their labels back to the host, which waits for the device."""
+    for preset in LABELLING:
+        model = load_model(subject.model_folder(preset), device)
+        assert isinstance(model, OccupancyModel)
+        labeller = OccupancyWorkload(model, subject.cloud(preset).points_mm, device)
+        yield from occupancy_frames(labeller, preset)
+        yield occupancy_volume(labeller, preset)
+        yield whole_training(subject, preset, device, budget_s)

@@ -52,29 +52,32 @@ class Bench:
             InputError: a model without a cloud or the other way, a document without its markers.
         """
         from tumortrack.cli.console import console, say
-        from tumortrack_lab.bench.plan import CURVES, Wish, measure
-        from tumortrack_lab.bench.report import check_document, write_bench
-        from tumortrack_lab.bench.suite import GROUPS
+        from tumortrack_lab.bench.report import BLOCKS, write_bench
+        from tumortrack_lab.bench.run import CURVES, GROUPS, BenchRequest, measure
         from tumortrack_lab.bench.tables import line, rich_table
+        from tumortrack_lab.study.document import ReportWriter
 
         if (self.model is None) != (self.cloud is None):
             raise InputError(
                 "--model and --cloud belong together: a model, and a cloud of its organ."
             )
+        command, given = self._command(), None
+        if self.model is not None and self.cloud is not None:
+            given = self.model, self.cloud
         if self.document is not None:
-            check_document(self.document)
-        wish = Wish(
+            ReportWriter(self.document, command).check(BLOCKS)
+        request = BenchRequest(
             groups=self.only or tuple(GROUPS),
             curves=tuple(CURVES) if self.curves else (),
             quick=self.quick,
             folder=TRAINED,
-            model=self.model,
-            cloud=self.cloud,
+            given=given,
         )
         with console.status("starting ...") as status:
             report = status.update if console.is_terminal else say
-            command = self._command()
-            found = measure(wish, _WORKER, command, report, lambda row: say(line(row)))
+            found = measure(
+                request, _WORKER, command, report, lambda row, left: say(line(row, left))
+            )
         shown = console if console.is_terminal else Console(width=_WIDE)
         shown.print(rich_table(found))
         for path in write_bench(found, self.out, self.document):
@@ -92,23 +95,23 @@ def _work(task_json: str) -> None:
     import msgspec
 
     from tumortrack.core.config import from_builtins
-    from tumortrack_lab.bench.tasks import Task, TaskMessage, carry_out, keep_to_cores, subject_of
+    from tumortrack_lab.bench.run import Task, TaskMessage, carry_out, keep_to_cores
 
     task = from_builtins(msgspec.json.decode(task_json), Task, "the bench's task")
     keep_to_cores(task.threads)
     from tumortrack.training.presets import PRESETS
-    from tumortrack_lab.bench.subject import ConfigOf
+    from tumortrack_lab.bench.subject import BenchSubject, ConfigOf
 
     def limited(name: str) -> ConfigOf:
         return lambda anatomy: PRESETS[name](anatomy, "limited")
 
-    presets = {name: limited(name) for name in PRESETS}
+    def tell(message: TaskMessage) -> None:
+        print(msgspec.json.encode(message).decode(), flush=True)
 
-    def tell(said: TaskMessage) -> None:
-        print(msgspec.json.encode(said).decode(), flush=True)
-
-    for said in carry_out(task, subject_of(task, presets), tell):
-        tell(said)
+    given = task.given and (Path(task.given[0]), Path(task.given[1]))
+    subject = BenchSubject({name: limited(name) for name in PRESETS}, Path(task.folder), given)
+    for message in carry_out(task, subject, tell):
+        tell(message)
 
 
 if __name__ == "__main__":

@@ -7,9 +7,7 @@ surfaces known, what is left is what the body's modes cannot represent.
 
 from __future__ import annotations
 
-import ast
-import hashlib
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cache, cached_property
 from pathlib import Path
 from typing import Literal, get_args
@@ -21,16 +19,15 @@ from scipy.spatial.transform import Rotation
 import tumortrack
 from tumortrack.core.config import Config, to_builtins
 from tumortrack.core.errors import InputError, NoEstimate
-from tumortrack.core.estimate import OneWay
 from tumortrack.core.types import Anatomy, Mesh
 from tumortrack.sense.camera import project
 from tumortrack.sense.render import Visibility
 from tumortrack.simulate.elastic.body import BodyConfig, ElasticBody, build_body
 from tumortrack.simulate.scene_folder import Scene
-from tumortrack_lab.peers.base import Fit, estimate_of, stopwatch
+from tumortrack_lab.peers.base import Fit, stopwatch
 from tumortrack_lab.peers.rigid import kabsch, matched_vertices
-from tumortrack_lab.study.measure import StudyCase
-from tumortrack_lab.study.methods import Answer, Method
+from tumortrack_lab.study.cases import StudyCase
+from tumortrack_lab.study.methods import Answer, Method, answer_of, code_sha256
 
 BoundName = Literal["visible_bound", "basis_bound"]
 BOUNDS: tuple[BoundName, ...] = get_args(BoundName)
@@ -72,7 +69,6 @@ class Bound(Method):
     name: BoundName
     case: StudyCase
     config: BoundConfig = field(default_factory=BoundConfig)
-    device: str = "cpu"
 
     @cached_property
     def identity(self) -> dict:
@@ -88,10 +84,6 @@ class Bound(Method):
     def prepare_s(self) -> float | None:
         return _body_of(self.case, self.config)[1]
 
-    @property
-    def about(self) -> dict:
-        return {"prepare_s": self.prepare_s}
-
     def locate(self, scene: Scene, grid: int) -> Answer:
         """See ``Method.locate``.
 
@@ -106,9 +98,7 @@ class Bound(Method):
             placed = laid_on(body, known_ct, known_mm, self.config)
         left_mm = np.linalg.norm(placed.carry(known_ct) - known_mm, axis=1)
         report = {"start": "truth", "residual_mm": float(np.sqrt(np.mean(left_mm**2)))}
-        fit = Fit(placed.carry, watch.seconds, report)
-        estimate = estimate_of(fit, rest, scene.cloud.stamp_ns, grid)
-        return Answer(replace(estimate, motion=OneWay(fit.carry)), fit.seconds)
+        return answer_of(Fit(placed.carry, watch.seconds, report), rest, scene, grid)
 
     def _known(self, rest: Anatomy, scene: Scene) -> tuple[np.ndarray, np.ndarray]:
         if len(rest.parts) != len(scene.reference.parts):
@@ -190,10 +180,6 @@ def _body_of(case: StudyCase, config: BoundConfig) -> tuple[ElasticBody, float]:
 
 @cache
 def _code_sha256() -> str:
-    """Of what decides the answers, without comments: this file and the elastic body's."""
-    study = Path(__file__)
-    bodies = study.parents[2] / "simulate" / "elastic"
-    digest = hashlib.sha256()
-    for path in (study, *sorted(bodies.glob("*.py"))):
-        digest.update(ast.dump(ast.parse(path.read_text(encoding="utf-8"))).encode())
-    return digest.hexdigest()
+    """Of what decides the answers: this file and the elastic body's."""
+    elastic = Path(tumortrack.__file__).parent / "simulate" / "elastic"
+    return code_sha256([Path(__file__), *elastic.glob("*.py")])

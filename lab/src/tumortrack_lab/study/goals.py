@@ -7,18 +7,18 @@ taken over variants and cases. Whether a goal is met is decided by the exact num
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
+from typing import get_args
 
-from tumortrack_lab.study.figures import NOT_FOUND, median, names, pick
-from tumortrack_lab.study.markdown import table
+import pandas as pd
+
+from tumortrack_lab.study.document import table
+from tumortrack_lab.study.frame import EMPTY, NOT_FOUND, NOTHING, names, scenes, tumors
 from tumortrack_lab.study.models import CLINIC
 from tumortrack_lab.study.paper import Kind, Lie, hausdorff
-from tumortrack_lab.study.tables import EMPTY, carries, label_of, target_error
-
-Lies = dict[str, dict[str, Lie]]  # by case and tumor
-Read = Callable[[list[dict]], float | None]
+from tumortrack_lab.study.tables import label_of
 
 RULE = (
     "Distances in mm. Medians over cases and variants (and tumors, where a case has several), "
@@ -32,232 +32,144 @@ RULE = (
     "Training: the longest of the models, by the wall clock of a machine with the load said here, "
     "without the seconds that building the elastic body takes; for the surface fit its preparation."
 )
-_UPRIGHT = "D0"
-_TURNED = "Rot"
 _GOALS_MM = {"exophytic": (1.5, 2.0, 3.0), "endophytic": (2.0, 3.0, 4.0)}
 _TRAINING_MIN = {"cpu": 15.0, "H100": 2.0}  # by device
-_NOTHING = "–"
 
 
 @dataclass(frozen=True)
 class StudyGoal:
-    """One figure: how it is read from one method's cells, and what it should be at most (or at
-    least, ``high``)."""
+    """One figure: how it is read from one method's rows (infinite: not found; NaN: nothing was
+    measured), and what it should be at most (or at least, ``high``)."""
 
     text: str
-    read: Read
+    read: Callable[[pd.DataFrame], float]
     limit: float | None = None
     paper: str = EMPTY
     high: bool = False
 
-    def verdict(self, cells: list[dict]) -> str:
+    def verdict(self, frame: pd.DataFrame) -> str:
         """``yes`` or ``no``; nothing where nothing was measured or there is no goal."""
-        if self.limit is None or not self.measured(cells):
-            return _NOTHING
-        value = self.read(cells)
-        if value is None:
-            return "no"
-        return "yes" if (value >= self.limit if self.high else value <= self.limit) else "no"
+        value = self.read(frame)
+        if self.limit is None or math.isnan(value):
+            return NOTHING
+        met = value >= self.limit if self.high else value <= self.limit
+        return "yes" if met and math.isfinite(value) else "no"
 
-    def measured(self, cells: list[dict]) -> bool:
-        try:
-            self.read(cells)
-        except LookupError:
-            return False
-        return True
-
-    def value(self, cells: list[dict], ours: bool) -> str:
+    def value(self, frame: pd.DataFrame, ours: bool) -> str:
         """The number, to two digits; ``ours``: rounded to its disadvantage."""
-        if not self.measured(cells):
-            return _NOTHING
-        value = self.read(cells)
-        if value is None:
-            return NOT_FOUND
+        value = self.read(frame)
+        if not math.isfinite(value):
+            return NOTHING if math.isnan(value) else NOT_FOUND
         if ours:
             away = math.floor if self.high else math.ceil
             value = away(round(value * 100, 6)) / 100
         return f"{value:.2f}"
 
+    def value_and_verdict(self, frame: pd.DataFrame) -> str:
+        value, verdict = self.value(frame, ours=True), self.verdict(frame)
+        return value if verdict == NOTHING else f"{value} ({verdict})"
 
-def tables_of(cells: list[dict], lies: Lies) -> str:
-    """The goals with every method, then each case by itself."""
-    goals = goals_of(cells, lies)
-    methods = names(cells, "method")
-    own = pick(cells, method=CLINIC)
-    before = [name for name in methods if name != CLINIC and "bound" not in name]
-    bounds = [name for name in methods if "bound" in name]
+    @property
+    def limit_text(self) -> str:
+        return EMPTY if self.limit is None else f"{'≥' if self.high else '≤'} {self.limit:g}"
+
+
+def goal_tables(frame: pd.DataFrame, lies: dict[str, dict[str, Lie]]) -> str:
+    """The goals with every method, then each case by itself. ``lies``: by case and tumor."""
+    kinds = [lies[case][part].kind if part in lies[case] else EMPTY
+             for case, part in zip(frame.case, frame.part, strict=True)]  # fmt: skip
+    frame = frame.assign(lie=kinds)
+    by_method = {name: frame[frame.method == name] for name in names(frame, "method")}
+    own = by_method.pop(CLINIC, frame[:0])
+    bounds = {name: mine for name, mine in by_method.items() if "bound" in name}
+    before = {name: mine for name, mine in by_method.items() if name not in bounds}
+    goals = goals_of(own)
     head = ["figure", "paper", *map(label_of, before), CLINIC, "goal", "met"]
     rows = []
     for goal in goals:
-        row = [goal.text, goal.paper]
-        row += [goal.value(pick(cells, method=name), ours=False) for name in before]
-        row += [goal.value(own, ours=True), _limit(goal), goal.verdict(own)]
-        row += [goal.value(pick(cells, method=name), ours=False) for name in bounds]
-        rows.append(row)
+        row = [goal.text, goal.paper, *(goal.value(mine, ours=False) for mine in before.values())]
+        row += [goal.value(own, ours=True), goal.limit_text, goal.verdict(own)]
+        rows.append([*row, *(goal.value(mine, ours=False) for mine in bounds.values())])
     whole = table([*head, *map(label_of, bounds)], rows)
     cases = names(own, "case")
     each = [
-        [goal.text, *(_with_verdict(goal, pick(own, case=case)) for case in cases)]
+        [goal.text, *(goal.value_and_verdict(own[own.case == case]) for case in cases)]
         for goal in goals
     ]
     return f"{whole}\n\nEach case of {CLINIC}:\n\n{table(['figure', *cases], each)}"
 
 
-def goals_of(cells: list[dict], lies: Lies) -> list[StudyGoal]:
-    """Every goal, as it is read from these cells' kind."""
+def goals_of(own: pd.DataFrame) -> list[StudyGoal]:
+    """Every goal; that of training depends on the device that trained our own."""
     goals = []
-    kinds: tuple[Kind, ...] = ("exophytic", "endophytic")
-    for kind in kinds:
+    for kind in get_args(Kind):
         for variant, limit in zip(("D1", "D2", "D3"), _GOALS_MM[kind], strict=True):
-            said = hausdorff(variant, "M_lim", kind)
+            theirs = hausdorff(variant, "M_lim", kind)
             for words, key in (("one-sided", "hausdorff_one_sided_mm"), ("HD", "hausdorff_mm")):
-                read = partial(_distance, variant=variant, kind=kind, key=key, lies=lies)
-                shown = said.text if said and words == "one-sided" else EMPTY
+                read = partial(_distance, variant=variant, kind=kind, key=key)
+                shown = theirs.text if theirs and words == "one-sided" else EMPTY
                 goals.append(StudyGoal(f"tumor {words}, {variant}, {kind}", read, limit, shown))
+    deformed, everything = partial(_noisy, deformed=True), _noisy
     return [
         *goals,
-        StudyGoal("tumor centre, worst variant of any case", _worst_center, 2.5, "< 10"),
-        StudyGoal(
-            "mIoU, deformed variants", partial(_miou, deformed=True), 0.90, "0.71", high=True
-        ),
-        StudyGoal("mIoU, all variants", partial(_miou, deformed=False), 0.90, high=True),
-        StudyGoal("target error, deformed variants", partial(_targets, deformed=True), 2.0),
-        StudyGoal("target error, all variants", partial(_targets, deformed=False), 2.0),
-        StudyGoal("target error, worst variant of any case", _worst_target),
-        StudyGoal("hidden surface: tumor HD, times", partial(_ratio, of=_tumor_distances), 1.3),
-        StudyGoal("hidden surface: target error, times", partial(_ratio, of=_target_errors), 1.3),
-        StudyGoal("training, minutes", _training, _training_limit(cells), "120 (RTX 4090)"),
-        StudyGoal("scenes with a part not found, %", _failed),
-    ]
+        StudyGoal("tumor centre, worst variant of any case",
+                  lambda f: _per_scene(tumors(_noisy(f)), "center_mm").max(), 2.5, "< 10"),
+        StudyGoal("mIoU, deformed variants", lambda f: _miou(deformed(f)), 0.90, "0.71", high=True),
+        StudyGoal("mIoU, all variants", lambda f: _miou(everything(f)), 0.90, high=True),
+        StudyGoal("target error, deformed variants", lambda f: _targets(deformed(f)).median(), 2.0),
+        StudyGoal("target error, all variants", lambda f: _targets(everything(f)).median(), 2.0),
+        StudyGoal("target error, worst variant of any case", lambda f: _targets(_noisy(f)).max()),
+        StudyGoal("hidden surface: tumor HD, times",
+                  partial(_ratio, of=lambda f: _per_scene(tumors(f), "hausdorff_mm")), 1.3),
+        StudyGoal("hidden surface: target error, times", partial(_ratio, of=_targets), 1.3),
+        StudyGoal("training, minutes", _training, _training_limit(own), "120 (RTX 4090)"),
+        StudyGoal("scenes with a part not found, %",
+                  lambda f: 100 * scenes(_noisy(f)).failed.mean()),
+    ]  # fmt: skip
 
 
-def _distance(cells: list[dict], variant: str, kind: Kind, key: str, lies: Lies) -> float | None:
+def _noisy(frame: pd.DataFrame, deformed: bool = False) -> pd.DataFrame:
+    """The scenes without further faults; ``deformed``: neither at rest nor turned only."""
+    here = frame[frame.fault == "none"]
+    still = here.variant.astype(str).str.fullmatch("D0|Rot.*")
+    return here[~still] if deformed else here
+
+
+def _per_scene(frame: pd.DataFrame, column: str) -> pd.Series:
+    """For each scene and part the mean over the method's seeds; infinite where a seed has none."""
+    keys = ["case", "scene", "fault", "fault_seed", "part"]
+    return frame.groupby(keys, observed=True)[column].mean()
+
+
+def _distance(frame: pd.DataFrame, variant: str, kind: str, key: str) -> float:
     """Of tumors of a kind in a variant: median over cases and tumors."""
-    here = pick(_noisy(cells), variant=variant)
-    values = [
-        value
-        for case in names(here, "case")
-        for tumor, lie in lies[case].items()
-        if lie.kind == kind
-        for value in _over_seeds(pick(here, case=case), partial(_of_part, part=tumor, key=key))
-    ]
-    return _median(values)
+    here = _noisy(frame)
+    return _per_scene(here[(here.variant == variant) & (here.lie == kind)], key).median()
 
 
-def _worst_center(cells: list[dict]) -> float | None:
-    return _worst(_of_tumors(_noisy(cells), "center_mm"))
+def _miou(frame: pd.DataFrame) -> float:
+    return _per_scene(scenes(frame), "miou").median()
 
 
-def _miou(cells: list[dict], deformed: bool) -> float | None:
-    return _median(_over_seeds(_noisy(cells, deformed), lambda cell: cell["miou"]))
+def _targets(frame: pd.DataFrame) -> pd.Series:
+    """None where the method carries no points."""
+    return _per_scene(scenes(frame if frame.carries.any() else frame[:0]), "target_mm")
 
 
-def _targets(cells: list[dict], deformed: bool) -> float | None:
-    return _median(_target_errors(_noisy(cells, deformed)))
+def _ratio(frame: pd.DataFrame, of: Callable[[pd.DataFrame], pd.Series]) -> float:
+    above = of(frame[frame.fault.astype(str).str.contains("=")]).median()
+    below = of(frame[frame.fault == "clean"]).median()
+    if math.isnan(above + below):
+        return math.nan
+    return above / below if 0 < below < math.inf else math.inf
 
 
-def _worst_target(cells: list[dict]) -> float | None:
-    return _worst(_target_errors(_noisy(cells)))
+def _training(frame: pd.DataFrame) -> float:
+    return scenes(frame[frame.kind != "bound"]).prepare_s.max() / 60
 
 
-def _ratio(cells: list[dict], of: Callable[[list[dict]], list[float | None]]) -> float | None:
-    hidden = [cell for cell in cells if "=" in cell["spec"]["fault"]]
-    above, below = _median(of(hidden)), _median(of(pick(cells, fault="clean")))
-    if above is None:
-        return None
-    return above / below if below else None
-
-
-def _training(cells: list[dict]) -> float | None:
-    spent = [cell["prepare_s"] for cell in cells if cell["spec"]["method"]["kind"] != "bound"]
-    return _worst(spent, 60.0)
-
-
-def _training_limit(cells: list[dict]) -> float | None:
+def _training_limit(own: pd.DataFrame) -> float | None:
     """The goal on the device that trained, if there is one for it."""
-    devices = {cell["method"]["device"] for cell in pick(cells, method=CLINIC)}
+    devices = own.device.unique()
     limits = [v for device in devices for key, v in _TRAINING_MIN.items() if key in device]
     return limits[0] if len(limits) == len(devices) == 1 else None
-
-
-def _failed(cells: list[dict]) -> float | None:
-    lost = [cell["failed"] is not None for cell in _noisy(cells)]
-    if not lost:
-        raise LookupError
-    return 100 * sum(lost) / len(lost)
-
-
-def _noisy(cells: list[dict], deformed: bool = False) -> list[dict]:
-    """The scenes without further faults; ``deformed``: neither at rest nor turned only."""
-    here = pick(cells, fault="none")
-    if not deformed:
-        return here
-    variants = {cell["spec"]["variant"] for cell in here}
-    kept = {name for name in variants if name != _UPRIGHT and not name.startswith(_TURNED)}
-    return [cell for cell in here if cell["spec"]["variant"] in kept]
-
-
-def _of_part(cell: dict, part: str, key: str) -> float | None:
-    metrics = cell["parts"][part]
-    return metrics.get(key) if metrics["found"] else None
-
-
-def _of_tumors(cells: list[dict], key: str) -> list[float | None]:
-    """One value for each scene and tumor."""
-    return [
-        value
-        for case in names(cells, "case")
-        for here in [pick(cells, case=case)]
-        for tumor in here[0]["parts"]
-        if tumor != "kidney"
-        for value in _over_seeds(here, partial(_of_part, part=tumor, key=key))
-    ]
-
-
-def _tumor_distances(cells: list[dict]) -> list[float | None]:
-    return _of_tumors(cells, "hausdorff_mm")
-
-
-def _target_errors(cells: list[dict]) -> list[float | None]:
-    return _over_seeds(cells, target_error) if carries(cells) else []
-
-
-def _over_seeds(cells: list[dict], value: Callable[[dict], float | None]) -> list[float | None]:
-    """For each scene the mean over the methods' seeds; None where a seed has none."""
-    scenes: dict[tuple, list[float | None]] = {}
-    for cell in cells:
-        spec = cell["spec"]
-        scene = (spec["case"], spec["scene"], spec["fault"], spec["fault_seed"])
-        scenes.setdefault(scene, []).append(value(cell))
-    return [_mean(values) for values in scenes.values()]
-
-
-def _mean(values: list[float | None]) -> float | None:
-    finite = [value for value in values if value is not None]
-    return sum(finite) / len(finite) if len(finite) == len(values) else None
-
-
-def _median(values: list[float | None]) -> float | None:
-    if not values:
-        raise LookupError
-    return median(values)
-
-
-def _worst(values: Iterable[float | None], per: float = 1.0) -> float | None:
-    values = list(values)
-    if not values:
-        raise LookupError
-    finite = [value for value in values if value is not None]
-    return max(finite) / per if len(finite) == len(values) else None
-
-
-def _limit(goal: StudyGoal) -> str:
-    if goal.limit is None:
-        return EMPTY
-    return f"{'≥' if goal.high else '≤'} {goal.limit:g}"
-
-
-def _with_verdict(goal: StudyGoal, cells: list[dict]) -> str:
-    verdict = goal.verdict(cells)
-    value = goal.value(cells, ours=True)
-    return value if verdict == _NOTHING else f"{value} ({verdict})"

@@ -1,45 +1,125 @@
-"""Jobs -> cells: each measured once, in an order that loads every method once."""
+"""Jobs -> measurements: one method on one scene under one fault, made once and kept as JSON.
+
+A measurement's file name holds the hash of everything that decides its numbers (case, scene, fault,
+method, grid), so that a study that was killed goes on where it stopped, and a measurement made from
+other inputs is never taken for this one.
+"""
 
 from __future__ import annotations
 
+import hashlib
+import json
+import os
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Float
 
+import tumortrack
 from tumortrack.core import store
-from tumortrack.core.errors import InputError
+from tumortrack.core.config import Config, to_builtins
+from tumortrack.core.errors import InputError, StorageError
 from tumortrack.core.estimate import Estimate
-from tumortrack.core.types import Anatomy
+from tumortrack.core.geometry import transform_points
+from tumortrack.core.types import Anatomy, Mesh
+from tumortrack.report.metrics import distance_to_surface
 from tumortrack.report.protocol import evaluate_scene
+from tumortrack.sense.camera import deproject
 from tumortrack.simulate.scene_folder import Scene, read_scene
-from tumortrack_lab.study.cells import MeasurementSpec, MeasurementStore, provenance
+from tumortrack_lab.bench.machine import cpu_name
+from tumortrack_lab.peers.rigid import kabsch
+from tumortrack_lab.study.cases import StudyCase
 from tumortrack_lab.study.methods import Answer, Method
-from tumortrack_lab.study.points import point_errors, visible_points
 
 CLEAN_VIEW = "clean"
+_POINTS = 120  # vertices drawn of each tumor
+_NEAR_MM, _FAR_MM = 50.0, 400.0  # of a depth image: what can be the organ at all
 
 
-@dataclass(frozen=True, eq=False)
-class StudyCase:
-    """A patient or phantom with its scenes; ``is_paper`` where the paper's figures apply."""
+_SCHEMA = 1  # raise it when a measurement's metrics change their meaning
 
-    name: str
-    folder: Path
-    scenes: Path
-    anatomy_ct: Anatomy
-    up_lps: tuple[float, float, float]
-    is_paper: bool = False
 
-    def scene(self, variant: str, view: str) -> Path:
-        return self.scenes / f"{variant}-{view}"
+class MeasurementSpec(Config, frozen=True):
+    """What decides a measurement's numbers, and the names under which tables find it."""
+
+    case: str
+    case_sha256: str
+    scene: str
+    scene_sha256: str
+    variant: str
+    view: str
+    method: dict  # the method's identity: name, seed, and hashes or settings
+    grid: int
+    fault: str = "none"
+    fault_seed: int = 0
+    schema: int = _SCHEMA
+
+    @property
+    def digest(self) -> str:
+        """sha256 of the whole specification."""
+        return hashlib.sha256(json.dumps(to_builtins(self), sort_keys=True).encode()).hexdigest()
+
+
+class MeasurementStore:
+    """The folder of all measurements: CASE/METHOD/SCENE-FAULT-GRID-DIGEST.json."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+
+    def path(self, spec: MeasurementSpec) -> Path:
+        method = f"{spec.method['name']}-{spec.method.get('seed', 0)}"
+        file = f"{spec.scene}-{spec.fault}-{spec.grid}-{spec.digest[:16]}.json"
+        return self.folder / spec.case / method / file
+
+    def read(self, spec: MeasurementSpec) -> dict | None:
+        """What was measured with exactly this specification; None where nothing was.
+
+        Raises:
+            ArtifactError: its file is damaged.
+        """
+        path = self.path(spec)
+        if not path.exists():
+            return None
+        measurement = store.read_json(path)
+        return measurement if measurement.get("spec") == to_builtins(spec) else None
+
+    def write(self, spec: MeasurementSpec, measured: dict) -> dict:
+        """Keep a measurement, in one step.
+
+        Raises:
+            StorageError: the disk refused.
+        """
+        path = self.path(spec)
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise StorageError(f"cannot write {path.parent}: {error.strerror}.") from error
+        measurement = {"spec": to_builtins(spec), **measured}
+        store.write_json(path, measurement)
+        return measurement
+
+
+def provenance(device: str) -> dict:
+    """Where and by what something is measured; ``load`` is how busy the machine was."""
+    import torch
+
+    return {
+        "tumortrack": tumortrack.__version__,
+        "device": device,
+        "cpu": cpu_name(),
+        "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 0,
+        "threads": torch.get_num_threads(),
+        "load": round(os.getloadavg()[0], 2) if hasattr(os, "getloadavg") else None,
+    }
 
 
 @dataclass(frozen=True, eq=False)
 class Job:
-    """One cell to be: which method on which scene, at which grid, under which fault."""
+    """A measurement to be made: which method on which scene, at which grid, under which fault."""
 
     case: StudyCase
     method: Method
@@ -49,65 +129,76 @@ class Job:
     fault: str = "none"
     fault_seed: int = 0
 
+    @property
+    def scene(self) -> Path:
+        return self.case.scene(self.variant, self.view)
+
 
 @dataclass(frozen=True)
 class StudyStatus:
-    """Where the measuring stands, told after each cell measured."""
+    """Where the measuring stands, after each measurement."""
 
     done: int
     total: int
     measured: int
     name: str
-    seconds_per_cell: float
+    seconds_each: float
     seconds_left: float
 
 
 def measure(
     jobs: Iterable[Job],
-    cells: MeasurementStore,
+    kept: MeasurementStore,
     report: Callable[[StudyStatus], None] | None = None,
-    one: Callable[[Job, str], dict] | None = None,
+    one: Callable[[Job], dict] | None = None,
 ) -> list[dict]:
-    """The cells of these jobs in their order; only those that are not kept yet are measured,
-    each by ``one`` (``measure_one``) from its job and its scene's name.
+    """The measurements of these jobs in their order; only those that are not kept yet are made,
+    each by ``one`` (``measure_one``).
 
     Raises:
         InputError: a scene is missing or cannot be read.
-        ArtifactError: a kept cell or a model is damaged.
+        ArtifactError: a kept measurement or a model is damaged.
         StorageError: the disk refused.
     """
     jobs = list(jobs)
-    hashes = Hashes()
-    specs = [spec_of(job, hashes) for job in jobs]
-    kept = {spec.digest: cells.read(spec) for spec in specs}
-    todo = {d: (s, j) for s, j in zip(specs, jobs, strict=True) if kept[d := s.digest] is None}
-    pace = _Pace([_kind_of(spec) for spec, _ in todo.values()])
+    hashed = cache(store.sha256_of)
+    specs = [spec_of(job, hashed) for job in jobs]
+    known = {spec.digest: kept.read(spec) for spec in specs}
+    todo = {d: (s, j) for s, j in zip(specs, jobs, strict=True) if known[d := s.digest] is None}
+    kinds = [_kind_of(spec) for spec, _ in todo.values()]
+    spent: dict[str, list[float]] = {}  # seconds, by kind
     for number, (digest, (spec, job)) in enumerate(todo.items(), start=1):
         start = time.perf_counter()
-        kept[digest] = cells.write(spec, (one or measure_one)(job, spec.scene))
-        pace.add(_kind_of(spec), time.perf_counter() - start)
+        known[digest] = kept.write(spec, (one or measure_one)(job))
+        spent.setdefault(_kind_of(spec), []).append(time.perf_counter() - start)
         if report:
-            done = len(kept) - len(todo) + number
+            done = len(known) - len(todo) + number
             name = f"{spec.case} {spec.method['name']} {spec.scene} {spec.fault}"
-            name = name.removesuffix(" none")
-            report(StudyStatus(done, len(kept), number, name, pace.mean(), pace.left()))
-    found = [kept[spec.digest] for spec in specs]
-    return [cell for cell in found if cell is not None]
+            mean = float(np.mean([s for each in spent.values() for s in each]))
+            # A kind that was not measured yet counts with the mean of all.
+            left = float(sum(np.mean(spent.get(kind, mean)) for kind in kinds[number:]))
+            status = StudyStatus(done, len(known), number, name.removesuffix(" none"), mean, left)
+            report(status)
+    found = [known[spec.digest] for spec in specs]
+    return [measurement for measurement in found if measurement is not None]
 
 
-def spec_of(job: Job, hashes: Hashes) -> MeasurementSpec:
+def _kind_of(spec: MeasurementSpec) -> str:
+    return f"{spec.case} {spec.method['name']} {spec.grid}"
+
+
+def spec_of(job: Job, hashed: Callable[[Path], str] = store.sha256_of) -> MeasurementSpec:
     """The job's full specification, inputs hashed."""
-    folder = job.case.scene(job.variant, job.view)
-    if not folder.is_dir():
+    if not job.scene.is_dir():
         raise InputError(
-            f"{folder} does not exist; make the scenes with: tumortrack twin "
+            f"{job.scene} does not exist; make the scenes with: tumortrack twin "
             f"{job.case.folder} {job.case.scenes}"
         )
     return MeasurementSpec(
         case=job.case.name,
-        case_sha256=hashes.of(job.case.folder / store.MANIFEST),
-        scene=folder.name,
-        scene_sha256=hashes.of(folder),
+        case_sha256=hashed(job.case.folder / store.MANIFEST),
+        scene=job.scene.name,
+        scene_sha256=hashed(job.scene),
         variant=job.variant,
         view=job.view,
         method=job.method.identity,
@@ -117,12 +208,30 @@ def spec_of(job: Job, hashes: Hashes) -> MeasurementSpec:
     )
 
 
-def measure_one(job: Job, name: str) -> dict:
-    """One cell's numbers: the protocol's metrics, errors at points, target errors, times."""
-    scene = read_scene(job.case.scene(job.variant, job.view))
-    if job.fault != "none":
-        from tumortrack_lab.twin.faults import disturbed
+def by_method(jobs: Iterable[Job]) -> list[Job]:
+    """Jobs sorted so that each method's follow one another (a model is loaded once)."""
+    groups: dict[int, list[Job]] = {}
+    for job in jobs:
+        groups.setdefault(id(job.method), []).append(job)
+    return [job for group in groups.values() for job in group]
 
+
+def about_answer(job: Job, answer: Answer | None) -> dict:
+    """What every measurement says of its method: seconds, training, machine."""
+    return {
+        "frame_s": answer.frame_s if answer else None,
+        "prepare_s": job.method.prepare_s,
+        "method": job.method.about,
+        "provenance": provenance(job.method.device),
+    }
+
+
+def measure_one(job: Job) -> dict:
+    """One measurement's numbers: the protocol's metrics, errors at points, target errors, times."""
+    from tumortrack_lab.twin.faults import MOVED, disturbed
+
+    scene = read_scene(job.scene)
+    if job.fault != "none":
         scene = disturbed(scene, job.fault, job.fault_seed)
     answers: list[Answer] = []
 
@@ -130,69 +239,84 @@ def measure_one(job: Job, name: str) -> dict:
         answers.append(job.method.locate(scene, job.grid))
         return answers[0].estimate
 
-    entry, estimate = evaluate_scene(locate, scene, name)
-    answer = answers[0] if answers else None
+    entry, estimate = evaluate_scene(locate, scene, job.scene.name)
+    points: dict = {}
+    if estimate:
+        clean = job.case.scene(job.variant, CLEAN_VIEW)
+        seen = scene if MOVED in scene.meta or not clean.is_dir() else read_scene(clean)
+        visible_mm = visible_points(seen)
+        points = point_errors(scene.reference, job.case.anatomy_ct, visible_mm, estimate.meshes)
     return {
         "parts": entry["parts"],
         "miou": entry["miou"],
         "failed": entry["failed"],
-        "frame_s": answer.frame_s if answer else None,
         "locate_s": entry.get("seconds"),
-        "prepare_s": job.method.prepare_s,
-        "points": _points(job, scene, estimate) if estimate else {},
+        "points": points,
         "targets_mm": entry.get("tre_mm"),
-        "method": job.method.about,
-        "provenance": provenance(job.method.device),
+        **about_answer(job, answers[0] if answers else None),
     }
 
 
-def _points(job: Job, scene: Scene, estimate: Estimate) -> dict:
-    from tumortrack_lab.twin.faults import MOVED
-
-    clean = job.case.scene(job.variant, CLEAN_VIEW)
-    seen = scene if MOVED in scene.meta or not clean.is_dir() else read_scene(clean)
-    return point_errors(scene.reference, job.case.anatomy_ct, visible_points(seen), estimate.meshes)
-
-
-class Hashes:
-    """sha256 of files and folders, each computed once."""
-
-    def __init__(self) -> None:
-        self._known: dict[Path, str] = {}
-
-    def of(self, path: Path) -> str:
-        if path not in self._known:
-            self._known[path] = store.sha256_of(path)
-        return self._known[path]
+def visible_points(scene: Scene) -> Float[np.ndarray, "n 3"]:
+    """The organ's visible surface: all pixels of the depth image, or else the cloud."""
+    if scene.depth is None:
+        return scene.cloud.points_mm.astype(float)
+    points = deproject(scene.depth).astype(float)
+    return points[(points[:, 2] > _NEAR_MM) & (points[:, 2] < _FAR_MM)]
 
 
-def _kind_of(spec: MeasurementSpec) -> str:
-    return f"{spec.case} {spec.method['name']} {spec.grid}"
+def point_errors(
+    truth: Anatomy,
+    rest_ct: Anatomy,
+    visible_mm: Float[np.ndarray, "n 3"],
+    meshes: dict[str, Mesh],
+) -> dict[str, dict[str, list[float]]]:
+    """By tumor that was found: depth, displacement and error of points of its true surface, mm.
+
+    A network gives no correspondence, so the error of a point is its distance to the estimated
+    surface, for every method alike. Depth is the distance to the nearest visible point;
+    displacement is what is left of a point's way after the best rigid motion of the whole organ,
+    and absent where the scene's surfaces are not the case's.
+
+    Args:
+        truth: the anatomy in the scene, camera frame; face n of a part is face n of ``rest_ct``.
+        rest_ct: the undeformed anatomy, CT frame.
+        visible_mm: the visible surface without noise, camera frame.
+        meshes: the estimate, by part name.
+    """
+    from scipy.spatial import cKDTree
+
+    seen = cKDTree(visible_mm)
+    moves = displacements(truth, rest_ct)
+    out: dict[str, dict[str, list[float]]] = {}
+    for name, part in zip(truth.names[1:], truth.tumors, strict=True):
+        if name not in meshes or len(meshes[name].faces) == 0:
+            continue
+        corners = part.faces.reshape(-1)
+        chosen = np.random.default_rng(0).integers(len(corners), size=_POINTS)
+        points = part.vertices_mm[corners[chosen]]
+        columns = {
+            "depth_mm": seen.query(points)[0],
+            "error_mm": distance_to_surface(points, meshes[name]),
+        }
+        if name in moves:
+            columns["displacement_mm"] = moves[name][chosen]
+        out[name] = {key: np.round(values, 2).tolist() for key, values in columns.items()}
+    return out
 
 
-class _Pace:
-    """Mean seconds per kind of cell, and what is left by them."""
+def displacements(truth: Anatomy, rest_ct: Anatomy) -> dict[str, Float[np.ndarray, " n"]]:
+    """How far the corner of each face lies from its place under the best rigid motion, mm.
 
-    def __init__(self, kinds: list[str]) -> None:
-        self._left = kinds
-        self._seconds: dict[str, list[float]] = {}
-
-    def add(self, kind: str, seconds: float) -> None:
-        self._left.remove(kind)
-        self._seconds.setdefault(kind, []).append(seconds)
-
-    def mean(self) -> float:
-        return float(np.mean([s for kind in self._seconds.values() for s in kind]))
-
-    def left(self) -> float:
-        """Seconds; a kind that was not measured yet counts with the mean of all."""
-        means = {kind: float(np.mean(s)) for kind, s in self._seconds.items()}
-        return float(sum(means.get(kind, self.mean()) for kind in self._left))
-
-
-def by_method(jobs: Iterable[Job]) -> list[Job]:
-    """Jobs sorted so that each method's follow one another (a model is loaded once)."""
-    groups: dict[int, list[Job]] = {}
-    for job in jobs:
-        groups.setdefault(id(job.method), []).append(job)
-    return [job for group in groups.values() for job in group]
+    Corners, because a file's vertices may come back in another order; its faces do not. Empty
+    where the surfaces are not the case's own.
+    """
+    if [len(part.faces) for part in truth.parts] != [len(part.faces) for part in rest_ct.parts]:
+        return {}
+    now = [part.vertices_mm[part.faces.reshape(-1)] for part in truth.parts]
+    before = [part.vertices_mm[part.faces.reshape(-1)] for part in rest_ct.parts]
+    best = kabsch(before[0], now[0], np.ones(len(now[0])))
+    return {
+        name: np.linalg.norm(a - transform_points(best, b), axis=1)
+        for name, a, b in zip(truth.names, now, before, strict=True)
+    }

@@ -1,30 +1,39 @@
-"""What can be measured: something with an identity that turns a scene's cloud into an estimate."""
+"""What can be measured: trained models and peers, as methods that locate.
+
+A method has an identity, and turns a scene's cloud into an estimate. Nothing heavy is made or
+loaded before a measurement needs it.
+"""
 
 from __future__ import annotations
 
+import ast
+import hashlib
 import math
 from abc import ABC, abstractmethod
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
 import msgspec
 
+import tumortrack
+import tumortrack_lab.peers
 from tumortrack.core import store
+from tumortrack.core.config import to_builtins
 from tumortrack.core.errors import InputError
-from tumortrack.core.estimate import Estimate
+from tumortrack.core.estimate import Estimate, OneWay
+from tumortrack.core.types import Anatomy
 from tumortrack.models.model import Model
 from tumortrack.registration.model import RegistrationModel
 from tumortrack.simulate.scene_folder import Scene
 from tumortrack.tracking.tracker import Tracker
 from tumortrack.training.model import load_model
+from tumortrack_lab.peers.base import Fit, Peer, estimate_of
+from tumortrack_lab.peers.kinds import PeerKind, peer_kinds
+from tumortrack_lab.study.cases import StudyCase
 
-LIVE_STAGES = (
-    "encode",
-    "coarse",
-    "refine",
-    "fine",
-)  # what a live frame takes; the dense volume is extra
+_LIVE_STAGES = ("encode", "coarse", "refine", "fine")  # of a live frame: without the dense volume
 
 
 @dataclass(frozen=True)
@@ -36,7 +45,7 @@ class Answer:
 
 
 class Method(ABC):
-    """One way to locate, for one patient. Nothing heavy is made or loaded before it is needed."""
+    """One way to locate, for one patient."""
 
     @property
     @abstractmethod
@@ -44,9 +53,9 @@ class Method(ABC):
         """``kind``, ``name`` and everything else that decides the answers (JSON)."""
 
     @property
-    @abstractmethod
     def device(self) -> str:
         """What it runs on."""
+        return "cpu"
 
     @property
     @abstractmethod
@@ -54,9 +63,9 @@ class Method(ABC):
         """Spent once for a patient, before the first frame: training, or a peer's own work."""
 
     @property
-    @abstractmethod
     def about(self) -> dict:
         """What else a reader wants to know of it (JSON)."""
+        return {"prepare_s": self.prepare_s}
 
     @abstractmethod
     def locate(self, scene: Scene, grid: int) -> Answer:
@@ -66,6 +75,12 @@ class Method(ABC):
             NoEstimate: nothing can be said of the scene.
             InputError: the cloud cannot be used.
         """
+
+
+def answer_of(fit: Fit, anatomy_ct: Anatomy, scene: Scene, grid: int) -> Answer:
+    """The answer of a method that carries the CT's points."""
+    estimate = estimate_of(fit, anatomy_ct, scene.cloud.stamp_ns, grid)
+    return Answer(replace(estimate, motion=OneWay(fit.carry)), fit.seconds)
 
 
 @dataclass(frozen=True)
@@ -82,7 +97,7 @@ class Network(Method):
     @cached_property
     def identity(self) -> dict:
         about = self.provenance
-        named = {"unrefined": True} if self.unrefined else {}  # older cells have no such word
+        named = {"unrefined": True} if self.unrefined else {}  # older measurements have no such key
         return {
             "kind": "network",
             "name": self.name,
@@ -99,17 +114,13 @@ class Network(Method):
         return store.read_json(self.folder / store.MANIFEST)["provenance"]
 
     @cached_property
-    def _model(self) -> Model:
-        model = load_model(self.folder, self.want_device)
-        return without_refinement(model) if self.unrefined else model
-
-    @cached_property
     def _tracker(self) -> Tracker:
-        return Tracker(self._model)
+        model = load_model(self.folder, self.want_device)
+        return Tracker(without_refinement(model) if self.unrefined else model)
 
     @property
     def device(self) -> str:
-        return str(next(self._model.network.parameters()).device.type)
+        return str(next(self._tracker.model.network.parameters()).device.type)
 
     @property
     def prepare_s(self) -> float | None:
@@ -124,7 +135,7 @@ class Network(Method):
     def locate(self, scene: Scene, grid: int) -> Answer:
         estimate = self._tracker.locate(scene.cloud, grid, self.locate_seed)
         seconds = estimate.report["timings"]
-        return Answer(estimate, sum(seconds.get(stage, 0.0) for stage in LIVE_STAGES))
+        return Answer(estimate, sum(seconds.get(stage, 0.0) for stage in _LIVE_STAGES))
 
 
 def without_refinement(model: Model) -> RegistrationModel:
@@ -141,5 +152,68 @@ def without_refinement(model: Model) -> RegistrationModel:
         model.config, refine=msgspec.structs.replace(model.config.refine, steps=0)
     )
     in_distribution = msgspec.structs.replace(model.in_distribution, fit_mm=math.inf)
-    trust = msgspec.structs.replace(model.calibration, usual_cost=math.inf)
-    return replace(model, config=config, in_distribution=in_distribution, calibration=trust)
+    calibration = msgspec.structs.replace(model.calibration, usual_cost=math.inf)
+    return replace(model, config=config, in_distribution=in_distribution, calibration=calibration)
+
+
+@dataclass(frozen=True, eq=False)
+class PeerMethod(Method):
+    """A peer of one patient as a method. Its identity names its settings, the peers' code by its
+    sha256, and the versions of the packages it rests on."""
+
+    name: str
+    kind: PeerKind
+    case: StudyCase
+
+    @cached_property
+    def identity(self) -> dict:
+        settings = to_builtins(self.kind.config) if self.kind.config else {}
+        if self.kind.program_sha256:
+            settings["program"] = self.kind.program_sha256  # wherever it lies
+        return {
+            "kind": "peer",
+            "name": self.name,
+            "settings": settings,
+            "code_sha256": code_sha256(Path(tumortrack_lab.peers.__path__[0]).glob("*.py")),
+            "versions": self.kind.versions,
+            "tumortrack": tumortrack.__version__,
+        }
+
+    @cached_property
+    def peer(self) -> Peer:
+        """Made ready for the patient."""
+        return self.kind.made_for(self.case.anatomy_ct, self.case.up_lps)
+
+    @property
+    def prepare_s(self) -> float | None:
+        return self.peer.prepare_s
+
+    def locate(self, scene: Scene, grid: int) -> Answer:
+        return answer_of(self.peer.fit(scene), self.case.anatomy_ct, scene, grid)
+
+
+def code_sha256(paths: Iterable[Path]) -> str:
+    """Of files of code without comments and docstrings: after a change of what they do, it is
+    measured anew; after a change of words it is not."""
+    digest = hashlib.sha256()
+    for path in sorted(paths):
+        tree = ast.parse(path.read_text(encoding="utf-8"))
+        for node in ast.walk(tree):
+            if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef) and ast.get_docstring(
+                node
+            ):
+                node.body = node.body[1:]
+        digest.update(f"{path.name}\0{ast.dump(tree)}\n".encode())
+    return digest.hexdigest()
+
+
+def peer_method(name: str, case: StudyCase, bcpd: Path | None = None) -> PeerMethod:
+    """The peer with this name for a case; ``bcpd`` is the built program of that peer.
+
+    Raises:
+        InputError: no such peer, or no program for ``bcpd``.
+    """
+    kinds = peer_kinds(bcpd)
+    if name not in kinds:
+        raise InputError(f"peer {name!r} is unknown. Allowed: {', '.join(kinds)}.")
+    return PeerMethod(name, kinds[name], case)

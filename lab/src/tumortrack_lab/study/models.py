@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-import msgspec
+from msgspec.structs import replace
 
 from tumortrack.core import store
 from tumortrack.core.errors import InputError
@@ -18,9 +18,8 @@ from tumortrack.sense.noise import CalibrationConfig
 from tumortrack.sense.occlusion import OcclusionConfig
 from tumortrack.simulate.deform import DragConfig
 from tumortrack.simulate.deform.drag import CONFIGURATIONS
-from tumortrack.simulate.scene import SceneConfig
 from tumortrack.training.train import TrainingRun, TrainingStatus, run_identity, train
-from tumortrack_lab.study.measure import StudyCase
+from tumortrack_lab.study.cases import StudyCase
 from tumortrack_lab.study.methods import Network
 
 # A preset: anatomy and rotations (limited, full) -> training configuration.
@@ -39,11 +38,6 @@ class Presets:
 
     quick: Preset
     clinic: Preset
-
-
-def configuration_name(number: int) -> str:
-    """Name of the model trained with one row of the paper's deformation table."""
-    return f"configuration_{number}"
 
 
 def train_config(name: str, case: StudyCase, presets: Presets) -> TrainConfig:
@@ -73,18 +67,13 @@ def train_config(name: str, case: StudyCase, presets: Presets) -> TrainConfig:
         both = tuple(DragConfig(steps=CONFIGURATIONS[n]) for n in (3, 6))
         return _with_scene(clinic, deform=(*both * (_DRAGS // 2), *clinic.scene.deform))
     if name == "clinic_clean":
-        return _with_scene(
-            clinic,
-            occlusion=OcclusionConfig(),
-            clutter=ClutterConfig(),
-            calibration=CalibrationConfig(),
-        )
+        occlusion, clutter = OcclusionConfig(), ClutterConfig()
+        calibration = CalibrationConfig()
+        return _with_scene(clinic, occlusion=occlusion, clutter=clutter, calibration=calibration)
     if name == "clinic_pointnet":
-        network = msgspec.structs.replace(clinic.network, encoder=quick.network.encoder)
-        return msgspec.structs.replace(clinic, network=network)
+        return replace(clinic, network=replace(clinic.network, encoder=quick.network.encoder))
     if name == "quick_elastic":
-        scene = msgspec.structs.replace(clinic.scene, occupancy=quick.scene.occupancy)
-        return msgspec.structs.replace(quick, scene=scene)
+        return replace(quick, scene=replace(clinic.scene, occupancy=quick.scene.occupancy))
     raise InputError(
         f"model {name!r} is unknown. Allowed: {', '.join((*MODELS, CLINIC, *ABLATED))}, each "
         f"warp also with {UNREFINED}, and configuration_1 to {max(CONFIGURATIONS)}."
@@ -92,8 +81,7 @@ def train_config(name: str, case: StudyCase, presets: Presets) -> TrainConfig:
 
 
 def _with_scene(config: TrainConfig, **changed: object) -> TrainConfig:
-    scene: SceneConfig = msgspec.structs.replace(config.scene, **changed)
-    return msgspec.structs.replace(config, scene=scene)
+    return replace(config, scene=replace(config.scene, **changed))
 
 
 class Trainer:
@@ -144,14 +132,11 @@ class Trainer:
         )
         if not is_finished(folder) or not _same(folder, run):
             threads = torch.get_num_threads()
-            told = f"{case.name} {trained} seed {seed}"
-            train(run, folder, lambda status: self._tell(told, status))
+            label = f"{case.name} {trained} seed {seed}"
+            report = self._report or (lambda *_: None)
+            train(run, folder, lambda status: report(label, status))
             torch.set_num_threads(threads)  # training leaves some cores to its workers
         return Network(name, folder, self._device, unrefined=trained != name)
-
-    def _tell(self, name: str, status: TrainingStatus) -> None:
-        if self._report:
-            self._report(name, status)
 
 
 def _same(folder: Path, run: TrainingRun) -> bool:

@@ -52,8 +52,8 @@ def hausdorff(variant: str, model: str, kind: Kind) -> PaperFigure | None:
 
 def center(variant: str, model: str) -> PaperFigure | None:
     """The paper's bound on the distance of the tumors' centres, mm."""
-    told = variant in ("D1", "D2", "D3") or variant.startswith("Rot")
-    return PaperFigure("<", 10.0) if told and (variant, model) != ("D3", "M_full") else None
+    stated = variant in ("D1", "D2", "D3") or variant.startswith("Rot")
+    return PaperFigure("<", 10.0) if stated and (variant, model) != ("D3", "M_full") else None
 
 
 EXPOSED_MM = 0.5  # a tumor's surface this close to the organ's is the organ's surface

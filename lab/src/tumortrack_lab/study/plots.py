@@ -1,4 +1,4 @@
-"""Plots of the study: error against depth and displacement, and per variant beside the paper.
+"""The study's pictures: errors against depth, displacement, variant and severity; a gallery.
 
 Colours are Okabe and Ito's (told apart by every colour vision); each method also has a marker of
 its own, so that the plots read in grey.
@@ -7,19 +7,28 @@ its own, so that the plots read in grey.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
+import pandas as pd
 
+from tumortrack.core.errors import InputError, NoEstimate
+from tumortrack.core.estimate import Estimate
 from tumortrack.report.drawing import new_figure, save
+from tumortrack.report.pictures import FROM_SIDE, draw_solid_view, scene_legend
+from tumortrack.report.protocol import compare
+from tumortrack.simulate.scene_folder import Scene, read_scene
 from tumortrack_lab.study import paper
-from tumortrack_lab.study.figures import figure, names, part_value, pick
-from tumortrack_lab.study.tables import label_of, tumors_of
+from tumortrack_lab.study.frame import ORGAN, by_seed, groups, names, tumors
+from tumortrack_lab.study.measure import Job
+from tumortrack_lab.study.tables import FALLING, SEVERITIES, label_of, levels_of, spaced
+from tumortrack_lab.twin.faults import KINDS
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.lines import Line2D
 
-STYLES = {
+_STYLES = {
     "M_lim": ("#0072B2", "o"),
     "M_full": ("#E69F00", "s"),
     "clinic": ("#D55E00", "*"),
@@ -29,202 +38,281 @@ STYLES = {
     "bcpd": ("#56B4E9", "D"),
     "elastic": ("#009E73", "P"),
 }
-OTHER_STYLE = ("#56B4E9", "h")
 _BANDS = 8  # groups of equally many points along a curve
 _FEWEST = 40  # points in a group
 _ALONG = {
     "depth_mm": "depth below the visible surface",
     "displacement_mm": "displacement left after the best rigid motion",
 }
+_DASHES: tuple[Literal["-", "--", ":", "-."], ...] = ("-", "--", ":", "-.")  # by tumor
+_LEAST_MM = 0.1  # the scale of severities is logarithmic
+_TICKS_MM = (1, 2, 5, 10, 20, 50)
 
 
-def error_against(cells: list[dict], key: str, path: Path) -> bool:
+def _style(method: str) -> dict[str, Any]:
+    color, marker = _STYLES.get(method, ("#56B4E9", "h"))
+    return {"color": color, "marker": marker}
+
+
+def error_against(frame: pd.DataFrame, key: str, path: Path) -> bool:
     """Error of points of the tumors' true surfaces against ``depth_mm`` or ``displacement_mm``:
     medians of groups of equally many points, the middle half shaded for the first two methods.
 
-    Returns False, and draws nothing, where no cell has such points.
+    Returns False, and draws nothing, where no measurement has such points.
     """
-    curves = {method: _points(pick(cells, method=method), key) for method in names(cells, "method")}
+    known = frame[frame[key].notna()]
+    curves = {
+        method: (np.concatenate([*mine[key]]), np.concatenate([*mine.error_mm]))
+        for (method,), mine in groups(known, "method")
+    }
     curves = {name: curve for name, curve in curves.items() if len(curve[0]) >= _FEWEST}
     if not curves:
         return False
     highest = 1.0
     drawing = new_figure(9.4, 4.6)
     axes = drawing.add_axes((0.075, 0.125, 0.6, 0.8))
-    for number, (method, (x, error)) in enumerate(curves.items()):
-        color, marker = STYLES.get(method, OTHER_STYLE)
-        at, low, middle, high = _grouped(x, error)
+    for number, (method, curve) in enumerate(curves.items()):
+        style = _style(method)
+        at, low, middle, high = _grouped(*curve)
         highest = max(highest, 1.25 * float(middle.max()))
         if number < 2:
-            axes.fill_between(at, low, high, color=color, alpha=0.13, linewidth=0)
-        axes.plot(at, middle, color=color, marker=marker, linewidth=2, label=label_of(method))
+            axes.fill_between(at, low, high, color=style["color"], alpha=0.13, linewidth=0)
+        axes.plot(at, middle, linewidth=2, label=label_of(method), **style)
     axes.set(xlabel=f"{_ALONG[key]}, mm", ylabel="distance to the estimated tumor surface, mm")
     axes.set_ylim(0, highest)  # bands may go beyond: a bad method must not flatten the others
     axes.set_xlim(left=0)
-    tidy(axes)
+    _tidy(axes)
+    title = "median of each eighth of the points\n(band: middle half)"
     axes.legend(
-        loc="upper left",
-        bbox_to_anchor=(1.02, 1.0),
-        frameon=False,
-        fontsize=9.5,
-        title="median of each eighth of the points\n(band: middle half)",
-        title_fontsize=9,
-        alignment="left",
-    )
+        loc="upper left", bbox_to_anchor=(1.02, 1.0), frameon=False, fontsize=9.5, title=title,
+        title_fontsize=9, alignment="left",
+    )  # fmt: skip
     axes.set_title(f"Tumor error against {_ALONG[key]}", loc="left", fontsize=12)
     save(drawing, path)
     return True
 
 
-def error_per_variant(cells: list[dict], lies: dict[str, paper.Lie], path: Path) -> None:
+def _grouped(x: np.ndarray, error: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Of groups of equally many points: median place, and the quartiles of the error."""
+    order = np.argsort(x, kind="stable")
+    parts = np.array_split(order, min(_BANDS, len(x) // (_FEWEST // 4)))
+    quartiles = [np.percentile(error[part], (25, 50, 75)) for part in parts]
+    return np.array([np.median(x[part]) for part in parts]), *np.transpose(quartiles)
+
+
+def error_per_variant(frame: pd.DataFrame, lies: dict[str, paper.Lie], path: Path) -> None:
     """One-sided Hausdorff distance of each tumor per variant and model, mean and spread over the
     seeds, with the paper's figures as open marks (a bar with an arrow: its upper bound)."""
-    tumors, variants = tumors_of(cells), names(cells, "variant")
-    drawing = new_figure(4.6 * len(tumors) + 2.4, 4.6)
-    panels = drawing.subplots(1, len(tumors), sharey=True, squeeze=False)[0]
-    narrow = len(tumors) == 1  # its legend takes two rows
+    parts, variants, models = (
+        names(tumors(frame), "part"),
+        names(frame, "variant"),
+        names(frame, "method"),
+    )
+    drawing = new_figure(4.6 * len(parts) + 2.4, 4.6)
+    panels = drawing.subplots(1, len(parts), sharey=True, squeeze=False)[0]
+    narrow = len(parts) == 1  # its legend takes two rows
     drawing.subplots_adjust(
         left=0.1 if narrow else 0.07, right=0.985, top=0.8 if narrow else 0.85, bottom=0.08,
         wspace=0.06,
     )  # fmt: skip
-    for axes, tumor in zip(panels, tumors, strict=True):
-        models = names(cells, "method")
+    for axes, tumor in zip(panels, parts, strict=True):
+        mine, kind = frame[frame.part == tumor], lies[tumor].kind
         for number, model in enumerate(models):
-            shift = (number - (len(models) - 1) / 2) * 0.26
-            mine = pick(cells, method=model)
-            _variant_bars(axes, mine, tumor, shift)
-            _paper_marks(axes, variants, model, lies[tumor].kind, shift)
+            for place, variant in enumerate(variants):
+                here = mine[(mine.method == model) & (mine.variant == variant)]
+                x = place + (number - (len(models) - 1) / 2) * 0.26
+                _seeds(axes, x, by_seed(here, "hausdorff_one_sided_mm"), _style(model))
+                _paper_mark(axes, x + 0.1, paper.hausdorff(variant, model, kind), _style(model))
         axes.set_xticks(range(len(variants)), variants)
-        axes.set_title(f"{tumor.replace('_', ' ')}, {lies[tumor].kind}", loc="left", fontsize=11)
+        axes.set_title(f"{spaced(tumor)}, {kind}", loc="left", fontsize=11)
         for place in range(len(variants) - 1):
             axes.axvline(place + 0.5, color="0.93", linewidth=0.8, zorder=0)
         axes.set_xlim(-0.5, len(variants) - 0.5)
-        tidy(axes)
+        _tidy(axes)
     panels[0].set_ylim(bottom=0)  # after all panels: it ends the search for common limits
     panels[0].set_ylabel("Hausdorff distance, estimate to truth, mm")
     drawing.legend(
-        handles=_legend(names(cells, "method")),
-        loc="upper left",
-        bbox_to_anchor=(0.06, 0.995),
-        ncols=3 if narrow else 5,
-        frameon=False,
-        fontsize=10,
-    )
+        handles=_variant_legend(models), loc="upper left", bbox_to_anchor=(0.06, 0.995),
+        ncols=3 if narrow else 5, frameon=False, fontsize=10,
+    )  # fmt: skip
     save(drawing, path)
 
 
-def _variant_bars(axes: Axes, cells: list[dict], tumor: str, shift: float) -> None:
-    model = cells[0]["spec"]["method"]["name"]
-    color, marker = STYLES.get(model, OTHER_STYLE)
-    value = part_value(tumor, "hausdorff_one_sided_mm")
-    for place, variant in enumerate(names(cells, "variant")):
-        number = figure(pick(cells, variant=variant), value)
-        x = place + shift
-        axes.scatter([x] * len(number.finite), number.finite, s=14, color=color, alpha=0.45, lw=0)
-        if number.mean is None:
-            axes.annotate("not\nfound", (x, 0), ha="center", va="bottom", fontsize=7.5, color=color)
-            continue
-        axes.errorbar(
-            x,
-            number.mean,
-            number.spread,
-            color=color,
-            marker=marker,
-            markersize=7,
-            capsize=3,
-            lw=1.6,
-        )
+def _seeds(axes: Axes, x: float, values: pd.Series, style: dict[str, Any]) -> None:
+    finite, color = values[np.isfinite(values)], style["color"]
+    axes.scatter([x] * len(finite), finite, s=14, color=color, alpha=0.45, lw=0)
+    if len(finite) < len(values):
+        axes.annotate("not\nfound", (x, 0), ha="center", va="bottom", fontsize=7.5, color=color)
+    elif len(values):
+        spread = values.std() if len(values) > 1 else None
+        axes.errorbar(x, values.mean(), spread, markersize=7, capsize=3, lw=1.6, **style)
 
 
-def _paper_marks(
-    axes: Axes, variants: list[str], model: str, kind: paper.Kind, shift: float
+def _paper_mark(
+    axes: Axes, x: float, figure: paper.PaperFigure | None, style: dict[str, Any]
 ) -> None:
-    color, marker = STYLES.get(model, OTHER_STYLE)
-    for place, variant in enumerate(variants):
-        said = paper.hausdorff(variant, model, kind)
-        if said is None:
-            continue
-        x = place + shift + 0.1
-        if said.sign == "<=":
-            axes.plot([x - 0.1, x + 0.1], [said.value_mm] * 2, color=color, lw=1.6)
-            axes.annotate(
-                "",
-                (x, said.value_mm - 1.4),
-                (x, said.value_mm),
-                arrowprops={"arrowstyle": "->", "color": color, "shrinkA": 0, "shrinkB": 0},
-            )
-        else:
-            axes.plot(
-                x,
-                said.value_mm,
-                marker=marker,
-                linestyle="",
-                markersize=8,
-                markerfacecolor="white",
-                markeredgecolor=color,
-                markeredgewidth=1.6,
-            )
+    if figure is None:
+        return
+    if figure.sign == "<=":
+        arrow = {"arrowstyle": "->", "color": style["color"], "shrinkA": 0, "shrinkB": 0}
+        axes.plot([x - 0.1, x + 0.1], [figure.value_mm] * 2, color=style["color"], lw=1.6)
+        axes.annotate("", (x, figure.value_mm - 1.4), (x, figure.value_mm), arrowprops=arrow)
+    else:
+        axes.plot(x, figure.value_mm, **_open_mark(style))
 
 
-def _legend(models: list[str]) -> list:
+def _open_mark(style: dict[str, Any]) -> dict[str, Any]:
+    return {
+        "marker": style["marker"], "markersize": 8, "linestyle": "", "markerfacecolor": "white",
+        "markeredgecolor": style["color"], "markeredgewidth": 1.6,
+    }  # fmt: skip
+
+
+def _variant_legend(models: list[str]) -> list[Line2D]:
     from matplotlib.lines import Line2D
 
     handles = []
     for model in models:
-        color, marker = STYLES.get(model, OTHER_STYLE)
-        handles.append(
-            Line2D([], [], color=color, marker=marker, markersize=7, lw=1.6, label=f"{model}, here")
-        )
-        handles.append(
-            Line2D(
-                [],
-                [],
-                marker=marker,
-                markersize=8,
-                linestyle="",
-                markerfacecolor="white",
-                markeredgecolor=color,
-                markeredgewidth=1.6,
-                label=f"{model}, paper (hydrogel)",
-            )
-        )
+        here, there = f"{model}, here", f"{model}, paper (hydrogel)"
+        handles.append(Line2D([], [], markersize=7, lw=1.6, label=here, **_style(model)))
+        handles.append(Line2D([], [], label=there, **_open_mark(_style(model))))
     bound = Line2D([], [], color="0.4", marker=r"$\downarrow$", markersize=9, lw=1.6)
     bound.set_label("paper: at most")
     return [*handles, bound]
 
 
-def _points(cells: list[dict], key: str) -> tuple[np.ndarray, np.ndarray]:
-    """All points of all tumors that have this key, and their errors."""
-    columns = [
-        (part[key], part["error_mm"])
-        for cell in cells
-        for part in cell["points"].values()
-        if key in part
+def severity_curves(frame: pd.DataFrame, path: Path) -> None:
+    """Hausdorff distance of each tumor against each kind's level, a panel for each kind, by the
+    rule of the table. Errors are on a logarithmic scale: what matters is by which factor they grow.
+
+    Raises:
+        StorageError: the disk refused.
+    """
+    kinds = [kind for kind in KINDS if levels_of(frame, kind)]
+    columns = min(4, max(len(kinds), 1))
+    rows = -(-max(len(kinds), 1) // columns)
+    width, height = 3.1 * columns, rows * 2.75 + 0.45
+    drawing = new_figure(width + 0.35, height)
+    panels = drawing.subplots(rows, columns, squeeze=False, sharey=True)
+    drawing.subplots_adjust(
+        left=0.6 / width, right=0.985, top=1 - 0.45 / height, bottom=0.5 / height, wspace=0.1,
+        hspace=0.38,
+    )  # fmt: skip
+    for axes, kind in zip(panels.flat, kinds, strict=False):
+        for (method,), mine in groups(frame, "method"):
+            levels = levels_of(mine, kind)
+            for tumor, dashes in zip(names(tumors(frame), "part"), _DASHES, strict=False):
+                here = [(level, rows[rows.part == tumor]) for level, rows in levels]
+                _severity_curve(axes, here, {**_style(method), "linestyle": dashes})
+        axes.set_xlabel(SEVERITIES[kind])
+        if kind in FALLING:
+            axes.invert_xaxis()
+        _tidy(axes)
+    for axes in panels.flat[len(kinds) :]:
+        axes.set_visible(False)
+    first = panels[0, 0]
+    first.set_yscale("log")
+    first.set_yticks(_TICKS_MM, [str(tick) for tick in _TICKS_MM], minor=False)
+    first.set_yticks([], minor=True)
+    low, high = first.get_ylim()
+    first.set_ylim(min(low, 0.9), max(high, 11.0))
+    for row in panels:
+        row[0].set_ylabel("tumor Hausdorff distance, mm")
+    drawing.legend(
+        handles=_severity_legend(frame), loc="upper left", bbox_to_anchor=(0.04, 1.0), ncols=4,
+        frameon=False, fontsize=10,
+    )  # fmt: skip
+    save(drawing, path)
+
+
+def _severity_curve(
+    axes: Axes, levels: list[tuple[float, pd.DataFrame]], style: dict[str, Any]
+) -> None:
+    middles, lost = [], []
+    for level, here in levels:
+        each = here.hausdorff_mm[np.isfinite(here.hausdorff_mm)]
+        if len(each) < len(here):
+            lost.append(level)
+        median = by_seed(here, "hausdorff_mm").mean()
+        if np.isfinite(median):
+            low, middle, high = (max(v, _LEAST_MM) for v in (each.min(), median, each.max()))
+            middles.append((level, middle, max(middle - low, 0.0), max(high - middle, 0.0)))
+    if middles:
+        x, y, below, above = zip(*middles, strict=True)
+        thin: dict[str, Any] = {"markersize": 5, "capsize": 2, "lw": 1.6, "elinewidth": 0.8}
+        axes.errorbar(x, y, (below, above), **thin, **style)
+    cross: dict[str, Any] = {"color": style["color"], "linestyle": "", "marker": "x"}
+    axes.plot(lost, [0.97] * len(lost), transform=axes.get_xaxis_transform(), **cross)
+
+
+def _severity_legend(frame: pd.DataFrame) -> list[Line2D]:
+    from matplotlib.lines import Line2D
+
+    handles = [
+        Line2D([], [], lw=1.6, label=label_of(method), **_style(method))
+        for method in names(frame, "method")
     ]
-    if not columns:
-        return np.zeros(0), np.zeros(0)
-    x, error = zip(*columns, strict=True)
-    return np.concatenate(x), np.concatenate(error)
+    for tumor, dashes in zip(names(tumors(frame), "part"), _DASHES, strict=False):
+        handles.append(Line2D([], [], color="0.3", linestyle=dashes, lw=1.6, label=spaced(tumor)))
+    return handles
 
 
-def _grouped(
-    x: np.ndarray, error: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Of groups of equally many points: median place, and the quartiles of the error."""
-    groups = np.array_split(np.argsort(x, kind="stable"), min(_BANDS, len(x) // (_FEWEST // 4)))
-    at = np.array([np.median(x[group]) for group in groups])
-    low, middle, high = (
-        np.array([np.percentile(error[group], q) for group in groups]) for q in (25, 50, 75)
+def gallery(jobs: list[Job], path: Path) -> None:
+    """The estimate over the truth, seen from the side: a row for each variant, a column for each
+    method of these jobs of one case.
+
+    Raises:
+        InputError: a scene cannot be read.
+        StorageError: the disk refused.
+    """
+    methods = list({id(job.method): job.method for job in jobs}.values())
+    scenes = list(dict.fromkeys((job.variant, job.view) for job in jobs))
+    total = len(scenes) * 2.75 + 1.0
+    drawing = new_figure(4.4 * len(methods) + 0.5, total)
+    panels = drawing.subplots(len(scenes), len(methods), squeeze=False)
+    drawing.subplots_adjust(
+        left=0.045, right=0.99, top=1 - 0.98 / total, bottom=0.1 / total, wspace=0.04, hspace=0.16
     )
-    return at, low, middle, high
+    bold: dict[str, Any] = {"fontweight": "bold"}
+    for axes, method in zip(panels[0], methods, strict=True):
+        label, place = label_of(method.identity["name"]), {"transform": axes.transAxes}
+        axes.text(0.5, 1.17, label, ha="center", fontsize=12, **place, **bold)
+    for row, (variant, view) in zip(panels, scenes, strict=True):
+        scene = read_scene(jobs[0].case.scene(variant, view))
+        row[0].set_ylabel(variant, fontsize=13, **bold)
+        for axes, method in zip(row, methods, strict=True):
+            estimate: Estimate | None = None
+            try:
+                estimate = method.locate(scene, jobs[0].grid).estimate
+            except (NoEstimate, InputError):
+                title = "nothing found"
+            else:
+                title = _numbers(estimate, scene)
+            draw_solid_view(axes, scene, estimate, FROM_SIDE)
+            axes.set_title(title, fontsize=9.5)
+    drawing.legend(
+        handles=scene_legend(),
+        loc="upper right",
+        ncols=4,
+        frameon=False,
+        bbox_to_anchor=(0.99, 0.999),
+    )
+    save(drawing, path)
 
 
-def tidy(axes: Axes) -> None:
+def _numbers(estimate: Estimate, scene: Scene) -> str:
+    each = [
+        f"{spaced(name)} " + (f"{part['hausdorff_mm']:.1f} mm" if part["found"] else "not found")
+        for name, part in compare(estimate, scene).items()
+        if name != ORGAN
+    ]
+    return "Hausdorff: " + ", ".join(each)
+
+
+def _tidy(axes: Axes) -> None:
     """A light grid, and no more frame than needed."""
     axes.grid(axis="y", color="0.9", linewidth=0.8)
     axes.set_axisbelow(True)
-    for side in ("top", "right"):
-        axes.spines[side].set_visible(False)
-    axes.spines["left"].set_color("0.6")
-    axes.spines["bottom"].set_color("0.6")
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.spines[["left", "bottom"]].set_color("0.6")
     axes.tick_params(color="0.6")

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import math
+from collections import Counter
 from dataclasses import asdict, dataclass, replace
 from functools import cache, cached_property
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 from jaxtyping import Float64
 
 import tumortrack
+import tumortrack_lab.cut
 from tumortrack.core.config import Config, to_builtins
 from tumortrack.core.errors import InputError, NoEstimate, NoPlan
 from tumortrack.core.estimate import Estimate
@@ -24,20 +28,41 @@ from tumortrack.registration.locator import QUERIES
 from tumortrack.simulate.scene_folder import Scene, read_scene
 from tumortrack_lab.cut.resection import VOXEL_MM, cut
 from tumortrack_lab.peers.base import Fit, estimate_of
-from tumortrack_lab.study.cells import provenance
-from tumortrack_lab.study.measure import Job, StudyCase
-from tumortrack_lab.study.methods import Answer, Method
+from tumortrack_lab.study.cases import StudyCase
+from tumortrack_lab.study.document import table
+from tumortrack_lab.study.frame import EMPTY, NOTHING, groups, names, ordered
+from tumortrack_lab.study.measure import Job, about_answer
+from tumortrack_lab.study.methods import Answer, Method, code_sha256
 from tumortrack_lab.study.paper import tumor_lies
-from tumortrack_lab.study.peer_methods import code_sha256
 
 TRUTH = "truth"
 _FINE = 256  # voxels along the true organ: its points' labels err by 0.2 mm
 MARGIN_MM = 5.0  # the paper's
 SIGMAS = 2.0
-_PLANNING = (
-    "config", "exophytic", "located", "margin", "margin_kernels", "outline", "published",
-    "resection", "values",
+_WHOLE = 0.999  # of a tumor: what is missing is a voxel's rounding
+_HEAD = (
+    "located by", "planner", "plans", "piece comes free", "tumor whole in the piece",
+    "tumor removed, %: median", "worst", "tumor left, ml: worst",
+    "margin kept, mm: median", "worst", "healthy tissue, ml: mean",
 )  # fmt: skip
+_RESULTS = ["detached", "removed_share", "left_ml", "margin_mm", "healthy_ml", "hurt"]
+RULE = (
+    "Each exophytic tumor (one whose own surface is the organ's over 5 % or more, in the CT) of "
+    "each scene is planned on the estimate, and the plan is carried out on the true organ of that "
+    "scene, as in `evaluate/resection.py`: voxels of 0.5 mm, severed only where a stroke or a "
+    "level sheet passes. Removed is what comes away within the piece that the strokes enclose: "
+    "what stays, or falls off beside it, is left; a piece that still hangs by 2 mm² of tissue or "
+    f"more has not come free, and nothing of it is removed. Whole: {100 * _WHOLE:g} % or more. "
+    "Margin kept: least distance from the cut's surface within tissue to the true tumor; negative: "
+    "so deep did the cut go into it. Healthy tissue: with the pieces that came free. Numbers are "
+    "of the plans that were made, tumors' shares rounded down. Truth: planned on the true organ, "
+    f"the bound. Margins are {MARGIN_MM:g} mm; “+ {SIGMAS:g} sd”: and {SIGMAS:g} standard "
+    "deviations of the estimate more, at each place of the tumor's surface; with the paper's "
+    "planner, which has one margin, as many as the least certain place needs. Left out: tissue "
+    "does not move or give way while it is cut, nobody pulls at the piece, the instrument takes "
+    "no tissue with it, and it reaches all of a level sheet below the piece, of which the paper's "
+    "planner gives the outline alone."
+)
 
 
 class Planner(Config, frozen=True):
@@ -49,9 +74,18 @@ class Planner(Config, frozen=True):
     margin_mm: float = MARGIN_MM
 
     @property
-    def name(self) -> str:
+    def _rest(self) -> str:
         more = f" + {self.sigmas:g} sd" if self.sigmas else ""
-        return f"{self.method}, {self.margin_mm:g} mm{more}"
+        return f", {self.margin_mm:g} mm{more}"
+
+    @property
+    def name(self) -> str:
+        return self.method + self._rest
+
+    @property
+    def label(self) -> str:
+        """For readers."""
+        return ("the paper's" if self.method == "published" else "ours") + self._rest
 
     def config(self, found: Located, tumor: str) -> ResectionConfig:
         """The paper's planner has one margin for all of the tumor: it is given what the least
@@ -70,16 +104,11 @@ class Truth(Method):
     """Answers what is so: the bound of every planner."""
 
     name: str = TRUTH
-    device: str = "cpu"
     prepare_s: float | None = None
 
     @property
     def identity(self) -> dict:
         return {"kind": "bound", "name": self.name, "tumortrack": tumortrack.__version__}
-
-    @property
-    def about(self) -> dict:
-        return {"prepare_s": None}
 
     def locate(self, scene: Scene, grid: int) -> Answer:
         still = Fit(lambda points: points, 0.0)
@@ -104,7 +133,7 @@ def scattered(estimate: Estimate) -> Estimate:
 
 @dataclass(frozen=True, eq=False)
 class Cutting(Method):
-    """A method whose estimates are planned on and cut: another cell than its accuracy's."""
+    """A method whose estimates are planned on and cut: measured apart from its accuracy."""
 
     inner: Method
 
@@ -130,45 +159,45 @@ class Cutting(Method):
         return self.inner.locate(scene, grid)
 
 
-def cut_one(job: Job, name: str) -> dict:
-    """One cell: ``plans`` by tumor and planner; what the cut did, or why there is none.
+@cache
+def _code_sha256() -> str:
+    """Of what plans and cuts."""
+    folders = Path(tumortrack.__file__).parent / "plan", Path(tumortrack_lab.cut.__path__[0])
+    return code_sha256(path for folder in folders for path in folder.glob("*.py"))
+
+
+def cut_one(job: Job) -> dict:
+    """One measurement: ``plans`` by tumor and planner; what the cut did, or why there is none.
 
     Raises:
         InputError: a scene that does not say where the table is.
     """
-    scene = read_scene(job.case.scene(job.variant, job.view))
-    table_from_camera = table_of(scene, name)
+    scene = read_scene(job.scene)
+    table_from_camera = table_of(scene, job.scene.name)
     truth = Anatomy(
         tuple(
             part.moved(transform_points(table_from_camera, part.vertices_mm))
             for part in scene.reference.parts
         )
     )
-    failed, answer = None, None
-    plans: dict[str, dict] = {}
+    failed, answer, found = None, None, None
     try:
         answer = job.method.locate(scene, job.grid)
     except (NoEstimate, InputError) as error:
         failed = str(error)
-    for tumor in exophytic_tumors(job.case):
-        if answer is None:
-            plans[tumor] = {planner.name: {"refused": failed} for planner in PLANNERS}
-            continue
+    else:
         estimate = answer.estimate
         found = located(estimate.cloud, estimate.meshes, estimate.motion, table_from_camera)
+    plans: dict[str, dict] = {}
+    for tumor in exophytic_tumors(job.case):
         plans[tumor] = {
             planner.name: planned_and_cut(truth, found, planner, tumor)
+            if found
+            else {"refused": failed}
             for planner in PLANNERS
-            if not planner.sigmas or found.std_mm  # others know no uncertainty
+            if not found or not planner.sigmas or found.std_mm  # others know no uncertainty
         }
-    return {
-        "plans": plans,
-        "failed": failed,
-        "frame_s": answer.frame_s if answer else None,
-        "prepare_s": job.method.prepare_s,
-        "method": job.method.about,
-        "provenance": provenance(job.method.device),
-    }
+    return {"plans": plans, "failed": failed, **about_answer(job, answer)}
 
 
 def planned_and_cut(truth: Anatomy, found: Located, planner: Planner, tumor: str) -> dict:
@@ -196,10 +225,79 @@ def exophytic_tumors(case: StudyCase) -> tuple[str, ...]:
     return tuple(name for name, lie in lies.items() if lie.kind == "exophytic")
 
 
-@cache
-def _code_sha256() -> str:
-    """Of what plans and cuts."""
-    package = Path(tumortrack.__file__).parent
-    paths = [package / "plan" / f"{name}.py" for name in _PLANNING]
-    paths += [package / "evaluate" / f"{name}.py" for name in ("resection", "severing")]
-    return code_sha256(paths)
+def tidy_plans(measurements: list[dict]) -> pd.DataFrame:
+    """One row for each plan, made or ``refused``: the truth's last, planners in their order."""
+    rows = [
+        {"case": one["spec"]["case"], "method": one["spec"]["method"]["name"], "planner": name}
+        | entry
+        for one in measurements
+        for plans in one["plans"].values()
+        for name, entry in plans.items()
+    ]
+    frame = pd.DataFrame(rows).reindex(columns=["case", "method", "planner", "refused", *_RESULTS])
+    numbers = ["removed_share", "left_ml", "margin_mm", "healthy_ml"]
+    frame[numbers] = frame[numbers].astype(float)
+    planners = pd.Categorical(frame.planner, [planner.name for planner in PLANNERS])
+    methods = sorted(frame.method.unique(), key=lambda name: name == TRUTH)
+    frame = frame.assign(planner=planners, method=pd.Categorical(frame.method, methods))
+    return ordered(frame, ["case"])
+
+
+def tables_of(measurements: list[dict]) -> str:
+    """Pooled over the cases; each case; and why there was no plan, where there was none."""
+    frame = tidy_plans(measurements)
+    texts = ["All cases:", table(_HEAD, _rows(frame), left=2)]
+    if len(names(frame, "case")) > 1:
+        each = [
+            [case if number == 0 else EMPTY, *row]
+            for (case,), mine in groups(frame, "case")
+            for number, row in enumerate(_rows(mine))
+        ]
+        texts += ["Each case:", table(("case", *_HEAD), each, left=3)]
+    refused = Counter(
+        f"{method}, {_label(planner)}: {reason}"
+        for (method, planner), plans in groups(frame, "method", "planner")
+        for reason in plans.refused.dropna()
+    )
+    reasons = " ".join(f"{count} x {why}" for why, count in refused.items())
+    made = frame[frame.refused.isna()]
+    texts.append(f"Refused: {reasons}" if refused else "No plan was refused.")
+    texts.append(f"Cuts into another tumor: {made.hurt.map(bool).sum()} of {len(made)}.")
+    return "\n\n".join(texts)
+
+
+def _rows(frame: pd.DataFrame) -> list[list[str]]:
+    return [
+        [method, _label(planner), *_texts(plans)]
+        for (method, planner), plans in groups(frame, "method", "planner")
+    ]
+
+
+def _label(planner: str) -> str:
+    return next(one.label for one in PLANNERS if one.name == planner)
+
+
+def _texts(plans: pd.DataFrame) -> list[str]:
+    """One planner on the estimates of one method."""
+    made = plans[plans.refused.isna()]
+    free = made[made.detached.astype(bool)]
+    removed = 100 * made.removed_share
+    return [
+        f"{len(made)} of {len(plans)}",
+        f"{len(free)} of {len(made)}",
+        f"{(made.removed_share >= _WHOLE).sum()} of {len(made)}",
+        _text(removed.median(), down=True),
+        _text(removed.min(), down=True),
+        _text(made.left_ml.max(), digits=2),
+        _text(made.margin_mm.median()),
+        _text(made.margin_mm.min()),
+        _text(free.healthy_ml.mean()),
+    ]
+
+
+def _text(value: float, digits: int = 1, down: bool = False) -> str:
+    if math.isnan(value):
+        return NOTHING
+    if down:
+        value = math.floor(round(value * 10**digits, 6)) / 10**digits
+    return f"{value + 0.0:.{digits}f}"

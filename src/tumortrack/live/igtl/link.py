@@ -1,8 +1,8 @@
-"""OpenIGTLink over TCP to many receivers, of whom none can hold up the sender.
+"""OpenIGTLink over TCP to many receivers, none of which can delay the sender.
 
-One thread serves all sockets. What a receiver has not taken yet is replaced by what is newer, type
-and device by type and device, so that a slow one skips messages and loses no last word: each
-holds at most one message of each kind, besides the one that is on its way.
+One thread serves all sockets. A message that a receiver has not taken yet is replaced by the next
+one of its type and device. So a slow receiver skips messages and still gets the last ones; at most
+one of each type and device waits for it, besides the one that is being sent.
 """
 
 from __future__ import annotations
@@ -15,24 +15,26 @@ import time
 from dataclasses import dataclass, field
 
 from tumortrack.core.errors import InputError
-from tumortrack.live.igtl.content import CHECKSUM_ERROR, IgtlStatus, pack_status
-from tumortrack.live.igtl.crc64 import crc64
 from tumortrack.live.igtl.message import (
+    CHECKSUM_ERROR,
     HEADER_SIZE,
     Header,
+    IgtlStatus,
     Message,
     ProtocolError,
+    check_body,
+    crc64,
     pack,
-    unpack,
+    pack_status,
     unpack_header,
 )
 
 _LARGEST_REQUEST = 2**16  # bytes; what a receiver sends is small
 _MOST_ANSWERS = 100  # that wait for a receiver: one that only asks gets no more
 _STALLED_S = 10.0  # a receiver that takes nothing for so long is gone
-_AGAIN_S = 1.0  # between tries to connect
-_AT_ONCE = 2**18  # bytes handed to the socket in one go
-_BUFFER = 2**19  # of the socket: about one update, so that what waits there is not old
+_RETRY_S = 1.0  # between tries to connect
+_PIECE = 2**18  # bytes handed to the socket in one go
+_BUFFER = 2**19  # of the socket: about one result, so that what waits there is not old
 
 Key = tuple[str, str]  # type and device
 
@@ -44,7 +46,7 @@ class _Receiver:
     waiting: dict[Key, bytes] = field(default_factory=dict)
     sending: memoryview = field(default_factory=lambda: memoryview(b""))
     received: bytearray = field(default_factory=bytearray)
-    moved_s: float = field(default_factory=time.monotonic)
+    progress_s: float = field(default_factory=time.monotonic)
 
     @property
     def busy(self) -> bool:
@@ -58,32 +60,32 @@ class Link:
     otherwise it is the server on ``host``.
 
     Raises:
-        InputError: the port is taken, or the host's name is unknown.
+        InputError: the port is taken, the host's name is unknown, or fastcrc is missing.
     """
 
     def __init__(self, host: str, port: int, connect: str = "") -> None:
+        crc64(b"")  # a missing package is reported before anything is opened
         self._lock = threading.Lock()
         self._newest: dict[Key, bytes] = {}
         self._receivers: dict[socket.socket, _Receiver] = {}
-        self._goal = _known(connect, port) if connect else None
-        self._try_s = 0.0
+        self._server = _checked(connect, port) if connect else None
+        self._next_try_s = 0.0
         self._closing = False
         self._selector = selectors.DefaultSelector()
         self._listener = None if connect else _listen(host, port)
         if self._listener is not None:
             self._selector.register(self._listener, selectors.EVENT_READ)
-        self._wake, self._woken = socket.socketpair()
-        self._wake.setblocking(False)
-        self._woken.setblocking(False)
-        self._selector.register(self._woken, selectors.EVENT_READ)
-        crc64(b"")  # compiled before there is anything to wait for
+        self._wake_writer, self._wake_reader = socket.socketpair()
+        self._wake_writer.setblocking(False)
+        self._wake_reader.setblocking(False)
+        self._selector.register(self._wake_reader, selectors.EVENT_READ)
         self._thread = threading.Thread(target=self._run, name="openigtlink", daemon=True)
         self._thread.start()
 
     @property
     def port(self) -> int:
         """The server's port; that of ``connect`` otherwise."""
-        return self._listener.getsockname()[1] if self._listener else self._goal[1]  # type: ignore[index]
+        return self._listener.getsockname()[1] if self._listener else self._server[1]  # type: ignore[index]
 
     @property
     def receivers(self) -> int:
@@ -101,7 +103,7 @@ class Link:
             self._newest.update(packed)
             for receiver in self._receivers.values():
                 receiver.waiting.update(packed)
-        self._nudge()
+        self._wake_thread()
 
     def close(self, patience_s: float = 1.0) -> None:
         """Let receivers take what waits for them, for so long at most, and go; may be called
@@ -113,45 +115,45 @@ class Link:
                     break
             time.sleep(0.01)
         self._closing = True
-        self._nudge()
+        self._wake_thread()
         self._thread.join()
 
-    def _nudge(self) -> None:
+    def _wake_thread(self) -> None:
         with contextlib.suppress(OSError):  # full: it is awake already; closed: it is over
-            self._wake.send(b"x")
+            self._wake_writer.send(b"x")
 
     def _run(self) -> None:
         while not self._closing:
-            if self._goal is not None and not self._receivers:
-                self._reach(self._goal)
+            if self._server is not None and not self._receivers:
+                self._connect(self._server)
             for key, events in self._selector.select(0.2):
-                if key.fileobj is self._woken:
-                    self._woken.recv(4096)
+                if key.fileobj is self._wake_reader:
+                    self._wake_reader.recv(4096)
                 elif key.fileobj is self._listener:
                     self._accept()
                 elif (receiver := self._receivers.get(key.fileobj)) is not None:  # type: ignore[call-overload]
                     self._serve(receiver, events)
-            self._look_round()
+            self._update_interest()
         for receiver in list(self._receivers.values()):
             self._drop(receiver)
-        for one in (self._listener, self._wake, self._woken, self._selector):
+        for one in (self._listener, self._wake_writer, self._wake_reader, self._selector):
             if one is not None:
                 one.close()
 
-    def _reach(self, goal: tuple[str, int]) -> None:
-        if time.monotonic() < self._try_s:
+    def _connect(self, server: tuple[str, int]) -> None:
+        if time.monotonic() < self._next_try_s:
             return
-        self._try_s = time.monotonic() + _AGAIN_S
+        self._next_try_s = time.monotonic() + _RETRY_S
         with contextlib.suppress(OSError):  # not there yet
-            self._welcome(socket.create_connection(goal, timeout=_AGAIN_S), goal[0])
+            self._add(socket.create_connection(server, timeout=_RETRY_S), server[0])
 
     def _accept(self) -> None:
         assert self._listener is not None
         with contextlib.suppress(OSError):  # gone before it was let in
             one, address = self._listener.accept()
-            self._welcome(one, str(address[0]))
+            self._add(one, str(address[0]))
 
-    def _welcome(self, one: socket.socket, name: str) -> None:
+    def _add(self, one: socket.socket, name: str) -> None:
         one.setblocking(False)
         one.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         one.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _BUFFER)
@@ -165,15 +167,15 @@ class Link:
         self._selector.unregister(receiver.socket)
         receiver.socket.close()
 
-    def _look_round(self) -> None:
-        """Ask to be told when those with something waiting can take more; drop the dead."""
+    def _update_interest(self) -> None:
+        """Wait for receivers that have something to take; drop the dead ones."""
         now = time.monotonic()
         for receiver in list(self._receivers.values()):
             with self._lock:
                 busy = receiver.busy
             if not busy:
-                receiver.moved_s = now
-            elif now - receiver.moved_s > _STALLED_S:
+                receiver.progress_s = now
+            elif now - receiver.progress_s > _STALLED_S:
                 self._drop(receiver)
                 continue
             wanted = selectors.EVENT_READ | (selectors.EVENT_WRITE if busy else 0)
@@ -183,26 +185,26 @@ class Link:
     def _serve(self, receiver: _Receiver, events: int) -> None:
         try:
             if events & selectors.EVENT_READ:
-                self._hear(receiver)
+                self._receive(receiver)
             if events & selectors.EVENT_WRITE:
-                self._tell(receiver)
+                self._send_waiting(receiver)
         except BlockingIOError:
             pass  # it was only nearly ready
         except (OSError, ProtocolError):
             self._drop(receiver)  # gone, or it speaks another language
 
-    def _tell(self, receiver: _Receiver) -> None:
+    def _send_waiting(self, receiver: _Receiver) -> None:
         if not receiver.sending:
             with self._lock:
                 if not receiver.waiting:
                     return
                 key = next(iter(receiver.waiting))
                 receiver.sending = memoryview(receiver.waiting.pop(key))
-        sent = receiver.socket.send(receiver.sending[:_AT_ONCE])
+        sent = receiver.socket.send(receiver.sending[:_PIECE])
         receiver.sending = receiver.sending[sent:]
-        receiver.moved_s = time.monotonic()
+        receiver.progress_s = time.monotonic()
 
-    def _hear(self, receiver: _Receiver) -> None:
+    def _receive(self, receiver: _Receiver) -> None:
         data = receiver.socket.recv(65536)
         if not data:
             raise ConnectionError("closed by the receiver")
@@ -226,24 +228,24 @@ class Link:
         where there is none. To STT_...: done, since everything is sent anyway; to STP_...: not
         done. Whatever else comes is not for us."""
         try:
-            asked = unpack(header, body)
+            check_body(header, body)
         except ProtocolError as error:
             wrong = IgtlStatus(CHECKSUM_ERROR, "checksum", str(error))
             return {("STATUS", ""): pack(Message("STATUS", "", 0, pack_status(wrong)))}
-        verb, _, kind = asked.type.partition("_")
+        verb, _, kind = header.type.partition("_")
         if not kind or verb not in ("GET", "STT", "STP"):
             return {}
         if verb != "GET":
-            answer = Message(f"RTS_{kind}", asked.device, 0, bytes([verb == "STP"]))
+            answer = Message(f"RTS_{kind}", header.device, 0, bytes([verb == "STP"]))
             return {(answer.type, answer.device): pack(answer)}
         with self._lock:
             # The type may be cut to fit: GET_TRANSFOR, GET_TRANS.
             found = {
                 (full, device): message
                 for (full, device), message in self._newest.items()
-                if full.startswith(kind) and asked.device in ("", device)
+                if full.startswith(kind) and header.device in ("", device)
             }
-        return found or {(kind, asked.device): pack(Message(kind, asked.device))}
+        return found or {(kind, header.device): pack(Message(kind, header.device))}
 
 
 def _listen(host: str, port: int) -> socket.socket:
@@ -256,7 +258,7 @@ def _listen(host: str, port: int) -> socket.socket:
         ) from error
 
 
-def _known(host: str, port: int) -> tuple[str, int]:
+def _checked(host: str, port: int) -> tuple[str, int]:
     try:
         socket.getaddrinfo(host, port)
     except (OSError, ValueError) as error:

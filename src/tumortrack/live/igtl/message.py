@@ -1,9 +1,10 @@
-"""A message's frame: header, extended header, metadata and checksum; contents are in ``content``.
+"""OpenIGTLink messages as bytes: header, extended header, content, metadata and checksum.
 
 Header version 2 (protocol 3), which 3D Slicer (since 4.7), PLUS and pyigtl read: version 1 has no
 metadata, so nothing could say in which frame a place is given or that a transform is missing.
-Version 1 is read too, since clients' requests come in it. All numbers are big-endian.
-Source: the protocol's Documents/Protocol/header.md and timestamp.md.
+Headers of version 1 are read too, since clients' requests come in it. All numbers are big-endian.
+Source: the protocol's Documents/Protocol: header.md, timestamp.md, transform.md, status.md,
+polydata.md.
 """
 
 from __future__ import annotations
@@ -12,8 +13,10 @@ import struct
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+import numpy as np
+from jaxtyping import Float, Int, Num
+
 from tumortrack.core.errors import InputError
-from tumortrack.live.igtl.crc64 import crc64
 
 HEADER_SIZE = 58
 _HEADER = struct.Struct("> H 12s 20s Q Q Q")
@@ -21,6 +24,12 @@ _EXTENDED = struct.Struct("> H H I I")
 _ENTRY = struct.Struct("> H H I")
 _ASCII, _UTF8 = 3, 106  # IANA's numbers of character sets
 _NS = 1_000_000_000
+# STATUS codes
+OK, NOT_FOUND, CHECKSUM_ERROR, NOT_READY, NOT_PRESENT, EXITING = 1, 4, 9, 13, 16, 19
+_STATUS = struct.Struct("> H q 20s")
+_POLYDATA = struct.Struct("> 10I")
+_ATTRIBUTE = struct.Struct("> B B I")
+_POINT_SCALARS = 0x00
 
 
 class ProtocolError(InputError):
@@ -98,31 +107,29 @@ def unpack_header(data: bytes) -> Header:
     return Header(version, names[0], names[1], (stamp * _NS + (1 << 31)) >> 32, size, crc)
 
 
-def unpack(header: Header, body: bytes) -> Message:
-    """The message of a header and the body that followed it.
-
-    Raises:
-        ProtocolError: a wrong length or checksum, or sizes inside that do not fit.
-    """
+def check_body(header: Header, body: bytes) -> None:
+    """Raises ProtocolError if the body that followed a header has a wrong length or checksum."""
     if len(body) != header.body_size:
         raise ProtocolError(
             f"{header.type}: the body has {len(body)} bytes; its header says {header.body_size}."
         )
     if crc64(body) != header.crc:
         raise ProtocolError(f"{header.type} of {header.device!r}: its checksum is wrong (damaged).")
-    content, metadata = body, {}
-    if header.version > 1:
-        try:
-            size, keys_size, values_size, _ = _EXTENDED.unpack_from(body)
-        except struct.error as error:
-            raise ProtocolError(f"{header.type}: its extended header is cut short.") from error
-        end = len(body) - keys_size - values_size
-        if not _EXTENDED.size <= size <= end:
-            raise ProtocolError(f"{header.type}: its extended header's sizes do not fit.")
-        content = body[size:end]
-        if keys_size:
-            metadata = _read_metadata(body[end : end + keys_size], body[end + keys_size :])
-    return Message(header.type, header.device, header.stamp_ns, content, metadata)
+
+
+def crc64(data: bytes) -> int:
+    """CRC-64 of ECMA-182 (1992), annex B: register 0 at the start, nothing reversed.
+
+    Raises:
+        InputError: fastcrc is not installed.
+    """
+    try:
+        from fastcrc.crc64 import ecma_182
+    except ImportError as error:
+        raise InputError(
+            "OpenIGTLink needs the package fastcrc: pip install 'tumortrack[live]'."
+        ) from error
+    return ecma_182(data)
 
 
 def _name(text: str, size: int, what: str) -> bytes:
@@ -149,18 +156,62 @@ def _packed_metadata(metadata: Mapping[str, str]) -> tuple[bytes, bytes]:
     return b"".join(index), b"".join(texts)
 
 
-def _read_metadata(index: bytes, texts: bytes) -> dict[str, str]:
-    found, at = {}, 0
-    try:
-        (count,) = struct.unpack_from("> H", index)
-        for n in range(count):
-            key_size, charset, value_size = _ENTRY.unpack_from(index, 2 + n * _ENTRY.size)
-            key = texts[at : at + key_size].decode("ascii")
-            value = texts[at + key_size : at + key_size + value_size]
-            at += key_size + value_size
-            found[key] = value.decode("utf-8" if charset == _UTF8 else "latin-1")
-    except (struct.error, UnicodeDecodeError) as error:
-        raise ProtocolError(f"the message's metadata are damaged: {error}.") from error
-    if at != len(texts):
-        raise ProtocolError(f"the metadata's sizes add up to {at} of {len(texts)} bytes.")
-    return found
+@dataclass(frozen=True)
+class IgtlStatus:
+    """How the sender is: ``code`` 1 is well; ``name`` at most 20 characters."""
+
+    code: int
+    name: str
+    text: str
+    sub_code: int = 0
+
+
+@dataclass(frozen=True, eq=False)
+class Polydata:
+    """Points (n, 3) and cells over them; ``scalars``: one number a point, by name.
+
+    ``triangles`` (f, 3) and ``segments`` (s, 2) hold point numbers.
+    """
+
+    points: Float[np.ndarray, "n 3"]
+    triangles: Int[np.ndarray, "f 3"]
+    segments: Int[np.ndarray, "s 2"] = field(default_factory=lambda: np.zeros((0, 2), np.int32))
+    scalars: dict[str, Num[np.ndarray, " n"]] = field(default_factory=dict)
+
+
+def pack_transform(b_from_a: Float[np.ndarray, "4 4"]) -> bytes:
+    """Its upper three rows, column by column, float32."""
+    return np.asarray(b_from_a)[:3].T.astype(">f4").tobytes()
+
+
+def pack_status(status: IgtlStatus) -> bytes:
+    """The text ends with a zero byte, as the protocol's own library writes it."""
+    name = status.name.encode("ascii", "replace")[:20]
+    return _STATUS.pack(status.code, status.sub_code, name) + status.text.encode() + b"\0"
+
+
+def pack_polydata(data: Polydata) -> bytes:
+    """Triangles are sent as polygons, segments as lines."""
+    lines, polygons = _cells(data.segments), _cells(data.triangles)
+    head = _POLYDATA.pack(
+        len(data.points),
+        *(0, 0),  # vertices: 3D Slicer's reader writes past its memory at the second one
+        *(len(data.segments), len(lines)),
+        *(len(data.triangles), len(polygons)),
+        *(0, 0),  # triangle strips
+        len(data.scalars),
+    )
+    points = np.asarray(data.points).astype(">f4").tobytes()
+    kinds = [_ATTRIBUTE.pack(_POINT_SCALARS, 1, len(values)) for values in data.scalars.values()]
+    names = b"".join(name.encode("ascii") + b"\0" for name in data.scalars)
+    values = [np.asarray(values).astype(">f4").tobytes() for values in data.scalars.values()]
+    padding = bytes(len(names) % 2)
+    return b"".join((head, points, lines, polygons, *kinds, names, padding, *values))
+
+
+def _cells(cells: np.ndarray) -> bytes:
+    """Each cell as its number of points and their numbers."""
+    count, size = cells.shape
+    out = np.empty((count, 1 + size), ">u4")
+    out[:, 0], out[:, 1:] = size, cells
+    return out.tobytes()

@@ -1,28 +1,36 @@
 """ROS bags as recordings: rosbag2 (.mcap, .db3, folders of them) and ROS 1 (.bag), by rosbags.
 
-Messages are read by the types that are known here, never by definitions that the bag brings along:
-those would become code.
+Messages are read by the types that are known here, never by definitions from the bag: those would
+become code.
 """
 
 from __future__ import annotations
 
+import io
+import struct
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 from tumortrack.core.errors import InputError, TumortrackError
-from tumortrack.live.recording.cut_mcap import is_whole, open_cut
-from tumortrack.live.recording.shots import Content, Shot, refuse
-from tumortrack.live.ros.incoming import CAMERA_INFO, CLOUD, IMAGE, cloud_of, depth_of, mask_of
+from tumortrack.live.recording import RecordedFrame
 from tumortrack.live.ros.messages import Messages, stamp_of
+from tumortrack.live.ros.sensors import CAMERA_INFO, CLOUD, IMAGE, cloud_of, depth_of, mask_of
+from tumortrack.live.values import Observation
 
 SUFFIXES = (".mcap", ".db3", ".bag")
 ESTIMATES = "/tumortrack/"  # topics of our own estimates, which are no input
 MASK_TOPIC = "/camera/mask"
 _REALSENSE = "/device_0/"  # how the RealSense SDK names all its topics
+# https://mcap.dev/spec
+_MAGIC = b"\x89MCAP0\r\n"
+_DATA_END = 0x0F
+_LAST_OPCODE = 0x0F
+# An empty DataEnd, then a footer of three zeros: where a summary would start, and its checksum.
+_ENDING = struct.pack("<BQI", _DATA_END, 4, 0) + struct.pack("<BQQQI", 0x02, 20, 0, 0, 0) + _MAGIC
 _DEPTHS = ("16UC1", "mono16", "32FC1")
 
 
@@ -30,7 +38,7 @@ _DEPTHS = ("16UC1", "mono16", "32FC1")
 class BagChoice:
     """Which topics, and how their depth images are meant; an empty topic: the only one there is.
 
-    ``rectified`` and ``unit_mm`` as in ``ros.incoming.depth_of``.
+    ``rectified`` and ``unit_mm`` as in ``ros.sensors.depth_of``.
     """
 
     topic: str = ""
@@ -44,7 +52,7 @@ def is_bag(path: Path) -> bool:
     return (path / "metadata.yaml").is_file() or bool(_files(path))
 
 
-class BagReel:
+class BagRecording:
     """An open bag: depth images, each with the camera_info that came last and the mask of its own
     stamp, or clouds.
 
@@ -73,7 +81,7 @@ class BagReel:
             with suppress(AssertionError):  # of rosbags: it was not open
                 reader.close()
 
-    def shots(self) -> Iterator[Shot]:
+    def frames(self) -> Iterator[RecordedFrame]:
         images = bool(self._info_topic)
         info = self._first(self._info_topic) if images else None
         mask: Any = None
@@ -84,24 +92,28 @@ class BagReel:
                 info, mask = (info, message) if topic == MASK_TOPIC else (message, mask)
                 continue
             if waiting is not None:
-                yield self._image_shot(waiting, info, mask)
+                yield self._image_frame(waiting, info, mask)
                 waiting = None
             if isinstance(message, InputError):
-                yield Shot(last_ns, partial(refuse, message))
+                yield RecordedFrame(last_ns, partial(_refuse, message))
                 continue
             last_ns = stamp_of(message.header)
             if images:
                 waiting = message
             else:
-                yield Shot(last_ns, partial(_cloud, message))
+                yield RecordedFrame(last_ns, partial(_cloud, message))
         if waiting is not None:
-            yield self._image_shot(waiting, info, mask)
+            yield self._image_frame(waiting, info, mask)
 
-    def _image_shot(self, image: Any, info: Any, mask: Any) -> Shot:
+    def _image_frame(self, image: Any, info: Any, mask: Any) -> RecordedFrame:
         stamp_ns = stamp_of(image.header)
-        if mask is not None and stamp_of(mask.header) != stamp_ns:
-            mask = None
-        return Shot(stamp_ns, partial(_frame, image, info, mask, self._choice))
+
+        def load() -> Observation:
+            frame = depth_of(image, info, self._choice.rectified, self._choice.unit_mm)
+            here = mask is not None and stamp_of(mask.header) == stamp_ns
+            return Observation(frame, 0, mask_of(mask) if here else None)
+
+        return RecordedFrame(stamp_ns, load)
 
     def _all(self, topics: set[str]) -> Iterator[tuple[str, Any]]:
         """Topic and message in the order of their recording; without a topic an InputError, where
@@ -202,9 +214,13 @@ def _open(path: Path) -> Any:
     from rosbags.rosbag2 import Reader as Reader2
 
     kind = path.suffix.lower() if path.is_file() else ""
-    if kind == ".mcap" and not is_whole(path):
-        return open_cut(path)
-    reader: Any = Reader1(path) if kind == ".bag" else Reader2(path)
+    reader: Any
+    if kind == ".mcap" and not _is_whole(path):
+        from rosbags.rosbag2.storage_mcap import McapReader
+
+        reader = McapReader(_CutMcap(path))  # type: ignore[arg-type]
+    else:
+        reader = Reader1(path) if kind == ".bag" else Reader2(path)
     reader.open()
     return reader
 
@@ -221,10 +237,79 @@ def _guarded(path: Path, step: Callable[[], Any]) -> Any:
         ) from error
 
 
-def _cloud(message: Any) -> Content:
-    return Content(cloud_of(message))
+def _cloud(message: Any) -> Observation:
+    return Observation(cloud_of(message), 0)
 
 
-def _frame(image: Any, info: Any, mask: Any, choice: BagChoice) -> Content:
-    frame = depth_of(image, info, choice.rectified, choice.unit_mm)
-    return Content(frame, None if mask is None else mask_of(mask))
+def _refuse(error: InputError) -> NoReturn:
+    raise error
+
+
+def _is_whole(path: Path) -> bool:
+    """Whether the file ends as it should; of one without a beginning too, which is no MCAP."""
+    with path.open("rb") as stream:
+        begins = stream.read(len(_MAGIC)) == _MAGIC
+        size = stream.seek(0, io.SEEK_END)
+        stream.seek(max(size - len(_MAGIC), 0))
+        return not begins or (size > len(_MAGIC) and stream.read() == _MAGIC)
+
+
+class _CutMcap(io.RawIOBase):
+    """An MCAP file without an end, as a killed recorder or a full disk leaves it, with an end.
+
+    A file is magic, records (opcode, length, content), footer, magic; readers begin at the footer.
+    Here the whole records get a footer that says "no index", in memory, so that the library reads
+    them from first to last; the file stays as it is. To the library this is the file's path.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._stream = path.open("rb")
+        self._kept = _end_of_records(self._stream)
+        self._at = 0
+
+    def open(self, mode: str) -> io.BufferedReader:
+        return io.BufferedReader(self)
+
+    def __str__(self) -> str:
+        return self._stream.name
+
+    def readable(self) -> bool:
+        return True
+
+    def seekable(self) -> bool:
+        return True
+
+    def seek(self, offset: int, whence: int = io.SEEK_SET) -> int:
+        start = {io.SEEK_SET: 0, io.SEEK_CUR: self._at, io.SEEK_END: self._kept + len(_ENDING)}
+        self._at = max(start[whence] + offset, 0)
+        return self._at
+
+    def readinto(self, buffer: Any) -> int:
+        if self._at < self._kept:
+            self._stream.seek(self._at)
+            got = self._stream.read(min(len(buffer), self._kept - self._at))
+        else:
+            begin = self._at - self._kept
+            got = _ENDING[begin : begin + len(buffer)]
+        buffer[: len(got)] = got
+        self._at += len(got)
+        return len(got)
+
+    def close(self) -> None:
+        self._stream.close()
+        super().close()
+
+
+def _end_of_records(stream: io.BufferedReader) -> int:
+    """Behind the last record that is there from its first to its last byte."""
+    size = stream.seek(0, io.SEEK_END)
+    end = len(_MAGIC)
+    while True:
+        stream.seek(end)
+        head = stream.read(9)
+        if len(head) < 9 or not 0 < head[0] < _LAST_OPCODE:
+            return end
+        beyond = end + 9 + int.from_bytes(head[1:], "little")
+        if beyond > size:
+            return end
+        end = beyond

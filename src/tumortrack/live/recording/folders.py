@@ -16,7 +16,8 @@ from tumortrack.core.errors import InputError
 from tumortrack.core.mesh_files import read_anatomy
 from tumortrack.core.store import read_json
 from tumortrack.core.types import DepthFrame, SensorCloud
-from tumortrack.live.recording.shots import Content, Shot
+from tumortrack.live.recording import RecordedFrame
+from tumortrack.live.values import Observation
 from tumortrack.sense.files import CLOUD_SUFFIXES, read_cloud, read_depth_png
 
 TIMES, INTRINSICS = "times.csv", "intrinsics.json"
@@ -36,19 +37,19 @@ Frame = DepthFrame | SensorCloud
 
 
 @dataclass(frozen=True)
-class FolderReel:
+class FolderRecording:
     """Frames in files: nothing is read before its turn."""
 
-    all_shots: tuple[Shot, ...]
+    all_frames: tuple[RecordedFrame, ...]
 
-    def shots(self) -> Iterator[Shot]:
-        return iter(self.all_shots)
+    def frames(self) -> Iterator[RecordedFrame]:
+        return iter(self.all_frames)
 
     def close(self) -> None:
         """Nothing is held open."""
 
 
-def open_folder(path: Path, fps: float, unit: Unit) -> FolderReel:
+def open_folder(path: Path, fps: float, unit: Unit) -> FolderRecording:
     """The frames in a folder, by name.
 
     Of: folders with depth.png and intrinsics.json, or cloud.ply (scenes, or what the sink
@@ -67,14 +68,16 @@ def open_folder(path: Path, fps: float, unit: Unit) -> FolderReel:
     images = [p for p in inside if p.suffix.lower() == ".png" and p.is_file()]
     clouds = [p for p in inside if p.suffix.lower() in CLOUD_SUFFIXES and p.is_file()]
     if folders:
-        return FolderReel(_shots([partial(_read_folder, f) for f in folders], _said(folders), fps))
+        return FolderRecording(
+            _recorded([partial(_read_folder, f) for f in folders], _folder_stamps(folders), fps)
+        )
     if images and (root / INTRINSICS).is_file():
         camera = root / INTRINSICS
-        loads: list[Callable[[], Content]] = [partial(_read_image, p, camera) for p in images]
-        return FolderReel(_shots(loads, _stamps(root, images), fps))
+        loads: list[Callable[[], Observation]] = [partial(_read_image, p, camera) for p in images]
+        return FolderRecording(_recorded(loads, _file_stamps(root, images), fps))
     if clouds:
         loads = [partial(_read_points, p, unit) for p in clouds]
-        return FolderReel(_shots(loads, _stamps(root, clouds), fps))
+        return FolderRecording(_recorded(loads, _file_stamps(root, clouds), fps))
     lack = f"its .png need {INTRINSICS} beside them" if images else "it holds none of these"
     raise InputError(
         f"{path} is no recording: {lack}. Allowed: a folder of clouds "
@@ -83,26 +86,25 @@ def open_folder(path: Path, fps: float, unit: Unit) -> FolderReel:
     )
 
 
-def _shots(
-    loads: list[Callable[[], Content]], stamps_ns: list[int | None], fps: float
-) -> tuple[Shot, ...]:
+def _recorded(
+    loads: list[Callable[[], Observation]], stamps_ns: list[int | None], fps: float
+) -> tuple[RecordedFrame, ...]:
     """Where a stamp is not known it is the one before and a period more."""
-    period_ns, last_ns, shots = round(1e9 / fps), 0, []
+    period_ns, last_ns, frames = round(1e9 / fps), 0, []
     for load, known_ns in zip(loads, stamps_ns, strict=True):
         last_ns = last_ns + period_ns if known_ns is None else known_ns
-        shots.append(Shot(last_ns, partial(_stamped, load, last_ns)))
-    return tuple(shots)
+        frames.append(RecordedFrame(last_ns, partial(_stamped, load, last_ns)))
+    return tuple(frames)
 
 
-def _stamped(load: Callable[[], Content], stamp_ns: int) -> Content:
-    content = load()
-    return replace(content, frame=replace(content.frame, stamp_ns=stamp_ns))
+def _stamped(load: Callable[[], Observation], stamp_ns: int) -> Observation:
+    seen = load()
+    return replace(seen, content=replace(seen.content, stamp_ns=stamp_ns))
 
 
-def _said(folders: list[Path]) -> list[int | None]:
-    """The stamps in the folders' own JSON; all None where not all but a few are known."""
-    stamps = [_own_stamp(folder) for folder in folders]
-    return stamps if any(stamps) else [None] * len(stamps)
+def _folder_stamps(folders: list[Path]) -> list[int | None]:
+    """The stamps in the folders' own JSON files; None where unknown."""
+    return [_own_stamp(folder) for folder in folders]
 
 
 def _own_stamp(folder: Path) -> int | None:
@@ -118,7 +120,7 @@ def _own_stamp(folder: Path) -> int | None:
     return None
 
 
-def _stamps(root: Path, files: list[Path]) -> list[int | None]:
+def _file_stamps(root: Path, files: list[Path]) -> list[int | None]:
     if (root / TIMES).is_file():
         times = _read_times(root / TIMES)
         if missing := [p.name for p in files if p.name not in times]:
@@ -146,15 +148,15 @@ def _read_times(path: Path) -> dict[str, int]:
         ) from error
 
 
-def _read_points(path: Path, unit: Unit) -> Content:
-    return Content(read_cloud(path, unit)[0])
+def _read_points(path: Path, unit: Unit) -> Observation:
+    return Observation(read_cloud(path, unit)[0], 0)
 
 
-def _read_image(path: Path, camera: Path) -> Content:
-    return Content(read_depth_png(path, camera))
+def _read_image(path: Path, camera: Path) -> Observation:
+    return Observation(read_depth_png(path, camera), 0)
 
 
-def _read_folder(folder: Path) -> Content:
+def _read_folder(folder: Path) -> Observation:
     """The depth image (else the cloud), the mask, and the true surfaces of a scene."""
     frame: Frame
     if (folder / DEPTH).is_file():
@@ -163,7 +165,7 @@ def _read_folder(folder: Path) -> Content:
         frame = read_cloud(folder / CLOUD)[0]
     mask = _read_mask(folder / MASK, frame) if (folder / MASK).is_file() else None
     truth = read_anatomy(folder) if (folder / "kidney.ply").is_file() else None
-    return Content(frame, mask, truth)
+    return Observation(frame, 0, mask, truth)
 
 
 def _read_mask(path: Path, frame: Frame) -> np.ndarray:

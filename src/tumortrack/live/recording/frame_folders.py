@@ -1,4 +1,4 @@
-"""Updates into plain files: a folder each, and one line each in index.jsonl. Camera frame, mm."""
+"""Results as plain files: a folder each, and one line each in index.jsonl. Camera frame, mm."""
 
 from __future__ import annotations
 
@@ -13,9 +13,8 @@ import numpy as np
 from tumortrack.core.errors import StorageError, TumortrackError
 from tumortrack.core.estimate import Estimate
 from tumortrack.core.mesh_files import write_mesh
-from tumortrack.core.types import DepthFrame, Mesh
+from tumortrack.core.types import DepthFrame, Mesh, SensorCloud
 from tumortrack.live.recording.folders import CLOUD, DEPTH, FRAMES, INTRINSICS, MASK, REPORT
-from tumortrack.live.recording.metadata import facts, report
 from tumortrack.live.values import Observation, RigidShape, TrackingResult, Workcell
 from tumortrack.sense.files import DEPTH_UNIT_MM, depth_png, intrinsics_json
 from tumortrack.sense.ply import cloud_ply
@@ -46,19 +45,19 @@ class FrameFolders:
         self._surfaces: dict[str, tuple[Mesh, str]] = {}  # by shape: the last, and its file
         self._written = 0
 
-    def write(self, update: TrackingResult) -> None:
-        folder = self._root / f"{update.sequence:08d}"
+    def write(self, result: TrackingResult) -> None:
+        folder = self._root / f"{result.sequence:08d}"
         try:
             folder.mkdir()
-            if self._frames and update.seen is not None:
-                _write_seen(folder, update.seen)
-            if update.estimate is not None:
-                _write_estimate(folder / _ESTIMATE, update.estimate)
-            if update.workcell is not None:
-                self._write_workcell(folder / WORKCELL, update.workcell)
-            text = json.dumps(report(update), indent=1, allow_nan=False)
+            if self._frames and result.observation is not None:
+                _write_seen(folder, result.observation)
+            if result.estimate is not None:
+                _write_estimate(folder / _ESTIMATE, result.estimate)
+            if result.workcell is not None:
+                self._write_workcell(folder / WORKCELL, result.workcell)
+            text = json.dumps(report(result), indent=1, allow_nan=False)
             (folder / REPORT).write_text(text + "\n", encoding="utf-8")
-            line = json.dumps({**facts(update), "folder": folder.name}) + "\n"
+            line = json.dumps({**facts(result), "folder": folder.name}) + "\n"
             self._index.write(line.encode())
         except (OSError, StorageError) as error:
             shutil.rmtree(folder, ignore_errors=True)
@@ -134,3 +133,31 @@ def _write_estimate(folder: Path, estimate: Estimate) -> None:
     (folder / "occupancy.ply").write_bytes(points)
     for name, mesh in estimate.meshes.items():
         write_mesh(folder / f"{name}.ply", mesh)
+
+
+def facts(result: TrackingResult) -> dict:
+    """One line about a result (JSON types)."""
+    seen = None
+    if result.observation is not None:
+        seen = "cloud" if isinstance(result.observation.content, SensorCloud) else "depth"
+    return {
+        "sequence": result.sequence,
+        "stamp_ns": result.stamp_ns,
+        "arrived_ns": None if result.observation is None else result.observation.arrived_ns,
+        "seen": seen,
+        "quality": result.quality,
+        "reason": result.reason,
+        "warning": result.warning,
+        "latency_ms": result.latency_ms,
+    }
+
+
+def report(result: TrackingResult) -> dict:
+    """Everything about a result: its facts, times of stages, and the estimate's own report, or
+    null with the reason."""
+    return {
+        **facts(result),
+        "organ_points": None if result.organ is None else len(result.organ.points_mm),
+        "seconds": dict(result.seconds),
+        "estimate": None if result.estimate is None else result.estimate.report,
+    }

@@ -12,12 +12,12 @@ from typing import Any
 import numpy as np
 
 from tumortrack.core.errors import StorageError
-from tumortrack.live.recording.metadata import camera_frame, report
-from tumortrack.live.ros.cell import WorkcellMessages
-from tumortrack.live.ros.markers import Rate
-from tumortrack.live.ros.messages import Messages
-from tumortrack.live.ros.observed import MM_PER_M, Outgoing, messages_seen
-from tumortrack.live.ros.outgoing import messages_of
+from tumortrack.live.meter import Rate
+from tumortrack.live.recording.frame_folders import report
+from tumortrack.live.ros.messages import MM_PER_M, Messages, Outgoing, xyz
+from tumortrack.live.ros.results import messages_of
+from tumortrack.live.ros.sensors import CAMERA_FRAME, messages_seen
+from tumortrack.live.ros.workcell import WorkcellMessages
 from tumortrack.live.values import PublishedFrame, SinkContext, TrackingResult
 
 # A killed program loses what is in no chunk yet.
@@ -35,13 +35,13 @@ class McapFile:
         StorageError: the disk refused. Whole chunks stay, in a file without an end.
     """
 
-    def __init__(self, folder: Path, setting: SinkContext, frames: bool, meshes_hz: float) -> None:
-        self._messages, self._setting = Messages("humble"), setting
+    def __init__(self, folder: Path, context: SinkContext, frames: bool, meshes_hz: float) -> None:
+        self._messages, self._context = Messages("humble"), context
         from rosbags.rosbag2 import StoragePlugin, Writer
 
         self._frames, self._meshes = frames, Rate(meshes_hz)
-        self._cell = (
-            WorkcellMessages(self._messages, meshes_hz, observed=False) if setting.arms else None
+        self._workcell = (
+            WorkcellMessages(self._messages, meshes_hz, observed=False) if context.arms else None
         )
         self._connections: dict[str, Any] = {}
         self._last_ns, self._chunk_s = 0, time.monotonic()
@@ -52,10 +52,10 @@ class McapFile:
         self._storage.bio = self._file = _WholeWrites(self._storage.path)
         self._whole = self._file.tell()  # behind the last whole chunk
 
-    def write(self, update: TrackingResult) -> None:
-        for out in self._messages_of(update):
+    def write(self, result: TrackingResult) -> None:
+        for out in self._messages_of(result):
             topic = out.suffix if out.suffix.startswith("/") else f"/tumortrack/{out.suffix}"
-            self._write(topic, out, self._time_of(update))
+            self._write(topic, out, self._time_of(result))
         if time.monotonic() - self._chunk_s >= _CHUNK_S:
             self._flush()
 
@@ -68,23 +68,23 @@ class McapFile:
         except OSError as error:
             self._give_up(error)
 
-    def _messages_of(self, update: TrackingResult) -> list[Outgoing]:
-        messages, published = self._messages, update.frames
+    def _messages_of(self, result: TrackingResult) -> list[Outgoing]:
+        messages, published = self._messages, result.published_frame
         due = self._meshes.due()
-        out = messages_of(update, messages, self._setting.parts, due, self._cell)
-        text = json.dumps(report(update), allow_nan=False)
+        out = messages_of(result, messages, self._context.parts, due, self._workcell)
+        text = json.dumps(report(result), allow_nan=False)
         string = "std_msgs/msg/String"
         out.append(Outgoing("report", string, messages.make(string, data=text)))
-        if self._frames and update.seen is not None:
-            camera = camera_frame(published)
-            seen = messages_seen(update.seen, messages, camera)
+        if self._frames and result.observation is not None:
+            camera = _camera_frame(published)
+            seen = messages_seen(result.observation, messages, camera)
             out = [*(one._replace(suffix=f"/camera/{one.suffix}") for one in seen), *out]
             if camera != published.frame_id:
-                out.append(_transform(update.stamp_ns, published, camera, messages))
+                out.append(_transform(result.stamp_ns, published, camera, messages))
         return out
 
-    def _time_of(self, update: TrackingResult) -> int:
-        now_ns = time.time_ns() if update.seen is None else update.seen.arrived_ns
+    def _time_of(self, result: TrackingResult) -> int:
+        now_ns = time.time_ns() if result.observation is None else result.observation.arrived_ns
         self._last_ns = max(self._last_ns, now_ns)
         return self._last_ns
 
@@ -142,23 +142,26 @@ class _WholeWrites(io.FileIO):
         return size
 
 
-def _transform(stamp_ns: int, frames: PublishedFrame, camera: str, messages: Messages) -> Outgoing:
-    """Where the camera stands in the published frame."""
+def _camera_frame(frame: PublishedFrame) -> str:
+    """The name of the camera's frame: the published one's where it is the same."""
+    if np.array_equal(frame.published_from_camera, np.eye(4)):
+        return frame.frame_id
+    return CAMERA_FRAME if frame.frame_id != CAMERA_FRAME else f"{CAMERA_FRAME}_optical"
+
+
+def _transform(stamp_ns: int, frame: PublishedFrame, camera: str, messages: Messages) -> Outgoing:
+    """The camera's pose in the published frame, for /tf."""
     from scipy.spatial.transform import Rotation
 
-    way = frames.published_from_camera
-    x, y, z = (float(v) for v in way[:3, 3] / MM_PER_M)
-    qx, qy, qz, qw = (float(v) for v in Rotation.from_matrix(np.array(way[:3, :3])).as_quat())
-    transform = messages.make(
-        "geometry_msgs/msg/Transform",
-        translation=messages.make("geometry_msgs/msg/Vector3", x=x, y=y, z=z),
-        rotation=messages.make("geometry_msgs/msg/Quaternion", x=qx, y=qy, z=qz, w=qw),
-    )
-    stamped = messages.make(
-        "geometry_msgs/msg/TransformStamped",
-        header=messages.header(stamp_ns, frames.frame_id),
-        child_frame_id=camera,
-        transform=transform,
-    )
+    way = frame.published_from_camera
+    quaternion = Rotation.from_matrix(np.array(way[:3, :3])).as_quat().tolist()
+    stamped = {
+        "header": messages.header(stamp_ns, frame.frame_id),
+        "child_frame_id": camera,
+        "transform": {
+            "translation": xyz(way[:3, 3] / MM_PER_M),
+            "rotation": dict(zip("xyzw", quaternion, strict=True)),
+        },
+    }
     kind = "tf2_msgs/msg/TFMessage"
     return Outgoing("/tf", kind, messages.make(kind, transforms=[stamped]))

@@ -1,7 +1,7 @@
-"""A ROS 2 graph as seen by one program: topics in and out as CDR bytes, through whichever way.
+"""A ROS graph as seen by one program: topics in and out as serialised bytes.
 
-Two ways stand behind the same interface: ``dds`` (Cyclone DDS from the package index, no ROS
-needed) and ``rclpy`` (the user's own ROS, with its RMW and security).
+Three implementations have this interface: ``dds`` (ROS 2 by Cyclone DDS, no ROS needed), ``rclpy``
+(ROS 2 by the user's own ROS, with its RMW and security) and ``rospy`` (ROS 1).
 """
 
 from __future__ import annotations
@@ -23,8 +23,13 @@ _LARGEST_DOMAIN = 232
 class Publisher(Protocol):
     """One topic out: reliable, volatile, the newest message only, as ROS 2 nodes publish."""
 
-    def publish(self, cdr: bytes | memoryview) -> None:
-        """Send a message, CDR with its 4 bytes of header.
+    @property
+    def wanted(self) -> bool:
+        """False if surely nobody subscribes."""
+        ...
+
+    def publish(self, raw: bytes | memoryview) -> None:
+        """Send a message: in ROS 2 CDR with its 4 bytes of header.
 
         Raises:
             TumortrackError: it could not be sent.
@@ -32,7 +37,7 @@ class Publisher(Protocol):
         ...
 
     def flush(self, timeout_s: float) -> None:
-        """Return when all reliable subscribers have what was sent, or in time."""
+        """Return when all reliable subscribers have what was sent, or when the time is up."""
         ...
 
 
@@ -46,7 +51,11 @@ class Subscriber(Protocol):
         ...
 
     def take(self) -> list[bytes | memoryview]:
-        """What came since the last call, oldest first, at most the depth asked for: CDR."""
+        """What came since the last call, oldest first, at most the depth asked for.
+
+        Raises:
+            InputError: a message of another type.
+        """
         ...
 
 
@@ -68,7 +77,7 @@ class Bus(Protocol):
         ...
 
     def wait(self, timeout_s: float) -> None:
-        """Return as soon as a subscriber has something to take, or in time."""
+        """Return as soon as a subscriber has something to take, or when the time is up."""
         ...
 
     def close(self) -> None:
@@ -77,7 +86,7 @@ class Bus(Protocol):
 
 
 def open_bus(via: Via, messages: Messages) -> Bus:
-    """Join the graph of ``ROS_DOMAIN_ID``; ``auto``: by rclpy where it can be imported.
+    """Join the ROS 2 graph of ``ROS_DOMAIN_ID``; ``auto``: by rclpy where it can be imported.
 
     Raises:
         InputError: that way is not there; an unusable environment.

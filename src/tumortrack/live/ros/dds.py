@@ -12,19 +12,19 @@ import contextlib
 import ctypes
 import os
 import threading
+from functools import cache
 from typing import Any
 
 import numpy as np
 
 from tumortrack.core.errors import InputError, TumortrackError
-from tumortrack.live.ros.dds_types import idl_type, ros_name
 from tumortrack.live.ros.messages import Messages
 
 # A writer waits while more than WhcHigh is not acknowledged. One cloud is more than the default,
 # 500 kB: beside a reliable subscriber that hangs, one call in twenty took 25 ms instead of 2. The
 # newest message alone is kept, so the limit set here is never reached. The receive buffer holds a
 # few clouds; the kernel cuts it to net.core.rmem_max. Where there is no multicast, programs with
-# another maker's DDS that start later are found only by being told: each second, not every 8.
+# another maker's DDS that start later are found by announcements alone: each second, not every 8.
 _TUNING = (
     "<CycloneDDS><Domain><Internal><Watermarks><WhcHigh>64MB</WhcHigh></Watermarks>"
     '<SocketReceiveBufferSize max="16MB"/></Internal>'
@@ -41,8 +41,12 @@ _LOCAL = (
 )
 _BLOCKED_NS = 20_000_000  # how long a writer may wait for a slow subscriber
 _MOST_ENDPOINTS = 4096
+_NUMBERS = (
+    *(f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64)),
+    *("float32", "float64"),
+)
 
-# A domain is set up once per process and outlives its participants: made anew, it would cut off
+# A domain is set up once per process and outlives its participants: made again, it would cut off
 # whoever else uses it.
 _domains: dict[int, Any] = {}
 _setting_up = threading.Lock()
@@ -79,9 +83,9 @@ class DdsBus:
             self._published = BuiltinDataReader(member, BuiltinTopicDcpsPublication)
         except DDSException as error:
             raise InputError(
-                f"DDS domain {domain_id} cannot be joined ({_said(error.code)}; Cyclone DDS says "
-                "more above). Check the network, CYCLONEDDS_URI, and that not too many programs "
-                "are in that domain."
+                f"DDS domain {domain_id} cannot be joined ({_error_text(error.code)}; Cyclone "
+                "DDS says more above). Check the network, CYCLONEDDS_URI, and that not too many "
+                "programs are in that domain."
             ) from error
         self._member: Any = member
 
@@ -134,6 +138,8 @@ class DdsBus:
 class DdsPublisher:
     """See ``bus.Publisher``."""
 
+    wanted = True
+
     def __init__(self, member: Any, topic: Any, user_data: bytes) -> None:
         from cyclonedds.internal import DDS
         from cyclonedds.pub import DataWriter
@@ -159,18 +165,18 @@ class DdsPublisher:
         self._write.argtypes = [ctypes.c_int32, ctypes.POINTER(Sample)]
         self._write.restype = ctypes.c_int32
 
-    def publish(self, cdr: bytes | memoryview) -> None:
+    def publish(self, raw: bytes | memoryview) -> None:
         """
         Raises:
             TumortrackError: not sent: subscribers don't keep up, or these bytes are not what the
                 topic's type says.
         """
-        padded = np.frombuffer(bytes(cdr) + bytes(-len(cdr) % 4), np.uint8)
+        padded = np.frombuffer(bytes(raw) + bytes(-len(raw) % 4), np.uint8)
         sample = self._sample(padded.ctypes.data, padded.nbytes)
         code = self._write(self._writer._ref, ctypes.byref(sample))
         if code < 0:
             raise TumortrackError(
-                f"{self._name}: a message of {len(cdr)} bytes was not sent ({_said(code)})."
+                f"{self._name}: a message of {len(raw)} bytes was not sent ({_error_text(code)})."
             )
 
     def flush(self, timeout_s: float) -> None:
@@ -218,7 +224,7 @@ class DdsSubscriber:
 
     @property
     def lost(self) -> int:
-        """Asked for, and not told by a listener: that would make the thread that empties the
+        """Asked for, not reported to a listener: that would make the thread that empties the
         socket wait for Python's lock."""
         from cyclonedds.internal import DDS, dds_c_t
 
@@ -252,8 +258,61 @@ def _local_only() -> bool:
     return os.environ.get("ROS_LOCALHOST_ONLY") == "1" or reach == "LOCALHOST"
 
 
-def _said(code: int) -> str:
+def _error_text(code: int) -> str:
     from cyclonedds.core import DDSException
 
     _, text = DDSException.error_message_mapping.get(code, ("", f"error {code}"))
     return text.strip(" .").lower()
+
+
+def dds_name(message_type: str) -> str:
+    """``sensor_msgs/msg/Image`` -> ``sensor_msgs::msg::dds_::Image_``."""
+    package, kind, name = message_type.split("/")
+    return f"{package}::{kind}::dds_::{name}_"
+
+
+def ros_name(type_name: str) -> str:
+    """The way back; empty for a type that is none of ROS."""
+    parts = type_name.split("::")
+    if len(parts) != 4 or parts[2] != "dds_" or not parts[3].endswith("_"):
+        return ""
+    return f"{parts[0]}/{parts[1]}/{parts[3][:-1]}"
+
+
+@cache
+def idl_type(message_type: str, distro: str) -> Any:
+    """The type as a cyclonedds ``IdlStruct``; final, no key, as ROS 2 makes it. By it Cyclone
+    checks that bytes from the network are what their type says, lengths included.
+
+    Raises:
+        InputError: no such type in that distribution, or one with wide characters.
+    """
+    from cyclonedds.idl import make_idl_struct
+    from rosbags.typesys import Stores, get_typestore
+
+    fields = get_typestore(Stores[f"ROS2_{distro.upper()}"]).fielddefs.get(message_type)
+    if fields is None:
+        raise InputError(f"ROS 2 {distro} has no message type {message_type}.")
+    members = {name: _member(kind, distro) for name, kind in fields[1]}
+    name = message_type.rsplit("/", 1)[-1]
+    return make_idl_struct(f"{name}_", dds_name(message_type), members)
+
+
+def _member(kind: Any, distro: str) -> Any:
+    from cyclonedds.idl import types
+    from rosbags.interfaces import Nodetype
+
+    node, content = kind
+    if node == Nodetype.NAME:
+        return idl_type(content, distro)
+    if node == Nodetype.BASE:
+        name = {"char": "uint8", "byte": "uint8", "octet": "uint8"}.get(content[0], content[0])
+        if name in _NUMBERS:
+            return getattr(types, name)
+        if name in ("string", "bool"):
+            return str if name == "string" else bool
+        raise InputError(f"messages with fields of type {name} are not supported.")
+    inner, length = content
+    if node == Nodetype.ARRAY:
+        return types.array(_member(inner, distro), length)
+    return types.sequence(_member(inner, distro))

@@ -1,33 +1,49 @@
-"""Messages of one ROS distribution, made by field names, and their bytes: CDR for ROS 2, ROS 1's
-own.
+"""Messages of one ROS distribution, made from field names, and their bytes: CDR for ROS 2, ROS 1's
+own format for ROS 1.
 
-Types come from rosbags, which is a Python library of the package index and needs no ROS. ROS 1
-names the same types: ``sensor_msgs/msg/Image`` here is its ``sensor_msgs/Image``.
+Types come from rosbags, a pure Python library that needs no ROS. ROS 1 has the same types by
+shorter names: ``sensor_msgs/msg/Image`` here is its ``sensor_msgs/Image``.
 """
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from functools import cache
-from typing import Any, Literal, get_args
+from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float, Float64
 
+from tumortrack.core.colours import Colour
 from tumortrack.core.errors import InputError
 
 Distro = Literal["noetic", "foxy", "galactic", "humble", "iron", "jazzy", "kilted", "lyrical"]
+
+MM_PER_M = 1000
+MARKERS = "visualization_msgs/msg/MarkerArray"
+ADD, DELETE, DELETE_ALL = 0, 2, 3  # Marker's actions
+LINE, TEXT, TRIANGLES = 4, 9, 11  # and types
+# Markers vanish if nothing follows, so that a stopped loop leaves nothing that looks current.
+MARKER_LIFETIME_S = 2
 
 _POINT = "geometry_msgs/msg/Point"
 _LATEST_S = 2**31 - 1  # ROS counts seconds in 32 bits, ROS 2 with a sign
 
 
+class Outgoing(NamedTuple):
+    """A message, and the end of the name of its topic (``meshes``)."""
+
+    suffix: str
+    message_type: str
+    message: Any
+
+
 class PointBlock(Sequence):
     """Points of a marker as one array, written in one piece.
 
-    Stands where a message wants a list of points: tens of thousands of objects would take a tenth
-    of a second to write. To iterate over it gives the array itself, once; an index gives a point.
+    It replaces a list of point messages: tens of thousands of objects would take a tenth of a
+    second to write. Iterating over it gives the array itself, once; an index gives a point.
     """
 
     def __init__(self, points: Float64[np.ndarray, "n 3"]) -> None:
@@ -56,7 +72,8 @@ class Messages:
         self._store = _store(distro)
 
     def make(self, message_type: str, **values: Any) -> Any:
-        """A message: fields by name, those not named empty (0, "", no elements).
+        """A message: fields by name, the others empty (0, "", no elements). A dictionary stands for
+        a message inside it, a list of dictionaries for several.
 
         Letters' case does not count: ROS 1 writes ``K`` where ROS 2 writes ``k``.
         """
@@ -64,10 +81,20 @@ class Messages:
         fields = {}
         for name, kind in self._store.fielddefs[message_type][1]:
             known = name.lower() in given
-            fields[name] = given.pop(name.lower()) if known else self._empty(kind)
+            fields[name] = self._value(kind, given.pop(name.lower()) if known else None)
         if given:
             raise TypeError(f"{message_type} has no field {', '.join(given)}")
         return self._store.types[message_type](**fields)
+
+    def _value(self, kind: Any, value: Any) -> Any:
+        if value is None:
+            return self._empty(kind)
+        if isinstance(value, dict):
+            return self.make(kind[1], **value)
+        if isinstance(value, list):
+            inner = kind[1][0][1]
+            return [self.make(inner, **one) if isinstance(one, dict) else one for one in value]
+        return value
 
     def _empty(self, kind: Any) -> Any:
         from rosbags.interfaces import Nodetype
@@ -97,7 +124,18 @@ class Messages:
         Raises:
             InputError: they are no such message.
         """
-        return from_bytes(self._store, data, message_type, ros1=self.is_ros1)
+        from rosbags.serde import SerdeError
+
+        read = self._store.deserialize_ros1 if self.is_ros1 else self._store.deserialize_cdr
+        try:
+            return read(data, message_type)
+        except KeyError as error:
+            raise InputError(f"{message_type} is no message type that is known here.") from error
+        except (SerdeError, AssertionError, MemoryError, IndexError, OverflowError) as error:
+            raise InputError(
+                f"{len(data)} bytes that came are no {message_type} ({error}). Are sender and "
+                "receiver of the same ROS distribution?"
+            ) from error
 
     def definition(self, message_type: str) -> str:
         """The type in ROS's own words, with the types that it is made of."""
@@ -112,10 +150,6 @@ class Messages:
         return self._store.hash_rihs01(message_type)
 
     def header(self, stamp_ns: int, frame_id: str) -> Any:
-        stamp = self.time(stamp_ns)
-        return self.make("std_msgs/msg/Header", stamp=stamp, frame_id=frame_id)
-
-    def time(self, stamp_ns: int) -> Any:
         """
         Raises:
             InputError: before 1970 or after 2038, which ROS's 32 bits of seconds can't say.
@@ -126,27 +160,76 @@ class Messages:
                 f"the stamp {stamp_ns} ns cannot be said in ROS, whose clock runs from 1970 to "
                 "2038. Set the clock of the source."
             )
-        return self.make("builtin_interfaces/msg/Time", sec=seconds, nanosec=nanoseconds)
+        stamp = {"sec": seconds, "nanosec": nanoseconds}
+        return self.make("std_msgs/msg/Header", stamp=stamp, frame_id=frame_id)
+
+    def markers(self, markers: list[dict]) -> Any:
+        """A MarkerArray; see ``marker``."""
+        return self.make(MARKERS, markers=markers)
+
+    def diagnostic(self, level: int, name: str, message: str, id: str, values: dict) -> Any:
+        """A DiagnosticStatus with its values as text."""
+        return self.make(
+            "diagnostic_msgs/msg/DiagnosticStatus",
+            level=level,
+            name=name,
+            message=message,
+            hardware_id=id,
+            values=[{"key": key, "value": str(value)} for key, value in values.items()],
+        )
 
 
-def from_bytes(store: Any, data: bytes | memoryview, message_type: str, ros1: bool) -> Any:
-    """The message that these bytes are, by a rosbags typestore.
+def marker(header: Any, **values: Any) -> dict:
+    """A Marker's fields."""
+    return {"header": header, "lifetime": {"sec": MARKER_LIFETIME_S}, **values}
 
-    Raises:
-        InputError: they are no such message.
-    """
-    from rosbags.serde import SerdeError
 
-    read = store.deserialize_ros1 if ros1 else store.deserialize_cdr
-    try:
-        return read(data, message_type)
-    except KeyError as error:
-        raise InputError(f"{message_type} is no message type that is known here.") from error
-    except (SerdeError, AssertionError, MemoryError, IndexError, OverflowError) as error:
-        raise InputError(
-            f"{len(data)} bytes that came are no {message_type} ({error}). Are sender and receiver "
-            "of the same ROS distribution?"
-        ) from error
+def text_marker(
+    header: Any, ns: str, text: str, place_mm: np.ndarray, height_m: float, colour: Colour
+) -> dict:
+    """A Marker of text that faces the viewer."""
+    return marker(
+        header,
+        ns=ns,
+        type=TEXT,
+        action=ADD,
+        pose=pose(place_mm),
+        scale={"z": height_m},
+        color=rgba(colour),
+        text=text,
+    )
+
+
+def triangles_marker(
+    header: Any, ns: str, corners_mm: np.ndarray, at: dict, colour: Colour, opacity: float
+) -> dict:
+    """A Marker of triangles, three corners each, at a pose."""
+    return marker(
+        header,
+        ns=ns,
+        type=TRIANGLES,
+        action=ADD,
+        pose=at,
+        scale=xyz((1.0, 1.0, 1.0)),
+        color=rgba(colour, opacity),
+        points=PointBlock(corners_mm / MM_PER_M),
+    )
+
+
+def pose(place_mm: Float[np.ndarray, " 3"], wxyz: Float[np.ndarray, " 4"] | None = None) -> dict:
+    """A Pose's fields; without a quaternion not turned."""
+    turn = {"w": 1.0} if wxyz is None else dict(zip("wxyz", wxyz.tolist(), strict=True))
+    return {"position": xyz(place_mm / MM_PER_M), "orientation": turn}
+
+
+def xyz(numbers: Iterable[float]) -> dict:
+    """The fields of a Point or a Vector3."""
+    return dict(zip("xyz", map(float, numbers), strict=True))
+
+
+def rgba(colour: Colour, opacity: float = 1.0) -> dict:
+    """A ColorRGBA's fields."""
+    return {**dict(zip("rgb", (value / 255 for value in colour), strict=True)), "a": opacity}
 
 
 def stamp_of(header: Any) -> int:

@@ -81,12 +81,14 @@ class RclpyBus:
 class RclpyPublisher:
     """See ``bus.Publisher``. rclpy's own defaults are ROS 2's: reliable, volatile."""
 
+    wanted = True
+
     def __init__(self, publisher: Any, topic: str) -> None:
         self._publisher, self._topic = publisher, topic
 
-    def publish(self, cdr: bytes | memoryview) -> None:
+    def publish(self, raw: bytes | memoryview) -> None:
         try:
-            self._publisher.publish(bytes(cdr))  # bytes: taken as serialised already
+            self._publisher.publish(bytes(raw))  # bytes: taken as serialised already
         except Exception as error:  # rclpy's own kinds differ between distributions
             raise TumortrackError(f"{self._topic}: a message was not sent ({error}).") from error
 

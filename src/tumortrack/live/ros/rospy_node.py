@@ -1,8 +1,8 @@
-"""This process's one node in a ROS 1 graph, through rospy, and its talks with the master.
+"""ROS 1 topics through rospy: this process's one node, and its calls to the master.
 
-rospy is made for a program that is nothing but a node: it has one node per process, it waits for
-ever on a master that is not there, and it never registers again at a master that was restarted.
-So the master is asked here first, with a time limit, and registrations are looked after.
+rospy is made for a program that is nothing but a node: it has one node per process, waits for ever
+for a master that is not there, and never registers again at a master that was restarted. So the
+master is asked here first, with a time limit, and registrations are checked.
 """
 
 from __future__ import annotations
@@ -13,7 +13,9 @@ import os
 import re
 import sys
 import threading
+import time
 import xmlrpc.client
+from collections import deque
 from functools import cache
 from http.client import HTTPConnection, HTTPException
 from types import ModuleType
@@ -21,13 +23,17 @@ from typing import Any
 from urllib.parse import urlsplit
 
 from tumortrack.core.errors import InputError
+from tumortrack.live.ros.messages import Messages
 from tumortrack.live.values import SourceLost
 
 _DEBIAN = "/usr/lib/python3/dist-packages"
 _DEBIAN_PYTHON = "/usr/bin/python3"
 _NAME = re.compile(r"[/~]?[A-Za-z]\w*(/[A-Za-z]\w*)*", re.ASCII)
 _ANSWER_S = 1.0  # a master answers within milliseconds
+_BUFFER = 2**21  # bytes taken from the socket at once: a cloud in one go
 _SUCCESS = 1  # https://wiki.ros.org/ROS/Master_Slave_APIs
+
+_ANY = "*/msg/"  # the type of a topic that so far is only subscribed to
 
 _starting = threading.Lock()
 _node: Node | None = None
@@ -116,14 +122,16 @@ class Master:
             ) from error
         return value if code == _SUCCESS else None
 
-    def types(self) -> dict[str, str]:
-        """Every topic known to the master, with its message type as ROS 1 writes it."""
-        return dict(self.call("getTopicTypes") or [])
-
     def published(self) -> set[str]:
         """Topics that somebody publishes."""
         publishers, *_ = self.call("getSystemState")
         return {topic for topic, nodes in publishers if nodes}
+
+    def published_types(self) -> dict[str, str]:
+        """Those topics with their message types, where these are known."""
+        published, types = self.published(), self.call("getTopicTypes") or []
+        known = {topic: full_type(kind) for topic, kind in types if topic in published}
+        return {topic: kind for topic, kind in known.items() if kind != _ANY}
 
     def simulated_time(self) -> bool:
         """Stamps follow a simulation's or a recording's clock, and not the machines'."""
@@ -144,7 +152,6 @@ class Node:
         self.rospy = rospy
         self.name: str = rospy.get_name()
         self.master = Master(master_uri, self.name)
-        self._uri: str = rospy.get_node_uri()
 
     def resolved(self, topic: str) -> str:
         """The topic's full name in this node's namespace."""
@@ -154,19 +161,6 @@ class Node:
         """Whether the master knows that this node subscribes; a new master does not."""
         _, subscribers, _ = self.master.call("getSystemState")
         return self.name in dict(subscribers).get(topic, ())
-
-    def register_again(self, publishers: list[Any]) -> None:
-        """Make publishers known to a master that does not know them; whoever listens already
-        stays connected.
-
-        Raises:
-            MasterLost: no answer.
-        """
-        known, *_ = self.master.call("getSystemState")
-        known = dict(known)
-        for one in publishers:
-            if self.name not in known.get(one.resolved_name, ()):
-                self.master.call("registerPublisher", one.resolved_name, one.type, self._uri)
 
 
 def node() -> Node:
@@ -224,8 +218,127 @@ def _start(rospy: ModuleType) -> None:
     logging.getLogger("rosout").addHandler(logging.NullHandler())
 
 
+class RospyBus:
+    """This node's topics of one source or sink; see ``bus.Bus``.
+
+    Raises:
+        InputError, MasterLost: as ``node``.
+    """
+
+    def __init__(self, messages: Messages) -> None:
+        self.node = node()
+        self._messages = messages
+        self._arrived = threading.Condition()
+        self._publishers: list[RospyPublisher] = []
+        self._subscribers: list[RospySubscriber] = []
+        self._closed = False
+
+    def publisher(self, topic: str, message_type: str) -> RospyPublisher:
+        kind = _raw_class(
+            message_type.replace("/msg/", "/"),
+            self._messages.md5(message_type),
+            self._messages.definition(message_type),
+        )
+        handle = self.node.rospy.Publisher(topic, kind, queue_size=1, tcp_nodelay=True)
+        self._publishers.append(RospyPublisher(handle))
+        return self._publishers[-1]
+
+    def subscriber(
+        self, topic: str, message_type: str, depth: int = 5, latched: bool = False
+    ) -> RospySubscriber:
+        """``latched`` makes no difference: in ROS 1 each subscriber gets what is latched."""
+        rospy = self.node.rospy
+        subscriber = RospySubscriber(topic, message_type, depth, self._arrived)
+        subscriber.handle = rospy.Subscriber(
+            topic, rospy.AnyMsg, subscriber.came, buff_size=_BUFFER, tcp_nodelay=True
+        )
+        self._subscribers.append(subscriber)
+        return subscriber
+
+    def types_of(self, topic: str) -> set[str]:
+        known = self.node.master.published_types()
+        return {known[topic]} if topic in known else set()
+
+    def wait(self, timeout_s: float) -> None:
+        with self._arrived:
+            self._arrived.wait_for(
+                lambda: self._closed or any(one.pending for one in self._subscribers),
+                max(timeout_s, 0.0),
+            )
+
+    def register_again(self) -> None:
+        """Make the publishers known to a master that does not know them; subscribers stay
+        connected.
+
+        Raises:
+            MasterLost: no answer.
+        """
+        node = self.node
+        known, *_ = node.master.call("getSystemState")
+        known = dict(known)
+        for handle in (one.handle for one in self._publishers):
+            if node.name not in known.get(handle.resolved_name, ()):
+                address = node.rospy.get_node_uri()
+                node.master.call("registerPublisher", handle.resolved_name, handle.type, address)
+
+    def close(self) -> None:
+        with self._arrived:
+            self._closed = True
+            self._arrived.notify_all()
+        while self._publishers or self._subscribers:
+            (self._publishers or self._subscribers).pop().handle.unregister()
+
+
+class RospyPublisher:
+    """See ``bus.Publisher``."""
+
+    def __init__(self, handle: Any) -> None:
+        self.handle = handle
+
+    @property
+    def wanted(self) -> bool:
+        return self.handle.get_num_connections() > 0
+
+    def publish(self, raw: bytes | memoryview) -> None:
+        message = self.handle.data_class()
+        message._buff = raw
+        self.handle.publish(message)
+
+    def flush(self, timeout_s: float) -> None:
+        time.sleep(timeout_s)  # rospy does not say what arrived
+
+
+class RospySubscriber:
+    """See ``bus.Subscriber``; rospy's threads call ``came``."""
+
+    handle: Any
+
+    def __init__(
+        self, topic: str, message_type: str, depth: int, arrived: threading.Condition
+    ) -> None:
+        self._topic, self._type, self._arrived = topic, message_type, arrived
+        self.pending: deque[Any] = deque(maxlen=depth)
+        self.lost = 0
+
+    def came(self, message: Any) -> None:
+        with self._arrived:
+            self.lost += len(self.pending) == self.pending.maxlen
+            self.pending.append(message)
+            self._arrived.notify_all()
+
+    def take(self) -> list[bytes | memoryview]:
+        with self._arrived:
+            taken = list(self.pending)
+            self.pending.clear()
+        for message in taken:
+            kind = full_type(message._connection_header["type"])
+            if kind != self._type:
+                raise InputError(f"on {self._topic} came a {kind}; it must be {self._type}.")
+        return [message._buff for message in taken]
+
+
 @cache
-def raw_class(type_name: str, md5sum: str, definition: str) -> type:
+def _raw_class(type_name: str, md5sum: str, definition: str) -> type:
     """A message class that carries bytes already serialised, as ``rospy.AnyMsg`` does, but may
     be published under its type's name."""
     base = rospy_module().AnyMsg

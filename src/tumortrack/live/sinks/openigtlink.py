@@ -1,4 +1,4 @@
-"""OpenIGTLink: tumors' places, surfaces and status to 3D Slicer, PLUS and whoever speaks it.
+"""OpenIGTLink: tumors' places, surfaces and status for 3D Slicer, PLUS and other receivers.
 
 Slicer takes what arrives as RAS. Its files are LPS, and ours say that they are; so x and y are
 sent with the other sign, and what is sent lies where the files lie (``space="lps"``: as it is).
@@ -15,20 +15,21 @@ from jaxtyping import Float64
 
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import RAS_FROM_LPS, rigid, transform_points
-from tumortrack.live.igtl.content import (
+from tumortrack.live.igtl.link import Link
+from tumortrack.live.igtl.message import (
     EXITING,
     NOT_FOUND,
     NOT_PRESENT,
     NOT_READY,
     OK,
     IgtlStatus,
+    Message,
     Polydata,
     pack_polydata,
     pack_status,
     pack_transform,
 )
-from tumortrack.live.igtl.link import Link
-from tumortrack.live.igtl.message import Message
+from tumortrack.live.meter import Rate
 from tumortrack.live.values import SinkConfig, SinkContext, TrackingResult, TransformedEstimate
 
 STATUS_DEVICE, CT_DEVICE, CLOUD_DEVICE, ARMS_DEVICE = "tumortrack", "ct", "occupancy", "arms"
@@ -65,17 +66,17 @@ class OpenIgtLinkSinkConfig(SinkConfig, frozen=True, kw_only=True, tag="openigtl
             if not 0 <= value <= 1000:
                 raise InputError(f"openigtlink: {name} {value} must lie in 0..1000.")
 
-    def open(self, setting: SinkContext) -> OpenIgtLinkSink:
+    def open(self, context: SinkContext) -> OpenIgtLinkSink:
         """Serve, or begin to try to connect.
 
         Raises:
             InputError: the port is taken.
         """
-        return OpenIgtLinkSink(self, setting)
+        return OpenIgtLinkSink(self, context)
 
 
 class OpenIgtLinkSink:
-    """Per update: STATUS ``tumortrack``, TRANSFORM of each tumor, and POLYDATA of each part.
+    """Per result: STATUS ``tumortrack``, TRANSFORM of each tumor, and POLYDATA of each part.
 
     A tumor's TRANSFORM has its origin in the middle of the tumor's box; its axes are the CT's, as
     the organ is turned now, or, without a motion, those of the published frame. With a motion
@@ -88,12 +89,13 @@ class OpenIgtLinkSink:
     (``cutter/tip``): from the tip's own frame, and MISSING once it is gone.
     """
 
-    def __init__(self, config: OpenIgtLinkSinkConfig, setting: SinkContext) -> None:
-        self._parts, self._frames = setting.parts, setting.frames
+    def __init__(self, config: OpenIgtLinkSinkConfig, context: SinkContext) -> None:
+        self._parts, self._frames = context.parts, context.published_frame
         self._axes = RAS_FROM_LPS if config.space == "ras" else np.eye(4)
         self._link = Link(config.host, config.port, config.connect)
-        self._meshes, self._cloud = _Pace(config.mesh_hz), _Pace(config.cloud_hz)
-        self._has_ct, self._arms = setting.anatomy_ct is not None, setting.arms
+        self._config = config
+        self._mesh_rate, self._cloud_rate = Rate(config.mesh_hz), Rate(config.cloud_hz)
+        self._has_ct, self._arms = context.anatomy_ct is not None, context.arms
         self._tips: set[str] = set()  # that ever were
         self._next, self._closed = 0, False
 
@@ -106,62 +108,66 @@ class OpenIgtLinkSink:
         """How many are connected."""
         return self._link.receivers
 
-    def publish(self, update: TrackingResult) -> None:
-        code = OK if update.estimate is not None else NOT_FOUND
-        self._link.send(self._said(update, code))
-        self._next = update.sequence + 1
+    def publish(self, result: TrackingResult) -> None:
+        code = OK if result.estimate is not None else NOT_FOUND
+        self._link.send(self._messages(result, code))
+        self._next = result.sequence + 1
 
     def close(self) -> None:
         """Say that it is over, and leave nothing that looks as if it were still true."""
         if not self._closed:
             self._closed = True
             reason = "tracking has ended"
-            over = TrackingResult(self._next, time.time_ns(), reason=reason, frames=self._frames)
-            self._link.send(self._said(over, EXITING))
+            over = TrackingResult(
+                self._next, time.time_ns(), reason=reason, published_frame=self._frames
+            )
+            self._link.send(self._messages(over, EXITING))
             self._link.close()
 
-    def _said(self, update: TrackingResult, code: int) -> list[Message]:
-        arms = [self._arms_status(update)] if self._arms else []
-        status = self._status(update, code)
-        return [status, *arms, *self._transforms(update), *self._surfaces(update)]
+    def _messages(self, result: TrackingResult, code: int) -> list[Message]:
+        arms = [self._arms_status(result)] if self._arms else []
+        status = self._status(result, code)
+        return [status, *arms, *self._transforms(result), *self._surfaces(result)]
 
     def _message(
-        self, kind: str, device: str, update: TrackingResult, content: bytes, **more: str
+        self, kind: str, device: str, result: TrackingResult, content: bytes, **more: str
     ) -> Message:
-        metadata = {"frame_id": update.frames.frame_id, "sequence": str(update.sequence), **more}
-        return Message(kind, device, update.stamp_ns, content, metadata)
+        metadata = {
+            "frame_id": result.published_frame.frame_id,
+            "sequence": str(result.sequence),
+            **more,
+        }
+        return Message(kind, device, result.stamp_ns, content, metadata)
 
-    def _status(self, update: TrackingResult, code: int) -> Message:
-        found = update.estimate is not None
-        name, text = (update.quality, update.warning) if found else ("no estimate", update.reason)
-        more = {"quality": str(update.quality)}
-        if update.latency_ms is not None:
-            more["latency_ms"] = f"{update.latency_ms:.1f}"
+    def _status(self, result: TrackingResult, code: int) -> Message:
+        found = result.estimate is not None
+        name, text = (result.quality, result.warning) if found else ("no estimate", result.reason)
+        more = {"quality": str(result.quality)}
+        if result.latency_ms is not None:
+            more["latency_ms"] = f"{result.latency_ms:.1f}"
         content = pack_status(IgtlStatus(code, name, text))
-        return self._message("STATUS", STATUS_DEVICE, update, content, **more)
+        return self._message("STATUS", STATUS_DEVICE, result, content, **more)
 
-    def _arms_status(self, update: TrackingResult) -> Message:
-        cell = update.workcell
+    def _arms_status(self, result: TrackingResult) -> Message:
+        cell = result.workcell
         if cell is None:
             status = IgtlStatus(NOT_PRESENT, "unknown", "nothing is known of the arms")
-            return self._message("STATUS", ARMS_DEVICE, update, pack_status(status))
+            return self._message("STATUS", ARMS_DEVICE, result, pack_status(status))
         status = IgtlStatus(NOT_READY if cell.halted else OK, cell.state, cell.halted)
         content = pack_status(status)
-        return self._message("STATUS", ARMS_DEVICE, update, content, state=cell.state)
+        return self._message("STATUS", ARMS_DEVICE, result, content, state=cell.state)
 
-    def _transforms(self, update: TrackingResult) -> Iterator[Message]:
-        way, pose = update.frames.published_from_camera, _camera_from_ct(update)
+    def _transforms(self, result: TrackingResult) -> Iterator[Message]:
+        way, pose = result.published_frame.published_from_camera, _camera_from_ct(result)
         places: dict[str, Float64[np.ndarray, "4 4"] | None] = dict.fromkeys(self._parts[1:])
         if self._has_ct:
             places[CT_DEVICE] = None if pose is None else way @ pose
-        if update.estimate is not None:
-            turn = np.eye(3) if pose is None else (way @ pose)[:3, :3]
-            for name in self._parts[1:]:
-                if (mesh := update.estimate.meshes.get(name)) is not None:
-                    middle = transform_points(way, mesh.box_mm.mean(0, keepdims=True))[0]
-                    places[name] = rigid(turn, middle)
+        turn = np.eye(3) if pose is None else (way @ pose)[:3, :3]
+        for name in self._parts[1:]:
+            if (center_mm := result.center_mm(name)) is not None:
+                places[name] = rigid(turn, center_mm)
         if self._arms:
-            shapes = () if update.workcell is None else update.workcell.shapes
+            shapes = () if result.workcell is None else result.workcell.shapes
             tips = {s.name: s.published_from_shape for s in shapes if s.name.endswith(_TIP)}
             self._tips |= tips.keys()
             places |= {name: tips.get(name) for name in sorted(self._tips)}
@@ -169,57 +175,42 @@ class OpenIgtLinkSink:
             turned = _NOWHERE if place is None else self._axes @ place @ self._axes
             known = "MISSING" if place is None else "OK"
             content = pack_transform(turned)
-            yield self._message("TRANSFORM", name, update, content, TransformStatus=known)
+            yield self._message("TRANSFORM", name, result, content, TransformStatus=known)
 
-    def _surfaces(self, update: TrackingResult) -> Iterator[Message]:
-        placed = update.placed
-        meshes, mesh_due = (placed.meshes, self._meshes.due()) if placed else ({}, True)
-        contents: dict[str, Polydata] = {}
-        for name in self._parts if self._meshes.on else ():
-            # What is not there any more goes at once; what is there may wait for its turn.
-            if (mesh := meshes.get(name)) is None:
-                contents[name] = Polydata(_NO_POINTS, _NO_FACES)
-            elif mesh_due:
-                contents[name] = Polydata(self._turned(mesh.vertices_mm), mesh.faces)
-        if self._cloud.on:
-            if placed is None:
-                contents[CLOUD_DEVICE] = Polydata(_NO_POINTS, _NO_FACES)
-            elif self._cloud.due():
-                contents[CLOUD_DEVICE] = self._points(placed)
+    def _surfaces(self, result: TrackingResult) -> Iterator[Message]:
+        estimate = result.transformed
+        contents: dict[str, Polydata | None] = {}
+        if self._config.mesh_hz:
+            # What is gone is deleted at once; what is there may wait until it is due.
+            meshes, due = (estimate.meshes, self._mesh_rate.due()) if estimate else ({}, True)
+            for name in self._parts:
+                if (mesh := meshes.get(name)) is None:
+                    contents[name] = None
+                elif due:
+                    contents[name] = Polydata(self._turned(mesh.vertices_mm), mesh.faces)
+        if self._config.cloud_hz:
+            if estimate is None:
+                contents[CLOUD_DEVICE] = None
+            elif self._cloud_rate.due():
+                contents[CLOUD_DEVICE] = self._points(estimate)
         for name, content in contents.items():
-            yield self._message("POLYDATA", name, update, pack_polydata(content))
+            packed = pack_polydata(content or Polydata(_NO_POINTS, _NO_FACES))
+            yield self._message("POLYDATA", name, result, packed)
 
-    def _points(self, placed: TransformedEstimate) -> Polydata:
+    def _points(self, estimate: TransformedEstimate) -> Polydata:
         """Each point as a line without length: Slicer shows points of cells only, and its reader
         does not bear cells of one point."""
-        number = np.arange(len(placed.points_mm))
-        scalars = {"label": placed.labels, "probability": placed.probability}
+        number = np.arange(len(estimate.points_mm))
+        scalars = {"label": estimate.labels, "probability": estimate.probability}
         segments = np.stack([number, number], 1)
-        return Polydata(self._turned(placed.points_mm), _NO_FACES, segments, scalars)
+        return Polydata(self._turned(estimate.points_mm), _NO_FACES, segments, scalars)
 
     def _turned(self, points_mm: np.ndarray) -> np.ndarray:
         return transform_points(self._axes, points_mm)
 
 
-class _Pace:
-    """Says when the next one is due, ``hz`` times a second."""
-
-    def __init__(self, hz: float) -> None:
-        self.on = hz > 0
-        self._period_s = 1 / hz if self.on else 0.0
-        self._next_s = 0.0
-
-    def due(self) -> bool:
-        now = time.monotonic()
-        if not self.on or now < self._next_s:
-            return False
-        in_step = now < self._next_s + self._period_s
-        self._next_s = (self._next_s if in_step else now) + self._period_s
-        return True
-
-
-def _camera_from_ct(update: TrackingResult) -> Float64[np.ndarray, "4 4"] | None:
+def _camera_from_ct(result: TrackingResult) -> Float64[np.ndarray, "4 4"] | None:
     """The organ's pose without its deformation, where the method knows one."""
-    if update.estimate is None or "motion" not in update.estimate.report:
+    if result.estimate is None or "motion" not in result.estimate.report:
         return None
-    return np.array(update.estimate.report["motion"]["camera_from_ct"], float)
+    return np.array(result.estimate.report["motion"]["camera_from_ct"], float)

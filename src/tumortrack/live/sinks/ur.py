@@ -16,9 +16,20 @@ import numpy as np
 from jaxtyping import Float64
 
 from tumortrack.core.errors import InputError, TumortrackError
-from tumortrack.live.ur_link import SILENT_S, UR_JOINTS, UrLink, connected
 from tumortrack.live.values import Controls, SinkConfig, SinkContext, TrackingResult
 
+UR_JOINTS = (
+    "shoulder_pan_joint",
+    "shoulder_lift_joint",
+    "elbow_joint",
+    "wrist_1_joint",
+    "wrist_2_joint",
+    "wrist_3_joint",
+)
+_WATCHDOG_S = 0.2  # of silence: the controller stops the arm by itself
+SILENT_S = _WATCHDOG_S  # and so does the sink
+OFF_DEG = 2.0  # between the arm and the plan, before it may move
+_STOP_M_S2 = 10.0  # servoStop's deceleration: ur_rtde's own
 # Of UR5, UR5e, UR10 and UR10e (data sheets): a turn either way; the larger ones' first two joints
 # are the slower ones, and their limits hold for all here.
 LIMIT_RAD = 2 * np.pi
@@ -57,20 +68,20 @@ class UrSinkConfig(SinkConfig, frozen=True, kw_only=True, tag="ur"):
             if not low <= value <= high:
                 raise InputError(f"ur: {name} {value:g} must lie in {low:g}..{high:g}.")
 
-    def open(self, setting: SinkContext) -> UrSink:
+    def open(self, context: SinkContext) -> UrSink:
         """Nothing, or with ``execute`` the connection to the arm, which does not move yet.
 
         Raises:
             InputError: no arms in this run; with ``execute``: see ``connected``.
         """
-        if not setting.arms:
+        if not context.arms:
             raise InputError("ur: nothing here moves an arm; it is for `tumortrack resect`.")
-        return UrSink(self, connected(self.host) if self.execute else None, setting.controls)
+        return UrSink(self, connected(self.host) if self.execute else None, context.controls)
 
 
 class UrSink:
     """Sends one arm's joints as they come, and stops it (servoStop) where the arms are halted,
-    there is no workcell, a target is refused, 0.2 s pass without an update, or it is closed.
+    there is no workcell, a target is refused, 0.2 s pass without a result, or it is closed.
 
     Whenever it stood still, it begins only where the arm is within 2 degrees of the target. Should
     this process die, the arm's controller stops it within 0.2 s by itself (setWatchdog).
@@ -96,7 +107,7 @@ class UrSink:
         with self._lock:
             return dict(self._counts)
 
-    def publish(self, update: TrackingResult) -> None:
+    def publish(self, result: TrackingResult) -> None:
         """Send the target, or check it.
 
         Raises:
@@ -107,14 +118,14 @@ class UrSink:
                 return
             if self._fault:
                 raise TumortrackError(self._fault)
-            cell = update.workcell
+            cell = result.workcell
             try:
                 if cell is None or cell.halted:
                     self._counts["no arms" if cell is None else "halted"] += 1
                     self._stop()
                 else:
                     self._heed_silence()
-                    self._go(_target(cell.joints_rad, self._names), update.stamp_ns)
+                    self._go(_target(cell.joints_rad, self._names), result.stamp_ns)
             except TumortrackError as error:
                 self._counts["refused"] += 1
                 self._give_up()
@@ -229,3 +240,69 @@ def _check_step(step: Float64[np.ndarray, " 6"], seconds: float, jump_deg: float
             f"{UR_JOINTS[joint]} would turn at {np.degrees(abs(step[joint]) / seconds):.0f} "
             f"degrees/s; allowed: {np.degrees(SPEED_RAD_S[joint]):.0f}"
         )
+
+
+class UrLink:
+    """ur_rtde's two interfaces to one arm. Not for two threads at once."""
+
+    def __init__(self, control: Any, receive: Any) -> None:
+        self._control, self._receive = control, receive
+        control.setWatchdog(1 / _WATCHDOG_S)
+
+    def check(self) -> None:
+        """Raises TumortrackError where the arm cannot follow."""
+        if self._receive.isEmergencyStopped() or self._receive.isProtectiveStopped():
+            raise TumortrackError("the arm is in an emergency or protective stop; release it there")
+        if not self._control.isProgramRunning():
+            raise TumortrackError("the arm runs no program any more; start again")
+
+    def compare(self, target: Float64[np.ndarray, " 6"]) -> None:
+        """Raises TumortrackError where the arm is not where the plan has it."""
+        off_deg = np.degrees(np.abs(np.array(self._receive.getActualQ()) - target))
+        if not off_deg.max() <= OFF_DEG:
+            raise TumortrackError(
+                f"{UR_JOINTS[int(off_deg.argmax())]} is {off_deg.max():.1f} degrees from the plan; "
+                f"allowed: {OFF_DEG:g}. Move the arm there first"
+            )
+
+    def servo(
+        self, target: Float64[np.ndarray, " 6"], follow_s: float, lookahead_s: float, gain: float
+    ) -> None:
+        if not self._control.servoJ(target.tolist(), 0.0, 0.0, follow_s, lookahead_s, gain):
+            raise TumortrackError("the arm did not take the target")
+
+    def stop(self) -> None:
+        if not self._control.servoStop(_STOP_M_S2):
+            raise TumortrackError("the arm did not take the order to stop")
+
+    def kick(self) -> None:
+        self._control.kickWatchdog()
+
+    def close(self) -> None:
+        self._control.stopScript()
+        self._control.disconnect()
+        self._receive.disconnect()
+
+
+def connected(host: str) -> UrLink:
+    """The controller of an arm, through ur_rtde.
+
+    Raises:
+        InputError: ur_rtde is missing, or the arm cannot be reached or controlled.
+    """
+    try:
+        import rtde_control
+        import rtde_receive
+    except ImportError as error:
+        raise InputError(
+            "ur with execute=true needs the package ur_rtde: pip install 'tumortrack[ur]'."
+        ) from error
+    try:
+        receive = rtde_receive.RTDEReceiveInterface(host)
+        control = rtde_control.RTDEControlInterface(host)
+    except RuntimeError as error:
+        raise InputError(
+            f"ur: the arm at {host} cannot be controlled ({error}). Is it on, released, in remote "
+            "control, and reachable on port 30004?"
+        ) from error
+    return UrLink(control, receive)

@@ -19,13 +19,13 @@ from tumortrack.core import colours
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.types import Mesh
+from tumortrack.live.display import seen_points
 from tumortrack.live.values import SinkConfig, SinkContext, TrackingResult
-from tumortrack.live.viewer.panel import Actions, Panel
-from tumortrack.live.viewer.points import point_under, seen_points
+from tumortrack.live.viewer.look import point_under
+from tumortrack.live.viewer.panel import Actions, Panel, State, StatusPanel, backdrop
 from tumortrack.live.viewer.scene import ViewerScene
 from tumortrack.live.viewer.server import close_server, open_server
 from tumortrack.live.viewer.slices import load_ct, plane_through, slice_picture
-from tumortrack.live.viewer.status import State, StatusPanel, backdrop
 from tumortrack.live.viewer.workcell import WorkcellView
 
 if TYPE_CHECKING:
@@ -64,59 +64,59 @@ class ViewerSinkConfig(SinkConfig, frozen=True, kw_only=True, tag="viewer"):
         if not 0 < self.hz <= 60:
             raise InputError(f"viewer: hz={self.hz:g}; allowed are more than 0 and up to 60.")
 
-    def open(self, setting: SinkContext) -> ViewerSink:
+    def open(self, context: SinkContext) -> ViewerSink:
         """The page, ready for visitors.
 
         Raises:
             InputError: the port is taken, viser is missing, or the case is another patient's.
             ArtifactError: ``case`` is no case.
         """
-        return ViewerSink(self, setting)
+        return ViewerSink(self, context)
 
 
 class ViewerSink:
     """See ``live.values.Sink``. ``port``: where the page is."""
 
-    def __init__(self, config: ViewerSinkConfig, setting: SinkContext) -> None:
-        ct = load_ct(config.case, setting) if config.case else None
-        self._config, self._setting, self._ct = config, setting, ct
+    def __init__(self, config: ViewerSinkConfig, context: SinkContext) -> None:
+        ct = load_ct(config.case, context) if config.case else None
+        self._config, self._context, self._ct = config, context, ct
         self._server = open_server(config.host, config.port)
         self.port: int = self._server.get_port()
         self._lock = threading.RLock()  # round every change of the page
-        self._update: TrackingResult | None = None  # the last that came
+        self._result: TrackingResult | None = None  # the last that came
         self._shown: TrackingResult | None = None  # whose estimate is visible
         self._came = self._drawn = -np.inf
-        self._spells = 0  # how often estimates were hidden: a slice of an earlier spell is void
-        self._beat = 0
+        self._hidden_count = 0  # a slice made before the last hiding is void
+        self._counter = 0
         self._fault: BaseException | None = None
-        self._asked = False
+        self._picking = False
         self._state: State | None = None
         self._behind: tuple[State, bool] | None = None
-        self._scene = ViewerScene(self._server, setting, config.margin_mm)
+        self._scene = ViewerScene(self._server, context, config.margin_mm)
         self._cell = WorkcellView(self._server)
         turn = self._scene.look.turn
-        actions = Actions(self._changed, self._ask, self._forget, turn, self._abort)
-        self._panel = Panel(self._server, setting.parts, actions, ct is not None, setting.arms)
+        actions = Actions(self._changed, self._toggle_picking, self._forget, turn, self._abort)
+        self._panel = Panel(self._server, context.parts, actions, ct is not None, context.arms)
         self._say("waiting")
         self._closing = threading.Event()
         self._watch = threading.Thread(target=self._keep_watch, name="viewer", daemon=True)
         self._watch.start()
 
-    def publish(self, update: TrackingResult) -> None:
+    def publish(self, result: TrackingResult) -> None:
         """Show it: without an estimate at once, with one not more often than ``hz``; arms each
         time."""
         if self._closing.is_set():
             return
         now = time.monotonic()
         with self._page():
-            before, self._update, self._came = self._update, update, now
-            if update.estimate is None:
+            before, self._result, self._came = self._result, result, now
+            if result.estimate is None:
                 self._hide()
-            self._draw_cell(update)
-            changed = before is None or self._shown is None or before.quality != update.quality
+            self._draw_cell(result)
+            changed = before is None or self._shown is None or before.quality != result.quality
             if changed or now - self._drawn >= 1 / self._config.hz:
                 self._drawn = now
-                self._draw(update)
+                self._draw(result)
         fault, self._fault = self._fault, None
         if fault is not None:
             raise fault
@@ -134,48 +134,48 @@ class ViewerSink:
         with self._lock, self._server.atomic():
             yield
 
-    def _draw(self, update: TrackingResult) -> None:
+    def _draw(self, result: TrackingResult) -> None:
         try:
-            self._scene.observe(update)
-            if update.estimate is None:
+            self._scene.observe(result)
+            if result.estimate is None:
                 self._scene.apply()
             else:
-                self._scene.show(update)
-                self._shown = update
-            self._say("none" if update.estimate is None else update.quality)
+                self._scene.show(result)
+                self._shown = result
+            self._say("none" if result.estimate is None else result.quality)
         except Exception as error:
             self._hide()
             reason = f"this estimate cannot be shown ({error!r})"
-            self._update = replace(update, estimate=None, quality="none", reason=reason)
+            self._result = replace(result, estimate=None, quality="none", reason=reason)
             self._say("none")
             raise
 
-    def _draw_cell(self, update: TrackingResult) -> None:
+    def _draw_cell(self, result: TrackingResult) -> None:
         try:
-            if update.workcell is None:
+            if result.workcell is None:
                 self._cell.hide()
                 return
-            self._cell.show(update.workcell)
-            self._scene.look.oversee(update.workcell)
+            self._cell.show(result.workcell)
+            self._scene.look.oversee(result.workcell)
         except Exception as error:
             self._cell.hide()
             self._fault = error  # raised when the estimate has been shown
 
     def _hide(self) -> None:
         self._shown = None
-        self._spells += 1
+        self._hidden_count += 1
         self._scene.hide()
         self._panel.put_slice(None)
 
     def _say(self, state: State) -> None:
         self._state = state
-        self._beat += 1
-        update = self._update
-        age_s = time.monotonic() - self._came if update is not None else 0.0
-        if update is not None and update.latency_ms is not None:
-            age_s += update.latency_ms / 1000
-        status = StatusPanel(state, update, age_s, self._beat, self._setting.arms)
-        if (behind := (state, status.loud)) != self._behind:
+        self._counter += 1
+        result = self._result
+        age_s = time.monotonic() - self._came if result is not None else 0.0
+        if result is not None and result.latency_ms is not None:
+            age_s += result.latency_ms / 1000
+        status = StatusPanel(state, result, age_s, self._counter, self._context.arms)
+        if (behind := (state, status.alarming)) != self._behind:
             self._behind = behind
             self._server.scene.set_background_image(backdrop(*behind))
         self._panel.say(status)
@@ -185,7 +185,7 @@ class ViewerSink:
         while not self._closing.wait(_TICK_S):
             try:
                 with self._page():
-                    if self._update is not None and time.monotonic() - self._came > _STALE_S:
+                    if self._result is not None and time.monotonic() - self._came > _STALE_S:
                         if self._shown is not None:
                             self._hide()
                         self._cell.hide()
@@ -200,30 +200,30 @@ class ViewerSink:
         if self._ct is None:
             return
         with self._lock:
-            update, spell = self._shown, self._spells
+            result, hidden_count = self._shown, self._hidden_count
             part, orientation = self._panel.slice_through
-        if update is None:
+        if result is None:
             return
-        plane = plane_through(update, part, orientation)
-        motion = update.estimate.motion if update.estimate is not None else None
+        plane = plane_through(result, part, orientation)
+        motion = result.estimate.motion if result.estimate is not None else None
         picture = None
         if plane is not None and motion is not None:
-            outlines = self._outlines(update)
+            outlines = self._outlines(result)
             picture = slice_picture(self._ct, motion, plane, outlines, _SLICE_PIXELS)
         with self._page():
-            if spell == self._spells:
+            if hidden_count == self._hidden_count:
                 self._panel.put_slice(picture)
                 if picture is not None and plane is not None:
-                    self._scene.put_slice(picture, plane, update.frames)
+                    self._scene.put_slice(picture, plane, result.published_frame)
 
-    def _outlines(self, update: TrackingResult) -> list[tuple[Mesh, colours.Colour, int]]:
-        assert update.estimate is not None
-        back = np.linalg.inv(update.frames.published_from_camera)
+    def _outlines(self, result: TrackingResult) -> list[tuple[Mesh, colours.Colour, int]]:
+        assert result.estimate is not None
+        back = np.linalg.inv(result.published_frame.published_from_camera)
         outlines = []
-        for label, name in enumerate(self._setting.parts, start=1):
+        for label, name in enumerate(self._context.parts, start=1):
             colour = colours.part_colour(label)
-            if name in update.estimate.meshes:
-                outlines.append((update.estimate.meshes[name], colour, 2 if label > 1 else 1))
+            if name in result.estimate.meshes:
+                outlines.append((result.estimate.meshes[name], colour, 2 if label > 1 else 1))
             if margin := self._scene.margins.get(name):
                 there = margin.moved(transform_points(back, margin.vertices_mm))
                 outlines.append((there, colour, 1))
@@ -235,43 +235,43 @@ class ViewerSink:
             self._scene.redraw_points()
             self._scene.apply()
 
-    def _ask(self) -> None:
+    def _toggle_picking(self) -> None:
         """The next click in the scene chooses the organ; asked twice: it does not."""
         with self._lock:
-            self._asked = not self._asked
-            if self._asked:
+            self._picking = not self._picking
+            if self._picking:
                 self._server.scene.on_click()(self._clicked)
             else:
                 self._server.scene.remove_click_callback(self._clicked)
-            self._panel.picking(self._asked, self._setting.controls.picked_mm is not None)
+            self._panel.picking(self._picking, self._context.controls.picked_mm is not None)
 
     def _clicked(self, event: SceneClickEvent) -> None:
         with self._lock:
-            if not self._asked:
+            if not self._picking:
                 return
-            self._ask()
-            update = self._update
-            if update is None or update.seen is None:
+            self._toggle_picking()
+            result = self._result
+            if result is None or result.observation is None:
                 event.client.add_notification("Nothing is seen at present", "Click again later.")
                 return
-            back = np.linalg.inv(update.frames.published_from_camera)
+            back = np.linalg.inv(result.published_frame.published_from_camera)
             origin = transform_points(back, np.array([event.ray_origin]))[0]
             direction = back[:3, :3] @ np.array(event.ray_direction)
-            point = point_under(seen_points(update).astype(float), origin, direction)
+            point = point_under(seen_points(result.observation).astype(float), origin, direction)
             if point is None:
                 event.client.add_notification("No observed point there", "Click on the points.")
                 return
-            self._setting.controls.pick(point)
-            self._scene.mark(point, update.frames)
+            self._context.controls.pick(point)
+            self._scene.mark(point, result.published_frame)
             self._panel.picking(False, True)
 
     def _forget(self) -> None:
         with self._lock:
-            self._setting.controls.pick(None)
-            self._scene.mark(None, self._setting.frames)
-            self._panel.picking(self._asked, False)
+            self._context.controls.pick(None)
+            self._scene.mark(None, self._context.published_frame)
+            self._panel.picking(self._picking, False)
 
     def _abort(self) -> None:
         with self._lock:
-            self._setting.controls.aborted.set()
+            self._context.controls.aborted.set()
             self._panel.aborted()

@@ -13,7 +13,7 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -24,6 +24,15 @@ from tumortrack.live.values import Observation, SourceConfig, SourceEnded, Sourc
 _RECORDINGS = (".db3", ".bag")
 _LAST_S = 0.2  # after a recording's end: its last frame may still be on its way
 _MOST_UNTIMED = 150  # frames before the camera's clock is tied to this machine's
+
+
+@contextlib.contextmanager
+def _while_connected() -> Iterator[None]:
+    """Anything that the SDK is asked fails while a camera comes or goes."""
+    try:
+        yield
+    except RuntimeError as error:
+        raise SourceLost(f"the RealSense does not answer: {error}. Replug it.") from error
 
 
 class RealSenseSourceConfig(SourceConfig, frozen=True, kw_only=True, tag="realsense"):
@@ -78,7 +87,7 @@ class RealSenseSource:
         self.dropped = 0
         self._device = device
         self._playback = device.as_playback() if device.is_playback() else None
-        self.waits = self._playback is not None and not config.realtime
+        self.lossless = self._playback is not None and not config.realtime
         self._room = threading.Condition()
         self._newest: tuple[Any, int] | None = None  # the SDK's frame, and when it came
         self._closed = False
@@ -90,24 +99,23 @@ class RealSenseSource:
         self._unit_mm = float(f"{self._sensor.get_option(rs.option.depth_units) * 1000:.6g}")
         if self._playback is None:
             _set_up(rs, self._sensor, config)
-        self.host_clock = self._playback is None and _tied_to_host(rs, self._sensor)
+        option = rs.option.global_time_enabled
+        tied = self._sensor.supports(option) and self._sensor.get_option(option)
+        self.host_clock = self._playback is None and bool(tied)
         self._sensor.open(profile)
         self._sensor.start(self._take)
 
+    @_while_connected()
     def read(self, timeout_s: float) -> Observation | None:
-        """The newest frame not yet given; None if none came in time.
+        """The newest frame not read before; None if none came in time.
 
         Raises:
             SourceLost: unplugged, or closed.
             SourceEnded: the recording is over.
             InputError: the camera's clock cannot be tied to this machine's.
         """
-        with _while_connected():
-            return self._read(timeout_s)
-
-    def _read(self, timeout_s: float) -> Observation | None:
         came = self._next(timeout_s)
-        if came is None and self._is_over():
+        if came is None and self._playback and self._playback.current_status() == self._stopped:
             came = self._next(_LAST_S)
             if came is None:
                 raise SourceEnded("the recording is over.")
@@ -143,7 +151,7 @@ class RealSenseSource:
         if not frame.is_depth_frame():
             return
         with self._room:
-            if self.waits:
+            if self.lossless:
                 self._room.wait_for(lambda: self._newest is None or self._closed)
             if self._closed:
                 return
@@ -160,9 +168,6 @@ class RealSenseSource:
             self._room.notify_all()
         return came
 
-    def _is_over(self) -> bool:
-        return self._playback is not None and self._playback.current_status() == self._stopped
-
     def _wait_for_clock(self) -> None:
         """A camera's first frames come before its clock is tied to this machine's."""
         self.dropped += 1
@@ -172,15 +177,6 @@ class RealSenseSource:
                 "the RealSense's clock is not tied to this machine's: its frames have no global "
                 "time. Give global_time=false."
             )
-
-
-@contextlib.contextmanager
-def _while_connected() -> Iterator[None]:
-    """Anything that the SDK is asked fails while a camera comes or goes."""
-    try:
-        yield
-    except RuntimeError as error:
-        raise SourceLost(f"the RealSense does not answer: {error}. Replug it.") from error
 
 
 def _sdk() -> ModuleType:
@@ -264,14 +260,7 @@ def _set_up(rs: ModuleType, sensor: Any, config: RealSenseSourceConfig) -> None:
         _set(sensor, rs.option.global_time_enabled, int(config.global_time), "global_time")
 
 
-def _set(
-    sensor: Any, option: Any, value: int, name: Literal["preset", "emitter", "global_time"]
-) -> None:
+def _set(sensor: Any, option: Any, value: int, name: str) -> None:
     if not sensor.supports(option) or sensor.is_option_read_only(option):
         raise InputError(f"this RealSense has no {name} to set; leave the option out.")
     sensor.set_option(option, value)
-
-
-def _tied_to_host(rs: ModuleType, sensor: Any) -> bool:
-    option = rs.option.global_time_enabled
-    return bool(sensor.supports(option) and sensor.get_option(option))

@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import ClassVar, Literal
 
 from tumortrack.core.errors import InputError
-from tumortrack.live.recording.bags import BagChoice, BagReel, is_bag
+from tumortrack.live.recording import RecordedFrame, Recording
+from tumortrack.live.recording.bags import BagChoice, BagRecording, is_bag
 from tumortrack.live.recording.folders import open_folder
-from tumortrack.live.recording.shots import Content, Reel, Shot
 from tumortrack.live.values import Observation, SourceConfig, SourceEnded, SourceLost
 
 # Less than what the loop takes for a frozen source.
@@ -64,32 +64,33 @@ class RecordingSourceConfig(SourceConfig, frozen=True, kw_only=True, tag="record
         Raises:
             InputError: nothing there that could be played.
         """
-        return RecordingSource(self._reel(), self.rate, self.loop)
+        return RecordingSource(self._recording(), self.rate, self.loop)
 
-    def _reel(self) -> Reel:
+    def _recording(self) -> Recording:
         if not self.path.exists():
             raise InputError(f"{self.path} does not exist, so it cannot be played.")
         if is_bag(self.path):
             choice = BagChoice(self.topic, self.info_topic, self.rectified, self.unit_mm)
-            return BagReel(self.path, choice)
+            return BagRecording(self.path, choice)
         return open_folder(self.path, self.fps, self.unit)
 
 
 class RecordingSource:
-    """Plays a reel. Frames that were due before they could be read are dropped, unless ``waits``.
+    """Plays a recording. Frames that were due before they could be read are dropped, unless it is
+    ``lossless``.
 
     A damaged frame is an InputError of its own, and the next read goes on behind it.
     """
 
     host_clock = False  # the stamps are those of the recording
 
-    def __init__(self, reel: Reel, rate: float, loop: bool) -> None:
-        self.waits = rate == 0
+    def __init__(self, recording: Recording, rate: float, loop: bool) -> None:
+        self.lossless = rate == 0
         self.dropped = 0
-        self._reel, self._rate = reel, rate
-        self._shots = _endless(reel) if loop else reel.shots()
-        self._next: Shot | None = None
-        self._shown_ns: int | None = None  # stamp of the shot before
+        self._recording, self._rate = recording, rate
+        self._frames = _endless(recording) if loop else recording.frames()
+        self._next: RecordedFrame | None = None
+        self._shown_ns: int | None = None  # stamp of the frame before
         self._due_s = 0.0  # when the next one is due, by time.monotonic
         self._closed = threading.Event()
         self._lock = threading.Lock()  # close may come while a frame is being read
@@ -102,25 +103,25 @@ class RecordingSource:
             SourceLost: it was closed.
         """
         with self._lock:
-            shot = self._newest_due()
-        if shot is None:
+            frame = self._newest_due()
+        if frame is None:
             self._closed.wait(min(timeout_s, max(self._due_s - time.monotonic(), 0)))
             with self._lock:
-                shot = self._newest_due()
-        if shot is None:
+                frame = self._newest_due()
+        if frame is None:
             return None
         with self._lock:
-            content = shot.load()
-        return Observation(content.frame, time.time_ns(), content.mask, content.truth)
+            seen = frame.load()
+        return replace(seen, arrived_ns=time.time_ns())
 
     def close(self) -> None:
         self._closed.set()
         with self._lock:
-            self._reel.close()
+            self._recording.close()
 
-    def _newest_due(self) -> Shot | None:
-        """The last shot whose time has come; those before it were missed."""
-        due: Shot | None = None
+    def _newest_due(self) -> RecordedFrame | None:
+        """The last frame whose time has come; those before it were missed."""
+        due: RecordedFrame | None = None
         while True:
             if self._closed.is_set():
                 raise SourceLost("the recording is closed; open it again.")
@@ -132,15 +133,15 @@ class RecordingSource:
                 return due
             self.dropped += due is not None
             due, self._next = self._next, None
-            if self.waits:
+            if self.lossless:
                 return due
 
     def _advance(self) -> None:
-        """Look at the next shot, if there is one, and find out when it is due."""
-        self._next = next(self._shots, None)
+        """Look at the next frame, if there is one, and find out when it is due."""
+        self._next = next(self._frames, None)
         if self._next is None:
             return
-        if self._shown_ns is None or self.waits:
+        if self._shown_ns is None or self.lossless:
             self._due_s = time.monotonic()
         else:
             gap_s = max(self._next.stamp_ns - self._shown_ns, 0) * 1e-9 / self._rate
@@ -148,24 +149,24 @@ class RecordingSource:
         self._shown_ns = self._next.stamp_ns
 
 
-def _endless(reel: Reel) -> Iterator[Shot]:
-    """The reel again and again, each time later by its length and one period."""
+def _endless(recording: Recording) -> Iterator[RecordedFrame]:
+    """The recording again and again, each time later by its length and one period."""
     shift_ns = 0
     while True:
         stamps_ns = set()
-        for shot in reel.shots():
-            stamps_ns.add(shot.stamp_ns)
-            yield shot if shift_ns == 0 else _later(shot, shift_ns)
+        for frame in recording.frames():
+            stamps_ns.add(frame.stamp_ns)
+            yield frame if shift_ns == 0 else _later(frame, shift_ns)
         if not any(stamps_ns):
             return  # nothing in it can be read
         length_ns = max(stamps_ns) - min(stamps_ns)
         shift_ns += length_ns + (length_ns // max(len(stamps_ns) - 1, 1) or _PERIOD_NS)
 
 
-def _later(shot: Shot, shift_ns: int) -> Shot:
-    def load() -> Content:
-        content = shot.load()
-        stamp_ns = content.frame.stamp_ns + shift_ns
-        return replace(content, frame=replace(content.frame, stamp_ns=stamp_ns))
+def _later(frame: RecordedFrame, shift_ns: int) -> RecordedFrame:
+    def load() -> Observation:
+        seen = frame.load()
+        stamp_ns = seen.stamp_ns + shift_ns
+        return replace(seen, content=replace(seen.content, stamp_ns=stamp_ns))
 
-    return Shot(shot.stamp_ns + shift_ns, load)
+    return RecordedFrame(frame.stamp_ns + shift_ns, load)

@@ -48,7 +48,7 @@ class VirtualSourceConfig(SourceConfig, frozen=True, kw_only=True, tag="virtual"
         if self.seed < 0:
             raise InputError(f"virtual: seed is {self.seed}; it must be 0 or more.")
 
-    def theatre(self) -> ScenePlayer:
+    def player(self) -> ScenePlayer:
         """The room that this shows; building it takes some seconds.
 
         Raises:
@@ -83,7 +83,7 @@ class VirtualSourceConfig(SourceConfig, frozen=True, kw_only=True, tag="virtual"
             ArtifactError: no case there.
             InputError: a case or options that make no scene.
         """
-        return VirtualSource(self.theatre(), self.fps)
+        return VirtualSource(self.player(), self.fps)
 
 
 class VirtualSource:
@@ -91,13 +91,13 @@ class VirtualSource:
     surfaces."""
 
     host_clock = True
-    waits = False
+    lossless = False
 
-    def __init__(self, theatre: ScenePlayer, fps: float) -> None:
-        self.theatre = theatre
+    def __init__(self, player: ScenePlayer, fps: float) -> None:
+        self.player = player
         self.dropped = 0
         self._period_s = 1 / fps
-        self._begin: float | None = None  # of the theatre's time, by time.monotonic
+        self._begin: float | None = None  # of scene time, by time.monotonic
         self._next = 0  # number of the frame that is due next
         self._closed = threading.Event()
 
@@ -123,10 +123,10 @@ class VirtualSource:
         return self.at(t_s, stamp_ns)
 
     def at(self, t_s: float, stamp_ns: int) -> Observation:
-        """The theatre at a time since its beginning: what ``read`` gives, without a clock."""
-        instant = self.theatre.state_at(t_s)
-        truth = self.theatre.truth(instant)
-        frame = self.theatre.frame(instant, truth, stamp_ns)
+        """The scene at a time since its beginning: what ``read`` gives, without a clock."""
+        instant = self.player.state_at(t_s)
+        truth = self.player.truth(instant)
+        frame = self.player.frame(instant, truth, stamp_ns)
         return Observation(frame, arrived_ns=time.time_ns(), truth=truth)
 
     def close(self) -> None:

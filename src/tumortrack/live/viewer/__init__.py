@@ -1,1 +1,1 @@
-"""What the web viewer is made of: the scene, the panel, slices of the CT, margins."""
+"""Parts of the web viewer: scene, panel, slices of the CT, margins."""

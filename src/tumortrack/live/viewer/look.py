@@ -1,14 +1,14 @@
-"""From where the scene is looked at, and in what light."""
+"""The views of the scene, its light, and which point a click means."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
+from jaxtyping import Float
 
 from tumortrack.core.types import Mesh
 from tumortrack.live.values import PublishedFrame, Workcell
-from tumortrack.live.viewer.workcell import box_of
 
 if TYPE_CHECKING:
     from viser import CameraHandle, ClientHandle, ViserServer
@@ -23,6 +23,9 @@ _ROOM = 0.85  # a cell is wide and flat: its box fits into less than its sphere
 _NEAR_MM, _FAR_MM = 0.5, 20_000.0  # viser draws its background 1 before the eye
 # In the camera's frame: one above the camera and left of it, a weaker one from behind the organ.
 _LIGHTS = (("/light", 2.6, (-60.0, -120.0, -130.0)), ("/light_behind", 1.5, (60.0, -120.0, 130.0)))
+
+_SAME_MM = 2.0  # points this near the ray are all under the pointer: the foremost is meant
+_MISSED_MM = 10.0
 
 
 class Look:
@@ -87,7 +90,7 @@ class Look:
 
     def _overview(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Eye, what it looks at, up."""
-        box_mm = None if self._cell is None else box_of(self._cell)
+        box_mm = None if self._cell is None else self._cell.box_mm
         if box_mm is None:
             return self._way[:3, 3], self._organ_mm, -self._way[:3, 1]
         middle_mm = box_mm.mean(0)
@@ -107,3 +110,23 @@ class Look:
         @client.camera.on_update
         def _(camera: CameraHandle) -> None:
             self._eye_mm = camera.position
+
+
+def point_under(
+    points_mm: Float[np.ndarray, "n 3"],
+    origin_mm: Float[np.ndarray, " 3"],
+    direction: Float[np.ndarray, " 3"],
+) -> Float[np.ndarray, " 3"] | None:
+    """The point nearest a ray, all in one frame; of several under it the foremost. None if the
+    nearest is more than 10 mm off, or behind the ray's origin."""
+    offset = points_mm - origin_mm
+    along = offset @ (direction / np.linalg.norm(direction))
+    before = along > 0
+    offset, along, points_mm = offset[before], along[before], points_mm[before]
+    if not len(along):
+        return None
+    squared = np.maximum((offset**2).sum(1) - along**2, 0)
+    if squared.min() > _MISSED_MM**2:
+        return None
+    under = squared <= max(_SAME_MM**2, float(squared.min()))
+    return points_mm[np.flatnonzero(under)[np.argmin(along[under])]]

@@ -15,12 +15,11 @@ from jaxtyping import Float, UInt8
 from tumortrack.core import colours
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.types import Mesh
+from tumortrack.live.display import MOST_SEEN, seen_points, thinned, wxyz_of
 from tumortrack.live.values import PublishedFrame, SinkContext, TrackingResult, TransformedEstimate
 from tumortrack.live.viewer.look import Look
-from tumortrack.live.viewer.points import MOST_SEEN, seen_points, thinned
 from tumortrack.live.viewer.slices import SlicePlane
 from tumortrack.live.viewer.surfaces import bare_faces, exact_margin, rough_margin
-from tumortrack.live.viewer.workcell import wxyz_of
 
 if TYPE_CHECKING:
     from viser import ImageHandle, MeshHandle, PointCloudHandle, ViserServer
@@ -48,14 +47,14 @@ class DisplayOptions:
 class ViewerScene:
     """viser's nodes, and what goes into them."""
 
-    def __init__(self, server: ViserServer, setting: SinkContext, margin_mm: float) -> None:
+    def __init__(self, server: ViserServer, context: SinkContext, margin_mm: float) -> None:
         self._nodes = server.scene
         self._margin_mm = margin_mm
-        self._anatomy_ct, self._margins_ct = setting.anatomy_ct, None
-        if setting.anatomy_ct is not None:
-            self._bare_faces = bare_faces(setting.anatomy_ct)
+        self._anatomy_ct, self._margins_ct = context.anatomy_ct, None
+        if context.anatomy_ct is not None:
+            self._bare_faces = bare_faces(context.anatomy_ct)
             if margin_mm > 0:
-                tumors = setting.anatomy_ct.tumors
+                tumors = context.anatomy_ct.tumors
                 self._margins_ct = tuple(exact_margin(tumor, margin_mm) for tumor in tumors)
         self.options = DisplayOptions()
         self.margins: dict[str, Mesh] = {}  # of the shown estimate, published frame
@@ -63,14 +62,18 @@ class ViewerScene:
         self._has_organ = self._has_slice = False
         self._parts: dict[str, MeshHandle] = {}
         self._shells: dict[str, MeshHandle] = {}
-        self.look = Look(server, setting.frames)
-        self._make_nodes(setting)
+        self.look = Look(server, context.published_frame)
+        self._make_nodes(context)
 
-    def observe(self, update: TrackingResult) -> None:
-        """Show what this update saw; nothing, if it saw nothing."""
-        way = update.frames.published_from_camera
-        seen = np.zeros((0, 3), np.float32) if update.seen is None else seen_points(update)
-        organ = np.zeros((0, 3), np.float32) if update.organ is None else update.organ.points_mm
+    def observe(self, result: TrackingResult) -> None:
+        """Show what this result saw; nothing, if it saw nothing."""
+        way = result.published_frame.published_from_camera
+        seen = (
+            np.zeros((0, 3), np.float32)
+            if result.observation is None
+            else seen_points(result.observation)
+        )
+        organ = np.zeros((0, 3), np.float32) if result.organ is None else result.organ.points_mm
         self._put_points(self._seen, transform_points(way, thinned(seen, MOST_SEEN)), colours.SEEN)
         organ_there = transform_points(way, thinned(organ, MOST_SEEN))
         self._put_points(self._organ, organ_there, colours.ORGAN)
@@ -79,15 +82,15 @@ class ViewerScene:
             lower, upper = organ.min(0), organ.max(0)
             corners = transform_points(way, lower + _CORNERS * (upper - lower))
             self._region.points = corners[_EDGES].astype(np.float32)
-            self.look.aim(update.frames, float(np.median(organ[:, 2])))
+            self.look.aim(result.published_frame, float(np.median(organ[:, 2])))
         self._has_organ = len(organ) > 0
 
-    def show(self, update: TrackingResult) -> None:
-        """Show this update's estimate, which it must have."""
-        placed = update.placed
+    def show(self, result: TrackingResult) -> None:
+        """Show this result's estimate, which it must have."""
+        placed = result.transformed
         assert placed is not None
         self._put_labelled(placed)
-        self.margins = self._margins_of(update, placed)
+        self.margins = self._margins_of(result, placed)
         for name, mesh in placed.meshes.items():
             if name in self._parts:
                 shown = self.look.last_drawn(self._bare(mesh)) if name == "kidney" else mesh
@@ -154,7 +157,7 @@ class ViewerScene:
             there = transform_points(frames.published_from_camera, np.asarray(point_mm)[None])
             self._picked.position = there[0]
 
-    def _make_nodes(self, setting: SinkContext) -> None:
+    def _make_nodes(self, context: SinkContext) -> None:
         nodes = self._nodes
         self._axes = nodes.add_frame("/camera", axes_length=_AXES_MM, axes_radius=0.35)
         self._seen = self._cloud("/seen", 0.2, colours.SEEN)
@@ -174,12 +177,12 @@ class ViewerScene:
         self._shells = {
             # Of a margin its far half: the near one would cover the organ that it reaches out of.
             name: self._surface(f"/estimate/margin_{name}", label, 0.3, "back")
-            for label, name in enumerate(setting.parts[1:], start=2)
+            for label, name in enumerate(context.parts[1:], start=2)
             if self._margin_mm > 0
         }
         self._parts = {
             name: self._surface(f"/estimate/{name}", label, 0.35 if label == 1 else None)
-            for label, name in enumerate(setting.parts, start=1)
+            for label, name in enumerate(context.parts, start=1)
         }
         self._points = self._cloud("/estimate/points", 0.3, colours.KIDNEY)
         blank = np.zeros((2, 2, 4), np.uint8)
@@ -230,13 +233,13 @@ class ViewerScene:
             colour = colours.label_colours(placed.labels[some])
         self._put_points(self._points, placed.points_mm[some], colour)
 
-    def _margins_of(self, update: TrackingResult, placed: TransformedEstimate) -> dict[str, Mesh]:
-        assert update.estimate is not None
+    def _margins_of(self, result: TrackingResult, placed: TransformedEstimate) -> dict[str, Mesh]:
+        assert result.estimate is not None
         tumors = {n: m for n, m in placed.meshes.items() if n in self._shells}
-        motion = update.estimate.motion
+        motion = result.estimate.motion
         if self._margins_ct is None or motion is None:
             return {name: rough_margin(mesh, self._margin_mm) for name, mesh in tumors.items()}
-        way = update.frames.published_from_camera
+        way = result.published_frame.published_from_camera
         at_rest = dict(zip(self._shells, self._margins_ct, strict=True))
         return {
             name: at_rest[name].moved(

@@ -153,19 +153,19 @@ def _window(hu: Float32[np.ndarray, " n"]) -> tuple[float, float]:
     return float(low) - room, float(high) + room
 
 
-def load_ct(case: str, setting: SinkContext) -> CarriedCt:
+def load_ct(case: str, context: SinkContext) -> CarriedCt:
     """
     Raises:
         InputError: the model knows no motion, or the case is another patient's.
         ArtifactError: ``case`` is no case.
     """
     loaded = load_case(Path(case))
-    if setting.anatomy_ct is None:
+    if context.anatomy_ct is None:
         raise InputError(
             "viewer: case= shows the CT at the present position, which this model cannot: its "
             "estimates have no motion. Leave it out, or train with a preset that warps."
         )
-    apart = np.abs(loaded.anatomy.organ.box_mm - setting.anatomy_ct.organ.box_mm).max()
+    apart = np.abs(loaded.anatomy.organ.box_mm - context.anatomy_ct.organ.box_mm).max()
     if apart > _SAME_ORGAN_MM:
         raise InputError(
             f"viewer: {case} is not the case that the model was trained on: the organs' boxes in "
@@ -174,10 +174,10 @@ def load_ct(case: str, setting: SinkContext) -> CarriedCt:
     return CarriedCt(loaded)
 
 
-def plane_through(update: TrackingResult, part: str, orientation: str) -> SlicePlane | None:
+def plane_through(result: TrackingResult, part: str, orientation: str) -> SlicePlane | None:
     """Through the middle of a part's present surface; centred on the organ, and as large."""
-    assert update.estimate is not None
-    meshes = update.estimate.meshes
+    assert result.estimate is not None
+    meshes = result.estimate.meshes
     if part not in meshes or "kidney" not in meshes:
         return None
     across, down = (np.array(axis) for axis in ORIENTATIONS[orientation])

@@ -10,8 +10,9 @@ from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import Float, Float64
+from jaxtyping import Float64
 
+from tumortrack.live.display import wxyz_of
 from tumortrack.live.values import Polyline, RigidShape, Workcell
 
 if TYPE_CHECKING:
@@ -31,7 +32,7 @@ class WorkcellView:
 
     def show(self, cell: Workcell) -> None:
         """Show this, and nothing of what was shown before."""
-        drawn = [line for line in cell.lines if len(line.points_mm) > 1]
+        drawn = cell.drawn_lines
         for name in _gone(self._shapes, cell.shapes):
             self._shapes.pop(name)[1].remove()
         for name in _gone(self._lines, drawn):
@@ -83,24 +84,6 @@ class WorkcellView:
         elif not np.array_equal(before.points_mm, line.points_mm):
             node.points = segments
         self._lines[line.name] = line, node
-
-
-def box_of(cell: Workcell) -> Float64[np.ndarray, "2 3"] | None:
-    """The box round all shapes' own boxes, as they stand; None without any."""
-    if not cell.shapes:
-        return None
-    boxes = np.array([shape.mesh.box_mm for shape in cell.shapes])  # (n, 2, 3)
-    ways = np.array([shape.published_from_shape for shape in cell.shapes])
-    middles = np.einsum("nij,nj->ni", ways[:, :3, :3], boxes.mean(1)) + ways[:, :3, 3]
-    halves = np.einsum("nij,nj->ni", np.abs(ways[:, :3, :3]), np.ptp(boxes, axis=1) / 2)
-    return np.stack([(middles - halves).min(0), (middles + halves).max(0)])
-
-
-def wxyz_of(rotation: Float[np.ndarray, "*n 3 3"]) -> Float[np.ndarray, "*n 4"]:
-    """Quaternions, as viser wants them."""
-    from scipy.spatial.transform import Rotation
-
-    return Rotation.from_matrix(rotation).as_quat(scalar_first=True)
 
 
 def _node(kind: str, name: str) -> str:

@@ -1,0 +1,104 @@
+"""Markdown tables, and a document whose marked blocks are replaced while the rest stays."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from tumortrack.core import store
+from tumortrack.core.errors import InputError, StorageError
+
+
+def table(head: Sequence[str], rows: Iterable[Sequence[str]], left: int = 1) -> str:
+    """A Markdown table; the first ``left`` columns are left-aligned, numbers right-aligned."""
+    marks = ["---" if n < left else "---:" for n in range(len(head))]
+    lines = [_line(head), _line(marks)]
+    for row in rows:
+        if len(row) != len(head):
+            raise ValueError(f"a row of {len(row)} cells under a head of {len(head)}: {row}")
+        lines.append(_line(row))
+    return "\n".join(lines)
+
+
+def _line(cells: Sequence[str]) -> str:
+    return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
+
+
+def opening(name: str) -> str:
+    return f"<!-- results:{name} -->"
+
+
+def closing(name: str) -> str:
+    return f"<!-- /results:{name} -->"
+
+
+def fill(document: str, blocks: dict[str, str]) -> str:
+    """The document with the text between each block's markers replaced.
+
+    Doing it twice changes nothing more. Blocks that are not given stay as they are.
+
+    Raises:
+        InputError: a marker is missing, double or out of order.
+    """
+    for name, text in blocks.items():
+        if document.count(opening(name)) != 1 or document.count(closing(name)) != 1:
+            raise InputError(
+                f"the document needs the markers {opening(name)} and {closing(name)} exactly once "
+                f"each; put them where the {name} results belong."
+            )
+        before, _, rest = document.partition(opening(name))
+        if closing(name) not in rest:
+            raise InputError(f"{closing(name)} stands before {opening(name)}; put it after.")
+        after = rest.partition(closing(name))[2]
+        document = f"{before}{opening(name)}\n{text.strip()}\n{closing(name)}{after}"
+    return document
+
+
+@dataclass(frozen=True)
+class ReportWriter:
+    """A document with markers, and the command that its blocks name. Its pictures lie in the
+    folder ``images`` beside it."""
+
+    document: Path
+    command: str
+
+    def write(self, blocks: dict[str, str]) -> None:
+        """Replace these blocks, in one step.
+
+        Raises:
+            InputError: no document, or a marker missing.
+            StorageError: the disk refused.
+        """
+        store.write_atomically(self.document, fill(self._text(), blocks).encode())
+
+    def check(self, names: Iterable[str]) -> None:
+        """Before anything is measured: these blocks can be filled.
+
+        Raises:
+            InputError: no document, or a marker missing.
+        """
+        fill(self._text(), dict.fromkeys(names, ""))
+
+    def _text(self) -> str:
+        try:
+            return self.document.read_text(encoding="utf-8")
+        except OSError as error:
+            raise InputError(f"{self.document} cannot be read: {error.strerror}.") from error
+
+    def image(self, name: str) -> Path:
+        """Where a picture goes; its folder is made.
+
+        Raises:
+            StorageError: the disk refused.
+        """
+        path = self.document.parent / "images" / f"{name}.png"
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise StorageError(f"cannot write {path.parent}: {error.strerror}.") from error
+        return path
+
+    def link(self, image: Path, words: str) -> str:
+        """Markdown that shows a picture."""
+        return f"![{words}]({image.relative_to(self.document.parent)})"

@@ -1,0 +1,125 @@
+"""Measurements -> blocks of a document, and pictures beside it."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable
+from pathlib import Path
+
+import pandas as pd
+
+from tumortrack.core import store
+from tumortrack.report.protocol import RULE
+from tumortrack_lab.study import goals, plots, resection, tables
+from tumortrack_lab.study.cases import StudyCase
+from tumortrack_lab.study.document import ReportWriter
+from tumortrack_lab.study.frame import names, tidy
+from tumortrack_lab.study.measure import Job, spec_of
+from tumortrack_lab.study.paper import tumor_lies
+from tumortrack_lab.study.plan import Section
+
+_MEDIANS = RULE.replace("written as null", "written as not found")
+_OVER_SCENES = f"Distances in mm. {_MEDIANS} ± is the standard deviation over the seeds."
+_TARGETS = "mean over the scene's inner targets, for methods that carry points."
+_RULES: dict[Section, str] = {
+    "accuracy": "Distances in mm; ± is the standard deviation over the seeds, one scene each; "
+    f"target error: {_TARGETS}",
+    "goals": goals.RULE,
+    "ablation": "Distances in mm. Every model saw the same number of scenes; medians over the "
+    "deformed variants and all tumors, ± is the standard deviation over the seeds; in brackets the "
+    "change against clinic. A part that was not found counts as infinitely far. The prior of the "
+    "refinement is that of the elastic body in every row. Seconds are of a machine with the load "
+    "said here.",
+    "deformation": "mIoU; ± is the standard deviation over the seeds.",
+    "peers": f"{_OVER_SCENES} A network's seconds a frame are those of 50,000 queries without the "
+    f"dense volume, its preparation is training; target error: {_TARGETS}",
+    "faults": f"{_OVER_SCENES} In brackets: the change against clean depth.",
+    "views": f"{_OVER_SCENES} In brackets: the change against the clean view.",
+    "severity": f"Distances in mm. {_MEDIANS} Here they are over the states and the random draws "
+    f"of the fault. Most kinds have the clean scenes as one level; distance has not. Target error: "
+    f"{_TARGETS} Bars in the picture reach to the best and the worst scene, a cross at the top is "
+    "a level where some scene's tumor was not found.",
+    "resection": resection.RULE,
+}
+
+
+def section_blocks(
+    section: Section,
+    measurements: list[dict],
+    cases: tuple[StudyCase, ...],
+    writer: ReportWriter,
+) -> dict[str, str]:
+    """The block of one section, its pictures drawn: name -> Markdown."""
+    if section == "goals":
+        lies = {case.name: tumor_lies(case.anatomy_ct) for case in cases}
+        texts = [goals.goal_tables(tidy(measurements), lies)]
+    elif section == "resection":
+        texts = [resection.tables_of(measurements)]
+    else:
+        frame, texts = tidy(measurements), []
+        for case in cases:
+            mine = frame[frame.case == case.name]
+            if mine.empty:
+                continue  # a section may ask for some cases alone
+            if len(cases) > 1 or section == "accuracy":
+                texts.append(f"#### {case.name}")
+            texts += _MAKERS[section](mine, case, writer)
+    below = f"{tables.caption(measurements, writer.command)} {_RULES[section]}"
+    return {section: "\n\n".join([*texts, below])}
+
+
+def _accuracy(frame: pd.DataFrame, case: StudyCase, writer: ReportWriter) -> list[str]:
+    lies = tumor_lies(case.anatomy_ct)
+    image = writer.image(f"results_variants_{case.name}")
+    plots.error_per_variant(frame, lies, image)
+    return [
+        tables.lies_text(case.name, lies),
+        writer.link(image, f"{case.name}: tumor error per variant"),
+        tables.accuracy(frame, lies, case.is_paper),
+    ]
+
+
+def _peers(frame: pd.DataFrame, case: StudyCase, writer: ReportWriter) -> list[str]:
+    lies, texts = tumor_lies(case.anatomy_ct), []
+    turned = frame.variant.astype(str).str.startswith("Rot")
+    for what, group in (("Deformed", frame[~turned]), ("Turned", frame[turned])):
+        if len(group):
+            texts += [f"{what} ({', '.join(names(group, 'variant'))}):"]
+            texts += [tables.methods(group, lies)]
+    for key in ("depth", "displacement"):
+        image = writer.image(f"results_{key}_{case.name}")
+        if plots.error_against(frame[~turned], f"{key}_mm", image):
+            texts.append(writer.link(image, f"{case.name}: tumor error against {key}"))
+    return texts
+
+
+def _severity(frame: pd.DataFrame, case: StudyCase, writer: ReportWriter) -> list[str]:
+    image = writer.image("results_severity")
+    plots.severity_curves(frame, image)
+    picture = writer.link(image, f"{case.name}: tumor error against severity")
+    return [picture, tables.severities(frame)]
+
+
+_MAKERS: dict[Section, Callable[[pd.DataFrame, StudyCase, ReportWriter], list[str]]] = {
+    "accuracy": _accuracy,
+    "ablation": lambda frame, *_: [tables.ablation(frame)],
+    "deformation": lambda frame, *_: [tables.deformation(frame)],
+    "peers": _peers,
+    "faults": lambda frame, *_: [tables.conditions(frame, "fault", "clean")],
+    "views": lambda frame, *_: [tables.conditions(frame, "view", "clean")],
+    "severity": _severity,
+}
+
+
+def gallery_block(jobs: list[Job], seed: int, writer: ReportWriter, memory: Path) -> dict[str, str]:
+    """The gallery of these jobs (one case; methods x scenes; ``seed``: of the networks), drawn
+    again only where the methods or scenes have changed since ``memory`` was written."""
+    image = writer.image("results_gallery")
+    specs = "".join(spec_of(job).digest for job in jobs)
+    digest = hashlib.sha256(specs.encode()).hexdigest()
+    drawn = store.read_json(memory).get("gallery") if memory.exists() else None
+    if drawn != digest or not image.exists():
+        plots.gallery(jobs, image)
+        store.write_json(memory, {"gallery": digest})
+    text = f"`{writer.command}`: {jobs[0].case.name}, seed {seed} of the networks."
+    return {"gallery": f"{writer.link(image, 'estimate over truth')}\n\n{text}"}

@@ -1,0 +1,62 @@
+"""What scripts that train and judge share: unseen scenes, kept rows, the command line."""
+
+from __future__ import annotations
+
+import shlex
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import NoReturn, TypeVar
+
+import msgspec
+import tyro
+
+from tumortrack.core import store
+from tumortrack.core.errors import TumortrackError
+from tumortrack.imaging.case import Case
+from tumortrack.models.config import TrainConfig
+from tumortrack.simulate.occupancy import organ_pool
+from tumortrack.simulate.scene import Simulator, body_for
+from tumortrack.training.task import ValidationScenes, validation_scenes
+
+Options = TypeVar("Options")
+_UNSEEN_SEED = 1_000_003  # of the judged scenes and their library of states
+
+
+def unseen_scenes(case: Case, config: TrainConfig, count: int) -> ValidationScenes:
+    """Scenes of a configuration that no training has seen, nor the library of their states."""
+    body = body_for(case.anatomy, case.up_lps, config.scene, _UNSEEN_SEED)
+    simulator = Simulator(case.anatomy, case.up_lps, config.scene, body)
+    pool = organ_pool(case.anatomy, config.scene.occupancy, _UNSEEN_SEED)
+    few = msgspec.structs.replace(config, validation_pairs=count)
+    return validation_scenes(simulator, pool, few, _UNSEEN_SEED)
+
+
+def kept(path: Path, about: dict, measure: Callable[[], list[dict]]) -> list[dict]:
+    """The rows in a file if they were measured by what ``about`` says; else measured now."""
+    known = store.read_json(path) if path.is_file() else {}
+    if known.get("about") == about and "rows" in known:
+        return known["rows"]
+    rows = measure()
+    store.write_json(path, {"about": about, "rows": rows})
+    return rows
+
+
+def make_command(target: str) -> str:
+    """What a block names: the call of make that this run is."""
+    given = f" ARGS='{shlex.join(sys.argv[1:])}'" if sys.argv[1:] else ""
+    return f"make {target}{given}"
+
+
+def run(main: Callable[[Options], None], options: type[Options]) -> NoReturn:
+    """Run a script by its command line; errors are one line, and the exit code says which."""
+    name = Path(sys.argv[0]).stem
+    try:
+        main(tyro.cli(options))
+    except TumortrackError as error:
+        print(f"{name}: {error}", file=sys.stderr)
+        sys.exit(error.exit_code)
+    except KeyboardInterrupt:
+        print(f"{name}: stopped; the same command goes on.", file=sys.stderr)
+        sys.exit(130)
+    sys.exit(0)

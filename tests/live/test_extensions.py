@@ -1,0 +1,128 @@
+"""Sources and sinks that other packages add by entry points."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from extension_objects import EXAMPLE, distribution, installed_example
+from live_objects import small_frame, small_setting, small_update
+from stories import COMMAND, environment, succeeded
+from tumortrack.core.errors import InputError
+from tumortrack.live.spec import SINKS, SOURCES, extensions
+from tumortrack.live.values import Sink, Source
+from tumortrack.sense.files import write_depth_png, write_intrinsics
+
+
+@pytest.fixture
+def example(tmp_path, monkeypatch):
+    folders = installed_example(tmp_path / "site")
+    for folder in folders:
+        monkeypatch.syspath_prepend(str(folder))
+    yield folders
+    for name in [name for name in sys.modules if name.startswith("tumortrack_example")]:
+        del sys.modules[name]
+
+
+def with_packages(folders: list[Path], *arguments: object) -> subprocess.CompletedProcess[str]:
+    """A command of a new process that finds these packages."""
+    paths = [*map(str, folders), os.environ.get("PYTHONPATH", "")]
+    return subprocess.run(
+        [*COMMAND, *map(str, arguments)],
+        capture_output=True,
+        text=True,
+        timeout=600,
+        env={**environment(), "PYTHONPATH": os.pathsep.join(filter(None, paths))},
+    )
+
+
+def test_an_installed_package_adds_a_source(example, tmp_path):
+    frame = small_frame()
+    write_depth_png(tmp_path / "depth.png", frame)
+    write_intrinsics(tmp_path / "intrinsics.json", frame.intrinsics)
+    source = SOURCES.parse(f"image:{tmp_path}?fps=100").open()
+    assert isinstance(source, Source)
+    first, second = source.read(1.0), source.read(1.0)
+    source.close()
+    assert first.stamp_ns < second.stamp_ns
+    held = np.isfinite(frame.depth_mm)
+    np.testing.assert_allclose(first.content.depth_mm[held], frame.depth_mm[held], atol=0.051)
+
+
+def test_an_installed_package_adds_a_sink(example, tmp_path):
+    sink = SINKS.parse(f"csv:{tmp_path}/centres.csv?digits=1").open(small_setting())
+    assert isinstance(sink, Sink)
+    sink.publish(small_update())
+    sink.close()
+    header, kidney, tumor, *_ = (tmp_path / "centres.csv").read_text().splitlines()
+    assert header == "stamp_ns,quality,part,x_mm,y_mm,z_mm"
+    assert kidney.split(",")[1:3] == ["good", "kidney"]
+    x, y, z = map(float, tumor.split(",")[3:])
+    np.testing.assert_allclose([x, y, z], small_update().center_mm("tumor_1"), atol=0.051)
+
+
+def test_track_uses_it_by_its_text(phantom_case, clinic_model, tmp_path):
+    folders = installed_example(tmp_path / "site")
+    table = tmp_path / "centres.csv"
+    arguments = (f"virtual:{phantom_case}?fps=10", f"csv:{table}", "--seconds", 2)
+    report = ("--report", tmp_path / "report.json")
+    succeeded(with_packages(folders, "track", clinic_model, *arguments, *report))
+    rows = [line.split(",") for line in table.read_text().splitlines()[1:]]
+    assert {row[2] for row in rows} >= {"kidney", "tumor_1"}
+    assert len({row[0] for row in rows}) > 5
+
+
+def test_a_broken_package_breaks_its_own_kind_alone(example, tmp_path, monkeypatch):
+    broken = {
+        "tumortrack.sinks": {
+            "lost": "no_such_module:Sink",
+            "number": "math:pi",
+            "renamed": "tumortrack_example.csv:CsvSinkConfig",
+            "viewer": "tumortrack_example.csv:CsvSinkConfig",
+        }
+    }
+    monkeypatch.syspath_prepend(str(distribution(tmp_path / "other", "acme-sinks", broken)))
+    assert SINKS.parse("viewer:9000").port == 9000
+    assert SINKS.parse(f"csv:{tmp_path}/a.csv").digits == 2
+    for kind, said in {
+        "lost": "acme-sinks offers 'lost', but it cannot be imported .*no_such_module",
+        "number": "acme-sinks offers math:pi, which is no SinkConfig",
+        "renamed": "acme-sinks names its entry point 'renamed', and its class 'csv'",
+    }.items():
+        with pytest.raises(InputError, match=said):
+            SINKS.parse(kind)
+    with pytest.raises(InputError, match=r"Allowed: csv, lost, number, openigtlink, .*viewer"):
+        SINKS.parse("screen")
+    faults = {(one.package, one.kind): one.fault for one in extensions()}
+    assert faults["tumortrack-example", "csv"] == faults["tumortrack-example", "image"] == ""
+    assert "is built in" in faults["acme-sinks", "viewer"]
+    assert all(fault for (package, _), fault in faults.items() if package == "acme-sinks")
+
+
+def test_two_packages_with_one_kind_are_both_named(example, tmp_path, monkeypatch):
+    twice = {"tumortrack.sinks": {"csv": "tumortrack_example.csv:CsvSinkConfig"}}
+    monkeypatch.syspath_prepend(str(distribution(tmp_path / "other", "acme-sinks", twice)))
+    with pytest.raises(InputError, match="acme-sinks and tumortrack-example both offer 'csv'"):
+        SINKS.parse(f"csv:{tmp_path}/a.csv")
+
+
+def test_doctor_names_what_other_packages_add(tmp_path):
+    broken = {"tumortrack.sources": {"lost": "no_such_module:Source"}}
+    folders = [
+        *installed_example(tmp_path / "site"),
+        distribution(tmp_path / "other", "acme-sources", broken),
+    ]
+    said = succeeded(with_packages(folders, "doctor"))
+    assert "ok       sink csv of the package tumortrack-example" in said
+    assert "BROKEN   source lost of the package acme-sources: " in said
+    assert "no_such_module" in said
+
+
+def test_the_documentation_shows_the_example_as_it_is():
+    shown = (EXAMPLE.parents[2] / "docs" / "live.md").read_text()
+    assert (EXAMPLE / "tumortrack_example" / "csv.py").read_text() in shown

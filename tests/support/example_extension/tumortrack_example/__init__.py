@@ -1,0 +1,1 @@
+"""A source and a sink for tumortrack, as another package would bring them."""
