@@ -57,7 +57,7 @@ class Pretraining:
     @property
     def identity(self) -> str:
         """sha256 of all that decides the weights."""
-        return settings_sha256(self, anatomies=self.anatomies)
+        return settings_sha256(self.config, self.seed, self.steps, anatomies=self.anatomies)
 
 
 @dataclass(frozen=True, eq=False)

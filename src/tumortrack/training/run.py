@@ -46,7 +46,8 @@ class TrainingRun:
     def identity(self) -> str:
         """sha256 of all that decides the weights, so that a resumed run is the same run."""
         start = {} if self.start is None else {"start": self.start.sha256}
-        return settings_sha256(self, case=self.case_sha256, minutes=self.minutes, **start)
+        more = {"case": self.case_sha256, "minutes": self.minutes, **start}
+        return settings_sha256(self.config, self.seed, self.steps, **more)
 
 
 def run_identity(run: TrainingRun) -> str:
@@ -70,9 +71,9 @@ def check_settings(run: RunSettings, **smallest: int) -> None:
         )
 
 
-def settings_sha256(run: RunSettings, **more: object) -> str:
+def settings_sha256(config: TrainConfig, seed: int, steps: int | None, **more: object) -> str:
     """sha256 of the configuration, the seed, the number of steps, and of ``more``."""
-    content = {"config": identity(run.config), "seed": run.seed, "steps": run.steps, **more}
+    content = {"config": identity(config), "seed": seed, "steps": steps, **more}
     content["schema"] = store.SCHEMA
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
