@@ -32,7 +32,7 @@ def cloud():
 
 
 @pytest.fixture(scope="module")
-def occupancy(clinic_model):
+def occupancy(quick_model):
     """The presets' kind, small: farthest points, balls, a skip, norms, octaves, alignment."""
     torch.manual_seed(0)
     config = NetworkConfig(
@@ -52,7 +52,7 @@ def occupancy(clinic_model):
         normalisation=Aligned(scale_mm=50.0, reach=1.35),
     )
     network = OccupancyNetwork(config)
-    model = replace(load_model(clinic_model, "cpu"), network=network.eval())
+    model = replace(load_model(quick_model, "cpu"), network=network.eval())
     return network, onnx_bytes(model)
 
 

@@ -509,6 +509,7 @@ print(refine(shape, points, start, GaussNewtonConfig(steps=3)).motion.coefficien
 """
 
 
+@pytest.mark.slow
 def test_the_first_answer_of_a_machine_is_that_of_all_others(tmp_path):
     """Kernels compiled by this process and kernels found in numba's cache add up alike."""
     points, pose = surface(placed(), 300), {"rotation": START.rotation, "centre": START.centre_mm}

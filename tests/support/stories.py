@@ -77,7 +77,7 @@ def trained(case: Path, model: Path, preset: str) -> None:
 
 
 def train_learnt(case_folder: Path, model: Path) -> None:
-    """Write a model folder of a ``quick`` with small pictures and batches, trained for a minute."""
+    """Write a model folder of a ``quick`` with small pictures, trained for a minute."""
     from msgspec.structs import replace
 
     from tumortrack.imaging.case import load_case
@@ -87,9 +87,9 @@ def train_learnt(case_folder: Path, model: Path) -> None:
     case = load_case(case_folder)
     preset = quick(case.anatomy)
     scene = replace(preset.scene, width=212, height=120)
-    config = replace(preset, scene=scene, batch_size=12, validation_pairs=4)
+    config = replace(preset, scene=scene, validation_pairs=4)
     digest = store.sha256_of(case_folder / store.MANIFEST)
-    settings = {"steps": 240, "workers": 0, "device": "cpu"}
+    settings = {"steps": 400, "workers": 0, "device": "cpu"}
     run = TrainingRun(case.anatomy, case.up_lps, digest, config, **settings)  # type: ignore[arg-type]
     train(run, model, lambda _: None)
 
