@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from tumortrack.tracking.tracker import Tracker
     from tumortrack.training import presets
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 __all__ = [
     "Case",
     "DepthFrame",

@@ -186,7 +186,13 @@ def open_sinks(
     # Those that make a folder last: if another cannot open, none is left behind.
     pairs = zip(sinks, configs, strict=True)
     for spec, config in sorted(pairs, key=lambda pair: pair[1].queue_size):
-        worker = SinkWorker(spec, config.open(context), config.queue_size)
+        try:
+            sink = config.open(context)
+        except OSError as error:  # a sink of another package that does not translate it
+            raise StorageError(
+                f"sink {spec!r} cannot be opened: {error.strerror}: {error.filename}."
+            ) from error
+        worker = SinkWorker(spec, sink, config.queue_size)
         stack.callback(worker.close)
         workers.append(worker)
     return workers
