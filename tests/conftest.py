@@ -23,7 +23,7 @@ CHECKED = [
     and path != PACKAGES[0] / "core" / "types.py"
     and not re.search("^ *import numba|^@n?jit", path.read_text(encoding="utf-8"), re.M)
 ]
-jaxtyping.install_import_hook(CHECKED, "checking.checked")
+jaxtyping.install_import_hook(CHECKED, "checking.check_annotations")
 
 
 # What needs a model is slow: it may be the one that trains it.

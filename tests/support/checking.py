@@ -12,6 +12,6 @@ _NUMBERS = FrozenDict({int: int | np.integer, float: float | int | np.number})
 _checked = beartype(conf=BeartypeConf(hint_overrides=_NUMBERS))
 
 
-def checked(function: Any) -> Any:
+def check_annotations(function: Any) -> Any:
     """The typechecker that the hook is given."""
     return _checked(function)
