@@ -8,7 +8,6 @@ import msgspec
 import numpy as np
 import pytest
 import torch
-from tumortrack.occupancy.mlp_decoder import MlpDecoder
 
 from clock import Clock
 from stories import tumortrack
@@ -17,7 +16,7 @@ from tumortrack.core.types import Anatomy, Mesh
 from tumortrack.models.config import MlpDecoderConfig, NetworkConfig
 from tumortrack.models.encoders.pointnet2 import PointNet2Config, SetAbstraction
 from tumortrack.models.normalisation import CloudBox
-from tumortrack.occupancy.network import OccupancyNetwork
+from tumortrack.occupancy.network import MlpDecoder, OccupancyNetwork
 from tumortrack.training.presets import quick_network
 from tumortrack_lab.bench import timing as interleaving
 from tumortrack_lab.bench.counts import module_flops

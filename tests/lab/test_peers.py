@@ -5,6 +5,7 @@ import sys
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from tumortrack_lab.study.peer_methods import peer_method
 
 from render_objects import ellipsoid
 from tumortrack.core.errors import InputError, NoEstimate
@@ -21,7 +22,6 @@ from tumortrack_lab.peers.point_drift import Bcpd, BcpdConfig, Cpd, CpdConfig
 from tumortrack_lab.peers.pose_search import RigidConfig, seen_from, surface_points
 from tumortrack_lab.peers.rigid import Rigid, RigidBound, fit_over_volume, matched_vertices
 from tumortrack_lab.study.measure import StudyCase
-from tumortrack_lab.study.peer_methods import peer_method
 from tumortrack_lab.tets import tetrahedralise
 
 UP = (0.0, -1.0, 0.0)
