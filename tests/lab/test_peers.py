@@ -5,7 +5,6 @@ import sys
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from tumortrack_lab.study.peer_methods import peer_method
 
 from render_objects import ellipsoid
 from tumortrack.core.errors import InputError, NoEstimate
