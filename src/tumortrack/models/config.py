@@ -61,8 +61,9 @@ class GaussNewtonConfig(Config, frozen=True):
     """``n_effective``: independent points in a cloud: errors of neighbours are correlated.
 
     ``sigma_mm``: of a point that belongs to the organ, model errors included. ``first_mm`` and
-    ``last_mm``: the distance where a point's pull is greatest falls from the one to the other;
-    points far beyond do not count. ``shift_mm``, ``turn_rad``: how far the start may be off.
+    ``last_mm``: the robust kernel's width falls from the one to the other; a point pulls most at
+    0.58 of it, and points far beyond do not count. ``shift_mm``, ``turn_rad``: how far the start
+    may be off.
     """
 
     steps: int = 20

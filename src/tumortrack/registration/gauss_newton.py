@@ -28,7 +28,7 @@ from tumortrack.registration.rest_shape import RestShape
 
 @dataclass(frozen=True, eq=False)
 class RegistrationResult:
-    """A motion, the squared error it minimises, and the residuals (signed distances, mm)."""
+    """A motion, its cost (robust data term and prior), and the residuals (signed distances, mm)."""
 
     motion: ElasticMotion
     cost: float

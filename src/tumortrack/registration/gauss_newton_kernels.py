@@ -100,7 +100,7 @@ def descend(organ, points, options, state, residuals, first, last):  # type: ign
 
 @numba.njit(cache=True, nogil=True)
 def _width(options, step):  # type: ignore[no-untyped-def]
-    """The distance (mm) where a point's pull is greatest, after so many steps."""
+    """The robust kernel's width (mm) after so many steps; a point pulls most at 0.58 of it."""
     return max(options.last_mm, options.first_mm * options.narrowing**step)
 
 
@@ -117,7 +117,7 @@ def _equations(  # type: ignore[no-untyped-def]
     pose = Pose(organ.center_ct, state.rotation, state.centre_mm)
     normal_equations(flow, organ, pose, np.float32(width), points, room, residuals)
     unknowns, cost = len(gradient), 0.0
-    for p in range(len(distances)):
+    for p in range(len(distances)):  # rho of Geman and McClure: its derivative is the weight below
         square = (np.float64(distances[p]) / last_mm) ** 2
         cost += square / (1.0 + square)
     cost *= weight * last_mm**2
@@ -155,9 +155,10 @@ def normal_equations(flow, organ, pose, width, points, room, out):  # type: igno
             for p in range(len(some)):
                 distance = rows[p, unknowns]
                 distances[first + p] = distance
-                share = one / (one + (distance * per_width) ** 2)
+                # The root of the kernel's weight: both factors of a product carry it.
+                root_weight = one / (one + (distance * per_width) ** 2)
                 for n in range(unknowns + 1):
-                    across[n, first - start + p] = rows[p, n] * share
+                    across[n, first - start + p] = rows[p, n] * root_weight
         _add_products(across, count, sums)
     for n in range(unknowns):
         for m in range(n + 1):

@@ -1,10 +1,10 @@
 """The method `clinic`, read top to bottom: from a cloud of one side to the whole organ.
 
-1. A network proposes where the organ lies and how it is deformed, either way round (`network`).
-2. Gauss-Newton lays the organ's surface on the points from each proposal (`gauss_newton`); the
-   one that fits best is kept.
-3. Where even that fits badly, the likeliest proposal is turned about the camera's axis and fitted
-   again: this repairs most starts that are wrong altogether.
+1. A network makes two hypotheses of where the organ lies and how it is deformed (`network`).
+2. Gauss-Newton lays the organ's surface on the points from each of them (`gauss_newton`), with a
+   robust kernel; the one that fits best is kept.
+3. Where even that fits badly, the undeformed organ is tried in eight turns about the camera's
+   axis, in the likeliest hypothesis's place: this repairs most starts that are wrong altogether.
 
 The result is a motion (`motion`): any point of the CT, carried to the camera's frame and back,
 with its uncertainty. `locator` reads surfaces, labels and numbers off it.
@@ -31,14 +31,14 @@ from tumortrack.registration.rest_shape import RestShape
 
 Points = Float[np.ndarray, "n 3"]  # camera frame, mm
 
-_SURE = 6.0  # logits: the other way round is not even tried
-_TURNS = 8  # of a proposal that does not fit
+_FLIP_MARGIN = 6.0  # logits: beyond this lead the other way round is not tried
+_TURNS = 8  # about the camera's axis, where no hypothesis fits
 
-# Of 840 clouds of four organs (drags, elastic states, the digital twin's), none had a best start
-# that after six steps cost more than 2.5 times what another did; two thirds of the wrong ways
-# round cost more than three times. Of turned starts: never more than twice.
+# On 840 clouds of four organs (drags, elastic states, the digital twin's) the eventual winner's
+# cost after six steps was at most 2.5 times the least (turned starts: twice). Two thirds of the
+# wrong ways round were above three times.
 _TRIAL_STEPS = 6
-_GIVEN_UP = 3.0  # times the least cost
+_MAX_COST_RATIO = 3.0  # to the least cost: starts above are given up
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,27 +50,27 @@ class Registration:
     config: GaussNewtonConfig
 
     def register(self, points_mm: Points, usual_cost: float = math.inf) -> RegistrationResult:
-        """The best fit to a cloud; ``usual_cost``: above it, turned proposals are tried too."""
+        """The whole method; the locator calls its two halves, to time each."""
         return self.best_fit(points_mm, self.propose(points_mm), usual_cost)
 
     @torch.no_grad()
     def propose(self, points_mm: Points) -> list[ElasticMotion]:
-        """What the network sees, the likelier way round first; the other one only where it may be
-        right."""
+        """The network's hypotheses, the likelier first; the second only where it may be right."""
         device = next(self.network.parameters()).device
         cloud = torch.tensor(np.asarray(points_mm, np.float32), device=device)[None]
         with _one_thread() if device.type == "cpu" else nullcontext():
             ways = sorted(
                 self.network.flip_hypotheses(cloud), key=lambda way: -float(way.right_way)
             )
-        if float(ways[0].right_way - ways[1].right_way) > _SURE:
+        if float(ways[0].right_way - ways[1].right_way) > _FLIP_MARGIN:
             ways = ways[:1]
         return [self._motion(way) for way in ways]
 
     def best_fit(
         self, points_mm: Points, starts: list[ElasticMotion], usual_cost: float = math.inf
     ) -> RegistrationResult:
-        """The refined start of the least cost."""
+        """The best refined start; give the likeliest one first. Above ``usual_cost`` turned starts
+        are tried too."""
         fit = self._race(points_mm, starts)
         return self.repaired(points_mm, starts[0], fit) if fit.cost > usual_cost else fit
 
@@ -93,7 +93,7 @@ class Registration:
         runners = [GaussNewton(self.rest, points_mm, start, self.config) for start in starts]
         for steps in (min(_TRIAL_STEPS, self.config.steps), self.config.steps):
             least = min(runner.cost for runner in runners)
-            runners = [runner for runner in runners if runner.cost <= _GIVEN_UP * least]
+            runners = [runner for runner in runners if runner.cost <= _MAX_COST_RATIO * least]
             _run_all(runners, steps)
         return min(runners, key=lambda runner: runner.cost).result()
 
