@@ -11,11 +11,11 @@ import pytest
 
 from clock import PATIENCE_S, until
 from igtl_objects import Heard, hear, hear_all, polydata_by_the_book
-from igtl_reader import unpack_polydata, unpack_status, unpack_transform
+from igtl_reader import IgtlStatus, unpack_polydata, unpack_status, unpack_transform
 from live_objects import STAMP_NS, empty_update, small_anatomy, small_setting, small_update
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import rigid
-from tumortrack.live.igtl.message import IgtlStatus, Message, pack
+from tumortrack.live.igtl.message import Message, pack
 from tumortrack.live.sinks.openigtlink import OpenIgtLinkSink, OpenIgtLinkSinkConfig
 from tumortrack.live.values import PublishedFrame, SinkContext, TrackingResult
 
@@ -242,7 +242,7 @@ def test_one_that_only_asks_fills_no_memory(opened) -> None:
         asker.sendall(pack(Message("GET_IMAGE", f"ct{n}")))
     sink.publish(small_update())
     assert len(hear_all(friend, ALL)) == ALL
-    most = max(len(one.waiting) for one in sink._link._receivers.values())
+    most = max(len(one.waiting) for one in sink._link._receivers)
     assert most <= 100 + ALL
 
 
@@ -288,7 +288,7 @@ def test_what_cannot_work_is_refused(opened) -> None:
     with pytest.raises(InputError, match="there is no host"):
         OpenIgtLinkSinkConfig(connect="no..host").open(small_setting())
     for bad in ({"port": 70000}, {"mesh_hz": -1.0}, {"cloud_hz": float("nan")}):
-        with pytest.raises(InputError, match="must lie in"):
+        with pytest.raises(InputError, match=next(iter(bad))):
             OpenIgtLinkSinkConfig(**bad)  # type: ignore[arg-type]
 
 

@@ -19,13 +19,12 @@ from scipy.spatial.transform import Rotation
 
 from clock import Clock, until
 from igtl_objects import hear_all
-from igtl_reader import unpack_status, unpack_transform
+from igtl_reader import IgtlStatus, unpack_status, unpack_transform
 from live_objects import PARTS, small_setting, small_update
 from recording_objects import frame_number
 from tumortrack.core.errors import InputError, TumortrackError
 from tumortrack.core.geometry import rigid, transform_points
 from tumortrack.core.mesh_files import read_mesh
-from tumortrack.live.igtl.message import IgtlStatus
 from tumortrack.live.ros.messages import Messages, stamp_of
 from tumortrack.live.ros.results import messages_of
 from tumortrack.live.ros.sensors import cloud_of

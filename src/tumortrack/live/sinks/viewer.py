@@ -6,12 +6,14 @@ second of silence, nothing of an older one stays visible.
 
 from __future__ import annotations
 
+import logging
+import socket
 import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
@@ -22,14 +24,12 @@ from tumortrack.core.types import Mesh
 from tumortrack.live.display import seen_points
 from tumortrack.live.values import SinkConfig, SinkContext, TrackingResult
 from tumortrack.live.viewer.look import point_under
-from tumortrack.live.viewer.panel import Actions, Panel, State, StatusPanel, backdrop
+from tumortrack.live.viewer.panel import Panel, State, StatusPanel
 from tumortrack.live.viewer.scene import ViewerScene
-from tumortrack.live.viewer.server import close_server, open_server
 from tumortrack.live.viewer.slices import load_ct, plane_through, slice_picture
-from tumortrack.live.viewer.workcell import WorkcellView
 
 if TYPE_CHECKING:
-    from viser import SceneClickEvent
+    from viser import GuiEvent, SceneClickEvent, ViserServer
 
 _STALE_S = 1.0
 _TICK_S = 0.2  # the status grows older, and slices are renewed, this often
@@ -57,10 +57,7 @@ class ViewerSinkConfig(SinkConfig, frozen=True, kw_only=True, tag="viewer"):
     hz: float = 15.0
 
     def __post_init__(self) -> None:
-        if not 0 <= self.port <= 65535:
-            raise InputError(f"viewer: port {self.port} is not in 0..65535.")
-        if not 0 <= self.margin_mm <= 50:
-            raise InputError(f"viewer: margin_mm={self.margin_mm:g}; allowed are 0 to 50 mm.")
+        self.check_ranges("viewer:", "0", port=65535, margin_mm=50)
         if not 0 < self.hz <= 60:
             raise InputError(f"viewer: hz={self.hz:g}; allowed are more than 0 and up to 60.")
 
@@ -78,9 +75,9 @@ class ViewerSink:
     """See ``live.values.Sink``. ``port``: where the page is."""
 
     def __init__(self, config: ViewerSinkConfig, context: SinkContext) -> None:
-        ct = load_ct(config.case, context) if config.case else None
-        self._config, self._context, self._ct = config, context, ct
-        self._server = open_server(config.host, config.port)
+        self._ct = load_ct(config.case, context) if config.case else None
+        self._config, self._context = config, context
+        self._server = _opened(config.host, config.port)
         self.port: int = self._server.get_port()
         self._lock = threading.RLock()  # round every change of the page
         self._result: TrackingResult | None = None  # the last that came
@@ -88,19 +85,32 @@ class ViewerSink:
         self._came = self._drawn = -np.inf
         self._hidden_count = 0  # a slice made before the last hiding is void
         self._counter = 0
-        self._fault: BaseException | None = None
+        self._fault: BaseException | None = None  # for the next publish to raise
         self._picking = False
-        self._state: State | None = None
+        self._state: State = "waiting"
         self._behind: tuple[State, bool] | None = None
         self._scene = ViewerScene(self._server, context, config.margin_mm)
-        self._cell = WorkcellView(self._server)
-        turn = self._scene.look.turn
-        actions = Actions(self._changed, self._toggle_picking, self._forget, turn, self._abort)
-        self._panel = Panel(self._server, context.parts, actions, ct is not None, context.arms)
+        self._panel = Panel(self._server, context.parts, self._ct is not None, context.arms)
+        self._connect()
         self._say("waiting")
         self._closing = threading.Event()
         self._watch = threading.Thread(target=self._keep_watch, name="viewer", daemon=True)
         self._watch.start()
+
+    def _connect(self) -> None:
+        """What the panel's elements do; viser calls it from its own threads."""
+        panel = self._panel
+        for switch in panel.switches:
+            switch.on_update(lambda _: self._changed())
+        panel.pick.on_click(lambda _: self._toggle_picking())
+        panel.forget.on_click(lambda _: self._forget())
+        if self._context.arms:
+            panel.abort.on_click(lambda _: self._abort())
+
+            @panel.views.on_click
+            def _(event: GuiEvent[Any]) -> None:
+                if event.client is not None:  # nobody's click otherwise: set by the program
+                    self._scene.look.turn(event.client, event.target.value)
 
     def publish(self, result: TrackingResult) -> None:
         """Show it: without an estimate at once, with one not more often than ``hz``; arms each
@@ -122,11 +132,10 @@ class ViewerSink:
             raise fault
 
     def close(self) -> None:
-        if self._closing.is_set():
-            return
-        self._closing.set()
-        self._watch.join(5)
-        close_server(self._server)
+        if not self._closing.is_set():
+            self._closing.set()
+            self._watch.join(5)
+            _close(self._server)
 
     @contextmanager
     def _page(self) -> Iterator[None]:
@@ -153,12 +162,12 @@ class ViewerSink:
     def _draw_cell(self, result: TrackingResult) -> None:
         try:
             if result.workcell is None:
-                self._cell.hide()
+                self._scene.hide_cell()
                 return
-            self._cell.show(result.workcell)
+            self._scene.show_cell(result.workcell)
             self._scene.look.oversee(result.workcell)
         except Exception as error:
-            self._cell.hide()
+            self._scene.hide_cell()
             self._fault = error  # raised when the estimate has been shown
 
     def _hide(self) -> None:
@@ -177,7 +186,7 @@ class ViewerSink:
         status = StatusPanel(state, result, age_s, self._counter, self._context.arms)
         if (behind := (state, status.alarming)) != self._behind:
             self._behind = behind
-            self._server.scene.set_background_image(backdrop(*behind))
+            self._server.scene.set_background_image(status.backdrop())
         self._panel.say(status)
 
     def _keep_watch(self) -> None:
@@ -185,16 +194,15 @@ class ViewerSink:
         while not self._closing.wait(_TICK_S):
             try:
                 with self._page():
-                    if self._result is not None and time.monotonic() - self._came > _STALE_S:
-                        if self._shown is not None:
-                            self._hide()
-                        self._cell.hide()
-                        self._say("stale")
-                    else:
-                        self._say(self._state or "waiting")
+                    stale = self._result and time.monotonic() - self._came > _STALE_S
+                    if stale and self._shown is not None:
+                        self._hide()
+                    if stale:
+                        self._scene.hide_cell()
+                    self._say("stale" if stale else self._state)
                 self._renew_slice()
-            except Exception as error:
-                self._fault = error  # for the next publish to raise: the watch must go on
+            except Exception as error:  # the watch must go on
+                self._fault = error
 
     def _renew_slice(self) -> None:
         if self._ct is None:
@@ -202,10 +210,9 @@ class ViewerSink:
         with self._lock:
             result, hidden_count = self._shown, self._hidden_count
             part, orientation = self._panel.slice_through
-        if result is None:
+        if result is None or result.estimate is None:
             return
-        plane = plane_through(result, part, orientation)
-        motion = result.estimate.motion if result.estimate is not None else None
+        plane, motion = plane_through(result, part, orientation), result.estimate.motion
         picture = None
         if plane is not None and motion is not None:
             outlines = self._outlines(result)
@@ -231,9 +238,7 @@ class ViewerSink:
 
     def _changed(self) -> None:
         with self._page():
-            self._scene.options = self._panel.options
-            self._scene.redraw_points()
-            self._scene.apply()
+            self._scene.change(self._panel.options)
 
     def _toggle_picking(self) -> None:
         """The next click in the scene chooses the organ; asked twice: it does not."""
@@ -261,13 +266,13 @@ class ViewerSink:
             if point is None:
                 event.client.add_notification("No observed point there", "Click on the points.")
                 return
-            self._context.controls.pick(point)
+            self._context.controls.picked_mm = point
             self._scene.mark(point, result.published_frame)
             self._panel.picking(False, True)
 
     def _forget(self) -> None:
         with self._lock:
-            self._context.controls.pick(None)
+            self._context.controls.picked_mm = None
             self._scene.mark(None, self._context.published_frame)
             self._panel.picking(self._picking, False)
 
@@ -275,3 +280,62 @@ class ViewerSink:
         with self._lock:
             self._context.controls.aborted.set()
             self._panel.aborted()
+
+
+def _opened(host: str, port: int) -> ViserServer:
+    """A running server with an empty scene, where it was asked for; port 0: any free one.
+
+    Raises:
+        InputError: viser is not installed; the port is taken; this machine has no such address.
+    """
+    try:
+        import viser
+    except ImportError as error:
+        raise InputError("the viewer needs viser: pip install 'tumortrack[live]'.") from error
+    taken = (
+        f"the viewer cannot listen on port {port} of {host}: another program does, or it may not "
+        f"be used. Close that, or choose another port: viewer:{port + 1}."
+    )
+    try:  # asked for a taken port, viser takes another and doesn't say so
+        family = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0][0]
+        with socket.socket(family, socket.SOCK_STREAM) as probe:
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # as the server will
+            probe.bind((host, port))
+    except socket.gaierror as error:
+        raise InputError(
+            f"the viewer cannot listen at {host!r}: {error.strerror}. Give host=127.0.0.1 for this "
+            "machine alone, host=0.0.0.0 for every machine that can reach it."
+        ) from error
+    except OSError as error:
+        raise InputError(f"{taken} ({error.strerror})") from error
+    logging.getLogger("websockets.server").addFilter(_is_no_refusal)
+    with _silence():
+        server = viser.ViserServer(host=host, port=port, label="tumortrack", verbose=False)
+    if port not in (0, server.get_port()):
+        _close(server)
+        raise InputError(taken)
+    return server
+
+
+def _close(server: ViserServer) -> None:
+    """Stop it, its threads and its connections; browsers have up to 6 s to say goodbye."""
+    with _silence():
+        server.stop()
+
+
+def _is_no_refusal(record: logging.LogRecord) -> bool:
+    """Browsers open connections in advance and drop them, which websockets logs as an error."""
+    return record.getMessage() != "opening handshake failed"
+
+
+@contextmanager
+def _silence() -> Iterator[None]:
+    """viser prints when it starts and stops, through rich's shared console."""
+    import rich
+
+    console = rich.get_console()
+    before, console.quiet = console.quiet, True
+    try:
+        yield
+    finally:
+        console.quiet = before
