@@ -29,13 +29,13 @@ from tumortrack.live.ros.messages import Messages, stamp_of
 from tumortrack.live.ros.results import messages_of
 from tumortrack.live.ros.sensors import cloud_of
 from tumortrack.live.ros.workcell import WorkcellMessages
-from tumortrack.live.sink_worker import SinkWorker
 from tumortrack.live.sinks.openigtlink import OpenIgtLinkSinkConfig
 from tumortrack.live.sinks.recording import RecordingSinkConfig as RecordTo
 from tumortrack.live.sinks.ur import SILENT_S, UR_JOINTS, UrSink, UrSinkConfig
 from tumortrack.live.sources.recording import RecordingSourceConfig
 from tumortrack.live.spec import SINKS
 from tumortrack.live.values import Observation, SinkContext, SourceEnded, TrackingResult
+from tumortrack.live.workers import SinkWorker
 from workcell_objects import CUT, REASON, TABLE, virtual, with_arms, workcell, working
 
 HUMBLE, NOETIC = Messages("humble"), Messages("noetic")

@@ -22,8 +22,6 @@ from tumortrack.core.errors import InputError, NoEstimate, TumortrackError
 from tumortrack.core.types import DepthFrame, Intrinsics, SensorCloud
 from tumortrack.live.meter import RunStatistics
 from tumortrack.live.quality import StampCheck, judge
-from tumortrack.live.sink_worker import SinkWorker
-from tumortrack.live.source_worker import SourceWorker
 from tumortrack.live.values import (
     ArmsController,
     Observation,
@@ -32,6 +30,7 @@ from tumortrack.live.values import (
     SourceLost,
     TrackingResult,
 )
+from tumortrack.live.workers import SinkWorker, SourceWorker
 from tumortrack.sense.camera import d405
 from tumortrack.sense.region import Hints, RegionConfig, organ_points
 from tumortrack.tracking.tracker import Follower, FollowerConfig, Tracker
@@ -229,7 +228,7 @@ class Loop:
             self._found_s = time.monotonic()
             self._follower.forget()
         elif self._picked is not None and time.monotonic() - self._found_s > _PICK_S:
-            controls.pick(None)  # it is not there any more, nor where it was seen last
+            controls.picked_mm = None  # it is not there any more, nor where it was seen last
             self._picked = self._place_mm = None
         last_box_mm = self._follower.last_box_mm(seen.stamp_ns)
         # Once the organ is found its box is the better guide: pieces may cover the place.

@@ -229,7 +229,6 @@ class TrackingResult:
         return f"{self.quality}: {self.warning}" if self.warning else self.quality
 
 
-@runtime_checkable
 class ArmsController(Protocol):
     """Moves arms by the results. The loop calls it from its own thread alone."""
 
@@ -248,24 +247,18 @@ class ArmsController(Protocol):
         ...
 
 
+@dataclass(eq=False)
 class Controls:
-    """What the user asks of the running loop; from any thread."""
+    """What the user asks of the running loop; from any thread.
 
-    def __init__(self) -> None:
-        self._lock = threading.Lock()
-        self.aborted = threading.Event()  # set: the arms stop for good
-        self._picked_mm: Float64[np.ndarray, " 3"] | None = None
+    Attributes:
+        picked_mm: this point (camera frame) lies on the organ: track the piece that it is on. None:
+            choose the organ without it.
+        aborted: set: the arms stop for good.
+    """
 
-    def pick(self, point_mm: Float64[np.ndarray, " 3"] | None) -> None:
-        """This point (camera frame, mm) lies on the organ: track the piece that it is on. None:
-        choose the organ without it again."""
-        with self._lock:
-            self._picked_mm = point_mm
-
-    @property
-    def picked_mm(self) -> Float64[np.ndarray, " 3"] | None:
-        with self._lock:
-            return self._picked_mm
+    picked_mm: Float64[np.ndarray, " 3"] | None = None
+    aborted: threading.Event = field(default_factory=threading.Event)
 
 
 @dataclass(frozen=True, eq=False)
@@ -290,21 +283,14 @@ class SinkContext:
 @runtime_checkable
 class Sink(Protocol):
     """An open sink. Both methods are called from one thread of its own, so they may take their
-    time. Errors are counted and reported, and the loop goes on."""
+    time. Errors are counted and reported, and the loop goes on. What a ``counts: dict[str, int]``
+    has, if there is one, goes into the run's report."""
 
     def publish(self, result: TrackingResult) -> None: ...
 
     def close(self) -> None:
         """Flush and release everything; may be called twice."""
         ...
-
-
-@runtime_checkable
-class CountingSink(Protocol):
-    """A sink with counts of its own for the run's report."""
-
-    @property
-    def counts(self) -> dict[str, int]: ...
 
 
 class SourceConfig(Config, frozen=True, kw_only=True, tag_field="kind"):
