@@ -229,6 +229,7 @@ class TrackingResult:
         return f"{self.quality}: {self.warning}" if self.warning else self.quality
 
 
+@runtime_checkable
 class ArmsController(Protocol):
     """Moves arms by the results. The loop calls it from its own thread alone."""
 

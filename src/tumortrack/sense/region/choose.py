@@ -9,11 +9,21 @@ from typing import NamedTuple
 import numpy as np
 
 from tumortrack.core.errors import NoEstimate
-from tumortrack.sense.region.config import RegionConfig
-from tumortrack.sense.region.picture import FLYING, LAST_BOX, Picture, jit
-from tumortrack.sense.region.pieces import Edges
+from tumortrack.sense.region.picture import (
+    FLYING,
+    LAST_BOX,
+    PIECES,
+    THIN,
+    Hints,
+    Picture,
+    RegionConfig,
+    jit,
+)
+from tumortrack.sense.region.pieces import find_edges, find_pieces
 
-PICK_REACH_MM = 10.0  # from the picked point to the piece it means
+_OPENINGS = (1.0, 1.7, 2.8)  # times ``opening_mm``: the last is wider than fingers
+_CLEARLY = 1.1  # better by so much is worth a wider opening
+_PICK_REACH_MM = 10.0  # from the picked point to the piece it means
 _STEEPEST_GAP = 0.5  # slope of a surface behind what hides part of it
 _STEP_MM = 3.0
 _SAME_MM = 5.0  # neighbouring pixels of one surface
@@ -30,37 +40,41 @@ _AIMED = 0.4  # so far (tangent) from the optical axis a piece is half as likely
 _THICK = 0.8  # of an organ's shortest extent: thinner pieces are likely fingers or shafts
 
 
-def under_point(picture: Picture, pieces: np.ndarray, point_mm: np.ndarray) -> int:
-    """The piece nearest to a point (3,), camera frame, mm.
+def take_one_piece(picture: Picture, config: RegionConfig, hints: Hints) -> None:
+    """Leave one piece (and what continues it) to the organ.
+
+    A hand that touches the organ makes one large piece with it that leaves the picture. Then the
+    opening is widened until fingers are too narrow to connect.
 
     Raises:
-        NoEstimate: none within 10 mm.
+        NoEstimate: a point was picked, and no piece lies within 10 mm of it.
     """
-    square, piece = _nearest(
-        picture.depth_mm, pieces, picture.pinhole, np.asarray(point_mm, np.float64)
-    )
-    if not square <= PICK_REACH_MM**2:
-        there = ", ".join(f"{x:.0f}" for x in point_mm)
-        raise NoEstimate(
-            f"no piece of the scene lies within {PICK_REACH_MM:g} mm of the picked point "
-            f"({there}) mm: it is on the background, on something thin, or outside the range. "
-            "Pick again, or clear the pick."
-        )
-    return int(piece)
+    edges = find_edges(picture, config)
+    best: _Choice | None = None
+    for wider in _OPENINGS:
+        pieces, count = find_pieces(picture, edges, wider * config.opening_mm)
+        depth_mm, taken = picture.depth_mm, picture.taken
+        these = _measure(depth_mm, edges.distance, taken, pieces, picture.pinhole, count)
+        here = _chosen(picture, pieces, these, config, hints)
+        if best is None or here.score > _CLEARLY * best.score:
+            best = here
+        if not here.doubtful:
+            break
+    assert best is not None
+    picture.take(best.pieces == 0, THIN)
+    together, these = best.together, best.these
+    if hints.last_box_mm is not None and together.any():
+        # A tumor that stands out, a part beyond a crease: wholly in the box, not at its far side,
+        # and not thin.
+        low, high = np.sort(np.asarray(hints.last_box_mm, np.float64), axis=0)
+        high[2] -= _FAR_SIDE * (high[2] - low[2])
+        area = _area_in_box(picture, best.pieces, these, low - _BOX_MM, high + _BOX_MM)
+        parts = (area > _WHOLLY * these.area_mm2) & (these.thick_mm > _THICK_PART_MM) & (area > 0)
+        together = together | parts
+    picture.take(~together[best.pieces], PIECES)
 
 
-def under_box(
-    picture: Picture, pieces: np.ndarray, these: Sizes, corners_mm: np.ndarray
-) -> int | None:
-    """The piece with the most surface, and the most of its surface, in a box (2, 3); None if none
-    has any."""
-    low, high = np.sort(np.asarray(corners_mm, np.float64), axis=0)
-    area = _area_inside(picture.depth_mm, pieces, picture.pinhole, low, high, len(these.cut))
-    inside = area**2 / np.maximum(these.area_mm2, 1e-9)  # what surrounds it reaches in, too
-    return int(inside.argmax()) if inside.max() > 0 else None
-
-
-class Sizes(NamedTuple):
+class _Sizes(NamedTuple):
     """Of every piece (count + 1,); entry 0 is not used.
 
     Attributes:
@@ -79,18 +93,8 @@ class Sizes(NamedTuple):
     aside: np.ndarray
 
 
-def sizes(picture: Picture, edges: Edges, pieces: np.ndarray, count: int) -> Sizes:
-    return _measure(picture.depth_mm, edges.distance, picture.taken, pieces, picture.pinhole, count)
-
-
-def likeliest(these: Sizes, config: RegionConfig) -> int | None:
-    """The largest piece of an organ's size; what leaves the picture counts less, as arms do."""
-    score = these.area_mm2 * _like_an_organ(these, config)
-    return int(score.argmax()) if score.max() > 0 else None
-
-
 @dataclass(frozen=True, eq=False)
-class Choice:
+class _Choice:
     """What is taken for the organ at one way of parting the picture.
 
     Attributes:
@@ -103,25 +107,27 @@ class Choice:
     """
 
     pieces: np.ndarray
-    these: Sizes
+    these: _Sizes
     together: np.ndarray
     score: float
     doubtful: bool
 
 
-def choice(
-    picture: Picture,
-    pieces: np.ndarray,
-    these: Sizes,
-    chosen: tuple[int | None, bool],
-    config: RegionConfig,
-) -> Choice:
-    """The chosen piece (None: there is none; and whether it is a guess), and those that continue
-    it behind something nearer."""
-    piece, guessed = chosen
+def _chosen(
+    picture: Picture, pieces: np.ndarray, these: _Sizes, config: RegionConfig, hints: Hints
+) -> _Choice:
+    """The piece that the hints name, else the likeliest: the largest of an organ's size (what
+    leaves the picture counts less, as arms do); and those that continue it behind something
+    nearer."""
+    likeness = _like_an_organ(these, config)
     together = np.zeros(len(these.cut), bool)
-    if piece is None:
-        return Choice(pieces, these, together, -1.0, True)
+    piece = _hinted(picture, pieces, these, hints)
+    guessed = piece is None
+    if guessed:
+        scores = these.area_mm2 * likeness
+        if not scores.max() > 0:
+            return _Choice(pieces, these, together, -1.0, True)
+        piece = int(scores.argmax())
     leaves = these.cut > _CUT
     gap = config.gap_mm / picture.footprint
     lines = _continuing(
@@ -135,48 +141,53 @@ def choice(
         more[0] = False
         refused |= bool((more & leaves & ~together).any())
         together |= more & ~leaves
-    likeness = _like_an_organ(these, config)[piece]
-    score = these.area_mm2[together].sum() * likeness
+    score = these.area_mm2[together].sum() * likeness[piece]
     too_wide = these.wide_mm[piece] > config.organ_mm[1]
     # A poor guess beside something larger that leaves the picture: a hand that holds the organ?
-    held = guessed and likeness < _POOR and these.area_mm2[leaves].max(initial=0) > score
+    larger = these.area_mm2[leaves].max(initial=0) > score
+    held = guessed and likeness[piece] < _POOR and larger
     doubtful = refused or leaves[piece] or too_wide or held
-    return Choice(pieces, these, together, float(score), bool(doubtful))
+    return _Choice(pieces, these, together, float(score), bool(doubtful))
 
 
-def parts_of(picture: Picture, taken: Choice, corners_mm: np.ndarray) -> np.ndarray:
-    """Further pieces (count + 1,), bool, that lie wholly in the last estimate's box (2, 3), not at
-    its far side, and are not thin: a tumor that stands out, a part beyond a crease."""
-    low, high = np.sort(np.asarray(corners_mm, np.float64), axis=0)
-    high[2] -= _FAR_SIDE * (high[2] - low[2])
-    low, high = low - _BOX_MM, high + _BOX_MM
-    these = taken.these
-    area = _area_inside(picture.depth_mm, taken.pieces, picture.pinhole, low, high, len(these.cut))
-    return (area > _WHOLLY * these.area_mm2) & (these.thick_mm > _THICK_PART_MM) & (area > 0)
+def _hinted(picture: Picture, pieces: np.ndarray, these: _Sizes, hints: Hints) -> int | None:
+    """The piece nearest to the picked point; without one, that with the most surface, and the most
+    of its surface, in the last box. None if there is none."""
+    if hints.picked_mm is not None:
+        rows, columns = np.nonzero(pieces)
+        z, (fx, fy, cx, cy) = picture.depth_mm[rows, columns].astype(float), picture.pinhole
+        points_mm = np.stack([(columns - cx) / fx * z, (rows - cy) / fy * z, z], axis=1)
+        square = ((points_mm - hints.picked_mm) ** 2).sum(1)
+        if not square.min(initial=np.inf) <= _PICK_REACH_MM**2:
+            there = ", ".join(f"{x:.0f}" for x in hints.picked_mm)
+            raise NoEstimate(
+                f"no piece of the scene lies within {_PICK_REACH_MM:g} mm of the picked point "
+                f"({there}) mm: it is on the background, on something thin, or outside the range. "
+                "Pick again, or clear the pick."
+            )
+        nearest = square.argmin()
+        return int(pieces[rows[nearest], columns[nearest]])
+    if hints.last_box_mm is None:
+        return None
+    low, high = np.sort(np.asarray(hints.last_box_mm, np.float64), axis=0)
+    area = _area_in_box(picture, pieces, these, low, high)
+    inside = area**2 / np.maximum(these.area_mm2, 1e-9)  # what surrounds it reaches in, too
+    return int(inside.argmax()) if inside.max() > 0 else None
 
 
-def _like_an_organ(these: Sizes, config: RegionConfig) -> np.ndarray:
+def _area_in_box(
+    picture: Picture, pieces: np.ndarray, these: _Sizes, low: np.ndarray, high: np.ndarray
+) -> np.ndarray:
+    return _area_inside(picture.depth_mm, pieces, picture.pinhole, low, high, len(these.cut))
+
+
+def _like_an_organ(these: _Sizes, config: RegionConfig) -> np.ndarray:
     """Of every piece, 0..1."""
     low, high = config.organ_mm
     fits = np.minimum(1.0, (high / np.maximum(these.wide_mm, 1e-9)) ** 4)
     thick = np.minimum(1.0, these.thick_mm / (_THICK * low)) ** 2
     aimed = 1 / (1 + (these.aside / _AIMED) ** 2)
     return fits * thick * aimed * (1 - 0.95 * these.cut) ** 4 * (these.wide_mm > low)
-
-
-@jit
-def _nearest(depth_mm, pieces, pinhole, point):  # type: ignore[no-untyped-def]
-    fx, fy, cx, cy = pinhole
-    best, piece = np.inf, 0
-    for v in range(len(depth_mm)):
-        for u in range(depth_mm.shape[1]):
-            if pieces[v, u]:
-                z = depth_mm[v, u]
-                x, y = (u - cx) / fx * z - point[0], (v - cy) / fy * z - point[1]
-                square = x * x + y * y + (z - point[2]) ** 2
-                if square < best:
-                    best, piece = square, pieces[v, u]
-    return best, piece
 
 
 @jit
@@ -236,7 +247,7 @@ def _measure(depth_mm, distance, taken, pieces, pinhole, count):  # type: ignore
             wide[piece] = (high[piece] - low[piece]).max()
             cut[piece] = min(border[piece] / np.sqrt(area[piece]), 1.0)
     aside = np.sqrt((middle**2).sum(1)) / np.maximum(pixels, 1)
-    return Sizes(area, wide, cut, 2 * disc, aside)
+    return _Sizes(area, wide, cut, 2 * disc, aside)
 
 
 @jit

@@ -1,4 +1,5 @@
-"""Depth image or cloud -> the working picture that all steps share; and back to points."""
+"""What finding the organ works on: its switches, hints, and the working picture that all steps
+share, made of a depth image or a cloud; and back to points."""
 
 from __future__ import annotations
 
@@ -7,14 +8,18 @@ from dataclasses import dataclass
 
 import numba
 import numpy as np
+from jaxtyping import Bool, Float
 
+from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError
 from tumortrack.core.types import DepthFrame, SensorCloud
 from tumortrack.sense.camera import Pinhole, deproject_pixels
+from tumortrack.sense.cloud import CloudConfig
 
 MOST_PIXELS = 110_000  # of a working picture: 424 x 240, and every second pixel of 848 x 480
 _POINTS_PER_PIXEL = 2
 _WIDEST = 2.0  # tangent of the largest angle from the optical axis in a rasterised cloud
+_BINS = 1000  # of the histogram of tangents
 
 # What became of a pixel: still the organ's, or the step that took it.
 ORGAN, NO_RETURN, RANGE, BOX, MASK, LAST_BOX, PLANE, FLYING, THIN, PIECES = range(10)
@@ -23,8 +28,86 @@ STEPS = (
     *("last box", "plane", "flying", "thin", "other pieces"),
 )
 
-
 jit = numba.njit(cache=True, nogil=True)
+
+
+class RegionConfig(Config, frozen=True, kw_only=True):
+    """From a whole depth image to the organ's points; camera frame, mm.
+
+    crop: depths kept, and how many points are drawn at the end.
+    box_mm: region of interest, two opposite corners; None: everywhere.
+    last_margin_mm: the last estimate's organ box, enlarged by this much on every side, narrows the
+        crop; zero switches that off.
+    plane: remove the large plane behind the organ (table, drape), and what lies behind it.
+    plane_mm: at most this far from the plane is still the plane: how uneven a drape may be.
+    plane_share: of everything seen, at least this share must lie on it.
+    flying: remove points that have hardly a neighbour in depth.
+    pieces: take one connected piece; zero ``opening_mm`` and ``gap_mm`` leave it as it is.
+    opening_mm: what is narrower than twice this is no piece of its own and connects nothing:
+        shafts, the strip where a finger touches.
+    crease_mm: a valley deeper than this over 4 mm to either side parts two pieces; zero: never.
+    gap_mm: pieces that continue each other behind something nearer and not wider than this are
+        one: an organ behind a shaft.
+    steepest_degrees: neighbouring pixels whose depths differ by more than a surface turned away by
+        this much (and noise) would explain are parted.
+    noise_mm: standard deviation of depth at 150 mm; grows with z^2.
+    organ_mm: longest and shortest extent of pieces that may be the organ, if no hint names it.
+    """
+
+    crop: CloudConfig = CloudConfig()
+    box_mm: tuple[tuple[float, float, float], tuple[float, float, float]] | None = None
+    last_margin_mm: float = 20.0
+    plane: bool = True
+    plane_mm: float = 5.0
+    plane_share: float = 0.15
+    flying: bool = True
+    pieces: bool = True
+    opening_mm: float = 3.0
+    crease_mm: float = 1.2
+    gap_mm: float = 20.0
+    steepest_degrees: float = 75.0
+    noise_mm: float = 0.2
+    organ_mm: tuple[float, float] = (30.0, 160.0)
+
+    def __post_init__(self) -> None:
+        self.check_ranges(
+            *("region", "0"),
+            last_margin_mm=1e3,
+            plane_mm=50,
+            plane_share=1,
+            opening_mm=20,
+            crease_mm=20,
+            gap_mm=100,
+            steepest_degrees=89,
+            noise_mm=10,
+        )
+        if not 0 < self.organ_mm[0] < self.organ_mm[1]:
+            raise InputError(
+                f"region organ_mm is {self.organ_mm}; give two sizes in mm, the smaller first."
+            )
+        if self.box_mm is not None and not all(
+            abs(a - b) > 1 for a, b in zip(*self.box_mm, strict=True)
+        ):
+            raise InputError(
+                f"region box_mm is {self.box_mm}; give two opposite corners (x y z, camera frame, "
+                "mm) at least 1 mm apart along each axis."
+            )
+
+
+@dataclass(frozen=True, eq=False)
+class Hints:
+    """What is known about a frame besides its depth.
+
+    Attributes:
+        mask: of a depth image's pixels, True where the organ may be.
+        picked_mm: a point on the organ, camera frame, as a user clicked it. It decides which piece
+            is taken. Organs move: once there is an estimate, give its box instead.
+        last_box_mm: lower and upper corner of the last estimate's organ, camera frame.
+    """
+
+    mask: Bool[np.ndarray, "h w"] | None = None
+    picked_mm: Float[np.ndarray, " 3"] | None = None
+    last_box_mm: Float[np.ndarray, "2 3"] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,7 +154,8 @@ class Picture:
 
     def counts(self) -> dict[str, int]:
         """Pixels by what became of them."""
-        return dict(zip(STEPS, _count(self.taken, len(STEPS)).tolist(), strict=True))
+        found = np.bincount(self.taken.ravel(), minlength=len(STEPS))
+        return dict(zip(STEPS, found.tolist(), strict=True))
 
 
 def picture_of_frame(frame: DepthFrame, mask: np.ndarray | None) -> Picture:
@@ -117,22 +201,33 @@ def picture_of_cloud(cloud: SensorCloud) -> Picture:
 
     Points at or behind the camera's centre are left out, and so are those behind another.
     """
-    points_mm = cloud.points_mm
-    tangents, low, high, inner = _spread(points_mm.copy(), _WIDEST)
+    points_mm, z = cloud.points_mm, cloud.points_mm[:, 2]
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        tangents = (points_mm[:, :2] / z[:, None]).astype(np.float64)
+    before = np.flatnonzero((z > 1.0) & (np.abs(tangents) < _WIDEST).all(axis=1))
+    tangents = tangents[before]
+    low, high = (tangents.min(0), tangents.max(0)) if len(before) else (np.zeros(2), np.zeros(2))
+    inner = _inner_spread(tangents, low, high)
     # Stray points widen the picture, but don't coarsen it.
-    pixels = max(len(tangents) / _POINTS_PER_PIXEL, 64.0)
+    pixels = max(len(points_mm) / _POINTS_PER_PIXEL, 64.0)
     most = np.prod(high - low + 1e-3) / MOST_PIXELS
     size = float(np.sqrt(max(np.prod(inner + 1e-3) / pixels, most)))
     width, height = (int(n) for n in np.floor((high - low) / size) + 1)
     pinhole = Pinhole(1 / size, 1 / size, float(-low[0] / size), float(-low[1] / size))
-    depth_mm, pixel = _rasterise(tangents, points_mm[:, 2].copy(), pinhole, height, width)
+    scale, centre = np.array([[pinhole.fx, pinhole.fy], [pinhole.cx, pinhole.cy]])
+    u, v = (scale * tangents + centre + 0.5).astype(np.int64).T
+    inside = (u >= 0) & (u < width) & (v >= 0) & (v < height)
+    pixel = np.full(len(points_mm), -1, np.int32)  # of each point; -1: none
+    pixel[before[inside]] = (v * width + u)[inside]
+    nearest = np.full(height * width, np.nan, np.float32)
+    seen = np.flatnonzero(pixel >= 0)
+    np.fmin.at(nearest, pixel[seen], z[seen])
+    depth_mm = nearest.reshape(height, width)
     taken = np.isnan(depth_mm).view(np.uint8) * np.uint8(NO_RETURN)
 
     def left(taken: np.ndarray) -> np.ndarray:
-        seen = np.flatnonzero(pixel >= 0)
-        seen = seen[taken.ravel()[pixel[seen]] == ORGAN]
-        behind_mm = points_mm[seen, 2] - depth_mm.ravel()[pixel[seen]]
-        return seen[behind_mm < 2 + 2 * size * points_mm[seen, 2]]
+        organ = seen[taken.ravel()[pixel[seen]] == ORGAN]
+        return organ[z[organ] - nearest[pixel[organ]] < 2 + 2 * size * z[organ]]
 
     return Picture(depth_mm, taken, pinhole, left, lambda some: points_mm[some])
 
@@ -159,70 +254,16 @@ def _keep_inside(depth_mm, taken, pinhole, low, high, step):  # type: ignore[no-
                 taken[v, u] = step
 
 
-@jit
-def _spread(points_mm, widest):  # type: ignore[no-untyped-def]
-    """x / z and y / z (n, 2), NaN where not before the camera or wider than ``widest``; their
-    extremes (2,) and (2,); and how far the middle 96 % spread (2,), from a histogram: the order of
-    the points doesn't matter."""
-    tangents = np.full((len(points_mm), 2), np.nan, np.float32)
-    low, high = np.full(2, np.inf), np.full(2, -np.inf)
-    count = 0
-    for i in range(len(points_mm)):
-        z = points_mm[i, 2]
-        if z > 1.0:
-            x, y = points_mm[i, 0] / z, points_mm[i, 1] / z
-            if abs(x) < widest and abs(y) < widest:
-                tangents[i, 0], tangents[i, 1] = x, y
-                low[0], low[1] = min(low[0], x), min(low[1], y)
-                high[0], high[1] = max(high[0], x), max(high[1], y)
-                count += 1
-    if count == 0:
-        return tangents, np.zeros(2), np.zeros(2), np.zeros(2)
-    return tangents, low, high, _inner_spread(tangents, low, high, count)
-
-
-@jit
-def _inner_spread(tangents, low, high, count):  # type: ignore[no-untyped-def]
-    bins = 1000
-    found = np.zeros((2, bins), np.int64)
-    for i in range(len(tangents)):
-        if not np.isnan(tangents[i, 0]):
-            for k in range(2):
-                share = (tangents[i, k] - low[k]) / max(high[k] - low[k], 1e-9)
-                found[k, min(int(share * bins), bins - 1)] += 1
+def _inner_spread(tangents: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """How far the middle 96 % of tangents (n, 2) spread (2,), from a histogram: the order of the
+    points doesn't matter."""
+    share = (tangents - low) / np.maximum(high - low, 1e-9)
+    place = np.minimum((share * _BINS).astype(np.int64), _BINS - 1)
     inner = np.zeros(2)
     for k in range(2):
-        total = 0
-        for one in found[k]:
-            total += one
-            if 0.02 * count < total < 0.98 * count:
-                inner[k] += (high[k] - low[k]) / bins
+        total = np.cumsum(np.bincount(place[:, k], minlength=_BINS))
+        count = ((0.02 * len(place) < total) & (total < 0.98 * len(place))).sum()
+        bins = np.full(count + 1, (high[k] - low[k]) / _BINS)
+        bins[0] = 0.0
+        inner[k] = bins.cumsum()[-1]
     return inner
-
-
-@jit
-def _rasterise(tangents, z_mm, pinhole, height, width):  # type: ignore[no-untyped-def]
-    """The nearest depth in each pixel (h, w), and each point's pixel (n,), -1 outside."""
-    fx, fy, cx, cy = pinhole
-    depth_mm = np.full(height * width, np.nan, np.float32)
-    pixel = np.full(len(tangents), -1, np.int32)
-    for i in range(len(tangents)):
-        if np.isnan(tangents[i, 0]):
-            continue
-        u = int(fx * tangents[i, 0] + cx + 0.5)
-        v = int(fy * tangents[i, 1] + cy + 0.5)
-        if 0 <= u < width and 0 <= v < height:
-            place = v * width + u
-            pixel[i] = place
-            if not depth_mm[place] <= z_mm[i]:
-                depth_mm[place] = z_mm[i]
-    return depth_mm.reshape(height, width), pixel
-
-
-@jit
-def _count(taken, kinds):  # type: ignore[no-untyped-def]
-    found = np.zeros(kinds, np.int64)
-    for v in range(len(taken)):
-        for u in range(taken.shape[1]):
-            found[taken[v, u]] += 1
-    return found

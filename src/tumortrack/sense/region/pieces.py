@@ -14,8 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from tumortrack.sense.noise import REFERENCE_MM
-from tumortrack.sense.region.config import RegionConfig
-from tumortrack.sense.region.picture import FLYING, ORGAN, Picture, jit
+from tumortrack.sense.region.picture import FLYING, ORGAN, Picture, RegionConfig, jit
 
 _CREASE_REACH_MM = 4.0
 _FEWEST_NEIGHBOURS = 3  # of 8; a straight edge leaves 5, a right angle 3
