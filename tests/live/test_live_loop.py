@@ -49,7 +49,7 @@ def clock(monkeypatch):
     """The loop's, its reader's and the script's, which the test turns."""
     one = Clock()
     monkeypatch.setattr(sys.modules[__name__], "time", one)
-    for module in ("loop", "source_worker"):
+    for module in ("loop", "workers"):
         monkeypatch.setattr(f"tumortrack.live.{module}.time", one)
     return one
 

@@ -1,4 +1,4 @@
-"""The per-pixel work of ``noise`` and ``occlusion``, compiled; imported on first use.
+"""The per-pixel work of ``noise``, compiled; imported on first use.
 
 An organ fills a tenth of an image: kernels visit only the pixels with a return, which
 ``seen_pixels`` finds once, and change a list of their depths.
@@ -27,7 +27,6 @@ _LOW_14, _LOW_32 = np.uint64(0x3FFF), np.uint64(0xFFFFFFFF)
 _TO_UNIT = 2.0**-32
 
 _NO_RETURN = np.float32(np.nan)
-_BINS = 1024  # of the histogram in ``take_first``
 
 _jit = numba.njit(cache=True, nogil=True)  # no fast-math: a frame replays on every machine
 
@@ -48,25 +47,12 @@ def _bits(key, counter):  # type: ignore[no-untyped-def]
     return z ^ (z >> _S31)
 
 
-@_jit
-def seen_pixels(depth_mm):  # type: ignore[no-untyped-def]
-    """The pixels of ``depth_mm`` (h, w) that are not NaN, as ``Seen``."""
+def seen_pixels(depth_mm: np.ndarray) -> Seen:
+    """The pixels of ``depth_mm`` (h, w) that are not NaN."""
     height, width = depth_mm.shape
-    starts = np.zeros(height + 1, np.int32)
-    for v in range(height):
-        count = np.int32(0)
-        for u in range(width):
-            count += np.int32(depth_mm[v, u] == depth_mm[v, u])
-        starts[v + 1] = starts[v] + count
-    pixels = np.empty(starts[height], np.int32)
-    for v in range(height):
-        at, last = starts[v], starts[v + 1]
-        u = 0
-        while at < last:
-            pixels[at] = v * width + u
-            at += not math.isnan(depth_mm[v, u])
-            u += 1
-    return Seen(pixels, starts)
+    pixels = np.flatnonzero(~np.isnan(depth_mm)).astype(np.int32)
+    starts = np.searchsorted(pixels, np.arange(height + 1, dtype=np.int32) * np.int32(width))
+    return Seen(pixels, starts.astype(np.int32))
 
 
 @_jit
@@ -108,22 +94,11 @@ def _slope(before, here, after):  # type: ignore[no-untyped-def]
     return here - before if math.isnan(after) else (after - before) * np.float32(0.5)
 
 
-class Flying(NamedTuple):
-    """Flying pixels: the share of edge pixels, how far behind the edge they end up at most, and
-    what is an edge: within ``near_px`` the depth falls back by ``step_mm`` or more, or ends."""
-
-    share: float
-    reach_mm: float
-    near_px: int
-    step_mm: float
-
-
 @_jit
 def fly(true_mm, depths_mm, seen, key, flying):  # type: ignore[no-untyped-def]
-    """Send edge pixels backwards, as ``Flying`` states.
-
-    The image's own border is no edge: what it cuts off continues outside.
-    """
+    """Send edge pixels backwards. ``flying``: the share of edge pixels, how far behind the edge
+    they end up at most, and what is an edge: within so many pixels the depth falls back by so many
+    mm or more, or ends. The image's own border is no edge: what it cuts off continues outside."""
     share, flying_mm, near, step_mm = flying
     pixels, starts = seen
     height, width = true_mm.shape
@@ -174,23 +149,15 @@ def jitter(depths_mm, seen, key, relative, correlated_share, smooth):  # type: i
 
 
 @_jit
-def _normal_grid(height, width, step, key):  # type: ignore[no-untyped-def]
-    """Standard normal values on every ``step``-th pixel, one node beyond the image."""
-    rows, columns = height // step + 2, width // step + 2
-    grid = np.empty((rows, columns), np.float32)
-    for i in range(rows):
-        for j in range(columns):
-            grid[i, j] = _QUANTILES[_bits(key, i * columns + j) & _LOW_14]
-    return grid
-
-
-@_jit
 def smooth_at(seen, shape, step, key):  # type: ignore[no-untyped-def]
     """A smooth random field, correlated over ``step`` pixels and standard normal in each, at the
     seen pixels of an image of that shape."""
     pixels, starts = seen
     height, width = shape
-    grid = _normal_grid(height, width, step, key)
+    # Standard normal values on every ``step``-th pixel, one node beyond the image.
+    grid = np.empty((height // step + 2, width // step + 2), np.float32)
+    for node in range(grid.size):
+        grid.ravel()[node] = _QUANTILES[_bits(key, node) & _LOW_14]
     first, second = _weights(step)
     out = np.empty(len(pixels), np.float32)
     row = np.empty(width + step, np.float32)
@@ -224,79 +191,3 @@ def _lowest_cosines(n: int) -> np.ndarray:
     waves = np.cos(np.pi * np.outer((np.arange(n) + 0.5) / n, np.arange(3))).astype(np.float32)
     waves.flags.writeable = False
     return waves
-
-
-@_jit
-def order_shaft(columns, rows, tip, towards, half, taper):  # type: ignore[no-untyped-def]
-    """A straight band that comes in against ``towards`` (unit vector, px) and ends round at
-    ``tip`` (px), ``half`` wide there to either side and wider by ``taper`` a pixel outwards.
-    What lies farthest out comes first, as when it is pushed in."""
-    order = np.full(len(columns), np.inf, np.float32)
-    for i in range(len(columns)):
-        du, dv = columns[i] - tip[0], rows[i] - tip[1]
-        along = du * towards[0] + dv * towards[1]
-        across = abs(dv * towards[0] - du * towards[1])
-        if along >= 0:
-            if across < half + taper * along:
-                order[i] = -along
-        elif du * du + dv * dv < half * half:
-            order[i] = -along
-    return order
-
-
-@_jit
-def order_patch(columns, rows, start, axes, round_one, waves):  # type: ignore[no-untyped-def]
-    """A patch with a wavy edge that grows from ``start`` (px): a blob or a half plane.
-
-    ``axes`` (2, 2), 1/px: a blob's two lengths and directions; a half plane grows along the first.
-    ``waves`` (2, k, 3): frequency (rad/px), phase and height of the edge's waves along the columns
-    and along the rows.
-    """
-    along_u, along_v = _wave(columns.max() + 1, waves[0]), _wave(rows[-1] + 1, waves[1])
-    order = np.empty(len(columns), np.float32)
-    for i in range(len(columns)):
-        du, dv = columns[i] - start[0], rows[i] - start[1]
-        a = du * axes[0, 0] + dv * axes[0, 1]
-        b = du * axes[1, 0] + dv * axes[1, 1]
-        distance = math.sqrt(a * a + b * b) if round_one else a
-        order[i] = distance + along_u[columns[i]] + along_v[rows[i]]
-    return order
-
-
-@_jit
-def _wave(length, waves):  # type: ignore[no-untyped-def]
-    out = np.zeros(length, np.float32)
-    for frequency, phase, height in waves:
-        for place in range(length):
-            out[place] += height * math.cos(frequency * place + phase)
-    return out
-
-
-@_jit
-def take_first(order, taken, count):  # type: ignore[no-untyped-def]
-    """Mark in ``taken`` the ``count`` pixels of lowest ``order`` that are not taken yet, or a few
-    less (whole bins of a histogram only); infinite ones never. Returns how many."""
-    low, high, room = np.float32(np.inf), np.float32(-np.inf), 0
-    for i in range(len(order)):
-        if not taken[i] and order[i] < np.inf:
-            low, high = min(low, order[i]), max(high, order[i])
-            room += 1
-    if room == 0:
-        return 0
-    scale = (_BINS - 1) / max(high - low, np.float32(1e-6))
-    last = _BINS - 1
-    if room > count:
-        histogram = np.zeros(_BINS, np.int64)
-        for i in range(len(order)):
-            if not taken[i] and order[i] < np.inf:
-                histogram[int((order[i] - low) * scale)] += 1
-        total, last = 0, -1
-        while total + histogram[last + 1] <= count:
-            last += 1
-            total += histogram[last]
-    marked = 0
-    for i in range(len(order)):
-        if not taken[i] and order[i] < np.inf and int((order[i] - low) * scale) <= last:
-            taken[i] = True
-            marked += 1
-    return marked

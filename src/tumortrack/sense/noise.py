@@ -140,8 +140,11 @@ def add_noise(frame: DepthFrame, config: NoiseConfig, rng: np.random.Generator) 
     scatter = _scatter(true_mm, seen.pixels, depths_mm, config, np.random.default_rng((seed, 0)))
     _disturb(frame, depths_mm, seen, config, seed)
     out_mm = np.full(true_mm.shape, np.nan, np.float32)
+    quantum_mm = np.float32(config.quantum_mm)
     for pixels, values_mm in ((seen.pixels, depths_mm), scatter):
-        out_mm.ravel()[pixels] = _quantised(values_mm, config.quantum_mm)
+        out_mm.ravel()[pixels] = (
+            np.rint(values_mm / quantum_mm) * quantum_mm if quantum_mm else values_mm
+        )
     return frame.with_depth(out_mm)
 
 
@@ -155,8 +158,7 @@ def _disturb(
 
     true_mm, shape = frame.depth_mm, frame.depth_mm.shape
     if config.flying_share:
-        edge = (config.edge_px, config.edge_mm)
-        flying = kernels.Flying(config.flying_share, config.flying_mm, *edge)
+        flying = (config.flying_share, config.flying_mm, config.edge_px, config.edge_mm)
         kernels.fly(true_mm, depths_mm, seen, seed + 1, flying)
     if config.grazing_share:
         grazing = (config.grazing_share, config.grazing_degrees)
@@ -193,12 +195,3 @@ def _scatter(
     near_mm = max(depths_mm.min() - config.scatter_mm, 1.0)
     values_mm = rng.uniform(near_mm, depths_mm.max() + config.scatter_mm, count)
     return pixels, values_mm.astype(np.float32)
-
-
-def _quantised(values_mm: np.ndarray, quantum_mm: float) -> np.ndarray:
-    """Rounded to whole quanta, in place; unchanged where the quantum is 0."""
-    if quantum_mm:
-        values_mm /= np.float32(quantum_mm)
-        np.rint(values_mm, out=values_mm)
-        values_mm *= np.float32(quantum_mm)
-    return values_mm

@@ -105,6 +105,9 @@ class Link:
         while time.monotonic() < until_s and any(one.busy for one in self._receivers):
             await asyncio.sleep(0.01)
         serving.cancel()
+        while self._receivers:
+            self._receivers[0].writer.transport.abort()
+            await asyncio.sleep(0)
 
     async def _accept(self) -> None:
         server = await asyncio.start_server(self._serve, sock=self._listener)
@@ -122,12 +125,12 @@ class Link:
         """One connection, until it ends."""
         writer.get_extra_info("socket").setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _BUFFER)
         writer.transport.set_write_buffer_limits(high=0)  # ``drain`` waits for the socket itself
-        receiver = _Receiver(self._newest)
+        receiver = _Receiver(writer, self._newest)
         self._receivers.append(receiver)
         try:
             async with asyncio.TaskGroup() as both:
                 both.create_task(self._receive(reader, receiver))
-                both.create_task(receiver.send(writer))
+                both.create_task(receiver.send())
         except* (OSError, EOFError, ProtocolError):
             pass  # gone, it takes nothing any more, or it speaks another language
         finally:
@@ -171,7 +174,8 @@ class Link:
 class _Receiver:
     """One that is connected, and what waits for it."""
 
-    def __init__(self, newest: dict[Key, bytes]) -> None:
+    def __init__(self, writer: asyncio.StreamWriter, newest: dict[Key, bytes]) -> None:
+        self.writer = writer
         self.waiting: dict[Key, bytes] = {}
         self.busy = False
         self._came = asyncio.Event()
@@ -184,15 +188,15 @@ class _Receiver:
             self.busy = True
             self._came.set()
 
-    async def send(self, writer: asyncio.StreamWriter) -> None:
+    async def send(self) -> None:
         """Raises TimeoutError where nothing is taken any more."""
         while await self._came.wait():
             while self.waiting:
                 message = self.waiting.pop(next(iter(self.waiting)))
                 for start in range(0, len(message), _PIECE):
-                    writer.write(message[start : start + _PIECE])
+                    self.writer.write(message[start : start + _PIECE])
                     async with asyncio.timeout(_STALLED_S):
-                        await writer.drain()
+                        await self.writer.drain()
             self._came.clear()
             self.busy = False
 

@@ -139,10 +139,12 @@ class OpenIgtLinkSink:
             more["latency_ms"] = f"{result.latency_ms:.1f}"
         yield "STATUS", STATUS_DEVICE, pack_status(code, name, text), more
         cell = result.workcell
+        if not self._context.arms:
+            return
         if cell is not None:
             content = pack_status(NOT_READY if cell.halted else OK, cell.state, cell.halted)
             yield "STATUS", ARMS_DEVICE, content, {"state": cell.state}
-        elif self._context.arms:
+        else:
             content = pack_status(NOT_PRESENT, "unknown", "nothing is known of the arms")
             yield "STATUS", ARMS_DEVICE, content, {}
 
@@ -156,7 +158,8 @@ class OpenIgtLinkSink:
         for name in tumors:
             if (center_mm := result.center_mm(name)) is not None:
                 places[name] = rigid(turn, center_mm)
-        shapes = () if result.workcell is None else result.workcell.shapes
+        cell = result.workcell if self._context.arms else None
+        shapes = () if cell is None else cell.shapes
         tips = {s.name: s.published_from_shape for s in shapes if s.name.endswith(_TIP)}
         self._tips |= tips.keys()
         places |= {name: tips.get(name) for name in sorted(self._tips)}
