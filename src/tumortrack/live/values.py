@@ -27,8 +27,7 @@ Quality = Literal["good", "poor", "none"]
 
 
 class SourceLost(TumortrackError):
-    """The source is gone for now: unplugged, killed, its file unreadable. The loop tries to open it
-    again."""
+    """The source is gone for now: unplugged, killed, unreadable. It is opened again."""
 
     exit_code = 3
 
@@ -78,10 +77,8 @@ class Source(Protocol):
         """The newest frame that was not read before; None if none came in time.
 
         Raises:
-            SourceLost: the source is gone; the loop opens it again.
-            SourceEnded: there are no more frames.
-            InputError: this frame cannot be used (another message type, say); the loop reports it
-                and reads on.
+            SourceLost, SourceEnded: as they say.
+            InputError: this frame cannot be used; the loop reports it and reads on.
         """
         ...
 
@@ -137,10 +134,8 @@ class Polyline:
 class Workcell:
     """What the arms do now, and what is shown with them; published frame, mm.
 
-    Attributes:
-        state: of the procedure: approach, grasp, hold, sweep 1, ...
-        halted: why the arms stand still before their end; empty: they do not.
-        joints_rad: angle by the joint's name; empty without arms.
+    ``state``: of the procedure: approach, grasp, hold, sweep 1, ... ``halted``: why the arms stand
+    still before their end; empty: they do not. ``joints_rad``: angle by the joint's name.
     """
 
     state: str
@@ -205,13 +200,12 @@ class TrackingResult:
         """The estimate in the published frame: what sinks send."""
         if self.estimate is None:
             return None
-        published_from_camera = self.published_frame.published_from_camera
-        cloud = self.estimate.cloud
+        way, cloud = self.published_frame.published_from_camera, self.estimate.cloud
         meshes = {
-            name: mesh.moved(transform_points(published_from_camera, mesh.vertices_mm))
+            name: mesh.moved(transform_points(way, mesh.vertices_mm))
             for name, mesh in self.estimate.meshes.items()
         }
-        points_mm = transform_points(published_from_camera, cloud.points_mm)
+        points_mm = transform_points(way, cloud.points_mm)
         return TransformedEstimate(points_mm, cloud.labels, cloud.probability, meshes)
 
     def center_mm(self, part: str) -> Float64[np.ndarray, " 3"] | None:

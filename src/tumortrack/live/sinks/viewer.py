@@ -161,13 +161,9 @@ class ViewerSink:
 
     def _draw_cell(self, result: TrackingResult) -> None:
         try:
-            if result.workcell is None:
-                self._scene.hide_cell()
-                return
             self._scene.show_cell(result.workcell)
-            self._scene.look.oversee(result.workcell)
         except Exception as error:
-            self._scene.hide_cell()
+            self._scene.show_cell(None)
             self._fault = error  # raised when the estimate has been shown
 
     def _hide(self) -> None:
@@ -198,7 +194,7 @@ class ViewerSink:
                     if stale and self._shown is not None:
                         self._hide()
                     if stale:
-                        self._scene.hide_cell()
+                        self._scene.show_cell(None)
                     self._say("stale" if stale else self._state)
                 self._renew_slice()
             except Exception as error:  # the watch must go on
@@ -212,8 +208,8 @@ class ViewerSink:
             part, orientation = self._panel.slice_through
         if result is None or result.estimate is None:
             return
-        plane, motion = plane_through(result, part, orientation), result.estimate.motion
-        picture = None
+        plane = plane_through(result.estimate.meshes, part, orientation)
+        motion, picture = result.estimate.motion, None
         if plane is not None and motion is not None:
             outlines = self._outlines(result)
             picture = slice_picture(self._ct, motion, plane, outlines, _SLICE_PIXELS)
@@ -223,18 +219,15 @@ class ViewerSink:
                 if picture is not None and plane is not None:
                     self._scene.put_slice(picture, plane, result.published_frame)
 
-    def _outlines(self, result: TrackingResult) -> list[tuple[Mesh, colours.Colour, int]]:
+    def _outlines(self, result: TrackingResult) -> Iterator[tuple[Mesh, colours.Colour, int]]:
         assert result.estimate is not None
         back = np.linalg.inv(result.published_frame.published_from_camera)
-        outlines = []
         for label, name in enumerate(self._context.parts, start=1):
             colour = colours.part_colour(label)
-            if name in result.estimate.meshes:
-                outlines.append((result.estimate.meshes[name], colour, 2 if label > 1 else 1))
-            if margin := self._scene.margins.get(name):
-                there = margin.moved(transform_points(back, margin.vertices_mm))
-                outlines.append((there, colour, 1))
-        return outlines
+            if (mesh := result.estimate.meshes.get(name)) is not None:
+                yield mesh, colour, 2 if label > 1 else 1
+            if (margin := self._scene.margins.get(name)) is not None:
+                yield margin.moved(transform_points(back, margin.vertices_mm)), colour, 1
 
     def _changed(self) -> None:
         with self._page():

@@ -215,9 +215,12 @@ class ViewerScene:
             there = transform_points(frames.published_from_camera, np.asarray(point_mm)[None])
             self._picked.position = there[0]
 
-    def show_cell(self, cell: Workcell) -> None:
-        """Show what arms do, and nothing of what was shown before. A shape's surface goes to the
-        page once, then only its place."""
+    def show_cell(self, cell: Workcell | None) -> None:
+        """Show what arms do, and nothing of what was shown before; None: nothing. A shape's surface
+        goes to the page once, then only its place."""
+        self._cell.visible = cell is not None
+        if cell is None:
+            return
         shapes = {f"shape/{shape.name}": shape for shape in cell.shapes}
         lines = {f"line/{line.name}": line for line in cell.drawn_lines}
         for name in self._drawn.keys() - shapes.keys() - lines.keys():
@@ -235,11 +238,7 @@ class ViewerScene:
             if node is not None:
                 points = line.points_mm.astype(np.float32)
                 node.points = np.stack([points[:-1], points[1:]], axis=1)
-        self._cell.visible = True
-
-    def hide_cell(self) -> None:
-        """Nothing of what arms do stays visible."""
-        self._cell.visible = False
+        self.look.oversee(cell)
 
     def _placed_node(
         self, name: str, look: Any, place: np.ndarray, add: Callable[..., Any]

@@ -15,7 +15,7 @@ from tumortrack.core.estimate import Motion
 from tumortrack.core.geometry import spacing_mm, transform_points
 from tumortrack.core.types import Mesh
 from tumortrack.imaging.case import Case, load_case
-from tumortrack.live.values import SinkContext, TrackingResult
+from tumortrack.live.values import SinkContext
 
 # Directions of the image's columns and rows in the camera frame (x right, y down, z forward).
 ORIENTATIONS: dict[str, tuple[tuple[float, ...], tuple[float, ...]]] = {
@@ -53,17 +53,13 @@ class SlicePlane:
         height = offset @ np.cross(self.across, self.down)
         flat = offset @ np.stack([self.across, self.down], axis=1)
         above = height[mesh.faces] > 0
-        cut = mesh.faces[(above.any(1)) & (~above.all(1))]
-        ends = []
-        for a, b in ((0, 1), (1, 2), (2, 0)):
-            first, second = cut[:, a], cut[:, b]
-            with np.errstate(divide="ignore", invalid="ignore"):
-                share = (height[first] / (height[first] - height[second]))[:, None]
-                point = flat[first] + share * (flat[second] - flat[first])
-            crosses = (height[first] > 0) != (height[second] > 0)
-            ends.append(np.where(crosses[:, None], point, np.nan))
-        corners = np.stack(ends, axis=1)  # of the three, exactly two are points
-        return corners[~np.isnan(corners[:, :, 0])].reshape(-1, 2, 2)
+        cut = mesh.faces[above.any(1) & ~above.all(1)]
+        first, second = cut, np.roll(cut, -1, axis=1)  # the three edges' ends
+        with np.errstate(divide="ignore", invalid="ignore"):
+            share = (height[first] / (height[first] - height[second]))[..., None]
+            points = flat[first] + share * (flat[second] - flat[first])
+        crosses = (height[first] > 0) != (height[second] > 0)  # exactly two of the three do
+        return points[crosses].reshape(-1, 2, 2)
 
 
 class CarriedCt:
@@ -161,13 +157,11 @@ def load_ct(case: str, context: SinkContext) -> CarriedCt:
     return CarriedCt(loaded)
 
 
-def plane_through(result: TrackingResult, part: str, orientation: str) -> SlicePlane | None:
+def plane_through(meshes: dict[str, Mesh], part: str, orientation: str) -> SlicePlane | None:
     """Through the middle of a part's present surface; centred on the organ, and as large."""
-    assert result.estimate is not None
-    meshes = result.estimate.meshes
     if part not in meshes or "kidney" not in meshes:
         return None
-    across, down = (np.array(axis) for axis in ORIENTATIONS[orientation])
+    across, down = np.array(ORIENTATIONS[orientation])
     normal = np.cross(across, down)
     centre, middle = (meshes[name].box_mm.mean(0) for name in ("kidney", part))
     everything = np.concatenate([mesh.box_mm for mesh in meshes.values()])
