@@ -49,9 +49,8 @@ _Patch = tuple[Float[np.ndarray, " 2"], float, Float[np.ndarray, " n"]]
 def add_clutter(frame: DepthFrame, config: ClutterConfig, rng: np.random.Generator) -> DepthFrame:
     """The frame with background in some of its pixels without return.
 
-    One kind a frame, with equal chance: a piece of a tilted plane behind the organ, a ball
-    beside it, or points anywhere. What the organ covers stays covered. Background has random
-    numbers of its own: ``rng`` is left as it was, and so is the rest of the scene.
+    One kind a frame, with equal chance: a piece of a tilted plane behind the organ, a ball beside
+    it, or points anywhere. It has random numbers of its own: ``rng`` is left as it was.
     """
     rng = rng.spawn(1)[0]
     if rng.uniform() >= config.scenes:

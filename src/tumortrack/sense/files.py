@@ -10,6 +10,7 @@ import io
 import math
 import struct
 import zipfile
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -34,10 +35,9 @@ _DISTORTION_KEYS = (
 def read_cloud(path: Path, unit: Literal["mm", "m"] = "mm") -> tuple[SensorCloud, tuple[str, ...]]:
     """A cloud in the camera frame from .ply, .pcd (all three encodings) or .npz, and notes.
 
-    An .npz holds ``points_mm``, or ``points``, or one array (n, 3) of any name. Points without
-    return (NaN, infinite, or exactly 0, 0, 0, as RealSense and organised clouds have them) are
-    dropped, and a note says how many. ``cloud.check_cloud`` then tells whether the rest can be
-    an organ in mm.
+    Points without return (NaN, infinite, or exactly 0, 0, 0, as RealSense and organised clouds have
+    them) are dropped, and a note says how many. ``cloud.check_cloud`` then tells whether the rest
+    can be an organ in mm.
 
     Raises:
         InputError: missing, too large, damaged, of another kind, or without any point.
@@ -47,11 +47,8 @@ def read_cloud(path: Path, unit: Literal["mm", "m"] = "mm") -> tuple[SensorCloud
         raise InputError(f"{path}: unknown cloud type. Allowed: {', '.join(CLOUD_SUFFIXES)}.")
     if unit not in ("mm", "m"):
         raise InputError(f"unit {unit!r} is not understood. Allowed: mm, m.")
-    content = _read_bytes(path)
-    if suffix == ".npz":
-        raw = _npz_points(content, str(path), unit)
-    else:
-        raw = (parse_ply_properties if suffix == ".ply" else _pcd_points)(content, str(path))
+    parse = {".ply": parse_ply_properties, ".pcd": _pcd_points, ".npz": partial(_npz_points, unit)}
+    raw = parse[suffix](_read_bytes(path), str(path))
     with np.errstate(over="ignore"):  # beyond float32 becomes infinite, and is dropped
         points_mm = (raw * (1000.0 if unit == "m" else 1.0)).astype(np.float32)
     kept = points_mm[np.isfinite(points_mm).all(axis=1) & (points_mm != 0).any(axis=1)]
@@ -78,11 +75,7 @@ def _read_bytes(path: Path) -> bytes:
 
 
 def _pcd_points(content: bytes, name: str) -> np.ndarray:
-    """The points' x, y, z as floats (n, 3), in the file's unit; ascii, binary or compressed.
-
-    Raises:
-        InputError: no PCD, damaged, larger than 256 MiB unpacked, or no x, y, z.
-    """
+    """x, y, z as floats (n, 3), in the file's unit; ascii, binary or compressed."""
     from pypcd4 import PointCloud
 
     _check_pcd_size(content, name)
@@ -125,13 +118,8 @@ def _check_pcd_size(content: bytes, name: str) -> None:
         raise InputError(f"{name} claims {points} points but has no room for them; it is damaged.")
 
 
-def _npz_points(content: bytes, name: str, unit: str) -> np.ndarray:
-    """The points (n, 3), in the file's unit: ``points_mm``, else ``points``, else the only array of
-    that shape.
-
-    Raises:
-        InputError: no .npz, damaged, larger than 256 MiB unpacked, no such array, or another unit.
-    """
+def _npz_points(unit: str, content: bytes, name: str) -> np.ndarray:
+    """``points_mm``, else ``points``, else the only array (n, 3), in the file's unit."""
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
             _check_npz_size(archive, name)

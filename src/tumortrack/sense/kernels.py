@@ -56,15 +56,14 @@ def seen_pixels(depth_mm: np.ndarray) -> Seen:
 
 
 @_jit
-def lose_grazing(true_mm, depths_mm, seen, key, grazing, pinhole):  # type: ignore[no-untyped-def]
+def lose_grazing(true_mm, depths_mm, seen, key, grazing):  # type: ignore[no-untyped-def]
     """Drop pixels that see a surface at grazing angles; ``grazing``: (share that is dropped, from
-    how many degrees between the normal and the line of sight).
+    how many degrees between the normal and the line of sight, fx, fy, cx, cy).
 
     With the depth's slopes (p, q) per pixel the surface normal is n = (fx p, fy q,
     -(z + (u - cx) p + (v - cy) q)), and its product with the line of sight r is -z.
     """
-    share, degrees = grazing
-    fx, fy, cx, cy = pinhole
+    share, degrees, fx, fy, cx, cy = grazing
     pixels, starts = seen
     height, width = true_mm.shape
     cosine = math.cos(math.radians(degrees))

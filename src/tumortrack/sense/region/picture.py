@@ -100,8 +100,8 @@ class Hints:
 
     Attributes:
         mask: of a depth image's pixels, True where the organ may be.
-        picked_mm: a point on the organ, camera frame, as a user clicked it. It decides which piece
-            is taken. Organs move: once there is an estimate, give its box instead.
+        picked_mm: a point on the organ, camera frame: it decides which piece is taken. Organs move:
+            once there is an estimate, give its box instead.
         last_box_mm: lower and upper corner of the last estimate's organ, camera frame.
     """
 
@@ -170,22 +170,15 @@ def picture_of_frame(frame: DepthFrame, mask: np.ndarray | None) -> Picture:
     depth_mm = frame.depth_mm[some].copy()
     taken = np.isnan(depth_mm).view(np.uint8) * np.uint8(NO_RETURN)
 
-    def left(taken: np.ndarray) -> np.ndarray:
-        return np.flatnonzero(taken == ORGAN)
-
     def points(pixel: np.ndarray) -> np.ndarray:
         row, column = np.divmod(pixel, depth_mm.shape[1])
         row, column = step // 2 + row * step, step // 2 + column * step
         seen_mm = frame.depth_mm[row, column].astype(np.float64)
         return deproject_pixels(row * camera.width + column, seen_mm, camera)
 
-    pinhole = Pinhole(
-        camera.fx / step,
-        camera.fy / step,
-        (camera.cx - step // 2) / step,
-        (camera.cy - step // 2) / step,
-    )
-    picture = Picture(depth_mm, taken, pinhole, left, points)
+    cx, cy = (camera.cx - step // 2) / step, (camera.cy - step // 2) / step
+    pinhole = Pinhole(camera.fx / step, camera.fy / step, cx, cy)
+    picture = Picture(depth_mm, taken, pinhole, lambda now: np.flatnonzero(now == ORGAN), points)
     if mask is not None:
         if mask.shape != frame.depth_mm.shape:
             raise InputError(
@@ -241,16 +234,13 @@ def keep_inside(picture: Picture, corners_mm: np.ndarray, step: int) -> None:
 @jit
 def _keep_inside(depth_mm, taken, pinhole, low, high, step):  # type: ignore[no-untyped-def]
     fx, fy, cx, cy = pinhole
-    height, width = depth_mm.shape
-    for v in range(height):
+    for v in range(len(depth_mm)):
         slope_y = (v - cy) / fy
-        for u in range(width):
-            if taken[v, u]:
-                continue
+        for u in range(depth_mm.shape[1]):
             z = depth_mm[v, u]
             x, y = (u - cx) / fx * z, slope_y * z
             inside = low[2] < z < high[2] and low[1] < y < high[1] and low[0] < x < high[0]
-            if not inside:
+            if not taken[v, u] and not inside:
                 taken[v, u] = step
 
 

@@ -36,7 +36,7 @@ def _jump(picture: Picture, config: RegionConfig) -> Jump:
 
 def remove_flying(picture: Picture, config: RegionConfig) -> None:
     """Take pixels with hardly a neighbour at their depth: between two surfaces, or alone."""
-    _take_lonely(picture.depth_mm, picture.taken, _jump(picture, config))
+    picture.take(_lonely(picture.depth_mm, picture.taken, _jump(picture, config)), FLYING)
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,7 +69,7 @@ def find_pieces(picture: Picture, edges: Edges, opening_mm: float) -> tuple[np.n
 
 
 @jit
-def _take_lonely(depth_mm, taken, jump):  # type: ignore[no-untyped-def]
+def _lonely(depth_mm, taken, jump):  # type: ignore[no-untyped-def]
     height, width = depth_mm.shape
     lonely = np.zeros((height, width), np.bool_)
     for v in range(height):
@@ -87,10 +87,7 @@ def _take_lonely(depth_mm, taken, jump):  # type: ignore[no-untyped-def]
                     else:
                         near += 1  # outside: unknown
             lonely[v, u] = near - 1 < _FEWEST_NEIGHBOURS
-    for v in range(height):
-        for u in range(width):
-            if lonely[v, u]:
-                taken[v, u] = FLYING
+    return lonely
 
 
 @jit
