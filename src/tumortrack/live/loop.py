@@ -21,16 +21,10 @@ from jaxtyping import Float64
 from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError, NoEstimate, TumortrackError
 from tumortrack.core.types import DepthFrame, Intrinsics, SensorCloud
+from tumortrack.live import values as live
 from tumortrack.live.meter import RunStatistics
 from tumortrack.live.quality import StampCheck, judge
-from tumortrack.live.values import (
-    ArmsController,
-    Observation,
-    Quality,
-    SinkContext,
-    SourceLost,
-    TrackingResult,
-)
+from tumortrack.live.values import Observation, Quality, SourceLost, TrackingResult
 from tumortrack.live.workers import SinkWorker, SourceWorker
 from tumortrack.sense.camera import d405
 from tumortrack.sense.region import Hints, RegionConfig, organ_points
@@ -72,9 +66,9 @@ class Loop:
     def __init__(
         self,
         tracker: Tracker,
-        context: SinkContext,
+        context: live.SinkContext,
         config: LoopConfig,
-        arms: ArmsController | None = None,
+        arms: live.ArmsController | None = None,
     ) -> None:
         self._config, self._context, self._arms = config, context, arms
         self._follower = Follower(tracker, config.follower)
@@ -249,7 +243,7 @@ class Loop:
         self.statistics.add(result)
         return result
 
-    def _act(self, arms: ArmsController, result: TrackingResult) -> TrackingResult:
+    def _act(self, arms: live.ArmsController, result: TrackingResult) -> TrackingResult:
         try:
             if self._context.controls.aborted.is_set():
                 arms.abort("stopped by the viewer, or a real arm gave up")

@@ -15,18 +15,8 @@ import time
 from collections.abc import Callable
 
 from tumortrack.core.errors import InputError
-from tumortrack.live.igtl.message import (
-    CHECKSUM_ERROR,
-    HEADER_SIZE,
-    Header,
-    Message,
-    ProtocolError,
-    check_body,
-    crc64,
-    pack,
-    pack_status,
-    unpack_header,
-)
+from tumortrack.live.igtl import message as igtl
+from tumortrack.live.igtl.message import Header, Message, ProtocolError, pack
 
 _LARGEST_REQUEST = 2**16  # bytes; what a receiver sends is small
 _MOST_ANSWERS = 100  # that wait for a receiver: one that only asks gets no more
@@ -50,7 +40,7 @@ class Link:
     """
 
     def __init__(self, host: str, port: int, connect: str = "") -> None:
-        crc64(b"")  # a missing package is reported before anything is opened
+        igtl.crc64(b"")  # a missing package is reported before anything is opened
         self._listener: socket.socket | None = None
         if connect:
             _check_host(connect, port)
@@ -139,7 +129,7 @@ class Link:
 
     async def _receive(self, reader: asyncio.StreamReader, receiver: _Receiver) -> None:
         while True:
-            header = unpack_header(await reader.readexactly(HEADER_SIZE))
+            header = igtl.unpack_header(await reader.readexactly(igtl.HEADER_SIZE))
             if header.body_size > _LARGEST_REQUEST:
                 raise ProtocolError(f"a request of {header.body_size} bytes is refused.")
             body = await reader.readexactly(header.body_size)
@@ -152,9 +142,9 @@ class Link:
         where there is none. To STT_...: done, since everything is sent anyway; to STP_...: not
         done. Whatever else comes is not for us."""
         try:
-            check_body(header, body)
+            igtl.check_body(header, body)
         except ProtocolError as error:
-            content = pack_status(CHECKSUM_ERROR, "checksum", str(error))
+            content = igtl.pack_status(igtl.CHECKSUM_ERROR, "checksum", str(error))
             return {("STATUS", ""): pack(Message("STATUS", "", 0, content))}
         verb, _, kind = header.type.partition("_")
         if not kind or verb not in ("GET", "STT", "STP"):

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
+from itertools import chain
 from typing import ClassVar, Literal
 
 import numpy as np
@@ -15,19 +16,9 @@ from jaxtyping import Float64
 
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import RAS_FROM_LPS, rigid, transform_points
+from tumortrack.live.igtl import message as igtl
 from tumortrack.live.igtl.link import Link
-from tumortrack.live.igtl.message import (
-    EXITING,
-    NOT_FOUND,
-    NOT_PRESENT,
-    NOT_READY,
-    OK,
-    Message,
-    Polydata,
-    pack_polydata,
-    pack_status,
-    pack_transform,
-)
+from tumortrack.live.igtl.message import Message, Polydata
 from tumortrack.live.meter import Rate
 from tumortrack.live.values import SinkConfig, SinkContext, TrackingResult
 
@@ -101,29 +92,23 @@ class OpenIgtLinkSink:
         return self._link.receivers
 
     def publish(self, result: TrackingResult) -> None:
-        self._send(result, OK if result.estimate is not None else NOT_FOUND)
+        self._send(result, igtl.OK if result.estimate is not None else igtl.NOT_FOUND)
         self._next = result.sequence + 1
 
     def close(self) -> None:
         """Say that it is over, and leave nothing that looks as if it were still true."""
         if not self._closed:
             self._closed = True
-            over = TrackingResult(
-                self._next,
-                time.time_ns(),
-                reason="tracking has ended",
-                published_frame=self._context.published_frame,
-            )
-            self._send(over, EXITING)
+            frame, why = self._context.published_frame, "tracking has ended"
+            over = TrackingResult(self._next, time.time_ns(), reason=why, published_frame=frame)
+            self._send(over, igtl.EXITING)
             self._link.close()
 
     def _send(self, result: TrackingResult, code: int) -> None:
         about = {"frame_id": result.published_frame.frame_id, "sequence": str(result.sequence)}
-        contents = [
-            *self._statuses(result, code),
-            *self._transforms(result),
-            *self._surfaces(result),
-        ]
+        contents = chain(
+            self._statuses(result, code), self._transforms(result), self._surfaces(result)
+        )
         self._link.send(
             [
                 Message(kind, device, result.stamp_ns, content, about | more)
@@ -137,20 +122,21 @@ class OpenIgtLinkSink:
         more = {"quality": str(result.quality)}
         if result.latency_ms is not None:
             more["latency_ms"] = f"{result.latency_ms:.1f}"
-        yield "STATUS", STATUS_DEVICE, pack_status(code, name, text), more
+        yield "STATUS", STATUS_DEVICE, igtl.pack_status(code, name, text), more
         cell = result.workcell
         if not self._context.arms:
             return
+        status, more = (igtl.NOT_PRESENT, "unknown", "nothing is known of the arms"), {}
         if cell is not None:
-            content = pack_status(NOT_READY if cell.halted else OK, cell.state, cell.halted)
-            yield "STATUS", ARMS_DEVICE, content, {"state": cell.state}
-        else:
-            content = pack_status(NOT_PRESENT, "unknown", "nothing is known of the arms")
-            yield "STATUS", ARMS_DEVICE, content, {}
+            code = igtl.NOT_READY if cell.halted else igtl.OK
+            status, more = (code, cell.state, cell.halted), {"state": cell.state}
+        yield "STATUS", ARMS_DEVICE, igtl.pack_status(*status), more
 
     def _transforms(self, result: TrackingResult) -> Iterator[_Content]:
-        way, pose = result.published_frame.published_from_camera, _camera_from_ct(result)
-        tumors = self._context.parts[1:]
+        way, tumors = result.published_frame.published_from_camera, self._context.parts[1:]
+        report = {} if result.estimate is None else result.estimate.report
+        # The organ's pose without its deformation, where the method knows one.
+        pose = np.array(report["motion"]["camera_from_ct"]) if "motion" in report else None
         places: dict[str, Float64[np.ndarray, "4 4"] | None] = dict.fromkeys(tumors)
         if self._context.anatomy_ct is not None:
             places[CT_DEVICE] = None if pose is None else way @ pose
@@ -166,7 +152,7 @@ class OpenIgtLinkSink:
         for name, place in places.items():
             turned = np.eye(4) if place is None else self._axes @ place @ self._axes
             known = {"TransformStatus": "MISSING" if place is None else "OK"}
-            yield "TRANSFORM", name, pack_transform(turned), known
+            yield "TRANSFORM", name, igtl.pack_transform(turned), known
 
     def _surfaces(self, result: TrackingResult) -> Iterator[_Content]:
         estimate = result.transformed
@@ -178,7 +164,9 @@ class OpenIgtLinkSink:
                 if (mesh := meshes.get(name)) is None:
                     contents[name] = _NOTHING
                 elif due:
-                    contents[name] = Polydata(self._turned(mesh.vertices_mm), mesh.faces)
+                    contents[name] = Polydata(
+                        transform_points(self._axes, mesh.vertices_mm), mesh.faces
+                    )
         if self._config.cloud_hz:
             if estimate is None:
                 contents[CLOUD_DEVICE] = _NOTHING
@@ -187,17 +175,7 @@ class OpenIgtLinkSink:
                 # reader does not bear cells of one point.
                 segments = np.repeat(np.arange(len(estimate.points_mm))[:, None], 2, axis=1)
                 scalars = {"label": estimate.labels, "probability": estimate.probability}
-                points = self._turned(estimate.points_mm)
+                points = transform_points(self._axes, estimate.points_mm)
                 contents[CLOUD_DEVICE] = Polydata(points, _NOTHING.triangles, segments, scalars)
         for name, content in contents.items():
-            yield "POLYDATA", name, pack_polydata(content), {}
-
-    def _turned(self, points_mm: np.ndarray) -> np.ndarray:
-        return transform_points(self._axes, points_mm)
-
-
-def _camera_from_ct(result: TrackingResult) -> Float64[np.ndarray, "4 4"] | None:
-    """The organ's pose without its deformation, where the method knows one."""
-    if result.estimate is None or "motion" not in result.estimate.report:
-        return None
-    return np.array(result.estimate.report["motion"]["camera_from_ct"], float)
+            yield "POLYDATA", name, igtl.pack_polydata(content), {}

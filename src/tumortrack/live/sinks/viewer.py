@@ -24,7 +24,7 @@ from tumortrack.core.types import Mesh
 from tumortrack.live.display import seen_points
 from tumortrack.live.values import SinkConfig, SinkContext, TrackingResult
 from tumortrack.live.viewer.look import point_under
-from tumortrack.live.viewer.panel import Panel, State, StatusPanel
+from tumortrack.live.viewer.panel import ABORTED, CANCEL, CLICK, Panel, State, StatusPanel
 from tumortrack.live.viewer.scene import ViewerScene
 from tumortrack.live.viewer.slices import load_ct, plane_through, slice_picture
 
@@ -79,6 +79,7 @@ class ViewerSink:
         self._config, self._context = config, context
         self._server = _opened(config.host, config.port)
         self.port: int = self._server.get_port()
+        self._back = np.linalg.inv(context.published_frame.published_from_camera)
         self._lock = threading.RLock()  # round every change of the page
         self._result: TrackingResult | None = None  # the last that came
         self._shown: TrackingResult | None = None  # whose estimate is visible
@@ -100,10 +101,15 @@ class ViewerSink:
     def _connect(self) -> None:
         """What the panel's elements do; viser calls it from its own threads."""
         panel = self._panel
+
+        def changed(_: object) -> None:
+            with self._page():
+                self._scene.change(panel.options)
+
         for switch in panel.switches:
-            switch.on_update(lambda _: self._changed())
+            switch.on_update(changed)
         panel.pick.on_click(lambda _: self._toggle_picking())
-        panel.forget.on_click(lambda _: self._forget())
+        panel.forget.on_click(lambda _: self._mark(None))
         if self._context.arms:
             panel.abort.on_click(lambda _: self._abort())
 
@@ -205,7 +211,7 @@ class ViewerSink:
             return
         with self._lock:
             result, hidden_count = self._shown, self._hidden_count
-            part, orientation = self._panel.slice_through
+            part, orientation = self._panel.through.value, self._panel.plane.value
         if result is None or result.estimate is None:
             return
         plane = plane_through(result.estimate.meshes, part, orientation)
@@ -217,21 +223,16 @@ class ViewerSink:
             if hidden_count == self._hidden_count:
                 self._panel.put_slice(picture)
                 if picture is not None and plane is not None:
-                    self._scene.put_slice(picture, plane, result.published_frame)
+                    self._scene.put_slice(picture, plane)
 
     def _outlines(self, result: TrackingResult) -> Iterator[tuple[Mesh, colours.Colour, int]]:
         assert result.estimate is not None
-        back = np.linalg.inv(result.published_frame.published_from_camera)
         for label, name in enumerate(self._context.parts, start=1):
             colour = colours.part_colour(label)
             if (mesh := result.estimate.meshes.get(name)) is not None:
                 yield mesh, colour, 2 if label > 1 else 1
             if (margin := self._scene.margins.get(name)) is not None:
-                yield margin.moved(transform_points(back, margin.vertices_mm)), colour, 1
-
-    def _changed(self) -> None:
-        with self._page():
-            self._scene.change(self._panel.options)
+                yield margin.moved(transform_points(self._back, margin.vertices_mm)), colour, 1
 
     def _toggle_picking(self) -> None:
         """The next click in the scene chooses the organ; asked twice: it does not."""
@@ -241,7 +242,7 @@ class ViewerSink:
                 self._server.scene.on_click()(self._clicked)
             else:
                 self._server.scene.remove_click_callback(self._clicked)
-            self._panel.picking(self._picking, self._context.controls.picked_mm is not None)
+            self._panel.pick.label = CANCEL if self._picking else CLICK
 
     def _clicked(self, event: SceneClickEvent) -> None:
         with self._lock:
@@ -252,27 +253,25 @@ class ViewerSink:
             if result is None or result.observation is None:
                 event.client.add_notification("Nothing is seen at present", "Click again later.")
                 return
-            back = np.linalg.inv(result.published_frame.published_from_camera)
-            origin = transform_points(back, np.array([event.ray_origin]))[0]
-            direction = back[:3, :3] @ np.array(event.ray_direction)
+            origin = transform_points(self._back, np.array([event.ray_origin]))[0]
+            direction = self._back[:3, :3] @ np.array(event.ray_direction)
             point = point_under(seen_points(result.observation).astype(float), origin, direction)
             if point is None:
                 event.client.add_notification("No observed point there", "Click on the points.")
                 return
-            self._context.controls.picked_mm = point
-            self._scene.mark(point, result.published_frame)
-            self._panel.picking(False, True)
+            self._mark(point)
 
-    def _forget(self) -> None:
+    def _mark(self, point_mm: np.ndarray | None) -> None:
+        """The user clicked here (camera frame), or on 'Choose again'."""
         with self._lock:
-            self._context.controls.picked_mm = None
-            self._scene.mark(None, self._context.published_frame)
-            self._panel.picking(self._picking, False)
+            self._context.controls.picked_mm = point_mm
+            self._scene.mark(point_mm)
+            self._panel.forget.visible = point_mm is not None
 
     def _abort(self) -> None:
         with self._lock:
             self._context.controls.aborted.set()
-            self._panel.aborted()
+            self._panel.abort.label, self._panel.abort.disabled = ABORTED, True
 
 
 def _opened(host: str, port: int) -> ViserServer:

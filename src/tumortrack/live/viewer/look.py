@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from tumortrack.core.types import Mesh
-from tumortrack.live.values import PublishedFrame, Workcell
+from tumortrack.live.values import Workcell
 
 if TYPE_CHECKING:
     from viser import CameraHandle, ClientHandle, ViserServer
@@ -31,9 +31,8 @@ _MISSED_MM = 10.0
 class Look:
     """New visitors look from the depth camera's place along its axis, its y axis down."""
 
-    def __init__(self, server: ViserServer, frames: PublishedFrame) -> None:
-        way = frames.published_from_camera
-        self._server, self._way = server, way
+    def __init__(self, server: ViserServer, way: Float[np.ndarray, "4 4"]) -> None:
+        self._server, self._way = server, way  # published_from_camera
         self._aimed = False
         self._eye_mm = way[:3, 3]  # of whoever moved last
         self._organ_mm = way[:3, 3] + _FIRST_LOOK_MM * way[:3, 2]
@@ -51,13 +50,12 @@ class Look:
             server.scene.add_light_directional(name, intensity=intensity, position=(x, y, z))
         server.on_client_connect(self._follow)
 
-    def aim(self, frames: PublishedFrame, depth_mm: float) -> None:
+    def aim(self, depth_mm: float) -> None:
         """Turn about the organ from now on, once its distance is known."""
         if self._aimed:
             return
         self._aimed = True
-        way = frames.published_from_camera
-        self._organ_mm = way[:3, 3] + depth_mm * way[:3, 2]
+        self._organ_mm = self._way[:3, 3] + depth_mm * self._way[:3, 2]
         if self._cell is None:  # else they look at the whole workcell
             self._server.initial_camera.look_at = self._organ_mm
             for client in self._server.get_clients().values():

@@ -24,8 +24,8 @@ if TYPE_CHECKING:
 State = Literal["waiting", "good", "poor", "none", "stale"]
 
 _WIDTH = 360  # pixels; what lies over the scene leaves this much room
-_ABORT, _ABORTED = "Stop the arms for good", "The arms were stopped for good"
-_CLICK, _CANCEL = "Click the organ", "Now click on the organ (again: cancel)"
+ABORT, ABORTED = "Stop the arms for good", "The arms were stopped for good"
+CLICK, CANCEL = "Click the organ", "Now click on the organ (again: cancel)"
 SILENCE_S = 2.0  # without a word from the server the page itself says so
 
 # In the panel, over the scene, in colour.
@@ -214,12 +214,12 @@ class Panel:
         gui.main_panel.set_width(_WIDTH)
         self.flag = gui.add_html("")  # of one height: what is to be clicked must not jump
         self.pick = gui.add_button(
-            _CLICK, hint="Of several things before the camera, choose the one that is the organ"
+            CLICK, hint="Of several things before the camera, choose the one that is the organ"
         )
         self.forget = gui.add_button("Choose again", visible=False)
         if arms:
             self.abort = gui.add_button(
-                _ABORT, color="red", hint="The arms stop, and move no more in this run"
+                ABORT, color="red", hint="The arms stop, and move no more in this run"
             )
             self.views = gui.add_button_group("Look at", get_args(View))
         self._numbers = gui.add_html("")
@@ -229,8 +229,8 @@ class Panel:
             with gui.add_folder("CT at the present position"):
                 self.slice = gui.add_image(np.zeros((8, 8, 3), np.uint8), format="jpeg")
                 self.slice.visible = False
-                self._through = gui.add_dropdown("Through", parts[1:] or parts)
-                self._plane = gui.add_dropdown("Plane", tuple(ORIENTATIONS))
+                self.through = gui.add_dropdown("Through", parts[1:] or parts)
+                self.plane = gui.add_dropdown("Plane", tuple(ORIENTATIONS))
                 shown["slice_plane"] = gui.add_checkbox("In the scene", default.slice_plane)
         with gui.add_folder("Show"):
             shown |= {
@@ -242,30 +242,16 @@ class Panel:
                 "helpers": gui.add_checkbox("Axes, region", default.helpers),
             }
         self._shown: dict[str, Any] = shown  # by the option's name
-        self.switches = [*shown.values(), *((self._through, self._plane) if slices else ())]
+        self.switches = [*shown.values(), *((self.through, self.plane) if slices else ())]
 
     @property
     def options(self) -> DisplayOptions:
         return DisplayOptions(**{name: element.value for name, element in self._shown.items()})
 
-    @property
-    def slice_through(self) -> tuple[str, str]:
-        """The part and the orientation that the user chose."""
-        return self._through.value, self._plane.value
-
     def say(self, status: StatusPanel) -> None:
         # Both before either: an error leaves the page as it was.
         flag, numbers = status.flag(), status.numbers()
         self.flag.content, self._numbers.content = flag, numbers
-
-    def picking(self, asked: bool, chosen: bool) -> None:
-        """``asked``: the next click counts; ``chosen``: one did."""
-        self.pick.label = _CANCEL if asked else _CLICK
-        self.forget.visible = chosen
-
-    def aborted(self) -> None:
-        """The arms move no more."""
-        self.abort.label, self.abort.disabled = _ABORTED, True
 
     def put_slice(self, picture: UInt8[np.ndarray, "h w 3"] | None) -> None:
         if self.slice is not None:

@@ -16,14 +16,9 @@ from jaxtyping import Float, UInt8
 from tumortrack.core import colours
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.types import Mesh
+from tumortrack.live import values as live
 from tumortrack.live.display import MOST_SEEN, seen_points, thinned, wxyz_of
-from tumortrack.live.values import (
-    PublishedFrame,
-    SinkContext,
-    TrackingResult,
-    TransformedEstimate,
-    Workcell,
-)
+from tumortrack.live.values import TrackingResult, TransformedEstimate
 from tumortrack.live.viewer.look import Look
 from tumortrack.live.viewer.slices import SlicePlane
 from tumortrack.live.viewer.surfaces import bare_faces, exact_margin, rough_margin
@@ -55,8 +50,9 @@ class DisplayOptions:
 class ViewerScene:
     """viser's nodes, and what goes into them."""
 
-    def __init__(self, server: ViserServer, context: SinkContext, margin_mm: float) -> None:
+    def __init__(self, server: ViserServer, context: live.SinkContext, margin_mm: float) -> None:
         self._nodes, self._margin_mm = server.scene, margin_mm
+        self._way = context.published_frame.published_from_camera
         self._at_rest, self._margins_ct = context.anatomy_ct, None
         if self._at_rest is not None:
             self._bare_faces = bare_faces(self._at_rest)
@@ -66,12 +62,13 @@ class ViewerScene:
         self.margins: dict[str, Mesh] = {}  # of the shown estimate, published frame
         self._placed: TransformedEstimate | None = None
         self._has_organ = self._has_slice = False
-        self.look = Look(server, context.published_frame)
+        self.look = Look(server, self._way)
         self._make_nodes(context)
 
-    def _make_nodes(self, context: SinkContext) -> None:
+    def _make_nodes(self, context: live.SinkContext) -> None:
         nodes = self._nodes
         self._axes = nodes.add_frame("/camera", axes_length=12.0, axes_radius=0.35)
+        self._axes.wxyz, self._axes.position = wxyz_of(self._way[:3, :3]), self._way[:3, 3]
         self._seen = self._cloud("/seen", 0.2, colours.SEEN)
         self._organ = self._cloud("/organ", 0.3, colours.ORGAN)
         self._region = nodes.add_line_segments(
@@ -129,18 +126,16 @@ class ViewerScene:
 
     def observe(self, result: TrackingResult) -> None:
         """Show what this result saw; nothing, if it saw nothing."""
-        way = result.published_frame.published_from_camera
         seen = _NO_POINTS if result.observation is None else seen_points(result.observation)
         organ = _NO_POINTS if result.organ is None else result.organ.points_mm
         for node, points in ((self._seen, seen), (self._organ, organ)):
-            there = transform_points(way, thinned(points, MOST_SEEN))
+            there = transform_points(self._way, thinned(points, MOST_SEEN))
             node.points = there.astype(np.float32)
-        self._axes.wxyz, self._axes.position = wxyz_of(way[:3, :3]), way[:3, 3]
         if len(organ):
             lower, upper = organ.min(0), organ.max(0)
-            corners = transform_points(way, lower + _CORNERS * (upper - lower))
+            corners = transform_points(self._way, lower + _CORNERS * (upper - lower))
             self._region.points = corners[_EDGES].astype(np.float32)
-            self.look.aim(result.published_frame, float(np.median(organ[:, 2])))
+            self.look.aim(float(np.median(organ[:, 2])))
         self._has_organ = len(organ) > 0
 
     def show(self, result: TrackingResult) -> None:
@@ -190,32 +185,27 @@ class ViewerScene:
             self._put_labelled(self._placed)
         self.apply()
 
-    def put_slice(
-        self, picture: UInt8[np.ndarray, "h w 3"], plane: SlicePlane, frames: PublishedFrame
-    ) -> None:
+    def put_slice(self, picture: UInt8[np.ndarray, "h w 3"], plane: SlicePlane) -> None:
         """The slice as a plane of the scene, at its true place."""
-        if not self.options.slice_plane:
-            self._has_slice = False  # what was there is old by the time it is asked for
-            return
+        self._has_slice = self.options.slice_plane
+        if not self._has_slice:
+            return  # what was there is old by the time it is asked for
         # viser lays a picture's columns along x and its rows along y.
         axes = np.stack([plane.across, plane.down, np.cross(plane.across, plane.down)], axis=1)
-        way = frames.published_from_camera
-        self._slice.position = transform_points(way, plane.centre_mm[None])[0]
-        self._slice.wxyz = wxyz_of(way[:3, :3] @ axes)
+        self._slice.position = transform_points(self._way, plane.centre_mm[None])[0]
+        self._slice.wxyz = wxyz_of(self._way[:3, :3] @ axes)
         self._slice.render_width = self._slice.render_height = plane.side_mm
         solid = (picture > 8).any(2, keepdims=True)
         self._slice.image = np.concatenate([picture, solid.astype(np.uint8) * 255], axis=2)
-        self._has_slice = True
         self.apply()
 
-    def mark(self, point_mm: Float[np.ndarray, " 3"] | None, frames: PublishedFrame) -> None:
+    def mark(self, point_mm: Float[np.ndarray, " 3"] | None) -> None:
         """Where the user clicked (camera frame); None: nowhere."""
         self._picked.visible = point_mm is not None
         if point_mm is not None:
-            there = transform_points(frames.published_from_camera, np.asarray(point_mm)[None])
-            self._picked.position = there[0]
+            self._picked.position = transform_points(self._way, point_mm[None])[0]
 
-    def show_cell(self, cell: Workcell | None) -> None:
+    def show_cell(self, cell: live.Workcell | None) -> None:
         """Show what arms do, and nothing of what was shown before; None: nothing. A shape's surface
         goes to the page once, then only its place."""
         self._cell.visible = cell is not None
@@ -289,9 +279,8 @@ class ViewerScene:
         motion = result.estimate.motion
         if self._margins_ct is None or motion is None:
             return {name: rough_margin(mesh, self._margin_mm) for name, mesh in tumors.items()}
-        way = result.published_frame.published_from_camera
         return {
-            name: margin.moved(transform_points(way, motion.carry(margin.vertices_mm)))
+            name: margin.moved(transform_points(self._way, motion.carry(margin.vertices_mm)))
             for name, margin in zip(self._shells, self._margins_ct, strict=True)
             if name in tumors
         }

@@ -137,11 +137,8 @@ def _sample(
 
 
 def load_ct(case: str, context: SinkContext) -> CarriedCt:
-    """
-    Raises:
-        InputError: the model knows no motion, or the case is another patient's.
-        ArtifactError: ``case`` is no case.
-    """
+    """Raises InputError where the model knows no motion or the case is another patient's,
+    ArtifactError where it is none."""
     loaded = load_case(Path(case))
     if context.anatomy_ct is None:
         raise InputError(
