@@ -33,8 +33,8 @@ class Extension(NamedTuple):
 
 @dataclass(frozen=True)
 class Registry(Generic[C]):
-    """All kinds of source, or of sink: ``built_in`` (``module:class`` by kind), and those of
-    ``group``. ``what`` names one in messages; ``base`` is what its class must be derived from."""
+    """All kinds of source, or of sink: ``built_in`` (``module:class`` by kind), and those of the
+    entry points' ``group``. ``what`` names one in messages; ``base`` is its class's base."""
 
     what: str
     group: str

@@ -42,11 +42,9 @@ class SourceEnded(TumortrackError):
 class Observation:
     """What a source observed at one instant; camera frame, mm.
 
-    Attributes:
-        content: a depth image or a cloud, with the ``stamp_ns`` of its exposure.
-        arrived_ns: when it reached this program, by ``time.time_ns``.
-        mask: of a depth image: True where the organ may be; None: anywhere.
-        truth: the true surfaces, where the source simulates them.
+    ``content`` has the ``stamp_ns`` of its exposure. ``arrived_ns``: when it reached this program,
+    by ``time.time_ns``. ``mask``: of a depth image: True where the organ may be. ``truth``: the
+    true surfaces, where the source simulates them.
     """
 
     content: DepthFrame | SensorCloud
@@ -63,8 +61,7 @@ class Observation:
 class Source(Protocol):
     """An open source. One thread calls ``read``; another may call ``close``."""
 
-    # True: stamps are this machine's time.time_ns, so the age of a frame is known. Holds for the
-    # frame read last; before the first one it may not be known.
+    # Stamps are this machine's time.time_ns, so the age of a frame is known; of the one read last.
     host_clock: bool
     lossless: bool  # every frame is processed, not only the newest: the source waits for the loop
 
@@ -89,7 +86,7 @@ class Source(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class PublishedFrame:
-    """The coordinate frame in which results are published, and the transform there."""
+    """Where results are published."""
 
     frame_id: str = "camera"
     published_from_camera: Float64[np.ndarray, "4 4"] = field(default_factory=lambda: np.eye(4))
@@ -107,11 +104,9 @@ class TransformedEstimate:
 
 @dataclass(frozen=True, eq=False)
 class RigidShape:
-    """A surface that moves rigidly: a link of an arm, a table, a planned piece.
-
-    ``name`` is unique within a workcell, with slashes between levels (``cutter/forearm``). Sinks
-    send the surface again only if ``mesh`` is another object than before, otherwise its pose alone.
-    """
+    """A surface that moves rigidly: a link of an arm, a table, a planned piece. ``name`` is unique
+    within a workcell, with slashes between levels (``cutter/forearm``). Sinks send the surface
+    again only if ``mesh`` is another object than before, otherwise its pose alone."""
 
     name: str
     mesh: Mesh  # in its own frame, mm
@@ -167,14 +162,12 @@ class TrackingResult:
 
     Attributes:
         sequence: number of the result, from 0.
-        stamp_ns: of the frame; if none came, the present by ``time.time_ns``.
+        stamp_ns: of the frame; if none came, the present by the source's clock.
         estimate: camera frame, mm; None where nothing can be said. Never an older one.
         reason: why there is no estimate; empty with one.
-        quality: ``none`` without an estimate; ``poor`` if it should not be relied on: ``warning``
-            then says why.
+        quality: ``poor``: it should not be relied on, and ``warning`` says why.
         observation: what the source saw; None if no frame came.
-        organ: the points of the observation that belong to the organ; camera frame.
-        published_frame: where sinks publish it.
+        organ: its points that belong to the organ; camera frame.
         seconds: duration of each stage.
         latency_ms: until the result was handed to the sinks, from the stamp (if the source does
             not have this machine's clock: from the arrival; if it waits for the loop: from the
@@ -244,13 +237,8 @@ class ArmsController(Protocol):
 
 @dataclass(eq=False)
 class Controls:
-    """What the user asks of the running loop; from any thread.
-
-    Attributes:
-        picked_mm: this point (camera frame) lies on the organ: track the piece that it is on. None:
-            choose the organ without it.
-        aborted: set: the arms stop for good.
-    """
+    """What the user asks of the running loop; from any thread. ``picked_mm``: this point (camera
+    frame) lies on the organ: track the piece that it is on. ``aborted``: the arms stop for good."""
 
     picked_mm: Float64[np.ndarray, " 3"] | None = None
     aborted: threading.Event = field(default_factory=threading.Event)
@@ -258,15 +246,9 @@ class Controls:
 
 @dataclass(frozen=True, eq=False)
 class SinkContext:
-    """What a sink knows when it is opened.
-
-    Attributes:
-        parts: the model's parts, the organ first.
-        anatomy_ct: the organ in the CT (LPS, mm), if the model has it: estimates then have a
-            motion, and their meshes its triangles.
-        controls: what a sink with buttons can ask of the loop.
-        arms: results may have a workcell.
-    """
+    """What a sink knows when it is opened. ``parts``: the model's, the organ first. ``anatomy_ct``:
+    the organ in the CT (LPS, mm), if the model has it: estimates then have a motion, and their
+    meshes its triangles. ``arms``: results may have a workcell."""
 
     parts: tuple[str, ...]
     published_frame: PublishedFrame
@@ -278,8 +260,8 @@ class SinkContext:
 @runtime_checkable
 class Sink(Protocol):
     """An open sink. Both methods are called from one thread of its own, so they may take their
-    time. Errors are counted and reported, and the loop goes on. What a ``counts: dict[str, int]``
-    has, if there is one, goes into the run's report."""
+    time. Errors are counted and reported, and the loop goes on. A ``counts: dict[str, int]``, if
+    there is one, goes into the run's report."""
 
     def publish(self, result: TrackingResult) -> None: ...
 
@@ -289,11 +271,9 @@ class Sink(Protocol):
 
 
 class SourceConfig(Config, frozen=True, kw_only=True, tag_field="kind"):
-    """Base of every source's configuration; its fields are the options on the command line.
-
-    The class's ``tag`` is the kind's name. ``target`` names the field that stands before the
-    question mark in ``kind:target?key=value``; empty: there is none.
-    """
+    """Base of every source's configuration; its fields are the options on the command line, its
+    ``tag`` is the kind's name. ``target`` names the field that stands before the question mark in
+    ``kind:target?key=value``; empty: there is none."""
 
     target: ClassVar[str] = ""
 

@@ -54,8 +54,7 @@ class SourceWorker:
     @property
     def dropped(self) -> int:
         """Frames that nobody got: overtaken by newer ones, here or in the source."""
-        source = self._source
-        return self._passed + (source.dropped if source else 0)
+        return self._passed + (source.dropped if (source := self._source) else 0)
 
     def born_ns(self, seen: Observation) -> int:
         """When the frame just taken came to be, by ``time.time_ns``: its stamp, or where the source
@@ -73,12 +72,12 @@ class SourceWorker:
             self._lock.wait_for(lambda: self._newest is not None or self._over, timeout_s)
             newest, self._newest = self._newest, None
             self._lock.notify_all()
-        if newest is not None:
-            taken, self.latency_from = newest
-            return taken
-        if self.failure is not None:
-            raise self.failure
-        return None
+        if newest is None:
+            if self.failure is not None:
+                raise self.failure
+            return None
+        taken, self.latency_from = newest
+        return taken
 
     def close(self) -> None:
         """Stop reading and close the source; one that hangs is left behind after 2 s."""

@@ -55,21 +55,15 @@ class UrSinkConfig(SinkConfig, frozen=True, kw_only=True, tag="ur"):
     gain: float = 300.0
 
     def __post_init__(self) -> None:
-        for name, low, high in (
-            ("jump_deg", 0.1, 20.0),
-            ("lookahead_s", 0.03, 0.2),  # servoJ's own limits
-            ("gain", 100.0, 2000.0),
-        ):
+        servo = (("lookahead_s", 0.03, 0.2), ("gain", 100.0, 2000.0))  # servoJ's own limits
+        for name, low, high in (("jump_deg", 0.1, 20.0), *servo):
             value = getattr(self, name)
             if not low <= value <= high:
                 raise InputError(f"ur: {name} {value:g} must lie in {low:g}..{high:g}.")
 
     def open(self, context: SinkContext) -> UrSink:
         """Nothing, or with ``execute`` the connection to the arm, which does not move yet.
-
-        Raises:
-            InputError: no arms in this run; with ``execute``: as ``UrLink``.
-        """
+        InputError: no arms in this run; with ``execute``: as ``UrLink``."""
         if not context.arms:
             raise InputError("ur: nothing here moves an arm; it is for `tumortrack resect`.")
         return UrSink(self, UrLink(self.host) if self.execute else None, context.controls)
@@ -97,17 +91,13 @@ class UrSink:
 
     @property
     def counts(self) -> dict[str, int]:
-        """Updates by what became of them: sent (in a dry run: would send), halted, no arms,
+        """Results by what became of them: sent (in a dry run: would send), halted, no arms,
         refused; and silences."""
         with self._lock:
             return dict(self._counts)
 
     def publish(self, result: TrackingResult) -> None:
-        """Send the target, or check it.
-
-        Raises:
-            TumortrackError: the target is refused, and why; the arm stands.
-        """
+        """Send the target, or check it; TumortrackError: it is refused, and the arm stands."""
         with self._lock:
             if self._closed.is_set():
                 return
@@ -203,11 +193,8 @@ class UrSink:
 
 
 def _target(joints_rad: Mapping[str, float], names: tuple[str, ...]) -> Float64[np.ndarray, " 6"]:
-    """One arm's joints in the maker's order.
-
-    Raises:
-        TumortrackError: one is missing, no number, or beyond its limit.
-    """
+    """One arm's joints in the maker's order; TumortrackError: one is missing, no number, or beyond
+    its limit."""
     if missing := [name for name in names if name not in joints_rad]:
         raise TumortrackError(f"there is no joint {missing[0]}; there are {', '.join(joints_rad)}")
     target = np.array([float(joints_rad[name]) for name in names])

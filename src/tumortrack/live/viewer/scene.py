@@ -8,7 +8,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal
+from functools import partial
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float, UInt8
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
 _MOST_LABELLED = 15_000  # points shown
 _TUMOR_WITH_POINTS = 0.3  # opacity
 _NO_POINTS = np.zeros((0, 3), np.float32)
+_NOTHING = Mesh(np.zeros((3, 3)), np.array([[0, 1, 2]]))
 _CORNERS = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)])
 _EDGES = [(a, b) for a in range(8) for b in range(a) if abs(_CORNERS[a] - _CORNERS[b]).sum() == 1]
 _FLAT: dict[str, Any] = {"cast_shadow": False, "receive_shadow": False}
@@ -52,6 +54,7 @@ class ViewerScene:
 
     def __init__(self, server: ViserServer, context: live.SinkContext, margin_mm: float) -> None:
         self._nodes, self._margin_mm = server.scene, margin_mm
+        self._lines = partial(server.scene.add_line_segments, thickness_units="world")
         self._way = context.published_frame.published_from_camera
         self._at_rest, self._margins_ct = context.anatomy_ct, None
         if self._at_rest is not None:
@@ -83,16 +86,16 @@ class ViewerScene:
             "/picked", radius=1.5, color=colours.PICKED, visible=False, cast_shadow=False
         )
         self._estimate = nodes.add_frame("/estimate", show_axes=False, visible=False)
-        self._shells = {
-            # Of a margin its far half: the near one would cover the organ that it reaches out of.
-            name: self._surface(f"/estimate/margin_{name}", label, 0.3, "back")
-            for label, name in enumerate(context.parts[1:], start=2)
-            if self._margin_mm > 0
-        }
-        self._parts = {
-            name: self._surface(f"/estimate/{name}", label, 0.35 if label == 1 else None)
-            for label, name in enumerate(context.parts, start=1)
-        }
+        self._shells, self._parts = {}, {}
+        for label, name in enumerate(context.parts, start=1):
+            look = {"color": colours.part_colour(label), "visible": False}
+            if label > 1 and self._margin_mm > 0:
+                # Its far half: the near one would cover the organ that it reaches out of.
+                path = f"/estimate/margin_{name}"
+                self._shells[name] = self._mesh(path, _NOTHING, opacity=0.3, side="back", **look)
+            opacity = 0.35 if label == 1 else None
+            path = f"/estimate/{name}"
+            self._parts[name] = self._mesh(path, _NOTHING, opacity=opacity, **look)
         self._points = self._cloud("/estimate/points", 0.3, colours.KIDNEY)
         blank = np.zeros((2, 2, 4), np.uint8)
         self._slice = nodes.add_image("/estimate/slice", blank, 1, 1, format="png", **_FLAT)
@@ -110,19 +113,9 @@ class ViewerScene:
             precision="float32",  # half precision is 0.125 mm at 150 mm
         )
 
-    def _surface(
-        self, name: str, label: int, opacity: float | None, side: Literal["front", "back"] = "front"
-    ) -> MeshHandle:
-        return self._nodes.add_mesh_simple(
-            name,
-            np.zeros((3, 3), np.float32),
-            np.array([[0, 1, 2]], np.uint32),
-            color=colours.part_colour(label),
-            opacity=opacity,
-            side=side,
-            visible=False,
-            **_FLAT,
-        )
+    def _mesh(self, name: str, mesh: Mesh, **look: Any) -> MeshHandle:
+        vertices, faces = mesh.vertices_mm.astype(np.float32), mesh.faces.astype(np.uint32)
+        return self._nodes.add_mesh_simple(name, vertices, faces, **_FLAT, **look)
 
     def observe(self, result: TrackingResult) -> None:
         """Show what this result saw; nothing, if it saw nothing."""
@@ -218,16 +211,20 @@ class ViewerScene:
         places = np.array([shape.published_from_shape for shape in cell.shapes]).reshape(-1, 4, 4)
         turns = wxyz_of(places[:, :3, :3]) if len(places) else ()  # all at once: 5 times quicker
         for (name, shape), wxyz in zip(shapes.items(), turns, strict=True):
-            look = (shape.mesh, shape.colour, shape.opacity)
-            node = self._placed_node(name, look, shape.published_from_shape, self._add_shape)
-            if node is not None:
-                node.position, node.wxyz = shape.published_from_shape[:3, 3], wxyz
+            look, way = (shape.mesh, shape.colour, shape.opacity), shape.published_from_shape
+            opacity = shape.opacity if shape.opacity < 1 else None
+            add = partial(
+                self._mesh, mesh=shape.mesh, color=shape.colour, opacity=opacity, flat_shading=True
+            )
+            if (node := self._placed_node(name, look, way, add)) is not None:
+                node.position, node.wxyz = way[:3, 3], wxyz
         for name, line in lines.items():
+            points = line.points_mm.astype(np.float32)
+            segments = np.stack([points[:-1], points[1:]], axis=1)
             look = (line.colour, line.width_mm)
-            node = self._placed_node(name, look, line.points_mm, self._add_line)
-            if node is not None:
-                points = line.points_mm.astype(np.float32)
-                node.points = np.stack([points[:-1], points[1:]], axis=1)
+            add = partial(self._lines, points=segments, colors=look[0], thickness=look[1])
+            if (node := self._placed_node(name, look, line.points_mm, add)) is not None:
+                node.points = segments
         self.look.oversee(cell)
 
     def _placed_node(
@@ -238,29 +235,9 @@ class ViewerScene:
         if before != look:
             kind, _, own = name.partition("/")
             # Without further slashes: to viser they say that one node moves with another.
-            node, there = add(f"/workcell/{kind}/{own.replace('/', ':')}", *look), None
+            node, there = add(f"/workcell/{kind}/{own.replace('/', ':')}"), None
         self._drawn[name] = look, place, node
         return None if there is not None and np.array_equal(there, place) else node
-
-    def _add_shape(
-        self, name: str, mesh: Mesh, colour: colours.Colour, opacity: float
-    ) -> MeshHandle:
-        return self._nodes.add_mesh_simple(
-            name,
-            mesh.vertices_mm.astype(np.float32),
-            mesh.faces.astype(np.uint32),
-            color=colour,
-            opacity=opacity if opacity < 1 else None,
-            flat_shading=True,
-            side="front",
-            **_FLAT,
-        )
-
-    def _add_line(self, name: str, colour: colours.Colour, width_mm: float) -> Any:
-        blank = np.zeros((1, 2, 3), np.float32)
-        return self._nodes.add_line_segments(
-            name, blank, colour, thickness=width_mm, thickness_units="world"
-        )
 
     def _put_labelled(self, placed: TransformedEstimate) -> None:
         if self.options.points == "none":
