@@ -47,8 +47,9 @@ def read_cloud(path: Path, unit: Literal["mm", "m"] = "mm") -> tuple[SensorCloud
         raise InputError(f"{path}: unknown cloud type. Allowed: {', '.join(CLOUD_SUFFIXES)}.")
     if unit not in ("mm", "m"):
         raise InputError(f"unit {unit!r} is not understood. Allowed: mm, m.")
-    parse = {".ply": parse_ply_properties, ".pcd": _pcd_points, ".npz": partial(_npz_points, unit)}
-    raw = parse[suffix](_read_bytes(path), str(path))
+    npz = partial(_npz_points, unit)
+    parse: Any = {".ply": parse_ply_properties, ".pcd": _pcd_points, ".npz": npz}[suffix]
+    raw = parse(_read_bytes(path), str(path))
     with np.errstate(over="ignore"):  # beyond float32 becomes infinite, and is dropped
         points_mm = (raw * (1000.0 if unit == "m" else 1.0)).astype(np.float32)
     kept = points_mm[np.isfinite(points_mm).all(axis=1) & (points_mm != 0).any(axis=1)]

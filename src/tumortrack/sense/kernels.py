@@ -154,9 +154,11 @@ def smooth_at(seen, shape, step, key):  # type: ignore[no-untyped-def]
     pixels, starts = seen
     height, width = shape
     # Standard normal values on every ``step``-th pixel, one node beyond the image.
-    grid = np.empty((height // step + 2, width // step + 2), np.float32)
-    for node in range(grid.size):
-        grid.ravel()[node] = _QUANTILES[_bits(key, node) & _LOW_14]
+    rows, columns = height // step + 2, width // step + 2
+    grid = np.empty((rows, columns), np.float32)
+    for i in range(rows):
+        for j in range(columns):
+            grid[i, j] = _QUANTILES[_bits(key, i * columns + j) & _LOW_14]
     first, second = _weights(step)
     out = np.empty(len(pixels), np.float32)
     row = np.empty(width + step, np.float32)

@@ -135,9 +135,11 @@ def add_noise(frame: DepthFrame, config: NoiseConfig, rng: np.random.Generator) 
     out_mm = np.full(true_mm.shape, np.nan, np.float32)
     quantum_mm = np.float32(config.quantum_mm)
     for pixels, values_mm in ((seen.pixels, depths_mm), scatter):
-        out_mm.ravel()[pixels] = (
-            np.rint(values_mm / quantum_mm) * quantum_mm if quantum_mm else values_mm
-        )
+        if quantum_mm:
+            values_mm /= quantum_mm
+            np.rint(values_mm, out=values_mm)
+            values_mm *= quantum_mm
+        out_mm.ravel()[pixels] = values_mm
     return frame.with_depth(out_mm)
 
 

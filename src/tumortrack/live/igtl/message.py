@@ -81,9 +81,9 @@ def pack(message: Message) -> bytes:
     keys, values = b"".join(index), b"".join(texts)
     extended = _EXTENDED.pack(_EXTENDED.size, len(keys), len(values), 0)
     body = b"".join((extended, message.content, keys, values))
-    for what, text, size in (("type", message.type, 12), ("device name", message.device, 20)):
-        if not text.isascii() or len(text) > size:
-            raise ProtocolError(f"{what} {text!r}: at most {size} ASCII characters are allowed.")
+    for what, given, size in (("type", message.type, 12), ("device name", message.device, 20)):
+        if not given.isascii() or len(given) > size:
+            raise ProtocolError(f"{what} {given!r}: at most {size} ASCII characters are allowed.")
     names = message.type.encode("ascii"), message.device.encode("ascii")
     # Seconds in the upper 32 bits, their fraction in the lower ones.
     stamp = ((message.stamp_ns << 32) + _NS // 2) // _NS

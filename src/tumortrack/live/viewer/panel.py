@@ -224,7 +224,8 @@ class Panel:
             self.views = gui.add_button_group("Look at", get_args(View))
         self._numbers = gui.add_html("")
         self.slice = None
-        shown, default = {}, DisplayOptions()
+        default = DisplayOptions()
+        shown: dict[str, Any] = {}  # by the option's name
         if slices:
             with gui.add_folder("CT at the present position"):
                 self.slice = gui.add_image(np.zeros((8, 8, 3), np.uint8), format="jpeg")
@@ -241,7 +242,7 @@ class Panel:
                 "coloured_by": gui.add_dropdown("Coloured by", ("label", "probability")),
                 "helpers": gui.add_checkbox("Axes, region", default.helpers),
             }
-        self._shown: dict[str, Any] = shown  # by the option's name
+        self._shown = shown
         self.switches = [*shown.values(), *((self.through, self.plane) if slices else ())]
 
     @property

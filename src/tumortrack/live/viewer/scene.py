@@ -34,6 +34,7 @@ _NOTHING = Mesh(np.zeros((3, 3)), np.array([[0, 1, 2]]))
 _CORNERS = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)])
 _EDGES = [(a, b) for a in range(8) for b in range(a) if abs(_CORNERS[a] - _CORNERS[b]).sum() == 1]
 _FLAT: dict[str, Any] = {"cast_shadow": False, "receive_shadow": False}
+_HAIRLINE: dict[str, Any] = {"thickness": 1.0, "thickness_units": "screen", "visible": False}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,7 +55,6 @@ class ViewerScene:
 
     def __init__(self, server: ViserServer, context: live.SinkContext, margin_mm: float) -> None:
         self._nodes, self._margin_mm = server.scene, margin_mm
-        self._lines = partial(server.scene.add_line_segments, thickness_units="world")
         self._way = context.published_frame.published_from_camera
         self._at_rest, self._margins_ct = context.anatomy_ct, None
         if self._at_rest is not None:
@@ -70,18 +70,14 @@ class ViewerScene:
 
     def _make_nodes(self, context: live.SinkContext) -> None:
         nodes = self._nodes
-        self._axes = nodes.add_frame("/camera", axes_length=12.0, axes_radius=0.35)
-        self._axes.wxyz, self._axes.position = wxyz_of(self._way[:3, :3]), self._way[:3, 3]
+        turn, eye_mm = wxyz_of(self._way[:3, :3]), self._way[:3, 3]
+        self._axes = nodes.add_frame(
+            "/camera", axes_length=12.0, axes_radius=0.35, wxyz=turn, position=eye_mm
+        )
         self._seen = self._cloud("/seen", 0.2, colours.SEEN)
         self._organ = self._cloud("/organ", 0.3, colours.ORGAN)
-        self._region = nodes.add_line_segments(
-            "/region",
-            np.zeros((12, 2, 3), np.float32),
-            colours.REGION,
-            thickness=1.0,
-            thickness_units="screen",
-        )
-        self._region.visible = False
+        blank = np.zeros((12, 2, 3), np.float32)
+        self._region = nodes.add_line_segments("/region", blank, colours.REGION, **_HAIRLINE)
         self._picked = nodes.add_icosphere(
             "/picked", radius=1.5, color=colours.PICKED, visible=False, cast_shadow=False
         )
@@ -97,8 +93,8 @@ class ViewerScene:
             path = f"/estimate/{name}"
             self._parts[name] = self._mesh(path, _NOTHING, opacity=opacity, **look)
         self._points = self._cloud("/estimate/points", 0.3, colours.KIDNEY)
-        blank = np.zeros((2, 2, 4), np.uint8)
-        self._slice = nodes.add_image("/estimate/slice", blank, 1, 1, format="png", **_FLAT)
+        clear = np.zeros((2, 2, 4), np.uint8)
+        self._slice = nodes.add_image("/estimate/slice", clear, 1, 1, format="png", **_FLAT)
         self._cell = nodes.add_frame("/workcell", show_axes=False, visible=False)
         self._drawn: dict[str, tuple[object, np.ndarray, Any]] = {}  # look, place and node by name
 
@@ -211,33 +207,35 @@ class ViewerScene:
         places = np.array([shape.published_from_shape for shape in cell.shapes]).reshape(-1, 4, 4)
         turns = wxyz_of(places[:, :3, :3]) if len(places) else ()  # all at once: 5 times quicker
         for (name, shape), wxyz in zip(shapes.items(), turns, strict=True):
-            look, way = (shape.mesh, shape.colour, shape.opacity), shape.published_from_shape
-            opacity = shape.opacity if shape.opacity < 1 else None
-            add = partial(
-                self._mesh, mesh=shape.mesh, color=shape.colour, opacity=opacity, flat_shading=True
-            )
-            if (node := self._placed_node(name, look, way, add)) is not None:
-                node.position, node.wxyz = way[:3, 3], wxyz
+            look = {"mesh": shape.mesh, "color": shape.colour, "opacity": shape.opacity}
+            node = self._placed_node(name, shape.published_from_shape, self._add_shape, look)
+            if node is not None:
+                node.position, node.wxyz = shape.published_from_shape[:3, 3], wxyz
         for name, line in lines.items():
             points = line.points_mm.astype(np.float32)
             segments = np.stack([points[:-1], points[1:]], axis=1)
-            look = (line.colour, line.width_mm)
-            add = partial(self._lines, points=segments, colors=look[0], thickness=look[1])
-            if (node := self._placed_node(name, look, line.points_mm, add)) is not None:
+            look = {"colors": line.colour, "thickness": line.width_mm, "thickness_units": "world"}
+            add = partial(self._nodes.add_line_segments, points=segments)
+            if (node := self._placed_node(name, line.points_mm, add, look)) is not None:
                 node.points = segments
         self.look.oversee(cell)
 
     def _placed_node(
-        self, name: str, look: Any, place: np.ndarray, add: Callable[..., Any]
+        self, name: str, place: np.ndarray, add: Callable[..., Any], look: dict[str, Any]
     ) -> Any | None:
         """The node to be moved, made anew where it looks otherwise; None: it lies there already."""
         before, there, node = self._drawn.get(name, (None, None, None))
         if before != look:
             kind, _, own = name.partition("/")
             # Without further slashes: to viser they say that one node moves with another.
-            node, there = add(f"/workcell/{kind}/{own.replace('/', ':')}"), None
+            node, there = add(f"/workcell/{kind}/{own.replace('/', ':')}", **look), None
         self._drawn[name] = look, place, node
         return None if there is not None and np.array_equal(there, place) else node
+
+    def _add_shape(self, name: str, opacity: float, **look: Any) -> MeshHandle:
+        # A mesh with an opacity is drawn as translucent, and sorted.
+        solid = opacity if opacity < 1 else None
+        return self._mesh(name, opacity=solid, flat_shading=True, **look)
 
     def _put_labelled(self, placed: TransformedEstimate) -> None:
         if self.options.points == "none":

@@ -52,9 +52,9 @@ def take_one_piece(picture: Picture, config: RegionConfig, hints: Hints) -> None
     edges = find_edges(picture, config)
     best: _Choice | None = None
     for wider in _OPENINGS:
-        pieces, count = find_pieces(picture, edges, wider * config.opening_mm)
-        depth_mm, taken = picture.depth_mm, picture.taken
-        these = _measure(depth_mm, edges.distance, taken, pieces, picture.pinhole, count)
+        pieces, count = find_pieces(picture, edges, config, wider)
+        seen = (picture.depth_mm, edges[1], picture.taken)
+        these = _measure(*seen, pieces, picture.pinhole, count)
         here = _chosen(picture, pieces, these, config, hints)
         if best is None or here.score > _CLEARLY * best.score:
             best = here
@@ -75,16 +75,10 @@ def take_one_piece(picture: Picture, config: RegionConfig, hints: Hints) -> None
 
 
 class _Sizes(NamedTuple):
-    """Of every piece (count + 1,); entry 0 is not used.
-
-    Attributes:
-        area_mm2: across the line of sight.
-        wide_mm: longest extent.
-        cut: 0..1, how much of it continues outside the examined part: the width there over the
-            square root of the area.
-        thick_mm: diameter of the largest disc in it.
-        aside: tangent of the angle between its middle and the optical axis.
-    """
+    """Of every piece (count + 1,); entry 0 is not used. ``area_mm2``: across the line of sight.
+    ``wide_mm``: longest extent. ``cut``: 0..1, how much of it continues outside the examined part:
+    the width there over the square root of the area. ``thick_mm``: diameter of the largest disc in
+    it. ``aside``: tangent of the angle between its middle and the optical axis."""
 
     area_mm2: np.ndarray
     wide_mm: np.ndarray
@@ -95,16 +89,10 @@ class _Sizes(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class _Choice:
-    """What is taken for the organ at one way of parting the picture.
-
-    Attributes:
-        pieces: number of its piece for every pixel (h, w).
-        these: their sizes.
-        together: (count + 1,) bool, which of them.
-        score: how like an organ it is; the largest of several choices is the best.
-        doubtful: it leaves the picture or is too wide, or something that does seems to continue
-            it: perhaps a wider opening parts them.
-    """
+    """What is taken for the organ at one way of parting the picture: ``pieces``, the number of its
+    piece for every pixel (h, w), and which of them, ``together`` (count + 1,). ``score``: how like
+    an organ it is. ``doubtful``: it leaves the picture or is too wide, or something that does seems
+    to continue it: perhaps a wider opening parts them."""
 
     pieces: np.ndarray
     these: _Sizes
@@ -130,9 +118,8 @@ def _chosen(
         piece = int(scores.argmax())
     leaves = these.cut > _CUT
     gap = config.gap_mm / picture.footprint
-    lines = _continuing(
-        picture.depth_mm, picture.taken, pieces, gap, picture.footprint, len(together)
-    )
+    seen = (picture.depth_mm, picture.taken, pieces)
+    lines = _continuing(*seen, gap, picture.footprint, len(together))
     lines = lines + lines.T
     together[piece] = True
     refused = False

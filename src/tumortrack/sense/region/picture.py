@@ -114,12 +114,9 @@ class Hints:
 class Picture:
     """A depth image at working size, and what the steps have decided about its pixels so far.
 
-    Attributes:
-        depth_mm: (h, w) float32, NaN where there was no return.
-        taken: (h, w) uint8, one of the numbers above; the steps write into it.
-        pinhole: of the working picture.
-        left: ``taken`` -> which points of the content are still called ORGAN, (n,) int.
-        points: some of these -> points (n, 3), camera frame, mm, float32.
+    ``depth_mm`` (h, w) is float32, NaN where there was no return; ``taken`` (h, w), uint8, is one
+    of the numbers above, and the steps write into it. ``left``: ``taken`` -> which points of the
+    content are still called ORGAN (n,); ``points``: of some of these (n, 3), camera frame, mm.
     """
 
     depth_mm: np.ndarray
@@ -194,33 +191,27 @@ def picture_of_cloud(cloud: SensorCloud) -> Picture:
 
     Points at or behind the camera's centre are left out, and so are those behind another.
     """
-    points_mm, z = cloud.points_mm, cloud.points_mm[:, 2]
+    points_mm = cloud.points_mm
+    x, y, z = np.ascontiguousarray(points_mm.T)
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        tangents = (points_mm[:, :2] / z[:, None]).astype(np.float64)
-    before = np.flatnonzero((z > 1.0) & (np.abs(tangents) < _WIDEST).all(axis=1))
-    tangents = tangents[before]
-    low, high = (tangents.min(0), tangents.max(0)) if len(before) else (np.zeros(2), np.zeros(2))
-    inner = _inner_spread(tangents, low, high)
+        across, down = x / z, y / z
+    before = np.flatnonzero((z > 1.0) & (np.abs(across) < _WIDEST) & (np.abs(down) < _WIDEST))
+    tangents = np.stack([across[before], down[before]]).astype(np.float64)
+    low, high = (tangents.min(1), tangents.max(1)) if len(before) else (np.zeros(2), np.zeros(2))
+    inner = np.array([_inner_spread(*of_axis) for of_axis in zip(tangents, low, high, strict=True)])
     # Stray points widen the picture, but don't coarsen it.
     pixels = max(len(points_mm) / _POINTS_PER_PIXEL, 64.0)
     most = np.prod(high - low + 1e-3) / MOST_PIXELS
     size = float(np.sqrt(max(np.prod(inner + 1e-3) / pixels, most)))
     width, height = (int(n) for n in np.floor((high - low) / size) + 1)
     pinhole = Pinhole(1 / size, 1 / size, float(-low[0] / size), float(-low[1] / size))
-    scale, centre = np.array([[pinhole.fx, pinhole.fy], [pinhole.cx, pinhole.cy]])
-    u, v = (scale * tangents + centre + 0.5).astype(np.int64).T
-    inside = (u >= 0) & (u < width) & (v >= 0) & (v < height)
-    pixel = np.full(len(points_mm), -1, np.int32)  # of each point; -1: none
-    pixel[before[inside]] = (v * width + u)[inside]
-    nearest = np.full(height * width, np.nan, np.float32)
-    seen = np.flatnonzero(pixel >= 0)
-    np.fmin.at(nearest, pixel[seen], z[seen])
-    depth_mm = nearest.reshape(height, width)
+    depth_mm, pixel = _rasterise(across, down, z, pinhole, (height, width))
     taken = np.isnan(depth_mm).view(np.uint8) * np.uint8(NO_RETURN)
 
     def left(taken: np.ndarray) -> np.ndarray:
-        organ = seen[taken.ravel()[pixel[seen]] == ORGAN]
-        return organ[z[organ] - nearest[pixel[organ]] < 2 + 2 * size * z[organ]]
+        seen = np.flatnonzero(pixel >= 0)
+        seen = seen[taken.ravel()[pixel[seen]] == ORGAN]
+        return seen[z[seen] - depth_mm.ravel()[pixel[seen]] < 2 + 2 * size * z[seen]]
 
     return Picture(depth_mm, taken, pinhole, left, lambda some: points_mm[some])
 
@@ -244,16 +235,27 @@ def _keep_inside(depth_mm, taken, pinhole, low, high, step):  # type: ignore[no-
                 taken[v, u] = step
 
 
-def _inner_spread(tangents: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-    """How far the middle 96 % of tangents (n, 2) spread (2,), from a histogram: the order of the
-    points doesn't matter."""
-    share = (tangents - low) / np.maximum(high - low, 1e-9)
+@jit
+def _rasterise(across, down, z_mm, pinhole, shape):  # type: ignore[no-untyped-def]
+    """The nearest depth in each pixel (h, w), and each point's pixel (n,), -1 outside."""
+    fx, fy, cx, cy = pinhole
+    depth_mm = np.full(shape[0] * shape[1], np.nan, np.float32)
+    pixel = np.full(len(z_mm), -1, np.int32)
+    for i in range(len(z_mm)):
+        if z_mm[i] > 1.0 and abs(across[i]) < _WIDEST and abs(down[i]) < _WIDEST:
+            u, v = int(fx * across[i] + cx + 0.5), int(fy * down[i] + cy + 0.5)
+            if 0 <= u < shape[1] and 0 <= v < shape[0]:
+                place = pixel[i] = v * shape[1] + u
+                if not depth_mm[place] <= z_mm[i]:
+                    depth_mm[place] = z_mm[i]
+    return depth_mm.reshape(shape), pixel
+
+
+def _inner_spread(tangents: np.ndarray, low: float, high: float) -> float:
+    """How far the middle 96 % of tangents (n,) spread, from a histogram: the order of the points
+    doesn't matter."""
+    share = (tangents - low) / max(high - low, 1e-9)
     place = np.minimum((share * _BINS).astype(np.int64), _BINS - 1)
-    inner = np.zeros(2)
-    for k in range(2):
-        total = np.cumsum(np.bincount(place[:, k], minlength=_BINS))
-        count = ((0.02 * len(place) < total) & (total < 0.98 * len(place))).sum()
-        bins = np.full(count + 1, (high[k] - low[k]) / _BINS)
-        bins[0] = 0.0
-        inner[k] = bins.cumsum()[-1]
-    return inner
+    total, n = np.cumsum(np.bincount(place, minlength=_BINS)), len(tangents)
+    bins = np.full(_BINS, (high - low) / _BINS)
+    return float(np.cumsum(np.where((0.02 * n < total) & (total < 0.98 * n), bins, 0.0))[-1])
