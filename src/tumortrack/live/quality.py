@@ -85,11 +85,7 @@ class StampCheck:
 
     def check(self, stamp_ns: int, age_s: float) -> bool:
         """True if the clock was set back. ``age_s``: how long ago the frame was made, or came, as
-        far as is known.
-
-        Raises:
-            NoEstimate: stale, or out of order.
-        """
+        far as is known. Raises NoEstimate for a frame that is stale or out of order."""
         clocks = "the clocks of camera and computer"
         if age_s > self._stale_s:
             raise NoEstimate(f"the frame is stale: {age_s:.2f} s old, if {clocks} agree")

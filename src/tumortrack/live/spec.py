@@ -42,12 +42,8 @@ class Registry(Generic[C]):
     built_in: Mapping[str, str]
 
     def parse(self, text: str) -> C:
-        """The configuration that ``text`` describes.
-
-        Raises:
-            InputError: no such kind, key or value: the message lists what there is; or the package
-                that offers the kind is broken.
-        """
+        """The configuration that ``text`` describes. Raises InputError for a kind, key or value
+        that there is not (the message lists what there is), and where a package is broken."""
         head, _, options = text.partition("?")
         kind, _, target = head.partition(":")
         config = self._class(kind, f"{self.what} {text!r}")

@@ -208,13 +208,12 @@ class SinkWorker:
                 shown = came[0]
                 self._publish(*came)
             elif shown is not None and self._waiting.maxlen == 1:  # a recording has no present
-                silent = TrackingResult(
-                    shown.sequence,
-                    shown.stamp_ns + int(_SILENT_S * 1e9),
-                    reason=f"the loop has said nothing for {_SILENT_S:g} s",
-                    published_frame=shown.published_frame,
+                stamp_ns, frame = shown.stamp_ns + int(_SILENT_S * 1e9), shown.published_frame
+                why = f"the loop has said nothing for {_SILENT_S:g} s"
+                silence = TrackingResult(
+                    shown.sequence, stamp_ns, reason=why, published_frame=frame
                 )
-                self._publish(silent, 0.0)
+                self._publish(silence, 0.0)
                 shown = None
         try:
             self._sink.close()

@@ -31,10 +31,8 @@ class CloudConfig(Config, frozen=True, kw_only=True):
 def cloud_from_depth(
     frame: DepthFrame, config: CloudConfig, rng: np.random.Generator
 ) -> SensorCloud:
-    """Crop by depth, draw unique random pixels, deproject them.
-
-    Returns ``n_points`` points in random order, or all of them where fewer (but at least 200)
-    lie in range.
+    """Crop by depth, draw ``n_points`` unique random pixels (all where fewer lie in range), and
+    deproject them.
 
     Raises:
         NoEstimate: fewer than 200 pixels lie in range.

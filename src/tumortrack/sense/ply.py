@@ -102,12 +102,7 @@ def _cut_off(name: str, claimed: int, held: int) -> str:
 
 
 def write_cloud_ply(path: Path, points_mm: np.ndarray, **point_properties: np.ndarray) -> None:
-    """Write points (n, 3) of the camera frame; see ``cloud_ply``.
-
-    Raises:
-        InputError: a property of another length or type.
-        StorageError: the disk refused.
-    """
+    """Write points (n, 3) of the camera frame; see ``cloud_ply``."""
     write_atomically(path, cloud_ply(points_mm, point_properties))
 
 

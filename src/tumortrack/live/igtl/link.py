@@ -62,11 +62,8 @@ class Link:
         return len(self._receivers)
 
     def send(self, messages: list[Message]) -> None:
-        """Hand these over; returns at once.
-
-        Raises:
-            ProtocolError: a message that the protocol cannot hold; then none is sent.
-        """
+        """Hand these over; returns at once. ProtocolError: the protocol cannot hold one of them;
+        then none is sent."""
         self._call(self._offer, {(m.type, m.device): pack(m) for m in messages})
 
     def close(self) -> None:

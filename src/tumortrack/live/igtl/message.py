@@ -68,11 +68,8 @@ class Header:
 
 
 def pack(message: Message) -> bytes:
-    """The message as it goes over the wire.
-
-    Raises:
-        ProtocolError: a name too long or not ASCII, a stamp before 1970 or after 2106.
-    """
+    """The message as it goes over the wire. Raises ProtocolError for a name too long or not ASCII,
+    and a stamp before 1970 or after 2106."""
     index, texts = [struct.pack("> H", len(message.metadata))], []
     for key, value in message.metadata.items():
         name, text = key.encode("ascii"), value.encode("utf-8")
@@ -93,11 +90,7 @@ def pack(message: Message) -> bytes:
 
 
 def unpack_header(data: bytes) -> Header:
-    """Read a header.
-
-    Raises:
-        ProtocolError: not 58 bytes, an unknown version, names that are no text.
-    """
+    """Raises ProtocolError: not 58 bytes, an unknown version, names that are no text."""
     if len(data) != HEADER_SIZE:
         raise ProtocolError(f"an OpenIGTLink header has {HEADER_SIZE} bytes, not {len(data)}.")
     version, kind, device, stamp, size, crc = _HEADER.unpack(data)
@@ -123,11 +116,7 @@ def check_body(header: Header, body: bytes) -> None:
 
 
 def crc64(data: bytes) -> int:
-    """CRC-64 of ECMA-182 (1992), annex B: register 0 at the start, nothing reversed.
-
-    Raises:
-        InputError: fastcrc is not installed.
-    """
+    """CRC-64 of ECMA-182 (1992), annex B: register 0 at the start, nothing reversed."""
     try:
         from fastcrc.crc64 import ecma_182
     except ImportError as error:
@@ -150,10 +139,7 @@ def pack_status(code: int, name: str, text: str) -> bytes:
 
 @dataclass(frozen=True, eq=False)
 class Polydata:
-    """Points (n, 3) and cells over them; ``scalars``: one number a point, by name.
-
-    ``triangles`` (f, 3) and ``segments`` (s, 2) hold point numbers.
-    """
+    """Points and cells over them, which hold point numbers; ``scalars``: one a point, by name."""
 
     points: Float[np.ndarray, "n 3"]
     triangles: Int[np.ndarray, "f 3"]

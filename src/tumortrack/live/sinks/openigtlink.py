@@ -55,11 +55,7 @@ class OpenIgtLinkSinkConfig(SinkConfig, frozen=True, kw_only=True, tag="openigtl
         self.check_ranges("openigtlink:", "0 (none)", mesh_hz=1000, cloud_hz=1000)
 
     def open(self, context: SinkContext) -> OpenIgtLinkSink:
-        """Serve, or begin to try to connect.
-
-        Raises:
-            InputError: the port is taken.
-        """
+        """Serve, or begin to try to connect. Raises InputError as ``Link``."""
         return OpenIgtLinkSink(self, context)
 
 
@@ -68,9 +64,8 @@ class OpenIgtLinkSink:
 
     A tumor's TRANSFORM has its origin in the middle of the tumor's box; its axes are the CT's, as
     the organ is turned now, or, without a motion, those of the published frame. With a motion
-    TRANSFORM ``ct`` is the organ's pose: what is put under it in Slicer follows the organ, as
-    a rigid body. Without an estimate STATUS says why, transforms are the identity with
-    ``TransformStatus`` MISSING, and surfaces and cloud are empty.
+    TRANSFORM ``ct`` is the organ's pose. Without an estimate STATUS says why, transforms are the
+    identity with ``TransformStatus`` MISSING, and surfaces and cloud are empty.
 
     Where there may be arms also STATUS ``arms`` (well: its name is their state; not ready: halted,
     and why; not present: nothing is known), and a TRANSFORM of each tool's tip, named as its shape

@@ -13,6 +13,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
@@ -60,14 +61,12 @@ class ViewerSinkConfig(SinkConfig, frozen=True, kw_only=True, tag="viewer"):
         self.check_ranges("viewer:", "0", port=65535, margin_mm=50)
         if not 0 < self.hz <= 60:
             raise InputError(f"viewer: hz={self.hz:g}; allowed are more than 0 and up to 60.")
+        if self.case and not Path(self.case).is_dir():
+            raise InputError(f"viewer: case={self.case} is no folder; give what `prepare` wrote.")
 
     def open(self, context: SinkContext) -> ViewerSink:
-        """The page, ready for visitors.
-
-        Raises:
-            InputError: the port is taken, viser is missing, or the case is another patient's.
-            ArtifactError: ``case`` is no case.
-        """
+        """The page, ready for visitors. Raises InputError where the port is taken, viser is
+        missing, or the case is another patient's, ArtifactError where ``case`` is none."""
         return ViewerSink(self, context)
 
 
@@ -182,9 +181,8 @@ class ViewerSink:
         self._state = state
         self._counter += 1
         result = self._result
-        age_s = time.monotonic() - self._came if result is not None else 0.0
-        if result is not None and result.latency_ms is not None:
-            age_s += result.latency_ms / 1000
+        late_s = 0.0 if result is None else (result.latency_ms or 0.0) / 1000
+        age_s = 0.0 if result is None else time.monotonic() - self._came + late_s
         status = StatusPanel(state, result, age_s, self._counter, self._context.arms)
         if (behind := (state, status.alarming)) != self._behind:
             self._behind = behind
@@ -275,11 +273,7 @@ class ViewerSink:
 
 
 def _opened(host: str, port: int) -> ViserServer:
-    """A running server with an empty scene, where it was asked for; port 0: any free one.
-
-    Raises:
-        InputError: viser is not installed; the port is taken; this machine has no such address.
-    """
+    """A running server with an empty scene, where it was asked for; port 0: any free one."""
     try:
         import viser
     except ImportError as error:

@@ -41,13 +41,11 @@ _THICK = 0.8  # of an organ's shortest extent: thinner pieces are likely fingers
 
 
 def take_one_piece(picture: Picture, config: RegionConfig, hints: Hints) -> None:
-    """Leave one piece (and what continues it) to the organ.
+    """Leave one piece (and what continues it) to the organ. NoEstimate: a point was picked, and no
+    piece lies within 10 mm of it.
 
     A hand that touches the organ makes one large piece with it that leaves the picture. Then the
     opening is widened until fingers are too narrow to connect.
-
-    Raises:
-        NoEstimate: a point was picked, and no piece lies within 10 mm of it.
     """
     edges = find_edges(picture, config)
     best: _Choice | None = None

@@ -156,11 +156,7 @@ class Picture:
 
 
 def picture_of_frame(frame: DepthFrame, mask: np.ndarray | None) -> Picture:
-    """Every pixel of a small frame, every second, third ... of a large one.
-
-    Raises:
-        InputError: the mask's shape is not the image's.
-    """
+    """Every pixel of a small frame, every second, third ... of a large one."""
     camera = frame.intrinsics
     step = int(np.ceil(np.sqrt(frame.depth_mm.size / MOST_PIXELS)))
     some = (slice(step // 2, None, step), slice(step // 2, None, step))
