@@ -66,13 +66,11 @@ def _read_bytes(path: Path) -> bytes:
     if not path.is_file():
         raise InputError(f"{path} does not exist or is no file.")
     try:
-        with path.open("rb") as stream:
-            content = stream.read(LARGEST_FILE + 1)
+        if path.stat().st_size > LARGEST_FILE:
+            raise InputError(f"{path} is larger than 256 MiB; thin it first.")
+        return path.read_bytes()
     except OSError as error:
         raise InputError(f"{path} cannot be read: {error.strerror}.") from error
-    if len(content) > LARGEST_FILE:
-        raise InputError(f"{path} is larger than 256 MiB; thin it first.")
-    return content
 
 
 def _pcd_points(content: bytes, name: str) -> np.ndarray:

@@ -6,6 +6,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from html import escape
+from importlib.resources import files
+from string import Template
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
@@ -26,7 +28,7 @@ State = Literal["waiting", "good", "poor", "none", "stale"]
 _WIDTH = 360  # pixels; what lies over the scene leaves this much room
 ABORT, ABORTED = "Stop the arms for good", "The arms were stopped for good"
 CLICK, CANCEL = "Click the organ", "Now click on the organ (again: cancel)"
-SILENCE_S = 2.0  # without a word from the server the page itself says so
+SILENCE_S = 2  # without a word from the server the page itself says so
 
 # In the panel, over the scene, in colour.
 _HEADINGS: dict[State, tuple[str, str, Colour]] = {
@@ -38,41 +40,12 @@ _HEADINGS: dict[State, tuple[str, str, Colour]] = {
 }
 _EMPTY: tuple[State, ...] = ("waiting", "none", "stale")
 
-# The page's own watch: every message replaces this element and so restarts its clock. When
-# none comes (the program was killed, the network is gone) it shows itself, by the browser alone;
-# as a popover it lies above all, where the panel has been dimmed too.
-_PAGE = f"""
-<style>
-@keyframes tumortrack-silence {{ to {{ visibility: visible; }} }}
-.tumortrack-silence {{ visibility: hidden; animation: tumortrack-silence 1ms {SILENCE_S}s forwards;
-  position: fixed; inset: 0; width: 100vw; height: 100vh; box-sizing: border-box; border: 0;
-  margin: 0; z-index: 9999; pointer-events: none; background: {css(colours.STALE)}99;
-  backdrop-filter: grayscale(1); display: flex; align-items: center; justify-content: center; }}
-.tumortrack-silence div {{ background: {css(colours.STALE)}; color: white; padding: 24px 36px;
-  border-radius: 10px; font: 800 44px/1.25 system-ui, sans-serif; text-align: center; }}
-.tumortrack-silence small, .tumortrack-over small {{ display: block; font-size: 19px;
-  font-weight: 400; }}
-.tumortrack-over {{ position: fixed; left: 18px; right: {_WIDTH + 18}px; z-index: 9998;
-  pointer-events: none; display: flex; justify-content: center; }}
-.tumortrack-over div {{ color: white; padding: 9px 24px; border-radius: 10px; text-align: center;
-  font-family: system-ui, sans-serif; font-weight: 800; line-height: 1.2; }}
-.tumortrack-box {{ color: white; padding: 8px 12px; margin: 8px 12px; border-radius: 6px;
-  font-size: 15px; font-weight: 700; }}
-.tumortrack-box small {{ display: block; font-size: 15px; font-weight: 400; }}
-.tumortrack-numbers {{ margin: 4px 14px 10px; font-size: 13px;
-  font-variant-numeric: tabular-nums; }}
-.tumortrack-numbers table {{ width: 100%; border-spacing: 2px 3px; }}
-.tumortrack-numbers td {{ text-align: right; }}
-.tumortrack-numbers td:first-child {{ text-align: left; }}
-.tumortrack-numbers i {{ display: inline-block; width: 11px; height: 11px; border-radius: 3px;
-  margin-right: 6px; }}
-.tumortrack-bar {{ background: #8884; border-radius: 3px; width: 70px; }}
-.tumortrack-bar div {{ height: 8px; border-radius: 3px; }}
-</style>
-<div class="tumortrack-silence" onanimationend="this.popover = 'manual'; this.showPopover()">
-<div>STALE<small>tumortrack has been silent for {SILENCE_S:g} s; what you see is old</small></div>
-</div>
-"""
+# The styles, and the page's own watch: every message replaces this element and so restarts its
+# clock. When none comes (the program was killed, the network is gone) it shows itself, by the
+# browser alone; as a popover it lies above all, where the panel has been dimmed too.
+_PAGE = Template(files(__package__).joinpath("status.html").read_text("utf-8")).substitute(
+    stale=css(colours.STALE), silence_s=SILENCE_S, right=_WIDTH + 18
+)
 
 
 @dataclass(frozen=True, eq=False)
