@@ -73,8 +73,7 @@ def organ_points(
     if config.flying:
         remove_flying(picture, config)
     if config.pieces:
-        window = picture.remaining()
-        part = picture.part(window)
+        window, part = picture.cropped()
         take_one_piece(part, config, hints)
         picture.taken[window] = part.taken
     counts = picture.counts()

@@ -3,7 +3,6 @@ continues it behind something nearer; and what lies wholly in the last estimate'
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -48,28 +47,28 @@ def take_one_piece(picture: Picture, config: RegionConfig, hints: Hints) -> None
     opening is widened until fingers are too narrow to connect.
     """
     edges = find_edges(picture, config)
-    best: _Choice | None = None
+    best: tuple[float, np.ndarray, _Sizes, np.ndarray] | None = None
     for wider in _OPENINGS:
         pieces, count = find_pieces(picture, edges, config, wider)
         seen = (picture.depth_mm, edges[1], picture.taken)
         these = _measure(*seen, pieces, picture.pinhole, count)
-        here = _chosen(picture, pieces, these, config, hints)
-        if best is None or here.score > _CLEARLY * best.score:
-            best = here
-        if not here.doubtful:
+        together, score, doubtful = _chosen(picture, pieces, these, config, hints)
+        if best is None or score > _CLEARLY * best[0]:
+            best = score, pieces, these, together
+        if not doubtful:
             break
     assert best is not None
-    picture.take(best.pieces == 0, THIN)
-    together, these = best.together, best.these
+    _, pieces, these, together = best
+    picture.take(pieces == 0, THIN)
     if hints.last_box_mm is not None and together.any():
         # A tumor that stands out, a part beyond a crease: wholly in the box, not at its far side,
         # and not thin.
         low, high = np.sort(np.asarray(hints.last_box_mm, np.float64), axis=0)
         high[2] -= _FAR_SIDE * (high[2] - low[2])
-        area = _area_in_box(picture, best.pieces, these, low - _BOX_MM, high + _BOX_MM)
+        area = _area_in_box(picture, pieces, these, low - _BOX_MM, high + _BOX_MM)
         parts = (area > _WHOLLY * these.area_mm2) & (these.thick_mm > _THICK_PART_MM) & (area > 0)
         together = together | parts
-    picture.take(~together[best.pieces], PIECES)
+    picture.take(~together[pieces], PIECES)
 
 
 class _Sizes(NamedTuple):
@@ -85,26 +84,14 @@ class _Sizes(NamedTuple):
     aside: np.ndarray
 
 
-@dataclass(frozen=True, eq=False)
-class _Choice:
-    """What is taken for the organ at one way of parting the picture: ``pieces``, the number of its
-    piece for every pixel (h, w), and which of them, ``together`` (count + 1,). ``score``: how like
-    an organ it is. ``doubtful``: it leaves the picture or is too wide, or something that does seems
-    to continue it: perhaps a wider opening parts them."""
-
-    pieces: np.ndarray
-    these: _Sizes
-    together: np.ndarray
-    score: float
-    doubtful: bool
-
-
 def _chosen(
     picture: Picture, pieces: np.ndarray, these: _Sizes, config: RegionConfig, hints: Hints
-) -> _Choice:
-    """The piece that the hints name, else the likeliest: the largest of an organ's size (what
-    leaves the picture counts less, as arms do); and those that continue it behind something
-    nearer."""
+) -> tuple[np.ndarray, float, bool]:
+    """Which pieces (count + 1,) are the organ at one way of parting the picture: the one that the
+    hints name, else the likeliest (the largest of an organ's size; what leaves the picture counts
+    less, as arms do), and those that continue it behind something nearer. How like an organ that
+    is; and whether it is doubtful: it leaves the picture or is too wide, or something that does
+    seems to continue it, so that perhaps a wider opening parts them."""
     likeness = _like_an_organ(these, config)
     together = np.zeros(len(these.cut), bool)
     piece = _hinted(picture, pieces, these, hints)
@@ -112,7 +99,7 @@ def _chosen(
     if guessed:
         scores = these.area_mm2 * likeness
         if not scores.max() > 0:
-            return _Choice(pieces, these, together, -1.0, True)
+            return together, -1.0, True
         piece = int(scores.argmax())
     leaves = these.cut > _CUT
     gap = config.gap_mm / picture.footprint
@@ -132,7 +119,7 @@ def _chosen(
     larger = these.area_mm2[leaves].max(initial=0) > score
     held = guessed and likeness[piece] < _POOR and larger
     doubtful = refused or leaves[piece] or too_wide or held
-    return _Choice(pieces, these, together, float(score), bool(doubtful))
+    return together, float(score), bool(doubtful)
 
 
 def _hinted(picture: Picture, pieces: np.ndarray, these: _Sizes, hints: Hints) -> int | None:

@@ -134,20 +134,18 @@ class Picture:
         """Give the pixels (h, w, bool) that are still the organ's to a step."""
         self.taken[where & (self.taken == ORGAN)] = step
 
-    def remaining(self) -> tuple[slice, slice]:
-        """The rows and columns that hold what is left, and one more to each side."""
-        rows, columns = (np.flatnonzero((self.taken == ORGAN).any(axis)) for axis in (1, 0))
-        if not len(rows):
-            return slice(0, 1), slice(0, 1)
-        tall, wide = (slice(max(int(i[0]) - 1, 0), int(i[-1]) + 2) for i in (rows, columns))
-        return tall, wide
-
-    def part(self, window: tuple[slice, slice]) -> Picture:
-        """Those rows and columns alone; what is decided there must be written back."""
+    def cropped(self) -> tuple[tuple[slice, slice], Picture]:
+        """The rows and columns that hold what is left, and one more to each side; and these alone:
+        what is decided there must be written back."""
+        tall = wide = slice(0, 1)
+        left = self.taken == ORGAN
+        if left.any():
+            ends = (np.flatnonzero(left.any(axis))[[0, -1]].tolist() for axis in (1, 0))
+            tall, wide = (slice(max(first - 1, 0), last + 2) for first, last in ends)
         fx, fy, cx, cy = self.pinhole
-        pinhole = Pinhole(fx, fy, cx - window[1].start, cy - window[0].start)
-        depth_mm, taken = self.depth_mm[window].copy(), self.taken[window].copy()
-        return Picture(depth_mm, taken, pinhole, self.left, self.points)
+        pinhole = Pinhole(fx, fy, cx - wide.start, cy - tall.start)
+        depth_mm, taken = self.depth_mm[tall, wide].copy(), self.taken[tall, wide].copy()
+        return (tall, wide), Picture(depth_mm, taken, pinhole, self.left, self.points)
 
     def counts(self) -> dict[str, int]:
         """Pixels by what became of them."""
