@@ -249,9 +249,9 @@ def slicer() -> Iterator:
 
     def opened(setting: SinkContext, **options):
         sink = OpenIgtLinkSinkConfig(port=0, **options).open(setting)
-        receiver = socket.create_connection(("127.0.0.1", sink.port))
+        receiver = socket.create_connection(("127.0.0.1", sink.link.port))
         used.extend((receiver, sink))
-        until(lambda: sink.receivers)
+        until(lambda: sink.link.receivers)
         return sink, receiver
 
     yield opened

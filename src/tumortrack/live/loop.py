@@ -60,8 +60,8 @@ class _TooLate(NoEstimate):
 
 
 class Loop:
-    """One run from a source to sinks. ``run`` returns when the source ends, when ``stop`` was
-    called from anywhere, or when the time is up."""
+    """One run from a source to sinks: until the source ends, ``stop`` is called from anywhere, or
+    the time is up."""
 
     def __init__(
         self,
@@ -102,12 +102,8 @@ class Loop:
         sink_workers: list[SinkWorker],
         on_result: Callable[[TrackingResult], None],
     ) -> None:
-        """``on_result`` is called with every result, after the sink_workers have it.
-
-        Raises:
-            SourceLost: no frame came for ``give_up_s``.
-            TumortrackError: the source can never work (as its ``open`` said).
-        """
+        """``on_result`` is called with every result, after the sink_workers have it. SourceLost: no
+        frame came for ``give_up_s``. Whatever keeps the source from ever working is raised too."""
         try:
             for result in self._results(source_worker):
                 on_result(self._publish(result, sink_workers))

@@ -85,8 +85,8 @@ class SourceWorker:
         with self._lock:
             self._lock.notify_all()
         self._thread.join(_STOP_S)
-        if self._thread.is_alive() and self._source is not None:
-            self._source.close()
+        if self._thread.is_alive() and (source := self._source) is not None:
+            source.close()
 
     @property
     def _over(self) -> bool:

@@ -48,18 +48,14 @@ class Link:
             self._listener = _listen(host, port)
             port = self._listener.getsockname()[1]
         self.port = port
-        # The thread's own; others only count them.
+        # The thread's own; others only look.
         self._newest: dict[Key, bytes] = {}
-        self._receivers: list[_Receiver] = []
+        self.receivers: list[_Receiver] = []
         self._loop, self._closing = asyncio.new_event_loop(), asyncio.Event()
         self._thread = threading.Thread(
             target=self._run, args=(connect,), name="openigtlink", daemon=True
         )
         self._thread.start()
-
-    @property
-    def receivers(self) -> int:
-        return len(self._receivers)
 
     def send(self, messages: list[Message]) -> None:
         """Hand these over; returns at once. ProtocolError: the protocol cannot hold one of them;
@@ -78,7 +74,7 @@ class Link:
 
     def _offer(self, packed: dict[Key, bytes]) -> None:
         self._newest.update(packed)
-        for receiver in self._receivers:
+        for receiver in self.receivers:
             receiver.offer(packed)
 
     def _run(self, connect: str) -> None:
@@ -89,11 +85,11 @@ class Link:
         serving = asyncio.create_task(self._visit(connect) if connect else self._accept())
         await self._closing.wait()
         until_s = time.monotonic() + _PATIENCE_S
-        while time.monotonic() < until_s and any(one.busy for one in self._receivers):
+        while time.monotonic() < until_s and any(one.busy for one in self.receivers):
             await asyncio.sleep(0.01)
         serving.cancel()
-        while self._receivers:
-            self._receivers[0].writer.transport.abort()
+        while self.receivers:
+            self.receivers[0].writer.transport.abort()
             await asyncio.sleep(0)
 
     async def _accept(self) -> None:
@@ -113,7 +109,7 @@ class Link:
         writer.get_extra_info("socket").setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _BUFFER)
         writer.transport.set_write_buffer_limits(high=0)  # ``drain`` waits for the socket itself
         receiver = _Receiver(writer, self._newest)
-        self._receivers.append(receiver)
+        self.receivers.append(receiver)
         try:
             async with asyncio.TaskGroup() as both:
                 both.create_task(self._receive(reader, receiver))
@@ -121,7 +117,7 @@ class Link:
         except* (OSError, EOFError, ProtocolError):
             pass  # gone, it takes nothing any more, or it speaks another language
         finally:
-            self._receivers.remove(receiver)
+            self.receivers.remove(receiver)
             writer.transport.abort()
 
     async def _receive(self, reader: asyncio.StreamReader, receiver: _Receiver) -> None:

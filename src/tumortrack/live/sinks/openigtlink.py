@@ -75,16 +75,10 @@ class OpenIgtLinkSink:
     def __init__(self, config: OpenIgtLinkSinkConfig, context: SinkContext) -> None:
         self._config, self._context = config, context
         self._axes = RAS_FROM_LPS if config.space == "ras" else np.eye(4)
-        self._link = Link(config.host, config.port, config.connect)
-        self.port = self._link.port
+        self.link = Link(config.host, config.port, config.connect)
         self._mesh_rate, self._cloud_rate = Rate(config.mesh_hz), Rate(config.cloud_hz)
         self._tips: set[str] = set()  # that ever were
         self._next, self._closed = 0, False
-
-    @property
-    def receivers(self) -> int:
-        """How many are connected."""
-        return self._link.receivers
 
     def publish(self, result: TrackingResult) -> None:
         self._send(result, igtl.OK if result.estimate is not None else igtl.NOT_FOUND)
@@ -97,14 +91,14 @@ class OpenIgtLinkSink:
             frame, why = self._context.published_frame, "tracking has ended"
             over = TrackingResult(self._next, time.time_ns(), reason=why, published_frame=frame)
             self._send(over, igtl.EXITING)
-            self._link.close()
+            self.link.close()
 
     def _send(self, result: TrackingResult, code: int) -> None:
         about = {"frame_id": result.published_frame.frame_id, "sequence": str(result.sequence)}
         contents = chain(
             self._statuses(result, code), self._transforms(result), self._surfaces(result)
         )
-        self._link.send(
+        self.link.send(
             [
                 Message(kind, device, result.stamp_ns, content, about | more)
                 for kind, device, content, more in contents
