@@ -241,6 +241,7 @@ class ViewerSink:
             else:
                 self._server.scene.remove_click_callback(self._clicked)
             self._panel.pick.label = CANCEL if self._picking else CLICK
+            self._panel.forget.visible = self._context.controls.picked_mm is not None
 
     def _clicked(self, event: SceneClickEvent) -> None:
         with self._lock:
@@ -256,8 +257,8 @@ class ViewerSink:
             point = point_under(seen_points(result.observation).astype(float), origin, direction)
             if point is None:
                 event.client.add_notification("No observed point there", "Click on the points.")
-                return
-            self._mark(point)
+            else:
+                self._mark(point)
 
     def _mark(self, point_mm: np.ndarray | None) -> None:
         """The user clicked here (camera frame), or on 'Choose again'."""
