@@ -192,3 +192,13 @@ def _lowest_cosines(n: int) -> np.ndarray:
     waves = np.cos(np.pi * np.outer((np.arange(n) + 0.5) / n, np.arange(3))).astype(np.float32)
     waves.flags.writeable = False
     return waves
+
+
+@_jit
+def wave(length, waves):  # type: ignore[no-untyped-def]
+    """The sum of waves (k, 3), of frequency (rad/px), phase and height, at the first pixels."""
+    out = np.zeros(length, np.float32)
+    for frequency, phase, height in waves:
+        for place in range(length):
+            out[place] += height * math.cos(frequency * place + phase)
+    return out

@@ -6,7 +6,6 @@ one end of them leaves its points in. All is done in the image: pixels and the o
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -135,6 +134,8 @@ def shaft_order(seen: _View, config: OcclusionConfig, rng: np.random.Generator) 
 def _patch_order(seen: _View, rng: np.random.Generator) -> np.ndarray:
     """Fat or a drape with a wavy edge: a blob or a half plane, from any border of the organ
     inwards."""
+    from tumortrack.sense.kernels import wave
+
     inwards = _direction(rng)
     across = np.array([-inwards[1], inwards[0]])
     start = seen.some[np.argmin(seen.some @ inwards)] + rng.uniform(-0.1, 0.1, 2) * seen.width_px
@@ -148,17 +149,8 @@ def _patch_order(seen: _View, rng: np.random.Generator) -> np.ndarray:
     order = du * axes[0, 0] + dv * axes[0, 1]
     if rng.integers(2):
         order = np.sqrt(order * order + (du * axes[1, 0] + dv * axes[1, 1]) ** 2)
-    order = order + _wave(waves[0], seen.columns) + _wave(waves[1], seen.rows)
-    return order.astype(np.float32)
-
-
-def _wave(waves: np.ndarray, places: np.ndarray) -> np.ndarray:
-    """The sum of waves (k, 3), of frequency (rad/px), phase and height, at whole pixels (n,)."""
-    out = np.zeros(places.max() + 1, np.float32)
-    for frequency, phase, height in waves.tolist():
-        # Python's cosine: NumPy's differs from processor to processor in the last bit.
-        out += [height * math.cos(frequency * place + phase) for place in range(len(out))]
-    return out[places]
+    across, down = wave(seen.columns.max() + 1, waves[0]), wave(seen.rows[-1] + 1, waves[1])
+    return (order + across[seen.columns] + down[seen.rows]).astype(np.float32)
 
 
 def take_first(order: np.ndarray, taken: np.ndarray, count: int) -> int:
