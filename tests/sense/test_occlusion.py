@@ -11,7 +11,7 @@ from render_objects import anatomy
 from tumortrack.core.config import from_builtins, identity, to_builtins
 from tumortrack.core.errors import InputError
 from tumortrack.core.types import DepthFrame
-from tumortrack.sense import occlusion
+from tumortrack.sense import kernels
 from tumortrack.sense.clutter import ClutterConfig
 from tumortrack.sense.noise import D405_NOISE, CalibrationConfig, miscalibrate
 from tumortrack.sense.occlusion import OcclusionConfig, occlude
@@ -52,15 +52,15 @@ def test_what_is_hidden_has_no_return_and_the_rest_is_as_it_was():
 def test_the_first_in_order_are_taken_up_to_a_count():
     order, taken = np.random.default_rng(0).random(20_000, np.float32), np.zeros(20_000, bool)
     taken[:100] = True
-    got = occlusion.take_first(order, taken, 7000)
+    got = kernels.take_first(order, taken, 7000)
     assert got == taken[100:].sum()
     assert 7000 - 40 <= got <= 7000  # short of it by less than one of 1024 bins
     assert order[100:][taken[100:]].max() <= order[100:][~taken[100:]].min()
     few = np.full(50, np.inf, np.float32)
     few[:3] = 1.0
-    assert occlusion.take_first(few, np.zeros(50, bool), 10) == 3
-    assert occlusion.take_first(few, np.zeros(50, bool), 2) == 0  # equal ones go together
-    assert occlusion.take_first(np.full(5, np.inf, np.float32), np.zeros(5, bool), 2) == 0
+    assert kernels.take_first(few, np.zeros(50, bool), 10) == 3
+    assert kernels.take_first(few, np.zeros(50, bool), 2) == 0  # equal ones go together
+    assert kernels.take_first(np.full(5, np.inf, np.float32), np.zeros(5, bool), 2) == 0
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -68,23 +68,9 @@ def test_a_shaft_is_as_wide_as_asked_and_ends_at_its_tip(seed):
     rng = np.random.default_rng(seed)
     angle = rng.uniform(0, 2 * np.pi)
     towards = np.array([np.cos(angle), np.sin(angle)])
-    seen = occlusion.look(dome(), rng)
-    columns, rows = seen.columns, seen.rows
-    at = int(np.hypot(columns - SMALL.cx, rows - SMALL.cy).argmin())
-    tip = np.array([columns[at], rows[at]], float)
-
-    class Drawn(np.random.Generator):
-        """Draws the angle, a width of 14 px, no taper, and that it does not cross."""
-
-        numbers = iter([angle, 14 * seen.depth_mm[at] / seen.focal_px, 0.0, 0.9])
-
-        def integers(self, _):
-            return at
-
-        def uniform(self, *_):
-            return next(self.numbers)
-
-    order = occlusion.shaft_order(seen, OcclusionConfig(), Drawn(np.random.PCG64()))
+    rows, columns = np.divmod(kernels.seen_pixels(dome().depth_mm).pixels, dome().intrinsics.width)
+    tip = np.array([SMALL.cx, SMALL.cy])
+    order = kernels.order_shaft(columns, rows, tip, towards, 7.0, 0.0)
     inside = np.isfinite(order)
     offset = np.stack([columns, rows], axis=1) - tip
     along, across = offset @ towards, np.abs(offset @ [-towards[1], towards[0]])

@@ -1,4 +1,4 @@
-"""The per-pixel work of ``noise``, compiled; imported on first use.
+"""The per-pixel work of ``noise`` and ``occlusion``, compiled; imported on first use.
 
 An organ fills a tenth of an image: kernels visit only the pixels with a return, which
 ``seen_pixels`` finds once, and change a list of their depths.
@@ -27,6 +27,7 @@ _LOW_14, _LOW_32 = np.uint64(0x3FFF), np.uint64(0xFFFFFFFF)
 _TO_UNIT = 2.0**-32
 
 _NO_RETURN = np.float32(np.nan)
+_BINS = 1024  # of the histogram in ``take_first``
 
 _jit = numba.njit(cache=True, nogil=True)  # no fast-math: a frame replays on every machine
 
@@ -47,12 +48,25 @@ def _bits(key, counter):  # type: ignore[no-untyped-def]
     return z ^ (z >> _S31)
 
 
-def seen_pixels(depth_mm: np.ndarray) -> Seen:
-    """The pixels of ``depth_mm`` (h, w) that are not NaN."""
+@_jit
+def seen_pixels(depth_mm):  # type: ignore[no-untyped-def]
+    """The pixels of ``depth_mm`` (h, w) that are not NaN, as ``Seen``."""
     height, width = depth_mm.shape
-    pixels = np.flatnonzero(~np.isnan(depth_mm)).astype(np.int32)
-    starts = np.searchsorted(pixels, np.arange(height + 1, dtype=np.int32) * np.int32(width))
-    return Seen(pixels, starts.astype(np.int32))
+    starts = np.zeros(height + 1, np.int32)
+    for v in range(height):
+        count = np.int32(0)
+        for u in range(width):
+            count += np.int32(depth_mm[v, u] == depth_mm[v, u])
+        starts[v + 1] = starts[v] + count
+    pixels = np.empty(starts[height], np.int32)
+    for v in range(height):
+        at, last = starts[v], starts[v + 1]
+        u = 0
+        while at < last:
+            pixels[at] = v * width + u
+            at += not math.isnan(depth_mm[v, u])
+            u += 1
+    return Seen(pixels, starts)
 
 
 @_jit
@@ -195,10 +209,76 @@ def _lowest_cosines(n: int) -> np.ndarray:
 
 
 @_jit
-def wave(length, waves):  # type: ignore[no-untyped-def]
-    """The sum of waves (k, 3), of frequency (rad/px), phase and height, at the first pixels."""
+def order_shaft(columns, rows, tip, towards, half, taper):  # type: ignore[no-untyped-def]
+    """A straight band that comes in against ``towards`` (unit vector, px) and ends round at
+    ``tip`` (px), ``half`` wide there to either side and wider by ``taper`` a pixel outwards.
+    What lies farthest out comes first, as when it is pushed in."""
+    order = np.full(len(columns), np.inf, np.float32)
+    for i in range(len(columns)):
+        du, dv = columns[i] - tip[0], rows[i] - tip[1]
+        along = du * towards[0] + dv * towards[1]
+        across = abs(dv * towards[0] - du * towards[1])
+        if along >= 0:
+            if across < half + taper * along:
+                order[i] = -along
+        elif du * du + dv * dv < half * half:
+            order[i] = -along
+    return order
+
+
+@_jit
+def order_patch(columns, rows, start, axes, round_one, waves):  # type: ignore[no-untyped-def]
+    """A patch with a wavy edge that grows from ``start`` (px): a blob or a half plane.
+
+    ``axes`` (2, 2), 1/px: a blob's two lengths and directions; a half plane grows along the first.
+    ``waves`` (2, k, 3): frequency (rad/px), phase and height of the edge's waves along the columns
+    and along the rows.
+    """
+    along_u, along_v = _wave(columns.max() + 1, waves[0]), _wave(rows[-1] + 1, waves[1])
+    order = np.empty(len(columns), np.float32)
+    for i in range(len(columns)):
+        du, dv = columns[i] - start[0], rows[i] - start[1]
+        a = du * axes[0, 0] + dv * axes[0, 1]
+        b = du * axes[1, 0] + dv * axes[1, 1]
+        distance = math.sqrt(a * a + b * b) if round_one else a
+        order[i] = distance + along_u[columns[i]] + along_v[rows[i]]
+    return order
+
+
+@_jit
+def _wave(length, waves):  # type: ignore[no-untyped-def]
     out = np.zeros(length, np.float32)
     for frequency, phase, height in waves:
         for place in range(length):
             out[place] += height * math.cos(frequency * place + phase)
     return out
+
+
+@_jit
+def take_first(order, taken, count):  # type: ignore[no-untyped-def]
+    """Mark in ``taken`` the ``count`` pixels of lowest ``order`` that are not taken yet, or a few
+    less (whole bins of a histogram only); infinite ones never. Returns how many."""
+    low, high, room = np.float32(np.inf), np.float32(-np.inf), 0
+    for i in range(len(order)):
+        if not taken[i] and order[i] < np.inf:
+            low, high = min(low, order[i]), max(high, order[i])
+            room += 1
+    if room == 0:
+        return 0
+    scale = (_BINS - 1) / max(high - low, np.float32(1e-6))
+    last = _BINS - 1
+    if room > count:
+        histogram = np.zeros(_BINS, np.int64)
+        for i in range(len(order)):
+            if not taken[i] and order[i] < np.inf:
+                histogram[int((order[i] - low) * scale)] += 1
+        total, last = 0, -1
+        while total + histogram[last + 1] <= count:
+            last += 1
+            total += histogram[last]
+    marked = 0
+    for i in range(len(order)):
+        if not taken[i] and order[i] < np.inf and int((order[i] - low) * scale) <= last:
+            taken[i] = True
+            marked += 1
+    return marked

@@ -21,7 +21,6 @@ _MOST_SHAFTS, _MOST_PATCHES = 2, 2
 _CROSSES = 0.25  # share of shafts that cross the whole organ
 _WIDER = 0.3  # a shaft that rises towards the camera looks wider by up to this an organ's width
 _WAVES = 3
-_BINS = 1024  # of the histogram that finds the first pixels
 _PATCHES_ALONE, _SHAFTS_ALONE = 0.4, 0.2  # shares of images; the others have both
 
 
@@ -73,7 +72,7 @@ def occlude(frame: DepthFrame, config: OcclusionConfig, rng: np.random.Generator
     rng = rng.spawn(1)[0]
     if rng.uniform() >= config.scenes:
         return frame
-    seen = look(frame, rng)
+    seen = _look(frame, rng)
     most = int(rng.uniform(0, config.largest_share) * len(seen.depth_mm))
     if most == 0:
         return frame
@@ -86,7 +85,7 @@ def occlude(frame: DepthFrame, config: OcclusionConfig, rng: np.random.Generator
     return frame.with_depth(out_mm)
 
 
-def look(frame: DepthFrame, rng: np.random.Generator) -> _View:
+def _look(frame: DepthFrame, rng: np.random.Generator) -> _View:
     from tumortrack.sense.kernels import seen_pixels
 
     pixels, starts = seen_pixels(frame.depth_mm)
@@ -101,21 +100,24 @@ def look(frame: DepthFrame, rng: np.random.Generator) -> _View:
 
 def _hide(seen: _View, most: int, config: OcclusionConfig, rng: np.random.Generator) -> np.ndarray:
     """Which pixels are hidden: by shafts, patches, or shafts and patches."""
+    from tumortrack.sense.kernels import take_first
+
     hidden = np.zeros(len(seen.depth_mm), np.bool_)
     left, kind = most, rng.uniform()
     if kind > _PATCHES_ALONE:
         for _ in range(rng.integers(1, _MOST_SHAFTS + 1)):
-            left -= take_first(shaft_order(seen, config, rng), hidden, left)
+            left -= take_first(_shaft(seen, config, rng), hidden, left)
     if kind < 1 - _SHAFTS_ALONE:
         for after in reversed(range(rng.integers(1, _MOST_PATCHES + 1))):
             count = left if after == 0 else int(rng.uniform() * left)
-            left -= take_first(_patch_order(seen, rng), hidden, count)
+            left -= take_first(_patch(seen, rng), hidden, count)
     return hidden
 
 
-def shaft_order(seen: _View, config: OcclusionConfig, rng: np.random.Generator) -> np.ndarray:
-    """A straight shaft from any side, its round tip over a random pixel of the organ or beyond it,
-    wider outwards. What lies farthest out comes first, as when it is pushed in."""
+def _shaft(seen: _View, config: OcclusionConfig, rng: np.random.Generator) -> np.ndarray:
+    """A straight shaft from any side, its tip over a random pixel of the organ or beyond it."""
+    from tumortrack.sense.kernels import order_shaft
+
     at = rng.integers(len(seen.depth_mm))
     towards = _direction(rng)
     tip = np.array([seen.columns[at], seen.rows[at]], float)
@@ -124,17 +126,12 @@ def shaft_order(seen: _View, config: OcclusionConfig, rng: np.random.Generator) 
     if rng.uniform() < _CROSSES:
         tip -= 2 * seen.width_px * towards
         taper /= 2
-    du, dv = seen.columns - tip[0], seen.rows - tip[1]
-    along = du * towards[0] + dv * towards[1]
-    across = np.abs(dv * towards[0] - du * towards[1])
-    within = np.where(along >= 0, across < half + taper * along, du * du + dv * dv < half * half)
-    return np.where(within, -along, np.inf).astype(np.float32)
+    return order_shaft(seen.columns, seen.rows, tip, towards, half, taper)
 
 
-def _patch_order(seen: _View, rng: np.random.Generator) -> np.ndarray:
-    """Fat or a drape with a wavy edge: a blob or a half plane, from any border of the organ
-    inwards."""
-    from tumortrack.sense.kernels import wave
+def _patch(seen: _View, rng: np.random.Generator) -> np.ndarray:
+    """Fat or a drape: a blob or a half plane, from any border of the organ inwards."""
+    from tumortrack.sense.kernels import order_patch
 
     inwards = _direction(rng)
     across = np.array([-inwards[1], inwards[0]])
@@ -145,29 +142,7 @@ def _patch_order(seen: _View, rng: np.random.Generator) -> np.ndarray:
     height = rng.uniform(0, 0.6, (2, _WAVES)) / frequency
     phase = rng.uniform(0, 2 * np.pi, (2, _WAVES))
     waves = np.stack([frequency / seen.width_px, phase, height], axis=2)
-    du, dv = seen.columns - start[0], seen.rows - start[1]
-    order = du * axes[0, 0] + dv * axes[0, 1]
-    if rng.integers(2):
-        order = np.sqrt(order * order + (du * axes[1, 0] + dv * axes[1, 1]) ** 2)
-    across, down = wave(seen.columns.max() + 1, waves[0]), wave(seen.rows[-1] + 1, waves[1])
-    return (order + across[seen.columns] + down[seen.rows]).astype(np.float32)
-
-
-def take_first(order: np.ndarray, taken: np.ndarray, count: int) -> int:
-    """Mark in ``taken`` the ``count`` pixels of lowest ``order`` that are not taken yet, or a few
-    less (whole bins of a histogram only); infinite ones never. Returns how many."""
-    free = np.flatnonzero(~taken & (order < np.inf))
-    if not len(free):
-        return 0
-    order = order[free]
-    if len(free) > count:
-        low, high = order.min(), order.max()
-        scale = (_BINS - 1) / float(max(high - low, np.float32(1e-6)))
-        place = ((order - low).astype(np.float64) * scale).astype(np.int64)
-        fits = np.cumsum(np.bincount(place, minlength=_BINS)) <= count
-        free = free[fits[place]]
-    taken[free] = True
-    return len(free)
+    return order_patch(seen.columns, seen.rows, start, axes, bool(rng.integers(2)), waves)
 
 
 def _leave_in(
@@ -179,6 +154,8 @@ def _leave_in(
     rng: np.random.Generator,
 ) -> None:
     """The occluder's own surface, a tilted plane, at one end of what it hides."""
+    from tumortrack.sense.kernels import take_first
+
     columns, rows, organ_mm = seen.columns[hidden], seen.rows[hidden], seen.depth_mm[hidden]
     shown = np.zeros(len(organ_mm), np.bool_)
     x, y = _direction(rng).astype(np.float32)
