@@ -186,20 +186,15 @@ def picture_of_cloud(cloud: SensorCloud) -> Picture:
     Points at or behind the camera's centre are left out, and so are those behind another.
     """
     points_mm = cloud.points_mm
-    x, y, z = np.ascontiguousarray(points_mm.T)
-    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        across, down = x / z, y / z
-    before = np.flatnonzero((z > 1.0) & (np.abs(across) < _WIDEST) & (np.abs(down) < _WIDEST))
-    tangents = np.stack([across[before], down[before]]).astype(np.float64)
-    low, high = (tangents.min(1), tangents.max(1)) if len(before) else (np.zeros(2), np.zeros(2))
-    inner = np.array([_inner_spread(*of_axis) for of_axis in zip(tangents, low, high, strict=True)])
+    tangents, low, high, inner = _spread(points_mm.copy())
+    z = points_mm[:, 2].copy()
     # Stray points widen the picture, but don't coarsen it.
     pixels = max(len(points_mm) / _POINTS_PER_PIXEL, 64.0)
     most = np.prod(high - low + 1e-3) / MOST_PIXELS
     size = float(np.sqrt(max(np.prod(inner + 1e-3) / pixels, most)))
     width, height = (int(n) for n in np.floor((high - low) / size) + 1)
     pinhole = Pinhole(1 / size, 1 / size, float(-low[0] / size), float(-low[1] / size))
-    depth_mm, pixel = _rasterise(across, down, z, pinhole, (height, width))
+    depth_mm, pixel = _rasterise(tangents, z, pinhole, (height, width))
     taken = np.isnan(depth_mm).view(np.uint8) * np.uint8(NO_RETURN)
 
     def left(taken: np.ndarray) -> np.ndarray:
@@ -230,26 +225,54 @@ def _keep_inside(depth_mm, taken, pinhole, low, high, step):  # type: ignore[no-
 
 
 @jit
-def _rasterise(across, down, z_mm, pinhole, shape):  # type: ignore[no-untyped-def]
+def _spread(points_mm):  # type: ignore[no-untyped-def]
+    """x / z and y / z (n, 2), NaN where not before the camera or too wide; their extremes (2,) and
+    (2,); and how far the middle 96 % spread (2,), from a histogram: the order of the points doesn't
+    matter."""
+    tangents = np.full((len(points_mm), 2), np.nan, np.float32)
+    low, high, count = np.full(2, np.inf), np.full(2, -np.inf), 0
+    for i in range(len(points_mm)):
+        z = points_mm[i, 2]
+        if z > 1.0:
+            x, y = points_mm[i, 0] / z, points_mm[i, 1] / z
+            if abs(x) < _WIDEST and abs(y) < _WIDEST:
+                tangents[i, 0], tangents[i, 1] = x, y
+                low[0], low[1] = min(low[0], x), min(low[1], y)
+                high[0], high[1] = max(high[0], x), max(high[1], y)
+                count += 1
+    if count == 0:
+        return tangents, np.zeros(2), np.zeros(2), np.zeros(2)
+    return tangents, low, high, _inner_spread(tangents, low, high, count)
+
+
+@jit
+def _inner_spread(tangents, low, high, count):  # type: ignore[no-untyped-def]
+    inner, found = np.zeros(2), np.zeros((2, _BINS), np.int64)
+    for i in range(len(tangents)):
+        if not np.isnan(tangents[i, 0]):
+            for k in range(2):
+                share = (tangents[i, k] - low[k]) / max(high[k] - low[k], 1e-9)
+                found[k, min(int(share * _BINS), _BINS - 1)] += 1
+    for k in range(2):
+        total = 0
+        for one in found[k]:
+            total += one
+            if 0.02 * count < total < 0.98 * count:
+                inner[k] += (high[k] - low[k]) / _BINS
+    return inner
+
+
+@jit
+def _rasterise(tangents, z_mm, pinhole, shape):  # type: ignore[no-untyped-def]
     """The nearest depth in each pixel (h, w), and each point's pixel (n,), -1 outside."""
     fx, fy, cx, cy = pinhole
     depth_mm = np.full(shape[0] * shape[1], np.nan, np.float32)
     pixel = np.full(len(z_mm), -1, np.int32)
     for i in range(len(z_mm)):
-        if z_mm[i] > 1.0 and abs(across[i]) < _WIDEST and abs(down[i]) < _WIDEST:
-            u, v = int(fx * across[i] + cx + 0.5), int(fy * down[i] + cy + 0.5)
+        if not np.isnan(tangents[i, 0]):
+            u, v = int(fx * tangents[i, 0] + cx + 0.5), int(fy * tangents[i, 1] + cy + 0.5)
             if 0 <= u < shape[1] and 0 <= v < shape[0]:
                 place = pixel[i] = v * shape[1] + u
                 if not depth_mm[place] <= z_mm[i]:
                     depth_mm[place] = z_mm[i]
     return depth_mm.reshape(shape), pixel
-
-
-def _inner_spread(tangents: np.ndarray, low: float, high: float) -> float:
-    """How far the middle 96 % of tangents (n,) spread, from a histogram: the order of the points
-    doesn't matter."""
-    share = (tangents - low) / max(high - low, 1e-9)
-    place = np.minimum((share * _BINS).astype(np.int64), _BINS - 1)
-    total, n = np.cumsum(np.bincount(place, minlength=_BINS)), len(tangents)
-    bins = np.full(_BINS, (high - low) / _BINS)
-    return float(np.cumsum(np.where((0.02 * n < total) & (total < 0.98 * n), bins, 0.0))[-1])
