@@ -305,8 +305,8 @@ class FakeArm:
         self.told: list[tuple] = []
         self.opened: list[str] = []
         self.actual = list(angles(0.0))
-        self.running, self.protective, self.fails = True, False, ""
-        self.kicks = 0
+        self.running, self.safety_mode, self.fails = True, 1, ""
+        self.kicks, self.follows, self.mute, self.force = 0, True, False, [1.0, 2.0, -3.0, 9, 9, 9]
 
     def modules(self) -> dict[str, ModuleType]:
         arm = self
@@ -332,6 +332,7 @@ class FakeArm:
                 if arm.fails == "servo":
                     raise RuntimeError("connection lost")
                 arm.told.append(("servo", q, time, lookahead_time, gain))
+                arm.actual = list(q) if arm.follows else arm.actual
                 return arm.fails != "refuse"
 
             def servoStop(self, a: float = 10.0) -> bool:  # noqa: N802
@@ -351,11 +352,17 @@ class FakeArm:
             def getActualQ(self) -> list[float]:  # noqa: N802
                 return arm.actual
 
-            def isEmergencyStopped(self) -> bool:  # noqa: N802
-                return False
+            def getSafetyMode(self) -> int:  # noqa: N802
+                return arm.safety_mode
 
-            def isProtectiveStopped(self) -> bool:  # noqa: N802
-                return arm.protective
+            def getActualTCPForce(self) -> list[float]:  # noqa: N802
+                return arm.force
+
+            def getTimestamp(self) -> float:  # noqa: N802
+                return 7.0 if arm.mute else time.monotonic()
+
+            def isConnected(self) -> bool:  # noqa: N802
+                return True
 
             def disconnect(self) -> None:
                 pass
@@ -500,16 +507,65 @@ def test_silence_stops_an_arm(arm, moving):
     assert sink.counts == {"sent": 1, "silences": 1}
 
 
-def test_an_arm_in_a_protective_stop_is_said(arm, moving):
-    sink = moving()
+def _push(arm: FakeArm) -> None:
+    arm.force = [0.0, -41.0, 0.0, 0.0, 0.0, 0.0]
+
+
+def _turn(arm: FakeArm) -> None:
+    arm.actual = [q + np.radians(4) for q in arm.actual]
+
+
+ARM_FAULTS = {
+    "protective": (lambda arm: setattr(arm, "safety_mode", 3), "in a protective stop"),
+    "emergency": (lambda arm: setattr(arm, "safety_mode", 7), "in an emergency stop"),
+    "program": (lambda arm: setattr(arm, "running", False), "no program"),
+    "force": (_push, r"the tool meets 41 N; allowed: 40"),
+    "elsewhere": (_turn, r"4\.0 degrees from the plan; allowed: 2"),
+    "mute": (lambda arm: setattr(arm, "mute", True), "nothing is heard of the arm"),
+}
+
+
+@pytest.mark.parametrize("fault", ARM_FAULTS)
+def test_whatever_happens_to_an_arm_between_two_targets_stops_all_arms(arm, monkeypatch, fault):
+    """Found by the sink's own thread: no further result is needed."""
+    monkeypatch.setattr("tumortrack.live.sinks.ur.SILENT_S", 20.0)
+    setting, (happens, words) = with_arms(), ARM_FAULTS[fault]
+    sink = UrSinkConfig(host="10.0.0.9", execute=True).open(setting)
     sink.publish(working(0))
-    arm.protective = True
-    with pytest.raises(TumortrackError, match="protective stop"):
+    happens(arm)
+    until(setting.controls.aborted.is_set)
+    until(lambda: "stop" in arm.what())
+    with pytest.raises(TumortrackError, match=words):
         sink.publish(working(1, 0.01))
-    assert arm.what() == ["servo", "stop"]
-    arm.protective, arm.running = False, False
-    with pytest.raises(TumortrackError, match="no program"):
-        sink.publish(working(2, 0.01))
+    sink.close()
+    assert arm.what()[:2] == ["servo", "stop"]
+    assert sink.counts == {"sent": 1, "refused": 1}
+
+
+@pytest.mark.parametrize("behind_deg", [3.1, 3.3])
+def test_an_arm_may_be_behind_by_the_time_it_looks_ahead(arm, monkeypatch, behind_deg):
+    """0.2 degrees every 20 ms, looked ahead 0.1 s: 0.2 + 1.0 degrees, and 2 more anywhere."""
+    monkeypatch.setattr("tumortrack.live.sinks.ur._TICK_S", 30.0)  # its thread looks away
+    monkeypatch.setattr("tumortrack.live.sinks.ur.time", Clock())
+    arm.follows = False
+    sink = UrSinkConfig(host="10.0.0.9", execute=True).open(with_arms())
+    results = []
+    for n in range(3):
+        cell = working(0).workcell
+        assert cell is not None
+        turned = {name: rad + n * np.radians(0.2) for name, rad in cell.joints_rad.items()}
+        stamp_ns = 10**9 + n * 20_000_000
+        results.append(
+            replace(working(0), stamp_ns=stamp_ns, workcell=replace(cell, joints_rad=turned))
+        )
+    sink.publish(results[0])
+    sink.publish(results[1])
+    arm.actual = (np.array(angles(0.0)) + np.radians(0.2 - behind_deg)).tolist()
+    if behind_deg < 3.2:
+        sink.publish(results[2])
+    else:
+        with pytest.raises(TumortrackError, match=r"3\.3 degrees from the plan; allowed: 3\.2"):
+            sink.publish(results[2])
 
 
 @pytest.mark.parametrize("why", ["refused", "fault", "halted"])

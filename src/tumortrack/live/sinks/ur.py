@@ -32,7 +32,21 @@ LIMIT_RAD = 2 * np.pi
 SPEED_RAD_S = np.radians([120.0, 120.0, 180.0, 180.0, 180.0, 180.0])
 
 _TICK_S = 0.02  # of the watchdog
+_MUTE_S = 0.1  # without news from the arm, which sends its state 125 times a second or more
+# Safety modes of the controller (RTDE guide of the maker); in 1 and 2 it follows.
+_SAFETY = {
+    3: "in a protective stop",
+    4: "in recovery",
+    5: "in a safeguard stop",
+    6: "in an emergency stop of the system",
+    7: "in an emergency stop",
+    8: "stopped by a safety violation",
+    9: "stopped by a fault",
+}
 _SHORTEST_S, _LONGEST_S = 0.008, 0.1  # that the controller follows one target
+
+
+Joints = Float64[np.ndarray, " 6"]
 
 
 class UrSinkConfig(SinkConfig, frozen=True, kw_only=True, tag="ur"):
@@ -42,6 +56,7 @@ class UrSinkConfig(SinkConfig, frozen=True, kw_only=True, tag="ur"):
         arm: whose joints: ``cutter_shoulder_pan_joint``, ...
         execute: false: say what would be sent. true: move it.
         jump_deg: the largest step of a joint from one target to the next.
+        force_n: at the tool; more of it stops the arms. Tissue gives way at a few newtons.
         lookahead_s, gain: of servoJ: longer and less is smoother and later.
     """
 
@@ -51,12 +66,14 @@ class UrSinkConfig(SinkConfig, frozen=True, kw_only=True, tag="ur"):
     arm: Literal["cutter", "holder"] = "cutter"
     execute: bool = False
     jump_deg: float = 5.0
+    force_n: float = 40.0
     lookahead_s: float = 0.1
     gain: float = 300.0
 
     def __post_init__(self) -> None:
         servo = (("lookahead_s", 0.03, 0.2), ("gain", 100.0, 2000.0))  # servoJ's own limits
-        for name, low, high in (("jump_deg", 0.1, 20.0), *servo):
+        ours = (("jump_deg", 0.1, 20.0), ("force_n", 5.0, 150.0))  # controllers end at 150 N
+        for name, low, high in (*ours, *servo):
             value = getattr(self, name)
             if not low <= value <= high:
                 raise InputError(f"ur: {name} {value:g} must lie in {low:g}..{high:g}.")
@@ -71,7 +88,10 @@ class UrSinkConfig(SinkConfig, frozen=True, kw_only=True, tag="ur"):
 
 class UrSink:
     """Sends one arm's joints as they come, and stops it (servoStop) where the arms are halted,
-    there is no workcell, a target is refused, 0.2 s pass without a result, or it is closed.
+    there is no workcell, a target is refused, 0.2 s pass without a result, or it is closed. With
+    every target, and 50 times a second between them, it looks whether the arm is heard of, stands
+    under no safety stop, meets no force, and is where the targets have led it; if not, all arms
+    stop for good.
 
     Whenever it stood still, it begins only where the arm is within 2 degrees of the target. Should
     this process die, the arm's controller stops it within 0.2 s by itself (setWatchdog).
@@ -80,11 +100,12 @@ class UrSink:
     def __init__(self, config: UrSinkConfig, link: UrLink | None, controls: Controls) -> None:
         self._config, self._link, self._controls = config, link, controls
         self._names = tuple(f"{config.arm}_{joint}" for joint in UR_JOINTS)
-        self._last: tuple[Float64[np.ndarray, " 6"], float, int] | None = None
+        # The last target, when it was sent, its stamp, and how far each joint may be behind it.
+        self._last: tuple[Joints, float, int, Joints] | None = None
         self._lock = threading.Lock()
         self._closed = threading.Event()
         self._counts: Counter[str] = Counter()
-        self._fault = ""
+        self._fault = self._trouble = ""  # for good; once, found between two results
         self._watch = threading.Thread(target=self._keep_watch, name="ur", daemon=True)
         if link is not None:
             self._watch.start()
@@ -101,8 +122,9 @@ class UrSink:
         with self._lock:
             if self._closed.is_set():
                 return
-            if self._fault:
-                raise TumortrackError(self._fault)
+            if trouble := self._fault or self._trouble:
+                self._trouble = ""
+                raise TumortrackError(trouble)
             cell = result.workcell
             try:
                 if cell is None or cell.halted:
@@ -140,23 +162,32 @@ class UrSink:
         if self._link is not None:
             self._controls.aborted.set()
 
-    def _go(self, target: Float64[np.ndarray, " 6"], stamp_ns: int) -> None:
+    def _go(self, target: Joints, stamp_ns: int) -> None:
         now_s = time.monotonic()
         seconds = _SHORTEST_S
+        lag_rad = np.zeros(6)
         if self._last is not None:
-            before, then_s, then_ns = self._last
+            before, then_s, then_ns, _ = self._last
             # Targets are as far apart as their stamps say, or came: a thread may have waited.
             seconds = max(now_s - then_s, (stamp_ns - then_ns) * 1e-9, _SHORTEST_S)
             _check_step(target - before, seconds, self._config.jump_deg)
+            # servoJ comes after its targets by the time it looks ahead, and one target.
+            lag_rad = np.abs(target - before) * (1 + self._config.lookahead_s / seconds)
         if self._link is not None:
-            self._link.check()
+            self._look_at(self._link, target)
             if self._last is None:
-                self._link.compare(target)
                 seconds = _LONGEST_S
             follow_s = float(np.clip(seconds, _SHORTEST_S, _LONGEST_S))
             self._link.servo(target, follow_s, self._config.lookahead_s, self._config.gain)
-        self._last = target, now_s, stamp_ns
+        self._last = target, now_s, stamp_ns, lag_rad
         self._counts["would send" if self._link is None else "sent"] += 1
+
+    def _look_at(self, link: UrLink, target: Joints) -> None:
+        """Raises TumortrackError where the arm cannot follow, meets something, or is elsewhere than
+        at the last target or, before the first one, at this."""
+        link.check(self._config.force_n)
+        at, lag_rad = (target, np.zeros(6)) if self._last is None else self._last[::3]
+        link.compare(at, np.radians(OFF_DEG) + lag_rad)
 
     def _stop(self) -> None:
         moving, self._last = self._last is not None, None
@@ -187,12 +218,20 @@ class UrSink:
                 if self._fault or self._link is None:
                     return
                 try:
+                    if self._last is not None:
+                        self._look_at(self._link, self._last[0])
                     self._link.kick()
+                except TumortrackError as error:
+                    self._trouble = f"ur {self._config.arm}: {error}"
+                    self._counts["refused"] += 1
+                    self._give_up()
+                    self._stop()
                 except Exception as error:
+                    self._give_up()
                     self._break(error)
 
 
-def _target(joints_rad: Mapping[str, float], names: tuple[str, ...]) -> Float64[np.ndarray, " 6"]:
+def _target(joints_rad: Mapping[str, float], names: tuple[str, ...]) -> Joints:
     """One arm's joints in the maker's order; TumortrackError: one is missing, no number, or beyond
     its limit."""
     if missing := [name for name in names if name not in joints_rad]:
@@ -208,7 +247,7 @@ def _target(joints_rad: Mapping[str, float], names: tuple[str, ...]) -> Float64[
     return target
 
 
-def _check_step(step: Float64[np.ndarray, " 6"], seconds: float, jump_deg: float) -> None:
+def _check_step(step: Joints, seconds: float, jump_deg: float) -> None:
     """Raises TumortrackError for a step too large, or too large for the time that it has."""
     jump, speed = np.degrees(np.abs(step)), np.abs(step) / seconds / SPEED_RAD_S
     if jump.max() > jump_deg:
@@ -248,26 +287,35 @@ class UrLink:
                 "remote control, and reachable on port 30004?"
             ) from error
         self._control.setWatchdog(1 / _WATCHDOG_S)
+        self._heard = (-1.0, 0.0)  # the arm's clock, and when it changed by ours
 
-    def check(self) -> None:
-        """Raises TumortrackError where the arm cannot follow."""
-        if self._receive.isEmergencyStopped() or self._receive.isProtectiveStopped():
-            raise TumortrackError("the arm is in an emergency or protective stop; release it there")
+    def check(self, force_n: float) -> None:
+        """Raises TumortrackError where the arm is not heard of, cannot follow, or meets a force."""
+        now_s, stamp_s = time.monotonic(), self._receive.getTimestamp()
+        if stamp_s != self._heard[0]:
+            self._heard = stamp_s, now_s
+        if not self._receive.isConnected() or now_s - self._heard[1] > _MUTE_S:
+            raise TumortrackError("nothing is heard of the arm; is its network well?")
+        if fault := _SAFETY.get(mode := self._receive.getSafetyMode()):
+            raise TumortrackError(f"the arm is {fault} (safety mode {mode}); release it there")
         if not self._control.isProgramRunning():
             raise TumortrackError("the arm runs no program any more; start again")
+        force = float(np.linalg.norm(self._receive.getActualTCPForce()[:3]))
+        if not force <= force_n:
+            raise TumortrackError(f"the tool meets {force:.0f} N; allowed: {force_n:g}")
 
-    def compare(self, target: Float64[np.ndarray, " 6"]) -> None:
+    def compare(self, target: Joints, allowed_rad: Joints) -> None:
         """Raises TumortrackError where the arm is not where the plan has it."""
-        off_deg = np.degrees(np.abs(np.array(self._receive.getActualQ()) - target))
-        if not off_deg.max() <= OFF_DEG:
+        off_rad = np.abs(np.array(self._receive.getActualQ()) - target)
+        if not (off_rad <= allowed_rad).all():
+            joint = int((off_rad - allowed_rad).argmax())
+            off_deg, allowed_deg = np.degrees([off_rad[joint], allowed_rad[joint]])
             raise TumortrackError(
-                f"{UR_JOINTS[int(off_deg.argmax())]} is {off_deg.max():.1f} degrees from the plan; "
-                f"allowed: {OFF_DEG:g}. Move the arm there first"
+                f"{UR_JOINTS[joint]} is {off_deg:.1f} degrees from the plan; allowed: "
+                f"{allowed_deg:.2g}. Move the arm there first"
             )
 
-    def servo(
-        self, target: Float64[np.ndarray, " 6"], follow_s: float, lookahead_s: float, gain: float
-    ) -> None:
+    def servo(self, target: Joints, follow_s: float, lookahead_s: float, gain: float) -> None:
         if not self._control.servoJ(target.tolist(), 0.0, 0.0, follow_s, lookahead_s, gain):
             raise TumortrackError("the arm did not take the target")
 
