@@ -156,5 +156,4 @@ def test_what_is_not_there_is_said(tmp_path, monkeypatch):
 def test_the_command_lines_text():
     config = SOURCES.parse("realsense:0123?fps=60&emitter=true&preset=default")
     assert config == RealSenseSourceConfig(device="0123", fps=60, emitter=True, preset="default")
-    assert config.recording is None
     assert SOURCES.parse("realsense") == RealSenseSourceConfig()

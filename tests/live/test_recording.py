@@ -35,9 +35,9 @@ from tumortrack.core.errors import InputError, StorageError
 from tumortrack.core.geometry import rigid
 from tumortrack.core.mesh_files import write_anatomy
 from tumortrack.core.types import DepthFrame, SensorCloud
-from tumortrack.live.recording.mcap_file import _CHUNK_S
 from tumortrack.live.ros.messages import Messages
 from tumortrack.live.ros.sensors import messages_seen
+from tumortrack.live.sinks.recording import _CHUNK_S
 from tumortrack.live.sinks.recording import RecordingSinkConfig as RecordTo
 from tumortrack.live.sources.recording import RecordingSourceConfig
 from tumortrack.live.values import Observation, PublishedFrame, SourceEnded, SourceLost
@@ -204,8 +204,8 @@ def test_a_file_cut_anywhere_gives_the_frames_before(tmp_path):
     ends = []
     for n in range(6):
         sink.publish(update_number(n))
-        sink._writer._flush()  # as time does
-        ends.append(sink._writer._whole)
+        sink._flush()  # as time does
+        ends.append(sink._whole)
     sink.close()
     raw = (tmp_path / "r" / "r.mcap").read_bytes()
     found, cut_file = [], tmp_path / "cut.mcap"
@@ -491,8 +491,8 @@ def test_a_bag_damaged_in_the_middle_is_said_and_ends(tmp_path):
     ends = []
     for n in range(4):
         sink.publish(update_number(n))
-        sink._writer._flush()
-        ends.append(sink._writer._whole)
+        sink._flush()
+        ends.append(sink._whole)
     sink.close()
     path = tmp_path / "r" / "r.mcap"
     raw = bytearray(path.read_bytes())
