@@ -165,7 +165,9 @@ class Loop:
         organ, estimate, reason, warning = None, None, "", ""
         quality: Quality = "none"
         try:
-            self._check_stamp(seen.stamp_ns, _age_s(born_ns))
+            # What is simulated has this computer's clock, and so has the moment of arrival.
+            other_clock = born_ns == seen.stamp_ns and seen.truth is None
+            self._check_stamp(seen.stamp_ns, _age_s(born_ns), other_clock)
             with timed(seconds, "organ"):
                 rng = np.random.default_rng((self._config.follower.seed, seen.stamp_ns))
                 region = organ_points(seen.content, self._config.region, self._hints(seen), rng)
@@ -217,8 +219,8 @@ class Loop:
             )
         return replace(seen, content=DepthFrame(content.depth_mm, given, content.stamp_ns))
 
-    def _check_stamp(self, stamp_ns: int, age_s: float) -> None:
-        if self._stamps.check(stamp_ns, age_s):
+    def _check_stamp(self, stamp_ns: int, age_s: float, other_clock: bool) -> None:
+        if self._stamps.check(stamp_ns, age_s, other_clock):
             self.statistics.clock_jumps += 1
             self._follower.forget()
 
