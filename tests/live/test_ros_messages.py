@@ -41,14 +41,15 @@ from tumortrack.live.ros.sensors import (
     mask_of,
     messages_seen,
 )
-from tumortrack.live.values import Observation, PublishedFrame
-from workcell_objects import with_arms, workcell
+from tumortrack.live.values import Observation, PublishedFrame, Workcell
+from workcell_objects import virtual, with_arms, workcell, working
 
 HUMBLE, NOETIC = Messages("humble"), Messages("noetic")
 STOCK = {HUMBLE: get_typestore(Stores.ROS2_HUMBLE), NOETIC: get_typestore(Stores.ROS1_NOETIC)}
 DEBIAN = Path("/usr/lib/python3/dist-packages/sensor_msgs")
 POINTS_M = np.array([[0.01, -0.02, 0.125], [0.003, 0.004, 0.13], [-0.05, 0.0, 0.2]])
 _TURN = Rotation.from_euler("xyz", [0.3, -1, 2]).as_matrix()
+BARE = Workcell("hold")  # nothing to show but its state
 TURNED = PublishedFrame("table", rigid(_TURN, np.array([50.0, -20, 9])))
 
 
@@ -399,11 +400,14 @@ def test_stamps_that_ros_cannot_say_are_refused(stamp_ns):
 
 
 @pytest.mark.parametrize("messages", [HUMBLE, NOETIC])
-@pytest.mark.parametrize("update", [small_update(), empty_update()])
+@pytest.mark.parametrize(
+    "update",
+    [small_update(), empty_update(), working(), virtual(), replace(working(), workcell=BARE)],
+)
 def test_bytes_are_those_of_plain_messages(messages, update):
     """Blocks of points are written as the library writes lists of points."""
     stock = STOCK[messages]
-    for out in ResultMessages(messages, small_setting()).of(update):
+    for out in ResultMessages(messages, with_arms()).of(update):
         raw, kind = messages.to_bytes(out.message), out.message_type
         if messages is HUMBLE:
             again = stock.serialize_cdr(stock.deserialize_cdr(raw, kind), kind)

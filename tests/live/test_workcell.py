@@ -14,7 +14,6 @@ from types import ModuleType
 import numpy as np
 import pytest
 from rosbags.highlevel import AnyReader
-from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
 
 from clock import Clock, until
@@ -39,7 +38,6 @@ from tumortrack.live.values import Observation, SinkContext, SourceEnded, Tracki
 from workcell_objects import CUT, REASON, TABLE, virtual, with_arms, workcell, working
 
 HUMBLE, NOETIC = Messages("humble"), Messages("noetic")
-STOCK = {HUMBLE: get_typestore(Stores.ROS2_HUMBLE), NOETIC: get_typestore(Stores.ROS1_NOETIC)}
 NAMES = [shape.name for shape in workcell().shapes]
 
 
@@ -152,19 +150,6 @@ def test_what_the_camera_saw_is_sent_in_the_frame_of_the_arms():
 def test_without_arms_nothing_of_them_is_announced():
     topics = {out.suffix for out in ResultMessages(HUMBLE, small_setting()).of(working())}
     assert not topics & {"workcell", "joint_states", "observed"}
-
-
-@pytest.mark.parametrize("messages", [HUMBLE, NOETIC])
-@pytest.mark.parametrize("update", [working(), virtual(), less(virtual(), *NAMES, "cut/1")])
-def test_bytes_are_those_of_plain_messages(messages, update):
-    stock = STOCK[messages]
-    for out in ResultMessages(messages, with_arms()).of(update):
-        raw, kind = messages.to_bytes(out.message), out.message_type
-        if messages is HUMBLE:
-            again = stock.serialize_cdr(stock.deserialize_cdr(raw, kind), kind)
-        else:
-            again = stock.serialize_ros1(stock.deserialize_ros1(raw, kind), kind)
-        assert bytes(again) == bytes(raw), out.suffix
 
 
 # Recordings
