@@ -97,7 +97,7 @@ def known(request) -> Learnt:
 def test_fast_arithmetic_gives_the_labels_of_single_precision(numbers, known):
     inference = Inference(known.network, Arithmetic(numbers=numbers, chunk=1024))
     latent = inference.encode(known.cloud)
-    right = reference(inference.network, latent, known.queries)
+    right = reference(known.network.folded(), latent, known.queries)
     assert right.argmax(1).bincount()[:2].min() > 50
     answer = inference.logits(latent, known.queries)
     assert answer.dtype == torch.float32
@@ -213,7 +213,7 @@ def test_compile_is_used_by_the_next_load_and_named_by_inspect(learnt_model, tmp
     assert after.arithmetic is not None
     assert after.arithmetic.numbers in said
     assert any("this machine" in line for line in describe(folder))
-    assert OccupancyLocator(after)._inference.arithmetic == after.arithmetic
+    assert OccupancyLocator(after).inference.arithmetic == after.arithmetic
 
 
 def test_there_is_nothing_to_choose_for_a_model_that_places_the_organ(clinic_model, capsys):

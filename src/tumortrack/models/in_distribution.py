@@ -51,13 +51,18 @@ def fit_mm(distances_mm: Float[np.ndarray, " n"]) -> float:
     return float(np.percentile(distances_mm, _SHARE))
 
 
-def check_in_distribution(known: InDistributionRange, spread: float, fit: float) -> None:
-    """Refuse what cannot be the organ.
+def check_in_distribution(
+    known: InDistributionRange,
+    points_mm: Float[np.ndarray, "n 3"],
+    distances_mm: Float[np.ndarray, " n"],
+) -> None:
+    """Refuse a cloud that cannot be the organ's; ``distances_mm``: from the estimated surface.
 
     Raises:
         NoEstimate: the points spread over much more or less than in any validation scene, or
             lie much farther from the estimated surface.
     """
+    spread, fit = spread_mm(points_mm), fit_mm(distances_mm)
     low, high = known.spread_mm[0] / _SPREAD_FACTOR, known.spread_mm[1] * _SPREAD_FACTOR
     if not low <= spread <= high:
         raise NoEstimate(

@@ -21,25 +21,21 @@ from tumortrack.models.in_distribution import InDistributionRange
 _OPSET = 18  # of ONNX files
 
 
+# What to trace for an ONNX file, on which inputs, and the names for ``torch.onnx.export``.
+OnnxParts = tuple[nn.Module, tuple[Tensor, ...], dict[str, Any]]
+
+
 class Network(nn.Module):
     """A network that can be trained and exported."""
 
-    def loss(
-        self,
-        clouds_mm: Tensor,
-        points_mm: Tensor,
-        labels: Tensor,
-        camera_from_ct: Tensor,
-        *,
-        first: int = 0,
-    ) -> Tensor:
+    def loss(self, *scenes: Tensor, first: int = 0) -> Tensor:
         """What a batch costs: clouds (B, N, 3), the scenes' points (B, P, 3) with their labels
         (B, P), poses (B, 4, 4); camera frame, mm. ``first``: the first cloud's number in a batch
         that is split over several processes."""
         raise NotImplementedError
 
-    def onnx_parts(self, cloud_mm: Tensor) -> tuple[nn.Module, tuple[Tensor, ...], dict[str, Any]]:
-        """What to trace for an ONNX file, on which inputs, and ``torch.onnx.export``'s names."""
+    def onnx_parts(self, cloud_mm: Tensor) -> OnnxParts:
+        """The parts of a file for clouds like this one, (1, N, 3)."""
         raise NotImplementedError
 
 

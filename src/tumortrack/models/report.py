@@ -1,4 +1,4 @@
-"""The parts of report.json that are the same for both kinds of locator."""
+"""What both kinds of locator do with a frame, and what both report."""
 
 from __future__ import annotations
 
@@ -16,38 +16,67 @@ from tumortrack.core.estimate import Estimate
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.types import Anatomy, CameraLabels, Mesh, OccupancyCloud, SensorCloud
 from tumortrack.imaging.raster import label_grid
+from tumortrack.models.model import Model
+from tumortrack.sense.cloud import check_cloud, thin_cloud
 
+Rng = np.random.Generator
 CLOUD_POINTS = 40_000  # of an estimate made of surfaces
 
 
-def report_head(cloud: SensorCloud, seed: int) -> dict[str, Any]:
-    """The first entries of report.json."""
-    return {
+class Frame:
+    """One cloud on its way to an estimate, camera frame, mm: ``points_mm`` are those that the
+    network sees, ``seconds`` what each stage took.
+
+    Raises:
+        NoEstimate, InputError: see ``sense.cloud.check_cloud``.
+    """
+
+    def __init__(self, model: Model, cloud: SensorCloud, seed: int, rng: Rng) -> None:
+        check_cloud(cloud)
+        self.model, self.cloud, self.seed, self.rng = model, cloud, seed, rng
+        self.points_mm = thin_cloud(cloud, model.config.scene.cloud.n_points, rng).points_mm
+        self.device = next(model.network.parameters()).device
+        self.seconds: dict[str, float] = {}
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        """Time a ``with`` block."""
+        start = time.perf_counter()
+        yield
+        if self.device.type == "cuda":  # kernels run asynchronously
+            torch.cuda.synchronize(self.device)
+        self.seconds[name] = time.perf_counter() - start
+
+    def report(
+        self,
+        distances_mm: Float[np.ndarray, " n"],
+        parts: dict[str, dict[str, Any]],
+        voxel_mm: float | None = None,
+        **more: object,
+    ) -> dict[str, Any]:
+        """report.json. ``distances_mm``: of the observed points from the estimated surface."""
+        return {
+            **_head(self.cloud.stamp_ns, voxel_mm),
+            "seed": self.seed,
+            "points": len(self.cloud.points_mm),
+            "fit_mm": {
+                "median": float(np.median(distances_mm)),
+                "p95": float(np.percentile(distances_mm, 95)),
+            },
+            "parts": parts,
+            **more,
+            "timings": {**self.seconds, "total": sum(self.seconds.values())},
+        }
+
+
+def _head(stamp_ns: int, voxel_mm: float | None) -> dict[str, Any]:
+    head = {
         "tumortrack": tumortrack.__version__,
         "units": "mm",
         "frame": "camera",
-        "stamp_ns": cloud.stamp_ns,
-        "seed": seed,
-        "points": len(cloud.points_mm),
+        "stamp_ns": stamp_ns,
     }
-
-
-def fit_report(distances_mm: Float[np.ndarray, " n"]) -> dict[str, Any]:
-    """How far the observed points lie from the estimated surface."""
-    return {
-        "median": float(np.median(distances_mm)),
-        "p95": float(np.percentile(distances_mm, 95)),
-    }
-
-
-@contextmanager
-def stage(seconds: dict[str, float], name: str, device: torch.device) -> Iterator[None]:
-    """Time a ``with`` block."""
-    start = time.perf_counter()
-    yield
-    if device.type == "cuda":  # kernels run asynchronously
-        torch.cuda.synchronize(device)
-    seconds[name] = time.perf_counter() - start
+    return head if voxel_mm is None else {**head, "voxel_mm": voxel_mm}
 
 
 def grid_over(
@@ -119,11 +148,7 @@ def estimate_of(
         CameraLabels(labels, camera_from_index),
         meshes,
         {
-            "tumortrack": tumortrack.__version__,
-            "units": "mm",
-            "frame": "camera",
-            "stamp_ns": stamp_ns,
-            "voxel_mm": float(camera_from_index[0, 0]),
+            **_head(stamp_ns, float(camera_from_index[0, 0])),
             "parts": describe_parts(tuple(meshes), meshes, inside),
             **report,
         },

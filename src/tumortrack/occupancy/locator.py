@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from contextlib import AbstractContextManager, suppress
-from dataclasses import dataclass, field, replace
+from contextlib import suppress
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -13,13 +13,13 @@ from jaxtyping import Float, Float16, Float32, Float64, UInt8
 from tumortrack.core.errors import NoEstimate
 from tumortrack.core.estimate import Estimate, Following
 from tumortrack.core.types import Anatomy, CameraLabels, OccupancyCloud, SensorCloud
-from tumortrack.models.in_distribution import check_in_distribution, fit_mm, spread_mm
-from tumortrack.models.report import describe_parts, fit_report, grid_over, report_head, stage
+from tumortrack.models.in_distribution import check_in_distribution
+from tumortrack.models.report import Frame, Rng, describe_parts, grid_over
 from tumortrack.occupancy.inference import Inference
+from tumortrack.occupancy.kernels import leading
 from tumortrack.occupancy.model import OccupancyModel
 from tumortrack.occupancy.sparse import (
     halved_lattice,
-    leading,
     organ_lattice,
     sparse_logits,
     sparse_margins,
@@ -34,7 +34,6 @@ from tumortrack.occupancy.volume import (
     part_surfaces,
     surface_distances,
 )
-from tumortrack.sense.cloud import check_cloud, thin_cloud
 
 COARSE_QUERIES = 10_000
 FINE_QUERIES = 40_000
@@ -52,7 +51,7 @@ class OccupancyLocator:
 
     def __init__(self, model: OccupancyModel) -> None:
         self.model = model
-        self._inference = Inference(model.network, model.arithmetic)
+        self.inference = Inference(model.network, model.arithmetic)
 
     def locate(self, cloud: SensorCloud, grid: int, seed: int) -> Estimate:
         """See ``tracking.tracker.Tracker.locate``.
@@ -60,14 +59,14 @@ class OccupancyLocator:
         The two passes of queries are those of the follow-up (LUDO): 10,000 coarse ones where the
         organ can be, then labels of 40,000 points in the enlarged box of those inside.
         """
-        frame = _Frame(self.model, self._inference, cloud, seed, np.random.default_rng(seed))
+        frame = _Frame(self, cloud, seed, np.random.default_rng(seed))
         lattice = frame.lattice(frame.coarse_box())
-        frame.check(lattice)
+        distances_mm = frame.checked(lattice)
         inside = frame.inside(lattice)
         with frame.stage("volume"):
             camera_from_index, shape = grid_over(inside.points_mm, grid)
             margins, labels = sparse_margins(frame.logits_at, camera_from_index, shape)
-        return frame.estimate(inside, margins, labels, camera_from_index)
+        return frame.estimate(distances_mm, inside, margins, labels, camera_from_index)
 
     def follow(self, cloud: SensorCloud, last: Estimate | None, how: Following) -> Estimate:
         """See ``tracking.tracker.Tracker.follow``.
@@ -79,7 +78,7 @@ class OccupancyLocator:
         the lattice, and queried only about surfaces.
         """
         rng = np.random.default_rng((how.seed, cloud.stamp_ns))
-        frame = _Frame(self.model, self._inference, cloud, how.seed, rng)
+        frame = _Frame(self, cloud, how.seed, rng)
         lattice = None
         if last is not None and not how.thorough:
             low, high = last.cloud.points_mm.min(0), last.cloud.points_mm.max(0)
@@ -87,20 +86,20 @@ class OccupancyLocator:
             lattice = frame.lattice(np.stack([low - margin, high + margin]).astype(float))
         if lattice is None or lattice.cut_off():
             lattice = frame.lattice(frame.coarse_box(), everywhere=True)
-        frame.check(lattice)
+        distances_mm = frame.checked(lattice)
         with frame.stage("volume"):
             finer = halved_lattice(frame.logits_at, lattice)
         inside = frame.inside(finer)
-        return replace(frame.estimate(inside, *margins_on(finer)), volume=None)
+        return replace(frame.estimate(distances_mm, inside, *margins_on(finer)), volume=None)
 
     def warm(self) -> None:
         """See ``tracking.tracker.Tracker.warm``."""
         rng = np.random.default_rng(0)
         points = rng.normal(0, 15, (self.model.config.scene.cloud.n_points, 3)) + [0, 0, 150]
-        frame = _Frame(self.model, self._inference, SensorCloud(points), 0, rng)
+        frame = _Frame(self, SensorCloud(points), 0, rng)
         box = self.model.query_box_mm + np.median(points, axis=0)
         finer = halved_lattice(frame.logits_at, frame.lattice(box))
-        for step in (frame.inside, frame.check):
+        for step in (frame.inside, frame.checked):
             with suppress(NoEstimate):  # it is no organ
                 step(finer)
         ball = np.linalg.norm(np.indices((16, 16, 16)).T - 7.5, axis=-1) < 5
@@ -114,29 +113,17 @@ def steps_over(box: Box) -> int:
     return max(FIT_STEPS, math.ceil(float((box[1] - box[0]).max()) / _LATTICE_MM))
 
 
-@dataclass(eq=False)
-class _Frame:
+class _Frame(Frame):
     """The work on one cloud, from its latent to the estimate."""
 
-    model: OccupancyModel
-    inference: Inference
-    cloud: SensorCloud
-    seed: int
-    rng: np.random.Generator
-    seconds: dict[str, float] = field(default_factory=dict)
-    distances_mm: Float32[np.ndarray, " n"] | None = None
-
-    def __post_init__(self) -> None:
-        check_cloud(self.cloud)
-        self.thinned = thin_cloud(self.cloud, self.model.config.scene.cloud.n_points, self.rng)
+    def __init__(self, locator: OccupancyLocator, cloud: SensorCloud, seed: int, rng: Rng) -> None:
+        super().__init__(locator.model, cloud, seed, rng)
+        self._inference = locator.inference
         with self.stage("encode"):
-            self.latent = self.inference.encode(self.thinned.points_mm)
-
-    def stage(self, name: str) -> AbstractContextManager[None]:
-        return stage(self.seconds, name, self.inference.device)
+            self._latent = self._inference.encode(self.points_mm)
 
     def logits_at(self, points_mm: Float32[np.ndarray, "n 3"]) -> torch.Tensor:
-        return self.inference.logits(self.latent, points_mm)
+        return self._inference.logits(self._latent, points_mm)
 
     def coarse_box(self) -> Box:
         """Where the organ is, by coarse random queries."""
@@ -159,12 +146,12 @@ class _Frame:
         with self.stage("lattice"):
             return over(self.logits_at, box, steps_over(box))
 
-    def check(self, lattice: LogitLattice) -> None:
-        """Refuse what cannot be the organ."""
+    def checked(self, lattice: LogitLattice) -> Float32[np.ndarray, " n"]:
+        """How far the points lie from the surface, if this can be the organ."""
         with self.stage("fit"):
-            self.distances_mm = surface_distances(lattice, self.thinned.points_mm)
-            spread = spread_mm(self.thinned.points_mm)
-            check_in_distribution(self.model.in_distribution, spread, fit_mm(self.distances_mm))
+            distances_mm = surface_distances(lattice, self.points_mm)
+            check_in_distribution(self.model.in_distribution, self.points_mm, distances_mm)
+        return distances_mm
 
     def inside(self, lattice: LogitLattice) -> OccupancyCloud:
         """Those of 40,000 random points in the lattice's box that lie inside."""
@@ -182,6 +169,7 @@ class _Frame:
 
     def estimate(
         self,
+        distances_mm: Float32[np.ndarray, " n"],
         inside: OccupancyCloud,
         margins: Float16[np.ndarray, "parts i j k"],
         found: UInt8[np.ndarray, "i j k"],
@@ -189,16 +177,10 @@ class _Frame:
     ) -> Estimate:
         """Everything read off margins and labels of a grid."""
         names = self.model.parts
-        assert self.distances_mm is not None
         with self.stage("surfaces"):
             labels = keep_largest_pieces(found, len(names))
             inside = drop_islands(inside, found, labels, camera_from_index)
             meshes = part_surfaces(margins, labels, camera_from_index, names)
-        report = {
-            **report_head(self.cloud, self.seed),
-            "voxel_mm": float(camera_from_index[0, 0]),
-            "fit_mm": fit_report(self.distances_mm),
-            "parts": describe_parts(names, meshes, inside),
-            "timings": {**self.seconds, "total": sum(self.seconds.values())},
-        }
+        parts = describe_parts(names, meshes, inside)
+        report = self.report(distances_mm, parts, float(camera_from_index[0, 0]))
         return Estimate(inside, CameraLabels(labels, camera_from_index), meshes, report)

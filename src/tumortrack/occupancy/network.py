@@ -9,7 +9,6 @@ from __future__ import annotations
 import copy
 import math
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -18,7 +17,7 @@ from torch.nn import functional
 from tumortrack.core.errors import InputError
 from tumortrack.models.config import MlpDecoderConfig, NetworkConfig
 from tumortrack.models.layers import Layer, Norm
-from tumortrack.models.model import Network
+from tumortrack.models.model import Network, OnnxParts
 from tumortrack.models.normalisation import (
     Aligned,
     CloudBox,
@@ -144,22 +143,14 @@ class OccupancyNetwork(Network):
         """Both at once: (B, N, 3) and (B, Q, 3) -> logits (B, Q, classes)."""
         return self.query(self.encode(points_mm), queries_mm)
 
-    def loss(
-        self,
-        clouds_mm: Tensor,
-        points_mm: Tensor,
-        labels: Tensor,
-        camera_from_ct: Tensor,
-        *,
-        first: int = 0,
-    ) -> Tensor:
+    def loss(self, *scenes: Tensor, first: int = 0) -> Tensor:
         """Cross-entropy of the points' labels, all points equal (the paper). Neither the poses nor
         the first cloud's number in the batch are used."""
+        clouds_mm, points_mm, labels, _ = scenes
         logits = self(clouds_mm, points_mm)
-        flat = logits.float().flatten(0, 1)
-        return functional.cross_entropy(flat, labels.long().flatten())
+        return functional.cross_entropy(logits.float().flatten(0, 1), labels.long().flatten())
 
-    def onnx_parts(self, cloud_mm: Tensor) -> tuple[nn.Module, tuple[Tensor, ...], dict[str, Any]]:
+    def onnx_parts(self, cloud_mm: Tensor) -> OnnxParts:
         """See ``Network``: clouds and queries in, logits out."""
         free = {"queries_mm": {1: "queries"}, "logits": {1: "queries"}}
         names = {"input_names": ["cloud_mm", "queries_mm"], "output_names": ["logits"]}

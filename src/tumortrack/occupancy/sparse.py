@@ -28,6 +28,8 @@ import torch
 from jaxtyping import Bool, Float, Float16, Float32, Float64, Int, UInt8
 
 from tumortrack.core.types import OUTSIDE
+from tumortrack.occupancy import kernels
+from tumortrack.occupancy.kernels import leading
 from tumortrack.occupancy.volume import (
     AT_ONCE,
     LARGEST_MARGIN,
@@ -43,7 +45,8 @@ _PROBE = 512  # of the least certain points, queried to learn how far linear log
 _SURPRISE = 0.5  # of the interpolation limit
 _FIRST_SEEN = 0.1  # of a first lattice's points may lie near a surface
 
-Query = Callable[[Int[np.ndarray, " n"]], Float32[np.ndarray, "n classes"]]
+Rows = Float32[np.ndarray, "n classes"]
+Flat = Int[np.ndarray, " n"]  # indices of points
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,16 +57,11 @@ class _Level:
     coarse: LogitLattice
     shape: tuple[int, int, int]
 
-    @property
-    def step_mm(self) -> float:
-        return self.coarse.step_mm / 2
+    def query(self, flat: Flat) -> Rows:
+        half_mm = self.coarse.step_mm / 2
+        return _query(self.logits_at, self.coarse.origin_mm, half_mm, self.shape, flat)
 
-    def query(self, flat: Int[np.ndarray, " n"]) -> Float32[np.ndarray, "n classes"]:
-        return _query(self.logits_at, self.coarse.origin_mm, self.step_mm, self.shape, flat)
-
-    def query_some(
-        self, flat: Int[np.ndarray, " n"], some: Int[np.ndarray, " m"]
-    ) -> Float32[np.ndarray, "m classes"]:
+    def query_among(self, flat: Flat, some: Int[np.ndarray, " m"]) -> Rows:
         return self.query(flat[some])
 
     def known(self) -> Bool[np.ndarray, " n"]:
@@ -73,16 +71,13 @@ class _Level:
         return known.ravel()
 
 
-Policy = Callable[[_Level, Float32[np.ndarray, "n classes"]], None]  # replaces rows by answers
-
-
 def _query(
     logits_at: LogitsAt,
     origin_mm: Float64[np.ndarray, " 3"],
     step_mm: float,
     shape: tuple[int, int, int],
-    flat: Int[np.ndarray, " n"],
-) -> Float32[np.ndarray, "n classes"]:
+    flat: Flat,
+) -> Rows:
     """The network's logits at flat indices of a lattice."""
     parts = []
     for first in range(0, len(flat), AT_ONCE):
@@ -92,16 +87,15 @@ def _query(
     return np.concatenate(parts)
 
 
-def refined(logits_at: LogitsAt, coarse: LogitLattice, policy: Policy) -> LogitLattice:
-    """The lattice of half the step: linear logits, the network's where the policy queries it."""
-    from tumortrack.occupancy.kernels import halved
-
+def refined(
+    logits_at: LogitsAt, coarse: LogitLattice, policy: Callable[[_Level, Rows], None]
+) -> LogitLattice:
+    """The lattice of half the step: linear logits, and the network's where the policy puts them."""
     i, j, k = (2 * n - 1 for n in coarse.logits.shape[:3])
-    level = _Level(logits_at, coarse, (i, j, k))
     logits = np.empty((i, j, k, coarse.logits.shape[3]), np.float32)
-    _in_slabs(partial(halved, coarse.logits, logits), i)
-    policy(level, logits.reshape(-1, logits.shape[3]))
-    return LogitLattice(coarse.origin_mm, level.step_mm, logits)
+    _in_slabs(partial(kernels.halved, coarse.logits, logits), i)
+    policy(_Level(logits_at, coarse, (i, j, k)), logits.reshape(-1, logits.shape[3]))
+    return LogitLattice(coarse.origin_mm, coarse.step_mm / 2, logits)
 
 
 def organ_lattice(
@@ -160,7 +154,7 @@ def sparse_logits(
     """
     logits = lattice.between(points_mm)
 
-    def query(some: Int[np.ndarray, " m"]) -> Float32[np.ndarray, "m classes"]:
+    def query(some: Flat) -> Rows:
         return logits_at(points_mm[some]).float().cpu().numpy()
 
     query_uncertain(logits, leading(logits)[1], query, InterpolationLimit(tail=0.99, safety=1.0))
@@ -171,8 +165,8 @@ def sparse_logits(
 class InterpolationLimit:
     """How far linear logits were found to be off: a label that leads by more is accepted.
 
-    ``coarser``: the limit at twice the step, 0 where there was none. The limit is a quantile,
-    ``tail``, of the errors found, times ``safety``.
+    It is a quantile, ``tail``, of the errors found, times ``safety``. ``coarser``: the limit at
+    twice the step, 0 where there was none.
     """
 
     limit: float = 0.0
@@ -196,9 +190,9 @@ class InterpolationLimit:
 
 
 def query_uncertain(
-    expected: Float32[np.ndarray, "n classes"],
+    expected: Rows,
     leads: Float32[np.ndarray, " n"],
-    query: Query,
+    query: Callable[[Flat], Rows],
     limit: InterpolationLimit,
 ) -> Bool[np.ndarray, " n"]:
     """Query wherever the expected label leads by too little; which were queried.
@@ -209,7 +203,6 @@ def query_uncertain(
     Args:
         expected: logits; replaced by the answers.
         leads: by how much the largest exceeds the second; infinite where it is known already.
-        query: indices (m,) -> logits (m, classes).
         limit: updated by the answers.
     """
     queried = np.zeros(len(leads), bool)
@@ -227,25 +220,22 @@ def query_uncertain(
         queried[now] = True
 
 
-def _connected(level: _Level, rows: Float32[np.ndarray, "n classes"]) -> None:
+def _connected(level: _Level, rows: Rows) -> None:
     """Query all points within two of a coarse one that lies inside, then all about those that turn
     out to lie inside, until none is left."""
-    from tumortrack.occupancy.kernels import neighbours
 
     def inside(flat: np.ndarray) -> np.ndarray:
         return flat[rows[flat].argmax(1) != OUTSIDE]
 
     known = level.known()
-    first = neighbours(level.shape, inside(np.flatnonzero(known)), known)
-    frontier = np.concatenate([first, neighbours(level.shape, first, known)])
+    first = kernels.neighbours(level.shape, inside(np.flatnonzero(known)), known)
+    frontier = np.concatenate([first, kernels.neighbours(level.shape, first, known)])
     while len(frontier):
         rows[frontier] = level.query(frontier)
-        frontier = neighbours(level.shape, inside(frontier), known)
+        frontier = kernels.neighbours(level.shape, inside(frontier), known)
 
 
-def _uncertain(
-    limit: InterpolationLimit, level: _Level, rows: Float32[np.ndarray, "n classes"]
-) -> None:
+def _uncertain(limit: InterpolationLimit, level: _Level, rows: Rows) -> None:
     """Query where linear logits do not settle the label, and about surprises."""
     leads = leading(rows)[1]
     leads[level.known()] = np.inf
@@ -258,9 +248,8 @@ def _voxels(
     level: _Level, limit: InterpolationLimit
 ) -> tuple[Float16[np.ndarray, "parts i j k"], UInt8[np.ndarray, "i j k"]]:
     """Margins and labels of the voxels. As ``_uncertain``, but logits of voxels far from surfaces
-    are never held: a cell whose corners lead clearly is filled with their label."""
-    from tumortrack.occupancy.kernels import filled
-
+    are never held: a cell whose corners lead clearly is filled with their label, and margins there
+    are the largest."""
     coarse = level.coarse.logits
     rows = coarse.reshape(-1, coarse.shape[3])
     certain, leads = (values.reshape(coarse.shape[:3]) for values in leading(rows))
@@ -268,81 +257,48 @@ def _voxels(
     seen = limit.coarser or float(np.quantile(leads, _FIRST_SEEN))
     while True:
         plain = np.where(leads >= np.float32(seen), certain, np.uint8(255))
-        lists = _in_slabs(partial(filled, coarse, certain, plain, labels), len(coarse))
+        lists = _in_slabs(partial(kernels.filled, coarse, certain, plain, labels), len(coarse))
         flat, expected, between = (np.concatenate(column) for column in zip(*lists, strict=True))
         lead = leading(expected)[1]
         lead[~between] = np.inf
-        queried = query_uncertain(expected, lead, partial(level.query_some, flat), limit)
+        query = partial(level.query_among, flat)
+        queried = query_uncertain(expected, lead, query, limit)
         if limit.limit <= seen:
             break
         seen = 2 * limit.limit  # voxels that lead by less were filled unseen
     more, found = _about_surprises(level, limit.limit, flat[queried], expected[queried])
     places, logits = np.concatenate([flat, more]), np.concatenate([expected, found])
     labels.reshape(-1)[places] = leading(logits)[0]
-    return _margins(labels, places, logits), labels
-
-
-def _margins(
-    labels: UInt8[np.ndarray, "i j k"],
-    places: Int[np.ndarray, " n"],
-    logits: Float32[np.ndarray, "n classes"],
-) -> Float16[np.ndarray, "parts i j k"]:
-    """The largest everywhere but at these places (flat), whose logits are known."""
-    from tumortrack.occupancy.kernels import spread
-
     margins = np.empty((logits.shape[1] - 1, *labels.shape), np.float16)
     inside, outside = np.array([LARGEST_MARGIN, -LARGEST_MARGIN], np.float16).view(np.uint16)
-    _in_slabs(partial(spread, labels, inside, outside, margins.view(np.uint16)), len(labels))
-    won = margins_of(torch.from_numpy(logits))
-    for part, margin in enumerate(margins):
-        margin.reshape(-1)[places] = won[:, part]
-    return margins
+    spread = partial(kernels.spread, labels, inside, outside, margins.view(np.uint16))
+    _in_slabs(spread, len(labels))
+    for margin, won in zip(margins, margins_of(torch.from_numpy(logits)).T, strict=True):
+        margin.reshape(-1)[places] = won
+    return margins, labels
 
 
 def _about_surprises(
-    level: _Level,
-    limit: float,
-    flat: Int[np.ndarray, " n"],
-    found: Float32[np.ndarray, "n classes"],
+    level: _Level, limit: float, flat: Flat, found: Rows
 ) -> tuple[Int[np.ndarray, " m"], Float32[np.ndarray, "m classes"]]:
     """Query every point that touches a surprise, until there is none; indices and logits.
 
     A surprise is another label than expected, by more than ``_SURPRISE`` of the ``limit``, since
-    linear logits are a little off everywhere.
-
-    Args:
-        flat, found: the points queried before, and their logits.
+    linear logits are a little off everywhere. ``flat`` and ``found``: the points queried before,
+    and their logits.
     """
-    from tumortrack.occupancy.kernels import expected_at, neighbours, surprising
-
-    def surprises_among(flat: np.ndarray, found: np.ndarray) -> np.ndarray:
-        expected = np.empty_like(found)
-        expected_at(level.coarse.logits, level.shape, flat, expected)
-        return flat[surprising(expected, found, np.float32(_SURPRISE * limit))]
-
-    more, logits = [np.zeros(0, np.int64)], [found[:0]]
-    surprises = surprises_among(flat, found)
-    if not len(surprises):
-        return more[0], logits[0]
-    known = level.known()
-    known[flat] = True
-    while len(surprises):
-        frontier = neighbours(level.shape, surprises, known)
-        if not len(frontier):
-            break
-        more.append(frontier)
-        logits.append(level.query(frontier))
-        surprises = surprises_among(frontier, logits[-1])
+    surprises = partial(
+        kernels.surprising, level.coarse.logits, level.shape, limit=np.float32(_SURPRISE * limit)
+    )
+    more, logits, surprised = [flat[:0]], [found[:0]], surprises(flat, found)
+    if len(surprised):
+        known = level.known()
+        known[flat] = True
+    while len(surprised) and len(flat := kernels.neighbours(level.shape, surprised, known)):
+        more.append(flat)
+        logits.append(found := level.query(flat))
+        surprised = surprises(flat, found)
     return np.concatenate(more), np.concatenate(logits)
-
-
-def leading(rows: Float32[np.ndarray, "n classes"]) -> tuple[np.ndarray, np.ndarray]:
-    """The label that leads in every row, and by how much."""
-    from tumortrack.occupancy.kernels import best
-
-    labels, leads = np.empty(len(rows), np.uint8), np.empty(len(rows), np.float32)
-    best(rows, labels, leads)
-    return labels, leads
 
 
 def _in_slabs(work: Callable[[int, int], object], planes: int) -> list[Any]:

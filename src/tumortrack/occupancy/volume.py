@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float, Float16, Float32, Float64, UInt8
 from tumortrack.core.errors import NoEstimate
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.types import FIRST_TUMOR, ORGAN, OUTSIDE, Mesh, OccupancyCloud
+from tumortrack.occupancy.kernels import between
 from tumortrack.simulate.occupancy import surface_distance
 
 AT_ONCE = 2**18  # queries; bounds the memory for any grid
@@ -38,24 +39,14 @@ class LogitLattice:
 
     def between(self, points_mm: Float32[np.ndarray, "n 3"]) -> Float32[np.ndarray, "n classes"]:
         """Trilinear logits at points; outside the lattice those of its border."""
-        from tumortrack.occupancy.kernels import between
-
-        out = np.empty((len(points_mm), self.logits.shape[3]), np.float32)
         place = ((points_mm - self.origin_mm) / self.step_mm).astype(np.float32)
-        between(self.logits, place, out)
-        return out
+        return between(self.logits, place)
 
     def cut_off(self) -> bool:
         """Whether the organ, the largest piece of what lies inside, reaches the border or is not
         there at all."""
-        from scipy import ndimage
-
-        pieces, count = ndimage.label(self.logits.argmax(-1) != OUTSIDE)
-        if not count:
-            return True
-        sizes = np.bincount(pieces.ravel())
-        largest = 1 + int(sizes[1:].argmax())
-        return bool(sizes[largest] > (pieces[1:-1, 1:-1, 1:-1] == largest).sum())
+        organ = _largest_piece(self.logits.argmax(-1) != OUTSIDE)
+        return not organ.any() or bool(organ.sum() > organ[1:-1, 1:-1, 1:-1].sum())
 
 
 def lattice_over(logits_at: LogitsAt, box_mm: Float[np.ndarray, "2 3"], steps: int) -> LogitLattice:
@@ -74,19 +65,16 @@ def dense_margins(
 
     Half precision: 2 bytes a voxel and part, 0.4 GB at 400^3 with two tumors.
     """
-    labels = np.empty(shape, np.uint8)
-    margins: np.ndarray | None = None
+    labels, margins = np.empty(shape, np.uint8), np.empty((0, *shape), np.float16)
     planes = max(1, AT_ONCE // (shape[1] * shape[2]))
     for first in range(0, shape[0], planes):
         block = (min(planes, shape[0] - first), *shape[1:])
         index = np.indices(block).reshape(3, -1).T + np.array([first, 0.0, 0.0])
         logits = logits_at(transform_points(camera_from_index, index).astype(np.float32))
-        won = margins_of(logits)
-        if margins is None:
-            margins = np.empty((won.shape[1], *shape), np.float16)
+        if first == 0:  # now the number of parts is known
+            margins = np.empty((logits.shape[1] - 1, *shape), np.float16)
         labels[first : first + planes] = logits.argmax(-1).byte().cpu().numpy().reshape(block)
-        margins[:, first : first + planes] = won.T.reshape(-1, *block)
-    assert margins is not None
+        margins[:, first : first + planes] = margins_of(logits).T.reshape(-1, *block)
     return margins, labels
 
 
@@ -170,9 +158,8 @@ def _largest_piece(mask: Bool[np.ndarray, "i j k"]) -> Bool[np.ndarray, "i j k"]
 def _box_of(mask: Bool[np.ndarray, "i j k"], margin: int = 0) -> tuple[slice, ...]:
     """Where a mask is true, and ``margin`` voxels more on each side."""
     box = []
-    for axis in range(3):
-        across = tuple(other for other in range(3) if other != axis)
-        found = np.flatnonzero(mask.any(axis=across))
+    for others in ((1, 2), (0, 2), (0, 1)):
+        found = np.flatnonzero(mask.any(axis=others))
         first, last = (int(found[0]), int(found[-1]) + 1) if len(found) else (0, 0)
         box.append(slice(max(first - margin, 0), last + margin))
     return tuple(box)
@@ -185,6 +172,8 @@ def part_surfaces(
     names: tuple[str, ...],
 ) -> dict[str, Mesh]:
     """Each part, in one piece, as a closed surface; parts without a voxel are left out."""
+    from skimage import measure
+
     meshes = {}
     for n, name in enumerate(names):
         mask = labels > 0 if n == 0 else labels == n + 1
@@ -192,23 +181,16 @@ def part_surfaces(
             continue
         # One voxel more on each side: the surface lies between voxels of either sign.
         box = _box_of(mask, 1)
-        field = np.where(mask[box], margins[n][box], -np.abs(margins[n][box]))
-        meshes[name] = _surface(field.astype(np.float32), camera_from_index, box)
+        field = np.where(mask[box], margins[n][box], -np.abs(margins[n][box])).astype(np.float32)
+        field = np.where(field > 0, 1, -1) * np.maximum(np.abs(field), _SMALLEST_MARGIN)
+        # Padding closes what the grid's edge cuts.
+        padded = np.pad(field, 1, constant_values=-float(np.abs(field).max()))
+        vertices, faces, _, _ = measure.marching_cubes(padded, 0.0, gradient_direction="ascent")
+        index = vertices.astype(np.float64) - 1 + [part.start for part in box]
+        mesh = Mesh(transform_points(camera_from_index, index), faces)
+        outwards = mesh.volume_mm3 > 0
+        meshes[name] = mesh if outwards else Mesh(mesh.vertices_mm, faces[:, ::-1])
     return meshes
-
-
-def _surface(
-    field: np.ndarray, camera_from_index: Float64[np.ndarray, "4 4"], box: tuple[slice, ...]
-) -> Mesh:
-    from skimage import measure
-
-    field = np.where(field > 0, 1, -1) * np.maximum(np.abs(field), _SMALLEST_MARGIN)
-    # Padding closes what the grid's edge cuts.
-    padded = np.pad(field, 1, constant_values=-float(np.abs(field).max()))
-    vertices, faces, _, _ = measure.marching_cubes(padded, 0.0, gradient_direction="ascent")
-    index = vertices.astype(np.float64) - 1 + [part.start for part in box]
-    mesh = Mesh(transform_points(camera_from_index, index), faces)
-    return mesh if mesh.volume_mm3 > 0 else Mesh(mesh.vertices_mm, faces[:, ::-1])
 
 
 def surface_distances(

@@ -3,13 +3,15 @@
 Unknown are a rigid motion and the coefficients of the body's modes. The most likely ones, given
 points with errors and the library of states as a Gaussian prior, minimise
 
-    n_effective / n * sum of rho(distance of a point, carried back to the CT, to the organ / sigma)
-    + the squared Mahalanobis distance of the coefficients from the library's mean.
+    (last_mm / sigma_mm)^2 * min(n_effective / n, 1) * sum of rho(d / last_mm)
+    + the squared Mahalanobis distance of pose and coefficients from the prior's mean,
+
+d being the distance (mm) of a point, carried back to the CT, to the organ's surface, and rho a
+robust kernel: (d / sigma_mm)^2 for small d.
 
 The distance is looked up in a field, so no nearest point is searched. The same curvature is the
 estimate's uncertainty. Source: surface registration as maximum a posteriori with a statistical
-shape prior, e.g. Heimann and Meinzer 2009 (doi 10.1016/j.media.2009.05.004); rho: Geman and
-McClure 1987.
+shape prior, e.g. Heimann and Meinzer 2009 (doi 10.1016/j.media.2009.05.004).
 """
 
 from __future__ import annotations
@@ -22,8 +24,8 @@ from jaxtyping import Float, Float64
 from tumortrack.models.config import GaussNewtonConfig
 from tumortrack.registration import gauss_newton_kernels as kernels
 from tumortrack.registration.motion import ElasticMotion
-from tumortrack.registration.residual_kernels import DistanceLattice
 from tumortrack.registration.rest_shape import RestShape
+from tumortrack.simulate.elastic.flow import LatticeField
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,18 +65,10 @@ class GaussNewton:
         start: ElasticMotion,
         config: GaussNewtonConfig,
     ) -> None:
-        body, field, count = rest.body, rest.distances[0], len(points_mm)
+        body, count, precision = rest.body, len(points_mm), _prior(rest, config)
         self._rest, self._points = rest, np.ascontiguousarray(points_mm, np.float32)
-        precision = _prior(rest, config)
-        self._organ = kernels.Organ(
-            body.modes,
-            body.origin_mm,
-            np.float32(body.spacing_mm),
-            body.center_ct,
-            DistanceLattice(field.values_mm, field.origin_mm, np.float32(field.spacing_mm)),
-            precision,
-            body.mean,
-        )
+        modes = LatticeField(body.modes, body.origin_mm, np.float32(body.spacing_mm))
+        self._organ = kernels.Organ(modes, body.center_ct, rest.distances[0], precision, body.mean)
         self._options = kernels.Options(
             weight=min(config.n_effective / count, 1.0) / config.sigma_mm**2,
             first_mm=config.first_mm,
@@ -84,26 +78,28 @@ class GaussNewton:
         )
         given = start.rotation, start.centre_mm, start.coefficients, np.zeros(6)
         # In C's order, whatever was given: the kernel is compiled for that.
-        self._state = kernels.State._make(np.array(part, float, order="C") for part in given)
-        gradient = np.empty(len(precision))
-        distances = np.empty(count, np.float32)
-        self._residuals = kernels.Residuals(distances, np.empty_like(precision), gradient)
+        self._state = kernels.State(
+            *(np.array(part, float, order="C") for part in given),
+            distances_mm=np.empty(count, np.float32),
+            curvature=np.empty_like(precision),
+            gradient=np.empty(len(precision)),
+        )
         self.cost, self.steps, self.converged = np.inf, 0, False
 
     def run(self, steps: int) -> None:
         """Continue until ``steps`` are taken since the start, or it has converged."""
         if self.converged or (steps <= self.steps and np.isfinite(self.cost)):
             return
-        problem = self._organ, self._points, self._options, self._state, self._residuals
+        problem = self._organ, self._points, self._options, self._state
         self.steps, self.converged, self.cost = kernels.descend(*problem, self.steps, steps)
 
     def result(self) -> RegistrationResult:
         """The present state."""
-        rotation, centre_mm, coefficients, _ = (part.copy() for part in self._state)
-        covariance = np.linalg.inv(self._residuals.curvature)
-        motion = ElasticMotion(self._rest, rotation, centre_mm, coefficients, covariance)
-        distances_mm = self._residuals.distances_mm.copy()
-        return RegistrationResult(motion, self.cost, distances_mm, self.steps)
+        state = kernels.State._make(part.copy() for part in self._state)
+        covariance = np.linalg.inv(state.curvature)
+        placed = state.rotation, state.centre_mm, state.coefficients
+        motion = ElasticMotion(self._rest, *placed, covariance)
+        return RegistrationResult(motion, self.cost, state.distances_mm, self.steps)
 
 
 def _prior(rest: RestShape, config: GaussNewtonConfig) -> Float64[np.ndarray, "p p"]:

@@ -9,20 +9,24 @@ from typing import Any
 from safetensors.numpy import load, save
 
 from tumortrack.core.config import Config, from_builtins, to_builtins
+from tumortrack.core.errors import InputError
 from tumortrack.models.config import NetworkConfig
 from tumortrack.models.folder import SHAPE
 from tumortrack.models.model import Model
+from tumortrack.registration.gauss_newton_kernels import KERNEL
 from tumortrack.registration.network import RegistrationNetwork
 from tumortrack.registration.registration import Registration
 from tumortrack.registration.rest_shape import RestShape
 
 
-class UncertaintyCalibration(Config, frozen=True):
-    """What validation scenes taught: standard deviations are multiplied by ``std_scale``; a fit
-    that costs more than ``usual_cost`` is tried from other starts."""
+class UncertaintyCalibration(Config, frozen=True, omit_defaults=True):
+    """What validation scenes taught: standard deviations are multiplied by ``std_scale``; where a
+    fit costs more than ``usual_cost``, turned starts are tried. Both hold for one robust kernel;
+    folders that name none were made with the first."""
 
     std_scale: float
     usual_cost: float
+    kernel: str = "geman-mcclure"
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -54,4 +58,9 @@ class RegistrationModel(Model):
         shape = RestShape.from_arrays(load((folder / SHAPE).read_bytes()), len(common["parts"]))
         where = f"{folder}: trust"
         calibration = from_builtins(manifest["trust"], UncertaintyCalibration, where)
+        if calibration.kernel != KERNEL:
+            raise InputError(
+                f"{folder}: its fits were calibrated with the robust kernel {calibration.kernel}; "
+                f"here it is {KERNEL}. Make it again: tumortrack train CASE {folder} --overwrite."
+            )
         return cls(shape=shape, calibration=calibration, **common)

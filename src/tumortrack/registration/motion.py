@@ -11,8 +11,8 @@ from jaxtyping import Float, Float32, Float64
 from scipy.spatial.transform import Rotation
 
 from tumortrack.core.process import parallel_for
-from tumortrack.registration import residual_kernels as kernels
-from tumortrack.registration.residual_kernels import Flow, Pose
+from tumortrack.registration import kernels
+from tumortrack.registration.kernels import Flow, Pose
 from tumortrack.registration.rest_shape import RestShape
 from tumortrack.simulate.elastic.flow import steps_for
 
@@ -56,12 +56,12 @@ class ElasticMotion:
 
     def carry(self, points_ct: Float[np.ndarray, "n 3"], /) -> Float64[np.ndarray, "n 3"]:
         """CT (LPS, mm) -> camera frame (mm)."""
-        return self._gone(kernels.carry, self._flow, points_ct)
+        return self._moved(kernels.carry, self._flow, points_ct)
 
     def back(self, points_camera: Float[np.ndarray, "n 3"], /) -> Float64[np.ndarray, "n 3"]:
         """Camera frame (mm) -> CT (LPS, mm)."""
         opposite = self._flow._replace(velocity=-self._flow.velocity)
-        return self._gone(kernels.back, opposite, points_camera)
+        return self._moved(kernels.back, opposite, points_camera)
 
     def std_mm(self, points_ct: Float[np.ndarray, "n 3"], /) -> Float64[np.ndarray, " n"] | None:
         """One standard deviation along any axis, mm: the pose's and the state's, to first order."""
@@ -75,7 +75,7 @@ class ElasticMotion:
         )
         return self.std_scale * np.sqrt(variance.astype(float))
 
-    def _gone(
+    def _moved(
         self, kernel: Callable[..., None], flow: Flow, points_mm: Float[np.ndarray, "n 3"]
     ) -> Float64[np.ndarray, "n 3"]:
         points, out = np.ascontiguousarray(points_mm, np.float32), np.empty((len(points_mm), 3))

@@ -8,8 +8,7 @@ undo a wrong turn by absurd deformations.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, fields
 
 import numpy as np
 import torch
@@ -22,11 +21,10 @@ from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import rotation_onto
 from tumortrack.models.config import NetworkConfig, RegistrationHeadConfig
 from tumortrack.models.layers import Layer
-from tumortrack.models.model import Network
+from tumortrack.models.model import Network, OnnxParts
 from tumortrack.models.normalisation import Aligned, alignment, turned, without_strays
 from tumortrack.registration.rest_shape import RestShape
 
-_PLACES = ("rotation", "centre_mm", "coefficients", "right_way")
 _LARGEST = 4.0  # coefficients lie within so many standard deviations of the library's mean
 _SMALL_START = 0.3  # of the last layer's weights
 _STEP = 0.5  # of the organ's half length: what an output of 1 moves it by
@@ -58,17 +56,13 @@ class AlignedCloud:
 @dataclass(frozen=True, eq=False)
 class PoseHypothesis:
     """Where organs lie and how they are deformed: rotation and centre (camera frame, mm), so that
-    a point x of the CT, deformed to y, lies at ``rotation (y - center_ct) + centre_mm``."""
+    a point x of the CT, deformed to y, lies at ``rotation (y - center_ct) + centre_mm``. The fields
+    are also what an ONNX file gives."""
 
     rotation: Tensor  # (B, 3, 3)
     centre_mm: Tensor  # (B, 3)
     coefficients: Tensor  # (B, M)
     right_way: Tensor  # (B,), logit
-
-    def __getitem__(self, rows: slice) -> PoseHypothesis:
-        return PoseHypothesis(
-            self.rotation[rows], self.centre_mm[rows], self.coefficients[rows], self.right_way[rows]
-        )
 
 
 class RegistrationNetwork(Network):
@@ -87,7 +81,7 @@ class RegistrationNetwork(Network):
         if not isinstance(config.decoder, RegistrationHeadConfig) or not isinstance(
             config.normalisation, Aligned
         ):
-            raise InputError("a registration network needs the warp decoder and aligned clouds.")
+            raise InputError("a registration network needs the decoder `warp` and aligned clouds.")
         self.config = config
         self.scale_mm, self.reach = config.normalisation.scale_mm, config.normalisation.reach
         modes, width = config.decoder.modes, config.decoder.width
@@ -163,22 +157,14 @@ class RegistrationNetwork(Network):
         bounded = _LARGEST * torch.tanh(out[:, POSE_OUTPUTS:] / _LARGEST)
         return PoseHypothesis(rotation, centre_mm, self.mean + self.std * bounded, out[:, 9])
 
-    def loss(
-        self,
-        clouds_mm: Tensor,
-        points_mm: Tensor,
-        labels: Tensor,
-        camera_from_ct: Tensor,
-        *,
-        first: int = 0,
-    ) -> Tensor:
-        """How far the known points (B, P, 3) are from where the placements carry them, with and
-        without deformation, and how well the right way round is told. ``labels`` is not used.
+    def loss(self, *scenes: Tensor, first: int = 0) -> Tensor:
+        """How far the known points (B, P, 3) are from where the hypotheses carry them, with and
+        without deformation, and how well the right way round is told. Labels are not used.
 
-        The deformation counts to first order: the displacement at the points' places at rest.
-        ``first``: the first cloud's number in a batch that several processes share; the mean of
-        equal shares' losses is the whole batch's.
+        The deformation counts to first order: the displacement at the points' places at rest. The
+        mean of equal shares' losses is the whole batch's.
         """
+        clouds_mm, points_mm, _, camera_from_ct = scenes
         aligned = self.align(clouds_mm)
         with torch.autocast(clouds_mm.device.type, enabled=False):
             true_rotation = camera_from_ct[:, :3, :3]
@@ -203,37 +189,38 @@ class RegistrationNetwork(Network):
         told = functional.softplus(self(few).right_way).sum()
         return told / (len(wrong.points) / _FLIPPED_SHARE)
 
-    def onnx_parts(self, cloud_mm: Tensor) -> tuple[nn.Module, tuple[Tensor, ...], dict[str, Any]]:
+    def onnx_parts(self, cloud_mm: Tensor) -> OnnxParts:
         """See ``Network``: clouds in, hypotheses of both ways round out."""
-        names = {"input_names": ["cloud_mm"], "output_names": list(_PLACES)}
-        return _FlipHypotheses(self).cpu().eval(), (cloud_mm,), names
+        outputs = [field.name for field in fields(PoseHypothesis)]
+        names = {"input_names": ["cloud_mm"], "output_names": outputs}
+        return _Exported(self).cpu().eval(), (cloud_mm,), names
 
-    def flip_hypotheses(self, points_mm: Tensor) -> tuple[PoseHypothesis, PoseHypothesis]:
-        """Placements for the clouds as they were turned, and for half a turn more."""
+    def flip_hypotheses(self, points_mm: Tensor) -> PoseHypothesis:
+        """Hypotheses (2B) for clouds (B, N, 3) as they were turned, then for half a turn more.
+
+        One batch: a network this small takes as long for two clouds as for one.
+        """
         one = self.align(points_mm)
         other = one.flipped(-torch.ones_like(one.centre_mm[:, 0]))
-        # One batch: a network this small takes as long for two clouds as for one.
-        both = self(
+        return self(
             AlignedCloud(
                 torch.cat([one.points, other.points]),
                 torch.cat([one.centre_mm, other.centre_mm]),
                 torch.cat([one.turn, other.turn], 1),
             )
         )
-        return both[: len(points_mm)], both[len(points_mm) :]
 
 
-class _FlipHypotheses(nn.Module):
-    """A cloud (1, N, 3) -> the hypotheses' four arrays, (2, ...) each: as the cloud was turned, and
-    half a turn more."""
+class _Exported(nn.Module):
+    """A cloud (1, N, 3) -> the arrays of ``flip_hypotheses``, (2, ...) each."""
 
     def __init__(self, network: RegistrationNetwork) -> None:
         super().__init__()
         self.network = network
 
     def forward(self, cloud_mm: Tensor) -> tuple[Tensor, ...]:
-        ways = self.network.flip_hypotheses(cloud_mm)
-        return tuple(torch.cat([getattr(way, name) for way in ways]) for name in _PLACES)
+        found = self.network.flip_hypotheses(cloud_mm)
+        return tuple(getattr(found, field.name) for field in fields(found))
 
 
 def facing_rotation(
