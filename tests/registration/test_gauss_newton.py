@@ -107,13 +107,18 @@ def test_sums_are_those_of_the_rows_and_rows_those_of_plain_arithmetic(state):
     lattice = body.origin_mm, np.float32(body.spacing_mm)
     field = shape().distances[0]
     kernels.normal_equations(
-        kernels.Organ(
-            LatticeField(body.modes, *lattice), body.center_ct, field, np.eye(2), body.mean
+        kernels.Problem(
+            LatticeField(body.modes, *lattice),
+            body.center_ct,
+            field,
+            np.eye(2),
+            body.mean,
+            points,
+            *(1.0, 5.0, 1.0, 0.7, 0.02),
         ),
         Flow(velocity, *lattice, steps_for(velocity, body.spacing_mm)),
         Pose(body.center_ct, *pose[:2]),
         np.float32(2),
-        points,
         (np.empty((BLOCK, unknowns + 1), np.float32), np.zeros((28, 300), np.float32)),
         left,
     )

@@ -25,9 +25,8 @@ def transform_points(
     b_from_a: Float[np.ndarray, "4 4"], points_a: Float[np.ndarray, "n 3"]
 ) -> Float[np.ndarray, "n 3"]:
     """Carry points (n, 3) from frame a to frame b by a 4 x 4 affine transform."""
-    return points_a @ b_from_a[:3, :3].T.astype(points_a.dtype) + b_from_a[:3, 3].astype(
-        points_a.dtype
-    )
+    linear, shift = b_from_a[:3, :3].T, b_from_a[:3, 3]
+    return points_a @ linear.astype(points_a.dtype) + shift.astype(points_a.dtype)
 
 
 def rigid(
@@ -44,8 +43,7 @@ def rotation_onto(
     source: Float[np.ndarray, " 3"], target: Float[np.ndarray, " 3"]
 ) -> Float[np.ndarray, "3 3"]:
     """The smallest rotation matrix that turns the direction ``source`` onto ``target``."""
-    a = np.asarray(source, float) / np.linalg.norm(source)
-    b = np.asarray(target, float) / np.linalg.norm(target)
+    a, b = unit(np.asarray(source, float)), unit(np.asarray(target, float))
     middle = a + b
     if np.linalg.norm(middle) < 1e-8:  # opposite: half a turn about any perpendicular axis
         middle = np.cross(a, np.eye(3)[np.argmin(np.abs(a))])
@@ -55,11 +53,8 @@ def rotation_onto(
 
 
 def direction_lps(text: str) -> tuple[float, float, float]:
-    """A unit vector in LPS from a name (``anterior``) or three numbers (``0,-1,0``).
-
-    Raises:
-        InputError: neither a known name nor a non-zero finite 3-vector.
-    """
+    """A unit vector in LPS from a name (``anterior``) or three numbers (``0,-1,0``); InputError for
+    neither a known name nor a non-zero finite 3-vector."""
     if text.lower() in DIRECTIONS_LPS:
         return DIRECTIONS_LPS[text.lower()]
     try:

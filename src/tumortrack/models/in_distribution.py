@@ -30,11 +30,8 @@ _LARGEST_MAHALANOBIS_2 = 1.25
 
 
 class InDistributionRange(Config, frozen=True):
-    """What the clouds of the validation scenes were like.
-
-    ``spread_mm``: smallest and largest ``spread_mm``; ``fit_mm``: the 95th percentile over the
-    scenes of ``fit_mm``.
-    """
+    """What the clouds of the validation scenes were like: smallest and largest ``spread_mm``, and
+    the 95th percentile of ``fit_mm``."""
 
     spread_mm: tuple[float, float]
     fit_mm: float
@@ -56,12 +53,8 @@ def check_in_distribution(
     points_mm: Float[np.ndarray, "n 3"],
     distances_mm: Float[np.ndarray, " n"],
 ) -> None:
-    """Refuse a cloud that cannot be the organ's; ``distances_mm``: from the estimated surface.
-
-    Raises:
-        NoEstimate: the points spread over much more or less than in any validation scene, or
-            lie much farther from the estimated surface.
-    """
+    """NoEstimate for a cloud that cannot be the organ's: its points spread over much more or less
+    than in any validation scene, or lie much farther from the estimated surface."""
     spread, fit = spread_mm(points_mm), fit_mm(distances_mm)
     low, high = known.spread_mm[0] / _SPREAD_FACTOR, known.spread_mm[1] * _SPREAD_FACTOR
     if not low <= spread <= high:
@@ -81,14 +74,8 @@ def check_in_distribution(
 
 
 def check_likely(mahalanobis_2: float) -> None:
-    """Refuse what only an implausible deformation of the organ explains.
-
-    Args:
-        mahalanobis_2: the state's squared Mahalanobis distance, in units of the library's mean.
-
-    Raises:
-        NoEstimate: it is too large.
-    """
+    """NoEstimate for what only an implausible deformation of the organ explains: a state's squared
+    Mahalanobis distance, in units of the library's mean, is too large."""
     if mahalanobis_2 > _LARGEST_MAHALANOBIS_2:
         raise NoEstimate(
             f"the cloud does not show this model's organ: only a deformation {mahalanobis_2:.1f} "

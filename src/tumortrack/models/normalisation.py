@@ -59,17 +59,12 @@ def without_strays(points_mm: Tensor, reach_mm: float) -> Tensor:
     that background moves it little (10 % of a plane behind a kidney: 0.5 mm, the mean of all by
     5 mm). The order of the points that stay is kept.
     """
-    if compiled(points_mm) and not points_mm.requires_grad:
+    if compiled(points_mm):
         from tumortrack.models.kernels import near as gathered
 
         out = torch.empty_like(points_mm, memory_format=torch.contiguous_format)
         gathered(points_mm.contiguous().numpy(), np.float32(reach_mm), out.numpy())
         return out
-    return _without_strays(points_mm, reach_mm)
-
-
-def _without_strays(points_mm: Tensor, reach_mm: float) -> Tensor:
-    """The reference, for every device."""
     n = points_mm.shape[1]
     if torch.jit.is_tracing():  # ONNX has no median
         middle = points_mm.sort(dim=1).values[:, (n - 1) // 2, None]

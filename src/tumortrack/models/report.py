@@ -24,12 +24,8 @@ CLOUD_POINTS = 40_000  # of an estimate made of surfaces
 
 
 class Frame:
-    """One cloud on its way to an estimate, camera frame, mm: ``points_mm`` are those that the
-    network sees, ``seconds`` what each stage took.
-
-    Raises:
-        NoEstimate, InputError: see ``sense.cloud.check_cloud``.
-    """
+    """One cloud (camera frame, mm; checked by ``check_cloud``) on its way to an estimate:
+    ``points_mm`` are those that the network sees, ``seconds`` what each stage took."""
 
     def __init__(self, model: Model, cloud: SensorCloud, seed: int, rng: Rng) -> None:
         check_cloud(cloud)
@@ -48,35 +44,26 @@ class Frame:
         self.seconds[name] = time.perf_counter() - start
 
     def report(
-        self,
-        distances_mm: Float[np.ndarray, " n"],
-        parts: dict[str, dict[str, Any]],
-        voxel_mm: float | None = None,
-        **more: object,
+        self, distances_mm: Float[np.ndarray, " n"], parts: dict[str, Any], **more: object
     ) -> dict[str, Any]:
         """report.json. ``distances_mm``: of the observed points from the estimated surface."""
         return {
-            **_head(self.cloud.stamp_ns, voxel_mm),
+            **_head(self.cloud.stamp_ns),
             "seed": self.seed,
             "points": len(self.cloud.points_mm),
+            **more,
             "fit_mm": {
                 "median": float(np.median(distances_mm)),
                 "p95": float(np.percentile(distances_mm, 95)),
             },
             "parts": parts,
-            **more,
             "timings": {**self.seconds, "total": sum(self.seconds.values())},
         }
 
 
-def _head(stamp_ns: int, voxel_mm: float | None) -> dict[str, Any]:
-    head = {
-        "tumortrack": tumortrack.__version__,
-        "units": "mm",
-        "frame": "camera",
-        "stamp_ns": stamp_ns,
-    }
-    return head if voxel_mm is None else {**head, "voxel_mm": voxel_mm}
+def _head(stamp_ns: int) -> dict[str, Any]:
+    about = {"tumortrack": tumortrack.__version__, "units": "mm", "frame": "camera"}
+    return {**about, "stamp_ns": stamp_ns}
 
 
 def grid_over(
@@ -128,12 +115,8 @@ def estimate_of(
     meshes: dict[str, Mesh], grid: int = 160, stamp_ns: int = 0, **report: object
 ) -> Estimate:
     """Surfaces of any method (camera frame, mm) as an estimate: labels are voxelised from them,
-    points are evenly chosen voxels with probability 1.
-
-    Args:
-        grid: voxels along the longest side of the labelled volume.
-        report: further entries of the estimate's report.
-    """
+    ``grid`` voxels along the longest side; points are evenly chosen voxels with probability 1.
+    ``report``: further entries of the estimate's report."""
     anatomy = Anatomy(tuple(meshes.values()))
     camera_from_index, shape = grid_over(anatomy.organ.vertices_mm, grid)
     labels = label_grid(anatomy, camera_from_index, shape)
@@ -148,7 +131,8 @@ def estimate_of(
         CameraLabels(labels, camera_from_index),
         meshes,
         {
-            **_head(stamp_ns, float(camera_from_index[0, 0])),
+            **_head(stamp_ns),
+            "voxel_mm": float(camera_from_index[0, 0]),
             "parts": describe_parts(tuple(meshes), meshes, inside),
             **report,
         },

@@ -83,11 +83,8 @@ def place_of(folder: Path, machine: Machine, threads: int) -> Path:
 
 
 def save(folder: Path, compiled: Compiled) -> Path:
-    """Write it into a model folder, over an older one of the same machine and threads.
-
-    Raises:
-        StorageError: the disk refused.
-    """
+    """Write it into a model folder, over an older one of the same machine and threads; StorageError
+    where the disk refuses."""
     path = place_of(folder, compiled.machine, compiled.threads)
     try:
         path.parent.mkdir(exist_ok=True)
@@ -122,11 +119,7 @@ def find(folder: Path, weights_sha256: str) -> tuple[Arithmetic | None, str | No
 
 
 def read(path: Path) -> Compiled:
-    """One file of MODEL/compiled.
-
-    Raises:
-        ArtifactError: damaged, or of another schema.
-    """
+    """One file of MODEL/compiled; ArtifactError where it is damaged or of another schema."""
     content = store.read_json(path)
     if content.get("schema") != SCHEMA:
         raise ArtifactError(f"{path} is of another version of tumortrack.")

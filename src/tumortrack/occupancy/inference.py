@@ -68,11 +68,7 @@ def usual(device: torch.device) -> Arithmetic:
 
 
 class Inference:
-    """A network in use, on the device where it lies.
-
-    Args:
-        arithmetic: how queries are answered; None: what is usually fastest.
-    """
+    """A network in use, where it lies; ``arithmetic`` None: what is usually fastest."""
 
     def __init__(self, network: OccupancyNetwork, arithmetic: Arithmetic | None = None) -> None:
         self.network = network.folded()
@@ -155,13 +151,10 @@ def pack_stacks(encoder: nn.Module) -> None:
 
 
 class PackedDecoder(MlpDecoder):
-    """A folded decoder of one cloud's queries, in ``dtype``.
+    """A folded decoder of one cloud's queries, ``rows`` at once, in ``dtype``.
 
     In bf16 a coordinate would be rounded to a tenth of a millimetre; so what the rounding took
     is given as three more inputs, and positions stay exact.
-
-    Args:
-        rows: queries at once; their activations should stay in the cache.
     """
 
     def __init__(self, decoder: MlpDecoder, dtype: torch.dtype, rows: int) -> None:

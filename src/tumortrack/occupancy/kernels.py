@@ -104,16 +104,13 @@ def filled(coarse, labels, plain, fine, first, last):  # type: ignore[no-untyped
     """The voxels between the points of the last lattice but one, cell by cell.
 
     A cell whose corners agree and all lead by the limit holds no voxel that leads by less: it is
-    filled with their label. The voxels of all others are listed.
+    filled with their label. The voxels of all others are listed: flat indices (n,), linear logits
+    (n, classes), and whether they lie between coarse points.
 
     Args:
         coarse, labels: logits (a, b, c, classes), and their labels.
         plain: the labels that lead by the limit, 255 for the others.
         fine: labels (i, j, k); filled between the coarse planes ``first`` to ``last``.
-
-    Returns:
-        Flat indices (n,) of the listed voxels, their linear logits (n, classes), and whether they
-        lie between coarse points.
     """
     _, n_j, n_k = fine.shape
     confident = np.empty(coarse.shape[2], np.uint8)

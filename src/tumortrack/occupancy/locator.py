@@ -15,25 +15,11 @@ from tumortrack.core.estimate import Estimate, Following
 from tumortrack.core.types import Anatomy, CameraLabels, OccupancyCloud, SensorCloud
 from tumortrack.models.in_distribution import check_in_distribution
 from tumortrack.models.report import Frame, Rng, describe_parts, grid_over
+from tumortrack.occupancy import volume
 from tumortrack.occupancy.inference import Inference
 from tumortrack.occupancy.kernels import leading
 from tumortrack.occupancy.model import OccupancyModel
-from tumortrack.occupancy.sparse import (
-    halved_lattice,
-    organ_lattice,
-    sparse_logits,
-    sparse_margins,
-)
-from tumortrack.occupancy.volume import (
-    FIT_STEPS,
-    LogitLattice,
-    drop_islands,
-    keep_largest_pieces,
-    lattice_over,
-    margins_on,
-    part_surfaces,
-    surface_distances,
-)
+from tumortrack.occupancy.sparse import halved_lattice, organ_lattice, sparse_logits, sparse_margins
 
 COARSE_QUERIES = 10_000
 FINE_QUERIES = 40_000
@@ -90,7 +76,7 @@ class OccupancyLocator:
         with frame.stage("volume"):
             finer = halved_lattice(frame.logits_at, lattice)
         inside = frame.inside(finer)
-        return replace(frame.estimate(distances_mm, inside, *margins_on(finer)), volume=None)
+        return replace(frame.estimate(distances_mm, inside, *volume.margins_on(finer)), volume=None)
 
     def warm(self) -> None:
         """See ``tracking.tracker.Tracker.warm``."""
@@ -104,13 +90,12 @@ class OccupancyLocator:
                 step(finer)
         ball = np.linalg.norm(np.indices((16, 16, 16)).T - 7.5, axis=-1) < 5
         margins = np.where(ball, 1, -1).astype(np.float16)[None]
-        for mesh in part_surfaces(margins, ball.astype(np.uint8), np.eye(4), ("kidney",)).values():
-            assert mesh.volume_mm3 > 0
+        volume.part_surfaces(margins, ball.astype(np.uint8), np.eye(4), ("kidney",))
 
 
 def steps_over(box: Box) -> int:
     """Steps of the lattice along a box's longest side."""
-    return max(FIT_STEPS, math.ceil(float((box[1] - box[0]).max()) / _LATTICE_MM))
+    return max(volume.FIT_STEPS, math.ceil(float((box[1] - box[0]).max()) / _LATTICE_MM))
 
 
 class _Frame(Frame):
@@ -141,19 +126,19 @@ class _Frame(Frame):
         margin = 0.05 * (high - low) + gap / 2
         return np.stack([low - margin, high + margin])
 
-    def lattice(self, box: Box, everywhere: bool = False) -> LogitLattice:
-        over = lattice_over if everywhere else organ_lattice
+    def lattice(self, box: Box, everywhere: bool = False) -> volume.LogitLattice:
+        over = volume.lattice_over if everywhere else organ_lattice
         with self.stage("lattice"):
             return over(self.logits_at, box, steps_over(box))
 
-    def checked(self, lattice: LogitLattice) -> Float32[np.ndarray, " n"]:
+    def checked(self, lattice: volume.LogitLattice) -> Float32[np.ndarray, " n"]:
         """How far the points lie from the surface, if this can be the organ."""
         with self.stage("fit"):
-            distances_mm = surface_distances(lattice, self.points_mm)
+            distances_mm = volume.surface_distances(lattice, self.points_mm)
             check_in_distribution(self.model.in_distribution, self.points_mm, distances_mm)
         return distances_mm
 
-    def inside(self, lattice: LogitLattice) -> OccupancyCloud:
+    def inside(self, lattice: volume.LogitLattice) -> OccupancyCloud:
         """Those of 40,000 random points in the lattice's box that lie inside."""
         with self.stage("fine"):
             low, high = lattice.box_mm
@@ -178,9 +163,9 @@ class _Frame(Frame):
         """Everything read off margins and labels of a grid."""
         names = self.model.parts
         with self.stage("surfaces"):
-            labels = keep_largest_pieces(found, len(names))
-            inside = drop_islands(inside, found, labels, camera_from_index)
-            meshes = part_surfaces(margins, labels, camera_from_index, names)
+            labels = volume.keep_largest_pieces(found, len(names))
+            inside = volume.drop_islands(inside, found, labels, camera_from_index)
+            meshes = volume.part_surfaces(margins, labels, camera_from_index, names)
         parts = describe_parts(names, meshes, inside)
-        report = self.report(distances_mm, parts, float(camera_from_index[0, 0]))
+        report = self.report(distances_mm, parts, voxel_mm=float(camera_from_index[0, 0]))
         return Estimate(inside, CameraLabels(labels, camera_from_index), meshes, report)

@@ -35,9 +35,9 @@ from tumortrack.occupancy.volume import (
     LARGEST_MARGIN,
     LogitLattice,
     LogitsAt,
-    dense_margins,
     lattice_over,
     margins_of,
+    margins_on,
 )
 
 START_MM = 4.0
@@ -61,7 +61,9 @@ class _Level:
         half_mm = self.coarse.step_mm / 2
         return _query(self.logits_at, self.coarse.origin_mm, half_mm, self.shape, flat)
 
-    def query_among(self, flat: Flat, some: Int[np.ndarray, " m"]) -> Rows:
+    def query_among(
+        self, flat: Flat, some: Int[np.ndarray, " m"]
+    ) -> Float32[np.ndarray, "m classes"]:
         return self.query(flat[some])
 
     def known(self) -> Bool[np.ndarray, " n"]:
@@ -121,8 +123,8 @@ def sparse_margins(
     shape: tuple[int, int, int],
     start_mm: float = START_MM,
 ) -> tuple[Float16[np.ndarray, "parts i j k"], UInt8[np.ndarray, "i j k"]]:
-    """What ``dense_margins`` returns; far from all surfaces margins are the largest there are,
-    between them and the queried voxels linear.
+    """The ``margins_of`` the parts, and labels, at every voxel's centre; far from all surfaces
+    margins are the largest there are, between them and the queried voxels linear.
 
     Args:
         camera_from_index: of cubic voxels along the camera's axes.
@@ -130,13 +132,14 @@ def sparse_margins(
     """
     voxel_mm, origin_mm = float(camera_from_index[0, 0]), camera_from_index[:3, 3]
     levels = max(0, int(np.floor(np.log2(max(start_mm / voxel_mm, 1.0)))))
-    if levels == 0:
-        return dense_margins(logits_at, camera_from_index, shape)
-    stride = 2**levels
-    i, j, k = ((n - 2) // stride + 2 for n in shape)  # the last lies on the grid's end or past it
+    stride, (i, j, k) = 2**levels, shape
+    if levels > 0:
+        i, j, k = ((n - 2) // stride + 2 for n in shape)  # the last on the grid's end or past it
     step_mm, every = voxel_mm * stride, np.arange(i * j * k)
     logits = _query(logits_at, origin_mm, step_mm, (i, j, k), every)
     lattice = LogitLattice(origin_mm, step_mm, logits.reshape(i, j, k, -1))
+    if levels == 0:
+        return margins_on(lattice)[:2]
     limit = InterpolationLimit()
     for _ in range(levels - 1):
         limit = limit.finer()

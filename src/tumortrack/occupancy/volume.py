@@ -58,32 +58,15 @@ def lattice_over(logits_at: LogitsAt, box_mm: Float[np.ndarray, "2 3"], steps: i
     return LogitLattice(box_mm[0].astype(float), step, logits.reshape(*grid.shape[:3], -1))
 
 
-def dense_margins(
-    logits_at: LogitsAt, camera_from_index: Float64[np.ndarray, "4 4"], shape: tuple[int, int, int]
-) -> tuple[Float16[np.ndarray, "parts i j k"], UInt8[np.ndarray, "i j k"]]:
-    """Query every voxel centre; ``margins_of`` the parts and labels.
-
-    Half precision: 2 bytes a voxel and part, 0.4 GB at 400^3 with two tumors.
-    """
-    labels, margins = np.empty(shape, np.uint8), np.empty((0, *shape), np.float16)
-    planes = max(1, AT_ONCE // (shape[1] * shape[2]))
-    for first in range(0, shape[0], planes):
-        block = (min(planes, shape[0] - first), *shape[1:])
-        index = np.indices(block).reshape(3, -1).T + np.array([first, 0.0, 0.0])
-        logits = logits_at(transform_points(camera_from_index, index).astype(np.float32))
-        if first == 0:  # now the number of parts is known
-            margins = np.empty((logits.shape[1] - 1, *shape), np.float16)
-        labels[first : first + planes] = logits.argmax(-1).byte().cpu().numpy().reshape(block)
-        margins[:, first : first + planes] = margins_of(logits).T.reshape(-1, *block)
-    return margins, labels
-
-
 def margins_on(
     lattice: LogitLattice,
 ) -> tuple[
     Float16[np.ndarray, "parts i j k"], UInt8[np.ndarray, "i j k"], Float64[np.ndarray, "4 4"]
 ]:
-    """``margins_of`` the parts, labels and ``camera_from_index`` of a lattice."""
+    """``margins_of`` the parts, labels and ``camera_from_index`` of a lattice.
+
+    Half precision: 2 bytes a voxel and part, 0.4 GB at 400^3 with two tumors.
+    """
     logits = torch.from_numpy(lattice.logits.reshape(-1, lattice.logits.shape[3]))
     shape = lattice.logits.shape[:3]
     labels = logits.argmax(-1).to(torch.uint8).numpy().reshape(shape)
@@ -196,14 +179,9 @@ def part_surfaces(
 def surface_distances(
     lattice: LogitLattice, points_mm: Float[np.ndarray, "n 3"]
 ) -> Float32[np.ndarray, " n"]:
-    """How far points (n, 3) lie from the organ's surface, camera frame, mm.
-
-    The surface is the zero of the margin, linear between the lattice's points: accurate to about
-    half a mm for an organ on ``FIT_STEPS``.
-
-    Raises:
-        NoEstimate: there is no surface in the lattice's box.
-    """
+    """How far points (n, 3) lie from the organ's surface, camera frame, mm; NoEstimate where there
+    is none in the lattice's box. It is the zero of the margin, linear between the lattice's points:
+    accurate to about half a mm for an organ on ``FIT_STEPS``."""
     from skimage import measure
 
     logits = lattice.logits

@@ -78,8 +78,7 @@ def generic_fields(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3 2
 
 @cache
 def _mixture() -> Float[np.ndarray, "30 24"]:
-    """Of the monomial fields, so that over a dense organ the results are orthogonal to each other
-    and to rigid motion."""
+    """That makes the fields orthogonal to each other and to rigid motion, over a dense organ."""
     dense = generic_points(2000)
     _, triangle = np.linalg.qr(_monomials(dense))
     return np.linalg.inv(triangle)[:, _RIGID:] * _FIELD_MM * np.sqrt(len(dense))
@@ -124,9 +123,8 @@ def carry_over(
     network.output.bias[:POSE_OUTPUTS] = bias[:POSE_OUTPUTS].to(network.output.bias)
 
     device = network.output.weight.device
-    points, modes, mean, std = (
-        getattr(network, name).double().cpu().numpy() for name in ("points", "modes", "mean", "std")
-    )
+    known = (network.points, network.modes, network.mean, network.std)
+    points, modes, mean, std = (value.double().cpu().numpy() for value in known)
     fields = generic_fields(points @ upright.facing.T * upright.scale)
     wanted = np.einsum("pdf,dc->pcf", fields, upright.facing) / upright.scale  # CT frame, mm
     own = (modes * std).reshape(-1, modes.shape[-1])

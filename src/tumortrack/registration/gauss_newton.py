@@ -53,9 +53,8 @@ def refine(
 class GaussNewton:
     """A refinement that can be stopped on its way and continued.
 
-    Attributes:
-        cost: of the present state, as in ``RegistrationResult``; infinite before the first step.
-        steps: taken so far; ``converged``: more would not move it.
+    ``cost``: of the present state, as in ``RegistrationResult``; infinite before the first step.
+    ``steps``: taken so far; ``converged``: more would not move it.
     """
 
     def __init__(
@@ -66,10 +65,14 @@ class GaussNewton:
         config: GaussNewtonConfig,
     ) -> None:
         body, count, precision = rest.body, len(points_mm), _prior(rest, config)
-        self._rest, self._points = rest, np.ascontiguousarray(points_mm, np.float32)
-        modes = LatticeField(body.modes, body.origin_mm, np.float32(body.spacing_mm))
-        self._organ = kernels.Organ(modes, body.center_ct, rest.distances[0], precision, body.mean)
-        self._options = kernels.Options(
+        self._rest = rest
+        self._problem = kernels.Problem(
+            modes=LatticeField(body.modes, body.origin_mm, np.float32(body.spacing_mm)),
+            center_ct=body.center_ct,
+            distances=rest.distances[0],
+            precision=precision,
+            mean=body.mean,
+            points=np.ascontiguousarray(points_mm, np.float32),
             weight=min(config.n_effective / count, 1.0) / config.sigma_mm**2,
             first_mm=config.first_mm,
             last_mm=config.last_mm,
@@ -90,8 +93,9 @@ class GaussNewton:
         """Continue until ``steps`` are taken since the start, or it has converged."""
         if self.converged or (steps <= self.steps and np.isfinite(self.cost)):
             return
-        problem = self._organ, self._points, self._options, self._state
-        self.steps, self.converged, self.cost = kernels.descend(*problem, self.steps, steps)
+        self.steps, self.converged, self.cost = kernels.descend(
+            self._problem, self._state, self.steps, steps
+        )
 
     def result(self) -> RegistrationResult:
         """The present state."""

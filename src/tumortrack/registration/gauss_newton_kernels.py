@@ -37,19 +37,16 @@ def root_weight(r):  # type: ignore[no-untyped-def]
     return one / (one + r**2)
 
 
-class Organ(NamedTuple):
-    """The organ at rest, and the prior of its motion; CT frame, mm."""
+class Problem(NamedTuple):
+    """The organ at rest and the prior of its motion (CT frame, mm), the observed points (camera
+    frame, mm), and of ``GaussNewtonConfig``; ``weight`` of one point's squared distance."""
 
     modes: LatticeField
     center_ct: np.ndarray  # (3,), float64
     distances: DistanceField
     precision: np.ndarray  # (p, p), float64
     mean: np.ndarray  # (m,), float64
-
-
-class Options(NamedTuple):
-    """See ``GaussNewtonConfig``; ``weight`` of one point's squared distance."""
-
+    points: np.ndarray  # (n, 3), float32
     weight: float
     first_mm: float
     last_mm: float
@@ -70,60 +67,51 @@ class State(NamedTuple):
 
 
 @numba.njit(cache=True, fastmath=True, nogil=True)
-def descend(organ, points, options, state, first, last):  # type: ignore[no-untyped-def]
-    """Steps ``first`` to ``last`` of a refinement, fewer if it converges.
-
-    Args:
-        organ, options, state: the values above; where ``first`` is not 0, the state is that which
-            the steps before have left.
-        points: observed, (n, 3), camera frame, mm, float32.
-
-    Returns:
-        The number of steps taken, whether it has converged, and the last state's cost.
-    """
+def descend(problem, state, first, last):  # type: ignore[no-untyped-def]
+    """Steps ``first`` to ``last`` of a refinement, fewer if it converges: their number, whether it
+    has converged, and the last cost. Where ``first`` is not 0, ``state`` is what is left by the
+    steps before."""
     unknowns, cost = len(state.gradient), 0.0
     rows = np.empty((BLOCK, unknowns + 1), np.float32)
     columns = np.zeros((-(-(unknowns + 1) // 4) * 4, _AT_ONCE + _APART), np.float32)
     buffers = rows, columns
     if first == 0:
-        cost = _equations(organ, points, options, state, _width(options, 0), buffers)
+        cost = _equations(problem, state, _width(problem, 0), buffers)
     for step in range(first, last):
         change = np.linalg.solve(state.curvature, state.gradient)
         _turn(state.rotation, state.centre_mm, change)
-        for n in range(POSE):
-            state.moved[n] -= change[n]
-        for n in range(len(state.coefficients)):
-            state.coefficients[n] -= change[POSE + n]
-        cost = _equations(organ, points, options, state, _width(options, step + 1), buffers)
-        small = np.abs(change).max() < options.enough_mm
-        if small and _width(options, step) == options.last_mm:
+        state.moved[:] -= change[:POSE]
+        state.coefficients[:] -= change[POSE:]
+        cost = _equations(problem, state, _width(problem, step + 1), buffers)
+        small = np.abs(change).max() < problem.enough_mm
+        if small and _width(problem, step) == problem.last_mm:
             return step + 1, True, cost
     return last, False, cost
 
 
 @numba.njit(cache=True, nogil=True)
-def _width(options, step):  # type: ignore[no-untyped-def]
+def _width(problem, step):  # type: ignore[no-untyped-def]
     """The robust kernel's width (mm) after so many steps; a point pulls most at 0.58 of it."""
-    return max(options.last_mm, options.first_mm * options.narrowing**step)
+    return max(problem.last_mm, problem.first_mm * problem.narrowing**step)
 
 
 @numba.njit(cache=True, fastmath=True, nogil=True, inline="always")
-def _equations(organ, points, options, state, width, buffers):  # type: ignore[no-untyped-def]
+def _equations(problem, state, width, buffers):  # type: ignore[no-untyped-def]
     """Distances, curvature and gradient of the cost at a state into it; the cost."""
-    weight, last_mm, precision = options.weight, options.last_mm, organ.precision
-    modes, origin, spacing = organ.modes
+    weight, last_mm, precision = problem.weight, problem.last_mm, problem.precision
+    modes, origin, spacing = problem.modes
     curvature, gradient = state.curvature, state.gradient
     velocity = combine(modes, (-state.coefficients).astype(np.float32))
     flow = Flow(velocity, origin, spacing, steps_of(velocity, spacing))
-    pose = Pose(organ.center_ct, state.rotation, state.centre_mm)
-    normal_equations(organ, flow, pose, np.float32(width), points, buffers, state)
+    pose = Pose(problem.center_ct, state.rotation, state.centre_mm)
+    normal_equations(problem, flow, pose, np.float32(width), buffers, state)
     unknowns, cost = len(gradient), 0.0
     for p in range(len(state.distances_mm)):
         cost += rho(np.float64(state.distances_mm[p]) / last_mm)
     cost *= weight * last_mm**2
     change = np.empty(unknowns)  # from the prior's mean
     change[:POSE] = state.moved
-    change[POSE:] = state.coefficients - organ.mean
+    change[POSE:] = state.coefficients - problem.mean
     for n in range(unknowns):
         slope = 0.0  # of the prior, halved
         for m in range(unknowns):
@@ -135,11 +123,11 @@ def _equations(organ, points, options, state, width, buffers):  # type: ignore[n
 
 
 @numba.njit(cache=True, fastmath=True, nogil=True, inline="always")
-def normal_equations(organ, flow, pose, width, points, buffers, state):  # type: ignore[no-untyped-def]
+def normal_equations(problem, flow, pose, width, buffers, state):  # type: ignore[no-untyped-def]
     """Distances as ``add_rows`` gives them, and the sums over points of ``weight * row * row'`` and
     ``weight * row * distance``, into ``state``; ``weight`` is ``root_weight`` squared. ``flow`` has
     the opposite velocity."""
-    rows, columns = buffers
+    (rows, columns), points = buffers, problem.points
     curvature, gradient = state.curvature, state.gradient
     unknowns = len(gradient)
     sums = np.zeros((len(columns), len(columns) + 4))
@@ -148,7 +136,7 @@ def normal_equations(organ, flow, pose, width, points, buffers, state):  # type:
         count = min(_AT_ONCE, len(points) - start)
         for first in range(start, start + count, BLOCK):
             some = points[first : min(first + BLOCK, start + count)]
-            add_rows(organ.modes.values, organ.distances, flow, pose, some, along, rows)
+            add_rows(problem.modes.values, problem.distances, flow, pose, some, along, rows)
             for p in range(len(some)):
                 distance = rows[p, unknowns]
                 state.distances_mm[first + p] = distance

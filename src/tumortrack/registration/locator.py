@@ -31,15 +31,14 @@ _BEHIND_MM = 2.0  # a smoothed motion that lags by more starts again
 
 @dataclass(frozen=True, eq=False)
 class NearestLookup:
-    """Which of some places is nearest, for every place in a box: that of the nearest node of a
-    lattice, which may be another one where two are about as near."""
+    """Which of some places is nearest, for every place in their box and a node beyond; farther out
+    as on its border. That of the nearest node of a lattice: where two are about as near, either."""
 
     origin_mm: Float32[np.ndarray, " 3"]
     nearest: Int32[np.ndarray, "i j k"]
 
     @classmethod
     def of(cls, places_mm: Float[np.ndarray, "k 3"]) -> NearestLookup:
-        """Over the places' box and a node beyond; what is farther out counts as on its border."""
         from scipy.spatial import cKDTree
 
         step = kernels.NODES_MM
@@ -99,33 +98,30 @@ class RegistrationLocator:
         self._registration = model.registration()
         self._near = msgspec.structs.replace(model.config.refine, first_mm=_MOVED_MM)
         anatomy = model.shape.anatomy_ct
-        organ = anatomy.organ
         self.anatomy_ct: Anatomy | None = anatomy
-        few = max(1, len(organ.vertices_mm) // (_SAMPLES // 2))
-        inner = [part.vertices_mm for part in anatomy.tumors]
-        self._samples_ct = np.concatenate(
-            [organ.vertices_mm[::few], *(v[:: max(1, len(v) // 64)] for v in inner)]
-        )
+        vertices = [part.vertices_mm for part in anatomy.parts]
+        self._vertices_ct = np.concatenate(vertices).astype(np.float32)
+        few = [_SAMPLES // 2, *[64] * len(anatomy.tumors)]
+        some = [v[:: max(1, len(v) // count)] for v, count in zip(vertices, few, strict=True)]
+        self._samples_ct = np.concatenate(some)
         self._nearest_sample = NearestLookup.of(self._samples_ct)
         self._middles_ct = np.array([part.box_mm.mean(0) for part in anatomy.parts])
-        vertices = np.concatenate([part.vertices_mm for part in anatomy.parts])
-        self._vertices_ct = vertices.astype(np.float32)
         self._carried: _OrganPoints | None = None
 
     def locate(self, cloud: SensorCloud, grid: int, seed: int) -> Estimate:
         """See ``tracking.tracker.Tracker.locate``."""
         frame = Frame(self._model, cloud, seed, np.random.default_rng(seed))
         usual = self._calibration.usual_cost
-        placed = self._checked(
-            frame, self._registration.register(frame.points_mm, usual, frame.stage)
-        )
+        fit = self._registration.register(frame.points_mm, usual, frame.stage)
+        placed = self._checked(frame, fit)
         organ = placed.meshes[self._model.parts[0]]
         with frame.stage("fine"):
             inside = self._drawn(placed, organ, cloud.stamp_ns, frame.rng)
         with frame.stage("volume"):
             camera_from_index, shape = grid_over(organ.vertices_mm, grid)
             labels = label_grid(Anatomy(tuple(placed.meshes.values())), camera_from_index, shape)
-        report = self._report(frame, placed, inside, float(camera_from_index[0, 0]))
+        voxel_mm = float(camera_from_index[0, 0])
+        report = self._report(frame, placed, inside, voxel_mm=voxel_mm)
         volume = CameraLabels(labels, camera_from_index)
         return Estimate(inside, volume, placed.meshes, report, placed.motion)
 
@@ -154,8 +150,8 @@ class RegistrationLocator:
         placed = self._checked(frame, fit)
         with frame.stage("carry"):
             inside = self._carry(placed, cloud.stamp_ns)
-        report = self._report(frame, placed, inside)
-        report["smoothing"] = {"time_s": how.smoothing_s, "lag_ms": 1000 * lag_s}
+        smoothing = {"time_s": how.smoothing_s, "lag_ms": 1000 * lag_s}
+        report = self._report(frame, placed, inside, smoothing=smoothing)
         return Estimate(inside, None, placed.meshes, report, placed.motion, unsmoothed)
 
     def warm(self) -> None:
@@ -189,28 +185,20 @@ class RegistrationLocator:
         return _Registered(fit, motion, meshes, deviation[:count], deviation[count:])
 
     def _report(
-        self,
-        frame: Frame,
-        placed: _Registered,
-        inside: OccupancyCloud,
-        voxel_mm: float | None = None,
+        self, frame: Frame, placed: _Registered, inside: OccupancyCloud, **more: Any
     ) -> dict[str, Any]:
         fit, motion = placed.fit, placed.motion
         parts = describe_parts(self._model.parts, placed.meshes, inside)
         for part, std_mm in zip(parts.values(), placed.middle_std_mm, strict=True):
             part["center_std_mm"] = float(std_mm)
-        return frame.report(
-            np.abs(fit.distances_mm),
-            parts,
-            voxel_mm,
-            fit_cost={"now": fit.cost, "usual": self._calibration.usual_cost},
-            motion={
-                "camera_from_ct": motion.camera_from_ct.tolist(),
-                "coefficients": motion.coefficients.tolist(),
-                "rarity": motion.rarity,
-                "steps": fit.steps,
-            },
-        )
+        more["fit_cost"] = {"now": fit.cost, "usual": self._calibration.usual_cost}
+        more["motion"] = {
+            "camera_from_ct": motion.camera_from_ct.tolist(),
+            "coefficients": motion.coefficients.tolist(),
+            "rarity": motion.rarity,
+            "steps": fit.steps,
+        }
+        return frame.report(np.abs(fit.distances_mm), parts, **more)
 
     def _drawn(
         self, placed: _Registered, organ: Mesh, stamp_ns: int, rng: np.random.Generator

@@ -8,7 +8,7 @@ from typing import Any
 
 from safetensors.numpy import load, save
 
-from tumortrack.core.config import Config, from_builtins, to_builtins
+from tumortrack.core.config import Config, from_builtins, identity
 from tumortrack.core.errors import InputError
 from tumortrack.models.config import NetworkConfig
 from tumortrack.models.folder import SHAPE
@@ -19,10 +19,12 @@ from tumortrack.registration.registration import Registration
 from tumortrack.registration.rest_shape import RestShape
 
 
-class UncertaintyCalibration(Config, frozen=True, omit_defaults=True):
+class UncertaintyCalibration(Config, frozen=True):
     """What validation scenes taught: standard deviations are multiplied by ``std_scale``; where a
     fit costs more than ``usual_cost``, turned starts are tried. Both hold for one robust kernel;
     folders that name none were made with the first."""
+
+    LATER = ("kernel",)
 
     std_scale: float
     usual_cost: float
@@ -49,7 +51,7 @@ class RegistrationModel(Model):
         return {SHAPE: save(self.shape.to_arrays())}
 
     def extra_entries(self) -> dict[str, Any]:
-        return {"trust": to_builtins(self.calibration)}
+        return {"trust": identity(self.calibration)}
 
     @classmethod
     def from_folder(

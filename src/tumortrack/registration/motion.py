@@ -29,8 +29,7 @@ class ElasticMotion:
         coefficients: of the body's modes.
         covariance: of shift (mm), turn (rad; both in the CT's axes, about the centre) and
             coefficients, as ``refine`` left it; None where nothing was refined.
-        std_scale: what its standard deviations are to be multiplied by; found on validation
-            scenes.
+        std_scale: a factor for its standard deviations, found on validation scenes.
     """
 
     shape: RestShape

@@ -66,7 +66,12 @@ class PoseHypothesis:
 
 
 class RegistrationNetwork(Network):
-    """Clouds -> hypotheses; the buffers that describe the organ are set by ``initialize``."""
+    """Clouds -> hypotheses.
+
+    What describes the organ is set by ``initialize``: the centre and axes, the points (P, 3; about
+    the centre) whose places before the camera the loss compares, the body's modes at these points
+    (P, 3, M), its states' mean and spread.
+    """
 
     center_ct: Tensor
     points: Tensor
@@ -93,10 +98,9 @@ class RegistrationNetwork(Network):
         with torch.no_grad():
             self.output.weight.mul_(_SMALL_START)
             self.output.bias.zero_()
-        n_points = config.decoder.points
         self.register_buffer("center_ct", torch.zeros(3))
-        self.register_buffer("points", torch.zeros(n_points, 3))  # about center_ct
-        self.register_buffer("modes", torch.zeros(n_points, 3, modes))  # at these points
+        self.register_buffer("points", torch.zeros(config.decoder.points, 3))
+        self.register_buffer("modes", torch.zeros(config.decoder.points, 3, modes))
         self.register_buffer("mean", torch.zeros(modes))
         self.register_buffer("std", torch.ones(modes))
         self.register_buffer("facing", torch.eye(3))
@@ -108,9 +112,7 @@ class RegistrationNetwork(Network):
         up_lps: tuple[float, float, float],
         points_ct: Float[np.ndarray, "p 3"],
     ) -> None:
-        """Take over what does not have to be learnt: the organ's centre and axes, its states'
-        mean and spread, and the points (CT frame) whose places before the camera the loss
-        compares."""
+        """Take over what does not have to be learnt, with these points (CT frame)."""
         body = shape.body
         known = {
             "center_ct": body.center_ct,
@@ -142,9 +144,9 @@ class RegistrationNetwork(Network):
         """What is seen, if the clouds lie the right way round."""
         out = self.output(self.hidden(self.encoder(aligned.points)))
         with torch.autocast(out.device.type, enabled=False):  # bf16 would round to 0.2 mm
-            return self._placement(out.float(), aligned)
+            return self._hypothesis(out.float(), aligned)
 
-    def _placement(self, out: Tensor, aligned: AlignedCloud) -> PoseHypothesis:
+    def _hypothesis(self, out: Tensor, aligned: AlignedCloud) -> PoseHypothesis:
         first = functional.normalize(out[:, :3] + out.new_tensor([1.0, 0.0, 0.0]), dim=1)
         second = out[:, 3:6] + out.new_tensor([0.0, 1.0, 0.0])
         second = second - (first * second).sum(1, keepdim=True) * first
@@ -170,14 +172,14 @@ class RegistrationNetwork(Network):
             true_rotation = camera_from_ct[:, :3, :3]
             true_centre = true_rotation @ self.center_ct + camera_from_ct[:, :3, 3]
             sign = self.flip_sign(aligned, true_rotation)
-        placed = self(aligned.flipped(sign))
+        found = self(aligned.flipped(sign))
         told_wrong = self._flipped_loss(aligned.flipped(-sign), first)
         with torch.autocast(clouds_mm.device.type, enabled=False):
-            moved = self.points + torch.einsum("pdm,bm->bpd", self.modes, placed.coefficients)
-            error = _size(_placed(moved, placed.rotation, placed.centre_mm) - points_mm)
-            rigid = _placed(self.points, placed.rotation, placed.centre_mm)
+            moved = self.points + torch.einsum("pdm,bm->bpd", self.modes, found.coefficients)
+            error = _size(_placed(moved, found.rotation, found.centre_mm) - points_mm)
+            rigid = _placed(self.points, found.rotation, found.centre_mm)
             rigid_error = _size(rigid - _placed(self.points, true_rotation, true_centre))
-            told = functional.softplus(-placed.right_way).mean() + told_wrong
+            told = functional.softplus(-found.right_way).mean() + told_wrong
             return error + _RIGID_SHARE * rigid_error + _WAY_SHARE * told
 
     def _flipped_loss(self, wrong: AlignedCloud, first: int) -> Tensor:
@@ -202,13 +204,8 @@ class RegistrationNetwork(Network):
         """
         one = self.align(points_mm)
         other = one.flipped(-torch.ones_like(one.centre_mm[:, 0]))
-        return self(
-            AlignedCloud(
-                torch.cat([one.points, other.points]),
-                torch.cat([one.centre_mm, other.centre_mm]),
-                torch.cat([one.turn, other.turn], 1),
-            )
-        )
+        points, centre_mm = torch.cat([one.points, other.points]), one.centre_mm.repeat(2, 1)
+        return self(AlignedCloud(points, centre_mm, torch.cat([one.turn, other.turn], 1)))
 
 
 class _Exported(nn.Module):
@@ -247,11 +244,7 @@ def _size(offsets_mm: Tensor) -> Tensor:
 
 def _about_z(turn: Tensor) -> Tensor:
     """(2, B, 1) cosine and sine -> rotations (B, 3, 3) from the turned frame back."""
-    cosine, sine = turn[0, :, 0], turn[1, :, 0]
+    cosine, sine = turn[..., 0]
     zero, one = torch.zeros_like(cosine), torch.ones_like(cosine)
-    rows = [
-        torch.stack([cosine, -sine, zero], -1),
-        torch.stack([sine, cosine, zero], -1),
-        torch.stack([zero, zero, one], -1),
-    ]
-    return torch.stack(rows, 1)
+    rows = [cosine, -sine, zero, sine, cosine, zero, zero, zero, one]
+    return torch.stack(rows, -1).view(-1, 3, 3)

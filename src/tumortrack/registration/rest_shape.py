@@ -75,11 +75,7 @@ class RestShape:
 
     @classmethod
     def from_arrays(cls, arrays: dict[str, np.ndarray], n_parts: int) -> RestShape:
-        """The inverse of ``to_arrays``.
-
-        Raises:
-            InputError: an array is missing or of a wrong shape.
-        """
+        """The inverse of ``to_arrays``; InputError for an array that is missing or misshapen."""
         try:
             body = {k.removeprefix(_BODY): v for k, v in arrays.items() if k.startswith(_BODY)}
             parts, fields = [], []

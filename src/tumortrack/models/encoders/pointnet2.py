@@ -13,7 +13,7 @@ from tumortrack.models.layers import Layer, Norm, greatest, greatest_above_zero,
 from tumortrack.models.sampling import (
     Sampling,
     ball_query,
-    choose_points,
+    farthest_points,
     strided_points,
     take,
     traced,
@@ -99,7 +99,8 @@ class _Level(nn.Module):
 
     def forward(self, points: Tensor, features: Tensor | None) -> tuple[Tensor, Tensor]:
         level, n = self.level, points.shape[1]
-        chosen = choose_points(points, math.ceil(level.ratio * n), self.sampling)
+        choose = farthest_points if self.sampling == "fps" else strided_points
+        chosen = choose(points, math.ceil(level.ratio * n))
         centres = take(points, chosen)
         neighbours = ball_query(points, centres, level.radius, level.neighbours)
         weight, projected = self.first.linear.weight, None
