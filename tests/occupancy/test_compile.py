@@ -16,7 +16,9 @@ from tumortrack.cli.models import Compile
 from tumortrack.core.config import to_builtins
 from tumortrack.models.config import MlpDecoderConfig, NetworkConfig
 from tumortrack.models.normalisation import CloudBox
-from tumortrack.occupancy.compiled import (
+from tumortrack.occupancy.inference import Arithmetic, Inference, can_pack, possible, usual
+from tumortrack.occupancy.locator import OccupancyLocator
+from tumortrack.occupancy.model import (
     Compiled,
     find,
     like_an_organ,
@@ -27,9 +29,7 @@ from tumortrack.occupancy.compiled import (
     save,
     this_machine,
 )
-from tumortrack.occupancy.compiled import describe as describe_compiled
-from tumortrack.occupancy.inference import Arithmetic, Inference, can_pack, possible, usual
-from tumortrack.occupancy.locator import OccupancyLocator
+from tumortrack.occupancy.model import describe as describe_compiled
 from tumortrack.occupancy.network import OccupancyNetwork
 from tumortrack.training.model import load_model
 from tumortrack.training.presets import quick_network

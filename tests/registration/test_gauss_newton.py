@@ -23,8 +23,8 @@ from tumortrack.models.config import GaussNewtonConfig
 from tumortrack.registration import gauss_newton_kernels as kernels
 from tumortrack.registration import registration
 from tumortrack.registration.gauss_newton import GaussNewton, _prior, refine
-from tumortrack.registration.kernels import Flow, Pose, probabilities
-from tumortrack.registration.locator import NearestLookup, RegistrationLocator, normal_table
+from tumortrack.registration.kernels import Flow, Pose, look_up, probabilities
+from tumortrack.registration.locator import RegistrationLocator, nearest_lookup
 from tumortrack.registration.registration import Registration
 from tumortrack.simulate.elastic.flow import BLOCK, LatticeField, steps_for
 from tumortrack.training.model import load_model
@@ -255,13 +255,13 @@ def test_the_nearest_place_is_nearest_but_for_a_nodes_width():
     rng = np.random.default_rng(5)
     places = CENTER + rng.uniform(-1, 1, (200, 3)) * RADII
     points = about(3000, 6)
-    found = np.linalg.norm(points - places[NearestLookup.of(places).to(points)], axis=1)
+    found = np.linalg.norm(points - places[look_up(*nearest_lookup(places), points)], axis=1)
     apart = np.linalg.norm(points[:, None] - places, axis=2)
     inside = ((points > places.min(0)) & (points < places.max(0))).all(1)
     assert inside.mean() > 0.2
     assert (found[inside] <= apart.min(1)[inside] + 2 * np.sqrt(3)).all()
     assert np.mean(found[inside] == apart.min(1)[inside].astype(found.dtype)) > 0.6
-    own = NearestLookup.of(places).to(places.astype(np.float32))
+    own = look_up(*nearest_lookup(places), places.astype(np.float32))
     assert np.mean(own == np.arange(200)) > 0.9
 
 
@@ -293,7 +293,7 @@ def test_chances_are_the_normal_distributions():
     margins = np.linspace(0, 30, 5000, dtype=np.float32)
     which = np.arange(5000) % 3
     std_mm = np.array([0.3, 1.0, 4.0])
-    told = probabilities(margins, 1 / std_mm, which, normal_table())
+    told = probabilities(margins, 1 / std_mm, which)
     np.testing.assert_allclose(told, ndtr(margins / std_mm[which]), atol=3e-7)
     assert told.min() == 0.5
     assert told.max() == 1

@@ -52,9 +52,8 @@ def write_mesh(path: Path, mesh: Mesh) -> None:
     disk refuses.
     """
     kind = path.suffix.lower().removeprefix(".")
-    data = _ply(mesh) if kind == "ply" else _exported(mesh, kind)
     try:
-        path.write_bytes(data)
+        path.write_bytes(_ply(mesh) if kind == "ply" else _exported(mesh, kind))
     except OSError as error:
         raise StorageError(f"cannot write {path}: {error.strerror}.") from error
 

@@ -22,11 +22,8 @@ _INTEGER = {torch.bfloat16: torch.int16, torch.float32: torch.int32}  # of the s
 
 
 class Layer(nn.Module):
-    """Linear, optional batch norm, ReLU; over the last axis of any array.
-
-    Weights start as He's, biases at zero: without a norm the signal then keeps its size through
-    many layers, which torch's default start does not give.
-    """
+    """Linear, optional batch norm, ReLU; over the last axis of any array. Weights start as He's,
+    biases at zero: without a norm the signal then keeps its size through many layers."""
 
     def __init__(self, n_in: int, n_out: int, norm: Norm) -> None:
         super().__init__()
@@ -45,10 +42,6 @@ class Layer(nn.Module):
     def activate(self, linear_out: Tensor) -> Tensor:
         """Batch norm and ReLU of what the linear part gave; it is overwritten."""
         return functional.relu(self.normalise(linear_out), inplace=True)
-
-    def before_relu(self, x: Tensor) -> Tensor:
-        """All but the ReLU, (..., n_in) -> (..., n_out)."""
-        return self.normalise(self.linear(x))
 
     def forward(self, x: Tensor) -> Tensor:
         # In rows: the output of a linear layer on more axes is a view, and overwriting a view

@@ -7,15 +7,14 @@ import warnings
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 import torch
 from jaxtyping import Float64
 from torch import Tensor, nn
 
-from tumortrack.core.errors import InputError
-from tumortrack.models.config import NetworkConfig, TrainConfig
+from tumortrack.models.config import TrainConfig
 from tumortrack.models.in_distribution import InDistributionRange
 
 _OPSET = 18  # of ONNX files
@@ -46,10 +45,11 @@ class Model(ABC):
     Attributes:
         query_box_mm: where the organ can lie, relative to the median of the observed points,
             camera frame (lower and upper corner).
-        in_distribution: range of clouds of this organ.
-        provenance: seeds, steps, hashes.
-        notes: for the user, about this machine.
+        provenance: seeds, steps, hashes; ``notes``: for the user, about this machine.
     """
+
+    # From a NetworkConfig, with weights from torch's global generator (``torch.manual_seed``).
+    new_network: ClassVar[type[Network]]
 
     network: Network
     config: TrainConfig
@@ -58,11 +58,6 @@ class Model(ABC):
     in_distribution: InDistributionRange
     provenance: dict[str, Any] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
-
-    @classmethod
-    @abstractmethod
-    def new_network(cls, config: NetworkConfig) -> Network:
-        """A network with weights from torch's global generator (``torch.manual_seed``)."""
 
     def extra_files(self) -> dict[str, bytes]:
         """Files of a model folder besides the weights, by name."""
@@ -75,11 +70,8 @@ class Model(ABC):
     @classmethod
     @abstractmethod
     def from_folder(cls: type[M], folder: Path, manifest: dict[str, Any], **common: Any) -> M:
-        """The model of a folder whose fields ``common`` are read already.
-
-        Raises:
-            InputError, KeyError, ValueError, OSError: the folder lacks something.
-        """
+        """The model of a folder whose fields ``common`` are read already; InputError, KeyError,
+        ValueError or OSError where the folder lacks something."""
 
 
 M = TypeVar("M", bound=Model)
@@ -93,16 +85,7 @@ def onnx_bytes(model: Model) -> bytes:
     cloud). Occupancy networks: ``cloud_mm`` (1, N, 3) and ``queries_mm`` (1, Q, 3) -> ``logits``
     (1, Q, classes). Networks that place the organ: ``cloud_mm`` -> ``rotation`` (2, 3, 3),
     ``centre_mm`` (2, 3), ``coefficients`` (2, M), ``right_way`` (2,). Camera frame, mm, float32.
-
-    Raises:
-        InputError: the package onnx is not installed.
     """
-    try:
-        import onnx  # noqa: F401  PyTorch needs it; its own message is long
-    except ImportError as error:
-        raise InputError(
-            "writing ONNX needs the package onnx: pip install 'tumortrack[onnx]'."
-        ) from error
     points, generator = model.config.scene.cloud.n_points, torch.Generator().manual_seed(0)
     cloud = torch.randn(1, points, 3, generator=generator) * 20 + torch.tensor([0.0, 0.0, 130.0])
     module, inputs, names = model.network.onnx_parts(cloud)

@@ -17,11 +17,8 @@ class CloudBox(Config, frozen=True, tag="cloud-box"):
 
 class FixedScale(Config, frozen=True, tag="fixed"):
     """Scale: a constant, so that size is not lost. Centre: the mean of the points that lie
-    within ``reach`` scales of it; the others are strays, and nothing sees them.
-
-    The mean and not the box's centre: one stray point within reach moves it by 1 / N of its
-    distance, the box by half.
-    """
+    within ``reach`` scales of it; the others are strays, and nothing sees them. The mean and not
+    the box's centre: one stray point moves it by 1 / N of its distance, the box by half."""
 
     scale_mm: float
     reach: float
@@ -34,11 +31,23 @@ class FixedScale(Config, frozen=True, tag="fixed"):
 
 class Aligned(FixedScale, frozen=True, tag="aligned"):
     """As ``FixedScale``, and turned about the camera's axis until the cloud's longest direction
-    across it is x, its heavier tail at +x.
+    across it is x, its heavier tail at +x. Turning the organ or the camera about that axis then
+    changes nothing: most of what varies between ``limited`` poses need not be learnt."""
 
-    Turning the organ or the camera about that axis then changes nothing, so that the network
-    need not learn it: most of what varies between ``limited`` poses is gone.
-    """
+
+def normalised(
+    points_mm: Tensor, kind: CloudBox | FixedScale
+) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
+    """Clouds (B, N, 3), camera frame, mm, in a network's frame; their centre (B, 1, 3) and scale
+    (B, 1, 1), mm, and cosine and sine (2, B, 1) of their turn about z, if they are turned."""
+    if not isinstance(kind, CloudBox):
+        points_mm = without_strays(points_mm, kind.reach * kind.scale_mm)
+    centre_mm, scale_mm = normalisation(points_mm, kind)
+    points = (points_mm - centre_mm) / scale_mm
+    if not isinstance(kind, Aligned):
+        return points, centre_mm, scale_mm, None
+    turn = alignment(points)
+    return turned(points, turn), centre_mm, scale_mm, turn
 
 
 def normalisation(points_mm: Tensor, kind: CloudBox | FixedScale) -> tuple[Tensor, Tensor]:

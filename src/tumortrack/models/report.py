@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float64
+from jaxtyping import Float
 
 import tumortrack
 from tumortrack.core.estimate import Estimate
-from tumortrack.core.geometry import transform_points
+from tumortrack.core.geometry import Affine, transform_points
 from tumortrack.core.types import Anatomy, CameraLabels, Mesh, OccupancyCloud, SensorCloud
 from tumortrack.imaging.raster import label_grid
 from tumortrack.models.model import Model
@@ -66,9 +66,7 @@ def _head(stamp_ns: int) -> dict[str, Any]:
     return {**about, "stamp_ns": stamp_ns}
 
 
-def grid_over(
-    points_mm: np.ndarray, grid: int
-) -> tuple[Float64[np.ndarray, "4 4"], tuple[int, int, int]]:
+def grid_over(points_mm: np.ndarray, grid: int) -> tuple[Affine, tuple[int, int, int]]:
     """``camera_from_index`` and shape of cubic voxels over the points' box, 4 % larger, with
     ``grid`` voxels along its longest side."""
     lower, upper = points_mm.min(0).astype(float), points_mm.max(0).astype(float)
@@ -93,15 +91,12 @@ def describe_parts(
     counts = np.bincount(inside.labels, minlength=len(names) + 1)
     sums = np.bincount(inside.labels, inside.probability, len(names) + 1)
     for n, name in enumerate(names):
-        mine = slice(1, None) if n == 0 else n + 1
-        points = int(counts[mine].sum())
+        parts[name] = {"label": n + 1, "found": name in meshes}
         if name not in meshes:
-            parts[name] = {"label": n + 1, "found": False}
             continue
-        mesh = meshes[name]
-        parts[name] = {
-            "label": n + 1,
-            "found": True,
+        mesh, mine = meshes[name], slice(1, None) if n == 0 else n + 1
+        points = int(counts[mine].sum())
+        parts[name] |= {
             "volume_ml": mesh.volume_mm3 / 1000,
             "center_mm": mesh.box_mm.mean(0).tolist(),
             "box_mm": mesh.box_mm.tolist(),
@@ -126,14 +121,6 @@ def estimate_of(
     points_mm = transform_points(camera_from_index, index)
     sure = np.ones(len(voxels))
     inside = OccupancyCloud(points_mm, labels.reshape(-1)[voxels], sure, stamp_ns)
-    return Estimate(
-        inside,
-        CameraLabels(labels, camera_from_index),
-        meshes,
-        {
-            **_head(stamp_ns),
-            "voxel_mm": float(camera_from_index[0, 0]),
-            "parts": describe_parts(tuple(meshes), meshes, inside),
-            **report,
-        },
-    )
+    parts = describe_parts(tuple(meshes), meshes, inside)
+    about = {**_head(stamp_ns), "voxel_mm": float(camera_from_index[0, 0]), "parts": parts}
+    return Estimate(inside, CameraLabels(labels, camera_from_index), meshes, {**about, **report})

@@ -185,6 +185,7 @@ class PackedDecoder(MlpDecoder):
         remaining = iter(term[0, 0].to(self._dtype) for term in terms)
         for of_hidden, of_query, bias in self._packed:
             if of_query is None:
+                assert of_hidden is not None
                 hidden = _linear(hidden, of_hidden, bias, "relu")
             elif of_hidden is None:
                 hidden = _linear(query, of_query, next(remaining), "relu")

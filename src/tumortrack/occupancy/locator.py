@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float16, Float32, Float64, UInt8
+from jaxtyping import Float32
 
 from tumortrack.core.errors import NoEstimate
 from tumortrack.core.estimate import Estimate, Following
@@ -26,8 +26,6 @@ FINE_QUERIES = 40_000
 FEWEST_INSIDE = 20  # of the coarse queries: fewer are no organ
 _LATTICE_MM = 4.5  # at most: always within a ball of 7.8 mm
 _LIVE_MARGIN = 0.1  # of the organ's extent: how far it may move from one live frame to the next
-
-Box = Float[np.ndarray, "2 3"]
 
 
 class OccupancyLocator:
@@ -93,7 +91,7 @@ class OccupancyLocator:
         volume.part_surfaces(margins, ball.astype(np.uint8), np.eye(4), ("kidney",))
 
 
-def steps_over(box: Box) -> int:
+def steps_over(box: volume.Box) -> int:
     """Steps of the lattice along a box's longest side."""
     return max(volume.FIT_STEPS, math.ceil(float((box[1] - box[0]).max()) / _LATTICE_MM))
 
@@ -107,10 +105,10 @@ class _Frame(Frame):
         with self.stage("encode"):
             self._latent = self._inference.encode(self.points_mm)
 
-    def logits_at(self, points_mm: Float32[np.ndarray, "n 3"]) -> torch.Tensor:
+    def logits_at(self, points_mm: volume.Points) -> torch.Tensor:
         return self._inference.logits(self._latent, points_mm)
 
-    def coarse_box(self) -> Box:
+    def coarse_box(self) -> volume.Box:
         """Where the organ is, by coarse random queries."""
         lower, upper = self.model.query_box_mm + np.median(self.cloud.points_mm, axis=0)
         points = self.rng.uniform(lower, upper, (COARSE_QUERIES, 3)).astype(np.float32)
@@ -126,7 +124,7 @@ class _Frame(Frame):
         margin = 0.05 * (high - low) + gap / 2
         return np.stack([low - margin, high + margin])
 
-    def lattice(self, box: Box, everywhere: bool = False) -> volume.LogitLattice:
+    def lattice(self, box: volume.Box, everywhere: bool = False) -> volume.LogitLattice:
         over = volume.lattice_over if everywhere else organ_lattice
         with self.stage("lattice"):
             return over(self.logits_at, box, steps_over(box))
@@ -156,9 +154,9 @@ class _Frame(Frame):
         self,
         distances_mm: Float32[np.ndarray, " n"],
         inside: OccupancyCloud,
-        margins: Float16[np.ndarray, "parts i j k"],
-        found: UInt8[np.ndarray, "i j k"],
-        camera_from_index: Float64[np.ndarray, "4 4"],
+        margins: volume.Margins,
+        found: volume.Labels,
+        camera_from_index: volume.Affine,
     ) -> Estimate:
         """Everything read off margins and labels of a grid."""
         names = self.model.parts

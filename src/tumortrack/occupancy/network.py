@@ -18,14 +18,7 @@ from tumortrack.core.errors import InputError
 from tumortrack.models.config import MlpDecoderConfig, NetworkConfig
 from tumortrack.models.layers import Layer, Norm
 from tumortrack.models.model import Network, OnnxParts
-from tumortrack.models.normalisation import (
-    Aligned,
-    CloudBox,
-    alignment,
-    normalisation,
-    turned,
-    without_strays,
-)
+from tumortrack.models.normalisation import normalised, turned
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,15 +115,7 @@ class OccupancyNetwork(Network):
 
     def encode(self, points_mm: Tensor) -> Latent:
         """Clouds (B, N, 3), camera frame, mm, float32, points in random order -> Latent."""
-        kind = self.config.normalisation
-        if not isinstance(kind, CloudBox):
-            points_mm = without_strays(points_mm, kind.reach * kind.scale_mm)
-        centre_mm, scale_mm = normalisation(points_mm, kind)
-        points = (points_mm - centre_mm) / scale_mm
-        turn = None
-        if isinstance(kind, Aligned):
-            turn = alignment(points)
-            points = turned(points, turn)
+        points, centre_mm, scale_mm, turn = normalised(points_mm, self.config.normalisation)
         vector = self.encoder(points)
         return Latent(vector, centre_mm, scale_mm, turn, self.decoder.prepare(vector))
 

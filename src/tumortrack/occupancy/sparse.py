@@ -25,27 +25,18 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float16, Float32, Float64, Int, UInt8
+from jaxtyping import Bool, Float32, Float64, Int
 
 from tumortrack.core.types import OUTSIDE
-from tumortrack.occupancy import kernels
+from tumortrack.occupancy import kernels, volume
 from tumortrack.occupancy.kernels import leading
-from tumortrack.occupancy.volume import (
-    AT_ONCE,
-    LARGEST_MARGIN,
-    LogitLattice,
-    LogitsAt,
-    lattice_over,
-    margins_of,
-    margins_on,
-)
+from tumortrack.occupancy.volume import LogitLattice, LogitsAt, Rows
 
 START_MM = 4.0
 _PROBE = 512  # of the least certain points, queried to learn how far linear logits are off
 _SURPRISE = 0.5  # of the interpolation limit
 _FIRST_SEEN = 0.1  # of a first lattice's points may lie near a surface
 
-Rows = Float32[np.ndarray, "n classes"]
 Flat = Int[np.ndarray, " n"]  # indices of points
 
 
@@ -60,11 +51,6 @@ class _Level:
     def query(self, flat: Flat) -> Rows:
         half_mm = self.coarse.step_mm / 2
         return _query(self.logits_at, self.coarse.origin_mm, half_mm, self.shape, flat)
-
-    def query_among(
-        self, flat: Flat, some: Int[np.ndarray, " m"]
-    ) -> Float32[np.ndarray, "m classes"]:
-        return self.query(flat[some])
 
     def known(self) -> Bool[np.ndarray, " n"]:
         """The coarse points."""
@@ -82,8 +68,8 @@ def _query(
 ) -> Rows:
     """The network's logits at flat indices of a lattice."""
     parts = []
-    for first in range(0, len(flat), AT_ONCE):
-        index = np.unravel_index(flat[first : first + AT_ONCE], shape)
+    for first in range(0, len(flat), volume.AT_ONCE):
+        index = np.unravel_index(flat[first : first + volume.AT_ONCE], shape)
         points = np.stack(index, axis=1) * step_mm + origin_mm
         parts.append(logits_at(points.astype(np.float32)).float().cpu().numpy())
     return np.concatenate(parts)
@@ -100,16 +86,14 @@ def refined(
     return LogitLattice(coarse.origin_mm, coarse.step_mm / 2, logits)
 
 
-def organ_lattice(
-    logits_at: LogitsAt, box_mm: Float[np.ndarray, "2 3"], steps: int
-) -> LogitLattice:
+def organ_lattice(logits_at: LogitsAt, box_mm: volume.Box, steps: int) -> LogitLattice:
     """``lattice_over``, queried everywhere inside the organ and a point or two about it.
 
     Every second point along each axis is queried first. Whatever is connected to a part that
     holds one of these points is found as if all were queried; what lies apart and between them is
     not, and would be dropped (``volume.keep_largest_pieces``).
     """
-    return refined(logits_at, lattice_over(logits_at, box_mm, -(-steps // 2)), _connected)
+    return refined(logits_at, volume.lattice_over(logits_at, box_mm, -(-steps // 2)), _connected)
 
 
 def halved_lattice(logits_at: LogitsAt, lattice: LogitLattice) -> LogitLattice:
@@ -119,10 +103,10 @@ def halved_lattice(logits_at: LogitsAt, lattice: LogitLattice) -> LogitLattice:
 
 def sparse_margins(
     logits_at: LogitsAt,
-    camera_from_index: Float64[np.ndarray, "4 4"],
+    camera_from_index: volume.Affine,
     shape: tuple[int, int, int],
     start_mm: float = START_MM,
-) -> tuple[Float16[np.ndarray, "parts i j k"], UInt8[np.ndarray, "i j k"]]:
+) -> tuple[volume.Margins, volume.Labels]:
     """The ``margins_of`` the parts, and labels, at every voxel's centre; far from all surfaces
     margins are the largest there are, between them and the queried voxels linear.
 
@@ -139,7 +123,7 @@ def sparse_margins(
     logits = _query(logits_at, origin_mm, step_mm, (i, j, k), every)
     lattice = LogitLattice(origin_mm, step_mm, logits.reshape(i, j, k, -1))
     if levels == 0:
-        return margins_on(lattice)[:2]
+        return volume.margins_on(lattice)[:2]
     limit = InterpolationLimit()
     for _ in range(levels - 1):
         limit = limit.finer()
@@ -147,9 +131,7 @@ def sparse_margins(
     return _voxels(_Level(logits_at, lattice, shape), limit.finer())
 
 
-def sparse_logits(
-    logits_at: LogitsAt, lattice: LogitLattice, points_mm: Float32[np.ndarray, "n 3"]
-) -> Float32[np.ndarray, "n classes"]:
+def sparse_logits(logits_at: LogitsAt, lattice: LogitLattice, points_mm: volume.Points) -> Rows:
     """Logits at points in a lattice's box: linear where the label is certain, else queried.
 
     Scattered points are counted, nobody sees one alone: less care than for voxels, half of the
@@ -247,9 +229,7 @@ def _uncertain(limit: InterpolationLimit, level: _Level, rows: Rows) -> None:
     rows[flat] = found
 
 
-def _voxels(
-    level: _Level, limit: InterpolationLimit
-) -> tuple[Float16[np.ndarray, "parts i j k"], UInt8[np.ndarray, "i j k"]]:
+def _voxels(level: _Level, limit: InterpolationLimit) -> tuple[volume.Margins, volume.Labels]:
     """Margins and labels of the voxels. As ``_uncertain``, but logits of voxels far from surfaces
     are never held: a cell whose corners lead clearly is filled with their label, and margins there
     are the largest."""
@@ -257,15 +237,18 @@ def _voxels(
     rows = coarse.reshape(-1, coarse.shape[3])
     certain, leads = (values.reshape(coarse.shape[:3]) for values in leading(rows))
     labels = np.empty(level.shape, np.uint8)
+
+    def uncertain(flat: Flat, expected: Rows, between: np.ndarray) -> np.ndarray:
+        lead = leading(expected)[1]
+        lead[~between] = np.inf
+        return query_uncertain(expected, lead, lambda some: level.query(flat[some]), limit)
+
     seen = limit.coarser or float(np.quantile(leads, _FIRST_SEEN))
     while True:
         plain = np.where(leads >= np.float32(seen), certain, np.uint8(255))
         lists = _in_slabs(partial(kernels.filled, coarse, certain, plain, labels), len(coarse))
         flat, expected, between = (np.concatenate(column) for column in zip(*lists, strict=True))
-        lead = leading(expected)[1]
-        lead[~between] = np.inf
-        query = partial(level.query_among, flat)
-        queried = query_uncertain(expected, lead, query, limit)
+        queried = uncertain(flat, expected, between)
         if limit.limit <= seen:
             break
         seen = 2 * limit.limit  # voxels that lead by less were filled unseen
@@ -273,10 +256,11 @@ def _voxels(
     places, logits = np.concatenate([flat, more]), np.concatenate([expected, found])
     labels.reshape(-1)[places] = leading(logits)[0]
     margins = np.empty((logits.shape[1] - 1, *labels.shape), np.float16)
-    inside, outside = np.array([LARGEST_MARGIN, -LARGEST_MARGIN], np.float16).view(np.uint16)
+    most = volume.LARGEST_MARGIN
+    inside, outside = np.array([most, -most], np.float16).view(np.uint16)
     spread = partial(kernels.spread, labels, inside, outside, margins.view(np.uint16))
     _in_slabs(spread, len(labels))
-    for margin, won in zip(margins, margins_of(torch.from_numpy(logits)).T, strict=True):
+    for margin, won in zip(margins, volume.margins_of(torch.from_numpy(logits)).T, strict=True):
         margin.reshape(-1)[places] = won
     return margins, labels
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Float16, Float32, Float64, UInt8
+from scipy import ndimage
 
 from tumortrack.core.errors import NoEstimate
 from tumortrack.core.geometry import transform_points
@@ -20,7 +21,14 @@ _SMALLEST_MARGIN = 1e-3  # a surface exactly through a grid point would not be c
 FIT_STEPS = 24  # of a lattice for surface_distances, along the box's longest side
 LARGEST_MARGIN = 30.0  # larger logits say no more about where a surface lies
 
-LogitsAt = Callable[[Float32[np.ndarray, "n 3"]], torch.Tensor]  # camera frame, mm -> (n, classes)
+Points = Float32[np.ndarray, "n 3"]  # camera frame, mm
+Rows = Float32[np.ndarray, "n classes"]
+Box = Float[np.ndarray, "2 3"]  # camera frame, mm: lower and upper corner
+Affine = Float64[np.ndarray, "4 4"]
+Labels = UInt8[np.ndarray, "i j k"]
+Mask = Bool[np.ndarray, "i j k"]
+Margins = Float16[np.ndarray, "parts i j k"]
+LogitsAt = Callable[[Points], torch.Tensor]  # camera frame, mm -> (n, classes)
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,7 +45,7 @@ class LogitLattice:
         size = np.array(self.logits.shape[:3]) - 1
         return np.stack([self.origin_mm, self.origin_mm + self.step_mm * size])
 
-    def between(self, points_mm: Float32[np.ndarray, "n 3"]) -> Float32[np.ndarray, "n classes"]:
+    def between(self, points_mm: Points) -> Rows:
         """Trilinear logits at points; outside the lattice those of its border."""
         place = ((points_mm - self.origin_mm) / self.step_mm).astype(np.float32)
         return between(self.logits, place)
@@ -49,7 +57,7 @@ class LogitLattice:
         return not organ.any() or bool(organ.sum() > organ[1:-1, 1:-1, 1:-1].sum())
 
 
-def lattice_over(logits_at: LogitsAt, box_mm: Float[np.ndarray, "2 3"], steps: int) -> LogitLattice:
+def lattice_over(logits_at: LogitsAt, box_mm: Box, steps: int) -> LogitLattice:
     """A lattice over a box, ``steps`` along its longest side, queried at every point."""
     step = float((box_mm[1] - box_mm[0]).max()) / steps
     axes = [np.arange(low, high + step, step) for low, high in box_mm.T]
@@ -58,15 +66,8 @@ def lattice_over(logits_at: LogitsAt, box_mm: Float[np.ndarray, "2 3"], steps: i
     return LogitLattice(box_mm[0].astype(float), step, logits.reshape(*grid.shape[:3], -1))
 
 
-def margins_on(
-    lattice: LogitLattice,
-) -> tuple[
-    Float16[np.ndarray, "parts i j k"], UInt8[np.ndarray, "i j k"], Float64[np.ndarray, "4 4"]
-]:
-    """``margins_of`` the parts, labels and ``camera_from_index`` of a lattice.
-
-    Half precision: 2 bytes a voxel and part, 0.4 GB at 400^3 with two tumors.
-    """
+def margins_on(lattice: LogitLattice) -> tuple[Margins, Labels, Affine]:
+    """``margins_of`` the parts, labels and ``camera_from_index`` of a lattice."""
     logits = torch.from_numpy(lattice.logits.reshape(-1, lattice.logits.shape[3]))
     shape = lattice.logits.shape[:3]
     labels = logits.argmax(-1).to(torch.uint8).numpy().reshape(shape)
@@ -77,7 +78,8 @@ def margins_on(
 
 
 def margins_of(logits: torch.Tensor) -> Float16[np.ndarray, "n parts"]:
-    """By how much each part's logit wins (positive inside): (n, classes) -> (n, parts).
+    """By how much each part's logit wins (positive inside): (n, classes) -> (n, parts). Half
+    precision: 2 bytes a voxel and part, 0.4 GB at 400^3 with two tumors.
 
     The organ's margin is that of the best label inside against the outside, so that its zero
     set is the whole organ's surface; a tumor's is against the best other label.
@@ -90,9 +92,7 @@ def margins_of(logits: torch.Tensor) -> Float16[np.ndarray, "n parts"]:
     return won.half().cpu().numpy()
 
 
-def keep_largest_pieces(
-    labels: UInt8[np.ndarray, "i j k"], n_parts: int
-) -> UInt8[np.ndarray, "i j k"]:
+def keep_largest_pieces(labels: Labels, n_parts: int) -> Labels:
     """One piece of each part: islands of the organ become outside, those of a tumor organ."""
     kept = np.where(_largest_piece(labels > 0), labels, 0).astype(np.uint8)
     for label in range(FIRST_TUMOR, n_parts + 1):
@@ -102,10 +102,7 @@ def keep_largest_pieces(
 
 
 def drop_islands(
-    cloud: OccupancyCloud,
-    found: UInt8[np.ndarray, "i j k"],
-    kept: UInt8[np.ndarray, "i j k"],
-    camera_from_index: Float64[np.ndarray, "4 4"],
+    cloud: OccupancyCloud, found: Labels, kept: Labels, camera_from_index: Affine
 ) -> OccupancyCloud:
     """The cloud without what ``keep_largest_pieces`` dropped from ``found``: points of an island of
     the organ are left out, those of a tumor become organ. A point belongs to a piece if one of the
@@ -126,9 +123,7 @@ def drop_islands(
     return OccupancyCloud(points, labels[stays], probability, cloud.stamp_ns)
 
 
-def _largest_piece(mask: Bool[np.ndarray, "i j k"]) -> Bool[np.ndarray, "i j k"]:
-    from scipy import ndimage
-
+def _largest_piece(mask: Mask) -> Mask:
     box = _box_of(mask)
     pieces, count = ndimage.label(mask[box])
     if count < 2:
@@ -138,7 +133,7 @@ def _largest_piece(mask: Bool[np.ndarray, "i j k"]) -> Bool[np.ndarray, "i j k"]
     return largest
 
 
-def _box_of(mask: Bool[np.ndarray, "i j k"], margin: int = 0) -> tuple[slice, ...]:
+def _box_of(mask: Mask, margin: int = 0) -> tuple[slice, ...]:
     """Where a mask is true, and ``margin`` voxels more on each side."""
     box = []
     for others in ((1, 2), (0, 2), (0, 1)):
@@ -149,10 +144,7 @@ def _box_of(mask: Bool[np.ndarray, "i j k"], margin: int = 0) -> tuple[slice, ..
 
 
 def part_surfaces(
-    margins: Float16[np.ndarray, "parts i j k"],
-    labels: UInt8[np.ndarray, "i j k"],
-    camera_from_index: Float64[np.ndarray, "4 4"],
-    names: tuple[str, ...],
+    margins: Margins, labels: Labels, camera_from_index: Affine, names: tuple[str, ...]
 ) -> dict[str, Mesh]:
     """Each part, in one piece, as a closed surface; parts without a voxel are left out."""
     from skimage import measure

@@ -16,6 +16,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
+from tumortrack.core.geometry import Matrix, Points, Vector
 from tumortrack.core.types import Mesh
 from tumortrack.registration.network import POSE_OUTPUTS, RegistrationNetwork, facing_rotation
 
@@ -32,11 +33,11 @@ _ERROR_MM = 1.0  # to which the fields are matched by the modes
 class CanonicalFrame:
     """An organ's upright frame: x upright = ``scale`` * ``facing`` (x_ct - ``center_ct``)."""
 
-    facing: Float[np.ndarray, "3 3"]
-    center_ct: Float[np.ndarray, " 3"]
+    facing: Matrix
+    center_ct: Vector
     scale: float
 
-    def in_ct(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+    def in_ct(self, points: Points) -> Points:
         """Points of the upright frame in the CT's."""
         return points @ self.facing / self.scale + self.center_ct
 
@@ -52,10 +53,7 @@ class CanonicalFrame:
 
 
 def upright_of(
-    organ_ct: Mesh,
-    up_lps: tuple[float, float, float],
-    center_ct: Float[np.ndarray, " 3"],
-    long_axis: Float[np.ndarray, " 3"],
+    organ_ct: Mesh, up_lps: tuple[float, float, float], center_ct: Vector, long_axis: Vector
 ) -> CanonicalFrame:
     """The upright frame of an organ."""
     lower, upper = organ_ct.box_mm
@@ -71,7 +69,7 @@ def generic_points(count: int) -> Float[np.ndarray, "p 3"]:
     return direction * np.cbrt(rng.uniform(size=(count, 1))) * _HALF_AXES
 
 
-def generic_fields(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3 24"]:
+def generic_fields(points: Points) -> Float[np.ndarray, "n 3 24"]:
     """The displacement of points of the upright frame by one unit of each field."""
     return (_monomials(points) @ _mixture()).reshape(len(points), 3, FIELDS)
 
@@ -84,7 +82,7 @@ def _mixture() -> Float[np.ndarray, "30 24"]:
     return np.linalg.inv(triangle)[:, _RIGID:] * _FIELD_MM * np.sqrt(len(dense))
 
 
-def _monomials(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "m 30"]:
+def _monomials(points: Points) -> Float[np.ndarray, "m 30"]:
     """Vector fields, rigid ones first: constant, turns, stretches and shears, second degree."""
     x = points / UPRIGHT_MM
     eye = np.eye(3)

@@ -20,7 +20,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Float64
+from scipy.linalg import block_diag
 
+from tumortrack.core.geometry import Points
 from tumortrack.models.config import GaussNewtonConfig
 from tumortrack.registration import gauss_newton_kernels as kernels
 from tumortrack.registration.motion import ElasticMotion
@@ -39,10 +41,7 @@ class RegistrationResult:
 
 
 def refine(
-    rest: RestShape,
-    points_mm: Float[np.ndarray, "n 3"],
-    start: ElasticMotion,
-    config: GaussNewtonConfig,
+    rest: RestShape, points_mm: Points, start: ElasticMotion, config: GaussNewtonConfig
 ) -> RegistrationResult:
     """The motion near ``start`` that fits points (camera frame, mm) and the library best."""
     descent = GaussNewton(rest, points_mm, start, config)
@@ -58,11 +57,7 @@ class GaussNewton:
     """
 
     def __init__(
-        self,
-        rest: RestShape,
-        points_mm: Float[np.ndarray, "n 3"],
-        start: ElasticMotion,
-        config: GaussNewtonConfig,
+        self, rest: RestShape, points_mm: Points, start: ElasticMotion, config: GaussNewtonConfig
     ) -> None:
         body, count, precision = rest.body, len(points_mm), _prior(rest, config)
         self._rest = rest
@@ -83,9 +78,9 @@ class GaussNewton:
         # In C's order, whatever was given: the kernel is compiled for that.
         self._state = kernels.State(
             *(np.array(part, float, order="C") for part in given),
-            distances_mm=np.empty(count, np.float32),
-            curvature=np.empty_like(precision),
-            gradient=np.empty(len(precision)),
+            np.empty(count, np.float32),
+            np.empty_like(precision),
+            np.empty(len(precision)),
         )
         self.cost, self.steps, self.converged = np.inf, 0, False
 
@@ -107,9 +102,6 @@ class GaussNewton:
 
 
 def _prior(rest: RestShape, config: GaussNewtonConfig) -> Float64[np.ndarray, "p p"]:
-    modes = len(rest.body.mean)
-    precision = np.zeros((6 + modes, 6 + modes))
-    precision[:3, :3] = np.eye(3) / config.shift_mm**2
-    precision[3:6, 3:6] = np.eye(3) / config.turn_rad**2
-    precision[6:, 6:] = rest.body.precision
-    return precision
+    """The precision of shift, turn and coefficients."""
+    pose = [np.eye(3) / config.shift_mm**2, np.eye(3) / config.turn_rad**2]
+    return block_diag(*pose, rest.body.precision)

@@ -11,12 +11,14 @@ from typing import NamedTuple
 
 import numba
 import numpy as np
+from scipy.special import ndtr
 
 from tumortrack.simulate.elastic.flow import BLOCK, add_modes, block, enter, travel
 
 POSE = 6  # unknowns before the coefficients
 NODES_MM = 2.0  # apart, of the lattice for ``look_up``
-MOST_STD, PER_STD = 8, 1024  # so wide a table, in such steps, is right to 1e-7
+_MOST_STD, _PER_STD = 8, 1024  # so wide a table, in such steps, is right to 1e-7
+_NORMAL = ndtr(np.arange(_MOST_STD * _PER_STD + 2) / _PER_STD)  # from 0 standard deviations on
 
 
 class Flow(NamedTuple):
@@ -192,20 +194,21 @@ def mark(field, label, points, labels, margin):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def probabilities(margins, per_std, which, table):  # type: ignore[no-untyped-def]
-    """That normal errors do not exceed margins (n,), 0 or more; ``per_std[which]`` of them make
-    one standard deviation, ``table`` is ``normal_table()``. Float32 (n,)."""
+def probabilities(margins, per_std, which):  # type: ignore[no-untyped-def]
+    """That normal errors do not exceed margins (n,), 0 or more; ``per_std[which]`` of them make one
+    standard deviation. Float32 (n,)."""
     out = np.empty(len(margins), np.float32)
     for p in range(len(margins)):
-        place = min(margins[p] * per_std[which[p]], np.float64(MOST_STD)) * PER_STD
+        place = min(margins[p] * per_std[which[p]], np.float64(_MOST_STD)) * _PER_STD
         n = int(place)
-        out[p] = table[n] + (place - n) * (table[n + 1] - table[n])
+        out[p] = _NORMAL[n] + (place - n) * (_NORMAL[n + 1] - _NORMAL[n])
     return out
 
 
 @numba.njit(cache=True, nogil=True)
-def look_up(nearest, origin, points):  # type: ignore[no-untyped-def]
-    """The entry of ``nearest``, on a lattice of ``NODES_MM``, at the node nearest to each point."""
+def look_up(origin, nearest, points):  # type: ignore[no-untyped-def]
+    """Which of some places is nearest to each point: that of the nearest node of a lattice, which
+    may be another one where two are about as near; outside as on its border."""
     step = np.float32(NODES_MM)
     out, zero, half = np.empty(len(points), np.int32), np.float32(0), np.float32(0.5)
     x_last, y_last, z_last = nearest.shape[0] - 1, nearest.shape[1] - 1, nearest.shape[2] - 1

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from functools import cache
 from typing import Any
 
 import msgspec
 import numpy as np
-from jaxtyping import Float, Float32, Float64, Int32, Int64, UInt8
+from jaxtyping import Float, Float32, Int32, Int64, UInt8
+from scipy.spatial import cKDTree
 
 from tumortrack.core.estimate import Estimate, Following
 from tumortrack.core.types import Anatomy, CameraLabels, Mesh, OccupancyCloud, SensorCloud
@@ -29,36 +29,17 @@ _MOVED_MM = 2.5  # between live frames: what moves farther is found again from t
 _BEHIND_MM = 2.0  # a smoothed motion that lags by more starts again
 
 
-@dataclass(frozen=True, eq=False)
-class NearestLookup:
-    """Which of some places is nearest, for every place in their box and a node beyond; farther out
-    as on its border. That of the nearest node of a lattice: where two are about as near, either."""
-
-    origin_mm: Float32[np.ndarray, " 3"]
-    nearest: Int32[np.ndarray, "i j k"]
-
-    @classmethod
-    def of(cls, places_mm: Float[np.ndarray, "k 3"]) -> NearestLookup:
-        from scipy.spatial import cKDTree
-
-        step = kernels.NODES_MM
-        lower, upper = places_mm.min(0) - step, places_mm.max(0) + step
-        shape = tuple(np.ceil((upper - lower) / step).astype(int) + 1)
-        nodes = lower + step * np.indices(shape).reshape(3, -1).T
-        which = cKDTree(places_mm).query(nodes)[1].astype(np.int32)
-        return cls(lower.astype(np.float32), which.reshape(shape))
-
-    def to(self, points_mm: Float32[np.ndarray, "n 3"]) -> Int32[np.ndarray, " n"]:
-        """The place's number for every point."""
-        return kernels.look_up(self.nearest, self.origin_mm, points_mm)
-
-
-@cache
-def normal_table() -> Float64[np.ndarray, " n"]:
-    """The normal distribution's integral from 0 standard deviations on."""
-    from scipy.special import ndtr
-
-    return ndtr(np.arange(kernels.MOST_STD * kernels.PER_STD + 2) / kernels.PER_STD)
+def nearest_lookup(
+    places_mm: Float[np.ndarray, "k 3"],
+) -> tuple[Float32[np.ndarray, " 3"], Int32[np.ndarray, "i j k"]]:
+    """For ``kernels.look_up``: a lattice's origin, over the places' box and a node beyond, and the
+    number of the place nearest to each node."""
+    step = kernels.NODES_MM
+    lower, upper = places_mm.min(0) - step, places_mm.max(0) + step
+    shape = tuple(np.ceil((upper - lower) / step).astype(int) + 1)
+    nodes = lower + step * np.indices(shape).reshape(3, -1).T
+    which = cKDTree(places_mm).query(nodes)[1].astype(np.int32)
+    return lower.astype(np.float32), which.reshape(shape)
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,7 +68,7 @@ class _Registered:
         """The chance that each point lies on the side of the nearest surface where it was found,
         if errors are normal."""
         per_std = 1 / np.hypot(self.sample_std_mm, _FIELD_MM)
-        return kernels.probabilities(mine.margin_mm, per_std, mine.sample, normal_table())
+        return kernels.probabilities(mine.margin_mm, per_std, mine.sample)
 
 
 class RegistrationLocator:
@@ -104,7 +85,7 @@ class RegistrationLocator:
         few = [_SAMPLES // 2, *[64] * len(anatomy.tumors)]
         some = [v[:: max(1, len(v) // count)] for v, count in zip(vertices, few, strict=True)]
         self._samples_ct = np.concatenate(some)
-        self._nearest_sample = NearestLookup.of(self._samples_ct)
+        self._nearest_sample = nearest_lookup(self._samples_ct)
         self._middles_ct = np.array([part.box_mm.mean(0) for part in anatomy.parts])
         self._carried: _OrganPoints | None = None
 
@@ -233,5 +214,5 @@ class RegistrationLocator:
         labels, margin_mm = self._shape.labels_at(points_ct)
         inside = np.flatnonzero(labels)
         mine = points_ct.take(inside, 0)  # much faster than by a mask
-        sample = self._nearest_sample.to(mine)
+        sample = kernels.look_up(*self._nearest_sample, mine)
         return inside, _OrganPoints(mine, labels[inside], margin_mm[inside], sample)

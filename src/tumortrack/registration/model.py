@@ -10,7 +10,6 @@ from safetensors.numpy import load, save
 
 from tumortrack.core.config import Config, from_builtins, identity
 from tumortrack.core.errors import InputError
-from tumortrack.models.config import NetworkConfig
 from tumortrack.models.folder import SHAPE
 from tumortrack.models.model import Model
 from tumortrack.registration.gauss_newton_kernels import KERNEL
@@ -35,13 +34,11 @@ class UncertaintyCalibration(Config, frozen=True):
 class RegistrationModel(Model):
     """See ``Model``; ``shape`` is the organ of the CT with its elastic body."""
 
+    new_network = RegistrationNetwork
+
     network: RegistrationNetwork
     shape: RestShape
     calibration: UncertaintyCalibration
-
-    @classmethod
-    def new_network(cls, config: NetworkConfig) -> RegistrationNetwork:
-        return RegistrationNetwork(config)
 
     def registration(self) -> Registration:
         """The method, with this model's network and organ."""

@@ -8,21 +8,21 @@ undo a wrong turn by absurd deformations.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 from torch import Tensor, nn
 from torch.nn import functional
 
 from tumortrack.core.errors import InputError
-from tumortrack.core.geometry import rotation_onto
+from tumortrack.core.geometry import Matrix, Points, Vector, rotation_onto
 from tumortrack.models.config import NetworkConfig, RegistrationHeadConfig
 from tumortrack.models.layers import Layer
 from tumortrack.models.model import Network, OnnxParts
-from tumortrack.models.normalisation import Aligned, alignment, turned, without_strays
+from tumortrack.models.normalisation import Aligned, normalised
 from tumortrack.registration.rest_shape import RestShape
 
 _LARGEST = 4.0  # coefficients lie within so many standard deviations of the library's mean
@@ -53,8 +53,7 @@ class AlignedCloud:
         return AlignedCloud(self.points[rows], self.centre_mm[rows], self.turn[:, rows])
 
 
-@dataclass(frozen=True, eq=False)
-class PoseHypothesis:
+class PoseHypothesis(NamedTuple):
     """Where organs lie and how they are deformed: rotation and centre (camera frame, mm), so that
     a point x of the CT, deformed to y, lies at ``rotation (y - center_ct) + centre_mm``. The fields
     are also what an ONNX file gives."""
@@ -83,13 +82,11 @@ class RegistrationNetwork(Network):
 
     def __init__(self, config: NetworkConfig) -> None:
         super().__init__()
-        if not isinstance(config.decoder, RegistrationHeadConfig) or not isinstance(
-            config.normalisation, Aligned
-        ):
+        head, kind = config.decoder, config.normalisation
+        if not isinstance(head, RegistrationHeadConfig) or not isinstance(kind, Aligned):
             raise InputError("a registration network needs the decoder `warp` and aligned clouds.")
-        self.config = config
-        self.scale_mm, self.reach = config.normalisation.scale_mm, config.normalisation.reach
-        modes, width = config.decoder.modes, config.decoder.width
+        self.config, self.scale_mm = config, kind.scale_mm
+        modes, width = head.modes, head.width
         self.encoder = config.encoder.build()
         self.hidden = nn.Sequential(
             Layer(config.encoder.latent_size, width, "none"), Layer(width, width, "none")
@@ -99,18 +96,15 @@ class RegistrationNetwork(Network):
             self.output.weight.mul_(_SMALL_START)
             self.output.bias.zero_()
         self.register_buffer("center_ct", torch.zeros(3))
-        self.register_buffer("points", torch.zeros(config.decoder.points, 3))
-        self.register_buffer("modes", torch.zeros(config.decoder.points, 3, modes))
+        self.register_buffer("points", torch.zeros(head.points, 3))
+        self.register_buffer("modes", torch.zeros(head.points, 3, modes))
         self.register_buffer("mean", torch.zeros(modes))
         self.register_buffer("std", torch.ones(modes))
         self.register_buffer("facing", torch.eye(3))
         self.register_buffer("long_axis", torch.tensor([1.0, 0.0, 0.0]))
 
     def initialize(
-        self,
-        shape: RestShape,
-        up_lps: tuple[float, float, float],
-        points_ct: Float[np.ndarray, "p 3"],
+        self, shape: RestShape, up_lps: tuple[float, float, float], points_ct: Points
     ) -> None:
         """Take over what does not have to be learnt, with these points (CT frame)."""
         body = shape.body
@@ -128,11 +122,9 @@ class RegistrationNetwork(Network):
 
     def align(self, points_mm: Tensor) -> AlignedCloud:
         """Clouds (B, N, 3), camera frame, mm, in the network's frame."""
-        near = without_strays(points_mm, self.reach * self.scale_mm)
-        centre_mm = near.mean(dim=1, keepdim=True)
-        points = (near - centre_mm) / self.scale_mm
-        turn = alignment(points)
-        return AlignedCloud(turned(points, turn), centre_mm[:, 0], turn)
+        points, centre_mm, _, turn = normalised(points_mm, self.config.normalisation)
+        assert turn is not None
+        return AlignedCloud(points, centre_mm[:, 0], turn)
 
     def flip_sign(self, aligned: AlignedCloud, rotation: Tensor) -> Tensor:
         """+1 where the organ's long axis points to +x in the network's frame, else -1; (B,)."""
@@ -193,8 +185,7 @@ class RegistrationNetwork(Network):
 
     def onnx_parts(self, cloud_mm: Tensor) -> OnnxParts:
         """See ``Network``: clouds in, hypotheses of both ways round out."""
-        outputs = [field.name for field in fields(PoseHypothesis)]
-        names = {"input_names": ["cloud_mm"], "output_names": outputs}
+        names = {"input_names": ["cloud_mm"], "output_names": list(PoseHypothesis._fields)}
         return _Exported(self).cpu().eval(), (cloud_mm,), names
 
     def flip_hypotheses(self, points_mm: Tensor) -> PoseHypothesis:
@@ -216,13 +207,10 @@ class _Exported(nn.Module):
         self.network = network
 
     def forward(self, cloud_mm: Tensor) -> tuple[Tensor, ...]:
-        found = self.network.flip_hypotheses(cloud_mm)
-        return tuple(getattr(found, field.name) for field in fields(found))
+        return tuple(self.network.flip_hypotheses(cloud_mm))
 
 
-def facing_rotation(
-    up_lps: tuple[float, float, float], long_axis: Float[np.ndarray, " 3"]
-) -> Float[np.ndarray, "3 3"]:
+def facing_rotation(up_lps: tuple[float, float, float], long_axis: Vector) -> Matrix:
     """The rotation that an organ of any patient has where nothing is tilted: its upper side
     towards the camera, its long axis along +x as far as it lies across the view."""
     facing = rotation_onto(np.asarray(up_lps, float), np.array([0.0, 0.0, -1.0]))

@@ -19,9 +19,9 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
+from tumortrack.core.geometry import Points
 from tumortrack.core.process import parallel_for
 from tumortrack.models.config import GaussNewtonConfig
 from tumortrack.registration.gauss_newton import GaussNewton, RegistrationResult
@@ -29,7 +29,6 @@ from tumortrack.registration.motion import ElasticMotion
 from tumortrack.registration.network import RegistrationNetwork
 from tumortrack.registration.rest_shape import RestShape
 
-Points = Float[np.ndarray, "n 3"]  # camera frame, mm
 Timer = Callable[[str], AbstractContextManager[object]]
 
 _FLIP_MARGIN = 6.0  # logits: beyond this lead the other way round is not tried
@@ -99,19 +98,12 @@ class Registration:
     def _race(self, points_mm: Points, hypotheses: list[ElasticMotion]) -> RegistrationResult:
         """All hypotheses are refined by a few steps; those that may still win, to the end."""
         descents = [GaussNewton(self.rest, points_mm, start, self.config) for start in hypotheses]
-        _run_all(descents, min(_TRIAL_STEPS, self.config.steps))
+        trial, steps = min(_TRIAL_STEPS, self.config.steps), self.config.steps
+        parallel_for(lambda part: descents[part.start].run(trial), len(descents), 1)
         most = _MAX_COST_RATIO * min(descent.cost for descent in descents)
         left = [descent for descent in descents if descent.cost <= most]
-        _run_all(left, self.config.steps)
+        parallel_for(lambda part: left[part.start].run(steps), len(left), 1)
         return min(left, key=lambda descent: descent.cost).result()
-
-
-def _run_all(descents: list[GaussNewton], steps: int) -> None:
-    def run(part: slice) -> None:
-        for descent in descents[part]:
-            descent.run(steps)
-
-    parallel_for(run, len(descents), 1)
 
 
 @contextmanager

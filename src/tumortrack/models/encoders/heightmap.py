@@ -22,10 +22,8 @@ _SEEN_BESIDE = 0.02  # mean over a pixel and its neighbours
 
 
 class HeightMapConfig(Config, frozen=True, tag="heightmap"):
-    """``pixels`` along a side; ``channels`` of three stages, each of which halves the picture.
-
-    ``n_points``: larger clouds lose the rest (None: take all).
-    """
+    """``pixels`` along a side; ``channels`` of three stages, each of which halves the picture;
+    ``n_points``: larger clouds lose the rest (None: take all)."""
 
     pixels: int = 32
     channels: tuple[int, int, int] = (24, 48, 96)
@@ -68,10 +66,8 @@ class HeightMap(nn.Module):
 
 def picture(points: Tensor, pixels: int) -> Tensor:
     """Points (B, N, 3) -> (B, 4, pixels, pixels): seen or not and mean height, by pixel, and the
-    same over a pixel and its eight neighbours, which closes the gaps between points.
-
-    A point is spread over the four pixels about it, so that heights change smoothly with it.
-    """
+    same over a pixel and its eight neighbours, which closes the gaps between points. A point is
+    spread over the four pixels about it, so that heights change smoothly with it."""
     place = (points[..., :2] + _HALF) / (2 * _HALF) * pixels - 0.5
     weight, height = _spread(place, points[..., 2].contiguous(), pixels)
     channels = []
