@@ -15,6 +15,7 @@ from torch.autograd import Function
 from torch.autograd.function import once_differentiable
 from torch.nn import functional
 
+from tumortrack.models import kernels
 from tumortrack.models.sampling import traced
 
 Norm = Literal["none", "batch"]
@@ -91,14 +92,12 @@ class _Greatest(Function):
 
     @staticmethod
     def forward(ctx: Any, values: Tensor) -> Tensor:
-        from tumortrack.models.kernels import greatest
-
         batch, m, k, channels = ctx.shape = values.shape
         bits = values.detach().contiguous().view(_INTEGER[values.dtype])
         out = torch.empty(batch, m, channels, dtype=values.dtype)
         chosen = torch.empty(batch * m, channels, dtype=bits.dtype)
         infinity = torch.tensor(torch.inf, dtype=values.dtype).view(bits.dtype)
-        greatest(
+        kernels.greatest(
             bits.view(-1, k, channels).numpy(),
             infinity.numpy()[()],
             out.view(bits.dtype).view(-1, channels).numpy(),
@@ -110,13 +109,11 @@ class _Greatest(Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *gradients: Tensor) -> Tensor:
-        from tumortrack.models.kernels import handed_back
-
         (chosen,) = ctx.saved_tensors
         (gradient,) = gradients
         bits = gradient.contiguous().view(chosen.dtype).view(chosen.shape)
         out = torch.empty(ctx.shape, dtype=gradient.dtype)
         _, _, k, channels = ctx.shape
         spread = out.view(chosen.dtype).view(-1, k, channels)
-        handed_back(bits.numpy(), chosen.numpy(), spread.numpy())
+        kernels.handed_back(bits.numpy(), chosen.numpy(), spread.numpy())
         return out

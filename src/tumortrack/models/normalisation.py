@@ -8,6 +8,7 @@ from torch import Tensor
 
 from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError
+from tumortrack.models import kernels
 from tumortrack.models.sampling import compiled, take
 
 
@@ -69,10 +70,8 @@ def without_strays(points_mm: Tensor, reach_mm: float) -> Tensor:
     5 mm). The order of the points that stay is kept.
     """
     if compiled(points_mm):
-        from tumortrack.models.kernels import near as gathered
-
         out = torch.empty_like(points_mm, memory_format=torch.contiguous_format)
-        gathered(points_mm.contiguous().numpy(), np.float32(reach_mm), out.numpy())
+        kernels.near(points_mm.contiguous().numpy(), np.float32(reach_mm), out.numpy())
         return out
     n = points_mm.shape[1]
     if torch.jit.is_tracing():  # ONNX has no median

@@ -13,6 +13,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from tumortrack.models import kernels
+
 Sampling = Literal["fps", "strided"]
 
 
@@ -30,9 +32,7 @@ def farthest_points(points: Tensor, k: int) -> Tensor:
     chosen = torch.empty((len(points), k), dtype=torch.int64, device=points.device)
     newest = _squared_distance(x, y, z, *centre.unbind(-1)).argmax(dim=1, keepdim=True)
     if compiled(points):
-        from tumortrack.models.kernels import farthest
-
-        farthest(rows.numpy(), newest[:, 0].numpy(), chosen.numpy())
+        kernels.farthest(rows.numpy(), newest[:, 0].numpy(), chosen.numpy())
         return chosen
     nearest = torch.full_like(x, torch.inf)
     for step in range(k):
@@ -63,11 +63,9 @@ def ball_query(points: Tensor, centres: Tensor, radius: float, k: int) -> Tensor
     Source: Qi et al., PointNet++, NIPS 2017, section 3.2.
     """
     if compiled(points):
-        from tumortrack.models.kernels import balls
-
         found = torch.empty((*centres.shape[:2], k), dtype=torch.int64)
         rows = _rows(points).numpy(), _rows(centres).numpy()
-        balls(*rows, np.float32(radius**2), found.numpy())
+        kernels.balls(*rows, np.float32(radius**2), found.numpy())
         return found
     across, down = _rows(points)[:, :, None].unbind(1), _rows(centres)[..., None].unbind(1)
     inside = _squared_distance(*across, *down) <= radius**2

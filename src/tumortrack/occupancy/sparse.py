@@ -25,7 +25,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float32, Float64, Int
+from jaxtyping import Bool, Float32, Int
 
 from tumortrack.core.types import OUTSIDE
 from tumortrack.occupancy import kernels, volume
@@ -49,30 +49,19 @@ class _Level:
     shape: tuple[int, int, int]
 
     def query(self, flat: Flat) -> Rows:
-        half_mm = self.coarse.step_mm / 2
-        return _query(self.logits_at, self.coarse.origin_mm, half_mm, self.shape, flat)
+        """The network's logits."""
+        parts, step_mm = [], self.coarse.step_mm / 2
+        for first in range(0, len(flat), volume.AT_ONCE):
+            index = np.unravel_index(flat[first : first + volume.AT_ONCE], self.shape)
+            points = np.stack(index, axis=1) * step_mm + self.coarse.origin_mm
+            parts.append(self.logits_at(points.astype(np.float32)).float().cpu().numpy())
+        return np.concatenate(parts)
 
     def known(self) -> Bool[np.ndarray, " n"]:
         """The coarse points."""
         known = np.zeros(self.shape, bool)
         known[::2, ::2, ::2] = True
         return known.ravel()
-
-
-def _query(
-    logits_at: LogitsAt,
-    origin_mm: Float64[np.ndarray, " 3"],
-    step_mm: float,
-    shape: tuple[int, int, int],
-    flat: Flat,
-) -> Rows:
-    """The network's logits at flat indices of a lattice."""
-    parts = []
-    for first in range(0, len(flat), volume.AT_ONCE):
-        index = np.unravel_index(flat[first : first + volume.AT_ONCE], shape)
-        points = np.stack(index, axis=1) * step_mm + origin_mm
-        parts.append(logits_at(points.astype(np.float32)).float().cpu().numpy())
-    return np.concatenate(parts)
 
 
 def refined(
@@ -119,8 +108,9 @@ def sparse_margins(
     stride, (i, j, k) = 2**levels, shape
     if levels > 0:
         i, j, k = ((n - 2) // stride + 2 for n in shape)  # the last on the grid's end or past it
-    step_mm, every = voxel_mm * stride, np.arange(i * j * k)
-    logits = _query(logits_at, origin_mm, step_mm, (i, j, k), every)
+    step_mm = voxel_mm * stride
+    unknown = LogitLattice(origin_mm, 2 * step_mm, np.empty((0, 0, 0, 0), np.float32))
+    logits = _Level(logits_at, unknown, (i, j, k)).query(np.arange(i * j * k))
     lattice = LogitLattice(origin_mm, step_mm, logits.reshape(i, j, k, -1))
     if levels == 0:
         return volume.margins_on(lattice)[:2]
@@ -195,14 +185,12 @@ def query_uncertain(
     if open_points:
         least = min(_PROBE, open_points) - 1
         limit.limit = max(limit.limit, float(np.partition(leads, least)[least]))
-    while True:
-        now = np.flatnonzero((leads <= limit.limit) & ~queried)
-        if not len(now):
-            return queried
+    while len(now := np.flatnonzero((leads <= limit.limit) & ~queried)):
         found = query(now)
         limit.update(expected[now], found)
         expected[now] = found
         queried[now] = True
+    return queried
 
 
 def _connected(level: _Level, rows: Rows) -> None:

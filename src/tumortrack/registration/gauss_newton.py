@@ -74,14 +74,11 @@ class GaussNewton:
             narrowing=config.narrowing,
             enough_mm=config.enough_mm,
         )
-        given = start.rotation, start.centre_mm, start.coefficients, np.zeros(6)
         # In C's order, whatever was given: the kernel is compiled for that.
-        self._state = kernels.State(
-            *(np.array(part, float, order="C") for part in given),
-            np.empty(count, np.float32),
-            np.empty_like(precision),
-            np.empty(len(precision)),
-        )
+        given = start.rotation, start.centre_mm, start.coefficients
+        rotation, centre_mm, coefficients = (np.array(part, float, order="C") for part in given)
+        left = np.empty(count, np.float32), np.empty_like(precision), np.empty(len(precision))
+        self._state = kernels.State(rotation, centre_mm, coefficients, np.zeros(6), *left)
         self.cost, self.steps, self.converged = np.inf, 0, False
 
     def run(self, steps: int) -> None:

@@ -14,6 +14,7 @@ from torch.nn import functional
 
 from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError
+from tumortrack.models import kernels
 from tumortrack.models.sampling import compiled
 
 _HALF = 1.25  # normalised units from the picture's middle to its border
@@ -83,9 +84,7 @@ def _spread(place: Tensor, heights: Tensor, pixels: int) -> tuple[Tensor, Tensor
     weight = place.new_zeros(len(place), 1, pixels, pixels)
     height = torch.zeros_like(weight)
     if compiled(place):
-        from tumortrack.models.kernels import spread
-
-        spread(place.numpy(), heights.numpy(), weight[:, 0].numpy(), height[:, 0].numpy())
+        kernels.spread(place.numpy(), heights.numpy(), weight[:, 0].numpy(), height[:, 0].numpy())
         return weight, height
     lowest = place.floor()
     part = place - lowest
