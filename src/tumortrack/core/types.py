@@ -20,22 +20,20 @@ OUTSIDE, ORGAN, FIRST_TUMOR = 0, 1, 2
 
 def _freeze(value: object, name: str, dtype: npt.DTypeLike, shape: tuple[int | None, ...]) -> None:
     """Convert one field to a read-only array and check its shape (None: any length)."""
-    given = np.asarray(getattr(value, name))
+    given, field = np.asarray(getattr(value, name)), f"{type(value).__name__}.{name}"
     if given.dtype == dtype and given.flags.owndata and not given.flags.writeable:
         array = given  # frozen already, by another value
     else:
         array = given.astype(dtype)  # a copy: the caller's stays writable
     if array.dtype.kind in "iu" and array.dtype != given.dtype and (array != given).any():
         raise InputError(
-            f"{type(value).__name__}.{name} has numbers that are no {array.dtype}; give whole "
+            f"{field} has numbers that are no {array.dtype}; give whole "
             f"numbers in {np.iinfo(array.dtype).min}..{np.iinfo(array.dtype).max}."
         )
     pairs = zip(shape, array.shape, strict=False)
     if array.ndim != len(shape) or any(want not in (None, have) for want, have in pairs):
         wanted = " x ".join("n" if s is None else str(s) for s in shape)
-        raise InputError(
-            f"{type(value).__name__}.{name} has shape {array.shape}; it must be {wanted}."
-        )
+        raise InputError(f"{field} has shape {array.shape}; it must be {wanted}.")
     array.flags.writeable = False
     object.__setattr__(value, name, array)
 

@@ -30,7 +30,7 @@ def farthest_points(points: Tensor, k: int) -> Tensor:
     rows, centre = _rows(points), points.detach().mean(dim=1, keepdim=True)
     x, y, z = rows.unbind(1)
     chosen = torch.empty((len(points), k), dtype=torch.int64, device=points.device)
-    newest = _squared_distance(x, y, z, *centre.unbind(-1)).argmax(dim=1, keepdim=True)
+    newest = _distance_2(x, y, z, *centre.unbind(-1)).argmax(dim=1, keepdim=True)
     if compiled(points):
         kernels.farthest(rows.numpy(), newest[:, 0].numpy(), chosen.numpy())
         return chosen
@@ -38,7 +38,7 @@ def farthest_points(points: Tensor, k: int) -> Tensor:
     for step in range(k):
         chosen[:, step : step + 1] = newest
         at = (axis.gather(1, newest) for axis in (x, y, z))
-        nearest = torch.minimum(nearest, _squared_distance(x, y, z, *at))
+        nearest = torch.minimum(nearest, _distance_2(x, y, z, *at))
         newest = nearest.argmax(dim=1, keepdim=True)
     return chosen
 
@@ -68,7 +68,7 @@ def ball_query(points: Tensor, centres: Tensor, radius: float, k: int) -> Tensor
         kernels.balls(*rows, np.float32(radius**2), found.numpy())
         return found
     across, down = _rows(points)[:, :, None].unbind(1), _rows(centres)[..., None].unbind(1)
-    inside = _squared_distance(*across, *down) <= radius**2
+    inside = _distance_2(*across, *down) <= radius**2
     slot = inside.long().cumsum(dim=2)  # 1 for the first found; ONNX sums no truths
     count = slot[:, :, -1:].clone()
     slot.sub_(1).masked_fill_(~inside, k).clamp_(max=k)  # slot k takes all that is not wanted
@@ -104,8 +104,6 @@ def _rows(points: Tensor) -> Tensor:
     return points.detach().transpose(1, 2).contiguous()
 
 
-def _squared_distance(
-    x: Tensor, y: Tensor, z: Tensor, cx: Tensor, cy: Tensor, cz: Tensor
-) -> Tensor:
-    """Of broadcastable coordinates; by differences, so that a point is at exactly 0 of itself."""
+def _distance_2(x: Tensor, y: Tensor, z: Tensor, cx: Tensor, cy: Tensor, cz: Tensor) -> Tensor:
+    """Squared, of broadcastable coordinates; by differences, so that a point is at exactly 0 of itself."""
     return (x - cx).square_().add_((y - cy).square_()).add_((z - cz).square_())

@@ -27,7 +27,7 @@ from tumortrack.core.errors import ArtifactError, InputError, StorageError
 from tumortrack.models.folder import WEIGHTS
 from tumortrack.models.model import Model
 from tumortrack.occupancy.inference import CHUNK, Arithmetic, Inference, possible
-from tumortrack.occupancy.network import Latent, OccupancyNetwork
+from tumortrack.occupancy.network import OccupancyNetwork
 
 FOLDER = "compiled"
 SCHEMA = 2
@@ -196,7 +196,9 @@ def measured(
         start = time.perf_counter()
         one.logits(latent, queries)
         seconds[n].append(time.perf_counter() - start)
-    truth = reference(inferences[0].network, latent, queries)
+    with torch.inference_mode():  # in single precision
+        parts = torch.from_numpy(queries)[None].split(CHUNK, dim=1)
+        truth = torch.cat([inferences[0].network.query(latent, part)[0] for part in parts])
     timings = [
         ArithmeticTiming(
             arithmetic=choice,
@@ -227,12 +229,3 @@ def like_an_organ(half_mm: float, rng: np.random.Generator) -> Float32[np.ndarra
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     directions[:, 2] = -np.abs(directions[:, 2])
     return (directions * _FLATTER * half_mm + [0, 0, _DISTANCE_MM]).astype(np.float32)
-
-
-@torch.inference_mode()
-def reference(
-    folded: OccupancyNetwork, latent: Latent, queries_mm: Float32[np.ndarray, "n 3"]
-) -> torch.Tensor:
-    """The network's own logits in single precision, (n, classes)."""
-    parts = torch.from_numpy(queries_mm)[None].split(CHUNK, dim=1)
-    return torch.cat([folded.query(latent, part)[0] for part in parts])

@@ -168,9 +168,7 @@ def part_surfaces(
     return meshes
 
 
-def surface_distances(
-    lattice: LogitLattice, points_mm: Float[np.ndarray, "n 3"]
-) -> Float32[np.ndarray, " n"]:
+def surface_distances(lattice: LogitLattice, points_mm: Points) -> Float32[np.ndarray, " n"]:
     """How far points (n, 3) lie from the organ's surface, camera frame, mm; NoEstimate where there
     is none in the lattice's box. It is the zero of the margin, linear between the lattice's points:
     accurate to about half a mm for an organ on ``FIT_STEPS``."""

@@ -20,6 +20,7 @@ from tumortrack.core.geometry import Matrix, Points, Vector
 from tumortrack.core.types import Mesh
 from tumortrack.registration.network import POSE_OUTPUTS, RegistrationNetwork, facing_rotation
 
+Poses = Float[np.ndarray, "b 4 4"]
 UPRIGHT_MM = 55.0  # half the length of every organ in its upright frame
 FIELDS = 24  # second degree: 30 vector fields, less 6 of rigid motion
 _RIGID = 6
@@ -41,9 +42,7 @@ class CanonicalFrame:
         """Points of the upright frame in the CT's."""
         return points @ self.facing / self.scale + self.center_ct
 
-    def camera_from_upright(
-        self, camera_from_ct: Float[np.ndarray, "b 4 4"]
-    ) -> Float[np.ndarray, "b 4 4"]:
+    def camera_from_upright(self, camera_from_ct: Poses) -> Poses:
         """Poses of the upright organ before a camera whose lengths are scaled likewise."""
         poses = np.tile(np.eye(4), (len(camera_from_ct), 1, 1))
         rotation = camera_from_ct[:, :3, :3]

@@ -60,6 +60,6 @@ class RegistrationModel(Model):
         if calibration.kernel != KERNEL:
             raise InputError(
                 f"{folder}: its fits were calibrated with the robust kernel {calibration.kernel}; "
-                f"here it is {KERNEL}. Make it again: tumortrack train CASE {folder} --overwrite."
+                f"here it is {KERNEL}. Make another model: tumortrack train CASE MODEL."
             )
         return cls(shape=shape, calibration=calibration, **common)

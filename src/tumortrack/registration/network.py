@@ -49,9 +49,6 @@ class AlignedCloud:
         flip = torch.stack([sign, sign, torch.ones_like(sign)], -1)[:, None]
         return AlignedCloud(self.points * flip, self.centre_mm, self.turn * sign[None, :, None])
 
-    def __getitem__(self, rows: slice) -> AlignedCloud:
-        return AlignedCloud(self.points[rows], self.centre_mm[rows], self.turn[:, rows])
-
 
 class PoseHypothesis(NamedTuple):
     """Where organs lie and how they are deformed: rotation and centre (camera frame, mm), so that
@@ -72,14 +69,6 @@ class RegistrationNetwork(Network):
     (P, 3, M), its states' mean and spread.
     """
 
-    center_ct: Tensor
-    points: Tensor
-    modes: Tensor
-    mean: Tensor
-    std: Tensor
-    facing: Tensor
-    long_axis: Tensor
-
     def __init__(self, config: NetworkConfig) -> None:
         super().__init__()
         head, kind = config.decoder, config.normalisation
@@ -95,13 +84,13 @@ class RegistrationNetwork(Network):
         with torch.no_grad():
             self.output.weight.mul_(_SMALL_START)
             self.output.bias.zero_()
-        self.register_buffer("center_ct", torch.zeros(3))
-        self.register_buffer("points", torch.zeros(head.points, 3))
-        self.register_buffer("modes", torch.zeros(head.points, 3, modes))
-        self.register_buffer("mean", torch.zeros(modes))
-        self.register_buffer("std", torch.ones(modes))
-        self.register_buffer("facing", torch.eye(3))
-        self.register_buffer("long_axis", torch.tensor([1.0, 0.0, 0.0]))
+        self.center_ct = nn.Buffer(torch.zeros(3))
+        self.points = nn.Buffer(torch.zeros(head.points, 3))
+        self.modes = nn.Buffer(torch.zeros(head.points, 3, modes))
+        self.mean = nn.Buffer(torch.zeros(modes))
+        self.std = nn.Buffer(torch.ones(modes))
+        self.facing = nn.Buffer(torch.eye(3))
+        self.long_axis = nn.Buffer(torch.tensor([1.0, 0.0, 0.0]))
 
     def initialize(
         self, shape: RestShape, up_lps: tuple[float, float, float], points_ct: Points
@@ -177,7 +166,8 @@ class RegistrationNetwork(Network):
     def _flipped_loss(self, wrong: AlignedCloud, first: int) -> Tensor:
         """How well the wrong way round is told, by some of the clouds: the same ones in every
         sharing of the batch, so that a small share may have none."""
-        few = wrong[slice(-first % _FLIPPED_SHARE, None, _FLIPPED_SHARE)]
+        rows = slice(-first % _FLIPPED_SHARE, None, _FLIPPED_SHARE)
+        few = AlignedCloud(wrong.points[rows], wrong.centre_mm[rows], wrong.turn[:, rows])
         if not len(few.points):
             return wrong.points.new_zeros(())
         told = functional.softplus(self(few).right_way).sum()
