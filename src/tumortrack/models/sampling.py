@@ -105,5 +105,5 @@ def _rows(points: Tensor) -> Tensor:
 
 
 def _distance_2(x: Tensor, y: Tensor, z: Tensor, cx: Tensor, cy: Tensor, cz: Tensor) -> Tensor:
-    """Squared, of broadcastable coordinates; by differences, so that a point is at exactly 0 of itself."""
+    """Squared, of broadcastable coordinates; exactly 0 of a point and itself."""
     return (x - cx).square_().add_((y - cy).square_()).add_((z - cz).square_())

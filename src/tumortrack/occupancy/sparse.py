@@ -2,12 +2,8 @@
 settle the label.
 
 Every rule refines the same way (``refined``): halfway between the points of a lattice logits are
-first taken as linear; then a policy queries the network where that is not enough.
-
-- ``_connected`` queries the organ and a point or two about it: all that touches what lies inside.
-- ``_uncertain`` queries where the leading label leads by less than linear logits were found to be
-  off. Where an answer is another label than expected, and by more than noise, the points about it
-  are queried as well.
+first taken as linear; then a policy queries the network where that is not enough: ``_connected``
+all that touches the organ, ``_uncertain`` where linear logits do not settle the label.
 
 ``sparse_margins`` goes on so from a lattice of at most ``START_MM`` down to voxels. What it may
 miss: a part that no lattice point lies in and that does not show in the logits about it either. A
@@ -209,7 +205,8 @@ def _connected(level: _Level, rows: Rows) -> None:
 
 
 def _uncertain(limit: InterpolationLimit, level: _Level, rows: Rows) -> None:
-    """Query where linear logits do not settle the label, and about surprises."""
+    """Query where the leading label leads by less than linear logits were found to be off, and
+    about surprises."""
     leads = leading(rows)[1]
     leads[level.known()] = np.inf
     queried = np.flatnonzero(query_uncertain(rows, leads, level.query, limit))

@@ -30,7 +30,7 @@ _BEHIND_MM = 2.0  # a smoothed motion that lags by more starts again
 
 
 def nearest_lookup(
-    places_mm: Float[np.ndarray, "k 3"],
+    places_mm: Float[np.ndarray, "p 3"],
 ) -> tuple[Float32[np.ndarray, " 3"], Int32[np.ndarray, "i j k"]]:
     """For ``kernels.look_up``: a lattice's origin, over the places' box and a node beyond, and the
     number of the place nearest to each node."""

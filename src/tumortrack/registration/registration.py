@@ -13,8 +13,8 @@ with its uncertainty. `locator` reads surfaces, labels and numbers off it.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 
 import numpy as np
@@ -63,8 +63,15 @@ class Registration:
         """The network's hypotheses, the likelier first; the second only where it may be right."""
         device = next(self.network.parameters()).device
         cloud = torch.tensor(np.asarray(points_mm, np.float32), device=device)[None]
-        with _one_thread() if device.type == "cpu" else nullcontext():
+        # One thread for a network so small that a second saves nothing: that would wait busily for
+        # more work, milliseconds long, on the core where the refinement is to run. The number is
+        # the whole process's: nothing else should start to use torch meanwhile.
+        threads = torch.get_num_threads()
+        torch.set_num_threads(1 if device.type == "cpu" else threads)
+        try:
             found = self.network.flip_hypotheses(cloud)
+        finally:
+            torch.set_num_threads(threads)
         likelier = int(found.right_way[1] > found.right_way[0])
         lead = float(found.right_way[likelier] - found.right_way[1 - likelier])
         parts = (found.rotation, found.centre_mm, found.coefficients)
@@ -104,18 +111,3 @@ class Registration:
         left = [descent for descent in descents if descent.cost <= most]
         parallel_for(lambda part: left[part.start].run(steps), len(left), 1)
         return min(left, key=lambda descent: descent.cost).result()
-
-
-@contextmanager
-def _one_thread() -> Iterator[None]:
-    """One thread for a network so small that a second saves nothing: it would wait busily for more
-    work, milliseconds long, on the core where the refinement is to run.
-
-    The number is the whole process's: nothing else should start to use torch meanwhile.
-    """
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)
