@@ -7,13 +7,14 @@ from jaxtyping import Float
 
 from tumortrack.core.errors import InputError
 
+Direction = tuple[float, float, float]
 Points = Float[np.ndarray, "n 3"]
 Affine = Float[np.ndarray, "4 4"]
 Matrix = Float[np.ndarray, "3 3"]
 Vector = Float[np.ndarray, " 3"]
 
 # Patient frame, DICOM: +x Left, +y Posterior, +z Superior (LPS).
-DIRECTIONS_LPS: dict[str, tuple[float, float, float]] = {
+DIRECTIONS_LPS: dict[str, Direction] = {
     "left": (1.0, 0.0, 0.0),
     "right": (-1.0, 0.0, 0.0),
     "posterior": (0.0, 1.0, 0.0),
@@ -51,7 +52,7 @@ def rotation_onto(source: Vector, target: Vector) -> Matrix:
     return (np.eye(3) - 2 * np.outer(middle, middle)) @ (np.eye(3) - 2 * np.outer(a, a))
 
 
-def direction_lps(text: str) -> tuple[float, float, float]:
+def direction_lps(text: str) -> Direction:
     """A unit vector in LPS from a name (``anterior``) or three numbers (``0,-1,0``); InputError for
     neither a known name nor a non-zero finite 3-vector."""
     if text.lower() in DIRECTIONS_LPS:

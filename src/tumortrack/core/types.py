@@ -159,11 +159,9 @@ class Intrinsics:
     cy: float
 
     def __post_init__(self) -> None:
-        numbers = [float(getattr(self, f.name)) for f in fields(self)]
-        if not np.isfinite(numbers).all() or min(self.fx, self.fy) <= 0:
-            raise InputError(
-                f"intrinsics {numbers} are not usable; fx and fy must be positive pixels."
-            )
+        six = [float(getattr(self, f.name)) for f in fields(self)]
+        if not np.isfinite(six).all() or min(self.fx, self.fy) <= 0:
+            raise InputError(f"intrinsics {six} are not usable; fx and fy must be positive pixels.")
         if not (0 < self.width <= 8192 and 0 < self.height <= 8192):
             raise InputError("intrinsics: width and height must lie in 1..8192 pixels.")
 

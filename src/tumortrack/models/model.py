@@ -69,8 +69,8 @@ class Model(ABC):
 
     @classmethod
     @abstractmethod
-    def from_folder(cls: type[M], folder: Path, manifest: dict[str, Any], **common: Any) -> M:
-        """The model of a folder whose fields ``common`` are read already; InputError, KeyError,
+    def from_folder(cls: type[M], folder: Path, manifest: dict[str, Any], **known: Any) -> M:
+        """The model of a folder whose fields ``known`` are read already; InputError, KeyError,
         ValueError or OSError where the folder lacks something."""
 
 

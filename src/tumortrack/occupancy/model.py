@@ -34,8 +34,6 @@ SCHEMA = 2
 QUERIES = 10_000
 ENOUGH_EQUAL = 0.999
 _CHUNKS = (1024, 2048, 4096)
-_POINTS = 1000
-_DISTANCE_MM = 130.0
 _FLATTER = (1.0, 0.6, 0.45)  # half axes of a kidney's upper side, about
 
 
@@ -78,11 +76,11 @@ class OccupancyModel(Model):
     arithmetic: Arithmetic | None = None
 
     @classmethod
-    def from_folder(cls, folder: Path, manifest: dict[str, Any], **common: Any) -> OccupancyModel:
-        if next(common["network"].parameters()).device.type != "cpu":
-            return cls(**common)
+    def from_folder(cls, folder: Path, manifest: dict[str, Any], **known: Any) -> OccupancyModel:
+        if next(known["network"].parameters()).device.type != "cpu":
+            return cls(**known)
         arithmetic, note = find(folder, str(manifest["files"][WEIGHTS]))
-        return cls(arithmetic=arithmetic, notes=() if note is None else (note,), **common)
+        return cls(arithmetic=arithmetic, notes=() if note is None else (note,), **known)
 
 
 def this_machine() -> Machine:
@@ -224,8 +222,8 @@ def measured(
 
 
 def like_an_organ(half_mm: float, rng: np.random.Generator) -> Float32[np.ndarray, "n 3"]:
-    """The upper side of an ellipsoid before the camera, ``half_mm`` its longest half axis."""
-    directions = rng.normal(size=(_POINTS, 3))
+    """An ellipsoid's upper side, 130 mm before the camera; ``half_mm``: its longest half axis."""
+    directions = rng.normal(size=(1000, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     directions[:, 2] = -np.abs(directions[:, 2])
-    return (directions * _FLATTER * half_mm + [0, 0, _DISTANCE_MM]).astype(np.float32)
+    return (directions * _FLATTER * half_mm + [0, 0, 130.0]).astype(np.float32)

@@ -60,9 +60,10 @@ class _Level:
         return known.ravel()
 
 
-def refined(
-    logits_at: LogitsAt, coarse: LogitLattice, policy: Callable[[_Level, Rows], None]
-) -> LogitLattice:
+Policy = Callable[[_Level, Rows], None]  # replaces rows by answers
+
+
+def refined(logits_at: LogitsAt, coarse: LogitLattice, policy: Policy) -> LogitLattice:
     """The lattice of half the step: linear logits, and the network's where the policy puts them."""
     i, j, k = (2 * n - 1 for n in coarse.logits.shape[:3])
     logits = np.empty((i, j, k, coarse.logits.shape[3]), np.float32)

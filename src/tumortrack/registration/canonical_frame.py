@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from tumortrack.core.geometry import Matrix, Points, Vector
+from tumortrack.core.geometry import Direction, Matrix, Points, Vector
 from tumortrack.core.types import Mesh
 from tumortrack.registration.network import POSE_OUTPUTS, RegistrationNetwork, facing_rotation
 
@@ -52,7 +52,7 @@ class CanonicalFrame:
 
 
 def upright_of(
-    organ_ct: Mesh, up_lps: tuple[float, float, float], center_ct: Vector, long_axis: Vector
+    organ_ct: Mesh, up_lps: Direction, center_ct: Vector, long_axis: Vector
 ) -> CanonicalFrame:
     """The upright frame of an organ."""
     lower, upper = organ_ct.box_mm

@@ -85,9 +85,8 @@ class GaussNewton:
         """Continue until ``steps`` are taken since the start, or it has converged."""
         if self.converged or (steps <= self.steps and np.isfinite(self.cost)):
             return
-        self.steps, self.converged, self.cost = kernels.descend(
-            self._problem, self._state, self.steps, steps
-        )
+        reached = kernels.descend(self._problem, self._state, self.steps, steps)
+        self.steps, self.converged, self.cost = reached
 
     def result(self) -> RegistrationResult:
         """The present state."""

@@ -51,10 +51,8 @@ class RegistrationModel(Model):
         return {"trust": identity(self.calibration)}
 
     @classmethod
-    def from_folder(
-        cls, folder: Path, manifest: dict[str, Any], **common: Any
-    ) -> RegistrationModel:
-        shape = RestShape.from_arrays(load((folder / SHAPE).read_bytes()), len(common["parts"]))
+    def from_folder(cls, folder: Path, manifest: dict[str, Any], **known: Any) -> RegistrationModel:
+        shape = RestShape.from_arrays(load((folder / SHAPE).read_bytes()), len(known["parts"]))
         where = f"{folder}: trust"
         calibration = from_builtins(manifest["trust"], UncertaintyCalibration, where)
         if calibration.kernel != KERNEL:
@@ -62,4 +60,4 @@ class RegistrationModel(Model):
                 f"{folder}: its fits were calibrated with the robust kernel {calibration.kernel}; "
                 f"here it is {KERNEL}. Make another model: tumortrack train CASE MODEL."
             )
-        return cls(shape=shape, calibration=calibration, **common)
+        return cls(shape=shape, calibration=calibration, **known)

@@ -18,7 +18,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from tumortrack.core.errors import InputError
-from tumortrack.core.geometry import Matrix, Points, Vector, rotation_onto
+from tumortrack.core.geometry import Direction, Matrix, Points, Vector, rotation_onto
 from tumortrack.models.config import NetworkConfig, RegistrationHeadConfig
 from tumortrack.models.layers import Layer
 from tumortrack.models.model import Network, OnnxParts
@@ -92,9 +92,7 @@ class RegistrationNetwork(Network):
         self.facing = nn.Buffer(torch.eye(3))
         self.long_axis = nn.Buffer(torch.tensor([1.0, 0.0, 0.0]))
 
-    def initialize(
-        self, shape: RestShape, up_lps: tuple[float, float, float], points_ct: Points
-    ) -> None:
+    def initialize(self, shape: RestShape, up_lps: Direction, points_ct: Points) -> None:
         """Take over what does not have to be learnt, with these points (CT frame)."""
         body = shape.body
         known = {
@@ -200,7 +198,7 @@ class _Exported(nn.Module):
         return tuple(self.network.flip_hypotheses(cloud_mm))
 
 
-def facing_rotation(up_lps: tuple[float, float, float], long_axis: Vector) -> Matrix:
+def facing_rotation(up_lps: Direction, long_axis: Vector) -> Matrix:
     """The rotation that an organ of any patient has where nothing is tilted: its upper side
     towards the camera, its long axis along +x as far as it lies across the view."""
     facing = rotation_onto(np.asarray(up_lps, float), np.array([0.0, 0.0, -1.0]))

@@ -56,10 +56,7 @@ class HeightMap(nn.Module):
         self.layers = nn.Sequential(*layers)
 
     def forward(self, points: Tensor) -> Tensor:
-        limit = self.config.n_points
-        if limit is not None:
-            points = points[:, :limit]
-        seen = picture(points, self.config.pixels)
+        seen = picture(points[:, : self.config.n_points], self.config.pixels)
         # The memory order of convolutions: else each of them would convert to it and back.
         latent: Tensor = self.layers(seen.to(memory_format=torch.channels_last)).flatten(1)
         return latent
