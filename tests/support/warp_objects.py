@@ -71,7 +71,8 @@ def residual_rows(points_mm, pose) -> np.ndarray:
 
 def with_slope(field, points) -> tuple[np.ndarray, np.ndarray]:
     """A field's distances at points (n, 3), and their slopes."""
-    found = np.array([kernels.distance_at(field, *point) for point in points], np.float32)
+    lattice = field.values_mm, field.origin_mm, np.float32(field.spacing_mm)
+    found = np.array([kernels.distance_at(*lattice, *point) for point in points], np.float32)
     return found[:, 0], found[:, 1:]
 
 

@@ -77,9 +77,9 @@ class Inference:
         self._rows = self.arithmetic.chunk
         if self.device.type == "cpu":
             self._rows *= torch.get_num_threads()
-        self._packed = self.arithmetic.numbers != "network"
-        self._bf16 = not self._packed and has_fast_bfloat16(self.device)
-        if self._packed:
+        packed = self.arithmetic.numbers != "network"
+        self._bf16 = not packed and has_fast_bfloat16(self.device)
+        if packed:
             bf16 = self.arithmetic.numbers == "bfloat16"
             dtype = torch.bfloat16 if bf16 else torch.float32
             self.network.decoder = PackedDecoder(self.network.decoder, dtype, self._rows)
@@ -96,12 +96,13 @@ class Inference:
     def logits(self, latent: Latent, points_mm: Float32[np.ndarray, "n 3"]) -> Tensor:
         """Points, camera frame, mm -> (n, classes), float32, on the network's device."""
         queries = torch.tensor(points_mm, dtype=torch.float32)[None].to(self.device)
-        if self._packed:
-            queries = filled_up(queries)
+        terms, decoder = latent.terms, self.network.decoder
+        if isinstance(decoder, PackedDecoder):
+            queries, terms = filled_up(queries), decoder.cast(terms)
         with torch.autocast(self.device.type, torch.bfloat16, enabled=self._bf16):
-            parts = queries.split(self._rows, dim=1)
-            logits = [self.network.query(latent, part).float() for part in parts]
-        return torch.cat(logits, 1)[0, : len(points_mm)]
+            parts = latent.normalised(queries).split(self._rows, dim=1)
+            logits = torch.cat([decoder(terms, part).float() for part in parts], 1)
+        return logits[0, : len(points_mm)]
 
 
 def filled_up(queries: Tensor) -> Tensor:
@@ -176,13 +177,17 @@ class PackedDecoder(MlpDecoder):
             n_hidden = len(weight)
         self._output = _laid_out(self.output.weight, rows, dtype), self.output.bias.to(dtype)
 
+    def cast(self, terms: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
+        """``prepare``'s terms as ``forward`` takes them."""
+        return tuple(term[0, 0].to(self._dtype) for term in terms)
+
     def forward(self, terms: tuple[Tensor, ...], queries: Tensor) -> Tensor:
-        """``prepare``'s terms and queries (1, Q, 3) -> logits (1, Q, classes), float32."""
+        """Terms and queries (1, Q, 3) -> logits (1, Q, classes), float32."""
         features = octave_features(queries[0], self.config.octaves)
         rounded = features.to(self._dtype)
         lost = (features[:, :3] - rounded[:, :3]).to(self._dtype)
         query = hidden = torch.cat([rounded, lost], 1)
-        remaining = iter(term[0, 0].to(self._dtype) for term in terms)
+        remaining = iter(terms)
         for of_hidden, of_query, bias in self._packed:
             if of_query is None:
                 assert of_hidden is not None

@@ -105,9 +105,9 @@ def _equations(problem, state, width, buffers):  # type: ignore[no-untyped-def]
     flow = Flow(velocity, origin, spacing, steps_of(velocity, spacing))
     pose = Pose(problem.center_ct, state.rotation, state.centre_mm)
     normal_equations(problem, flow, pose, np.float32(width), buffers, state)
-    unknowns, cost = len(gradient), 0.0
-    for p in range(len(state.distances_mm)):
-        cost += rho(np.float64(state.distances_mm[p]) / last_mm)
+    unknowns, distances, cost = len(gradient), state.distances_mm, 0.0
+    for p in range(len(distances)):
+        cost += rho(np.float64(distances[p]) / last_mm)
     cost *= weight * last_mm**2
     change = np.empty(unknowns)  # from the prior's mean
     change[:POSE] = state.moved
@@ -128,7 +128,8 @@ def normal_equations(problem, flow, pose, width, buffers, state):  # type: ignor
     ``weight * row * distance``, into ``state``; ``weight`` is ``root_weight`` squared. ``flow`` has
     the opposite velocity."""
     (rows, columns), points = buffers, problem.points
-    curvature, gradient = state.curvature, state.gradient
+    modes, field = problem.modes.values, problem.distances
+    distances, curvature, gradient = state.distances_mm, state.curvature, state.gradient
     unknowns = len(gradient)
     sums = np.zeros((len(columns), len(columns) + 4))
     along, per_width = block(), np.float32(1) / width
@@ -136,10 +137,10 @@ def normal_equations(problem, flow, pose, width, buffers, state):  # type: ignor
         count = min(_AT_ONCE, len(points) - start)
         for first in range(start, start + count, BLOCK):
             some = points[first : min(first + BLOCK, start + count)]
-            add_rows(problem.modes.values, problem.distances, flow, pose, some, along, rows)
+            add_rows(modes, field, flow, pose, some, along, rows)
             for p in range(len(some)):
                 distance = rows[p, unknowns]
-                state.distances_mm[first + p] = distance
+                distances[first + p] = distance
                 weight = root_weight(distance * per_width)
                 for n in range(unknowns + 1):
                     columns[n, first - start + p] = rows[p, n] * weight

@@ -133,6 +133,7 @@ def add_rows(modes, field, flow, pose, points, buffers, rows):  # type: ignore[n
     """
     velocity, origin, spacing, steps = flow
     center, rotation, centre = pose
+    values, corner, width = field.values_mm, field.origin_mm, np.float32(field.spacing_mm)
     places, speeds, middles = buffers
     per_cell, inwards = np.float32(1) / spacing, np.empty(3, np.float32)
     offsets = np.empty((BLOCK, 3), np.float32)
@@ -148,7 +149,7 @@ def add_rows(modes, field, flow, pose, points, buffers, rows):  # type: ignore[n
         y = origin[1] + spacing * places[1, p]
         z = origin[2] + spacing * places[2, p]
         row = rows[p]
-        row[-1], sx, sy, sz = distance_at(field, x, y, z)
+        row[-1], sx, sy, sz = distance_at(values, corner, width, x, y, z)
         inwards[0], inwards[1], inwards[2] = -sx, -sy, -sz
         ox, oy, oz = offsets[p, 0], offsets[p, 1], offsets[p, 2]
         row[0], row[1], row[2] = -sx, -sy, -sz
@@ -158,12 +159,10 @@ def add_rows(modes, field, flow, pose, points, buffers, rows):  # type: ignore[n
 
 
 @numba.njit(cache=True, fastmath=True, nogil=True, inline="always")
-def distance_at(field, x, y, z):  # type: ignore[no-untyped-def]
-    """Distance and its slope along x, y, z at one place (mm) of a ``DistanceField``, by trilinear
-    interpolation."""
-    values, origin = field.values_mm, field.origin_mm
+def distance_at(values, origin, spacing, x, y, z):  # type: ignore[no-untyped-def]
+    """Distance and its slope along x, y, z at one place (mm), by trilinear interpolation."""
     zero, one, most = np.float32(0), np.float32(1), np.float32(1.001)
-    per_cell = one / np.float32(field.spacing_mm)
+    per_cell = one / spacing
     x = min(max((x - origin[0]) * per_cell, zero), np.float32(values.shape[0]) - most)
     y = min(max((y - origin[1]) * per_cell, zero), np.float32(values.shape[1]) - most)
     z = min(max((z - origin[2]) * per_cell, zero), np.float32(values.shape[2]) - most)
@@ -186,8 +185,10 @@ def distance_at(field, x, y, z):  # type: ignore[no-untyped-def]
 @numba.njit(cache=True, fastmath=True, nogil=True)
 def mark(field, label, points, labels, margin):  # type: ignore[no-untyped-def]
     """Give points inside the label, and every point the distance if it is the least so far."""
+    values, origin, spacing = field.values_mm, field.origin_mm, np.float32(field.spacing_mm)
     for p in range(len(points)):
-        distance = distance_at(field, points[p, 0], points[p, 1], points[p, 2])[0]
+        x, y, z = points[p, 0], points[p, 1], points[p, 2]
+        distance = distance_at(values, origin, spacing, x, y, z)[0]
         if distance < 0:
             labels[p] = label
         margin[p] = min(margin[p], abs(distance))
