@@ -36,8 +36,7 @@ def part_colour(label: int) -> Colour:
 
 
 def label_colours(labels: UInt8[np.ndarray, " n"]) -> UInt8[np.ndarray, "n 3"]:
-    table = np.array([SEEN, *(part_colour(n) for n in range(1, 256))], np.uint8)
-    return table[labels]
+    return np.array([SEEN, *(part_colour(n) for n in range(1, 256))], np.uint8)[labels]
 
 
 def probability_colours(probability: Float[np.ndarray, " n"]) -> UInt8[np.ndarray, "n 3"]:

@@ -15,15 +15,12 @@ from tumortrack.core.geometry import Points
 from tumortrack.core.types import CameraLabels, Mesh, OccupancyCloud
 
 LARGEST_GRID = 400
-Carry = Callable[[Points], Points]
 
 
 @runtime_checkable
 class Motion(Protocol):
-    """One frame's correspondence: undeformed CT (LPS, mm) <-> camera frame (mm).
-
-    It takes any finite points, also outside the organ, and returns finite ones.
-    """
+    """One frame's correspondence: undeformed CT (LPS, mm) <-> camera frame (mm). It takes any
+    finite points, also outside the organ, and returns finite ones."""
 
     def carry(self, points_ct: Points, /) -> Points:
         """CT points in the camera frame."""
@@ -40,7 +37,7 @@ class Motion(Protocol):
 class OneWay:
     """The motion of a method that knows only the way from the CT to the camera."""
 
-    carry: Carry
+    carry: Callable[[Points], Points]
 
     def back(self, points_camera: Points, /) -> None:
         return None

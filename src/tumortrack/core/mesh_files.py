@@ -45,12 +45,10 @@ def read_mesh(path: Path) -> Mesh:
 
 
 def write_mesh(path: Path, mesh: Mesh) -> None:
-    """Write a binary PLY (or STL, by suffix), vertices in mm, in the mesh's own frame.
-
-    The header states ``SPACE=LPS``, which 3D Slicer looks for; also for meshes in the camera frame:
-    Slicer shows all files of a run as if their frame were the patient's. StorageError where the
-    disk refuses.
-    """
+    """Write a binary PLY (or STL, by suffix), vertices in mm, in the mesh's own frame. The header
+    states ``SPACE=LPS``, which 3D Slicer looks for; also for meshes in the camera frame: Slicer
+    shows all files of a run as if their frame were the patient's. StorageError where the disk
+    refuses."""
     kind = path.suffix.lower().removeprefix(".")
     try:
         path.write_bytes(_ply(mesh) if kind == "ply" else _exported(mesh, kind))

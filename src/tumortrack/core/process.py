@@ -74,18 +74,16 @@ def _helper(process: int) -> ThreadPoolExecutor | None:
 def keep_freed_memory() -> None:
     """Make glibc keep freed blocks: page faults cost more than the memory. Training on a CPU
     becomes about a tenth faster. No effect with other C libraries."""
-    _set_malloc_options({_M_MMAP_MAX: 0, _M_TRIM_THRESHOLD: 2**31 - 1})
+    _mallopt({_M_MMAP_MAX: 0, _M_TRIM_THRESHOLD: 2**31 - 1})
 
 
 def keep_small_blocks() -> None:
     """The same for blocks of up to 32 MB, which is all that a frame needs: ``clinic`` takes a third
     less time. Larger blocks, of volumes, are still returned to the system."""
-    _set_malloc_options(
-        {_M_MMAP_MAX: _MMAP_MAX, _M_MMAP_THRESHOLD: _SMALL, _M_TRIM_THRESHOLD: 8 * _SMALL}
-    )
+    _mallopt({_M_MMAP_MAX: _MMAP_MAX, _M_MMAP_THRESHOLD: _SMALL, _M_TRIM_THRESHOLD: 8 * _SMALL})
 
 
-def _set_malloc_options(options: dict[int, int]) -> None:
+def _mallopt(options: dict[int, int]) -> None:
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None) if sys.platform == "linux" else None
     if mallopt is not None:
         for option, value in options.items():

@@ -82,12 +82,9 @@ def seal(folder: Path, kind: str, content: dict[str, Any], frame: str) -> None:
 
 
 def check_place(path: Path, kind: str, overwrite: bool) -> None:
-    """Refuse to write an artifact where something lies that must stay.
-
-    ``overwrite`` replaces an empty folder or an artifact of the same kind in which nothing else
-    lies. All else, and anything without ``overwrite``, is an InputError: a mistyped path must not
-    cost the user's files.
-    """
+    """InputError for a place where something lies that must stay: ``overwrite`` replaces an empty
+    folder or an artifact of the same kind in which nothing else lies, and nothing but that, for a
+    mistyped path must not cost the user's files."""
     if not path.exists():
         return
     if not overwrite:
@@ -113,11 +110,9 @@ def check_place(path: Path, kind: str, overwrite: bool) -> None:
 
 @contextmanager
 def new_folder(path: Path, overwrite: bool = False) -> Iterator[Path]:
-    """Fill a folder aside, then move it to ``path`` in one step; on any error nothing appears.
-
-    What it replaces must be empty or of the kind that the new folder's manifest states:
-    InputError as by ``check_place``. StorageError where the disk is full or not writable.
-    """
+    """Fill a folder aside, then move it to ``path`` in one step; on any error nothing appears. What
+    it replaces must be empty or of the kind that the new folder's manifest states: InputError as by
+    ``check_place``. StorageError where the disk is full or not writable."""
     if not overwrite:
         check_place(path, "", overwrite)
     try:

@@ -61,12 +61,9 @@ def balls(points, centres, radius_2, found):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def greatest(values, infinity, out, chosen):  # type: ignore[no-untyped-def]
-    """The greatest of every K numbers or zero; NaN counts as greater than all.
-
-    Args:
-        values: (M, K, C), bits of floating point numbers as integers, like ``infinity``.
-        out, chosen: (M, C); filled. ``chosen``: the first of the K that is so great, -1 for zero.
-    """
+    """The greatest of every K numbers (M, K, C) or zero, NaN greater than all, into ``out`` (M, C);
+    which of the K it is, the first one or -1 for zero, into ``chosen``. ``values`` and ``infinity``
+    are bits of floating point numbers as integers."""
     n, k, channels = values.shape
     for m in range(n):
         best, which = out[m], chosen[m]

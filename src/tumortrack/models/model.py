@@ -40,13 +40,9 @@ class Network(nn.Module):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Model(ABC):
-    """A network in evaluation mode and what it was trained for.
-
-    Attributes:
-        query_box_mm: where the organ can lie, relative to the median of the observed points,
-            camera frame (lower and upper corner).
-        provenance: seeds, steps, hashes; ``notes``: for the user, about this machine.
-    """
+    """A network in evaluation mode and what it was trained for. ``query_box_mm``: where the organ
+    can lie (lower and upper corner), relative to the median of the observed points, camera frame;
+    ``provenance``: seeds, steps, hashes; ``notes``: for the user, about this machine."""
 
     # From a NetworkConfig, with weights from torch's global generator (``torch.manual_seed``).
     new_network: ClassVar[type[Network]]
@@ -78,14 +74,12 @@ M = TypeVar("M", bound=Model)
 
 
 def onnx_bytes(model: Model) -> bytes:
-    """A model's network as an ONNX file, in single precision, for other programs.
-
-    Farthest points and balls are written out in plain operators; the number of queries is free, the
-    number of points is the one that the model was trained with (repeat the points of a smaller
-    cloud). Occupancy networks: ``cloud_mm`` (1, N, 3) and ``queries_mm`` (1, Q, 3) -> ``logits``
-    (1, Q, classes). Networks that place the organ: ``cloud_mm`` -> ``rotation`` (2, 3, 3),
-    ``centre_mm`` (2, 3), ``coefficients`` (2, M), ``right_way`` (2,). Camera frame, mm, float32.
-    """
+    """A model's network as an ONNX file, in single precision, for other programs. Farthest points
+    and balls are written out in plain operators; the number of queries is free, the number of
+    points is the one that the model was trained with (repeat the points of a smaller cloud).
+    Occupancy networks: ``cloud_mm`` (1, N, 3) and ``queries_mm`` (1, Q, 3) -> ``logits`` (1, Q,
+    classes). Networks that place the organ: ``cloud_mm`` -> ``rotation`` (2, 3, 3), ``centre_mm``
+    (2, 3), ``coefficients`` (2, M), ``right_way`` (2,). Camera frame, mm, float32."""
     points, generator = model.config.scene.cloud.n_points, torch.Generator().manual_seed(0)
     cloud = torch.randn(1, points, 3, generator=generator) * 20 + torch.tensor([0.0, 0.0, 130.0])
     module, inputs, names = model.network.onnx_parts(cloud)

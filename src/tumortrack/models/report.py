@@ -83,10 +83,8 @@ def grid_over(points_mm: np.ndarray, grid: int) -> tuple[Affine, tuple[int, int,
 def describe_parts(
     names: tuple[str, ...], meshes: dict[str, Mesh], inside: OccupancyCloud
 ) -> dict[str, dict[str, Any]]:
-    """Per part: volume, centre, box and how sure the labels inside it are (JSON types).
-
-    The kidney's numbers are those of the whole organ, tumors included.
-    """
+    """Per part: volume, centre, box and how sure the labels inside it are (JSON types). The
+    kidney's numbers are those of the whole organ, tumors included."""
     parts: dict[str, dict[str, Any]] = {}
     counts = np.bincount(inside.labels, minlength=len(names) + 1)
     sums = np.bincount(inside.labels, inside.probability, len(names) + 1)
@@ -119,8 +117,7 @@ def estimate_of(
     voxels = voxels[:: max(1, len(voxels) // CLOUD_POINTS)]
     index = np.stack(np.unravel_index(voxels, labels.shape), 1).astype(float)
     points_mm = transform_points(camera_from_index, index)
-    sure = np.ones(len(voxels))
-    inside = OccupancyCloud(points_mm, labels.reshape(-1)[voxels], sure, stamp_ns)
+    inside = OccupancyCloud(points_mm, labels.reshape(-1)[voxels], np.ones(len(voxels)), stamp_ns)
     parts = describe_parts(tuple(meshes), meshes, inside)
     about = {**_head(stamp_ns), "voxel_mm": float(camera_from_index[0, 0]), "parts": parts}
     return Estimate(inside, CameraLabels(labels, camera_from_index), meshes, {**about, **report})

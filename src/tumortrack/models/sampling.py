@@ -6,8 +6,6 @@ points. Points come in batches (B, N, 3). Lengths are in whatever unit the point
 
 from __future__ import annotations
 
-from typing import Literal
-
 import numpy as np
 import torch
 from torch import Tensor
@@ -15,18 +13,13 @@ from torch.nn import functional
 
 from tumortrack.models import kernels
 
-Sampling = Literal["fps", "strided"]
-
 
 def farthest_points(points: Tensor, k: int) -> Tensor:
-    """Farthest point sampling; the first point is the one farthest from the centroid.
-
-    The fixed start makes the chosen set independent of the points' order (but for exact ties);
-    a random one alone changes about 0.8 % of the labels. Sequential in ``k``. Points (B, N, 3) ->
-    indices (B, k), int64, in the order of choice.
-
-    Source: Eldar et al. 1997; Qi et al., PointNet++, NIPS 2017, section 3.2.
-    """
+    """Farthest point sampling; the first point is the one farthest from the centroid. The fixed
+    start makes the chosen set independent of the points' order (but for exact ties); a random one
+    alone changes about 0.8 % of the labels. Sequential in ``k``. Points (B, N, 3) -> indices (B,
+    k), int64, in the order of choice. Source: Eldar et al. 1997; Qi et al., PointNet++, NIPS 2017,
+    section 3.2."""
     rows, centre = _rows(points), points.detach().mean(dim=1, keepdim=True)
     x, y, z = rows.unbind(1)
     chosen = torch.empty((len(points), k), dtype=torch.int64, device=points.device)
@@ -45,8 +38,8 @@ def farthest_points(points: Tensor, k: int) -> Tensor:
 
 def strided_points(points: Tensor, k: int) -> Tensor:
     """Every (N / k)-th point, k at most N: for points (B, N, 3) in random order as good as a random
-    choice, and free (rows of a depth image also do, being spread evenly). Indices (B, k), rising.
-    """
+    choice, and free (rows of a depth image also do, being spread evenly). Indices (B, k),
+    rising."""
     n = points.shape[1]
     row = torch.arange(k, device=points.device) * n // k
     return row.expand(len(points), k)
@@ -54,14 +47,9 @@ def strided_points(points: Tensor, k: int) -> Tensor:
 
 def ball_query(points: Tensor, centres: Tensor, radius: float, k: int) -> Tensor:
     """The first ``k`` points (B, N, 3), by index, within ``radius`` of each centre (B, M, 3):
-    indices (B, M, k), int64.
-
-    Where fewer are found the first found is repeated, so that a maximum over the neighbours is
-    not changed. A centre that is one of the points always finds itself; an empty ball gives
-    index 0.
-
-    Source: Qi et al., PointNet++, NIPS 2017, section 3.2.
-    """
+    indices (B, M, k), int64. Where fewer are found the first found is repeated, so that a maximum
+    over the neighbours is not changed. A centre that is one of the points always finds itself; an
+    empty ball gives index 0. Source: Qi et al., PointNet++, NIPS 2017, section 3.2."""
     if compiled(points):
         found = torch.empty((*centres.shape[:2], k), dtype=torch.int64)
         rows = _rows(points).numpy(), _rows(centres).numpy()

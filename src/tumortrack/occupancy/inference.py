@@ -80,8 +80,7 @@ class Inference:
         packed = self.arithmetic.numbers != "network"
         self._bf16 = not packed and has_fast_bfloat16(self.device)
         if packed:
-            bf16 = self.arithmetic.numbers == "bfloat16"
-            dtype = torch.bfloat16 if bf16 else torch.float32
+            dtype = torch.bfloat16 if self.arithmetic.numbers == "bfloat16" else torch.float32
             self.network.decoder = PackedDecoder(self.network.decoder, dtype, self._rows)
             pack_stacks(self.network.encoder)
 
@@ -106,11 +105,9 @@ class Inference:
 
 
 def filled_up(queries: Tensor) -> Tensor:
-    """Queries (1, Q, 3) with the last one repeated until their number is a round one.
-
-    oneDNN compiles and keeps a kernel for every number of rows that it meets: frames that each
-    have another number of queries would fill memory (0.7 GB until its cache is full).
-    """
+    """Queries (1, Q, 3) with the last one repeated until their number is a round one: oneDNN
+    compiles and keeps a kernel for every number of rows that it meets, and frames that each have
+    another number of queries would fill memory (0.7 GB until its cache is full)."""
     n = queries.shape[1]
     full = -(-n // _ROUND) * _ROUND if n > _ROUND else 1 << max(n - 1, 0).bit_length()
     return torch.cat([queries, queries[:, -1:].expand(-1, full - n, -1)], 1) if n else queries
@@ -152,11 +149,9 @@ def pack_stacks(encoder: nn.Module) -> None:
 
 
 class PackedDecoder(MlpDecoder):
-    """A folded decoder of one cloud's queries, ``rows`` at once, in ``dtype``.
-
-    In bf16 a coordinate would be rounded to a tenth of a millimetre; so what the rounding took
-    is given as three more inputs, and positions stay exact.
-    """
+    """A folded decoder of one cloud's queries, ``rows`` at once, in ``dtype``. In bf16 a coordinate
+    would be rounded to a tenth of a millimetre; so what the rounding took is given as three more
+    inputs, and positions stay exact."""
 
     def __init__(self, decoder: MlpDecoder, dtype: torch.dtype, rows: int) -> None:
         nn.Module.__init__(self)

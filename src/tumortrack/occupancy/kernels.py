@@ -101,17 +101,12 @@ def _confident_row(plain, i, j, labels):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def filled(coarse, labels, plain, fine, first, last):  # type: ignore[no-untyped-def]
-    """The voxels between the points of the last lattice but one, cell by cell.
-
-    A cell whose corners agree and all lead by the limit holds no voxel that leads by less: it is
-    filled with their label. The voxels of all others are listed: flat indices (n,), linear logits
-    (n, classes), and whether they lie between coarse points.
-
-    Args:
-        coarse, labels: logits (a, b, c, classes), and their labels.
-        plain: the labels that lead by the limit, 255 for the others.
-        fine: labels (i, j, k); filled between the coarse planes ``first`` to ``last``.
-    """
+    """The voxels between the points of the last lattice but one, cell by cell, from coarse plane
+    ``first`` to ``last``. A cell whose corners agree and all lead by the limit holds no voxel that
+    leads by less: it is filled with their label in ``fine`` (i, j, k). All other cells' voxels are
+    listed: flat indices (n,), linear logits (n, classes), and whether they lie between coarse
+    points. ``coarse`` (a, b, c, classes) has these ``labels``; ``plain``: those that lead by the
+    limit, 255 for the others."""
     _, n_j, n_k = fine.shape
     confident = np.empty(coarse.shape[2], np.uint8)
     cells = 0

@@ -38,11 +38,9 @@ class OccupancyLocator:
         self.inference = Inference(model.network, model.arithmetic)
 
     def locate(self, cloud: SensorCloud, grid: int, seed: int) -> Estimate:
-        """See ``tracking.tracker.Tracker.locate``.
-
-        The two passes of queries are those of the follow-up (LUDO): 10,000 coarse ones where the
-        organ can be, then labels of 40,000 points in the enlarged box of those inside.
-        """
+        """See ``tracking.tracker.Tracker.locate``. The two passes of queries are those of the
+        follow-up (LUDO): 10,000 coarse ones where the organ can be, then labels of 40,000 points
+        in the enlarged box of those inside."""
         frame = _Frame(self, cloud, seed, np.random.default_rng(seed))
         lattice = frame.lattice(frame.coarse_box())
         distances_mm = frame.checked(lattice)
@@ -53,14 +51,12 @@ class OccupancyLocator:
         return frame.estimate(distances_mm, inside, margins, labels, camera_from_index)
 
     def follow(self, cloud: SensorCloud, last: Estimate | None, how: Following) -> Estimate:
-        """See ``tracking.tracker.Tracker.follow``.
-
-        The enlarged box of the last organ replaces the coarse queries, and its lattice is queried
-        only where the organ is (``organ_lattice``). Where this frame's organ reaches the box's
-        border, without a last estimate, or with ``thorough``, the organ is searched for as in a
-        first frame, and the lattice queried everywhere. The surfaces' grid is twice as fine as
-        the lattice, and queried only about surfaces.
-        """
+        """See ``tracking.tracker.Tracker.follow``. The enlarged box of the last organ replaces the
+        coarse queries, and its lattice is queried only where the organ is (``organ_lattice``).
+        Where this frame's organ reaches the box's border, without a last estimate, or with
+        ``thorough``, the organ is searched for as in a first frame, and the lattice queried
+        everywhere. The surfaces' grid is twice as fine as the lattice, and queried only about
+        surfaces."""
         rng = np.random.default_rng((how.seed, cloud.stamp_ns))
         frame = _Frame(self, cloud, how.seed, rng)
         lattice = None

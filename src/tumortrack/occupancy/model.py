@@ -173,11 +173,9 @@ def measured(
     rounds: int = 5,
 ) -> Compiled:
     """Every arithmetic that this machine offers, in interleaved rounds, on a cloud of about the
-    organ's size (``half_mm``: its longest half axis).
-
-    How fast products of matrices are does not depend on what is in them, so no real cloud is
-    needed; the labels compared are those of the network in single precision.
-    """
+    organ's size (``half_mm``: its longest half axis). How fast products of matrices are does not
+    depend on what is in them, so no real cloud is needed; the labels compared are those of the
+    network in single precision."""
     rng = np.random.default_rng(0)
     cloud = like_an_organ(half_mm, rng)
     # The network as it is with one size of chunks, for comparison; the others with several.

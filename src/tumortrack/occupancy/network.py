@@ -38,12 +38,9 @@ class Latent:
 
 
 class MlpDecoder(nn.Module):
-    """An MLP on [latent, query] (Mescheder et al., CVPR 2019), the latent's part computed once
-    per cloud.
-
-    Inputs of a hidden layer are ordered [hidden, query, latent]; W [h, q, z] + b is computed as
-    W_hq [h, q] + (W_z z + b): the bracket is one vector per cloud.
-    """
+    """An MLP on [latent, query] (Mescheder et al., CVPR 2019), the latent's part computed once per
+    cloud. Inputs of a hidden layer are ordered [hidden, query, latent]; W [h, q, z] + b is computed
+    as W_hq [h, q] + (W_z z + b): the bracket is one vector per cloud."""
 
     def __init__(self, config: MlpDecoderConfig, latent_size: int) -> None:
         super().__init__()

@@ -73,12 +73,10 @@ def refined(logits_at: LogitsAt, coarse: LogitLattice, policy: Policy) -> LogitL
 
 
 def organ_lattice(logits_at: LogitsAt, box_mm: volume.Box, steps: int) -> LogitLattice:
-    """``lattice_over``, queried everywhere inside the organ and a point or two about it.
-
-    Every second point along each axis is queried first. Whatever is connected to a part that
-    holds one of these points is found as if all were queried; what lies apart and between them is
-    not, and would be dropped (``volume.keep_largest_pieces``).
-    """
+    """``lattice_over``, queried everywhere inside the organ and a point or two about it. Every
+    second point along each axis is queried first. Whatever is connected to a part that holds one of
+    these points is found as if all were queried; what lies apart and between them is not, and would
+    be dropped (``volume.keep_largest_pieces``)."""
     return refined(logits_at, volume.lattice_over(logits_at, box_mm, -(-steps // 2)), _connected)
 
 
@@ -93,13 +91,9 @@ def sparse_margins(
     shape: tuple[int, int, int],
     start_mm: float = START_MM,
 ) -> tuple[volume.Margins, volume.Labels]:
-    """The ``margins_of`` the parts, and labels, at every voxel's centre; far from all surfaces
-    margins are the largest there are, between them and the queried voxels linear.
-
-    Args:
-        camera_from_index: of cubic voxels along the camera's axes.
-        start_mm: largest step of the first lattice.
-    """
+    """The ``margins_of`` the parts, and labels, at the centres of cubic voxels along the camera's
+    axes; far from all surfaces margins are the largest there are, between them and the queried
+    voxels linear. ``start_mm``: largest step of the first lattice."""
     voxel_mm, origin_mm = float(camera_from_index[0, 0]), camera_from_index[:3, 3]
     levels = max(0, int(np.floor(np.log2(max(start_mm / voxel_mm, 1.0)))))
     stride, (i, j, k) = 2**levels, shape
@@ -120,10 +114,8 @@ def sparse_margins(
 
 def sparse_logits(logits_at: LogitsAt, lattice: LogitLattice, points_mm: volume.Points) -> Rows:
     """Logits at points in a lattice's box: linear where the label is certain, else queried.
-
     Scattered points are counted, nobody sees one alone: less care than for voxels, half of the
-    queries (networks tried: none to three of 40,000 labels other than those of querying all).
-    """
+    queries (networks tried: none to three of 40,000 labels other than those of querying all)."""
     logits = lattice.between(points_mm)
 
     def query(some: Flat) -> Rows:
@@ -135,11 +127,9 @@ def sparse_logits(logits_at: LogitsAt, lattice: LogitLattice, points_mm: volume.
 
 @dataclass(eq=False)
 class InterpolationLimit:
-    """How far linear logits were found to be off: a label that leads by more is accepted.
-
-    It is a quantile, ``tail``, of the errors found, times ``safety``. ``coarser``: the limit at
-    twice the step, 0 where there was none.
-    """
+    """How far linear logits were found to be off: a label that leads by more is accepted. It is a
+    quantile, ``tail``, of the errors found, times ``safety``. ``coarser``: the limit at twice the
+    step, 0 where there was none."""
 
     limit: float = 0.0
     coarser: float = 0.0
@@ -167,16 +157,11 @@ def query_uncertain(
     query: Callable[[Flat], Rows],
     limit: InterpolationLimit,
 ) -> Bool[np.ndarray, " n"]:
-    """Query wherever the expected label leads by too little; which were queried.
-
-    The least certain points come first. How far their logits are off tells which of the others
-    have to be queried as well, until none is left.
-
-    Args:
-        expected: logits; replaced by the answers.
-        leads: by how much the largest exceeds the second; infinite where it is known already.
-        limit: updated by the answers.
-    """
+    """Query wherever the expected label leads by too little; which were queried. The least certain
+    points come first. How far their logits are off tells which of the others have to be queried as
+    well, until none is left. ``expected``: logits, replaced by the answers; ``leads``: by how much
+    the largest exceeds the second, infinite where it is known already; ``limit``: updated by the
+    answers."""
     queried = np.zeros(len(leads), bool)
     open_points = int(np.isfinite(leads).sum())
     if open_points:
@@ -254,12 +239,10 @@ def _voxels(level: _Level, limit: InterpolationLimit) -> tuple[volume.Margins, v
 def _about_surprises(
     level: _Level, limit: float, flat: Flat, found: Rows
 ) -> tuple[Int[np.ndarray, " m"], Float32[np.ndarray, "m classes"]]:
-    """Query every point that touches a surprise, until there is none; indices and logits.
-
-    A surprise is another label than expected, by more than ``_SURPRISE`` of the ``limit``, since
+    """Query every point that touches a surprise, until there is none; indices and logits. A
+    surprise is another label than expected, by more than ``_SURPRISE`` of the ``limit``, since
     linear logits are a little off everywhere. ``flat`` and ``found``: the points queried before,
-    and their logits.
-    """
+    and their logits."""
     surprises = partial(
         kernels.surprising, level.coarse.logits, level.shape, limit=np.float32(_SURPRISE * limit)
     )

@@ -79,11 +79,9 @@ def margins_on(lattice: LogitLattice) -> tuple[Margins, Labels, Affine]:
 
 def margins_of(logits: torch.Tensor) -> Float16[np.ndarray, "n parts"]:
     """By how much each part's logit wins (positive inside): (n, classes) -> (n, parts). Half
-    precision: 2 bytes a voxel and part, 0.4 GB at 400^3 with two tumors.
-
-    The organ's margin is that of the best label inside against the outside, so that its zero
-    set is the whole organ's surface; a tumor's is against the best other label.
-    """
+    precision: 2 bytes a voxel and part, 0.4 GB at 400^3 with two tumors. The organ's margin is that
+    of the best label inside against the outside, so that its zero set is the whole organ's surface;
+    a tumor's is against the best other label."""
     columns = [logits[:, 1:].amax(1) - logits[:, 0]]
     for label in range(FIRST_TUMOR, logits.shape[1]):
         others = torch.cat([logits[:, :label], logits[:, label + 1 :]], 1).amax(1)

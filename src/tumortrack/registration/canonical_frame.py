@@ -55,8 +55,7 @@ def upright_of(
     organ_ct: Mesh, up_lps: Direction, center_ct: Vector, long_axis: Vector
 ) -> CanonicalFrame:
     """The upright frame of an organ."""
-    lower, upper = organ_ct.box_mm
-    half_mm = float((upper - lower).max()) / 2
+    half_mm = float(np.ptp(organ_ct.box_mm, axis=0).max()) / 2
     return CanonicalFrame(facing_rotation(up_lps, long_axis), center_ct, UPRIGHT_MM / half_mm)
 
 
@@ -106,11 +105,9 @@ def initialize_canonical(network: RegistrationNetwork) -> None:
 def carry_over(
     network: RegistrationNetwork, weights: dict[str, torch.Tensor], upright: CanonicalFrame
 ) -> None:
-    """Start a network that knows its organ (``know``) from pretrained weights.
-
-    Encoder, hidden layers and pose are taken as they are; each field becomes the state of the
-    organ's own modes that resembles it best, weighed against how the states spread.
-    """
+    """Start a network that knows its organ from pretrained weights: encoder, hidden layers and pose
+    are taken as they are; each field becomes the state of the organ's own modes that
+    resembles it best, weighed against how the states spread."""
     state = network.state_dict()
     for name, value in weights.items():
         if name.startswith(("encoder.", "hidden.")):

@@ -50,11 +50,9 @@ def refine(
 
 
 class GaussNewton:
-    """A refinement that can be stopped on its way and continued.
-
-    ``cost``: of the present state, as in ``RegistrationResult``; infinite before the first step.
-    ``steps``: taken so far; ``converged``: more would not move it.
-    """
+    """A refinement that can be stopped on its way and continued. ``cost``: of the present state, as
+    in ``RegistrationResult``; infinite before the first step. ``steps``: taken so far;
+    ``converged``: more would not move it."""
 
     def __init__(
         self, rest: RestShape, points_mm: Points, start: ElasticMotion, config: GaussNewtonConfig

@@ -74,15 +74,14 @@ def descend(problem, state, first, last):  # type: ignore[no-untyped-def]
     unknowns, cost = len(state.gradient), 0.0
     rows = np.empty((BLOCK, unknowns + 1), np.float32)
     columns = np.zeros((-(-(unknowns + 1) // 4) * 4, _AT_ONCE + _APART), np.float32)
-    buffers = rows, columns
     if first == 0:
-        cost = _equations(problem, state, _width(problem, 0), buffers)
+        cost = _equations(problem, state, _width(problem, 0), (rows, columns))
     for step in range(first, last):
         change = np.linalg.solve(state.curvature, state.gradient)
         _turn(state.rotation, state.centre_mm, change)
         state.moved[:] -= change[:POSE]
         state.coefficients[:] -= change[POSE:]
-        cost = _equations(problem, state, _width(problem, step + 1), buffers)
+        cost = _equations(problem, state, _width(problem, step + 1), (rows, columns))
         small = np.abs(change).max() < problem.enough_mm
         if small and _width(problem, step) == problem.last_mm:
             return step + 1, True, cost

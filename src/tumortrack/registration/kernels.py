@@ -126,11 +126,8 @@ def variances(flow, modes, center, root, points, out):  # type: ignore[no-untype
 def add_rows(modes, field, flow, pose, points, buffers, rows):  # type: ignore[no-untyped-def]
     """What each unknown does to the signed distance of one block of points (n, 3; camera frame,
     mm), carried back, to a surface at rest; the distance itself stands in the last column of
-    ``rows`` (n, p + 1).
-
-    ``flow`` has the opposite velocity; ``field`` is the surface's ``DistanceField``; ``buffers``
-    are those of ``elastic.flow.block()``.
-    """
+    ``rows`` (n, p + 1). ``flow`` has the opposite velocity; ``field`` is the surface's
+    ``DistanceField``; ``buffers`` are those of ``elastic.flow.block()``."""
     velocity, origin, spacing, steps = flow
     center, rotation, centre = pose
     values, corner, width = field.values_mm, field.origin_mm, np.float32(field.spacing_mm)

@@ -101,8 +101,7 @@ class RegistrationLocator:
         with frame.stage("volume"):
             camera_from_index, shape = grid_over(organ.vertices_mm, grid)
             labels = label_grid(Anatomy(tuple(placed.meshes.values())), camera_from_index, shape)
-        voxel_mm = float(camera_from_index[0, 0])
-        report = self._report(frame, placed, inside, voxel_mm=voxel_mm)
+        report = self._report(frame, placed, inside, voxel_mm=float(camera_from_index[0, 0]))
         volume = CameraLabels(labels, camera_from_index)
         return Estimate(inside, volume, placed.meshes, report, placed.motion)
 

@@ -53,8 +53,7 @@ class RegistrationModel(Model):
     @classmethod
     def from_folder(cls, folder: Path, manifest: dict[str, Any], **known: Any) -> RegistrationModel:
         shape = RestShape.from_arrays(load((folder / SHAPE).read_bytes()), len(known["parts"]))
-        where = f"{folder}: trust"
-        calibration = from_builtins(manifest["trust"], UncertaintyCalibration, where)
+        calibration = from_builtins(manifest["trust"], UncertaintyCalibration, f"{folder}: trust")
         if calibration.kernel != KERNEL:
             raise InputError(
                 f"{folder}: its fits were calibrated with the robust kernel {calibration.kernel}; "

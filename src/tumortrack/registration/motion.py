@@ -27,10 +27,9 @@ class ElasticMotion:
     """``core.estimate.Motion`` of a shape: x -> rotation (flow(x) - center_ct) + centre_mm.
 
     Attributes:
-        rotation, centre_mm: where the organ's centre and axes are before the camera.
-        coefficients: of the body's modes.
-        covariance: of shift (mm), turn (rad; both in the CT's axes, about the centre) and
-            coefficients, as ``refine`` left it; None where nothing was refined.
+        rotation, centre_mm: where the organ's axes and centre are before the camera.
+        coefficients: of the body's modes; ``covariance``: of shift (mm), turn (rad; both in the
+            CT's axes, about the centre) and coefficients, as ``refine`` left it, if it did.
         std_scale: a factor for its standard deviations, found on validation scenes.
     """
 

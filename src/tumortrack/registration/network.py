@@ -62,12 +62,9 @@ class PoseHypothesis(NamedTuple):
 
 
 class RegistrationNetwork(Network):
-    """Clouds -> hypotheses.
-
-    What describes the organ is set by ``initialize``: the centre and axes, the points (P, 3; about
-    the centre) whose places before the camera the loss compares, the body's modes at these points
-    (P, 3, M), its states' mean and spread.
-    """
+    """Clouds -> hypotheses. What describes the organ is set by ``initialize``: the centre and axes,
+    the points (P, 3; about the centre) whose places before the camera the loss compares, the body's
+    modes at these points (P, 3, M), its states' mean and spread."""
 
     def __init__(self, config: NetworkConfig) -> None:
         super().__init__()
@@ -140,11 +137,9 @@ class RegistrationNetwork(Network):
 
     def loss(self, *scenes: Tensor, first: int = 0) -> Tensor:
         """How far the known points (B, P, 3) are from where the hypotheses carry them, with and
-        without deformation, and how well the right way round is told. Labels are not used.
-
-        The deformation counts to first order: the displacement at the points' places at rest. The
-        mean of equal shares' losses is the whole batch's.
-        """
+        without deformation, and how well the right way round is told. Labels are not used. The
+        deformation counts to first order: the displacement at the points' places at rest. The mean
+        of equal shares' losses is the whole batch's."""
         clouds_mm, points_mm, _, camera_from_ct = scenes
         aligned = self.align(clouds_mm)
         with torch.autocast(clouds_mm.device.type, enabled=False):
@@ -177,10 +172,8 @@ class RegistrationNetwork(Network):
         return _Exported(self).cpu().eval(), (cloud_mm,), names
 
     def flip_hypotheses(self, points_mm: Tensor) -> PoseHypothesis:
-        """Hypotheses (2B) for clouds (B, N, 3) as they were turned, then for half a turn more.
-
-        One batch: a network this small takes as long for two clouds as for one.
-        """
+        """Hypotheses (2B) for clouds (B, N, 3) as they were turned, then for half a turn more; in
+        one batch: a network this small takes as long for two clouds as for one."""
         one = self.align(points_mm)
         other = one.flipped(-torch.ones_like(one.centre_mm[:, 0]))
         points, centre_mm = torch.cat([one.points, other.points]), one.centre_mm.repeat(2, 1)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Literal
 
 import torch
 from torch import Tensor, nn
@@ -11,7 +12,7 @@ from torch.nn import functional
 from tumortrack.core.config import Config
 from tumortrack.models import sampling as sampled
 from tumortrack.models.layers import Layer, Norm, greatest, greatest_above_zero, stack
-from tumortrack.models.sampling import Sampling, take, traced
+from tumortrack.models.sampling import take, traced
 
 _AT_ONCE = 128  # centres
 
@@ -35,7 +36,7 @@ class PointNet2Config(Config, frozen=True, tag="pointnet2"):
     levels: tuple[SetAbstraction, ...]
     widths: tuple[int, ...]
     norm: Norm = "batch"
-    sampling: Sampling = "fps"
+    sampling: Literal["fps", "strided"] = "fps"
     n_points: int | None = None
 
     @property
