@@ -20,7 +20,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Float64
-from scipy.linalg import block_diag
 
 from tumortrack.core.geometry import Points
 from tumortrack.models.config import GaussNewtonConfig
@@ -97,5 +96,7 @@ class GaussNewton:
 
 def _prior(rest: RestShape, config: GaussNewtonConfig) -> Float64[np.ndarray, "p p"]:
     """The precision of shift, turn and coefficients."""
-    pose = [np.eye(3) / config.shift_mm**2, np.eye(3) / config.turn_rad**2]
-    return block_diag(*pose, rest.body.precision)
+    pose = [1 / config.shift_mm**2] * 3 + [1 / config.turn_rad**2] * 3
+    precision = np.diag(pose + [0.0] * len(rest.body.mean))
+    precision[6:, 6:] = rest.body.precision
+    return precision
