@@ -152,9 +152,9 @@ def _artifact(folder: Path) -> list[str]:
     if isinstance(scenes := manifest.get("scenes"), dict):
         return [*lines, *_sealed_scenes(folder, scenes)]
     if kind == "model":
-        from tumortrack.occupancy import compiled  # PyTorch takes a second
+        from tumortrack.occupancy import model  # PyTorch takes a second
 
-        lines += [_kind_of_model(manifest), *(f"  {line}" for line in compiled.describe(folder))]
+        lines += [_kind_of_model(manifest), *(f"  {line}" for line in model.describe(folder))]
     skip = {"kind", "schema", "tumortrack", "units", "frame", "files", "config"}
     lines += [f"  {key}: {value}" for key, value in manifest.items() if key not in skip]
     return [*lines, f"  files: {', '.join(manifest['files'])}"]

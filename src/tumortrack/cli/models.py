@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from tumortrack.models.model import Model
-    from tumortrack.occupancy.compiled import Compiled
+    from tumortrack.occupancy.model import Compiled
 
 _GRID = 32
 
@@ -43,8 +43,7 @@ class Compile:
             StorageError: the disk refused.
         """
         from tumortrack.models.folder import WEIGHTS
-        from tumortrack.occupancy.compiled import measured, save
-        from tumortrack.occupancy.model import OccupancyModel
+        from tumortrack.occupancy.model import OccupancyModel, measured, save
         from tumortrack.training.model import load_model
 
         model = load_model(self.model, self.device)
