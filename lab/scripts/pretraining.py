@@ -145,7 +145,7 @@ def _curve(
                 rows.append(row)
 
     judge(0)
-    for step, batch in enumerate(batches(stream, range(max(lengths)), 0, 0, device), start=1):
+    for step, batch in enumerate(batches(stream.batch, range(max(lengths)), 0, 0, device), start=1):
         for (length, _), state in states.items():
             if step <= length:
                 state.step(batch)

@@ -157,7 +157,7 @@ def _curve(case: Case, setting: Setting, judge: Judge, options: Options) -> list
     stream.batch(0)  # compiled kernels and ray trees are there before the clock starts
     progress, curve, spent = state.progress, [], 0.0
     began = time.perf_counter()
-    for batch in batches(stream, range(10**9), 0, 0, CPU):
+    for batch in batches(stream.batch, range(10**9), 0, 0, CPU):
         state.step(batch)
         progress.elapsed_s = spent + time.perf_counter() - began
         settle_end(config, progress, training.minutes)

@@ -21,7 +21,6 @@ from tumortrack.simulate.dataset import SceneStream
 from tumortrack.simulate.deform import ChainConfig, DragConfig, ElasticConfig, StretchConfig
 from tumortrack.simulate.deform.base import View
 from tumortrack.simulate.elastic.body import ElasticBody, build_body
-from tumortrack.simulate.elastic.equilibrium import KPA, ReducedModel, ReducedProblem
 from tumortrack.simulate.elastic.finite import (
     CORNERS,
     BlockCholesky,
@@ -29,11 +28,19 @@ from tumortrack.simulate.elastic.finite import (
     LatticeSolid,
     cube_stiffness,
 )
-from tumortrack.simulate.elastic.loads import LOADS, expand, in_bed, press, random_state, weigh
-from tumortrack.simulate.elastic.modes import modes_of, patches_of, random_loads
+from tumortrack.simulate.elastic.loads import (
+    KPA,
+    LOADS,
+    ReducedProblem,
+    expand,
+    in_bed,
+    press,
+    random_state,
+    weigh,
+)
+from tumortrack.simulate.elastic.modes import ReducedModel, modes_of, patches_of, random_loads
 from tumortrack.simulate.occupancy import OccupancyConfig, OccupancyPool
-from tumortrack.simulate.pose import PoseConfig
-from tumortrack.simulate.scene import SceneConfig, SceneRecipe, Simulator, body_for
+from tumortrack.simulate.scene import PoseConfig, SceneConfig, SceneRecipe, Simulator, body_for
 
 ANATOMY = organ()
 ORGAN = ANATOMY.organ

@@ -159,8 +159,7 @@ class Simulate:
             StretchConfig,
         )
         from tumortrack.simulate.deform.drag import CONFIGURATIONS
-        from tumortrack.simulate.pose import PoseConfig
-        from tumortrack.simulate.scene import SceneConfig
+        from tumortrack.simulate.scene import PoseConfig, SceneConfig
 
         models: list[DragConfig | ElasticConfig] = [ElasticConfig()]
         if not self.elastic:

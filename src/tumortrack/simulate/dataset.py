@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Float32, Num, UInt8
@@ -15,8 +15,7 @@ from tumortrack.simulate.occupancy import PointSource
 from tumortrack.simulate.scene import SceneConfig, SceneRecipe, Simulator
 
 
-@dataclass(frozen=True, eq=False)
-class Batch:
+class Batch(NamedTuple):
     """Scenes stacked; camera frame, mm."""
 
     clouds_mm: Float32[np.ndarray, "b n 3"]
@@ -56,10 +55,10 @@ class SceneStream:
         ]
         n = self.config.cloud.n_points
         return Batch(
-            np.stack([refill(p.cloud.points_mm, n) for p in pairs]),
-            np.stack([p.samples.points_mm for p in pairs]),
-            np.stack([p.samples.labels for p in pairs]),
-            np.stack([p.camera_from_ct for p in pairs]).astype(np.float32),
+            np.stack([refill(scene.cloud.points_mm, n) for scene, _ in pairs]),
+            np.stack([samples.points_mm for _, samples in pairs]),
+            np.stack([samples.labels for _, samples in pairs]),
+            np.stack([scene.camera_from_ct for scene, _ in pairs]).astype(np.float32),
         )
 
 

@@ -6,7 +6,7 @@ true surfaces.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Float32, Float64
@@ -21,10 +21,10 @@ from tumortrack.sense.camera import d405
 from tumortrack.sense.noise import D405_NOISE, NoiseConfig, add_noise
 from tumortrack.sense.render import render_depth
 from tumortrack.simulate.elastic.body import BodyConfig, body_of, reduced_organ
-from tumortrack.simulate.elastic.equilibrium import LEVER_MM
 from tumortrack.simulate.elastic.loads import expand
-from tumortrack.simulate.indentation import Bed, Indentation, indentations
-from tumortrack.simulate.pose import PoseConfig, sample_pose
+from tumortrack.simulate.elastic.modes import LEVER_MM
+from tumortrack.simulate.indentation import Bed, Indentation
+from tumortrack.simulate.scene import PoseConfig, sample_pose
 
 SHAFT_MM = 4.0  # an instrument's radius
 _SHAFT_LENGTH_MM = 200.0
@@ -100,11 +100,7 @@ class Instant:
     coefficients: Float64[np.ndarray, " m"]  # of the body's modes
     velocity: Float32[np.ndarray, "i j k 3"]  # the field of these, which points of the CT follow
     depth_mm: float  # of the push
-    room_from_rod: Float64[np.ndarray, "4 4"] = field(default_factory=lambda: np.eye(4))
-
-    def __post_init__(self) -> None:
-        if not self.t_s >= 0:
-            raise InputError(f"time {self.t_s} s is before the scene's beginning, 0 s.")
+    room_from_rod: Float64[np.ndarray, "4 4"]  # of the instrument
 
 
 class ScenePlayer:
@@ -131,14 +127,16 @@ class ScenePlayer:
         self._camera_from_ct = sample_pose(pose, anatomy_ct.organ, up_lps, near_mm, rng)
         bed = Bed(reduced_organ(anatomy_ct, up, config.body, rng), up, seed)
         self._swollen = bed.under("swell", expand, config.swell)
-        self._pushes: tuple[Indentation, ...] = ()
+        self._pushes: list[Indentation] = []
         if config.push_mm > 0:
-            self._pushes = indentations(bed, config.places, SHAFT_MM, config.push_mm, rng)
+            self._pushes = bed.indentations(config.places, SHAFT_MM, config.push_mm, rng)
         states = [self._swollen, *(push.unknowns(config.push_mm) for push in self._pushes)]
         self._body = body_of(bed.organ, np.array(states, np.float32)[:, : bed.organ.n_modes])
-        self._down_the_body = _down_the_body(up)
+        inferior = np.array([0.0, 0.0, -1.0])
+        along = inferior - (inferior @ up) * up  # for a body that stands, any direction
+        self._down_the_body = perpendicular(up) if np.linalg.norm(along) < 0.1 else unit(along)
         self._vertices = np.concatenate([part.vertices_mm for part in anatomy_ct.parts])
-        self._table = Table.under(anatomy_ct.organ, up)
+        self._table = Table(anatomy_ct.organ, up)
         self._drape = drape(self._table, rng) if config.drape else _NOTHING
         self._rod = rod(SHAFT_MM, _SHAFT_LENGTH_MM) if self._pushes else _NOTHING
         shown = (anatomy_ct.organ, self._drape, self._rod)
@@ -149,6 +147,8 @@ class ScenePlayer:
 
     def state_at(self, t_s: float) -> Instant:
         """Everything at a time from 0 s on. A pure function: no clock, no memory."""
+        if not t_s >= 0:
+            raise InputError(f"time {t_s} s is before the scene's beginning, 0 s.")
         config = self.config
         breath = np.sin(np.pi * t_s / config.breath_s) ** 4  # Lujan 1999, doi 10.1118/1.598577
         unknowns = breath * self._swollen
@@ -161,22 +161,20 @@ class ScenePlayer:
         center = self._body.center_ct
         moved = shift + config.breath_mm * breath * self._down_the_body
         room_from_organ = rigid(rotation, center - rotation @ center + moved)
-        velocity = self._body.velocity(coefficients)
-        camera_from_room = self._camera_at(t_s)
-        instant = Instant(t_s, camera_from_room, room_from_organ, coefficients, velocity, depth_mm)
-        if push is None:
-            return instant
-        place = self._deformed(instant, push.place_ct[None])
-        tip = transform_points(room_from_organ, place)[0] + away_mm * push.axis
-        upright = rigid(rotation_onto(np.array([0.0, 0.0, 1.0]), push.axis), tip)
-        return replace(instant, room_from_rod=upright)
+        velocity, room_from_rod = self._body.velocity(coefficients), np.eye(4)
+        if push is not None:
+            place = self._deformed(velocity, push.place_ct[None])
+            tip = transform_points(room_from_organ, place)[0] + away_mm * push.axis
+            room_from_rod = rigid(rotation_onto(np.array([0.0, 0.0, 1.0]), push.axis), tip)
+        poses = self._camera_at(t_s), room_from_organ
+        return Instant(t_s, *poses, coefficients, velocity, depth_mm, room_from_rod)
 
     def carry(
         self, instant: Instant, points_ct: Float[np.ndarray, "n 3"]
     ) -> Float64[np.ndarray, "n 3"]:
         """Where points of the CT are before the camera."""
         camera_from_organ = instant.camera_from_room @ instant.room_from_organ
-        return transform_points(camera_from_organ, self._deformed(instant, points_ct))
+        return transform_points(camera_from_organ, self._deformed(instant.velocity, points_ct))
 
     def truth(self, instant: Instant) -> Anatomy:
         """The true surfaces, camera frame."""
@@ -199,8 +197,8 @@ class ScenePlayer:
         rng = np.random.default_rng([self._seed, round(instant.t_s * 1e6)])
         return add_noise(clean, self.config.noise, rng)
 
-    def _deformed(self, instant: Instant, points_ct: np.ndarray) -> Float64[np.ndarray, "n 3"]:
-        return self._body.follow(instant.velocity, points_ct, _STEPS).astype(np.float64)
+    def _deformed(self, velocity: np.ndarray, points_ct: np.ndarray) -> Float64[np.ndarray, "n 3"]:
+        return self._body.follow(velocity, points_ct, _STEPS).astype(np.float64)
 
     def _push_at(self, t_s: float) -> tuple[float, float, Indentation | None]:
         """Depth, distance from the organ (mm), and which push it is."""
@@ -219,30 +217,16 @@ class ScenePlayer:
         return swayed @ self._camera_from_ct
 
 
-def _down_the_body(up: Float64[np.ndarray, " 3"]) -> Float64[np.ndarray, " 3"]:
-    """Inferior along the table; for a body that stands, any direction along it."""
-    inferior = np.array([0.0, 0.0, -1.0])
-    along = inferior - (inferior @ up) * up
-    return perpendicular(up) if np.linalg.norm(along) < 0.1 else unit(along)
-
-
-@dataclass(frozen=True, eq=False)
 class Table:
-    """The plane under an organ, and how the organ rises over it; CT frame."""
+    """The plane on which an organ lies, and how the organ rises over it; CT frame. ``up`` is a unit
+    vector, ``origin`` lies under the organ's middle."""
 
-    origin: Float64[np.ndarray, " 3"]  # under the organ's middle
-    up: Float64[np.ndarray, " 3"]
-    organ_height_mm: float
-    organ_radius_mm: float
-
-    @classmethod
-    def under(cls, organ: Mesh, up: Float64[np.ndarray, " 3"]) -> Table:
-        """The plane on which an organ lies; ``up`` is a unit vector."""
+    def __init__(self, organ: Mesh, up: Float64[np.ndarray, " 3"]) -> None:
         heights, middle = organ.vertices_mm @ up, organ.box_mm.mean(0)
         offset = organ.vertices_mm - middle
-        radius_mm = np.linalg.norm(offset - np.outer(offset @ up, up), axis=1).mean()
-        origin = middle - up * (middle @ up - heights.min())
-        return cls(origin, up, float(np.ptp(heights)), float(radius_mm))
+        across = np.linalg.norm(offset - np.outer(offset @ up, up), axis=1)
+        self.up, self.origin = up, middle - up * (middle @ up - heights.min())
+        self.organ_height_mm, self.organ_radius_mm = np.ptp(heights), across.mean()
 
     def depth_mm(
         self, camera_from_room: Float64[np.ndarray, "4 4"], intrinsics: Intrinsics

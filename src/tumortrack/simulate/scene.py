@@ -9,16 +9,18 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Literal
 
 import msgspec
 import numpy as np
 from jaxtyping import Float64
 from scipy.spatial import ConvexHull
+from scipy.spatial.transform import Rotation
 
 from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError, NoEstimate, TumortrackError
-from tumortrack.core.geometry import transform_points
+from tumortrack.core.geometry import rigid, rotation_onto, transform_points
 from tumortrack.core.types import Anatomy, DepthFrame, Mesh, OccupancySamples, SensorCloud
 from tumortrack.sense.camera import d405, project
 from tumortrack.sense.cloud import FEWEST_POINTS, CloudConfig, cloud_from_depth
@@ -27,15 +29,27 @@ from tumortrack.sense.noise import CalibrationConfig, NoiseConfig, add_noise, mi
 from tumortrack.sense.occlusion import OcclusionConfig, occlude
 from tumortrack.sense.render import Visibility, render_depth
 from tumortrack.simulate import deform as deformations
-from tumortrack.simulate.deform import DragConfig
+from tumortrack.simulate.deform import DragConfig, links_of
 from tumortrack.simulate.deform.base import Deformation, Points, View
-from tumortrack.simulate.deform.chain import links_of
 from tumortrack.simulate.elastic.body import BodyConfig, ElasticBody, build_body
 from tumortrack.simulate.occupancy import OccupancyConfig, PointSource
-from tumortrack.simulate.pose import PoseConfig, sample_pose
 
 STREAMS = ("train", "validation", "test")
 ATTEMPTS = 20  # draws of a recipe until one shows enough of the organ
+
+
+class PoseConfig(Config, frozen=True):
+    """Random poses of the organ.
+
+    ``full``: every rotation, uniformly (the paper's M_full). ``limited``: any rotation about the
+    camera's axis, tilts about X and Y uniform within ``tilt_deg`` of the direction that faces
+    the camera (the paper's M_lim, section Experiments).
+    """
+
+    rotations: Literal["full", "limited"] = "limited"
+    tilt_deg: float = 15.0
+    nearest_mm: tuple[float, float] = (110.0, 125.0)  # depth of the organ's nearest point
+    sideways_mm: float = 15.0  # the organ's centre may lie this far off the camera's axis
 
 
 class SceneConfig(Config, frozen=True):
@@ -93,15 +107,6 @@ class SceneRecipe:
 
 
 @dataclass(frozen=True, eq=False)
-class TrainingPair:
-    """What training needs of a scene."""
-
-    cloud: SensorCloud
-    samples: OccupancySamples
-    camera_from_ct: Float64[np.ndarray, "4 4"]  # the organ's pose, without its deformation
-
-
-@dataclass(frozen=True, eq=False)
 class SceneDraw:
     """What is drawn before the image is rendered."""
 
@@ -139,12 +144,13 @@ class Simulator:
         corners = vertices[ConvexHull(vertices).vertices]  # the farthest in any direction
         self._hull_ct = Mesh(corners, np.empty((0, 3)))
 
-    def pair(self, recipe: SceneRecipe, pool: PointSource) -> TrainingPair:
-        """The scene's cloud and its labelled points, camera frame."""
+    def pair(
+        self, recipe: SceneRecipe, pool: PointSource
+    ) -> tuple[RenderedScene, OccupancySamples]:
+        """The scene and its labelled points, camera frame."""
         scene, rng = self._render(recipe)
         points_ct, labels = pool.draw(rng)
-        samples = OccupancySamples(scene.carry(points_ct), labels)
-        return TrainingPair(scene.cloud, samples, scene.camera_from_ct)
+        return scene, OccupancySamples(scene.carry(points_ct), labels)
 
     def render(self, recipe: SceneRecipe) -> RenderedScene:
         """Pose, deformation, depth image and cloud of a recipe."""
@@ -196,6 +202,50 @@ class Simulator:
             return pictured & self._visibility(points_ct, eye_ct)
 
         return View(self.anatomy_ct, visible, self.body)
+
+
+def sample_pose(
+    config: PoseConfig,
+    organ_ct: Mesh,
+    up_lps: tuple[float, float, float],
+    nearest_mm: tuple[float, float],
+    rng: np.random.Generator,
+) -> Float64[np.ndarray, "4 4"]:
+    """Draw ``camera_from_ct``; the organ's nearest point gets a depth within ``nearest_mm``."""
+    if config.rotations == "full":
+        rotation = Rotation.random(rng=rng).as_matrix()
+    else:
+        spin = rng.uniform(0, 360)
+        tilt_x, tilt_y = rng.uniform(-config.tilt_deg, config.tilt_deg, 2)
+        rotation = _turn(*np.radians([tilt_x, tilt_y, spin])) @ _facing(up_lps)
+    rotated = rotation @ organ_ct.vertices_mm.T  # (3, v): minima along rows are fast
+    lower, upper = rotated.min(1), rotated.max(1)
+    offset = rng.uniform(-config.sideways_mm, config.sideways_mm, 2)
+    nearest = rng.uniform(*nearest_mm)
+    centre = (lower + upper) / 2
+    return rigid(rotation, np.array([*(offset - centre[:2]), nearest - lower[2]]))
+
+
+def _turn(about_x: float, about_y: float, about_z: float) -> Float64[np.ndarray, "3 3"]:
+    """A rotation about z, then y, then x, all fixed axes; radians. (Scipy's Rotation takes a
+    twentieth of a scene's time for a single one.)"""
+    sx, sy, sz = np.sin([about_x, about_y, about_z]).tolist()
+    cx, cy, cz = np.cos([about_x, about_y, about_z]).tolist()
+    return np.array(
+        [
+            [cy * cz, -cy * sz, sy],
+            [cx * sz + sx * sy * cz, cx * cz - sx * sy * sz, -sx * cy],
+            [sx * sz - cx * sy * cz, sx * cz + cx * sy * sz, cx * cy],
+        ]
+    )
+
+
+@lru_cache(maxsize=64)
+def _facing(up_lps: tuple[float, float, float]) -> Float64[np.ndarray, "3 3"]:
+    """The rotation that turns the organ's upper side towards the camera."""
+    turn = rotation_onto(np.array(up_lps), np.array([0.0, 0.0, -1.0]))
+    turn.flags.writeable = False
+    return turn
 
 
 def shows_nothing(recipe: SceneRecipe) -> TumortrackError:

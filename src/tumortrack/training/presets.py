@@ -26,8 +26,7 @@ from tumortrack.simulate.deform import ChainConfig, DragConfig, ElasticConfig, S
 from tumortrack.simulate.deform.drag import CONFIGURATIONS
 from tumortrack.simulate.elastic.body import BodyConfig
 from tumortrack.simulate.occupancy import OccupancyConfig
-from tumortrack.simulate.pose import PoseConfig
-from tumortrack.simulate.scene import SceneConfig
+from tumortrack.simulate.scene import PoseConfig, SceneConfig
 
 Rotations = Literal["full", "limited"]
 

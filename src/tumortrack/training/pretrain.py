@@ -142,7 +142,7 @@ def pretrain(run: Pretraining, folder: Path, report: Report) -> dict[str, Any]:
         state.initialize(initialize_canonical)
         state.resume(work)
         steps = range(state.progress.step, run.steps)
-        made = batches(kidney_stream(run), steps, 0, workers, device)
+        made = batches(kidney_stream(run).batch, steps, 0, workers, device)
         run_steps(state, Scenes(made, f"{workers} processes"), work, report)
         about = {
             "seed": run.seed,

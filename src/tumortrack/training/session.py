@@ -96,7 +96,7 @@ def divide_cores(device: torch.device, workers: int | None, sharing: int = 1) ->
     """How many processes make scenes, and set the network's number of threads.
 
     Without ``workers`` they are as many as there are cores, sixteen at most: their priority is low
-    (``scenes.quiet_worker``) while the network wants its half. ``sharing`` processes of one
+    (see ``scenes``) while the network wants its half. ``sharing`` processes of one
     training share the machine.
     """
     cores = available_cores() // sharing

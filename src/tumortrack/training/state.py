@@ -24,9 +24,9 @@ from tumortrack.core.store import write_atomically
 from tumortrack.models.config import TrainConfig
 from tumortrack.models.hardware import has_fast_bfloat16
 from tumortrack.models.model import Network
+from tumortrack.simulate.batched.stream import Tensors
 from tumortrack.training.distributed import ProcessGroup
 from tumortrack.training.model import model_class
-from tumortrack.training.scenes import Tensors
 
 _FILE = "checkpoint.safetensors"
 _FLOOR = 0.01  # of the peak learning rate, at the end of the tail

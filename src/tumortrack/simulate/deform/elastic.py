@@ -57,4 +57,7 @@ class ElasticConfig(Config, frozen=True, tag="elastic"):
         state = states[rng.integers(len(states))] * rng.uniform(*self.scale)
         if rng.uniform() < self.mixed:
             state = state + states[rng.integers(len(states))] * rng.uniform(*self.second_scale)
-        return ElasticDeformation(view.body, view.body.within_reach(state.astype(np.float32)))
+        coefficients, swelling = state.astype(np.float32), states[:, -1]
+        # No more swelling or shrinking than the library has.
+        coefficients[-1] = np.clip(coefficients[-1], swelling.min(), swelling.max())
+        return ElasticDeformation(view.body, coefficients)

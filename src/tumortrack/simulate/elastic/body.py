@@ -1,9 +1,8 @@
 """An elastic body: an organ's displacement modes and typical states, small enough for every frame.
 
 Finite elements (``finite``) of the organ respond to random loads; the principal components of the
-responses are its modes (``modes``). In their space the organ takes loads in its bed
-(``equilibrium``, ``loads``), which gives a library of states. See docs/method.md, section "Elastic
-deformations".
+responses are its modes (``modes``). In their space the organ takes loads in its bed (``loads``),
+which gives a library of states. See docs/method.md, section "Elastic deformations".
 """
 
 from __future__ import annotations
@@ -23,7 +22,7 @@ from tumortrack.core.types import Anatomy
 from tumortrack.simulate.elastic.flow import LatticeField, combine, follow, project, steps_for
 
 if TYPE_CHECKING:
-    from tumortrack.simulate.elastic.equilibrium import ReducedModel
+    from tumortrack.simulate.elastic.modes import ReducedModel
 
 Points = Float[np.ndarray, "n 3"]
 Moved = Float32[np.ndarray, "n 3"]
@@ -54,10 +53,10 @@ class ElasticBody:
     one unit of time. Outside the organ space follows smoothly.
 
     Attributes:
-        origin_mm: node (0, 0, 0) of the lattice; ``spacing_mm``: its step.
+        origin_mm, spacing_mm: node (0, 0, 0) of the lattice, and its step.
+        center_ct: the organ's centre of mass.
         modes: displacement at each node; a unit coefficient moves the organ by 1 mm rms. Free of
             rigid motion; the last one swells, the others keep volume.
-        center_ct: the organ's centre of mass.
         states: the library, one state a row.
     """
 
@@ -88,8 +87,7 @@ class ElasticBody:
     @cached_property
     def covariance(self) -> Float64[np.ndarray, "m m"]:
         """Of the library, with a small ridge: always invertible."""
-        ridge = _RIDGE * np.eye(self.states.shape[1])
-        return np.cov(self.states.T.astype(float)) + ridge
+        return np.cov(self.states.T.astype(float)) + _RIDGE * np.eye(self.states.shape[1])
 
     @cached_property
     def precision(self) -> Float64[np.ndarray, "m m"]:
@@ -118,12 +116,6 @@ class ElasticBody:
         axes = np.eye(3, dtype=np.float32)
         along = [project(field, place, np.tile(axis, (len(place), 1))) for axis in axes]
         return np.stack(along, 1)
-
-    def within_reach(self, coefficients: Float32[np.ndarray, " m"]) -> Float32[np.ndarray, " m"]:
-        """The same with no more swelling or shrinking than the library has."""
-        kept = coefficients.copy()
-        kept[-1] = np.clip(kept[-1], self.states[:, -1].min(), self.states[:, -1].max())
-        return kept
 
     def _field(self, values: Float32[np.ndarray, "i j k ..."]) -> LatticeField:
         return LatticeField(values, self.origin_mm, np.float32(self.spacing_mm))
@@ -186,12 +178,25 @@ def reduced_organ(
     Raises:
         InputError: a surface that turns inside, or numbers that make no body.
     """
-    _check(anatomy_ct, config)
-    from tumortrack.simulate.elastic.equilibrium import ReducedModel
     from tumortrack.simulate.elastic.finite import ElementLattice, LatticeSolid
-    from tumortrack.simulate.elastic.modes import modes_of, patches_of, random_loads
+    from tumortrack.simulate.elastic.modes import ReducedModel, modes_of, patches_of, random_loads
 
     organ = anatomy_ct.organ
+    if organ.volume_mm3 <= 0:
+        raise InputError("the organ's surface has no volume inside; its faces must turn outward.")
+    if not (
+        config.cells >= 50
+        and 2 <= config.modes <= min(config.responses, config.cells)
+        and config.states >= 2
+        and config.patches >= 20
+        and 0 <= config.poisson < 0.5
+        and len(config.contrasts) > 0
+        and min(config.contrasts) > 0
+    ):
+        raise InputError(
+            f"{config} makes no body: it needs at least 50 cells, 20 patches, 2 states, 2 modes "
+            "(no more than responses and cells), contrasts above 0, a Poisson ratio in 0..0.5."
+        )
     spacing_mm = float(np.cbrt(organ.volume_mm3 / config.cells))
     lattice = ElementLattice.around(organ.box_mm, spacing_mm)
     solid = LatticeSolid(anatomy_ct, lattice, config.poisson)
@@ -211,21 +216,3 @@ def body_of(reduced: ReducedModel, states: Float32[np.ndarray, "s m"]) -> Elasti
         solid.spread(reduced.modes).astype(np.float32),
         states,
     )
-
-
-def _check(anatomy_ct: Anatomy, config: BodyConfig) -> None:
-    if anatomy_ct.organ.volume_mm3 <= 0:
-        raise InputError("the organ's surface has no volume inside; its faces must turn outward.")
-    if not (
-        config.cells >= 50
-        and 2 <= config.modes <= min(config.responses, config.cells)
-        and config.states >= 2
-        and config.patches >= 20
-        and 0 <= config.poisson < 0.5
-        and len(config.contrasts) > 0
-        and min(config.contrasts) > 0
-    ):
-        raise InputError(
-            f"{config} makes no body: it needs at least 50 cells, 20 patches, 2 states, 2 modes "
-            "(no more than responses and cells), contrasts above 0, a Poisson ratio in 0..0.5."
-        )

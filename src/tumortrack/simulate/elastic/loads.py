@@ -1,4 +1,8 @@
-"""What is done to an organ on the table: one function a load, and the state that several lead to.
+"""An organ in its bed takes loads: equilibrium with one-sided contacts in the space of its modes.
+
+Unknowns are the modes' coefficients and six rigid ones. The bed is a layer of springs on the
+underside, obstacles are stiff springs that only push. Each Newton step solves for the contacts
+that the last one left closed. Lengths in mm, stress in N/mm2 (1 kPa = 1e-3).
 
 A random load is a function in ``LOADS`` that adds itself to the problem of an organ in its bed.
 """
@@ -6,15 +10,20 @@ A random load is a function in ``LOADS`` that adds itself to the problem of an o
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass, field
 
+import numba
 import numpy as np
 from jaxtyping import Float64
 from scipy.spatial.transform import Rotation
 
 from tumortrack.core.geometry import perpendicular, unit
-from tumortrack.simulate.elastic.equilibrium import KPA, ReducedModel, ReducedProblem
+from tumortrack.simulate.elastic.modes import ReducedModel
 
+KPA = 1e-3  # N/mm2
 Vector = Float64[np.ndarray, " 3"]
+_MOST_STEPS = 20
+_CONVERGED_MM = 1e-2
 _OBSTACLE = 100 * KPA  # N/mm3, of plates and instruments
 _GRIP = 50 * KPA  # N/mm3, of what holds a place
 _WEIGHT = 1.05e-6 * 9.81  # N/mm3
@@ -22,6 +31,98 @@ _EDGE_MM = 4.0  # over which an obstacle's edge fades
 _DEEPEST = 0.28  # of the organ's thickness, that a plate goes
 _FARTHEST_MM = 16.0  # that a place of the surface moves
 _SWELLING = 0.025  # largest change of volume: leaves room below 3 % for what modes do to it
+
+
+@dataclass(eq=False)
+class ReducedProblem:
+    """What acts on the organ, gathered by the loads: energy z' H z / 2 - g z + springs' energy.
+
+    ``contacts`` are (rows, depth_mm, springs): springs that push where ``depth_mm + rows @ z`` is
+    above zero.
+    """
+
+    organ: ReducedModel
+    up: Vector
+    modulus: float  # of the tissue, N/mm2
+    stiffness: Float64[np.ndarray, "m m"]  # H
+    forces: Float64[np.ndarray, " m"]  # g
+    contacts: list[tuple[np.ndarray, ...]] = field(default_factory=list)
+
+    def touch(self, rows: np.ndarray, depth_mm: np.ndarray, springs: np.ndarray) -> None:
+        """Add contacts with springs in N/mm."""
+        near = springs > 0
+        self.contacts.append((rows[near], depth_mm[near], springs[near]))
+
+    def tie(self, rows: np.ndarray, target_mm: np.ndarray | float, springs: np.ndarray) -> None:
+        """Springs (N/mm) that hold ``rows @ z`` at a target, both ways."""
+        _add_springs(self.stiffness, self.forces, rows, springs * target_mm, springs)
+
+    def equilibrium(self) -> Float64[np.ndarray, " m"] | None:
+        """The unknowns at rest; None where the contacts do not converge."""
+        none = np.zeros((0, len(self.forces))), np.zeros(0), np.zeros(0)
+        contacts = map(np.concatenate, zip(none, *self.contacts, strict=True))
+        z, converged = _equilibrium(self.stiffness, self.forces, *contacts)
+        return z if converged else None
+
+
+# Own loops for small matrices: BLAS would wake every thread for each product, which on a busy
+# machine takes many times longer than the product; and most springs are open.
+@numba.njit(cache=True, nogil=True)
+def _equilibrium(stiffness, forces, rows, depth, springs):  # type: ignore[no-untyped-def]
+    z = np.zeros(len(forces))
+    for step in range(_MOST_STEPS):
+        closed, loads = np.zeros(len(rows)), np.zeros(len(rows))
+        for p in range(len(rows)):
+            sunk = depth[p]
+            for a in range(len(z)):
+                sunk += rows[p, a] * z[a]
+            if sunk > 0:
+                closed[p] = springs[p]
+                loads[p] = -springs[p] * depth[p]
+        matrix, found = stiffness.copy(), forces.copy()
+        _add_springs(matrix, found, rows, loads, closed)
+        _solve(matrix, found)
+        farthest = 0.0
+        for a in range(len(z)):
+            move = found[a] - z[a]
+            farthest = max(farthest, abs(move))
+            z[a] += move if step < 6 else 0.6 * move  # contacts that open and close in turns
+        if farthest < _CONVERGED_MM:
+            return found, True
+    return z, False
+
+
+@numba.njit(cache=True, nogil=True)
+def _add_springs(matrix, right, rows, loads, springs):  # type: ignore[no-untyped-def]
+    """matrix += rows' diag(springs) rows and right += rows' loads, in place."""
+    for p in range(len(rows)):
+        if springs[p] == 0.0:
+            continue
+        for a in range(len(right)):
+            force = springs[p] * rows[p, a]
+            right[a] += rows[p, a] * loads[p]
+            for b in range(len(right)):
+                matrix[a, b] += force * rows[p, b]
+
+
+@numba.njit(cache=True, nogil=True)
+def _solve(matrix, right):  # type: ignore[no-untyped-def]
+    """right = inverse(matrix) right, by Cholesky; both are overwritten."""
+    n = len(right)
+    for i in range(n):
+        for j in range(i + 1):
+            total = matrix[i, j]
+            for k in range(j):
+                total -= matrix[i, k] * matrix[j, k]
+            matrix[i, j] = np.sqrt(total) if i == j else total / matrix[j, j]
+        total = right[i]
+        for k in range(i):
+            total -= matrix[i, k] * right[k]
+        right[i] = total / matrix[i, i]
+    for i in range(n - 1, -1, -1):
+        right[i] /= matrix[i, i]
+        for k in range(i):
+            right[k] -= matrix[i, k] * right[i]
 
 
 def press(
@@ -48,8 +149,8 @@ def indent(
 def hold(problem: ReducedProblem, patch: int, radius_mm: float, shift_mm: Vector) -> None:
     """A region around a patch is held at a shift."""
     patches = problem.organ.patches
-    square = ((patches.points_mm - patches.points_mm[patch]) ** 2).sum(1)
-    springs = _GRIP * patches.areas_mm2 * np.exp(-0.5 * square / radius_mm**2)
+    spot = patches.spot(patches.points_mm[patch], radius_mm)
+    springs = _GRIP * patches.areas_mm2 * spot
     for axis, shift in zip(np.eye(3), shift_mm, strict=True):
         problem.tie(problem.organ.along(axis), shift, springs)
 
