@@ -34,7 +34,8 @@ from tumortrack.simulate.targets import draw_targets
 from tumortrack.tracking.tracker import Follower, FollowerConfig, Tracker
 from tumortrack.training.model import load_model
 from tumortrack.training.presets import PRESETS, pretraining
-from tumortrack.training.pretrain import Pretraining, kidney_stream
+from tumortrack.training.pretrain import kidney_stream
+from tumortrack.training.run import Pretraining
 from tumortrack.training.train import TrainingRun, task_of, train
 from tumortrack_lab.twin.dataset import StateCache, TwinRun
 from tumortrack_lab.twin.views import VIEWS, ViewConfig, make_scene

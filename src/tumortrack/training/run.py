@@ -1,9 +1,10 @@
-"""What a training run is: case, configuration, seed and length; its name and its origin."""
+"""What a training is: configuration, seed and length; its name, its origin and its schedule."""
 
 from __future__ import annotations
 
 import hashlib
 import json
+import math
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -15,7 +16,8 @@ from tumortrack.core.errors import InputError
 from tumortrack.core.types import Anatomy
 from tumortrack.models.config import TrainConfig
 from tumortrack.training.model import PretrainedWeights
-from tumortrack.training.state import RunSettings, TrainingProgress
+
+_FLOOR = 0.01  # of the peak learning rate, at the end of the tail
 
 
 @dataclass(frozen=True)
@@ -36,7 +38,7 @@ class TrainingRun:
     scenes: Literal["auto", "workers", "device"] = "auto"  # who makes them; see ``training.scenes``
 
     def __post_init__(self) -> None:
-        check_settings(self, seed=0, steps=1, workers=0)
+        _check(self, seed=0, steps=1, workers=0)
         if self.minutes is not None and not 0 < self.minutes < float("inf"):
             raise InputError(f"minutes is {self.minutes}; it must be positive.")
         if self.start is not None:
@@ -46,21 +48,34 @@ class TrainingRun:
     def identity(self) -> str:
         """sha256 of all that decides the weights, so that a resumed run is the same run."""
         start = {} if self.start is None else {"start": self.start.sha256}
-        more = {"case": self.case_sha256, "minutes": self.minutes, **start}
-        return settings_sha256(self.config, self.seed, self.steps, **more)
+        return _sha256(self, case=self.case_sha256, minutes=self.minutes, **start)
 
 
-def run_identity(run: TrainingRun) -> str:
-    """``run.identity``."""
-    return run.identity
+@dataclass(frozen=True)
+class Pretraining:
+    """What to pretrain: on how many random kidneys, for how many steps."""
+
+    config: TrainConfig
+    anatomies: int
+    steps: int
+    seed: int = 0
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    workers: int | None = None
+    checkpoint_every_s: float = 30.0
+
+    minutes = None  # steps alone decide
+
+    def __post_init__(self) -> None:
+        _check(self, anatomies=1, steps=1, seed=0, workers=0)
+
+    @property
+    def identity(self) -> str:
+        """sha256 of all that decides the weights."""
+        return _sha256(self, anatomies=self.anatomies)
 
 
-def check_settings(run: RunSettings, **smallest: int) -> None:
-    """Refuse numbers smaller than these, and impossible times between checkpoints.
-
-    Raises:
-        InputError: one of them is out of range.
-    """
+def _check(run: TrainingRun | Pretraining, **smallest: int) -> None:
+    """Refuse numbers smaller than these, and impossible times between checkpoints."""
     for name, least in smallest.items():
         value = getattr(run, name)
         if value is not None and value < least:
@@ -71,16 +86,26 @@ def check_settings(run: RunSettings, **smallest: int) -> None:
         )
 
 
-def settings_sha256(config: TrainConfig, seed: int, steps: int | None, **more: object) -> str:
-    """sha256 of the configuration, the seed, the number of steps, and of ``more``."""
-    content = {"config": identity(config), "seed": seed, "steps": steps, **more}
+def _sha256(run: TrainingRun | Pretraining, **more: object) -> str:
+    content = {"config": identity(run.config), "seed": run.seed, "steps": run.steps, **more}
     content["schema"] = store.SCHEMA
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+
+
+@dataclass
+class TrainingProgress:
+    """Where a run stands. ``end`` is the step it will stop at; None while minutes decide."""
+
+    step: int = 0
+    elapsed_s: float = 0.0
+    end: int | None = None
+    best_miou: float = -1.0
 
 
 def provenance(
     run: TrainingRun, progress: TrainingProgress, device: torch.device
 ) -> dict[str, Any]:
+    """What a model's manifest says of its training."""
     about = {
         "seed": run.seed,
         "steps": progress.step,
@@ -107,3 +132,17 @@ def settle_end(config: TrainConfig, progress: TrainingProgress, minutes: float |
     elif progress.elapsed_s >= head * minutes * 60:
         progress.end = max(progress.step + 1, round(progress.step / head))
     return progress.end is not None
+
+
+def learning_rate(config: TrainConfig, progress: TrainingProgress) -> float:
+    """The learning rate of the step that comes next."""
+    schedule, step = config.schedule, progress.step
+    peak = schedule.learning_rate
+    if schedule.kind == "exponential":
+        return peak * schedule.gamma ** (step * config.batch_size // schedule.epoch_pairs)
+    warm = min(1.0, (step + 1) / schedule.warmup_steps)
+    if progress.end is None:
+        return peak * warm
+    begin = progress.end * (1 - schedule.tail)
+    through = min(max((step - begin) / max(progress.end - begin, 1), 0.0), 1.0)
+    return peak * warm * (_FLOOR + (1 - _FLOOR) * (1 + math.cos(math.pi * through)) / 2)

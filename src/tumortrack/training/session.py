@@ -7,10 +7,9 @@ import os
 import signal
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
-from dataclasses import asdict, dataclass
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
 from typing import TypeVar
 
 import torch
@@ -18,7 +17,7 @@ import torch
 from tumortrack.core.errors import InputError, StorageError, TumortrackError
 from tumortrack.core.process import available_cores, keep_freed_memory
 from tumortrack.core.store import write_atomically
-from tumortrack.training.state import TrainingProgress
+from tumortrack.training.run import TrainingProgress
 
 MOST_THREADS = 16  # more only wait for each other in layers this small
 _MOST_WORKERS = 16
@@ -93,34 +92,29 @@ def work_folder(folder: Path, writes: bool = True) -> Iterator[Path]:
 
 
 def divide_cores(device: torch.device, workers: int | None, sharing: int = 1) -> int:
-    """How many processes make scenes, and set the network's number of threads.
+    """How many processes make scenes, and set the network's number of threads: on a CPU it gets the
+    cores that the workers leave, half of them at least, within OMP_NUM_THREADS.
 
     Without ``workers`` they are as many as there are cores, sixteen at most: their priority is low
-    (see ``scenes``) while the network wants its half. ``sharing`` processes of one
-    training share the machine.
+    (see ``scenes``). ``sharing`` processes of one training share the machine.
     """
     cores = available_cores() // sharing
     if workers is None:
         workers = max(1, min(_MOST_WORKERS, cores))
-    use_cores(device, min(workers, cores // 2), sharing)
-    return workers
-
-
-def use_cores(device: torch.device, workers: int, sharing: int = 1) -> None:
-    """Give the network the cores that the workers leave, within OMP_NUM_THREADS."""
     if device.type == "cpu":
         keep_freed_memory()
         granted = os.environ.get("OMP_NUM_THREADS", "")
         most = min(int(granted) if granted.isdigit() else MOST_THREADS, MOST_THREADS)
-        torch.set_num_threads(max(1, min(most, available_cores() // sharing - workers)))
+        torch.set_num_threads(max(1, min(most, cores - min(workers, cores // 2))))
+    return workers
 
 
 class TrainingClock:
     """Time spent in all sessions of a run, and when things are due again."""
 
     def __init__(self, progress: TrainingProgress) -> None:
-        self._start, self._first_step = time.monotonic(), progress.step
-        self._before = progress.elapsed_s
+        self._progress, self._first_step = progress, progress.step
+        self._start, self._before = time.monotonic(), progress.elapsed_s
         self._last: dict[str, float] = {}
         self._waited = 0.0
 
@@ -137,14 +131,19 @@ class TrainingClock:
     @property
     def waiting(self) -> float:
         """Fraction of this session's time that was spent waiting."""
-        return self._waited / max(time.monotonic() - self._start, 1e-9)
+        return self._waited / self._session_s
+
+    @property
+    def rate(self) -> float:
+        """Steps per second in this session."""
+        return (self._progress.step - self._first_step) / self._session_s
+
+    @property
+    def _session_s(self) -> float:
+        return max(time.monotonic() - self._start, 1e-9)
 
     def elapsed(self) -> float:
         return self._before + time.monotonic() - self._start
-
-    def rate(self, progress: TrainingProgress) -> float:
-        """Steps per second in this session."""
-        return (progress.step - self._first_step) / max(time.monotonic() - self._start, 1e-9)
 
     def due(self, what: str, every_s: float) -> bool:
         now = time.monotonic()
@@ -174,84 +173,61 @@ def ctrl_c() -> Iterator[Callable[[], bool]]:
             signal.signal(number, handler)
 
 
-@dataclass(frozen=True)
-class Record:
-    """What one validation adds to a step number and a time."""
-
-    loss: float
-    validation_miou: float
-    samples_per_s: float
-    learning_rate: float
-    waiting: float = 0.0  # fraction of the time that was spent waiting for scenes
-
-
-# Tags of TensorBoard, and digits in history.jsonl
+# Of a validation: tags of TensorBoard, and digits in history.jsonl
 _SCALARS = {
     "loss": ("loss/train", ".5f"),
     "validation_miou": ("miou/validation", ".4f"),
     "samples_per_s": ("speed/samples_per_s", ".1f"),
     "learning_rate": ("learning_rate", ".4g"),
-    "waiting": ("speed/waiting", ".3f"),
+    "waiting": ("speed/waiting", ".3f"),  # fraction of the time that was spent waiting for scenes
 }
 
 
-class History:
-    """history.jsonl and TensorBoard, one record a validation; on resuming, those after the
-    checkpoint are dropped first.
+@contextmanager
+def history(folder: Path, progress: TrainingProgress) -> Iterator[Callable[..., None]]:
+    """history.jsonl and TensorBoard: yields a function that writes a validation's numbers, which
+    ``_SCALARS`` names. On resuming, records after the checkpoint are dropped first.
 
     Raises (entering, writing, leaving):
         StorageError: the disk is full. On leaving after another error, that one is kept.
     """
+    from torch.utils.tensorboard import SummaryWriter
 
-    def __init__(self, folder: Path, progress: TrainingProgress) -> None:
-        self._path = folder / "history.jsonl"
-        self._folder = folder
-        self._resumed_at = progress.step
+    path, files = folder / "history.jsonl", ExitStack()
+    with _history_errors(folder):
+        if path.exists():
+            lines = path.read_text(encoding="utf-8").splitlines(keepends=True)
+            whole = [line for line in lines if line.endswith("\n")]
+            kept = [line for line in whole if json.loads(line)["step"] <= progress.step]
+            write_atomically(path, "".join(kept).encode())
+        stream = files.enter_context(path.open("a", buffering=1, encoding="utf-8"))
+        board = SummaryWriter(folder / "tensorboard", purge_step=progress.step + 1)
+        files.callback(board.close)
 
-    def __enter__(self) -> History:
-        from torch.utils.tensorboard import SummaryWriter
-
-        try:
-            if self._path.exists():
-                lines = self._path.read_text(encoding="utf-8").splitlines(keepends=True)
-                whole = [line for line in lines if line.endswith("\n")]
-                kept = [line for line in whole if json.loads(line)["step"] <= self._resumed_at]
-                write_atomically(self._path, "".join(kept).encode())
-            self._lines = self._path.open("a", buffering=1, encoding="utf-8")
-            self._board = SummaryWriter(
-                self._folder / "tensorboard", purge_step=self._resumed_at + 1
-            )
-        except OSError as error:
-            raise self._refused(error) from error
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None
-    ) -> None:
-        refused: list[OSError] = []
-        for close in (self._board.close, self._lines.close):
-            try:
-                close()
-            except OSError as failure:
-                refused.append(failure)
-        if refused and error is None:
-            raise self._refused(refused[0]) from refused[0]
-
-    def write(self, progress: TrainingProgress, record: Record) -> None:
-        """One validation's record."""
-        values = asdict(record)
+    def write(**values: float) -> None:
         line = {"step": progress.step, "elapsed_s": round(progress.elapsed_s, 1)}
-        for name, (_, digits) in _SCALARS.items():
-            line[name] = float(f"{values[name]:{digits}}")
-        try:
-            self._lines.write(json.dumps(line) + "\n")
+        line |= {k: float(f"{values[k]:{digits}}") for k, (_, digits) in _SCALARS.items()}
+        with _history_errors(folder):
+            stream.write(json.dumps(line) + "\n")
             for name, (tag, _) in _SCALARS.items():
-                self._board.add_scalar(tag, values[name], progress.step)
-        except OSError as error:
-            raise self._refused(error) from error
+                board.add_scalar(tag, values[name], progress.step)
 
-    def _refused(self, error: OSError) -> StorageError:
-        return StorageError(
-            f"cannot write the history in {self._folder}: {error.strerror or error}. "
+    try:
+        yield write
+    except BaseException:
+        with suppress(OSError):  # the first error counts
+            files.close()
+        raise
+    with _history_errors(folder):
+        files.close()
+
+
+@contextmanager
+def _history_errors(folder: Path) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        raise StorageError(
+            f"cannot write the history in {folder}: {error.strerror or error}. "
             "Free some space and give the same command again."
-        )
+        ) from error

@@ -9,9 +9,9 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import numpy as np
 import torch
@@ -21,25 +21,14 @@ from torch import Tensor
 
 from tumortrack.core.errors import ArtifactError, TumortrackError
 from tumortrack.core.store import write_atomically
-from tumortrack.models.config import TrainConfig
 from tumortrack.models.hardware import has_fast_bfloat16
 from tumortrack.models.model import Network
 from tumortrack.simulate.batched.stream import Tensors
 from tumortrack.training.distributed import ProcessGroup
 from tumortrack.training.model import model_class
+from tumortrack.training.run import Pretraining, TrainingProgress, TrainingRun, learning_rate
 
 _FILE = "checkpoint.safetensors"
-_FLOOR = 0.01  # of the peak learning rate, at the end of the tail
-
-
-@dataclass
-class TrainingProgress:
-    """Where a run stands. ``end`` is the step it will stop at; None while minutes decide."""
-
-    step: int = 0
-    elapsed_s: float = 0.0
-    end: int | None = None
-    best_miou: float = -1.0
 
 
 class Diverged(TumortrackError):
@@ -52,31 +41,14 @@ class Diverged(TumortrackError):
         )
 
 
-@runtime_checkable
-class RunSettings(Protocol):
-    """What training needs to know of a run."""
-
-    @property
-    def config(self) -> TrainConfig: ...
-    @property
-    def seed(self) -> int: ...
-    @property
-    def steps(self) -> int | None: ...
-    @property
-    def minutes(self) -> float | None: ...
-    @property
-    def checkpoint_every_s(self) -> float: ...
-    @property
-    def identity(self) -> str:
-        """sha256 of all that decides the weights."""
-        ...
-
-
 class TrainingState:
     """All that changes while training, and nothing else."""
 
     def __init__(
-        self, run: RunSettings, device: torch.device, group: ProcessGroup | None = None
+        self,
+        run: TrainingRun | Pretraining,
+        device: torch.device,
+        group: ProcessGroup | None = None,
     ) -> None:
         self.run, self._device = run, device
         self.group = group or ProcessGroup(device)
@@ -153,11 +125,7 @@ class TrainingState:
         groups = {
             "network": self.network.state_dict(),
             "average": self.average.state_dict(),
-            "optimizer": {
-                f"{index}.{name}": value
-                for index, state in moments.items()
-                for name, value in state.items()
-            },
+            "optimizer": {f"{n}.{k}": v for n, state in moments.items() for k, v in state.items()},
             "best": self._best,
         }
         tensors = {
@@ -165,8 +133,7 @@ class TrainingState:
             for group, members in groups.items()
             for name, tensor in members.items()
         }
-        progress = json.dumps(asdict(self.progress))
-        metadata = {"progress": progress, "identity": self.run.identity}
+        metadata = {"progress": json.dumps(asdict(self.progress)), "identity": self.run.identity}
         write_atomically(work / _FILE, save(tensors, metadata))
 
     def step(self, batch: Tensors) -> float:
@@ -176,10 +143,10 @@ class TrainingState:
             Diverged: the loss is not finite; the weights are as they were.
             ProcessLost: another process of this training has ended.
         """
-        config, progress = self.run.config, self.progress
+        progress = self.progress
         clouds, points, labels, poses = (part.to(self._device, non_blocking=True) for part in batch)
         clouds = clouds[:, : self.points_kept(clouds.shape[1])]
-        self.learning_rate = learning_rate(config, progress)
+        self.learning_rate = learning_rate(self.run.config, progress)
         for group in self.optimizer.param_groups:
             group["lr"] = self.learning_rate
         self.network.train()
@@ -209,12 +176,9 @@ class TrainingState:
     def _update_average(self) -> None:
         """Exponential moving average of weights and running statistics; short memory at first."""
         decay = min(self.run.config.ema, (1 + self.progress.step) / (10 + self.progress.step))
-        pairs = zip(
-            self.average.state_dict().values(), self.network.state_dict().values(), strict=True
-        )
-        averages, weights = zip(
-            *(pair for pair in pairs if pair[0].is_floating_point()), strict=True
-        )
+        networks = (network.state_dict().values() for network in (self.average, self.network))
+        pairs = (pair for pair in zip(*networks, strict=True) if pair[0].is_floating_point())
+        averages, weights = zip(*pairs, strict=True)
         torch._foreach_lerp_(averages, weights, 1 - decay)
 
     def keep_if_best(self, miou: float) -> None:
@@ -226,17 +190,3 @@ class TrainingState:
         """The averaged weights of the best validation."""
         self.average.load_state_dict(self._best)
         return self.average
-
-
-def learning_rate(config: TrainConfig, progress: TrainingProgress) -> float:
-    """The learning rate of the step that comes next."""
-    schedule, step = config.schedule, progress.step
-    peak = schedule.learning_rate
-    if schedule.kind == "exponential":
-        return peak * schedule.gamma ** (step * config.batch_size // schedule.epoch_pairs)
-    warm = min(1.0, (step + 1) / schedule.warmup_steps)
-    if progress.end is None:
-        return peak * warm
-    begin = progress.end * (1 - schedule.tail)
-    through = min(max((step - begin) / max(progress.end - begin, 1), 0.0), 1.0)
-    return peak * warm * (_FLOOR + (1 - _FLOOR) * (1 + math.cos(math.pi * through)) / 2)

@@ -2,47 +2,84 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol, TypeVar, runtime_checkable
+from functools import cached_property
+from typing import Any
 
 import numpy as np
+import torch
 from jaxtyping import Float32, Float64, UInt8
 
 from tumortrack.models.config import TrainConfig
-from tumortrack.models.model import Model, Network
+from tumortrack.models.in_distribution import InDistributionRange
+from tumortrack.models.model import Model
 from tumortrack.simulate.dataset import refill
 from tumortrack.simulate.elastic.body import ElasticBody
-from tumortrack.simulate.occupancy import PartPool, PointSource
-from tumortrack.simulate.scene import SceneRecipe, Simulator
+from tumortrack.simulate.occupancy import PartPool, PointSource, organ_pool
+from tumortrack.simulate.scene import SceneRecipe, Simulator, body_for
+from tumortrack.training.run import TrainingRun
 
-N = TypeVar("N", bound=Network, contravariant=True)
 
+class TrainingTask(ABC):
+    """What a method learns, how it is validated, and the model it leaves; a class per method.
 
-@runtime_checkable
-class TrainingTask(Protocol[N]):
-    """What a method learns, how it is validated, and the model it leaves; a class per method."""
+    Attributes:
+        points: those of the training scenes.
+        body: the organ's, where scenes or model need it.
+    """
 
-    @property
-    def points(self) -> PointSource:
-        """Those of the training scenes."""
-        ...
+    points: PointSource
+    body: ElasticBody | None
 
-    @property
-    def body(self) -> ElasticBody | None:
-        """The organ's, where scenes or model need it."""
-        ...
+    def __init__(self, run: TrainingRun, device: torch.device) -> None:
+        self._run, self._device = run, device
+        self.body = body_for(run.anatomy_ct, run.up_lps, run.config.scene, run.seed)
 
-    def initialize(self, network: N) -> None:
+    @abstractmethod
+    def initialize(self, network: Any) -> None:
         """Give a fresh network what does not have to be learnt."""
-        ...
 
-    def miou(self, network: N) -> float:
+    @abstractmethod
+    def miou(self, network: Any) -> float:
         """On the validation scenes."""
-        ...
 
-    def model(self, network: N, provenance: dict[str, Any]) -> Model:
+    @abstractmethod
+    def model(self, network: Any, provenance: dict[str, Any]) -> Model:
         """The finished model of the network."""
-        ...
+
+    @cached_property
+    def _scenes(self) -> ValidationScenes:
+        run = self._run
+        simulator = Simulator(run.anatomy_ct, run.up_lps, run.config.scene, self.body)
+        return validation_scenes(simulator, self._pool(), run.config, run.seed)
+
+    def _pool(self) -> PartPool:
+        """Points about the organ, to validate on."""
+        return organ_pool(self._run.anatomy_ct, self._run.config.scene.occupancy, self._run.seed)
+
+    def _fields(
+        self,
+        network: Any,
+        provenance: dict[str, Any],
+        spreads_mm: Sequence[float],
+        fits_mm: Sequence[float],
+    ) -> dict[str, Any]:
+        """What models of both methods hold; of validation scenes, how far their points spread and
+        how far they lie from the surface that was found."""
+        known = InDistributionRange(
+            spread_mm=(min(spreads_mm), max(spreads_mm)),
+            fit_mm=float(np.percentile(fits_mm, 95)),
+        )
+        return {
+            "network": network,
+            "config": self._run.config,
+            "parts": self._run.anatomy_ct.names,
+            "query_box_mm": self._scenes.query_box_mm,
+            "in_distribution": known,
+            "provenance": provenance,
+        }
 
 
 @dataclass(frozen=True, eq=False)

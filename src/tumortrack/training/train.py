@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from contextlib import AbstractContextManager, closing, nullcontext
 from pathlib import Path
-from typing import Any
 
 import torch
 
@@ -21,28 +20,27 @@ from tumortrack.training.distributed import ProcessGroup, process_group
 from tumortrack.training.model import load_model, save_model
 from tumortrack.training.occupancy_task import OccupancyTask
 from tumortrack.training.registration_task import RegistrationTask
-from tumortrack.training.run import TrainingRun, provenance, run_identity, settle_end
+from tumortrack.training.run import TrainingRun, provenance, settle_end
 from tumortrack.training.scenes import Scenes, scenes_for
 from tumortrack.training.session import (
-    History,
     Interrupted,
-    Record,
     TrainingClock,
     TrainingStatus,
     ctrl_c,
     divide_cores,
+    history,
     work_folder,
 )
 from tumortrack.training.state import TrainingState
 from tumortrack.training.task import TrainingTask
 
-__all__ = ["Interrupted", "TrainingRun", "TrainingStatus", "run_identity", "train"]
+__all__ = ["Interrupted", "TrainingRun", "TrainingStatus", "train"]
 
 REPORT_EVERY_S = 5.0
 Report = Callable[[TrainingStatus], None]
 
 
-def task_of(run: TrainingRun, device: torch.device) -> TrainingTask[Any]:
+def task_of(run: TrainingRun, device: torch.device) -> TrainingTask:
     """The task of a run's method.
 
     Raises:
@@ -115,22 +113,26 @@ def run_steps(
     """
     run, group, progress = state.run, state.group, state.progress
     clock, miou = TrainingClock(progress), None
-    written: AbstractContextManager[History | None] = (
-        History(work, progress) if miou_of and group.is_main else nullcontext()
+    written: AbstractContextManager[Callable[..., None] | None] = (
+        history(work, progress) if miou_of and group.is_main else nullcontext()
     )
     source = closing(scenes.batches)
-    with written as history, ctrl_c() as stopped, source as loaded:
+    with written as write, ctrl_c() as stopped, source as loaded:
         for batch in clock.timed(loaded):
             loss = state.step(batch)
             progress.elapsed_s, stop = group.all_reduce(clock.elapsed(), stopped())
             settled = settle_end(run.config, progress, run.minutes)
             done = progress.step == progress.end
-            if miou_of and history and (done or progress.step % run.config.validate_every == 0):
+            if miou_of and write and (done or progress.step % run.config.validate_every == 0):
                 miou = miou_of(state.average)
                 state.keep_if_best(miou)
-                speed = clock.rate(progress) * run.config.batch_size
-                record = Record(loss, miou, speed, state.learning_rate, clock.waiting)
-                history.write(progress, record)
+                write(
+                    loss=loss,
+                    validation_miou=miou,
+                    samples_per_s=clock.rate * run.config.batch_size,
+                    learning_rate=state.learning_rate,
+                    waiting=clock.waiting,
+                )
             due = done or settled or stop
             if group.is_main and (due or clock.due("checkpoint", run.checkpoint_every_s)):
                 state.save(work)
@@ -145,11 +147,9 @@ def run_steps(
 def _status(
     state: TrainingState, clock: TrainingClock, loss: float, miou: float | None, note: str
 ) -> TrainingStatus:
-    run, progress, rate = state.run, state.progress, clock.rate(state.progress)
+    run, progress, rate = state.run, state.progress, clock.rate
     left = ((progress.end or run.config.steps) - progress.step) / rate
     if progress.end is None and run.minutes is not None:
         left = min(left, run.minutes * 60 - progress.elapsed_s)
-    speed = rate * run.config.batch_size
-    return TrainingStatus(
-        progress.step, progress.end, max(left, 0.0), speed, loss, miou, note, clock.waiting
-    )
+    about = rate * run.config.batch_size, loss, miou, note, clock.waiting
+    return TrainingStatus(progress.step, progress.end, max(left, 0.0), *about)

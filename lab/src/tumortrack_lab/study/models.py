@@ -18,7 +18,7 @@ from tumortrack.sense.noise import CalibrationConfig
 from tumortrack.sense.occlusion import OcclusionConfig
 from tumortrack.simulate.deform import DragConfig
 from tumortrack.simulate.deform.drag import CONFIGURATIONS
-from tumortrack.training.train import TrainingRun, TrainingStatus, run_identity, train
+from tumortrack.training.train import TrainingRun, TrainingStatus, train
 from tumortrack_lab.study.cases import StudyCase
 from tumortrack_lab.study.methods import Network
 
@@ -142,4 +142,4 @@ class Trainer:
 def _same(folder: Path, run: TrainingRun) -> bool:
     """Whether a finished model is this run's; else training refuses it with a clear text."""
     manifest = store.read_json(folder / store.MANIFEST)
-    return manifest["provenance"].get("run_sha256") == run_identity(run)
+    return manifest["provenance"].get("run_sha256") == run.identity

@@ -205,7 +205,8 @@ class DeviceStream:
             rows.append((drawn.camera_from_ct, *motion, *depths, rng.bit_generator.state))
         *columns, states = zip(*rows, strict=True)
         arrays = [np.array(recipes, object), np.array(attempts), *map(np.stack, columns)]
-        return BatchPlan(*arrays, np.array(states, object))
+        arrays.append(np.array(states, object))
+        return BatchPlan(*arrays)
 
     def _render(self, plan: BatchPlan) -> tuple[Float32[Tensor, "b h w"], Int32[Tensor, "b hw"]]:
         """Depth images (mm, NaN where there is nothing), and the running count, in row-major order,
