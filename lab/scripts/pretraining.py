@@ -33,14 +33,13 @@ from tumortrack.registration.network import RegistrationNetwork
 from tumortrack.registration.registration import Registration
 from tumortrack.registration.rest_shape import RestShape, shape_of
 from tumortrack.report.drawing import new_figure, save
-from tumortrack.simulate.dataset import SceneStream
+from tumortrack.simulate.scene import SceneStream
 from tumortrack.training.model import PretrainedWeights, load_start
 from tumortrack.training.presets import clinic
-from tumortrack.training.registration_task import RegistrationTask
 from tumortrack.training.run import TrainingRun
 from tumortrack.training.scenes import batches
 from tumortrack.training.state import TrainingState
-from tumortrack.training.task import ValidationScenes, mean_iou_of
+from tumortrack.training.task import RegistrationTask, ValidationScenes, mean_iou_of
 from tumortrack_lab.study.cases import named_folders, phantom_case
 from tumortrack_lab.study.document import ReportWriter, table
 from tumortrack_lab.study.frame import text as seeds_text

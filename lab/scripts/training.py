@@ -37,15 +37,12 @@ from tumortrack.registration.network import RegistrationNetwork
 from tumortrack.registration.registration import Registration
 from tumortrack.registration.rest_shape import shape_of
 from tumortrack.report.drawing import new_figure, save
-from tumortrack.simulate.dataset import SceneStream
-from tumortrack.simulate.scene import body_for
-from tumortrack.training.occupancy_task import label_miou
+from tumortrack.simulate.scene import SceneStream, body_for
 from tumortrack.training.presets import PRESETS
 from tumortrack.training.run import TrainingRun, settle_end
 from tumortrack.training.scenes import batches
 from tumortrack.training.state import TrainingState
-from tumortrack.training.task import ValidationScenes, mean_iou_of
-from tumortrack.training.train import task_of
+from tumortrack.training.task import ValidationScenes, label_miou, mean_iou_of, task_of
 from tumortrack_lab.study.cases import phantom_case
 from tumortrack_lab.study.document import ReportWriter, table
 from tumortrack_lab.study.trainings import kept, make_command, run, unseen_scenes

@@ -17,7 +17,6 @@ from tumortrack.sense.noise import D405_NOISE
 from tumortrack.sense.render import render_depth
 from tumortrack.simulate.batched.render import depth_images
 from tumortrack.simulate.batched.stream import DeviceStream, carried, why_not
-from tumortrack.simulate.dataset import SceneStream
 from tumortrack.simulate.deform import (
     ChainConfig,
     DragConfig,
@@ -26,7 +25,7 @@ from tumortrack.simulate.deform import (
     StretchConfig,
 )
 from tumortrack.simulate.occupancy import FixedPoints, OccupancyConfig, OccupancyPool
-from tumortrack.simulate.scene import PoseConfig, SceneConfig, SceneRecipe, Simulator
+from tumortrack.simulate.scene import PoseConfig, SceneConfig, SceneRecipe, SceneStream, Simulator
 from tumortrack.training.presets import paper, quick
 from tumortrack.training.scenes import batches_on, scenes_for
 from tumortrack.training.train import TrainingRun, train

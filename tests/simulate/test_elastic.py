@@ -17,7 +17,6 @@ from tumortrack.cli.cases import Simulate
 from tumortrack.core.config import from_builtins, to_builtins
 from tumortrack.core.errors import InputError
 from tumortrack.core.types import Anatomy, Mesh
-from tumortrack.simulate.dataset import SceneStream
 from tumortrack.simulate.deform import ChainConfig, DragConfig, ElasticConfig, StretchConfig
 from tumortrack.simulate.deform.base import View
 from tumortrack.simulate.elastic.body import ElasticBody, build_body
@@ -40,7 +39,14 @@ from tumortrack.simulate.elastic.loads import (
 )
 from tumortrack.simulate.elastic.modes import ReducedModel, modes_of, patches_of, random_loads
 from tumortrack.simulate.occupancy import OccupancyConfig, OccupancyPool
-from tumortrack.simulate.scene import PoseConfig, SceneConfig, SceneRecipe, Simulator, body_for
+from tumortrack.simulate.scene import (
+    PoseConfig,
+    SceneConfig,
+    SceneRecipe,
+    SceneStream,
+    Simulator,
+    body_for,
+)
 
 ANATOMY = organ()
 ORGAN = ANATOMY.organ

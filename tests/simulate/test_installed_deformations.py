@@ -56,7 +56,7 @@ assert "shifting" not in sys.modules  # imported when a configuration is read
 from render_objects import anatomy
 from tumortrack.core.config import from_builtins, to_builtins
 from tumortrack.simulate.batched.stream import why_not
-from tumortrack.simulate.dataset import SceneStream
+from tumortrack.simulate.scene import SceneStream
 from tumortrack.simulate.occupancy import OccupancyPool
 from tumortrack.simulate.scene import SceneConfig, SceneRecipe, Simulator, body_for
 

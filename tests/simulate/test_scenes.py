@@ -14,10 +14,16 @@ from tumortrack.sense.camera import deproject
 from tumortrack.sense.cloud import CloudConfig
 from tumortrack.sense.clutter import ClutterConfig
 from tumortrack.sense.noise import D405_NOISE
-from tumortrack.simulate.dataset import SceneStream
 from tumortrack.simulate.deform import DragConfig, RestConfig
 from tumortrack.simulate.occupancy import OccupancyConfig, OccupancyPool
-from tumortrack.simulate.scene import STREAMS, PoseConfig, SceneConfig, SceneRecipe, Simulator
+from tumortrack.simulate.scene import (
+    STREAMS,
+    PoseConfig,
+    SceneConfig,
+    SceneRecipe,
+    SceneStream,
+    Simulator,
+)
 
 ANATOMY = anatomy()
 UP = (0.0, -1.0, 0.0)

@@ -35,8 +35,8 @@ from tumortrack.training.model import PretrainedWeights, load_start
 from tumortrack.training.presets import clinic, pretraining, quick
 from tumortrack.training.pretrain import KidneyStream, kidney_stream, pretrain
 from tumortrack.training.run import Pretraining, TrainingProgress, TrainingRun, provenance
-from tumortrack.training.task import TrainingTask
-from tumortrack.training.train import task_of, train
+from tumortrack.training.task import TrainingTask, task_of
+from tumortrack.training.train import train
 
 CPU = torch.device("cpu")
 TINY_BODY = msgspec.structs.replace(SMALL, modes=12, responses=24, patches=80, states=8)

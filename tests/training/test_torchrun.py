@@ -16,9 +16,8 @@ from stories import environment
 from torchrun_peer import STEPS, UP, anatomy, small_run
 from tumortrack.core.errors import InputError
 from tumortrack.registration.network import RegistrationNetwork
-from tumortrack.simulate.dataset import SceneStream
 from tumortrack.simulate.occupancy import FixedPoints
-from tumortrack.simulate.scene import SceneConfig
+from tumortrack.simulate.scene import SceneConfig, SceneStream
 from tumortrack.training.distributed import ProcessGroup, ProcessLost, process_group
 from tumortrack.training.presets import clinic_network
 from tumortrack.training.state import TrainingState

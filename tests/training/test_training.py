@@ -27,9 +27,8 @@ from tumortrack.models.normalisation import CloudBox
 from tumortrack.training.model import load_model
 from tumortrack.training.presets import clinic, paper, quick
 from tumortrack.training.run import TrainingProgress, learning_rate, settle_end
-from tumortrack.training.session import divide_cores, work_folder
 from tumortrack.training.state import Diverged, TrainingState
-from tumortrack.training.train import TrainingRun, train
+from tumortrack.training.train import TrainingRun, divide_cores, train, work_folder
 from warp_objects import train_slim
 
 
@@ -154,22 +153,22 @@ import resource, sys
 from pathlib import Path
 from tumortrack.core.errors import InputError, StorageError
 from tumortrack.training.run import TrainingProgress
-from tumortrack.training.session import history
+from tumortrack.training.train import history
 
 folder, mode = Path(sys.argv[1]), sys.argv[2]
 import torch.utils.tensorboard  # its own caches are not the point
 resource.setrlimit(resource.RLIMIT_FSIZE, (300, 300))
 import signal
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-numbers = dict(loss=1, validation_miou=0.5, samples_per_s=100, learning_rate=1e-3, waiting=0)
+numbers = 1.0, 0.5, 100.0, 1e-3, 0.0
 progress = TrainingProgress()
 try:
     with history(folder, progress) as write:
         if mode == "other":
-            write(**numbers)
+            write(*numbers)
             raise InputError("the first error")
         for progress.step in range(200):
-            write(**numbers)
+            write(*numbers)
 except StorageError as error:
     print("storage:", error)
 except InputError as error:
@@ -236,7 +235,7 @@ def test_two_trainings_in_one_folder_are_refused_and_a_dead_ones_lock_is_not(tmp
     assert (work / "something").exists()
     hold = (
         "import sys, os, signal; from pathlib import Path;"
-        "from tumortrack.training.session import work_folder\n"
+        "from tumortrack.training.train import work_folder\n"
         "with work_folder(Path(sys.argv[1])): os.kill(os.getpid(), signal.SIGKILL)"
     )
     assert subprocess.run([sys.executable, "-c", hold, str(model)]).returncode == -signal.SIGKILL
@@ -301,7 +300,7 @@ def test_the_network_gets_the_cores_that_workers_and_openmp_leave(
 ):
     before = torch.get_num_threads()
     monkeypatch.setenv("OMP_NUM_THREADS", granted)
-    monkeypatch.setattr("tumortrack.training.session.available_cores", lambda: 6)
+    monkeypatch.setattr("tumortrack.training.train.available_cores", lambda: 6)
     assert divide_cores(torch.device("cpu"), workers) == workers
     try:
         assert torch.get_num_threads() == threads

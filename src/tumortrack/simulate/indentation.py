@@ -93,7 +93,7 @@ class Bed:
             states = np.stack(
                 [self.under("poke", indent, *how, depth) for depth in depths.tolist()]
             )
-            unknowns = PchipInterpolator(depths, np.stack(states) - states[0])
+            unknowns = PchipInterpolator(depths, states - states[0])
             axis = _clearest_axis(places - places[patch], normals[patch])
             made.append(Indentation(places[patch], axis, unknowns))
         return made

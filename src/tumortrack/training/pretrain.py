@@ -24,15 +24,13 @@ from tumortrack.registration.canonical_frame import (
     upright_of,
 )
 from tumortrack.registration.rest_shape import long_axis_of
-from tumortrack.simulate.dataset import Batch, SceneStream
 from tumortrack.simulate.occupancy import FixedPoints
-from tumortrack.simulate.scene import body_for
+from tumortrack.simulate.scene import Batch, SceneStream, body_for
 from tumortrack.training.model import save_start
 from tumortrack.training.run import Pretraining
 from tumortrack.training.scenes import Scenes, batches
-from tumortrack.training.session import divide_cores, work_folder
 from tumortrack.training.state import TrainingState
-from tumortrack.training.train import Report, run_steps
+from tumortrack.training.train import Report, divide_cores, run_steps, work_folder
 
 
 @dataclass(frozen=True, eq=False)

@@ -23,7 +23,7 @@ from tumortrack.simulate.batched.stream import (
     Tensors,
     why_not,
 )
-from tumortrack.simulate.dataset import Batch, SceneStream
+from tumortrack.simulate.scene import Batch, SceneStream
 
 _LOWER_PRIORITY = 10  # of the workers
 _TRIANGLES_AT_ONCE = 8_000_000  # of the scenes that a GPU makes together: some 2 GB

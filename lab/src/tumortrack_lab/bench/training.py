@@ -20,7 +20,6 @@ from tumortrack.core.process import keep_freed_memory
 from tumortrack.models.hardware import has_fast_bfloat16
 from tumortrack.occupancy.model import OccupancyModel
 from tumortrack.occupancy.network import OccupancyNetwork
-from tumortrack.simulate.dataset import SceneStream
 from tumortrack.simulate.deform import DragConfig, ElasticConfig
 from tumortrack.simulate.elastic.body import ElasticBody
 from tumortrack.simulate.occupancy import (
@@ -29,7 +28,7 @@ from tumortrack.simulate.occupancy import (
     OccupancyPool,
     PointSource,
 )
-from tumortrack.simulate.scene import SceneConfig, SceneRecipe, Simulator
+from tumortrack.simulate.scene import SceneConfig, SceneRecipe, SceneStream, Simulator
 from tumortrack.training.model import load_model
 from tumortrack.training.run import TrainingRun
 from tumortrack.training.state import TrainingState

@@ -22,13 +22,19 @@ from tumortrack.sense.camera import d405
 from tumortrack.sense.cloud import FEWEST_POINTS, draw_some
 from tumortrack.sense.noise import CALIBRATED, CLEAN
 from tumortrack.simulate.batched.render import depth_images
-from tumortrack.simulate.dataset import SceneStream, refill
 from tumortrack.simulate.deform import Chain, DragConfig, RestConfig, StretchConfig, links_of
 from tumortrack.simulate.deform.base import Deformation
 from tumortrack.simulate.deform.drag import Drags
 from tumortrack.simulate.deform.stretch import Stretch
 from tumortrack.simulate.occupancy import OccupancyPool
-from tumortrack.simulate.scene import ATTEMPTS, SceneRecipe, crop_of, shows_nothing
+from tumortrack.simulate.scene import (
+    ATTEMPTS,
+    SceneRecipe,
+    SceneStream,
+    crop_of,
+    refill,
+    shows_nothing,
+)
 
 # clouds_mm (b, n, 3), points_mm (b, q, 3), labels (b, q), camera_from_ct (b, 4, 4)
 Tensors = tuple[Tensor, Tensor, Tensor, Tensor]
