@@ -28,17 +28,11 @@ _SIDES = 24  # from which it may come
 
 @dataclass(frozen=True, eq=False)
 class Indentation:
-    """One place of the surface under an instrument; CT frame.
+    """One place of the surface under an instrument; CT frame."""
 
-    Attributes:
-        place_ct: the place at rest.
-        axis: unit vector from the instrument's tip along its shaft.
-        unknowns: of the body's modes and rigid motions, for a depth in mm.
-    """
-
-    place_ct: Float64[np.ndarray, " 3"]
-    axis: Float64[np.ndarray, " 3"]
-    unknowns: Callable[[float], Float64[np.ndarray, " m"]]
+    place_ct: Float64[np.ndarray, " 3"]  # at rest
+    axis: Float64[np.ndarray, " 3"]  # unit vector from the instrument's tip along its shaft
+    unknowns: Callable[[float], Float64[np.ndarray, " m"]]  # for a depth in mm
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,10 +84,8 @@ class Bed:
         made, depths = [], np.linspace(0, deepest_mm, _DEPTHS)
         for patch in facing[chosen].tolist():
             how = patch, normals[patch], radius_mm + _FOOT_MM
-            states = np.stack(
-                [self.under("poke", indent, *how, depth) for depth in depths.tolist()]
-            )
-            unknowns = PchipInterpolator(depths, states - states[0])
+            states = [self.under("poke", indent, *how, depth) for depth in depths.tolist()]
+            unknowns = PchipInterpolator(depths, np.stack(states) - states[0])
             axis = _clearest_axis(places - places[patch], normals[patch])
             made.append(Indentation(places[patch], axis, unknowns))
         return made

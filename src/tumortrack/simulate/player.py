@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Float32, Float64
+from jaxtyping import Float32, Float64
 from scipy.interpolate import PchipInterpolator
 from scipy.spatial.transform import Rotation
 
@@ -20,7 +20,7 @@ from tumortrack.core.types import Anatomy, DepthFrame, Intrinsics, Mesh
 from tumortrack.sense.camera import d405
 from tumortrack.sense.noise import D405_NOISE, NoiseConfig, add_noise
 from tumortrack.sense.render import render_depth
-from tumortrack.simulate.elastic.body import BodyConfig, body_of, reduced_organ
+from tumortrack.simulate.elastic.body import BodyConfig, Points, body_of, reduced_organ
 from tumortrack.simulate.elastic.loads import expand
 from tumortrack.simulate.elastic.modes import LEVER_MM
 from tumortrack.simulate.indentation import Bed, Indentation
@@ -28,6 +28,8 @@ from tumortrack.simulate.scene import PoseConfig, sample_pose
 
 SHAFT_MM = 4.0  # an instrument's radius
 _SHAFT_LENGTH_MM = 200.0
+_DISTANCE_MM = 60.0, 400.0
+_BREATH_S, _PUSH_S = 4.0, 6.0  # from one to the next
 _AWAY_MM = 160.0  # along its shaft: an instrument out of the picture
 _STEPS = 3  # along the body's field: within 0.02 mm of the exact position, for states as here
 _SWAY_S = (17.0, 23.0, 29.0, 19.0, 13.0, 31.0)  # periods of the camera's rotations and shifts
@@ -42,17 +44,6 @@ _RING_MM = 4.0
 _SECTIONS = 24
 _FARTHEST_MM = 500.0  # that the sensor sees of a table
 _NOTHING = Mesh(np.empty((0, 3)), np.empty((0, 3), np.int32))
-_RANGES = {
-    "distance_mm": (60, 400),
-    "breath_mm": (0, 30),
-    "breath_s": (1, 20),
-    "swell": (0, 0.025),
-    "push_mm": (0, 14),
-    "push_s": (2, 60),
-    "places": (1, 20),
-    "sway_mm": (0, 30),
-    "sway_degrees": (0, 20),
-}
 
 
 class ScenePlayerConfig(Config, frozen=True, kw_only=True):
@@ -60,9 +51,9 @@ class ScenePlayerConfig(Config, frozen=True, kw_only=True):
 
     Attributes:
         distance_mm: depth of the organ's nearest point, at rest and before the camera sways.
-        breath_mm: the organ's motion down the body and back, every ``breath_s``; ``swell`` is the
-            strain of its volume that goes with it.
-        push_mm: how deep an instrument presses, one push every ``push_s`` at one of ``places``.
+        breath_mm, swell: the organ's motion down the body and back, and the strain of its volume
+            that goes with it.
+        push_mm: how deep an instrument presses at each of ``places`` in turn.
         sway_mm, sway_degrees: the camera's slow motion along and about each axis.
     """
 
@@ -70,10 +61,8 @@ class ScenePlayerConfig(Config, frozen=True, kw_only=True):
     height: int = 240
     distance_mm: float = 118.0
     breath_mm: float = 6.0
-    breath_s: float = 4.0
     swell: float = 0.01
     push_mm: float = 8.0
-    push_s: float = 6.0
     places: int = 3
     sway_mm: float = 3.0
     sway_degrees: float = 3.0
@@ -83,10 +72,11 @@ class ScenePlayerConfig(Config, frozen=True, kw_only=True):
     body: BodyConfig = BodyConfig()
 
     def __post_init__(self) -> None:
-        for name, (low, high) in _RANGES.items():
-            value = getattr(self, name)
-            if not low <= value <= high:
-                raise InputError(f"{name} is {value:g}; it must lie in {low:g}..{high:g}.")
+        low, high = _DISTANCE_MM
+        if not low <= self.distance_mm <= high:
+            raise InputError(
+                f"distance_mm is {self.distance_mm:g}; it must lie in {low:g}..{high:g}."
+            )
         d405(self.width, self.height)
 
 
@@ -97,10 +87,9 @@ class Instant:
     t_s: float
     camera_from_room: Float64[np.ndarray, "4 4"]
     room_from_organ: Float64[np.ndarray, "4 4"]  # the organ's rigid motion, after its deformation
-    coefficients: Float64[np.ndarray, " m"]  # of the body's modes
-    velocity: Float32[np.ndarray, "i j k 3"]  # the field of these, which points of the CT follow
-    depth_mm: float  # of the push
     room_from_rod: Float64[np.ndarray, "4 4"]  # of the instrument
+    velocity: Float32[np.ndarray, "i j k 3"]  # the field that points of the CT follow
+    depth_mm: float  # of the push
 
 
 class ScenePlayer:
@@ -141,19 +130,20 @@ class ScenePlayer:
         self._rod = rod(SHAFT_MM, _SHAFT_LENGTH_MM) if self._pushes else _NOTHING
         shown = (anatomy_ct.organ, self._drape, self._rod)
         first = np.cumsum([0, *(len(mesh.vertices_mm) for mesh in shown)])
-        self._faces = np.concatenate(
-            [mesh.faces + n for mesh, n in zip(shown, first, strict=False)]
-        )
+        faces = [mesh.faces + n for mesh, n in zip(shown, first, strict=False)]
+        self._faces = np.concatenate(faces)
 
     def state_at(self, t_s: float) -> Instant:
         """Everything at a time from 0 s on. A pure function: no clock, no memory."""
         if not t_s >= 0:
             raise InputError(f"time {t_s} s is before the scene's beginning, 0 s.")
         config = self.config
-        breath = np.sin(np.pi * t_s / config.breath_s) ** 4  # Lujan 1999, doi 10.1118/1.598577
-        unknowns = breath * self._swollen
-        depth_mm, away_mm, push = self._push_at(t_s)
-        if push is not None:
+        breath = np.sin(np.pi * t_s / _BREATH_S) ** 4  # Lujan 1999, doi 10.1118/1.598577
+        unknowns, depth_mm, push = breath * self._swollen, 0.0, None
+        number, phase = divmod(t_s / _PUSH_S, 1)
+        if self._pushes:
+            push = self._pushes[int(number) % len(self._pushes)]
+            depth_mm = config.push_mm * float(_DEPTH(phase))
             unknowns = unknowns + push.unknowns(depth_mm)
         modes = self._body.modes.shape[-1]
         coefficients, shift, turn = np.split(unknowns, [modes, modes + 3])
@@ -164,14 +154,15 @@ class ScenePlayer:
         velocity, room_from_rod = self._body.velocity(coefficients), np.eye(4)
         if push is not None:
             place = self._deformed(velocity, push.place_ct[None])
-            tip = transform_points(room_from_organ, place)[0] + away_mm * push.axis
+            tip = (
+                transform_points(room_from_organ, place)[0]
+                + _AWAY_MM * float(_AWAY(phase)) * push.axis
+            )
             room_from_rod = rigid(rotation_onto(np.array([0.0, 0.0, 1.0]), push.axis), tip)
-        poses = self._camera_at(t_s), room_from_organ
-        return Instant(t_s, *poses, coefficients, velocity, depth_mm, room_from_rod)
+        poses = self._camera_at(t_s), room_from_organ, room_from_rod
+        return Instant(t_s, *poses, velocity, depth_mm)
 
-    def carry(
-        self, instant: Instant, points_ct: Float[np.ndarray, "n 3"]
-    ) -> Float64[np.ndarray, "n 3"]:
+    def carry(self, instant: Instant, points_ct: Points) -> Float64[np.ndarray, "n 3"]:
         """Where points of the CT are before the camera."""
         camera_from_organ = instant.camera_from_room @ instant.room_from_organ
         return transform_points(camera_from_organ, self._deformed(instant.velocity, points_ct))
@@ -197,16 +188,8 @@ class ScenePlayer:
         rng = np.random.default_rng([self._seed, round(instant.t_s * 1e6)])
         return add_noise(clean, self.config.noise, rng)
 
-    def _deformed(self, velocity: np.ndarray, points_ct: np.ndarray) -> Float64[np.ndarray, "n 3"]:
+    def _deformed(self, velocity: np.ndarray, points_ct: Points) -> Float64[np.ndarray, "n 3"]:
         return self._body.follow(velocity, points_ct, _STEPS).astype(np.float64)
-
-    def _push_at(self, t_s: float) -> tuple[float, float, Indentation | None]:
-        """Depth, distance from the organ (mm), and which push it is."""
-        if not self._pushes:
-            return 0.0, 0.0, None
-        number, phase = divmod(t_s / self.config.push_s, 1)
-        push = self._pushes[int(number) % len(self._pushes)]
-        return self.config.push_mm * float(_DEPTH(phase)), _AWAY_MM * float(_AWAY(phase)), push
 
     def _camera_at(self, t_s: float) -> Float64[np.ndarray, "4 4"]:
         """A slow sway about the organ's centre."""

@@ -1,4 +1,4 @@
-"""One scene from a recipe: pose, deformation, depth image, cloud, labelled points.
+"""One scene from a recipe (pose, deformation, depth image, cloud, labelled points), and streams.
 
 A recipe is (seed, stream, index); with the case and the configuration it replays bit for bit on
 the same machine and versions. Elsewhere last digits may differ: compiled code may reorder sums,
@@ -111,7 +111,7 @@ class SceneDraw:
     """What is drawn before the image is rendered."""
 
     free: bool  # seen from any distance and not cropped
-    camera_from_ct: Float64[np.ndarray, "4 4"]
+    camera_from_ct: Float64[np.ndarray, "4 4"]  # the organ's pose, without its deformation
     deformation: Deformation
 
 
@@ -172,25 +172,23 @@ class Simulator:
         return SceneDraw(free, camera_from_ct, model.sample(self._view(camera_from_ct), rng))
 
     def _render(self, recipe: SceneRecipe) -> tuple[RenderedScene, np.random.Generator]:
+        config, organ = self.config, self.anatomy_ct.organ
         for attempt in range(ATTEMPTS):
             rng = recipe.generator(attempt)
+            drawn = self.draw(rng)
+            deformed = drawn.deformation.apply(organ.vertices_mm)
+            vertices = transform_points(drawn.camera_from_ct, deformed)
+            frame = render_depth(vertices, organ.faces, self._intrinsics)
+            frame = add_clutter(frame, config.clutter, rng)
+            frame = occlude(frame, config.occlusion, rng)  # hides background too
+            frame = miscalibrate(frame, config.calibration, rng)
+            frame = add_noise(frame, config.noise, rng)
             try:
-                return self._attempt(rng), rng
+                cloud = cloud_from_depth(frame, crop_of(config, drawn.free, rng), rng)
             except NoEstimate:  # the crop left too few points: another draw of the same recipe
                 continue
+            return RenderedScene(**vars(drawn), frame=frame, cloud=cloud), rng
         raise shows_nothing(recipe)
-
-    def _attempt(self, rng: np.random.Generator) -> RenderedScene:
-        config, organ, drawn = self.config, self.anatomy_ct.organ, self.draw(rng)
-        deformed = drawn.deformation.apply(organ.vertices_mm)
-        vertices = transform_points(drawn.camera_from_ct, deformed)
-        frame = render_depth(vertices, organ.faces, self._intrinsics)
-        frame = add_clutter(frame, config.clutter, rng)
-        frame = occlude(frame, config.occlusion, rng)  # hides background too
-        frame = miscalibrate(frame, config.calibration, rng)
-        frame = add_noise(frame, config.noise, rng)
-        cloud = cloud_from_depth(frame, crop_of(config, drawn.free, rng), rng)
-        return RenderedScene(**vars(drawn), frame=frame, cloud=cloud)
 
     def _view(self, camera_from_ct: Float64[np.ndarray, "4 4"]) -> View:
         eye_ct, camera = np.linalg.inv(camera_from_ct)[:3, 3], self._intrinsics
@@ -313,8 +311,7 @@ def crop_of(config: SceneConfig, free: bool, rng: np.random.Generator) -> CloudC
     near_mm, far_mm = (1.0, 1e4) if free else (config.cloud.near_mm, config.cloud.far_mm)
     n_points = config.cloud.n_points
     if config.cloud_points is not None:
-        fewest, most = config.cloud_points
-        n_points = round(math.exp(rng.uniform(math.log(fewest), math.log(most))))
+        n_points = round(math.exp(rng.uniform(*map(math.log, config.cloud_points))))
     return CloudConfig(near_mm=near_mm, far_mm=far_mm, n_points=n_points)
 
 
@@ -329,8 +326,8 @@ def body_for(
         InputError: elastic deformations that ask for different bodies.
     """
     links = (link for model in config.deform for link in links_of(model))
-    asked = (getattr(link, "body", None) for link in links)
-    wanted = {body for body in asked if isinstance(body, BodyConfig)}
+    bodies = (getattr(link, "body", None) for link in links)
+    wanted = {body for body in bodies if isinstance(body, BodyConfig)}
     if len(wanted) > 1:
         raise InputError(
             "the scene configuration has elastic deformations with different bodies; give them "

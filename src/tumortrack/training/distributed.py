@@ -30,7 +30,8 @@ class ProcessLost(TumortrackError):
 
 @dataclass(frozen=True)
 class ProcessGroup:
-    """Which of how many processes this is, and the device it computes on."""
+    """Which of how many processes this is, and the device it computes on; whatever waits for the
+    others raises ``ProcessLost`` where one has ended."""
 
     device: torch.device
     rank: int = 0
@@ -57,33 +58,24 @@ class ProcessGroup:
 
     def local_batches(self, steps: range) -> range:
         """This process's parts of these steps' batches, as numbers in a stream of such parts."""
-        return range(
-            steps.start * self.size + self.rank, steps.stop * self.size + self.rank, self.size
-        )
+        start, stop = (step * self.size + self.rank for step in (steps.start, steps.stop))
+        return range(start, stop, self.size)
 
     def mean(self, parameters: Iterable[nn.Parameter], value: Tensor) -> Tensor:
-        """Replace gradients by their mean over all processes; returns the mean of ``value``.
-
-        Raises:
-            ProcessLost: another process has ended.
-        """
+        """Replace gradients by their mean over all processes; returns the mean of ``value``."""
         if self.size == 1:
             return value
         gradients = [p.grad for p in parameters if p.grad is not None]
         flat = torch.cat([*(g.flatten() for g in gradients), value.detach().float().flatten()])
         self._sum(flat)
         flat /= self.size
-        parts = flat.split([*(g.numel() for g in gradients), 1])
-        for gradient, part in zip(gradients, parts[:-1], strict=True):
+        *parts, mean = flat.split([*(g.numel() for g in gradients), 1])
+        for gradient, part in zip(gradients, parts, strict=True):
             gradient.copy_(part.view_as(gradient))
-        return parts[-1][0]
+        return mean[0]
 
     def all_reduce(self, elapsed_s: float, stop: bool) -> tuple[float, bool]:
-        """The main process's time, and whether any process is to stop.
-
-        Raises:
-            ProcessLost: another process has ended.
-        """
+        """The main process's time, and whether any process is to stop."""
         if self.size == 1:
             return elapsed_s, stop
         mine = [elapsed_s if self.is_main else 0.0, float(stop)]
@@ -97,11 +89,7 @@ class ProcessGroup:
             distributed.all_reduce(values)
 
     def close(self) -> None:
-        """Leave the group.
-
-        Raises:
-            ProcessLost: another process has ended.
-        """
+        """Leave the group."""
         with self._lost_process():
             distributed.destroy_process_group()
 

@@ -15,12 +15,7 @@ from torch import Tensor, nn
 from tumortrack.core import store
 from tumortrack.core.config import from_builtins, to_builtins
 from tumortrack.core.errors import ArtifactError, InputError
-from tumortrack.models.config import (
-    MlpDecoderConfig,
-    NetworkConfig,
-    RegistrationHeadConfig,
-    TrainConfig,
-)
+from tumortrack.models.config import NetworkConfig, RegistrationHeadConfig, TrainConfig
 from tumortrack.models.folder import KIND, WEIGHTS, read_model_manifest
 from tumortrack.models.hardware import choose_device
 from tumortrack.models.in_distribution import InDistributionRange
@@ -31,15 +26,11 @@ from tumortrack.registration.model import RegistrationModel
 
 PRETRAINED = "pretrained"  # kind of a folder
 
-_KINDS: dict[type, type[Model]] = {
-    MlpDecoderConfig: OccupancyModel,
-    RegistrationHeadConfig: RegistrationModel,
-}
-
 
 def model_class(config: NetworkConfig) -> type[Model]:
     """The kind of model that a network's configuration makes."""
-    return _KINDS[type(config.decoder)]
+    registers = isinstance(config.decoder, RegistrationHeadConfig)
+    return RegistrationModel if registers else OccupancyModel
 
 
 def save_model(model: Model, folder: Path) -> None:

@@ -54,9 +54,10 @@ def quick(anatomy: Anatomy, rotations: Rotations = "limited") -> TrainConfig:
     them seen from any distance between 8 and 25 cm, half of them with some background."""
     local = tuple(DragConfig(steps=CONFIGURATIONS[n]) for n in (3, 6))
     squeezed = tuple(ChainConfig(links=(drag, StretchConfig())) for drag in local)
-    lower, upper = anatomy.organ.box_mm
     return TrainConfig(
-        network=quick_network(len(anatomy.parts) + 1, scale_mm=float(np.max(upper - lower)) / 2),
+        network=quick_network(
+            len(anatomy.parts) + 1, float(np.ptp(anatomy.organ.box_mm, axis=0).max()) / 2
+        ),
         scene=SceneConfig(
             pose=PoseConfig(rotations=rotations),
             deform=(*local, *squeezed),
@@ -75,9 +76,13 @@ def quick(anatomy: Anatomy, rotations: Rotations = "limited") -> TrainConfig:
 def clinic(anatomy: Anatomy, rotations: Rotations = "limited") -> TrainConfig:
     """The default: registration of the organ's elastic body, learnt in minutes from scenes with
     sensor errors, occlusion and background."""
-    lower, upper = anatomy.organ.box_mm
     elastic = ElasticConfig()
-    return _clinic(elastic, elastic.body.modes, float(np.max(upper - lower)) / 2, rotations)
+    return _clinic(
+        elastic,
+        elastic.body.modes,
+        float(np.ptp(anatomy.organ.box_mm, axis=0).max()) / 2,
+        rotations,
+    )
 
 
 def pretraining(rotations: Rotations = "limited") -> TrainConfig:

@@ -8,21 +8,15 @@ import signal
 from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
-from itertools import islice
+from itertools import chain, islice
 from typing import Any, Literal
 
 import torch
 from torch.utils.data import DataLoader, Dataset
 
 from tumortrack.core.errors import InputError
-from tumortrack.simulate.batched.stream import (
-    BatchPlan,
-    DeviceStream,
-    RenderedBatch,
-    SampleChoice,
-    Tensors,
-    why_not,
-)
+from tumortrack.simulate.batched import stream as batched
+from tumortrack.simulate.batched.stream import DeviceStream, Tensors, why_not
 from tumortrack.simulate.scene import Batch, SceneStream
 
 _LOWER_PRIORITY = 10  # of the workers
@@ -96,34 +90,21 @@ def batches_on(
     """The batches of these steps, made on a device, ``at_once`` scenes or somewhat less together,
     since starting a device's work costs as much for one scene as for many. Workers plan ahead, some
     kB a scene, and a thread draws the next clouds' pixels while the network learns."""
-    size = stream.batch_size
-    on_device = DeviceStream(stream, device)
-
-    def groups() -> Iterator[tuple[int, ...]]:
-        indices = _numbers(steps, period)
-        while group := tuple(islice(indices, max(1, at_once // size))):
-            yield group
-
-    plans = _loader(on_device.plan, groups(), workers, ahead=1)
+    size, made = stream.batch_size, DeviceStream(stream, device)
+    indices = _numbers(steps, period)
+    groups = iter(lambda: tuple(islice(indices, max(1, at_once // size))), ())
     with ThreadPoolExecutor(1) as thread:
-        for parts in _finished(on_device, plans, thread):
-            clouds, points, labels, poses = (part.split(size) for part in parts)
-            yield from zip(clouds, points, labels, poses, strict=True)
-
-
-def _finished(
-    stream: DeviceStream, plans: Iterable[BatchPlan], thread: ThreadPoolExecutor
-) -> Iterator[Tensors]:
-    """The batches of these plans; the next pictures are taken before a batch is returned."""
-    before: tuple[RenderedBatch, Future[SampleChoice]] | None = None
-    for plan in plans:
-        rendered = stream.render(plan)
-        coming = rendered, thread.submit(stream.sample, rendered)
-        if before is not None:
-            yield stream.assemble(before[0], before[1].result())
-        before = coming
-    if before is not None:
-        yield stream.assemble(before[0], before[1].result())
+        before: tuple[batched.RenderedBatch, Future[batched.SampleChoice]] | None = None
+        for plan in chain(_loader(made.plan, groups, workers, ahead=1), [None]):
+            coming = None
+            if plan is not None:  # the next pictures are taken before a batch is returned
+                rendered = made.render(plan)
+                coming = rendered, thread.submit(made.sample, rendered)
+            if before is not None:
+                parts = made.assemble(before[0], before[1].result())
+                clouds, points, labels, poses = (part.split(size) for part in parts)
+                yield from zip(clouds, points, labels, poses, strict=True)
+            before = coming
 
 
 def _numbers(steps: range, period: int) -> Iterator[int]:

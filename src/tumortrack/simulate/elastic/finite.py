@@ -39,19 +39,19 @@ class ElementLattice:
 
     origin_mm: Float64[np.ndarray, " 3"]
     spacing_mm: float
-    shape: tuple[int, int, int]  # nodes along each axis
+    shape: tuple[int, ...]  # nodes along each axis
 
     @classmethod
     def around(cls, box_mm: Float64[np.ndarray, "2 3"], spacing_mm: float) -> ElementLattice:
         """The lattice around a box with a margin of two cells on every side."""
         cells = np.ceil((box_mm[1] - box_mm[0]) / spacing_mm + 4.0).astype(int)
-        nodes = (int(cells[0]) + 1, int(cells[1]) + 1, int(cells[2]) + 1)
-        return cls(box_mm.mean(0) - cells * spacing_mm / 2, spacing_mm, nodes)
+        origin_mm = box_mm.mean(0) - cells * spacing_mm / 2
+        return cls(origin_mm, spacing_mm, tuple((cells + 1).tolist()))
 
     @property
-    def cells(self) -> tuple[int, int, int]:
-        """Cells along each axis."""
-        return self.shape[0] - 1, self.shape[1] - 1, self.shape[2] - 1
+    def cells(self) -> tuple[int, ...]:
+        """Along each axis."""
+        return tuple(nodes - 1 for nodes in self.shape)
 
     def nodes_mm(self) -> Float64[np.ndarray, "n 3"]:
         """Positions of all nodes, in the order of their numbers."""
@@ -75,13 +75,10 @@ class ElementLattice:
         return np.ravel_multi_index(tuple(np.moveaxis(lowest[:, None] + CORNERS, 2, 0)), self.shape)
 
 
-def cube_stiffness(
-    poisson: float,
-) -> tuple[Float64[np.ndarray, "24 24"], Float64[np.ndarray, " 24"]]:
-    """Of a unit cube with Young's modulus 1: stiffness, and mean dilatation per displacement.
-
-    Unknowns: x, y, z of the corners in the order of ``CORNERS``. A cube of edge h has h times
-    this stiffness, and 1 / h times this dilatation.
+def cube_stiffness(poisson: float) -> tuple[np.ndarray, np.ndarray]:
+    """Of a unit cube with Young's modulus 1: stiffness (24, 24), and mean dilatation per
+    displacement (24,). Unknowns: x, y, z of the corners in the order of ``CORNERS``. A cube of edge
+    h has h times this stiffness, and 1 / h times this dilatation.
     """
     shear = 1 / (2 * (1 + poisson))
     bulk = 1 / (3 * (1 - 2 * poisson))
@@ -202,11 +199,8 @@ class BlockCholesky:
     A lattice cut across its longest axis has such a stiffness. Every block is dense after
     elimination, so BLAS does all the work on whole blocks and all right-hand sides at once: for an
     organ of some 10,000 unknowns many times faster than sparse factorisations with a general
-    ordering.
-
-    Args:
-        matrix: (n, n); entries between blocks that are not neighbours are taken to be zero.
-        bounds: 0, ..., n: block s holds the unknowns ``bounds[s] : bounds[s + 1]``.
+    ordering. Block s holds the unknowns ``bounds[s] : bounds[s + 1]``; entries between blocks that
+    are not neighbours are taken to be zero.
     """
 
     def __init__(self, matrix: csr_matrix, bounds: list[int]) -> None:
@@ -218,9 +212,8 @@ class BlockCholesky:
             if s:
                 own -= self._coupling[-1].T @ self._coupling[-1]
             self._diagonal.append(cholesky(own, lower=True, overwrite_a=True, check_finite=False))
-            if s + 1 < len(self._blocks):
-                beside = matrix[block, self._blocks[s + 1]].toarray()
-                self._coupling.append(self._solve(s, beside))
+            for beside in self._blocks[s + 1 : s + 2]:
+                self._coupling.append(self._solve(s, matrix[block, beside].toarray()))
 
     def solve(self, right: Float64[np.ndarray, "n r"]) -> Float64[np.ndarray, "n r"]:
         """The solutions for all right-hand sides at once."""

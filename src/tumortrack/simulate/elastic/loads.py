@@ -249,8 +249,7 @@ def random_state(
     """Coefficients of the modes after one or two random loads; None for states that find no
     equilibrium or move a place by more than 24 mm. Motions of 16 to 24 mm are scaled to 16.
 
-    Args:
-        anywhere: fraction of states with the bed on any side, instead of opposite to ``up``.
+    ``anywhere``: fraction of states with the bed on any side, instead of opposite to ``up``.
     """
     if rng.uniform() < anywhere:
         up = unit(rng.normal(size=3))
