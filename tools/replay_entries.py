@@ -29,8 +29,7 @@ from tumortrack.sense.files import read_cloud
 from tumortrack.sense.region import Hints, RegionConfig, organ_points
 from tumortrack.simulate.batched.stream import DeviceStream, why_not
 from tumortrack.simulate.scene import SceneStream
-from tumortrack.simulate.scene_folder import write_scene
-from tumortrack.simulate.targets import draw_targets
+from tumortrack.simulate.scene_folder import draw_targets
 from tumortrack.tracking.tracker import Follower, FollowerConfig, Tracker
 from tumortrack.training.model import load_model
 from tumortrack.training.presets import PRESETS, pretraining
@@ -229,7 +228,7 @@ def twin(states: Path, recording: bool) -> Entries:
     state = cache.get("D1", lambda line: None)
     for view in VIEWS:
         scene, targets_mm = make_scene(state, "D1", view, ViewConfig(), 0)
-        write_scene(Path("twin", view), scene)
+        scene.write(Path("twin", view))
         yield f"{view}/targets", targets_mm
     yield from files("twin")
 

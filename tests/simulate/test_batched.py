@@ -235,7 +235,7 @@ def test_what_it_cannot_make_it_refuses_by_name(pool):
         assert name in (why_not(stream(pool, config)) or "")
         with pytest.raises(InputError, match=name):
             DeviceStream(stream(pool, config), CPU)
-    fixed = FixedPoints(np.zeros((4, 3), np.float32), np.zeros(4, np.uint8))
+    fixed = FixedPoints(np.zeros((4, 3), np.float32))
     with pytest.raises(InputError, match="same in every scene"):
         DeviceStream(stream(fixed, CONFIGS["paper"]), CPU)
 

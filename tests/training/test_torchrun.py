@@ -81,7 +81,7 @@ def train_start() -> dict[str, np.ndarray]:
 
 def test_shares_are_the_batch():
     """Whatever their number, the processes see the scenes that one would, each once."""
-    pool = FixedPoints(np.zeros((1, 3), np.float32), np.zeros(1, np.uint8))
+    pool = FixedPoints(np.zeros((1, 3), np.float32))
     config = SceneConfig(width=106, height=60)
 
     def stream(size: int) -> SceneStream:

@@ -186,8 +186,7 @@ class Simulate:
         from tumortrack.core.config import to_builtins
         from tumortrack.imaging.case import load_case
         from tumortrack.simulate.scene import SceneRecipe, Simulator, body_for
-        from tumortrack.simulate.scene_folder import Scene, write_scene
-        from tumortrack.simulate.targets import draw_targets
+        from tumortrack.simulate.scene_folder import Scene, draw_targets
 
         if self.scenes < 1:
             raise InputError(f"--scenes {self.scenes} must be at least 1.")
@@ -217,7 +216,7 @@ class Simulate:
                     }
                     truth = simulator.reference(stage)
                     placed = targets.at(stage.carry(targets.points_ct))
-                    write_scene(folder, Scene(stage.cloud, truth, stage.frame, meta, placed))
+                    Scene(stage.cloud, truth, stage.frame, meta, placed).write(folder)
                 advance()
 
 

@@ -38,13 +38,12 @@ class OccupancyConfig(Config, frozen=True):
 
 @dataclass(frozen=True, eq=False)
 class FixedPoints:
-    """The same points in every scene, to learn where each of them goes."""
+    """The same points in every scene, to learn where each of them goes; they have no labels."""
 
     points_ct: Float32[np.ndarray, "n 3"]
-    labels: Labels
 
     def draw(self, rng: np.random.Generator) -> tuple[Points, Labels]:
-        return self.points_ct, self.labels
+        return self.points_ct, np.zeros(len(self.points_ct), np.uint8)
 
 
 @dataclass(frozen=True, eq=False)

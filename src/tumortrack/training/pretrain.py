@@ -62,8 +62,7 @@ def kidney_stream(run: Pretraining) -> KidneyStream:
             raise InputError("pretraining needs elastic deformations; the configuration has none.")
         organ = anatomy_ct.organ
         upright = upright_of(organ, up_lps, body.center_ct, long_axis_of(organ))
-        points = upright.in_ct(generic).astype(np.float32)
-        fixed = FixedPoints(points, np.zeros(len(points), np.uint8))
+        fixed = FixedPoints(upright.in_ct(generic).astype(np.float32))
         scenes = (anatomy_ct, up_lps, config.scene, fixed, run.seed)
         organs.append((SceneStream(*scenes, "train", config.batch_size, body), upright))
     return KidneyStream(tuple(organs))

@@ -15,8 +15,7 @@ import torch
 from torch.utils.data import DataLoader, Dataset
 
 from tumortrack.core.errors import InputError
-from tumortrack.simulate.batched import stream as batched
-from tumortrack.simulate.batched.stream import DeviceStream, Tensors, why_not
+from tumortrack.simulate.batched.stream import DeviceStream, RenderedBatch, Tensors, why_not
 from tumortrack.simulate.scene import Batch, SceneStream
 
 _LOWER_PRIORITY = 10  # of the workers
@@ -94,7 +93,7 @@ def batches_on(
     indices = _numbers(steps, period)
     groups = iter(lambda: tuple(islice(indices, max(1, at_once // size))), ())
     with ThreadPoolExecutor(1) as thread:
-        before: tuple[batched.RenderedBatch, Future[batched.SampleChoice]] | None = None
+        before: tuple[RenderedBatch, Future[Any]] | None = None
         for plan in chain(_loader(made.plan, groups, workers, ahead=1), [None]):
             coming = None
             if plan is not None:  # the next pictures are taken before a batch is returned

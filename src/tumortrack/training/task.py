@@ -35,7 +35,7 @@ from tumortrack.simulate.occupancy import (
     organ_pool,
 )
 from tumortrack.simulate.scene import SceneRecipe, Simulator, body_for, refill
-from tumortrack.simulate.targets import draw_targets
+from tumortrack.simulate.scene_folder import draw_targets
 from tumortrack.training.run import TrainingRun
 
 _AT_ONCE = 32  # scenes
@@ -246,8 +246,7 @@ def _learnt_points(run: TrainingRun) -> FixedPoints:
     surface = vertices[rng.choice(len(vertices), round(count * _AT_SURFACE), replace=True)]
     inner = draw_targets(run.anatomy_ct, run.seed).points_ct
     inner = inner[rng.choice(len(inner), count - len(surface), replace=True)]
-    points = np.concatenate([surface, inner]).astype(np.float32)
-    return FixedPoints(points, np.zeros(len(points), np.uint8))
+    return FixedPoints(np.concatenate([surface, inner]).astype(np.float32))
 
 
 @dataclass(frozen=True, eq=False)

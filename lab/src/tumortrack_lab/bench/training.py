@@ -11,7 +11,6 @@ from itertools import count, cycle, pairwise
 from pathlib import Path
 from typing import Literal
 
-import numpy as np
 import torch
 from msgspec.structs import replace
 from torch.nn import functional
@@ -149,7 +148,7 @@ def training_state(
     if preset == "clinic":
         body, known = subject.body, subject.model(preset).network.state_dict()
         places = (known["points"] + known["center_ct"]).numpy()
-        points = FixedPoints(places, np.zeros(len(places), np.uint8))
+        points = FixedPoints(places)
     else:
         points = OccupancyPool(anatomy, config.scene.occupancy, SEED)
     stream = SceneStream(anatomy, UP, config.scene, points, SEED, "train", size, body)

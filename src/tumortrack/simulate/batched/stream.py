@@ -8,7 +8,7 @@ is made. Work on every vertex, pixel and point runs batched. The compiled scenes
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
@@ -38,6 +38,7 @@ from tumortrack.simulate.scene import (
 
 # clouds_mm (b, n, 3), points_mm (b, q, 3), labels (b, q), camera_from_ct (b, 4, 4)
 Tensors = tuple[Tensor, Tensor, Tensor, Tensor]
+SampleChoice = tuple[Int32[np.ndarray, "b n"], Int64[np.ndarray, "b w 2"]]
 Points = Float32[Tensor, "3 b n"]
 # A stretch as 20 numbers: centre (3), matrix (9), along (3), across (3), sagitta, reach.
 _NO_STRETCH = np.array([*[0] * 3, *np.eye(3).ravel(), 1, 0, 0, 0, 1, 0, 0, 1], np.float32)
@@ -63,10 +64,10 @@ class BatchPlan:
 
     def replaced(self, rows: Int64[np.ndarray, " r"], others: BatchPlan) -> BatchPlan:
         """The plan with other scenes in these rows."""
-        arrays = [getattr(self, field.name).copy() for field in fields(self)]
-        for array, field in zip(arrays, fields(self), strict=True):
-            array[rows] = getattr(others, field.name)
-        return BatchPlan(*arrays)
+        arrays = {name: array.copy() for name, array in vars(self).items()}
+        for name, array in arrays.items():
+            array[rows] = getattr(others, name)
+        return BatchPlan(**arrays)
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,15 +79,6 @@ class RenderedBatch:
     depth_mm: Float32[Tensor, "b h w"]
     counted: Int32[Tensor, "b hw"]
     available: Int32[np.ndarray, " b"]
-
-
-@dataclass(frozen=True, eq=False)
-class SampleChoice:
-    """The pixels in range that become a scene's cloud, and the points of the pools (first, count;
-    the last of those anywhere) that it considers."""
-
-    ranks: Int32[np.ndarray, "b n"]
-    windows: Int64[np.ndarray, "b w 2"]
 
 
 class DeviceStream:
@@ -115,9 +107,9 @@ class DeviceStream:
 
     @cached_property
     def _organ(self) -> tuple[Float32[Tensor, "3 v"], Tensor]:
-        organ = self._stream.anatomy_ct.organ
-        vertices = torch.tensor(organ.vertices_mm.T, dtype=torch.float32, device=self._device)
-        return vertices, torch.tensor(organ.faces, dtype=torch.int64, device=self._device)
+        organ, device = self._stream.anatomy_ct.organ, self._device
+        vertices = torch.tensor(organ.vertices_mm.T, dtype=torch.float32, device=device)
+        return vertices, torch.tensor(organ.faces, dtype=torch.int64, device=device)
 
     @cached_property
     def _points(self) -> list[list[Tensor]]:
@@ -164,8 +156,9 @@ class DeviceStream:
             depth_mm[rows], counted[rows] = self._render(again)
 
     def sample(self, rendered: RenderedBatch) -> SampleChoice:
-        """What is drawn after the images. Needs no device, so that a thread can do it alongside
-        the device's work."""
+        """What is drawn after the images: each scene's pixels in range that become its cloud, and
+        the points of the pools that it considers, see ``OccupancyPool.windows``. Needs no device,
+        so that a thread can do it alongside the device's work."""
         plan, n = rendered.plan, self._stream.config.cloud.n_points
         rng = np.random.default_rng()
         ranks, windows = [], []
@@ -174,19 +167,19 @@ class DeviceStream:
             rng.bit_generator.state = state
             ranks.append(refill(draw_some(count, wanted, rng), n))
             windows.append(self._pool.windows(rng))
-        return SampleChoice(np.stack(ranks).astype(np.int32), np.array(windows))
+        return np.stack(ranks).astype(np.int32), np.array(windows)
 
     @torch.no_grad()
     def assemble(self, rendered: RenderedBatch, chosen: SampleChoice) -> Tensors:
         """The clouds of the chosen pixels, and labelled points at their places, camera frame."""
-        camera, plan = self._camera, rendered.plan
-        pixel = torch.searchsorted(rendered.counted, self._sent(chosen.ranks) + 1)
+        (ranks, windows), camera, plan = chosen, self._camera, rendered.plan
+        pixel = torch.searchsorted(rendered.counted, self._sent(ranks) + 1)
         z = rendered.depth_mm.flatten(1).gather(1, pixel).double()
         row = pixel.div(camera.width, rounding_mode="floor")
         x = (pixel - row * camera.width - camera.cx) * (z / camera.fx)
         y = (row - camera.cy) * (z / camera.fy)
         clouds_mm = torch.stack([x, y, z], -1).float()
-        points_ct, labels = self._taken(chosen.windows)
+        points_ct, labels = self._taken(windows)
         points_mm = carried(plan, points_ct)
         poses = self._sent(plan.camera_from_ct.astype(np.float32))
         return clouds_mm, points_mm.permute(1, 2, 0).contiguous(), labels, poses
@@ -253,17 +246,17 @@ def why_not(stream: SceneStream) -> str | None:
     if not isinstance(stream.pool, OccupancyPool):
         return "Points that are the same in every scene: made on the CPU alone"
     config = stream.config
+    known = all(  # some drags, and then at most one squeeze and bend
+        all(isinstance(link, DragConfig) for link in first)
+        and isinstance(last, DragConfig | StretchConfig | RestConfig)
+        for *first, last in map(links_of, config.deform)
+    )
     parts = {
         "sensor noise": config.noise != CLEAN,
         "background": config.clutter.scenes > 0,
         "occlusion": config.occlusion.scenes > 0 and config.occlusion.largest_share > 0,
         "cameras out of calibration": config.calibration != CALIBRATED,
-        "deformations other than drags, squeezing and bending": not all(
-            # Some drags, and then at most one squeeze and bend.
-            all(isinstance(link, DragConfig) for link in first)
-            and isinstance(last, DragConfig | StretchConfig | RestConfig)
-            for *first, last in map(links_of, config.deform)
-        ),
+        "deformations other than drags, squeezing and bending": not known,
     }
     lacks = [what for what, on in parts.items() if on]
     return f"{', '.join(lacks)}: made on the CPU alone" if lacks else None
@@ -277,10 +270,9 @@ def _as_arrays(deformation: Deformation, n_drags: int, n_stretches: int) -> tupl
     done = 0
     for link in deformation.links if isinstance(deformation, Chain) else (deformation,):
         if isinstance(link, Drags):
-            here = slice(done, done + len(link.sigmas_mm))
+            here = slice(done, done := done + len(link.sigmas_mm))
             centres[here], shifts[here] = link.centres_ct, link.shifts_mm
             sigmas[here] = link.sigmas_mm
-            done = here.stop
         elif isinstance(link, Stretch):
             bend = link.along, link.across, [link.sagitta_mm, link.reach_mm]
             stretch[0] = np.concatenate([link.centre_ct, link.matrix.ravel(), *bend])
