@@ -44,12 +44,8 @@ class Bed:
     seed: int
 
     def under(self, what: str, load: Callable[..., None], *how: object) -> np.ndarray:
-        """The unknowns at rest under a load of ``elastic.loads`` with its arguments; ``what`` names
-        it in the error.
-
-        Raises:
-            InputError: this organ finds no equilibrium.
-        """
+        """The unknowns at rest under a load of ``elastic.loads`` with its arguments; InputError,
+        naming ``what``, where there is no equilibrium."""
         problem = in_bed(self.organ, self.up, np.random.default_rng([self.seed, 0xBED]))
         load(problem, *how)
         found = problem.equilibrium()
@@ -63,11 +59,8 @@ class Bed:
     def indentations(
         self, count: int, radius_mm: float, deepest_mm: float, rng: np.random.Generator
     ) -> list[Indentation]:
-        """Indentations of ``count`` different places that face up, by an instrument of that radius.
-
-        Raises:
-            InputError: an organ with fewer such places, or one that finds no equilibrium.
-        """
+        """Indentations of ``count`` different places that face up, by an instrument of that radius;
+        InputError where the organ has fewer, or finds no equilibrium."""
         places, normals = self.organ.patches.points_mm, self.organ.patches.normals
         facing = np.flatnonzero(normals @ self.up > _FACING)
         if len(facing) < count:

@@ -311,7 +311,8 @@ def crop_of(config: SceneConfig, free: bool, rng: np.random.Generator) -> CloudC
     near_mm, far_mm = (1.0, 1e4) if free else (config.cloud.near_mm, config.cloud.far_mm)
     n_points = config.cloud.n_points
     if config.cloud_points is not None:
-        n_points = round(math.exp(rng.uniform(*map(math.log, config.cloud_points))))
+        fewest, most = config.cloud_points
+        n_points = round(math.exp(rng.uniform(math.log(fewest), math.log(most))))
     return CloudConfig(near_mm=near_mm, far_mm=far_mm, n_points=n_points)
 
 
@@ -321,9 +322,7 @@ def body_for(
     """The organ's elastic body where a deformation of the configuration needs it, else None.
 
     Where every rotation of the organ is shown (``full``), its bed lies on any side of it.
-
-    Raises:
-        InputError: elastic deformations that ask for different bodies.
+    Deformations that ask for different bodies raise InputError.
     """
     links = (link for model in config.deform for link in links_of(model))
     bodies = (getattr(link, "body", None) for link in links)

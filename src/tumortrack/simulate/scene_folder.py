@@ -89,11 +89,7 @@ class Scene:
 
 
 def write_scene_files(folder: Path, scene: Scene) -> None:
-    """A scene's files into a folder that is being filled aside.
-
-    Raises:
-        StorageError: the disk refused.
-    """
+    """A scene's files into a folder that is being filled aside; raises StorageError."""
     write_cloud_ply(folder / "cloud.ply", scene.cloud.points_mm)
     if scene.depth is not None:
         write_depth_png(folder / "depth.png", scene.depth)
@@ -102,8 +98,8 @@ def write_scene_files(folder: Path, scene: Scene) -> None:
     if scene.targets is not None:
         points = scene.targets.points_ct, scene.targets.points_mm
         table, text = np.column_stack([scene.targets.labels, *points]), io.StringIO()
-        form = {"fmt": ["%d", *["%.5f"] * 6], "delimiter": ","}  # to 0.01 micrometres
-        np.savetxt(text, table, header=",".join(_COLUMNS), comments="", **form)
+        numbers, head = ["%d", *["%.5f"] * 6], ",".join(_COLUMNS)  # to 0.01 micrometres
+        np.savetxt(text, table, numbers, delimiter=",", header=head, comments="")
         write_atomically(folder / _TARGETS, text.getvalue().encode())
     meta = {**scene.meta, "units": "mm", "frame": "camera", _STAMP: scene.cloud.stamp_ns}
     write_json(folder / "meta.json", {**meta, _UNITED: True})
@@ -142,11 +138,8 @@ def read_scene(folder: Path) -> Scene:
 
 
 def list_scenes(folder: Path) -> list[Path]:
-    """The scene folders (those with a kidney.ply or cloud.ply) in a folder, by name.
-
-    Raises:
-        InputError: no such folder, or no scene in it.
-    """
+    """The scene folders (those with a kidney.ply or cloud.ply) in a folder, by name; InputError
+    where there is none."""
     if not folder.is_dir():
         raise InputError(f"{folder} does not exist or is no folder.")
     scenes = sorted(
@@ -202,11 +195,8 @@ def _united(folder: Path, anatomy: Anatomy) -> Anatomy:
 
 def draw_targets(anatomy_ct: Anatomy, seed: int) -> InnerPoints:
     """``TARGETS`` points spread evenly inside each part: half of them in the parenchyma, the others
-    shared by the tumors (all in the organ where it has none).
-
-    Raises:
-        InputError: a tumor that others cover; a negative seed.
-    """
+    shared by the tumors (all in the organ where it has none). A tumor that others cover and a
+    negative seed raise InputError."""
     if seed < 0:
         raise InputError(f"seed {seed} must be 0 or more.")
     rng = np.random.default_rng([seed, 1000])
@@ -233,11 +223,8 @@ def draw_targets(anatomy_ct: Anatomy, seed: int) -> InnerPoints:
 
 
 def read_targets(path: Path) -> Targets:
-    """Read targets.csv, ours or another program's; further columns are not looked at.
-
-    Raises:
-        InputError: a column or every row is missing, or a value is no finite number.
-    """
+    """Read targets.csv, ours or another program's; further columns are not looked at. Missing
+    columns or rows, and values that are no finite numbers, raise InputError."""
     try:
         with path.open(encoding="utf-8-sig", newline="") as stream:
             rows = list(csv.DictReader(stream))

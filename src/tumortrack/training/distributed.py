@@ -44,11 +44,7 @@ class ProcessGroup:
         return self.rank == 0
 
     def local_size(self, batch_size: int) -> int:
-        """How many samples of a batch are this process's.
-
-        Raises:
-            InputError: the batch cannot be split equally.
-        """
+        """How many samples of a batch are this process's; InputError where it cannot be split."""
         if batch_size % self.size:
             raise InputError(
                 f"a batch of {batch_size} cannot be shared by {self.size} processes; choose a "
@@ -109,11 +105,7 @@ class ProcessGroup:
 @contextmanager
 def process_group(device: str) -> Iterator[ProcessGroup]:
     """All processes that torchrun started, by NCCL on GPUs and Gloo on CPUs; else this one alone.
-
-    Raises:
-        InputError: CUDA is requested where there is none, or more processes than GPUs.
-        ProcessLost: the processes do not find each other.
-    """
+    Raises InputError for CUDA where there is none, and for more processes than GPUs."""
     chosen = choose_device(device)
     size = int(os.environ["WORLD_SIZE"]) if "TORCHELASTIC_RUN_ID" in os.environ else 1
     if size == 1:

@@ -97,11 +97,7 @@ class PretrainedWeights:
     weights: dict[str, Tensor]
 
     def check(self, network: NetworkConfig) -> None:
-        """Refuse a network that these weights do not fit.
-
-        Raises:
-            InputError: another kind of network, or other sizes.
-        """
+        """Refuse a network of another kind or other sizes, by InputError."""
         if not isinstance(network.decoder, RegistrationHeadConfig):
             raise InputError("--start is for the preset clinic; quick and paper have none.")
         if _shared(self.config) != _shared(network):
@@ -128,11 +124,8 @@ def save_start(
 
 
 def load_start(folder: Path) -> PretrainedWeights:
-    """Read a folder that `pretrain` wrote.
-
-    Raises:
-        ArtifactError: missing, another kind, damaged, or not of this version.
-    """
+    """Read a folder that `pretrain` wrote; one that is missing, of another kind, damaged or not of
+    this version raises ArtifactError."""
     manifest = store.read_manifest(folder, PRETRAINED)
     try:
         config = from_builtins(manifest["config"], NetworkConfig, f"{folder}: config")

@@ -70,10 +70,7 @@ def kidney_stream(run: Pretraining) -> KidneyStream:
 
 def pretrain(run: Pretraining, folder: Path, report: Report) -> dict[str, Any]:
     """Train until the end, resuming what lies in ``folder``; leaves a folder of weights, and
-    returns its provenance.
-
-    Raises: as ``train``.
-    """
+    returns its provenance. Raises as ``train``."""
     with work_folder(folder) as work:
         device = choose_device(run.device)
         workers = divide_cores(device, run.workers)

@@ -42,10 +42,8 @@ def scenes_for(
 ) -> Scenes:
     """The batches of these steps; after ``period`` steps (0: never) they repeat.
 
-    ``auto`` has a GPU make them where it can; ``device`` has the device do so, whichever it is.
-
-    Raises:
-        InputError: ``device``, and a configuration that only the CPU's workers can make.
+    ``auto`` has a GPU make them where it can; ``device`` has the device do so, whichever it is, and
+    raises InputError for a configuration that only the CPU's workers can make.
     """
     reason, on_gpu = why_not(stream), device.type == "cuda"
     if maker == "device" or (maker == "auto" and on_gpu and reason is None):
@@ -66,12 +64,8 @@ def scenes_for(
 def batches(
     make: Callable[[int], Batch], steps: range, period: int, workers: int, device: torch.device
 ) -> Generator[Tensors, None, None]:
-    """The batches of these steps, in order, for any number of workers; after ``period`` steps (0:
-    never) they repeat. Close the generator to end the workers.
-
-    Args:
-        make: the batch with a number; picklable, the same number gives the same batch.
-    """
+    """As ``scenes_for``, by workers. ``make`` makes the batch with a number: picklable, the same
+    number gives the same batch. Close the generator to end the workers."""
     pinned = device.type == "cuda"  # copies then overlap with the work before
     indices = ((number,) for number in _numbers(steps, period))
     for batch in _loader(make, indices, workers, ahead=4, pin_memory=pinned):
@@ -86,9 +80,9 @@ def batches_on(
     workers: int,
     at_once: int,
 ) -> Generator[Tensors, None, None]:
-    """The batches of these steps, made on a device, ``at_once`` scenes or somewhat less together,
-    since starting a device's work costs as much for one scene as for many. Workers plan ahead, some
-    kB a scene, and a thread draws the next clouds' pixels while the network learns."""
+    """As ``scenes_for``, on a device, ``at_once`` scenes or somewhat less together, since starting
+    a device's work costs as much for one scene as for many. Workers plan ahead, some kB a scene,
+    and a thread draws the next clouds' pixels while the network learns."""
     size, made = stream.batch_size, DeviceStream(stream, device)
     indices = _numbers(steps, period)
     groups = iter(lambda: tuple(islice(indices, max(1, at_once // size))), ())

@@ -76,12 +76,8 @@ class TrainingState:
         initialize(self.average)
 
     def resume(self, work: Path) -> None:
-        """Restore the last checkpoint, if there is one.
-
-        Raises:
-            ArtifactError: it is damaged, or belongs to a run with another case, configuration or
-                seed.
-        """
+        """Restore the last checkpoint, if there is one; ArtifactError where it is damaged or of
+        another run."""
         path = work / _FILE
         if not path.exists():
             return
@@ -113,12 +109,8 @@ class TrainingState:
         self._best = groups.get("best", {})
 
     def save(self, work: Path) -> None:
-        """Write the checkpoint.
-
-        Raises:
-            Diverged: a weight is not finite; the checkpoint before stays.
-            StorageError: the disk is full; the checkpoint before stays.
-        """
+        """Write the checkpoint. The one before stays where a weight is not finite (Diverged) or the
+        disk is full (StorageError)."""
         if not all(bool(p.isfinite().all()) for p in self.network.parameters()):
             raise Diverged(self.progress.step)
         moments = self.optimizer.state_dict()["state"]  # Adam's, and step counts, by parameter
@@ -138,11 +130,7 @@ class TrainingState:
 
     def step(self, batch: Tensors) -> float:
         """One optimizer step on this process's part of the batch; returns the whole batch's loss.
-
-        Raises:
-            Diverged: the loss is not finite; the weights are as they were.
-            ProcessLost: another process of this training has ended.
-        """
+        Where that is not finite the weights stay as they were, and Diverged is raised."""
         progress = self.progress
         clouds, points, labels, poses = (part.to(self._device, non_blocking=True) for part in batch)
         clouds = clouds[:, : self.points_kept(clouds.shape[1])]

@@ -48,26 +48,18 @@ _AT_SURFACE = 0.5  # of the points whose positions are learnt; the others lie in
 
 
 def task_of(run: TrainingRun, device: torch.device) -> TrainingTask:
-    """The task of a run's method.
-
-    Raises:
-        InputError: a part too small to be learnt, deformations that do not fit the network.
-    """
+    """The task of a run's method; a part too small to be learnt, or deformations that do not fit
+    the network, raise InputError."""
     if isinstance(run.config.network.decoder, RegistrationHeadConfig):
         return RegistrationTask(run, device)
     return OccupancyTask(run, device)
 
 
 class TrainingTask(ABC):
-    """What a method learns, how it is validated, and the model it leaves; a class per method.
+    """What a method learns, how it is validated, and the model it leaves; a class per method."""
 
-    Attributes:
-        points: those of the training scenes.
-        body: the organ's, where scenes or model need it.
-    """
-
-    points: PointSource
-    body: ElasticBody | None
+    points: PointSource  # of the training scenes
+    body: ElasticBody | None  # the organ's, where scenes or model need it
 
     def __init__(self, run: TrainingRun, device: torch.device) -> None:
         self._run, self._device = run, device
@@ -252,16 +244,13 @@ def _learnt_points(run: TrainingRun) -> FixedPoints:
 @dataclass(frozen=True, eq=False)
 class ValidationScenes:
     """Scenes of the ``validation`` stream with points spread evenly over the organ's enlarged
-    box, so that numbers of points are volumes; camera frame, mm.
-
-    ``boxes_mm``: the organ's, relative to the median of the observed points.
-    """
+    box, so that numbers of points are volumes; camera frame, mm."""
 
     clouds_mm: Float32[np.ndarray, "s n 3"]
     points_ct: Float32[np.ndarray, "s q 3"]
     points_mm: Float32[np.ndarray, "s q 3"]
     labels: UInt8[np.ndarray, "s q"]
-    boxes_mm: Float64[np.ndarray, "s 2 3"]
+    boxes_mm: Float64[np.ndarray, "s 2 3"]  # the organ's, relative to the points' median
 
     @property
     def query_box_mm(self) -> Float64[np.ndarray, "2 3"]:

@@ -126,10 +126,7 @@ def run_steps(
     miou_of: Callable[[Network], float] | None = None,
 ) -> None:
     """All steps to the end; the main process writes checkpoints into ``work``, reports and, with
-    ``miou_of``, validates.
-
-    Raises: as ``train``.
-    """
+    ``miou_of``, validates. Raises as ``train``."""
     run, group, progress = state.run, state.group, state.progress
     clock, miou = TrainingClock(progress), None
     with ExitStack() as stack:
@@ -170,15 +167,9 @@ def _status(
 
 @contextmanager
 def work_folder(folder: Path, writes: bool = True) -> Iterator[Path]:
-    """MODEL/training, locked while in use; removed again if nothing was written into it. Nothing
-    is done for a process that only reads (``writes`` is False).
-
-    The lock is the operating system's and ends with its process, however that ends.
-
-    Raises:
-        InputError: another process trains in it.
-        StorageError: it cannot be made.
-    """
+    """MODEL/training, locked while in use, if this process writes; removed again if nothing was
+    written into it. The lock is the operating system's and ends with its process, however that
+    ends. InputError where another process trains in it, StorageError where it cannot be made."""
     import fcntl
 
     work = folder / "training"
@@ -288,11 +279,8 @@ def ctrl_c() -> Iterator[Callable[[], bool]]:
 @contextmanager
 def history(folder: Path, progress: TrainingProgress) -> Iterator[Callable[..., None]]:
     """history.jsonl and TensorBoard: yields a function that writes a validation's ``_SCALARS``. On
-    resuming, records after the checkpoint are dropped first.
-
-    Raises (entering, writing, leaving):
-        StorageError: the disk is full. On leaving after another error, that one is kept.
-    """
+    resuming, records after the checkpoint are dropped first. A full disk raises StorageError,
+    except on leaving after another error, which is kept."""
     from torch.utils.tensorboard import SummaryWriter
 
     path, files = folder / "history.jsonl", ExitStack()

@@ -88,10 +88,8 @@ class DeviceStream:
     values; a scene's labelled points come in another order. A batch is made in four steps, so that
     they can be pipelined: ``plan`` (host), ``render`` (device), ``sample`` (host), ``assemble``
     (device). Only each scene's number of pixels in range returns from the device; the random
-    choice among them depends on it. Pickled without what lies on the device.
-
-    Raises:
-        InputError: scenes that ``why_not`` refuses.
+    choice among them depends on it. Pickled without what lies on the device. Raises InputError for
+    scenes that ``why_not`` refuses.
     """
 
     def __init__(self, stream: SceneStream, device: torch.device) -> None:
@@ -137,11 +135,8 @@ class DeviceStream:
 
     @torch.no_grad()
     def render(self, plan: BatchPlan) -> RenderedBatch:
-        """The plan's depth images; scenes that show too little are drawn again.
-
-        Raises:
-            TumortrackError: no pose of a scene shows enough of the organ.
-        """
+        """The plan's depth images; scenes that show too little are drawn again. Raises
+        TumortrackError where no pose of a scene shows enough of the organ."""
         depth_mm, counted = self._render(plan)
         while True:
             available = counted[:, -1].cpu().numpy()
@@ -280,8 +275,8 @@ def _as_arrays(deformation: Deformation, n_drags: int, n_stretches: int) -> tupl
 
 
 def carried(plan: BatchPlan, points_ct: Points) -> Points:
-    """Points of the undeformed CT frame at their places before the plan's cameras, mm: dragged one
-    drag after the other, squeezed and bent, and seen, as ``simulate.deform`` does.
+    """Points of the undeformed CT frame at their places before the plan's cameras, mm: dragged,
+    squeezed and bent as by ``simulate.deform``.
 
     Component by component: matrix products may be rounded to fewer bits by a device's settings
     (TF32, autocast), which at a tumor's distance is a tenth of a millimetre.

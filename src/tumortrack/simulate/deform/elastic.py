@@ -43,11 +43,7 @@ class ElasticConfig(Config, frozen=True, tag="elastic"):
     body: BodyConfig = BodyConfig()
 
     def sample(self, view: View, rng: np.random.Generator) -> ElasticDeformation:
-        """Draw states and scales uniformly.
-
-        Raises:
-            InputError: the view has no body.
-        """
+        """Draw states and scales uniformly; a view without a body raises InputError."""
         if view.body is None:
             raise InputError(
                 "elastic deformations need the organ's body; build it with body_for(...) and give "

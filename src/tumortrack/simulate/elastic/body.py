@@ -126,11 +126,8 @@ class ElasticBody:
 
     @classmethod
     def from_arrays(cls, arrays: dict[str, np.ndarray]) -> ElasticBody:
-        """The inverse of ``to_arrays``.
-
-        Raises:
-            InputError: an array is missing or of a wrong shape.
-        """
+        """The inverse of ``to_arrays``; an array that is missing or of a wrong shape raises
+        InputError."""
         missing = [name for name in _ARRAYS if name not in arrays]
         if missing:
             raise InputError(f"a body lacks {', '.join(missing)}; build it again.")
@@ -148,9 +145,8 @@ def build_body(
 ) -> ElasticBody:
     """Finite elements of an organ, its modes, and a library of states under random loads.
 
-    Takes seconds on one core. The same anatomy, configuration and seed give the same body on the
-    same machine; elsewhere last digits differ, and with them possibly the order of modes that
-    matter equally.
+    Takes seconds on one core. The same arguments give the same body on the same machine; elsewhere
+    last digits differ, and with them possibly the order of modes that matter equally.
 
     Raises:
         InputError: a surface that turns inside, or numbers that make no body.
@@ -173,11 +169,8 @@ def build_body(
 def reduced_organ(
     anatomy_ct: Anatomy, up: Float64[np.ndarray, " 3"], config: BodyConfig, rng: np.random.Generator
 ) -> ReducedModel:
-    """An organ in the space of its modes, ready for loads; ``up`` is a unit vector.
-
-    Raises:
-        InputError: a surface that turns inside, or numbers that make no body.
-    """
+    """An organ in the space of its modes, ready for loads; ``up`` is a unit vector. Raises as
+    ``build_body``."""
     from tumortrack.simulate.elastic.finite import ElementLattice, LatticeSolid
     from tumortrack.simulate.elastic.modes import ReducedModel, modes_of, patches_of, random_loads
 

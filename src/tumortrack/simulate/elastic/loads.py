@@ -35,17 +35,14 @@ _SWELLING = 0.025  # largest change of volume: leaves room below 3 % for what mo
 
 @dataclass(eq=False)
 class ReducedProblem:
-    """What acts on the organ, gathered by the loads: energy z' H z / 2 - g z + springs' energy.
-
-    ``contacts`` are (rows, depth_mm, springs): springs that push where ``depth_mm + rows @ z`` is
-    above zero.
-    """
+    """What acts on the organ, gathered by the loads: energy z' H z / 2 - g z + springs' energy."""
 
     organ: ReducedModel
     up: Vector
     modulus: float  # of the tissue, N/mm2
     stiffness: Float64[np.ndarray, "m m"]  # H
     forces: Float64[np.ndarray, " m"]  # g
+    # (rows, depth_mm, springs): they push where depth_mm + rows @ z is above zero
     contacts: list[tuple[np.ndarray, ...]] = field(default_factory=list)
 
     def touch(self, rows: np.ndarray, depth_mm: np.ndarray, springs: np.ndarray) -> None:

@@ -67,12 +67,9 @@ def modes_of(
     contrasts: tuple[float, ...],
     loads: Float64[np.ndarray, "f n"],
 ) -> Float64[np.ndarray, "f k"]:
-    """``count`` modes of the responses to loads, which alternate between the tumors' contrasts.
-
-    Returns:
-        Displacements of the solid's nodes: a unit coefficient moves the organ by 1 mm rms. The
-        last mode swells the organ; the others keep its volume.
-    """
+    """``count`` modes of the responses to loads, which alternate between the tumors' contrasts, as
+    displacements of the solid's nodes: a unit coefficient moves the organ by 1 mm rms. The last
+    mode swells the organ; the others keep its volume."""
     arms, axes = solid.nodes_mm - solid.center_mm, np.eye(3)
     turns = [np.cross(axis, arms).ravel() for axis in axes]
     rigid = np.stack([*(np.tile(axis, len(arms)) for axis in axes), *turns], 1)
@@ -109,11 +106,8 @@ def random_loads(
     solid: LatticeSolid, patches: Patches, up: Float64[np.ndarray, " 3"], count: int,
     rng: np.random.Generator,
 ) -> Float64[np.ndarray, "f n"]:  # fmt: skip
-    """Forces at the nodes, one column a load: squeezed, poked, pulled, hanging, bent, sheared.
-
-    They only have to be diverse: magnitudes, and how an organ in its bed responds, are decided
-    for every state by itself (``loads.random_state``).
-    """
+    """Forces at the nodes, one column a load. They only have to be diverse: magnitudes, and how an
+    organ in its bed responds, are decided for every state by itself (``loads.random_state``)."""
     draw = _Tractions(patches, solid.center_mm, up, rng)
     kinds = (draw.squeeze, draw.poke, draw.hang, draw.bend, draw.shear)
     shares = np.array([0.36, 0.28, 0.12, 0.16, 0.08])
