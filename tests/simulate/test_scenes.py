@@ -48,11 +48,9 @@ def recipe(index, stream="train", seed=5):
 
 
 def same(one, two):
-    (scene, samples), (other, others) = one, two
-    return (
-        np.array_equal(scene.cloud.points_mm, other.cloud.points_mm)
-        and np.array_equal(samples.points_mm, others.points_mm)
-        and np.array_equal(samples.labels, others.labels)
+    (scene, *samples), (other, *others) = one, two
+    return np.array_equal(scene.cloud.points_mm, other.cloud.points_mm) and all(
+        map(np.array_equal, samples, others)
     )
 
 
@@ -135,10 +133,10 @@ def test_the_share_of_free_scenes_is_as_asked():
 
 
 def test_labelled_points_lie_in_the_scene_as_the_reference_does(simulator, pool):
-    scene, samples = simulator.pair(recipe(3), pool)
+    scene, points_mm, labels = simulator.pair(recipe(3), pool)
     reference = simulator.reference(scene)
     for label, part in enumerate(reference.parts, start=1):
-        own = samples.points_mm[samples.labels == label]
+        own = points_mm[labels == label]
         lower, upper = part.box_mm
         assert len(own) >= 40
         assert (own > lower - 0.5).all()
@@ -207,10 +205,10 @@ def test_a_batch_holds_its_recipes(pool):
     simulator = Simulator(ANATOMY, UP, TINY)
     assert batch.clouds_mm.shape == (3, 200, 3)
     for row, index in enumerate((6, 7, 8)):
-        scene, samples = simulator.pair(recipe(index), pool)
+        scene, points_mm, labels = simulator.pair(recipe(index), pool)
         np.testing.assert_array_equal(batch.clouds_mm[row], scene.cloud.points_mm)
-        np.testing.assert_array_equal(batch.points_mm[row], samples.points_mm)
-        np.testing.assert_array_equal(batch.labels[row], samples.labels)
+        np.testing.assert_array_equal(batch.points_mm[row], points_mm)
+        np.testing.assert_array_equal(batch.labels[row], labels)
 
 
 def test_batches_do_not_depend_on_who_asks(pool):

@@ -151,13 +151,7 @@ class Simulate:
 
     def scene_config(self) -> SceneConfig:
         from tumortrack.sense.noise import CLEAN, D405_NOISE
-        from tumortrack.simulate.deform import (
-            ChainConfig,
-            DeformConfig,
-            DragConfig,
-            ElasticConfig,
-            StretchConfig,
-        )
+        from tumortrack.simulate.deform import ChainConfig, DragConfig, ElasticConfig, StretchConfig
         from tumortrack.simulate.deform.drag import CONFIGURATIONS
         from tumortrack.simulate.scene import PoseConfig, SceneConfig
 
@@ -165,7 +159,7 @@ class Simulate:
         if not self.elastic:
             table = (CONFIGURATIONS[number] for number in self.configuration)
             models = [DragConfig(steps=steps, falloff=self.falloff) for steps in table]
-        deform: tuple[DeformConfig, ...] = tuple(
+        deform = tuple(
             ChainConfig(links=(model, StretchConfig())) if self.squeeze else model
             for model in models
         )

@@ -21,15 +21,14 @@ from scipy.spatial.transform import Rotation
 from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError, NoEstimate, TumortrackError
 from tumortrack.core.geometry import rigid, rotation_onto, transform_points
-from tumortrack.core.types import Anatomy, DepthFrame, Mesh, OccupancySamples, SensorCloud
+from tumortrack.core.types import Anatomy, DepthFrame, Mesh, SensorCloud
 from tumortrack.sense.camera import d405, project
 from tumortrack.sense.cloud import FEWEST_POINTS, CloudConfig, cloud_from_depth
 from tumortrack.sense.clutter import ClutterConfig, add_clutter
 from tumortrack.sense.noise import CalibrationConfig, NoiseConfig, add_noise, miscalibrate
 from tumortrack.sense.occlusion import OcclusionConfig, occlude
 from tumortrack.sense.render import Visibility, render_depth
-from tumortrack.simulate import deform as deformations
-from tumortrack.simulate.deform import DragConfig, links_of
+from tumortrack.simulate.deform import ChainConfig, DragConfig, RestConfig, installed, links_of
 from tumortrack.simulate.deform.base import Deformation, Points, View
 from tumortrack.simulate.elastic.body import BodyConfig, ElasticBody, build_body
 from tumortrack.simulate.occupancy import OccupancyConfig, PointSource
@@ -66,7 +65,8 @@ class SceneConfig(Config, frozen=True):
     width: int = 424
     height: int = 240
     pose: PoseConfig = PoseConfig()
-    deform: tuple[deformations.DeformConfig, ...] = (DragConfig(),)  # one a scene, drawn uniformly
+    # One a scene, drawn uniformly.
+    deform: tuple[installed.LinkConfig | ChainConfig | RestConfig, ...] = (DragConfig(),)
     clutter: ClutterConfig = ClutterConfig()
     noise: NoiseConfig = NoiseConfig()
     cloud: CloudConfig = CloudConfig()
@@ -146,11 +146,11 @@ class Simulator:
 
     def pair(
         self, recipe: SceneRecipe, pool: PointSource
-    ) -> tuple[RenderedScene, OccupancySamples]:
-        """The scene and its labelled points, camera frame."""
+    ) -> tuple[RenderedScene, Float32[np.ndarray, "n 3"], UInt8[np.ndarray, " n"]]:
+        """The scene, and its labelled points, camera frame."""
         scene, rng = self._render(recipe)
         points_ct, labels = pool.draw(rng)
-        return scene, OccupancySamples(scene.carry(points_ct), labels)
+        return scene, scene.carry(points_ct).astype(np.float32, copy=False), labels
 
     def render(self, recipe: SceneRecipe) -> RenderedScene:
         """Pose, deformation, depth image and cloud of a recipe."""
@@ -279,18 +279,14 @@ class SceneStream:
 
     def batch(self, index: int) -> Batch:
         """The batch with this number."""
-        first = index * self.batch_size
-        pairs = [
-            self.simulator.pair(SceneRecipe(self.seed, self.stream, i), self.pool)
-            for i in range(first, first + self.batch_size)
-        ]
-        n = self.config.cloud.n_points
-        return Batch(
-            np.stack([refill(scene.cloud.points_mm, n) for scene, _ in pairs]),
-            np.stack([samples.points_mm for _, samples in pairs]),
-            np.stack([samples.labels for _, samples in pairs]),
-            np.stack([scene.camera_from_ct for scene, _ in pairs]).astype(np.float32),
-        )
+        first, n = index * self.batch_size, self.config.cloud.n_points
+        rows = []
+        for number in range(first, first + self.batch_size):
+            recipe = SceneRecipe(self.seed, self.stream, number)
+            scene, points_mm, labels = self.simulator.pair(recipe, self.pool)
+            cloud_mm = refill(scene.cloud.points_mm, n)
+            rows.append((cloud_mm, points_mm, labels, scene.camera_from_ct.astype(np.float32)))
+        return Batch(*map(np.stack, zip(*rows, strict=True)))
 
 
 def refill(points_mm: Num[np.ndarray, m * row], n: int) -> Num[np.ndarray, n * row]:

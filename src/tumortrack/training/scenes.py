@@ -73,12 +73,7 @@ def batches(
 
 
 def batches_on(
-    device: torch.device,
-    stream: SceneStream,
-    steps: range,
-    period: int,
-    workers: int,
-    at_once: int,
+    device: torch.device, stream: SceneStream, steps: range, period: int, workers: int, at_once: int
 ) -> Generator[Tensors, None, None]:
     """As ``scenes_for``, on a device, ``at_once`` scenes or somewhat less together, since starting
     a device's work costs as much for one scene as for many. Workers plan ahead, some kB a scene,

@@ -97,8 +97,7 @@ class TrainingTask(ABC):
         """What models of both methods hold; of validation scenes, how far their points spread and
         how far they lie from the surface that was found."""
         known = InDistributionRange(
-            spread_mm=(min(spreads_mm), max(spreads_mm)),
-            fit_mm=float(np.percentile(fits_mm, 95)),
+            spread_mm=(min(spreads_mm), max(spreads_mm)), fit_mm=float(np.percentile(fits_mm, 95))
         )
         return {
             "network": network,

@@ -64,10 +64,7 @@ def _front(
 
 
 def _planes(
-    corners: Float32[Tensor, "t 9"],
-    area: Float32[Tensor, " t"],
-    left: PerFace,
-    top: PerFace,
+    corners: Float32[Tensor, "t 9"], area: Float32[Tensor, " t"], left: PerFace, top: PerFace
 ) -> Float64[Tensor, "3 3 t"]:
     """The barycentric weights of corners a and b, and 1/z: at a box's first pixel, their increment
     by column and by row."""

@@ -17,7 +17,6 @@ import torch
 from jaxtyping import Float32, Float64, Int32, Int64
 from torch import Tensor
 
-from tumortrack.core.errors import InputError
 from tumortrack.sense.camera import d405
 from tumortrack.sense.cloud import FEWEST_POINTS, draw_some
 from tumortrack.sense.noise import CALIBRATED, CLEAN
@@ -88,14 +87,11 @@ class DeviceStream:
     values; a scene's labelled points come in another order. A batch is made in four steps, so that
     they can be pipelined: ``plan`` (host), ``render`` (device), ``sample`` (host), ``assemble``
     (device). Only each scene's number of pixels in range returns from the device; the random
-    choice among them depends on it. Pickled without what lies on the device. Raises InputError for
-    scenes that ``why_not`` refuses.
+    choice among them depends on it. Pickled without what lies on the device. Only for streams that
+    ``why_not`` lets pass.
     """
 
     def __init__(self, stream: SceneStream, device: torch.device) -> None:
-        reason = why_not(stream)
-        if reason is not None:
-            raise InputError(f"these scenes cannot be made in batches. {reason}.")
         assert isinstance(stream.pool, OccupancyPool)
         self._stream, self._device, self._pool = stream, device, stream.pool
         self._camera = d405(stream.config.width, stream.config.height)

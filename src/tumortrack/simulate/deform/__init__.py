@@ -9,7 +9,7 @@ recorded (``record``). To add one here: write its file, add its configuration to
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -63,15 +63,3 @@ class RestConfig(Config, frozen=True, tag="rest"):
 
     def record(self) -> dict[str, Any]:
         return {"kind": "rest"}
-
-
-if TYPE_CHECKING:
-    DeformConfig = installed.LinkConfig | ChainConfig | RestConfig
-else:
-
-    def __getattr__(name: str) -> Any:
-        """``DeformConfig``, which includes the models of other packages, on first use."""
-        if name != "DeformConfig":
-            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-        globals()[name] = union = installed.LinkConfig | ChainConfig | RestConfig
-        return union

@@ -57,10 +57,6 @@ class ElementLattice:
         """Positions of all nodes, in the order of their numbers."""
         return self.origin_mm + self.spacing_mm * np.indices(self.shape).reshape(3, -1).T
 
-    def cell_nodes(self) -> Int[np.ndarray, "c 8"]:
-        """Node numbers of every cell's corners, in the order of ``CORNERS``."""
-        return self._corner_nodes(np.indices(self.cells).reshape(3, -1).T)
-
     def weights(self, points_mm: Float[np.ndarray, "p 3"]) -> csr_matrix:
         """Sparse (p, n): trilinear values at points = weights @ values at nodes; beyond the
         lattice those of its nearest border."""
@@ -68,10 +64,11 @@ class ElementLattice:
         lowest = np.minimum(place.astype(int), np.array(self.cells) - 1)
         part = (place - lowest)[:, None]
         weight = np.where(CORNERS, part, 1 - part).prod(2)
-        entries = (np.repeat(np.arange(len(points_mm)), 8), self._corner_nodes(lowest).ravel())
+        entries = (np.repeat(np.arange(len(points_mm)), 8), self.corner_nodes(lowest).ravel())
         return csr_matrix((weight.ravel(), entries), (len(points_mm), int(np.prod(self.shape))))
 
-    def _corner_nodes(self, lowest: Int[np.ndarray, "c 3"]) -> Int[np.ndarray, "c 8"]:
+    def corner_nodes(self, lowest: Int[np.ndarray, "c 3"]) -> Int[np.ndarray, "c 8"]:
+        """Node numbers of cells' corners, in the order of ``CORNERS``."""
         return np.ravel_multi_index(tuple(np.moveaxis(lowest[:, None] + CORNERS, 2, 0)), self.shape)
 
 
@@ -137,7 +134,7 @@ class LatticeSolid:
         near = binary_dilation((organ > 0).reshape(lattice.cells), np.ones((3, 3, 3))).ravel()
         self.lattice, self.poisson = lattice, poisson
         self.organ, self.tumor = organ[near], np.minimum(tumor, organ)[near]
-        corners = lattice.cell_nodes()[near]
+        corners = lattice.corner_nodes(np.indices(lattice.cells).reshape(3, -1).T[near])
         used = np.unique(corners)
         layer = np.unravel_index(used, lattice.shape)[int(np.argmax(lattice.shape))]
         order = np.argsort(layer, kind="stable")
