@@ -28,7 +28,6 @@ from tumortrack.simulate.scene import PoseConfig, sample_pose
 
 SHAFT_MM = 4.0  # an instrument's radius
 _SHAFT_LENGTH_MM = 200.0
-_DISTANCE_MM = 60.0, 400.0
 _BREATH_S, _PUSH_S = 4.0, 6.0  # from one to the next
 _AWAY_MM = 160.0  # along its shaft: an instrument out of the picture
 _STEPS = 3  # along the body's field: within 0.02 mm of the exact position, for states as here
@@ -72,11 +71,8 @@ class ScenePlayerConfig(Config, frozen=True, kw_only=True):
     body: BodyConfig = BodyConfig()
 
     def __post_init__(self) -> None:
-        low, high = _DISTANCE_MM
-        if not low <= self.distance_mm <= high:
-            raise InputError(
-                f"distance_mm is {self.distance_mm:g}; it must lie in {low:g}..{high:g}."
-            )
+        if not 60 <= self.distance_mm <= 400:
+            raise InputError(f"distance_mm is {self.distance_mm:g}; it must lie in 60..400.")
         d405(self.width, self.height)
 
 
@@ -154,10 +150,8 @@ class ScenePlayer:
         velocity, room_from_rod = self._body.velocity(coefficients), np.eye(4)
         if push is not None:
             place = self._deformed(velocity, push.place_ct[None])
-            tip = (
-                transform_points(room_from_organ, place)[0]
-                + _AWAY_MM * float(_AWAY(phase)) * push.axis
-            )
+            away_mm = _AWAY_MM * float(_AWAY(phase))
+            tip = transform_points(room_from_organ, place)[0] + away_mm * push.axis
             room_from_rod = rigid(rotation_onto(np.array([0.0, 0.0, 1.0]), push.axis), tip)
         poses = self._camera_at(t_s), room_from_organ, room_from_rod
         return Instant(t_s, *poses, velocity, depth_mm)

@@ -158,9 +158,8 @@ class Simulator:
 
     def reference(self, scene: RenderedScene) -> Anatomy:
         """The anatomy as it lies in the scene, camera frame."""
-        return Anatomy(
-            tuple(part.moved(scene.carry(part.vertices_mm)) for part in self.anatomy_ct.parts)
-        )
+        parts = self.anatomy_ct.parts
+        return Anatomy(tuple(part.moved(scene.carry(part.vertices_mm)) for part in parts))
 
     def draw(self, rng: np.random.Generator) -> SceneDraw:
         """Pose and deformation of the next scene of this generator."""

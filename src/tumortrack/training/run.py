@@ -74,7 +74,10 @@ class Pretraining:
         return _sha256(self, anatomies=self.anatomies)
 
 
-def _check(run: TrainingRun | Pretraining, **smallest: int) -> None:
+Run = TrainingRun | Pretraining
+
+
+def _check(run: Run, **smallest: int) -> None:
     """Refuse numbers smaller than these, and impossible times between checkpoints."""
     for name, least in smallest.items():
         value = getattr(run, name)
@@ -86,7 +89,7 @@ def _check(run: TrainingRun | Pretraining, **smallest: int) -> None:
         )
 
 
-def _sha256(run: TrainingRun | Pretraining, **more: object) -> str:
+def _sha256(run: Run, **more: object) -> str:
     content = {"config": identity(run.config), "seed": run.seed, "steps": run.steps, **more}
     content["schema"] = store.SCHEMA
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()

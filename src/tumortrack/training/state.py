@@ -26,7 +26,7 @@ from tumortrack.models.model import Network
 from tumortrack.simulate.batched.stream import Tensors
 from tumortrack.training.distributed import ProcessGroup
 from tumortrack.training.model import model_class
-from tumortrack.training.run import Pretraining, TrainingProgress, TrainingRun, learning_rate
+from tumortrack.training.run import Run, TrainingProgress, learning_rate
 
 _FILE = "checkpoint.safetensors"
 
@@ -44,12 +44,7 @@ class Diverged(TumortrackError):
 class TrainingState:
     """All that changes while training, and nothing else."""
 
-    def __init__(
-        self,
-        run: TrainingRun | Pretraining,
-        device: torch.device,
-        group: ProcessGroup | None = None,
-    ) -> None:
+    def __init__(self, run: Run, device: torch.device, group: ProcessGroup | None = None) -> None:
         self.run, self._device = run, device
         self.group = group or ProcessGroup(device)
         self._bf16 = has_fast_bfloat16(device)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property, partial
 from typing import Any
@@ -27,13 +28,7 @@ from tumortrack.registration.network import RegistrationNetwork
 from tumortrack.registration.registration import Registration
 from tumortrack.registration.rest_shape import shape_of
 from tumortrack.simulate.elastic.body import ElasticBody
-from tumortrack.simulate.occupancy import (
-    FixedPoints,
-    OccupancyPool,
-    PartPool,
-    PointSource,
-    organ_pool,
-)
+from tumortrack.simulate.occupancy import FixedPoints, OccupancyPool, PartPool, organ_pool
 from tumortrack.simulate.scene import SceneRecipe, Simulator, body_for, refill
 from tumortrack.simulate.scene_folder import draw_targets
 from tumortrack.training.run import TrainingRun
@@ -58,7 +53,7 @@ def task_of(run: TrainingRun, device: torch.device) -> TrainingTask:
 class TrainingTask(ABC):
     """What a method learns, how it is validated, and the model it leaves; a class per method."""
 
-    points: PointSource  # of the training scenes
+    points: FixedPoints | OccupancyPool  # of the training scenes
     body: ElasticBody | None  # the organ's, where scenes or model need it
 
     def __init__(self, run: TrainingRun, device: torch.device) -> None:
@@ -88,23 +83,18 @@ class TrainingTask(ABC):
         return organ_pool(self._run.anatomy_ct, self._run.config.scene.occupancy, self._run.seed)
 
     def _fields(
-        self,
-        network: Any,
-        provenance: dict[str, Any],
-        spreads_mm: Sequence[float],
-        fits_mm: Sequence[float],
+        self, network: Any, provenance: dict[str, Any], clouds_mm: Sequence[tuple[float, float]]
     ) -> dict[str, Any]:
-        """What models of both methods hold; of validation scenes, how far their points spread and
-        how far they lie from the surface that was found."""
-        known = InDistributionRange(
-            spread_mm=(min(spreads_mm), max(spreads_mm)), fit_mm=float(np.percentile(fits_mm, 95))
-        )
+        """What models of both methods hold. ``clouds_mm``: of validation scenes, how far the points
+        spread, and how far they lie from the surface that was found."""
+        spreads, fits = zip(*clouds_mm, strict=True)
+        spread_mm, fit_mm = (min(spreads), max(spreads)), float(np.percentile(fits, 95))
         return {
             "network": network,
             "config": self._run.config,
             "parts": self._run.anatomy_ct.names,
             "query_box_mm": self._scenes.query_box_mm,
-            "in_distribution": known,
+            "in_distribution": InDistributionRange(spread_mm=spread_mm, fit_mm=fit_mm),
             "provenance": provenance,
         }
 
@@ -130,18 +120,16 @@ class OccupancyTask(TrainingTask):
     @torch.no_grad()
     def model(self, network: OccupancyNetwork, provenance: dict[str, Any]) -> OccupancyModel:
         network.eval()
-        spreads, fits = [], []
-        scenes = self._scenes
+        scenes, ranges = self._scenes, []
         for points_mm, box_mm in zip(scenes.clouds_mm[:_FIT_ON], scenes.boxes_mm, strict=False):
             latent = network.encode(torch.from_numpy(points_mm).to(self._device)[None])
             around = grown_box(box_mm[None] + np.median(points_mm, axis=0))
-            spreads.append(spread_mm(points_mm))
-            try:
+            fit = spread = spread_mm(points_mm)
+            with suppress(NoEstimate):  # after a few steps a network finds no organ
                 lattice = lattice_over(partial(self._logits, network, latent), around, FIT_STEPS)
-                fits.append(fit_mm(surface_distances(lattice, points_mm)))
-            except NoEstimate:  # after a few steps a network finds no organ
-                fits.append(spreads[-1])
-        return OccupancyModel(**self._fields(network, provenance, spreads, fits))
+                fit = fit_mm(surface_distances(lattice, points_mm))
+            ranges.append((spread, fit))
+        return OccupancyModel(**self._fields(network, provenance, ranges))
 
     def _logits(
         self, network: OccupancyNetwork, latent: Latent, queries_mm: np.ndarray
@@ -202,10 +190,10 @@ class RegistrationTask(TrainingTask):
             ratios.append(error / deviation)
         std_scale = float(np.quantile(np.concatenate(ratios), _COVERED)) / _RADIUS
         about = {**provenance, "validation_tre_mm": round(float(np.median(errors)), 3)}
-        spreads = [spread_mm(cloud) for cloud in scenes.clouds_mm]
-        off = [fit_mm(np.abs(fit.distances_mm)) for fit in fits]
+        pairs = zip(scenes.clouds_mm, fits, strict=True)
+        ranges = [(spread_mm(cloud), fit_mm(np.abs(fit.distances_mm))) for cloud, fit in pairs]
         return RegistrationModel(
-            **self._fields(network, about, spreads, off),
+            **self._fields(network, about, ranges),
             shape=self._shape,
             calibration=UncertaintyCalibration(std_scale=std_scale, usual_cost=usual_cost),
         )

@@ -201,11 +201,7 @@ def reduced_organ(
 
 def body_of(reduced: ReducedModel, states: Float32[np.ndarray, "s m"]) -> ElasticBody:
     """The body of a reduced organ with these states as its library."""
-    solid = reduced.solid
-    return ElasticBody(
-        solid.lattice.origin_mm.astype(np.float32),
-        solid.lattice.spacing_mm,
-        solid.center_mm,
-        solid.spread(reduced.modes).astype(np.float32),
-        states,
-    )
+    solid, lattice = reduced.solid, reduced.solid.lattice
+    origin_mm, modes = lattice.origin_mm, solid.spread(reduced.modes)
+    place = origin_mm.astype(np.float32), lattice.spacing_mm, solid.center_mm
+    return ElasticBody(*place, modes.astype(np.float32), states)

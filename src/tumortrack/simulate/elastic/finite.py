@@ -24,6 +24,7 @@ from scipy.sparse import coo_matrix, csr_matrix, diags
 from tumortrack.core.types import Anatomy, Mesh
 from tumortrack.simulate.occupancy import contains
 
+Points = Float[np.ndarray, "p 3"]
 VOID = 1e-2  # stiffness of the medium outside, relative to the organ's
 _SUBCELLS = 3  # samples along each axis of a cell for its filled fraction
 _ANCHOR = 1e-6  # of the stiffness: holds the rigid motions, which no load here excites
@@ -54,10 +55,10 @@ class ElementLattice:
         return tuple(nodes - 1 for nodes in self.shape)
 
     def nodes_mm(self) -> Float64[np.ndarray, "n 3"]:
-        """Positions of all nodes, in the order of their numbers."""
+        """All nodes, in the order of their numbers."""
         return self.origin_mm + self.spacing_mm * np.indices(self.shape).reshape(3, -1).T
 
-    def weights(self, points_mm: Float[np.ndarray, "p 3"]) -> csr_matrix:
+    def weights(self, points_mm: Points) -> csr_matrix:
         """Sparse (p, n): trilinear values at points = weights @ values at nodes; beyond the
         lattice those of its nearest border."""
         place = np.clip((points_mm - self.origin_mm) / self.spacing_mm, 0, np.array(self.cells))
@@ -119,9 +120,9 @@ class LatticeSolid:
 
     Attributes:
         organ, tumor: filled fraction of each remaining cell.
-        cells: (c, 8), each cell's corners as indices into ``nodes``.
         nodes: numbers in the lattice, ordered by layers along the lattice's longest axis.
         bounds: the first node of each layer, and the end.
+        unknowns: (c, 24), those of each cell's corners.
         volume_mm3: the organ's volume, distributed over the nodes.
         center_mm: the organ's centre of mass.
     """
@@ -143,10 +144,10 @@ class LatticeSolid:
         self.bounds = [*starts.tolist(), len(self.nodes)]
         number = np.empty(int(np.prod(lattice.shape)), int)
         number[self.nodes] = np.arange(len(self.nodes))
-        self.cells = number[corners]
-        self.unknowns = (3 * self.cells[:, :, None] + np.arange(3)).reshape(-1, 24)
+        cells = number[corners]
+        self.unknowns = (3 * cells[:, :, None] + np.arange(3)).reshape(-1, 24)
         volume = np.repeat(self.organ * lattice.spacing_mm**3 / 8, 8)
-        self.volume_mm3 = np.bincount(self.cells.ravel(), volume, len(self.nodes))
+        self.volume_mm3 = np.bincount(cells.ravel(), volume, len(self.nodes))
         self.nodes_mm = lattice.nodes_mm()[self.nodes]
         self.center_mm = self.volume_mm3 @ self.nodes_mm / self.volume_mm3.sum()
 
@@ -158,9 +159,14 @@ class LatticeSolid:
         weights = np.outer(force, dilatation).ravel()
         return np.bincount(self.unknowns.ravel(), weights, 3 * len(self.nodes))
 
-    def weights(self, points_mm: Float[np.ndarray, "p 3"]) -> csr_matrix:
+    def weights(self, points_mm: Points) -> csr_matrix:
         """Sparse (p, n): values at points from values at the solid's nodes."""
         return self.lattice.weights(points_mm)[:, self.nodes]
+
+    def at(self, points_mm: Points, values: Float[np.ndarray, "f k"]) -> Float[np.ndarray, "p 3 k"]:
+        """Values of the unknowns at points."""
+        by_node = values.reshape(len(self.nodes), -1)
+        return (self.weights(points_mm) @ by_node).reshape(len(points_mm), 3, -1)
 
     def stiffness(self, moduli: Float[np.ndarray, " c"]) -> csr_matrix:
         """The stiffness matrix for a Young's modulus (N/mm2) in each cell."""

@@ -146,8 +146,7 @@ def indent(
 def hold(problem: ReducedProblem, patch: int, radius_mm: float, shift_mm: Vector) -> None:
     """A region around a patch is held at a shift."""
     patches = problem.organ.patches
-    spot = patches.spot(patches.points_mm[patch], radius_mm)
-    springs = _GRIP * patches.areas_mm2 * spot
+    springs = _GRIP * patches.areas_mm2 * patches.spot(patches.points_mm[patch], radius_mm)
     for axis, shift in zip(np.eye(3), shift_mm, strict=True):
         problem.tie(problem.organ.along(axis), shift, springs)
 
@@ -233,8 +232,7 @@ def in_bed(organ: ReducedModel, up: Vector, rng: np.random.Generator) -> Reduced
         problem.tie(down, 0.0, 1e-3 * springs)  # keeps it over the bed
     else:
         problem.tie(down, 0.0, springs)
-    grip = rng.uniform(0, 0.3)
-    one = perpendicular(up)
+    grip, one = rng.uniform(0, 0.3), perpendicular(up)
     for aside in (one, np.cross(up, one)):
         problem.tie(organ.along(aside), 0.0, grip * springs)
     return problem

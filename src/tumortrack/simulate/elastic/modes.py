@@ -25,12 +25,11 @@ _FREE = 1e-4  # N/mm: keeps the rigid motions solvable where nothing touches
 
 @dataclass(frozen=True, eq=False)
 class Patches:
-    """The organ's surface as some hundred areas, where loads act and obstacles are felt: their
-    centroid, area and mean outward normal."""
+    """The organ's surface as some hundred areas, where loads act and obstacles are felt."""
 
-    points_mm: Float64[np.ndarray, "p 3"]
+    points_mm: Float64[np.ndarray, "p 3"]  # centroids
     areas_mm2: Float64[np.ndarray, " p"]
-    normals: Float64[np.ndarray, "p 3"]
+    normals: Float64[np.ndarray, "p 3"]  # mean, outward
 
     def spot(self, middle_mm: np.ndarray, radius_mm: float) -> Float64[np.ndarray, " p"]:
         """A weight that falls off from a place as a Gaussian."""
@@ -89,8 +88,7 @@ def modes_of(
         if turn == 0:
             swelling = without_rigid(factor.solve(forces[:, -1:]))
     responses = without_rigid(responses)
-    weights = solid.weights(patches.points_mm)
-    moved = (weights @ responses.reshape(len(solid.nodes), -1)).reshape(-1, 3, responses.shape[1])
+    moved = solid.at(patches.points_mm, responses)
     responses /= np.linalg.norm(moved, axis=1).max(0)  # each moves its farthest patch by 1 mm
 
     energies, mixes = np.linalg.eigh(responses.T @ (mass * responses))
@@ -98,8 +96,7 @@ def modes_of(
     kept = responses @ (mixes[:, : count - 1] / np.sqrt(energies[: count - 1]))
     swelling -= kept @ (kept.T @ (mass * swelling))
     shapes = np.column_stack([kept, swelling / np.sqrt((mass * swelling**2).sum())])
-    shapes *= np.sqrt(solid.volume_mm3.sum())
-    return shapes
+    return shapes * np.sqrt(solid.volume_mm3.sum())
 
 
 def random_loads(
@@ -113,8 +110,8 @@ def random_loads(
     shares = np.array([0.36, 0.28, 0.12, 0.16, 0.08])
     chosen = rng.choice(len(kinds), count, p=shares / shares.sum())
     surface = np.stack([kinds[n]() for n in chosen], -1)  # (p, 3, n)
-    weights = solid.weights(patches.points_mm)
-    return (weights.T @ surface.reshape(len(surface), -1)).reshape(-1, count)
+    spread = solid.weights(patches.points_mm).T @ surface.reshape(len(surface), -1)
+    return spread.reshape(-1, count)
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,12 +161,11 @@ class _Tractions:
 
     def shear(self) -> np.ndarray:
         """Two regions are pulled in opposite directions."""
-        rng, points = self.rng, self.patches.points_mm
-        one, other = (
-            self.patches.spot(points[rng.integers(len(points))], radius * self._size_mm)
-            * self.patches.areas_mm2
-            for radius in rng.uniform(0.3, 0.6, 2)
-        )
+        rng, patches = self.rng, self.patches
+        radii = rng.uniform(0.3, 0.6, 2) * self._size_mm
+        middles = (patches.points_mm[rng.integers(len(patches.points_mm))] for _ in radii)
+        spots = (patches.spot(*place) for place in zip(middles, radii, strict=True))
+        one, other = (spot * patches.areas_mm2 for spot in spots)
         along = unit(rng.normal(size=3))
         return _total(one, along) - _total(other, along)
 
@@ -203,8 +199,7 @@ class ReducedModel:
     ) -> None:
         k, n = modes.shape[1], len(solid.nodes)
         self.solid, self.modes, self.patches, self.n_modes = solid, modes, patches, k
-        weights = solid.weights(patches.points_mm)
-        bent = (weights @ modes.reshape(n, -1)).reshape(-1, 3, k)
+        bent = solid.at(patches.points_mm, modes)
         arms = (patches.points_mm - solid.center_mm) / LEVER_MM
         turned = np.stack([np.cross(axis, arms) for axis in np.eye(3)], -1)
         shifted = np.broadcast_to(np.eye(3), turned.shape)
@@ -214,10 +209,8 @@ class ReducedModel:
         rigid = np.concatenate([np.eye(3) * volume.sum(), np.zeros((3, 3))], 1)
         self.volume_moves = np.concatenate([mean, rigid], 1)
         self.swelling = np.append(modes.T @ solid.swelling, np.zeros(6))
-        self._tissue, self._tumors = (
-            modes.T @ (solid.stiffness(fractions) @ modes)
-            for fractions in (solid.organ, solid.tumor)
-        )
+        self._tissue = modes.T @ (solid.stiffness(solid.organ) @ modes)
+        self._tumors = modes.T @ (solid.stiffness(solid.tumor) @ modes)
 
     def stiffness(self, modulus: float, contrast: float) -> Float64[np.ndarray, "m m"]:
         """For the tissue's Young's modulus (N/mm2) and how many times stiffer the tumors are."""
