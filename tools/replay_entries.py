@@ -34,7 +34,7 @@ from tumortrack.tracking.tracker import Follower, FollowerConfig, Tracker
 from tumortrack.training.model import load_model
 from tumortrack.training.presets import PRESETS, pretraining
 from tumortrack.training.pretrain import kidney_stream
-from tumortrack.training.run import Pretraining
+from tumortrack.training.state import Pretraining
 from tumortrack.training.task import task_of
 from tumortrack.training.train import TrainingRun, train
 from tumortrack_lab.twin.dataset import StateCache, TwinRun

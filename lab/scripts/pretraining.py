@@ -36,9 +36,8 @@ from tumortrack.report.drawing import new_figure, save
 from tumortrack.simulate.scene import SceneStream
 from tumortrack.training.model import PretrainedWeights, load_start
 from tumortrack.training.presets import clinic
-from tumortrack.training.run import TrainingRun
 from tumortrack.training.scenes import batches
-from tumortrack.training.state import TrainingState
+from tumortrack.training.state import TrainingRun, TrainingState
 from tumortrack.training.task import RegistrationTask, ValidationScenes, mean_iou_of
 from tumortrack_lab.study.cases import named_folders, phantom_case
 from tumortrack_lab.study.document import ReportWriter, table

@@ -39,9 +39,8 @@ from tumortrack.registration.rest_shape import shape_of
 from tumortrack.report.drawing import new_figure, save
 from tumortrack.simulate.scene import SceneStream, body_for
 from tumortrack.training.presets import PRESETS
-from tumortrack.training.run import TrainingRun, settle_end
 from tumortrack.training.scenes import batches
-from tumortrack.training.state import TrainingState
+from tumortrack.training.state import TrainingRun, TrainingState, settle_end
 from tumortrack.training.task import ValidationScenes, label_miou, mean_iou_of, task_of
 from tumortrack_lab.study.cases import phantom_case
 from tumortrack_lab.study.document import ReportWriter, table

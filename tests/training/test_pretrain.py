@@ -34,7 +34,7 @@ from tumortrack.simulate.occupancy import OccupancyConfig
 from tumortrack.training.model import PretrainedWeights, load_start
 from tumortrack.training.presets import clinic, pretraining, quick
 from tumortrack.training.pretrain import KidneyStream, kidney_stream, pretrain
-from tumortrack.training.run import Pretraining, TrainingProgress, TrainingRun, provenance
+from tumortrack.training.state import Pretraining, TrainingProgress, TrainingRun, provenance
 from tumortrack.training.task import TrainingTask, task_of
 from tumortrack.training.train import train
 

@@ -26,8 +26,13 @@ from tumortrack.models.config import RegistrationHeadConfig, TrainConfig
 from tumortrack.models.normalisation import CloudBox
 from tumortrack.training.model import load_model
 from tumortrack.training.presets import clinic, paper, quick
-from tumortrack.training.run import TrainingProgress, learning_rate, settle_end
-from tumortrack.training.state import Diverged, TrainingState
+from tumortrack.training.state import (
+    Diverged,
+    TrainingProgress,
+    TrainingState,
+    learning_rate,
+    settle_end,
+)
 from tumortrack.training.train import TrainingRun, divide_cores, train, work_folder
 from warp_objects import train_slim
 
@@ -152,7 +157,7 @@ HISTORY_ON_A_FULL_DISK = """
 import resource, sys
 from pathlib import Path
 from tumortrack.core.errors import InputError, StorageError
-from tumortrack.training.run import TrainingProgress
+from tumortrack.training.state import TrainingProgress
 from tumortrack.training.train import history
 
 folder, mode = Path(sys.argv[1]), sys.argv[2]

@@ -134,7 +134,7 @@ class Pretrain:
         from tumortrack.training.model import PRETRAINED
         from tumortrack.training.presets import pretraining
         from tumortrack.training.pretrain import pretrain
-        from tumortrack.training.run import Pretraining
+        from tumortrack.training.state import Pretraining
 
         run = Pretraining(
             config=pretraining(),

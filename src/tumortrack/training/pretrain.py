@@ -27,9 +27,8 @@ from tumortrack.registration.rest_shape import long_axis_of
 from tumortrack.simulate.occupancy import FixedPoints
 from tumortrack.simulate.scene import Batch, SceneStream, body_for
 from tumortrack.training.model import save_start
-from tumortrack.training.run import Pretraining
 from tumortrack.training.scenes import Scenes, batches
-from tumortrack.training.state import TrainingState
+from tumortrack.training.state import Pretraining, TrainingState
 from tumortrack.training.train import Report, divide_cores, run_steps, work_folder
 
 

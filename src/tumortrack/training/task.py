@@ -31,7 +31,7 @@ from tumortrack.simulate.elastic.body import ElasticBody
 from tumortrack.simulate.occupancy import FixedPoints, OccupancyPool, PartPool, organ_pool
 from tumortrack.simulate.scene import SceneRecipe, Simulator, body_for, refill
 from tumortrack.simulate.scene_folder import draw_targets
-from tumortrack.training.run import TrainingRun
+from tumortrack.training.state import TrainingRun
 
 _AT_ONCE = 32  # scenes
 _FIT_ON = 32  # scenes

@@ -27,9 +27,14 @@ from tumortrack.models.model import Model, Network
 from tumortrack.simulate.scene import SceneStream
 from tumortrack.training.distributed import ProcessGroup, process_group
 from tumortrack.training.model import load_model, save_model
-from tumortrack.training.run import TrainingProgress, TrainingRun, provenance, settle_end
 from tumortrack.training.scenes import Scenes, scenes_for
-from tumortrack.training.state import TrainingState
+from tumortrack.training.state import (
+    TrainingProgress,
+    TrainingRun,
+    TrainingState,
+    provenance,
+    settle_end,
+)
 from tumortrack.training.task import task_of
 
 __all__ = ["Interrupted", "TrainingRun", "TrainingStatus", "train"]

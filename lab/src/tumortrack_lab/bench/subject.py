@@ -31,7 +31,7 @@ from tumortrack.simulate.deform import DragConfig
 from tumortrack.simulate.elastic.body import ElasticBody
 from tumortrack.simulate.scene import RenderedScene, SceneConfig, SceneRecipe, Simulator
 from tumortrack.training.model import load_model
-from tumortrack.training.run import TrainingRun
+from tumortrack.training.state import TrainingRun
 from tumortrack.training.train import TrainingStatus, train
 from tumortrack_lab.bench.occupancy import OccupancyWorkload
 from tumortrack_lab.bench.overfitted import overfit_scene

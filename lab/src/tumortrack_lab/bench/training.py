@@ -29,8 +29,7 @@ from tumortrack.simulate.occupancy import (
 )
 from tumortrack.simulate.scene import SceneConfig, SceneRecipe, SceneStream, Simulator
 from tumortrack.training.model import load_model
-from tumortrack.training.run import TrainingRun
-from tumortrack.training.state import TrainingState
+from tumortrack.training.state import TrainingRun, TrainingState
 from tumortrack.training.train import TrainingStatus, train
 from tumortrack_lab.bench.counts import (
     blend_flops,
