@@ -189,9 +189,7 @@ def surface_distance(mesh: Mesh, points_mm: Points) -> Float[np.ndarray, " n"]:
     return distance
 
 
-def _nearest_of(
-    samples_mm: Float[np.ndarray, "p 3"], points_mm: Points
-) -> Float32[np.ndarray, " n"]:
+def _nearest_of(samples_mm: np.ndarray, points_mm: Points) -> Float32[np.ndarray, " n"]:
     from scipy.spatial import cKDTree
 
     # Points far from a surface have many almost nearest ones: large, loose leaves are six times

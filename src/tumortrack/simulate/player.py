@@ -55,24 +55,16 @@ _NOTHING = Mesh(np.empty((0, 3)), np.empty((0, 3), np.int32))
 
 
 class ScenePlayerConfig(Config, frozen=True, kw_only=True):
-    """What moves and what is seen; a length of zero switches its part off.
-
-    Attributes:
-        distance_mm: depth of the organ's nearest point, at rest and before the camera sways.
-        breath_mm, swell: the organ's motion down the body and back, and the strain of its volume
-            that goes with it.
-        push_mm: how deep an instrument presses at each of ``places`` in turn.
-        sway_mm, sway_degrees: the camera's slow motion along and about each axis.
-    """
+    """What moves and what is seen; a length of zero switches its part off."""
 
     width: int = 424
     height: int = 240
-    distance_mm: float = 118.0
-    breath_mm: float = 6.0
-    swell: float = 0.01
-    push_mm: float = 8.0
+    distance_mm: float = 118.0  # depth of the organ's nearest point, before all motion
+    breath_mm: float = 6.0  # down the body and back
+    swell: float = 0.01  # strain of the organ's volume with a breath
+    push_mm: float = 8.0  # how deep an instrument presses, at each place in turn
     places: int = 3
-    sway_mm: float = 3.0
+    sway_mm: float = 3.0  # of the camera along each axis, and about each
     sway_degrees: float = 3.0
     table: bool = True
     drape: bool = False

@@ -22,13 +22,7 @@ from tumortrack.core.mesh_files import read_anatomy, write_anatomy
 from tumortrack.core.store import new_folder, read_json, write_atomically, write_json
 from tumortrack.core.types import Anatomy, DepthFrame, SensorCloud
 from tumortrack.imaging.meshes import mesh_of, solid_of
-from tumortrack.sense.files import (
-    read_cloud,
-    read_depth_png,
-    write_cloud_ply,
-    write_depth_png,
-    write_intrinsics,
-)
+from tumortrack.sense import files
 from tumortrack.simulate.occupancy import contains, labels_of
 
 # Our own scenes state in meta.json that kidney.ply is the whole organ, tumors included.
@@ -90,10 +84,10 @@ class Scene:
 
 def write_scene_files(folder: Path, scene: Scene) -> None:
     """A scene's files into a folder that is being filled aside; raises StorageError."""
-    write_cloud_ply(folder / "cloud.ply", scene.cloud.points_mm)
+    files.write_cloud_ply(folder / "cloud.ply", scene.cloud.points_mm)
     if scene.depth is not None:
-        write_depth_png(folder / "depth.png", scene.depth)
-        write_intrinsics(folder / "intrinsics.json", scene.depth.intrinsics)
+        files.write_depth_png(folder / "depth.png", scene.depth)
+        files.write_intrinsics(folder / "intrinsics.json", scene.depth.intrinsics)
     write_anatomy(folder, scene.reference)
     if scene.targets is not None:
         points = scene.targets.points_ct, scene.targets.points_mm
@@ -131,10 +125,13 @@ def read_scene(folder: Path) -> Scene:
     stamp_ns = meta.get(_STAMP, 0)
     if not isinstance(stamp_ns, int):
         raise InputError(f"{folder / 'meta.json'}: {_STAMP} must be a whole number of ns.")
-    cloud, _ = read_cloud(folder / "cloud.ply")
-    targets = read_targets(folder / _TARGETS) if (folder / _TARGETS).exists() else None
-    cloud = SensorCloud(cloud.points_mm, stamp_ns)
-    return Scene(cloud, reference, _depth(folder), meta, targets)
+    depth, camera, table = (folder / name for name in ("depth.png", "intrinsics.json", _TARGETS))
+    if depth.exists() and not camera.exists():
+        raise InputError(f"{folder} has depth.png but lacks intrinsics.json, which explains it.")
+    cloud = SensorCloud(files.read_cloud(folder / "cloud.ply")[0].points_mm, stamp_ns)
+    frame = files.read_depth_png(depth, camera) if depth.exists() else None
+    targets = read_targets(table) if table.exists() else None
+    return Scene(cloud, reference, frame, meta, targets)
 
 
 def list_scenes(folder: Path) -> list[Path]:
@@ -154,15 +151,6 @@ def list_scenes(folder: Path) -> list[Path]:
             "Make some with: tumortrack simulate CASE DATASET."
         )
     return scenes
-
-
-def _depth(folder: Path) -> DepthFrame | None:
-    image, camera = folder / "depth.png", folder / "intrinsics.json"
-    if not image.exists():
-        return None
-    if not camera.exists():
-        raise InputError(f"{folder} has depth.png but lacks intrinsics.json, which explains it.")
-    return read_depth_png(image, camera)
 
 
 def _check_parts(folder: Path, anatomy: Anatomy) -> None:

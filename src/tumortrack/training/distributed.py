@@ -10,7 +10,7 @@ the exception: it sees its process's part. The main process alone validates, wri
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from datetime import timedelta
@@ -63,7 +63,7 @@ class ProcessGroup:
             return value
         gradients = [p.grad for p in parameters if p.grad is not None]
         flat = torch.cat([*(g.flatten() for g in gradients), value.detach().float().flatten()])
-        self._sum(flat)
+        self._together(distributed.all_reduce, flat)
         flat /= self.size
         *parts, mean = flat.split([*(g.numel() for g in gradients), 1])
         for gradient, part in zip(gradients, parts, strict=True):
@@ -76,24 +76,18 @@ class ProcessGroup:
             return elapsed_s, stop
         mine = [elapsed_s if self.is_main else 0.0, float(stop)]
         total = torch.tensor(mine, dtype=torch.float64).to(self.device)
-        self._sum(total)
+        self._together(distributed.all_reduce, total)
         elapsed_s, stops = total.tolist()
         return elapsed_s, stops > 0
 
-    def _sum(self, values: Tensor) -> None:
-        with self._lost_process():
-            distributed.all_reduce(values)
-
     def close(self) -> None:
         """Leave the group."""
-        with self._lost_process():
-            distributed.destroy_process_group()
+        self._together(distributed.destroy_process_group)
 
-    @contextmanager
-    def _lost_process(self) -> Iterator[None]:
-        """One error for what Gloo and NCCL raise where a process is gone."""
+    def _together(self, call: Callable[..., object], *values: Tensor) -> None:
+        """What waits for the others; one error for what Gloo and NCCL raise where one is gone."""
         try:
-            yield
+            call(*values)
         except RuntimeError as error:
             raise ProcessLost(
                 f"process {self.rank} of {self.size} stops: another one of this training has "
@@ -124,9 +118,8 @@ def process_group(device: str) -> Iterator[ProcessGroup]:
     try:
         distributed.init_process_group(backend, timeout=_PATIENCE)
     except (RuntimeError, ValueError) as error:
-        raise ProcessLost(
-            f"the processes of this training do not find each other: {error}"
-        ) from error
+        lost = f"the processes of this training do not find each other: {error}"
+        raise ProcessLost(lost) from error
     group = ProcessGroup(chosen, distributed.get_rank(), size, on_machine)
     try:
         yield group

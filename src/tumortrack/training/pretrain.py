@@ -17,12 +17,7 @@ from tumortrack.core.errors import InputError
 from tumortrack.models.config import RegistrationHeadConfig
 from tumortrack.models.hardware import choose_device
 from tumortrack.phantom.kidneys import random_anatomy
-from tumortrack.registration.canonical_frame import (
-    CanonicalFrame,
-    generic_points,
-    initialize_canonical,
-    upright_of,
-)
+from tumortrack.registration import canonical_frame
 from tumortrack.registration.rest_shape import long_axis_of
 from tumortrack.simulate.occupancy import FixedPoints
 from tumortrack.simulate.scene import Batch, SceneStream, body_for
@@ -37,7 +32,7 @@ class KidneyStream:
     """Batches of many organs in turn, each in its upright frame: batch ``i`` shows organ ``i``
     modulo their number."""
 
-    organs: tuple[tuple[SceneStream, CanonicalFrame], ...]
+    organs: tuple[tuple[SceneStream, canonical_frame.CanonicalFrame], ...]
 
     def batch(self, index: int) -> Batch:
         """The batch with this number, its lengths scaled with the organ's."""
@@ -53,14 +48,14 @@ def kidney_stream(run: Pretraining) -> KidneyStream:
     seeds = np.random.default_rng([run.seed, 0x517E]).integers(1 << 31, size=run.anatomies)
     config, organs = run.config, []
     assert isinstance(config.network.decoder, RegistrationHeadConfig)
-    generic = generic_points(config.network.decoder.points)
+    generic = canonical_frame.generic_points(config.network.decoder.points)
     for seed in seeds.tolist():
         anatomy_ct, up_lps = random_anatomy(seed)
         body = body_for(anatomy_ct, up_lps, config.scene, seed)
         if body is None:
             raise InputError("pretraining needs elastic deformations; the configuration has none.")
         organ = anatomy_ct.organ
-        upright = upright_of(organ, up_lps, body.center_ct, long_axis_of(organ))
+        upright = canonical_frame.upright_of(organ, up_lps, body.center_ct, long_axis_of(organ))
         fixed = FixedPoints(upright.in_ct(generic).astype(np.float32))
         scenes = (anatomy_ct, up_lps, config.scene, fixed, run.seed)
         organs.append((SceneStream(*scenes, "train", config.batch_size, body), upright))
@@ -74,7 +69,7 @@ def pretrain(run: Pretraining, folder: Path, report: Report) -> dict[str, Any]:
         device = choose_device(run.device)
         workers = divide_cores(device, run.workers)
         state = TrainingState(run, device)
-        state.initialize(initialize_canonical)
+        state.initialize(canonical_frame.initialize_canonical)
         state.resume(work)
         steps = range(state.progress.step, run.steps)
         made = batches(kidney_stream(run).batch, steps, 0, workers, device)

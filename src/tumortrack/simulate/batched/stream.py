@@ -20,20 +20,14 @@ from torch import Tensor
 from tumortrack.sense.camera import d405
 from tumortrack.sense.cloud import FEWEST_POINTS, draw_some
 from tumortrack.sense.noise import CALIBRATED, CLEAN
+from tumortrack.simulate import scene as scenes
 from tumortrack.simulate.batched.render import depth_images
 from tumortrack.simulate.deform import Chain, DragConfig, RestConfig, StretchConfig, links_of
 from tumortrack.simulate.deform.base import Deformation
 from tumortrack.simulate.deform.drag import Drags
 from tumortrack.simulate.deform.stretch import Stretch
 from tumortrack.simulate.occupancy import OccupancyPool
-from tumortrack.simulate.scene import (
-    ATTEMPTS,
-    SceneRecipe,
-    SceneStream,
-    crop_of,
-    refill,
-    shows_nothing,
-)
+from tumortrack.simulate.scene import SceneRecipe, SceneStream
 
 # clouds_mm (b, n, 3), points_mm (b, q, 3), labels (b, q), camera_from_ct (b, 4, 4)
 Tensors = tuple[Tensor, Tensor, Tensor, Tensor]
@@ -140,8 +134,8 @@ class DeviceStream:
             if len(few) == 0:
                 return RenderedBatch(plan, depth_mm, counted, available)
             attempts = plan.attempts[few] + 1
-            if attempts.max() >= ATTEMPTS:
-                raise shows_nothing(plan.recipes[few[attempts.argmax()]])
+            if attempts.max() >= scenes.ATTEMPTS:
+                raise scenes.shows_nothing(plan.recipes[few[attempts.argmax()]])
             again = self._planned(plan.recipes[few].tolist(), attempts.tolist())
             plan, rows = plan.replaced(few, again), self._sent(few)
             depth_mm[rows], counted[rows] = self._render(again)
@@ -156,7 +150,7 @@ class DeviceStream:
         counts = rendered.available.tolist(), plan.n_points.tolist()
         for state, count, wanted in zip(plan.states, *counts, strict=True):
             rng.bit_generator.state = state
-            ranks.append(refill(draw_some(count, wanted, rng), n))
+            ranks.append(scenes.refill(draw_some(count, wanted, rng), n))
             windows.append(self._pool.windows(rng))
         return np.stack(ranks).astype(np.int32), np.array(windows)
 
@@ -189,7 +183,7 @@ class DeviceStream:
             rng = recipe.generator(attempt)
             drawn = simulator.draw(rng)
             rng.integers(2**62)  # the seed of a noise that is off
-            crop = crop_of(simulator.config, drawn.free, rng)
+            crop = scenes.crop_of(simulator.config, drawn.free, rng)
             motion = _as_arrays(drawn.deformation, n_drags, n_stretches)
             depths = np.float32(crop.near_mm), np.float32(crop.far_mm), crop.n_points
             rows.append((drawn.camera_from_ct, *motion, *depths, rng.bit_generator.state))

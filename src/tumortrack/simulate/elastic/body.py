@@ -51,20 +51,15 @@ class ElasticBody:
 
     A state is a vector of coefficients; points follow the velocity ``modes @ coefficients`` for
     one unit of time. Outside the organ space follows smoothly.
-
-    Attributes:
-        origin_mm, spacing_mm: node (0, 0, 0) of the lattice, and its step.
-        center_ct: the organ's centre of mass.
-        modes: displacement at each node; a unit coefficient moves the organ by 1 mm rms. Free of
-            rigid motion; the last one swells, the others keep volume.
-        states: the library, one state a row.
     """
 
-    origin_mm: Float32[np.ndarray, " 3"]
+    origin_mm: Float32[np.ndarray, " 3"]  # node (0, 0, 0) of the lattice
     spacing_mm: float
-    center_ct: Float64[np.ndarray, " 3"]
+    center_ct: Float64[np.ndarray, " 3"]  # the organ's centre of mass
+    # Displacement at each node; a unit coefficient moves the organ by 1 mm rms. Free of rigid
+    # motion; the last one swells, the others keep volume.
     modes: Float32[np.ndarray, "i j k 3 m"]
-    states: Float32[np.ndarray, "s m"]
+    states: Float32[np.ndarray, "s m"]  # the library
 
     def __post_init__(self) -> None:
         shapes = (self.modes.ndim, self.states.ndim, self.modes.shape[-1])
@@ -95,7 +90,7 @@ class ElasticBody:
         return np.linalg.inv(self.covariance)
 
     def velocity(self, coefficients: Float[np.ndarray, " m"]) -> Field:
-        """The field that points follow, mm per unit of time, at the lattice's nodes."""
+        """The field that points follow, mm per unit of time."""
         return combine(self.modes, np.asarray(coefficients, np.float32))
 
     def carry(self, coefficients: Float[np.ndarray, " m"], points_ct: Points) -> Moved:

@@ -116,16 +116,8 @@ def _filled(mesh: Mesh, lattice: ElementLattice) -> Float64[np.ndarray, " c"]:
 
 
 class LatticeSolid:
-    """An organ and its tumors on a lattice. Cells that do not touch a filled one are left out.
-
-    Attributes:
-        organ, tumor: filled fraction of each remaining cell.
-        nodes: numbers in the lattice, ordered by layers along the lattice's longest axis.
-        bounds: the first node of each layer, and the end.
-        unknowns: (c, 24), those of each cell's corners.
-        volume_mm3: the organ's volume, distributed over the nodes.
-        center_mm: the organ's centre of mass.
-    """
+    """An organ and its tumors on a lattice. Cells that do not touch a filled one are left out; the
+    nodes run by layers along the lattice's longest axis."""
 
     def __init__(self, anatomy_ct: Anatomy, lattice: ElementLattice, poisson: float) -> None:
         organ = _filled(anatomy_ct.organ, lattice)
@@ -134,19 +126,20 @@ class LatticeSolid:
             tumor = np.maximum(tumor, _filled(part, lattice))
         near = binary_dilation((organ > 0).reshape(lattice.cells), np.ones((3, 3, 3))).ravel()
         self.lattice, self.poisson = lattice, poisson
+        # The filled fraction of each remaining cell.
         self.organ, self.tumor = organ[near], np.minimum(tumor, organ)[near]
         corners = lattice.corner_nodes(np.indices(lattice.cells).reshape(3, -1).T[near])
         used = np.unique(corners)
         layer = np.unravel_index(used, lattice.shape)[int(np.argmax(lattice.shape))]
         order = np.argsort(layer, kind="stable")
-        self.nodes = used[order]
+        self.nodes = used[order]  # their numbers in the lattice
         starts = np.flatnonzero(np.diff(layer[order], prepend=-1))
-        self.bounds = [*starts.tolist(), len(self.nodes)]
+        self.bounds = [*starts.tolist(), len(self.nodes)]  # of the layers
         number = np.empty(int(np.prod(lattice.shape)), int)
         number[self.nodes] = np.arange(len(self.nodes))
         cells = number[corners]
-        self.unknowns = (3 * cells[:, :, None] + np.arange(3)).reshape(-1, 24)
-        volume = np.repeat(self.organ * lattice.spacing_mm**3 / 8, 8)
+        self.unknowns = (3 * cells[:, :, None] + np.arange(3)).reshape(-1, 24)  # by cell
+        volume = np.repeat(self.organ * lattice.spacing_mm**3 / 8, 8)  # distributed over the nodes
         self.volume_mm3 = np.bincount(cells.ravel(), volume, len(self.nodes))
         self.nodes_mm = lattice.nodes_mm()[self.nodes]
         self.center_mm = self.volume_mm3 @ self.nodes_mm / self.volume_mm3.sum()

@@ -257,9 +257,7 @@ def random_state(
         return None
     state = found[: organ.n_modes]
     farthest = np.linalg.norm(organ.moves[:, :, : organ.n_modes] @ state, axis=1).max()
-    if farthest > 1.5 * _FARTHEST_MM:
-        return None
-    return state * min(1.0, _FARTHEST_MM / farthest)
+    return None if farthest > 1.5 * _FARTHEST_MM else state * min(1.0, _FARTHEST_MM / farthest)
 
 
 def _press_strip(problem: ReducedProblem, outward: np.ndarray, rng: np.random.Generator) -> None:

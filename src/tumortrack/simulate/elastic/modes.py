@@ -186,13 +186,7 @@ def _total(weights: np.ndarray, along: np.ndarray) -> np.ndarray:
 
 
 class ReducedModel:
-    """A solid in the space of its modes and six rigid motions: k + 6 unknowns.
-
-    Attributes:
-        moves: of each patch, per unknown (p, 3, k + 6).
-        volume_moves: of the organ's volume, per unknown (3, k + 6), mm3.
-        swelling: force on each unknown of a suppressed volume strain of 1, Young's modulus 1.
-    """
+    """A solid in the space of its modes and six rigid motions: k + 6 unknowns."""
 
     def __init__(
         self, solid: LatticeSolid, modes: Float64[np.ndarray, "f k"], patches: Patches
@@ -203,12 +197,12 @@ class ReducedModel:
         arms = (patches.points_mm - solid.center_mm) / LEVER_MM
         turned = np.stack([np.cross(axis, arms) for axis in np.eye(3)], -1)
         shifted = np.broadcast_to(np.eye(3), turned.shape)
-        self.moves = np.concatenate([bent, shifted, turned], -1)
+        self.moves = np.concatenate([bent, shifted, turned], -1)  # of patches: (p, 3, k + 6)
         volume = solid.volume_mm3
         mean = np.tensordot(volume, modes.reshape(n, 3, k), 1)
         rigid = np.concatenate([np.eye(3) * volume.sum(), np.zeros((3, 3))], 1)
-        self.volume_moves = np.concatenate([mean, rigid], 1)
-        self.swelling = np.append(modes.T @ solid.swelling, np.zeros(6))
+        self.volume_moves = np.concatenate([mean, rigid], 1)  # of all volume: (3, k + 6), mm3
+        self.swelling = np.append(modes.T @ solid.swelling, np.zeros(6))  # as the solid's
         self._tissue = modes.T @ (solid.stiffness(solid.organ) @ modes)
         self._tumors = modes.T @ (solid.stiffness(solid.tumor) @ modes)
 
