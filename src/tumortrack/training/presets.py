@@ -49,9 +49,8 @@ def paper(anatomy: Anatomy, rotations: Rotations = "limited") -> TrainConfig:
 
 
 def quick(anatomy: Anatomy, rotations: Rotations = "limited") -> TrainConfig:
-    """A slim network that learns in minutes on two CPU cores, from endless noisy scenes: drags
-    of the paper's configurations 3 and 6, half of them squeezed and bent as a whole, half of
-    them seen from any distance between 8 and 25 cm, half of them with some background."""
+    """A slim network that learns in minutes on two CPU cores, from endless noisy scenes: drags of
+    the paper's configurations 3 and 6, half of them squeezed and bent as a whole."""
     local = tuple(DragConfig(steps=CONFIGURATIONS[n]) for n in (3, 6))
     squeezed = tuple(ChainConfig(links=(drag, StretchConfig())) for drag in local)
     return TrainConfig(
@@ -122,11 +121,10 @@ def paper_network(n_classes: int) -> NetworkConfig:
     """The paper's network.
 
     From the paper: PointNet++ to a 1024-d latent; 8 hidden layers x 512, ReLU, a skip into the
-    fifth, batch norm on "the skip and the final layer": read as the fifth and the last hidden
-    layer. From the follow-up (LUDO, IEEE T-RO 2025), where the paper is silent: the levels'
-    ratios, radii, neighbours and widths, and the cloud's bounding box as normalisation. From
-    PointNet++: batch norm in the encoder. Ours: raw query coordinates (the follow-up adds
-    octaves; the paper names none) and He's start of the weights.
+    fifth, batch norm on "the skip and the final layer": the fifth and the last hidden one. From
+    the follow-up (LUDO, IEEE T-RO 2025): the levels' ratios, radii, neighbours and widths, and the
+    cloud's bounding box as normalisation. From PointNet++: batch norm in the encoder. Ours: raw
+    query coordinates (the follow-up adds octaves; the paper names none), He's start of the weights.
     """
     return NetworkConfig(
         encoder=PointNet2Config(

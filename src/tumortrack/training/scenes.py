@@ -110,11 +110,7 @@ class _Made(Dataset[Any]):
 
 
 def _loader(
-    make: Callable[..., Any],
-    arguments: Iterable[tuple[int, ...]],
-    workers: int,
-    ahead: int,
-    **more: Any,
+    make: Callable[..., Any], arguments: Iterable[Any], workers: int, ahead: int, **more: Any
 ) -> DataLoader[Any]:
     """What processes, each of which works ``ahead``, make of these arguments, in their order;
     arrays in a tuple become tensors."""

@@ -93,7 +93,7 @@ class TrainingTask(ABC):
             "network": network,
             "config": self._run.config,
             "parts": self._run.anatomy_ct.names,
-            "query_box_mm": self._scenes.query_box_mm,
+            "query_box_mm": grown_box(self._scenes.boxes_mm),
             "in_distribution": InDistributionRange(spread_mm=spread_mm, fit_mm=fit_mm),
             "provenance": provenance,
         }
@@ -238,11 +238,6 @@ class ValidationScenes:
     points_mm: Float32[np.ndarray, "s q 3"]
     labels: UInt8[np.ndarray, "s q"]
     boxes_mm: Float64[np.ndarray, "s 2 3"]  # the organ's, relative to the points' median
-
-    @property
-    def query_box_mm(self) -> Float64[np.ndarray, "2 3"]:
-        """Where the organ can lie, relative to the median of the observed points."""
-        return grown_box(self.boxes_mm)
 
 
 def validation_scenes(

@@ -40,8 +40,7 @@ from tumortrack.training.task import task_of
 __all__ = ["Interrupted", "TrainingRun", "TrainingStatus", "train"]
 
 REPORT_EVERY_S = 5.0
-MOST_THREADS = 16  # more only wait for each other in layers this small
-_MOST_WORKERS = 16
+_MOST = 16  # processes that make scenes; and threads: more only wait, in layers this small
 _LOCK = ".lock"
 _Item = TypeVar("_Item")
 # Of a validation: names and digits in history.jsonl, and tags of TensorBoard
@@ -213,11 +212,11 @@ def divide_cores(device: torch.device, workers: int | None, sharing: int = 1) ->
     """
     cores = available_cores() // sharing
     if workers is None:
-        workers = max(1, min(_MOST_WORKERS, cores))
+        workers = max(1, min(_MOST, cores))
     if device.type == "cpu":
         keep_freed_memory()
         granted = os.environ.get("OMP_NUM_THREADS", "")
-        most = min(int(granted) if granted.isdigit() else MOST_THREADS, MOST_THREADS)
+        most = min(int(granted) if granted.isdigit() else _MOST, _MOST)
         torch.set_num_threads(max(1, min(most, cores - min(workers, cores // 2))))
     return workers
 
