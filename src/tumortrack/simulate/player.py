@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from jaxtyping import Float32, Float64
@@ -26,8 +27,8 @@ from tumortrack.sense.camera import d405
 from tumortrack.sense.noise import D405_NOISE, NoiseConfig, add_noise
 from tumortrack.sense.render import render_depth
 from tumortrack.simulate.elastic.body import BodyConfig, Points, body_of, reduced_organ
-from tumortrack.simulate.elastic.loads import expand, in_bed, indent
-from tumortrack.simulate.elastic.modes import LEVER_MM, ReducedModel
+from tumortrack.simulate.elastic.loads import ReducedProblem, in_bed
+from tumortrack.simulate.elastic.modes import LEVER_MM
 from tumortrack.simulate.scene import PoseConfig, sample_pose
 
 SHAFT_MM = 4.0  # an instrument's radius
@@ -89,6 +90,15 @@ class Instant:
     depth_mm: float  # of the push
 
 
+@dataclass(frozen=True, eq=False)
+class Indentation:
+    """One place of the surface under an instrument; CT frame."""
+
+    place_ct: Float64[np.ndarray, " 3"]  # at rest
+    axis: Float64[np.ndarray, " 3"]  # unit vector from the instrument's tip along its shaft
+    unknowns: Callable[[float], Float64[np.ndarray, " m"]]  # for a depth in mm
+
+
 class ScenePlayer:
     """One case in motion. Building it solves the elastic states: some seconds.
 
@@ -107,17 +117,15 @@ class ScenePlayer:
         up = unit(np.asarray(up_lps, float))
         self.anatomy_ct, self.config = anatomy_ct, config
         self.intrinsics = d405(config.width, config.height)
-        self._seed = seed
+        self._seed, self._up = seed, up
         pose = PoseConfig(tilt_deg=8.0, sideways_mm=5.0)
         near_mm = (config.distance_mm, config.distance_mm)
         self._camera_from_ct = sample_pose(pose, anatomy_ct.organ, up_lps, near_mm, rng)
-        bed = Bed(reduced_organ(anatomy_ct, up, config.body, rng), up, seed)
-        self._swollen = bed.under("swell", expand, config.swell)
-        self._pushes: list[Indentation] = []
-        if config.push_mm > 0:
-            self._pushes = bed.indentations(config.places, SHAFT_MM, config.push_mm, rng)
+        organ = self._organ = reduced_organ(anatomy_ct, up, config.body, rng)
+        self._swollen = self._under("swell", ReducedProblem.expand, config.swell)
+        self._pushes = self._indentations(rng) if config.push_mm > 0 else []
         states = [self._swollen, *(push.unknowns(config.push_mm) for push in self._pushes)]
-        self._body = body_of(bed.organ, np.array(states, np.float32)[:, : bed.organ.n_modes])
+        self._body = body_of(organ, np.array(states, np.float32)[:, : organ.n_modes])
         inferior = np.array([0.0, 0.0, -1.0])
         along = inferior - (inferior @ up) * up  # for a body that stands, any direction
         self._down_the_body = perpendicular(up) if np.linalg.norm(along) < 0.1 else unit(along)
@@ -183,39 +191,10 @@ class ScenePlayer:
         rng = np.random.default_rng([self._seed, round(instant.t_s * 1e6)])
         return add_noise(clean, self.config.noise, rng)
 
-    def _deformed(self, velocity: np.ndarray, points_ct: Points) -> Float64[np.ndarray, "n 3"]:
-        return self._body.follow(velocity, points_ct, _STEPS).astype(np.float64)
-
-    def _camera_at(self, t_s: float) -> Float64[np.ndarray, "4 4"]:
-        """A slow sway about the organ's centre."""
-        sway = np.sin(2 * np.pi * t_s / np.array(_SWAY_S))
-        turn = Rotation.from_rotvec(self.config.sway_degrees * sway[:3], degrees=True).as_matrix()
-        center = transform_points(self._camera_from_ct, self._body.center_ct[None])[0]
-        swayed = rigid(turn, center - turn @ center + self.config.sway_mm * sway[3:])
-        return swayed @ self._camera_from_ct
-
-
-@dataclass(frozen=True, eq=False)
-class Indentation:
-    """One place of the surface under an instrument; CT frame."""
-
-    place_ct: Float64[np.ndarray, " 3"]  # at rest
-    axis: Float64[np.ndarray, " 3"]  # unit vector from the instrument's tip along its shaft
-    unknowns: Callable[[float], Float64[np.ndarray, " m"]]  # for a depth in mm
-
-
-@dataclass(frozen=True, eq=False)
-class Bed:
-    """An organ of fixed tissue on a fixed bed, both drawn by a seed, that takes loads."""
-
-    organ: ReducedModel
-    up: Float64[np.ndarray, " 3"]
-    seed: int
-
-    def under(self, what: str, load: Callable[..., None], *how: object) -> np.ndarray:
-        """The unknowns at rest under a load of ``elastic.loads`` with its arguments; InputError,
-        naming ``what``, where there is no equilibrium."""
-        problem = in_bed(self.organ, self.up, np.random.default_rng([self.seed, 0xBED]))
+    def _under(self, what: str, load: Callable[..., None], *how: object) -> np.ndarray:
+        """The organ's unknowns, its tissue and bed drawn by the seed, at rest under a load with its
+        arguments; ``what`` names it in the error."""
+        problem = in_bed(self._organ, self._up, np.random.default_rng([self._seed, 0xBED]))
         load(problem, *how)
         found = problem.equilibrium()
         if found is None:
@@ -225,13 +204,11 @@ class Bed:
             )
         return found
 
-    def indentations(
-        self, count: int, radius_mm: float, deepest_mm: float, rng: np.random.Generator
-    ) -> list[Indentation]:
-        """Indentations of ``count`` different places that face up, by an instrument of that radius;
-        InputError where the organ has fewer, or finds no equilibrium."""
-        places, normals = self.organ.patches.points_mm, self.organ.patches.normals
-        facing = np.flatnonzero(normals @ self.up > _FACING)
+    def _indentations(self, rng: np.random.Generator) -> list[Indentation]:
+        """By an instrument, of different places that face up."""
+        count, patches = self.config.places, self._organ.patches
+        places, normals = patches.points_mm, patches.normals
+        facing = np.flatnonzero(normals @ self._up > _FACING)
         if len(facing) < count:
             raise InputError(
                 f"only {len(facing)} places of the organ face the camera, {count} are to be "
@@ -243,14 +220,26 @@ class Bed:
         while len(chosen) < count:
             distance = np.minimum(distance, np.linalg.norm(points - points[chosen[-1]], axis=1))
             chosen.append(int(np.argmax(distance)))
-        made, depths = [], np.linspace(0, deepest_mm, _DEPTHS)
+        made, depths = [], np.linspace(0, self.config.push_mm, _DEPTHS)
         for patch in facing[chosen].tolist():
-            how = patch, normals[patch], radius_mm + _FOOT_MM
-            states = [self.under("poke", indent, *how, depth) for depth in depths.tolist()]
+            how = patch, normals[patch], SHAFT_MM + _FOOT_MM
+            poke = partial(self._under, "poke", ReducedProblem.indent, *how)
+            states = [poke(depth) for depth in depths.tolist()]
             unknowns = PchipInterpolator(depths, np.stack(states) - states[0])
             axis = _clearest_axis(places - places[patch], normals[patch])
             made.append(Indentation(places[patch], axis, unknowns))
         return made
+
+    def _deformed(self, velocity: np.ndarray, points_ct: Points) -> Float64[np.ndarray, "n 3"]:
+        return self._body.follow(velocity, points_ct, _STEPS).astype(np.float64)
+
+    def _camera_at(self, t_s: float) -> Float64[np.ndarray, "4 4"]:
+        """A slow sway about the organ's centre."""
+        sway = np.sin(2 * np.pi * t_s / np.array(_SWAY_S))
+        turn = Rotation.from_rotvec(self.config.sway_degrees * sway[:3], degrees=True).as_matrix()
+        center = transform_points(self._camera_from_ct, self._body.center_ct[None])[0]
+        swayed = rigid(turn, center - turn @ center + self.config.sway_mm * sway[3:])
+        return swayed @ self._camera_from_ct
 
 
 def _clearest_axis(offset_mm: np.ndarray, outward: np.ndarray) -> np.ndarray:

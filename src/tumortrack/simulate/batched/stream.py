@@ -91,24 +91,19 @@ class DeviceStream:
         self._camera = d405(stream.config.width, stream.config.height)
 
     def __getstate__(self) -> dict[str, Any]:
-        return {k: v for k, v in self.__dict__.items() if k not in ("_organ", "_points")}
+        return {k: v for k, v in self.__dict__.items() if k != "_tensors"}
 
     @cached_property
-    def _organ(self) -> tuple[Float32[Tensor, "3 v"], Tensor]:
-        organ, device = self._stream.anatomy_ct.organ, self._device
-        vertices = torch.tensor(organ.vertices_mm.T, dtype=torch.float32, device=device)
-        return vertices, torch.tensor(organ.faces, dtype=torch.int64, device=device)
-
-    @cached_property
-    def _points(self) -> list[list[Tensor]]:
-        """Of each part: points (3, n), labels, distances to its surface, whether they are inside;
-        last points and labels of those anywhere."""
-        pool = self._pool
+    def _tensors(self) -> list[list[Tensor]]:
+        """The organ's vertices (3, v) and faces; of each part points (3, n), labels, distances to
+        its surface, whether they are inside; last points and labels of those anywhere."""
+        organ, pool = self._stream.anatomy_ct.organ, self._pool
         arrays: list[tuple[np.ndarray, ...]] = [
-            (part.points_ct.T, part.labels, part.distance_mm, part.inside) for part in pool.parts
+            (organ.vertices_mm.T.astype(np.float32), organ.faces.astype(np.int64)),
+            *((p.points_ct.T, p.labels, p.distance_mm, p.inside) for p in pool.parts),
+            (pool.far_points_ct.T, pool.far_labels),
         ]
-        arrays.append((pool.far_points_ct.T, pool.far_labels))
-        return [[torch.tensor(one, device=self._device) for one in part] for part in arrays]
+        return [[torch.tensor(one, device=self._device) for one in row] for row in arrays]
 
     def batch(self, index: int) -> Tensors:
         """The batch with this number."""
@@ -195,7 +190,7 @@ class DeviceStream:
     def _render(self, plan: BatchPlan) -> tuple[Float32[Tensor, "b h w"], Int32[Tensor, "b hw"]]:
         """Depth images (mm, NaN where there is nothing), and the running count, in row-major order,
         of their pixels strictly within the plan's depths."""
-        vertices_ct, faces = self._organ
+        vertices_ct, faces = self._tensors[0]
         everywhere = vertices_ct[:, None].expand(-1, len(plan.recipes), -1)
         depth_mm = depth_images(carried(plan, everywhere), faces, self._camera)
         near, far = self._sent(plan.near_mm)[:, None], self._sent(plan.far_mm)[:, None]
@@ -206,7 +201,8 @@ class DeviceStream:
         """The points (undeformed CT frame) and labels (b, n) that ``OccupancyPool.draw`` takes from
         these windows; on each side of a part, first inside, the nearest come first."""
         points, labels, sent = [], [], self._sent(windows)
-        for n, (part, widest) in enumerate(zip(self._points, windows[..., 1].max(0), strict=True)):
+        widths = windows[..., 1].max(0)
+        for n, (part, widest) in enumerate(zip(self._tensors[1:], widths, strict=True)):
             first, count = sent[:, n, :1], sent[:, n, 1:]
             step = torch.arange(int(widest), device=self._device)
             index = (first + step) % len(part[1])

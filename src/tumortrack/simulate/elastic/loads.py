@@ -54,6 +54,36 @@ class ReducedProblem:
         """Springs (N/mm) that hold ``rows @ z`` at a target, both ways."""
         _add_springs(self.stiffness, self.forces, rows, springs * target_mm, springs)
 
+    def press(self, outward: Vector, height_mm: float, foot: Float64[np.ndarray, " p"]) -> None:
+        """Something hard comes from a unit vector and stops at ``height_mm`` along it, felt by a
+        fraction ``foot`` of each patch."""
+        patches = self.organ.patches
+        depth = patches.points_mm @ outward - height_mm
+        self.touch(self.organ.along(outward), depth, _OBSTACLE * patches.areas_mm2 * foot)
+
+    def indent(self, patch: int, outward: Vector, radius_mm: float, depth_mm: float) -> None:
+        """An instrument of a radius is pressed to a depth at a patch, against a unit vector."""
+        points, normals = self.organ.patches.points_mm, self.organ.patches.normals
+        offset = points - points[patch]
+        aside = np.linalg.norm(offset - np.outer(offset @ outward, outward), axis=1)
+        foot = _faded(radius_mm - aside) * (normals @ outward > 0)
+        self.press(outward, float(points[patch] @ outward - depth_mm), foot)
+
+    def hold(self, patch: int, radius_mm: float, shift_mm: Vector) -> None:
+        """A region around a patch is held at a shift."""
+        patches = self.organ.patches
+        springs = _GRIP * patches.areas_mm2 * patches.spot(patches.points_mm[patch], radius_mm)
+        for axis, shift in zip(np.eye(3), shift_mm, strict=True):
+            self.tie(self.organ.along(axis), shift, springs)
+
+    def weigh(self, down: Vector, fraction: float) -> None:
+        """A fraction of the weight that the tissue bore in the CT is no longer borne."""
+        self.forces += fraction * _WEIGHT * (down @ self.organ.volume_moves)
+
+    def expand(self, strain: float) -> None:
+        """The organ takes up or loses fluid: a strain of its volume, if nothing hinders it."""
+        self.forces += self.modulus * strain * self.organ.swelling
+
     def equilibrium(self) -> Float64[np.ndarray, " m"] | None:
         """The unknowns at rest; None where the contacts do not converge."""
         none = np.zeros((0, len(self.forces))), np.zeros(0), np.zeros(0)
@@ -122,45 +152,6 @@ def _solve(matrix, right):  # type: ignore[no-untyped-def]
             right[k] -= matrix[i, k] * right[i]
 
 
-def press(
-    problem: ReducedProblem, outward: Vector, height_mm: float, foot: Float64[np.ndarray, " p"]
-) -> None:
-    """Something hard comes from ``outward`` (a unit vector) and stops at ``height_mm`` along it,
-    felt by a fraction ``foot`` of each patch."""
-    patches = problem.organ.patches
-    depth = patches.points_mm @ outward - height_mm
-    problem.touch(problem.organ.along(outward), depth, _OBSTACLE * patches.areas_mm2 * foot)
-
-
-def indent(
-    problem: ReducedProblem, patch: int, outward: Vector, radius_mm: float, depth_mm: float
-) -> None:
-    """An instrument of a radius is pressed to a depth at a patch, against a unit vector."""
-    points, normals = problem.organ.patches.points_mm, problem.organ.patches.normals
-    offset = points - points[patch]
-    aside = np.linalg.norm(offset - np.outer(offset @ outward, outward), axis=1)
-    foot = _faded(radius_mm - aside) * (normals @ outward > 0)
-    press(problem, outward, float(points[patch] @ outward - depth_mm), foot)
-
-
-def hold(problem: ReducedProblem, patch: int, radius_mm: float, shift_mm: Vector) -> None:
-    """A region around a patch is held at a shift."""
-    patches = problem.organ.patches
-    springs = _GRIP * patches.areas_mm2 * patches.spot(patches.points_mm[patch], radius_mm)
-    for axis, shift in zip(np.eye(3), shift_mm, strict=True):
-        problem.tie(problem.organ.along(axis), shift, springs)
-
-
-def weigh(problem: ReducedProblem, down: Vector, fraction: float) -> None:
-    """A fraction of the weight that the tissue bore in the CT is no longer borne."""
-    problem.forces += fraction * _WEIGHT * (down @ problem.organ.volume_moves)
-
-
-def expand(problem: ReducedProblem, strain: float) -> None:
-    """The organ takes up or loses fluid: a strain of its volume, if nothing hinders it."""
-    problem.forces += problem.modulus * strain * problem.organ.swelling
-
-
 def plate(problem: ReducedProblem, rng: np.random.Generator) -> None:
     """A plate or strip pressed down on the organ, a little tilted."""
     _press_strip(problem, _turned(problem.up, 0.15, rng), rng)
@@ -177,14 +168,14 @@ def poke(problem: ReducedProblem, rng: np.random.Generator) -> None:
     """A blunt instrument pressed into the surface that does not face down."""
     tip = _reachable(problem, rng)
     outward = unit(problem.organ.patches.normals[tip] + rng.normal(0, 0.25, 3))
-    indent(problem, tip, outward, rng.uniform(3, 10), rng.uniform(1, 14))
+    problem.indent(tip, outward, rng.uniform(3, 10), rng.uniform(1, 14))
 
 
 def pull(problem: ReducedProblem, rng: np.random.Generator) -> None:
     """Forceps pull at the surface."""
     place, radius_mm = _reachable(problem, rng), rng.uniform(4, 9)
     along = unit(problem.organ.patches.normals[place] + rng.normal(0, 0.6, 3))
-    hold(problem, place, radius_mm, along * rng.uniform(1, 12))
+    problem.hold(place, radius_mm, along * rng.uniform(1, 12))
 
 
 def lift(problem: ReducedProblem, rng: np.random.Generator) -> None:
@@ -192,17 +183,17 @@ def lift(problem: ReducedProblem, rng: np.random.Generator) -> None:
     outward, up = rng.normal(size=3), problem.up
     outward -= 0.7 * up * (outward @ up)
     place, radius_mm = int(np.argmax(problem.organ.patches.points_mm @ outward)), rng.uniform(8, 20)
-    hold(problem, place, radius_mm, unit(rng.normal(size=3) + 0.7 * up) * rng.uniform(1, 12))
+    problem.hold(place, radius_mm, unit(rng.normal(size=3) + 0.7 * up) * rng.uniform(1, 12))
 
 
 def sag(problem: ReducedProblem, rng: np.random.Generator) -> None:
     """Tissue softened, or cut open and without its turgor."""
-    weigh(problem, _turned(-problem.up, 0.15, rng), float(rng.uniform(0.2, 1)))
+    problem.weigh(_turned(-problem.up, 0.15, rng), float(rng.uniform(0.2, 1)))
 
 
 def swell(problem: ReducedProblem, rng: np.random.Generator) -> None:
     """Fluid taken up or lost."""
-    expand(problem, float(rng.uniform(-_SWELLING, _SWELLING)))
+    problem.expand(float(rng.uniform(-_SWELLING, _SWELLING)))
 
 
 # Each with its probability.
@@ -270,7 +261,7 @@ def _press_strip(problem: ReducedProblem, outward: np.ndarray, rng: np.random.Ge
     height = patches.points_mm @ outward
     depth = rng.uniform(0.02, _DEEPEST) * np.ptp(height)
     touched = height[foot > 0] if (foot > 0).any() else height
-    press(problem, outward, float(touched.max() - depth), foot)
+    problem.press(outward, float(touched.max() - depth), foot)
 
 
 def _faded(inward_mm: np.ndarray) -> np.ndarray:
