@@ -185,9 +185,10 @@ def test_motion_carries_as_the_deformation_and_pose_do(both):
     simulator = Simulator(ANATOMY, UP, reference.config)
     moved = []
     for row in range(SIZE):
-        drawn = simulator.draw(plan.recipes[row].generator(int(plan.attempts[row])))
-        deformed = drawn.deformation.apply(points_ct)
-        expected = transform_points(drawn.camera_from_ct, deformed)
+        rng = plan.recipes[row].generator(int(plan.attempts[row]))
+        camera_from_ct, deformation, _ = simulator.draw(rng)
+        deformed = deformation.apply(points_ct)
+        expected = transform_points(camera_from_ct, deformed)
         np.testing.assert_allclose(placed[row], expected, atol=2e-4)
         moved.append(np.abs(deformed - points_ct).max())
     assert max(moved) > 0.5

@@ -107,18 +107,11 @@ class SceneRecipe:
 
 
 @dataclass(frozen=True, eq=False)
-class SceneDraw:
-    """What is drawn before the image is rendered."""
-
-    free: bool  # seen from any distance and not cropped
-    camera_from_ct: Float64[np.ndarray, "4 4"]  # the organ's pose, without its deformation
-    deformation: Deformation
-
-
-@dataclass(frozen=True, eq=False)
-class RenderedScene(SceneDraw):
+class RenderedScene:
     """A scene before points are labelled: where the organ lies, and what the camera sees of it."""
 
+    camera_from_ct: Float64[np.ndarray, "4 4"]  # the organ's pose, without its deformation
+    deformation: Deformation
     frame: DepthFrame
     cloud: SensorCloud
 
@@ -161,32 +154,34 @@ class Simulator:
         parts = self.anatomy_ct.parts
         return Anatomy(tuple(part.moved(scene.carry(part.vertices_mm)) for part in parts))
 
-    def draw(self, rng: np.random.Generator) -> SceneDraw:
-        """Pose and deformation of the next scene of this generator."""
+    def draw(
+        self, rng: np.random.Generator
+    ) -> tuple[Float64[np.ndarray, "4 4"], Deformation, bool]:
+        """Of the next scene of this generator: ``camera_from_ct``, deformation, and whether it is
+        seen from any distance and not cropped."""
         config = self.config
         free = bool(rng.uniform() < config.free_range)
         nearest = config.free_nearest_mm if free else config.pose.nearest_mm
         camera_from_ct = sample_pose(config.pose, self._hull_ct, self.up_lps, nearest, rng)
         model = config.deform[rng.integers(len(config.deform))]
-        return SceneDraw(free, camera_from_ct, model.sample(self._view(camera_from_ct), rng))
+        return camera_from_ct, model.sample(self._view(camera_from_ct), rng), free
 
     def _render(self, recipe: SceneRecipe) -> tuple[RenderedScene, np.random.Generator]:
         config, organ = self.config, self.anatomy_ct.organ
         for attempt in range(ATTEMPTS):
             rng = recipe.generator(attempt)
-            drawn = self.draw(rng)
-            deformed = drawn.deformation.apply(organ.vertices_mm)
-            vertices = transform_points(drawn.camera_from_ct, deformed)
+            camera_from_ct, deformation, free = self.draw(rng)
+            vertices = transform_points(camera_from_ct, deformation.apply(organ.vertices_mm))
             frame = render_depth(vertices, organ.faces, self._intrinsics)
             frame = add_clutter(frame, config.clutter, rng)
             frame = occlude(frame, config.occlusion, rng)  # hides background too
             frame = miscalibrate(frame, config.calibration, rng)
             frame = add_noise(frame, config.noise, rng)
             try:
-                cloud = cloud_from_depth(frame, crop_of(config, drawn.free, rng), rng)
+                cloud = cloud_from_depth(frame, crop_of(config, free, rng), rng)
             except NoEstimate:  # the crop left too few points: another draw of the same recipe
                 continue
-            return RenderedScene(**vars(drawn), frame=frame, cloud=cloud), rng
+            return RenderedScene(camera_from_ct, deformation, frame, cloud), rng
         raise shows_nothing(recipe)
 
     def _view(self, camera_from_ct: Float64[np.ndarray, "4 4"]) -> View:

@@ -176,12 +176,12 @@ class DeviceStream:
         rows = []
         for recipe, attempt in zip(recipes, attempts, strict=True):
             rng = recipe.generator(attempt)
-            drawn = simulator.draw(rng)
+            camera_from_ct, deformation, free = simulator.draw(rng)
             rng.integers(2**62)  # the seed of a noise that is off
-            crop = scenes.crop_of(simulator.config, drawn.free, rng)
-            motion = _as_arrays(drawn.deformation, n_drags, n_stretches)
+            crop = scenes.crop_of(simulator.config, free, rng)
+            motion = _as_arrays(deformation, n_drags, n_stretches)
             depths = np.float32(crop.near_mm), np.float32(crop.far_mm), crop.n_points
-            rows.append((drawn.camera_from_ct, *motion, *depths, rng.bit_generator.state))
+            rows.append((camera_from_ct, *motion, *depths, rng.bit_generator.state))
         *columns, states = zip(*rows, strict=True)
         arrays = [np.array(recipes, object), np.array(attempts), *map(np.stack, columns)]
         arrays.append(np.array(states, object))
