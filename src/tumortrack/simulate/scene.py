@@ -223,13 +223,10 @@ def _turn(about_x: float, about_y: float, about_z: float) -> Float64[np.ndarray,
     twentieth of a scene's time for a single one.)"""
     sx, sy, sz = np.sin([about_x, about_y, about_z]).tolist()
     cx, cy, cz = np.cos([about_x, about_y, about_z]).tolist()
-    return np.array(
-        [
-            [cy * cz, -cy * sz, sy],
-            [cx * sz + sx * sy * cz, cx * cz - sx * sy * sz, -sx * cy],
-            [sx * sz - cx * sy * cz, sx * cz + cx * sy * sz, cx * cy],
-        ]
-    )
+    first = [cy * cz, -cy * sz, sy]
+    second = [cx * sz + sx * sy * cz, cx * cz - sx * sy * sz, -sx * cy]
+    third = [sx * sz - cx * sy * cz, sx * cz + cx * sy * sz, cx * cy]
+    return np.array([first, second, third])
 
 
 @lru_cache(maxsize=64)

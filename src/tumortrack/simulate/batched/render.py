@@ -40,9 +40,8 @@ def depth_images(
 def _front(
     points_mm: Float32[Tensor, "3 b v"], faces: Int64[Tensor, "f 3"], intrinsics: Intrinsics
 ) -> tuple[Float32[Tensor, "t 9"], Float32[Tensor, " t"], Int64[Tensor, "t 5"]]:
-    """Of the triangles that face the camera and touch a pixel: corners (column, row and 1/z, which
-    is linear in the image; -1 behind the camera), area, and box (scene, left, top, width,
-    height)."""
+    """Of the triangles that face the camera and touch a pixel: corners (column, row, and 1/z or -1
+    behind the camera), area, and box (scene, left, top, width, height)."""
     x, y, z = points_mm
     inverse = torch.where(z > _NEAREST_MM, 1.0 / z, -1.0)
     u = intrinsics.fx * x.double() * inverse.double() + intrinsics.cx

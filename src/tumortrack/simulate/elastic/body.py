@@ -126,13 +126,12 @@ class ElasticBody:
         missing = [name for name in _ARRAYS if name not in arrays]
         if missing:
             raise InputError(f"a body lacks {', '.join(missing)}; build it again.")
-        return cls(
-            np.asarray(arrays["origin_mm"], np.float32),
-            float(arrays["spacing_mm"]),
-            np.asarray(arrays["center_ct"], float),
-            np.ascontiguousarray(arrays["modes"], np.float32),
-            np.asarray(arrays["states"], np.float32),
+        origin_mm, modes, states = (
+            np.ascontiguousarray(arrays[name], np.float32)
+            for name in ("origin_mm", "modes", "states")
         )
+        place = origin_mm, float(arrays["spacing_mm"]), np.asarray(arrays["center_ct"], float)
+        return cls(*place, modes, states)
 
 
 def build_body(

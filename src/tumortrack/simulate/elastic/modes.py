@@ -64,11 +64,11 @@ def modes_of(
     patches: Patches,
     count: int,
     contrasts: tuple[float, ...],
-    loads: Float64[np.ndarray, "f n"],
+    loads: np.ndarray,
 ) -> Float64[np.ndarray, "f k"]:
-    """``count`` modes of the responses to loads, which alternate between the tumors' contrasts, as
-    displacements of the solid's nodes: a unit coefficient moves the organ by 1 mm rms. The last
-    mode swells the organ; the others keep its volume."""
+    """``count`` modes of the responses to loads (f, n), which alternate between the tumors'
+    contrasts, as displacements of the solid's nodes: a unit coefficient moves the organ by 1 mm
+    rms. The last mode swells the organ; the others keep its volume."""
     arms, axes = solid.nodes_mm - solid.center_mm, np.eye(3)
     turns = [np.cross(axis, arms).ravel() for axis in axes]
     rigid = np.stack([*(np.tile(axis, len(arms)) for axis in axes), *turns], 1)
@@ -100,9 +100,8 @@ def modes_of(
 
 
 def random_loads(
-    solid: LatticeSolid, patches: Patches, up: Float64[np.ndarray, " 3"], count: int,
-    rng: np.random.Generator,
-) -> Float64[np.ndarray, "f n"]:  # fmt: skip
+    solid: LatticeSolid, patches: Patches, up: np.ndarray, count: int, rng: np.random.Generator
+) -> Float64[np.ndarray, "f n"]:
     """Forces at the nodes, one column a load. They only have to be diverse: magnitudes, and how an
     organ in its bed responds, are decided for every state by itself (``loads.random_state``)."""
     draw = _Tractions(patches, solid.center_mm, up, rng)
