@@ -126,10 +126,8 @@ class ElasticBody:
         missing = [name for name in _ARRAYS if name not in arrays]
         if missing:
             raise InputError(f"a body lacks {', '.join(missing)}; build it again.")
-        origin_mm, modes, states = (
-            np.ascontiguousarray(arrays[name], np.float32)
-            for name in ("origin_mm", "modes", "states")
-        )
+        names = ("origin_mm", "modes", "states")
+        origin_mm, modes, states = (np.ascontiguousarray(arrays[n], np.float32) for n in names)
         place = origin_mm, float(arrays["spacing_mm"]), np.asarray(arrays["center_ct"], float)
         return cls(*place, modes, states)
 

@@ -8,6 +8,7 @@ and modes are free of rigid motion, which belongs to the pose.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -60,11 +61,7 @@ def patches_of(mesh: Mesh, count: int, rng: np.random.Generator) -> Patches:
 
 
 def modes_of(
-    solid: LatticeSolid,
-    patches: Patches,
-    count: int,
-    contrasts: tuple[float, ...],
-    loads: np.ndarray,
+    solid: LatticeSolid, patches: Patches, count: int, contrasts: Sequence[float], loads: np.ndarray
 ) -> Float64[np.ndarray, "f k"]:
     """``count`` modes of the responses to loads (f, n), which alternate between the tumors'
     contrasts, as displacements of the solid's nodes: a unit coefficient moves the organ by 1 mm
