@@ -58,12 +58,10 @@ class InnerPoints:
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """An observed cloud and the truth behind it, camera frame, mm.
-
-    ``reference.parts[0]`` is the whole organ, tumors included. ``depth`` is the image that the
-    cloud was taken from, where it is known; ``meta`` is plain JSON (recipe, origin, ...);
-    ``targets`` are inner points with known positions in the CT.
-    """
+    """An observed cloud and the truth behind it, camera frame, mm. ``reference.parts[0]`` is the
+    whole organ, tumors included; ``depth`` the image that the cloud was taken from, where it is
+    known; ``meta`` plain JSON (recipe, origin, ...); ``targets`` inner points with known positions
+    in the CT."""
 
     cloud: SensorCloud
     reference: Anatomy

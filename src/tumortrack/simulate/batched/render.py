@@ -26,7 +26,13 @@ def depth_images(
     corners, area, box = _front(points_mm, faces, intrinsics)
     scene, left, top, wide, high = box.unbind(1)
     planes = _planes(corners, area, left, top)
-    triangle, column, row = _pixels(wide, high)
+    # All pixels of all boxes: their triangle, and their column and row in its box.
+    count = wide * high
+    triangle = torch.repeat_interleave(count)
+    place = torch.arange(len(triangle), device=wide.device) - (count.cumsum(0) - count)[triangle]
+    wide = wide[triangle]
+    row = place.div(wide, rounding_mode="floor")
+    column = place - row * wide
     start, across, down = planes[:, :, triangle]
     share_a, share_b, inverse = start.addcmul(across, column).addcmul(down, row)
     least = torch.minimum(torch.minimum(share_a, share_b), 1.0 - share_a - share_b)
@@ -80,13 +86,3 @@ def _planes(
     down = down_a * from_a + down_b * from_b
     rows = (start_a, start_b, start, across_a, across_b, across, down_a, down_b, down)
     return torch.stack(rows).unflatten(0, (3, 3))
-
-
-def _pixels(wide: PerFace, high: PerFace) -> tuple[Int64[Tensor, " p"], ...]:
-    """All pixels of all boxes: their triangle, and their column and row in its box."""
-    count = wide * high
-    triangle = torch.repeat_interleave(count)
-    place = torch.arange(len(triangle), device=wide.device) - (count.cumsum(0) - count)[triangle]
-    wide = wide[triangle]
-    row = place.div(wide, rounding_mode="floor")
-    return triangle, place - row * wide, row
