@@ -195,5 +195,4 @@ def _nearest_of(samples_mm: np.ndarray, points_mm: Points) -> Float32[np.ndarray
     # Points far from a surface have many almost nearest ones: large, loose leaves are six times
     # faster here than scipy's usual tree, with the same distances.
     tree = cKDTree(samples_mm, leafsize=100, balanced_tree=False, compact_nodes=False)
-    distance: np.ndarray = tree.query(points_mm, workers=-1)[0].astype(np.float32)
-    return distance
+    return np.asarray(tree.query(points_mm, workers=-1)[0], np.float32)

@@ -78,9 +78,7 @@ class SceneConfig(Config, frozen=True):
     cloud_points: tuple[int, int] | None = None
 
     def __post_init__(self) -> None:
-        if self.cloud_points is None:
-            return
-        fewest, most = self.cloud_points
+        fewest, most = self.cloud_points or (FEWEST_POINTS, FEWEST_POINTS)
         if not FEWEST_POINTS <= fewest <= most:
             raise InputError(
                 f"cloud_points is {fewest}..{most}; it must be a rising range from "

@@ -137,12 +137,9 @@ def list_scenes(folder: Path) -> list[Path]:
     where there is none."""
     if not folder.is_dir():
         raise InputError(f"{folder} does not exist or is no folder.")
-    scenes = sorted(
-        path
-        for path in folder.iterdir()
-        if not path.name.startswith(".")
-        and ((path / "kidney.ply").is_file() or (path / "cloud.ply").is_file())
-    )
+    names = ("kidney.ply", "cloud.ply")
+    found = (path for path in folder.iterdir() if any((path / name).is_file() for name in names))
+    scenes = sorted(path for path in found if not path.name.startswith("."))
     if not scenes:
         raise InputError(
             f"{folder} holds no scenes: none of its folders has a cloud.ply and a kidney.ply. "

@@ -62,6 +62,7 @@ def load_model(folder: Path, device: str = "auto") -> Model:
         kind = model_class(config.network)
         network = kind.new_network(config.network)
         network.load_state_dict(load((folder / WEIGHTS).read_bytes()))
+        known = from_builtins(manifest["familiar"], InDistributionRange, f"{folder}: familiar")
         return kind.from_folder(
             folder,
             manifest,
@@ -69,9 +70,7 @@ def load_model(folder: Path, device: str = "auto") -> Model:
             config=config,
             parts=tuple(manifest["parts"]),
             query_box_mm=np.array(manifest["query_box_mm"], float).reshape(2, 3),
-            in_distribution=from_builtins(
-                manifest["familiar"], InDistributionRange, f"{folder}: familiar"
-            ),
+            in_distribution=known,
             provenance=dict(manifest["provenance"]),
         )
     except InputError as error:
