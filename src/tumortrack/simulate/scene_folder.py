@@ -22,7 +22,8 @@ from tumortrack.core.mesh_files import read_anatomy, write_anatomy
 from tumortrack.core.store import new_folder, read_json, write_atomically, write_json
 from tumortrack.core.types import Anatomy, DepthFrame, SensorCloud
 from tumortrack.imaging.meshes import mesh_of, solid_of
-from tumortrack.sense import files
+from tumortrack.sense.files import depth_png, intrinsics_json, read_cloud, read_depth_png
+from tumortrack.sense.ply import write_cloud_ply
 from tumortrack.simulate.occupancy import contains, labels_of
 
 # Our own scenes state in meta.json that kidney.ply is the whole organ, tumors included.
@@ -82,10 +83,10 @@ class Scene:
 
 def write_scene_files(folder: Path, scene: Scene) -> None:
     """A scene's files into a folder that is being filled aside; raises StorageError."""
-    files.write_cloud_ply(folder / "cloud.ply", scene.cloud.points_mm)
+    write_cloud_ply(folder / "cloud.ply", scene.cloud.points_mm)
     if scene.depth is not None:
-        files.write_depth_png(folder / "depth.png", scene.depth)
-        files.write_intrinsics(folder / "intrinsics.json", scene.depth.intrinsics)
+        write_atomically(folder / "depth.png", depth_png(scene.depth))
+        write_json(folder / "intrinsics.json", intrinsics_json(scene.depth.intrinsics))
     write_anatomy(folder, scene.reference)
     if scene.targets is not None:
         points = scene.targets.points_ct, scene.targets.points_mm
@@ -126,8 +127,8 @@ def read_scene(folder: Path) -> Scene:
     depth, camera, table = (folder / name for name in ("depth.png", "intrinsics.json", _TARGETS))
     if depth.exists() and not camera.exists():
         raise InputError(f"{folder} has depth.png but lacks intrinsics.json, which explains it.")
-    cloud = SensorCloud(files.read_cloud(folder / "cloud.ply")[0].points_mm, stamp_ns)
-    frame = files.read_depth_png(depth, camera) if depth.exists() else None
+    cloud = SensorCloud(read_cloud(folder / "cloud.ply")[0].points_mm, stamp_ns)
+    frame = read_depth_png(depth, camera) if depth.exists() else None
     targets = read_targets(table) if table.exists() else None
     return Scene(cloud, reference, frame, meta, targets)
 
