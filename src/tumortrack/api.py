@@ -144,8 +144,7 @@ def simulate_scenes(
     from tumortrack.sense.noise import CLEAN, D405_NOISE
     from tumortrack.simulate.deform import DragConfig, ElasticConfig
     from tumortrack.simulate.scene import SceneConfig, SceneRecipe, Simulator, body_for
-    from tumortrack.simulate.scene_folder import Scene
-    from tumortrack.simulate.targets import Targets, draw_targets
+    from tumortrack.simulate.scene_folder import Scene, Targets, draw_targets
 
     deform = ElasticConfig() if elastic else DragConfig()
     config = SceneConfig(deform=(deform,), noise=D405_NOISE if noise else CLEAN)

@@ -25,7 +25,7 @@ from tumortrack.report.pictures import FROM_CAMERA, FROM_SIDE
 from tumortrack.report.protocol import evaluate_scenes, summarise, summary_table
 from tumortrack.report.qc import PLANES, border_letters, qc_picture, slice_volume
 from tumortrack.report.renderer import Body, Frame, ParallelView
-from tumortrack.simulate.scene_folder import Scene, write_scene
+from tumortrack.simulate.scene_folder import Scene
 
 
 def ball(radius_mm, center_mm=(0.0, 0.0, 0.0), subdivisions=3):
@@ -76,7 +76,7 @@ def evaluated(tmp_path_factory):
     """Four scenes: shifted by 3 mm, by 1 mm, without the tumor, nothing at all."""
     folder = tmp_path_factory.mktemp("evaluate")
     for n in range(4):
-        write_scene(folder / "scenes" / f"scene_{n}", scene())
+        scene().write(folder / "scenes" / f"scene_{n}")
     locate = Scripted(
         estimate_of(anatomy((3, 0, 0))),
         estimate_of(anatomy((0, 0, 1))),
@@ -164,7 +164,7 @@ def test_table_shows_every_part(evaluated):
 
 
 def test_errors_that_are_ours_are_not_hidden(tmp_path):
-    write_scene(tmp_path / "scenes" / "a", scene())
+    scene().write(tmp_path / "scenes" / "a")
     with pytest.raises(ZeroDivisionError):
         evaluate_scenes(Scripted(ZeroDivisionError()), tmp_path / "scenes", tmp_path / "out")
     assert not (tmp_path / "out" / "report.json").exists()

@@ -151,22 +151,15 @@ class Simulate:
 
     def scene_config(self) -> SceneConfig:
         from tumortrack.sense.noise import CLEAN, D405_NOISE
-        from tumortrack.simulate.deform import (
-            ChainConfig,
-            DeformConfig,
-            DragConfig,
-            ElasticConfig,
-            StretchConfig,
-        )
+        from tumortrack.simulate.deform import ChainConfig, DragConfig, ElasticConfig, StretchConfig
         from tumortrack.simulate.deform.drag import CONFIGURATIONS
-        from tumortrack.simulate.pose import PoseConfig
-        from tumortrack.simulate.scene import SceneConfig
+        from tumortrack.simulate.scene import PoseConfig, SceneConfig
 
         models: list[DragConfig | ElasticConfig] = [ElasticConfig()]
         if not self.elastic:
             table = (CONFIGURATIONS[number] for number in self.configuration)
             models = [DragConfig(steps=steps, falloff=self.falloff) for steps in table]
-        deform: tuple[DeformConfig, ...] = tuple(
+        deform = tuple(
             ChainConfig(links=(model, StretchConfig())) if self.squeeze else model
             for model in models
         )
@@ -187,8 +180,7 @@ class Simulate:
         from tumortrack.core.config import to_builtins
         from tumortrack.imaging.case import load_case
         from tumortrack.simulate.scene import SceneRecipe, Simulator, body_for
-        from tumortrack.simulate.scene_folder import Scene, write_scene
-        from tumortrack.simulate.targets import draw_targets
+        from tumortrack.simulate.scene_folder import Scene, draw_targets
 
         if self.scenes < 1:
             raise InputError(f"--scenes {self.scenes} must be at least 1.")
@@ -218,7 +210,7 @@ class Simulate:
                     }
                     truth = simulator.reference(stage)
                     placed = targets.at(stage.carry(targets.points_ct))
-                    write_scene(folder, Scene(stage.cloud, truth, stage.frame, meta, placed))
+                    Scene(stage.cloud, truth, stage.frame, meta, placed).write(folder)
                 advance()
 
 

@@ -64,7 +64,7 @@ class Train:
         from tumortrack.models.folder import is_finished
         from tumortrack.training.model import load_model, load_start
         from tumortrack.training.presets import PRESETS
-        from tumortrack.training.train import TrainingRun, run_identity, train
+        from tumortrack.training.train import TrainingRun, train
 
         keep_loaded()
         run = TrainingRun(
@@ -82,7 +82,7 @@ class Train:
         )
         if is_finished(self.model):
             done = load_model(self.model).provenance
-            if done.get("run_sha256") != run_identity(run):
+            if done.get("run_sha256") != run.identity:
                 raise InputError(
                     f"{self.model} holds a model of another case, preset, seed or option. Choose "
                     "another MODEL folder."
@@ -133,7 +133,8 @@ class Pretrain:
         """Pretrained weights into OUT, resumed where a run was begun."""
         from tumortrack.training.model import PRETRAINED
         from tumortrack.training.presets import pretraining
-        from tumortrack.training.pretrain import Pretraining, pretrain
+        from tumortrack.training.pretrain import pretrain
+        from tumortrack.training.state import Pretraining
 
         run = Pretraining(
             config=pretraining(),

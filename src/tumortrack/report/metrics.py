@@ -17,7 +17,7 @@ from tumortrack.core.estimate import Motion
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.types import Anatomy, CameraLabels, Mesh
 from tumortrack.imaging.raster import expand, label_grid
-from tumortrack.simulate.targets import Targets
+from tumortrack.simulate.scene_folder import Targets
 
 # Vertices are sampled too, so the maximum misses at most s^2 / (8 R) where a flat piece of size s
 # lies over a surface of radius R: 0.025 mm at R = 5 mm.
