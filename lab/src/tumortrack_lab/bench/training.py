@@ -22,7 +22,7 @@ from tumortrack.occupancy.network import OccupancyNetwork
 from tumortrack.simulate.deform import DragConfig, ElasticConfig
 from tumortrack.simulate.elastic.body import ElasticBody
 from tumortrack.simulate.occupancy import FixedPoints, OccupancyConfig, OccupancyPool, PointSource
-from tumortrack.simulate.scene import SceneConfig, SceneRecipe, Simulator
+from tumortrack.simulate.scene import SceneConfig, SceneRecipe, SceneStream, Simulator
 from tumortrack.training.model import load_model
 from tumortrack.training.state import TrainingRun, TrainingState
 from tumortrack.training.train import TrainingStatus, train
