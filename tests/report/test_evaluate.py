@@ -21,9 +21,15 @@ from tumortrack.core.types import (
 from tumortrack.report.drawing import section, section_mask
 from tumortrack.report.metrics import label_grid
 from tumortrack.report.page import thinned
-from tumortrack.report.pictures import FROM_CAMERA, FROM_SIDE
+from tumortrack.report.pictures import (
+    FROM_CAMERA,
+    FROM_SIDE,
+    PLANES,
+    border_letters,
+    qc_picture,
+    slice_volume,
+)
 from tumortrack.report.protocol import evaluate_scenes, summarise, summary_table
-from tumortrack.report.qc import PLANES, border_letters, qc_picture, slice_volume
 from tumortrack.report.renderer import Body, Frame, ParallelView
 from tumortrack.simulate.scene_folder import Scene, write_scene
 

@@ -18,8 +18,14 @@ from tumortrack.live.values import Polyline, RigidShape, Workcell
 from tumortrack.plan.motions import Motions, MotionStage
 from tumortrack.plan.values import Cut, CutLayer, Located, ResectionPlan
 from tumortrack.report.film import film, moments_s, tube
-from tumortrack.report.organ_surfaces import organ_surfaces, parted, skin, within
-from tumortrack.report.plan_pictures import draw_plan, plan_figure
+from tumortrack.report.plan_pictures import (
+    draw_plan,
+    organ_surfaces,
+    parted,
+    plan_figure,
+    skin,
+    within,
+)
 from tumortrack.report.renderer import Body, Viewpoint, corner_normals, render
 
 CENTRE, RADII = np.array([0.0, 0.0, 145.0]), np.array([55.0, 30.0, 25.0])

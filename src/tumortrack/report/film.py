@@ -9,10 +9,11 @@ import io
 from collections.abc import Callable, Iterable, Iterator
 from itertools import groupby, pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+import matplotlib
 import numpy as np
 from jaxtyping import Float, Float64, UInt8
+from PIL import Image, ImageDraw, ImageFont
 
 from tumortrack.core.colours import BACKGROUND, NONE, part_colour
 from tumortrack.core.errors import InputError
@@ -22,11 +23,8 @@ from tumortrack.core.types import ORGAN, Mesh
 from tumortrack.live.values import Polyline, Workcell
 from tumortrack.plan.motions import Motions
 from tumortrack.plan.values import Located
-from tumortrack.report.organ_surfaces import organ_surfaces
+from tumortrack.report.plan_pictures import organ_surfaces
 from tumortrack.report.renderer import Body, Viewpoint, render, rgb
-
-if TYPE_CHECKING:
-    from PIL import Image, ImageDraw, ImageFont
 
 _FROM = np.array([-0.36, -0.8, 0.48])  # where the viewer is: to the left, in front, above
 _CLOSE_FROM = np.array([-0.36, -0.72, 0.6])
@@ -72,17 +70,17 @@ def film(
         InputError: no frame, or another kind of file, speed or size.
         StorageError: the disk refused.
     """
-    from PIL import Image
-
     cells = list(frames)
     _check(cells, path, fps, size)
     painter = _FramePainter(cells, located, size)
     chosen = np.linspace(0, len(cells) - 1, min(_SAMPLES, len(cells))).astype(int).tolist()
-    palette = _palette([painter.picture(n) for n in chosen])
+    some = [np.asarray(painter.picture(n))[::2, ::2] for n in chosen]
+    sheet, plain = Image.fromarray(np.concatenate(some)), Image.Dither.NONE
+    palette = sheet.quantize(_COLOURS, Image.Quantize.MEDIANCUT, kmeans=2, dither=plain)
 
     def indexed() -> Iterator[Image.Image]:
         for n in range(len(cells)):
-            yield painter.picture(n).quantize(palette=palette, dither=Image.Dither.NONE)
+            yield painter.picture(n).quantize(palette=palette, dither=plain)
             if progress is not None:
                 progress(n + 1, len(cells))
 
@@ -145,13 +143,12 @@ class _FramePainter:
         self._near = _close_viewpoint(self._organ[0].mesh, self._close_size)
         flat = self._far.project(self._organ[0].mesh.vertices_mm, size)[:, :2]
         self._spot = (*(flat.min(0) - 4).round().tolist(), *(flat.max(0) + 4).round().tolist())
-        self._letters = _letters(size[1] // 20), _letters(size[1] // 34)
+        font = f"{matplotlib.get_data_path()}/fonts/ttf/DejaVuSans.ttf"
+        self._letters = [ImageFont.truetype(font, size[1] // share) for share in (20, 34)]
         self._tubes: dict[tuple[int, float], tuple[Polyline, Mesh]] = {}
 
     def picture(self, n: int) -> Image.Image:
         """Frame n, in full colour."""
-        from PIL import Image, ImageDraw
-
         cell = self._frames[n]
         out = Image.fromarray(self._seen(cell, self._far, self._size))
         close = Image.fromarray(self._seen(cell, self._near, self._close_size))
@@ -161,7 +158,11 @@ class _FramePainter:
         draw = ImageDraw.Draw(out)
         draw.rectangle(self._spot, outline=_FRAME)  # what is shown from near
         draw.rectangle((left - 1, top - 1, left + close.width, top + close.height), outline=_FRAME)
-        self._say(draw, n)
+        large, small = self._letters
+        draw.text((12, 10), cell.state, fill=BACKGROUND, font=large)
+        if cell.halted:
+            draw.text((12, 18 + large.size), f"halted: {cell.halted}", fill=NONE, font=small)
+        self._draw_progress(draw, n)
         return out
 
     def _seen(
@@ -175,8 +176,7 @@ class _FramePainter:
         least_mm = _LEAST_PIXELS * viewpoint.width_mm / size[0]
         lines = [
             Body(self._tube(line, max(line.width_mm, least_mm)), rgb(line.colour))
-            for line in cell.lines
-            if len(line.points_mm) > 1
+            for line in cell.drawn_lines
         ]
         return render(shapes + lines + self._organ, viewpoint, size, _BACKDROP)
 
@@ -186,14 +186,9 @@ class _FramePainter:
             self._tubes[key] = line, tube(line.points_mm, width_mm / 2)
         return self._tubes[key][1]
 
-    def _say(self, draw: ImageDraw.ImageDraw, n: int) -> None:
-        """The state, why the arms stand still, and how far the procedure is."""
-        cell = self._frames[n]
-        large, small = self._letters
-        draw.text((12, 10), cell.state, fill=BACKGROUND, font=large)
-        if cell.halted:
-            draw.text((12, 18 + large.size), f"halted: {cell.halted}", fill=NONE, font=small)
-        width, height = self._size
+    def _draw_progress(self, draw: ImageDraw.ImageDraw, n: int) -> None:
+        """A bar of all states, filled as far as the procedure is; red where the arms stand."""
+        cell, (width, height) = self._frames[n], self._size
         done = 0
         for state, group in groupby(self._frames, lambda one: one.state):
             first, done = done, done + len(list(group))
@@ -203,13 +198,6 @@ class _FramePainter:
             if n >= first:
                 colour = NONE if cell.halted and state == cell.state else (60, 110, 190)
                 draw.rectangle((x[0], box[0], max(x[1] - 2, x[0]), box[1]), fill=colour)
-
-
-def _letters(pixels: int) -> ImageFont.FreeTypeFont:
-    import matplotlib
-    from PIL import ImageFont
-
-    return ImageFont.truetype(f"{matplotlib.get_data_path()}/fonts/ttf/DejaVuSans.ttf", pixels)
 
 
 def _reach(frames: list[Workcell]) -> Float[np.ndarray, "n 3"]:
@@ -255,14 +243,6 @@ def _close_viewpoint(organ: Mesh, size: tuple[int, int]) -> Viewpoint:
     radius = float(np.linalg.norm(organ.vertices_mm - organ.box_mm.mean(0), axis=1).max())
     place, before_mm = target + 10 * (near.place_mm - target), radius + _CLOSE_MM
     return Viewpoint.towards(target, place, near.width_mm, parallel=True, before_mm=before_mm)
-
-
-def _palette(pictures: list[Image.Image]) -> Image.Image:
-    """An image of the colours that suit these pictures."""
-    from PIL import Image
-
-    sheet = Image.fromarray(np.concatenate([np.asarray(one)[::2, ::2] for one in pictures]))
-    return sheet.quantize(_COLOURS, Image.Quantize.MEDIANCUT, kmeans=2, dither=Image.Dither.NONE)
 
 
 def tube(points_mm: Float[np.ndarray, "n 3"], radius_mm: float, sides: int = 6) -> Mesh:

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float
+from PIL import Image
 
 from tumortrack.core.estimate import Estimate
 from tumortrack.core.store import write_atomically
@@ -105,8 +106,6 @@ def _packed(points_mm: Float[np.ndarray, "n 3"]) -> str:
 
 def _webp(picture: Path) -> str:
     """In base64."""
-    from PIL import Image  # matplotlib brings it
-
     buffer = io.BytesIO()
     with Image.open(picture) as image:
         image.convert("RGB").save(buffer, "WEBP", quality=82)

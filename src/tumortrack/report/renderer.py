@@ -12,6 +12,7 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 from jaxtyping import Float, Float32, UInt8
+from PIL import Image
 
 from tumortrack.core.colours import Colour
 from tumortrack.core.geometry import transform_points
@@ -209,8 +210,6 @@ def render(
 
     Opaque bodies hide each other by depth; translucent ones tint what lies behind them.
     """
-    from PIL import Image
-
     width, height = (_SHARPER * n for n in size)
     solid = _join([body for body in bodies if body.opacity >= 1])
     light = _light(solid if solid.shadowed.any() else _join([]), viewpoint)
