@@ -8,8 +8,9 @@ everywhere; the CT frame is LPS, the camera frame x right, y down, z forward. Al
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -17,44 +18,27 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from tumortrack.core import store
-from tumortrack.core.errors import InputError
+from tumortrack.core.errors import InputError, StorageError
 from tumortrack.core.estimate import Estimate
-from tumortrack.core.types import DepthFrame, Intrinsics, Mesh, SensorCloud
+from tumortrack.core.types import DepthFrame, Mesh, SensorCloud
 from tumortrack.imaging.case import Case
-from tumortrack.imaging.case import load_case as _load_case
+from tumortrack.imaging.case import load_case as read_case
 
 if TYPE_CHECKING:
-    from tumortrack.live.values import TrackingResult
+    from tumortrack.live.sink_worker import SinkWorker
+    from tumortrack.live.source_worker import SourceWorker
+    from tumortrack.live.values import SinkContext, SourceConfig, TrackingResult
     from tumortrack.models.config import TrainConfig
     from tumortrack.models.model import Model
     from tumortrack.plan.values import ResectionPlan
+    from tumortrack.simulate.scene import SceneConfig
     from tumortrack.simulate.scene_folder import Scene
     from tumortrack.tracking.tracker import Tracker
     from tumortrack.training.train import TrainingStatus
 
-__all__ = [
-    "Case",
-    "DepthFrame",
-    "Estimate",
-    "Intrinsics",
-    "SensorCloud",
-    "estimate_from_surfaces",
-    "evaluate",
-    "find_organ",
-    "load_case",
-    "load_model",
-    "plan_resection",
-    "prepare",
-    "read_cloud",
-    "save_estimate",
-    "scan_phantom",
-    "simulate_scenes",
-    "track",
-    "train",
-]
-
 StrPath = str | Path
 Device = Literal["auto", "cpu", "cuda"]
+_TEST_BODY = 2**20  # and the seed: elastic states that training with the same seed never sees
 
 
 def scan_phantom(folder: StrPath, seed: int = 1) -> Path:
@@ -121,7 +105,7 @@ def load_case(folder: StrPath) -> Case:
     Raises:
         ArtifactError: missing, of another schema, or changed since.
     """
-    return _load_case(Path(folder))
+    return read_case(Path(folder))
 
 
 def simulate_scenes(
@@ -143,26 +127,35 @@ def simulate_scenes(
     """
     from tumortrack.sense.noise import CLEAN, D405_NOISE
     from tumortrack.simulate.deform import DragConfig, ElasticConfig
-    from tumortrack.simulate.scene import SceneConfig, SceneRecipe, Simulator, body_for
-    from tumortrack.simulate.scene_folder import Scene
-    from tumortrack.simulate.targets import Targets, draw_targets
+    from tumortrack.simulate.scene import SceneConfig
 
     deform = ElasticConfig() if elastic else DragConfig()
     config = SceneConfig(deform=(deform,), noise=D405_NOISE if noise else CLEAN)
-    # Elastic states of another library than the one that training draws from.
-    body = body_for(case.anatomy, case.up_lps, config, 2**20 + seed)
+    return list(map(scene_maker(case, config, seed), range(count)))
+
+
+def scene_maker(case: Case, config: SceneConfig, seed: int) -> Callable[[int], Scene]:
+    """Makes any scene of the stream ``test`` by its number."""
+    from tumortrack.simulate.scene import SceneRecipe, Simulator, body_for
+    from tumortrack.simulate.scene_folder import Scene
+    from tumortrack.simulate.targets import draw_targets
+
+    body = body_for(case.anatomy, case.up_lps, config, _TEST_BODY + seed)
     simulator = Simulator(case.anatomy, case.up_lps, config, body)
     inner = draw_targets(case.anatomy, seed)
-    scenes = []
-    for index in range(count):
-        made = simulator.render(SceneRecipe(seed, "test", index))
+
+    def make(index: int) -> Scene:
+        recipe = SceneRecipe(seed, "test", index)
+        made = simulator.render(recipe)
         meta = {
+            "recipe": asdict(recipe),
             "camera_from_ct": made.camera_from_ct.tolist(),
-            "recipe": {"seed": seed, "stream": "test", "index": index},
+            "deformation": made.deformation.record(),
         }
-        targets = Targets(inner.points_ct, made.carry(inner.points_ct), inner.labels)
-        scenes.append(Scene(made.cloud, simulator.reference(made), made.frame, meta, targets))
-    return scenes
+        targets = inner.at(made.carry(inner.points_ct))
+        return Scene(made.cloud, simulator.reference(made), made.frame, meta, targets)
+
+    return make
 
 
 def train(
@@ -196,27 +189,19 @@ def train(
         ArtifactError: no case, or ``folder`` holds another run.
         StorageError: the disk is full; the last checkpoint is whole.
     """
+    from tumortrack.training import train as training
     from tumortrack.training.presets import PRESETS
-    from tumortrack.training.train import TrainingRun
-    from tumortrack.training.train import train as fit
 
     if minutes is not None and steps is not None:
         raise InputError("minutes and steps both say when to stop; give one of them.")
     if preset not in PRESETS:
         raise InputError(f"there is no preset {preset!r}; allowed: {', '.join(PRESETS)}.")
     of = load_case(case)
-    run = TrainingRun(
-        anatomy_ct=of.anatomy,
-        up_lps=of.up_lps,
-        case_sha256=store.sha256_of(Path(case) / store.MANIFEST),
-        config=config or PRESETS[preset](of.anatomy, "limited"),
-        seed=seed,
-        steps=steps,
-        minutes=minutes,
-        device=device,
-        workers=workers,
+    run = training.TrainingRun(
+        *(of.anatomy, of.up_lps, store.sha256_of(Path(case) / store.MANIFEST)),
+        *(config or PRESETS[preset](of.anatomy, "limited"), seed, steps, minutes, device, workers),
     )
-    return fit(run, Path(folder), report or (lambda status: None))
+    return training.train(run, Path(folder), report or (lambda status: None))
 
 
 def load_model(folder: StrPath, device: Device = "auto") -> Model:
@@ -273,7 +258,7 @@ def find_organ(
         InputError: an option that is not allowed.
     """
     from tumortrack.sense.region import Hints, organ_points
-    from tumortrack.tracking.region import region_for
+    from tumortrack.tracking.tracker import region_for
 
     region = region_for(model, range_mm=range_mm, box_mm=box_mm)
     hints = Hints(mask=mask, picked_mm=picked_mm)
@@ -360,16 +345,17 @@ def track(
         The run's figures: counts, latencies, stage times (docs/conventions.md).
 
     Raises:
-        InputError: a source or sink that cannot be opened.
+        InputError: a source or sink that is not written as it must be, or cannot work.
+        StorageError: a sink cannot write.
+        SourceLost: no frame came for a minute.
     """
     from tumortrack.live.loop import Loop, LoopConfig, summary
-    from tumortrack.live.sink_worker import SinkWorker
-    from tumortrack.live.source_worker import SourceWorker
-    from tumortrack.live.spec import SINKS, SOURCES
-    from tumortrack.live.values import PublishedFrame, SinkConfig, SinkContext
-    from tumortrack.tracking.region import region_for
+    from tumortrack.live.spec import SOURCES
+    from tumortrack.live.values import PublishedFrame, SinkContext
+    from tumortrack.tracking.tracker import region_for
 
     config = SOURCES.parse(source) if isinstance(source, str) else source
+    named = named_sinks(sinks)
     context = SinkContext(tracker.model.parts, PublishedFrame(), tracker.anatomy_ct)
     region = region_for(tracker.model, range_mm=range_mm)
     loop = Loop(tracker, context, LoopConfig(region=region, seconds=seconds))
@@ -379,19 +365,72 @@ def track(
         if until is not None and until(result):
             loop.stop()
 
+    with live_workers(config, named, context) as (source_worker, sink_workers):
+        loop.run(source_worker, sink_workers, seen)
+    return summary(loop, source_worker, sink_workers)
+
+
+def named_sinks(sinks: Sequence[Any]) -> dict[str, Any]:
+    """Sinks, or their configurations, by the names that reports give them.
+
+    Raises:
+        InputError: one is not written as it must be, or is given twice.
+    """
+    from tumortrack.live.spec import SINKS
+
+    named: dict[str, Any] = {}
+    for number, sink in enumerate(sinks):
+        name = sink if isinstance(sink, str) else f"sink {number}"
+        if name in named:
+            raise InputError(f"sink {name!r} is given twice.")
+        named[name] = SINKS.parse(sink) if isinstance(sink, str) else sink
+    return named
+
+
+@contextmanager
+def live_workers(
+    source: SourceConfig, sinks: Mapping[str, Any], context: SinkContext
+) -> Iterator[tuple[SourceWorker, list[SinkWorker]]]:
+    """A source and sinks, each at work in a thread of its own.
+
+    Raises: as ``open_sinks``.
+    """
+    from tumortrack.live.source_worker import SourceWorker
+
     with ExitStack() as stack:
-        workers = []
-        for number, sink in enumerate(sinks):
-            name = sink if isinstance(sink, str) else f"sink {number}"
-            made = SINKS.parse(sink) if isinstance(sink, str) else sink
-            waiting = made.queue_size if isinstance(made, SinkConfig) else 1
-            opened = made.open(context) if isinstance(made, SinkConfig) else made
-            workers.append(SinkWorker(name, opened, waiting))
-            stack.callback(workers[-1].close)
-        source_worker = SourceWorker(config.open)
+        sink_workers = open_sinks(sinks, context, stack)
+        source_worker = SourceWorker(source.open)
         stack.callback(source_worker.close)
-        loop.run(source_worker, workers, seen)
-    return summary(loop, source_worker, workers)
+        yield source_worker, sink_workers
+
+
+def open_sinks(
+    sinks: Mapping[str, Any], context: SinkContext, stack: ExitStack
+) -> list[SinkWorker]:
+    """Each of ``named_sinks`` at work in a thread of its own, until the stack ends.
+
+    Raises:
+        InputError: a sink cannot work.
+        StorageError: a sink cannot write.
+    """
+    from tumortrack.live.sink_worker import SinkWorker
+    from tumortrack.live.values import SinkConfig
+
+    def waiting(sink: Any) -> int:
+        return sink.queue_size if isinstance(sink, SinkConfig) else 1
+
+    workers = []
+    # Those that make a folder last: if another cannot open, none is left behind.
+    for name, sink in sorted(sinks.items(), key=lambda pair: waiting(pair[1])):
+        try:
+            opened = sink.open(context) if isinstance(sink, SinkConfig) else sink
+        except OSError as error:  # a sink of another package that does not translate it
+            raise StorageError(
+                f"sink {name!r} cannot be opened: {error.strerror}: {error.filename}."
+            ) from error
+        workers.append(SinkWorker(name, opened, waiting(sink)))
+        stack.callback(workers[-1].close)
+    return workers
 
 
 def plan_resection(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -14,8 +14,6 @@ from tumortrack.core.errors import InputError
 
 if TYPE_CHECKING:
     from tumortrack.simulate.scene import SceneConfig
-
-_TEST_BODY = 2**20  # and the seed: elastic states that training with the same seed never sees
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,11 +52,11 @@ class Prepare:
 
     def run(self) -> None:
         """Input -> case folder with a picture to check it by."""
-        from tumortrack.api import prepare
+        from tumortrack import api
         from tumortrack.imaging.prepare import PrepareOptions
 
         options = {field.name: getattr(self, field.name) for field in fields(PrepareOptions)}
-        case = prepare(self.input, self.case, overwrite=self.overwrite, **options)
+        case = api.prepare(self.input, self.case, overwrite=self.overwrite, **options)
         say_notes(case.report.get("notes", []))
         for name, part in zip(case.anatomy.names, case.anatomy.parts, strict=True):
             say(f"{name}: {part.volume_mm3 / 1000:.1f} ml")
@@ -89,28 +87,27 @@ class Export:
             ArtifactError: no case.
             StorageError: the disk refused.
         """
-        from tumortrack.imaging.case import load_case
-        from tumortrack.imaging.segmentation import (
-            SIDES,
-            segments,
-            write_dicom_seg,
-            write_seg_nrrd,
-        )
+        from tumortrack import api
+        from tumortrack.imaging import segmentation
 
         if self.series is not None and self.dicom is None:
             raise InputError("--series says which series of --dicom; give that folder too.")
-        case = load_case(self.case)
+        case = api.load_case(self.case)
         options = case.report.get("options", {})
         side = options.get("side")
-        parts = segments(case.anatomy.names, side if side in SIDES else None)
+        parts = segmentation.segments(
+            case.anatomy.names, side if side in segmentation.SIDES else None
+        )
         labels = case.labels
         notes: tuple[str, ...] = ()
         with store.new_folder(self.out) as aside:
-            write_seg_nrrd(aside / "case.seg.nrrd", labels.labels, labels.lps_from_index, parts)
+            segmentation.write_seg_nrrd(
+                aside / "case.seg.nrrd", labels.labels, labels.lps_from_index, parts
+            )
             if self.dicom is not None:
                 series = self.series or options.get("series")
                 file = aside / "segmentation.dcm"
-                notes = write_dicom_seg(file, labels, parts, self.dicom, series)
+                notes = segmentation.write_dicom_seg(file, labels, parts, self.dicom, series)
         say_notes(notes)
         say(f"written to {self.out}: {', '.join(sorted(p.name for p in self.out.iterdir()))}.")
 
@@ -184,19 +181,16 @@ class Simulate:
         Raises:
             InputError: no case, or scenes that are not of this case, seed and options.
         """
+        from tumortrack import api
         from tumortrack.core.config import to_builtins
-        from tumortrack.imaging.case import load_case
-        from tumortrack.simulate.scene import SceneRecipe, Simulator, body_for
-        from tumortrack.simulate.scene_folder import Scene, write_scene
-        from tumortrack.simulate.targets import draw_targets
+        from tumortrack.simulate.scene import SceneRecipe
+        from tumortrack.simulate.scene_folder import write_scene
 
         if self.scenes < 1:
             raise InputError(f"--scenes {self.scenes} must be at least 1.")
-        case = load_case(self.case)
+        case = api.load_case(self.case)
         config = self.scene_config()
-        body = body_for(case.anatomy, case.up_lps, config, _TEST_BODY + self.seed)
-        simulator = Simulator(case.anatomy, case.up_lps, config, body)
-        targets = draw_targets(case.anatomy, self.seed)
+        make = api.scene_maker(case, config, self.seed)
         about = {
             "case_sha256": store.sha256_of(self.case / store.MANIFEST),
             "case_volumes_mm3": [part.volume_mm3 for part in case.anatomy.parts],
@@ -205,20 +199,12 @@ class Simulate:
         with progress_bar("simulate", self.scenes) as advance:
             for index in range(self.scenes):
                 folder = self.dataset / f"{prefix}{index:04d}"
-                recipe = SceneRecipe(self.seed, "test", index)
-                made_from = {**about, "recipe": asdict(recipe)}
                 if folder.exists():
-                    _check_same(folder, made_from)
+                    recipe = asdict(SceneRecipe(self.seed, "test", index))
+                    _check_same(folder, {**about, "recipe": recipe})
                 else:
-                    stage = simulator.render(recipe)
-                    meta = {
-                        **made_from,
-                        "camera_from_ct": stage.camera_from_ct.tolist(),
-                        "deformation": stage.deformation.record(),
-                    }
-                    truth = simulator.reference(stage)
-                    placed = targets.at(stage.carry(targets.points_ct))
-                    write_scene(folder, Scene(stage.cloud, truth, stage.frame, meta, placed))
+                    scene = make(index)
+                    write_scene(folder, replace(scene, meta={**about, **scene.meta}))
                 advance()
 
 

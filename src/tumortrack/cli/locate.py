@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from tumortrack.core.types import DepthFrame, SensorCloud
     from tumortrack.models.model import Model
     from tumortrack.sense.cloud import CloudConfig
-    from tumortrack.tracking.point_table import PointTable
+    from tumortrack.tracking.points import PointTable
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -12,19 +12,9 @@ from typing import TYPE_CHECKING, Any
 
 from tyro.conf import Positional
 
+from tumortrack.cli import track
 from tumortrack.cli.console import Device, progress_bar, say
 from tumortrack.cli.plan import check_arms_installed
-from tumortrack.cli.track import (
-    STOPPED,
-    Arms,
-    Track,
-    check_closed,
-    open_sinks,
-    parse_sinks,
-    report_path,
-    say_failures,
-    stopping,
-)
 from tumortrack.core import store
 from tumortrack.core.errors import Aborted, InputError
 
@@ -82,6 +72,7 @@ class Resect:
 
     def run(self) -> None:
         """A plan's motions, virtually, shown by sinks or filmed."""
+        from tumortrack import api
         from tumortrack.core.config import from_builtins
         from tumortrack.live.sinks.ur import UrSinkConfig
         from tumortrack.plan.arms.config import CellConfig
@@ -92,9 +83,8 @@ class Resect:
         stored = read_plan(self.plan)
         if stored.motions is None or stored.cell is None:
             raise InputError(f"{self.plan} was planned with --no-arms; plan again without it.")
-        # A wrong one is reported before anything heavy is loaded.
-        real = [s for s in parse_sinks(self.sinks) if isinstance(s, UrSinkConfig) and s.execute]
-        if self.speed > 1 and real:
+        sinks = api.named_sinks(self.sinks).values()  # wrong: said before all that takes long
+        if self.speed > 1 and any(isinstance(s, UrSinkConfig) and s.execute for s in sinks):
             raise InputError(f"--speed {self.speed:g} with real arms; allowed: up to 1.")
         config = OperationConfig(speed=self.speed, moved_mm=self.moved)
         cell_config = from_builtins(stored.cell, CellConfig, str(self.plan))
@@ -156,7 +146,7 @@ class Resect:
             begun.result()
             operation = _operation(stored, cell, config, locate=locate, replan=replan)
             frames = PublishedFrame(stored.frame_id, stored.table_from_camera)
-            Track(
+            track.Track(
                 model=model,
                 source=source,
                 sinks=self.sinks,
@@ -166,23 +156,24 @@ class Resect:
                 intrinsics=self.intrinsics,
                 report=self.report,
                 device=self.device,
-            ).run(Arms(operation, frames, {"plan_config": to_builtins(config)}))
+            ).run(track.Arms(operation, frames, {"plan_config": to_builtins(config)}))
         _say_end(operation)
 
     def _execute(self, stored: PlanFolder, cell: ArmCell, config: OperationConfig) -> None:
         """Without a camera: the stored motions in real time."""
+        from tumortrack import api
         from tumortrack.live.values import Controls, PublishedFrame, SinkContext, TrackingResult
 
         assert stored.motions is not None
         operation = _operation(stored, cell, config)
         operation.still_life = _organ_shapes(stored)
-        report = report_path(self.report, "resect")
+        report = track.report_path(self.report, "resect")
         frames = PublishedFrame(stored.frame_id, stored.table_from_camera)
         controls = Controls()
         context = SinkContext(tuple(stored.meshes), frames, None, controls, arms=True)
         with ExitStack() as stack:
-            stack.enter_context(stopping(lambda: operation.abort(STOPPED)))
-            sinks = open_sinks(self.sinks, parse_sinks(self.sinks), context, stack)
+            stack.enter_context(track.stopping(lambda: operation.abort(track.STOPPED)))
+            sinks = api.open_sinks(api.named_sinks(self.sinks), context, stack)
             say(f"{stored.motions.seconds / config.speed:.0f} s in frame {frames.frame_id!r}; "
                 "Ctrl-C stops the arms.")  # fmt: skip
             errors: dict[str, str] = {}
@@ -197,7 +188,7 @@ class Resect:
                 )
                 for sink in sinks:
                     sink.put(result)
-                say_failures(sinks, errors)
+                track.say_failures(sinks, errors)
                 assert result.workcell is not None
                 text = result.workcell.state
                 text += f": {result.workcell.halted}" if result.workcell.halted else ""
@@ -217,7 +208,7 @@ class Resect:
         store.write_json(report, content)
         say(f"written to {report}.")
         _say_end(operation)
-        check_closed(sinks)
+        track.check_closed(sinks)
 
 
 def _operation(
@@ -271,7 +262,7 @@ def _say_end(operation: Operation) -> None:
     if found["state"] == "done":
         say("done: both arms are home.")
         return
-    if found["halted"] == STOPPED:
+    if found["halted"] == track.STOPPED:
         raise KeyboardInterrupt
     raise Aborted(f"the resection was {found['state']}: {found['halted']}.")
 

@@ -44,11 +44,9 @@ _TUMOR_COLORS = ((0.97, 0.88, 0.22), (0.34, 0.71, 0.91), (0.56, 0.93, 0.56), (0.
 _SOFT_TISSUE_HU = (-160.0, 240.0)
 _MARGIN_MM, _ASPECT = 18.0, 1.22
 _MOST_ROWS = 6  # tumors with slices of their own
-_BORDERS = {
-    "left": (0.025, 0.5),
-    "right": (0.975, 0.5),
-    "top": (0.5, 0.965),
-    "bottom": (0.5, 0.035),
+_NEAR_BORDER = {
+    **{"left": (0.025, 0.5), "right": (0.975, 0.5)},
+    **{"top": (0.5, 0.965), "bottom": (0.5, 0.035)},
 }
 
 

@@ -12,8 +12,7 @@ from tumortrack.core.mesh_files import write_mesh
 from tumortrack.imaging.nifti import write_nifti
 from tumortrack.imaging.segmentation import segments, write_seg_nrrd
 from tumortrack.sense.ply import write_cloud_ply
-from tumortrack.tracking.point_table import PointTable
-from tumortrack.tracking.points import camera_table
+from tumortrack.tracking.points import PointTable, camera_table
 
 
 def write_estimate(
