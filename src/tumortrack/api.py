@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -26,8 +26,7 @@ from tumortrack.imaging.case import load_case as read_case
 
 if TYPE_CHECKING:
     from tumortrack.live.sink_worker import SinkWorker
-    from tumortrack.live.source_worker import SourceWorker
-    from tumortrack.live.values import SinkContext, SourceConfig, TrackingResult
+    from tumortrack.live.values import SinkContext, TrackingResult
     from tumortrack.models.config import TrainConfig
     from tumortrack.models.model import Model
     from tumortrack.plan.values import ResectionPlan
@@ -49,14 +48,13 @@ def scan_phantom(folder: StrPath, seed: int = 1) -> Path:
     Raises:
         StorageError: the disk refused.
     """
-    from tumortrack.phantom.dicom import write_dicom_series
-    from tumortrack.phantom.digital import PhantomParameters, phantom_labels
-    from tumortrack.phantom.scanner import ScannerParameters, scan
+    from tumortrack.phantom import dicom, digital, scanner
 
     folder = Path(folder)
     if not folder.exists():
-        scanner = ScannerParameters(spacing_mm=(1.2, 1.2, 1.5))
-        write_dicom_series(scan(phantom_labels(PhantomParameters()), scanner, seed), folder)
+        labels = digital.phantom_labels(digital.PhantomParameters())
+        parameters = scanner.ScannerParameters(spacing_mm=(1.2, 1.2, 1.5))
+        dicom.write_dicom_series(scanner.scan(labels, parameters, seed), folder)
     return folder
 
 
@@ -80,16 +78,15 @@ def prepare(
         InputError: the source cannot be used, or an option is unknown or not allowed.
         StorageError: the disk refused.
     """
+    from tumortrack.imaging import prepare as preparing
     from tumortrack.imaging.case import KIND, save_case
-    from tumortrack.imaging.prepare import PrepareOptions
-    from tumortrack.imaging.prepare import prepare as make_case
 
-    known = PrepareOptions.__dataclass_fields__
+    known = preparing.PrepareOptions.__dataclass_fields__
     if unknown := sorted(set(options) - set(known)):
         raise InputError(f"prepare knows no {unknown[0]!r}; allowed: {', '.join(known)}.")
     if folder is not None:
         store.check_place(Path(folder), KIND, overwrite)
-    case = make_case(Path(source), PrepareOptions(**options))
+    case = preparing.prepare(Path(source), preparing.PrepareOptions(**options))
     if folder is not None:
         from tumortrack.report.pictures import qc_picture
 
@@ -198,9 +195,11 @@ def train(
         raise InputError(f"there is no preset {preset!r}; allowed: {', '.join(PRESETS)}.")
     of = load_case(case)
     run = training.TrainingRun(
-        *(of.anatomy, of.up_lps, store.sha256_of(Path(case) / store.MANIFEST)),
-        *(config or PRESETS[preset](of.anatomy, "limited"), seed, steps, minutes, device, workers),
-    )
+        anatomy_ct=of.anatomy, up_lps=of.up_lps,
+        case_sha256=store.sha256_of(Path(case) / store.MANIFEST),
+        config=config or PRESETS[preset](of.anatomy, "limited"),
+        seed=seed, steps=steps, minutes=minutes, device=device, workers=workers,
+    )  # fmt: skip
     return training.train(run, Path(folder), report or (lambda status: None))
 
 
@@ -211,9 +210,9 @@ def load_model(folder: StrPath, device: Device = "auto") -> Model:
         ArtifactError: missing, unfinished, of another schema, damaged or changed.
         InputError: CUDA was asked for and is not available.
     """
-    from tumortrack.training.model import load_model as load
+    from tumortrack.training import model
 
-    return load(Path(folder), device)
+    return model.load_model(Path(folder), device)
 
 
 def read_cloud(path: StrPath, unit: Literal["mm", "m"] = "mm") -> SensorCloud:
@@ -222,10 +221,10 @@ def read_cloud(path: StrPath, unit: Literal["mm", "m"] = "mm") -> SensorCloud:
     Raises:
         InputError: missing, damaged, of another kind, in metres, or without any point.
     """
+    from tumortrack.sense import files
     from tumortrack.sense.cloud import check_cloud
-    from tumortrack.sense.files import read_cloud as read
 
-    cloud, notes = read(Path(path), unit)
+    cloud, notes = files.read_cloud(Path(path), unit)
     for note in notes:
         warnings.warn(note, stacklevel=2)
     check_cloud(cloud)
@@ -310,15 +309,16 @@ def evaluate(
     Raises:
         InputError: no scenes, or a scene that cannot be read.
     """
-    from tumortrack.report.protocol import evaluate_scene, evaluate_scenes, summarise
+    from tumortrack.report import protocol
 
     call: Any = getattr(locate, "locate", None) or locate
     if isinstance(scenes, str | Path):
         if report is None:
             raise InputError("evaluating a folder of scenes writes a report: say where.")
-        return evaluate_scenes(call, Path(scenes), Path(report))
-    entries = [evaluate_scene(call, scene, f"{n:04d}")[0] for n, scene in enumerate(scenes)]
-    return {"scenes": entries, "summary": summarise(entries)}
+        return protocol.evaluate_scenes(call, Path(scenes), Path(report))
+    named = ((f"{n:04d}", scene) for n, scene in enumerate(scenes))
+    entries = [protocol.evaluate_scene(call, scene, name)[0] for name, scene in named]
+    return {"scenes": entries, "summary": protocol.summarise(entries)}
 
 
 def track(
@@ -350,6 +350,7 @@ def track(
         SourceLost: no frame came for a minute.
     """
     from tumortrack.live.loop import Loop, LoopConfig, summary
+    from tumortrack.live.source_worker import SourceWorker
     from tumortrack.live.spec import SOURCES
     from tumortrack.live.values import PublishedFrame, SinkContext
     from tumortrack.tracking.tracker import region_for
@@ -365,9 +366,9 @@ def track(
         if until is not None and until(result):
             loop.stop()
 
-    with live_workers(config, named, context) as (source_worker, sink_workers):
-        loop.run(source_worker, sink_workers, seen)
-    return summary(loop, source_worker, sink_workers)
+    with open_sinks(named, context) as workers, closing(SourceWorker(config.open)) as reader:
+        loop.run(reader, workers, seen)
+    return summary(loop, reader, workers)
 
 
 def named_sinks(sinks: Sequence[Any]) -> dict[str, Any]:
@@ -388,26 +389,8 @@ def named_sinks(sinks: Sequence[Any]) -> dict[str, Any]:
 
 
 @contextmanager
-def live_workers(
-    source: SourceConfig, sinks: Mapping[str, Any], context: SinkContext
-) -> Iterator[tuple[SourceWorker, list[SinkWorker]]]:
-    """A source and sinks, each at work in a thread of its own.
-
-    Raises: as ``open_sinks``.
-    """
-    from tumortrack.live.source_worker import SourceWorker
-
-    with ExitStack() as stack:
-        sink_workers = open_sinks(sinks, context, stack)
-        source_worker = SourceWorker(source.open)
-        stack.callback(source_worker.close)
-        yield source_worker, sink_workers
-
-
-def open_sinks(
-    sinks: Mapping[str, Any], context: SinkContext, stack: ExitStack
-) -> list[SinkWorker]:
-    """Each of ``named_sinks`` at work in a thread of its own, until the stack ends.
+def open_sinks(sinks: Mapping[str, Any], context: SinkContext) -> Iterator[list[SinkWorker]]:
+    """``named_sinks``, each at work in a thread of its own.
 
     Raises:
         InputError: a sink cannot work.
@@ -419,18 +402,19 @@ def open_sinks(
     def waiting(sink: Any) -> int:
         return sink.queue_size if isinstance(sink, SinkConfig) else 1
 
-    workers = []
-    # Those that make a folder last: if another cannot open, none is left behind.
-    for name, sink in sorted(sinks.items(), key=lambda pair: waiting(pair[1])):
-        try:
-            opened = sink.open(context) if isinstance(sink, SinkConfig) else sink
-        except OSError as error:  # a sink of another package that does not translate it
-            raise StorageError(
-                f"sink {name!r} cannot be opened: {error.strerror}: {error.filename}."
-            ) from error
-        workers.append(SinkWorker(name, opened, waiting(sink)))
-        stack.callback(workers[-1].close)
-    return workers
+    workers: list[SinkWorker] = []
+    with ExitStack() as stack:
+        # Those that make a folder last: if another cannot open, none is left behind.
+        for name, sink in sorted(sinks.items(), key=lambda pair: waiting(pair[1])):
+            try:
+                opened = sink.open(context) if isinstance(sink, SinkConfig) else sink
+            except OSError as error:  # a sink of another package that does not translate it
+                raise StorageError(
+                    f"sink {name!r} cannot be opened: {error.strerror}: {error.filename}."
+                ) from error
+            workers.append(SinkWorker(name, opened, waiting(sink)))
+            stack.callback(workers[-1].close)
+        yield workers
 
 
 def plan_resection(
@@ -458,19 +442,19 @@ def plan_resection(
         InputError: no such tumor, or an option that is not allowed.
     """
     from tumortrack.core.config import from_builtins
+    from tumortrack.plan import located as places
+    from tumortrack.plan import resection
     from tumortrack.plan.config import ResectionConfig
-    from tumortrack.plan.located import STAND_MM, read_run, table_below
-    from tumortrack.plan.located import located as in_table_frame
-    from tumortrack.plan.resection import plan_resection as make_plan
 
     config = from_builtins(options, ResectionConfig, "plan_resection")
-    run = located if isinstance(located, Estimate) else read_run(Path(located))
-    table_from_camera = table_below(run.cloud.points_mm, STAND_MM if stand_mm is None else stand_mm)
+    run = located if isinstance(located, Estimate) else places.read_run(Path(located))
+    stand_mm = places.STAND_MM if stand_mm is None else stand_mm
+    table_from_camera = places.table_below(run.cloud.points_mm, stand_mm)
     if isinstance(run, Estimate):
-        seen = in_table_frame(run.cloud, run.meshes, run.motion, table_from_camera)
+        seen = places.located(run.cloud, run.meshes, run.motion, table_from_camera)
     else:
         seen = run.located(table_from_camera)
-    plan = make_plan(seen, config)
+    plan = resection.plan_resection(seen, config)
     if picture is not None:
         from tumortrack.report.plan_pictures import draw_plan
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -70,11 +70,10 @@ class Locate:
             assert tracker.anatomy_ct is not None  # a model with a shape
             box_mm = tracker.anatomy_ct.organ.box_mm
             far = check_near_organ(points.points_ct, box_mm, str(self.map))
-            points = replace(points, notes=(*points.notes, *far))
+            notes = (*notes, *points.notes, *far)
         cloud = self._cropped(seen, model.config.scene.cloud)
         estimate = tracker.locate(cloud, self.grid, self.seed)
         if points is not None and self.map is not None:
-            notes = (*notes, *points.notes)
             estimate.report["map"] = {
                 "points": len(points.points_ct),
                 "from": "lps",
@@ -96,14 +95,13 @@ class Locate:
             else:
                 say(f"{name}: not found")
         if points is not None:
-            count, file = len(points.points_ct), self.out / "points.csv"
-            say(f"{count} points of the CT: their places are in {file}")
+            file = self.out / "points.csv"
+            say(f"{len(points.points_ct)} points of the CT: their places are in {file}")
         seconds = estimate.report["timings"]["total"]
         say(f"written to {self.out} (camera frame, mm) in {seconds:.2f} s.")
 
     def _points(self) -> PointTable | None:
-        """The points of --map; model and points are checked before there is anything to wait
-        for."""
+        """The points of --map; what is wrong with them or the model is said before a wait."""
         from tumortrack.models.folder import has_shape, read_model_manifest
         from tumortrack.tracking.points import read_points
 

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import itertools
 import signal
 import time
 from collections.abc import Iterator
-from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -25,9 +25,9 @@ if TYPE_CHECKING:
     from jaxtyping import Float64
 
     from tumortrack.live.values import RigidShape, TrackingResult, Workcell
+    from tumortrack.plan import operation as operations
     from tumortrack.plan.arms.cell import ArmCell
     from tumortrack.plan.files import PlanFolder
-    from tumortrack.plan.operation import Operation, OperationConfig, Planned, ResectionProgress
     from tumortrack.plan.values import Located
 
 _FPS = 30.0  # of an execution that no camera drives
@@ -102,7 +102,12 @@ class Resect:
             self._execute(stored, cell, config)
 
     def _follow(
-        self, stored: PlanFolder, cell: ArmCell, config: OperationConfig, model: Path, source: str
+        self,
+        stored: PlanFolder,
+        cell: ArmCell,
+        config: operations.OperationConfig,
+        model: Path,
+        source: str,
     ) -> None:
         """Beside the live loop: every estimate is looked at, and planned on where the tumor
         moved."""
@@ -133,8 +138,8 @@ class Resect:
             def replan(
                 result: TrackingResult,
                 joints_rad: Float64[np.ndarray, " 12"],
-                progress: ResectionProgress,
-            ) -> Future[Planned]:
+                progress: operations.ResectionProgress,
+            ) -> Future[operations.Planned]:
                 seen = locate(result, unsure=stored.config.sigmas > 0)
                 return planner.submit(replanning.replan, seen, joints_rad, progress)
 
@@ -147,19 +152,15 @@ class Resect:
             operation = _operation(stored, cell, config, locate=locate, replan=replan)
             frames = PublishedFrame(stored.frame_id, stored.table_from_camera)
             track.Track(
-                model=model,
-                source=source,
-                sinks=self.sinks,
-                range=self.range,
-                box=self.box,
-                whole=self.whole,
-                intrinsics=self.intrinsics,
-                report=self.report,
+                model=model, source=source, sinks=self.sinks, range=self.range, box=self.box,
+                whole=self.whole, intrinsics=self.intrinsics, report=self.report,
                 device=self.device,
-            ).run(track.Arms(operation, frames, {"plan_config": to_builtins(config)}))
+            ).run(track.Arms(operation, frames, {"plan_config": to_builtins(config)}))  # fmt: skip
         _say_end(operation)
 
-    def _execute(self, stored: PlanFolder, cell: ArmCell, config: OperationConfig) -> None:
+    def _execute(
+        self, stored: PlanFolder, cell: ArmCell, config: operations.OperationConfig
+    ) -> None:
         """Without a camera: the stored motions in real time."""
         from tumortrack import api
         from tumortrack.live.values import Controls, PublishedFrame, SinkContext, TrackingResult
@@ -171,20 +172,18 @@ class Resect:
         frames = PublishedFrame(stored.frame_id, stored.table_from_camera)
         controls = Controls()
         context = SinkContext(tuple(stored.meshes), frames, None, controls, arms=True)
-        with ExitStack() as stack:
-            stack.enter_context(track.stopping(lambda: operation.abort(track.STOPPED)))
-            sinks = api.open_sinks(api.named_sinks(self.sinks), context, stack)
+        stop = track.stopping(lambda: operation.abort(track.STOPPED))
+        with stop, api.open_sinks(api.named_sinks(self.sinks), context) as sinks:
             say(f"{stored.motions.seconds / config.speed:.0f} s in frame {frames.frame_id!r}; "
                 "Ctrl-C stops the arms.")  # fmt: skip
             errors: dict[str, str] = {}
-            shown, sequence, next_s = "", 0, time.monotonic()
-            while True:
+            shown, started = "", time.monotonic()
+            for sequence in itertools.count():
                 if controls.aborted.is_set():
                     operation.abort("stopped by the viewer, or a real arm gave up")
+                now_ns = time.time_ns()
                 result = operation.act(
-                    TrackingResult(
-                        sequence, time.time_ns(), reason=_NOTHING, published_frame=frames
-                    )
+                    TrackingResult(sequence, now_ns, reason=_NOTHING, published_frame=frames)
                 )
                 for sink in sinks:
                     sink.put(result)
@@ -196,9 +195,7 @@ class Resect:
                     say(shown := text)
                 if operation.ended:
                     break
-                sequence += 1
-                next_s += 1 / _FPS
-                time.sleep(max(0.0, next_s - time.monotonic()))
+                time.sleep(max(0.0, started + (sequence + 1) / _FPS - time.monotonic()))
         content = {
             "plan": {"tumor": stored.plan.tumor, "method": stored.plan.method},
             "frame": stored.frame_id,
@@ -212,8 +209,8 @@ class Resect:
 
 
 def _operation(
-    stored: PlanFolder, cell: ArmCell, config: OperationConfig, **live: Any
-) -> Operation:
+    stored: PlanFolder, cell: ArmCell, config: operations.OperationConfig, **live: Any
+) -> operations.Operation:
     from tumortrack.plan.operation import Operation, Planned
 
     assert stored.motions is not None
@@ -257,7 +254,7 @@ def _organ_shapes(stored: PlanFolder) -> tuple[RigidShape, ...]:
     )
 
 
-def _say_end(operation: Operation) -> None:
+def _say_end(operation: operations.Operation) -> None:
     found = operation.summary()
     if found["state"] == "done":
         say("done: both arms are home.")
@@ -282,7 +279,7 @@ def _write_film(stored: PlanFolder, cell: ArmCell, path: Path) -> None:
     say(f"written to {path}: {stored.motions.seconds:.0f} s in {n:.0f}.")
 
 
-def _frames(operation: Operation, times_s: list[float]) -> Iterator[Workcell]:
+def _frames(operation: operations.Operation, times_s: list[float]) -> Iterator[Workcell]:
     """What is seen at these times; if it heard of the time less often, the arms would halt."""
     from tumortrack.live.values import TrackingResult
 

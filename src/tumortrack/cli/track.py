@@ -6,7 +6,7 @@ import re
 import signal
 import time
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -107,6 +107,7 @@ class Track:
         report = report_path(self.report, "track")
 
         from tumortrack.live.loop import Loop
+        from tumortrack.live.source_worker import SourceWorker
         from tumortrack.tracking.tracker import Tracker
 
         if arms is None:
@@ -139,8 +140,12 @@ class Track:
             },
             **({} if arms is None else arms.about),
         }
-        live = api.live_workers(source_config, named, context)
-        with stopping(stop), ExitStack() as ending, live as (source, sinks):
+        with (
+            stopping(stop),
+            ExitStack() as ending,
+            api.open_sinks(named, context) as sinks,
+            closing(SourceWorker(source_config.open)) as source,
+        ):
             screen = _Screen(loop, source, sinks, report, about, companion)
             ending.callback(screen.end)  # once all workers have flushed
             say(f"tracking {self.source} in frame {frames.frame_id!r}; Ctrl-C ends it.")

@@ -64,25 +64,20 @@ class Train:
         from tumortrack.models.folder import is_finished
         from tumortrack.training.model import load_model, load_start
         from tumortrack.training.presets import PRESETS
-        from tumortrack.training.train import TrainingRun, run_identity, train
+        from tumortrack.training.train import TrainingRun, train
 
         keep_loaded()
         run = TrainingRun(
-            anatomy_ct=case.anatomy,
-            up_lps=case.up_lps,
+            anatomy_ct=case.anatomy, up_lps=case.up_lps,
             case_sha256=store.sha256_of(self.case / store.MANIFEST),
-            config=PRESETS[self.preset](case.anatomy, self.rotations),
-            seed=self.seed,
-            steps=self.steps,
-            minutes=self.minutes,
-            device=self.device,
-            workers=self.workers,
+            config=PRESETS[self.preset](case.anatomy, self.rotations), seed=self.seed,
+            steps=self.steps, minutes=self.minutes, device=self.device, workers=self.workers,
             checkpoint_every_s=self.checkpoint_every,
             start=None if self.start is None else load_start(self.start),
-        )
+        )  # fmt: skip
         if is_finished(self.model):
             done = load_model(self.model).provenance
-            if done.get("run_sha256") != run_identity(run):
+            if done.get("run_sha256") != run.identity:
                 raise InputError(
                     f"{self.model} holds a model of another case, preset, seed or option. Choose "
                     "another MODEL folder."
@@ -136,14 +131,9 @@ class Pretrain:
         from tumortrack.training.pretrain import Pretraining, pretrain
 
         run = Pretraining(
-            config=pretraining(),
-            anatomies=self.anatomies,
-            steps=self.steps,
-            seed=self.seed,
-            device=self.device,
-            workers=self.workers,
-            checkpoint_every_s=self.checkpoint_every,
-        )
+            config=pretraining(), anatomies=self.anatomies, steps=self.steps, seed=self.seed,
+            device=self.device, workers=self.workers, checkpoint_every_s=self.checkpoint_every,
+        )  # fmt: skip
         if (self.out / store.MANIFEST).is_file():
             done = store.read_manifest(self.out, PRETRAINED).get("provenance", {})
             if done.get("run_sha256") != run.identity:
