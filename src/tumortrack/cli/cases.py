@@ -51,7 +51,6 @@ class Prepare:
     overwrite: bool = False
 
     def run(self) -> None:
-        """Input -> case folder with a picture to check it by."""
         from tumortrack import api
         from tumortrack.imaging.prepare import PrepareOptions
 
@@ -80,13 +79,6 @@ class Export:
     series: str | None = None
 
     def run(self) -> None:
-        """Write OUT; all or nothing.
-
-        Raises:
-            InputError: OUT exists; ``series`` without ``dicom``; see ``write_dicom_seg``.
-            ArtifactError: no case.
-            StorageError: the disk refused.
-        """
         from tumortrack import api
         from tumortrack.imaging import segmentation
 
@@ -142,45 +134,31 @@ class Simulate:
     elastic: bool = False
 
     def run(self) -> None:
-        """Case -> folder of scenes, one folder each."""
         self.write()
         say(f"{self.scenes} scenes written to {self.dataset}.")
 
     def scene_config(self) -> SceneConfig:
         from tumortrack.sense.noise import CLEAN, D405_NOISE
-        from tumortrack.simulate.deform import (
-            ChainConfig,
-            DeformConfig,
-            DragConfig,
-            ElasticConfig,
-            StretchConfig,
-        )
+        from tumortrack.simulate import deform
         from tumortrack.simulate.deform.drag import CONFIGURATIONS
         from tumortrack.simulate.pose import PoseConfig
         from tumortrack.simulate.scene import SceneConfig
 
-        models: list[DragConfig | ElasticConfig] = [ElasticConfig()]
+        models: list[deform.DragConfig | deform.ElasticConfig] = [deform.ElasticConfig()]
         if not self.elastic:
             table = (CONFIGURATIONS[number] for number in self.configuration)
-            models = [DragConfig(steps=steps, falloff=self.falloff) for steps in table]
-        deform: tuple[DeformConfig, ...] = tuple(
-            ChainConfig(links=(model, StretchConfig())) if self.squeeze else model
-            for model in models
-        )
+            models = [deform.DragConfig(steps=steps, falloff=self.falloff) for steps in table]
+        chains = [deform.ChainConfig(links=(model, deform.StretchConfig())) for model in models]
         return SceneConfig(
             width=848,
             height=480,
             pose=PoseConfig(rotations=self.rotations),
-            deform=deform,
+            deform=tuple(chains if self.squeeze else models),
             noise=D405_NOISE if self.noise else CLEAN,
         )
 
     def write(self, prefix: str = "") -> None:
-        """Scenes PREFIX0000, PREFIX0001, ... of the ``test`` stream; those that are there stay.
-
-        Raises:
-            InputError: no case, or scenes that are not of this case, seed and options.
-        """
+        """Scenes PREFIX0000, PREFIX0001, ... of the ``test`` stream; those that are there stay."""
         from tumortrack import api
         from tumortrack.core.config import to_builtins
         from tumortrack.simulate.scene import SceneRecipe

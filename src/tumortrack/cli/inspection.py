@@ -142,12 +142,12 @@ def describe(path: Path) -> list[str]:
 
 
 def _artifact(folder: Path) -> list[str]:
-    kind = store.read_json(folder / store.MANIFEST).get("kind")
-    manifest = store.read_manifest(folder, str(kind))
-    what = _NAMES.get(str(kind), f"a {kind}")
+    kind = str(store.read_json(folder / store.MANIFEST).get("kind"))
+    manifest = store.read_manifest(folder, kind)
     lines = [
-        f"{folder}: {what} (schema {manifest['schema']}, tumortrack {manifest['tumortrack']}); "
-        f"{manifest['units']}, {manifest['frame']} frame; all files as they were written."
+        f"{folder}: {_NAMES.get(kind, f'a {kind}')} (schema {manifest['schema']}, tumortrack "
+        f"{manifest['tumortrack']}); {manifest['units']}, {manifest['frame']} frame; all files as "
+        "they were written."
     ]
     if isinstance(scenes := manifest.get("scenes"), dict):
         return [*lines, *_sealed_scenes(folder, scenes)]

@@ -52,7 +52,6 @@ class Locate:
     overwrite: bool = False
 
     def run(self) -> None:
-        """One cloud or depth image -> run folder."""
         _check_grid(self.grid)
         store.check_place(self.out, "run", self.overwrite)
         points = self._points()
@@ -172,7 +171,6 @@ class Evaluate:
     device: Device = "auto"
 
     def run(self) -> None:
-        """Model x scenes -> report folder."""
         from tumortrack.models.folder import read_model_manifest
         from tumortrack.simulate.scene_folder import list_scenes
 
@@ -213,13 +211,8 @@ class Evaluate:
 
 
 def check_case(model: Model, folders: list[Path]) -> None:
-    """Refuse scenes that are known to show another anatomy than the model's.
-
-    Scenes of other programs do not say which case they show; they pass.
-
-    Raises:
-        InputError: a scene that `simulate` made of another case.
-    """
+    """Raises InputError for a scene that `simulate` made of another case than the model's. Scenes
+    of other programs do not say which case they show; they pass."""
     wanted = model.provenance.get("case_sha256")
     for folder in folders:
         path = folder / "meta.json"

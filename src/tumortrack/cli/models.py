@@ -36,12 +36,7 @@ class Compile:
     device: Device = "auto"
 
     def run(self) -> None:
-        """Fill MODEL/compiled for this machine, and numba's cache of the kernels that frames use.
-
-        Raises:
-            ArtifactError: no model.
-            StorageError: the disk refused.
-        """
+        """Fill MODEL/compiled for this machine, and numba's cache of a frame's kernels."""
         from tumortrack.models.folder import WEIGHTS
         from tumortrack.occupancy.compiled import measured, save
         from tumortrack.occupancy.model import OccupancyModel
@@ -84,13 +79,6 @@ class Onnx:
     overwrite: bool = False
 
     def run(self) -> None:
-        """Write OUT.
-
-        Raises:
-            InputError: OUT exists or is named otherwise; the package onnx is not installed.
-            ArtifactError: no model.
-            StorageError: the disk refused.
-        """
         from tumortrack.models.folder import read_model_manifest
 
         out = self.out

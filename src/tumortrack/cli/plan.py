@@ -61,7 +61,6 @@ class Plan:
     overwrite: bool = False
 
     def run(self) -> None:
-        """A run -> strokes, motions, pictures."""
         from tumortrack.core.config import to_builtins
         from tumortrack.plan.files import KIND, PlanFolder, write_plan
         from tumortrack.plan.located import read_run

@@ -71,7 +71,6 @@ class Resect:
     device: Device = "auto"
 
     def run(self) -> None:
-        """A plan's motions, virtually, shown by sinks or filmed."""
         from tumortrack import api
         from tumortrack.core.config import from_builtins
         from tumortrack.live.sinks.ur import UrSinkConfig

@@ -127,6 +127,7 @@ class Track:
 
         say("warming up ...")
         loop.warm()
+        way = frames.published_from_camera
         about = {
             "model": model.provenance,
             "notes": list(model.notes),
@@ -134,10 +135,7 @@ class Track:
             "source": self.source,
             "sinks": list(self.sinks),
             "config": to_builtins(config),
-            "frame": {
-                "frame_id": frames.frame_id,
-                "published_from_camera": frames.published_from_camera.tolist(),
-            },
+            "frame": {"frame_id": frames.frame_id, "published_from_camera": way.tolist()},
             **({} if arms is None else arms.about),
         }
         with (
@@ -157,11 +155,10 @@ class Track:
         from tumortrack.tracking.tracker import FollowerConfig, region_for
 
         box = None if self.box is None else (self.box[:3], self.box[3:])
+        follower = FollowerConfig(rescan_s=self.rescan, smoothing_s=self.smoothing, seed=self.seed)
         return LoopConfig(
             region=region_for(model, range_mm=self.range, box_mm=box, whole=self.whole),
-            follower=FollowerConfig(
-                rescan_s=self.rescan, smoothing_s=self.smoothing, seed=self.seed
-            ),
+            follower=follower,
             intrinsics=None if self.intrinsics is None else read_intrinsics(self.intrinsics),
             stale_s=self.stale,
             give_up_s=self.give_up,
@@ -213,38 +210,35 @@ def stopping(end: Callable[[], None]) -> Iterator[None]:
             signal.signal(number, handler)
 
 
+@dataclass(eq=False)
 class _Screen:
     """One line of state now and then, every change of quality, and the report."""
 
-    def __init__(
-        self,
-        loop: Loop,
-        source: SourceWorker,
-        sinks: list[SinkWorker],
-        report: Path,
-        about: dict[str, Any],
-        arms: Operation | None,
-    ) -> None:
-        self._loop, self._source, self._sinks = loop, source, sinks
-        self._report, self._about, self._arms = report, about, arms
+    loop: Loop
+    source: SourceWorker
+    sinks: list[SinkWorker]
+    report: Path
+    about: dict[str, Any]
+    arms: Operation | None
+
+    def __post_init__(self) -> None:
         self._started = self._shown = self._stored = time.monotonic()
-        self._before, self._state, self._changed = 0, "", 0.0
-        self._unwritten = ""
+        self._before, self._state, self._changed, self._unwritten = 0, "", 0.0, ""
         self._errors: dict[str, str] = {}
         self._memory_mb = {"start": round(_resident_mb(), 1)}
 
     def show(self, result: TrackingResult) -> None:
         """Called with every result."""
         state = result.reason or result.warning or "good"
-        kind = _without_digits(state)
+        kind = re.sub(r"\d", "", state)  # numbers change with every frame
         if (cell := result.workcell) is not None:
             state += f"; arms: {cell.state}" + (f" ({cell.halted})" if cell.halted else "")
-            kind += cell.state + _without_digits(cell.halted)
+            kind += cell.state + re.sub(r"\d", "", cell.halted)
         now = time.monotonic()
         if kind != self._state and now - self._changed >= _SAY_S:
             self._state, self._changed = kind, now
             say(f"{result.quality}: {state}")
-        say_failures(self._sinks, self._errors)
+        say_failures(self.sinks, self._errors)
         if now - self._shown >= (_SAY_S if console.is_terminal else _SAY_PLAIN_S):
             self._line(now)
         if now - self._stored >= _STORE_S:
@@ -253,7 +247,7 @@ class _Screen:
     def end(self) -> None:
         """The last lines."""
         self._store()
-        source, statistics = self._source, self._loop.statistics
+        source, statistics = self.source, self.loop.statistics
         counts, latency = statistics.counts, statistics.latency
         say(
             f"{counts['good'] + counts['poor']} estimates ({counts['poor']} poor), "
@@ -265,7 +259,7 @@ class _Screen:
                 f"latency from {source.latency_from} to published estimate: p50 "
                 f"{times['p50']:.1f}, p95 {times['p95']:.1f}, p99.9 {times['p99.9']:.1f} ms."
             )
-        for sink in self._sinks:
+        for sink in self.sinks:
             if sink.dropped or sink.errors:
                 last = f"; the last: {sink.error}" if sink.error else ""
                 say(f"sink {sink.name}: {sink.dropped} missed, {sink.errors} errors{last}.")
@@ -273,11 +267,11 @@ class _Screen:
             off = errors.summary()
             say(f"{name}: centre off by {off['p50']:.1f} mm (median; 95 %: {off['p95']:.1f} mm).")
         if not self._unwritten:
-            say(f"written to {self._report}.")
-        check_closed(self._sinks)
+            say(f"written to {self.report}.")
+        check_closed(self.sinks)
 
     def _line(self, now: float) -> None:
-        statistics = self._loop.statistics
+        statistics = self.loop.statistics
         total = sum(statistics.counts.values())
         rate = (total - self._before) / (now - self._shown)
         self._before, self._shown = total, now
@@ -285,7 +279,7 @@ class _Screen:
             p50, p95 = (statistics.latency.percentile(percent) for percent in (50, 95))
             say(
                 f"{now - self._started:6.0f} s  {rate:5.1f} updates/s  latency p50 {p50:.1f} p95 "
-                f"{p95:.1f} ms  dropped {self._source.dropped}  {_resident_mb():.0f} MB"
+                f"{p95:.1f} ms  dropped {self.source.dropped}  {_resident_mb():.0f} MB"
             )
 
     def _store(self) -> None:
@@ -296,23 +290,19 @@ class _Screen:
         if self._stored - self._started > _SETTLED_S:
             self._memory_mb.setdefault("settled", now_mb)
         content = {
-            **self._about,
+            **self.about,
             "seconds": round(self._stored - self._started, 2),
             "memory_mb": self._memory_mb,
-            **summary(self._loop, self._source, self._sinks),
-            **({} if self._arms is None else {"resection": self._arms.summary()}),
+            **summary(self.loop, self.source, self.sinks),
+            **({} if self.arms is None else {"resection": self.arms.summary()}),
         }
         try:
-            store.write_json(self._report, content)
+            store.write_json(self.report, content)
             self._unwritten = ""
         except StorageError as error:  # a full disk must not end what is seen live
             if not self._unwritten:
                 say(f"report: {error}")
             self._unwritten = str(error)
-
-
-def _without_digits(text: str) -> str:
-    return re.sub(r"\d", "", text)
 
 
 def _resident_mb() -> float:

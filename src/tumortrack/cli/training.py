@@ -55,7 +55,6 @@ class Train:
     start: Path | None = None
 
     def run(self) -> None:
-        """Case -> model folder, resumed where one was begun."""
         from tumortrack.imaging.case import load_case
 
         self._check_numbers()
@@ -125,7 +124,6 @@ class Pretrain:
     checkpoint_every: float = 30.0
 
     def run(self) -> None:
-        """Pretrained weights into OUT, resumed where a run was begun."""
         from tumortrack.training.model import PRETRAINED
         from tumortrack.training.presets import pretraining
         from tumortrack.training.pretrain import Pretraining, pretrain

@@ -59,11 +59,9 @@ def film(
     bytes; frames that look the same are one that lasts longer.
 
     Args:
-        frames: of the table frame, evenly spaced in time.
-        located: organ and tumors, table frame, mm.
+        frames, located: table frame, mm; frames evenly spaced in time.
         path: ``.gif``, written atomically.
         fps: frames a second, up to 50.
-        size: width and height in pixels.
         progress: called with frames done and frames in all.
 
     Raises:
@@ -219,8 +217,7 @@ def _viewpoint_of(
     size: tuple[int, int],
     share: tuple[float, float] = (0.9, 0.9),
 ) -> Viewpoint:
-    """The one in this direction that shows all points as large as they can be in the uppermost
-    ``share`` of the picture."""
+    """In this direction, all points as large as can be in the picture's uppermost ``share``."""
     target = (points_mm.min(0) + points_mm.max(0)) / 2
     radius = float(np.linalg.norm(points_mm - target, axis=1).max())
     away = _AWAY * radius * direction / np.linalg.norm(direction)
@@ -261,11 +258,10 @@ def tube(points_mm: Float[np.ndarray, "n 3"], radius_mm: float, sides: int = 6) 
     turn = 2 * np.pi * np.arange(sides) / sides
     ring = np.cos(turn)[None, :, None] * a[:, None] + np.sin(turn)[None, :, None] * b[:, None]
     vertices = (points_mm[:, None] + radius_mm * ring).reshape(-1, 3)
-    n = len(points_mm)
-    first = sides * np.arange(n - 1)[:, None] + np.arange(sides)
-    next_ = sides * np.arange(n - 1)[:, None] + (np.arange(sides) + 1) % sides
+    start, corner = sides * np.arange(len(points_mm) - 1)[:, None], np.arange(sides)
+    first, next_ = start + corner, start + (corner + 1) % sides
     low = np.stack([first, next_, next_ + sides], -1).reshape(-1, 3)
     high = np.stack([first, next_ + sides, first + sides], -1).reshape(-1, 3)
-    fan = np.stack([np.zeros(sides - 2), np.arange(1, sides - 1), np.arange(2, sides)], -1)
-    ends = [fan[:, ::-1], fan + sides * (n - 1)]
+    fan = np.stack([np.zeros(sides - 2), corner[1:-1], corner[2:]], -1)
+    ends = [fan[:, ::-1], fan + sides * (len(points_mm) - 1)]
     return Mesh(vertices, np.concatenate([low, high, *ends]).astype(np.int32))

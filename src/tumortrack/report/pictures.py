@@ -53,13 +53,10 @@ _NEAR_BORDER = {
 def scene_picture(
     scene: Scene, estimate: Estimate | None, entry: dict[str, Any], path: Path
 ) -> None:
-    """Estimate over truth: two 3-D views, and two slices through each true tumor's centre.
+    """Estimate over truth: two 3-D views, and two slices through each true tumor's centre; a PNG,
+    written atomically.
 
-    Args:
-        scene: truth and observed cloud, camera frame.
-        estimate: None where nothing was found; then the truth is shown alone.
-        entry: this scene's entry of the report (name, parts, miou, failed), for the titles.
-        path: PNG to write, atomically.
+    Where nothing was found (None) the truth is shown alone. ``entry``: of the scene in the report.
     """
     shown = estimate.meshes if estimate else {}
     slices = [(name, view) for name in scene.reference.names[1:] for view in _SLICES]
@@ -156,12 +153,8 @@ def qc_picture(case_labels: LabelVolume, ct: Volume | None, anatomy: Anatomy, pa
     """Orthogonal slices with outlines, a row through each tumor, and a 3-D view: is everything
     outlined, and on the right side?
 
-    Args:
-        case_labels: shown as grey where there is no CT; patient frame.
-        ct: the CT behind it, if there is one.
-        anatomy: the prepared surfaces, in the same patient frame (LPS, mm). Of more than
-            six tumors the six largest have rows.
-        path: PNG to write, atomically.
+    All in the patient's frame (LPS, mm). The labels are shown as grey where there is no CT. Of
+    more than six tumors the six largest have rows. The PNG is written atomically.
     """
     order = sorted(range(len(anatomy.tumors)), key=lambda n: -abs(anatomy.tumors[n].volume_mm3))
     rows = {anatomy.names[n + 1]: anatomy.tumors[n] for n in sorted(order[:_MOST_ROWS])}

@@ -49,12 +49,7 @@ _CELL_MM = 1.0  # in which a stroke is said to be in the organ
 
 
 def draw_plan(plan: ResectionPlan, located: Located, path: Path) -> None:
-    """Write ``plan_figure`` as a PNG of 1200 x 600 pixels, atomically.
-
-    Raises:
-        InputError: as ``plan_figure``.
-        StorageError: the disk refused.
-    """
+    """Write ``plan_figure`` as a PNG of 1200 x 600 pixels, atomically; raises as it does."""
     drawing.save(plan_figure(plan, located), path)
 
 
@@ -63,9 +58,6 @@ def plan_figure(plan: ResectionPlan, located: Located) -> Figure:
 
     Two axes in mm, down pointing down: from above x and -y, from the side x and -z. Strokes are
     bold where they pass through the organ. Of a cloud without meshes the skin is drawn.
-
-    Args:
-        plan, located: table frame, mm.
 
     Raises:
         InputError: what was located has no surface, or one that is not closed.
@@ -142,11 +134,9 @@ def _draw_cuts(
 
 def _draw_arrows(axes: Axes, flat: Float[np.ndarray, "n 3"], colour: RGB) -> None:
     """Heads along a stroke, where it is on the side towards the viewer."""
-    arrow = {
-        "arrowstyle": "simple,head_width=0.85,head_length=0.9,tail_width=0.01",
-        **{"mutation_scale": 13, "shrinkA": 0, "shrinkB": 0},
-        **{"facecolor": colour, "edgecolor": "white", "linewidth": 0.6},
-    }
+    style = "simple,head_width=0.85,head_length=0.9,tail_width=0.01"
+    arrow = {"arrowstyle": style, "mutation_scale": 13, "shrinkA": 0, "shrinkB": 0}
+    arrow |= {"facecolor": colour, "edgecolor": "white", "linewidth": 0.6}
     steps = np.linalg.norm(np.diff(flat[:, :2], axis=0), axis=1)
     near = flat[:-1, 2] <= (flat[:, 2].min() + flat[:, 2].max()) / 2 + 1e-6
     good = np.flatnonzero(near & (steps >= 0.6 * steps[near].max()))
@@ -162,8 +152,7 @@ def _draw_numbers(axes: Axes, plan: ResectionPlan, view: ParallelView, frame: Fr
     The first and the last, and those between with room."""
     first = {cut.sweep: cut for cut in reversed(plan.cuts)}
     taken: list[Float[np.ndarray, " 2"]] = []
-    order = sorted(first, key=lambda sweep: (sweep not in (1, plan.sweeps), sweep))
-    for sweep in order:
+    for sweep in sorted(first, key=lambda sweep: (sweep not in (1, plan.sweeps), sweep)):
         flat = view.project(first[sweep].path_mm)[:, :2]
         colour = rgb(sweep_colour(sweep, plan.sweeps))
         spot = flat[0] if view is FROM_ABOVE else np.array([frame.right - 6.0, flat[0, 1]])
@@ -240,10 +229,8 @@ def organ_surfaces(located: Located) -> dict[int, Mesh]:
 
 
 def skin(points_mm: Float[np.ndarray, "n 3"]) -> Mesh:
-    """The closed surface around points strewn evenly through a body.
-
-    A level of the points' blurred density: the one that holds all of them at the density that
-    there is inside.
+    """The closed surface around points strewn evenly through a body: a level of their blurred
+    density, the one that holds all of them at the density that there is inside.
 
     Raises:
         InputError: too few points.

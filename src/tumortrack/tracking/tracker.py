@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float64
@@ -24,20 +24,7 @@ from tumortrack.sense.region import RegionConfig
 _ALONE = Following()
 
 
-@runtime_checkable
-class Locator(Protocol):
-    """One method at work; ``Tracker`` documents the calls."""
-
-    anatomy_ct: Anatomy | None
-
-    def locate(self, cloud: SensorCloud, grid: int, seed: int) -> Estimate: ...
-
-    def follow(self, cloud: SensorCloud, last: Estimate | None, how: Following) -> Estimate: ...
-
-    def warm(self) -> None: ...
-
-
-_LOCATORS: dict[type[Model], Callable[[Any], Locator]] = {
+_LOCATORS: dict[type[Model], Callable[[Any], RegistrationLocator | OccupancyLocator]] = {
     RegistrationModel: RegistrationLocator,
     OccupancyModel: OccupancyLocator,
 }
@@ -135,9 +122,7 @@ class Follower:
     def last_box_mm(self, stamp_ns: int) -> Float64[np.ndarray, "2 3"] | None:
         """The organ's box in the last estimate (camera frame), if that is recent enough."""
         last = self._recent(stamp_ns)
-        if last is None:
-            return None
-        return next(iter(last.meshes.values())).box_mm
+        return None if last is None else next(iter(last.meshes.values())).box_mm
 
     def locate(self, cloud: SensorCloud) -> Estimate:
         """The estimate of this frame.
@@ -149,18 +134,16 @@ class Follower:
         thorough = (cloud.stamp_ns - self._scanned_ns) * 1e-9 >= self._config.rescan_s
         if last is None or thorough:
             self._scanned_ns = cloud.stamp_ns
-        how = Following(
-            thorough=thorough, smoothing_s=self._config.smoothing_s, seed=self._config.seed
-        )
+        smoothing_s, seed = self._config.smoothing_s, self._config.seed
+        how = Following(thorough=thorough, smoothing_s=smoothing_s, seed=seed)
         self._last = self._tracker.follow(cloud, last, how)
         return self._last
 
     def _recent(self, stamp_ns: int) -> Estimate | None:
-        last = self._last
-        if last is None:
+        if self._last is None:
             return None
-        age_s = (stamp_ns - last.cloud.stamp_ns) * 1e-9
-        return last if 0 <= age_s <= self._config.forget_s else None
+        age_s = (stamp_ns - self._last.cloud.stamp_ns) * 1e-9
+        return self._last if 0 <= age_s <= self._config.forget_s else None
 
 
 def region_for(
@@ -173,10 +156,7 @@ def region_for(
     """Depths that training showed, unless others are given; where it showed any distance, its
     farthest organ still lies in them whole. Pieces of about the organ's size, if that is known.
 
-    Args:
-        range_mm: nearest and farthest depth, camera frame.
-        box_mm: two opposite corners of a region of interest, camera frame.
-        whole: everything in range is the organ.
+    ``box_mm``: opposite corners, camera frame. ``whole``: everything in range is the organ.
     """
     if model is None:
         near, far = range_mm or (CloudConfig().near_mm, CloudConfig().far_mm)
