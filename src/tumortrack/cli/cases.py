@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 from tyro.conf import Positional
 
@@ -178,18 +178,14 @@ class Simulate:
             for index in range(self.scenes):
                 folder = self.dataset / f"{prefix}{index:04d}"
                 if folder.exists():
-                    recipe = asdict(SceneRecipe(self.seed, "test", index))
-                    _check_same(folder, {**about, "recipe": recipe})
+                    made_from = {**about, "recipe": asdict(SceneRecipe(self.seed, "test", index))}
+                    meta = store.read_json(folder / "meta.json")
+                    if {key: meta.get(key) for key in made_from} != made_from:
+                        raise InputError(
+                            f"{folder} is a scene of another case, seed or option. Choose another "
+                            "DATASET folder."
+                        )
                 else:
                     scene = make(index)
                     write_scene(folder, replace(scene, meta={**about, **scene.meta}))
                 advance()
-
-
-def _check_same(folder: Path, made_from: dict[str, Any]) -> None:
-    """Refuse to continue a dataset of another case, seed or options."""
-    meta = store.read_json(folder / "meta.json")
-    if {key: meta.get(key) for key in made_from} != made_from:
-        raise InputError(
-            f"{folder} is a scene of another case, seed or option. Choose another DATASET folder."
-        )

@@ -95,9 +95,10 @@ class Plan:
             )
             if moved:
                 say(f"note: {moved}")
+        model = store.read_json(self.run_folder / "report.json").get("model")
         content = PlanFolder(
             resection, config, table_from_camera, frame_id, located.meshes, cell_used, motions,
-            _case_of(self.run_folder),
+            str(model.get("case_sha256", "")) if isinstance(model, dict) else "",
         )  # fmt: skip
 
         def pictures(aside: Path) -> None:
@@ -173,11 +174,6 @@ def _below(organ: Mesh, config: CellConfig) -> CellConfig:
     x, y = organ.box_mm.mean(0)[:2].tolist()
     middle_mm = (x, y, float(organ.box_mm[0, 2]) - config.stand_mm)
     return replace(config, middle_mm=middle_mm)
-
-
-def _case_of(run_folder: Path) -> str:
-    model = store.read_json(run_folder / "report.json").get("model")
-    return str(model.get("case_sha256", "")) if isinstance(model, dict) else ""
 
 
 def _say_plan(resection: ResectionPlan) -> None:

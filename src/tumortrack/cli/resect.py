@@ -245,11 +245,10 @@ def _organ_shapes(stored: PlanFolder) -> tuple[RigidShape, ...]:
     names = sorted(stored.meshes)  # kidney before tumors
     meshes = [stored.meshes[name] for name in names]
     meshes[0] = Mesh(meshes[0].vertices_mm, bare_faces(Anatomy(tuple(meshes))))
+    opacity, still = [0.35] + [1.0] * len(names), np.eye(4)
     return tuple(
-        RigidShape(
-            f"planned/{name}", mesh, np.eye(4), part_colour(label), 1.0 if label > 1 else 0.35
-        )
-        for label, (name, mesh) in enumerate(zip(names, meshes, strict=True), start=1)
+        RigidShape(f"planned/{name}", mesh, still, part_colour(n + 1), opacity[n])
+        for n, (name, mesh) in enumerate(zip(names, meshes, strict=True))
     )
 
 
@@ -265,28 +264,26 @@ def _say_end(operation: operations.Operation) -> None:
 
 def _write_film(stored: PlanFolder, cell: ArmCell, path: Path) -> None:
     """An animated GIF of about twelve seconds."""
+    from tumortrack.live.values import TrackingResult
     from tumortrack.plan.files import as_located
     from tumortrack.plan.operation import OperationConfig
     from tumortrack.report.film import film, moments_s
 
     assert stored.motions is not None
     times_s = moments_s(stored.motions, _FILM_FRAMES)
-    frames = _frames(_operation(stored, cell, OperationConfig()), times_s.tolist())
+    operation = _operation(stored, cell, OperationConfig())
+
+    def frames() -> Iterator[Workcell]:
+        now_s = 0.0
+        for time_s in times_s.tolist():
+            frame = operation.act(TrackingResult(0, 0, reason=_NOTHING), now_s)
+            while now_s < time_s:  # heard it of the time less often, the arms would halt
+                now_s = min(now_s + _FILM_STEP_S, time_s)
+                frame = operation.act(TrackingResult(0, 0, reason=_NOTHING), now_s)
+            assert frame.workcell is not None
+            yield frame.workcell
+
     with progress_bar("drawing", len(times_s)) as advance:
-        film(frames, as_located(stored), path, _FILM_FPS, progress=lambda *_: advance())
+        film(frames(), as_located(stored), path, _FILM_FPS, progress=lambda *_: advance())
     n = len(times_s) / _FILM_FPS
     say(f"written to {path}: {stored.motions.seconds:.0f} s in {n:.0f}.")
-
-
-def _frames(operation: operations.Operation, times_s: list[float]) -> Iterator[Workcell]:
-    """What is seen at these times; if it heard of the time less often, the arms would halt."""
-    from tumortrack.live.values import TrackingResult
-
-    now_s = 0.0
-    for time_s in times_s:
-        frame = operation.act(TrackingResult(0, 0, reason=_NOTHING), now_s)
-        while now_s < time_s:
-            now_s = min(now_s + _FILM_STEP_S, time_s)
-            frame = operation.act(TrackingResult(0, 0, reason=_NOTHING), now_s)
-        assert frame.workcell is not None
-        yield frame.workcell

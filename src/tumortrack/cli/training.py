@@ -168,7 +168,14 @@ def _training_screen() -> Iterator[Callable[[TrainingStatus], None]]:
         if status.note != noted:
             say(status.note)
             noted = status.note
-        text = _line(status)
+        end = f"/{status.end}" if status.end is not None else ""
+        miou = "-" if status.miou is None else f"{status.miou:.3f}"
+        minutes, seconds = divmod(int(status.seconds_left), 60)
+        text = (
+            f"step {status.step}{end} | {status.samples_per_s:.0f} samples/s | loss "
+            f"{status.loss:.4f} | validation mIoU {miou} | {minutes}:{seconds:02d} left | "
+            f"{status.waiting:.0%} waiting for scenes"
+        )
         if console.is_terminal:
             spinner.update(text)
         elif time.monotonic() - shown_s >= _EVERY_S or status.step == status.end:
@@ -185,13 +192,3 @@ def _training_screen() -> Iterator[Callable[[TrainingStatus], None]]:
         raise
     finally:
         spinner.stop()
-
-
-def _line(status: TrainingStatus) -> str:
-    end = f"/{status.end}" if status.end is not None else ""
-    miou = "-" if status.miou is None else f"{status.miou:.3f}"
-    left = f"{int(status.seconds_left) // 60}:{int(status.seconds_left) % 60:02d}"
-    return (
-        f"step {status.step}{end} | {status.samples_per_s:.0f} samples/s | loss {status.loss:.4f} "
-        f"| validation mIoU {miou} | {left} left | {status.waiting:.0%} waiting for scenes"
-    )

@@ -172,7 +172,7 @@ class TrackingResult:
 
     Attributes:
         sequence: number of the result, from 0.
-        stamp_ns: of the frame; if none came, the present by ``time.time_ns``.
+        stamp_ns: of the frame; if none came, the present on its clock (docs/conventions.md).
         estimate: camera frame, mm; None where nothing can be said. Never an older one.
         reason: why there is no estimate; empty with one.
         quality: ``none`` without an estimate; ``poor`` if it should not be relied on: ``warning``

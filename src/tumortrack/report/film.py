@@ -138,8 +138,13 @@ class _FramePainter:
         ]
         self._close_size = round(_CLOSE[0] * size[0]), round(_CLOSE[1] * size[1])
         self._far = _viewpoint_of(_reach(frames), _FROM, size, _ARMS)
-        self._near = _close_viewpoint(self._organ[0].mesh, self._close_size)
-        flat = self._far.project(self._organ[0].mesh.vertices_mm, size)[:, :2]
+        organ_mm = self._organ[0].mesh.vertices_mm
+        radius = float(np.linalg.norm(organ_mm - self._organ[0].mesh.box_mm.mean(0), axis=1).max())
+        near = _viewpoint_of(organ_mm, _CLOSE_FROM, self._close_size)
+        target = near.place_mm + near.distance_mm * near.axes[2]
+        place, before_mm = target + 10 * (near.place_mm - target), radius + _CLOSE_MM
+        self._near = Viewpoint.towards(target, place, near.width_mm, True, before_mm)
+        flat = self._far.project(organ_mm, size)[:, :2]
         self._spot = (*(flat.min(0) - 4).round().tolist(), *(flat.max(0) + 4).round().tolist())
         font = f"{matplotlib.get_data_path()}/fonts/ttf/DejaVuSans.ttf"
         self._letters = [ImageFont.truetype(font, size[1] // share) for share in (20, 34)]
@@ -232,14 +237,6 @@ def _viewpoint_of(
         width = viewpoint.width_mm * float(((high - low) / room).max())
         viewpoint = Viewpoint.towards(target, target + away, width)
     return viewpoint
-
-
-def _close_viewpoint(organ: Mesh, size: tuple[int, int]) -> Viewpoint:
-    near = _viewpoint_of(organ.vertices_mm, _CLOSE_FROM, size)
-    target = near.place_mm + near.distance_mm * near.axes[2]
-    radius = float(np.linalg.norm(organ.vertices_mm - organ.box_mm.mean(0), axis=1).max())
-    place, before_mm = target + 10 * (near.place_mm - target), radius + _CLOSE_MM
-    return Viewpoint.towards(target, place, near.width_mm, parallel=True, before_mm=before_mm)
 
 
 def tube(points_mm: Float[np.ndarray, "n 3"], radius_mm: float, sides: int = 6) -> Mesh:
