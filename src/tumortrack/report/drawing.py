@@ -7,11 +7,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import trimesh
 from jaxtyping import Bool, Float
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
+from trimesh.intersections import mesh_plane
 
 from tumortrack.core import colours
 from tumortrack.core.store import write_atomically
@@ -57,16 +59,9 @@ def section(
     mesh: Mesh, view: ParallelView, through_mm: Float[np.ndarray, " 3"]
 ) -> Float[np.ndarray, "n 2 2"]:
     """Outline of a mesh in the view's plane through a point: segments as (right, down) mm."""
-    flat = view.project(mesh.vertices_mm)
-    side = flat[:, 2] - view.project(through_mm[None])[0, 2]
-    side = np.where(side == 0, 1e-9, side)  # no corner lies in the plane: always two crossings
-    up = side[mesh.faces] > 0
-    start = mesh.faces[up.any(1) & ~up.all(1)]  # (face, edge)
-    end = np.roll(start, -1, axis=1)
-    gap = np.where(side[start] * side[end] < 0, side[start] - side[end], np.nan)
-    share = (side[start] / gap)[..., None]
-    ends = flat[start, :2] + share * (flat[end, :2] - flat[start, :2])
-    return ends[~np.isnan(gap)].reshape(-1, 2, 2)
+    solid = trimesh.Trimesh(mesh.vertices_mm, mesh.faces, process=False)
+    ends_mm = mesh_plane(solid, view.axes[2], through_mm)
+    return view.project(ends_mm.reshape(-1, 3))[:, :2].reshape(-1, 2, 2)
 
 
 def section_mask(
@@ -103,9 +98,7 @@ def draw_lines(axes: Axes, segments: Float[np.ndarray, "n 2 2"], **style: Any) -
 
 def tint(axes: Axes, mask: Bool[np.ndarray, "h w"], frame: Frame, color: RGB) -> None:
     """Lay a translucent colour over the mask."""
-    picture = np.empty((*mask.shape, 4))
-    picture[...] = (*color, 0.0)
-    picture[mask, 3] = 0.25
+    picture = np.where(mask[..., None], (*color, 0.25), (*color, 0.0))
     axes.imshow(picture, extent=frame.extent, zorder=1)
 
 

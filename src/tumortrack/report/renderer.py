@@ -17,7 +17,7 @@ from PIL import Image
 from tumortrack.core.colours import Colour
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.types import Mesh
-from tumortrack.report.renderer_kernels import Hits, Light, Triangles, crease, nearest, shade
+from tumortrack.report.renderer_kernels import Light, Triangles, crease, nearest, shade
 
 _SHARPER = 2  # pixels drawn per pixel shown, each way: smooth edges
 _CREASE = np.cos(np.radians(40.0))  # faces that meet at a sharper angle keep their edge
@@ -173,8 +173,8 @@ class ParallelView:
     ) -> Float[np.ndarray, "h w"]:
         """Of what is seen, mm away from the viewer as ``project`` has it; infinite: nothing."""
         viewpoint, size = self.viewpoint(frame, pixel_mm), frame.size(pixel_mm)
-        corners = viewpoint.project(mesh.vertices_mm, size).astype(np.float32)
-        near, _ = nearest(corners, mesh.faces.astype(np.int32), *size, np.inf, False)
+        seen = viewpoint.project(mesh.vertices_mm, size).astype(np.float32)[mesh.faces]
+        near, _ = nearest(seen, *size, np.inf, False)
         return -near.astype(float) - _FAR_MM
 
     def silhouette(
@@ -212,22 +212,18 @@ def render(
 
 
 def _join(bodies: list[Body]) -> Triangles:
-    places, faces, count = [np.zeros((0, 3))], [np.zeros((0, 3), int)], 0
-    normals = [np.zeros((0, 3, 3), np.float32)]
+    corners, normals = [np.zeros((0, 3, 3))], [np.zeros((0, 3, 3), np.float32)]
     for body in bodies:
         vertices, normal = body.mesh.vertices_mm, corner_normals(body.mesh)
         if (way := body.world_from_mesh) is not None:
             vertices = transform_points(way, vertices)
-            normal = (normal.reshape(-1, 3) @ way[:3, :3].T.astype(np.float32)).reshape(-1, 3, 3)
-        places.append(vertices)
-        faces.append(body.mesh.faces + count)
+            normal = normal @ way[:3, :3].T.astype(np.float32)
+        corners.append(vertices[body.mesh.faces])
         normals.append(normal)
-        count += len(vertices)
     each = [len(body.mesh.faces) for body in bodies]
     colors = np.array([body.color for body in bodies], np.float32).reshape(-1, 3)
     return Triangles(
-        np.concatenate(places).astype(np.float32),
-        np.concatenate(faces).astype(np.int32),
+        np.concatenate(corners).astype(np.float32),
         np.concatenate(normals),
         np.repeat(colors, each, axis=0),
         np.repeat(np.array([body.shadowed for body in bodies], bool), each),
@@ -264,9 +260,9 @@ def _light(triangles: Triangles, viewpoint: Viewpoint) -> Light:
     pixel_mm = 1.6 * viewpoint.width_mm / _SHADOW_PIXELS
     middle = axes[:2] @ target_mm.astype(np.float32)
     corner = (middle - pixel_mm * _SHADOW_PIXELS / 2).astype(np.float32)
-    seen = triangles.places @ axes.T
-    seen[:, :2] = (seen[:, :2] - corner) / pixel_mm
-    near, _ = nearest(seen, triangles.faces, _SHADOW_PIXELS, _SHADOW_PIXELS, np.inf, False)
+    seen = triangles.corners @ axes.T
+    seen[..., :2] = (seen[..., :2] - corner) / pixel_mm
+    near, _ = nearest(seen, _SHADOW_PIXELS, _SHADOW_PIXELS, np.inf, False)
     return Light(axes, viewpoint.up.astype(np.float32), near, corner, pixel_mm)
 
 
@@ -276,13 +272,13 @@ def _lay(
 ) -> Float32[np.ndarray, "h w"]:  # fmt: skip
     """Paint them where nothing in ``below`` is nearer; returns their nearness (-inf: nothing)."""
     size = picture.shape[1], picture.shape[0]
-    corners = viewpoint.project(triangles.places.astype(float), size).astype(np.float32)
+    seen = viewpoint.project(triangles.corners.astype(float), size).astype(np.float32)
     perspective = not viewpoint.parallel
     closest_mm = max(viewpoint.distance_mm - viewpoint.before_mm, 1.0)
     limit = 1 / closest_mm if perspective else -closest_mm
-    near, winner = nearest(corners, triangles.faces, *size, limit, perspective)
+    near, winner = nearest(seen, *size, limit, perspective)
     one_mm = near**2 if perspective else np.float32(1.0)  # of nearness
     winner[near - _SAME_MM * one_mm <= below] = -1
-    hits = Hits(winner, corners, perspective, viewpoint.place_mm.astype(np.float32))
-    shade(picture, hits, triangles, light, opacity)
+    eye = viewpoint.place_mm.astype(np.float32), perspective
+    shade(picture, winner, seen, triangles, light, eye, opacity)
     return near
