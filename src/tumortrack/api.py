@@ -41,9 +41,8 @@ _TEST_BODY = 2**20  # and the seed: elastic states that training with the same s
 
 
 def scan_phantom(folder: StrPath, seed: int = 1) -> Path:
-    """Write a virtual CT of the built-in kidney phantom as a DICOM series, if none is there.
-
-    Returns the folder, which ``prepare`` reads.
+    """Write a virtual CT of the built-in kidney phantom as a DICOM series, if none is there;
+    returns the folder, which ``prepare`` reads.
 
     Raises:
         StorageError: the disk refused.
@@ -64,7 +63,6 @@ def prepare(
     """A case from a DICOM folder, a CT volume, a label map or a folder of meshes.
 
     Args:
-        source: what to read.
         folder: where to write the case with a picture to check it by (qc.png); None: nowhere.
         overwrite: replace a case that lies there.
         options: fields of ``imaging.prepare.PrepareOptions``: ``kidney_hu``, ``tumor_hu``,
@@ -108,15 +106,12 @@ def load_case(folder: StrPath) -> Case:
 def simulate_scenes(
     case: Case, count: int = 1, *, seed: int = 0, elastic: bool = True, noise: bool = True
 ) -> list[Scene]:
-    """Deformed scenes with their truth, as a D405 sees them; never those that training sees.
+    """Deformed scenes with their truth, as a D405 sees them; never those that training sees. The
+    same seed gives the same scenes.
 
     Args:
-        case: whose organ.
-        count: how many.
-        seed: of the scenes; the same seed gives the same scenes.
         elastic: deform the organ as an elastic body in its bed; else drag its surface as the paper
             does (its configuration 3).
-        noise: with the depth sensor's noise.
 
     Returns:
         Scenes: ``cloud`` and ``depth`` (camera frame, mm), ``reference`` (the true surfaces),
@@ -176,8 +171,6 @@ def train(
         preset: ``clinic`` registers the organ of the CT, ``quick`` and ``paper`` label points.
         config: a changed preset instead: ``msgspec.structs.replace(presets.clinic(anatomy), ...)``.
         minutes, steps: where to stop; at most one of them (default: the preset's end).
-        seed: of weights and scenes.
-        device: ``auto`` takes CUDA if it is available.
         workers: processes that make scenes (default: as the machine allows).
         report: called every few seconds.
 
@@ -244,13 +237,11 @@ def find_organ(
     """The organ's points among table, drape, instruments and hands; camera frame, mm.
 
     Args:
-        content: a whole depth image or cloud.
         model: whose organ; gives depths and sizes to expect.
         range_mm: nearest and farthest depth to keep.
         box_mm: two opposite corners of a region of interest.
         mask: of a depth image, True where the organ may be.
         picked_mm: a point on the organ: the piece that it lies on is taken.
-        seed: of the draw of points.
 
     Raises:
         NoEstimate: nothing is left that may be the organ; says which step took the rest.
@@ -278,12 +269,9 @@ def save_estimate(estimate: Estimate, folder: StrPath, overwrite: bool = False) 
 
 
 def estimate_from_surfaces(surfaces: Mapping[str, Mesh], grid: int = 160) -> Estimate:
-    """What another method says, in the form that ``evaluate`` compares.
-
-    Args:
-        surfaces: closed surfaces by part (kidney, tumor_1, ...), camera frame, mm; the kidney's
-            includes its tumors.
-        grid: voxels along the longest side of the labelled volume.
+    """What another method says, in the form that ``evaluate`` compares: closed surfaces by part
+    (kidney, tumor_1, ...), camera frame, mm; the kidney's includes its tumors. ``grid``: voxels
+    along the longest side of the labelled volume.
     """
     from tumortrack.models.report import estimate_of
 
@@ -333,7 +321,6 @@ def track(
     """Follow the organ live, from a source to sinks, until the source ends.
 
     Args:
-        tracker: with the model.
         source: as on the command line (``"virtual:CASE"``, ``"realsense"``, ...), or a source's
             configuration.
         sinks: likewise, or objects with ``publish(result)`` and ``close()``.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -199,13 +200,8 @@ class Evaluate:
         tracker = Tracker(model)
         say_notes(model.notes)
         with progress_bar("evaluate", len(folders)) as advance:
-            result = evaluate_scenes(
-                lambda cloud: tracker.locate(cloud, self.grid, self.seed),
-                self.variants,
-                self.report,
-                progress=lambda *_: advance(),
-                about=about,
-            )
+            locate = partial(tracker.locate, grid=self.grid, seed=self.seed)
+            result = evaluate_scenes(locate, self.variants, self.report, advance, about)
         console.print(summary_table(result))
         say(f"written to {self.report / 'report.json'}; look at {self.report / 'index.html'}.")
 

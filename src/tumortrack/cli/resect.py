@@ -32,8 +32,7 @@ if TYPE_CHECKING:
 
 _FPS = 30.0  # of an execution that no camera drives
 _NOTHING = "virtual execution of a stored plan: nothing is tracked"
-_FILM_FPS, _FILM_FRAMES = 10, 120
-_FILM_STEP_S = 0.1
+_FILM_FRAMES, _FILM_STEP_S = 120, 0.1
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -267,7 +266,7 @@ def _write_film(stored: PlanFolder, cell: ArmCell, path: Path) -> None:
     from tumortrack.live.values import TrackingResult
     from tumortrack.plan.files import as_located
     from tumortrack.plan.operation import OperationConfig
-    from tumortrack.report.film import film, moments_s
+    from tumortrack.report.film import FPS, film, moments_s
 
     assert stored.motions is not None
     times_s = moments_s(stored.motions, _FILM_FRAMES)
@@ -284,6 +283,5 @@ def _write_film(stored: PlanFolder, cell: ArmCell, path: Path) -> None:
             yield frame.workcell
 
     with progress_bar("drawing", len(times_s)) as advance:
-        film(frames(), as_located(stored), path, _FILM_FPS, progress=lambda *_: advance())
-    n = len(times_s) / _FILM_FPS
-    say(f"written to {path}: {stored.motions.seconds:.0f} s in {n:.0f}.")
+        film(frames(), as_located(stored), path, progress=advance)
+    say(f"written to {path}: {stored.motions.seconds:.0f} s in {len(times_s) / FPS:.0f}.")

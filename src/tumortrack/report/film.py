@@ -26,6 +26,7 @@ from tumortrack.plan.values import Located
 from tumortrack.report.plan_pictures import organ_surfaces
 from tumortrack.report.renderer import Body, Viewpoint, render, rgb
 
+FPS = 10  # a GIF counts hundredths of a second
 _FROM = np.array([-0.36, -0.8, 0.48])  # where the viewer is: to the left, in front, above
 _CLOSE_FROM = np.array([-0.36, -0.72, 0.6])
 _AWAY = 2.6  # the viewer's distance in radii of what is seen: a natural perspective
@@ -41,16 +42,14 @@ _SAMPLES = 8  # frames from which the colours are chosen
 _LOOKED_AT, _EVERY = 40, 3  # frames, and every which vertex, that the viewpoint is chosen from
 _LEAST_FRAMES = 2  # of a stage
 _LAST_S = 1.5  # the last picture stays
-_FASTEST, _SMALLEST = 50, 160
 
 
 def film(
     frames: Iterable[Workcell],
     located: Located,
     path: Path,
-    fps: int = 10,
     size: tuple[int, int] = (640, 480),
-    progress: Callable[[int, int], None] | None = None,
+    progress: Callable[[], None] = lambda: None,
 ) -> None:
     """Write the frames as an animated GIF that begins again when it has ended.
 
@@ -59,17 +58,18 @@ def film(
     bytes; frames that look the same are one that lasts longer.
 
     Args:
-        frames, located: table frame, mm; frames evenly spaced in time.
+        frames, located: table frame, mm; ``FPS`` frames a second.
         path: ``.gif``, written atomically.
-        fps: frames a second, up to 50.
-        progress: called with frames done and frames in all.
+        progress: called after each frame.
 
     Raises:
-        InputError: no frame, or another kind of file, speed or size.
+        InputError: no frame, nothing in them, or another kind of file.
         StorageError: the disk refused.
     """
-    cells = list(frames)
-    _check(cells, path, fps, size)
+    if path.suffix.lower() != ".gif":
+        raise InputError(f"{path}: a film is an animated GIF; give a name that ends in .gif.")
+    if not (cells := list(frames)):
+        raise InputError("there is no frame to film: the arms did nothing.")
     painter = _FramePainter(cells, located, size)
     chosen = np.linspace(0, len(cells) - 1, min(_SAMPLES, len(cells))).astype(int).tolist()
     some = [np.asarray(painter.picture(n))[::2, ::2] for n in chosen]
@@ -79,11 +79,10 @@ def film(
     def indexed() -> Iterator[Image.Image]:
         for n in range(len(cells)):
             yield painter.picture(n).quantize(palette=palette, dither=plain)
-            if progress is not None:
-                progress(n + 1, len(cells))
+            progress()
 
     pictures = indexed()
-    each_ms = round(100 / fps) * 10  # a GIF counts hundredths of a second
+    each_ms = round(1000 / FPS)
     buffer = io.BytesIO()
     next(pictures).save(
         buffer,
@@ -111,20 +110,6 @@ def moments_s(motions: Motions, frames: int) -> Float64[np.ndarray, " n"]:
     stages = zip(starts, seconds, counts.tolist(), strict=True)
     each = [start + length * np.arange(n) / n for start, length, n in stages]
     return np.append(np.concatenate(each), seconds.sum())
-
-
-def _check(frames: list[Workcell], path: Path, fps: int, size: tuple[int, int]) -> None:
-    if path.suffix.lower() != ".gif":
-        raise InputError(f"{path}: a film is an animated GIF; give a name that ends in .gif.")
-    if not 1 <= fps <= _FASTEST:
-        raise InputError(f"{fps} frames a second are not possible; allowed: 1 to {_FASTEST}.")
-    if min(size) < _SMALLEST or max(size) > 10 * _SMALLEST:
-        raise InputError(
-            f"a film of {size[0]} x {size[1]} pixels is not possible; allowed: {_SMALLEST} to "
-            f"{10 * _SMALLEST} each way."
-        )
-    if not frames:
-        raise InputError("there is no frame to film: the arms did nothing.")
 
 
 class _FramePainter:

@@ -20,11 +20,11 @@ from tumortrack.core.colours import part_colour, sweep_colour
 from tumortrack.core.errors import InputError
 from tumortrack.core.types import ORGAN, Mesh, part_names
 from tumortrack.imaging.meshes import mesh_of, solid_of
-from tumortrack.imaging.raster import voxelise
 from tumortrack.plan.values import Cut, CutLayer, Located, ResectionPlan
 from tumortrack.report import drawing
 from tumortrack.report.drawing import CENTRED, KIDNEY
 from tumortrack.report.renderer import RGB, Body, Frame, ParallelView, rgb
+from tumortrack.simulate.occupancy import contains
 
 FROM_ABOVE = ParallelView("from above", (1.0, 0.0, 0.0), (0.0, -1.0, 0.0))
 FROM_SIDE = ParallelView("from the side", (1.0, 0.0, 0.0), (0.0, 0.0, -1.0))
@@ -45,7 +45,6 @@ _MOST_ARROWED = 8  # sweeps with arrows
 _BLUR = 1.2  # cells: bridges the gaps between points strewn at random
 _INSIDE = 0.75  # quantile of the density at the points: those near the surface have less
 _FEWEST, _MOST_CELLS = 8, 60  # points of a part; cells along its longest side
-_CELL_MM = 1.0  # in which a stroke is said to be in the organ
 
 
 def draw_plan(plan: ResectionPlan, located: Located, path: Path) -> None:
@@ -69,7 +68,7 @@ def plan_figure(plan: ResectionPlan, located: Located) -> Figure:
     piece, rest = parted(organ, plan.layers)
     bodies = [Body(mesh, rgb(part_colour(label))) for label, mesh in surfaces.items()]
     bodies += [Body(rest, KIDNEY, _ORGAN_OPACITY), Body(piece, _PIECE, _PIECE_OPACITY)]
-    in_organ = [within(cut, organ) for cut in plan.cuts]
+    in_organ = [contains(organ, cut.path_mm) for cut in plan.cuts]
     reach_mm = plan.grasp_mm + np.array([0.0, 0.0, _APPROACH_MM])
     shown = [organ.vertices_mm, *(cut.path_mm for cut in plan.cuts), reach_mm[None]]
     borders = {"left": 0.012, "right": 0.988, "top": 0.845, "bottom": 0.1}
@@ -267,13 +266,3 @@ def parted(organ: Mesh, layers: tuple[CutLayer, ...]) -> tuple[Mesh, Mesh]:
             slabs.append(area.extrude(height).translate((0.0, 0.0, layer.bottom_mm)))
     taken = manifold3d.Manifold.batch_boolean(slabs, manifold3d.OpType.Add)
     return mesh_of(solid ^ taken), mesh_of(solid - taken)
-
-
-def within(cut: Cut, organ: Mesh) -> Bool[np.ndarray, " n"]:
-    """Which points of a stroke lie in the organ."""
-    low, high = cut.path_mm.min(0) - _CELL_MM, cut.path_mm.max(0) + _CELL_MM
-    way = np.diag([_CELL_MM, _CELL_MM, _CELL_MM, 1.0])
-    way[:3, 3] = low
-    nx, ny, nz = (np.ceil((high - low) / _CELL_MM).astype(int) + 1).tolist()
-    grid = voxelise(organ, way, (nx, ny, nz))
-    return grid[tuple(np.rint((cut.path_mm - low) / _CELL_MM).astype(int).T)]

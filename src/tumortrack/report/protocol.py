@@ -30,14 +30,13 @@ RULE = (
 )
 TARGET_ERRORS = ("mean", "rms", "median", "p95", "max")
 Locate = Callable[[SensorCloud], Estimate]
-Progress = Callable[[int, int, str], None]
 
 
 def evaluate_scenes(
     locate: Locate,
     scenes_dir: Path,
     out: Path,
-    progress: Progress | None = None,
+    progress: Callable[[], None] = lambda: None,
     about: dict[str, Any] | None = None,
 ) -> dict[str, Any]:
     """Evaluate ``locate`` on every scene of a folder.
@@ -48,7 +47,7 @@ def evaluate_scenes(
     Args:
         locate: observed cloud (camera frame, mm) -> estimate; raises NoEstimate or InputError
             where it can say nothing, which counts as a failed scene.
-        progress: called after each scene with (done, total, its name).
+        progress: called after each scene.
         about: plain JSON that the report repeats: the model and options behind ``locate``.
 
     Raises:
@@ -62,15 +61,14 @@ def evaluate_scenes(
     except OSError as error:
         raise StorageError(f"cannot write {out}: {error.strerror}.") from error
     entries, shown = [], []
-    for done, folder in enumerate(folders, start=1):
+    for folder in folders:
         scene = read_scene(folder)
         entry, estimate = evaluate_scene(locate, scene, folder.name)
         picture = out / "scenes" / f"{folder.name}.png"
         scene_picture(scene, estimate, entry, picture)
         entries.append(entry)
         shown.append(page_scene(folder.name, scene, estimate, picture))
-        if progress:
-            progress(done, len(folders), folder.name)
+        progress()
     report = {
         "tumortrack": tumortrack.__version__,
         "units": "mm",

@@ -118,17 +118,20 @@ def _mixed(of, shares):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
+def _dot(one, two):  # type: ignore[no-untyped-def]
+    return one[0] * two[0] + one[1] * two[1] + one[2] * two[2]
+
+
+@numba.njit(cache=True, nogil=True)
 def _dark(spot, light):  # type: ignore[no-untyped-def]
     """Whether something lies between this place and the light."""
     axes, step = light.axes, light.pixel_mm
-    u = (axes[0, 0] * spot[0] + axes[0, 1] * spot[1] + axes[0, 2] * spot[2]) - light.corner[0]
-    v = (axes[1, 0] * spot[0] + axes[1, 1] * spot[1] + axes[1, 2] * spot[2]) - light.corner[1]
-    toward = axes[2, 0] * spot[0] + axes[2, 1] * spot[1] + axes[2, 2] * spot[2]
+    u, v = _dot(axes[0], spot) - light.corner[0], _dot(axes[1], spot) - light.corner[1]
     column, row = int(np.rint(u / step)), int(np.rint(v / step))
     side = light.near.shape[0]
     if not (0 <= column < side and 0 <= row < side):
         return False
-    return light.near[row, column] > toward + _SHADOW_BIAS * step
+    return light.near[row, column] > _dot(axes[2], spot) + _SHADOW_BIAS * step
 
 
 @numba.njit(cache=True, nogil=True)
@@ -137,9 +140,7 @@ def shade(picture, winner, seen, triangles, light, eye, opacity):  # type: ignor
 
     Seen as in ``nearest``; the eye is a place and whether it sees in perspective.
     """
-    lx, ly, lz = light.axes[2]
-    ux, uy, uz = light.up
-    place, perspective = eye
+    (place, perspective), sun = eye, light.axes[2]
     for y in range(winner.shape[0]):
         for x in range(winner.shape[1]):
             t = winner[y, x]
@@ -147,22 +148,20 @@ def shade(picture, winner, seen, triangles, light, eye, opacity):  # type: ignor
                 continue
             shares = _shares(seen[t], x, y, perspective)
             spot = _mixed(triangles.corners[t], shares)
-            nx, ny, nz = _mixed(triangles.normals[t], shares)
-            vx, vy, vz = place[0] - spot[0], place[1] - spot[1], place[2] - spot[2]
-            scale = 1 / max(np.sqrt(nx * nx + ny * ny + nz * nz), 1e-12)
-            far = 1 / np.sqrt(vx * vx + vy * vy + vz * vz)
-            vx, vy, vz = vx * far, vy * far, vz * far
-            toward = (nx * vx + ny * vy + nz * vz) * scale
+            normal = _mixed(triangles.normals[t], shares)
+            view = (place[0] - spot[0], place[1] - spot[1], place[2] - spot[2])
+            scale = 1 / max(np.sqrt(_dot(normal, normal)), 1e-12)
+            far = 1 / np.sqrt(_dot(view, view))
+            toward = _dot(normal, view) * far * scale
             scale = scale if toward >= 0 else -scale  # of a surface seen from behind
-            nx, ny, nz = nx * scale, ny * scale, nz * scale
-            lit, gloss = max(nx * lx + ny * ly + nz * lz, 0.0), 0.0
+            lit, gloss = max(_dot(normal, sun) * scale, 0.0), 0.0
             if lit > 0 and triangles.shadowed[t] and _dark(spot, light):
                 lit = 0.0
-            elif lit > 0:
-                hx, hy, hz = lx + vx, ly + vy, lz + vz
-                gloss = (nx * hx + ny * hy + nz * hz) / np.sqrt(hx * hx + hy * hy + hz * hz)
+            elif lit > 0:  # about the direction half way between the light and the viewer
+                half = (sun[0] + view[0] * far, sun[1] + view[1] * far, sun[2] + view[2] * far)
+                gloss = _dot(normal, half) * scale / np.sqrt(_dot(half, half))
                 gloss = 0.16 * max(gloss, 0.0) ** 40
-            strength = 0.46 + 0.1 * (nx * ux + ny * uy + nz * uz) + 0.5 * lit
+            strength = 0.46 + 0.1 * _dot(normal, light.up) * scale + 0.5 * lit
             slant = 1 - abs(toward)
             cover = opacity + (1 - opacity) * 0.75 * slant * slant
             for d in range(3):

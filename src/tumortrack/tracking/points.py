@@ -16,6 +16,7 @@ import io
 import re
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -229,35 +230,35 @@ def check_near_organ(
     """
     lower, upper = organ_box_ct
 
-    def distance(points: np.ndarray) -> np.ndarray:
-        return np.linalg.norm(points - np.clip(points, lower, upper), axis=1)
+    def distance(scale: Any = 1.0) -> np.ndarray:
+        read = points_ct * scale
+        return np.linalg.norm(read - np.clip(read, lower, upper), axis=1)
 
-    def share_near(points: np.ndarray) -> float:
-        return float((distance(points) <= _NEAR_MM).mean())
+    def share_near(scale: Any = 1.0) -> float:
+        return float((distance(scale) <= _NEAR_MM).mean())
 
     box = f"the organ in the CT, {lower.round().tolist()} to {upper.round().tolist()} mm (LPS)"
     tiny = len(points_ct) > 1 and np.abs(points_ct).max() < 1  # as metres are, round the origin
-    if (tiny or share_near(points_ct) == 0) and share_near(1000 * points_ct) >= 0.5:
+    if (tiny or share_near() == 0) and share_near(1000) >= 0.5:
         raise InputError(
             f"{name}: the points are in metres, it seems: times 1000 they lie at {box}. Give mm."
         )
-    if share_near(points_ct) == 0 and share_near(points_ct * [-1, -1, 1]) >= 0.5:
+    if share_near() == 0 and share_near([-1, -1, 1]) >= 0.5:
         raise InputError(
             f"{name}: the points are RAS, it seems: with the other sign of x and y they lie at "
             f"{box}. Turn them to LPS, or name their columns r,a,s."
         )
-    far = distance(points_ct) > FAR_MM
+    far = distance() > FAR_MM
+    away = f"more than {FAR_MM:g} mm away from {box}"
     if far.all():
         raise InputError(
-            f"{name}: every point lies more than {FAR_MM:g} mm away from {box}. Points must be in "
-            "the frame of the CT that the case was made from, LPS, mm."
+            f"{name}: every point lies {away}. Points must be in the frame of the CT that the case "
+            "was made from, LPS, mm."
         )
-    if far.any():
-        return (
-            f"{name}: {far.sum()} of {len(far)} points lie more than {FAR_MM:g} mm away from "
-            f"{box}; nothing is known of how they moved.",
-        )
-    return ()
+    said = (
+        f"{name}: {far.sum()} of {len(far)} points lie {away}; nothing is known of how they moved."
+    )
+    return (said,) if far.any() else ()
 
 
 def camera_table(table: PointTable, motion: Motion | None) -> bytes:

@@ -43,14 +43,12 @@ class Tracker:
 
     @property
     def anatomy_ct(self) -> Anatomy | None:
-        """The organ in the CT (LPS, mm) if this model's estimates have a motion; None for models
-        that know no correspondences."""
+        """The organ in the CT (LPS, mm); None for models that know no correspondences."""
         return self._locator.anatomy_ct
 
     def locate(self, cloud: SensorCloud, grid: int = 160, seed: int = 0) -> Estimate:
-        """Everything about one cloud; the same cloud and seed give the same answer.
-
-        ``grid``: voxels along the longest side of the dense volume.
+        """Everything about one cloud; the same cloud and seed give the same answer. ``grid``:
+        voxels along the longest side of the dense volume.
 
         Raises:
             NoEstimate: too few points, no organ found in them, or they do not show this model's.
