@@ -119,7 +119,13 @@ class Resect:
         from tumortrack.plan import replanning
         from tumortrack.plan.located import located
 
-        _check_case(stored, model)
+        manifest = store.read_json(model / store.MANIFEST) if model.is_dir() else {}
+        case = manifest.get("provenance", {}).get("case_sha256", "")
+        if stored.case_sha256 and case and case != stored.case_sha256:
+            raise InputError(  # it would find another patient's tumor
+                f"{model} was trained for another case than the one that was planned on. Give a "
+                "model of that case, or plan on what this model locates."
+            )
 
         def locate(result: TrackingResult, unsure: bool = False) -> Located:
             estimate = result.estimate
@@ -219,17 +225,6 @@ def _operation(
         )
     planned = Planned(stored.plan, stored.meshes, stored.motions)
     return Operation(planned, config, cell.shapes, **live)
-
-
-def _check_case(stored: PlanFolder, model: Path) -> None:
-    """Another patient's model would find another patient's tumor."""
-    manifest = store.read_json(model / store.MANIFEST) if model.is_dir() else {}
-    case = manifest.get("provenance", {}).get("case_sha256", "")
-    if stored.case_sha256 and case and case != stored.case_sha256:
-        raise InputError(
-            f"{model} was trained for another case than the one that was planned on. Give a model "
-            "of that case, or plan on what this model locates."
-        )
 
 
 def _organ_shapes(stored: PlanFolder) -> tuple[RigidShape, ...]:

@@ -57,7 +57,14 @@ class Train:
     def run(self) -> None:
         from tumortrack.imaging.case import load_case
 
-        self._check_numbers()
+        if self.minutes is not None and not self.minutes > 0:
+            raise InputError(f"--minutes {self.minutes} must be more than 0.")
+        if self.steps is not None and self.steps < 1:
+            raise InputError(f"--steps {self.steps} must be at least 1.")
+        if self.minutes is not None and self.steps is not None:
+            raise InputError("--minutes and --steps both say when to stop; give one of them.")
+        if self.workers is not None and self.workers < 0:
+            raise InputError(f"--workers {self.workers} must be 0 or more.")
         case = load_case(self.case)  # report what is wrong so far before PyTorch's seconds
 
         from tumortrack.models.folder import is_finished
@@ -89,16 +96,6 @@ class Train:
             f"model written to {self.model}: {about['steps']} steps in {about['training_s']:.0f} "
             f"s, validation mIoU {about['validation_miou']:.3f}."
         )
-
-    def _check_numbers(self) -> None:
-        if self.minutes is not None and not self.minutes > 0:
-            raise InputError(f"--minutes {self.minutes} must be more than 0.")
-        if self.steps is not None and self.steps < 1:
-            raise InputError(f"--steps {self.steps} must be at least 1.")
-        if self.minutes is not None and self.steps is not None:
-            raise InputError("--minutes and --steps both say when to stop; give one of them.")
-        if self.workers is not None and self.workers < 0:
-            raise InputError(f"--workers {self.workers} must be 0 or more.")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -73,8 +73,19 @@ def scene_picture(
         axes = figure.add_subplot(below[n // 4, n % 4])
         _draw_slice(axes, scene, shown, name, view)
         what = f"{name.replace('_', ' ')}: {_SLICES[view]}"
-        axes.set_title(f"{what}\n{_distances(entry, name)}", fontsize=9.5)
-    figure.suptitle(_headline(entry), x=0.02, ha="left", fontsize=13, fontweight="bold")
+        part = entry["parts"][name]
+        found = (
+            f"Hausdorff {part['hausdorff_mm']:.1f} mm, centre {part['center_mm']:.1f} mm, "
+            f"IoU {part['iou']:.2f}"
+            if part["found"]
+            else "not found"
+        )
+        axes.set_title(f"{what}\n{found}", fontsize=9.5)
+    failed = "" if entry["failed"] is None else f"   {textwrap.shorten(entry['failed'], 60)}"
+    errors = entry.get("tre_mm")
+    targets = f"   target error {errors['mean']:.1f} mm" if errors else ""
+    headline = f"{entry['name']}   mIoU {entry['miou']:.2f}{targets}{failed}"
+    figure.suptitle(headline, x=0.02, ha="left", fontsize=13, fontweight="bold")
     drawing.show_legend(figure, scene_legend(), 4, (0.985, 0.995))
     drawing.save(figure, path)
 
@@ -120,23 +131,6 @@ def _draw_slice(
     near = np.abs(flat[:, 2] - middle[0, 2]) < 1.5
     axes.scatter(flat[near, 0], flat[near, 1], s=7, color=OBSERVED, linewidths=0, zorder=5)
     drawing.finish_view(axes, frame, _CAMERA_AXES[view])
-
-
-def _distances(entry: dict[str, Any], name: str) -> str:
-    part = entry.get("parts", {}).get(name)
-    if not part or not part["found"]:
-        return "not found"
-    return (
-        f"Hausdorff {part['hausdorff_mm']:.1f} mm, centre {part['center_mm']:.1f} mm, "
-        f"IoU {part['iou']:.2f}"
-    )
-
-
-def _headline(entry: dict[str, Any]) -> str:
-    failed = "" if entry["failed"] is None else f"   {textwrap.shorten(entry['failed'], 60)}"
-    errors = entry.get("tre_mm")
-    targets = f"   target error {errors['mean']:.1f} mm" if errors else ""
-    return f"{entry['name']}   mIoU {entry['miou']:.2f}{targets}{failed}"
 
 
 def scene_legend() -> list[Any]:

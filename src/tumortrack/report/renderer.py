@@ -17,7 +17,8 @@ from PIL import Image
 from tumortrack.core.colours import Colour
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.types import Mesh
-from tumortrack.report.renderer_kernels import Light, Triangles, crease, nearest, shade
+from tumortrack.imaging.raster import expand
+from tumortrack.report.renderer_kernels import Light, Triangles, nearest, shade
 
 _SHARPER = 2  # pixels drawn per pixel shown, each way: smooth edges
 _CREASE = np.cos(np.radians(40.0))  # faces that meet at a sharper angle keep their edge
@@ -245,8 +246,15 @@ def corner_normals(mesh: Mesh) -> Float32[np.ndarray, "f 3 3"]:
     corner = place.reshape(-1)[mesh.faces].reshape(-1)
     order = np.argsort(corner, kind="stable")
     first = np.searchsorted(corner[order], np.arange(corner.max(initial=-1) + 2))
-    normals = crease(area, unit, corner, order // 3, first, _CREASE)
-    _NORMALS[mesh] = normals.reshape(-1, 3, 3).astype(np.float32)
+    mine, n = expand(np.diff(first)[corner])  # every corner with every face about its place
+    other = order[first[corner[mine]] + n] // 3
+    smooth = (unit[mine // 3] * unit[other]).sum(1) >= _CREASE
+    smooth |= other == mine // 3
+    mine, other = mine[smooth], other[smooth]
+    sums = [np.bincount(mine, area[other, axis], len(corner)) for axis in range(3)]
+    normals = np.stack(sums, axis=1).reshape(-1, 3, 3)
+    normals = normals / np.maximum(np.linalg.norm(normals, axis=2, keepdims=True), 1e-12)
+    _NORMALS[mesh] = normals.astype(np.float32)
     return _NORMALS[mesh]
 
 

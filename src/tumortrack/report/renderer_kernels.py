@@ -32,25 +32,6 @@ class Light(NamedTuple):
 
 
 @numba.njit(cache=True, nogil=True)
-def crease(area, unit, corner, faces, first, limit):  # type: ignore[no-untyped-def]
-    out = np.zeros((len(corner), 3))
-    for n in range(len(corner)):
-        own = n // 3
-        for k in range(first[corner[n]], first[corner[n] + 1]):
-            other = faces[k]
-            angle = 0.0
-            for d in range(3):
-                angle += unit[own, d] * unit[other, d]
-            if angle >= limit or other == own:
-                for d in range(3):
-                    out[n, d] += area[other, d]
-        length = np.sqrt(out[n, 0] ** 2 + out[n, 1] ** 2 + out[n, 2] ** 2)
-        for d in range(3):
-            out[n, d] /= max(length, 1e-12)
-    return out
-
-
-@numba.njit(cache=True, nogil=True)
 def nearest(seen, width, height, limit, perspective):  # type: ignore[no-untyped-def]
     """Greatest nearness up to the limit in each pixel (-inf: nothing) and whose it is (-1).
 
