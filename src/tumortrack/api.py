@@ -25,8 +25,8 @@ from tumortrack.imaging.case import Case
 from tumortrack.imaging.case import load_case as read_case
 
 if TYPE_CHECKING:
-    from tumortrack.live.sink_worker import SinkWorker
     from tumortrack.live.values import SinkContext, TrackingResult
+    from tumortrack.live.workers import SinkWorker
     from tumortrack.models.config import TrainConfig
     from tumortrack.models.model import Model
     from tumortrack.plan.values import ResectionPlan
@@ -337,9 +337,9 @@ def track(
         SourceLost: no frame came for a minute.
     """
     from tumortrack.live.loop import Loop, LoopConfig, summary
-    from tumortrack.live.source_worker import SourceWorker
     from tumortrack.live.spec import SOURCES
     from tumortrack.live.values import PublishedFrame, SinkContext
+    from tumortrack.live.workers import SourceWorker
     from tumortrack.tracking.tracker import region_for
 
     config = SOURCES.parse(source) if isinstance(source, str) else source
@@ -383,8 +383,8 @@ def open_sinks(sinks: Mapping[str, Any], context: SinkContext) -> Iterator[list[
         InputError: a sink cannot work.
         StorageError: a sink cannot write.
     """
-    from tumortrack.live.sink_worker import SinkWorker
     from tumortrack.live.values import SinkConfig
+    from tumortrack.live.workers import SinkWorker
 
     def waiting(sink: Any) -> int:
         return sink.queue_size if isinstance(sink, SinkConfig) else 1

@@ -20,9 +20,8 @@ from tumortrack.core.errors import InputError, StorageError
 
 if TYPE_CHECKING:
     from tumortrack.live.loop import Loop, LoopConfig
-    from tumortrack.live.sink_worker import SinkWorker
-    from tumortrack.live.source_worker import SourceWorker
     from tumortrack.live.values import PublishedFrame, TrackingResult
+    from tumortrack.live.workers import SinkWorker, SourceWorker
     from tumortrack.models.model import Model
     from tumortrack.plan.operation import Operation
 
@@ -107,7 +106,7 @@ class Track:
         report = report_path(self.report, "track")
 
         from tumortrack.live.loop import Loop
-        from tumortrack.live.source_worker import SourceWorker
+        from tumortrack.live.workers import SourceWorker
         from tumortrack.tracking.tracker import Tracker
 
         if arms is None:
