@@ -31,9 +31,7 @@ from tumortrack_lab.peers.base import Fit, estimate_of, rigid_carry
 from tumortrack_lab.peers.kinds import peer_kinds
 from tumortrack_lab.study import paper, tables
 from tumortrack_lab.study.bound import BOUNDS, Bound, BoundConfig, BoundMotion, laid_on
-from tumortrack_lab.study.cases import StudyCase, study_case
 from tumortrack_lab.study.document import ReportWriter, closing, fill, opening, table
-from tumortrack_lab.study.frame import NOT_FOUND, by_seed, text, tidy
 from tumortrack_lab.study.goals import goal_tables
 from tumortrack_lab.study.measure import (
     Job,
@@ -43,10 +41,11 @@ from tumortrack_lab.study.measure import (
     measure,
     point_errors,
 )
-from tumortrack_lab.study.methods import Answer, Method, peer_method
+from tumortrack_lab.study.methods import Answer, Method, StudyCase, peer_method, study_case
 from tumortrack_lab.study.models import ABLATED, Presets, Trainer, train_config
 from tumortrack_lab.study.plan import FULL, QUICK, SECTIONS, Methods, StudyPlan, jobs_of
 from tumortrack_lab.study.report import gallery_block, section_blocks
+from tumortrack_lab.study.tables import NOT_FOUND, by_seed, text, tidy
 
 ROOT = Path(__file__).parents[2]
 TURN = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])

@@ -17,7 +17,7 @@ from tumortrack.plan.files import as_builtins, from_plain
 from tumortrack.plan.outline import arcs, concave_hull, evenly, grown, polygon_of
 from tumortrack.plan.resection import exophytic_shares, inside, plan_resection
 from tumortrack.plan.values import CutLayer, Located
-from tumortrack_lab.cut.resection import cut as cut_out
+from tumortrack_lab.cut import cut as cut_out
 
 PUBLISHED, OURS = ResectionConfig(method="published"), ResectionConfig()
 

@@ -189,10 +189,8 @@ def test_a_patient_is_placed_as_the_pretrained_network_places_any_organ(patient,
     cloud = 20 * torch.randn(3, 300, 3, generator=torch.Generator().manual_seed(0))
     cloud = cloud * torch.tensor([2.0, 1.0, 0.3]) + torch.tensor([0, 0, 130.0])
     with torch.no_grad():
-        mine, theirs = (
-            own.flip_hypotheses(cloud)[0],
-            general.flip_hypotheses(cloud * upright.scale)[0],
-        )
+        mine = own.flip_hypotheses(cloud)
+        theirs = general.flip_hypotheses(cloud * upright.scale)
     facing = torch.as_tensor(upright.facing, dtype=torch.float32)
     torch.testing.assert_close(mine.rotation, theirs.rotation @ facing, atol=1e-4, rtol=0)
     centre = theirs.centre_mm / upright.scale

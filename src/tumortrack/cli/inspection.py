@@ -159,7 +159,7 @@ def _artifact(folder: Path) -> list[str]:
             verdict = f"CHANGED or missing since they were sealed: {changed}"
         return [*lines, f"  {len(scenes)} scenes: {', '.join(scenes)}", f"  {verdict}"]
     if kind == "model":
-        from tumortrack.occupancy import compiled  # PyTorch takes a second
+        from tumortrack.occupancy import model  # PyTorch takes a second
 
         network = manifest.get("config", {}).get("network", {})
         encoder, decoder = (network.get(n, {}).get("type", "?") for n in ("encoder", "decoder"))
@@ -167,7 +167,7 @@ def _artifact(folder: Path) -> list[str]:
         if decoder == "warp":
             does = "places the organ of the CT; `locate --map` says where points of the CT are"
         lines.append(f"  {encoder} + {decoder}: {does}")
-        lines += [f"  {line}" for line in compiled.describe(folder)]
+        lines += [f"  {line}" for line in model.describe(folder)]
     skip = {"kind", "schema", "tumortrack", "units", "frame", "files", "config"}
     lines += [f"  {key}: {value}" for key, value in manifest.items() if key not in skip]
     return [*lines, f"  files: {', '.join(manifest['files'])}"]

@@ -37,8 +37,7 @@ class Compile:
         from rich.table import Table
 
         from tumortrack.models.folder import WEIGHTS
-        from tumortrack.occupancy.compiled import measured, save
-        from tumortrack.occupancy.model import OccupancyModel
+        from tumortrack.occupancy.model import OccupancyModel, measured, save
         from tumortrack.training.model import load_model
 
         model = load_model(self.model, self.device)

@@ -15,6 +15,7 @@ from tumortrack.models.config import RegistrationHeadConfig
 from tumortrack.models.in_distribution import InDistributionRange, fit_mm, spread_mm
 from tumortrack.registration.canonical_frame import carry_over, upright_of
 from tumortrack.registration.gauss_newton import RegistrationResult
+from tumortrack.registration.gauss_newton_kernels import KERNEL
 from tumortrack.registration.model import RegistrationModel, UncertaintyCalibration
 from tumortrack.registration.motion import ElasticMotion
 from tumortrack.registration.network import RegistrationNetwork
@@ -69,7 +70,7 @@ class RegistrationTask:
     def model(self, network: RegistrationNetwork, provenance: dict[str, Any]) -> RegistrationModel:
         fits = self._fits(network)
         usual_cost = float(np.percentile([fit.cost for _, fit in fits], _USUAL))
-        summary = self._summary(self._repaired(network, fits, usual_cost))
+        summary = self._summary(self._final(network, fits, usual_cost))
         return RegistrationModel(
             network=network,
             config=self._run.config,
@@ -78,36 +79,38 @@ class RegistrationTask:
             in_distribution=summary.in_distribution,
             provenance={**provenance, "validation_tre_mm": round(summary.tre_mm, 3)},
             shape=self._shape,
-            calibration=UncertaintyCalibration(std_scale=summary.std_scale, usual_cost=usual_cost),
+            calibration=UncertaintyCalibration(
+                std_scale=summary.std_scale, usual_cost=usual_cost, kernel=KERNEL
+            ),
         )
 
     def _fits(self, network: RegistrationNetwork) -> list[tuple[ElasticMotion, RegistrationResult]]:
-        """The likeliest start and the best fit in each validation scene; kept for the same weights,
-        since the last ones are mostly the best."""
+        """The likeliest hypothesis and the best fit in each validation scene; kept for the same
+        weights, since the last ones are mostly the best."""
         weights = b"".join(w.numpy(force=True).tobytes() for w in network.state_dict().values())
         if self._last is None or self._last[0] != weights:
             network.eval()
             registration, fits = self._registration(network), []
             for cloud in self._scenes.clouds_mm:
-                starts = registration.propose(cloud)
-                fits.append((starts[0], registration.best_fit(cloud, starts)))
+                hypotheses = registration.propose(cloud)
+                fits.append((hypotheses[0], registration.best_fit(cloud, hypotheses)))
             self._last = weights, fits
         return self._last[1]
 
     def _registration(self, network: RegistrationNetwork) -> Registration:
         return Registration(network, self._shape, self._run.config.refine)
 
-    def _repaired(
+    def _final(
         self,
         network: RegistrationNetwork,
         fits: list[tuple[ElasticMotion, RegistrationResult]],
         usual_cost: float,
     ) -> list[RegistrationResult]:
         """The fits as the model will make them, knowing the usual cost."""
-        repaired = self._registration(network).repaired
+        more = self._registration(network).try_turned_starts
         return [
-            repaired(cloud, start, fit) if fit.cost > usual_cost else fit
-            for cloud, (start, fit) in zip(self._scenes.clouds_mm, fits, strict=True)
+            more(cloud, likeliest, fit) if fit.cost > usual_cost else fit
+            for cloud, (likeliest, fit) in zip(self._scenes.clouds_mm, fits, strict=True)
         ]
 
     def _summary(self, fits: list[RegistrationResult]) -> ValidationSummary:
