@@ -21,9 +21,15 @@ from tumortrack.core.types import (
 from tumortrack.report.drawing import section, section_mask
 from tumortrack.report.metrics import label_grid
 from tumortrack.report.page import thinned
-from tumortrack.report.pictures import FROM_CAMERA, FROM_SIDE
+from tumortrack.report.pictures import (
+    FROM_CAMERA,
+    FROM_SIDE,
+    PLANES,
+    border_letters,
+    qc_picture,
+    slice_volume,
+)
 from tumortrack.report.protocol import evaluate_scenes, summarise, summary_table
-from tumortrack.report.qc import PLANES, border_letters, qc_picture, slice_volume
 from tumortrack.report.renderer import Body, Frame, ParallelView
 from tumortrack.simulate.scene_folder import Scene
 
@@ -84,9 +90,7 @@ def evaluated(tmp_path_factory):
         NoEstimate("no <organ> in view"),
     )
     seen = []
-    report = evaluate_scenes(
-        locate, folder / "scenes", folder / "report", lambda *step: seen.append(step)
-    )
+    report = evaluate_scenes(locate, folder / "scenes", folder / "report", lambda: seen.append(1))
     return folder / "report", report, seen
 
 
@@ -95,7 +99,7 @@ def test_report_has_the_promised_layout(evaluated):
     text = (out / "report.json").read_text()
     assert json.loads(text, parse_constant=pytest.fail) == report
     assert [s["name"] for s in report["scenes"]] == [f"scene_{n}" for n in range(4)]
-    assert seen == [(n + 1, 4, f"scene_{n}") for n in range(4)]
+    assert len(seen) == 4
     keys = {"hausdorff_mm", "hausdorff_one_sided_mm", "hausdorff_95_mm", "surface_mm",
             "center_mm", "iou"}  # fmt: skip
     assert keys <= report["summary"]["tumor_1"].keys()
