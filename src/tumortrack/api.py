@@ -419,10 +419,10 @@ def plan_resection(
         InputError: no such tumor, or an option that is not allowed.
     """
     from tumortrack.core.config import from_builtins
-    from tumortrack.plan.config import ResectionConfig
     from tumortrack.plan.located import STAND_MM, read_run, table_below
     from tumortrack.plan.located import located as in_table_frame
     from tumortrack.plan.resection import plan_resection as make_plan
+    from tumortrack.plan.values import ResectionConfig
 
     config = from_builtins(options, ResectionConfig, "plan_resection")
     run = located if isinstance(located, Estimate) else read_run(Path(located))

@@ -10,10 +10,9 @@ import numpy as np
 
 from tumortrack.core.types import Anatomy, Mesh
 from tumortrack.imaging.raster import label_grid
-from tumortrack.plan.config import ResectionConfig
 from tumortrack.plan.located import STAND_MM
 from tumortrack.plan.resection import plan_resection
-from tumortrack.plan.values import Located
+from tumortrack.plan.values import Located, ResectionConfig
 from tumortrack_lab.bench.naive import plans
 from tumortrack_lab.bench.rows import MOTIONS, PLAN, Workload
 from tumortrack_lab.bench.subject import BenchSubject
