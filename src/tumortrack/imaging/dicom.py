@@ -149,10 +149,15 @@ def _read_tags(path: Path) -> _Slice | str:
             tags = pydicom.dcmread(path, stop_before_pixels=True, specific_tags=_TAGS)
             if int(tags.get("NumberOfFrames") or 1) > 1:
                 return _MULTI_FRAME
-            texts = [str(tags.get(tag) or "") for tag in _TAGS[:3]]
+            uid, description, modality = (
+                "".join(c if c.isprintable() else "?" for c in str(tags.get(tag) or ""))
+                for tag in _TAGS[:3]
+            )
             return _Slice(
                 path,
-                *("".join(c if c.isprintable() else "?" for c in text) for text in texts),
+                uid,
+                description,
+                modality,
                 shape=(int(tags.Rows), int(tags.Columns)),
                 spacing_mm=(float(tags.PixelSpacing[0]), float(tags.PixelSpacing[1])),
                 position_mm=tuple(float(x) for x in tags.ImagePositionPatient),

@@ -162,8 +162,8 @@ def _find_organ(solid: np.ndarray, dense: np.ndarray, lps_from_index: np.ndarray
     only where that frees it of a sheet. Attached sheets thinner than 6 mm are removed.
     """
     factors = np.maximum(1, np.rint(_STEP_MM / spacing_mm(lps_from_index)).astype(int))
-    coarse = (_block_mean(mask, factors) >= 0.5 for mask in (solid, dense))
-    grid = _Grid(*coarse, lps_from_index=lps_from_index @ np.diag([*factors, 1.0]))
+    filled, bright = (_block_mean(mask, factors) >= 0.5 for mask in (solid, dense))
+    grid = _Grid(filled, bright, lps_from_index @ np.diag([*factors, 1.0]))
     region = _search(grid) if grid.solid.any() else None
     if region is None:
         raise InputError(

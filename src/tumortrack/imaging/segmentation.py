@@ -73,12 +73,9 @@ class Segment:
         return self.label == ORGAN
 
     @property
-    def category(self) -> Term:
-        return STRUCTURE if self.is_organ else ALTERED
-
-    @property
-    def kind(self) -> Term:
-        return KIDNEY if self.is_organ else MASS
+    def terms(self) -> tuple[Term, Term]:
+        """Category and type."""
+        return (STRUCTURE, KIDNEY) if self.is_organ else (ALTERED, MASS)
 
     @property
     def rgb(self) -> tuple[int, int, int]:
@@ -89,9 +86,9 @@ class Segment:
         """As Slicer writes it: category, type and its modifier; region and its modifier."""
         side = str(SIDES[self.side]) if self.side else "^^"
         where, region = (side, "^^~^^") if self.is_organ else ("^^", f"{KIDNEY}~{side}")
-        what = f"{self.category}~{self.kind}~{where}"
+        category, kind = self.terms
         return (
-            f"Segmentation category and type - DICOM master list~{what}"
+            f"Segmentation category and type - DICOM master list~{category}~{kind}~{where}"
             f"~Anatomic codes - DICOM master list~{region}"
         )
 
@@ -252,8 +249,8 @@ def _description(part: Segment) -> Any:
     described = hd.seg.SegmentDescription(
         segment_number=part.label,
         segment_label=part.name,
-        segmented_property_category=part.category,
-        segmented_property_type=part.kind,
+        segmented_property_category=part.terms[0],
+        segmented_property_type=part.terms[1],
         # Whoever drew them, `prepare` has chosen among the pieces and closed their cavities.
         algorithm_type=hd.seg.SegmentAlgorithmTypeValues.SEMIAUTOMATIC,
         algorithm_identification=hd.AlgorithmIdentificationSequence(

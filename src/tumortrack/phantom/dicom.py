@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -71,7 +71,7 @@ def _slice(volume: Volume, k: int, entropy: list[str], description: str) -> Data
     dataset = Dataset()
     dataset.file_meta = FileMetaDataset()
     dataset.file_meta.TransferSyntaxUID = ExplicitVRLittleEndian
-    tags = {
+    tags: dict[str, Any] = {
         **dict.fromkeys(("StudyDate", "SeriesDate", "AcquisitionDate", "ContentDate"), _DATE),
         **dict.fromkeys(("StudyTime", "SeriesTime", "AcquisitionTime", "ContentTime"), _TIME),
         **dict.fromkeys(("AccessionNumber", "ReferringPhysicianName", "PatientBirthDate"), ""),

@@ -125,7 +125,10 @@ def _arm_parts(arm: str, model: ArmModel) -> list[Part]:
         ("wrist_2_cap", "wrist_2", ((0, 0, d5 + 0.8 * w), (0, 0, d5 + w)), 0.85 * w, BLUE, look),
         ("wrist_3", "wrist_3", ((0, 0, 0.3 * w), (0, 0, d6)), 0.9 * w, DARK, "both"),
     ]
-    return [_rod(name, f"{arm}_{link}_link", *how) for name, link, *how in rows]
+    return [
+        _rod(name, f"{arm}_{link}_link", ends, radius, colour, use)
+        for name, link, ends, radius, colour, use in rows
+    ]
 
 
 def _tool_parts(config: CellConfig) -> list[Part]:

@@ -267,11 +267,15 @@ class Leg:
     @property
     def runs(self) -> list[tuple[slice, bool]]:
         """Pieces of ``poses`` to go through without a stop, and whether they cut; each begins
-        where the one before ends."""
-        first, n = len(self.enter_mm) - 1, len(self.cut_mm)
-        end = first + n - 1
-        cuts = [(slice(first + a, first + b + 1), True) for a, b in _smooth_runs(self.cut_mm)]
-        runs = [(slice(0, first + 1), False), *cuts, (slice(end, end + len(self.leave_mm)), False)]
+        where the one before ends. At sharp corners of the cut the tip stops."""
+        edges = np.diff(self.cut_mm, axis=0)
+        edges /= np.linalg.norm(edges, axis=1, keepdims=True)
+        corners = np.flatnonzero((edges[1:] * edges[:-1]).sum(1) < _CORNER) + 1
+        ends = [0, *corners.tolist(), len(self.cut_mm) - 1]
+        first, last = len(self.enter_mm) - 1, len(self.enter_mm) + len(self.cut_mm) - 2
+        cuts = [(slice(first + a, first + b + 1), True) for a, b in itertools.pairwise(ends)]
+        leave = slice(last, last + len(self.leave_mm))
+        runs = [(slice(0, first + 1), False), *cuts, (leave, False)]
         return [(run, cutting) for run, cutting in runs if run.stop - run.start > 1]
 
 
@@ -305,12 +309,3 @@ def _lines(
     ahead = np.stack([np.cos(yaws_rad), np.sin(yaws_rad)], 1)[:, None]
     ends = [tips_mm[None, :, :2] - far * ahead for far in (from_mm, to_mm)]
     return shapely.linestrings(np.stack(ends, axis=2))
-
-
-def _smooth_runs(points_mm: np.ndarray) -> list[tuple[int, int]]:
-    """First and last points of the pieces of a path without sharp corners; each begins where the
-    one before ends."""
-    edges = np.diff(points_mm, axis=0)
-    edges /= np.linalg.norm(edges, axis=1, keepdims=True)
-    corners = np.flatnonzero((edges[1:] * edges[:-1]).sum(1) < _CORNER) + 1
-    return list(itertools.pairwise([0, *corners.tolist(), len(points_mm) - 1]))

@@ -234,11 +234,14 @@ def _elsewhere(plan: ResectionPlan, config: CellConfig) -> Iterator[CellConfig]:
     targets = {CUTTER: strokes, HOLDER: plan.grasp_mm[None] + [[0, 0, 0], [0, 0, 60.0]]}
     good = []
     for arm in ARMS:
-        places = [_with(config, {arm: base}) for base in _places(config, arm, plan.grasp_mm[:2])]
+        places = [
+            msgspec.structs.replace(config, **{f"{arm}_base": base})
+            for base in _places(config, arm, plan.grasp_mm[:2])
+        ]
         good.append([place.base(arm) for place in places if _reaches(place, arm, targets[arm])])
     pairs = itertools.product(*map(enumerate, good))
     for (_, cutter), (_, holder) in sorted(pairs, key=lambda pair: pair[0][0] + pair[1][0]):
-        yield _with(config, {CUTTER: cutter, HOLDER: holder})
+        yield msgspec.structs.replace(config, cutter_base=cutter, holder_base=holder)
 
 
 def _places(config: CellConfig, arm: str, middle_mm: np.ndarray) -> list[Base]:
@@ -267,10 +270,6 @@ def _reaches(config: CellConfig, arm: str, targets_mm: np.ndarray) -> bool:
         any(len(group.inverse_kinematics(level_pose(target, yaw))) for yaw in yaws)
         for target in targets_mm
     )
-
-
-def _with(config: CellConfig, bases: dict[str, Base]) -> CellConfig:
-    return msgspec.structs.replace(config, **{f"{arm}_base": base for arm, base in bases.items()})
 
 
 def _note(config: CellConfig) -> str:

@@ -59,7 +59,8 @@ class TrajectoryBuilder:
         """One arm along a path that begins where it is; its tip no faster than ``tip_mm_s``."""
         if np.ptp(path_rad, axis=0).max() < _THERE_RAD:
             return
-        group, tips = self.group(arm), None
+        group = self.group(arm)
+        tips: np.ndarray | None = None
         if tip_mm_s is not None:
             everything = map(group.all_joints, path_rad)
             tips = np.array([self.cell.tips(joints)[arm][:3, 3] for joints in everything])
