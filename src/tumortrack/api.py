@@ -363,13 +363,13 @@ def track(
         InputError: a source or sink that cannot be opened.
     """
     from tumortrack.live.loop import Loop, LoopConfig, summary
-    from tumortrack.live.sink_worker import SinkWorker
-    from tumortrack.live.source_worker import SourceWorker
     from tumortrack.live.spec import SINKS, SOURCES
     from tumortrack.live.values import PublishedFrame, SinkConfig, SinkContext
+    from tumortrack.live.workers import SinkWorker, SourceWorker
     from tumortrack.tracking.region import region_for
 
     config = SOURCES.parse(source) if isinstance(source, str) else source
+    made_sinks = [SINKS.parse(sink) if isinstance(sink, str) else sink for sink in sinks]
     context = SinkContext(tracker.model.parts, PublishedFrame(), tracker.anatomy_ct)
     region = region_for(tracker.model, range_mm=range_mm)
     loop = Loop(tracker, context, LoopConfig(region=region, seconds=seconds))
@@ -381,9 +381,8 @@ def track(
 
     with ExitStack() as stack:
         workers = []
-        for number, sink in enumerate(sinks):
+        for number, (sink, made) in enumerate(zip(sinks, made_sinks, strict=True)):
             name = sink if isinstance(sink, str) else f"sink {number}"
-            made = SINKS.parse(sink) if isinstance(sink, str) else sink
             waiting = made.queue_size if isinstance(made, SinkConfig) else 1
             opened = made.open(context) if isinstance(made, SinkConfig) else made
             workers.append(SinkWorker(name, opened, waiting))

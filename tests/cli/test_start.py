@@ -10,7 +10,7 @@ import pytest
 
 from stories import COMMAND, cloud_by_rays, environment, looking_down
 from tumortrack.imaging.case import load_case
-from tumortrack.sense.files import write_cloud_ply
+from tumortrack.sense.ply import write_cloud_ply
 
 
 def answered(

@@ -10,13 +10,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from depth_files import write_depth_png, write_intrinsics
 from extension_objects import EXAMPLE, distribution, installed_example
 from live_objects import small_frame, small_setting, small_update
 from stories import COMMAND, environment, succeeded
 from tumortrack.core.errors import InputError
 from tumortrack.live.spec import SINKS, SOURCES, extensions
 from tumortrack.live.values import Sink, Source
-from tumortrack.sense.files import write_depth_png, write_intrinsics
 
 
 @pytest.fixture

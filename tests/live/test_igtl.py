@@ -8,12 +8,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from igtl_objects import polydata_by_the_book, slow_crc
-from igtl_reader import unpack, unpack_polydata, unpack_status, unpack_transform
+from igtl_reader import IgtlStatus, unpack, unpack_polydata, unpack_status, unpack_transform
 from live_objects import STAMP_NS
 from tumortrack.core.geometry import rigid
 from tumortrack.live.igtl.message import (
     HEADER_SIZE,
-    IgtlStatus,
     Message,
     Polydata,
     ProtocolError,
@@ -77,13 +76,13 @@ def test_status_byte_for_byte() -> None:
     expected = from_hex(
         """
         0004                                              not found
-        ffffffffffffffff                                  sub code -1
+        0000000000000000                                  sub code 0
         6e6f20657374696d617465 000000000000000000         no estimate
         6661722061776179 00                               far away
         """
     )
-    assert pack_status(IgtlStatus(4, "no estimate", "far away", -1)) == expected
-    assert unpack_status(expected) == IgtlStatus(4, "no estimate", "far away", -1)
+    assert pack_status(4, "no estimate", "far away") == expected
+    assert unpack_status(expected) == IgtlStatus(4, "no estimate", "far away")
 
 
 def test_polydata_byte_for_byte() -> None:

@@ -18,8 +18,6 @@ from tumortrack.core.estimate import Following
 from tumortrack.core.types import DepthFrame, Intrinsics, SensorCloud
 from tumortrack.live.loop import Loop, LoopConfig, summary
 from tumortrack.live.quality import judge, seen_through
-from tumortrack.live.sink_worker import SinkWorker
-from tumortrack.live.source_worker import SourceWorker
 from tumortrack.live.values import (
     Controls,
     Observation,
@@ -28,6 +26,7 @@ from tumortrack.live.values import (
     SourceEnded,
     SourceLost,
 )
+from tumortrack.live.workers import SinkWorker, SourceWorker
 from tumortrack.sense.camera import d405
 from tumortrack.sense.region import RegionConfig
 from tumortrack.sense.render import render_depth
@@ -50,7 +49,7 @@ def clock(monkeypatch):
     """The loop's, its reader's and the script's, which the test turns."""
     one = Clock()
     monkeypatch.setattr(sys.modules[__name__], "time", one)
-    for module in ("loop", "source_worker"):
+    for module in ("loop", "workers"):
         monkeypatch.setattr(f"tumortrack.live.{module}.time", one)
     return one
 
@@ -390,7 +389,7 @@ def test_smoothing_never_lags_by_much(tracker, stages):
 def test_a_pick_moves_along_and_is_forgotten_when_lost(tracker, stages, clock):
     clouds = moving(stages[0], 3, step_mm=(6, 0, 0))
     controls = Controls()
-    controls.pick(clouds[0].points_mm[5].astype(float))
+    controls.picked_mm = clouds[0].points_mm[5].astype(float)
     setting = SinkContext(tracker.model.parts, PublishedFrame(), tracker.anatomy_ct, controls)
     loop = Loop(tracker, setting, LoopConfig(region=WHOLE, stale_s=PATIENCE_S / 2))
     places = []
@@ -488,7 +487,7 @@ def test_a_click_makes_the_loop_look_anew(tracker, stages):
 
     def click(update):
         if update.sequence == 0:
-            controls.pick(stages[0].cloud.points_mm[5].astype(float))
+            controls.picked_mm = stages[0].cloud.points_mm[5].astype(float)
 
     loop.run(reader, outlets, click)
     reader.close()

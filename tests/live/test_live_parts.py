@@ -5,8 +5,9 @@ from __future__ import annotations
 import json
 import threading
 import time
-from typing import ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
+import msgspec
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -17,10 +18,9 @@ from tumortrack.core.errors import InputError, NoEstimate, StorageError
 from tumortrack.live.calibration_file import read_frames
 from tumortrack.live.meter import Histogram
 from tumortrack.live.quality import StampCheck
-from tumortrack.live.sink_worker import SinkWorker
-from tumortrack.live.source_worker import SourceWorker
 from tumortrack.live.spec import Registry
 from tumortrack.live.values import Observation, PublishedFrame, SinkConfig, SourceEnded, SourceLost
+from tumortrack.live.workers import SinkWorker, SourceWorker
 
 SECOND = 1_000_000_000
 
@@ -31,6 +31,7 @@ class Camera(SinkConfig, frozen=True, kw_only=True, tag="camera"):
     fps: float = 30.0
     noise: bool = True
     type: Literal["auto", "cloud"] = "auto"
+    every: Annotated[int, msgspec.Meta(ge=1, le=9)] | None = None
 
 
 class Window(SinkConfig, frozen=True, kw_only=True, tag="window"):
@@ -74,10 +75,13 @@ def test_text_becomes_configuration(text, expected):
     ("text", "said"),
     [
         ("screen", "Allowed: camera, plain, window"),
-        ("camera", "lacks its topic. Write camera:TOPIC[?fps=30.0&noise=true&type=auto]."),
+        ("camera", "lacks its topic. Write camera:TOPIC[?fps=30.0&noise=true&type=auto&every=]."),
         ("camera:/a?rate=3", "'rate' is no option. Write camera:TOPIC"),
-        ("camera:/a?fps=fast", "fps"),
-        ("camera:/a?type=mesh", "mesh"),
+        ("camera:/a?fps=fast", "': fps is 'fast'; allowed: a number. Write camera:TOPIC"),
+        ("camera:/a?noise=2", "': noise is '2'; allowed: true or false. Write"),
+        ("camera:/a?type=mesh", "': type is 'mesh'; allowed: auto, cloud. Write"),
+        ("camera:/a?every=0", "': every is '0'; allowed: a whole number from 1 to 9, null. Write"),
+        ("camera:/a?every=abc", "': every is 'abc'; allowed: a whole number from 1 to 9, null."),
         ("camera:/a?topic=/b", "'/a' has no place there"),
         ("camera:/a?fps=1&fps=2", "'fps' is given twice"),
         ("window:http", "Write window[:port]"),
@@ -275,7 +279,7 @@ class Notes:
 
 
 def test_a_slow_sink_gets_the_newest_and_holds_up_nobody(monkeypatch):
-    monkeypatch.setattr("tumortrack.live.sink_worker._SILENT_S", PATIENCE_S)  # however slow we are
+    monkeypatch.setattr("tumortrack.live.workers._SILENT_S", PATIENCE_S)  # however slow we are
     gate = threading.Event()
     sink = Notes(gate)
     outlet = SinkWorker("slow", sink, waiting=1)
@@ -300,7 +304,7 @@ def test_a_sink_that_may_be_behind_loses_nothing():
 
 
 def test_a_sink_that_shows_is_told_when_the_loop_hangs(monkeypatch):
-    monkeypatch.setattr("tumortrack.live.sink_worker._SILENT_S", 0.2)
+    monkeypatch.setattr("tumortrack.live.workers._SILENT_S", 0.2)
 
     class Shown(Notes):
         def publish(self, update):

@@ -21,6 +21,7 @@ from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 
 from clock import PATIENCE_S, Clock
+from depth_files import write_depth_png, write_intrinsics
 from live_objects import (
     CAMERA,
     PARTS,
@@ -41,7 +42,7 @@ from tumortrack.live.ros.sensors import messages_seen
 from tumortrack.live.sinks.recording import RecordingSinkConfig as RecordTo
 from tumortrack.live.sources.recording import RecordingSourceConfig
 from tumortrack.live.values import Observation, PublishedFrame, SourceEnded, SourceLost
-from tumortrack.sense.files import write_cloud_ply, write_depth_png, write_intrinsics
+from tumortrack.sense.ply import write_cloud_ply
 
 TURNED = PublishedFrame("table", rigid(np.diag([-1.0, -1.0, 1.0]), np.array([50.0, -20, 9])))
 

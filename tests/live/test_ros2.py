@@ -34,9 +34,9 @@ from tumortrack.live.ros.results import messages_of
 from tumortrack.live.ros.sensors import messages_seen, plain_cloud
 from tumortrack.live.ros.workcell import JOINTS, WorkcellMessages
 from tumortrack.live.sinks.ros import Ros2SinkConfig as SinkRos2
-from tumortrack.live.source_worker import SourceWorker
 from tumortrack.live.sources.ros import Ros2SourceConfig as SourceRos2
 from tumortrack.live.values import Observation, Source
+from tumortrack.live.workers import SourceWorker
 from workcell_objects import with_arms, working
 
 pytest.importorskip("cyclonedds", reason="cyclonedds is not installed (tumortrack[live])")

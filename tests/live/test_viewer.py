@@ -278,8 +278,8 @@ def test_estimate_that_cannot_be_shown_hides_the_one_before(sinks, clock):
     assert not sink._server.scene.get_handle_by_name("/estimate").visible
     beat = sink._counter
     until(lambda: sink._counter > beat, "the watch's next word")
-    assert "NO ESTIMATE" in sink._panel._flag.content
-    assert "cannot be shown" in sink._panel._flag.content
+    assert "NO ESTIMATE" in sink._panel.flag.content
+    assert "cannot be shown" in sink._panel.flag.content
 
 
 def test_case_gives_slices_and_an_exact_margin_that_moves_along(sinks, clock, tmp_path):
@@ -291,14 +291,14 @@ def test_case_gives_slices_and_an_exact_margin_that_moves_along(sinks, clock, tm
     )
     sink = sinks(setting, case=str(tmp_path / "case"))
     sink.publish(carried_update(case))
-    until(lambda: sink._panel._slice.visible, "a slice")
-    picture = sink._panel._slice.image
+    until(lambda: sink._panel.slice.visible, "a slice")
+    picture = sink._panel.slice.image
     assert (np.abs(picture.astype(int) - TUMORS[0]).sum(2) < 90).sum() > 30  # its outline
     shell = sink._server.scene.get_handle_by_name("/estimate/margin_tumor_1").vertices
     middle = MOTION.carry(np.array([[8.0, 0, 0]]))[0]
     assert np.linalg.norm(shell - middle, axis=1) == pytest.approx(11.0, abs=0.35)
     sink.publish(empty_update())
-    assert not sink._panel._slice.visible
+    assert not sink._panel.slice.visible
 
     with pytest.raises(InputError, match="is not the case that the model was trained on"):
         sinks(replace(setting, anatomy_ct=small_anatomy()), case=str(tmp_path / "case"))
@@ -341,7 +341,7 @@ def test_arms_are_shown_without_an_estimate_and_never_after_silence(sinks, clock
     sink.publish(virtual(1))
     assert nodes("/workcell").visible
     assert not nodes("/estimate").visible
-    assert REASON in sink._panel._flag.content
+    assert REASON in sink._panel.flag.content
     sink.publish(small_update(2))
     assert not nodes("/workcell").visible
     nowhere = replace(workcell().shapes[0], published_from_shape=np.zeros((4, 4)))
@@ -353,9 +353,9 @@ def test_arms_are_shown_without_an_estimate_and_never_after_silence(sinks, clock
     sink.publish(working(4))
     assert nodes("/workcell").visible
     clock.sleep(1.1)
-    until(lambda: "nothing has come for" in sink._panel._flag.content, "silence")
+    until(lambda: "nothing has come for" in sink._panel.flag.content, "silence")
     assert not nodes("/workcell").visible
-    assert "nothing is known of them" in sink._panel._flag.content
+    assert "nothing is known of them" in sink._panel.flag.content
 
 
 def test_status_says_why_and_no_old_numbers():

@@ -19,24 +19,23 @@ from scipy.spatial.transform import Rotation
 
 from clock import Clock, until
 from igtl_objects import hear_all
-from igtl_reader import unpack_status, unpack_transform
+from igtl_reader import IgtlStatus, unpack_status, unpack_transform
 from live_objects import PARTS, small_setting, small_update
 from recording_objects import frame_number
 from tumortrack.core.errors import InputError, TumortrackError
 from tumortrack.core.geometry import rigid, transform_points
 from tumortrack.core.mesh_files import read_mesh
-from tumortrack.live.igtl.message import IgtlStatus
 from tumortrack.live.ros.messages import Messages, stamp_of
 from tumortrack.live.ros.results import messages_of
 from tumortrack.live.ros.sensors import cloud_of
 from tumortrack.live.ros.workcell import WorkcellMessages
-from tumortrack.live.sink_worker import SinkWorker
 from tumortrack.live.sinks.openigtlink import OpenIgtLinkSinkConfig
 from tumortrack.live.sinks.recording import RecordingSinkConfig as RecordTo
 from tumortrack.live.sinks.ur import SILENT_S, UR_JOINTS, UrSink, UrSinkConfig
 from tumortrack.live.sources.recording import RecordingSourceConfig
 from tumortrack.live.spec import SINKS
 from tumortrack.live.values import Observation, SinkContext, SourceEnded, TrackingResult
+from tumortrack.live.workers import SinkWorker
 from workcell_objects import CUT, REASON, TABLE, virtual, with_arms, workcell, working
 
 HUMBLE, NOETIC = Messages("humble"), Messages("noetic")
@@ -250,9 +249,9 @@ def slicer() -> Iterator:
 
     def opened(setting: SinkContext, **options):
         sink = OpenIgtLinkSinkConfig(port=0, **options).open(setting)
-        receiver = socket.create_connection(("127.0.0.1", sink.port))
+        receiver = socket.create_connection(("127.0.0.1", sink.link.port))
         used.extend((receiver, sink))
-        until(lambda: sink.receivers)
+        until(lambda: sink.link.receivers)
         return sink, receiver
 
     yield opened

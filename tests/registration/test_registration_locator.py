@@ -15,7 +15,7 @@ from stories import succeeded, tumortrack
 from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.estimate import Motion
 from tumortrack.core.types import SensorCloud
-from tumortrack.sense.files import write_cloud_ply
+from tumortrack.sense.ply import write_cloud_ply
 from tumortrack.simulate.occupancy import labels_of, surface_distance
 from tumortrack.simulate.scene import SceneRecipe, Simulator, body_for
 from tumortrack.simulate.targets import draw_targets

@@ -11,20 +11,15 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from depth_files import write_depth_png, write_intrinsics
 from depth_objects import SMALL, dome, pixels, wall
 from tumortrack.core.errors import InputError
 from tumortrack.core.types import Intrinsics
 from tumortrack.sense.camera import d405, deproject
 from tumortrack.sense.cloud import CloudConfig, check_cloud, cloud_from_depth
-from tumortrack.sense.files import (
-    read_cloud,
-    read_depth_png,
-    read_intrinsics,
-    write_cloud_ply,
-    write_depth_png,
-    write_intrinsics,
-)
+from tumortrack.sense.files import read_cloud, read_depth_png, read_intrinsics
 from tumortrack.sense.noise import NoiseConfig, add_noise
+from tumortrack.sense.ply import write_cloud_ply
 
 
 @pytest.fixture

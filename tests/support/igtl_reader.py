@@ -3,18 +3,28 @@
 from __future__ import annotations
 
 import struct
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int, Num, UInt32
 
 from tumortrack.live.igtl.message import (
     Header,
-    IgtlStatus,
     Message,
     Polydata,
     ProtocolError,
     check_body,
 )
+
+
+class IgtlStatus(NamedTuple):
+    """What a STATUS says: ``code`` 1 is well."""
+
+    code: int
+    name: str
+    text: str
+    sub_code: int = 0
+
 
 _EXTENDED = struct.Struct("> H H I I")
 _ENTRY = struct.Struct("> H H I")

@@ -22,7 +22,8 @@ from tumortrack.core.types import Anatomy, CameraLabels, Mesh, OccupancyCloud
 from tumortrack.models.in_distribution import InDistributionRange
 from tumortrack.occupancy.model import OccupancyModel
 from tumortrack.occupancy.network import OccupancyNetwork
-from tumortrack.sense.files import read_cloud, write_cloud_ply
+from tumortrack.sense.files import read_cloud
+from tumortrack.sense.ply import write_cloud_ply
 from tumortrack.tracking.files import write_estimate
 from tumortrack.tracking.points import camera_table, check_near_organ, read_points
 from tumortrack.training.model import save_model

@@ -19,9 +19,8 @@ from tumortrack.core.errors import InputError, StorageError
 
 if TYPE_CHECKING:
     from tumortrack.live.loop import Loop, LoopConfig
-    from tumortrack.live.sink_worker import SinkWorker
-    from tumortrack.live.source_worker import SourceWorker
     from tumortrack.live.values import PublishedFrame, SinkConfig, SinkContext, TrackingResult
+    from tumortrack.live.workers import SinkWorker, SourceWorker
     from tumortrack.models.model import Model
     from tumortrack.plan.operation import Operation
 
@@ -104,7 +103,7 @@ class Track:
         report = report_path(self.report, "track")
 
         from tumortrack.live.loop import Loop
-        from tumortrack.live.source_worker import SourceWorker
+        from tumortrack.live.workers import SourceWorker
         from tumortrack.tracking.tracker import Tracker
         from tumortrack.training.model import load_model
 
@@ -180,7 +179,7 @@ def open_sinks(
     sinks: tuple[str, ...], configs: list[SinkConfig], context: SinkContext, stack: ExitStack
 ) -> list[SinkWorker]:
     """Each at work in a thread of its own, until the stack ends."""
-    from tumortrack.live.sink_worker import SinkWorker
+    from tumortrack.live.workers import SinkWorker
 
     workers = []
     # Those that make a folder last: if another cannot open, none is left behind.

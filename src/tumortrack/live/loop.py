@@ -6,6 +6,7 @@ estimate is ever repeated.
 
 from __future__ import annotations
 
+import itertools
 import math
 import threading
 import time
@@ -20,18 +21,11 @@ from jaxtyping import Float64
 from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError, NoEstimate, TumortrackError
 from tumortrack.core.types import DepthFrame, Intrinsics, SensorCloud
+from tumortrack.live import values as live
 from tumortrack.live.meter import RunStatistics
 from tumortrack.live.quality import StampCheck, judge
-from tumortrack.live.sink_worker import SinkWorker
-from tumortrack.live.source_worker import SourceWorker
-from tumortrack.live.values import (
-    ArmsController,
-    Observation,
-    Quality,
-    SinkContext,
-    SourceLost,
-    TrackingResult,
-)
+from tumortrack.live.values import Observation, Quality, SourceLost, TrackingResult
+from tumortrack.live.workers import SinkWorker, SourceWorker
 from tumortrack.sense.camera import d405
 from tumortrack.sense.region import Hints, RegionConfig, organ_points
 from tumortrack.tracking.tracker import Follower, FollowerConfig, Tracker
@@ -42,9 +36,7 @@ _PICK_S = 3.0  # without the organ: a pick is forgotten
 class LoopConfig(Config, frozen=True, kw_only=True):
     """``stale_s``: no frame for so long, or one that old, gives 'no estimate'. ``give_up_s``: the
     loop ends where no frame came for so long. ``intrinsics``: of depth images, instead of what the
-    source says. ``seconds``: the loop ends so long after the first
-    frame; 0: never.
-    """
+    source says. ``seconds``: the loop ends so long after the first frame; 0: never."""
 
     region: RegionConfig = RegionConfig()
     follower: FollowerConfig = FollowerConfig()
@@ -63,26 +55,26 @@ class LoopConfig(Config, frozen=True, kw_only=True):
             raise InputError(f"seconds is {self.seconds:g}; it must be 0 (no end) or more.")
 
 
-class TooLate(NoEstimate):
+class _TooLate(NoEstimate):
     """The estimate is right, but its frame is stale by now."""
 
 
 class Loop:
-    """One run from a source to sinks. ``run`` returns when the source ends, when ``stop`` was
-    called from anywhere, or when the time is up."""
+    """One run from a source to sinks: until the source ends, ``stop`` is called from anywhere, or
+    the time is up."""
 
     def __init__(
         self,
         tracker: Tracker,
-        context: SinkContext,
+        context: live.SinkContext,
         config: LoopConfig,
-        arms: ArmsController | None = None,
+        arms: live.ArmsController | None = None,
     ) -> None:
         self._config, self._context, self._arms = config, context, arms
         self._follower = Follower(tracker, config.follower)
         self._stamps = StampCheck(config.stale_s)
         self._stop = threading.Event()
-        self._sequence = 0
+        self._sequence = itertools.count()
         self._picked: Float64[np.ndarray, " 3"] | None = None  # by the user
         self._place_mm: Float64[np.ndarray, " 3"] | None = None  # where that is by now
         self._found_s = time.monotonic()
@@ -110,52 +102,44 @@ class Loop:
         sink_workers: list[SinkWorker],
         on_result: Callable[[TrackingResult], None],
     ) -> None:
-        """``on_result`` is called with every result, after the sink_workers have it.
-
-        Raises:
-            SourceLost: no frame came for ``give_up_s``.
-            TumortrackError: the source can never work (as its ``open`` said).
-        """
+        """``on_result`` is called with every result, after the sink_workers have it. SourceLost: no
+        frame came for ``give_up_s``. Whatever keeps the source from ever working is raised too."""
         try:
-            self._run(source_worker, sink_workers, on_result)
+            for result in self._results(source_worker):
+                on_result(self._publish(result, sink_workers))
+                if self._arms is not None and self._arms.ended:
+                    return
         finally:
             if self._arms is not None and not self._arms.ended:
                 self._arms.abort("tracking has ended")
-                self._publish(self._without_frame(None, 0.0, "tracking has ended"), sink_workers)
+                self._publish(self._without_frame("tracking has ended"), sink_workers)
 
-    def _run(
-        self,
-        source_worker: SourceWorker,
-        sink_workers: list[SinkWorker],
-        on_result: Callable[[TrackingResult], None],
-    ) -> None:
-        fresh = time.monotonic()
-        ends = math.inf
+    def _results(self, source_worker: SourceWorker) -> Iterator[TrackingResult]:
+        fresh_s = time.monotonic()
+        ends_s = math.inf
         while not self._stop.is_set():
             got = source_worker.take(self._config.stale_s)
-            now = time.monotonic()
+            now_s = time.monotonic()
             if isinstance(got, Observation):
                 got = self._calibrated(got)
             if isinstance(got, Observation):
-                fresh = now
-                if self._config.seconds and ends == math.inf:
-                    ends = now + self._config.seconds
-                result = self._answer(
-                    got, source_worker.born_ns(got), source_worker.latency_from != "taking"
-                )
+                fresh_s = now_s
+                if self._config.seconds and ends_s == math.inf:
+                    ends_s = now_s + self._config.seconds
+                hurry = source_worker.latency_from != "taking"
+                yield self._answer(got, source_worker.born_ns(got), hurry)
             elif got is None and source_worker.ended:
                 return
             else:
-                result = self._without_frame(got, now - fresh, source_worker.trouble)
-            result = self._publish(result, sink_workers)
-            on_result(result)
-            if now >= ends or (self._arms is not None and self._arms.ended):
+                silence = source_worker.trouble or f"no frame for {now_s - fresh_s:.1f} s"
+                yield self._without_frame(silence if got is None else str(got))
+            if now_s >= ends_s:
                 return
-            if now - fresh > self._config.give_up_s:
+            if now_s - fresh_s > self._config.give_up_s:
                 trouble = f": {source_worker.trouble}" if source_worker.trouble else ""
                 raise SourceLost(
-                    f"no frame for {now - fresh:.0f} s{trouble}. Look at the camera or the topic, "
-                    "then start again."
+                    f"no frame for {now_s - fresh_s:.0f} s{trouble}. Look at the camera or the "
+                    "topic, then start again."
                 )
 
     def _answer(self, seen: Observation, born_ns: int, hurry: bool) -> TrackingResult:
@@ -165,33 +149,31 @@ class Loop:
         organ, estimate, reason, warning = None, None, "", ""
         quality: Quality = "none"
         try:
-            self._check_stamp(seen.stamp_ns, _age_s(born_ns))
-            with timed(seconds, "organ"):
+            if self._stamps.check(seen.stamp_ns, _age_s(born_ns)):
+                self.statistics.clock_jumps += 1
+                self._follower.forget()
+            with _timed(seconds, "organ"):
                 rng = np.random.default_rng((self._config.follower.seed, seen.stamp_ns))
-                region = organ_points(seen.content, self._config.region, self._hints(seen), rng)
-                organ = region.cloud
-            with timed(seconds, "locate"):
+                hints = self._hints(seen)
+                organ = organ_points(seen.content, self._config.region, hints, rng).cloud
+            with _timed(seconds, "locate"):
                 estimate = self._follower.locate(organ)
             seconds |= {f"locate.{k}": v for k, v in estimate.report["timings"].items()}
-            with timed(seconds, "judge"):
+            with _timed(seconds, "judge"):
                 quality, warning = judge(estimate, seen.content)
             self._follow_pick(organ)
             if hurry and _age_s(born_ns) > self._config.stale_s:
-                raise TooLate(f"the answer came too late: {_age_s(born_ns):.2f} s after the frame")
-        except TooLate as error:  # and yet the best place to start the next search at
-            estimate, reason = None, str(error)
-        except TumortrackError as error:
-            self._follower.forget()
-            estimate, reason = None, str(error)
-        except Exception as error:  # a defect of ours: reported, kept, and the next frame is tried
-            self._follower.forget()
-            self.statistics.add_defect(error)
-            estimate, reason = None, f"internal error, {type(error).__name__}: {error}"
-        if estimate is None:
-            quality, warning = "none", ""
+                raise _TooLate(f"the answer came too late: {_age_s(born_ns):.2f} s after the frame")
+        except Exception as error:
+            estimate, reason, quality, warning = None, str(error), "none", ""
+            if not isinstance(error, _TooLate):  # that is the best place to start the next search
+                self._follower.forget()
+            if not isinstance(error, TumortrackError):  # a defect of ours: the next frame is tried
+                self.statistics.add_defect(error)
+                reason = f"internal error, {type(error).__name__}: {error}"
         self._stamp = (seen.stamp_ns, time.monotonic_ns())
         return TrackingResult(
-            self._next(),
+            next(self._sequence),
             seen.stamp_ns,
             estimate,
             reason,
@@ -203,6 +185,16 @@ class Loop:
             seconds,
             latency_ms=1000 * _age_s(born_ns),
         )
+
+    def _without_frame(self, reason: str) -> TrackingResult:
+        """The result where there is no frame; its stamp is now, by the source's clock as far as it
+        is known."""
+        stamp_ns = time.time_ns()
+        if self._stamp is not None:
+            last_ns, then_ns = self._stamp
+            stamp_ns = last_ns + time.monotonic_ns() - then_ns
+        frame = self._context.published_frame
+        return TrackingResult(next(self._sequence), stamp_ns, reason=reason, published_frame=frame)
 
     def _calibrated(self, seen: Observation) -> Observation | InputError:
         """The frame as the camera that the user says it is took it."""
@@ -217,11 +209,6 @@ class Loop:
             )
         return replace(seen, content=DepthFrame(content.depth_mm, given, content.stamp_ns))
 
-    def _check_stamp(self, stamp_ns: int, age_s: float) -> None:
-        if self._stamps.check(stamp_ns, age_s):
-            self.statistics.clock_jumps += 1
-            self._follower.forget()
-
     def _hints(self, seen: Observation) -> Hints:
         controls = self._context.controls
         if controls.picked_mm is not self._picked:  # the user chose again
@@ -229,7 +216,7 @@ class Loop:
             self._found_s = time.monotonic()
             self._follower.forget()
         elif self._picked is not None and time.monotonic() - self._found_s > _PICK_S:
-            controls.pick(None)  # it is not there any more, nor where it was seen last
+            controls.picked_mm = None  # it is not there any more, nor where it was seen last
             self._picked = self._place_mm = None
         last_box_mm = self._follower.last_box_mm(seen.stamp_ns)
         # Once the organ is found its box is the better guide: pieces may cover the place.
@@ -244,25 +231,6 @@ class Loop:
             off_mm = np.linalg.norm(points_mm - np.median(points_mm, axis=0), axis=1)
             self._place_mm = points_mm[int(off_mm.argmin())]
 
-    def _without_frame(
-        self, fault: TumortrackError | None, silent_s: float, trouble: str
-    ) -> TrackingResult:
-        """The result where there is no frame."""
-        reason = str(fault) if fault is not None else trouble or f"no frame for {silent_s:.1f} s"
-        return TrackingResult(
-            self._next(),
-            self._now_ns(),
-            reason=reason,
-            published_frame=self._context.published_frame,
-        )
-
-    def _now_ns(self) -> int:
-        """Now, by the source's clock as far as it is known."""
-        if self._stamp is None:
-            return time.time_ns()
-        stamp_ns, then_ns = self._stamp
-        return stamp_ns + time.monotonic_ns() - then_ns
-
     def _publish(self, result: TrackingResult, sink_workers: list[SinkWorker]) -> TrackingResult:
         if self._arms is not None:
             result = self._act(self._arms, result)
@@ -271,7 +239,7 @@ class Loop:
         self.statistics.add(result)
         return result
 
-    def _act(self, arms: ArmsController, result: TrackingResult) -> TrackingResult:
+    def _act(self, arms: live.ArmsController, result: TrackingResult) -> TrackingResult:
         try:
             if self._context.controls.aborted.is_set():
                 arms.abort("stopped by the viewer, or a real arm gave up")
@@ -281,13 +249,9 @@ class Loop:
             arms.abort(f"internal error, {type(error).__name__}: {error}")
             return result
 
-    def _next(self) -> int:
-        self._sequence += 1
-        return self._sequence - 1
-
 
 @contextmanager
-def timed(seconds: dict[str, float], name: str) -> Iterator[None]:
+def _timed(seconds: dict[str, float], name: str) -> Iterator[None]:
     """Notes how long a ``with`` block took, also where it raises."""
     start = time.perf_counter()
     try:

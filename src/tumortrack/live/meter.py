@@ -38,10 +38,9 @@ class Histogram:
 
     def percentile(self, share: float) -> float:
         """What ``share`` per cent do not exceed: the middle of its bin. NaN of nothing."""
-        total = self._counts.sum()
-        if not total:
+        if not len(self):
             return float("nan")
-        rank = max(int(np.ceil(share / 100 * total)), 1)
+        rank = max(int(np.ceil(share / 100 * len(self))), 1)
         place = int(np.searchsorted(np.cumsum(self._counts), rank))
         return min(float(_FINEST * _STEP ** (place + 0.5)), self._largest)
 
@@ -94,12 +93,12 @@ class RunStatistics:
             return
         if result.latency_ms is not None:
             self.latency.add(result.latency_ms)
-        if result.observation is not None and (truth := result.observation.truth) is not None:
-            meshes = result.estimate.meshes
-            for name, true in zip(truth.names, truth.parts, strict=True):
-                if name in meshes:
-                    off = meshes[name].box_mm.mean(0) - true.box_mm.mean(0)
-                    self.errors.setdefault(name, Histogram()).add(float(np.linalg.norm(off)))
+        if result.observation is None or (truth := result.observation.truth) is None:
+            return
+        for name, true in zip(truth.names, truth.parts, strict=True):
+            if (mesh := result.estimate.meshes.get(name)) is not None:
+                off = mesh.box_mm.mean(0) - true.box_mm.mean(0)
+                self.errors.setdefault(name, Histogram()).add(float(np.linalg.norm(off)))
 
     def add_defect(self, error: Exception) -> None:
         """Keep the traceback of an internal error."""

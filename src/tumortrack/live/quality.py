@@ -59,24 +59,15 @@ def judge(estimate: Estimate, content: DepthFrame | SensorCloud) -> tuple[Qualit
 
 
 def seen_through(estimate: Estimate, frame: DepthFrame) -> float:
-    """The share of the estimated organ's picture behind whose surface the camera sees something.
-
-    What the camera sees there, a table, say, it could not see if the organ lay there: an organ laid
-    on the points of a hand sticks out of the hand, and is seen through. Pixels without return, and
-    those where something lies before the organ, say nothing. 0 where no pixel says anything.
-    """
+    """The share of the estimated organ's picture behind whose surface the camera sees something,
+    a table, say, which it could not see if the organ lay there. Pixels without return, and those
+    where something lies before the organ, say nothing. 0 where no pixel says anything."""
     every = max(1, round(frame.intrinsics.width / _WIDTH))
     seen_mm = frame.depth_mm[::every, ::every]
     organ = next(iter(estimate.meshes.values()))
     given = frame.intrinsics
-    few = Intrinsics(
-        seen_mm.shape[1],
-        seen_mm.shape[0],
-        given.fx / every,
-        given.fy / every,
-        given.cx / every,
-        given.cy / every,
-    )
+    scaled = (number / every for number in (given.fx, given.fy, given.cx, given.cy))
+    few = Intrinsics(*seen_mm.shape[::-1], *scaled)
     organ_mm = render_depth(organ.vertices_mm, organ.faces, few).depth_mm
     both = np.isfinite(organ_mm) & np.isfinite(seen_mm)
     if not both.any():
@@ -89,34 +80,26 @@ class StampCheck:
 
     def __init__(self, stale_s: float) -> None:
         self._stale_s = stale_s
-        self._last_ns: int | None = None
+        self._last_ns = -1
         self._behind: list[int] = []
 
     def check(self, stamp_ns: int, age_s: float) -> bool:
         """True if the clock was set back. ``age_s``: how long ago the frame was made, or came, as
-        far as is known.
-
-        Raises:
-            NoEstimate: stale, or out of order.
-        """
+        far as is known. Raises NoEstimate for a frame that is stale or out of order."""
+        clocks = "the clocks of camera and computer"
         if age_s > self._stale_s:
-            raise NoEstimate(
-                f"the frame is stale: {age_s:.2f} s old, if the clocks of camera and computer agree"
-            )
+            raise NoEstimate(f"the frame is stale: {age_s:.2f} s old, if {clocks} agree")
         if age_s < -_AHEAD_S:
             raise NoEstimate(
-                f"the frame's stamp lies {-age_s:.2f} s in the future: the clocks of camera and "
-                "computer disagree"
+                f"the frame's stamp lies {-age_s:.2f} s in the future: {clocks} disagree"
             )
         if stamp_ns < 0:
             raise NoEstimate(f"the frame's stamp is {stamp_ns} ns; it must be 0 or more")
-        if self._last_ns is None or stamp_ns > self._last_ns:
-            self._last_ns, self._behind = stamp_ns, []
-            return False
-        grows = not self._behind or stamp_ns > self._behind[-1]
-        self._behind = [*self._behind, stamp_ns] if grows else [stamp_ns]
-        back_s = (self._last_ns - stamp_ns) * 1e-9
-        if len(self._behind) < _ACCEPTED_AFTER:
-            raise NoEstimate(f"the frame's stamp went back by {back_s:.3f} s")
+        back_ns = self._last_ns - stamp_ns
+        if back_ns >= 0:
+            grows = not self._behind or stamp_ns > self._behind[-1]
+            self._behind = [*self._behind, stamp_ns] if grows else [stamp_ns]
+            if len(self._behind) < _ACCEPTED_AFTER:
+                raise NoEstimate(f"the frame's stamp went back by {back_ns * 1e-9:.3f} s")
         self._last_ns, self._behind = stamp_ns, []
-        return True
+        return back_ns >= 0

@@ -33,8 +33,8 @@ class Extension(NamedTuple):
 
 @dataclass(frozen=True)
 class Registry(Generic[C]):
-    """All kinds of source, or of sink: ``built_in`` (``module:class`` by kind), and those of
-    ``group``. ``what`` names one in messages; ``base`` is what its class must be derived from."""
+    """All kinds of source, or of sink: ``built_in`` (``module:class`` by kind), and those of the
+    entry points' ``group``. ``what`` names one in messages; ``base`` is its class's base."""
 
     what: str
     group: str
@@ -42,12 +42,8 @@ class Registry(Generic[C]):
     built_in: Mapping[str, str]
 
     def parse(self, text: str) -> C:
-        """The configuration that ``text`` describes.
-
-        Raises:
-            InputError: no such kind, key or value: the message lists what there is; or the package
-                that offers the kind is broken.
-        """
+        """The configuration that ``text`` describes. Raises InputError for a kind, key or value
+        that there is not (the message lists what there is), and where a package is broken."""
         head, _, options = text.partition("?")
         kind, _, target = head.partition(":")
         config = self._class(kind, f"{self.what} {text!r}")
@@ -63,7 +59,7 @@ class Registry(Generic[C]):
                     fault = f"{entry.name!r} is built in, and cannot be replaced"
             except InputError as error:
                 fault = str(error)
-            yield Extension(self.what, entry.name, package_of(entry), fault)
+            yield Extension(self.what, entry.name, _package_of(entry), fault)
 
     def _class(self, kind: str, where: str) -> type[C]:
         """Raises InputError, which ``where`` opens."""
@@ -75,27 +71,24 @@ class Registry(Generic[C]):
             allowed = sorted({*self.built_in, *(entry.name for entry in entries)})
             raise InputError(f"{where}: there is no kind {kind!r}. Allowed: {', '.join(allowed)}.")
         if len(found) > 1:
-            packages = " and ".join(sorted(map(package_of, found)))
+            packages = " and ".join(sorted(map(_package_of, found)))
             raise InputError(f"{where}: {packages} both offer {kind!r}. Uninstall one of them.")
-        package = package_of(found[0])
+        cause: Exception | None = None
         try:
             config: type[C] = found[0].load()
+            fault = f"offers {found[0].value}, which is no {self.base.__name__} of tumortrack"
+            if isinstance(config, type) and issubclass(config, self.base):
+                tag = config.__struct_config__.tag
+                if tag == kind:
+                    return config
+                names = f"names its entry point {kind!r}, and its class {tag!r}"
+                fault = f"{names}; both must be the same"
         except Exception as error:  # a foreign package raises anything
-            raise InputError(
-                f"{where}: the package {package} offers {kind!r}, but it cannot be imported "
-                f"({type(error).__name__}: {error}). Repair or uninstall it."
-            ) from error
-        if not (isinstance(config, type) and issubclass(config, self.base)):
-            raise InputError(
-                f"{where}: the package {package} offers {found[0].value}, which is no "
-                f"{self.base.__name__} of tumortrack. Repair or uninstall it."
-            )
-        if config.__struct_config__.tag != kind:
-            raise InputError(
-                f"{where}: the package {package} names its entry point {kind!r}, and its class "
-                f"{config.__struct_config__.tag!r}; both must be the same. Repair or uninstall it."
-            )
-        return config
+            cause = error
+            fault = f"offers {kind!r}, but it cannot be imported ({type(error).__name__}: {error})"
+        raise InputError(
+            f"{where}: the package {_package_of(found[0])} {fault}. Repair or uninstall it."
+        ) from cause
 
     def _entry_points(self) -> list[EntryPoint]:
         return sorted(entry_points(group=self.group), key=lambda entry: entry.name)
@@ -134,7 +127,7 @@ def extensions() -> list[Extension]:
     return [*SOURCES.extensions(), *SINKS.extensions()]
 
 
-def package_of(entry: EntryPoint) -> str:
+def _package_of(entry: EntryPoint) -> str:
     """The distribution that declares an entry point."""
     return entry.dist.name if entry.dist is not None else entry.value
 
@@ -146,19 +139,29 @@ def _filled(config: type[C], target: str, options: str, where: str) -> C:
         if key in given:
             raise InputError(f"{where}: {key!r} is given twice.")
         given[key] = value
-    names = {field.name: field for field in msgspec.structs.fields(config)}
+    fields = {field.name: field for field in msgspec.structs.fields(config)}
     target_name = getattr(config, "target", "")
     if target and (not target_name or target_name in given):
         raise InputError(f"{where}: {target!r} has no place there. {usage(config)}")
     if target:
         given[target_name] = target
-    if unknown := [key for key in given if key not in names]:
+    if unknown := [key for key in given if key not in fields]:
         raise InputError(f"{where}: {unknown[0]!r} is no option. {usage(config)}")
-    if missing := [n for n, f in names.items() if f.required and n not in given]:
+    if missing := [n for n, f in fields.items() if f.required and n not in given]:
         raise InputError(f"{where} lacks its {missing[0]}. {usage(config)}")
+    values = {}
+    for key, text in given.items():
+        kind = fields[key].type
+        try:
+            values[key] = msgspec.convert(text, kind, strict=False, dec_hook=_path)
+        except msgspec.ValidationError as error:
+            allowed = _allowed(msgspec.inspect.type_info(kind))
+            raise InputError(
+                f"{where}: {key} is {text!r}; allowed: {allowed}. {usage(config)}"
+            ) from error
     try:
-        return msgspec.convert(given, config, strict=False, dec_hook=_path)
-    except msgspec.ValidationError as error:
+        return config(**values)
+    except (TypeError, ValueError) as error:  # of a foreign class's own check
         raise InputError(f"{where}: {error}. {usage(config)}") from error
 
 
@@ -166,6 +169,28 @@ def _path(kind: type, value: object) -> object:
     if kind is Path and isinstance(value, str):
         return Path(value)
     raise TypeError(f"{kind.__name__} is not read from text")
+
+
+_WORDS: dict[type, str] = {
+    msgspec.inspect.BoolType: "true or false",
+    msgspec.inspect.IntType: "a whole number",
+    msgspec.inspect.FloatType: "a number",
+    msgspec.inspect.NoneType: "null",
+}
+_BOUNDS = {"ge": "from", "gt": "more than", "le": "to", "lt": "less than"}
+
+
+def _allowed(info: msgspec.inspect.Type) -> str:
+    """What an option's text may be, in words."""
+    if isinstance(info, msgspec.inspect.Metadata):
+        return _allowed(info.type)
+    if isinstance(info, msgspec.inspect.UnionType):
+        return ", ".join(map(_allowed, info.types))
+    if isinstance(info, msgspec.inspect.LiteralType):
+        return ", ".join(map(str, info.values))
+    bounds = [(word, getattr(info, key, None)) for key, word in _BOUNDS.items()]
+    words = [f"{word} {bound:g}" for word, bound in bounds if bound is not None]
+    return " ".join([_WORDS.get(type(info), "other text"), *words])
 
 
 def usage(config: type[Config]) -> str:

@@ -27,8 +27,7 @@ Quality = Literal["good", "poor", "none"]
 
 
 class SourceLost(TumortrackError):
-    """The source is gone for now: unplugged, killed, its file unreadable. The loop tries to open it
-    again."""
+    """The source is gone for now: unplugged, killed, unreadable. It is opened again."""
 
     exit_code = 3
 
@@ -43,11 +42,9 @@ class SourceEnded(TumortrackError):
 class Observation:
     """What a source observed at one instant; camera frame, mm.
 
-    Attributes:
-        content: a depth image or a cloud, with the ``stamp_ns`` of its exposure.
-        arrived_ns: when it reached this program, by ``time.time_ns``.
-        mask: of a depth image: True where the organ may be; None: anywhere.
-        truth: the true surfaces, where the source simulates them.
+    ``content`` has the ``stamp_ns`` of its exposure. ``arrived_ns``: when it reached this program,
+    by ``time.time_ns``. ``mask``: of a depth image: True where the organ may be. ``truth``: the
+    true surfaces, where the source simulates them.
     """
 
     content: DepthFrame | SensorCloud
@@ -64,8 +61,7 @@ class Observation:
 class Source(Protocol):
     """An open source. One thread calls ``read``; another may call ``close``."""
 
-    # True: stamps are this machine's time.time_ns, so the age of a frame is known. Holds for the
-    # frame read last; before the first one it may not be known.
+    # Stamps are this machine's time.time_ns, so the age of a frame is known; of the one read last.
     host_clock: bool
     lossless: bool  # every frame is processed, not only the newest: the source waits for the loop
 
@@ -78,10 +74,8 @@ class Source(Protocol):
         """The newest frame that was not read before; None if none came in time.
 
         Raises:
-            SourceLost: the source is gone; the loop opens it again.
-            SourceEnded: there are no more frames.
-            InputError: this frame cannot be used (another message type, say); the loop reports it
-                and reads on.
+            SourceLost, SourceEnded: as they say.
+            InputError: this frame cannot be used; the loop reports it and reads on.
         """
         ...
 
@@ -92,7 +86,7 @@ class Source(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class PublishedFrame:
-    """The coordinate frame in which results are published, and the transform there."""
+    """Where results are published."""
 
     frame_id: str = "camera"
     published_from_camera: Float64[np.ndarray, "4 4"] = field(default_factory=lambda: np.eye(4))
@@ -110,11 +104,9 @@ class TransformedEstimate:
 
 @dataclass(frozen=True, eq=False)
 class RigidShape:
-    """A surface that moves rigidly: a link of an arm, a table, a planned piece.
-
-    ``name`` is unique within a workcell, with slashes between levels (``cutter/forearm``). Sinks
-    send the surface again only if ``mesh`` is another object than before, otherwise its pose alone.
-    """
+    """A surface that moves rigidly: a link of an arm, a table, a planned piece. ``name`` is unique
+    within a workcell, with slashes between levels (``cutter/forearm``). Sinks send the surface
+    again only if ``mesh`` is another object than before, otherwise its pose alone."""
 
     name: str
     mesh: Mesh  # in its own frame, mm
@@ -137,10 +129,8 @@ class Polyline:
 class Workcell:
     """What the arms do now, and what is shown with them; published frame, mm.
 
-    Attributes:
-        state: of the procedure: approach, grasp, hold, sweep 1, ...
-        halted: why the arms stand still before their end; empty: they do not.
-        joints_rad: angle by the joint's name; empty without arms.
+    ``state``: of the procedure: approach, grasp, hold, sweep 1, ... ``halted``: why the arms stand
+    still before their end; empty: they do not. ``joints_rad``: angle by the joint's name.
     """
 
     state: str
@@ -172,14 +162,12 @@ class TrackingResult:
 
     Attributes:
         sequence: number of the result, from 0.
-        stamp_ns: of the frame; if none came, the present by ``time.time_ns``.
+        stamp_ns: of the frame; if none came, the present by the source's clock.
         estimate: camera frame, mm; None where nothing can be said. Never an older one.
         reason: why there is no estimate; empty with one.
-        quality: ``none`` without an estimate; ``poor`` if it should not be relied on: ``warning``
-            then says why.
+        quality: ``poor``: it should not be relied on, and ``warning`` says why.
         observation: what the source saw; None if no frame came.
-        organ: the points of the observation that belong to the organ; camera frame.
-        published_frame: where sinks publish it.
+        organ: its points that belong to the organ; camera frame.
         seconds: duration of each stage.
         latency_ms: until the result was handed to the sinks, from the stamp (if the source does
             not have this machine's clock: from the arrival; if it waits for the loop: from the
@@ -205,13 +193,12 @@ class TrackingResult:
         """The estimate in the published frame: what sinks send."""
         if self.estimate is None:
             return None
-        published_from_camera = self.published_frame.published_from_camera
-        cloud = self.estimate.cloud
+        way, cloud = self.published_frame.published_from_camera, self.estimate.cloud
         meshes = {
-            name: mesh.moved(transform_points(published_from_camera, mesh.vertices_mm))
+            name: mesh.moved(transform_points(way, mesh.vertices_mm))
             for name, mesh in self.estimate.meshes.items()
         }
-        points_mm = transform_points(published_from_camera, cloud.points_mm)
+        points_mm = transform_points(way, cloud.points_mm)
         return TransformedEstimate(points_mm, cloud.labels, cloud.probability, meshes)
 
     def center_mm(self, part: str) -> Float64[np.ndarray, " 3"] | None:
@@ -248,37 +235,20 @@ class ArmsController(Protocol):
         ...
 
 
+@dataclass(eq=False)
 class Controls:
-    """What the user asks of the running loop; from any thread."""
+    """What the user asks of the running loop; from any thread. ``picked_mm``: this point (camera
+    frame) lies on the organ: track the piece that it is on. ``aborted``: the arms stop for good."""
 
-    def __init__(self) -> None:
-        self._lock = threading.Lock()
-        self.aborted = threading.Event()  # set: the arms stop for good
-        self._picked_mm: Float64[np.ndarray, " 3"] | None = None
-
-    def pick(self, point_mm: Float64[np.ndarray, " 3"] | None) -> None:
-        """This point (camera frame, mm) lies on the organ: track the piece that it is on. None:
-        choose the organ without it again."""
-        with self._lock:
-            self._picked_mm = point_mm
-
-    @property
-    def picked_mm(self) -> Float64[np.ndarray, " 3"] | None:
-        with self._lock:
-            return self._picked_mm
+    picked_mm: Float64[np.ndarray, " 3"] | None = None
+    aborted: threading.Event = field(default_factory=threading.Event)
 
 
 @dataclass(frozen=True, eq=False)
 class SinkContext:
-    """What a sink knows when it is opened.
-
-    Attributes:
-        parts: the model's parts, the organ first.
-        anatomy_ct: the organ in the CT (LPS, mm), if the model has it: estimates then have a
-            motion, and their meshes its triangles.
-        controls: what a sink with buttons can ask of the loop.
-        arms: results may have a workcell.
-    """
+    """What a sink knows when it is opened. ``parts``: the model's, the organ first. ``anatomy_ct``:
+    the organ in the CT (LPS, mm), if the model has it: estimates then have a motion, and their
+    meshes its triangles. ``arms``: results may have a workcell."""
 
     parts: tuple[str, ...]
     published_frame: PublishedFrame
@@ -290,7 +260,8 @@ class SinkContext:
 @runtime_checkable
 class Sink(Protocol):
     """An open sink. Both methods are called from one thread of its own, so they may take their
-    time. Errors are counted and reported, and the loop goes on."""
+    time. Errors are counted and reported, and the loop goes on. A ``counts: dict[str, int]``, if
+    there is one, goes into the run's report."""
 
     def publish(self, result: TrackingResult) -> None: ...
 
@@ -299,20 +270,10 @@ class Sink(Protocol):
         ...
 
 
-@runtime_checkable
-class CountingSink(Protocol):
-    """A sink with counts of its own for the run's report."""
-
-    @property
-    def counts(self) -> dict[str, int]: ...
-
-
 class SourceConfig(Config, frozen=True, kw_only=True, tag_field="kind"):
-    """Base of every source's configuration; its fields are the options on the command line.
-
-    The class's ``tag`` is the kind's name. ``target`` names the field that stands before the
-    question mark in ``kind:target?key=value``; empty: there is none.
-    """
+    """Base of every source's configuration; its fields are the options on the command line, its
+    ``tag`` is the kind's name. ``target`` names the field that stands before the question mark in
+    ``kind:target?key=value``; empty: there is none."""
 
     target: ClassVar[str] = ""
 

@@ -35,14 +35,8 @@ def d405(width: int = 848, height: int = 480) -> Intrinsics:
             "1280 x 720, 848 x 480, 640 x 360, 480 x 270 or 424 x 240."
         )
     half_x, half_y = (math.radians(degrees) / 2 for degrees in D405_FOV_DEGREES)
-    return Intrinsics(
-        width=width,
-        height=height,
-        fx=width / 2 / math.tan(half_x),
-        fy=height / 2 / math.tan(half_y),
-        cx=(width - 1) / 2,
-        cy=(height - 1) / 2,
-    )
+    fx, fy = width / 2 / math.tan(half_x), height / 2 / math.tan(half_y)
+    return Intrinsics(width, height, fx, fy, cx=(width - 1) / 2, cy=(height - 1) / 2)
 
 
 class Pinhole(NamedTuple):
@@ -63,11 +57,9 @@ def deproject_pixels(
 ) -> Float32[np.ndarray, "n 3"]:
     """Points (n, 3) in the camera frame of pixels given by flat (row-major) index and depth."""
     row, column = np.divmod(index, intrinsics.width)
-    points_mm = np.empty((len(index), 3), np.float32)
-    points_mm[:, 0] = (column - intrinsics.cx) * (depth_mm / intrinsics.fx)
-    points_mm[:, 1] = (row - intrinsics.cy) * (depth_mm / intrinsics.fy)
-    points_mm[:, 2] = depth_mm
-    return points_mm
+    x = (column - intrinsics.cx) * (depth_mm / intrinsics.fx)
+    y = (row - intrinsics.cy) * (depth_mm / intrinsics.fy)
+    return np.stack([x, y, depth_mm], axis=1).astype(np.float32)
 
 
 def deproject(frame: DepthFrame) -> Float32[np.ndarray, "n 3"]:

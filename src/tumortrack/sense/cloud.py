@@ -31,10 +31,8 @@ class CloudConfig(Config, frozen=True, kw_only=True):
 def cloud_from_depth(
     frame: DepthFrame, config: CloudConfig, rng: np.random.Generator
 ) -> SensorCloud:
-    """Crop by depth, draw unique random pixels, deproject them.
-
-    Returns ``n_points`` points in random order, or all of them where fewer (but at least 200)
-    lie in range.
+    """Crop by depth, draw ``n_points`` unique random pixels (all where fewer lie in range), and
+    deproject them.
 
     Raises:
         NoEstimate: fewer than 200 pixels lie in range.
@@ -78,7 +76,10 @@ def check_cloud(cloud: SensorCloud) -> None:
     """
     points_mm = cloud.points_mm
     ordered = np.sort(points_mm.T, axis=1)
-    different = _count_different(points_mm, ordered[0])
+    different = 1 + int(np.count_nonzero(np.diff(ordered[0])))  # mostly decides, and is cheap
+    for some in (points_mm[:2000], points_mm):  # sorting all of a large cloud takes a while
+        if different < FEWEST_POINTS:
+            different = len(np.unique(some, axis=0))
     if different < FEWEST_POINTS:
         raise NoEstimate(
             f"the cloud has {different} different points with a return; at least {FEWEST_POINTS} "
@@ -103,18 +104,6 @@ def check_cloud(cloud: SensorCloud) -> None:
             "no point of the cloud lies before the camera (z > 0). The camera frame has x right, "
             "y down, z forward; turn the cloud into that frame."
         )
-
-
-def _count_different(points_mm: np.ndarray, ordered_x: np.ndarray) -> int:
-    """How many points differ; a count of 200 or more is a lower bound."""
-    count = 1 + int(np.count_nonzero(np.diff(ordered_x)))  # mostly decides, and is cheap
-    if count >= FEWEST_POINTS:
-        return count
-    for some in (points_mm[:2000], points_mm):  # sorting all of a large cloud takes a while
-        count = len(np.unique(some, axis=0))
-        if count >= FEWEST_POINTS:
-            break
-    return count
 
 
 def draw_some(available: int, wanted: int, rng: np.random.Generator) -> np.ndarray:

@@ -41,21 +41,16 @@ class _Organ:
     far_mm: float
 
 
-@dataclass(frozen=True)
-class _Patch:
-    """A disc of the image and the depths of what it shows."""
-
-    middle_px: Float[np.ndarray, " 2"]
-    radius_px: float
-    depth_mm: Float[np.ndarray, " n"]  # at the offsets (n, 2), in radii, that it was made for
+# A disc of the image: its middle and radius (px), and the depths of what it shows at the offsets
+# (n, 2), in radii, that it was made for.
+_Patch = tuple[Float[np.ndarray, " 2"], float, Float[np.ndarray, " n"]]
 
 
 def add_clutter(frame: DepthFrame, config: ClutterConfig, rng: np.random.Generator) -> DepthFrame:
     """The frame with background in some of its pixels without return.
 
-    One kind a frame, with equal chance: a piece of a tilted plane behind the organ, a ball
-    beside it, or points anywhere. What the organ covers stays covered. Background has random
-    numbers of its own: ``rng`` is left as it was, and so is the rest of the scene.
+    One kind a frame, with equal chance: a piece of a tilted plane behind the organ, a ball beside
+    it, or points anywhere. It has random numbers of its own: ``rng`` is left as it was.
     """
     rng = rng.spawn(1)[0]
     if rng.uniform() >= config.scenes:
@@ -69,15 +64,16 @@ def add_clutter(frame: DepthFrame, config: ClutterConfig, rng: np.random.Generat
     radius = np.sqrt(rng.uniform(size=4 * count))  # most may lie on the organ or off the image
     angle = rng.uniform(0, 2 * np.pi, 4 * count)
     offsets = np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1)
-    patch = (_plane, _ball, _anywhere)[rng.integers(3)](frame, organ, offsets, rng)
-    column, row = np.rint(patch.middle_px + offsets * patch.radius_px).astype(int).T
+    shows = (_plane, _ball, _anywhere)[rng.integers(3)]
+    middle_px, radius_px, patch_mm = shows(frame, organ, offsets, rng)
+    column, row = np.rint(middle_px + offsets * radius_px).astype(int).T
     camera = frame.intrinsics
     free = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
     free[free] &= np.isnan(frame.depth_mm[row[free], column[free]])
-    free &= patch.depth_mm > 1.0
+    free &= patch_mm > 1.0
     chosen = np.flatnonzero(free)[:count]
     depth_mm = frame.depth_mm.copy()
-    depth_mm[row[chosen], column[chosen]] = patch.depth_mm[chosen]
+    depth_mm[row[chosen], column[chosen]] = patch_mm[chosen]
     return frame.with_depth(depth_mm)
 
 
@@ -104,7 +100,7 @@ def _plane(
     depth_mm = organ.far_mm + rng.uniform(-0.1, 0.4) * organ.width_mm
     slope = rng.uniform(-_STEEPEST, _STEEPEST, 2)
     tangents = offsets * (radius / frame.intrinsics.fx)
-    return _Patch(middle, radius, depth_mm / np.maximum(1 - tangents @ slope, 0.2))
+    return middle, radius, depth_mm / np.maximum(1 - tangents @ slope, 0.2)
 
 
 def _ball(
@@ -118,7 +114,7 @@ def _ball(
     depth_mm = rng.uniform(organ.near_mm, organ.far_mm + 0.2 * organ.width_mm)
     radius_mm = radius * depth_mm / frame.intrinsics.fx
     bulge = np.sqrt(np.maximum(1 - (offsets**2).sum(1), 0.0))
-    return _Patch(middle, radius, depth_mm - radius_mm * bulge)
+    return middle, radius, depth_mm - radius_mm * bulge
 
 
 def _anywhere(
@@ -128,4 +124,4 @@ def _anywhere(
     size = np.array([frame.intrinsics.width, frame.intrinsics.height])
     low = organ.near_mm - 0.2 * organ.width_mm
     depth_mm = rng.uniform(low, organ.far_mm + 0.4 * organ.width_mm, len(offsets))
-    return _Patch((size - 1) / 2, float(np.hypot(*size)) / 2, depth_mm)
+    return (size - 1) / 2, float(np.hypot(*size)) / 2, depth_mm

@@ -10,24 +10,16 @@ import io
 import math
 import struct
 import zipfile
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
 from tumortrack.core.errors import InputError
-from tumortrack.core.store import read_json, write_atomically, write_json
+from tumortrack.core.store import read_json
 from tumortrack.core.types import DepthFrame, Intrinsics, SensorCloud
-from tumortrack.sense.ply import parse_ply_properties, write_cloud_ply
-
-__all__ = [
-    "read_cloud",
-    "read_depth_png",
-    "read_intrinsics",
-    "write_cloud_ply",
-    "write_depth_png",
-    "write_intrinsics",
-]
+from tumortrack.sense.ply import parse_ply_properties
 
 CLOUD_SUFFIXES = (".ply", ".pcd", ".npz")
 DEPTH_UNIT_MM = 0.1  # the D405's default
@@ -43,15 +35,21 @@ _DISTORTION_KEYS = (
 def read_cloud(path: Path, unit: Literal["mm", "m"] = "mm") -> tuple[SensorCloud, tuple[str, ...]]:
     """A cloud in the camera frame from .ply, .pcd (all three encodings) or .npz, and notes.
 
-    An .npz holds ``points_mm``, or ``points``, or one array (n, 3) of any name. Points without
-    return (NaN, infinite, or exactly 0, 0, 0, as RealSense and organised clouds have them) are
-    dropped, and a note says how many. ``cloud.check_cloud`` then tells whether the rest can be
-    an organ in mm.
+    Points without return (NaN, infinite, or exactly 0, 0, 0, as RealSense and organised clouds have
+    them) are dropped, and a note says how many. ``cloud.check_cloud`` then tells whether the rest
+    can be an organ in mm.
 
     Raises:
         InputError: missing, too large, damaged, of another kind, or without any point.
     """
-    raw = _raw_points(path, unit)
+    suffix = path.suffix.lower()
+    if suffix not in CLOUD_SUFFIXES:
+        raise InputError(f"{path}: unknown cloud type. Allowed: {', '.join(CLOUD_SUFFIXES)}.")
+    if unit not in ("mm", "m"):
+        raise InputError(f"unit {unit!r} is not understood. Allowed: mm, m.")
+    npz = partial(_npz_points, unit)
+    parse: Any = {".ply": parse_ply_properties, ".pcd": _pcd_points, ".npz": npz}[suffix]
+    raw = parse(_read_bytes(path), str(path))
     with np.errstate(over="ignore"):  # beyond float32 becomes infinite, and is dropped
         points_mm = (raw * (1000.0 if unit == "m" else 1.0)).astype(np.float32)
     kept = points_mm[np.isfinite(points_mm).all(axis=1) & (points_mm != 0).any(axis=1)]
@@ -64,42 +62,19 @@ def read_cloud(path: Path, unit: Literal["mm", "m"] = "mm") -> tuple[SensorCloud
     return SensorCloud(kept), (note,)
 
 
-def _raw_points(path: Path, unit: str) -> np.ndarray:
-    suffix = path.suffix.lower()
-    if suffix not in CLOUD_SUFFIXES:
-        raise InputError(f"{path}: unknown cloud type. Allowed: {', '.join(CLOUD_SUFFIXES)}.")
-    if unit not in ("mm", "m"):
-        raise InputError(f"unit {unit!r} is not understood. Allowed: mm, m.")
-    content = _read_bytes(path)
-    if suffix == ".ply":
-        return parse_ply_properties(content, str(path))
-    if suffix == ".pcd":
-        return _pcd_points(content, str(path))
-    points, key = _npz_points(content, str(path))
-    if unit == "m" and key == "points_mm":
-        raise InputError(f"{path}: 'points_mm' is in mm by its name; leave out --unit m.")
-    return points
-
-
 def _read_bytes(path: Path) -> bytes:
     if not path.is_file():
         raise InputError(f"{path} does not exist or is no file.")
     try:
-        with path.open("rb") as stream:
-            content = stream.read(LARGEST_FILE + 1)
+        if path.stat().st_size > LARGEST_FILE:
+            raise InputError(f"{path} is larger than 256 MiB; thin it first.")
+        return path.read_bytes()
     except OSError as error:
         raise InputError(f"{path} cannot be read: {error.strerror}.") from error
-    if len(content) > LARGEST_FILE:
-        raise InputError(f"{path} is larger than 256 MiB; thin it first.")
-    return content
 
 
 def _pcd_points(content: bytes, name: str) -> np.ndarray:
-    """The points' x, y, z as floats (n, 3), in the file's unit; ascii, binary or compressed.
-
-    Raises:
-        InputError: no PCD, damaged, larger than 256 MiB unpacked, or no x, y, z.
-    """
+    """x, y, z as floats (n, 3), in the file's unit; ascii, binary or compressed."""
     from pypcd4 import PointCloud
 
     _check_pcd_size(content, name)
@@ -142,13 +117,8 @@ def _check_pcd_size(content: bytes, name: str) -> None:
         raise InputError(f"{name} claims {points} points but has no room for them; it is damaged.")
 
 
-def _npz_points(content: bytes, name: str) -> tuple[np.ndarray, str]:
-    """The points (n, 3), in the file's unit, and the name of their array: ``points_mm``, else
-    ``points``, else the only one of that shape.
-
-    Raises:
-        InputError: no .npz, damaged, larger than 256 MiB unpacked, or no such array.
-    """
+def _npz_points(unit: str, content: bytes, name: str) -> np.ndarray:
+    """``points_mm``, else ``points``, else the only array (n, 3), in the file's unit."""
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
             _check_npz_size(archive, name)
@@ -166,18 +136,20 @@ def _npz_points(content: bytes, name: str) -> tuple[np.ndarray, str]:
             f"{name} must hold points_mm, points, or exactly one (n, 3) array of numbers; "
             f"it has: {shapes or 'nothing'}."
         )
-    return found[clouds[0]], clouds[0]
+    if unit == "m" and clouds == ["points_mm"]:
+        raise InputError(f"{name}: 'points_mm' is in mm by its name; leave out --unit m.")
+    return found[clouds[0]]
 
 
 def _check_npz_size(archive: zipfile.ZipFile, name: str) -> None:
     """Hold each array's claimed shape against its bytes; numpy allocates what a header claims."""
     if sum(member.file_size for member in archive.infolist()) > LARGEST_FILE:
         raise InputError(f"{name} unpacks to more than 256 MiB; thin the cloud first.")
+    forms = np.lib.format
     for member in archive.infolist():
         with archive.open(member) as stream:
-            major, _ = np.lib.format.read_magic(stream)
-            headers = np.lib.format
-            read = headers.read_array_header_1_0 if major == 1 else headers.read_array_header_2_0
+            first = forms.read_magic(stream)[0] == 1
+            read = forms.read_array_header_1_0 if first else forms.read_array_header_2_0
             shape, _, dtype = read(stream)
         claimed = math.prod((dtype.itemsize, *shape))
         if claimed > member.file_size or min(shape, default=0) < 0:
@@ -190,19 +162,17 @@ def read_intrinsics(path: Path) -> Intrinsics:
     Raises:
         InputError: missing, not JSON, a key missing or no number, or lens distortion.
     """
-    return _intrinsics(_read_camera_json(path), path)
+    return _camera(path)[0]
 
 
-def _read_camera_json(path: Path) -> dict[str, Any]:
+def _camera(path: Path) -> tuple[Intrinsics, dict[str, Any]]:
+    """The camera, and all that its file has."""
     try:
-        return read_json(path)
+        data = read_json(path)
     except (ValueError, RecursionError) as error:  # numbers of thousands of digits, deep nesting
         raise InputError(f"{path} cannot be read as JSON: {error}.") from error
-
-
-def _intrinsics(data: dict[str, Any], path: Path) -> Intrinsics:
     for key in _DISTORTION_KEYS:
-        if np.any(np.array(_numbers(data.get(key, 0), key, path)) != 0):
+        if any(_numbers(data.get(key, 0), key, path)):
             raise InputError(
                 f"{path}: {key!r} states lens distortion, which depth images here must not have. "
                 "Give the rectified depth stream (a D405's is) and its intrinsics."
@@ -217,7 +187,7 @@ def _intrinsics(data: dict[str, Any], path: Path) -> Intrinsics:
     for key in ("width", "height"):
         if not values[key].is_integer():
             raise InputError(f"{path}: {key} is {values[key]}; it must be a whole number.")
-    return Intrinsics(int(values.pop("width")), int(values.pop("height")), **values)
+    return Intrinsics(int(values.pop("width")), int(values.pop("height")), **values), data
 
 
 def _numbers(value: object, key: str, path: Path) -> list[float]:
@@ -231,19 +201,8 @@ def _numbers(value: object, key: str, path: Path) -> list[float]:
     return numbers
 
 
-def write_intrinsics(
-    path: Path, intrinsics: Intrinsics, depth_unit_mm: float = DEPTH_UNIT_MM
-) -> None:
-    """intrinsics.json beside a depth.png: the pinhole and what one step of depth means.
-
-    Raises:
-        StorageError: the disk refused.
-    """
-    write_json(path, intrinsics_json(intrinsics, depth_unit_mm))
-
-
 def intrinsics_json(intrinsics: Intrinsics, depth_unit_mm: float = DEPTH_UNIT_MM) -> dict[str, Any]:
-    """What ``write_intrinsics`` writes."""
+    """intrinsics.json beside a depth.png: the pinhole and what one step of depth means."""
     values = {key: getattr(intrinsics, key) for key in _PINHOLE_KEYS}
     return {**values, "depth_unit_mm": depth_unit_mm}
 
@@ -260,8 +219,7 @@ def read_depth_png(
     """
     from PIL import Image
 
-    data = _read_camera_json(intrinsics_path)
-    intrinsics = _intrinsics(data, intrinsics_path)
+    intrinsics, data = _camera(intrinsics_path)
     stated = data.get("depth_unit_mm", DEPTH_UNIT_MM) if depth_unit_mm is None else depth_unit_mm
     unit_mm = _numbers(stated, "depth_unit_mm", intrinsics_path)[0]
     if not 0 < unit_mm <= 100:
@@ -283,21 +241,11 @@ def read_depth_png(
     return DepthFrame(np.where(steps > 0, steps * np.float32(unit_mm), np.nan), intrinsics)
 
 
-def write_depth_png(path: Path, frame: DepthFrame, depth_unit_mm: float = DEPTH_UNIT_MM) -> None:
-    """Write the depth as a 16-bit PNG in steps of ``depth_unit_mm``; NaN becomes 0.
-
-    Raises:
-        InputError: a depth that 16 bits of this unit cannot hold.
-        StorageError: the disk refused.
-    """
-    write_atomically(path, depth_png(frame, depth_unit_mm))
-
-
 def depth_png(
     frame: DepthFrame, depth_unit_mm: float = DEPTH_UNIT_MM, compress_level: int = 6
 ) -> bytes:
-    """What ``write_depth_png`` writes. ``compress_level`` 1 takes a sixth of the time, for a fifth
-    more bytes.
+    """The depth as a 16-bit PNG in steps of ``depth_unit_mm``; NaN becomes 0. ``compress_level`` 1
+    takes a sixth of the time, for a fifth more bytes.
 
     Raises:
         InputError: a depth that 16 bits of this unit cannot hold.

@@ -70,15 +70,14 @@ def seen_pixels(depth_mm):  # type: ignore[no-untyped-def]
 
 
 @_jit
-def lose_grazing(true_mm, depths_mm, seen, key, grazing, pinhole):  # type: ignore[no-untyped-def]
+def lose_grazing(true_mm, depths_mm, seen, key, grazing):  # type: ignore[no-untyped-def]
     """Drop pixels that see a surface at grazing angles; ``grazing``: (share that is dropped, from
-    how many degrees between the normal and the line of sight).
+    how many degrees between the normal and the line of sight, fx, fy, cx, cy).
 
     With the depth's slopes (p, q) per pixel the surface normal is n = (fx p, fy q,
     -(z + (u - cx) p + (v - cy) q)), and its product with the line of sight r is -z.
     """
-    share, degrees = grazing
-    fx, fy, cx, cy = pinhole
+    share, degrees, fx, fy, cx, cy = grazing
     pixels, starts = seen
     height, width = true_mm.shape
     cosine = math.cos(math.radians(degrees))
@@ -108,22 +107,11 @@ def _slope(before, here, after):  # type: ignore[no-untyped-def]
     return here - before if math.isnan(after) else (after - before) * np.float32(0.5)
 
 
-class Flying(NamedTuple):
-    """Flying pixels: the share of edge pixels, how far behind the edge they end up at most, and
-    what is an edge: within ``near_px`` the depth falls back by ``step_mm`` or more, or ends."""
-
-    share: float
-    reach_mm: float
-    near_px: int
-    step_mm: float
-
-
 @_jit
 def fly(true_mm, depths_mm, seen, key, flying):  # type: ignore[no-untyped-def]
-    """Send edge pixels backwards, as ``Flying`` states.
-
-    The image's own border is no edge: what it cuts off continues outside.
-    """
+    """Send edge pixels backwards. ``flying``: the share of edge pixels, how far behind the edge
+    they end up at most, and what is an edge: within so many pixels the depth falls back by so many
+    mm or more, or ends. The image's own border is no edge: what it cuts off continues outside."""
     share, flying_mm, near, step_mm = flying
     pixels, starts = seen
     height, width = true_mm.shape
@@ -174,23 +162,17 @@ def jitter(depths_mm, seen, key, relative, correlated_share, smooth):  # type: i
 
 
 @_jit
-def _normal_grid(height, width, step, key):  # type: ignore[no-untyped-def]
-    """Standard normal values on every ``step``-th pixel, one node beyond the image."""
-    rows, columns = height // step + 2, width // step + 2
-    grid = np.empty((rows, columns), np.float32)
-    for i in range(rows):
-        for j in range(columns):
-            grid[i, j] = _QUANTILES[_bits(key, i * columns + j) & _LOW_14]
-    return grid
-
-
-@_jit
 def smooth_at(seen, shape, step, key):  # type: ignore[no-untyped-def]
     """A smooth random field, correlated over ``step`` pixels and standard normal in each, at the
     seen pixels of an image of that shape."""
     pixels, starts = seen
     height, width = shape
-    grid = _normal_grid(height, width, step, key)
+    # Standard normal values on every ``step``-th pixel, one node beyond the image.
+    rows, columns = height // step + 2, width // step + 2
+    grid = np.empty((rows, columns), np.float32)
+    for i in range(rows):
+        for j in range(columns):
+            grid[i, j] = _QUANTILES[_bits(key, i * columns + j) & _LOW_14]
     first, second = _weights(step)
     out = np.empty(len(pixels), np.float32)
     row = np.empty(width + step, np.float32)

@@ -28,14 +28,11 @@ REFERENCE_MM = 150.0  # the distance at which ``axial_mm`` is stated
 
 
 class CalibrationConfig(Config, frozen=True, kw_only=True):
-    """Largest errors of a camera out of calibration; zero switches it off.
+    """Largest errors of a camera out of calibration, as stereo cameras drift with temperature and
+    shocks; zero switches it off. Each frame draws its own error, uniformly to either side and the
+    same for all pixels: no averaging removes it.
 
-    Stereo cameras drift with temperature and shocks until they are calibrated again. Each frame
-    draws its own error, uniformly to either side and the same for all pixels: no averaging
-    removes it.
-
-    offset_mm: added to every depth.
-    scale: share of the depth, 0..0.2.
+    ``offset_mm`` is added to every depth; ``scale`` is a share of the depth, 0..0.2.
     """
 
     offset_mm: float = 0.0
@@ -51,10 +48,7 @@ CALIBRATED = CalibrationConfig()
 def miscalibrate(
     frame: DepthFrame, config: CalibrationConfig, rng: np.random.Generator
 ) -> DepthFrame:
-    """The frame as a camera out of calibration would measure it.
-
-    ``rng`` is left as it was. Where it is off, nothing is drawn and the frame itself comes back.
-    """
+    """The frame as a camera out of calibration would measure it; ``rng`` is left as it was."""
     if config == CALIBRATED:
         return frame
     offset, scale = rng.spawn(1)[0].uniform(-1, 1, 2)
@@ -125,9 +119,8 @@ D405_NOISE = NoiseConfig(
 def add_noise(frame: DepthFrame, config: NoiseConfig, rng: np.random.Generator) -> DepthFrame:
     """The frame as a noisy sensor would have seen it; the frame itself if all parts are off.
 
-    One number is drawn from ``rng``, whatever is on; each part hashes its own stream from it.
-    So the same generator gives the same frame bit for bit, and switching one part off leaves
-    the random numbers of the others as they were.
+    One number is drawn from ``rng``, whatever is on; each part hashes its own stream from it. So
+    switching one part off leaves the random numbers of the others as they were.
     """
     seed = int(rng.integers(2**62))
     if config == CLEAN:
@@ -137,11 +130,16 @@ def add_noise(frame: DepthFrame, config: NoiseConfig, rng: np.random.Generator) 
     true_mm = frame.depth_mm
     seen = seen_pixels(true_mm)
     depths_mm = true_mm.ravel()[seen.pixels]
-    scatter = _scatter(true_mm, seen.pixels, depths_mm, config, np.random.default_rng((seed, 0)))
+    scatter = _scatter(true_mm.size, seen.pixels, depths_mm, config, seed)
     _disturb(frame, depths_mm, seen, config, seed)
     out_mm = np.full(true_mm.shape, np.nan, np.float32)
+    quantum_mm = np.float32(config.quantum_mm)
     for pixels, values_mm in ((seen.pixels, depths_mm), scatter):
-        out_mm.ravel()[pixels] = _quantised(values_mm, config.quantum_mm)
+        if quantum_mm:
+            values_mm /= quantum_mm
+            np.rint(values_mm, out=values_mm)
+            values_mm *= quantum_mm
+        out_mm.ravel()[pixels] = values_mm
     return frame.with_depth(out_mm)
 
 
@@ -155,13 +153,11 @@ def _disturb(
 
     true_mm, shape = frame.depth_mm, frame.depth_mm.shape
     if config.flying_share:
-        edge = (config.edge_px, config.edge_mm)
-        flying = kernels.Flying(config.flying_share, config.flying_mm, *edge)
+        flying = (config.flying_share, config.flying_mm, config.edge_px, config.edge_mm)
         kernels.fly(true_mm, depths_mm, seen, seed + 1, flying)
     if config.grazing_share:
-        grazing = (config.grazing_share, config.grazing_degrees)
-        pinhole = pinhole_of(frame.intrinsics)
-        kernels.lose_grazing(true_mm, depths_mm, seen, seed + 2, grazing, pinhole)
+        grazing = (config.grazing_share, config.grazing_degrees, *pinhole_of(frame.intrinsics))
+        kernels.lose_grazing(true_mm, depths_mm, seen, seed + 2, grazing)
     if config.distortion_mm:
         rng = np.random.default_rng((seed, 1))
         field, scale = kernels.slow_shape(shape, config.distortion_mm * rng.random(), rng)
@@ -176,14 +172,11 @@ def _disturb(
 
 
 def _scatter(
-    true_mm: np.ndarray,
-    seen: np.ndarray,
-    depths_mm: np.ndarray,
-    config: NoiseConfig,
-    rng: np.random.Generator,
+    size: int, seen: np.ndarray, depths_mm: np.ndarray, config: NoiseConfig, seed: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The pixels (flat indices) that get a false point, and its depth."""
-    n_empty = true_mm.size - len(seen)
+    """The pixels (flat indices, of ``size``) that get a false point, and its depth."""
+    rng = np.random.default_rng((seed, 0))
+    n_empty = size - len(seen)
     count = rng.poisson(config.scatter_share * len(seen)) if config.scatter_share else 0
     if not n_empty or not count:
         return seen[:0], depths_mm[:0]
@@ -193,12 +186,3 @@ def _scatter(
     near_mm = max(depths_mm.min() - config.scatter_mm, 1.0)
     values_mm = rng.uniform(near_mm, depths_mm.max() + config.scatter_mm, count)
     return pixels, values_mm.astype(np.float32)
-
-
-def _quantised(values_mm: np.ndarray, quantum_mm: float) -> np.ndarray:
-    """Rounded to whole quanta, in place; unchanged where the quantum is 0."""
-    if quantum_mm:
-        values_mm /= np.float32(quantum_mm)
-        np.rint(values_mm, out=values_mm)
-        values_mm *= np.float32(quantum_mm)
-    return values_mm

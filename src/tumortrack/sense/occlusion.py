@@ -65,11 +65,8 @@ class _View:
 
 
 def occlude(frame: DepthFrame, config: OcclusionConfig, rng: np.random.Generator) -> DepthFrame:
-    """The frame without what lies behind shafts, patches, or both.
-
-    Occlusion has random numbers of its own: ``rng`` is left as it was, and so is the rest of the
-    scene. Where it is off, nothing is drawn and the frame itself comes back.
-    """
+    """The frame without what lies behind shafts, patches, or both. Occlusion has random numbers of
+    its own: ``rng`` is left as it was, and so is the rest of the scene."""
     if config.scenes == 0 or config.largest_share == 0:
         return frame
     rng = rng.spawn(1)[0]
@@ -166,8 +163,7 @@ def _leave_in(
     columns, rows, organ_mm = columns[shown], rows[shown], organ_mm[shown]
     if not len(rows):
         return
-    low, high = config.nearer_mm
-    anchor = rng.integers(len(rows))
+    (low, high), anchor = config.nearer_mm, rng.integers(len(rows))
     slope_x, slope_y = rng.uniform(-_STEEPEST, _STEEPEST, 2) / seen.focal_px
     rise = slope_x * (columns - columns[anchor]) + slope_y * (rows - rows[anchor])
     depth_mm = float(organ_mm[anchor]) - rng.uniform(low, high)

@@ -49,7 +49,8 @@ def parse_ply_properties(content: bytes, name: str, wanted: Sequence[str] = "xyz
         )
     body = content[start:]
     if form == "ascii":
-        return _ascii(body, count, list(columns), wanted, name)
+        places = [list(columns).index(column) for column in wanted]
+        return _ascii(body, count, places, len(columns), name)
     dtype = np.dtype([(column, _ORDERS[form] + code) for column, code in columns.items()])
     if count * dtype.itemsize > len(body):
         raise InputError(_cut_off(name, count, len(body) // dtype.itemsize))
@@ -77,16 +78,15 @@ def _vertex_layout(lines: list[list[str]], name: str) -> tuple[int, dict[str, st
     return count, columns
 
 
-def _ascii(
-    body: bytes, count: int, columns: list[str], wanted: Sequence[str], name: str
-) -> np.ndarray:
-    if 2 * count * len(columns) > len(body) + 1:  # a digit and a blank each
-        raise InputError(_cut_off(name, count, len(body) // (2 * len(columns))))
+def _ascii(body: bytes, count: int, wanted: list[int], columns: int, name: str) -> np.ndarray:
+    if 2 * count * columns > len(body) + 1:  # a digit and a blank each
+        raise InputError(_cut_off(name, count, len(body) // (2 * columns)))
     if count == 0:
         return np.empty((0, len(wanted)))
-    these = [columns.index(column) for column in wanted]
     try:
-        points = np.loadtxt(io.BytesIO(body), comments=None, usecols=these, max_rows=count, ndmin=2)
+        points = np.loadtxt(
+            io.BytesIO(body), comments=None, usecols=wanted, max_rows=count, ndmin=2
+        )
     except ValueError as error:
         raise InputError(f"{name} has a vertex that is no row of numbers: {error}.") from error
     if len(points) < count:
@@ -102,12 +102,7 @@ def _cut_off(name: str, claimed: int, held: int) -> str:
 
 
 def write_cloud_ply(path: Path, points_mm: np.ndarray, **point_properties: np.ndarray) -> None:
-    """Write points (n, 3) of the camera frame; see ``cloud_ply``.
-
-    Raises:
-        InputError: a property of another length or type.
-        StorageError: the disk refused.
-    """
+    """Write points (n, 3) of the camera frame; see ``cloud_ply``."""
     write_atomically(path, cloud_ply(points_mm, point_properties))
 
 
@@ -121,17 +116,16 @@ def cloud_ply(
         InputError: a property of another length or type.
     """
     points = np.asarray(points_mm, "<f4")
-    columns = [(axis, points[:, i]) for i, axis in enumerate("xyz")]
-    for name, values in point_properties.items():
+    columns = dict(zip("xyz", points.T, strict=True)) | dict(point_properties)
+    for name, values in columns.items():
         if values.shape != (len(points),) or values.dtype.str[1:] not in _NAMES:
             raise InputError(
                 f"point property {name!r} is {values.dtype} {values.shape}; it must be one of "
                 f"uint8, int32, float32, float64, and one value for each of {len(points)} points."
             )
-        columns.append((name, values))
-    codes = {name: values.dtype.str[1:] for name, values in columns}
+    codes = {name: values.dtype.str[1:] for name, values in columns.items()}
     table = np.empty(len(points), [(name, "<" + code) for name, code in codes.items()])
-    for name, values in columns:
+    for name, values in columns.items():
         table[name] = values
     header = [
         "ply",

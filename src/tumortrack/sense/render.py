@@ -24,8 +24,9 @@ def render_depth(
     vertices = np.ascontiguousarray(vertices_camera_mm, np.float32)
     shape = (intrinsics.height, intrinsics.width)
     faces = np.ascontiguousarray(faces, np.int32)
-    depth = _to_depth(_z_buffer(vertices, faces, shape, pinhole_of(intrinsics)))
-    return DepthFrame(depth, intrinsics, stamp_ns)
+    nearest = _z_buffer(vertices, faces, shape, pinhole_of(intrinsics))
+    depth_mm = np.full(shape, np.nan, np.float32)
+    return DepthFrame(np.divide(1, nearest, depth_mm, where=nearest > 0), intrinsics, stamp_ns)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -34,8 +35,7 @@ def _z_buffer(vertices, faces, shape, pinhole):  # type: ignore[no-untyped-def]
     fx, fy, cx, cy = pinhole
     height, width = shape
     n = len(vertices)
-    u = np.zeros(n, np.float32)
-    v = np.zeros(n, np.float32)
+    u, v = np.zeros(n, np.float32), np.zeros(n, np.float32)
     w = np.empty(n, np.float32)  # 1/z: linear in the image, unlike z
     for i in range(n):
         z = vertices[i, 2]
@@ -71,16 +71,6 @@ def _z_buffer(vertices, faces, shape, pinhole):  # type: ignore[no-untyped-def]
                 here = here if min(pa, pb, pc) >= -1e-5 else np.float32(0.0)
                 nearest[y, x] = max(nearest[y, x], here)
     return nearest
-
-
-@numba.njit(cache=True, nogil=True)
-def _to_depth(nearest):  # type: ignore[no-untyped-def]
-    depth = np.full(nearest.shape, np.nan, np.float32)
-    for y in range(len(nearest)):
-        for x in range(nearest.shape[1]):
-            if nearest[y, x] > 0:
-                depth[y, x] = 1.0 / nearest[y, x]
-    return depth
 
 
 class Visibility:

@@ -15,16 +15,11 @@ import numpy as np
 
 from tumortrack.core.errors import InputError
 from tumortrack.core.mesh_files import read_anatomy, write_anatomy
-from tumortrack.core.store import new_folder, read_json, write_json
+from tumortrack.core.store import new_folder, read_json, write_atomically, write_json
 from tumortrack.core.types import Anatomy, DepthFrame, SensorCloud
 from tumortrack.imaging.meshes import mesh_of, solid_of
-from tumortrack.sense.files import (
-    read_cloud,
-    read_depth_png,
-    write_cloud_ply,
-    write_depth_png,
-    write_intrinsics,
-)
+from tumortrack.sense.files import depth_png, intrinsics_json, read_cloud, read_depth_png
+from tumortrack.sense.ply import write_cloud_ply
 from tumortrack.simulate.targets import Targets, read_targets, write_targets
 
 # Our own scenes state in meta.json that kidney.ply is the whole organ, tumors included.
@@ -74,8 +69,8 @@ def write_scene_files(folder: Path, scene: Scene) -> None:
     """
     write_cloud_ply(folder / "cloud.ply", scene.cloud.points_mm)
     if scene.depth is not None:
-        write_depth_png(folder / "depth.png", scene.depth)
-        write_intrinsics(folder / "intrinsics.json", scene.depth.intrinsics)
+        write_atomically(folder / "depth.png", depth_png(scene.depth))
+        write_json(folder / "intrinsics.json", intrinsics_json(scene.depth.intrinsics))
     write_anatomy(folder, scene.reference)
     if scene.targets is not None:
         write_targets(folder / _TARGETS, scene.targets)

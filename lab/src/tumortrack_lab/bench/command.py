@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from tumortrack.core.errors import TumortrackError
-from tumortrack.sense.files import write_cloud_ply
+from tumortrack.sense.ply import write_cloud_ply
 from tumortrack_lab.bench.rows import BEFORE_TORCH, COMMAND, LARGE, PEAK, PRESETS, Workload
 from tumortrack_lab.bench.subject import BenchSubject
 from tumortrack_lab.bench.timing import timing_of

@@ -1,4 +1,1 @@
-"""OpenIGTLink, protocol version 3: https://github.com/openigtlink/OpenIGTLink/tree/master/Documents
-
-``message`` makes messages, ``link`` sends them over TCP to many clients.
-"""
+"""OpenIGTLink 3 (github.com/openigtlink/OpenIGTLink, Documents): messages, and the TCP link."""

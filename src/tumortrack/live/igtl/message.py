@@ -68,31 +68,29 @@ class Header:
 
 
 def pack(message: Message) -> bytes:
-    """The message as it goes over the wire.
-
-    Raises:
-        ProtocolError: a name too long or not ASCII, a stamp before 1970 or after 2106.
-    """
-    keys, values = _packed_metadata(message.metadata)
+    """The message as it goes over the wire. Raises ProtocolError for a name too long or not ASCII,
+    and a stamp before 1970 or after 2106."""
+    index, texts = [struct.pack("> H", len(message.metadata))], []
+    for key, value in message.metadata.items():
+        name, text = key.encode("ascii"), value.encode("utf-8")
+        index.append(_ENTRY.pack(len(name), _ASCII if value.isascii() else _UTF8, len(text)))
+        texts += [name, text]
+    keys, values = b"".join(index), b"".join(texts)
     extended = _EXTENDED.pack(_EXTENDED.size, len(keys), len(values), 0)
     body = b"".join((extended, message.content, keys, values))
-    head = _HEADER.pack(
-        2,
-        _name(message.type, 12, "type"),
-        _name(message.device, 20, "device name"),
-        _fixed_point(message.stamp_ns),
-        len(body),
-        crc64(body),
-    )
-    return head + body
+    for what, given, size in (("type", message.type, 12), ("device name", message.device, 20)):
+        if not given.isascii() or len(given) > size:
+            raise ProtocolError(f"{what} {given!r}: at most {size} ASCII characters are allowed.")
+    names = message.type.encode("ascii"), message.device.encode("ascii")
+    # Seconds in the upper 32 bits, their fraction in the lower ones.
+    stamp = ((message.stamp_ns << 32) + _NS // 2) // _NS
+    if not 0 <= stamp < 1 << 64:
+        raise ProtocolError(f"stamp {message.stamp_ns} ns lies before 1970 or after 2106.")
+    return _HEADER.pack(2, *names, stamp, len(body), crc64(body)) + body
 
 
 def unpack_header(data: bytes) -> Header:
-    """Read a header.
-
-    Raises:
-        ProtocolError: not 58 bytes, an unknown version, names that are no text.
-    """
+    """Raises ProtocolError: not 58 bytes, an unknown version, names that are no text."""
     if len(data) != HEADER_SIZE:
         raise ProtocolError(f"an OpenIGTLink header has {HEADER_SIZE} bytes, not {len(data)}.")
     version, kind, device, stamp, size, crc = _HEADER.unpack(data)
@@ -118,11 +116,7 @@ def check_body(header: Header, body: bytes) -> None:
 
 
 def crc64(data: bytes) -> int:
-    """CRC-64 of ECMA-182 (1992), annex B: register 0 at the start, nothing reversed.
-
-    Raises:
-        InputError: fastcrc is not installed.
-    """
+    """CRC-64 of ECMA-182 (1992), annex B: register 0 at the start, nothing reversed."""
     try:
         from fastcrc.crc64 import ecma_182
     except ImportError as error:
@@ -132,62 +126,25 @@ def crc64(data: bytes) -> int:
     return ecma_182(data)
 
 
-def _name(text: str, size: int, what: str) -> bytes:
-    if not text.isascii() or len(text) > size:
-        raise ProtocolError(f"{what} {text!r}: at most {size} ASCII characters are allowed.")
-    return text.encode("ascii")
-
-
-def _fixed_point(stamp_ns: int) -> int:
-    """Seconds in the upper 32 bits, their fraction in the lower ones."""
-    fixed = ((stamp_ns << 32) + _NS // 2) // _NS
-    if not 0 <= fixed < 1 << 64:
-        raise ProtocolError(f"stamp {stamp_ns} ns lies before 1970 or after 2106.")
-    return fixed
-
-
-def _packed_metadata(metadata: Mapping[str, str]) -> tuple[bytes, bytes]:
-    """The index (count and sizes), and the keys and values themselves."""
-    index, texts = [struct.pack("> H", len(metadata))], []
-    for key, value in metadata.items():
-        name, text = key.encode("ascii"), value.encode("utf-8")
-        index.append(_ENTRY.pack(len(name), _ASCII if value.isascii() else _UTF8, len(text)))
-        texts += [name, text]
-    return b"".join(index), b"".join(texts)
-
-
-@dataclass(frozen=True)
-class IgtlStatus:
-    """How the sender is: ``code`` 1 is well; ``name`` at most 20 characters."""
-
-    code: int
-    name: str
-    text: str
-    sub_code: int = 0
-
-
-@dataclass(frozen=True, eq=False)
-class Polydata:
-    """Points (n, 3) and cells over them; ``scalars``: one number a point, by name.
-
-    ``triangles`` (f, 3) and ``segments`` (s, 2) hold point numbers.
-    """
-
-    points: Float[np.ndarray, "n 3"]
-    triangles: Int[np.ndarray, "f 3"]
-    segments: Int[np.ndarray, "s 2"] = field(default_factory=lambda: np.zeros((0, 2), np.int32))
-    scalars: dict[str, Num[np.ndarray, " n"]] = field(default_factory=dict)
-
-
 def pack_transform(b_from_a: Float[np.ndarray, "4 4"]) -> bytes:
     """Its upper three rows, column by column, float32."""
     return np.asarray(b_from_a)[:3].T.astype(">f4").tobytes()
 
 
-def pack_status(status: IgtlStatus) -> bytes:
-    """The text ends with a zero byte, as the protocol's own library writes it."""
-    name = status.name.encode("ascii", "replace")[:20]
-    return _STATUS.pack(status.code, status.sub_code, name) + status.text.encode() + b"\0"
+def pack_status(code: int, name: str, text: str) -> bytes:
+    """How the sender is: ``code`` 1 is well; ``name`` is cut to 20 characters. The text ends with
+    a zero byte, as the protocol's own library writes it; the sub code is 0."""
+    return _STATUS.pack(code, 0, name.encode("ascii", "replace")[:20]) + text.encode() + b"\0"
+
+
+@dataclass(frozen=True, eq=False)
+class Polydata:
+    """Points and cells over them, which hold point numbers; ``scalars``: one a point, by name."""
+
+    points: Float[np.ndarray, "n 3"]
+    triangles: Int[np.ndarray, "f 3"]
+    segments: Int[np.ndarray, "s 2"] = field(default_factory=lambda: np.zeros((0, 2), np.int32))
+    scalars: dict[str, Num[np.ndarray, " n"]] = field(default_factory=dict)
 
 
 def pack_polydata(data: Polydata) -> bytes:
@@ -211,7 +168,4 @@ def pack_polydata(data: Polydata) -> bytes:
 
 def _cells(cells: np.ndarray) -> bytes:
     """Each cell as its number of points and their numbers."""
-    count, size = cells.shape
-    out = np.empty((count, 1 + size), ">u4")
-    out[:, 0], out[:, 1:] = size, cells
-    return out.tobytes()
+    return np.insert(cells, 0, cells.shape[1], axis=1).astype(">u4").tobytes()

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
+from itertools import chain
 from typing import ClassVar, Literal
 
 import numpy as np
@@ -15,27 +16,16 @@ from jaxtyping import Float64
 
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import RAS_FROM_LPS, rigid, transform_points
+from tumortrack.live.igtl import message as igtl
 from tumortrack.live.igtl.link import Link
-from tumortrack.live.igtl.message import (
-    EXITING,
-    NOT_FOUND,
-    NOT_PRESENT,
-    NOT_READY,
-    OK,
-    IgtlStatus,
-    Message,
-    Polydata,
-    pack_polydata,
-    pack_status,
-    pack_transform,
-)
+from tumortrack.live.igtl.message import Message, Polydata
 from tumortrack.live.meter import Rate
-from tumortrack.live.values import SinkConfig, SinkContext, TrackingResult, TransformedEstimate
+from tumortrack.live.values import SinkConfig, SinkContext, TrackingResult
 
 STATUS_DEVICE, CT_DEVICE, CLOUD_DEVICE, ARMS_DEVICE = "tumortrack", "ct", "occupancy", "arms"
 _TIP = "/tip"  # how the names of shapes at the tips of tools end
-_NOWHERE = np.eye(4)
-_NO_POINTS, _NO_FACES = np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32)
+_NOTHING = Polydata(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32))
+_Content = tuple[str, str, bytes, dict[str, str]]  # type, device, content, metadata of its own
 
 
 class OpenIgtLinkSinkConfig(SinkConfig, frozen=True, kw_only=True, tag="openigtlink"):
@@ -62,16 +52,10 @@ class OpenIgtLinkSinkConfig(SinkConfig, frozen=True, kw_only=True, tag="openigtl
     def __post_init__(self) -> None:
         if not 0 <= self.port <= 65535 or (self.connect and not self.port):
             raise InputError(f"openigtlink: port {self.port} must lie in 1..65535.")
-        for name, value in (("mesh_hz", self.mesh_hz), ("cloud_hz", self.cloud_hz)):
-            if not 0 <= value <= 1000:
-                raise InputError(f"openigtlink: {name} {value} must lie in 0..1000.")
+        self.check_ranges("openigtlink:", "0 (none)", mesh_hz=1000, cloud_hz=1000)
 
     def open(self, context: SinkContext) -> OpenIgtLinkSink:
-        """Serve, or begin to try to connect.
-
-        Raises:
-            InputError: the port is taken.
-        """
+        """Serve, or begin to try to connect. Raises InputError as ``Link``."""
         return OpenIgtLinkSink(self, context)
 
 
@@ -80,9 +64,8 @@ class OpenIgtLinkSink:
 
     A tumor's TRANSFORM has its origin in the middle of the tumor's box; its axes are the CT's, as
     the organ is turned now, or, without a motion, those of the published frame. With a motion
-    TRANSFORM ``ct`` is the organ's pose: what is put under it in Slicer follows the organ, as
-    a rigid body. Without an estimate STATUS says why, transforms are the identity with
-    ``TransformStatus`` MISSING, and surfaces and cloud are empty.
+    TRANSFORM ``ct`` is the organ's pose. Without an estimate STATUS says why, transforms are the
+    identity with ``TransformStatus`` MISSING, and surfaces and cloud are empty.
 
     Where there may be arms also STATUS ``arms`` (well: its name is their state; not ready: halted,
     and why; not present: nothing is known), and a TRANSFORM of each tool's tip, named as its shape
@@ -90,127 +73,98 @@ class OpenIgtLinkSink:
     """
 
     def __init__(self, config: OpenIgtLinkSinkConfig, context: SinkContext) -> None:
-        self._parts, self._frames = context.parts, context.published_frame
+        self._config, self._context = config, context
         self._axes = RAS_FROM_LPS if config.space == "ras" else np.eye(4)
-        self._link = Link(config.host, config.port, config.connect)
-        self._config = config
+        self.link = Link(config.host, config.port, config.connect)
         self._mesh_rate, self._cloud_rate = Rate(config.mesh_hz), Rate(config.cloud_hz)
-        self._has_ct, self._arms = context.anatomy_ct is not None, context.arms
         self._tips: set[str] = set()  # that ever were
         self._next, self._closed = 0, False
 
-    @property
-    def port(self) -> int:
-        return self._link.port
-
-    @property
-    def receivers(self) -> int:
-        """How many are connected."""
-        return self._link.receivers
-
     def publish(self, result: TrackingResult) -> None:
-        code = OK if result.estimate is not None else NOT_FOUND
-        self._link.send(self._messages(result, code))
+        self._send(result, igtl.OK if result.estimate is not None else igtl.NOT_FOUND)
         self._next = result.sequence + 1
 
     def close(self) -> None:
         """Say that it is over, and leave nothing that looks as if it were still true."""
         if not self._closed:
             self._closed = True
-            reason = "tracking has ended"
-            over = TrackingResult(
-                self._next, time.time_ns(), reason=reason, published_frame=self._frames
-            )
-            self._link.send(self._messages(over, EXITING))
-            self._link.close()
+            frame, why = self._context.published_frame, "tracking has ended"
+            over = TrackingResult(self._next, time.time_ns(), reason=why, published_frame=frame)
+            self._send(over, igtl.EXITING)
+            self.link.close()
 
-    def _messages(self, result: TrackingResult, code: int) -> list[Message]:
-        arms = [self._arms_status(result)] if self._arms else []
-        status = self._status(result, code)
-        return [status, *arms, *self._transforms(result), *self._surfaces(result)]
+    def _send(self, result: TrackingResult, code: int) -> None:
+        about = {"frame_id": result.published_frame.frame_id, "sequence": str(result.sequence)}
+        contents = chain(
+            self._statuses(result, code), self._transforms(result), self._surfaces(result)
+        )
+        self.link.send(
+            [
+                Message(kind, device, result.stamp_ns, content, about | more)
+                for kind, device, content, more in contents
+            ]
+        )
 
-    def _message(
-        self, kind: str, device: str, result: TrackingResult, content: bytes, **more: str
-    ) -> Message:
-        metadata = {
-            "frame_id": result.published_frame.frame_id,
-            "sequence": str(result.sequence),
-            **more,
-        }
-        return Message(kind, device, result.stamp_ns, content, metadata)
-
-    def _status(self, result: TrackingResult, code: int) -> Message:
+    def _statuses(self, result: TrackingResult, code: int) -> Iterator[_Content]:
         found = result.estimate is not None
         name, text = (result.quality, result.warning) if found else ("no estimate", result.reason)
         more = {"quality": str(result.quality)}
         if result.latency_ms is not None:
             more["latency_ms"] = f"{result.latency_ms:.1f}"
-        content = pack_status(IgtlStatus(code, name, text))
-        return self._message("STATUS", STATUS_DEVICE, result, content, **more)
-
-    def _arms_status(self, result: TrackingResult) -> Message:
+        yield "STATUS", STATUS_DEVICE, igtl.pack_status(code, name, text), more
         cell = result.workcell
-        if cell is None:
-            status = IgtlStatus(NOT_PRESENT, "unknown", "nothing is known of the arms")
-            return self._message("STATUS", ARMS_DEVICE, result, pack_status(status))
-        status = IgtlStatus(NOT_READY if cell.halted else OK, cell.state, cell.halted)
-        content = pack_status(status)
-        return self._message("STATUS", ARMS_DEVICE, result, content, state=cell.state)
+        if not self._context.arms:
+            return
+        status, more = (igtl.NOT_PRESENT, "unknown", "nothing is known of the arms"), {}
+        if cell is not None:
+            code = igtl.NOT_READY if cell.halted else igtl.OK
+            status, more = (code, cell.state, cell.halted), {"state": cell.state}
+        yield "STATUS", ARMS_DEVICE, igtl.pack_status(*status), more
 
-    def _transforms(self, result: TrackingResult) -> Iterator[Message]:
-        way, pose = result.published_frame.published_from_camera, _camera_from_ct(result)
-        places: dict[str, Float64[np.ndarray, "4 4"] | None] = dict.fromkeys(self._parts[1:])
-        if self._has_ct:
+    def _transforms(self, result: TrackingResult) -> Iterator[_Content]:
+        way, tumors = result.published_frame.published_from_camera, self._context.parts[1:]
+        report = {} if result.estimate is None else result.estimate.report
+        # The organ's pose without its deformation, where the method knows one.
+        pose = np.array(report["motion"]["camera_from_ct"]) if "motion" in report else None
+        places: dict[str, Float64[np.ndarray, "4 4"] | None] = dict.fromkeys(tumors)
+        if self._context.anatomy_ct is not None:
             places[CT_DEVICE] = None if pose is None else way @ pose
         turn = np.eye(3) if pose is None else (way @ pose)[:3, :3]
-        for name in self._parts[1:]:
+        for name in tumors:
             if (center_mm := result.center_mm(name)) is not None:
                 places[name] = rigid(turn, center_mm)
-        if self._arms:
-            shapes = () if result.workcell is None else result.workcell.shapes
-            tips = {s.name: s.published_from_shape for s in shapes if s.name.endswith(_TIP)}
-            self._tips |= tips.keys()
-            places |= {name: tips.get(name) for name in sorted(self._tips)}
+        cell = result.workcell if self._context.arms else None
+        shapes = () if cell is None else cell.shapes
+        tips = {s.name: s.published_from_shape for s in shapes if s.name.endswith(_TIP)}
+        self._tips |= tips.keys()
+        places |= {name: tips.get(name) for name in sorted(self._tips)}
         for name, place in places.items():
-            turned = _NOWHERE if place is None else self._axes @ place @ self._axes
-            known = "MISSING" if place is None else "OK"
-            content = pack_transform(turned)
-            yield self._message("TRANSFORM", name, result, content, TransformStatus=known)
+            turned = np.eye(4) if place is None else self._axes @ place @ self._axes
+            known = {"TransformStatus": "MISSING" if place is None else "OK"}
+            yield "TRANSFORM", name, igtl.pack_transform(turned), known
 
-    def _surfaces(self, result: TrackingResult) -> Iterator[Message]:
+    def _surfaces(self, result: TrackingResult) -> Iterator[_Content]:
         estimate = result.transformed
-        contents: dict[str, Polydata | None] = {}
+        contents: dict[str, Polydata] = {}
         if self._config.mesh_hz:
             # What is gone is deleted at once; what is there may wait until it is due.
             meshes, due = (estimate.meshes, self._mesh_rate.due()) if estimate else ({}, True)
-            for name in self._parts:
+            for name in self._context.parts:
                 if (mesh := meshes.get(name)) is None:
-                    contents[name] = None
+                    contents[name] = _NOTHING
                 elif due:
-                    contents[name] = Polydata(self._turned(mesh.vertices_mm), mesh.faces)
+                    contents[name] = Polydata(
+                        transform_points(self._axes, mesh.vertices_mm), mesh.faces
+                    )
         if self._config.cloud_hz:
             if estimate is None:
-                contents[CLOUD_DEVICE] = None
+                contents[CLOUD_DEVICE] = _NOTHING
             elif self._cloud_rate.due():
-                contents[CLOUD_DEVICE] = self._points(estimate)
+                # Each point as a line without length: Slicer shows points of cells only, and its
+                # reader does not bear cells of one point.
+                segments = np.repeat(np.arange(len(estimate.points_mm))[:, None], 2, axis=1)
+                scalars = {"label": estimate.labels, "probability": estimate.probability}
+                points = transform_points(self._axes, estimate.points_mm)
+                contents[CLOUD_DEVICE] = Polydata(points, _NOTHING.triangles, segments, scalars)
         for name, content in contents.items():
-            packed = pack_polydata(content or Polydata(_NO_POINTS, _NO_FACES))
-            yield self._message("POLYDATA", name, result, packed)
-
-    def _points(self, estimate: TransformedEstimate) -> Polydata:
-        """Each point as a line without length: Slicer shows points of cells only, and its reader
-        does not bear cells of one point."""
-        number = np.arange(len(estimate.points_mm))
-        scalars = {"label": estimate.labels, "probability": estimate.probability}
-        segments = np.stack([number, number], 1)
-        return Polydata(self._turned(estimate.points_mm), _NO_FACES, segments, scalars)
-
-    def _turned(self, points_mm: np.ndarray) -> np.ndarray:
-        return transform_points(self._axes, points_mm)
-
-
-def _camera_from_ct(result: TrackingResult) -> Float64[np.ndarray, "4 4"] | None:
-    """The organ's pose without its deformation, where the method knows one."""
-    if result.estimate is None or "motion" not in result.estimate.report:
-        return None
-    return np.array(result.estimate.report["motion"]["camera_from_ct"], float)
+            yield "POLYDATA", name, igtl.pack_polydata(content), {}

@@ -10,7 +10,8 @@ from __future__ import annotations
 import threading
 import time
 from collections import Counter
-from typing import Any, ClassVar, Literal
+from collections.abc import Mapping
+from typing import ClassVar, Literal
 
 import numpy as np
 from jaxtyping import Float64
@@ -19,15 +20,10 @@ from tumortrack.core.errors import InputError, TumortrackError
 from tumortrack.live.values import Controls, SinkConfig, SinkContext, TrackingResult
 
 UR_JOINTS = (
-    "shoulder_pan_joint",
-    "shoulder_lift_joint",
-    "elbow_joint",
-    "wrist_1_joint",
-    "wrist_2_joint",
-    "wrist_3_joint",
+    *("shoulder_pan_joint", "shoulder_lift_joint", "elbow_joint"),
+    *("wrist_1_joint", "wrist_2_joint", "wrist_3_joint"),
 )
-_WATCHDOG_S = 0.2  # of silence: the controller stops the arm by itself
-SILENT_S = _WATCHDOG_S  # and so does the sink
+_WATCHDOG_S = SILENT_S = 0.2  # of silence: the controller stops the arm by itself, and the sink
 OFF_DEG = 2.0  # between the arm and the plan, before it may move
 _STOP_M_S2 = 10.0  # servoStop's deceleration: ur_rtde's own
 # Of UR5, UR5e, UR10 and UR10e (data sheets): a turn either way; the larger ones' first two joints
@@ -59,24 +55,18 @@ class UrSinkConfig(SinkConfig, frozen=True, kw_only=True, tag="ur"):
     gain: float = 300.0
 
     def __post_init__(self) -> None:
-        for name, low, high in (
-            ("jump_deg", 0.1, 20.0),
-            ("lookahead_s", 0.03, 0.2),  # servoJ's own limits
-            ("gain", 100.0, 2000.0),
-        ):
+        servo = (("lookahead_s", 0.03, 0.2), ("gain", 100.0, 2000.0))  # servoJ's own limits
+        for name, low, high in (("jump_deg", 0.1, 20.0), *servo):
             value = getattr(self, name)
             if not low <= value <= high:
                 raise InputError(f"ur: {name} {value:g} must lie in {low:g}..{high:g}.")
 
     def open(self, context: SinkContext) -> UrSink:
         """Nothing, or with ``execute`` the connection to the arm, which does not move yet.
-
-        Raises:
-            InputError: no arms in this run; with ``execute``: see ``connected``.
-        """
+        InputError: no arms in this run; with ``execute``: as ``UrLink``."""
         if not context.arms:
             raise InputError("ur: nothing here moves an arm; it is for `tumortrack resect`.")
-        return UrSink(self, connected(self.host) if self.execute else None, context.controls)
+        return UrSink(self, UrLink(self.host) if self.execute else None, context.controls)
 
 
 class UrSink:
@@ -95,24 +85,19 @@ class UrSink:
         self._closed = threading.Event()
         self._counts: Counter[str] = Counter()
         self._fault = ""
-        self._watch: threading.Thread | None = None
+        self._watch = threading.Thread(target=self._keep_watch, name="ur", daemon=True)
         if link is not None:
-            self._watch = threading.Thread(target=self._keep_watch, name="ur", daemon=True)
             self._watch.start()
 
     @property
     def counts(self) -> dict[str, int]:
-        """Updates by what became of them: sent (in a dry run: would send), halted, no arms,
+        """Results by what became of them: sent (in a dry run: would send), halted, no arms,
         refused; and silences."""
         with self._lock:
             return dict(self._counts)
 
     def publish(self, result: TrackingResult) -> None:
-        """Send the target, or check it.
-
-        Raises:
-            TumortrackError: the target is refused, and why; the arm stands.
-        """
+        """Send the target, or check it; TumortrackError: it is refused, and the arm stands."""
         with self._lock:
             if self._closed.is_set():
                 return
@@ -141,14 +126,14 @@ class UrSink:
         if self._closed.is_set():
             return
         self._closed.set()
-        if self._watch is not None:
-            self._watch.join()
+        if self._link is None:
+            return
+        self._watch.join()
         with self._lock:
-            if self._link is not None:
-                try:
-                    self._stop()
-                finally:
-                    self._link.close()
+            try:
+                self._stop()
+            finally:
+                self._link.close()
 
     def _give_up(self) -> None:
         """This arm no longer does what was planned: all arms stop for good."""
@@ -207,18 +192,15 @@ class UrSink:
                     self._break(error)
 
 
-def _target(joints_rad: Any, names: tuple[str, ...]) -> Float64[np.ndarray, " 6"]:
-    """One arm's joints in the maker's order.
-
-    Raises:
-        TumortrackError: one is missing, no number, or beyond its limit.
-    """
+def _target(joints_rad: Mapping[str, float], names: tuple[str, ...]) -> Float64[np.ndarray, " 6"]:
+    """One arm's joints in the maker's order; TumortrackError: one is missing, no number, or beyond
+    its limit."""
     if missing := [name for name in names if name not in joints_rad]:
         raise TumortrackError(f"there is no joint {missing[0]}; there are {', '.join(joints_rad)}")
     target = np.array([float(joints_rad[name]) for name in names])
     wrong = ~(np.abs(target) <= LIMIT_RAD)  # also where it is no number
     if wrong.any():
-        joint = int(np.flatnonzero(wrong)[0])
+        joint = int(wrong.argmax())
         raise TumortrackError(
             f"{UR_JOINTS[joint]} at {np.degrees(target[joint]):.1f} degrees; allowed: "
             f"{np.degrees(LIMIT_RAD):g} either way"
@@ -243,11 +225,29 @@ def _check_step(step: Float64[np.ndarray, " 6"], seconds: float, jump_deg: float
 
 
 class UrLink:
-    """ur_rtde's two interfaces to one arm. Not for two threads at once."""
+    """ur_rtde's two interfaces to the controller of one arm. Not for two threads at once.
 
-    def __init__(self, control: Any, receive: Any) -> None:
-        self._control, self._receive = control, receive
-        control.setWatchdog(1 / _WATCHDOG_S)
+    Raises:
+        InputError: ur_rtde is missing, or the arm cannot be reached or controlled.
+    """
+
+    def __init__(self, host: str) -> None:
+        try:
+            import rtde_control
+            import rtde_receive
+        except ImportError as error:
+            raise InputError(
+                "ur with execute=true needs the package ur_rtde: pip install 'tumortrack[ur]'."
+            ) from error
+        try:
+            self._receive = rtde_receive.RTDEReceiveInterface(host)
+            self._control = rtde_control.RTDEControlInterface(host)
+        except RuntimeError as error:
+            raise InputError(
+                f"ur: the arm at {host} cannot be controlled ({error}). Is it on, released, in "
+                "remote control, and reachable on port 30004?"
+            ) from error
+        self._control.setWatchdog(1 / _WATCHDOG_S)
 
     def check(self) -> None:
         """Raises TumortrackError where the arm cannot follow."""
@@ -276,33 +276,10 @@ class UrLink:
             raise TumortrackError("the arm did not take the order to stop")
 
     def kick(self) -> None:
+        """Tell the controller's watchdog that this program is well."""
         self._control.kickWatchdog()
 
     def close(self) -> None:
         self._control.stopScript()
         self._control.disconnect()
         self._receive.disconnect()
-
-
-def connected(host: str) -> UrLink:
-    """The controller of an arm, through ur_rtde.
-
-    Raises:
-        InputError: ur_rtde is missing, or the arm cannot be reached or controlled.
-    """
-    try:
-        import rtde_control
-        import rtde_receive
-    except ImportError as error:
-        raise InputError(
-            "ur with execute=true needs the package ur_rtde: pip install 'tumortrack[ur]'."
-        ) from error
-    try:
-        receive = rtde_receive.RTDEReceiveInterface(host)
-        control = rtde_control.RTDEControlInterface(host)
-    except RuntimeError as error:
-        raise InputError(
-            f"ur: the arm at {host} cannot be controlled ({error}). Is it on, released, in remote "
-            "control, and reachable on port 30004?"
-        ) from error
-    return UrLink(control, receive)

@@ -6,12 +6,15 @@ second of silence, nothing of an older one stays visible.
 
 from __future__ import annotations
 
+import logging
+import socket
 import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
-from typing import TYPE_CHECKING, ClassVar
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
@@ -22,14 +25,12 @@ from tumortrack.core.types import Mesh
 from tumortrack.live.display import seen_points
 from tumortrack.live.values import SinkConfig, SinkContext, TrackingResult
 from tumortrack.live.viewer.look import point_under
-from tumortrack.live.viewer.panel import Actions, Panel, State, StatusPanel, backdrop
+from tumortrack.live.viewer.panel import ABORTED, CANCEL, CLICK, Panel, State, StatusPanel
 from tumortrack.live.viewer.scene import ViewerScene
-from tumortrack.live.viewer.server import close_server, open_server
 from tumortrack.live.viewer.slices import load_ct, plane_through, slice_picture
-from tumortrack.live.viewer.workcell import WorkcellView
 
 if TYPE_CHECKING:
-    from viser import SceneClickEvent
+    from viser import GuiEvent, SceneClickEvent, ViserServer
 
 _STALE_S = 1.0
 _TICK_S = 0.2  # the status grows older, and slices are renewed, this often
@@ -57,20 +58,15 @@ class ViewerSinkConfig(SinkConfig, frozen=True, kw_only=True, tag="viewer"):
     hz: float = 15.0
 
     def __post_init__(self) -> None:
-        if not 0 <= self.port <= 65535:
-            raise InputError(f"viewer: port {self.port} is not in 0..65535.")
-        if not 0 <= self.margin_mm <= 50:
-            raise InputError(f"viewer: margin_mm={self.margin_mm:g}; allowed are 0 to 50 mm.")
+        self.check_ranges("viewer:", "0", port=65535, margin_mm=50)
         if not 0 < self.hz <= 60:
             raise InputError(f"viewer: hz={self.hz:g}; allowed are more than 0 and up to 60.")
+        if self.case and not Path(self.case).is_dir():
+            raise InputError(f"viewer: case={self.case} is no folder; give what `prepare` wrote.")
 
     def open(self, context: SinkContext) -> ViewerSink:
-        """The page, ready for visitors.
-
-        Raises:
-            InputError: the port is taken, viser is missing, or the case is another patient's.
-            ArtifactError: ``case`` is no case.
-        """
+        """The page, ready for visitors. Raises InputError where the port is taken, viser is
+        missing, or the case is another patient's, ArtifactError where ``case`` is none."""
         return ViewerSink(self, context)
 
 
@@ -78,29 +74,48 @@ class ViewerSink:
     """See ``live.values.Sink``. ``port``: where the page is."""
 
     def __init__(self, config: ViewerSinkConfig, context: SinkContext) -> None:
-        ct = load_ct(config.case, context) if config.case else None
-        self._config, self._context, self._ct = config, context, ct
-        self._server = open_server(config.host, config.port)
+        self._ct = load_ct(config.case, context) if config.case else None
+        self._config, self._context = config, context
+        self._server = _opened(config.host, config.port)
         self.port: int = self._server.get_port()
+        self._back = np.linalg.inv(context.published_frame.published_from_camera)
         self._lock = threading.RLock()  # round every change of the page
         self._result: TrackingResult | None = None  # the last that came
         self._shown: TrackingResult | None = None  # whose estimate is visible
         self._came = self._drawn = -np.inf
         self._hidden_count = 0  # a slice made before the last hiding is void
         self._counter = 0
-        self._fault: BaseException | None = None
+        self._fault: BaseException | None = None  # for the next publish to raise
         self._picking = False
-        self._state: State | None = None
+        self._state: State = "waiting"
         self._behind: tuple[State, bool] | None = None
         self._scene = ViewerScene(self._server, context, config.margin_mm)
-        self._cell = WorkcellView(self._server)
-        turn = self._scene.look.turn
-        actions = Actions(self._changed, self._toggle_picking, self._forget, turn, self._abort)
-        self._panel = Panel(self._server, context.parts, actions, ct is not None, context.arms)
+        self._panel = Panel(self._server, context.parts, self._ct is not None, context.arms)
+        self._connect()
         self._say("waiting")
         self._closing = threading.Event()
         self._watch = threading.Thread(target=self._keep_watch, name="viewer", daemon=True)
         self._watch.start()
+
+    def _connect(self) -> None:
+        """What the panel's elements do; viser calls it from its own threads."""
+        panel = self._panel
+
+        def changed(_: object) -> None:
+            with self._page():
+                self._scene.change(panel.options)
+
+        for switch in panel.switches:
+            switch.on_update(changed)
+        panel.pick.on_click(lambda _: self._toggle_picking())
+        panel.forget.on_click(lambda _: self._mark(None))
+        if self._context.arms:
+            panel.abort.on_click(lambda _: self._abort())
+
+            @panel.views.on_click
+            def _(event: GuiEvent[Any]) -> None:
+                if event.client is not None:  # nobody's click otherwise: set by the program
+                    self._scene.look.turn(event.client, event.target.value)
 
     def publish(self, result: TrackingResult) -> None:
         """Show it: without an estimate at once, with one not more often than ``hz``; arms each
@@ -122,11 +137,10 @@ class ViewerSink:
             raise fault
 
     def close(self) -> None:
-        if self._closing.is_set():
-            return
-        self._closing.set()
-        self._watch.join(5)
-        close_server(self._server)
+        if not self._closing.is_set():
+            self._closing.set()
+            self._watch.join(5)
+            _close(self._server)
 
     @contextmanager
     def _page(self) -> Iterator[None]:
@@ -152,13 +166,9 @@ class ViewerSink:
 
     def _draw_cell(self, result: TrackingResult) -> None:
         try:
-            if result.workcell is None:
-                self._cell.hide()
-                return
-            self._cell.show(result.workcell)
-            self._scene.look.oversee(result.workcell)
+            self._scene.show_cell(result.workcell)
         except Exception as error:
-            self._cell.hide()
+            self._scene.show_cell(None)
             self._fault = error  # raised when the estimate has been shown
 
     def _hide(self) -> None:
@@ -171,13 +181,12 @@ class ViewerSink:
         self._state = state
         self._counter += 1
         result = self._result
-        age_s = time.monotonic() - self._came if result is not None else 0.0
-        if result is not None and result.latency_ms is not None:
-            age_s += result.latency_ms / 1000
+        late_s = 0.0 if result is None else (result.latency_ms or 0.0) / 1000
+        age_s = 0.0 if result is None else time.monotonic() - self._came + late_s
         status = StatusPanel(state, result, age_s, self._counter, self._context.arms)
         if (behind := (state, status.alarming)) != self._behind:
             self._behind = behind
-            self._server.scene.set_background_image(backdrop(*behind))
+            self._server.scene.set_background_image(status.backdrop())
         self._panel.say(status)
 
     def _keep_watch(self) -> None:
@@ -185,28 +194,26 @@ class ViewerSink:
         while not self._closing.wait(_TICK_S):
             try:
                 with self._page():
-                    if self._result is not None and time.monotonic() - self._came > _STALE_S:
-                        if self._shown is not None:
-                            self._hide()
-                        self._cell.hide()
-                        self._say("stale")
-                    else:
-                        self._say(self._state or "waiting")
+                    stale = self._result and time.monotonic() - self._came > _STALE_S
+                    if stale and self._shown is not None:
+                        self._hide()
+                    if stale:
+                        self._scene.show_cell(None)
+                    self._say("stale" if stale else self._state)
                 self._renew_slice()
-            except Exception as error:
-                self._fault = error  # for the next publish to raise: the watch must go on
+            except Exception as error:  # the watch must go on
+                self._fault = error
 
     def _renew_slice(self) -> None:
         if self._ct is None:
             return
         with self._lock:
             result, hidden_count = self._shown, self._hidden_count
-            part, orientation = self._panel.slice_through
-        if result is None:
+            part, orientation = self._panel.through.value, self._panel.plane.value
+        if result is None or result.estimate is None:
             return
-        plane = plane_through(result, part, orientation)
-        motion = result.estimate.motion if result.estimate is not None else None
-        picture = None
+        plane = plane_through(result.estimate.meshes, part, orientation)
+        motion, picture = result.estimate.motion, None
         if plane is not None and motion is not None:
             outlines = self._outlines(result)
             picture = slice_picture(self._ct, motion, plane, outlines, _SLICE_PIXELS)
@@ -214,26 +221,16 @@ class ViewerSink:
             if hidden_count == self._hidden_count:
                 self._panel.put_slice(picture)
                 if picture is not None and plane is not None:
-                    self._scene.put_slice(picture, plane, result.published_frame)
+                    self._scene.put_slice(picture, plane)
 
-    def _outlines(self, result: TrackingResult) -> list[tuple[Mesh, colours.Colour, int]]:
+    def _outlines(self, result: TrackingResult) -> Iterator[tuple[Mesh, colours.Colour, int]]:
         assert result.estimate is not None
-        back = np.linalg.inv(result.published_frame.published_from_camera)
-        outlines = []
         for label, name in enumerate(self._context.parts, start=1):
             colour = colours.part_colour(label)
-            if name in result.estimate.meshes:
-                outlines.append((result.estimate.meshes[name], colour, 2 if label > 1 else 1))
-            if margin := self._scene.margins.get(name):
-                there = margin.moved(transform_points(back, margin.vertices_mm))
-                outlines.append((there, colour, 1))
-        return outlines
-
-    def _changed(self) -> None:
-        with self._page():
-            self._scene.options = self._panel.options
-            self._scene.redraw_points()
-            self._scene.apply()
+            if (mesh := result.estimate.meshes.get(name)) is not None:
+                yield mesh, colour, 2 if label > 1 else 1
+            if (margin := self._scene.margins.get(name)) is not None:
+                yield margin.moved(transform_points(self._back, margin.vertices_mm)), colour, 1
 
     def _toggle_picking(self) -> None:
         """The next click in the scene chooses the organ; asked twice: it does not."""
@@ -243,7 +240,8 @@ class ViewerSink:
                 self._server.scene.on_click()(self._clicked)
             else:
                 self._server.scene.remove_click_callback(self._clicked)
-            self._panel.picking(self._picking, self._context.controls.picked_mm is not None)
+            self._panel.pick.label = CANCEL if self._picking else CLICK
+            self._panel.forget.visible = self._context.controls.picked_mm is not None
 
     def _clicked(self, event: SceneClickEvent) -> None:
         with self._lock:
@@ -254,24 +252,77 @@ class ViewerSink:
             if result is None or result.observation is None:
                 event.client.add_notification("Nothing is seen at present", "Click again later.")
                 return
-            back = np.linalg.inv(result.published_frame.published_from_camera)
-            origin = transform_points(back, np.array([event.ray_origin]))[0]
-            direction = back[:3, :3] @ np.array(event.ray_direction)
+            origin = transform_points(self._back, np.array([event.ray_origin]))[0]
+            direction = self._back[:3, :3] @ np.array(event.ray_direction)
             point = point_under(seen_points(result.observation).astype(float), origin, direction)
             if point is None:
                 event.client.add_notification("No observed point there", "Click on the points.")
-                return
-            self._context.controls.pick(point)
-            self._scene.mark(point, result.published_frame)
-            self._panel.picking(False, True)
+            else:
+                self._mark(point)
 
-    def _forget(self) -> None:
+    def _mark(self, point_mm: np.ndarray | None) -> None:
+        """The user clicked here (camera frame), or on 'Choose again'."""
         with self._lock:
-            self._context.controls.pick(None)
-            self._scene.mark(None, self._context.published_frame)
-            self._panel.picking(self._picking, False)
+            self._context.controls.picked_mm = point_mm
+            self._scene.mark(point_mm)
+            self._panel.forget.visible = point_mm is not None
 
     def _abort(self) -> None:
         with self._lock:
             self._context.controls.aborted.set()
-            self._panel.aborted()
+            self._panel.abort.label, self._panel.abort.disabled = ABORTED, True
+
+
+def _opened(host: str, port: int) -> ViserServer:
+    """A running server with an empty scene, where it was asked for; port 0: any free one."""
+    try:
+        import viser
+    except ImportError as error:
+        raise InputError("the viewer needs viser: pip install 'tumortrack[live]'.") from error
+    taken = (
+        f"the viewer cannot listen on port {port} of {host}: another program does, or it may not "
+        f"be used. Close that, or choose another port: viewer:{port + 1}."
+    )
+    try:  # asked for a taken port, viser takes another and doesn't say so
+        family = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0][0]
+        with socket.socket(family, socket.SOCK_STREAM) as probe:
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # as the server will
+            probe.bind((host, port))
+    except socket.gaierror as error:
+        raise InputError(
+            f"the viewer cannot listen at {host!r}: {error.strerror}. Give host=127.0.0.1 for this "
+            "machine alone, host=0.0.0.0 for every machine that can reach it."
+        ) from error
+    except OSError as error:
+        raise InputError(f"{taken} ({error.strerror})") from error
+    logging.getLogger("websockets.server").addFilter(_is_no_refusal)
+    with _silence():
+        server = viser.ViserServer(host=host, port=port, label="tumortrack", verbose=False)
+    if port not in (0, server.get_port()):
+        _close(server)
+        raise InputError(taken)
+    return server
+
+
+def _close(server: ViserServer) -> None:
+    """Stop it, its threads and its connections; browsers have up to 6 s to say goodbye."""
+    with _silence():
+        server.stop()
+
+
+def _is_no_refusal(record: logging.LogRecord) -> bool:
+    """Browsers open connections in advance and drop them, which websockets logs as an error."""
+    return record.getMessage() != "opening handshake failed"
+
+
+@contextmanager
+def _silence() -> Iterator[None]:
+    """viser prints when it starts and stops, through rich's shared console."""
+    import rich
+
+    console = rich.get_console()
+    before, console.quiet = console.quiet, True
+    try:
+        yield
+    finally:
+        console.quiet = before

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from tumortrack.core.types import Mesh
-from tumortrack.live.values import PublishedFrame, Workcell
+from tumortrack.live.values import Workcell
 
 if TYPE_CHECKING:
     from viser import CameraHandle, ClientHandle, ViserServer
@@ -31,19 +31,16 @@ _MISSED_MM = 10.0
 class Look:
     """New visitors look from the depth camera's place along its axis, its y axis down."""
 
-    def __init__(self, server: ViserServer, frames: PublishedFrame) -> None:
-        way = frames.published_from_camera
-        self._server = server
+    def __init__(self, server: ViserServer, way: Float[np.ndarray, "4 4"]) -> None:
+        self._server, self._way = server, way  # published_from_camera
         self._aimed = False
-        self._eye_mm = way[:3, 3]
-        self._way = way
+        self._eye_mm = way[:3, 3]  # of whoever moved last
         self._organ_mm = way[:3, 3] + _FIRST_LOOK_MM * way[:3, 2]
         self._cell: Workcell | None = None  # the last there was
         server.scene.set_up_direction(-way[:3, 1])
         first = server.initial_camera
         first.fov, first.near, first.far = _FOV_RADIANS, _NEAR_MM, _FAR_MM
-        first.position, first.up = way[:3, 3], -way[:3, 1]
-        first.look_at = self._organ_mm
+        first.position, first.look_at, first.up = self._view("organ")
         # Light from the camera's side, as an endoscope gives it, some from behind, no shadows.
         server.scene.configure_default_lights(False)
         server.scene.configure_environment_map(None)
@@ -53,44 +50,37 @@ class Look:
             server.scene.add_light_directional(name, intensity=intensity, position=(x, y, z))
         server.on_client_connect(self._follow)
 
-    def aim(self, frames: PublishedFrame, depth_mm: float) -> None:
+    def aim(self, depth_mm: float) -> None:
         """Turn about the organ from now on, once its distance is known."""
         if self._aimed:
             return
         self._aimed = True
-        way = frames.published_from_camera
-        self._organ_mm = way[:3, 3] + depth_mm * way[:3, 2]
-        if self._cell is not None:
-            return  # they look at the whole workcell
-        self._server.initial_camera.look_at = self._organ_mm
-        for client in self._server.get_clients().values():
-            client.camera.look_at = self._organ_mm
+        self._organ_mm = self._way[:3, 3] + depth_mm * self._way[:3, 2]
+        if self._cell is None:  # else they look at the whole workcell
+            self._server.initial_camera.look_at = self._organ_mm
+            for client in self._server.get_clients().values():
+                client.camera.look_at = self._organ_mm
 
     def oversee(self, cell: Workcell) -> None:
         """There is a workcell: when it comes first, all look at it whole."""
         first, self._cell = self._cell is None, cell
-        if not first:
-            return
-        eye_mm, middle_mm, up = self._overview()
-        camera = self._server.initial_camera
-        camera.position, camera.look_at, camera.up = eye_mm, middle_mm, up
-        for client in self._server.get_clients().values():
-            self.turn(client, "arms")
+        if first:
+            camera = self._server.initial_camera
+            camera.position, camera.look_at, camera.up = self._view("arms")
+            for client in self._server.get_clients().values():
+                self.turn(client, "arms")
 
     def turn(self, client: ClientHandle, towards: View) -> None:
         """Let a visitor look at the organ from the camera's place, or at the whole workcell."""
-        if towards == "organ":
-            eye_mm, middle_mm, up = self._way[:3, 3], self._organ_mm, -self._way[:3, 1]
-        else:
-            eye_mm, middle_mm, up = self._overview()
+        eye_mm, middle_mm, up = self._view(towards)
         with client.atomic():
             client.camera.up_direction = up
             client.camera.position = eye_mm
             client.camera.look_at = middle_mm
 
-    def _overview(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def _view(self, towards: View) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Eye, what it looks at, up."""
-        box_mm = None if self._cell is None else self._cell.box_mm
+        box_mm = None if towards == "organ" or self._cell is None else self._cell.box_mm
         if box_mm is None:
             return self._way[:3, 3], self._organ_mm, -self._way[:3, 1]
         middle_mm = box_mm.mean(0)
@@ -121,12 +111,9 @@ def point_under(
     nearest is more than 10 mm off, or behind the ray's origin."""
     offset = points_mm - origin_mm
     along = offset @ (direction / np.linalg.norm(direction))
-    before = along > 0
-    offset, along, points_mm = offset[before], along[before], points_mm[before]
-    if not len(along):
+    squared = np.where(along > 0, np.maximum((offset**2).sum(1) - along**2, 0), np.inf)
+    nearest = squared.min(initial=np.inf)
+    if nearest > _MISSED_MM**2:
         return None
-    squared = np.maximum((offset**2).sum(1) - along**2, 0)
-    if squared.min() > _MISSED_MM**2:
-        return None
-    under = squared <= max(_SAME_MM**2, float(squared.min()))
-    return points_mm[np.flatnonzero(under)[np.argmin(along[under])]]
+    under = squared <= max(_SAME_MM**2, nearest)
+    return points_mm[np.where(under, along, np.inf).argmin()]

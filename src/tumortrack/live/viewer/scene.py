@@ -1,4 +1,4 @@
-"""The viewer's 3-D scene: what was seen, what was estimated; published frame, mm.
+"""The viewer's 3-D scene: what was seen, what was estimated, what arms do; published frame, mm.
 
 Every node is made once and then changed in place, so that clients keep their buffers. Calls must
 not overlap: the sink holds a lock round them.
@@ -6,8 +6,10 @@ not overlap: the sink holds a lock round them.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from functools import partial
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float, UInt8
@@ -15,20 +17,24 @@ from jaxtyping import Float, UInt8
 from tumortrack.core import colours
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.types import Mesh
+from tumortrack.live import values as live
 from tumortrack.live.display import MOST_SEEN, seen_points, thinned, wxyz_of
-from tumortrack.live.values import PublishedFrame, SinkContext, TrackingResult, TransformedEstimate
+from tumortrack.live.values import TrackingResult, TransformedEstimate
 from tumortrack.live.viewer.look import Look
 from tumortrack.live.viewer.slices import SlicePlane
 from tumortrack.live.viewer.surfaces import bare_faces, exact_margin, rough_margin
 
 if TYPE_CHECKING:
-    from viser import ImageHandle, MeshHandle, PointCloudHandle, ViserServer
+    from viser import MeshHandle, PointCloudHandle, ViserServer
 
 _MOST_LABELLED = 15_000  # points shown
-_AXES_MM = 12.0
 _TUMOR_WITH_POINTS = 0.3  # opacity
+_NO_POINTS = np.zeros((0, 3), np.float32)
+_NOTHING = Mesh(np.zeros((3, 3)), np.array([[0, 1, 2]]))
 _CORNERS = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)])
 _EDGES = [(a, b) for a in range(8) for b in range(a) if abs(_CORNERS[a] - _CORNERS[b]).sum() == 1]
+_FLAT: dict[str, Any] = {"cast_shadow": False, "receive_shadow": False}
+_HAIRLINE: dict[str, Any] = {"thickness": 1.0, "thickness_units": "screen", "visible": False}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,7 +45,7 @@ class DisplayOptions:
     kidney: float = 0.35  # opacity
     margin: bool = True
     points: str = "none"  # none | tumors | all
-    by_probability: bool = False
+    coloured_by: str = "label"  # label | probability
     slice_plane: bool = False
     helpers: bool = True  # axes and the region of the organ's points
 
@@ -47,42 +53,78 @@ class DisplayOptions:
 class ViewerScene:
     """viser's nodes, and what goes into them."""
 
-    def __init__(self, server: ViserServer, context: SinkContext, margin_mm: float) -> None:
-        self._nodes = server.scene
-        self._margin_mm = margin_mm
-        self._anatomy_ct, self._margins_ct = context.anatomy_ct, None
-        if context.anatomy_ct is not None:
-            self._bare_faces = bare_faces(context.anatomy_ct)
+    def __init__(self, server: ViserServer, context: live.SinkContext, margin_mm: float) -> None:
+        self._nodes, self._margin_mm = server.scene, margin_mm
+        self._way = context.published_frame.published_from_camera
+        self._at_rest, self._margins_ct = context.anatomy_ct, None
+        if self._at_rest is not None:
+            self._bare_faces = bare_faces(self._at_rest)
             if margin_mm > 0:
-                tumors = context.anatomy_ct.tumors
-                self._margins_ct = tuple(exact_margin(tumor, margin_mm) for tumor in tumors)
+                self._margins_ct = [exact_margin(part, margin_mm) for part in self._at_rest.tumors]
         self.options = DisplayOptions()
         self.margins: dict[str, Mesh] = {}  # of the shown estimate, published frame
         self._placed: TransformedEstimate | None = None
         self._has_organ = self._has_slice = False
-        self._parts: dict[str, MeshHandle] = {}
-        self._shells: dict[str, MeshHandle] = {}
-        self.look = Look(server, context.published_frame)
+        self.look = Look(server, self._way)
         self._make_nodes(context)
+
+    def _make_nodes(self, context: live.SinkContext) -> None:
+        nodes = self._nodes
+        turn, eye_mm = wxyz_of(self._way[:3, :3]), self._way[:3, 3]
+        self._axes = nodes.add_frame(
+            "/camera", axes_length=12.0, axes_radius=0.35, wxyz=turn, position=eye_mm
+        )
+        self._seen = self._cloud("/seen", 0.2, colours.SEEN)
+        self._organ = self._cloud("/organ", 0.3, colours.ORGAN)
+        blank = np.zeros((12, 2, 3), np.float32)
+        self._region = nodes.add_line_segments("/region", blank, colours.REGION, **_HAIRLINE)
+        self._picked = nodes.add_icosphere(
+            "/picked", radius=1.5, color=colours.PICKED, visible=False, cast_shadow=False
+        )
+        self._estimate = nodes.add_frame("/estimate", show_axes=False, visible=False)
+        self._shells, self._parts = {}, {}
+        for label, name in enumerate(context.parts, start=1):
+            look = {"color": colours.part_colour(label), "visible": False}
+            if label > 1 and self._margin_mm > 0:
+                # Its far half: the near one would cover the organ that it reaches out of.
+                path = f"/estimate/margin_{name}"
+                self._shells[name] = self._mesh(path, _NOTHING, opacity=0.3, side="back", **look)
+            opacity = 0.35 if label == 1 else None
+            path = f"/estimate/{name}"
+            self._parts[name] = self._mesh(path, _NOTHING, opacity=opacity, **look)
+        self._points = self._cloud("/estimate/points", 0.3, colours.KIDNEY)
+        clear = np.zeros((2, 2, 4), np.uint8)
+        self._slice = nodes.add_image("/estimate/slice", clear, 1, 1, format="png", **_FLAT)
+        self._cell = nodes.add_frame("/workcell", show_axes=False, visible=False)
+        self._drawn: dict[str, tuple[object, np.ndarray, Any]] = {}  # look, place and node by name
+
+    def _cloud(self, name: str, size_mm: float, colour: colours.Colour) -> PointCloudHandle:
+        return self._nodes.add_point_cloud(
+            name,
+            _NO_POINTS,
+            np.array(colour, np.uint8),
+            point_size=size_mm,
+            point_shape="circle",
+            point_shading="flat",
+            precision="float32",  # half precision is 0.125 mm at 150 mm
+        )
+
+    def _mesh(self, name: str, mesh: Mesh, **look: Any) -> MeshHandle:
+        vertices, faces = mesh.vertices_mm.astype(np.float32), mesh.faces.astype(np.uint32)
+        return self._nodes.add_mesh_simple(name, vertices, faces, **_FLAT, **look)
 
     def observe(self, result: TrackingResult) -> None:
         """Show what this result saw; nothing, if it saw nothing."""
-        way = result.published_frame.published_from_camera
-        seen = (
-            np.zeros((0, 3), np.float32)
-            if result.observation is None
-            else seen_points(result.observation)
-        )
-        organ = np.zeros((0, 3), np.float32) if result.organ is None else result.organ.points_mm
-        self._put_points(self._seen, transform_points(way, thinned(seen, MOST_SEEN)), colours.SEEN)
-        organ_there = transform_points(way, thinned(organ, MOST_SEEN))
-        self._put_points(self._organ, organ_there, colours.ORGAN)
-        self._axes.wxyz, self._axes.position = wxyz_of(way[:3, :3]), way[:3, 3]
+        seen = _NO_POINTS if result.observation is None else seen_points(result.observation)
+        organ = _NO_POINTS if result.organ is None else result.organ.points_mm
+        for node, points in ((self._seen, seen), (self._organ, organ)):
+            there = transform_points(self._way, thinned(points, MOST_SEEN))
+            node.points = there.astype(np.float32)
         if len(organ):
             lower, upper = organ.min(0), organ.max(0)
-            corners = transform_points(way, lower + _CORNERS * (upper - lower))
+            corners = transform_points(self._way, lower + _CORNERS * (upper - lower))
             self._region.points = corners[_EDGES].astype(np.float32)
-            self.look.aim(result.published_frame, float(np.median(organ[:, 2])))
+            self.look.aim(float(np.median(organ[:, 2])))
         self._has_organ = len(organ) > 0
 
     def show(self, result: TrackingResult) -> None:
@@ -103,8 +145,7 @@ class ViewerScene:
     def hide(self) -> None:
         """Nothing of any estimate stays visible."""
         self._placed = None
-        self._has_slice = False
-        self._estimate.visible = False
+        self._has_slice = self._estimate.visible = False
         self.margins = {}
 
     def apply(self) -> None:
@@ -126,115 +167,86 @@ class ViewerScene:
         self._slice.visible = options.slice_plane and self._has_slice
         self._estimate.visible = True
 
-    def redraw_points(self) -> None:
-        """After a change of what labelled points are to be shown."""
+    def change(self, options: DisplayOptions) -> None:
+        """What the user wants to see is another."""
+        self.options = options
         if self._placed is not None:
             self._put_labelled(self._placed)
-            self.apply()
+        self.apply()
 
-    def put_slice(
-        self, picture: UInt8[np.ndarray, "h w 3"], plane: SlicePlane, frames: PublishedFrame
-    ) -> None:
+    def put_slice(self, picture: UInt8[np.ndarray, "h w 3"], plane: SlicePlane) -> None:
         """The slice as a plane of the scene, at its true place."""
-        if not self.options.slice_plane:
-            self._has_slice = False  # what was there is old by the time it is asked for
-            return
+        self._has_slice = self.options.slice_plane
+        if not self._has_slice:
+            return  # what was there is old by the time it is asked for
         # viser lays a picture's columns along x and its rows along y.
         axes = np.stack([plane.across, plane.down, np.cross(plane.across, plane.down)], axis=1)
-        way = frames.published_from_camera
-        self._slice.position = transform_points(way, plane.centre_mm[None])[0]
-        self._slice.wxyz = wxyz_of(way[:3, :3] @ axes)
+        self._slice.position = transform_points(self._way, plane.centre_mm[None])[0]
+        self._slice.wxyz = wxyz_of(self._way[:3, :3] @ axes)
         self._slice.render_width = self._slice.render_height = plane.side_mm
         solid = (picture > 8).any(2, keepdims=True)
         self._slice.image = np.concatenate([picture, solid.astype(np.uint8) * 255], axis=2)
-        self._has_slice = True
         self.apply()
 
-    def mark(self, point_mm: Float[np.ndarray, " 3"] | None, frames: PublishedFrame) -> None:
+    def mark(self, point_mm: Float[np.ndarray, " 3"] | None) -> None:
         """Where the user clicked (camera frame); None: nowhere."""
         self._picked.visible = point_mm is not None
         if point_mm is not None:
-            there = transform_points(frames.published_from_camera, np.asarray(point_mm)[None])
-            self._picked.position = there[0]
+            self._picked.position = transform_points(self._way, point_mm[None])[0]
 
-    def _make_nodes(self, context: SinkContext) -> None:
-        nodes = self._nodes
-        self._axes = nodes.add_frame("/camera", axes_length=_AXES_MM, axes_radius=0.35)
-        self._seen = self._cloud("/seen", 0.2, colours.SEEN)
-        self._organ = self._cloud("/organ", 0.3, colours.ORGAN)
-        self._region = nodes.add_line_segments(
-            "/region",
-            np.zeros((12, 2, 3), np.float32),
-            colours.REGION,
-            thickness=1.0,
-            thickness_units="screen",
-        )
-        self._region.visible = False
-        self._picked = nodes.add_icosphere(
-            "/picked", radius=1.5, color=colours.PICKED, visible=False, cast_shadow=False
-        )
-        self._estimate = nodes.add_frame("/estimate", show_axes=False, visible=False)
-        self._shells = {
-            # Of a margin its far half: the near one would cover the organ that it reaches out of.
-            name: self._surface(f"/estimate/margin_{name}", label, 0.3, "back")
-            for label, name in enumerate(context.parts[1:], start=2)
-            if self._margin_mm > 0
-        }
-        self._parts = {
-            name: self._surface(f"/estimate/{name}", label, 0.35 if label == 1 else None)
-            for label, name in enumerate(context.parts, start=1)
-        }
-        self._points = self._cloud("/estimate/points", 0.3, colours.KIDNEY)
-        blank = np.zeros((2, 2, 4), np.uint8)
-        self._slice: ImageHandle = nodes.add_image(
-            "/estimate/slice", blank, 1, 1, format="png", cast_shadow=False, receive_shadow=False
-        )
+    def show_cell(self, cell: live.Workcell | None) -> None:
+        """Show what arms do, and nothing of what was shown before; None: nothing. A shape's surface
+        goes to the page once, then only its place."""
+        self._cell.visible = cell is not None
+        if cell is None:
+            return
+        shapes = {f"shape/{shape.name}": shape for shape in cell.shapes}
+        lines = {f"line/{line.name}": line for line in cell.drawn_lines}
+        for name in self._drawn.keys() - shapes.keys() - lines.keys():
+            self._drawn.pop(name)[2].remove()
+        places = np.array([shape.published_from_shape for shape in cell.shapes]).reshape(-1, 4, 4)
+        turns = wxyz_of(places[:, :3, :3]) if len(places) else ()  # all at once: 5 times quicker
+        for (name, shape), wxyz in zip(shapes.items(), turns, strict=True):
+            look = {"mesh": shape.mesh, "color": shape.colour, "opacity": shape.opacity}
+            node = self._placed_node(name, shape.published_from_shape, self._add_shape, look)
+            if node is not None:
+                node.position, node.wxyz = shape.published_from_shape[:3, 3], wxyz
+        for name, line in lines.items():
+            points = line.points_mm.astype(np.float32)
+            segments = np.stack([points[:-1], points[1:]], axis=1)
+            look = {"colors": line.colour, "thickness": line.width_mm, "thickness_units": "world"}
+            add = partial(self._nodes.add_line_segments, points=segments)
+            if (node := self._placed_node(name, line.points_mm, add, look)) is not None:
+                node.points = segments
+        self.look.oversee(cell)
 
-    def _cloud(self, name: str, size_mm: float, colour: colours.Colour) -> PointCloudHandle:
-        return self._nodes.add_point_cloud(
-            name,
-            np.zeros((0, 3), np.float32),
-            np.array(colour, np.uint8),
-            point_size=size_mm,
-            point_shape="circle",
-            point_shading="flat",
-            precision="float32",  # half precision is 0.125 mm at 150 mm
-        )
+    def _placed_node(
+        self, name: str, place: np.ndarray, add: Callable[..., Any], look: dict[str, Any]
+    ) -> Any | None:
+        """The node to be moved, made anew where it looks otherwise; None: it lies there already."""
+        before, there, node = self._drawn.get(name, (None, None, None))
+        if before != look:
+            kind, _, own = name.partition("/")
+            # Without further slashes: to viser they say that one node moves with another.
+            node, there = add(f"/workcell/{kind}/{own.replace('/', ':')}", **look), None
+        self._drawn[name] = look, place, node
+        return None if there is not None and np.array_equal(there, place) else node
 
-    def _surface(
-        self, name: str, label: int, opacity: float | None, side: Literal["front", "back"] = "front"
-    ) -> MeshHandle:
-        return self._nodes.add_mesh_simple(
-            name,
-            np.zeros((3, 3), np.float32),
-            np.array([[0, 1, 2]], np.uint32),
-            color=colours.part_colour(label),
-            opacity=opacity,
-            side=side,
-            visible=False,
-            cast_shadow=False,
-            receive_shadow=False,
-        )
-
-    def _put_points(
-        self,
-        node: PointCloudHandle,
-        points: np.ndarray,
-        colour: np.ndarray | tuple[int, ...],
-    ) -> None:
-        node.points = points.astype(np.float32)
-        node.colors = np.asarray(colour, np.uint8)
+    def _add_shape(self, name: str, opacity: float, **look: Any) -> MeshHandle:
+        # A mesh with an opacity is drawn as translucent, and sorted.
+        solid = opacity if opacity < 1 else None
+        return self._mesh(name, opacity=solid, flat_shading=True, **look)
 
     def _put_labelled(self, placed: TransformedEstimate) -> None:
         if self.options.points == "none":
             return
         least = 2 if self.options.points == "tumors" else 1
         some = thinned(np.flatnonzero(placed.labels >= least), _MOST_LABELLED)
-        if self.options.by_probability:
-            colour = colours.probability_colours(placed.probability[some])
+        self._points.points = placed.points_mm[some].astype(np.float32)
+        if self.options.coloured_by == "probability":
+            self._points.colors = colours.probability_colours(placed.probability[some])
         else:
-            colour = colours.label_colours(placed.labels[some])
-        self._put_points(self._points, placed.points_mm[some], colour)
+            self._points.colors = colours.label_colours(placed.labels[some])
 
     def _margins_of(self, result: TrackingResult, placed: TransformedEstimate) -> dict[str, Mesh]:
         assert result.estimate is not None
@@ -242,19 +254,15 @@ class ViewerScene:
         motion = result.estimate.motion
         if self._margins_ct is None or motion is None:
             return {name: rough_margin(mesh, self._margin_mm) for name, mesh in tumors.items()}
-        way = result.published_frame.published_from_camera
-        at_rest = dict(zip(self._shells, self._margins_ct, strict=True))
         return {
-            name: at_rest[name].moved(
-                transform_points(way, motion.carry(at_rest[name].vertices_mm))
-            )
-            for name in tumors
+            name: margin.moved(transform_points(self._way, motion.carry(margin.vertices_mm)))
+            for name, margin in zip(self._shells, self._margins_ct, strict=True)
+            if name in tumors
         }
 
     def _bare(self, organ: Mesh) -> Mesh:
         """The organ's surface where it is no tumor's, if its triangles are those of the CT."""
-        at_rest = self._anatomy_ct
-        if at_rest is None or not np.array_equal(at_rest.organ.faces, organ.faces):
+        if self._at_rest is None or not np.array_equal(self._at_rest.organ.faces, organ.faces):
             return organ
         return Mesh(organ.vertices_mm, self._bare_faces)
 

@@ -15,7 +15,7 @@ from tumortrack.core.estimate import Motion
 from tumortrack.core.geometry import spacing_mm, transform_points
 from tumortrack.core.types import Mesh
 from tumortrack.imaging.case import Case, load_case
-from tumortrack.live.values import SinkContext, TrackingResult
+from tumortrack.live.values import SinkContext
 
 # Directions of the image's columns and rows in the camera frame (x right, y down, z forward).
 ORIENTATIONS: dict[str, tuple[tuple[float, ...], tuple[float, ...]]] = {
@@ -53,17 +53,13 @@ class SlicePlane:
         height = offset @ np.cross(self.across, self.down)
         flat = offset @ np.stack([self.across, self.down], axis=1)
         above = height[mesh.faces] > 0
-        cut = mesh.faces[(above.any(1)) & (~above.all(1))]
-        ends = []
-        for a, b in ((0, 1), (1, 2), (2, 0)):
-            first, second = cut[:, a], cut[:, b]
-            with np.errstate(divide="ignore", invalid="ignore"):
-                share = (height[first] / (height[first] - height[second]))[:, None]
-                point = flat[first] + share * (flat[second] - flat[first])
-            crosses = (height[first] > 0) != (height[second] > 0)
-            ends.append(np.where(crosses[:, None], point, np.nan))
-        corners = np.stack(ends, axis=1)  # of the three, exactly two are points
-        return corners[~np.isnan(corners[:, :, 0])].reshape(-1, 2, 2)
+        cut = mesh.faces[above.any(1) & ~above.all(1)]
+        first, second = cut, np.roll(cut, -1, axis=1)  # the three edges' ends
+        with np.errstate(divide="ignore", invalid="ignore"):
+            share = (height[first] / (height[first] - height[second]))[..., None]
+            points = flat[first] + share * (flat[second] - flat[first])
+        crosses = (height[first] > 0) != (height[second] > 0)  # exactly two of the three do
+        return points[crosses].reshape(-1, 2, 2)
 
 
 class CarriedCt:
@@ -72,34 +68,32 @@ class CarriedCt:
     def __init__(self, case: Case) -> None:
         from scipy.ndimage import distance_transform_edt
 
-        organ = case.labels.labels > 0
-        label_spacing = spacing_mm(case.labels.lps_from_index)
-        self._outside_mm = distance_transform_edt(~organ, sampling=label_spacing).astype(np.float32)
-        self._label_index_from_lps = np.linalg.inv(case.labels.lps_from_index)
-        if case.ct is not None:
-            self._values = case.ct.hu
-            self._index_from_lps = np.linalg.inv(case.ct.lps_from_index)
-            self._window = _window(self._at(self._values, _centres(organ, case), linear=False))
-        else:
-            self._values = case.labels.labels.astype(np.float32)
+        labels, ct = case.labels, case.ct
+        organ = labels.labels > 0
+        outside_mm = distance_transform_edt(~organ, sampling=spacing_mm(labels.lps_from_index))
+        self._outside_mm = outside_mm.astype(np.float32)
+        self._label_index_from_lps = np.linalg.inv(labels.lps_from_index)
+        if ct is None:
+            self._values, self._order = labels.labels.astype(np.float32), 0
             self._index_from_lps = self._label_index_from_lps
-            self._window = (-0.5, float(self._values.max()))
-        self._linear = case.ct is not None
+            self._window = -0.5, float(self._values.max())
+            return
+        self._values, self._order = ct.hu, 1
+        self._index_from_lps = np.linalg.inv(ct.lps_from_index)
+        # Black and white: the organ's values (of each tenth voxel), and as much again round them.
+        inside = transform_points(labels.lps_from_index, np.argwhere(organ)[::10].astype(float))
+        low, high = np.nanpercentile(_sample(ct.hu, self._index_from_lps, inside, 0), (1, 99))
+        room = max(50.0, 0.5 * float(high - low))
+        self._window = float(low) - room, float(high) + room
 
     def grey(self, points_ct: Float[np.ndarray, "n 3"]) -> UInt8[np.ndarray, " n"]:
         """Grey values: 0 where there is no CT, faint far outside the organ."""
-        values = self._at(self._values, points_ct, self._linear)
+        values = _sample(self._values, self._index_from_lps, points_ct, self._order)
         low, high = self._window
         share = np.clip((values - low) / (high - low), 0, 1)
-        index = transform_points(self._label_index_from_lps, points_ct)
-        outside = _sample(self._outside_mm, index, linear=True)
-        fade = np.interp(outside, (_SURE_MM, _UNSURE_MM), (1.0, _FAINT))
+        outside_mm = _sample(self._outside_mm, self._label_index_from_lps, points_ct, 1)
+        fade = np.interp(outside_mm, (_SURE_MM, _UNSURE_MM), (1.0, _FAINT))
         return np.nan_to_num(255 * share * fade).astype(np.uint8)
-
-    def _at(
-        self, values: np.ndarray, points_ct: Float[np.ndarray, "n 3"], linear: bool
-    ) -> Float32[np.ndarray, " n"]:
-        return _sample(values, transform_points(self._index_from_lps, points_ct), linear)
 
 
 def slice_picture(
@@ -132,33 +126,19 @@ def slice_picture(
     return np.asarray(image.resize((pixels, pixels), Image.Resampling.BOX))
 
 
-def _sample(values: np.ndarray, index: np.ndarray, linear: bool) -> Float32[np.ndarray, " n"]:
-    """Values at fractional indices, NaN outside the grid."""
+def _sample(
+    values: np.ndarray, index_from_lps: np.ndarray, points_ct: np.ndarray, order: int
+) -> Float32[np.ndarray, " n"]:
+    """Values at points (order 0: of the nearest voxel, 1: between them), NaN outside the grid."""
     from scipy.ndimage import map_coordinates
 
-    return map_coordinates(
-        values, index.T, output=np.float32, order=int(linear), mode="constant", cval=np.nan
-    )
-
-
-def _centres(organ: np.ndarray, case: Case) -> Float64[np.ndarray, "n 3"]:
-    """Voxels of the organ (each tenth) as points of the CT."""
-    return transform_points(case.labels.lps_from_index, np.argwhere(organ)[::10].astype(float))
-
-
-def _window(hu: Float32[np.ndarray, " n"]) -> tuple[float, float]:
-    """Black and white: the organ's values, and as much again round them."""
-    low, high = np.nanpercentile(hu, (1, 99))
-    room = max(50.0, 0.5 * float(high - low))
-    return float(low) - room, float(high) + room
+    index = transform_points(index_from_lps, points_ct).T
+    return map_coordinates(values, index, output=np.float32, order=order, cval=np.nan)
 
 
 def load_ct(case: str, context: SinkContext) -> CarriedCt:
-    """
-    Raises:
-        InputError: the model knows no motion, or the case is another patient's.
-        ArtifactError: ``case`` is no case.
-    """
+    """Raises InputError where the model knows no motion or the case is another patient's,
+    ArtifactError where it is none."""
     loaded = load_case(Path(case))
     if context.anatomy_ct is None:
         raise InputError(
@@ -174,13 +154,11 @@ def load_ct(case: str, context: SinkContext) -> CarriedCt:
     return CarriedCt(loaded)
 
 
-def plane_through(result: TrackingResult, part: str, orientation: str) -> SlicePlane | None:
+def plane_through(meshes: dict[str, Mesh], part: str, orientation: str) -> SlicePlane | None:
     """Through the middle of a part's present surface; centred on the organ, and as large."""
-    assert result.estimate is not None
-    meshes = result.estimate.meshes
     if part not in meshes or "kidney" not in meshes:
         return None
-    across, down = (np.array(axis) for axis in ORIENTATIONS[orientation])
+    across, down = np.array(ORIENTATIONS[orientation])
     normal = np.cross(across, down)
     centre, middle = (meshes[name].box_mm.mean(0) for name in ("kidney", part))
     everything = np.concatenate([mesh.box_mm for mesh in meshes.values()])

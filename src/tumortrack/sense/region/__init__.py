@@ -1,6 +1,6 @@
 """From a whole depth image or cloud to the organ's points; one step, one file.
 
-``organ_points`` runs the steps, ``config`` has their switches, ``picture`` what they work on.
+``organ_points`` runs the steps; ``picture`` has their switches, and what they work on.
 """
 
 from __future__ import annotations
@@ -9,39 +9,17 @@ import time
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float
 
 from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.types import DepthFrame, SensorCloud
 from tumortrack.sense.cloud import FEWEST_POINTS
-from tumortrack.sense.region import choose
 from tumortrack.sense.region import picture as pictures
-from tumortrack.sense.region.choose import Choice, Sizes
-from tumortrack.sense.region.config import RegionConfig
-from tumortrack.sense.region.picture import Picture, keep_inside
-from tumortrack.sense.region.pieces import find_edges, find_pieces, remove_flying
+from tumortrack.sense.region.choose import take_one_piece
+from tumortrack.sense.region.picture import Hints, RegionConfig, keep_inside
+from tumortrack.sense.region.pieces import remove_flying
 from tumortrack.sense.region.plane import remove_plane
 
 __all__ = ["Hints", "Region", "RegionConfig", "organ_points"]
-
-_OPENINGS = (1.0, 1.7, 2.8)  # times ``opening_mm``: the last is wider than fingers
-_CLEARLY = 1.1  # better by so much is worth a wider opening
-
-
-@dataclass(frozen=True, eq=False)
-class Hints:
-    """What is known about a frame besides its depth.
-
-    Attributes:
-        mask: of a depth image's pixels, True where the organ may be.
-        picked_mm: a point on the organ, camera frame, as a user clicked it. It decides which piece
-            is taken. Organs move: once there is an estimate, give its box instead.
-        last_box_mm: lower and upper corner of the last estimate's organ, camera frame.
-    """
-
-    mask: Bool[np.ndarray, "h w"] | None = None
-    picked_mm: Float[np.ndarray, " 3"] | None = None
-    last_box_mm: Float[np.ndarray, "2 3"] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,62 +73,19 @@ def organ_points(
     if config.flying:
         remove_flying(picture, config)
     if config.pieces:
-        window = picture.remaining()
-        part = picture.part(window)
-        _take_one_piece(part, config, hints)
+        window, part = picture.cropped()
+        take_one_piece(part, config, hints)
         picture.taken[window] = part.taken
     counts = picture.counts()
     left = picture.left(picture.taken)
     if len(left) < FEWEST_POINTS:
-        raise NoEstimate(_too_few(len(left), counts, config))
+        took = ", ".join(f"{name} {n}" for name, n in counts.items() if n and name != "organ")
+        raise NoEstimate(
+            f"only {len(left)} points are left for the organ; at least {FEWEST_POINTS} are needed. "
+            f"Of {picture.taken.size} pixels went to: {took or 'nothing'} (range "
+            f"{config.crop.near_mm:g}..{config.crop.far_mm:g} mm). Move the camera, widen what "
+            "took most, or switch that step off."
+        )
     drawn = rng.choice(left, min(len(left), config.crop.n_points), replace=False)
     cloud = SensorCloud(picture.points(drawn), content.stamp_ns)
     return Region(cloud, counts, picture.taken, time.perf_counter() - start)
-
-
-def _take_one_piece(picture: Picture, config: RegionConfig, hints: Hints) -> None:
-    """Leave one piece (and what continues it) to the organ.
-
-    A hand that touches the organ makes one large piece with it that leaves the picture. Then the
-    opening is widened until fingers are too narrow to connect.
-    """
-    edges = find_edges(picture, config)
-    best: Choice | None = None
-    for wider in _OPENINGS:
-        pieces, count = find_pieces(picture, edges, wider * config.opening_mm)
-        sizes = choose.sizes(picture, edges, pieces, count)
-        chosen = _chosen(picture, pieces, sizes, config, hints)
-        here = choose.choice(picture, pieces, sizes, chosen, config)
-        if best is None or here.score > _CLEARLY * best.score:
-            best = here
-        if not here.doubtful:
-            break
-    assert best is not None
-    picture.take(best.pieces == 0, pictures.THIN)
-    together = best.together
-    if hints.last_box_mm is not None and together.any():
-        together = together | choose.parts_of(picture, best, hints.last_box_mm)
-    picture.take(~together[best.pieces], pictures.PIECES)
-
-
-def _chosen(
-    picture: Picture, pieces: np.ndarray, sizes: Sizes, config: RegionConfig, hints: Hints
-) -> tuple[int | None, bool]:
-    """The piece that the hints name, else the likeliest; and whether it is only the likeliest."""
-    if hints.picked_mm is not None:
-        return choose.under_point(picture, pieces, hints.picked_mm), False
-    if hints.last_box_mm is not None:
-        piece = choose.under_box(picture, pieces, sizes, hints.last_box_mm)
-        if piece is not None:
-            return piece, False
-    return choose.likeliest(sizes, config), True
-
-
-def _too_few(left: int, counts: dict[str, int], config: RegionConfig) -> str:
-    took = ", ".join(f"{name} {n}" for name, n in counts.items() if n and name != "organ")
-    return (
-        f"only {left} points are left for the organ; at least {FEWEST_POINTS} are needed. Of "
-        f"{sum(counts.values())} pixels went to: {took or 'nothing'} (range "
-        f"{config.crop.near_mm:g}..{config.crop.far_mm:g} mm). Move the camera, widen what took "
-        "most, or switch that step off."
-    )

@@ -3,17 +3,26 @@ continues it behind something nearer; and what lies wholly in the last estimate'
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
 from tumortrack.core.errors import NoEstimate
-from tumortrack.sense.region.config import RegionConfig
-from tumortrack.sense.region.picture import FLYING, LAST_BOX, Picture, jit
-from tumortrack.sense.region.pieces import Edges
+from tumortrack.sense.region.picture import (
+    FLYING,
+    LAST_BOX,
+    PIECES,
+    THIN,
+    Hints,
+    Picture,
+    RegionConfig,
+    jit,
+)
+from tumortrack.sense.region.pieces import find_edges, find_pieces
 
-PICK_REACH_MM = 10.0  # from the picked point to the piece it means
+_OPENINGS = (1.0, 1.7, 2.8)  # times ``opening_mm``: the last is wider than fingers
+_CLEARLY = 1.1  # better by so much is worth a wider opening
+_PICK_REACH_MM = 10.0  # from the picked point to the piece it means
 _STEEPEST_GAP = 0.5  # slope of a surface behind what hides part of it
 _STEP_MM = 3.0
 _SAME_MM = 5.0  # neighbouring pixels of one surface
@@ -30,47 +39,43 @@ _AIMED = 0.4  # so far (tangent) from the optical axis a piece is half as likely
 _THICK = 0.8  # of an organ's shortest extent: thinner pieces are likely fingers or shafts
 
 
-def under_point(picture: Picture, pieces: np.ndarray, point_mm: np.ndarray) -> int:
-    """The piece nearest to a point (3,), camera frame, mm.
+def take_one_piece(picture: Picture, config: RegionConfig, hints: Hints) -> None:
+    """Leave one piece (and what continues it) to the organ. NoEstimate: a point was picked, and no
+    piece lies within 10 mm of it.
 
-    Raises:
-        NoEstimate: none within 10 mm.
+    A hand that touches the organ makes one large piece with it that leaves the picture. Then the
+    opening is widened until fingers are too narrow to connect.
     """
-    square, piece = _nearest(
-        picture.depth_mm, pieces, picture.pinhole, np.asarray(point_mm, np.float64)
-    )
-    if not square <= PICK_REACH_MM**2:
-        there = ", ".join(f"{x:.0f}" for x in point_mm)
-        raise NoEstimate(
-            f"no piece of the scene lies within {PICK_REACH_MM:g} mm of the picked point "
-            f"({there}) mm: it is on the background, on something thin, or outside the range. "
-            "Pick again, or clear the pick."
-        )
-    return int(piece)
+    edges = find_edges(picture, config)
+    best: tuple[float, np.ndarray, _Sizes, np.ndarray] | None = None
+    for wider in _OPENINGS:
+        pieces, count = find_pieces(picture, edges, config, wider)
+        seen = (picture.depth_mm, edges[1], picture.taken)
+        these = _measure(*seen, pieces, picture.pinhole, count)
+        together, score, doubtful = _chosen(picture, pieces, these, config, hints)
+        if best is None or score > _CLEARLY * best[0]:
+            best = score, pieces, these, together
+        if not doubtful:
+            break
+    assert best is not None
+    _, pieces, these, together = best
+    picture.take(pieces == 0, THIN)
+    if hints.last_box_mm is not None and together.any():
+        # A tumor that stands out, a part beyond a crease: wholly in the box, not at its far side,
+        # and not thin.
+        low, high = np.sort(np.asarray(hints.last_box_mm, np.float64), axis=0)
+        high[2] -= _FAR_SIDE * (high[2] - low[2])
+        area = _area_in_box(picture, pieces, these, low - _BOX_MM, high + _BOX_MM)
+        parts = (area > _WHOLLY * these.area_mm2) & (these.thick_mm > _THICK_PART_MM) & (area > 0)
+        together = together | parts
+    picture.take(~together[pieces], PIECES)
 
 
-def under_box(
-    picture: Picture, pieces: np.ndarray, these: Sizes, corners_mm: np.ndarray
-) -> int | None:
-    """The piece with the most surface, and the most of its surface, in a box (2, 3); None if none
-    has any."""
-    low, high = np.sort(np.asarray(corners_mm, np.float64), axis=0)
-    area = _area_inside(picture.depth_mm, pieces, picture.pinhole, low, high, len(these.cut))
-    inside = area**2 / np.maximum(these.area_mm2, 1e-9)  # what surrounds it reaches in, too
-    return int(inside.argmax()) if inside.max() > 0 else None
-
-
-class Sizes(NamedTuple):
-    """Of every piece (count + 1,); entry 0 is not used.
-
-    Attributes:
-        area_mm2: across the line of sight.
-        wide_mm: longest extent.
-        cut: 0..1, how much of it continues outside the examined part: the width there over the
-            square root of the area.
-        thick_mm: diameter of the largest disc in it.
-        aside: tangent of the angle between its middle and the optical axis.
-    """
+class _Sizes(NamedTuple):
+    """Of every piece (count + 1,); entry 0 is not used. ``area_mm2``: across the line of sight.
+    ``wide_mm``: longest extent. ``cut``: 0..1, how much of it continues outside the examined part:
+    the width there over the square root of the area. ``thick_mm``: diameter of the largest disc in
+    it. ``aside``: tangent of the angle between its middle and the optical axis."""
 
     area_mm2: np.ndarray
     wide_mm: np.ndarray
@@ -79,54 +84,27 @@ class Sizes(NamedTuple):
     aside: np.ndarray
 
 
-def sizes(picture: Picture, edges: Edges, pieces: np.ndarray, count: int) -> Sizes:
-    return _measure(picture.depth_mm, edges.distance, picture.taken, pieces, picture.pinhole, count)
-
-
-def likeliest(these: Sizes, config: RegionConfig) -> int | None:
-    """The largest piece of an organ's size; what leaves the picture counts less, as arms do."""
-    score = these.area_mm2 * _like_an_organ(these, config)
-    return int(score.argmax()) if score.max() > 0 else None
-
-
-@dataclass(frozen=True, eq=False)
-class Choice:
-    """What is taken for the organ at one way of parting the picture.
-
-    Attributes:
-        pieces: number of its piece for every pixel (h, w).
-        these: their sizes.
-        together: (count + 1,) bool, which of them.
-        score: how like an organ it is; the largest of several choices is the best.
-        doubtful: it leaves the picture or is too wide, or something that does seems to continue
-            it: perhaps a wider opening parts them.
-    """
-
-    pieces: np.ndarray
-    these: Sizes
-    together: np.ndarray
-    score: float
-    doubtful: bool
-
-
-def choice(
-    picture: Picture,
-    pieces: np.ndarray,
-    these: Sizes,
-    chosen: tuple[int | None, bool],
-    config: RegionConfig,
-) -> Choice:
-    """The chosen piece (None: there is none; and whether it is a guess), and those that continue
-    it behind something nearer."""
-    piece, guessed = chosen
+def _chosen(
+    picture: Picture, pieces: np.ndarray, these: _Sizes, config: RegionConfig, hints: Hints
+) -> tuple[np.ndarray, float, bool]:
+    """Which pieces (count + 1,) are the organ at one way of parting the picture: the one that the
+    hints name, else the likeliest (the largest of an organ's size; what leaves the picture counts
+    less, as arms do), and those that continue it behind something nearer. How like an organ that
+    is; and whether it is doubtful: it leaves the picture or is too wide, or something that does
+    seems to continue it, so that perhaps a wider opening parts them."""
+    likeness = _like_an_organ(these, config)
     together = np.zeros(len(these.cut), bool)
-    if piece is None:
-        return Choice(pieces, these, together, -1.0, True)
+    piece = _hinted(picture, pieces, these, hints)
+    guessed = piece is None
+    if guessed:
+        scores = these.area_mm2 * likeness
+        if not scores.max() > 0:
+            return together, -1.0, True
+        piece = int(scores.argmax())
     leaves = these.cut > _CUT
     gap = config.gap_mm / picture.footprint
-    lines = _continuing(
-        picture.depth_mm, picture.taken, pieces, gap, picture.footprint, len(together)
-    )
+    seen = (picture.depth_mm, picture.taken, pieces)
+    lines = _continuing(*seen, gap, picture.footprint, len(together))
     lines = lines + lines.T
     together[piece] = True
     refused = False
@@ -135,48 +113,53 @@ def choice(
         more[0] = False
         refused |= bool((more & leaves & ~together).any())
         together |= more & ~leaves
-    likeness = _like_an_organ(these, config)[piece]
-    score = these.area_mm2[together].sum() * likeness
+    score = these.area_mm2[together].sum() * likeness[piece]
     too_wide = these.wide_mm[piece] > config.organ_mm[1]
     # A poor guess beside something larger that leaves the picture: a hand that holds the organ?
-    held = guessed and likeness < _POOR and these.area_mm2[leaves].max(initial=0) > score
+    larger = these.area_mm2[leaves].max(initial=0) > score
+    held = guessed and likeness[piece] < _POOR and larger
     doubtful = refused or leaves[piece] or too_wide or held
-    return Choice(pieces, these, together, float(score), bool(doubtful))
+    return together, float(score), bool(doubtful)
 
 
-def parts_of(picture: Picture, taken: Choice, corners_mm: np.ndarray) -> np.ndarray:
-    """Further pieces (count + 1,), bool, that lie wholly in the last estimate's box (2, 3), not at
-    its far side, and are not thin: a tumor that stands out, a part beyond a crease."""
-    low, high = np.sort(np.asarray(corners_mm, np.float64), axis=0)
-    high[2] -= _FAR_SIDE * (high[2] - low[2])
-    low, high = low - _BOX_MM, high + _BOX_MM
-    these = taken.these
-    area = _area_inside(picture.depth_mm, taken.pieces, picture.pinhole, low, high, len(these.cut))
-    return (area > _WHOLLY * these.area_mm2) & (these.thick_mm > _THICK_PART_MM) & (area > 0)
+def _hinted(picture: Picture, pieces: np.ndarray, these: _Sizes, hints: Hints) -> int | None:
+    """The piece nearest to the picked point; without one, that with the most surface, and the most
+    of its surface, in the last box. None if there is none."""
+    if hints.picked_mm is not None:
+        rows, columns = np.nonzero(pieces)
+        z, (fx, fy, cx, cy) = picture.depth_mm[rows, columns].astype(float), picture.pinhole
+        points_mm = np.stack([(columns - cx) / fx * z, (rows - cy) / fy * z, z], axis=1)
+        square = ((points_mm - hints.picked_mm) ** 2).sum(1)
+        if not square.min(initial=np.inf) <= _PICK_REACH_MM**2:
+            there = ", ".join(f"{x:.0f}" for x in hints.picked_mm)
+            raise NoEstimate(
+                f"no piece of the scene lies within {_PICK_REACH_MM:g} mm of the picked point "
+                f"({there}) mm: it is on the background, on something thin, or outside the range. "
+                "Pick again, or clear the pick."
+            )
+        nearest = square.argmin()
+        return int(pieces[rows[nearest], columns[nearest]])
+    if hints.last_box_mm is None:
+        return None
+    low, high = np.sort(np.asarray(hints.last_box_mm, np.float64), axis=0)
+    area = _area_in_box(picture, pieces, these, low, high)
+    inside = area**2 / np.maximum(these.area_mm2, 1e-9)  # what surrounds it reaches in, too
+    return int(inside.argmax()) if inside.max() > 0 else None
 
 
-def _like_an_organ(these: Sizes, config: RegionConfig) -> np.ndarray:
+def _area_in_box(
+    picture: Picture, pieces: np.ndarray, these: _Sizes, low: np.ndarray, high: np.ndarray
+) -> np.ndarray:
+    return _area_inside(picture.depth_mm, pieces, picture.pinhole, low, high, len(these.cut))
+
+
+def _like_an_organ(these: _Sizes, config: RegionConfig) -> np.ndarray:
     """Of every piece, 0..1."""
     low, high = config.organ_mm
     fits = np.minimum(1.0, (high / np.maximum(these.wide_mm, 1e-9)) ** 4)
     thick = np.minimum(1.0, these.thick_mm / (_THICK * low)) ** 2
     aimed = 1 / (1 + (these.aside / _AIMED) ** 2)
     return fits * thick * aimed * (1 - 0.95 * these.cut) ** 4 * (these.wide_mm > low)
-
-
-@jit
-def _nearest(depth_mm, pieces, pinhole, point):  # type: ignore[no-untyped-def]
-    fx, fy, cx, cy = pinhole
-    best, piece = np.inf, 0
-    for v in range(len(depth_mm)):
-        for u in range(depth_mm.shape[1]):
-            if pieces[v, u]:
-                z = depth_mm[v, u]
-                x, y = (u - cx) / fx * z - point[0], (v - cy) / fy * z - point[1]
-                square = x * x + y * y + (z - point[2]) ** 2
-                if square < best:
-                    best, piece = square, pieces[v, u]
-    return best, piece
 
 
 @jit
@@ -236,7 +219,7 @@ def _measure(depth_mm, distance, taken, pieces, pinhole, count):  # type: ignore
             wide[piece] = (high[piece] - low[piece]).max()
             cut[piece] = min(border[piece] / np.sqrt(area[piece]), 1.0)
     aside = np.sqrt((middle**2).sum(1)) / np.maximum(pixels, 1)
-    return Sizes(area, wide, cut, 2 * disc, aside)
+    return _Sizes(area, wide, cut, 2 * disc, aside)
 
 
 @jit

@@ -1,4 +1,5 @@
-"""Depth image or cloud -> the working picture that all steps share; and back to points."""
+"""What finding the organ works on: its switches, hints, and the working picture that all steps
+share, made of a depth image or a cloud; and back to points."""
 
 from __future__ import annotations
 
@@ -7,14 +8,18 @@ from dataclasses import dataclass
 
 import numba
 import numpy as np
+from jaxtyping import Bool, Float
 
+from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError
 from tumortrack.core.types import DepthFrame, SensorCloud
 from tumortrack.sense.camera import Pinhole, deproject_pixels
+from tumortrack.sense.cloud import CloudConfig
 
 MOST_PIXELS = 110_000  # of a working picture: 424 x 240, and every second pixel of 848 x 480
 _POINTS_PER_PIXEL = 2
 _WIDEST = 2.0  # tangent of the largest angle from the optical axis in a rasterised cloud
+_BINS = 1000  # of the histogram of tangents
 
 # What became of a pixel: still the organ's, or the step that took it.
 ORGAN, NO_RETURN, RANGE, BOX, MASK, LAST_BOX, PLANE, FLYING, THIN, PIECES = range(10)
@@ -23,20 +28,95 @@ STEPS = (
     *("last box", "plane", "flying", "thin", "other pieces"),
 )
 
-
 jit = numba.njit(cache=True, nogil=True)
+
+
+class RegionConfig(Config, frozen=True, kw_only=True):
+    """From a whole depth image to the organ's points; camera frame, mm.
+
+    crop: depths kept, and how many points are drawn at the end.
+    box_mm: region of interest, two opposite corners; None: everywhere.
+    last_margin_mm: the last estimate's organ box, enlarged by this much on every side, narrows the
+        crop; zero switches that off.
+    plane: remove the large plane behind the organ (table, drape), and what lies behind it.
+    plane_mm: at most this far from the plane is still the plane: how uneven a drape may be.
+    plane_share: of everything seen, at least this share must lie on it.
+    flying: remove points that have hardly a neighbour in depth.
+    pieces: take one connected piece; zero ``opening_mm`` and ``gap_mm`` leave it as it is.
+    opening_mm: what is narrower than twice this is no piece of its own and connects nothing:
+        shafts, the strip where a finger touches.
+    crease_mm: a valley deeper than this over 4 mm to either side parts two pieces; zero: never.
+    gap_mm: pieces that continue each other behind something nearer and not wider than this are
+        one: an organ behind a shaft.
+    steepest_degrees: neighbouring pixels whose depths differ by more than a surface turned away by
+        this much (and noise) would explain are parted.
+    noise_mm: standard deviation of depth at 150 mm; grows with z^2.
+    organ_mm: longest and shortest extent of pieces that may be the organ, if no hint names it.
+    """
+
+    crop: CloudConfig = CloudConfig()
+    box_mm: tuple[tuple[float, float, float], tuple[float, float, float]] | None = None
+    last_margin_mm: float = 20.0
+    plane: bool = True
+    plane_mm: float = 5.0
+    plane_share: float = 0.15
+    flying: bool = True
+    pieces: bool = True
+    opening_mm: float = 3.0
+    crease_mm: float = 1.2
+    gap_mm: float = 20.0
+    steepest_degrees: float = 75.0
+    noise_mm: float = 0.2
+    organ_mm: tuple[float, float] = (30.0, 160.0)
+
+    def __post_init__(self) -> None:
+        self.check_ranges(
+            *("region", "0"),
+            last_margin_mm=1e3,
+            plane_mm=50,
+            plane_share=1,
+            opening_mm=20,
+            crease_mm=20,
+            gap_mm=100,
+            steepest_degrees=89,
+            noise_mm=10,
+        )
+        if not 0 < self.organ_mm[0] < self.organ_mm[1]:
+            raise InputError(
+                f"region organ_mm is {self.organ_mm}; give two sizes in mm, the smaller first."
+            )
+        if self.box_mm is not None and not all(
+            abs(a - b) > 1 for a, b in zip(*self.box_mm, strict=True)
+        ):
+            raise InputError(
+                f"region box_mm is {self.box_mm}; give two opposite corners (x y z, camera frame, "
+                "mm) at least 1 mm apart along each axis."
+            )
+
+
+@dataclass(frozen=True, eq=False)
+class Hints:
+    """What is known about a frame besides its depth.
+
+    Attributes:
+        mask: of a depth image's pixels, True where the organ may be.
+        picked_mm: a point on the organ, camera frame: it decides which piece is taken. Organs move:
+            once there is an estimate, give its box instead.
+        last_box_mm: lower and upper corner of the last estimate's organ, camera frame.
+    """
+
+    mask: Bool[np.ndarray, "h w"] | None = None
+    picked_mm: Float[np.ndarray, " 3"] | None = None
+    last_box_mm: Float[np.ndarray, "2 3"] | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class Picture:
     """A depth image at working size, and what the steps have decided about its pixels so far.
 
-    Attributes:
-        depth_mm: (h, w) float32, NaN where there was no return.
-        taken: (h, w) uint8, one of the numbers above; the steps write into it.
-        pinhole: of the working picture.
-        left: ``taken`` -> which points of the content are still called ORGAN, (n,) int.
-        points: some of these -> points (n, 3), camera frame, mm, float32.
+    ``depth_mm`` (h, w) is float32, NaN where there was no return; ``taken`` (h, w), uint8, is one
+    of the numbers above, and the steps write into it. ``left``: ``taken`` -> which points of the
+    content are still called ORGAN (n,); ``points``: of some of these (n, 3), camera frame, mm.
     """
 
     depth_mm: np.ndarray
@@ -54,40 +134,32 @@ class Picture:
         """Give the pixels (h, w, bool) that are still the organ's to a step."""
         self.taken[where & (self.taken == ORGAN)] = step
 
-    def remaining(self) -> tuple[slice, slice]:
-        """The rows and columns that hold what is left, and one more to each side."""
-        rows, columns = (np.flatnonzero((self.taken == ORGAN).any(axis)) for axis in (1, 0))
-        if not len(rows):
-            return slice(0, 1), slice(0, 1)
-        tall, wide = (slice(max(int(i[0]) - 1, 0), int(i[-1]) + 2) for i in (rows, columns))
-        return tall, wide
-
-    def part(self, window: tuple[slice, slice]) -> Picture:
-        """Those rows and columns alone; what is decided there must be written back."""
+    def cropped(self) -> tuple[tuple[slice, slice], Picture]:
+        """The rows and columns that hold what is left, and one more to each side; and these alone:
+        what is decided there must be written back."""
+        tall = wide = slice(0, 1)
+        left = self.taken == ORGAN
+        if left.any():
+            ends = (np.flatnonzero(left.any(axis))[[0, -1]].tolist() for axis in (1, 0))
+            tall, wide = (slice(max(first - 1, 0), last + 2) for first, last in ends)
         fx, fy, cx, cy = self.pinhole
-        pinhole = Pinhole(fx, fy, cx - window[1].start, cy - window[0].start)
-        depth_mm, taken = self.depth_mm[window].copy(), self.taken[window].copy()
-        return Picture(depth_mm, taken, pinhole, self.left, self.points)
+        pinhole = Pinhole(fx, fy, cx - wide.start, cy - tall.start)
+        depth_mm, taken = self.depth_mm[tall, wide].copy(), self.taken[tall, wide].copy()
+        return (tall, wide), Picture(depth_mm, taken, pinhole, self.left, self.points)
 
     def counts(self) -> dict[str, int]:
         """Pixels by what became of them."""
-        return dict(zip(STEPS, _count(self.taken, len(STEPS)).tolist(), strict=True))
+        found = np.bincount(self.taken.ravel(), minlength=len(STEPS))
+        return dict(zip(STEPS, found.tolist(), strict=True))
 
 
 def picture_of_frame(frame: DepthFrame, mask: np.ndarray | None) -> Picture:
-    """Every pixel of a small frame, every second, third ... of a large one.
-
-    Raises:
-        InputError: the mask's shape is not the image's.
-    """
+    """Every pixel of a small frame, every second, third ... of a large one."""
     camera = frame.intrinsics
     step = int(np.ceil(np.sqrt(frame.depth_mm.size / MOST_PIXELS)))
     some = (slice(step // 2, None, step), slice(step // 2, None, step))
     depth_mm = frame.depth_mm[some].copy()
     taken = np.isnan(depth_mm).view(np.uint8) * np.uint8(NO_RETURN)
-
-    def left(taken: np.ndarray) -> np.ndarray:
-        return np.flatnonzero(taken == ORGAN)
 
     def points(pixel: np.ndarray) -> np.ndarray:
         row, column = np.divmod(pixel, depth_mm.shape[1])
@@ -95,13 +167,9 @@ def picture_of_frame(frame: DepthFrame, mask: np.ndarray | None) -> Picture:
         seen_mm = frame.depth_mm[row, column].astype(np.float64)
         return deproject_pixels(row * camera.width + column, seen_mm, camera)
 
-    pinhole = Pinhole(
-        camera.fx / step,
-        camera.fy / step,
-        (camera.cx - step // 2) / step,
-        (camera.cy - step // 2) / step,
-    )
-    picture = Picture(depth_mm, taken, pinhole, left, points)
+    cx, cy = (camera.cx - step // 2) / step, (camera.cy - step // 2) / step
+    pinhole = Pinhole(camera.fx / step, camera.fy / step, cx, cy)
+    picture = Picture(depth_mm, taken, pinhole, lambda now: np.flatnonzero(now == ORGAN), points)
     if mask is not None:
         if mask.shape != frame.depth_mm.shape:
             raise InputError(
@@ -118,21 +186,21 @@ def picture_of_cloud(cloud: SensorCloud) -> Picture:
     Points at or behind the camera's centre are left out, and so are those behind another.
     """
     points_mm = cloud.points_mm
-    tangents, low, high, inner = _spread(points_mm.copy(), _WIDEST)
+    tangents, low, high, inner = _spread(points_mm.copy())
+    z = points_mm[:, 2].copy()
     # Stray points widen the picture, but don't coarsen it.
-    pixels = max(len(tangents) / _POINTS_PER_PIXEL, 64.0)
+    pixels = max(len(points_mm) / _POINTS_PER_PIXEL, 64.0)
     most = np.prod(high - low + 1e-3) / MOST_PIXELS
     size = float(np.sqrt(max(np.prod(inner + 1e-3) / pixels, most)))
     width, height = (int(n) for n in np.floor((high - low) / size) + 1)
     pinhole = Pinhole(1 / size, 1 / size, float(-low[0] / size), float(-low[1] / size))
-    depth_mm, pixel = _rasterise(tangents, points_mm[:, 2].copy(), pinhole, height, width)
+    depth_mm, pixel = _rasterise(tangents, z, pinhole, (height, width))
     taken = np.isnan(depth_mm).view(np.uint8) * np.uint8(NO_RETURN)
 
     def left(taken: np.ndarray) -> np.ndarray:
         seen = np.flatnonzero(pixel >= 0)
         seen = seen[taken.ravel()[pixel[seen]] == ORGAN]
-        behind_mm = points_mm[seen, 2] - depth_mm.ravel()[pixel[seen]]
-        return seen[behind_mm < 2 + 2 * size * points_mm[seen, 2]]
+        return seen[z[seen] - depth_mm.ravel()[pixel[seen]] < 2 + 2 * size * z[seen]]
 
     return Picture(depth_mm, taken, pinhole, left, lambda some: points_mm[some])
 
@@ -146,32 +214,28 @@ def keep_inside(picture: Picture, corners_mm: np.ndarray, step: int) -> None:
 @jit
 def _keep_inside(depth_mm, taken, pinhole, low, high, step):  # type: ignore[no-untyped-def]
     fx, fy, cx, cy = pinhole
-    height, width = depth_mm.shape
-    for v in range(height):
+    for v in range(len(depth_mm)):
         slope_y = (v - cy) / fy
-        for u in range(width):
-            if taken[v, u]:
-                continue
+        for u in range(depth_mm.shape[1]):
             z = depth_mm[v, u]
             x, y = (u - cx) / fx * z, slope_y * z
             inside = low[2] < z < high[2] and low[1] < y < high[1] and low[0] < x < high[0]
-            if not inside:
+            if not taken[v, u] and not inside:
                 taken[v, u] = step
 
 
 @jit
-def _spread(points_mm, widest):  # type: ignore[no-untyped-def]
-    """x / z and y / z (n, 2), NaN where not before the camera or wider than ``widest``; their
-    extremes (2,) and (2,); and how far the middle 96 % spread (2,), from a histogram: the order of
-    the points doesn't matter."""
+def _spread(points_mm):  # type: ignore[no-untyped-def]
+    """x / z and y / z (n, 2), NaN where not before the camera or too wide; their extremes (2,) and
+    (2,); and how far the middle 96 % spread (2,), from a histogram: the order of the points doesn't
+    matter."""
     tangents = np.full((len(points_mm), 2), np.nan, np.float32)
-    low, high = np.full(2, np.inf), np.full(2, -np.inf)
-    count = 0
+    low, high, count = np.full(2, np.inf), np.full(2, -np.inf), 0
     for i in range(len(points_mm)):
         z = points_mm[i, 2]
         if z > 1.0:
             x, y = points_mm[i, 0] / z, points_mm[i, 1] / z
-            if abs(x) < widest and abs(y) < widest:
+            if abs(x) < _WIDEST and abs(y) < _WIDEST:
                 tangents[i, 0], tangents[i, 1] = x, y
                 low[0], low[1] = min(low[0], x), min(low[1], y)
                 high[0], high[1] = max(high[0], x), max(high[1], y)
@@ -183,46 +247,32 @@ def _spread(points_mm, widest):  # type: ignore[no-untyped-def]
 
 @jit
 def _inner_spread(tangents, low, high, count):  # type: ignore[no-untyped-def]
-    bins = 1000
-    found = np.zeros((2, bins), np.int64)
+    inner, found = np.zeros(2), np.zeros((2, _BINS), np.int64)
     for i in range(len(tangents)):
         if not np.isnan(tangents[i, 0]):
             for k in range(2):
                 share = (tangents[i, k] - low[k]) / max(high[k] - low[k], 1e-9)
-                found[k, min(int(share * bins), bins - 1)] += 1
-    inner = np.zeros(2)
+                found[k, min(int(share * _BINS), _BINS - 1)] += 1
     for k in range(2):
         total = 0
         for one in found[k]:
             total += one
             if 0.02 * count < total < 0.98 * count:
-                inner[k] += (high[k] - low[k]) / bins
+                inner[k] += (high[k] - low[k]) / _BINS
     return inner
 
 
 @jit
-def _rasterise(tangents, z_mm, pinhole, height, width):  # type: ignore[no-untyped-def]
+def _rasterise(tangents, z_mm, pinhole, shape):  # type: ignore[no-untyped-def]
     """The nearest depth in each pixel (h, w), and each point's pixel (n,), -1 outside."""
     fx, fy, cx, cy = pinhole
-    depth_mm = np.full(height * width, np.nan, np.float32)
-    pixel = np.full(len(tangents), -1, np.int32)
-    for i in range(len(tangents)):
-        if np.isnan(tangents[i, 0]):
-            continue
-        u = int(fx * tangents[i, 0] + cx + 0.5)
-        v = int(fy * tangents[i, 1] + cy + 0.5)
-        if 0 <= u < width and 0 <= v < height:
-            place = v * width + u
-            pixel[i] = place
-            if not depth_mm[place] <= z_mm[i]:
-                depth_mm[place] = z_mm[i]
-    return depth_mm.reshape(height, width), pixel
-
-
-@jit
-def _count(taken, kinds):  # type: ignore[no-untyped-def]
-    found = np.zeros(kinds, np.int64)
-    for v in range(len(taken)):
-        for u in range(taken.shape[1]):
-            found[taken[v, u]] += 1
-    return found
+    depth_mm = np.full(shape[0] * shape[1], np.nan, np.float32)
+    pixel = np.full(len(z_mm), -1, np.int32)
+    for i in range(len(z_mm)):
+        if not np.isnan(tangents[i, 0]):
+            u, v = int(fx * tangents[i, 0] + cx + 0.5), int(fy * tangents[i, 1] + cy + 0.5)
+            if 0 <= u < shape[1] and 0 <= v < shape[0]:
+                place = pixel[i] = v * shape[1] + u
+                if not depth_mm[place] <= z_mm[i]:
+                    depth_mm[place] = z_mm[i]
+    return depth_mm.reshape(shape), pixel

@@ -8,14 +8,12 @@ grow from their cores, by little more than what the opening took, and never over
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
 from tumortrack.sense.noise import REFERENCE_MM
-from tumortrack.sense.region.config import RegionConfig
-from tumortrack.sense.region.picture import FLYING, ORGAN, Picture, jit
+from tumortrack.sense.region.picture import FLYING, ORGAN, Picture, RegionConfig, jit
 
 _CREASE_REACH_MM = 4.0
 _FEWEST_NEIGHBOURS = 3  # of 8; a straight edge leaves 5, a right angle 3
@@ -37,40 +35,35 @@ def _jump(picture: Picture, config: RegionConfig) -> Jump:
 
 def remove_flying(picture: Picture, config: RegionConfig) -> None:
     """Take pixels with hardly a neighbour at their depth: between two surfaces, or alone."""
-    _take_lonely(picture.depth_mm, picture.taken, _jump(picture, config))
+    picture.take(_lonely(picture.depth_mm, picture.taken, _jump(picture, config)), FLYING)
 
 
-@dataclass(frozen=True, eq=False)
-class Edges:
-    """Where the picture may part: ``depth_mm`` (h, w) with short holes bridged, NaN where nothing
-    is left; ``distance`` (h, w) of every pixel to the nearest edge, px."""
-
-    depth_mm: np.ndarray
-    distance: np.ndarray
-    jump: Jump
-
-
-def find_edges(picture: Picture, config: RegionConfig) -> Edges:
-    """Edges between what is left of the picture."""
+def find_edges(picture: Picture, config: RegionConfig) -> tuple[np.ndarray, np.ndarray]:
+    """Where the picture may part: what is left of its depths (h, w), mm, with short holes bridged
+    and NaN elsewhere; and the distance (h, w) of every pixel to the nearest edge, px."""
     jump = _jump(picture, config)
     depth_mm = _without_holes(picture.depth_mm, picture.taken, jump)
     crease = (config.crease_mm, _CREASE_REACH_MM / picture.footprint)
-    return Edges(depth_mm, _edge_distance(depth_mm, jump, crease), jump)
+    return depth_mm, _edge_distance(depth_mm, jump, crease)
 
 
-def find_pieces(picture: Picture, edges: Edges, opening_mm: float) -> tuple[np.ndarray, int]:
-    """Number of its piece for every pixel (h, w), int32, 0 for none, and how many there are."""
+def find_pieces(
+    picture: Picture, edges: tuple[np.ndarray, np.ndarray], config: RegionConfig, wider: float
+) -> tuple[np.ndarray, int]:
+    """Number of its piece for every pixel (h, w), int32, 0 for none, and how many there are; at
+    ``wider`` times the configured opening."""
     from scipy.ndimage import label
 
-    radius = opening_mm / picture.footprint  # px at distance 1
-    pieces, count = label(edges.distance * edges.depth_mm > radius)
-    _grow(edges.depth_mm, pieces, edges.jump, radius)
+    depth_mm, distance = edges
+    radius = wider * config.opening_mm / picture.footprint  # px at distance 1
+    pieces, count = label(distance * depth_mm > radius)
+    _grow(depth_mm, pieces, _jump(picture, config), radius)
     pieces[picture.taken != ORGAN] = 0  # bridged holes
     return pieces, count
 
 
 @jit
-def _take_lonely(depth_mm, taken, jump):  # type: ignore[no-untyped-def]
+def _lonely(depth_mm, taken, jump):  # type: ignore[no-untyped-def]
     height, width = depth_mm.shape
     lonely = np.zeros((height, width), np.bool_)
     for v in range(height):
@@ -88,10 +81,7 @@ def _take_lonely(depth_mm, taken, jump):  # type: ignore[no-untyped-def]
                     else:
                         near += 1  # outside: unknown
             lonely[v, u] = near - 1 < _FEWEST_NEIGHBOURS
-    for v in range(height):
-        for u in range(width):
-            if lonely[v, u]:
-                taken[v, u] = FLYING
+    return lonely
 
 
 @jit

@@ -8,12 +8,9 @@ little behind a plane speak against it.
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 
-from tumortrack.sense.region.config import RegionConfig
-from tumortrack.sense.region.picture import NO_RETURN, PLANE, Picture, jit
+from tumortrack.sense.region.picture import NO_RETURN, PLANE, Picture, RegionConfig, jit
 
 _SAMPLED = 1200  # pixels
 _TRIES = 150
@@ -25,45 +22,24 @@ _MOST_BEHIND = 0.03  # of the points on the plane: more is a cavity, and the org
 _NARROWEST_MM = 120.0  # extent of a background across its long side
 
 
-class BackgroundPlane(NamedTuple):
-    """Points with ``normal @ point = offset_mm``; the unit normal points to the camera, so that
-    ``normal @ point - offset_mm`` is the height above it. ``half_mm``: what is lower belongs to
-    the plane."""
-
-    normal: np.ndarray
-    offset_mm: float
-    half_mm: float
-
-
-def remove_plane(
-    picture: Picture, config: RegionConfig, rng: np.random.Generator
-) -> BackgroundPlane | None:
-    """Take the background plane and what lies behind it, where there is one."""
-    plane = find_plane(picture, config, rng)
-    if plane is not None:
-        _take_below(picture.depth_mm, picture.taken, picture.pinhole, plane)
-    return plane
-
-
-def find_plane(
-    picture: Picture, config: RegionConfig, rng: np.random.Generator
-) -> BackgroundPlane | None:
-    """The background plane, seen in all pixels (also those that other steps have taken)."""
+def remove_plane(picture: Picture, config: RegionConfig, rng: np.random.Generator) -> None:
+    """Take the background plane, looked for in all pixels (also those that other steps have taken),
+    and what lies behind it, where there is one."""
     points = _some_points(picture, config.crop.far_mm + _BEYOND_MM, rng)
     if len(points) < 50:
-        return None
+        return
     # Uneven, and noisy: three standard deviations.
     most_mm = config.plane_mm + 3 * config.noise_mm * float(np.median(points[:, 2]) / 150) ** 2
     triples = rng.integers(len(points), size=(_TRIES, 3))
     score, normal, offset = _consensus(points, triples, most_mm)
     if score < config.plane_share / 2 * len(points):
-        return None
+        return
     half_mm = most_mm
     for _ in range(3):
         height = points @ normal - offset
         inliers = points[np.abs(height) < half_mm]
         if len(inliers) < 20:
-            return None
+            return
         middle = inliers.mean(0)
         apart = inliers - middle
         spreads, axes = np.linalg.eigh(apart.T @ apart / len(apart))
@@ -76,12 +52,13 @@ def find_plane(
     behind = np.count_nonzero((height < -half_mm) & (height > -_DEEPEST_MM))
     # A strip or disc of even density is sqrt(12) or 4 standard deviations wide.
     wide_mm = np.sqrt(12 * spreads[1])
-    good = (
+    if (
         on >= config.plane_share * len(points)
         and behind <= _MOST_BEHIND * on
         and wide_mm >= _NARROWEST_MM
-    )
-    return BackgroundPlane(normal.astype(np.float64), offset, half_mm) if good else None
+    ):
+        normal = normal.astype(np.float64)
+        _take_below(picture.depth_mm, picture.taken, picture.pinhole, normal, offset, half_mm)
 
 
 def _some_points(picture: Picture, far_mm: float, rng: np.random.Generator) -> np.ndarray:
@@ -91,11 +68,8 @@ def _some_points(picture: Picture, far_mm: float, rng: np.random.Generator) -> n
     z = picture.depth_mm.ravel()[pixel]
     good = np.flatnonzero((picture.taken.ravel()[pixel] != NO_RETURN) & (z < far_mm))[:_SAMPLED]
     row, column = np.divmod(pixel[good], width)
-    fx, fy, cx, cy = picture.pinhole
-    z = z[good]
-    out = np.empty((len(good), 3), np.float32)
-    out[:, 0], out[:, 1], out[:, 2] = (column - cx) / fx * z, (row - cy) / fy * z, z
-    return out
+    (fx, fy, cx, cy), z = picture.pinhole, z[good]
+    return np.stack([(column - cx) / fx * z, (row - cy) / fy * z, z], axis=1).astype(np.float32)
 
 
 @jit
@@ -140,9 +114,10 @@ def _score(points, nx, ny, nz, offset, tolerance):  # type: ignore[no-untyped-de
 
 
 @jit
-def _take_below(depth_mm, taken, pinhole, plane):  # type: ignore[no-untyped-def]
+def _take_below(depth_mm, taken, pinhole, normal, offset, half):  # type: ignore[no-untyped-def]
+    """Take what lies less than ``half`` above the plane ``normal @ point = offset``, mm; the unit
+    normal points to the camera."""
     fx, fy, cx, cy = pinhole
-    normal, offset, half = plane
     height, width = depth_mm.shape
     for v in range(height):
         across = normal[1] * (v - cy) / fy + normal[2]

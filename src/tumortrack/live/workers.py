@@ -1,0 +1,241 @@
+"""The threads round the loop: one reads the source, and each sink works in one of its own, so that
+none holds up the loop or another."""
+
+from __future__ import annotations
+
+import threading
+import time
+import traceback
+from collections import deque
+from collections.abc import Callable
+from typing import Any
+
+from tumortrack.core.errors import InputError, TumortrackError
+from tumortrack.live.meter import Histogram
+from tumortrack.live.values import (
+    Observation,
+    Sink,
+    Source,
+    SourceEnded,
+    SourceLost,
+    TrackingResult,
+)
+
+_READ_S = 0.2  # one wait for a frame: how soon the thread sees that it is to stop
+_AGAIN_S = 1.0  # between two tries to open
+_FROZEN_S = 5.0  # without a frame: closed and opened again
+_DEFECTS = 5  # tracebacks that are kept
+_STOP_S = 2.0  # how long close waits for a source that hangs
+_CLOSE_S = 10.0  # for a sink to write what waits, and flush
+_SILENT_S = 2.0  # without a word from the loop: what a sink shows holds no longer
+
+
+class SourceWorker:
+    """Opens a source, reads it, and opens it again when it is lost. Of frames that come faster than
+    they are taken the newest stays, and the others count as dropped; a ``lossless`` source is read
+    only as they are taken."""
+
+    def __init__(self, open_source: Callable[[], Source]) -> None:
+        self._open = open_source
+        self._lock = threading.Condition()
+        self._newest: tuple[Observation | TumortrackError, str] | None = None
+        self._stop = threading.Event()
+        self._passed = 0  # replaced before they were taken, or dropped by sources that are closed
+        self._source: Source | None = None
+        self.latency_from = "arrival"  # what the age of what was taken counts from
+        self.trouble = "the source is not open yet"
+        self.ended = False
+        self.failure: Exception | None = None
+        self.defects: list[str] = []
+        self.opened = 0
+        self._thread = threading.Thread(target=self._run, name="source", daemon=True)
+        self._thread.start()
+
+    @property
+    def dropped(self) -> int:
+        """Frames that nobody got: overtaken by newer ones, here or in the source."""
+        return self._passed + (source.dropped if (source := self._source) else 0)
+
+    def born_ns(self, seen: Observation) -> int:
+        """When the frame just taken came to be, by ``time.time_ns``: its stamp, or where the source
+        has another clock, its arrival; of a source that waits for us, now."""
+        if self.latency_from == "stamp":
+            return seen.stamp_ns
+        return seen.arrived_ns if self.latency_from == "arrival" else time.time_ns()
+
+    def take(self, timeout_s: float) -> Observation | TumortrackError | None:
+        """The newest frame, or what was wrong with it; None if none came in time or all is over.
+
+        Raises whatever stopped the reading for good.
+        """
+        with self._lock:
+            self._lock.wait_for(lambda: self._newest is not None or self._over, timeout_s)
+            newest, self._newest = self._newest, None
+            self._lock.notify_all()
+        if newest is None:
+            if self.failure is not None:
+                raise self.failure
+            return None
+        taken, self.latency_from = newest
+        return taken
+
+    def close(self) -> None:
+        """Stop reading and close the source; one that hangs is left behind after 2 s."""
+        self._stop.set()
+        with self._lock:
+            self._lock.notify_all()
+        self._thread.join(_STOP_S)
+        if self._thread.is_alive() and (source := self._source) is not None:
+            source.close()
+
+    @property
+    def _over(self) -> bool:
+        return self.ended or self.failure is not None
+
+    def _run(self) -> None:
+        while not self._stop.is_set() and not self._over:
+            try:
+                self._read_all()
+            except SourceEnded:
+                self.ended = True
+            except Exception as error:
+                self._note(error)
+            if not self._over:
+                self._stop.wait(_AGAIN_S)
+        with self._lock:
+            self._lock.notify_all()
+
+    def _note(self, error: Exception) -> None:
+        """After it worked once, whatever it is may pass."""
+        if not self.opened and not isinstance(error, SourceLost):
+            self.failure = error  # handed to the loop, which raises it
+        elif isinstance(error, TumortrackError):
+            self.trouble = str(error)
+        else:
+            self.trouble = f"internal error, {_text_of(error)}"
+            self.defects.append("".join(traceback.format_exception(error)))
+            del self.defects[_DEFECTS:]
+
+    def _read_all(self) -> None:
+        source = self._open()
+        self._source = source
+        self.opened += 1
+        self.trouble = ""
+        try:
+            came = time.monotonic()
+            while not self._stop.is_set():
+                try:
+                    got: Observation | TumortrackError | None = source.read(_READ_S)
+                except InputError as error:
+                    got = error
+                if got is not None:
+                    came = time.monotonic()
+                    # Asked for again: some know whose clock it is from the first frame on only.
+                    clock = "stamp" if source.host_clock else "arrival"
+                    self._put(got, "taking" if source.lossless else clock)
+                elif time.monotonic() - came > _FROZEN_S:
+                    raise SourceLost(f"no frame for {_FROZEN_S:g} s; the source is opened again")
+        finally:
+            self._passed, self._source = self.dropped, None
+            source.close()
+
+    def _put(self, got: Observation | TumortrackError, counts_from: str) -> None:
+        with self._lock:
+            if counts_from == "taking":
+                self._lock.wait_for(lambda: self._newest is None or self._stop.is_set())
+            elif self._newest is not None:
+                self._passed += 1
+            self._newest = (got, counts_from)
+            self._lock.notify_all()
+
+
+class SinkWorker:
+    """Hands results to one sink: the newest ``waiting`` of them. What does not fit is dropped,
+    oldest first, and counted; errors are counted and the last one kept."""
+
+    def __init__(self, name: str, sink: Sink, waiting: int) -> None:
+        self.name = name
+        self._sink = sink
+        self._waiting: deque[tuple[TrackingResult, float]] = deque(maxlen=waiting)
+        self._lock = threading.Condition()
+        self._stop = False
+        self.unclosed = False  # it failed at its end
+        self.delivered = self.dropped = self.errors = 0
+        self.failing, self.error = False, ""  # now; the last one there was
+        self.latency = Histogram()  # from the stamp (or arrival) to the end of publish
+        self._thread = threading.Thread(target=self._run, name=name, daemon=True)
+        self._thread.start()
+
+    def put(self, result: TrackingResult) -> None:
+        """Returns at once."""
+        with self._lock:
+            if len(self._waiting) == self._waiting.maxlen:
+                self.dropped += 1
+            self._waiting.append((result, time.monotonic()))
+            self._lock.notify()
+
+    def close(self) -> None:
+        """Hand over what waits, then close the sink; a sink that hangs is left after 10 s."""
+        with self._lock:
+            self._stop = True
+            self._lock.notify()
+        self._thread.join(_CLOSE_S)
+        if self._thread.is_alive():
+            self._failed(f"it did not finish within {_CLOSE_S:g} s")
+            self.unclosed = True
+
+    def summary(self) -> dict[str, Any]:
+        """What became of the results (JSON types)."""
+        counts = getattr(self._sink, "counts", None)
+        return {
+            "delivered": self.delivered,
+            "dropped": self.dropped,
+            "errors": self.errors,
+            "last_error": self.error,
+            "latency_ms": self.latency.summary(),
+            **({} if counts is None else {"counts": counts}),
+        }
+
+    def _run(self) -> None:
+        shown: TrackingResult | None = None  # the last result, until it was replaced for silence
+        while True:
+            with self._lock:
+                self._lock.wait_for(lambda: self._waiting or self._stop, _SILENT_S)
+                came = self._waiting.popleft() if self._waiting else None
+                if came is None and self._stop:
+                    break
+            if came is not None:
+                shown = came[0]
+                self._publish(*came)
+            elif shown is not None and self._waiting.maxlen == 1:  # a recording has no present
+                stamp_ns, frame = shown.stamp_ns + int(_SILENT_S * 1e9), shown.published_frame
+                why = f"the loop has said nothing for {_SILENT_S:g} s"
+                silence = TrackingResult(
+                    shown.sequence, stamp_ns, reason=why, published_frame=frame
+                )
+                self._publish(silence, 0.0)
+                shown = None
+        try:
+            self._sink.close()
+        except Exception as error:
+            self._failed(_text_of(error))
+            self.unclosed = True
+
+    def _publish(self, result: TrackingResult, handed_s: float) -> None:
+        try:
+            self._sink.publish(result)
+        except Exception as error:  # whatever a sink raises must not end the loop
+            self._failed(_text_of(error))
+            return
+        self.delivered += 1
+        self.failing = False
+        if result.latency_ms is not None:
+            self.latency.add(result.latency_ms + 1000 * (time.monotonic() - handed_s))
+
+    def _failed(self, text: str) -> None:
+        self.errors += 1
+        self.failing, self.error = True, text
+
+
+def _text_of(error: Exception) -> str:
+    return str(error) if isinstance(error, TumortrackError) else f"{type(error).__name__}: {error}"

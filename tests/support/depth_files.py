@@ -1,0 +1,17 @@
+"""Depth images and their cameras to files."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from tumortrack.core.store import write_json
+from tumortrack.core.types import DepthFrame, Intrinsics
+from tumortrack.sense.files import DEPTH_UNIT_MM, depth_png, intrinsics_json
+
+
+def write_depth_png(path: Path, frame: DepthFrame, depth_unit_mm: float = DEPTH_UNIT_MM) -> None:
+    path.write_bytes(depth_png(frame, depth_unit_mm))
+
+
+def write_intrinsics(path: Path, camera: Intrinsics, depth_unit_mm: float = DEPTH_UNIT_MM) -> None:
+    write_json(path, intrinsics_json(camera, depth_unit_mm))
