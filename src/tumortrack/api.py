@@ -407,7 +407,7 @@ def plan_resection(
             camera is taken to look straight down on the table.
         picture: PNG file to draw the plan into.
         stand_mm: height of the organ's lowest point over the table.
-        options: fields of ``plan.config.ResectionConfig``: ``tumor``, ``method`` (``margin`` or
+        options: fields of ``plan.values.ResectionConfig``: ``tumor``, ``method`` (``margin`` or
             ``published``), ``margin_mm``, ``sigmas`` and others.
 
     Returns:
