@@ -245,25 +245,27 @@ def _segmentation(
 def _description(part: Segment) -> Any:
     import highdicom as hd
     from pydicom.sr.codedict import codes
+    from pydicom.sr.coding import Code
 
+    category, kind = (Code(*term) for term in part.terms)
     described = hd.seg.SegmentDescription(
         segment_number=part.label,
         segment_label=part.name,
-        segmented_property_category=part.terms[0],
-        segmented_property_type=part.terms[1],
+        segmented_property_category=category,
+        segmented_property_type=kind,
         # Whoever drew them, `prepare` has chosen among the pieces and closed their cavities.
         algorithm_type=hd.seg.SegmentAlgorithmTypeValues.SEMIAUTOMATIC,
         algorithm_identification=hd.AlgorithmIdentificationSequence(
             "tumortrack prepare", codes.cid7162.MorphologicalOperations, tumortrack.__version__
         ),
-        anatomic_regions=None if part.is_organ else [KIDNEY],
+        anatomic_regions=None if part.is_organ else [Code(*KIDNEY)],
         display_color=hd.color.CIELabColor.from_rgb(*part.rgb),
     )
     if part.side is not None:
         side = [hd.sr.CodedConcept(*SIDES[part.side])]
         if part.is_organ:
-            kind = described.SegmentedPropertyTypeCodeSequence[0]
-            kind.SegmentedPropertyTypeModifierCodeSequence = side
+            what = described.SegmentedPropertyTypeCodeSequence[0]
+            what.SegmentedPropertyTypeModifierCodeSequence = side
         else:
             described.AnatomicRegionSequence[0].AnatomicRegionModifierSequence = side
     return described

@@ -143,7 +143,7 @@ def _read_nrrd(path: Path) -> grid.RawVolume:
     if dtype.itemsize > 1:
         if fields.get("endian", "").lower() not in ("little", "big"):
             raise InputError(f"{path}: the NRRD header states no byte order. Export it again.")
-        dtype = dtype.newbyteorder(fields["endian"].lower())
+        dtype = dtype.newbyteorder("<" if fields["endian"].lower() == "little" else ">")
     data = _voxels(path, start, encoding, math.prod(shape) * dtype.itemsize)
     array = np.frombuffer(data, dtype).reshape(shape, order="F")
     return grid.RawVolume(array.astype(dtype.newbyteorder("="), copy=False), lps_from_index)

@@ -224,7 +224,7 @@ def _shortcut(group: PlanningGroup, path: np.ndarray, rng: np.random.Generator) 
         )
         ends = np.array([[np.interp(at, along, axis) for axis in path.T] for at in (low, high)])
         between = ((along > low) & (along < high)).any()
-        if between and group.segment_collides(*ends, _COARSE) is None:
+        if between and group.segment_collides(ends[0], ends[1], _COARSE) is None:
             path = np.concatenate([path[along < low], ends, path[along > high]])
     return path
 
