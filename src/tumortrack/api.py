@@ -417,7 +417,7 @@ def plan_resection(
             camera is taken to look straight down on the table.
         picture: PNG file to draw the plan into.
         stand_mm: height of the organ's lowest point over the table.
-        options: fields of ``plan.config.ResectionConfig``: ``tumor``, ``method`` (``margin`` or
+        options: fields of ``plan.values.ResectionConfig``: ``tumor``, ``method`` (``margin`` or
             ``published``), ``margin_mm``, ``sigmas`` and others.
 
     Returns:
@@ -430,7 +430,7 @@ def plan_resection(
     from tumortrack.core.config import from_builtins
     from tumortrack.plan import located as places
     from tumortrack.plan import resection
-    from tumortrack.plan.config import ResectionConfig
+    from tumortrack.plan.values import ResectionConfig
 
     config = from_builtins(options, ResectionConfig, "plan_resection")
     run = located if isinstance(located, Estimate) else places.read_run(Path(located))

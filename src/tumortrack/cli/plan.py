@@ -20,9 +20,8 @@ if TYPE_CHECKING:
 
     from tumortrack.core.types import Mesh
     from tumortrack.plan.arms.config import CellConfig
-    from tumortrack.plan.config import ResectionConfig
     from tumortrack.plan.located import LocatedRun
-    from tumortrack.plan.values import ResectionPlan
+    from tumortrack.plan.values import ResectionConfig, ResectionPlan
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -104,7 +103,7 @@ class Plan:
         def pictures(aside: Path) -> None:
             draw_plan(resection, located, aside / "plan.png")
             if self.arms:
-                from tumortrack.plan.arms.urdf import cell_urdf
+                from tumortrack.plan.arms.body import cell_urdf
 
                 store.write_atomically(aside / "cell.urdf", cell_urdf(placed.config).encode())
 
@@ -115,7 +114,7 @@ class Plan:
     def _resection_config(self) -> ResectionConfig:
         """What the file says, and over that what was given on the command line."""
         from tumortrack.core.config import from_builtins
-        from tumortrack.plan.config import ResectionConfig
+        from tumortrack.plan.values import ResectionConfig
 
         written = {} if self.config is None else store.read_json(self.config)
         names = {"method": "method", "tumor": "tumor", "margin": "margin_mm", "sigmas": "sigmas"}

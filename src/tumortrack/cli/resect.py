@@ -116,7 +116,7 @@ class Resect:
 
         from tumortrack.core.config import to_builtins
         from tumortrack.live.values import PublishedFrame
-        from tumortrack.plan import replanning
+        from tumortrack.plan.arms import procedure
         from tumortrack.plan.located import located
 
         manifest = store.read_json(model / store.MANIFEST) if model.is_dir() else {}
@@ -136,7 +136,7 @@ class Resect:
         again = msgspec.structs.replace(stored.config, tumor=stored.plan.tumor)
         # In a process of its own: planning for a second must not hold up a frame.
         with ProcessPoolExecutor(
-            1, get_context("spawn"), replanning.initialize, (again, cell.config)
+            1, get_context("spawn"), procedure.begin_worker, (again, cell.config)
         ) as planner:
 
             def replan(
@@ -145,12 +145,12 @@ class Resect:
                 progress: operations.ResectionProgress,
             ) -> Future[operations.Planned]:
                 seen = locate(result, unsure=stored.config.sigmas > 0)
-                return planner.submit(replanning.replan, seen, joints_rad, progress)
+                return planner.submit(procedure.replan, seen, joints_rad, progress)
 
             say("starting the replanning worker ...")
             # The worker does not hear of Ctrl-C: that is the live loop's affair.
             before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-            begun = planner.submit(replanning.warm_up)
+            begun = planner.submit(procedure.warm_up)
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
             begun.result()
             operation = _operation(stored, cell, config, locate=locate, replan=replan)
