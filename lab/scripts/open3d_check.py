@@ -65,15 +65,12 @@ def camera_from_lps(kidney_lps: np.ndarray, rng: np.random.Generator) -> tuple[n
 
 def cast_cloud(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """The points where the camera's rays first meet the mesh (camera frame, mm)."""
-    scene = o3d.t.geometry.RaycastingScene()
-    scene.add_triangles(
-        o3d.core.Tensor(vertices.astype(np.float32)), o3d.core.Tensor(faces.astype(np.uint32))
-    )
+    scene, tensor = o3d.t.geometry.RaycastingScene(), o3d.core.Tensor
+    scene.add_triangles(tensor(vertices.astype(np.float32)), tensor(faces.astype(np.uint32)))
     u, v = np.meshgrid(np.arange(WIDTH), np.arange(HEIGHT))
     rays = np.stack([(u - WIDTH / 2) / FOCAL_PX, (v - HEIGHT / 2) / FOCAL_PX, np.ones(u.shape)], -1)
     rays = rays.reshape(-1, 3).astype(np.float32)
-    from_origin = o3d.core.Tensor(np.concatenate([np.zeros_like(rays), rays], 1))
-    depth = scene.cast_rays(from_origin)["t_hit"].numpy()
+    depth = scene.cast_rays(tensor(np.concatenate([0 * rays, rays], 1)))["t_hit"].numpy()
     seen = np.isfinite(depth)
     return rays[seen] * depth[seen][:, None]
 
@@ -116,15 +113,11 @@ def main() -> None:
             kidney_camera, tumor_camera = (x @ rotation.T + translation for x in (kidney, tumor))
             points = cast_cloud(kidney_camera, faces)
             parts = locate(options.tumortrack, model, points)
-            errors = [
-                centre_error(parts[name], truth)
-                for name, truth in (("kidney", kidney_camera), ("tumor_1", tumor_camera))
-            ]
-            ml = parts["tumor_1"].get("volume_ml", float("nan"))
-            print(
-                f"| {model} | {seed} | {len(points)} | {errors[0]} | {errors[1]} | {ml:.1f} |",
-                flush=True,
-            )
+            truths = {"kidney": kidney_camera, "tumor_1": tumor_camera}
+            errors = [centre_error(parts[name], truth) for name, truth in truths.items()]
+            ml = f"{parts['tumor_1'].get('volume_ml', float('nan')):.1f}"
+            row = map(str, (model, seed, len(points), *errors, ml))
+            print(f"| {' | '.join(row)} |", flush=True)
 
 
 if __name__ == "__main__":

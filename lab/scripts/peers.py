@@ -17,8 +17,7 @@ import numpy as np
 from tumortrack.simulate.scene_folder import list_scenes, read_scene
 from tumortrack_lab.peers.kinds import peer_kinds
 from tumortrack_lab.peers.rigid import matched_vertices
-from tumortrack_lab.study.cases import study_case
-from tumortrack_lab.study.methods import peer_method
+from tumortrack_lab.study.methods import peer_method, study_case
 
 
 def main() -> None:

@@ -14,6 +14,7 @@ import shlex
 import sys
 from dataclasses import dataclass, replace
 from functools import cache
+from itertools import product
 from pathlib import Path
 
 os.environ.setdefault("GOMP_SPINCOUNT", "1000")
@@ -25,26 +26,20 @@ import torch
 from tumortrack.cli.console import say
 from tumortrack.core import store
 from tumortrack.imaging.case import Case, load_case
-from tumortrack.models.config import GaussNewtonConfig
 from tumortrack.phantom.digital import PhantomParameters
 from tumortrack.registration.canonical_frame import carry_over, upright_of
 from tumortrack.registration.motion import ElasticMotion
-from tumortrack.registration.network import RegistrationNetwork
 from tumortrack.registration.registration import Registration
 from tumortrack.registration.rest_shape import RestShape, shape_of
 from tumortrack.report.drawing import new_figure, save
-from tumortrack.simulate.dataset import SceneStream
 from tumortrack.training.model import PretrainedWeights, load_start
 from tumortrack.training.presets import clinic
-from tumortrack.training.registration_task import RegistrationTask
-from tumortrack.training.run import TrainingRun
-from tumortrack.training.scenes import batches
-from tumortrack.training.state import TrainingState
-from tumortrack.training.task import ValidationScenes, mean_iou_of
-from tumortrack_lab.study.cases import named_folders, phantom_case
+from tumortrack.training.state import TrainingRun, TrainingState
+from tumortrack.training.task import RegistrationTask, ValidationScenes
+from tumortrack_lab.study import trainings
 from tumortrack_lab.study.document import ReportWriter, table
-from tumortrack_lab.study.frame import text as seeds_text
-from tumortrack_lab.study.trainings import kept, run, unseen_scenes
+from tumortrack_lab.study.methods import named_folders, phantom_case
+from tumortrack_lab.study.tables import text as seeds_text
 
 BLOCK = "pretraining"
 TITLES = {
@@ -85,24 +80,28 @@ def main(options: Options) -> None:
     options.out.mkdir(parents=True, exist_ok=True)
     cases = {"phantom": phantom_case(options.out / "phantom", PhantomParameters())}
     cases |= named_folders(options.case, cases)
-    rows = []
-    for name, folder in cases.items():
-        case = load_case(folder)
-        scenes = cache(lambda case=case: unseen_scenes(case, clinic(case.anatomy), options.scenes))
-        for seed in options.seeds:
-            about = {
-                "case": name,
-                "case_sha256": store.sha256_of(folder / store.MANIFEST),
-                "start_sha256": start.sha256,
-                "seed": seed,
-                "steps": list(options.steps),
-                "scenes": options.scenes,
-            }
-            curve = kept(
-                options.out / f"{name}_{seed}.json", about,
-                lambda: _curve(case, scenes(), start, seed, options.steps),  # noqa: B023 (called now)
-            )  # fmt: skip
-            rows += [{"case": name, "seed": seed, **row} for row in curve]
+    made, rows = {name: load_case(folder) for name, folder in cases.items()}, []
+
+    @cache
+    def scenes(name: str) -> ValidationScenes:
+        return trainings.unseen_scenes(made[name], clinic(made[name].anatomy), options.scenes)
+
+    for (name, folder), seed in product(cases.items(), options.seeds):
+        about = {
+            "case": name,
+            "case_sha256": store.sha256_of(folder / store.MANIFEST),
+            "start_sha256": start.sha256,
+            "seed": seed,
+            "steps": list(options.steps),
+            "scenes": options.scenes,
+        }
+        path = options.out / f"{name}_{seed}.json"
+        curve = trainings.kept(
+            path,
+            about,
+            lambda: _curve(made[name], scenes(name), start, seed, options.steps),  # noqa: B023
+        )
+        rows += [{"case": name, "seed": seed, **row} for row in curve]
     command = shlex.join(["make", "headstart", f"ARGS={shlex.join(sys.argv[1:])}"])
     about = store.read_manifest(options.start, "pretrained")["provenance"]
     _write(pd.DataFrame(rows), about, ReportWriter(options.document, command))
@@ -122,30 +121,26 @@ def _curve(
     shape = shape_of(case.anatomy, task.body)
     upright = upright_of(case.anatomy.organ, case.up_lps, shape.body.center_ct, shape.long_axis)
     states: dict[tuple[int, bool], TrainingState] = {}
-    for length in lengths:
-        for pretrained in (False, True):
-            state = TrainingState(replace(training, steps=max(length, 1)), device)
-            state.initialize(task.initialize)
-            if pretrained:
-                state.initialize(lambda network: carry_over(network, start.weights, upright))
-            states[length, pretrained] = state
-    stream = SceneStream(
-        case.anatomy, case.up_lps, config.scene, task.points, seed, "train", config.batch_size,
-        task.body,
-    )  # fmt: skip
+    for length, pretrained in product(lengths, (False, True)):
+        state = TrainingState(replace(training, steps=max(length, 1)), device)
+        state.initialize(task.initialize)
+        if pretrained:
+            state.initialize(lambda network: carry_over(network, start.weights, upright))
+        states[length, pretrained] = state
     rows = []
 
     def judge(steps: int) -> None:
         for (length, pretrained), state in states.items():
             if length == steps:
-                row = {"steps": steps, "pretrained": pretrained}
-                row |= _errors(state.average, shape, scenes, config.refine)
+                method = Registration(state.average.eval(), shape, config.refine)
+                row = {"steps": steps, "pretrained": pretrained, **_errors(method, shape, scenes)}
                 figures = (f"{key}={round(row[key], 2)}" for key in TITLES)
                 say(f"steps={steps} pretrained={pretrained} {' '.join(figures)}")
                 rows.append(row)
 
     judge(0)
-    for step, batch in enumerate(batches(stream, range(max(lengths)), 0, 0, device), start=1):
+    made = trainings.training_batches(training, task, max(lengths))
+    for step, batch in enumerate(made, start=1):
         for (length, _), state in states.items():
             if step <= length:
                 state.step(batch)
@@ -153,31 +148,25 @@ def _curve(
     return rows
 
 
-def _errors(
-    network: RegistrationNetwork,
-    shape: RestShape,
-    scenes: ValidationScenes,
-    refine: GaussNewtonConfig,
-) -> dict[str, float]:
+def _errors(method: Registration, shape: RestShape, scenes: ValidationScenes) -> dict[str, float]:
     """Target errors (a scene's mean; then the scenes' median and 90th percentile), before and
     after refinement, and mIoU of the refined labels."""
-    network.eval()
-    method = Registration(network, shape, refine)
-    first, refined, guesses = [], [], []
+    first, refined, motions = [], [], []
     for cloud, points_mm, points_ct, labels in zip(
         scenes.clouds_mm, scenes.points_mm, scenes.points_ct, scenes.labels, strict=True
     ):
         starts = method.propose(cloud)
-        motion = method.best_fit(cloud, starts).motion
-        inside = labels > 0
-        first.append(_error_mm(starts[0], points_ct[inside], points_mm[inside]))
-        refined.append(_error_mm(motion, points_ct[inside], points_mm[inside]))
-        guesses.append(shape.labels_at(motion.back(points_mm).astype(np.float32))[0])
-    numbers = [np.median(first), np.percentile(first, 90)]
-    numbers += [np.median(refined), np.percentile(refined, 90)]
-    parts = len(shape.anatomy_ct.parts) + 1
-    numbers.append(mean_iou_of(np.stack(guesses), scenes.labels, parts))
+        motions.append(method.best_fit(cloud, starts).motion)
+        inside = points_ct[labels > 0], points_mm[labels > 0]
+        first.append(_error_mm(starts[0], *inside))
+        refined.append(_error_mm(motions[-1], *inside))
+    numbers = [f(errors) for errors in (first, refined) for f in (np.median, _worst)]
+    numbers.append(trainings.placed_miou(motions, shape, scenes))
     return dict(zip(TITLES, map(float, numbers), strict=True))
+
+
+def _worst(errors: list[float]) -> float:
+    return np.percentile(errors, 90)
 
 
 def _error_mm(motion: ElasticMotion, points_ct: np.ndarray, points_mm: np.ndarray) -> float:
@@ -230,4 +219,4 @@ def _draw(frame: pd.DataFrame, path: Path) -> None:
 
 
 if __name__ == "__main__":
-    run(main, Options)
+    trainings.run(main, Options)

@@ -13,6 +13,7 @@ import shutil
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -31,10 +32,17 @@ from tumortrack.training.presets import clinic, quick
 from tumortrack.training.train import TrainingStatus
 from tumortrack_lab.study import plan as studies
 from tumortrack_lab.study.bound import BOUNDS, Bound
-from tumortrack_lab.study.cases import StudyCase, named_folders, phantom_case, study_case
 from tumortrack_lab.study.document import ReportWriter
 from tumortrack_lab.study.measure import Job, MeasurementStore, StudyStatus, measure
-from tumortrack_lab.study.methods import Method, Network, peer_method
+from tumortrack_lab.study.methods import (
+    Method,
+    Network,
+    StudyCase,
+    named_folders,
+    peer_method,
+    phantom_case,
+    study_case,
+)
 from tumortrack_lab.study.models import CLINIC, MODELS, Presets, Trainer
 from tumortrack_lab.study.report import gallery_block, section_blocks
 from tumortrack_lab.study.resection import cut_one
@@ -94,8 +102,12 @@ def main(options: Options) -> None:
         writer.write(section_blocks(section, measured, cases, writer))
         say(f"{section}: {len(measured)} measurements, block written to {document}")
     if "peers" in options.sections:
-        jobs = _gallery_jobs(plan, studied[0], methods)
-        writer.write(gallery_block(jobs, plan.seeds[0], writer, out / "gallery.json"))
+        case, seed = studied[0], plan.seeds[0]
+        chosen: list[Method] = [methods.model(case, name, seed) for name in plan.models]
+        chosen += [methods.peer("elastic", case)] * ("elastic" in plan.peers)
+        scenes = [variant for variant in plan.variants if not variant.startswith("Rot")]
+        shown = [Job(case, m, v, plan.view, plan.coarse_grid) for m in chosen for v in scenes]
+        writer.write(gallery_block(shown, seed, writer, out / "gallery.json"))
     say(f"done; {document} is up to date.")
 
 
@@ -113,8 +125,7 @@ def _methods(options: Options, plan: studies.StudyPlan, out: Path) -> studies.Me
         return trainer.model(case, name, seed, steps)
 
     def peer(name: str, case: StudyCase) -> Method:
-        bounds = {bound: Bound(bound, case) for bound in BOUNDS}
-        return bounds[name] if name in bounds else peer_method(name, case, bcpd)
+        return Bound(name, case) if name in BOUNDS else peer_method(name, case, bcpd)
 
     return studies.Methods(cache(model), cache(peer), cache(ablated))
 
@@ -141,52 +152,38 @@ def _scenes(case: StudyCase, variants: tuple[str, ...], views: tuple[str, ...]) 
         raise TumortrackError(f"the scenes of {case.name} could not be made (see above).")
 
 
-def _gallery_jobs(plan: studies.StudyPlan, case: StudyCase, methods: studies.Methods) -> list[Job]:
-    chosen: list[Method] = [methods.model(case, name, plan.seeds[0]) for name in plan.models]
-    chosen += [methods.peer(name, case) for name in ("elastic",) if name in plan.peers]
-    return [
-        Job(case, method, variant, plan.view, plan.coarse_grid)
-        for method in chosen
-        for variant in plan.variants
-        if not variant.startswith("Rot")
-    ]
+def _lines() -> Callable[[str, float, bool], None]:
+    """Progress with the seconds left, as lines: one now and then, and the last."""
+    last_s = -EVERY_S
+
+    def line(text: str, left_s: float, last: bool) -> None:
+        nonlocal last_s
+        if last or time.monotonic() - last_s >= EVERY_S:
+            s = int(left_s)
+            say(text.format(left=f"{s // 3600}:{s // 60 % 60:02d}:{s % 60:02d} left"))
+            last_s = time.monotonic()
+
+    return line
 
 
-class Lines:
-    """Progress as lines, one now and then."""
+def _training() -> Callable[[str, TrainingStatus], None]:
+    line = _lines()
 
-    def __init__(self) -> None:
-        self._last_s = -EVERY_S
-
-    def line(self, text: str, last: bool) -> None:
-        if last or time.monotonic() - self._last_s >= EVERY_S:
-            say(text)
-            self._last_s = time.monotonic()
-
-
-def _training():
-    lines = Lines()
-
-    def show(name: str, status: TrainingStatus) -> None:
-        text = f"{name}: step {status.step}/{status.end}, {status.samples_per_s:.0f} samples/s"
-        lines.line(f"{text}, {_clock(status.seconds_left)} left", status.step == status.end)
+    def show(name: str, now: TrainingStatus) -> None:
+        text = f"{name}: step {now.step}/{now.end}, {now.samples_per_s:.0f} samples/s, {{left}}"
+        line(text, now.seconds_left, now.step == now.end)
 
     return show
 
 
-def _measuring(section: str):
-    lines = Lines()
+def _measuring(section: str) -> Callable[[StudyStatus], None]:
+    line = _lines()
 
-    def show(status: StudyStatus) -> None:
-        text = f"{section}: {status.done}/{status.total}, {status.seconds_each:.1f} s each"
-        left = f"{_clock(status.seconds_left)} left ({status.name})"
-        lines.line(f"{text}, {left}", status.done == status.total)
+    def show(now: StudyStatus) -> None:
+        text = f"{section}: {now.done}/{now.total}, {now.seconds_each:.1f} s each, {{left}}"
+        line(f"{text} ({now.name})", now.seconds_left, now.done == now.total)
 
     return show
-
-
-def _clock(seconds: float) -> str:
-    return f"{int(seconds) // 3600}:{int(seconds) // 60 % 60:02d}:{int(seconds) % 60:02d}"
 
 
 if __name__ == "__main__":

@@ -43,16 +43,13 @@ def main() -> int:
             return 1
         found = json.loads(report.read_text())
     problems = judge(found, options.error)
-    print(table(found))
-    for problem in problems:
-        print(f"FAILED: {problem}")
+    print(table(found), *(f"FAILED: {problem}" for problem in problems), sep="\n")
     return int(bool(problems))
 
 
 def judge(found: dict, most_mm: float) -> list[str]:
     """What is wrong with a run's report; nothing, if all is well."""
-    problems = []
-    memory = found["memory_mb"]
+    problems, memory = [], found["memory_mb"]
     if "settled" not in memory:
         problems.append("the run was too short to tell whether memory grows; give 1.5 minutes")
     elif memory["now"] - memory["settled"] > GROWN_MB:
@@ -72,12 +69,11 @@ def judge(found: dict, most_mm: float) -> list[str]:
 
 def table(found: dict) -> str:
     """The run in a few lines."""
-    latency, memory, estimates = found["latency_ms"], found["memory_mb"], found["estimates"]
+    latency, memory, good = found["latency_ms"], found["memory_mb"], found["estimates"]
     percentiles = ", ".join(f"{key} {latency[key]}" for key in ("p50", "p95", "p99.9", "max"))
     rows = {
         "seconds": f"{found['seconds']:.0f}",
-        "estimates": f"{estimates['good']} good, {estimates['poor']} poor, "
-        f"{found['no_estimate']} none",
+        "estimates": f"{good['good']} good, {good['poor']} poor, {found['no_estimate']} none",
         "frames dropped": str(found["dropped"]),
         f"latency from {found['latency_from']}, ms": percentiles,
         "memory, MB": f"{memory['start']} at start, {memory.get('settled')} after a minute, "
@@ -86,9 +82,8 @@ def table(found: dict) -> str:
     for name, errors in found["center_error_mm"].items():
         rows[name] = f"centre off by {errors['p50']} mm (median), {errors['p95']} (95 %)"
     for name, sink in found["sinks"].items():
-        late = sink["latency_ms"]
-        rows[name] = f"{sink['delivered']} delivered, {sink['dropped']} dropped, p50 "
-        rows[name] += f"{late.get('p50')}, p99.9 {late.get('p99.9')} ms"
+        late = f"p50 {sink['latency_ms'].get('p50')}, p99.9 {sink['latency_ms'].get('p99.9')} ms"
+        rows[name] = f"{sink['delivered']} delivered, {sink['dropped']} dropped, {late}"
     return "\n".join(f"{name:20} {row}" for name, row in rows.items())
 
 

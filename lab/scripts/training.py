@@ -16,11 +16,9 @@ from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from functools import cache
 from pathlib import Path
-from typing import Literal
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
-import numpy as np
 import pandas as pd
 import torch
 from msgspec.structs import replace
@@ -33,29 +31,23 @@ from tumortrack.models.config import GaussNewtonConfig, TrainConfig
 from tumortrack.models.model import Network
 from tumortrack.occupancy.network import OccupancyNetwork
 from tumortrack.phantom.digital import PhantomParameters
-from tumortrack.registration.network import RegistrationNetwork
 from tumortrack.registration.registration import Registration
 from tumortrack.registration.rest_shape import shape_of
 from tumortrack.report.drawing import new_figure, save
-from tumortrack.simulate.dataset import SceneStream
 from tumortrack.simulate.scene import body_for
-from tumortrack.training.occupancy_task import label_miou
 from tumortrack.training.presets import PRESETS
-from tumortrack.training.run import TrainingRun, settle_end
-from tumortrack.training.scenes import batches
-from tumortrack.training.state import TrainingState
-from tumortrack.training.task import ValidationScenes, mean_iou_of
-from tumortrack.training.train import task_of
-from tumortrack_lab.study.cases import phantom_case
+from tumortrack.training.state import TrainingRun, TrainingState, settle_end
+from tumortrack.training.task import label_miou, task_of
+from tumortrack_lab.study import trainings
 from tumortrack_lab.study.document import ReportWriter, table
-from tumortrack_lab.study.trainings import kept, make_command, run, unseen_scenes
+from tumortrack_lab.study.methods import phantom_case
 
 BLOCK = "training-speed"
 CPU = torch.device("cpu")
 BATCHES = (8, 16, 32, 64)
 USUAL_BATCH = {"quick": 16, "clinic": 32}
 COLORS = dict(zip(BATCHES, ("#D55E00", "#0072B2", "#009E73", "#CC79A7"), strict=True))
-Preset = Literal["quick", "clinic"]
+SETTING = ["preset", "batch", "per_side", "learning_rate"]
 
 
 @dataclass(frozen=True)
@@ -78,9 +70,9 @@ class Options:
 
 @dataclass(frozen=True)
 class Setting:
-    """One training."""
+    """One training: a preset with other numbers."""
 
-    preset: Preset
+    preset: str
     batch: int
     per_side: int
     learning_rate: float
@@ -92,7 +84,6 @@ class Setting:
         return "_".join(map(str, (self.preset, *numbers)))
 
     def config(self, case: Case) -> TrainConfig:
-        """The preset with this setting's numbers."""
         config = PRESETS[self.preset](case.anatomy, "limited")
         occupancy = replace(config.scene.occupancy, per_side=self.per_side)
         return replace(
@@ -113,8 +104,7 @@ def settings(case: Case, options: Options) -> Iterator[Setting]:
         rows = [(batch, per_side, rate) for batch in BATCHES]
         rows += [(n, per_side, round(rate * (n / usual.batch_size) ** 0.5, 6)) for n in others]
         rows += [(usual.batch_size, sides, rate) for sides in (32, 128) if preset == "quick"]
-        for row in rows:
-            yield Setting(preset, *row, seed)
+        yield from (Setting(preset, *row, seed) for row in rows)
 
 
 def main(options: Options) -> None:
@@ -130,34 +120,29 @@ def main(options: Options) -> None:
             "case_sha256": store.sha256_of(folder / store.MANIFEST),
             **{name: getattr(options, name) for name in ("seconds", "scenes", "looks")},
         }
-        curve = kept(
-            options.out / f"{setting.name}.json", about,
-            lambda: _curve(case, setting, judge(setting.preset), options),  # noqa: B023 (called now)
-        )  # fmt: skip
+        path = options.out / f"{setting.name}.json"
+        curve = trainings.kept(
+            path,
+            about,
+            lambda: _curve(case, setting, judge(setting.preset), options),  # noqa: B023
+        )
         rows += [{**asdict(setting), **row} for row in curve]
         say(f"{setting.name}: " + " ".join(f"{k}={round(v, 3)}" for k, v in curve[-1].items()))
     frame = pd.DataFrame(rows)
     frame["both"] = (frame.miou + frame.other_miou) / 2
-    _write(frame, options, ReportWriter(options.document, make_command(BLOCK)))
+    _write(frame, options, ReportWriter(options.document, trainings.make_command(BLOCK)))
 
 
 def _curve(case: Case, setting: Setting, judge: Judge, options: Options) -> list[dict]:
     """A training of so many seconds; judging does not count."""
-    config = setting.config(case)
-    training = TrainingRun(
-        case.anatomy, case.up_lps, "", config, setting.seed, minutes=options.seconds / 60
-    )
-    task = task_of(training, CPU)
-    state = TrainingState(training, CPU)
+    config, minutes = setting.config(case), options.seconds / 60
+    training = TrainingRun(case.anatomy, case.up_lps, "", config, setting.seed, minutes=minutes)
+    task, state = task_of(training, CPU), TrainingState(training, CPU)
     state.initialize(task.initialize)
-    stream = SceneStream(
-        case.anatomy, case.up_lps, config.scene, task.points, setting.seed, "train",
-        setting.batch, task.body,
-    )  # fmt: skip
-    stream.batch(0)  # compiled kernels and ray trees are there before the clock starts
     progress, curve, spent = state.progress, [], 0.0
+    made = trainings.training_batches(training, task, 10**9)
     began = time.perf_counter()
-    for batch in batches(stream, range(10**9), 0, 0, CPU):
+    for batch in made:
         state.step(batch)
         progress.elapsed_s = spent + time.perf_counter() - began
         settle_end(config, progress, training.minutes)
@@ -175,14 +160,14 @@ def _curve(case: Case, setting: Setting, judge: Judge, options: Options) -> list
 class Judge:
     """Scenes of one case: of the kinds that a preset trains on, and of another kind."""
 
-    def __init__(self, case: Case, preset: Preset, scenes: int) -> None:
+    def __init__(self, case: Case, preset: str, scenes: int) -> None:
         own = PRESETS[preset](case.anatomy, "limited")
         other = PRESETS["clinic" if preset == "quick" else "quick"](case.anatomy, "limited")
         scene = replace(own.scene, deform=other.scene.deform[-1:])
         self._parts = len(case.anatomy.parts) + 1
         self._sets = {
-            "miou": unseen_scenes(case, own, scenes),
-            "other_miou": unseen_scenes(case, replace(own, scene=scene), scenes),
+            "miou": trainings.unseen_scenes(case, own, scenes),
+            "other_miou": trainings.unseen_scenes(case, replace(own, scene=scene), scenes),
         }
         body = body_for(case.anatomy, case.up_lps, own.scene, 0)
         self._shape = None if body is None else shape_of(case.anatomy, body)
@@ -190,25 +175,19 @@ class Judge:
     def figures(self, network: Network) -> dict[str, float]:
         """Mean IoU over the parts, on either kind of scenes; of ``clinic`` as the network places
         the organ, before the refinement, which makes up for much that was not learnt."""
-        return {name: self._miou(network, scenes) for name, scenes in self._sets.items()}
-
-    def _miou(self, network: Network, scenes: ValidationScenes) -> float:
         network.eval()
         if isinstance(network, OccupancyNetwork):
-            return label_miou(network, scenes, self._parts, CPU)
-        assert isinstance(network, RegistrationNetwork)
-        assert self._shape is not None
-        guesses = []
-        for cloud, points_mm in zip(scenes.clouds_mm, scenes.points_mm, strict=True):
-            motion = Registration(network, self._shape, GaussNewtonConfig()).propose(cloud)[0]
-            guesses.append(self._shape.labels_at(motion.back(points_mm).astype(np.float32))[0])
-        return mean_iou_of(np.stack(guesses), scenes.labels, self._parts)
+            return {k: label_miou(network, s, self._parts, CPU) for k, s in self._sets.items()}
+        method, figures = Registration(network, self._shape, GaussNewtonConfig()), {}
+        for name, scenes in self._sets.items():
+            motions = (method.propose(cloud)[0] for cloud in scenes.clouds_mm)
+            figures[name] = trainings.placed_miou(motions, self._shape, scenes)
+        return figures
 
 
 def _write(frame: pd.DataFrame, options: Options, writer: ReportWriter) -> None:
-    setting = ["preset", "batch", "per_side", "learning_rate"]
-    last = frame.groupby([*setting, "seed"], sort=False).last().reset_index()
-    groups = sorted(last.groupby(setting, sort=False), key=lambda g: (g[0][0], -g[1].both.mean()))
+    last = frame.groupby([*SETTING, "seed"], sort=False).last().reset_index()
+    groups = sorted(last.groupby(SETTING, sort=False), key=lambda g: (g[0][0], -g[1].both.mean()))
     body = []
     for (preset, batch, per_side, rate), seeds in groups:
         speed = (seeds.samples / seeds.seconds).mean()
@@ -237,8 +216,7 @@ def _draw(frame: pd.DataFrame, path: Path) -> None:
         axes = figure.add_subplot(1, 3, number)
         mine = frame[frame.preset == preset]
         usual = mine[mine.batch == USUAL_BATCH[preset]].iloc[0]
-        keys = ["seed", "batch", "per_side", "learning_rate"]
-        for (_, batch, per_side, rate), curve in mine.groupby(keys, sort=False):
+        for (_, _, batch, per_side, rate), curve in mine.groupby(["seed", *SETTING], sort=False):
             by_batch = what == "batch" and per_side == usual.per_side
             alike = (batch, rate) == (usual.batch, usual.learning_rate)
             if not (by_batch or (what == "queries" and alike)):
@@ -259,4 +237,4 @@ def _draw(frame: pd.DataFrame, path: Path) -> None:
 
 
 if __name__ == "__main__":
-    run(main, Options)
+    trainings.run(main, Options)

@@ -18,17 +18,25 @@ from tumortrack.models.encoders.pointnet2 import PointNet2Config, SetAbstraction
 from tumortrack.models.normalisation import CloudBox
 from tumortrack.occupancy.network import MlpDecoder, OccupancyNetwork
 from tumortrack.training.presets import quick_network
-from tumortrack_lab.bench import timing as interleaving
-from tumortrack_lab.bench.counts import module_flops
-from tumortrack_lab.bench.goals import GOALS, goals_table
+from tumortrack_lab.bench import rows as interleaving
+from tumortrack_lab.bench.forms import module_flops
 from tumortrack_lab.bench.machine import forget_peak, peak_bytes
-from tumortrack_lab.bench.naive.occupancy import NaiveOccupancy
-from tumortrack_lab.bench.naive.scenes import flowed
+from tumortrack_lab.bench.naive import NaiveOccupancy, flowed
 from tumortrack_lab.bench.report import BLOCKS, draw_growth, write_bench
-from tumortrack_lab.bench.rows import BenchResult, BenchRow, Peaks, Point, Work
-from tumortrack_lab.bench.run import GROUPS, BenchRequest, Task, TaskMessage, carry_out, tasks_of
+from tumortrack_lab.bench.rows import (
+    BenchResult,
+    BenchRow,
+    InterleavedTiming,
+    Peaks,
+    Point,
+    Uncounted,
+    Work,
+    interleaved,
+    timing_of,
+)
+from tumortrack_lab.bench.run import GROUPS, Task, TaskMessage, carry_out, tasks_of
 from tumortrack_lab.bench.subject import BenchSubject
-from tumortrack_lab.bench.timing import InterleavedTiming, Uncounted, interleaved, timing_of
+from tumortrack_lab.bench.tables import GOALS, goals_table
 from tumortrack_lab.cli import bench as benching
 from tumortrack_lab.cli.bench import Bench
 from tumortrack_lab.study.document import closing, opening
@@ -282,14 +290,15 @@ def test_the_command_gathers_what_processes_find(tmp_path, monkeypatch, capfd) -
 
 
 def test_each_process_has_its_own_threads_and_only_needed_models_are_trained(tmp_path) -> None:
-    request = BenchRequest(("generator", "frame", "tracking"), ("grid",), False, tmp_path)
-    first, one, two, *curves = tasks_of(request, cores=4)
+    common = Task(threads=1, folder=str(tmp_path))
+    groups = ("generator", "frame", "tracking")
+    first, one, two, *curves = tasks_of(common, groups, ("grid",), cores=4)
     assert (first.threads, first.train) == (2, ("clinic", "paper", "quick"))
     assert first.describe
     assert (one.threads, one.groups) == (1, ("generator", "frame", "tracking"))
     assert (two.threads, two.groups) == (2, ("frame", "tracking"))
     assert [task.curve for task in curves] == [("grid", p) for p in ("clinic", "quick", "paper")]
-    (alone,) = tasks_of(BenchRequest(("generator",), (), False, tmp_path), cores=1)
+    (alone,) = tasks_of(common, ("generator",), (), cores=1)
     assert alone.describe
     assert alone.train == ()
 

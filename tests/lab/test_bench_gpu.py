@@ -7,8 +7,7 @@ import pytest
 
 from clock import Clock
 from tumortrack.training.presets import PRESETS, quick
-from tumortrack_lab.bench import curves, networks, timing, training
-from tumortrack_lab.bench.goals import goals_table
+from tumortrack_lab.bench import curves, networks, rows, training
 from tumortrack_lab.bench.rows import (
     DECODER,
     ENCODER,
@@ -21,16 +20,18 @@ from tumortrack_lab.bench.rows import (
     VOLUME,
     BenchResult,
     BenchRow,
+    interleaved,
+    timing_of,
 )
 from tumortrack_lab.bench.subject import BenchSubject
-from tumortrack_lab.bench.timing import interleaved, timing_of
+from tumortrack_lab.bench.tables import goals_table
 
 
 def test_long_calls_have_three_turns_the_first_among_them(monkeypatch) -> None:
-    monkeypatch.setattr(timing, "_LONG_S", 0.01)
-    monkeypatch.setattr(timing, "_LONGER_S", 0.01)
+    monkeypatch.setattr(rows, "_LONG_S", 0.01)
+    monkeypatch.setattr(rows, "_LONGER_S", 0.01)
     clock = Clock()
-    monkeypatch.setattr(timing, "time", clock)
+    monkeypatch.setattr(rows, "time", clock)
     seconds = iter([0.08, 0.02, 0.03, 0.5])  # the first is cold
     order = []
 

@@ -15,8 +15,7 @@ from tumortrack.core.errors import InputError
 from tumortrack.core.types import Anatomy, Mesh
 from tumortrack.imaging.meshes import mesh_of, solid_of
 from tumortrack.plan.values import Cut, CutLayer, ResectionPlan
-from tumortrack_lab.cut.resection import cut
-from tumortrack_lab.cut.severing import Severed, pieces_of, within
+from tumortrack_lab.cut import Severed, cut, pieces_of, within
 
 ML = 1e-3
 

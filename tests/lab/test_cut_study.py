@@ -16,26 +16,25 @@ from tumortrack.core.types import Anatomy, Mesh, SensorCloud
 from tumortrack.imaging.meshes import mesh_of, solid_of
 from tumortrack.plan.located import located
 from tumortrack.plan.resection import plan_resection
-from tumortrack.simulate.scene_folder import Scene, write_scene
-from tumortrack_lab.cut.resection import cut
+from tumortrack.simulate.scene_folder import Scene
+from tumortrack_lab.cut import cut
 from tumortrack_lab.peers.base import Fit, estimate_of, rigid_carry
-from tumortrack_lab.study.cases import StudyCase
 from tumortrack_lab.study.document import ReportWriter
-from tumortrack_lab.study.frame import groups
 from tumortrack_lab.study.measure import Job, MeasurementStore, measure, spec_of
-from tumortrack_lab.study.methods import Answer, Method
+from tumortrack_lab.study.methods import Answer, Method, StudyCase
 from tumortrack_lab.study.report import section_blocks
 from tumortrack_lab.study.resection import (
     PLANNERS,
-    Cutting,
     Planner,
     Truth,
     cut_one,
+    cutting,
     exophytic_tumors,
     scattered,
     tables_of,
     tidy_plans,
 )
+from tumortrack_lab.study.tables import groups
 
 CAMERA_FROM_TABLE = rigid(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 150.0]))
 PUBLISHED, OURS = Planner(method="published"), Planner(method="margin")
@@ -137,14 +136,14 @@ def case(tmp_path_factory):
     cloud = SensorCloud(truth.organ.vertices_mm[truth.organ.vertices_mm[:, 2] < 120])
     for variant in ("D0", "D1"):
         meta = {"camera_from_bench": CAMERA_FROM_TABLE.tolist()}
-        write_scene(root / "scenes" / f"{variant}-noise", Scene(cloud, truth, None, meta))
-    write_scene(root / "scenes" / "G1-noise", Scene(cloud, truth))
+        Scene(cloud, truth, None, meta).write(root / "scenes" / f"{variant}-noise")
+    Scene(cloud, truth).write(root / "scenes" / "G1-noise")
     return StudyCase("balls", root / "case", root / "scenes", kidney(), (0.0, 0.0, 1.0))
 
 
 def jobs(case, *methods, variants=("D0",)):
-    cuttings = [Cutting(method) for method in methods]
-    return [Job(case, c, variant, "noise", 64) for c in cuttings for variant in variants]
+    also = cutting()
+    return [Job(case, m, v, "noise", 64, also=also) for m in methods for v in variants]
 
 
 def test_only_exophytic_tumors_are_cut(case):
@@ -183,13 +182,13 @@ def test_plans_are_measured_once_and_apart_from_accuracy(case, tmp_path):
     assert len(method.calls) == 2
     assert measure(todo, kept, one=cut_one) == first
     assert len(method.calls) == 2
-    plain = replace(todo[0], method=method)
+    plain = replace(todo[0], also={})
     assert spec_of(plain).digest != spec_of(todo[0]).digest
 
 
 def test_a_scene_without_a_table_is_refused(case):
     with pytest.raises(InputError, match="where its table is"):
-        cut_one(Job(case, Cutting(Truth()), "G1", "noise", 64))
+        cut_one(*jobs(case, Truth(), variants=("G1",)))
 
 
 def test_tables_say_what_was_removed_and_why_not(case, tmp_path):

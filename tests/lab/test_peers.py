@@ -14,8 +14,12 @@ from tumortrack.report.protocol import compare
 from tumortrack.sense.render import Visibility
 from tumortrack.simulate.scene_folder import Scene
 from tumortrack_lab.peers.base import Fit, estimate_of, rigid_carry
-from tumortrack_lab.peers.elastic import ElasticPeer, ElasticPeerConfig
-from tumortrack_lab.peers.elastic_body import elastic_body, stiffness_matrix
+from tumortrack_lab.peers.elastic import (
+    ElasticPeer,
+    ElasticPeerConfig,
+    elastic_body,
+    stiffness_matrix,
+)
 from tumortrack_lab.peers.kinds import peer_kinds
 from tumortrack_lab.peers.point_drift import Bcpd, BcpdConfig, Cpd, CpdConfig
 from tumortrack_lab.peers.pose_search import RigidConfig, seen_from, surface_points

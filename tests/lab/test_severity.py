@@ -14,14 +14,12 @@ from tumortrack.core.geometry import rigid, transform_points
 from tumortrack.sense.camera import project
 from tumortrack.sense.noise import CLEAN, D405_NOISE
 from tumortrack.sense.render import render_depth
-from tumortrack.simulate.targets import draw_targets
-from tumortrack_lab.study.cases import StudyCase
-from tumortrack_lab.study.frame import by_seed, text, tidy
+from tumortrack.simulate.scene_folder import draw_targets
 from tumortrack_lab.study.measure import MeasurementSpec
-from tumortrack_lab.study.methods import Network, peer_method
+from tumortrack_lab.study.methods import Network, StudyCase, peer_method
 from tumortrack_lab.study.plan import FULL, QUICK, Methods, jobs_of, scenes_of
 from tumortrack_lab.study.plots import severity_curves
-from tumortrack_lab.study.tables import levels_of, severities
+from tumortrack_lab.study.tables import by_seed, levels_of, severities, text, tidy
 from tumortrack_lab.twin.faults import (
     FAULTS,
     KINDS,

@@ -25,15 +25,13 @@ from tumortrack.simulate.deform.drag import CONFIGURATIONS
 from tumortrack.simulate.elastic.body import BodyConfig, build_body
 from tumortrack.simulate.occupancy import OccupancyConfig
 from tumortrack.simulate.scene import SceneConfig, SceneRecipe, Simulator
-from tumortrack.simulate.scene_folder import Scene, write_scene
+from tumortrack.simulate.scene_folder import Scene
 from tumortrack.training.presets import clinic, quick
 from tumortrack_lab.peers.base import Fit, estimate_of, rigid_carry
 from tumortrack_lab.peers.kinds import peer_kinds
 from tumortrack_lab.study import paper, tables
 from tumortrack_lab.study.bound import BOUNDS, Bound, BoundConfig, BoundMotion, laid_on
-from tumortrack_lab.study.cases import StudyCase, study_case
 from tumortrack_lab.study.document import ReportWriter, closing, fill, opening, table
-from tumortrack_lab.study.frame import NOT_FOUND, by_seed, text, tidy
 from tumortrack_lab.study.goals import goal_tables
 from tumortrack_lab.study.measure import (
     Job,
@@ -43,10 +41,11 @@ from tumortrack_lab.study.measure import (
     measure,
     point_errors,
 )
-from tumortrack_lab.study.methods import Answer, Method, peer_method
+from tumortrack_lab.study.methods import Answer, Method, StudyCase, peer_method, study_case
 from tumortrack_lab.study.models import ABLATED, Presets, Trainer, train_config
 from tumortrack_lab.study.plan import FULL, QUICK, SECTIONS, Methods, StudyPlan, jobs_of
 from tumortrack_lab.study.report import gallery_block, section_blocks
+from tumortrack_lab.study.tables import NOT_FOUND, by_seed, text, tidy
 
 ROOT = Path(__file__).parents[2]
 TURN = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
@@ -81,7 +80,7 @@ def case(tmp_path):
         truth = moved(anatomy(), CAMERA_FROM_CT)
         points = truth.organ.vertices_mm
         cloud = SensorCloud(points[points[:, 2] < 120])
-        write_scene(tmp_path / "scenes" / f"{variant}-clean", Scene(cloud, truth))
+        Scene(cloud, truth).write(tmp_path / "scenes" / f"{variant}-clean")
     return StudyCase("balls", folder, tmp_path / "scenes", anatomy(), (0.0, -1.0, 0.0), True)
 
 
@@ -332,7 +331,7 @@ def phantom(tmp_path_factory):
     for number, variant in enumerate(("D0", "D1")):
         stage = simulator.render(SceneRecipe(3, "test", number))
         scene = Scene(stage.cloud, simulator.reference(stage), stage.frame)
-        write_scene(root / "scenes" / f"{variant}-clean", scene)
+        scene.write(root / "scenes" / f"{variant}-clean")
     return study_case("phantom", root / "case", root / "scenes", is_paper=True)
 
 

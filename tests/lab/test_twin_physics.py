@@ -15,11 +15,17 @@ from scipy.spatial.transform import Rotation
 from tumortrack.core.errors import InputError, TumortrackError
 from tumortrack.core.types import Anatomy, Mesh
 from tumortrack_lab.tets import TetMesh, embed, tetrahedralise
-from tumortrack_lab.twin.apparatus import Apparatus, ApparatusConfig
-from tumortrack_lab.twin.contact import Contact, ContactPlate, Rod, Support
-from tumortrack_lab.twin.equilibrium import EquilibriumProblem, Hold, settle
+from tumortrack_lab.twin.apparatus import Apparatus, ApparatusConfig, solve
+from tumortrack_lab.twin.equilibrium import (
+    Contact,
+    ContactPlate,
+    EquilibriumProblem,
+    Hold,
+    Rod,
+    Support,
+    settle,
+)
 from tumortrack_lab.twin.solid import NeoHookeanSolid
-from tumortrack_lab.twin.states import solve
 
 pytestmark = pytest.mark.slow
 

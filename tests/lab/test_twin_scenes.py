@@ -28,12 +28,11 @@ from tumortrack.report.metrics import label_grid
 from tumortrack.report.protocol import evaluate_scenes
 from tumortrack.sense.camera import deproject
 from tumortrack.simulate.occupancy import contains, labels_of
-from tumortrack.simulate.scene_folder import list_scenes, read_scene
-from tumortrack.simulate.targets import draw_targets
+from tumortrack.simulate.scene_folder import draw_targets, list_scenes, read_scene
 from tumortrack_lab.twin import dataset
 from tumortrack_lab.twin.apparatus import State
-from tumortrack_lab.twin.contact import Rod
 from tumortrack_lab.twin.dataset import TwinRun, make_scenes
+from tumortrack_lab.twin.equilibrium import Rod
 from tumortrack_lab.twin.faults import FAULTS, faulty
 from tumortrack_lab.twin.occluders import rod_mesh, shaft_over
 from tumortrack_lab.twin.views import (

@@ -4,14 +4,19 @@ from __future__ import annotations
 
 import contextlib
 import tempfile
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float, Float64, Int, Int32
 
 from tumortrack.core.errors import InputError
 from tumortrack.core.types import Mesh
+
+if TYPE_CHECKING:
+    from scipy.sparse import spmatrix
 
 _CANDIDATES = 24  # tetrahedra round a point among which its own is looked for
 
@@ -48,11 +53,8 @@ def tetrahedralise(surface: Mesh, edge_mm: float, envelope: float = 2e-3) -> Tet
     """Fill a closed surface with tetrahedra (Hu et al. 2020, doi 10.1145/3386569.3392385).
 
     The mesh's own surface keeps within ``envelope`` times the diagonal (0.002: about 0.3 mm on a
-    kidney) of the given one. fTetWild is not reproducible even on one thread: keep the mesh
-    where results must be.
-
-    Raises:
-        InputError: nothing could be filled (an open or inverted surface).
+    kidney) of the given one. fTetWild is not reproducible even on one thread: keep the mesh where
+    results must be. Raises InputError: nothing could be filled (an open or inverted surface).
     """
     import pytetwild
 
@@ -72,6 +74,15 @@ def tetrahedralise(surface: Mesh, edge_mm: float, envelope: float = 2e-3) -> Tet
     turned = tet_volumes(nodes_mm, tets) < 0
     tets[turned, 2:] = tets[turned, :1:-1]
     return TetMesh(np.ascontiguousarray(nodes_mm, np.float64), tets)
+
+
+def factorised(matrix: spmatrix) -> Callable[[np.ndarray], np.ndarray]:
+    """Solves with a symmetric stiffness matrix."""
+    from scipy.sparse.linalg import splu
+
+    options = {"SymmetricMode": True}
+    factors = splu(matrix.tocsc(), "MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options)
+    return factors.solve
 
 
 @dataclass(frozen=True, eq=False)

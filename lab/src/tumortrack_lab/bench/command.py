@@ -8,14 +8,22 @@ import tempfile
 import threading
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 from tumortrack.core.errors import TumortrackError
 from tumortrack.sense.ply import write_cloud_ply
-from tumortrack_lab.bench.rows import BEFORE_TORCH, COMMAND, LARGE, PEAK, PRESETS, Workload
+from tumortrack_lab.bench.machine import status_bytes
+from tumortrack_lab.bench.rows import (
+    BEFORE_TORCH,
+    COMMAND,
+    LARGE,
+    PEAK,
+    PRESETS,
+    Workload,
+    timing_of,
+)
 from tumortrack_lab.bench.subject import BenchSubject
-from tumortrack_lab.bench.timing import timing_of
 
 _GRIDS = {COMMAND: 160, LARGE: 400}
 _FEWEST = 3
@@ -37,8 +45,7 @@ main()
 _LOOK_EVERY_S = 0.02  # at the process's peak memory
 
 
-@dataclass(frozen=True)
-class CommandRun:
+class CommandRun(NamedTuple):
     """One run of the command: seconds in all and before torch was imported, peak memory."""
 
     seconds: float
@@ -66,32 +73,25 @@ def _workload(name: str, preset: str, arguments: list[str], budget_s: float) -> 
         (time.perf_counter() - begun) * (len(runs) + 1) / len(runs) < budget_s
     ):
         runs.append(run_command(arguments))
-    before = timing_of([run.before_torch_s for run in runs]).median_s
-    peak = max(run.peak_bytes for run in runs)
+    seconds, before, peaks = zip(*runs, strict=True)
+    before_s, peak = timing_of([*before]).median_s, max(peaks)
     facts = {
-        "others": {BEFORE_TORCH: before, PEAK: peak},
-        "note": f"{before:.2f} s before torch is imported, {peak / 2**30:.2f} GiB at most",
+        "others": {BEFORE_TORCH: before_s, PEAK: peak},
+        "note": f"{before_s:.2f} s before torch is imported, {peak / 2**30:.2f} GiB at most",
     }
-    took = timing_of([run.seconds for run in runs])
-    return Workload(name, preset, "run", took, facts=lambda: facts)
+    return Workload(name, preset, "run", timing_of([*seconds]), facts=lambda: facts)
 
 
 def run_command(arguments: list[str]) -> CommandRun:
-    """Run `tumortrack` with these arguments in a process of its own.
-
-    Raises:
-        TumortrackError: the command failed; the message says its last words.
-    """
+    """Run `tumortrack` with these arguments in a process of its own. Raises TumortrackError: the
+    command failed, the message says its last words."""
     with tempfile.TemporaryDirectory() as folder:
         report = Path(folder) / "imported.txt"
-        start = time.monotonic()
+        command = [sys.executable, "-c", _PROBE, *arguments, str(report)]
+        start, held = time.monotonic(), [0]
         process = subprocess.Popen(
-            [sys.executable, "-c", _PROBE, *arguments, str(report)],
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            text=True,
+            command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
         )
-        held = [0]
         looker = threading.Thread(target=_look, args=(process, held))
         looker.start()
         output = process.communicate()[0]
@@ -107,13 +107,9 @@ def run_command(arguments: list[str]) -> CommandRun:
 def _look(process: subprocess.Popen[str], held: list[int]) -> None:
     """Note a process's peak memory until its end. What the system tells of ended children
     (``ru_maxrss``) counts the memory of the parent that they were born of."""
-    status = Path(f"/proc/{process.pid}/status")
     while process.poll() is None:
         try:
-            text = status.read_text(encoding="ascii")
+            held[0] = max(held[0], status_bytes("VmHWM", process.pid))
         except OSError:  # ended meanwhile, or no Linux
             return
-        for line in text.splitlines():
-            if line.startswith("VmHWM:"):
-                held[0] = max(held[0], int(line.split()[1]) * 1024)
         time.sleep(_LOOK_EVERY_S)

@@ -14,15 +14,12 @@ from tumortrack.imaging.raster import label_grid
 from tumortrack.models.report import grid_over
 from tumortrack.occupancy.inference import Inference
 from tumortrack.occupancy.network import OccupancyNetwork
-from tumortrack.occupancy.sparse import sparse_margins
 from tumortrack.simulate.occupancy import OccupancyPool, contains
 from tumortrack.simulate.scene import SceneConfig, SceneRecipe, Simulator
+from tumortrack_lab.bench.forms import CountedQueries
 from tumortrack_lab.bench.machine import forget_peak, peak_bytes
-from tumortrack_lab.bench.networks import organ_grid
-from tumortrack_lab.bench.occupancy import CountedQueries
-from tumortrack_lab.bench.rows import Point
+from tumortrack_lab.bench.rows import Call, Point, interleaved
 from tumortrack_lab.bench.subject import SEED, UP, BenchSubject
-from tumortrack_lab.bench.timing import Call, interleaved
 from tumortrack_lab.bench.training import training_state
 
 _QUERIES = (1000, 10_000, 100_000, 1_000_000)
@@ -50,39 +47,19 @@ def points_of(subject: BenchSubject, curve: str, preset: str) -> Iterator[Point]
         )  # fmt: skip
 
 
-def _queries(subject: BenchSubject, preset: str) -> Calls:
-    """Labels of queries, the cloud being encoded or the organ registered."""
-    if preset == "clinic":
-        registered = subject.registration
-        for size in _QUERIES:
-            yield preset, size, partial(registered.labels, registered.places(size))
-        return
-    labeller = subject.occupancy(preset)
-    logits = labeller.counted()
-    for size in _QUERIES:
-        yield preset, size, partial(_labels, logits, labeller.queries(size))
-
-
-def _labels(logits: CountedQueries, queries: np.ndarray) -> None:
-    logits(queries).argmax(-1)
-
-
 def _points(subject: BenchSubject, preset: str) -> Calls:
     """A cloud of so many points encoded."""
-    cloud = subject.scene.cloud.points_mm
-    rng = np.random.default_rng(SEED)
+    cloud, rng = subject.scene.cloud.points_mm, np.random.default_rng(SEED)
     for size in _POINTS:
         seen = cloud[rng.integers(len(cloud), size=size)]
-        if preset == "clinic":
-            yield preset, size, partial(subject.clinic.registration().propose, seen)
-        else:
-            yield preset, size, partial(subject.occupancy(preset).inference.encode, seen)
+        yield preset, size, partial(subject.forms(preset).encode, seen)
 
 
 def _tumors(subject: BenchSubject, _: str) -> Calls:
     """An organ with so many tumors: a training pair, a labelled volume, labels of queries by an
     untrained network of so many classes (which takes as long as a trained one)."""
-    labeller = subject.occupancy("quick")
+    forms = subject.occupancy("quick")
+    queries = forms.queries(40_000)
     for size in _TUMORS:
         anatomy, config = with_tumors(subject.anatomy, size), SceneConfig()
         pool = OccupancyPool(anatomy, config.occupancy, SEED)
@@ -92,10 +69,12 @@ def _tumors(subject: BenchSubject, _: str) -> Calls:
         yield f"clinic, {_TUMOR_GRID}^3 labels", size, partial(label_grid, anatomy, *grid)
         torch.manual_seed(SEED)
         network = OccupancyNetwork(subject.presets["quick"](anatomy).network)
-        inference = Inference(network.eval())
-        logits = CountedQueries(inference, inference.encode(labeller.points_mm))
-        call = partial(_labels, logits, labeller.queries(40_000))
-        yield "quick, 40,000 queries", size, call
+        logits = CountedQueries(Inference(network.eval()), forms.points_mm)
+        yield "quick, 40,000 queries", size, partial(_labels, logits, queries)
+
+
+def _labels(logits: CountedQueries, queries: np.ndarray) -> None:
+    logits(queries).argmax(-1)
 
 
 def with_tumors(anatomy: Anatomy, count: int) -> Anatomy:
@@ -106,20 +85,6 @@ def with_tumors(anatomy: Anatomy, count: int) -> Anatomy:
     inside = drawn[contains(organ, drawn)]
     small = (tumor.vertices_mm - tumor.box_mm.mean(0)) * _SMALL
     return Anatomy((organ, *(tumor.moved(small + place) for place in inside[:count])))
-
-
-def _grids(subject: BenchSubject, preset: str) -> Calls:
-    """The labelled volume."""
-    if preset == "clinic":
-        anatomy = Anatomy(tuple(subject.registration.estimate.meshes.values()))
-        for size in _GRIDS:
-            grid = grid_over(anatomy.organ.vertices_mm, size)
-            yield preset, size, partial(label_grid, anatomy, *grid)
-        return
-    labeller = subject.occupancy(preset)
-    logits = labeller.counted()
-    for size in _GRIDS:
-        yield preset, size, partial(sparse_margins, logits, *organ_grid(labeller, size))
 
 
 def _batches(subject: BenchSubject, preset: str) -> Calls:
@@ -133,9 +98,9 @@ def _batches(subject: BenchSubject, preset: str) -> Calls:
 
 
 _CURVES = {
-    "queries": _queries,
+    "queries": lambda s, preset: ((preset, n, s.forms(preset).labelling(n)) for n in _QUERIES),
     "points": _points,
     "tumors": _tumors,
-    "grid": _grids,
+    "grid": lambda s, preset: ((preset, n, s.forms(preset).filling(n)) for n in _GRIDS),
     "batch": _batches,
 }

@@ -12,8 +12,7 @@ from importlib.metadata import version
 from pathlib import Path
 
 from tumortrack.core.process import available_cores
-from tumortrack_lab.bench.rows import Peaks
-from tumortrack_lab.bench.timing import interleaved
+from tumortrack_lab.bench.rows import Peaks, interleaved
 
 _FEATURES = {
     "avx2": "AVX2",
@@ -26,7 +25,7 @@ _FEATURES = {
 NO_GPU = "none at hand"
 _SIZE = 1024  # of the square matrices
 _LONG = 2**24  # floats in each of the triad's three arrays (64 MB: far more than any cache)
-_STATUS, _CLEAR = Path("/proc/self/status"), Path("/proc/self/clear_refs")
+_CPU_INFO, _CLEAR = Path("/proc/cpuinfo"), Path("/proc/self/clear_refs")
 _RESET_PEAK = "5"  # Documentation/filesystems/proc: resets VmHWM to what is resident now
 _LIBRARIES = ("tumortrack", "torch", "numba", "numpy", "scipy")
 
@@ -35,20 +34,17 @@ def describe_machine() -> dict[str, str]:
     """Processor, cores, caches, memory, GPU, versions, date: for people, in their order."""
     import torch
 
-    capabilities = torch.cpu.get_capabilities()
-    gpu = torch.cuda.get_device_name() if torch.cuda.is_available() else NO_GPU
-    libraries = ", ".join(f"{name} {version(name)}" for name in _LIBRARIES)
+    info, has = _cpu_info(), torch.cpu.get_capabilities()
+    model = f" (family {info['cpu family']}, model {info.get('model')})"
     return {
-        "processor": _processor(),
+        "processor": cpu_name() + (model if "cpu family" in info else ""),
         "cores": f"{available_cores()}",
-        "matrix products": ", ".join(
-            name for key, name in _FEATURES.items() if capabilities.get(key)
-        ),
+        "matrix products": ", ".join(name for key, name in _FEATURES.items() if has.get(key)),
         "caches": _caches(),
         "memory": f"{os.sysconf('SC_PAGE_SIZE') * os.sysconf('SC_PHYS_PAGES') / 2**30:.0f} GiB",
-        "GPU": gpu,
+        "GPU": torch.cuda.get_device_name() if torch.cuda.is_available() else NO_GPU,
         "system": f"{platform.system()} {platform.machine()}, Python {platform.python_version()}",
-        "libraries": libraries,
+        "libraries": ", ".join(f"{name} {version(name)}" for name in _LIBRARIES),
         "date": datetime.now(UTC).strftime("%Y-%m-%d"),
         "load before": f"{os.getloadavg()[0]:.1f}",
     }
@@ -59,20 +55,11 @@ def cpu_name() -> str:
     return _cpu_info().get("model name") or platform.processor() or platform.machine()
 
 
-def _processor() -> str:
-    info = _cpu_info()
-    family, model = info.get("cpu family"), info.get("model")
-    return cpu_name() + ("" if family is None else f" (family {family}, model {model})")
-
-
 def _cpu_info() -> dict[str, str]:
     """Of the first core, as Linux tells it."""
-    info = Path("/proc/cpuinfo")
-    found: dict[str, str] = {}
-    for line in info.read_text(encoding="utf-8").splitlines() if info.exists() else ():
-        key, _, value = line.partition(":")
-        found.setdefault(key.strip(), value.strip())
-    return found
+    text = _CPU_INFO.read_text(encoding="utf-8") if _CPU_INFO.exists() else ""
+    first = [line.partition(":") for line in text.partition("\n\n")[0].splitlines()]
+    return {key.strip(): value.strip() for key, _, value in first}
 
 
 def _caches() -> str:
@@ -139,16 +126,18 @@ def forget_peak() -> int | None:
         _CLEAR.write_text(_RESET_PEAK, encoding="ascii")
     except PermissionError:  # a container may forbid it
         return None
-    return _of("VmRSS")
+    return status_bytes("VmRSS")
 
 
-def peak_bytes() -> int | None:
-    """The most that was resident since ``forget_peak``."""
-    return _of("VmHWM") if _STATUS.exists() else None
+def peak_bytes() -> int:
+    """The most that was resident since ``forget_peak``. Raises OSError: the system does not say."""
+    return status_bytes("VmHWM")
 
 
-def _of(name: str) -> int:
-    for line in _STATUS.read_text(encoding="ascii").splitlines():
+def status_bytes(name: str, process: int | str = "self") -> int:
+    """What Linux tells of a process's memory. Raises OSError: no such process, or no Linux."""
+    status = Path(f"/proc/{process}/status")
+    for line in status.read_text(encoding="ascii").splitlines():
         if line.startswith(name + ":"):
             return int(line.split()[1]) * 1024
-    raise OSError(f"{_STATUS} does not tell {name}.")
+    raise OSError(f"{status} does not tell {name}.")

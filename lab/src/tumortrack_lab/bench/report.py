@@ -11,7 +11,6 @@ import msgspec
 from tumortrack.core.store import write_atomically
 from tumortrack.report.drawing import new_figure, save
 from tumortrack_lab.bench import tables
-from tumortrack_lab.bench.goals import goals_table
 from tumortrack_lab.bench.rows import BenchResult, Point
 from tumortrack_lab.study.document import ReportWriter
 
@@ -39,27 +38,18 @@ _LINEAR = "tumors"  # the other axes are logarithmic
 
 def write_bench(bench: BenchResult, out: Path, document: Path | None) -> list[Path]:
     """Write OUT, and where there is a document its blocks and its picture; returns what was
-    written. The curves lie beside OUT.
-
-    Raises:
-        InputError: no such document, or a marker of its blocks is missing.
-        StorageError: the disk refused.
-    """
-    written = []
+    written. The curves lie beside OUT. Raises InputError: no such document, or a marker of its
+    blocks is missing; StorageError: the disk refused."""
+    files: dict[Path, object] = {}
     if bench.rows:
-        written.append(_json(out, msgspec.structs.replace(bench, points=())))
+        files[out] = msgspec.structs.replace(bench, points=())
     if bench.points:
         curves = {"machine": bench.machine, "points": bench.points}
-        written.append(_json(out.with_name(out.stem + "_curves.json"), curves))
-    if document is not None:
-        written += _document(bench, document)
-    return written
-
-
-def _json(path: Path, content: object) -> Path:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_atomically(path, msgspec.json.format(msgspec.json.encode(content), indent=1))
-    return path
+        files[out.with_name(out.stem + "_curves.json")] = curves
+    for path, content in files.items():
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_atomically(path, msgspec.json.format(msgspec.json.encode(content), indent=1))
+    return [*files, *(_document(bench, document) if document else ())]
 
 
 def _document(bench: BenchResult, document: Path) -> list[Path]:
@@ -68,7 +58,7 @@ def _document(bench: BenchResult, document: Path) -> list[Path]:
     blocks = {}
     if bench.rows:
         blocks = {
-            "goals": f"{goals_table(bench)}\n\n{caption}",
+            "goals": f"{tables.goals_table(bench)}\n\n{caption}",
             "machine": tables.machine_table(bench),
             "speed": f"{tables.speed_table(bench)}\n\n{tables.notes(bench)}\n\n{caption}",
             "floors": tables.floor_table(bench),
@@ -106,14 +96,13 @@ def draw_growth(points: Sequence[Point], path: Path) -> None:
 
 
 def _lines(axes: Axes, points: Sequence[Point], values: list[float]) -> None:
-    names = dict.fromkeys(point.what for point in points)
-    for name in names:
+    for name in dict.fromkeys(point.what for point in points):
         color, marker = _STYLES[name.replace(",", " ").split()[0]]
         chosen = [(p.size, v) for p, v in zip(points, values, strict=True) if p.what == name]
         axes.plot(*zip(*chosen, strict=True), color=color, marker=marker, label=name, linewidth=1.5)
-    sizes = sorted({point.size for point in points})
     if points[0].curve != _LINEAR:
         axes.set_xscale("log")
+    sizes = sorted({point.size for point in points})
     axes.set_xticks(sizes, [_short(size) for size in sizes])
     axes.minorticks_off()
     axes.grid(alpha=0.25)
@@ -121,7 +110,5 @@ def _lines(axes: Axes, points: Sequence[Point], values: list[float]) -> None:
 
 
 def _short(size: int) -> str:
-    for unit, name in ((10**6, "M"), (10**3, "k")):
-        if size >= unit:
-            return f"{size / unit:g}{name}"
-    return str(size)
+    unit, name = next((u for u in ((10**6, "M"), (10**3, "k")) if size >= u[0]), (1, ""))
+    return f"{size / unit:g}{name}"

@@ -1,17 +1,24 @@
-"""Workloads, and the rows that become of them: what was done, how long it took, what it has to
-take at least."""
+"""Workloads, timed in turns, and the rows that become of them: what was done, how long it took,
+what it has to take at least. Versions take turns, so that what else the machine does meets all.
+"""
 
 from __future__ import annotations
 
+import math
+import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any, Literal
 
 import msgspec
+import numpy as np
 
 from tumortrack.core.config import Config
-from tumortrack_lab.bench.timing import Call, InterleavedTiming, interleaved
 
+_FEWEST, _MOST = 3, 25  # rounds
+_LEAST_S = 0.01  # that a turn lasts: shorter calls are repeated within it
+_LONG_S = 0.5  # a first call that takes longer is warm enough
+_LONGER_S = 1.0  # and one that takes longer still is a turn: what it loaded is little beside it
 PRESETS = ("clinic", "quick", "paper")
 # What rows are called.
 GENERATOR, ENCODER, DECODER = "generator", "encoder", "decoder"
@@ -21,6 +28,75 @@ PLAN, MOTIONS, STEP, TRAINING = "plan", "motions", "training step", "training, g
 BEFORE_TORCH, PEAK = "seconds before torch is imported", "peak bytes"  # among ``others``
 
 Precision = Literal["fp32", "bf16", "int8"]
+
+
+@dataclass(frozen=True)
+class Uncounted:
+    """What a timed call returns if some of its seconds belong to something else."""
+
+    seconds: float
+
+
+Call = Callable[[], object]
+
+
+class InterleavedTiming(Config, frozen=True):
+    """Seconds of one call: the median of several turns, the quartiles about it, the fastest."""
+
+    best_s: float
+    median_s: float
+    low_s: float
+    high_s: float
+    turns: int
+
+    def times(self, factor: float) -> InterleavedTiming:
+        """Of so many calls, or of a part of one."""
+        seconds = {key: factor * getattr(self, key) for key in self.__struct_fields__[:4]}
+        return InterleavedTiming(**seconds, turns=self.turns)
+
+
+def interleaved(*versions: Call, budget_s: float, fewest: int = _FEWEST) -> list[InterleavedTiming]:
+    """Seconds a call of each version. Every version is called before (compiled, cached, warm);
+    then all take turns until ``budget_s`` is spent, between ``fewest`` and 25 times each. A first
+    call that took more than a second counts as a turn: a median of three bears a cold one. Where
+    time is up, those that have had the fewest turns leave the last to the others."""
+    begun = time.perf_counter()
+    warmed = [_warm(version) for version in versions]
+    repeats = [max(1, math.ceil(_LEAST_S / max(took_s, 1e-7))) for took_s, _ in warmed]
+    seconds = [[counted_s] if took_s > _LONGER_S else [] for took_s, counted_s in warmed]
+    for done in range(_MOST):
+        past_s = time.perf_counter() - begun
+        up = past_s * (done + 1) / max(done, 1) > budget_s
+        if up and min(map(len, seconds)) >= fewest:
+            break
+        for times, version, repeat in zip(seconds, versions, repeats, strict=True):
+            if not (up and len(times) >= fewest):
+                times.append(_turn(version, repeat)[1] / repeat)
+    return [timing_of(times) for times in seconds]
+
+
+def _turn(version: Call, repeat: int) -> tuple[float, float]:
+    """Seconds of so many calls: in all, and those that count."""
+    start, uncounted = time.perf_counter(), 0.0
+    for _ in range(repeat):
+        result = version()
+        uncounted += result.seconds if isinstance(result, Uncounted) else 0.0
+    took_s = time.perf_counter() - start
+    return took_s, took_s - uncounted
+
+
+def timing_of(seconds: list[float]) -> InterleavedTiming:
+    """Median and quartiles of the turns' seconds."""
+    low, middle, high = (float(np.quantile(seconds, q)) for q in (0.25, 0.5, 0.75))
+    return InterleavedTiming(
+        best_s=min(seconds), median_s=middle, low_s=low, high_s=high, turns=len(seconds)
+    )
+
+
+def _warm(version: Call) -> tuple[float, float]:
+    """Of the last call of those that warm it up."""
+    first = _turn(version, 1)
+    return first if first[0] > _LONG_S else _turn(version, 1)
 
 
 class Work(Config, frozen=True):
@@ -35,9 +111,8 @@ class BenchRow(Config, frozen=True):
     """One measured part.
 
     ``item`` is what a call makes: a pair, a frame; ``per_call``: how many of them. ``naive`` is the
-    plain form's time for the same, ``naive_is`` says what it is, ``naive_work`` its arithmetic.
-    ``agreement``: share of labels equal to the naive form's in single precision. ``others``: other
-    figures, by name (seconds, bytes, shares).
+    plain form's time for the same, ``naive_is`` says what it is. ``agreement``: share of labels
+    equal to the naive form's in single precision. ``others``: other figures, by name.
     """
 
     name: str
@@ -48,7 +123,6 @@ class BenchRow(Config, frozen=True):
     naive: InterleavedTiming | None = None
     naive_is: str = ""
     work: Work | None = None
-    naive_work: Work | None = None
     per_call: int = 1
     agreement: float | None = None
     others: dict[str, float] = msgspec.field(default_factory=dict)
@@ -91,22 +165,16 @@ class Workload:
         """Time all forms in turns."""
         forms = (self, *self.beside)
         calls = [call for call in (*(f.ours for f in forms), self.naive) if callable(call)]
-        timed: dict[object, Any] = dict(
-            zip(calls, interleaved(*calls, budget_s=budget_s), strict=True)
-        )
+        seconds = interleaved(*calls, budget_s=budget_s)
+        timed: dict[object, Any] = dict(zip(calls, seconds, strict=True))
         self.naive = timed.get(self.naive, self.naive)
         for form in forms:
-            ours = timed.get(form.ours, form.ours)
+            ours = timed.get(form.ours, form.ours).times(1 / form.calls)
+            naive = self.naive and self.naive.times(self.naive_share)
             yield BenchRow(
-                name=form.name,
-                what=form.what,
-                threads=threads,
-                item=form.item,
-                ours=ours.times(1 / form.calls),
-                naive=self.naive and self.naive.times(self.naive_share),
-                naive_is=self.naive_is,
-                **form.facts(),
-            )
+                name=form.name, what=form.what, threads=threads, item=form.item, ours=ours,
+                naive=naive, naive_is=self.naive_is, **form.facts(),
+            )  # fmt: skip
 
 
 class Peaks(Config, frozen=True):
@@ -146,13 +214,6 @@ class BenchResult(Config, frozen=True):
     peaks: tuple[Peaks, ...] = ()
     rows: tuple[BenchRow, ...] = ()
     points: tuple[Point, ...] = ()
-
-    def find(self, name: str, what: str, threads: int) -> BenchRow | None:
-        """The row of this name, if it was measured on the CPU."""
-        for row in self.rows:
-            if (row.name, row.what, row.threads, row.device) == (name, what, threads, "cpu"):
-                return row
-        return None
 
     def peaks_for(self, row: BenchRow) -> Peaks | None:
         """Of as many threads as the row was measured with; none for other devices."""

@@ -12,33 +12,25 @@ import subprocess
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
-from pathlib import Path
 from pkgutil import resolve_name
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import msgspec
 
 from tumortrack.core.config import Config, from_builtins
 from tumortrack.core.errors import TumortrackError
-from tumortrack.core.process import available_cores
 from tumortrack_lab.bench.rows import PRESETS, BenchResult, BenchRow, Peaks, Point
 
 if TYPE_CHECKING:  # with PyTorch, whose threads are settled when it is imported
-    from tumortrack.training.train import TrainingStatus
     from tumortrack_lab.bench.subject import BenchSubject
 
-_TRAINING_S, _PEAKS_S, _CURVE_S = 60.0, 5.0, 20.0  # see ``_expected_s``
+_TRAINING_S, _PEAKS_S, _CURVE_S = 60.0, 5.0, 20.0  # on a machine of two cores, roughly
 
 
-@dataclass(frozen=True)
-class Group:
-    """Workloads measured together.
-
-    ``source``: module of this package and function that yields them; ``threads``: at which numbers
-    of threads; ``rows``: how many there are; ``seconds``: for how long each (about; ``quick_s`` in
-    a hurry); ``needs``: presets whose trained models they need.
-    """
+class Group(NamedTuple):
+    """Workloads measured together: module of this package and function that yields them; numbers
+    of threads; how many rows there are, and for how long each is measured (about; in a hurry);
+    presets whose trained models they need."""
 
     source: str
     threads: tuple[int, ...]
@@ -46,17 +38,6 @@ class Group:
     seconds: float
     quick_s: float
     needs: tuple[str, ...] = ()
-
-    def budget_s(self, quick: bool) -> float:
-        return self.quick_s if quick else self.seconds
-
-    def expected_s(self, quick: bool) -> float:
-        return 2 * self.rows * self.budget_s(quick) * max(1, len(self.needs))
-
-    def measured(self, subject: BenchSubject, task: Task) -> Iterator[BenchRow]:
-        budget_s = self.budget_s(task.quick)
-        for workload in resolve_name(f"{__package__}.{self.source}")(subject, budget_s):
-            yield from workload.rows(task.threads, budget_s)
 
 
 # Training comes last: it tells the C library to keep freed memory, which stays so.
@@ -76,30 +57,16 @@ GROUPS: dict[str, Group] = {
 }
 # Curves, and of which presets: each in a process of its own, whose memory so is its own.
 CURVES = {
-    "queries": PRESETS,
-    "points": PRESETS,
+    **dict.fromkeys(("queries", "points"), PRESETS),
     "tumors": ("clinic",),
-    "grid": PRESETS,
-    "batch": PRESETS,
+    **dict.fromkeys(("grid", "batch"), PRESETS),
 }
-
-
-@dataclass(frozen=True)
-class BenchRequest:
-    """What to measure: groups of rows and curves by name; ``folder``: of trained models; ``given``:
-    a user's own model and cloud, which are then measured instead."""
-
-    groups: tuple[str, ...]
-    curves: tuple[str, ...]
-    quick: bool
-    folder: Path
-    given: tuple[Path, Path] | None = None
 
 
 class Task(Config, frozen=True):
     """What one process does: describe the machine, train these presets, measure the machine's
     peaks, these groups of rows, this curve, in that order. ``folder``: of trained models;
-    ``given``: a user's own model and cloud."""
+    ``given``: a user's own model and cloud, which are then measured instead."""
 
     threads: int
     folder: str
@@ -111,13 +78,16 @@ class Task(Config, frozen=True):
     curve: tuple[str, str] | None = None  # which, and of which preset
     quick: bool = False
 
+    def budget_s(self, group: str) -> float:
+        return GROUPS[group].quick_s if self.quick else GROUPS[group].seconds
+
     def expected_s(self) -> list[float]:
-        """Of each thing that it begins with, roughly, on a machine of two cores."""
-        groups = [GROUPS[name] for name in self.groups]
+        """Of each thing that it begins with, roughly."""
+        groups = [(GROUPS[name], self.budget_s(name)) for name in self.groups]
         return [
             *(_TRAINING_S for _ in self.train),
             *([_PEAKS_S] if self.peaks else []),
-            *(group.expected_s(self.quick) for group in groups),
+            *(2 * group.rows * budget_s * max(1, len(group.needs)) for group, budget_s in groups),
             *([_CURVE_S] if self.curve is not None else []),
         ]
 
@@ -133,25 +103,22 @@ class TaskMessage(Config, frozen=True):
     point: Point | None = None
 
 
-def tasks_of(request: BenchRequest, cores: int) -> list[Task]:
-    """First the trainings with all cores, then one core, two threads, the curves."""
-    given = request.given and (str(request.given[0]), str(request.given[1]))
+def tasks_of(common: Task, groups: Sequence[str], curves: Sequence[str], cores: int) -> list[Task]:
+    """What all have in common, as tasks: first the trainings with all cores, then one core, two
+    threads, the curves."""
 
     def task(threads: int, **what: object) -> Task:
-        known = {"folder": str(request.folder), "given": given, "quick": request.quick}
-        return Task(threads=threads, **known, **what)  # type: ignore[arg-type]
+        return msgspec.structs.replace(common, threads=threads, **what)
 
-    groups = {name: GROUPS[name] for name in request.groups}
-    needed = {preset for group in groups.values() for preset in group.needs}
-    if request.curves:
-        needed |= set(PRESETS)
-    train = () if request.given is not None else tuple(sorted(needed))
+    needed = {preset for name in groups for preset in GROUPS[name].needs}
+    needed |= set(PRESETS if curves else ())
+    train = () if common.given is not None else tuple(sorted(needed))
     tasks = [task(min(cores, 2), train=train)] if train else []
     for threads in (1, 2):
-        mine = tuple(name for name, group in groups.items() if threads in group.threads)
+        mine = tuple(name for name in groups if threads in GROUPS[name].threads)
         if mine and threads <= cores:
             tasks.append(task(threads, peaks=True, groups=mine))
-    tasks += [task(1, curve=(curve, of)) for curve in request.curves for of in CURVES[curve]]
+    tasks += [task(1, curve=(curve, of)) for curve in curves for of in CURVES[curve]]
     return [msgspec.structs.replace(tasks[0], describe=True), *tasks[1:]]
 
 
@@ -179,26 +146,25 @@ class _Pace:
         pace = (self._part_begun_s - self._begun_s) / self._past_s if self._past_s else 1.0
         part_s = pace * self._part_s - (time.monotonic() - self._part_begun_s)
         seconds = pace * sum(map(sum, self._ahead)) + max(part_s, 0.0)
-        left = f"{seconds:.0f} s" if seconds < 100 else f"{seconds / 60:.0f} minutes"
-        return f"about {left} left"
+        return (
+            f"about {seconds:.0f} s left"
+            if seconds < 100
+            else f"about {seconds / 60:.0f} minutes left"
+        )
 
 
 def measure(
-    request: BenchRequest,
+    tasks: Sequence[Task],
     worker: Sequence[str],
     command: str,
     report: Callable[[str], None],
     show: Callable[[BenchRow, str], None],
 ) -> BenchResult:
     """Run all processes one after another. ``report`` is called with what is under way and about
-    how long all will still take, ``show`` with each row once it is measured, and that time.
-
-    Raises:
-        TumortrackError: one of them failed.
-    """
+    how long all will still take, ``show`` with each row once it is measured, and that time. Raises
+    TumortrackError: one of them failed."""
     machine: dict[str, str] = {}
     found: dict[str, list] = {"peaks": [], "row": [], "point": []}
-    tasks = tasks_of(request, available_cores())
     pace = _Pace(tasks)
     for task in tasks:
         for message in listen(worker, task):
@@ -214,7 +180,7 @@ def measure(
                 pace.begin_part()
                 report(f"{message.begins}; {pace.left}")
         pace.end_task()
-    peaks, rows, points = (tuple(results) for results in found.values())
+    peaks, rows, points = map(tuple, found.values())
     return BenchResult(machine=machine, command=command, peaks=peaks, rows=rows, points=points)
 
 
@@ -225,23 +191,24 @@ def carry_out(
     from tumortrack_lab.bench.curves import points_of
     from tumortrack_lab.bench.machine import describe_machine, measure_peaks
 
-    def under_way(status: TrainingStatus) -> None:
-        tell(TaskMessage(under_way=f"  step {status.step} of {status.end}"))
-
     threads = "one core" if task.threads == 1 else f"{task.threads} threads"
     if task.describe:
         yield TaskMessage(machine=describe_machine())
     for preset in task.train:
         if not subject.trained(preset):
             yield TaskMessage(begins=f"training a `{preset}` network to measure")
-            subject.train(preset, under_way)
+            subject.train(
+                preset, lambda now: tell(TaskMessage(under_way=f"  step {now.step} of {now.end}"))
+            )
     if task.peaks:
         yield TaskMessage(begins=f"the machine's own rates, {threads}")
         yield TaskMessage(peaks=measure_peaks(task.threads, 1.0 if task.quick else 3.0))
     for name in task.groups:
         yield TaskMessage(begins=f"{name}, {threads}")
-        for row in GROUPS[name].measured(subject, task):
-            yield TaskMessage(row=row)
+        workloads = resolve_name(f"{__package__}.{GROUPS[name].source}")
+        for workload in workloads(subject, task.budget_s(name)):
+            for row in workload.rows(task.threads, task.budget_s(name)):
+                yield TaskMessage(row=row)
     if task.curve is not None:
         yield TaskMessage(begins=f"growth with {task.curve[0]}, {task.curve[1]}")
         for point in points_of(subject, *task.curve):
@@ -249,11 +216,8 @@ def carry_out(
 
 
 def listen(command: Sequence[str], task: Task) -> Iterator[TaskMessage]:
-    """Run a task in a process: ``command`` with the task's JSON behind it.
-
-    Raises:
-        TumortrackError: it failed; the message says its last words.
-    """
+    """Run a task in a process: ``command`` with the task's JSON behind it. Raises TumortrackError:
+    it failed, the message says its last words."""
     threads = str(task.threads)
     limits = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"), threads)
     command = [*command, msgspec.json.encode(task).decode()]
@@ -276,10 +240,3 @@ def listen(command: Sequence[str], task: Task) -> Iterator[TaskMessage]:
         last = words.read().strip().splitlines()[-1:] or ["nothing was said"]
     if code != 0:
         raise TumortrackError(f"measuring failed: {last[0]}")
-
-
-def keep_to_cores(count: int) -> None:
-    """Confine this process to so many of the cores that it may use; before its libraries start
-    threads."""
-    if hasattr(os, "sched_setaffinity"):  # Linux alone has it
-        os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[:count])

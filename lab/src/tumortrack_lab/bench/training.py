@@ -11,7 +11,6 @@ from itertools import count, cycle, pairwise
 from pathlib import Path
 from typing import Literal
 
-import numpy as np
 import torch
 from msgspec.structs import replace
 from torch.nn import functional
@@ -20,39 +19,23 @@ from tumortrack.core.process import keep_freed_memory
 from tumortrack.models.hardware import has_fast_bfloat16
 from tumortrack.occupancy.model import OccupancyModel
 from tumortrack.occupancy.network import OccupancyNetwork
-from tumortrack.simulate.dataset import SceneStream
 from tumortrack.simulate.deform import DragConfig, ElasticConfig
 from tumortrack.simulate.elastic.body import ElasticBody
-from tumortrack.simulate.occupancy import (
-    FixedPoints,
-    OccupancyConfig,
-    OccupancyPool,
-    PointSource,
-)
-from tumortrack.simulate.scene import SceneConfig, SceneRecipe, Simulator
+from tumortrack.simulate.occupancy import FixedPoints, OccupancyConfig, OccupancyPool, PointSource
+from tumortrack.simulate.scene import SceneConfig, SceneRecipe, SceneStream, Simulator
 from tumortrack.training.model import load_model
-from tumortrack.training.run import TrainingRun
-from tumortrack.training.state import TrainingState
+from tumortrack.training.state import TrainingRun, TrainingState
 from tumortrack.training.train import TrainingStatus, train
-from tumortrack_lab.bench.counts import (
-    blend_flops,
-    drag_flops,
-    draw_flops,
-    flow_flops,
-    module_flops,
-    weight_bytes,
-)
-from tumortrack_lab.bench.naive.occupancy import NaiveOccupancy
-from tumortrack_lab.bench.naive.scenes import plain_pair
+from tumortrack_lab.bench.forms import OccupancyForms, flow_flops, module_flops, weight_bytes
+from tumortrack_lab.bench.naive import NaiveOccupancy, plain_pair
 from tumortrack_lab.bench.networks import occupancy_frames, occupancy_volume
-from tumortrack_lab.bench.occupancy import OccupancyWorkload
-from tumortrack_lab.bench.rows import GENERATOR, STEP, TRAINING, Work, Workload
+from tumortrack_lab.bench.rows import GENERATOR, STEP, TRAINING, Work, Workload, timing_of
 from tumortrack_lab.bench.subject import LABELLING, SEED, UP, BenchSubject
-from tumortrack_lab.bench.timing import timing_of
 
 _LABELS = 2000
 _PAIRS = 20  # in one call of ours
 _COVERED = 0.25  # of the image, by the organ
+_DRAG = 16  # of a point: square, exponential, three products and sums
 _SAMPLES = {"clinic": 32, "quick": 16, "paper": 8}  # in a step here
 _BATCHES = 4  # made before and used again
 _STEPS = 10**6  # never reached
@@ -64,18 +47,19 @@ Batch = tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]
 
 def drags(subject: BenchSubject, _: float) -> Iterator[Workload]:
     """A pair of depth image (424 x 240) and 2,000 labels, by the paper's drags."""
-    yield _generator(subject, "drags", DragConfig())
+    yield _generator(subject, "drags", DragConfig(), None)
 
 
 def elastic(subject: BenchSubject, _: float) -> Iterator[Workload]:
     """States of the organ's elastic body."""
-    yield _generator(subject, "elastic", ElasticConfig())
+    yield _generator(subject, "elastic", ElasticConfig(), subject.body)
 
 
-def _generator(subject: BenchSubject, what: str, deform: object) -> Workload:
+def _generator(
+    subject: BenchSubject, what: str, deform: DragConfig | ElasticConfig, body: ElasticBody | None
+) -> Workload:
     anatomy, config = subject.anatomy, OccupancyConfig(per_side=283)
-    body = subject.body if what == "elastic" else None
-    simulator = Simulator(anatomy, UP, SceneConfig(occupancy=config, deform=(deform,)), body)  # type: ignore[arg-type]
+    simulator = Simulator(anatomy, UP, SceneConfig(occupancy=config, deform=(deform,)), body)
     pool, index = OccupancyPool(anatomy, config, SEED), count()
 
     def ours() -> None:
@@ -86,26 +70,28 @@ def _generator(subject: BenchSubject, what: str, deform: object) -> Workload:
         plain_pair(anatomy, simulator.render(SceneRecipe(SEED, "train", next(index))), _LABELS)
 
     facts = {
-        "work": generator_work(simulator, body),
+        "work": _generator_work(simulator, body),
         "note": "one thread whatever there is: workers are processes",
     }
     naive_is = "NumPy, a ray a pixel, inside tests on deformed surfaces"
     return Workload(GENERATOR, what, "pair", ours, naive, naive_is, _PAIRS, facts=lambda: facts)
 
 
-def generator_work(simulator: Simulator, body: ElasticBody | None) -> Work:
+def _generator_work(simulator: Simulator, body: ElasticBody | None) -> Work:
     """Of one pair: points and the organ's surface moved, the surface drawn; vertices, faces,
     image, points and cloud moved through memory once."""
     config, organ = simulator.config, simulator.anatomy_ct.organ
     moved, pixels = len(organ.vertices_mm) + _LABELS, config.width * config.height
     moved_bytes = 2 * 12 * moved + 12 * len(organ.faces) + 4 * pixels + 12 * 1000
     if body is None:
-        flops = drag_flops(moved, sum(times for _, _, times in DragConfig().steps))
-    else:
-        values, modes = body.modes[..., 0].size, body.modes.shape[-1]
-        flops = blend_flops(values, modes) + flow_flops(moved, steps=6)
+        drags = sum(times for _, _, times in DragConfig().steps)
+        flops = float(moved * drags * _DRAG)
+    else:  # a field blended of the modes
+        flops = float(2 * body.modes.size) + flow_flops(moved)
         moved_bytes += body.modes.nbytes
-    flops += draw_flops(len(organ.faces) // 2, round(_COVERED * pixels))
+    # A z-buffer: corners projected and edges set up once a triangle, three edges and a depth worked
+    # out at each pixel that the organ covers, about twice.
+    flops += 60 * (len(organ.faces) // 2) + 2 * 20 * round(_COVERED * pixels)
     return Work(flops=flops, bytes=float(moved_bytes))
 
 
@@ -144,20 +130,19 @@ def training_state(
 ) -> tuple[TrainingState, list[Batch]]:
     """Of the preset with so many samples a step, told what it does not have to learn; and so many
     of its batches."""
-    config = replace(subject.config(preset), batch_size=size)
+    config = replace(subject.presets[preset](subject.anatomy), batch_size=size)
     anatomy, body, known = subject.anatomy, None, {}
     points: PointSource
     if preset == "clinic":
         body, known = subject.body, subject.model(preset).network.state_dict()
         places = (known["points"] + known["center_ct"]).numpy()
-        points = FixedPoints(places, np.zeros(len(places), np.uint8))
+        points = FixedPoints(places)
     else:
         points = OccupancyPool(anatomy, config.scene.occupancy, SEED)
     stream = SceneStream(anatomy, UP, config.scene, points, SEED, "train", size, body)
     run = TrainingRun(anatomy, UP, "", config, SEED, steps=_STEPS, device="cpu")
     made = []
-    for number in range(batches):
-        one = stream.batch(number)
+    for one in map(stream.batch, range(batches)):
         arrays = one.clouds_mm, one.points_mm, one.labels, one.camera_from_ct
         made.append(tuple(map(torch.from_numpy, arrays)))
     state = TrainingState(run, CPU)
@@ -191,15 +176,18 @@ def naive_step(state: TrainingState) -> Callable[[Batch], None]:
 
 def whole(subject: BenchSubject, budget_s: float) -> Iterator[Workload]:
     """Preset ``quick``."""
-    yield whole_training(subject, "quick", "cpu", budget_s)
+    yield _whole_training(subject, "quick", "cpu", budget_s)
 
 
-def whole_training(subject: BenchSubject, preset: str, device: Device, budget_s: float) -> Workload:
+def _whole_training(
+    subject: BenchSubject, preset: str, device: Device, budget_s: float
+) -> Workload:
     """A preset as a user trains it: workers, or the GPU itself, make scenes, the network learns
     them."""
-    config = replace(subject.config(preset), validation_pairs=4)
+    anatomy = subject.anatomy
+    config = replace(subject.presets[preset](anatomy), validation_pairs=4)
     seen: list[tuple[float, TrainingStatus]] = []
-    run = TrainingRun(subject.anatomy, UP, "", config, SEED, minutes=budget_s / 60, device=device)
+    run = TrainingRun(anatomy, UP, "", config, SEED, minutes=budget_s / 60, device=device)
     with tempfile.TemporaryDirectory() as folder:
         train(run, Path(folder) / "model", lambda now: seen.append((time.perf_counter(), now)))
     # Between reports, and so without the start; where the end was the first, by the last's word.
@@ -229,7 +217,7 @@ def on_device(subject: BenchSubject, device: Device, budget_s: float) -> Iterato
     for preset in LABELLING:
         model = load_model(subject.model_folder(preset), device)
         assert isinstance(model, OccupancyModel)
-        labeller = OccupancyWorkload(model, subject.cloud(preset).points_mm, device)
-        yield from occupancy_frames(labeller, preset)
-        yield occupancy_volume(labeller, preset)
-        yield whole_training(subject, preset, device, budget_s)
+        forms = OccupancyForms(model, subject.cloud(preset).points_mm, device)
+        yield from occupancy_frames(forms, preset)
+        yield occupancy_volume(forms, preset)
+        yield _whole_training(subject, preset, device, budget_s)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -46,14 +47,12 @@ class Bench:
     document: Path | None = None
 
     def run(self) -> None:
-        """Measure, show, write.
-
-        Raises:
-            InputError: a model without a cloud or the other way, a document without its markers.
-        """
+        """Measure, show, write. Raises InputError: a model without a cloud or the other way, a
+        document without its markers."""
         from tumortrack.cli.console import console, say
+        from tumortrack.core.process import available_cores
         from tumortrack_lab.bench.report import BLOCKS, write_bench
-        from tumortrack_lab.bench.run import CURVES, GROUPS, BenchRequest, measure
+        from tumortrack_lab.bench.run import CURVES, GROUPS, Task, measure, tasks_of
         from tumortrack_lab.bench.tables import line, rich_table
         from tumortrack_lab.study.document import ReportWriter
 
@@ -61,33 +60,22 @@ class Bench:
             raise InputError(
                 "--model and --cloud belong together: a model, and a cloud of its organ."
             )
-        command, given = self._command(), None
-        if self.model is not None and self.cloud is not None:
-            given = self.model, self.cloud
+        words = ["tumortrack bench", *(["--only", *self.only] if self.only else [])]
+        words += [f"--{name}" for name in ("quick", "curves") if getattr(self, name)]
+        command = " ".join(words)
         if self.document is not None:
             ReportWriter(self.document, command).check(BLOCKS)
-        request = BenchRequest(
-            groups=self.only or tuple(GROUPS),
-            curves=tuple(CURVES) if self.curves else (),
-            quick=self.quick,
-            folder=TRAINED,
-            given=given,
-        )
+        given = (str(self.model), str(self.cloud)) if self.model else None
+        common = Task(threads=1, folder=str(TRAINED), given=given, quick=self.quick)
+        curves = tuple(CURVES) if self.curves else ()
+        tasks = tasks_of(common, self.only or tuple(GROUPS), curves, available_cores())
         with console.status("starting ...") as status:
             report = status.update if console.is_terminal else say
-            found = measure(
-                request, _WORKER, command, report, lambda row, left: say(line(row, left))
-            )
+            found = measure(tasks, _WORKER, command, report, lambda row, left: say(line(row, left)))
         shown = console if console.is_terminal else Console(width=_WIDE)
         shown.print(rich_table(found))
         for path in write_bench(found, self.out, self.document):
             say(f"written to {path}")
-
-    def _command(self) -> str:
-        words = ["tumortrack bench"]
-        words += ["--only", *self.only] if self.only else []
-        words += [f"--{name}" for name in ("quick", "curves") if getattr(self, name)]
-        return " ".join(words)
 
 
 def _work(task_json: str) -> None:
@@ -95,22 +83,19 @@ def _work(task_json: str) -> None:
     import msgspec
 
     from tumortrack.core.config import from_builtins
-    from tumortrack_lab.bench.run import Task, TaskMessage, carry_out, keep_to_cores
+    from tumortrack_lab.bench.run import Task, TaskMessage, carry_out
 
     task = from_builtins(msgspec.json.decode(task_json), Task, "the bench's task")
-    keep_to_cores(task.threads)
+    if hasattr(os, "sched_setaffinity"):  # Linux alone has it; before libraries start threads
+        os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[: task.threads])
     from tumortrack.training.presets import PRESETS
-    from tumortrack_lab.bench.subject import BenchSubject, ConfigOf
-
-    def limited(name: str) -> ConfigOf:
-        return lambda anatomy: PRESETS[name](anatomy, "limited")
+    from tumortrack_lab.bench.subject import BenchSubject
 
     def tell(message: TaskMessage) -> None:
         print(msgspec.json.encode(message).decode(), flush=True)
 
     given = task.given and (Path(task.given[0]), Path(task.given[1]))
-    subject = BenchSubject({name: limited(name) for name in PRESETS}, Path(task.folder), given)
-    for message in carry_out(task, subject, tell):
+    for message in carry_out(task, BenchSubject(PRESETS, Path(task.folder), given), tell):
         tell(message)
 
 

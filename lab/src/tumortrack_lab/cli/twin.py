@@ -39,31 +39,16 @@ class Twin:
     views: tuple[Literal["clean", "noise", "shaft", "clutter"], ...] = ()
 
     def run(self) -> None:
-        """Make what is missing of these states and views; empty means all.
-
-        Raises:
-            InputError: no case, unknown names, or scenes made from something else.
-        """
-        from rich.progress import (
-            BarColumn,
-            Progress,
-            TaskProgressColumn,
-            TextColumn,
-            TimeElapsedColumn,
-            TimeRemainingColumn,
-        )
+        """Make what is missing of these states and views; empty means all. Raises InputError: no
+        case, unknown names, or scenes made from something else."""
+        from rich import progress as bars
 
         from tumortrack_lab.twin.dataset import TwinRun, make_scenes
         from tumortrack_lab.twin.views import VARIANTS, VIEWS
 
-        columns = (
-            TextColumn("{task.description}"),
-            BarColumn(),
-            TaskProgressColumn(),
-            TimeElapsedColumn(),
-            TimeRemainingColumn(),
-        )
-        with Progress(*columns, console=console, transient=True) as progress:
+        columns = [*bars.Progress.get_default_columns(), bars.TimeElapsedColumn()]
+        columns = [columns[n] for n in (0, 1, 2, 4, 3)]  # the time left stands last
+        with bars.Progress(*columns, console=console, transient=True) as progress:
             task = progress.add_task("twin", total=1.0)
             shown_s = -_EVERY_S
 

@@ -36,10 +36,9 @@ Carry = Callable[[Float[np.ndarray, "n 3"]], Float[np.ndarray, "n 3"]]
 class Fit:
     """A peer's answer for one scene.
 
-    Attributes:
-        carry: points of the undeformed CT frame (LPS, mm) -> the camera frame (mm).
-        seconds: what a frame costs, preparation excluded.
-        report: JSON types: ``start`` used, ``iterations``, ``residual_mm``, whatever explains it.
+    ``carry``: points of the undeformed CT frame (LPS, mm) -> the camera frame (mm); ``seconds``:
+    what a frame costs, preparation excluded; ``report`` (JSON): ``start`` used, ``iterations``,
+    ``residual_mm``, whatever explains it.
     """
 
     carry: Carry
@@ -55,12 +54,9 @@ class Peer(Protocol):
     prepare_s: float  # spent before the first frame
 
     def fit(self, scene: Scene) -> Fit:
-        """Locate the anatomy in a scene. All but the bound use ``scene.cloud`` alone.
-
-        Raises:
-            NoEstimate: the cloud has too little information.
-            InputError: the cloud or the peer's settings cannot be used.
-        """
+        """Locate the anatomy in a scene. All but the bound use ``scene.cloud`` alone. Raises
+        NoEstimate: the cloud has too little information; InputError: the cloud or the peer's
+        settings cannot be used."""
         ...
 
 
@@ -70,17 +66,9 @@ def rigid_carry(camera_from_ct: Transform) -> Carry:
 
 
 def estimate_of(fit: Fit, anatomy_ct: Anatomy, stamp_ns: int = 0, grid: int = 160) -> Estimate:
-    """A fit as the tracker's value: surfaces moved, labels voxelised from them.
-
-    Args:
-        fit: the peer's answer.
-        anatomy_ct: the patient's anatomy (CT frame).
-        stamp_ns: of the cloud.
-        grid: voxels along the longest side of the dense volume, as in ``Tracker.locate``.
-
-    Raises:
-        InputError: the fit carries points to NaN or infinity.
-    """
+    """A fit of a patient's anatomy as the tracker's value: surfaces moved, labels voxelised from
+    them with ``grid`` voxels along the longest side; ``stamp_ns``: of the cloud. Raises InputError:
+    the fit carries points to NaN or infinity."""
     carried = [np.asarray(fit.carry(part.vertices_mm)) for part in anatomy_ct.parts]
     if not all(np.isfinite(points_mm).all() for points_mm in carried):
         raise InputError("the fit diverged: it carries points to NaN or infinity.")
@@ -123,8 +111,7 @@ def stopwatch() -> Iterator[Stopwatch]:
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """A deformable fit from one pose: its map, the error by which fits are compared (any unit), and
-    its report."""
+    """A fit from one pose: its map, the error by which fits are compared (any unit), its report."""
 
     carry: Carry
     error: float
@@ -148,11 +135,7 @@ class DeformablePeer(ABC):
         self.prepare_s = watch.seconds
 
     def fit(self, scene: Scene) -> Fit:
-        """See ``Peer.fit``.
-
-        Raises:
-            NoEstimate: fewer than 20 points.
-        """
+        """See ``Peer.fit``; NoEstimate for fewer than 20 points."""
         cloud = scene.cloud.points_mm.astype(float)
         with stopwatch() as watch:
             poses = self._search.poses(scene.cloud)[: self.config.starts]

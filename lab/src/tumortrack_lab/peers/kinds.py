@@ -24,19 +24,13 @@ GROUP = "tumortrack.peers"
 
 @dataclass(frozen=True)
 class PeerKind:
-    """How a peer is made for a patient.
+    """How a peer is made for a patient. Answers depend on the settings, on the versions of the
+    packages and on an outside program."""
 
-    Attributes:
-        make: ``make(anatomy_ct, up_lps, config)``, or ``make(anatomy_ct, up_lps)`` without
-            ``config``, gives a ``Peer``.
-        config: all settings. Answers depend on these, on the versions of ``packages`` and on an
-            outside program.
-        packages: names of distributions; an entry point's own is added to them.
-    """
-
+    # make(anatomy_ct, up_lps, config), or make(anatomy_ct, up_lps) without config, gives a Peer.
     make: Callable[..., Any]
     config: Config | None = None
-    packages: tuple[str, ...] = ()
+    packages: tuple[str, ...] = ()  # distributions; an entry point's own is added to them
     program_sha256: str | None = None
 
     @property
@@ -50,12 +44,8 @@ class PeerKind:
 
 
 def peer_kinds(bcpd: Path | None = None) -> dict[str, PeerKind]:
-    """Every peer there is; ``bcpd`` only with its program.
-
-    Raises:
-        InputError: the program does not exist; an entry point that names no ``PeerKind``, or takes
-            the name of a peer of ours.
-    """
+    """Every peer there is; ``bcpd`` only with its program. Raises InputError: the program does not
+    exist, an entry point that names no ``PeerKind``, or takes the name of a peer of ours."""
     from tumortrack_lab.peers.elastic import ElasticPeer, ElasticPeerConfig
     from tumortrack_lab.peers.point_drift import Bcpd, BcpdConfig, Cpd, CpdConfig
     from tumortrack_lab.peers.pose_search import RigidConfig

@@ -27,13 +27,7 @@ from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.types import Anatomy
 from tumortrack_lab.peers.base import Candidate, DeformablePeer
-from tumortrack_lab.peers.pose_search import (
-    Direction,
-    Points,
-    RigidConfig,
-    Transform,
-    trimmed_mean,
-)
+from tumortrack_lab.peers.pose_search import Direction, Points, RigidConfig, Transform, trimmed_mean
 
 _KEPT = 0.9  # of the distances
 _PATIENCE_S = 120.0
@@ -103,7 +97,10 @@ class _PointDrift(DeformablePeer):
         source = self._search.seen(cloud, camera_from_ct)
         source = source[:: max(1, len(source) // self.config.points)]
         drift, iterations = self._drift(source, cloud)
-        error_mm = _mutual_error_mm(drift(source), cloud)
+        # Trimmed mean distance of the drifted surface to the cloud and back: it compares starts.
+        moved = drift(source)
+        both = (moved, cloud), (cloud, moved)
+        error_mm = sum(trimmed_mean(cKDTree(to).query(at)[0], _KEPT) for to, at in both) / 2
         report = {"iterations": iterations, "residual_mm": error_mm}
         return Candidate(
             lambda points_ct: drift(transform_points(camera_from_ct, points_ct)), error_mm, report
@@ -138,11 +135,8 @@ class Cpd(_PointDrift):
 
 
 class Bcpd(_PointDrift):
-    """Bayesian coherent point drift as a peer.
-
-    Raises:
-        InputError: ``config.program`` is not given or is no file.
-    """
+    """Bayesian coherent point drift as a peer. Raises InputError: ``config.program`` is not given
+    or is no file."""
 
     name = "bcpd"
     config: BcpdConfig
@@ -159,10 +153,7 @@ class Bcpd(_PointDrift):
     def _drift(self, source: Points, cloud: Points) -> tuple[Drift, int]:
         """The program's displacements v, interpolated by its own Gaussian process (Hirose 2021b,
         doi 10.1109/TPAMI.2020.3043769), then the similarity that carries y + v to its shape y'.
-
-        Raises:
-            NoEstimate: the program failed on these points.
-        """
+        Raises NoEstimate: the program failed on these points."""
         config = self.config
         displacement, shape, loops = self._run(source, cloud)
         kernel_mm = config.kernel * float(np.sqrt(((cloud - cloud.mean(0)) ** 2).mean()))
@@ -198,12 +189,6 @@ class Bcpd(_PointDrift):
             lines = info.read_text().splitlines() if info.is_file() else []
             loops = (int(line.split()[1]) for line in lines if line.startswith("loops"))
             return displacement, shape, next(loops, 0)
-
-
-def _mutual_error_mm(moved: Points, cloud: Points) -> float:
-    """Trimmed mean distance of the drifted surface to the cloud and back: it compares starts."""
-    out, back = cKDTree(moved).query(cloud)[0], cKDTree(cloud).query(moved)[0]
-    return (trimmed_mean(out, _KEPT) + trimmed_mean(back, _KEPT)) / 2
 
 
 def _gaussian(

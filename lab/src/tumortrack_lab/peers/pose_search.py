@@ -126,11 +126,7 @@ class PoseSearch:
         self._starts = [self._start(turn) for turn in _rotations(config, np.array(up_lps))]
 
     def poses(self, cloud: SensorCloud) -> list[Pose]:
-        """The refined poses, best first, no two alike.
-
-        Raises:
-            NoEstimate: fewer than 20 points.
-        """
+        """The refined poses, best first, no two alike. Raises NoEstimate: fewer than 20 points."""
         points = cloud.points_mm.astype(float)
         if len(points) < _FEWEST_POINTS:
             raise NoEstimate(

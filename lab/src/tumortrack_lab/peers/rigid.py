@@ -26,11 +26,7 @@ class Rigid:
         self.prepare_s = watch.seconds
 
     def fit(self, scene: Scene) -> Fit:
-        """The pose of least error.
-
-        Raises:
-            NoEstimate: fewer than 20 points.
-        """
+        """The pose of least error; NoEstimate for fewer than 20 points."""
         with stopwatch() as watch:
             best = self._search.poses(scene.cloud)[0]
         report = {"start": best.start, "residual_mm": best.error_mm}
@@ -52,11 +48,7 @@ class RigidBound:
         self._organ = anatomy_ct.organ
 
     def fit(self, scene: Scene) -> Fit:
-        """The pose, from ``scene.reference``.
-
-        Raises:
-            InputError: the scene's kidney has other triangles than the case's.
-        """
+        """The pose, from ``scene.reference``; errors as of ``matched_vertices``."""
         reference = self._organ.moved(matched_vertices(self._organ, scene.reference.organ))
         with stopwatch() as watch:
             camera_from_ct, residual_mm = fit_over_volume(self._organ, reference)
@@ -68,10 +60,7 @@ def matched_vertices(rest: Mesh, moved: Mesh) -> Points:
     """Where each vertex of ``rest`` lies in ``moved``, the same triangles in the same order.
 
     Meshes lose the order of their vertices when they are read (equal ones are merged), but never
-    that of their triangles.
-
-    Raises:
-        InputError: ``moved`` has other triangles.
+    that of their triangles. Raises InputError: ``moved`` has other triangles.
     """
     vertex = np.full(len(rest.vertices_mm), -1)
     same = rest.faces.shape == moved.faces.shape
@@ -87,14 +76,12 @@ def matched_vertices(rest: Mesh, moved: Mesh) -> Points:
 
 
 def fit_over_volume(source: Mesh, target: Mesh) -> tuple[Transform, float]:
-    """``target_from_source`` with the least squared displacement over the source's volume.
+    """``target_from_source`` with the least squared displacement over the source's volume, and the
+    root mean square displacement that it leaves, mm.
 
     The integral over the volume is exact for a displacement that is linear in each tetrahedron
     (reference point, triangle). The reference point matters only through its own displacement, for
     which the vertices' mean is taken.
-
-    Returns:
-        The 4 x 4 rigid transform and the root mean square displacement it leaves, mm.
     """
     from_mm, weights = _volume_points(source, source)
     to_mm, _ = _volume_points(source, target)
@@ -114,15 +101,9 @@ def _volume_points(rest: Mesh, moved: Mesh) -> tuple[Points, Float64[np.ndarray,
     return points, np.repeat(volume / 4, 4)
 
 
-def kabsch(
-    source_mm: Float[np.ndarray, "n 3"],
-    target_mm: Float[np.ndarray, "n 3"],
-    weights: Float[np.ndarray, " n"],
-) -> Transform:
-    """The rigid transform that carries source points to target points best (weighted squares).
-
-    Source: Kabsch 1976, doi 10.1107/S0567739476001873.
-    """
+def kabsch(source_mm: Points, target_mm: Points, weights: Float[np.ndarray, " n"]) -> Transform:
+    """The rigid transform that carries source points to target points best, in weighted squares
+    (Kabsch 1976, doi 10.1107/S0567739476001873)."""
     share = weights / weights.sum()
     source_centre, target_centre = share @ source_mm, share @ target_mm
     spread = (source_mm - source_centre).T @ (share[:, None] * (target_mm - target_centre))

@@ -14,6 +14,7 @@ from typing import Literal, get_args
 
 import numpy as np
 from jaxtyping import Bool, Float, Float64
+from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 
 import tumortrack
@@ -26,8 +27,7 @@ from tumortrack.simulate.elastic.body import BodyConfig, ElasticBody, build_body
 from tumortrack.simulate.scene_folder import Scene
 from tumortrack_lab.peers.base import Fit, stopwatch
 from tumortrack_lab.peers.rigid import kabsch, matched_vertices
-from tumortrack_lab.study.cases import StudyCase
-from tumortrack_lab.study.methods import Answer, Method, answer_of, code_sha256
+from tumortrack_lab.study.methods import Answer, Method, StudyCase, answer_of, code_sha256
 
 BoundName = Literal["visible_bound", "basis_bound"]
 BOUNDS: tuple[BoundName, ...] = get_args(BoundName)
@@ -72,11 +72,12 @@ class Bound(Method):
 
     @cached_property
     def identity(self) -> dict:
+        elastic = Path(tumortrack.__file__).parent / "simulate" / "elastic"
         return {
             "kind": "bound",
             "name": self.name,
             "settings": to_builtins(self.config),
-            "code_sha256": _code_sha256(),
+            "code_sha256": code_sha256([Path(__file__), *elastic.glob("*.py")]),
             "tumortrack": tumortrack.__version__,
         }
 
@@ -85,14 +86,7 @@ class Bound(Method):
         return _body_of(self.case, self.config)[1]
 
     def locate(self, scene: Scene, grid: int) -> Answer:
-        """See ``Method.locate``.
-
-        Raises:
-            InputError: the scene's surfaces have other triangles than the case's.
-            NoEstimate: hardly anything of the organ is in the picture.
-        """
-        body, _ = _body_of(self.case, self.config)
-        rest = self.case.anatomy_ct
+        body, rest = _body_of(self.case, self.config)[0], self.case.anatomy_ct
         with stopwatch() as watch:
             known_ct, known_mm = self._known(rest, scene)
             placed = laid_on(body, known_ct, known_mm, self.config)
@@ -134,28 +128,22 @@ def laid_on(
     config: BoundConfig,
 ) -> BoundMotion:
     """The pose and state that carry known points of the CT to their places most likely, by
-    Gauss-Newton from the best rigid pose and the library's mean.
-
-    As ``registration.gauss_newton``, but of points whose partners are known: residuals are vectors,
-    and the pose needs no prior.
-    """
+    Gauss-Newton from the best rigid pose and the library's mean. As ``registration.gauss_newton``,
+    but points' partners are known: residuals are vectors, and the pose needs no prior."""
     modes = len(body.mean)
     pose = kabsch(known_ct, known_mm, np.ones(len(known_ct)))
     rotation = pose[:3, :3]
     centre = rotation @ body.center_ct + pose[:3, 3]
     coefficients = body.mean.copy()
-    precision = np.zeros((6 + modes, 6 + modes))
-    precision[6:, 6:] = np.linalg.inv(body.covariance)
+    precision = block_diag(np.zeros((6, 6)), np.linalg.inv(body.covariance))
     weight = min(config.n_effective / len(known_ct), 1.0) / config.sigma_mm**2
     for _ in range(config.steps):
         offset = body.carry(coefficients, known_ct).astype(float) - body.center_ct
         error = (offset - (known_mm - centre) @ rotation).reshape(-1)  # in the CT's axes
         halfway = body.carry(0.5 * coefficients, known_ct)
-        rows = np.empty((len(known_ct), 3, 6 + modes))
-        rows[:, :, :3] = np.eye(3)
-        rows[:, :, 3:6] = -_crosses(offset)
-        rows[:, :, 6:] = body.modes_at(halfway)
-        flat = rows.reshape(-1, 6 + modes)
+        shifts = np.broadcast_to(np.eye(3), (len(known_ct), 3, 3))
+        turns = np.stack([np.cross(axis, offset) for axis in np.eye(3)], axis=2)
+        flat = np.concatenate([shifts, turns, body.modes_at(halfway)], 2).reshape(-1, 6 + modes)
         off = np.concatenate([np.zeros(6), coefficients - body.mean])
         curvature = weight * flat.T @ flat + precision
         change = -np.linalg.solve(curvature, weight * flat.T @ error + precision @ off)
@@ -165,21 +153,9 @@ def laid_on(
     return BoundMotion(body, rotation, centre, coefficients)
 
 
-def _crosses(vectors: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 3 3"]:
-    """Matrices that take a vector x to ``vector x x``."""
-    return np.stack([np.cross(vectors, axis) for axis in np.eye(3)], axis=2)
-
-
 @cache
 def _body_of(case: StudyCase, config: BoundConfig) -> tuple[ElasticBody, float]:
     """The case's elastic body, and the seconds that it took; one for both bounds."""
     with stopwatch() as watch:
         body = build_body(case.anatomy_ct, case.up_lps, config.body, config.seed)
     return body, watch.seconds
-
-
-@cache
-def _code_sha256() -> str:
-    """Of what decides the answers: this file and the elastic body's."""
-    elastic = Path(tumortrack.__file__).parent / "simulate" / "elastic"
-    return code_sha256([Path(__file__), *elastic.glob("*.py")])

@@ -12,17 +12,13 @@ from tumortrack.core.errors import InputError, StorageError
 
 def table(head: Sequence[str], rows: Iterable[Sequence[str]], left: int = 1) -> str:
     """A Markdown table; the first ``left`` columns are left-aligned, numbers right-aligned."""
-    marks = ["---" if n < left else "---:" for n in range(len(head))]
-    lines = [_line(head), _line(marks)]
+    lines = [head, ["---" if n < left else "---:" for n in range(len(head))]]
     for row in rows:
         if len(row) != len(head):
             raise ValueError(f"a row of {len(row)} cells under a head of {len(head)}: {row}")
-        lines.append(_line(row))
-    return "\n".join(lines)
-
-
-def _line(cells: Sequence[str]) -> str:
-    return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
+        lines.append(row)
+    cells = ((cell.replace("|", "\\|") for cell in line) for line in lines)
+    return "\n".join(f"| {' | '.join(line)} |" for line in cells)
 
 
 def opening(name: str) -> str:
@@ -34,13 +30,8 @@ def closing(name: str) -> str:
 
 
 def fill(document: str, blocks: dict[str, str]) -> str:
-    """The document with the text between each block's markers replaced.
-
-    Doing it twice changes nothing more. Blocks that are not given stay as they are.
-
-    Raises:
-        InputError: a marker is missing, double or out of order.
-    """
+    """The document with the text between each block's markers replaced; the rest stays. Raises
+    InputError: a marker is missing, double or out of order."""
     for name, text in blocks.items():
         if document.count(opening(name)) != 1 or document.count(closing(name)) != 1:
             raise InputError(
@@ -64,41 +55,33 @@ class ReportWriter:
     command: str
 
     def write(self, blocks: dict[str, str]) -> None:
-        """Replace these blocks, in one step.
-
-        Raises:
-            InputError: no document, or a marker missing.
-            StorageError: the disk refused.
-        """
-        store.write_atomically(self.document, fill(self._text(), blocks).encode())
+        """Replace these blocks, in one step; errors as of ``check`` and ``store``."""
+        store.write_atomically(self.document, self._filled(blocks).encode())
 
     def check(self, names: Iterable[str]) -> None:
-        """Before anything is measured: these blocks can be filled.
+        """Before anything is measured: these blocks can be filled. Raises InputError: no document,
+        or a marker missing."""
+        self._filled(dict.fromkeys(names, ""))
 
-        Raises:
-            InputError: no document, or a marker missing.
-        """
-        fill(self._text(), dict.fromkeys(names, ""))
-
-    def _text(self) -> str:
+    def _filled(self, blocks: dict[str, str]) -> str:
         try:
-            return self.document.read_text(encoding="utf-8")
+            return fill(self.document.read_text(encoding="utf-8"), blocks)
         except OSError as error:
             raise InputError(f"{self.document} cannot be read: {error.strerror}.") from error
 
     def image(self, name: str) -> Path:
-        """Where a picture goes; its folder is made.
-
-        Raises:
-            StorageError: the disk refused.
-        """
-        path = self.document.parent / "images" / f"{name}.png"
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise StorageError(f"cannot write {path.parent}: {error.strerror}.") from error
-        return path
+        """Where a picture goes; its folder is made. Raises StorageError: the disk refused."""
+        folder = self.document.parent / "images"
+        make_folder(folder)
+        return folder / f"{name}.png"
 
     def link(self, image: Path, words: str) -> str:
         """Markdown that shows a picture."""
         return f"![{words}]({image.relative_to(self.document.parent)})"
+
+
+def make_folder(folder: Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise StorageError(f"cannot write {folder}: {error.strerror}.") from error

@@ -15,10 +15,9 @@ from typing import get_args
 import pandas as pd
 
 from tumortrack_lab.study.document import table
-from tumortrack_lab.study.frame import EMPTY, NOT_FOUND, NOTHING, names, scenes, tumors
 from tumortrack_lab.study.models import CLINIC
 from tumortrack_lab.study.paper import Kind, Lie, hausdorff
-from tumortrack_lab.study.tables import label_of
+from tumortrack_lab.study.tables import EMPTY, NOT_FOUND, NOTHING, label_of, names, scenes, tumors
 
 RULE = (
     "Distances in mm. Medians over cases and variants (and tumors, where a case has several), "
@@ -47,31 +46,22 @@ class StudyGoal:
     paper: str = EMPTY
     high: bool = False
 
-    def verdict(self, frame: pd.DataFrame) -> str:
-        """``yes`` or ``no``; nothing where nothing was measured or there is no goal."""
-        value = self.read(frame)
-        if self.limit is None or math.isnan(value):
-            return NOTHING
-        met = value >= self.limit if self.high else value <= self.limit
-        return "yes" if met and math.isfinite(value) else "no"
-
-    def value(self, frame: pd.DataFrame, ours: bool) -> str:
-        """The number, to two digits; ``ours``: rounded to its disadvantage."""
+    def value(self, frame: pd.DataFrame) -> str:
+        """The number, to two digits."""
         value = self.read(frame)
         if not math.isfinite(value):
             return NOTHING if math.isnan(value) else NOT_FOUND
-        if ours:
-            away = math.floor if self.high else math.ceil
-            value = away(round(value * 100, 6)) / 100
         return f"{value:.2f}"
 
-    def value_and_verdict(self, frame: pd.DataFrame) -> str:
-        value, verdict = self.value(frame, ours=True), self.verdict(frame)
-        return value if verdict == NOTHING else f"{value} ({verdict})"
-
-    @property
-    def limit_text(self) -> str:
-        return EMPTY if self.limit is None else f"{'≥' if self.high else '≤'} {self.limit:g}"
+    def ours(self, frame: pd.DataFrame) -> tuple[str, str]:
+        """The number rounded to its disadvantage, and ``yes`` or ``no``; nothing where nothing was
+        measured or there is no goal."""
+        value, away = self.read(frame), math.floor if self.high else math.ceil
+        shown = f"{away(round(value * 100, 6)) / 100:.2f}" if math.isfinite(value) else None
+        if self.limit is None or math.isnan(value):
+            return shown or self.value(frame), NOTHING
+        met = value >= self.limit if self.high else value <= self.limit
+        return shown or self.value(frame), "yes" if met and math.isfinite(value) else "no"
 
 
 def goal_tables(frame: pd.DataFrame, lies: dict[str, dict[str, Lie]]) -> str:
@@ -83,19 +73,17 @@ def goal_tables(frame: pd.DataFrame, lies: dict[str, dict[str, Lie]]) -> str:
     own = by_method.pop(CLINIC, frame[:0])
     bounds = {name: mine for name, mine in by_method.items() if "bound" in name}
     before = {name: mine for name, mine in by_method.items() if name not in bounds}
-    goals = goals_of(own)
     head = ["figure", "paper", *map(label_of, before), CLINIC, "goal", "met"]
-    rows = []
-    for goal in goals:
-        row = [goal.text, goal.paper, *(goal.value(mine, ours=False) for mine in before.values())]
-        row += [goal.value(own, ours=True), goal.limit_text, goal.verdict(own)]
-        rows.append([*row, *(goal.value(mine, ours=False) for mine in bounds.values())])
+    cases, rows, each = names(own, "case"), [], []
+    for goal in goals_of(own):
+        ours, met = goal.ours(own)
+        limit = EMPTY if goal.limit is None else f"{'≥' if goal.high else '≤'} {goal.limit:g}"
+        theirs = [[goal.value(mine) for mine in some.values()] for some in (before, bounds)]
+        rows.append([goal.text, goal.paper, *theirs[0], ours, limit, met, *theirs[1]])
+        by_case = [goal.ours(own[own.case == case]) for case in cases]
+        texts = [value if met == NOTHING else f"{value} ({met})" for value, met in by_case]
+        each.append([goal.text, *texts])
     whole = table([*head, *map(label_of, bounds)], rows)
-    cases = names(own, "case")
-    each = [
-        [goal.text, *(goal.value_and_verdict(own[own.case == case]) for case in cases)]
-        for goal in goals
-    ]
     return f"{whole}\n\nEach case of {CLINIC}:\n\n{table(['figure', *cases], each)}"
 
 
@@ -109,20 +97,22 @@ def goals_of(own: pd.DataFrame) -> list[StudyGoal]:
                 read = partial(_distance, variant=variant, kind=kind, key=key)
                 shown = theirs.text if theirs and words == "one-sided" else EMPTY
                 goals.append(StudyGoal(f"tumor {words}, {variant}, {kind}", read, limit, shown))
-    deformed, everything = partial(_noisy, deformed=True), _noisy
+    deformed = partial(_noisy, deformed=True)
     return [
         *goals,
         StudyGoal("tumor centre, worst variant of any case",
                   lambda f: _per_scene(tumors(_noisy(f)), "center_mm").max(), 2.5, "< 10"),
         StudyGoal("mIoU, deformed variants", lambda f: _miou(deformed(f)), 0.90, "0.71", high=True),
-        StudyGoal("mIoU, all variants", lambda f: _miou(everything(f)), 0.90, high=True),
+        StudyGoal("mIoU, all variants", lambda f: _miou(_noisy(f)), 0.90, high=True),
         StudyGoal("target error, deformed variants", lambda f: _targets(deformed(f)).median(), 2.0),
-        StudyGoal("target error, all variants", lambda f: _targets(everything(f)).median(), 2.0),
+        StudyGoal("target error, all variants", lambda f: _targets(_noisy(f)).median(), 2.0),
         StudyGoal("target error, worst variant of any case", lambda f: _targets(_noisy(f)).max()),
         StudyGoal("hidden surface: tumor HD, times",
                   partial(_ratio, of=lambda f: _per_scene(tumors(f), "hausdorff_mm")), 1.3),
         StudyGoal("hidden surface: target error, times", partial(_ratio, of=_targets), 1.3),
-        StudyGoal("training, minutes", _training, _training_limit(own), "120 (RTX 4090)"),
+        StudyGoal("training, minutes",
+                  lambda f: scenes(f[f.kind != "bound"]).prepare_s.max() / 60,
+                  _training_limit(own), "120 (RTX 4090)"),
         StudyGoal("scenes with a part not found, %",
                   lambda f: 100 * scenes(_noisy(f)).failed.mean()),
     ]  # fmt: skip
@@ -162,10 +152,6 @@ def _ratio(frame: pd.DataFrame, of: Callable[[pd.DataFrame], pd.Series]) -> floa
     if math.isnan(above + below):
         return math.nan
     return above / below if 0 < below < math.inf else math.inf
-
-
-def _training(frame: pd.DataFrame) -> float:
-    return scenes(frame[frame.kind != "bound"]).prepare_s.max() / 60
 
 
 def _training_limit(own: pd.DataFrame) -> float | None:

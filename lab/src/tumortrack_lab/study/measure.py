@@ -12,9 +12,10 @@ import json
 import os
 import time
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -22,24 +23,22 @@ from jaxtyping import Float
 import tumortrack
 from tumortrack.core import store
 from tumortrack.core.config import Config, to_builtins
-from tumortrack.core.errors import InputError, StorageError
+from tumortrack.core.errors import InputError
 from tumortrack.core.estimate import Estimate
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.types import Anatomy, Mesh
 from tumortrack.report.metrics import distance_to_surface
 from tumortrack.report.protocol import evaluate_scene
 from tumortrack.sense.camera import deproject
-from tumortrack.simulate.scene_folder import Scene, read_scene
+from tumortrack.simulate.scene_folder import read_scene
 from tumortrack_lab.bench.machine import cpu_name
 from tumortrack_lab.peers.rigid import kabsch
-from tumortrack_lab.study.cases import StudyCase
-from tumortrack_lab.study.methods import Answer, Method
+from tumortrack_lab.study.document import make_folder
+from tumortrack_lab.study.methods import Answer, Method, StudyCase
 
 CLEAN_VIEW = "clean"
 _POINTS = 120  # vertices drawn of each tumor
 _NEAR_MM, _FAR_MM = 50.0, 400.0  # of a depth image: what can be the organ at all
-
-
 _SCHEMA = 1  # raise it when a measurement's metrics change their meaning
 
 
@@ -64,11 +63,11 @@ class MeasurementSpec(Config, frozen=True):
         return hashlib.sha256(json.dumps(to_builtins(self), sort_keys=True).encode()).hexdigest()
 
 
+@dataclass(frozen=True)
 class MeasurementStore:
     """The folder of all measurements: CASE/METHOD/SCENE-FAULT-GRID-DIGEST.json."""
 
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
+    folder: Path
 
     def path(self, spec: MeasurementSpec) -> Path:
         method = f"{spec.method['name']}-{spec.method.get('seed', 0)}"
@@ -76,45 +75,18 @@ class MeasurementStore:
         return self.folder / spec.case / method / file
 
     def read(self, spec: MeasurementSpec) -> dict | None:
-        """What was measured with exactly this specification; None where nothing was.
-
-        Raises:
-            ArtifactError: its file is damaged.
-        """
+        """What was measured with exactly this specification; None where nothing was. Raises
+        ArtifactError: its file is damaged."""
         path = self.path(spec)
-        if not path.exists():
-            return None
-        measurement = store.read_json(path)
+        measurement = store.read_json(path) if path.exists() else {}
         return measurement if measurement.get("spec") == to_builtins(spec) else None
 
     def write(self, spec: MeasurementSpec, measured: dict) -> dict:
-        """Keep a measurement, in one step.
-
-        Raises:
-            StorageError: the disk refused.
-        """
-        path = self.path(spec)
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise StorageError(f"cannot write {path.parent}: {error.strerror}.") from error
+        """Keep a measurement, in one step. Raises StorageError: the disk refused."""
+        make_folder(self.path(spec).parent)
         measurement = {"spec": to_builtins(spec), **measured}
-        store.write_json(path, measurement)
+        store.write_json(self.path(spec), measurement)
         return measurement
-
-
-def provenance(device: str) -> dict:
-    """Where and by what something is measured; ``load`` is how busy the machine was."""
-    import torch
-
-    return {
-        "tumortrack": tumortrack.__version__,
-        "device": device,
-        "cpu": cpu_name(),
-        "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 0,
-        "threads": torch.get_num_threads(),
-        "load": round(os.getloadavg()[0], 2) if hasattr(os, "getloadavg") else None,
-    }
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,14 +100,14 @@ class Job:
     grid: int
     fault: str = "none"
     fault_seed: int = 0
+    also: dict = field(default_factory=dict)  # what else decides it, beside the method's identity
 
     @property
     def scene(self) -> Path:
         return self.case.scene(self.variant, self.view)
 
 
-@dataclass(frozen=True)
-class StudyStatus:
+class StudyStatus(NamedTuple):
     """Where the measuring stands, after each measurement."""
 
     done: int
@@ -153,15 +125,9 @@ def measure(
     one: Callable[[Job], dict] | None = None,
 ) -> list[dict]:
     """The measurements of these jobs in their order; only those that are not kept yet are made,
-    each by ``one`` (``measure_one``).
-
-    Raises:
-        InputError: a scene is missing or cannot be read.
-        ArtifactError: a kept measurement or a model is damaged.
-        StorageError: the disk refused.
-    """
-    jobs = list(jobs)
-    hashed = cache(store.sha256_of)
+    each by ``one`` (``measure_one``). Raises InputError: a scene is missing or cannot be read;
+    ArtifactError: a kept measurement or a model is damaged; StorageError: the disk refused."""
+    jobs, hashed = list(jobs), cache(store.sha256_of)
     specs = [spec_of(job, hashed) for job in jobs]
     known = {spec.digest: kept.read(spec) for spec in specs}
     todo = {d: (s, j) for s, j in zip(specs, jobs, strict=True) if known[d := s.digest] is None}
@@ -177,10 +143,9 @@ def measure(
             mean = float(np.mean([s for each in spent.values() for s in each]))
             # A kind that was not measured yet counts with the mean of all.
             left = float(sum(np.mean(spent.get(kind, mean)) for kind in kinds[number:]))
-            status = StudyStatus(done, len(known), number, name.removesuffix(" none"), mean, left)
-            report(status)
-    found = [known[spec.digest] for spec in specs]
-    return [measurement for measurement in found if measurement is not None]
+            name = name.removesuffix(" none")
+            report(StudyStatus(done, len(known), number, name, mean, left))
+    return [found for spec in specs if (found := known[spec.digest]) is not None]
 
 
 def _kind_of(spec: MeasurementSpec) -> str:
@@ -201,7 +166,7 @@ def spec_of(job: Job, hashed: Callable[[Path], str] = store.sha256_of) -> Measur
         scene_sha256=hashed(job.scene),
         variant=job.variant,
         view=job.view,
-        method=job.method.identity,
+        method={**job.method.identity, **job.also},
         grid=job.grid,
         fault=job.fault,
         fault_seed=job.fault_seed,
@@ -217,12 +182,22 @@ def by_method(jobs: Iterable[Job]) -> list[Job]:
 
 
 def about_answer(job: Job, answer: Answer | None) -> dict:
-    """What every measurement says of its method: seconds, training, machine."""
+    """What every measurement says of its method: seconds, training, machine (``load``: how busy
+    it was)."""
+    import torch
+
     return {
         "frame_s": answer.frame_s if answer else None,
         "prepare_s": job.method.prepare_s,
         "method": job.method.about,
-        "provenance": provenance(job.method.device),
+        "provenance": {
+            "tumortrack": tumortrack.__version__,
+            "device": job.method.device,
+            "cpu": cpu_name(),
+            "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 0,
+            "threads": torch.get_num_threads(),
+            "load": round(os.getloadavg()[0], 2) if hasattr(os, "getloadavg") else None,
+        },
     }
 
 
@@ -244,12 +219,14 @@ def measure_one(job: Job) -> dict:
     if estimate:
         clean = job.case.scene(job.variant, CLEAN_VIEW)
         seen = scene if MOVED in scene.meta or not clean.is_dir() else read_scene(clean)
-        visible_mm = visible_points(seen)
+        visible_mm = seen.cloud.points_mm.astype(float)
+        if seen.depth is not None:  # all its pixels
+            visible_mm = deproject(seen.depth).astype(float)
+            z = visible_mm[:, 2]
+            visible_mm = visible_mm[(z > _NEAR_MM) & (z < _FAR_MM)]
         points = point_errors(scene.reference, job.case.anatomy_ct, visible_mm, estimate.meshes)
     return {
-        "parts": entry["parts"],
-        "miou": entry["miou"],
-        "failed": entry["failed"],
+        **{key: entry[key] for key in ("parts", "miou", "failed")},
         "locate_s": entry.get("seconds"),
         "points": points,
         "targets_mm": entry.get("tre_mm"),
@@ -257,37 +234,21 @@ def measure_one(job: Job) -> dict:
     }
 
 
-def visible_points(scene: Scene) -> Float[np.ndarray, "n 3"]:
-    """The organ's visible surface: all pixels of the depth image, or else the cloud."""
-    if scene.depth is None:
-        return scene.cloud.points_mm.astype(float)
-    points = deproject(scene.depth).astype(float)
-    return points[(points[:, 2] > _NEAR_MM) & (points[:, 2] < _FAR_MM)]
-
-
 def point_errors(
-    truth: Anatomy,
-    rest_ct: Anatomy,
-    visible_mm: Float[np.ndarray, "n 3"],
-    meshes: dict[str, Mesh],
+    truth: Anatomy, rest_ct: Anatomy, visible_mm: Float[np.ndarray, "n 3"], meshes: dict[str, Mesh]
 ) -> dict[str, dict[str, list[float]]]:
     """By tumor that was found: depth, displacement and error of points of its true surface, mm.
 
     A network gives no correspondence, so the error of a point is its distance to the estimated
     surface, for every method alike. Depth is the distance to the nearest visible point;
     displacement is what is left of a point's way after the best rigid motion of the whole organ,
-    and absent where the scene's surfaces are not the case's.
-
-    Args:
-        truth: the anatomy in the scene, camera frame; face n of a part is face n of ``rest_ct``.
-        rest_ct: the undeformed anatomy, CT frame.
-        visible_mm: the visible surface without noise, camera frame.
-        meshes: the estimate, by part name.
+    and absent where the scene's surfaces are not the case's. ``truth``: camera frame; face n of a
+    part is face n of ``rest_ct``, the undeformed anatomy, CT frame; ``visible_mm``: the visible
+    surface without noise, camera frame; ``meshes``: the estimate, by part name.
     """
     from scipy.spatial import cKDTree
 
-    seen = cKDTree(visible_mm)
-    moves = displacements(truth, rest_ct)
+    seen, moves = cKDTree(visible_mm), displacements(truth, rest_ct)
     out: dict[str, dict[str, list[float]]] = {}
     for name, part in zip(truth.names[1:], truth.tumors, strict=True):
         if name not in meshes or len(meshes[name].faces) == 0:
@@ -295,10 +256,8 @@ def point_errors(
         corners = part.faces.reshape(-1)
         chosen = np.random.default_rng(0).integers(len(corners), size=_POINTS)
         points = part.vertices_mm[corners[chosen]]
-        columns = {
-            "depth_mm": seen.query(points)[0],
-            "error_mm": distance_to_surface(points, meshes[name]),
-        }
+        columns = {"depth_mm": seen.query(points)[0]}
+        columns["error_mm"] = distance_to_surface(points, meshes[name])
         if name in moves:
             columns["displacement_mm"] = moves[name][chosen]
         out[name] = {key: np.round(values, 2).tolist() for key, values in columns.items()}
@@ -313,8 +272,10 @@ def displacements(truth: Anatomy, rest_ct: Anatomy) -> dict[str, Float[np.ndarra
     """
     if [len(part.faces) for part in truth.parts] != [len(part.faces) for part in rest_ct.parts]:
         return {}
-    now = [part.vertices_mm[part.faces.reshape(-1)] for part in truth.parts]
-    before = [part.vertices_mm[part.faces.reshape(-1)] for part in rest_ct.parts]
+    now, before = (
+        [part.vertices_mm[part.faces.reshape(-1)] for part in anatomy.parts]
+        for anatomy in (truth, rest_ct)
+    )
     best = kabsch(before[0], now[0], np.ones(len(now[0])))
     return {
         name: np.linalg.norm(a - transform_points(best, b), axis=1)

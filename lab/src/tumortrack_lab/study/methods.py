@@ -1,4 +1,4 @@
-"""What can be measured: trained models and peers, as methods that locate.
+"""What can be measured: cases with their scenes; trained models and peers, as methods that locate.
 
 A method has an identity, and turns a scene's cloud into an estimate. Nothing heavy is made or
 loaded before a measurement needs it.
@@ -24,16 +24,63 @@ from tumortrack.core.config import to_builtins
 from tumortrack.core.errors import InputError
 from tumortrack.core.estimate import Estimate, OneWay
 from tumortrack.core.types import Anatomy
+from tumortrack.imaging.case import Case, load_case, save_case
+from tumortrack.imaging.surface import surfaces
 from tumortrack.models.model import Model
+from tumortrack.phantom.digital import PhantomParameters, phantom_labels
 from tumortrack.registration.model import RegistrationModel
 from tumortrack.simulate.scene_folder import Scene
 from tumortrack.tracking.tracker import Tracker
 from tumortrack.training.model import load_model
 from tumortrack_lab.peers.base import Fit, Peer, estimate_of
 from tumortrack_lab.peers.kinds import PeerKind, peer_kinds
-from tumortrack_lab.study.cases import StudyCase
 
+_UP_LPS = (0.0, -1.0, 0.0)
+_VOXEL_MM = 0.8  # of the phantoms' labels
 _LIVE_STAGES = ("encode", "coarse", "refine", "fine")  # of a live frame: without the dense volume
+
+
+@dataclass(frozen=True, eq=False)
+class StudyCase:
+    """A patient or phantom with its scenes; ``is_paper`` where the paper's figures apply."""
+
+    name: str
+    folder: Path
+    scenes: Path
+    anatomy_ct: Anatomy
+    up_lps: tuple[float, float, float]
+    is_paper: bool = False
+
+    def scene(self, variant: str, view: str) -> Path:
+        return self.scenes / f"{variant}-{view}"
+
+
+def study_case(name: str, folder: Path, scenes: Path, is_paper: bool = False) -> StudyCase:
+    """A case folder and its scenes; ArtifactError where the folder is no case, or damaged."""
+    case = load_case(folder)
+    return StudyCase(name, folder, scenes, case.anatomy, case.up_lps, is_paper)
+
+
+def phantom_case(folder: Path, parameters: PhantomParameters) -> Path:
+    """Write a phantom's case folder from its exact labels; one that is there stays."""
+    if not folder.exists():
+        labels = phantom_labels(parameters, _VOXEL_MM)
+        case = Case(surfaces(labels)[0], labels, _UP_LPS, {"kind": "phantom"})
+        with store.new_folder(folder) as aside:
+            save_case(case, aside)
+    return folder
+
+
+def named_folders(texts: Iterable[str], taken: Iterable[str]) -> dict[str, Path]:
+    """Folders by name, of options that read NAME=FOLDER; InputError for a name that is none, or
+    stands twice."""
+    folders: dict[str, Path] = {}
+    for text in texts:
+        name, _, folder = text.partition("=")
+        if not name.isidentifier() or not folder or name in (*taken, *folders):
+            raise InputError(f"--case {text!r} must be NAME=FOLDER, with a name of its own.")
+        folders[name] = Path(folder)
+    return folders
 
 
 @dataclass(frozen=True)
@@ -47,15 +94,12 @@ class Answer:
 class Method(ABC):
     """One way to locate, for one patient."""
 
+    device: str = "cpu"
+
     @property
     @abstractmethod
     def identity(self) -> dict:
         """``kind``, ``name`` and everything else that decides the answers (JSON)."""
-
-    @property
-    def device(self) -> str:
-        """What it runs on."""
-        return "cpu"
 
     @property
     @abstractmethod
@@ -69,12 +113,8 @@ class Method(ABC):
 
     @abstractmethod
     def locate(self, scene: Scene, grid: int) -> Answer:
-        """The anatomy in a scene; ``grid``: voxels along the longest side of the volume.
-
-        Raises:
-            NoEstimate: nothing can be said of the scene.
-            InputError: the cloud cannot be used.
-        """
+        """The anatomy in a scene; ``grid``: voxels along the longest side of the volume. Raises
+        NoEstimate: nothing can be said of the scene; InputError: the cloud cannot be used."""
 
 
 def answer_of(fit: Fit, anatomy_ct: Anatomy, scene: Scene, grid: int) -> Answer:
@@ -96,21 +136,18 @@ class Network(Method):
 
     @cached_property
     def identity(self) -> dict:
-        about = self.provenance
         named = {"unrefined": True} if self.unrefined else {}  # older measurements have no such key
         return {
             "kind": "network",
             "name": self.name,
-            "seed": about["seed"],
-            "steps": about["steps"],
+            **{key: self._provenance[key] for key in ("seed", "steps")},
             "locate_seed": self.locate_seed,
             "model_sha256": store.sha256_of(self.folder / store.MANIFEST),
             **named,
         }
 
-    @property
-    def provenance(self) -> dict:
-        """The model's own: steps, seconds of training, device."""
+    @cached_property
+    def _provenance(self) -> dict:
         return store.read_json(self.folder / store.MANIFEST)["provenance"]
 
     @cached_property
@@ -119,18 +156,18 @@ class Network(Method):
         return Tracker(without_refinement(model) if self.unrefined else model)
 
     @property
-    def device(self) -> str:
+    def device(self) -> str:  # type: ignore[override]
         return str(next(self._tracker.model.network.parameters()).device.type)
 
     @property
     def prepare_s(self) -> float | None:
-        return self.about["training_s"]
+        return self._provenance["training_s"]
 
     @property
     def about(self) -> dict:
         """Of the training: seed, steps, seconds, device, validation mIoU."""
         keys = ("seed", "steps", "training_s", "device", "validation_miou")
-        return {key: self.provenance[key] for key in keys}
+        return {key: self._provenance[key] for key in keys}
 
     def locate(self, scene: Scene, grid: int) -> Answer:
         estimate = self._tracker.locate(scene.cloud, grid, self.locate_seed)
@@ -141,19 +178,16 @@ class Network(Method):
 def without_refinement(model: Model) -> RegistrationModel:
     """The warp model that takes its network's word; only which way round an organ lies, where the
     network is in doubt, is still decided by the cloud. Any fit is familiar and usual to it, for
-    validation knew refined ones.
-
-    Raises:
-        InputError: the model is no warp.
-    """
+    validation knew refined ones. Raises InputError: the model is no warp."""
     if not isinstance(model, RegistrationModel):
         raise InputError("only warps are refined; an occupancy model has no unrefined form.")
-    config = msgspec.structs.replace(
-        model.config, refine=msgspec.structs.replace(model.config.refine, steps=0)
+    change = msgspec.structs.replace
+    return replace(
+        model,
+        config=change(model.config, refine=change(model.config.refine, steps=0)),
+        in_distribution=change(model.in_distribution, fit_mm=math.inf),
+        calibration=change(model.calibration, usual_cost=math.inf),
     )
-    in_distribution = msgspec.structs.replace(model.in_distribution, fit_mm=math.inf)
-    calibration = msgspec.structs.replace(model.calibration, usual_cost=math.inf)
-    return replace(model, config=config, in_distribution=in_distribution, calibration=calibration)
 
 
 @dataclass(frozen=True, eq=False)
@@ -208,11 +242,8 @@ def code_sha256(paths: Iterable[Path]) -> str:
 
 
 def peer_method(name: str, case: StudyCase, bcpd: Path | None = None) -> PeerMethod:
-    """The peer with this name for a case; ``bcpd`` is the built program of that peer.
-
-    Raises:
-        InputError: no such peer, or no program for ``bcpd``.
-    """
+    """The peer with this name for a case; ``bcpd`` is the built program of that peer. Raises
+    InputError: no such peer, or no program for ``bcpd``."""
     kinds = peer_kinds(bcpd)
     if name not in kinds:
         raise InputError(f"peer {name!r} is unknown. Allowed: {', '.join(kinds)}.")

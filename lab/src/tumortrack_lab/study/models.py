@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 from msgspec.structs import replace
 
@@ -18,9 +19,8 @@ from tumortrack.sense.noise import CalibrationConfig
 from tumortrack.sense.occlusion import OcclusionConfig
 from tumortrack.simulate.deform import DragConfig
 from tumortrack.simulate.deform.drag import CONFIGURATIONS
-from tumortrack.training.train import TrainingRun, TrainingStatus, run_identity, train
-from tumortrack_lab.study.cases import StudyCase
-from tumortrack_lab.study.methods import Network
+from tumortrack.training.train import TrainingRun, TrainingStatus, train
+from tumortrack_lab.study.methods import Network, StudyCase
 
 # A preset: anatomy and rotations (limited, full) -> training configuration.
 Preset = Callable[[Anatomy, str], TrainConfig]
@@ -32,8 +32,7 @@ ABLATED = ("clinic_drags", "clinic_clean", "clinic_pointnet", "quick_elastic")
 _DRAGS = 10  # kinds of drags beside one elastic kind, all with equal chance
 
 
-@dataclass(frozen=True)
-class Presets:
+class Presets(NamedTuple):
     """Those that the study's models are made of."""
 
     quick: Preset
@@ -51,29 +50,28 @@ def train_config(name: str, case: StudyCase, presets: Presets) -> TrainConfig:
     - clinic_pointnet: ``clinic`` with the encoder of ``quick``.
     - quick_elastic: M_lim's network on the scenes of ``clinic``.
 
-    Raises:
-        InputError: no such model.
+    Raises InputError: no such model.
     """
     quick = presets.quick(case.anatomy_ct, MODELS.get(name, "limited"))
     if name in MODELS:
         return quick
+    drags = {number: DragConfig(steps=steps) for number, steps in CONFIGURATIONS.items()}
     if name.startswith("configuration_"):
-        drags = DragConfig(steps=CONFIGURATIONS[int(name.rpartition("_")[2])])
-        return _with_scene(quick, deform=(drags,))
-    clinic = presets.clinic(case.anatomy_ct, "limited")
-    if name == CLINIC:
-        return clinic
-    if name == "clinic_drags":
-        both = tuple(DragConfig(steps=CONFIGURATIONS[n]) for n in (3, 6))
-        return _with_scene(clinic, deform=(*both * (_DRAGS // 2), *clinic.scene.deform))
-    if name == "clinic_clean":
-        occlusion, clutter = OcclusionConfig(), ClutterConfig()
-        calibration = CalibrationConfig()
-        return _with_scene(clinic, occlusion=occlusion, clutter=clutter, calibration=calibration)
-    if name == "clinic_pointnet":
-        return replace(clinic, network=replace(clinic.network, encoder=quick.network.encoder))
-    if name == "quick_elastic":
-        return replace(quick, scene=replace(clinic.scene, occupancy=quick.scene.occupancy))
+        return _with_scene(quick, deform=(drags[int(name.rpartition("_")[2])],))
+    own = presets.clinic(case.anatomy_ct, "limited")
+    match name:
+        case "clinic":
+            return own
+        case "clinic_drags":
+            both = (drags[3], drags[6]) * (_DRAGS // 2)
+            return _with_scene(own, deform=(*both, *own.scene.deform))
+        case "clinic_clean":
+            clean = {"occlusion": OcclusionConfig(), "clutter": ClutterConfig()}
+            return _with_scene(own, **clean, calibration=CalibrationConfig())
+        case "clinic_pointnet":
+            return replace(own, network=replace(own.network, encoder=quick.network.encoder))
+        case "quick_elastic":
+            return replace(quick, scene=replace(own.scene, occupancy=quick.scene.occupancy))
     raise InputError(
         f"model {name!r} is unknown. Allowed: {', '.join((*MODELS, CLINIC, *ABLATED))}, each "
         f"warp also with {UNREFINED}, and configuration_1 to {max(CONFIGURATIONS)}."
@@ -84,38 +82,28 @@ def _with_scene(config: TrainConfig, **changed: object) -> TrainConfig:
     return replace(config, scene=replace(config.scene, **changed))
 
 
+@dataclass(frozen=True)
 class Trainer:
     """Trains what is not trained yet; a training that was killed is taken up again.
 
     Steps decide the end, not minutes: a loaded machine gives the same model, only later.
     """
 
-    def __init__(
-        self,
-        folder: Path,
-        presets: Presets,
-        device: str = "auto",
-        workers: int | None = None,
-        report: Report | None = None,
-    ) -> None:
-        self.folder = folder
-        self._presets, self._device, self._workers = presets, device, workers
-        self._report = report
+    folder: Path
+    presets: Presets
+    device: str = "auto"
+    workers: int | None = None
+    report: Report = lambda *_: None
 
     def steps_for(self, case: StudyCase, name: str, scenes: int) -> int:
         """Steps after which a model has seen so many scenes."""
-        config = train_config(name.removesuffix(UNREFINED), case, self._presets)
+        config = train_config(name.removesuffix(UNREFINED), case, self.presets)
         return max(1, scenes // config.batch_size)
 
     def model(self, case: StudyCase, name: str, seed: int, steps: int) -> Network:
         """The model under FOLDER/CASE/NAME-seed-steps; an unrefined one is the refined one's.
-
-        Raises:
-            InputError: no such model.
-            ArtifactError: what lies there belongs to another case or configuration.
-            StorageError: the disk refused.
-            Interrupted: Ctrl-C; the state is saved.
-        """
+        Raises InputError: no such model; ArtifactError: what lies there belongs to another case or
+        configuration; StorageError: the disk refused; Interrupted: Ctrl-C, the state is saved."""
         import torch
 
         trained = name.removesuffix(UNREFINED)
@@ -124,22 +112,17 @@ class Trainer:
             anatomy_ct=case.anatomy_ct,
             up_lps=case.up_lps,
             case_sha256=store.sha256_of(case.folder / store.MANIFEST),
-            config=train_config(trained, case, self._presets),
+            config=train_config(trained, case, self.presets),
             seed=seed,
             steps=steps,
-            device=self._device,  # type: ignore[arg-type]
-            workers=self._workers,
+            device=self.device,  # type: ignore[arg-type]
+            workers=self.workers,
         )
-        if not is_finished(folder) or not _same(folder, run):
+        # A finished model of another run is refused by training, with a clear text.
+        about = store.read_json(folder / store.MANIFEST) if is_finished(folder) else {}
+        if about.get("provenance", {}).get("run_sha256") != run.identity:
             threads = torch.get_num_threads()
             label = f"{case.name} {trained} seed {seed}"
-            report = self._report or (lambda *_: None)
-            train(run, folder, lambda status: report(label, status))
+            train(run, folder, lambda status: self.report(label, status))
             torch.set_num_threads(threads)  # training leaves some cores to its workers
-        return Network(name, folder, self._device, unrefined=trained != name)
-
-
-def _same(folder: Path, run: TrainingRun) -> bool:
-    """Whether a finished model is this run's; else training refuses it with a clear text."""
-    manifest = store.read_json(folder / store.MANIFEST)
-    return manifest["provenance"].get("run_sha256") == run_identity(run)
+        return Network(name, folder, self.device, unrefined=trained != name)

@@ -8,7 +8,7 @@ is the text's "approximately", "less than or equal to" and "less than".
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -21,8 +21,7 @@ Kind = Literal["exophytic", "endophytic"]
 CONFIGURATION_MIOU = {1: 0.70, 2: 0.65, 3: 0.71, 4: 0.71, 5: 0.68, 6: 0.66}
 
 
-@dataclass(frozen=True)
-class PaperFigure:
+class PaperFigure(NamedTuple):
     """A figure of the paper with its sign: ``""``, ``"~"``, ``"<="`` or ``"<"``."""
 
     sign: str
@@ -34,20 +33,24 @@ class PaperFigure:
         return f"{signs[self.sign]}{self.value_mm:g}"
 
 
+# Tumor distances (estimate to reference), mm, by variant (and model): exophytic, endophytic.
+_HAUSDORFF = {
+    "D1": ("~", 4.0, 7.0),
+    "D2": ("~", 6.0, 9.0),
+    "D3 M_lim": ("", 11.3, 12.9),
+    "D3 M_full": ("", 15.4, 18.5),
+}
+
+
 def hausdorff(variant: str, model: str, kind: Kind) -> PaperFigure | None:
     """The paper's tumor distance (estimate to reference), mm, where the text gives one."""
-    first = kind == "exophytic"
-    if variant == "D1":
-        return PaperFigure("~", 4.0 if first else 7.0)
-    if variant == "D2":
-        return PaperFigure("~", 6.0 if first else 9.0)
-    if variant == "D3" and model == "M_lim":
-        return PaperFigure("", 11.3 if first else 12.9)
-    if variant == "D3" and model == "M_full":
-        return PaperFigure("", 15.4 if first else 18.5)
     if variant.startswith("Rot") and model == "M_full":
         return PaperFigure("<=", 13.4)
-    return None
+    stated = _HAUSDORFF.get(variant) or _HAUSDORFF.get(f"{variant} {model}")
+    if stated is None:
+        return None
+    sign, exophytic, endophytic = stated
+    return PaperFigure(sign, exophytic if kind == "exophytic" else endophytic)
 
 
 def center(variant: str, model: str) -> PaperFigure | None:

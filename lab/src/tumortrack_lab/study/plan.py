@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Sequence
 from itertools import product
-from typing import Literal, TypeVar, get_args
+from typing import Literal, NamedTuple, TypeVar, get_args
 
 from tumortrack.core.config import Config
 from tumortrack_lab.study.bound import BOUNDS
-from tumortrack_lab.study.cases import StudyCase
 from tumortrack_lab.study.measure import CLEAN_VIEW, Job, by_method
-from tumortrack_lab.study.methods import Method, Network
+from tumortrack_lab.study.methods import Method, Network, StudyCase
 from tumortrack_lab.study.models import CLINIC, UNREFINED
-from tumortrack_lab.study.resection import Cutting, Truth
+from tumortrack_lab.study.resection import Truth, cutting
 
 VARIANTS = ("D0", "D1", "D2", "D3", "Rot90", "Rot180", "Rot270", "G1", "P1")
 VIEWS = ("clean", "noise", "shaft", "clutter")
@@ -118,33 +116,25 @@ QUICK = StudyPlan(
 )
 
 
-@dataclass(frozen=True)
-class Methods:
-    """Where methods come from: trained models, those of the ablation, peers (and bounds) made
-    ready for a patient."""
+class Methods(NamedTuple):
+    """Where methods come from: trained models, peers (and bounds) made ready for a patient, models
+    of the ablation."""
 
     model: Callable[[StudyCase, str, int], Network]
     peer: Callable[[str, StudyCase], Method]
     ablated: Callable[[StudyCase, str, int], Network]
 
 
-Made = Callable[[Methods], Iterable[Method]]  # making methods trains
+class _Block(NamedTuple):
+    """Models (names and seeds) and peers on every scene under every fault (with the seed of its
+    random part)."""
 
-
-@dataclass(frozen=True)
-class _Block:
-    """Every method on every scene under every fault (with the seed of its random part)."""
-
-    methods: Made
+    models: Iterable[tuple[str, int]]
+    peers: Sequence[str]
     variants: tuple[str, ...]
     views: tuple[str, ...]
     grid: int
-    faults: tuple[tuple[str, int], ...] = (("none", 0),)
-
-    def jobs(self, case: StudyCase, methods: Methods) -> Iterator[Job]:
-        made = list(self.methods(methods))
-        for method, view, fault, variant in product(made, self.views, self.faults, self.variants):
-            yield Job(case, method, variant, view, self.grid, *fault)
+    faults: Sequence[tuple[str, int]] = (("none", 0),)
 
 
 def jobs_of(
@@ -155,12 +145,19 @@ def jobs_of(
     ``cases``: for ``deformation`` the second phantom; for faults, views and severities, which have
     the first seed alone, the paper's phantom; for all others every case.
     """
-    return by_method(
-        job
-        for case in cases
-        for block in _Blocks(plan, case).of(section)
-        for job in block.jobs(case, methods)
-    )
+    model = methods.ablated if section == "ablation" else methods.model
+    jobs = []
+    for case in cases:
+        for block in _blocks(plan, section, case):
+            made: list[Method] = [model(case, *one) for one in block.models]
+            made += [methods.peer(name, case) for name in block.peers]
+            also = cutting() if section == "resection" else {}
+            made += [Truth()] if also else []
+            for one, view, fault, variant in product(
+                made, block.views, block.faults, block.variants
+            ):
+                jobs.append(Job(case, one, variant, view, block.grid, *fault, also))
+    return by_method(jobs)
 
 
 def scenes_of(
@@ -168,95 +165,60 @@ def scenes_of(
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Variants and views that a section needs; the clean view always, for it says what is
     visible."""
-    blocks = _Blocks(plan, case).of(section)
+    blocks = _blocks(plan, section, case)
     variants = dict.fromkeys(variant for block in blocks for variant in block.variants)
     views = dict.fromkeys(view for block in blocks for view in block.views)
     return tuple(variants), tuple(dict.fromkeys((CLEAN_VIEW, *views)))
 
 
-class _Blocks:
-    """The blocks of each section, by its name."""
+def _blocks(plan: StudyPlan, section: Section, case: StudyCase) -> list[_Block]:
+    def for_case(ours: T, theirs: T | None) -> T:
+        return ours if case.is_paper or theirs is None else theirs
 
-    def __init__(self, plan: StudyPlan, case: StudyCase) -> None:
-        self._plan, self._case = plan, case
-        self._seeds = self._for_case(plan.seeds, plan.case_seeds)
+    seeds = for_case(plan.seeds, plan.case_seeds)
+    coarse, usual = plan.coarse_grid, (plan.variants, (plan.view,))
+    clean = (CLEAN_VIEW,)
 
-    def of(self, section: Section) -> list[_Block]:
-        blocks: list[_Block] = getattr(self, section)()
-        return blocks
+    def trained(models: Iterable[str], of: Sequence[int] = seeds) -> list[tuple[str, int]]:
+        return list(product(models, of))
 
-    def accuracy(self) -> list[_Block]:
-        grid = self._for_case(self._plan.grid, self._plan.case_grid)
-        return [self._usual(self._made(self._plan.models), grid)]
+    def known(peers: Sequence[str]) -> list[str]:
+        return [name for name in peers if name in plan.peers]
 
-    def goals(self) -> list[_Block]:
-        """Hidden surface is for methods that have to find the organ: bounds see no cloud."""
-        models, peers = self._plan.goal_models, self._plan.goal_peers
-        hidden = self._disturbed(self._made(models, peers), (_HIDDEN,))
-        return [self._usual(self._made(models, (*peers, *BOUNDS))), hidden]
+    def disturbed(models: list[tuple[str, int]], peers: Sequence[str], levels: tuple) -> _Block:
+        draws = (("clean", 0), *product(levels, plan.severity_seeds))
+        return _Block(models, peers, plan.severity_variants, clean, coarse, draws)
 
-    def ablation(self) -> list[_Block]:
-        plan, case = self._plan, self._case
-        if case.name not in plan.ablation_cases:
-            return []
-        models = list(product(plan.ablation_models, plan.ablation_seeds))
-        made: Made = lambda methods: [methods.ablated(case, *model) for model in models]  # noqa: E731
-        return [_Block(made, plan.ablation_variants, plan.ablation_views, plan.coarse_grid)]
-
-    def deformation(self) -> list[_Block]:
-        plan = self._plan
-        names = [f"configuration_{number}" for number in plan.configurations]
-        seeds = plan.seeds if plan.configuration_seeds is None else plan.configuration_seeds
-        views = (plan.configuration_view,)
-        made = self._made(names, seeds=seeds)
-        return [_Block(made, plan.configuration_variants, views, plan.coarse_grid)]
-
-    def peers(self) -> list[_Block]:
-        peers = self._for_case(self._plan.peers, self._plan.case_peers)
-        return [self._usual(self._made(self._plan.models, peers))]
-
-    def faults(self) -> list[_Block]:
-        plan = self._plan
-        draws = [(f, s) for f in plan.faults for s in (plan.fault_seeds if f != "clean" else (0,))]
-        made = self._one_seed(plan.fault_models, plan.fault_peers)
-        return [_Block(made, plan.fault_variants, (CLEAN_VIEW,), plan.coarse_grid, tuple(draws))]
-
-    def views(self) -> list[_Block]:
-        plan = self._plan
-        return [_Block(self._one_seed(plan.models), plan.variants, plan.views, plan.coarse_grid)]
-
-    def severity(self) -> list[_Block]:
-        made = self._one_seed(self._plan.severity_models, self._plan.severity_peers)
-        return [self._disturbed(made, self._plan.severities)]
-
-    def resection(self) -> list[_Block]:
-        located_by = self._one_seed(self._plan.resection_models)
-        return [self._usual(lambda methods: map(Cutting, [*located_by(methods), Truth()]))]
-
-    def _for_case(self, ours: T, theirs: T | None) -> T:
-        return ours if self._case.is_paper or theirs is None else theirs
-
-    def _usual(self, methods: Made, grid: int | None = None) -> _Block:
-        plan = self._plan
-        return _Block(methods, plan.variants, (plan.view,), grid or plan.coarse_grid)
-
-    def _disturbed(self, methods: Made, severities: Sequence[str]) -> _Block:
-        plan = self._plan
-        draws = (("clean", 0), *product(severities, plan.severity_seeds))
-        return _Block(methods, plan.severity_variants, (CLEAN_VIEW,), plan.coarse_grid, draws)
-
-    def _one_seed(self, models: Sequence[str], peers: Sequence[str] = ()) -> Made:
-        known = [name for name in peers if name in self._plan.peers]
-        return self._made(models, known, self._seeds[:1])
-
-    def _made(
-        self,
-        models: Sequence[str],
-        peers: Sequence[str] = (),
-        seeds: Sequence[int] | None = None,
-    ) -> Made:
-        case, every = self._case, list(product(models, self._seeds if seeds is None else seeds))
-        return lambda methods: [
-            *(methods.model(case, *model) for model in every),
-            *(methods.peer(name, case) for name in peers),
-        ]
+    once, goal_models = seeds[:1], trained(plan.goal_models)
+    configurations = [f"configuration_{number}" for number in plan.configurations]
+    of = plan.seeds if plan.configuration_seeds is None else plan.configuration_seeds
+    draws = [(f, s) for f in plan.faults for s in (plan.fault_seeds if f != "clean" else (0,))]
+    grid, peers = for_case(plan.grid, plan.case_grid), for_case(plan.peers, plan.case_peers)
+    ablation = _Block(
+        trained(plan.ablation_models, plan.ablation_seeds), (),
+        plan.ablation_variants, plan.ablation_views, coarse,
+    )  # fmt: skip
+    blocks: dict[Section, list[_Block]] = {
+        "accuracy": [_Block(trained(plan.models), (), *usual, grid)],
+        "goals": [  # hidden surface is for methods that have to find the organ: bounds see no cloud
+            _Block(goal_models, (*plan.goal_peers, *BOUNDS), *usual, coarse),
+            disturbed(goal_models, plan.goal_peers, (_HIDDEN,)),
+        ],
+        "ablation": [ablation] * (case.name in plan.ablation_cases),
+        "deformation": [
+            _Block(trained(configurations, of), (), plan.configuration_variants,
+                   (plan.configuration_view,), coarse)
+        ],
+        "peers": [_Block(trained(plan.models), peers, *usual, coarse)],
+        "faults": [
+            _Block(trained(plan.fault_models, once), known(plan.fault_peers),
+                   plan.fault_variants, clean, coarse, draws)
+        ],
+        "views": [_Block(trained(plan.models, once), (), plan.variants, plan.views, coarse)],
+        "severity": [
+            disturbed(trained(plan.severity_models, once), known(plan.severity_peers),
+                      plan.severities)
+        ],
+        "resection": [_Block(trained(plan.resection_models, once), (), *usual, coarse)],
+    }  # fmt: skip
+    return blocks[section]

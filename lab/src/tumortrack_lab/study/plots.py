@@ -19,9 +19,19 @@ from tumortrack.report.pictures import FROM_SIDE, draw_solid_view, scene_legend
 from tumortrack.report.protocol import compare
 from tumortrack.simulate.scene_folder import Scene, read_scene
 from tumortrack_lab.study import paper
-from tumortrack_lab.study.frame import ORGAN, by_seed, groups, names, tumors
 from tumortrack_lab.study.measure import Job
-from tumortrack_lab.study.tables import FALLING, SEVERITIES, label_of, levels_of, spaced
+from tumortrack_lab.study.tables import (
+    FALLING,
+    ORGAN,
+    SEVERITIES,
+    by_seed,
+    groups,
+    label_of,
+    levels_of,
+    names,
+    spaced,
+    tumors,
+)
 from tumortrack_lab.twin.faults import KINDS
 
 if TYPE_CHECKING:
@@ -71,9 +81,11 @@ def error_against(frame: pd.DataFrame, key: str, path: Path) -> bool:
     highest = 1.0
     drawing = new_figure(9.4, 4.6)
     axes = drawing.add_axes((0.075, 0.125, 0.6, 0.8))
-    for number, (method, curve) in enumerate(curves.items()):
-        style = _style(method)
-        at, low, middle, high = _grouped(*curve)
+    for number, (method, (x, error)) in enumerate(curves.items()):
+        order, style = np.argsort(x, kind="stable"), _style(method)
+        parts = np.array_split(order, min(_BANDS, len(x) // (_FEWEST // 4)))
+        at = np.array([np.median(x[part]) for part in parts])
+        low, middle, high = np.transpose([np.percentile(error[p], (25, 50, 75)) for p in parts])
         highest = max(highest, 1.25 * float(middle.max()))
         if number < 2:
             axes.fill_between(at, low, high, color=style["color"], alpha=0.13, linewidth=0)
@@ -92,22 +104,11 @@ def error_against(frame: pd.DataFrame, key: str, path: Path) -> bool:
     return True
 
 
-def _grouped(x: np.ndarray, error: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Of groups of equally many points: median place, and the quartiles of the error."""
-    order = np.argsort(x, kind="stable")
-    parts = np.array_split(order, min(_BANDS, len(x) // (_FEWEST // 4)))
-    quartiles = [np.percentile(error[part], (25, 50, 75)) for part in parts]
-    return np.array([np.median(x[part]) for part in parts]), *np.transpose(quartiles)
-
-
 def error_per_variant(frame: pd.DataFrame, lies: dict[str, paper.Lie], path: Path) -> None:
     """One-sided Hausdorff distance of each tumor per variant and model, mean and spread over the
     seeds, with the paper's figures as open marks (a bar with an arrow: its upper bound)."""
-    parts, variants, models = (
-        names(tumors(frame), "part"),
-        names(frame, "variant"),
-        names(frame, "method"),
-    )
+    parts, variants = names(tumors(frame), "part"), names(frame, "variant")
+    models = names(frame, "method")
     drawing = new_figure(4.6 * len(parts) + 2.4, 4.6)
     panels = drawing.subplots(1, len(parts), sharey=True, squeeze=False)[0]
     narrow = len(parts) == 1  # its legend takes two rows
@@ -122,7 +123,8 @@ def error_per_variant(frame: pd.DataFrame, lies: dict[str, paper.Lie], path: Pat
                 here = mine[(mine.method == model) & (mine.variant == variant)]
                 x = place + (number - (len(models) - 1) / 2) * 0.26
                 _seeds(axes, x, by_seed(here, "hausdorff_one_sided_mm"), _style(model))
-                _paper_mark(axes, x + 0.1, paper.hausdorff(variant, model, kind), _style(model))
+                if figure := paper.hausdorff(variant, model, kind):
+                    _paper_mark(axes, x + 0.1, figure, _style(model))
         axes.set_xticks(range(len(variants)), variants)
         axes.set_title(f"{spaced(tumor)}, {kind}", loc="left", fontsize=11)
         for place in range(len(variants) - 1):
@@ -148,11 +150,7 @@ def _seeds(axes: Axes, x: float, values: pd.Series, style: dict[str, Any]) -> No
         axes.errorbar(x, values.mean(), spread, markersize=7, capsize=3, lw=1.6, **style)
 
 
-def _paper_mark(
-    axes: Axes, x: float, figure: paper.PaperFigure | None, style: dict[str, Any]
-) -> None:
-    if figure is None:
-        return
+def _paper_mark(axes: Axes, x: float, figure: paper.PaperFigure, style: dict[str, Any]) -> None:
     if figure.sign == "<=":
         arrow = {"arrowstyle": "->", "color": style["color"], "shrinkA": 0, "shrinkB": 0}
         axes.plot([x - 0.1, x + 0.1], [figure.value_mm] * 2, color=style["color"], lw=1.6)
@@ -176,18 +174,14 @@ def _variant_legend(models: list[str]) -> list[Line2D]:
         here, there = f"{model}, here", f"{model}, paper (hydrogel)"
         handles.append(Line2D([], [], markersize=7, lw=1.6, label=here, **_style(model)))
         handles.append(Line2D([], [], label=there, **_open_mark(_style(model))))
-    bound = Line2D([], [], color="0.4", marker=r"$\downarrow$", markersize=9, lw=1.6)
-    bound.set_label("paper: at most")
-    return [*handles, bound]
+    most: dict[str, Any] = {"marker": r"$\downarrow$", "label": "paper: at most"}
+    return [*handles, Line2D([], [], color="0.4", markersize=9, lw=1.6, **most)]
 
 
 def severity_curves(frame: pd.DataFrame, path: Path) -> None:
     """Hausdorff distance of each tumor against each kind's level, a panel for each kind, by the
-    rule of the table. Errors are on a logarithmic scale: what matters is by which factor they grow.
-
-    Raises:
-        StorageError: the disk refused.
-    """
+    rule of the table. Errors are on a logarithmic scale: what matters is by which factor they
+    grow."""
     kinds = [kind for kind in KINDS if levels_of(frame, kind)]
     columns = min(4, max(len(kinds), 1))
     rows = -(-max(len(kinds), 1) // columns)
@@ -198,12 +192,13 @@ def severity_curves(frame: pd.DataFrame, path: Path) -> None:
         left=0.6 / width, right=0.985, top=1 - 0.45 / height, bottom=0.5 / height, wspace=0.1,
         hspace=0.38,
     )  # fmt: skip
+    dashes = [*zip(names(tumors(frame), "part"), _DASHES, strict=False)]
     for axes, kind in zip(panels.flat, kinds, strict=False):
         for (method,), mine in groups(frame, "method"):
             levels = levels_of(mine, kind)
-            for tumor, dashes in zip(names(tumors(frame), "part"), _DASHES, strict=False):
+            for tumor, dash in dashes:
                 here = [(level, rows[rows.part == tumor]) for level, rows in levels]
-                _severity_curve(axes, here, {**_style(method), "linestyle": dashes})
+                _severity_curve(axes, here, {**_style(method), "linestyle": dash})
         axes.set_xlabel(SEVERITIES[kind])
         if kind in FALLING:
             axes.invert_xaxis()
@@ -219,8 +214,8 @@ def severity_curves(frame: pd.DataFrame, path: Path) -> None:
     for row in panels:
         row[0].set_ylabel("tumor Hausdorff distance, mm")
     drawing.legend(
-        handles=_severity_legend(frame), loc="upper left", bbox_to_anchor=(0.04, 1.0), ncols=4,
-        frameon=False, fontsize=10,
+        handles=_severity_legend(frame, dashes), loc="upper left", bbox_to_anchor=(0.04, 1.0),
+        ncols=4, frameon=False, fontsize=10,
     )  # fmt: skip
     save(drawing, path)
 
@@ -245,26 +240,17 @@ def _severity_curve(
     axes.plot(lost, [0.97] * len(lost), transform=axes.get_xaxis_transform(), **cross)
 
 
-def _severity_legend(frame: pd.DataFrame) -> list[Line2D]:
+def _severity_legend(frame: pd.DataFrame, dashes: list[tuple[str, Any]]) -> list[Line2D]:
     from matplotlib.lines import Line2D
 
-    handles = [
-        Line2D([], [], lw=1.6, label=label_of(method), **_style(method))
-        for method in names(frame, "method")
-    ]
-    for tumor, dashes in zip(names(tumors(frame), "part"), _DASHES, strict=False):
-        handles.append(Line2D([], [], color="0.3", linestyle=dashes, lw=1.6, label=spaced(tumor)))
-    return handles
+    styles = {label_of(method): _style(method) for method in names(frame, "method")}
+    styles |= {spaced(tumor): {"color": "0.3", "linestyle": dash} for tumor, dash in dashes}
+    return [Line2D([], [], lw=1.6, label=label, **style) for label, style in styles.items()]
 
 
 def gallery(jobs: list[Job], path: Path) -> None:
     """The estimate over the truth, seen from the side: a row for each variant, a column for each
-    method of these jobs of one case.
-
-    Raises:
-        InputError: a scene cannot be read.
-        StorageError: the disk refused.
-    """
+    method of these jobs of one case. Raises InputError: a scene cannot be read."""
     methods = list({id(job.method): job.method for job in jobs}.values())
     scenes = list(dict.fromkeys((job.variant, job.view) for job in jobs))
     total = len(scenes) * 2.75 + 1.0
@@ -281,22 +267,17 @@ def gallery(jobs: list[Job], path: Path) -> None:
         scene = read_scene(jobs[0].case.scene(variant, view))
         row[0].set_ylabel(variant, fontsize=13, **bold)
         for axes, method in zip(row, methods, strict=True):
-            estimate: Estimate | None = None
             try:
                 estimate = method.locate(scene, jobs[0].grid).estimate
             except (NoEstimate, InputError):
-                title = "nothing found"
-            else:
-                title = _numbers(estimate, scene)
+                estimate = None
+            title = _numbers(estimate, scene) if estimate else "nothing found"
             draw_solid_view(axes, scene, estimate, FROM_SIDE)
             axes.set_title(title, fontsize=9.5)
     drawing.legend(
-        handles=scene_legend(),
-        loc="upper right",
-        ncols=4,
-        frameon=False,
+        handles=scene_legend(), loc="upper right", ncols=4, frameon=False,
         bbox_to_anchor=(0.99, 0.999),
-    )
+    )  # fmt: skip
     save(drawing, path)
 
 

@@ -11,12 +11,12 @@ import pandas as pd
 from tumortrack.core import store
 from tumortrack.report.protocol import RULE
 from tumortrack_lab.study import goals, plots, resection, tables
-from tumortrack_lab.study.cases import StudyCase
 from tumortrack_lab.study.document import ReportWriter
-from tumortrack_lab.study.frame import names, tidy
 from tumortrack_lab.study.measure import Job, spec_of
+from tumortrack_lab.study.methods import StudyCase
 from tumortrack_lab.study.paper import tumor_lies
 from tumortrack_lab.study.plan import Section
+from tumortrack_lab.study.tables import names, tidy
 
 _MEDIANS = RULE.replace("written as null", "written as not found")
 _OVER_SCENES = f"Distances in mm. {_MEDIANS} ± is the standard deviation over the seeds."
@@ -44,10 +44,7 @@ _RULES: dict[Section, str] = {
 
 
 def section_blocks(
-    section: Section,
-    measurements: list[dict],
-    cases: tuple[StudyCase, ...],
-    writer: ReportWriter,
+    section: Section, measurements: list[dict], cases: tuple[StudyCase, ...], writer: ReportWriter
 ) -> dict[str, str]:
     """The block of one section, its pictures drawn: name -> Markdown."""
     if section == "goals":
@@ -96,8 +93,8 @@ def _peers(frame: pd.DataFrame, case: StudyCase, writer: ReportWriter) -> list[s
 def _severity(frame: pd.DataFrame, case: StudyCase, writer: ReportWriter) -> list[str]:
     image = writer.image("results_severity")
     plots.severity_curves(frame, image)
-    picture = writer.link(image, f"{case.name}: tumor error against severity")
-    return [picture, tables.severities(frame)]
+    words = f"{case.name}: tumor error against severity"
+    return [writer.link(image, words), tables.severities(frame)]
 
 
 _MAKERS: dict[Section, Callable[[pd.DataFrame, StudyCase, ReportWriter], list[str]]] = {

@@ -5,12 +5,11 @@ from __future__ import annotations
 import math
 from collections import Counter
 from dataclasses import asdict, dataclass, replace
-from functools import cache, cached_property
+from functools import cache
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
-from jaxtyping import Float64
 
 import tumortrack
 import tumortrack_lab.cut
@@ -19,21 +18,20 @@ from tumortrack.core.errors import InputError, NoEstimate, NoPlan
 from tumortrack.core.estimate import Estimate
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.types import Anatomy, OccupancyCloud
-from tumortrack.plan.config import ResectionConfig
 from tumortrack.plan.located import located
 from tumortrack.plan.resection import plan_resection
-from tumortrack.plan.values import Located
+from tumortrack.plan.values import Located, ResectionConfig
 from tumortrack.plan.values import Method as PlanMethod
 from tumortrack.registration.locator import QUERIES
 from tumortrack.simulate.scene_folder import Scene, read_scene
-from tumortrack_lab.cut.resection import VOXEL_MM, cut
+from tumortrack_lab.cut import VOXEL_MM, cut
 from tumortrack_lab.peers.base import Fit, estimate_of
-from tumortrack_lab.study.cases import StudyCase
 from tumortrack_lab.study.document import table
-from tumortrack_lab.study.frame import EMPTY, NOTHING, groups, names, ordered
 from tumortrack_lab.study.measure import Job, about_answer
-from tumortrack_lab.study.methods import Answer, Method, code_sha256
+from tumortrack_lab.study.methods import Answer, Method, StudyCase, code_sha256
 from tumortrack_lab.study.paper import tumor_lies
+from tumortrack_lab.study.tables import EMPTY, NOTHING, groups, names, ordered
+from tumortrack_lab.twin.apparatus import moved
 
 TRUTH = "truth"
 _FINE = 256  # voxels along the true organ: its points' labels err by 0.2 mm
@@ -49,7 +47,7 @@ _RESULTS = ["detached", "removed_share", "left_ml", "margin_mm", "healthy_ml", "
 RULE = (
     "Each exophytic tumor (one whose own surface is the organ's over 5 % or more, in the CT) of "
     "each scene is planned on the estimate, and the plan is carried out on the true organ of that "
-    "scene, as in `evaluate/resection.py`: voxels of 0.5 mm, severed only where a stroke or a "
+    "scene, as in `tumortrack_lab/cut.py`: voxels of 0.5 mm, severed only where a stroke or a "
     "level sheet passes. Removed is what comes away within the piece that the strokes enclose: "
     "what stays, or falls off beside it, is left; a piece that still hangs by 2 mm² of tissue or "
     f"more has not come free, and nothing of it is removed. Whole: {100 * _WHOLE:g} % or more. "
@@ -74,18 +72,9 @@ class Planner(Config, frozen=True):
     margin_mm: float = MARGIN_MM
 
     @property
-    def _rest(self) -> str:
-        more = f" + {self.sigmas:g} sd" if self.sigmas else ""
-        return f", {self.margin_mm:g} mm{more}"
-
-    @property
     def name(self) -> str:
-        return self.method + self._rest
-
-    @property
-    def label(self) -> str:
-        """For readers."""
-        return ("the paper's" if self.method == "published" else "ours") + self._rest
+        more = f" + {self.sigmas:g} sd" if self.sigmas else ""
+        return f"{self.method}, {self.margin_mm:g} mm{more}"
 
     def config(self, found: Located, tumor: str) -> ResectionConfig:
         """The paper's planner has one margin for all of the tumor: it is given what the least
@@ -131,55 +120,26 @@ def scattered(estimate: Estimate) -> Estimate:
     return replace(estimate, cloud=cloud)
 
 
-@dataclass(frozen=True, eq=False)
-class Cutting(Method):
-    """A method whose estimates are planned on and cut: measured apart from its accuracy."""
-
-    inner: Method
-
-    @cached_property
-    def identity(self) -> dict:
-        planners = [to_builtins(planner) for planner in PLANNERS]
-        cutting = {"planners": planners, "voxel_mm": VOXEL_MM, "code_sha256": _code_sha256()}
-        return {**self.inner.identity, "cutting": cutting}
-
-    @property
-    def device(self) -> str:
-        return self.inner.device
-
-    @property
-    def prepare_s(self) -> float | None:
-        return self.inner.prepare_s
-
-    @property
-    def about(self) -> dict:
-        return self.inner.about
-
-    def locate(self, scene: Scene, grid: int) -> Answer:
-        return self.inner.locate(scene, grid)
-
-
 @cache
-def _code_sha256() -> str:
-    """Of what plans and cuts."""
-    folders = Path(tumortrack.__file__).parent / "plan", Path(tumortrack_lab.cut.__path__[0])
-    return code_sha256(path for folder in folders for path in folder.glob("*.py"))
+def cutting() -> dict:
+    """What else decides a measurement whose estimate is planned on and cut: such are apart from
+    those of a method's accuracy."""
+    planning = (Path(tumortrack.__file__).parent / "plan").glob("*.py")
+    code = code_sha256([*planning, Path(tumortrack_lab.cut.__file__)])
+    planners = [to_builtins(planner) for planner in PLANNERS]
+    return {"cutting": {"planners": planners, "voxel_mm": VOXEL_MM, "code_sha256": code}}
 
 
 def cut_one(job: Job) -> dict:
     """One measurement: ``plans`` by tumor and planner; what the cut did, or why there is none.
-
-    Raises:
-        InputError: a scene that does not say where the table is.
-    """
+    Raises InputError: a scene that does not say where the table is."""
     scene = read_scene(job.scene)
-    table_from_camera = table_of(scene, job.scene.name)
-    truth = Anatomy(
-        tuple(
-            part.moved(transform_points(table_from_camera, part.vertices_mm))
-            for part in scene.reference.parts
+    if "camera_from_bench" not in scene.meta:
+        raise InputError(
+            f"{job.scene.name} does not say where its table is; make it with tumortrack twin."
         )
-    )
+    table_from_camera = np.linalg.inv(np.array(scene.meta["camera_from_bench"], float))
+    truth = moved(scene.reference, table_from_camera)
     failed, answer, found = None, None, None
     try:
         answer = job.method.locate(scene, job.grid)
@@ -188,19 +148,20 @@ def cut_one(job: Job) -> dict:
     else:
         estimate = answer.estimate
         found = located(estimate.cloud, estimate.meshes, estimate.motion, table_from_camera)
-    plans: dict[str, dict] = {}
-    for tumor in exophytic_tumors(job.case):
-        plans[tumor] = {
-            planner.name: planned_and_cut(truth, found, planner, tumor)
+    plans = {
+        tumor: {
+            planner.name: _planned_and_cut(truth, found, planner, tumor)
             if found
             else {"refused": failed}
             for planner in PLANNERS
             if not found or not planner.sigmas or found.std_mm  # others know no uncertainty
         }
+        for tumor in exophytic_tumors(job.case)
+    }
     return {"plans": plans, "failed": failed, **about_answer(job, answer)}
 
 
-def planned_and_cut(truth: Anatomy, found: Located, planner: Planner, tumor: str) -> dict:
+def _planned_and_cut(truth: Anatomy, found: Located, planner: Planner, tumor: str) -> dict:
     """Plain JSON: ``refused`` and why, or what the cut did (``CutResult``)."""
     try:
         plan = plan_resection(found, planner.config(found, tumor))
@@ -209,13 +170,6 @@ def planned_and_cut(truth: Anatomy, found: Located, planner: Planner, tumor: str
     result = cut(truth, plan)
     more = {"hurt": list(result.hurt), "left_ml": result.left_ml, "promised_ml": plan.volumes_ml}
     return {**asdict(result), **more}
-
-
-def table_of(scene: Scene, name: str) -> Float64[np.ndarray, "4 4"]:
-    """``table_from_camera`` of a scene of the twin, whose bench is the table."""
-    if "camera_from_bench" not in scene.meta:
-        raise InputError(f"{name} does not say where its table is; make it with tumortrack twin.")
-    return np.linalg.inv(np.array(scene.meta["camera_from_bench"], float))
 
 
 @cache
@@ -235,8 +189,7 @@ def tidy_plans(measurements: list[dict]) -> pd.DataFrame:
         for name, entry in plans.items()
     ]
     frame = pd.DataFrame(rows).reindex(columns=["case", "method", "planner", "refused", *_RESULTS])
-    numbers = ["removed_share", "left_ml", "margin_mm", "healthy_ml"]
-    frame[numbers] = frame[numbers].astype(float)
+    frame = frame.astype(dict.fromkeys(_RESULTS[1:5], float))
     planners = pd.Categorical(frame.planner, [planner.name for planner in PLANNERS])
     methods = sorted(frame.method.unique(), key=lambda name: name == TRUTH)
     frame = frame.assign(planner=planners, method=pd.Categorical(frame.method, methods))
@@ -260,8 +213,8 @@ def tables_of(measurements: list[dict]) -> str:
         for reason in plans.refused.dropna()
     )
     reasons = " ".join(f"{count} x {why}" for why, count in refused.items())
-    made = frame[frame.refused.isna()]
     texts.append(f"Refused: {reasons}" if refused else "No plan was refused.")
+    made = frame[frame.refused.isna()]
     texts.append(f"Cuts into another tumor: {made.hurt.map(bool).sum()} of {len(made)}.")
     return "\n\n".join(texts)
 
@@ -274,7 +227,8 @@ def _rows(frame: pd.DataFrame) -> list[list[str]]:
 
 
 def _label(planner: str) -> str:
-    return next(one.label for one in PLANNERS if one.name == planner)
+    """For readers."""
+    return planner.replace("published", "the paper's", 1).replace("margin", "ours", 1)
 
 
 def _texts(plans: pd.DataFrame) -> list[str]:

@@ -1,27 +1,30 @@
-"""The study's Markdown tables. Every number comes from a measurement, or from the paper."""
+"""Measurements as one tidy table (a row for each measurement and part), and Markdown tables of it.
+
+Over scenes: medians, a part that was not found counting as infinitely far (``protocol.RULE``).
+Over seeds: mean and standard deviation (n - 1); where a seed has no finite number, how many have.
+In the table, and in every figure, infinite means not found. Every number comes from a measurement,
+or from the paper.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 
+import numpy as np
 import pandas as pd
 
 from tumortrack_lab.study import paper
 from tumortrack_lab.study.document import table
-from tumortrack_lab.study.frame import (
-    EMPTY,
-    NOTHING,
-    by_seed,
-    change,
-    groups,
-    names,
-    scenes,
-    text,
-    tumors,
-)
 from tumortrack_lab.study.models import CLINIC
 from tumortrack_lab.twin.faults import KINDS, clean_level, parse
 
+NOT_FOUND, NOTHING, EMPTY = "not found", "–", ""
+ORGAN = "kidney"  # its rows stand for their measurements
+DISTANCES = ("hausdorff_one_sided_mm", "hausdorff_mm", "hausdorff_95_mm", "center_mm")
+POINTS = ("depth_mm", "displacement_mm", "error_mm")  # of points of a tumor's surface: lists
+_SCENE = ("case", "scene", "variant", "view", "fault", "fault_seed")
+_NUMBERS = [*DISTANCES, "iou", "miou", "target_mm", "frame_s", "prepare_s"]
+_ORDERED = ["case", "variant", "view", "fault", "method", "part"]
 METHODS = {
     "rigid_bound": "true rigid pose (bound)",
     "rigid": "rigid registration, many starts",
@@ -32,21 +35,23 @@ METHODS = {
     "visible_bound": "true visible surface (bound)",
     "basis_bound": "all true surfaces (bound)",
 }
-FAULTS = {
-    "clean": "none (clean depth)",
-    "noise": "sensor noise",
-    "distortion": "slow distortion",
-    "offset": "systematic 2 mm offset",
-    "occlusion": "occlusion",
-    "outliers": "outliers",
-    "registration": "registration, 1 mm and 1 degree",
-    "all": "all together",
-}
-VIEWS = {
-    "clean": "clean",
-    "noise": "sensor noise",
-    "shaft": "8 mm shaft in view",
-    "clutter": "3 % background points",
+CONDITIONS = {
+    "fault": {
+        "clean": "none (clean depth)",
+        "noise": "sensor noise",
+        "distortion": "slow distortion",
+        "offset": "systematic 2 mm offset",
+        "occlusion": "occlusion",
+        "outliers": "outliers",
+        "registration": "registration, 1 mm and 1 degree",
+        "all": "all together",
+    },
+    "view": {
+        "clean": "clean",
+        "noise": "sensor noise",
+        "shaft": "8 mm shaft in view",
+        "clutter": "3 % background points",
+    },
 }
 SEVERITIES = {
     "noise": "sensor noise, times the D405's",
@@ -73,6 +78,82 @@ _KEYS = {
     "centre": "center_mm",
     "IoU": "iou",
 }
+_WHOLE = ("target error", "mIoU", "failed")
+Lies = dict[str, paper.Lie]
+
+
+def tidy(measurements: list[dict]) -> pd.DataFrame:
+    """One row for each measurement and part. Columns of names are ordered as they first appear."""
+    rows = []
+    for one in measurements:
+        spec, method, targets = one["spec"], one["spec"]["method"], one["targets_mm"]
+        whole = {
+            **{key: spec[key] for key in _SCENE},
+            "method": method["name"],
+            "kind": method.get("kind"),
+            "seed": method.get("seed", 0),
+            "device": one.get("method", {}).get("device"),
+            "failed": one["failed"] is not None,
+            "carries": bool(targets),  # whether the method carries points
+            "target_mm": targets["mean"] if targets else None,
+            **{key: one.get(key) for key in ("miou", "frame_s", "prepare_s")},
+        }
+        for part, metrics in one["parts"].items():
+            found = metrics if metrics["found"] else {"iou": metrics.get("iou")}
+            rows.append({**whole, "part": part, **found, **one.get("points", {}).get(part, {})})
+    frame = pd.DataFrame(rows).reindex(columns=[*whole, "part", "iou", *DISTANCES, *POINTS])
+    frame[_NUMBERS] = frame[_NUMBERS].astype(float).fillna(np.inf)
+    return ordered(frame, _ORDERED)
+
+
+def ordered(frame: pd.DataFrame, columns: list[str]) -> pd.DataFrame:
+    """Columns that sort, and group, in the order in which their values first appear."""
+    return frame.assign(**{key: pd.Categorical(frame[key], frame[key].unique()) for key in columns})
+
+
+def groups(frame: pd.DataFrame, *keys: str) -> Iterator[tuple[tuple, pd.DataFrame]]:
+    """The rows of each combination of values that there is."""
+    return iter(frame.groupby(list(keys), observed=True))
+
+
+def names(frame: pd.DataFrame, key: str) -> list[str]:
+    """Distinct values of a column, in the order of the table's."""
+    return [name for (name,), _ in groups(frame, key)]
+
+
+def tumors(frame: pd.DataFrame) -> pd.DataFrame:
+    return frame[frame.part != ORGAN]
+
+
+def scenes(frame: pd.DataFrame) -> pd.DataFrame:
+    """One row for each measurement."""
+    return frame[frame.part == ORGAN]
+
+
+def by_seed(frame: pd.DataFrame, column: str) -> pd.Series:
+    """Median over the rows of each seed."""
+    return frame.groupby("seed")[column].median()
+
+
+def text(values: pd.Series, digits: int = 1) -> str:
+    """Of one value a seed: ``4.2 ± 0.3``; ``4.2`` for one seed; ``5.0 (2 of 3)``: the median by the
+    rule, where a seed has none; ``not found``."""
+    if values.empty:
+        return NOTHING
+    finite = int(np.isfinite(values).sum())
+    if finite == len(values):
+        spread = f" ± {values.std():.{digits}f}" if finite > 1 else ""
+        return f"{values.mean():.{digits}f}{spread}"
+    middle = values.median()
+    return NOT_FOUND if np.isinf(middle) else f"{middle:.{digits}f} ({finite} of {len(values)})"
+
+
+def change(here: pd.Series, base: pd.Series) -> str:
+    """A figure, and in brackets how much it is above its base."""
+    means = here.mean(), base.mean()
+    if not np.isfinite(means).all() or np.array_equal(here, base):
+        return text(here)
+    return f"{text(here)} ({round(means[0] - means[1], 1) + 0.0:+.1f})"  # no minus before a zero
 
 
 def label_of(method: str) -> str:
@@ -80,37 +161,41 @@ def label_of(method: str) -> str:
     return METHODS.get(method, method)
 
 
-def accuracy(frame: pd.DataFrame, lies: dict[str, paper.Lie], is_paper: bool) -> str:
+def accuracy(frame: pd.DataFrame, lies: Lies, is_paper: bool) -> str:
     """The paper's table of results for one case: a row for each variant, model and tumor."""
-    head = ["variant", "model", "tumor", *_KEYS, "mIoU", "target error"]
+    head = ["variant", "model", "tumor", *_KEYS, *_WHOLE[1::-1]]
     if is_paper:
         head[4:4] = ["paper"]
         head[8:8] = ["paper"]
     rows = []
     for (variant, model), mine in groups(frame, "variant", "method"):
+        target, miou, _ = _whole(mine)
         for number, ((tumor,), part) in enumerate(groups(tumors(mine), "part")):
             kind = lies[tumor].kind
-            row = [*_once(number, variant, model), tumor_text(tumor, kind), *_distances(part)]
-            row += _once(number, miou_text(mine), target_text(mine))
+            row = [*_once(number, variant, model), _tumor_text(tumor, lies), *_distances(part)]
+            row += _once(number, miou, target)
             if is_paper:
-                row[4:4] = [_paper_text(paper.hausdorff(variant, model, kind))]
-                row[8:8] = [_paper_text(paper.center(variant, model))]
+                for at, figure in (
+                    (4, paper.hausdorff(variant, model, kind)),
+                    (8, paper.center(variant, model)),
+                ):
+                    row[at:at] = [EMPTY if figure is None else figure.text]
             rows.append(row)
     return table(head, rows, left=3)
 
 
-def methods(frame: pd.DataFrame, lies: dict[str, paper.Lie]) -> str:
+def methods(frame: pd.DataFrame, lies: Lies) -> str:
     """Methods beside one another on the same scenes: medians over the scenes, by tumor."""
     head = ["method", "tumor", *_KEYS, "mIoU", "target error", "failed", "s a frame"]
     rows = []
     for (method,), mine in groups(frame, "method"):
         frame_s = by_seed(scenes(mine), "frame_s")
         slow = 1 <= frame_s.mean() < float("inf")
-        whole = [miou_text(mine), target_text(mine), failed_text(mine)]
-        whole += [text(frame_s, 1 if slow else 3), text(by_seed(scenes(mine), "prepare_s"))]
+        target, miou, failed = _whole(mine)
+        whole = [miou, target, failed, text(frame_s, 1 if slow else 3)]
+        whole.append(text(by_seed(scenes(mine), "prepare_s")))
         for number, ((tumor,), part) in enumerate(groups(tumors(mine), "part")):
-            name = tumor_text(tumor, lies[tumor].kind)
-            row = [*_once(number, label_of(method)), name, *_distances(part)]
+            row = [*_once(number, label_of(method)), _tumor_text(tumor, lies), *_distances(part)]
             rows.append(row + _once(number, *whole))
     return table([*head, "preparation, s"], rows, left=2)
 
@@ -120,7 +205,7 @@ def deformation(frame: pd.DataFrame) -> str:
     rows = []
     for (method,), mine in groups(frame, "method"):
         number = int(method.rpartition("_")[2])
-        each = [miou_text(here) for _, here in groups(mine, "variant")]
+        each = [_whole(here)[1] for _, here in groups(mine, "variant")]
         mean = text(scenes(mine).groupby("seed", sort=False).miou.mean(), 2)
         rows.append([str(number), *each, mean, f"{paper.CONFIGURATION_MIOU[number]:.2f}"])
     return table(["configuration", *names(frame, "variant"), "mean", "paper"], rows)
@@ -129,15 +214,15 @@ def deformation(frame: pd.DataFrame) -> str:
 def conditions(frame: pd.DataFrame, field: str, base: str) -> str:
     """One row for each method and condition (``field``: fault or view): medians over the
     scenes, and in brackets the change against ``base``."""
-    keys = ("HD", "centre")
-    first, labels = ("view", VIEWS) if field == "view" else ("error source", FAULTS)
+    keys, first = ("HD", "centre"), "view" if field == "view" else "error source"
     rows = []
     for (method,), mine in groups(frame, "method"):
         reference = mine[mine[field] == base]
         for number, ((condition,), here) in enumerate(groups(mine, field)):
-            row = [*_once(number, label_of(method)), labels.get(condition, condition)]
-            for tumor in _parts(frame):
-                parts = [rows[rows.part == tumor] for rows in (here, reference)]
+            row = _once(number, label_of(method))
+            row.append(CONDITIONS[field].get(condition, condition))
+            for tumor in names(tumors(frame), "part"):
+                parts = [some[some.part == tumor] for some in (here, reference)]
                 row += [change(*(by_seed(part, _KEYS[key]) for part in parts)) for key in keys]
             rows.append([*row, *_whole(here)])
     return table(["method", first, *_by_tumor(frame, keys), *_WHOLE], rows, left=2)
@@ -151,7 +236,7 @@ def severities(frame: pd.DataFrame) -> str:
         for kind in KINDS:
             for number, (level, here) in enumerate(levels_of(mine, kind)):
                 row = [*_once(number, label_of(method), SEVERITIES[kind]), f"{level:g}"]
-                for tumor in _parts(frame):
+                for tumor in names(tumors(frame), "part"):
                     row += _distances(here[here.part == tumor], keys)
                 rows.append(row + _whole(here))
     head = ["method", "severity", "level", *_by_tumor(frame, keys), *_WHOLE]
@@ -178,25 +263,24 @@ def ablation(frame: pd.DataFrame) -> str:
     views = names(frame, "view")
     head = ["model", "training, s", "frame, s"]
     for view in views:
-        head += [f"{VIEWS.get(view, view)}: tumor HD", "centre", "target error", "mIoU", "failed"]
+        label = CONDITIONS["view"].get(view, view)
+        head += [f"{label}: tumor HD", "centre", "target error", "mIoU", "failed"]
     base = frame[frame.method == CLINIC]
     rows = []
     for (method,), mine in groups(frame, "method"):
         row = [ABLATED.get(method, method), text(by_seed(scenes(mine), "prepare_s"), 0)]
         row.append(text(by_seed(scenes(mine), "frame_s"), 3))
         for view in views:
-            here, there = mine[mine.view == view], base[base.view == view]
-            row += [
-                change(by_seed(tumors(here), key), by_seed(tumors(there), key))
-                for key in ("hausdorff_mm", "center_mm")
-            ]
-            errors = change(*(by_seed(scenes(one), "target_mm") for one in (here, there)))
-            row += [errors if here.carries.any() else NOTHING, miou_text(here), failed_text(here)]
+            both = mine[mine.view == view], base[base.view == view]
+            for of, key in ((tumors, "hausdorff_mm"), (tumors, "center_mm"), (scenes, "target_mm")):
+                row.append(change(*(by_seed(of(one), key) for one in both)))
+            target, miou, failed = _whole(both[0])
+            row[-1:] = [row[-1] if target != NOTHING else NOTHING, miou, failed]
         rows.append(row)
     return table(head, rows)
 
 
-def lies_text(case: str, lies: dict[str, paper.Lie]) -> str:
+def lies_text(case: str, lies: Lies) -> str:
     """Which tumor of a case is exophytic, and by what measure."""
     each = [
         f"{spaced(name)} is {lie.kind} ({100 * lie.exposed_share:.0f} % of its surface "
@@ -206,44 +290,27 @@ def lies_text(case: str, lies: dict[str, paper.Lie]) -> str:
     return f"{case}: " + "; ".join(each) + "."
 
 
-def tumor_text(tumor: str, kind: str) -> str:
-    return f"{tumor.rpartition('_')[2]}, {kind}"
-
-
 def spaced(part: str) -> str:
     return part.replace("_", " ")
 
 
-def target_text(frame: pd.DataFrame) -> str:
-    """Mean over the scene's inner targets, mm."""
-    return text(by_seed(scenes(frame), "target_mm")) if frame.carries.any() else NOTHING
-
-
-def miou_text(frame: pd.DataFrame) -> str:
-    return text(by_seed(scenes(frame), "miou"), 2)
-
-
-def failed_text(frame: pd.DataFrame) -> str:
-    return f"{scenes(frame).failed.sum()} of {len(scenes(frame))}"
-
-
-_WHOLE = ("target error", "mIoU", "failed")
+def _tumor_text(tumor: str, lies: Lies) -> str:
+    return f"{tumor.rpartition('_')[2]}, {lies[tumor].kind}"
 
 
 def _whole(frame: pd.DataFrame) -> list[str]:
-    return [target_text(frame), miou_text(frame), failed_text(frame)]
+    """Mean over the scene's inner targets (mm) where points are carried; mIoU; scenes failed."""
+    each = scenes(frame)
+    target = text(by_seed(each, "target_mm")) if frame.carries.any() else NOTHING
+    return [target, text(by_seed(each, "miou"), 2), f"{each.failed.sum()} of {len(each)}"]
 
 
 def _distances(part: pd.DataFrame, keys: Iterable[str] = _KEYS) -> list[str]:
     return [text(by_seed(part, _KEYS[key]), 2 if key == "IoU" else 1) for key in keys]
 
 
-def _parts(frame: pd.DataFrame) -> list[str]:
-    return names(tumors(frame), "part")
-
-
 def _by_tumor(frame: pd.DataFrame, keys: Iterable[str]) -> list[str]:
-    return [f"{spaced(tumor)} {key}" for tumor in _parts(frame) for key in keys]
+    return [f"{spaced(tumor)} {key}" for tumor in names(tumors(frame), "part") for key in keys]
 
 
 def _once(number: int, *texts: str) -> list[str]:
@@ -251,34 +318,27 @@ def _once(number: int, *texts: str) -> list[str]:
     return list(texts) if number == 0 else [EMPTY] * len(texts)
 
 
-def _paper_text(figure: paper.PaperFigure | None) -> str:
-    return EMPTY if figure is None else figure.text
-
-
 def caption(measurements: list[dict], command: str) -> str:
     """What stands below a block: command, scenes, models with their steps and training time,
     device, load (seconds mean little without it), grid; from the measurements."""
-    about = pd.json_normalize([{k: one[k] for k in _CAPTION} for one in measurements])
-    scenes = about.drop_duplicates([f"spec.{key}" for key in _SCENE])
-    loads = about["provenance.load"].dropna()
-    busy = (
-        f"load average {loads.min():.1f} to {loads.max():.1f}" if len(loads) else "load not known"
+    about = pd.json_normalize(
+        [{k: one[k] for k in ("spec", "method", "provenance")} for one in measurements]
     )
+    scene = ("case", "scene", "fault", "fault_seed")
+    scenes = about.drop_duplicates([f"spec.{key}" for key in scene])
+    loads = about["provenance.load"].dropna()
+    busy = f"average {loads.min():.1f} to {loads.max():.1f}" if len(loads) else "not known"
+    models = about[about["spec.method.kind"] == "network"]
     return (
         f"`{command}`: {len(about)} measurements, {len(scenes)} scenes (views: "
         f"{_listed(about['spec.view'])}), volumes of {_listed(about['spec.grid'], '{}³')} voxels "
-        f"at most. {_training(about[about['spec.method.kind'] == 'network'])}Measured on "
-        f"{_listed(_device(one['provenance']) for one in measurements)}, {busy}."
+        f"at most. {_training(models) if len(models) else ''}Measured on "
+        f"{_listed(_device(one['provenance']) for one in measurements)}, load {busy}."
     )
 
 
-_CAPTION, _SCENE = ("spec", "method", "provenance"), ("case", "scene", "fault", "fault_seed")
-
-
 def _training(about: pd.DataFrame) -> str:
-    """One sentence about the models, if there are any."""
-    if about.empty:
-        return ""
+    """One sentence about the models."""
     models = about.drop_duplicates("spec.method.model_sha256", keep="last")
     minutes = models["method.training_s"] / 60
     return (

@@ -1,4 +1,4 @@
-"""The apparatus of the paper's experiment as physics, with one case on it.
+"""The apparatus of the paper's experiment as physics, with one case on it, and its experiments.
 
 Bench frame, mm: z up, towards the camera; the support is the plane z = 0, on which the organ
 stands as in its CT; its long axis lies along x, its middle at x = y = 0. Packing between support
@@ -6,56 +6,68 @@ and organ fits the underside, as the body's own bed does: on a bare plane an org
 its pole would first of all collapse, which says nothing of plates and instruments.
 
 The CT shows the organ at rest under its weight in that bed. Only what is added deforms it: loads,
-and weight that softened tissue no longer bears.
+and weight that softened tissue no longer bears. After the paper's section Experiments, and Altamar
+et al. 2011 (doi 10.1117/12.877992) for G1. D0: as in the CT, taken free of stress. D1, D2, D3: the
+midsection pressed to 4, 8, 12 mm less between a plate and the bed. G1: turgor lost after an
+incision, softened tissue sinks under its weight by 8 mm at the midsection. P1: a rod of 8 mm with a
+round end pressed 10 mm into the side that faces the camera, away from the tumors.
 
 Nothing here is shared with the deformations that networks are trained on.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from functools import cached_property
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Float64
 
 from tumortrack.core.config import Config
-from tumortrack.core.errors import InputError
+from tumortrack.core.errors import InputError, TumortrackError
 from tumortrack.core.geometry import rigid, rotation_onto, transform_points
 from tumortrack.core.types import Anatomy, Mesh
 from tumortrack.imaging.raster import label_grid
 from tumortrack.report.metrics import surface_samples
 from tumortrack_lab.tets import TetMesh, embed, tetrahedralise
-from tumortrack_lab.twin.contact import Contact, Obstacles, Support
-from tumortrack_lab.twin.equilibrium import Convergence, EquilibriumProblem, Hold, settle
+from tumortrack_lab.twin.equilibrium import (
+    Contact,
+    ContactPlate,
+    Convergence,
+    EquilibriumProblem,
+    Hold,
+    Obstacles,
+    Rod,
+    Support,
+    settle,
+)
 from tumortrack_lab.twin.solid import NeoHookeanSolid
 
 GRAVITY_KPA_PER_MM = 9.81e-6  # of 1 kg/m^3
+STATES = ("D0", "D1", "D2", "D3", "G1", "P1")
+COMPRESSION_MM = {"D1": 4.0, "D2": 8.0, "D3": 12.0}
+_LARGEST_VOLUME_CHANGE = 0.02
+_SINK_STEPS = 15
+_SINK_TOLERANCE_MM = 0.4
+
+Nodes = Float64[np.ndarray, "n 3"]
+Step = Callable[..., Nodes]  # of the load: nodes, obstacles, text, added weight -> nodes at rest
 
 
 class ApparatusConfig(Config, frozen=True, kw_only=True):
-    """Material and apparatus.
+    """Material and apparatus."""
 
-    youngs_kpa: of the organ; kidney and soft PVA gels lie near 5..30 kPa.
-    tumor_ratio: tumors are stiffer by this factor (2..5).
-    poisson, density_kg_m3: nearly incompressible, water-like.
-    edge_mm: of the tetrahedra.
-    contact_kpa_mm: penalty per depth; pressures of a few kPa sink in by about 0.1 mm.
-    packing_kpa_mm: of what bears the underside: fat, foam.
-    plate_mm: width of the plate along the organ; rounding_mm: of its edges.
-    load_step_mm: the plate advances by this much at a time, the rod by half.
-    """
-
-    youngs_kpa: float = 15.0
-    tumor_ratio: float = 3.0
-    poisson: float = 0.49
+    youngs_kpa: float = 15.0  # of the organ; kidney and soft PVA gels lie near 5..30 kPa
+    tumor_ratio: float = 3.0  # tumors are stiffer by this factor (2..5)
+    poisson: float = 0.49  # nearly incompressible
     density_kg_m3: float = 1050.0
-    edge_mm: float = 5.5
-    contact_kpa_mm: float = 300.0
-    packing_kpa_mm: float = 3.0
-    plate_mm: float = 36.0
-    rounding_mm: float = 4.0
-    load_step_mm: float = 2.0
+    edge_mm: float = 5.5  # of the tetrahedra
+    contact_kpa_mm: float = 300.0  # penalty per depth; few kPa sink in by about 0.1 mm
+    packing_kpa_mm: float = 3.0  # of what bears the underside: fat, foam
+    plate_mm: float = 36.0  # width along the organ
+    rounding_mm: float = 4.0  # of the plate's edges
+    load_step_mm: float = 2.0  # the plate advances by this much at a time, the rod by half
     sink_mm: float = 8.0
     poke_mm: float = 10.0
     poke_diameter_mm: float = 8.0
@@ -111,32 +123,24 @@ class Apparatus:
     def settle(
         self, nodes_mm: np.ndarray, obstacles: Obstacles, weight: float = 0.0
     ) -> tuple[np.ndarray, Convergence]:
-        """One load step: the nodes at rest in their bed among obstacles, under so many weights
-        more than in the CT.
-
-        Raises:
-            TumortrackError: no equilibrium was found.
-        """
+        """One load step: the nodes at rest in their bed among obstacles, under so many weights more
+        than in the CT. Raises TumortrackError: no equilibrium was found."""
         contacts = ((self.contact, (Support(), *obstacles)), self._packing)
         load_mn = weight * self._weight_mn
         problem = EquilibriumProblem(self.solid, contacts, load_mn, self._hold)
         return settle(problem, nodes_mm)
 
-    def midsection(self, nodes_mm: np.ndarray) -> tuple[float, float]:
-        """Lowest and highest z of the surface under the middle half of the plate, mm."""
-        z = self.contact.surface.carry(nodes_mm)[self._in_middle, 2]
-        return float(z.min()), float(z.max())
+    def midsection(self, nodes_mm: np.ndarray, axis: int = 2) -> tuple[float, float]:
+        """Lowest and highest z (or y) of the surface under the middle half of the plate, mm."""
+        at_rest = self.contact.surface.carry(self.mesh.nodes_mm)
+        in_middle = np.abs(at_rest[:, 0]) < self.config.plate_mm / 4
+        there = self.contact.surface.carry(nodes_mm)[in_middle, axis]
+        return float(there.min()), float(there.max())
 
     def sides_outwards_mm(self, nodes_mm: np.ndarray) -> tuple[float, float]:
         """How far the midsection's two lateral edges have moved outwards."""
-        before = self.contact.surface.carry(self.mesh.nodes_mm)[self._in_middle, 1]
-        after = self.contact.surface.carry(nodes_mm)[self._in_middle, 1]
-        return float(before.min() - after.min()), float(after.max() - before.max())
-
-    @cached_property
-    def _in_middle(self) -> Bool[np.ndarray, " m"]:
-        at_rest = self.contact.surface.carry(self.mesh.nodes_mm)
-        return np.abs(at_rest[:, 0]) < self.config.plate_mm / 4
+        before, after = (self.midsection(nodes, 1) for nodes in (self.mesh.nodes_mm, nodes_mm))
+        return before[0] - after[0], after[1] - before[1]
 
 
 def moved(anatomy: Anatomy, b_from_a: Float64[np.ndarray, "4 4"]) -> Anatomy:
@@ -157,9 +161,9 @@ def _bench_from_ct(organ_ct: Mesh, up_lps: tuple[float, float, float]) -> np.nda
     flat = (organ_ct.vertices_mm - organ_ct.vertices_mm.mean(0)) @ upright.T
     x, y = np.linalg.eigh(np.cov(flat[:, :2].T))[1][:, 1]
     rotation = np.array([[x, y, 0], [-y, x, 0], [0, 0, 1]]) @ upright
-    box = np.stack([f(organ_ct.vertices_mm @ rotation.T, axis=0) for f in (np.min, np.max)])
-    middle = box.mean(0)
-    return rigid(rotation, -np.array([middle[0], middle[1], box[0, 2]]))
+    turned = organ_ct.vertices_mm @ rotation.T
+    box = np.stack([turned.min(0), turned.max(0)])
+    return rigid(rotation, -np.array([*box.mean(0)[:2], box[0, 2]]))
 
 
 def _contact_points(
@@ -196,3 +200,135 @@ def _tumor_share(mesh: TetMesh, anatomy: Anatomy) -> Float64[np.ndarray, " t"]:
     points = np.einsum("pk,tkj->tpj", weights, mesh.nodes_mm[mesh.tets])
     index = np.clip(np.rint(points - low).astype(int), 0, shape - 1)
     return np.asarray((labels[tuple(index.transpose(2, 0, 1))] > 1).mean(1), np.float64)
+
+
+def solve(
+    bench: Apparatus,
+    name: str,
+    warm: State | None = None,
+    progress: Callable[[str], None] = lambda line: None,
+) -> State:
+    """Bring the organ into a state. ``warm``: for D2 and D3, a state of less compression to go on
+    from (the answer is the same); ``progress``: called with a line after each load step.
+
+    Raises InputError: no such state; TumortrackError: no equilibrium, or the organ's volume changed
+    by over 2 %.
+    """
+    if name not in STATES:
+        raise InputError(f"state {name!r} is not known; allowed: {', '.join(STATES)}.")
+    start, log = time.perf_counter(), list[Convergence]()
+    if name == "D0":
+        return State(name, bench.mesh.nodes_mm, {"state": name, "volume_change": 0.0})
+
+    def step(nodes: Nodes, obstacles: Obstacles, text: str, weight: float = 0.0) -> Nodes:
+        nodes, convergence = bench.settle(nodes, obstacles, weight)
+        log.append(convergence)
+        progress(f"{text}: {convergence.iterations} iterations")
+        return nodes
+
+    if name == "G1":
+        nodes, about = _sink(bench, step)
+    elif name == "P1":
+        nodes, about = _poke(bench, step)
+    else:
+        nodes, about = _compress(bench, step, COMPRESSION_MM[name], warm)
+    stretch = bench.solid.stretch(nodes)
+    change = float(np.average(stretch, weights=bench.mesh.volumes_mm3) - 1)
+    if abs(change) > _LARGEST_VOLUME_CHANGE:
+        raise TumortrackError(f"{name}: the organ's volume changed by {change:.1%}, over 2 %.")
+    moved_mm = np.linalg.norm(nodes - bench.mesh.nodes_mm, axis=1)
+    report = {
+        "state": name,
+        **about,
+        "sides_outwards_mm": list(bench.sides_outwards_mm(nodes)),
+        "volume_change": change,
+        "least_stretch": float(stretch.min()),
+        "largest_displacement_mm": float(moved_mm.max()),
+        "residual": log[-1].residual,
+        "steps": [asdict(step) for step in log],
+        "seconds": time.perf_counter() - start,
+    }
+    return State(name, nodes, report)
+
+
+def _increments(start_mm: float, end_mm: float, step_mm: float) -> list[float]:
+    """From start (exclusive) to end in equal steps of about that length."""
+    count = max(1, round((end_mm - start_mm) / step_mm))
+    return np.linspace(start_mm, end_mm, count + 1)[1:].tolist()
+
+
+def _compress(bench: Apparatus, step: Step, by_mm: float, warm: State | None) -> tuple[Nodes, dict]:
+    config, nodes, done_mm = bench.config, bench.mesh.nodes_mm, 0.0
+    if warm is not None and COMPRESSION_MM.get(warm.name, np.inf) < by_mm:
+        nodes, done_mm = warm.nodes_mm, COMPRESSION_MM[warm.name]
+    low, high = bench.midsection(bench.mesh.nodes_mm)
+    half = (config.plate_mm / 2, 200.0, 10.0)  # wider than any organ
+    for amount in _increments(done_mm, by_mm, config.load_step_mm):
+        above = ContactPlate((0.0, 0.0, high - amount + half[2]), half, config.rounding_mm)
+        nodes = step(nodes, (above,), f"plate lowered by {amount:.1f} mm")
+    now_low, now_high = bench.midsection(nodes)
+    return nodes, {
+        "plate_z_mm": high - by_mm,
+        "midsection_mm": [high - low, now_high - now_low],
+        "plate_load_n": -float(bench.contact.load_mn(nodes, above)[2]) / 1000,
+        "sunk_in_mm": bench.contact.depth_mm(nodes, (Support(), above)),
+    }
+
+
+def _sink(bench: Apparatus, step: Step) -> tuple[Nodes, dict]:
+    """Weight over stiffness grows until the midsection has sunk as far as wanted.
+
+    Tissue softer by a factor and weight multiplied by it are the same problem; the second keeps
+    the factorised stiffness. One weight of it is borne already, as the CT shows.
+    """
+    wanted, nodes = bench.config.sink_mm, bench.mesh.nodes_mm
+    height, added, sunk = bench.midsection(nodes)[1], 4.0, 0.0
+    less, more = (0.0, 0.0), (np.inf, np.inf)  # weights added, and how far it sank
+    for _ in range(_SINK_STEPS):
+        nodes = step(nodes, (), f"softer by {1 + added:.1f}, sunk {sunk:.1f} mm before", added)
+        sunk = height - bench.midsection(nodes)[1]
+        if abs(sunk - wanted) < _SINK_TOLERANCE_MM:
+            return nodes, {
+                "youngs_kpa": bench.config.youngs_kpa / (1 + added),
+                "sunk_mm": sunk,
+                "sunk_in_mm": bench.contact.depth_mm(nodes, (Support(),)),
+            }
+        less, more = ((added, sunk), more) if sunk < wanted else (less, (added, sunk))
+        if np.isfinite(more[0]):
+            share = (wanted - less[1]) / (more[1] - less[1])
+            added = less[0] + share * (more[0] - less[0])
+        else:
+            added *= min(2.0, wanted / max(sunk, 1e-6))
+    raise TumortrackError(
+        f"G1: the midsection would not sink by {wanted:g} mm (it sank {sunk:.1f} mm at "
+        f"{1 + added:.1f} times the softness). Choose a smaller sink_mm."
+    )
+
+
+def _poke(bench: Apparatus, step: Step) -> tuple[Nodes, dict]:
+    config, nodes = bench.config, bench.mesh.nodes_mm
+    radius = config.poke_diameter_mm / 2
+    x, y, z = _poke_point(bench).tolist()
+    for depth in _increments(0.0, config.poke_mm, config.load_step_mm / 2):
+        rod = Rod((x, y, z - depth), (0.0, 0.0, 1.0), radius)
+        nodes = step(nodes, (rod,), f"rod pressed in by {depth:.1f} mm")
+    load_n = -float(bench.contact.load_mn(nodes, rod)[2]) / 1000
+    if load_n <= 0:
+        raise TumortrackError("P1: the surface slipped past the rod; take a finer mesh (edge_mm).")
+    return nodes, {
+        "poke": {"tip_mm": list(rod.tip_mm), "axis": list(rod.axis), "radius_mm": radius},
+        "poke_load_n": load_n,
+        "sunk_in_mm": bench.contact.depth_mm(nodes, (Support(), rod)),
+    }
+
+
+def _poke_point(bench: Apparatus) -> Float64[np.ndarray, " 3"]:
+    """Where the surface faces up and is farthest from every tumor and from the organ's rim."""
+    from scipy.spatial import cKDTree
+
+    middle, normal = triangles(bench.anatomy.organ)
+    facing = normal[:, 2] / np.maximum(np.linalg.norm(normal, axis=1), 1e-12)
+    top = (facing > min(0.85, float(facing.max()))) & (middle[:, 2] > middle[:, 2].mean())
+    away = [middle[facing < 0.5], *(tumor.vertices_mm for tumor in bench.anatomy.tumors)]
+    room = np.min([cKDTree(points).query(middle[top])[0] for points in away], axis=0)
+    return middle[top][int(room.argmax())]

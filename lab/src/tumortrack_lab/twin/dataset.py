@@ -11,11 +11,11 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -25,28 +25,17 @@ from tumortrack.core.errors import ArtifactError, InputError, StorageError
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.types import Anatomy
 from tumortrack.imaging.case import Case, load_case
-from tumortrack.simulate.scene_folder import write_scene_files
-from tumortrack.simulate.targets import TARGETS, InnerPoints, draw_targets
-from tumortrack_lab.twin.apparatus import Apparatus, ApparatusConfig, State
+from tumortrack.simulate.scene_folder import TARGETS, InnerPoints, draw_targets, write_scene_files
+from tumortrack_lab.twin import views as viewing
+from tumortrack_lab.twin.apparatus import Apparatus, ApparatusConfig, State, solve
 from tumortrack_lab.twin.pictures import twin_picture
-from tumortrack_lab.twin.states import solve
-from tumortrack_lab.twin.views import (
-    VARIANTS,
-    VIEWS,
-    EquilibriumState,
-    View,
-    ViewConfig,
-    for_organ,
-    make_scene,
-)
+from tumortrack_lab.twin.views import VARIANTS, VIEWS, EquilibriumState
 
 KIND = "twin"
 _STATES = "states"
 _STATE_SHARE = 15.0  # a state takes about as long as so many scenes
 # More compression goes on from less: the same answer in fewer load steps.
 _GOES_ON_FROM = {"D2": "D1", "D3": "D2"}
-
-Build = Callable[[Anatomy, tuple[float, float, float], ApparatusConfig], Any]
 
 
 @dataclass(frozen=True)
@@ -55,14 +44,13 @@ class TwinRun:
 
     case_folder: Path
     bench: ApparatusConfig = field(default_factory=ApparatusConfig)
-    view: ViewConfig = field(default_factory=ViewConfig)
+    view: viewing.ViewConfig = field(default_factory=viewing.ViewConfig)
     seed: int = 0
-    build: Build = Apparatus  # these two have stand-ins in tests
-    solve: Callable[..., State] = solve
+    build: Callable[[Anatomy, tuple[float, float, float], ApparatusConfig], Any] = Apparatus
+    solve: Callable[..., State] = solve  # these two have stand-ins in tests
 
 
-@dataclass(frozen=True)
-class TwinStatus:
+class TwinStatus(NamedTuple):
     """Where the work stands: share of it done (a guess), and what was done last."""
 
     share: float
@@ -73,8 +61,8 @@ def make_scenes(
     run: TwinRun,
     out: Path,
     variants: Sequence[str] = tuple(VARIANTS),
-    views: Sequence[View] = VIEWS,
-    report: Callable[[TwinStatus], None] | None = None,
+    views: Sequence[viewing.View] = VIEWS,
+    report: Callable[[TwinStatus], None] = lambda status: None,
 ) -> list[Path]:
     """The scenes of these variants in these views; those that are there already stay.
 
@@ -83,12 +71,9 @@ def make_scenes(
     Returns:
         The scenes' folders.
 
-    Raises:
-        InputError: no case; an unknown variant or view; ``out`` holds something else, or scenes
-            made from another case, seed or configuration.
-        ArtifactError: a kept state is damaged.
-        TumortrackError: a state has no equilibrium.
-        StorageError: the disk refused.
+    Raises InputError: no case, an unknown variant or view, ``out`` holds something else, or scenes
+    made from another case, seed or configuration; ArtifactError: a kept state is damaged;
+    TumortrackError: a state has no equilibrium; StorageError: the disk refused.
     """
     wanted = [(v, w) for v in _known(variants, VARIANTS) for w in _known(views, VIEWS)]
     case = load_case(run.case_folder)
@@ -97,24 +82,29 @@ def make_scenes(
     todo = [(v, w) for v, w in wanted if not (out / f"{v}-{w}").exists()]
     states = list(dict.fromkeys(VARIANTS[v].state for v, _ in todo))
     cache = StateCache(out / _STATES, run, case, targets)
-    unsolved = sum(not cache.has(state) for state in states)
-    progress = _Progress(report, len(todo) + _STATE_SHARE * unsolved)
+    unsolved = [state for state in states if not cache.has(state)]
+    total, done = max(len(todo) + _STATE_SHARE * len(unsolved), 1.0), 0.0
+
+    def say(text: str) -> None:
+        report(TwinStatus(done / total, text))
+
     for name in states:
-        is_new = not cache.has(name)
-        state = cache.get(name, progress.say)
-        if is_new:
-            progress.add(_STATE_SHARE, f"{name}: settled")
+        state = cache.get(name, say)
+        if name in unsolved:
+            done += _STATE_SHARE
+            say(f"{name}: settled")
         for variant, view in todo:
             if VARIANTS[variant].state == name:
                 _write(out / f"{variant}-{view}", state, run, targets, case.anatomy, identity)
-                progress.add(1.0, f"{variant}-{view}")
+                done += 1.0
+                say(f"{variant}-{view}")
     names = [f"{variant}-{view}" for variant in VARIANTS for view in VIEWS]
     scenes = {name: store.sha256_of(out / name) for name in names if (out / name).is_dir()}
     store.seal(out, KIND, {**identity, "scenes": scenes}, frame="camera")
     return [out / f"{v}-{w}" for v, w in wanted]
 
 
-def _known(names: Sequence[Any], allowed: Sequence[str] | dict) -> list:
+def _known(names: Sequence[Any], allowed: Iterable[str]) -> list:
     for name in names:
         if name not in allowed:
             raise InputError(f"{name!r} is not known; allowed: {', '.join(allowed)}.")
@@ -162,8 +152,10 @@ def _write(
     """One scene's folder with targets and picture, all or nothing."""
     variant, _, view = folder.name.partition("-")
     rest = anatomy_ct.organ
-    config = for_organ(run.view, float(np.ptp(rest.vertices_mm @ state.bench_from_ct[2, :3])))
-    scene, targets_mm = make_scene(state, variant, view, config, run.seed)  # type: ignore[arg-type]
+    config = viewing.for_organ(
+        run.view, float(np.ptp(rest.vertices_mm @ state.bench_from_ct[2, :3]))
+    )
+    scene, targets_mm = viewing.make_scene(state, variant, view, config, run.seed)  # type: ignore[arg-type]
     scene = replace(scene, meta={**identity, **scene.meta}, targets=targets.at(targets_mm))
     rest = rest.moved(transform_points(state.bench_from_ct, rest.vertices_mm))
     with store.new_folder(folder) as aside:
@@ -187,10 +179,10 @@ class StateCache:
         """The state, solved and kept if it is not there yet; ``say`` gets a line per load step."""
         if not self.has(name):
             self._solve(name, say)
-        tensors, about = self._read(name)
+        tensors, report, _ = self._read(name)
         parts = tuple(part.moved(tensors[key]) for key, part in self._parts.items())
         targets_mm, bench_from_ct = tensors["targets"], tensors["bench_from_ct"]
-        return EquilibriumState(name, Anatomy(parts), targets_mm, bench_from_ct, about["report"])
+        return EquilibriumState(name, Anatomy(parts), targets_mm, bench_from_ct, report)
 
     @cached_property
     def _bench(self) -> Any:
@@ -201,9 +193,11 @@ class StateCache:
 
         if "_bench" not in self.__dict__:
             say("bench: filling the organ with tetrahedra")
-        bench = self._bench
+        bench, warm = self._bench, None
         mesh = hashlib.sha256(np.ascontiguousarray(bench.mesh.nodes_mm).tobytes()).hexdigest()
-        warm = self._warm(name, mesh)
+        if (before := _GOES_ON_FROM.get(name)) and self.has(before):
+            tensors, report, of = self._read(before)
+            warm = State(before, tensors["nodes"], report) if of == mesh else None
         solved = self._run.solve(bench, name, warm, lambda line: say(f"{name}: {line}"))
         tensors = {
             **{key: bench.carry(solved, part.vertices_mm) for key, part in self._parts.items()},
@@ -215,15 +209,8 @@ class StateCache:
         contiguous = {key: np.ascontiguousarray(array) for key, array in tensors.items()}
         store.write_atomically(self._path(name), save(contiguous, metadata))
 
-    def _warm(self, name: str, mesh: str) -> State | None:
-        """The kept state to go on from, where it was solved on the same tetrahedra."""
-        before = _GOES_ON_FROM.get(name)
-        if before is None or not self.has(before):
-            return None
-        tensors, about = self._read(before)
-        return State(before, tensors["nodes"], about["report"]) if about["mesh"] == mesh else None
-
-    def _read(self, name: str) -> tuple[dict[str, np.ndarray], dict]:
+    def _read(self, name: str) -> tuple[dict[str, np.ndarray], dict, str]:
+        """A kept state: its arrays, its report, and the sha256 of its tetrahedra's nodes."""
         from safetensors import SafetensorError, safe_open
 
         path = self._path(name)
@@ -232,7 +219,7 @@ class StateCache:
                 keys = (*self._parts, "targets", "bench_from_ct", "nodes")
                 tensors = {key: file.get_tensor(key) for key in keys}
                 metadata = file.metadata() or {}
-            return tensors, {"report": json.loads(metadata["report"]), "mesh": metadata["mesh"]}
+            return tensors, json.loads(metadata["report"]), metadata["mesh"]
         except (SafetensorError, KeyError, ValueError, OSError) as error:
             raise ArtifactError(
                 f"{path} is damaged: {error}. Remove it, and the state is solved again."
@@ -240,19 +227,3 @@ class StateCache:
 
     def _path(self, name: str) -> Path:
         return self._folder / f"{name}.safetensors"
-
-
-class _Progress:
-    """Turns pieces of work done into a share of all."""
-
-    def __init__(self, report: Callable[[TwinStatus], None] | None, total: float) -> None:
-        self._report = report or (lambda status: None)
-        self._total = max(total, 1.0)
-        self._done = 0.0
-
-    def say(self, text: str) -> None:
-        self._report(TwinStatus(self._done / self._total, text))
-
-    def add(self, amount: float, text: str) -> None:
-        self._done += amount
-        self.say(text)

@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 from tumortrack.core.config import from_builtins
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import rigid, transform_points
-from tumortrack.core.types import Anatomy, DepthFrame
+from tumortrack.core.types import DepthFrame
 from tumortrack.sense.cloud import CloudConfig, cloud_from_depth, thin_cloud
 from tumortrack.sense.noise import D405_NOISE, NoiseConfig, add_noise
 from tumortrack.sense.render import render_depth
@@ -37,11 +37,8 @@ Kind = Literal["noise", "visible", "outliers", "points", "offset", "distance", "
 KINDS: tuple[Kind, ...] = get_args(Kind)  # their order is that of their random streams: append only
 
 # The axial noise and depth steps of the D405 model, and nothing else of it.
-AXIAL_NOISE = NoiseConfig(
-    axial_mm=D405_NOISE.axial_mm,
-    correlated_share=D405_NOISE.correlated_share,
-    quantum_mm=D405_NOISE.quantum_mm,
-)
+_AXIAL = ("axial_mm", "correlated_share", "quantum_mm")
+AXIAL_NOISE = NoiseConfig(**{name: getattr(D405_NOISE, name) for name in _AXIAL})
 DISTORTION_MM = 1.0  # largest slow depth error in the image
 OFFSET_MM = 2.0  # towards the camera: the thickness of the paper's soft cardboard
 REGISTRATION_MM, REGISTRATION_DEGREES = 1.0, 1.0
@@ -62,6 +59,7 @@ SCALED = (
 MOVED = "camera_from_clean"  # in meta: the camera is another one
 
 Transform = Float64[np.ndarray, "4 4"]
+Generator = np.random.Generator
 
 
 @dataclass(frozen=True)
@@ -104,11 +102,8 @@ def clean_level(kind: str) -> float | None:
 
 
 def parse(name: str) -> Severity | None:
-    """The severity of this name, None where it is none (``noise`` is a fault).
-
-    Raises:
-        InputError: an unknown kind, or a level that is no number or not allowed.
-    """
+    """The severity of this name, None where it is none (``noise`` is a fault). Raises InputError:
+    an unknown kind, or a level that is no number or not allowed."""
     kind, equals, level = name.partition("=")
     if not equals:
         return None
@@ -122,11 +117,8 @@ def parse(name: str) -> Severity | None:
 
 
 def disturbed(clean: Scene, fault: str, seed: int) -> Scene:
-    """The scene with this fault, by the name of a severity or of one of ``FAULTS``.
-
-    Raises:
-        InputError: no such fault; no clean scene of the twin with its depth image.
-    """
+    """The scene with this fault, by the name of a severity or of one of ``FAULTS``. Raises
+    InputError: no such fault, no clean scene of the twin with its depth image."""
     severity = parse(fault)
     return faulty(clean, fault, seed) if severity is None else severe(clean, severity, seed)
 
@@ -143,25 +135,31 @@ def faulty(clean: Scene, fault: str, seed: int) -> Scene:
 
     The fault's random numbers depend on seed and fault alone, and are the same in ``all``. The
     cloud is drawn from the depth image again, by the scene's own crop; a scene that was read from
-    its folder has depths in steps of 0.1 mm.
-
-    Raises:
-        InputError: no such fault, or no clean scene of the twin with its depth image.
+    its folder has depths in steps of 0.1 mm. Raises InputError: no such fault, or no clean scene of
+    the twin with its depth image.
     """
     if fault not in FAULTS:
         raise InputError(f"fault {fault!r} is not known; allowed: {', '.join(FAULTS)}.")
-    frame, config = clean_view(clean)
+    frame, config = _clean_view(clean)
     if fault == "clean":
         return clean
+
+    def rng(name: Fault) -> Generator:
+        return np.random.default_rng([seed, FAULTS.index(name)])
+
+    usual = {"offset": OFFSET_MM, "outliers": config.clutter_share}
     for name, change in _CHANGES.items():
         if fault in (name, "all"):
-            frame = change(frame, config, _rng(seed, name))
+            frame = change(frame, usual.get(name, 1.0), config, rng(name))
     cloud = clean.cloud
     if frame is not clean.depth:
         cloud = cloud_from_depth(frame, config.crop, np.random.default_rng([seed, len(FAULTS)]))
     meta = {**clean.meta, "fault": fault, "fault_seed": seed}
-    if fault in ("registration", "all"):
-        error = registration_error(clean.reference, _rng(seed, "registration"))
+    if fault in ("registration", "all"):  # both directions are uniform
+        shift, axis = rng("registration").standard_normal((2, 3))
+        shift *= REGISTRATION_MM / np.linalg.norm(shift)
+        axis *= np.deg2rad(REGISTRATION_DEGREES) / np.linalg.norm(axis)
+        error = _turned(clean, axis, shift)
         clean = _truth_moved(clean, error)
         meta["registration"] = error.tolist()
     return replace(clean, cloud=cloud, depth=frame, meta=meta)
@@ -173,32 +171,33 @@ def severe(clean: Scene, severity: Severity, seed: int) -> Scene:
 
     Random numbers depend on seed and kind alone. The cloud is drawn again from the depth image by
     the scene's own crop; a camera that moved has the surfaces rendered again and crops nothing.
-
-    Raises:
-        InputError: no clean scene of the twin; or another camera for a scene with a rod in view.
-        NoEstimate: fewer than 200 points are left.
+    Raises InputError: no clean scene of the twin, or another camera for a scene with a rod in view;
+    NoEstimate: fewer than 200 points are left.
     """
-    frame, config = clean_view(clean)
+    frame, config = _clean_view(clean)
     if severity.is_clean:
         return clean
+    kind, level = severity.kind, severity.level
     meta = {**clean.meta, "fault": severity.name, "fault_seed": seed}
-    rng = np.random.default_rng([seed, 7000 + KINDS.index(severity.kind)])
-    draw = np.random.default_rng([seed, 7000 + len(_LIMITS) + KINDS.index(severity.kind)])
-    if severity.kind == "points":
-        return replace(clean, cloud=thin_cloud(clean.cloud, int(severity.level), draw), meta=meta)
-    if severity.kind in _MOVES:
-        camera_from_clean = _MOVES[severity.kind](clean, severity.level, rng)
+    stream = 7000 + KINDS.index(kind)
+    rng, draw = (np.random.default_rng([seed, stream + more]) for more in (0, len(KINDS)))
+    if kind == "points":
+        return replace(clean, cloud=thin_cloud(clean.cloud, int(level), draw), meta=meta)
+    if kind in ("distance", "tilt"):
+        if kind == "distance":
+            nearest_mm = float(clean.reference.organ.vertices_mm[:, 2].min())
+            camera_from_clean = rigid(np.eye(3), np.array([0.0, 0.0, level - nearest_mm]))
+        else:
+            angle = rng.uniform(0, 2 * np.pi)
+            axis = np.array([np.cos(angle), np.sin(angle), 0.0])
+            camera_from_clean = _turned(clean, np.deg2rad(level) * axis)
         return _seen_from(replace(clean, meta=meta), camera_from_clean, config, draw)
-    frame = _LEVELS[severity.kind](frame, severity.level, config, rng)
+    frame = _LEVELS[kind](frame, level, config, rng)
     return replace(clean, cloud=cloud_from_depth(frame, config.crop, draw), depth=frame, meta=meta)
 
 
-def clean_view(clean: Scene) -> tuple[DepthFrame, ViewConfig]:
-    """The depth image of a clean scene, and how it was taken.
-
-    Raises:
-        InputError: no clean scene of the twin with its depth image.
-    """
+def _clean_view(clean: Scene) -> tuple[DepthFrame, ViewConfig]:
+    """The depth image of a clean scene, and how it was taken; else InputError."""
     if clean.depth is None or clean.meta.get("view") != "clean" or "fault" in clean.meta:
         raise InputError(
             "faults are made from clean scenes of the twin with their depth image: the folders "
@@ -206,16 +205,6 @@ def clean_view(clean: Scene) -> tuple[DepthFrame, ViewConfig]:
         )
     config = from_builtins(clean.meta.get("view_config"), ViewConfig, "meta.json, view_config")
     return clean.depth, config
-
-
-def registration_error(reference: Anatomy, rng: np.random.Generator) -> Transform:
-    """A rigid motion by 1 mm and 1 degree about the organ's centre, both directions uniform."""
-    centre = reference.organ.box_mm.mean(0)
-    shift, axis = rng.standard_normal((2, 3))
-    shift *= REGISTRATION_MM / np.linalg.norm(shift)
-    axis *= np.deg2rad(REGISTRATION_DEGREES) / np.linalg.norm(axis)
-    rotation = Rotation.from_rotvec(axis).as_matrix()
-    return rigid(rotation, centre + shift - rotation @ centre)
 
 
 def scaled(noise: NoiseConfig, factor: float) -> NoiseConfig:
@@ -226,11 +215,15 @@ def scaled(noise: NoiseConfig, factor: float) -> NoiseConfig:
     return structs.replace(noise, **limited)
 
 
-def _nearer(frame: DepthFrame, by_mm: float) -> DepthFrame:
+def _nearer(frame: DepthFrame, by_mm: float, _: ViewConfig, __: Generator) -> DepthFrame:
     return replace(frame, depth_mm=frame.depth_mm - np.float32(by_mm))
 
 
-def _distortion(frame: DepthFrame, config: ViewConfig, rng: np.random.Generator) -> DepthFrame:
+def _outliers(frame: DepthFrame, share: float, config: ViewConfig, rng: Generator) -> DepthFrame:
+    return add_background(frame, share, config.far_mm, rng)[0]
+
+
+def _distortion(frame: DepthFrame, _: float, __: ViewConfig, rng: Generator) -> DepthFrame:
     """The sensor model's slow field at its full height, in every scene."""
     from tumortrack.sense.kernels import slow_shape
 
@@ -239,75 +232,51 @@ def _distortion(frame: DepthFrame, config: ViewConfig, rng: np.random.Generator)
     return frame.with_depth(frame.depth_mm + field * scale)
 
 
+_Change = Callable[[DepthFrame, float, ViewConfig, Generator], DepthFrame]
 # First what lies before the sensor, then the sensor itself, stored steps last.
-_CHANGES: dict[str, Callable[[DepthFrame, ViewConfig, np.random.Generator], DepthFrame]] = {
-    "offset": lambda frame, config, rng: _nearer(frame, OFFSET_MM),
-    "occlusion": lambda frame, config, rng: occlude(
+_CHANGES: dict[Fault, _Change] = {
+    "offset": _nearer,
+    "occlusion": lambda frame, _, config, rng: occlude(
         frame, shaft_over(frame, config.shaft_radius_mm, rng)
     )[0],
-    "outliers": lambda frame, config, rng: add_background(
-        frame, config.clutter_share, config.far_mm, rng
-    )[0],
+    "outliers": _outliers,
     "distortion": _distortion,
-    "noise": lambda frame, config, rng: add_noise(frame, AXIAL_NOISE, rng),
+    "noise": lambda frame, _, __, rng: add_noise(frame, AXIAL_NOISE, rng),
 }
-_LEVELS: dict[str, Callable[[DepthFrame, float, ViewConfig, np.random.Generator], DepthFrame]] = {
+_LEVELS: dict[str, _Change] = {
     "noise": lambda frame, level, config, rng: add_noise(frame, scaled(config.noise, level), rng),
     "visible": lambda frame, level, config, rng: hide_share(
         frame, 1 - level / 100, config.shaft_radius_mm, rng
     )[0],
-    "outliers": lambda frame, level, config, rng: add_background(
-        frame, level / 100, config.far_mm, rng
-    )[0],
-    "offset": lambda frame, level, config, rng: _nearer(frame, level),
+    "outliers": lambda frame, level, config, rng: _outliers(frame, level / 100, config, rng),
+    "offset": _nearer,
 }
 
 
-def _rng(seed: int, fault: str) -> np.random.Generator:
-    return np.random.default_rng([seed, list(FAULTS).index(fault)])  # type: ignore[arg-type]
-
-
-def _distance(clean: Scene, level: float, rng: np.random.Generator) -> Transform:
-    nearest_mm = float(clean.reference.organ.vertices_mm[:, 2].min())
-    return rigid(np.eye(3), np.array([0.0, 0.0, level - nearest_mm]))
-
-
-def _tilt(clean: Scene, level: float, rng: np.random.Generator) -> Transform:
-    angle = rng.uniform(0, 2 * np.pi)
-    axis = np.array([np.cos(angle), np.sin(angle), 0.0])
-    turn = Rotation.from_rotvec(np.deg2rad(level) * axis).as_matrix()
-    centre = clean.reference.organ.box_mm.mean(0)
-    return rigid(turn, centre - turn @ centre)
-
-
-_Move = Callable[[Scene, float, np.random.Generator], Transform]
-_MOVES: dict[str, _Move] = {"distance": _distance, "tilt": _tilt}
+def _turned(clean: Scene, turn: np.ndarray, shift: np.ndarray | float = 0.0) -> Transform:
+    """A rotation vector about the organ's centre, and a shift."""
+    centre, rotation = clean.reference.organ.box_mm.mean(0), Rotation.from_rotvec(turn).as_matrix()
+    return rigid(rotation, centre + shift - rotation @ centre)
 
 
 def _seen_from(
-    clean: Scene,
-    camera_from_clean: Transform,
-    config: ViewConfig,
-    draw: np.random.Generator,
+    clean: Scene, camera_from_clean: Transform, config: ViewConfig, draw: Generator
 ) -> Scene:
     """The same state of the organ before another camera of the same make."""
     if "poke" in clean.meta.get("state", {}):
         raise InputError(
             "a scene with a rod in view cannot be seen from elsewhere; choose another state."
         )
-    if clean.depth is None:
-        raise InputError("the scene has no depth image.")
-    turned = _truth_moved(clean, camera_from_clean)
-    organ = turned.reference.organ
-    frame = render_depth(
-        organ.vertices_mm, organ.faces, clean.depth.intrinsics, clean.depth.stamp_ns
-    )
+    assert clean.depth is not None
+    made = _truth_moved(clean, camera_from_clean)
+    organ, camera = made.reference.organ, clean.depth.intrinsics
+    frame = render_depth(organ.vertices_mm, organ.faces, camera, clean.depth.stamp_ns)
     crop = CloudConfig(near_mm=1.0, far_mm=1e4, n_points=config.n_points)
     meta = {**clean.meta, MOVED: camera_from_clean.tolist()}
     for name in ("camera_from_ct", "camera_from_bench"):
         if name in meta:
             meta[name] = (camera_from_clean @ np.array(meta[name])).tolist()
-    return replace(turned, cloud=cloud_from_depth(frame, crop, draw), depth=frame, meta=meta)
+    return replace(made, cloud=cloud_from_depth(frame, crop, draw), depth=frame, meta=meta)
 
 
 def _truth_moved(scene: Scene, b_from_a: Transform) -> Scene:

@@ -11,14 +11,14 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Float32, Float64
+from jaxtyping import Float64
 
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import rotation_onto
 from tumortrack.core.types import DepthFrame, Mesh
 from tumortrack.sense.camera import deproject
 from tumortrack.sense.render import render_depth
-from tumortrack_lab.twin.contact import Rod, three
+from tumortrack_lab.twin.equilibrium import Rod, three
 
 SHAFT_CLEARANCE_MM = 3.0  # between a shaft's tip and the organ, towards the camera
 SHAFT_RISE_DEGREES = 30.0  # of a shaft above the image plane
@@ -36,7 +36,7 @@ _HALVINGS = 14
 
 Occluder = Callable[[float], Mesh]  # a mesh (camera frame) that hides more the higher its number
 Flat = Float64[np.ndarray, " 2"]
-Image = Float32[np.ndarray, "h w"]
+Generator = np.random.Generator
 
 
 def rod_mesh(rod: Rod) -> Mesh:
@@ -60,15 +60,15 @@ def rod_mesh(rod: Rod) -> Mesh:
 
 def occlude(frame: DepthFrame, rod: Rod) -> tuple[DepthFrame, float]:
     """The frame without what the rod hides, and the share of its returns that were lost."""
-    out = _without(frame, rod_mesh(rod))
-    before = _returns(frame)
+    out, before = _without(frame, rod_mesh(rod)), _returns(frame)
     return out, (before - _returns(out)) / max(before, 1)
 
 
 def _without(frame: DepthFrame, mesh: Mesh) -> DepthFrame:
     """The frame without what a solid hides."""
     with np.errstate(invalid="ignore"):
-        hidden = _depth_of(mesh, frame) < frame.depth_mm
+        solid = render_depth(mesh.vertices_mm, mesh.faces, frame.intrinsics)
+        hidden = solid.depth_mm < frame.depth_mm
     return replace(frame, depth_mm=np.where(hidden, np.float32(np.nan), frame.depth_mm))
 
 
@@ -76,17 +76,13 @@ def _returns(frame: DepthFrame) -> int:
     return int(np.isfinite(frame.depth_mm).sum())
 
 
-def _depth_of(mesh: Mesh, frame: DepthFrame) -> Image:
-    return render_depth(mesh.vertices_mm, mesh.faces, frame.intrinsics).depth_mm
-
-
-def shaft_over(frame: DepthFrame, radius_mm: float, rng: np.random.Generator) -> Rod:
+def shaft_over(frame: DepthFrame, radius_mm: float, rng: Generator) -> Rod:
     """A shaft that comes from any side, 30 degrees above the image plane, and ends 3 mm above a
     random place in the middle tenth of what is seen; higher where it would else touch the organ
     on its way."""
     row, column = np.nonzero(np.isfinite(frame.depth_mm))
-    middle = np.median(row), np.median(column)
-    inner = np.argsort(np.hypot(row - middle[0], column - middle[1]), kind="stable")
+    offset = row - np.median(row), column - np.median(column)
+    inner = np.argsort(np.hypot(*offset), kind="stable")
     points = deproject(frame).astype(np.float64)
     target = points[inner[rng.integers(max(len(points) // 10, 1))]]
     angle, rise = rng.uniform(0, 2 * np.pi), np.deg2rad(SHAFT_RISE_DEGREES)
@@ -100,32 +96,26 @@ def shaft_over(frame: DepthFrame, radius_mm: float, rng: np.random.Generator) ->
 
 
 def add_background(
-    frame: DepthFrame, share: float, support_mm: float, rng: np.random.Generator
+    frame: DepthFrame, share: float, support_mm: float, rng: Generator
 ) -> tuple[DepthFrame, float]:
-    """The frame with background in pixels without return, and its share of all returns.
+    """The frame with background in pixels without return: ``share`` of all returns, to the nearest
+    pixel; and what share that is. ``support_mm``: depth of the support plane.
 
-    Two thirds are the top of a lump of fat that lies on the support beside the organ, one third
-    is the end of an instrument there, which a segmentation has left. Both are nearer than the
-    support, so a crop by depth keeps them. What the organ covers stays covered.
-
-    Args:
-        share: of all returns, to the nearest pixel.
-        support_mm: depth of the support plane.
-
-    Raises:
-        InputError: the image has no room beside the organ.
+    Two thirds are the top of a lump of fat that lies on the support beside the organ, one third is
+    the end of an instrument there, which a segmentation has left. Both are nearer than the support,
+    so a crop by depth keeps them. What the organ covers stays covered. Raises InputError: the image
+    has no room beside the organ.
     """
     organ = _returns(frame)
     count = round(share / (1 - share) * organ)
-    lump = round(_LUMP_SHARE * count)
-    out = _filled(frame, _lumps(frame, support_mm, rng), lump, support_mm, nearest=True)
-    tips = _tips(out, support_mm, rng)
-    out = _filled(out, tips, count - lump, support_mm, nearest=False)
+    lump, out = round(_LUMP_SHARE * count), frame
+    for solids, pixels, nearest in ((_lumps, lump, True), (_tips, count - lump, False)):
+        out = _filled(out, solids(out, support_mm, rng), pixels, support_mm, nearest)
     got = _returns(out) - organ
     return out, got / (got + organ)
 
 
-def _lumps(frame: DepthFrame, support_mm: float, rng: np.random.Generator) -> Iterator[Mesh]:
+def _lumps(frame: DepthFrame, support_mm: float, rng: Generator) -> Iterator[Mesh]:
     """Half ellipsoids on the support beside the organ, ever larger."""
     import trimesh
 
@@ -137,7 +127,7 @@ def _lumps(frame: DepthFrame, support_mm: float, rng: np.random.Generator) -> It
             yield Mesh(ball.vertices * half + np.array([*beside, support_mm]), ball.faces)
 
 
-def _tips(frame: DepthFrame, support_mm: float, rng: np.random.Generator) -> Iterator[Mesh]:
+def _tips(frame: DepthFrame, support_mm: float, rng: Generator) -> Iterator[Mesh]:
     """Rods that stand beside the organ and lean outwards, ever thicker."""
     height_mm = support_mm - float(np.nanmedian(frame.depth_mm))
     for radius_mm in (4.0, 6.0, 9.0, 13.0):
@@ -154,7 +144,7 @@ def _filled(
     """The frame with the nearest or the farthest ``count`` pixels of the first solid that shows so
     many where nothing else is seen, and nearer than the support."""
     for solid in solids:
-        seen = _depth_of(solid, frame)
+        seen = render_depth(solid.vertices_mm, solid.faces, frame.intrinsics).depth_mm
         with np.errstate(invalid="ignore"):
             free = np.flatnonzero((seen < support_mm) & np.isnan(frame.depth_mm))
         if len(free) >= count:
@@ -186,24 +176,21 @@ def _beside(frame: DepthFrame, angle: float, depth_mm: float, gap_mm: float) -> 
 
 
 def hide_share(
-    frame: DepthFrame, share: float, shaft_radius_mm: float, rng: np.random.Generator
+    frame: DepthFrame, share: float, shaft_radius_mm: float, rng: Generator
 ) -> tuple[DepthFrame, float]:
     """The frame with that share of its returns hidden by a shaft, a lump of fat and the edge of a
     drape, one after another; and the share that it has become.
 
     The occluders keep their places and directions from one share to another with the same
     generator; only how far they reach differs. They add up: what one hides the next need not.
-
-    Raises:
-        InputError: a share outside 0..0.9, or a frame without returns.
+    Raises InputError: a share outside 0..0.9, or a frame without returns.
     """
     if not 0 <= share <= LARGEST_SHARE:
         raise InputError(f"a share of {share:g} cannot be hidden; allowed: 0 to {LARGEST_SHARE:g}.")
-    total = _returns(frame)
+    total, out = _returns(frame), frame
     if not total:
         raise InputError("the depth image has no return, so nothing of it can be hidden.")
     occluders = (_shaft(frame, shaft_radius_mm, rng), _lump(frame, rng), _drape(frame, rng))
-    out = frame
     for occluder, part in zip(occluders, _PARTS, strict=True):
         out = _reached(out, occluder, total - round(part * share * total))
     return out, 1 - _returns(out) / total
@@ -225,7 +212,7 @@ def _reached(frame: DepthFrame, occluder: Occluder, fewest: int) -> DepthFrame:
     return best
 
 
-def _shaft(frame: DepthFrame, radius_mm: float, rng: np.random.Generator) -> Occluder:
+def _shaft(frame: DepthFrame, radius_mm: float, rng: Generator) -> Occluder:
     """The shaft of the views, drawn back along itself."""
     rod = shaft_over(frame, radius_mm, rng)
 
@@ -236,7 +223,7 @@ def _shaft(frame: DepthFrame, radius_mm: float, rng: np.random.Generator) -> Occ
     return solid
 
 
-def _lump(frame: DepthFrame, rng: np.random.Generator) -> Occluder:
+def _lump(frame: DepthFrame, rng: Generator) -> Occluder:
     """A lump of fat with hills that grows over the organ from a place on its outline."""
     import trimesh
 
@@ -260,7 +247,7 @@ def _lump(frame: DepthFrame, rng: np.random.Generator) -> Occluder:
     return solid
 
 
-def _drape(frame: DepthFrame, rng: np.random.Generator) -> Occluder:
+def _drape(frame: DepthFrame, rng: Generator) -> Occluder:
     """A creased sheet before the organ whose wavy edge comes in from any side."""
     points = deproject(frame).astype(float)
     middle, nearest_mm = points.mean(0), float(points[:, 2].min())

@@ -8,21 +8,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from tumortrack.core.types import Anatomy, Mesh
-from tumortrack.report.drawing import (
-    KIDNEY,
-    OBSERVED,
-    TRUE,
-    finish_view,
-    new_figure,
-    outline,
-    save,
-    show_legend,
-)
+from tumortrack.report import drawing
 from tumortrack.report.pictures import FROM_CAMERA
 from tumortrack.report.renderer import Body, Frame, ParallelView
 from tumortrack.sense.camera import project
 from tumortrack.simulate.scene_folder import Scene
-from tumortrack_lab.twin.states import COMPRESSION_MM
+from tumortrack_lab.twin.apparatus import COMPRESSION_MM
 from tumortrack_lab.twin.views import EquilibriumState
 
 if TYPE_CHECKING:
@@ -38,15 +29,9 @@ _PLATE_SHOWN_MM = 9.0
 
 
 def twin_picture(scene: Scene, state: EquilibriumState, rest_organ: Mesh, path: Path) -> None:
-    """Depth image, cloud over truth, and two side views of the bench.
-
-    Args:
-        scene: with its depth image, camera frame.
-        state: the state on the bench, bench frame.
-        rest_organ: the undeformed organ on the bench, for its outline.
-        path: PNG to write, atomically.
-    """
-    figure = new_figure(14.0, 9.6)
+    """Depth image, cloud over truth, and two side views of the bench with the undeformed organ's
+    outline; a PNG, written atomically. The scene is in the camera frame, the rest on the bench."""
+    figure = drawing.new_figure(14.0, 9.6)
     figure.subplots_adjust(left=0.02, right=0.985, top=0.875, bottom=0.03)
     grid = figure.add_gridspec(2, 2, hspace=0.13, wspace=0.05)
     _depth_view(figure.add_subplot(grid[0, 0]), scene)
@@ -60,8 +45,8 @@ def twin_picture(scene: Scene, state: EquilibriumState, rest_organ: Mesh, path: 
         x=0.02, y=0.985, ha="left", fontsize=13, fontweight="bold",
     )  # fmt: skip
     figure.text(0.02, 0.945, _numbers(scene, state), ha="left", va="top", fontsize=10)
-    show_legend(figure, _legend(), 5, (0.99, 1.0))
-    save(figure, path)
+    drawing.show_legend(figure, _legend(), 5, (0.99, 1.0))
+    drawing.save(figure, path)
 
 
 def _depth_view(axes: Axes, scene: Scene) -> None:
@@ -81,7 +66,7 @@ def _depth_view(axes: Axes, scene: Scene) -> None:
         frame = Frame(-0.5, width - 0.5, -0.5, height - 0.5)
         mask = FROM_CAMERA.silhouette(flat, frame, 2.0)
         x, y = np.meshgrid(*frame.pixel_centres(2.0))
-        for color, line in (("white", 3.2), (TRUE, 1.4)):  # a halo: seen on any depth
+        for color, line in (("white", 3.2), (drawing.TRUE, 1.4)):  # a halo: seen on any depth
             axes.contour(x, y, mask, levels=[0.5], colors=[color], linewidths=line)
     axes.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), xticks=[], yticks=[])
     for spine in axes.spines.values():
@@ -100,8 +85,10 @@ def _cloud_view(axes: Axes, scene: Scene) -> None:
     frame = FROM_CAMERA.frame_around(scene.reference.organ.vertices_mm, _AROUND_MM).widened(1.6)
     _paint(axes, scene.reference, FROM_CAMERA, frame)
     flat = FROM_CAMERA.project(points_mm)
-    axes.scatter(flat[:, 0], flat[:, 1], s=2.0, color=OBSERVED, alpha=0.5, linewidths=0, zorder=3)
-    finish_view(axes, frame)
+    axes.scatter(
+        flat[:, 0], flat[:, 1], s=2.0, color=drawing.OBSERVED, alpha=0.5, linewidths=0, zorder=3
+    )
+    drawing.finish_view(axes, frame)
     axes.set_title(f"{FROM_CAMERA.name}: {len(points_mm)} points over the truth", fontsize=11)
 
 
@@ -111,15 +98,18 @@ def _bench_view(axes: Axes, state: EquilibriumState, rest_organ: Mesh, view: Par
     everything = np.concatenate([everything, everything.mean(0)[None] * [1, 1, 0] + [0, 0, -12.0]])
     frame = view.frame_around(everything, 8.0).widened(1.75)
     _paint(axes, anatomy, view, frame)
-    outline(axes, rest_organ, view, frame, _REST, 1.3, linestyles=["dashed"])
+    drawing.outline(axes, rest_organ, view, frame, _REST, 1.3, linestyles=["dashed"])
     axes.axhspan(0, frame.bottom, color="0.3", alpha=0.13, zorder=2.2, linewidth=0)
     axes.axhline(0, color="0.45", linewidth=1.2, zorder=2.5)
-    finish_view(axes, frame)
+    drawing.finish_view(axes, frame)
     axes.set_title(view.name, fontsize=11)
 
 
 def _paint(axes: Axes, anatomy: Anatomy, view: ParallelView, frame: Frame) -> None:
-    bodies = [*(Body(tumor, TRUE) for tumor in anatomy.tumors), Body(anatomy.organ, KIDNEY, 0.4)]
+    bodies = [
+        *(Body(tumor, drawing.TRUE) for tumor in anatomy.tumors),
+        Body(anatomy.organ, drawing.KIDNEY, 0.4),
+    ]
     picture = view.draw(bodies, frame)
     axes.imshow(picture, extent=frame.extent, zorder=2, interpolation="bilinear")
 
@@ -166,8 +156,8 @@ _TEXT = {
 def _numbers(scene: Scene, state: EquilibriumState) -> str:
     """What was measured of this scene, in one line."""
     measured = {**state.report, **scene.meta["seen"]}
-    if (change := measured.get("volume_change")) is not None:
-        measured["volume_change"] = 100 * change
+    if "volume_change" in measured:
+        measured["volume_change"] *= 100
     texts = {
         "volume_change": "volume {:+.2f} %",
         "largest_displacement_mm": "largest displacement {:.1f} mm",
@@ -183,9 +173,9 @@ def _legend() -> list:
     from matplotlib.patches import Patch
 
     return [
-        Patch(facecolor=(*KIDNEY, 0.5), label="kidney"),
-        Patch(facecolor=TRUE, label="tumor"),
+        Patch(facecolor=(*drawing.KIDNEY, 0.5), label="kidney"),
+        Patch(facecolor=drawing.TRUE, label="tumor"),
         Line2D([], [], color=_REST, linestyle="dashed", label="undeformed"),
         Patch(facecolor=_STEEL, edgecolor="0.3", label="plate, rod"),
-        Line2D([], [], color=OBSERVED, marker=".", linestyle="", label="point"),
+        Line2D([], [], color=drawing.OBSERVED, marker=".", linestyle="", label="point"),
     ]

@@ -43,17 +43,11 @@ class _RestElements(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class NeoHookeanSolid:
-    """An unloaded mesh and its stiffness.
+    """An unloaded mesh and its stiffness."""
 
-    Attributes:
-        mesh: at rest, free of stress.
-        shear_kpa: shear modulus mu of each tetrahedron; Young's modulus / (2 (1 + poisson)).
-        poisson: near 0.5; 0.49 makes the bulk modulus 50 times the shear modulus.
-    """
-
-    mesh: TetMesh
-    shear_kpa: Float[np.ndarray, " t"]
-    poisson: float = 0.49
+    mesh: TetMesh  # at rest, free of stress
+    shear_kpa: Float[np.ndarray, " t"]  # of each tetrahedron: Young's modulus / (2 (1 + poisson))
+    poisson: float = 0.49  # near 0.5; 0.49 makes the bulk modulus 50 times the shear modulus
 
     @cached_property
     def node_volumes_mm3(self) -> Float64[np.ndarray, " n"]:
@@ -70,14 +64,9 @@ class NeoHookeanSolid:
     def _rest(self) -> _RestElements:
         corners = self.mesh.nodes_mm[self.mesh.tets]
         edges = (corners[:, 1:] - corners[:, :1]).transpose(0, 2, 1)
-        return _RestElements(
-            tets=self.mesh.tets,
-            inner=np.ascontiguousarray(np.linalg.inv(edges)),
-            volumes_mm3=self.mesh.volumes_mm3,
-            node_volumes_mm3=self.node_volumes_mm3,
-            shear_kpa=np.asarray(self.shear_kpa, np.float64),
-            bulk_kpa=self.bulk_kpa,
-        )
+        inner, shear = np.ascontiguousarray(np.linalg.inv(edges)), np.asarray(self.shear_kpa, float)
+        volumes = self.mesh.volumes_mm3, self.node_volumes_mm3
+        return _RestElements(self.mesh.tets, inner, *volumes, shear, self.bulk_kpa)
 
     def energy(self, nodes_mm: Nodes) -> tuple[float, Nodes]:
         """Elastic energy (uJ) and its gradient (mN); infinite where an element has turned over."""
@@ -106,17 +95,12 @@ class NeoHookeanSolid:
         unknowns = (3 * tets[:, :, None] + np.arange(3)).reshape(-1, 12)
         size = 3 * len(self.mesh.nodes_mm)
         rows, columns = np.repeat(unknowns, 12, axis=1), np.tile(unknowns, (1, 12))
-        stiffness = csr_matrix(
-            (block.reshape(-1), (rows.reshape(-1), columns.reshape(-1))), shape=(size, size)
-        )
+        places = rows.reshape(-1), columns.reshape(-1)
+        stiffness = csr_matrix((block.reshape(-1), places), shape=(size, size))
         share = (volumes[:, None, None] / 4 * shape).reshape(-1, 12)
-        swelling = csr_matrix(
-            (
-                np.tile(share, (1, 4)).reshape(-1),
-                (np.repeat(tets, 12, axis=1).reshape(-1), np.tile(unknowns, (1, 4)).reshape(-1)),
-            ),
-            shape=(size // 3, size),
-        )
+        places = np.repeat(tets, 12, axis=1).reshape(-1), np.tile(unknowns, (1, 4)).reshape(-1)
+        shares = np.tile(share, (1, 4)).reshape(-1)
+        swelling = csr_matrix((shares, places), shape=(size // 3, size))
         held = diags((1 - PER_TET) * self.bulk_kpa / self.node_volumes_mm3)
         return (stiffness + swelling.T @ held @ swelling).tocsr()
 

@@ -1,1 +1,0 @@
-"""What a research repository would have: the same answers, in the plain way."""

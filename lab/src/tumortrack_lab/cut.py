@@ -1,0 +1,340 @@
+"""A plan made on the estimate cuts the true anatomy: what is removed, and the margins.
+
+The planner's own volumes are not used. The true organ is voxelised, faces between voxels are
+severed where a stroke or a level sheet passes between their centres, and the largest connected
+piece is what stays. Tissue does not move while it is cut. No voxel is removed, so that a cut has
+no volume and leaves no diagonal way through.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Float64, Int, UInt8
+
+from tumortrack.core.errors import InputError
+from tumortrack.core.types import ORGAN, Anatomy, Mesh
+from tumortrack.imaging.raster import expand, label_grid
+from tumortrack.plan.values import Cut, CutLayer, ResectionPlan
+from tumortrack.report.metrics import distance_to_surface
+
+Flat = Float[np.ndarray, "_ 2"]
+Mask = Bool[np.ndarray, "i j"]
+Voxels = Bool[np.ndarray, "i j k"]
+
+# In voxels: with this offset no line that anyone draws runs exactly through a voxel's centre, where
+# rounding would decide on which side it passes. So closed lines separate inside from outside.
+_ASIDE = 1e-7 * np.sqrt([2.0, 3.0])
+VOXEL_MM = 0.5
+SAMPLES_MM = 0.4  # between points of the cut's surface
+_SAME_MM = 1e-6  # of heights
+_BESIDE_MM = 0.5  # an outline this close to a stroke is cut: its chords leave it by less
+_TEARS_MM2 = 2.0  # a thinner bridge tears when the piece is lifted
+_ML = 1e-3  # of a mm3
+
+Points = Float[np.ndarray, "_ 3"]
+Box = Float64[np.ndarray, "2 3"]
+
+
+class Severed:
+    """Which faces between neighbouring voxels of a grid are cut; axis by axis, face n between
+    voxels n and n + 1."""
+
+    def __init__(self, shape: tuple[int, int, int]) -> None:
+        self.shape = shape
+        self.faces = [
+            np.zeros(tuple(n - (axis == a) for a, n in enumerate(shape)), bool) for axis in range(3)
+        ]
+
+    def wall(self, path: Flat, first: int, stop: int) -> None:
+        """Cut along a line (x and y in voxels), in the levels first .. stop - 1."""
+        i, j, _ = self.shape
+        path = path + _ASIDE
+        self.faces[0][:, :, first:stop] |= (_crossings(path, (i, j))[1:-1] > 0)[:, :, None]
+        across = _crossings(path[:, ::-1], (j, i))[1:-1].T
+        self.faces[1][:, :, first:stop] |= (across > 0)[:, :, None]
+
+    def sheet(self, columns: Mask, level: int) -> None:
+        """Cut these columns level, between the levels level - 1 and level."""
+        if 0 < level < self.shape[2]:
+            self.faces[2][:, :, level - 1] |= columns
+
+
+def within(rings: tuple[Flat, ...], shape: tuple[int, int]) -> Mask:
+    """Which of the points (i, j), i < shape[0], j < shape[1], lie within rings (the first point not
+    repeated) by the even-odd rule."""
+    counts = np.zeros((shape[0] + 1, shape[1]), int)
+    for ring in rings:
+        counts += _crossings(np.concatenate([ring, ring[:1]]) + _ASIDE, shape)
+    return np.cumsum(counts, axis=0)[:-1] % 2 == 1
+
+
+def _crossings(path: Flat, shape: tuple[int, int]) -> Int[np.ndarray, "i j"]:
+    """How often a line passes each row j just before point i; (shape[0] + 1, shape[1])."""
+    start, end = path[:-1], path[1:]
+    low, high = np.minimum(start[:, 1], end[:, 1]), np.maximum(start[:, 1], end[:, 1])
+    first = np.clip(np.ceil(low), 0, shape[1]).astype(int)
+    stop = np.clip(np.ceil(high), 0, shape[1]).astype(int)
+    part, step = expand(np.maximum(stop - first, 0))
+    row = first[part] + step
+    share = (row - start[part, 1]) / (end[part, 1] - start[part, 1])
+    at = start[part, 0] + share * (end[part, 0] - start[part, 0])
+    counts = np.zeros((shape[0] + 1, shape[1]), int)
+    np.add.at(counts, (np.clip(np.ceil(at), 0, shape[0]).astype(int), row), 1)
+    return counts
+
+
+def pieces_of(tissue: Voxels, severed: Severed) -> Int[np.ndarray, "i j k"]:
+    """Pieces connected over faces that are not severed: 1 is the largest, then 2, 3, ...; 0 where
+    there is no tissue."""
+    from scipy.ndimage import label
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    # Pieces of voxels that touch no severed face, found fast; each other voxel is one by itself.
+    beside = np.zeros(tissue.shape, bool)
+    for axis, cut in enumerate(severed.faces):
+        low, high = _ends(axis)
+        beside[low] |= cut
+        beside[high] |= cut
+    pieces, count = label(tissue & ~beside, output=np.int32)
+    alone = np.flatnonzero(tissue & beside)
+    pieces.reshape(-1)[alone] = count + 1 + np.arange(len(alone))
+    ends = []
+    for axis, cut in enumerate(severed.faces):
+        low, high = _ends(axis)
+        holds = tissue[low] & tissue[high] & ~cut & (beside[low] | beside[high])
+        ends.append(np.stack([pieces[low][holds], pieces[high][holds]]))
+    a, b = np.concatenate(ends, axis=1)
+    total = count + 1 + len(alone)
+    graph = coo_array((np.ones(len(a), bool), (a, b)), (total, total))
+    _, whole = connected_components(graph, directed=False)
+    of_voxel = whole[pieces]
+    sizes = np.bincount(of_voxel[tissue], minlength=total)
+    rank = np.empty(total, int)
+    rank[np.argsort(-sizes, kind="stable")] = 1 + np.arange(total)
+    return np.where(tissue, rank[of_voxel], 0)
+
+
+def _ends(axis: int) -> tuple[tuple[slice, ...], tuple[slice, ...]]:
+    """The voxels below and above each face along an axis."""
+    low, high = [slice(None)] * 3, [slice(None)] * 3
+    low[axis], high[axis] = slice(None, -1), slice(1, None)
+    return tuple(low), tuple(high)
+
+
+@dataclass(frozen=True)
+class CutResult:
+    """What a cut did to the true anatomy. The piece is what the layers enclose."""
+
+    tumor_ml: float  # true volume of the tumor that was to come away
+    removed_share: float  # of it, what came away within the piece
+    loose_share: float  # of it, what came off beside the piece, for a cut went through the tumor
+    enclosed_share: float  # of it, what lies within the layers, whether or not they came free
+    healthy_ml: float  # organ without tumors that has come away, within the piece or beside it
+    piece_ml: float  # 0 where it did not come free
+    detached: bool  # whether the piece came free
+    # Area of the piece's outline that lies in tissue and that no stroke went along. Less than 2 mm2
+    # tears, and counts as cut.
+    bridge_mm2: float
+    # Least distance between a cut within tissue and the tumor's surface; negative: this deep the
+    # cut went into the tumor. None where nothing was cut at all.
+    margin_mm: float | None
+    hurt: tuple[str, ...]  # other tumors that were cut into
+
+    @property
+    def left_ml(self) -> float:
+        """Tumor that does not come away with the piece."""
+        return self.tumor_ml * (1 - self.removed_share)
+
+
+def cut(truth: Anatomy, plan: ResectionPlan, voxel_mm: float = VOXEL_MM) -> CutResult:
+    """Cut the true anatomy (table frame, mm) by a plan.
+
+    Cut are walls, along the strokes alone, each from the bottom to the top of the layer in which
+    its stroke lies; and level sheets, at the bottom of each layer where none goes on below. Raises
+    InputError: the truth lacks the plan's tumor, or a stroke lies in none of its layers.
+    """
+    if plan.tumor not in truth.names[1:]:
+        raise InputError(
+            f"the plan is for {plan.tumor}, which is not among the anatomy's parts: "
+            f"{', '.join(truth.names)}."
+        )
+    cutting, number = _Cutting(truth, plan, voxel_mm), truth.names.index(plan.tumor)
+    bridge_mm2 = cutting.bridge_mm2()
+    labels = cutting.labels
+    tissue, tumor = labels > 0, labels == ORGAN + number
+    pieces = pieces_of(tissue, cutting.severed(torn=bridge_mm2 < _TEARS_MM2))
+    enclosed = cutting.enclosed() & tissue
+    largest = int(np.bincount(pieces[enclosed], minlength=1).argmax())  # 0: nothing enclosed
+    piece = pieces == largest if largest > 1 else np.zeros_like(tissue)
+    surface = cutting.surface()
+    found = cutting.at(surface)
+    surface, found = surface[found > 0], found[found > 0]
+    voxel_ml = voxel_mm**3 * _ML
+    return CutResult(
+        tumor_ml=float(tumor.sum()) * voxel_ml,
+        removed_share=_share(piece, tumor),
+        loose_share=_share((pieces > 1) & ~piece, tumor),
+        enclosed_share=_share(enclosed, tumor),
+        healthy_ml=float(((pieces > 1) & (labels == ORGAN)).sum()) * voxel_ml,
+        piece_ml=float(piece.sum()) * voxel_ml,
+        detached=largest > 1,
+        bridge_mm2=bridge_mm2,
+        margin_mm=_margin_mm(surface, found == ORGAN + number, truth.parts[number]),
+        hurt=tuple(
+            name
+            for n, name in enumerate(truth.names[1:], start=1)
+            if n != number and (found == ORGAN + n).any()
+        ),
+    )
+
+
+class _Cutting:
+    """A plan in the true anatomy, whose voxel (i, j, k) lies at low_mm + voxel_mm (i, j, k).
+
+    The lowest layer's bottom lies midway between two levels, so that half a voxel all over the
+    largest sheet is no bias of the volumes. ``walls``: each stroke along an outline, with the layer
+    whose wall it cuts; ``box_mm``: of the organ, beyond which nothing is looked at.
+    """
+
+    def __init__(self, truth: Anatomy, plan: ResectionPlan, voxel_mm: float) -> None:
+        self.layers, self.box_mm, self.voxel_mm = plan.layers, truth.organ.box_mm, voxel_mm
+        corners = np.concatenate([part.box_mm for part in truth.parts])
+        self.low_mm = low_mm = corners.min(0) - voxel_mm
+        bottom_mm = min(layer.bottom_mm for layer in plan.layers) + voxel_mm / 2
+        low_mm[2] = bottom_mm - voxel_mm * np.ceil((bottom_mm - low_mm[2]) / voxel_mm)
+        i, j, k = (np.ceil((corners.max(0) - low_mm) / voxel_mm) + 2).astype(int).tolist()
+        table_from_index = np.diag([voxel_mm, voxel_mm, voxel_mm, 1.0])
+        table_from_index[:3, 3] = low_mm
+        self.labels = label_grid(truth, table_from_index, (i, j, k))
+        self.walls: list[tuple[Cut, CutLayer]] = []
+        for stroke in (stroke for stroke in plan.cuts if stroke.kind == "wall"):
+            at = stroke.height_mm + _SAME_MM
+            here = [layer for layer in plan.layers if layer.bottom_mm <= at < layer.top_mm]
+            if not here:
+                raise InputError(
+                    f"a stroke at {stroke.height_mm:g} mm lies in none of the plan's layers."
+                )
+            self.walls.append((stroke, here[0]))
+
+    def rings(self, layer: CutLayer) -> tuple[Flat, ...]:
+        """A layer's rings in voxels."""
+        return tuple((ring - self.low_mm[:2]) / self.voxel_mm for ring in layer.rings_mm)
+
+    def columns(self, layer: CutLayer) -> Mask:
+        """Which columns of voxels lie within a layer."""
+        return within(self.rings(layer), self.labels.shape[:2])
+
+    def levels(self, layer: CutLayer) -> tuple[int, int]:
+        """First level of a layer and first beyond it, by the voxels' centres."""
+        heights = np.array([layer.bottom_mm, layer.top_mm])
+        levels = np.ceil((heights - self.low_mm[2]) / self.voxel_mm)
+        first, stop = np.clip(levels, 0, self.labels.shape[2]).astype(int).tolist()
+        return first, stop
+
+    def at(self, points_mm: Points) -> UInt8[np.ndarray, " n"]:
+        """Labels of the nearest voxels; 0 beyond the grid."""
+        index = np.rint((points_mm - self.low_mm) / self.voxel_mm).astype(int)
+        known = ((index >= 0) & (index < self.labels.shape)).all(1)
+        out = np.zeros(len(points_mm), np.uint8)
+        out[known] = self.labels[tuple(index[known].T)]
+        return out
+
+    def severed(self, torn: bool) -> Severed:
+        """A sheet reaches one voxel further than its outlines, for the strokes' chords leave those.
+        ``torn``: what the strokes left of the outlines is severed too."""
+        from scipy.ndimage import binary_dilation, binary_erosion
+
+        near, severed = np.ones((3, 3), bool), Severed(self.labels.shape)
+        for stroke, layer in self.walls:
+            path = (stroke.path_mm[:, :2] - self.low_mm[:2]) / self.voxel_mm
+            severed.wall(path, *self.levels(layer))
+        for layer in self.layers:
+            for ring in self.rings(layer) if torn else ():
+                severed.wall(np.concatenate([ring, ring[:1]]), *self.levels(layer))
+            sheet = binary_dilation(self.columns(layer), near)
+            for lower in self._below(layer):
+                sheet &= ~binary_erosion(self.columns(lower), near)
+            severed.sheet(sheet, self.levels(layer)[0])
+        return severed
+
+    def enclosed(self) -> Voxels:
+        """What lies within the layers."""
+        inside = np.zeros(self.labels.shape, bool)
+        for layer in self.layers:
+            inside[:, :, slice(*self.levels(layer))] |= self.columns(layer)[:, :, None]
+        return inside
+
+    def surface(self) -> Points:
+        """Points all over walls and sheets, SAMPLES_MM apart."""
+        points = [self._curtain(stroke.path_mm[:, :2], layer) for stroke, layer in self.walls]
+        points += [self._flat(layer, self._below(layer), layer.bottom_mm) for layer in self.layers]
+        return np.concatenate(points)
+
+    def bridge_mm2(self) -> float:
+        """Area within tissue of what encloses the piece and was not cut: of outlines, that no
+        stroke goes along; and where a layer is wider than the one above it, that rim."""
+        from scipy.spatial import cKDTree
+
+        held = 0
+        for layer in self.layers:
+            strokes = [_even(s.path_mm[:, :2]) for s, wall in self.walls if wall is layer]
+            for ring in layer.rings_mm:
+                points = self._curtain(np.concatenate([ring, ring[:1]]), layer)
+                points = points[self.at(points) > 0]
+                if strokes and len(points):
+                    beside = cKDTree(np.concatenate(strokes)).query(points[:, :2])[0]
+                    points = points[beside > _BESIDE_MM]
+                held += len(points)
+            above = [other for other in self.layers if layer in self._below(other)]
+            if np.isfinite(layer.top_mm):
+                rim = self._flat(layer, above, layer.top_mm)
+                held += int((self.at(rim) > 0).sum())
+        return held * SAMPLES_MM**2
+
+    def _below(self, layer: CutLayer) -> list[CutLayer]:
+        """The layers whose top is this one's bottom."""
+        return [other for other in self.layers if abs(other.top_mm - layer.bottom_mm) < _SAME_MM]
+
+    def _curtain(self, path: Flat, layer: CutLayer) -> Points:
+        """Points on the wall over a line, from the layer's bottom to its top, within the box."""
+        low = max(layer.bottom_mm, self.box_mm[0, 2]) + SAMPLES_MM / 2
+        heights = np.arange(low, min(layer.top_mm, self.box_mm[1, 2]), SAMPLES_MM)
+        flat = _even(path)
+        return np.column_stack([np.tile(flat, (len(heights), 1)), np.repeat(heights, len(flat))])
+
+    def _flat(self, layer: CutLayer, without: list[CutLayer], height_mm: float) -> Points:
+        """Points level within a layer and outside others, within the box."""
+        low, high = self.box_mm[:, :2]
+        shape = tuple((np.ceil((high - low) / SAMPLES_MM).astype(int) + 1).tolist())
+
+        def inside(layer: CutLayer) -> Mask:
+            return within(tuple((ring - low) / SAMPLES_MM for ring in layer.rings_mm), shape)
+
+        kept = inside(layer)
+        for other in without:
+            kept &= ~inside(other)
+        heights = np.full(kept.sum(), height_mm)
+        return np.column_stack([low + SAMPLES_MM * np.argwhere(kept), heights])
+
+
+def _even(path: Flat) -> Flat:
+    """Points along a line, SAMPLES_MM apart, its end included."""
+    way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
+    at = np.append(np.arange(0, way[-1], SAMPLES_MM), way[-1])
+    return np.column_stack([np.interp(at, way, axis) for axis in path.T])
+
+
+def _margin_mm(surface: Points, inside: Bool[np.ndarray, " n"], tumor: Mesh) -> float | None:
+    """Signed distance of the nearest, or else the deepest, of the cut's points."""
+    if not len(surface):
+        return None
+    if inside.any():
+        return -float(distance_to_surface(surface[inside], tumor).max())
+    return float(distance_to_surface(surface, tumor).min())
+
+
+def _share(of: Voxels, whole: Voxels) -> float:
+    return float((of & whole).sum() / max(1, whole.sum()))
