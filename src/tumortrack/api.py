@@ -408,6 +408,7 @@ def plan_resection(
     *,
     picture: StrPath | None = None,
     stand_mm: float | None = None,
+    accept_poor: bool = False,
     **options: Any,
 ) -> ResectionPlan:
     """Where to cut a tumor out; nothing moves. `tumortrack plan` also plans the arms' motions.
@@ -417,6 +418,7 @@ def plan_resection(
             camera is taken to look straight down on the table.
         picture: PNG file to draw the plan into.
         stand_mm: height of the organ's lowest point over the table.
+        accept_poor: plan on a poor estimate; the plan's notes say so.
         options: fields of ``plan.values.ResectionConfig``: ``tumor``, ``method`` (``margin`` or
             ``published``), ``margin_mm``, ``sigmas`` and others.
 
@@ -425,8 +427,10 @@ def plan_resection(
 
     Raises:
         NoPlan: nothing to cut, or not as asked; says why.
-        InputError: no such tumor, or an option that is not allowed.
+        InputError: a poor estimate; no such tumor, or an option that is not allowed.
     """
+    from dataclasses import replace
+
     from tumortrack.core.config import from_builtins
     from tumortrack.plan import located as places
     from tumortrack.plan import resection
@@ -437,10 +441,13 @@ def plan_resection(
     stand_mm = places.STAND_MM if stand_mm is None else stand_mm
     table_from_camera = places.table_below(run.cloud.points_mm, stand_mm)
     if isinstance(run, Estimate):
+        doubt = "" if run.quality == "good" else run.reason
         seen = places.located(run.cloud, run.meshes, run.motion, table_from_camera)
     else:
-        seen = run.located(table_from_camera)
+        doubt, seen = run.doubt, run.located(table_from_camera)
+    notes = places.notes_of_doubt(doubt, accept_poor)
     plan = resection.plan_resection(seen, config)
+    plan = replace(plan, notes=(*notes, *plan.notes))
     if picture is not None:
         from tumortrack.report.plan_pictures import draw_plan
 

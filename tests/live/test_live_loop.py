@@ -17,7 +17,6 @@ from tumortrack.core.errors import InputError, NoEstimate, StorageError
 from tumortrack.core.estimate import Following
 from tumortrack.core.types import DepthFrame, Intrinsics, SensorCloud
 from tumortrack.live.loop import Loop, LoopConfig, summary
-from tumortrack.live.quality import judge, seen_through
 from tumortrack.live.values import (
     Controls,
     Observation,
@@ -27,9 +26,7 @@ from tumortrack.live.values import (
     SourceLost,
 )
 from tumortrack.live.workers import SinkWorker, SourceWorker
-from tumortrack.sense.camera import d405
 from tumortrack.sense.region import RegionConfig
-from tumortrack.sense.render import render_depth
 from tumortrack.simulate.scene import SceneRecipe, Simulator, body_for
 from tumortrack.tracking.tracker import Follower, FollowerConfig, Tracker
 from tumortrack.training.model import load_model
@@ -208,49 +205,6 @@ def test_an_old_estimate_does_not_help(tracker, stages):
     with pytest.raises(NoEstimate):
         follower.locate(SensorCloud(clouds[1].points_mm[:100], clouds[1].stamp_ns))
     assert follower.last_box_mm(clouds[1].stamp_ns) is None
-
-
-def test_a_worse_fit_is_flagged(tracker, stages):
-    cloud = stages[0].cloud
-    estimate = tracker.follow(cloud)
-    estimate.report["fit_cost"] = {"now": 1.0, "usual": 2.0}
-    for part in estimate.report["parts"].values():
-        part["probability"], part["center_std_mm"] = 0.9, 1.0
-    assert judge(estimate, cloud) == ("good", "")
-    estimate.report["parts"]["tumor_1"]["center_std_mm"] = 3.4
-    quality, warning = judge(estimate, cloud)
-    assert quality == "poor"
-    assert "tumor_1 is unsure by 3.4 mm" in warning
-    estimate.report["fit_cost"]["now"] = 2.1
-    assert "worse than in most" in judge(estimate, cloud)[1]
-
-
-def test_an_organ_that_the_camera_sees_through_is_refused(tracker, stages):
-    estimate = tracker.follow(stages[0].cloud)
-    camera = d405(424, 240)
-    organ = estimate.meshes["kidney"]
-    alone = render_depth(organ.vertices_mm, organ.faces, camera)
-    behind_mm = np.float32(np.nanmax(alone.depth_mm) + 30)
-    table = DepthFrame(np.fmin(alone.depth_mm, behind_mm), camera)
-    assert seen_through(estimate, alone) == 0
-    assert seen_through(estimate, table) == 0
-    rows = np.flatnonzero(np.isfinite(alone.depth_mm).any(1))
-    for share, expected in ((0.07, "poor"), (0.3, "none")):
-        area = np.cumsum(np.isfinite(alone.depth_mm[rows]).sum(1))
-        few = rows[: np.searchsorted(area, share * area[-1])]
-        depth_mm = table.depth_mm.copy()
-        depth_mm[few] = behind_mm  # the table where the organ is said to be
-        holed = DepthFrame(depth_mm, camera)
-        assert seen_through(estimate, holed) == pytest.approx(share, abs=0.02)
-        if expected == "poor":
-            assert judge(estimate, holed)[0] == "poor"
-            assert estimate.report["seen_through"] == pytest.approx(share, abs=0.02)
-        else:
-            with pytest.raises(NoEstimate, match="sees through 3"):
-                judge(estimate, holed)
-    hidden = table.depth_mm.copy()
-    hidden[:, :200] = behind_mm - 90  # a hand before it hides it, and proves nothing
-    assert seen_through(estimate, DepthFrame(hidden, camera)) == 0
 
 
 def test_every_frame_gives_one_update_with_its_own_stamp(tracker, stages):

@@ -17,8 +17,8 @@ from live_objects import empty_update, small_frame, small_update
 from tumortrack.core.errors import InputError, NoEstimate, StorageError
 from tumortrack.live.calibration_file import read_frames
 from tumortrack.live.meter import Histogram
-from tumortrack.live.quality import StampCheck
 from tumortrack.live.spec import Registry
+from tumortrack.live.stamps import StampCheck
 from tumortrack.live.values import Observation, PublishedFrame, SinkConfig, SourceEnded, SourceLost
 from tumortrack.live.workers import SinkWorker, SourceWorker
 

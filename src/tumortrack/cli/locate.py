@@ -72,7 +72,7 @@ class Locate:
             far = check_near_organ(points.points_ct, box_mm, str(self.map))
             notes = (*notes, *points.notes, *far)
         cloud = self._cropped(seen, model.config.scene.cloud)
-        estimate = tracker.locate(cloud, self.grid, self.seed)
+        estimate = tracker.locate(cloud, self.grid, self.seed, seen)
         if points is not None and self.map is not None:
             estimate.report["map"] = {
                 "points": len(points.points_ct),
@@ -97,6 +97,9 @@ class Locate:
         if points is not None:
             file = self.out / "points.csv"
             say(f"{len(points.points_ct)} points of the CT: their places are in {file}")
+        good = estimate.quality == "good"
+        say("GOOD: it fits as in validation; this does not verify it." if good
+            else f"POOR: {estimate.reason}. Do not rely on it.")  # fmt: skip
         seconds = estimate.report["timings"]["total"]
         say(f"written to {self.out} (camera frame, mm) in {seconds:.2f} s.")
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -43,6 +43,7 @@ class Plan:
         stand: height of the organ's lowest point over the table in mm, where no frame is given.
         cell: JSON file with arms, tools, table and their places (docs/resection.md).
         arms: also plan the motions of both arms.
+        accept_poor: plan on an estimate that `locate` called poor; the plan says so everywhere.
         overwrite: replace PLAN if it exists.
     """
 
@@ -57,12 +58,13 @@ class Plan:
     stand: float | None = None
     cell: Path | None = None
     arms: bool = True
+    accept_poor: bool = False
     overwrite: bool = False
 
     def run(self) -> None:
         from tumortrack.core.config import to_builtins
         from tumortrack.plan.files import KIND, PlanFolder, write_plan
-        from tumortrack.plan.located import read_run
+        from tumortrack.plan.located import notes_of_doubt, read_run
         from tumortrack.plan.resection import plan_resection
         from tumortrack.report.plan_pictures import draw_plan
 
@@ -72,6 +74,7 @@ class Plan:
         if self.arms:
             check_arms_installed()
         run = read_run(self.run_folder)
+        doubts = notes_of_doubt(run.doubt, self.accept_poor)
         frame_id, table_from_camera = self._frame(run, cell_config.stand_mm)
         located = run.located(table_from_camera)
         organ = located.meshes.get("kidney")
@@ -80,6 +83,7 @@ class Plan:
                 "the run has no kidney.ply, so arms can't keep clear of it; give --no-arms."
             )
         resection = plan_resection(located, config)
+        resection = replace(resection, notes=(*doubts, *resection.notes))
         _say_plan(resection)
         motions, cell_used = None, None
         if self.arms and organ is not None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Literal, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float
@@ -15,6 +15,7 @@ from tumortrack.core.geometry import Points
 from tumortrack.core.types import CameraLabels, Mesh, OccupancyCloud
 
 LARGEST_GRID = 400
+Quality = Literal["good", "poor", "none"]  # none: there is no estimate
 
 
 @runtime_checkable
@@ -73,6 +74,7 @@ class Estimate:
         report: plain JSON: per part volume, centre, box and probability; ``timings`` in seconds.
         motion: where every point of the CT is, if the method knows that; ``unsmoothed``: before the
             mean over past frames: the next frame's search starts from it.
+        quality: ``good`` or ``poor``, and the ``reason``: see ``tracking.quality.judged``.
     """
 
     cloud: OccupancyCloud
@@ -81,3 +83,5 @@ class Estimate:
     report: dict[str, Any]
     motion: Motion | None = None
     unsmoothed: Motion | None = None
+    quality: Quality = "poor"
+    reason: str = "it was not judged"

@@ -20,11 +20,12 @@ from jaxtyping import Float64
 
 from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError, NoEstimate, TumortrackError
+from tumortrack.core.estimate import Quality
 from tumortrack.core.types import DepthFrame, Intrinsics, SensorCloud
 from tumortrack.live import values as live
 from tumortrack.live.meter import RunStatistics
-from tumortrack.live.quality import StampCheck, judge
-from tumortrack.live.values import Observation, Quality, SourceLost, TrackingResult
+from tumortrack.live.stamps import StampCheck
+from tumortrack.live.values import Observation, SourceLost, TrackingResult
 from tumortrack.live.workers import SinkWorker, SourceWorker
 from tumortrack.sense.camera import d405
 from tumortrack.sense.region import Hints, RegionConfig, organ_points
@@ -159,10 +160,9 @@ class Loop:
                 hints = self._hints(seen)
                 organ = organ_points(seen.content, self._config.region, hints, rng).cloud
             with _timed(seconds, "locate"):
-                estimate = self._follower.locate(organ)
+                estimate = self._follower.locate(organ, seen.content)
             seconds |= {f"locate.{k}": v for k, v in estimate.report["timings"].items()}
-            with _timed(seconds, "judge"):
-                quality, warning = judge(estimate, seen.content)
+            quality, warning = estimate.quality, estimate.reason
             self._follow_pick(organ)
             if hurry and _age_s(born_ns) > self._config.stale_s:
                 raise _TooLate(f"the answer came too late: {_age_s(born_ns):.2f} s after the frame")

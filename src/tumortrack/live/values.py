@@ -12,18 +12,16 @@ from abc import abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import ClassVar, Literal, Protocol, runtime_checkable
+from typing import ClassVar, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, UInt8
 
 from tumortrack.core.config import Config
 from tumortrack.core.errors import TumortrackError
-from tumortrack.core.estimate import Estimate
+from tumortrack.core.estimate import Estimate, Quality
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.types import Anatomy, DepthFrame, Mesh, SensorCloud
-
-Quality = Literal["good", "poor", "none"]
 
 
 class SourceLost(TumortrackError):

@@ -59,6 +59,7 @@ class LocatedRun:
     cloud: OccupancyCloud
     meshes: dict[str, Mesh]
     std_mm: Float64[np.ndarray, " n"] | None
+    doubt: str = ""  # why it is poor; empty: it is good
 
     def located(self, table_from_camera: Float[np.ndarray, "4 4"]) -> Located:
         """In the table's frame; a surface's uncertainty is that of the nearest points."""
@@ -74,6 +75,19 @@ class LocatedRun:
         return replace(found, std_mm=deviations)
 
 
+def notes_of_doubt(doubt: str, accept_poor: bool) -> tuple[str, ...]:
+    """What a plan says of the estimate it is made on. InputError: that is poor, and nobody said
+    that it is to be planned on all the same."""
+    if not doubt:
+        return ()
+    if not accept_poor:
+        raise InputError(
+            f"the estimate is poor: {doubt}. Locate again with a better view; only for a plan that "
+            "nobody carries out, accept it (--accept-poor, accept_poor=True)."
+        )
+    return (f"PLANNED ON A POOR ESTIMATE: {doubt}.",)
+
+
 def read_run(folder: Path) -> LocatedRun:
     """
     Raises:
@@ -86,7 +100,12 @@ def read_run(folder: Path) -> LocatedRun:
         table = parse_ply_properties(content, str(path), ("x", "y", "z", "label", "probability"))
     except (OSError, InputError) as error:
         raise ArtifactError(f"{folder} is no run that can be planned on: {error}") from error
-    stamp_ns = read_json(folder / "report.json").get("stamp_ns", 0)
+    report = read_json(folder / "report.json")
+    quality = report.get("quality")
+    if not isinstance(quality, dict):
+        quality = {"reason": "an older version located it, which did not judge"}
+    doubt = "" if quality.get("verdict") == "good" else str(quality.get("reason") or "unknown")
+    stamp_ns = report.get("stamp_ns", 0)
     stamp_ns = stamp_ns if isinstance(stamp_ns, int) else 0
     cloud = OccupancyCloud(table[:, :3], table[:, 3], table[:, 4], stamp_ns)
     surfaces = {Path(file).stem for file in manifest["files"] if file.endswith(".ply")}
@@ -101,4 +120,4 @@ def read_run(folder: Path) -> LocatedRun:
         std_mm = parse_ply_properties(content, str(path), ("std_mm",))[:, 0]
     except InputError:  # a method without uncertainty
         std_mm = None
-    return LocatedRun(cloud, meshes, std_mm)
+    return LocatedRun(cloud, meshes, std_mm, doubt)

@@ -105,6 +105,8 @@ def evaluate_scene(
         "name": name,
         "parts": parts,
         "miou": metrics.mean_iou({name: part["iou"] for name, part in parts.items()}),
+        "quality": estimate.quality,
+        "reason": estimate.reason,
         "seconds": seconds,
         "timings": estimate.report.get("timings", {}),
         "failed": f"not found: {', '.join(missing)}" if missing else None,
@@ -153,6 +155,7 @@ def summarise(entries: list[dict[str, Any]]) -> dict[str, Any]:
         summary["tre_mm"] = {**medians, "scenes": len(errors)}
     summary["miou"] = _median([entry["miou"] for entry in entries])
     summary["miou_mean"] = float(np.mean([entry["miou"] for entry in entries]))
+    summary["poor"] = sum(entry.get("quality") == "poor" for entry in entries)
     summary["failed"] = sum(entry["failed"] is not None for entry in entries)
     summary["scenes"] = len(entries)
     return summary
@@ -164,7 +167,7 @@ def summary_table(report: dict[str, Any]) -> Table:
     errors = summary.get("tre_mm")
     targets = f", target error {number(errors['mean'], 1)} mm" if errors else ""
     table = Table(
-        title=f"{summary['scenes']} scenes, {summary['failed']} failed, "
+        title=f"{summary['scenes']} scenes, {summary['failed']} failed, {summary['poor']} poor, "
         f"mIoU {summary['miou']:.3f}{targets} (medians)"
     )
     table.add_column("part")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from typing import Any
 
@@ -12,7 +13,7 @@ from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError
 from tumortrack.core.estimate import Estimate, Following
 from tumortrack.core.process import keep_small_blocks
-from tumortrack.core.types import Anatomy, SensorCloud
+from tumortrack.core.types import Anatomy, DepthFrame, SensorCloud
 from tumortrack.models.model import Model
 from tumortrack.occupancy.locator import OccupancyLocator
 from tumortrack.occupancy.model import OccupancyModel
@@ -20,6 +21,7 @@ from tumortrack.registration.locator import RegistrationLocator
 from tumortrack.registration.model import RegistrationModel
 from tumortrack.sense.cloud import CloudConfig
 from tumortrack.sense.region import RegionConfig
+from tumortrack.tracking.quality import judged
 
 _ALONE = Following()
 
@@ -46,20 +48,34 @@ class Tracker:
         """The organ in the CT (LPS, mm); None for models that know no correspondences."""
         return self._locator.anatomy_ct
 
-    def locate(self, cloud: SensorCloud, grid: int = 160, seed: int = 0) -> Estimate:
-        """Everything about one cloud; the same cloud and seed give the same answer. ``grid``:
-        voxels along the longest side of the dense volume.
+    def locate(
+        self,
+        cloud: SensorCloud,
+        grid: int = 160,
+        seed: int = 0,
+        seen: DepthFrame | SensorCloud | None = None,
+    ) -> Estimate:
+        """Everything about one cloud; the same cloud and seed give the same answer.
+
+        Args:
+            grid: voxels along the longest side of the dense volume.
+            seen: all that the camera saw, by which the estimate is judged; None: the cloud.
 
         Raises:
-            NoEstimate: too few points, no organ found in them, or they do not show this model's.
+            NoEstimate: too few points, no organ found in them, they do not show this model's, or
+                the camera sees through where it would lie.
             InputError: the cloud is in metres; the seed is negative.
         """
         if seed < 0:
             raise InputError(f"the seed is {seed}; it must be 0 or more.")
-        return self._locator.locate(cloud, grid, seed)
+        return self._judged(self._locator.locate(cloud, grid, seed), seen or cloud)
 
     def follow(
-        self, cloud: SensorCloud, last: Estimate | None = None, how: Following = _ALONE
+        self,
+        cloud: SensorCloud,
+        last: Estimate | None = None,
+        how: Following = _ALONE,
+        seen: DepthFrame | SensorCloud | None = None,
     ) -> Estimate:
         """The same, fast, for one frame of many: no volume, and a search that starts at the
         ``last`` estimate, if there is one a moment old. Models that know no motion smooth nothing.
@@ -68,7 +84,15 @@ class Tracker:
             NoEstimate: as ``locate``.
             InputError: the cloud is in metres.
         """
-        return self._locator.follow(cloud, last, how)
+        return self._judged(self._locator.follow(cloud, last, how), seen or cloud)
+
+    def _judged(self, estimate: Estimate, seen: DepthFrame | SensorCloud) -> Estimate:
+        start = time.perf_counter()
+        estimate = judged(estimate, seen)
+        seconds = estimate.report["timings"]
+        seconds["judge"] = time.perf_counter() - start
+        seconds["total"] += seconds["judge"]
+        return estimate
 
     def warm(self) -> None:
         """Load and compile what ``follow`` needs, which its first call would otherwise wait for."""
@@ -122,7 +146,7 @@ class Follower:
         last = self._recent(stamp_ns)
         return None if last is None else next(iter(last.meshes.values())).box_mm
 
-    def locate(self, cloud: SensorCloud) -> Estimate:
+    def locate(self, cloud: SensorCloud, seen: DepthFrame | SensorCloud | None = None) -> Estimate:
         """The estimate of this frame.
 
         Raises:
@@ -134,7 +158,7 @@ class Follower:
             self._scanned_ns = cloud.stamp_ns
         smoothing_s, seed = self._config.smoothing_s, self._config.seed
         how = Following(thorough=thorough, smoothing_s=smoothing_s, seed=seed)
-        self._last = self._tracker.follow(cloud, last, how)
+        self._last = self._tracker.follow(cloud, last, how, seen)
         return self._last
 
     def _recent(self, stamp_ns: int) -> Estimate | None:

@@ -1,0 +1,130 @@
+"""Whether an estimate should be relied on: the same judgement of files and of live frames."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from scipy.ndimage import distance_transform_edt
+
+from tumortrack.core.errors import NoEstimate
+from tumortrack.core.estimate import Estimate, Quality
+from tumortrack.core.types import DepthFrame, Intrinsics, Mesh, SensorCloud
+from tumortrack.sense.render import render_depth
+
+_UNSURE_MM = 3.0  # standard deviation of a tumor's middle
+# Shares of the organ's picture. Right estimates have up to 0.03 (moving and pushed, on tables, in
+# beds and cavities, among instruments and hands), an organ upside down 0.12 to 0.16, one laid on
+# the points of a hand 0.2 to 0.4, a model laid on another patient's kidney mostly 0.1 to 0.24.
+_LIMITS = 0.05, 0.09  # doubtful, impossible
+# Without a motion surfaces are rougher: where centres are 2 to 8 mm off, 0.09 to 0.15 are usual.
+_ROUGH_LIMITS = 0.1, 0.2
+_WIDTH = 212  # pixels: so coarse a picture tells
+_THROUGH_MM = 6.0  # behind the estimated surface: what is seen there lies behind, not beside
+_UNSURE = 0.6  # mean probability of a tumor's points
+_PIXEL_MM = 1.5  # of the picture that a cloud is compared in
+_MOST_PIXELS = 1024  # along a side
+# Share of the organ's picture where a cloud has no point: up to 0.03 where the whole side that the
+# camera sees was scanned (80 scenes, two kinds of deformation); more, and there is no telling what
+# lies there: an organ upside down reaches so far beyond the points that it fits.
+_UNSEEN = 0.1
+_NEAR_MM = 6.0  # of a point, or twice the points' usual distance: seen
+
+
+def judged(estimate: Estimate, seen: DepthFrame | SensorCloud) -> Estimate:
+    """The estimate with its ``quality``, ``good`` or ``poor``, and the ``reason`` in words; also in
+    its report, with the shares of the organ that are seen through and, of a cloud, not seen.
+
+    Poor is an estimate that fits the points worse than usual in validation, through which the
+    camera sees, that lies where a cloud has no points, that lacks a tumor, or that says itself that
+    a tumor's place is unsure. Good means no more than that none holds.
+
+    Args:
+        seen: all that the camera saw, not the organ's points alone, where it is known.
+
+    Raises:
+        NoEstimate: the camera sees through so much of it that the organ cannot lie there.
+    """
+    organ, unseen = next(iter(estimate.meshes.values())), 0.0
+    if isinstance(seen, DepthFrame):
+        through = seen_through(organ, seen)
+    else:
+        through, unseen = cloud_shares(organ, seen)
+        estimate.report["unseen"] = unseen
+    estimate.report["seen_through"] = through
+    doubtful, impossible = _LIMITS if estimate.motion is not None else _ROUGH_LIMITS
+    if through > impossible:
+        raise NoEstimate(
+            f"the camera sees through {100 * through:.0f} % of where the organ would lie: what "
+            "was taken for it is something else, or lies as no organ in training did."
+        )
+    reason = _doubt(estimate)
+    if through > doubtful:
+        reason = f"the camera sees through {100 * through:.0f} % of where the organ lies"
+    elif unseen > _UNSEEN and not reason:
+        reason = f"over {100 * unseen:.0f} % of where the organ lies the cloud has no points"
+    quality: Quality = "poor" if reason else "good"
+    estimate.report["quality"] = {"verdict": quality, "reason": reason}
+    return replace(estimate, quality=quality, reason=reason)
+
+
+def _doubt(estimate: Estimate) -> str:
+    """What the estimate itself says against it."""
+    cost = estimate.report.get("fit_cost")
+    if cost is not None and cost["now"] > cost["usual"]:
+        return "the organ's surface fits the points worse than in most validation scenes"
+    for name, part in estimate.report["parts"].items():
+        if not part["found"]:
+            return f"{name} was not found"
+        if part.get("center_std_mm", 0.0) > _UNSURE_MM:
+            return f"the place of {name} is unsure by {part['center_std_mm']:.1f} mm"
+        if part["probability"] is not None and part["probability"] < _UNSURE:
+            return f"the points of {name} have a probability of {part['probability']:.2f}"
+    return ""
+
+
+def seen_through(organ: Mesh, frame: DepthFrame) -> float:
+    """The share of the estimated organ's picture behind whose surface the camera sees something,
+    a table, say, which it could not see if the organ lay there. Pixels without return, and those
+    where something lies before the organ, say nothing. 0 where no pixel says anything."""
+    every = max(1, round(frame.intrinsics.width / _WIDTH))
+    seen_mm = frame.depth_mm[::every, ::every]
+    given = frame.intrinsics
+    scaled = (number / every for number in (given.fx, given.fy, given.cx, given.cy))
+    few = Intrinsics(*seen_mm.shape[::-1], *scaled)
+    organ_mm = render_depth(organ.vertices_mm, organ.faces, few).depth_mm
+    both = np.isfinite(organ_mm) & np.isfinite(seen_mm)
+    if not both.any():
+        return 0.0
+    return float((seen_mm[both] > organ_mm[both] + _THROUGH_MM).mean())
+
+
+def cloud_shares(organ: Mesh, cloud: SensorCloud) -> tuple[float, float]:
+    """By a cloud, whose camera is at its origin: the share of the points in the organ's picture
+    that lie behind its surface, and the share of the picture that has no points."""
+    nearest_mm = organ.vertices_mm[:, 2].min()
+    if nearest_mm <= _PIXEL_MM:  # round the camera
+        return 0.0, 1.0
+    focal = nearest_mm / _PIXEL_MM
+    outline = focal * organ.vertices_mm[:, :2] / organ.vertices_mm[:, 2:]
+    low, high = np.floor(outline.min(0)), np.ceil(outline.max(0))
+    width, height = (int(n) for n in high - low + 1)
+    if max(width, height) > _MOST_PIXELS:
+        return 0.0, 1.0
+    camera = Intrinsics(width, height, focal, focal, *(-low).tolist())
+    organ_mm = render_depth(organ.vertices_mm, organ.faces, camera).depth_mm
+    points_mm = cloud.points_mm[cloud.points_mm[:, 2] > 0].astype(np.float64)
+    column, row = np.rint(focal * points_mm[:, :2] / points_mm[:, 2:] - low).astype(int).T
+    within = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+    column, row, z_mm = column[within], row[within], points_mm[within, 2]
+    surface_mm = organ_mm[row, column]
+    on = np.isfinite(surface_mm)
+    if not on.any():
+        return 0.0, 1.0
+    through = float((z_mm[on] > surface_mm[on] + _THROUGH_MM).mean())
+    empty = np.ones(organ_mm.shape, bool)
+    empty[row, column] = False
+    picture = np.isfinite(organ_mm)
+    apart = np.sqrt(picture.sum() / on.sum())  # pixels between neighbours
+    far = distance_transform_edt(empty) > max(_NEAR_MM / _PIXEL_MM, 2 * apart)
+    return through, float(far[picture].mean())

@@ -1,0 +1,157 @@
+"""The same judgement of files and live frames: what makes an estimate poor, and what refuses it."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from elastic_objects import UP
+from stories import refusal, succeeded, tumortrack
+from tumortrack.core import store
+from tumortrack.core.errors import NoEstimate
+from tumortrack.core.types import DepthFrame, Mesh, SensorCloud
+from tumortrack.sense.camera import d405
+from tumortrack.sense.render import render_depth
+from tumortrack.simulate.scene import SceneRecipe, Simulator, body_for
+from tumortrack.tracking.quality import cloud_shares, judged, seen_through
+from tumortrack.tracking.tracker import Tracker
+from tumortrack.training.model import load_model
+from warp_objects import ANATOMY, slim_clinic
+
+
+@pytest.fixture(scope="module")
+def tracker(slim_model):
+    return Tracker(load_model(slim_model, "cpu"))
+
+
+@pytest.fixture(scope="module")
+def stages():
+    config = slim_clinic().scene
+    simulator = Simulator(ANATOMY, UP, config, body_for(ANATOMY, UP, config, 77))
+    return [simulator.render(SceneRecipe(5, "test", index)) for index in range(4)]
+
+
+def doubted(estimate, seen, **report):
+    """A judgement in which only what is given speaks against the estimate."""
+    parts = {
+        name: {**part, "probability": 0.9, "center_std_mm": 1.0}
+        for name, part in estimate.report["parts"].items()
+    }
+    sure = {**estimate.report, "parts": parts, "fit_cost": {"now": 1.0, "usual": 2.0}, **report}
+    found = judged(replace(estimate, report=sure), seen)
+    assert found.report["quality"] == {"verdict": found.quality, "reason": found.reason}
+    return found
+
+
+def seen_side(organ: Mesh, spacing: int = 1) -> np.ndarray:
+    """Points (n, 3) of the organ's side before the camera."""
+    camera = d405(424, 240)
+    depth_mm = render_depth(organ.vertices_mm, organ.faces, camera).depth_mm
+    rows, columns = np.nonzero(np.isfinite(depth_mm))
+    z_mm = depth_mm[rows, columns].astype(float)
+    x, y = (columns - camera.cx) / camera.fx, (rows - camera.cy) / camera.fy
+    return np.column_stack([x * z_mm, y * z_mm, z_mm])[::spacing]
+
+
+def test_a_worse_fit_is_flagged(tracker, stages):
+    cloud = stages[0].cloud
+    estimate = tracker.follow(cloud)
+    good = doubted(estimate, cloud)
+    assert (good.quality, good.reason) == ("good", "")
+    worse = doubted(estimate, cloud, fit_cost={"now": 2.1, "usual": 2.0})
+    assert worse.quality == "poor"
+    assert "worse than in most" in worse.reason
+    parts = json.loads(json.dumps(good.report["parts"]))
+    parts["tumor_1"]["center_std_mm"] = 3.4
+    assert "tumor_1 is unsure by 3.4 mm" in doubted(estimate, cloud, parts=parts).reason
+
+
+def test_an_organ_that_the_camera_sees_through_is_refused(tracker, stages):
+    estimate = tracker.follow(stages[0].cloud)
+    camera = d405(424, 240)
+    organ = estimate.meshes["kidney"]
+    alone = render_depth(organ.vertices_mm, organ.faces, camera)
+    behind_mm = np.float32(np.nanmax(alone.depth_mm) + 30)
+    table = DepthFrame(np.fmin(alone.depth_mm, behind_mm), camera)
+    assert seen_through(organ, alone) == 0
+    assert seen_through(organ, table) == 0
+    rows = np.flatnonzero(np.isfinite(alone.depth_mm).any(1))
+    for share, expected in ((0.07, "poor"), (0.3, "none")):
+        area = np.cumsum(np.isfinite(alone.depth_mm[rows]).sum(1))
+        few = rows[: np.searchsorted(area, share * area[-1])]
+        depth_mm = table.depth_mm.copy()
+        depth_mm[few] = behind_mm  # the table where the organ is said to be
+        holed = DepthFrame(depth_mm, camera)
+        assert seen_through(organ, holed) == pytest.approx(share, abs=0.02)
+        if expected == "poor":
+            found = doubted(estimate, holed)
+            assert found.quality == "poor"
+            assert found.report["seen_through"] == pytest.approx(share, abs=0.02)
+        else:
+            with pytest.raises(NoEstimate, match="sees through 3"):
+                doubted(estimate, holed)
+    hidden = table.depth_mm.copy()
+    hidden[:, :200] = behind_mm - 90  # a hand before it hides it, and proves nothing
+    assert seen_through(organ, DepthFrame(hidden, camera)) == 0
+
+
+@pytest.mark.parametrize("spacing", [1, 5, 40])
+def test_a_cloud_tells_what_lies_behind_the_organ_and_what_it_does_not_show(
+    tracker, stages, spacing
+):
+    estimate = tracker.follow(stages[0].cloud)
+    organ = estimate.meshes["kidney"]
+    points_mm = seen_side(organ, spacing)
+
+    def shares(points):
+        return cloud_shares(organ, SensorCloud(points.astype(np.float32)))
+
+    through, unseen = shares(points_mm)
+    assert through < 0.01
+    assert unseen < 0.03
+    ends = np.quantile(points_mm[:, 0], 0.25)
+    half = points_mm[points_mm[:, 0] > ends]  # a quarter is not in the cloud
+    assert shares(half)[1] == pytest.approx(0.25, abs=0.12)
+    assert doubted(estimate, SensorCloud(half.astype(np.float32))).quality == "poor"
+    beyond = points_mm * np.where(points_mm[:, :1] > ends, 1.0, 1.4)  # a table shines through
+    assert shares(beyond)[0] == pytest.approx(0.25, abs=0.08)
+    with pytest.raises(NoEstimate, match="sees through"):
+        doubted(estimate, SensorCloud(beyond.astype(np.float32)))
+    hand = np.concatenate([half, points_mm[points_mm[:, 0] <= ends] * 0.8])  # hides, proves nothing
+    assert shares(hand)[1] < 0.06
+
+
+def test_an_organ_round_the_camera_is_not_seen(tracker, stages):
+    organ = tracker.follow(stages[0].cloud).meshes["kidney"]
+    close = organ.moved(organ.vertices_mm - [0, 0, organ.vertices_mm[:, 2].mean()])
+    assert cloud_shares(close, stages[0].cloud) == (0.0, 1.0)
+
+
+def test_locate_says_its_verdict_and_plan_heeds_it(tmp_path, phantom_case, clinic_model):
+    succeeded(tumortrack("simulate", phantom_case, tmp_path / "scenes", "--scenes", 1))
+    run, cloud = tmp_path / "run", tmp_path / "scenes" / "0000" / "cloud.ply"
+    said = succeeded(tumortrack("locate", clinic_model, cloud, run, "--device", "cpu"))
+    quality = store.read_json(run / "report.json")["quality"]
+    assert quality["verdict"].upper() + ":" in said
+    manifest = store.read_json(run / store.MANIFEST)
+    for verdict, reason in (("good", ""), ("poor", "the organ hides")):
+        report = store.read_json(run / "report.json")
+        report["quality"] = {"verdict": verdict, "reason": reason}
+        store.write_json(run / "report.json", report)
+        manifest["files"]["report.json"] = store.sha256_of(run / "report.json")
+        store.write_json(run / store.MANIFEST, manifest)
+        out = tmp_path / f"plan-{verdict}"
+        command = ("plan", run, out, "--no-arms")
+        if verdict == "poor":
+            line = refusal(tumortrack(*command))
+            assert "the estimate is poor: the organ hides" in line
+            assert "--accept-poor" in line
+            assert not out.exists()
+            command = (*command, "--accept-poor")
+        said = succeeded(tumortrack(*command))
+        notes = store.read_json(out / "plan.json")["plan"]["notes"]
+        assert ("PLANNED ON A POOR ESTIMATE: the organ hides" in said) == (verdict == "poor")
+        assert any("POOR ESTIMATE" in note for note in notes) == (verdict == "poor")
