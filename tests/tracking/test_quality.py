@@ -112,12 +112,12 @@ def test_a_cloud_tells_what_lies_behind_the_organ_and_what_it_does_not_show(
     through, unseen = shares(points_mm)
     assert through < 0.01
     assert unseen < 0.03
-    ends = np.quantile(points_mm[:, 0], 0.25)
-    half = points_mm[points_mm[:, 0] > ends]  # a quarter is not in the cloud
-    assert shares(half)[1] == pytest.approx(0.25, abs=0.12)
+    ends = np.quantile(points_mm[:, 0], 0.4)
+    half = points_mm[points_mm[:, 0] > ends]  # what is near a point is not called unseen
+    assert 0.2 < shares(half)[1] < 0.4
     assert doubted(estimate, SensorCloud(half.astype(np.float32))).quality == "poor"
     beyond = points_mm * np.where(points_mm[:, :1] > ends, 1.0, 1.4)  # a table shines through
-    assert shares(beyond)[0] == pytest.approx(0.25, abs=0.08)
+    assert shares(beyond)[0] == pytest.approx(0.4, abs=0.1)
     with pytest.raises(NoEstimate, match="sees through"):
         doubted(estimate, SensorCloud(beyond.astype(np.float32)))
     hand = np.concatenate([half, points_mm[points_mm[:, 0] <= ends] * 0.8])  # hides, proves nothing
