@@ -103,7 +103,7 @@ class Plan:
         model = store.read_json(self.run_folder / "report.json").get("model")
         content = PlanFolder(
             resection, config, table_from_camera, frame_id, located.meshes, cell_used, motions,
-            str(model.get("case_sha256", "")) if isinstance(model, dict) else "",
+            str(model.get("case_sha256") or "") if isinstance(model, dict) else "",
             store.sha256_of(self.frame) if self.frame else INVENTED, cell_source,
         )  # fmt: skip
 

@@ -48,7 +48,7 @@ class Resect:
     Attributes:
         plan: folder that `plan` wrote.
         sinks: where arms, cuts and estimates go; see `track`. ur:ADDRESS is a real arm, and only
-            says what it would do unless told execute=true, which docs/resection.md says more about.
+            says what it would do unless told execute=true; docs/resection.md has what that needs.
         live: MODEL SOURCE: follow the organ meanwhile, as `track` does. Arms stand while there is
             no good estimate, and it is planned anew where the tumor has moved.
         replan_cut: plan anew even once the first sweep has begun, though the model knows only the
@@ -113,14 +113,9 @@ class Resect:
             _write_film(stored, cell, self.film)
             return
         _confirm(moving)
-        dry = bool(arms) and not moving
-        with _dry_run(dry):
-            operation = (
-                self._execute(stored, cell, config, dry)
-                if self.live is None
-                else self._follow(stored, cell, config, *self.live)
-            )
-            _say_end(operation, arms)
+        carry_out = self._execute if self.live is None else self._follow
+        with _dry_run(bool(arms) and not moving):
+            carry_out(stored, cell, config, arms)
 
     def _check_real(self, stored: PlanFolder, arms: Sequence[UrSinkConfig]) -> None:
         """Raises InputError that lists what is missing for real arms to move."""
@@ -161,9 +156,8 @@ class Resect:
         stored: PlanFolder,
         cell: ArmCell,
         config: operations.OperationConfig,
-        model: Path,
-        source: str,
-    ) -> operations.Operation:
+        arms: Sequence[UrSinkConfig],
+    ) -> None:
         """Beside the live loop: every estimate is looked at, and planned on where the tumor
         moved."""
         from concurrent.futures import ProcessPoolExecutor
@@ -176,6 +170,8 @@ class Resect:
         from tumortrack.plan.arms import procedure
         from tumortrack.plan.located import located
 
+        assert self.live is not None
+        model, source = self.live
         case = _case_of(model)
         if stored.case_sha256 and case and case != stored.case_sha256:
             raise InputError(  # it would find another patient's tumor
@@ -216,11 +212,15 @@ class Resect:
                 whole=self.whole, intrinsics=self.intrinsics, report=self.report,
                 device=self.device,
             ).run(track.Arms(operation, frames, {"plan_config": to_builtins(config)}))  # fmt: skip
-        return operation
+        _say_end(operation, arms)
 
     def _execute(
-        self, stored: PlanFolder, cell: ArmCell, config: operations.OperationConfig, dry: bool
-    ) -> operations.Operation:
+        self,
+        stored: PlanFolder,
+        cell: ArmCell,
+        config: operations.OperationConfig,
+        arms: Sequence[UrSinkConfig],
+    ) -> None:
         """Without a camera: the stored motions in real time."""
         from tumortrack import api
         from tumortrack.live.values import Controls, PublishedFrame, SinkContext, TrackingResult
@@ -250,7 +250,7 @@ class Resect:
                 track.say_failures(sinks, errors)
                 assert result.workcell is not None
                 text = result.workcell.state
-                text = "the way back" if dry and text == "home" else text
+                text = "the way back" if arms and text == "home" else text
                 text += f": {result.workcell.halted}" if result.workcell.halted else ""
                 if text != shown:
                     say(shown := text)
@@ -265,8 +265,8 @@ class Resect:
         }
         store.write_json(report, content)
         say(f"written to {report}.")
+        _say_end(operation, arms)
         track.check_closed(sinks)
-        return operation
 
 
 def _shows_the_present(source: str) -> bool:
@@ -281,7 +281,7 @@ def _shows_the_present(source: str) -> bool:
 def _case_of(model: Path) -> str:
     """The case that a model was trained for, by its digest; empty where unknown."""
     manifest = store.read_json(model / store.MANIFEST) if model.is_dir() else {}
-    return str(manifest.get("provenance", {}).get("case_sha256", ""))
+    return str(manifest.get("provenance", {}).get("case_sha256") or "")
 
 
 def _confirm(arms: Sequence[UrSinkConfig]) -> None:

@@ -125,7 +125,7 @@ def read_plan(folder: Path) -> PlanFolder:
             meshes=meshes,
             cell=data["cell"],
             motions=motions,
-            case_sha256=str(data["case_sha256"]),
+            case_sha256=str(data["case_sha256"] or ""),
             frame_source=str(data.get("frame_source", INVENTED)),
             cell_source=str(data.get("cell_source", INVENTED)),
         )
