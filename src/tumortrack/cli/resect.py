@@ -9,7 +9,7 @@ import termios
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from tumortrack.plan.values import Located
 
 _FPS = 30.0  # of an execution that no camera drives
-_NOTHING = "virtual execution of a stored plan: nothing is tracked"
+_NOTHING = "PLAYBACK of a stored plan: nothing is tracked"
 _FILM_FRAMES, _FILM_STEP_S = 120, 0.1
 _DRY_RUN = "DRY RUN: no arm is connected"
 _LIVE = ("realsense", "ros2", "ros1")  # sources that show the present
@@ -374,7 +374,7 @@ def _write_film(stored: PlanFolder, cell: ArmCell, path: Path) -> None:
                 now_s = min(now_s + _FILM_STEP_S, time_s)
                 frame = operation.act(TrackingResult(0, 0, reason=_NOTHING), now_s)
             assert frame.workcell is not None
-            yield frame.workcell
+            yield replace(frame.workcell, state=f"VIRTUAL: {frame.workcell.state}")
 
     with progress_bar("drawing", len(times_s)) as advance:
         film(frames(), as_located(stored), path, progress=advance)
