@@ -308,15 +308,15 @@ def _sink(bench: Apparatus, step: Step) -> tuple[Nodes, dict]:
 def _poke(bench: Apparatus, step: Step) -> tuple[Nodes, dict]:
     config, nodes = bench.config, bench.mesh.nodes_mm
     radius = config.poke_diameter_mm / 2
-    x, y, z = _poke_point(bench).tolist()
+    point, up = _poke_point(bench), np.array([0.0, 0.0, 1.0])
     for depth in _increments(0.0, config.poke_mm, config.load_step_mm / 2):
-        rod = Rod((x, y, z - depth), (0.0, 0.0, 1.0), radius)
+        rod = Rod(point - depth * up, up, radius)
         nodes = step(nodes, (rod,), f"rod pressed in by {depth:.1f} mm")
     load_n = -float(bench.contact.load_mn(nodes, rod)[2]) / 1000
     if load_n <= 0:
         raise TumortrackError("P1: the surface slipped past the rod; take a finer mesh (edge_mm).")
     return nodes, {
-        "poke": {"tip_mm": list(rod.tip_mm), "axis": list(rod.axis), "radius_mm": radius},
+        "poke": {"tip_mm": rod.tip_mm.tolist(), "axis": up.tolist(), "radius_mm": radius},
         "poke_load_n": load_n,
         "sunk_in_mm": bench.contact.depth_mm(nodes, (Support(), rod)),
     }
