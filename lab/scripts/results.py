@@ -35,15 +35,18 @@ from tumortrack_lab.study.bound import BOUNDS, Bound
 from tumortrack_lab.study.document import ReportWriter
 from tumortrack_lab.study.measure import Job, MeasurementStore, StudyStatus, measure
 from tumortrack_lab.study.methods import (
+    CLINIC,
+    MODELS,
     Method,
     Network,
+    Presets,
     StudyCase,
+    Trainer,
     named_folders,
     peer_method,
     phantom_case,
     study_case,
 )
-from tumortrack_lab.study.models import CLINIC, MODELS, Presets, Trainer
 from tumortrack_lab.study.report import gallery_block, section_blocks
 from tumortrack_lab.study.resection import cut_one
 from tumortrack_lab.study.trainings import make_command, run

@@ -41,8 +41,17 @@ from tumortrack_lab.study.measure import (
     measure,
     point_errors,
 )
-from tumortrack_lab.study.methods import Answer, Method, StudyCase, peer_method, study_case
-from tumortrack_lab.study.models import ABLATED, Presets, Trainer, train_config
+from tumortrack_lab.study.methods import (
+    ABLATED,
+    Answer,
+    Method,
+    Presets,
+    StudyCase,
+    Trainer,
+    peer_method,
+    study_case,
+    train_config,
+)
 from tumortrack_lab.study.plan import FULL, QUICK, SECTIONS, Methods, StudyPlan, jobs_of
 from tumortrack_lab.study.report import gallery_block, section_blocks
 from tumortrack_lab.study.tables import NOT_FOUND, by_seed, text, tidy

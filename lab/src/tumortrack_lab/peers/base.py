@@ -1,8 +1,8 @@
 """What a peer is: a method that moves the pre-operative anatomy onto one observed cloud.
 
-A peer is made for one patient (the work that does not need the cloud is done and timed there) and
-fitted to scenes one by one. Its answer is a map of points, from which organ, tumors and labels
-follow; so peers and network are compared by the same ``report.protocol.compare``.
+A peer is made for one patient and fitted to scenes one by one. Its answer is a map of points, from
+which organ, tumors and labels follow; so peers and network are compared by the same
+``report.protocol.compare``.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -46,18 +46,35 @@ class Fit:
     report: dict = field(default_factory=dict)
 
 
-@runtime_checkable
-class Peer(Protocol):
-    """A method made ready for one patient."""
+class Peer(ABC):
+    """A method made ready for one patient. Needed of it is no more than ``name``, ``prepare_s`` and
+    ``fit``; here what is done before a cloud is seen, and each fit, is timed."""
 
     name: str
+    config: Any
     prepare_s: float  # spent before the first frame
+
+    def __init__(self, anatomy_ct: Anatomy, up_lps: Direction, config: Any = None) -> None:
+        self.config = config
+        with stopwatch() as watch:
+            self._prepare(anatomy_ct, up_lps)
+        self.prepare_s = watch.seconds
 
     def fit(self, scene: Scene) -> Fit:
         """Locate the anatomy in a scene. All but the bound use ``scene.cloud`` alone. Raises
-        NoEstimate: the cloud has too little information; InputError: the cloud or the peer's
-        settings cannot be used."""
-        ...
+        NoEstimate: the cloud has too little information, such as fewer than 20 points; InputError:
+        the cloud or the peer's settings cannot be used."""
+        with stopwatch() as watch:
+            carry, report = self._fit(scene)
+        return Fit(carry, watch.seconds, report)
+
+    @abstractmethod
+    def _prepare(self, anatomy_ct: Anatomy, up_lps: Direction) -> None:
+        """What can be done before a cloud is seen."""
+
+    @abstractmethod
+    def _fit(self, scene: Scene) -> tuple[Carry, dict]:
+        """The map of a fit, and its report."""
 
 
 def rigid_carry(camera_from_ct: Transform) -> Carry:
@@ -66,9 +83,8 @@ def rigid_carry(camera_from_ct: Transform) -> Carry:
 
 
 def estimate_of(fit: Fit, anatomy_ct: Anatomy, stamp_ns: int = 0, grid: int = 160) -> Estimate:
-    """A fit of a patient's anatomy as the tracker's value: surfaces moved, labels voxelised from
-    them with ``grid`` voxels along the longest side; ``stamp_ns``: of the cloud. Raises InputError:
-    the fit carries points to NaN or infinity."""
+    """A fit as the tracker's value: surfaces moved, labels voxelised from them with ``grid`` voxels
+    along the longest side. Raises InputError: the fit carries points to NaN or infinity."""
     carried = [np.asarray(fit.carry(part.vertices_mm)) for part in anatomy_ct.parts]
     if not all(np.isfinite(points_mm).all() for points_mm in carried):
         raise InputError("the fit diverged: it carries points to NaN or infinity.")
@@ -109,44 +125,21 @@ def stopwatch() -> Iterator[Stopwatch]:
     watch.seconds = time.perf_counter() - start
 
 
-@dataclass(frozen=True, eq=False)
-class Candidate:
-    """A fit from one pose: its map, the error by which fits are compared (any unit), its report."""
+class DeformablePeer(Peer):
+    """A peer that fits from each of the best rigid poses and keeps the fit of least error. Its
+    configuration has ``rigid`` (of the pose search) and ``starts`` (how many poses)."""
 
-    carry: Carry
-    error: float
-    report: dict
+    def _prepare(self, anatomy_ct: Anatomy, up_lps: Direction) -> None:
+        self._search = PoseSearch(anatomy_ct, up_lps, self.config.rigid)
 
-
-class DeformablePeer(ABC):
-    """A peer that fits from each of the best rigid poses and keeps the fit of least error.
-
-    Its configuration has ``rigid`` (of the pose search) and ``starts`` (how many poses).
-    """
-
-    name: str
-    config: Any
-
-    def __init__(self, anatomy_ct: Anatomy, up_lps: Direction, config: Any) -> None:
-        self.config = config
-        with stopwatch() as watch:
-            self._search = PoseSearch(anatomy_ct, up_lps, config.rigid)
-            self._prepare(anatomy_ct)
-        self.prepare_s = watch.seconds
-
-    def fit(self, scene: Scene) -> Fit:
-        """See ``Peer.fit``; NoEstimate for fewer than 20 points."""
+    def _fit(self, scene: Scene) -> tuple[Carry, dict]:
         cloud = scene.cloud.points_mm.astype(float)
-        with stopwatch() as watch:
-            poses = self._search.poses(scene.cloud)[: self.config.starts]
-            fits = [self._fit_from(pose.camera_from_ct, cloud) for pose in poses]
-            best = int(np.argmin([fit.error for fit in fits]))
-        report = {"start": poses[best].start, **fits[best].report}
-        return Fit(fits[best].carry, watch.seconds, report)
-
-    def _prepare(self, anatomy_ct: Anatomy) -> None:  # noqa: B027, nothing by default
-        """What else can be done before a cloud is seen."""
+        poses = self._search.poses(scene.cloud)[: self.config.starts]
+        fits = [(pose.start, *self._fit_from(pose.camera_from_ct, cloud)) for pose in poses]
+        start, _, carry, report = min(fits, key=lambda fit: fit[1])
+        return carry, {"start": start, **report}
 
     @abstractmethod
-    def _fit_from(self, camera_from_ct: Transform, cloud: Points) -> Candidate:
-        """The fit from one pose to the cloud (camera frame, mm)."""
+    def _fit_from(self, camera_from_ct: Transform, cloud: Points) -> tuple[float, Carry, dict]:
+        """The fit from one pose to the cloud (camera frame, mm): the error by which fits are
+        compared (any unit), the map, its report."""

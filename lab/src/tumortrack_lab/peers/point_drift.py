@@ -26,7 +26,7 @@ from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.types import Anatomy
-from tumortrack_lab.peers.base import Candidate, DeformablePeer
+from tumortrack_lab.peers.base import Carry, DeformablePeer
 from tumortrack_lab.peers.pose_search import Direction, Points, RigidConfig, Transform, trimmed_mean
 
 _KEPT = 0.9  # of the distances
@@ -34,40 +34,29 @@ _PATIENCE_S = 120.0
 
 
 class CpdConfig(Config, frozen=True):
-    """Settings of CPD, lengths in mm.
-
-    ``kernel_mm`` is the paper's beta, the distance over which points move together; ``smooth``
-    its lambda, the weight of smoothness (of points scaled to a spread of 1, as the paper scales
-    them); ``outliers`` its w. ``first_sigma_mm`` starts the annealing at the error that a rigid
-    pose leaves, instead of at the size of the cloud.
-    """
+    """Settings of CPD, lengths in mm; the paper's name of each in brackets."""
 
     rigid: RigidConfig = RigidConfig()
     starts: int = 2  # the best rigid poses, each fitted
-    kernel_mm: float = 50.0
-    smooth: float = 1000.0
-    outliers: float = 0.1
-    first_sigma_mm: float = 6.0
+    kernel_mm: float = 50.0  # distance over which points move together (beta)
+    smooth: float = 1000.0  # weight of smoothness, of points scaled to a spread of 1 (lambda)
+    outliers: float = 0.1  # (w)
+    first_sigma_mm: float = 6.0  # annealing starts at the error that a rigid pose leaves
     iterations: int = 60
     points: int = 400  # of the visible surface
 
 
 class BcpdConfig(Config, frozen=True):
-    """Settings of BCPD under the names of its options; lengths in units of the cloud's spread
-    (the root mean square of its coordinates about their mean).
+    """Settings of BCPD, the paper's name of each in brackets; lengths in units of the cloud's
+    spread (the root mean square of its coordinates about their mean)."""
 
-    ``program`` is the path of the built binary. ``kernel`` (beta) is the reach of the Gaussian
-    over which points move together; ``length`` (lambda): the expected displacement is
-    sqrt(3 / lambda); ``outliers`` (omega); ``near`` (gamma): small where the start is good.
-    """
-
-    program: str = ""
+    program: str = ""  # path of the built binary
     rigid: RigidConfig = RigidConfig()
     starts: int = 3  # the best rigid poses, each fitted
-    kernel: float = 1.2
-    length: float = 50.0
-    outliers: float = 0.1
-    near: float = 0.1
+    kernel: float = 1.2  # reach of the Gaussian over which points move together (beta)
+    length: float = 50.0  # the expected displacement is sqrt(3 / length) (lambda)
+    outliers: float = 0.1  # (omega)
+    near: float = 0.1  # small where the start is good (gamma)
     iterations: int = 300
     points: int = 700  # of the visible surface
     ridge: float = 1e-2  # of the interpolation of displacements into the depth
@@ -85,7 +74,6 @@ class Drift:
     shift_mm: Float64[np.ndarray, " 3"] | None = None
 
     def __call__(self, at_mm: Points) -> Points:
-        """The mapped points."""
         moved = at_mm + _gaussian(at_mm, self.points_mm, self.kernel_mm) @ self.weights
         return moved if self.matrix is None else moved @ self.matrix.T + self.shift_mm
 
@@ -93,7 +81,7 @@ class Drift:
 class _PointDrift(DeformablePeer):
     config: CpdConfig | BcpdConfig
 
-    def _fit_from(self, camera_from_ct: Transform, cloud: Points) -> Candidate:
+    def _fit_from(self, camera_from_ct: Transform, cloud: Points) -> tuple[float, Carry, dict]:
         source = self._search.seen(cloud, camera_from_ct)
         source = source[:: max(1, len(source) // self.config.points)]
         drift, iterations = self._drift(source, cloud)
@@ -102,9 +90,7 @@ class _PointDrift(DeformablePeer):
         both = (moved, cloud), (cloud, moved)
         error_mm = sum(trimmed_mean(cKDTree(to).query(at)[0], _KEPT) for to, at in both) / 2
         report = {"iterations": iterations, "residual_mm": error_mm}
-        return Candidate(
-            lambda points_ct: drift(transform_points(camera_from_ct, points_ct)), error_mm, report
-        )
+        return error_mm, lambda ct: drift(transform_points(camera_from_ct, ct)), report
 
     @abstractmethod
     def _drift(self, source: Points, cloud: Points) -> tuple[Drift, int]:
@@ -112,8 +98,6 @@ class _PointDrift(DeformablePeer):
 
 
 class Cpd(_PointDrift):
-    """Coherent point drift as a peer."""
-
     name = "cpd"
     config: CpdConfig
 
@@ -141,14 +125,14 @@ class Bcpd(_PointDrift):
     name = "bcpd"
     config: BcpdConfig
 
-    def __init__(self, anatomy_ct: Anatomy, up_lps: Direction, config: BcpdConfig) -> None:
-        if not Path(config.program).is_file():
+    def _prepare(self, anatomy_ct: Anatomy, up_lps: Direction) -> None:
+        if not Path(self.config.program).is_file():
             raise InputError(
-                f"BCPD's program {config.program!r} does not exist. Get the source from "
+                f"BCPD's program {self.config.program!r} does not exist. Get the source from "
                 "https://github.com/ohirose/bcpd, install OpenBLAS, run make, and give the path "
                 "of the binary that it builds."
             )
-        super().__init__(anatomy_ct, up_lps, config)
+        super()._prepare(anatomy_ct, up_lps)
 
     def _drift(self, source: Points, cloud: Points) -> tuple[Drift, int]:
         """The program's displacements v, interpolated by its own Gaussian process (Hirose 2021b,

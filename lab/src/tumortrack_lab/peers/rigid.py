@@ -9,59 +9,46 @@ from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import rigid, transform_points
 from tumortrack.core.types import Anatomy, Mesh
 from tumortrack.simulate.scene_folder import Scene
-from tumortrack_lab.peers.base import Fit, rigid_carry, stopwatch
-from tumortrack_lab.peers.pose_search import Direction, Points, PoseSearch, RigidConfig, Transform
+from tumortrack_lab.peers.base import Carry, Peer, rigid_carry
+from tumortrack_lab.peers.pose_search import Direction, Points, PoseSearch, Transform
 
 # Barycentric points of a tetrahedron that integrate quadratics exactly (Keast 1986, 4 points).
 _NEAR, _FAR = 0.1381966011250105, 0.5854101966249685
 
 
-class Rigid:
-    """The best rigid pose as a peer."""
+class Rigid(Peer):
+    """The pose of least error as a peer."""
 
-    def __init__(self, anatomy_ct: Anatomy, up_lps: Direction, config: RigidConfig) -> None:
-        self.name = "rigid" if config.orientation == "facing" else "rigid_any_rotation"
-        with stopwatch() as watch:
-            self._search = PoseSearch(anatomy_ct, up_lps, config)
-        self.prepare_s = watch.seconds
+    def _prepare(self, anatomy_ct: Anatomy, up_lps: Direction) -> None:
+        self.name = "rigid" if self.config.orientation == "facing" else "rigid_any_rotation"
+        self._search = PoseSearch(anatomy_ct, up_lps, self.config)
 
-    def fit(self, scene: Scene) -> Fit:
-        """The pose of least error; NoEstimate for fewer than 20 points."""
-        with stopwatch() as watch:
-            best = self._search.poses(scene.cloud)[0]
+    def _fit(self, scene: Scene) -> tuple[Carry, dict]:
+        best = self._search.poses(scene.cloud)[0]
         report = {"start": best.start, "residual_mm": best.error_mm}
-        return Fit(rigid_carry(best.camera_from_ct), watch.seconds, report)
+        return rigid_carry(best.camera_from_ct), report
 
 
-class RigidBound:
+class RigidBound(Peer):
     """The best rigid pose there is, found with the truth in hand: least squares over the organ's
-    whole volume, from the truth's own correspondence.
-
-    Needs scenes whose meshes keep the case's triangles (ours do). Not a method anyone could use;
-    no rigid method can beat it in that norm.
-    """
+    whole volume, from the truth's own correspondence. Not a method anyone could use; no rigid
+    method can beat it in that norm. Errors as of ``matched_vertices``."""
 
     name = "rigid_bound"
-    prepare_s = 0.0
 
-    def __init__(self, anatomy_ct: Anatomy, up_lps: Direction) -> None:
+    def _prepare(self, anatomy_ct: Anatomy, up_lps: Direction) -> None:
         self._organ = anatomy_ct.organ
 
-    def fit(self, scene: Scene) -> Fit:
-        """The pose, from ``scene.reference``; errors as of ``matched_vertices``."""
+    def _fit(self, scene: Scene) -> tuple[Carry, dict]:
         reference = self._organ.moved(matched_vertices(self._organ, scene.reference.organ))
-        with stopwatch() as watch:
-            camera_from_ct, residual_mm = fit_over_volume(self._organ, reference)
-        report = {"residual_mm": residual_mm, "start": "truth"}
-        return Fit(rigid_carry(camera_from_ct), watch.seconds, report)
+        camera_from_ct, residual_mm = fit_over_volume(self._organ, reference)
+        return rigid_carry(camera_from_ct), {"residual_mm": residual_mm, "start": "truth"}
 
 
 def matched_vertices(rest: Mesh, moved: Mesh) -> Points:
-    """Where each vertex of ``rest`` lies in ``moved``, the same triangles in the same order.
-
-    Meshes lose the order of their vertices when they are read (equal ones are merged), but never
-    that of their triangles. Raises InputError: ``moved`` has other triangles.
-    """
+    """Where each vertex of ``rest`` lies in ``moved``, the same triangles in the same order: read
+    meshes lose the order of their vertices (equal ones are merged), but never that of their
+    triangles. Raises InputError: ``moved`` has other triangles."""
     vertex = np.full(len(rest.vertices_mm), -1)
     same = rest.faces.shape == moved.faces.shape
     if same:
@@ -77,12 +64,8 @@ def matched_vertices(rest: Mesh, moved: Mesh) -> Points:
 
 def fit_over_volume(source: Mesh, target: Mesh) -> tuple[Transform, float]:
     """``target_from_source`` with the least squared displacement over the source's volume, and the
-    root mean square displacement that it leaves, mm.
-
-    The integral over the volume is exact for a displacement that is linear in each tetrahedron
-    (reference point, triangle). The reference point matters only through its own displacement, for
-    which the vertices' mean is taken.
-    """
+    root mean square displacement that it leaves, mm. Exact for a displacement that is linear in
+    each tetrahedron of a triangle and the vertices' mean."""
     from_mm, weights = _volume_points(source, source)
     to_mm, _ = _volume_points(source, target)
     transform = kabsch(from_mm, to_mm, weights)

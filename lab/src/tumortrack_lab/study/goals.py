@@ -15,7 +15,7 @@ from typing import get_args
 import pandas as pd
 
 from tumortrack_lab.study.document import table
-from tumortrack_lab.study.models import CLINIC
+from tumortrack_lab.study.methods import CLINIC
 from tumortrack_lab.study.paper import Kind, Lie, hausdorff
 from tumortrack_lab.study.tables import EMPTY, NOT_FOUND, NOTHING, label_of, names, scenes, tumors
 

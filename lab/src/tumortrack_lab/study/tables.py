@@ -15,7 +15,7 @@ import pandas as pd
 
 from tumortrack_lab.study import paper
 from tumortrack_lab.study.document import table
-from tumortrack_lab.study.models import CLINIC
+from tumortrack_lab.study.methods import CLINIC
 from tumortrack_lab.twin.faults import KINDS, clean_level, parse
 
 NOT_FOUND, NOTHING, EMPTY = "not found", "–", ""
