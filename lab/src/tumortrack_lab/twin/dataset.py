@@ -13,7 +13,6 @@ import hashlib
 import json
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -65,12 +64,8 @@ def make_scenes(
     views: Sequence[viewing.View] = VIEWS,
     report: Callable[[TwinStatus], None] = lambda status: None,
 ) -> list[Path]:
-    """The scenes of these variants in these views; those that are there already stay.
-
-    A state is solved once and kept; a run that is killed loses the state or scene at work.
-
-    Returns:
-        The scenes' folders.
+    """The scenes' folders, of these variants in these views; those that are there already stay. A
+    state is solved once and kept; a run that is killed loses the state or scene at work.
 
     Raises InputError: no case, an unknown variant or view, ``out`` holds something else, or scenes
     made from another case, seed or configuration; ArtifactError: a kept state is damaged;
@@ -165,15 +160,14 @@ def _write(
 
 
 class StateCache:
-    """The states of one case on disk, one file each, so that none is solved twice; the apparatus
-    is built when the first one is needed."""
+    """The states of one case on disk, one file each, so that none is solved twice."""
 
     def __init__(self, folder: Path, run: TwinRun, case: Case, targets: InnerPoints) -> None:
         self._folder, self._run, self._case, self._targets = folder, run, case, targets
+        self._bench: Any = None  # built when the first state is solved
         self._parts = dict(zip(case.anatomy.names, case.anatomy.parts, strict=True))
 
     def has(self, name: str) -> bool:
-        """Is it solved already?"""
         return self._path(name).exists()
 
     def get(self, name: str, say: Callable[[str], None]) -> EquilibriumState:
@@ -185,27 +179,22 @@ class StateCache:
         targets_mm, bench_from_ct = tensors["targets"], tensors["bench_from_ct"]
         return EquilibriumState(name, Anatomy(parts), targets_mm, bench_from_ct, report)
 
-    @cached_property
-    def _bench(self) -> Any:
-        return self._run.build(self._case.anatomy, self._case.up_lps, self._run.bench)
-
     def _solve(self, name: str, say: Callable[[str], None]) -> None:
         from safetensors.numpy import save
 
-        if "_bench" not in self.__dict__:
+        if self._bench is None:
             say("bench: filling the organ with tetrahedra")
+            self._bench = self._run.build(self._case.anatomy, self._case.up_lps, self._run.bench)
         bench, warm = self._bench, None
         mesh = hashlib.sha256(np.ascontiguousarray(bench.mesh.nodes_mm).tobytes()).hexdigest()
         if (before := _GOES_ON_FROM.get(name)) and self.has(before):
             tensors, report, of = self._read(before)
             warm = State(before, tensors["nodes"], report) if of == mesh else None
         solved = self._run.solve(bench, name, warm, lambda line: say(f"{name}: {line}"))
-        tensors = {
-            **{key: bench.carry(solved, part.vertices_mm) for key, part in self._parts.items()},
-            "targets": bench.carry(solved, self._targets.points_ct),
-            "bench_from_ct": bench.bench_from_ct,
-            "nodes": solved.nodes_mm,
-        }
+        points = {key: part.vertices_mm for key, part in self._parts.items()}
+        points["targets"] = self._targets.points_ct
+        tensors = {key: bench.carry(solved, some) for key, some in points.items()}
+        tensors |= {"bench_from_ct": bench.bench_from_ct, "nodes": solved.nodes_mm}
         metadata = {"report": json.dumps(solved.report, allow_nan=False), "mesh": mesh}
         contiguous = {key: np.ascontiguousarray(array) for key, array in tensors.items()}
         store.write_atomically(self._path(name), save(contiguous, metadata))

@@ -51,8 +51,7 @@ Obstacles = tuple[ContactSurface, ...]
 
 @dataclass(frozen=True, eq=False)
 class Support:
-    """Everything below z = height: a plane, or packing that bears each point of a surface at the
-    height where it lay (one height a point)."""
+    """Everything below z = height: a plane, or packing (one height a point)."""
 
     height_mm: float | Distances = 0.0
 
@@ -150,12 +149,9 @@ class Contact:
 
 @dataclass(frozen=True, eq=False)
 class Hold:
-    """Keeps the body from sliding sideways and from rolling, without deforming it.
-
-    The mean sideways displacement and the mean rotation are held by stiff springs whose forces
-    are spread over the whole mass as a rigid motion is (inertia relief): packing in the operating
-    room, the phantom's bed in the laboratory. Without it an organ rolls to its next stable side.
-    """
+    """Keeps the body from sliding sideways and from rolling to its next stable side, without
+    deforming it: stiff springs hold the mean sideways displacement and the mean rotation, their
+    forces spread over the whole mass as a rigid motion is (inertia relief)."""
 
     rest_mm: Nodes
     share: Float64[np.ndarray, " n"]  # of the volume at each node
@@ -177,13 +173,10 @@ class Hold:
 
 @dataclass(frozen=True, eq=False)
 class EquilibriumProblem:
-    """A solid among obstacles under its weight. Units: mm, kPa, mN, uJ.
-
-    ``contacts``: surfaces (of a stiffness each) and the obstacles that push them back.
-    """
+    """A solid among obstacles under its weight. Units: mm, kPa, mN, uJ."""
 
     solid: NeoHookeanSolid
-    contacts: tuple[tuple[Contact, Obstacles], ...]
+    contacts: tuple[tuple[Contact, Obstacles], ...]  # surfaces, and what pushes them back
     weight_mn: Float64[np.ndarray, " n"]  # along -z
     hold: Hold | None = None
 

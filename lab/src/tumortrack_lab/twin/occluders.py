@@ -96,18 +96,14 @@ def add_background(
     frame: DepthFrame, share: float, support_mm: float, rng: Generator
 ) -> tuple[DepthFrame, float]:
     """The frame with background in pixels without return: ``share`` of all returns, to the nearest
-    pixel; and what share that is. ``support_mm``: depth of the support plane.
-
-    Two thirds are the top of a lump of fat that lies on the support beside the organ, one third is
-    the end of an instrument there, which a segmentation has left. Both are nearer than the support,
-    so a crop by depth keeps them. What the organ covers stays covered. Raises InputError: the image
-    has no room beside the organ.
-    """
+    pixel; and what share that is. ``support_mm``: depth of the support plane. Two thirds are the
+    top of a lump of fat that lies on the support beside the organ, one third is the end of an
+    instrument there; a crop by depth keeps both. Raises InputError: no room beside the organ."""
     organ = _returns(frame)
     count = round(share / (1 - share) * organ)
-    lump, out = round(_LUMP_SHARE * count), frame
-    for solids, pixels, nearest in ((_lumps, lump, True), (_tips, count - lump, False)):
-        out = _filled(out, solids(out, support_mm, rng), pixels, support_mm, nearest)
+    lump = round(_LUMP_SHARE * count)
+    out = _filled(frame, _lumps(frame, support_mm, rng), lump, support_mm, nearest=True)
+    out = _filled(out, _tips(out, support_mm, rng), count - lump, support_mm, nearest=False)
     got = _returns(out) - organ
     return out, got / (got + organ)
 
@@ -176,12 +172,9 @@ def hide_share(
     frame: DepthFrame, share: float, shaft_radius_mm: float, rng: Generator
 ) -> DepthFrame:
     """The frame with that share of its returns hidden by a shaft, a lump of fat and the edge of a
-    drape, one after another.
-
-    The occluders keep their places and directions from one share to another with the same
-    generator; only how far they reach differs. They add up: what one hides the next need not.
-    Raises InputError: a share outside 0..0.9, or a frame without returns.
-    """
+    drape, one after another. With the same generator they keep their places and directions from
+    one share to another; only how far they reach differs. Raises InputError: a share outside
+    0..0.9, or a frame without returns."""
     if not 0 <= share <= LARGEST_SHARE:
         raise InputError(f"a share of {share:g} cannot be hidden; allowed: 0 to {LARGEST_SHARE:g}.")
     total, out = _returns(frame), frame
