@@ -37,8 +37,8 @@ _TRAINING_MIN = {"cpu": 15.0, "H100": 2.0}  # by device
 
 @dataclass(frozen=True)
 class StudyGoal:
-    """One figure: how it is read from one method's rows (infinite: not found; NaN: nothing was
-    measured), and what it should be at most (or at least, ``high``)."""
+    """One figure: how it is read from one method's rows (infinite: not found; NaN: not measured),
+    and what it should be at most (or at least, ``high``)."""
 
     text: str
     read: Callable[[pd.DataFrame], float]
@@ -47,7 +47,6 @@ class StudyGoal:
     high: bool = False
 
     def value(self, frame: pd.DataFrame) -> str:
-        """The number, to two digits."""
         value = self.read(frame)
         if not math.isfinite(value):
             return NOTHING if math.isnan(value) else NOT_FOUND
@@ -142,7 +141,6 @@ def _miou(frame: pd.DataFrame) -> float:
 
 
 def _targets(frame: pd.DataFrame) -> pd.Series:
-    """None where the method carries no points."""
     return _per_scene(scenes(frame if frame.carries.any() else frame[:0]), "target_mm")
 
 

@@ -80,7 +80,7 @@ def study_case(name: str, folder: Path, scenes: Path, is_paper: bool = False) ->
 
 
 def phantom_case(folder: Path, parameters: PhantomParameters) -> Path:
-    """Write a phantom's case folder from its exact labels; one that is there stays."""
+    """Write a phantom's case folder; one that is there stays."""
     if not folder.exists():
         labels = phantom_labels(parameters, _VOXEL_MM)
         case = Case(surfaces(labels)[0], labels, _UP_LPS, {"kind": "phantom"})
@@ -90,8 +90,7 @@ def phantom_case(folder: Path, parameters: PhantomParameters) -> Path:
 
 
 def named_folders(texts: Iterable[str], taken: Iterable[str]) -> dict[str, Path]:
-    """Folders by name, of options that read NAME=FOLDER; InputError for a name that is none, or
-    stands twice."""
+    """Folders by name, of options NAME=FOLDER; InputError for a name that is none, or double."""
     folders: dict[str, Path] = {}
     for text in texts:
         name, _, folder = text.partition("=")
@@ -133,7 +132,6 @@ class Method(ABC):
 
 
 def answer_of(fit: Fit, anatomy_ct: Anatomy, scene: Scene, grid: int) -> Answer:
-    """The answer of a method that carries the CT's points."""
     estimate = estimate_of(fit, anatomy_ct, scene.cloud.stamp_ns, grid)
     return Answer(replace(estimate, motion=OneWay(fit.carry)), fit.seconds)
 
@@ -262,25 +260,12 @@ def peer_method(name: str, case: StudyCase, bcpd: Path | None = None) -> PeerMet
 
 
 class Presets(NamedTuple):
-    """Those that the study's models are made of."""
-
     quick: Preset
     clinic: Preset
 
 
 def train_config(name: str, case: StudyCase, presets: Presets) -> TrainConfig:
-    """How the model of a name is trained.
-
-    - M_lim, M_full: the preset ``quick`` as it is; ``clinic``: that preset, limited rotations.
-    - configuration_n: M_lim with the paper's drags n as the only deformation.
-    - clinic_drags: ``clinic`` with the paper's drags 3 and 6 in 10 of 11 scenes; the others stay
-      elastic, for the body's modes and its library of states must be known all the same.
-    - clinic_clean: ``clinic`` without occlusion, background and calibration errors.
-    - clinic_pointnet: ``clinic`` with the encoder of ``quick``.
-    - quick_elastic: M_lim's network on the scenes of ``clinic``.
-
-    Raises InputError: no such model.
-    """
+    """How the model of a name is trained. Raises InputError: no such model."""
     quick = presets.quick(case.anatomy_ct, MODELS.get(name, "limited"))
     if name in MODELS:
         return quick
@@ -292,6 +277,7 @@ def train_config(name: str, case: StudyCase, presets: Presets) -> TrainConfig:
         case "clinic":
             return own
         case "clinic_drags":
+            # Some stay elastic: the body's modes and its library of states must be known.
             both = (drags[3], drags[6]) * (_DRAGS // 2)
             return _with_scene(own, deform=(*both, *own.scene.deform))
         case "clinic_clean":
@@ -313,10 +299,8 @@ def _with_scene(config: TrainConfig, **fields: object) -> TrainConfig:
 
 @dataclass(frozen=True)
 class Trainer:
-    """Trains what is not trained yet; a training that was killed is taken up again.
-
-    Steps decide the end, not minutes: a loaded machine gives the same model, only later.
-    """
+    """Trains what is not trained yet, or was killed. Steps decide the end, not minutes: a loaded
+    machine gives the same model, only later."""
 
     folder: Path
     presets: Presets

@@ -93,12 +93,11 @@ PLANNERS = tuple(Planner(method=m, sigmas=s) for m in ("published", "margin") fo
 class Truth(Method):
     """Answers what is so: the bound of every planner."""
 
-    name: str = TRUTH
     prepare_s: float | None = None
 
     @property
     def identity(self) -> dict:
-        return {"kind": "bound", "name": self.name, "tumortrack": tumortrack.__version__}
+        return {"kind": "bound", "name": TRUTH, "tumortrack": tumortrack.__version__}
 
     def locate(self, scene: Scene, grid: int) -> Answer:
         still = Fit(lambda points: points, 0.0)
@@ -123,8 +122,7 @@ def scattered(estimate: Estimate) -> Estimate:
 
 @cache
 def cutting() -> dict:
-    """What else decides a measurement whose estimate is planned on and cut: such are apart from
-    those of a method's accuracy."""
+    """What else decides a measurement whose estimate is planned on and cut."""
     planning = (Path(tumortrack.__file__).parent / "plan").glob("*.py")
     code = code_sha256([*planning, Path(tumortrack_lab.cut.__file__)])
     planners = [to_builtins(planner) for planner in PLANNERS]
@@ -132,8 +130,8 @@ def cutting() -> dict:
 
 
 def cut_one(job: Job) -> dict:
-    """One measurement: ``plans`` by tumor and planner; what the cut did, or why there is none.
-    Raises InputError: a scene that does not say where the table is."""
+    """One measurement: ``plans`` by tumor and planner. Raises InputError: a scene that does not say
+    where the table is."""
     scene = read_scene(job.scene)
     if "camera_from_bench" not in scene.meta:
         raise InputError(
@@ -175,7 +173,6 @@ def _planned_and_cut(truth: Anatomy, found: Located, planner: Planner, tumor: st
 
 @cache
 def exophytic_tumors(case: StudyCase) -> tuple[str, ...]:
-    """Parts' names, by the rule of the tables of accuracy."""
     lies = tumor_lies(case.anatomy_ct)
     return tuple(name for name, lie in lies.items() if lie.kind == "exophytic")
 
@@ -228,12 +225,10 @@ def _rows(frame: pd.DataFrame) -> list[list[str]]:
 
 
 def _label(planner: str) -> str:
-    """For readers."""
     return planner.replace("published", "the paper's", 1).replace("margin", "ours", 1)
 
 
 def _texts(plans: pd.DataFrame) -> list[str]:
-    """One planner on the estimates of one method."""
     made = plans[plans.refused.isna()]
     free = made[made.detached.astype(bool)]
     removed = 100 * made.removed_share
