@@ -1,6 +1,6 @@
-"""What a peer is: a method that moves the pre-operative anatomy onto one observed cloud.
+"""What a peer is, and the rigid ones.
 
-A peer is made for one patient and fitted to scenes one by one. Its answer is a map of points, from
+A peer moves the pre-operative anatomy onto one observed cloud: it is made for one patient and fitted to scenes one by one. Its answer is a map of points, from
 which organ, tumors and labels follow; so peers and network are compared by the same
 ``report.protocol.compare``.
 """
@@ -12,21 +12,24 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Float64
 
 import tumortrack
 from tumortrack.core.errors import InputError
 from tumortrack.core.estimate import Estimate
-from tumortrack.core.geometry import transform_points
-from tumortrack.core.types import Anatomy, CameraLabels, OccupancyCloud
+from tumortrack.core.geometry import rigid, transform_points
+from tumortrack.core.types import Anatomy, CameraLabels, Mesh, OccupancyCloud
 from tumortrack.imaging.raster import label_grid
 from tumortrack.models.report import describe_parts, grid_over
 from tumortrack.simulate.scene_folder import Scene
 from tumortrack_lab.peers.pose_search import Direction, Points, PoseSearch, Transform
 
+# Barycentric points of a tetrahedron that integrate quadratics exactly (Keast 1986, 4 points).
+_NEAR, _FAR = 0.1381966011250105, 0.5854101966249685
 CLOUD_POINTS = 40_000  # of an estimate, as many as the tracker asks for
 
 Carry = Callable[[Float[np.ndarray, "n 3"]], Float[np.ndarray, "n 3"]]
@@ -112,15 +115,10 @@ def estimate_of(fit: Fit, anatomy_ct: Anatomy, stamp_ns: int = 0, grid: int = 16
     return Estimate(cloud, CameraLabels(labels, camera_from_index), meshes, report)
 
 
-class Stopwatch:
-    """Seconds spent in a ``with`` block."""
-
-    seconds = 0.0
-
-
 @contextmanager
-def stopwatch() -> Iterator[Stopwatch]:
-    watch, start = Stopwatch(), time.perf_counter()
+def stopwatch() -> Iterator[SimpleNamespace]:
+    """Its ``seconds`` are those spent in the ``with`` block."""
+    watch, start = SimpleNamespace(), time.perf_counter()
     yield watch
     watch.seconds = time.perf_counter() - start
 
@@ -143,3 +141,83 @@ class DeformablePeer(Peer):
     def _fit_from(self, camera_from_ct: Transform, cloud: Points) -> tuple[float, Carry, dict]:
         """The fit from one pose to the cloud (camera frame, mm): the error by which fits are
         compared (any unit), the map, its report."""
+
+
+class Rigid(Peer):
+    """The pose of least error as a peer."""
+
+    def _prepare(self, anatomy_ct: Anatomy, up_lps: Direction) -> None:
+        self.name = "rigid" if self.config.orientation == "facing" else "rigid_any_rotation"
+        self._search = PoseSearch(anatomy_ct, up_lps, self.config)
+
+    def _fit(self, scene: Scene) -> tuple[Carry, dict]:
+        best = self._search.poses(scene.cloud)[0]
+        report = {"start": best.start, "residual_mm": best.error_mm}
+        return rigid_carry(best.camera_from_ct), report
+
+
+class RigidBound(Peer):
+    """The best rigid pose there is, found with the truth in hand: least squares over the organ's
+    whole volume, from the truth's own correspondence. Not a method anyone could use; no rigid
+    method can beat it in that norm. Errors as of ``matched_vertices``."""
+
+    name = "rigid_bound"
+
+    def _prepare(self, anatomy_ct: Anatomy, up_lps: Direction) -> None:
+        self._organ = anatomy_ct.organ
+
+    def _fit(self, scene: Scene) -> tuple[Carry, dict]:
+        reference = self._organ.moved(matched_vertices(self._organ, scene.reference.organ))
+        camera_from_ct, residual_mm = fit_over_volume(self._organ, reference)
+        return rigid_carry(camera_from_ct), {"residual_mm": residual_mm, "start": "truth"}
+
+
+def matched_vertices(rest: Mesh, moved: Mesh) -> Points:
+    """Where each vertex of ``rest`` lies in ``moved``, the same triangles in the same order: read
+    meshes lose the order of their vertices (equal ones are merged), but never that of their
+    triangles. Raises InputError: ``moved`` has other triangles."""
+    vertex = np.full(len(rest.vertices_mm), -1)
+    same = rest.faces.shape == moved.faces.shape
+    if same:
+        vertex[rest.faces.reshape(-1)] = moved.faces.reshape(-1)
+        same = bool((vertex[rest.faces] == moved.faces).all() and (vertex >= 0).all())
+    if not same:
+        raise InputError(
+            "the rigid bound needs a scene made from this case: its kidney.ply must have the "
+            "same triangles as the case's. Make scenes with this case, or leave the bound out."
+        )
+    return moved.vertices_mm[vertex]
+
+
+def fit_over_volume(source: Mesh, target: Mesh) -> tuple[Transform, float]:
+    """``target_from_source`` with the least squared displacement over the source's volume, and the
+    root mean square displacement that it leaves, mm. Exact for a displacement that is linear in
+    each tetrahedron of a triangle and the vertices' mean."""
+    from_mm, weights = _volume_points(source, source)
+    to_mm, _ = _volume_points(source, target)
+    transform = kabsch(from_mm, to_mm, weights)
+    left2 = ((transform_points(transform, from_mm) - to_mm) ** 2).sum(1)
+    return transform, float(np.sqrt(max(np.average(left2, weights=weights), 0.0)))
+
+
+def _volume_points(rest: Mesh, moved: Mesh) -> tuple[Points, Float64[np.ndarray, " n"]]:
+    """Quadrature points carried along with ``moved``; their signed weights from ``rest``."""
+    corners = rest.vertices_mm[rest.faces] - rest.vertices_mm.mean(0)
+    volume = np.einsum("ij,ij->i", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) / 6
+    apex = np.broadcast_to(moved.vertices_mm.mean(0), (len(volume), 1, 3))
+    tetrahedra = np.concatenate([apex, moved.vertices_mm[moved.faces]], axis=1)
+    shares = np.full((4, 4), _NEAR) + (_FAR - _NEAR) * np.eye(4)
+    points = np.einsum("qc,tcx->tqx", shares, tetrahedra).reshape(-1, 3)
+    return points, np.repeat(volume / 4, 4)
+
+
+def kabsch(source_mm: Points, target_mm: Points, weights: Float[np.ndarray, " n"]) -> Transform:
+    """The rigid transform that carries source points to target points best, in weighted squares
+    (Kabsch 1976, doi 10.1107/S0567739476001873)."""
+    share = weights / weights.sum()
+    source_centre, target_centre = share @ source_mm, share @ target_mm
+    spread = (source_mm - source_centre).T @ (share[:, None] * (target_mm - target_centre))
+    u, _, vt = np.linalg.svd(spread)
+    mirror = np.diag([1.0, 1.0, np.sign(np.linalg.det(vt.T @ u.T))])
+    rotation = vt.T @ mirror @ u.T
+    return rigid(rotation, target_centre - rotation @ source_centre)

@@ -13,11 +13,10 @@ from tumortrack.core import store
 from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError
 from tumortrack.core.types import Anatomy
-from tumortrack_lab.peers.base import Peer
+from tumortrack_lab.peers.base import Peer, Rigid, RigidBound
 from tumortrack_lab.peers.elastic import ElasticPeer, ElasticPeerConfig
 from tumortrack_lab.peers.point_drift import Bcpd, BcpdConfig, Cpd, CpdConfig
 from tumortrack_lab.peers.pose_search import Direction, RigidConfig
-from tumortrack_lab.peers.rigid import Rigid, RigidBound
 
 GROUP = "tumortrack.peers"
 

@@ -14,7 +14,6 @@ from __future__ import annotations
 import subprocess
 import tempfile
 from abc import abstractmethod
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -62,22 +61,6 @@ class BcpdConfig(Config, frozen=True):
     ridge: float = 1e-2  # of the interpolation of displacements into the depth
 
 
-@dataclass(frozen=True, eq=False)
-class Drift:
-    """Displacements that drift coherently, v(z) = sum over n of G(z, y_n) w_n, and a similarity
-    after them; camera frame, mm."""
-
-    points_mm: Float64[np.ndarray, "n 3"]
-    weights: Float64[np.ndarray, "n 3"]
-    kernel_mm: float
-    matrix: Float64[np.ndarray, "3 3"] | None = None  # none: displacements alone
-    shift_mm: Float64[np.ndarray, " 3"] | None = None
-
-    def __call__(self, at_mm: Points) -> Points:
-        moved = at_mm + _gaussian(at_mm, self.points_mm, self.kernel_mm) @ self.weights
-        return moved if self.matrix is None else moved @ self.matrix.T + self.shift_mm
-
-
 class _PointDrift(DeformablePeer):
     config: CpdConfig | BcpdConfig
 
@@ -93,15 +76,16 @@ class _PointDrift(DeformablePeer):
         return error_mm, lambda ct: drift(transform_points(camera_from_ct, ct)), report
 
     @abstractmethod
-    def _drift(self, source: Points, cloud: Points) -> tuple[Drift, int]:
-        """The drift of a rigidly placed surface onto a cloud, and the iterations it took."""
+    def _drift(self, source: Points, cloud: Points) -> tuple[Carry, int]:
+        """The drift of a rigidly placed surface onto a cloud, v(z) = sum over n of G(z, y_n) w_n,
+        and the iterations it took."""
 
 
 class Cpd(_PointDrift):
     name = "cpd"
     config: CpdConfig
 
-    def _drift(self, source: Points, cloud: Points) -> tuple[Drift, int]:
+    def _drift(self, source: Points, cloud: Points) -> tuple[Carry, int]:
         from pycpd import DeformableRegistration
 
         config = self.config
@@ -115,7 +99,8 @@ class Cpd(_PointDrift):
             max_iterations=config.iterations,
         )
         registration.register()
-        return Drift(source, registration.W, config.kernel_mm), int(registration.iteration)
+        carry = _coherent(source, registration.W, config.kernel_mm)
+        return carry, int(registration.iteration)
 
 
 class Bcpd(_PointDrift):
@@ -134,7 +119,7 @@ class Bcpd(_PointDrift):
             )
         super()._prepare(anatomy_ct, up_lps)
 
-    def _drift(self, source: Points, cloud: Points) -> tuple[Drift, int]:
+    def _drift(self, source: Points, cloud: Points) -> tuple[Carry, int]:
         """The program's displacements v, interpolated by its own Gaussian process (Hirose 2021b,
         doi 10.1109/TPAMI.2020.3043769), then the similarity that carries y + v to its shape y'.
         Raises NoEstimate: the program failed on these points."""
@@ -145,7 +130,8 @@ class Bcpd(_PointDrift):
         weights = np.linalg.solve(kernel, displacement)
         moved = np.pad(source + displacement, ((0, 0), (0, 1)), constant_values=1)
         affine = np.linalg.lstsq(moved, shape, rcond=None)[0]
-        return Drift(source, weights, kernel_mm, affine[:3].T, affine[3]), loops
+        carry = _coherent(source, weights, kernel_mm)
+        return lambda at_mm: carry(at_mm) @ affine[:3] + affine[3], loops
 
     def _run(self, source: Points, cloud: Points) -> tuple[Points, Points, int]:
         """One run of the program: its displacements v and shape y, and its count of loops."""
@@ -173,6 +159,10 @@ class Bcpd(_PointDrift):
             lines = info.read_text().splitlines() if info.is_file() else []
             loops = (int(line.split()[1]) for line in lines if line.startswith("loops"))
             return displacement, shape, next(loops, 0)
+
+
+def _coherent(source: Points, weights: Points, kernel_mm: float) -> Carry:
+    return lambda at_mm: at_mm + _gaussian(at_mm, source, kernel_mm) @ weights
 
 
 def _gaussian(

@@ -25,8 +25,7 @@ from tumortrack.sense.camera import project
 from tumortrack.sense.render import Visibility
 from tumortrack.simulate.elastic.body import BodyConfig, ElasticBody, build_body
 from tumortrack.simulate.scene_folder import Scene
-from tumortrack_lab.peers.base import Fit, stopwatch
-from tumortrack_lab.peers.rigid import kabsch, matched_vertices
+from tumortrack_lab.peers.base import Fit, kabsch, matched_vertices, stopwatch
 from tumortrack_lab.study.methods import Answer, Method, StudyCase, answer_of, code_sha256
 
 BoundName = Literal["visible_bound", "basis_bound"]
@@ -35,8 +34,8 @@ _FEWEST = 10  # known points
 
 
 class BoundConfig(Config, frozen=True):
-    """As in ``registration.gauss_newton``: on the phantom 0.3 mm or 2,000 effective points double the
-    inner error."""
+    """As in ``registration.gauss_newton``: on the phantom 0.3 mm or 2,000 points double the inner
+    error."""
 
     body: BodyConfig = BodyConfig()
     seed: int = 0  # of the body
@@ -153,7 +152,7 @@ def laid_on(
 
 @cache
 def _body_of(case: StudyCase, config: BoundConfig) -> tuple[ElasticBody, float]:
-    """The case's elastic body, and the seconds that it took; one for both bounds."""
+    """And the seconds that it took; one for both bounds."""
     with stopwatch() as watch:
         body = build_body(case.anatomy_ct, case.up_lps, config.body, config.seed)
     return body, watch.seconds

@@ -33,7 +33,7 @@ from tumortrack.report.protocol import evaluate_scene
 from tumortrack.sense.camera import deproject
 from tumortrack.simulate.scene_folder import read_scene
 from tumortrack_lab.bench.machine import cpu_name
-from tumortrack_lab.peers.rigid import kabsch
+from tumortrack_lab.peers.base import kabsch
 from tumortrack_lab.study import document
 from tumortrack_lab.study.methods import Answer, Method, StudyCase
 

@@ -215,8 +215,7 @@ def conditions(frame: pd.DataFrame, field: str, base: str) -> str:
     for (method,), mine in groups(frame, "method"):
         reference = mine[mine[field] == base]
         for number, ((condition,), here) in enumerate(groups(mine, field)):
-            row = _once(number, label_of(method))
-            row.append(CONDITIONS[field].get(condition, condition))
+            row = [*_once(number, label_of(method)), CONDITIONS[field].get(condition, condition)]
             for tumor in names(tumors(frame), "part"):
                 parts = [some[some.part == tumor] for some in (here, reference)]
                 row += [change(*(by_seed(part, _KEYS[key]) for part in parts)) for key in keys]

@@ -73,7 +73,7 @@ def make_scenes(
     """
     wanted = [(v, w) for v in _known(variants, VARIANTS) for w in _known(views, VIEWS)]
     case = load_case(run.case_folder)
-    targets = draw_targets(case.anatomy, run.seed)
+    targets, rest_ct = draw_targets(case.anatomy, run.seed), case.anatomy.organ
     identity = _claim(run, out)
     todo = [(v, w) for v, w in wanted if not (out / f"{v}-{w}").exists()]
     states = list(dict.fromkeys(VARIANTS[v].state for v, _ in todo))
@@ -91,7 +91,15 @@ def make_scenes(
             say(f"{name}: settled")
         for variant, view in todo:
             if VARIANTS[variant].state == name:
-                _write(out / f"{variant}-{view}", state, run, targets, case.anatomy, identity)
+                height_mm = float(np.ptp(rest_ct.vertices_mm @ state.bench_from_ct[2, :3]))
+                config = viewing.for_organ(run.view, height_mm)
+                scene, targets_mm = viewing.make_scene(state, variant, view, config, run.seed)
+                meta = {**identity, **scene.meta}
+                scene = replace(scene, meta=meta, targets=targets.at(targets_mm))
+                rest = rest_ct.moved(transform_points(state.bench_from_ct, rest_ct.vertices_mm))
+                with store.new_folder(out / f"{variant}-{view}") as aside:
+                    write_scene_files(aside, scene)
+                    twin_picture(scene, state, rest, aside / "scene.png")
                 done += 1.0
                 say(f"{variant}-{view}")
     names = [f"{variant}-{view}" for variant in VARIANTS for view in VIEWS]
@@ -135,28 +143,6 @@ def _claim(run: TwinRun, out: Path) -> dict:
         raise StorageError(f"cannot write {out}: {error.strerror}.") from error
     store.write_json(path, identity)
     return identity
-
-
-def _write(
-    folder: Path,
-    state: EquilibriumState,
-    run: TwinRun,
-    targets: InnerPoints,
-    anatomy_ct: Anatomy,
-    identity: dict,
-) -> None:
-    """One scene's folder with targets and picture, all or nothing."""
-    variant, _, view = folder.name.partition("-")
-    rest = anatomy_ct.organ
-    config = viewing.for_organ(
-        run.view, float(np.ptp(rest.vertices_mm @ state.bench_from_ct[2, :3]))
-    )
-    scene, targets_mm = viewing.make_scene(state, variant, view, config, run.seed)  # type: ignore[arg-type]
-    scene = replace(scene, meta={**identity, **scene.meta}, targets=targets.at(targets_mm))
-    rest = rest.moved(transform_points(state.bench_from_ct, rest.vertices_mm))
-    with store.new_folder(folder) as aside:
-        write_scene_files(aside, scene)
-        twin_picture(scene, state, rest, aside / "scene.png")
 
 
 class StateCache:

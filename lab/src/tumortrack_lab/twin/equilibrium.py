@@ -12,7 +12,7 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float64
@@ -39,16 +39,8 @@ Pairs = deque[tuple[np.ndarray, np.ndarray]]  # steps, and what the gradient cha
 Solve = Callable[[np.ndarray], np.ndarray]
 
 
-class ContactSurface(Protocol):
-    """A rigid body; frame and unit are the bench's (mm)."""
-
-    def distance(self, points_mm: Points) -> tuple[Distances, Points]:
-        """Distance (negative inside) and its gradient: outwards, of length 1 where it is true."""
-
-
-Obstacles = tuple[ContactSurface, ...]
-
-
+# Rigid bodies in the bench's frame, mm. Each gives its ``distance`` (negative inside) and that
+# one's gradient: outwards, of length 1 where it is true.
 @dataclass(frozen=True, eq=False)
 class Support:
     """Everything below z = height: a plane, or packing (one height a point)."""
@@ -95,6 +87,10 @@ class Rod:
         return length - self.radius_mm, offset / np.maximum(length, 1e-12)[:, None]
 
 
+Obstacle = Support | ContactPlate | Rod
+Obstacles = tuple[Obstacle, ...]
+
+
 @dataclass(frozen=True, eq=False)
 class Contact:
     """A surface (embedded points, an area each) that obstacles push back."""
@@ -117,7 +113,7 @@ class Contact:
             np.add.at(gradient, self.surface.nodes[hit], force)
         return energy, gradient
 
-    def load_mn(self, nodes_mm: Points, obstacle: ContactSurface) -> Float64[np.ndarray, " 3"]:
+    def load_mn(self, nodes_mm: Points, obstacle: Obstacle) -> Float64[np.ndarray, " 3"]:
         """Total force on the body by one obstacle, mN."""
         distance, normal = obstacle.distance(self.surface.carry(nodes_mm))
         push = self.stiffness_kpa_mm * self.areas_mm2 * np.minimum(distance, 0)
