@@ -222,7 +222,7 @@ class _Cutting:
                 )
             self.walls.append((stroke, here[0]))
 
-    def flat(self, path_mm: Points) -> Flat:
+    def flat(self, path_mm: np.ndarray) -> Flat:
         """A line in voxels."""
         return (path_mm[:, :2] - self.low_mm[:2]) / self.voxel_mm
 

@@ -1,8 +1,8 @@
 """What a peer is, and the rigid ones.
 
-A peer moves the pre-operative anatomy onto one observed cloud: it is made for one patient and fitted to scenes one by one. Its answer is a map of points, from
-which organ, tumors and labels follow; so peers and network are compared by the same
-``report.protocol.compare``.
+A peer moves the pre-operative anatomy onto one observed cloud: it is made for one patient and
+fitted to scenes one by one. Its answer is a map of points, from which organ, tumors and labels
+follow; so peers and network are compared by the same ``report.protocol.compare``.
 """
 
 from __future__ import annotations

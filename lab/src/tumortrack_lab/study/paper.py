@@ -73,6 +73,9 @@ class Lie(NamedTuple):
     def kind(self) -> Kind:
         return "exophytic" if self.exposed_share >= EXOPHYTIC_SHARE else "endophytic"
 
+    def text(self, tumor: str) -> str:
+        return f"{tumor.rpartition('_')[2]}, {self.kind}"
+
 
 def tumor_lies(anatomy: Anatomy) -> dict[str, Lie]:
     """By part name; any frame."""

@@ -266,12 +266,11 @@ def gallery(jobs: list[Job], path: Path) -> None:
 
 
 def _numbers(estimate: Estimate, scene: Scene) -> str:
-    each = [
+    parts = {name: part for name, part in compare(estimate, scene).items() if name != of.ORGAN}
+    return "Hausdorff: " + ", ".join(
         f"{spaced(name)} " + (f"{part['hausdorff_mm']:.1f} mm" if part["found"] else "not found")
-        for name, part in compare(estimate, scene).items()
-        if name != of.ORGAN
-    ]
-    return "Hausdorff: " + ", ".join(each)
+        for name, part in parts.items()
+    )
 
 
 def _tidy(axes: Axes) -> None:

@@ -218,31 +218,21 @@ def tables_of(measurements: list[dict]) -> str:
 
 
 def _rows(frame: pd.DataFrame) -> list[list[str]]:
-    return [
-        [method, _label(planner), *_texts(plans)]
-        for (method, planner), plans in groups(frame, "method", "planner")
-    ]
+    rows = []
+    for (method, planner), plans in groups(frame, "method", "planner"):
+        made = plans[plans.refused.isna()]
+        free, removed = made[made.detached.astype(bool)], 100 * made.removed_share
+        row = [method, _label(planner), f"{len(made)} of {len(plans)}"]
+        row += [f"{n} of {len(made)}" for n in (len(free), (made.removed_share >= _WHOLE).sum())]
+        row += [_text(share, down=True) for share in (removed.median(), removed.min())]
+        row.append(_text(made.left_ml.max(), digits=2))
+        margins = made.margin_mm.median(), made.margin_mm.min()
+        rows.append([*row, *map(_text, (*margins, free.healthy_ml.mean()))])
+    return rows
 
 
 def _label(planner: str) -> str:
     return planner.replace("published", "the paper's", 1).replace("margin", "ours", 1)
-
-
-def _texts(plans: pd.DataFrame) -> list[str]:
-    made = plans[plans.refused.isna()]
-    free = made[made.detached.astype(bool)]
-    removed = 100 * made.removed_share
-    return [
-        f"{len(made)} of {len(plans)}",
-        f"{len(free)} of {len(made)}",
-        f"{(made.removed_share >= _WHOLE).sum()} of {len(made)}",
-        _text(removed.median(), down=True),
-        _text(removed.min(), down=True),
-        _text(made.left_ml.max(), digits=2),
-        _text(made.margin_mm.median()),
-        _text(made.margin_mm.min()),
-        _text(free.healthy_ml.mean()),
-    ]
 
 
 def _text(value: float, digits: int = 1, down: bool = False) -> str:

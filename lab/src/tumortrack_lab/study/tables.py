@@ -167,7 +167,7 @@ def accuracy(frame: pd.DataFrame, lies: Lies, is_paper: bool) -> str:
     for (variant, model), mine in groups(frame, "variant", "method"):
         target, miou, _ = _whole(mine)
         for number, ((tumor,), part) in enumerate(groups(tumors(mine), "part")):
-            row = [*_once(number, variant, model), _tumor_text(tumor, lies), *_distances(part)]
+            row = [*_once(number, variant, model), lies[tumor].text(tumor), *_distances(part)]
             row += _once(number, miou, target)
             if is_paper:
                 theirs = paper.hausdorff(variant, model, lies[tumor].kind)
@@ -191,7 +191,7 @@ def methods(frame: pd.DataFrame, lies: Lies) -> str:
         target, miou, failed = _whole(mine)
         whole = [miou, target, failed, text(frame_s, digits), text(prepare_s)]
         for number, ((tumor,), part) in enumerate(groups(tumors(mine), "part")):
-            row = [*_once(number, label_of(method)), _tumor_text(tumor, lies), *_distances(part)]
+            row = [*_once(number, label_of(method)), lies[tumor].text(tumor), *_distances(part)]
             rows.append(row + _once(number, *whole))
     return table([*head, "preparation, s"], rows, left=2)
 
@@ -285,10 +285,6 @@ def lies_text(case: str, lies: Lies) -> str:
 
 def spaced(part: str) -> str:
     return part.replace("_", " ")
-
-
-def _tumor_text(tumor: str, lies: Lies) -> str:
-    return f"{tumor.rpartition('_')[2]}, {lies[tumor].kind}"
 
 
 def _whole(frame: pd.DataFrame) -> list[str]:

@@ -64,7 +64,7 @@ class ApparatusConfig(Config, frozen=True, kw_only=True):
 
     def __post_init__(self) -> None:
         for name in self.__struct_fields__:
-            if not 0 < getattr(self, name) < float("inf"):
+            if not 0 < getattr(self, name) < np.inf:
                 raise InputError(f"bench {name} is {getattr(self, name)}; it must be positive.")
         if not self.poisson <= 0.495:
             raise InputError(f"bench poisson is {self.poisson}; it must be at most 0.495.")
@@ -90,7 +90,11 @@ class Apparatus:
         ratio = 1 + (config.tumor_ratio - 1) * _tumor_share(self.mesh, self.anatomy)
         shear_kpa = config.youngs_kpa * ratio / (2 * (1 + config.poisson))
         self.solid = NeoHookeanSolid(self.mesh, shear_kpa, config.poisson)
-        points_mm, areas_mm2 = _contact_points(self.anatomy.organ)
+        # One point of the surface per cube of 1 mm that it passes, and the area there.
+        points_mm, areas_mm2, _ = surface_samples(self.anatomy.organ, 1.0)
+        cubes = np.floor(points_mm).astype(int)
+        _, first, cube = np.unique(cubes, axis=0, return_index=True, return_inverse=True)
+        points_mm, areas_mm2 = points_mm[first], np.bincount(cube.ravel(), areas_mm2)
         self.contact = Contact(embed(self.mesh, points_mm), areas_mm2, config.contact_kpa_mm)
         volumes = self.solid.node_volumes_mm3
         self._weight_mn = config.density_kg_m3 * GRAVITY_KPA_PER_MM * volumes
@@ -147,16 +151,6 @@ def _bench_from_ct(organ_ct: Mesh, up_lps: tuple[float, float, float]) -> np.nda
     turned = organ_ct.vertices_mm @ rotation.T
     box = np.stack([turned.min(0), turned.max(0)])
     return rigid(rotation, -np.array([*box.mean(0)[:2], box[0, 2]]))
-
-
-def _contact_points(
-    organ: Mesh, spacing_mm: float = 1.0
-) -> tuple[Float64[np.ndarray, "m 3"], Float64[np.ndarray, " m"]]:
-    """One point of the surface per cube of this size that it passes, and the area there."""
-    points_mm, areas_mm2, _ = surface_samples(organ, spacing_mm)
-    cubes = np.floor(points_mm / spacing_mm).astype(int)
-    _, first, cube = np.unique(cubes, axis=0, return_index=True, return_inverse=True)
-    return points_mm[first], np.bincount(cube.ravel(), areas_mm2)
 
 
 def _faces_down(
