@@ -345,6 +345,7 @@ def test_stale_frames_are_refused(tracker, stages, clock):
 
     updates, told = play(tracker, [old, later, fresh], config, sink, host_clock=True, waits=False)
     assert "stale" in updates[0].reason
+    assert "if the clocks of camera and computer agree" in updates[0].reason
     assert updates[0].estimate is None
     assert updates[1].estimate is not None
     assert told["latency_from"] == "stamp"

@@ -116,7 +116,7 @@ def test_what_cannot_be_used_is_refused_with_what_there_is(graph):
     with publisher({"/d/info": "info", "/d/points": "cloud", "/d/image": "depth"}):
         said = refusal_of(Source(topic="/d/info").open, InputError)
         assert "/d/info is a sensor_msgs/msg/CameraInfo; it must be" in said
-        eventually(lambda: "/d/points" in graph.master.published(), "the topic")
+        eventually(lambda: "/d/points" in graph.master.published_types(), "the topic")
         with pytest.raises(SourceLost, match=r"nobody publishes /d/other .*/d/points"):
             Source(topic="/d/other").open()
         with pytest.raises(InputError, match="a mask needs a depth image"):
@@ -149,7 +149,7 @@ def test_simulated_time_is_not_this_machines(graph):
         source = opened(Source(topic="/e/points"))
         assert source.host_clock
         source.close()
-        rospy_node.node().master.call("setParam", "/use_sim_time", True)
+        graph.master.call("setParam", "/use_sim_time", True)
         try:
             source = opened(Source(topic="/e/points"))
             assert not source.host_clock
@@ -158,7 +158,7 @@ def test_simulated_time_is_not_this_machines(graph):
             assert source.host_clock
             source.close()
         finally:
-            rospy_node.node().master.call("setParam", "/use_sim_time", False)
+            graph.master.call("setParam", "/use_sim_time", False)
 
 
 def test_an_estimate_arrives_in_metres_in_its_frame_at_its_time(graph, tmp_path):

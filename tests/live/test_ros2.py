@@ -16,7 +16,6 @@ import pytest
 
 from clock import PATIENCE_S, until
 from live_objects import (
-    PARTS,
     empty_update,
     small_frame,
     small_setting,
@@ -27,12 +26,12 @@ from ros2_peer import points_mm
 from tumortrack.core.errors import InputError, TumortrackError
 from tumortrack.core.types import SensorCloud
 from tumortrack.live.ros import sensors
-from tumortrack.live.ros.bus import Bus, domain_id, open_bus
-from tumortrack.live.ros.dds import dds_name, idl_type, ros_name
-from tumortrack.live.ros.messages import MARKERS, Messages
-from tumortrack.live.ros.results import messages_of
+from tumortrack.live.ros.bus import Bus
+from tumortrack.live.ros.dds import dds_name, domain_id, idl_type, ros_name
+from tumortrack.live.ros.messages import Messages
+from tumortrack.live.ros.results import JOINTS, MARKERS, ResultMessages
+from tumortrack.live.ros.ros2 import open_bus
 from tumortrack.live.ros.sensors import messages_seen, plain_cloud
-from tumortrack.live.ros.workcell import JOINTS, WorkcellMessages
 from tumortrack.live.sinks.ros import Ros2SinkConfig as SinkRos2
 from tumortrack.live.sources.ros import Ros2SourceConfig as SourceRos2
 from tumortrack.live.values import Observation, Source
@@ -52,15 +51,15 @@ def _own_graph() -> Iterator[None]:
 
 
 @pytest.fixture
-def messages() -> Messages:
-    return Messages()
+def bus() -> Iterator[Bus]:
+    joined = open_bus("dds")
+    yield joined
+    joined.close()
 
 
 @pytest.fixture
-def bus(messages: Messages) -> Iterator[Bus]:
-    joined = open_bus("dds", messages)
-    yield joined
-    joined.close()
+def messages() -> Messages:
+    return Messages()
 
 
 # --- types ---------------------------------------------------------------------------------------
@@ -72,10 +71,10 @@ def test_types_agree_with_a_second_encoder(kind: str, messages: Messages) -> Non
     seen = Observation(small_frame(), 0)
     cloud = Observation(SensorCloud(points_mm()[:7], 12_000_000_034), 0)
     made = [*messages_seen(seen, messages), *messages_seen(cloud, messages)]
-    made += messages_of(working(), messages, PARTS, True, WorkcellMessages(messages, 0.0))
+    made += ResultMessages(messages, with_arms()).of(working())
     message = next(one.message for one in made if one.message_type == kind)
     cdr = bytes(messages.to_bytes(message))
-    type_ = idl_type(kind, "humble")
+    type_ = idl_type(kind)
     value = type_.deserialize(cdr)
     assert value.serialize(use_version_2=False)[: len(cdr)] == cdr
     if kind == sensors.CLOUD:
@@ -87,8 +86,6 @@ def test_types_agree_with_a_second_encoder(kind: str, messages: Messages) -> Non
 def test_names_that_are_none_of_ros() -> None:
     assert ros_name("HelloWorld") == ""
     assert ros_name("a::msg::dds_::B") == ""
-    with pytest.raises(InputError, match="no message type"):
-        idl_type("sensor_msgs/msg/Nothing", "humble")
 
 
 def test_what_other_nodes_see_of_a_topic(bus: Bus) -> None:
@@ -140,8 +137,8 @@ class Sender(Frames):
         raise AssertionError("never refused")
 
 
-def test_what_belongs_to_an_image_is_asked_for(bus: Bus, messages: Messages) -> None:
-    frames = Sender(bus, messages, "/a")
+def test_what_belongs_to_an_image_is_asked_for(bus: Bus) -> None:
+    frames = Sender(bus, "/a")
     source = SourceRos2(topic="/a/depth/image_rect", mask="/a/mask").open()
     now = small_frame(time.time_ns())
     old = small_frame(now.stamp_ns - 2_000_000_000)
@@ -165,7 +162,7 @@ def test_what_belongs_to_an_image_is_asked_for(bus: Bus, messages: Messages) -> 
     [(0, "auto", True), (-20, "auto", True), (-3600, "auto", True), (-90_000, "auto", False)]
     + [(-90_000, "host", True), (0, "other", False)],
 )
-def test_whose_clock(offset_s: int, clock: str, host: bool, bus: Bus, messages: Messages) -> None:
+def test_whose_clock(offset_s: int, clock: str, host: bool, bus: Bus) -> None:
     """A stream that lags by seconds is not taken for one with a clock of its own."""
     place = f"/clock_{secrets.token_hex(4)}"
     source = SourceRos2(topic=f"{place}/points", clock=clock).open()
@@ -173,7 +170,7 @@ def test_whose_clock(offset_s: int, clock: str, host: bool, bus: Bus, messages: 
     stamp_ns = begin_ns + offset_s * 1_000_000_000
     try:
         cloud = Observation(SensorCloud(points_mm()[:9], stamp_ns), 0)
-        seen = Sender(bus, messages, place).until(source, cloud)
+        seen = Sender(bus, place).until(source, cloud)
         assert source.host_clock is host
         assert seen.stamp_ns == stamp_ns
         assert begin_ns <= seen.arrived_ns <= time.time_ns()
@@ -202,11 +199,8 @@ def test_the_view_for_rviz_shows_what_is_published(
 ) -> None:
     """Topics, frame and reliability of docs/ros/*.rviz are the sink's."""
     view = (HERE.parents[1] / "docs" / "ros" / name).read_text(encoding="utf-8")
-    cell = WorkcellMessages(messages, 0.0)
-    sent = {
-        f"/tumortrack/{one.suffix}"
-        for one in messages_of(empty_update(), messages, (), workcell=cell)
-    }
+    out = ResultMessages(messages, with_arms()).of(empty_update())
+    sent = {f"/tumortrack/{one.suffix}" for one in out}
     shown = set(re.findall(r"Value: (/tumortrack\S+)", view))
     assert sorted(shown) == [f"/tumortrack/{topic}" for topic in topics]
     assert shown < sent

@@ -30,10 +30,11 @@ from tumortrack.core.errors import InputError
 from tumortrack.core.estimate import Estimate
 from tumortrack.core.types import OccupancyCloud, SensorCloud
 from tumortrack.live.ros import sensors
-from tumortrack.live.ros.bus import Bus, open_bus
+from tumortrack.live.ros.bus import Bus
 from tumortrack.live.ros.dds import dds_name
 from tumortrack.live.ros.messages import Messages
-from tumortrack.live.ros.results import messages_of
+from tumortrack.live.ros.results import ResultMessages
+from tumortrack.live.ros.ros2 import open_bus
 from tumortrack.live.ros.sensors import messages_seen, plain_cloud
 from tumortrack.live.sinks.ros import Ros2SinkConfig as SinkRos2
 from tumortrack.live.sources.ros import Ros2SourceConfig as SourceRos2
@@ -57,8 +58,8 @@ def messages() -> Messages:
 
 
 @pytest.fixture
-def bus(messages: Messages) -> Iterator[Bus]:
-    joined = open_bus("dds", messages)
+def bus() -> Iterator[Bus]:
+    joined = open_bus("dds")
     yield joined
     joined.close()
 
@@ -146,7 +147,9 @@ def test_updates_reach_another_process(messages: Messages) -> None:
     sink = SinkRos2(mesh_hz=0.0).open(small_setting())
     assert isinstance(sink, Sink)
     update = small_update()
-    expected = {one.suffix: one.message for one in messages_of(update, messages, PARTS)}
+    expected = {
+        one.suffix: one.message for one in ResultMessages(messages, small_setting()).of(update)
+    }
     try:
         with peer("hear", 600) as other:
             other.lines_until(lambda said: "listens" in said)

@@ -23,14 +23,15 @@ from live_objects import (
     small_anatomy,
     small_estimate,
     small_frame,
+    small_setting,
     small_update,
 )
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import rigid
 from tumortrack.core.types import SensorCloud
 from tumortrack.live.meter import Rate
-from tumortrack.live.ros.messages import MARKERS, Messages, stamp_of
-from tumortrack.live.ros.results import messages_of
+from tumortrack.live.ros.messages import Messages, stamp_of
+from tumortrack.live.ros.results import MARKERS, ResultMessages
 from tumortrack.live.ros.sensors import (
     CAMERA_INFO,
     CLOUD,
@@ -40,15 +41,15 @@ from tumortrack.live.ros.sensors import (
     mask_of,
     messages_seen,
 )
-from tumortrack.live.ros.workcell import WorkcellMessages
-from tumortrack.live.values import Observation, PublishedFrame
-from workcell_objects import workcell
+from tumortrack.live.values import Observation, PublishedFrame, Workcell
+from workcell_objects import virtual, with_arms, workcell, working
 
 HUMBLE, NOETIC = Messages("humble"), Messages("noetic")
 STOCK = {HUMBLE: get_typestore(Stores.ROS2_HUMBLE), NOETIC: get_typestore(Stores.ROS1_NOETIC)}
 DEBIAN = Path("/usr/lib/python3/dist-packages/sensor_msgs")
 POINTS_M = np.array([[0.01, -0.02, 0.125], [0.003, 0.004, 0.13], [-0.05, 0.0, 0.2]])
 _TURN = Rotation.from_euler("xyz", [0.3, -1, 2]).as_matrix()
+BARE = Workcell("hold")  # nothing to show but its state
 TURNED = PublishedFrame("table", rigid(_TURN, np.array([50.0, -20, 9])))
 
 
@@ -300,11 +301,9 @@ def test_what_was_seen_comes_back(messages):
     np.testing.assert_allclose(back.points_mm, cloud.points_mm, rtol=2e-7)
 
 
-def by_suffix(update, **options):
-    return {
-        out.suffix: out.message
-        for out in messages_of(update, HUMBLE, options.pop("parts", PARTS), **options)
-    }
+def by_suffix(update, results: ResultMessages | None = None):
+    results = results or ResultMessages(HUMBLE, small_setting())
+    return {out.suffix: out.message for out in results.of(update)}
 
 
 def headers_of(message) -> list:
@@ -361,7 +360,7 @@ def test_an_estimate_is_sent_in_metres_in_the_published_frame():
 
 
 def test_without_an_estimate_every_topic_says_so():
-    out = by_suffix(empty_update(reason="the drape hides it"), meshes=False)
+    out = by_suffix(empty_update(reason="the drape hides it"))
     assert (out["cloud"].width, len(out["cloud"].data)) == (0, 0)
     assert len(out["cloud"].fields) == 6
     first, text = out["meshes"].markers
@@ -383,7 +382,9 @@ def test_a_part_that_was_not_found_is_deleted_and_meshes_may_wait():
     assert markers["tumor_2"].action == markers["tumor_2"].ADD
     assert np.isnan(by_suffix(update)["tumor_1/center"].point.x)
     assert by_suffix(update)["diagnostics"].status[0].level == 1
-    assert [m.ns for m in by_suffix(update, meshes=False)["meshes"].markers] == ["quality"]
+    slow = ResultMessages(HUMBLE, small_setting(), hz=0.01)
+    assert len(by_suffix(update, slow)["meshes"].markers) == 4
+    assert [m.ns for m in by_suffix(update, slow)["meshes"].markers] == ["quality"]
 
 
 def test_a_rate_lets_pass_the_first_and_then_waits():
@@ -399,11 +400,14 @@ def test_stamps_that_ros_cannot_say_are_refused(stamp_ns):
 
 
 @pytest.mark.parametrize("messages", [HUMBLE, NOETIC])
-@pytest.mark.parametrize("update", [small_update(), empty_update()])
+@pytest.mark.parametrize(
+    "update",
+    [small_update(), empty_update(), working(), virtual(), replace(working(), workcell=BARE)],
+)
 def test_bytes_are_those_of_plain_messages(messages, update):
     """Blocks of points are written as the library writes lists of points."""
     stock = STOCK[messages]
-    for out in messages_of(update, messages, PARTS):
+    for out in ResultMessages(messages, with_arms()).of(update):
         raw, kind = messages.to_bytes(out.message), out.message_type
         if messages is HUMBLE:
             again = stock.serialize_cdr(stock.deserialize_cdr(raw, kind), kind)
@@ -467,13 +471,13 @@ def run_ros(script: str, folder: Path) -> str:
 
 def test_ros_s_own_classes_read_what_is_sent(tmp_path):
     update, lines = replace(small_update(frames=TURNED), workcell=workcell(0.3)), []
-    for out in messages_of(update, NOETIC, PARTS, True, WorkcellMessages(NOETIC, 0.0)):
+    for out in ResultMessages(NOETIC, with_arms()).of(update):
         name = out.suffix.replace("/", "_")
         (tmp_path / name).write_bytes(NOETIC.to_bytes(out.message))
-        lines.append(f"{name} {out.message_type} {NOETIC.md5(out.message_type)}")
+        lines.append(f"{name} {out.message_type} {NOETIC.definition(out.message_type)[1]}")
     for n, out in enumerate(messages_seen(update.observation, NOETIC)):
         (tmp_path / f"seen_{n}").write_bytes(NOETIC.to_bytes(out.message))
-        lines.append(f"seen_{n} {out.message_type} {NOETIC.md5(out.message_type)}")
+        lines.append(f"seen_{n} {out.message_type} {NOETIC.definition(out.message_type)[1]}")
     (tmp_path / "list").write_text("\n".join(lines))
     said = json.loads(run_ros(RECEIVER, tmp_path))
     assert len(said) == len(lines) == 11
@@ -506,6 +510,10 @@ def test_what_ros_s_own_classes_send_is_read(tmp_path):
 
 def test_marker_arrays_of_humble_and_noetic_differ():
     """Humble's Marker has textures: bytes of one are refused by the other."""
-    out = next(o for o in messages_of(small_update(), HUMBLE, PARTS) if o.suffix == "meshes")
+    out = next(
+        o
+        for o in ResultMessages(HUMBLE, small_setting()).of(small_update())
+        if o.suffix == "meshes"
+    )
     with pytest.raises(InputError, match="same ROS distribution"):
         NOETIC.from_bytes(HUMBLE.to_bytes(out.message), MARKERS)

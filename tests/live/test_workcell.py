@@ -14,21 +14,19 @@ from types import ModuleType
 import numpy as np
 import pytest
 from rosbags.highlevel import AnyReader
-from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
 
 from clock import Clock, until
 from igtl_objects import hear_all
 from igtl_reader import IgtlStatus, unpack_status, unpack_transform
-from live_objects import PARTS, small_setting, small_update
+from live_objects import small_setting, small_update
 from recording_objects import frame_number
 from tumortrack.core.errors import InputError, TumortrackError
 from tumortrack.core.geometry import rigid, transform_points
 from tumortrack.core.mesh_files import read_mesh
 from tumortrack.live.ros.messages import Messages, stamp_of
-from tumortrack.live.ros.results import messages_of
+from tumortrack.live.ros.results import ResultMessages
 from tumortrack.live.ros.sensors import cloud_of
-from tumortrack.live.ros.workcell import WorkcellMessages
 from tumortrack.live.sinks.openigtlink import OpenIgtLinkSinkConfig
 from tumortrack.live.sinks.recording import RecordingSinkConfig as RecordTo
 from tumortrack.live.sinks.ur import SILENT_S, UR_JOINTS, UrSink, UrSinkConfig
@@ -39,12 +37,12 @@ from tumortrack.live.workers import SinkWorker
 from workcell_objects import CUT, REASON, TABLE, virtual, with_arms, workcell, working
 
 HUMBLE, NOETIC = Messages("humble"), Messages("noetic")
-STOCK = {HUMBLE: get_typestore(Stores.ROS2_HUMBLE), NOETIC: get_typestore(Stores.ROS1_NOETIC)}
 NAMES = [shape.name for shape in workcell().shapes]
 
 
-def sent(update: TrackingResult, cell: WorkcellMessages, messages: Messages = HUMBLE) -> dict:
-    return {out.suffix: out.message for out in messages_of(update, messages, PARTS, True, cell)}
+def sent(update: TrackingResult, results: ResultMessages | None = None) -> dict:
+    results = results or ResultMessages(HUMBLE, with_arms())
+    return {out.suffix: out.message for out in results.of(update)}
 
 
 def less(update: TrackingResult, *names: str) -> TrackingResult:
@@ -61,7 +59,7 @@ def less(update: TrackingResult, *names: str) -> TrackingResult:
 
 def test_joints_and_markers_say_where_everything_stands():
     update = working(3, 0.3)
-    out, cell = sent(update, WorkcellMessages(HUMBLE, 0.0)), update.workcell
+    out, cell = sent(update), update.workcell
     joints = out["joint_states"]
     assert dict(zip(joints.name, joints.position, strict=True)) == cell.joints_rad
     assert (stamp_of(joints.header), joints.header.frame_id) == (update.stamp_ns, "table")
@@ -97,7 +95,8 @@ def test_joints_and_markers_say_where_everything_stands():
 
 
 def test_arms_are_told_of_without_an_estimate_and_why_they_stand():
-    out = sent(virtual(halted="the tumor moved by 6 mm"), WorkcellMessages(NOETIC, 0.0), NOETIC)
+    results = ResultMessages(NOETIC, with_arms())
+    out = sent(virtual(halted="the tumor moved by 6 mm"), results)
     assert len(out["workcell"].markers) == len(NAMES) + 3
     assert [m.action for m in out["meshes"].markers] == [3]  # DELETEALL: no estimate
     assert out["workcell"].markers[-1].text == (
@@ -108,11 +107,11 @@ def test_arms_are_told_of_without_an_estimate_and_why_they_stand():
     assert {v.key: v.value for v in arms.values} == {
         "state": "sweep 1", "halted": "the tumor moved by 6 mm",
     }  # fmt: skip
-    assert sent(working(), WorkcellMessages(HUMBLE, 0.0))["diagnostics"].status[1].level == 0
+    assert sent(working())["diagnostics"].status[1].level == 0
 
 
 def test_markers_keep_their_rate_and_changes_come_at_once():
-    cell = WorkcellMessages(HUMBLE, 0.01)
+    cell = ResultMessages(HUMBLE, with_arms(), hz=0.01)
     assert len(sent(working(0), cell)["workcell"].markers) == len(NAMES) + 3
     later = sent(working(1, 0.2), cell)
     assert "workcell" not in later
@@ -134,35 +133,22 @@ def test_markers_keep_their_rate_and_changes_come_at_once():
 def test_what_the_camera_saw_is_sent_in_the_frame_of_the_arms():
     update = working()
     assert update.observation is not None
-    points_mm = cloud_of(sent(update, WorkcellMessages(HUMBLE, 0.0))["observed"]).points_mm
+    points_mm = cloud_of(sent(update)["observed"]).points_mm
     depth_mm = update.observation.content.depth_mm
     assert len(points_mm) == np.isfinite(depth_mm).sum()
     # The camera looks down from 160 mm: a depth of d is a height of 160 - d.
     assert np.sort(points_mm[:, 2]) == pytest.approx(
         np.sort(160 - depth_mm[np.isfinite(depth_mm)]), abs=1e-3
     )
-    slow = WorkcellMessages(HUMBLE, 0.01)
+    slow = ResultMessages(HUMBLE, with_arms(), hz=0.01)
     assert "observed" in sent(update, slow)
     assert "observed" not in sent(update, slow)
     assert sent(virtual(), slow)["observed"].width == 0
 
 
 def test_without_arms_nothing_of_them_is_announced():
-    topics = {out.suffix for out in messages_of(working(), HUMBLE, PARTS)}
+    topics = {out.suffix for out in ResultMessages(HUMBLE, small_setting()).of(working())}
     assert not topics & {"workcell", "joint_states", "observed"}
-
-
-@pytest.mark.parametrize("messages", [HUMBLE, NOETIC])
-@pytest.mark.parametrize("update", [working(), virtual(), less(virtual(), *NAMES, "cut/1")])
-def test_bytes_are_those_of_plain_messages(messages, update):
-    stock = STOCK[messages]
-    for out in messages_of(update, messages, PARTS, True, WorkcellMessages(messages, 0.0)):
-        raw, kind = messages.to_bytes(out.message), out.message_type
-        if messages is HUMBLE:
-            again = stock.serialize_cdr(stock.deserialize_cdr(raw, kind), kind)
-        else:
-            again = stock.serialize_ros1(stock.deserialize_ros1(raw, kind), kind)
-        assert bytes(again) == bytes(raw), out.suffix
 
 
 # Recordings

@@ -16,20 +16,19 @@ from tumortrack.cli.models import Compile
 from tumortrack.core.config import to_builtins
 from tumortrack.models.config import MlpDecoderConfig, NetworkConfig
 from tumortrack.models.normalisation import CloudBox
-from tumortrack.occupancy.compiled import (
+from tumortrack.occupancy.inference import Arithmetic, Inference, can_pack, possible, usual
+from tumortrack.occupancy.locator import OccupancyLocator
+from tumortrack.occupancy.model import (
     Compiled,
     find,
     like_an_organ,
     measured,
     place_of,
     read,
-    reference,
     save,
     this_machine,
 )
-from tumortrack.occupancy.compiled import describe as describe_compiled
-from tumortrack.occupancy.inference import Arithmetic, Inference, can_pack, possible, usual
-from tumortrack.occupancy.locator import OccupancyLocator
+from tumortrack.occupancy.model import describe as describe_compiled
 from tumortrack.occupancy.network import OccupancyNetwork
 from tumortrack.training.model import load_model
 from tumortrack.training.presets import quick_network
@@ -97,7 +96,9 @@ def known(request) -> Learnt:
 def test_fast_arithmetic_gives_the_labels_of_single_precision(numbers, known):
     inference = Inference(known.network, Arithmetic(numbers=numbers, chunk=1024))
     latent = inference.encode(known.cloud)
-    right = reference(inference.network, latent, known.queries)
+    with torch.inference_mode():
+        queries = torch.from_numpy(known.queries)[None]
+        right = known.network.folded().query(latent, queries)[0]
     assert right.argmax(1).bincount()[:2].min() > 50
     answer = inference.logits(latent, known.queries)
     assert answer.dtype == torch.float32
@@ -213,7 +214,7 @@ def test_compile_is_used_by_the_next_load_and_named_by_inspect(learnt_model, tmp
     assert after.arithmetic is not None
     assert after.arithmetic.numbers in said
     assert any("this machine" in line for line in describe(folder))
-    assert OccupancyLocator(after)._inference.arithmetic == after.arithmetic
+    assert OccupancyLocator(after).inference.arithmetic == after.arithmetic
 
 
 def test_there_is_nothing_to_choose_for_a_model_that_places_the_organ(clinic_model, capsys):

@@ -11,11 +11,11 @@ from tumortrack.core.geometry import transform_points
 from tumortrack.core.types import OccupancyCloud
 from tumortrack.models.report import grid_over
 from tumortrack.occupancy.volume import (
-    dense_margins,
     drop_islands,
     keep_largest_pieces,
     part_surfaces,
 )
+from volume_points import dense_margins
 
 NAMES = ("kidney", "tumor_1")
 CENTRE = np.array([4.0, -7.0, 140.0])

@@ -118,7 +118,7 @@ def test_an_organ_that_jumps_is_found_in_the_same_frame(tracker, seen, jump_mm):
 def test_a_part_that_vanishes_and_returns_is_seen_at_once(tracker, seen, monkeypatch):
     points = np.random.default_rng(0).permutation(seen[0].astype(np.float32))[:512]
     first = tracker.follow(SensorCloud(points, 1))
-    inference = tracker._locator._inference
+    inference = tracker._locator.inference
     logits = inference.logits
 
     def without_tumor(latent, points_mm):

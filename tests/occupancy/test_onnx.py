@@ -73,8 +73,8 @@ def test_a_network_that_places_the_organ_gives_the_same_placements(clinic_model,
     model = load_model(clinic_model, "cpu")
     found = answers(onnx_bytes(model), cloud_mm=cloud)
     with torch.inference_mode():
-        ways = model.network.flip_hypotheses(torch.from_numpy(cloud))
+        hypotheses = model.network.flip_hypotheses(torch.from_numpy(cloud))
     names = ("rotation", "centre_mm", "coefficients", "right_way")
     for name, value in zip(names, found, strict=True):
-        right = torch.cat([getattr(way, name) for way in ways]).numpy()
+        right = getattr(hypotheses, name).numpy()
         np.testing.assert_allclose(value, right, atol=1e-3)

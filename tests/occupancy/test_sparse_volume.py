@@ -17,7 +17,8 @@ from tumortrack.occupancy.sparse import (
     sparse_logits,
     sparse_margins,
 )
-from tumortrack.occupancy.volume import dense_margins, lattice_over, margins_on, part_surfaces
+from tumortrack.occupancy.volume import lattice_over, margins_on, part_surfaces
+from volume_points import dense_margins
 
 NAMES = ("kidney", "tumor_1", "tumor_2")
 

@@ -1,5 +1,7 @@
-"""The warp's compiled kernels against plain forms: flow, sums, chances, rasters; and a steady
-loop."""
+"""The registration's compiled kernels against plain forms: flow, sums, chances, rasters.
+
+And a steady loop.
+"""
 
 from __future__ import annotations
 
@@ -21,13 +23,12 @@ from tumortrack.models.config import GaussNewtonConfig
 from tumortrack.registration import gauss_newton_kernels as kernels
 from tumortrack.registration import registration
 from tumortrack.registration.gauss_newton import GaussNewton, _prior, refine
-from tumortrack.registration.label_probability import NearestLookup, normal_table, probabilities
-from tumortrack.registration.locator import RegistrationLocator
+from tumortrack.registration.kernels import Flow, Pose, look_up, probabilities
+from tumortrack.registration.locator import RegistrationLocator, nearest_lookup
 from tumortrack.registration.registration import Registration
-from tumortrack.registration.residual_kernels import DistanceLattice, Flow, Pose
-from tumortrack.simulate.elastic.flow import BLOCK, steps_for
+from tumortrack.simulate.elastic.flow import BLOCK, LatticeField, steps_for
 from tumortrack.training.model import load_model
-from warp_objects import ANATOMY, PLACE_MM, TURNED, nudged, placed, residual_rows, shape
+from warp_objects import ANATOMY, PLACE_MM, TURNED, nudged, placed, residual_rows, shape, with_slope
 
 
 def about(count, seed=0, reach=1.6):
@@ -95,43 +96,60 @@ def test_sums_are_those_of_the_rows_and_rows_those_of_plain_arithmetic(state):
     points += np.random.default_rng(1).normal(0, 1.5, points.shape).astype(np.float32)
     pose = (motion.rotation, motion.centre_mm, 0.9 * motion.coefficients)
     rows = residual_rows(points, pose).astype(float)
-    unknowns, field, velocity = rows.shape[1] - 1, shape().distances[0], body.velocity(-pose[2])
-    left = kernels.Residuals(
-        np.empty(len(points), np.float32),
-        np.empty((unknowns, unknowns)),
-        np.empty(unknowns),
+    unknowns, velocity = rows.shape[1] - 1, body.velocity(-pose[2])
+    left = kernels.State(
+        *pose,
+        np.zeros(6),
+        distances_mm=np.empty(len(points), np.float32),
+        curvature=np.empty((unknowns, unknowns)),
+        gradient=np.empty(unknowns),
     )
     lattice = body.origin_mm, np.float32(body.spacing_mm)
-    distances = DistanceLattice(field.values_mm, field.origin_mm, np.float32(field.spacing_mm))
+    field = shape().distances[0]
     kernels.normal_equations(
+        kernels.Problem(
+            LatticeField(body.modes, *lattice),
+            body.center_ct,
+            field,
+            np.eye(2),
+            body.mean,
+            points,
+            *(1.0, 5.0, 1.0, 0.7, 0.02),
+        ),
         Flow(velocity, *lattice, steps_for(velocity, body.spacing_mm)),
-        kernels.Organ(body.modes, *lattice, body.center_ct, distances, np.eye(2), body.mean),
         Pose(body.center_ct, *pose[:2]),
         np.float32(2),
-        points,
-        kernels.Workspace(
-            np.empty((BLOCK, unknowns + 1), np.float32), np.zeros((28, 300), np.float32)
-        ),
+        (np.empty((BLOCK, unknowns + 1), np.float32), np.zeros((28, 300), np.float32)),
         left,
     )
-    np.testing.assert_array_equal(left[0], rows[:, -1])
-    assert np.abs(left[0]).max() > 2
+    np.testing.assert_array_equal(left.distances_mm, rows[:, -1])
+    assert np.abs(left.distances_mm).max() > 2
     pulled = rows / (1 + (rows[:, -1:] / 2.0) ** 2)
     sums = pulled.T @ pulled
     most = np.abs(sums).max()
-    np.testing.assert_allclose(left[1], sums[:-1, :-1], atol=1e-5 * most)
-    np.testing.assert_allclose(left[2], sums[:-1, -1], atol=1e-5 * most)
+    np.testing.assert_allclose(left.curvature, sums[:-1, :-1], atol=1e-5 * most)
+    np.testing.assert_allclose(left.gradient, sums[:-1, -1], atol=1e-5 * most)
 
     offsets = (points.astype(float) - pose[1]) @ pose[0]
     rest, middle = plainly_followed(
         velocity, offsets + body.center_ct, steps_for(velocity, body.spacing_mm)
     )
-    distances, outwards = shape().distances[0].with_slope(rest.astype(np.float32))
+    distances, outwards = with_slope(field, rest.astype(np.float32))
     np.testing.assert_allclose(rows[:, -1], distances, atol=1e-3)
     by_modes = -np.einsum("ndm,nd->nm", body.modes_at(middle), outwards)
     plain = np.concatenate([-outwards, -np.cross(offsets, outwards), by_modes], axis=1)
     same = np.isclose(rows[:, :-1], plain, atol=0.02).all(1)  # others lie on a cell's border
     assert same.mean() > 0.99
+
+
+def test_the_kernels_weight_is_its_derivative():
+    """Gauss-Newton minimises rho only if a squared distance weighs rho'(r) / (2 r)."""
+    r, small = np.linspace(0.05, 6, 120), 1e-6
+    slope = (kernels.rho(r + small) - kernels.rho(r - small)) / (2 * small)
+    np.testing.assert_allclose(kernels.root_weight(r) ** 2, slope / (2 * r), rtol=1e-6)
+    assert kernels.rho(0.0) == 0
+    assert kernels.rho(1e-3) == pytest.approx(1e-6, rel=1e-5)  # sigma is that of small distances
+    assert abs(r[np.argmax(slope)] - 0.58) < 0.05  # where a point pulls most: ``_width``
 
 
 def plainly_refined(points, start, config):
@@ -224,7 +242,7 @@ def test_starts_that_are_far_behind_are_given_up(monkeypatch, unchecked):
 def test_labels_and_margins_are_those_of_the_distances():
     points = about(9000, 4)
     labels, margin_mm = shape().labels_at(points)
-    distances = np.stack([field.at(points) for field in shape().distances])
+    distances = np.stack([with_slope(field, points)[0] for field in shape().distances])
     plain = np.where(distances[1] < 0, 2, (distances[0] < 0).astype(int))
     assert set(np.unique(plain)) == {0, 1, 2}
     np.testing.assert_allclose(margin_mm, np.abs(distances).min(0), atol=1e-5)
@@ -237,13 +255,13 @@ def test_the_nearest_place_is_nearest_but_for_a_nodes_width():
     rng = np.random.default_rng(5)
     places = CENTER + rng.uniform(-1, 1, (200, 3)) * RADII
     points = about(3000, 6)
-    found = np.linalg.norm(points - places[NearestLookup.of(places).to(points)], axis=1)
+    found = np.linalg.norm(points - places[look_up(*nearest_lookup(places), points)], axis=1)
     apart = np.linalg.norm(points[:, None] - places, axis=2)
     inside = ((points > places.min(0)) & (points < places.max(0))).all(1)
     assert inside.mean() > 0.2
     assert (found[inside] <= apart.min(1)[inside] + 2 * np.sqrt(3)).all()
     assert np.mean(found[inside] == apart.min(1)[inside].astype(found.dtype)) > 0.6
-    own = NearestLookup.of(places).to(places.astype(np.float32))
+    own = look_up(*nearest_lookup(places), places.astype(np.float32))
     assert np.mean(own == np.arange(200)) > 0.9
 
 
@@ -275,7 +293,7 @@ def test_chances_are_the_normal_distributions():
     margins = np.linspace(0, 30, 5000, dtype=np.float32)
     which = np.arange(5000) % 3
     std_mm = np.array([0.3, 1.0, 4.0])
-    told = probabilities(margins, 1 / std_mm, which, normal_table())
+    told = probabilities(margins, 1 / std_mm, which)
     np.testing.assert_allclose(told, ndtr(margins / std_mm[which]), atol=3e-7)
     assert told.min() == 0.5
     assert told.max() == 1

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import csv
 import json
+from dataclasses import replace
 
+import msgspec
 import numpy as np
 import pytest
 import trimesh
@@ -12,13 +14,13 @@ from scipy.spatial.transform import Rotation
 
 from elastic_objects import CENTER, UP
 from stories import succeeded, tumortrack
-from tumortrack.core.errors import InputError, NoEstimate
+from tumortrack.core.errors import ArtifactError, InputError, NoEstimate
 from tumortrack.core.estimate import Motion
 from tumortrack.core.types import SensorCloud
 from tumortrack.sense.ply import write_cloud_ply
 from tumortrack.simulate.occupancy import labels_of, surface_distance
 from tumortrack.simulate.scene import SceneRecipe, Simulator, body_for
-from tumortrack.simulate.targets import draw_targets
+from tumortrack.simulate.scene_folder import draw_targets
 from tumortrack.tracking.tracker import Tracker
 from tumortrack.training.model import load_model, save_model
 from warp_objects import ANATOMY, shape, slim_clinic
@@ -85,6 +87,14 @@ def test_a_loaded_model_says_the_same_bit_for_bit(model, stages, tmp_path, estim
     np.testing.assert_array_equal(found.cloud.probability, estimate.cloud.probability)
     for name, mesh in estimate.meshes.items():
         np.testing.assert_array_equal(found.meshes[name].vertices_mm, mesh.vertices_mm)
+
+
+def test_a_model_calibrated_with_another_robust_kernel_is_refused(model, tmp_path):
+    assert "kernel" not in model.extra_entries()["trust"]  # as in folders that know no other
+    calibration = msgspec.structs.replace(model.calibration, kernel="huber")
+    save_model(replace(model, calibration=calibration), tmp_path)
+    with pytest.raises(ArtifactError, match=r"kernel huber; .* tumortrack train CASE"):
+        load_model(tmp_path, "cpu")
 
 
 def test_meshes_are_the_cts_carried_along(estimate):

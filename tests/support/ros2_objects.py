@@ -19,8 +19,8 @@ from unittest import mock
 from clock import PATIENCE_S, until
 from live_objects import PARTS, small_anatomy, small_frame
 from tumortrack.core.types import SensorCloud
-from tumortrack.live.ros.bus import Bus, open_bus
-from tumortrack.live.ros.messages import Messages
+from tumortrack.live.ros.bus import Bus
+from tumortrack.live.ros.ros2 import open_bus
 from tumortrack.live.ros.sensors import messages_seen
 from tumortrack.live.values import Observation, Source
 
@@ -41,8 +41,8 @@ def own_graph() -> Iterator[None]:
 class Frames:
     """Sends frames on topics under ``place``."""
 
-    def __init__(self, bus: Bus, messages: Messages, place: str) -> None:
-        self._bus, self._messages, self.place = bus, messages, place
+    def __init__(self, bus: Bus, place: str) -> None:
+        self._bus, self._messages, self.place = bus, bus.messages, place
         self._publishers: dict = {}
 
     def send(self, seen: Observation, leave_out: tuple[str, ...] = ()) -> None:
@@ -58,13 +58,12 @@ class Frames:
 @contextmanager
 def sending(kind: str, hz: float = 50) -> Iterator[str]:
     """Small frames (``image``) or clouds, stamped as they are sent; yields their topic."""
-    messages = Messages()
     place = f"/camera_{secrets.token_hex(4)}"
     over = threading.Event()
 
     def send() -> None:
-        bus = open_bus("dds", messages)
-        frames = Frames(bus, messages, place)
+        bus = open_bus("dds")
+        frames = Frames(bus, place)
         while not over.wait(1 / hz):
             now_ns = time.time_ns()
             cloud = SensorCloud(small_anatomy().organ.vertices_mm, now_ns)

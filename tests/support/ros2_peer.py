@@ -12,12 +12,12 @@ import time
 
 import numpy as np
 
-from live_objects import PARTS, empty_update, small_frame
+from live_objects import empty_update, small_frame, small_setting
 from tumortrack.core.types import DepthFrame, SensorCloud
-from tumortrack.live.ros.bus import open_bus
 from tumortrack.live.ros.dds import DdsBus
-from tumortrack.live.ros.messages import MARKERS, Messages, stamp_of
-from tumortrack.live.ros.results import DIAGNOSTICS, messages_of
+from tumortrack.live.ros.messages import stamp_of
+from tumortrack.live.ros.results import DIAGNOSTICS, MARKERS, ResultMessages
+from tumortrack.live.ros.ros2 import open_bus
 from tumortrack.live.ros.sensors import CLOUD, messages_seen, plain_cloud
 from tumortrack.live.values import Observation
 
@@ -37,8 +37,8 @@ def frame_numbered(number: int, stamp_ns: int) -> DepthFrame:
 
 
 def send(kind: str, hz: float, seconds: float) -> None:
-    messages = Messages()
-    bus = open_bus("dds", messages)
+    bus = open_bus("dds")
+    messages = bus.messages
     points = points_mm()
     mask = np.arange(48 * 64).reshape(48, 64) % 3 == 0
     publishers: dict = {}
@@ -63,10 +63,11 @@ def send(kind: str, hz: float, seconds: float) -> None:
 
 def hear(seconds: float) -> None:
     """Writes a line as soon as it listens, and one for every message."""
-    messages = Messages()
-    bus = open_bus("dds", messages)
+    bus = open_bus("dds")
+    messages = bus.messages
     _reliable = reliably(bus)
-    kinds = {one.suffix: one.message_type for one in messages_of(empty_update(), messages, PARTS)}
+    out = ResultMessages(messages, small_setting()).of(empty_update())
+    kinds = {one.suffix: one.message_type for one in out}
     heard = {name: bus.subscriber(f"/tumortrack/{name}", kind) for name, kind in kinds.items()}
     print(json.dumps({"listens": sorted(heard)}), flush=True)
     end_s = time.monotonic() + seconds
@@ -82,12 +83,11 @@ def hear(seconds: float) -> None:
 
 def reliably(bus: DdsBus) -> object:
     """A second reader of the cloud, whose writer has to wait for its acknowledgements."""
-    from cyclonedds.qos import Policy, Qos
+    from cyclonedds.qos import Policy
     from cyclonedds.sub import DataReader
 
-    topic = bus._topic("/tumortrack/cloud", CLOUD)
-    qos = Qos(Policy.Reliability.Reliable(0), Policy.History.KeepLast(1))
-    return DataReader(bus._member, topic, qos)
+    reliable, volatile = Policy.Reliability.Reliable(0), Policy.Durability.Volatile
+    return DataReader(*bus._endpoint("/tumortrack/cloud", CLOUD, reliable, volatile, 1))
 
 
 def told(message: object, kind: str) -> dict:

@@ -1,4 +1,4 @@
-"""The elastic objects' organ as a warp model knows it, and a training of seconds."""
+"""The elastic objects' organ as a `clinic` model knows it, and a training of seconds."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from elastic_objects import SMALL, UP, organ
 from tumortrack.core.types import Anatomy
 from tumortrack.models.config import NetworkConfig, TrainConfig
-from tumortrack.registration import residual_kernels as kernels
+from tumortrack.registration import kernels
 from tumortrack.registration.motion import ElasticMotion
 from tumortrack.registration.rest_shape import RestShape, shape_of
 from tumortrack.simulate.deform import ElasticConfig
@@ -52,21 +52,28 @@ def nudged(motion, shift_mm, turn_rad):
 def residual_rows(points_mm, pose) -> np.ndarray:
     """``kernels.add_rows`` of points at a (rotation, centre_mm, coefficients)."""
     rotation, centre_mm, coefficients = pose
-    body, field = shape().body, shape().distances[0]
+    body = shape().body
     velocity = body.velocity(-coefficients)
     rows = np.empty((len(points_mm), kernels.POSE + len(coefficients) + 1), np.float32)
     spacing_mm = np.float32(body.spacing_mm)
     known = (
-        kernels.Flow(velocity, body.origin_mm, spacing_mm, steps_for(velocity, body.spacing_mm)),
         body.modes,
+        shape().distances[0],
+        kernels.Flow(velocity, body.origin_mm, spacing_mm, steps_for(velocity, body.spacing_mm)),
         kernels.Pose(body.center_ct, rotation, centre_mm),
-        kernels.DistanceLattice(field.values_mm, field.origin_mm, np.float32(field.spacing_mm)),
     )
     points = np.ascontiguousarray(points_mm, np.float32)
     for first in range(0, len(points), BLOCK):
         some = slice(first, first + BLOCK)
         kernels.add_rows(*known, points[some], block(), rows[some])
     return rows
+
+
+def with_slope(field, points) -> tuple[np.ndarray, np.ndarray]:
+    """A field's distances at points (n, 3), and their slopes."""
+    lattice = field.values_mm, field.origin_mm, np.float32(field.spacing_mm)
+    found = np.array([kernels.distance_at(*lattice, *point) for point in points], np.float32)
+    return found[:, 0], found[:, 1:]
 
 
 def slim_network() -> NetworkConfig:

@@ -8,13 +8,7 @@ from jaxtyping import Float, UInt8
 Colour = tuple[int, int, int]
 
 KIDNEY: Colour = (185, 102, 83)
-TUMORS: tuple[Colour, ...] = (
-    (144, 238, 144),
-    (255, 205, 60),
-    (110, 190, 255),
-    (240, 130, 230),
-    (170, 150, 255),
-)
+TUMORS = ((144, 238, 144), (255, 205, 60), (110, 190, 255), (240, 130, 230), (170, 150, 255))
 SEEN: Colour = (112, 118, 126)
 ORGAN: Colour = (225, 230, 235)
 REGION: Colour = (64, 70, 82)
@@ -29,7 +23,7 @@ BACKGROUND: Colour = (22, 24, 29)
 BACKGROUND_NONE: Colour = (74, 8, 12)
 BACKGROUND_STALE: Colour = (48, 24, 72)
 
-_SWEEPS: tuple[Colour, ...] = ((0, 120, 240), (90, 60, 220), (205, 0, 130))
+_SWEEPS = ((0, 120, 240), (90, 60, 220), (205, 0, 130))
 
 # Probabilities from a guess to certainty.
 _LEVELS = (0.5, 0.75, 0.9, 1.0)
@@ -42,8 +36,7 @@ def part_colour(label: int) -> Colour:
 
 
 def label_colours(labels: UInt8[np.ndarray, " n"]) -> UInt8[np.ndarray, "n 3"]:
-    table = np.array([SEEN, *(part_colour(n) for n in range(1, 256))], np.uint8)
-    return table[labels]
+    return np.array([SEEN, *(part_colour(n) for n in range(1, 256))], np.uint8)[labels]
 
 
 def probability_colours(probability: Float[np.ndarray, " n"]) -> UInt8[np.ndarray, "n 3"]:

@@ -10,20 +10,15 @@ from tumortrack.core.errors import InputError
 
 
 class Config(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Base of every configuration value.
-
-    Subclasses that take part in a typed union (one kind, one file) add ``tag=...``. ``LATER``
-    names fields that came after the first hashes of such values; see ``identity``.
-    """
+    """Base of every configuration value. Subclasses that take part in a typed union (one kind, one
+    file) add ``tag=...``. ``LATER`` names fields that came after the first hashes of such values;
+    see ``identity``."""
 
     LATER: ClassVar[tuple[str, ...]] = ()
 
     def check_ranges(self, what: str, least: str = "0 (off)", **most: float) -> None:
-        """Refuse each named field that is not in 0..most; ``what`` names the configuration.
-
-        Raises:
-            InputError: with the allowed range, its lower end written as ``least``.
-        """
+        """Refuse each named field that is not in 0..most, by an InputError with this range, its
+        lower end written as ``least``; ``what`` names the configuration."""
         for name, limit in most.items():
             value = getattr(self, name)
             if not 0 <= value <= limit:
@@ -39,8 +34,8 @@ def to_builtins(config: msgspec.Struct) -> dict[str, Any]:
 
 
 def identity(config: msgspec.Struct) -> dict[str, Any]:
-    """``to_builtins`` for hashing: fields named in ``LATER`` are left out at their default, so
-    that artifacts from before there was such a field keep their hash."""
+    """``to_builtins`` without the fields named in ``LATER`` where they have their default, so that
+    artifacts from before there was such a field keep their hash."""
     written = to_builtins(config)
     _drop_later(config, written)
     return written
@@ -53,24 +48,18 @@ def _drop_later(value: Any, written: Any) -> None:
     elif isinstance(value, Config):
         for field in msgspec.structs.fields(value):
             here = getattr(value, field.name)
-            if field.name in value.LATER and here == _default(field):
+            default = field.default
+            if field.default_factory is not msgspec.NODEFAULT:
+                default = field.default_factory()
+            if field.name in value.LATER and here == default:
                 del written[field.name]
             else:
                 _drop_later(here, written[field.name])
 
 
-def _default(field: msgspec.structs.FieldInfo) -> Any:
-    if field.default_factory is not msgspec.NODEFAULT:
-        return field.default_factory()
-    return field.default
-
-
 def from_builtins(data: object, kind: type[C], where: str) -> C:
-    """Rebuild a configuration; ``where`` names its origin in the error.
-
-    Raises:
-        InputError: unknown key, wrong type or missing value.
-    """
+    """Rebuild a configuration. An unknown key, wrong type or missing value is an InputError, in
+    which ``where`` names the origin."""
     try:
         return msgspec.convert(data, kind)
     except msgspec.ValidationError as error:

@@ -4,11 +4,8 @@ from __future__ import annotations
 
 
 class TumortrackError(Exception):
-    """Base of every error that tumortrack raises on purpose.
-
-    The command line prints its text as one line and exits with ``exit_code``; any other
-    exception is a defect of ours and keeps its traceback.
-    """
+    """Base of every error raised on purpose: the command line prints its text as one line and exits
+    with ``exit_code``. Any other exception is a defect of ours and keeps its traceback."""
 
     exit_code = 1
 

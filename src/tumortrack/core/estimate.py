@@ -11,39 +11,33 @@ from jaxtyping import Float
 
 from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError
+from tumortrack.core.geometry import Points
 from tumortrack.core.types import CameraLabels, Mesh, OccupancyCloud
 
 LARGEST_GRID = 400
-Points = Float[np.ndarray, "n 3"]
-Carry = Callable[[Points], Points]
 
 
 @runtime_checkable
 class Motion(Protocol):
-    """One frame's correspondence: undeformed CT (LPS, mm) <-> camera frame (mm).
-
-    It takes any finite points, also outside the organ, and returns finite ones.
-    """
+    """One frame's correspondence: undeformed CT (LPS, mm) <-> camera frame (mm). It takes any
+    finite points, also outside the organ, and returns finite ones."""
 
     def carry(self, points_ct: Points, /) -> Points:
         """CT points in the camera frame."""
-        ...
 
     def back(self, points_camera: Points, /) -> Points | None:
         """Camera points in the undeformed CT; None if the method knows only ``carry``."""
-        ...
 
     def std_mm(self, points_ct: Points, /) -> Float[np.ndarray, " n"] | None:
         """Uncertainty of ``carry`` at each point: one standard deviation along any axis, mm; None
         where the method does not know it."""
-        ...
 
 
 @dataclass(frozen=True, eq=False)
 class OneWay:
     """The motion of a method that knows only the way from the CT to the camera."""
 
-    carry: Carry
+    carry: Callable[[Points], Points]
 
     def back(self, points_camera: Points, /) -> None:
         return None
@@ -53,12 +47,9 @@ class OneWay:
 
 
 class Following(Config, frozen=True, kw_only=True):
-    """How one frame of many is located.
-
-    thorough: also search without the last estimate, and keep the better fit: a search near the
-        last answer alone would keep its error.
-    smoothing_s: time constant of the mean over past estimates; 0: none.
-    """
+    """How one frame of many is located. ``thorough``: also search without the last estimate, and
+    keep the better fit: a search near the last answer alone would keep its error. ``smoothing_s``:
+    time constant of the mean over past estimates; 0: none."""
 
     thorough: bool = False
     smoothing_s: float = 0.0
@@ -80,9 +71,8 @@ class Estimate:
         meshes: kidney, tumor_1, ... -> closed surfaces; a part that was not found is absent. The
             kidney's surface is the whole organ, tumors included, as in ``Anatomy``.
         report: plain JSON: per part volume, centre, box and probability; ``timings`` in seconds.
-        motion: where every point of the CT is, if the method knows that.
-        unsmoothed: the motion before the mean over past frames: the next frame's search starts
-            from it.
+        motion: where every point of the CT is, if the method knows that; ``unsmoothed``: before the
+            mean over past frames: the next frame's search starts from it.
     """
 
     cloud: OccupancyCloud

@@ -7,8 +7,14 @@ from jaxtyping import Float
 
 from tumortrack.core.errors import InputError
 
+Direction = tuple[float, float, float]
+Points = Float[np.ndarray, "n 3"]
+Affine = Float[np.ndarray, "4 4"]
+Matrix = Float[np.ndarray, "3 3"]
+Vector = Float[np.ndarray, " 3"]
+
 # Patient frame, DICOM: +x Left, +y Posterior, +z Superior (LPS).
-DIRECTIONS_LPS: dict[str, tuple[float, float, float]] = {
+DIRECTIONS_LPS: dict[str, Direction] = {
     "left": (1.0, 0.0, 0.0),
     "right": (-1.0, 0.0, 0.0),
     "posterior": (0.0, 1.0, 0.0),
@@ -21,18 +27,13 @@ DIRECTIONS_LPS: dict[str, tuple[float, float, float]] = {
 RAS_FROM_LPS = np.diag([-1.0, -1.0, 1.0, 1.0])
 
 
-def transform_points(
-    b_from_a: Float[np.ndarray, "4 4"], points_a: Float[np.ndarray, "n 3"]
-) -> Float[np.ndarray, "n 3"]:
+def transform_points(b_from_a: Affine, points_a: Points) -> Points:
     """Carry points (n, 3) from frame a to frame b by a 4 x 4 affine transform."""
-    return points_a @ b_from_a[:3, :3].T.astype(points_a.dtype) + b_from_a[:3, 3].astype(
-        points_a.dtype
-    )
+    linear, shift = b_from_a[:3, :3].T, b_from_a[:3, 3]
+    return points_a @ linear.astype(points_a.dtype) + shift.astype(points_a.dtype)
 
 
-def rigid(
-    rotation: Float[np.ndarray, "3 3"], translation_mm: Float[np.ndarray, " 3"]
-) -> Float[np.ndarray, "4 4"]:
+def rigid(rotation: Matrix, translation_mm: Vector) -> Affine:
     """A 4 x 4 transform from a rotation matrix and a translation in mm."""
     b_from_a = np.eye(4)
     b_from_a[:3, :3] = rotation
@@ -40,12 +41,9 @@ def rigid(
     return b_from_a
 
 
-def rotation_onto(
-    source: Float[np.ndarray, " 3"], target: Float[np.ndarray, " 3"]
-) -> Float[np.ndarray, "3 3"]:
+def rotation_onto(source: Vector, target: Vector) -> Matrix:
     """The smallest rotation matrix that turns the direction ``source`` onto ``target``."""
-    a = np.asarray(source, float) / np.linalg.norm(source)
-    b = np.asarray(target, float) / np.linalg.norm(target)
+    a, b = unit(np.asarray(source, float)), unit(np.asarray(target, float))
     middle = a + b
     if np.linalg.norm(middle) < 1e-8:  # opposite: half a turn about any perpendicular axis
         middle = np.cross(a, np.eye(3)[np.argmin(np.abs(a))])
@@ -54,12 +52,9 @@ def rotation_onto(
     return (np.eye(3) - 2 * np.outer(middle, middle)) @ (np.eye(3) - 2 * np.outer(a, a))
 
 
-def direction_lps(text: str) -> tuple[float, float, float]:
-    """A unit vector in LPS from a name (``anterior``) or three numbers (``0,-1,0``).
-
-    Raises:
-        InputError: neither a known name nor a non-zero finite 3-vector.
-    """
+def direction_lps(text: str) -> Direction:
+    """A unit vector in LPS from a name (``anterior``) or three numbers (``0,-1,0``); InputError for
+    neither a known name nor a non-zero finite 3-vector."""
     if text.lower() in DIRECTIONS_LPS:
         return DIRECTIONS_LPS[text.lower()]
     try:
@@ -76,16 +71,16 @@ def direction_lps(text: str) -> tuple[float, float, float]:
     return (x, y, z)
 
 
-def spacing_mm(frame_from_index: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, " 3"]:
+def spacing_mm(frame_from_index: Affine) -> Vector:
     """Voxel edge lengths in mm along the three array axes."""
     return np.linalg.norm(frame_from_index[:3, :3], axis=0)
 
 
-def unit(vector: Float[np.ndarray, " 3"]) -> Float[np.ndarray, " 3"]:
+def unit(vector: Vector) -> Vector:
     """The same direction with length 1."""
     return vector / np.linalg.norm(vector)
 
 
-def perpendicular(vector: Float[np.ndarray, " 3"]) -> Float[np.ndarray, " 3"]:
+def perpendicular(vector: Vector) -> Vector:
     """Some unit vector at right angles to a vector."""
     return unit(np.cross(vector, np.eye(3)[np.argmin(np.abs(vector))]))

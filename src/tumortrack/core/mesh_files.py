@@ -15,11 +15,8 @@ _SPACE, _STL_HEADER = b"SPACE=LPS", 80
 
 
 def read_mesh(path: Path) -> Mesh:
-    """Read one triangle mesh (PLY, STL or OBJ) as it is, equal vertices merged.
-
-    Raises:
-        InputError: missing, too large, not a mesh, or without triangles.
-    """
+    """Read one triangle mesh (PLY, STL or OBJ) as it is, equal vertices merged; InputError where it
+    is missing, too large, no mesh or without triangles."""
     import trimesh
 
     if path.suffix.lower() not in SUFFIXES:
@@ -48,18 +45,13 @@ def read_mesh(path: Path) -> Mesh:
 
 
 def write_mesh(path: Path, mesh: Mesh) -> None:
-    """Write a binary PLY (or STL, by suffix), vertices in mm, in the mesh's own frame.
-
-    The header states ``SPACE=LPS``, which 3D Slicer looks for; also for meshes in the camera frame:
-    Slicer shows all files of a run as if their frame were the patient's.
-
-    Raises:
-        StorageError: the disk refused.
-    """
+    """Write a binary PLY (or STL, by suffix), vertices in mm, in the mesh's own frame. The header
+    states ``SPACE=LPS``, which 3D Slicer looks for; also for meshes in the camera frame: Slicer
+    shows all files of a run as if their frame were the patient's. StorageError where the disk
+    refuses."""
     kind = path.suffix.lower().removeprefix(".")
-    data = _ply(mesh) if kind == "ply" else _exported(mesh, kind)
     try:
-        path.write_bytes(data)
+        path.write_bytes(_ply(mesh) if kind == "ply" else _exported(mesh, kind))
     except OSError as error:
         raise StorageError(f"cannot write {path}: {error.strerror}.") from error
 
@@ -95,11 +87,8 @@ def write_anatomy(folder: Path, anatomy: Anatomy) -> None:
 
 
 def read_anatomy(folder: Path) -> Anatomy:
-    """kidney.ply and tumor_1.ply, tumor_2.ply, ... (without a gap) from a folder.
-
-    Raises:
-        InputError: no kidney.ply, or a mesh that cannot be read.
-    """
+    """kidney.ply and tumor_1.ply, tumor_2.ply, ... (without a gap) from a folder; InputError where
+    there is no kidney.ply, or a mesh cannot be read."""
     parts = [read_mesh(folder / "kidney.ply")]
     while (path := folder / f"tumor_{len(parts)}.ply").exists():
         parts.append(read_mesh(path))

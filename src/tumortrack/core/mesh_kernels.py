@@ -7,10 +7,8 @@ import numba
 
 @numba.njit(cache=True, fastmath=True, nogil=True)
 def signed_volume(vertices, faces):  # type: ignore[no-untyped-def]
-    """Sum over faces (f, 3) of their area seen along z times their height over the first vertex.
-
-    A closed surface's volume, positive where faces turn outward.
-    """
+    """Sum over faces (f, 3) of their area seen along z times their height over the first vertex. A
+    closed surface's volume, positive where faces turn outward."""
     triple = 0.0
     for n in range(len(faces)):
         a, b, c = vertices[faces[n, 0]], vertices[faces[n, 1]], vertices[faces[n, 2]]

@@ -24,11 +24,8 @@ def is_follower() -> bool:
 
 def available_cores(cgroups: Path = _CGROUPS) -> int:
     """Cores for this process by its affinity mask and its container's quota: 1 or more."""
-    if hasattr(os, "sched_getaffinity"):  # Linux only
-        cores = len(os.sched_getaffinity(0))
-    else:
-        cores = os.cpu_count() or 1
-    quota = _quota(cgroups)
+    affinity = getattr(os, "sched_getaffinity", None)  # Linux only
+    cores, quota = len(affinity(0)) if affinity else os.cpu_count() or 1, _quota(cgroups)
     return cores if quota is None else max(1, min(cores, round(quota)))
 
 
@@ -47,11 +44,9 @@ def _quota(cgroups: Path) -> float | None:
 
 def parallel_for(body: Callable[[slice], object], count: int, chunk: int) -> None:
     """Call ``body`` on every chunk of ``range(count)``, on two threads where there are two cores.
-
     The chunks do not depend on the number of cores, so sums over them do not either. The second
     thread helps only where ``body`` releases Python's lock; if it starts too late, nobody waits
-    for it. ``NUMBA_NUM_THREADS=1`` keeps all work on the calling thread.
-    """
+    for it. ``NUMBA_NUM_THREADS=1`` keeps all work on the calling thread."""
     chunks = deque(slice(first, first + chunk) for first in range(0, count, chunk))
 
     def drain() -> None:
@@ -79,18 +74,16 @@ def _helper(process: int) -> ThreadPoolExecutor | None:
 def keep_freed_memory() -> None:
     """Make glibc keep freed blocks: page faults cost more than the memory. Training on a CPU
     becomes about a tenth faster. No effect with other C libraries."""
-    _set_malloc_options({_M_MMAP_MAX: 0, _M_TRIM_THRESHOLD: 2**31 - 1})
+    _mallopt({_M_MMAP_MAX: 0, _M_TRIM_THRESHOLD: 2**31 - 1})
 
 
 def keep_small_blocks() -> None:
     """The same for blocks of up to 32 MB, which is all that a frame needs: ``clinic`` takes a third
     less time. Larger blocks, of volumes, are still returned to the system."""
-    _set_malloc_options(
-        {_M_MMAP_MAX: _MMAP_MAX, _M_MMAP_THRESHOLD: _SMALL, _M_TRIM_THRESHOLD: 8 * _SMALL}
-    )
+    _mallopt({_M_MMAP_MAX: _MMAP_MAX, _M_MMAP_THRESHOLD: _SMALL, _M_TRIM_THRESHOLD: 8 * _SMALL})
 
 
-def _set_malloc_options(options: dict[int, int]) -> None:
+def _mallopt(options: dict[int, int]) -> None:
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None) if sys.platform == "linux" else None
     if mallopt is not None:
         for option, value in options.items():

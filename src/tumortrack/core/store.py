@@ -36,11 +36,8 @@ def sha256_of(path: Path) -> str:
 
 
 def write_atomically(path: Path, content: bytes) -> None:
-    """Write a file so that a reader sees the old or the new content, never a part.
-
-    Raises:
-        StorageError: the disk is full or not writable; the old file is untouched.
-    """
+    """Write a file so that a reader sees the old or the new content, never a part. StorageError
+    where the disk is full or not writable; the old file is then untouched."""
     aside = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
         with aside.open("wb") as stream:
@@ -61,11 +58,7 @@ def write_json(path: Path, data: object) -> None:
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """Read a JSON object.
-
-    Raises:
-        ArtifactError: missing, too large, or not a JSON object.
-    """
+    """Read a JSON object; ArtifactError where it is missing, too large, or none."""
     try:
         if path.stat().st_size > _LARGEST_MANIFEST:
             raise ArtifactError(f"{path} is larger than 16 MiB; this is no file of ours.")
@@ -84,35 +77,21 @@ def seal(folder: Path, kind: str, content: dict[str, Any], frame: str) -> None:
         for p in sorted(folder.iterdir())
         if p.is_file() and p.name != MANIFEST and not p.name.startswith(".")
     }
-    manifest = {
-        "kind": kind,
-        "schema": SCHEMA,
-        "tumortrack": tumortrack.__version__,
-        "units": "mm",
-        "frame": frame,
-        **content,
-        "files": files,
-    }
-    write_json(folder / MANIFEST, manifest)
+    head = {"kind": kind, "schema": SCHEMA, "tumortrack": tumortrack.__version__, "units": "mm"}
+    write_json(folder / MANIFEST, {**head, "frame": frame, **content, "files": files})
 
 
 def check_place(path: Path, kind: str, overwrite: bool) -> None:
-    """Refuse to write an artifact where something lies that must stay.
-
-    ``overwrite`` replaces an empty folder or an artifact of the same kind in which nothing else
-    lies, and nothing but that: a mistyped path must not cost the user's files.
-
-    Raises:
-        InputError: something else is there, or anything without ``overwrite``.
-    """
+    """InputError for a place where something lies that must stay: ``overwrite`` replaces an empty
+    folder or an artifact of the same kind in which nothing else lies, and nothing but that, for a
+    mistyped path must not cost the user's files."""
     if not path.exists():
         return
     if not overwrite:
         raise InputError(f"{path} exists already. Choose another path, or give --overwrite.")
     if not path.is_dir():
         raise InputError(f"{path} is a file; --overwrite replaces only a {kind} folder.")
-    inside = [p.name for p in path.iterdir()]
-    if not inside:
+    if not (inside := [p.name for p in path.iterdir()]):
         return
     manifest = read_json(path / MANIFEST) if MANIFEST in inside else {}
     files = manifest.get("files")
@@ -121,8 +100,8 @@ def check_place(path: Path, kind: str, overwrite: bool) -> None:
             f"{path} is no {kind} of tumortrack's, so --overwrite does not replace it. Choose "
             "another path, or move the folder away yourself."
         )
-    strays = [name for name in sorted(inside) if name not in (MANIFEST, *files)]
-    if strays := [name for name in strays if not name.startswith(".")]:
+    known = (MANIFEST, *files)
+    if strays := [n for n in sorted(inside) if n not in known and not n.startswith(".")]:
         raise InputError(
             f"{path} also holds {', '.join(strays[:3])}, which no {kind} has; --overwrite would "
             "lose it. Move it away first, or choose another path."
@@ -131,17 +110,11 @@ def check_place(path: Path, kind: str, overwrite: bool) -> None:
 
 @contextmanager
 def new_folder(path: Path, overwrite: bool = False) -> Iterator[Path]:
-    """Fill a folder aside, then move it to ``path`` in one step; on any error nothing appears.
-
-    What it replaces must be empty or of the kind that the new folder's manifest states: see
-    ``check_place``.
-
-    Raises:
-        InputError: ``path`` exists and ``overwrite`` is False, or it may not be replaced.
-        StorageError: the disk is full or not writable.
-    """
-    if path.exists() and not overwrite:
-        raise InputError(f"{path} exists already. Choose another path, or give --overwrite.")
+    """Fill a folder aside, then move it to ``path`` in one step; on any error nothing appears. What
+    it replaces must be empty or of the kind that the new folder's manifest states: InputError as by
+    ``check_place``. StorageError where the disk is full or not writable."""
+    if not overwrite:
+        check_place(path, "", overwrite)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         aside = Path(tempfile.mkdtemp(prefix=f".{path.name}.", suffix=".part", dir=path.parent))
@@ -150,20 +123,20 @@ def new_folder(path: Path, overwrite: bool = False) -> Iterator[Path]:
     try:
         yield aside
         aside.chmod(0o755)
-        if path.exists():
-            sealed = (aside / MANIFEST).is_file()
-            kind = str(read_json(aside / MANIFEST).get("kind")) if sealed else "unsealed folder"
-            check_place(path, kind, overwrite)
-            old = aside.with_suffix(".old")
-            os.rename(path, old)
-            try:
-                os.rename(aside, path)
-            except OSError:
-                os.rename(old, path)
-                raise
-            _remove(old)
-        else:
+        if not path.exists():
             os.rename(aside, path)
+            return
+        sealed = (aside / MANIFEST).is_file()
+        kind = str(read_json(aside / MANIFEST).get("kind")) if sealed else "unsealed folder"
+        check_place(path, kind, overwrite)
+        old = aside.with_suffix(".old")
+        os.rename(path, old)
+        try:
+            os.rename(aside, path)
+        except OSError:
+            os.rename(old, path)
+            raise
+        _remove(old)
     except OSError as error:
         raise StorageError(f"cannot write {path}: {error.strerror or error}.") from error
     finally:
@@ -178,11 +151,8 @@ def _remove(path: Path) -> None:
 
 
 def read_manifest(folder: Path, kind: str) -> dict[str, Any]:
-    """The manifest of an artifact of this kind, every file's sha256 checked.
-
-    Raises:
-        ArtifactError: no such folder, another kind or schema, a file missing or changed.
-    """
+    """The manifest of an artifact of this kind, every file's sha256 checked; ArtifactError for no
+    such folder, another kind or schema, a file missing or changed."""
     if not (folder / MANIFEST).is_file():
         raise ArtifactError(
             f"{folder} is not a tumortrack {kind}: it has no {MANIFEST}. "

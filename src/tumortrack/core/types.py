@@ -20,29 +20,27 @@ OUTSIDE, ORGAN, FIRST_TUMOR = 0, 1, 2
 
 def _freeze(value: object, name: str, dtype: npt.DTypeLike, shape: tuple[int | None, ...]) -> None:
     """Convert one field to a read-only array and check its shape (None: any length)."""
-    given = np.asarray(getattr(value, name))
+    given, field = np.asarray(getattr(value, name)), f"{type(value).__name__}.{name}"
     if given.dtype == dtype and given.flags.owndata and not given.flags.writeable:
         array = given  # frozen already, by another value
     else:
         array = given.astype(dtype)  # a copy: the caller's stays writable
     if array.dtype.kind in "iu" and array.dtype != given.dtype and (array != given).any():
         raise InputError(
-            f"{type(value).__name__}.{name} has numbers that are no {array.dtype}; give whole "
+            f"{field} has numbers that are no {array.dtype}; give whole "
             f"numbers in {np.iinfo(array.dtype).min}..{np.iinfo(array.dtype).max}."
         )
-    good = array.ndim == len(shape) and all(
-        want is None or want == have for want, have in zip(shape, array.shape, strict=False)
-    )
-    if not good:
+    pairs = zip(shape, array.shape, strict=False)
+    if array.ndim != len(shape) or any(want not in (None, have) for want, have in pairs):
         wanted = " x ".join("n" if s is None else str(s) for s in shape)
-        raise InputError(
-            f"{type(value).__name__}.{name} has shape {array.shape}; it must be {wanted}."
-        )
+        raise InputError(f"{field} has shape {array.shape}; it must be {wanted}.")
     array.flags.writeable = False
     object.__setattr__(value, name, array)
 
 
-def _check_affine(value: object, name: str) -> None:
+def _freeze_grid(value: object, values: str, dtype: npt.DTypeLike, name: str) -> None:
+    """The same for values on a voxel grid, and its affine transform."""
+    _freeze(value, values, dtype, (None, None, None))
     _freeze(value, name, np.float64, (4, 4))
     affine = getattr(value, name)
     if not np.isfinite(affine).all() or abs(np.linalg.det(affine[:3, :3])) < 1e-9:
@@ -60,8 +58,7 @@ class Volume:
     lps_from_index: Float64[np.ndarray, "4 4"]
 
     def __post_init__(self) -> None:
-        _freeze(self, "hu", np.float32, (None, None, None))
-        _check_affine(self, "lps_from_index")
+        _freeze_grid(self, "hu", np.float32, "lps_from_index")
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,8 +69,7 @@ class LabelVolume:
     lps_from_index: Float64[np.ndarray, "4 4"]
 
     def __post_init__(self) -> None:
-        _freeze(self, "labels", np.uint8, (None, None, None))
-        _check_affine(self, "lps_from_index")
+        _freeze_grid(self, "labels", np.uint8, "lps_from_index")
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,8 +80,7 @@ class CameraLabels:
     camera_from_index: Float64[np.ndarray, "4 4"]
 
     def __post_init__(self) -> None:
-        _freeze(self, "labels", np.uint8, (None, None, None))
-        _check_affine(self, "camera_from_index")
+        _freeze_grid(self, "labels", np.uint8, "camera_from_index")
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,9 +95,8 @@ class Mesh:
         _freeze(self, "faces", np.int32, (None, 3))
         if not np.isfinite(self.vertices_mm).all():
             raise InputError("the mesh has NaN or infinite vertices. Export it again.")
-        if len(self.faces) and not (
-            self.faces.min() >= 0 and self.faces.max() < len(self.vertices_mm)
-        ):
+        faces = self.faces
+        if len(faces) and not (faces.min() >= 0 and faces.max() < len(self.vertices_mm)):
             raise InputError("the mesh has faces that name vertices it does not have.")
 
     @cached_property
@@ -125,9 +119,8 @@ class Mesh:
 
 @dataclass(frozen=True, eq=False)
 class Anatomy:
-    """Closed surfaces, outermost first: ``parts[0]`` is the whole organ, tumors included
-    (the union), so that it is the visible surface; ``parts[n]`` is the tumor labelled n + 1.
-    """
+    """Closed surfaces, outermost first: ``parts[0]`` is the whole organ, tumors included (the
+    union), so that it is the visible surface; ``parts[n]`` is the tumor labelled n + 1."""
 
     parts: tuple[Mesh, ...]
 
@@ -166,11 +159,9 @@ class Intrinsics:
     cy: float
 
     def __post_init__(self) -> None:
-        numbers = [float(getattr(self, f.name)) for f in fields(self)]
-        if not np.isfinite(numbers).all() or min(self.fx, self.fy) <= 0:
-            raise InputError(
-                f"intrinsics {numbers} are not usable; fx and fy must be positive pixels."
-            )
+        six = [float(getattr(self, f.name)) for f in fields(self)]
+        if not np.isfinite(six).all() or min(self.fx, self.fy) <= 0:
+            raise InputError(f"intrinsics {six} are not usable; fx and fy must be positive pixels.")
         if not (0 < self.width <= 8192 and 0 < self.height <= 8192):
             raise InputError("intrinsics: width and height must lie in 1..8192 pixels.")
 
@@ -205,18 +196,6 @@ class SensorCloud:
             raise InputError(
                 "the cloud has NaN or infinite points; remove them first (no return is no point)."
             )
-
-
-@dataclass(frozen=True, eq=False)
-class OccupancySamples:
-    """Labelled training points, camera frame, mm."""
-
-    points_mm: Float32[np.ndarray, "n 3"]
-    labels: UInt8[np.ndarray, " n"]
-
-    def __post_init__(self) -> None:
-        _freeze(self, "points_mm", np.float32, (None, 3))
-        _freeze(self, "labels", np.uint8, (len(self.points_mm),))
 
 
 @dataclass(frozen=True, eq=False)

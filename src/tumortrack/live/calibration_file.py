@@ -19,12 +19,10 @@ Rows = tuple[tuple[float, float, float, float], ...]
 
 
 class CalibrationFile(Config, frozen=True, kw_only=True):
-    """A file that says where the camera is, in one of three ways, each by 4 x 4 rows.
-
-    ``camera_from_robot`` or ``robot_from_camera``: of a hand-eye calibration.
+    """A file that says where the camera is, in one of three ways, each by 4 x 4 rows:
+    ``camera_from_robot`` or ``robot_from_camera``, of a hand-eye calibration, or
     ``camera_from_marker`` with ``robot_from_marker``: a marker that both know. ``unit``: of the
-    translations. ``frame_id``: the robot's frame, as ROS calls it.
-    """
+    translations. ``frame_id``: the robot's frame, as ROS calls it."""
 
     frame_id: str
     unit: Literal["mm", "m"]
@@ -35,35 +33,27 @@ class CalibrationFile(Config, frozen=True, kw_only=True):
 
 
 def read_frames(path: Path) -> PublishedFrame:
-    """The robot's frame of a calibration file (JSON; keys as in ``CalibrationFile``).
-
-    Raises:
-        InputError: missing, an unknown key, a matrix that is no rigid transform, or not exactly one
-            of the three ways.
-    """
+    """The robot's frame of a calibration file (JSON; keys as in ``CalibrationFile``). Raises
+    InputError if it is missing, or has an unknown key, a matrix that is no rigid transform, or not
+    exactly one of the three ways."""
     file = from_builtins(read_json(path), CalibrationFile, str(path))
     matrices = {
         name: _rigid(rows, file.unit, f"{path}: {name}")
-        for name in (
-            "camera_from_robot",
-            "robot_from_camera",
-            "camera_from_marker",
-            "robot_from_marker",
-        )
-        if (rows := getattr(file, name)) is not None
+        for name in CalibrationFile.__struct_fields__
+        if isinstance(rows := getattr(file, name), tuple)
     }
-    if set(matrices) == {"robot_from_camera"}:
-        robot_from_camera = matrices["robot_from_camera"]
-    elif set(matrices) == {"camera_from_robot"}:
-        robot_from_camera = np.linalg.inv(matrices["camera_from_robot"])
-    elif set(matrices) == {"camera_from_marker", "robot_from_marker"}:
-        marker_from_camera = np.linalg.inv(matrices["camera_from_marker"])
-        robot_from_camera = matrices["robot_from_marker"] @ marker_from_camera
-    else:
-        raise InputError(
-            f"{path} must have camera_from_robot, or robot_from_camera, or camera_from_marker and "
-            f"robot_from_marker; it has {', '.join(matrices) or 'none of them'}."
-        )
+    match list(matrices.items()):
+        case [("robot_from_camera", robot_from_camera)]:
+            pass
+        case [("camera_from_robot", camera_from_robot)]:
+            robot_from_camera = np.linalg.inv(camera_from_robot)
+        case [("camera_from_marker", camera_from_marker), ("robot_from_marker", robot_from_marker)]:
+            robot_from_camera = robot_from_marker @ np.linalg.inv(camera_from_marker)
+        case _:
+            raise InputError(
+                f"{path} must have camera_from_robot, or robot_from_camera, or camera_from_marker "
+                f"and robot_from_marker; it has {', '.join(matrices) or 'none of them'}."
+            )
     if not file.frame_id.strip():
         raise InputError(f"{path}: frame_id is empty; give the robot's frame, base_link say.")
     return PublishedFrame(file.frame_id, robot_from_camera)

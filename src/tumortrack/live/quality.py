@@ -83,12 +83,14 @@ class StampCheck:
         self._last_ns = -1
         self._behind: list[int] = []
 
-    def check(self, stamp_ns: int, age_s: float) -> bool:
+    def check(self, stamp_ns: int, age_s: float, other_clock: bool = True) -> bool:
         """True if the clock was set back. ``age_s``: how long ago the frame was made, or came, as
-        far as is known. Raises NoEstimate for a frame that is stale or out of order."""
+        far as is known; ``other_clock``: by a camera's clock against this computer's. Raises
+        NoEstimate for a frame that is stale or out of order."""
         clocks = "the clocks of camera and computer"
         if age_s > self._stale_s:
-            raise NoEstimate(f"the frame is stale: {age_s:.2f} s old, if {clocks} agree")
+            doubt = f", if {clocks} agree" if other_clock else ""
+            raise NoEstimate(f"the frame is stale: {age_s:.2f} s old{doubt}")
         if age_s < -_AHEAD_S:
             raise NoEstimate(
                 f"the frame's stamp lies {-age_s:.2f} s in the future: {clocks} disagree"

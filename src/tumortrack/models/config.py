@@ -13,11 +13,9 @@ from tumortrack.simulate.scene import SceneConfig
 
 class MlpDecoderConfig(Config, frozen=True, tag="mlp"):
     """``hidden_layers`` of ``width`` with ReLU, then one linear layer to the classes' logits.
-
     ``skip_layer``: this hidden layer (counted from 1) sees [latent, query] again; None: no skip.
     ``norm_layers``: hidden layers (from 1) with batch norm between linear part and ReLU.
-    ``octaves``: k of sin and cos(2^k pi q) that join each raw coordinate q; () for raw alone.
-    """
+    ``octaves``: k of sin and cos(2^k pi q) that join each raw coordinate q; () for raw alone."""
 
     n_classes: int
     width: int
@@ -59,12 +57,10 @@ class NetworkConfig(Config, frozen=True):
 
 class GaussNewtonConfig(Config, frozen=True):
     """``n_effective``: independent points in a cloud: errors of neighbours are correlated.
-
     ``sigma_mm``: of a point that belongs to the organ, model errors included. ``first_mm`` and
     ``last_mm``: the robust kernel's width falls from the one to the other; a point pulls most at
-    0.58 of it, and points far beyond do not count. ``shift_mm``, ``turn_rad``: how far the start
-    may be off.
-    """
+    0.58 of it, and points far beyond do not count. ``shift_mm``, ``turn_rad``: how far a hypothesis
+    may be off."""
 
     steps: int = 20
     n_effective: float = 300.0
@@ -78,11 +74,8 @@ class GaussNewtonConfig(Config, frozen=True):
 
 
 class Schedule(Config, frozen=True):
-    """Learning rate over the run.
-
-    ``decay``: linear warm-up, then constant, then cosine to zero over the last ``tail`` of the
-    steps; ``exponential``: times ``gamma`` after each ``epoch_pairs`` samples.
-    """
+    """Learning rate. ``decay``: linear warm-up, then constant, then cosine to zero over the last
+    ``tail`` of the steps; ``exponential``: times ``gamma`` after each ``epoch_pairs`` samples."""
 
     kind: Literal["decay", "exponential"] = "decay"
     learning_rate: float = 2e-3

@@ -19,11 +19,8 @@ def is_finished(folder: Path) -> bool:
 
 
 def read_model_manifest(folder: Path) -> dict[str, Any]:
-    """The manifest of a finished model.
-
-    Raises:
-        ArtifactError: no model, not finished, of another schema, a file missing or changed.
-    """
+    """The manifest of a finished model; ArtifactError for no model, a training that has not ended,
+    another schema, a file missing or changed."""
     if not is_finished(folder) and (folder / "training").is_dir():
         raise ArtifactError(
             f"{folder} holds a training that has not ended. Run the same `tumortrack train` "

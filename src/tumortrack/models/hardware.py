@@ -8,11 +8,7 @@ from tumortrack.core.errors import InputError
 
 
 def choose_device(device: str) -> torch.device:
-    """``auto`` takes CUDA if it is available.
-
-    Raises:
-        InputError: ``cuda`` is requested and not available.
-    """
+    """``auto`` takes CUDA if it is available; ``cuda`` where it is not is an InputError."""
     if device == "cuda" and not torch.cuda.is_available():
         raise InputError("--device cuda: PyTorch sees no CUDA GPU here. Use --device cpu or auto.")
     if device == "auto":

@@ -12,7 +12,9 @@ from jaxtyping import Float
 
 from tumortrack.core.config import Config
 from tumortrack.core.errors import NoEstimate
+from tumortrack.core.geometry import Points
 
+Distances = Float[np.ndarray, " n"]
 _SHARE = 80  # per cent of the points that must fit: a tenth may be background
 
 # Validation scenes hold noise, background and deformation, yet not all that occurs.
@@ -30,64 +32,59 @@ _LARGEST_MAHALANOBIS_2 = 1.25
 
 
 class InDistributionRange(Config, frozen=True):
-    """What the clouds of the validation scenes were like.
-
-    ``spread_mm``: smallest and largest ``spread_mm``; ``fit_mm``: the 95th percentile over the
-    scenes of ``fit_mm``.
-    """
+    """What the clouds of the validation scenes were like: smallest and largest ``spread_mm``, and
+    the 95th percentile of ``fit_mm``."""
 
     spread_mm: tuple[float, float]
     fit_mm: float
 
 
-def spread_mm(points_mm: Float[np.ndarray, "n 3"]) -> float:
+def spread_mm(points_mm: Points) -> float:
     """The distance from their median within which four fifths of the points lie."""
     middle = np.median(points_mm, axis=0)
     return float(np.percentile(np.linalg.norm(points_mm - middle, axis=1), _SHARE))
 
 
-def fit_mm(distances_mm: Float[np.ndarray, " n"]) -> float:
+def fit_mm(distances_mm: Distances) -> float:
     """The distance within which four fifths of the points lie from the surface."""
     return float(np.percentile(distances_mm, _SHARE))
 
 
-def check_in_distribution(known: InDistributionRange, spread: float, fit: float) -> None:
-    """Refuse what cannot be the organ.
-
-    Raises:
-        NoEstimate: the points spread over much more or less than in any validation scene, or
-            lie much farther from the estimated surface.
-    """
+def check_in_distribution(
+    known: InDistributionRange, points_mm: Points, distances_mm: Distances
+) -> None:
+    """NoEstimate for a cloud that cannot be the organ's: its points spread over much more or less
+    than in any validation scene, or lie much farther from the estimated surface."""
+    spread, fit = spread_mm(points_mm), fit_mm(distances_mm)
     low, high = known.spread_mm[0] / _SPREAD_FACTOR, known.spread_mm[1] * _SPREAD_FACTOR
     if not low <= spread <= high:
-        raise NoEstimate(
-            f"the cloud does not show this model's organ: four fifths of its points lie within "
-            f"{spread:.0f} mm of their middle, in this model's scenes within {low:.0f} to "
-            f"{high:.0f} mm. Remove the background (--range NEAR FAR), and check the unit."
+        raise _refusal(
+            f"four fifths of its points lie within {spread:.0f} mm of their middle, in this "
+            f"model's scenes within {low:.0f} to {high:.0f} mm",
+            "the unit",
         )
     limit = max(known.fit_mm * _FIT_FACTOR, _SMALLEST_LIMIT_MM)
     if fit > limit:
-        raise NoEstimate(
-            f"the cloud does not show this model's organ: a fifth of its points lie more than "
-            f"{fit:.1f} mm from the estimated surface, where {limit:.1f} mm are the most to "
-            "expect. Remove the background (--range NEAR FAR), and check that the model is of "
-            "this patient and the frame is the camera's."
+        raise _refusal(
+            f"a fifth of its points lie more than {fit:.1f} mm from the estimated surface, where "
+            f"{limit:.1f} mm are the most to expect"
         )
 
 
 def check_likely(mahalanobis_2: float) -> None:
-    """Refuse what only an implausible deformation of the organ explains.
-
-    Args:
-        mahalanobis_2: the state's squared Mahalanobis distance, in units of the library's mean.
-
-    Raises:
-        NoEstimate: it is too large.
-    """
+    """NoEstimate for what only an implausible deformation of the organ explains: a state's squared
+    Mahalanobis distance, in units of the library's mean, is too large."""
     if mahalanobis_2 > _LARGEST_MAHALANOBIS_2:
-        raise NoEstimate(
-            f"the cloud does not show this model's organ: only a deformation {mahalanobis_2:.1f} "
-            f"times as rare as usual would fit it, where {_LARGEST_MAHALANOBIS_2:g} times is the "
-            "most to expect. Remove the background (--range NEAR FAR), and check that the model is "
-            "of this patient and the frame is the camera's."
+        raise _refusal(
+            f"only a deformation {mahalanobis_2:.1f} times as rare as usual would fit it, where "
+            f"{_LARGEST_MAHALANOBIS_2:g} times is the most to expect"
         )
+
+
+def _refusal(
+    why: str, check: str = "that the model is of this patient and the frame is the camera's"
+) -> NoEstimate:
+    return NoEstimate(
+        f"the cloud does not show this model's organ: {why}. Remove the background (--range NEAR "
+        f"FAR), and check {check}."
+    )

@@ -10,13 +10,8 @@ _MAXIMUM = {"nnan", "nsz"}  # lets a maximum be taken in lanes; sums stay as the
 
 @numba.njit(cache=True, nogil=True, fastmath=_MAXIMUM)
 def farthest(points, first, chosen):  # type: ignore[no-untyped-def]
-    """Farthest points of every cloud.
-
-    Args:
-        points: (B, 3, N), float32.
-        first: (B,), the first choice.
-        chosen: (B, k), int64; filled.
-    """
+    """Farthest points of clouds (B, 3, N), float32, into ``chosen`` (B, k), int64, from the first
+    choices (B,) on."""
     n_clouds, _, n = points.shape
     nearest = np.empty(n, np.float32)
     for cloud in range(n_clouds):
@@ -39,14 +34,8 @@ def farthest(points, first, chosen):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def balls(points, centres, radius_2, found):  # type: ignore[no-untyped-def]
-    """The first points within a radius of every centre, the first repeated where they are few.
-
-    Args:
-        points: (B, 3, N), float32.
-        centres: (B, 3, M), float32.
-        radius_2: squared.
-        found: (B, M, k), int64; filled.
-    """
+    """The first points (B, 3, N) within the root of ``radius_2`` of every centre (B, 3, M), the
+    first repeated where they are few, into ``found`` (B, M, k), int64; all others float32."""
     n_clouds, _, n = points.shape
     k = found.shape[2]
     square = np.empty(n, np.float32)
@@ -72,14 +61,9 @@ def balls(points, centres, radius_2, found):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def greatest(values, infinity, out, chosen):  # type: ignore[no-untyped-def]
-    """The greatest of every K numbers or zero; NaN counts as greater than all.
-
-    Args:
-        values: (M, K, C).
-        infinity: as such an integer, of the same type.
-        out: (M, C); filled.
-        chosen: (M, C), as ``values``: the first of the K that is so great, -1 for zero; filled.
-    """
+    """The greatest of every K numbers (M, K, C) or zero, NaN greater than all, into ``out`` (M, C);
+    which of the K it is, the first one or -1 for zero, into ``chosen``. ``values`` and ``infinity``
+    are bits of floating point numbers as integers."""
     n, k, channels = values.shape
     for m in range(n):
         best, which = out[m], chosen[m]

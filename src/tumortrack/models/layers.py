@@ -15,6 +15,7 @@ from torch.autograd import Function
 from torch.autograd.function import once_differentiable
 from torch.nn import functional
 
+from tumortrack.models import kernels
 from tumortrack.models.sampling import traced
 
 Norm = Literal["none", "batch"]
@@ -22,11 +23,8 @@ _INTEGER = {torch.bfloat16: torch.int16, torch.float32: torch.int32}  # of the s
 
 
 class Layer(nn.Module):
-    """Linear, optional batch norm, ReLU; over the last axis of any array.
-
-    Weights start as He's, biases at zero: without a norm the signal then keeps its size through
-    many layers, which torch's default start does not give.
-    """
+    """Linear, optional batch norm, ReLU; over the last axis of any array. Weights start as He's,
+    biases at zero: without a norm the signal then keeps its size through many layers."""
 
     def __init__(self, n_in: int, n_out: int, norm: Norm) -> None:
         super().__init__()
@@ -45,10 +43,6 @@ class Layer(nn.Module):
     def activate(self, linear_out: Tensor) -> Tensor:
         """Batch norm and ReLU of what the linear part gave; it is overwritten."""
         return functional.relu(self.normalise(linear_out), inplace=True)
-
-    def before_relu(self, x: Tensor) -> Tensor:
-        """All but the ReLU, (..., n_in) -> (..., n_out)."""
-        return self.normalise(self.linear(x))
 
     def forward(self, x: Tensor) -> Tensor:
         # In rows: the output of a linear layer on more axes is a view, and overwriting a view
@@ -98,14 +92,12 @@ class _Greatest(Function):
 
     @staticmethod
     def forward(ctx: Any, values: Tensor) -> Tensor:
-        from tumortrack.models.kernels import greatest
-
         batch, m, k, channels = ctx.shape = values.shape
         bits = values.detach().contiguous().view(_INTEGER[values.dtype])
         out = torch.empty(batch, m, channels, dtype=values.dtype)
         chosen = torch.empty(batch * m, channels, dtype=bits.dtype)
         infinity = torch.tensor(torch.inf, dtype=values.dtype).view(bits.dtype)
-        greatest(
+        kernels.greatest(
             bits.view(-1, k, channels).numpy(),
             infinity.numpy()[()],
             out.view(bits.dtype).view(-1, channels).numpy(),
@@ -117,13 +109,11 @@ class _Greatest(Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *gradients: Tensor) -> Tensor:
-        from tumortrack.models.kernels import handed_back
-
         (chosen,) = ctx.saved_tensors
         (gradient,) = gradients
         bits = gradient.contiguous().view(chosen.dtype).view(chosen.shape)
         out = torch.empty(ctx.shape, dtype=gradient.dtype)
         _, _, k, channels = ctx.shape
         spread = out.view(chosen.dtype).view(-1, k, channels)
-        handed_back(bits.numpy(), chosen.numpy(), spread.numpy())
+        kernels.handed_back(bits.numpy(), chosen.numpy(), spread.numpy())
         return out

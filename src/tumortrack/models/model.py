@@ -7,53 +7,45 @@ import warnings
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 import torch
 from jaxtyping import Float64
 from torch import Tensor, nn
 
-from tumortrack.core.errors import InputError
-from tumortrack.models.config import NetworkConfig, TrainConfig
+from tumortrack.models.config import TrainConfig
 from tumortrack.models.in_distribution import InDistributionRange
 
 _OPSET = 18  # of ONNX files
 
 
+# What to trace for an ONNX file, on which inputs, and the names for ``torch.onnx.export``.
+OnnxParts = tuple[nn.Module, tuple[Tensor, ...], dict[str, Any]]
+
+
 class Network(nn.Module):
     """A network that can be trained and exported."""
 
-    def loss(
-        self,
-        clouds_mm: Tensor,
-        points_mm: Tensor,
-        labels: Tensor,
-        camera_from_ct: Tensor,
-        *,
-        first: int = 0,
-    ) -> Tensor:
+    def loss(self, *scenes: Tensor, first: int = 0) -> Tensor:
         """What a batch costs: clouds (B, N, 3), the scenes' points (B, P, 3) with their labels
         (B, P), poses (B, 4, 4); camera frame, mm. ``first``: the first cloud's number in a batch
         that is split over several processes."""
         raise NotImplementedError
 
-    def onnx_parts(self, cloud_mm: Tensor) -> tuple[nn.Module, tuple[Tensor, ...], dict[str, Any]]:
-        """What to trace for an ONNX file, on which inputs, and ``torch.onnx.export``'s names."""
+    def onnx_parts(self, cloud_mm: Tensor) -> OnnxParts:
+        """The parts of a file for clouds like this one, (1, N, 3)."""
         raise NotImplementedError
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Model(ABC):
-    """A network in evaluation mode and what it was trained for.
+    """A network in evaluation mode and what it was trained for. ``query_box_mm``: where the organ
+    can lie (lower and upper corner), relative to the median of the observed points, camera frame;
+    ``provenance``: seeds, steps, hashes; ``notes``: for the user, about this machine."""
 
-    Attributes:
-        query_box_mm: where the organ can lie, relative to the median of the observed points,
-            camera frame (lower and upper corner).
-        in_distribution: range of clouds of this organ.
-        provenance: seeds, steps, hashes.
-        notes: for the user, about this machine.
-    """
+    # From a NetworkConfig, with weights from torch's global generator (``torch.manual_seed``).
+    new_network: ClassVar[type[Network]]
 
     network: Network
     config: TrainConfig
@@ -62,11 +54,6 @@ class Model(ABC):
     in_distribution: InDistributionRange
     provenance: dict[str, Any] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
-
-    @classmethod
-    @abstractmethod
-    def new_network(cls, config: NetworkConfig) -> Network:
-        """A network with weights from torch's global generator (``torch.manual_seed``)."""
 
     def extra_files(self) -> dict[str, bytes]:
         """Files of a model folder besides the weights, by name."""
@@ -78,35 +65,21 @@ class Model(ABC):
 
     @classmethod
     @abstractmethod
-    def from_folder(cls: type[M], folder: Path, manifest: dict[str, Any], **common: Any) -> M:
-        """The model of a folder whose fields ``common`` are read already.
-
-        Raises:
-            InputError, KeyError, ValueError, OSError: the folder lacks something.
-        """
+    def from_folder(cls: type[M], folder: Path, manifest: dict[str, Any], **known: Any) -> M:
+        """The model of a folder whose fields ``known`` are read already; InputError, KeyError,
+        ValueError or OSError where the folder lacks something."""
 
 
 M = TypeVar("M", bound=Model)
 
 
 def onnx_bytes(model: Model) -> bytes:
-    """A model's network as an ONNX file, in single precision, for other programs.
-
-    Farthest points and balls are written out in plain operators; the number of queries is free, the
-    number of points is the one that the model was trained with (repeat the points of a smaller
-    cloud). Occupancy networks: ``cloud_mm`` (1, N, 3) and ``queries_mm`` (1, Q, 3) -> ``logits``
-    (1, Q, classes). Networks that place the organ: ``cloud_mm`` -> ``rotation`` (2, 3, 3),
-    ``centre_mm`` (2, 3), ``coefficients`` (2, M), ``right_way`` (2,). Camera frame, mm, float32.
-
-    Raises:
-        InputError: the package onnx is not installed.
-    """
-    try:
-        import onnx  # noqa: F401  PyTorch needs it; its own message is long
-    except ImportError as error:
-        raise InputError(
-            "writing ONNX needs the package onnx: pip install 'tumortrack[onnx]'."
-        ) from error
+    """A model's network as an ONNX file, in single precision, for other programs. Farthest points
+    and balls are written out in plain operators; the number of queries is free, the number of
+    points is the one that the model was trained with (repeat the points of a smaller cloud).
+    Occupancy networks: ``cloud_mm`` (1, N, 3) and ``queries_mm`` (1, Q, 3) -> ``logits`` (1, Q,
+    classes). Networks that place the organ: ``cloud_mm`` -> ``rotation`` (2, 3, 3), ``centre_mm``
+    (2, 3), ``coefficients`` (2, M), ``right_way`` (2,). Camera frame, mm, float32."""
     points, generator = model.config.scene.cloud.n_points, torch.Generator().manual_seed(0)
     cloud = torch.randn(1, points, 3, generator=generator) * 20 + torch.tensor([0.0, 0.0, 130.0])
     module, inputs, names = model.network.onnx_parts(cloud)

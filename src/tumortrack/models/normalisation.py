@@ -8,6 +8,7 @@ from torch import Tensor
 
 from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError
+from tumortrack.models import kernels
 from tumortrack.models.sampling import compiled, take
 
 
@@ -17,11 +18,8 @@ class CloudBox(Config, frozen=True, tag="cloud-box"):
 
 class FixedScale(Config, frozen=True, tag="fixed"):
     """Scale: a constant, so that size is not lost. Centre: the mean of the points that lie
-    within ``reach`` scales of it; the others are strays, and nothing sees them.
-
-    The mean and not the box's centre: one stray point within reach moves it by 1 / N of its
-    distance, the box by half.
-    """
+    within ``reach`` scales of it; the others are strays, and nothing sees them. The mean and not
+    the box's centre: one stray point moves it by 1 / N of its distance, the box by half."""
 
     scale_mm: float
     reach: float
@@ -34,11 +32,23 @@ class FixedScale(Config, frozen=True, tag="fixed"):
 
 class Aligned(FixedScale, frozen=True, tag="aligned"):
     """As ``FixedScale``, and turned about the camera's axis until the cloud's longest direction
-    across it is x, its heavier tail at +x.
+    across it is x, its heavier tail at +x. Turning the organ or the camera about that axis then
+    changes nothing: most of what varies between ``limited`` poses need not be learnt."""
 
-    Turning the organ or the camera about that axis then changes nothing, so that the network
-    need not learn it: most of what varies between ``limited`` poses is gone.
-    """
+
+def normalised(
+    points_mm: Tensor, kind: CloudBox | FixedScale
+) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
+    """Clouds (B, N, 3), camera frame, mm, in a network's frame; their centre (B, 1, 3) and scale
+    (B, 1, 1), mm, and cosine and sine (2, B, 1) of their turn about z, if they are turned."""
+    if not isinstance(kind, CloudBox):
+        points_mm = without_strays(points_mm, kind.reach * kind.scale_mm)
+    centre_mm, scale_mm = normalisation(points_mm, kind)
+    points = (points_mm - centre_mm) / scale_mm
+    if not isinstance(kind, Aligned):
+        return points, centre_mm, scale_mm, None
+    turn = alignment(points)
+    return turned(points, turn), centre_mm, scale_mm, turn
 
 
 def normalisation(points_mm: Tensor, kind: CloudBox | FixedScale) -> tuple[Tensor, Tensor]:
@@ -52,24 +62,15 @@ def normalisation(points_mm: Tensor, kind: CloudBox | FixedScale) -> tuple[Tenso
 
 
 def without_strays(points_mm: Tensor, reach_mm: float) -> Tensor:
-    """Clouds (B, N, 3) with every point that is not within reach of the others' middle replaced
-    by one that is: a repeated point changes no maximum, and is never a farthest one.
-
-    The middle is the coordinates' median, then twice the mean of the points within reach, so
-    that background moves it little (10 % of a plane behind a kidney: 0.5 mm, the mean of all by
-    5 mm). The order of the points that stay is kept.
-    """
-    if compiled(points_mm) and not points_mm.requires_grad:
-        from tumortrack.models.kernels import near as gathered
-
+    """Clouds (B, N, 3) with every point that is not within reach of the others' middle replaced by
+    one that is: a repeated point changes no maximum, and is never a farthest one. The middle is the
+    coordinates' median, then twice the mean of the points within reach, so that background moves it
+    little (10 % of a plane behind a kidney: 0.5 mm, the mean of all by 5 mm). The order of the
+    points that stay is kept."""
+    if compiled(points_mm):
         out = torch.empty_like(points_mm, memory_format=torch.contiguous_format)
-        gathered(points_mm.contiguous().numpy(), np.float32(reach_mm), out.numpy())
+        kernels.near(points_mm.contiguous().numpy(), np.float32(reach_mm), out.numpy())
         return out
-    return _without_strays(points_mm, reach_mm)
-
-
-def _without_strays(points_mm: Tensor, reach_mm: float) -> Tensor:
-    """The reference, for every device."""
     n = points_mm.shape[1]
     if torch.jit.is_tracing():  # ONNX has no median
         middle = points_mm.sort(dim=1).values[:, (n - 1) // 2, None]

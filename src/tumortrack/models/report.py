@@ -1,4 +1,4 @@
-"""The parts of report.json that are the same for both kinds of locator."""
+"""What both kinds of locator do with a frame, and what both report."""
 
 from __future__ import annotations
 
@@ -9,50 +9,64 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float64
+from jaxtyping import Float
 
 import tumortrack
 from tumortrack.core.estimate import Estimate
-from tumortrack.core.geometry import transform_points
+from tumortrack.core.geometry import Affine, transform_points
 from tumortrack.core.types import Anatomy, CameraLabels, Mesh, OccupancyCloud, SensorCloud
 from tumortrack.imaging.raster import label_grid
+from tumortrack.models.model import Model
+from tumortrack.sense.cloud import check_cloud, thin_cloud
 
+Rng = np.random.Generator
 CLOUD_POINTS = 40_000  # of an estimate made of surfaces
 
 
-def report_head(cloud: SensorCloud, seed: int) -> dict[str, Any]:
-    """The first entries of report.json."""
-    return {
-        "tumortrack": tumortrack.__version__,
-        "units": "mm",
-        "frame": "camera",
-        "stamp_ns": cloud.stamp_ns,
-        "seed": seed,
-        "points": len(cloud.points_mm),
-    }
+class Frame:
+    """One cloud (camera frame, mm; checked by ``check_cloud``) on its way to an estimate:
+    ``points_mm`` are those that the network sees, ``seconds`` what each stage took."""
+
+    def __init__(self, model: Model, cloud: SensorCloud, seed: int, rng: Rng) -> None:
+        check_cloud(cloud)
+        self.model, self.cloud, self.seed, self.rng = model, cloud, seed, rng
+        self.points_mm = thin_cloud(cloud, model.config.scene.cloud.n_points, rng).points_mm
+        self.device = next(model.network.parameters()).device
+        self.seconds: dict[str, float] = {}
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        """Time a ``with`` block."""
+        start = time.perf_counter()
+        yield
+        if self.device.type == "cuda":  # kernels run asynchronously
+            torch.cuda.synchronize(self.device)
+        self.seconds[name] = time.perf_counter() - start
+
+    def report(
+        self, distances_mm: Float[np.ndarray, " n"], parts: dict[str, Any], **more: object
+    ) -> dict[str, Any]:
+        """report.json. ``distances_mm``: of the observed points from the estimated surface."""
+        return {
+            **_head(self.cloud.stamp_ns),
+            "seed": self.seed,
+            "points": len(self.cloud.points_mm),
+            **more,
+            "fit_mm": {
+                "median": float(np.median(distances_mm)),
+                "p95": float(np.percentile(distances_mm, 95)),
+            },
+            "parts": parts,
+            "timings": {**self.seconds, "total": sum(self.seconds.values())},
+        }
 
 
-def fit_report(distances_mm: Float[np.ndarray, " n"]) -> dict[str, Any]:
-    """How far the observed points lie from the estimated surface."""
-    return {
-        "median": float(np.median(distances_mm)),
-        "p95": float(np.percentile(distances_mm, 95)),
-    }
+def _head(stamp_ns: int) -> dict[str, Any]:
+    about = {"tumortrack": tumortrack.__version__, "units": "mm", "frame": "camera"}
+    return {**about, "stamp_ns": stamp_ns}
 
 
-@contextmanager
-def stage(seconds: dict[str, float], name: str, device: torch.device) -> Iterator[None]:
-    """Time a ``with`` block."""
-    start = time.perf_counter()
-    yield
-    if device.type == "cuda":  # kernels run asynchronously
-        torch.cuda.synchronize(device)
-    seconds[name] = time.perf_counter() - start
-
-
-def grid_over(
-    points_mm: np.ndarray, grid: int
-) -> tuple[Float64[np.ndarray, "4 4"], tuple[int, int, int]]:
+def grid_over(points_mm: np.ndarray, grid: int) -> tuple[Affine, tuple[int, int, int]]:
     """``camera_from_index`` and shape of cubic voxels over the points' box, 4 % larger, with
     ``grid`` voxels along its longest side."""
     lower, upper = points_mm.min(0).astype(float), points_mm.max(0).astype(float)
@@ -69,23 +83,18 @@ def grid_over(
 def describe_parts(
     names: tuple[str, ...], meshes: dict[str, Mesh], inside: OccupancyCloud
 ) -> dict[str, dict[str, Any]]:
-    """Per part: volume, centre, box and how sure the labels inside it are (JSON types).
-
-    The kidney's numbers are those of the whole organ, tumors included.
-    """
+    """Per part: volume, centre, box and how sure the labels inside it are (JSON types). The
+    kidney's numbers are those of the whole organ, tumors included."""
     parts: dict[str, dict[str, Any]] = {}
     counts = np.bincount(inside.labels, minlength=len(names) + 1)
     sums = np.bincount(inside.labels, inside.probability, len(names) + 1)
     for n, name in enumerate(names):
-        mine = slice(1, None) if n == 0 else n + 1
-        points = int(counts[mine].sum())
+        parts[name] = {"label": n + 1, "found": name in meshes}
         if name not in meshes:
-            parts[name] = {"label": n + 1, "found": False}
             continue
-        mesh = meshes[name]
-        parts[name] = {
-            "label": n + 1,
-            "found": True,
+        mesh, mine = meshes[name], slice(1, None) if n == 0 else n + 1
+        points = int(counts[mine].sum())
+        parts[name] |= {
             "volume_ml": mesh.volume_mm3 / 1000,
             "center_mm": mesh.box_mm.mean(0).tolist(),
             "box_mm": mesh.box_mm.tolist(),
@@ -99,12 +108,8 @@ def estimate_of(
     meshes: dict[str, Mesh], grid: int = 160, stamp_ns: int = 0, **report: object
 ) -> Estimate:
     """Surfaces of any method (camera frame, mm) as an estimate: labels are voxelised from them,
-    points are evenly chosen voxels with probability 1.
-
-    Args:
-        grid: voxels along the longest side of the labelled volume.
-        report: further entries of the estimate's report.
-    """
+    ``grid`` voxels along the longest side; points are evenly chosen voxels with probability 1.
+    ``report``: further entries of the estimate's report."""
     anatomy = Anatomy(tuple(meshes.values()))
     camera_from_index, shape = grid_over(anatomy.organ.vertices_mm, grid)
     labels = label_grid(anatomy, camera_from_index, shape)
@@ -112,19 +117,7 @@ def estimate_of(
     voxels = voxels[:: max(1, len(voxels) // CLOUD_POINTS)]
     index = np.stack(np.unravel_index(voxels, labels.shape), 1).astype(float)
     points_mm = transform_points(camera_from_index, index)
-    sure = np.ones(len(voxels))
-    inside = OccupancyCloud(points_mm, labels.reshape(-1)[voxels], sure, stamp_ns)
-    return Estimate(
-        inside,
-        CameraLabels(labels, camera_from_index),
-        meshes,
-        {
-            "tumortrack": tumortrack.__version__,
-            "units": "mm",
-            "frame": "camera",
-            "stamp_ns": stamp_ns,
-            "voxel_mm": float(camera_from_index[0, 0]),
-            "parts": describe_parts(tuple(meshes), meshes, inside),
-            **report,
-        },
-    )
+    inside = OccupancyCloud(points_mm, labels.reshape(-1)[voxels], np.ones(len(voxels)), stamp_ns)
+    parts = describe_parts(tuple(meshes), meshes, inside)
+    about = {**_head(stamp_ns), "voxel_mm": float(camera_from_index[0, 0]), "parts": parts}
+    return Estimate(inside, CameraLabels(labels, camera_from_index), meshes, {**about, **report})

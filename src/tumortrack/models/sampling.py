@@ -6,96 +6,57 @@ points. Points come in batches (B, N, 3). Lengths are in whatever unit the point
 
 from __future__ import annotations
 
-from typing import Literal
-
 import numpy as np
 import torch
 from torch import Tensor
 from torch.nn import functional
 
-Sampling = Literal["fps", "strided"]
+from tumortrack.models import kernels
 
 
 def farthest_points(points: Tensor, k: int) -> Tensor:
-    """Farthest point sampling; the first point is the one farthest from the centroid.
-
-    The fixed start makes the chosen set independent of the points' order (but for exact ties);
-    a random one alone changes about 0.8 % of the labels. Sequential in ``k``.
-
-    Args:
-        points: (B, N, 3).
-        k: how many to choose, at most N.
-
-    Returns:
-        Indices (B, k), int64, in the order of choice.
-
-    Source: Eldar et al. 1997; Qi et al., PointNet++, NIPS 2017, section 3.2.
-    """
-    points = points.detach()
-    x, y, z = (points[..., axis].contiguous() for axis in range(3))  # 3x faster than (B, N, 3)
+    """Farthest point sampling; the first point is the one farthest from the centroid. The fixed
+    start makes the chosen set independent of the points' order (but for exact ties); a random one
+    alone changes about 0.8 % of the labels. Sequential in ``k``. Points (B, N, 3) -> indices (B,
+    k), int64, in the order of choice. Source: Eldar et al. 1997; Qi et al., PointNet++, NIPS 2017,
+    section 3.2."""
+    rows, centre = _rows(points), points.detach().mean(dim=1, keepdim=True)
+    x, y, z = rows.unbind(1)
     chosen = torch.empty((len(points), k), dtype=torch.int64, device=points.device)
-    centre = points.mean(dim=1, keepdim=True)
-    newest = _squared_distance(x, y, z, *centre.unbind(-1)).argmax(dim=1, keepdim=True)
+    newest = _distance_2(x, y, z, *centre.unbind(-1)).argmax(dim=1, keepdim=True)
     if compiled(points):
-        from tumortrack.models.kernels import farthest
-
-        farthest(_rows(points), newest[:, 0].numpy(), chosen.numpy())
+        kernels.farthest(rows.numpy(), newest[:, 0].numpy(), chosen.numpy())
         return chosen
     nearest = torch.full_like(x, torch.inf)
     for step in range(k):
         chosen[:, step : step + 1] = newest
         at = (axis.gather(1, newest) for axis in (x, y, z))
-        nearest = torch.minimum(nearest, _squared_distance(x, y, z, *at))
+        nearest = torch.minimum(nearest, _distance_2(x, y, z, *at))
         newest = nearest.argmax(dim=1, keepdim=True)
     return chosen
 
 
 def strided_points(points: Tensor, k: int) -> Tensor:
-    """Every (N / k)-th point: for points in random order as good as a random choice, and free.
-
-    Args:
-        points: (B, N, 3), in random order (rows of a depth image also do, being spread evenly).
-        k: how many to choose, at most N.
-
-    Returns:
-        Indices (B, k), int64, rising.
-    """
+    """Every (N / k)-th point, k at most N: for points (B, N, 3) in random order as good as a random
+    choice, and free (rows of a depth image also do, being spread evenly). Indices (B, k),
+    rising."""
     n = points.shape[1]
     row = torch.arange(k, device=points.device) * n // k
     return row.expand(len(points), k)
 
 
-def choose_points(points: Tensor, k: int, how: Sampling) -> Tensor:
-    """Indices (B, k) of points (B, N, 3) by farthest point sampling or by stride."""
-    return farthest_points(points, k) if how == "fps" else strided_points(points, k)
-
-
 def ball_query(points: Tensor, centres: Tensor, radius: float, k: int) -> Tensor:
-    """The first ``k`` points, by index, within ``radius`` of each centre.
-
-    Where fewer are found the first found is repeated, so that a maximum over the neighbours is
-    not changed. A centre that is one of the points always finds itself; an empty ball gives
-    index 0.
-
-    Args:
-        points: (B, N, 3).
-        centres: (B, M, 3).
-
-    Returns:
-        Indices (B, M, k), int64.
-
-    Source: Qi et al., PointNet++, NIPS 2017, section 3.2.
-    """
+    """The first ``k`` points (B, N, 3), by index, within ``radius`` of each centre (B, M, 3):
+    indices (B, M, k), int64. Where fewer are found the first found is repeated, so that a maximum
+    over the neighbours is not changed. A centre that is one of the points always finds itself; an
+    empty ball gives index 0. Source: Qi et al., PointNet++, NIPS 2017, section 3.2."""
     if compiled(points):
-        from tumortrack.models.kernels import balls
-
         found = torch.empty((*centres.shape[:2], k), dtype=torch.int64)
-        balls(_rows(points), _rows(centres), np.float32(radius**2), found.numpy())
+        rows = _rows(points).numpy(), _rows(centres).numpy()
+        kernels.balls(*rows, np.float32(radius**2), found.numpy())
         return found
-    # One contiguous row per coordinate: 3x faster than strides of 3.
-    across = points.detach().transpose(1, 2).contiguous()[:, :, None, :].unbind(1)
-    down = centres.detach().transpose(1, 2).contiguous()[:, :, :, None].unbind(1)
-    inside = _squared_distance(*across, *down) <= radius**2
+    across, down = _rows(points)[:, :, None].unbind(1), _rows(centres)[..., None].unbind(1)
+    inside = _distance_2(*across, *down) <= radius**2
     slot = inside.long().cumsum(dim=2)  # 1 for the first found; ONNX sums no truths
     count = slot[:, :, -1:].clone()
     slot.sub_(1).masked_fill_(~inside, k).clamp_(max=k)  # slot k takes all that is not wanted
@@ -115,8 +76,10 @@ def take(values: Tensor, indices: Tensor) -> Tensor:
 
 
 def compiled(points: Tensor) -> bool:
-    """Whether the compiled kernels can take these points: not while torch traces the network."""
-    return points.device.type == "cpu" and points.dtype == torch.float32 and not traced()
+    """Whether the compiled kernels can take these points: not while torch traces the network, and
+    without a gradient."""
+    plain = points.device.type != "cpu" or points.dtype != torch.float32 or points.requires_grad
+    return not (plain or traced())
 
 
 def traced() -> bool:
@@ -124,13 +87,11 @@ def traced() -> bool:
     return torch.compiler.is_compiling() or torch.jit.is_tracing()
 
 
-def _rows(points: Tensor) -> np.ndarray:
-    """(B, N, 3) -> (B, 3, N), contiguous."""
-    return points.detach().transpose(1, 2).contiguous().numpy()
+def _rows(points: Tensor) -> Tensor:
+    """(B, N, 3) -> (B, 3, N), contiguous: 3x faster than strides of 3."""
+    return points.detach().transpose(1, 2).contiguous()
 
 
-def _squared_distance(
-    x: Tensor, y: Tensor, z: Tensor, cx: Tensor, cy: Tensor, cz: Tensor
-) -> Tensor:
-    """Of broadcastable coordinates; by differences, so that a point is at exactly 0 of itself."""
+def _distance_2(x: Tensor, y: Tensor, z: Tensor, cx: Tensor, cy: Tensor, cz: Tensor) -> Tensor:
+    """Squared, of broadcastable coordinates; exactly 0 of a point and itself."""
     return (x - cx).square_().add_((y - cy).square_()).add_((z - cz).square_())

@@ -16,13 +16,12 @@ import numpy as np
 import torch
 from jaxtyping import Float32
 from torch import Tensor, nn
-from torch.nn import functional
 
 from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError
 from tumortrack.models.hardware import has_fast_bfloat16
 from tumortrack.models.layers import Layer
-from tumortrack.occupancy.network import Latent, OccupancyNetwork, octave_features
+from tumortrack.occupancy.network import Latent, MlpDecoder, OccupancyNetwork, octave_features
 
 CHUNK = 2048  # queries at once and core: their activations (2 MB at 512 channels) stay near it
 _CHUNK_GPU = 2**17
@@ -69,25 +68,21 @@ def usual(device: torch.device) -> Arithmetic:
 
 
 class Inference:
-    """A network in use, on the device where it lies.
-
-    Args:
-        arithmetic: how queries are answered; None: what is usually fastest.
-    """
+    """A network in use, where it lies; ``arithmetic`` None: what is usually fastest."""
 
     def __init__(self, network: OccupancyNetwork, arithmetic: Arithmetic | None = None) -> None:
         self.network = network.folded()
         self.device = next(network.parameters()).device
         self.arithmetic = arithmetic or usual(self.device)
-        threads = torch.get_num_threads() if self.device.type == "cpu" else 1
-        self._rows = self.arithmetic.chunk * threads
-        self._packed: PackedDecoder | None = None
-        if self.arithmetic.numbers != "network":
-            bf16 = self.arithmetic.numbers == "bfloat16"
-            dtype = torch.bfloat16 if bf16 else torch.float32
-            self._packed = PackedDecoder(self.network, dtype, self._rows)
+        self._rows = self.arithmetic.chunk
+        if self.device.type == "cpu":
+            self._rows *= torch.get_num_threads()
+        packed = self.arithmetic.numbers != "network"
+        self._bf16 = not packed and has_fast_bfloat16(self.device)
+        if packed:
+            dtype = torch.bfloat16 if self.arithmetic.numbers == "bfloat16" else torch.float32
+            self.network.decoder = PackedDecoder(self.network.decoder, dtype, self._rows)
             pack_stacks(self.network.encoder)
-        self._bf16 = self._packed is None and has_fast_bfloat16(self.device)
 
     @torch.inference_mode()
     def encode(self, points_mm: Float32[np.ndarray, "n 3"]) -> Latent:
@@ -100,32 +95,35 @@ class Inference:
     def logits(self, latent: Latent, points_mm: Float32[np.ndarray, "n 3"]) -> Tensor:
         """Points, camera frame, mm -> (n, classes), float32, on the network's device."""
         queries = torch.tensor(points_mm, dtype=torch.float32)[None].to(self.device)
-        if self._packed is not None:
-            return self._packed(latent, queries)[0]
+        terms, decoder = latent.terms, self.network.decoder
+        if isinstance(decoder, PackedDecoder):
+            queries, terms = filled_up(queries), decoder.cast(terms)
         with torch.autocast(self.device.type, torch.bfloat16, enabled=self._bf16):
-            parts = queries.split(self._rows, dim=1)
-            return torch.cat([self.network.query(latent, part).float() for part in parts], 1)[0]
+            parts = latent.normalised(queries).split(self._rows, dim=1)
+            logits = torch.cat([decoder(terms, part).float() for part in parts], 1)
+        return logits[0, : len(points_mm)]
 
 
-class PackedLinear:
-    """y = x W^T, optionally with a sum and ReLU in the same pass.
+def filled_up(queries: Tensor) -> Tensor:
+    """Queries (1, Q, 3) with the last one repeated until their number is a round one: oneDNN
+    compiles and keeps a kernel for every number of rows that it meets, and frames that each have
+    another number of queries would fill memory (0.7 GB until its cache is full)."""
+    n = queries.shape[1]
+    full = -(-n // _ROUND) * _ROUND if n > _ROUND else 1 << max(n - 1, 0).bit_length()
+    return torch.cat([queries, queries[:, -1:].expand(-1, full - n, -1)], 1) if n else queries
 
-    The layout is chosen for ``rows`` of x at once; any other number works too.
-    """
 
-    def __init__(self, weight: Tensor, rows: int, dtype: torch.dtype) -> None:
-        held = weight.detach().to(dtype).contiguous()
-        self.packed = torch.ops.mkldnn._reorder_linear_weight(held, rows)
+def _laid_out(weight: Tensor, rows: int, dtype: torch.dtype) -> Tensor:
+    """Weights (out, in) laid out for ``rows`` of x at once; any other number works too."""
+    held = weight.detach().to(dtype).contiguous()
+    out: Tensor = torch.ops.mkldnn._reorder_linear_weight(held, rows)
+    return out
 
-    def __call__(self, x: Tensor, bias: Tensor, after: Literal["none", "relu"] = "none") -> Tensor:
-        """Rows (n, in) and (out,) -> (n, out)."""
-        out: Tensor = torch.ops.mkldnn._linear_pointwise(x, self.packed, bias, after, (), "")
-        return out
 
-    def onto(self, x: Tensor, added: Tensor) -> Tensor:
-        """Rows (n, in) and (n, out) -> the sum of their product with W and ``added``."""
-        out: Tensor = torch.ops.mkldnn._linear_pointwise.binary(x, added, self.packed, None, "add")
-        return out
+def _linear(x: Tensor, packed: Tensor, bias: Tensor, after: str = "none") -> Tensor:
+    """Rows (n, in) -> (n, out), with ReLU in the same pass where ``after`` is "relu"."""
+    out: Tensor = torch.ops.mkldnn._linear_pointwise(x, packed, bias, after, (), "")
+    return out
 
 
 class PackedLayer(nn.Module):
@@ -134,12 +132,10 @@ class PackedLayer(nn.Module):
     def __init__(self, layer: Layer) -> None:
         super().__init__()
         weight = layer.linear.weight
-        self.linear = PackedLinear(weight, _ENCODER_ROWS, weight.dtype)
-        self.bias = layer.linear.bias.detach()
+        self._weight, self._bias = _laid_out(weight, _ENCODER_ROWS, weight.dtype), layer.linear.bias
 
     def forward(self, x: Tensor) -> Tensor:
-        rows = self.linear(x.flatten(0, -2), self.bias, "relu")
-        return rows.view(*x.shape[:-1], -1)
+        return _linear(x.flatten(0, -2), self._weight, self._bias, "relu").view(*x.shape[:-1], -1)
 
 
 def pack_stacks(encoder: nn.Module) -> None:
@@ -152,67 +148,49 @@ def pack_stacks(encoder: nn.Module) -> None:
                     module[n] = PackedLayer(layer)
 
 
-def filled_up(queries: Tensor) -> Tensor:
-    """Queries (1, Q, 3) with the last one repeated until their number is a round one.
+class PackedDecoder(MlpDecoder):
+    """A folded decoder of one cloud's queries, ``rows`` at once, in ``dtype``. In bf16 a coordinate
+    would be rounded to a tenth of a millimetre; so what the rounding took is given as three more
+    inputs, and positions stay exact."""
 
-    oneDNN compiles and keeps a kernel for every number of rows that it meets: frames that each
-    have another number of queries would fill memory (0.7 GB until its cache is full).
-    """
-    n = queries.shape[1]
-    full = -(-n // _ROUND) * _ROUND if n > _ROUND else 1 << max(n - 1, 0).bit_length()
-    return torch.cat([queries, queries[:, -1:].expand(-1, full - n, -1)], 1) if n else queries
-
-
-class PackedDecoder:
-    """``OccupancyNetwork.query`` of a folded network, in ``dtype``.
-
-    In bf16 a coordinate would be rounded to a tenth of a millimetre; so what the rounding took
-    is given as three more inputs, and positions stay exact.
-
-    Args:
-        rows: queries at once; their activations should stay in the cache.
-    """
-
-    def __init__(self, network: OccupancyNetwork, dtype: torch.dtype, rows: int) -> None:
-        decoder, output = network.decoder, network.decoder.output
-        self._octaves, self._dtype, self._rows = decoder.config.octaves, dtype, rows
+    def __init__(self, decoder: MlpDecoder, dtype: torch.dtype, rows: int) -> None:
+        nn.Module.__init__(self)
+        self.config, self.query_size = decoder.config, decoder.query_size
+        self.layers, self.output, self._dtype = decoder.layers, decoder.output, dtype
         # Per layer: weights of the layer before, weights of the query, bias. The bias of
         # layers that see the query comes with the latent.
-        self._layers: list[tuple[PackedLinear | None, PackedLinear | None, Tensor]] = []
+        self._packed: list[tuple[Tensor | None, Tensor | None, Tensor]] = []
         n_hidden = 0
-        for layer in decoder.hidden_layers():
-            weight, size = layer.linear.weight.detach(), decoder.query_size
-            of_hidden = PackedLinear(weight[:, :n_hidden], rows, dtype) if n_hidden else None
+        for layer in self.hidden_layers():
+            weight, size = layer.linear.weight, self.query_size
+            of_hidden = _laid_out(weight[:, :n_hidden], rows, dtype) if n_hidden else None
             of_query = None
             if weight.shape[1] > n_hidden:
                 columns = weight[:, n_hidden : n_hidden + size]
-                of_query = PackedLinear(torch.cat([columns, columns[:, :3]], 1), rows, dtype)
-            self._layers.append((of_hidden, of_query, layer.linear.bias.detach().to(dtype)))
+                of_query = _laid_out(torch.cat([columns, columns[:, :3]], 1), rows, dtype)
+            self._packed.append((of_hidden, of_query, layer.linear.bias.to(dtype)))
             n_hidden = len(weight)
-        self._output = PackedLinear(output.weight, rows, dtype)
-        self._output_bias = output.bias.detach().to(dtype)
+        self._output = _laid_out(self.output.weight, rows, dtype), self.output.bias.to(dtype)
 
-    def __call__(self, latent: Latent, queries_mm: Tensor) -> Tensor:
-        """One cloud's latent and queries (1, Q, 3), mm -> logits (1, Q, classes), float32."""
-        terms = [term[0, 0].to(self._dtype) for term in latent.terms]
-        queries, n = latent.normalised(filled_up(queries_mm))[0], queries_mm.shape[1]
-        parts = [self._logits(terms, part) for part in queries.split(self._rows)]
-        return torch.cat(parts)[None, :n]
+    def cast(self, terms: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
+        """``prepare``'s terms as ``forward`` takes them."""
+        return tuple(term[0, 0].to(self._dtype) for term in terms)
 
-    def _logits(self, terms: list[Tensor], queries: Tensor) -> Tensor:
-        """Normalised queries (Q, 3) -> logits (Q, classes), float32."""
-        features = octave_features(queries, self._octaves)
+    def forward(self, terms: tuple[Tensor, ...], queries: Tensor) -> Tensor:
+        """Terms and queries (1, Q, 3) -> logits (1, Q, classes), float32."""
+        features = octave_features(queries[0], self.config.octaves)
         rounded = features.to(self._dtype)
         lost = (features[:, :3] - rounded[:, :3]).to(self._dtype)
         query = hidden = torch.cat([rounded, lost], 1)
-        term = iter(terms)
-        for of_hidden, of_query, bias in self._layers:
-            if of_hidden is None:
-                assert of_query is not None
-                hidden = of_query(query, next(term), "relu")
-            elif of_query is None:
-                hidden = of_hidden(hidden, bias, "relu")
+        remaining = iter(terms)
+        for of_hidden, of_query, bias in self._packed:
+            if of_query is None:
+                assert of_hidden is not None
+                hidden = _linear(hidden, of_hidden, bias, "relu")
+            elif of_hidden is None:
+                hidden = _linear(query, of_query, next(remaining), "relu")
             else:
-                added = of_query(query, next(term))
-                hidden = functional.relu(of_hidden.onto(hidden, added), inplace=True)
-        return self._output(hidden, self._output_bias).float()
+                added = _linear(query, of_query, next(remaining))
+                both = (hidden, added, of_hidden, None, "add")
+                hidden = torch.ops.mkldnn._linear_pointwise.binary(*both).relu_()
+        return _linear(hidden, *self._output).float()[None]

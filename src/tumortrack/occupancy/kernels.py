@@ -20,12 +20,8 @@ def _linear(coarse, low, high, n):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def halved(coarse, fine, first, last):  # type: ignore[no-untyped-def]
-    """Logits at half the step, linear between the coarse ones; planes ``first`` to ``last``.
-
-    Args:
-        coarse: (a, b, c, classes), float32.
-        fine: (2a - 1, 2b - 1, 2c - 1, classes); filled.
-    """
+    """Logits at half the step, linear between the coarse ones (a, b, c, classes), into ``fine``
+    (2a - 1, 2b - 1, 2c - 1, classes), float32; planes ``first`` to ``last``."""
     for i in range(first, last):
         for j in range(fine.shape[1]):
             for k in range(fine.shape[2]):
@@ -36,8 +32,9 @@ def halved(coarse, fine, first, last):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def best(logits, labels, leads):  # type: ignore[no-untyped-def]
-    """The largest logit of every row (n, classes), and by how much it leads; both filled."""
+def leading(logits):  # type: ignore[no-untyped-def]
+    """The label that leads in every row (n, classes), and by how much."""
+    labels, leads = np.empty(len(logits), np.uint8), np.empty(len(logits), np.float32)
     for row in range(len(logits)):
         first, second, label = np.float32(-np.inf), np.float32(-np.inf), 0
         for n in range(logits.shape[1]):
@@ -48,60 +45,45 @@ def best(logits, labels, leads):  # type: ignore[no-untyped-def]
                 second = value
         labels[row] = label
         leads[row] = first - second
+    return labels, leads
 
 
 @numba.njit(cache=True, nogil=True)
-def surprising(expected, found, limit):  # type: ignore[no-untyped-def]
-    """Which rows (n, classes) have another label than expected, the difference of the two labels'
-    logits being off by more than the limit: (n,)."""
-    out = np.zeros(len(expected), np.bool_)
-    for row in range(len(expected)):
-        thought, label = 0, 0
-        for n in range(1, expected.shape[1]):
-            if expected[row, n] > expected[row, thought]:
-                thought = n
-            if found[row, n] > found[row, label]:
-                label = n
-        before = expected[row, thought] - expected[row, label]
-        now = found[row, label] - found[row, thought]
-        out[row] = thought != label and before + now > limit
-    return out
-
-
-@numba.njit(cache=True, nogil=True)
-def expected_at(coarse, shape, flat, out):  # type: ignore[no-untyped-def]
-    """``halved`` at some of the finer lattice's points (flat indices); ``out``: (n, classes)."""
+def surprising(coarse, shape, flat, found, limit):  # type: ignore[no-untyped-def]
+    """Which points (n,) of the lattice of half the step, flat indices, have another label than
+    linear logits let expect, the difference of the two labels' logits being off by more than the
+    limit. ``found``: their logits (n, classes)."""
+    surprises = np.zeros(len(flat), np.bool_)
+    expected = np.empty(coarse.shape[3], np.float32)
     for m in range(len(flat)):
         i, rest = divmod(flat[m], shape[1] * shape[2])
         j, k = divmod(rest, shape[2])
-        for n in range(coarse.shape[3]):
-            total = np.float32(0)
-            for a in (i // 2, (i + 1) // 2):
-                for b in (j // 2, (j + 1) // 2):
-                    for c in (k // 2, (k + 1) // 2):
-                        total += coarse[a, b, c, n]
-            out[m, n] = np.float32(0.125) * total
+        low, high = (i // 2, j // 2, k // 2), ((i + 1) // 2, (j + 1) // 2, (k + 1) // 2)
+        thought, label = 0, 0
+        for n in range(len(expected)):
+            expected[n] = _linear(coarse, low, high, n)
+            if expected[n] > expected[thought]:
+                thought = n
+            if found[m, n] > found[m, label]:
+                label = n
+        before = expected[thought] - expected[label]
+        now = found[m, label] - found[m, thought]
+        surprises[m] = thought != label and before + now > limit
+    return flat[surprises]
 
 
 @numba.njit(cache=True, nogil=True)
 def spread(labels, inside, outside, margins, first, last):  # type: ignore[no-untyped-def]
-    """Per part one of two values (bits of half precision) by the labels; planes first to last.
-
-    Args:
-        labels: (i, j, k); the first part is inside wherever there is a label.
-        margins: (parts, i, j, k), uint16; filled.
-    """
+    """Per part one of two values (bits of half precision) into ``margins`` (parts, i, j, k) by the
+    labels (i, j, k); the first part is inside wherever there is one. Planes first to last."""
     for i in range(first, last):
         for j in range(labels.shape[1]):
             row = labels[i, j]
             for part in range(len(margins)):
                 out = margins[part, i, j]
-                if part == 0:
-                    for k in range(len(row)):
-                        out[k] = inside if row[k] > 0 else outside
-                else:
-                    for k in range(len(row)):
-                        out[k] = inside if row[k] == part + 1 else outside
+                for k in range(len(row)):
+                    mine = row[k] > 0 if part == 0 else row[k] == part + 1
+                    out[k] = inside if mine else outside
 
 
 @numba.njit(nogil=True, inline="always")
@@ -119,21 +101,12 @@ def _confident_row(plain, i, j, labels):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def filled(coarse, labels, plain, fine, first, last):  # type: ignore[no-untyped-def]
-    """The voxels between the points of the last lattice but one, cell by cell.
-
-    A cell whose corners agree and all lead by the limit holds no voxel that leads by less: it is
-    filled with their label. The voxels of all others are listed.
-
-    Args:
-        coarse, labels: logits (a, b, c, classes), and their labels.
-        plain: the labels that lead by the limit, 255 for the others.
-        fine: labels (i, j, k); filled.
-        first, last: coarse planes.
-
-    Returns:
-        Flat indices (n,) of the listed voxels, their linear logits (n, classes), and whether they
-        lie between coarse points.
-    """
+    """The voxels between the points of the last lattice but one, cell by cell, from coarse plane
+    ``first`` to ``last``. A cell whose corners agree and all lead by the limit holds no voxel that
+    leads by less: it is filled with their label in ``fine`` (i, j, k). All other cells' voxels are
+    listed: flat indices (n,), linear logits (n, classes), and whether they lie between coarse
+    points. ``coarse`` (a, b, c, classes) has these ``labels``; ``plain``: those that lead by the
+    limit, 255 for the others."""
     _, n_j, n_k = fine.shape
     confident = np.empty(coarse.shape[2], np.uint8)
     cells = 0
@@ -194,9 +167,10 @@ def _cell(at, size):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def between(values, place, out):  # type: ignore[no-untyped-def]
-    """Trilinear values (a, b, c, n) at places (m, 3), in steps of the lattice; outside those of the
-    nearest border. ``out``: (m, n), filled."""
+def between(values, place):  # type: ignore[no-untyped-def]
+    """Trilinear values (m, n) of a lattice (a, b, c, n) at places (m, 3), in its steps; outside
+    those of the nearest border."""
+    out = np.empty((len(place), values.shape[3]), np.float32)
     for m in range(len(place)):
         i, x = _cell(place[m, 0], values.shape[0])
         j, y = _cell(place[m, 1], values.shape[1])
@@ -209,3 +183,4 @@ def between(values, place, out):  # type: ignore[no-untyped-def]
             right = (1 - z) * values[i + 1, j + 1, k, n] + z * values[i + 1, j + 1, k + 1, n]
             far = (1 - y) * far + y * right
             out[m, n] = (1 - x) * near + x * far
+    return out

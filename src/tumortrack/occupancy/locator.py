@@ -3,46 +3,29 @@
 from __future__ import annotations
 
 import math
-from contextlib import AbstractContextManager, suppress
-from dataclasses import dataclass, field, replace
+from contextlib import suppress
+from dataclasses import replace
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float16, Float32, Float64, UInt8
+from jaxtyping import Float32
 
 from tumortrack.core.errors import NoEstimate
 from tumortrack.core.estimate import Estimate, Following
 from tumortrack.core.types import Anatomy, CameraLabels, OccupancyCloud, SensorCloud
-from tumortrack.models.in_distribution import check_in_distribution, fit_mm, spread_mm
-from tumortrack.models.report import describe_parts, fit_report, grid_over, report_head, stage
+from tumortrack.models.in_distribution import check_in_distribution
+from tumortrack.models.report import Frame, Rng, describe_parts, grid_over
+from tumortrack.occupancy import volume
 from tumortrack.occupancy.inference import Inference
+from tumortrack.occupancy.kernels import leading
 from tumortrack.occupancy.model import OccupancyModel
-from tumortrack.occupancy.sparse import (
-    halved_lattice,
-    leading,
-    organ_lattice,
-    sparse_logits,
-    sparse_margins,
-)
-from tumortrack.occupancy.volume import (
-    FIT_STEPS,
-    LogitLattice,
-    drop_islands,
-    keep_largest_pieces,
-    lattice_over,
-    margins_on,
-    part_surfaces,
-    surface_distances,
-)
-from tumortrack.sense.cloud import check_cloud, thin_cloud
+from tumortrack.occupancy.sparse import halved_lattice, organ_lattice, sparse_logits, sparse_margins
 
 COARSE_QUERIES = 10_000
 FINE_QUERIES = 40_000
 FEWEST_INSIDE = 20  # of the coarse queries: fewer are no organ
 _LATTICE_MM = 4.5  # at most: always within a ball of 7.8 mm
 _LIVE_MARGIN = 0.1  # of the organ's extent: how far it may move from one live frame to the next
-
-Box = Float[np.ndarray, "2 3"]
 
 
 class OccupancyLocator:
@@ -52,34 +35,30 @@ class OccupancyLocator:
 
     def __init__(self, model: OccupancyModel) -> None:
         self.model = model
-        self._inference = Inference(model.network, model.arithmetic)
+        self.inference = Inference(model.network, model.arithmetic)
 
     def locate(self, cloud: SensorCloud, grid: int, seed: int) -> Estimate:
-        """See ``tracking.tracker.Tracker.locate``.
-
-        The two passes of queries are those of the follow-up (LUDO): 10,000 coarse ones where the
-        organ can be, then labels of 40,000 points in the enlarged box of those inside.
-        """
-        frame = _Frame(self.model, self._inference, cloud, seed, np.random.default_rng(seed))
+        """See ``tracking.tracker.Tracker.locate``. The two passes of queries are those of the
+        follow-up (LUDO): 10,000 coarse ones where the organ can be, then labels of 40,000 points
+        in the enlarged box of those inside."""
+        frame = _Frame(self, cloud, seed, np.random.default_rng(seed))
         lattice = frame.lattice(frame.coarse_box())
-        frame.check(lattice)
+        distances_mm = frame.checked(lattice)
         inside = frame.inside(lattice)
         with frame.stage("volume"):
             camera_from_index, shape = grid_over(inside.points_mm, grid)
             margins, labels = sparse_margins(frame.logits_at, camera_from_index, shape)
-        return frame.estimate(inside, margins, labels, camera_from_index)
+        return frame.estimate(distances_mm, inside, margins, labels, camera_from_index)
 
     def follow(self, cloud: SensorCloud, last: Estimate | None, how: Following) -> Estimate:
-        """See ``tracking.tracker.Tracker.follow``.
-
-        The enlarged box of the last organ replaces the coarse queries, and its lattice is queried
-        only where the organ is (``organ_lattice``). Where this frame's organ reaches the box's
-        border, without a last estimate, or with ``thorough``, the organ is searched for as in a
-        first frame, and the lattice queried everywhere. The surfaces' grid is twice as fine as
-        the lattice, and queried only about surfaces.
-        """
+        """See ``tracking.tracker.Tracker.follow``. The enlarged box of the last organ replaces the
+        coarse queries, and its lattice is queried only where the organ is (``organ_lattice``).
+        Where this frame's organ reaches the box's border, without a last estimate, or with
+        ``thorough``, the organ is searched for as in a first frame, and the lattice queried
+        everywhere. The surfaces' grid is twice as fine as the lattice, and queried only about
+        surfaces."""
         rng = np.random.default_rng((how.seed, cloud.stamp_ns))
-        frame = _Frame(self.model, self._inference, cloud, how.seed, rng)
+        frame = _Frame(self, cloud, how.seed, rng)
         lattice = None
         if last is not None and not how.thorough:
             low, high = last.cloud.points_mm.min(0), last.cloud.points_mm.max(0)
@@ -87,58 +66,45 @@ class OccupancyLocator:
             lattice = frame.lattice(np.stack([low - margin, high + margin]).astype(float))
         if lattice is None or lattice.cut_off():
             lattice = frame.lattice(frame.coarse_box(), everywhere=True)
-        frame.check(lattice)
+        distances_mm = frame.checked(lattice)
         with frame.stage("volume"):
             finer = halved_lattice(frame.logits_at, lattice)
         inside = frame.inside(finer)
-        return replace(frame.estimate(inside, *margins_on(finer)), volume=None)
+        return replace(frame.estimate(distances_mm, inside, *volume.margins_on(finer)), volume=None)
 
     def warm(self) -> None:
         """See ``tracking.tracker.Tracker.warm``."""
         rng = np.random.default_rng(0)
         points = rng.normal(0, 15, (self.model.config.scene.cloud.n_points, 3)) + [0, 0, 150]
-        frame = _Frame(self.model, self._inference, SensorCloud(points), 0, rng)
+        frame = _Frame(self, SensorCloud(points), 0, rng)
         box = self.model.query_box_mm + np.median(points, axis=0)
         finer = halved_lattice(frame.logits_at, frame.lattice(box))
-        for step in (frame.inside, frame.check):
+        for step in (frame.inside, frame.checked):
             with suppress(NoEstimate):  # it is no organ
                 step(finer)
         ball = np.linalg.norm(np.indices((16, 16, 16)).T - 7.5, axis=-1) < 5
         margins = np.where(ball, 1, -1).astype(np.float16)[None]
-        for mesh in part_surfaces(margins, ball.astype(np.uint8), np.eye(4), ("kidney",)).values():
-            assert mesh.volume_mm3 > 0
+        volume.part_surfaces(margins, ball.astype(np.uint8), np.eye(4), ("kidney",))
 
 
-def steps_over(box: Box) -> int:
+def steps_over(box: volume.Box) -> int:
     """Steps of the lattice along a box's longest side."""
-    return max(FIT_STEPS, math.ceil(float((box[1] - box[0]).max()) / _LATTICE_MM))
+    return max(volume.FIT_STEPS, math.ceil(float((box[1] - box[0]).max()) / _LATTICE_MM))
 
 
-@dataclass(eq=False)
-class _Frame:
+class _Frame(Frame):
     """The work on one cloud, from its latent to the estimate."""
 
-    model: OccupancyModel
-    inference: Inference
-    cloud: SensorCloud
-    seed: int
-    rng: np.random.Generator
-    seconds: dict[str, float] = field(default_factory=dict)
-    distances_mm: Float32[np.ndarray, " n"] | None = None
-
-    def __post_init__(self) -> None:
-        check_cloud(self.cloud)
-        self.thinned = thin_cloud(self.cloud, self.model.config.scene.cloud.n_points, self.rng)
+    def __init__(self, locator: OccupancyLocator, cloud: SensorCloud, seed: int, rng: Rng) -> None:
+        super().__init__(locator.model, cloud, seed, rng)
+        self._inference = locator.inference
         with self.stage("encode"):
-            self.latent = self.inference.encode(self.thinned.points_mm)
+            self._latent = self._inference.encode(self.points_mm)
 
-    def stage(self, name: str) -> AbstractContextManager[None]:
-        return stage(self.seconds, name, self.inference.device)
+    def logits_at(self, points_mm: volume.Points) -> torch.Tensor:
+        return self._inference.logits(self._latent, points_mm)
 
-    def logits_at(self, points_mm: Float32[np.ndarray, "n 3"]) -> torch.Tensor:
-        return self.inference.logits(self.latent, points_mm)
-
-    def coarse_box(self) -> Box:
+    def coarse_box(self) -> volume.Box:
         """Where the organ is, by coarse random queries."""
         lower, upper = self.model.query_box_mm + np.median(self.cloud.points_mm, axis=0)
         points = self.rng.uniform(lower, upper, (COARSE_QUERIES, 3)).astype(np.float32)
@@ -154,19 +120,19 @@ class _Frame:
         margin = 0.05 * (high - low) + gap / 2
         return np.stack([low - margin, high + margin])
 
-    def lattice(self, box: Box, everywhere: bool = False) -> LogitLattice:
-        over = lattice_over if everywhere else organ_lattice
+    def lattice(self, box: volume.Box, everywhere: bool = False) -> volume.LogitLattice:
+        over = volume.lattice_over if everywhere else organ_lattice
         with self.stage("lattice"):
             return over(self.logits_at, box, steps_over(box))
 
-    def check(self, lattice: LogitLattice) -> None:
-        """Refuse what cannot be the organ."""
+    def checked(self, lattice: volume.LogitLattice) -> Float32[np.ndarray, " n"]:
+        """How far the points lie from the surface, if this can be the organ."""
         with self.stage("fit"):
-            self.distances_mm = surface_distances(lattice, self.thinned.points_mm)
-            spread = spread_mm(self.thinned.points_mm)
-            check_in_distribution(self.model.in_distribution, spread, fit_mm(self.distances_mm))
+            distances_mm = volume.surface_distances(lattice, self.points_mm)
+            check_in_distribution(self.model.in_distribution, self.points_mm, distances_mm)
+        return distances_mm
 
-    def inside(self, lattice: LogitLattice) -> OccupancyCloud:
+    def inside(self, lattice: volume.LogitLattice) -> OccupancyCloud:
         """Those of 40,000 random points in the lattice's box that lie inside."""
         with self.stage("fine"):
             low, high = lattice.box_mm
@@ -182,23 +148,18 @@ class _Frame:
 
     def estimate(
         self,
+        distances_mm: Float32[np.ndarray, " n"],
         inside: OccupancyCloud,
-        margins: Float16[np.ndarray, "parts i j k"],
-        found: UInt8[np.ndarray, "i j k"],
-        camera_from_index: Float64[np.ndarray, "4 4"],
+        margins: volume.Margins,
+        found: volume.Labels,
+        camera_from_index: volume.Affine,
     ) -> Estimate:
         """Everything read off margins and labels of a grid."""
         names = self.model.parts
-        assert self.distances_mm is not None
         with self.stage("surfaces"):
-            labels = keep_largest_pieces(found, len(names))
-            inside = drop_islands(inside, found, labels, camera_from_index)
-            meshes = part_surfaces(margins, labels, camera_from_index, names)
-        report = {
-            **report_head(self.cloud, self.seed),
-            "voxel_mm": float(camera_from_index[0, 0]),
-            "fit_mm": fit_report(self.distances_mm),
-            "parts": describe_parts(names, meshes, inside),
-            "timings": {**self.seconds, "total": sum(self.seconds.values())},
-        }
+            labels = volume.keep_largest_pieces(found, len(names))
+            inside = volume.drop_islands(inside, found, labels, camera_from_index)
+            meshes = volume.part_surfaces(margins, labels, camera_from_index, names)
+        parts = describe_parts(names, meshes, inside)
+        report = self.report(distances_mm, parts, voxel_mm=float(camera_from_index[0, 0]))
         return Estimate(inside, CameraLabels(labels, camera_from_index), meshes, report)

@@ -9,7 +9,6 @@ from __future__ import annotations
 import copy
 import math
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -18,15 +17,8 @@ from torch.nn import functional
 from tumortrack.core.errors import InputError
 from tumortrack.models.config import MlpDecoderConfig, NetworkConfig
 from tumortrack.models.layers import Layer, Norm
-from tumortrack.models.model import Network
-from tumortrack.models.normalisation import (
-    Aligned,
-    CloudBox,
-    alignment,
-    normalisation,
-    turned,
-    without_strays,
-)
+from tumortrack.models.model import Network, OnnxParts
+from tumortrack.models.normalisation import normalised, turned
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,12 +38,9 @@ class Latent:
 
 
 class MlpDecoder(nn.Module):
-    """An MLP on [latent, query] (Mescheder et al., CVPR 2019), the latent's part computed once
-    per cloud.
-
-    Inputs of a hidden layer are ordered [hidden, query, latent]; W [h, q, z] + b is computed as
-    W_hq [h, q] + (W_z z + b): the bracket is one vector per cloud.
-    """
+    """An MLP on [latent, query] (Mescheder et al., CVPR 2019), the latent's part computed once per
+    cloud. Inputs of a hidden layer are ordered [hidden, query, latent]; W [h, q, z] + b is computed
+    as W_hq [h, q] + (W_z z + b): the bracket is one vector per cloud."""
 
     def __init__(self, config: MlpDecoderConfig, latent_size: int) -> None:
         super().__init__()
@@ -123,15 +112,7 @@ class OccupancyNetwork(Network):
 
     def encode(self, points_mm: Tensor) -> Latent:
         """Clouds (B, N, 3), camera frame, mm, float32, points in random order -> Latent."""
-        kind = self.config.normalisation
-        if not isinstance(kind, CloudBox):
-            points_mm = without_strays(points_mm, kind.reach * kind.scale_mm)
-        centre_mm, scale_mm = normalisation(points_mm, kind)
-        points = (points_mm - centre_mm) / scale_mm
-        turn = None
-        if isinstance(kind, Aligned):
-            turn = alignment(points)
-            points = turned(points, turn)
+        points, centre_mm, scale_mm, turn = normalised(points_mm, self.config.normalisation)
         vector = self.encoder(points)
         return Latent(vector, centre_mm, scale_mm, turn, self.decoder.prepare(vector))
 
@@ -144,22 +125,14 @@ class OccupancyNetwork(Network):
         """Both at once: (B, N, 3) and (B, Q, 3) -> logits (B, Q, classes)."""
         return self.query(self.encode(points_mm), queries_mm)
 
-    def loss(
-        self,
-        clouds_mm: Tensor,
-        points_mm: Tensor,
-        labels: Tensor,
-        camera_from_ct: Tensor,
-        *,
-        first: int = 0,
-    ) -> Tensor:
+    def loss(self, *scenes: Tensor, first: int = 0) -> Tensor:
         """Cross-entropy of the points' labels, all points equal (the paper). Neither the poses nor
         the first cloud's number in the batch are used."""
+        clouds_mm, points_mm, labels, _ = scenes
         logits = self(clouds_mm, points_mm)
-        flat = logits.float().flatten(0, 1)
-        return functional.cross_entropy(flat, labels.long().flatten())
+        return functional.cross_entropy(logits.float().flatten(0, 1), labels.long().flatten())
 
-    def onnx_parts(self, cloud_mm: Tensor) -> tuple[nn.Module, tuple[Tensor, ...], dict[str, Any]]:
+    def onnx_parts(self, cloud_mm: Tensor) -> OnnxParts:
         """See ``Network``: clouds and queries in, logits out."""
         free = {"queries_mm": {1: "queries"}, "logits": {1: "queries"}}
         names = {"input_names": ["cloud_mm", "queries_mm"], "output_names": ["logits"]}

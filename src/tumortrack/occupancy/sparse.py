@@ -2,12 +2,8 @@
 settle the label.
 
 Every rule refines the same way (``refined``): halfway between the points of a lattice logits are
-first taken as linear; then a policy queries the network where that is not enough.
-
-- ``_connected`` queries the organ and a point or two about it: all that touches what lies inside.
-- ``_uncertain`` queries where the leading label leads by less than linear logits were found to be
-  off. Where an answer is another label than expected, and by more than noise, the points about it
-  are queried as well.
+first taken as linear; then a policy queries the network where that is not enough: ``_connected``
+all that touches the organ, ``_uncertain`` where linear logits do not settle the label.
 
 ``sparse_margins`` goes on so from a lattice of at most ``START_MM`` down to voxels. What it may
 miss: a part that no lattice point lies in and that does not show in the logits about it either. A
@@ -25,25 +21,19 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float16, Float32, Float64, Int, UInt8
+from jaxtyping import Bool, Float32, Int
 
 from tumortrack.core.types import OUTSIDE
-from tumortrack.occupancy.volume import (
-    AT_ONCE,
-    LARGEST_MARGIN,
-    LogitLattice,
-    LogitsAt,
-    dense_margins,
-    lattice_over,
-    margins_of,
-)
+from tumortrack.occupancy import kernels, volume
+from tumortrack.occupancy.kernels import leading
+from tumortrack.occupancy.volume import LogitLattice, LogitsAt, Rows
 
 START_MM = 4.0
 _PROBE = 512  # of the least certain points, queried to learn how far linear logits are off
 _SURPRISE = 0.5  # of the interpolation limit
 _FIRST_SEEN = 0.1  # of a first lattice's points may lie near a surface
 
-Query = Callable[[Int[np.ndarray, " n"]], Float32[np.ndarray, "n classes"]]
+Flat = Int[np.ndarray, " n"]  # indices of points
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,17 +44,14 @@ class _Level:
     coarse: LogitLattice
     shape: tuple[int, int, int]
 
-    @property
-    def step_mm(self) -> float:
-        return self.coarse.step_mm / 2
-
-    def query(self, flat: Int[np.ndarray, " n"]) -> Float32[np.ndarray, "n classes"]:
-        return _query(self.logits_at, self.coarse.origin_mm, self.step_mm, self.shape, flat)
-
-    def query_some(
-        self, flat: Int[np.ndarray, " n"], some: Int[np.ndarray, " m"]
-    ) -> Float32[np.ndarray, "m classes"]:
-        return self.query(flat[some])
+    def query(self, flat: Flat) -> Rows:
+        """The network's logits."""
+        parts, step_mm = [], self.coarse.step_mm / 2
+        for first in range(0, len(flat), volume.AT_ONCE):
+            index = np.unravel_index(flat[first : first + volume.AT_ONCE], self.shape)
+            points = np.stack(index, axis=1) * step_mm + self.coarse.origin_mm
+            parts.append(self.logits_at(points.astype(np.float32)).float().cpu().numpy())
+        return np.concatenate(parts)
 
     def known(self) -> Bool[np.ndarray, " n"]:
         """The coarse points."""
@@ -73,47 +60,24 @@ class _Level:
         return known.ravel()
 
 
-Policy = Callable[[_Level, Float32[np.ndarray, "n classes"]], None]  # replaces rows by answers
-
-
-def _query(
-    logits_at: LogitsAt,
-    origin_mm: Float64[np.ndarray, " 3"],
-    step_mm: float,
-    shape: tuple[int, int, int],
-    flat: Int[np.ndarray, " n"],
-) -> Float32[np.ndarray, "n classes"]:
-    """The network's logits at flat indices of a lattice."""
-    parts = []
-    for first in range(0, len(flat), AT_ONCE):
-        index = np.unravel_index(flat[first : first + AT_ONCE], shape)
-        points = np.stack(index, axis=1) * step_mm + origin_mm
-        parts.append(logits_at(points.astype(np.float32)).float().cpu().numpy())
-    return np.concatenate(parts)
+Policy = Callable[[_Level, Rows], None]  # replaces rows by answers
 
 
 def refined(logits_at: LogitsAt, coarse: LogitLattice, policy: Policy) -> LogitLattice:
-    """The lattice of half the step: linear logits, the network's where the policy queries it."""
-    from tumortrack.occupancy.kernels import halved
-
+    """The lattice of half the step: linear logits, and the network's where the policy puts them."""
     i, j, k = (2 * n - 1 for n in coarse.logits.shape[:3])
-    level = _Level(logits_at, coarse, (i, j, k))
     logits = np.empty((i, j, k, coarse.logits.shape[3]), np.float32)
-    _in_slabs(partial(halved, coarse.logits, logits), i)
-    policy(level, logits.reshape(-1, logits.shape[3]))
-    return LogitLattice(coarse.origin_mm, level.step_mm, logits)
+    _in_slabs(partial(kernels.halved, coarse.logits, logits), i)
+    policy(_Level(logits_at, coarse, (i, j, k)), logits.reshape(-1, logits.shape[3]))
+    return LogitLattice(coarse.origin_mm, coarse.step_mm / 2, logits)
 
 
-def organ_lattice(
-    logits_at: LogitsAt, box_mm: Float[np.ndarray, "2 3"], steps: int
-) -> LogitLattice:
-    """``lattice_over``, queried everywhere inside the organ and a point or two about it.
-
-    Every second point along each axis is queried first. Whatever is connected to a part that
-    holds one of these points is found as if all were queried; what lies apart and between them is
-    not, and would be dropped (``volume.keep_largest_pieces``).
-    """
-    return refined(logits_at, lattice_over(logits_at, box_mm, -(-steps // 2)), _connected)
+def organ_lattice(logits_at: LogitsAt, box_mm: volume.Box, steps: int) -> LogitLattice:
+    """``lattice_over``, queried everywhere inside the organ and a point or two about it. Every
+    second point along each axis is queried first. Whatever is connected to a part that holds one of
+    these points is found as if all were queried; what lies apart and between them is not, and would
+    be dropped (``volume.keep_largest_pieces``)."""
+    return refined(logits_at, volume.lattice_over(logits_at, box_mm, -(-steps // 2)), _connected)
 
 
 def halved_lattice(logits_at: LogitsAt, lattice: LogitLattice) -> LogitLattice:
@@ -123,26 +87,24 @@ def halved_lattice(logits_at: LogitsAt, lattice: LogitLattice) -> LogitLattice:
 
 def sparse_margins(
     logits_at: LogitsAt,
-    camera_from_index: Float64[np.ndarray, "4 4"],
+    camera_from_index: volume.Affine,
     shape: tuple[int, int, int],
     start_mm: float = START_MM,
-) -> tuple[Float16[np.ndarray, "parts i j k"], UInt8[np.ndarray, "i j k"]]:
-    """What ``dense_margins`` returns; far from all surfaces margins are the largest there are,
-    between them and the queried voxels linear.
-
-    Args:
-        camera_from_index: of cubic voxels along the camera's axes.
-        start_mm: largest step of the first lattice.
-    """
+) -> tuple[volume.Margins, volume.Labels]:
+    """The ``margins_of`` the parts, and labels, at the centres of cubic voxels along the camera's
+    axes; far from all surfaces margins are the largest there are, between them and the queried
+    voxels linear. ``start_mm``: largest step of the first lattice."""
     voxel_mm, origin_mm = float(camera_from_index[0, 0]), camera_from_index[:3, 3]
     levels = max(0, int(np.floor(np.log2(max(start_mm / voxel_mm, 1.0)))))
-    if levels == 0:
-        return dense_margins(logits_at, camera_from_index, shape)
-    stride = 2**levels
-    i, j, k = ((n - 2) // stride + 2 for n in shape)  # the last lies on the grid's end or past it
-    step_mm, every = voxel_mm * stride, np.arange(i * j * k)
-    logits = _query(logits_at, origin_mm, step_mm, (i, j, k), every)
+    stride, (i, j, k) = 2**levels, shape
+    if levels > 0:
+        i, j, k = ((n - 2) // stride + 2 for n in shape)  # the last on the grid's end or past it
+    step_mm = voxel_mm * stride
+    unknown = LogitLattice(origin_mm, 2 * step_mm, np.empty((0, 0, 0, 0), np.float32))
+    logits = _Level(logits_at, unknown, (i, j, k)).query(np.arange(i * j * k))
     lattice = LogitLattice(origin_mm, step_mm, logits.reshape(i, j, k, -1))
+    if levels == 0:
+        return volume.margins_on(lattice)[:2]
     limit = InterpolationLimit()
     for _ in range(levels - 1):
         limit = limit.finer()
@@ -150,17 +112,13 @@ def sparse_margins(
     return _voxels(_Level(logits_at, lattice, shape), limit.finer())
 
 
-def sparse_logits(
-    logits_at: LogitsAt, lattice: LogitLattice, points_mm: Float32[np.ndarray, "n 3"]
-) -> Float32[np.ndarray, "n classes"]:
+def sparse_logits(logits_at: LogitsAt, lattice: LogitLattice, points_mm: volume.Points) -> Rows:
     """Logits at points in a lattice's box: linear where the label is certain, else queried.
-
     Scattered points are counted, nobody sees one alone: less care than for voxels, half of the
-    queries (networks tried: none to three of 40,000 labels other than those of querying all).
-    """
+    queries (networks tried: none to three of 40,000 labels other than those of querying all)."""
     logits = lattice.between(points_mm)
 
-    def query(some: Int[np.ndarray, " m"]) -> Float32[np.ndarray, "m classes"]:
+    def query(some: Flat) -> Rows:
         return logits_at(points_mm[some]).float().cpu().numpy()
 
     query_uncertain(logits, leading(logits)[1], query, InterpolationLimit(tail=0.99, safety=1.0))
@@ -169,11 +127,9 @@ def sparse_logits(
 
 @dataclass(eq=False)
 class InterpolationLimit:
-    """How far linear logits were found to be off: a label that leads by more is accepted.
-
-    ``coarser``: the limit at twice the step, 0 where there was none. The limit is a quantile,
-    ``tail``, of the errors found, times ``safety``.
-    """
+    """How far linear logits were found to be off: a label that leads by more is accepted. It is a
+    quantile, ``tail``, of the errors found, times ``safety``. ``coarser``: the limit at twice the
+    step, 0 where there was none."""
 
     limit: float = 0.0
     coarser: float = 0.0
@@ -196,57 +152,47 @@ class InterpolationLimit:
 
 
 def query_uncertain(
-    expected: Float32[np.ndarray, "n classes"],
+    expected: Rows,
     leads: Float32[np.ndarray, " n"],
-    query: Query,
+    query: Callable[[Flat], Rows],
     limit: InterpolationLimit,
 ) -> Bool[np.ndarray, " n"]:
-    """Query wherever the expected label leads by too little; which were queried.
-
-    The least certain points come first. How far their logits are off tells which of the others
-    have to be queried as well, until none is left.
-
-    Args:
-        expected: logits; replaced by the answers.
-        leads: by how much the largest exceeds the second; infinite where it is known already.
-        query: indices (m,) -> logits (m, classes).
-        limit: updated by the answers.
-    """
+    """Query wherever the expected label leads by too little; which were queried. The least certain
+    points come first. How far their logits are off tells which of the others have to be queried as
+    well, until none is left. ``expected``: logits, replaced by the answers; ``leads``: by how much
+    the largest exceeds the second, infinite where it is known already; ``limit``: updated by the
+    answers."""
     queried = np.zeros(len(leads), bool)
     open_points = int(np.isfinite(leads).sum())
     if open_points:
         least = min(_PROBE, open_points) - 1
         limit.limit = max(limit.limit, float(np.partition(leads, least)[least]))
-    while True:
-        now = np.flatnonzero((leads <= limit.limit) & ~queried)
-        if not len(now):
-            return queried
+    while len(now := np.flatnonzero((leads <= limit.limit) & ~queried)):
         found = query(now)
         limit.update(expected[now], found)
         expected[now] = found
         queried[now] = True
+    return queried
 
 
-def _connected(level: _Level, rows: Float32[np.ndarray, "n classes"]) -> None:
+def _connected(level: _Level, rows: Rows) -> None:
     """Query all points within two of a coarse one that lies inside, then all about those that turn
     out to lie inside, until none is left."""
-    from tumortrack.occupancy.kernels import neighbours
 
     def inside(flat: np.ndarray) -> np.ndarray:
         return flat[rows[flat].argmax(1) != OUTSIDE]
 
     known = level.known()
-    first = neighbours(level.shape, inside(np.flatnonzero(known)), known)
-    frontier = np.concatenate([first, neighbours(level.shape, first, known)])
+    first = kernels.neighbours(level.shape, inside(np.flatnonzero(known)), known)
+    frontier = np.concatenate([first, kernels.neighbours(level.shape, first, known)])
     while len(frontier):
         rows[frontier] = level.query(frontier)
-        frontier = neighbours(level.shape, inside(frontier), known)
+        frontier = kernels.neighbours(level.shape, inside(frontier), known)
 
 
-def _uncertain(
-    limit: InterpolationLimit, level: _Level, rows: Float32[np.ndarray, "n classes"]
-) -> None:
-    """Query where linear logits do not settle the label, and about surprises."""
+def _uncertain(limit: InterpolationLimit, level: _Level, rows: Rows) -> None:
+    """Query where the leading label leads by less than linear logits were found to be off, and
+    about surprises."""
     leads = leading(rows)[1]
     leads[level.known()] = np.inf
     queried = np.flatnonzero(query_uncertain(rows, leads, level.query, limit))
@@ -254,95 +200,61 @@ def _uncertain(
     rows[flat] = found
 
 
-def _voxels(
-    level: _Level, limit: InterpolationLimit
-) -> tuple[Float16[np.ndarray, "parts i j k"], UInt8[np.ndarray, "i j k"]]:
+def _voxels(level: _Level, limit: InterpolationLimit) -> tuple[volume.Margins, volume.Labels]:
     """Margins and labels of the voxels. As ``_uncertain``, but logits of voxels far from surfaces
-    are never held: a cell whose corners lead clearly is filled with their label."""
-    from tumortrack.occupancy.kernels import filled
-
+    are never held: a cell whose corners lead clearly is filled with their label, and margins there
+    are the largest."""
     coarse = level.coarse.logits
     rows = coarse.reshape(-1, coarse.shape[3])
     certain, leads = (values.reshape(coarse.shape[:3]) for values in leading(rows))
     labels = np.empty(level.shape, np.uint8)
+
+    def uncertain(flat: Flat, expected: Rows, between: np.ndarray) -> np.ndarray:
+        lead = leading(expected)[1]
+        lead[~between] = np.inf
+        return query_uncertain(expected, lead, lambda some: level.query(flat[some]), limit)
+
     seen = limit.coarser or float(np.quantile(leads, _FIRST_SEEN))
     while True:
         plain = np.where(leads >= np.float32(seen), certain, np.uint8(255))
-        lists = _in_slabs(partial(filled, coarse, certain, plain, labels), len(coarse))
+        lists = _in_slabs(partial(kernels.filled, coarse, certain, plain, labels), len(coarse))
         flat, expected, between = (np.concatenate(column) for column in zip(*lists, strict=True))
-        lead = leading(expected)[1]
-        lead[~between] = np.inf
-        queried = query_uncertain(expected, lead, partial(level.query_some, flat), limit)
+        queried = uncertain(flat, expected, between)
         if limit.limit <= seen:
             break
         seen = 2 * limit.limit  # voxels that lead by less were filled unseen
     more, found = _about_surprises(level, limit.limit, flat[queried], expected[queried])
     places, logits = np.concatenate([flat, more]), np.concatenate([expected, found])
     labels.reshape(-1)[places] = leading(logits)[0]
-    return _margins(labels, places, logits), labels
-
-
-def _margins(
-    labels: UInt8[np.ndarray, "i j k"],
-    places: Int[np.ndarray, " n"],
-    logits: Float32[np.ndarray, "n classes"],
-) -> Float16[np.ndarray, "parts i j k"]:
-    """The largest everywhere but at these places (flat), whose logits are known."""
-    from tumortrack.occupancy.kernels import spread
-
     margins = np.empty((logits.shape[1] - 1, *labels.shape), np.float16)
-    inside, outside = np.array([LARGEST_MARGIN, -LARGEST_MARGIN], np.float16).view(np.uint16)
-    _in_slabs(partial(spread, labels, inside, outside, margins.view(np.uint16)), len(labels))
-    won = margins_of(torch.from_numpy(logits))
-    for part, margin in enumerate(margins):
-        margin.reshape(-1)[places] = won[:, part]
-    return margins
+    most = volume.LARGEST_MARGIN
+    inside, outside = np.array([most, -most], np.float16).view(np.uint16)
+    spread = partial(kernels.spread, labels, inside, outside, margins.view(np.uint16))
+    _in_slabs(spread, len(labels))
+    for margin, won in zip(margins, volume.margins_of(torch.from_numpy(logits)).T, strict=True):
+        margin.reshape(-1)[places] = won
+    return margins, labels
 
 
 def _about_surprises(
-    level: _Level,
-    limit: float,
-    flat: Int[np.ndarray, " n"],
-    found: Float32[np.ndarray, "n classes"],
+    level: _Level, limit: float, flat: Flat, found: Rows
 ) -> tuple[Int[np.ndarray, " m"], Float32[np.ndarray, "m classes"]]:
-    """Query every point that touches a surprise, until there is none; indices and logits.
-
-    A surprise is another label than expected, by more than ``_SURPRISE`` of the ``limit``, since
-    linear logits are a little off everywhere.
-
-    Args:
-        flat, found: the points queried before, and their logits.
-    """
-    from tumortrack.occupancy.kernels import expected_at, neighbours, surprising
-
-    def surprises_among(flat: np.ndarray, found: np.ndarray) -> np.ndarray:
-        expected = np.empty_like(found)
-        expected_at(level.coarse.logits, level.shape, flat, expected)
-        return flat[surprising(expected, found, np.float32(_SURPRISE * limit))]
-
-    more, logits = [np.zeros(0, np.int64)], [found[:0]]
-    surprises = surprises_among(flat, found)
-    if not len(surprises):
-        return more[0], logits[0]
-    known = level.known()
-    known[flat] = True
-    while len(surprises):
-        frontier = neighbours(level.shape, surprises, known)
-        if not len(frontier):
-            break
-        more.append(frontier)
-        logits.append(level.query(frontier))
-        surprises = surprises_among(frontier, logits[-1])
+    """Query every point that touches a surprise, until there is none; indices and logits. A
+    surprise is another label than expected, by more than ``_SURPRISE`` of the ``limit``, since
+    linear logits are a little off everywhere. ``flat`` and ``found``: the points queried before,
+    and their logits."""
+    surprises = partial(
+        kernels.surprising, level.coarse.logits, level.shape, limit=np.float32(_SURPRISE * limit)
+    )
+    more, logits, surprised = [flat[:0]], [found[:0]], surprises(flat, found)
+    if len(surprised):
+        known = level.known()
+        known[flat] = True
+    while len(surprised) and len(flat := kernels.neighbours(level.shape, surprised, known)):
+        more.append(flat)
+        logits.append(found := level.query(flat))
+        surprised = surprises(flat, found)
     return np.concatenate(more), np.concatenate(logits)
-
-
-def leading(rows: Float32[np.ndarray, "n classes"]) -> tuple[np.ndarray, np.ndarray]:
-    """The label that leads in every row, and by how much."""
-    from tumortrack.occupancy.kernels import best
-
-    labels, leads = np.empty(len(rows), np.uint8), np.empty(len(rows), np.float32)
-    best(rows, labels, leads)
-    return labels, leads
 
 
 def _in_slabs(work: Callable[[int, int], object], planes: int) -> list[Any]:

@@ -8,10 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Float16, Float32, Float64, UInt8
+from scipy import ndimage
 
 from tumortrack.core.errors import NoEstimate
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.types import FIRST_TUMOR, ORGAN, OUTSIDE, Mesh, OccupancyCloud
+from tumortrack.occupancy.kernels import between
 from tumortrack.simulate.occupancy import surface_distance
 
 AT_ONCE = 2**18  # queries; bounds the memory for any grid
@@ -19,7 +21,14 @@ _SMALLEST_MARGIN = 1e-3  # a surface exactly through a grid point would not be c
 FIT_STEPS = 24  # of a lattice for surface_distances, along the box's longest side
 LARGEST_MARGIN = 30.0  # larger logits say no more about where a surface lies
 
-LogitsAt = Callable[[Float32[np.ndarray, "n 3"]], torch.Tensor]  # camera frame, mm -> (n, classes)
+Points = Float32[np.ndarray, "n 3"]  # camera frame, mm
+Rows = Float32[np.ndarray, "n classes"]
+Box = Float[np.ndarray, "2 3"]  # camera frame, mm: lower and upper corner
+Affine = Float64[np.ndarray, "4 4"]
+Labels = UInt8[np.ndarray, "i j k"]
+Mask = Bool[np.ndarray, "i j k"]
+Margins = Float16[np.ndarray, "parts i j k"]
+LogitsAt = Callable[[Points], torch.Tensor]  # camera frame, mm -> (n, classes)
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,29 +45,19 @@ class LogitLattice:
         size = np.array(self.logits.shape[:3]) - 1
         return np.stack([self.origin_mm, self.origin_mm + self.step_mm * size])
 
-    def between(self, points_mm: Float32[np.ndarray, "n 3"]) -> Float32[np.ndarray, "n classes"]:
+    def between(self, points_mm: Points) -> Rows:
         """Trilinear logits at points; outside the lattice those of its border."""
-        from tumortrack.occupancy.kernels import between
-
-        out = np.empty((len(points_mm), self.logits.shape[3]), np.float32)
         place = ((points_mm - self.origin_mm) / self.step_mm).astype(np.float32)
-        between(self.logits, place, out)
-        return out
+        return between(self.logits, place)
 
     def cut_off(self) -> bool:
         """Whether the organ, the largest piece of what lies inside, reaches the border or is not
         there at all."""
-        from scipy import ndimage
-
-        pieces, count = ndimage.label(self.logits.argmax(-1) != OUTSIDE)
-        if not count:
-            return True
-        sizes = np.bincount(pieces.ravel())
-        largest = 1 + int(sizes[1:].argmax())
-        return bool(sizes[largest] > (pieces[1:-1, 1:-1, 1:-1] == largest).sum())
+        organ = _largest_piece(self.logits.argmax(-1) != OUTSIDE)
+        return not organ.any() or bool(organ.sum() > organ[1:-1, 1:-1, 1:-1].sum())
 
 
-def lattice_over(logits_at: LogitsAt, box_mm: Float[np.ndarray, "2 3"], steps: int) -> LogitLattice:
+def lattice_over(logits_at: LogitsAt, box_mm: Box, steps: int) -> LogitLattice:
     """A lattice over a box, ``steps`` along its longest side, queried at every point."""
     step = float((box_mm[1] - box_mm[0]).max()) / steps
     axes = [np.arange(low, high + step, step) for low, high in box_mm.T]
@@ -67,34 +66,7 @@ def lattice_over(logits_at: LogitsAt, box_mm: Float[np.ndarray, "2 3"], steps: i
     return LogitLattice(box_mm[0].astype(float), step, logits.reshape(*grid.shape[:3], -1))
 
 
-def dense_margins(
-    logits_at: LogitsAt, camera_from_index: Float64[np.ndarray, "4 4"], shape: tuple[int, int, int]
-) -> tuple[Float16[np.ndarray, "parts i j k"], UInt8[np.ndarray, "i j k"]]:
-    """Query every voxel centre; ``margins_of`` the parts and labels.
-
-    Half precision: 2 bytes a voxel and part, 0.4 GB at 400^3 with two tumors.
-    """
-    labels = np.empty(shape, np.uint8)
-    margins: np.ndarray | None = None
-    planes = max(1, AT_ONCE // (shape[1] * shape[2]))
-    for first in range(0, shape[0], planes):
-        block = (min(planes, shape[0] - first), *shape[1:])
-        index = np.indices(block).reshape(3, -1).T + np.array([first, 0.0, 0.0])
-        logits = logits_at(transform_points(camera_from_index, index).astype(np.float32))
-        won = margins_of(logits)
-        if margins is None:
-            margins = np.empty((won.shape[1], *shape), np.float16)
-        labels[first : first + planes] = logits.argmax(-1).byte().cpu().numpy().reshape(block)
-        margins[:, first : first + planes] = won.T.reshape(-1, *block)
-    assert margins is not None
-    return margins, labels
-
-
-def margins_on(
-    lattice: LogitLattice,
-) -> tuple[
-    Float16[np.ndarray, "parts i j k"], UInt8[np.ndarray, "i j k"], Float64[np.ndarray, "4 4"]
-]:
+def margins_on(lattice: LogitLattice) -> tuple[Margins, Labels, Affine]:
     """``margins_of`` the parts, labels and ``camera_from_index`` of a lattice."""
     logits = torch.from_numpy(lattice.logits.reshape(-1, lattice.logits.shape[3]))
     shape = lattice.logits.shape[:3]
@@ -106,11 +78,10 @@ def margins_on(
 
 
 def margins_of(logits: torch.Tensor) -> Float16[np.ndarray, "n parts"]:
-    """By how much each part's logit wins (positive inside): (n, classes) -> (n, parts).
-
-    The organ's margin is that of the best label inside against the outside, so that its zero
-    set is the whole organ's surface; a tumor's is against the best other label.
-    """
+    """By how much each part's logit wins (positive inside): (n, classes) -> (n, parts). Half
+    precision: 2 bytes a voxel and part, 0.4 GB at 400^3 with two tumors. The organ's margin is that
+    of the best label inside against the outside, so that its zero set is the whole organ's surface;
+    a tumor's is against the best other label."""
     columns = [logits[:, 1:].amax(1) - logits[:, 0]]
     for label in range(FIRST_TUMOR, logits.shape[1]):
         others = torch.cat([logits[:, :label], logits[:, label + 1 :]], 1).amax(1)
@@ -119,9 +90,7 @@ def margins_of(logits: torch.Tensor) -> Float16[np.ndarray, "n parts"]:
     return won.half().cpu().numpy()
 
 
-def keep_largest_pieces(
-    labels: UInt8[np.ndarray, "i j k"], n_parts: int
-) -> UInt8[np.ndarray, "i j k"]:
+def keep_largest_pieces(labels: Labels, n_parts: int) -> Labels:
     """One piece of each part: islands of the organ become outside, those of a tumor organ."""
     kept = np.where(_largest_piece(labels > 0), labels, 0).astype(np.uint8)
     for label in range(FIRST_TUMOR, n_parts + 1):
@@ -131,10 +100,7 @@ def keep_largest_pieces(
 
 
 def drop_islands(
-    cloud: OccupancyCloud,
-    found: UInt8[np.ndarray, "i j k"],
-    kept: UInt8[np.ndarray, "i j k"],
-    camera_from_index: Float64[np.ndarray, "4 4"],
+    cloud: OccupancyCloud, found: Labels, kept: Labels, camera_from_index: Affine
 ) -> OccupancyCloud:
     """The cloud without what ``keep_largest_pieces`` dropped from ``found``: points of an island of
     the organ are left out, those of a tumor become organ. A point belongs to a piece if one of the
@@ -155,9 +121,7 @@ def drop_islands(
     return OccupancyCloud(points, labels[stays], probability, cloud.stamp_ns)
 
 
-def _largest_piece(mask: Bool[np.ndarray, "i j k"]) -> Bool[np.ndarray, "i j k"]:
-    from scipy import ndimage
-
+def _largest_piece(mask: Mask) -> Mask:
     box = _box_of(mask)
     pieces, count = ndimage.label(mask[box])
     if count < 2:
@@ -167,24 +131,22 @@ def _largest_piece(mask: Bool[np.ndarray, "i j k"]) -> Bool[np.ndarray, "i j k"]
     return largest
 
 
-def _box_of(mask: Bool[np.ndarray, "i j k"], margin: int = 0) -> tuple[slice, ...]:
+def _box_of(mask: Mask, margin: int = 0) -> tuple[slice, ...]:
     """Where a mask is true, and ``margin`` voxels more on each side."""
     box = []
-    for axis in range(3):
-        across = tuple(other for other in range(3) if other != axis)
-        found = np.flatnonzero(mask.any(axis=across))
+    for others in ((1, 2), (0, 2), (0, 1)):
+        found = np.flatnonzero(mask.any(axis=others))
         first, last = (int(found[0]), int(found[-1]) + 1) if len(found) else (0, 0)
         box.append(slice(max(first - margin, 0), last + margin))
     return tuple(box)
 
 
 def part_surfaces(
-    margins: Float16[np.ndarray, "parts i j k"],
-    labels: UInt8[np.ndarray, "i j k"],
-    camera_from_index: Float64[np.ndarray, "4 4"],
-    names: tuple[str, ...],
+    margins: Margins, labels: Labels, camera_from_index: Affine, names: tuple[str, ...]
 ) -> dict[str, Mesh]:
     """Each part, in one piece, as a closed surface; parts without a voxel are left out."""
+    from skimage import measure
+
     meshes = {}
     for n, name in enumerate(names):
         mask = labels > 0 if n == 0 else labels == n + 1
@@ -192,36 +154,22 @@ def part_surfaces(
             continue
         # One voxel more on each side: the surface lies between voxels of either sign.
         box = _box_of(mask, 1)
-        field = np.where(mask[box], margins[n][box], -np.abs(margins[n][box]))
-        meshes[name] = _surface(field.astype(np.float32), camera_from_index, box)
+        field = np.where(mask[box], margins[n][box], -np.abs(margins[n][box])).astype(np.float32)
+        field = np.where(field > 0, 1, -1) * np.maximum(np.abs(field), _SMALLEST_MARGIN)
+        # Padding closes what the grid's edge cuts.
+        padded = np.pad(field, 1, constant_values=-float(np.abs(field).max()))
+        vertices, faces, _, _ = measure.marching_cubes(padded, 0.0, gradient_direction="ascent")
+        index = vertices.astype(np.float64) - 1 + [part.start for part in box]
+        mesh = Mesh(transform_points(camera_from_index, index), faces)
+        outwards = mesh.volume_mm3 > 0
+        meshes[name] = mesh if outwards else Mesh(mesh.vertices_mm, faces[:, ::-1])
     return meshes
 
 
-def _surface(
-    field: np.ndarray, camera_from_index: Float64[np.ndarray, "4 4"], box: tuple[slice, ...]
-) -> Mesh:
-    from skimage import measure
-
-    field = np.where(field > 0, 1, -1) * np.maximum(np.abs(field), _SMALLEST_MARGIN)
-    # Padding closes what the grid's edge cuts.
-    padded = np.pad(field, 1, constant_values=-float(np.abs(field).max()))
-    vertices, faces, _, _ = measure.marching_cubes(padded, 0.0, gradient_direction="ascent")
-    index = vertices.astype(np.float64) - 1 + [part.start for part in box]
-    mesh = Mesh(transform_points(camera_from_index, index), faces)
-    return mesh if mesh.volume_mm3 > 0 else Mesh(mesh.vertices_mm, faces[:, ::-1])
-
-
-def surface_distances(
-    lattice: LogitLattice, points_mm: Float[np.ndarray, "n 3"]
-) -> Float32[np.ndarray, " n"]:
-    """How far points (n, 3) lie from the organ's surface, camera frame, mm.
-
-    The surface is the zero of the margin, linear between the lattice's points: accurate to about
-    half a mm for an organ on ``FIT_STEPS``.
-
-    Raises:
-        NoEstimate: there is no surface in the lattice's box.
-    """
+def surface_distances(lattice: LogitLattice, points_mm: Points) -> Float32[np.ndarray, " n"]:
+    """How far points (n, 3) lie from the organ's surface, camera frame, mm; NoEstimate where there
+    is none in the lattice's box. It is the zero of the margin, linear between the lattice's points:
+    accurate to about half a mm for an organ on ``FIT_STEPS``."""
     from skimage import measure
 
     logits = lattice.logits

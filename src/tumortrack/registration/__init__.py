@@ -1,4 +1,1 @@
-"""The method of the preset `clinic`: the organ of the CT, laid on a cloud of one side.
-
-Read ``registration`` first; it is the whole method and names the steps.
-"""
+"""The method of the preset `clinic`; read ``registration`` first, which names the steps."""

@@ -16,9 +16,11 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
+from tumortrack.core.geometry import Direction, Matrix, Points, Vector
 from tumortrack.core.types import Mesh
 from tumortrack.registration.network import POSE_OUTPUTS, RegistrationNetwork, facing_rotation
 
+Poses = Float[np.ndarray, "b 4 4"]
 UPRIGHT_MM = 55.0  # half the length of every organ in its upright frame
 FIELDS = 24  # second degree: 30 vector fields, less 6 of rigid motion
 _RIGID = 6
@@ -32,17 +34,15 @@ _ERROR_MM = 1.0  # to which the fields are matched by the modes
 class CanonicalFrame:
     """An organ's upright frame: x upright = ``scale`` * ``facing`` (x_ct - ``center_ct``)."""
 
-    facing: Float[np.ndarray, "3 3"]
-    center_ct: Float[np.ndarray, " 3"]
+    facing: Matrix
+    center_ct: Vector
     scale: float
 
-    def in_ct(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+    def in_ct(self, points: Points) -> Points:
         """Points of the upright frame in the CT's."""
         return points @ self.facing / self.scale + self.center_ct
 
-    def camera_from_upright(
-        self, camera_from_ct: Float[np.ndarray, "b 4 4"]
-    ) -> Float[np.ndarray, "b 4 4"]:
+    def camera_from_upright(self, camera_from_ct: Poses) -> Poses:
         """Poses of the upright organ before a camera whose lengths are scaled likewise."""
         poses = np.tile(np.eye(4), (len(camera_from_ct), 1, 1))
         rotation = camera_from_ct[:, :3, :3]
@@ -52,14 +52,10 @@ class CanonicalFrame:
 
 
 def upright_of(
-    organ_ct: Mesh,
-    up_lps: tuple[float, float, float],
-    center_ct: Float[np.ndarray, " 3"],
-    long_axis: Float[np.ndarray, " 3"],
+    organ_ct: Mesh, up_lps: Direction, center_ct: Vector, long_axis: Vector
 ) -> CanonicalFrame:
     """The upright frame of an organ."""
-    lower, upper = organ_ct.box_mm
-    half_mm = float((upper - lower).max()) / 2
+    half_mm = float(np.ptp(organ_ct.box_mm, axis=0).max()) / 2
     return CanonicalFrame(facing_rotation(up_lps, long_axis), center_ct, UPRIGHT_MM / half_mm)
 
 
@@ -71,21 +67,20 @@ def generic_points(count: int) -> Float[np.ndarray, "p 3"]:
     return direction * np.cbrt(rng.uniform(size=(count, 1))) * _HALF_AXES
 
 
-def generic_fields(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3 24"]:
+def generic_fields(points: Points) -> Float[np.ndarray, "n 3 24"]:
     """The displacement of points of the upright frame by one unit of each field."""
     return (_monomials(points) @ _mixture()).reshape(len(points), 3, FIELDS)
 
 
 @cache
 def _mixture() -> Float[np.ndarray, "30 24"]:
-    """Of the monomial fields, so that over a dense organ the results are orthogonal to each other
-    and to rigid motion."""
+    """That makes the fields orthogonal to each other and to rigid motion, over a dense organ."""
     dense = generic_points(2000)
     _, triangle = np.linalg.qr(_monomials(dense))
     return np.linalg.inv(triangle)[:, _RIGID:] * _FIELD_MM * np.sqrt(len(dense))
 
 
-def _monomials(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "m 30"]:
+def _monomials(points: Points) -> Float[np.ndarray, "m 30"]:
     """Vector fields, rigid ones first: constant, turns, stretches and shears, second degree."""
     x = points / UPRIGHT_MM
     eye = np.eye(3)
@@ -110,11 +105,9 @@ def initialize_canonical(network: RegistrationNetwork) -> None:
 def carry_over(
     network: RegistrationNetwork, weights: dict[str, torch.Tensor], upright: CanonicalFrame
 ) -> None:
-    """Start a network that knows its organ (``know``) from pretrained weights.
-
-    Encoder, hidden layers and pose are taken as they are; each field becomes the state of the
-    organ's own modes that resembles it best, weighed against how the states spread.
-    """
+    """Start a network that knows its organ from pretrained weights: encoder, hidden layers and pose
+    are taken as they are; each field becomes the state of the organ's own modes that
+    resembles it best, weighed against how the states spread."""
     state = network.state_dict()
     for name, value in weights.items():
         if name.startswith(("encoder.", "hidden.")):
@@ -124,9 +117,8 @@ def carry_over(
     network.output.bias[:POSE_OUTPUTS] = bias[:POSE_OUTPUTS].to(network.output.bias)
 
     device = network.output.weight.device
-    points, modes, mean, std = (
-        getattr(network, name).double().cpu().numpy() for name in ("points", "modes", "mean", "std")
-    )
+    known = (network.points, network.modes, network.mean, network.std)
+    points, modes, mean, std = (value.double().cpu().numpy() for value in known)
     fields = generic_fields(points @ upright.facing.T * upright.scale)
     wanted = np.einsum("pdf,dc->pcf", fields, upright.facing) / upright.scale  # CT frame, mm
     own = (modes * std).reshape(-1, modes.shape[-1])

@@ -3,13 +3,15 @@
 Unknown are a rigid motion and the coefficients of the body's modes. The most likely ones, given
 points with errors and the library of states as a Gaussian prior, minimise
 
-    n_effective / n * sum of rho(distance of a point, carried back to the CT, to the organ / sigma)
-    + the squared Mahalanobis distance of the coefficients from the library's mean.
+    (last_mm / sigma_mm)^2 * min(n_effective / n, 1) * sum of rho(d / last_mm)
+    + the squared Mahalanobis distance of pose and coefficients from the prior's mean,
+
+d being the distance (mm) of a point, carried back to the CT, to the organ's surface, and rho a
+robust kernel: (d / sigma_mm)^2 for small d.
 
 The distance is looked up in a field, so no nearest point is searched. The same curvature is the
 estimate's uncertainty. Source: surface registration as maximum a posteriori with a statistical
-shape prior, e.g. Heimann and Meinzer 2009 (doi 10.1016/j.media.2009.05.004); rho: Geman and
-McClure 1987.
+shape prior, e.g. Heimann and Meinzer 2009 (doi 10.1016/j.media.2009.05.004).
 """
 
 from __future__ import annotations
@@ -19,11 +21,12 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Float64
 
+from tumortrack.core.geometry import Points
 from tumortrack.models.config import GaussNewtonConfig
 from tumortrack.registration import gauss_newton_kernels as kernels
 from tumortrack.registration.motion import ElasticMotion
-from tumortrack.registration.residual_kernels import DistanceLattice
 from tumortrack.registration.rest_shape import RestShape
+from tumortrack.simulate.elastic.flow import LatticeField
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,10 +40,7 @@ class RegistrationResult:
 
 
 def refine(
-    rest: RestShape,
-    points_mm: Float[np.ndarray, "n 3"],
-    start: ElasticMotion,
-    config: GaussNewtonConfig,
+    rest: RestShape, points_mm: Points, start: ElasticMotion, config: GaussNewtonConfig
 ) -> RegistrationResult:
     """The motion near ``start`` that fits points (camera frame, mm) and the library best."""
     descent = GaussNewton(rest, points_mm, start, config)
@@ -49,67 +49,54 @@ def refine(
 
 
 class GaussNewton:
-    """A refinement that can be stopped on its way and continued.
-
-    Attributes:
-        cost: of the present state, as in ``RegistrationResult``; infinite before the first step.
-        steps: taken so far; ``converged``: more would not move it.
-    """
+    """A refinement that can be stopped on its way and continued. ``cost``: of the present state, as
+    in ``RegistrationResult``; infinite before the first step. ``steps``: taken so far;
+    ``converged``: more would not move it."""
 
     def __init__(
-        self,
-        rest: RestShape,
-        points_mm: Float[np.ndarray, "n 3"],
-        start: ElasticMotion,
-        config: GaussNewtonConfig,
+        self, rest: RestShape, points_mm: Points, start: ElasticMotion, config: GaussNewtonConfig
     ) -> None:
-        body, field, count = rest.body, rest.distances[0], len(points_mm)
-        self._rest, self._points = rest, np.ascontiguousarray(points_mm, np.float32)
-        precision = _prior(rest, config)
-        self._organ = kernels.Organ(
-            body.modes,
-            body.origin_mm,
-            np.float32(body.spacing_mm),
-            body.center_ct,
-            DistanceLattice(field.values_mm, field.origin_mm, np.float32(field.spacing_mm)),
-            precision,
-            body.mean,
-        )
-        self._options = kernels.Options(
+        body, count, precision = rest.body, len(points_mm), _prior(rest, config)
+        self._rest = rest
+        self._problem = kernels.Problem(
+            modes=LatticeField(body.modes, body.origin_mm, np.float32(body.spacing_mm)),
+            center_ct=body.center_ct,
+            distances=rest.distances[0],
+            precision=precision,
+            mean=body.mean,
+            points=np.ascontiguousarray(points_mm, np.float32),
             weight=min(config.n_effective / count, 1.0) / config.sigma_mm**2,
             first_mm=config.first_mm,
             last_mm=config.last_mm,
             narrowing=config.narrowing,
             enough_mm=config.enough_mm,
         )
-        given = start.rotation, start.centre_mm, start.coefficients, np.zeros(6)
         # In C's order, whatever was given: the kernel is compiled for that.
-        self._state = kernels.State._make(np.array(part, float, order="C") for part in given)
-        gradient = np.empty(len(precision))
-        distances = np.empty(count, np.float32)
-        self._residuals = kernels.Residuals(distances, np.empty_like(precision), gradient)
+        given = start.rotation, start.centre_mm, start.coefficients
+        rotation, centre_mm, coefficients = (np.array(part, float, order="C") for part in given)
+        left = np.empty(count, np.float32), np.empty_like(precision), np.empty(len(precision))
+        self._state = kernels.State(rotation, centre_mm, coefficients, np.zeros(6), *left)
         self.cost, self.steps, self.converged = np.inf, 0, False
 
     def run(self, steps: int) -> None:
         """Continue until ``steps`` are taken since the start, or it has converged."""
         if self.converged or (steps <= self.steps and np.isfinite(self.cost)):
             return
-        problem = self._organ, self._points, self._options, self._state, self._residuals
-        self.steps, self.converged, self.cost = kernels.descend(*problem, self.steps, steps)
+        reached = kernels.descend(self._problem, self._state, self.steps, steps)
+        self.steps, self.converged, self.cost = reached
 
     def result(self) -> RegistrationResult:
         """The present state."""
-        rotation, centre_mm, coefficients, _ = (part.copy() for part in self._state)
-        covariance = np.linalg.inv(self._residuals.curvature)
-        motion = ElasticMotion(self._rest, rotation, centre_mm, coefficients, covariance)
-        distances_mm = self._residuals.distances_mm.copy()
-        return RegistrationResult(motion, self.cost, distances_mm, self.steps)
+        state = kernels.State._make(part.copy() for part in self._state)
+        covariance = np.linalg.inv(state.curvature)
+        placed = state.rotation, state.centre_mm, state.coefficients
+        motion = ElasticMotion(self._rest, *placed, covariance)
+        return RegistrationResult(motion, self.cost, state.distances_mm, self.steps)
 
 
 def _prior(rest: RestShape, config: GaussNewtonConfig) -> Float64[np.ndarray, "p p"]:
-    modes = len(rest.body.mean)
-    precision = np.zeros((6 + modes, 6 + modes))
-    precision[:3, :3] = np.eye(3) / config.shift_mm**2
-    precision[3:6, 3:6] = np.eye(3) / config.turn_rad**2
+    """The precision of shift, turn and coefficients."""
+    pose = [1 / config.shift_mm**2] * 3 + [1 / config.turn_rad**2] * 3
+    precision = np.diag(pose + [0.0] * len(rest.body.mean))
     precision[6:, 6:] = rest.body.precision
     return precision

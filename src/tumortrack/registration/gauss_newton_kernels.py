@@ -1,7 +1,7 @@
 """Kernels of the refinement: all Gauss-Newton iterations in one compiled call.
 
 A step takes less than half a millisecond; calling Python in between would take as long again, and
-two starts refined on two cores would wait for each other's. See ``gauss_newton`` for what is
+two hypotheses refined on two cores would wait for each other's. See ``gauss_newton`` for what is
 minimised.
 """
 
@@ -13,28 +13,40 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
-from tumortrack.registration.residual_kernels import POSE, DistanceLattice, Flow, Pose, add_rows
-from tumortrack.simulate.elastic.flow import BLOCK, block, combine, steps_of
+from tumortrack.registration.kernels import POSE, DistanceField, Flow, Pose, add_rows
+from tumortrack.simulate.elastic.flow import BLOCK, LatticeField, block, combine, steps_of
 
+KERNEL = "geman-mcclure"  # names the two functions below: rename it with them
 _AT_ONCE = 256  # points whose rows stay in the cache; also so many are summed in single precision
 _APART = 16  # numbers between rows of sums: rows a power of two apart share a cache's lines
 
 
-class Organ(NamedTuple):
-    """The organ at rest, and the prior of its motion; CT frame, mm."""
+@numba.njit(cache=True, fastmath=True, nogil=True, inline="always")
+def rho(r):  # type: ignore[no-untyped-def]
+    """The robust kernel, r^2 / (1 + r^2), of a distance in widths. Source: Geman and McClure, Bull.
+    ISI 52, 1987."""
+    square = r**2
+    return square / (1.0 + square)
 
-    modes: np.ndarray  # (i, j, k, 3, m), float32
-    origin_mm: np.ndarray  # (3,)
-    spacing_mm: np.float32
+
+@numba.njit(cache=True, fastmath=True, nogil=True, inline="always")
+def root_weight(r):  # type: ignore[no-untyped-def]
+    """The root of rho'(r) / (2 r), which is 1 / (1 + r^2): a residual and its derivatives are each
+    multiplied by it in a Gauss-Newton step."""
+    one = np.float32(1)
+    return one / (one + r**2)
+
+
+class Problem(NamedTuple):
+    """The organ at rest and the prior of its motion (CT frame, mm), the observed points (camera
+    frame, mm), and of ``GaussNewtonConfig``; ``weight`` of one point's squared distance."""
+
+    modes: LatticeField
     center_ct: np.ndarray  # (3,), float64
-    distances: DistanceLattice
+    distances: DistanceField
     precision: np.ndarray  # (p, p), float64
     mean: np.ndarray  # (m,), float64
-
-
-class Options(NamedTuple):
-    """See ``GaussNewtonConfig``; ``weight`` of one point's squared distance."""
-
+    points: np.ndarray  # (n, 3), float32
     weight: float
     first_mm: float
     last_mm: float
@@ -43,139 +55,111 @@ class Options(NamedTuple):
 
 
 class State(NamedTuple):
-    """What is refined, float64, changed in place."""
+    """What is refined, and what its last step has left; float64, changed in place."""
 
     rotation: np.ndarray  # (3, 3)
     centre_mm: np.ndarray  # (3,)
     coefficients: np.ndarray  # (m,)
     moved: np.ndarray  # (6,): shift and turn since the start
-
-
-class Residuals(NamedTuple):
-    """Of the last state, changed in place."""
-
     distances_mm: np.ndarray  # (n,), float32
-    curvature: np.ndarray  # (p, p), float64
-    gradient: np.ndarray  # (p,), float64
-
-
-class Workspace(NamedTuple):
-    """Memory of ``normal_equations``."""
-
-    rows: np.ndarray  # (BLOCK, p + 1), float32
-    columns: np.ndarray  # (p + 1 or more, _AT_ONCE + _APART), float32, zero
+    curvature: np.ndarray  # (p, p)
+    gradient: np.ndarray  # (p,)
 
 
 @numba.njit(cache=True, fastmath=True, nogil=True)
-def descend(organ, points, options, state, residuals, first, last):  # type: ignore[no-untyped-def]
-    """Steps ``first`` to ``last`` of a refinement, fewer if it converges.
-
-    Args:
-        organ: ``Organ``; options: ``Options``; state: ``State``.
-        points: observed, (n, 3), camera frame, mm, float32.
-        residuals: ``Residuals``; where ``first`` is not 0, those that the steps before have left.
-
-    Returns:
-        The number of steps taken, whether it has converged, and the last state's cost.
-    """
-    unknowns = len(residuals.gradient)
+def descend(problem, state, first, last):  # type: ignore[no-untyped-def]
+    """Steps ``first`` to ``last`` of a refinement, fewer if it converges: their number, whether it
+    has converged, and the last cost. Where ``first`` is not 0, ``state`` is what is left by the
+    steps before."""
+    unknowns, cost = len(state.gradient), 0.0
     rows = np.empty((BLOCK, unknowns + 1), np.float32)
     columns = np.zeros((-(-(unknowns + 1) // 4) * 4, _AT_ONCE + _APART), np.float32)
-    room, cost = Workspace(rows, columns), 0.0
     if first == 0:
-        cost = _equations(organ, points, options, state, _width(options, 0), room, residuals)
+        cost = _equations(problem, state, _width(problem, 0), (rows, columns))
     for step in range(first, last):
-        change = np.linalg.solve(residuals.curvature, residuals.gradient)
+        change = np.linalg.solve(state.curvature, state.gradient)
         _turn(state.rotation, state.centre_mm, change)
-        for n in range(POSE):
-            state.moved[n] -= change[n]
-        for n in range(len(state.coefficients)):
-            state.coefficients[n] -= change[POSE + n]
-        cost = _equations(organ, points, options, state, _width(options, step + 1), room, residuals)
-        small = np.abs(change).max() < options.enough_mm
-        if small and _width(options, step) == options.last_mm:
+        state.moved[:] -= change[:POSE]
+        state.coefficients[:] -= change[POSE:]
+        cost = _equations(problem, state, _width(problem, step + 1), (rows, columns))
+        small = np.abs(change).max() < problem.enough_mm
+        if small and _width(problem, step) == problem.last_mm:
             return step + 1, True, cost
     return last, False, cost
 
 
 @numba.njit(cache=True, nogil=True)
-def _width(options, step):  # type: ignore[no-untyped-def]
+def _width(problem, step):  # type: ignore[no-untyped-def]
     """The robust kernel's width (mm) after so many steps; a point pulls most at 0.58 of it."""
-    return max(options.last_mm, options.first_mm * options.narrowing**step)
+    return max(problem.last_mm, problem.first_mm * problem.narrowing**step)
 
 
 @numba.njit(cache=True, fastmath=True, nogil=True, inline="always")
-def _equations(  # type: ignore[no-untyped-def]
-    organ, points, options, state, width, room, residuals
-):
-    """Distances, curvature and gradient of the cost at a state into ``residuals``; the cost."""
-    distances, curvature, gradient = residuals
-    weight, last_mm, precision = options.weight, options.last_mm, organ.precision
-    velocity = combine(organ.modes, (-state.coefficients).astype(np.float32))
-    steps = steps_of(velocity, organ.spacing_mm)
-    flow = Flow(velocity, organ.origin_mm, organ.spacing_mm, steps)
-    pose = Pose(organ.center_ct, state.rotation, state.centre_mm)
-    normal_equations(flow, organ, pose, np.float32(width), points, room, residuals)
-    unknowns, cost = len(gradient), 0.0
-    for p in range(len(distances)):  # rho of Geman and McClure: its derivative is the weight below
-        square = (np.float64(distances[p]) / last_mm) ** 2
-        cost += square / (1.0 + square)
+def _equations(problem, state, width, buffers):  # type: ignore[no-untyped-def]
+    """Distances, curvature and gradient of the cost at a state into it; the cost."""
+    weight, last_mm, precision = problem.weight, problem.last_mm, problem.precision
+    modes, origin, spacing = problem.modes
+    curvature, gradient = state.curvature, state.gradient
+    velocity = combine(modes, (-state.coefficients).astype(np.float32))
+    flow = Flow(velocity, origin, spacing, steps_of(velocity, spacing))
+    pose = Pose(problem.center_ct, state.rotation, state.centre_mm)
+    normal_equations(problem, flow, pose, np.float32(width), buffers, state)
+    unknowns, distances, cost = len(gradient), state.distances_mm, 0.0
+    for p in range(len(distances)):
+        cost += rho(np.float64(distances[p]) / last_mm)
     cost *= weight * last_mm**2
-    off = np.empty(unknowns)
-    off[:POSE] = state.moved
-    off[POSE:] = state.coefficients - organ.mean
+    change = np.empty(unknowns)  # from the prior's mean
+    change[:POSE] = state.moved
+    change[POSE:] = state.coefficients - problem.mean
     for n in range(unknowns):
-        pull = 0.0
+        slope = 0.0  # of the prior, halved
         for m in range(unknowns):
-            pull += precision[n, m] * off[m]
+            slope += precision[n, m] * change[m]
             curvature[n, m] = weight * curvature[n, m] + precision[n, m]
-        gradient[n] = weight * gradient[n] + pull
-        cost += off[n] * pull
+        gradient[n] = weight * gradient[n] + slope
+        cost += change[n] * slope
     return cost
 
 
 @numba.njit(cache=True, fastmath=True, nogil=True, inline="always")
-def normal_equations(flow, organ, pose, width, points, room, out):  # type: ignore[no-untyped-def]
-    """Distances as ``add_rows`` gives them, and the sums over points of ``pull * row * row'`` and
-    of ``pull * row * distance`` into ``out`` (``Residuals``); ``pull`` is
-    1 / (1 + (distance / width)^2)^2. ``flow`` has the opposite velocity."""
-    rows, across = room
-    distances, square, mixed = out
-    unknowns = len(mixed)
-    sums = np.zeros((len(across), len(across) + 4))
-    places, speeds, middles = block()
-    one, per_width = np.float32(1), np.float32(1) / width
+def normal_equations(problem, flow, pose, width, buffers, state):  # type: ignore[no-untyped-def]
+    """Distances as ``add_rows`` gives them, and the sums over points of ``weight * row * row'`` and
+    ``weight * row * distance``, into ``state``; ``weight`` is ``root_weight`` squared. ``flow`` has
+    the opposite velocity."""
+    (rows, columns), points = buffers, problem.points
+    modes, field = problem.modes.values, problem.distances
+    distances, curvature, gradient = state.distances_mm, state.curvature, state.gradient
+    unknowns = len(gradient)
+    sums = np.zeros((len(columns), len(columns) + 4))
+    along, per_width = block(), np.float32(1) / width
     for start in range(0, len(points), _AT_ONCE):
         count = min(_AT_ONCE, len(points) - start)
         for first in range(start, start + count, BLOCK):
             some = points[first : min(first + BLOCK, start + count)]
-            add_rows(
-                flow, organ.modes, pose, organ.distances, some, (places, speeds, middles), rows
-            )
+            add_rows(modes, field, flow, pose, some, along, rows)
             for p in range(len(some)):
                 distance = rows[p, unknowns]
                 distances[first + p] = distance
-                # The root of the kernel's weight: both factors of a product carry it.
-                root_weight = one / (one + (distance * per_width) ** 2)
+                weight = root_weight(distance * per_width)
                 for n in range(unknowns + 1):
-                    across[n, first - start + p] = rows[p, n] * root_weight
-        _add_products(across, count, sums)
+                    columns[n, first - start + p] = rows[p, n] * weight
+        _add_products(columns, count, sums)
     for n in range(unknowns):
         for m in range(n + 1):
-            square[n, m] = sums[n, m]
-            square[m, n] = sums[n, m]
-        mixed[n] = sums[unknowns, n]
+            curvature[n, m] = sums[n, m]
+            curvature[m, n] = sums[n, m]
+        gradient[n] = sums[unknowns, n]
 
 
 @numba.njit(cache=True, fastmath=True, nogil=True, inline="always")
-def _add_products(across, count, sums):  # type: ignore[no-untyped-def]
-    """Add the products of all pairs of rows (over ``count`` columns) to the lower triangle of
+def _add_products(columns, count, sums):  # type: ignore[no-untyped-def]
+    """Add the products of all pairs of columns, over ``count`` points, to the lower triangle of
     ``sums``: eight at a time, so that a number read is used more than once."""
     zero = np.float32(0)
-    for n in range(0, len(across), 2):
-        a, b = across[n], across[n + 1]
+    for n in range(0, len(columns), 2):
+        a, b = columns[n], columns[n + 1]
         for m in range(0, n + 2, 4):
-            c, d, e, f = across[m], across[m + 1], across[m + 2], across[m + 3]
+            c, d, e, f = columns[m], columns[m + 1], columns[m + 2], columns[m + 3]
             ac, ad, ae, af, bc, bd, be, bf = zero, zero, zero, zero, zero, zero, zero, zero
             for p in range(count):
                 ac += a[p] * c[p]

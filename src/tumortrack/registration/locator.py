@@ -9,22 +9,17 @@ from typing import Any
 import msgspec
 import numpy as np
 from jaxtyping import Float, Float32, Int32, Int64, UInt8
+from scipy.spatial import cKDTree
 
 from tumortrack.core.estimate import Estimate, Following
 from tumortrack.core.types import Anatomy, CameraLabels, Mesh, OccupancyCloud, SensorCloud
 from tumortrack.imaging.raster import label_grid
-from tumortrack.models.in_distribution import (
-    check_in_distribution,
-    check_likely,
-    fit_mm,
-    spread_mm,
-)
-from tumortrack.models.report import describe_parts, fit_report, grid_over, report_head, stage
+from tumortrack.models.in_distribution import check_in_distribution, check_likely
+from tumortrack.models.report import Frame, describe_parts, grid_over
+from tumortrack.registration import kernels
 from tumortrack.registration.gauss_newton import RegistrationResult, refine
-from tumortrack.registration.label_probability import NearestLookup, normal_table, probabilities
 from tumortrack.registration.model import RegistrationModel
 from tumortrack.registration.motion import ElasticMotion, blend
-from tumortrack.sense.cloud import check_cloud, thin_cloud
 
 QUERIES = 40_000  # as many as the paper asks
 CARRIED = 20_000  # points of the undeformed organ that live estimates carry along
@@ -32,6 +27,19 @@ _SAMPLES = 256  # places where the uncertainty is computed; other points take th
 _FIELD_MM = 0.3  # error of the distance fields and surfaces themselves
 _MOVED_MM = 2.5  # between live frames: what moves farther is found again from the start
 _BEHIND_MM = 2.0  # a smoothed motion that lags by more starts again
+
+
+def nearest_lookup(
+    places_mm: Float[np.ndarray, "p 3"],
+) -> tuple[Float32[np.ndarray, " 3"], Int32[np.ndarray, "i j k"]]:
+    """For ``kernels.look_up``: a lattice's origin, over the places' box and a node beyond, and the
+    number of the place nearest to each node."""
+    step = kernels.NODES_MM
+    lower, upper = places_mm.min(0) - step, places_mm.max(0) + step
+    shape = tuple(np.ceil((upper - lower) / step).astype(int) + 1)
+    nodes = lower + step * np.indices(shape).reshape(3, -1).T
+    which = cKDTree(places_mm).query(nodes)[1].astype(np.int32)
+    return lower.astype(np.float32), which.reshape(shape)
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,6 +64,12 @@ class _Registered:
     sample_std_mm: Float[np.ndarray, " k"]
     middle_std_mm: Float[np.ndarray, " parts"]
 
+    def probability(self, mine: _OrganPoints) -> Float32[np.ndarray, " n"]:
+        """The chance that each point lies on the side of the nearest surface where it was found,
+        if errors are normal."""
+        per_std = 1 / np.hypot(self.sample_std_mm, _FIELD_MM)
+        return kernels.probabilities(mine.margin_mm, per_std, mine.sample)
+
 
 class RegistrationLocator:
     """Locates by ``Registration``; its estimates have a motion."""
@@ -63,62 +77,46 @@ class RegistrationLocator:
     def __init__(self, model: RegistrationModel) -> None:
         self._model, self._shape, self._calibration = model, model.shape, model.calibration
         self._registration = model.registration()
-        self._device = next(model.network.parameters()).device
         self._near = msgspec.structs.replace(model.config.refine, first_mm=_MOVED_MM)
         anatomy = model.shape.anatomy_ct
-        organ = anatomy.organ
         self.anatomy_ct: Anatomy | None = anatomy
-        few = max(1, len(organ.vertices_mm) // (_SAMPLES // 2))
-        inner = [part.vertices_mm for part in anatomy.tumors]
-        self._samples_ct = np.concatenate(
-            [organ.vertices_mm[::few], *(v[:: max(1, len(v) // 64)] for v in inner)]
-        )
-        self._nearest_sample = NearestLookup.of(self._samples_ct)
+        vertices = [part.vertices_mm for part in anatomy.parts]
+        self._vertices_ct = np.concatenate(vertices).astype(np.float32)
+        few = [_SAMPLES // 2, *[64] * len(anatomy.tumors)]
+        some = [v[:: max(1, len(v) // count)] for v, count in zip(vertices, few, strict=True)]
+        self._samples_ct = np.concatenate(some)
+        self._nearest_sample = nearest_lookup(self._samples_ct)
         self._middles_ct = np.array([part.box_mm.mean(0) for part in anatomy.parts])
-        vertices = np.concatenate([part.vertices_mm for part in anatomy.parts])
-        self._vertices_ct = vertices.astype(np.float32)
         self._carried: _OrganPoints | None = None
 
     def locate(self, cloud: SensorCloud, grid: int, seed: int) -> Estimate:
         """See ``tracking.tracker.Tracker.locate``."""
-        rng = np.random.default_rng(seed)
-        seconds: dict[str, float] = {}
-        points = self._thinned(cloud, rng)
-        with stage(seconds, "encode", self._device):
-            starts = self._registration.propose(points)
-        with stage(seconds, "refine", self._device):
-            fit = self._registration.best_fit(points, starts, self._calibration.usual_cost)
-        placed = self._checked(points, fit, seconds)
-        meshes = placed.meshes
-        organ = meshes[self._model.parts[0]]
-        with stage(seconds, "fine", self._device):
-            inside = self._drawn(placed, organ, cloud.stamp_ns, rng)
-        with stage(seconds, "volume", self._device):
+        frame = Frame(self._model, cloud, seed, np.random.default_rng(seed))
+        usual = self._calibration.usual_cost
+        fit = self._registration.register(frame.points_mm, usual, frame.stage)
+        placed = self._checked(frame, fit)
+        organ = placed.meshes[self._model.parts[0]]
+        with frame.stage("fine"):
+            inside = self._drawn(placed, organ, cloud.stamp_ns, frame.rng)
+        with frame.stage("volume"):
             camera_from_index, shape = grid_over(organ.vertices_mm, grid)
-            anatomy = Anatomy(tuple(meshes.values()))
-            labels = label_grid(anatomy, camera_from_index, shape)
-        head = report_head(cloud, seed)
-        head["voxel_mm"] = float(camera_from_index[0, 0])
-        report = self._report(head, placed, inside, seconds)
+            labels = label_grid(Anatomy(tuple(placed.meshes.values())), camera_from_index, shape)
+        report = self._report(frame, placed, inside, voxel_mm=float(camera_from_index[0, 0]))
         volume = CameraLabels(labels, camera_from_index)
-        return Estimate(inside, volume, meshes, report, placed.motion)
+        return Estimate(inside, volume, placed.meshes, report, placed.motion)
 
     def follow(self, cloud: SensorCloud, last: Estimate | None, how: Following) -> Estimate:
         """See ``tracking.tracker.Tracker.follow``."""
         rng = np.random.default_rng((how.seed, cloud.stamp_ns))
-        seconds: dict[str, float] = {}
-        points = self._thinned(cloud, rng)
-        start = last.unsmoothed if last is not None else None
+        frame = Frame(self._model, cloud, how.seed, rng)
+        points, start = frame.points_mm, last.unsmoothed if last is not None else None
         usual, fits = self._calibration.usual_cost, []
         if isinstance(start, ElasticMotion):
-            with stage(seconds, "follow", self._device):
+            with frame.stage("follow"):
                 fits.append(refine(self._shape, points, start, self._near))
         if not fits or how.thorough or fits[0].cost > usual:
-            with stage(seconds, "encode", self._device):
-                starts = self._registration.propose(points)
-            with stage(seconds, "refine", self._device):
-                enough = usual if how.thorough or not fits else np.inf
-                fits.append(self._registration.best_fit(points, starts, enough))
+            enough = usual if how.thorough or not fits else np.inf
+            fits.append(self._registration.register(points, enough, frame.stage))
         fit = min(fits, key=lambda fit: fit.cost)
         unsmoothed, lag_s = fit.motion, 0.0
         if last is not None and isinstance(last.motion, ElasticMotion) and how.smoothing_s > 0:
@@ -129,37 +127,29 @@ class RegistrationLocator:
             if np.linalg.norm(behind, axis=1).max() < _BEHIND_MM:
                 fit = replace(fit, motion=smooth)
                 lag_s = past_s * (1 - share) / share  # of what moves steadily
-        placed = self._checked(points, fit, seconds)
-        with stage(seconds, "carry", self._device):
+        placed = self._checked(frame, fit)
+        with frame.stage("carry"):
             inside = self._carry(placed, cloud.stamp_ns)
-        report = self._report(report_head(cloud, how.seed), placed, inside, seconds)
-        report["smoothing"] = {"time_s": how.smoothing_s, "lag_ms": 1000 * lag_s}
+        smoothing = {"time_s": how.smoothing_s, "lag_ms": 1000 * lag_s}
+        report = self._report(frame, placed, inside, smoothing=smoothing)
         return Estimate(inside, None, placed.meshes, report, placed.motion, unsmoothed)
 
     def warm(self) -> None:
         """See ``tracking.tracker.Tracker.warm``."""
-        rest = ElasticMotion(
-            self._shape, np.eye(3), np.array([0.0, 0.0, 150.0]), self._shape.body.mean
-        )
-        cloud = SensorCloud(rest.carry(self._shape.anatomy_ct.organ.vertices_mm))
-        points = self._thinned(cloud, np.random.default_rng(0))
+        body, organ = self._shape.body, self._shape.anatomy_ct.organ
+        rest = ElasticMotion(self._shape, np.eye(3), np.array([0.0, 0.0, 150.0]), body.mean)
+        cloud = SensorCloud(rest.carry(organ.vertices_mm))
+        points = Frame(self._model, cloud, 0, np.random.default_rng(0)).points_mm
         self._registration.propose(points)
         fit = refine(self._shape, points, rest, self._near)
         self._carry(self._moved(fit), 0)
 
-    def _thinned(self, cloud: SensorCloud, rng: np.random.Generator) -> Float32[np.ndarray, "n 3"]:
-        check_cloud(cloud)
-        return thin_cloud(cloud, self._model.config.scene.cloud.n_points, rng).points_mm
-
-    def _checked(
-        self, points: Float32[np.ndarray, "n 3"], fit: RegistrationResult, seconds: dict[str, float]
-    ) -> _Registered:
+    def _checked(self, frame: Frame, fit: RegistrationResult) -> _Registered:
         """What a fit says, if it can be this organ's."""
-        check_in_distribution(
-            self._model.in_distribution, spread_mm(points), fit_mm(np.abs(fit.distances_mm))
-        )
+        known, distances_mm = self._model.in_distribution, np.abs(fit.distances_mm)
+        check_in_distribution(known, frame.points_mm, distances_mm)
         check_likely(fit.motion.rarity)
-        with stage(seconds, "surfaces", self._device):
+        with frame.stage("surfaces"):
             return self._moved(fit)
 
     def _moved(self, fit: RegistrationResult) -> _Registered:
@@ -175,29 +165,20 @@ class RegistrationLocator:
         return _Registered(fit, motion, meshes, deviation[:count], deviation[count:])
 
     def _report(
-        self,
-        head: dict[str, Any],
-        placed: _Registered,
-        inside: OccupancyCloud,
-        seconds: dict[str, float],
+        self, frame: Frame, placed: _Registered, inside: OccupancyCloud, **more: Any
     ) -> dict[str, Any]:
         fit, motion = placed.fit, placed.motion
         parts = describe_parts(self._model.parts, placed.meshes, inside)
         for part, std_mm in zip(parts.values(), placed.middle_std_mm, strict=True):
             part["center_std_mm"] = float(std_mm)
-        return {
-            **head,
-            "fit_mm": fit_report(np.abs(fit.distances_mm)),
-            "fit_cost": {"now": fit.cost, "usual": self._calibration.usual_cost},
-            "parts": parts,
-            "motion": {
-                "camera_from_ct": motion.camera_from_ct.tolist(),
-                "coefficients": motion.coefficients.tolist(),
-                "rarity": motion.rarity,
-                "steps": fit.steps,
-            },
-            "timings": {**seconds, "total": sum(seconds.values())},
+        more["fit_cost"] = {"now": fit.cost, "usual": self._calibration.usual_cost}
+        more["motion"] = {
+            "camera_from_ct": motion.camera_from_ct.tolist(),
+            "coefficients": motion.coefficients.tolist(),
+            "rarity": motion.rarity,
+            "steps": fit.steps,
         }
+        return frame.report(np.abs(fit.distances_mm), parts, **more)
 
     def _drawn(
         self, placed: _Registered, organ: Mesh, stamp_ns: int, rng: np.random.Generator
@@ -208,7 +189,7 @@ class RegistrationLocator:
         points *= (upper - lower).astype(np.float32)
         points += lower.astype(np.float32)
         inside, mine = self._inside(placed.motion.back(points).astype(np.float32))
-        probability = _probability(placed, mine)
+        probability = placed.probability(mine)
         return OccupancyCloud(points.take(inside, 0), mine.labels, probability, stamp_ns)
 
     def _carry(self, placed: _Registered, stamp_ns: int) -> OccupancyCloud:
@@ -223,7 +204,7 @@ class RegistrationLocator:
             self._carried = self._inside(found[:CARRIED])[1]
         mine = self._carried
         places = placed.motion.carry(mine.points_ct).astype(np.float32)
-        return OccupancyCloud(places, mine.labels, _probability(placed, mine), stamp_ns)
+        return OccupancyCloud(places, mine.labels, placed.probability(mine), stamp_ns)
 
     def _inside(
         self, points_ct: Float32[np.ndarray, "n 3"]
@@ -232,12 +213,5 @@ class RegistrationLocator:
         labels, margin_mm = self._shape.labels_at(points_ct)
         inside = np.flatnonzero(labels)
         mine = points_ct.take(inside, 0)  # much faster than by a mask
-        sample = self._nearest_sample.to(mine)
+        sample = kernels.look_up(*self._nearest_sample, mine)
         return inside, _OrganPoints(mine, labels[inside], margin_mm[inside], sample)
-
-
-def _probability(placed: _Registered, mine: _OrganPoints) -> Float32[np.ndarray, " n"]:
-    """The chance that each point lies on the side of the nearest surface where it was found, if
-    errors are normal."""
-    per_std = 1 / np.hypot(placed.sample_std_mm, _FIELD_MM)
-    return probabilities(mine.margin_mm, per_std, mine.sample, normal_table())

@@ -8,34 +8,37 @@ from typing import Any
 
 from safetensors.numpy import load, save
 
-from tumortrack.core.config import Config, from_builtins, to_builtins
-from tumortrack.models.config import NetworkConfig
+from tumortrack.core.config import Config, from_builtins, identity
+from tumortrack.core.errors import InputError
 from tumortrack.models.folder import SHAPE
 from tumortrack.models.model import Model
+from tumortrack.registration.gauss_newton_kernels import KERNEL
 from tumortrack.registration.network import RegistrationNetwork
 from tumortrack.registration.registration import Registration
 from tumortrack.registration.rest_shape import RestShape
 
 
 class UncertaintyCalibration(Config, frozen=True):
-    """What validation scenes taught: standard deviations are multiplied by ``std_scale``; a fit
-    that costs more than ``usual_cost`` is tried from other starts."""
+    """What validation scenes taught: standard deviations are multiplied by ``std_scale``; where a
+    fit costs more than ``usual_cost``, turned starts are tried. Both hold for one robust kernel;
+    folders that name none were made with the first."""
+
+    LATER = ("kernel",)
 
     std_scale: float
     usual_cost: float
+    kernel: str = "geman-mcclure"
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class RegistrationModel(Model):
     """See ``Model``; ``shape`` is the organ of the CT with its elastic body."""
 
+    new_network = RegistrationNetwork
+
     network: RegistrationNetwork
     shape: RestShape
     calibration: UncertaintyCalibration
-
-    @classmethod
-    def new_network(cls, config: NetworkConfig) -> RegistrationNetwork:
-        return RegistrationNetwork(config)
 
     def registration(self) -> Registration:
         """The method, with this model's network and organ."""
@@ -45,13 +48,15 @@ class RegistrationModel(Model):
         return {SHAPE: save(self.shape.to_arrays())}
 
     def extra_entries(self) -> dict[str, Any]:
-        return {"trust": to_builtins(self.calibration)}
+        return {"trust": identity(self.calibration)}
 
     @classmethod
-    def from_folder(
-        cls, folder: Path, manifest: dict[str, Any], **common: Any
-    ) -> RegistrationModel:
-        shape = RestShape.from_arrays(load((folder / SHAPE).read_bytes()), len(common["parts"]))
-        where = f"{folder}: trust"
-        calibration = from_builtins(manifest["trust"], UncertaintyCalibration, where)
-        return cls(shape=shape, calibration=calibration, **common)
+    def from_folder(cls, folder: Path, manifest: dict[str, Any], **known: Any) -> RegistrationModel:
+        shape = RestShape.from_arrays(load((folder / SHAPE).read_bytes()), len(known["parts"]))
+        calibration = from_builtins(manifest["trust"], UncertaintyCalibration, f"{folder}: trust")
+        if calibration.kernel != KERNEL:
+            raise InputError(
+                f"{folder}: its fits were calibrated with the robust kernel {calibration.kernel}; "
+                f"here it is {KERNEL}. Make another model: tumortrack train CASE MODEL."
+            )
+        return cls(shape=shape, calibration=calibration, **known)

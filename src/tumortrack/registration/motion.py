@@ -7,15 +7,17 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from jaxtyping import Float, Float32, Float64
+from jaxtyping import Float64
 from scipy.spatial.transform import Rotation
 
+from tumortrack.core.geometry import Points, rigid
 from tumortrack.core.process import parallel_for
-from tumortrack.registration import residual_kernels as kernels
-from tumortrack.registration.residual_kernels import Flow, Pose
+from tumortrack.registration import kernels
+from tumortrack.registration.kernels import Flow, Pose
 from tumortrack.registration.rest_shape import RestShape
 from tumortrack.simulate.elastic.flow import steps_for
 
+Moved = Float64[np.ndarray, "n 3"]
 _AT_ONCE = 4096  # points: a thread's part
 _FEW = 64  # as well, where each takes longer
 
@@ -25,12 +27,10 @@ class ElasticMotion:
     """``core.estimate.Motion`` of a shape: x -> rotation (flow(x) - center_ct) + centre_mm.
 
     Attributes:
-        rotation, centre_mm: where the organ's centre and axes are before the camera.
-        coefficients: of the body's modes.
-        covariance: of shift (mm), turn (rad; both in the CT's axes, about the centre) and
-            coefficients, as ``refine`` left it; None where nothing was refined.
-        std_scale: what its standard deviations are to be multiplied by; found on validation
-            scenes.
+        rotation, centre_mm: where the organ's axes and centre are before the camera.
+        coefficients: of the body's modes; ``covariance``: of shift (mm), turn (rad; both in the
+            CT's axes, about the centre) and coefficients, as ``refine`` left it, if it did.
+        std_scale: a factor for its standard deviations, found on validation scenes.
     """
 
     shape: RestShape
@@ -43,10 +43,7 @@ class ElasticMotion:
     @property
     def camera_from_ct(self) -> Float64[np.ndarray, "4 4"]:
         """The rigid part."""
-        out = np.eye(4)
-        out[:3, :3] = self.rotation
-        out[:3, 3] = self.centre_mm - self.rotation @ self.shape.body.center_ct
-        return out
+        return rigid(self.rotation, self.centre_mm - self.rotation @ self.shape.body.center_ct)
 
     @property
     def rarity(self) -> float:
@@ -54,30 +51,29 @@ class ElasticMotion:
         off = self.coefficients - self.shape.body.mean
         return float(off @ self.shape.body.precision @ off) / len(off)
 
-    def carry(self, points_ct: Float[np.ndarray, "n 3"], /) -> Float64[np.ndarray, "n 3"]:
+    def carry(self, points_ct: Points, /) -> Moved:
         """CT (LPS, mm) -> camera frame (mm)."""
-        return self._gone(kernels.carry, self._flow, points_ct)
+        return self._moved(kernels.carry, self._flow, points_ct)
 
-    def back(self, points_camera: Float[np.ndarray, "n 3"], /) -> Float64[np.ndarray, "n 3"]:
+    def back(self, points_camera: Points, /) -> Moved:
         """Camera frame (mm) -> CT (LPS, mm)."""
         opposite = self._flow._replace(velocity=-self._flow.velocity)
-        return self._gone(kernels.back, opposite, points_camera)
+        return self._moved(kernels.back, opposite, points_camera)
 
-    def std_mm(self, points_ct: Float[np.ndarray, "n 3"], /) -> Float64[np.ndarray, " n"] | None:
+    def std_mm(self, points_ct: Points, /) -> Float64[np.ndarray, " n"] | None:
         """One standard deviation along any axis, mm: the pose's and the state's, to first order."""
         if self.covariance is None:
             return None
         body, points = self.shape.body, np.ascontiguousarray(points_ct, np.float32)
-        known = self._flow, body.modes, body.center_ct.astype(np.float32), self._root
+        root = np.linalg.cholesky(self.covariance).astype(np.float32)
+        known = self._flow, body.modes, body.center_ct.astype(np.float32), root
         variance = np.empty(len(points), np.float32)
         parallel_for(
             lambda part: kernels.variances(*known, points[part], variance[part]), len(points), _FEW
         )
         return self.std_scale * np.sqrt(variance.astype(float))
 
-    def _gone(
-        self, kernel: Callable[..., None], flow: Flow, points_mm: Float[np.ndarray, "n 3"]
-    ) -> Float64[np.ndarray, "n 3"]:
+    def _moved(self, kernel: Callable[..., None], flow: Flow, points_mm: Points) -> Moved:
         points, out = np.ascontiguousarray(points_mm, np.float32), np.empty((len(points_mm), 3))
         pose = Pose(self.shape.body.center_ct, self.rotation, self.centre_mm)
         parallel_for(lambda part: kernel(flow, pose, points[part], out[part]), len(out), _AT_ONCE)
@@ -90,11 +86,6 @@ class ElasticMotion:
         velocity = body.velocity(self.coefficients)
         steps = steps_for(velocity, body.spacing_mm)
         return Flow(velocity, body.origin_mm, np.float32(body.spacing_mm), steps)
-
-    @cached_property
-    def _root(self) -> Float32[np.ndarray, "p p"]:
-        assert self.covariance is not None
-        return np.linalg.cholesky(self.covariance).astype(np.float32)
 
 
 def blend(a: ElasticMotion, b: ElasticMotion, share: float) -> ElasticMotion:

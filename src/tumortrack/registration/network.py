@@ -9,24 +9,22 @@ undo a wrong turn by absurd deformations.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 from torch import Tensor, nn
 from torch.nn import functional
 
 from tumortrack.core.errors import InputError
-from tumortrack.core.geometry import rotation_onto
+from tumortrack.core.geometry import Direction, Matrix, Points, Vector, rotation_onto
 from tumortrack.models.config import NetworkConfig, RegistrationHeadConfig
 from tumortrack.models.layers import Layer
-from tumortrack.models.model import Network
-from tumortrack.models.normalisation import Aligned, alignment, turned, without_strays
+from tumortrack.models.model import Network, OnnxParts
+from tumortrack.models.normalisation import Aligned, normalised
 from tumortrack.registration.rest_shape import RestShape
 
-_PLACES = ("rotation", "centre_mm", "coefficients", "right_way")
 _LARGEST = 4.0  # coefficients lie within so many standard deviations of the library's mean
 _SMALL_START = 0.3  # of the last layer's weights
 _STEP = 0.5  # of the organ's half length: what an output of 1 moves it by
@@ -51,46 +49,30 @@ class AlignedCloud:
         flip = torch.stack([sign, sign, torch.ones_like(sign)], -1)[:, None]
         return AlignedCloud(self.points * flip, self.centre_mm, self.turn * sign[None, :, None])
 
-    def __getitem__(self, rows: slice) -> AlignedCloud:
-        return AlignedCloud(self.points[rows], self.centre_mm[rows], self.turn[:, rows])
 
-
-@dataclass(frozen=True, eq=False)
-class PoseHypothesis:
+class PoseHypothesis(NamedTuple):
     """Where organs lie and how they are deformed: rotation and centre (camera frame, mm), so that
-    a point x of the CT, deformed to y, lies at ``rotation (y - center_ct) + centre_mm``."""
+    a point x of the CT, deformed to y, lies at ``rotation (y - center_ct) + centre_mm``. The fields
+    are also what an ONNX file gives."""
 
     rotation: Tensor  # (B, 3, 3)
     centre_mm: Tensor  # (B, 3)
     coefficients: Tensor  # (B, M)
     right_way: Tensor  # (B,), logit
 
-    def __getitem__(self, rows: slice) -> PoseHypothesis:
-        return PoseHypothesis(
-            self.rotation[rows], self.centre_mm[rows], self.coefficients[rows], self.right_way[rows]
-        )
-
 
 class RegistrationNetwork(Network):
-    """Clouds -> hypotheses; the buffers that describe the organ are set by ``initialize``."""
-
-    center_ct: Tensor
-    points: Tensor
-    modes: Tensor
-    mean: Tensor
-    std: Tensor
-    facing: Tensor
-    long_axis: Tensor
+    """Clouds -> hypotheses. What describes the organ is set by ``initialize``: the centre and axes,
+    the points (P, 3; about the centre) whose places before the camera the loss compares, the body's
+    modes at these points (P, 3, M), its states' mean and spread."""
 
     def __init__(self, config: NetworkConfig) -> None:
         super().__init__()
-        if not isinstance(config.decoder, RegistrationHeadConfig) or not isinstance(
-            config.normalisation, Aligned
-        ):
-            raise InputError("a registration network needs the warp decoder and aligned clouds.")
-        self.config = config
-        self.scale_mm, self.reach = config.normalisation.scale_mm, config.normalisation.reach
-        modes, width = config.decoder.modes, config.decoder.width
+        head, kind = config.decoder, config.normalisation
+        if not isinstance(head, RegistrationHeadConfig) or not isinstance(kind, Aligned):
+            raise InputError("a registration network needs the decoder `warp` and aligned clouds.")
+        self.config, self.scale_mm = config, kind.scale_mm
+        modes, width = head.modes, head.width
         self.encoder = config.encoder.build()
         self.hidden = nn.Sequential(
             Layer(config.encoder.latent_size, width, "none"), Layer(width, width, "none")
@@ -99,24 +81,16 @@ class RegistrationNetwork(Network):
         with torch.no_grad():
             self.output.weight.mul_(_SMALL_START)
             self.output.bias.zero_()
-        n_points = config.decoder.points
-        self.register_buffer("center_ct", torch.zeros(3))
-        self.register_buffer("points", torch.zeros(n_points, 3))  # about center_ct
-        self.register_buffer("modes", torch.zeros(n_points, 3, modes))  # at these points
-        self.register_buffer("mean", torch.zeros(modes))
-        self.register_buffer("std", torch.ones(modes))
-        self.register_buffer("facing", torch.eye(3))
-        self.register_buffer("long_axis", torch.tensor([1.0, 0.0, 0.0]))
+        self.center_ct = nn.Buffer(torch.zeros(3))
+        self.points = nn.Buffer(torch.zeros(head.points, 3))
+        self.modes = nn.Buffer(torch.zeros(head.points, 3, modes))
+        self.mean = nn.Buffer(torch.zeros(modes))
+        self.std = nn.Buffer(torch.ones(modes))
+        self.facing = nn.Buffer(torch.eye(3))
+        self.long_axis = nn.Buffer(torch.tensor([1.0, 0.0, 0.0]))
 
-    def initialize(
-        self,
-        shape: RestShape,
-        up_lps: tuple[float, float, float],
-        points_ct: Float[np.ndarray, "p 3"],
-    ) -> None:
-        """Take over what does not have to be learnt: the organ's centre and axes, its states'
-        mean and spread, and the points (CT frame) whose places before the camera the loss
-        compares."""
+    def initialize(self, shape: RestShape, up_lps: Direction, points_ct: Points) -> None:
+        """Take over what does not have to be learnt, with these points (CT frame)."""
         body = shape.body
         known = {
             "center_ct": body.center_ct,
@@ -132,11 +106,9 @@ class RegistrationNetwork(Network):
 
     def align(self, points_mm: Tensor) -> AlignedCloud:
         """Clouds (B, N, 3), camera frame, mm, in the network's frame."""
-        near = without_strays(points_mm, self.reach * self.scale_mm)
-        centre_mm = near.mean(dim=1, keepdim=True)
-        points = (near - centre_mm) / self.scale_mm
-        turn = alignment(points)
-        return AlignedCloud(turned(points, turn), centre_mm[:, 0], turn)
+        points, centre_mm, _, turn = normalised(points_mm, self.config.normalisation)
+        assert turn is not None
+        return AlignedCloud(points, centre_mm[:, 0], turn)
 
     def flip_sign(self, aligned: AlignedCloud, rotation: Tensor) -> Tensor:
         """+1 where the organ's long axis points to +x in the network's frame, else -1; (B,)."""
@@ -148,9 +120,9 @@ class RegistrationNetwork(Network):
         """What is seen, if the clouds lie the right way round."""
         out = self.output(self.hidden(self.encoder(aligned.points)))
         with torch.autocast(out.device.type, enabled=False):  # bf16 would round to 0.2 mm
-            return self._placement(out.float(), aligned)
+            return self._hypothesis(out.float(), aligned)
 
-    def _placement(self, out: Tensor, aligned: AlignedCloud) -> PoseHypothesis:
+    def _hypothesis(self, out: Tensor, aligned: AlignedCloud) -> PoseHypothesis:
         first = functional.normalize(out[:, :3] + out.new_tensor([1.0, 0.0, 0.0]), dim=1)
         second = out[:, 3:6] + out.new_tensor([0.0, 1.0, 0.0])
         second = second - (first * second).sum(1, keepdim=True) * first
@@ -163,82 +135,63 @@ class RegistrationNetwork(Network):
         bounded = _LARGEST * torch.tanh(out[:, POSE_OUTPUTS:] / _LARGEST)
         return PoseHypothesis(rotation, centre_mm, self.mean + self.std * bounded, out[:, 9])
 
-    def loss(
-        self,
-        clouds_mm: Tensor,
-        points_mm: Tensor,
-        labels: Tensor,
-        camera_from_ct: Tensor,
-        *,
-        first: int = 0,
-    ) -> Tensor:
-        """How far the known points (B, P, 3) are from where the placements carry them, with and
-        without deformation, and how well the right way round is told. ``labels`` is not used.
-
-        The deformation counts to first order: the displacement at the points' places at rest.
-        ``first``: the first cloud's number in a batch that several processes share; the mean of
-        equal shares' losses is the whole batch's.
-        """
+    def loss(self, *scenes: Tensor, first: int = 0) -> Tensor:
+        """How far the known points (B, P, 3) are from where the hypotheses carry them, with and
+        without deformation, and how well the right way round is told. Labels are not used. The
+        deformation counts to first order: the displacement at the points' places at rest. The mean
+        of equal shares' losses is the whole batch's."""
+        clouds_mm, points_mm, _, camera_from_ct = scenes
         aligned = self.align(clouds_mm)
         with torch.autocast(clouds_mm.device.type, enabled=False):
             true_rotation = camera_from_ct[:, :3, :3]
             true_centre = true_rotation @ self.center_ct + camera_from_ct[:, :3, 3]
             sign = self.flip_sign(aligned, true_rotation)
-        placed = self(aligned.flipped(sign))
+        found = self(aligned.flipped(sign))
         told_wrong = self._flipped_loss(aligned.flipped(-sign), first)
         with torch.autocast(clouds_mm.device.type, enabled=False):
-            moved = self.points + torch.einsum("pdm,bm->bpd", self.modes, placed.coefficients)
-            error = _size(_placed(moved, placed.rotation, placed.centre_mm) - points_mm)
-            rigid = _placed(self.points, placed.rotation, placed.centre_mm)
+            moved = self.points + torch.einsum("pdm,bm->bpd", self.modes, found.coefficients)
+            error = _size(_placed(moved, found.rotation, found.centre_mm) - points_mm)
+            rigid = _placed(self.points, found.rotation, found.centre_mm)
             rigid_error = _size(rigid - _placed(self.points, true_rotation, true_centre))
-            told = functional.softplus(-placed.right_way).mean() + told_wrong
+            told = functional.softplus(-found.right_way).mean() + told_wrong
             return error + _RIGID_SHARE * rigid_error + _WAY_SHARE * told
 
     def _flipped_loss(self, wrong: AlignedCloud, first: int) -> Tensor:
         """How well the wrong way round is told, by some of the clouds: the same ones in every
         sharing of the batch, so that a small share may have none."""
-        few = wrong[slice(-first % _FLIPPED_SHARE, None, _FLIPPED_SHARE)]
+        rows = slice(-first % _FLIPPED_SHARE, None, _FLIPPED_SHARE)
+        few = AlignedCloud(wrong.points[rows], wrong.centre_mm[rows], wrong.turn[:, rows])
         if not len(few.points):
             return wrong.points.new_zeros(())
         told = functional.softplus(self(few).right_way).sum()
         return told / (len(wrong.points) / _FLIPPED_SHARE)
 
-    def onnx_parts(self, cloud_mm: Tensor) -> tuple[nn.Module, tuple[Tensor, ...], dict[str, Any]]:
+    def onnx_parts(self, cloud_mm: Tensor) -> OnnxParts:
         """See ``Network``: clouds in, hypotheses of both ways round out."""
-        names = {"input_names": ["cloud_mm"], "output_names": list(_PLACES)}
-        return _FlipHypotheses(self).cpu().eval(), (cloud_mm,), names
+        names = {"input_names": ["cloud_mm"], "output_names": list(PoseHypothesis._fields)}
+        return _Exported(self).cpu().eval(), (cloud_mm,), names
 
-    def flip_hypotheses(self, points_mm: Tensor) -> tuple[PoseHypothesis, PoseHypothesis]:
-        """Placements for the clouds as they were turned, and for half a turn more."""
+    def flip_hypotheses(self, points_mm: Tensor) -> PoseHypothesis:
+        """Hypotheses (2B) for clouds (B, N, 3) as they were turned, then for half a turn more; in
+        one batch: a network this small takes as long for two clouds as for one."""
         one = self.align(points_mm)
         other = one.flipped(-torch.ones_like(one.centre_mm[:, 0]))
-        # One batch: a network this small takes as long for two clouds as for one.
-        both = self(
-            AlignedCloud(
-                torch.cat([one.points, other.points]),
-                torch.cat([one.centre_mm, other.centre_mm]),
-                torch.cat([one.turn, other.turn], 1),
-            )
-        )
-        return both[: len(points_mm)], both[len(points_mm) :]
+        points, centre_mm = torch.cat([one.points, other.points]), one.centre_mm.repeat(2, 1)
+        return self(AlignedCloud(points, centre_mm, torch.cat([one.turn, other.turn], 1)))
 
 
-class _FlipHypotheses(nn.Module):
-    """A cloud (1, N, 3) -> the hypotheses' four arrays, (2, ...) each: as the cloud was turned, and
-    half a turn more."""
+class _Exported(nn.Module):
+    """A cloud (1, N, 3) -> the arrays of ``flip_hypotheses``, (2, ...) each."""
 
     def __init__(self, network: RegistrationNetwork) -> None:
         super().__init__()
         self.network = network
 
     def forward(self, cloud_mm: Tensor) -> tuple[Tensor, ...]:
-        ways = self.network.flip_hypotheses(cloud_mm)
-        return tuple(torch.cat([getattr(way, name) for way in ways]) for name in _PLACES)
+        return tuple(self.network.flip_hypotheses(cloud_mm))
 
 
-def facing_rotation(
-    up_lps: tuple[float, float, float], long_axis: Float[np.ndarray, " 3"]
-) -> Float[np.ndarray, "3 3"]:
+def facing_rotation(up_lps: Direction, long_axis: Vector) -> Matrix:
     """The rotation that an organ of any patient has where nothing is tilted: its upper side
     towards the camera, its long axis along +x as far as it lies across the view."""
     facing = rotation_onto(np.asarray(up_lps, float), np.array([0.0, 0.0, -1.0]))
@@ -260,11 +213,7 @@ def _size(offsets_mm: Tensor) -> Tensor:
 
 def _about_z(turn: Tensor) -> Tensor:
     """(2, B, 1) cosine and sine -> rotations (B, 3, 3) from the turned frame back."""
-    cosine, sine = turn[0, :, 0], turn[1, :, 0]
+    cosine, sine = turn[..., 0]
     zero, one = torch.zeros_like(cosine), torch.ones_like(cosine)
-    rows = [
-        torch.stack([cosine, -sine, zero], -1),
-        torch.stack([sine, cosine, zero], -1),
-        torch.stack([zero, zero, one], -1),
-    ]
-    return torch.stack(rows, 1)
+    rows = [cosine, -sine, zero, sine, cosine, zero, zero, zero, one]
+    return torch.stack(rows, -1).view(-1, 3, 3)

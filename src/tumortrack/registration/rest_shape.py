@@ -1,17 +1,17 @@
-"""What a warp model knows of the organ at rest: surfaces, signed distances, elastic body."""
+"""What a `clinic` model knows of the organ at rest: surfaces, signed distances, elastic body."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
 
-import numba
 import numpy as np
 from jaxtyping import Float32, Float64, UInt8
 
 from tumortrack.core.errors import InputError
 from tumortrack.core.process import parallel_for
 from tumortrack.core.types import Anatomy, Mesh
+from tumortrack.registration.kernels import DistanceField, mark
 from tumortrack.simulate.elastic.body import ElasticBody
 from tumortrack.simulate.occupancy import contains, surface_distance
 
@@ -20,26 +20,6 @@ _FINEST_MM, _COARSEST_MM = 0.5, 2.0
 _REACH = 10  # steps about a part; farther out the distance is that of the nearest border
 _AT_ONCE = 4096  # points: a thread's part
 _BODY = "body."
-
-
-@dataclass(frozen=True, eq=False)
-class DistanceField:
-    """Signed distance to one closed surface (mm, negative inside) on a lattice, CT frame."""
-
-    origin_mm: Float32[np.ndarray, " 3"]
-    spacing_mm: float
-    values_mm: Float32[np.ndarray, "i j k"]
-
-    def at(self, points_ct: Float32[np.ndarray, "n 3"]) -> Float32[np.ndarray, " n"]:
-        """The distance of points, by trilinear interpolation."""
-        return self.with_slope(points_ct)[0]
-
-    def with_slope(
-        self, points_ct: Float32[np.ndarray, "n 3"]
-    ) -> tuple[Float32[np.ndarray, " n"], Float32[np.ndarray, "n 3"]]:
-        """Distance and its slope, which points outwards."""
-        spacing = np.float32(self.spacing_mm)
-        return _distance(self.values_mm, self.origin_mm, spacing, points_ct)
 
 
 def distance_of(mesh: Mesh) -> DistanceField:
@@ -54,7 +34,7 @@ def distance_of(mesh: Mesh) -> DistanceField:
     inside = np.zeros(len(nodes), bool)
     inside[near] = contains(mesh, nodes[near])
     values = np.where(inside, -distance, distance).reshape(tuple(shape))
-    return DistanceField(origin.astype(np.float32), step, values)
+    return DistanceField(values, origin.astype(np.float32), step)
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,47 +58,36 @@ class RestShape:
         far = np.finfo(np.float32).max  # fast math knows no infinity
         margin_mm = np.full(len(points_ct), far, np.float32)
 
-        def mark(part: slice) -> None:
-            some = points_ct[part], labels[part], margin_mm[part]
+        def mark_part(part: slice) -> None:
             for label, field in enumerate(self.distances, start=1):
-                lattice = field.values_mm, field.origin_mm, np.float32(field.spacing_mm)
-                _mark(*lattice, np.uint8(label), *some)
+                mark(field, np.uint8(label), points_ct[part], labels[part], margin_mm[part])
 
-        parallel_for(mark, len(points_ct), _AT_ONCE)
+        parallel_for(mark_part, len(points_ct), _AT_ONCE)
         return labels, margin_mm
 
     def to_arrays(self) -> dict[str, np.ndarray]:
         """Everything as named arrays, for a file."""
         arrays = {f"{_BODY}{name}": value for name, value in self.body.to_arrays().items()}
         for n, (part, field) in enumerate(zip(self.anatomy_ct.parts, self.distances, strict=True)):
-            arrays |= {
-                f"{n}.vertices_mm": part.vertices_mm,
-                f"{n}.faces": part.faces,
-                f"{n}.origin_mm": field.origin_mm,
-                f"{n}.spacing_mm": np.array(field.spacing_mm),
-                f"{n}.values_mm": field.values_mm,
-            }
+            named = {"vertices_mm": part.vertices_mm, "faces": part.faces, **field._asdict()}
+            arrays |= {f"{n}.{name}": np.asarray(value) for name, value in named.items()}
         return arrays
 
     @classmethod
     def from_arrays(cls, arrays: dict[str, np.ndarray], n_parts: int) -> RestShape:
-        """The inverse of ``to_arrays``.
-
-        Raises:
-            InputError: an array is missing or of a wrong shape.
-        """
+        """The inverse of ``to_arrays``; InputError for an array that is missing or misshapen."""
         try:
             body = {k.removeprefix(_BODY): v for k, v in arrays.items() if k.startswith(_BODY)}
             parts, fields = [], []
             for n in range(n_parts):
-                parts.append(Mesh(arrays[f"{n}.vertices_mm"], arrays[f"{n}.faces"]))
-                fields.append(
-                    DistanceField(
-                        np.asarray(arrays[f"{n}.origin_mm"], np.float32),
-                        float(arrays[f"{n}.spacing_mm"]),
-                        np.ascontiguousarray(arrays[f"{n}.values_mm"], np.float32),
-                    )
+                part = (
+                    arrays[f"{n}.{name}"]
+                    for name in ("vertices_mm", "faces", *DistanceField._fields)
                 )
+                vertices, faces, values, origin, spacing = part
+                parts.append(Mesh(vertices, faces))
+                values = np.ascontiguousarray(values, np.float32)
+                fields.append(DistanceField(values, np.asarray(origin, np.float32), float(spacing)))
         except KeyError as error:
             raise InputError(f"the organ's shape lacks {error}; train the model again.") from error
         return cls(Anatomy(tuple(parts)), ElasticBody.from_arrays(body), tuple(fields))
@@ -135,48 +104,3 @@ def long_axis_of(organ: Mesh) -> Float64[np.ndarray, " 3"]:
 def shape_of(anatomy_ct: Anatomy, body: ElasticBody) -> RestShape:
     """The shape of an anatomy with its body; seconds."""
     return RestShape(anatomy_ct, body, tuple(distance_of(part) for part in anatomy_ct.parts))
-
-
-@numba.njit(cache=True, fastmath=True, nogil=True)
-def _mark(values, origin, spacing, label, points, labels, margin):  # type: ignore[no-untyped-def]
-    """Give points inside the label, and every point the distance if it is the least so far."""
-    for p in range(len(points)):
-        distance = distance_at(values, origin, spacing, points[p, 0], points[p, 1], points[p, 2])[0]
-        if distance < 0:
-            labels[p] = label
-        margin[p] = min(margin[p], abs(distance))
-
-
-@numba.njit(cache=True, fastmath=True, nogil=True)
-def _distance(values, origin, spacing, points):  # type: ignore[no-untyped-def]
-    n = len(points)
-    out, slope = np.empty(n, np.float32), np.empty((n, 3), np.float32)
-    for p in range(n):
-        out[p], slope[p, 0], slope[p, 1], slope[p, 2] = distance_at(
-            values, origin, spacing, points[p, 0], points[p, 1], points[p, 2]
-        )
-    return out, slope
-
-
-@numba.njit(cache=True, fastmath=True, nogil=True, inline="always")
-def distance_at(values, origin, spacing, x, y, z):  # type: ignore[no-untyped-def]
-    """Distance and its slope along x, y, z at one place (mm), by trilinear interpolation."""
-    zero, one, most = np.float32(0), np.float32(1), np.float32(1.001)
-    per_cell = one / spacing
-    x = min(max((x - origin[0]) * per_cell, zero), np.float32(values.shape[0]) - most)
-    y = min(max((y - origin[1]) * per_cell, zero), np.float32(values.shape[1]) - most)
-    z = min(max((z - origin[2]) * per_cell, zero), np.float32(values.shape[2]) - most)
-    i, j, k = int(x), int(y), int(z)
-    a, b, c = np.float32(x - i), np.float32(y - j), np.float32(z - k)
-    v000, v001 = values[i, j, k], values[i, j, k + 1]
-    v010, v011 = values[i, j + 1, k], values[i, j + 1, k + 1]
-    v100, v101 = values[i + 1, j, k], values[i + 1, j, k + 1]
-    v110, v111 = values[i + 1, j + 1, k], values[i + 1, j + 1, k + 1]
-    l00, l01 = v000 + (v001 - v000) * c, v010 + (v011 - v010) * c
-    l10, l11 = v100 + (v101 - v100) * c, v110 + (v111 - v110) * c
-    f0, f1 = l00 + (l01 - l00) * b, l10 + (l11 - l10) * b
-    by_y = (l01 - l00) * (one - a) + (l11 - l10) * a
-    d0 = (v001 - v000) * (one - b) + (v011 - v010) * b
-    d1 = (v101 - v100) * (one - b) + (v111 - v110) * b
-    by_z = d0 * (one - a) + d1 * a
-    return f0 + (f1 - f0) * a, (f1 - f0) * per_cell, by_y * per_cell, by_z * per_cell

@@ -246,11 +246,9 @@ class NaiveRegistration:
     def labels(self, points_mm: np.ndarray, queries_mm: np.ndarray) -> np.ndarray:
         """A cloud (n, 3) -> labels of queries (q, 3)."""
         with torch.inference_mode():
-            ways = self._network.flip_hypotheses(torch.tensor(points_mm)[None])
-        starts = [
-            [part[0].double().numpy() for part in (way.rotation, way.centre_mm, way.coefficients)]
-            for way in ways
-        ]
+            found = self._network.flip_hypotheses(torch.tensor(points_mm)[None])
+        parts = (found.rotation, found.centre_mm, found.coefficients)
+        starts = zip(*(part.double().numpy() for part in parts), strict=True)
         best = min((self._refined(points_mm, *start) for start in starts), key=lambda fit: fit[0])
         return self._labelled(best, queries_mm)
 

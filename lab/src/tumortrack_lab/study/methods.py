@@ -41,7 +41,7 @@ from tumortrack.simulate.deform.drag import CONFIGURATIONS
 from tumortrack.simulate.scene_folder import Scene
 from tumortrack.tracking.tracker import Tracker
 from tumortrack.training.model import load_model
-from tumortrack.training.train import TrainingRun, TrainingStatus, run_identity, train
+from tumortrack.training.train import TrainingRun, TrainingStatus, train
 from tumortrack_lab.peers.base import Fit, Peer, estimate_of
 from tumortrack_lab.peers.kinds import PeerKind, peer_kinds
 
@@ -333,7 +333,7 @@ class Trainer:
         )
         # A finished model of another run is refused by training, with a clear text.
         about = store.read_json(folder / store.MANIFEST) if is_finished(folder) else {}
-        if about.get("provenance", {}).get("run_sha256") != run_identity(run):
+        if about.get("provenance", {}).get("run_sha256") != run.identity:
             threads = torch.get_num_threads()
             label = f"{case.name} {trained} seed {seed}"
             train(run, folder, lambda status: self.report(label, status))

@@ -7,20 +7,20 @@ become code.
 from __future__ import annotations
 
 import io
-import struct
-from collections.abc import Callable, Iterator
-from contextlib import suppress
-from dataclasses import dataclass
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager, suppress
 from functools import partial
+from itertools import chain
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
-from tumortrack.core.errors import InputError, TumortrackError
-from tumortrack.live.recording import RecordedFrame
+from tumortrack.core.errors import InputError
+from tumortrack.live.recording.folders import RecordedFrame
+from tumortrack.live.ros import sensors
 from tumortrack.live.ros.messages import Messages, stamp_of
-from tumortrack.live.ros.sensors import CAMERA_INFO, CLOUD, IMAGE, cloud_of, depth_of, mask_of
 from tumortrack.live.values import Observation
 
+_KINDS = (sensors.IMAGE, sensors.CLOUD)
 SUFFIXES = (".mcap", ".db3", ".bag")
 ESTIMATES = "/tumortrack/"  # topics of our own estimates, which are no input
 MASK_TOPIC = "/camera/mask"
@@ -28,114 +28,87 @@ _REALSENSE = "/device_0/"  # how the RealSense SDK names all its topics
 # https://mcap.dev/spec
 _MAGIC = b"\x89MCAP0\r\n"
 _DATA_END = 0x0F
-_LAST_OPCODE = 0x0F
-# An empty DataEnd, then a footer of three zeros: where a summary would start, and its checksum.
-_ENDING = struct.pack("<BQI", _DATA_END, 4, 0) + struct.pack("<BQQQI", 0x02, 20, 0, 0, 0) + _MAGIC
-_DEPTHS = ("16UC1", "mono16", "32FC1")
-
-
-@dataclass(frozen=True)
-class BagChoice:
-    """Which topics, and how their depth images are meant; an empty topic: the only one there is.
-
-    ``rectified`` and ``unit_mm`` as in ``ros.sensors.depth_of``.
-    """
-
-    topic: str = ""
-    info_topic: str = ""
-    rectified: bool = False
-    unit_mm: float = 1.0
-
-
-def is_bag(path: Path) -> bool:
-    """Whether this is a bag's file, or a folder of one."""
-    return (path / "metadata.yaml").is_file() or bool(_files(path))
 
 
 class BagRecording:
     """An open bag: depth images, each with the camera_info that came last and the mask of its own
-    stamp, or clouds.
-
-    Raises:
-        InputError: no bag, damaged, or not exactly one topic to choose.
+    stamp, or clouds. An empty topic is the only one there is; ``rectified`` and ``unit_mm`` as in
+    ``ros.sensors.depth_of``. Raises InputError if it is no bag or damaged, or if there is not
+    exactly one topic to choose.
     """
 
-    def __init__(self, path: Path, choice: BagChoice) -> None:
-        files = _files(path)
-        self._path, self._choice = path, choice
-        self._messages = Messages("noetic" if files and files[0].suffix == ".bag" else "humble")
+    def __init__(
+        self,
+        path: Path,
+        topic: str = "",
+        info_topic: str = "",
+        rectified: bool = False,
+        unit_mm: float = 1.0,
+    ) -> None:
+        files = bag_files(path)
+        is_ros1 = files[0].is_file() and files[0].suffix.lower() == ".bag"
+        self._path, self._rectified, self._unit_mm = path, rectified, unit_mm
+        self._messages = Messages("noetic" if is_ros1 else "humble")
         self._readers: list[Any] = []
-        try:
-            for file in [path] if (path / "metadata.yaml").is_file() else files:
-                self._readers.append(_guarded(path, partial(_open, file)))
+        with ExitStack() as opened:
+            for file in files:
+                with _guarded(path):
+                    self._readers.append(_opened(file))
+                opened.callback(self._readers[-1].close)
             self._types = {c.topic: c.msgtype for r in self._readers for c in r.connections}
-            self._topic = self._choose_topic()
-            self._info_topic = self._choose_info() if self._types[self._topic] == IMAGE else ""
-        except BaseException:
-            self.close()
-            raise
+            self._topic = self._choose_topic(topic)
+            images = self._types[self._topic] == sensors.IMAGE
+            self._info_topic = self._choose_info(info_topic) if images else ""
+            self._opened = opened.pop_all()
 
     def close(self) -> None:
-        readers, self._readers = self._readers, []
-        for reader in readers:
-            with suppress(AssertionError):  # of rosbags: it was not open
-                reader.close()
+        self._opened.close()
 
     def frames(self) -> Iterator[RecordedFrame]:
-        images = bool(self._info_topic)
-        info = self._first(self._info_topic) if images else None
-        mask: Any = None
+        """From first to last; each call starts again. A damaged frame is one whose ``load``
+        raises."""
+        info = self._first(self._info_topic) if self._info_topic else None
+        mask, stamp_ns = None, 0
         waiting: Any = None  # an image: its camera_info and mask may follow it
-        last_ns = 0
-        for topic, message in self._all({self._topic, self._info_topic, MASK_TOPIC}):
+        topics = {self._topic, self._info_topic, MASK_TOPIC}
+        for topic, message in chain(self._all(topics), [("", None)]):
             if topic and topic != self._topic:
                 info, mask = (info, message) if topic == MASK_TOPIC else (message, mask)
                 continue
             if waiting is not None:
-                yield self._image_frame(waiting, info, mask)
-                waiting = None
-            if isinstance(message, InputError):
-                yield RecordedFrame(last_ns, partial(_refuse, message))
-                continue
-            last_ns = stamp_of(message.header)
-            if images:
-                waiting = message
-            else:
-                yield RecordedFrame(last_ns, partial(_cloud, message))
-        if waiting is not None:
-            yield self._image_frame(waiting, info, mask)
+                yield RecordedFrame(stamp_ns, partial(self._observed, waiting, info, mask))
+            if message is not None and not isinstance(message, InputError):
+                stamp_ns = stamp_of(message.header)
+            waiting = message
 
-    def _image_frame(self, image: Any, info: Any, mask: Any) -> RecordedFrame:
-        stamp_ns = stamp_of(image.header)
-
-        def load() -> Observation:
-            frame = depth_of(image, info, self._choice.rectified, self._choice.unit_mm)
-            here = mask is not None and stamp_of(mask.header) == stamp_ns
-            return Observation(frame, 0, mask_of(mask) if here else None)
-
-        return RecordedFrame(stamp_ns, load)
+    def _observed(self, message: Any, info: Any, mask: Any) -> Observation:
+        if isinstance(message, InputError):
+            raise message
+        if info is None:
+            return Observation(sensors.cloud_of(message), 0)
+        frame = sensors.depth_of(message, info, self._rectified, self._unit_mm)
+        here = mask is not None and stamp_of(mask.header) == frame.stamp_ns
+        return Observation(frame, 0, sensors.mask_of(mask) if here else None)
 
     def _all(self, topics: set[str]) -> Iterator[tuple[str, Any]]:
         """Topic and message in the order of their recording; without a topic an InputError, where
         a message, or the bag from there on, is damaged."""
         for reader in self._readers:
             wanted = [c for c in reader.connections if c.topic in topics]
-            if not wanted:
-                continue
-            raw = reader.messages(wanted)
+            raw = reader.messages(wanted) if wanted else iter(())
             while True:
+                got = None
                 try:
-                    got = _guarded(self._path, partial(next, raw, None))
-                except InputError as error:
-                    yield "", error
-                    break
-                if got is None:
-                    break
-                topic = got[0].topic
-                try:
+                    with _guarded(self._path):
+                        got = next(raw, None)
+                    if got is None:
+                        break
+                    topic = got[0].topic
                     yield topic, self._messages.from_bytes(got[2], self._types[topic])
                 except InputError as error:
                     yield "", error
+                    if got is None:
+                        break
 
     def _first(self, topic: str) -> Any:
         for _, message in self._all({topic}):
@@ -144,21 +117,21 @@ class BagRecording:
             return message
         raise InputError(f"{self._path} has no message on {topic}, which was announced in it.")
 
-    def _choose_topic(self) -> str:
-        usable = {
-            topic: kind
+    def _choose_topic(self, wanted: str) -> str:
+        usable = [
+            topic
             for topic, kind in self._types.items()
-            if kind in (IMAGE, CLOUD) and not topic.startswith(ESTIMATES)
-        }
-        if wanted := self._choice.topic:
-            if self._types.get(wanted) in (IMAGE, CLOUD):
+            if kind in _KINDS and not topic.startswith(ESTIMATES)
+        ]
+        if wanted:
+            if self._types.get(wanted) in _KINDS:
                 return wanted
             raise InputError(
                 f"{self._path} has no topic {wanted!r} of depth images or clouds. It has: "
                 f"{', '.join(usable) or 'none'}."
             )
-        images = [t for t, kind in usable.items() if kind == IMAGE and self._is_depth(t)]
-        found = images or [topic for topic, kind in usable.items() if kind == CLOUD]
+        clouds = [topic for topic in usable if self._types[topic] == sensors.CLOUD]
+        found = [topic for topic in usable if self._is_depth(topic)] or clouds
         if len(found) == 1:
             return found[0]
         if any(topic.startswith(_REALSENSE) for topic in self._types):
@@ -168,8 +141,8 @@ class BagRecording:
             )
         if not usable:
             raise InputError(
-                f"{self._path} holds no depth images and no clouds (topics of {IMAGE} or {CLOUD}; "
-                f"those under {ESTIMATES} are estimates)."
+                f"{self._path} holds no depth images and no clouds (topics of "
+                f"{' or '.join(_KINDS)}; those under {ESTIMATES} are estimates)."
             )
         raise InputError(
             f"{self._path}: which topic holds the depth images or clouds? Say topic=NAME; "
@@ -177,139 +150,88 @@ class BagRecording:
         )
 
     def _is_depth(self, topic: str) -> bool:
-        try:
-            return self._first(topic).encoding in _DEPTHS
-        except InputError:
+        if self._types[topic] != sensors.IMAGE:
             return False
+        with suppress(InputError):
+            return self._first(topic).encoding in sensors.DEPTHS
+        return False
 
-    def _choose_info(self) -> str:
+    def _choose_info(self, wanted: str) -> str:
         """The camera_info beside the image, by ROS's convention or RealSense's; or the only one."""
-        if self._choice.info_topic:
-            if self._types.get(self._choice.info_topic) == CAMERA_INFO:
-                return self._choice.info_topic
-            raise InputError(f"{self._path} has no camera_info topic {self._choice.info_topic!r}.")
-        infos = [topic for topic, kind in self._types.items() if kind == CAMERA_INFO]
+        infos = [topic for topic, kind in self._types.items() if kind == sensors.CAMERA_INFO]
+        if wanted and wanted not in infos:
+            raise InputError(f"{self._path} has no camera_info topic {wanted!r}.")
         parent = self._topic.rpartition("/")[0]
         beside = (f"{parent}/camera_info", f"{parent.rpartition('/')[0]}/info/camera_info")
         found = [topic for topic in beside if topic in infos] or infos
-        if len(found) == 1:
-            return found[0]
+        if wanted or len(found) == 1:
+            return wanted or found[0]
         raise InputError(
             f"{self._path}: which camera_info belongs to {self._topic}? Say info_topic=NAME; "
             f"candidates: {', '.join(infos) or 'none, so its depth images cannot be used'}."
         )
 
 
-def _files(path: Path) -> list[Path]:
-    """The bag's files in the order of their numbers."""
+def bag_files(path: Path) -> list[Path]:
+    """The bag's files in the order of their numbers; a rosbag2 folder is one of its own. None
+    where there is no bag."""
+    if (path / "metadata.yaml").is_file():
+        return [path]
     if not path.is_dir():
         return [path] if path.suffix.lower() in SUFFIXES else []
     inside = (p for p in path.iterdir() if p.suffix.lower() in SUFFIXES and p.is_file())
     return sorted(inside, key=lambda p: (len(p.name), p.name))
 
 
-def _open(path: Path) -> Any:
-    """An opened reader of a file, or of a rosbag2 folder."""
-    from rosbags.rosbag1 import Reader as Reader1
-    from rosbags.rosbag2 import Reader as Reader2
+def _opened(path: Path) -> Any:
+    """A reader of a file, or of a rosbag2 folder."""
+    from rosbags import rosbag1, rosbag2
+    from rosbags.rosbag2.storage_mcap import McapReader
 
     kind = path.suffix.lower() if path.is_file() else ""
-    reader: Any
-    if kind == ".mcap" and not _is_whole(path):
-        from rosbags.rosbag2.storage_mcap import McapReader
-
-        reader = McapReader(_CutMcap(path))  # type: ignore[arg-type]
-    else:
-        reader = Reader1(path) if kind == ".bag" else Reader2(path)
-    reader.open()
+    end = _end_of_records(path) if kind == ".mcap" else 0
+    if not end:
+        whole: Any = rosbag1.Reader(path) if kind == ".bag" else rosbag2.Reader(path)
+        whole.open()
+        return whole
+    # Readers begin at the end. This one is told where the records end, and goes through them all.
+    reader: Any = McapReader(path)
+    try:
+        reader.open()
+    except Exception:
+        if not reader.data_start:  # the head is damaged too
+            raise
+    reader.bio, reader.data_end = path.open("rb"), end
+    reader.meta_scan()
     return reader
 
 
-def _guarded(path: Path, step: Callable[[], Any]) -> Any:
-    """What ``step`` returns, or an InputError that names the bag."""
+@contextmanager
+def _guarded(path: Path) -> Iterator[None]:
+    """Errors inside become an InputError that names the bag."""
     try:
-        return step()
-    except TumortrackError:
-        raise
+        yield
     except Exception as error:  # rosbags, sqlite and unpackers raise anything on a damaged bag
         raise InputError(
             f"{path} is no bag that can be read, or is damaged from here on: {error}."
         ) from error
 
 
-def _cloud(message: Any) -> Observation:
-    return Observation(cloud_of(message), 0)
-
-
-def _refuse(error: InputError) -> NoReturn:
-    raise error
-
-
-def _is_whole(path: Path) -> bool:
-    """Whether the file ends as it should; of one without a beginning too, which is no MCAP."""
+def _end_of_records(path: Path) -> int:
+    """Behind the last whole record of an MCAP without an end, as a killed recorder or a full disk
+    leaves it; 0 of one with an end, or of another file. A file is magic, records (opcode, length,
+    content), footer, magic."""
     with path.open("rb") as stream:
         begins = stream.read(len(_MAGIC)) == _MAGIC
         size = stream.seek(0, io.SEEK_END)
         stream.seek(max(size - len(_MAGIC), 0))
-        return not begins or (size > len(_MAGIC) and stream.read() == _MAGIC)
-
-
-class _CutMcap(io.RawIOBase):
-    """An MCAP file without an end, as a killed recorder or a full disk leaves it, with an end.
-
-    A file is magic, records (opcode, length, content), footer, magic; readers begin at the footer.
-    Here the whole records get a footer that says "no index", in memory, so that the library reads
-    them from first to last; the file stays as it is. To the library this is the file's path.
-    """
-
-    def __init__(self, path: Path) -> None:
-        self._stream = path.open("rb")
-        self._kept = _end_of_records(self._stream)
-        self._at = 0
-
-    def open(self, mode: str) -> io.BufferedReader:
-        return io.BufferedReader(self)
-
-    def __str__(self) -> str:
-        return self._stream.name
-
-    def readable(self) -> bool:
-        return True
-
-    def seekable(self) -> bool:
-        return True
-
-    def seek(self, offset: int, whence: int = io.SEEK_SET) -> int:
-        start = {io.SEEK_SET: 0, io.SEEK_CUR: self._at, io.SEEK_END: self._kept + len(_ENDING)}
-        self._at = max(start[whence] + offset, 0)
-        return self._at
-
-    def readinto(self, buffer: Any) -> int:
-        if self._at < self._kept:
-            self._stream.seek(self._at)
-            got = self._stream.read(min(len(buffer), self._kept - self._at))
-        else:
-            begin = self._at - self._kept
-            got = _ENDING[begin : begin + len(buffer)]
-        buffer[: len(got)] = got
-        self._at += len(got)
-        return len(got)
-
-    def close(self) -> None:
-        self._stream.close()
-        super().close()
-
-
-def _end_of_records(stream: io.BufferedReader) -> int:
-    """Behind the last record that is there from its first to its last byte."""
-    size = stream.seek(0, io.SEEK_END)
-    end = len(_MAGIC)
-    while True:
-        stream.seek(end)
-        head = stream.read(9)
-        if len(head) < 9 or not 0 < head[0] < _LAST_OPCODE:
-            return end
-        beyond = end + 9 + int.from_bytes(head[1:], "little")
-        if beyond > size:
-            return end
-        end = beyond
+        if not begins or (size > len(_MAGIC) and stream.read() == _MAGIC):
+            return 0
+        end = len(_MAGIC)
+        while True:
+            stream.seek(end)
+            head = stream.read(9)
+            beyond = end + 9 + int.from_bytes(head[1:], "little")
+            if len(head) < 9 or not 0 < head[0] < _DATA_END or beyond > size:
+                return end
+            end = beyond

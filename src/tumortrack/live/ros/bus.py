@@ -1,129 +1,85 @@
 """A ROS graph as seen by one program: topics in and out as serialised bytes.
 
-Three implementations have this interface: ``dds`` (ROS 2 by Cyclone DDS, no ROS needed), ``rclpy``
-(ROS 2 by the user's own ROS, with its RMW and security) and ``rospy`` (ROS 1).
+Three implementations have the interface ``Bus``: ``dds.DdsBus`` (ROS 2 by Cyclone DDS, no ROS
+needed), ``ros2.RclpyBus`` (ROS 2 by the user's own ROS, with its RMW and security) and
+``rospy_node.RospyBus`` (ROS 1).
 """
 
 from __future__ import annotations
 
-import importlib.util
-import os
-from typing import Literal, Protocol, runtime_checkable
+import re
+from collections import deque
+from collections.abc import Callable
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 from tumortrack.core.errors import InputError
 from tumortrack.live.ros.messages import Messages
 
-Via = Literal["auto", "dds", "rclpy"]
 
-# Domain 233 and above have ports beyond 65535 (DDSI-RTPS 9.6.1.1).
-_LARGEST_DOMAIN = 232
+class Publisher(NamedTuple):
+    """One topic out: reliable, volatile, the newest message only, as ROS 2 nodes publish.
 
+    ``publish`` sends a message, in ROS 2 CDR with its 4 bytes of header, or raises TumortrackError.
+    ``flush`` returns when all reliable subscribers have what was sent, or after so many seconds.
+    ``wanted``: False if surely nobody subscribes.
+    """
 
-@runtime_checkable
-class Publisher(Protocol):
-    """One topic out: reliable, volatile, the newest message only, as ROS 2 nodes publish."""
-
-    @property
-    def wanted(self) -> bool:
-        """False if surely nobody subscribes."""
-        ...
-
-    def publish(self, raw: bytes | memoryview) -> None:
-        """Send a message: in ROS 2 CDR with its 4 bytes of header.
-
-        Raises:
-            TumortrackError: it could not be sent.
-        """
-        ...
-
-    def flush(self, timeout_s: float) -> None:
-        """Return when all reliable subscribers have what was sent, or when the time is up."""
-        ...
+    publish: Callable[[bytes | memoryview], None]
+    flush: Callable[[float], None]
+    wanted: Callable[[], bool] = lambda: True
 
 
-@runtime_checkable
-class Subscriber(Protocol):
-    """One topic in, from reliable and best effort publishers alike."""
+class Subscriber:
+    """One topic in, from reliable and best effort publishers alike. The graph's library hands each
+    message over by ``came``; of more than ``most`` the oldest are lost."""
 
-    @property
-    def lost(self) -> int:
-        """Messages that were sent and never taken, as far as is known."""
-        ...
+    def __init__(self, most: int) -> None:
+        self.lost = 0  # messages that were sent and never taken, as far as is known
+        self.pending: deque[Any] = deque(maxlen=most)
+
+    def came(self, message: Any) -> None:
+        self.lost += len(self.pending) == self.pending.maxlen
+        self.pending.append(message)
 
     def take(self) -> list[bytes | memoryview]:
-        """What came since the last call, oldest first, at most the depth asked for.
-
-        Raises:
-            InputError: a message of another type.
-        """
-        ...
+        """What came since the last call, oldest first. Raises InputError on another type."""
+        return [self.pending.popleft() for _ in range(len(self.pending))]
 
 
 @runtime_checkable
 class Bus(Protocol):
-    """A participant of the graph. Used by one thread; ``close`` perhaps from another."""
+    """A participant of the graph. Used by one thread; ``close`` perhaps from another, and twice.
+    ``messages``: the types that travel there."""
 
-    def publisher(self, topic: str, message_type: str) -> Publisher: ...
+    messages: Messages
 
-    def subscriber(
-        self, topic: str, message_type: str, depth: int = 5, latched: bool = False
-    ) -> Subscriber:
-        """Listen to ``topic``. ``latched``: to what was published before, too; such a subscriber
-        does not hear publishers that keep nothing (transient local against volatile)."""
-        ...
+    def publisher(self, topic: str, kind: str) -> Publisher: ...
+
+    def subscriber(self, topic: str, kind: str, most: int = 5, latched: bool = False) -> Subscriber:
+        """Listen to ``topic`` and hold up to ``most`` messages. ``latched``: what was published
+        before, too; such a subscriber does not hear publishers that keep nothing (transient local
+        against volatile)."""
 
     def types_of(self, topic: str) -> set[str]:
         """Message types (``sensor_msgs/msg/Image``) with which the topic is published now."""
-        ...
 
     def wait(self, timeout_s: float) -> None:
         """Return as soon as a subscriber has something to take, or when the time is up."""
-        ...
 
     def close(self) -> None:
-        """Leave the graph; may be called twice."""
-        ...
+        """Leave the graph."""
 
 
-def open_bus(via: Via, messages: Messages) -> Bus:
-    """Join the ROS 2 graph of ``ROS_DOMAIN_ID``; ``auto``: by rclpy where it can be imported.
-
-    Raises:
-        InputError: that way is not there; an unusable environment.
-    """
-    if via == "rclpy" or (via == "auto" and importlib.util.find_spec("rclpy")):
-        from tumortrack.live.ros.rclpy_node import RclpyBus
-
-        return RclpyBus(messages)
-    from tumortrack.live.ros.dds import DdsBus
-
-    return DdsBus(messages, domain_id())
-
-
-def domain_id() -> int:
-    """The ROS domain, from the environment.
-
-    Raises:
-        InputError: ``ROS_DOMAIN_ID`` is no whole number in 0..232.
-    """
-    text = os.environ.get("ROS_DOMAIN_ID", "").strip() or "0"
-    if not (text.isdecimal() and text.isascii() and int(text) <= _LARGEST_DOMAIN):
+def check_topic(kind: str, what: str, name: str) -> None:
+    """Raises InputError unless ``name`` is a topic's: in ROS 2 a full one such as
+    /camera/depth/image, in ROS 1 any (http://wiki.ros.org/Names)."""
+    if kind == "ros2" and not re.fullmatch(r"(/[A-Za-z_]\w*)+", name, re.ASCII):
         raise InputError(
-            f"ROS_DOMAIN_ID is {text!r}; it must be a whole number in 0..{_LARGEST_DOMAIN}."
+            f"ros2: the {what} {name!r} is no full topic name; it must look like "
+            "/camera/depth/image: letters, digits and underscores between slashes, no digit first."
         )
-    return int(text)
-
-
-def check_topic(topic: str, what: str) -> None:
-    """Raises InputError unless ``topic`` is a full topic name such as /camera/depth/image."""
-    parts = topic.split("/")
-    good = (
-        len(parts) > 1
-        and parts[0] == ""
-        and all(part.isascii() and part.isidentifier() for part in parts[1:])
-    )
-    if not good:
+    if kind == "ros1" and not re.fullmatch(r"[/~]?[A-Za-z]\w*(/[A-Za-z]\w*)*", name, re.ASCII):
         raise InputError(
-            f"{what} {topic!r} is no full topic name; it must look like /camera/depth/image: "
-            "letters, digits and underscores between slashes, no digit first."
+            f"{name!r} is no ROS topic; names look like /camera/depth/points: letters, digits, _ "
+            "and / between them."
         )

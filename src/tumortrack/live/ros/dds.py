@@ -11,13 +11,26 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import os
+import re
 import threading
 from functools import cache
 from typing import Any
 
 import numpy as np
+from cyclonedds import core
+from cyclonedds._clayer import ddspy_take
+from cyclonedds.builtin import BuiltinDataReader, BuiltinTopicDcpsPublication
+from cyclonedds.domain import Domain, DomainParticipant
+from cyclonedds.idl import make_idl_struct, types
+from cyclonedds.internal import DDS, dds_c_t
+from cyclonedds.pub import DataWriter
+from cyclonedds.qos import Policy, Qos
+from cyclonedds.sub import DataReader
+from cyclonedds.topic import Sample, Topic
+from rosbags.interfaces import Nodetype
 
 from tumortrack.core.errors import InputError, TumortrackError
+from tumortrack.live.ros.bus import Publisher, Subscriber
 from tumortrack.live.ros.messages import Messages
 
 # A writer waits while more than WhcHigh is not acknowledged. One cloud is more than the default,
@@ -41,10 +54,11 @@ _LOCAL = (
 )
 _BLOCKED_NS = 20_000_000  # how long a writer may wait for a slow subscriber
 _MOST_ENDPOINTS = 4096
-_NUMBERS = (
-    *(f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64)),
-    *("float32", "float64"),
-)
+_LARGEST_DOMAIN = 232  # further ones have ports beyond 65535 (DDSI-RTPS 9.6.1.1)
+_OTHER_TYPES: dict[str, Any] = {  # those that cyclonedds calls otherwise than ROS
+    **{"string": str, "bool": bool},
+    **dict.fromkeys(("char", "byte", "octet"), types.uint8),
+}
 
 # A domain is set up once per process and outlives its participants: made again, it would cut off
 # whoever else uses it.
@@ -53,70 +67,73 @@ _setting_up = threading.Lock()
 
 
 class DdsBus:
-    """One participant in domain ``domain_id``; see ``bus.Bus``.
-
-    The network is the one that ``CYCLONEDDS_URI`` says, ``ROS_LOCALHOST_ONLY`` and
-    ``ROS_AUTOMATIC_DISCOVERY_RANGE`` are heeded.
+    """One participant in the environment's domain; see ``bus.Bus``. ``CYCLONEDDS_URI``,
+    ``ROS_LOCALHOST_ONLY`` and ``ROS_AUTOMATIC_DISCOVERY_RANGE`` choose the network. Raises
+    InputError if the environment or the network cannot be used.
     """
 
-    def __init__(self, messages: Messages, domain_id: int) -> None:
-        """
-        Raises:
-            InputError: no cyclonedds; no network that it can use.
-        """
-        try:
-            from cyclonedds.builtin import BuiltinDataReader, BuiltinTopicDcpsPublication
-            from cyclonedds.core import DDSException, GuardCondition, WaitSet
-            from cyclonedds.domain import DomainParticipant
-            from cyclonedds.qos import Policy, Qos
-        except ImportError as error:
-            raise InputError(
-                "ROS 2 without ROS needs the package cyclonedds: pip install 'tumortrack[live]'."
-            ) from error
-        self._messages = messages
+    def __init__(self, messages: Messages) -> None:
+        self.messages = messages
         self._closing = threading.Lock()
+        domain = domain_id()
         try:
-            _set_up(domain_id)
-            member = DomainParticipant(domain_id, Qos(Policy.Userdata(b"enclave=/;")))
-            self._waitset, self._over = WaitSet(member), GuardCondition(member)
+            _set_up(domain)
+            member = DomainParticipant(domain, Qos(Policy.Userdata(b"enclave=/;")))
+            self._waitset, self._over = core.WaitSet(member), core.GuardCondition(member)
             self._waitset.attach(self._over)  # and without anything attached it would not wait
             self._published = BuiltinDataReader(member, BuiltinTopicDcpsPublication)
-        except DDSException as error:
+        except core.DDSException as error:
             raise InputError(
-                f"DDS domain {domain_id} cannot be joined ({_error_text(error.code)}; Cyclone "
+                f"DDS domain {domain} cannot be joined ({_error_text(error.code)}; Cyclone "
                 "DDS says more above). Check the network, CYCLONEDDS_URI, and that not too many "
                 "programs are in that domain."
             ) from error
         self._member: Any = member
 
-    def publisher(self, topic: str, message_type: str) -> DdsPublisher:
-        return DdsPublisher(
-            self._member, self._topic(topic, message_type), self._hash(message_type)
-        )
+    def publisher(self, topic: str, kind: str) -> Publisher:
+        reliable, volatile = Policy.Reliability.Reliable(_BLOCKED_NS), Policy.Durability.Volatile
+        writer: Any = DataWriter(*self._endpoint(topic, kind, reliable, volatile, 1))
+        # By ctypes, and not by the extension module: that one keeps Python's lock while it waits
+        # for a slow subscriber.
+        write = DDS._dll_handle.dds_write
+        write.argtypes = [ctypes.c_int32, ctypes.POINTER(Sample)]
+        write.restype = ctypes.c_int32
 
-    def subscriber(
-        self, topic: str, message_type: str, depth: int = 5, latched: bool = False
-    ) -> DdsSubscriber:
-        subscriber = DdsSubscriber(
-            self._member, self._topic(topic, message_type), self._hash(message_type), depth, latched
-        )
+        def publish(raw: bytes | memoryview) -> None:
+            """Fails where subscribers don't keep up, or these bytes are not what the topic's type
+            says."""
+            padded = np.frombuffer(bytes(raw) + bytes(-len(raw) % 4), np.uint8)
+            sample = Sample(padded.ctypes.data, padded.nbytes)
+            if (code := write(writer._ref, ctypes.byref(sample))) < 0:
+                said = f"a message of {len(raw)} bytes was not sent ({_error_text(code)})"
+                raise TumortrackError(f"{topic}: {said}.")
+
+        def flush(timeout_s: float) -> None:
+            # Not its public method: that one fails on a timeout (11.0.1).
+            writer._wait_for_acks(writer._ref, int(timeout_s * 1e9))
+
+        return Publisher(publish, flush)
+
+    def subscriber(self, topic: str, kind: str, most: int = 5, latched: bool = False) -> Subscriber:
+        # Best effort and volatile ask for the least, and so match every publisher; what was
+        # published before comes only to who asks for it, reliably.
+        qos: tuple[Any, Any] = (Policy.Reliability.BestEffort, Policy.Durability.Volatile)
+        if latched:
+            qos = Policy.Reliability.Reliable(0), Policy.Durability.TransientLocal
+        subscriber = DdsSubscriber(*self._endpoint(topic, kind, *qos, most), most)
         self._waitset.attach(subscriber.condition)
         return subscriber
 
     def types_of(self, topic: str) -> set[str]:
-        from cyclonedds.core import InstanceState, ReadCondition, SampleState, ViewState
-
-        mask = ViewState.Any | SampleState.Any | InstanceState.Alive
-        alive = ReadCondition(self._published, mask)
+        mask = core.ViewState.Any | core.SampleState.Any | core.InstanceState.Alive
+        alive = core.ReadCondition(self._published, mask)
         known = self._published.read(_MOST_ENDPOINTS, alive)
         here = [one for one in known if one.topic_name == "rt" + topic]
         return {ros_name(one.type_name) or one.type_name for one in here}
 
     def wait(self, timeout_s: float) -> None:
-        from cyclonedds.core import DDSException
-
         # Closed meanwhile by another thread: nothing will come.
-        with contextlib.suppress(DDSException):
+        with contextlib.suppress(core.DDSException):
             self._waitset.wait(max(0, int(timeout_s * 1e9)))
 
     def close(self) -> None:
@@ -126,142 +143,64 @@ class DdsBus:
             self._over.set(True)
             member._delete(member._ref)  # and with it all that it made
 
-    def _topic(self, topic: str, message_type: str) -> Any:
-        from cyclonedds.topic import Topic
-
-        return Topic(self._member, "rt" + topic, idl_type(message_type, self._messages.distro))
-
-    def _hash(self, message_type: str) -> bytes:
-        return f"typehash={self._messages.type_hash(message_type)};".encode()
-
-
-class DdsPublisher:
-    """See ``bus.Publisher``."""
-
-    wanted = True
-
-    def __init__(self, member: Any, topic: Any, user_data: bytes) -> None:
-        from cyclonedds.internal import DDS
-        from cyclonedds.pub import DataWriter
-        from cyclonedds.qos import Policy, Qos
-        from cyclonedds.topic import Sample
-
-        self._name = topic.name.removeprefix("rt")
-        self._writer = DataWriter(
-            member,
-            topic,
-            Qos(
-                Policy.Reliability.Reliable(_BLOCKED_NS),
-                Policy.Durability.Volatile,
-                Policy.History.KeepLast(1),
-                Policy.DataRepresentation(use_cdrv0_representation=True),
-                Policy.Userdata(user_data),
-            ),
-        )
-        self._sample = Sample
-        # By ctypes, and not by the extension module: that one keeps Python's lock while it waits
-        # for a slow subscriber.
-        self._write = DDS._dll_handle.dds_write
-        self._write.argtypes = [ctypes.c_int32, ctypes.POINTER(Sample)]
-        self._write.restype = ctypes.c_int32
-
-    def publish(self, raw: bytes | memoryview) -> None:
-        """
-        Raises:
-            TumortrackError: not sent: subscribers don't keep up, or these bytes are not what the
-                topic's type says.
-        """
-        padded = np.frombuffer(bytes(raw) + bytes(-len(raw) % 4), np.uint8)
-        sample = self._sample(padded.ctypes.data, padded.nbytes)
-        code = self._write(self._writer._ref, ctypes.byref(sample))
-        if code < 0:
-            raise TumortrackError(
-                f"{self._name}: a message of {len(raw)} bytes was not sent ({_error_text(code)})."
-            )
-
-    def flush(self, timeout_s: float) -> None:
-        # Not its public method: that one fails on a timeout (11.0.1).
-        self._writer._wait_for_acks(self._writer._ref, int(timeout_s * 1e9))
+    def _endpoint(
+        self, topic: str, kind: str, reliability: Any, durability: Any, most: int
+    ) -> tuple[Any, Any, Any]:
+        """Participant, topic and QoS of a reader or writer."""
+        user_data = f"typehash={self.messages.type_hash(kind)};".encode()
+        encoding = Policy.DataRepresentation(use_cdrv0_representation=True)
+        kept = Policy.History.KeepLast(most)
+        qos = Qos(reliability, durability, kept, encoding, Policy.Userdata(user_data))
+        return self._member, Topic(self._member, "rt" + topic, idl_type(kind)), qos
 
 
-class DdsSubscriber:
-    """See ``bus.Subscriber``."""
+class DdsSubscriber(Subscriber):
+    """It takes what came from Cyclone's own queue."""
 
-    def __init__(
-        self, member: Any, topic: Any, user_data: bytes, depth: int, latched: bool
-    ) -> None:
-        from cyclonedds.core import InstanceState, ReadCondition, SampleState, ViewState
-        from cyclonedds.qos import Policy, Qos
-        from cyclonedds.sub import DataReader
-
-        self._depth, self._lost = depth, 0
-        # Best effort and volatile ask for the least, and so match every publisher; what was
-        # published before comes only to who asks for it, reliably.
-        reliability = Policy.Reliability.Reliable(0) if latched else Policy.Reliability.BestEffort
-        durability = Policy.Durability.TransientLocal if latched else Policy.Durability.Volatile
-        self._reader = DataReader(
-            member,
-            topic,
-            Qos(
-                reliability,
-                durability,
-                Policy.History.KeepLast(depth),
-                Policy.DataRepresentation(use_cdrv0_representation=True),
-                Policy.Userdata(user_data),
-            ),
-        )
-        self.condition = ReadCondition(
-            self._reader, ViewState.Any | InstanceState.Any | SampleState.NotRead
-        )
+    def __init__(self, member: Any, topic: Any, qos: Any, most: int) -> None:
+        super().__init__(most)
+        self._reader = DataReader(member, topic, qos)
+        mask = core.ViewState.Any | core.InstanceState.Any | core.SampleState.NotRead
+        self.condition = core.ReadCondition(self._reader, mask)
 
     def take(self) -> list[bytes | memoryview]:
-        from cyclonedds._clayer import ddspy_take
-
-        taken = ddspy_take(self._reader._ref, self.condition.mask, self._depth)
+        # Asked for, not reported to a listener: that would make the thread that empties the socket
+        # wait for Python's lock. Once closed it is 0.
+        status = dds_c_t.sample_lost_status()
+        DDS._dll_handle.dds_get_sample_lost_status(self._reader._ref, ctypes.byref(status))
+        self.lost = max(self.lost, int(status.total_count))
+        taken = ddspy_take(self._reader._ref, self.condition.mask, self.pending.maxlen)
         if isinstance(taken, int):  # an error: closed meanwhile by another thread
             return []
         return [data for data, info in taken if info.valid_data]
 
-    @property
-    def lost(self) -> int:
-        """Asked for, not reported to a listener: that would make the thread that empties the
-        socket wait for Python's lock."""
-        from cyclonedds.internal import DDS, dds_c_t
 
-        status = dds_c_t.sample_lost_status()
-        DDS._dll_handle.dds_get_sample_lost_status(self._reader._ref, ctypes.byref(status))
-        self._lost = max(self._lost, int(status.total_count))  # once closed it would be 0
-        return self._lost
-
-
-def _set_up(domain_id: int) -> None:
-    from cyclonedds.domain import Domain
-
-    with _setting_up:
-        if domain_id not in _domains:
-            parts = (_TUNING, _LOCAL if _local_only() else "", os.environ.get("CYCLONEDDS_URI", ""))
-            _domains[domain_id] = Domain(domain_id, ",".join(filter(None, parts)))
+def domain_id() -> int:
+    """The ROS domain, from the environment; InputError unless it is a whole number in 0..232."""
+    text = os.environ.get("ROS_DOMAIN_ID", "").strip() or "0"
+    if not (text.isdecimal() and text.isascii() and int(text) <= _LARGEST_DOMAIN):
+        raise InputError(
+            f"ROS_DOMAIN_ID is {text!r}; it must be a whole number in 0..{_LARGEST_DOMAIN}."
+        )
+    return int(text)
 
 
-def _local_only() -> bool:
-    """Whether the environment keeps ROS 2 on this machine, as its own nodes read it.
-
-    Raises:
-        InputError: it says that nothing shall be found.
-    """
+def _set_up(domain: int) -> None:
     reach = os.environ.get("ROS_AUTOMATIC_DISCOVERY_RANGE", "").upper()
     if reach == "OFF":
         raise InputError(
             "ROS_AUTOMATIC_DISCOVERY_RANGE is OFF: no topic would ever be found. Allowed here: "
             "LOCALHOST, SUBNET, SYSTEM_DEFAULT, or not set."
         )
-    return os.environ.get("ROS_LOCALHOST_ONLY") == "1" or reach == "LOCALHOST"
+    local = os.environ.get("ROS_LOCALHOST_ONLY") == "1" or reach == "LOCALHOST"
+    with _setting_up:
+        if domain not in _domains:
+            parts = (_TUNING, _LOCAL if local else "", os.environ.get("CYCLONEDDS_URI", ""))
+            _domains[domain] = Domain(domain, ",".join(filter(None, parts)))
 
 
 def _error_text(code: int) -> str:
-    from cyclonedds.core import DDSException
-
-    _, text = DDSException.error_message_mapping.get(code, ("", f"error {code}"))
+    _, text = core.DDSException.error_message_mapping.get(code, ("", f"error {code}"))
     return text.strip(" .").lower()
 
 
@@ -273,46 +212,26 @@ def dds_name(message_type: str) -> str:
 
 def ros_name(type_name: str) -> str:
     """The way back; empty for a type that is none of ROS."""
-    parts = type_name.split("::")
-    if len(parts) != 4 or parts[2] != "dds_" or not parts[3].endswith("_"):
-        return ""
-    return f"{parts[0]}/{parts[1]}/{parts[3][:-1]}"
+    parts = re.fullmatch(r"(\w+)::(\w+)::dds_::(\w+)_", type_name)
+    return "/".join(parts.groups()) if parts else ""
 
 
 @cache
-def idl_type(message_type: str, distro: str) -> Any:
+def idl_type(message_type: str) -> Any:
     """The type as a cyclonedds ``IdlStruct``; final, no key, as ROS 2 makes it. By it Cyclone
-    checks that bytes from the network are what their type says, lengths included.
-
-    Raises:
-        InputError: no such type in that distribution, or one with wide characters.
-    """
-    from cyclonedds.idl import make_idl_struct
-    from rosbags.typesys import Stores, get_typestore
-
-    fields = get_typestore(Stores[f"ROS2_{distro.upper()}"]).fielddefs.get(message_type)
-    if fields is None:
-        raise InputError(f"ROS 2 {distro} has no message type {message_type}.")
-    members = {name: _member(kind, distro) for name, kind in fields[1]}
+    checks that bytes from the network are what their type says, lengths included."""
+    members = {name: _member(kind) for name, kind in Messages().fields(message_type)}
     name = message_type.rsplit("/", 1)[-1]
     return make_idl_struct(f"{name}_", dds_name(message_type), members)
 
 
-def _member(kind: Any, distro: str) -> Any:
-    from cyclonedds.idl import types
-    from rosbags.interfaces import Nodetype
-
+def _member(kind: Any) -> Any:
     node, content = kind
     if node == Nodetype.NAME:
-        return idl_type(content, distro)
+        return idl_type(content)
     if node == Nodetype.BASE:
-        name = {"char": "uint8", "byte": "uint8", "octet": "uint8"}.get(content[0], content[0])
-        if name in _NUMBERS:
-            return getattr(types, name)
-        if name in ("string", "bool"):
-            return str if name == "string" else bool
-        raise InputError(f"messages with fields of type {name} are not supported.")
+        return _OTHER_TYPES.get(content[0]) or getattr(types, content[0])
     inner, length = content
     if node == Nodetype.ARRAY:
-        return types.array(_member(inner, distro), length)
-    return types.sequence(_member(inner, distro))
+        return types.array(_member(inner), length)
+    return types.sequence(_member(inner))

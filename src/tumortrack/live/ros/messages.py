@@ -1,5 +1,4 @@
-"""Messages of one ROS distribution, made from field names, and their bytes: CDR for ROS 2, ROS 1's
-own format for ROS 1.
+"""Messages of ROS 1 or 2, made from field names, and their bytes: CDR in ROS 2, its own form in 1.
 
 Types come from rosbags, a pure Python library that needs no ROS. ROS 1 has the same types by
 shorter names: ``sensor_msgs/msg/Image`` here is its ``sensor_msgs/Image``.
@@ -8,27 +7,21 @@ shorter names: ``sensor_msgs/msg/Image`` here is its ``sensor_msgs/Image``.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from functools import cache
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Float64
+from jaxtyping import Float64
 
-from tumortrack.core.colours import Colour
 from tumortrack.core.errors import InputError
 
-Distro = Literal["noetic", "foxy", "galactic", "humble", "iron", "jazzy", "kilted", "lyrical"]
+Distro = Literal["noetic", "humble"]
 
 MM_PER_M = 1000
-MARKERS = "visualization_msgs/msg/MarkerArray"
-ADD, DELETE, DELETE_ALL = 0, 2, 3  # Marker's actions
-LINE, TEXT, TRIANGLES = 4, 9, 11  # and types
-# Markers vanish if nothing follows, so that a stopped loop leaves nothing that looks current.
-MARKER_LIFETIME_S = 2
-
 _POINT = "geometry_msgs/msg/Point"
 _LATEST_S = 2**31 - 1  # ROS counts seconds in 32 bits, ROS 2 with a sign
+_ZEROS = bytes(4096)  # in ROS 1's form any message, with nothing in it
 
 
 class Outgoing(NamedTuple):
@@ -39,12 +32,9 @@ class Outgoing(NamedTuple):
     message: Any
 
 
-class PointBlock(Sequence[Any]):
-    """Points of a marker as one array, written in one piece.
-
-    It replaces a list of point messages: tens of thousands of objects would take a tenth of a
-    second to write. Iterating over it gives the array itself, once; an index gives a point.
-    """
+class PointBlock:
+    """Points of a marker as one array, its only element, written in one piece: a list of tens of
+    thousands of point messages would take a tenth of a second to write."""
 
     def __init__(self, points: Float64[np.ndarray, "n 3"]) -> None:
         self.array = np.ascontiguousarray(points, "<f8")
@@ -52,81 +42,50 @@ class PointBlock(Sequence[Any]):
     def __len__(self) -> int:
         return len(self.array)
 
-    def __getitem__(self, index: Any) -> Any:
-        return self.array[index]
-
     def __iter__(self) -> Iterator[np.ndarray]:
         return iter((self.array,) if len(self.array) else ())
 
 
 class Messages:
-    """The message types of one distribution."""
+    """The message types of one distribution; ROS 2's are the same from Humble to Lyrical."""
 
     def __init__(self, distro: Distro = "humble") -> None:
-        if distro not in get_args(Distro):
-            raise InputError(
-                f"ROS distribution {distro!r} is not known; allowed: {', '.join(get_args(Distro))}."
-            )
-        self.distro = distro
-        self.is_ros1 = distro == "noetic"
+        self._is_ros1 = distro == "noetic"
         self._store = _store(distro)
 
     def make(self, message_type: str, **values: Any) -> Any:
         """A message: fields by name, the others empty (0, "", no elements). A dictionary stands for
-        a message inside it, a list of dictionaries for several.
+        a message inside it, a list of dictionaries for several. Letters' case does not count: ROS 1
+        writes ``K`` where ROS 2 writes ``k``."""
+        about = self._store.get_msgdef(message_type)
+        message, _ = about.deserialize_ros1(_ZEROS, 0, about.cls, self._store)
+        fields = {name.lower(): (name, kind) for name, kind in about.fields}
+        for given, value in values.items():
+            if given.lower() not in fields:
+                raise TypeError(f"{message_type} has no field {given}")
+            name, (_, inner) = fields[given.lower()]
+            if isinstance(value, dict):
+                value = self.make(inner, **value)
+            elif isinstance(value, list):
+                of = inner[0][1]
+                value = [self.make(of, **one) if isinstance(one, dict) else one for one in value]
+            setattr(message, name, value)
+        return message
 
-        Letters' case does not count: ROS 1 writes ``K`` where ROS 2 writes ``k``.
-        """
-        given = {name.lower(): value for name, value in values.items()}
-        fields = {}
-        for name, kind in self._store.fielddefs[message_type][1]:
-            known = name.lower() in given
-            fields[name] = self._value(kind, given.pop(name.lower()) if known else None)
-        if given:
-            raise TypeError(f"{message_type} has no field {', '.join(given)}")
-        return self._store.types[message_type](**fields)
-
-    def _value(self, kind: Any, value: Any) -> Any:
-        if value is None:
-            return self._empty(kind)
-        if isinstance(value, dict):
-            return self.make(kind[1], **value)
-        if isinstance(value, list):
-            inner = kind[1][0][1]
-            return [self.make(inner, **one) if isinstance(one, dict) else one for one in value]
-        return value
-
-    def _empty(self, kind: Any) -> Any:
-        from rosbags.interfaces import Nodetype
-
-        node, content = kind
-        if node == Nodetype.NAME:
-            return self.make(content)
-        if node == Nodetype.BASE:
-            return {"string": "", "bool": False}.get(content[0], 0)
-        (inner, what), length = content
-        if inner == Nodetype.NAME or what[0] == "string":
-            filled = length if node == Nodetype.ARRAY else 0
-            return [self._empty((inner, what)) for _ in range(filled)]
-        dtype = {"char": "uint8", "byte": "uint8"}.get(what[0], what[0])
-        return np.zeros(length if node == Nodetype.ARRAY else 0, dtype)
+    def fields(self, message_type: str) -> list[tuple[str, Any]]:
+        """Names and kinds of a type's fields, as rosbags says them."""
+        return self._store.fielddefs[message_type][1]
 
     def to_bytes(self, message: Any) -> memoryview:
         """What goes over the wire: CDR with its header in ROS 2, ROS 1's form in Noetic."""
-        name = message.__msgtype__
-        if self.is_ros1:
-            return self._store.serialize_ros1(message, name)
-        return self._store.serialize_cdr(message, name)
+        write = self._store.serialize_ros1 if self._is_ros1 else self._store.serialize_cdr
+        return write(message, message.__msgtype__)
 
     def from_bytes(self, data: bytes | memoryview, message_type: str) -> Any:
-        """The message that these bytes are.
-
-        Raises:
-            InputError: they are no such message.
-        """
+        """The message that these bytes are; InputError if they are none of that type."""
         from rosbags.serde import SerdeError
 
-        read = self._store.deserialize_ros1 if self.is_ros1 else self._store.deserialize_cdr
+        read = self._store.deserialize_ros1 if self._is_ros1 else self._store.deserialize_cdr
         try:
             return read(data, message_type)
         except KeyError as error:
@@ -137,23 +96,17 @@ class Messages:
                 "receiver of the same ROS distribution?"
             ) from error
 
-    def definition(self, message_type: str) -> str:
-        """The type in ROS's own words, with the types that it is made of."""
-        return self._store.generate_msgdef(message_type, ros_version=1 if self.is_ros1 else 2)[0]
-
-    def md5(self, message_type: str) -> str:
-        """By which ROS 1 knows the type."""
-        return self._store.generate_msgdef(message_type)[1]
+    def definition(self, message_type: str) -> tuple[str, str]:
+        """The type in ROS's own words, with the types that it is made of; and the sum by which
+        ROS 1 knows it."""
+        return self._store.generate_msgdef(message_type, ros_version=1 if self._is_ros1 else 2)
 
     def type_hash(self, message_type: str) -> str:
         """By which ROS 2 knows the type: ``RIHS01_...`` (REP 2011)."""
         return self._store.hash_rihs01(message_type)
 
     def header(self, stamp_ns: int, frame_id: str) -> Any:
-        """
-        Raises:
-            InputError: before 1970 or after 2038, which ROS's 32 bits of seconds can't say.
-        """
+        """Raises InputError before 1970 or after 2038, which 32 bits of seconds can't say."""
         seconds, nanoseconds = divmod(int(stamp_ns), 1_000_000_000)
         if not 0 <= seconds <= _LATEST_S:
             raise InputError(
@@ -163,77 +116,10 @@ class Messages:
         stamp = {"sec": seconds, "nanosec": nanoseconds}
         return self.make("std_msgs/msg/Header", stamp=stamp, frame_id=frame_id)
 
-    def markers(self, markers: list[dict[str, Any]]) -> Any:
-        """A MarkerArray; see ``marker``."""
-        return self.make(MARKERS, markers=markers)
-
-    def diagnostic(
-        self, level: int, name: str, message: str, id: str, values: dict[str, Any]
-    ) -> Any:
-        """A DiagnosticStatus with its values as text."""
-        return self.make(
-            "diagnostic_msgs/msg/DiagnosticStatus",
-            level=level,
-            name=name,
-            message=message,
-            hardware_id=id,
-            values=[{"key": key, "value": str(value)} for key, value in values.items()],
-        )
-
-
-def marker(header: Any, **values: Any) -> dict[str, Any]:
-    """A Marker's fields."""
-    return {"header": header, "lifetime": {"sec": MARKER_LIFETIME_S}, **values}
-
-
-def text_marker(
-    header: Any, ns: str, text: str, place_mm: np.ndarray, height_m: float, colour: Colour
-) -> dict[str, Any]:
-    """A Marker of text that faces the viewer."""
-    return marker(
-        header,
-        ns=ns,
-        type=TEXT,
-        action=ADD,
-        pose=pose(place_mm),
-        scale={"z": height_m},
-        color=rgba(colour),
-        text=text,
-    )
-
-
-def triangles_marker(
-    header: Any, ns: str, corners_mm: np.ndarray, at: dict[str, Any], colour: Colour, opacity: float
-) -> dict[str, Any]:
-    """A Marker of triangles, three corners each, at a pose."""
-    return marker(
-        header,
-        ns=ns,
-        type=TRIANGLES,
-        action=ADD,
-        pose=at,
-        scale=xyz((1.0, 1.0, 1.0)),
-        color=rgba(colour, opacity),
-        points=PointBlock(corners_mm / MM_PER_M),
-    )
-
-
-def pose(
-    place_mm: Float[np.ndarray, " 3"], wxyz: Float[np.ndarray, " 4"] | None = None
-) -> dict[str, Any]:
-    """A Pose's fields; without a quaternion not turned."""
-    turn = {"w": 1.0} if wxyz is None else dict(zip("wxyz", wxyz.tolist(), strict=True))
-    return {"position": xyz(place_mm / MM_PER_M), "orientation": turn}
-
 
 def xyz(numbers: Iterable[float]) -> dict[str, Any]:
     """The fields of a Point or a Vector3."""
     return dict(zip("xyz", map(float, numbers), strict=True))
-
-
-def rgba(colour: Colour, opacity: float = 1.0) -> dict[str, Any]:
-    """A ColorRGBA's fields."""
-    return {**dict(zip("rgb", (value / 255 for value in colour), strict=True)), "a": opacity}
 
 
 def stamp_of(header: Any) -> int:
@@ -250,12 +136,11 @@ def _store(distro: Distro) -> Any:
         raise InputError(
             "ROS messages need the package rosbags: pip install 'tumortrack[live]'."
         ) from error
-    name = "ROS1_NOETIC" if distro == "noetic" else f"ROS2_{distro.upper()}"
-    store = get_typestore(Stores[name])
+    store = get_typestore(Stores.ROS1_NOETIC if distro == "noetic" else Stores.ROS2_HUMBLE)
     known = store.get_msgdef(_POINT)
 
     def size(pos: int, point: Any, _store: Any) -> int:
-        return pos + (point.nbytes if isinstance(point, np.ndarray) else 24)
+        return pos + getattr(point, "nbytes", 24)
 
     def writer(write_one: Any) -> Any:
         def write(raw: memoryview, pos: int, point: Any, store: Any) -> int:

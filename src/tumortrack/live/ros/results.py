@@ -1,4 +1,4 @@
-"""What is published over ROS of a tracking result. Millimetres in, metres out.
+"""What is published over ROS of a tracking result. Millimetres in, metres and radians out.
 
 Every message has the result's stamp and frame. Without an estimate each topic says so: an empty
 cloud, deleted markers, places that are NaN, a diagnostic with the reason.
@@ -9,81 +9,183 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float32
 
 from tumortrack.core.colours import GOOD, NONE, POOR, Colour, label_colours, part_colour
 from tumortrack.core.geometry import transform_points
-from tumortrack.live.ros.messages import (
-    DELETE,
-    DELETE_ALL,
-    MARKERS,
-    MM_PER_M,
-    Messages,
-    Outgoing,
-    marker,
-    pose,
-    text_marker,
-    triangles_marker,
-    xyz,
-)
-from tumortrack.live.ros.sensors import CLOUD, FLOAT32, UINT8, cloud_message
-from tumortrack.live.ros.workcell import WorkcellMessages
-from tumortrack.live.values import Quality, TrackingResult, TransformedEstimate
+from tumortrack.core.types import Mesh, SensorCloud
+from tumortrack.live.display import MOST_SEEN, seen_points, thinned, wxyz_of
+from tumortrack.live.meter import Rate
+from tumortrack.live.ros.messages import MM_PER_M, Messages, Outgoing, PointBlock, xyz
+from tumortrack.live.ros.sensors import CLOUD, cloud_message, plain_cloud
+from tumortrack.live.values import SinkContext, TrackingResult, TransformedEstimate, Workcell
 
+MARKERS = "visualization_msgs/msg/MarkerArray"
 DIAGNOSTICS = "diagnostic_msgs/msg/DiagnosticArray"
 PLACE = "geometry_msgs/msg/PointStamped"
+JOINTS = "sensor_msgs/msg/JointState"
 
-_LEVELS = {"good": 0, "poor": 1, "none": 2}  # DiagnosticStatus: OK, WARN, ERROR
-_TEXT_COLOURS: dict[Quality, Colour] = {"good": GOOD, "poor": POOR, "none": NONE}
+_STATE = "state"  # the namespace of the arms' text
+_DELETE, _DELETE_ALL = 2, 3  # Marker's actions
+_LINE, _TEXT, _TRIANGLES = 4, 9, 11  # and types
+# Markers vanish if nothing follows, so that a stopped loop leaves nothing that looks current.
+_LIFETIME_S = 2
+_OK, _WARN, _ERROR, _STALE = range(4)  # DiagnosticStatus
+_LEVELS = {"good": _OK, "poor": _WARN, "none": _ERROR}
+_TEXT_COLOURS = {"good": GOOD, "poor": POOR, "none": NONE}
+_STATE_COLOUR: Colour = (235, 238, 242)
 _KIDNEY_OPACITY = 0.35
-_TEXT_HEIGHT_M = 0.008
+_TEXT_HEIGHT_M, _STATE_HEIGHT_M = 0.008, 0.04
+_STATE_ABOVE_MM = 60.0
+_ORIGIN = np.zeros(3)
 
 _POINT = np.dtype(
-    {
-        "names": ["x", "y", "z", "label", "probability", "rgb"],
-        "formats": ["<f4", "<f4", "<f4", "u1", "<f4", "<u4"],
-        "offsets": [0, 4, 8, 12, 16, 20],  # rising: ROS 1's reader goes by them, not by the list
-        "itemsize": 24,
-    }
+    [(name, "<f4") for name in "xyz"] + [("label", "u1"), ("probability", "<f4"), ("rgb", "<u4")],
+    align=True,
 )
 
 
-def messages_of(
-    result: TrackingResult,
-    messages: Messages,
-    parts: tuple[str, ...] = (),
-    meshes: bool = True,
-    workcell: WorkcellMessages | None = None,
-) -> list[Outgoing]:
-    """What is published of one result.
+class ResultMessages:
+    """The messages of one publisher. It remembers what it showed of the arms, so that what is gone
+    is deleted.
 
-    ``cloud`` (PointCloud2: x, y, z, label, probability, rgb), ``meshes`` (MarkerArray: a list of
-    triangles per part and a text), ``diagnostics``, and for each of ``parts`` ``PART/center``
-    (PointStamped: centre of its box; NaN where it was not found). With ``workcell`` also what arms
-    do: see ``WorkcellMessages.outgoing``.
-
-    Args:
-        parts: the model's parts, kidney first; those that were not found are deleted.
-        meshes: False leaves the triangles out, where meshes are sent at a lower rate; without an
-            estimate, their deletion is sent all the same.
-        workcell: where results may have a workcell, the memory of what was shown of it.
-
-    Raises:
-        InputError: a stamp that ROS can't say.
+    ``hz``: triangles, arms' markers and observed points at most so often (0: with every result);
+    without ``observed`` those points are left out.
     """
-    header = messages.header(result.stamp_ns, result.published_frame.frame_id)
-    estimate = result.transformed
-    names = parts or tuple(estimate.meshes if estimate else ())
-    markers = messages.markers(_markers(result, names, header, meshes))
-    return [
-        Outgoing("cloud", CLOUD, _labelled_cloud(estimate, header, messages)),
-        Outgoing("meshes", MARKERS, markers),
-        *(
-            Outgoing(f"{name}/center", PLACE, _center(result, name, header, messages))
-            for name in names
-        ),
-        Outgoing("diagnostics", DIAGNOSTICS, _diagnostics(result, header, messages, workcell)),
-        *(workcell.outgoing(result, header) if workcell is not None else ()),
-    ]
+
+    def __init__(
+        self, messages: Messages, context: SinkContext, hz: float = 0.0, observed: bool = True
+    ) -> None:
+        self._messages, self._context, self._observed = messages, context, observed
+        self._meshes_rate, self._markers_rate, self._points_rate = Rate(hz), Rate(hz), Rate(hz)
+        self._shown: set[str] = set()
+        self._shown_state: tuple[str, bool] | None = None
+
+    def of(self, result: TrackingResult) -> list[Outgoing]:
+        """What is published of one result; docs/ros.md says it topic by topic. Nothing is sent on
+        /tf, so a camera's own cloud could not be shown beside what it saw (``observed``). Raises
+        InputError for a stamp that ROS can't say."""
+        header = self._messages.header(result.stamp_ns, result.published_frame.frame_id)
+        out: list[Outgoing] = []
+
+        def send(suffix: str, message_type: str, **values: Any) -> None:
+            message = self._messages.make(message_type, **values)
+            out.append(Outgoing(suffix, message_type, message))
+
+        def send_markers(suffix: str, markers: list[dict[str, Any]]) -> None:
+            always = {"header": header, "lifetime": {"sec": _LIFETIME_S}}
+            send(suffix, MARKERS, markers=[always | marker for marker in markers])
+
+        cloud = _labelled_cloud(result.transformed, header, self._messages)
+        out.append(Outgoing("cloud", CLOUD, cloud))
+        send_markers("meshes", self._organ(result))
+        for name in self._context.parts:
+            center_mm = result.center_mm(name)
+            metres = np.full(3, np.nan) if center_mm is None else center_mm / MM_PER_M
+            send(f"{name}/center", PLACE, header=header, point=xyz(metres))
+        arms = [_arms_status(result)] if self._context.arms else []
+        send("diagnostics", DIAGNOSTICS, header=header, status=[_estimate_status(result), *arms])
+        if not self._context.arms:
+            return out
+        joints = {} if result.workcell is None else result.workcell.joints_rad
+        angles = np.array(list(joints.values()), np.float64)
+        send("joint_states", JOINTS, header=header, name=list(joints), position=angles)
+        if (markers := self._workcell(result)) is not None:
+            send_markers("workcell", markers)
+        if self._observed and (points := self._points(result)) is not None:
+            seen = plain_cloud(SensorCloud(points, result.stamp_ns), header, self._messages)
+            out.append(Outgoing("observed", CLOUD, seen))
+        return out
+
+    def _organ(self, result: TrackingResult) -> list[dict[str, Any]]:
+        """Triangles per part and a text of their quality; everything deleted without estimate."""
+        estimate = result.transformed
+        markers: list[dict[str, Any]] = []
+        if estimate is None:
+            markers.append({"action": _DELETE_ALL})
+        elif self._meshes_rate.due():
+            for label, name in enumerate(self._context.parts, start=1):
+                if (mesh := estimate.meshes.get(name)) is None:
+                    markers.append({"ns": name, "action": _DELETE})
+                else:
+                    opacity = _KIDNEY_OPACITY if label == 1 else 1.0
+                    markers.append(_triangles(name, mesh, part_colour(label), opacity))
+        if estimate is not None or result.workcell is None:  # else the workcell's text says it
+            markers.append(_quality_text(result))
+        return markers
+
+    def _workcell(self, result: TrackingResult) -> list[dict[str, Any]] | None:
+        """All of its markers or, if they are not due, None: a slow receiver keeps the newest
+        message alone, so each must be whole."""
+        cell = result.workcell
+        if cell is None:
+            self._shown, self._shown_state = set(), None
+            return [{"action": _DELETE_ALL}]
+        names = {_STATE, *(s.name for s in cell.shapes), *(line.name for line in cell.drawn_lines)}
+        gone, self._shown = self._shown - names, names
+        state = cell.state, bool(cell.halted)  # why may change with each frame
+        changed, self._shown_state = gone or state != self._shown_state, state
+        if not self._markers_rate.due() and not changed:
+            return None
+        markers: list[dict[str, Any]] = [{"ns": name, "action": _DELETE} for name in sorted(gone)]
+        turns = [shape.published_from_shape[:3, :3] for shape in cell.shapes]
+        quaternions = wxyz_of(np.array(turns)) if turns else ()  # all at once: 5 times quicker
+        for shape, wxyz in zip(cell.shapes, quaternions, strict=True):
+            marker = _triangles(shape.name, shape.mesh, shape.colour, shape.opacity)
+            place_m = shape.published_from_shape[:3, 3] / MM_PER_M
+            orientation = dict(zip("wxyz", wxyz.tolist(), strict=True))
+            markers.append(
+                marker | {"pose": {"position": xyz(place_m), "orientation": orientation}}
+            )
+        for line in cell.drawn_lines:
+            scale, points = {"x": line.width_mm / MM_PER_M}, PointBlock(line.points_mm / MM_PER_M)
+            markers.append(_drawn(line.name, _LINE, line.colour, scale=scale, points=points))
+        return [*markers, _state_text(result, cell)]
+
+    def _points(self, result: TrackingResult) -> Float32[np.ndarray, "n 3"] | None:
+        """What the camera saw, published frame; None: they are not due."""
+        points_mm = np.zeros((0, 3), np.float32)
+        if result.observation is not None:
+            if not self._points_rate.due():
+                return None
+            points_mm = thinned(seen_points(result.observation), MOST_SEEN)
+            points_mm = transform_points(result.published_frame.published_from_camera, points_mm)
+        return points_mm
+
+
+def _estimate_status(result: TrackingResult) -> dict[str, Any]:
+    values: dict[str, Any] = {
+        "quality": result.quality,
+        "sequence": result.sequence,
+        "stamp_ns": result.stamp_ns,
+        "points": 0 if result.organ is None else len(result.organ.points_mm),
+    }
+    if result.latency_ms is not None:
+        values["latency_ms"] = f"{result.latency_ms:.3f}"
+    values |= {f"{stage}_ms": f"{1000 * s:.3f}" for stage, s in result.seconds.items()}
+    return _status(_LEVELS[result.quality], "estimate", result.describe(), result, values)
+
+
+def _arms_status(result: TrackingResult) -> dict[str, Any]:
+    """OK with the state, WARN where the arms are halted, STALE without a workcell."""
+    cell = result.workcell
+    if cell is None:
+        return _status(_STALE, "arms", "nothing is known of the arms", result, {})
+    values = {"state": cell.state, "halted": cell.halted}
+    return _status(_WARN if cell.halted else _OK, "arms", _describe(cell), result, values)
+
+
+def _status(
+    level: int, what: str, text: str, result: TrackingResult, values: dict[str, Any]
+) -> dict[str, Any]:
+    """A DiagnosticStatus with its values as text."""
+    return {
+        "level": level,
+        "name": f"tumortrack: {what}",
+        "message": text,
+        "hardware_id": result.published_frame.frame_id,
+        "values": [{"key": key, "value": str(value)} for key, value in values.items()],
+    }
 
 
 def _labelled_cloud(estimate: TransformedEstimate | None, header: Any, messages: Messages) -> Any:
@@ -94,69 +196,51 @@ def _labelled_cloud(estimate: TransformedEstimate | None, header: Any, messages:
         table["label"], table["probability"] = estimate.labels, estimate.probability
         red, green, blue = label_colours(estimate.labels).T.astype(np.uint32)
         table["rgb"] = red << 16 | green << 8 | blue  # PCL's packing
-    fields = [
-        (name, place[1], UINT8 if place[0] == np.uint8 else FLOAT32)
-        for name, place in _POINT.fields.items()  # type: ignore[union-attr]
-    ]
-    return cloud_message(table, fields, header, messages)
+    return cloud_message(table, header, messages)
 
 
-def _markers(
-    result: TrackingResult, names: tuple[str, ...], header: Any, meshes: bool
-) -> list[dict[str, Any]]:
-    """Triangles per part and a text about their quality; everything deleted without estimate."""
-    estimate, markers = result.transformed, []
-    if estimate is None:
-        markers.append(marker(header, action=DELETE_ALL))
-    elif meshes:
-        for label, name in enumerate(names, start=1):
-            if (mesh := estimate.meshes.get(name)) is None:
-                markers.append(marker(header, ns=name, action=DELETE))
-                continue
-            corners_mm = mesh.vertices_mm[mesh.faces.ravel()]
-            colour, opacity = part_colour(label), _KIDNEY_OPACITY if label == 1 else 1.0
-            at = pose(np.zeros(3))
-            markers.append(triangles_marker(header, name, corners_mm, at, colour, opacity))
-    if estimate is not None or result.workcell is None:  # else the workcell's text says it
-        markers.append(_quality_text(result, header))
-    return markers
-
-
-def _quality_text(result: TrackingResult, header: Any) -> dict[str, Any]:
+def _quality_text(result: TrackingResult) -> dict[str, Any]:
     """Above the organ, as the camera sees it; without one, in front of the camera."""
     above_mm = np.array([[0.0, 0.0, 150.0]])
     if result.estimate is not None and (organ := result.estimate.meshes.get("kidney")):
         low, high = organ.box_mm
         above_mm = np.array([[(low + high)[0] / 2, low[1] - 8.0, (low + high)[2] / 2]])
     place_mm = transform_points(result.published_frame.published_from_camera, above_mm)[0]
-    colour = _TEXT_COLOURS[result.quality]
-    return text_marker(header, "quality", result.describe(), place_mm, _TEXT_HEIGHT_M, colour)
+    look = {"text": result.describe(), "scale": {"z": _TEXT_HEIGHT_M}}
+    return _drawn("quality", _TEXT, _TEXT_COLOURS[result.quality], place_mm, **look)
 
 
-def _center(result: TrackingResult, name: str, header: Any, messages: Messages) -> Any:
-    center_mm = result.center_mm(name)
-    metres = np.full(3, np.nan) if center_mm is None else center_mm / MM_PER_M
-    return messages.make(PLACE, header=header, point=xyz(metres))
+def _state_text(result: TrackingResult, cell: Workcell) -> dict[str, Any]:
+    """Above everything: where arms are, z is up."""
+    said = _describe(cell)
+    if result.estimate is None:
+        said += f"\n{result.describe()}"
+    box_mm, lines_mm = cell.box_mm, [line.points_mm for line in cell.drawn_lines]
+    spots = lines_mm if box_mm is None else [box_mm, *lines_mm]
+    corners = np.concatenate(spots) if spots else np.zeros((1, 3))
+    place_mm = (corners.min(0) + corners.max(0)) / 2
+    place_mm[2] = corners[:, 2].max() + _STATE_ABOVE_MM
+    colour, scale = NONE if cell.halted else _STATE_COLOUR, {"z": _STATE_HEIGHT_M}
+    return _drawn(_STATE, _TEXT, colour, place_mm, text=said, scale=scale)
 
 
-def _diagnostics(
-    result: TrackingResult, header: Any, messages: Messages, workcell: WorkcellMessages | None
-) -> Any:
-    values: dict[str, Any] = {
-        "quality": result.quality,
-        "sequence": result.sequence,
-        "stamp_ns": result.stamp_ns,
-        "points": 0 if result.organ is None else len(result.organ.points_mm),
-    }
-    if result.latency_ms is not None:
-        values["latency_ms"] = f"{result.latency_ms:.3f}"
-    values |= {f"{stage}_ms": f"{1000 * s:.3f}" for stage, s in result.seconds.items()}
-    status = messages.diagnostic(
-        _LEVELS[result.quality],
-        "tumortrack: estimate",
-        result.describe(),
-        result.published_frame.frame_id,
-        values,
-    )
-    statuses = [status] if workcell is None else [status, workcell.status(result)]
-    return messages.make(DIAGNOSTICS, header=header, status=statuses)
+def _describe(cell: Workcell) -> str:
+    """The state, and why the arms stand still."""
+    return f"{cell.state}, halted: {cell.halted}" if cell.halted else cell.state
+
+
+def _triangles(ns: str, mesh: Mesh, colour: Colour, opacity: float) -> dict[str, Any]:
+    """A Marker of a mesh where it is: three corners each triangle."""
+    points = PointBlock(mesh.vertices_mm[mesh.faces.ravel()] / MM_PER_M)
+    marker = _drawn(ns, _TRIANGLES, colour, scale=xyz((1, 1, 1)), points=points)
+    marker["color"]["a"] = opacity
+    return marker
+
+
+def _drawn(
+    ns: str, kind: int, colour: Colour, place_mm: np.ndarray = _ORIGIN, **more: Any
+) -> dict[str, Any]:
+    """What every Marker that shows something has, and ``more``."""
+    rgb = dict(zip("rgb", (value / 255 for value in colour), strict=True))
+    pose = {"position": xyz(place_mm / MM_PER_M), "orientation": {"w": 1.0}}
+    return {"ns": ns, "type": kind, "pose": pose, "color": {**rgb, "a": 1.0}, **more}

@@ -10,33 +10,31 @@ from __future__ import annotations
 import importlib
 import logging
 import os
-import re
 import sys
 import threading
 import time
 import xmlrpc.client
-from collections import deque
+from contextlib import suppress
 from functools import cache
 from http.client import HTTPConnection, HTTPException
 from types import ModuleType
-from typing import Any
+from typing import Any, NamedTuple
 from urllib.parse import urlsplit
 
 from tumortrack.core.errors import InputError
+from tumortrack.live.ros.bus import Publisher, Subscriber
 from tumortrack.live.ros.messages import Messages
 from tumortrack.live.values import SourceLost
 
 _DEBIAN = "/usr/lib/python3/dist-packages"
 _DEBIAN_PYTHON = "/usr/bin/python3"
-_NAME = re.compile(r"[/~]?[A-Za-z]\w*(/[A-Za-z]\w*)*", re.ASCII)
 _ANSWER_S = 1.0  # a master answers within milliseconds
 _BUFFER = 2**21  # bytes taken from the socket at once: a cloud in one go
 _SUCCESS = 1  # https://wiki.ros.org/ROS/Master_Slave_APIs
-
-_ANY = "*/msg/"  # the type of a topic that so far is only subscribed to
+_ANY = "*"  # the type of a topic that so far is only subscribed to
 
 _starting = threading.Lock()
-_node: Node | None = None
+_joined = ""  # the master at which this process is a node
 
 
 class MasterLost(SourceLost):
@@ -44,14 +42,9 @@ class MasterLost(SourceLost):
 
 
 def rospy_module() -> ModuleType:
-    """rospy: as the ROS environment gives it, or else as Debian installs it.
-
-    Debian's folder goes to the end of ``sys.path``, so that whatever is installed here keeps
-    precedence over Debian's older numpy.
-
-    Raises:
-        InputError: there is none that this Python can import.
-    """
+    """rospy: as the ROS environment gives it, or else as Debian installs it: its folder goes to
+    the end of ``sys.path``, so that what is installed here precedes Debian's older numpy. Raises
+    InputError if there is none that this Python can import."""
     logger_class = logging.getLoggerClass()
     try:
         try:
@@ -60,58 +53,36 @@ def rospy_module() -> ModuleType:
             _append_debian()
             return importlib.import_module("rospy")
     except ImportError as error:
-        raise InputError(_how_to_get(str(error))) from error
+        raise InputError(
+            f"ROS 1 needs rospy, which cannot be imported ({error}). On Debian 12: apt install "
+            "python3-rospy, and run tumortrack with Python 3.11; elsewhere source ROS's "
+            "setup.bash, with a Python of the same version."
+        ) from error
     finally:
         logging.setLoggerClass(logger_class)  # rospy's own is for rospy
 
 
 def _append_debian() -> None:
-    """Raises InputError where Debian's packages are for another Python."""
+    """Raises ImportError where Debian's packages are for another Python."""
     theirs = os.path.basename(os.path.realpath(_DEBIAN_PYTHON))
     ours = f"python{sys.version_info.major}.{sys.version_info.minor}"
-    if not os.path.isdir(os.path.join(_DEBIAN, "rospy")):
-        raise InputError(_how_to_get(f"{_DEBIAN} has none"))
+    if not os.path.isdir(f"{_DEBIAN}/rospy"):
+        raise ImportError(f"{_DEBIAN} has none")
     if theirs != ours:
-        raise InputError(_how_to_get(f"Debian's is for {theirs}, and this is {ours}"))
+        raise ImportError(f"Debian's is for {theirs}, and this is {ours}")
     if _DEBIAN not in sys.path:
         sys.path.append(_DEBIAN)
 
 
-def check_name(name: str) -> None:
-    """Raises InputError for what is no name of a topic (http://wiki.ros.org/Names)."""
-    if not _NAME.fullmatch(name):
-        raise InputError(
-            f"{name!r} is no ROS topic; names look like /camera/depth/points: letters, digits, _ "
-            "and / between them."
-        )
-
-
-def full_type(ros1_type: str) -> str:
-    """``sensor_msgs/Image`` -> ``sensor_msgs/msg/Image``."""
-    package, _, name = ros1_type.partition("/")
-    return f"{package}/msg/{name}"
-
-
-def _how_to_get(why: str) -> str:
-    return (
-        f"ROS 1 needs rospy, which cannot be imported ({why}). On Debian 12: apt install "
-        "python3-rospy, and run tumortrack with Python 3.11; elsewhere source ROS's setup.bash, "
-        "with a Python of the same version."
-    )
-
-
-class Master:
+class Master(NamedTuple):
     """The ROS master's XML-RPC interface, with a time limit on every answer."""
 
-    def __init__(self, uri: str, caller: str = "/tumortrack") -> None:
-        self.uri, self.caller = uri, caller
+    uri: str
+    caller: str = "/tumortrack"
 
     def call(self, method: str, *arguments: object) -> Any:
-        """The value of a call that the master granted; None of one that it refused.
-
-        Raises:
-            MasterLost: no answer, or none that is XML-RPC.
-        """
+        """The value of a call that the master granted; None of one that it refused. Raises
+        MasterLost where there is no answer, or none that is XML-RPC."""
         try:
             proxy = xmlrpc.client.ServerProxy(self.uri, transport=_Hurried())
             code, _, value = getattr(proxy, method)(self.caller, *arguments)
@@ -122,20 +93,15 @@ class Master:
             ) from error
         return value if code == _SUCCESS else None
 
-    def published(self) -> set[str]:
-        """Topics that somebody publishes."""
-        publishers, *_ = self.call("getSystemState")
-        return {topic for topic, nodes in publishers if nodes}
-
     def published_types(self) -> dict[str, str]:
-        """Those topics with their message types, where these are known."""
-        published, types = self.published(), self.call("getTopicTypes") or []
-        known = {topic: full_type(kind) for topic, kind in types if topic in published}
-        return {topic: kind for topic, kind in known.items() if kind != _ANY}
-
-    def simulated_time(self) -> bool:
-        """Stamps follow a simulation's or a recording's clock, and not the machines'."""
-        return self.call("getParam", "/use_sim_time") is True
+        """Topics that somebody publishes, with their message types, where these are known."""
+        publishers, *_ = self.call("getSystemState")
+        published = {topic for topic, nodes in publishers if nodes}
+        return {
+            topic: kind.replace("/", "/msg/")
+            for topic, kind in self.call("getTopicTypes") or []
+            if topic in published and kind != _ANY
+        }
 
 
 class _Hurried(xmlrpc.client.Transport):
@@ -145,58 +111,30 @@ class _Hurried(xmlrpc.client.Transport):
         return connection
 
 
-class Node:
-    """This process as a ROS 1 node; see ``node``."""
-
-    def __init__(self, master_uri: str, rospy: ModuleType) -> None:
-        self.rospy = rospy
-        self.name: str = rospy.get_name()
-        self.master = Master(master_uri, self.name)
-
-    def resolved(self, topic: str) -> str:
-        """The topic's full name in this node's namespace."""
-        return self.rospy.resolve_name(topic)
-
-    def listens(self, topic: str) -> bool:
-        """Whether the master knows that this node subscribes; a new master does not."""
-        _, subscribers, _ = self.master.call("getSystemState")
-        return self.name in dict(subscribers).get(topic, ())
-
-
-def node() -> Node:
-    """The node, started at the first call; rospy knows one per process, and one master.
-
-    Raises:
-        InputError: no rospy; ROS_MASTER_URI is no address, or changed since the start.
-        MasterLost: the master does not answer.
-    """
-    global _node
+def _join() -> tuple[ModuleType, Master]:
+    """rospy, its node started at the first call, and the master: one of each per process."""
+    global _joined
+    good = False
     with _starting:
-        uri = _master_uri()
-        if _node is not None and _node.master.uri != uri:
+        uri = os.environ.get("ROS_MASTER_URI") or "http://localhost:11311"
+        with suppress(ValueError):
+            parts = urlsplit(uri)
+            good = parts.scheme == "http" and bool(parts.hostname) and parts.port is not None
+        if not good:
+            raise InputError(
+                f"ROS_MASTER_URI is {uri!r}; it must look like http://localhost:11311."
+            )
+        if _joined not in ("", uri):
             raise InputError(
                 f"ROS_MASTER_URI is now {uri}, and this program is already a node of "
-                f"{_node.master.uri}. Start it anew for another master."
+                f"{_joined}. Start it anew for another master."
             )
         rospy = rospy_module()
         Master(uri).call("getPid")  # rospy would wait for it for ever
-        if _node is None:
-            if not rospy.core.is_initialized():
-                _start(rospy)
-            _node = Node(uri, rospy)
-        return _node
-
-
-def _master_uri() -> str:
-    uri = os.environ.get("ROS_MASTER_URI") or "http://localhost:11311"
-    try:
-        parts = urlsplit(uri)
-        good = parts.scheme == "http" and bool(parts.hostname) and parts.port is not None
-    except ValueError:
-        good = False
-    if not good:
-        raise InputError(f"ROS_MASTER_URI is {uri!r}; it must look like http://localhost:11311.")
-    return uri
+        if not rospy.core.is_initialized():
+            _start(rospy)
+        _joined = uri
+        return rospy, Master(uri, rospy.get_name())
 
 
 def _start(rospy: ModuleType) -> None:
@@ -204,14 +142,8 @@ def _start(rospy: ModuleType) -> None:
     configure = rospy.core.configure_logging
     rospy.core.configure_logging = lambda *_: None  # it would close everybody's log handlers
     try:
-        rospy.init_node(
-            "tumortrack",
-            argv=[],
-            anonymous=True,
-            disable_signals=True,
-            disable_rostime=True,
-            disable_rosout=True,
-        )
+        without = dict.fromkeys(("disable_signals", "disable_rostime", "disable_rosout"), True)
+        rospy.init_node("tumortrack", argv=[], anonymous=True, **without)
     finally:
         rospy.core.configure_logging = configure
     # Its warnings go to whoever listens to Python's logging, and are not printed.
@@ -219,45 +151,43 @@ def _start(rospy: ModuleType) -> None:
 
 
 class RospyBus:
-    """This node's topics of one source or sink; see ``bus.Bus``.
-
-    Raises:
-        InputError, MasterLost: as ``node``.
+    """This process's node, with the topics of one source or sink; see ``bus.Bus``. In ROS 1 each
+    subscriber gets what is latched, whether asked for or not. Raises InputError without rospy, or
+    if ROS_MASTER_URI is no address or changed since the start; MasterLost without an answer.
     """
 
-    def __init__(self, messages: Messages) -> None:
-        self.node = node()
-        self._messages = messages
+    def __init__(self) -> None:
+        self.messages = Messages("noetic")
+        self.rospy, self.master = _join()
         self._arrived = threading.Condition()
-        self._publishers: list[RospyPublisher] = []
+        self._publishers: list[Any] = []  # rospy's
+        self._handles: list[Any] = []  # those, and rospy's subscribers
         self._subscribers: list[RospySubscriber] = []
         self._closed = False
 
-    def publisher(self, topic: str, message_type: str) -> RospyPublisher:
-        kind = _raw_class(
-            message_type.replace("/msg/", "/"),
-            self._messages.md5(message_type),
-            self._messages.definition(message_type),
-        )
-        handle = self.node.rospy.Publisher(topic, kind, queue_size=1, tcp_nodelay=True)
-        self._publishers.append(RospyPublisher(handle))
-        return self._publishers[-1]
+    def publisher(self, topic: str, kind: str) -> Publisher:
+        message_class = _raw_class(kind)
+        handle = self.rospy.Publisher(topic, message_class, queue_size=1, tcp_nodelay=True)
+        self._publishers.append(handle)
+        self._handles.append(handle)
 
-    def subscriber(
-        self, topic: str, message_type: str, depth: int = 5, latched: bool = False
-    ) -> RospySubscriber:
-        """``latched`` makes no difference: in ROS 1 each subscriber gets what is latched."""
-        rospy = self.node.rospy
-        subscriber = RospySubscriber(topic, message_type, depth, self._arrived)
-        subscriber.handle = rospy.Subscriber(
-            topic, rospy.AnyMsg, subscriber.came, buff_size=_BUFFER, tcp_nodelay=True
-        )
+        def publish(raw: bytes | memoryview) -> None:
+            message = message_class()
+            message._buff = raw
+            handle.publish(message)
+
+        # rospy does not say what arrived.
+        return Publisher(publish, time.sleep, lambda: handle.get_num_connections() > 0)
+
+    def subscriber(self, topic: str, kind: str, most: int = 5, latched: bool = False) -> Subscriber:
+        subscriber = RospySubscriber(topic, kind, most, self._arrived)
+        any_type, sizes = self.rospy.AnyMsg, {"buff_size": _BUFFER, "tcp_nodelay": True}
+        self._handles.append(self.rospy.Subscriber(topic, any_type, subscriber.came, **sizes))
         self._subscribers.append(subscriber)
         return subscriber
 
     def types_of(self, topic: str) -> set[str]:
-        known = self.node.master.published_types()
-        return {known[topic]} if topic in known else set()
+        return {kind for name, kind in self.master.published_types().items() if name == topic}
 
     def wait(self, timeout_s: float) -> None:
         with self._arrived:
@@ -266,81 +196,57 @@ class RospyBus:
                 max(timeout_s, 0.0),
             )
 
+    def listens(self, topic: str) -> bool:
+        """Whether the master knows that this node subscribes; a new master does not."""
+        _, subscribers, _ = self.master.call("getSystemState")
+        return self.master.caller in dict(subscribers).get(topic, ())
+
     def register_again(self) -> None:
         """Make the publishers known to a master that does not know them; subscribers stay
-        connected.
-
-        Raises:
-            MasterLost: no answer.
-        """
-        node = self.node
-        known, *_ = node.master.call("getSystemState")
-        known = dict(known)
-        for handle in (one.handle for one in self._publishers):
-            if node.name not in known.get(handle.resolved_name, ()):
-                address = node.rospy.get_node_uri()
-                node.master.call("registerPublisher", handle.resolved_name, handle.type, address)
+        connected."""
+        known = dict(self.master.call("getSystemState")[0])
+        for handle in self._publishers:
+            name = handle.resolved_name
+            if self.master.caller not in known.get(name, ()):
+                address = self.rospy.get_node_uri()
+                self.master.call("registerPublisher", name, handle.type, address)
 
     def close(self) -> None:
         with self._arrived:
             self._closed = True
             self._arrived.notify_all()
-        while self._publishers or self._subscribers:
-            (self._publishers or self._subscribers).pop().handle.unregister()
+        while self._handles:
+            self._handles.pop().unregister()
 
 
-class RospyPublisher:
-    """See ``bus.Publisher``."""
+class RospySubscriber(Subscriber):
+    """rospy's threads call ``came``."""
 
-    def __init__(self, handle: Any) -> None:
-        self.handle = handle
-
-    @property
-    def wanted(self) -> bool:
-        return self.handle.get_num_connections() > 0
-
-    def publish(self, raw: bytes | memoryview) -> None:
-        message = self.handle.data_class()
-        message._buff = raw
-        self.handle.publish(message)
-
-    def flush(self, timeout_s: float) -> None:
-        time.sleep(timeout_s)  # rospy does not say what arrived
-
-
-class RospySubscriber:
-    """See ``bus.Subscriber``; rospy's threads call ``came``."""
-
-    handle: Any
-
-    def __init__(
-        self, topic: str, message_type: str, depth: int, arrived: threading.Condition
-    ) -> None:
-        self._topic, self._type, self._arrived = topic, message_type, arrived
-        self.pending: deque[Any] = deque(maxlen=depth)
-        self.lost = 0
+    def __init__(self, topic: str, kind: str, most: int, arrived: threading.Condition) -> None:
+        super().__init__(most)
+        self._topic, self._kind, self._arrived = topic, kind, arrived
+        self._other = ""  # type of a message that came
 
     def came(self, message: Any) -> None:
+        kind = message._connection_header["type"].replace("/", "/msg/")
         with self._arrived:
-            self.lost += len(self.pending) == self.pending.maxlen
-            self.pending.append(message)
+            super().came(message._buff)
+            self._other = self._other if kind == self._kind else kind
             self._arrived.notify_all()
 
     def take(self) -> list[bytes | memoryview]:
         with self._arrived:
-            taken = list(self.pending)
-            self.pending.clear()
-        for message in taken:
-            kind = full_type(message._connection_header["type"])
-            if kind != self._type:
-                raise InputError(f"on {self._topic} came a {kind}; it must be {self._type}.")
-        return [message._buff for message in taken]
+            taken, other, self._other = super().take(), self._other, ""
+        if other:
+            raise InputError(f"on {self._topic} came a {other}; it must be {self._kind}.")
+        return taken
 
 
 @cache
-def _raw_class(type_name: str, md5sum: str, definition: str) -> type:
+def _raw_class(message_type: str) -> Any:
     """A message class that carries bytes already serialised, as ``rospy.AnyMsg`` does, but may
     be published under its type's name."""
-    base = rospy_module().AnyMsg
-    name = type_name.replace("/", "_")
-    return type(name, (base,), {"_type": type_name, "_md5sum": md5sum, "_full_text": definition})
+    text, md5sum = Messages("noetic").definition(message_type)
+    name = message_type.replace("/msg/", "/")
+    content = {"_type": name, "_md5sum": md5sum, "_full_text": text}
+    return type(name.replace("/", "_"), (rospy_module().AnyMsg,), content)

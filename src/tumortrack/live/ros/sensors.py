@@ -1,12 +1,12 @@
 """Depth images, clouds and masks <-> ROS messages, in the camera's frame; mm here, metres there.
 
-Messages are rosbags' objects (``Messages.from_bytes``). The sizes that a message claims are checked
-against the bytes it holds; each refusal is an InputError.
+Messages are rosbags' objects (``Messages.from_bytes``). What they claim is checked against the
+bytes they hold, and that it is supported (no lens distortion, binning, region of interest, shift or
+skew of the camera; see each message): whatever is refused is an InputError.
 """
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import numpy as np
@@ -21,12 +21,11 @@ CLOUD = "sensor_msgs/msg/PointCloud2"
 IMAGE = "sensor_msgs/msg/Image"
 CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 CAMERA_FRAME = "camera"
-FLOAT32, UINT8 = 7, 2  # PointField's numbers
-
-_FLOATS = {7: "f4", 8: "f8"}  # PointField.FLOAT32, FLOAT64
-_DEPTHS = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}
+_UINT8, _FLOAT32, _FLOAT64 = 2, 7, 8  # PointField's numbers
+_FLOATS = {_FLOAT32: "f4", _FLOAT64: "f8"}
+_POINT_FIELDS = {"|u1": _UINT8, "<f4": _FLOAT32, "<u4": _FLOAT32}  # four bytes of colour, by PCL
+DEPTHS = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}
 _MASKS = {"mono8": "u1", "8UC1": "u1"}
-_MASK_APART_NS = 500_000_000  # a mask that is further from its frame shows another place
 _LONGEST_SIDE = 8192  # as of Intrinsics
 
 
@@ -35,28 +34,21 @@ def cloud_of(message: Any) -> SensorCloud:
 
     x, y and z are float32 or float64 at any place of a point; either byte order, organised or
     not, rows padded or not. Points without return (NaN, infinite, or 0, 0, 0) are dropped.
-
-    Raises:
-        InputError: no x, y, z; of another type; more points claimed than there are bytes.
     """
-    step, fields = int(message.point_step), {}
+    step, places = int(message.point_step), {}
     for field in message.fields:
-        if field.name in fields:
+        if field.name in places:
             raise InputError(f"a cloud came that has the field {field.name} twice; it is damaged.")
         if field.name in ("x", "y", "z"):
-            fields[field.name] = _place(field, step)
-    if len(fields) < 3:
-        raise InputError(
-            f"a cloud came with the fields {[f.name for f in message.fields][:12]}; x, y and z are "
-            "needed."
-        )
+            places[field.name] = _place(field, step)
+    if len(places) < 3:
+        names = [field.name for field in message.fields][:12]
+        raise InputError(f"a cloud came with the fields {names}; x, y and z are needed.")
     width, height, row = int(message.width), int(message.height), int(message.row_step)
     data = np.frombuffer(message.data, np.uint8)
-    if height > 1:
-        claimed, short = row * (height - 1) + step * width, row < step * width
-    else:
-        claimed, short = step * width * height, False
-    if claimed > data.nbytes or short:
+    organised = height > 1
+    claimed = row * (height - 1) + step * width if organised else step * width * height
+    if claimed > data.nbytes or (organised and row < step * width):
         raise InputError(
             f"a cloud came that claims {width} x {height} points of {step} bytes in rows of {row}, "
             f"and holds {data.nbytes} bytes; it is damaged."
@@ -64,11 +56,11 @@ def cloud_of(message: Any) -> SensorCloud:
     order = ">" if message.is_bigendian else "<"
     points_mm = np.empty((height, width, 3), np.float32)
     with np.errstate(over="ignore", invalid="ignore"):  # beyond float32: infinite, and dropped
-        for axis, name in enumerate("xyz" if width * height else ""):
-            offset, code = fields[name]
+        for axis, name in enumerate("xyz" if points_mm.size else ""):
+            offset, code = places[name]
             metres = np.ndarray((height, width), order + code, data, offset, (row, step))
             np.multiply(metres, 1000, out=points_mm[..., axis], casting="same_kind")
-    rows = points_mm.reshape(width * height, 3)
+    rows = points_mm.reshape(-1, 3)
     kept = np.isfinite(rows).all(axis=1) & (rows != 0).any(axis=1)
     return SensorCloud(rows[kept], stamp_of(message.header))
 
@@ -97,13 +89,9 @@ def depth_of(image: Any, info: Any, rectified: bool = False, unit_mm: float = 1.
         rectified: the image's topic is a rectified one: its camera is P, and D is what was taken
             out of it. Otherwise its camera is K, and D must be zero.
         unit_mm: of one step of a 16-bit image; ROS says 1 mm (REP 118).
-
-    Raises:
-        InputError: another encoding, lens distortion, binning, a region of interest, sizes that
-            do not fit each other or the data.
     """
-    intrinsics = intrinsics_of(info, rectified)
-    values = _pixels(image, _DEPTHS, "a depth image")
+    intrinsics = _intrinsics_of(info, rectified)
+    values = _pixels(image, DEPTHS, "a depth image")
     if values.shape != (intrinsics.height, intrinsics.width):
         raise InputError(
             f"a depth image of {values.shape[1]} x {values.shape[0]} came with a camera_info of "
@@ -117,42 +105,11 @@ def depth_of(image: Any, info: Any, rectified: bool = False, unit_mm: float = 1.
 
 
 def mask_of(image: Any) -> Bool[np.ndarray, "h w"]:
-    """A mono8 or 8UC1 image as a mask: True where it is not 0.
-
-    Raises:
-        InputError: another encoding; a size that does not fit the data.
-    """
+    """A mono8 or 8UC1 image as a mask: True where it is not 0."""
     return _pixels(image, _MASKS, "a mask") != 0
 
 
-def mask_for(frame: DepthFrame, image: Any, topic: str) -> Bool[np.ndarray, "h w"]:
-    """``mask_of`` the newest image on a mask's topic, held against the frame that it goes with.
-
-    Raises:
-        InputError: no mask, of another size, or of another time.
-    """
-    mask, older_ns = mask_of(image), frame.stamp_ns - stamp_of(image.header)
-    if mask.shape != frame.depth_mm.shape:
-        raise InputError(
-            f"a mask of {mask.shape[1]} x {mask.shape[0]} pixels came for depth images of "
-            f"{frame.intrinsics.width} x {frame.intrinsics.height}; they must be of one size."
-        )
-    if abs(older_ns) > _MASK_APART_NS:
-        raise InputError(
-            f"the newest mask on {topic} is {abs(older_ns) * 1e-9:.2f} s "
-            f"{'older' if older_ns > 0 else 'newer'} than the frame; allowed: "
-            f"{_MASK_APART_NS * 1e-9:g} s."
-        )
-    return mask
-
-
-def intrinsics_of(info: Any, rectified: bool = False) -> Intrinsics:
-    """The pinhole of a CameraInfo: K, or of a rectified image P.
-
-    Raises:
-        InputError: lens distortion (unless ``rectified``), binning, a region of interest, a shift
-            or skew of P, unusable numbers.
-    """
+def _intrinsics_of(info: Any, rectified: bool) -> Intrinsics:
     width, height = int(info.width), int(info.height)
     roi = info.roi
     whole = (int(roi.width), int(roi.height)) in ((0, 0), (width, height))
@@ -161,30 +118,22 @@ def intrinsics_of(info: Any, rectified: bool = False) -> Intrinsics:
             "a camera_info came with binning or a region of interest, which is not supported. Send "
             "the whole image."
         )
-    distortion = np.asarray(_either(info, "d"), float)
-    if rectified:
-        matrix = np.asarray(_either(info, "p"), float).reshape(3, 4)
-        if (matrix[:, 3] != 0).any():
-            raise InputError(
-                "a camera_info came whose P has a shift, as of a stereo pair's right camera. Give "
-                "the depth image of the left one."
-            )
-    else:
-        matrix = np.asarray(_either(info, "k"), float).reshape(3, 3)
-        if (distortion != 0).any():
-            raise InputError(
-                "a camera_info came that states lens distortion (D), which depth images here must "
-                "not have. Give the rectified depth image, and say that it is (rectified=true)."
-            )
+    lens = {name.lower(): value for name, value in vars(info).items()}  # ROS 1 has capitals
+    matrix = np.asarray(lens["p" if rectified else "k"], float).reshape(3, -1)
+    if rectified and (matrix[:, 3] != 0).any():
+        raise InputError(
+            "a camera_info came whose P has a shift, as of a stereo pair's right camera. Give "
+            "the depth image of the left one."
+        )
+    if not rectified and (np.asarray(lens["d"], float) != 0).any():
+        raise InputError(
+            "a camera_info came that states lens distortion (D), which depth images here must "
+            "not have. Give the rectified depth image, and say that it is (rectified=true)."
+        )
     if matrix[0, 1] != 0:
         raise InputError("a camera_info came whose pixels are skewed, which is not supported.")
     fx, cx, fy, cy = matrix[0, 0], matrix[0, 2], matrix[1, 1], matrix[1, 2]
     return Intrinsics(width, height, float(fx), float(fy), float(cx), float(cy))
-
-
-def _either(message: Any, name: str) -> Any:
-    """A field that ROS 2 writes small and ROS 1 as a capital."""
-    return getattr(message, name) if hasattr(message, name) else getattr(message, name.upper())
 
 
 def _pixels(image: Any, allowed: dict[str, str], what: str) -> np.ndarray:
@@ -214,10 +163,7 @@ def messages_seen(
     """An observation in the camera's frame: ``depth/image_rect`` (32FC1, metres, NaN without
     return (REP 118): float32 there and back is exact to one part in 10 million, 1e-5 mm at 150 mm)
     and ``depth/camera_info`` (K and P, no distortion), or ``points``; and ``mask`` (mono8) where
-    there is one.
-
-    Raises:
-        InputError: a stamp that ROS can't say.
+    there is one. Raises InputError for a stamp that ROS can't say.
     """
     header = messages.header(seen.stamp_ns, frame_id)
     frame = seen.content
@@ -263,22 +209,15 @@ def _image(pixels: np.ndarray, encoding: str, header: Any, messages: Messages) -
 
 def plain_cloud(cloud: SensorCloud, header: Any, messages: Messages) -> Any:
     """x, y, z in metres, float32."""
-    fields = [("x", 0, FLOAT32), ("y", 4, FLOAT32), ("z", 8, FLOAT32)]
     metres = (cloud.points_mm / np.float32(MM_PER_M)).astype("<f4")
-    return cloud_message(metres, fields, header, messages)
+    return cloud_message(metres.view([(axis, "<f4") for axis in "xyz"]), header, messages)
 
 
-def cloud_message(
-    table: np.ndarray, places: list[tuple[str, int, int]], header: Any, messages: Messages
-) -> Any:
-    """A PointCloud2 whose data are an array's bytes: one row of it, or one element, a point.
-
-    ``places``: name, offset in bytes and PointField type of each field.
-    """
-    step = table.itemsize * math.prod(table.shape[1:])
+def cloud_message(table: np.ndarray, header: Any, messages: Messages) -> Any:
+    """A PointCloud2 whose data are the bytes of a structured array, an element a point."""
     fields = [
-        {"name": name, "offset": offset, "datatype": kind, "count": 1}
-        for name, offset, kind in places
+        {"name": name, "offset": at[1], "datatype": _POINT_FIELDS[at[0].str], "count": 1}
+        for name, at in table.dtype.fields.items()  # type: ignore[union-attr]
     ]
     return messages.make(
         CLOUD,
@@ -287,8 +226,8 @@ def cloud_message(
         width=len(table),
         fields=fields,
         is_bigendian=False,
-        point_step=step,
-        row_step=step * len(table),
+        point_step=table.itemsize,
+        row_step=table.nbytes,
         data=_octets(table),
         is_dense=True,
     )

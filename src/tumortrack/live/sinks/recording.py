@@ -1,22 +1,34 @@
-"""A recording of observations and results, to be played again."""
+"""A recording of observations and results, to be played again: a rosbag2 folder (MCAP), as
+`ros2 bag play` and Foxglove read it, by rosbags; or plain files."""
 
 from __future__ import annotations
 
+import io
 import json
+import os
 import shutil
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
+import numpy as np
+
 import tumortrack
 from tumortrack.core.errors import InputError, StorageError
-from tumortrack.core.store import read_json
-from tumortrack.live.recording.folders import FRAMES
-from tumortrack.live.recording.frame_folders import INDEX, SHAPES, FrameFolders
-from tumortrack.live.recording.mcap_file import McapFile
+from tumortrack.core.store import read_json, write_json
+from tumortrack.live.display import wxyz_of
+from tumortrack.live.recording.folders import FRAMES, INDEX, SHAPES, FrameFolders, report
+from tumortrack.live.ros.messages import MM_PER_M, Messages, Outgoing, xyz
+from tumortrack.live.ros.results import ResultMessages
+from tumortrack.live.ros.sensors import CAMERA_FRAME, messages_seen
 from tumortrack.live.values import SinkConfig, SinkContext, TrackingResult
 
 _ABOUT = "recording.json"
 _KIND = "recording"
+_CHUNK_S = 0.5  # a killed program loses what is in no chunk yet
+_STRING, _TRANSFORMS = "std_msgs/msg/String", "tf2_msgs/msg/TFMessage"
 
 
 class RecordingSinkConfig(SinkConfig, frozen=True, kw_only=True, tag="recording"):
@@ -43,30 +55,21 @@ class RecordingSinkConfig(SinkConfig, frozen=True, kw_only=True, tag="recording"
         if not 0 <= self.meshes_hz <= 1000:
             raise InputError(f"recording: meshes_hz is {self.meshes_hz:g}; allowed: 0..1000.")
 
-    def open(self, context: SinkContext) -> RecordingSink:
-        """
-        Raises:
-            InputError: the folder exists, and is no recording or ``overwrite`` was not given.
-            StorageError: the disk refused.
-        """
+    def open(self, context: SinkContext) -> McapFile | FrameFolders:
+        """Raises InputError if the folder exists, and is no recording or ``overwrite`` was not
+        given."""
         _make_room(self.path, self.overwrite)
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
-            writer: McapFile | FrameFolders
+            sink: McapFile | FrameFolders
             if self.format == "mcap":
-                writer = McapFile(self.path, context, self.frames, self.meshes_hz)
+                sink = McapFile(self.path, context, self.frames, self.meshes_hz)
             else:
-                writer = FrameFolders(self.path, self.frames)
-            text = json.dumps(self._about(context), indent=1)
-            (self.path / _ABOUT).write_text(text + "\n", encoding="utf-8")
+                sink = FrameFolders(self.path, self.frames)
         except OSError as error:
             raise StorageError(f"cannot write {self.path}: {error.strerror or error}.") from error
-        return RecordingSink(writer)
-
-    def _about(self, context: SinkContext) -> dict[str, Any]:
-        """What the recording is: recording.json."""
         frame = context.published_frame
-        return {
+        about = {
             "kind": _KIND,
             "tumortrack": tumortrack.__version__,
             "format": self.format,
@@ -76,34 +79,8 @@ class RecordingSinkConfig(SinkConfig, frozen=True, kw_only=True, tag="recording"
             # Plain files lie beside their depth images; messages are as they were published.
             "estimate_frame": "camera" if self.format == "files" else frame.frame_id,
         }
-
-
-class RecordingSink:
-    """Writes until the disk refuses.
-
-    An MCAP is then left as it is, and every later result raises the same StorageError: it is not
-    in the recording. Plain files go on with the next frame.
-    """
-
-    def __init__(self, writer: McapFile | FrameFolders) -> None:
-        self._writer = writer
-        self._refused: StorageError | None = None
-        self._closed = False
-
-    def publish(self, result: TrackingResult) -> None:
-        if self._refused is not None:
-            raise StorageError(str(self._refused))
-        try:
-            self._writer.write(result)
-        except StorageError as error:
-            if isinstance(self._writer, McapFile):
-                self._refused = error
-            raise
-
-    def close(self) -> None:
-        if not self._closed and self._refused is None:
-            self._writer.close()
-        self._closed = True
+        write_json(self.path / _ABOUT, about)
+        return sink
 
 
 def _make_room(path: Path, overwrite: bool) -> None:
@@ -124,3 +101,118 @@ def _make_room(path: Path, overwrite: bool) -> None:
             "replaced. Choose another folder."
         )
     shutil.rmtree(path)
+
+
+class McapFile:
+    """Topics: ``/camera/...`` what the source saw, in the camera's frame; ``/tumortrack/...`` the
+    results as in ROS, and ``report`` (JSON); ``/tf`` where the two frames differ.
+
+    Messages are filed under their time of arrival, which never goes back; headers have the stamps.
+    Where the disk refuses, whole chunks stay, in a file without an end, and each later result
+    raises the same StorageError: it is not in the recording.
+    """
+
+    def __init__(self, folder: Path, context: SinkContext, frames: bool, meshes_hz: float) -> None:
+        self._messages, self._frames = Messages(), frames
+        from rosbags.rosbag2 import StoragePlugin, Writer
+
+        self._results = ResultMessages(self._messages, context, meshes_hz, observed=False)
+        self._connections: dict[str, Any] = {}
+        self._last_ns, self._chunk_s = 0, time.monotonic()
+        self._refused = ""
+        writer: Any = Writer(folder, version=8, storage_plugin=StoragePlugin.MCAP)  # 8: Humble's
+        writer.open()
+        self._writer, self._storage = writer, writer.storage
+        self._storage.bio.close()  # what is buffered could not be taken back on a full disk
+        self._storage.bio = self._file = _WholeWrites(self._storage.path)
+        self._whole = self._file.tell()  # behind the last whole chunk
+
+    def publish(self, result: TrackingResult) -> None:
+        if self._refused:
+            raise StorageError(self._refused)
+        seen = result.observation
+        self._last_ns = max(self._last_ns, time.time_ns() if seen is None else seen.arrived_ns)
+        for topic, message_type, message in self._messages_of(result):
+            if topic not in self._connections:
+                definition, _ = self._messages.definition(message_type)
+                type_hash = self._messages.type_hash(message_type)
+                self._connections[topic] = self._writer.add_connection(
+                    topic, message_type, msgdef=definition, rihs01=type_hash
+                )
+            data = self._messages.to_bytes(message)
+            with self._on_disk():
+                self._writer.write(self._connections[topic], self._last_ns, data)
+        if time.monotonic() - self._chunk_s >= _CHUNK_S:
+            self._flush()
+
+    def close(self) -> None:
+        """Write the index and metadata.yaml."""
+        if not self._file.closed:
+            if self._storage.chunk.msgs:
+                self._flush()
+            with self._on_disk():
+                self._writer.close()
+
+    def _messages_of(self, result: TrackingResult) -> list[Outgoing]:
+        """With the full names of their topics."""
+        make, frame = self._messages.make, result.published_frame
+        text = json.dumps(report(result), allow_nan=False)
+        said = Outgoing("report", _STRING, make(_STRING, data=text))
+        out = [*self._results.of(result), said]
+        out = [one._replace(suffix=f"/tumortrack/{one.suffix}") for one in out]
+        if not self._frames or result.observation is None:
+            return out
+        same = np.array_equal(frame.published_from_camera, np.eye(4))
+        camera = CAMERA_FRAME if frame.frame_id != CAMERA_FRAME else f"{CAMERA_FRAME}_optical"
+        camera = frame.frame_id if same else camera
+        seen = messages_seen(result.observation, self._messages, camera)
+        out = [*(one._replace(suffix=f"/camera/{one.suffix}") for one in seen), *out]
+        if not same:  # the camera's pose in the published frame
+            way = frame.published_from_camera
+            stamped = {
+                "header": self._messages.header(result.stamp_ns, frame.frame_id),
+                "child_frame_id": camera,
+                "transform": {
+                    "translation": xyz(way[:3, 3] / MM_PER_M),
+                    "rotation": dict(zip("wxyz", wxyz_of(way[:3, :3]).tolist(), strict=True)),
+                },
+            }
+            out.append(Outgoing("/tf", _TRANSFORMS, make(_TRANSFORMS, transforms=[stamped])))
+        return out
+
+    def _flush(self) -> None:
+        with self._on_disk():
+            self._storage.close_chunk()
+
+    @contextmanager
+    def _on_disk(self) -> Iterator[None]:
+        """Around what may write a chunk: where it fails, whole chunks only are left."""
+        try:
+            yield
+        except OSError as error:
+            if not self._file.closed:
+                os.ftruncate(self._file.fileno(), self._whole)
+                self._file.close()
+            self._refused = (
+                f"cannot write {self._file.name}: {error.strerror}. The recording ends "
+                f"{_CHUNK_S:g} s before or less; it can be played with recording:FOLDER, and "
+                "`mcap recover` makes it whole for others."
+            )
+            raise StorageError(self._refused) from error
+        if not self._file.closed and (end := self._file.tell()) > self._whole:
+            self._whole, self._chunk_s = end, time.monotonic()
+
+
+class _WholeWrites(io.FileIO):
+    """Appends, without a buffer; each write is whole or raises."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(path, "r+")
+        self.seek(0, io.SEEK_END)
+
+    def write(self, data: Any) -> int:
+        left = memoryview(data).cast("B")
+        size = len(left)
+        while left:
+            left = left[super().write(left) or 0 :]
+        return size

@@ -58,24 +58,32 @@ class RealSenseSourceConfig(SourceConfig, frozen=True, kw_only=True, tag="realse
     global_time: bool = True
     realtime: bool = True
 
-    @property
-    def recording(self) -> Path | None:
-        path = Path(self.device)
-        return path if path.suffix in _RECORDINGS else None
-
     def open(self) -> RealSenseSource:
-        """Start the camera or the recording.
+        """Start the camera or the recording. Raises SourceLost if no such camera is connected or
+        another program has it; InputError if it can't do what was asked, its image is distorted,
+        there is no such recording, or pyrealsense2 is missing."""
+        rs, path = _sdk(), Path(self.device)
+        if path.suffix not in _RECORDINGS:
+            with _while_connected():
+                return RealSenseSource(self._connected(rs), self)
+        if not path.is_file():
+            raise InputError(f"no recording {path}.")
+        try:
+            device = rs.context().load_device(str(path))
+            device.set_real_time(self.realtime)
+        except RuntimeError as error:
+            raise InputError(f"{path} is no recording of a RealSense: {error}.") from error
+        return RealSenseSource(device, self)
 
-        Raises:
-            SourceLost: no such camera is connected, or another program has it.
-            InputError: it can't do what was asked, its image is distorted, no such recording, or
-                pyrealsense2 is missing.
-        """
-        rs = _sdk()
-        if self.recording is not None:
-            return RealSenseSource(_recorded(rs, self.recording, self.realtime), self)
-        with _while_connected():
-            return RealSenseSource(_connected(rs, self.device), self)
+    def _connected(self, rs: ModuleType) -> Any:
+        serial = rs.camera_info.serial_number
+        devices = {device.get_info(serial): device for device in rs.context().query_devices()}
+        if not devices:
+            raise SourceLost("no RealSense is connected. Plug one in, at a USB 3 port.")
+        if self.device and self.device not in devices:
+            there = ", ".join(sorted(devices))
+            raise SourceLost(f"no RealSense {self.device!r} is connected; there is {there}.")
+        return devices[self.device or next(iter(devices))]
 
 
 class RealSenseSource:
@@ -83,7 +91,7 @@ class RealSenseSource:
 
     def __init__(self, device: Any, config: RealSenseSourceConfig) -> None:
         """Start streaming; raises as ``RealSenseSourceConfig.open``."""
-        rs = _sdk()
+        self._rs = rs = _sdk()
         self.dropped = 0
         self._device = device
         self._playback = device.as_playback() if device.is_playback() else None
@@ -92,10 +100,15 @@ class RealSenseSource:
         self._newest: tuple[Any, int] | None = None  # the SDK's frame, and when it came
         self._closed = False
         self._untimed = 0
-        self._hardware = rs.timestamp_domain.hardware_clock
-        self._stopped = rs.playback_status.stopped
         self._sensor, profile = _depth_stream(rs, device, None if self._playback else config)
-        self._intrinsics = _intrinsics(profile)
+        given = profile.get_intrinsics()
+        if any(given.coeffs):
+            raise InputError(
+                f"the RealSense's depth image is distorted ({given.model}, {list(given.coeffs)}); "
+                "a rectified stream is needed. Calibrate the camera."
+            )
+        focal, center = (given.fx, given.fy), (given.ppx, given.ppy)
+        self._intrinsics = Intrinsics(given.width, given.height, *focal, *center)
         self._unit_mm = float(f"{self._sensor.get_option(rs.option.depth_units) * 1000:.6g}")
         if self._playback is None:
             _set_up(rs, self._sensor, config)
@@ -107,15 +120,10 @@ class RealSenseSource:
 
     @_while_connected()
     def read(self, timeout_s: float) -> Observation | None:
-        """The newest frame not read before; None if none came in time.
-
-        Raises:
-            SourceLost: unplugged, or closed.
-            SourceEnded: the recording is over.
-            InputError: the camera's clock cannot be tied to this machine's.
-        """
+        """See ``Source``."""
         came = self._next(timeout_s)
-        if came is None and self._playback and self._playback.current_status() == self._stopped:
+        stopped = self._rs.playback_status.stopped
+        if came is None and self._playback and self._playback.current_status() == stopped:
             came = self._next(_LAST_S)
             if came is None:
                 raise SourceEnded("the recording is over.")
@@ -124,26 +132,32 @@ class RealSenseSource:
                 raise SourceLost("the RealSense is unplugged.")
             return None
         frame, arrived_ns = came
-        if self.host_clock and frame.get_frame_timestamp_domain() == self._hardware:
-            self._wait_for_clock()
+        hardware_clock = self._rs.timestamp_domain.hardware_clock
+        if self.host_clock and frame.get_frame_timestamp_domain() == hardware_clock:
+            # A camera's first frames come before its clock is tied to this machine's.
+            self.dropped += 1
+            self._untimed += 1
+            if self._untimed > _MOST_UNTIMED:
+                raise InputError(
+                    "the RealSense's clock is not tied to this machine's: its frames have no "
+                    "global time. Give global_time=false."
+                )
             return None
-        stamp_ns = round(frame.get_timestamp() * 1e6)
         raw = np.asarray(frame.get_data())
         depth_mm = raw * np.float32(self._unit_mm)
         depth_mm[raw == 0] = np.nan  # the sensor's way to say: no return
+        stamp_ns = round(frame.get_timestamp() * 1e6)
         return Observation(DepthFrame(depth_mm, self._intrinsics, stamp_ns), arrived_ns)
 
     def close(self) -> None:
         """Stop the stream; may be called twice."""
         with self._room:
-            if self._closed:
-                return
-            self._closed = True
-            self._newest = None
+            closed, self._closed, self._newest = self._closed, True, None
             self._room.notify_all()
         with contextlib.suppress(RuntimeError):  # an unplugged camera can't be stopped
-            self._sensor.stop()
-            self._sensor.close()
+            if not closed:
+                self._sensor.stop()
+                self._sensor.close()
 
     def _take(self, frame: Any) -> None:
         """Called by the SDK's thread."""
@@ -168,16 +182,6 @@ class RealSenseSource:
             self._room.notify_all()
         return came
 
-    def _wait_for_clock(self) -> None:
-        """A camera's first frames come before its clock is tied to this machine's."""
-        self.dropped += 1
-        self._untimed += 1
-        if self._untimed > _MOST_UNTIMED:
-            raise InputError(
-                "the RealSense's clock is not tied to this machine's: its frames have no global "
-                "time. Give global_time=false."
-            )
-
 
 def _sdk() -> ModuleType:
     try:
@@ -188,30 +192,6 @@ def _sdk() -> ModuleType:
             f"libusb-1.0-0 ({error})."
         ) from error
     return pyrealsense2
-
-
-def _recorded(rs: ModuleType, path: Path, realtime: bool) -> Any:
-    if not path.is_file():
-        raise InputError(f"no recording {path}.")
-    try:
-        device = rs.context().load_device(str(path))
-        device.set_real_time(realtime)
-    except RuntimeError as error:
-        raise InputError(f"{path} is no recording of a RealSense: {error}.") from error
-    return device
-
-
-def _connected(rs: ModuleType, serial: str) -> Any:
-    devices = {d.get_info(rs.camera_info.serial_number): d for d in rs.context().query_devices()}
-    if not devices:
-        raise SourceLost("no RealSense is connected. Plug one in, at a USB 3 port.")
-    if not serial:
-        return next(iter(devices.values()))
-    if serial not in devices:
-        raise SourceLost(
-            f"no RealSense {serial!r} is connected; there is {', '.join(sorted(devices))}."
-        )
-    return devices[serial]
 
 
 def _depth_stream(
@@ -236,31 +216,20 @@ def _depth_stream(
     return modes[size]
 
 
-def _intrinsics(profile: Any) -> Intrinsics:
-    given = profile.get_intrinsics()
-    if any(given.coeffs):
-        raise InputError(
-            f"the RealSense's depth image is distorted ({given.model}, {list(given.coeffs)}); a "
-            "rectified stream is needed. Calibrate the camera."
-        )
-    return Intrinsics(given.width, given.height, given.fx, given.fy, given.ppx, given.ppy)
-
-
 def _set_up(rs: ModuleType, sensor: Any, config: RealSenseSourceConfig) -> None:
+    options: dict[str, tuple[Any, int]] = {}
     if config.preset:
         presets = rs.rs400_visual_preset.__members__
         if config.preset not in presets:
             raise InputError(
                 f"the RealSense has no preset {config.preset!r}. Allowed: {', '.join(presets)}."
             )
-        _set(sensor, rs.option.visual_preset, int(presets[config.preset]), "preset")
+        options["preset"] = rs.option.visual_preset, int(presets[config.preset])
     if config.emitter is not None:
-        _set(sensor, rs.option.emitter_enabled, int(config.emitter), "emitter")
+        options["emitter"] = rs.option.emitter_enabled, int(config.emitter)
     if sensor.supports(rs.option.global_time_enabled):
-        _set(sensor, rs.option.global_time_enabled, int(config.global_time), "global_time")
-
-
-def _set(sensor: Any, option: Any, value: int, name: str) -> None:
-    if not sensor.supports(option) or sensor.is_option_read_only(option):
-        raise InputError(f"this RealSense has no {name} to set; leave the option out.")
-    sensor.set_option(option, value)
+        options["global_time"] = rs.option.global_time_enabled, int(config.global_time)
+    for name, (option, value) in options.items():
+        if not sensor.supports(option) or sensor.is_option_read_only(option):
+            raise InputError(f"this RealSense has no {name} to set; leave the option out.")
+        sensor.set_option(option, value)

@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import ClassVar, Literal
 
 from tumortrack.core.errors import InputError
-from tumortrack.live.recording import RecordedFrame, Recording
-from tumortrack.live.recording.bags import BagChoice, BagRecording, is_bag
-from tumortrack.live.recording.folders import open_folder
+from tumortrack.live.recording.bags import BagRecording, bag_files
+from tumortrack.live.recording.folders import RecordedFrame, folder_frames
 from tumortrack.live.values import Observation, SourceConfig, SourceEnded, SourceLost
 
+Frames = Callable[[], Iterator[RecordedFrame]]
 # Less than what the loop takes for a frozen source.
 _LONGEST_WAIT_S = 2.0
 _PERIOD_NS = 33_333_333  # of a recording of one frame that is played again
@@ -59,36 +60,32 @@ class RecordingSourceConfig(SourceConfig, frozen=True, kw_only=True, tag="record
             raise InputError(f"recording: unit_mm is {self.unit_mm:g}; it must lie in 0..100 mm.")
 
     def open(self) -> RecordingSource:
-        """Find the frames; none is read yet.
-
-        Raises:
-            InputError: nothing there that could be played.
-        """
-        return RecordingSource(self._recording(), self.rate, self.loop)
-
-    def _recording(self) -> Recording:
+        """Find the frames; none is read yet. Raises InputError if there are none to play."""
         if not self.path.exists():
             raise InputError(f"{self.path} does not exist, so it cannot be played.")
-        if is_bag(self.path):
-            choice = BagChoice(self.topic, self.info_topic, self.rectified, self.unit_mm)
-            return BagRecording(self.path, choice)
-        return open_folder(self.path, self.fps, self.unit)
+        if bag_files(self.path):
+            chosen = self.topic, self.info_topic, self.rectified, self.unit_mm
+            bag = BagRecording(self.path, *chosen)
+            return RecordingSource(self, bag.frames, bag.close)
+        frames = folder_frames(self.path, self.fps, self.unit)
+        return RecordingSource(self, partial(iter, frames), lambda: None)
 
 
 class RecordingSource:
-    """Plays a recording. Frames that were due before they could be read are dropped, unless it is
-    ``lossless``.
+    """Plays a recording: its ``frames`` from first to last, ``close`` ends it. Frames that were due
+    before they could be read are dropped, unless it is ``lossless``.
 
     A damaged frame is an InputError of its own, and the next read goes on behind it.
     """
 
     host_clock = False  # the stamps are those of the recording
 
-    def __init__(self, recording: Recording, rate: float, loop: bool) -> None:
-        self.lossless = rate == 0
-        self.dropped = 0
-        self._recording, self._rate = recording, rate
-        self._frames = _endless(recording) if loop else recording.frames()
+    def __init__(
+        self, config: RecordingSourceConfig, frames: Frames, close: Callable[[], None]
+    ) -> None:
+        self.lossless, self.dropped = config.rate == 0, 0
+        self._close, self._rate = close, config.rate
+        self._frames = _endless(frames) if config.loop else frames()
         self._next: RecordedFrame | None = None
         self._shown_ns: int | None = None  # stamp of the frame before
         self._due_s = 0.0  # when the next one is due, by time.monotonic
@@ -96,28 +93,24 @@ class RecordingSource:
         self._lock = threading.Lock()  # close may come while a frame is being read
 
     def read(self, timeout_s: float) -> Observation | None:
-        """
-        Raises:
-            InputError: this frame is damaged.
-            SourceEnded: that was all.
-            SourceLost: it was closed.
-        """
+        """See ``Source``."""
         with self._lock:
             frame = self._newest_due()
         if frame is None:
             self._closed.wait(min(timeout_s, max(self._due_s - time.monotonic(), 0)))
-            with self._lock:
-                frame = self._newest_due()
-        if frame is None:
-            return None
         with self._lock:
+            if frame is None and (frame := self._newest_due()) is None:
+                return None
             seen = frame.load()
-        return replace(seen, arrived_ns=time.time_ns())
+        content = seen.content
+        if content.stamp_ns != frame.stamp_ns:
+            content = replace(content, stamp_ns=frame.stamp_ns)
+        return replace(seen, content=content, arrived_ns=time.time_ns())
 
     def close(self) -> None:
         self._closed.set()
         with self._lock:
-            self._recording.close()
+            self._close()
 
     def _newest_due(self) -> RecordedFrame | None:
         """The last frame whose time has come; those before it were missed."""
@@ -125,8 +118,13 @@ class RecordingSource:
         while True:
             if self._closed.is_set():
                 raise SourceLost("the recording is closed; open it again.")
-            if self._next is None:
-                self._advance()
+            if self._next is None and (ahead := next(self._frames, None)) is not None:
+                if self._shown_ns is None or self.lossless:
+                    self._due_s = time.monotonic()
+                else:
+                    gap_s = max(ahead.stamp_ns - self._shown_ns, 0) * 1e-9 / self._rate
+                    self._due_s += min(gap_s, _LONGEST_WAIT_S)
+                self._next, self._shown_ns = ahead, ahead.stamp_ns
             if self._next is None and due is None:
                 raise SourceEnded("the recording is at its end.")
             if self._next is None or self._due_s > time.monotonic():
@@ -136,37 +134,16 @@ class RecordingSource:
             if self.lossless:
                 return due
 
-    def _advance(self) -> None:
-        """Look at the next frame, if there is one, and find out when it is due."""
-        self._next = next(self._frames, None)
-        if self._next is None:
-            return
-        if self._shown_ns is None or self.lossless:
-            self._due_s = time.monotonic()
-        else:
-            gap_s = max(self._next.stamp_ns - self._shown_ns, 0) * 1e-9 / self._rate
-            self._due_s += min(gap_s, _LONGEST_WAIT_S)
-        self._shown_ns = self._next.stamp_ns
 
-
-def _endless(recording: Recording) -> Iterator[RecordedFrame]:
+def _endless(frames: Frames) -> Iterator[RecordedFrame]:
     """The recording again and again, each time later by its length and one period."""
     shift_ns = 0
     while True:
         stamps_ns = set()
-        for frame in recording.frames():
+        for frame in frames():
             stamps_ns.add(frame.stamp_ns)
-            yield frame if shift_ns == 0 else _later(frame, shift_ns)
+            yield frame._replace(stamp_ns=frame.stamp_ns + shift_ns)
         if not any(stamps_ns):
             return  # nothing in it can be read
         length_ns = max(stamps_ns) - min(stamps_ns)
         shift_ns += length_ns + (length_ns // max(len(stamps_ns) - 1, 1) or _PERIOD_NS)
-
-
-def _later(frame: RecordedFrame, shift_ns: int) -> RecordedFrame:
-    def load() -> Observation:
-        seen = frame.load()
-        stamp_ns = seen.stamp_ns + shift_ns
-        return replace(seen, content=replace(seen.content, stamp_ns=stamp_ns))
-
-    return RecordedFrame(frame.stamp_ns + shift_ns, load)

@@ -49,46 +49,31 @@ class VirtualSourceConfig(SourceConfig, frozen=True, kw_only=True, tag="virtual"
             raise InputError(f"virtual: seed is {self.seed}; it must be 0 or more.")
 
     def player(self) -> ScenePlayer:
-        """The room that this shows; building it takes some seconds.
-
-        Raises:
-            ArtifactError: no case there.
-            InputError: a case or options that make no scene.
-        """
+        """The room that this shows; building it takes some seconds. Raises ArtifactError if there
+        is no case, InputError if case or options make no scene."""
         from tumortrack.imaging.case import load_case
         from tumortrack.sense.noise import CLEAN, D405_NOISE
         from tumortrack.simulate.player import ScenePlayer, ScenePlayerConfig
 
-        normal = ScenePlayerConfig()
-        config = ScenePlayerConfig(
-            width=self.width,
-            height=self.height,
-            distance_mm=self.distance_mm,
-            breath_mm=normal.breath_mm if self.breathing else 0.0,
-            swell=normal.swell if self.breathing else 0.0,
-            push_mm=normal.push_mm if self.instrument else 0.0,
-            sway_mm=normal.sway_mm if self.camera_motion else 0.0,
-            sway_degrees=normal.sway_degrees if self.camera_motion else 0.0,
-            table=self.table,
-            drape=self.drape,
-            noise=D405_NOISE if self.noise else CLEAN,
-        )
+        off = [
+            *(() if self.breathing else ("breath_mm", "swell")),
+            *(() if self.instrument else ("push_mm",)),
+            *(() if self.camera_motion else ("sway_mm", "sway_degrees")),
+        ]
+        same = ("width", "height", "distance_mm", "table", "drape")
+        options = {name: getattr(self, name) for name in same} | dict.fromkeys(off, 0.0)
+        noise = D405_NOISE if self.noise else CLEAN
+        config = ScenePlayerConfig(noise=noise, **options)
         case = load_case(self.case)
         return ScenePlayer(case.anatomy, case.up_lps, config, self.seed)
 
     def open(self) -> VirtualSource:
-        """Build the room; its time begins with the first read.
-
-        Raises:
-            ArtifactError: no case there.
-            InputError: a case or options that make no scene.
-        """
+        """Build the room; its time begins with the first read. Raises as ``player``."""
         return VirtualSource(self.player(), self.fps)
 
 
 class VirtualSource:
-    """Renders the scene as it is now, ``fps`` times a second; ``Observation.truth`` has its
-    surfaces."""
+    """Renders the scene as it is now, ``fps`` times a second, with its true surfaces."""
 
     host_clock = True
     lossless = False
@@ -103,15 +88,10 @@ class VirtualSource:
 
     def read(self, timeout_s: float) -> Observation | None:
         """The frame that is due, once it is; None if that is later. Frames whose time passed
-        unread are dropped.
-
-        Raises:
-            SourceLost: it was closed.
-        """
+        unread are dropped."""
         if self._begin is None:
             self._begin = time.monotonic()
-        due = self._begin + self._next * self._period_s
-        wait_s = due - time.monotonic()
+        wait_s = self._begin + self._next * self._period_s - time.monotonic()
         if self._closed.wait(max(min(wait_s, timeout_s), 0)):
             raise SourceLost("the virtual source is closed; open it again.")
         stamp_ns, t_s = time.time_ns(), time.monotonic() - self._begin

@@ -4,5 +4,3 @@ from tumortrack.models.encoders.heightmap import HeightMapConfig
 from tumortrack.models.encoders.pointnet2 import PointNet2Config
 
 EncoderConfig = PointNet2Config | HeightMapConfig
-
-__all__ = ["EncoderConfig"]

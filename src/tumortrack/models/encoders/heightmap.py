@@ -14,6 +14,7 @@ from torch.nn import functional
 
 from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError
+from tumortrack.models import kernels
 from tumortrack.models.sampling import compiled
 
 _HALF = 1.25  # normalised units from the picture's middle to its border
@@ -22,10 +23,8 @@ _SEEN_BESIDE = 0.02  # mean over a pixel and its neighbours
 
 
 class HeightMapConfig(Config, frozen=True, tag="heightmap"):
-    """``pixels`` along a side; ``channels`` of three stages, each of which halves the picture.
-
-    ``n_points``: larger clouds lose the rest (None: take all).
-    """
+    """``pixels`` along a side; ``channels`` of three stages, each of which halves the picture;
+    ``n_points``: larger clouds lose the rest (None: take all)."""
 
     pixels: int = 32
     channels: tuple[int, int, int] = (24, 48, 96)
@@ -57,10 +56,7 @@ class HeightMap(nn.Module):
         self.layers = nn.Sequential(*layers)
 
     def forward(self, points: Tensor) -> Tensor:
-        limit = self.config.n_points
-        if limit is not None:
-            points = points[:, :limit]
-        seen = picture(points, self.config.pixels)
+        seen = picture(points[:, : self.config.n_points], self.config.pixels)
         # The memory order of convolutions: else each of them would convert to it and back.
         latent: Tensor = self.layers(seen.to(memory_format=torch.channels_last)).flatten(1)
         return latent
@@ -68,13 +64,10 @@ class HeightMap(nn.Module):
 
 def picture(points: Tensor, pixels: int) -> Tensor:
     """Points (B, N, 3) -> (B, 4, pixels, pixels): seen or not and mean height, by pixel, and the
-    same over a pixel and its eight neighbours, which closes the gaps between points.
-
-    A point is spread over the four pixels about it, so that heights change smoothly with it.
-    """
+    same over a pixel and its eight neighbours, which closes the gaps between points. A point is
+    spread over the four pixels about it, so that heights change smoothly with it."""
     place = (points[..., :2] + _HALF) / (2 * _HALF) * pixels - 0.5
-    spread = _spread_compiled if compiled(points) and not points.requires_grad else _spread
-    weight, height = spread(place, points[..., 2].contiguous(), pixels)
+    weight, height = _spread(place, points[..., 2].contiguous(), pixels)
     channels = []
     for least in (_SEEN, _SEEN_BESIDE):
         seen = (weight > least).to(points)
@@ -85,10 +78,14 @@ def picture(points: Tensor, pixels: int) -> Tensor:
 
 def _spread(place: Tensor, heights: Tensor, pixels: int) -> tuple[Tensor, Tensor]:
     """Weights of points (B, N, 2) and weights times heights (B, N), by pixel, (B, 1, P, P)."""
+    weight = place.new_zeros(len(place), 1, pixels, pixels)
+    height = torch.zeros_like(weight)
+    if compiled(place):
+        kernels.spread(place.numpy(), heights.numpy(), weight[:, 0].numpy(), height[:, 0].numpy())
+        return weight, height
     lowest = place.floor()
     part = place - lowest
-    weight = place.new_zeros(len(place), pixels * pixels)
-    height = torch.zeros_like(weight)
+    weight, height = weight.flatten(1), height.flatten(1)
     for right in (0, 1):
         for down in (0, 1):
             fraction = (part[..., 0] if right else 1 - part[..., 0]) * (
@@ -99,17 +96,7 @@ def _spread(place: Tensor, heights: Tensor, pixels: int) -> tuple[Tensor, Tensor
             index = y.clamp(0, pixels - 1) * pixels + x.clamp(0, pixels - 1)
             weight.scatter_add_(1, index, fraction)
             height.scatter_add_(1, index, fraction * heights)
-    shape = len(place), 1, pixels, pixels
-    return weight.view(shape), height.view(shape)
-
-
-def _spread_compiled(place: Tensor, heights: Tensor, pixels: int) -> tuple[Tensor, Tensor]:
-    """The same in one pass on a CPU."""
-    from tumortrack.models.kernels import spread
-
-    weight, height = place.new_zeros(2, len(place), pixels, pixels)
-    spread(place.numpy(), heights.numpy(), weight.numpy(), height.numpy())
-    return weight[:, None], height[:, None]
+    return weight.view(-1, 1, pixels, pixels), height.view(-1, 1, pixels, pixels)
 
 
 def _convolution(n_in: int, n_out: int, stride: int) -> list[nn.Module]:

@@ -3,32 +3,24 @@
 from __future__ import annotations
 
 import math
+from typing import Literal
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
 from tumortrack.core.config import Config
+from tumortrack.models import sampling as sampled
 from tumortrack.models.layers import Layer, Norm, greatest, greatest_above_zero, stack
-from tumortrack.models.sampling import (
-    Sampling,
-    ball_query,
-    choose_points,
-    strided_points,
-    take,
-    traced,
-)
+from tumortrack.models.sampling import take, traced
 
 _AT_ONCE = 128  # centres
 
 
 class SetAbstraction(Config, frozen=True):
-    """One level: choose centres among the points, describe each by its neighbours.
-
-    ``ratio``: centres per point (rounded up). ``radius``: of the ball, in normalised units.
-    ``neighbours``: at most so many in a ball. ``widths``: of the MLP, whose maximum over the
-    neighbours is the centre's feature.
-    """
+    """One level: choose centres among the points, describe each by its neighbours. ``ratio``:
+    centres per point (rounded up). ``radius``: of the ball, in normalised units. ``neighbours``: at
+    most so many in a ball. ``widths``: of the MLP, whose maximum over them is the feature."""
 
     ratio: float
     radius: float
@@ -38,15 +30,13 @@ class SetAbstraction(Config, frozen=True):
 
 class PointNet2Config(Config, frozen=True, tag="pointnet2"):
     """``levels``, then an MLP of ``widths`` on [position, feature] and its maximum: the latent.
-
     ``n_points``: larger clouds are first thinned to so many, by stride (None: take all).
-    ``sampling``: how the centres are chosen. Stride needs points in random order.
-    """
+    ``sampling``: how the centres are chosen. Stride needs points in random order."""
 
     levels: tuple[SetAbstraction, ...]
     widths: tuple[int, ...]
     norm: Norm = "batch"
-    sampling: Sampling = "fps"
+    sampling: Literal["fps", "strided"] = "fps"
     n_points: int | None = None
 
     @property
@@ -74,7 +64,7 @@ class PointNet2(nn.Module):
     def forward(self, points: Tensor) -> Tensor:
         limit = self.config.n_points
         if limit is not None and points.shape[1] > limit:
-            points = take(points, strided_points(points, limit))
+            points = take(points, sampled.strided_points(points, limit))
         features: Tensor | None = None
         for level in self.levels:
             points, features = level(points, features)
@@ -85,11 +75,9 @@ class PointNet2(nn.Module):
 
 class _Level(nn.Module):
     """Points (B, N, 3) and features (B, N, F) or none -> centres (B, M, 3), features (B, M, G).
-
     The first linear layer on [p_j - c_i, f_j] is W_p (p_j - c_i) + W_f f_j: the second product
     is made once per point, before the neighbours are gathered. Offsets are taken in full
-    precision and divided by the radius.
-    """
+    precision and divided by the radius."""
 
     def __init__(self, level: SetAbstraction, n_features: int, config: PointNet2Config) -> None:
         super().__init__()
@@ -99,9 +87,10 @@ class _Level(nn.Module):
 
     def forward(self, points: Tensor, features: Tensor | None) -> tuple[Tensor, Tensor]:
         level, n = self.level, points.shape[1]
-        chosen = choose_points(points, math.ceil(level.ratio * n), self.sampling)
+        choose = sampled.farthest_points if self.sampling == "fps" else sampled.strided_points
+        chosen = choose(points, math.ceil(level.ratio * n))
         centres = take(points, chosen)
-        neighbours = ball_query(points, centres, level.radius, level.neighbours)
+        neighbours = sampled.ball_query(points, centres, level.radius, level.neighbours)
         weight, projected = self.first.linear.weight, None
         if features is not None:
             projected = functional.linear(features, weight[:, 3:])
@@ -127,4 +116,5 @@ class _Level(nn.Module):
             return greatest(self.rest(hidden))
         for layer in layers[:-1]:
             hidden = layer(hidden)
-        return greatest_above_zero(layers[-1].before_relu(hidden))
+        last = layers[-1]
+        return greatest_above_zero(last.normalise(last.linear(hidden)))

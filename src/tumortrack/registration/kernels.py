@@ -1,4 +1,5 @@
-"""Kernels of a motion: points carried to the camera and back, and derivatives by every unknown.
+"""Kernels of a motion and of an organ at rest: points carried to the camera and back, distances,
+labels, probabilities, and derivatives by every unknown.
 
 Modes lie on the flow's lattice. Unknowns are shift, turn and coefficients, in this order.
 Derivatives by coefficients are to first order: the modes halfway along a point's path.
@@ -10,11 +11,14 @@ from typing import NamedTuple
 
 import numba
 import numpy as np
+from scipy.special import ndtr
 
-from tumortrack.registration.rest_shape import distance_at
 from tumortrack.simulate.elastic.flow import BLOCK, add_modes, block, enter, travel
 
 POSE = 6  # unknowns before the coefficients
+NODES_MM = 2.0  # apart, of the lattice for ``look_up``
+_MOST_STD, _PER_STD = 8, 1024  # so wide a table, in such steps, is right to 1e-7
+_NORMAL = ndtr(np.arange(_MOST_STD * _PER_STD + 2) / _PER_STD)  # from 0 standard deviations on
 
 
 class Flow(NamedTuple):
@@ -34,12 +38,12 @@ class Pose(NamedTuple):
     centre_mm: np.ndarray  # (3,)
 
 
-class DistanceLattice(NamedTuple):
-    """Signed distances to a surface on a lattice, CT frame, mm, float32."""
+class DistanceField(NamedTuple):
+    """Signed distances (mm, negative inside) to one closed surface on a lattice of the CT frame."""
 
-    values_mm: np.ndarray  # (i, j, k)
-    origin_mm: np.ndarray  # (3,)
-    spacing_mm: np.float32
+    values_mm: np.ndarray  # (i, j, k), float32
+    origin_mm: np.ndarray  # (3,), float32
+    spacing_mm: float
 
 
 @numba.njit(cache=True, fastmath=True, nogil=True)
@@ -119,18 +123,15 @@ def variances(flow, modes, center, root, points, out):  # type: ignore[no-untype
 
 
 @numba.njit(cache=True, fastmath=True, nogil=True, inline="always")
-def add_rows(flow, modes, pose, field, points, room, rows):  # type: ignore[no-untyped-def]
+def add_rows(modes, field, flow, pose, points, buffers, rows):  # type: ignore[no-untyped-def]
     """What each unknown does to the signed distance of one block of points (n, 3; camera frame,
     mm), carried back, to a surface at rest; the distance itself stands in the last column of
-    ``rows`` (n, p + 1).
-
-    ``flow`` has the opposite velocity; ``field`` is the surface's ``DistanceLattice``; ``room`` is
-    ``elastic.flow.block()``.
-    """
+    ``rows`` (n, p + 1). ``flow`` has the opposite velocity; ``field`` is the surface's
+    ``DistanceField``; ``buffers`` are those of ``elastic.flow.block()``."""
     velocity, origin, spacing, steps = flow
     center, rotation, centre = pose
-    values, corner, width = field
-    places, speeds, middles = room
+    values, corner, width = field.values_mm, field.origin_mm, np.float32(field.spacing_mm)
+    places, speeds, middles = buffers
     per_cell, inwards = np.float32(1) / spacing, np.empty(3, np.float32)
     offsets = np.empty((BLOCK, 3), np.float32)
     for p in range(len(points)):
@@ -152,3 +153,66 @@ def add_rows(flow, modes, pose, field, points, room, rows):  # type: ignore[no-u
         row[3], row[4], row[5] = sy * oz - sz * oy, sz * ox - sx * oz, sx * oy - sy * ox
         row[POSE:-1] = 0
         add_modes(modes, middles[0, p], middles[1, p], middles[2, p], inwards, row[POSE:-1])
+
+
+@numba.njit(cache=True, fastmath=True, nogil=True, inline="always")
+def distance_at(values, origin, spacing, x, y, z):  # type: ignore[no-untyped-def]
+    """Distance and its slope along x, y, z at one place (mm), by trilinear interpolation."""
+    zero, one, most = np.float32(0), np.float32(1), np.float32(1.001)
+    per_cell = one / spacing
+    x = min(max((x - origin[0]) * per_cell, zero), np.float32(values.shape[0]) - most)
+    y = min(max((y - origin[1]) * per_cell, zero), np.float32(values.shape[1]) - most)
+    z = min(max((z - origin[2]) * per_cell, zero), np.float32(values.shape[2]) - most)
+    i, j, k = int(x), int(y), int(z)
+    a, b, c = np.float32(x - i), np.float32(y - j), np.float32(z - k)
+    v000, v001 = values[i, j, k], values[i, j, k + 1]
+    v010, v011 = values[i, j + 1, k], values[i, j + 1, k + 1]
+    v100, v101 = values[i + 1, j, k], values[i + 1, j, k + 1]
+    v110, v111 = values[i + 1, j + 1, k], values[i + 1, j + 1, k + 1]
+    l00, l01 = v000 + (v001 - v000) * c, v010 + (v011 - v010) * c
+    l10, l11 = v100 + (v101 - v100) * c, v110 + (v111 - v110) * c
+    f0, f1 = l00 + (l01 - l00) * b, l10 + (l11 - l10) * b
+    by_y = (l01 - l00) * (one - a) + (l11 - l10) * a
+    d0 = (v001 - v000) * (one - b) + (v011 - v010) * b
+    d1 = (v101 - v100) * (one - b) + (v111 - v110) * b
+    by_z = d0 * (one - a) + d1 * a
+    return f0 + (f1 - f0) * a, (f1 - f0) * per_cell, by_y * per_cell, by_z * per_cell
+
+
+@numba.njit(cache=True, fastmath=True, nogil=True)
+def mark(field, label, points, labels, margin):  # type: ignore[no-untyped-def]
+    """Give points inside the label, and every point the distance if it is the least so far."""
+    values, origin, spacing = field.values_mm, field.origin_mm, np.float32(field.spacing_mm)
+    for p in range(len(points)):
+        x, y, z = points[p, 0], points[p, 1], points[p, 2]
+        distance = distance_at(values, origin, spacing, x, y, z)[0]
+        if distance < 0:
+            labels[p] = label
+        margin[p] = min(margin[p], abs(distance))
+
+
+@numba.njit(cache=True, nogil=True)
+def probabilities(margins, per_std, which):  # type: ignore[no-untyped-def]
+    """That normal errors do not exceed margins (n,), 0 or more; ``per_std[which]`` of them make one
+    standard deviation. Float32 (n,)."""
+    out = np.empty(len(margins), np.float32)
+    for p in range(len(margins)):
+        place = min(margins[p] * per_std[which[p]], np.float64(_MOST_STD)) * _PER_STD
+        n = int(place)
+        out[p] = _NORMAL[n] + (place - n) * (_NORMAL[n + 1] - _NORMAL[n])
+    return out
+
+
+@numba.njit(cache=True, nogil=True)
+def look_up(origin, nearest, points):  # type: ignore[no-untyped-def]
+    """Which of some places is nearest to each point: that of the nearest node of a lattice, which
+    may be another one where two are about as near; outside as on its border."""
+    step = np.float32(NODES_MM)
+    out, zero, half = np.empty(len(points), np.int32), np.float32(0), np.float32(0.5)
+    x_last, y_last, z_last = nearest.shape[0] - 1, nearest.shape[1] - 1, nearest.shape[2] - 1
+    for p in range(len(points)):
+        i = int(max((points[p, 0] - origin[0]) / step + half, zero))
+        j = int(max((points[p, 1] - origin[1]) / step + half, zero))
+        k = int(max((points[p, 2] - origin[2]) / step + half, zero))
+        out[p] = nearest[min(i, x_last), min(j, y_last), min(k, z_last)]
+    return out

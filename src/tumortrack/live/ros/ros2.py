@@ -1,0 +1,113 @@
+"""ROS 2: without ROS (``dds``), or through the user's own (``rclpy``)."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib.util
+import threading
+from typing import Any, Literal
+
+from tumortrack.core.errors import InputError, TumortrackError
+from tumortrack.live.ros.bus import Bus, Publisher, Subscriber
+from tumortrack.live.ros.messages import Messages
+
+Via = Literal["auto", "dds", "rclpy"]
+
+
+def open_bus(via: Via) -> Bus:
+    """Join the ROS 2 graph of ``ROS_DOMAIN_ID``; ``auto``: by rclpy where it can be imported.
+    Raises InputError if that way is not there, or the environment cannot be used."""
+    messages = Messages()
+    if via == "rclpy" or (via == "auto" and importlib.util.find_spec("rclpy")):
+        return RclpyBus(messages)
+    try:
+        from tumortrack.live.ros.dds import DdsBus
+    except ImportError as error:
+        raise InputError(
+            "ROS 2 without ROS needs the package cyclonedds: pip install 'tumortrack[live]'."
+        ) from error
+    return DdsBus(messages)
+
+
+class RclpyBus:
+    """ROS 2 through the user's own ROS: a node of its own, in a context of its own.
+
+    Serialised bytes pass through in both directions, so that rclpy's conversion to Python objects,
+    slow for clouds, is not used. Needs a sourced ROS 2, Humble or later, of this Python's version.
+    """
+
+    def __init__(self, messages: Messages) -> None:
+        try:
+            import rclpy
+            from rclpy import executors, qos
+        except ImportError as error:
+            raise InputError(
+                f"rclpy cannot be imported ({error}). Source ROS 2's setup.bash, with a Python of "
+                "the same version; or use via=dds, which needs no ROS."
+            ) from error
+        self.messages, self._qos = messages, qos
+        self._context = rclpy.Context()
+        rclpy.init(args=[], context=self._context)  # its own context: no grip on signals
+        self._node = rclpy.create_node("tumortrack", context=self._context)
+        self._executor = executors.SingleThreadedExecutor(context=self._context)
+        self._executor.add_node(self._node)
+        self._lock = threading.Lock()  # held while spinning: nothing is taken apart under it
+        self._closed = False
+
+    def publisher(self, topic: str, kind: str) -> Publisher:
+        from rclpy.duration import Duration
+
+        profile = self._qos.QoSProfile(depth=1)  # its defaults are ROS 2's: reliable, volatile
+        writer = self._node.create_publisher(_message_class(kind), topic, profile)
+
+        def publish(raw: bytes | memoryview) -> None:
+            try:
+                writer.publish(bytes(raw))  # bytes: taken as serialised already
+            except Exception as error:  # rclpy's own kinds differ between distributions
+                raise TumortrackError(f"{topic}: a message was not sent ({error}).") from error
+
+        def flush(timeout_s: float) -> None:
+            # Not every RMW can say what arrived; then there is nothing to wait for.
+            with contextlib.suppress(NotImplementedError, RuntimeError):
+                writer.wait_for_all_acked(Duration(seconds=timeout_s))
+
+        return Publisher(publish, flush)
+
+    def subscriber(self, topic: str, kind: str, most: int = 5, latched: bool = False) -> Subscriber:
+        reliability, durability = self._qos.ReliabilityPolicy, self._qos.DurabilityPolicy
+        profile = self._qos.QoSProfile(
+            depth=most,
+            reliability=reliability.RELIABLE if latched else reliability.BEST_EFFORT,
+            durability=durability.TRANSIENT_LOCAL if latched else durability.VOLATILE,
+        )
+        subscriber = Subscriber(most)
+        came, message_class = subscriber.came, _message_class(kind)
+        self._node.create_subscription(message_class, topic, came, profile, raw=True)
+        return subscriber
+
+    def types_of(self, topic: str) -> set[str]:
+        return {one.topic_type for one in self._node.get_publishers_info_by_topic(topic)}
+
+    def wait(self, timeout_s: float) -> None:
+        with self._lock:
+            if not self._closed:
+                self._executor.spin_once(timeout_sec=max(0.0, timeout_s))
+
+    def close(self) -> None:
+        with self._lock:
+            closed, self._closed = self._closed, True
+        if not closed:
+            self._executor.shutdown()
+            self._node.destroy_node()
+            self._context.try_shutdown()
+
+
+def _message_class(message_type: str) -> Any:
+    package, _, name = message_type.split("/")
+    try:
+        return getattr(importlib.import_module(f"{package}.msg"), name)
+    except (ImportError, AttributeError) as error:
+        raise InputError(
+            f"the sourced ROS 2 has no message type {message_type}. Install the package "
+            f"ros-<distribution>-{package.replace('_', '-')}."
+        ) from error
