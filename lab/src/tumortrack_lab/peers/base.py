@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float, Float64
@@ -49,13 +49,24 @@ class Fit:
     report: dict = field(default_factory=dict)
 
 
-class Peer(ABC):
-    """A method made ready for one patient. Needed of it is no more than ``name``, ``prepare_s`` and
-    ``fit``; here what is done before a cloud is seen, and each fit, is timed."""
+@runtime_checkable
+class Peer(Protocol):
+    """A method made ready for one patient."""
+
+    name: str
+    prepare_s: float  # spent before the first frame
+
+    def fit(self, scene: Scene) -> Fit:
+        """Locate the anatomy in a scene. All but the bound use ``scene.cloud`` alone. Raises
+        NoEstimate: the cloud has too little information, such as fewer than 20 points; InputError:
+        the cloud or the peer's settings cannot be used."""
+
+
+class TimedPeer(ABC):
+    """What our own peers share: their preparation and each fit are timed."""
 
     name: str
     config: Any
-    prepare_s: float  # spent before the first frame
 
     def __init__(self, anatomy_ct: Anatomy, up_lps: Direction, config: Any = None) -> None:
         self.config = config
@@ -64,9 +75,7 @@ class Peer(ABC):
         self.prepare_s = watch.seconds
 
     def fit(self, scene: Scene) -> Fit:
-        """Locate the anatomy in a scene. All but the bound use ``scene.cloud`` alone. Raises
-        NoEstimate: the cloud has too little information, such as fewer than 20 points; InputError:
-        the cloud or the peer's settings cannot be used."""
+        """See ``Peer.fit``."""
         with stopwatch() as watch:
             carry, report = self._fit(scene)
         return Fit(carry, watch.seconds, report)
@@ -123,7 +132,7 @@ def stopwatch() -> Iterator[SimpleNamespace]:
     watch.seconds = time.perf_counter() - start
 
 
-class DeformablePeer(Peer):
+class DeformablePeer(TimedPeer):
     """A peer that fits from each of the best rigid poses and keeps the fit of least error. Its
     configuration has ``rigid`` (of the pose search) and ``starts`` (how many poses)."""
 
@@ -143,7 +152,7 @@ class DeformablePeer(Peer):
         compared (any unit), the map, its report."""
 
 
-class Rigid(Peer):
+class Rigid(TimedPeer):
     """The pose of least error as a peer."""
 
     def _prepare(self, anatomy_ct: Anatomy, up_lps: Direction) -> None:
@@ -156,7 +165,7 @@ class Rigid(Peer):
         return rigid_carry(best.camera_from_ct), report
 
 
-class RigidBound(Peer):
+class RigidBound(TimedPeer):
     """The best rigid pose there is, found with the truth in hand: least squares over the organ's
     whole volume, from the truth's own correspondence. Not a method anyone could use; no rigid
     method can beat it in that norm. Errors as of ``matched_vertices``."""
