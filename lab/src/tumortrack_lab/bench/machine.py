@@ -58,8 +58,12 @@ def cpu_name() -> str:
 def _cpu_info() -> dict[str, str]:
     """Of the first core, as Linux tells it."""
     text = _CPU_INFO.read_text(encoding="utf-8") if _CPU_INFO.exists() else ""
-    first = [line.partition(":") for line in text.partition("\n\n")[0].splitlines()]
-    return {key.strip(): value.strip() for key, _, value in first}
+    return _fields(text.partition("\n\n")[0])
+
+
+def _fields(text: str) -> dict[str, str]:
+    lines = (line.partition(":") for line in text.splitlines())
+    return {key.strip(): value.strip() for key, _, value in lines}
 
 
 def _caches() -> str:
@@ -119,25 +123,20 @@ def forget_peak() -> int | None:
     gc.collect()
     if not _CLEAR.exists():
         return None
-    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
-    if trim is not None:
+    if trim := getattr(ctypes.CDLL(None), "malloc_trim", None):
         trim(0)
     try:
         _CLEAR.write_text(_RESET_PEAK, encoding="ascii")
     except PermissionError:  # a container may forbid it
         return None
-    return status_bytes("VmRSS")
+    return _status_bytes("VmRSS")
 
 
 def peak_bytes() -> int:
-    """The most that was resident since ``forget_peak``. Raises OSError: the system does not say."""
-    return status_bytes("VmHWM")
+    """The most that was resident since ``forget_peak``."""
+    return _status_bytes("VmHWM")
 
 
-def status_bytes(name: str, process: int | str = "self") -> int:
-    """What Linux tells of a process's memory. Raises OSError: no such process, or no Linux."""
-    status = Path(f"/proc/{process}/status")
-    for line in status.read_text(encoding="ascii").splitlines():
-        if line.startswith(name + ":"):
-            return int(line.split()[1]) * 1024
-    raise OSError(f"{status} does not tell {name}.")
+def _status_bytes(name: str) -> int:
+    found = _fields(Path("/proc/self/status").read_text(encoding="ascii"))
+    return int(found[name].split()[0]) * 1024
