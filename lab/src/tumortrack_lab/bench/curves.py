@@ -75,7 +75,8 @@ def _tumors(subject: BenchSubject, _: str) -> Calls:
 def _with_tumors(anatomy: Anatomy, count: int) -> Anatomy:
     """The organ with so many tumors: its first one, made smaller, at places inside."""
     organ, tumor = anatomy.organ, anatomy.tumors[0]
-    drawn = np.random.default_rng(SEED).uniform(*organ.box_mm, (4000, 3)).astype(np.float32)
+    lower, upper = organ.box_mm
+    drawn = np.random.default_rng(SEED).uniform(lower, upper, (4000, 3)).astype(np.float32)
     inside = drawn[contains(organ, drawn)]
     small = (tumor.vertices_mm - tumor.box_mm.mean(0)) * _SMALL
     return Anatomy((organ, *(tumor.moved(small + place) for place in inside[:count])))

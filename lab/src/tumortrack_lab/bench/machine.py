@@ -7,6 +7,7 @@ import gc
 import os
 import platform
 from collections.abc import Callable
+from contextlib import suppress
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
@@ -68,15 +69,13 @@ def _fields(text: str) -> dict[str, str]:
 
 def _caches() -> str:
     """Level and size of the first core's caches, as Linux tells them."""
-    found = []
-    for folder in sorted(Path("/sys/devices/system/cpu/cpu0/cache").glob("index*")):
-        level, kind, size = (
-            (folder / name).read_text(encoding="utf-8").strip()
-            for name in ("level", "type", "size")
-        )
-        if kind != "Instruction":
-            found.append(f"L{level} {size}")
-    return ", ".join(found) or "not known"
+    folders = sorted(Path("/sys/devices/system/cpu/cpu0/cache").glob("index*"))
+    found = [
+        [(folder / name).read_text(encoding="utf-8").strip() for name in ("level", "type", "size")]
+        for folder in folders
+    ]
+    data = ", ".join(f"L{level} {size}" for level, kind, size in found if kind != "Instruction")
+    return data or "not known"
 
 
 def measure_peaks(threads: int, budget_s: float) -> Peaks:
@@ -109,11 +108,9 @@ def _products() -> dict[str, Callable[[], object]]:
     }
     offered = {}
     for name, call in calls.items():
-        try:
+        with suppress(RuntimeError):  # not made for this processor
             call()
-        except RuntimeError:  # not made for this processor
-            continue
-        offered[name] = call
+            offered[name] = call
     return offered
 
 

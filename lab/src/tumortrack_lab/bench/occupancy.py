@@ -273,7 +273,7 @@ class OccupancyForms:
     def _encoder_work(self) -> Work:
         folded, n = self._model.network.folded(), len(self.points_mm)
         flops = module_flops(lambda: folded.encode(self._cloud))
-        for level in folded.config.encoder.levels:
+        for level in folded.config.encoder.levels:  # type: ignore[union-attr]
             centres = round(level.ratio * n)
             # Each choice of the farthest compares all points with the newest; then the neighbours
             # of the centres, every point tried.

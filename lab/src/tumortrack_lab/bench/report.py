@@ -22,24 +22,17 @@ _EMPTY = "–"
 _GIB, _MIB = 2**30, 2**20
 _SECONDS = {"s": 1.0, "ms": 1e-3, "µs": 1e-6}
 _COUNTS = {"T": 1e12, "G": 1e9, "M": 1e6, "k": 1e3, "": 1.0}
-# Columns of the tables: as headed, and what of ``_cells`` they show.
-_WHOSE = {key: key for key in ("part", "of", "threads")}
-_NAIVE = {key: key for key in ("naive", "ratio", "labels equal")}
-_SHOWN = {
-    "part": "part", "": "of", "threads": "threads", "tumortrack": "took", "per s": "per s",
-    **_NAIVE, "floor": "floor",
-}  # fmt: skip
-_SPEED = {
-    **_WHOSE, "tumortrack": "took each", "quartiles": "quartiles", "items a second": "per s",
-    **_NAIVE,
-}  # fmt: skip
+# Columns, by what ``_cells`` calls them; a terminal's table has other names for some.
+_WHOSE, _NAIVE = ("part", "of", "threads"), ("items a second", "naive", "ratio", "labels equal")
+_SPEED = (*_WHOSE, "tumortrack", "quartiles", *_NAIVE)
 # What each row has to do at least, and what that would take; shares of the machine's matrix
 # products in this precision, and of its memory's bandwidth.
 _LEAST = (
     "arithmetic", "memory", "in", "share of the rate", "share of the bandwidth", "floor",
     "times the floor",
 )  # fmt: skip
-_FLOORS = {**_WHOSE, **{key: key for key in _LEAST}}
+_SHOWN = (*_WHOSE, "took", *_NAIVE, "floor")
+_SHOWN_AS = {"of": "", "took": "tumortrack", "items a second": "per s"}
 # Okabe and Ito's colours; each curve has a marker of its own too.
 _STYLES = {
     "clinic": ("#D55E00", "*"),
@@ -75,15 +68,15 @@ def _agreement(share: float) -> str:
 def _cells(bench: BenchResult, row: BenchRow) -> dict[str, str]:
     """All that tables say of a row."""
     took, work, peaks = row.ours.median_s, row.work, bench.peaks_for(row)
-    naive_s, share = row.naive and row.naive.median_s, row.agreement
+    naive_s, share = row.naive.median_s if row.naive else None, row.agreement
     cells = {
         "part": row.name,
         "of": row.what,
         "threads": f"{row.threads}" if row.device == "cpu" else row.device,
         "took": _text(took),
-        "took each": f"{_text(took)} a {row.item}",
+        "tumortrack": f"{_text(took)} a {row.item}",
         "quartiles": f"± {50 * (row.ours.high_s - row.ours.low_s) / took:.0f} %",
-        "per s": _text(row.per_s, _COUNTS).strip(),
+        "items a second": _text(row.per_s, _COUNTS).strip(),
         "naive": _EMPTY if naive_s is None else _text(naive_s),
         "ratio": _EMPTY if row.ratio is None else f"{_digits(row.ratio)} x",
         "labels equal": _EMPTY if share is None else _agreement(share),
@@ -111,22 +104,22 @@ def line(row: BenchRow, left: str) -> str:
     """One row, as soon as it is measured; ``left``: how long all others will take."""
     cells = _cells(BenchResult(machine={}, command=""), row)
     naive = "; naive {naive}, {ratio}".format_map(cells) if row.naive else ""
-    return "  {part} {of}, threads {threads}: {took each}".format_map(cells) + f"{naive}; {left}"
+    return "  {part} {of}, threads {threads}: {tumortrack}".format_map(cells) + f"{naive}; {left}"
 
 
 def rich_table(bench: BenchResult) -> Table:
     """For a terminal."""
     title = f"{bench.machine.get('processor', '')}, {bench.machine.get('date', '')}"
-    out = Table(*_SHOWN, title=title)
+    out = Table(*(_SHOWN_AS.get(key, key) for key in _SHOWN), title=title)
     for row in bench.rows:
         cells = _cells(bench, row)
-        out.add_row(*(cells[key] for key in _SHOWN.values()))
+        out.add_row(*(cells[key] for key in _SHOWN))
     return out
 
 
-def _table(bench: BenchResult, columns: dict[str, str], of: Sequence[BenchRow]) -> str:
+def _table(bench: BenchResult, columns: Sequence[str], of: Sequence[BenchRow]) -> str:
     every = (_cells(bench, row) for row in of)
-    return table([*columns], [[cells[key] for key in columns.values()] for cells in every], left=2)
+    return table(columns, [[cells[key] for key in columns] for cells in every], left=2)
 
 
 def _notes(bench: BenchResult) -> str:
@@ -282,7 +275,7 @@ def _document(bench: BenchResult, document: Path) -> list[Path]:
             "goals": f"{goals_table(bench)}\n\n{caption}",
             "machine": _machine_table(bench),
             "speed": f"{speed}\n\n{_notes(bench)}\n\n{caption}",
-            "floors": _table(bench, _FLOORS, [row for row in bench.rows if row.work]),
+            "floors": _table(bench, (*_WHOSE, *_LEAST), [row for row in bench.rows if row.work]),
         }
     if bench.points:
         picture = writer.image("growth")
@@ -312,8 +305,8 @@ def draw_growth(points: Sequence[Point], path: Path) -> None:
                     for p in mine
                     if p.what == name
                 ]
-                style = {"color": color, "marker": marker, "label": name, "linewidth": 1.5}
-                axes.plot(*zip(*chosen, strict=True), **style)
+                x, y = zip(*chosen, strict=True)
+                axes.plot(x, y, color=color, marker=marker, label=name, linewidth=1.5)
             if curve != _LINEAR:
                 axes.set_xscale("log")
             axes.set_xticks(sizes, [short(size) for size in sizes])

@@ -225,7 +225,7 @@ def carry_out(task: Task, subject: BenchSubject, tell: Callable[[TaskMessage], N
         part_s, *later_s = map(task.expected_s, task.parts[number:])
         tell(TaskMessage(begins=words[kind].format(*of), expected_s=(part_s, sum(later_s))))
         if kind == "train":
-            subject.train(*of, under_way)
+            subject.train(of[0], under_way)
         elif kind == "peaks":
             tell(TaskMessage(peaks=measure_peaks(task.threads, 1.0 if task.quick else 3.0)))
         elif kind == "curve":
