@@ -29,7 +29,7 @@ def flow_flops(points: int) -> float:
 
 
 class RegistrationForms:
-    """Of preset ``clinic``."""
+    """Of preset ``clinic``; the workloads are those of ``OccupancyForms``."""
 
     naive_is = "nearest vertices by a tree, SciPy, every start to its end, inside tests"
 
@@ -46,12 +46,10 @@ class RegistrationForms:
         return lambda: self._shape.labels_at(self._back(places).astype(np.float32))[0]
 
     def filling(self, size: int) -> Call:
-        """A label in every voxel."""
         grid = grid_over(self._anatomy.organ.vertices_mm, size)
         return partial(label_grid, self._anatomy, *grid)
 
     def encoders(self) -> Iterator[Workload]:
-        """The cloud to what is known of it."""
         points = self._cloud.points_mm
 
         @torch.inference_mode()
@@ -66,7 +64,6 @@ class RegistrationForms:
         yield Workload(rows.ENCODER, "clinic", "cloud", ours, facts=facts)
 
     def frames(self) -> Iterator[Workload]:
-        """1,000 points to 40,000 labels."""
         cloud = self._estimate.cloud
 
         def ours() -> Uncounted:
@@ -88,7 +85,6 @@ class RegistrationForms:
         )
 
     def tracking(self) -> Iterator[Workload]:
-        """From frame to frame."""
         ours = occupancy.LiveFrames(self._tracker, self._cloud.points_mm)
 
         def facts() -> dict:
@@ -102,7 +98,6 @@ class RegistrationForms:
         )
 
     def volumes(self) -> Iterator[Workload]:
-        """From what is known of the cloud to a label in every voxel."""
         grid = grid_over(self._anatomy.organ.vertices_mm, occupancy.GRID)
         index, points = occupancy.slab(grid)
         voxels, faces = int(np.prod(grid[1])), sum(len(part.faces) for part in self._anatomy.parts)

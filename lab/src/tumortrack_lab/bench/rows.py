@@ -161,9 +161,10 @@ class Workload:
         """Time all forms in turns."""
         forms = (self, *self.beside)
         calls = [call for call in (*(f.ours for f in forms), self.naive) if callable(call)]
-        timed = dict(zip(calls, interleaved(*calls, budget_s=budget_s), strict=True))
-        self.naive = known = timed.get(self.naive, self.naive)  # type: ignore[arg-type]
-        naive = None if known is None else known.times(self.naive_share)  # type: ignore[union-attr]
+        seconds = interleaved(*calls, budget_s=budget_s)
+        timed: dict[object, Any] = dict(zip(calls, seconds, strict=True))
+        self.naive = known = timed.get(self.naive, self.naive)
+        naive = None if known is None else known.times(self.naive_share)
         for form in forms:
             ours = timed.get(form.ours, form.ours).times(1 / form.calls)
             yield BenchRow(

@@ -125,9 +125,8 @@ class _Pace:
     of them."""
 
     def __init__(self, expected_s: float) -> None:
-        self._whole_s = self._later_s = expected_s
-        self._part_s, self._begun_s = 0.0, time.monotonic()
-        self._part_begun_s = self._begun_s
+        self._whole_s, self._begun_s = expected_s, time.monotonic()
+        self.begin_part(0.0, expected_s)
 
     def begin_part(self, part_s: float, later_s: float) -> None:
         self._part_s, self._later_s, self._part_begun_s = part_s, later_s, time.monotonic()
@@ -202,10 +201,9 @@ def listen(task: Task) -> Iterator[TaskMessage]:
 
 def carry_out(task: Task, subject: BenchSubject, tell: Callable[[TaskMessage], None]) -> None:
     """Tell everything that a task asks for, as it becomes known."""
-    from tumortrack_lab.bench.curves import points_of
-    from tumortrack_lab.bench.machine import describe_machine, measure_peaks
+    from tumortrack_lab.bench.machine import describe_machine
 
-    threads = "one core" if task.threads == 1 else f"{task.threads} threads"
+    threads = {1: "one core"}.get(task.threads, f"{task.threads} threads")
     words = {
         "train": "training a `{}` network to measure",
         "peaks": f"the machine's own rates, {threads}",
@@ -226,20 +224,26 @@ def carry_out(task: Task, subject: BenchSubject, tell: Callable[[TaskMessage], N
         tell(TaskMessage(begins=words[kind].format(*of), expected_s=(part_s, sum(later_s))))
         if kind == "train":
             subject.train(of[0], under_way)
-        elif kind == "peaks":
-            tell(TaskMessage(peaks=measure_peaks(task.threads, 1.0 if task.quick else 3.0)))
-        elif kind == "curve":
-            for point in points_of(subject, *of):
-                tell(TaskMessage(point=point))
-        else:
-            for row in rows_of(subject, of[0], task.threads, task.budget_s(*of)):
-                tell(TaskMessage(row=row))
+            continue
+        for message in _measured(task, subject, kind, of):
+            tell(message)
 
 
-def rows_of(subject: BenchSubject, group: str, threads: int, budget_s: float) -> Iterator[BenchRow]:
-    """Of one group, as they are measured."""
-    for workload in resolve_name(f"tumortrack_lab.bench.{GROUPS[group].source}")(subject, budget_s):
-        yield from workload.rows(threads, budget_s)
+def _measured(
+    task: Task, subject: BenchSubject, kind: str, of: Sequence[str]
+) -> Iterator[TaskMessage]:
+    from tumortrack_lab.bench.curves import points_of
+    from tumortrack_lab.bench.machine import measure_peaks
+
+    if kind == "peaks":
+        yield TaskMessage(peaks=measure_peaks(task.threads, 1.0 if task.quick else 3.0))
+    elif kind == "curve":
+        yield from (TaskMessage(point=point) for point in points_of(subject, *of))
+    else:
+        workloads = resolve_name(f"tumortrack_lab.bench.{GROUPS[of[0]].source}")
+        for workload in workloads(subject, task.budget_s(*of)):
+            for row in workload.rows(task.threads, task.budget_s(*of)):
+                yield TaskMessage(row=row)
 
 
 def _work(task_json: str) -> None:
