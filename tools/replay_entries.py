@@ -28,14 +28,15 @@ from tumortrack.sense.cloud import CloudConfig
 from tumortrack.sense.files import read_cloud
 from tumortrack.sense.region import Hints, RegionConfig, organ_points
 from tumortrack.simulate.batched.stream import DeviceStream, why_not
-from tumortrack.simulate.dataset import SceneStream
-from tumortrack.simulate.scene_folder import write_scene
-from tumortrack.simulate.targets import draw_targets
+from tumortrack.simulate.scene import SceneStream
+from tumortrack.simulate.scene_folder import draw_targets
 from tumortrack.tracking.tracker import Follower, FollowerConfig, Tracker
 from tumortrack.training.model import load_model
 from tumortrack.training.presets import PRESETS, pretraining
-from tumortrack.training.pretrain import Pretraining, kidney_stream
-from tumortrack.training.train import TrainingRun, task_of, train
+from tumortrack.training.pretrain import kidney_stream
+from tumortrack.training.state import Pretraining
+from tumortrack.training.task import task_of
+from tumortrack.training.train import TrainingRun, train
 from tumortrack_lab.twin.dataset import StateCache, TwinRun
 from tumortrack_lab.twin.views import VIEWS, ViewConfig, make_scene
 
@@ -227,7 +228,7 @@ def twin(states: Path, recording: bool) -> Entries:
     state = cache.get("D1", lambda line: None)
     for view in VIEWS:
         scene, targets_mm = make_scene(state, "D1", view, ViewConfig(), 0)
-        write_scene(Path("twin", view), scene)
+        scene.write(Path("twin", view))
         yield f"{view}/targets", targets_mm
     yield from files("twin")
 

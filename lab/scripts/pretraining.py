@@ -35,10 +35,8 @@ from tumortrack.registration.rest_shape import RestShape, shape_of
 from tumortrack.report.drawing import new_figure, save
 from tumortrack.training.model import PretrainedWeights, load_start
 from tumortrack.training.presets import clinic
-from tumortrack.training.registration_task import RegistrationTask
-from tumortrack.training.run import TrainingRun
-from tumortrack.training.state import TrainingState
-from tumortrack.training.task import ValidationScenes
+from tumortrack.training.state import TrainingRun, TrainingState
+from tumortrack.training.task import RegistrationTask, ValidationScenes
 from tumortrack_lab.study import trainings
 from tumortrack_lab.study.document import ReportWriter, table
 from tumortrack_lab.study.methods import named_folders, phantom_case

@@ -35,12 +35,9 @@ from tumortrack.registration.registration import Registration
 from tumortrack.registration.rest_shape import shape_of
 from tumortrack.report.drawing import new_figure, save
 from tumortrack.simulate.scene import body_for
-from tumortrack.training.occupancy_task import label_miou
 from tumortrack.training.presets import PRESETS
-from tumortrack.training.run import TrainingRun, settle_end
-from tumortrack.training.state import TrainingState
-from tumortrack.training.task import ValidationScenes
-from tumortrack.training.train import task_of
+from tumortrack.training.state import TrainingRun, TrainingState, settle_end
+from tumortrack.training.task import ValidationScenes, label_miou, task_of
 from tumortrack_lab.study import trainings
 from tumortrack_lab.study.document import ReportWriter, table
 from tumortrack_lab.study.methods import phantom_case

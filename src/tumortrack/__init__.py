@@ -14,70 +14,40 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from tumortrack.api import (
-        Case,
-        DepthFrame,
-        Estimate,
-        Intrinsics,
-        SensorCloud,
-        estimate_from_surfaces,
-        evaluate,
-        find_organ,
-        load_case,
-        load_model,
-        plan_resection,
-        prepare,
-        read_cloud,
-        save_estimate,
-        scan_phantom,
-        simulate_scenes,
-        track,
-        train,
-    )
-    from tumortrack.core import errors
-    from tumortrack.tracking.tracker import Tracker
-    from tumortrack.training import presets
+    from tumortrack.api import *  # noqa: F403
+    from tumortrack.core import errors as errors
+    from tumortrack.core.estimate import Estimate as Estimate
+    from tumortrack.core.types import DepthFrame as DepthFrame
+    from tumortrack.core.types import Intrinsics as Intrinsics
+    from tumortrack.core.types import SensorCloud as SensorCloud
+    from tumortrack.imaging.case import Case as Case
+    from tumortrack.tracking.tracker import Tracker as Tracker
+    from tumortrack.training import presets as presets
+
+_NAMES = {  # by the module that has them
+    "api": "estimate_from_surfaces evaluate find_organ load_case load_model plan_resection prepare "
+    "read_cloud save_estimate scan_phantom simulate_scenes track train",
+    "core": "errors",
+    "core.estimate": "Estimate",
+    "core.types": "DepthFrame Intrinsics SensorCloud",
+    "imaging.case": "Case",
+    "tracking.tracker": "Tracker",
+    "training": "presets",
+}
+_HOMES = {name: home for home, names in _NAMES.items() for name in names.split()}
 
 __version__ = "0.2.0"
-__all__ = [
-    "Case",
-    "DepthFrame",
-    "Estimate",
-    "Intrinsics",
-    "SensorCloud",
-    "Tracker",
-    "errors",
-    "estimate_from_surfaces",
-    "evaluate",
-    "find_organ",
-    "load_case",
-    "load_model",
-    "plan_resection",
-    "prepare",
-    "presets",
-    "read_cloud",
-    "save_estimate",
-    "scan_phantom",
-    "simulate_scenes",
-    "track",
-    "train",
-]
-
-_ELSEWHERE = {
-    "Tracker": "tumortrack.tracking.tracker",
-    "errors": "tumortrack.core",
-    "presets": "tumortrack.training",
-}
+__all__ = sorted(_HOMES)
 
 
 def __getattr__(name: str) -> Any:
-    if name not in __all__:
+    if name not in _HOMES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    home = _ELSEWHERE.get(name, "tumortrack.api")
-    if home in ("tumortrack.core", "tumortrack.training"):
+    home = f"{__name__}.{_HOMES[name]}"
+    if name in ("errors", "presets"):
         return import_module(f"{home}.{name}")
     return getattr(import_module(home), name)
 
 
 def __dir__() -> list[str]:
-    return sorted(__all__)
+    return __all__

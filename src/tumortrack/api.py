@@ -8,8 +8,9 @@ everywhere; the CT frame is LPS, the camera frame x right, y down, z forward. Al
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, closing, contextmanager
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -17,62 +18,42 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from tumortrack.core import store
-from tumortrack.core.errors import InputError
+from tumortrack.core.errors import InputError, StorageError
 from tumortrack.core.estimate import Estimate
-from tumortrack.core.types import DepthFrame, Intrinsics, Mesh, SensorCloud
+from tumortrack.core.types import DepthFrame, Mesh, SensorCloud
 from tumortrack.imaging.case import Case
-from tumortrack.imaging.case import load_case as _load_case
+from tumortrack.imaging.case import load_case as read_case
 
 if TYPE_CHECKING:
-    from tumortrack.live.values import TrackingResult
+    from tumortrack.live.values import SinkContext, TrackingResult
+    from tumortrack.live.workers import SinkWorker
     from tumortrack.models.config import TrainConfig
     from tumortrack.models.model import Model
     from tumortrack.plan.values import ResectionPlan
+    from tumortrack.simulate.scene import SceneConfig
     from tumortrack.simulate.scene_folder import Scene
     from tumortrack.tracking.tracker import Tracker
     from tumortrack.training.train import TrainingStatus
 
-__all__ = [
-    "Case",
-    "DepthFrame",
-    "Estimate",
-    "Intrinsics",
-    "SensorCloud",
-    "estimate_from_surfaces",
-    "evaluate",
-    "find_organ",
-    "load_case",
-    "load_model",
-    "plan_resection",
-    "prepare",
-    "read_cloud",
-    "save_estimate",
-    "scan_phantom",
-    "simulate_scenes",
-    "track",
-    "train",
-]
-
 StrPath = str | Path
 Device = Literal["auto", "cpu", "cuda"]
+_TEST_BODY = 2**20  # and the seed: elastic states that training with the same seed never sees
 
 
 def scan_phantom(folder: StrPath, seed: int = 1) -> Path:
-    """Write a virtual CT of the built-in kidney phantom as a DICOM series, if none is there.
-
-    Returns the folder, which ``prepare`` reads.
+    """Write a virtual CT of the built-in kidney phantom as a DICOM series, if none is there;
+    returns the folder, which ``prepare`` reads.
 
     Raises:
         StorageError: the disk refused.
     """
-    from tumortrack.phantom.dicom import write_dicom_series
-    from tumortrack.phantom.digital import PhantomParameters, phantom_labels
-    from tumortrack.phantom.scanner import ScannerParameters, scan
+    from tumortrack.phantom import dicom, digital, scanner
 
     folder = Path(folder)
     if not folder.exists():
-        scanner = ScannerParameters(spacing_mm=(1.2, 1.2, 1.5))
-        write_dicom_series(scan(phantom_labels(PhantomParameters()), scanner, seed), folder)
+        labels = digital.phantom_labels(digital.PhantomParameters())
+        parameters = scanner.ScannerParameters(spacing_mm=(1.2, 1.2, 1.5))
+        dicom.write_dicom_series(scanner.scan(labels, parameters, seed), folder)
     return folder
 
 
@@ -82,7 +63,6 @@ def prepare(
     """A case from a DICOM folder, a CT volume, a label map or a folder of meshes.
 
     Args:
-        source: what to read.
         folder: where to write the case with a picture to check it by (qc.png); None: nowhere.
         overwrite: replace a case that lies there.
         options: fields of ``imaging.prepare.PrepareOptions``: ``kidney_hu``, ``tumor_hu``,
@@ -96,16 +76,15 @@ def prepare(
         InputError: the source cannot be used, or an option is unknown or not allowed.
         StorageError: the disk refused.
     """
+    from tumortrack.imaging import prepare as preparing
     from tumortrack.imaging.case import KIND, save_case
-    from tumortrack.imaging.prepare import PrepareOptions
-    from tumortrack.imaging.prepare import prepare as make_case
 
-    known = PrepareOptions.__dataclass_fields__
+    known = preparing.PrepareOptions.__dataclass_fields__
     if unknown := sorted(set(options) - set(known)):
         raise InputError(f"prepare knows no {unknown[0]!r}; allowed: {', '.join(known)}.")
     if folder is not None:
         store.check_place(Path(folder), KIND, overwrite)
-    case = make_case(Path(source), PrepareOptions(**options))
+    case = preparing.prepare(Path(source), preparing.PrepareOptions(**options))
     if folder is not None:
         from tumortrack.report.pictures import qc_picture
 
@@ -121,21 +100,18 @@ def load_case(folder: StrPath) -> Case:
     Raises:
         ArtifactError: missing, of another schema, or changed since.
     """
-    return _load_case(Path(folder))
+    return read_case(Path(folder))
 
 
 def simulate_scenes(
     case: Case, count: int = 1, *, seed: int = 0, elastic: bool = True, noise: bool = True
 ) -> list[Scene]:
-    """Deformed scenes with their truth, as a D405 sees them; never those that training sees.
+    """Deformed scenes with their truth, as a D405 sees them; never those that training sees. The
+    same seed gives the same scenes.
 
     Args:
-        case: whose organ.
-        count: how many.
-        seed: of the scenes; the same seed gives the same scenes.
         elastic: deform the organ as an elastic body in its bed; else drag its surface as the paper
             does (its configuration 3).
-        noise: with the depth sensor's noise.
 
     Returns:
         Scenes: ``cloud`` and ``depth`` (camera frame, mm), ``reference`` (the true surfaces),
@@ -143,26 +119,34 @@ def simulate_scenes(
     """
     from tumortrack.sense.noise import CLEAN, D405_NOISE
     from tumortrack.simulate.deform import DragConfig, ElasticConfig
-    from tumortrack.simulate.scene import SceneConfig, SceneRecipe, Simulator, body_for
-    from tumortrack.simulate.scene_folder import Scene
-    from tumortrack.simulate.targets import Targets, draw_targets
+    from tumortrack.simulate.scene import SceneConfig
 
     deform = ElasticConfig() if elastic else DragConfig()
     config = SceneConfig(deform=(deform,), noise=D405_NOISE if noise else CLEAN)
-    # Elastic states of another library than the one that training draws from.
-    body = body_for(case.anatomy, case.up_lps, config, 2**20 + seed)
+    return list(map(scene_maker(case, config, seed), range(count)))
+
+
+def scene_maker(case: Case, config: SceneConfig, seed: int) -> Callable[[int], Scene]:
+    """Makes any scene of the stream ``test`` by its number."""
+    from tumortrack.simulate.scene import SceneRecipe, Simulator, body_for
+    from tumortrack.simulate.scene_folder import Scene, draw_targets
+
+    body = body_for(case.anatomy, case.up_lps, config, _TEST_BODY + seed)
     simulator = Simulator(case.anatomy, case.up_lps, config, body)
     inner = draw_targets(case.anatomy, seed)
-    scenes = []
-    for index in range(count):
-        made = simulator.render(SceneRecipe(seed, "test", index))
+
+    def make(index: int) -> Scene:
+        recipe = SceneRecipe(seed, "test", index)
+        made = simulator.render(recipe)
         meta = {
+            "recipe": asdict(recipe),
             "camera_from_ct": made.camera_from_ct.tolist(),
-            "recipe": {"seed": seed, "stream": "test", "index": index},
+            "deformation": made.deformation.record(),
         }
-        targets = Targets(inner.points_ct, made.carry(inner.points_ct), inner.labels)
-        scenes.append(Scene(made.cloud, simulator.reference(made), made.frame, meta, targets))
-    return scenes
+        targets = inner.at(made.carry(inner.points_ct))
+        return Scene(made.cloud, simulator.reference(made), made.frame, meta, targets)
+
+    return make
 
 
 def train(
@@ -186,8 +170,6 @@ def train(
         preset: ``clinic`` registers the organ of the CT, ``quick`` and ``paper`` label points.
         config: a changed preset instead: ``msgspec.structs.replace(presets.clinic(anatomy), ...)``.
         minutes, steps: where to stop; at most one of them (default: the preset's end).
-        seed: of weights and scenes.
-        device: ``auto`` takes CUDA if it is available.
         workers: processes that make scenes (default: as the machine allows).
         report: called every few seconds.
 
@@ -196,27 +178,21 @@ def train(
         ArtifactError: no case, or ``folder`` holds another run.
         StorageError: the disk is full; the last checkpoint is whole.
     """
+    from tumortrack.training import train as training
     from tumortrack.training.presets import PRESETS
-    from tumortrack.training.train import TrainingRun
-    from tumortrack.training.train import train as fit
 
     if minutes is not None and steps is not None:
         raise InputError("minutes and steps both say when to stop; give one of them.")
     if preset not in PRESETS:
         raise InputError(f"there is no preset {preset!r}; allowed: {', '.join(PRESETS)}.")
     of = load_case(case)
-    run = TrainingRun(
-        anatomy_ct=of.anatomy,
-        up_lps=of.up_lps,
+    run = training.TrainingRun(
+        anatomy_ct=of.anatomy, up_lps=of.up_lps,
         case_sha256=store.sha256_of(Path(case) / store.MANIFEST),
         config=config or PRESETS[preset](of.anatomy, "limited"),
-        seed=seed,
-        steps=steps,
-        minutes=minutes,
-        device=device,
-        workers=workers,
-    )
-    return fit(run, Path(folder), report or (lambda status: None))
+        seed=seed, steps=steps, minutes=minutes, device=device, workers=workers,
+    )  # fmt: skip
+    return training.train(run, Path(folder), report or (lambda status: None))
 
 
 def load_model(folder: StrPath, device: Device = "auto") -> Model:
@@ -226,9 +202,9 @@ def load_model(folder: StrPath, device: Device = "auto") -> Model:
         ArtifactError: missing, unfinished, of another schema, damaged or changed.
         InputError: CUDA was asked for and is not available.
     """
-    from tumortrack.training.model import load_model as load
+    from tumortrack.training import model
 
-    return load(Path(folder), device)
+    return model.load_model(Path(folder), device)
 
 
 def read_cloud(path: StrPath, unit: Literal["mm", "m"] = "mm") -> SensorCloud:
@@ -237,10 +213,10 @@ def read_cloud(path: StrPath, unit: Literal["mm", "m"] = "mm") -> SensorCloud:
     Raises:
         InputError: missing, damaged, of another kind, in metres, or without any point.
     """
+    from tumortrack.sense import files
     from tumortrack.sense.cloud import check_cloud
-    from tumortrack.sense.files import read_cloud as read
 
-    cloud, notes = read(Path(path), unit)
+    cloud, notes = files.read_cloud(Path(path), unit)
     for note in notes:
         warnings.warn(note, stacklevel=2)
     check_cloud(cloud)
@@ -260,20 +236,18 @@ def find_organ(
     """The organ's points among table, drape, instruments and hands; camera frame, mm.
 
     Args:
-        content: a whole depth image or cloud.
         model: whose organ; gives depths and sizes to expect.
         range_mm: nearest and farthest depth to keep.
         box_mm: two opposite corners of a region of interest.
         mask: of a depth image, True where the organ may be.
         picked_mm: a point on the organ: the piece that it lies on is taken.
-        seed: of the draw of points.
 
     Raises:
         NoEstimate: nothing is left that may be the organ; says which step took the rest.
         InputError: an option that is not allowed.
     """
     from tumortrack.sense.region import Hints, organ_points
-    from tumortrack.tracking.region import region_for
+    from tumortrack.tracking.tracker import region_for
 
     region = region_for(model, range_mm=range_mm, box_mm=box_mm)
     hints = Hints(mask=mask, picked_mm=picked_mm)
@@ -294,12 +268,9 @@ def save_estimate(estimate: Estimate, folder: StrPath, overwrite: bool = False) 
 
 
 def estimate_from_surfaces(surfaces: Mapping[str, Mesh], grid: int = 160) -> Estimate:
-    """What another method says, in the form that ``evaluate`` compares.
-
-    Args:
-        surfaces: closed surfaces by part (kidney, tumor_1, ...), camera frame, mm; the kidney's
-            includes its tumors.
-        grid: voxels along the longest side of the labelled volume.
+    """What another method says, in the form that ``evaluate`` compares: closed surfaces by part
+    (kidney, tumor_1, ...), camera frame, mm; the kidney's includes its tumors. ``grid``: voxels
+    along the longest side of the labelled volume.
     """
     from tumortrack.models.report import estimate_of
 
@@ -325,15 +296,16 @@ def evaluate(
     Raises:
         InputError: no scenes, or a scene that cannot be read.
     """
-    from tumortrack.report.protocol import evaluate_scene, evaluate_scenes, summarise
+    from tumortrack.report import protocol
 
     call: Any = getattr(locate, "locate", None) or locate
     if isinstance(scenes, str | Path):
         if report is None:
             raise InputError("evaluating a folder of scenes writes a report: say where.")
-        return evaluate_scenes(call, Path(scenes), Path(report))
-    entries = [evaluate_scene(call, scene, f"{n:04d}")[0] for n, scene in enumerate(scenes)]
-    return {"scenes": entries, "summary": summarise(entries)}
+        return protocol.evaluate_scenes(call, Path(scenes), Path(report))
+    named = ((f"{n:04d}", scene) for n, scene in enumerate(scenes))
+    entries = [protocol.evaluate_scene(call, scene, name)[0] for name, scene in named]
+    return {"scenes": entries, "summary": protocol.summarise(entries)}
 
 
 def track(
@@ -348,7 +320,6 @@ def track(
     """Follow the organ live, from a source to sinks, until the source ends.
 
     Args:
-        tracker: with the model.
         source: as on the command line (``"virtual:CASE"``, ``"realsense"``, ...), or a source's
             configuration.
         sinks: likewise, or objects with ``publish(result)`` and ``close()``.
@@ -360,16 +331,18 @@ def track(
         The run's figures: counts, latencies, stage times (docs/conventions.md).
 
     Raises:
-        InputError: a source or sink that cannot be opened.
+        InputError: a source or sink that is not written as it must be, or cannot work.
+        StorageError: a sink cannot write.
+        SourceLost: no frame came for a minute.
     """
     from tumortrack.live.loop import Loop, LoopConfig, summary
-    from tumortrack.live.spec import SINKS, SOURCES
-    from tumortrack.live.values import PublishedFrame, SinkConfig, SinkContext
-    from tumortrack.live.workers import SinkWorker, SourceWorker
-    from tumortrack.tracking.region import region_for
+    from tumortrack.live.spec import SOURCES
+    from tumortrack.live.values import PublishedFrame, SinkContext
+    from tumortrack.live.workers import SourceWorker
+    from tumortrack.tracking.tracker import region_for
 
     config = SOURCES.parse(source) if isinstance(source, str) else source
-    made_sinks = [SINKS.parse(sink) if isinstance(sink, str) else sink for sink in sinks]
+    named = named_sinks(sinks)
     context = SinkContext(tracker.model.parts, PublishedFrame(), tracker.anatomy_ct)
     region = region_for(tracker.model, range_mm=range_mm)
     loop = Loop(tracker, context, LoopConfig(region=region, seconds=seconds))
@@ -379,18 +352,55 @@ def track(
         if until is not None and until(result):
             loop.stop()
 
+    with open_sinks(named, context) as workers, closing(SourceWorker(config.open)) as reader:
+        loop.run(reader, workers, seen)
+    return summary(loop, reader, workers)
+
+
+def named_sinks(sinks: Sequence[Any]) -> dict[str, Any]:
+    """Sinks, or their configurations, by the names that reports give them.
+
+    Raises:
+        InputError: one is not written as it must be, or is given twice.
+    """
+    from tumortrack.live.spec import SINKS
+
+    named: dict[str, Any] = {}
+    for number, sink in enumerate(sinks):
+        name = sink if isinstance(sink, str) else f"sink {number}"
+        if name in named:
+            raise InputError(f"sink {name!r} is given twice.")
+        named[name] = SINKS.parse(sink) if isinstance(sink, str) else sink
+    return named
+
+
+@contextmanager
+def open_sinks(sinks: Mapping[str, Any], context: SinkContext) -> Iterator[list[SinkWorker]]:
+    """``named_sinks``, each at work in a thread of its own.
+
+    Raises:
+        InputError: a sink cannot work.
+        StorageError: a sink cannot write.
+    """
+    from tumortrack.live.values import SinkConfig
+    from tumortrack.live.workers import SinkWorker
+
+    def waiting(sink: Any) -> int:
+        return sink.queue_size if isinstance(sink, SinkConfig) else 1
+
+    workers: list[SinkWorker] = []
     with ExitStack() as stack:
-        workers = []
-        for number, (sink, made) in enumerate(zip(sinks, made_sinks, strict=True)):
-            name = sink if isinstance(sink, str) else f"sink {number}"
-            waiting = made.queue_size if isinstance(made, SinkConfig) else 1
-            opened = made.open(context) if isinstance(made, SinkConfig) else made
-            workers.append(SinkWorker(name, opened, waiting))
+        # Those that make a folder last: if another cannot open, none is left behind.
+        for name, sink in sorted(sinks.items(), key=lambda pair: waiting(pair[1])):
+            try:
+                opened = sink.open(context) if isinstance(sink, SinkConfig) else sink
+            except OSError as error:  # a sink of another package that does not translate it
+                raise StorageError(
+                    f"sink {name!r} cannot be opened: {error.strerror}: {error.filename}."
+                ) from error
+            workers.append(SinkWorker(name, opened, waiting(sink)))
             stack.callback(workers[-1].close)
-        source_worker = SourceWorker(config.open)
-        stack.callback(source_worker.close)
-        loop.run(source_worker, workers, seen)
-    return summary(loop, source_worker, workers)
+        yield workers
 
 
 def plan_resection(
@@ -407,7 +417,7 @@ def plan_resection(
             camera is taken to look straight down on the table.
         picture: PNG file to draw the plan into.
         stand_mm: height of the organ's lowest point over the table.
-        options: fields of ``plan.config.ResectionConfig``: ``tumor``, ``method`` (``margin`` or
+        options: fields of ``plan.values.ResectionConfig``: ``tumor``, ``method`` (``margin`` or
             ``published``), ``margin_mm``, ``sigmas`` and others.
 
     Returns:
@@ -418,19 +428,19 @@ def plan_resection(
         InputError: no such tumor, or an option that is not allowed.
     """
     from tumortrack.core.config import from_builtins
-    from tumortrack.plan.config import ResectionConfig
-    from tumortrack.plan.located import STAND_MM, read_run, table_below
-    from tumortrack.plan.located import located as in_table_frame
-    from tumortrack.plan.resection import plan_resection as make_plan
+    from tumortrack.plan import located as places
+    from tumortrack.plan import resection
+    from tumortrack.plan.values import ResectionConfig
 
     config = from_builtins(options, ResectionConfig, "plan_resection")
-    run = located if isinstance(located, Estimate) else read_run(Path(located))
-    table_from_camera = table_below(run.cloud.points_mm, STAND_MM if stand_mm is None else stand_mm)
+    run = located if isinstance(located, Estimate) else places.read_run(Path(located))
+    stand_mm = places.STAND_MM if stand_mm is None else stand_mm
+    table_from_camera = places.table_below(run.cloud.points_mm, stand_mm)
     if isinstance(run, Estimate):
-        seen = in_table_frame(run.cloud, run.meshes, run.motion, table_from_camera)
+        seen = places.located(run.cloud, run.meshes, run.motion, table_from_camera)
     else:
         seen = run.located(table_from_camera)
-    plan = make_plan(seen, config)
+    plan = resection.plan_resection(seen, config)
     if picture is not None:
         from tumortrack.report.plan_pictures import draw_plan
 

@@ -27,7 +27,6 @@ from tumortrack.core.types import (
     Intrinsics,
     LabelVolume,
     Mesh,
-    OccupancySamples,
     SensorCloud,
     Volume,
 )
@@ -157,7 +156,6 @@ def test_values_are_frozen_and_copies():
         lambda: LabelVolume(np.full((2, 2, 2), 257), np.eye(4)),
         lambda: LabelVolume(np.full((2, 2, 2), 0.5), np.eye(4)),
         lambda: SensorCloud([[0, 0, np.inf]]),
-        lambda: OccupancySamples(np.zeros((3, 3)), [0, 1]),
         lambda: Intrinsics(10, 10, 0, 5, 5, 5),
         lambda: Intrinsics(10, 10, 5, 5, np.nan, 5),
         lambda: Intrinsics(0, 10, 5, 5, 5, 5),

@@ -16,7 +16,7 @@ from tumortrack.core.types import Anatomy, Mesh, SensorCloud
 from tumortrack.imaging.meshes import mesh_of, solid_of
 from tumortrack.plan.located import located
 from tumortrack.plan.resection import plan_resection
-from tumortrack.simulate.scene_folder import Scene, write_scene
+from tumortrack.simulate.scene_folder import Scene
 from tumortrack_lab.cut import cut
 from tumortrack_lab.peers.base import Fit, estimate_of, rigid_carry
 from tumortrack_lab.study.document import ReportWriter
@@ -136,8 +136,8 @@ def case(tmp_path_factory):
     cloud = SensorCloud(truth.organ.vertices_mm[truth.organ.vertices_mm[:, 2] < 120])
     for variant in ("D0", "D1"):
         meta = {"camera_from_bench": CAMERA_FROM_TABLE.tolist()}
-        write_scene(root / "scenes" / f"{variant}-noise", Scene(cloud, truth, None, meta))
-    write_scene(root / "scenes" / "G1-noise", Scene(cloud, truth))
+        Scene(cloud, truth, None, meta).write(root / "scenes" / f"{variant}-noise")
+    Scene(cloud, truth).write(root / "scenes" / "G1-noise")
     return StudyCase("balls", root / "case", root / "scenes", kidney(), (0.0, 0.0, 1.0))
 
 

@@ -14,7 +14,7 @@ from tumortrack.core.geometry import rigid, transform_points
 from tumortrack.sense.camera import project
 from tumortrack.sense.noise import CLEAN, D405_NOISE
 from tumortrack.sense.render import render_depth
-from tumortrack.simulate.targets import draw_targets
+from tumortrack.simulate.scene_folder import draw_targets
 from tumortrack_lab.study.measure import MeasurementSpec
 from tumortrack_lab.study.methods import Network, StudyCase, peer_method
 from tumortrack_lab.study.plan import FULL, QUICK, Methods, jobs_of, scenes_of

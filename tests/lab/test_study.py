@@ -25,7 +25,7 @@ from tumortrack.simulate.deform.drag import CONFIGURATIONS
 from tumortrack.simulate.elastic.body import BodyConfig, build_body
 from tumortrack.simulate.occupancy import OccupancyConfig
 from tumortrack.simulate.scene import SceneConfig, SceneRecipe, Simulator
-from tumortrack.simulate.scene_folder import Scene, write_scene
+from tumortrack.simulate.scene_folder import Scene
 from tumortrack.training.presets import clinic, quick
 from tumortrack_lab.peers.base import Fit, estimate_of, rigid_carry
 from tumortrack_lab.peers.kinds import peer_kinds
@@ -80,7 +80,7 @@ def case(tmp_path):
         truth = moved(anatomy(), CAMERA_FROM_CT)
         points = truth.organ.vertices_mm
         cloud = SensorCloud(points[points[:, 2] < 120])
-        write_scene(tmp_path / "scenes" / f"{variant}-clean", Scene(cloud, truth))
+        Scene(cloud, truth).write(tmp_path / "scenes" / f"{variant}-clean")
     return StudyCase("balls", folder, tmp_path / "scenes", anatomy(), (0.0, -1.0, 0.0), True)
 
 
@@ -331,7 +331,7 @@ def phantom(tmp_path_factory):
     for number, variant in enumerate(("D0", "D1")):
         stage = simulator.render(SceneRecipe(3, "test", number))
         scene = Scene(stage.cloud, simulator.reference(stage), stage.frame)
-        write_scene(root / "scenes" / f"{variant}-clean", scene)
+        scene.write(root / "scenes" / f"{variant}-clean")
     return study_case("phantom", root / "case", root / "scenes", is_paper=True)
 
 

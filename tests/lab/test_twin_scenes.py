@@ -28,8 +28,7 @@ from tumortrack.report.metrics import label_grid
 from tumortrack.report.protocol import evaluate_scenes
 from tumortrack.sense.camera import deproject
 from tumortrack.simulate.occupancy import contains, labels_of
-from tumortrack.simulate.scene_folder import list_scenes, read_scene
-from tumortrack.simulate.targets import draw_targets
+from tumortrack.simulate.scene_folder import draw_targets, list_scenes, read_scene
 from tumortrack_lab.twin import dataset
 from tumortrack_lab.twin.apparatus import State
 from tumortrack_lab.twin.dataset import TwinRun, make_scenes

@@ -14,7 +14,8 @@ from depth_files import write_depth_png, write_intrinsics
 from extension_objects import EXAMPLE, distribution, installed_example
 from live_objects import small_frame, small_setting, small_update
 from stories import COMMAND, environment, succeeded
-from tumortrack.core.errors import InputError
+from tumortrack.api import named_sinks, open_sinks
+from tumortrack.core.errors import InputError, StorageError
 from tumortrack.live.spec import SINKS, SOURCES, extensions
 from tumortrack.live.values import Sink, Source
 
@@ -64,6 +65,17 @@ def test_an_installed_package_adds_a_sink(example, tmp_path):
     assert kidney.split(",")[1:3] == ["good", "kidney"]
     x, y, z = map(float, tumor.split(",")[3:])
     np.testing.assert_allclose([x, y, z], small_update().center_mm("tumor_1"), atol=0.051)
+
+
+def test_a_sink_that_cannot_open_its_file_is_a_clear_line(example, tmp_path):
+    named = named_sinks([f"csv:{tmp_path}/missing/centres.csv"])
+    with (
+        pytest.raises(StorageError, match=r"sink 'csv:.*cannot be opened: No such file.*centres"),
+        open_sinks(named, small_setting()),
+    ):
+        pass
+    with pytest.raises(InputError, match="sink 'viewer' is given twice"):
+        named_sinks(["viewer", "viewer"])
 
 
 def test_track_uses_it_by_its_text(phantom_case, clinic_model, tmp_path):

@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 from arm_objects import CREEPING_MRAD, bare, flange_pose, nearest_mm, organ, plan
 from tumortrack.core.errors import InputError, NoPlan
 from tumortrack.core.geometry import transform_points
-from tumortrack.plan.arms import kinematics, trajectory, urdf
+from tumortrack.plan.arms import body, kinematics, trajectory
 from tumortrack.plan.arms.cell import ArmCell, Blocked, PlanningGroup
 from tumortrack.plan.arms.config import Base, CellConfig
 from tumortrack.plan.arms.paths import connect
@@ -60,7 +60,7 @@ def test_three_sources_of_kinematics_agree(model):
     import pinocchio as pin
     import ur_analytic_ik
 
-    built = pin.buildModelFromXML(urdf.cell_urdf(CellConfig(cutter_model=model.name)))
+    built = pin.buildModelFromXML(body.cell_urdf(CellConfig(cutter_model=model.name)))
     data = built.createData()
     base, flange = (built.getFrameId(f"cutter_{link}") for link in ("base_link", "flange"))
     for joints in np.random.default_rng(1).uniform(-np.pi, np.pi, (50, 6)):
@@ -113,7 +113,7 @@ def test_turns_by_whole_turns_stay_within_limits():
 def test_the_cell_s_description_names_the_joints_and_agrees_with_the_numbers(cell):
     import pinocchio as pin
 
-    text = urdf.cell_urdf(cell.config)
+    text = body.cell_urdf(cell.config)
     root = ET.fromstring(text)
     links = [link.get("name") for link in root.iter("link")]
     children = [joint.find("child").get("link") for joint in root.iter("joint")]

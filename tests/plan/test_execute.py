@@ -17,10 +17,10 @@ from live_objects import small_update
 from plan_objects import MIDDLE_MM, RADIUS_MM, TUMOR_MM, located, sphere
 from tumortrack.core.errors import InputError, NoPlan
 from tumortrack.live.values import TrackingResult
-from tumortrack.plan.config import ResectionConfig
 from tumortrack.plan.motions import ABORTED, DONE, JOINTS, Execution, Motions, MotionStage
 from tumortrack.plan.operation import Operation, OperationConfig, Planned, ResectionProgress
 from tumortrack.plan.resection import plan_resection
+from tumortrack.plan.values import ResectionConfig
 
 STATES = ("approach", "grasp", "hold", "sweep 1", "sweep 2", "release", "home")
 FRAME_S = 1 / 30

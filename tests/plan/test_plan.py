@@ -12,11 +12,10 @@ from plan_objects import HALF_MM, MIDDLE_MM, RADIUS_MM, TUMOR_MM, located, spher
 from tumortrack.core.errors import InputError, NoPlan
 from tumortrack.core.types import Anatomy, Mesh
 from tumortrack.imaging.meshes import mesh_of, solid_of
-from tumortrack.plan.config import ResectionConfig
 from tumortrack.plan.files import as_builtins, from_plain
 from tumortrack.plan.outline import arcs, concave_hull, evenly, grown, polygon_of
 from tumortrack.plan.resection import exophytic_shares, inside, plan_resection
-from tumortrack.plan.values import CutLayer, Located
+from tumortrack.plan.values import CutLayer, Located, ResectionConfig
 from tumortrack_lab.cut import cut as cut_out
 
 PUBLISHED, OURS = ResectionConfig(method="published"), ResectionConfig()

@@ -20,7 +20,7 @@ from tumortrack.core.types import SensorCloud
 from tumortrack.sense.ply import write_cloud_ply
 from tumortrack.simulate.occupancy import labels_of, surface_distance
 from tumortrack.simulate.scene import SceneRecipe, Simulator, body_for
-from tumortrack.simulate.targets import draw_targets
+from tumortrack.simulate.scene_folder import draw_targets
 from tumortrack.tracking.tracker import Tracker
 from tumortrack.training.model import load_model, save_model
 from warp_objects import ANATOMY, shape, slim_clinic

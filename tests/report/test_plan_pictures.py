@@ -18,9 +18,15 @@ from tumortrack.live.values import Polyline, RigidShape, Workcell
 from tumortrack.plan.motions import Motions, MotionStage
 from tumortrack.plan.values import Cut, CutLayer, Located, ResectionPlan
 from tumortrack.report.film import film, moments_s, tube
-from tumortrack.report.organ_surfaces import organ_surfaces, parted, skin, within
-from tumortrack.report.plan_pictures import draw_plan, plan_figure
+from tumortrack.report.plan_pictures import (
+    draw_plan,
+    organ_surfaces,
+    parted,
+    plan_figure,
+    skin,
+)
 from tumortrack.report.renderer import Body, Viewpoint, corner_normals, render
+from tumortrack.simulate.occupancy import contains
 
 CENTRE, RADII = np.array([0.0, 0.0, 145.0]), np.array([55.0, 30.0, 25.0])
 TUMOR, TUMOR_MM = np.array([18.0, -6.0, 163.0]), 14.0
@@ -90,7 +96,7 @@ def test_strokes_and_tumor_are_drawn_where_they_are(plan: ResectionPlan, located
         (panel, cut.sweep): np.mean(
             [
                 (np.abs(colour_at(panel, p, 3) - sweep_colour(cut.sweep, 2)).max(1) < 30).any()
-                for p in cut.path_mm[within(cut, located.meshes["kidney"])]
+                for p in cut.path_mm[contains(located.meshes["kidney"], cut.path_mm)]
             ]
         )
         for panel in (0, 1)
@@ -113,13 +119,6 @@ def test_the_piece_and_the_rest_are_the_organ(located: Located) -> None:
     assert piece.box_mm[1, 0] == pytest.approx(CENTRE[0])
     quarter, _ = parted(ball, (CutLayer(CENTRE[2], np.inf, (half[::-1],)),))  # either way round
     assert quarter.volume_mm3 == pytest.approx(ball.volume_mm3 / 4, rel=1e-3)
-
-
-def test_which_points_of_a_stroke_lie_in_the_organ() -> None:
-    path = np.stack([np.linspace(-80, 80, 161), np.zeros(161), np.full(161, CENTRE[2])], axis=1)
-    found = within(Cut(1, path), ellipsoid(CENTRE, RADII, 4))
-    np.testing.assert_allclose(path[found, 0][[0, -1]], [-55, 55], atol=1.0)
-    assert found.sum() == pytest.approx(110, abs=2)
 
 
 def test_the_same_plan_is_the_same_file(
@@ -258,10 +257,10 @@ def workcells(plan: ResectionPlan) -> list[Workcell]:
 def test_the_film_shows_every_frame_and_what_moves(
     workcells: list[Workcell], located: Located, tmp_path: Path
 ) -> None:
-    told: list[tuple[int, int]] = []
+    told: list[int] = []
     path = tmp_path / "film.gif"
-    film(iter(workcells), located, path, 20, (320, 240), lambda *done: told.append(done))
-    assert told == [(n, 6) for n in range(1, 7)]
+    film(iter(workcells), located, path, (320, 240), lambda: told.append(1))
+    assert len(told) == 6
     pictures, lasting = [], []
     with Image.open(path) as gif:
         assert (gif.n_frames, gif.size, gif.info["loop"]) == (6, (320, 240), 0)  # type: ignore[attr-defined]
@@ -269,7 +268,7 @@ def test_the_film_shows_every_frame_and_what_moves(
             gif.seek(n)
             lasting.append(gif.info["duration"])
             pictures.append(np.asarray(gif.convert("RGB")).astype(int))
-    assert lasting == [50] * 5 + [1550]
+    assert lasting == [100] * 5 + [1600]
     moved = np.stack([(a != b).any(2) for a, b in pairwise(pictures)])
     assert (moved.sum((1, 2)) > 50).all()
     assert moved[:, 45:130, :100].sum() < 0.02 * moved.sum()  # the holder stands still
@@ -316,8 +315,6 @@ def test_every_stage_has_its_moments() -> None:
     ("change", "said"),
     [
         ({"path": "film.mp4"}, "animated GIF"),
-        ({"fps": 0}, "allowed: 1 to 50"),
-        ({"size": (100, 480)}, "allowed: 160"),
         ({"frames": []}, "no frame"),
         ({"frames": [Workcell("approach")]}, "nothing to film"),
     ],

@@ -16,9 +16,8 @@ from tumortrack.sense.clutter import ClutterConfig
 from tumortrack.sense.noise import D405_NOISE, CalibrationConfig, miscalibrate
 from tumortrack.sense.occlusion import OcclusionConfig, occlude
 from tumortrack.simulate import scene as scene_module
-from tumortrack.simulate.dataset import SceneStream
 from tumortrack.simulate.occupancy import OccupancyConfig, OccupancyPool
-from tumortrack.simulate.scene import SceneConfig, SceneRecipe, Simulator
+from tumortrack.simulate.scene import SceneConfig, SceneRecipe, SceneStream, Simulator
 from tumortrack.training.presets import paper, quick
 
 HIDING = OcclusionConfig(scenes=1.0, largest_share=0.6)

@@ -17,11 +17,9 @@ from tumortrack.cli.cases import Simulate
 from tumortrack.core.config import from_builtins, to_builtins
 from tumortrack.core.errors import InputError
 from tumortrack.core.types import Anatomy, Mesh
-from tumortrack.simulate.dataset import SceneStream
 from tumortrack.simulate.deform import ChainConfig, DragConfig, ElasticConfig, StretchConfig
 from tumortrack.simulate.deform.base import View
 from tumortrack.simulate.elastic.body import ElasticBody, build_body
-from tumortrack.simulate.elastic.equilibrium import KPA, ReducedModel, ReducedProblem
 from tumortrack.simulate.elastic.finite import (
     CORNERS,
     BlockCholesky,
@@ -29,11 +27,23 @@ from tumortrack.simulate.elastic.finite import (
     LatticeSolid,
     cube_stiffness,
 )
-from tumortrack.simulate.elastic.loads import LOADS, expand, in_bed, press, random_state, weigh
-from tumortrack.simulate.elastic.modes import modes_of, patches_of, random_loads
+from tumortrack.simulate.elastic.loads import (
+    KPA,
+    LOADS,
+    ReducedProblem,
+    in_bed,
+    random_state,
+)
+from tumortrack.simulate.elastic.modes import ReducedModel, modes_of, patches_of, random_loads
 from tumortrack.simulate.occupancy import OccupancyConfig, OccupancyPool
-from tumortrack.simulate.pose import PoseConfig
-from tumortrack.simulate.scene import SceneConfig, SceneRecipe, Simulator, body_for
+from tumortrack.simulate.scene import (
+    PoseConfig,
+    SceneConfig,
+    SceneRecipe,
+    SceneStream,
+    Simulator,
+    body_for,
+)
 
 ANATOMY = organ()
 ORGAN = ANATOMY.organ
@@ -202,7 +212,7 @@ def bed(
 def test_a_plate_flattens_the_organ_against_its_bed(reduced):
     problem, up, patches = bed(reduced), np.array(UP), reduced.patches
     top = float((patches.points_mm @ up).max())
-    press(problem, up, top - 8.0, (patches.normals @ up > 0).astype(float))
+    problem.press(up, top - 8.0, (patches.normals @ up > 0).astype(float))
     z = problem.equilibrium()
     assert z is not None
     rise = reduced.along(up) @ z
@@ -228,7 +238,7 @@ def test_weight_that_is_no_longer_borne_makes_the_organ_sink_and_flatten(reduced
     up, patches, sunk = np.array(UP), reduced.patches, []
     for modulus in (3 * KPA, 30 * KPA):
         problem = bed(reduced, 2.0, modulus)
-        weigh(problem, -up, 1.0)
+        problem.weigh(-up, 1.0)
         z = problem.equilibrium()
         rise = reduced.along(up) @ z
         above = rise[patches.normals @ up > 0.8].mean()
@@ -245,7 +255,7 @@ def test_weight_that_is_no_longer_borne_makes_the_organ_sink_and_flatten(reduced
 @pytest.mark.parametrize("strain", [-0.02, 0.02])
 def test_swelling_changes_the_volume_by_what_is_taken_up(reduced, solid, modes, strain):
     problem = bed(reduced, 0.1)
-    expand(problem, strain)
+    problem.expand(strain)
     state = problem.equilibrium()[: reduced.n_modes]
     field = solid.spread(modes)
     lattice = solid.lattice

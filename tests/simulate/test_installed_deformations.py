@@ -56,7 +56,7 @@ assert "shifting" not in sys.modules  # imported when a configuration is read
 from render_objects import anatomy
 from tumortrack.core.config import from_builtins, to_builtins
 from tumortrack.simulate.batched.stream import why_not
-from tumortrack.simulate.dataset import SceneStream
+from tumortrack.simulate.scene import SceneStream
 from tumortrack.simulate.occupancy import OccupancyPool
 from tumortrack.simulate.scene import SceneConfig, SceneRecipe, Simulator, body_for
 
@@ -77,7 +77,7 @@ for index in range(16):
         moved = scene.deformation.apply(organ.organ.vertices_mm) - organ.organ.vertices_mm
         np.testing.assert_allclose(moved.mean(0), records[-1]["way_mm"], atol=1e-4)
         assert np.abs(moved).max() <= 9.001
-        assert simulator.pair(SceneRecipe(0, "test", index), pool).samples.labels.max() > 0
+        assert simulator.pair(SceneRecipe(0, "test", index), pool)[2].max() > 0
 kinds = {record["kind"] for record in records}
 assert kinds == {"shift", "chain"}, kinds
 print("used")

@@ -9,7 +9,7 @@ import trimesh
 from tumortrack.core.errors import InputError
 from tumortrack.core.mesh_files import write_mesh
 from tumortrack.core.types import Anatomy, DepthFrame, Intrinsics, Mesh, SensorCloud
-from tumortrack.simulate.scene_folder import Scene, list_scenes, read_scene, write_scene
+from tumortrack.simulate.scene_folder import Scene, list_scenes, read_scene
 
 
 def ball(radius_mm, center_mm):
@@ -44,7 +44,7 @@ def foreign_scene(folder, kidney, *tumors):
 
 def test_round_trip(tmp_path):
     scene = make_scene()
-    write_scene(tmp_path / "a", scene)
+    scene.write(tmp_path / "a")
     again = read_scene(tmp_path / "a")
     np.testing.assert_array_equal(again.cloud.points_mm, scene.cloud.points_mm)
     assert again.cloud.stamp_ns == 7_000
@@ -58,7 +58,7 @@ def test_round_trip(tmp_path):
 
 
 def test_depth_is_optional(tmp_path):
-    write_scene(tmp_path / "a", make_scene(depth=False))
+    make_scene(depth=False).write(tmp_path / "a")
     assert read_scene(tmp_path / "a").depth is None
 
 
@@ -88,13 +88,13 @@ def test_a_tumor_that_sticks_out_becomes_part_of_the_organ(tmp_path):
 def test_our_own_meta_says_that_the_organ_is_whole(tmp_path):
     scene = make_scene(depth=False)
     out = Scene(scene.cloud, Anatomy((scene.reference.organ, ball(10, (26, 2, 140)))))
-    write_scene(tmp_path / "a", out)
+    out.write(tmp_path / "a")
     assert len(read_scene(tmp_path / "a").reference.organ.faces) == len(out.reference.organ.faces)
 
 
 def test_scenes_are_listed_by_name(tmp_path):
     for name in ("scene_10", "scene_02", "scene_01"):
-        write_scene(tmp_path / name, make_scene(depth=False))
+        make_scene(depth=False).write(tmp_path / name)
     (tmp_path / "notes").mkdir()
     (tmp_path / ".scene_03.x.part").mkdir()
     (tmp_path / "readme.txt").write_text("not a scene")
@@ -105,14 +105,14 @@ def test_a_failing_write_leaves_nothing(tmp_path):
     scene = make_scene()
     broken = Scene(scene.cloud, scene.reference, scene.depth, {"bad": float("nan")})
     with pytest.raises(ValueError, match="JSON"):
-        write_scene(tmp_path / "a", broken)
+        broken.write(tmp_path / "a")
     assert list(tmp_path.iterdir()) == []
 
 
 def test_nothing_is_overwritten(tmp_path):
-    write_scene(tmp_path / "a", make_scene())
+    make_scene().write(tmp_path / "a")
     with pytest.raises(InputError, match="exists already"):
-        write_scene(tmp_path / "a", make_scene())
+        make_scene().write(tmp_path / "a")
 
 
 def open_surface(folder):
@@ -143,7 +143,7 @@ def metres(folder):
 )
 def test_broken_scenes_are_refused(tmp_path, spoil, message):
     folder = tmp_path / "scene"
-    write_scene(folder, make_scene())
+    make_scene().write(folder)
     assert json.loads((folder / "meta.json").read_text())["units"] == "mm"
     spoil(folder)
     with pytest.raises(InputError, match=message):

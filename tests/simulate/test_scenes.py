@@ -14,11 +14,16 @@ from tumortrack.sense.camera import deproject
 from tumortrack.sense.cloud import CloudConfig
 from tumortrack.sense.clutter import ClutterConfig
 from tumortrack.sense.noise import D405_NOISE
-from tumortrack.simulate.dataset import SceneStream
 from tumortrack.simulate.deform import DragConfig, RestConfig
 from tumortrack.simulate.occupancy import OccupancyConfig, OccupancyPool
-from tumortrack.simulate.pose import PoseConfig
-from tumortrack.simulate.scene import STREAMS, SceneConfig, SceneRecipe, Simulator
+from tumortrack.simulate.scene import (
+    STREAMS,
+    PoseConfig,
+    SceneConfig,
+    SceneRecipe,
+    SceneStream,
+    Simulator,
+)
 
 ANATOMY = anatomy()
 UP = (0.0, -1.0, 0.0)
@@ -43,10 +48,9 @@ def recipe(index, stream="train", seed=5):
 
 
 def same(one, two):
-    return (
-        np.array_equal(one.cloud.points_mm, two.cloud.points_mm)
-        and np.array_equal(one.samples.points_mm, two.samples.points_mm)
-        and np.array_equal(one.samples.labels, two.samples.labels)
+    (scene, *samples), (other, *others) = one, two
+    return np.array_equal(scene.cloud.points_mm, other.cloud.points_mm) and all(
+        map(np.array_equal, samples, others)
     )
 
 
@@ -56,13 +60,13 @@ def test_a_recipe_replays_bit_for_bit(pool):
     for i in (3, 0, 2, 1):  # in any order
         assert same(first[i], two.pair(recipe(i), pool))
         np.testing.assert_array_equal(
-            two.render(recipe(i)).cloud.points_mm, first[i].cloud.points_mm
+            two.render(recipe(i)).cloud.points_mm, first[i][0].cloud.points_mm
         )
 
 
 def test_every_seed_stream_and_index_is_a_scene_of_its_own(simulator, pool):
     recipes = [recipe(i, stream, s) for i in (0, 1) for stream in STREAMS for s in (0, 1)]
-    clouds = [simulator.pair(r, pool).cloud.points_mm for r in recipes]
+    clouds = [simulator.pair(r, pool)[0].cloud.points_mm for r in recipes]
     firsts = {tuple(cloud[0]) for cloud in clouds}
     states = {str(r.generator(a).bit_generator.state) for r in recipes for a in (0, 1)}
     assert len(firsts) == len(recipes) == 12
@@ -129,17 +133,17 @@ def test_the_share_of_free_scenes_is_as_asked():
 
 
 def test_labelled_points_lie_in_the_scene_as_the_reference_does(simulator, pool):
-    pair, scene = simulator.pair(recipe(3), pool), simulator.render(recipe(3))
+    scene, points_mm, labels = simulator.pair(recipe(3), pool)
     reference = simulator.reference(scene)
     for label, part in enumerate(reference.parts, start=1):
-        own = pair.samples.points_mm[pair.samples.labels == label]
+        own = points_mm[labels == label]
         lower, upper = part.box_mm
         assert len(own) >= 40
         assert (own > lower - 0.5).all()
         assert (own < upper + 0.5).all()
     assert reference.names == ("kidney", "tumor_1", "tumor_2")
     assert reference.organ.volume_mm3 == pytest.approx(ANATOMY.organ.volume_mm3, rel=0.1)
-    cloud = pair.cloud.points_mm
+    cloud = scene.cloud.points_mm
     assert (cloud > reference.organ.box_mm[0] - 0.1).all()
     assert (cloud < reference.organ.box_mm[1] + 0.1).all()
 
@@ -201,10 +205,10 @@ def test_a_batch_holds_its_recipes(pool):
     simulator = Simulator(ANATOMY, UP, TINY)
     assert batch.clouds_mm.shape == (3, 200, 3)
     for row, index in enumerate((6, 7, 8)):
-        pair = simulator.pair(recipe(index), pool)
-        np.testing.assert_array_equal(batch.clouds_mm[row], pair.cloud.points_mm)
-        np.testing.assert_array_equal(batch.points_mm[row], pair.samples.points_mm)
-        np.testing.assert_array_equal(batch.labels[row], pair.samples.labels)
+        scene, points_mm, labels = simulator.pair(recipe(index), pool)
+        np.testing.assert_array_equal(batch.clouds_mm[row], scene.cloud.points_mm)
+        np.testing.assert_array_equal(batch.points_mm[row], points_mm)
+        np.testing.assert_array_equal(batch.labels[row], labels)
 
 
 def test_batches_do_not_depend_on_who_asks(pool):
@@ -224,8 +228,8 @@ def test_small_clouds_repeat_their_points(pool):
     config = SceneConfig(width=160, height=90, occupancy=SMALL, cloud=CloudConfig(n_points=wanted))
     (cloud,) = stream(pool, config, size=1).batch(0).clouds_mm
     unique, count = np.unique(cloud, axis=0, return_counts=True)
-    pair = Simulator(ANATOMY, UP, config).pair(recipe(0), pool)
+    drawn = Simulator(ANATOMY, UP, config).render(recipe(0)).cloud.points_mm
     assert cloud.shape == (wanted, 3)
-    assert 200 <= len(pair.cloud.points_mm) < wanted
-    np.testing.assert_array_equal(unique, np.unique(pair.cloud.points_mm, axis=0))
+    assert 200 <= len(drawn) < wanted
+    np.testing.assert_array_equal(unique, np.unique(drawn, axis=0))
     assert np.ptp(count) <= 1

@@ -11,10 +11,10 @@ from scipy.stats import kstest
 from render_objects import anatomy, sphere
 from tumortrack.core.errors import TumortrackError
 from tumortrack.core.geometry import direction_lps, transform_points
+from tumortrack.simulate.deform import RestConfig
 from tumortrack.simulate.deform.base import View
-from tumortrack.simulate.deform.chain import RestConfig
 from tumortrack.simulate.deform.drag import CONFIGURATIONS, DragConfig, Drags, _centres
-from tumortrack.simulate.pose import PoseConfig, _turn, sample_pose
+from tumortrack.simulate.scene import PoseConfig, _turn, sample_pose
 
 ANATOMY = anatomy()
 ORGAN = ANATOMY.organ

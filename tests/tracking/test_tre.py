@@ -29,8 +29,13 @@ from tumortrack.report.page import target_text
 from tumortrack.report.protocol import evaluate_scene, evaluate_scenes, summarise, summary_table
 from tumortrack.sense.camera import d405
 from tumortrack.simulate.occupancy import labels_of
-from tumortrack.simulate.scene_folder import Scene, read_scene, write_scene
-from tumortrack.simulate.targets import Targets, draw_targets, read_targets
+from tumortrack.simulate.scene_folder import (
+    Scene,
+    Targets,
+    draw_targets,
+    read_scene,
+    read_targets,
+)
 from tumortrack_lab.twin.faults import faulty
 from tumortrack_lab.twin.views import ViewConfig
 
@@ -107,13 +112,13 @@ def test_a_negative_seed_is_refused():
 
 def test_targets_come_back_from_a_scenes_folder(tmp_path):
     made = scene()
-    write_scene(tmp_path / "scene", made)
+    made.write(tmp_path / "scene")
     back = read_scene(tmp_path / "scene").targets
     np.testing.assert_allclose(back.points_ct, made.targets.points_ct, atol=6e-6)
     np.testing.assert_allclose(back.points_mm, made.targets.points_mm, atol=6e-6)
     np.testing.assert_array_equal(back.labels, made.targets.labels)
     assert np.bincount(back.labels).tolist() == [0, 100, 100]
-    write_scene(tmp_path / "without", scene(with_targets=False))
+    scene(with_targets=False).write(tmp_path / "without")
     assert read_scene(tmp_path / "without").targets is None
 
 
@@ -145,7 +150,7 @@ def test_targets_of_other_programs_are_read(tmp_path):
     ],
 )
 def test_broken_targets_are_refused_with_their_scene(tmp_path, text, words):
-    write_scene(tmp_path / "scene", scene(with_targets=False))
+    scene(with_targets=False).write(tmp_path / "scene")
     (tmp_path / "scene" / "targets.csv").write_text(text)
     with pytest.raises(InputError, match=words):
         read_scene(tmp_path / "scene")
@@ -224,7 +229,7 @@ def test_a_scene_where_nothing_was_found_is_infinitely_far():
 def evaluated(tmp_path_factory):
     folder = tmp_path_factory.mktemp("tre")
     for n in range(3):
-        write_scene(folder / "scenes" / f"scene_{n}", scene())
+        scene().write(folder / "scenes" / f"scene_{n}")
     answers = iter([shifted(1.25), shifted(4.5), shifted(2.0)])
     report = evaluate_scenes(
         lambda _: estimate(next(answers)), folder / "scenes", folder / "report"

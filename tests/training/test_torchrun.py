@@ -16,9 +16,8 @@ from stories import environment
 from torchrun_peer import STEPS, UP, anatomy, small_run
 from tumortrack.core.errors import InputError
 from tumortrack.registration.network import RegistrationNetwork
-from tumortrack.simulate.dataset import SceneStream
 from tumortrack.simulate.occupancy import FixedPoints
-from tumortrack.simulate.scene import SceneConfig
+from tumortrack.simulate.scene import SceneConfig, SceneStream
 from tumortrack.training.distributed import ProcessGroup, ProcessLost, process_group
 from tumortrack.training.presets import clinic_network
 from tumortrack.training.state import TrainingState
@@ -82,7 +81,7 @@ def train_start() -> dict[str, np.ndarray]:
 
 def test_shares_are_the_batch():
     """Whatever their number, the processes see the scenes that one would, each once."""
-    pool = FixedPoints(np.zeros((1, 3), np.float32), np.zeros(1, np.uint8))
+    pool = FixedPoints(np.zeros((1, 3), np.float32))
     config = SceneConfig(width=106, height=60)
 
     def stream(size: int) -> SceneStream:

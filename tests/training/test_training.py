@@ -26,10 +26,14 @@ from tumortrack.models.config import RegistrationHeadConfig, TrainConfig
 from tumortrack.models.normalisation import CloudBox
 from tumortrack.training.model import load_model
 from tumortrack.training.presets import clinic, paper, quick
-from tumortrack.training.run import settle_end
-from tumortrack.training.session import use_cores, work_folder
-from tumortrack.training.state import Diverged, TrainingProgress, TrainingState, learning_rate
-from tumortrack.training.train import TrainingRun, train
+from tumortrack.training.state import (
+    Diverged,
+    TrainingProgress,
+    TrainingState,
+    learning_rate,
+    settle_end,
+)
+from tumortrack.training.train import TrainingRun, divide_cores, train, work_folder
 from warp_objects import train_slim
 
 
@@ -153,21 +157,23 @@ HISTORY_ON_A_FULL_DISK = """
 import resource, sys
 from pathlib import Path
 from tumortrack.core.errors import InputError, StorageError
-from tumortrack.training.session import History, Record
 from tumortrack.training.state import TrainingProgress
+from tumortrack.training.train import history
 
 folder, mode = Path(sys.argv[1]), sys.argv[2]
 import torch.utils.tensorboard  # its own caches are not the point
 resource.setrlimit(resource.RLIMIT_FSIZE, (300, 300))
 import signal
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+numbers = 1.0, 0.5, 100.0, 1e-3, 0.0
+progress = TrainingProgress()
 try:
-    with History(folder, TrainingProgress()) as history:
+    with history(folder, progress) as write:
         if mode == "other":
-            history.write(TrainingProgress(step=1), Record(1.0, 0.5, 100.0, 1e-3))
+            write(*numbers)
             raise InputError("the first error")
-        for step in range(200):
-            history.write(TrainingProgress(step=step), Record(1.0, 0.5, 100.0, 1e-3))
+        for progress.step in range(200):
+            write(*numbers)
 except StorageError as error:
     print("storage:", error)
 except InputError as error:
@@ -234,7 +240,7 @@ def test_two_trainings_in_one_folder_are_refused_and_a_dead_ones_lock_is_not(tmp
     assert (work / "something").exists()
     hold = (
         "import sys, os, signal; from pathlib import Path;"
-        "from tumortrack.training.session import work_folder\n"
+        "from tumortrack.training.train import work_folder\n"
         "with work_folder(Path(sys.argv[1])): os.kill(os.getpid(), signal.SIGKILL)"
     )
     assert subprocess.run([sys.executable, "-c", hold, str(model)]).returncode == -signal.SIGKILL
@@ -292,15 +298,15 @@ def test_a_containers_quota_of_cores_counts(tmp_path, monkeypatch, files, cores)
 
 
 @pytest.mark.parametrize(
-    ("granted", "workers", "threads"), [("", 1, 5), ("2", 1, 2), ("2", 5, 1), ("9", 0, 6)]
+    ("granted", "workers", "threads"), [("", 1, 5), ("2", 1, 2), ("", 5, 3), ("9", 0, 6)]
 )
 def test_the_network_gets_the_cores_that_workers_and_openmp_leave(
     monkeypatch, granted, workers, threads
 ):
     before = torch.get_num_threads()
     monkeypatch.setenv("OMP_NUM_THREADS", granted)
-    monkeypatch.setattr("tumortrack.training.session.available_cores", lambda: 6)
-    use_cores(torch.device("cpu"), workers)
+    monkeypatch.setattr("tumortrack.training.train.available_cores", lambda: 6)
+    assert divide_cores(torch.device("cpu"), workers) == workers
     try:
         assert torch.get_num_threads() == threads
     finally:

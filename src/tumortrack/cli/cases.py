@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 from tyro.conf import Positional
 
@@ -14,8 +14,6 @@ from tumortrack.core.errors import InputError
 
 if TYPE_CHECKING:
     from tumortrack.simulate.scene import SceneConfig
-
-_TEST_BODY = 2**20  # and the seed: elastic states that training with the same seed never sees
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,12 +51,11 @@ class Prepare:
     overwrite: bool = False
 
     def run(self) -> None:
-        """Input -> case folder with a picture to check it by."""
-        from tumortrack.api import prepare
+        from tumortrack import api
         from tumortrack.imaging.prepare import PrepareOptions
 
         options = {field.name: getattr(self, field.name) for field in fields(PrepareOptions)}
-        case = prepare(self.input, self.case, overwrite=self.overwrite, **options)
+        case = api.prepare(self.input, self.case, overwrite=self.overwrite, **options)
         say_notes(case.report.get("notes", []))
         for name, part in zip(case.anatomy.names, case.anatomy.parts, strict=True):
             say(f"{name}: {part.volume_mm3 / 1000:.1f} ml")
@@ -82,35 +79,27 @@ class Export:
     series: str | None = None
 
     def run(self) -> None:
-        """Write OUT; all or nothing.
-
-        Raises:
-            InputError: OUT exists; ``series`` without ``dicom``; see ``write_dicom_seg``.
-            ArtifactError: no case.
-            StorageError: the disk refused.
-        """
-        from tumortrack.imaging.case import load_case
-        from tumortrack.imaging.segmentation import (
-            SIDES,
-            segments,
-            write_dicom_seg,
-            write_seg_nrrd,
-        )
+        from tumortrack import api
+        from tumortrack.imaging import segmentation
 
         if self.series is not None and self.dicom is None:
             raise InputError("--series says which series of --dicom; give that folder too.")
-        case = load_case(self.case)
+        case = api.load_case(self.case)
         options = case.report.get("options", {})
         side = options.get("side")
-        parts = segments(case.anatomy.names, side if side in SIDES else None)
+        parts = segmentation.segments(
+            case.anatomy.names, side if side in segmentation.SIDES else None
+        )
         labels = case.labels
         notes: tuple[str, ...] = ()
         with store.new_folder(self.out) as aside:
-            write_seg_nrrd(aside / "case.seg.nrrd", labels.labels, labels.lps_from_index, parts)
+            segmentation.write_seg_nrrd(
+                aside / "case.seg.nrrd", labels.labels, labels.lps_from_index, parts
+            )
             if self.dicom is not None:
                 series = self.series or options.get("series")
                 file = aside / "segmentation.dcm"
-                notes = write_dicom_seg(file, labels, parts, self.dicom, series)
+                notes = segmentation.write_dicom_seg(file, labels, parts, self.dicom, series)
         say_notes(notes)
         say(f"written to {self.out}: {', '.join(sorted(p.name for p in self.out.iterdir()))}.")
 
@@ -145,58 +134,39 @@ class Simulate:
     elastic: bool = False
 
     def run(self) -> None:
-        """Case -> folder of scenes, one folder each."""
         self.write()
         say(f"{self.scenes} scenes written to {self.dataset}.")
 
     def scene_config(self) -> SceneConfig:
         from tumortrack.sense.noise import CLEAN, D405_NOISE
-        from tumortrack.simulate.deform import (
-            ChainConfig,
-            DeformConfig,
-            DragConfig,
-            ElasticConfig,
-            StretchConfig,
-        )
+        from tumortrack.simulate import deform
         from tumortrack.simulate.deform.drag import CONFIGURATIONS
-        from tumortrack.simulate.pose import PoseConfig
-        from tumortrack.simulate.scene import SceneConfig
+        from tumortrack.simulate.scene import PoseConfig, SceneConfig
 
-        models: list[DragConfig | ElasticConfig] = [ElasticConfig()]
+        models: list[deform.DragConfig | deform.ElasticConfig] = [deform.ElasticConfig()]
         if not self.elastic:
             table = (CONFIGURATIONS[number] for number in self.configuration)
-            models = [DragConfig(steps=steps, falloff=self.falloff) for steps in table]
-        deform: tuple[DeformConfig, ...] = tuple(
-            ChainConfig(links=(model, StretchConfig())) if self.squeeze else model
-            for model in models
-        )
+            models = [deform.DragConfig(steps=steps, falloff=self.falloff) for steps in table]
+        chains = [deform.ChainConfig(links=(model, deform.StretchConfig())) for model in models]
         return SceneConfig(
             width=848,
             height=480,
             pose=PoseConfig(rotations=self.rotations),
-            deform=deform,
+            deform=tuple(chains if self.squeeze else models),
             noise=D405_NOISE if self.noise else CLEAN,
         )
 
     def write(self, prefix: str = "") -> None:
-        """Scenes PREFIX0000, PREFIX0001, ... of the ``test`` stream; those that are there stay.
-
-        Raises:
-            InputError: no case, or scenes that are not of this case, seed and options.
-        """
+        """Scenes PREFIX0000, PREFIX0001, ... of the ``test`` stream; those that are there stay."""
+        from tumortrack import api
         from tumortrack.core.config import to_builtins
-        from tumortrack.imaging.case import load_case
-        from tumortrack.simulate.scene import SceneRecipe, Simulator, body_for
-        from tumortrack.simulate.scene_folder import Scene, write_scene
-        from tumortrack.simulate.targets import draw_targets
+        from tumortrack.simulate.scene import SceneRecipe
 
         if self.scenes < 1:
             raise InputError(f"--scenes {self.scenes} must be at least 1.")
-        case = load_case(self.case)
+        case = api.load_case(self.case)
         config = self.scene_config()
-        body = body_for(case.anatomy, case.up_lps, config, _TEST_BODY + self.seed)
-        simulator = Simulator(case.anatomy, case.up_lps, config, body)
-        targets = draw_targets(case.anatomy, self.seed)
+        make = api.scene_maker(case, config, self.seed)
         about = {
             "case_sha256": store.sha256_of(self.case / store.MANIFEST),
             "case_volumes_mm3": [part.volume_mm3 for part in case.anatomy.parts],
@@ -205,27 +175,15 @@ class Simulate:
         with progress_bar("simulate", self.scenes) as advance:
             for index in range(self.scenes):
                 folder = self.dataset / f"{prefix}{index:04d}"
-                recipe = SceneRecipe(self.seed, "test", index)
-                made_from = {**about, "recipe": asdict(recipe)}
                 if folder.exists():
-                    _check_same(folder, made_from)
+                    made_from = {**about, "recipe": asdict(SceneRecipe(self.seed, "test", index))}
+                    meta = store.read_json(folder / "meta.json")
+                    if {key: meta.get(key) for key in made_from} != made_from:
+                        raise InputError(
+                            f"{folder} is a scene of another case, seed or option. Choose another "
+                            "DATASET folder."
+                        )
                 else:
-                    stage = simulator.render(recipe)
-                    meta = {
-                        **made_from,
-                        "camera_from_ct": stage.camera_from_ct.tolist(),
-                        "deformation": stage.deformation.record(),
-                    }
-                    truth = simulator.reference(stage)
-                    placed = targets.at(stage.carry(targets.points_ct))
-                    write_scene(folder, Scene(stage.cloud, truth, stage.frame, meta, placed))
+                    scene = make(index)
+                    replace(scene, meta={**about, **scene.meta}).write(folder)
                 advance()
-
-
-def _check_same(folder: Path, made_from: dict[str, Any]) -> None:
-    """Refuse to continue a dataset of another case, seed or options."""
-    meta = store.read_json(folder / "meta.json")
-    if {key: meta.get(key) for key in made_from} != made_from:
-        raise InputError(
-            f"{folder} is a scene of another case, seed or option. Choose another DATASET folder."
-        )

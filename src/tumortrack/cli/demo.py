@@ -35,14 +35,7 @@ class Demo:
     scenes: int = 20
 
     def run(self) -> None:
-        """Write everything below ``out``; the report is OUT/report.json, the page OUT/index.html.
-
-        Raises:
-            InputError: ``out`` is a file or holds what no demo made; no minutes or scenes.
-        """
-        from tumortrack.phantom.dicom import write_dicom_series
-        from tumortrack.phantom.digital import PhantomParameters, phantom_labels
-        from tumortrack.phantom.scanner import ScannerParameters, scan
+        from tumortrack.phantom import dicom, digital, scanner
 
         if not 0 < self.minutes < float("inf"):
             raise InputError(f"--minutes {self.minutes:g} must be more than 0.")
@@ -51,8 +44,9 @@ class Demo:
         out = self.out
         _clear(out)
         say("1/5 scanning the built-in kidney phantom (virtual CT, DICOM)")
-        ct = scan(phantom_labels(PhantomParameters()), ScannerParameters(), _CT_SEED)
-        write_dicom_series(ct, out / "ct_dicom")
+        labels = digital.phantom_labels(digital.PhantomParameters())
+        ct = scanner.scan(labels, scanner.ScannerParameters(), _CT_SEED)
+        dicom.write_dicom_series(ct, out / "ct_dicom")
         say("2/5 segmenting the CT, making surfaces")
         Prepare(input=out / "ct_dicom", case=out / "case").run()
         say(f"3/5 training for {self.minutes:g} minutes")
@@ -71,13 +65,11 @@ class Demo:
         )
         for kind, count, options in kinds:
             if count > 0:
-                Simulate(
-                    case=out / "case",
-                    dataset=out / "dataset",
-                    scenes=count,
-                    seed=_SCENE_SEED,
-                    **options,
-                ).write(f"{kind}-")
+                case, dataset = out / "case", out / "dataset"
+                made = Simulate(
+                    case=case, dataset=dataset, scenes=count, seed=_SCENE_SEED, **options
+                )
+                made.write(f"{kind}-")
         say("5/5 locating kidney and tumors in each from one depth image")
         Evaluate(model=out / "model", variants=out / "dataset", report=out, grid=128).run()
         say(f"open {out / 'index.html'} in a browser: estimate over truth, in 3-D, scene by scene.")

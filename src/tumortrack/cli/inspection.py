@@ -9,7 +9,6 @@ from importlib import import_module
 from importlib.metadata import version
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
 
 from tyro.conf import Positional
 
@@ -142,45 +141,36 @@ def describe(path: Path) -> list[str]:
 
 
 def _artifact(folder: Path) -> list[str]:
-    kind = store.read_json(folder / store.MANIFEST).get("kind")
-    manifest = store.read_manifest(folder, str(kind))
-    what = _NAMES.get(str(kind), f"a {kind}")
+    kind = str(store.read_json(folder / store.MANIFEST).get("kind"))
+    manifest = store.read_manifest(folder, kind)
     lines = [
-        f"{folder}: {what} (schema {manifest['schema']}, tumortrack {manifest['tumortrack']}); "
-        f"{manifest['units']}, {manifest['frame']} frame; all files as they were written."
+        f"{folder}: {_NAMES.get(kind, f'a {kind}')} (schema {manifest['schema']}, tumortrack "
+        f"{manifest['tumortrack']}); {manifest['units']}, {manifest['frame']} frame; all files as "
+        "they were written."
     ]
-    if isinstance(scenes := manifest.get("scenes"), dict):
-        return [*lines, *_sealed_scenes(folder, scenes)]
+    if isinstance(scenes := manifest.get("scenes"), dict):  # with the digests they were sealed by
+        as_sealed = {
+            name: (folder / name).is_dir() and store.sha256_of(folder / name) == digest
+            for name, digest in scenes.items()
+        }
+        changed = ", ".join(name for name, same in as_sealed.items() if not same)
+        verdict = "all as they were sealed; `tumortrack evaluate` reads them."
+        if changed:
+            verdict = f"CHANGED or missing since they were sealed: {changed}"
+        return [*lines, f"  {len(scenes)} scenes: {', '.join(scenes)}", f"  {verdict}"]
     if kind == "model":
         from tumortrack.occupancy import model  # PyTorch takes a second
 
-        lines += [_kind_of_model(manifest), *(f"  {line}" for line in model.describe(folder))]
+        network = manifest.get("config", {}).get("network", {})
+        encoder, decoder = (network.get(n, {}).get("type", "?") for n in ("encoder", "decoder"))
+        does = "labels points; it does not know which point of the CT lies where (no `--map`)"
+        if decoder == "warp":
+            does = "places the organ of the CT; `locate --map` says where points of the CT are"
+        lines.append(f"  {encoder} + {decoder}: {does}")
+        lines += [f"  {line}" for line in model.describe(folder)]
     skip = {"kind", "schema", "tumortrack", "units", "frame", "files", "config"}
     lines += [f"  {key}: {value}" for key, value in manifest.items() if key not in skip]
     return [*lines, f"  files: {', '.join(manifest['files'])}"]
-
-
-def _kind_of_model(manifest: dict[str, Any]) -> str:
-    network = manifest.get("config", {}).get("network", {})
-    kinds = [network.get(part, {}).get("type", "?") for part in ("encoder", "decoder")]
-    if kinds[1] == "warp":
-        does = "places the organ of the CT; `locate --map` says where points of the CT are"
-    else:
-        does = "labels points; it does not know which point of the CT lies where (no `--map`)"
-    return f"  {kinds[0]} + {kinds[1]}: {does}"
-
-
-def _sealed_scenes(folder: Path, scenes: dict[str, Any]) -> list[str]:
-    """What became of the scenes that a manifest lists."""
-    changed = [
-        name
-        for name, digest in scenes.items()
-        if not (folder / name).is_dir() or store.sha256_of(folder / name) != digest
-    ]
-    lines = [f"  {len(scenes)} scenes: {', '.join(scenes)}"]
-    if changed:
-        return [*lines, f"  CHANGED or missing since they were sealed: {', '.join(changed)}"]
-    return [*lines, "  all as they were sealed; `tumortrack evaluate` reads them."]
 
 
 def _scene(folder: Path) -> list[str]:

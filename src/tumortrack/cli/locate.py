@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -16,7 +17,7 @@ if TYPE_CHECKING:
     from tumortrack.core.types import DepthFrame, SensorCloud
     from tumortrack.models.model import Model
     from tumortrack.sense.cloud import CloudConfig
-    from tumortrack.tracking.point_table import PointTable
+    from tumortrack.tracking.points import PointTable
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,7 +53,6 @@ class Locate:
     overwrite: bool = False
 
     def run(self) -> None:
-        """One cloud or depth image -> run folder."""
         _check_grid(self.grid)
         store.check_place(self.out, "run", self.overwrite)
         points = self._points()
@@ -70,11 +70,10 @@ class Locate:
             assert tracker.anatomy_ct is not None  # a model with a shape
             box_mm = tracker.anatomy_ct.organ.box_mm
             far = check_near_organ(points.points_ct, box_mm, str(self.map))
-            points = replace(points, notes=(*points.notes, *far))
+            notes = (*notes, *points.notes, *far)
         cloud = self._cropped(seen, model.config.scene.cloud)
         estimate = tracker.locate(cloud, self.grid, self.seed)
         if points is not None and self.map is not None:
-            notes = (*notes, *points.notes)
             estimate.report["map"] = {
                 "points": len(points.points_ct),
                 "from": "lps",
@@ -96,14 +95,13 @@ class Locate:
             else:
                 say(f"{name}: not found")
         if points is not None:
-            count, file = len(points.points_ct), self.out / "points.csv"
-            say(f"{count} points of the CT: their places are in {file}")
+            file = self.out / "points.csv"
+            say(f"{len(points.points_ct)} points of the CT: their places are in {file}")
         seconds = estimate.report["timings"]["total"]
         say(f"written to {self.out} (camera frame, mm) in {seconds:.2f} s.")
 
     def _points(self) -> PointTable | None:
-        """The points of --map; model and points are checked before there is anything to wait
-        for."""
+        """The points of --map; what is wrong with them or the model is said before a wait."""
         from tumortrack.models.folder import has_shape, read_model_manifest
         from tumortrack.tracking.points import read_points
 
@@ -174,7 +172,6 @@ class Evaluate:
     device: Device = "auto"
 
     def run(self) -> None:
-        """Model x scenes -> report folder."""
         from tumortrack.models.folder import read_model_manifest
         from tumortrack.simulate.scene_folder import list_scenes
 
@@ -203,25 +200,15 @@ class Evaluate:
         tracker = Tracker(model)
         say_notes(model.notes)
         with progress_bar("evaluate", len(folders)) as advance:
-            result = evaluate_scenes(
-                lambda cloud: tracker.locate(cloud, self.grid, self.seed),
-                self.variants,
-                self.report,
-                progress=lambda *_: advance(),
-                about=about,
-            )
+            locate = partial(tracker.locate, grid=self.grid, seed=self.seed)
+            result = evaluate_scenes(locate, self.variants, self.report, advance, about)
         console.print(summary_table(result))
         say(f"written to {self.report / 'report.json'}; look at {self.report / 'index.html'}.")
 
 
 def check_case(model: Model, folders: list[Path]) -> None:
-    """Refuse scenes that are known to show another anatomy than the model's.
-
-    Scenes of other programs do not say which case they show; they pass.
-
-    Raises:
-        InputError: a scene that `simulate` made of another case.
-    """
+    """Raises InputError for a scene that `simulate` made of another case than the model's. Scenes
+    of other programs do not say which case they show; they pass."""
     wanted = model.provenance.get("case_sha256")
     for folder in folders:
         path = folder / "meta.json"

@@ -86,14 +86,13 @@ def leave() -> NoReturn:
 def _commands() -> dict[str, Callable[..., Command]]:
     """Ours, and those of other installed packages: entry points of the group
     ``tumortrack.commands``."""
-    others = {point.name: point for point in entry_points(group="tumortrack.commands")}
     found: dict[str, Callable[..., Command]] = {
         command.__name__.lower(): command for command in _COMMANDS
     }
-    found |= {name: point.load() for name, point in sorted(others.items())}
-    names = [name for name in _ORDER if name in found]
-    names += [name for name in found if name not in _ORDER]
-    return {name: found[name] for name in names}
+    others = sorted(entry_points(group="tumortrack.commands"), key=lambda point: point.name)
+    found |= {point.name: point.load() for point in others}
+    places = {name: place for place, name in enumerate(_ORDER)}
+    return {name: found[name] for name in sorted(found, key=lambda n: places.get(n, len(places)))}
 
 
 def _parse(arguments: list[str]) -> Command:

@@ -15,10 +15,7 @@ from tumortrack.core import store
 from tumortrack.core.errors import InputError, NoEstimate
 
 if TYPE_CHECKING:
-    from rich.table import Table
-
     from tumortrack.models.model import Model
-    from tumortrack.occupancy.model import Compiled
 
 _GRID = 32
 
@@ -36,12 +33,9 @@ class Compile:
     device: Device = "auto"
 
     def run(self) -> None:
-        """Fill MODEL/compiled for this machine, and numba's cache of the kernels that frames use.
+        """Fill MODEL/compiled for this machine, and numba's cache of a frame's kernels."""
+        from rich.table import Table
 
-        Raises:
-            ArtifactError: no model.
-            StorageError: the disk refused.
-        """
         from tumortrack.models.folder import WEIGHTS
         from tumortrack.occupancy.model import OccupancyModel, measured, save
         from tumortrack.training.model import load_model
@@ -62,7 +56,15 @@ class Compile:
         half_mm = model.in_distribution.spread_mm[1]
         compiled = measured(model.network, model.query_box_mm, half_mm, weights)
         path = save(self.model, compiled)
-        console.print(_table(compiled))
+        table = Table(title=f"{compiled.queries} queries, {compiled.threads} cores")
+        table.add_column("arithmetic")
+        for name in ("at once", "ms", "labels equal", "largest error of a logit"):
+            table.add_column(name, justify="right")
+        for one in sorted(compiled.timings, key=lambda timing: timing.milliseconds):
+            shares = f"{100 * one.labels_equal:.2f} %", f"{one.largest_error:.3f}"
+            how = one.arithmetic.numbers, str(one.arithmetic.chunk)
+            table.add_row(*how, f"{one.milliseconds:.1f}", *shares)
+        console.print(table)
         best = compiled.arithmetic
         say(f"network: {best.numbers}, {best.chunk} queries at once and core; kept in {path}.")
 
@@ -83,13 +85,6 @@ class Onnx:
     overwrite: bool = False
 
     def run(self) -> None:
-        """Write OUT.
-
-        Raises:
-            InputError: OUT exists or is named otherwise; the package onnx is not installed.
-            ArtifactError: no model.
-            StorageError: the disk refused.
-        """
         from tumortrack.models.folder import read_model_manifest
 
         out = self.out
@@ -136,20 +131,3 @@ def _warm(model: Model) -> None:
         cloud = SensorCloud(organ - organ.mean(0) + [0, 0, 150])
         with suppress(NoEstimate):  # seen from all sides at once it may fit nothing
             tracker.locate(cloud, _GRID)
-
-
-def _table(compiled: Compiled) -> Table:
-    from rich.table import Table
-
-    table = Table(title=f"{compiled.queries} queries, {compiled.threads} cores")
-    for name in ("arithmetic", "at once", "ms", "labels equal", "largest error of a logit"):
-        table.add_column(name, justify="left" if name == "arithmetic" else "right")
-    for one in sorted(compiled.timings, key=lambda timing: timing.milliseconds):
-        table.add_row(
-            one.arithmetic.numbers,
-            str(one.arithmetic.chunk),
-            f"{one.milliseconds:.1f}",
-            f"{100 * one.labels_equal:.2f} %",
-            f"{one.largest_error:.3f}",
-        )
-    return table

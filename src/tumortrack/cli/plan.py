@@ -20,9 +20,8 @@ if TYPE_CHECKING:
 
     from tumortrack.core.types import Mesh
     from tumortrack.plan.arms.config import CellConfig
-    from tumortrack.plan.config import ResectionConfig
     from tumortrack.plan.located import LocatedRun
-    from tumortrack.plan.values import Located, ResectionPlan
+    from tumortrack.plan.values import ResectionConfig, ResectionPlan
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,7 +60,6 @@ class Plan:
     overwrite: bool = False
 
     def run(self) -> None:
-        """A run -> strokes, motions, pictures."""
         from tumortrack.core.config import to_builtins
         from tumortrack.plan.files import KIND, PlanFolder, write_plan
         from tumortrack.plan.located import read_run
@@ -76,16 +74,19 @@ class Plan:
         run = read_run(self.run_folder)
         frame_id, table_from_camera = self._frame(run, cell_config.stand_mm)
         located = run.located(table_from_camera)
-        if self.arms:
-            cell_config = _below(_organ_of(located), cell_config)
+        organ = located.meshes.get("kidney")
+        if self.arms and organ is None:
+            raise NoPlan(
+                "the run has no kidney.ply, so arms can't keep clear of it; give --no-arms."
+            )
         resection = plan_resection(located, config)
         _say_plan(resection)
         motions, cell_used = None, None
-        if self.arms:
+        if self.arms and organ is not None:
             from tumortrack.plan.arms.procedure import search_bases
 
             start = time.perf_counter()
-            placed, motions, moved = search_bases(resection, cell_config, _organ_of(located))
+            placed, motions, moved = search_bases(resection, _below(organ, cell_config), organ)
             cell_used = to_builtins(placed.config)
             say(
                 f"arms: {len(motions.stages)} stages, {motions.seconds:.0f} s; planned in "
@@ -93,21 +94,16 @@ class Plan:
             )
             if moved:
                 say(f"note: {moved}")
+        model = store.read_json(self.run_folder / "report.json").get("model")
         content = PlanFolder(
-            resection,
-            config,
-            table_from_camera,
-            frame_id,
-            located.meshes,
-            cell_used,
-            motions,
-            _case_of(self.run_folder),
-        )
+            resection, config, table_from_camera, frame_id, located.meshes, cell_used, motions,
+            str(model.get("case_sha256", "")) if isinstance(model, dict) else "",
+        )  # fmt: skip
 
         def pictures(aside: Path) -> None:
             draw_plan(resection, located, aside / "plan.png")
             if self.arms:
-                from tumortrack.plan.arms.urdf import cell_urdf
+                from tumortrack.plan.arms.body import cell_urdf
 
                 store.write_atomically(aside / "cell.urdf", cell_urdf(placed.config).encode())
 
@@ -118,30 +114,23 @@ class Plan:
     def _resection_config(self) -> ResectionConfig:
         """What the file says, and over that what was given on the command line."""
         from tumortrack.core.config import from_builtins
-        from tumortrack.plan.config import ResectionConfig
+        from tumortrack.plan.values import ResectionConfig
 
         written = {} if self.config is None else store.read_json(self.config)
-        options = {
-            "method": self.method,
-            "tumor": self.tumor,
-            "margin_mm": self.margin,
-            "sigmas": self.sigmas,
-        }
+        names = {"method": "method", "tumor": "tumor", "margin": "margin_mm", "sigmas": "sigmas"}
+        options = {key: getattr(self, name) for name, key in names.items()}
         given = {key: value for key, value in options.items() if value is not None}
         return from_builtins({**written, **given}, ResectionConfig, str(self.config or "options"))
 
     def _cell_config(self) -> CellConfig:
-        import msgspec
+        from msgspec.structs import replace
 
         from tumortrack.core.config import from_builtins
         from tumortrack.plan.arms.config import CellConfig
 
-        config = CellConfig()
-        if self.cell is not None:
-            config = from_builtins(store.read_json(self.cell), CellConfig, str(self.cell))
-        if self.stand is not None:
-            config = msgspec.structs.replace(config, stand_mm=self.stand)
-        return config
+        written = {} if self.cell is None else store.read_json(self.cell)
+        config = from_builtins(written, CellConfig, str(self.cell))
+        return config if self.stand is None else replace(config, stand_mm=self.stand)
 
     def _frame(self, run: LocatedRun, stand_mm: float) -> tuple[str, Float64[np.ndarray, "4 4"]]:
         """Frame id and ``table_from_camera``: of the calibration, or of a camera that looks
@@ -175,43 +164,27 @@ def check_arms_installed() -> None:
         raise InputError(f"arms need {', '.join(missing)}: pip install 'tumortrack[arms]'.")
 
 
-def _organ_of(located: Located) -> Mesh:
-    """The organ's surface, which arms must not touch.
-
-    Raises:
-        NoPlan: the run has none.
-    """
-    if "kidney" not in located.meshes:
-        raise NoPlan("the run has no kidney.ply, so arms can't keep clear of it; give --no-arms.")
-    return located.meshes["kidney"]
-
-
 def _below(organ: Mesh, config: CellConfig) -> CellConfig:
     """The table below the organ, unless the cell's file says where it is."""
-    import msgspec
+    from msgspec.structs import replace
 
     if any(config.middle_mm):
         return config
     x, y = organ.box_mm.mean(0)[:2].tolist()
     middle_mm = (x, y, float(organ.box_mm[0, 2]) - config.stand_mm)
-    return msgspec.structs.replace(config, middle_mm=middle_mm)
-
-
-def _case_of(run_folder: Path) -> str:
-    model = store.read_json(run_folder / "report.json").get("model")
-    return str(model.get("case_sha256", "")) if isinstance(model, dict) else ""
+    return replace(config, middle_mm=middle_mm)
 
 
 def _say_plan(resection: ResectionPlan) -> None:
-    volumes = resection.volumes_ml
+    ml = resection.volumes_ml
     say(
-        f"{resection.tumor} ({volumes['tumor']:.1f} ml, {resection.exophytic:.0%} outside the "
-        f"organ's hull): {len(resection.cuts)} strokes in {resection.sweeps} sweeps, "
+        f"{resection.tumor} ({ml['tumor']:.1f} ml, {resection.exophytic:.0%} outside the organ's "
+        f"hull): {len(resection.cuts)} strokes in {resection.sweeps} sweeps, "
         f"{sum(cut.length_mm for cut in resection.cuts):.0f} mm."
     )
     say(
-        f"margin {resection.margin_mm:g} mm; {volumes['piece']:.1f} ml come away, of that "
-        f"{volumes['healthy']:.1f} ml healthy tissue "
-        f"({volumes['healthy'] / volumes['parenchyma']:.0%} of the organ's)."
+        f"margin {resection.margin_mm:g} mm; {ml['piece']:.1f} ml come away, of that "
+        f"{ml['healthy']:.1f} ml healthy tissue ({ml['healthy'] / ml['parenchyma']:.0%} of the "
+        "organ's)."
     )
     say_notes(resection.notes)

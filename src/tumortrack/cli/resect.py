@@ -2,29 +2,19 @@
 
 from __future__ import annotations
 
+import itertools
 import signal
 import time
 from collections.abc import Iterator
-from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from tyro.conf import Positional
 
+from tumortrack.cli import track
 from tumortrack.cli.console import Device, progress_bar, say
 from tumortrack.cli.plan import check_arms_installed
-from tumortrack.cli.track import (
-    STOPPED,
-    Arms,
-    Track,
-    check_closed,
-    open_sinks,
-    parse_sinks,
-    report_path,
-    say_failures,
-    stopping,
-)
 from tumortrack.core import store
 from tumortrack.core.errors import Aborted, InputError
 
@@ -35,15 +25,14 @@ if TYPE_CHECKING:
     from jaxtyping import Float64
 
     from tumortrack.live.values import RigidShape, TrackingResult, Workcell
+    from tumortrack.plan import operation as operations
     from tumortrack.plan.arms.cell import ArmCell
     from tumortrack.plan.files import PlanFolder
-    from tumortrack.plan.operation import Operation, OperationConfig, Planned, ResectionProgress
     from tumortrack.plan.values import Located
 
 _FPS = 30.0  # of an execution that no camera drives
 _NOTHING = "virtual execution of a stored plan: nothing is tracked"
-_FILM_FPS, _FILM_FRAMES = 10, 120
-_FILM_STEP_S = 0.1
+_FILM_FRAMES, _FILM_STEP_S = 120, 0.1
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,7 +70,7 @@ class Resect:
     device: Device = "auto"
 
     def run(self) -> None:
-        """A plan's motions, virtually, shown by sinks or filmed."""
+        from tumortrack import api
         from tumortrack.core.config import from_builtins
         from tumortrack.live.sinks.ur import UrSinkConfig
         from tumortrack.plan.arms.config import CellConfig
@@ -92,9 +81,8 @@ class Resect:
         stored = read_plan(self.plan)
         if stored.motions is None or stored.cell is None:
             raise InputError(f"{self.plan} was planned with --no-arms; plan again without it.")
-        # A wrong one is reported before anything heavy is loaded.
-        real = [s for s in parse_sinks(self.sinks) if isinstance(s, UrSinkConfig) and s.execute]
-        if self.speed > 1 and real:
+        sinks = api.named_sinks(self.sinks).values()  # wrong: said before all that takes long
+        if self.speed > 1 and any(isinstance(s, UrSinkConfig) and s.execute for s in sinks):
             raise InputError(f"--speed {self.speed:g} with real arms; allowed: up to 1.")
         config = OperationConfig(speed=self.speed, moved_mm=self.moved)
         cell_config = from_builtins(stored.cell, CellConfig, str(self.plan))
@@ -112,7 +100,12 @@ class Resect:
             self._execute(stored, cell, config)
 
     def _follow(
-        self, stored: PlanFolder, cell: ArmCell, config: OperationConfig, model: Path, source: str
+        self,
+        stored: PlanFolder,
+        cell: ArmCell,
+        config: operations.OperationConfig,
+        model: Path,
+        source: str,
     ) -> None:
         """Beside the live loop: every estimate is looked at, and planned on where the tumor
         moved."""
@@ -123,10 +116,16 @@ class Resect:
 
         from tumortrack.core.config import to_builtins
         from tumortrack.live.values import PublishedFrame
-        from tumortrack.plan import replanning
+        from tumortrack.plan.arms import procedure
         from tumortrack.plan.located import located
 
-        _check_case(stored, model)
+        manifest = store.read_json(model / store.MANIFEST) if model.is_dir() else {}
+        case = manifest.get("provenance", {}).get("case_sha256", "")
+        if stored.case_sha256 and case and case != stored.case_sha256:
+            raise InputError(  # it would find another patient's tumor
+                f"{model} was trained for another case than the one that was planned on. Give a "
+                "model of that case, or plan on what this model locates."
+            )
 
         def locate(result: TrackingResult, unsure: bool = False) -> Located:
             estimate = result.estimate
@@ -137,67 +136,62 @@ class Resect:
         again = msgspec.structs.replace(stored.config, tumor=stored.plan.tumor)
         # In a process of its own: planning for a second must not hold up a frame.
         with ProcessPoolExecutor(
-            1, get_context("spawn"), replanning.initialize, (again, cell.config)
+            1, get_context("spawn"), procedure.begin_worker, (again, cell.config)
         ) as planner:
 
             def replan(
                 result: TrackingResult,
                 joints_rad: Float64[np.ndarray, " 12"],
-                progress: ResectionProgress,
-            ) -> Future[Planned]:
+                progress: operations.ResectionProgress,
+            ) -> Future[operations.Planned]:
                 seen = locate(result, unsure=stored.config.sigmas > 0)
-                return planner.submit(replanning.replan, seen, joints_rad, progress)
+                return planner.submit(procedure.replan, seen, joints_rad, progress)
 
             say("starting the replanning worker ...")
             # The worker does not hear of Ctrl-C: that is the live loop's affair.
             before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-            begun = planner.submit(replanning.warm_up)
+            begun = planner.submit(procedure.warm_up)
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
             begun.result()
             operation = _operation(stored, cell, config, locate=locate, replan=replan)
             frames = PublishedFrame(stored.frame_id, stored.table_from_camera)
-            Track(
-                model=model,
-                source=source,
-                sinks=self.sinks,
-                range=self.range,
-                box=self.box,
-                whole=self.whole,
-                intrinsics=self.intrinsics,
-                report=self.report,
+            track.Track(
+                model=model, source=source, sinks=self.sinks, range=self.range, box=self.box,
+                whole=self.whole, intrinsics=self.intrinsics, report=self.report,
                 device=self.device,
-            ).run(Arms(operation, frames, {"plan_config": to_builtins(config)}))
+            ).run(track.Arms(operation, frames, {"plan_config": to_builtins(config)}))  # fmt: skip
         _say_end(operation)
 
-    def _execute(self, stored: PlanFolder, cell: ArmCell, config: OperationConfig) -> None:
+    def _execute(
+        self, stored: PlanFolder, cell: ArmCell, config: operations.OperationConfig
+    ) -> None:
         """Without a camera: the stored motions in real time."""
+        from tumortrack import api
         from tumortrack.live.values import Controls, PublishedFrame, SinkContext, TrackingResult
 
         assert stored.motions is not None
         operation = _operation(stored, cell, config)
         operation.still_life = _organ_shapes(stored)
-        report = report_path(self.report, "resect")
+        report = track.report_path(self.report, "resect")
         frames = PublishedFrame(stored.frame_id, stored.table_from_camera)
         controls = Controls()
         context = SinkContext(tuple(stored.meshes), frames, None, controls, arms=True)
-        with ExitStack() as stack:
-            stack.enter_context(stopping(lambda: operation.abort(STOPPED)))
-            sinks = open_sinks(self.sinks, parse_sinks(self.sinks), context, stack)
+        stop = track.stopping(lambda: operation.abort(track.STOPPED))
+        with stop, api.open_sinks(api.named_sinks(self.sinks), context) as sinks:
             say(f"{stored.motions.seconds / config.speed:.0f} s in frame {frames.frame_id!r}; "
                 "Ctrl-C stops the arms.")  # fmt: skip
             errors: dict[str, str] = {}
-            shown, sequence, next_s = "", 0, time.monotonic()
-            while True:
+            shown, started = "", time.monotonic()
+            for sequence in itertools.count():
                 if controls.aborted.is_set():
                     operation.abort("stopped by the viewer, or a real arm gave up")
+                now_ns = time.time_ns()
                 result = operation.act(
-                    TrackingResult(
-                        sequence, time.time_ns(), reason=_NOTHING, published_frame=frames
-                    )
+                    TrackingResult(sequence, now_ns, reason=_NOTHING, published_frame=frames)
                 )
                 for sink in sinks:
                     sink.put(result)
-                say_failures(sinks, errors)
+                track.say_failures(sinks, errors)
                 assert result.workcell is not None
                 text = result.workcell.state
                 text += f": {result.workcell.halted}" if result.workcell.halted else ""
@@ -205,9 +199,7 @@ class Resect:
                     say(shown := text)
                 if operation.ended:
                     break
-                sequence += 1
-                next_s += 1 / _FPS
-                time.sleep(max(0.0, next_s - time.monotonic()))
+                time.sleep(max(0.0, started + (sequence + 1) / _FPS - time.monotonic()))
         content = {
             "plan": {"tumor": stored.plan.tumor, "method": stored.plan.method},
             "frame": stored.frame_id,
@@ -217,12 +209,12 @@ class Resect:
         store.write_json(report, content)
         say(f"written to {report}.")
         _say_end(operation)
-        check_closed(sinks)
+        track.check_closed(sinks)
 
 
 def _operation(
-    stored: PlanFolder, cell: ArmCell, config: OperationConfig, **live: Any
-) -> Operation:
+    stored: PlanFolder, cell: ArmCell, config: operations.OperationConfig, **live: Any
+) -> operations.Operation:
     from tumortrack.plan.operation import Operation, Planned
 
     assert stored.motions is not None
@@ -233,17 +225,6 @@ def _operation(
         )
     planned = Planned(stored.plan, stored.meshes, stored.motions)
     return Operation(planned, config, cell.shapes, **live)
-
-
-def _check_case(stored: PlanFolder, model: Path) -> None:
-    """Another patient's model would find another patient's tumor."""
-    manifest = store.read_json(model / store.MANIFEST) if model.is_dir() else {}
-    case = manifest.get("provenance", {}).get("case_sha256", "")
-    if stored.case_sha256 and case and case != stored.case_sha256:
-        raise InputError(
-            f"{model} was trained for another case than the one that was planned on. Give a model "
-            "of that case, or plan on what this model locates."
-        )
 
 
 def _organ_shapes(stored: PlanFolder) -> tuple[RigidShape, ...]:
@@ -258,48 +239,44 @@ def _organ_shapes(stored: PlanFolder) -> tuple[RigidShape, ...]:
     names = sorted(stored.meshes)  # kidney before tumors
     meshes = [stored.meshes[name] for name in names]
     meshes[0] = Mesh(meshes[0].vertices_mm, bare_faces(Anatomy(tuple(meshes))))
+    opacity, still = [0.35] + [1.0] * len(names), np.eye(4)
     return tuple(
-        RigidShape(
-            f"planned/{name}", mesh, np.eye(4), part_colour(label), 1.0 if label > 1 else 0.35
-        )
-        for label, (name, mesh) in enumerate(zip(names, meshes, strict=True), start=1)
+        RigidShape(f"planned/{name}", mesh, still, part_colour(n + 1), opacity[n])
+        for n, (name, mesh) in enumerate(zip(names, meshes, strict=True))
     )
 
 
-def _say_end(operation: Operation) -> None:
+def _say_end(operation: operations.Operation) -> None:
     found = operation.summary()
     if found["state"] == "done":
         say("done: both arms are home.")
         return
-    if found["halted"] == STOPPED:
+    if found["halted"] == track.STOPPED:
         raise KeyboardInterrupt
     raise Aborted(f"the resection was {found['state']}: {found['halted']}.")
 
 
 def _write_film(stored: PlanFolder, cell: ArmCell, path: Path) -> None:
     """An animated GIF of about twelve seconds."""
+    from tumortrack.live.values import TrackingResult
     from tumortrack.plan.files import as_located
     from tumortrack.plan.operation import OperationConfig
-    from tumortrack.report.film import film, moments_s
+    from tumortrack.report.film import FPS, film, moments_s
 
     assert stored.motions is not None
     times_s = moments_s(stored.motions, _FILM_FRAMES)
-    frames = _frames(_operation(stored, cell, OperationConfig()), times_s.tolist())
-    with progress_bar("drawing", len(times_s)) as advance:
-        film(frames, as_located(stored), path, _FILM_FPS, progress=lambda *_: advance())
-    n = len(times_s) / _FILM_FPS
-    say(f"written to {path}: {stored.motions.seconds:.0f} s in {n:.0f}.")
+    operation = _operation(stored, cell, OperationConfig())
 
-
-def _frames(operation: Operation, times_s: list[float]) -> Iterator[Workcell]:
-    """What is seen at these times; if it heard of the time less often, the arms would halt."""
-    from tumortrack.live.values import TrackingResult
-
-    now_s = 0.0
-    for time_s in times_s:
-        frame = operation.act(TrackingResult(0, 0, reason=_NOTHING), now_s)
-        while now_s < time_s:
-            now_s = min(now_s + _FILM_STEP_S, time_s)
+    def frames() -> Iterator[Workcell]:
+        now_s = 0.0
+        for time_s in times_s.tolist():
             frame = operation.act(TrackingResult(0, 0, reason=_NOTHING), now_s)
-        assert frame.workcell is not None
-        yield frame.workcell
+            while now_s < time_s:  # heard it of the time less often, the arms would halt
+                now_s = min(now_s + _FILM_STEP_S, time_s)
+                frame = operation.act(TrackingResult(0, 0, reason=_NOTHING), now_s)
+            assert frame.workcell is not None
+            yield frame.workcell
+
+    with progress_bar("drawing", len(times_s)) as advance:
+        film(frames(), as_located(stored), path, progress=advance)
+    say(f"written to {path}: {stored.motions.seconds:.0f} s in {len(times_s) / FPS:.0f}.")

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import re
 import signal
 import time
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -19,7 +20,7 @@ from tumortrack.core.errors import InputError, StorageError
 
 if TYPE_CHECKING:
     from tumortrack.live.loop import Loop, LoopConfig
-    from tumortrack.live.values import PublishedFrame, SinkConfig, SinkContext, TrackingResult
+    from tumortrack.live.values import PublishedFrame, TrackingResult
     from tumortrack.live.workers import SinkWorker, SourceWorker
     from tumortrack.models.model import Model
     from tumortrack.plan.operation import Operation
@@ -46,8 +47,9 @@ class Track:
 
     Sources and sinks are written kind:target?option=value&option=value. Sources: virtual:CASE,
     recording:PATH, realsense[:SERIAL|FILE], ros2:TOPIC, ros1:TOPIC. Sinks: viewer[:PORT],
-    recording:FOLDER, ros2[:TOPIC], ros1[:TOPIC], openigtlink[:PORT]. A wrong one is answered with
-    its options. docs/live.md has examples.
+    recording:FOLDER, ros2[:TOPIC], ros1[:TOPIC], openigtlink[:PORT], and for `resect` ur:HOST.
+    Installed packages can add sources and sinks. A wrong one is answered with its options.
+    docs/live.md has examples.
 
     Attributes:
         model: folder that `train` wrote.
@@ -88,6 +90,7 @@ class Track:
 
     def run(self, arms: Arms | None = None) -> None:
         """Until the source ends, the time is up, the arms have ended, or Ctrl-C."""
+        from tumortrack import api
         from tumortrack.core.config import to_builtins
         from tumortrack.live.calibration_file import read_frames
         from tumortrack.live.spec import SOURCES
@@ -95,7 +98,7 @@ class Track:
         from tumortrack.models.folder import read_model_manifest
 
         source_config = SOURCES.parse(self.source)
-        sink_configs = parse_sinks(self.sinks)
+        named = api.named_sinks(self.sinks)
         frames = read_frames(self.frame) if self.frame else PublishedFrame()
         if arms is not None:
             frames = arms.frames
@@ -105,11 +108,10 @@ class Track:
         from tumortrack.live.loop import Loop
         from tumortrack.live.workers import SourceWorker
         from tumortrack.tracking.tracker import Tracker
-        from tumortrack.training.model import load_model
 
         if arms is None:
             keep_loaded()
-        model = load_model(self.model, self.device)
+        model = api.load_model(self.model, self.device)
         say_notes(model.notes)
         tracker = Tracker(model)
         config = self._loop_config(model)
@@ -124,23 +126,23 @@ class Track:
 
         say("warming up ...")
         loop.warm()
-        with stopping(stop), ExitStack() as ending, ExitStack() as workers:
-            sinks = open_sinks(self.sinks, sink_configs, context, workers)
-            source = SourceWorker(source_config.open)
-            workers.callback(source.close)
-            about = {
-                "model": model.provenance,
-                "notes": list(model.notes),
-                "model_sha256": store.sha256_of(self.model / store.MANIFEST),
-                "source": self.source,
-                "sinks": list(self.sinks),
-                "config": to_builtins(config),
-                "frame": {
-                    "frame_id": frames.frame_id,
-                    "published_from_camera": frames.published_from_camera.tolist(),
-                },
-                **({} if arms is None else arms.about),
-            }
+        way = frames.published_from_camera
+        about = {
+            "model": model.provenance,
+            "notes": list(model.notes),
+            "model_sha256": store.sha256_of(self.model / store.MANIFEST),
+            "source": self.source,
+            "sinks": list(self.sinks),
+            "config": to_builtins(config),
+            "frame": {"frame_id": frames.frame_id, "published_from_camera": way.tolist()},
+            **({} if arms is None else arms.about),
+        }
+        with (
+            stopping(stop),
+            ExitStack() as ending,
+            api.open_sinks(named, context) as sinks,
+            closing(SourceWorker(source_config.open)) as source,
+        ):
             screen = _Screen(loop, source, sinks, report, about, companion)
             ending.callback(screen.end)  # once all workers have flushed
             say(f"tracking {self.source} in frame {frames.frame_id!r}; Ctrl-C ends it.")
@@ -149,52 +151,18 @@ class Track:
     def _loop_config(self, model: Model) -> LoopConfig:
         from tumortrack.live.loop import LoopConfig
         from tumortrack.sense.files import read_intrinsics
-        from tumortrack.tracking.region import region_for
-        from tumortrack.tracking.tracker import FollowerConfig
+        from tumortrack.tracking.tracker import FollowerConfig, region_for
 
         box = None if self.box is None else (self.box[:3], self.box[3:])
+        follower = FollowerConfig(rescan_s=self.rescan, smoothing_s=self.smoothing, seed=self.seed)
         return LoopConfig(
             region=region_for(model, range_mm=self.range, box_mm=box, whole=self.whole),
-            follower=FollowerConfig(
-                rescan_s=self.rescan, smoothing_s=self.smoothing, seed=self.seed
-            ),
+            follower=follower,
             intrinsics=None if self.intrinsics is None else read_intrinsics(self.intrinsics),
             stale_s=self.stale,
             give_up_s=self.give_up,
             seconds=self.seconds,
         )
-
-
-def parse_sinks(sinks: tuple[str, ...]) -> list[SinkConfig]:
-    """Configurations of what was written on the command line."""
-    from tumortrack.live.spec import SINKS
-
-    configs = [SINKS.parse(sink) for sink in sinks]
-    if doubled := sorted({sink for sink in sinks if sinks.count(sink) > 1}):
-        raise InputError(f"sink {doubled[0]!r} is given twice.")
-    return configs
-
-
-def open_sinks(
-    sinks: tuple[str, ...], configs: list[SinkConfig], context: SinkContext, stack: ExitStack
-) -> list[SinkWorker]:
-    """Each at work in a thread of its own, until the stack ends."""
-    from tumortrack.live.workers import SinkWorker
-
-    workers = []
-    # Those that make a folder last: if another cannot open, none is left behind.
-    pairs = zip(sinks, configs, strict=True)
-    for spec, config in sorted(pairs, key=lambda pair: pair[1].queue_size):
-        try:
-            sink = config.open(context)
-        except OSError as error:  # a sink of another package that does not translate it
-            raise StorageError(
-                f"sink {spec!r} cannot be opened: {error.strerror}: {error.filename}."
-            ) from error
-        worker = SinkWorker(spec, sink, config.queue_size)
-        stack.callback(worker.close)
-        workers.append(worker)
-    return workers
 
 
 def say_failures(sinks: list[SinkWorker], known: dict[str, str]) -> None:
@@ -241,39 +209,35 @@ def stopping(end: Callable[[], None]) -> Iterator[None]:
             signal.signal(number, handler)
 
 
+@dataclass(eq=False)
 class _Screen:
     """One line of state now and then, every change of quality, and the report."""
 
-    def __init__(
-        self,
-        loop: Loop,
-        source: SourceWorker,
-        sinks: list[SinkWorker],
-        report: Path,
-        about: dict[str, Any],
-        arms: Operation | None,
-    ) -> None:
-        self._loop, self._source, self._sinks = loop, source, sinks
-        self._report, self._about, self._arms = report, about, arms
+    loop: Loop
+    source: SourceWorker
+    sinks: list[SinkWorker]
+    report: Path
+    about: dict[str, Any]
+    arms: Operation | None
+
+    def __post_init__(self) -> None:
         self._started = self._shown = self._stored = time.monotonic()
-        self._before = 0
-        self._state, self._changed = "", 0.0
-        self._unwritten = ""
+        self._before, self._state, self._changed, self._unwritten = 0, "", 0.0, ""
         self._errors: dict[str, str] = {}
         self._memory_mb = {"start": round(_resident_mb(), 1)}
 
     def show(self, result: TrackingResult) -> None:
         """Called with every result."""
         state = result.reason or result.warning or "good"
-        kind = _without_digits(state)
+        kind = re.sub(r"\d", "", state)  # numbers change with every frame
         if (cell := result.workcell) is not None:
             state += f"; arms: {cell.state}" + (f" ({cell.halted})" if cell.halted else "")
-            kind += cell.state + _without_digits(cell.halted)
+            kind += cell.state + re.sub(r"\d", "", cell.halted)
         now = time.monotonic()
         if kind != self._state and now - self._changed >= _SAY_S:
             self._state, self._changed = kind, now
             say(f"{result.quality}: {state}")
-        say_failures(self._sinks, self._errors)
+        say_failures(self.sinks, self._errors)
         if now - self._shown >= (_SAY_S if console.is_terminal else _SAY_PLAIN_S):
             self._line(now)
         if now - self._stored >= _STORE_S:
@@ -281,9 +245,9 @@ class _Screen:
 
     def end(self) -> None:
         """The last lines."""
-        source, loop = self._source, self._loop
         self._store()
-        counts, latency = loop.statistics.counts, loop.statistics.latency
+        source, statistics = self.source, self.loop.statistics
+        counts, latency = statistics.counts, statistics.latency
         say(
             f"{counts['good'] + counts['poor']} estimates ({counts['poor']} poor), "
             f"{counts['none']} times none, {source.dropped} frames dropped."
@@ -294,56 +258,50 @@ class _Screen:
                 f"latency from {source.latency_from} to published estimate: p50 "
                 f"{times['p50']:.1f}, p95 {times['p95']:.1f}, p99.9 {times['p99.9']:.1f} ms."
             )
-        for sink in self._sinks:
+        for sink in self.sinks:
             if sink.dropped or sink.errors:
                 last = f"; the last: {sink.error}" if sink.error else ""
                 say(f"sink {sink.name}: {sink.dropped} missed, {sink.errors} errors{last}.")
-        for name, errors in loop.statistics.errors.items():
+        for name, errors in statistics.errors.items():
             off = errors.summary()
             say(f"{name}: centre off by {off['p50']:.1f} mm (median; 95 %: {off['p95']:.1f} mm).")
         if not self._unwritten:
-            say(f"written to {self._report}.")
-        check_closed(self._sinks)
+            say(f"written to {self.report}.")
+        check_closed(self.sinks)
 
     def _line(self, now: float) -> None:
-        total = sum(self._loop.statistics.counts.values())
+        statistics = self.loop.statistics
+        total = sum(statistics.counts.values())
         rate = (total - self._before) / (now - self._shown)
         self._before, self._shown = total, now
-        latency = self._loop.statistics.latency
-        if not len(latency):
-            return
-        say(
-            f"{now - self._started:6.0f} s  {rate:5.1f} updates/s  latency p50 "
-            f"{latency.percentile(50):.1f} p95 {latency.percentile(95):.1f} ms  "
-            f"dropped {self._source.dropped}  {_resident_mb():.0f} MB"
-        )
+        if len(statistics.latency):
+            p50, p95 = (statistics.latency.percentile(percent) for percent in (50, 95))
+            say(
+                f"{now - self._started:6.0f} s  {rate:5.1f} updates/s  latency p50 {p50:.1f} p95 "
+                f"{p95:.1f} ms  dropped {self.source.dropped}  {_resident_mb():.0f} MB"
+            )
 
     def _store(self) -> None:
         from tumortrack.live.loop import summary
 
         self._stored = time.monotonic()
-        now_mb = round(_resident_mb(), 1)
-        self._memory_mb["now"] = now_mb
+        self._memory_mb["now"] = now_mb = round(_resident_mb(), 1)
         if self._stored - self._started > _SETTLED_S:
             self._memory_mb.setdefault("settled", now_mb)
         content = {
-            **self._about,
+            **self.about,
             "seconds": round(self._stored - self._started, 2),
             "memory_mb": self._memory_mb,
-            **summary(self._loop, self._source, self._sinks),
-            **({} if self._arms is None else {"resection": self._arms.summary()}),
+            **summary(self.loop, self.source, self.sinks),
+            **({} if self.arms is None else {"resection": self.arms.summary()}),
         }
         try:
-            store.write_json(self._report, content)
+            store.write_json(self.report, content)
             self._unwritten = ""
         except StorageError as error:  # a full disk must not end what is seen live
             if not self._unwritten:
                 say(f"report: {error}")
             self._unwritten = str(error)
-
-
-def _without_digits(text: str) -> str:
-    return "".join(character for character in text if not character.isdigit())
 
 
 def _resident_mb() -> float:

@@ -55,34 +55,35 @@ class Train:
     start: Path | None = None
 
     def run(self) -> None:
-        """Case -> model folder, resumed where one was begun."""
         from tumortrack.imaging.case import load_case
 
-        self._check_numbers()
+        if self.minutes is not None and not self.minutes > 0:
+            raise InputError(f"--minutes {self.minutes} must be more than 0.")
+        if self.steps is not None and self.steps < 1:
+            raise InputError(f"--steps {self.steps} must be at least 1.")
+        if self.minutes is not None and self.steps is not None:
+            raise InputError("--minutes and --steps both say when to stop; give one of them.")
+        if self.workers is not None and self.workers < 0:
+            raise InputError(f"--workers {self.workers} must be 0 or more.")
         case = load_case(self.case)  # report what is wrong so far before PyTorch's seconds
 
         from tumortrack.models.folder import is_finished
         from tumortrack.training.model import load_model, load_start
         from tumortrack.training.presets import PRESETS
-        from tumortrack.training.train import TrainingRun, run_identity, train
+        from tumortrack.training.train import TrainingRun, train
 
         keep_loaded()
         run = TrainingRun(
-            anatomy_ct=case.anatomy,
-            up_lps=case.up_lps,
+            anatomy_ct=case.anatomy, up_lps=case.up_lps,
             case_sha256=store.sha256_of(self.case / store.MANIFEST),
-            config=PRESETS[self.preset](case.anatomy, self.rotations),
-            seed=self.seed,
-            steps=self.steps,
-            minutes=self.minutes,
-            device=self.device,
-            workers=self.workers,
+            config=PRESETS[self.preset](case.anatomy, self.rotations), seed=self.seed,
+            steps=self.steps, minutes=self.minutes, device=self.device, workers=self.workers,
             checkpoint_every_s=self.checkpoint_every,
             start=None if self.start is None else load_start(self.start),
-        )
+        )  # fmt: skip
         if is_finished(self.model):
             done = load_model(self.model).provenance
-            if done.get("run_sha256") != run_identity(run):
+            if done.get("run_sha256") != run.identity:
                 raise InputError(
                     f"{self.model} holds a model of another case, preset, seed or option. Choose "
                     "another MODEL folder."
@@ -95,16 +96,6 @@ class Train:
             f"model written to {self.model}: {about['steps']} steps in {about['training_s']:.0f} "
             f"s, validation mIoU {about['validation_miou']:.3f}."
         )
-
-    def _check_numbers(self) -> None:
-        if self.minutes is not None and not self.minutes > 0:
-            raise InputError(f"--minutes {self.minutes} must be more than 0.")
-        if self.steps is not None and self.steps < 1:
-            raise InputError(f"--steps {self.steps} must be at least 1.")
-        if self.minutes is not None and self.steps is not None:
-            raise InputError("--minutes and --steps both say when to stop; give one of them.")
-        if self.workers is not None and self.workers < 0:
-            raise InputError(f"--workers {self.workers} must be 0 or more.")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -130,20 +121,15 @@ class Pretrain:
     checkpoint_every: float = 30.0
 
     def run(self) -> None:
-        """Pretrained weights into OUT, resumed where a run was begun."""
         from tumortrack.training.model import PRETRAINED
         from tumortrack.training.presets import pretraining
-        from tumortrack.training.pretrain import Pretraining, pretrain
+        from tumortrack.training.pretrain import pretrain
+        from tumortrack.training.state import Pretraining
 
         run = Pretraining(
-            config=pretraining(),
-            anatomies=self.anatomies,
-            steps=self.steps,
-            seed=self.seed,
-            device=self.device,
-            workers=self.workers,
-            checkpoint_every_s=self.checkpoint_every,
-        )
+            config=pretraining(), anatomies=self.anatomies, steps=self.steps, seed=self.seed,
+            device=self.device, workers=self.workers, checkpoint_every_s=self.checkpoint_every,
+        )  # fmt: skip
         if (self.out / store.MANIFEST).is_file():
             done = store.read_manifest(self.out, PRETRAINED).get("provenance", {})
             if done.get("run_sha256") != run.identity:
@@ -180,7 +166,14 @@ def _training_screen() -> Iterator[Callable[[TrainingStatus], None]]:
         if status.note != noted:
             say(status.note)
             noted = status.note
-        text = _line(status)
+        end = f"/{status.end}" if status.end is not None else ""
+        miou = "-" if status.miou is None else f"{status.miou:.3f}"
+        minutes, seconds = divmod(int(status.seconds_left), 60)
+        text = (
+            f"step {status.step}{end} | {status.samples_per_s:.0f} samples/s | loss "
+            f"{status.loss:.4f} | validation mIoU {miou} | {minutes}:{seconds:02d} left | "
+            f"{status.waiting:.0%} waiting for scenes"
+        )
         if console.is_terminal:
             spinner.update(text)
         elif time.monotonic() - shown_s >= _EVERY_S or status.step == status.end:
@@ -197,13 +190,3 @@ def _training_screen() -> Iterator[Callable[[TrainingStatus], None]]:
         raise
     finally:
         spinner.stop()
-
-
-def _line(status: TrainingStatus) -> str:
-    end = f"/{status.end}" if status.end is not None else ""
-    miou = "-" if status.miou is None else f"{status.miou:.3f}"
-    left = f"{int(status.seconds_left) // 60}:{int(status.seconds_left) % 60:02d}"
-    return (
-        f"step {status.step}{end} | {status.samples_per_s:.0f} samples/s | loss {status.loss:.4f} "
-        f"| validation mIoU {miou} | {left} left | {status.waiting:.0%} waiting for scenes"
-    )

@@ -199,18 +199,6 @@ class SensorCloud:
 
 
 @dataclass(frozen=True, eq=False)
-class OccupancySamples:
-    """Labelled training points, camera frame, mm."""
-
-    points_mm: Float32[np.ndarray, "n 3"]
-    labels: UInt8[np.ndarray, " n"]
-
-    def __post_init__(self) -> None:
-        _freeze(self, "points_mm", np.float32, (None, 3))
-        _freeze(self, "labels", np.uint8, (len(self.points_mm),))
-
-
-@dataclass(frozen=True, eq=False)
 class OccupancyCloud:
     """The estimate as points inside the organ: label >= 1 and its probability, camera frame."""
 

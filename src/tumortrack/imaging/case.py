@@ -73,11 +73,6 @@ def load_case(folder: Path) -> Case:
     anatomy = read_anatomy(folder)
     if list(anatomy.names) != parts:
         raise ArtifactError(f"{folder} lacks parts: {parts} expected, {list(anatomy.names)} found.")
-    ct = folder / "ct.nii.gz"
-    return Case(
-        anatomy=anatomy,
-        labels=read_labels(folder / "labels.nii.gz"),
-        up_lps=(float(up[0]), float(up[1]), float(up[2])),
-        report=report,
-        ct=read_volume(ct) if ct.exists() else None,
-    )
+    labels, ct = read_labels(folder / "labels.nii.gz"), folder / "ct.nii.gz"
+    x, y, z = up
+    return Case(anatomy, labels, (x, y, z), report, read_volume(ct) if ct.exists() else None)

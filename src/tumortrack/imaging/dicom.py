@@ -38,10 +38,6 @@ class _Slice:
     position_mm: tuple[float, ...]  # LPS, first pixel
     orientation: tuple[float, ...]  # along a row, along a column
 
-    @property
-    def group(self) -> tuple[Any, ...]:
-        return (self.uid, self.shape, tuple(round(c, 3) for c in self.orientation))
-
 
 @dataclass(frozen=True, eq=False)
 class Series:
@@ -73,37 +69,44 @@ def find_series(folder: Path, series: str | None = None) -> Series:
     if not 0.99 < np.linalg.norm(normal) < 1.01:
         raise InputError(f"{first.path}: ImageOrientationPatient is not two unit directions.")
     slices = sorted(slices, key=lambda s: float(np.dot(s.position_mm, normal)))
-    step = _slice_step(slices, normal)
-    lps_from_index = np.eye(4)
-    # Pixel spacing is (between rows, between columns); index i runs along a row.
-    lps_from_index[:3, 0] = row * slices[0].spacing_mm[1]
-    lps_from_index[:3, 1] = column * slices[0].spacing_mm[0]
-    lps_from_index[:3, 2] = step
-    lps_from_index[:3, 3] = slices[0].position_mm
+    between_rows, between_columns = first.spacing_mm
+    lps_from_index = np.eye(4)  # index i runs along a row
+    axes = (row * between_columns, column * between_rows, _slice_step(slices, normal))
+    lps_from_index[:3] = np.stack([*axes, slices[0].position_mm], axis=1)
     shape = (first.shape[1], first.shape[0], len(slices))
     check_size(folder, shape, 4)
     check_affine(folder, lps_from_index)
-    files = tuple(s.path for s in slices)
-    return Series(files, shape, lps_from_index, notes + _other_series(groups, slices))
+    # A damaged slice may be among the images that are not taken.
+    if others := sum(map(len, groups)) - len(slices):
+        notes += (f"{others} images of other series, sizes or orientations left out",)
+    return Series(tuple(s.path for s in slices), shape, lps_from_index, notes)
 
 
 def read_dicom(folder: Path, series: str | None = None) -> RawVolume:
-    """Read one CT series of a folder, chosen as by ``find_series``.
+    """Read one CT series of a folder, chosen as by ``find_series``: rescaled values (HU), float32.
 
     Raises:
         InputError: see ``find_series``; damaged pixels.
     """
+    import SimpleITK as sitk  # noqa: N813
+
     found = find_series(folder, series)
-    pixels = _pixels(folder, list(found.files), found.shape)
-    return RawVolume(pixels, found.lps_from_index, found.notes)
+    sitk.ProcessObject.SetGlobalWarningDisplay(False)
+    reader = sitk.ImageSeriesReader()
+    reader.SetFileNames([str(file) for file in found.files])
+    reader.SetOutputPixelType(sitk.sitkFloat32)
+    try:
+        array = sitk.GetArrayFromImage(reader.Execute()).transpose(2, 1, 0)
+    except RuntimeError as error:
+        last = str(error).strip().splitlines()[-1]
+        raise InputError(f"{folder}: the slices' pixels cannot be decoded: {last}.") from error
+    if array.shape != found.shape:
+        raise InputError(f"{folder}: the pixels are {array.shape}, the tags say {found.shape}.")
+    return RawVolume(array, found.lps_from_index, found.notes)
 
 
 def _groups(folder: Path) -> tuple[list[list[_Slice]], tuple[str, ...]]:
-    """Slices by series, size and orientation, in a fixed order; and notes on other files.
-
-    Raises:
-        InputError: too many files, or no slice at all.
-    """
+    """Slices by series, size and orientation, in a fixed order; and notes on other files."""
     files = sorted(p for p in folder.iterdir() if p.is_file() and not p.name.startswith("."))
     if len(files) > _MAX_FILES:
         raise InputError(f"{folder} holds {len(files)} files; the limit is {_MAX_FILES}.")
@@ -111,10 +114,11 @@ def _groups(folder: Path) -> tuple[list[list[_Slice]], tuple[str, ...]]:
     left_out: dict[str, list[Path]] = {_NO_SLICE: [], _MULTI_FRAME: []}
     for file in files:
         one = _read_tags(file)
-        if isinstance(one, _Slice):
-            found.setdefault(one.group, []).append(one)
-        else:
+        if isinstance(one, str):
             left_out[one].append(file)
+        else:
+            turn = tuple(round(c, 3) for c in one.orientation)
+            found.setdefault((one.uid, one.shape, turn), []).append(one)
     if not found and (multi_frame := left_out[_MULTI_FRAME]):
         raise InputError(
             f"{multi_frame[0]} is a multi-frame DICOM object; export classic slices, one file "
@@ -135,14 +139,6 @@ def _groups(folder: Path) -> tuple[list[list[_Slice]], tuple[str, ...]]:
     return groups, notes
 
 
-def _other_series(groups: list[list[_Slice]], chosen: list[_Slice]) -> tuple[str, ...]:
-    """A note on the images that were not taken: a damaged slice may be among them."""
-    n_slices = sum(map(len, groups)) - len(chosen)
-    if not n_slices:
-        return ()
-    return (f"{n_slices} images of other series, sizes or orientations left out",)
-
-
 def _read_tags(path: Path) -> _Slice | str:
     """The tags of one slice, or why the file is none (``_NO_SLICE``, ``_MULTI_FRAME``)."""
     import pydicom
@@ -153,11 +149,15 @@ def _read_tags(path: Path) -> _Slice | str:
             tags = pydicom.dcmread(path, stop_before_pixels=True, specific_tags=_TAGS)
             if int(tags.get("NumberOfFrames") or 1) > 1:
                 return _MULTI_FRAME
+            uid, description, modality = (
+                "".join(c if c.isprintable() else "?" for c in str(tags.get(tag) or ""))
+                for tag in _TAGS[:3]
+            )
             return _Slice(
-                path=path,
-                uid=_printable(tags.get("SeriesInstanceUID")),
-                description=_printable(tags.get("SeriesDescription")),
-                modality=_printable(tags.get("Modality")),
+                path,
+                uid,
+                description,
+                modality,
                 shape=(int(tags.Rows), int(tags.Columns)),
                 spacing_mm=(float(tags.PixelSpacing[0]), float(tags.PixelSpacing[1])),
                 position_mm=tuple(float(x) for x in tags.ImagePositionPatient),
@@ -167,16 +167,13 @@ def _read_tags(path: Path) -> _Slice | str:
         return _NO_SLICE
 
 
-def _printable(value: object) -> str:
-    """A tag's text, safe to print on a terminal."""
-    return "".join(c if c.isprintable() else "?" for c in str(value or ""))
-
-
 def _choose(folder: Path, groups: list[list[_Slice]], series: str | None) -> list[_Slice]:
     if series is not None:
         fitting = [g for n, g in enumerate(groups, 1) if series in (g[0].uid, str(n))]
+        what = f"fit {series!r}"
     else:
         fitting = [g for g in groups if g[0].modality == "CT" and len(g) >= MIN_SLICES]
+        what = f"are CT with at least {MIN_SLICES} slices"
     if len(fitting) == 1:
         return fitting[0]
     listing = "\n".join(
@@ -184,34 +181,28 @@ def _choose(folder: Path, groups: list[list[_Slice]], series: str | None) -> lis
         f"{g[0].modality}, {len(g)} slices of {g[0].shape[1]} x {g[0].shape[0]}"
         for n, g in enumerate(groups, 1)
     )
-    what = (
-        f"{len(fitting)} of them fit {series!r}"
-        if series is not None
-        else f"{len(fitting)} of them are CT with at least {MIN_SLICES} slices"
-    )
     raise InputError(
-        f"{folder} holds these series and {what}; give --series with a UID or number:\n{listing}"
+        f"{folder} holds these series and {len(fitting)} of them {what}; give --series with a UID "
+        f"or number:\n{listing}"
     )
 
 
-def _slice_step(slices: list[_Slice], normal: Float[np.ndarray, " 3"]) -> Float[np.ndarray, " 3"]:
+def _slice_step(slices: list[_Slice], normal: np.ndarray) -> np.ndarray:
     """The vector from one slice to the next, after checking that all slices follow it."""
+    folder = slices[0].path.parent
     if len({s.spacing_mm for s in slices}) > 1:
-        raise InputError(f"{slices[0].path.parent}: its slices differ in pixel spacing.")
+        raise InputError(f"{folder}: its slices differ in pixel spacing.")
     if len(slices) < 2:
-        raise InputError(f"{slices[0].path.parent}: one slice is no volume.")
+        raise InputError(f"{folder}: one slice is no volume.")
     positions = np.array([s.position_mm for s in slices])
     along = positions @ normal
     gaps = np.diff(along)
     usual = float(np.median(gaps))
     for n in np.flatnonzero(np.abs(gaps - usual) > max(0.02, 0.05 * abs(usual))):
-        kind = (
-            "two slices lie at"
-            if gaps[n] < 0.5 * usual or usual < 0.01
-            else "a slice is missing after"
-        )
+        double = gaps[n] < 0.5 * usual or usual < 0.01
+        kind = "two slices lie at" if double else "a slice is missing after"
         raise InputError(
-            f"{slices[n].path.parent}: {kind} position {along[n]:.2f} mm ({slices[n].path.name} to "
+            f"{folder}: {kind} position {along[n]:.2f} mm ({slices[n].path.name} to "
             f"{slices[n + 1].path.name}: {gaps[n]:.2f} mm, usually {usual:.2f} mm). Export the "
             "whole series again, each slice once."
         )
@@ -225,21 +216,3 @@ def _slice_step(slices: list[_Slice], normal: Float[np.ndarray, " 3"]) -> Float[
             "line through the others. Export one continuous series."
         )
     return step
-
-
-def _pixels(folder: Path, files: list[Path], shape: tuple[int, int, int]) -> np.ndarray:
-    """Rescaled values (HU), float32, axes (column, row, slice)."""
-    import SimpleITK as sitk  # noqa: N813
-
-    sitk.ProcessObject.SetGlobalWarningDisplay(False)
-    reader = sitk.ImageSeriesReader()
-    reader.SetFileNames([str(f) for f in files])
-    reader.SetOutputPixelType(sitk.sitkFloat32)
-    try:
-        array = sitk.GetArrayFromImage(reader.Execute()).transpose(2, 1, 0)
-    except RuntimeError as error:
-        last = str(error).strip().splitlines()[-1]
-        raise InputError(f"{folder}: the slices' pixels cannot be decoded: {last}.") from error
-    if array.shape != shape:
-        raise InputError(f"{folder}: the pixels are {array.shape}, the tags say {shape}.")
-    return array

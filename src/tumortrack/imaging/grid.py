@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -34,11 +36,14 @@ class RawVolume:
     notes: tuple[str, ...] = ()
 
 
-def check_size(path: Path, shape: tuple[int, ...], bytes_per_voxel: int) -> None:
-    """Refuse a shape that is no volume or too large, before anything is allocated.
+def check_size(
+    path: Path, shape: tuple[int, ...], bytes_per_voxel: int, compressed: bool | None = None
+) -> None:
+    """Refuse a shape that is no volume or too large, and a file too short to hold what its header
+    claims (``compressed`` None: not one file, or no bound is known), before anything is allocated.
 
     Raises:
-        InputError: not three axes, fewer than two voxels along one, or above the limits.
+        InputError: not three axes, fewer than two voxels along one, above the limits; truncated.
     """
     dims = " x ".join(str(n) for n in shape)
     if len(shape) != 3:
@@ -48,36 +53,23 @@ def check_size(path: Path, shape: tuple[int, ...], bytes_per_voxel: int) -> None
         )
     if min(shape) < 2:
         raise InputError(f"{path} is {dims} voxels: a flat image. Give a whole 3-D volume.")
-    voxels = 1
-    for n in shape:
-        voxels *= int(n)
-    if voxels > _MAX_VOXELS or voxels * bytes_per_voxel > _MAX_BYTES:
+    voxels = math.prod(int(n) for n in shape)
+    needed = voxels * bytes_per_voxel
+    if voxels > _MAX_VOXELS or needed > _MAX_BYTES:
         raise InputError(
             f"{path} claims {dims} voxels of {bytes_per_voxel} bytes; the limit is {_MAX_VOXELS} "
             "voxels and 8 GiB. Crop or resample the volume round the kidney."
         )
-
-
-def check_stored(path: Path, needed_bytes: int, compressed: bool) -> None:
-    """Refuse a file too short to hold what its header claims, before allocating it.
-
-    Raises:
-        InputError: the file is truncated, or its header is damaged.
-    """
-    most = path.stat().st_size * (_GZIP_BEST if compressed else 1)
-    if most < needed_bytes:
+    if compressed is not None and path.stat().st_size * (_GZIP_BEST if compressed else 1) < needed:
         raise InputError(
-            f"{path} is shorter than its header says ({needed_bytes} bytes of voxels): truncated "
+            f"{path} is shorter than its header says ({needed} bytes of voxels): truncated "
             "or damaged. Copy or export it again."
         )
 
 
 def check_affine(path: Path, lps_from_index: Float[np.ndarray, "4 4"]) -> None:
-    """Refuse a NaN or singular affine, and spacing that is not plausibly millimetres.
-
-    Raises:
-        InputError: with the reason; metres are recognised.
-    """
+    """Refuse a NaN or singular affine, and spacing that is not plausibly millimetres (metres are
+    recognised), with an InputError."""
     linear = lps_from_index[:3, :3]
     if not np.isfinite(lps_from_index).all():
         raise InputError(f"{path}: the affine has NaN or infinite numbers. Export it again.")
@@ -91,26 +83,11 @@ def check_affine(path: Path, lps_from_index: Float[np.ndarray, "4 4"]) -> None:
     low, high = _SPACING_RANGE_MM
     if min(steps) < low or max(steps) > high:
         text = " x ".join(f"{s:.6g}" for s in steps)
-        metres = low <= 1000 * min(steps) and 1000 * max(steps) <= high
-        hint = (
-            "This looks like metres: multiply the spacing by 1000 and export again."
-            if metres
-            else "Correct the header and export again."
-        )
+        hint = "Correct the header and export again."
+        if low <= 1000 * min(steps) and 1000 * max(steps) <= high:
+            hint = "This looks like metres: multiply the spacing by 1000 and export again."
         raise InputError(
             f"{path}: voxels of {text} mm; allowed are {low:g} to {high:g} mm on each axis. {hint}"
-        )
-
-
-def check_numbers(path: Path, dtype: npt.DTypeLike) -> None:
-    """Refuse voxels that are not plain integers or real numbers.
-
-    Raises:
-        InputError: colours, complex numbers or structures.
-    """
-    if np.dtype(dtype).kind not in "iuf":
-        raise InputError(
-            f"{path}: voxels are {np.dtype(dtype)}; a CT or a label map of plain numbers is needed."
         )
 
 
@@ -129,11 +106,8 @@ def label_counts(labels: UInt8[np.ndarray, "i j k"]) -> Int64[np.ndarray, " 256"
 
 
 def components(mask: Bool[np.ndarray, "i j k"]) -> tuple[Int32[np.ndarray, "i j k"], np.ndarray]:
-    """Connected pieces (26 neighbours), numbered 1, 2, ... largest first, and their voxel counts.
-
-    Returns:
-        The numbered grid (0 outside) and counts, ``counts[n - 1]`` of piece n.
-    """
+    """Connected pieces (26 neighbours), numbered 1, 2, ... largest first, 0 outside, and their
+    voxel counts, ``counts[n - 1]`` of piece n."""
     from scipy import ndimage
 
     pieces, n = ndimage.label(mask, np.ones((3, 3, 3)))
@@ -152,19 +126,19 @@ def tight_box(mask: Bool[np.ndarray, "i j k"]) -> Box:
     return i, j, k
 
 
-def grown_box(box: tuple[slice, ...], shape: tuple[int, ...], margin: np.ndarray) -> Box:
+def grown_box(
+    box: Iterable[slice], shape: tuple[int, ...], margin: npt.ArrayLike = (0, 0, 0)
+) -> Box:
     """A box grown on every side by a margin (3,) in voxels, within the grid."""
     i, j, k = (
         slice(max(0, s.start - m), min(n, s.stop + m))
-        for s, n, m in zip(box, shape, margin.tolist(), strict=True)
+        for s, n, m in zip(box, shape, np.asarray(margin).tolist(), strict=True)
     )
     return i, j, k
 
 
 def bounding_box(
-    mask: Bool[np.ndarray, "i j k"],
-    lps_from_index: Float[np.ndarray, "4 4"],
-    margin_mm: float,
+    mask: Bool[np.ndarray, "i j k"], lps_from_index: Float[np.ndarray, "4 4"], margin_mm: float
 ) -> Box:
     """The slices that hold every True voxel and a margin, within the grid."""
     margin = np.ceil(margin_mm / spacing_mm(lps_from_index)).astype(int)
@@ -210,4 +184,5 @@ def grid_round(
     frame_from_index = np.diag([step_mm, step_mm, step_mm, 1.0])
     frame_from_index[:3, 3] = box_mm[0] - margin_mm
     counts = np.ceil((box_mm[1] - box_mm[0] + 2 * margin_mm) / step_mm).astype(int) + 1
-    return frame_from_index, (int(counts[0]), int(counts[1]), int(counts[2]))
+    i, j, k = counts.tolist()
+    return frame_from_index, (i, j, k)

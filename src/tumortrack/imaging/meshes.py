@@ -44,41 +44,38 @@ def read_mesh_folder(folder: Path, unit: str | None = None) -> tuple[Anatomy, li
     """
     if not folder.is_dir():
         raise InputError(f"{folder} is not a folder of meshes.")
-    organ_file, tumor_files = _files_by_name(folder)
+    organ_file, *tumor_files = files = _files_by_name(folder)
     if unit not in (None, "mm", "m"):
         raise InputError(f"unit {unit!r} is not allowed: mm or m.")
     notes: list[str] = []
-    scale = 1000.0 if unit == "m" else 1.0
-    organ, tumors = _read(organ_file, scale, notes), [_read(f, scale, notes) for f in tumor_files]
+    organ, *tumors = [_read(file, 1000.0 if unit == "m" else 1.0, notes) for file in files]
     _check_unit(organ_file, organ, unit)
     # A bed cut out for an inner tumor is no outside: the outermost shell is the organ.
     organ = largest_shell(closed_mesh(organ, organ_file.name, notes))
     tumors = [closed_mesh(t, f.name, notes) for t, f in zip(tumors, tumor_files, strict=True)]
     for tumor, file in zip(tumors, tumor_files, strict=True):
         organ = _union(organ, tumor, file.name)
-    names = part_names(1 + len(tumors))
-    notes += [
-        f"{file.name} is {name}"
-        for file, name in zip([organ_file, *tumor_files], names, strict=True)
-    ]
+    names = part_names(len(files))
+    notes += [f"{file.name} is {name}" for file, name in zip(files, names, strict=True)]
     if not tumors:
         notes.append("no tumor in this folder")
     return Anatomy((organ, *tumors)), notes
 
 
-def label_meshes(anatomy: Anatomy, voxel_mm: float = _VOXEL_MM) -> LabelVolume:
+def label_meshes(anatomy: Anatomy) -> LabelVolume:
     """Label the cells of an LPS-aligned grid whose centres the parts contain; tumors win."""
-    lps_from_index, shape = grid_round(anatomy.organ.box_mm, voxel_mm, 8.0)
+    lps_from_index, shape = grid_round(anatomy.organ.box_mm, _VOXEL_MM, 8.0)
     labels = np.zeros(shape, np.uint8)
     for number, part in enumerate(anatomy.parts, ORGAN):
         labels[winding_numbers(part, lps_from_index, shape) > 0] = number
     for number in range(FIRST_TUMOR, len(anatomy.parts) + 1):
         if not (labels == number).any():
-            raise InputError(f"tumor {number - 1} fills no {voxel_mm:g} mm cell: too small.")
+            raise InputError(f"tumor {number - 1} fills no {_VOXEL_MM:g} mm cell: too small.")
     return LabelVolume(labels, lps_from_index)
 
 
-def _files_by_name(folder: Path) -> tuple[Path, list[Path]]:
+def _files_by_name(folder: Path) -> list[Path]:
+    """The organ's file, then the tumors'."""
     files = sorted(p for p in folder.iterdir() if p.suffix.lower() in SUFFIXES)
     if not files:
         raise InputError(f"{folder} holds no meshes ({', '.join(SUFFIXES)}).")
@@ -93,7 +90,7 @@ def _files_by_name(folder: Path) -> tuple[Path, list[Path]]:
     if len(organs) != 1 or other:
         problem = f"{len(organs)} name an organ" + (f", {other} name neither" if other else "")
         raise InputError(f"{folder}: of {[f.name for f in files]} {problem}. {_RULE}")
-    return organs[0], sorted(tumors, key=_natural)
+    return [organs[0], *sorted(tumors, key=_natural)]
 
 
 def _natural(path: Path) -> list[Any]:
@@ -145,9 +142,8 @@ def _check_unit(path: Path, organ: Mesh, unit: str | None) -> None:
 def _union(organ: Mesh, tumor: Mesh, name: str) -> Mesh:
     """Organ and tumor as one closed surface; cavities that remain between them are closed."""
     joined = solid_of(organ, "the organ") + solid_of(tumor, name)
-    shells = joined.decompose()
-    outer = [s for s in shells if s.volume() > 0]
-    outer.sort(key=lambda s: -s.volume())
+    outer = [shell for shell in joined.decompose() if shell.volume() > 0]
+    outer.sort(key=lambda shell: -shell.volume())
     if not outer or (len(outer) > 1 and outer[1].volume() > 0.01 * tumor.volume_mm3):
         raise InputError(
             f"{name} lies apart from the organ: a tumor must lie in it or touch it. Check that "
@@ -170,10 +166,10 @@ def closed_mesh(mesh: Mesh, name: str, notes: list[str]) -> Mesh:
     size = float(np.ptp(mesh.box_mm, axis=0).max())
     if not size > 0:
         raise InputError(f"{name} has no extent; it is damaged.")
-    faces = _unique_faces(mesh.faces)
-    if doubled := len(mesh.faces) - len(faces):
+    _, first = np.unique(np.sort(mesh.faces, axis=1), axis=0, return_index=True)
+    out = Mesh(mesh.vertices_mm, mesh.faces[np.sort(first)])
+    if doubled := len(mesh.faces) - len(first):
         notes.append(f"{name}: {doubled} doubled faces removed")
-    out = Mesh(mesh.vertices_mm, faces)
     work = trimesh.Trimesh(out.vertices_mm, out.faces, process=False)
     if not work.is_winding_consistent:
         trimesh.repair.fix_winding(work)
@@ -191,28 +187,24 @@ def closed_mesh(mesh: Mesh, name: str, notes: list[str]) -> Mesh:
     if abs(out.volume_mm3) < 1e-9 * size**3:
         raise InputError(f"{name} encloses no volume; it is no solid.")
     if not is_simple(out, size / 80):
-        out = _remesh(out, name, size)
+        out = _remesh(out, name, size / 120)
         notes.append(f"{name}: it crossed itself; remeshed at {size / 120:.2g} mm")
     return out
-
-
-def _unique_faces(faces: np.ndarray) -> np.ndarray:
-    _, first = np.unique(np.sort(faces, axis=1), axis=0, return_index=True)
-    return faces[np.sort(first)]
 
 
 def _close_holes(mesh: Mesh, name: str, notes: list[str]) -> Mesh:
     """Fan every boundary loop from its centre, if all are small."""
     edges = np.concatenate([mesh.faces[:, [0, 1]], mesh.faces[:, [1, 2]], mesh.faces[:, [2, 0]]])
-    codes = edges[:, 0].astype(np.int64) * len(mesh.vertices_mm) + edges[:, 1]
-    back = edges[:, 1].astype(np.int64) * len(mesh.vertices_mm) + edges[:, 0]
+    n = len(mesh.vertices_mm)
+    codes, back = (edges.astype(np.int64) @ weights for weights in ([n, 1], [1, n]))
     border = edges[~np.isin(codes, back)]
     if len(border) == 0:
         return mesh
     following = {int(a): int(b) for a, b in border}
     if len(following) != len(border):
         raise InputError(f"{name} has holes that meet in one point; repair the mesh first.")
-    vertices, faces, widest, n_loops = [mesh.vertices_mm], [mesh.faces], 0.0, 0
+    centres: list[np.ndarray] = []
+    faces, widest = [mesh.faces], 0.0
     while following:
         loop = [next(iter(following))]
         while (ahead := following.pop(loop[-1], None)) is not None and ahead != loop[0]:
@@ -221,32 +213,27 @@ def _close_holes(mesh: Mesh, name: str, notes: list[str]) -> Mesh:
             raise InputError(f"{name} has a border that does not close; repair the mesh first.")
         ring = mesh.vertices_mm[loop]
         widest = max(widest, float(np.ptp(ring, axis=0).max()))
-        centre = len(mesh.vertices_mm) + n_loops
-        vertices.append(ring.mean(0, keepdims=True))
         # The border runs as its faces do; the new ones run against it.
-        faces.append(
-            np.array([[b, a, centre] for a, b in zip(loop, [*loop[1:], loop[0]], strict=True)])
-        )
-        n_loops += 1
+        centre = np.full(len(loop), n + len(centres))
+        faces.append(np.stack([np.roll(loop, -1), loop, centre], axis=1))
+        centres.append(ring.mean(0))
     if widest > _LARGEST_HOLE_MM:
         raise InputError(
-            f"{name} is open: {n_loops} holes, the widest {widest:.1f} mm (up to "
+            f"{name} is open: {len(centres)} holes, the widest {widest:.1f} mm (up to "
             f"{_LARGEST_HOLE_MM:g} mm are closed). Close the mesh, or give a label map."
         )
-    notes.append(f"{name}: {n_loops} holes closed, the widest {widest:.1f} mm")
-    return Mesh(np.concatenate(vertices), np.concatenate(faces))
+    notes.append(f"{name}: {len(centres)} holes closed, the widest {widest:.1f} mm")
+    return Mesh(np.concatenate([mesh.vertices_mm, centres]), np.concatenate(faces))
 
 
-def _remesh(mesh: Mesh, name: str, size: float) -> Mesh:
+def _remesh(mesh: Mesh, name: str, step: float) -> Mesh:
     """March the region of positive winding number: crossings and inner walls vanish."""
-    step = size / 120
     affine, shape = grid_round(mesh.box_mm, step, 4 * step)
     inside = winding_numbers(mesh, affine, shape) > 0
     if not inside.any():
         raise InputError(f"{name} crosses itself and encloses nothing; repair it first.")
     out = surfaces(LabelVolume(inside.astype(np.uint8), affine))[0].organ
-    ratio = out.volume_mm3 / mesh.volume_mm3
-    if not 1 / _LARGEST_REMESH < ratio < _LARGEST_REMESH:
+    if not 1 / _LARGEST_REMESH < out.volume_mm3 / mesh.volume_mm3 < _LARGEST_REMESH:
         raise InputError(f"{name} crosses itself too much to be repaired; repair it first.")
     return out
 
@@ -264,11 +251,8 @@ def is_simple(mesh: Mesh, step_mm: float) -> bool:
 
 
 def solid_of(mesh: Mesh, name: str) -> Any:
-    """A closed mesh as a ``manifold3d.Manifold``; ``name`` is for the error.
-
-    Raises:
-        InputError: open, crossing itself beyond use, or inside out.
-    """
+    """A closed mesh as a ``manifold3d.Manifold``; ``name`` is for the InputError where it is open,
+    crosses itself beyond use, or is inside out."""
     import manifold3d
 
     raw = manifold3d.Mesh64(mesh.vertices_mm.copy(), mesh.faces.astype(np.uint64))

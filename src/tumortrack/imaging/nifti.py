@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Float, Num
 
 from tumortrack.core.errors import InputError
-from tumortrack.core.geometry import RAS_FROM_LPS
+from tumortrack.core.geometry import RAS_FROM_LPS, spacing_mm
 from tumortrack.core.store import write_atomically
 from tumortrack.imaging import grid
 
@@ -69,10 +69,11 @@ def read_nifti(path: Path) -> grid.RawVolume:
         raise InputError(f"{path}: the header puts the voxels at byte {offset:g}; it is damaged.")
     while len(shape) > 3 and shape[-1] == 1:
         shape = shape[:-1]
-    grid.check_size(path, shape, dtype.itemsize)
-    grid.check_numbers(path, dtype)
-    compressed = path.suffix.lower() == ".gz"
-    grid.check_stored(path, math.prod(shape) * dtype.itemsize, compressed)
+    grid.check_size(path, shape, dtype.itemsize, compressed=path.suffix.lower() == ".gz")
+    if dtype.kind not in "iuf":
+        raise InputError(
+            f"{path}: voxels are {dtype}; a CT or a label map of plain numbers is needed."
+        )
     if units not in ("mm", "unknown"):
         raise InputError(
             f"{path} states its unit as {units}; millimetres are needed. Export it in mm."
@@ -154,9 +155,11 @@ def write_nifti(
 
 def _header_of(array: np.ndarray, affine: np.ndarray) -> np.ndarray:
     """Everything but the numbers' type."""
-    axes = affine[:3, :3]
-    spacing = np.linalg.norm(axes, axis=0)
-    handed = 1.0 if np.linalg.det(axes) > 0 else -1.0
+    from scipy.spatial.transform import Rotation
+
+    spacing = spacing_mm(affine)
+    turn = affine[:3, :3] / spacing
+    handed = 1.0 if np.linalg.det(affine[:3, :3]) > 0 else -1.0
     header = np.zeros((), _HEADER)
     header["sizeof_hdr"], header["vox_offset"], header["magic"] = 348, 352, b"n+1"
     header["dim"] = [3, *array.shape, 1, 1, 1, 1]
@@ -164,27 +167,17 @@ def _header_of(array: np.ndarray, affine: np.ndarray) -> np.ndarray:
     header["scl_slope"], header["xyzt_units"] = 1, _MM
     header["sform_code"], header["srow"] = _SCANNER, affine[:3]
     # A quaternion cannot hold shear; the sform alone is right for every affine.
-    if np.allclose((axes / spacing).T @ (axes / spacing), np.eye(3), atol=1e-4):
+    if np.allclose(turn.T @ turn, np.eye(3), atol=1e-4):
+        rotation = Rotation.from_matrix(turn * [1, 1, handed])
         header["qform_code"], header["offset"] = _SCANNER, affine[:3, 3]
-        header["quaternion"] = _quaternion(axes / spacing * [1, 1, handed])
+        header["quaternion"] = rotation.as_quat(canonical=True)[:3]  # a >= 0 is left out
     return header
-
-
-def _quaternion(turn: np.ndarray) -> np.ndarray:
-    """b, c, d of a rotation; a >= 0 is left out."""
-    from scipy.spatial.transform import Rotation
-
-    return Rotation.from_matrix(turn).as_quat(canonical=True)[:3]
 
 
 def write_volume_nifti(
     path: Path, hu: Num[np.ndarray, "i j k"], lps_from_index: Float[np.ndarray, "4 4"]
 ) -> None:
-    """Write a CT as .nii.gz: 16-bit integers where that loses nothing, else float32.
-
-    Raises:
-        StorageError: the disk refused.
-    """
+    """Write a CT (see ``write_nifti``): 16-bit integers where that loses nothing, else float32."""
     whole = np.clip(np.rint(hu), -32768, 32767).astype(np.int16)
     exact = whole if np.array_equal(whole, hu) else hu.astype(np.float32)
     write_nifti(path, exact, lps_from_index, lps=True)

@@ -12,9 +12,9 @@ from tumortrack.core import store
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import direction_lps, spacing_mm
 from tumortrack.core.mesh_files import SUFFIXES
-from tumortrack.core.types import ORGAN, Anatomy, LabelVolume, Volume
+from tumortrack.core.types import ORGAN, LabelVolume, Volume
 from tumortrack.imaging.case import Case
-from tumortrack.imaging.grid import voxel_ml
+from tumortrack.imaging.grid import grown_box, voxel_ml
 from tumortrack.imaging.meshes import label_meshes, read_mesh_folder
 from tumortrack.imaging.segment import KIDNEY_HU, TUMOR_HU, segment_ct
 from tumortrack.imaging.select import MIN_TUMOR_ML, select_labels
@@ -22,10 +22,8 @@ from tumortrack.imaging.surface import surfaces
 from tumortrack.imaging.volume import is_label_map, labels_of, read_raw, volume_of
 
 # Options that only one kind of input uses.
-_OF_CT = ("kidney_hu", "tumor_hu")
-_OF_LABELS = ("labels", "side", "organ", "tumor")
-_OF_DICOM, _OF_MESHES = ("series",), ("unit",)
-
+_OF_CT, _OF_LABELS = ("kidney_hu", "tumor_hu"), ("labels", "side", "organ", "tumor")
+_UP_LPS = (0.0, -1.0, 0.0)  # until ``prepare`` sets what was asked for
 _MOST_CHANGE_PERCENT = 1.0  # of a part's volume, by smoothing; more is noted
 
 
@@ -89,7 +87,7 @@ def prepare(input: Path, options: PrepareOptions | None = None) -> Case:
     return replace(case, up_lps=up, report={**case.report, **origin})
 
 
-def _refuse_unused(what: str, options: PrepareOptions, unused: tuple[str, ...]) -> None:
+def _refuse_unused(what: str, options: PrepareOptions, *unused: str) -> None:
     """Refuse options that this kind of input would ignore."""
     usual = PrepareOptions()
     given = [name for name in unused if getattr(options, name) != getattr(usual, name)]
@@ -100,12 +98,12 @@ def _refuse_unused(what: str, options: PrepareOptions, unused: tuple[str, ...]) 
 
 def _from_volume(path: Path, options: PrepareOptions) -> Case:
     if not path.is_dir():
-        _refuse_unused(f"{path} is one file", options, _OF_DICOM)
+        _refuse_unused(f"{path} is one file", options, "series")
     raw = read_raw(path, options.series)
     as_labels = options.labels or (path.is_file() and is_label_map(raw))
     ct, notes = None, list(raw.notes)
     if as_labels:
-        _refuse_unused(f"{path} is read as a label map", options, _OF_CT + _OF_MESHES)
+        _refuse_unused(f"{path} is read as a label map", options, *_OF_CT, "unit")
         if not options.labels:
             notes.append("few distinct whole numbers: read as a label map, not as a CT")
         source = labels_of(raw, path)
@@ -115,7 +113,7 @@ def _from_volume(path: Path, options: PrepareOptions) -> Case:
         )
     else:
         what = f"{path} is read as a CT (a label map needs --labels)"
-        _refuse_unused(what, options, _OF_LABELS + _OF_MESHES)
+        _refuse_unused(what, options, *_OF_LABELS, "unit")
         volume = volume_of(raw, path)
         del raw
         labels, more = segment_ct(volume, options.kidney_hu, options.tumor_hu, options.min_tumor_ml)
@@ -125,57 +123,41 @@ def _from_volume(path: Path, options: PrepareOptions) -> Case:
     notes += [
         f"{name}: the surface's volume is {change:+.1f} % off its labels'; it is too thin or hangs "
         "together by too little for a smooth surface. Look at qc.png"
-        for name, change in zip(surface.names, surface.change_percent, strict=True)
+        for name, change in zip(surface["names"], surface["change_percent"], strict=True)
         if abs(change) > _MOST_CHANGE_PERCENT
     ]
-    measured = {key: list(values) for key, values in asdict(surface).items()}
-    return _case("label map" if as_labels else "ct", anatomy, labels, measured, notes, ct)
+    report = {"kind": "label map" if as_labels else "ct", "notes": notes}
+    return Case(anatomy, labels, _UP_LPS, {**report, **_measured(labels, surface)}, ct)
 
 
 def _from_meshes(folder: Path, options: PrepareOptions) -> Case:
-    unused = (*_OF_CT, *_OF_LABELS, *_OF_DICOM, "min_tumor_ml")
-    _refuse_unused(f"{folder} holds meshes", options, unused)
+    unused = (*_OF_CT, *_OF_LABELS, "series", "min_tumor_ml")
+    _refuse_unused(f"{folder} holds meshes", options, *unused)
     anatomy, notes = read_mesh_folder(folder, options.unit)
+    labels = label_meshes(anatomy)
     mesh_ml = [part.volume_mm3 / 1000 for part in anatomy.parts]
-    surface = {"names": list(anatomy.names), "mesh_ml": mesh_ml}
-    return _case("meshes", anatomy, label_meshes(anatomy), surface, notes)
+    measured = _measured(labels, {"names": list(anatomy.names), "mesh_ml": mesh_ml})
+    return Case(anatomy, labels, _UP_LPS, {"kind": "meshes", "notes": notes, **measured})
 
 
-def _case(
-    kind: str,
-    anatomy: Anatomy,
-    labels: LabelVolume,
-    surface: dict[str, Any],
-    notes: list[str],
-    ct: Volume | None = None,
-) -> Case:
-    report = {
-        "kind": kind,
-        "notes": notes,
-        "volumes_ml": volumes_ml(labels),
+def _measured(labels: LabelVolume, surface: dict[str, list[Any]]) -> dict[str, Any]:
+    """Volumes by part from the labels (``kidney`` includes its tumors), and how they lie."""
+    counts = np.bincount(labels.labels.ravel(), minlength=2) * voxel_ml(labels.lps_from_index)
+    tumors = {f"tumor_{n - 1}": float(counts[n]) for n in range(2, len(counts))}
+    return {
+        "volumes_ml": {"kidney": float(counts[1:].sum()), **tumors},
         "surface": surface,
         "spacing_mm": spacing_mm(labels.lps_from_index).tolist(),
     }
-    return Case(anatomy, labels, (0.0, -1.0, 0.0), report, ct)
-
-
-def volumes_ml(labels: LabelVolume) -> dict[str, float]:
-    """Volumes by part from the labels; ``kidney`` includes its tumors."""
-    counts = np.bincount(labels.labels.ravel(), minlength=2) * voxel_ml(labels.lps_from_index)
-    tumors = {f"tumor_{n - 1}": float(counts[n]) for n in range(2, len(counts))}
-    return {"kidney": float(counts[1:].sum()), **tumors}
 
 
 def _crop_ct(volume: Volume, labels: LabelVolume) -> Volume:
     """The CT on the labels' crop; beyond the scan's edge it is air."""
+    shape = labels.labels.shape
     index_from_lps = np.linalg.inv(volume.lps_from_index)
     start = np.rint((index_from_lps @ labels.lps_from_index)[:3, 3]).astype(int)
-    stop = start + labels.labels.shape
-    inner = tuple(
-        slice(max(0, a), min(n, b)) for a, b, n in zip(start, stop, volume.hu.shape, strict=True)
-    )
-    hu = np.full(labels.labels.shape, -1000.0, np.float32)
-    hu[tuple(slice(s.start - a, s.stop - a) for s, a in zip(inner, start, strict=True))] = (
-        volume.hu[inner]
-    )
+    inner = grown_box([slice(a, a + n) for a, n in zip(start, shape, strict=True)], volume.hu.shape)
+    hu = np.full(shape, -1000.0, np.float32)
+    there = tuple(slice(s.start - a, s.stop - a) for s, a in zip(inner, start, strict=True))
+    hu[there] = volume.hu[inner]
     return Volume(hu, labels.lps_from_index)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import numba
 import numpy as np
@@ -16,9 +15,7 @@ from tumortrack.core.types import Anatomy, Mesh
 _MOST_CELLS = 2**28  # of a grid
 
 
-def expand(
-    counts: Int[np.ndarray, " n"],
-) -> tuple[Int[np.ndarray, " m"], Int[np.ndarray, " m"]]:
+def expand(counts: Int[np.ndarray, " n"]) -> tuple[Int[np.ndarray, " m"], Int[np.ndarray, " m"]]:
     """``counts[item]`` entries for each item: the item and the running number within it."""
     item = np.repeat(np.arange(len(counts)), counts)
     return item, np.arange(len(item)) - np.repeat(np.cumsum(counts) - counts, counts)
@@ -29,13 +26,9 @@ def winding_numbers(
 ) -> Int16[np.ndarray, "i j k"]:
     """The winding number at voxel centres (whole indices), by rays along the last axis.
 
-    Each triangle adds +1 or -1 to every voxel behind it. A closed mesh whose faces turn outward
-    and that does not cross itself gives 0 outside and 1 inside, and nothing else.
-
-    Args:
-        mesh: surface in some frame, mm.
-        frame_from_index: array index -> that frame; any invertible affine.
-        shape: of the grid.
+    Each triangle adds +1 or -1 to every voxel behind it. A closed mesh (in some frame, mm) whose
+    faces turn outward and that does not cross itself gives 0 outside and 1 inside, and nothing
+    else. ``frame_from_index``: array index -> that frame; any invertible affine.
 
     Raises:
         InputError: the grid is too large.
@@ -73,20 +66,6 @@ def _room(shape: tuple[int, int, int], dtype: type) -> np.ndarray:
     return np.zeros(shape, dtype)
 
 
-class Crossings(NamedTuple):
-    """Where the m crossings of a surface lie on the rays along a grid's last axis.
-
-    Attributes:
-        first: (rays + 1,) where each ray's crossings begin in the arrays below.
-        behind: (m,) the first voxel behind each crossing.
-        sign: (m,) +1 where a face is entered, -1 where it is left.
-    """
-
-    first: np.ndarray
-    behind: np.ndarray
-    sign: np.ndarray
-
-
 def _fill(mesh: Mesh, frame_from_index: np.ndarray, out: np.ndarray, value: int) -> None:
     """``value`` into the voxels of ``out`` whose winding number is not 0, or that number itself
     where ``value`` is 0; others stay as they are."""
@@ -100,26 +79,27 @@ def _fill(mesh: Mesh, frame_from_index: np.ndarray, out: np.ndarray, value: int)
     high[2] = out.shape[2]  # of an open mesh the rays do not leave what they entered
     triangles = (index - low)[mesh.faces]
     i, j, k = (high - low).tolist()
-    found = Crossings(np.zeros(i * j + 1, np.int64), np.zeros(0, np.int32), np.zeros(0, np.int8))
-    _find_crossings(triangles, (i, j, k), found)
-    first = np.cumsum(found.first)
+    first = np.zeros(i * j + 1, np.int64)
+    _find_crossings(triangles, (i, j, k), first, np.zeros(0, np.int32), np.zeros(0, np.int8))
+    first = np.cumsum(first)
     if first[-1] == 0:
         return
-    found = Crossings(first.copy(), np.empty(first[-1], np.int32), np.empty(first[-1], np.int8))
-    _find_crossings(triangles, (i, j, k), found)
-    sign = -found.sign if np.linalg.det(frame_from_index[:3, :3]) < 0 else found.sign
+    behind, sign = np.empty(first[-1], np.int32), np.empty(first[-1], np.int8)
+    _find_crossings(triangles, (i, j, k), first.copy(), behind, sign)
+    if np.linalg.det(frame_from_index[:3, :3]) < 0:
+        sign = -sign
     box = tuple(slice(a, b) for a, b in zip(low.tolist(), high.tolist(), strict=True))
-    _fill_along_rays(Crossings(first, found.behind, sign), value, out[box])
+    _fill_along_rays(first, behind, sign, value, out[box])
 
 
 @numba.njit(cache=True, nogil=True)  # no fast math: each number is rounded as in ``cover``
-def _find_crossings(triangles, shape, found):  # type: ignore[no-untyped-def]
-    """Where rays along the last axis pass triangles (t, 3, 3), in cells, into ``Crossings``.
+def _find_crossings(triangles, shape, first, k, sign):  # type: ignore[no-untyped-def]
+    """Where rays along the last axis pass triangles (t, 3, 3), in cells: into ``k`` the first voxel
+    behind each crossing, into ``sign`` +1 where a face is entered, -1 where it is left.
 
-    Called twice. With ``behind`` empty it counts, ``first[i * shape[1] + j + 1]`` for the ray
-    (i, j). With their cumulative sum in ``first`` it writes the crossings and advances ``first``.
+    Called twice. With ``k`` empty it counts, ``first[i * shape[1] + j + 1]`` for the ray (i, j).
+    With their cumulative sum in ``first`` it writes the crossings and advances ``first``.
     """
-    first, k, sign = found
     fill = len(k) > 0
     for t in range(len(triangles)):
         tri = triangles[t]
@@ -170,9 +150,8 @@ def _span(tri, i):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def _fill_along_rays(found, value, out):  # type: ignore[no-untyped-def]
-    """See ``_fill``; ``found`` as ``Crossings``."""
-    first, k, sign = found
+def _fill_along_rays(first, k, sign, value, out):  # type: ignore[no-untyped-def]
+    """See ``_fill``; of each ray the crossings in ``k`` and ``sign`` begin at ``first``."""
     for i in range(out.shape[0]):
         for j in range(out.shape[1]):
             ray = i * out.shape[1] + j

@@ -9,22 +9,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float
 
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import spacing_mm
 from tumortrack.core.types import FIRST_TUMOR, ORGAN, LabelVolume, Volume
-from tumortrack.imaging.grid import (
-    bounding_box,
-    components,
-    cropped,
-    depth_mm,
-    extent_mm,
-    grown_box,
-    moved_origin,
-    tight_box,
-    voxel_ml,
-)
+from tumortrack.imaging import grid as grids
+from tumortrack.imaging.grid import bounding_box, components, depth_mm, extent_mm, voxel_ml
 from tumortrack.imaging.select import MIN_TUMOR_ML
 
 KIDNEY_HU = (-300.0, 300.0)
@@ -64,43 +55,36 @@ def segment_ct(
     Raises:
         InputError: unusable windows, or no kidney-like body (a patient's CT).
     """
-    _check_windows(kidney_hu, tumor_hu)
-    hu, affine = volume.hu, volume.lps_from_index
-    solid = (hu >= kidney_hu[0]) & (hu < tumor_hu[1])
-    dense = (hu >= tumor_hu[0]) & (hu < tumor_hu[1])
-    organ = _find_organ(solid, dense, affine)
-    everything_ml = float(solid.sum()) * voxel_ml(affine)
-
-    box = bounding_box(organ, affine, _REACH_MM)
-    organ, solid, dense = organ[box], solid[box], dense[box]
-    affine = moved_origin(affine, box)
-    notes = []
-    organ, tumors, more = _tumors_of(organ, solid, dense, affine, min_tumor_ml)
-    kept_ml = float(organ.sum()) * voxel_ml(affine)
-    notes.append(
-        f"{kept_ml:.1f} ml of {everything_ml:.1f} ml between the HU limits are the kidney; table, "
-        "blocks, rims and specks were dropped"
-    )
-    labels = _number_by_volume(organ, tumors)
-    return cropped(labels, affine), notes + more
-
-
-def _check_windows(kidney_hu: tuple[float, float], tumor_hu: tuple[float, float]) -> None:
     limits = (*kidney_hu, *tumor_hu)
     if not (np.isfinite(limits).all() and kidney_hu[0] < kidney_hu[1] <= tumor_hu[0] < tumor_hu[1]):
         raise InputError(
             f"HU windows kidney {kidney_hu} and tumor {tumor_hu} are not usable: each needs "
             "low < high, and the tumor's must lie above the kidney's."
         )
+    hu, affine = volume.hu, volume.lps_from_index
+    solid = (hu >= kidney_hu[0]) & (hu < tumor_hu[1])
+    dense = (hu >= tumor_hu[0]) & (hu < tumor_hu[1])
+    organ = _find_organ(solid, dense, affine)
+    everything_ml = float(solid.sum()) * voxel_ml(affine)
+    box = bounding_box(organ, affine, _REACH_MM)
+    affine = grids.moved_origin(affine, box)
+    organ, tumors, more = _tumors_of(organ[box], solid[box], dense[box], affine, min_tumor_ml)
+    kept_ml = float(organ.sum()) * voxel_ml(affine)
+    note = (
+        f"{kept_ml:.1f} ml of {everything_ml:.1f} ml between the HU limits are the kidney; table, "
+        "blocks, rims and specks were dropped"
+    )
+    if len(tumors) > 254:
+        raise InputError(f"{len(tumors)} tumors found; raise --min-tumor-ml or check --tumor-hu.")
+    labels = np.where(organ, ORGAN, 0).astype(np.uint8)
+    for number, tumor in enumerate(sorted(tumors, key=lambda mask: -int(mask.sum())), FIRST_TUMOR):
+        labels[tumor] = number
+    return grids.cropped(labels, affine), [note, *more]
 
 
 def _tumors_of(
-    organ: Bool[np.ndarray, "i j k"],
-    solid: Bool[np.ndarray, "i j k"],
-    dense: Bool[np.ndarray, "i j k"],
-    affine: Float[np.ndarray, "4 4"],
-    min_tumor_ml: float,
-) -> tuple[Bool[np.ndarray, "i j k"], list[np.ndarray], list[str]]:
+    organ: np.ndarray, solid: np.ndarray, dense: np.ndarray, affine: np.ndarray, min_tumor_ml: float
+) -> tuple[np.ndarray, list[np.ndarray], list[str]]:
     """The organ, corrected by its tumors; the tumors' masks; notes on what was dropped."""
     from scipy import ndimage
 
@@ -108,20 +92,19 @@ def _tumors_of(
     rim_mm = max(_RIM_MM, 1.5 * float(steps.max()))
     parenchyma = _opened(organ & ~dense, steps, rim_mm)
     pieces, counts = components(dense)
-    unit = voxel_ml(affine)
     boxes = ndimage.find_objects(pieces)
     tumors, small, beside = [], [], []
-    for n, count in enumerate(counts.tolist(), 1):
-        grown = grown_box(boxes[n - 1], dense.shape, np.ceil(3.5 / steps).astype(int))
+    for n, ml in enumerate((counts * voxel_ml(affine)).tolist(), 1):
+        grown = grids.grown_box(boxes[n - 1], dense.shape, np.ceil(3.5 / steps).astype(int))
         mask = pieces[grown] == n
-        if count * unit < min_tumor_ml:
+        if ml < min_tumor_ml:
             if (mask & organ[grown]).any():
-                small.append(count * unit)
+                small.append(ml)
             continue
         around = ndimage.distance_transform_edt(~mask, sampling=steps)
         shell = (around > 0) & (around <= max(3.0, 2.0 * float(steps.max())))
         if (shell & parenchyma[grown]).sum() < _LEAST_CONTACT * shell.sum():
-            beside.append(count * unit)
+            beside.append(ml)
             # The piece and its rim are no part of the organ, even if they touch it.
             organ[grown] &= (around > rim_mm) | parenchyma[grown]
             continue
@@ -139,8 +122,7 @@ def _tumors_of(
         notes.append(f"{text} (largest {max(beside):.1f} ml)")
     if not tumors:
         notes.append("no tumor found in this organ")
-    numbered, _ = components(organ)
-    organ = ndimage.binary_fill_holes(numbered == 1)
+    organ = ndimage.binary_fill_holes(components(organ)[0] == 1)
     return organ, [t & organ for t in tumors], notes
 
 
@@ -154,19 +136,9 @@ def _opened(mask: np.ndarray, steps_mm: np.ndarray, radius_mm: float) -> np.ndar
     return mask & (ndimage.distance_transform_edt(~inner, sampling=steps_mm) <= radius_mm)
 
 
-def _number_by_volume(organ: np.ndarray, tumors: list[np.ndarray]) -> UInt8[np.ndarray, "i j k"]:
-    if len(tumors) > 254:
-        raise InputError(f"{len(tumors)} tumors found; raise --min-tumor-ml or check --tumor-hu.")
-    labels = np.where(organ, ORGAN, 0).astype(np.uint8)
-    order = sorted(range(len(tumors)), key=lambda n: -int(tumors[n].sum()))
-    for number, n in enumerate(order, FIRST_TUMOR):
-        labels[tumors[n]] = number
-    return labels
-
-
 @dataclass(frozen=True, eq=False)
 class _Grid:
-    """The solid mask and tumor share on coarse cells."""
+    """The solid mask and its part in the tumor window on coarse cells."""
 
     solid: Bool[np.ndarray, "i j k"]
     dense: Bool[np.ndarray, "i j k"]
@@ -177,12 +149,9 @@ class _Grid:
         return spacing_mm(self.lps_from_index)
 
 
-def _find_organ(
-    solid: Bool[np.ndarray, "i j k"],
-    dense: Bool[np.ndarray, "i j k"],
-    lps_from_index: Float[np.ndarray, "4 4"],
-) -> Bool[np.ndarray, "i j k"]:
-    """The voxels of ``solid`` that belong to the one kidney-like body.
+def _find_organ(solid: np.ndarray, dense: np.ndarray, lps_from_index: np.ndarray) -> np.ndarray:
+    """The voxels of ``solid`` that belong to the one kidney-like body; ``dense`` is its part in the
+    tumor window.
 
     The rule, on cells of about 1.5 mm: erode by 3 mm, then by up to 15 mm, until a piece stands
     alone that, grown back and cut from its neighbours at the narrowest place (watershed of the
@@ -191,20 +160,11 @@ def _find_organ(
     and was cut along at most a quarter of its surface, and is no sheet (shortest over longest
     principal spread above 0.28). The largest such piece is the kidney; a deeper cut replaces it
     only where that frees it of a sheet. Attached sheets thinner than 6 mm are removed.
-
-    Args:
-        dense: the part of ``solid`` in the tumor window.
-
-    Raises:
-        InputError: there is no such piece; it suggests a label map.
     """
     factors = np.maximum(1, np.rint(_STEP_MM / spacing_mm(lps_from_index)).astype(int))
-    grid = _Grid(
-        _block_mean(solid, factors) >= 0.5,
-        _block_mean(dense, factors) >= 0.5,
-        lps_from_index @ np.diag([*factors, 1.0]),
-    )
-    region = _search(grid)
+    filled, bright = (_block_mean(mask, factors) >= 0.5 for mask in (solid, dense))
+    grid = _Grid(filled, bright, lps_from_index @ np.diag([*factors, 1.0]))
+    region = _search(grid) if grid.solid.any() else None
     if region is None:
         raise InputError(
             "no free-standing kidney was found in this CT: nothing between the HU limits is "
@@ -215,7 +175,7 @@ def _find_organ(
     return _refine(region, grid.solid & ~region, solid, factors)
 
 
-def _block_mean(mask: np.ndarray, factors: np.ndarray) -> Float[np.ndarray, "i j k"]:
+def _block_mean(mask: np.ndarray, factors: np.ndarray) -> np.ndarray:
     """Mean over blocks of ``factors`` voxels; the ends are padded with False."""
     f = factors.tolist()
     out = np.pad(mask, [(0, -n % k) for n, k in zip(mask.shape, f, strict=True)])
@@ -228,8 +188,6 @@ def _block_mean(mask: np.ndarray, factors: np.ndarray) -> Float[np.ndarray, "i j
 def _search(grid: _Grid) -> np.ndarray | None:
     from scipy import ndimage
 
-    if not grid.solid.any():
-        return None
     depth = depth_mm(grid.solid, grid.steps_mm)
     least = _KIDNEY_ML[0] / voxel_ml(grid.lps_from_index)
     found: np.ndarray | None = None
@@ -273,10 +231,8 @@ def _piece_region(core: np.ndarray, depth: np.ndarray, radius: float, grid: _Gri
     if core_again.any():
         back = ndimage.distance_transform_edt(~core_again, sampling=steps)
         own &= back <= _OPEN_MM + float(steps.max())
-    pieces, counts = components(own)
     region = np.zeros_like(grid.solid)
-    if len(counts):
-        region[box] = pieces == 1
+    region[box] = components(own)[0] == 1
     return region
 
 
@@ -284,20 +240,18 @@ def _is_kidney(region: np.ndarray, grid: _Grid) -> bool:
     if not region.any():
         return False
     ml = float(region.sum()) * voxel_ml(grid.lps_from_index)
-    if not _KIDNEY_ML[0] <= ml <= _KIDNEY_ML[1]:
-        return False
-    box = tight_box(region)
+    box = grids.tight_box(region)
     extent = extent_mm(box, grid.steps_mm)
     at_edge = any(s.start == 0 or s.stop == n for s, n in zip(box, region.shape, strict=True))
-    if at_edge or extent.max() > _LONGEST_MM or extent.min() < _THINNEST_MM:
-        return False
-    if (region & grid.dense).sum() > _MOST_TUMOR * region.sum():
-        return False
-    if _contact(region, grid.solid) > _MOST_CONTACT:
-        return False
-    if _flatness(region[box], grid.steps_mm) < _LEAST_FLATNESS:
-        return False
-    return _solidity(region[box], grid.steps_mm) >= _LEAST_SOLIDITY
+    return (
+        _KIDNEY_ML[0] <= ml <= _KIDNEY_ML[1]
+        and not at_edge
+        and bool(extent.min() >= _THINNEST_MM and extent.max() <= _LONGEST_MM)
+        and bool((region & grid.dense).sum() <= _MOST_TUMOR * region.sum())
+        and _contact(region, grid.solid) <= _MOST_CONTACT
+        and _flatness(region[box], grid.steps_mm) >= _LEAST_FLATNESS
+        and _solidity(region[box], grid.steps_mm) >= _LEAST_SOLIDITY
+    )
 
 
 def _contact(region: np.ndarray, solid: np.ndarray) -> float:
@@ -336,7 +290,7 @@ def _solidity(region: np.ndarray, steps_mm: np.ndarray) -> float:
 
 def _refine(
     region: np.ndarray, other: np.ndarray, solid: np.ndarray, factors: np.ndarray
-) -> Bool[np.ndarray, "i j k"]:
+) -> np.ndarray:
     """The coarse decision on the voxels; a cell that was neither takes its nearest cell's."""
     from scipy import ndimage
 
@@ -349,5 +303,4 @@ def _refine(
     for axis, factor in enumerate(factors.tolist()):
         label = np.repeat(label, factor, axis)
     fine = label[tuple(slice(0, n) for n in solid.shape)] == 1
-    pieces, counts = components(fine & solid)
-    return pieces == 1 if len(counts) else fine & solid
+    return components(fine & solid)[0] == 1

@@ -39,15 +39,13 @@ class _Pieces:
 
     @cached_property
     def tumor_ml(self) -> Float[np.ndarray, " n"]:
-        """Tumor volume by piece number."""
         return self._ml(self.tumors)
 
     @property
     def whole_ml(self) -> Float[np.ndarray, " n"]:
-        """Volume by piece number."""
         return self.organ_ml + self.tumor_ml
 
-    def _ml(self, values: tuple[int, ...]) -> Float[np.ndarray, " n"]:
+    def _ml(self, values: tuple[int, ...]) -> np.ndarray:
         inside = self.numbers[np.isin(self.labels, values)]
         count = np.bincount(inside, minlength=int(self.numbers.max()) + 1)
         return count * grid.voxel_ml(self.lps_from_index)
@@ -68,7 +66,7 @@ def select_labels(
     tumor: int | None = None,
     min_tumor_ml: float = MIN_TUMOR_ML,
 ) -> tuple[LabelVolume, list[str]]:
-    """Keep one kidney (label 1) and its tumors (2, 3, ...), grid.cropped with a margin.
+    """Keep one kidney (label 1) and its tumors (2, 3, ...), cropped with a margin.
 
     A kidney is a connected piece of organ and tumor voxels with at least 10 ml of organ and a
     tenth of the largest one's volume (where there is none, the piece with most organ). A tumor
@@ -89,19 +87,19 @@ def select_labels(
         InputError: no organ, no such tumor label, two kidneys without tumor and no ``side``, no
             tumor but one apart from every kidney.
     """
-    labels = label_volume.labels
+    labels, affine = label_volume.labels, label_volume.lps_from_index
     present = [int(n) for n in np.flatnonzero(grid.label_counts(labels)) if n > 0]
     tumors = _tumor_labels(present, organ, tumor)
-    affine = label_volume.lps_from_index
-    box = grid.bounding_box(np.isin(labels, [organ, *tumors]), affine, 2.0)
+    middle = affine @ [*(np.array(labels.shape) / 2), 1]
+    counted = np.isin(labels, [organ, *tumors])
+    box = grid.bounding_box(counted, affine, 2.0)
     affine = grid.moved_origin(affine, box)
-    numbered, _ = grid.components(np.isin(labels[box], [organ, *tumors]))
+    numbered, _ = grid.components(counted[box])
     pieces = _Pieces(labels[box], numbered, affine, organ, tuple(tumors))
     numbers = _kidney_pieces(pieces)
     pieces, notes, apart = _attach_tumors(pieces, numbers, min_tumor_ml)
     kidneys = _kidneys(pieces, numbers)
     notes += _left_out(pieces, kidneys, apart, min_tumor_ml)
-    middle = label_volume.lps_from_index @ [*(np.array(labels.shape) / 2), 1]
     chosen, more = _choose_kidney(kidneys, side, float(middle[0]))
     notes += more
     if not _MIN_KIDNEY_ML <= chosen.ml <= _MAX_KIDNEY_ML:
@@ -111,12 +109,8 @@ def select_labels(
         )
     kidney = pieces.numbers == chosen.piece
     box = grid.bounding_box(kidney, affine, 2.0)
-    out, more = _number_tumors(
-        np.where(kidney, pieces.labels, 0)[box].astype(np.uint8),
-        tumors,
-        grid.voxel_ml(affine),
-        min_tumor_ml,
-    )
+    own = np.where(kidney, pieces.labels, 0)[box].astype(np.uint8)
+    out, more = _number_tumors(own, tumors, grid.voxel_ml(affine), min_tumor_ml)
     return grid.cropped(out, grid.moved_origin(affine, box)), notes + more
 
 
@@ -151,14 +145,13 @@ def _kidney_pieces(pieces: _Pieces) -> list[int]:
 def _kidneys(pieces: _Pieces, numbers: list[int]) -> list[_Kidney]:
     from scipy import ndimage
 
-    whole_ml = pieces.whole_ml
     boxes = ndimage.find_objects(pieces.numbers, max_label=max(numbers))
     out = []
     for n in numbers:
         box = boxes[n - 1]
         index = np.argwhere(pieces.numbers[box] == n).mean(0) + [s.start for s in box]
         x_mm = float((pieces.lps_from_index @ [*index, 1])[0])
-        out.append(_Kidney(n, float(whole_ml[n]), float(pieces.tumor_ml[n]), x_mm))
+        out.append(_Kidney(n, float(pieces.whole_ml[n]), float(pieces.tumor_ml[n]), x_mm))
     return out
 
 
@@ -169,9 +162,6 @@ def _attach_tumors(
 
     The gap (up to 3 mm, or one voxel where voxels are larger) is filled with organ, no wider
     than the two face each other, so that organ and tumor have one surface.
-
-    Args:
-        kidneys: the numbers of the pieces that are kidneys.
 
     Returns:
         The pieces with joined ones numbered as their kidney, notes, and the numbers of the
@@ -199,33 +189,30 @@ def _joined(
     pieces: _Pieces, kidneys: list[int], number: int
 ) -> tuple[_Pieces, float, float] | None:
     """The pieces with one joined to its nearest kidney, the gap in mm and what fills it in ml."""
-    from scipy import ndimage
+    from scipy.ndimage import distance_transform_edt
 
-    spacing = spacing_mm(pieces.lps_from_index)
+    affine = pieces.lps_from_index
+    spacing = spacing_mm(affine)
     reach_mm = max(_GAP_MM, float(spacing.max()))
-    box = grid.bounding_box(
-        pieces.numbers == number, pieces.lps_from_index, reach_mm + 2 * float(spacing.max())
-    )
+    box = grid.bounding_box(pieces.numbers == number, affine, reach_mm + 2 * float(spacing.max()))
     numbers = pieces.numbers[box]
     own, kidney = numbers == number, np.isin(numbers, kidneys)
     if not kidney.any():
         return None
-    to_kidney, nearest = ndimage.distance_transform_edt(
-        ~kidney, sampling=spacing, return_indices=True
-    )
+    to_kidney, nearest = distance_transform_edt(~kidney, sampling=spacing, return_indices=True)
     here = np.unravel_index(np.where(own, to_kidney, np.inf).argmin(), own.shape)
     there = tuple(int(axis[here]) for axis in nearest)
     steps = np.abs(np.subtract(here, there))
     gap_mm = float(np.linalg.norm(np.maximum(steps - 1, 0) * spacing))  # between voxels' faces
     if gap_mm > reach_mm:
         return None
-    to_own = ndimage.distance_transform_edt(~own, sampling=spacing)
+    to_own = distance_transform_edt(~own, sampling=spacing)
     between = to_kidney + to_own <= float(to_kidney[here]) + float(np.median(spacing))
     bridge = between & (numbers == 0)
     joined, labels = pieces.numbers.copy(), pieces.labels.copy()
     joined[box][own | bridge] = numbers[there]
     labels[box][bridge] = pieces.organ
-    ml = float(bridge.sum()) * grid.voxel_ml(pieces.lps_from_index)
+    ml = float(bridge.sum()) * grid.voxel_ml(affine)
     return replace(pieces, labels=labels, numbers=joined), gap_mm, ml
 
 
@@ -257,44 +244,39 @@ def _left_out(
 def _choose_kidney(
     kidneys: list[_Kidney], side: str | None, middle_x_mm: float
 ) -> tuple[_Kidney, list[str]]:
-    def rank(kidney: _Kidney) -> tuple[float, float]:
-        return (kidney.tumor_ml, kidney.ml)
-
     if side not in (None, "left", "right"):
         raise InputError(f"side {side!r} is not understood. Allowed: left, right (the patient's).")
-    if len(kidneys) > 1:
+    best = max(kidneys, key=lambda kidney: (kidney.tumor_ml, kidney.ml))
+    alone = len(kidneys) == 1
+    if not alone:
         xs = [kidney.x_mm for kidney in kidneys]
         middle_x_mm = (min(xs) + max(xs)) / 2
     if side is None:
-        if len(kidneys) > 1 and max(k.tumor_ml for k in kidneys) == 0:
+        if not alone and best.tumor_ml == 0:
             raise InputError(
                 f"the label map holds {len(kidneys)} kidneys and no tumor. Give --side left or "
                 "--side right (the patient's)."
             )
-        best = max(kidneys, key=rank)
-        if len(kidneys) == 1:
-            return best, []
         name = "left" if best.x_mm > middle_x_mm else "right"
-        return best, [f"the patient's {name} kidney was chosen: it bears most tumor"]
+        note = f"the patient's {name} kidney was chosen: it bears most tumor"
+        return best, [] if alone else [note]
     sign = 1 if side == "left" else -1
     # With one kidney only the image's midline is known: near it, trust the user.
-    slack = _MIDLINE_MARGIN_MM if len(kidneys) == 1 else 0.0
+    slack = _MIDLINE_MARGIN_MM if alone else 0.0
     fitting = [k for k in kidneys if sign * (k.x_mm - middle_x_mm) > -slack]
     if not fitting:
         raise InputError(
             f"no kidney on the patient's {side} side in this label map; its kidney lies on the "
             "other side. Leave out --side, or check the map's orientation."
         )
-    notes = ["only one kidney in the map; its side was checked against the image's middle only"]
-    return max(fitting, key=rank), notes if len(kidneys) == 1 else []
+    best = max(fitting, key=lambda kidney: (kidney.tumor_ml, kidney.ml))
+    note = "only one kidney in the map; its side was checked against the image's middle only"
+    return best, [note] if alone else []
 
 
 def _number_tumors(
-    labels: UInt8[np.ndarray, "i j k"],
-    tumors: list[int],
-    voxel_volume_ml: float,
-    min_tumor_ml: float,
-) -> tuple[UInt8[np.ndarray, "i j k"], list[str]]:
+    labels: np.ndarray, tumors: list[int], voxel_volume_ml: float, min_tumor_ml: float
+) -> tuple[np.ndarray, list[str]]:
     """Renumber to 1, 2, 3, ... without gaps; report what went and what changed its number."""
     from scipy import ndimage
 
@@ -307,16 +289,16 @@ def _number_tumors(
     number = FIRST_TUMOR
     for value in tumors:
         pieces, counts = grid.components(labels == value)
-        kept = [n for n in range(len(counts)) if counts[n] * voxel_volume_ml >= min_tumor_ml]
-        if lost := len(counts) - len(kept):
-            lost_ml = float(counts[len(kept) :].sum()) * voxel_volume_ml
+        kept = int((counts * voxel_volume_ml >= min_tumor_ml).sum())  # largest first
+        if lost := len(counts) - kept:
+            lost_ml = float(counts[kept:].sum()) * voxel_volume_ml
             notes.append(
                 f"label {value}: {lost} pieces below {min_tumor_ml:g} ml became organ "
                 f"({lost_ml:.2f} ml together)"
             )
-        if len(kept) > 1:
-            notes.append(f"label {value} has {len(kept)} separate pieces: one tumor each")
-        for n in kept:
+        if kept > 1:
+            notes.append(f"label {value} has {kept} separate pieces: one tumor each")
+        for n in range(kept):
             if number > 255:
                 raise InputError("more than 254 tumors; raise --min-tumor-ml or check the labels.")
             out[pieces == n + 1] = number

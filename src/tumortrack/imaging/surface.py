@@ -7,10 +7,9 @@ al. 2003, scikit-image); the level is then chosen so that the mesh holds the lab
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Int
 
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import spacing_mm, transform_points
@@ -21,23 +20,19 @@ _TRIANGLES = 28_000  # aimed at for the organ
 _BLUR_VOXELS = 0.9  # enough to melt steps of one voxel, too little to lose a small tumor
 _STEPS_ACROSS = 14  # cells across the thinnest extent of a small part
 _MOST_MARCHES = 16  # 2 to 4 suffice where the volume is a smooth function of the level
+_REPORTED = (
+    *("labels_ml", "mesh_ml", "change_percent"),
+    *("distance_mean_voxels", "distance_95_voxels", "distance_max_voxels"),
+)
 
 
-@dataclass(frozen=True)
-class SurfaceReport:
-    """Per part, organ first. Distances are from mesh vertices to the labels' boundary."""
-
-    names: tuple[str, ...]
-    labels_ml: tuple[float, ...]
-    mesh_ml: tuple[float, ...]
-    change_percent: tuple[float, ...]
-    distance_mean_voxels: tuple[float, ...]
-    distance_95_voxels: tuple[float, ...]
-    distance_max_voxels: tuple[float, ...]
-
-
-def surfaces(label_volume: LabelVolume) -> tuple[Anatomy, SurfaceReport]:
+def surfaces(label_volume: LabelVolume) -> tuple[Anatomy, dict[str, list[Any]]]:
     """The organ's surface (all labels from 1 up) and one per tumor, LPS mm, faces outward.
+
+    Returns:
+        The anatomy, and lists of a number per part, organ first: ``names``, ``labels_ml``,
+        ``mesh_ml``, ``change_percent``, and how far mesh vertices lie from the labels' boundary:
+        ``distance_mean_voxels``, ``distance_95_voxels``, ``distance_max_voxels``.
 
     Raises:
         InputError: no organ, a gap in the tumor numbers, or a part too small for a surface.
@@ -48,27 +43,26 @@ def surfaces(label_volume: LabelVolume) -> tuple[Anatomy, SurfaceReport]:
         raise InputError("the labels are empty: no organ to take a surface of.")
     masks = [labels > 0, *(labels == n for n in range(FIRST_TUMOR, top + 1))]
     names = part_names(len(masks))
-    step = _organ_step_mm(masks[0], affine)
+    # The grid step that gives about the wanted number of triangles (about 2.2 per cell face)
+    volume_mm3 = 1000 * float(masks[0].sum()) * voxel_ml(affine)
+    area_mm2 = 1.35 * 4.836 * volume_mm3 ** (2 / 3)  # a kidney has 1.35 times a sphere's area
+    step = float(np.clip(np.sqrt(2.2 * area_mm2 / _TRIANGLES), 0.4, 1.5))
     parts, rows = [], []
     for name, mask in zip(names, masks, strict=True):
         if not mask.any():
             raise InputError(f"the labels have no voxel of {name}; number the tumors without gap.")
         mesh = _surface(name, mask, affine, step)
-        ml = float(mask.sum()) * voxel_ml(affine)
+        ml, mesh_ml = float(mask.sum()) * voxel_ml(affine), mesh.volume_mm3 / 1000
         distance = _boundary_distance(mesh, mask, affine)
-        mesh_ml = mesh.volume_mm3 / 1000
-        p95 = float(np.percentile(distance, 95))
+        p95 = np.percentile(distance, 95)
         rows.append((ml, mesh_ml, 100 * (mesh_ml / ml - 1), distance.mean(), p95, distance.max()))
         parts.append(mesh)
-    columns = [tuple(round(float(x), 4) for x in column) for column in zip(*rows, strict=True)]
-    return Anatomy(tuple(parts)), SurfaceReport(names, *columns)
-
-
-def _organ_step_mm(organ: Bool[np.ndarray, "i j k"], affine: np.ndarray) -> float:
-    """The grid step that gives about the wanted number of triangles (about 2.2 per cell face)."""
-    volume_mm3 = 1000 * float(organ.sum()) * voxel_ml(affine)
-    area_mm2 = 1.35 * 4.836 * volume_mm3 ** (2 / 3)  # a kidney has 1.35 times a sphere's area
-    return float(np.clip(np.sqrt(2.2 * area_mm2 / _TRIANGLES), 0.4, 1.5))
+    columns = [[round(float(x), 4) for x in column] for column in zip(*rows, strict=True)]
+    report: dict[str, list[Any]] = {
+        "names": list(names),
+        **dict(zip(_REPORTED, columns, strict=True)),
+    }
+    return Anatomy(tuple(parts)), report
 
 
 def _surface(name: str, mask: np.ndarray, affine: np.ndarray, step_mm: float) -> Mesh:
@@ -91,15 +85,23 @@ def _surface(name: str, mask: np.ndarray, affine: np.ndarray, step_mm: float) ->
     # The level where that many cells lie above is close; the rest is a search on the volume.
     level = float(-np.partition(-field.ravel(), n := int(wanted_mm3 / cell_mm3))[n])
 
-    def volume_error(level: float) -> tuple[Mesh, float]:
-        mesh = _march(name, field, level, affine, scale, offset)
+    def march(level: float) -> tuple[Mesh, float]:
+        from skimage import measure
+
+        if not field.min() < level < field.max():
+            raise InputError(f"{name} is too small or thin for a surface at this voxel size.")
+        vertices, faces, _, _ = measure.marching_cubes(field, level, gradient_direction="ascent")
+        vertices_mm = transform_points(affine, vertices.astype(np.float64) * scale + offset)
+        mesh = Mesh(vertices_mm, faces[:, ::-1] if np.linalg.det(affine[:3, :3]) < 0 else faces)
+        mesh = largest_shell(mesh)
+        mesh = mesh if mesh.volume_mm3 > 0 else Mesh(mesh.vertices_mm, mesh.faces[:, ::-1])
         return mesh, mesh.volume_mm3 / wanted_mm3 - 1
 
-    return _keep_volume(volume_error, level, float(field.max()))
+    return _keep_volume(march, level, float(field.max()))
 
 
 def _keep_volume(
-    volume_error: Callable[[float], tuple[Mesh, float]], level: float, highest: float
+    march: Callable[[float], tuple[Mesh, float]], level: float, highest: float
 ) -> Mesh:
     """The mesh whose volume errs least: secant steps on the level, bisection where they fail.
 
@@ -107,12 +109,11 @@ def _keep_volume(
     """
     too_large, too_small = 0.0, highest
     tried: list[tuple[float, float]] = []
-    best: tuple[Mesh, float] | None = None
     for _ in range(_MOST_MARCHES):
-        mesh, error = volume_error(level)
+        mesh, error = march(level)
+        if all(abs(error) < abs(other) for _, other in tried):
+            best = mesh
         tried.append((level, error))
-        if best is None or abs(error) < abs(best[1]):
-            best = (mesh, error)
         if error > 0:
             too_large = level
         else:
@@ -125,28 +126,7 @@ def _keep_volume(
         level -= error / slope
         if len(tried) > 5 or not too_large < level < too_small:
             level = (too_large + too_small) / 2
-    assert best is not None
-    return best[0]
-
-
-def _march(
-    name: str,
-    field: np.ndarray,
-    level: float,
-    affine: np.ndarray,
-    scale: np.ndarray,
-    offset: np.ndarray,
-) -> Mesh:
-    from skimage import measure
-
-    if not field.min() < level < field.max():
-        raise InputError(f"{name} is too small or thin for a surface at this voxel size.")
-    vertices, faces, _, _ = measure.marching_cubes(field, level, gradient_direction="ascent")
-    vertices_mm = transform_points(affine, vertices.astype(np.float64) * scale + offset)
-    if np.linalg.det(affine[:3, :3]) < 0:
-        faces = faces[:, ::-1]
-    mesh = largest_shell(Mesh(vertices_mm, faces))
-    return mesh if mesh.volume_mm3 > 0 else Mesh(mesh.vertices_mm, mesh.faces[:, ::-1])
+    return best
 
 
 def _boundary_distance(mesh: Mesh, mask: np.ndarray, affine: np.ndarray) -> np.ndarray:
@@ -174,21 +154,16 @@ def _boundary_distance(mesh: Mesh, mask: np.ndarray, affine: np.ndarray) -> np.n
 def largest_shell(mesh: Mesh) -> Mesh:
     """The piece that encloses most (by the size of its signed volume); shells inside it and
     specks are dropped."""
-    if len(mesh.faces) == 0:
-        return mesh
-    piece = _piece_of_face(mesh)
-    a, b, c = (mesh.vertices_mm[mesh.faces[:, n]] - mesh.vertices_mm[0] for n in range(3))
-    volumes = np.bincount(piece, np.einsum("ij,ij->i", a, np.cross(b, c)))
-    used, compact = np.unique(mesh.faces[piece == np.abs(volumes).argmax()], return_inverse=True)
-    return Mesh(mesh.vertices_mm[used], compact.reshape(-1, 3))
-
-
-def _piece_of_face(mesh: Mesh) -> Int[np.ndarray, " f"]:
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
-    a, b, c = mesh.faces.T
+    if len(mesh.faces) == 0:
+        return mesh
+    i, j, k = mesh.faces.T
     n = len(mesh.vertices_mm)
-    graph = coo_array((np.ones(2 * len(a), np.int8), (np.r_[a, b], np.r_[b, c])), shape=(n, n))
-    _, piece = connected_components(graph, directed=False)
-    return piece[a]
+    graph = coo_array((np.ones(2 * len(i), np.int8), (np.r_[i, j], np.r_[j, k])), shape=(n, n))
+    piece = connected_components(graph, directed=False)[1][i]
+    a, b, c = (mesh.vertices_mm[corner] - mesh.vertices_mm[0] for corner in (i, j, k))
+    volumes = np.bincount(piece, np.einsum("ij,ij->i", a, np.cross(b, c)))
+    used, compact = np.unique(mesh.faces[piece == np.abs(volumes).argmax()], return_inverse=True)
+    return Mesh(mesh.vertices_mm[used], compact.reshape(-1, 3))

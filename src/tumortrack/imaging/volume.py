@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import bz2
 import math
+import re
 import zlib
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
 
 from tumortrack.core.errors import InputError
 from tumortrack.core.types import LabelVolume, Volume
@@ -23,6 +23,7 @@ from tumortrack.imaging.nifti import read_nifti
 _DETACHED = (".nhdr", ".mhd", ".hdr", ".img")
 _MOST_LABELS = 32  # distinct values that still look like a label map
 _MAX_HEADER = 2**20
+_IS_GZIP = {"raw": False, "gzip": True, "gz": True}  # of bzip2, compression has no known bound
 _TYPES = {
     **dict.fromkeys(("signed char", "int8", "int8_t"), "i1"),
     **dict.fromkeys(("uchar", "unsigned char", "uint8", "uint8_t"), "u1"),
@@ -73,28 +74,18 @@ def read_raw(path: Path, series: str | None = None) -> grid.RawVolume:
 
 
 def read_volume(path: Path, series: str | None = None) -> Volume:
-    """Read a CT volume (HU) from a DICOM folder, .nii, .nii.gz or .nrrd.
-
-    Args:
-        series: of several DICOM series, the wanted one's UID or number.
-
-    Raises:
-        InputError: see ``read_raw``; or the voxels hold NaN.
-    """
+    """Read a CT volume (HU); of several DICOM series, ``series`` is the wanted one's UID or number.
+    Errors as ``read_raw`` and ``volume_of``."""
     return volume_of(read_raw(path, series), path)
 
 
 def read_labels(path: Path) -> LabelVolume:
-    """Read a label map: whole numbers 0..255, in any number type.
-
-    Raises:
-        InputError: see ``read_raw``; or a value is no label.
-    """
+    """Read a label map; errors as ``read_raw`` and ``labels_of``."""
     return labels_of(read_raw(path), path)
 
 
 def volume_of(raw: grid.RawVolume, path: Path) -> Volume:
-    """Raw voxels as a CT; ``path`` names them in errors."""
+    """Raw voxels as a CT; ``path`` names them in the InputError where they are not plausibly HU."""
     hu = raw.array.astype(np.float32, copy=False)
     low, high = float(hu.min()), float(hu.max())
     if not (np.isfinite(low) and np.isfinite(high)):
@@ -107,7 +98,7 @@ def volume_of(raw: grid.RawVolume, path: Path) -> Volume:
 
 
 def labels_of(raw: grid.RawVolume, path: Path) -> LabelVolume:
-    """Raw voxels as labels; ``path`` names them in errors."""
+    """Raw voxels as labels: whole numbers 0..255, in any number type, or else an InputError."""
     low, high = float(raw.array.min()), float(raw.array.max())
     if not (low >= 0 and high <= 255):
         raise InputError(
@@ -136,11 +127,7 @@ def _whole_numbers(array: np.ndarray) -> np.ndarray | None:
 
 
 def _read_nrrd(path: Path) -> grid.RawVolume:
-    """Read an attached .nrrd (raw, gzip or bzip2) with a stated patient space.
-
-    Raises:
-        InputError: damaged, detached, not 3-D, too large, without orientation, not in mm.
-    """
+    """Read an attached .nrrd (raw, gzip or bzip2) with a stated patient space."""
     fields, start = _header(path)
     try:
         shape = tuple(int(n) for n in fields["sizes"].split())
@@ -151,18 +138,13 @@ def _read_nrrd(path: Path) -> grid.RawVolume:
         raise InputError(
             f"{path}: the NRRD header is damaged or lacks a field ({error}). Export it again."
         ) from error
-    grid.check_size(path, shape, dtype.itemsize)
+    grid.check_size(path, shape, dtype.itemsize, _IS_GZIP.get(encoding))
     grid.check_affine(path, lps_from_index)
     if dtype.itemsize > 1:
         if fields.get("endian", "").lower() not in ("little", "big"):
             raise InputError(f"{path}: the NRRD header states no byte order. Export it again.")
         dtype = dtype.newbyteorder("<" if fields["endian"].lower() == "little" else ">")
-    if encoding not in ("raw", "gzip", "gz", "bzip2", "bz2"):
-        raise InputError(f"{path}: encoding {encoding!r} is not read. Export as raw or gzip.")
-    n_bytes = math.prod(shape) * dtype.itemsize
-    if encoding in ("raw", "gzip", "gz"):
-        grid.check_stored(path, n_bytes, compressed=encoding != "raw")
-    data = _voxels(path, start, encoding, n_bytes)
+    data = _voxels(path, start, encoding, math.prod(shape) * dtype.itemsize)
     array = np.frombuffer(data, dtype).reshape(shape, order="F")
     return grid.RawVolume(array.astype(dtype.newbyteorder("="), copy=False), lps_from_index)
 
@@ -171,35 +153,33 @@ def _header(path: Path) -> tuple[dict[str, str], int]:
     """The fields up to the empty line, and the byte where the voxels start."""
     with path.open("rb") as stream:
         head = stream.read(_MAX_HEADER)
-    text, gap, _ = head.replace(b"\r\n", b"\n").partition(b"\n\n")
     if not head.startswith(b"NRRD000"):
         raise InputError(f"{path} is not a NRRD file. Export it again.")
+    gap = re.search(rb"\r?\n\r?\n", head)
+    lines = head[: gap.start() if gap else None].decode("latin-1").replace("\r\n", "\n").split("\n")
     fields: dict[str, str] = {}
-    for line in text.decode("latin-1").split("\n")[1:]:
-        if line.startswith("#") or ":=" in line:
-            continue
-        name, _, value = line.partition(":")
-        fields[name.strip().lower()] = value.strip()
-    if not gap or "data file" in fields or "datafile" in fields:
+    for line in lines[1:]:
+        if not line.startswith("#") and ":=" not in line:
+            name, _, value = line.partition(":")
+            fields[name.strip().lower()] = value.strip()
+    if gap is None or "data file" in fields or "datafile" in fields:
         raise InputError(
             f"{path}: its voxels lie in another file; detached data are refused. Export one "
             "attached .nrrd file."
         )
     if any(fields.get(name, "0") != "0" for name in ("line skip", "byte skip", "lineskip")):
         raise InputError(f"{path}: skipped lines or bytes are not read. Export it again.")
-    ends = [(head.find(mark), len(mark)) for mark in (b"\n\n", b"\r\n\r\n")]
-    position, length = min((at, n) for at, n in ends if at >= 0)
-    return fields, position + length
+    return fields, gap.end()
 
 
-def _lps_from_index(path: Path, fields: dict[str, str]) -> Float[np.ndarray, "4 4"]:
+def _lps_from_index(path: Path, fields: dict[str, str]) -> np.ndarray:
     sign = _LPS_FROM_SPACE.get(fields.get("space", "").lower())
     if sign is None or "space directions" not in fields:
         raise InputError(
             f"{path} states no patient orientation (space {fields.get('space')!r}), so left and "
             "right are unknown. Export it with space left-posterior-superior or RAS."
         )
-    units = [u for u in fields.get("space units", "").replace('"', " ").split() if u]
+    units = fields.get("space units", "").replace('"', " ").split()
     if any(unit.lower() not in ("mm", "millimeter", "millimetre") for unit in units):
         raise InputError(f"{path} states its units as {units}; millimetres are needed.")
     columns = [_vector(part) for part in fields["space directions"].split(")") if part.strip()]
@@ -224,10 +204,12 @@ def _voxels(path: Path, start: int, encoding: str, n_bytes: int) -> bytes:
     try:
         if encoding == "raw":
             data = stored[:n_bytes]
-        elif encoding in ("gzip", "gz"):
+        elif encoding in _IS_GZIP:
             data = zlib.decompressobj(wbits=31).decompress(stored, n_bytes)
-        else:
+        elif encoding in ("bzip2", "bz2"):
             data = bz2.BZ2Decompressor().decompress(stored, n_bytes)
+        else:
+            raise InputError(f"{path}: encoding {encoding!r} is not read. Export as raw or gzip.")
     except (zlib.error, OSError, EOFError) as error:
         raise InputError(f"{path}: its compressed voxels are damaged: {error}.") from error
     if len(data) < n_bytes:

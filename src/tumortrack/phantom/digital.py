@@ -20,6 +20,7 @@ from tumortrack.core.errors import InputError
 from tumortrack.core.types import FIRST_TUMOR, ORGAN, LabelVolume
 
 _LARGEST_GRID = 50_000_000  # voxels
+_RIM_MM = 7.0  # width of the hilum's rounded rim
 
 # The three axes of a grid in the organ frame, mm.
 Axes = tuple[Float[np.ndarray, " i"], Float[np.ndarray, " j"], Float[np.ndarray, " k"]]
@@ -147,11 +148,6 @@ def phantom_labels(parameters: PhantomParameters, voxel_mm: float = 0.8) -> Labe
     return LabelVolume(labels, lps_from_index)
 
 
-def sorted_tumors(parameters: PhantomParameters) -> list[TumorParameters]:
-    """The tumors in label order: largest diameter first."""
-    return sorted(parameters.tumors, key=lambda tumor: -tumor.diameter_mm)
-
-
 def gap_mm(one: TumorParameters, other: TumorParameters) -> float:
     """A lower bound of the distance between two tumors' surfaces."""
     radii_mm = [tumor.diameter_mm / 2 * (1 + tumor.lobulation) for tumor in (one, other)]
@@ -175,9 +171,7 @@ def organ_field(parameters: PhantomParameters, axes_mm: Axes) -> Float[np.ndarra
     return _organ_field(parameters, (x, y, z))
 
 
-def _crossings(
-    axis_mm: Float[np.ndarray, " n"], values: Float[np.ndarray, " n"]
-) -> tuple[float, float]:
+def _crossings(axis_mm: np.ndarray, values: np.ndarray) -> tuple[float, float]:
     """First and last place where ``values`` change sign, by linear interpolation."""
     inside = np.flatnonzero(values < 0)
     ends = []
@@ -203,7 +197,9 @@ def _organ_field(parameters: PhantomParameters, axes_mm: Axes) -> Float[np.ndarr
     u = (x - rx - 2) * np.cos(turn) - (y + 8) * np.sin(turn)
     v = (x - rx - 2) * np.sin(turn) + (y + 8) * np.cos(turn)
     slot = _ellipsoid((u, v, z + 4), (parameters.hilum_depth_mm + 4, 9.0, 0.33 * rz), power=2.0)
-    carved = _smooth_max(body, -slot, 7.0)
+    # Their maximum with a rounded edge (polynomial smooth maximum)
+    blend = np.clip(_RIM_MM - np.abs(body + slot), 0, None)
+    carved = np.maximum(body, -slot) + blend**2 / (4 * _RIM_MM)
     return carved + _lumps(parameters, (x, y, z))
 
 
@@ -213,12 +209,6 @@ def _ellipsoid(point: tuple[np.ndarray, ...], radii: tuple[float, ...], power: f
     norm = sum(s**power for s in scaled) ** (1 / power) + 1e-9
     gradient = [(s / norm) ** (power - 1) / r for s, r in zip(scaled, radii, strict=True)]
     return (norm - 1) / (np.sqrt(sum(g**2 for g in gradient)) + 1e-9)
-
-
-def _smooth_max(a: np.ndarray, b: np.ndarray, width_mm: float) -> np.ndarray:
-    """Maximum with a rounded edge (polynomial smooth maximum)."""
-    blend = np.clip(width_mm - np.abs(a - b), 0, None)
-    return np.maximum(a, b) + blend**2 / (4 * width_mm)
 
 
 def _lumps(parameters: PhantomParameters, point_mm: tuple[np.ndarray, ...]) -> np.ndarray:
@@ -238,7 +228,8 @@ def tumor_fields(parameters: PhantomParameters, axes_mm: Axes) -> list[Float[np.
     """About the signed distance to each tumor, in label order, negative inside, on the grid of
     three axes (organ frame, mm)."""
     fields = []
-    for number, tumor in enumerate(sorted_tumors(parameters)):
+    largest_first = sorted(parameters.tumors, key=lambda tumor: -tumor.diameter_mm)
+    for number, tumor in enumerate(largest_first):
         rng = np.random.default_rng((parameters.shape_seed, 1, number))
         waves = rng.normal(size=(3, 3))
         waves *= 4.0 / np.linalg.norm(waves, axis=1, keepdims=True)

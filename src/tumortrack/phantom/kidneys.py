@@ -7,7 +7,6 @@ CT and seen from a random side. Nothing in them comes from a patient.
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from tumortrack.core.errors import TumortrackError
@@ -38,10 +37,14 @@ def random_anatomy(seed: int) -> tuple[Anatomy, tuple[float, float, float]]:
         turn = turn @ np.diag([-1.0, 1.0, 1.0])
     centre = rng.uniform(-100, 100, 3)
     fields, axes = _fields(parameters)
-    parts = tuple(_placed(_surface(field, axes), turn, centre) for field in fields)
+    parts = []
+    for field in fields:
+        mesh = _surface(field, axes)
+        faces = mesh.faces if np.linalg.det(turn) > 0 else mesh.faces[:, ::-1]  # outward again
+        parts.append(Mesh(mesh.vertices_mm @ turn.T + centre, faces))
     aside = Rotation.from_euler("z", rng.uniform(-_SIDEWAYS_DEG, _SIDEWAYS_DEG), degrees=True)
     x, y, z = turn @ aside.apply([0.0, -1.0, 0.0])
-    return Anatomy(parts), (float(x), float(y), float(z))
+    return Anatomy(tuple(parts)), (float(x), float(y), float(z))
 
 
 def _random_parameters(rng: np.random.Generator) -> digital.PhantomParameters:
@@ -78,12 +81,10 @@ def _random_tumors(
     return tuple(tumors)
 
 
-def _fields(
-    parameters: digital.PhantomParameters,
-) -> tuple[list[Float[np.ndarray, "i j k"]], digital.Axes]:
+def _fields(parameters: digital.PhantomParameters) -> tuple[list[np.ndarray], digital.Axes]:
     """About the signed distance to the whole organ and to each tumor, on a grid round them."""
     reach = np.array(parameters.size_mm) / 2
-    for tumor in digital.sorted_tumors(parameters):
+    for tumor in parameters.tumors:
         reach = np.maximum(reach, np.abs(tumor.center_mm) + 0.6 * tumor.diameter_mm)
     reach = reach + _MARGIN_MM
     x, y, z = (np.arange(-length, length + _STEP_MM, _STEP_MM) for length in reach)
@@ -92,7 +93,7 @@ def _fields(
     return [whole, *tumors], (x, y, z)
 
 
-def _surface(field_mm: Float[np.ndarray, "i j k"], axes: digital.Axes) -> Mesh:
+def _surface(field_mm: np.ndarray, axes: digital.Axes) -> Mesh:
     """The closed zero surface of a field, its largest piece, organ frame."""
     import trimesh
     from skimage.measure import marching_cubes
@@ -105,9 +106,3 @@ def _surface(field_mm: Float[np.ndarray, "i j k"], axes: digital.Axes) -> Mesh:
     largest = max(pieces, key=lambda piece: abs(piece.volume))
     mesh = Mesh(largest.vertices + [axis[0] for axis in axes], largest.faces)
     return mesh if mesh.volume_mm3 > 0 else Mesh(mesh.vertices_mm, mesh.faces[:, ::-1])
-
-
-def _placed(mesh: Mesh, turn: Float[np.ndarray, "3 3"], centre_mm: Float[np.ndarray, " 3"]) -> Mesh:
-    """The mesh turned (or mirrored) and moved, its faces outward again."""
-    faces = mesh.faces if np.linalg.det(turn) > 0 else mesh.faces[:, ::-1]
-    return Mesh(mesh.vertices_mm @ turn.T + centre_mm, faces)

@@ -18,6 +18,8 @@ AIR_HU = -1000.0
 _LOWEST_HU, _HIGHEST_HU = -1024, 3071  # the 12 bits of a clinical scanner
 _LARGEST_SCAN = 400_000_000  # voxels
 
+_Object = tuple[np.ndarray, np.ndarray, float]  # lower and upper corner, HU
+
 
 class ScannerParameters(Config, frozen=True):
     """Materials, objects beside the phantom, and the scanner's resolution and noise.
@@ -51,18 +53,17 @@ class ScannerParameters(Config, frozen=True):
     """Between the label map's box and the block, on the patient's right."""
 
     def __post_init__(self) -> None:
-        if not all(0.2 <= length <= 10 for length in self.spacing_mm):
-            raise InputError(f"scan spacing {self.spacing_mm} mm: allowed are 0.2 to 10 mm.")
         for name in ("organ_hu", "tumor_hu", "table_hu", "block_hu"):
             if not AIR_HU <= getattr(self, name) <= 3000:
                 raise InputError(f"{name} = {getattr(self, name)}: allowed are -1000 to 3000.")
-        lengths = ("margin_mm", "table_thickness_mm", "table_gap_mm", "block_gap_mm")
-        blurs = ("psf_sigma_mm", "noise_hu", "noise_correlation_voxels")
+        if not all(0.2 <= length <= 10 for length in self.spacing_mm):
+            raise InputError(f"scan spacing {self.spacing_mm} mm: allowed are 0.2 to 10 mm.")
         if not all(0 <= length <= 200 for length in self.block_size_mm):
             raise InputError(f"block_size_mm = {self.block_size_mm}: allowed are 0 to 200 mm.")
         if not all(-180 <= angle <= 180 for angle in self.tilt_deg):
             raise InputError(f"tilt_deg = {self.tilt_deg}: allowed are -180 to 180 degrees.")
-        for name in (*lengths, *blurs):
+        lengths = ("margin_mm", "table_thickness_mm", "table_gap_mm", "block_gap_mm")
+        for name in (*lengths, "psf_sigma_mm", "noise_hu", "noise_correlation_voxels"):
             if not 0 <= getattr(self, name) <= 200:
                 raise InputError(f"{name} = {getattr(self, name)}: allowed are 0 to 200.")
 
@@ -76,67 +77,54 @@ def scan(labels: LabelVolume, parameters: ScannerParameters, seed: int) -> Volum
     Raises:
         InputError: no label at all, or a scan of more than 400 million voxels.
     """
-    body, lps_from_body = _crop(labels)
-    box_mm = _corner_box(lps_from_body, body.shape)
+    body = _crop(labels)
+    # Lower and upper corner in LPS of the grid's voxel centres
+    ends = np.stack(np.meshgrid(*[(0, n - 1) for n in body.labels.shape]), -1).reshape(-1, 3)
+    corners = ends @ body.lps_from_index[:3, :3].T + body.lps_from_index[:3, 3]
+    box_mm = np.stack([corners.min(0), corners.max(0)])
     objects = _objects(box_mm, parameters)
     lps_from_index, shape = _field_of_view(box_mm, objects, parameters)
-    sigma_mm = _blur_along_axes(lps_from_index, parameters)
-
-    hu = _scan_labels(body, lps_from_body, lps_from_index, shape, parameters)
+    sigma_mm = _blur_mm(np.eye(3), lps_from_index, parameters)
+    hu = _scan_labels(body, lps_from_index, shape, parameters)
     for lower_mm, upper_mm, object_hu in objects:
         _add_box(hu, lps_from_index, (lower_mm, upper_mm), object_hu - AIR_HU, sigma_mm)
     hu += _noise(shape, parameters, seed)
     return Volume(np.clip(np.rint(hu), _LOWEST_HU, _HIGHEST_HU), lps_from_index)
 
 
-def _crop(labels: LabelVolume) -> tuple[np.ndarray, np.ndarray]:
-    """The box round all labels with one empty voxel about it, and its lps_from_index."""
+def _crop(labels: LabelVolume) -> LabelVolume:
+    """The box round all labels with one empty voxel about it."""
+    from scipy import ndimage
+
     if not labels.labels.any():
         raise InputError("the label map is empty (0 everywhere); there is nothing to scan.")
-    hits = [np.flatnonzero(labels.labels.any(axis=rest)) for rest in ((1, 2), (0, 2), (0, 1))]
-    bounds = [slice(hit[0], hit[-1] + 1) for hit in hits]
+    box = ndimage.find_objects((labels.labels > 0).astype(np.uint8))[0]
     lps_from_crop = labels.lps_from_index.copy()
-    first = np.array([b.start - 1 for b in bounds])
-    lps_from_crop[:3, 3] += lps_from_crop[:3, :3] @ first
-    return np.pad(labels.labels[tuple(bounds)], 1), lps_from_crop
+    lps_from_crop[:3, 3] += lps_from_crop[:3, :3] @ [side.start - 1 for side in box]
+    return LabelVolume(np.pad(labels.labels[box], 1), lps_from_crop)
 
 
-def _corner_box(lps_from_index: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """Lower and upper corner in LPS of a grid's voxel centres."""
-    ends = np.stack(np.meshgrid(*[(0, n - 1) for n in shape]), -1).reshape(-1, 3)
-    corners = ends @ lps_from_index[:3, :3].T + lps_from_index[:3, 3]
-    return np.stack([corners.min(0), corners.max(0)])
-
-
-def _objects(
-    box_mm: np.ndarray, parameters: ScannerParameters
-) -> list[tuple[np.ndarray, np.ndarray, float]]:
+def _objects(box_mm: np.ndarray, parameters: ScannerParameters) -> list[_Object]:
     """Table and block as (lower, upper, HU) boxes along the LPS axes."""
     objects = []
-    table_top = box_mm[1, 1] + parameters.table_gap_mm
+    lower, upper = box_mm.copy()
     block = np.array(parameters.block_size_mm)
-    middle = box_mm.mean(0)
-    has_block = block.min() > 0
-    right_mm = box_mm[0, 0]
-    if has_block:
+    if block.min() > 0:
         # It stands on the table's pad, beside the phantom, nearer the feet than the middle.
-        upper = np.array(
-            [right_mm - parameters.block_gap_mm, box_mm[1, 1], middle[2] - 5 + block[2] / 2]
-        )
-        objects.append((upper - block, upper, parameters.block_hu))
-        right_mm = upper[0] - block[0]
+        right_mm, middle_mm = lower[0] - parameters.block_gap_mm, box_mm.mean(0)[2]
+        corner = np.array([right_mm, upper[1], middle_mm - 5 + block[2] / 2])
+        objects.append((corner - block, corner, parameters.block_hu))
+        lower[0] = corner[0] - block[0]
     if parameters.table_thickness_mm > 0:
-        lower = np.array([right_mm, table_top, box_mm[0, 2]]) - parameters.margin_mm
-        upper = np.array([*(box_mm[1] + parameters.margin_mm)])
-        lower[1], upper[1] = table_top, table_top + parameters.table_thickness_mm
+        top_mm = upper[1] + parameters.table_gap_mm
+        lower, upper = lower - parameters.margin_mm, upper + parameters.margin_mm
+        lower[1], upper[1] = top_mm, top_mm + parameters.table_thickness_mm
         objects.append((lower, upper, parameters.table_hu))
     return objects
 
 
 def _field_of_view(
-    box_mm: np.ndarray,
-    objects: list[tuple[np.ndarray, np.ndarray, float]],
-    parameters: ScannerParameters,
+    box_mm: np.ndarray, objects: list[_Object], parameters: ScannerParameters
 ) -> tuple[np.ndarray, tuple[int, int, int]]:
     """lps_from_index and shape of a grid that holds everything, tilted as requested."""
     from scipy.spatial.transform import Rotation
@@ -144,7 +132,6 @@ def _field_of_view(
     lower = np.min([box_mm[0] - parameters.margin_mm, *(o[0] - 4 for o in objects)], axis=0)
     upper = np.max([box_mm[1] + parameters.margin_mm, *(o[1] + 4 for o in objects)], axis=0)
     rotation = Rotation.from_euler("xyz", parameters.tilt_deg, degrees=True).as_matrix()
-    middle = (lower + upper) / 2
     half_mm = np.abs(rotation.T) @ ((upper - lower) / 2)
     spacing = np.array(parameters.spacing_mm)
     counts = np.ceil(2 * half_mm / spacing).astype(int) + 1
@@ -153,22 +140,22 @@ def _field_of_view(
             f"the scan would have {' x '.join(map(str, counts))} voxels; at most 400 million are "
             "allowed. Choose a larger spacing_mm, or a label map of one organ."
         )
-    origin = middle - rotation @ (spacing * (counts - 1) / 2)
-    lps_from_index = rigid(rotation, origin) @ np.diag([*spacing, 1.0])
-    return lps_from_index, (int(counts[0]), int(counts[1]), int(counts[2]))
+    origin = (lower + upper) / 2 - rotation @ (spacing * (counts - 1) / 2)
+    i, j, k = counts.tolist()
+    return rigid(rotation, origin) @ np.diag([*spacing, 1.0]), (i, j, k)
 
 
-def _blur_along_axes(
-    lps_from_index: np.ndarray, parameters: ScannerParameters
+def _blur_mm(
+    axes: np.ndarray, lps_from_index: np.ndarray, parameters: ScannerParameters
 ) -> Float[np.ndarray, " 3"]:
-    """Blur along the LPS axes in mm: point spread and a voxel's own extent (variance h^2/12)."""
-    voxel = (lps_from_index[:3, :3] ** 2).sum(1) / 12
+    """Blur along three directions (columns, LPS): point spread and a voxel's own extent, which has
+    the variance h^2/12."""
+    voxel = ((axes.T @ lps_from_index[:3, :3]) ** 2).sum(1) / 12
     return np.sqrt(parameters.psf_sigma_mm**2 + voxel)
 
 
 def _scan_labels(
-    body: np.ndarray,
-    lps_from_body: np.ndarray,
+    body: LabelVolume,
     lps_from_index: np.ndarray,
     shape: tuple[int, int, int],
     parameters: ScannerParameters,
@@ -179,17 +166,14 @@ def _scan_labels(
     hu_of_label = np.full(256, AIR_HU, np.float32)
     hu_of_label[ORGAN] = parameters.organ_hu
     hu_of_label[FIRST_TUMOR:] = parameters.tumor_hu
-    directions = lps_from_body[:3, :3] / spacing_mm(lps_from_body)
-    voxel = ((directions.T @ lps_from_index[:3, :3]) ** 2).sum(1) / 12
-    sigma_mm = np.sqrt(parameters.psf_sigma_mm**2 + voxel)
-    sigma = sigma_mm / spacing_mm(lps_from_body)
+    spacing = spacing_mm(body.lps_from_index)
+    directions = body.lps_from_index[:3, :3] / spacing
+    sigma = _blur_mm(directions, lps_from_index, parameters) / spacing
     pad = int(np.ceil(4 * sigma.max())) + 1
-    dense = ndimage.gaussian_filter(
-        np.pad(hu_of_label[body], pad, constant_values=AIR_HU), sigma, mode="nearest"
-    )
-    body_from_index = np.linalg.inv(lps_from_body) @ lps_from_index
+    padded = np.pad(hu_of_label[body.labels], pad, constant_values=AIR_HU)
+    body_from_index = np.linalg.inv(body.lps_from_index) @ lps_from_index
     return ndimage.affine_transform(
-        dense,
+        ndimage.gaussian_filter(padded, sigma, mode="nearest"),
         body_from_index[:3, :3],
         body_from_index[:3, 3] + pad,
         output_shape=shape,
@@ -222,9 +206,7 @@ def _add_box(
         hu[:, :, k] += share
 
 
-def _noise(
-    shape: tuple[int, int, int], parameters: ScannerParameters, seed: int
-) -> Float32[np.ndarray, "i j k"]:
+def _noise(shape: tuple[int, ...], parameters: ScannerParameters, seed: int) -> np.ndarray:
     """Gaussian noise of the stated standard deviation, correlated between neighbours."""
     from scipy import ndimage
 

@@ -6,11 +6,12 @@ Everything in it is in the table's frame, mm; ``plan.json`` has ``table_from_cam
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 from jaxtyping import Float64
 
@@ -19,9 +20,8 @@ from tumortrack.core.config import from_builtins, to_builtins
 from tumortrack.core.errors import ArtifactError, InputError
 from tumortrack.core.mesh_files import read_mesh, write_mesh
 from tumortrack.core.types import Mesh
-from tumortrack.plan.config import ResectionConfig
 from tumortrack.plan.motions import JOINTS, Motions, MotionStage
-from tumortrack.plan.values import Cut, CutLayer, Located, ResectionPlan
+from tumortrack.plan.values import Located, ResectionConfig, ResectionPlan
 from tumortrack.sense.ply import cloud_ply
 
 KIND = "plan"
@@ -58,23 +58,23 @@ def write_plan(
         InputError: the folder exists and ``overwrite`` is False.
         StorageError: the disk refused.
     """
+    plan, motions = content.plan, content.motions
+    data = {
+        "frame_id": content.frame_id,
+        "table_from_camera": content.table_from_camera.tolist(),
+        "config": to_builtins(content.config),
+        "case_sha256": content.case_sha256,
+        "plan": as_builtins(plan),
+        "cell": content.cell,
+        "seconds": motions and motions.seconds,
+    }
     with store.new_folder(folder, overwrite) as aside:
-        plan = content.plan
-        data = {
-            "frame_id": content.frame_id,
-            "table_from_camera": content.table_from_camera.tolist(),
-            "config": to_builtins(content.config),
-            "case_sha256": content.case_sha256,
-            "plan": as_builtins(plan),
-            "cell": content.cell,
-            "seconds": None if content.motions is None else content.motions.seconds,
-        }
         store.write_json(aside / _NAME, data)
         store.write_atomically(aside / _STROKES, _strokes(plan))
         for name, mesh in content.meshes.items():
             write_mesh(aside / f"{name}.ply", mesh)
-        if content.motions is not None:
-            _write_motions(aside / _MOTIONS, content.motions)
+        if motions is not None:
+            _write_motions(aside / _MOTIONS, motions)
         more(aside)
         store.seal(aside, KIND, {"inputs": inputs}, frame=content.frame_id)
 
@@ -91,22 +91,23 @@ def read_plan(folder: Path) -> PlanFolder:
         ArtifactError: no plan, damaged, or of another version.
     """
     manifest = store.read_manifest(folder, KIND)
-    data = store.read_json(folder / _NAME)
-    try:
-        plan = from_plain(data["plan"])
-        table_from_camera = np.array(data["table_from_camera"], float)
-        frame_id, cell = str(data["frame_id"]), data["cell"]
-        config = from_builtins(data["config"], ResectionConfig, str(folder / _NAME))
-        case_sha256 = str(data["case_sha256"])
-    except (KeyError, TypeError, ValueError, InputError) as error:
-        raise ArtifactError(f"{folder / _NAME} lacks or spoils {error}; plan again.") from error
-    surfaces = [Path(name).stem for name in manifest["files"] if name.endswith(".ply")]
-    meshes = {
-        name: read_mesh(folder / f"{name}.ply") for name in surfaces if name != Path(_STROKES).stem
-    }
-    path = folder / _MOTIONS
+    data, path = store.read_json(folder / _NAME), folder / _MOTIONS
+    surfaces = {Path(file).stem for file in manifest["files"] if file.endswith(".ply")}
+    meshes = {name: read_mesh(folder / f"{name}.ply") for name in sorted(surfaces - {"strokes"})}
     motions = _read_motions(path) if path.is_file() else None
-    return PlanFolder(plan, config, table_from_camera, frame_id, meshes, cell, motions, case_sha256)
+    try:
+        return PlanFolder(
+            plan=from_plain(data["plan"]),
+            config=from_builtins(data["config"], ResectionConfig, str(folder / _NAME)),
+            table_from_camera=np.array(data["table_from_camera"], float),
+            frame_id=str(data["frame_id"]),
+            meshes=meshes,
+            cell=data["cell"],
+            motions=motions,
+            case_sha256=str(data["case_sha256"]),
+        )
+    except (KeyError, TypeError, ValueError, InputError, msgspec.ValidationError) as error:
+        raise ArtifactError(f"{folder / _NAME} lacks or spoils {error}; plan again.") from error
 
 
 def as_builtins(plan: ResectionPlan) -> dict[str, Any]:
@@ -144,46 +145,25 @@ def as_builtins(plan: ResectionPlan) -> dict[str, Any]:
 
 
 def from_plain(data: dict[str, Any]) -> ResectionPlan:
-    """The inverse of ``as_builtins``; raises KeyError, TypeError or ValueError for other data."""
-    return ResectionPlan(
-        method=data["method"],
-        tumor=data["tumor"],
-        label=int(data["label"]),
-        grasp_mm=_array(data["grasp_mm"]),
-        cuts=tuple(
-            Cut(int(cut["sweep"]), _array(cut["path_mm"]), cut["kind"]) for cut in data["cuts"]
-        ),
-        layers=tuple(_layer(layer) for layer in data["layers"]),
-        margin_mm=float(data["margin_mm"]),
-        volumes_ml={name: float(value) for name, value in data["volumes_ml"].items()},
-        exophytic=float(data["exophytic"]),
-        stamp_ns=int(data["stamp_ns"]),
-        notes=tuple(data["notes"]),
-    )
-
-
-def _layer(data: dict[str, Any]) -> CutLayer:
-    top_mm = np.inf if data["top_mm"] is None else float(data["top_mm"])
-    return CutLayer(float(data["bottom_mm"]), top_mm, tuple(map(_array, data["rings_mm"])))
-
-
-def _array(values: Any) -> np.ndarray:
-    return np.array(values, float)
+    """The inverse of ``as_builtins``; raises KeyError, TypeError, ValueError or ValidationError for
+    other data."""
+    layers = [dict(layer) for layer in data["layers"]]
+    for layer in layers:
+        layer["top_mm"] = np.inf if layer["top_mm"] is None else layer["top_mm"]
+    read = {**data, "layers": layers}
+    return msgspec.convert(read, ResectionPlan, dec_hook=lambda _, value: np.array(value, float))
 
 
 def _strokes(plan: ResectionPlan) -> bytes:
     """The strokes' points in their order, each with its sweep, its stroke and whether it is one of
     the floor; the grasp point last, with sweep 0."""
-    cuts = plan.cuts
-    points = [*(cut.path_mm for cut in cuts), plan.grasp_mm[None]]
-
-    def of_points(of_strokes: Iterable[int], kind: type) -> np.ndarray:
-        return np.repeat(np.array([*of_strokes, 0], kind), [len(each) for each in points])
-
+    points = [*(cut.path_mm for cut in plan.cuts), plan.grasp_mm[None]]
+    rows = [(cut.sweep, n, cut.kind == "floor") for n, cut in enumerate(plan.cuts, start=1)]
+    columns = np.repeat([*rows, (0, 0, 0)], [len(each) for each in points], axis=0).T
+    kinds = {"sweep": np.int32, "stroke": np.int32, "floor": np.uint8}
     properties = {
-        "sweep": of_points((cut.sweep for cut in cuts), np.int32),
-        "stroke": of_points(range(1, len(cuts) + 1), np.int32),
-        "floor": of_points((cut.kind == "floor" for cut in cuts), np.uint8),
+        name: column.astype(kind)
+        for (name, kind), column in zip(kinds.items(), columns, strict=True)
     }
     return cloud_ply(np.concatenate(points), properties, "table (z up)")
 

@@ -23,19 +23,15 @@ STAND_MM = 120.0  # the organ's lowest point over the table, where it is not kno
 
 
 def table_below(points_mm: Float[np.ndarray, "n 3"], stand_mm: float) -> Float64[np.ndarray, "4 4"]:
-    """``table_from_camera`` of a camera that looks straight down on the organ.
+    """``table_from_camera`` of a camera that looks straight down on the organ (camera frame), whose
+    lowest point stands ``stand_mm`` over the table.
 
     x goes to the right in the picture, y to its top, z towards the camera; the origin lies on the
     table below the organ's middle.
-
-    Args:
-        points_mm: of the organ, camera frame.
-        stand_mm: height of the organ's lowest point over the table.
     """
     low, high = points_mm.min(0), points_mm.max(0)
-    middle = (low + high) / 2
-    turn = np.diag([1.0, -1.0, -1.0])
-    return rigid(turn, np.array([-middle[0], middle[1], high[2] + stand_mm]))
+    x, y, _ = (low + high) / 2
+    return rigid(np.diag([1.0, -1.0, -1.0]), np.array([-x, y, high[2] + stand_mm]))
 
 
 def located(
@@ -90,13 +86,11 @@ def read_run(folder: Path) -> LocatedRun:
         table = parse_ply_properties(content, str(path), ("x", "y", "z", "label", "probability"))
     except (OSError, InputError) as error:
         raise ArtifactError(f"{folder} is no run that can be planned on: {error}") from error
-    report = read_json(folder / "report.json")
-    stamp_ns = report.get("stamp_ns", 0)
-    cloud = OccupancyCloud(
-        table[:, :3], table[:, 3], table[:, 4], stamp_ns if isinstance(stamp_ns, int) else 0
-    )
-    names = [f.removesuffix(".ply") for f in manifest["files"] if f.endswith(".ply")]
-    meshes = {name: read_mesh(folder / f"{name}.ply") for name in names if name != path.stem}
+    stamp_ns = read_json(folder / "report.json").get("stamp_ns", 0)
+    stamp_ns = stamp_ns if isinstance(stamp_ns, int) else 0
+    cloud = OccupancyCloud(table[:, :3], table[:, 3], table[:, 4], stamp_ns)
+    surfaces = {Path(file).stem for file in manifest["files"] if file.endswith(".ply")}
+    meshes = {name: read_mesh(folder / f"{name}.ply") for name in sorted(surfaces - {path.stem})}
     found = [name_of(label) for label in np.unique(cloud.labels) if label]
     lacking = [name for name in found if name not in meshes]
     if meshes and lacking:

@@ -9,18 +9,26 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+import numba
 import numpy as np
 import shapely
-from jaxtyping import Float, Float64, Int, Num
+from jaxtyping import Float, Float64, Int
 from numpy.linalg import norm
 from scipy.ndimage import binary_closing, minimum_filter
 from skimage.measure import find_contours
 
 from tumortrack.core.errors import NoPlan
-from tumortrack.plan.config import Direction, ResectionConfig
-from tumortrack.plan.margin_kernels import outline_fields
 from tumortrack.plan.outline import arcs, evenly_round, first_in_cell, polygon_of, rings_of
-from tumortrack.plan.values import Cut, CutLayer, Located, MethodResult, Rings, name_of
+from tumortrack.plan.values import (
+    Cut,
+    CutLayer,
+    Direction,
+    Located,
+    MethodResult,
+    ResectionConfig,
+    Rings,
+    name_of,
+)
 
 # Of outlines, which are interpolated; and one surface point in each cube of that size. Both finer
 # where the margin is narrow, so that it is kept to a tenth of a millimetre.
@@ -32,9 +40,8 @@ _SMOOTH_MM = 0.05  # outlines lose corners smaller than this
 _FAR_MM = 1e3
 _LEAST_MM2 = 1.0  # a smaller rest of a floor needs no stroke
 
-Heights = tuple[Float64[np.ndarray, " n"], Float64[np.ndarray, " n"]]  # lowest and highest, mm
-# Points of the tumor, and the margin that each needs, mm
-Grown = tuple[Float64[np.ndarray, "n 3"], Num[np.ndarray, " n"]]
+Heights = tuple[Float64[np.ndarray, "..."], Float64[np.ndarray, "..."]]  # lowest and highest, mm
+_Grown = tuple[np.ndarray, np.ndarray]  # points of the tumor, and the margin that each needs, mm
 
 
 def margin_plan(located: Located, label: int, config: ResectionConfig) -> MethodResult:
@@ -43,7 +50,7 @@ def margin_plan(located: Located, label: int, config: ResectionConfig) -> Method
     Raises:
         NoPlan: the margin with its uncertainty is wider than allowed; there is nothing to cut.
     """
-    columns = Columns.of(located)
+    columns, tumor = Columns.of(located), located.of(label)
     layers = _layers(_grown_tumor(located, label, config), columns, config.layer_mm)
     slabs = list(zip(layers, (*layers[1:], None), strict=True))
     cuts: list[Cut] = []
@@ -52,17 +59,15 @@ def margin_plan(located: Located, label: int, config: ResectionConfig) -> Method
         cuts += _in_turn(_strokes(layer, below, columns, config), sweep, last, config.direction)
     if not cuts:
         raise NoPlan("the organ does not reach the tumor's margin; there is nothing to cut.")
-    return layers, tuple(cuts), _grasp(located.of(label), columns)
+    # Held is the surface straight above the tumor's centre of mass: there the cup finds something.
+    x, y, _ = tumor.mean(0)
+    high = columns.at(np.array([[x, y]], float))[1][0]
+    top = tumor[:, 2].max() if np.isnan(high) else high
+    return layers, tuple(cuts), np.array([x, y, top], float)
 
 
-def _grown_tumor(located: Located, label: int, config: ResectionConfig) -> Grown:
-    """Points of the tumor's surface (also inside it, where there is no mesh) and the margin that
-    each needs, mm.
-
-    Raises:
-        NoPlan: a margin is wider than ``most_margin_mm``; the estimate has no uncertainty, and it
-            is asked for.
-    """
+def _grown_tumor(located: Located, label: int, config: ResectionConfig) -> _Grown:
+    """Of the tumor's surface, or of points in it where there is no mesh."""
     name = name_of(label)
     mesh = located.meshes.get(name)
     points = np.asarray(located.of(label) if mesh is None else mesh.vertices_mm, float)
@@ -102,23 +107,18 @@ class Columns:
         points = np.asarray(located.points_mm if mesh is None else mesh.vertices_mm, float)
         low = points[:, :2].min(0) - 2 * _COLUMN_MM
         cell = np.round((points[:, :2] - low) / _COLUMN_MM).astype(int)
-        shape = cell.max(0) + 3
-        flat = cell[:, 0] * shape[1] + cell[:, 1]
-        lowest, highest = column_extremes(flat, points[:, 2], shape.prod())
-        return cls(low, _spread(lowest.reshape(shape)), -_spread(-highest.reshape(shape)))
+        lowest, highest = column_extremes(cell, points[:, 2], tuple(cell.max(0) + 3))
+        return cls(low, _spread(lowest), -_spread(-highest))
 
     def at(self, points_mm: Float[np.ndarray, "n 2"]) -> Heights:
         """Lowest and highest point of the organ below and above each place."""
         cell = np.round((points_mm - self.first_mm) / _COLUMN_MM).astype(int)
-        shape = np.array(self.lowest_mm.shape)
-        inside = ((cell >= 0) & (cell < shape)).all(1)
-        i, j = np.clip(cell, 0, shape - 1).T
-        low, high = self.lowest_mm[i, j], self.highest_mm[i, j]
+        inside = ((cell >= 0) & (cell < self.lowest_mm.shape)).all(1)
+        place = tuple(np.where(inside, cell.T, 0))
+        low, high = self.lowest_mm[place], self.highest_mm[place]
         return np.where(inside, low, np.nan), np.where(inside, high, np.nan)
 
-    def within(
-        self, points_mm: Float[np.ndarray, "n 2"], bottom_mm: float, top_mm: float
-    ) -> np.ndarray:
+    def within(self, points_mm: np.ndarray, bottom_mm: float, top_mm: float) -> np.ndarray:
         """Where there is organ between two heights, or nearly: the estimate may be a little off,
         and a thin bridge would hold the piece."""
         low, high = self.at(points_mm)
@@ -126,25 +126,25 @@ class Columns:
 
 
 def column_extremes(
-    columns: Int[np.ndarray, " m"], heights: Float[np.ndarray, " m"], n_columns: int
+    cells: Int[np.ndarray, "m 2"], heights: Float[np.ndarray, " m"], shape: tuple[int, ...]
 ) -> Heights:
-    """The lowest and the highest point of each column; inf and -inf where none is."""
-    lowest, highest = np.full(n_columns, np.inf), np.full(n_columns, -np.inf)
-    np.minimum.at(lowest, columns, heights)
-    np.maximum.at(highest, columns, heights)
+    """The lowest and the highest point in each cell of a grid; inf and -inf where none is."""
+    flat = np.ravel_multi_index(tuple(cells.T), shape)
+    lowest, highest = np.full(shape, np.inf), np.full(shape, -np.inf)
+    np.minimum.at(lowest.ravel(), flat, heights)
+    np.maximum.at(highest.ravel(), flat, heights)
     return lowest, highest
 
 
-def _spread(values: Float[np.ndarray, "i j"]) -> Float64[np.ndarray, "i j"]:
+def _spread(values: np.ndarray) -> np.ndarray:
     """Empty cells take the least of their neighbours, if those surround them."""
     known = np.isfinite(values)
+    filled = np.where(known, values, minimum_filter(np.where(known, values, np.inf), 5))
     closed = binary_closing(known, iterations=2) | known
-    near = minimum_filter(np.where(known, values, np.inf), 5)
-    filled = np.where(known, values, near)
     return np.where(closed & np.isfinite(filled), filled, np.nan)
 
 
-def _layers(grown: Grown, columns: Columns, layer_mm: float) -> tuple[CutLayer, ...]:
+def _layers(grown: _Grown, columns: Columns, layer_mm: float) -> tuple[CutLayer, ...]:
     """Slabs from the top down; each has the outline at its upper end, where it is widest."""
     points, margins = grown
     floor = float((points[:, 2] - margins).min())
@@ -157,16 +157,12 @@ def _layers(grown: Grown, columns: Columns, layer_mm: float) -> tuple[CutLayer, 
     n = max(1, int(np.ceil((np.nanmax(high) - floor) / layer_mm)))
     bottoms = floor + (np.nanmax(high) - floor) / n * np.arange(n)
     tops = np.append(bottoms[1:], np.inf)
-    outlines = [*_outlines(grown, tops[:-1]), outermost]
-    layers = [
-        CutLayer(float(bottom), float(top), rings)
-        for bottom, top, rings in zip(bottoms, tops, outlines, strict=True)
-        if rings
-    ]
+    slabs = zip(bottoms, tops, [*_outlines(grown, tops[:-1]), outermost], strict=True)
+    layers = [CutLayer(float(low), float(top), rings) for low, top, rings in slabs if rings]
     return tuple(reversed(layers))
 
 
-def _outlines(grown: Grown, levels_mm: Float[np.ndarray, " k"]) -> list[Rings]:
+def _outlines(grown: _Grown, levels_mm: np.ndarray) -> list[Rings]:
     """Rings of what comes away at each height."""
     points, margins = grown
     cell = min(_CELL_MM, _CELL_SHARE * float(margins.min()))
@@ -174,7 +170,7 @@ def _outlines(grown: Grown, levels_mm: Float[np.ndarray, " k"]) -> list[Rings]:
     first = points[:, :2].min(0) - room
     shape = np.ceil((points[:, :2].max(0) + room - first) / cell).astype(int) + 1
     fields = np.full((len(levels_mm), *shape), _FAR_MM)
-    outline_fields(points, margins, np.asarray(levels_mm, float), first, cell, fields)
+    _outline_fields(points, margins, levels_mm, first, cell, fields)
     found = []
     for field in fields:
         # Far cells hold no distance: next to the outline all are nearer than this.
@@ -208,14 +204,14 @@ def _strokes(
 
 
 def _in_turn(
-    strokes: list[Cut], sweep: int, last: Float[np.ndarray, " 3"] | None, direction: Direction
+    strokes: list[Cut], sweep: int, last: np.ndarray | None, direction: Direction
 ) -> list[Cut]:
     """Walls first, then the floor; each time the stroke that begins nearest to where the one before
     ended. Outlines run anticlockwise, seen from above."""
     turns = {"shortest": (1, -1), "clockwise": (-1,), "anticlockwise": (1,)}[direction]
     ordered = []
-    for floor in (False, True):
-        left = [stroke for stroke in strokes if (stroke.kind == "floor") == floor]
+    for kind in ("wall", "floor"):
+        left = [stroke for stroke in strokes if stroke.kind == kind]
         while left:
             gaps = [
                 (0.0 if last is None else float(norm(stroke.path_mm[::turn][0] - last)), n, -turn)
@@ -229,8 +225,38 @@ def _in_turn(
     return ordered
 
 
-def _grasp(tumor: Float[np.ndarray, "n 3"], columns: Columns) -> Float64[np.ndarray, " 3"]:
-    """The surface straight above the tumor's centre of mass: there the cup finds something."""
-    x, y, _ = tumor.mean(0)
-    high = columns.at(np.array([[x, y]], float))[1][0]
-    return np.array([x, y, tumor[:, 2].max() if np.isnan(high) else high], float)
+@numba.njit(cache=True, nogil=True)
+def _outline_fields(points, margins, levels, first, cell, fields):  # type: ignore[no-untyped-def]
+    """Into ``fields`` (k, nx, ny), large where nothing is near: for each of k levels (mm) the
+    signed distance (mm, near 0) to the outline of what comes away there.
+
+    What comes away at a height is all that lies above the tumor, points (n, 3) grown by margins
+    (n,): of each point a disc, as wide as its ball of the margin is at that height, and the whole
+    ball's width above its middle. ``first``: x and y of the first grid point; ``cell``: between
+    grid points.
+    """
+    n_levels, nx, ny = fields.shape
+    for i in range(len(points)):
+        x, y, z = points[i]
+        margin = margins[i]
+        for level in range(n_levels):
+            rise = z - levels[level]
+            if rise >= margin:
+                continue
+            radius = margin if rise <= 0 else np.sqrt(margin * margin - rise * rise)
+            reach, core = radius + 2 * cell, max(0.0, radius - 2 * cell)
+            left = max(0, int(np.ceil((x - reach - first[0]) / cell)))
+            right = min(nx - 1, int(np.floor((x + reach - first[0]) / cell)))
+            low = max(0, int(np.ceil((y - reach - first[1]) / cell)))
+            high = min(ny - 1, int(np.floor((y + reach - first[1]) / cell)))
+            for a in range(left, right + 1):
+                across = first[0] + a * cell - x
+                for b in range(low, high + 1):
+                    along = first[1] + b * cell - y
+                    square = across * across + along * along
+                    if square >= reach * reach:
+                        continue
+                    # Deep inside it is enough to say so: only the outline's surroundings count.
+                    off = core - radius if square < core * core else np.sqrt(square) - radius
+                    if off < fields[level, a, b]:
+                        fields[level, a, b] = off

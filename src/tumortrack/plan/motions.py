@@ -27,9 +27,9 @@ class MotionStage:
     """One state of the procedure: approach, grasp, hold, sweep 1, sweep 2, ..., release, home.
 
     Attributes:
-        times_s: rising from 0 (n,); one entry where nothing moves.
-        joints_rad: of all twelve joints in the order of ``JOINTS`` (n, 12); between two times
-            they change linearly.
+        times_s: rising from 0; one entry where nothing moves.
+        joints_rad: of all twelve joints in the order of ``JOINTS``; between two times they change
+            linearly.
         cutting: True at the times at which the instrument's tip is on a cut (n,).
     """
 
@@ -74,14 +74,15 @@ class Execution:
     """Executes motions. ``step`` lets time go by; ``halt`` has the arms slow down and stand, on
     their path, and ``go`` lets them go on; ``abort`` is a halt for good.
 
-    ``state`` is the name of the stage, ``done`` or ``aborted``.
+    ``state`` is the name of the stage, ``done`` or ``aborted``; ``halted`` is why the arms stand or
+    slow down, empty where they don't.
     """
 
     def __init__(self, motions: Motions) -> None:
         self._motions = motions
         self._number, self._time_s = 0, 0.0
         self._speed = 0.0  # of the motions' own time, 0..1
-        self._reason, self._aborted = "", False
+        self.halted, self._aborted = "", False
 
     @property
     def state(self) -> str:
@@ -95,13 +96,7 @@ class Execution:
         return self._over or (self._aborted and self.still)
 
     @property
-    def halted(self) -> str:
-        """Why the arms stand or slow down; empty where they don't."""
-        return self._reason
-
-    @property
     def still(self) -> bool:
-        """The arms stand."""
         return self._speed == 0.0 or self._over
 
     @property
@@ -125,14 +120,14 @@ class Execution:
     def go(self) -> None:
         """Take up the motion again, or begin."""
         if not self._aborted:
-            self._reason = ""
+            self.halted = ""
 
     def halt(self, reason: str) -> None:
         """Slow down and stand."""
         if not reason:
             raise InputError("a halt needs its reason.")
         if not self._aborted:
-            self._reason = reason
+            self.halted = reason
 
     def abort(self, reason: str) -> None:
         """Slow down and stand, and never go on; no effect once everything has ended."""
@@ -141,11 +136,8 @@ class Execution:
             self._aborted = True
 
     def replace(self, motions: Motions) -> None:
-        """Go on with other motions, which begin where the arms stand now.
-
-        Raises:
-            InputError: they begin elsewhere, or the arms are moving.
-        """
+        """Go on with other motions; InputError where they do not begin where the arms stand now, or
+        the arms are moving."""
         if not self.still:
             raise InputError("motions can be replaced only while the arms stand.")
         off = np.abs(motions.stages[0].joints_rad[0] - self.joints_rad).max()
@@ -160,20 +152,13 @@ class Execution:
         while seconds > 0 and not self._over:
             change = min(seconds, 0.02)  # the speed changes in steps as short as that
             seconds -= change
-            wanted = 0.0 if self._reason else 1.0
+            wanted, before = 0.0 if self.halted else 1.0, self._speed
             most = change / self._brake_s()
-            before = self._speed
-            self._speed += float(np.clip(wanted - self._speed, -most, most))
-            self._advance(change * (before + self._speed) / 2)
-
-    def _advance(self, seconds: float) -> None:
-        self._time_s += seconds
-        while not self._over and self._time_s >= self._stage.seconds:
-            if self._number + 1 == len(self._motions.stages):
-                self._number, self._time_s = self._number + 1, self._stage.seconds
-                return
-            self._time_s -= self._stage.seconds
-            self._number += 1
+            self._speed += float(np.clip(wanted - before, -most, most))
+            self._time_s += change * (before + self._speed) / 2
+            while not self._over and self._time_s >= (length_s := self._stage.seconds):
+                self._number += 1
+                self._time_s = length_s if self._over else self._time_s - length_s
 
     def _brake_s(self) -> float:
         """Time in which the motion comes to rest without more than the brake's acceleration."""

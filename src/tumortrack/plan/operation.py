@@ -64,10 +64,6 @@ class Planned:
     meshes: Mapping[str, Mesh]
     motions: Motions
 
-    @property
-    def tumor(self) -> Mesh:
-        return self.meshes[self.plan.tumor]
-
 
 @dataclass(frozen=True)
 class ResectionProgress:
@@ -87,13 +83,9 @@ class ResectionProgress:
             return None
         if self.done_mm is None:
             return 1
-        low = float(tumor.box_mm[0, 2])
+        done_mm = float(tumor.box_mm[0, 2]) + self.done_mm
         onward = 1 if planned.cuts[-1].height_mm > planned.cuts[0].height_mm else -1
-        left = {
-            cut.sweep
-            for cut in planned.cuts
-            if onward * (cut.height_mm - low - self.done_mm) > _SAME_MM
-        }
+        left = [c.sweep for c in planned.cuts if onward * (c.height_mm - done_mm) > _SAME_MM]
         return min(left, default=planned.sweeps)
 
 
@@ -146,19 +138,25 @@ class Operation:
     @property
     def progress(self) -> ResectionProgress:
         """How far it came."""
-        if not self._execution.holds:
-            return ResectionProgress()
-        done = [cut for cut in self.planned.plan.cuts if cut.sweep < self._execution.sweep]
-        if not done:
-            return ResectionProgress(holds=True)
-        return ResectionProgress(True, done[-1].height_mm - float(self.planned.tumor.box_mm[0, 2]))
+        plan, sweep = self.planned.plan, self._execution.sweep
+        done = [cut.height_mm for cut in plan.cuts if cut.sweep < sweep]
+        if not (self._execution.holds and done):
+            return ResectionProgress(self._execution.holds)
+        return ResectionProgress(
+            True, done[-1] - float(self.planned.meshes[plan.tumor].box_mm[0, 2])
+        )
 
     def act(self, update: TrackingResult, now_s: float | None = None) -> TrackingResult:
         """The update with what the arms do now. ``now_s``: a steady clock's time."""
         now_s = time.monotonic() if now_s is None else now_s
         self._advance(now_s)
         self._decide(update, now_s)
-        self._note(now_s)
+        if not self.log or self.log[-1]["state"] != self._execution.state:
+            self._log(now_s)
+        halted = "".join(c for c in self._execution.halted if not (c.isdigit() or c == "."))
+        if halted and halted != self._counted:
+            self.halts[halted] += 1
+        self._counted = halted
         return replace(update, workcell=self.workcell())
 
     def abort(self, reason: str) -> None:
@@ -167,15 +165,17 @@ class Operation:
 
     def workcell(self) -> Workcell:
         """State, joints and drawing of the arms."""
-        execution = self._execution
-        joints = execution.joints_rad
-        return Workcell(
-            execution.state,
-            execution.halted,
-            dict(zip(JOINTS, joints.tolist(), strict=True)),
-            (*self.still_life, *self._draw(joints)),
-            self._lines(),
-        )
+        execution, plan = self._execution, self.planned.plan
+        joints, sweep = execution.joints_rad, execution.sweep
+        lines = []
+        for number, cut in enumerate(plan.cuts, start=1):
+            colour = CUT if cut.sweep < sweep else NOW if cut.sweep == sweep else TO_CUT
+            lines.append(Polyline(f"cut/{number}", cut.path_mm, colour, 0.8))
+        above = plan.grasp_mm + np.array([[0.0, 0.0, 40.0], [0.0, 0.0, 0.0]])
+        lines.append(Polyline("grasp", above, (90, 200, 255), 0.8))
+        named = dict(zip(JOINTS, joints.tolist(), strict=True))
+        shapes = (*self.still_life, *self._draw(joints))
+        return Workcell(execution.state, execution.halted, named, shapes, tuple(lines))
 
     def summary(self) -> dict[str, Any]:
         """For the report: states and when they began, halts, new plans."""
@@ -231,12 +231,12 @@ class Operation:
         for part in self.planned.meshes.keys() & located.meshes.keys():
             off_mm = apart_mm(located.meshes[part], self.planned.meshes[part])
             if off_mm > config.moved_mm * (1.0 if part == name else _OTHERS):
-                far.append((off_mm, part))
+                far.append((part == name, off_mm, part))
         if not far:
             self._settled = None
             execution.go()
             return
-        off_mm, part = next((one for one in far if one[1] == name), max(far))
+        _, off_mm, part = max(far)  # the tumor, or else what moved farthest
         execution.halt(f"{part} has moved by {off_mm:.1f} mm")
         if self._settled is None or apart_mm(tumor, self._settled[0]) > config.settled_mm:
             self._settled = (tumor, now_s)
@@ -259,33 +259,15 @@ class Operation:
         if failure is None:
             self.planned = work.result()
             execution.replace(self.planned.motions)
-            self._log(now_s, {"event": "planned anew"})
+            self._log(now_s, event="planned anew")
         elif isinstance(failure, TumortrackError):
             execution.abort(f"no new plan: {failure}")
         else:  # a defect of the planner must stop the arms, and be reported
             execution.abort(f"internal error, {type(failure).__name__}: {failure}")
 
-    def _note(self, now_s: float) -> None:
-        if not self.log or self.log[-1]["state"] != self._execution.state:
-            self._log(now_s, {})
-        halted = "".join(c for c in self._execution.halted if not (c.isdigit() or c == "."))
-        if halted != self._counted:
-            self._counted = halted
-            if halted:
-                self.halts[halted] += 1
-
-    def _log(self, now_s: float, event: dict[str, str]) -> None:
+    def _log(self, now_s: float, **event: str) -> None:
         at_s = round(now_s - self._first_s, 3)
         self.log.append({"state": self._execution.state, "at_s": at_s, **event})
-
-    def _lines(self) -> tuple[Polyline, ...]:
-        sweep, plan = self._execution.sweep, self.planned.plan
-        lines = []
-        for number, cut in enumerate(plan.cuts, start=1):
-            colour = CUT if cut.sweep < sweep else NOW if cut.sweep == sweep else TO_CUT
-            lines.append(Polyline(f"cut/{number}", cut.path_mm, colour, 0.8))
-        above = plan.grasp_mm + np.array([[0.0, 0.0, 40.0], [0.0, 0.0, 0.0]])
-        return (*lines, Polyline("grasp", above, (90, 200, 255), 0.8))
 
 
 def apart_mm(a: Mesh, b: Mesh) -> float:
@@ -294,8 +276,6 @@ def apart_mm(a: Mesh, b: Mesh) -> float:
     if np.array_equal(a.faces, b.faces):
         off = a.vertices_mm - b.vertices_mm
         return float(np.sqrt((off**2).sum(axis=1).mean()))
-    apart = []
-    for one, other in ((a.vertices_mm, b.vertices_mm), (b.vertices_mm, a.vertices_mm)):
-        some = one[:: max(1, len(one) // _COMPARED)]
-        apart.append(cKDTree(other).query(some)[0])
+    pairs = (a.vertices_mm, b.vertices_mm), (b.vertices_mm, a.vertices_mm)
+    apart = [cKDTree(to).query(of[:: max(1, len(of) // _COMPARED)])[0] for of, to in pairs]
     return float(np.sqrt((np.concatenate(apart) ** 2).mean()))

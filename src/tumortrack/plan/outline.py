@@ -15,9 +15,7 @@ from shapely.geometry.polygon import orient
 
 from tumortrack.core.errors import NoPlan
 
-_CELL = (
-    2.0  # of a grid that separates inner points from outer ones, in sqrt(area / number of points)
-)
+_CELL = 2.0  # of a grid that parts inner points from outer ones, in sqrt(area / number of points)
 _EDGE = 5.0  # longest edge of a hull, in sqrt(area / number of points)
 _SPARSE = 6  # of inner points, one in each block of so many cells stays
 _MOST = 10_000  # points that are used
@@ -41,16 +39,13 @@ def concave_hull(points_mm: Float[np.ndarray, "n 2"]) -> Polygon:
     # Points of a grid lie on each other when they are projected, and would count as many.
     points = points[first_in_cell(np.round(points / _SAME_MM).astype(np.int64))]
     try:
-        if len(points) < 3:
-            raise ValueError("too few")
         typical_mm = float(np.sqrt(ConvexHull(points).volume / len(points)))
         outer = _outer(points, _CELL * typical_mm)
-        triangles = Delaunay(outer).simplices
+        corners = outer[Delaunay(outer).simplices]
     except (QhullError, ValueError, IndexError) as error:
         raise NoPlan(
             f"{len(points_mm)} points that lie on a line, or are too few, have no outline."
         ) from error
-    corners = outer[triangles]
     lengths = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)
     span = max(float(np.ptp(lengths)), 1e-9)
     ratio = float(np.clip((_EDGE * typical_mm - lengths.min()) / span, 0.0, 1.0))
@@ -70,8 +65,9 @@ def common(a: Polygon, b: Polygon) -> Polygon:
 def evenly(ring_mm: Float[np.ndarray, "n 2"], spacing_mm: float) -> Float64[np.ndarray, "m 2"]:
     """Points at equal distances along a line, ends included; at most ``spacing_mm`` apart."""
     steps = np.linalg.norm(np.diff(ring_mm, axis=0), axis=1)
-    line = np.asarray(ring_mm, float)[np.r_[True, steps > 1e-9]]
-    along = np.concatenate([[0.0], np.cumsum(steps[steps > 1e-9])])
+    moves = steps > 1e-9
+    line = np.asarray(ring_mm, float)[np.r_[True, moves]]
+    along = np.r_[0.0, np.cumsum(steps[moves])]
     at = np.linspace(0.0, along[-1], max(2, int(np.ceil(along[-1] / spacing_mm)) + 1))
     return np.stack([np.interp(at, along, axis) for axis in line.T], axis=1)
 
@@ -108,7 +104,7 @@ def arcs(
 def rings_of(area: Any) -> tuple[Float64[np.ndarray, "n 2"], ...]:
     """The outer rings of a polygon or several, anticlockwise, first points not repeated, largest
     first."""
-    pieces = [p for p in _polygons(area) if p.area >= _LEAST_MM2]
+    pieces = [piece for piece in _polygons(area) if piece.area >= _LEAST_MM2]
     pieces.sort(key=lambda piece: -piece.area)
     return tuple(np.array(orient(piece).exterior.coords)[:-1, :2] for piece in pieces)
 
@@ -129,35 +125,32 @@ def _polygons(area: Any) -> list[Polygon]:
 
 
 def _largest(area: Any) -> Polygon:
-    pieces = _polygons(area)
-    if not pieces or max(piece.area for piece in pieces) < _LEAST_MM2:
+    """Without its holes: what lies in them comes away too."""
+    largest = max(_polygons(area), key=lambda piece: piece.area, default=Polygon())
+    if largest.area < _LEAST_MM2:
         raise NoPlan("the outline has no area; there is no contour to cut along.")
-    largest = max(pieces, key=lambda piece: piece.area)
-    return shapely.Polygon(largest.exterior)  # what lies in a hole comes away too
+    return Polygon(largest.exterior)
 
 
 def first_in_cell(cells: Int[np.ndarray, "n d"]) -> Int[np.ndarray, " m"]:
     """Numbers of the points that are the first in their cells, ordered by cell."""
     shifted = cells - cells.min(0, initial=0)
-    key = np.zeros(len(cells), np.int64)
-    for axis, size in zip(shifted.T, shifted.max(0, initial=0) + 1, strict=True):
-        key = key * size + axis
-    return np.unique(key, return_index=True)[1]
+    keys = np.ravel_multi_index(tuple(shifted.T), tuple(shifted.max(0, initial=0) + 1))
+    return np.unique(keys, return_index=True)[1]
 
 
-def _outer(points: Float[np.ndarray, "n 2"], cell_mm: float) -> Float[np.ndarray, "m 2"]:
+def _outer(points: np.ndarray, cell_mm: float) -> np.ndarray:
     """Of the largest cluster, the points that matter for its outline: those in cells next to an
     empty one, and a few of the others.
 
     A cell holds about four points; clusters are cells that touch each other.
     """
     i, j = ((points - points.min(0)) / cell_mm).astype(int).T
-    some = np.zeros((int(i.max()) + 1, int(j.max()) + 1), bool)
+    some = np.zeros((i.max() + 1, j.max() + 1), bool)
     some[i, j] = True
     clusters = label(some, np.ones((3, 3)))[0][i, j]
-    mine = np.flatnonzero(clusters == np.bincount(clusters).argmax())
-    i, j = i[mine], j[mine]
-    deep = binary_erosion(some, np.ones((3, 3)))[i, j]
-    keep = ~deep
+    mine = clusters == np.bincount(clusters).argmax()
+    points, i, j = points[mine], i[mine], j[mine]
+    keep = ~binary_erosion(some, np.ones((3, 3)))[i, j]
     keep[first_in_cell(np.stack([i, j], axis=1) // _SPARSE)] = True
-    return points[mine[keep]]
+    return points[keep]

@@ -7,15 +7,22 @@ from __future__ import annotations
 
 import numpy as np
 import shapely
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from scipy.spatial import ConvexHull, QhullError
 
 from tumortrack.core.errors import InputError, NoPlan
 from tumortrack.core.types import FIRST_TUMOR, ORGAN
-from tumortrack.plan.config import ResectionConfig
 from tumortrack.plan.margin import column_extremes, margin_plan
 from tumortrack.plan.outline import common, concave_hull, evenly, grown, polygon_of, rings_of
-from tumortrack.plan.values import Cut, CutLayer, Located, MethodResult, ResectionPlan, name_of
+from tumortrack.plan.values import (
+    Cut,
+    CutLayer,
+    Located,
+    MethodResult,
+    ResectionConfig,
+    ResectionPlan,
+    name_of,
+)
 
 _DIRECTIONS, _MOST = 192, 12_000  # of the hull, points it is made of: a kidney's is off by 0.5 mm
 _FEWEST = 30  # points that define a tumor's shape
@@ -63,17 +70,12 @@ def published_plan(located: Located, label: int, config: ResectionConfig) -> Met
     The tumor's points are projected on the table's plane; their concave hull, grown by the margin
     and clipped to the organ's projection, is cut along twice: at the middle of the tumor's bounding
     box, and on the box's lower face. Held is the tumor's centre of mass, carried up to the top of
-    the box.
-
-    Raises:
-        NoPlan: there is no contour.
+    the box. NoPlan where there is no contour.
     """
     tumor = located.of(label)
     low, high = float(tumor[:, 2].min()), float(tumor[:, 2].max())
-    zone = common(
-        grown(concave_hull(tumor[:, :2]), config.margin_mm), concave_hull(located.points_mm[:, :2])
-    )
-    ring = rings_of(zone)[0]
+    wide = grown(concave_hull(tumor[:, :2]), config.margin_mm)
+    ring = rings_of(common(wide, concave_hull(located.points_mm[:, :2])))[0]
     flat = evenly(np.concatenate([ring, ring[:1]]), config.spacing_mm)
     cuts = (Cut.level(1, flat, (low + high) / 2), Cut.level(2, flat, low))
     x, y, _ = tumor.mean(0)
@@ -81,12 +83,7 @@ def published_plan(located: Located, label: int, config: ResectionConfig) -> Met
 
 
 def _chosen_tumor(located: Located, config: ResectionConfig) -> tuple[int, float]:
-    """Label of the tumor to cut out, and its share outside the organ's hull.
-
-    Raises:
-        InputError: no such tumor.
-        NoPlan: nothing was located; the tumor lies wholly inside; too few points.
-    """
+    """Label of the tumor to cut out, and its share outside the organ's hull."""
     if len(located.of(ORGAN)) < _FEWEST:
         raise NoPlan("no organ was located, so nothing can be planned. Locate it first.")
     if not located.tumors:
@@ -110,10 +107,19 @@ def _chosen_tumor(located: Located, config: ResectionConfig) -> tuple[int, float
 
 
 def exophytic_shares(located: Located, labels: list[int]) -> dict[int, float]:
-    """How much of each tumor lies outside the convex hull of the organ without tumors."""
+    """How much of each tumor lies outside the convex hull of the organ without tumors.
+
+    Of a dense cloud the hull needs only the farthest point in each of many directions.
+    """
     organ = located.of(ORGAN)
+    organ = organ[:: 1 + len(organ) // _MOST]
+    n = np.arange(_DIRECTIONS)
+    z = 1 - (2 * n + 1) / _DIRECTIONS  # a Fibonacci sphere
+    turn, ring = n * np.pi * (3 - np.sqrt(5)), np.sqrt(1 - z * z)
+    directions = np.stack([ring * np.cos(turn), ring * np.sin(turn), z], axis=1)
+    farthest = (directions.astype(np.float32) @ organ.T.astype(np.float32)).argmax(axis=1)
     try:
-        hull = ConvexHull(_outermost(organ[:: 1 + len(organ) // _MOST]))
+        hull = ConvexHull(organ[np.unique(farthest)].astype(np.float64))
     except QhullError as error:
         raise NoPlan("the organ's points lie in a plane; locate it anew.") from error
     normals, offsets = np.split(hull.equations.astype(np.float32), [3], axis=1)
@@ -124,21 +130,8 @@ def exophytic_shares(located: Located, labels: list[int]) -> dict[int, float]:
     return shares
 
 
-def _outermost(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "m 3"]:
-    """The farthest point in each of many directions: what a hull needs of a dense cloud."""
-    n = np.arange(_DIRECTIONS)
-    z = 1 - (2 * n + 1) / _DIRECTIONS  # a Fibonacci sphere
-    turn = n * np.pi * (3 - np.sqrt(5))
-    ring = np.sqrt(1 - z * z)
-    directions = np.stack([ring * np.cos(turn), ring * np.sin(turn), z], axis=1)
-    farthest = (directions.astype(np.float32) @ points.T.astype(np.float32)).argmax(axis=1)
-    return points[np.unique(farthest)].astype(np.float64)
-
-
-def inside(
-    layers: tuple[CutLayer, ...], points_mm: Float[np.ndarray, "n 3"]
-) -> Bool[np.ndarray, " n"]:
-    """Which points lie in the piece that the layers make up."""
+def inside(layers: tuple[CutLayer, ...], points_mm: Float[np.ndarray, "n 3"]) -> np.ndarray:
+    """Which points lie in the piece that the layers make up (n,)."""
     found = np.zeros(len(points_mm), bool)
     for layer in layers:
         area = polygon_of(layer.rings_mm)
@@ -153,32 +146,32 @@ def inside(
     return found
 
 
-def _volumes_ml(located: Located, label: int, taken: Bool[np.ndarray, " n"]) -> dict[str, float]:
+def _volumes_ml(located: Located, label: int, taken: np.ndarray) -> dict[str, float]:
     """By counting points, which lie evenly in the organ."""
     kidney = located.meshes.get("kidney")
     organ_mm3 = _cloud_volume_mm3(located.points_mm) if kidney is None else kidney.volume_mm3
     organ_ml = organ_mm3 / 1000
     each_ml = organ_ml / len(located.points_mm)
     tumor, healthy = located.labels == label, located.labels < FIRST_TUMOR
-    return {
-        "organ": organ_ml,
-        "parenchyma": each_ml * float(healthy.sum()),
-        "tumor": each_ml * float(tumor.sum()),
-        "piece": each_ml * float((taken | tumor).sum()),
-        "healthy": each_ml * float((taken & healthy).sum()),
+    masks = {
+        "parenchyma": healthy,
+        "tumor": tumor,
+        "piece": taken | tumor,
+        "healthy": taken & healthy,
     }
+    return {"organ": organ_ml, **{k: each_ml * float(mask.sum()) for k, mask in masks.items()}}
 
 
-def _cloud_volume_mm3(points_mm: Float[np.ndarray, "n 3"]) -> float:
+def _cloud_volume_mm3(points_mm: np.ndarray) -> float:
     """Of a body evenly filled with points, without overhangs: the sum over columns of their area
     times the height that k points' span stands for, (k + 1) / (k - 1) of it."""
     flat = points_mm[:, :2] - points_mm[:, :2].min(0)
     side_mm = float(np.sqrt(_A_COLUMN * np.ptp(flat, axis=0).prod() / len(flat)))
     cell = (flat / side_mm).astype(int)
-    shape = cell.max(0) + 1
-    column = cell[:, 0] * shape[1] + cell[:, 1]
-    low, high = column_extremes(column, points_mm[:, 2], shape.prod())
-    count = np.bincount(column, minlength=len(low))
+    shape = tuple(cell.max(0) + 1)
+    low, high = column_extremes(cell, points_mm[:, 2], shape)
+    count = np.bincount(np.ravel_multi_index(tuple(cell.T), shape), minlength=low.size)
+    count = count.reshape(shape)
     some = count >= 2
     span = (high - low)[some] * (count[some] + 1) / (count[some] - 1)
     # A column at the edge is not full: it counts by how dense its points are.
@@ -187,7 +180,7 @@ def _cloud_volume_mm3(points_mm: Float[np.ndarray, "n 3"]) -> float:
     return float((span * area).sum() * side_mm**2)
 
 
-def _others(located: Located, label: int, taken: Bool[np.ndarray, " n"]) -> tuple[str, ...]:
+def _others(located: Located, label: int, taken: np.ndarray) -> tuple[str, ...]:
     """What becomes of other tumors; a cut through one is no plan."""
     notes = []
     for other in located.tumors:

@@ -1,4 +1,4 @@
-"""The values of planning: what was located, where to cut, and what comes away.
+"""The values of planning: what was asked for, what was located, where to cut, what comes away.
 
 All in the ``table`` frame, mm: z up against gravity, its origin on the table's top. The paper's
 'transverse plane' is the table's plane, its 'superior' is up and its 'posterior' is down.
@@ -7,22 +7,76 @@ All in the ``table`` frame, mm: z up against gravity, its origin on the table's 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from functools import cached_property
 from typing import Literal
 
 import numpy as np
 from jaxtyping import Float, Float64, UInt8
 
+from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError
 from tumortrack.core.types import FIRST_TUMOR, Mesh, part_names
 
 Method = Literal["published", "margin"]
+Direction = Literal["shortest", "clockwise", "anticlockwise"]
 StrokeKind = Literal["wall", "floor"]
 Rings = tuple[Float64[np.ndarray, "_ 2"], ...]
+_ALLOWED = {
+    "margin_mm": (1.0, 20.0),
+    "sigmas": (0.0, 10.0),
+    "spacing_mm": (0.2, 10.0),
+    "layer_mm": (1.0, 20.0),
+    "stroke_mm": (1.0, 30.0),
+    "lead_mm": (0.0, 30.0),
+    "least_exophytic": (0.0, 1.0),
+    "most_healthy": (0.0, 1.0),
+    "most_margin_mm": (20.0, 60.0),
+}
+
+
+class ResectionConfig(Config, frozen=True, kw_only=True):
+    """How a tumor is to be cut out.
+
+    Attributes:
+        method: published: the paper's two sweeps round the tumor's projection; margin: layers that
+            keep the margin in all directions.
+        tumor: its part's name (tumor_1, ...); empty: the one that lies farthest out.
+        margin_mm: least distance between tumor and cut (the paper's 5), to which ``sigmas``
+            standard deviations of the estimate's own uncertainty are added; with them it is
+            nowhere wider than ``most_margin_mm``.
+        spacing_mm: between points of a stroke.
+        layer_mm: height of a layer, where the method is ``margin``.
+        stroke_mm: width that one stroke of the horizontal instrument cuts.
+        order: of layers, from the top down or from the floor up.
+        direction: of strokes, seen from above; shortest: each from the end that is nearer to where
+            the one before ended.
+        lead_mm: strokes begin and end so far outside the organ.
+        least_exophytic: a tumor with a smaller share outside the organ's hull lies wholly inside.
+        most_healthy: the largest share of the organ's healthy tissue that a plan may take.
+    """
+
+    method: Method = "margin"
+    tumor: str = ""
+    margin_mm: float = 5.0
+    sigmas: float = 0.0
+    spacing_mm: float = 1.0
+    layer_mm: float = 4.0
+    stroke_mm: float = 6.0
+    order: Literal["down", "up"] = "down"
+    direction: Direction = "shortest"
+    lead_mm: float = 5.0
+    least_exophytic: float = 0.05
+    most_healthy: float = 0.5
+    most_margin_mm: float = 20.0
+
+    def __post_init__(self) -> None:
+        for name, (low, high) in _ALLOWED.items():
+            value = getattr(self, name)
+            if not low <= value <= high:
+                raise InputError(f"{name} is {value:g}; allowed: {low:g} to {high:g}.")
 
 
 def name_of(label: int) -> str:
-    """The part's name: 1 is kidney, 2 is tumor_1."""
+    """1 is kidney, 2 is tumor_1."""
     return part_names(label)[label - 1]
 
 
@@ -44,18 +98,13 @@ class Located:
     stamp_ns: int = 0
 
     def of(self, label: int) -> Float[np.ndarray, "m 3"]:
-        """The points with this label."""
-        return self._by_label.get(label, self.points_mm[:0])
+        return self.points_mm[self.labels == label]
 
     @property
     def tumors(self) -> tuple[int, ...]:
         """Labels of the tumors that were found."""
-        return tuple(label for label in self._by_label if label >= FIRST_TUMOR)
-
-    @cached_property
-    def _by_label(self) -> dict[int, Float[np.ndarray, "m 3"]]:
-        labels = np.flatnonzero(np.bincount(self.labels))
-        return {int(label): self.points_mm[self.labels == label] for label in labels}
+        found = np.flatnonzero(np.bincount(self.labels)).tolist()
+        return tuple(label for label in found if label >= FIRST_TUMOR)
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,22 +128,18 @@ class CutLayer:
 class Cut:
     """One stroke of the instrument's tip, which is held horizontally.
 
-    Attributes:
-        sweep: which sweep it belongs to, from 1.
-        path_mm: of the tip (n, 3), evenly spaced, all at one height, in the order of motion; of a
-            closed stroke the first point is repeated at the end.
-        kind: wall: along the outline of a layer; floor: the sheet below the piece.
+    ``sweep``: the one it belongs to, from 1. ``path_mm``: of the tip, evenly spaced, all at one
+    height, in the order of motion; of a closed stroke the first point is repeated at the end.
+    ``kind``: wall: along the outline of a layer; floor: the sheet below the piece.
     """
 
     sweep: int
-    path_mm: Float64[np.ndarray, "n 3"]
+    path_mm: Float64[np.ndarray, "_ 3"]
     kind: StrokeKind = "wall"
 
     @classmethod
-    def level(
-        cls, sweep: int, flat: Float64[np.ndarray, "n 2"], height: float, kind: StrokeKind = "wall"
-    ) -> Cut:
-        """From its x and y, and its height, mm."""
+    def level(cls, sweep: int, flat: np.ndarray, height: float, kind: StrokeKind = "wall") -> Cut:
+        """From its x and y (n, 2), and its height, mm."""
         return cls(sweep, np.column_stack([flat, np.full(len(flat), height)]), kind)
 
     @property
@@ -141,7 +186,6 @@ class ResectionPlan:
 
     @property
     def sweeps(self) -> int:
-        """How many sweeps there are."""
         return max(cut.sweep for cut in self.cuts)
 
 

@@ -4,35 +4,35 @@ from __future__ import annotations
 
 import io
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+import trimesh
 from jaxtyping import Bool, Float
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.collections import LineCollection
+from matplotlib.figure import Figure
+from trimesh.intersections import mesh_plane
 
 from tumortrack.core import colours
 from tumortrack.core.store import write_atomically
 from tumortrack.core.types import Mesh
 from tumortrack.imaging.raster import voxelise
-from tumortrack.report.renderer import RGB, Frame, ParallelView, rgb
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
+from tumortrack.report.renderer import RGB, Body, Frame, ParallelView, rgb
 
 KIDNEY = rgb(colours.KIDNEY)
 ESTIMATED = (230 / 255, 140 / 255, 0.0)
 TRUE = (0.0, 90 / 255, 160 / 255)
 OBSERVED = (0.25, 0.25, 0.25)
+CENTRED: dict[str, Any] = {"ha": "center", "va": "center"}
 
 
-def new_figure(width_in: float, height_in: float) -> Figure:
-    """A figure without display or global state."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
+def new_figure(width_in: float, height_in: float, **borders: float) -> Figure:
+    """A figure without display or global state; ``borders`` as in ``subplots_adjust``."""
     figure = Figure(figsize=(width_in, height_in), dpi=100, facecolor="white")
     FigureCanvasAgg(figure)
-    figure.subplots_adjust(left=0.02, right=0.98, top=0.9, bottom=0.03)
+    figure.subplots_adjust(**{"left": 0.02, "right": 0.98, "top": 0.9, "bottom": 0.03} | borders)
     return figure
 
 
@@ -59,16 +59,9 @@ def section(
     mesh: Mesh, view: ParallelView, through_mm: Float[np.ndarray, " 3"]
 ) -> Float[np.ndarray, "n 2 2"]:
     """Outline of a mesh in the view's plane through a point: segments as (right, down) mm."""
-    flat = view.project(mesh.vertices_mm)
-    side = flat[:, 2] - view.project(through_mm[None])[0, 2]
-    side = np.where(side == 0, 1e-9, side)  # no corner lies in the plane: always two crossings
-    up = side[mesh.faces] > 0
-    cut = mesh.faces[up.any(1) & ~up.all(1)]
-    start, end = cut, np.roll(cut, -1, axis=1)  # (face, edge)
-    gap = np.where(side[start] * side[end] < 0, side[start] - side[end], np.nan)
-    share = (side[start] / gap)[..., None]
-    ends = flat[start, :2] + share * (flat[end, :2] - flat[start, :2])
-    return ends[~np.isnan(gap)].reshape(-1, 2, 2)
+    solid = trimesh.Trimesh(mesh.vertices_mm, mesh.faces, process=False)
+    ends_mm = mesh_plane(solid, view.axes[2], through_mm)
+    return view.project(ends_mm.reshape(-1, 3))[:, :2].reshape(-1, 2, 2)
 
 
 def section_mask(
@@ -80,6 +73,12 @@ def section_mask(
     data_from_index[:3, :3] = axes * [y[1] - y[0], x[1] - x[0], 1.0]
     data_from_index[:3, 3] = axes @ [y[0], x[0], view.project(through_mm[None])[0, 2]]
     return voxelise(mesh, data_from_index, (len(y), len(x), 1))[:, :, 0]
+
+
+def show_bodies(axes: Axes, view: ParallelView, bodies: list[Body], frame: Frame) -> None:
+    """Draw shaded bodies on white."""
+    picture = view.draw(bodies, frame)
+    axes.imshow(picture, extent=frame.extent, zorder=2, interpolation="bilinear")
 
 
 def outline(
@@ -94,16 +93,12 @@ def outline(
 
 def draw_lines(axes: Axes, segments: Float[np.ndarray, "n 2 2"], **style: Any) -> None:
     """Draw a section's segments as one collection."""
-    from matplotlib.collections import LineCollection
-
     axes.add_collection(LineCollection(list(segments), capstyle="round", **style))
 
 
 def tint(axes: Axes, mask: Bool[np.ndarray, "h w"], frame: Frame, color: RGB) -> None:
     """Lay a translucent colour over the mask."""
-    picture = np.empty((*mask.shape, 4))
-    picture[...] = (*color, 0.0)
-    picture[mask, 3] = 0.25
+    picture = np.where(mask[..., None], (*color, 0.25), (*color, 0.0))
     axes.imshow(picture, extent=frame.extent, zorder=1)
 
 
@@ -113,34 +108,25 @@ def finish_view(
     arrows: dict[str, tuple[float, float]] | None = None,
     background: str = "white",
 ) -> None:
-    """Axes in mm, down pointing down, equal scales, without ticks; a scale bar in the lower left
-    corner. ``arrows`` name the frame's axes by letter and direction (right, down)."""
+    """Axes in mm, down pointing down, equal scales, without ticks; a scale bar of a round length
+    in the lower left corner. ``arrows``, in the upper left one, name the frame's axes by letter
+    and direction (right, down)."""
     axes.set(xlim=(frame.left, frame.right), ylim=(frame.bottom, frame.top), aspect="equal")
     axes.set(xticks=[], yticks=[], facecolor=background)
     for spine in axes.spines.values():
         spine.set_color("0.8")
-    _scale_bar(axes, frame, "black" if background == "white" else "white")
-    if arrows:
-        _axis_arrows(axes, frame, arrows)
-
-
-def _scale_bar(axes: Axes, frame: Frame, color: str) -> None:
-    """Of a round length in mm."""
     width, height = frame.right - frame.left, frame.bottom - frame.top
     length = max(n for n in (1, 2, 5, 10, 20, 50, 100) if n <= max(0.3 * width, 1))
     x, y = frame.left + 0.05 * width, frame.bottom - 0.05 * height
+    color = "black" if background == "white" else "white"
     axes.plot([x, x + length], [y, y], color=color, linewidth=3, solid_capstyle="butt")
     style: dict[str, Any] = {"color": color, "ha": "center", "va": "bottom", "fontsize": 9}
     axes.text(x + length / 2, y - 0.015 * height, f"{length} mm", **style)
-
-
-def _axis_arrows(axes: Axes, frame: Frame, arrows: dict[str, tuple[float, float]]) -> None:
-    """In the upper left corner; those that point up begin lower."""
-    span = 0.07 * min(frame.right - frame.left, frame.bottom - frame.top)
-    rises = any(down < 0 for _, down in arrows.values())
+    span, ways = 0.07 * min(width, height), arrows or {}
+    rises = any(down < 0 for _, down in ways.values())  # those that point up begin lower
     x, y = frame.left + 0.6 * span, frame.top + (2.1 if rises else 0.6) * span
     arrow = {"arrowstyle": "->", "color": "0.35", "shrinkA": 0, "shrinkB": 0}
-    style: dict[str, Any] = {"color": "0.35", "fontsize": 8, "ha": "center", "va": "center"}
-    for letter, (right, down) in arrows.items():
+    for letter, (right, down) in ways.items():
         axes.annotate("", (x + right * span, y + down * span), (x, y), arrowprops=arrow)
-        axes.text(x + 1.5 * right * span, y + 1.5 * down * span, letter, **style)
+        spot = x + 1.5 * right * span, y + 1.5 * down * span
+        axes.text(*spot, letter, color="0.35", fontsize=8, **CENTRED)

@@ -9,10 +9,11 @@ import io
 from collections.abc import Callable, Iterable, Iterator
 from itertools import groupby, pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+import matplotlib
 import numpy as np
 from jaxtyping import Float, Float64, UInt8
+from PIL import Image, ImageDraw, ImageFont
 
 from tumortrack.core.colours import BACKGROUND, NONE, part_colour
 from tumortrack.core.errors import InputError
@@ -22,12 +23,10 @@ from tumortrack.core.types import ORGAN, Mesh
 from tumortrack.live.values import Polyline, Workcell
 from tumortrack.plan.motions import Motions
 from tumortrack.plan.values import Located
-from tumortrack.report.organ_surfaces import organ_surfaces
+from tumortrack.report.plan_pictures import organ_surfaces
 from tumortrack.report.renderer import Body, Viewpoint, render, rgb
 
-if TYPE_CHECKING:
-    from PIL import Image, ImageDraw, ImageFont
-
+FPS = 10  # a GIF counts hundredths of a second
 _FROM = np.array([-0.36, -0.8, 0.48])  # where the viewer is: to the left, in front, above
 _CLOSE_FROM = np.array([-0.36, -0.72, 0.6])
 _AWAY = 2.6  # the viewer's distance in radii of what is seen: a natural perspective
@@ -43,16 +42,14 @@ _SAMPLES = 8  # frames from which the colours are chosen
 _LOOKED_AT, _EVERY = 40, 3  # frames, and every which vertex, that the viewpoint is chosen from
 _LEAST_FRAMES = 2  # of a stage
 _LAST_S = 1.5  # the last picture stays
-_FASTEST, _SMALLEST = 50, 160
 
 
 def film(
     frames: Iterable[Workcell],
     located: Located,
     path: Path,
-    fps: int = 10,
     size: tuple[int, int] = (640, 480),
-    progress: Callable[[int, int], None] | None = None,
+    progress: Callable[[], None] = lambda: None,
 ) -> None:
     """Write the frames as an animated GIF that begins again when it has ended.
 
@@ -61,33 +58,31 @@ def film(
     bytes; frames that look the same are one that lasts longer.
 
     Args:
-        frames: of the table frame, evenly spaced in time.
-        located: organ and tumors, table frame, mm.
+        frames, located: table frame, mm; ``FPS`` frames a second.
         path: ``.gif``, written atomically.
-        fps: frames a second, up to 50.
-        size: width and height in pixels.
-        progress: called with frames done and frames in all.
+        progress: called after each frame.
 
     Raises:
-        InputError: no frame, or another kind of file, speed or size.
+        InputError: no frame, nothing in them, or another kind of file.
         StorageError: the disk refused.
     """
-    from PIL import Image
-
-    cells = list(frames)
-    _check(cells, path, fps, size)
+    if path.suffix.lower() != ".gif":
+        raise InputError(f"{path}: a film is an animated GIF; give a name that ends in .gif.")
+    if not (cells := list(frames)):
+        raise InputError("there is no frame to film: the arms did nothing.")
     painter = _FramePainter(cells, located, size)
     chosen = np.linspace(0, len(cells) - 1, min(_SAMPLES, len(cells))).astype(int).tolist()
-    palette = _palette([painter.picture(n) for n in chosen])
+    some = [np.asarray(painter.picture(n))[::2, ::2] for n in chosen]
+    sheet, plain = Image.fromarray(np.concatenate(some)), Image.Dither.NONE
+    palette = sheet.quantize(_COLOURS, Image.Quantize.MEDIANCUT, kmeans=2, dither=plain)
 
     def indexed() -> Iterator[Image.Image]:
         for n in range(len(cells)):
-            yield painter.picture(n).quantize(palette=palette, dither=Image.Dither.NONE)
-            if progress is not None:
-                progress(n + 1, len(cells))
+            yield painter.picture(n).quantize(palette=palette, dither=plain)
+            progress()
 
     pictures = indexed()
-    each_ms = round(100 / fps) * 10  # a GIF counts hundredths of a second
+    each_ms = round(1000 / FPS)
     buffer = io.BytesIO()
     next(pictures).save(
         buffer,
@@ -117,20 +112,6 @@ def moments_s(motions: Motions, frames: int) -> Float64[np.ndarray, " n"]:
     return np.append(np.concatenate(each), seconds.sum())
 
 
-def _check(frames: list[Workcell], path: Path, fps: int, size: tuple[int, int]) -> None:
-    if path.suffix.lower() != ".gif":
-        raise InputError(f"{path}: a film is an animated GIF; give a name that ends in .gif.")
-    if not 1 <= fps <= _FASTEST:
-        raise InputError(f"{fps} frames a second are not possible; allowed: 1 to {_FASTEST}.")
-    if min(size) < _SMALLEST or max(size) > 10 * _SMALLEST:
-        raise InputError(
-            f"a film of {size[0]} x {size[1]} pixels is not possible; allowed: {_SMALLEST} to "
-            f"{10 * _SMALLEST} each way."
-        )
-    if not frames:
-        raise InputError("there is no frame to film: the arms did nothing.")
-
-
 class _FramePainter:
     """Draws frame by frame; viewpoints, organ and letters stay the same."""
 
@@ -142,16 +123,20 @@ class _FramePainter:
         ]
         self._close_size = round(_CLOSE[0] * size[0]), round(_CLOSE[1] * size[1])
         self._far = _viewpoint_of(_reach(frames), _FROM, size, _ARMS)
-        self._near = _close_viewpoint(self._organ[0].mesh, self._close_size)
-        flat = self._far.project(self._organ[0].mesh.vertices_mm, size)[:, :2]
+        organ_mm = self._organ[0].mesh.vertices_mm
+        radius = float(np.linalg.norm(organ_mm - self._organ[0].mesh.box_mm.mean(0), axis=1).max())
+        near = _viewpoint_of(organ_mm, _CLOSE_FROM, self._close_size)
+        target = near.place_mm + near.distance_mm * near.axes[2]
+        place, before_mm = target + 10 * (near.place_mm - target), radius + _CLOSE_MM
+        self._near = Viewpoint.towards(target, place, near.width_mm, True, before_mm)
+        flat = self._far.project(organ_mm, size)[:, :2]
         self._spot = (*(flat.min(0) - 4).round().tolist(), *(flat.max(0) + 4).round().tolist())
-        self._letters = _letters(size[1] // 20), _letters(size[1] // 34)
+        font = f"{matplotlib.get_data_path()}/fonts/ttf/DejaVuSans.ttf"
+        self._letters = [ImageFont.truetype(font, size[1] // share) for share in (20, 34)]
         self._tubes: dict[tuple[int, float], tuple[Polyline, Mesh]] = {}
 
     def picture(self, n: int) -> Image.Image:
         """Frame n, in full colour."""
-        from PIL import Image, ImageDraw
-
         cell = self._frames[n]
         out = Image.fromarray(self._seen(cell, self._far, self._size))
         close = Image.fromarray(self._seen(cell, self._near, self._close_size))
@@ -161,7 +146,11 @@ class _FramePainter:
         draw = ImageDraw.Draw(out)
         draw.rectangle(self._spot, outline=_FRAME)  # what is shown from near
         draw.rectangle((left - 1, top - 1, left + close.width, top + close.height), outline=_FRAME)
-        self._say(draw, n)
+        large, small = self._letters
+        draw.text((12, 10), cell.state, fill=BACKGROUND, font=large)
+        if cell.halted:
+            draw.text((12, 18 + large.size), f"halted: {cell.halted}", fill=NONE, font=small)
+        self._draw_progress(draw, n)
         return out
 
     def _seen(
@@ -175,8 +164,7 @@ class _FramePainter:
         least_mm = _LEAST_PIXELS * viewpoint.width_mm / size[0]
         lines = [
             Body(self._tube(line, max(line.width_mm, least_mm)), rgb(line.colour))
-            for line in cell.lines
-            if len(line.points_mm) > 1
+            for line in cell.drawn_lines
         ]
         return render(shapes + lines + self._organ, viewpoint, size, _BACKDROP)
 
@@ -186,14 +174,9 @@ class _FramePainter:
             self._tubes[key] = line, tube(line.points_mm, width_mm / 2)
         return self._tubes[key][1]
 
-    def _say(self, draw: ImageDraw.ImageDraw, n: int) -> None:
-        """The state, why the arms stand still, and how far the procedure is."""
-        cell = self._frames[n]
-        large, small = self._letters
-        draw.text((12, 10), cell.state, fill=BACKGROUND, font=large)
-        if cell.halted:
-            draw.text((12, 18 + large.size), f"halted: {cell.halted}", fill=NONE, font=small)
-        width, height = self._size
+    def _draw_progress(self, draw: ImageDraw.ImageDraw, n: int) -> None:
+        """A bar of all states, filled as far as the procedure is; red where the arms stand."""
+        cell, (width, height) = self._frames[n], self._size
         done = 0
         for state, group in groupby(self._frames, lambda one: one.state):
             first, done = done, done + len(list(group))
@@ -203,13 +186,6 @@ class _FramePainter:
             if n >= first:
                 colour = NONE if cell.halted and state == cell.state else (60, 110, 190)
                 draw.rectangle((x[0], box[0], max(x[1] - 2, x[0]), box[1]), fill=colour)
-
-
-def _letters(pixels: int) -> ImageFont.FreeTypeFont:
-    import matplotlib
-    from PIL import ImageFont
-
-    return ImageFont.truetype(f"{matplotlib.get_data_path()}/fonts/ttf/DejaVuSans.ttf", pixels)
 
 
 def _reach(frames: list[Workcell]) -> Float[np.ndarray, "n 3"]:
@@ -231,8 +207,7 @@ def _viewpoint_of(
     size: tuple[int, int],
     share: tuple[float, float] = (0.9, 0.9),
 ) -> Viewpoint:
-    """The one in this direction that shows all points as large as they can be in the uppermost
-    ``share`` of the picture."""
+    """In this direction, all points as large as can be in the picture's uppermost ``share``."""
     target = (points_mm.min(0) + points_mm.max(0)) / 2
     radius = float(np.linalg.norm(points_mm - target, axis=1).max())
     away = _AWAY * radius * direction / np.linalg.norm(direction)
@@ -247,22 +222,6 @@ def _viewpoint_of(
         width = viewpoint.width_mm * float(((high - low) / room).max())
         viewpoint = Viewpoint.towards(target, target + away, width)
     return viewpoint
-
-
-def _close_viewpoint(organ: Mesh, size: tuple[int, int]) -> Viewpoint:
-    near = _viewpoint_of(organ.vertices_mm, _CLOSE_FROM, size)
-    target = near.place_mm + near.distance_mm * near.axes[2]
-    radius = float(np.linalg.norm(organ.vertices_mm - organ.box_mm.mean(0), axis=1).max())
-    place, before_mm = target + 10 * (near.place_mm - target), radius + _CLOSE_MM
-    return Viewpoint.towards(target, place, near.width_mm, parallel=True, before_mm=before_mm)
-
-
-def _palette(pictures: list[Image.Image]) -> Image.Image:
-    """An image of the colours that suit these pictures."""
-    from PIL import Image
-
-    sheet = Image.fromarray(np.concatenate([np.asarray(one)[::2, ::2] for one in pictures]))
-    return sheet.quantize(_COLOURS, Image.Quantize.MEDIANCUT, kmeans=2, dither=Image.Dither.NONE)
 
 
 def tube(points_mm: Float[np.ndarray, "n 3"], radius_mm: float, sides: int = 6) -> Mesh:
@@ -281,11 +240,10 @@ def tube(points_mm: Float[np.ndarray, "n 3"], radius_mm: float, sides: int = 6) 
     turn = 2 * np.pi * np.arange(sides) / sides
     ring = np.cos(turn)[None, :, None] * a[:, None] + np.sin(turn)[None, :, None] * b[:, None]
     vertices = (points_mm[:, None] + radius_mm * ring).reshape(-1, 3)
-    n = len(points_mm)
-    first = sides * np.arange(n - 1)[:, None] + np.arange(sides)
-    next_ = sides * np.arange(n - 1)[:, None] + (np.arange(sides) + 1) % sides
+    start, corner = sides * np.arange(len(points_mm) - 1)[:, None], np.arange(sides)
+    first, next_ = start + corner, start + (corner + 1) % sides
     low = np.stack([first, next_, next_ + sides], -1).reshape(-1, 3)
     high = np.stack([first, next_ + sides, first + sides], -1).reshape(-1, 3)
-    fan = np.stack([np.zeros(sides - 2), np.arange(1, sides - 1), np.arange(2, sides)], -1)
-    ends = [fan[:, ::-1], fan + sides * (n - 1)]
+    fan = np.stack([np.zeros(sides - 2), corner[1:-1], corner[2:]], -1)
+    ends = [fan[:, ::-1], fan + sides * (len(points_mm) - 1)]
     return Mesh(vertices, np.concatenate([low, high, *ends]).astype(np.int32))

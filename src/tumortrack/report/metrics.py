@@ -11,13 +11,14 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Int
+from scipy.spatial import cKDTree
 
 from tumortrack.core.errors import InputError
 from tumortrack.core.estimate import Motion
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.types import Anatomy, CameraLabels, Mesh
 from tumortrack.imaging.raster import expand, label_grid
-from tumortrack.simulate.targets import Targets
+from tumortrack.simulate.scene_folder import Targets
 
 # Vertices are sampled too, so the maximum misses at most s^2 / (8 R) where a flat piece of size s
 # lies over a surface of radius R: 0.025 mm at R = 5 mm.
@@ -109,10 +110,8 @@ def surface_distances(
         raise InputError("surface distances need two surfaces with triangles; one is empty.")
     points_out, weights_out, _ = surface_samples(estimate, spacing_mm)
     points_back, weights_back, _ = surface_samples(reference, spacing_mm)
-    out, back = (
-        distance_to_surface(points_out, reference),
-        distance_to_surface(points_back, estimate),
-    )
+    out = distance_to_surface(points_out, reference)
+    back = distance_to_surface(points_back, estimate)
     return SurfaceDistances(
         hausdorff_mm=float(max(out.max(), back.max())),
         hausdorff_one_sided_mm=float(out.max()),
@@ -133,8 +132,6 @@ def distance_to_surface(
 
     Against all triangles this errs by less than 0.01 mm (tested), always upwards.
     """
-    from scipy.spatial import cKDTree
-
     seeds, area, seed_face = surface_samples(target, _SEED_SPACING_MM)
     middle = area > 0
     count = min(_NEIGHBOURS, int(middle.sum()))

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float
+from PIL import Image
 
 from tumortrack.core.estimate import Estimate
 from tumortrack.core.store import write_atomically
@@ -42,30 +43,27 @@ def page_scene(name: str, scene: Scene, estimate: Estimate | None, picture: Path
     for part, mesh in zip(scene.reference.names, scene.reference.parts, strict=True):
         kind = "truth" if part == "kidney" else "wire"
         layers.append(_layer(kind, f"{part} (truth)", part, mesh))
-    return {"name": name, "layers": layers, "picture": _webp(picture)}
+    webp = io.BytesIO()
+    with Image.open(picture) as image:
+        image.convert("RGB").save(webp, "WEBP", quality=82)
+    return {"name": name, "layers": layers, "picture": _base64(webp.getvalue())}
 
 
 def write_page(report: dict[str, Any], scenes: list[dict[str, Any]], path: Path) -> None:
-    """Write the page; it holds plotly itself and loads nothing from anywhere.
+    """Write the page, atomically; it holds plotly itself and loads nothing from anywhere.
 
-    Args:
-        report: as ``evaluate_scenes`` returns it.
-        scenes: of ``page_scene``, in the order of the report's.
-        path: HTML file to write, atomically.
-
-    Raises:
-        StorageError: the disk refused.
+    ``report``: as ``evaluate_scenes`` returns it; ``scenes``: of ``page_scene``, in its order.
     """
     from plotly.offline import get_plotlyjs
 
     data = [
-        {**scene, "rows": _scene_table(entry), "note": html.escape(_note(entry))}
+        {**scene, "rows": _table(entry["parts"]), "note": html.escape(_note(entry))}
         for entry, scene in zip(report["scenes"], scenes, strict=True)
     ]
     embedded = json.dumps(data, allow_nan=False).replace("</", "<\\/")
     # The texts that are long or hold braces go in by position, never through a formatter.
     page = resources.files("tumortrack.report").joinpath("page.html").read_text("utf-8")
-    page = page.replace("@SUMMARY@", _summary_table(report["summary"]))
+    page = page.replace("@SUMMARY@", _table(part_rows(report["summary"])))
     page = page.replace("@COUNTS@", html.escape(_counts(report["summary"])))
     page = page.replace("@RULE@", html.escape(report["rule"]))
     head, script = page.split("@PLOTLY@")
@@ -93,24 +91,18 @@ def thinned(mesh: Mesh, cell_mm: float) -> Mesh:
 
 def _layer(kind: str, name: str, part: str, mesh: Mesh) -> dict[str, Any]:
     small = thinned(mesh, _KIDNEY_CELL_MM if part == "kidney" else _TUMOR_CELL_MM)
-    faces = base64.b64encode(small.faces.astype("<u4").tobytes()).decode()
     about = {"kind": kind, "part": part, "name": name.replace("_", " ")}
+    faces = _base64(small.faces.astype("<u4").tobytes())
     return {**about, "v": _packed(small.vertices_mm), "f": faces}
 
 
 def _packed(points_mm: Float[np.ndarray, "n 3"]) -> str:
     """Little-endian float32, rounded to 0.01 mm, in base64."""
-    return base64.b64encode(np.round(points_mm, 2).astype("<f4").tobytes()).decode()
+    return _base64(np.round(points_mm, 2).astype("<f4").tobytes())
 
 
-def _webp(picture: Path) -> str:
-    """In base64."""
-    from PIL import Image  # matplotlib brings it
-
-    buffer = io.BytesIO()
-    with Image.open(picture) as image:
-        image.convert("RGB").save(buffer, "WEBP", quality=82)
-    return base64.b64encode(buffer.getvalue()).decode()
+def _base64(content: bytes) -> str:
+    return base64.b64encode(content).decode()
 
 
 def _counts(summary: dict[str, Any]) -> str:
@@ -146,24 +138,16 @@ def part_rows(summary: dict[str, Any]) -> dict[str, dict[str, Any]]:
     return {k: row for k, row in summary.items() if isinstance(row, dict) and "found" in row}
 
 
-def _summary_table(summary: dict[str, Any]) -> str:
-    parts = part_rows(summary)
-    found = {name: f"{part['found']}/{part['scenes']}" for name, part in parts.items()}
-    return _table(parts, found)
-
-
-def _scene_table(entry: dict[str, Any]) -> str:
-    parts = entry["parts"]
-    return _table(parts, {name: "yes" if part["found"] else "no" for name, part in parts.items()})
-
-
-def _table(parts: dict[str, dict[str, Any]], found: dict[str, str]) -> str:
+def _table(parts: dict[str, dict[str, Any]]) -> str:
+    """Of a scene's parts, or the summary's."""
     head = "".join(f"<th>{title}</th>" for title in ("part", "found", *_COLUMNS.values()))
     rows = []
     for name, part in parts.items():
+        found = "yes" if part["found"] else "no"
+        found = f"{part['found']}/{part['scenes']}" if "scenes" in part else found
         cells = "".join(f"<td>{number(part.get(key))}</td>" for key in _COLUMNS)
         label = html.escape(name.replace("_", " "))
-        rows.append(f"<tr><th>{label}</th><td>{found[name]}</td>{cells}</tr>")
+        rows.append(f"<tr><th>{label}</th><td>{found}</td>{cells}</tr>")
     return f"<table><thead><tr>{head}</tr></thead><tbody>{''.join(rows)}</tbody></table>"
 
 

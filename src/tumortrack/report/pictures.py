@@ -1,4 +1,4 @@
-"""Pictures that a surgeon can read: the estimate over the truth, here; a case, in ``qc``.
+"""Pictures that a surgeon can read: the estimate over the truth, and a prepared case.
 
 Orange is what was estimated, blue is the truth (a pair that every colour vision tells apart).
 Nothing needs a display.
@@ -8,34 +8,21 @@ from __future__ import annotations
 
 import textwrap
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from jaxtyping import Float, Shaped
+from matplotlib.axes import Axes
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
 
 from tumortrack.core.estimate import Estimate
-from tumortrack.report.drawing import (
-    ESTIMATED,
-    KIDNEY,
-    OBSERVED,
-    TRUE,
-    draw_lines,
-    finish_view,
-    new_figure,
-    outline,
-    save,
-    section,
-    section_mask,
-    show_legend,
-    tint,
-)
-from tumortrack.report.qc import qc_picture
-from tumortrack.report.renderer import Body, ParallelView
+from tumortrack.core.geometry import DIRECTIONS_LPS, transform_points
+from tumortrack.core.types import Anatomy, LabelVolume, Mesh, Volume
+from tumortrack.report import drawing
+from tumortrack.report.drawing import CENTRED, ESTIMATED, KIDNEY, OBSERVED, TRUE
+from tumortrack.report.renderer import RGB, Body, Frame, ParallelView
 from tumortrack.simulate.scene_folder import Scene
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
-__all__ = ["qc_picture", "scene_picture"]
 
 FROM_CAMERA = ParallelView("seen from the camera", (1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
 FROM_SIDE = ParallelView("seen from the side, camera above", (1.0, 0.0, 0.0), (0.0, 0.0, 1.0))
@@ -44,110 +31,234 @@ _CAMERA_AXES = {
     FROM_SIDE: {"x": (1.0, 0.0), "z": (0.0, 1.0)},
 }
 _SLICES = {FROM_CAMERA: "across the view", FROM_SIDE: "along the view"}
+# A case's slices in LPS. Radiological convention: the patient's right is on the picture's left
+# (axial seen from the feet, coronal from the front); sagittal with anterior on the left.
+PLANES = (
+    ParallelView("axial", (1.0, 0.0, 0.0), (0.0, 1.0, 0.0)),
+    ParallelView("coronal", (1.0, 0.0, 0.0), (0.0, 0.0, -1.0)),
+    ParallelView("sagittal", (0.0, 1.0, 0.0), (0.0, 0.0, -1.0)),
+)
+# On grey, apart in every colour vision: organ light orange, tumors yellow, sky blue, green, purple.
+_ORGAN_LINE = (1.0, 0.62, 0.45)
+_TUMOR_COLORS = ((0.97, 0.88, 0.22), (0.34, 0.71, 0.91), (0.56, 0.93, 0.56), (0.85, 0.55, 0.75))
+_SOFT_TISSUE_HU = (-160.0, 240.0)
+_MARGIN_MM, _ASPECT = 18.0, 1.22
+_MOST_ROWS = 6  # tumors with slices of their own
+_NEAR_BORDER = {
+    **{"left": (0.025, 0.5), "right": (0.975, 0.5)},
+    **{"top": (0.5, 0.965), "bottom": (0.5, 0.035)},
+}
 
 
 def scene_picture(
     scene: Scene, estimate: Estimate | None, entry: dict[str, Any], path: Path
 ) -> None:
-    """Estimate over truth: two 3-D views, and two slices through each true tumor's centre.
+    """Estimate over truth: two 3-D views, and two slices through each true tumor's centre; a PNG,
+    written atomically.
 
-    Args:
-        scene: truth and observed cloud, camera frame.
-        estimate: None where nothing was found; then the truth is shown alone.
-        entry: this scene's entry of the report (name, parts, miou, failed), for the titles.
-        path: PNG to write, atomically.
+    Where nothing was found (None) the truth is shown alone. ``entry``: of the scene in the report.
     """
+    shown = estimate.meshes if estimate else {}
     slices = [(name, view) for name in scene.reference.names[1:] for view in _SLICES]
     rows = -(-len(slices) // 4)
     height_in = 5.1 + 4.05 * rows
-    figure = new_figure(14.0, height_in)
-    figure.subplots_adjust(top=1 - 0.85 / height_in, bottom=0.15 / height_in)
+    top, bottom = 1 - 0.85 / height_in, 0.15 / height_in
+    figure = drawing.new_figure(14.0, height_in, top=top, bottom=bottom)
     outer = figure.add_gridspec(2, 1, height_ratios=[4.1, 3.95 * max(rows, 0.01)], hspace=0.13)
-    top = outer[0].subgridspec(1, 2, wspace=0.04)
+    above = outer[0].subgridspec(1, 2, wspace=0.04)
     for column, view in enumerate(_SLICES):
-        draw_solid_view(figure.add_subplot(top[column]), scene, estimate, view)
+        draw_solid_view(figure.add_subplot(above[column]), scene, estimate, view)
     below = outer[1].subgridspec(max(rows, 1), 4, wspace=0.06, hspace=0.2)
     for n, (name, view) in enumerate(slices):
         axes = figure.add_subplot(below[n // 4, n % 4])
-        _draw_slice(axes, scene, estimate, name, view)
+        _draw_slice(axes, scene, shown, name, view)
         what = f"{name.replace('_', ' ')}: {_SLICES[view]}"
-        axes.set_title(f"{what}\n{_distances(entry, name)}", fontsize=9.5)
-    figure.suptitle(_headline(entry), x=0.02, ha="left", fontsize=13, fontweight="bold")
-    show_legend(figure, scene_legend(), 4, (0.985, 0.995))
-    save(figure, path)
+        part = entry["parts"][name]
+        found = (
+            f"Hausdorff {part['hausdorff_mm']:.1f} mm, centre {part['center_mm']:.1f} mm, "
+            f"IoU {part['iou']:.2f}"
+            if part["found"]
+            else "not found"
+        )
+        axes.set_title(f"{what}\n{found}", fontsize=9.5)
+    failed = "" if entry["failed"] is None else f"   {textwrap.shorten(entry['failed'], 60)}"
+    errors = entry.get("tre_mm")
+    targets = f"   target error {errors['mean']:.1f} mm" if errors else ""
+    headline = f"{entry['name']}   mIoU {entry['miou']:.2f}{targets}{failed}"
+    figure.suptitle(headline, x=0.02, ha="left", fontsize=13, fontweight="bold")
+    drawing.show_legend(figure, scene_legend(), 4, (0.985, 0.995))
+    drawing.save(figure, path)
 
 
 def draw_solid_view(
     axes: Axes, scene: Scene, estimate: Estimate | None, view: ParallelView
 ) -> None:
     """The estimate's surfaces, the truth's outlines and the observed points."""
-    shown = estimate.meshes if estimate else {}
-    everything = [*scene.reference.parts, *shown.values()]
-    frame = view.frame_around(np.concatenate([m.vertices_mm for m in everything]), 6.0)
-    frame = frame.widened(1.7)
-    bodies = [Body(mesh, ESTIMATED) for name, mesh in shown.items() if name != "kidney"]
-    if "kidney" in shown:
-        bodies.append(Body(shown["kidney"], KIDNEY, 0.36))
-    picture = view.draw(bodies, frame)
-    axes.imshow(picture, extent=frame.extent, zorder=2, interpolation="bilinear")
+    shown = dict(estimate.meshes) if estimate else {}
+    everything = [mesh.vertices_mm for mesh in (*scene.reference.parts, *shown.values())]
+    frame = view.frame_around(np.concatenate(everything), 6.0).widened(1.7)
+    kidney = [Body(shown.pop("kidney"), KIDNEY, 0.36)] if "kidney" in shown else []
+    tumors = [Body(mesh, ESTIMATED) for mesh in shown.values()]
+    drawing.show_bodies(axes, view, [*tumors, *kidney], frame)
     flat = view.project(scene.cloud.points_mm.astype(float))
     axes.scatter(flat[:, 0], flat[:, 1], s=2.5, color=OBSERVED, alpha=0.55, linewidths=0, zorder=3)
     for n, part in enumerate(scene.reference.parts):
-        outline(axes, part, view, frame, TRUE, 1.2 if n == 0 else 2.2)
+        drawing.outline(axes, part, view, frame, TRUE, 1.2 if n == 0 else 2.2)
     for name, mesh in shown.items():
-        if name != "kidney":
-            u, v = view.project(mesh.box_mm.mean(0)[None])[0, :2]
-            axes.text(u, v, name.split("_")[-1], ha="center", va="center", fontweight="bold")
-    finish_view(axes, frame, _CAMERA_AXES[view])
+        u, v = view.project(mesh.box_mm.mean(0)[None])[0, :2]
+        axes.text(u, v, name.split("_")[-1], fontweight="bold", **CENTRED)
+    drawing.finish_view(axes, frame, _CAMERA_AXES[view])
     axes.set_title(view.name, fontsize=11)
 
 
 def _draw_slice(
-    axes: Axes, scene: Scene, estimate: Estimate | None, name: str, view: ParallelView
+    axes: Axes, scene: Scene, shown: dict[str, Mesh], name: str, view: ParallelView
 ) -> None:
     truth = dict(zip(scene.reference.names, scene.reference.parts, strict=True))
-    shown = estimate.meshes if estimate else {}
     through_mm = truth[name].box_mm.mean(0)
-    around = [truth[name].vertices_mm] + ([shown[name].vertices_mm] if name in shown else [])
+    around = [meshes[name].vertices_mm for meshes in (truth, shown) if name in meshes]
     frame = view.frame_around(np.concatenate(around), 12.0).widened(1.0)
     for part, mesh in shown.items():
         color, width = (KIDNEY, 1.4) if part == "kidney" else (ESTIMATED, 2.4)
-        tint(axes, section_mask(mesh, view, frame, through_mm), frame, color)
-        draw_lines(axes, section(mesh, view, through_mm), color=color, linewidth=width, zorder=3)
+        drawing.tint(axes, drawing.section_mask(mesh, view, frame, through_mm), frame, color)
+        lines = drawing.section(mesh, view, through_mm)
+        drawing.draw_lines(axes, lines, color=color, linewidth=width, zorder=3)
     for part, mesh in truth.items():
         width = 1.1 if part == "kidney" else 2.0
-        draw_lines(axes, section(mesh, view, through_mm), color=TRUE, linewidth=width, zorder=4)
+        lines = drawing.section(mesh, view, through_mm)
+        drawing.draw_lines(axes, lines, color=TRUE, linewidth=width, zorder=4)
     flat, middle = view.project(scene.cloud.points_mm.astype(float)), view.project(through_mm[None])
     near = np.abs(flat[:, 2] - middle[0, 2]) < 1.5
     axes.scatter(flat[near, 0], flat[near, 1], s=7, color=OBSERVED, linewidths=0, zorder=5)
-    finish_view(axes, frame, _CAMERA_AXES[view])
-
-
-def _distances(entry: dict[str, Any], name: str) -> str:
-    part = entry.get("parts", {}).get(name)
-    if not part or not part["found"]:
-        return "not found"
-    return (
-        f"Hausdorff {part['hausdorff_mm']:.1f} mm, centre {part['center_mm']:.1f} mm, "
-        f"IoU {part['iou']:.2f}"
-    )
-
-
-def _headline(entry: dict[str, Any]) -> str:
-    failed = "" if entry["failed"] is None else f"   {textwrap.shorten(entry['failed'], 60)}"
-    errors = entry.get("tre_mm")
-    targets = f"   target error {errors['mean']:.1f} mm" if errors else ""
-    return f"{entry['name']}   mIoU {entry['miou']:.2f}{targets}{failed}"
+    drawing.finish_view(axes, frame, _CAMERA_AXES[view])
 
 
 def scene_legend() -> list[Any]:
     """Handles of what ``draw_solid_view`` shows."""
-    from matplotlib.lines import Line2D
-    from matplotlib.patches import Patch
-
     return [
         Patch(facecolor=ESTIMATED, label="estimated tumor"),
         Patch(facecolor=(*KIDNEY, 0.5), label="estimated kidney"),
         Line2D([], [], color=TRUE, linewidth=2, label="truth (outline)"),
         Line2D([], [], color=OBSERVED, marker=".", linestyle="", label="observed point"),
     ]
+
+
+def qc_picture(case_labels: LabelVolume, ct: Volume | None, anatomy: Anatomy, path: Path) -> None:
+    """Orthogonal slices with outlines, a row through each tumor, and a 3-D view: is everything
+    outlined, and on the right side?
+
+    All in the patient's frame (LPS, mm). The labels are shown as grey where there is no CT. Of
+    more than six tumors the six largest have rows. The PNG is written atomically.
+    """
+    order = sorted(range(len(anatomy.tumors)), key=lambda n: -abs(anatomy.tumors[n].volume_mm3))
+    rows = {anatomy.names[n + 1]: anatomy.tumors[n] for n in sorted(order[:_MOST_ROWS])}
+    rows = rows or {"kidney": anatomy.organ}
+    height = 3.85 * len(rows)
+    borders = {"left": 0.025, "right": 0.99, "bottom": 0.05 / (height + 1.0)}
+    figure = drawing.new_figure(18.0, height + 1.0, top=height / (height + 1.0), **borders)
+    grid = figure.add_gridspec(len(rows), 4, wspace=0.03, hspace=0.12)
+    shown: LabelVolume | Volume = ct if ct is not None else case_labels
+    window = _window(shown, anatomy)
+    for row, (name, part) in enumerate(rows.items()):
+        for column, view in enumerate(PLANES):
+            axes = figure.add_subplot(grid[row, column])
+            _draw_plane(axes, (shown, window), anatomy, view, part.box_mm.mean(0))
+            if column == 0:
+                title = f"through {name.replace('_', ' ')}"
+                axes.set_ylabel(title, fontsize=12, fontweight="bold")
+    axes, view = figure.add_subplot(grid[:, 3]), PLANES[1]
+    frame = view.frame_around(anatomy.organ.vertices_mm, 8.0).widened(_ASPECT)
+    colors = _part_colors(anatomy)
+    tumors = [Body(*one) for one in zip(anatomy.tumors, colors[1:], strict=True)]
+    drawing.show_bodies(axes, view, [*tumors, Body(anatomy.organ, KIDNEY, 0.38)], frame)
+    drawing.finish_view(axes, frame)
+    _write_letters(axes, view, "black")
+    axes.set_title("3-D, seen from the front", fontsize=10.5)
+    what = "CT" if ct is not None else "label map"
+    dropped = len(order) > _MOST_ROWS
+    more = f" (slices through the {_MOST_ROWS} largest of {len(order)} tumors)" if dropped else ""
+    figure.suptitle(f"Prepared case over its {what}{more}", x=0.015, ha="left", fontweight="bold")
+    handles = [
+        Patch(facecolor=color, label=f"{name.replace('_', ' ')} {part.volume_mm3 / 1000:.1f} ml")
+        for color, name, part in zip(colors, anatomy.names, anatomy.parts, strict=True)
+    ]
+    drawing.show_legend(figure, handles, 6, (0.99, 0.995))
+    drawing.save(figure, path)
+
+
+def _draw_plane(
+    axes: Axes,
+    background: tuple[Volume | LabelVolume, tuple[float, float]],
+    anatomy: Anatomy,
+    view: ParallelView,
+    through_mm: Float[np.ndarray, " 3"],
+) -> None:
+    """A slice, equally large in all planes, so that lengths compare."""
+    half = float(np.ptp(anatomy.organ.box_mm, axis=0).max()) / 2 + _MARGIN_MM
+    right, down, _ = view.project(anatomy.organ.box_mm.mean(0)[None])[0].tolist()
+    frame = Frame(right - _ASPECT * half, right + _ASPECT * half, down - half, down + half)
+    shown, (low, high) = background
+    array = shown.hu if isinstance(shown, Volume) else shown.labels
+    values = slice_volume(array, shown.lps_from_index, view, frame, through_mm)
+    axes.imshow(np.ma.masked_invalid(values), cmap="gray", vmin=low, vmax=high, extent=frame.extent)
+    for color, part in zip(_part_colors(anatomy), anatomy.parts, strict=True):
+        lines = drawing.section(part, view, through_mm)
+        drawing.draw_lines(axes, lines, color=color, linewidth=1.7)
+    drawing.finish_view(axes, frame, background="black")
+    _write_letters(axes, view, "white")
+    axis = int(np.argmax(np.abs(view.axes[2])))
+    letter = ("LPS" if through_mm[axis] >= 0 else "RAI")[axis]
+    axes.set_title(f"{view.name}, {letter} {abs(through_mm[axis]):.1f} mm", fontsize=10.5)
+
+
+def slice_volume(
+    array: Shaped[np.ndarray, "i j k"],
+    lps_from_index: Float[np.ndarray, "4 4"],
+    view: ParallelView,
+    frame: Frame,
+    through_mm: Float[np.ndarray, " 3"],
+) -> Float[np.ndarray, "h w"]:
+    """A volume's values (nearest voxel, NaN outside) in the view's plane through a point.
+
+    Row 0 is the frame's top, column 0 its left, as in ``ParallelView.draw``.
+    """
+    x, y = np.meshgrid(*frame.pixel_centres())
+    depth = view.project(through_mm[None])[0, 2]
+    lps = np.stack([x, y, np.full_like(x, depth)], axis=-1).reshape(-1, 3) @ view.axes
+    index = np.floor(transform_points(np.linalg.inv(lps_from_index), lps) + 0.5).astype(int)
+    inside = ((index >= 0) & (index < array.shape)).all(1)
+    values = np.full(len(index), np.nan)
+    values[inside] = array[tuple(index[inside].T)]
+    return values.reshape(x.shape)
+
+
+def _window(shown: Volume | LabelVolume, anatomy: Anatomy) -> tuple[float, float]:
+    """Grey range: soft tissue, opened upwards as far as the organ and its tumors need."""
+    if isinstance(shown, LabelVolume):
+        return 0.0, float(shown.labels.max()) * 1.6 + 1e-6
+    low, high = _SOFT_TISSUE_HU
+    inner = np.concatenate([0.7 * p.vertices_mm + 0.3 * p.box_mm.mean(0) for p in anatomy.parts])
+    index = np.rint(transform_points(np.linalg.inv(shown.lps_from_index), inner)).astype(int)
+    index = index[((index >= 0) & (index < shown.hu.shape)).all(1)]
+    brightest = float(np.percentile(shown.hu[tuple(index.T)], 98)) if len(index) else high
+    return low, max(high, 1.15 * brightest)
+
+
+def border_letters(view: ParallelView) -> dict[str, str]:
+    """Where the patient's sides lie: left, right, top, bottom of the picture -> L R A P S I."""
+    right, down, _ = view.axes
+    towards = {"right": right, "left": -right, "bottom": down, "top": -down}
+    names = {tuple(np.array(v)): n[0].upper() for n, v in DIRECTIONS_LPS.items()}
+    return {border: names[tuple(v)] for border, v in towards.items()}
+
+
+def _write_letters(axes: Axes, view: ParallelView, color: str) -> None:
+    style = {**CENTRED, "fontsize": 13, "fontweight": "bold", "color": color}
+    for border, letter in border_letters(view).items():
+        axes.text(*_NEAR_BORDER[border], letter, transform=axes.transAxes, gid=border, **style)
+
+
+def _part_colors(anatomy: Anatomy) -> list[RGB]:
+    """Of the organ and of each tumor."""
+    few = len(_TUMOR_COLORS)
+    return [_ORGAN_LINE, *(_TUMOR_COLORS[n % few] for n in range(len(anatomy.tumors)))]

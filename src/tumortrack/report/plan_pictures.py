@@ -1,25 +1,30 @@
-"""A picture of a resection plan: from above and from the side, in the table's frame."""
+"""Pictures of a resection plan, from above and from the side, in the table's frame; and surfaces of
+what was located and planned: organ, tumors, the piece that comes away."""
 
 from __future__ import annotations
 
 import textwrap
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
+import manifold3d
 import numpy as np
 from jaxtyping import Bool, Float
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+from matplotlib.patheffects import Normal, Stroke
+from scipy.ndimage import gaussian_filter
 
 from tumortrack.core.colours import part_colour, sweep_colour
 from tumortrack.core.errors import InputError
-from tumortrack.core.types import ORGAN, Mesh
-from tumortrack.plan.values import Cut, Located, ResectionPlan
-from tumortrack.report.drawing import finish_view, new_figure, outline, save, show_legend
-from tumortrack.report.organ_surfaces import organ_surfaces, parted, within
+from tumortrack.core.types import ORGAN, Mesh, part_names
+from tumortrack.imaging.meshes import mesh_of, solid_of
+from tumortrack.plan.values import Cut, CutLayer, Located, ResectionPlan
+from tumortrack.report import drawing
+from tumortrack.report.drawing import CENTRED, KIDNEY
 from tumortrack.report.renderer import RGB, Body, Frame, ParallelView, rgb
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
+from tumortrack.simulate.occupancy import contains
 
 FROM_ABOVE = ParallelView("from above", (1.0, 0.0, 0.0), (0.0, -1.0, 0.0))
 FROM_SIDE = ParallelView("from the side", (1.0, 0.0, 0.0), (0.0, 0.0, -1.0))
@@ -37,16 +42,14 @@ _ORGAN_OPACITY, _PIECE_OPACITY = 0.36, 0.3
 _BADGE_MM = 4.4  # numbers closer than this would cover each other
 _ARROW_EVERY_MM, _HEAD_MM = 45.0, 2.6
 _MOST_ARROWED = 8  # sweeps with arrows
+_BLUR = 1.2  # cells: bridges the gaps between points strewn at random
+_INSIDE = 0.75  # quantile of the density at the points: those near the surface have less
+_FEWEST, _MOST_CELLS = 8, 60  # points of a part; cells along its longest side
 
 
 def draw_plan(plan: ResectionPlan, located: Located, path: Path) -> None:
-    """Write ``plan_figure`` as a PNG of 1200 x 600 pixels, atomically.
-
-    Raises:
-        InputError: as ``plan_figure``.
-        StorageError: the disk refused.
-    """
-    save(plan_figure(plan, located), path)
+    """Write ``plan_figure`` as a PNG of 1200 x 600 pixels, atomically; raises as it does."""
+    drawing.save(plan_figure(plan, located), path)
 
 
 def plan_figure(plan: ResectionPlan, located: Located) -> Figure:
@@ -55,54 +58,40 @@ def plan_figure(plan: ResectionPlan, located: Located) -> Figure:
     Two axes in mm, down pointing down: from above x and -y, from the side x and -z. Strokes are
     bold where they pass through the organ. Of a cloud without meshes the skin is drawn.
 
-    Args:
-        plan, located: table frame, mm.
-
     Raises:
         InputError: what was located has no surface, or one that is not closed.
     """
     surfaces = organ_surfaces(located)
     if plan.label not in surfaces:
         raise InputError(f"{plan.tumor} was not located, so its plan can't be drawn.")
-    piece, rest = parted(surfaces[ORGAN], plan.layers)
-    in_organ = [within(cut, surfaces[ORGAN]) for cut in plan.cuts]
-    figure = new_figure(12.0, 6.0)
-    figure.subplots_adjust(left=0.012, right=0.988, top=0.845, bottom=0.1, wspace=0.02)
+    organ = surfaces.pop(ORGAN)
+    piece, rest = parted(organ, plan.layers)
+    bodies = [Body(mesh, rgb(part_colour(label))) for label, mesh in surfaces.items()]
+    bodies += [Body(rest, KIDNEY, _ORGAN_OPACITY), Body(piece, _PIECE, _PIECE_OPACITY)]
+    in_organ = [contains(organ, cut.path_mm) for cut in plan.cuts]
+    reach_mm = plan.grasp_mm + np.array([0.0, 0.0, _APPROACH_MM])
+    shown = [organ.vertices_mm, *(cut.path_mm for cut in plan.cuts), reach_mm[None]]
+    borders = {"left": 0.012, "right": 0.988, "top": 0.845, "bottom": 0.1}
+    figure = drawing.new_figure(12.0, 6.0, **borders, wspace=0.02)
     for column, view in enumerate((FROM_ABOVE, FROM_SIDE)):
         axes = figure.add_subplot(1, 2, column + 1)
-        frame = _frame(view, surfaces, plan)
-        tumors = {label: mesh for label, mesh in surfaces.items() if label != ORGAN}
-        _draw_bodies(axes, view, frame, tumors, piece, rest)
-        depth = np.min([view.depth_of(mesh, frame) for mesh in tumors.values()], axis=0)
+        frame = view.frame_around(np.concatenate(shown), 7.0).widened(_ASPECT)
+        drawing.show_bodies(axes, view, bodies, frame)
+        if len(piece.faces):
+            drawing.outline(axes, piece, view, frame, _PIECE, 0.9)
+        depth = np.min([view.depth_of(mesh, frame) for mesh in surfaces.values()], axis=0)
         hidden = [_behind(cut, depth, view, frame) for cut in plan.cuts]
         _draw_cuts(axes, plan, in_organ, hidden, view)
         _draw_numbers(axes, plan, view, frame)
         _draw_grasp(axes, plan, view)
-        for label, mesh in tumors.items():
+        for label, mesh in surfaces.items():
             if label != plan.label:
                 u, v = view.project(mesh.box_mm.mean(0)[None])[0, :2]
-                axes.text(u, v, f"tumor {label - ORGAN}", ha="center", va="center", zorder=3)
-        finish_view(axes, frame, _ARROWS[view])
+                axes.text(u, v, f"tumor {label - ORGAN}", zorder=3, **CENTRED)
+        drawing.finish_view(axes, frame, _ARROWS[view])
         axes.set_title(view.name, fontsize=11)
     _words(figure, plan)
     return figure
-
-
-def _draw_bodies(
-    axes: Axes, view: ParallelView, frame: Frame, tumors: dict[int, Mesh], piece: Mesh, rest: Mesh
-) -> None:
-    bodies = [Body(mesh, rgb(part_colour(label))) for label, mesh in tumors.items()]
-    bodies.append(Body(rest, rgb(part_colour(ORGAN)), _ORGAN_OPACITY))
-    bodies.append(Body(piece, _PIECE, _PIECE_OPACITY))
-    axes.imshow(view.draw(bodies, frame), extent=frame.extent, interpolation="bilinear")
-    if len(piece.faces):
-        outline(axes, piece, view, frame, _PIECE, 0.9)
-
-
-def _frame(view: ParallelView, surfaces: dict[int, Mesh], plan: ResectionPlan) -> Frame:
-    reach = plan.grasp_mm + np.array([0.0, 0.0, _APPROACH_MM])
-    points = [surfaces[ORGAN].vertices_mm, *(cut.path_mm for cut in plan.cuts), reach[None]]
-    return view.frame_around(np.concatenate(points), 7.0).widened(_ASPECT)
 
 
 def _behind(
@@ -125,8 +114,6 @@ def _draw_cuts(
 ) -> None:
     """The lowest first and, from above, widest, so that strokes above each other all show; what
     lies behind a tumor is faint."""
-    from matplotlib.patheffects import Normal, Stroke
-
     every = -(-plan.sweeps // _MOST_ARROWED)
     every += 1 - every % 2  # odd: strokes go to and fro, and that is to be seen
     for cut, inside, behind in reversed(list(zip(plan.cuts, in_organ, hidden, strict=True))):
@@ -146,11 +133,9 @@ def _draw_cuts(
 
 def _draw_arrows(axes: Axes, flat: Float[np.ndarray, "n 3"], colour: RGB) -> None:
     """Heads along a stroke, where it is on the side towards the viewer."""
-    arrow = {
-        "arrowstyle": "simple,head_width=0.85,head_length=0.9,tail_width=0.01",
-        **{"mutation_scale": 13, "shrinkA": 0, "shrinkB": 0},
-        **{"facecolor": colour, "edgecolor": "white", "linewidth": 0.6},
-    }
+    style = "simple,head_width=0.85,head_length=0.9,tail_width=0.01"
+    arrow = {"arrowstyle": style, "mutation_scale": 13, "shrinkA": 0, "shrinkB": 0}
+    arrow |= {"facecolor": colour, "edgecolor": "white", "linewidth": 0.6}
     steps = np.linalg.norm(np.diff(flat[:, :2], axis=0), axis=1)
     near = flat[:-1, 2] <= (flat[:, 2].min() + flat[:, 2].max()) / 2 + 1e-6
     good = np.flatnonzero(near & (steps >= 0.6 * steps[near].max()))
@@ -166,8 +151,7 @@ def _draw_numbers(axes: Axes, plan: ResectionPlan, view: ParallelView, frame: Fr
     The first and the last, and those between with room."""
     first = {cut.sweep: cut for cut in reversed(plan.cuts)}
     taken: list[Float[np.ndarray, " 2"]] = []
-    order = sorted(first, key=lambda sweep: (sweep not in (1, plan.sweeps), sweep))
-    for sweep in order:
+    for sweep in sorted(first, key=lambda sweep: (sweep not in (1, plan.sweeps), sweep)):
         flat = view.project(first[sweep].path_mm)[:, :2]
         colour = rgb(sweep_colour(sweep, plan.sweeps))
         spot = flat[0] if view is FROM_ABOVE else np.array([frame.right - 6.0, flat[0, 1]])
@@ -178,14 +162,8 @@ def _draw_numbers(axes: Axes, plan: ResectionPlan, view: ParallelView, frame: Fr
             x = [flat[:, 0].max(), spot[0]]
             axes.plot(x, [spot[1]] * 2, ":", color=colour, lw=0.9, zorder=4)
         badge = {"boxstyle": "circle,pad=0.22", "facecolor": colour, "edgecolor": "white"}
-        style: dict[str, Any] = {
-            "fontsize": 7.5,
-            "weight": "bold",
-            "ha": "center",
-            "va": "center",
-            "zorder": 10,
-        }
-        axes.annotate(str(sweep), tuple(spot), color="white", bbox=badge, **style)
+        style = {**CENTRED, "fontsize": 7.5, "weight": "bold", "color": "white", "zorder": 10}
+        axes.annotate(str(sweep), tuple(spot), bbox=badge, **style)
 
 
 def _draw_grasp(axes: Axes, plan: ResectionPlan, view: ParallelView) -> None:
@@ -204,13 +182,11 @@ def _draw_grasp(axes: Axes, plan: ResectionPlan, view: ParallelView) -> None:
 
 
 def _words(figure: Figure, plan: ResectionPlan) -> None:
-    ml = plan.volumes_ml
+    """Title, what comes away, and the legend."""
+    ml, tumor = plan.volumes_ml, plan.tumor.replace("_", " ")
     sweeps = f"{plan.sweeps} sweep" + ("s" if plan.sweeps > 1 else "")
-    mm = sum(cut.length_mm for cut in plan.cuts)
-    figure.suptitle(
-        f"Resection of {plan.tumor.replace('_', ' ')}: {_METHODS[plan.method]}, {sweeps}",
-        x=0.014, y=0.975, ha="left", fontsize=13, fontweight="bold",
-    )  # fmt: skip
+    title = f"Resection of {tumor}: {_METHODS[plan.method]}, {sweeps}"
+    figure.suptitle(title, x=0.014, y=0.975, ha="left", fontsize=13, fontweight="bold")
     share = ml["healthy"] / ml["parenchyma"]
     line = (
         f"{ml['piece']:.1f} ml come away: {ml['tumor']:.1f} ml tumor and {ml['healthy']:.1f} ml "
@@ -220,28 +196,73 @@ def _words(figure: Figure, plan: ResectionPlan) -> None:
     about = [
         f"margin {plan.margin_mm:g} mm",
         f"{plan.exophytic:.0%} of the tumor outside the organ's hull",
-        f"{mm / 10:.0f} cm of cuts, bold in the organ",
+        f"{sum(cut.length_mm for cut in plan.cuts) / 10:.0f} cm of cuts, bold in the organ",
         *plan.notes,
     ]
     line = textwrap.shorten(" · ".join(about), 190)
     figure.text(0.014, 0.021, line, fontsize=9.5, va="center", color="0.35")
-    style = {"columnspacing": 1.2, "handlelength": 1.6}
-    show_legend(figure, _legend(plan), 6, (0.992, 0.945), **style)
-
-
-def _legend(plan: ResectionPlan) -> list[Any]:
-    from matplotlib.lines import Line2D
-    from matplotlib.patches import Patch
-
-    kidney = rgb(part_colour(ORGAN))
-    ends = sorted({1, plan.sweeps})
-    return [
-        Patch(facecolor=(*kidney, 0.5), label="kidney"),
-        Patch(facecolor=rgb(part_colour(plan.label)), label=plan.tumor.replace("_", " ")),
+    colours = {n: rgb(sweep_colour(n, plan.sweeps)) for n in sorted({1, plan.sweeps})}
+    handles = [
+        Patch(facecolor=(*KIDNEY, 0.5), label="kidney"),
+        Patch(facecolor=rgb(part_colour(plan.label)), label=tumor),
         Patch(facecolor=(*_PIECE, 0.45), edgecolor=_PIECE, label="comes away"),
-        *(
-            Line2D([], [], color=rgb(sweep_colour(n, plan.sweeps)), lw=2.8, label=f"sweep {n}")
-            for n in ends
-        ),
+        *(Line2D([], [], color=c, lw=2.8, label=f"sweep {n}") for n, c in colours.items()),
         Line2D([], [], color=_GRASP, marker="o", mfc="none", mew=1.8, ls="", label="grasp"),
     ]
+    corner = 0.992, 0.945
+    drawing.show_legend(figure, handles, 6, corner, columnspacing=1.2, handlelength=1.6)
+
+
+def organ_surfaces(located: Located) -> dict[int, Mesh]:
+    """By label 1 (the whole organ, tumors included), 2, ...: closed surfaces, table frame, mm.
+    Of a bare cloud they are the skin of its points.
+
+    Raises:
+        InputError: neither meshes nor enough points.
+    """
+    if "kidney" in located.meshes:
+        labels = {name: label for label, name in enumerate(part_names(255), start=1)}
+        return {labels[name]: mesh for name, mesh in located.meshes.items() if name in labels}
+    clouds = {ORGAN: located.points_mm} | {n: located.of(n) for n in located.tumors}
+    return {label: skin(np.asarray(points, float)) for label, points in clouds.items()}
+
+
+def skin(points_mm: Float[np.ndarray, "n 3"]) -> Mesh:
+    """The closed surface around points strewn evenly through a body: a level of their blurred
+    density, the one that holds all of them at the density that there is inside.
+
+    Raises:
+        InputError: too few points.
+    """
+    from skimage.measure import marching_cubes
+
+    if len(points_mm) < _FEWEST:
+        raise InputError(f"{len(points_mm)} points are too few to draw a part of the organ.")
+    low, size = points_mm.min(0), np.ptp(points_mm, axis=0)
+    # About two points a cell, if they fill an ellipsoid.
+    cell = (2 * np.pi / 6 * np.prod(np.maximum(size, 1.0)) / len(points_mm)) ** (1 / 3)
+    cell = max(cell, size.max() / _MOST_CELLS)
+    low = low - 4 * cell
+    edges = [low[d] + cell * np.arange(np.ceil(size[d] / cell) + 9) for d in range(3)]
+    counts, _ = np.histogramdd(points_mm, edges)
+    density = gaussian_filter(counts, _BLUR, mode="constant")
+    inside = np.quantile(density[tuple(((points_mm - low) / cell).astype(int).T)], _INSIDE)
+    ranked, cells = np.sort(density, axis=None), round(len(points_mm) / inside)
+    level = float(ranked[-cells - 1 : -cells + 1].mean())  # of no cell: corners would coincide
+    vertices, faces, _, _ = marching_cubes(density, level, gradient_direction="ascent")
+    mesh = Mesh(low + cell * (vertices + 0.5), faces)
+    return mesh if mesh.volume_mm3 > 0 else Mesh(mesh.vertices_mm, mesh.faces[:, ::-1])
+
+
+def parted(organ: Mesh, layers: tuple[CutLayer, ...]) -> tuple[Mesh, Mesh]:
+    """The piece that comes away, and what stays."""
+    solid = solid_of(organ, "the located organ")
+    above_mm = organ.box_mm[1, 2] + 1.0
+    slabs = []
+    for layer in layers:
+        area = manifold3d.CrossSection(list(layer.rings_mm), manifold3d.FillRule.NonZero)
+        height = min(layer.top_mm, above_mm) - layer.bottom_mm
+        if height > 0:
+            slabs.append(area.extrude(height).translate((0.0, 0.0, layer.bottom_mm)))
+    taken = manifold3d.Manifold.batch_boolean(slabs, manifold3d.OpType.Add)
+    return mesh_of(solid ^ taken), mesh_of(solid - taken)

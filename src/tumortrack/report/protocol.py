@@ -6,31 +6,22 @@ import time
 from collections.abc import Callable
 from dataclasses import asdict, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from rich.table import Table
 
 import tumortrack
 from tumortrack.core.errors import InputError, NoEstimate, StorageError
 from tumortrack.core.estimate import Estimate
 from tumortrack.core.store import write_json
 from tumortrack.core.types import SensorCloud
-from tumortrack.report.metrics import (
-    SurfaceDistances,
-    box_center_distance,
-    label_ious,
-    mean_iou,
-    surface_distances,
-    target_errors,
-)
+from tumortrack.report import metrics
 from tumortrack.report.page import number, page_scene, part_rows, write_page
 from tumortrack.report.pictures import scene_picture
 from tumortrack.simulate.scene_folder import Scene, list_scenes, read_scene
 
-if TYPE_CHECKING:
-    from rich.table import Table
-
-DISTANCES = (*(field.name for field in fields(SurfaceDistances)), "center_mm")
+DISTANCES = (*(field.name for field in fields(metrics.SurfaceDistances)), "center_mm")
 RULE = (
     "Medians over all scenes that have the part. A part that was not found counts as infinitely "
     "far and with IoU 0; a median that is infinite is written as null. A scene with a part "
@@ -39,14 +30,13 @@ RULE = (
 )
 TARGET_ERRORS = ("mean", "rms", "median", "p95", "max")
 Locate = Callable[[SensorCloud], Estimate]
-Progress = Callable[[int, int, str], None]
 
 
 def evaluate_scenes(
     locate: Locate,
     scenes_dir: Path,
     out: Path,
-    progress: Progress | None = None,
+    progress: Callable[[], None] = lambda: None,
     about: dict[str, Any] | None = None,
 ) -> dict[str, Any]:
     """Evaluate ``locate`` on every scene of a folder.
@@ -57,13 +47,8 @@ def evaluate_scenes(
     Args:
         locate: observed cloud (camera frame, mm) -> estimate; raises NoEstimate or InputError
             where it can say nothing, which counts as a failed scene.
-        scenes_dir: folder of scene folders.
-        out: report folder, made if it is not there.
-        progress: called after each scene with (done, total, its name).
+        progress: called after each scene.
         about: plain JSON that the report repeats: the model and options behind ``locate``.
-
-    Returns:
-        The report: ``scenes``, ``summary`` and the ``rule`` by which medians were taken.
 
     Raises:
         InputError: no scenes, or a scene that cannot be read.
@@ -75,17 +60,15 @@ def evaluate_scenes(
         (out / "report.json").unlink(missing_ok=True)  # never an old table beside new pictures
     except OSError as error:
         raise StorageError(f"cannot write {out}: {error.strerror}.") from error
-    entries: list[dict[str, Any]] = []
-    shown: list[dict[str, Any]] = []
-    for done, folder in enumerate(folders, start=1):
+    entries, shown = [], []
+    for folder in folders:
         scene = read_scene(folder)
         entry, estimate = evaluate_scene(locate, scene, folder.name)
         picture = out / "scenes" / f"{folder.name}.png"
         scene_picture(scene, estimate, entry, picture)
         entries.append(entry)
         shown.append(page_scene(folder.name, scene, estimate, picture))
-        if progress:
-            progress(done, len(folders), folder.name)
+        progress()
     report = {
         "tumortrack": tumortrack.__version__,
         "units": "mm",
@@ -117,30 +100,30 @@ def evaluate_scene(
         return (entry if scene.targets is None else {**entry, "tre_mm": None}), None
     seconds = time.perf_counter() - start
     parts = compare(estimate, scene)
-    missing = [part for part, metrics in parts.items() if not metrics["found"]]
+    missing = [name for name, part in parts.items() if not part["found"]]
     entry = {
         "name": name,
         "parts": parts,
-        "miou": mean_iou({part: metrics["iou"] for part, metrics in parts.items()}),
+        "miou": metrics.mean_iou({name: part["iou"] for name, part in parts.items()}),
         "seconds": seconds,
         "timings": estimate.report.get("timings", {}),
         "failed": f"not found: {', '.join(missing)}" if missing else None,
     }
     if estimate.motion is not None and scene.targets is not None:
-        entry["tre_mm"] = target_errors(estimate.motion, scene.targets)
+        entry["tre_mm"] = metrics.target_errors(estimate.motion, scene.targets)
     return entry, estimate
 
 
 def compare(estimate: Estimate, scene: Scene) -> dict[str, dict[str, Any]]:
     """Metrics of every part of the truth; a part that was not found has only found and iou."""
     assert estimate.volume is not None
-    ious = label_ious(estimate.volume, scene.reference)
+    ious = metrics.label_ious(estimate.volume, scene.reference)
     parts: dict[str, dict[str, Any]] = {}
     for name, reference in zip(scene.reference.names, scene.reference.parts, strict=True):
         mesh, distances = estimate.meshes.get(name), {}
         if found := mesh is not None and len(mesh.faces) > 0:
-            distances = asdict(surface_distances(mesh, reference))
-            distances["center_mm"] = box_center_distance(mesh, reference)
+            distances = asdict(metrics.surface_distances(mesh, reference))
+            distances["center_mm"] = metrics.box_center_distance(mesh, reference)
         parts[name] = {"found": found, **distances, "iou": ious[name]}
     return parts
 
@@ -177,8 +160,6 @@ def summarise(entries: list[dict[str, Any]]) -> dict[str, Any]:
 
 def summary_table(report: dict[str, Any]) -> Table:
     """The summary as a table for the terminal."""
-    from rich.table import Table
-
     summary = report["summary"]
     errors = summary.get("tre_mm")
     targets = f", target error {number(errors['mean'], 1)} mm" if errors else ""

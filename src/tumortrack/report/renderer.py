@@ -12,11 +12,13 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 from jaxtyping import Float, Float32, UInt8
+from PIL import Image
 
 from tumortrack.core.colours import Colour
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.types import Mesh
-from tumortrack.report.renderer_kernels import Hits, Light, Triangles, crease, nearest, shade
+from tumortrack.imaging.raster import expand
+from tumortrack.report.renderer_kernels import Light, Triangles, nearest, shade
 
 _SHARPER = 2  # pixels drawn per pixel shown, each way: smooth edges
 _CREASE = np.cos(np.radians(40.0))  # faces that meet at a sharper angle keep their edge
@@ -24,6 +26,7 @@ _WORLD_LIGHT = np.array([-0.42, -0.5, 1.0])  # towards it: from the left, the fr
 _VIEW_LIGHT = np.array([-0.35, -0.55, -1.0])  # right, down, away: over the viewer's left shoulder
 _SHADOW_PIXELS = 1024
 _SAME_MM = 0.6  # a translucent surface that close over an opaque one is the same one
+_DRAWN_MM = 0.3  # a pixel of a parallel view
 _FAR_MM = 10_000.0  # the viewer of a parallel view
 
 RGB = tuple[float, float, float]  # each in 0..1
@@ -38,11 +41,8 @@ def rgb(colour: Colour) -> RGB:
 
 @dataclass(frozen=True, eq=False)
 class Body:
-    """A surface somewhere in the world.
-
-    ``opacity``: where seen face on; edges are denser. ``shadowed``: whether others cast shadows
-    on it.
-    """
+    """A surface somewhere in the world. ``opacity``: where seen face on; edges are denser.
+    ``shadowed``: whether others cast shadows on it."""
 
     mesh: Mesh
     color: RGB
@@ -53,14 +53,11 @@ class Body:
 
 @dataclass(frozen=True, eq=False)
 class Viewpoint:
-    """From where one looks; world frame, mm.
+    """From where one looks; world frame, mm. ``axes``: rows right, down and forward.
 
-    Attributes:
-        axes: rows right, down and forward in the world.
-        distance_mm: to the plane that the picture's width spans ``width_mm`` of.
-        light: towards it; ``up``: where the rest of the light comes from.
-        parallel: without perspective.
-        before_mm: what is nearer to the viewer than that plane by more is not shown.
+    The picture's width spans ``width_mm`` of the plane at ``distance_mm``; what is nearer to the
+    viewer than that by more than ``before_mm`` is not shown. ``light``: towards it; ``up``: where
+    the rest of the light comes from. ``parallel``: without perspective.
     """
 
     place_mm: Float[np.ndarray, " 3"]
@@ -74,20 +71,16 @@ class Viewpoint:
 
     @staticmethod
     def towards(
-        target_mm: Float[np.ndarray, " 3"],
-        place_mm: Float[np.ndarray, " 3"],
-        width_mm: float,
-        parallel: bool = False,
-        before_mm: float = np.inf,
-    ) -> Viewpoint:
+        target_mm: Float[np.ndarray, " 3"], place_mm: Float[np.ndarray, " 3"], width_mm: float,
+        parallel: bool = False, before_mm: float = np.inf,
+    ) -> Viewpoint:  # fmt: skip
         """Of a viewer who stands upright in a world whose z points up."""
         distance_mm = float(np.linalg.norm(target_mm - place_mm))
-        forward = (target_mm - place_mm) / distance_mm
-        right = np.cross(forward, [0.0, 0.0, 1.0])
+        forward, up = (target_mm - place_mm) / distance_mm, np.array([0.0, 0.0, 1.0])
+        right = np.cross(forward, up)
         right /= np.linalg.norm(right)
         axes = np.stack([right, np.cross(forward, right), forward])
         light = _WORLD_LIGHT / np.linalg.norm(_WORLD_LIGHT)
-        up = np.array([0.0, 0.0, 1.0])
         return Viewpoint(place_mm, axes, distance_mm, width_mm, light, up, parallel, before_mm)
 
     def project(
@@ -104,12 +97,6 @@ class Viewpoint:
         scale = width / self.width_mm * (1.0 if self.parallel else self.distance_mm * near)
         middle = (width - 1) / 2, (height - 1) / 2
         return np.stack([scale * x + middle[0], scale * y + middle[1], near], axis=-1)
-
-    @property
-    def limit(self) -> float:
-        """The greatest nearness shown."""
-        distance = max(self.distance_mm - self.before_mm, 1.0)
-        return -distance if self.parallel else 1 / distance
 
 
 @dataclass(frozen=True)
@@ -128,9 +115,8 @@ class Frame:
 
     def size(self, pixel_mm: float) -> tuple[int, int]:
         """Width and height in pixels."""
-        width = int(np.ceil((self.right - self.left) / pixel_mm))
-        height = int(np.ceil((self.bottom - self.top) / pixel_mm))
-        return max(width, 1), max(height, 1)
+        width, height = self.right - self.left, self.bottom - self.top
+        return max(int(np.ceil(width / pixel_mm)), 1), max(int(np.ceil(height / pixel_mm)), 1)
 
     def pixel_centres(self, pixel_mm: float = 0.25) -> tuple[np.ndarray, np.ndarray]:
         """Positions along right (w,) and down (h,) of the pixels of a picture of it, mm."""
@@ -179,26 +165,23 @@ class ParallelView:
         light = _VIEW_LIGHT @ axes / np.linalg.norm(_VIEW_LIGHT)
         return Viewpoint(place_mm, axes, _FAR_MM, 2 * half[0], light, -axes[2], parallel=True)
 
-    def draw(
-        self, bodies: list[Body], frame: Frame, pixel_mm: float = 0.3
-    ) -> UInt8[np.ndarray, "h w 3"]:
+    def draw(self, bodies: list[Body], frame: Frame) -> UInt8[np.ndarray, "h w 3"]:
         """The bodies on white, row 0 at the frame's top: for ``imshow`` with ``frame.extent``."""
-        return render(bodies, self.viewpoint(frame, pixel_mm), frame.size(pixel_mm))
+        return render(bodies, self.viewpoint(frame, _DRAWN_MM), frame.size(_DRAWN_MM))
 
     def depth_of(
         self, mesh: Mesh, frame: Frame, pixel_mm: float = 0.25
     ) -> Float[np.ndarray, "h w"]:
-        """Of the surface that is seen, mm away from the viewer as ``project`` has it; where nothing
-        is seen, infinite."""
+        """Of what is seen, mm away from the viewer as ``project`` has it; infinite: nothing."""
         viewpoint, size = self.viewpoint(frame, pixel_mm), frame.size(pixel_mm)
-        corners = viewpoint.project(mesh.vertices_mm, size).astype(np.float32)
-        near, _ = nearest(corners, mesh.faces.astype(np.int32), *size, np.inf, False)
+        seen = viewpoint.project(mesh.vertices_mm, size).astype(np.float32)[mesh.faces]
+        near, _ = nearest(seen, *size, np.inf, False)
         return -near.astype(float) - _FAR_MM
 
     def silhouette(
         self, mesh: Mesh, frame: Frame, pixel_mm: float = 0.25
     ) -> Float[np.ndarray, "h w"]:
-        """Where the mesh covers the picture: 1.0 or 0.0 per pixel, for a contour at 0.5."""
+        """1.0 where the mesh covers the picture, else 0.0: for a contour at 0.5."""
         return np.isfinite(self.depth_of(mesh, frame, pixel_mm)).astype(float)
 
 
@@ -209,8 +192,6 @@ def render(
 
     Opaque bodies hide each other by depth; translucent ones tint what lies behind them.
     """
-    from PIL import Image
-
     width, height = (_SHARPER * n for n in size)
     solid = _join([body for body in bodies if body.opacity >= 1])
     light = _light(solid if solid.shadowed.any() else _join([]), viewpoint)
@@ -232,22 +213,18 @@ def render(
 
 
 def _join(bodies: list[Body]) -> Triangles:
-    places, faces, count = [np.zeros((0, 3))], [np.zeros((0, 3), int)], 0
-    normals = [np.zeros((0, 3, 3), np.float32)]
+    corners, normals = [np.zeros((0, 3, 3))], [np.zeros((0, 3, 3), np.float32)]
     for body in bodies:
         vertices, normal = body.mesh.vertices_mm, corner_normals(body.mesh)
         if (way := body.world_from_mesh) is not None:
             vertices = transform_points(way, vertices)
-            normal = (normal.reshape(-1, 3) @ way[:3, :3].T.astype(np.float32)).reshape(-1, 3, 3)
-        places.append(vertices)
-        faces.append(body.mesh.faces + count)
+            normal = normal @ way[:3, :3].T.astype(np.float32)
+        corners.append(vertices[body.mesh.faces])
         normals.append(normal)
-        count += len(vertices)
     each = [len(body.mesh.faces) for body in bodies]
     colors = np.array([body.color for body in bodies], np.float32).reshape(-1, 3)
     return Triangles(
-        np.concatenate(places).astype(np.float32),
-        np.concatenate(faces).astype(np.int32),
+        np.concatenate(corners).astype(np.float32),
         np.concatenate(normals),
         np.repeat(colors, each, axis=0),
         np.repeat(np.array([body.shadowed for body in bodies], bool), each),
@@ -269,8 +246,15 @@ def corner_normals(mesh: Mesh) -> Float32[np.ndarray, "f 3 3"]:
     corner = place.reshape(-1)[mesh.faces].reshape(-1)
     order = np.argsort(corner, kind="stable")
     first = np.searchsorted(corner[order], np.arange(corner.max(initial=-1) + 2))
-    normals = crease(area, unit, corner, order // 3, first, _CREASE)
-    _NORMALS[mesh] = normals.reshape(-1, 3, 3).astype(np.float32)
+    mine, n = expand(np.diff(first)[corner])  # every corner with every face about its place
+    other = order[first[corner[mine]] + n] // 3
+    smooth = (unit[mine // 3] * unit[other]).sum(1) >= _CREASE
+    smooth |= other == mine // 3
+    mine, other = mine[smooth], other[smooth]
+    sums = [np.bincount(mine, area[other, axis], len(corner)) for axis in range(3)]
+    normals = np.stack(sums, axis=1).reshape(-1, 3, 3)
+    normals = normals / np.maximum(np.linalg.norm(normals, axis=2, keepdims=True), 1e-12)
+    _NORMALS[mesh] = normals.astype(np.float32)
     return _NORMALS[mesh]
 
 
@@ -284,27 +268,25 @@ def _light(triangles: Triangles, viewpoint: Viewpoint) -> Light:
     pixel_mm = 1.6 * viewpoint.width_mm / _SHADOW_PIXELS
     middle = axes[:2] @ target_mm.astype(np.float32)
     corner = (middle - pixel_mm * _SHADOW_PIXELS / 2).astype(np.float32)
-    seen = triangles.places @ axes.T
-    seen[:, :2] = (seen[:, :2] - corner) / pixel_mm
-    near, _ = nearest(seen, triangles.faces, _SHADOW_PIXELS, _SHADOW_PIXELS, np.inf, False)
+    seen = triangles.corners @ axes.T
+    seen[..., :2] = (seen[..., :2] - corner) / pixel_mm
+    near, _ = nearest(seen, _SHADOW_PIXELS, _SHADOW_PIXELS, np.inf, False)
     return Light(axes, viewpoint.up.astype(np.float32), near, corner, pixel_mm)
 
 
 def _lay(
-    picture: Float32[np.ndarray, "h w 3"],
-    below: Float32[np.ndarray, "h w"],
-    triangles: Triangles,
-    viewpoint: Viewpoint,
-    light: Light,
-    opacity: float,
-) -> Float32[np.ndarray, "h w"]:
+    picture: Float32[np.ndarray, "h w 3"], below: Float32[np.ndarray, "h w"],
+    triangles: Triangles, viewpoint: Viewpoint, light: Light, opacity: float,
+) -> Float32[np.ndarray, "h w"]:  # fmt: skip
     """Paint them where nothing in ``below`` is nearer; returns their nearness (-inf: nothing)."""
     size = picture.shape[1], picture.shape[0]
-    corners = viewpoint.project(triangles.places.astype(float), size).astype(np.float32)
+    seen = viewpoint.project(triangles.corners.astype(float), size).astype(np.float32)
     perspective = not viewpoint.parallel
-    near, winner = nearest(corners, triangles.faces, *size, viewpoint.limit, perspective)
+    closest_mm = max(viewpoint.distance_mm - viewpoint.before_mm, 1.0)
+    limit = 1 / closest_mm if perspective else -closest_mm
+    near, winner = nearest(seen, *size, limit, perspective)
     one_mm = near**2 if perspective else np.float32(1.0)  # of nearness
     winner[near - _SAME_MM * one_mm <= below] = -1
-    hits = Hits(winner, corners, perspective, viewpoint.place_mm.astype(np.float32))
-    shade(picture, hits, triangles, light, opacity)
+    eye = viewpoint.place_mm.astype(np.float32), perspective
+    shade(picture, winner, seen, triangles, light, eye, opacity)
     return near

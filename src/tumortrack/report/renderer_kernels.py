@@ -6,17 +6,16 @@ from typing import NamedTuple
 
 import numba
 import numpy as np
-from jaxtyping import Bool, Float32, Int32
+from jaxtyping import Bool, Float32
 
 _SHADOW_BIAS = 4.0  # pixels of the shadow's picture: a surface doesn't shade itself
 
 
 class Triangles(NamedTuple):
-    """Many bodies as one, world frame, mm: vertices, and of each triangle its corners, their
-    normals, its colour, and whether others cast shadows on it."""
+    """Of many bodies, world frame, mm: each one's corners, their normals, its colour, and whether
+    others cast shadows on it."""
 
-    places: Float32[np.ndarray, "v 3"]
-    faces: Int32[np.ndarray, "t 3"]
+    corners: Float32[np.ndarray, "t 3 3"]
     normals: Float32[np.ndarray, "t 3 3"]
     colors: Float32[np.ndarray, "t 3"]
     shadowed: Bool[np.ndarray, " t"]
@@ -32,48 +31,19 @@ class Light(NamedTuple):
     pixel_mm: float
 
 
-class Hits(NamedTuple):
-    """Which triangle each pixel sees (-1: none), from where, and the column, row and nearness of
-    all vertices."""
-
-    winner: Int32[np.ndarray, "h w"]
-    corners: Float32[np.ndarray, "v 3"]
-    perspective: bool
-    place: Float32[np.ndarray, " 3"]
-
-
 @numba.njit(cache=True, nogil=True)
-def crease(area, unit, corner, faces, first, limit):  # type: ignore[no-untyped-def]
-    out = np.zeros((len(corner), 3))
-    for n in range(len(corner)):
-        own = n // 3
-        for k in range(first[corner[n]], first[corner[n] + 1]):
-            other = faces[k]
-            angle = 0.0
-            for d in range(3):
-                angle += unit[own, d] * unit[other, d]
-            if angle >= limit or other == own:
-                for d in range(3):
-                    out[n, d] += area[other, d]
-        length = np.sqrt(out[n, 0] ** 2 + out[n, 1] ** 2 + out[n, 2] ** 2)
-        for d in range(3):
-            out[n, d] /= max(length, 1e-12)
-    return out
-
-
-@numba.njit(cache=True, nogil=True)
-def nearest(seen, faces, width, height, limit, perspective):  # type: ignore[no-untyped-def]
+def nearest(seen, width, height, limit, perspective):  # type: ignore[no-untyped-def]
     """Greatest nearness up to the limit in each pixel (-inf: nothing) and whose it is (-1).
 
-    Seen (v, 3) are the vertices' column, row and nearness, linear in the picture. In perspective a
-    triangle that reaches behind the eye (nearness 0 or less) is left out.
+    Seen (t, 3, 3) are the corners' column, row and nearness, linear in the picture. In perspective
+    a triangle that reaches behind the eye (nearness 0 or less) is left out.
     """
     near = np.full((height, width), -np.inf, np.float32)
     winner = np.full((height, width), -1, np.int32)
-    for t in range(len(faces)):
-        ua, va, na = seen[faces[t, 0]]
-        ub, vb, nb = seen[faces[t, 1]]
-        uc, vc, nc = seen[faces[t, 2]]
+    for t in range(len(seen)):
+        ua, va, na = seen[t, 0]
+        ub, vb, nb = seen[t, 1]
+        uc, vc, nc = seen[t, 2]
         if perspective and min(na, nb, nc) <= 0:
             continue
         area = (ub - ua) * (vc - va) - (vb - va) * (uc - ua)
@@ -104,11 +74,11 @@ def nearest(seen, faces, width, height, limit, perspective):  # type: ignore[no-
 
 
 @numba.njit(cache=True, nogil=True)
-def _shares(seen, face, x, y, perspective):  # type: ignore[no-untyped-def]
+def _shares(seen, x, y, perspective):  # type: ignore[no-untyped-def]
     """How much of each corner there is in a pixel of a triangle."""
-    ua, va, na = seen[face[0]]
-    ub, vb, nb = seen[face[1]]
-    uc, vc, nc = seen[face[2]]
+    ua, va, na = seen[0]
+    ub, vb, nb = seen[1]
+    uc, vc, nc = seen[2]
     area = (ub - ua) * (vc - va) - (vb - va) * (uc - ua)
     a = ((ub - x) * (vc - y) - (vb - y) * (uc - x)) / area
     b = ((uc - x) * (va - y) - (vc - y) * (ua - x)) / area
@@ -121,59 +91,58 @@ def _shares(seen, face, x, y, perspective):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def _mixed(one, two, three, shares):  # type: ignore[no-untyped-def]
+def _mixed(of, shares):  # type: ignore[no-untyped-def]
     a, b, c = shares
-    return (
-        a * one[0] + b * two[0] + c * three[0],
-        a * one[1] + b * two[1] + c * three[1],
-        a * one[2] + b * two[2] + c * three[2],
-    )
+    x = a * of[0, 0] + b * of[1, 0] + c * of[2, 0]
+    y = a * of[0, 1] + b * of[1, 1] + c * of[2, 1]
+    return x, y, a * of[0, 2] + b * of[1, 2] + c * of[2, 2]
+
+
+@numba.njit(cache=True, nogil=True)
+def _dot(one, two):  # type: ignore[no-untyped-def]
+    return one[0] * two[0] + one[1] * two[1] + one[2] * two[2]
 
 
 @numba.njit(cache=True, nogil=True)
 def _dark(spot, light):  # type: ignore[no-untyped-def]
     """Whether something lies between this place and the light."""
     axes, step = light.axes, light.pixel_mm
-    u = (axes[0, 0] * spot[0] + axes[0, 1] * spot[1] + axes[0, 2] * spot[2]) - light.corner[0]
-    v = (axes[1, 0] * spot[0] + axes[1, 1] * spot[1] + axes[1, 2] * spot[2]) - light.corner[1]
-    toward = axes[2, 0] * spot[0] + axes[2, 1] * spot[1] + axes[2, 2] * spot[2]
+    u, v = _dot(axes[0], spot) - light.corner[0], _dot(axes[1], spot) - light.corner[1]
     column, row = int(np.rint(u / step)), int(np.rint(v / step))
     side = light.near.shape[0]
     if not (0 <= column < side and 0 <= row < side):
         return False
-    return light.near[row, column] > toward + _SHADOW_BIAS * step
+    return light.near[row, column] > _dot(axes[2], spot) + _SHADOW_BIAS * step
 
 
 @numba.njit(cache=True, nogil=True)
-def shade(picture, hits, triangles, light, opacity):  # type: ignore[no-untyped-def]
-    """Lay each pixel's triangle over what is there; a diffuse light, a little gloss."""
-    lx, ly, lz = light.axes[2]
-    ux, uy, uz = light.up
-    places, place = triangles.places, hits.place
-    for y in range(hits.winner.shape[0]):
-        for x in range(hits.winner.shape[1]):
-            t = hits.winner[y, x]
+def shade(picture, winner, seen, triangles, light, eye, opacity):  # type: ignore[no-untyped-def]
+    """Lay each pixel's triangle (-1: none) over what is there; a diffuse light, a little gloss.
+
+    Seen as in ``nearest``; the eye is a place and whether it sees in perspective.
+    """
+    (place, perspective), sun = eye, light.axes[2]
+    for y in range(winner.shape[0]):
+        for x in range(winner.shape[1]):
+            t = winner[y, x]
             if t < 0:
                 continue
-            face, corner = triangles.faces[t], triangles.normals[t]
-            shares = _shares(hits.corners, face, x, y, hits.perspective)
-            spot = _mixed(places[face[0]], places[face[1]], places[face[2]], shares)
-            nx, ny, nz = _mixed(corner[0], corner[1], corner[2], shares)
-            vx, vy, vz = place[0] - spot[0], place[1] - spot[1], place[2] - spot[2]
-            scale = 1 / max(np.sqrt(nx * nx + ny * ny + nz * nz), 1e-12)
-            far = 1 / np.sqrt(vx * vx + vy * vy + vz * vz)
-            vx, vy, vz = vx * far, vy * far, vz * far
-            toward = (nx * vx + ny * vy + nz * vz) * scale
+            shares = _shares(seen[t], x, y, perspective)
+            spot = _mixed(triangles.corners[t], shares)
+            normal = _mixed(triangles.normals[t], shares)
+            view = (place[0] - spot[0], place[1] - spot[1], place[2] - spot[2])
+            scale = 1 / max(np.sqrt(_dot(normal, normal)), 1e-12)
+            far = 1 / np.sqrt(_dot(view, view))
+            toward = _dot(normal, view) * far * scale
             scale = scale if toward >= 0 else -scale  # of a surface seen from behind
-            nx, ny, nz = nx * scale, ny * scale, nz * scale
-            lit, gloss = max(nx * lx + ny * ly + nz * lz, 0.0), 0.0
+            lit, gloss = max(_dot(normal, sun) * scale, 0.0), 0.0
             if lit > 0 and triangles.shadowed[t] and _dark(spot, light):
                 lit = 0.0
-            elif lit > 0:
-                hx, hy, hz = lx + vx, ly + vy, lz + vz
-                gloss = (nx * hx + ny * hy + nz * hz) / np.sqrt(hx * hx + hy * hy + hz * hz)
+            elif lit > 0:  # about the direction half way between the light and the viewer
+                half = (sun[0] + view[0] * far, sun[1] + view[1] * far, sun[2] + view[2] * far)
+                gloss = _dot(normal, half) * scale / np.sqrt(_dot(half, half))
                 gloss = 0.16 * max(gloss, 0.0) ** 40
-            strength = 0.46 + 0.1 * (nx * ux + ny * uy + nz * uz) + 0.5 * lit
+            strength = 0.46 + 0.1 * _dot(normal, light.up) * scale + 0.5 * lit
             slant = 1 - abs(toward)
             cover = opacity + (1 - opacity) * 0.75 * slant * slant
             for d in range(3):

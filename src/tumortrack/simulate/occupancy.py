@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int64, UInt8
@@ -22,6 +21,7 @@ from tumortrack.core.types import Anatomy, Mesh
 
 Points = Float[np.ndarray, "n 3"]
 Labels = UInt8[np.ndarray, " n"]
+_POOL = 0x5047  # of the generator
 _WITHIN_MM = 0.1  # of ``surface_distance``
 
 
@@ -36,29 +36,20 @@ class OccupancyConfig(Config, frozen=True):
     pool: int = 100_000  # points per part that are labelled once
 
 
-@runtime_checkable
-class PointSource(Protocol):
-    """Where the points of scenes come from."""
-
-    def draw(self, rng: np.random.Generator) -> tuple[Points, Labels]:
-        """One scene's points (CT frame, undeformed) and labels; the same number every time."""
-        ...
-
-
 @dataclass(frozen=True, eq=False)
 class FixedPoints:
-    """The same points in every scene, to learn where each of them goes."""
+    """The same points in every scene, to learn where each of them goes; they have no labels."""
 
     points_ct: Float32[np.ndarray, "n 3"]
-    labels: Labels
 
     def draw(self, rng: np.random.Generator) -> tuple[Points, Labels]:
-        return self.points_ct, self.labels
+        return self.points_ct, np.zeros(len(self.points_ct), np.uint8)
 
 
 @dataclass(frozen=True, eq=False)
 class PartPool:
-    """Points around one part: CT frame, distance to its surface, inside it or not, label."""
+    """Points around one part, in random order, so that neighbours are a random draw, without its
+    cost: CT frame, distance to its surface, inside it or not, label."""
 
     points_ct: Points
     distance_mm: Float[np.ndarray, " n"]
@@ -67,53 +58,43 @@ class PartPool:
 
     def draw_evenly(self, rng: np.random.Generator, count: int) -> tuple[Points, Labels]:
         """Points uniform in the part's enlarged box: fractions of them measure volumes."""
-        chosen = self.neighbours(int(rng.integers(len(self.labels))), count)
+        chosen = _following(int(rng.integers(len(self.labels))), count, len(self.labels))
         return self.points_ct[chosen], self.labels[chosen]
 
-    def neighbours(self, first: int, count: int) -> Int64[np.ndarray, " count"]:
-        """Indices of ``count`` points from ``first`` on; after the last comes the first."""
-        return (first + np.arange(count)) % len(self.labels)
-
     def nearest(self, first: int, count: int, k: int) -> Int64[np.ndarray, " m"]:
-        """Of these neighbours the ``k`` inside that are nearest to the surface, and ``k`` outside;
-        on a side in any order."""
-        drawn = self.neighbours(first, count)
+        """Of the ``count`` points from ``first`` on the ``k`` inside that are nearest to the
+        surface, and ``k`` outside; on a side in any order."""
+        drawn, chosen = _following(first, count, len(self.labels)), []
         inside = self.inside[drawn]
-        return np.concatenate([self._nearest(drawn[side], k) for side in (inside, ~inside)])
+        for side in (drawn[inside], drawn[~inside]):
+            every = len(side) == k
+            chosen.append(side if every else side[np.argpartition(self.distance_mm[side], k)[:k]])
+        return np.concatenate(chosen)
 
     def window(self, k: int, rng: np.random.Generator) -> tuple[int, int]:
-        """A random first point and so many neighbours that ``k`` lie on either side."""
-        count = int(k / self._rarer * 1.1)
+        """A random first point and so many points from it on that ``k`` lie on either side."""
+        before, rarer = self._counts
+        count = int(k / rarer * 1.1)
         while True:
             first = int(rng.integers(len(self.inside)))
             rounds, last = divmod(first + count, len(self.labels))
-            before = self._inside_before
             inside = int(rounds * before[-1] + before[last] - before[first])
             if min(inside, count - inside) >= k:
                 return first, count
             count = min(2 * count, len(self.inside))
 
-    def _nearest(self, drawn: np.ndarray, k: int) -> np.ndarray:
-        if len(drawn) == k:
-            return drawn
-        return drawn[np.argpartition(self.distance_mm[drawn], k)[:k]]
-
     @cached_property
-    def _inside_before(self) -> Int64[np.ndarray, " m"]:
-        return np.concatenate([[0], np.cumsum(self.inside)])
-
-    @cached_property
-    def _rarer(self) -> float:
-        """Fraction of the points on the side that has fewer."""
+    def _counts(self) -> tuple[Int64[np.ndarray, " m"], float]:
+        """How many points before each lie inside; the fraction on the side that has fewer."""
         inside = float(self.inside.mean())
-        return min(inside, 1 - inside)
+        return np.concatenate([[0], np.cumsum(self.inside)]), min(inside, 1 - inside)
 
 
 class OccupancyPool:
     """Labelled points of one undeformed anatomy, computed once; every scene draws from them."""
 
     def __init__(self, anatomy_ct: Anatomy, config: OccupancyConfig, seed: int) -> None:
-        rng = _pool_generator(seed)
+        rng = np.random.default_rng([seed, _POOL])
         self.config = config
         self.parts = tuple(_part_pool(anatomy_ct, part, config, rng) for part in anatomy_ct.parts)
         lower, upper = anatomy_ct.organ.box_mm
@@ -128,7 +109,7 @@ class OccupancyPool:
     def draw(self, rng: np.random.Generator) -> tuple[Points, Labels]:
         """One scene's points (CT frame, undeformed) and labels; the same number every time."""
         *near, (first, count) = self.windows(rng)
-        k, far = self.config.per_side, (first + np.arange(count)) % len(self.far_labels)
+        k, far = self.config.per_side, _following(first, count, len(self.far_labels))
         chosen = [(p, p.nearest(*window, k)) for p, window in zip(self.parts, near, strict=True)]
         return (
             np.concatenate([*(p.points_ct[c] for p, c in chosen), self.far_points_ct[far]]),
@@ -137,21 +118,25 @@ class OccupancyPool:
 
     def windows(self, rng: np.random.Generator) -> list[tuple[int, int]]:
         """Which points of the pool a scene considers, as (first, count): of each part enough on
-        either side of its surface; last those anywhere. The pool is in random order, so that
-        neighbours are a random draw, without its cost."""
+        either side of its surface; last those anywhere."""
         windows = [part.window(self.config.per_side, rng) for part in self.parts]
         near = 2 * self.config.per_side * len(self.parts)
         count = round(near * self.config.far_share / (1 - self.config.far_share))
         return [*windows, (int(rng.integers(len(self.far_labels))), count)]
 
 
+PointSource = FixedPoints | OccupancyPool  # of the labelled points of scenes
+
+
 def organ_pool(anatomy_ct: Anatomy, config: OccupancyConfig, seed: int) -> PartPool:
     """The first part of an ``OccupancyPool`` alone."""
-    return _part_pool(anatomy_ct, anatomy_ct.organ, config, _pool_generator(seed))
+    rng = np.random.default_rng([seed, _POOL])
+    return _part_pool(anatomy_ct, anatomy_ct.organ, config, rng)
 
 
-def _pool_generator(seed: int) -> np.random.Generator:
-    return np.random.default_rng([seed, 0x5047])
+def _following(first: int, count: int, n: int) -> Int64[np.ndarray, " count"]:
+    """Indices of ``count`` of ``n`` points from ``first`` on; after the last comes the first."""
+    return (first + np.arange(count)) % n
 
 
 def _part_pool(
@@ -204,13 +189,10 @@ def surface_distance(mesh: Mesh, points_mm: Points) -> Float[np.ndarray, " n"]:
     return distance
 
 
-def _nearest_of(
-    samples_mm: Float[np.ndarray, "p 3"], points_mm: Points
-) -> Float32[np.ndarray, " n"]:
+def _nearest_of(samples_mm: np.ndarray, points_mm: Points) -> Float32[np.ndarray, " n"]:
     from scipy.spatial import cKDTree
 
     # Points far from a surface have many almost nearest ones: large, loose leaves are six times
     # faster here than scipy's usual tree, with the same distances.
     tree = cKDTree(samples_mm, leafsize=100, balanced_tree=False, compact_nodes=False)
-    distance: np.ndarray = tree.query(points_mm, workers=-1)[0].astype(np.float32)
-    return distance
+    return np.asarray(tree.query(points_mm, workers=-1)[0], np.float32)

@@ -1,15 +1,21 @@
 """A scene in motion: an organ that breathes and is pushed on its table, before a camera.
 
+A state is an equilibrium of ``elastic``: coefficients of the body's modes and a small rigid motion
+on the bed. It is solved for a few depths of a push; between them the unknowns follow a monotone
+cubic (PCHIP: Fritsch and Carlson 1980, doi 10.1137/0717021), so that nothing overshoots or jumps.
+
 ``ScenePlayer`` is a function of time: the same seed and time give the same state, depth image and
 true surfaces.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
-from jaxtyping import Float, Float32, Float64
+from jaxtyping import Float32, Float64
 from scipy.interpolate import PchipInterpolator
 from scipy.spatial.transform import Rotation
 
@@ -20,14 +26,14 @@ from tumortrack.core.types import Anatomy, DepthFrame, Intrinsics, Mesh
 from tumortrack.sense.camera import d405
 from tumortrack.sense.noise import D405_NOISE, NoiseConfig, add_noise
 from tumortrack.sense.render import render_depth
-from tumortrack.simulate.elastic.body import BodyConfig, body_of, reduced_organ
-from tumortrack.simulate.elastic.equilibrium import LEVER_MM
-from tumortrack.simulate.elastic.loads import expand
-from tumortrack.simulate.indentation import Bed, Indentation, indentations
-from tumortrack.simulate.pose import PoseConfig, sample_pose
+from tumortrack.simulate.elastic.body import BodyConfig, Points, body_of, reduced_organ
+from tumortrack.simulate.elastic.loads import ReducedProblem, in_bed
+from tumortrack.simulate.elastic.modes import LEVER_MM
+from tumortrack.simulate.scene import PoseConfig, sample_pose
 
 SHAFT_MM = 4.0  # an instrument's radius
 _SHAFT_LENGTH_MM = 200.0
+_BREATH_S, _PUSH_S = 4.0, 6.0  # from one to the next
 _AWAY_MM = 160.0  # along its shaft: an instrument out of the picture
 _STEPS = 3  # along the body's field: within 0.02 mm of the exact position, for states as here
 _SWAY_S = (17.0, 23.0, 29.0, 19.0, 13.0, 31.0)  # periods of the camera's rotations and shifts
@@ -41,41 +47,25 @@ _WAVES = 5
 _RING_MM = 4.0
 _SECTIONS = 24
 _FARTHEST_MM = 500.0  # that the sensor sees of a table
+_DEPTHS = 7
+_FOOT_MM = 2.0  # the tissue is held down this far beyond the instrument's radius
+_FACING = 0.85  # least cosine between an indented place's normal and up
+_RISE_DEGREES = 50.0  # of an instrument's shaft over the surface
+_SIDES = 24  # from which it may come
 _NOTHING = Mesh(np.empty((0, 3)), np.empty((0, 3), np.int32))
-_RANGES = {
-    "distance_mm": (60, 400),
-    "breath_mm": (0, 30),
-    "breath_s": (1, 20),
-    "swell": (0, 0.025),
-    "push_mm": (0, 14),
-    "push_s": (2, 60),
-    "places": (1, 20),
-    "sway_mm": (0, 30),
-    "sway_degrees": (0, 20),
-}
 
 
 class ScenePlayerConfig(Config, frozen=True, kw_only=True):
-    """What moves and what is seen; a length of zero switches its part off.
-
-    Attributes:
-        distance_mm: depth of the organ's nearest point, at rest and before the camera sways.
-        breath_mm: the organ's motion down the body and back, every ``breath_s``; ``swell`` is the
-            strain of its volume that goes with it.
-        push_mm: how deep an instrument presses, one push every ``push_s`` at one of ``places``.
-        sway_mm, sway_degrees: the camera's slow motion along and about each axis.
-    """
+    """What moves and what is seen; a length of zero switches its part off."""
 
     width: int = 424
     height: int = 240
-    distance_mm: float = 118.0
-    breath_mm: float = 6.0
-    breath_s: float = 4.0
-    swell: float = 0.01
-    push_mm: float = 8.0
-    push_s: float = 6.0
+    distance_mm: float = 118.0  # depth of the organ's nearest point, before all motion
+    breath_mm: float = 6.0  # down the body and back
+    swell: float = 0.01  # strain of the organ's volume with a breath
+    push_mm: float = 8.0  # how deep an instrument presses, at each place in turn
     places: int = 3
-    sway_mm: float = 3.0
+    sway_mm: float = 3.0  # of the camera along each axis, and about each
     sway_degrees: float = 3.0
     table: bool = True
     drape: bool = False
@@ -83,10 +73,8 @@ class ScenePlayerConfig(Config, frozen=True, kw_only=True):
     body: BodyConfig = BodyConfig()
 
     def __post_init__(self) -> None:
-        for name, (low, high) in _RANGES.items():
-            value = getattr(self, name)
-            if not low <= value <= high:
-                raise InputError(f"{name} is {value:g}; it must lie in {low:g}..{high:g}.")
+        if not 60 <= self.distance_mm <= 400:
+            raise InputError(f"distance_mm is {self.distance_mm:g}; it must lie in 60..400.")
         d405(self.width, self.height)
 
 
@@ -97,14 +85,18 @@ class Instant:
     t_s: float
     camera_from_room: Float64[np.ndarray, "4 4"]
     room_from_organ: Float64[np.ndarray, "4 4"]  # the organ's rigid motion, after its deformation
-    coefficients: Float64[np.ndarray, " m"]  # of the body's modes
-    velocity: Float32[np.ndarray, "i j k 3"]  # the field of these, which points of the CT follow
+    room_from_rod: Float64[np.ndarray, "4 4"]  # of the instrument
+    velocity: Float32[np.ndarray, "i j k 3"]  # the field that points of the CT follow
     depth_mm: float  # of the push
-    room_from_rod: Float64[np.ndarray, "4 4"] = field(default_factory=lambda: np.eye(4))
 
-    def __post_init__(self) -> None:
-        if not self.t_s >= 0:
-            raise InputError(f"time {self.t_s} s is before the scene's beginning, 0 s.")
+
+@dataclass(frozen=True, eq=False)
+class Indentation:
+    """One place of the surface under an instrument; CT frame."""
+
+    place_ct: Float64[np.ndarray, " 3"]  # at rest
+    axis: Float64[np.ndarray, " 3"]  # unit vector from the instrument's tip along its shaft
+    unknowns: Callable[[float], Float64[np.ndarray, " m"]]  # for a depth in mm
 
 
 class ScenePlayer:
@@ -125,35 +117,38 @@ class ScenePlayer:
         up = unit(np.asarray(up_lps, float))
         self.anatomy_ct, self.config = anatomy_ct, config
         self.intrinsics = d405(config.width, config.height)
-        self._seed = seed
+        self._seed, self._up = seed, up
         pose = PoseConfig(tilt_deg=8.0, sideways_mm=5.0)
         near_mm = (config.distance_mm, config.distance_mm)
         self._camera_from_ct = sample_pose(pose, anatomy_ct.organ, up_lps, near_mm, rng)
-        bed = Bed(reduced_organ(anatomy_ct, up, config.body, rng), up, seed)
-        self._swollen = bed.under("swell", expand, config.swell)
-        self._pushes: tuple[Indentation, ...] = ()
-        if config.push_mm > 0:
-            self._pushes = indentations(bed, config.places, SHAFT_MM, config.push_mm, rng)
+        organ = self._organ = reduced_organ(anatomy_ct, up, config.body, rng)
+        self._swollen = self._under("swell", ReducedProblem.expand, config.swell)
+        self._pushes = self._indentations(rng) if config.push_mm > 0 else []
         states = [self._swollen, *(push.unknowns(config.push_mm) for push in self._pushes)]
-        self._body = body_of(bed.organ, np.array(states, np.float32)[:, : bed.organ.n_modes])
-        self._down_the_body = _down_the_body(up)
+        self._body = body_of(organ, np.array(states, np.float32)[:, : organ.n_modes])
+        inferior = np.array([0.0, 0.0, -1.0])
+        along = inferior - (inferior @ up) * up  # for a body that stands, any direction
+        self._down_the_body = perpendicular(up) if np.linalg.norm(along) < 0.1 else unit(along)
         self._vertices = np.concatenate([part.vertices_mm for part in anatomy_ct.parts])
-        self._table = Table.under(anatomy_ct.organ, up)
+        self._table = Table(anatomy_ct.organ, up)
         self._drape = drape(self._table, rng) if config.drape else _NOTHING
         self._rod = rod(SHAFT_MM, _SHAFT_LENGTH_MM) if self._pushes else _NOTHING
         shown = (anatomy_ct.organ, self._drape, self._rod)
         first = np.cumsum([0, *(len(mesh.vertices_mm) for mesh in shown)])
-        self._faces = np.concatenate(
-            [mesh.faces + n for mesh, n in zip(shown, first, strict=False)]
-        )
+        faces = [mesh.faces + n for mesh, n in zip(shown, first, strict=False)]
+        self._faces = np.concatenate(faces)
 
     def state_at(self, t_s: float) -> Instant:
         """Everything at a time from 0 s on. A pure function: no clock, no memory."""
+        if not t_s >= 0:
+            raise InputError(f"time {t_s} s is before the scene's beginning, 0 s.")
         config = self.config
-        breath = np.sin(np.pi * t_s / config.breath_s) ** 4  # Lujan 1999, doi 10.1118/1.598577
-        unknowns = breath * self._swollen
-        depth_mm, away_mm, push = self._push_at(t_s)
-        if push is not None:
+        breath = np.sin(np.pi * t_s / _BREATH_S) ** 4  # Lujan 1999, doi 10.1118/1.598577
+        unknowns, depth_mm, push = breath * self._swollen, 0.0, None
+        number, phase = divmod(t_s / _PUSH_S, 1)
+        if self._pushes:
+            push = self._pushes[int(number) % len(self._pushes)]
+            depth_mm = config.push_mm * float(_DEPTH(phase))
             unknowns = unknowns + push.unknowns(depth_mm)
         modes = self._body.modes.shape[-1]
         coefficients, shift, turn = np.split(unknowns, [modes, modes + 3])
@@ -161,22 +156,19 @@ class ScenePlayer:
         center = self._body.center_ct
         moved = shift + config.breath_mm * breath * self._down_the_body
         room_from_organ = rigid(rotation, center - rotation @ center + moved)
-        velocity = self._body.velocity(coefficients)
-        camera_from_room = self._camera_at(t_s)
-        instant = Instant(t_s, camera_from_room, room_from_organ, coefficients, velocity, depth_mm)
-        if push is None:
-            return instant
-        place = self._deformed(instant, push.place_ct[None])
-        tip = transform_points(room_from_organ, place)[0] + away_mm * push.axis
-        upright = rigid(rotation_onto(np.array([0.0, 0.0, 1.0]), push.axis), tip)
-        return replace(instant, room_from_rod=upright)
+        velocity, room_from_rod = self._body.velocity(coefficients), np.eye(4)
+        if push is not None:
+            place = self._deformed(velocity, push.place_ct[None])
+            away_mm = _AWAY_MM * float(_AWAY(phase))
+            tip = transform_points(room_from_organ, place)[0] + away_mm * push.axis
+            room_from_rod = rigid(rotation_onto(np.array([0.0, 0.0, 1.0]), push.axis), tip)
+        poses = self._camera_at(t_s), room_from_organ, room_from_rod
+        return Instant(t_s, *poses, velocity, depth_mm)
 
-    def carry(
-        self, instant: Instant, points_ct: Float[np.ndarray, "n 3"]
-    ) -> Float64[np.ndarray, "n 3"]:
+    def carry(self, instant: Instant, points_ct: Points) -> Float64[np.ndarray, "n 3"]:
         """Where points of the CT are before the camera."""
         camera_from_organ = instant.camera_from_room @ instant.room_from_organ
-        return transform_points(camera_from_organ, self._deformed(instant, points_ct))
+        return transform_points(camera_from_organ, self._deformed(instant.velocity, points_ct))
 
     def truth(self, instant: Instant) -> Anatomy:
         """The true surfaces, camera frame."""
@@ -199,16 +191,47 @@ class ScenePlayer:
         rng = np.random.default_rng([self._seed, round(instant.t_s * 1e6)])
         return add_noise(clean, self.config.noise, rng)
 
-    def _deformed(self, instant: Instant, points_ct: np.ndarray) -> Float64[np.ndarray, "n 3"]:
-        return self._body.follow(instant.velocity, points_ct, _STEPS).astype(np.float64)
+    def _under(self, what: str, load: Callable[..., None], *how: object) -> np.ndarray:
+        """The organ's unknowns, its tissue and bed drawn by the seed, at rest under a load with its
+        arguments; ``what`` names it in the error."""
+        problem = in_bed(self._organ, self._up, np.random.default_rng([self._seed, 0xBED]))
+        load(problem, *how)
+        found = problem.equilibrium()
+        if found is None:
+            raise InputError(
+                f"the organ does not come to rest under {what}; choose another seed. If that does "
+                "not help, look at the case's pictures."
+            )
+        return found
 
-    def _push_at(self, t_s: float) -> tuple[float, float, Indentation | None]:
-        """Depth, distance from the organ (mm), and which push it is."""
-        if not self._pushes:
-            return 0.0, 0.0, None
-        number, phase = divmod(t_s / self.config.push_s, 1)
-        push = self._pushes[int(number) % len(self._pushes)]
-        return self.config.push_mm * float(_DEPTH(phase)), _AWAY_MM * float(_AWAY(phase)), push
+    def _indentations(self, rng: np.random.Generator) -> list[Indentation]:
+        """By an instrument, of different places that face up."""
+        count, patches = self.config.places, self._organ.patches
+        places, normals = patches.points_mm, patches.normals
+        facing = np.flatnonzero(normals @ self._up > _FACING)
+        if len(facing) < count:
+            raise InputError(
+                f"only {len(facing)} places of the organ face the camera, {count} are to be "
+                "pushed; ask for fewer."
+            )
+        points = places[facing]
+        chosen = [int(rng.integers(len(facing)))]  # farthest point sampling
+        distance = np.full(len(facing), np.inf)
+        while len(chosen) < count:
+            distance = np.minimum(distance, np.linalg.norm(points - points[chosen[-1]], axis=1))
+            chosen.append(int(np.argmax(distance)))
+        made, depths = [], np.linspace(0, self.config.push_mm, _DEPTHS)
+        for patch in facing[chosen].tolist():
+            how = patch, normals[patch], SHAFT_MM + _FOOT_MM
+            poke = partial(self._under, "poke", ReducedProblem.indent, *how)
+            states = [poke(depth) for depth in depths.tolist()]
+            unknowns = PchipInterpolator(depths, np.stack(states) - states[0])
+            axis = _clearest_axis(places - places[patch], normals[patch])
+            made.append(Indentation(places[patch], axis, unknowns))
+        return made
+
+    def _deformed(self, velocity: np.ndarray, points_ct: Points) -> Float64[np.ndarray, "n 3"]:
+        return self._body.follow(velocity, points_ct, _STEPS).astype(np.float64)
 
     def _camera_at(self, t_s: float) -> Float64[np.ndarray, "4 4"]:
         """A slow sway about the organ's centre."""
@@ -219,30 +242,32 @@ class ScenePlayer:
         return swayed @ self._camera_from_ct
 
 
-def _down_the_body(up: Float64[np.ndarray, " 3"]) -> Float64[np.ndarray, " 3"]:
-    """Inferior along the table; for a body that stands, any direction along it."""
-    inferior = np.array([0.0, 0.0, -1.0])
-    along = inferior - (inferior @ up) * up
-    return perpendicular(up) if np.linalg.norm(along) < 0.1 else unit(along)
+def _clearest_axis(offset_mm: np.ndarray, outward: np.ndarray) -> np.ndarray:
+    """The direction of a shaft that stays farthest from the organ, of those of equal rise;
+    ``offset_mm``: of the organ's places from the shaft's tip."""
+    one = perpendicular(outward)
+    other, rise = np.cross(outward, one), np.deg2rad(_RISE_DEGREES)
+
+    def gap(axis: np.ndarray) -> float:
+        along = offset_mm @ axis
+        apart = np.linalg.norm(offset_mm - np.outer(along, axis), axis=1)
+        return float((apart[along > 10] / along[along > 10]).min(initial=np.inf))
+
+    turns = np.arange(_SIDES) * 2 * np.pi / _SIDES
+    aside = [np.cos(angle) * one + np.sin(angle) * other for angle in turns]
+    return max((np.sin(rise) * outward + np.cos(rise) * way for way in aside), key=gap)
 
 
-@dataclass(frozen=True, eq=False)
 class Table:
-    """The plane under an organ, and how the organ rises over it; CT frame."""
+    """The plane on which an organ lies, and how the organ rises over it; CT frame. ``up`` is a unit
+    vector, ``origin`` lies under the organ's middle."""
 
-    origin: Float64[np.ndarray, " 3"]  # under the organ's middle
-    up: Float64[np.ndarray, " 3"]
-    organ_height_mm: float
-    organ_radius_mm: float
-
-    @classmethod
-    def under(cls, organ: Mesh, up: Float64[np.ndarray, " 3"]) -> Table:
-        """The plane on which an organ lies; ``up`` is a unit vector."""
+    def __init__(self, organ: Mesh, up: Float64[np.ndarray, " 3"]) -> None:
         heights, middle = organ.vertices_mm @ up, organ.box_mm.mean(0)
         offset = organ.vertices_mm - middle
-        radius_mm = np.linalg.norm(offset - np.outer(offset @ up, up), axis=1).mean()
-        origin = middle - up * (middle @ up - heights.min())
-        return cls(origin, up, float(np.ptp(heights)), float(radius_mm))
+        across = np.linalg.norm(offset - np.outer(offset @ up, up), axis=1)
+        self.up, self.origin = up, middle - up * (middle @ up - heights.min())
+        self.organ_height_mm, self.organ_radius_mm = np.ptp(heights), across.mean()
 
     def depth_mm(
         self, camera_from_room: Float64[np.ndarray, "4 4"], intrinsics: Intrinsics

@@ -1,4 +1,4 @@
-"""One scene from a recipe: pose, deformation, depth image, cloud, labelled points.
+"""One scene from a recipe (pose, deformation, depth image, cloud, labelled points), and streams.
 
 A recipe is (seed, stream, index); with the case and the configuration it replays bit for bit on
 the same machine and versions. Elsewhere last digits may differ: compiled code may reorder sums,
@@ -9,33 +9,46 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Literal
+from functools import cached_property, lru_cache
+from typing import Any, Literal, NamedTuple
 
 import msgspec
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float32, Float64, Num, UInt8
 from scipy.spatial import ConvexHull
+from scipy.spatial.transform import Rotation
 
 from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError, NoEstimate, TumortrackError
-from tumortrack.core.geometry import transform_points
-from tumortrack.core.types import Anatomy, DepthFrame, Mesh, OccupancySamples, SensorCloud
+from tumortrack.core.geometry import rigid, rotation_onto, transform_points
+from tumortrack.core.types import Anatomy, DepthFrame, Mesh, SensorCloud
 from tumortrack.sense.camera import d405, project
 from tumortrack.sense.cloud import FEWEST_POINTS, CloudConfig, cloud_from_depth
 from tumortrack.sense.clutter import ClutterConfig, add_clutter
 from tumortrack.sense.noise import CalibrationConfig, NoiseConfig, add_noise, miscalibrate
 from tumortrack.sense.occlusion import OcclusionConfig, occlude
 from tumortrack.sense.render import Visibility, render_depth
-from tumortrack.simulate import deform as deformations
-from tumortrack.simulate.deform import DragConfig
+from tumortrack.simulate.deform import ChainConfig, DragConfig, RestConfig, installed, links_of
 from tumortrack.simulate.deform.base import Deformation, Points, View
-from tumortrack.simulate.deform.chain import links_of
 from tumortrack.simulate.elastic.body import BodyConfig, ElasticBody, build_body
 from tumortrack.simulate.occupancy import OccupancyConfig, PointSource
-from tumortrack.simulate.pose import PoseConfig, sample_pose
 
 STREAMS = ("train", "validation", "test")
 ATTEMPTS = 20  # draws of a recipe until one shows enough of the organ
+
+
+class PoseConfig(Config, frozen=True):
+    """Random poses of the organ.
+
+    ``full``: every rotation, uniformly (the paper's M_full). ``limited``: any rotation about the
+    camera's axis, tilts about X and Y uniform within ``tilt_deg`` of the direction that faces
+    the camera (the paper's M_lim, section Experiments).
+    """
+
+    rotations: Literal["full", "limited"] = "limited"
+    tilt_deg: float = 15.0
+    nearest_mm: tuple[float, float] = (110.0, 125.0)  # depth of the organ's nearest point
+    sideways_mm: float = 15.0  # the organ's centre may lie this far off the camera's axis
 
 
 class SceneConfig(Config, frozen=True):
@@ -52,7 +65,8 @@ class SceneConfig(Config, frozen=True):
     width: int = 424
     height: int = 240
     pose: PoseConfig = PoseConfig()
-    deform: tuple[deformations.DeformConfig, ...] = (DragConfig(),)  # one a scene, drawn uniformly
+    # One a scene, drawn uniformly.
+    deform: tuple[installed.LinkConfig | ChainConfig | RestConfig, ...] = (DragConfig(),)
     clutter: ClutterConfig = ClutterConfig()
     noise: NoiseConfig = NoiseConfig()
     cloud: CloudConfig = CloudConfig()
@@ -64,9 +78,7 @@ class SceneConfig(Config, frozen=True):
     cloud_points: tuple[int, int] | None = None
 
     def __post_init__(self) -> None:
-        if self.cloud_points is None:
-            return
-        fewest, most = self.cloud_points
+        fewest, most = self.cloud_points or (FEWEST_POINTS, FEWEST_POINTS)
         if not FEWEST_POINTS <= fewest <= most:
             raise InputError(
                 f"cloud_points is {fewest}..{most}; it must be a rising range from "
@@ -93,27 +105,11 @@ class SceneRecipe:
 
 
 @dataclass(frozen=True, eq=False)
-class TrainingPair:
-    """What training needs of a scene."""
-
-    cloud: SensorCloud
-    samples: OccupancySamples
-    camera_from_ct: Float64[np.ndarray, "4 4"]  # the organ's pose, without its deformation
-
-
-@dataclass(frozen=True, eq=False)
-class SceneDraw:
-    """What is drawn before the image is rendered."""
-
-    free: bool  # seen from any distance and not cropped
-    camera_from_ct: Float64[np.ndarray, "4 4"]
-    deformation: Deformation
-
-
-@dataclass(frozen=True, eq=False)
-class RenderedScene(SceneDraw):
+class RenderedScene:
     """A scene before points are labelled: where the organ lies, and what the camera sees of it."""
 
+    camera_from_ct: Float64[np.ndarray, "4 4"]  # the organ's pose, without its deformation
+    deformation: Deformation
     frame: DepthFrame
     cloud: SensorCloud
 
@@ -139,12 +135,13 @@ class Simulator:
         corners = vertices[ConvexHull(vertices).vertices]  # the farthest in any direction
         self._hull_ct = Mesh(corners, np.empty((0, 3)))
 
-    def pair(self, recipe: SceneRecipe, pool: PointSource) -> TrainingPair:
-        """The scene's cloud and its labelled points, camera frame."""
+    def pair(
+        self, recipe: SceneRecipe, pool: PointSource
+    ) -> tuple[RenderedScene, Float32[np.ndarray, "n 3"], UInt8[np.ndarray, " n"]]:
+        """The scene, and its labelled points, camera frame."""
         scene, rng = self._render(recipe)
         points_ct, labels = pool.draw(rng)
-        samples = OccupancySamples(scene.carry(points_ct), labels)
-        return TrainingPair(scene.cloud, samples, scene.camera_from_ct)
+        return scene, scene.carry(points_ct).astype(np.float32, copy=False), labels
 
     def render(self, recipe: SceneRecipe) -> RenderedScene:
         """Pose, deformation, depth image and cloud of a recipe."""
@@ -152,39 +149,38 @@ class Simulator:
 
     def reference(self, scene: RenderedScene) -> Anatomy:
         """The anatomy as it lies in the scene, camera frame."""
-        return Anatomy(
-            tuple(part.moved(scene.carry(part.vertices_mm)) for part in self.anatomy_ct.parts)
-        )
+        parts = self.anatomy_ct.parts
+        return Anatomy(tuple(part.moved(scene.carry(part.vertices_mm)) for part in parts))
 
-    def draw(self, rng: np.random.Generator) -> SceneDraw:
-        """Pose and deformation of the next scene of this generator."""
+    def draw(
+        self, rng: np.random.Generator
+    ) -> tuple[Float64[np.ndarray, "4 4"], Deformation, bool]:
+        """Of the next scene of this generator: ``camera_from_ct``, deformation, and whether it is
+        seen from any distance and not cropped."""
         config = self.config
         free = bool(rng.uniform() < config.free_range)
         nearest = config.free_nearest_mm if free else config.pose.nearest_mm
         camera_from_ct = sample_pose(config.pose, self._hull_ct, self.up_lps, nearest, rng)
         model = config.deform[rng.integers(len(config.deform))]
-        return SceneDraw(free, camera_from_ct, model.sample(self._view(camera_from_ct), rng))
+        return camera_from_ct, model.sample(self._view(camera_from_ct), rng), free
 
     def _render(self, recipe: SceneRecipe) -> tuple[RenderedScene, np.random.Generator]:
+        config, organ = self.config, self.anatomy_ct.organ
         for attempt in range(ATTEMPTS):
             rng = recipe.generator(attempt)
+            camera_from_ct, deformation, free = self.draw(rng)
+            vertices = transform_points(camera_from_ct, deformation.apply(organ.vertices_mm))
+            frame = render_depth(vertices, organ.faces, self._intrinsics)
+            frame = add_clutter(frame, config.clutter, rng)
+            frame = occlude(frame, config.occlusion, rng)  # hides background too
+            frame = miscalibrate(frame, config.calibration, rng)
+            frame = add_noise(frame, config.noise, rng)
             try:
-                return self._attempt(rng), rng
+                cloud = cloud_from_depth(frame, crop_of(config, free, rng), rng)
             except NoEstimate:  # the crop left too few points: another draw of the same recipe
                 continue
+            return RenderedScene(camera_from_ct, deformation, frame, cloud), rng
         raise shows_nothing(recipe)
-
-    def _attempt(self, rng: np.random.Generator) -> RenderedScene:
-        config, organ, drawn = self.config, self.anatomy_ct.organ, self.draw(rng)
-        deformed = drawn.deformation.apply(organ.vertices_mm)
-        vertices = transform_points(drawn.camera_from_ct, deformed)
-        frame = render_depth(vertices, organ.faces, self._intrinsics)
-        frame = add_clutter(frame, config.clutter, rng)
-        frame = occlude(frame, config.occlusion, rng)  # hides background too
-        frame = miscalibrate(frame, config.calibration, rng)
-        frame = add_noise(frame, config.noise, rng)
-        cloud = cloud_from_depth(frame, crop_of(config, drawn.free, rng), rng)
-        return RenderedScene(**vars(drawn), frame=frame, cloud=cloud)
 
     def _view(self, camera_from_ct: Float64[np.ndarray, "4 4"]) -> View:
         eye_ct, camera = np.linalg.inv(camera_from_ct)[:3, 3], self._intrinsics
@@ -196,6 +192,96 @@ class Simulator:
             return pictured & self._visibility(points_ct, eye_ct)
 
         return View(self.anatomy_ct, visible, self.body)
+
+
+def sample_pose(
+    config: PoseConfig,
+    organ_ct: Mesh,
+    up_lps: tuple[float, float, float],
+    nearest_mm: tuple[float, float],
+    rng: np.random.Generator,
+) -> Float64[np.ndarray, "4 4"]:
+    """Draw ``camera_from_ct``; the organ's nearest point gets a depth within ``nearest_mm``."""
+    if config.rotations == "full":
+        rotation = Rotation.random(rng=rng).as_matrix()
+    else:
+        spin = rng.uniform(0, 360)
+        tilt_x, tilt_y = rng.uniform(-config.tilt_deg, config.tilt_deg, 2)
+        rotation = _turn(*np.radians([tilt_x, tilt_y, spin])) @ _facing(up_lps)
+    rotated = rotation @ organ_ct.vertices_mm.T  # (3, v): minima along rows are fast
+    lower, upper = rotated.min(1), rotated.max(1)
+    offset = rng.uniform(-config.sideways_mm, config.sideways_mm, 2)
+    nearest = rng.uniform(*nearest_mm)
+    centre = (lower + upper) / 2
+    return rigid(rotation, np.array([*(offset - centre[:2]), nearest - lower[2]]))
+
+
+def _turn(about_x: float, about_y: float, about_z: float) -> Float64[np.ndarray, "3 3"]:
+    """A rotation about z, then y, then x, all fixed axes; radians. (Scipy's Rotation takes a
+    twentieth of a scene's time for a single one.)"""
+    sx, sy, sz = np.sin([about_x, about_y, about_z]).tolist()
+    cx, cy, cz = np.cos([about_x, about_y, about_z]).tolist()
+    first = [cy * cz, -cy * sz, sy]
+    second = [cx * sz + sx * sy * cz, cx * cz - sx * sy * sz, -sx * cy]
+    third = [sx * sz - cx * sy * cz, sx * cz + cx * sy * sz, cx * cy]
+    return np.array([first, second, third])
+
+
+@lru_cache(maxsize=64)
+def _facing(up_lps: tuple[float, float, float]) -> Float64[np.ndarray, "3 3"]:
+    """The rotation that turns the organ's upper side towards the camera."""
+    turn = rotation_onto(np.array(up_lps), np.array([0.0, 0.0, -1.0]))
+    turn.flags.writeable = False
+    return turn
+
+
+class Batch(NamedTuple):
+    """Scenes stacked; camera frame, mm."""
+
+    clouds_mm: Float32[np.ndarray, "b n 3"]
+    points_mm: Float32[np.ndarray, "b q 3"]
+    labels: UInt8[np.ndarray, "b q"]
+    camera_from_ct: Float32[np.ndarray, "b 4 4"]
+
+
+@dataclass(frozen=True, eq=False)
+class SceneStream:
+    """Batch ``i`` holds the recipes ``i * size ... i * size + size - 1``, so that worker processes
+    and resumed runs see the same data. Picklable."""
+
+    anatomy_ct: Anatomy
+    up_lps: tuple[float, float, float]
+    config: SceneConfig
+    pool: PointSource
+    seed: int
+    stream: Literal["train", "validation", "test"]
+    batch_size: int
+    body: ElasticBody | None = None  # built once by the caller, for elastic deformations
+
+    @cached_property
+    def simulator(self) -> Simulator:
+        """Built where it is used: ray trees cannot be pickled."""
+        return Simulator(self.anatomy_ct, self.up_lps, self.config, self.body)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {k: v for k, v in self.__dict__.items() if k != "simulator"}
+
+    def batch(self, index: int) -> Batch:
+        """The batch with this number."""
+        first, n = index * self.batch_size, self.config.cloud.n_points
+        rows = []
+        for number in range(first, first + self.batch_size):
+            recipe = SceneRecipe(self.seed, self.stream, number)
+            scene, points_mm, labels = self.simulator.pair(recipe, self.pool)
+            cloud_mm = refill(scene.cloud.points_mm, n)
+            rows.append((cloud_mm, points_mm, labels, scene.camera_from_ct.astype(np.float32)))
+        return Batch(*map(np.stack, zip(*rows, strict=True)))
+
+
+def refill(points_mm: Num[np.ndarray, m * row], n: int) -> Num[np.ndarray, n * row]:
+    """A cloud of fewer than ``n`` points repeats them, so that clouds stack; max pooling is not
+    affected."""
+    return points_mm[np.arange(n) % len(points_mm)]
 
 
 def shows_nothing(recipe: SceneRecipe) -> TumortrackError:
@@ -221,13 +307,11 @@ def body_for(
     """The organ's elastic body where a deformation of the configuration needs it, else None.
 
     Where every rotation of the organ is shown (``full``), its bed lies on any side of it.
-
-    Raises:
-        InputError: elastic deformations that ask for different bodies.
+    Deformations that ask for different bodies raise InputError.
     """
     links = (link for model in config.deform for link in links_of(model))
-    asked = (getattr(link, "body", None) for link in links)
-    wanted = {body for body in asked if isinstance(body, BodyConfig)}
+    bodies = (getattr(link, "body", None) for link in links)
+    wanted = {body for body in bodies if isinstance(body, BodyConfig)}
     if len(wanted) > 1:
         raise InputError(
             "the scene configuration has elastic deformations with different bodies; give them "

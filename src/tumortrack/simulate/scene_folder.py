@@ -1,17 +1,21 @@
 """One scene on disk: what the sensor saw and the truth, in files that other programs can make.
 
 cloud.ply (camera frame, mm), depth.png (16 bit, steps of 0.1 mm) with intrinsics.json, kidney.ply,
-tumor_1.ply, ... (the truth, camera frame, mm), targets.csv (inner points in both frames) and
-meta.json. Depth, targets and meta.json may be absent.
+tumor_1.ply, ... (the truth, camera frame, mm), targets.csv (points inside the organ: label, ct_x,
+ct_y, ct_z in LPS, camera_x, camera_y, camera_z; mm) and meta.json. Depth, targets and meta.json may
+be absent.
 """
 
 from __future__ import annotations
 
+import csv
+import io
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float, Float64, UInt8
 
 from tumortrack.core.errors import InputError
 from tumortrack.core.mesh_files import read_anatomy, write_anatomy
@@ -20,7 +24,7 @@ from tumortrack.core.types import Anatomy, DepthFrame, SensorCloud
 from tumortrack.imaging.meshes import mesh_of, solid_of
 from tumortrack.sense.files import depth_png, intrinsics_json, read_cloud, read_depth_png
 from tumortrack.sense.ply import write_cloud_ply
-from tumortrack.simulate.targets import Targets, read_targets, write_targets
+from tumortrack.simulate.occupancy import contains, labels_of
 
 # Our own scenes state in meta.json that kidney.ply is the whole organ, tumors included.
 _UNITED = "organ_includes_tumors"
@@ -28,16 +32,37 @@ _STAMP = "stamp_ns"
 _TARGETS = "targets.csv"
 _STICKS_OUT = 0.02  # of a tumor's volume: smoothing alone lets it stick out by less
 _ORGAN_SIZE_MM = (5.0, 1000.0)
+TARGETS = 200
+_COLUMNS = ("label", *(f"{frame}_{axis}" for frame in ("ct", "camera") for axis in "xyz"))
+
+
+@dataclass(frozen=True, eq=False)
+class Targets:
+    """Points in the undeformed CT (LPS, mm), their true places before the camera (mm), labels."""
+
+    points_ct: Float64[np.ndarray, "n 3"]
+    points_mm: Float[np.ndarray, "n 3"]
+    labels: UInt8[np.ndarray, " n"]
+
+
+@dataclass(frozen=True, eq=False)
+class InnerPoints:
+    """Points inside the undeformed anatomy, CT frame (LPS), mm, with their labels."""
+
+    points_ct: Float64[np.ndarray, "n 3"]
+    labels: UInt8[np.ndarray, " n"]
+
+    def at(self, points_mm: Float[np.ndarray, "n 3"]) -> Targets:
+        """These points as targets of a scene in which they lie there (camera frame)."""
+        return Targets(self.points_ct, points_mm, self.labels)
 
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """An observed cloud and the truth behind it, camera frame, mm.
-
-    ``reference.parts[0]`` is the whole organ, tumors included. ``depth`` is the image that the
-    cloud was taken from, where it is known; ``meta`` is plain JSON (recipe, origin, ...);
-    ``targets`` are inner points with known positions in the CT.
-    """
+    """An observed cloud and the truth behind it, camera frame, mm. ``reference.parts[0]`` is the
+    whole organ, tumors included; ``depth`` the image that the cloud was taken from, where it is
+    known; ``meta`` plain JSON (recipe, origin, ...); ``targets`` inner points with known positions
+    in the CT."""
 
     cloud: SensorCloud
     reference: Anatomy
@@ -46,34 +71,29 @@ class Scene:
     targets: Targets | None = None
 
     def write(self, folder: str | Path) -> None:
-        """See ``write_scene``."""
-        write_scene(Path(folder), self)
+        """Write a scene folder, all or nothing.
 
-
-def write_scene(folder: Path, scene: Scene) -> None:
-    """Write a scene folder, all or nothing.
-
-    Raises:
-        InputError: the folder exists already.
-        StorageError: the disk refused.
-    """
-    with new_folder(folder) as aside:
-        write_scene_files(aside, scene)
+        Raises:
+            InputError: the folder exists already.
+            StorageError: the disk refused.
+        """
+        with new_folder(Path(folder)) as aside:
+            write_scene_files(aside, self)
 
 
 def write_scene_files(folder: Path, scene: Scene) -> None:
-    """A scene's files into a folder that is being filled aside.
-
-    Raises:
-        StorageError: the disk refused.
-    """
+    """A scene's files into a folder that is being filled aside; raises StorageError."""
     write_cloud_ply(folder / "cloud.ply", scene.cloud.points_mm)
     if scene.depth is not None:
         write_atomically(folder / "depth.png", depth_png(scene.depth))
         write_json(folder / "intrinsics.json", intrinsics_json(scene.depth.intrinsics))
     write_anatomy(folder, scene.reference)
     if scene.targets is not None:
-        write_targets(folder / _TARGETS, scene.targets)
+        points = scene.targets.points_ct, scene.targets.points_mm
+        table, text = np.column_stack([scene.targets.labels, *points]), io.StringIO()
+        numbers, head = ["%d", *["%.5f"] * 6], ",".join(_COLUMNS)  # to 0.01 micrometres
+        np.savetxt(text, table, numbers, delimiter=",", header=head, comments="")
+        write_atomically(folder / _TARGETS, text.getvalue().encode())
     meta = {**scene.meta, "units": "mm", "frame": "camera", _STAMP: scene.cloud.stamp_ns}
     write_json(folder / "meta.json", {**meta, _UNITED: True})
 
@@ -104,41 +124,29 @@ def read_scene(folder: Path) -> Scene:
     stamp_ns = meta.get(_STAMP, 0)
     if not isinstance(stamp_ns, int):
         raise InputError(f"{folder / 'meta.json'}: {_STAMP} must be a whole number of ns.")
-    cloud, _ = read_cloud(folder / "cloud.ply")
-    targets = read_targets(folder / _TARGETS) if (folder / _TARGETS).exists() else None
-    cloud = SensorCloud(cloud.points_mm, stamp_ns)
-    return Scene(cloud, reference, _depth(folder), meta, targets)
+    depth, camera, table = (folder / name for name in ("depth.png", "intrinsics.json", _TARGETS))
+    if depth.exists() and not camera.exists():
+        raise InputError(f"{folder} has depth.png but lacks intrinsics.json, which explains it.")
+    cloud = SensorCloud(read_cloud(folder / "cloud.ply")[0].points_mm, stamp_ns)
+    frame = read_depth_png(depth, camera) if depth.exists() else None
+    targets = read_targets(table) if table.exists() else None
+    return Scene(cloud, reference, frame, meta, targets)
 
 
 def list_scenes(folder: Path) -> list[Path]:
-    """The scene folders (those with a kidney.ply or cloud.ply) in a folder, by name.
-
-    Raises:
-        InputError: no such folder, or no scene in it.
-    """
+    """The scene folders (those with a kidney.ply or cloud.ply) in a folder, by name; InputError
+    where there is none."""
     if not folder.is_dir():
         raise InputError(f"{folder} does not exist or is no folder.")
-    scenes = sorted(
-        path
-        for path in folder.iterdir()
-        if not path.name.startswith(".")
-        and ((path / "kidney.ply").is_file() or (path / "cloud.ply").is_file())
-    )
+    names = ("kidney.ply", "cloud.ply")
+    found = (path for path in folder.iterdir() if any((path / name).is_file() for name in names))
+    scenes = sorted(path for path in found if not path.name.startswith("."))
     if not scenes:
         raise InputError(
             f"{folder} holds no scenes: none of its folders has a cloud.ply and a kidney.ply. "
             "Make some with: tumortrack simulate CASE DATASET."
         )
     return scenes
-
-
-def _depth(folder: Path) -> DepthFrame | None:
-    image, camera = folder / "depth.png", folder / "intrinsics.json"
-    if not image.exists():
-        return None
-    if not camera.exists():
-        raise InputError(f"{folder} has depth.png but lacks intrinsics.json, which explains it.")
-    return read_depth_png(image, camera)
 
 
 def _check_parts(folder: Path, anatomy: Anatomy) -> None:
@@ -167,3 +175,58 @@ def _united(folder: Path, anatomy: Anatomy) -> Anatomy:
         if joined.volume() - organ.volume() > _STICKS_OUT * tumor.volume():
             organ = joined
     return anatomy if organ is whole else Anatomy((mesh_of(organ), *anatomy.tumors))
+
+
+def draw_targets(anatomy_ct: Anatomy, seed: int) -> InnerPoints:
+    """``TARGETS`` points spread evenly inside each part: half of them in the parenchyma, the others
+    shared by the tumors (all in the organ where it has none). A tumor that others cover and a
+    negative seed raise InputError."""
+    if seed < 0:
+        raise InputError(f"seed {seed} must be 0 or more.")
+    rng = np.random.default_rng([seed, 1000])
+    n_tumors = len(anatomy_ct.tumors)
+    inside = TARGETS // 2 if n_tumors else TARGETS
+    each = np.full(n_tumors, (TARGETS - inside) // max(n_tumors, 1))
+    each[: TARGETS - inside - each.sum()] += 1
+    points, counts = [], [inside, *each.tolist()]
+    for label, (part, wanted) in enumerate(zip(anatomy_ct.parts, counts, strict=True), start=1):
+        found = np.zeros((0, 3))
+        for _ in range(40):
+            if len(found) >= wanted:
+                break
+            low, high = part.box_mm
+            drawn = low + rng.random((4 * TARGETS, 3)) * (high - low)
+            drawn = drawn[contains(part, drawn)]
+            found = np.concatenate([found, drawn[labels_of(anatomy_ct, drawn) == label]])
+        else:
+            name = anatomy_ct.names[label - 1]
+            raise InputError(f"{name} has no room for target points: other tumors cover it.")
+        points.append(found[:wanted])
+    labels = np.repeat(np.arange(1, len(counts) + 1, dtype=np.uint8), counts)
+    return InnerPoints(np.concatenate(points), labels)
+
+
+def read_targets(path: Path) -> Targets:
+    """Read targets.csv, ours or another program's; further columns are not looked at. Missing
+    columns or rows, and values that are no finite numbers, raise InputError."""
+    try:
+        with path.open(encoding="utf-8-sig", newline="") as stream:
+            rows = list(csv.DictReader(stream))
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise InputError(f"{path} cannot be read as a table: {error}.") from error
+    lacks = [name for name in _COLUMNS if not rows or name not in rows[0]]
+    if lacks:
+        raise InputError(
+            f"{path} has no rows, or lacks the columns {', '.join(lacks)}. Targets need "
+            f"{','.join(_COLUMNS)}; remove the file if the scene has none."
+        )
+    try:
+        table = np.array([[float(row[name]) for name in _COLUMNS] for row in rows])
+        if not np.isfinite(table).all():
+            raise ValueError("NaN or infinite")
+        labels = table[:, 0]
+        if not np.isin(labels, np.arange(1, 256)).all():
+            raise ValueError("labels must be 1 (organ), 2, 3, ... (tumors)")
+    except (TypeError, ValueError, OverflowError) as error:
+        raise InputError(f"{path} has a row that is no target: {error}.") from error
+    return Targets(table[:, 1:4], table[:, 4:], labels.astype(np.uint8))

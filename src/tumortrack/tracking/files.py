@@ -12,8 +12,7 @@ from tumortrack.core.mesh_files import write_mesh
 from tumortrack.imaging.nifti import write_nifti
 from tumortrack.imaging.segmentation import segments, write_seg_nrrd
 from tumortrack.sense.ply import write_cloud_ply
-from tumortrack.tracking.point_table import PointTable
-from tumortrack.tracking.points import camera_table
+from tumortrack.tracking.points import PointTable, camera_table
 
 
 def write_estimate(
@@ -29,24 +28,16 @@ def write_estimate(
         NoEstimate: the motion has no answer for a point.
         StorageError: the disk refused.
     """
+    cloud, volume = estimate.cloud, estimate.volume
+    assert volume is not None  # live estimates are the recording sink's
     with store.new_folder(folder, overwrite) as aside:
-        cloud = estimate.cloud
-        write_cloud_ply(
-            aside / "occupancy.ply",
-            cloud.points_mm,
-            label=cloud.labels,
-            probability=cloud.probability,
-            **_places_in_ct(estimate),
-        )
-        volume = estimate.volume
-        assert volume is not None  # live estimates are the recording sink's
-        write_nifti(aside / "labels.nii.gz", volume.labels, volume.camera_from_index, lps=False)
-        write_seg_nrrd(
-            aside / "labels.seg.nrrd",
-            volume.labels,
-            volume.camera_from_index,
-            segments(estimate.report["parts"]),
-        )
+        values = {"label": cloud.labels, "probability": cloud.probability}
+        values |= _places_in_ct(estimate)
+        write_cloud_ply(aside / "occupancy.ply", cloud.points_mm, **values)
+        labels, way = volume.labels, volume.camera_from_index
+        write_nifti(aside / "labels.nii.gz", labels, way, lps=False)
+        parts = segments(estimate.report["parts"])
+        write_seg_nrrd(aside / "labels.seg.nrrd", labels, way, parts)
         for name, mesh in estimate.meshes.items():
             write_mesh(aside / f"{name}.ply", mesh)
         if points is not None:

@@ -3,21 +3,27 @@
 points.csv: a header, columns separated by commas, coordinates in mm in one of four namings:
 ct_x, ct_y, ct_z or x, y, z or l, p, s (all LPS), or r, a, s (RAS, turned to LPS here). Further
 columns (label, name, ...) are kept as they are.
+
+Markups of 3D Slicer (.mrk.json, .fcsv): it shows RAS and writes LPS; either may stand in a file,
+which says so. Format:
+https://slicer.readthedocs.io/en/latest/developer_guide/modules/markups.html
 """
 
 from __future__ import annotations
 
 import csv
 import io
+import re
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
+import msgspec
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Float64
 
 from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.estimate import Motion
-from tumortrack.tracking.markups import parse_fcsv, parse_markups_json
-from tumortrack.tracking.point_table import PointTable, numbers_of, text_of
 
 FAR_MM = 100.0  # from the organ's box: such a point is hardly meant
 _NEAR_MM = 20.0  # a point about the organ, where another reading of the file is weighed
@@ -29,14 +35,32 @@ _NAMINGS: dict[tuple[str, str, str], tuple[int, int, int]] = {
     ("r", "a", "s"): (-1, -1, 1),
 }
 _ANSWER = ("camera_x", "camera_y", "camera_z", "std_mm")
+_Signs = tuple[float, float, float]
+_LPS_FROM: dict[str, _Signs] = {"LPS": (1.0, 1.0, 1.0), "RAS": (-1.0, -1.0, 1.0)}
+_OLD_NUMBERS = {"0": "RAS", "1": "LPS"}  # how .fcsv named them before Slicer 4.11
+_Placed = tuple[str, str, list[str], bool, _Signs]  # label, description, position, whether placed
+_STATUS, _PLACED = 14, "2"  # a field that .fcsv has without naming it, and what it should say
+
+
+@dataclass(frozen=True, eq=False)
+class PointTable:
+    """Points of the CT (LPS, mm) and what their file says of each, as text.
+
+    ``notes`` tell what a user must know of how the file was read.
+    """
+
+    points_ct: Float64[np.ndarray, "n 3"]
+    columns: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+    notes: tuple[str, ...] = ()
 
 
 def read_points(path: Path) -> PointTable:
     """Read points.csv, or a 3D Slicer markups file (.fcsv, .mrk.json).
 
     Raises:
-        InputError: no such file, another format, no points, a value that is no finite number, or
-            a Slicer file whose coordinate system is neither LPS nor RAS.
+        InputError: no such file, another format or unit, no points, a value that is no finite
+            number, or a Slicer file whose coordinate system is neither LPS nor RAS.
     """
     try:
         if path.stat().st_size > _MOST_BYTES:
@@ -45,21 +69,17 @@ def read_points(path: Path) -> PointTable:
     except OSError as error:
         raise InputError(f"{path} cannot be read: {error.strerror}.") from error
     name = path.name.lower()
-    if name.endswith(".json"):
-        table = parse_markups_json(content, str(path))
-    elif name.endswith(".fcsv"):
-        table = parse_fcsv(text_of(content, str(path)), str(path))
-    elif name.endswith(".csv"):
-        table = _parse_csv(text_of(content, str(path)), str(path))
-    else:
+    parse = next((parse for end, parse in _PARSERS.items() if name.endswith(end)), None)
+    if parse is None:
         raise InputError(f"{path}: points come as .csv, or from 3D Slicer as .fcsv or .mrk.json.")
+    table = parse(content, str(path))
     if len(table.points_ct) == 0:
         raise InputError(f"{path} holds no points.")
     return table
 
 
-def _parse_csv(text: str, name: str) -> PointTable:
-    reader = csv.reader(io.StringIO(text, newline=""), strict=True)
+def _parse_csv(content: bytes, name: str) -> PointTable:
+    reader = csv.reader(io.StringIO(_text_of(content, name), newline=""), strict=True)
     try:
         lines = [(reader.line_num, row) for row in reader if any(cell.strip() for cell in row)]
     except csv.Error as error:
@@ -76,23 +96,128 @@ def _parse_csv(text: str, name: str) -> PointTable:
             f"{name}: its first line is {','.join(header)[:80]!r}; it must name the columns x,y,z "
             "(or ct_x,ct_y,ct_z: LPS, mm), separated by commas."
         )
-    where, kept = [lower.index(axis) for axis in naming], []
+    where = [lower.index(axis) for axis in naming]
     points = np.empty((len(lines) - 1, 3))
     for number, (line, row) in enumerate(lines[1:]):
         if len(row) != len(header):
             raise InputError(f"{name}, line {line}: {len(row)} values in {len(header)} columns.")
-        points[number] = numbers_of([row[n] for n in where], f"{name}, line {line}")
-        kept.append(row)
+        points[number] = _numbers_of([row[n] for n in where], f"{name}, line {line}")
     # An answer to an earlier frame may be asked again: the old one gives way.
     stay = [n for n, column in enumerate(lower) if column not in _ANSWER]
     gone = [column for column in header if column.lower() in _ANSWER]
-    notes = (f"{name}: its columns {', '.join(gone)} give way to the answer's.",) if gone else ()
     return PointTable(
         points * np.array(_NAMINGS[naming], float),
         tuple(header[n] for n in stay),
-        tuple(tuple(row[n] for n in stay) for row in kept),
-        notes,
+        tuple(tuple(row[n] for n in stay) for _, row in lines[1:]),
+        (f"{name}: its columns {', '.join(gone)} give way to the answer's.",) if gone else (),
     )
+
+
+class _ControlPoint(msgspec.Struct, rename="camel"):
+    label: str = ""
+    description: str = ""
+    position: list[float] = []
+    position_status: str = "defined"
+
+
+class _Markup(msgspec.Struct, rename="camel"):
+    control_points: list[_ControlPoint] = []
+    coordinate_system: str = "missing"
+    coordinate_units: str | list[str] = "mm"
+
+
+class _Markups(msgspec.Struct):
+    markups: list[_Markup]
+
+
+def _parse_markups(content: bytes, name: str) -> PointTable:
+    """Every control point of every markup in the file."""
+    try:
+        data = msgspec.json.decode(content, type=_Markups)
+    except (msgspec.DecodeError, RecursionError, UnicodeDecodeError) as error:
+        raise InputError(f"{name} is no markups file of 3D Slicer: {error}.") from error
+    points: list[_Placed] = []
+    for markup in data.markups:
+        if set(np.atleast_1d(markup.coordinate_units).tolist()) != {"mm"}:
+            raise InputError(f"{name}: the unit is {markup.coordinate_units!r}; it must be mm.")
+        signs = _signs(markup.coordinate_system, name)
+        points += [
+            (p.label, p.description, [*map(str, p.position)], p.position_status == "defined", signs)
+            for p in markup.control_points
+        ]
+    return _fiducials(points, name)
+
+
+def _parse_fcsv(content: bytes, name: str) -> PointTable:
+    """The points of a fiducial list, whose header names columns and coordinate system."""
+    text = _text_of(content, name)
+    system = re.search(r"^#\s*CoordinateSystem\s*=\s*(\w+)", text, re.MULTILINE)
+    columns = re.search(r"^#\s*columns\s*=(.+)$", text, re.MULTILINE)
+    signs = _signs(system.group(1) if system else "missing", name)
+    names = [n.strip() for n in columns.group(1).split(",")] if columns else []
+    if not {"x", "y", "z"} <= set(names):
+        raise InputError(f"{name}: its header lacks '# columns = id,x,y,z,...'. Save it again.")
+    body = [line for line in text.splitlines() if line.strip() and not line.startswith("#")]
+    try:
+        rows = list(csv.reader(io.StringIO("\n".join(body))))
+    except csv.Error as error:
+        raise InputError(f"{name} is damaged: {error}. Save it again.") from error
+    points: list[_Placed] = []
+    for row in rows:
+        of = dict(zip(names, row, strict=False))
+        placed = len(row) <= _STATUS or row[_STATUS] == _PLACED
+        position = [of.get(axis, "") for axis in "xyz"]
+        points.append((of.get("label", ""), of.get("desc", ""), position, placed, signs))
+    return _fiducials(points, name)
+
+
+def _signs(system: str, name: str) -> _Signs:
+    known = _OLD_NUMBERS.get(system, system)
+    if known not in _LPS_FROM:
+        raise InputError(
+            f"{name}: its coordinate system is {system}; it must be LPS or RAS. Save it in 3D "
+            "Slicer again."
+        )
+    return _LPS_FROM[known]
+
+
+def _fiducials(points: list[_Placed], name: str) -> PointTable:
+    missing = [label for label, _, _, placed, _ in points if not placed]
+    rows, places = [], []
+    for label, description, position, placed, signs in points:
+        if placed:
+            place = np.multiply(_numbers_of(position, f"{name}, point {label!r}"), signs)
+            places.append(place)
+            rows.append((label, description, *(f"{number:.5f}" for number in place)))
+    return PointTable(
+        np.array(places).reshape(-1, 3),
+        ("label", "description", "ct_x", "ct_y", "ct_z"),
+        tuple(rows),
+        (f"{name}: left out what has no place yet: {', '.join(missing)}.",) if missing else (),
+    )
+
+
+_PARSERS = {".json": _parse_markups, ".fcsv": _parse_fcsv, ".csv": _parse_csv}
+
+
+def _text_of(content: bytes, name: str) -> str:
+    """UTF-8 text, with or without a byte order mark."""
+    try:
+        return content.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise InputError(f"{name} is no text in UTF-8: {error}. Save it as CSV (UTF-8).") from error
+
+
+def _numbers_of(texts: list[str], where: str) -> tuple[float, float, float]:
+    """Three finite numbers; ``where`` names the place in the file."""
+    shown = ", ".join(texts)[:80]
+    try:
+        x, y, z = (float(text) for text in texts)
+    except ValueError as error:
+        raise InputError(f"{where}: {shown!r} is no point: it takes x, y, z as numbers.") from error
+    if not np.isfinite([x, y, z]).all():
+        raise InputError(f"{where}: {shown!r} has NaN or infinity; remove the point.")
+    return x, y, z
 
 
 def check_near_organ(
@@ -105,35 +230,35 @@ def check_near_organ(
     """
     lower, upper = organ_box_ct
 
-    def distance(points: np.ndarray) -> np.ndarray:
-        return np.linalg.norm(points - np.clip(points, lower, upper), axis=1)
+    def distance(scale: Any = 1.0) -> np.ndarray:
+        read = points_ct * scale
+        return np.linalg.norm(read - np.clip(read, lower, upper), axis=1)
 
-    def share_near(points: np.ndarray) -> float:
-        return float((distance(points) <= _NEAR_MM).mean())
+    def share_near(scale: Any = 1.0) -> float:
+        return float((distance(scale) <= _NEAR_MM).mean())
 
     box = f"the organ in the CT, {lower.round().tolist()} to {upper.round().tolist()} mm (LPS)"
     tiny = len(points_ct) > 1 and np.abs(points_ct).max() < 1  # as metres are, round the origin
-    if (tiny or share_near(points_ct) == 0) and share_near(1000 * points_ct) >= 0.5:
+    if (tiny or share_near() == 0) and share_near(1000) >= 0.5:
         raise InputError(
             f"{name}: the points are in metres, it seems: times 1000 they lie at {box}. Give mm."
         )
-    if share_near(points_ct) == 0 and share_near(points_ct * [-1, -1, 1]) >= 0.5:
+    if share_near() == 0 and share_near([-1, -1, 1]) >= 0.5:
         raise InputError(
             f"{name}: the points are RAS, it seems: with the other sign of x and y they lie at "
             f"{box}. Turn them to LPS, or name their columns r,a,s."
         )
-    far = distance(points_ct) > FAR_MM
+    far = distance() > FAR_MM
+    away = f"more than {FAR_MM:g} mm away from {box}"
     if far.all():
         raise InputError(
-            f"{name}: every point lies more than {FAR_MM:g} mm away from {box}. Points must be in "
-            "the frame of the CT that the case was made from, LPS, mm."
+            f"{name}: every point lies {away}. Points must be in the frame of the CT that the case "
+            "was made from, LPS, mm."
         )
-    if far.any():
-        return (
-            f"{name}: {far.sum()} of {len(far)} points lie more than {FAR_MM:g} mm away from "
-            f"{box}; nothing is known of how they moved.",
-        )
-    return ()
+    said = (
+        f"{name}: {far.sum()} of {len(far)} points lie {away}; nothing is known of how they moved."
+    )
+    return (said,) if far.any() else ()
 
 
 def camera_table(table: PointTable, motion: Motion | None) -> bytes:

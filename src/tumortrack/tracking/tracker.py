@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float64
@@ -18,24 +18,13 @@ from tumortrack.occupancy.locator import OccupancyLocator
 from tumortrack.occupancy.model import OccupancyModel
 from tumortrack.registration.locator import RegistrationLocator
 from tumortrack.registration.model import RegistrationModel
+from tumortrack.sense.cloud import CloudConfig
+from tumortrack.sense.region import RegionConfig
 
 _ALONE = Following()
 
 
-@runtime_checkable
-class Locator(Protocol):
-    """One method at work; ``Tracker`` documents the calls."""
-
-    anatomy_ct: Anatomy | None
-
-    def locate(self, cloud: SensorCloud, grid: int, seed: int) -> Estimate: ...
-
-    def follow(self, cloud: SensorCloud, last: Estimate | None, how: Following) -> Estimate: ...
-
-    def warm(self) -> None: ...
-
-
-_LOCATORS: dict[type[Model], Callable[[Any], Locator]] = {
+_LOCATORS: dict[type[Model], Callable[[Any], RegistrationLocator | OccupancyLocator]] = {
     RegistrationModel: RegistrationLocator,
     OccupancyModel: OccupancyLocator,
 }
@@ -54,14 +43,12 @@ class Tracker:
 
     @property
     def anatomy_ct(self) -> Anatomy | None:
-        """The organ in the CT (LPS, mm) if this model's estimates have a motion; None for models
-        that know no correspondences."""
+        """The organ in the CT (LPS, mm); None for models that know no correspondences."""
         return self._locator.anatomy_ct
 
     def locate(self, cloud: SensorCloud, grid: int = 160, seed: int = 0) -> Estimate:
-        """Everything about one cloud; the same cloud and seed give the same answer.
-
-        ``grid``: voxels along the longest side of the dense volume.
+        """Everything about one cloud; the same cloud and seed give the same answer. ``grid``:
+        voxels along the longest side of the dense volume.
 
         Raises:
             NoEstimate: too few points, no organ found in them, or they do not show this model's.
@@ -133,9 +120,7 @@ class Follower:
     def last_box_mm(self, stamp_ns: int) -> Float64[np.ndarray, "2 3"] | None:
         """The organ's box in the last estimate (camera frame), if that is recent enough."""
         last = self._recent(stamp_ns)
-        if last is None:
-            return None
-        return next(iter(last.meshes.values())).box_mm
+        return None if last is None else next(iter(last.meshes.values())).box_mm
 
     def locate(self, cloud: SensorCloud) -> Estimate:
         """The estimate of this frame.
@@ -147,15 +132,46 @@ class Follower:
         thorough = (cloud.stamp_ns - self._scanned_ns) * 1e-9 >= self._config.rescan_s
         if last is None or thorough:
             self._scanned_ns = cloud.stamp_ns
-        how = Following(
-            thorough=thorough, smoothing_s=self._config.smoothing_s, seed=self._config.seed
-        )
+        smoothing_s, seed = self._config.smoothing_s, self._config.seed
+        how = Following(thorough=thorough, smoothing_s=smoothing_s, seed=seed)
         self._last = self._tracker.follow(cloud, last, how)
         return self._last
 
     def _recent(self, stamp_ns: int) -> Estimate | None:
-        last = self._last
-        if last is None:
+        if self._last is None:
             return None
-        age_s = (stamp_ns - last.cloud.stamp_ns) * 1e-9
-        return last if 0 <= age_s <= self._config.forget_s else None
+        age_s = (stamp_ns - self._last.cloud.stamp_ns) * 1e-9
+        return self._last if 0 <= age_s <= self._config.forget_s else None
+
+
+def region_for(
+    model: Model | None = None,
+    *,
+    range_mm: tuple[float, float] | None = None,
+    box_mm: tuple[tuple[float, float, float], tuple[float, float, float]] | None = None,
+    whole: bool = False,
+) -> RegionConfig:
+    """Depths that training showed, unless others are given; where it showed any distance, its
+    farthest organ still lies in them whole. Pieces of about the organ's size, if that is known.
+
+    ``box_mm``: opposite corners, camera frame. ``whole``: everything in range is the organ.
+    """
+    if model is None:
+        near, far = range_mm or (CloudConfig().near_mm, CloudConfig().far_mm)
+        return RegionConfig(crop=CloudConfig(near_mm=near, far_mm=far), box_mm=box_mm)
+    scene = model.config.scene
+    near, far = scene.cloud.near_mm, scene.cloud.far_mm
+    if scene.free_range > 0:
+        nearest, farthest = scene.free_nearest_mm
+        near, far = min(near, nearest - 5), max(far, farthest + far - near)
+    near, far = range_mm or (near, far)
+    crop = CloudConfig(near_mm=near, far_mm=far, n_points=scene.cloud.n_points)
+    if whole:
+        return RegionConfig(crop=crop, box_mm=box_mm, plane=False, flying=False, pieces=False)
+    if not isinstance(model, RegistrationModel):
+        return RegionConfig(crop=crop, box_mm=box_mm)
+    vertices = model.shape.anatomy_ct.organ.vertices_mm
+    axes = np.linalg.svd(vertices - vertices.mean(0), full_matrices=False)[2]
+    extents_mm = np.ptp(vertices @ axes.T, axis=0)
+    size_mm = (0.7 * float(extents_mm.min()), 1.25 * float(extents_mm.max()))
+    return RegionConfig(crop=crop, box_mm=box_mm, organ_mm=size_mm)

@@ -10,7 +10,7 @@ the exception: it sees its process's part. The main process alone validates, wri
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from datetime import timedelta
@@ -30,7 +30,8 @@ class ProcessLost(TumortrackError):
 
 @dataclass(frozen=True)
 class ProcessGroup:
-    """Which of how many processes this is, and the device it computes on."""
+    """Which of how many processes this is, and the device it computes on; whatever waits for the
+    others raises ``ProcessLost`` where one has ended."""
 
     device: torch.device
     rank: int = 0
@@ -43,11 +44,7 @@ class ProcessGroup:
         return self.rank == 0
 
     def local_size(self, batch_size: int) -> int:
-        """How many samples of a batch are this process's.
-
-        Raises:
-            InputError: the batch cannot be split equally.
-        """
+        """How many samples of a batch are this process's; InputError where it cannot be split."""
         if batch_size % self.size:
             raise InputError(
                 f"a batch of {batch_size} cannot be shared by {self.size} processes; choose a "
@@ -57,59 +54,40 @@ class ProcessGroup:
 
     def local_batches(self, steps: range) -> range:
         """This process's parts of these steps' batches, as numbers in a stream of such parts."""
-        return range(
-            steps.start * self.size + self.rank, steps.stop * self.size + self.rank, self.size
-        )
+        start, stop = (step * self.size + self.rank for step in (steps.start, steps.stop))
+        return range(start, stop, self.size)
 
     def mean(self, parameters: Iterable[nn.Parameter], value: Tensor) -> Tensor:
-        """Replace gradients by their mean over all processes; returns the mean of ``value``.
-
-        Raises:
-            ProcessLost: another process has ended.
-        """
+        """Replace gradients by their mean over all processes; returns the mean of ``value``."""
         if self.size == 1:
             return value
         gradients = [p.grad for p in parameters if p.grad is not None]
         flat = torch.cat([*(g.flatten() for g in gradients), value.detach().float().flatten()])
-        self._sum(flat)
+        self._together(distributed.all_reduce, flat)
         flat /= self.size
-        parts = flat.split([*(g.numel() for g in gradients), 1])
-        for gradient, part in zip(gradients, parts[:-1], strict=True):
+        *parts, mean = flat.split([*(g.numel() for g in gradients), 1])
+        for gradient, part in zip(gradients, parts, strict=True):
             gradient.copy_(part.view_as(gradient))
-        return parts[-1][0]
+        return mean[0]
 
     def all_reduce(self, elapsed_s: float, stop: bool) -> tuple[float, bool]:
-        """The main process's time, and whether any process is to stop.
-
-        Raises:
-            ProcessLost: another process has ended.
-        """
+        """The main process's time, and whether any process is to stop."""
         if self.size == 1:
             return elapsed_s, stop
         mine = [elapsed_s if self.is_main else 0.0, float(stop)]
         total = torch.tensor(mine, dtype=torch.float64).to(self.device)
-        self._sum(total)
+        self._together(distributed.all_reduce, total)
         elapsed_s, stops = total.tolist()
         return elapsed_s, stops > 0
 
-    def _sum(self, values: Tensor) -> None:
-        with self._lost_process():
-            distributed.all_reduce(values)
-
     def close(self) -> None:
-        """Leave the group.
+        """Leave the group."""
+        self._together(distributed.destroy_process_group)
 
-        Raises:
-            ProcessLost: another process has ended.
-        """
-        with self._lost_process():
-            distributed.destroy_process_group()
-
-    @contextmanager
-    def _lost_process(self) -> Iterator[None]:
-        """One error for what Gloo and NCCL raise where a process is gone."""
+    def _together(self, call: Callable[..., object], *values: Tensor) -> None:
+        """What waits for the others; one error for what Gloo and NCCL raise where one is gone."""
         try:
-            yield
+            call(*values)
         except RuntimeError as error:
             raise ProcessLost(
                 f"process {self.rank} of {self.size} stops: another one of this training has "
@@ -121,11 +99,7 @@ class ProcessGroup:
 @contextmanager
 def process_group(device: str) -> Iterator[ProcessGroup]:
     """All processes that torchrun started, by NCCL on GPUs and Gloo on CPUs; else this one alone.
-
-    Raises:
-        InputError: CUDA is requested where there is none, or more processes than GPUs.
-        ProcessLost: the processes do not find each other.
-    """
+    Raises InputError for CUDA where there is none, and for more processes than GPUs."""
     chosen = choose_device(device)
     size = int(os.environ["WORLD_SIZE"]) if "TORCHELASTIC_RUN_ID" in os.environ else 1
     if size == 1:
@@ -144,9 +118,8 @@ def process_group(device: str) -> Iterator[ProcessGroup]:
     try:
         distributed.init_process_group(backend, timeout=_PATIENCE)
     except (RuntimeError, ValueError) as error:
-        raise ProcessLost(
-            f"the processes of this training do not find each other: {error}"
-        ) from error
+        lost = f"the processes of this training do not find each other: {error}"
+        raise ProcessLost(lost) from error
     group = ProcessGroup(chosen, distributed.get_rank(), size, on_machine)
     try:
         yield group

@@ -15,12 +15,7 @@ from torch import Tensor, nn
 from tumortrack.core import store
 from tumortrack.core.config import from_builtins, to_builtins
 from tumortrack.core.errors import ArtifactError, InputError
-from tumortrack.models.config import (
-    MlpDecoderConfig,
-    NetworkConfig,
-    RegistrationHeadConfig,
-    TrainConfig,
-)
+from tumortrack.models.config import NetworkConfig, RegistrationHeadConfig, TrainConfig
 from tumortrack.models.folder import KIND, WEIGHTS, read_model_manifest
 from tumortrack.models.hardware import choose_device
 from tumortrack.models.in_distribution import InDistributionRange
@@ -31,15 +26,11 @@ from tumortrack.registration.model import RegistrationModel
 
 PRETRAINED = "pretrained"  # kind of a folder
 
-_KINDS: dict[type, type[Model]] = {
-    MlpDecoderConfig: OccupancyModel,
-    RegistrationHeadConfig: RegistrationModel,
-}
-
 
 def model_class(config: NetworkConfig) -> type[Model]:
     """The kind of model that a network's configuration makes."""
-    return _KINDS[type(config.decoder)]
+    registers = isinstance(config.decoder, RegistrationHeadConfig)
+    return RegistrationModel if registers else OccupancyModel
 
 
 def save_model(model: Model, folder: Path) -> None:
@@ -71,6 +62,7 @@ def load_model(folder: Path, device: str = "auto") -> Model:
         kind = model_class(config.network)
         network = kind.new_network(config.network)
         network.load_state_dict(load((folder / WEIGHTS).read_bytes()))
+        known = from_builtins(manifest["familiar"], InDistributionRange, f"{folder}: familiar")
         return kind.from_folder(
             folder,
             manifest,
@@ -78,9 +70,7 @@ def load_model(folder: Path, device: str = "auto") -> Model:
             config=config,
             parts=tuple(manifest["parts"]),
             query_box_mm=np.array(manifest["query_box_mm"], float).reshape(2, 3),
-            in_distribution=from_builtins(
-                manifest["familiar"], InDistributionRange, f"{folder}: familiar"
-            ),
+            in_distribution=known,
             provenance=dict(manifest["provenance"]),
         )
     except InputError as error:
@@ -106,11 +96,7 @@ class PretrainedWeights:
     weights: dict[str, Tensor]
 
     def check(self, network: NetworkConfig) -> None:
-        """Refuse a network that these weights do not fit.
-
-        Raises:
-            InputError: another kind of network, or other sizes.
-        """
+        """Refuse a network of another kind or other sizes, by InputError."""
         if not isinstance(network.decoder, RegistrationHeadConfig):
             raise InputError("--start is for the preset clinic; quick and paper have none.")
         if _shared(self.config) != _shared(network):
@@ -137,11 +123,8 @@ def save_start(
 
 
 def load_start(folder: Path) -> PretrainedWeights:
-    """Read a folder that `pretrain` wrote.
-
-    Raises:
-        ArtifactError: missing, another kind, damaged, or not of this version.
-    """
+    """Read a folder that `pretrain` wrote; one that is missing, of another kind, damaged or not of
+    this version raises ArtifactError."""
     manifest = store.read_manifest(folder, PRETRAINED)
     try:
         config = from_builtins(manifest["config"], NetworkConfig, f"{folder}: config")

@@ -26,8 +26,7 @@ from tumortrack.simulate.deform import ChainConfig, DragConfig, ElasticConfig, S
 from tumortrack.simulate.deform.drag import CONFIGURATIONS
 from tumortrack.simulate.elastic.body import BodyConfig
 from tumortrack.simulate.occupancy import OccupancyConfig
-from tumortrack.simulate.pose import PoseConfig
-from tumortrack.simulate.scene import SceneConfig
+from tumortrack.simulate.scene import PoseConfig, SceneConfig
 
 Rotations = Literal["full", "limited"]
 
@@ -50,14 +49,14 @@ def paper(anatomy: Anatomy, rotations: Rotations = "limited") -> TrainConfig:
 
 
 def quick(anatomy: Anatomy, rotations: Rotations = "limited") -> TrainConfig:
-    """A slim network that learns in minutes on two CPU cores, from endless noisy scenes: drags
-    of the paper's configurations 3 and 6, half of them squeezed and bent as a whole, half of
-    them seen from any distance between 8 and 25 cm, half of them with some background."""
+    """A slim network that learns in minutes on two CPU cores, from endless noisy scenes: drags of
+    the paper's configurations 3 and 6, half of them squeezed and bent as a whole."""
     local = tuple(DragConfig(steps=CONFIGURATIONS[n]) for n in (3, 6))
     squeezed = tuple(ChainConfig(links=(drag, StretchConfig())) for drag in local)
-    lower, upper = anatomy.organ.box_mm
     return TrainConfig(
-        network=quick_network(len(anatomy.parts) + 1, scale_mm=float(np.max(upper - lower)) / 2),
+        network=quick_network(
+            len(anatomy.parts) + 1, float(np.ptp(anatomy.organ.box_mm, axis=0).max()) / 2
+        ),
         scene=SceneConfig(
             pose=PoseConfig(rotations=rotations),
             deform=(*local, *squeezed),
@@ -76,9 +75,13 @@ def quick(anatomy: Anatomy, rotations: Rotations = "limited") -> TrainConfig:
 def clinic(anatomy: Anatomy, rotations: Rotations = "limited") -> TrainConfig:
     """The default: registration of the organ's elastic body, learnt in minutes from scenes with
     sensor errors, occlusion and background."""
-    lower, upper = anatomy.organ.box_mm
     elastic = ElasticConfig()
-    return _clinic(elastic, elastic.body.modes, float(np.max(upper - lower)) / 2, rotations)
+    return _clinic(
+        elastic,
+        elastic.body.modes,
+        float(np.ptp(anatomy.organ.box_mm, axis=0).max()) / 2,
+        rotations,
+    )
 
 
 def pretraining(rotations: Rotations = "limited") -> TrainConfig:
@@ -118,11 +121,10 @@ def paper_network(n_classes: int) -> NetworkConfig:
     """The paper's network.
 
     From the paper: PointNet++ to a 1024-d latent; 8 hidden layers x 512, ReLU, a skip into the
-    fifth, batch norm on "the skip and the final layer": read as the fifth and the last hidden
-    layer. From the follow-up (LUDO, IEEE T-RO 2025), where the paper is silent: the levels'
-    ratios, radii, neighbours and widths, and the cloud's bounding box as normalisation. From
-    PointNet++: batch norm in the encoder. Ours: raw query coordinates (the follow-up adds
-    octaves; the paper names none) and He's start of the weights.
+    fifth, batch norm on "the skip and the final layer": the fifth and the last hidden one. From
+    the follow-up (LUDO, IEEE T-RO 2025): the levels' ratios, radii, neighbours and widths, and the
+    cloud's bounding box as normalisation. From PointNet++: batch norm in the encoder. Ours: raw
+    query coordinates (the follow-up adds octaves; the paper names none), He's start of the weights.
     """
     return NetworkConfig(
         encoder=PointNet2Config(

@@ -7,142 +7,72 @@ where any organ lies and how it is bent.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from functools import cached_property
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
 from tumortrack.core.errors import InputError
-from tumortrack.core.types import Anatomy
-from tumortrack.models.config import RegistrationHeadConfig, TrainConfig
+from tumortrack.models.config import RegistrationHeadConfig
 from tumortrack.models.hardware import choose_device
 from tumortrack.phantom.kidneys import random_anatomy
-from tumortrack.registration.canonical_frame import (
-    CanonicalFrame,
-    generic_points,
-    initialize_canonical,
-    upright_of,
-)
+from tumortrack.registration import canonical_frame
 from tumortrack.registration.rest_shape import long_axis_of
-from tumortrack.simulate.dataset import Batch, SceneStream
-from tumortrack.simulate.elastic.body import ElasticBody
 from tumortrack.simulate.occupancy import FixedPoints
-from tumortrack.simulate.scene import body_for
+from tumortrack.simulate.scene import Batch, SceneStream, body_for
 from tumortrack.training.model import save_start
-from tumortrack.training.run import check_settings, settings_sha256
 from tumortrack.training.scenes import Scenes, batches
-from tumortrack.training.session import divide_cores, work_folder
-from tumortrack.training.state import TrainingState
-from tumortrack.training.train import Report, run_steps
-
-
-@dataclass(frozen=True)
-class Pretraining:
-    """What to pretrain: on how many kidneys, for how many steps."""
-
-    config: TrainConfig
-    anatomies: int
-    steps: int
-    seed: int = 0
-    device: Literal["auto", "cpu", "cuda"] = "auto"
-    workers: int | None = None
-    checkpoint_every_s: float = 30.0
-    minutes: None = field(default=None, init=False)  # steps alone decide
-
-    def __post_init__(self) -> None:
-        check_settings(self, anatomies=1, steps=1, seed=0, workers=0)
-
-    @property
-    def identity(self) -> str:
-        """sha256 of all that decides the weights."""
-        return settings_sha256(self.config, self.seed, self.steps, anatomies=self.anatomies)
-
-
-@dataclass(frozen=True, eq=False)
-class UprightStream:
-    """A scene stream of one organ in its upright frame; the addressing is the scene stream's."""
-
-    anatomy_ct: Anatomy
-    up_lps: tuple[float, float, float]
-    body: ElasticBody
-    config: TrainConfig
-    seed: int
-
-    @cached_property
-    def upright(self) -> CanonicalFrame:
-        """The organ's upright frame."""
-        organ = self.anatomy_ct.organ
-        return upright_of(organ, self.up_lps, self.body.center_ct, long_axis_of(organ))
-
-    @cached_property
-    def _scenes(self) -> SceneStream:
-        decoder = self.config.network.decoder
-        assert isinstance(decoder, RegistrationHeadConfig)
-        points = self.upright.in_ct(generic_points(decoder.points)).astype(np.float32)
-        return SceneStream(
-            self.anatomy_ct,
-            self.up_lps,
-            self.config.scene,
-            FixedPoints(points, np.zeros(len(points), np.uint8)),
-            self.seed,
-            "train",
-            self.config.batch_size,
-            self.body,
-        )
-
-    def batch(self, index: int) -> Batch:
-        """The batch with this number, its lengths scaled with the organ's."""
-        batch, scale = self._scenes.batch(index), np.float32(self.upright.scale)
-        poses = self.upright.camera_from_upright(batch.camera_from_ct)
-        return Batch(
-            batch.clouds_mm * scale,
-            batch.points_mm * scale,
-            batch.labels,
-            poses.astype(np.float32),
-        )
+from tumortrack.training.state import Pretraining, TrainingState
+from tumortrack.training.train import Report, divide_cores, run_steps, work_folder
 
 
 @dataclass(frozen=True, eq=False)
 class KidneyStream:
-    """Batches of many organs in turn: batch ``i`` shows organ ``i`` modulo their number."""
+    """Batches of many organs in turn, each in its upright frame: batch ``i`` shows organ ``i``
+    modulo their number."""
 
-    organs: tuple[UprightStream, ...]
+    organs: tuple[tuple[SceneStream, canonical_frame.CanonicalFrame], ...]
 
     def batch(self, index: int) -> Batch:
-        """The batch with this number."""
+        """The batch with this number, its lengths scaled with the organ's."""
         turn, which = divmod(index, len(self.organs))
-        return self.organs[which].batch(turn)
+        stream, upright = self.organs[which]
+        clouds_mm, points_mm, labels, camera_from_ct = stream.batch(turn)
+        poses, scale = upright.camera_from_upright(camera_from_ct), np.float32(upright.scale)
+        return Batch(clouds_mm * scale, points_mm * scale, labels, poses.astype(np.float32))
 
 
 def kidney_stream(run: Pretraining) -> KidneyStream:
     """The random kidneys of a run with their bodies; about a second each."""
     seeds = np.random.default_rng([run.seed, 0x517E]).integers(1 << 31, size=run.anatomies)
-    organs = []
+    config, organs = run.config, []
+    assert isinstance(config.network.decoder, RegistrationHeadConfig)
+    generic = canonical_frame.generic_points(config.network.decoder.points)
     for seed in seeds.tolist():
         anatomy_ct, up_lps = random_anatomy(seed)
-        body = body_for(anatomy_ct, up_lps, run.config.scene, seed)
+        body = body_for(anatomy_ct, up_lps, config.scene, seed)
         if body is None:
             raise InputError("pretraining needs elastic deformations; the configuration has none.")
-        organs.append(UprightStream(anatomy_ct, up_lps, body, run.config, run.seed))
+        organ = anatomy_ct.organ
+        upright = canonical_frame.upright_of(organ, up_lps, body.center_ct, long_axis_of(organ))
+        fixed = FixedPoints(upright.in_ct(generic).astype(np.float32))
+        scenes = (anatomy_ct, up_lps, config.scene, fixed, run.seed)
+        organs.append((SceneStream(*scenes, "train", config.batch_size, body), upright))
     return KidneyStream(tuple(organs))
 
 
 def pretrain(run: Pretraining, folder: Path, report: Report) -> dict[str, Any]:
     """Train until the end, resuming what lies in ``folder``; leaves a folder of weights, and
-    returns its provenance.
-
-    Raises: as ``train``.
-    """
+    returns its provenance. Raises as ``train``."""
     with work_folder(folder) as work:
         device = choose_device(run.device)
         workers = divide_cores(device, run.workers)
         state = TrainingState(run, device)
-        state.initialize(initialize_canonical)
+        state.initialize(canonical_frame.initialize_canonical)
         state.resume(work)
         steps = range(state.progress.step, run.steps)
-        made = batches(kidney_stream(run), steps, 0, workers, device)
+        made = batches(kidney_stream(run).batch, steps, 0, workers, device)
         run_steps(state, Scenes(made, f"{workers} processes"), work, report)
         about = {
             "seed": run.seed,

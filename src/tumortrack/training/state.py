@@ -1,17 +1,18 @@
-"""All that changes while training: weights, their average, the optimizer, the best so far; and the
-checkpoint that holds it.
+"""What a training is (configuration, seed, length, schedule) and all that changes while it runs:
+weights, their average, the optimizer, the best so far; and the checkpoint that holds that.
 
 A checkpoint is one file, written atomically: kill -9 loses the steps since the last one.
 """
 
 from __future__ import annotations
 
+import hashlib
 import json
 import math
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -19,17 +20,94 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor
 
-from tumortrack.core.errors import ArtifactError, TumortrackError
-from tumortrack.core.store import write_atomically
+from tumortrack.core import store
+from tumortrack.core.config import identity
+from tumortrack.core.errors import ArtifactError, InputError, TumortrackError
+from tumortrack.core.types import Anatomy
 from tumortrack.models.config import TrainConfig
 from tumortrack.models.hardware import has_fast_bfloat16
 from tumortrack.models.model import Network
+from tumortrack.simulate.batched.stream import Tensors
 from tumortrack.training.distributed import ProcessGroup
-from tumortrack.training.model import model_class
-from tumortrack.training.scenes import Tensors
+from tumortrack.training.model import PretrainedWeights, model_class
 
 _FILE = "checkpoint.safetensors"
 _FLOOR = 0.01  # of the peak learning rate, at the end of the tail
+
+
+@dataclass(frozen=True)
+class TrainingRun:
+    """What to train, on what, for how long: to the end of ``steps``, or about ``minutes``."""
+
+    anatomy_ct: Anatomy
+    up_lps: tuple[float, float, float]
+    case_sha256: str
+    config: TrainConfig
+    seed: int = 0
+    steps: int | None = None  # None: the preset's
+    minutes: float | None = None
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    workers: int | None = None  # processes that make scenes; None: as the machine allows
+    checkpoint_every_s: float = 30.0
+    start: PretrainedWeights | None = None  # of a registration network
+    scenes: Literal["auto", "workers", "device"] = "auto"  # who makes them; see ``training.scenes``
+
+    def __post_init__(self) -> None:
+        _check(self, seed=0, steps=1, workers=0)
+        if self.minutes is not None and not 0 < self.minutes < float("inf"):
+            raise InputError(f"minutes is {self.minutes}; it must be positive.")
+        if self.start is not None:
+            self.start.check(self.config.network)
+
+    @property
+    def identity(self) -> str:
+        """sha256 of all that decides the weights, so that a resumed run is the same run."""
+        start = {} if self.start is None else {"start": self.start.sha256}
+        return _sha256(self, case=self.case_sha256, minutes=self.minutes, **start)
+
+
+@dataclass(frozen=True)
+class Pretraining:
+    """What to pretrain: on how many random kidneys, for how many steps."""
+
+    config: TrainConfig
+    anatomies: int
+    steps: int
+    seed: int = 0
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    workers: int | None = None
+    checkpoint_every_s: float = 30.0
+
+    minutes = None  # steps alone decide
+
+    def __post_init__(self) -> None:
+        _check(self, anatomies=1, steps=1, seed=0, workers=0)
+
+    @property
+    def identity(self) -> str:
+        """sha256 of all that decides the weights."""
+        return _sha256(self, anatomies=self.anatomies)
+
+
+Run = TrainingRun | Pretraining
+
+
+def _check(run: Run, **smallest: int) -> None:
+    """Refuse numbers smaller than these, and impossible times between checkpoints."""
+    for name, least in smallest.items():
+        value = getattr(run, name)
+        if value is not None and value < least:
+            raise InputError(f"{name} is {value}; it must be at least {least}.")
+    if not 0 <= run.checkpoint_every_s < float("inf"):
+        raise InputError(
+            f"--checkpoint-every is {run.checkpoint_every_s}; give seconds, 0 or more."
+        )
+
+
+def _sha256(run: Run, **more: object) -> str:
+    content = {"config": identity(run.config), "seed": run.seed, "steps": run.steps, **more}
+    content["schema"] = store.SCHEMA
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
 
 @dataclass
@@ -42,6 +120,52 @@ class TrainingProgress:
     best_miou: float = -1.0
 
 
+def provenance(
+    run: TrainingRun, progress: TrainingProgress, device: torch.device
+) -> dict[str, Any]:
+    """What a model's manifest says of its training."""
+    about = {
+        "seed": run.seed,
+        "steps": progress.step,
+        "training_s": round(progress.elapsed_s, 1),
+        "validation_miou": round(progress.best_miou, 4),
+        "device": torch.cuda.get_device_name(device) if device.type == "cuda" else "cpu",
+        "threads": torch.get_num_threads(),
+        "run_sha256": run.identity,
+        "case_sha256": run.case_sha256,
+        "up_lps": list(run.up_lps),
+    }
+    return about if run.start is None else {**about, "start_sha256": run.start.sha256}
+
+
+def settle_end(config: TrainConfig, progress: TrainingProgress, minutes: float | None) -> bool:
+    """With a limit in minutes: fix the last step, from the pace so far, once the schedule's tail
+    has to begin; True when that happened now. From then on the schedule depends on steps alone, so
+    that a resumed run repeats it."""
+    if progress.end is not None or minutes is None:
+        return False
+    head = 1 - config.schedule.tail
+    if progress.step >= head * config.steps:
+        progress.end = config.steps
+    elif progress.elapsed_s >= head * minutes * 60:
+        progress.end = max(progress.step + 1, round(progress.step / head))
+    return progress.end is not None
+
+
+def learning_rate(config: TrainConfig, progress: TrainingProgress) -> float:
+    """The learning rate of the step that comes next."""
+    schedule, step = config.schedule, progress.step
+    peak = schedule.learning_rate
+    if schedule.kind == "exponential":
+        return peak * schedule.gamma ** (step * config.batch_size // schedule.epoch_pairs)
+    warm = min(1.0, (step + 1) / schedule.warmup_steps)
+    if progress.end is None:
+        return peak * warm
+    begin = progress.end * (1 - schedule.tail)
+    through = min(max((step - begin) / max(progress.end - begin, 1), 0.0), 1.0)
+    return peak * warm * (_FLOOR + (1 - _FLOOR) * (1 + math.cos(math.pi * through)) / 2)
+
+
 class Diverged(TumortrackError):
     """The loss or a weight is not finite any more; the last checkpoint is from before."""
 
@@ -52,32 +176,10 @@ class Diverged(TumortrackError):
         )
 
 
-@runtime_checkable
-class RunSettings(Protocol):
-    """What training needs to know of a run."""
-
-    @property
-    def config(self) -> TrainConfig: ...
-    @property
-    def seed(self) -> int: ...
-    @property
-    def steps(self) -> int | None: ...
-    @property
-    def minutes(self) -> float | None: ...
-    @property
-    def checkpoint_every_s(self) -> float: ...
-    @property
-    def identity(self) -> str:
-        """sha256 of all that decides the weights."""
-        ...
-
-
 class TrainingState:
     """All that changes while training, and nothing else."""
 
-    def __init__(
-        self, run: RunSettings, device: torch.device, group: ProcessGroup | None = None
-    ) -> None:
+    def __init__(self, run: Run, device: torch.device, group: ProcessGroup | None = None) -> None:
         self.run, self._device = run, device
         self.group = group or ProcessGroup(device)
         self._bf16 = has_fast_bfloat16(device)
@@ -104,12 +206,8 @@ class TrainingState:
         initialize(self.average)
 
     def resume(self, work: Path) -> None:
-        """Restore the last checkpoint, if there is one.
-
-        Raises:
-            ArtifactError: it is damaged, or belongs to a run with another case, configuration or
-                seed.
-        """
+        """Restore the last checkpoint, if there is one; ArtifactError where it is damaged or of
+        another run."""
         path = work / _FILE
         if not path.exists():
             return
@@ -141,23 +239,15 @@ class TrainingState:
         self._best = groups.get("best", {})
 
     def save(self, work: Path) -> None:
-        """Write the checkpoint.
-
-        Raises:
-            Diverged: a weight is not finite; the checkpoint before stays.
-            StorageError: the disk is full; the checkpoint before stays.
-        """
+        """Write the checkpoint. The one before stays where a weight is not finite (Diverged) or the
+        disk is full (StorageError)."""
         if not all(bool(p.isfinite().all()) for p in self.network.parameters()):
             raise Diverged(self.progress.step)
         moments = self.optimizer.state_dict()["state"]  # Adam's, and step counts, by parameter
         groups = {
             "network": self.network.state_dict(),
             "average": self.average.state_dict(),
-            "optimizer": {
-                f"{index}.{name}": value
-                for index, state in moments.items()
-                for name, value in state.items()
-            },
+            "optimizer": {f"{n}.{k}": v for n, state in moments.items() for k, v in state.items()},
             "best": self._best,
         }
         tensors = {
@@ -165,21 +255,16 @@ class TrainingState:
             for group, members in groups.items()
             for name, tensor in members.items()
         }
-        progress = json.dumps(asdict(self.progress))
-        metadata = {"progress": progress, "identity": self.run.identity}
-        write_atomically(work / _FILE, save(tensors, metadata))
+        metadata = {"progress": json.dumps(asdict(self.progress)), "identity": self.run.identity}
+        store.write_atomically(work / _FILE, save(tensors, metadata))
 
     def step(self, batch: Tensors) -> float:
         """One optimizer step on this process's part of the batch; returns the whole batch's loss.
-
-        Raises:
-            Diverged: the loss is not finite; the weights are as they were.
-            ProcessLost: another process of this training has ended.
-        """
-        config, progress = self.run.config, self.progress
+        Where that is not finite the weights stay as they were, and Diverged is raised."""
+        progress = self.progress
         clouds, points, labels, poses = (part.to(self._device, non_blocking=True) for part in batch)
         clouds = clouds[:, : self.points_kept(clouds.shape[1])]
-        self.learning_rate = learning_rate(config, progress)
+        self.learning_rate = learning_rate(self.run.config, progress)
         for group in self.optimizer.param_groups:
             group["lr"] = self.learning_rate
         self.network.train()
@@ -209,12 +294,9 @@ class TrainingState:
     def _update_average(self) -> None:
         """Exponential moving average of weights and running statistics; short memory at first."""
         decay = min(self.run.config.ema, (1 + self.progress.step) / (10 + self.progress.step))
-        pairs = zip(
-            self.average.state_dict().values(), self.network.state_dict().values(), strict=True
-        )
-        averages, weights = zip(
-            *(pair for pair in pairs if pair[0].is_floating_point()), strict=True
-        )
+        networks = (network.state_dict().values() for network in (self.average, self.network))
+        pairs = (pair for pair in zip(*networks, strict=True) if pair[0].is_floating_point())
+        averages, weights = zip(*pairs, strict=True)
         torch._foreach_lerp_(averages, weights, 1 - decay)
 
     def keep_if_best(self, miou: float) -> None:
@@ -226,17 +308,3 @@ class TrainingState:
         """The averaged weights of the best validation."""
         self.average.load_state_dict(self._best)
         return self.average
-
-
-def learning_rate(config: TrainConfig, progress: TrainingProgress) -> float:
-    """The learning rate of the step that comes next."""
-    schedule, step = config.schedule, progress.step
-    peak = schedule.learning_rate
-    if schedule.kind == "exponential":
-        return peak * schedule.gamma ** (step * config.batch_size // schedule.epoch_pairs)
-    warm = min(1.0, (step + 1) / schedule.warmup_steps)
-    if progress.end is None:
-        return peak * warm
-    begin = progress.end * (1 - schedule.tail)
-    through = min(max((step - begin) / max(progress.end - begin, 1), 0.0), 1.0)
-    return peak * warm * (_FLOOR + (1 - _FLOOR) * (1 + math.cos(math.pi * through)) / 2)

@@ -1,68 +1,246 @@
-"""What training asks of a method, and the validation scenes that both methods share."""
+"""What each method learns, how it is validated, and the model it leaves: a class per method."""
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
-from typing import Any, Protocol, TypeVar, runtime_checkable
+from functools import cached_property, partial
+from typing import Any
 
 import numpy as np
+import torch
 from jaxtyping import Float32, Float64, UInt8
 
-from tumortrack.models.config import TrainConfig
-from tumortrack.models.model import Model, Network
-from tumortrack.simulate.dataset import refill
+from tumortrack.core.errors import InputError, NoEstimate
+from tumortrack.models.config import RegistrationHeadConfig, TrainConfig
+from tumortrack.models.in_distribution import InDistributionRange, fit_mm, spread_mm
+from tumortrack.models.model import Model
+from tumortrack.occupancy.model import OccupancyModel
+from tumortrack.occupancy.network import Latent, OccupancyNetwork
+from tumortrack.occupancy.volume import FIT_STEPS, lattice_over, surface_distances
+from tumortrack.registration.canonical_frame import carry_over, upright_of
+from tumortrack.registration.gauss_newton import RegistrationResult
+from tumortrack.registration.gauss_newton_kernels import KERNEL
+from tumortrack.registration.model import RegistrationModel, UncertaintyCalibration
+from tumortrack.registration.motion import ElasticMotion
+from tumortrack.registration.network import RegistrationNetwork
+from tumortrack.registration.registration import Registration
+from tumortrack.registration.rest_shape import shape_of
 from tumortrack.simulate.elastic.body import ElasticBody
-from tumortrack.simulate.occupancy import PartPool, PointSource
-from tumortrack.simulate.scene import SceneRecipe, Simulator
+from tumortrack.simulate.occupancy import FixedPoints, OccupancyPool, PartPool, organ_pool
+from tumortrack.simulate.scene import SceneRecipe, Simulator, body_for, refill
+from tumortrack.simulate.scene_folder import draw_targets
+from tumortrack.training.state import TrainingRun
 
-N = TypeVar("N", bound=Network, contravariant=True)
+_AT_ONCE = 32  # scenes
+_FIT_ON = 32  # scenes
+_QUERIES = 2**13  # at once: bounds the memory
+_USUAL = 90  # per cent of the validation scenes have no more than the usual cost
+_COVERED = 0.683  # of all errors lie within this radius if each axis errs normally by 1
+_RADIUS = 1.878
+_AT_SURFACE = 0.5  # of the points whose positions are learnt; the others lie inside the parts
 
 
-@runtime_checkable
-class TrainingTask(Protocol[N]):
+def task_of(run: TrainingRun, device: torch.device) -> TrainingTask:
+    """The task of a run's method; a part too small to be learnt, or deformations that do not fit
+    the network, raise InputError."""
+    if isinstance(run.config.network.decoder, RegistrationHeadConfig):
+        return RegistrationTask(run, device)
+    return OccupancyTask(run, device)
+
+
+class TrainingTask(ABC):
     """What a method learns, how it is validated, and the model it leaves; a class per method."""
 
-    @property
-    def points(self) -> PointSource:
-        """Those of the training scenes."""
-        ...
+    points: FixedPoints | OccupancyPool  # of the training scenes
+    body: ElasticBody | None  # the organ's, where scenes or model need it
 
-    @property
-    def body(self) -> ElasticBody | None:
-        """The organ's, where scenes or model need it."""
-        ...
+    def __init__(self, run: TrainingRun, device: torch.device) -> None:
+        self._run, self._device = run, device
+        self.body = body_for(run.anatomy_ct, run.up_lps, run.config.scene, run.seed)
 
-    def initialize(self, network: N) -> None:
+    @abstractmethod
+    def initialize(self, network: Any) -> None:
         """Give a fresh network what does not have to be learnt."""
-        ...
 
-    def miou(self, network: N) -> float:
+    @abstractmethod
+    def miou(self, network: Any) -> float:
         """On the validation scenes."""
-        ...
 
-    def model(self, network: N, provenance: dict[str, Any]) -> Model:
+    @abstractmethod
+    def model(self, network: Any, provenance: dict[str, Any]) -> Model:
         """The finished model of the network."""
-        ...
+
+    @cached_property
+    def _scenes(self) -> ValidationScenes:
+        run = self._run
+        simulator = Simulator(run.anatomy_ct, run.up_lps, run.config.scene, self.body)
+        return validation_scenes(simulator, self._pool(), run.config, run.seed)
+
+    def _pool(self) -> PartPool:
+        """Points about the organ, to validate on."""
+        return organ_pool(self._run.anatomy_ct, self._run.config.scene.occupancy, self._run.seed)
+
+    def _fields(
+        self, network: Any, provenance: dict[str, Any], clouds_mm: Sequence[tuple[float, float]]
+    ) -> dict[str, Any]:
+        """What models of both methods hold. ``clouds_mm``: of validation scenes, how far the points
+        spread, and how far they lie from the surface that was found."""
+        spreads, fits = zip(*clouds_mm, strict=True)
+        spread_mm, fit_mm = (min(spreads), max(spreads)), float(np.percentile(fits, 95))
+        return {
+            "network": network,
+            "config": self._run.config,
+            "parts": self._run.anatomy_ct.names,
+            "query_box_mm": grown_box(self._scenes.boxes_mm),
+            "in_distribution": InDistributionRange(spread_mm=spread_mm, fit_mm=fit_mm),
+            "provenance": provenance,
+        }
+
+
+class OccupancyTask(TrainingTask):
+    """Labels of points near surfaces, as in the paper."""
+
+    points: OccupancyPool
+
+    def __init__(self, run: TrainingRun, device: torch.device) -> None:
+        self.points = OccupancyPool(run.anatomy_ct, run.config.scene.occupancy, run.seed)
+        super().__init__(run, device)
+
+    def _pool(self) -> PartPool:
+        return self.points.parts[0]
+
+    def initialize(self, network: OccupancyNetwork) -> None:
+        """An occupancy network knows nothing at first."""
+
+    def miou(self, network: OccupancyNetwork) -> float:
+        return label_miou(network, self._scenes, len(self._run.anatomy_ct.parts) + 1, self._device)
+
+    @torch.no_grad()
+    def model(self, network: OccupancyNetwork, provenance: dict[str, Any]) -> OccupancyModel:
+        network.eval()
+        scenes, ranges = self._scenes, []
+        for points_mm, box_mm in zip(scenes.clouds_mm[:_FIT_ON], scenes.boxes_mm, strict=False):
+            latent = network.encode(torch.from_numpy(points_mm).to(self._device)[None])
+            around = grown_box(box_mm[None] + np.median(points_mm, axis=0))
+            fit = spread = spread_mm(points_mm)
+            with suppress(NoEstimate):  # after a few steps a network finds no organ
+                lattice = lattice_over(partial(self._logits, network, latent), around, FIT_STEPS)
+                fit = fit_mm(surface_distances(lattice, points_mm))
+            ranges.append((spread, fit))
+        return OccupancyModel(**self._fields(network, provenance, ranges))
+
+    def _logits(
+        self, network: OccupancyNetwork, latent: Latent, queries_mm: np.ndarray
+    ) -> torch.Tensor:
+        parts = torch.from_numpy(queries_mm).to(self._device)[None].split(_QUERIES, dim=1)
+        return torch.cat([network.query(latent, part)[0] for part in parts])
+
+
+class RegistrationTask(TrainingTask):
+    """Where fixed points of the organ go in each scene."""
+
+    points: FixedPoints
+    body: ElasticBody
+
+    def __init__(self, run: TrainingRun, device: torch.device) -> None:
+        super().__init__(run, device)
+        if self.body is None:
+            raise InputError(
+                "a registration network learns from elastic deformations; the scene configuration "
+                "has none."
+            )
+        self._shape = shape_of(run.anatomy_ct, self.body)
+        self.points = _learnt_points(run)
+        self._last: tuple[bytes, list[tuple[ElasticMotion, RegistrationResult]]] | None = None
+
+    def initialize(self, network: RegistrationNetwork) -> None:
+        run, shape = self._run, self._shape
+        network.initialize(shape, run.up_lps, self.points.points_ct)
+        if run.start is not None:
+            where = shape.body.center_ct, shape.long_axis
+            upright = upright_of(run.anatomy_ct.organ, run.up_lps, *where)
+            carry_over(network, run.start.weights, upright)
+
+    def miou(self, network: RegistrationNetwork) -> float:
+        scenes, guesses = self._scenes, []
+        for (_, fit), points_mm in zip(self._fits(network), scenes.points_mm, strict=True):
+            rest = fit.motion.back(points_mm).astype(np.float32)
+            guesses.append(self._shape.labels_at(rest)[0])
+        return mean_iou_of(np.stack(guesses), scenes.labels, len(self._run.anatomy_ct.parts) + 1)
+
+    def model(self, network: RegistrationNetwork, provenance: dict[str, Any]) -> RegistrationModel:
+        scenes, drafts = self._scenes, self._fits(network)
+        usual_cost = float(np.percentile([fit.cost for _, fit in drafts], _USUAL))
+        more = self._registration(network).try_turned_starts
+        fits = [  # as the model will make them, knowing the usual cost
+            more(cloud, likeliest, fit) if fit.cost > usual_cost else fit
+            for cloud, (likeliest, fit) in zip(scenes.clouds_mm, drafts, strict=True)
+        ]
+        errors, ratios = [], []
+        for fit, points_mm, points_ct, labels in zip(
+            fits, scenes.points_mm, scenes.points_ct, scenes.labels, strict=True
+        ):
+            inside_ct, inside_mm = points_ct[labels > 0], points_mm[labels > 0]
+            deviation = fit.motion.std_mm(inside_ct)
+            assert deviation is not None
+            error = np.linalg.norm(fit.motion.carry(inside_ct) - inside_mm, axis=1)
+            errors.append(error.mean())
+            ratios.append(error / deviation)
+        std_scale = float(np.quantile(np.concatenate(ratios), _COVERED)) / _RADIUS
+        about = {**provenance, "validation_tre_mm": round(float(np.median(errors)), 3)}
+        pairs = zip(scenes.clouds_mm, fits, strict=True)
+        ranges = [(spread_mm(cloud), fit_mm(np.abs(fit.distances_mm))) for cloud, fit in pairs]
+        return RegistrationModel(
+            **self._fields(network, about, ranges),
+            shape=self._shape,
+            calibration=UncertaintyCalibration(
+                std_scale=std_scale, usual_cost=usual_cost, kernel=KERNEL
+            ),
+        )
+
+    def _fits(self, network: RegistrationNetwork) -> list[tuple[ElasticMotion, RegistrationResult]]:
+        """The likeliest hypothesis and the best fit in each validation scene; kept for the same
+        weights, since the last ones are mostly the best."""
+        weights = b"".join(w.numpy(force=True).tobytes() for w in network.state_dict().values())
+        if self._last is None or self._last[0] != weights:
+            network.eval()
+            registration, fits = self._registration(network), []
+            for cloud in self._scenes.clouds_mm:
+                hypotheses = registration.propose(cloud)
+                fits.append((hypotheses[0], registration.best_fit(cloud, hypotheses)))
+            self._last = weights, fits
+        return self._last[1]
+
+    def _registration(self, network: RegistrationNetwork) -> Registration:
+        return Registration(network, self._shape, self._run.config.refine)
+
+
+def _learnt_points(run: TrainingRun) -> FixedPoints:
+    """Points of the organ's surface, evenly drawn vertices, and of the parts' insides."""
+    decoder = run.config.network.decoder
+    assert isinstance(decoder, RegistrationHeadConfig)
+    count = decoder.points
+    rng = np.random.default_rng([run.seed, 0x9A49])
+    vertices = run.anatomy_ct.organ.vertices_mm
+    surface = vertices[rng.choice(len(vertices), round(count * _AT_SURFACE), replace=True)]
+    inner = draw_targets(run.anatomy_ct, run.seed).points_ct
+    inner = inner[rng.choice(len(inner), count - len(surface), replace=True)]
+    return FixedPoints(np.concatenate([surface, inner]).astype(np.float32))
 
 
 @dataclass(frozen=True, eq=False)
 class ValidationScenes:
     """Scenes of the ``validation`` stream with points spread evenly over the organ's enlarged
-    box, so that numbers of points are volumes; camera frame, mm.
-
-    ``boxes_mm``: the organ's, relative to the median of the observed points.
-    """
+    box, so that numbers of points are volumes; camera frame, mm."""
 
     clouds_mm: Float32[np.ndarray, "s n 3"]
     points_ct: Float32[np.ndarray, "s q 3"]
     points_mm: Float32[np.ndarray, "s q 3"]
     labels: UInt8[np.ndarray, "s q"]
-    boxes_mm: Float64[np.ndarray, "s 2 3"]
-
-    @property
-    def query_box_mm(self) -> Float64[np.ndarray, "2 3"]:
-        """Where the organ can lie, relative to the median of the observed points."""
-        return grown_box(self.boxes_mm)
+    boxes_mm: Float64[np.ndarray, "s 2 3"]  # the organ's, relative to the points' median
 
 
 def validation_scenes(
@@ -98,3 +276,15 @@ def grown_box(boxes_mm: Float64[np.ndarray, "s 2 3"]) -> Float64[np.ndarray, "2 
     """The box of all the boxes, 10 % larger."""
     lower, upper = boxes_mm[:, 0].min(0), boxes_mm[:, 1].max(0)
     return np.stack([lower - 0.05 * (upper - lower), upper + 0.05 * (upper - lower)])
+
+
+@torch.no_grad()
+def label_miou(
+    network: OccupancyNetwork, scenes: ValidationScenes, n_classes: int, device: torch.device
+) -> float:
+    """``mean_iou_of`` the network's labels."""
+    network.eval()
+    clouds, points = (torch.from_numpy(v).to(device) for v in (scenes.clouds_mm, scenes.points_mm))
+    pairs = zip(clouds.split(_AT_ONCE), points.split(_AT_ONCE), strict=True)
+    guess = torch.cat([network(*pair).argmax(-1) for pair in pairs])
+    return mean_iou_of(guess.to(torch.uint8).cpu().numpy(), scenes.labels, n_classes)

@@ -1,4 +1,5 @@
-"""The training loop, read top to bottom.
+"""The training loop, read top to bottom, and what surrounds it: the folder's lock, cores, time,
+Ctrl-C, the history.
 
 Data are addressed by step, the only randomness is drawn from (seed, step), and the state is one
 atomic file: a run that is killed and started again ends with the weights of one that was not.
@@ -7,50 +8,78 @@ Where torchrun started several processes each runs this loop with its part of th
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from contextlib import AbstractContextManager, closing, nullcontext
+import json
+import os
+import signal
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, closing, contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TypeVar
 
 import torch
 
-from tumortrack.models.config import RegistrationHeadConfig
+from tumortrack.core.errors import InputError, StorageError, TumortrackError
+from tumortrack.core.process import available_cores, keep_freed_memory
+from tumortrack.core.store import write_atomically
 from tumortrack.models.model import Model, Network
-from tumortrack.simulate.dataset import SceneStream
+from tumortrack.simulate.scene import SceneStream
 from tumortrack.training.distributed import ProcessGroup, process_group
 from tumortrack.training.model import load_model, save_model
-from tumortrack.training.occupancy_task import OccupancyTask
-from tumortrack.training.registration_task import RegistrationTask
-from tumortrack.training.run import TrainingRun, provenance, run_identity, settle_end
 from tumortrack.training.scenes import Scenes, scenes_for
-from tumortrack.training.session import (
-    History,
-    Interrupted,
-    Record,
-    TrainingClock,
-    TrainingStatus,
-    ctrl_c,
-    divide_cores,
-    work_folder,
+from tumortrack.training.state import (
+    TrainingProgress,
+    TrainingRun,
+    TrainingState,
+    provenance,
+    settle_end,
 )
-from tumortrack.training.state import TrainingState
-from tumortrack.training.task import TrainingTask
+from tumortrack.training.task import task_of
 
-__all__ = ["Interrupted", "TrainingRun", "TrainingStatus", "run_identity", "train"]
+__all__ = ["Interrupted", "TrainingRun", "TrainingStatus", "train"]
 
 REPORT_EVERY_S = 5.0
+_MOST = 16  # processes that make scenes; and threads: more only wait, in layers this small
+_LOCK = ".lock"
+_Item = TypeVar("_Item")
+# Of a validation: names and digits in history.jsonl, and tags of TensorBoard
+_SCALARS = (
+    ("loss", "loss/train", ".5f"),
+    ("validation_miou", "miou/validation", ".4f"),
+    ("samples_per_s", "speed/samples_per_s", ".1f"),
+    ("learning_rate", "learning_rate", ".4g"),
+    ("waiting", "speed/waiting", ".3f"),  # fraction of the time that was spent waiting for scenes
+)
+
+
+@dataclass(frozen=True)
+class TrainingStatus:
+    """What the loop reports while it runs; ``end`` is None while minutes decide."""
+
+    step: int
+    end: int | None
+    seconds_left: float
+    samples_per_s: float
+    loss: float
+    miou: float | None  # of the last validation
+    note: str = ""  # on how scenes are made, where a user should know
+    waiting: float = 0.0  # fraction of the time that was spent waiting for scenes
+
+
+class Interrupted(TumortrackError):
+    """Ctrl-C: the state is saved, the same command goes on."""
+
+    exit_code = 130
+
+    def __init__(self, step: int, folder: Path) -> None:
+        super().__init__(
+            f"stopped at step {step}; the state is saved in {folder}. The same "
+            "command goes on from there."
+        )
+
+
 Report = Callable[[TrainingStatus], None]
-
-
-def task_of(run: TrainingRun, device: torch.device) -> TrainingTask[Any]:
-    """The task of a run's method.
-
-    Raises:
-        InputError: a part too small to be learnt, deformations that do not fit the network.
-    """
-    if isinstance(run.config.network.decoder, RegistrationHeadConfig):
-        return RegistrationTask(run, device)
-    return OccupancyTask(run, device)
 
 
 def train(run: TrainingRun, folder: Path, report: Report) -> Model:
@@ -79,16 +108,8 @@ def _train(run: TrainingRun, work: Path, group: ProcessGroup, report: Report) ->
     state = TrainingState(run, device, group)
     state.initialize(task.initialize)
     state.resume(work)
-    stream = SceneStream(
-        run.anatomy_ct,
-        run.up_lps,
-        config.scene,
-        task.points,
-        run.seed,
-        "train",
-        group.local_size(config.batch_size),
-        task.body,
-    )
+    about = run.anatomy_ct, run.up_lps, config.scene, task.points, run.seed
+    stream = SceneStream(*about, "train", group.local_size(config.batch_size), task.body)
     steps = group.local_batches(range(state.progress.step, state.progress.end or config.steps))
     period = config.training_pairs // config.batch_size * group.size
     scenes = scenes_for(stream, steps, period, workers, device, run.scenes)
@@ -109,28 +130,23 @@ def run_steps(
     miou_of: Callable[[Network], float] | None = None,
 ) -> None:
     """All steps to the end; the main process writes checkpoints into ``work``, reports and, with
-    ``miou_of``, validates.
-
-    Raises: as ``train``.
-    """
+    ``miou_of``, validates. Raises as ``train``."""
     run, group, progress = state.run, state.group, state.progress
     clock, miou = TrainingClock(progress), None
-    written: AbstractContextManager[History | None] = (
-        History(work, progress) if miou_of and group.is_main else nullcontext()
-    )
-    source = closing(scenes.batches)
-    with written as history, ctrl_c() as stopped, source as loaded:
-        for batch in clock.timed(loaded):
+    with ExitStack() as stack:
+        validates = miou_of is not None and group.is_main
+        write = stack.enter_context(history(work, progress)) if validates else None
+        stopped = stack.enter_context(ctrl_c())
+        for batch in clock.timed(stack.enter_context(closing(scenes.batches))):
             loss = state.step(batch)
             progress.elapsed_s, stop = group.all_reduce(clock.elapsed(), stopped())
             settled = settle_end(run.config, progress, run.minutes)
             done = progress.step == progress.end
-            if miou_of and history and (done or progress.step % run.config.validate_every == 0):
+            if miou_of and write and (done or progress.step % run.config.validate_every == 0):
                 miou = miou_of(state.average)
                 state.keep_if_best(miou)
-                speed = clock.rate(progress) * run.config.batch_size
-                record = Record(loss, miou, speed, state.learning_rate, clock.waiting)
-                history.write(progress, record)
+                speed = clock.rate() * run.config.batch_size
+                write(loss, miou, speed, state.learning_rate, clock.waiting())
             due = done or settled or stop
             if group.is_main and (due or clock.due("checkpoint", run.checkpoint_every_s)):
                 state.save(work)
@@ -145,11 +161,168 @@ def run_steps(
 def _status(
     state: TrainingState, clock: TrainingClock, loss: float, miou: float | None, note: str
 ) -> TrainingStatus:
-    run, progress, rate = state.run, state.progress, clock.rate(state.progress)
+    run, progress, rate = state.run, state.progress, clock.rate()
     left = ((progress.end or run.config.steps) - progress.step) / rate
     if progress.end is None and run.minutes is not None:
         left = min(left, run.minutes * 60 - progress.elapsed_s)
-    speed = rate * run.config.batch_size
-    return TrainingStatus(
-        progress.step, progress.end, max(left, 0.0), speed, loss, miou, note, clock.waiting
-    )
+    about = rate * run.config.batch_size, loss, miou, note, clock.waiting()
+    return TrainingStatus(progress.step, progress.end, max(left, 0.0), *about)
+
+
+@contextmanager
+def work_folder(folder: Path, writes: bool = True) -> Iterator[Path]:
+    """MODEL/training, locked while in use, if this process writes; removed again if nothing was
+    written into it. The lock is the operating system's and ends with its process, however that
+    ends. InputError where another process trains in it, StorageError where it cannot be made."""
+    import fcntl
+
+    work = folder / "training"
+    if not writes:
+        yield work
+        return
+    try:
+        work.mkdir(parents=True, exist_ok=True)
+        lock = (work / _LOCK).open("w")
+    except OSError as error:
+        raise StorageError(f"cannot write into {folder}: {error.strerror}.") from error
+    with lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise InputError(
+                f"another process is training in {folder}. Wait for its end or stop it, or choose "
+                "another MODEL folder."
+            ) from error
+        try:
+            yield work
+        finally:
+            if [path.name for path in work.iterdir()] == [_LOCK]:
+                (work / _LOCK).unlink()
+                work.rmdir()
+                with suppress(OSError):  # there was more in it before
+                    folder.rmdir()
+
+
+def divide_cores(device: torch.device, workers: int | None, sharing: int = 1) -> int:
+    """How many processes make scenes, and set the network's number of threads: on a CPU it gets the
+    cores that the workers leave, half of them at least, within OMP_NUM_THREADS.
+
+    Without ``workers`` they are as many as there are cores, sixteen at most: their priority is low
+    (see ``scenes``). ``sharing`` processes of one training share the machine.
+    """
+    cores = available_cores() // sharing
+    if workers is None:
+        workers = max(1, min(_MOST, cores))
+    if device.type == "cpu":
+        keep_freed_memory()
+        granted = os.environ.get("OMP_NUM_THREADS", "")
+        most = min(int(granted) if granted.isdigit() else _MOST, _MOST)
+        torch.set_num_threads(max(1, min(most, cores - min(workers, cores // 2))))
+    return workers
+
+
+class TrainingClock:
+    """Time spent in all sessions of a run, and when things are due again."""
+
+    def __init__(self, progress: TrainingProgress) -> None:
+        self._progress, self._first_step = progress, progress.step
+        self._start, self._before = time.monotonic(), progress.elapsed_s
+        self._last: dict[str, float] = {}
+        self._waited = 0.0
+
+    def timed(self, source: Iterator[_Item]) -> Iterator[_Item]:
+        """The same items; the time spent waiting for them counts."""
+        began = time.monotonic()
+        for item in source:
+            self._waited += time.monotonic() - began
+            yield item
+            began = time.monotonic()
+
+    def elapsed(self) -> float:
+        return self._before + self._session_s()
+
+    def waiting(self) -> float:
+        """Fraction of this session's time that was spent waiting."""
+        return self._waited / self._session_s()
+
+    def rate(self) -> float:
+        """Steps per second in this session."""
+        return (self._progress.step - self._first_step) / self._session_s()
+
+    def due(self, what: str, every_s: float) -> bool:
+        now = time.monotonic()
+        if now - self._last.setdefault(what, self._start) < every_s:
+            return False
+        self._last[what] = now
+        return True
+
+    def _session_s(self) -> float:
+        return max(time.monotonic() - self._start, 1e-9)
+
+
+@contextmanager
+def ctrl_c() -> Iterator[Callable[[], bool]]:
+    """Turns Ctrl-C and SIGTERM into a flag that the loop checks after each step."""
+    received: list[int] = []
+    before = {
+        number: signal.signal(number, lambda number, _: received.append(number))
+        for number in (signal.SIGINT, signal.SIGTERM)
+    }
+    try:
+        yield lambda: bool(received)
+    except BaseException:
+        if "TORCHELASTIC_RUN_ID" in os.environ:
+            # torchrun ends the processes that are left; this one's message comes first.
+            before[signal.SIGTERM] = signal.SIG_IGN
+        raise
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+@contextmanager
+def history(folder: Path, progress: TrainingProgress) -> Iterator[Callable[..., None]]:
+    """history.jsonl and TensorBoard: yields a function that writes a validation's ``_SCALARS``. On
+    resuming, records after the checkpoint are dropped first. A full disk raises StorageError,
+    except on leaving after another error, which is kept."""
+    from torch.utils.tensorboard import SummaryWriter
+
+    path, files = folder / "history.jsonl", ExitStack()
+    with _history_errors(folder):
+        if path.exists():
+            lines = path.read_text(encoding="utf-8").splitlines(keepends=True)
+            whole = [line for line in lines if line.endswith("\n")]
+            kept = [line for line in whole if json.loads(line)["step"] <= progress.step]
+            write_atomically(path, "".join(kept).encode())
+        stream = files.enter_context(path.open("a", buffering=1, encoding="utf-8"))
+        board = SummaryWriter(folder / "tensorboard", purge_step=progress.step + 1)
+        files.callback(board.close)
+
+    def write(*values: float) -> None:
+        line = {"step": progress.step, "elapsed_s": round(progress.elapsed_s, 1)}
+        for value, (name, _, digits) in zip(values, _SCALARS, strict=True):
+            line[name] = float(f"{value:{digits}}")
+        with _history_errors(folder):
+            stream.write(json.dumps(line) + "\n")
+            for value, (_, tag, _) in zip(values, _SCALARS, strict=True):
+                board.add_scalar(tag, value, progress.step)
+
+    try:
+        yield write
+    except BaseException:
+        with suppress(OSError):  # the first error counts
+            files.close()
+        raise
+    with _history_errors(folder):
+        files.close()
+
+
+@contextmanager
+def _history_errors(folder: Path) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        raise StorageError(
+            f"cannot write the history in {folder}: {error.strerror or error}. "
+            "Free some space and give the same command again."
+        ) from error

@@ -14,11 +14,10 @@ from skimage.measure import find_contours
 from tumortrack.core.geometry import rigid
 from tumortrack.core.types import Anatomy
 from tumortrack.imaging.raster import label_grid
-from tumortrack.plan.config import ResectionConfig
 from tumortrack.plan.located import STAND_MM
 from tumortrack.plan.outline import common, evenly, grown
 from tumortrack.plan.resection import plan_resection
-from tumortrack.plan.values import Located
+from tumortrack.plan.values import Located, ResectionConfig
 from tumortrack_lab.bench.rows import MOTIONS, PLAN, Workload
 from tumortrack_lab.bench.subject import BenchSubject
 from tumortrack_lab.twin.apparatus import moved

@@ -40,7 +40,7 @@ from tumortrack.simulate.elastic.body import ElasticBody
 from tumortrack.simulate.occupancy import OccupancyConfig, OccupancyPool
 from tumortrack.simulate.scene import RenderedScene, SceneConfig, SceneRecipe, Simulator
 from tumortrack.training.model import load_model, save_model
-from tumortrack.training.run import TrainingRun
+from tumortrack.training.state import TrainingRun
 from tumortrack.training.train import TrainingStatus, train
 from tumortrack_lab.bench.occupancy import OccupancyForms
 from tumortrack_lab.bench.registration import RegistrationForms

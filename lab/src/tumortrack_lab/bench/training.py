@@ -11,7 +11,6 @@ from itertools import count, cycle, pairwise
 from pathlib import Path
 from typing import Literal
 
-import numpy as np
 import torch
 from msgspec.structs import replace
 from torch.nn import functional
@@ -20,14 +19,12 @@ from tumortrack.core.process import keep_freed_memory
 from tumortrack.models.hardware import has_fast_bfloat16
 from tumortrack.occupancy.model import OccupancyModel
 from tumortrack.occupancy.network import OccupancyNetwork
-from tumortrack.simulate.dataset import SceneStream
 from tumortrack.simulate.deform import DragConfig, ElasticConfig
 from tumortrack.simulate.elastic.body import ElasticBody
 from tumortrack.simulate.occupancy import FixedPoints, OccupancyConfig, OccupancyPool, PointSource
-from tumortrack.simulate.scene import SceneConfig, SceneRecipe, Simulator
+from tumortrack.simulate.scene import SceneConfig, SceneRecipe, SceneStream, Simulator
 from tumortrack.training.model import load_model
-from tumortrack.training.run import TrainingRun
-from tumortrack.training.state import TrainingState
+from tumortrack.training.state import TrainingRun, TrainingState
 from tumortrack.training.train import TrainingStatus, train
 from tumortrack_lab.bench.naive import NaiveOccupancy, plain_pair
 from tumortrack_lab.bench.occupancy import OccupancyForms, module_flops, weight_bytes
@@ -139,7 +136,7 @@ def training_state(
     if preset == "clinic":
         body, known = subject.body, subject.model(preset).network.state_dict()
         places = (known["points"] + known["center_ct"]).numpy()
-        points = FixedPoints(places, np.zeros(len(places), np.uint8))
+        points = FixedPoints(places)
     else:
         points = OccupancyPool(anatomy, config.scene.occupancy, SEED)
     stream = SceneStream(anatomy, UP, config.scene, points, SEED, "train", size, body)

@@ -19,7 +19,7 @@ from tumortrack.sense.noise import CalibrationConfig
 from tumortrack.sense.occlusion import OcclusionConfig
 from tumortrack.simulate.deform import DragConfig
 from tumortrack.simulate.deform.drag import CONFIGURATIONS
-from tumortrack.training.train import TrainingRun, TrainingStatus, run_identity, train
+from tumortrack.training.train import TrainingRun, TrainingStatus, train
 from tumortrack_lab.study.methods import Network, StudyCase
 
 # A preset: anatomy and rotations (limited, full) -> training configuration.
@@ -120,7 +120,7 @@ class Trainer:
         )
         # A finished model of another run is refused by training, with a clear text.
         about = store.read_json(folder / store.MANIFEST) if is_finished(folder) else {}
-        if about.get("provenance", {}).get("run_sha256") != run_identity(run):
+        if about.get("provenance", {}).get("run_sha256") != run.identity:
             threads = torch.get_num_threads()
             label = f"{case.name} {trained} seed {seed}"
             train(run, folder, lambda status: self.report(label, status))

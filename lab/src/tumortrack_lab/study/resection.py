@@ -18,10 +18,9 @@ from tumortrack.core.errors import InputError, NoEstimate, NoPlan
 from tumortrack.core.estimate import Estimate
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.types import Anatomy, OccupancyCloud
-from tumortrack.plan.config import ResectionConfig
 from tumortrack.plan.located import located
 from tumortrack.plan.resection import plan_resection
-from tumortrack.plan.values import Located
+from tumortrack.plan.values import Located, ResectionConfig
 from tumortrack.plan.values import Method as PlanMethod
 from tumortrack.registration.locator import QUERIES
 from tumortrack.simulate.scene_folder import Scene, read_scene

@@ -18,11 +18,10 @@ from tumortrack.imaging.case import Case
 from tumortrack.models.config import TrainConfig
 from tumortrack.registration.motion import ElasticMotion
 from tumortrack.registration.rest_shape import RestShape
-from tumortrack.simulate.dataset import SceneStream
 from tumortrack.simulate.occupancy import organ_pool
-from tumortrack.simulate.scene import Simulator, body_for
-from tumortrack.training.run import TrainingRun
+from tumortrack.simulate.scene import SceneStream, Simulator, body_for
 from tumortrack.training.scenes import batches
+from tumortrack.training.state import TrainingRun
 from tumortrack.training.task import TrainingTask, ValidationScenes, mean_iou_of, validation_scenes
 
 Options = TypeVar("Options")
@@ -47,7 +46,7 @@ def training_batches(training: TrainingRun, task: TrainingTask, steps: int) -> I
         "train", training.config.batch_size, task.body,
     )  # fmt: skip
     stream.batch(0)
-    return iter(batches(stream, range(steps), 0, 0, torch.device("cpu")))
+    return iter(batches(stream.batch, range(steps), 0, 0, torch.device("cpu")))
 
 
 def placed_miou(

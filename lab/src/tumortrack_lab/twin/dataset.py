@@ -25,8 +25,7 @@ from tumortrack.core.errors import ArtifactError, InputError, StorageError
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.types import Anatomy
 from tumortrack.imaging.case import Case, load_case
-from tumortrack.simulate.scene_folder import write_scene_files
-from tumortrack.simulate.targets import TARGETS, InnerPoints, draw_targets
+from tumortrack.simulate.scene_folder import TARGETS, InnerPoints, draw_targets, write_scene_files
 from tumortrack_lab.twin import views as viewing
 from tumortrack_lab.twin.apparatus import Apparatus, ApparatusConfig, State, solve
 from tumortrack_lab.twin.pictures import twin_picture

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
+from collections import defaultdict
+from collections.abc import Collection
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import product
@@ -19,7 +20,6 @@ from tumortrack.live.values import RigidShape
 from tumortrack.plan.arms import body
 from tumortrack.plan.arms.config import CellConfig
 from tumortrack.plan.arms.kinematics import ArmModel, Pose, inverse_kinematics, nearest_turn
-from tumortrack.plan.arms.urdf import cell_urdf
 from tumortrack.plan.motions import ARMS, CUTTER, HOLDER, Joints
 
 ORGAN = "organ"
@@ -33,41 +33,32 @@ class ArmCell:
     """Both arms with their tools over the table, and the organ once it is known.
 
     Values do not change after construction, but the buffers of pinocchio do: one thread at a time.
-    ``model`` and ``solids`` are pinocchio's, in metres.
+    ``model`` and ``solids`` are pinocchio's, in metres. ``home_rad``, ``limits_rad`` (in both
+    directions) and ``speeds_rad_s`` (the maximum planned with) are of all twelve joints.
     """
 
     def __init__(self, config: CellConfig | None = None, organ: Mesh | None = None) -> None:
         self.config = config or CellConfig()
         self.organ = organ
-        text, parts = cell_urdf(self.config), body.cell_parts(self.config)
+        arms = [self.config.model(arm) for arm in ARMS]
+        self.home_rad: Joints = np.array(self.config.home_rad)
+        self.limits_rad: Joints = np.concatenate([model.limits_rad for model in arms])
+        makers = np.concatenate([model.speeds_rad_s for model in arms])
+        self.speeds_rad_s: Joints = self.config.speed_share * makers
+        text = body.cell_urdf(self.config)
         self.model = pin.buildModelFromXML(text)
         self.solids = pin.buildGeomFromUrdfString(self.model, text, pin.GeometryType.COLLISION)
         self._data = self.model.createData()
-        names = _solid_names(self.solids, parts)
+        names = _solid_names(self.solids, body.cell_parts(self.config))
         if organ is not None:
             surface = _bounding_volumes(organ)
             self.solids.addGeometryObject(pin.GeometryObject(ORGAN, 0, pin.SE3.Identity(), surface))
             names.append(ORGAN)
         index = {name: n for n, name in enumerate(names)}
-        self._pairs = [pair for pair in _pairs() if pair[0] in index and pair[1] in index]
+        self._pairs = [pair for pair in _pairs() if index.keys() >= set(pair)]
         for one, other in self._pairs:
             self.solids.addCollisionPair(pin.CollisionPair(index[one], index[other]))
         self._states: dict[tuple[Any, ...], Any] = {}
-
-    @property
-    def home_rad(self) -> Joints:
-        return np.array(self.config.home_rad)
-
-    @cached_property
-    def limits_rad(self) -> Joints:
-        """The joints' limits in both directions."""
-        return np.concatenate([self.config.model(arm).limits_rad for arm in ARMS])
-
-    @cached_property
-    def speeds_rad_s(self) -> Joints:
-        """The maximum speeds planned with."""
-        makers = np.concatenate([self.config.model(arm).speeds_rad_s for arm in ARMS])
-        return self.config.speed_share * makers
 
     def levers_mm(self, start_rad: Joints, goal_rad: Joints) -> Joints:
         """On the straight segment between two configurations, no point of an arm or its tool moves
@@ -164,7 +155,6 @@ class Blocked(NoPlan):
 
     @classmethod
     def by(cls, pair: CollidingPair, where: str = "") -> Blocked:
-        """By a collision of these two."""
         return cls(f"{pair[0]} would meet {pair[1]}{where}", pair)
 
 
@@ -216,6 +206,13 @@ class PlanningGroup:
         flange = base_from_table @ table_from_tip @ tip_from_flange
         return nearest_turn(self.model, inverse_kinematics(self.model, flange), self.current_rad)
 
+    @cached_property
+    def _frames(self) -> tuple[Pose, Pose]:
+        """``base_from_table`` and ``tip_from_flange``, mm."""
+        config, arm = self.cell.config, str(self.arm)
+        poses = config.base(arm).table_from_base, config.flange_from_tip(arm)
+        return np.linalg.inv(poses[0]), np.linalg.inv(poses[1])
+
     def collides(self, own_rad: Float64[np.ndarray, " d"]) -> CollidingPair | None:
         """What comes nearer than allowed to what."""
         return self.cell.collisions(self.all_joints(own_rad), self.touching, self.arm)
@@ -238,20 +235,14 @@ class PlanningGroup:
                 return pair
         return None
 
-    @cached_property
-    def _frames(self) -> tuple[Pose, Pose]:
-        """``base_from_table`` and ``tip_from_flange``, mm."""
-        config, arm = self.cell.config, str(self.arm)
-        table_from_base, flange_from_tip = config.base(arm).table_from_base, config.flange_from_tip
-        return np.linalg.inv(table_from_base), np.linalg.inv(flange_from_tip(arm))
-
 
 def _solid_names(solids: Any, parts: tuple[body.Part, ...]) -> list[str]:
     """Our names in pinocchio's order, which is that of each link's collision elements."""
-    by_link: dict[str, Iterator[str]] = {}
-    for link in {part.link for part in parts}:
-        by_link[link] = iter([p.whose for p in parts if p.link == link and p.use != "picture"])
-    return [next(by_link[solid.name.rsplit("_", 1)[0]]) for solid in solids.geometryObjects]
+    by_link: dict[str, list[str]] = defaultdict(list)
+    for part in parts:
+        if part.use != "picture":
+            by_link[part.link].append(part.whose)
+    return [by_link[solid.name.rsplit("_", 1)[0]].pop(0) for solid in solids.geometryObjects]
 
 
 def _pairs() -> list[CollidingPair]:
@@ -261,12 +252,11 @@ def _pairs() -> list[CollidingPair]:
     pairs = list(product(moving[CUTTER], moving[HOLDER]))
     for arm, other in (ARMS, ARMS[::-1]):
         own = moving[arm]
-        still = [f"{arm}/{name}" for name in body.LINKS[:2]]
         pairs += product(own, [f"{other}/{name}" for name in (body.PEDESTAL, *body.LINKS[:2])])
         pairs += product(own[1:], (f"{arm}/{body.PEDESTAL}",))
         pairs += product(own, (body.TABLE, body.STAND, body.CAMERA))
         pairs += product(own[1:], (ORGAN,))
-        pairs += product(own[1:], still)
+        pairs += product(own[1:], [f"{arm}/{name}" for name in body.LINKS[:2]])
         pairs += product(own[2:], own[:1])  # the upper arm
         pairs += product(own[4:], own[1:2])  # the forearm
     return pairs

@@ -17,6 +17,11 @@ _LENGTHS = (
     *("bracket_mm", "pencil_mm", "electrode_mm", "rod_mm", "cup_mm", "cup_radius_mm"),
     *("stand_mm", "stand_radius_mm", "cutting_mm_s", "grasping_mm_s"),
 )
+_ALLOWED: dict[str, tuple[float, float]] = {
+    **dict.fromkeys(_LENGTHS, (0, 1000)),
+    **dict.fromkeys(("clearance_mm", "organ_clearance_mm", "contact_mm"), (0.5, 100)),
+    "speed_share": (0, 1),
+}
 
 
 class Base(Config, frozen=True, kw_only=True):
@@ -87,25 +92,20 @@ class CellConfig(Config, frozen=True, kw_only=True):
     def __post_init__(self) -> None:
         if len(self.home_rad) != len(JOINTS):
             raise InputError(f"home has {len(self.home_rad)} joints; give {len(JOINTS)} angles.")
-        for name in _LENGTHS:
-            if not 0 < getattr(self, name) < 1000:
-                raise InputError(
-                    f"cell: {name} is {getattr(self, name):g}; allowed: over 0 to 1000."
-                )
-        for name in ("clearance_mm", "organ_clearance_mm", "contact_mm"):
-            if not 0.5 <= getattr(self, name) <= 100:
-                raise InputError(f"cell: {name} is {getattr(self, name):g}; allowed: 0.5 to 100.")
+        for name, (low, high) in _ALLOWED.items():
+            value = getattr(self, name)
+            if not (0 < value < 1000 and low <= value <= high):
+                allowed = f"{low or 'over 0'} to {high}"
+                raise InputError(f"cell: {name} is {value:g}; allowed: {allowed}.")
         if not all(100 <= side <= 10_000 for side in self.table_mm):
             raise InputError(f"cell: table_mm is {self.table_mm}; allowed: 100 to 10000 each.")
         places = (*self.middle_mm, *self.camera_mm, *self.home_rad)
-        bases = (self.cutter_base, self.holder_base)
-        places += tuple(v for base in bases for v in (*base.position_mm, base.yaw_deg))
+        for base in (self.cutter_base, self.holder_base):
+            places += (*base.position_mm, base.yaw_deg)
         if not np.isfinite(places).all() or np.abs(places).max() > 10_000:
             raise InputError("cell: places must be finite and within 10000 mm, angles finite.")
         if self.cup_mm >= self.rod_mm:
             raise InputError("cell: the cup must be shorter than the rod that ends in it.")
-        if not 0 < self.speed_share <= 1:
-            raise InputError(f"cell: speed_share is {self.speed_share:g}; allowed: over 0 to 1.")
 
     def model(self, arm: str) -> ArmModel:
         """The type of arm that is ``cutter`` or ``holder``."""

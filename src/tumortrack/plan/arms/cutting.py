@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections import Counter
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
@@ -73,8 +74,8 @@ def _cut_leg(builder: TrajectoryBuilder, path_mm: np.ndarray, around: Surroundin
             approach = connect(away, joints[0], detours=_detours(away, one))
         except Blocked as blocked:
             reasons.append(blocked)
-            continue
-        return _execute(builder, one, approach, joints)
+        else:
+            return _execute(builder, one, approach, joints)
     for _, one, joints in sorted(later, key=lambda each: each[0])[:_SEARCHED]:
         try:
             approach = connect(away, joints[0], builder.rng, _detours(away, one))
@@ -143,7 +144,7 @@ def _execute(
     return len(one.cut_mm) - 1
 
 
-def passes(cuts: tuple[Cut, ...]) -> list[Float64[np.ndarray, "n 3"]]:
+def passes(cuts: Iterable[Cut]) -> list[Float64[np.ndarray, "n 3"]]:
     """The tip's paths, closely spaced: strokes one after the other, joined where the next begins
     beside the end of the last."""
     paths: list[np.ndarray] = []
@@ -151,11 +152,11 @@ def passes(cuts: tuple[Cut, ...]) -> list[Float64[np.ndarray, "n 3"]]:
         if paths and np.linalg.norm(paths[-1][-1] - cut.path_mm[0]) <= _LINK_MM:
             paths[-1] = np.concatenate([paths[-1], cut.path_mm])
         else:
-            paths.append(np.array(cut.path_mm))
-    steps = (np.linalg.norm(np.diff(path, axis=0), axis=1) for path in paths)
+            paths.append(cut.path_mm)
+    steps = (np.linalg.norm(np.diff(path, axis=0), axis=1) > 1e-6 for path in paths)
     return [
-        resampled(path[np.r_[True, step > 1e-6]], _STEP_MM)
-        for path, step in zip(paths, steps, strict=True)
+        resampled(path[np.r_[True, moves]], _STEP_MM)
+        for path, moves in zip(paths, steps, strict=True)
     ]
 
 
@@ -212,11 +213,6 @@ class Surroundings:
             section = section.symmetric_difference(shapely.Polygon(ring).buffer(0))
         return section.simplify(0.1)
 
-    def _within(self, height_mm: float, margin_mm: float) -> Any:
-        """All that lies within a margin of the organ at this height, and a little more."""
-        heights = (height_mm - margin_mm, height_mm, height_mm + margin_mm)
-        return shapely.union_all([self._organ(h) for h in heights]).buffer(margin_mm, 4)
-
     def _without_piece(self, height_mm: float) -> Any:
         rings = [
             shapely.Polygon(ring).buffer(_WALL_MM)
@@ -233,19 +229,24 @@ class Surroundings:
         radius = self._config.cup_radius_mm + around_mm
         return shapely.Point(self._grasp_mm[:2]).buffer(radius, 6)
 
+    def _near(self, height_mm: float, organ_mm: float, cup_mm: float) -> Any:
+        """All that lies within a margin of the organ at this height, and a little more, or of the
+        grasper."""
+        heights = (height_mm - organ_mm, height_mm, height_mm + organ_mm)
+        organ = shapely.union_all([self._organ(h) for h in heights]).buffer(organ_mm, 4)
+        return shapely.union(organ, self._cup(height_mm, cup_mm))
+
     def _electrode_obstacle(self, height_mm: float) -> Any:
         return self._cup(height_mm, ELECTRODE_RADIUS_MM + self._config.contact_mm)
 
     def _pencil_obstacle(self, height_mm: float) -> Any:
         # A little less than what collides: the exact test comes later.
         margin = 0.8 * (PENCIL_RADIUS_MM + self._config.organ_clearance_mm)
-        cup = self._cup(height_mm, PENCIL_RADIUS_MM + self._config.clearance_mm)
-        return shapely.union(self._within(height_mm, margin), cup)
+        return self._near(height_mm, margin, PENCIL_RADIUS_MM + self._config.clearance_mm)
 
     def _within_clearance(self, height_mm: float) -> Any:
         around = ELECTRODE_RADIUS_MM + self._config.clearance_mm
-        cup = self._cup(height_mm, around + 1.0)
-        return shapely.union(self._within(height_mm, _CLEAR_MM), cup)
+        return self._near(height_mm, _CLEAR_MM, around + 1.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -266,11 +267,15 @@ class Leg:
     @property
     def runs(self) -> list[tuple[slice, bool]]:
         """Pieces of ``poses`` to go through without a stop, and whether they cut; each begins
-        where the one before ends."""
-        first, n = len(self.enter_mm) - 1, len(self.cut_mm)
-        end = first + n - 1
-        cuts = [(slice(first + a, first + b + 1), True) for a, b in _smooth_runs(self.cut_mm)]
-        runs = [(slice(0, first + 1), False), *cuts, (slice(end, end + len(self.leave_mm)), False)]
+        where the one before ends. At sharp corners of the cut the tip stops."""
+        edges = np.diff(self.cut_mm, axis=0)
+        edges /= np.linalg.norm(edges, axis=1, keepdims=True)
+        corners = np.flatnonzero((edges[1:] * edges[:-1]).sum(1) < _CORNER) + 1
+        ends = [0, *corners.tolist(), len(self.cut_mm) - 1]
+        first, last = len(self.enter_mm) - 1, len(self.enter_mm) + len(self.cut_mm) - 2
+        cuts = [(slice(first + a, first + b + 1), True) for a, b in itertools.pairwise(ends)]
+        leave = slice(last, last + len(self.leave_mm))
+        runs = [(slice(0, first + 1), False), *cuts, (leave, False)]
         return [(run, cutting) for run, cutting in runs if run.stop - run.start > 1]
 
 
@@ -304,12 +309,3 @@ def _lines(
     ahead = np.stack([np.cos(yaws_rad), np.sin(yaws_rad)], 1)[:, None]
     ends = [tips_mm[None, :, :2] - far * ahead for far in (from_mm, to_mm)]
     return shapely.linestrings(np.stack(ends, axis=2))
-
-
-def _smooth_runs(points_mm: np.ndarray) -> list[tuple[int, int]]:
-    """First and last points of the pieces of a path without sharp corners; each begins where the
-    one before ends."""
-    edges = np.diff(points_mm, axis=0)
-    edges /= np.linalg.norm(edges, axis=1, keepdims=True)
-    corners = np.flatnonzero((edges[1:] * edges[:-1]).sum(1) < _CORNER) + 1
-    return list(itertools.pairwise([0, *corners.tolist(), len(points_mm) - 1]))

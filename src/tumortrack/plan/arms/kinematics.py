@@ -28,12 +28,9 @@ _LIMITS = np.array([TURN, TURN, np.pi, TURN, TURN, TURN])
 class ArmModel(NamedTuple):
     """One type of arm, standard Denavit-Hartenberg: Rz(joint) Tz(d) Tx(a) Rx(alpha) per joint.
 
-    Attributes:
-        name: as ``ur_analytic_ik`` calls it.
-        a_mm, d_mm, alpha_rad: per joint (6,).
-        limits_rad: of the joints, in both directions (6,).
-        speeds_rad_s: the maker's maximum (6,).
-        reach_mm: the maker's figure, from the base to the flange's middle.
+    Arrays are per joint (6,). ``name``: as ``ur_analytic_ik`` calls it; ``speeds_rad_s`` and
+    ``reach_mm`` (from the base to the flange's middle): the maker's maxima; ``limits_rad``: of the
+    joints, in both directions.
     """
 
     name: str

@@ -65,16 +65,11 @@ def follow(
 
 
 def _reject_early(group: PlanningGroup, poses: np.ndarray) -> None:
-    """Most paths that are blocked show it at a few of their poses.
-
-    Raises:
-        Blocked: no branch is free at one of them.
-    """
+    """Most paths that are blocked show it at a few of their poses: no branch is free there."""
     for branches in _branches(group, poses[_FEW // 2 :: _FEW]):
-        pairs = (group.collides(joints) for joints in branches[~np.isnan(branches[:, 0])])
         pair: CollidingPair | None = None
-        for pair in pairs:
-            if pair is None:
+        for joints in branches[~np.isnan(branches[:, 0])]:
+            if (pair := group.collides(joints)) is None:
                 break
         if pair is not None:
             raise Blocked.by(pair)
@@ -83,11 +78,10 @@ def _reject_early(group: PlanningGroup, poses: np.ndarray) -> None:
 def _branches(group: PlanningGroup, poses: np.ndarray) -> np.ndarray:
     """All branches of the inverse kinematics of all poses (n, most, 6), filled up with NaN."""
     found = [group.inverse_kinematics(pose) for pose in poses]
-    for pose, branches in zip(poses, found, strict=True):
+    joints = np.full((len(poses), max(map(len, found), default=0), 6), np.nan)
+    for row, branches, pose in zip(joints, found, poses, strict=True):
         if not len(branches):
             raise out_of_reach(group, pose)
-    joints = np.full((len(poses), max(map(len, found), default=0), 6), np.nan)
-    for row, branches in zip(joints, found, strict=True):
         row[: len(branches)] = branches
     return joints
 
@@ -117,11 +111,8 @@ def _cheapest(joints: np.ndarray, barred: np.ndarray, near_rad: np.ndarray) -> n
 
 
 def _checked(group: PlanningGroup, path_rad: np.ndarray) -> np.ndarray:
-    """The path, each joint moved by a whole turn where it would leave its limits.
-
-    Raises:
-        Blocked: it turns by more than the limits leave, or collides between its points.
-    """
+    """The path, each joint moved by a whole turn where it would leave its limits; Blocked where it
+    turns by more than the limits leave, or collides between its points."""
     limits_rad = group.limits_rad
     path_rad = np.where((path_rad > limits_rad).any(0), path_rad - TURN, path_rad)
     path_rad = np.where((path_rad < -limits_rad).any(0), path_rad + TURN, path_rad)
@@ -156,9 +147,12 @@ def connect(
     if pair is None:
         steps = max(2, int(np.ceil(np.abs(goal_rad - start_rad).max() / _POINT_RAD)))
         return np.linspace(start_rad, goal_rad, steps + 1)
-    for corners in detours:
-        path = _detour(group, np.stack([start_rad, *corners, goal_rad]))
-        if path is not None:
+    for between in detours:
+        corners = np.stack([start_rad, *between, goal_rad])
+        free = not any(group.collides(corner) for corner in between) and not any(
+            group.segment_collides(a, b, _COARSE) for a, b in itertools.pairwise(corners)
+        )
+        if free and (path := _smooth(group, corners)) is not None:
             return path
     if rng is None:
         raise Blocked.by(pair, " on the way")
@@ -173,15 +167,6 @@ def connect(
     raise Blocked(f"no way round was found where {pair[0]} would meet {pair[1]}", pair)
 
 
-def _detour(group: PlanningGroup, corners: np.ndarray) -> np.ndarray | None:
-    """The path through these corners, rounded, if it is free."""
-    if any(group.collides(corner) for corner in corners[1:-1]):
-        return None
-    if any(group.segment_collides(a, b, _COARSE) for a, b in itertools.pairwise(corners)):
-        return None
-    return _smooth(group, corners)
-
-
 class _Tree:
     def __init__(self, root: np.ndarray) -> None:
         self.nodes, self.parents = [root], [-1]
@@ -189,17 +174,15 @@ class _Tree:
     def extend(self, target: np.ndarray, group: PlanningGroup) -> bool:
         """Grow towards the target until it is reached (True) or something collides."""
         at = int(((np.array(self.nodes) - target) ** 2).sum(1).argmin())
-        while True:
+        while (far := float(np.abs(target - self.nodes[at]).max())) >= 1e-9:
             here = self.nodes[at]
-            far = float(np.abs(target - here).max())
-            if far < 1e-9:
-                return True
             there = target if far <= _STEP_RAD else here + (target - here) * (_STEP_RAD / far)
             if group.collides(there) or group.segment_collides(here, there, _COARSE):
                 return False
             self.nodes.append(there)
             self.parents.append(at)
             at = len(self.nodes) - 1
+        return True
 
     def branch(self) -> list[np.ndarray]:
         """From the newest node back to the root."""
@@ -213,7 +196,7 @@ class _Tree:
 def _grow(
     group: PlanningGroup,
     goal_rad: np.ndarray,
-    box: tuple[np.ndarray, np.ndarray],
+    box: tuple[np.ndarray, ...],
     rng: np.random.Generator,
 ) -> np.ndarray | None:
     """Corners of a free path (k, d), or None: two trees that grow towards each other."""
@@ -228,10 +211,9 @@ def _grow(
     return None
 
 
-def _shortcut(group: PlanningGroup, corners: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+def _shortcut(group: PlanningGroup, path: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Fewer corners, closer to the straight path: pieces between any two places on it are replaced
     by straight segments where those are free."""
-    path = corners
     for _ in range(_SHORTCUTS):
         if len(path) == 2:
             break
@@ -241,7 +223,7 @@ def _shortcut(group: PlanningGroup, corners: np.ndarray, rng: np.random.Generato
             rng.choice(along, 2, False) if rng.random() < 0.5 else rng.uniform(0, along[-1], 2)
         )
         ends = np.array([[np.interp(at, along, axis) for axis in path.T] for at in (low, high)])
-        between = ((along > low) & (along < high)).sum()
+        between = ((along > low) & (along < high)).any()
         if between and group.segment_collides(ends[0], ends[1], _COARSE) is None:
             path = np.concatenate([path[along < low], ends, path[along > high]])
     return path

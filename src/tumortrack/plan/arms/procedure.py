@@ -1,8 +1,12 @@
-"""From a resection plan to motions of both arms: approach, grasp, hold, sweeps, release, home."""
+"""From a resection plan to motions of both arms: approach, grasp, hold, sweeps, release, home.
+
+Also the worker that plans anew beside the live loop: a process of its own, which holds up no frame.
+"""
 
 from __future__ import annotations
 
 import itertools
+import signal
 from collections.abc import Iterator
 from copy import copy
 
@@ -11,22 +15,17 @@ import numpy as np
 
 from tumortrack.core.errors import InputError, NoPlan
 from tumortrack.core.types import Mesh
+from tumortrack.plan.arms import cutting
 from tumortrack.plan.arms.cell import TOUCHES, ArmCell, Blocked, PlanningGroup
 from tumortrack.plan.arms.config import Base, CellConfig
-from tumortrack.plan.arms.cutting import (
-    DETOURS_MM,
-    Surroundings,
-    aside,
-    cut_pass,
-    leg,
-    level_poses,
-    passes,
-)
+from tumortrack.plan.arms.cutting import Surroundings, level_poses
 from tumortrack.plan.arms.kinematics import level_pose, yaw_of
 from tumortrack.plan.arms.paths import connect, follow, out_of_reach
 from tumortrack.plan.arms.trajectory import TrajectoryBuilder, along, together
 from tumortrack.plan.motions import ARMS, CUTTER, HOLDER, JOINTS, Joints, Motions
-from tumortrack.plan.values import ResectionPlan
+from tumortrack.plan.operation import Planned, ResectionProgress
+from tumortrack.plan.resection import plan_resection
+from tumortrack.plan.values import Located, ResectionConfig, ResectionPlan
 
 _SETTLE_S = 0.5  # until the vacuum holds
 _LET_GO_S = 0.3
@@ -111,12 +110,10 @@ def _lowering(grasp_mm: np.ndarray, yaw_rad: float) -> np.ndarray:
 
 
 def _grips(builder: TrajectoryBuilder, grasp_mm: np.ndarray) -> Iterator[np.ndarray]:
-    """Joint paths (n, 6) straight down onto the grasp, those near the arm's present place first.
+    """Joint paths (n, 6) straight down onto the grasp, those near the arm's present place first;
+    Blocked where there is none.
 
     How the cup is turned does not matter: it is round, and turns about the last joint alone.
-
-    Raises:
-        Blocked: none at all, and why.
     """
     group = builder.group(HOLDER, touching=(HOLDER,))
     poses = _lowering(grasp_mm, yaw_of(builder.tip(HOLDER)))
@@ -152,12 +149,14 @@ def _cut_and_finish(
     builder: TrajectoryBuilder, plan: ResectionPlan, around: Surroundings, first: int
 ) -> Motions:
     for sweep in range(first, plan.sweeps + 1):
-        for path_mm in passes(tuple(cut for cut in plan.cuts if cut.sweep == sweep)):
-            cut_pass(builder, path_mm, around)
+        for path_mm in cutting.passes(cut for cut in plan.cuts if cut.sweep == sweep):
+            cutting.cut_pass(builder, path_mm, around)
         builder.close(f"sweep {sweep}")
     _let_go(builder)
     builder.close("release")
-    return _home(builder)
+    _go_home(builder)
+    builder.close("home")
+    return Motions(builder.stages)
 
 
 def _withdraw(builder: TrajectoryBuilder, around: Surroundings, holding: bool) -> None:
@@ -166,7 +165,7 @@ def _withdraw(builder: TrajectoryBuilder, around: Surroundings, holding: bool) -
     if pair is not None and TOUCHES[CUTTER] in pair:
         tip = builder.tip(CUTTER)
         yaw = yaw_of(tip)
-        leave = leg(tip[None, :3, 3], yaw, around).leave_mm
+        leave = cutting.leg(tip[None, :3, 3], yaw, around).leave_mm
         builder.follow(CUTTER, level_poses(leave, yaw), builder.cell.config.cutting_mm_s)
     pair = builder.cell.collisions(builder.joints_rad, (CUTTER,))
     if not holding and pair is not None and TOUCHES[HOLDER] in pair:
@@ -181,7 +180,7 @@ def _let_go(builder: TrajectoryBuilder) -> None:
     builder.follow(HOLDER, rising, builder.cell.config.grasping_mm_s)
 
 
-def _home(builder: TrajectoryBuilder) -> Motions:
+def _go_home(builder: TrajectoryBuilder) -> None:
     """Both arms at once: straight in joint space if that is free."""
     both, home, speeds = builder.group(None), builder.cell.home_rad, builder.cell.speeds_rad_s
     for place in (both.joints_rad, home):
@@ -191,11 +190,9 @@ def _home(builder: TrajectoryBuilder) -> Motions:
         builder.add(together(both.joints_rad, home, speeds))
     else:
         cutter, tip = builder.group(CUTTER), builder.tip(CUTTER)
-        corners = [aside(cutter, tip, *by) for by in DETOURS_MM]
+        corners = [cutting.aside(cutter, tip, *by) for by in cutting.DETOURS_MM]
         detours = [cutter.all_joints(corner)[None] for corner in corners if len(corner)]
         builder.add(along(connect(both, home, builder.rng, detours), speeds))
-    builder.close("home")
-    return builder.motions()
 
 
 def search_bases(
@@ -224,10 +221,9 @@ def search_bases(
         if cell.collisions(cell.home_rad) is not None:
             continue
         try:
-            motions = plan_motions(plan, cell, organ, seed=seed)
+            return cell, plan_motions(plan, cell, organ, seed=seed), _note(elsewhere)
         except NoPlan:
             continue
-        return cell, motions, _note(elsewhere)
     raise NoPlan(f"{reason} Other places for the arms round the table were tried in vain.")
 
 
@@ -236,13 +232,16 @@ def _elsewhere(plan: ResectionPlan, config: CellConfig) -> Iterator[CellConfig]:
     # Ends and middles of all strokes
     strokes = np.concatenate([cut.path_mm[[0, len(cut.path_mm) // 2, -1]] for cut in plan.cuts])
     targets = {CUTTER: strokes, HOLDER: plan.grasp_mm[None] + [[0, 0, 0], [0, 0, 60.0]]}
-    good: dict[str, list[Base]] = {}
+    good = []
     for arm in ARMS:
-        places = _places(config, arm, plan.grasp_mm[:2])
-        good[arm] = [base for base in places if _reaches(_with(config, {arm: base}), arm, targets)]
-    pairs = itertools.product(enumerate(good[CUTTER]), enumerate(good[HOLDER]))
+        places = [
+            msgspec.structs.replace(config, **{f"{arm}_base": base})
+            for base in _places(config, arm, plan.grasp_mm[:2])
+        ]
+        good.append([place.base(arm) for place in places if _reaches(place, arm, targets[arm])])
+    pairs = itertools.product(*map(enumerate, good))
     for (_, cutter), (_, holder) in sorted(pairs, key=lambda pair: pair[0][0] + pair[1][0]):
-        yield _with(config, {CUTTER: cutter, HOLDER: holder})
+        yield msgspec.structs.replace(config, cutter_base=cutter, holder_base=holder)
 
 
 def _places(config: CellConfig, arm: str, middle_mm: np.ndarray) -> list[Base]:
@@ -262,27 +261,51 @@ def _places(config: CellConfig, arm: str, middle_mm: np.ndarray) -> list[Base]:
     return bases
 
 
-def _reaches(config: CellConfig, arm: str, targets_mm: dict[str, np.ndarray]) -> bool:
+def _reaches(config: CellConfig, arm: str, targets_mm: np.ndarray) -> bool:
     """Whether the arm's tip comes to all its targets, each time pointing in any direction."""
     cell = ArmCell(config)
     group = PlanningGroup(cell, arm, cell.home_rad)
     yaws = np.linspace(0, 2 * np.pi, _YAWS if arm == CUTTER else 1, endpoint=False)
     return all(
         any(len(group.inverse_kinematics(level_pose(target, yaw))) for yaw in yaws)
-        for target in targets_mm[arm]
+        for target in targets_mm
     )
-
-
-def _with(config: CellConfig, bases: dict[str, Base]) -> CellConfig:
-    return msgspec.structs.replace(config, **{f"{arm}_base": base for arm, base in bases.items()})
 
 
 def _note(config: CellConfig) -> str:
     places = []
     for arm in ARMS:
-        base = config.base(arm)
-        x, y, z = base.position_mm
-        places.append(
-            f"{arm}'s base at ({x:g}, {y:g}, {z:g}) mm, turned by {base.yaw_deg:g} degrees"
-        )
+        (x, y, z), yaw_deg = config.base(arm).position_mm, config.base(arm).yaw_deg
+        places.append(f"{arm}'s base at ({x:g}, {y:g}, {z:g}) mm, turned by {yaw_deg:g} degrees")
     return f"the arms do not manage from where they stand; planned with the {', the '.join(places)}"
+
+
+_setting: list[tuple[ResectionConfig, ArmCell]] = []  # of the worker
+
+
+def begin_worker(config: ResectionConfig, cell: CellConfig) -> None:
+    """Called once in the new process. Ctrl-C is for the live loop to handle, not for the worker."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    _setting.append((config, ArmCell(cell)))
+
+
+def warm_up() -> None:
+    """Returns when the process has begun and has loaded what is slow to load."""
+    import ruckig  # noqa: F401
+    import toppra  # noqa: F401
+
+
+def replan(located: Located, joints_rad: Joints, progress: ResectionProgress) -> Planned:
+    """The plan for the organ as it lies now, from where the arms are; see ``plan_motions``.
+
+    Raises:
+        NoPlan: there is none.
+    """
+    config, cell = _setting[0]
+    plan = plan_resection(located, config)
+    organ = located.meshes.get("kidney")
+    if organ is None:
+        raise NoPlan("the organ's surface was not found")
+    from_sweep = progress.first_sweep(plan, located.meshes[plan.tumor])
+    motions = plan_motions(plan, cell, organ, start_rad=joints_rad, from_sweep=from_sweep)
+    return Planned(plan, located.meshes, motions)

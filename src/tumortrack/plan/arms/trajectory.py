@@ -17,7 +17,7 @@ from jaxtyping import Float64
 from tumortrack.plan.arms.cell import ArmCell, Blocked, PlanningGroup
 from tumortrack.plan.arms.kinematics import ACCELERATION_RAD_S2, JERK_RAD_S3, Pose
 from tumortrack.plan.arms.paths import arc_lengths, follow
-from tumortrack.plan.motions import CUTTER, HOLDER, Joints, Motions, MotionStage
+from tumortrack.plan.motions import CUTTER, HOLDER, Joints, MotionStage
 
 _STEP_S = 0.02  # between two samples; straight segments between them stay within 0.05 mm
 _TIP_SPEED_UP_S = 0.2  # until a tip has its speed
@@ -38,7 +38,7 @@ class TrajectoryBuilder:
 
     def __init__(self, cell: ArmCell, start_rad: Joints, rng: np.random.Generator) -> None:
         self.cell, self.joints_rad, self.rng = cell, start_rad, rng
-        self._stages: tuple[MotionStage, ...] = ()
+        self.stages: tuple[MotionStage, ...] = ()
         self._pieces: tuple[tuple[np.ndarray, np.ndarray, bool], ...] = ()
 
     def group(self, arm: str | None, touching: Collection[str] = ()) -> PlanningGroup:
@@ -57,15 +57,14 @@ class TrajectoryBuilder:
         cutting: bool = False,
     ) -> None:
         """One arm along a path that begins where it is; its tip no faster than ``tip_mm_s``."""
-        group = self.group(arm)
         if np.ptp(path_rad, axis=0).max() < _THERE_RAD:
             return
-        speeds = self.cell.speeds_rad_s[group.own]
-        if tip_mm_s is None:
-            times, own = along(path_rad, speeds)
-        else:
-            tips = [self.cell.tips(group.all_joints(joints))[arm][:3, 3] for joints in path_rad]
-            times, own = along(path_rad, speeds, np.array(tips), tip_mm_s)
+        group = self.group(arm)
+        tips: np.ndarray | None = None
+        if tip_mm_s is not None:
+            everything = map(group.all_joints, path_rad)
+            tips = np.array([self.cell.tips(joints)[arm][:3, 3] for joints in everything])
+        times, own = along(path_rad, self.cell.speeds_rad_s[group.own], tips, tip_mm_s or 0.0)
         joints = np.repeat(self.joints_rad[None], len(times), axis=0)
         joints[:, group.own] = own
         self.add((times, joints), cutting)
@@ -100,11 +99,8 @@ class TrajectoryBuilder:
             joints.append(piece_joints[1:])
             cutting.append(np.full(len(piece_times) - 1, cuts))
         arrays = (np.concatenate(parts) for parts in (times, joints, cutting))
-        self._stages += (MotionStage(name, *arrays),)
+        self.stages += (MotionStage(name, *arrays),)
         self._pieces = ()
-
-    def motions(self) -> Motions:
-        return Motions(self._stages)
 
 
 def along(
@@ -122,7 +118,7 @@ def along(
         Blocked: no such motion (the path has a kink that can't be taken).
     """
     import toppra
-    from toppra import algorithm, constraint
+    from toppra import constraint
 
     logging.getLogger("toppra").setLevel(logging.ERROR)
     width = path_rad.shape[1]
@@ -145,9 +141,7 @@ def along(
     best: Any = None
     for finer in _FINER:
         grid = np.linspace(0, knots[-1], round(finer * max(_GRID, keep.sum())))
-        solver = algorithm.TOPPRA(
-            limits, curve, gridpoints=grid, parametrizer="ParametrizeConstAccel"
-        )
+        solver = toppra.algorithm.TOPPRA(limits, curve, grid, parametrizer="ParametrizeConstAccel")
         found = solver.compute_trajectory(0, 0)
         if found is not None and (best is None or found.duration < best.duration):
             best = found

@@ -1,73 +1,21 @@
-"""Points and depth images of a batch of scenes as tensors.
+"""Depth images of a batch of surfaces with the same triangles, as tensors.
 
-Motion (drags, squeeze and bend, the camera's pose) is written component by component: matrix
-products may be rounded to fewer bits by a device's settings (TF32, autocast), which at a tumor's
-distance is a tenth of a millimetre.
-
-Depth images of surfaces with the same triangles are a z-buffer of scattered maxima: every triangle
-that faces the camera is spread over the pixels of its box, and each pixel keeps the greatest 1/z.
-Precision and tolerance are those of ``sense.render``, so that the same vertices give the same
-image, in whatever order a device works.
+A z-buffer of scattered maxima: every triangle that faces the camera is spread over the pixels of
+its box, and each pixel keeps the greatest 1/z. Precision and tolerance are those of
+``sense.render``, so that the same vertices give the same image, in whatever order a device works.
 """
 
 from __future__ import annotations
 
-import numpy as np
 import torch
 from jaxtyping import Float32, Float64, Int64
 from torch import Tensor
 
 from tumortrack.core.types import Intrinsics
-from tumortrack.simulate.batched.plan import BatchPlan
 
-Points = Float32[Tensor, "3 b n"]
 PerFace = Int64[Tensor, " t"]
-_SMALLEST = -12.0  # a drag's exponents below, factors of 6e-6, count as zero
 _NEAREST_MM = 1.0
 _EDGE = -1e-5  # barycentric weights of a point on an edge may be this far below 0
-
-
-def carried(plan: BatchPlan, points_ct: Points) -> Points:
-    """Points of the undeformed CT frame at their places before the plan's cameras, mm."""
-
-    def sent(array: np.ndarray) -> Tensor:
-        sent = torch.from_numpy(array.astype(np.float32))
-        return sent.to(points_ct.device, non_blocking=True)
-
-    drags = map(sent, (plan.centres_ct, plan.shifts_mm, plan.sigmas_mm))
-    points = _dragged(points_ct.clone(), *drags)
-    for numbers in sent(plan.stretches).permute(1, 2, 0):
-        points = _stretched(points, numbers[:, :, None])
-    x, y, z = points
-    rows = sent(plan.camera_from_ct)[:, :3, :, None].unbind(1)
-    return torch.stack([x * r[:, 0] + y * r[:, 1] + z * r[:, 2] + r[:, 3] for r in rows])
-
-
-def _dragged(
-    points: Points,
-    centres_ct: Float32[Tensor, "b k 3"],
-    shifts_mm: Float32[Tensor, "b k 3"],
-    sigmas_mm: Float32[Tensor, "b k"],
-) -> Points:
-    """k drags one after the other, in place, as ``simulate.deform.drag``."""
-    centres_ct, shifts_mm = centres_ct.permute(2, 0, 1), shifts_mm.permute(2, 0, 1)
-    scales = -0.5 / (sigmas_mm * sigmas_mm)
-    for k in range(sigmas_mm.shape[1]):
-        offset = points - centres_ct[:, :, k, None]
-        exponent = offset.square_().sum(0).mul_(scales[:, k, None])
-        factor = torch.threshold_(exponent, _SMALLEST, -torch.inf).exp_()
-        points.addcmul_(factor, shifts_mm[:, :, k, None])
-    return points
-
-
-def _stretched(points: Points, numbers: Float32[Tensor, "20 b 1"]) -> Points:
-    """A squeeze and bend, as ``simulate.deform.stretch``."""
-    centre, rows = numbers[:3], numbers[3:12].unflatten(0, (3, 3))
-    along, across, sagitta, reach = numbers[12:15], numbers[15:18], numbers[18], numbers[19]
-    offset = points - centre
-    bend = sagitta * ((offset * along).sum(0) / reach).square()
-    offset = offset + bend * across
-    return torch.stack([(offset * row).sum(0) for row in rows]) + centre
 
 
 def depth_images(
@@ -78,7 +26,13 @@ def depth_images(
     corners, area, box = _front(points_mm, faces, intrinsics)
     scene, left, top, wide, high = box.unbind(1)
     planes = _planes(corners, area, left, top)
-    triangle, column, row = _pixels(wide, high)
+    # All pixels of all boxes: their triangle, and their column and row in its box.
+    count = wide * high
+    triangle = torch.repeat_interleave(count)
+    place = torch.arange(len(triangle), device=wide.device) - (count.cumsum(0) - count)[triangle]
+    wide = wide[triangle]
+    row = place.div(wide, rounding_mode="floor")
+    column = place - row * wide
     start, across, down = planes[:, :, triangle]
     share_a, share_b, inverse = start.addcmul(across, column).addcmul(down, row)
     least = torch.minimum(torch.minimum(share_a, share_b), 1.0 - share_a - share_b)
@@ -92,9 +46,8 @@ def depth_images(
 def _front(
     points_mm: Float32[Tensor, "3 b v"], faces: Int64[Tensor, "f 3"], intrinsics: Intrinsics
 ) -> tuple[Float32[Tensor, "t 9"], Float32[Tensor, " t"], Int64[Tensor, "t 5"]]:
-    """Of the triangles that face the camera and touch a pixel: corners (column, row and 1/z, which
-    is linear in the image; -1 behind the camera), area, and box (scene, left, top, width,
-    height)."""
+    """Of the triangles that face the camera and touch a pixel: corners (column, row, and 1/z or -1
+    behind the camera), area, and box (scene, left, top, width, height)."""
     x, y, z = points_mm
     inverse = torch.where(z > _NEAREST_MM, 1.0 / z, -1.0)
     u = intrinsics.fx * x.double() * inverse.double() + intrinsics.cx
@@ -116,10 +69,7 @@ def _front(
 
 
 def _planes(
-    corners: Float32[Tensor, "t 9"],
-    area: Float32[Tensor, " t"],
-    left: PerFace,
-    top: PerFace,
+    corners: Float32[Tensor, "t 9"], area: Float32[Tensor, " t"], left: PerFace, top: PerFace
 ) -> Float64[Tensor, "3 3 t"]:
     """The barycentric weights of corners a and b, and 1/z: at a box's first pixel, their increment
     by column and by row."""
@@ -136,13 +86,3 @@ def _planes(
     down = down_a * from_a + down_b * from_b
     rows = (start_a, start_b, start, across_a, across_b, across, down_a, down_b, down)
     return torch.stack(rows).unflatten(0, (3, 3))
-
-
-def _pixels(wide: PerFace, high: PerFace) -> tuple[Int64[Tensor, " p"], ...]:
-    """All pixels of all boxes: their triangle, and their column and row in its box."""
-    count = wide * high
-    triangle = torch.repeat_interleave(count)
-    place = torch.arange(len(triangle), device=wide.device) - (count.cumsum(0) - count)[triangle]
-    wide = wide[triangle]
-    row = place.div(wide, rounding_mode="floor")
-    return triangle, place - row * wide, row

@@ -1,4 +1,4 @@
-"""Deformations: one file per model.
+"""Deformations: one file per model; and several one after the other, or none.
 
 A model's configuration samples parameters from what the camera sees (``sample``); the sampled
 deformation is a value that maps any point of the CT frame to its new place (``apply``) and can be
@@ -6,23 +6,60 @@ recorded (``record``). To add one here: write its file, add its configuration to
 ``installed``. Other packages add theirs with an entry point, see there.
 """
 
-from typing import TYPE_CHECKING, Any
+from __future__ import annotations
 
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from tumortrack.core.config import Config
 from tumortrack.simulate.deform import installed
-from tumortrack.simulate.deform.chain import ChainConfig, RestConfig
+from tumortrack.simulate.deform.base import Deformation, Points, View
 from tumortrack.simulate.deform.drag import DragConfig
 from tumortrack.simulate.deform.elastic import ElasticConfig
 from tumortrack.simulate.deform.stretch import StretchConfig
 
 __all__ = ["ChainConfig", "DragConfig", "ElasticConfig", "RestConfig", "StretchConfig"]
 
-if TYPE_CHECKING:
-    DeformConfig = installed.LinkConfig | ChainConfig | RestConfig
-else:
 
-    def __getattr__(name: str) -> Any:
-        """``DeformConfig``, which includes the models of other packages, on first use."""
-        if name != "DeformConfig":
-            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-        globals()[name] = union = installed.LinkConfig | ChainConfig | RestConfig
-        return union
+@dataclass(frozen=True)
+class Chain:
+    """The first is applied first."""
+
+    links: tuple[Deformation, ...]
+
+    def apply(self, points_ct: Points) -> Points:
+        for link in self.links:
+            points_ct = link.apply(points_ct)
+        return points_ct
+
+    def record(self) -> dict[str, Any]:
+        return {"kind": "chain", "links": [link.record() for link in self.links]}
+
+
+class ChainConfig(Config, frozen=True, tag="chain"):
+    """Each link is sampled from the view of the undeformed organ; local ones come first."""
+
+    links: tuple[installed.LinkConfig, ...]
+
+    def sample(self, view: View, rng: np.random.Generator) -> Chain:
+        return Chain(tuple(link.sample(view, rng) for link in self.links))
+
+
+def links_of(model: Config) -> tuple[Config, ...]:
+    """A model's links: of one that is no chain, itself."""
+    return model.links if isinstance(model, ChainConfig) else (model,)
+
+
+class RestConfig(Config, frozen=True, tag="rest"):
+    """The organ as it was in the CT, for rigid scenes: its own sample."""
+
+    def sample(self, view: View, rng: np.random.Generator) -> RestConfig:
+        return self
+
+    def apply(self, points_ct: Points) -> Points:
+        return points_ct.astype(np.float32)
+
+    def record(self) -> dict[str, Any]:
+        return {"kind": "rest"}

@@ -43,11 +43,7 @@ class ElasticConfig(Config, frozen=True, tag="elastic"):
     body: BodyConfig = BodyConfig()
 
     def sample(self, view: View, rng: np.random.Generator) -> ElasticDeformation:
-        """Draw states and scales uniformly.
-
-        Raises:
-            InputError: the view has no body.
-        """
+        """Draw states and scales uniformly; a view without a body raises InputError."""
         if view.body is None:
             raise InputError(
                 "elastic deformations need the organ's body; build it with body_for(...) and give "
@@ -57,4 +53,7 @@ class ElasticConfig(Config, frozen=True, tag="elastic"):
         state = states[rng.integers(len(states))] * rng.uniform(*self.scale)
         if rng.uniform() < self.mixed:
             state = state + states[rng.integers(len(states))] * rng.uniform(*self.second_scale)
-        return ElasticDeformation(view.body, view.body.within_reach(state.astype(np.float32)))
+        coefficients, swelling = state.astype(np.float32), states[:, -1]
+        # No more swelling or shrinking than the library has.
+        coefficients[-1] = np.clip(coefficients[-1], swelling.min(), swelling.max())
+        return ElasticDeformation(view.body, coefficients)

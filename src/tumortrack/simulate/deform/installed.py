@@ -22,6 +22,7 @@ from tumortrack.simulate.deform.elastic import ElasticConfig
 from tumortrack.simulate.deform.stretch import StretchConfig
 
 GROUP = "tumortrack.deformations"
+_OURS = (DragConfig, StretchConfig, ElasticConfig)
 
 if TYPE_CHECKING:
     LinkConfig = DragConfig | StretchConfig | ElasticConfig
@@ -39,9 +40,6 @@ else:
                 raise _broken(point, f"its tag {kind.__struct_config__.tag!r} is taken")
         globals()[name] = union = reduce(or_, filter(None, known.values()))
         return union
-
-
-_OURS = (DragConfig, StretchConfig, ElasticConfig)
 
 
 def _loaded(point: EntryPoint) -> type[Config]:

@@ -55,14 +55,9 @@ class StretchConfig(Config, frozen=True, tag="stretch"):
         stretch = rng.uniform(self.thinnest, self.thickest)
         matrix = axes @ np.diag([stretch, stretch**-0.5, stretch**-0.5]) @ axes.T
         along, across, _ = Rotation.random(rng=rng).as_matrix()
-        return Stretch(
-            centre_ct=(lower + upper) / 2,
-            matrix=matrix,
-            along=along,
-            across=across,
-            sagitta_mm=float(rng.uniform(-self.sagitta_mm, self.sagitta_mm)),
-            reach_mm=float(np.max(upper - lower) / 2),
-        )
+        sagitta_mm = float(rng.uniform(-self.sagitta_mm, self.sagitta_mm))
+        reach_mm = float(np.max(upper - lower) / 2)
+        return Stretch((lower + upper) / 2, matrix, along, across, sagitta_mm, reach_mm)
 
 
 @numba.njit(cache=True, nogil=True)

@@ -1,9 +1,8 @@
 """An elastic body: an organ's displacement modes and typical states, small enough for every frame.
 
 Finite elements (``finite``) of the organ respond to random loads; the principal components of the
-responses are its modes (``modes``). In their space the organ takes loads in its bed
-(``equilibrium``, ``loads``), which gives a library of states. See docs/method.md, section "Elastic
-deformations".
+responses are its modes (``modes``). In their space the organ takes loads in its bed (``loads``),
+which gives a library of states. See docs/method.md, section "Elastic deformations".
 """
 
 from __future__ import annotations
@@ -23,7 +22,7 @@ from tumortrack.core.types import Anatomy
 from tumortrack.simulate.elastic.flow import LatticeField, combine, follow, project, steps_for
 
 if TYPE_CHECKING:
-    from tumortrack.simulate.elastic.equilibrium import ReducedModel
+    from tumortrack.simulate.elastic.modes import ReducedModel
 
 Points = Float[np.ndarray, "n 3"]
 Moved = Float32[np.ndarray, "n 3"]
@@ -52,20 +51,15 @@ class ElasticBody:
 
     A state is a vector of coefficients; points follow the velocity ``modes @ coefficients`` for
     one unit of time. Outside the organ space follows smoothly.
-
-    Attributes:
-        origin_mm: node (0, 0, 0) of the lattice; ``spacing_mm``: its step.
-        modes: displacement at each node; a unit coefficient moves the organ by 1 mm rms. Free of
-            rigid motion; the last one swells, the others keep volume.
-        center_ct: the organ's centre of mass.
-        states: the library, one state a row.
     """
 
-    origin_mm: Float32[np.ndarray, " 3"]
+    origin_mm: Float32[np.ndarray, " 3"]  # node (0, 0, 0) of the lattice
     spacing_mm: float
-    center_ct: Float64[np.ndarray, " 3"]
+    center_ct: Float64[np.ndarray, " 3"]  # the organ's centre of mass
+    # Displacement at each node; a unit coefficient moves the organ by 1 mm rms. Free of rigid
+    # motion; the last one swells, the others keep volume.
     modes: Float32[np.ndarray, "i j k 3 m"]
-    states: Float32[np.ndarray, "s m"]
+    states: Float32[np.ndarray, "s m"]  # the library
 
     def __post_init__(self) -> None:
         shapes = (self.modes.ndim, self.states.ndim, self.modes.shape[-1])
@@ -88,8 +82,7 @@ class ElasticBody:
     @cached_property
     def covariance(self) -> Float64[np.ndarray, "m m"]:
         """Of the library, with a small ridge: always invertible."""
-        ridge = _RIDGE * np.eye(self.states.shape[1])
-        return np.cov(self.states.T.astype(float)) + ridge
+        return np.cov(self.states.T.astype(float)) + _RIDGE * np.eye(self.states.shape[1])
 
     @cached_property
     def precision(self) -> Float64[np.ndarray, "m m"]:
@@ -97,7 +90,7 @@ class ElasticBody:
         return np.linalg.inv(self.covariance)
 
     def velocity(self, coefficients: Float[np.ndarray, " m"]) -> Field:
-        """The field that points follow, mm per unit of time, at the lattice's nodes."""
+        """The field that points follow, mm per unit of time."""
         return combine(self.modes, np.asarray(coefficients, np.float32))
 
     def carry(self, coefficients: Float[np.ndarray, " m"], points_ct: Points) -> Moved:
@@ -119,12 +112,6 @@ class ElasticBody:
         along = [project(field, place, np.tile(axis, (len(place), 1))) for axis in axes]
         return np.stack(along, 1)
 
-    def within_reach(self, coefficients: Float32[np.ndarray, " m"]) -> Float32[np.ndarray, " m"]:
-        """The same with no more swelling or shrinking than the library has."""
-        kept = coefficients.copy()
-        kept[-1] = np.clip(kept[-1], self.states[:, -1].min(), self.states[:, -1].max())
-        return kept
-
     def _field(self, values: Float32[np.ndarray, "i j k ..."]) -> LatticeField:
         return LatticeField(values, self.origin_mm, np.float32(self.spacing_mm))
 
@@ -134,21 +121,15 @@ class ElasticBody:
 
     @classmethod
     def from_arrays(cls, arrays: dict[str, np.ndarray]) -> ElasticBody:
-        """The inverse of ``to_arrays``.
-
-        Raises:
-            InputError: an array is missing or of a wrong shape.
-        """
+        """The inverse of ``to_arrays``; an array that is missing or of a wrong shape raises
+        InputError."""
         missing = [name for name in _ARRAYS if name not in arrays]
         if missing:
             raise InputError(f"a body lacks {', '.join(missing)}; build it again.")
-        return cls(
-            np.asarray(arrays["origin_mm"], np.float32),
-            float(arrays["spacing_mm"]),
-            np.asarray(arrays["center_ct"], float),
-            np.ascontiguousarray(arrays["modes"], np.float32),
-            np.asarray(arrays["states"], np.float32),
-        )
+        names = ("origin_mm", "modes", "states")
+        origin_mm, modes, states = (np.ascontiguousarray(arrays[n], np.float32) for n in names)
+        place = origin_mm, float(arrays["spacing_mm"]), np.asarray(arrays["center_ct"], float)
+        return cls(*place, modes, states)
 
 
 def build_body(
@@ -156,9 +137,8 @@ def build_body(
 ) -> ElasticBody:
     """Finite elements of an organ, its modes, and a library of states under random loads.
 
-    Takes seconds on one core. The same anatomy, configuration and seed give the same body on the
-    same machine; elsewhere last digits differ, and with them possibly the order of modes that
-    matter equally.
+    Takes seconds on one core. The same arguments give the same body on the same machine; elsewhere
+    last digits differ, and with them possibly the order of modes that matter equally.
 
     Raises:
         InputError: a surface that turns inside, or numbers that make no body.
@@ -181,40 +161,13 @@ def build_body(
 def reduced_organ(
     anatomy_ct: Anatomy, up: Float64[np.ndarray, " 3"], config: BodyConfig, rng: np.random.Generator
 ) -> ReducedModel:
-    """An organ in the space of its modes, ready for loads; ``up`` is a unit vector.
-
-    Raises:
-        InputError: a surface that turns inside, or numbers that make no body.
-    """
-    _check(anatomy_ct, config)
-    from tumortrack.simulate.elastic.equilibrium import ReducedModel
+    """An organ in the space of its modes, ready for loads; ``up`` is a unit vector. Raises as
+    ``build_body``."""
     from tumortrack.simulate.elastic.finite import ElementLattice, LatticeSolid
-    from tumortrack.simulate.elastic.modes import modes_of, patches_of, random_loads
+    from tumortrack.simulate.elastic.modes import ReducedModel, modes_of, patches_of, random_loads
 
     organ = anatomy_ct.organ
-    spacing_mm = float(np.cbrt(organ.volume_mm3 / config.cells))
-    lattice = ElementLattice.around(organ.box_mm, spacing_mm)
-    solid = LatticeSolid(anatomy_ct, lattice, config.poisson)
-    patches = patches_of(organ, config.patches, rng)
-    loads = random_loads(solid, patches, up, config.responses, rng)
-    modes = modes_of(solid, patches, config.modes, config.contrasts, loads)
-    return ReducedModel(solid, modes, patches)
-
-
-def body_of(reduced: ReducedModel, states: Float32[np.ndarray, "s m"]) -> ElasticBody:
-    """The body of a reduced organ with these states as its library."""
-    solid = reduced.solid
-    return ElasticBody(
-        solid.lattice.origin_mm.astype(np.float32),
-        solid.lattice.spacing_mm,
-        solid.center_mm,
-        solid.spread(reduced.modes).astype(np.float32),
-        states,
-    )
-
-
-def _check(anatomy_ct: Anatomy, config: BodyConfig) -> None:
-    if anatomy_ct.organ.volume_mm3 <= 0:
+    if organ.volume_mm3 <= 0:
         raise InputError("the organ's surface has no volume inside; its faces must turn outward.")
     if not (
         config.cells >= 50
@@ -229,3 +182,18 @@ def _check(anatomy_ct: Anatomy, config: BodyConfig) -> None:
             f"{config} makes no body: it needs at least 50 cells, 20 patches, 2 states, 2 modes "
             "(no more than responses and cells), contrasts above 0, a Poisson ratio in 0..0.5."
         )
+    spacing_mm = float(np.cbrt(organ.volume_mm3 / config.cells))
+    lattice = ElementLattice.around(organ.box_mm, spacing_mm)
+    solid = LatticeSolid(anatomy_ct, lattice, config.poisson)
+    patches = patches_of(organ, config.patches, rng)
+    loads = random_loads(solid, patches, up, config.responses, rng)
+    modes = modes_of(solid, patches, config.modes, config.contrasts, loads)
+    return ReducedModel(solid, modes, patches)
+
+
+def body_of(reduced: ReducedModel, states: Float32[np.ndarray, "s m"]) -> ElasticBody:
+    """The body of a reduced organ with these states as its library."""
+    solid, lattice = reduced.solid, reduced.solid.lattice
+    origin_mm, modes = lattice.origin_mm, solid.spread(reduced.modes)
+    place = origin_mm.astype(np.float32), lattice.spacing_mm, solid.center_mm
+    return ElasticBody(*place, modes.astype(np.float32), states)

@@ -24,6 +24,7 @@ from scipy.sparse import coo_matrix, csr_matrix, diags
 from tumortrack.core.types import Anatomy, Mesh
 from tumortrack.simulate.occupancy import contains
 
+Points = Float[np.ndarray, "p 3"]
 VOID = 1e-2  # stiffness of the medium outside, relative to the organ's
 _SUBCELLS = 3  # samples along each axis of a cell for its filled fraction
 _ANCHOR = 1e-6  # of the stiffness: holds the rigid motions, which no load here excites
@@ -39,49 +40,43 @@ class ElementLattice:
 
     origin_mm: Float64[np.ndarray, " 3"]
     spacing_mm: float
-    shape: tuple[int, int, int]  # nodes along each axis
+    shape: tuple[int, ...]  # nodes along each axis
 
     @classmethod
     def around(cls, box_mm: Float64[np.ndarray, "2 3"], spacing_mm: float) -> ElementLattice:
         """The lattice around a box with a margin of two cells on every side."""
         cells = np.ceil((box_mm[1] - box_mm[0]) / spacing_mm + 4.0).astype(int)
-        nodes = (int(cells[0]) + 1, int(cells[1]) + 1, int(cells[2]) + 1)
-        return cls(box_mm.mean(0) - cells * spacing_mm / 2, spacing_mm, nodes)
+        origin_mm = box_mm.mean(0) - cells * spacing_mm / 2
+        return cls(origin_mm, spacing_mm, tuple((cells + 1).tolist()))
 
     @property
-    def cells(self) -> tuple[int, int, int]:
-        """Cells along each axis."""
-        return self.shape[0] - 1, self.shape[1] - 1, self.shape[2] - 1
+    def cells(self) -> tuple[int, ...]:
+        """Along each axis."""
+        return tuple(nodes - 1 for nodes in self.shape)
 
     def nodes_mm(self) -> Float64[np.ndarray, "n 3"]:
-        """Positions of all nodes, in the order of their numbers."""
+        """All nodes, in the order of their numbers."""
         return self.origin_mm + self.spacing_mm * np.indices(self.shape).reshape(3, -1).T
 
-    def cell_nodes(self) -> Int[np.ndarray, "c 8"]:
-        """Node numbers of every cell's corners, in the order of ``CORNERS``."""
-        return self._corner_nodes(np.indices(self.cells).reshape(3, -1).T)
-
-    def weights(self, points_mm: Float[np.ndarray, "p 3"]) -> csr_matrix:
+    def weights(self, points_mm: Points) -> csr_matrix:
         """Sparse (p, n): trilinear values at points = weights @ values at nodes; beyond the
         lattice those of its nearest border."""
         place = np.clip((points_mm - self.origin_mm) / self.spacing_mm, 0, np.array(self.cells))
         lowest = np.minimum(place.astype(int), np.array(self.cells) - 1)
         part = (place - lowest)[:, None]
         weight = np.where(CORNERS, part, 1 - part).prod(2)
-        entries = (np.repeat(np.arange(len(points_mm)), 8), self._corner_nodes(lowest).ravel())
+        entries = (np.repeat(np.arange(len(points_mm)), 8), self.corner_nodes(lowest).ravel())
         return csr_matrix((weight.ravel(), entries), (len(points_mm), int(np.prod(self.shape))))
 
-    def _corner_nodes(self, lowest: Int[np.ndarray, "c 3"]) -> Int[np.ndarray, "c 8"]:
+    def corner_nodes(self, lowest: Int[np.ndarray, "c 3"]) -> Int[np.ndarray, "c 8"]:
+        """Node numbers of cells' corners, in the order of ``CORNERS``."""
         return np.ravel_multi_index(tuple(np.moveaxis(lowest[:, None] + CORNERS, 2, 0)), self.shape)
 
 
-def cube_stiffness(
-    poisson: float,
-) -> tuple[Float64[np.ndarray, "24 24"], Float64[np.ndarray, " 24"]]:
-    """Of a unit cube with Young's modulus 1: stiffness, and mean dilatation per displacement.
-
-    Unknowns: x, y, z of the corners in the order of ``CORNERS``. A cube of edge h has h times
-    this stiffness, and 1 / h times this dilatation.
+def cube_stiffness(poisson: float) -> tuple[np.ndarray, np.ndarray]:
+    """Of a unit cube with Young's modulus 1: stiffness (24, 24), and mean dilatation per
+    displacement (24,). Unknowns: x, y, z of the corners in the order of ``CORNERS``. A cube of edge
+    h has h times this stiffness, and 1 / h times this dilatation.
     """
     shear = 1 / (2 * (1 + poisson))
     bulk = 1 / (3 * (1 - 2 * poisson))
@@ -121,16 +116,8 @@ def _filled(mesh: Mesh, lattice: ElementLattice) -> Float64[np.ndarray, " c"]:
 
 
 class LatticeSolid:
-    """An organ and its tumors on a lattice. Cells that do not touch a filled one are left out.
-
-    Attributes:
-        organ, tumor: filled fraction of each remaining cell.
-        cells: (c, 8), each cell's corners as indices into ``nodes``.
-        nodes: numbers in the lattice, ordered by layers along the lattice's longest axis.
-        bounds: the first node of each layer, and the end.
-        volume_mm3: the organ's volume, distributed over the nodes.
-        center_mm: the organ's centre of mass.
-    """
+    """An organ and its tumors on a lattice. Cells that do not touch a filled one are left out; the
+    nodes run by layers along the lattice's longest axis."""
 
     def __init__(self, anatomy_ct: Anatomy, lattice: ElementLattice, poisson: float) -> None:
         organ = _filled(anatomy_ct.organ, lattice)
@@ -139,20 +126,21 @@ class LatticeSolid:
             tumor = np.maximum(tumor, _filled(part, lattice))
         near = binary_dilation((organ > 0).reshape(lattice.cells), np.ones((3, 3, 3))).ravel()
         self.lattice, self.poisson = lattice, poisson
+        # The filled fraction of each remaining cell.
         self.organ, self.tumor = organ[near], np.minimum(tumor, organ)[near]
-        corners = lattice.cell_nodes()[near]
+        corners = lattice.corner_nodes(np.indices(lattice.cells).reshape(3, -1).T[near])
         used = np.unique(corners)
         layer = np.unravel_index(used, lattice.shape)[int(np.argmax(lattice.shape))]
         order = np.argsort(layer, kind="stable")
-        self.nodes = used[order]
+        self.nodes = used[order]  # their numbers in the lattice
         starts = np.flatnonzero(np.diff(layer[order], prepend=-1))
-        self.bounds = [*starts.tolist(), len(self.nodes)]
+        self.bounds = [*starts.tolist(), len(self.nodes)]  # of the layers
         number = np.empty(int(np.prod(lattice.shape)), int)
         number[self.nodes] = np.arange(len(self.nodes))
-        self.cells = number[corners]
-        self.unknowns = (3 * self.cells[:, :, None] + np.arange(3)).reshape(-1, 24)
-        volume = np.repeat(self.organ * lattice.spacing_mm**3 / 8, 8)
-        self.volume_mm3 = np.bincount(self.cells.ravel(), volume, len(self.nodes))
+        cells = number[corners]
+        self.unknowns = (3 * cells[:, :, None] + np.arange(3)).reshape(-1, 24)  # by cell
+        volume = np.repeat(self.organ * lattice.spacing_mm**3 / 8, 8)  # distributed over the nodes
+        self.volume_mm3 = np.bincount(cells.ravel(), volume, len(self.nodes))
         self.nodes_mm = lattice.nodes_mm()[self.nodes]
         self.center_mm = self.volume_mm3 @ self.nodes_mm / self.volume_mm3.sum()
 
@@ -164,9 +152,14 @@ class LatticeSolid:
         weights = np.outer(force, dilatation).ravel()
         return np.bincount(self.unknowns.ravel(), weights, 3 * len(self.nodes))
 
-    def weights(self, points_mm: Float[np.ndarray, "p 3"]) -> csr_matrix:
+    def weights(self, points_mm: Points) -> csr_matrix:
         """Sparse (p, n): values at points from values at the solid's nodes."""
         return self.lattice.weights(points_mm)[:, self.nodes]
+
+    def at(self, points_mm: Points, values: Float[np.ndarray, "f k"]) -> Float[np.ndarray, "p 3 k"]:
+        """Values of the unknowns at points."""
+        by_node = values.reshape(len(self.nodes), -1)
+        return (self.weights(points_mm) @ by_node).reshape(len(points_mm), 3, -1)
 
     def stiffness(self, moduli: Float[np.ndarray, " c"]) -> csr_matrix:
         """The stiffness matrix for a Young's modulus (N/mm2) in each cell."""
@@ -202,11 +195,8 @@ class BlockCholesky:
     A lattice cut across its longest axis has such a stiffness. Every block is dense after
     elimination, so BLAS does all the work on whole blocks and all right-hand sides at once: for an
     organ of some 10,000 unknowns many times faster than sparse factorisations with a general
-    ordering.
-
-    Args:
-        matrix: (n, n); entries between blocks that are not neighbours are taken to be zero.
-        bounds: 0, ..., n: block s holds the unknowns ``bounds[s] : bounds[s + 1]``.
+    ordering. Block s holds the unknowns ``bounds[s] : bounds[s + 1]``; entries between blocks that
+    are not neighbours are taken to be zero.
     """
 
     def __init__(self, matrix: csr_matrix, bounds: list[int]) -> None:
@@ -218,9 +208,8 @@ class BlockCholesky:
             if s:
                 own -= self._coupling[-1].T @ self._coupling[-1]
             self._diagonal.append(cholesky(own, lower=True, overwrite_a=True, check_finite=False))
-            if s + 1 < len(self._blocks):
-                beside = matrix[block, self._blocks[s + 1]].toarray()
-                self._coupling.append(self._solve(s, beside))
+            for beside in self._blocks[s + 1 : s + 2]:
+                self._coupling.append(self._solve(s, matrix[block, beside].toarray()))
 
     def solve(self, right: Float64[np.ndarray, "n r"]) -> Float64[np.ndarray, "n r"]:
         """The solutions for all right-hand sides at once."""

@@ -1,4 +1,8 @@
-"""What is done to an organ on the table: one function a load, and the state that several lead to.
+"""An organ in its bed takes loads: equilibrium with one-sided contacts in the space of its modes.
+
+Unknowns are the modes' coefficients and six rigid ones. The bed is a layer of springs on the
+underside, obstacles are stiff springs that only push. Each Newton step solves for the contacts
+that the last one left closed. Lengths in mm, stress in N/mm2 (1 kPa = 1e-3).
 
 A random load is a function in ``LOADS`` that adds itself to the problem of an organ in its bed.
 """
@@ -6,15 +10,20 @@ A random load is a function in ``LOADS`` that adds itself to the problem of an o
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass, field
 
+import numba
 import numpy as np
 from jaxtyping import Float64
 from scipy.spatial.transform import Rotation
 
 from tumortrack.core.geometry import perpendicular, unit
-from tumortrack.simulate.elastic.equilibrium import KPA, ReducedModel, ReducedProblem
+from tumortrack.simulate.elastic.modes import ReducedModel
 
+KPA = 1e-3  # N/mm2
 Vector = Float64[np.ndarray, " 3"]
+_MOST_STEPS = 20
+_CONVERGED_MM = 1e-2
 _OBSTACLE = 100 * KPA  # N/mm3, of plates and instruments
 _GRIP = 50 * KPA  # N/mm3, of what holds a place
 _WEIGHT = 1.05e-6 * 9.81  # N/mm3
@@ -24,44 +33,123 @@ _FARTHEST_MM = 16.0  # that a place of the surface moves
 _SWELLING = 0.025  # largest change of volume: leaves room below 3 % for what modes do to it
 
 
-def press(
-    problem: ReducedProblem, outward: Vector, height_mm: float, foot: Float64[np.ndarray, " p"]
-) -> None:
-    """Something hard comes from ``outward`` (a unit vector) and stops at ``height_mm`` along it,
-    felt by a fraction ``foot`` of each patch."""
-    patches = problem.organ.patches
-    depth = patches.points_mm @ outward - height_mm
-    problem.touch(problem.organ.along(outward), depth, _OBSTACLE * patches.areas_mm2 * foot)
+@dataclass(eq=False)
+class ReducedProblem:
+    """What acts on the organ, gathered by the loads: energy z' H z / 2 - g z + springs' energy."""
+
+    organ: ReducedModel
+    up: Vector
+    modulus: float  # of the tissue, N/mm2
+    stiffness: Float64[np.ndarray, "m m"]  # H
+    forces: Float64[np.ndarray, " m"]  # g
+    # (rows, depth_mm, springs): they push where depth_mm + rows @ z is above zero
+    contacts: list[tuple[np.ndarray, ...]] = field(default_factory=list)
+
+    def touch(self, rows: np.ndarray, depth_mm: np.ndarray, springs: np.ndarray) -> None:
+        """Add contacts with springs in N/mm."""
+        near = springs > 0
+        self.contacts.append((rows[near], depth_mm[near], springs[near]))
+
+    def tie(self, rows: np.ndarray, target_mm: np.ndarray | float, springs: np.ndarray) -> None:
+        """Springs (N/mm) that hold ``rows @ z`` at a target, both ways."""
+        _add_springs(self.stiffness, self.forces, rows, springs * target_mm, springs)
+
+    def press(self, outward: Vector, height_mm: float, foot: Float64[np.ndarray, " p"]) -> None:
+        """Something hard comes from a unit vector and stops at ``height_mm`` along it, felt by a
+        fraction ``foot`` of each patch."""
+        patches = self.organ.patches
+        depth = patches.points_mm @ outward - height_mm
+        self.touch(self.organ.along(outward), depth, _OBSTACLE * patches.areas_mm2 * foot)
+
+    def indent(self, patch: int, outward: Vector, radius_mm: float, depth_mm: float) -> None:
+        """An instrument of a radius is pressed to a depth at a patch, against a unit vector."""
+        points, normals = self.organ.patches.points_mm, self.organ.patches.normals
+        offset = points - points[patch]
+        aside = np.linalg.norm(offset - np.outer(offset @ outward, outward), axis=1)
+        foot = _faded(radius_mm - aside) * (normals @ outward > 0)
+        self.press(outward, float(points[patch] @ outward - depth_mm), foot)
+
+    def hold(self, patch: int, radius_mm: float, shift_mm: Vector) -> None:
+        """A region around a patch is held at a shift."""
+        patches = self.organ.patches
+        springs = _GRIP * patches.areas_mm2 * patches.spot(patches.points_mm[patch], radius_mm)
+        for axis, shift in zip(np.eye(3), shift_mm, strict=True):
+            self.tie(self.organ.along(axis), shift, springs)
+
+    def weigh(self, down: Vector, fraction: float) -> None:
+        """A fraction of the weight that the tissue bore in the CT is no longer borne."""
+        self.forces += fraction * _WEIGHT * (down @ self.organ.volume_moves)
+
+    def expand(self, strain: float) -> None:
+        """The organ takes up or loses fluid: a strain of its volume, if nothing hinders it."""
+        self.forces += self.modulus * strain * self.organ.swelling
+
+    def equilibrium(self) -> Float64[np.ndarray, " m"] | None:
+        """The unknowns at rest; None where the contacts do not converge."""
+        none = np.zeros((0, len(self.forces))), np.zeros(0), np.zeros(0)
+        contacts = map(np.concatenate, zip(none, *self.contacts, strict=True))
+        z, converged = _equilibrium(self.stiffness, self.forces, *contacts)
+        return z if converged else None
 
 
-def indent(
-    problem: ReducedProblem, patch: int, outward: Vector, radius_mm: float, depth_mm: float
-) -> None:
-    """An instrument of a radius is pressed to a depth at a patch, against a unit vector."""
-    points, normals = problem.organ.patches.points_mm, problem.organ.patches.normals
-    offset = points - points[patch]
-    aside = np.linalg.norm(offset - np.outer(offset @ outward, outward), axis=1)
-    foot = _faded(radius_mm - aside) * (normals @ outward > 0)
-    press(problem, outward, float(points[patch] @ outward - depth_mm), foot)
+# Own loops for small matrices: BLAS would wake every thread for each product, which on a busy
+# machine takes many times longer than the product; and most springs are open.
+@numba.njit(cache=True, nogil=True)
+def _equilibrium(stiffness, forces, rows, depth, springs):  # type: ignore[no-untyped-def]
+    z = np.zeros(len(forces))
+    for step in range(_MOST_STEPS):
+        closed, loads = np.zeros(len(rows)), np.zeros(len(rows))
+        for p in range(len(rows)):
+            sunk = depth[p]
+            for a in range(len(z)):
+                sunk += rows[p, a] * z[a]
+            if sunk > 0:
+                closed[p] = springs[p]
+                loads[p] = -springs[p] * depth[p]
+        matrix, found = stiffness.copy(), forces.copy()
+        _add_springs(matrix, found, rows, loads, closed)
+        _solve(matrix, found)
+        farthest = 0.0
+        for a in range(len(z)):
+            move = found[a] - z[a]
+            farthest = max(farthest, abs(move))
+            z[a] += move if step < 6 else 0.6 * move  # contacts that open and close in turns
+        if farthest < _CONVERGED_MM:
+            return found, True
+    return z, False
 
 
-def hold(problem: ReducedProblem, patch: int, radius_mm: float, shift_mm: Vector) -> None:
-    """A region around a patch is held at a shift."""
-    patches = problem.organ.patches
-    square = ((patches.points_mm - patches.points_mm[patch]) ** 2).sum(1)
-    springs = _GRIP * patches.areas_mm2 * np.exp(-0.5 * square / radius_mm**2)
-    for axis, shift in zip(np.eye(3), shift_mm, strict=True):
-        problem.tie(problem.organ.along(axis), shift, springs)
+@numba.njit(cache=True, nogil=True)
+def _add_springs(matrix, right, rows, loads, springs):  # type: ignore[no-untyped-def]
+    """matrix += rows' diag(springs) rows and right += rows' loads, in place."""
+    for p in range(len(rows)):
+        if springs[p] == 0.0:
+            continue
+        for a in range(len(right)):
+            force = springs[p] * rows[p, a]
+            right[a] += rows[p, a] * loads[p]
+            for b in range(len(right)):
+                matrix[a, b] += force * rows[p, b]
 
 
-def weigh(problem: ReducedProblem, down: Vector, fraction: float) -> None:
-    """A fraction of the weight that the tissue bore in the CT is no longer borne."""
-    problem.forces += fraction * _WEIGHT * (down @ problem.organ.volume_moves)
-
-
-def expand(problem: ReducedProblem, strain: float) -> None:
-    """The organ takes up or loses fluid: a strain of its volume, if nothing hinders it."""
-    problem.forces += problem.modulus * strain * problem.organ.swelling
+@numba.njit(cache=True, nogil=True)
+def _solve(matrix, right):  # type: ignore[no-untyped-def]
+    """right = inverse(matrix) right, by Cholesky; both are overwritten."""
+    n = len(right)
+    for i in range(n):
+        for j in range(i + 1):
+            total = matrix[i, j]
+            for k in range(j):
+                total -= matrix[i, k] * matrix[j, k]
+            matrix[i, j] = np.sqrt(total) if i == j else total / matrix[j, j]
+        total = right[i]
+        for k in range(i):
+            total -= matrix[i, k] * right[k]
+        right[i] = total / matrix[i, i]
+    for i in range(n - 1, -1, -1):
+        right[i] /= matrix[i, i]
+        for k in range(i):
+            right[k] -= matrix[i, k] * right[i]
 
 
 def plate(problem: ReducedProblem, rng: np.random.Generator) -> None:
@@ -80,14 +168,14 @@ def poke(problem: ReducedProblem, rng: np.random.Generator) -> None:
     """A blunt instrument pressed into the surface that does not face down."""
     tip = _reachable(problem, rng)
     outward = unit(problem.organ.patches.normals[tip] + rng.normal(0, 0.25, 3))
-    indent(problem, tip, outward, rng.uniform(3, 10), rng.uniform(1, 14))
+    problem.indent(tip, outward, rng.uniform(3, 10), rng.uniform(1, 14))
 
 
 def pull(problem: ReducedProblem, rng: np.random.Generator) -> None:
     """Forceps pull at the surface."""
     place, radius_mm = _reachable(problem, rng), rng.uniform(4, 9)
     along = unit(problem.organ.patches.normals[place] + rng.normal(0, 0.6, 3))
-    hold(problem, place, radius_mm, along * rng.uniform(1, 12))
+    problem.hold(place, radius_mm, along * rng.uniform(1, 12))
 
 
 def lift(problem: ReducedProblem, rng: np.random.Generator) -> None:
@@ -95,17 +183,17 @@ def lift(problem: ReducedProblem, rng: np.random.Generator) -> None:
     outward, up = rng.normal(size=3), problem.up
     outward -= 0.7 * up * (outward @ up)
     place, radius_mm = int(np.argmax(problem.organ.patches.points_mm @ outward)), rng.uniform(8, 20)
-    hold(problem, place, radius_mm, unit(rng.normal(size=3) + 0.7 * up) * rng.uniform(1, 12))
+    problem.hold(place, radius_mm, unit(rng.normal(size=3) + 0.7 * up) * rng.uniform(1, 12))
 
 
 def sag(problem: ReducedProblem, rng: np.random.Generator) -> None:
     """Tissue softened, or cut open and without its turgor."""
-    weigh(problem, _turned(-problem.up, 0.15, rng), float(rng.uniform(0.2, 1)))
+    problem.weigh(_turned(-problem.up, 0.15, rng), float(rng.uniform(0.2, 1)))
 
 
 def swell(problem: ReducedProblem, rng: np.random.Generator) -> None:
     """Fluid taken up or lost."""
-    expand(problem, float(rng.uniform(-_SWELLING, _SWELLING)))
+    problem.expand(float(rng.uniform(-_SWELLING, _SWELLING)))
 
 
 # Each with its probability.
@@ -135,8 +223,7 @@ def in_bed(organ: ReducedModel, up: Vector, rng: np.random.Generator) -> Reduced
         problem.tie(down, 0.0, 1e-3 * springs)  # keeps it over the bed
     else:
         problem.tie(down, 0.0, springs)
-    grip = rng.uniform(0, 0.3)
-    one = perpendicular(up)
+    grip, one = rng.uniform(0, 0.3), perpendicular(up)
     for aside in (one, np.cross(up, one)):
         problem.tie(organ.along(aside), 0.0, grip * springs)
     return problem
@@ -148,8 +235,7 @@ def random_state(
     """Coefficients of the modes after one or two random loads; None for states that find no
     equilibrium or move a place by more than 24 mm. Motions of 16 to 24 mm are scaled to 16.
 
-    Args:
-        anywhere: fraction of states with the bed on any side, instead of opposite to ``up``.
+    ``anywhere``: fraction of states with the bed on any side, instead of opposite to ``up``.
     """
     if rng.uniform() < anywhere:
         up = unit(rng.normal(size=3))
@@ -162,9 +248,7 @@ def random_state(
         return None
     state = found[: organ.n_modes]
     farthest = np.linalg.norm(organ.moves[:, :, : organ.n_modes] @ state, axis=1).max()
-    if farthest > 1.5 * _FARTHEST_MM:
-        return None
-    return state * min(1.0, _FARTHEST_MM / farthest)
+    return None if farthest > 1.5 * _FARTHEST_MM else state * min(1.0, _FARTHEST_MM / farthest)
 
 
 def _press_strip(problem: ReducedProblem, outward: np.ndarray, rng: np.random.Generator) -> None:
@@ -177,7 +261,7 @@ def _press_strip(problem: ReducedProblem, outward: np.ndarray, rng: np.random.Ge
     height = patches.points_mm @ outward
     depth = rng.uniform(0.02, _DEEPEST) * np.ptp(height)
     touched = height[foot > 0] if (foot > 0).any() else height
-    press(problem, outward, float(touched.max() - depth), foot)
+    problem.press(outward, float(touched.max() - depth), foot)
 
 
 def _faded(inward_mm: np.ndarray) -> np.ndarray:

@@ -1,4 +1,5 @@
-"""Displacement modes: the principal components of an organ's responses to many random loads.
+"""Displacement modes: the principal components of an organ's responses to many random loads; and
+the organ in their space.
 
 Reduced bases of elastic bodies from their responses, in the inner product of the mass: Barbic and
 James 2005, doi 10.1145/1073204.1073300. Loads balance themselves (inertia relief), so responses
@@ -7,6 +8,7 @@ and modes are free of rigid motion, which belongs to the pose.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,15 +20,25 @@ from tumortrack.core.geometry import unit
 from tumortrack.core.types import Mesh
 from tumortrack.simulate.elastic.finite import LatticeSolid
 
+LEVER_MM = 50.0  # a rotation's unknown is the motion at this lever arm
+_FREE = 1e-4  # N/mm: keeps the rigid motions solvable where nothing touches
+
 
 @dataclass(frozen=True, eq=False)
 class Patches:
-    """The organ's surface as some hundred areas, where loads act and obstacles are felt: their
-    centroid, area and mean outward normal."""
+    """The organ's surface as some hundred areas, where loads act and obstacles are felt."""
 
-    points_mm: Float64[np.ndarray, "p 3"]
+    points_mm: Float64[np.ndarray, "p 3"]  # centroids
     areas_mm2: Float64[np.ndarray, " p"]
-    normals: Float64[np.ndarray, "p 3"]
+    normals: Float64[np.ndarray, "p 3"]  # mean, outward
+
+    def spot(self, middle_mm: np.ndarray, radius_mm: float) -> Float64[np.ndarray, " p"]:
+        """A weight that falls off from a place as a Gaussian."""
+        return np.exp(-0.5 * ((self.points_mm - middle_mm) ** 2).sum(1) / radius_mm**2)
+
+    def facing(self, along: np.ndarray) -> Float64[np.ndarray, " p"]:
+        """Areas as seen from a direction, mm2."""
+        return np.clip(self.normals @ along, 0, None) * self.areas_mm2
 
 
 def patches_of(mesh: Mesh, count: int, rng: np.random.Generator) -> Patches:
@@ -48,152 +60,154 @@ def patches_of(mesh: Mesh, count: int, rng: np.random.Generator) -> Patches:
     return Patches(points, area[some], normals[some] / length[some][:, None])
 
 
-class _RigidMotions:
-    """The rigid motions of a solid and the projections that remove them."""
-
-    def __init__(self, solid: LatticeSolid) -> None:
-        arms = solid.nodes_mm - solid.center_mm
-        turns = [np.cross(axis, arms).ravel() for axis in np.eye(3)]
-        shifts = [np.tile(axis, len(arms)) for axis in np.eye(3)]
-        self._motions = np.stack([*shifts, *turns], 1)
-        self._mass = np.repeat(solid.volume_mm3, 3)
-        self._inverse = np.linalg.inv(self._motions.T @ (self._mass[:, None] * self._motions))
-
-    def relieved(self, forces: np.ndarray) -> np.ndarray:
-        """Forces (f, n) made to balance themselves by inertia."""
-        spread = self._motions @ (self._inverse @ (self._motions.T @ forces))
-        return forces - self._mass[:, None] * spread
-
-    def removed(self, displacements: np.ndarray) -> np.ndarray:
-        """Displacements (f, n) without their mean translation and rotation."""
-        moments = self._motions.T @ (self._mass[:, None] * displacements)
-        return displacements - self._motions @ (self._inverse @ moments)
-
-
 def modes_of(
-    solid: LatticeSolid,
-    patches: Patches,
-    count: int,
-    contrasts: tuple[float, ...],
-    loads: Float64[np.ndarray, "f n"],
+    solid: LatticeSolid, patches: Patches, count: int, contrasts: Sequence[float], loads: np.ndarray
 ) -> Float64[np.ndarray, "f k"]:
-    """``count`` modes of the responses to loads, which alternate between the tumors' contrasts.
+    """``count`` modes of the responses to loads (f, n), which alternate between the tumors'
+    contrasts, as displacements of the solid's nodes: a unit coefficient moves the organ by 1 mm
+    rms. The last mode swells the organ; the others keep its volume."""
+    arms, axes = solid.nodes_mm - solid.center_mm, np.eye(3)
+    turns = [np.cross(axis, arms).ravel() for axis in axes]
+    rigid = np.stack([*(np.tile(axis, len(arms)) for axis in axes), *turns], 1)
+    mass = np.repeat(solid.volume_mm3, 3)[:, None]
+    inverse = np.linalg.inv(rigid.T @ (mass * rigid))
 
-    Returns:
-        Displacements of the solid's nodes: a unit coefficient moves the organ by 1 mm rms. The
-        last mode swells the organ; the others keep its volume.
-    """
-    rigid = _RigidMotions(solid)
-    forces = rigid.relieved(np.column_stack([loads, solid.swelling]))
+    def without_rigid(displacements: np.ndarray) -> np.ndarray:
+        return displacements - rigid @ (inverse @ (rigid.T @ (mass * displacements)))
+
+    forces = np.column_stack([loads, solid.swelling])
+    forces = forces - mass * (rigid @ (inverse @ (rigid.T @ forces)))  # inertia balances them
     responses = np.empty_like(forces[:, :-1])
     for turn, contrast in enumerate(contrasts):
         factor = solid.factor(contrast)
         taken = slice(turn, None, len(contrasts))
         responses[:, taken] = factor.solve(forces[:, :-1][:, taken])
         if turn == 0:
-            swelling = rigid.removed(factor.solve(forces[:, -1:]))
-    responses = rigid.removed(responses)
-    weights = solid.weights(patches.points_mm)
-    moved = (weights @ responses.reshape(len(solid.nodes), -1)).reshape(-1, 3, responses.shape[1])
+            swelling = without_rigid(factor.solve(forces[:, -1:]))
+    responses = without_rigid(responses)
+    moved = solid.at(patches.points_mm, responses)
     responses /= np.linalg.norm(moved, axis=1).max(0)  # each moves its farthest patch by 1 mm
 
-    mass = np.repeat(solid.volume_mm3, 3)[:, None]
     energies, mixes = np.linalg.eigh(responses.T @ (mass * responses))
     energies, mixes = energies[::-1], mixes[:, ::-1]
     kept = responses @ (mixes[:, : count - 1] / np.sqrt(energies[: count - 1]))
     swelling -= kept @ (kept.T @ (mass * swelling))
     shapes = np.column_stack([kept, swelling / np.sqrt((mass * swelling**2).sum())])
-    shapes *= np.sqrt(solid.volume_mm3.sum())
-    return shapes
+    return shapes * np.sqrt(solid.volume_mm3.sum())
 
 
 def random_loads(
-    solid: LatticeSolid, patches: Patches, up: Float64[np.ndarray, " 3"], count: int,
-    rng: np.random.Generator,
-) -> Float64[np.ndarray, "f n"]:  # fmt: skip
-    """Forces at the nodes, one column a load: squeezed, poked, pulled, hanging, bent, sheared.
-
-    They only have to be diverse: magnitudes, and how an organ in its bed responds, are decided
-    for every state by itself (``loads.random_state``).
-    """
+    solid: LatticeSolid, patches: Patches, up: np.ndarray, count: int, rng: np.random.Generator
+) -> Float64[np.ndarray, "f n"]:
+    """Forces at the nodes, one column a load. They only have to be diverse: magnitudes, and how an
+    organ in its bed responds, are decided for every state by itself (``loads.random_state``)."""
     draw = _Tractions(patches, solid.center_mm, up, rng)
     kinds = (draw.squeeze, draw.poke, draw.hang, draw.bend, draw.shear)
     shares = np.array([0.36, 0.28, 0.12, 0.16, 0.08])
     chosen = rng.choice(len(kinds), count, p=shares / shares.sum())
     surface = np.stack([kinds[n]() for n in chosen], -1)  # (p, 3, n)
-    weights = solid.weights(patches.points_mm)
-    return (weights.T @ surface.reshape(len(surface), -1)).reshape(-1, count)
+    spread = solid.weights(patches.points_mm).T @ surface.reshape(len(surface), -1)
+    return spread.reshape(-1, count)
 
 
+@dataclass(frozen=True, eq=False)
 class _Tractions:
     """Draws forces on patches (p, 3)."""
 
-    def __init__(
-        self, patches: Patches, center: np.ndarray, up: np.ndarray, rng: np.random.Generator
-    ) -> None:
-        self._points, self._areas = patches.points_mm, patches.areas_mm2
-        self._normals, self._center, self._up, self._rng = patches.normals, center, up, rng
-        self._size = np.ptp(patches.points_mm, axis=0).max() / 2
+    patches: Patches
+    center_mm: np.ndarray
+    up: np.ndarray
+    rng: np.random.Generator
 
     def squeeze(self) -> np.ndarray:
         """A pad presses, a bed or a second pad holds against it."""
-        rng, along = self._rng, self._direction()
-        facing = self._facing(along)
-        place = self._points[rng.choice(len(facing), p=facing / facing.sum())]
-        radius = rng.uniform(0.15, 0.7) * self._size
-        pad = self._spot(place, radius) * facing
-        bed = self._facing(-along)
+        rng, patches, along = self.rng, self.patches, self._direction()
+        facing = patches.facing(along)
+        place = patches.points_mm[rng.choice(len(facing), p=facing / facing.sum())]
+        radius = rng.uniform(0.15, 0.7) * self._size_mm
+        pad, bed = patches.spot(place, radius) * facing, patches.facing(-along)
         if rng.uniform() > 0.6:
-            below = place - 0.6 * self._size * along
-            bed = bed * (self._spot(below, 1.5 * radius) + 1e-6)
+            bed = bed * (patches.spot(place - 0.6 * self._size_mm * along, 1.5 * radius) + 1e-6)
         return _total(bed, along) - _total(pad, along)
 
     def poke(self) -> np.ndarray:
         """An instrument presses or pulls in one place; inertia alone, or the far side, holds."""
-        rng = self._rng
-        patch = rng.choice(len(self._areas), p=self._areas / self._areas.sum())
-        along = unit(self._normals[patch] + rng.normal(0, 0.3, 3))
-        force = _total(self._spot(self._points[patch], rng.uniform(4, 10)) * self._areas, along)
-        return force - _total(self._facing(-along), along) if rng.uniform() < 0.6 else force
+        rng, patches = self.rng, self.patches
+        areas = patches.areas_mm2
+        patch = rng.choice(len(areas), p=areas / areas.sum())
+        along = unit(patches.normals[patch] + rng.normal(0, 0.3, 3))
+        spot = patches.spot(patches.points_mm[patch], rng.uniform(4, 10))
+        force = _total(spot * areas, along)
+        return force - _total(patches.facing(-along), along) if rng.uniform() < 0.6 else force
 
     def hang(self) -> np.ndarray:
         """Borne in one place; weight, which is all that inertia relief is, pulls elsewhere."""
-        along = self._direction()
-        radius = self._rng.uniform(0.4, 2) * self._size
-        middle = self._points[self._rng.integers(len(self._points))]
-        return _total(self._facing(-along) * self._spot(middle, radius) + 1e-12, along)
+        along, points = self._direction(), self.patches.points_mm
+        radius = self.rng.uniform(0.4, 2) * self._size_mm
+        borne = self.patches.spot(points[self.rng.integers(len(points))], radius)
+        return _total(self.patches.facing(-along) * borne + 1e-12, along)
 
     def bend(self) -> np.ndarray:
         """The ends go one way, the middle the other."""
-        along, across, _ = Rotation.random(rng=self._rng).as_matrix()
-        square = ((self._points - self._center) @ along / self._size) ** 2
-        mean = self._areas @ square / self._areas.sum()
-        return (self._areas * np.clip(square - mean, -1, 1))[:, None] * across
+        along, across, _ = Rotation.random(rng=self.rng).as_matrix()
+        areas = self.patches.areas_mm2
+        square = ((self.patches.points_mm - self.center_mm) @ along / self._size_mm) ** 2
+        mean = areas @ square / areas.sum()
+        return (areas * np.clip(square - mean, -1, 1))[:, None] * across
 
     def shear(self) -> np.ndarray:
         """Two regions are pulled in opposite directions."""
-        rng = self._rng
-        spots = [
-            self._spot(self._points[rng.integers(len(self._points))], r * self._size) * self._areas
-            for r in rng.uniform(0.3, 0.6, 2)
-        ]
+        rng, patches = self.rng, self.patches
+        radii = rng.uniform(0.3, 0.6, 2) * self._size_mm
+        middles = (patches.points_mm[rng.integers(len(patches.points_mm))] for _ in radii)
+        spots = (patches.spot(*place) for place in zip(middles, radii, strict=True))
+        one, other = (spot * patches.areas_mm2 for spot in spots)
         along = unit(rng.normal(size=3))
-        return _total(spots[0], along) - _total(spots[1], along)
+        return _total(one, along) - _total(other, along)
 
     def _direction(self) -> np.ndarray:
         """Half of the time roughly up, else anywhere."""
-        rng = self._rng
-        if rng.uniform() < 0.5:
-            return unit(rng.normal(size=3))
-        return Rotation.from_rotvec(rng.normal(0, 0.3, 3)).apply(self._up)
+        if self.rng.uniform() < 0.5:
+            return unit(self.rng.normal(size=3))
+        return Rotation.from_rotvec(self.rng.normal(0, 0.3, 3)).apply(self.up)
 
-    def _facing(self, along: np.ndarray) -> np.ndarray:
-        return np.clip(self._normals @ along, 0, None) * self._areas
-
-    def _spot(self, middle: np.ndarray, radius: float) -> np.ndarray:
-        return np.exp(-0.5 * ((self._points - middle) ** 2).sum(1) / radius**2)
+    @property
+    def _size_mm(self) -> float:
+        return np.ptp(self.patches.points_mm, axis=0).max() / 2
 
 
 def _total(weights: np.ndarray, along: np.ndarray) -> np.ndarray:
     """A total force of 1 along a direction, distributed by weights."""
     return (weights / weights.sum())[:, None] * along
+
+
+class ReducedModel:
+    """A solid in the space of its modes and six rigid motions: k + 6 unknowns."""
+
+    def __init__(
+        self, solid: LatticeSolid, modes: Float64[np.ndarray, "f k"], patches: Patches
+    ) -> None:
+        k, n = modes.shape[1], len(solid.nodes)
+        self.solid, self.modes, self.patches, self.n_modes = solid, modes, patches, k
+        bent = solid.at(patches.points_mm, modes)
+        arms = (patches.points_mm - solid.center_mm) / LEVER_MM
+        turned = np.stack([np.cross(axis, arms) for axis in np.eye(3)], -1)
+        shifted = np.broadcast_to(np.eye(3), turned.shape)
+        self.moves = np.concatenate([bent, shifted, turned], -1)  # of patches: (p, 3, k + 6)
+        volume = solid.volume_mm3
+        mean = np.tensordot(volume, modes.reshape(n, 3, k), 1)
+        rigid = np.concatenate([np.eye(3) * volume.sum(), np.zeros((3, 3))], 1)
+        self.volume_moves = np.concatenate([mean, rigid], 1)  # of all volume: (3, k + 6), mm3
+        self.swelling = np.append(modes.T @ solid.swelling, np.zeros(6))  # as the solid's
+        self._tissue = modes.T @ (solid.stiffness(solid.organ) @ modes)
+        self._tumors = modes.T @ (solid.stiffness(solid.tumor) @ modes)
+
+    def stiffness(self, modulus: float, contrast: float) -> Float64[np.ndarray, "m m"]:
+        """For the tissue's Young's modulus (N/mm2) and how many times stiffer the tumors are."""
+        k, whole = self.n_modes, _FREE * np.eye(self.n_modes + 6)
+        whole[:k, :k] = modulus * (self._tissue + (contrast - 1) * self._tumors)
+        return whole
+
+    def along(self, direction: Float64[np.ndarray, " 3"]) -> Float64[np.ndarray, "p m"]:
+        """How far each patch moves along a direction, per unknown."""
+        return np.einsum("d,pdm->pm", direction, self.moves)
