@@ -385,6 +385,7 @@ def test_each_model_of_the_ablation_lacks_its_piece_alone(phantom):
         train_config("clinical", phantom, PRESETS)
 
 
+@pytest.mark.slow
 def test_end_to_end_twice_gives_the_same_document(phantom, tmp_path):
     plan = StudyPlan(
         name="tiny",
