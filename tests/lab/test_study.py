@@ -426,7 +426,7 @@ def test_end_to_end_twice_gives_the_same_document(phantom, tmp_path):
 
     told, trained = run()
     assert len(told) == 1 + 4 + 2  # peers: the networks' are those of accuracy
-    assert len(trained) == 1
+    assert len(set(trained)) == 1  # it is told of every few seconds
     first = document.read_text()
     assert first.startswith("mine\n")
     assert first.endswith("yours\n")
