@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
+import pty
+import shutil
 import signal
 import subprocess
 
@@ -21,6 +24,7 @@ from stories import (
     succeeded,
     tumortrack,
 )
+from tumortrack.core import store
 from tumortrack.core.estimate import Estimate
 from tumortrack.core.types import CameraLabels, OccupancyCloud
 from tumortrack.imaging.case import load_case
@@ -31,6 +35,7 @@ from tumortrack.tracking.files import write_estimate
 
 pytestmark = pytest.mark.slow
 
+CASE = "c" * 64
 CAMERA_FROM_TABLE = np.array([[1.0, 0, 0, 5.0], [0, -1, 0, -8.0], [0, 0, -1, 300.0], [0, 0, 0, 1]])
 
 
@@ -48,7 +53,8 @@ def write_run(folder):
         name: {"label": label, "found": True, "volume_ml": mesh.volume_mm3 / 1000}
         for label, (name, mesh) in enumerate(camera.items(), start=1)
     }
-    write_estimate(folder, Estimate(cloud, volume, camera, {"units": "mm", "parts": parts}))
+    report = {"units": "mm", "parts": parts, "model": {"case_sha256": CASE}}
+    write_estimate(folder, Estimate(cloud, volume, camera, report))
     return seen
 
 
@@ -108,7 +114,7 @@ def test_a_plan_is_carried_out_and_recorded(story, tmp_path):
     assert stages[:4] == ["approach", "grasp", "hold", "sweep 1"]
     assert stages[-2:] == ["release", "home"]
     lines = said.splitlines()
-    assert "done: both arms are home." in lines
+    assert lines[-1] == "done: both virtual arms are home."
     found = json.loads(report.read_text())["resection"]
     assert found["state"] == "done"
     assert found["halts"] == {}
@@ -134,10 +140,127 @@ def test_a_plan_is_carried_out_and_recorded(story, tmp_path):
     assert np.ptp(way, axis=0).max() > 0.5
 
 
-def test_real_arms_are_not_hurried(story):
+REAL = "ur:127.0.0.1?execute=true"  # where nothing answers
+NEEDS = {
+    "live": "--live MODEL SOURCE",
+    "source": "a source that shows the present",
+    "model": "a model that says which case",
+    "same": "a model of the case that was planned on",
+    "plan": "a plan that says which case",
+    "frame": "--frame FILE (this one's frame is invented)",
+    "cell": "--cell FILE that gives both bases",
+    "speed": "--speed up to 1, not 2",
+    "moved": "--moved up to the margin, 5 mm",
+    "person": "a person at a terminal",
+}
+
+
+def missing(done):
+    line = refusal(done)
+    assert "the arm at 127.0.0.1 may not move. It needs: " in line
+    return {name for name, said in NEEDS.items() if said in line}
+
+
+def model_of(folder, case):
+    folder.mkdir()
+    (folder / "manifest.json").write_text(json.dumps({"provenance": {"case_sha256": case}}))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def given(story, tmp_path_factory):
+    """Plans in a robot's frame, with and without the arms' places; models of three cases."""
     folder, _ = story
-    done = tumortrack("resect", folder / "plan", "ur:10.0.0.9?execute=true", "--speed", 2)
-    assert "--speed 2 with real arms; allowed: up to 1" in refusal(done)
+    here, place = read_plan(folder / "plan"), tmp_path_factory.mktemp("given")
+    rows = here.table_from_camera.tolist()
+    frame = {"frame_id": "base_link", "unit": "mm", "robot_from_camera": rows}
+    (place / "frame.json").write_text(json.dumps(frame))
+    bases = {name: here.cell[name] for name in ("cutter_base", "holder_base")}
+    (place / "cell.json").write_text(json.dumps(bases))
+    (place / "empty.json").write_text("{}")
+    for name, cell in (("plan", "cell"), ("anywhere", "empty")):
+        command = ("plan", folder / "run", place / name, "--frame", place / "frame.json")
+        succeeded(tumortrack(*command, "--cell", place / f"{cell}.json"))
+    for name, case in (("model", CASE), ("other", "d" * 64), ("unknown", "")):
+        model_of(place / name, case)
+    return place
+
+
+def test_a_real_arm_moves_only_with_all_that_it_needs_and_nothing_is_connected_before(story, given):
+    folder, _ = story
+    plan = given / "plan"
+    resect = lambda *rest: missing(tumortrack("resect", *rest))  # noqa: E731
+    everything = resect(folder / "plan", REAL, "--speed", 2, "--moved", 7)
+    assert everything == {"live", "frame", "cell", "speed", "moved", "person"}
+    assert resect(given / "anywhere", REAL) == {"live", "cell", "person"}
+    live = (plan, REAL, "--live")
+    assert resect(*live, given / "unknown", "realsense") == {"model", "person"}
+    assert resect(*live, given / "other", "ros2:/depth") == {"same", "person"}
+    for source in (f"virtual:{given}", "recording:seen", "realsense:seen.bag",
+                   "realsense?device=seen.bag"):  # fmt: skip
+        assert resect(*live, given / "model", source) == {"source", "person"}
+    assert resect(*live, given / "model", "realsense") == {"person"}
+
+
+def test_a_run_of_an_unknown_case_moves_no_real_arm(story, given, tmp_path):
+    data = json.loads((given / "plan" / "plan.json").read_text())
+    plan = tmp_path / "plan"
+    shutil.copytree(given / "plan", plan)
+    (plan / "plan.json").write_text(json.dumps({**data, "case_sha256": ""}))
+    store.seal(plan, "plan", {}, "base_link")
+    done = tumortrack("resect", plan, REAL, "--live", given / "model", "realsense")
+    assert missing(done) == {"plan", "person"}
+
+
+@pytest.mark.parametrize("typed", ["127.0.0.1", "yes", ""])
+def test_a_person_types_the_address_of_the_arm_that_will_move(given, typed):
+    terminal, stdin = pty.openpty()
+    os.write(terminal, b"127.0.0.1\n")  # before it is asked for: does not count
+    arguments = ("resect", given / "plan", REAL, "--live", given / "model", "realsense")
+    process = subprocess.Popen(
+        [*COMMAND, *map(str, arguments)], stdin=stdin, stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE, text=True, env=environment(),
+    )  # fmt: skip
+    assert process.stdout is not None
+    said = ""
+    while not said.endswith("to let it begin: "):
+        said += process.stdout.read(1)
+    os.write(terminal, f"{typed}\n".encode())
+    _, error = process.communicate(timeout=300)
+    os.close(terminal)
+    os.close(stdin)
+    assert "The cutter at 127.0.0.1 is about to move: as soon as an estimate is good" in said
+    assert ("127.0.0.1 was not confirmed" in error) == (typed != "127.0.0.1")
+    assert process.returncode == 2  # confirmed: the model has nothing but its case
+
+
+def test_without_an_arm_it_is_a_dry_run_from_the_first_line_to_the_last(story, tmp_path):
+    folder, _ = story
+    said = succeeded(
+        tumortrack(
+            "resect", folder / "plan", "ur:10.0.0.9", "--speed", 20,
+            "--report", tmp_path / "report.json",
+        )
+    )  # fmt: skip
+    lines = said.splitlines()
+    assert lines[0] == lines[-1] == "DRY RUN: no arm is connected"
+    assert "done: nothing moved." in lines
+    assert "home" not in said
+
+
+def test_motions_that_were_edited_are_neither_carried_out_nor_filmed(story, tmp_path):
+    """A table that stands higher than the one planned with: only the collision test can tell."""
+    folder, _ = story
+    plan = tmp_path / "plan"
+    shutil.copytree(folder / "plan", plan)
+    data = json.loads((plan / "plan.json").read_text())
+    data["cell"]["middle_mm"][2] += 100.0
+    (plan / "plan.json").write_text(json.dumps(data))
+    store.seal(plan, "plan", {}, "table")
+    for more in ((), ("--film", tmp_path / "film.gif")):
+        line = refusal(tumortrack("resect", plan, *more))
+        assert "its motions are not as planned" in line
+        assert "would meet" in line
 
 
 def test_ctrl_c_stops_the_arms_and_says_so(story, tmp_path):
@@ -267,13 +390,14 @@ def test_a_live_world_that_lies_elsewhere_is_planned_anew_and_cut(
     said = succeeded(
         tumortrack(
             "resect", tmp_path / "plan", "--live", clinic_model, world, "--speed", 10,
-            "--report", report,
+            "--report", report, "--replan-cut",
         )
     )  # fmt: skip
-    assert "done: both arms are home." in said
+    assert "done: both virtual arms are home." in said
     found = json.loads(report.read_text())
     passed = found["resection"]["log"]
     assert passed[-1]["state"] == "done"
+    assert found["resection"]["note"] == "cut: estimates are of the intact organ"
     assert any(entry.get("event") == "planned anew" for entry in passed)
     assert any("has moved by" in halt for halt in found["resection"]["halts"])
     assert found["frame"]["frame_id"] == "table"

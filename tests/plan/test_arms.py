@@ -188,6 +188,24 @@ def test_clearances_agree_with_distances(cell):
     assert seen == {(True, True), (True, False), (False, False)}
 
 
+@pytest.mark.parametrize(
+    ("touching", "least_mm"), [((), 3.0), ((HOLDER,), 3.0), ((CUTTER, HOLDER), 1.5)]
+)
+def test_between_two_places_it_is_tested_as_densely_as_the_least_clearance_asks(
+    cell, monkeypatch, touching, least_mm
+):
+    """While both tools work, electrode and cup may come to 1.5 mm, and are tested every 3 mm."""
+    start, tested = cell.home_rad, []
+    goal = start[:6] + 0.1
+    group = PlanningGroup(cell, CUTTER, start, touching)
+    monkeypatch.setattr(PlanningGroup, "collides", lambda _, joints: tested.append(joints))
+    assert group.segment_collides(start[:6], goal) is None
+    places = sorted([start[:6], *tested, goal], key=lambda joints: joints[0])
+    levers_mm = cell.levers_mm(start, group.all_joints(goal))[:6]
+    assert (np.diff(places, axis=0) @ levers_mm).max() <= 2 * least_mm
+    assert (np.diff(places, axis=0) @ levers_mm).max() > 1.9 * least_mm
+
+
 def test_no_point_moves_farther_than_the_levers_say(cell):
     rng = np.random.default_rng(6)
     for _ in range(30):
@@ -294,6 +312,7 @@ def test_the_same_every_time(motions):
         assert np.array_equal(one.times_s, other.times_s)
 
 
+@pytest.mark.slow
 def test_a_cut_round_the_cup_is_made_from_several_sides(cell):
     ring = plan()
     above = ring.cuts[0].path_mm + [0.0, 0.0, 8.0 + ring.grasp_mm[2] - ring.cuts[0].height_mm]
@@ -387,6 +406,7 @@ def test_a_way_round_is_found_and_the_same_for_the_same_seed(cell):
             assert touch.collisions(joints) is None
 
 
+@pytest.mark.slow
 def test_places_for_the_bases_are_searched():
     shift = (0.0, 150.0, 0.0)
     far = Base(position_mm=(-900.0, -380.0, 150.0), yaw_deg=180.0)

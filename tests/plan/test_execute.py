@@ -18,7 +18,13 @@ from plan_objects import MIDDLE_MM, RADIUS_MM, TUMOR_MM, located, sphere
 from tumortrack.core.errors import InputError, NoPlan
 from tumortrack.live.values import TrackingResult
 from tumortrack.plan.motions import ABORTED, DONE, JOINTS, Execution, Motions, MotionStage
-from tumortrack.plan.operation import Operation, OperationConfig, Planned, ResectionProgress
+from tumortrack.plan.operation import (
+    CUT_NOTE,
+    Operation,
+    OperationConfig,
+    Planned,
+    ResectionProgress,
+)
 from tumortrack.plan.resection import plan_resection
 from tumortrack.plan.values import ResectionConfig
 
@@ -141,6 +147,11 @@ def test_a_stage_that_is_none_is_refused(kind, bad, unchecked):
         MotionStage("grasp", *bad)
 
 
+def plain(cell):
+    """The state without its note."""
+    return cell.state.partition(" (")[0]
+
+
 class World:
     """An organ that the tests move, an operation on it, and a clock."""
 
@@ -199,7 +210,7 @@ class World:
     def until(self, state, most=600, **changes):
         for _ in range(most):
             cell = self.frame(**changes)
-            if cell.state == state:
+            if plain(cell) == state:
                 return cell
         raise AssertionError(f"never {state}, but {cell.state}: {cell.halted}")
 
@@ -209,8 +220,8 @@ def test_a_whole_procedure_on_an_organ_that_keeps_still():
     seen = []
     while not world.operation.ended:
         cell = world.frame()
-        if not seen or seen[-1] != cell.state:
-            seen.append(cell.state)
+        if not seen or seen[-1] != plain(cell):
+            seen.append(plain(cell))
         assert cell.halted == ""
         assert set(cell.joints_rad) == set(JOINTS)
     assert tuple(seen) == (*STATES, DONE)
@@ -238,7 +249,7 @@ def test_every_doubt_halts_the_arms_and_they_go_on_after_it(state, doubt, said):
     assert cell.halted.startswith(said)
     still = world.frame(**doubt)
     assert still.joints_rad == cell.joints_rad
-    assert still.state == state
+    assert plain(still) == state
     world.until(DONE)
 
 
@@ -274,7 +285,7 @@ def test_a_tumor_that_moved_is_planned_anew_once_it_has_settled():
 
 
 def test_a_tumor_that_moves_in_the_second_sweep_is_held_and_cut_on_from_there():
-    world = World()
+    world = World(config=OperationConfig(settled_s=0.2, replan_cut=True))
     world.until("sweep 2")
     world.frames(10)
     world.shift = np.array([0.0, 0.0, 4.0])
@@ -283,6 +294,35 @@ def test_a_tumor_that_moves_in_the_second_sweep_is_held_and_cut_on_from_there():
         if world.calls:
             break
     assert world.calls[0][1] == 2
+    world.until(DONE)
+
+
+def test_after_the_first_sweep_began_results_are_marked_and_nothing_is_planned_unasked():
+    world = World()
+    assert "intact" not in world.until("hold").state
+    assert world.operation.summary()["note"] == ""
+    assert world.until("sweep 1").state == f"sweep 1 ({CUT_NOTE})"
+    world.shift = np.array([0.0, 0.0, 4.0])
+    cell = world.frames(200)
+    assert cell.halted.startswith(f"tumor_1 has moved by 4.0 mm ({CUT_NOTE}; --replan-cut")
+    assert plain(cell) == "sweep 1"
+    assert not world.calls
+    world.shift = np.zeros(3)
+    world.until(DONE)
+    assert world.operation.summary()["note"] == CUT_NOTE
+
+
+@pytest.mark.parametrize("part", ["kidney", "tumor_1"])
+def test_a_part_that_is_not_found_halts_the_arms(part):
+    world = World()
+    world.until("approach")
+    whole = world.seen
+    left = {name: mesh for name, mesh in whole.meshes.items() if name != part}
+    world.seen = replace(whole, meshes=left)
+    cell = world.frames(10)
+    assert cell.halted == f"{part} was not found"
+    assert world.frame().joints_rad == cell.joints_rad
+    world.seen = whole
     world.until(DONE)
 
 
@@ -402,7 +442,7 @@ def test_an_abort_by_the_user_is_final():
     world.until("sweep 1")
     world.operation.abort("aborted by the user")
     cell = world.frames(30)
-    assert cell.state == ABORTED
+    assert plain(cell) == ABORTED
     assert cell.halted == "aborted by the user"
     assert world.operation.ended
 

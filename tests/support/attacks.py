@@ -848,7 +848,7 @@ def motions(change: Callable[[dict[str, np.ndarray]], object]) -> Attack:
 
     def make(folder: Path, base: Path) -> Made:
         plan = resealed(folder, base / "plan", edit)
-        return ["resect", plan, "--speed", 1000, "--report", folder / "report.json"]
+        return ["resect", plan, "--speed", 20, "--report", folder / "report.json"]
 
     return make
 

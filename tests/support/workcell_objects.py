@@ -26,7 +26,7 @@ UR = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
 TABLE = PublishedFrame("table", rigid(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 160.0])))
 CUTTER, HOLDER, TOP = (245, 150, 40), (70, 150, 240), (200, 205, 212)
 CUT = (255, 40, 160)
-REASON = "virtual execution of a stored plan: nothing is tracked"
+REASON = "PLAYBACK of a stored plan: nothing is tracked"
 
 
 @cache

@@ -23,6 +23,8 @@ if TYPE_CHECKING:
     from tumortrack.plan.located import LocatedRun
     from tumortrack.plan.values import ResectionConfig, ResectionPlan
 
+_BASES = ("cutter_base", "holder_base")
+
 
 @dataclass(frozen=True, kw_only=True)
 class Plan:
@@ -63,7 +65,7 @@ class Plan:
 
     def run(self) -> None:
         from tumortrack.core.config import to_builtins
-        from tumortrack.plan.files import KIND, PlanFolder, write_plan
+        from tumortrack.plan.files import INVENTED, KIND, PlanFolder, write_plan
         from tumortrack.plan.located import notes_of_doubt, read_run
         from tumortrack.plan.resection import plan_resection
         from tumortrack.report.plan_pictures import draw_plan
@@ -85,13 +87,17 @@ class Plan:
         resection = plan_resection(located, config)
         resection = replace(resection, notes=(*doubts, *resection.notes))
         _say_plan(resection)
-        motions, cell_used = None, None
+        motions, cell_used, cell_source = None, None, INVENTED
         if self.arms and organ is not None:
             from tumortrack.plan.arms.procedure import search_bases
+            from tumortrack.plan.arms.trajectory import first_hit
 
             start = time.perf_counter()
             placed, motions, moved = search_bases(resection, _below(organ, cell_config), organ)
+            if hit := first_hit(motions, placed.config, organ):
+                raise NoPlan(f"the arms can't carry this out: {hit}. Place the organ otherwise.")
             cell_used = to_builtins(placed.config)
+            cell_source = INVENTED if moved else self._cell_source()
             say(
                 f"arms: {len(motions.stages)} stages, {motions.seconds:.0f} s; planned in "
                 f"{time.perf_counter() - start:.1f} s."
@@ -101,7 +107,8 @@ class Plan:
         model = store.read_json(self.run_folder / "report.json").get("model")
         content = PlanFolder(
             resection, config, table_from_camera, frame_id, located.meshes, cell_used, motions,
-            str(model.get("case_sha256", "")) if isinstance(model, dict) else "",
+            str(model.get("case_sha256") or "") if isinstance(model, dict) else "",
+            store.sha256_of(self.frame) if self.frame else INVENTED, cell_source,
         )  # fmt: skip
 
         def pictures(aside: Path) -> None:
@@ -135,6 +142,14 @@ class Plan:
         written = {} if self.cell is None else store.read_json(self.cell)
         config = from_builtins(written, CellConfig, str(self.cell))
         return config if self.stand is None else replace(config, stand_mm=self.stand)
+
+    def _cell_source(self) -> str:
+        """As ``PlanFolder`` holds it: a file that leaves the arms' places out gives none."""
+        from tumortrack.plan.files import INVENTED
+
+        if self.cell is None or not store.read_json(self.cell).keys() >= {*_BASES}:
+            return INVENTED
+        return store.sha256_of(self.cell)
 
     def _frame(self, run: LocatedRun, stand_mm: float) -> tuple[str, Float64[np.ndarray, "4 4"]]:
         """Frame id and ``table_from_camera``: of the calibration, or of a camera that looks

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import itertools
 import signal
+import sys
 import time
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,7 +18,7 @@ from tumortrack.cli import track
 from tumortrack.cli.console import Device, progress_bar, say
 from tumortrack.cli.plan import check_arms_installed
 from tumortrack.core import store
-from tumortrack.core.errors import Aborted, InputError
+from tumortrack.core.errors import Aborted, ArtifactError, InputError
 
 if TYPE_CHECKING:
     from concurrent.futures import Future
@@ -24,6 +26,7 @@ if TYPE_CHECKING:
     import numpy as np
     from jaxtyping import Float64
 
+    from tumortrack.live.sinks.ur import UrSinkConfig
     from tumortrack.live.values import RigidShape, TrackingResult, Workcell
     from tumortrack.plan import operation as operations
     from tumortrack.plan.arms.cell import ArmCell
@@ -31,8 +34,10 @@ if TYPE_CHECKING:
     from tumortrack.plan.values import Located
 
 _FPS = 30.0  # of an execution that no camera drives
-_NOTHING = "virtual execution of a stored plan: nothing is tracked"
+_NOTHING = "PLAYBACK of a stored plan: nothing is tracked"
 _FILM_FRAMES, _FILM_STEP_S = 120, 0.1
+_DRY_RUN = "DRY RUN: no arm is connected"
+_LIVE = ("realsense", "ros2", "ros1")  # sources that show the present
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,9 +47,11 @@ class Resect:
     Attributes:
         plan: folder that `plan` wrote.
         sinks: where arms, cuts and estimates go; see `track`. ur:ADDRESS is a real arm, and only
-            says what it would do unless told execute=true.
+            says what it would do unless told execute=true; docs/resection.md has what that needs.
         live: MODEL SOURCE: follow the organ meanwhile, as `track` does. Arms stand while there is
             no good estimate, and it is planned anew where the tumor has moved.
+        replan_cut: plan anew even once the first sweep has begun, though the model knows only the
+            intact organ; otherwise the arms stand then.
         range: of depths, as in `track`.
         box: as in `track`.
         whole: as in `track`.
@@ -59,6 +66,7 @@ class Resect:
     plan: Positional[Path]
     sinks: Positional[tuple[str, ...]] = ()
     live: tuple[Path, str] | None = None
+    replan_cut: bool = False
     range: tuple[float, float] | None = None
     box: tuple[float, float, float, float, float, float] | None = None
     whole: bool = False
@@ -81,31 +89,77 @@ class Resect:
         stored = read_plan(self.plan)
         if stored.motions is None or stored.cell is None:
             raise InputError(f"{self.plan} was planned with --no-arms; plan again without it.")
+        if lacking := sorted({"kidney", stored.plan.tumor} - stored.meshes.keys()):
+            raise ArtifactError(f"{self.plan} lacks {lacking[0]}.ply. Plan again.")
         sinks = api.named_sinks(self.sinks).values()  # wrong: said before all that takes long
-        if self.speed > 1 and any(isinstance(s, UrSinkConfig) and s.execute for s in sinks):
-            raise InputError(f"--speed {self.speed:g} with real arms; allowed: up to 1.")
-        config = OperationConfig(speed=self.speed, moved_mm=self.moved)
+        config = OperationConfig(speed=self.speed, moved_mm=self.moved, replan_cut=self.replan_cut)
         cell_config = from_builtins(stored.cell, CellConfig, str(self.plan))
+        arms = [sink for sink in sinks if isinstance(sink, UrSinkConfig)]
+        moving = [arm for arm in arms if arm.execute]
+        if moving:
+            self._check_real(stored, moving)
 
         from tumortrack.plan.arms.cell import ArmCell
+        from tumortrack.plan.arms.trajectory import first_hit
 
-        cell = ArmCell(cell_config, stored.meshes.get("kidney"))
+        organ = stored.meshes["kidney"]
+        if hit := first_hit(stored.motions, cell_config, organ):
+            raise ArtifactError(f"{self.plan}: its motions are not as planned: {hit}. Plan again.")
+        cell = ArmCell(cell_config, organ)
         if self.film is not None:
             if self.live is not None or self.sinks:
                 raise InputError("--film shows the stored plan; give it without sinks and --live.")
             _write_film(stored, cell, self.film)
-        elif self.live is not None:
-            self._follow(stored, cell, config, *self.live)
-        else:
-            self._execute(stored, cell, config)
+            return
+        _confirm(moving)
+        carry_out = self._execute if self.live is None else self._follow
+        with _dry_run(bool(arms) and not moving):
+            carry_out(stored, cell, config, arms)
+
+    def _check_real(self, stored: PlanFolder, arms: Sequence[UrSinkConfig]) -> None:
+        """Raises InputError that lists what is missing for real arms to move."""
+        from tumortrack.plan.files import INVENTED
+        from tumortrack.plan.located import POOR_ESTIMATE
+
+        model, source = self.live or (None, "")
+        case, margin_mm = model and _case_of(model), stored.plan.margin_mm
+        needs = {
+            "--live MODEL SOURCE, so that they stop where the tumor moves": model,
+            f"a source that shows the present ({', '.join(_LIVE)}; not {source})": (
+                model is None or _shows_the_present(source)
+            ),
+            f"a model that says which case it was trained for ({model} does not)": (
+                model is None or case
+            ),
+            "a plan that says which case it was made on (locate and plan again)": (
+                stored.case_sha256
+            ),
+            f"a model of the case that was planned on ({model} is of another)": (
+                not (case and stored.case_sha256) or case == stored.case_sha256
+            ),
+            "a plan made on a good estimate (this one's was poor)": (
+                not any(note.startswith(POOR_ESTIMATE) for note in stored.plan.notes)
+            ),
+            "a plan made with --frame FILE (this one's frame is invented)": (
+                stored.frame_source != INVENTED
+            ),
+            "a plan made with --cell FILE that gives both bases, and keeps to them": (
+                stored.cell_source != INVENTED
+            ),
+            f"--speed up to 1, not {self.speed:g}": self.speed <= 1,
+            f"--moved up to the margin, {margin_mm:g} mm": self.moved <= margin_mm,
+            "a person at a terminal who confirms it": sys.stdin.isatty(),
+        }
+        if lacking := [what for what, met in needs.items() if not met]:
+            names = " and ".join(arm.host for arm in arms)
+            raise InputError(f"the arm at {names} may not move. It needs: {'; '.join(lacking)}.")
 
     def _follow(
         self,
         stored: PlanFolder,
         cell: ArmCell,
         config: operations.OperationConfig,
-        model: Path,
-        source: str,
+        arms: Sequence[UrSinkConfig],
     ) -> None:
         """Beside the live loop: every estimate is looked at, and planned on where the tumor
         moved."""
@@ -119,8 +173,9 @@ class Resect:
         from tumortrack.plan.arms import procedure
         from tumortrack.plan.located import located
 
-        manifest = store.read_json(model / store.MANIFEST) if model.is_dir() else {}
-        case = manifest.get("provenance", {}).get("case_sha256", "")
+        assert self.live is not None
+        model, source = self.live
+        case = _case_of(model)
         if stored.case_sha256 and case and case != stored.case_sha256:
             raise InputError(  # it would find another patient's tumor
                 f"{model} was trained for another case than the one that was planned on. Give a "
@@ -160,10 +215,14 @@ class Resect:
                 whole=self.whole, intrinsics=self.intrinsics, report=self.report,
                 device=self.device,
             ).run(track.Arms(operation, frames, {"plan_config": to_builtins(config)}))  # fmt: skip
-        _say_end(operation)
+        _say_end(operation, arms)
 
     def _execute(
-        self, stored: PlanFolder, cell: ArmCell, config: operations.OperationConfig
+        self,
+        stored: PlanFolder,
+        cell: ArmCell,
+        config: operations.OperationConfig,
+        arms: Sequence[UrSinkConfig],
     ) -> None:
         """Without a camera: the stored motions in real time."""
         from tumortrack import api
@@ -194,6 +253,7 @@ class Resect:
                 track.say_failures(sinks, errors)
                 assert result.workcell is not None
                 text = result.workcell.state
+                text = "the way back" if arms and text == "home" else text
                 text += f": {result.workcell.halted}" if result.workcell.halted else ""
                 if text != shown:
                     say(shown := text)
@@ -208,8 +268,53 @@ class Resect:
         }
         store.write_json(report, content)
         say(f"written to {report}.")
-        _say_end(operation)
+        _say_end(operation, arms)
         track.check_closed(sinks)
+
+
+def _shows_the_present(source: str) -> bool:
+    """Not a virtual source, nor a recording."""
+    from tumortrack.live.spec import SOURCES
+
+    config = SOURCES.parse(source)
+    kind = config.__struct_config__.tag
+    return kind in _LIVE and not Path(getattr(config, "device", "")).suffix
+
+
+def _case_of(model: Path) -> str:
+    """The case that a model was trained for, by its digest; empty where unknown."""
+    manifest = store.read_json(model / store.MANIFEST) if model.is_dir() else {}
+    return str(manifest.get("provenance", {}).get("case_sha256") or "")
+
+
+def _confirm(arms: Sequence[UrSinkConfig]) -> None:
+    """A person at the terminal types each arm's address; InputError: something else."""
+    for arm in arms:
+        import termios  # not on Windows, where no terminal would be found above
+
+        termios.tcflush(sys.stdin, termios.TCIFLUSH)  # what was typed before it was asked for
+        say(
+            f"The {arm.arm} at {arm.host} is about to move: as soon as an estimate is good, and "
+            "again after every pause. Nobody in its reach, a hand at the emergency stop?"
+        )
+        try:
+            typed = input("Type its address to let it begin: ")
+        except EOFError:
+            typed = ""
+        if typed.strip() != arm.host:
+            raise InputError(f"{arm.host} was not confirmed; nothing was connected.")
+
+
+@contextmanager
+def _dry_run(dry: bool) -> Iterator[None]:
+    """Say first and last that no arm is connected, if so."""
+    if dry:
+        say(_DRY_RUN)
+    try:
+        yield
+    finally:
+        if dry:
+            say(_DRY_RUN)
 
 
 def _operation(
@@ -218,11 +323,6 @@ def _operation(
     from tumortrack.plan.operation import Operation, Planned
 
     assert stored.motions is not None
-    if stored.plan.tumor not in stored.meshes:
-        raise InputError(
-            f"the plan lacks {stored.plan.tumor}.ply: it was made on a run without surfaces. "
-            "Plan on one that `locate` wrote."
-        )
     planned = Planned(stored.plan, stored.meshes, stored.motions)
     return Operation(planned, config, cell.shapes, **live)
 
@@ -246,10 +346,14 @@ def _organ_shapes(stored: PlanFolder) -> tuple[RigidShape, ...]:
     )
 
 
-def _say_end(operation: operations.Operation) -> None:
+def _say_end(operation: operations.Operation, arms: Sequence[UrSinkConfig]) -> None:
+    """``arms``: real ones, connected or not."""
     found = operation.summary()
     if found["state"] == "done":
-        say("done: both arms are home.")
+        if any(arm.execute for arm in arms):
+            say("done: all motions were sent; see where the arms stand.")
+        else:
+            say(f"done: {'nothing moved' if arms else 'both virtual arms are home'}.")
         return
     if found["halted"] == track.STOPPED:
         raise KeyboardInterrupt
@@ -275,7 +379,7 @@ def _write_film(stored: PlanFolder, cell: ArmCell, path: Path) -> None:
                 now_s = min(now_s + _FILM_STEP_S, time_s)
                 frame = operation.act(TrackingResult(0, 0, reason=_NOTHING), now_s)
             assert frame.workcell is not None
-            yield frame.workcell
+            yield replace(frame.workcell, state=f"VIRTUAL: {frame.workcell.state}")
 
     with progress_bar("drawing", len(times_s)) as advance:
         film(frames(), as_located(stored), path, progress=advance)

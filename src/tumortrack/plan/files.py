@@ -6,7 +6,7 @@ Everything in it is in the table's frame, mm; ``plan.json`` has ``table_from_cam
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,22 +17,28 @@ from jaxtyping import Float64
 
 from tumortrack.core import store
 from tumortrack.core.config import from_builtins, to_builtins
-from tumortrack.core.errors import ArtifactError, InputError
+from tumortrack.core.errors import ArtifactError, InputError, NoPlan
 from tumortrack.core.mesh_files import read_mesh, write_mesh
 from tumortrack.core.types import Mesh
+from tumortrack.plan.arms.config import CellConfig
 from tumortrack.plan.motions import JOINTS, Motions, MotionStage
 from tumortrack.plan.values import Located, ResectionConfig, ResectionPlan
 from tumortrack.sense.ply import cloud_ply
 
 KIND = "plan"
 _NAME, _STROKES, _MOTIONS = "plan.json", "strokes.ply", "motions.safetensors"
+INVENTED = "invented"  # a frame or cell that no file of the user's gave
+_OVER = 1.01  # speeds: the timing keeps its limits at grid points only
+_GAP_RAD = 1e-6
+_LONGEST_S = 4 * 3600.0  # no resection takes so long
 
 
 @dataclass(frozen=True, eq=False)
 class PlanFolder:
     """What a plan's folder holds. ``cell``: the workcell's configuration that the motions are for,
     as JSON; motions and cell are None where no arms were planned. ``case_sha256``: of the case that
-    the organ was located by; empty where unknown."""
+    the organ was located by; empty where unknown. ``frame_source``, ``cell_source``: the sha256 of
+    the user's file that gave the frame, and the places of the arms; or ``INVENTED``."""
 
     plan: ResectionPlan
     config: ResectionConfig
@@ -42,6 +48,8 @@ class PlanFolder:
     cell: dict[str, Any] | None = None
     motions: Motions | None = None
     case_sha256: str = ""
+    frame_source: str = INVENTED
+    cell_source: str = INVENTED
 
 
 def write_plan(
@@ -56,14 +64,21 @@ def write_plan(
 
     Raises:
         InputError: the folder exists and ``overwrite`` is False.
+        NoPlan: motions that would be refused when read.
         StorageError: the disk refused.
     """
     plan, motions = content.plan, content.motions
+    if motions is not None:
+        cell = from_builtins(content.cell, CellConfig, "cell")
+        for fault in _faults(motions, cell, plan.sweeps):
+            raise NoPlan(f"the arms can't carry this out: {fault}.")
     data = {
         "frame_id": content.frame_id,
         "table_from_camera": content.table_from_camera.tolist(),
         "config": to_builtins(content.config),
         "case_sha256": content.case_sha256,
+        "frame_source": content.frame_source,
+        "cell_source": content.cell_source,
         "plan": as_builtins(plan),
         "cell": content.cell,
         "seconds": motions and motions.seconds,
@@ -88,7 +103,8 @@ def as_located(content: PlanFolder) -> Located:
 def read_plan(folder: Path) -> PlanFolder:
     """
     Raises:
-        ArtifactError: no plan, damaged, or of another version.
+        ArtifactError: no plan, damaged, of another version, or with motions that the planner would
+            not have made.
     """
     manifest = store.read_manifest(folder, KIND)
     data, path = store.read_json(folder / _NAME), folder / _MOTIONS
@@ -96,16 +112,25 @@ def read_plan(folder: Path) -> PlanFolder:
     meshes = {name: read_mesh(folder / f"{name}.ply") for name in sorted(surfaces - {"strokes"})}
     motions = _read_motions(path) if path.is_file() else None
     try:
+        plan = from_plain(data["plan"])
+        if motions is not None:
+            cell = from_builtins(data["cell"], CellConfig, str(folder / _NAME))
+            for fault in _faults(motions, cell, plan.sweeps):
+                raise ArtifactError(f"{path} can't be carried out: {fault}. Plan again.")
         return PlanFolder(
-            plan=from_plain(data["plan"]),
+            plan=plan,
             config=from_builtins(data["config"], ResectionConfig, str(folder / _NAME)),
             table_from_camera=np.array(data["table_from_camera"], float),
             frame_id=str(data["frame_id"]),
             meshes=meshes,
             cell=data["cell"],
             motions=motions,
-            case_sha256=str(data["case_sha256"]),
+            case_sha256=str(data["case_sha256"] or ""),
+            frame_source=str(data.get("frame_source", INVENTED)),
+            cell_source=str(data.get("cell_source", INVENTED)),
         )
+    except ArtifactError:
+        raise
     except (KeyError, TypeError, ValueError, InputError, msgspec.ValidationError) as error:
         raise ArtifactError(f"{folder / _NAME} lacks or spoils {error}; plan again.") from error
 
@@ -186,16 +211,46 @@ def _read_motions(path: Path) -> Motions:
         with safe_open(path, "np") as tensors:
             named = tensors.metadata() or {}
             if json.loads(named.get("joints", "[]")) != list(JOINTS):
-                raise ArtifactError(f"{path} is for other arms' joints; plan again.")
+                raise ValueError("it is for other arms' joints")
             stages = tuple(
                 MotionStage(
                     name,
-                    tensors.get_tensor(f"{number}.times_s"),
-                    tensors.get_tensor(f"{number}.joints_rad"),
+                    tensors.get_tensor(f"{number}.times_s").astype(float),
+                    tensors.get_tensor(f"{number}.joints_rad").astype(float),
                     tensors.get_tensor(f"{number}.cutting").astype(bool),
                 )
                 for number, name in enumerate(json.loads(named["stages"]))
             )
-    except (OSError, SafetensorError, KeyError, ValueError) as error:
-        raise ArtifactError(f"{path} cannot be read: {error}. Plan again.") from error
+    except (OSError, SafetensorError, KeyError, TypeError, ValueError, InputError) as error:
+        reason = str(error).rstrip(".")
+        raise ArtifactError(f"{path} cannot be read: {reason}. Plan again.") from error
     return Motions(stages)
+
+
+def _faults(motions: Motions, cell: CellConfig, sweeps: int) -> Iterator[str]:
+    """What the planner would not have done."""
+    names = [stage.name for stage in motions.stages]
+    cuts = [f"sweep {n}" for n in range(1, sweeps + 1)]
+    if names != ["approach", "grasp", "hold", *cuts, "release", "home"]:
+        yield f"its stages are {', '.join(names) or 'none'}"
+    for stage in motions.stages:
+        if not (np.isfinite(stage.times_s).all() and np.isfinite(stage.joints_rad).all()):
+            yield f"{stage.name} has times or joints that are no numbers"
+        if (over := np.abs(stage.joints_rad) - cell.limits_rad).max() > 0:
+            joint = JOINTS[int(over.max(0).argmax())]
+            yield f"{joint} turns beyond its limit in {stage.name}"
+        speeds = np.abs(np.diff(stage.joints_rad, axis=0)) / np.diff(stage.times_s)[:, None]
+        share = (speeds / cell.speeds_rad_s).max(0, initial=0)
+        if not share.max() <= _OVER:
+            yield (
+                f"{JOINTS[int(share.argmax())]} turns {share.max():.3g} times as fast as planned "
+                f"with in {stage.name}"
+            )
+    home_rad = np.array([cell.home_rad])
+    joints = [home_rad, *(stage.joints_rad for stage in motions.stages), home_rad]
+    for before, after, name in zip(joints[:-1], joints[1:], [*names, "its end"], strict=True):
+        gap_rad = float(np.abs(after[0] - before[-1]).max())
+        if not gap_rad <= _GAP_RAD:
+            yield f"a joint jumps by {gap_rad:.2g} rad at {name}"
+    if not motions.seconds <= _LONGEST_S:
+        yield f"it takes {motions.seconds:.3g} s; allowed: {_LONGEST_S:.0f}"

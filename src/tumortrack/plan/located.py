@@ -20,6 +20,7 @@ from tumortrack.plan.values import Located, name_of
 from tumortrack.sense.ply import parse_ply_properties
 
 STAND_MM = 120.0  # the organ's lowest point over the table, where it is not known
+POOR_ESTIMATE = "PLANNED ON A POOR ESTIMATE"
 
 
 def table_below(points_mm: Float[np.ndarray, "n 3"], stand_mm: float) -> Float64[np.ndarray, "4 4"]:
@@ -85,7 +86,7 @@ def notes_of_doubt(doubt: str, accept_poor: bool) -> tuple[str, ...]:
             f"the estimate is poor: {doubt}. Locate again with a better view; only for a plan that "
             "nobody carries out, accept it (--accept-poor, accept_poor=True)."
         )
-    return (f"PLANNED ON A POOR ESTIMATE: {doubt}.",)
+    return (f"{POOR_ESTIMATE}: {doubt}.",)
 
 
 def read_run(folder: Path) -> LocatedRun:

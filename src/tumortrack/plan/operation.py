@@ -29,6 +29,7 @@ CUT: Colour = (120, 40, 40)
 _SAME_MM = 0.2  # of heights
 _OTHERS = 2.0  # other parts may have moved so many times as far as the tumor
 _COMPARED = 500  # points of surfaces whose triangles differ
+CUT_NOTE = "cut: estimates are of the intact organ"
 _BLIND_S = 0.2  # without an update for longer, the arms halt by themselves
 
 
@@ -40,12 +41,15 @@ class OperationConfig(Config, frozen=True, kw_only=True):
             square).
         settled_mm, settled_s: it is replanned once the tumor has moved no more than that for so
             long; until then the arms wait.
+        replan_cut: it is planned anew on the intact organ's model even after the first sweep has
+            begun; otherwise the arms stand then.
         speed: of the arms' time.
     """
 
     moved_mm: float = 2.0
     settled_mm: float = 0.7
     settled_s: float = 0.5
+    replan_cut: bool = False
     speed: float = 1.0
 
     def __post_init__(self) -> None:
@@ -126,6 +130,7 @@ class Operation:
         self._first_s = 0.0
         self._settled: tuple[Mesh, float] | None = None  # where the tumor is, and since when
         self._work: Future[Planned] | None = None
+        self._cut = False  # whether the first sweep has begun, of whatever plan
         self.still_life: tuple[RigidShape, ...] = ()
         self.log: list[dict[str, Any]] = []
         self.halts: Counter[str] = Counter()
@@ -175,12 +180,19 @@ class Operation:
         lines.append(Polyline("grasp", above, (90, 200, 255), 0.8))
         named = dict(zip(JOINTS, joints.tolist(), strict=True))
         shapes = (*self.still_life, *self._draw(joints))
-        return Workcell(execution.state, execution.halted, named, shapes, tuple(lines))
+        state = f"{execution.state} ({self._note})" if self._note else execution.state
+        return Workcell(state, execution.halted, named, shapes, tuple(lines))
+
+    @property
+    def _note(self) -> str:
+        """What is wrong with all estimates by now."""
+        return CUT_NOTE if self._cut and self._locate is not None else ""
 
     def summary(self) -> dict[str, Any]:
         """For the report: states and when they began, halts, new plans."""
         return {
             "state": self._execution.state,
+            "note": self._note,
             "halted": self._execution.halted,
             "halts": dict(self.halts.most_common()),
             "log": self.log,
@@ -196,6 +208,7 @@ class Operation:
         if passed_s > _BLIND_S:
             self._execution.halt("no word from the loop")
             self._execution.step((passed_s - _BLIND_S) * speed)
+        self._cut |= self._execution.sweep > 0
 
     def _decide(self, update: TrackingResult, now_s: float) -> None:
         """Go on, or halt and why."""
@@ -223,12 +236,12 @@ class Operation:
         """Go on where everything lies as planned; else halt, and replan once it has settled."""
         execution, config = self._execution, self._config
         name = self.planned.plan.tumor
-        tumor = located.meshes.get(name)
-        if tumor is None:
-            self._halt_in_doubt(f"{name} was not found")
-            return
-        far = []
-        for part in self.planned.meshes.keys() & located.meshes.keys():
+        for part in (name, *self.planned.meshes):
+            if part not in located.meshes:
+                self._halt_in_doubt(f"{part} was not found")
+                return
+        tumor, far = located.meshes[name], []
+        for part in self.planned.meshes:
             off_mm = apart_mm(located.meshes[part], self.planned.meshes[part])
             if off_mm > config.moved_mm * (1.0 if part == name else _OTHERS):
                 far.append((part == name, off_mm, part))
@@ -237,7 +250,11 @@ class Operation:
             execution.go()
             return
         _, off_mm, part = max(far)  # the tumor, or else what moved farthest
-        execution.halt(f"{part} has moved by {off_mm:.1f} mm")
+        reason = f"{part} has moved by {off_mm:.1f} mm"
+        if self._cut and not config.replan_cut:
+            execution.halt(f"{reason} ({CUT_NOTE}; --replan-cut plans on them anyway)")
+            return
+        execution.halt(reason)
         if self._settled is None or apart_mm(tumor, self._settled[0]) > config.settled_mm:
             self._settled = (tumor, now_s)
         elif now_s - self._settled[1] >= config.settled_s and execution.still:

@@ -33,18 +33,14 @@ class ArmCell:
     """Both arms with their tools over the table, and the organ once it is known.
 
     Values do not change after construction, but the buffers of pinocchio do: one thread at a time.
-    ``model`` and ``solids`` are pinocchio's, in metres. ``home_rad``, ``limits_rad`` (in both
-    directions) and ``speeds_rad_s`` (the maximum planned with) are of all twelve joints.
+    ``model`` and ``solids`` are pinocchio's, in metres.
     """
 
     def __init__(self, config: CellConfig | None = None, organ: Mesh | None = None) -> None:
         self.config = config or CellConfig()
         self.organ = organ
-        arms = [self.config.model(arm) for arm in ARMS]
         self.home_rad: Joints = np.array(self.config.home_rad)
-        self.limits_rad: Joints = np.concatenate([model.limits_rad for model in arms])
-        makers = np.concatenate([model.speeds_rad_s for model in arms])
-        self.speeds_rad_s: Joints = self.config.speed_share * makers
+        self.limits_rad, self.speeds_rad_s = self.config.limits_rad, self.config.speeds_rad_s
         text = body.cell_urdf(self.config)
         self.model = pin.buildModelFromXML(text)
         self.solids = pin.buildGeomFromUrdfString(self.model, text, pin.GeometryType.COLLISION)
@@ -225,7 +221,7 @@ class PlanningGroup:
         With ``spacing`` 1 no point of an arm moves by more than twice the least clearance in one
         step, so that what is free of collisions with that clearance at both ends is free between.
         """
-        least_mm = min(self.cell.config.clearance_mm, self.cell.config.organ_clearance_mm)
+        least_mm = self.cell.config.least_clearance_mm(self.touching)
         levers_mm = self.cell.levers_mm(self.all_joints(start_rad), self.all_joints(goal_rad))
         moved_mm = float(np.abs(goal_rad - start_rad) @ levers_mm[self.own])
         n = int(np.ceil(moved_mm / (2 * least_mm * spacing)))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from typing import Literal
 
 import numpy as np
@@ -10,7 +11,7 @@ from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import rigid
 from tumortrack.plan.arms.kinematics import MODELS, ArmModel, Pose, level_pose
-from tumortrack.plan.motions import CUTTER, JOINTS
+from tumortrack.plan.motions import ARMS, CUTTER, JOINTS, Joints
 
 _DOWN = np.diag([1.0, -1.0, -1.0])  # a flange that points down, over a tip whose z is up
 _LENGTHS = (
@@ -111,8 +112,24 @@ class CellConfig(Config, frozen=True, kw_only=True):
         """The type of arm that is ``cutter`` or ``holder``."""
         return MODELS[self.cutter_model if arm == CUTTER else self.holder_model]
 
+    @property
+    def limits_rad(self) -> Joints:
+        """Of all twelve joints, in both directions."""
+        return np.concatenate([self.model(arm).limits_rad for arm in ARMS])
+
+    @property
+    def speeds_rad_s(self) -> Joints:
+        """The maximum planned with, of all twelve joints."""
+        return self.speed_share * np.concatenate([self.model(arm).speeds_rad_s for arm in ARMS])
+
     def base(self, arm: str) -> Base:
         return self.cutter_base if arm == CUTTER else self.holder_base
+
+    def least_clearance_mm(self, touching: Collection[str]) -> float:
+        """Of any pair, where these arms may touch the organ: the tools come nearest to each other
+        where both do."""
+        contact_mm = self.contact_mm if len(touching) == len(ARMS) else np.inf
+        return min(self.clearance_mm, self.organ_clearance_mm, contact_mm)
 
     def flange_from_tip(self, arm: str) -> Pose:
         """The tip's frame: z up where the flange points down; the instrument points along x."""

@@ -11,13 +11,16 @@ import logging
 from collections.abc import Collection
 from typing import Any
 
+import msgspec
 import numpy as np
 from jaxtyping import Float64
 
+from tumortrack.core.types import Mesh
 from tumortrack.plan.arms.cell import ArmCell, Blocked, PlanningGroup
+from tumortrack.plan.arms.config import CellConfig
 from tumortrack.plan.arms.kinematics import ACCELERATION_RAD_S2, JERK_RAD_S3, Pose
 from tumortrack.plan.arms.paths import arc_lengths, follow
-from tumortrack.plan.motions import CUTTER, HOLDER, Joints, MotionStage
+from tumortrack.plan.motions import ARMS, CUTTER, HOLDER, Joints, Motions, MotionStage
 
 _STEP_S = 0.02  # between two samples; straight segments between them stay within 0.05 mm
 _TIP_SPEED_UP_S = 0.2  # until a tip has its speed
@@ -26,6 +29,15 @@ _FINER = (1.0, 1.7, 2.9, 4.3)  # grids that are tried, in points of the first
 _CRAWL, _CRAWL_S = 2.0, 3.0  # a motion longer than so many times the least, and so much, crawls
 _SLACK = 0.97  # of the acceleration: toppra keeps its limits at grid points only
 _THERE_RAD = 1e-6  # a thousandth of a millimetre at the tip: no motion to be timed
+
+# Who may touch the organ, but in sweeps and at the release, where both may
+_TOUCHING: dict[str, tuple[str, ...]] = {
+    "approach": (),
+    "grasp": (HOLDER,),
+    "hold": (HOLDER,),
+    "home": (),
+}
+_OVER = 1.05  # tip speeds: toppra keeps them at grid points only
 
 Timed = tuple[Float64[np.ndarray, " n"], Float64[np.ndarray, "n d"]]
 
@@ -181,6 +193,40 @@ def together(
     times = _samples(found.duration)
     share = np.array([found.at_time(time)[0] for time in times]).reshape(-1, 1)
     return times, start_rad + share * (goal_rad - start_rad)
+
+
+def first_hit(motions: Motions, config: CellConfig, organ: Mesh) -> str:
+    """What would meet what, and when, if these motions were carried out; empty: nothing.
+
+    Tested as densely as the planner tests, with half of its clearances: between the places that it
+    tests, its own motions come nearer than the whole ones. An electrode or cup may touch the organ
+    only where its tip is as slow as it is planned there.
+    """
+    halves = {
+        name: max(getattr(config, name) / 2, 0.5)
+        for name in ("clearance_mm", "organ_clearance_mm", "contact_mm")
+    }
+    cell = ArmCell(msgspec.structs.replace(config, **halves), organ)
+    slow_mm_s = _OVER * np.array([config.cutting_mm_s, config.grasping_mm_s])
+    levers_mm = cell.levers_mm(np.zeros(len(cell.home_rad)), np.zeros(len(cell.home_rad)))
+    for stage in motions.stages:
+        touching = _TOUCHING.get(stage.name, ARMS)
+        turns = np.abs(np.diff(stage.joints_rad, axis=0)) @ levers_mm
+        moved_mm = np.concatenate([[0.0], np.cumsum(turns)])  # at most, of any point
+        steps = int(np.ceil(moved_mm[-1] / (2 * cell.config.least_clearance_mm(touching))))
+        at_mm = np.linspace(0, moved_mm[-1], steps + 1)
+        joints = np.stack([np.interp(at_mm, moved_mm, one) for one in stage.joints_rad.T], axis=1)
+        times_s = np.interp(at_mm, moved_mm, stage.times_s)
+        tips = np.array([[cell.tips(one)[arm][:3, 3] for arm in ARMS] for one in joints])
+        speeds = np.linalg.norm(np.diff(tips, axis=0), axis=2) / np.diff(times_s)[:, None]
+        edge = np.full((1, len(ARMS)), np.inf)
+        slow = np.minimum(np.r_[edge, speeds], np.r_[speeds, edge]) <= slow_mm_s
+        slow |= steps == 0
+        for one, time_s, both in zip(joints, times_s, slow, strict=True):
+            now = [arm for arm, is_slow in zip(ARMS, both, strict=True) if is_slow]
+            if pair := cell.collisions(one, [arm for arm in touching if arm in now]):
+                return f"{pair[0]} would meet {pair[1]} {time_s:.1f} s after {stage.name} begins"
+    return ""
 
 
 def _samples(seconds: float) -> Float64[np.ndarray, " n"]:
