@@ -73,9 +73,9 @@ def nifti_header(shape: tuple[int, ...], code: int = 2, bits: int = 8) -> bytear
 
 def volume(folder: Path, change: Callable[[bytearray], None], data: bytes | None = None) -> Made:
     """`prepare` on a NIfTI ball whose header was changed."""
-    header = nifti_header((40, 40, 40))
+    header = nifti_header((60, 60, 60))
     change(header)
-    (folder / "in.nii").write_bytes(bytes(header) + (ball().tobytes("F") if data is None else data))
+    (folder / "in.nii").write_bytes(bytes(header) + (ball(60).tobytes("F") if data is None else data))
     return ["prepare", folder / "in.nii", folder / "out", "--labels"]
 
 
@@ -95,8 +95,8 @@ for name, form, offset, values in (
     ("nifti_data_far_behind", "<f", 108, (1e30,)),
     ("nifti_data_in_the_header", "<f", 108, (-4.0,)),
     ("nifti_nan_slope", "<f", 112, (float("nan"),)),
-    ("nifti_five_dimensions", "<8h", 40, (5, 40, 40, 40, 2, 2, 1, 1)),
-    ("nifti_a_plane", "<8h", 40, (2, 40, 40, 1, 1, 1, 1, 1)),
+    ("nifti_five_dimensions", "<8h", 40, (5, 60, 60, 60, 2, 2, 1, 1)),
+    ("nifti_a_plane", "<8h", 40, (2, 60, 60, 1, 1, 1, 1, 1)),
     ("nifti_header_of_another_size", "<i", 0, (2**31 - 1,)),
     ("nifti_metres", "<B", 123, (1,)),
     ("nifti_kilometre_voxels", "<4f", 280, (1e6, 0, 0, 0)),
@@ -118,10 +118,12 @@ def _gzip_cut_short(folder: Path, base: Path) -> Made:
 @attack
 def _gzip_of_other_content(folder: Path, base: Path) -> Made:
     """Voxels zeroed and the checksum of what was there before: only reading to the end tells."""
-    voxels = ball()
-    whole = bytes(nifti_header((40, 40, 40))) + voxels.tobytes("F")
-    voxels[:, :, 18:21] = 0
-    changed = bytes(nifti_header((40, 40, 40))) + voxels.tobytes("F")
+    voxels = ball(60)
+    head = bytes(nifti_header((60, 60, 60)))
+    whole = head + voxels.tobytes("F")
+    voxels[:, :, 55:] = 0
+    voxels[10:13, 30, 30] = 0
+    changed = head + voxels.tobytes("F")
     stream = gzip.compress(changed)
     return packed(folder, stream[:-8] + struct.pack("<II", zlib.crc32(whole), len(whole)))
 
@@ -163,19 +165,19 @@ def _labels_of_fractions(folder: Path, base: Path) -> Made:
 @attack
 def _labels_all_one(folder: Path, base: Path) -> Made:
     """The organ fills the volume: there is no surface in it."""
-    return volume(folder, lambda header: None, np.ones(40**3, np.uint8).tobytes())
+    return volume(folder, lambda header: None, np.ones(60**3, np.uint8).tobytes())
 
 
 @attack
 def _labels_all_zero(folder: Path, base: Path) -> Made:
-    return volume(folder, lambda header: None, bytes(40**3))
+    return volume(folder, lambda header: None, bytes(60**3))
 
 
 @attack
 def _labels_tumor_round_the_organ(folder: Path, base: Path) -> Made:
     """The tumor encloses the kidney."""
-    labels = 2 * ball()
-    labels[18:22, 18:22, 18:22] = 1
+    labels = 2 * ball(60)
+    labels[28:32, 28:32, 28:32] = 1
     return volume(folder, lambda header: None, labels.tobytes("F"))
 
 
@@ -205,7 +207,9 @@ def _nrrd_detached_data(folder: Path, base: Path) -> Made:
 
 @attack
 def _nrrd_claims_terabytes(folder: Path, base: Path) -> Made:
-    return nrrd(folder, f"type: uint8\ndimension: 3\nsizes: 30000 30000 30000\n{_SPACE}encoding: raw")
+    return nrrd(
+        folder, f"type: uint8\ndimension: 3\nsizes: 30000 30000 30000\n{_SPACE}encoding: raw"
+    )
 
 
 @attack
@@ -382,7 +386,9 @@ def _dicom_latin1_names(folder: Path, base: Path) -> Made:
     def change(slices: list[Any]) -> None:
         for n, (dataset, path) in enumerate(slices):
             dataset.save_as(path)
-            os.rename(os.fsencode(path), os.fsencode(path.parent) + f"/sch\xf6n{n}".encode("latin-1"))
+            os.rename(
+                os.fsencode(path), os.fsencode(path.parent) + f"/sch\xf6n{n}".encode("latin-1")
+            )
         slices.clear()
 
     return dicom(folder, change)
@@ -468,7 +474,9 @@ def _mesh_260_tumors(folder: Path, base: Path) -> Made:
 
 @attack
 def _mesh_material_is_a_fifo(folder: Path, base: Path) -> Made:
-    made = meshes(folder, kidney__obj=b"mtllib pipe\n" + sphere(30).export(file_type="obj").encode())
+    made = meshes(
+        folder, kidney__obj=b"mtllib pipe\n" + sphere(30).export(file_type="obj").encode()
+    )
     os.mkfifo(folder / "meshes" / "pipe")
     return made
 
@@ -553,7 +561,9 @@ ATTACKS |= {
     "cloud_seen_from_behind": cloud_of(
         lambda points, rng: (points - points.mean(0)) * [1, -1, -1] + points.mean(0)
     ),
-    "cloud_of_noise": cloud_of(lambda points, rng: points.mean(0) + rng.uniform(-50, 50, (5000, 3))),
+    "cloud_of_noise": cloud_of(
+        lambda points, rng: points.mean(0) + rng.uniform(-50, 50, (5000, 3))
+    ),
     "cloud_stretched_twice": cloud_of(
         lambda points, rng: (points - points.mean(0)) * [2, 2, 1] + points.mean(0)
     ),
@@ -694,7 +704,9 @@ def _intrinsics_without_end(folder: Path, base: Path) -> Made:
 
 def png_of(width: int, height: int, bits: int, data: bytes) -> bytes:
     def chunk(kind: bytes, body: bytes) -> bytes:
-        return struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
+        return (
+            struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
+        )
 
     head = struct.pack(">IIBBBBB", width, height, bits, 0, 0, 0, 0)
     return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + chunk(b"IDAT", data) + chunk(b"IEND", b"")
@@ -1013,14 +1025,21 @@ def _resident_mb(process: int) -> float:
 def outcome(name: str, folder: Path, base: Path) -> Outcome:
     """Make one attack in an empty folder, and run it."""
     folder.mkdir(parents=True)
-    arguments = [os.fspath(one) if isinstance(one, Path) else str(one) for one in ATTACKS[name](folder, base)]
+    arguments = [
+        os.fspath(one) if isinstance(one, Path) else str(one) for one in ATTACKS[name](folder, base)
+    ]
     before = set(_below(folder))
     code, output, seconds, megabytes = run(arguments, folder, SECONDS)
     lines = [line for line in output.strip().splitlines() if line.startswith("tumortrack: ")]
     line = lines[-1] if lines else (output.strip().splitlines() or [""])[-1]
     left = [path for path in _below(folder) if path not in before]
     return Outcome(
-        name, code, seconds, megabytes, line, _fault(name, code, output, lines, left, seconds, megabytes)
+        name,
+        code,
+        seconds,
+        megabytes,
+        line,
+        _fault(name, code, output, lines, left, seconds, megabytes),
     )
 
 
@@ -1029,7 +1048,13 @@ def _below(folder: Path) -> list[str]:
 
 
 def _fault(
-    name: str, code: int, output: str, lines: list[str], left: list[str], seconds: float, megabytes: float
+    name: str,
+    code: int,
+    output: str,
+    lines: list[str],
+    left: list[str],
+    seconds: float,
+    megabytes: float,
 ) -> str:
     if code < 0:
         return f"killed ({signal.Signals(-code).name})"
@@ -1047,7 +1072,7 @@ def _fault(
 
 
 def main(folder: Path, names: list[str]) -> int:
-    import warm  # noqa: F401
+    import warm
 
     for module in warm.PRELOADED:
         __import__(module)

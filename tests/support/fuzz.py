@@ -286,7 +286,9 @@ def input_of(seeds: list[bytes], name: str, seed: int, index: int) -> bytes:
     return changed(seeds[index % len(seeds)], rng)
 
 
-def _attack(name: str, target: Target, seed: int, indices: range, at: mmap.mmap, faults: Any) -> None:
+def _attack(
+    name: str, target: Target, seed: int, indices: range, at: mmap.mmap, faults: Any
+) -> None:
     """In a fork: one input after the other; ``at`` tells the parent which."""
     from tumortrack.core.errors import TumortrackError
 
@@ -305,7 +307,9 @@ def _attack(name: str, target: Target, seed: int, indices: range, at: mmap.mmap,
         except Exception as error:
             where = traceback.extract_tb(error.__traceback__)[-1]
             faults.write(
-                json.dumps([index, f"{type(error).__name__}: {error}", f"{where.filename}:{where.lineno}"])
+                json.dumps(
+                    [index, f"{type(error).__name__}: {error}", f"{where.filename}:{where.lineno}"]
+                )
                 + "\n"
             )
             faults.flush()

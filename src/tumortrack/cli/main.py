@@ -20,7 +20,7 @@ from tumortrack.cli.plan import Plan
 from tumortrack.cli.resect import Resect
 from tumortrack.cli.track import Track
 from tumortrack.cli.training import Pretrain, Train
-from tumortrack.core.errors import TumortrackError
+from tumortrack.core.errors import InputError, TumortrackError
 
 
 @runtime_checkable
@@ -72,6 +72,11 @@ def run(arguments: list[str]) -> int:
     except BrokenPipeError:  # `tumortrack inspect X | head`
         sys.stderr.close()
         return 1
+    except OSError as error:  # of the file system, not of ours: a name too long, no permission
+        if error.filename is None:
+            raise
+        print(f"tumortrack: {error.filename}: {error.strerror}.", file=sys.stderr)
+        return InputError.exit_code
     return 0
 
 

@@ -20,7 +20,7 @@ Box = tuple[slice, slice, slice]
 _MAX_VOXELS = 2**30
 _MAX_BYTES = 8 * 2**30
 _SPACING_RANGE_MM = (0.05, 10.0)
-_GZIP_BEST = 1100  # deflate cannot compress better than 1032 : 1
+GZIP_BEST = 1100  # deflate cannot compress better than 1032 : 1
 _AT_ONCE = 2**16  # labels: counting makes eight bytes of each
 
 
@@ -60,7 +60,7 @@ def check_size(
             f"{path} claims {dims} voxels of {bytes_per_voxel} bytes; the limit is {_MAX_VOXELS} "
             "voxels and 8 GiB. Crop or resample the volume round the kidney."
         )
-    if compressed is not None and path.stat().st_size * (_GZIP_BEST if compressed else 1) < needed:
+    if compressed is not None and path.stat().st_size * (GZIP_BEST if compressed else 1) < needed:
         raise InputError(
             f"{path} is shorter than its header says ({needed} bytes of voxels): truncated "
             "or damaged. Copy or export it again."
