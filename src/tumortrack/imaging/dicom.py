@@ -24,7 +24,7 @@ _NO_SLICE, _MULTI_FRAME = "no DICOM slices", "multi-frame DICOM objects"
 _TAGS = [
     "SeriesInstanceUID", "SeriesDescription", "Modality", "ImageType", "Rows", "Columns",
     "NumberOfFrames", "PixelSpacing", "ImagePositionPatient", "ImageOrientationPatient",
-    "SamplesPerPixel", "BitsAllocated", "RescaleSlope", "RescaleIntercept", "SOPClassUID",
+    "SamplesPerPixel", "BitsAllocated", "RescaleSlope", "RescaleIntercept",
 ]  # fmt: skip
 _CT = "1.2.840.10008.5.1.4.1.1.2"  # SOP class of CT images
 _UNDEFINED = 0xFFFFFFFF  # length of compressed pixels
@@ -83,11 +83,14 @@ def find_series(folder: Path, series: str | None = None) -> Series:
     axes = (row * between_columns, column * between_rows, _slice_step(slices, normal))
     lps_from_index[:3] = np.stack([*axes, slices[0].position_mm], axis=1)
     shape = (first.shape[1], first.shape[0], len(slices))
-    check_size(folder, shape, 4)
+    stored = sum(one.path.stat().st_size for one in slices)
+    check_size(folder, shape, 4, compressed=True, stored=stored)
     check_affine(folder, lps_from_index)
     # A damaged slice may be among the images that are not taken.
     if others := sum(map(len, groups)) - len(slices):
         notes += (f"{others} images of other series, sizes or orientations left out",)
+    if not first.uid:
+        notes += ("the slices have no SeriesInstanceUID: taken as one series",)
     return Series(tuple(s.path for s in slices), shape, lps_from_index, notes)
 
 
@@ -116,11 +119,6 @@ def read_dicom(folder: Path, series: str | None = None) -> RawVolume:
 
 def _check_tags(folder: Path, slices: list[_Slice]) -> None:
     """What holds for each slice of a series of Hounsfield units; its place is checked apart."""
-    if not slices[0].uid:
-        raise InputError(
-            f"{folder}: its slices have no SeriesInstanceUID, so they may be of several series. "
-            f"{_AGAIN}"
-        )
     if len({one.scale for one in slices}) > 1:
         raise InputError(
             f"{folder}: its slices differ in RescaleSlope or RescaleIntercept, so their Hounsfield "
@@ -184,16 +182,11 @@ def _read_tags(path: Path) -> _Slice | str:
     import pydicom
 
     tags: Any = None
-    is_dicom = False
-    try:
-        with (
-            warnings.catch_warnings(),
-            path.open("rb") as stream,
-        ):  # a damaged header gets our errors
-            warnings.simplefilter("ignore")
-            stream.seek(128)
-            is_dicom = stream.read(4) == b"DICM"
-            stream.seek(0)
+    with warnings.catch_warnings(), path.open("rb") as stream:
+        warnings.simplefilter("ignore")  # a damaged header gets our own errors
+        is_dicom = stream.read(132)[128:] == b"DICM"
+        stream.seek(0)
+        try:
             tags = pydicom.dcmread(stream, stop_before_pixels=True, specific_tags=_TAGS)
             if int(tags.get("NumberOfFrames") or 1) > 1:
                 return _MULTI_FRAME
@@ -218,10 +211,18 @@ def _read_tags(path: Path) -> _Slice | str:
                 samples=int(tags.get("SamplesPerPixel") or 1),
                 pixel_fault=_pixel_fault(tags, stream),
             )
-    except Exception as error:  # pydicom raises anything on a foreign or damaged file
-        if is_dicom and (tags is None or tags.file_meta.get("MediaStorageSOPClassUID") == _CT):
-            raise InputError(f"{path} is cut short or damaged ({error}). {_AGAIN}") from error
-        return _NO_SLICE
+        except Exception as error:  # pydicom raises anything on a foreign or damaged file
+            if is_dicom and _should_be_slice(tags):
+                raise InputError(f"{path} is cut short or damaged ({error}). {_AGAIN}") from error
+            return _NO_SLICE
+
+
+def _should_be_slice(tags: Any) -> bool:
+    """Whether a file that is no slice calls itself one, or could not be read far enough to say."""
+    try:
+        return tags is None or tags.file_meta.get("MediaStorageSOPClassUID") == _CT
+    except Exception:  # likewise
+        return True
 
 
 def _pixel_fault(tags: Any, stream: BinaryIO) -> str:

@@ -103,15 +103,15 @@ def _read(path: Path, stream: Any, compressed: bool) -> grid.RawVolume:
         raise InputError(
             f"{path} states its unit as {units}; millimetres are needed. Export it in mm."
         )
-    if not np.isfinite(stated).all():
-        raise InputError(f"{path}: its numbers' slope or intercept is not finite. Export it again.")
     lps_from_index = _lps_from_index(path, header)
     grid.check_affine(path, lps_from_index)
+    if not np.isfinite(stated).all():
+        raise InputError(f"{path}: its numbers' slope or intercept is not finite. Export it again.")
     stream.seek(int(offset))
     data = _voxels(path, stream, math.prod(shape) * dtype.itemsize, compressed)
     array = np.frombuffer(data, dtype).reshape(shape, order="F")
-    scales = np.array(slope or 1.0), np.array(intercept or 0.0)
-    return grid.RawVolume(apply_read_scaling(array, *scales), lps_from_index)
+    scale = np.float64(slope or 1.0), np.float64(intercept or 0.0)
+    return grid.RawVolume(apply_read_scaling(array, *scale), lps_from_index)
 
 
 def _voxels(path: Path, stream: Any, n_bytes: int, compressed: bool) -> bytes:
@@ -151,7 +151,7 @@ def _lps_from_index(path: Path, header: Any) -> Float[np.ndarray, "4 4"]:
             steps = [np.linalg.norm(a[:3, :3], axis=0) for a in (sform, qform)]
             s, q = (a[:3, :3] / step for a, step in zip((sform, qform), steps, strict=True))
             agree = bool((np.sum(s * q, axis=0) > math.cos(math.radians(2))).all())
-            equal = np.allclose(*steps, rtol=_EQUAL_STEPS, atol=0)
+            equal = np.allclose(steps[0], steps[1], rtol=_EQUAL_STEPS, atol=0)
             apart_mm = np.linalg.norm(sform[:3, 3] - qform[:3, 3])
         if not agree:
             raise InputError(

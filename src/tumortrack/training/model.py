@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from safetensors.torch import load, save
 from torch import Tensor, nn
 
@@ -19,7 +20,7 @@ from tumortrack.models.config import NetworkConfig, RegistrationHeadConfig, Trai
 from tumortrack.models.folder import KIND, WEIGHTS, read_model_manifest, read_tensors
 from tumortrack.models.hardware import choose_device
 from tumortrack.models.in_distribution import InDistributionRange
-from tumortrack.models.model import Model
+from tumortrack.models.model import Model, Network
 from tumortrack.models.normalisation import Aligned
 from tumortrack.occupancy.model import OccupancyModel
 from tumortrack.registration.model import RegistrationModel
@@ -61,8 +62,7 @@ def load_model(folder: Path, device: str = "auto") -> Model:
     try:
         config = from_builtins(manifest["config"], TrainConfig, f"{folder}: config")
         kind = model_class(config.network)
-        network = kind.new_network(config.network)
-        network.load_state_dict(read_tensors(folder / WEIGHTS, load))
+        network = _filled(kind, config.network, read_tensors(folder / WEIGHTS, load))
         known = from_builtins(manifest["familiar"], InDistributionRange, f"{folder}: familiar")
         return kind.from_folder(
             folder,
@@ -84,6 +84,19 @@ def load_model(folder: Path, device: str = "auto") -> Model:
         raise ArtifactError(
             f"{folder} is not a whole model of this version: {error}. Train it again."
         ) from error
+
+
+def _filled(kind: type[Model], config: NetworkConfig, weights: dict[str, Tensor]) -> Network:
+    """The network with these weights; ValueError for others, before room is made for them."""
+    with torch.device("meta"):
+        needed = kind.new_network(config).state_dict()
+    for name in needed.keys() | weights.keys():
+        sizes = [tuple(one[name].shape) if name in one else None for one in (needed, weights)]
+        if sizes[0] != sizes[1]:
+            raise ValueError(f"{name} is {sizes[1]} and must be {sizes[0]}")
+    network = kind.new_network(config)
+    network.load_state_dict(weights)
+    return network
 
 
 def _parts(stated: list[str]) -> tuple[str, ...]:
@@ -145,8 +158,8 @@ def load_start(folder: Path) -> PretrainedWeights:
     try:
         config = from_builtins(manifest["config"], NetworkConfig, f"{folder}: config")
         weights = read_tensors(folder / WEIGHTS, load)
-        model_class(config).new_network(config).load_state_dict(weights)
-    except (InputError, KeyError, RuntimeError, OSError) as error:
+        _filled(model_class(config), config, weights)
+    except (InputError, KeyError, ValueError, RuntimeError, OSError) as error:
         raise ArtifactError(
             f"{folder} holds no whole pretrained weights of this version: {error}. Make them "
             "again: tumortrack pretrain OUT."
