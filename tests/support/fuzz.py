@@ -209,7 +209,7 @@ def _wire() -> dict[str, Target]:
         unpack_header,
     )
     from tumortrack.live.ros.messages import Messages
-    from tumortrack.live.ros.sensors import CLOUD, IMAGE, cloud_of, intrinsics_of
+    from tumortrack.live.ros.sensors import CLOUD, IMAGE, cloud_of
 
     def igtl(data: bytes) -> None:
         check_body(unpack_header(data[:HEADER_SIZE]), data[HEADER_SIZE:])
@@ -246,7 +246,10 @@ def _wire() -> dict[str, Target]:
             )
 
         def of_info(data: bytes, messages: Messages = messages) -> object:
-            return intrinsics_of(messages.from_bytes(data, "sensor_msgs/msg/CameraInfo"), False)
+            from tumortrack.live.ros import sensors
+
+            info = messages.from_bytes(data, "sensor_msgs/msg/CameraInfo")
+            return sensors._intrinsics_of(info, False)  # type: ignore[attr-defined]
 
         image = messages.make(
             IMAGE,

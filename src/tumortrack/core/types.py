@@ -164,18 +164,6 @@ class Intrinsics:
             raise InputError(f"intrinsics {six} are not usable; fx and fy must be positive pixels.")
         if not (0 < self.width <= 8192 and 0 < self.height <= 8192):
             raise InputError("intrinsics: width and height must lie in 1..8192 pixels.")
-        side = max(self.width, self.height)
-        if not all(0.1 * side < focal < 5 * side for focal in (self.fx, self.fy)):
-            raise InputError(
-                f"intrinsics: focal lengths {self.fx:g}, {self.fy:g} px are no depth camera's of "
-                f"{self.width} x {self.height}; 0.1 to 5 times the longer side are allowed (fields "
-                "of view of 11 to 157 degrees). Give those of the image's own size, in pixels."
-            )
-        if not all(-side < middle < 2 * side for middle in (self.cx, self.cy)):
-            raise InputError(
-                f"intrinsics: the optical axis at {self.cx:g}, {self.cy:g} px lies far off an "
-                f"image of {self.width} x {self.height}. Give it in pixels of this image."
-            )
 
 
 @dataclass(frozen=True, eq=False)

@@ -75,7 +75,7 @@ class GaussNewtonConfig(Config, frozen=True):
     def __post_init__(self) -> None:
         self.check_between(
             "refine",
-            steps=(1, 1000),
+            steps=(0, 1000),
             n_effective=(1, 1e6),
             sigma_mm=(0.01, 100),
             first_mm=(0.01, 1000),

@@ -178,7 +178,20 @@ def _camera(path: Path) -> tuple[Intrinsics, dict[str, Any]]:
     for key in ("width", "height"):
         if not values[key].is_integer():
             raise InputError(f"{path}: {key} is {values[key]}; it must be a whole number.")
-    return Intrinsics(int(values.pop("width")), int(values.pop("height")), **values), data
+    camera = Intrinsics(int(values.pop("width")), int(values.pop("height")), **values)
+    side = max(camera.width, camera.height)
+    if not all(0.1 * side < focal < 5 * side for focal in (camera.fx, camera.fy)):
+        raise InputError(
+            f"{path}: focal lengths {camera.fx:g}, {camera.fy:g} px are no depth camera's of "
+            f"{camera.width} x {camera.height}; 0.1 to 5 times the longer side are allowed (fields "
+            "of view of 11 to 157 degrees). Give those of the image's own size, in pixels."
+        )
+    if not all(-side < middle < 2 * side for middle in (camera.cx, camera.cy)):
+        raise InputError(
+            f"{path}: the optical axis at {camera.cx:g}, {camera.cy:g} px lies far off an image of "
+            f"{camera.width} x {camera.height}. Give it in pixels of this image."
+        )
+    return camera, data
 
 
 def _numbers(value: object, key: str, path: Path) -> list[float]:
