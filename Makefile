@@ -6,7 +6,7 @@ SETUP := .venv/.installed
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: help setup debian demo test test-hard check replay bench soak wheel results headstart training-speed clean
+.PHONY: help setup debian demo test test-hard check attack fuzz replay bench soak wheel results headstart training-speed clean
 
 help:  ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 10
@@ -33,6 +33,12 @@ debian:  ## what tests need of Debian (ROS, RViz, Chromium), where it can be ins
 
 test: check  ## check, then all tests (those of ROS, RViz and Chromium after `make debian`)
 	OMP_NUM_THREADS=1 $(BIN)/pytest -n 3 --dist loadfile --no-loadscope-reorder
+
+attack: setup  ## hostile files and calls: each must end in one clear line (4 minutes; ARGS=NAME ...: these)
+	$(BIN)/python tests/support/attacks.py runs/attacks $(ARGS)
+
+fuzz: setup  ## damaged input for every reader (ARGS="--inputs 60000": how many; --target NAME)
+	$(BIN)/python tests/support/fuzz.py $(ARGS)
 
 replay: setup  ## has any number changed since runs/replay.json? Without that file: record it (4 minutes; ARGS=--quick)
 	$(BIN)/python tools/replay.py either runs/replay.json $(ARGS)

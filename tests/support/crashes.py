@@ -174,7 +174,10 @@ def main() -> int:
             fault = kind(base, folder, given.times, np.random.default_rng(given.seed))
             faults += bool(fault)
             seconds = time.perf_counter() - start
-            print(f"{fault or 'ok':20} {name}, killed {given.times} times, {seconds:.0f} s", flush=True)
+            print(
+                f"{fault or 'ok':20} {name}, killed {given.times} times, {seconds:.0f} s",
+                flush=True,
+            )
     return bool(faults)
 
 

@@ -209,7 +209,7 @@ def _wire() -> dict[str, Target]:
         unpack_header,
     )
     from tumortrack.live.ros.messages import Messages
-    from tumortrack.live.ros.sensors import CLOUD, IMAGE, cloud_of, intrinsics_of
+    from tumortrack.live.ros.sensors import CLOUD, IMAGE, cloud_of
 
     def igtl(data: bytes) -> None:
         check_body(unpack_header(data[:HEADER_SIZE]), data[HEADER_SIZE:])
@@ -246,7 +246,10 @@ def _wire() -> dict[str, Target]:
             )
 
         def of_info(data: bytes, messages: Messages = messages) -> object:
-            return intrinsics_of(messages.from_bytes(data, "sensor_msgs/msg/CameraInfo"), False)
+            from tumortrack.live.ros import sensors
+
+            info = messages.from_bytes(data, "sensor_msgs/msg/CameraInfo")
+            return sensors._intrinsics_of(info, False)  # type: ignore[attr-defined]
 
         image = messages.make(
             IMAGE,
@@ -286,7 +289,9 @@ def input_of(seeds: list[bytes], name: str, seed: int, index: int) -> bytes:
     return changed(seeds[index % len(seeds)], rng)
 
 
-def _attack(name: str, target: Target, seed: int, indices: range, at: mmap.mmap, faults: Any) -> None:
+def _attack(
+    name: str, target: Target, seed: int, indices: range, at: mmap.mmap, faults: Any
+) -> None:
     """In a fork: one input after the other; ``at`` tells the parent which."""
     from tumortrack.core.errors import TumortrackError
 
@@ -305,7 +310,9 @@ def _attack(name: str, target: Target, seed: int, indices: range, at: mmap.mmap,
         except Exception as error:
             where = traceback.extract_tb(error.__traceback__)[-1]
             faults.write(
-                json.dumps([index, f"{type(error).__name__}: {error}", f"{where.filename}:{where.lineno}"])
+                json.dumps(
+                    [index, f"{type(error).__name__}: {error}", f"{where.filename}:{where.lineno}"]
+                )
                 + "\n"
             )
             faults.flush()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import gc
 import os
 import sys
@@ -20,7 +21,7 @@ from tumortrack.cli.plan import Plan
 from tumortrack.cli.resect import Resect
 from tumortrack.cli.track import Track
 from tumortrack.cli.training import Pretrain, Train
-from tumortrack.core.errors import TumortrackError
+from tumortrack.core.errors import InputError, StorageError, TumortrackError
 
 
 @runtime_checkable
@@ -72,6 +73,14 @@ def run(arguments: list[str]) -> int:
     except BrokenPipeError:  # `tumortrack inspect X | head`
         sys.stderr.close()
         return 1
+    except OSError as error:  # of the file system, not of ours: a name too long, no permission
+        if error.filename is None and error.errno != errno.ENOSPC:
+            raise
+        if full := error.filename is None:  # what is still to be said goes nowhere
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        where = "standard output or the disk" if full else error.filename
+        print(f"tumortrack: {where}: {error.strerror}.", file=sys.stderr)
+        return StorageError.exit_code if full else InputError.exit_code
     return 0
 
 

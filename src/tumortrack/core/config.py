@@ -24,6 +24,13 @@ class Config(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
             if not 0 <= value <= limit:
                 raise InputError(f"{what} {name} is {value}; allowed: {least} to {limit:g}.")
 
+    def check_between(self, what: str, **allowed: tuple[float, float]) -> None:
+        """The same for ranges with a lower end: each named field, or all numbers in it."""
+        for name, (low, high) in allowed.items():
+            value = getattr(self, name)
+            if not all(low <= one <= high for one in (value if type(value) is tuple else (value,))):
+                raise InputError(f"{what} {name} is {value}; allowed: {low:g} to {high:g}.")
+
 
 C = TypeVar("C", bound=msgspec.Struct)
 

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import io
 from pathlib import Path
 
 import numpy as np
 
 from tumortrack.core.errors import InputError, StorageError
+from tumortrack.core.store import read_file
 from tumortrack.core.types import Anatomy, Mesh
 
 SUFFIXES = (".ply", ".stl", ".obj")
@@ -21,12 +23,10 @@ def read_mesh(path: Path) -> Mesh:
 
     if path.suffix.lower() not in SUFFIXES:
         raise InputError(f"{path}: unknown mesh type. Allowed: {', '.join(SUFFIXES)}.")
-    if not path.is_file():
-        raise InputError(f"{path} does not exist.")
-    if path.stat().st_size > _LARGEST_FILE:
-        raise InputError(f"{path} is larger than 512 MiB; reduce the mesh first.")
-    try:
-        loaded = trimesh.load_mesh(path, process=False)
+    content = read_file(path, _LARGEST_FILE, "Reduce the mesh first.")
+    try:  # from memory: no other file that it names, as of a texture, is looked for
+        kind = path.suffix.lower().removeprefix(".")
+        loaded = trimesh.load_mesh(io.BytesIO(content), file_type=kind, process=False)
         vertices, faces = np.asarray(loaded.vertices), np.asarray(loaded.faces)
     except Exception as error:  # trimesh raises anything on a damaged file
         raise InputError(f"{path} cannot be read as a mesh: {error}.") from error

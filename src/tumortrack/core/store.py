@@ -10,6 +10,7 @@ import hashlib
 import json
 import os
 import shutil
+import stat
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -29,10 +30,27 @@ def sha256_of(path: Path) -> str:
     if path.is_dir():
         digest = hashlib.sha256()
         for file in sorted(p for p in path.rglob("*") if p.is_file()):
-            digest.update(f"{file.relative_to(path)}\0{sha256_of(file)}\n".encode())
+            digest.update(os.fsencode(f"{file.relative_to(path)}\0{sha256_of(file)}\n"))
         return digest.hexdigest()
     with path.open("rb") as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
+def read_file(path: Path, most_bytes: int, advice: str = "This is no file of ours.") -> bytes:
+    """The content of a regular file: a pipe or a device may have no end. InputError where it is
+    missing, none, or larger than ``most_bytes``, which is told before anything is read."""
+    try:
+        found = path.stat()
+        if not stat.S_ISREG(found.st_mode):
+            raise InputError(f"{path} is no regular file (but a folder, a pipe or a device).")
+        if found.st_size > most_bytes:
+            raise InputError(f"{path} is larger than {most_bytes >> 20} MiB. {advice}")
+        with path.open("rb") as stream:
+            return stream.read(found.st_size)
+    except FileNotFoundError as error:
+        raise InputError(f"{path} does not exist.") from error
+    except OSError as error:
+        raise InputError(f"{path} cannot be read: {error.strerror}.") from error
 
 
 def write_atomically(path: Path, content: bytes) -> None:
@@ -60,10 +78,10 @@ def write_json(path: Path, data: object) -> None:
 def read_json(path: Path) -> dict[str, Any]:
     """Read a JSON object; ArtifactError where it is missing, too large, or none."""
     try:
-        if path.stat().st_size > _LARGEST_MANIFEST:
-            raise ArtifactError(f"{path} is larger than 16 MiB; this is no file of ours.")
-        data = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError) as error:
+        data = json.loads(read_file(path, _LARGEST_MANIFEST))
+    except InputError as error:
+        raise ArtifactError(str(error)) from error
+    except (ValueError, RecursionError) as error:
         raise ArtifactError(f"{path} cannot be read as JSON: {error}.") from error
     if not isinstance(data, dict):
         raise ArtifactError(f"{path} must hold a JSON object.")
@@ -85,8 +103,11 @@ def check_place(path: Path, kind: str, overwrite: bool) -> None:
     """InputError for a place where something lies that must stay: ``overwrite`` replaces an empty
     folder or an artifact of the same kind in which nothing else lies, and nothing but that, for a
     mistyped path must not cost the user's files."""
-    if not path.exists():
-        return
+    try:
+        if not path.exists():
+            return
+    except OSError as error:  # a name that is too long
+        raise InputError(f"{path} cannot be written: {error.strerror}.") from error
     if not overwrite:
         raise InputError(f"{path} exists already. Choose another path, or give --overwrite.")
     if not path.is_dir():

@@ -211,3 +211,5 @@ class OccupancyCloud:
         _freeze(self, "points_mm", np.float32, (None, 3))
         _freeze(self, "labels", np.uint8, (len(self.points_mm),))
         _freeze(self, "probability", np.float32, (len(self.points_mm),))
+        if not np.isfinite(self.points_mm).all():
+            raise InputError("the estimate has NaN or infinite points; locate again.")

@@ -6,16 +6,17 @@ readers only warn of a missing slice and stretch the patient.
 
 from __future__ import annotations
 
+import os
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 from jaxtyping import Float
 
 from tumortrack.core.errors import InputError
-from tumortrack.imaging.grid import RawVolume, check_affine, check_size
+from tumortrack.imaging.grid import GZIP_BEST, RawVolume, check_affine, check_size
 
 MIN_SLICES = 10
 _MAX_FILES = 20_000
@@ -23,8 +24,12 @@ _NO_SLICE, _MULTI_FRAME = "no DICOM slices", "multi-frame DICOM objects"
 _TAGS = [
     "SeriesInstanceUID", "SeriesDescription", "Modality", "ImageType", "Rows", "Columns",
     "NumberOfFrames", "PixelSpacing", "ImagePositionPatient", "ImageOrientationPatient",
-    "SamplesPerPixel",
+    "SamplesPerPixel", "BitsAllocated", "RescaleSlope", "RescaleIntercept",
 ]  # fmt: skip
+_CT = "1.2.840.10008.5.1.4.1.1.2"  # SOP class of CT images
+_UNDEFINED = 0xFFFFFFFF  # length of compressed pixels
+_DEFLATED = "1.2.840.10008.1.2.1.99"  # a transfer syntax in which pixels have no place of their own
+_AGAIN = "Export the series again."
 
 
 @dataclass(frozen=True)
@@ -37,6 +42,9 @@ class _Slice:
     spacing_mm: tuple[float, float]  # between rows, between columns
     position_mm: tuple[float, ...]  # LPS, first pixel
     orientation: tuple[float, ...]  # along a row, along a column
+    scale: tuple[float, float]  # stored number -> HU: slope, intercept
+    samples: int  # of a pixel
+    pixel_fault: str  # what is wrong with the length of the pixels; "": nothing
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,6 +72,7 @@ def find_series(folder: Path, series: str | None = None) -> Series:
     groups, notes = _groups(folder)
     slices = _choose(folder, groups, series)
     first = slices[0]
+    _check_tags(folder, slices)
     row, column = np.reshape(first.orientation, (2, 3))
     normal = np.cross(row, column)
     if not 0.99 < np.linalg.norm(normal) < 1.01:
@@ -74,11 +83,14 @@ def find_series(folder: Path, series: str | None = None) -> Series:
     axes = (row * between_columns, column * between_rows, _slice_step(slices, normal))
     lps_from_index[:3] = np.stack([*axes, slices[0].position_mm], axis=1)
     shape = (first.shape[1], first.shape[0], len(slices))
-    check_size(folder, shape, 4)
+    stored = sum(one.path.stat().st_size for one in slices)
+    check_size(folder, shape, 4, compressed=True, stored=stored)
     check_affine(folder, lps_from_index)
     # A damaged slice may be among the images that are not taken.
     if others := sum(map(len, groups)) - len(slices):
         notes += (f"{others} images of other series, sizes or orientations left out",)
+    if not first.uid:
+        notes += ("the slices have no SeriesInstanceUID: taken as one series",)
     return Series(tuple(s.path for s in slices), shape, lps_from_index, notes)
 
 
@@ -105,6 +117,26 @@ def read_dicom(folder: Path, series: str | None = None) -> RawVolume:
     return RawVolume(array, found.lps_from_index, found.notes)
 
 
+def _check_tags(folder: Path, slices: list[_Slice]) -> None:
+    """What holds for each slice of a series of Hounsfield units; its place is checked apart."""
+    if len({one.scale for one in slices}) > 1:
+        raise InputError(
+            f"{folder}: its slices differ in RescaleSlope or RescaleIntercept, so their Hounsfield "
+            f"units are uncertain. {_AGAIN}"
+        )
+    for one in slices:
+        faults = {
+            f"PixelSpacing {one.spacing_mm} must be above 0": min(one.spacing_mm) <= 0,
+            f"RescaleSlope {one.scale[0]:g} must be above 0": one.scale[0] <= 0,
+            f"{one.samples} samples a pixel are no CT's, which has 1": one.samples != 1,
+            one.pixel_fault: bool(one.pixel_fault),
+        }
+        if found := [fault for fault, there in faults.items() if there]:
+            raise InputError(f"{one.path}: {found[0]}. {_AGAIN}")
+        if (name := str(one.path)).encode(errors="replace") != os.fsencode(name):
+            raise InputError(f"{name!a}: this name is no UTF-8. Rename the files.")
+
+
 def _groups(folder: Path) -> tuple[list[list[_Slice]], tuple[str, ...]]:
     """Slices by series, size and orientation, in a fixed order; and notes on other files."""
     files = sorted(p for p in folder.iterdir() if p.is_file() and not p.name.startswith("."))
@@ -116,6 +148,12 @@ def _groups(folder: Path) -> tuple[list[list[_Slice]], tuple[str, ...]]:
         one = _read_tags(file)
         if isinstance(one, str):
             left_out[one].append(file)
+        elif not np.isfinite(
+            (*one.position_mm, *one.orientation, *one.spacing_mm, *one.scale)
+        ).all():
+            raise InputError(
+                f"{file}: its position, orientation, spacing or rescaling is not finite. {_AGAIN}"
+            )
         else:
             turn = tuple(round(c, 3) for c in one.orientation)
             found.setdefault((one.uid, one.shape, turn), []).append(one)
@@ -143,16 +181,20 @@ def _read_tags(path: Path) -> _Slice | str:
     """The tags of one slice, or why the file is none (``_NO_SLICE``, ``_MULTI_FRAME``)."""
     import pydicom
 
-    try:
-        with warnings.catch_warnings():  # a damaged header gets our own errors
-            warnings.simplefilter("ignore")
-            tags = pydicom.dcmread(path, stop_before_pixels=True, specific_tags=_TAGS)
+    tags: Any = None
+    with warnings.catch_warnings(), path.open("rb") as stream:
+        warnings.simplefilter("ignore")  # a damaged header gets our own errors
+        is_dicom = stream.read(132)[128:] == b"DICM"
+        stream.seek(0)
+        try:
+            tags = pydicom.dcmread(stream, stop_before_pixels=True, specific_tags=_TAGS)
             if int(tags.get("NumberOfFrames") or 1) > 1:
                 return _MULTI_FRAME
             uid, description, modality = (
                 "".join(c if c.isprintable() else "?" for c in str(tags.get(tag) or ""))
                 for tag in _TAGS[:3]
             )
+            slope, intercept = tags.get("RescaleSlope"), tags.get("RescaleIntercept")
             return _Slice(
                 path,
                 uid,
@@ -162,9 +204,43 @@ def _read_tags(path: Path) -> _Slice | str:
                 spacing_mm=(float(tags.PixelSpacing[0]), float(tags.PixelSpacing[1])),
                 position_mm=tuple(float(x) for x in tags.ImagePositionPatient),
                 orientation=tuple(float(x) for x in tags.ImageOrientationPatient),
+                scale=(
+                    1.0 if slope is None else float(slope),
+                    0.0 if intercept is None else float(intercept),
+                ),
+                samples=int(tags.get("SamplesPerPixel") or 1),
+                pixel_fault=_pixel_fault(tags, stream),
             )
-    except Exception:  # pydicom raises anything on a foreign or damaged file: it is no slice
-        return _NO_SLICE
+        except Exception as error:  # pydicom raises anything on a foreign or damaged file
+            if is_dicom and _should_be_slice(tags):
+                raise InputError(f"{path} is cut short or damaged ({error}). {_AGAIN}") from error
+            return _NO_SLICE
+
+
+def _should_be_slice(tags: Any) -> bool:
+    """Whether a file that is no slice calls itself one, or could not be read far enough to say."""
+    try:
+        return tags is None or tags.file_meta.get("MediaStorageSOPClassUID") == _CT
+    except Exception:  # likewise
+        return True
+
+
+def _pixel_fault(tags: Any, stream: BinaryIO) -> str:
+    """What is wrong with the length of the pixels, to which the stream has come: decoders fill up
+    what is missing, and make room for all that is claimed."""
+    if tags.file_meta.get("TransferSyntaxUID") == _DEFLATED:
+        return ""
+    start, head = stream.tell(), stream.read(12)
+    implicit, little = tags.original_encoding
+    size = 8 if implicit else 12  # of the element's head, which ends with the length
+    length = int.from_bytes(head[size - 4 : size], "little" if little else "big")
+    there = os.fstat(stream.fileno()).st_size - start - size
+    bits = int(tags.get("BitsAllocated") or 16) * int(tags.get("SamplesPerPixel") or 1)
+    needed = int(tags.Rows) * int(tags.Columns) * bits // 8
+    room = there * GZIP_BEST if length == _UNDEFINED else min(length, there)
+    if room >= needed:
+        return ""
+    return f"it claims {tags.Columns} x {tags.Rows} pixels and holds {max(0, there)} bytes of them"
 
 
 def _choose(folder: Path, groups: list[list[_Slice]], series: str | None) -> list[_Slice]:

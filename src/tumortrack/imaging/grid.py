@@ -20,7 +20,8 @@ Box = tuple[slice, slice, slice]
 _MAX_VOXELS = 2**30
 _MAX_BYTES = 8 * 2**30
 _SPACING_RANGE_MM = (0.05, 10.0)
-_GZIP_BEST = 1100  # deflate cannot compress better than 1032 : 1
+GZIP_BEST = 1100  # deflate cannot compress better than 1032 : 1
+_USUAL_BEST, _MUCH = 100, 2**30  # what is beyond is refused if it unpacks to so many bytes
 _AT_ONCE = 2**16  # labels: counting makes eight bytes of each
 
 
@@ -37,10 +38,15 @@ class RawVolume:
 
 
 def check_size(
-    path: Path, shape: tuple[int, ...], bytes_per_voxel: int, compressed: bool | None = None
+    path: Path,
+    shape: tuple[int, ...],
+    bytes_per_voxel: int,
+    compressed: bool | None = None,
+    stored: int | None = None,
 ) -> None:
     """Refuse a shape that is no volume or too large, and a file too short to hold what its header
-    claims (``compressed`` None: not one file, or no bound is known), before anything is allocated.
+    claims (``compressed`` None: no bound is known; ``stored`` None: the file's size), before
+    anything is allocated.
 
     Raises:
         InputError: not three axes, fewer than two voxels along one, above the limits; truncated.
@@ -60,7 +66,15 @@ def check_size(
             f"{path} claims {dims} voxels of {bytes_per_voxel} bytes; the limit is {_MAX_VOXELS} "
             "voxels and 8 GiB. Crop or resample the volume round the kidney."
         )
-    if compressed is not None and path.stat().st_size * (_GZIP_BEST if compressed else 1) < needed:
+    if compressed is None:
+        return
+    stored = path.stat().st_size if stored is None else stored
+    if compressed and needed > _MUCH and _USUAL_BEST * stored < needed <= GZIP_BEST * stored:
+        raise InputError(
+            f"{path} would unpack from {stored / 2**20:.1f} MiB to {needed / 2**30:.1f} GiB, as no "
+            "scan does. Crop it round the kidney, or store it as 8-bit or 16-bit numbers."
+        )
+    if stored * (GZIP_BEST if compressed else 1) < needed:
         raise InputError(
             f"{path} is shorter than its header says ({needed} bytes of voxels): truncated "
             "or damaged. Copy or export it again."

@@ -19,6 +19,7 @@ from tumortrack.imaging.surface import largest_shell, surfaces
 _ORGAN_WORDS, _TUMOR_WORDS = ("kidney", "organ"), ("tumor", "tumour", "lesion", "mass")
 _ORGAN_MM = (20.0, 400.0)  # plausible longest extent
 _VOXEL_MM = 1.0
+_MOST_TUMORS = 254  # labels 2 to 255
 _LARGEST_HOLE_MM = 10.0  # across; larger ones would invent anatomy
 _LARGEST_REMESH = 1.5  # change of volume that a remesh may make, as a ratio
 _RULE = (
@@ -90,6 +91,8 @@ def _files_by_name(folder: Path) -> list[Path]:
     if len(organs) != 1 or other:
         problem = f"{len(organs)} name an organ" + (f", {other} name neither" if other else "")
         raise InputError(f"{folder}: of {[f.name for f in files]} {problem}. {_RULE}")
+    if len(tumors) > _MOST_TUMORS:
+        raise InputError(f"{folder}: {len(tumors)} tumors; up to {_MOST_TUMORS} are read.")
     return [organs[0], *sorted(tumors, key=_natural)]
 
 

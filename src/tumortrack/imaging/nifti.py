@@ -9,6 +9,8 @@ from __future__ import annotations
 import gzip
 import logging
 import math
+import struct
+import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -37,7 +39,10 @@ _HEADER = np.dtype(  # what is written of it; all else is 0
 )
 _TYPES = {"u1": 2, "i2": 4, "i4": 8, "f4": 16, "f8": 64, "i1": 256, "u2": 512, "u4": 768}
 _MM, _SCANNER = 2, 1
+_EQUAL_STEPS = 0.01  # of sform and qform, relatively
+_LONGEST_HEADER = 540  # bytes: NIfTI-2's
 _MAX_OFFSET = 16 * 2**20  # bytes of header and extensions before the voxels
+_MOST_BEHIND = 16 * 2**20  # bytes after the voxels
 
 
 def read_nifti(path: Path) -> grid.RawVolume:
@@ -47,17 +52,37 @@ def read_nifti(path: Path) -> grid.RawVolume:
         InputError: damaged, not 3-D, too large, without or with contradictory orientation,
             not in millimetres.
     """
-    import nibabel
+    compressed = path.suffix.lower() == ".gz"
+    stream: Any
+    try:
+        with (gzip.open if compressed else open)(path, "rb") as stream:
+            return _read(path, stream, compressed)
+    except (OSError, EOFError, zlib.error) as error:
+        raise InputError(f"{path} is truncated or damaged: {error}.") from error
 
+
+def _read(path: Path, stream: Any, compressed: bool) -> grid.RawVolume:
+    """Header, voxels and, of a compressed file, the rest: at its end stands the checksum. Not
+    ``nibabel.load``, which reads extensions as long as they say they are, and not to the end."""
+    import nibabel
+    from nibabel.volumeutils import apply_read_scaling
+
+    head = stream.read(_LONGEST_HEADER)
+    kinds = {348: nibabel.Nifti1Header, 540: nibabel.Nifti2Header}
+    sizes = [struct.unpack(order + "i", head[:4].ljust(4, b"\0"))[0] for order in "<>"]
+    size = next((size for size in sizes if size in kinds), None)
+    if size is None:
+        raise InputError(f"{path} is no NIfTI file (its header has {sizes[0]} bytes, not 348).")
     try:
         with _silent(nibabel.imageglobals.logger):
-            image: Any = nibabel.load(path)
-        header = image.header
+            header = kinds[size](head[:size])
         shape = tuple(int(n) for n in header.get_data_shape())
         dtype = header.get_data_dtype()
         units = header.get_xyzt_units()[0]
-        offset = float(header["vox_offset"])
+        offset = float(header["vox_offset"]) or size + 4.0
+        stated = [header["scl_slope"], header["scl_inter"]]
         magic = bytes(header["magic"].tobytes())
+        slope, intercept = header.get_slope_inter()
     except Exception as error:  # nibabel raises anything on a damaged file
         raise InputError(f"{path} cannot be read as NIfTI: {error}.") from error
     if magic[:3] not in (b"n+1", b"n+2"):
@@ -65,11 +90,11 @@ def read_nifti(path: Path) -> grid.RawVolume:
             f"{path}: its voxels lie in another file (magic {magic!r}); detached data are refused. "
             "Export one .nii or .nii.gz file."
         )
-    if not (math.isfinite(offset) and 0 <= offset <= _MAX_OFFSET):
+    if not (math.isfinite(offset) and size <= offset <= _MAX_OFFSET):
         raise InputError(f"{path}: the header puts the voxels at byte {offset:g}; it is damaged.")
     while len(shape) > 3 and shape[-1] == 1:
         shape = shape[:-1]
-    grid.check_size(path, shape, dtype.itemsize, compressed=path.suffix.lower() == ".gz")
+    grid.check_size(path, shape, dtype.itemsize, compressed)
     if dtype.kind not in "iuf":
         raise InputError(
             f"{path}: voxels are {dtype}; a CT or a label map of plain numbers is needed."
@@ -80,11 +105,22 @@ def read_nifti(path: Path) -> grid.RawVolume:
         )
     lps_from_index = _lps_from_index(path, header)
     grid.check_affine(path, lps_from_index)
-    try:
-        array = np.asarray(image.dataobj).reshape(shape)
-    except Exception as error:
-        raise InputError(f"{path} is truncated or damaged: {error}.") from error
-    return grid.RawVolume(array, lps_from_index)
+    if not np.isfinite(stated).all():
+        raise InputError(f"{path}: its numbers' slope or intercept is not finite. Export it again.")
+    stream.seek(int(offset))
+    data = _voxels(path, stream, math.prod(shape) * dtype.itemsize, compressed)
+    array = np.frombuffer(data, dtype).reshape(shape, order="F")
+    scale = np.float64(slope or 1.0), np.float64(intercept or 0.0)
+    return grid.RawVolume(apply_read_scaling(array, *scale), lps_from_index)
+
+
+def _voxels(path: Path, stream: Any, n_bytes: int, compressed: bool) -> bytes:
+    data = bytes(stream.read(n_bytes))
+    if len(data) < n_bytes:
+        raise InputError(f"{path} is truncated: {len(data)} of {n_bytes} bytes of voxels.")
+    if compressed and len(stream.read(_MOST_BEHIND + 1)) > _MOST_BEHIND:
+        raise InputError(f"{path} holds much more than its header says. Export it again.")
+    return data
 
 
 @contextmanager
@@ -112,12 +148,22 @@ def _lps_from_index(path: Path, header: Any) -> Float[np.ndarray, "4 4"]:
         )
     if sform_code and qform_code:
         with np.errstate(all="ignore"):
-            s, q = (a[:3, :3] / np.linalg.norm(a[:3, :3], axis=0) for a in (sform, qform))
+            steps = [np.linalg.norm(a[:3, :3], axis=0) for a in (sform, qform)]
+            s, q = (a[:3, :3] / step for a, step in zip((sform, qform), steps, strict=True))
             agree = bool((np.sum(s * q, axis=0) > math.cos(math.radians(2))).all())
+            equal = np.allclose(steps[0], steps[1], rtol=_EQUAL_STEPS, atol=0)
+            apart_mm = np.linalg.norm(sform[:3, 3] - qform[:3, 3])
         if not agree:
             raise InputError(
                 f"{path}: its two orientations (sform and qform) disagree, so left and right are "
                 "uncertain. Export it again from the DICOM series."
+            )
+        if not (equal and apart_mm <= max(steps[0])):
+            raise InputError(
+                f"{path}: its two affines (sform and qform) disagree: voxels of "
+                f"{' x '.join(f'{step:.4g}' for step in steps[0])} and "
+                f"{' x '.join(f'{step:.4g}' for step in steps[1])} mm, origins {apart_mm:.4g} mm "
+                "apart. Export it again from the DICOM series."
             )
     return RAS_FROM_LPS @ np.asarray(sform if sform_code else qform, np.float64)
 

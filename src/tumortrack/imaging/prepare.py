@@ -24,6 +24,7 @@ from tumortrack.imaging.volume import is_label_map, labels_of, read_raw, volume_
 # Options that only one kind of input uses.
 _OF_CT, _OF_LABELS = ("kidney_hu", "tumor_hu"), ("labels", "side", "organ", "tumor")
 _UP_LPS = (0.0, -1.0, 0.0)  # until ``prepare`` sets what was asked for
+_LEAST_ORGAN_OUTSIDE = 0.02  # of the outer surface
 _MOST_CHANGE_PERCENT = 1.0  # of a part's volume, by smoothing; more is noted
 
 
@@ -72,19 +73,35 @@ def prepare(input: Path, options: PrepareOptions | None = None) -> Case:
     """
     options = options or PrepareOptions()
     up = direction_lps(options.up)
-    if not input.exists():
-        raise InputError(f"{input} does not exist.")
-    if input.is_dir() and not any(p.is_file() for p in input.iterdir()):
-        raise InputError(f"{input} holds no files. Give a folder of DICOM slices or of meshes.")
-    is_meshes = input.is_dir() and any(p.suffix.lower() in SUFFIXES for p in input.iterdir())
     try:
+        if not input.exists():
+            raise InputError(f"{input} does not exist.")
+        inside = list(input.iterdir()) if input.is_dir() else []
+        if input.is_dir() and not any(p.is_file() for p in inside):
+            raise InputError(f"{input} holds no files. Give a folder of DICOM slices or of meshes.")
+        is_meshes = any(p.suffix.lower() in SUFFIXES for p in inside)
         case = _from_meshes(input, options) if is_meshes else _from_volume(input, options)
+        _check_organ_outside(case.labels)
         source_sha256 = store.sha256_of(input)
     except OSError as error:
         raise InputError(f"{input} cannot be read: {error.strerror or error}.") from error
     given = {k: list(v) if isinstance(v, tuple) else v for k, v in asdict(options).items()}
     origin = {"source": input.name, "source_sha256": source_sha256, "options": given}
     return replace(case, up_lps=up, report={**case.report, **origin})
+
+
+def _check_organ_outside(labels: LabelVolume) -> None:
+    """Refuse a tumor that encloses the organ: of a real one some surface is left."""
+    from scipy import ndimage
+
+    inside = labels.labels > 0
+    outermost = labels.labels[inside & ~ndimage.binary_erosion(inside)]
+    share = np.count_nonzero(outermost == ORGAN) / max(len(outermost), 1)
+    if share < _LEAST_ORGAN_OUTSIDE:
+        raise InputError(
+            f"tumors make up {1 - share:.0%} of the outer surface: they enclose the kidney. Check "
+            "which part is the organ and which the tumor, and that all have one frame and unit."
+        )
 
 
 def _refuse_unused(what: str, options: PrepareOptions, *unused: str) -> None:

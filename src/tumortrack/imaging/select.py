@@ -17,6 +17,9 @@ MIN_TUMOR_ML = 0.2
 _GAP_MM = 3.0  # annotators and resampling leave such gaps; a thicker slice counts as one voxel
 _MIN_KIDNEY_ML, _MAX_KIDNEY_ML = 10.0, 2500.0  # a polycystic kidney can pass 2 litres
 _MIDLINE_MARGIN_MM = 20.0
+_MOST_TUMORS = 254
+_MOST_OF_BORDER = 1 / 3  # of the map's outermost voxels; a kidney cut in half covers a quarter
+_MOST_RUGGED = 60.0  # area of all labels' borders over volume^(2/3); a voxelised ball has 7
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,6 +95,7 @@ def select_labels(
     tumors = _tumor_labels(present, organ, tumor)
     middle = affine @ [*(np.array(labels.shape) / 2), 1]
     counted = np.isin(labels, [organ, *tumors])
+    _check_border(counted)
     box = grid.bounding_box(counted, affine, 2.0)
     affine = grid.moved_origin(affine, box)
     numbered, _ = grid.components(counted[box])
@@ -110,8 +114,36 @@ def select_labels(
     kidney = pieces.numbers == chosen.piece
     box = grid.bounding_box(kidney, affine, 2.0)
     own = np.where(kidney, pieces.labels, 0)[box].astype(np.uint8)
+    _check_ruggedness(own, affine)
     out, more = _number_tumors(own, tumors, grid.voxel_ml(affine), min_tumor_ml)
     return grid.cropped(out, grid.moved_origin(affine, box)), notes + more
+
+
+def _check_border(counted: np.ndarray) -> None:
+    """Refuse a map whose outermost voxels are labelled to a large part: no surface lies in it."""
+    inner = counted[1:-1, 1:-1, 1:-1]
+    share = (counted.sum() - inner.sum()) / max(counted.size - inner.size, 1)
+    if share > _MOST_OF_BORDER:
+        raise InputError(
+            f"organ and tumors cover {share:.0%} of the label map's border, so their surface is "
+            "cut off. Give a map that holds the whole kidney, with a margin about it."
+        )
+
+
+def _check_ruggedness(labels: np.ndarray, affine: np.ndarray) -> None:
+    """Refuse labels that are torn to shreds: what makes surfaces of them would take minutes."""
+    i, j, k = affine[:3, :3].T
+    area_mm2 = sum(
+        np.count_nonzero(np.diff(labels, axis=axis)) * float(np.linalg.norm(np.cross(a, b)))
+        for axis, (a, b) in enumerate(((j, k), (k, i), (i, j)))
+    )
+    volume_mm3 = 1000 * np.count_nonzero(labels) * grid.voxel_ml(affine)
+    if area_mm2 > _MOST_RUGGED * volume_mm3 ** (2 / 3):
+        raise InputError(
+            f"the labels are torn to shreds: {volume_mm3 / 1000:.0f} ml with borders of "
+            f"{area_mm2 / 100:.0f} cm2, where a kidney and its tumors have a tenth. This is noise "
+            "rather than a segmentation; smooth it, or draw it anew."
+        )
 
 
 def _tumor_labels(present: list[int], organ: int, tumor: int | None) -> list[int]:
@@ -136,7 +168,7 @@ def _tumor_labels(present: list[int], organ: int, tumor: int | None) -> list[int
 def _kidney_pieces(pieces: _Pieces) -> list[int]:
     """The numbers of the pieces that hold enough organ to be a kidney, largest first."""
     whole_ml = pieces.whole_ml
-    large = [n for n in range(1, len(whole_ml)) if pieces.organ_ml[n] >= _MIN_KIDNEY_ML]
+    large = np.flatnonzero(pieces.organ_ml >= _MIN_KIDNEY_ML).tolist()
     if not large:  # a kidney nearly eaten up by its tumor, or a very small one
         return [int(pieces.organ_ml.argmax())]
     return [n for n in large if whole_ml[n] >= whole_ml[large].max() / 10]
@@ -169,10 +201,15 @@ def _attach_tumors(
     """
     notes: list[str] = []
     apart: list[int] = []
-    for number in range(1, len(pieces.tumor_ml)):
+    beside = np.flatnonzero((pieces.tumor_ml > 0) & (pieces.tumor_ml >= min_tumor_ml)).tolist()
+    beside = [number for number in beside if number not in kidneys]
+    if len(beside) > _MOST_TUMORS:
+        raise InputError(
+            f"{len(beside)} tumors lie beside the kidneys, more than {_MOST_TUMORS}; raise "
+            "--min-tumor-ml or check the labels."
+        )
+    for number in beside:
         ml = float(pieces.tumor_ml[number])
-        if number in kidneys or ml == 0 or ml < min_tumor_ml:
-            continue
         joined = _joined(pieces, kidneys, number)
         if joined is None:
             apart.append(number)
@@ -299,7 +336,7 @@ def _number_tumors(
         if kept > 1:
             notes.append(f"label {value} has {kept} separate pieces: one tumor each")
         for n in range(kept):
-            if number > 255:
+            if number > _MOST_TUMORS + 1:
                 raise InputError("more than 254 tumors; raise --min-tumor-ml or check the labels.")
             out[pieces == n + 1] = number
             if number != value:

@@ -23,6 +23,7 @@ from tumortrack.imaging.nifti import read_nifti
 _DETACHED = (".nhdr", ".mhd", ".hdr", ".img")
 _MOST_LABELS = 32  # distinct values that still look like a label map
 _MAX_HEADER = 2**20
+_MOST_BEHIND = 16 * 2**20  # bytes after the voxels
 _IS_GZIP = {"raw": False, "gzip": True, "gz": True}  # of bzip2, compression has no known bound
 _TYPES = {
     **dict.fromkeys(("signed char", "int8", "int8_t"), "i1"),
@@ -55,7 +56,7 @@ def read_raw(path: Path, series: str | None = None) -> grid.RawVolume:
     if path.is_dir():
         return read_dicom(path, series)
     if not path.is_file():
-        raise InputError(f"{path} does not exist.")
+        raise InputError(f"{path} does not exist or is no file (but a pipe or a device).")
     if path.stat().st_size == 0:
         raise InputError(f"{path} is empty (0 bytes).")
     if name.endswith((".nii", ".nii.gz")):
@@ -140,6 +141,8 @@ def _read_nrrd(path: Path) -> grid.RawVolume:
         ) from error
     grid.check_size(path, shape, dtype.itemsize, _IS_GZIP.get(encoding))
     grid.check_affine(path, lps_from_index)
+    if fields.get("dimension") != "3":
+        raise InputError(f"{path}: dimension {fields.get('dimension')} is not that of its sizes.")
     if dtype.itemsize > 1:
         if fields.get("endian", "").lower() not in ("little", "big"):
             raise InputError(f"{path}: the NRRD header states no byte order. Export it again.")
@@ -201,17 +204,25 @@ def _voxels(path: Path, start: int, encoding: str, n_bytes: int) -> bytes:
     with path.open("rb") as stream:
         stream.seek(start)
         stored = stream.read()
+    whole = True  # with its checksum, which stands at the end
     try:
         if encoding == "raw":
             data = stored[:n_bytes]
         elif encoding in _IS_GZIP:
-            data = zlib.decompressobj(wbits=31).decompress(stored, n_bytes)
+            packed = zlib.decompressobj(wbits=31)
+            data = packed.decompress(stored, n_bytes)
+            packed.decompress(packed.unconsumed_tail, _MOST_BEHIND)
+            whole = packed.eof
         elif encoding in ("bzip2", "bz2"):
-            data = bz2.BZ2Decompressor().decompress(stored, n_bytes)
+            blocks = bz2.BZ2Decompressor()
+            data = blocks.decompress(stored, n_bytes)
+            whole = blocks.eof or bool(blocks.decompress(b"", _MOST_BEHIND) or blocks.eof)
         else:
             raise InputError(f"{path}: encoding {encoding!r} is not read. Export as raw or gzip.")
     except (zlib.error, OSError, EOFError) as error:
         raise InputError(f"{path}: its compressed voxels are damaged: {error}.") from error
     if len(data) < n_bytes:
         raise InputError(f"{path} is truncated: {len(data)} of {n_bytes} bytes of voxels.")
+    if not whole:
+        raise InputError(f"{path}: its compressed voxels do not end where they should: damaged.")
     return data

@@ -72,6 +72,20 @@ class GaussNewtonConfig(Config, frozen=True):
     turn_rad: float = 0.5
     enough_mm: float = 0.02  # a step that moves less is the last
 
+    def __post_init__(self) -> None:
+        self.check_between(
+            "refine",
+            steps=(0, 1000),
+            n_effective=(1, 1e6),
+            sigma_mm=(0.01, 100),
+            first_mm=(0.01, 1000),
+            last_mm=(0.01, 1000),
+            narrowing=(0.01, 1),
+            shift_mm=(0.01, 1000),
+            turn_rad=(0.001, 10),
+            enough_mm=(0, 10),
+        )
+
 
 class Schedule(Config, frozen=True):
     """Learning rate. ``decay``: linear warm-up, then constant, then cosine to zero over the last

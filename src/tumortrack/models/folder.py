@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +28,23 @@ def read_model_manifest(folder: Path) -> dict[str, Any]:
             "command again to go on with it."
         )
     return store.read_manifest(folder, KIND)
+
+
+def read_tensors(
+    path: Path, load: Callable[[bytes], dict[str, Any]], largest: float = 1e6
+) -> dict[str, Any]:
+    """The tensors of a safetensors file, as ``load`` makes them; ArtifactError where it is damaged
+    or holds a number that is not finite or beyond ``largest``, as no training gives them."""
+    from safetensors import SafetensorError
+
+    try:
+        tensors = load(path.read_bytes())
+    except (OSError, SafetensorError) as error:
+        raise ArtifactError(f"{path} cannot be read: {error}.") from error
+    for name, tensor in tensors.items():
+        if 0 not in tensor.shape and not -largest <= tensor.min() <= tensor.max() <= largest:
+            raise ArtifactError(f"{path}: {name} holds numbers that are no trained model's.")
+    return tensors
 
 
 def has_shape(manifest: dict[str, Any]) -> bool:

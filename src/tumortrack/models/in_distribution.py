@@ -38,6 +38,9 @@ class InDistributionRange(Config, frozen=True):
     spread_mm: tuple[float, float]
     fit_mm: float
 
+    def __post_init__(self) -> None:
+        self.check_between("familiar", spread_mm=(0.1, 1000), fit_mm=(0, 100))
+
 
 def spread_mm(points_mm: Points) -> float:
     """The distance from their median within which four fifths of the points lie."""

@@ -10,7 +10,7 @@ from safetensors.numpy import load, save
 
 from tumortrack.core.config import Config, from_builtins, identity
 from tumortrack.core.errors import InputError
-from tumortrack.models.folder import SHAPE
+from tumortrack.models.folder import SHAPE, read_tensors
 from tumortrack.models.model import Model
 from tumortrack.registration.gauss_newton_kernels import KERNEL
 from tumortrack.registration.network import RegistrationNetwork
@@ -28,6 +28,9 @@ class UncertaintyCalibration(Config, frozen=True):
     std_scale: float
     usual_cost: float
     kernel: str = "geman-mcclure"
+
+    def __post_init__(self) -> None:
+        self.check_between("calibration", std_scale=(0.05, 50), usual_cost=(1e-3, 1e6))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -52,7 +55,7 @@ class RegistrationModel(Model):
 
     @classmethod
     def from_folder(cls, folder: Path, manifest: dict[str, Any], **known: Any) -> RegistrationModel:
-        shape = RestShape.from_arrays(load((folder / SHAPE).read_bytes()), len(known["parts"]))
+        shape = RestShape.from_arrays(read_tensors(folder / SHAPE, load), len(known["parts"]))
         calibration = from_builtins(manifest["trust"], UncertaintyCalibration, f"{folder}: trust")
         if calibration.kernel != KERNEL:
             raise InputError(

@@ -21,6 +21,7 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
+from tumortrack.core.errors import NoEstimate
 from tumortrack.core.geometry import Points
 from tumortrack.core.process import parallel_for
 from tumortrack.models.config import GaussNewtonConfig
@@ -32,6 +33,7 @@ from tumortrack.registration.rest_shape import RestShape
 Timer = Callable[[str], AbstractContextManager[object]]
 
 _FLIP_MARGIN = 6.0  # logits: beyond this lead the other way round is not tried
+_FARTHEST_MM = 1e5  # of the organ's middle
 _TURNS = 8  # about the camera's axis, where no hypothesis fits
 
 # On 840 clouds of four organs (drags, elastic states, the digital twin's) the eventual winner's
@@ -72,6 +74,14 @@ class Registration:
             found = self.network.flip_hypotheses(cloud)
         finally:
             torch.set_num_threads(threads)
+        if not (
+            all(bool(part.isfinite().all()) for part in found)
+            and float(found.centre_mm.abs().max()) < _FARTHEST_MM
+        ):
+            raise NoEstimate(
+                "the network places the organ nowhere (a number that is not finite, or far away). "
+                "Train the model again: tumortrack train CASE MODEL."
+            )
         likelier = int(found.right_way[1] > found.right_way[0])
         lead = float(found.right_way[likelier] - found.right_way[1 - likelier])
         parts = (found.rotation, found.centre_mm, found.coefficients)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from jaxtyping import Float32
 
 from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError, NoEstimate
@@ -10,6 +11,9 @@ from tumortrack.core.types import DepthFrame, SensorCloud
 from tumortrack.sense.camera import deproject_pixels
 
 FEWEST_POINTS = 200  # fewer do not determine an organ's shape and pose
+_FARTHEST_MM = 20_000.0  # beyond any depth camera
+_MOST_FAR = 0.01  # of a cloud's points: more are no flaws of single ones
+_THINNEST_MM = 1.0  # standard deviation along the second axis; an organ's is more than 10
 
 
 class CloudConfig(Config, frozen=True, kw_only=True):
@@ -67,12 +71,40 @@ def crop_cloud(cloud: SensorCloud, near_mm: float, far_mm: float) -> SensorCloud
     return SensorCloud(cloud.points_mm[inside], cloud.stamp_ns)
 
 
+def seen_points(
+    points_mm: Float32[np.ndarray, "n 3"], name: str
+) -> tuple[Float32[np.ndarray, "m 3"], tuple[str, ...]]:
+    """The points that can be something seen, and notes on what was dropped: points without return
+    (NaN, infinite, or exactly 0, 0, 0, as RealSense and organised clouds have them), and up to 1 %
+    beyond 20 m. InputError, which names the cloud, where more are beyond."""
+    returned = np.isfinite(points_mm).all(axis=1) & (points_mm != 0).any(axis=1)
+    near = np.abs(points_mm).max(axis=1, initial=0) <= _FARTHEST_MM
+    dropped, far = len(points_mm) - int(returned.sum()), int((returned & ~near).sum())
+    if far > _MOST_FAR * returned.sum():
+        raise InputError(
+            f"{name}: {far} of {len(points_mm)} points lie more than 20 m away, beyond any depth "
+            "camera: its numbers look like millimetres read as metres (then leave out --unit m), "
+            "or they are damaged. Give the camera frame, in mm."
+        )
+    notes = {
+        "without return (NaN or 0, 0, 0)": dropped,
+        "more than 20 m away": far,
+    }
+    kept = points_mm if not dropped + far else points_mm[returned & near]
+    return kept, tuple(
+        f"dropped {count} of {len(points_mm)} points {what}"
+        for what, count in notes.items()
+        if count
+    )
+
+
 def check_cloud(cloud: SensorCloud) -> None:
     """Refuse a cloud from elsewhere that cannot show an organ before the camera, in mm.
 
     Raises:
-        InputError: the unit is evidently not mm (metres, or mm read as metres).
-        NoEstimate: fewer than 200 different points, or none before the camera.
+        InputError: the unit is evidently not mm (metres, or mm read as metres), or a point lies
+            more than 20 m away.
+        NoEstimate: fewer than 200 different points, on one line, or none before the camera.
     """
     points_mm = cloud.points_mm
     ordered = np.sort(points_mm.T, axis=1)
@@ -94,10 +126,23 @@ def check_cloud(cloud: SensorCloud) -> None:
             f"the cloud is {extent_mm:.3g} wide and {middle[2]:.3g} away, which in mm is no organ: "
             "it looks like metres. Give --unit m (millimetres are expected)."
         )
-    if abs(middle[2]) > 20_000:
+    if abs(middle[2]) > _FARTHEST_MM:
         raise InputError(
             f"the cloud is {middle[2]:.4g} mm away, beyond any depth camera: its numbers look like "
             "millimetres read as metres. Leave out --unit m."
+        )
+    farthest_mm = float(np.abs(ordered[:, [0, -1]]).max())
+    if farthest_mm > _FARTHEST_MM:
+        raise InputError(
+            f"a point of the cloud is {farthest_mm:.4g} mm away, beyond any depth camera. Remove "
+            "such points."
+        )
+    some = points_mm[:: max(1, len(points_mm) // 2000)]
+    inner = some[((some >= low) & (some <= high)).all(axis=1)].astype(float)
+    if np.linalg.eigvalsh(np.cov(inner.T))[1] < _THINNEST_MM**2:
+        raise NoEstimate(
+            "the points of the cloud lie on one line; an organ has extent along two axes at least. "
+            "Give the whole surface that the camera sees."
         )
     if not (points_mm[:, 2] > 0).any():
         raise NoEstimate(

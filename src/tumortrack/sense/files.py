@@ -17,8 +17,9 @@ from typing import Any, Literal
 import numpy as np
 
 from tumortrack.core.errors import InputError
-from tumortrack.core.store import read_json
+from tumortrack.core.store import read_file, read_json
 from tumortrack.core.types import DepthFrame, Intrinsics, SensorCloud
+from tumortrack.sense.cloud import seen_points
 from tumortrack.sense.ply import parse_ply_properties
 
 CLOUD_SUFFIXES = (".ply", ".pcd", ".npz")
@@ -35,9 +36,8 @@ _DISTORTION_KEYS = (
 def read_cloud(path: Path, unit: Literal["mm", "m"] = "mm") -> tuple[SensorCloud, tuple[str, ...]]:
     """A cloud in the camera frame from .ply, .pcd (all three encodings) or .npz, and notes.
 
-    Points without return (NaN, infinite, or exactly 0, 0, 0, as RealSense and organised clouds have
-    them) are dropped, and a note says how many. ``cloud.check_cloud`` then tells whether the rest
-    can be an organ in mm.
+    What is no point seen is dropped with a note, as by ``cloud.seen_points``; ``cloud.check_cloud``
+    then tells whether the rest can be an organ in mm.
 
     Raises:
         InputError: missing, too large, damaged, of another kind, or without any point.
@@ -49,28 +49,13 @@ def read_cloud(path: Path, unit: Literal["mm", "m"] = "mm") -> tuple[SensorCloud
         raise InputError(f"unit {unit!r} is not understood. Allowed: mm, m.")
     npz = partial(_npz_points, unit)
     parse: Any = {".ply": parse_ply_properties, ".pcd": _pcd_points, ".npz": npz}[suffix]
-    raw = parse(_read_bytes(path), str(path))
+    raw = parse(read_file(path, LARGEST_FILE, "Thin it first."), str(path))
     with np.errstate(over="ignore"):  # beyond float32 becomes infinite, and is dropped
         points_mm = (raw * (1000.0 if unit == "m" else 1.0)).astype(np.float32)
-    kept = points_mm[np.isfinite(points_mm).all(axis=1) & (points_mm != 0).any(axis=1)]
-    dropped = len(points_mm) - len(kept)
+    kept, notes = seen_points(points_mm, str(path))
     if len(kept) == 0:
-        raise InputError(f"{path} holds no point with a return ({dropped} without).")
-    if not dropped:
-        return SensorCloud(kept), ()
-    note = f"dropped {dropped} of {len(points_mm)} points without return (NaN or 0, 0, 0)"
-    return SensorCloud(kept), (note,)
-
-
-def _read_bytes(path: Path) -> bytes:
-    if not path.is_file():
-        raise InputError(f"{path} does not exist or is no file.")
-    try:
-        if path.stat().st_size > LARGEST_FILE:
-            raise InputError(f"{path} is larger than 256 MiB; thin it first.")
-        return path.read_bytes()
-    except OSError as error:
-        raise InputError(f"{path} cannot be read: {error.strerror}.") from error
+        raise InputError(f"{path} holds no point with a return ({len(points_mm)} without).")
+    return SensorCloud(kept), notes
 
 
 def _pcd_points(content: bytes, name: str) -> np.ndarray:
@@ -103,8 +88,14 @@ def _check_pcd_size(content: bytes, name: str) -> None:
         counts = [int(count) for count in fields.get(b"COUNT", [b"1"] * len(sizes))]
         claimed = points * sum(size * n for size, n in zip(sizes, counts, strict=True))
         start = len(header) + len(found) + body.index(b"\n") + 1
+        x, y, z, _, *turn = map(float, fields.get(b"VIEWPOINT", b"0 0 0 1 0 0 0".split()))
     except (KeyError, ValueError, IndexError) as error:
         raise InputError(f"{name} is no PCD file (its header lacks or garbles a line).") from error
+    if any((x, y, z, *turn)) or len(turn) != 3:
+        raise InputError(
+            f"{name} states a VIEWPOINT other than 0 0 0 1 0 0 0, so the frame of its points is "
+            "uncertain. Export it in the camera frame, without a viewpoint."
+        )
     if body.startswith(b"binary_compressed"):
         packed, unpacked = struct.unpack_from("<II", content[start : start + 8].ljust(8, b"\0"))
         too_large = unpacked > LARGEST_FILE or packed > len(content) - start - 8
@@ -187,7 +178,20 @@ def _camera(path: Path) -> tuple[Intrinsics, dict[str, Any]]:
     for key in ("width", "height"):
         if not values[key].is_integer():
             raise InputError(f"{path}: {key} is {values[key]}; it must be a whole number.")
-    return Intrinsics(int(values.pop("width")), int(values.pop("height")), **values), data
+    camera = Intrinsics(int(values.pop("width")), int(values.pop("height")), **values)
+    side = max(camera.width, camera.height)
+    if not all(0.1 * side < focal < 5 * side for focal in (camera.fx, camera.fy)):
+        raise InputError(
+            f"{path}: focal lengths {camera.fx:g}, {camera.fy:g} px are no depth camera's of "
+            f"{camera.width} x {camera.height}; 0.1 to 5 times the longer side are allowed (fields "
+            "of view of 11 to 157 degrees). Give those of the image's own size, in pixels."
+        )
+    if not all(-side < middle < 2 * side for middle in (camera.cx, camera.cy)):
+        raise InputError(
+            f"{path}: the optical axis at {camera.cx:g}, {camera.cy:g} px lies far off an image of "
+            f"{camera.width} x {camera.height}. Give it in pixels of this image."
+        )
+    return camera, data
 
 
 def _numbers(value: object, key: str, path: Path) -> list[float]:
@@ -225,7 +229,7 @@ def read_depth_png(
     if not 0 < unit_mm <= 100:
         raise InputError(f"depth_unit_mm is {unit_mm}; it must lie in 0..100 mm per step.")
     try:
-        image = Image.open(io.BytesIO(_read_bytes(path)), formats=["PNG"])
+        image = Image.open(io.BytesIO(read_file(path, LARGEST_FILE)), formats=["PNG"])
         size, mode = image.size, image.mode  # from the header: nothing is decoded yet
         good = size == (intrinsics.width, intrinsics.height) and mode.startswith("I")
         steps = np.asarray(image, dtype=np.float32) if good else None

@@ -8,23 +8,25 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from safetensors import SafetensorError
+import torch
 from safetensors.torch import load, save
 from torch import Tensor, nn
 
 from tumortrack.core import store
 from tumortrack.core.config import from_builtins, to_builtins
 from tumortrack.core.errors import ArtifactError, InputError
+from tumortrack.core.types import part_names
 from tumortrack.models.config import NetworkConfig, RegistrationHeadConfig, TrainConfig
-from tumortrack.models.folder import KIND, WEIGHTS, read_model_manifest
+from tumortrack.models.folder import KIND, WEIGHTS, read_model_manifest, read_tensors
 from tumortrack.models.hardware import choose_device
 from tumortrack.models.in_distribution import InDistributionRange
-from tumortrack.models.model import Model
+from tumortrack.models.model import Model, Network
 from tumortrack.models.normalisation import Aligned
 from tumortrack.occupancy.model import OccupancyModel
 from tumortrack.registration.model import RegistrationModel
 
 PRETRAINED = "pretrained"  # kind of a folder
+_LARGEST_BOX_MM = 1000.0
 
 
 def model_class(config: NetworkConfig) -> type[Model]:
@@ -60,19 +62,20 @@ def load_model(folder: Path, device: str = "auto") -> Model:
     try:
         config = from_builtins(manifest["config"], TrainConfig, f"{folder}: config")
         kind = model_class(config.network)
-        network = kind.new_network(config.network)
-        network.load_state_dict(load((folder / WEIGHTS).read_bytes()))
+        network = _filled(kind, config.network, read_tensors(folder / WEIGHTS, load))
         known = from_builtins(manifest["familiar"], InDistributionRange, f"{folder}: familiar")
         return kind.from_folder(
             folder,
             manifest,
             network=network.eval().requires_grad_(False).to(where),
             config=config,
-            parts=tuple(manifest["parts"]),
-            query_box_mm=np.array(manifest["query_box_mm"], float).reshape(2, 3),
+            parts=_parts(manifest["parts"]),
+            query_box_mm=_query_box(manifest["query_box_mm"]),
             in_distribution=known,
             provenance=dict(manifest["provenance"]),
         )
+    except ArtifactError:
+        raise
     except InputError as error:
         raise ArtifactError(
             f"{error} The model was trained by another version of tumortrack; train it again."
@@ -81,6 +84,32 @@ def load_model(folder: Path, device: str = "auto") -> Model:
         raise ArtifactError(
             f"{folder} is not a whole model of this version: {error}. Train it again."
         ) from error
+
+
+def _filled(kind: type[Model], config: NetworkConfig, weights: dict[str, Tensor]) -> Network:
+    """The network with these weights; ValueError for others, before room is made for them."""
+    with torch.device("meta"):
+        needed = kind.new_network(config).state_dict()
+    for name in needed.keys() | weights.keys():
+        sizes = [tuple(one[name].shape) if name in one else None for one in (needed, weights)]
+        if sizes[0] != sizes[1]:
+            raise ValueError(f"{name} is {sizes[1]} and must be {sizes[0]}")
+    network = kind.new_network(config)
+    network.load_state_dict(weights)
+    return network
+
+
+def _parts(stated: list[str]) -> tuple[str, ...]:
+    if not stated or tuple(stated) != part_names(len(stated)):
+        raise InputError(f"parts {stated} are not kidney, tumor_1, tumor_2, ...")
+    return tuple(stated)
+
+
+def _query_box(stated: list[list[float]]) -> np.ndarray:
+    box_mm = np.array(stated, float).reshape(2, 3)
+    if not ((box_mm[0] < box_mm[1]).all() and (np.abs(box_mm) < _LARGEST_BOX_MM).all()):
+        raise InputError(f"query_box_mm {stated} is no box about a kidney.")
+    return box_mm
 
 
 def _weights(network: nn.Module) -> bytes:
@@ -128,9 +157,9 @@ def load_start(folder: Path) -> PretrainedWeights:
     manifest = store.read_manifest(folder, PRETRAINED)
     try:
         config = from_builtins(manifest["config"], NetworkConfig, f"{folder}: config")
-        weights = load((folder / WEIGHTS).read_bytes())
-        model_class(config).new_network(config).load_state_dict(weights)
-    except (InputError, KeyError, RuntimeError, SafetensorError, OSError) as error:
+        weights = read_tensors(folder / WEIGHTS, load)
+        _filled(model_class(config), config, weights)
+    except (InputError, KeyError, ValueError, RuntimeError, OSError) as error:
         raise ArtifactError(
             f"{folder} holds no whole pretrained weights of this version: {error}. Make them "
             "again: tumortrack pretrain OUT."

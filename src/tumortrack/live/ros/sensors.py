@@ -16,6 +16,7 @@ from tumortrack.core.errors import InputError
 from tumortrack.core.types import DepthFrame, Intrinsics, SensorCloud
 from tumortrack.live.ros.messages import MM_PER_M, Messages, Outgoing, stamp_of
 from tumortrack.live.values import Observation
+from tumortrack.sense.cloud import seen_points
 
 CLOUD = "sensor_msgs/msg/PointCloud2"
 IMAGE = "sensor_msgs/msg/Image"
@@ -33,7 +34,7 @@ def cloud_of(message: Any) -> SensorCloud:
     """A PointCloud2 in metres as points in mm, in the message's order, with its stamp.
 
     x, y and z are float32 or float64 at any place of a point; either byte order, organised or
-    not, rows padded or not. Points without return (NaN, infinite, or 0, 0, 0) are dropped.
+    not, rows padded or not. What is no point seen is dropped, as by ``seen_points``.
     """
     step, places = int(message.point_step), {}
     for field in message.fields:
@@ -60,9 +61,9 @@ def cloud_of(message: Any) -> SensorCloud:
             offset, code = places[name]
             metres = np.ndarray((height, width), order + code, data, offset, (row, step))
             np.multiply(metres, 1000, out=points_mm[..., axis], casting="same_kind")
-    rows = points_mm.reshape(-1, 3)
-    kept = np.isfinite(rows).all(axis=1) & (rows != 0).any(axis=1)
-    return SensorCloud(rows[kept], stamp_of(message.header))
+    return SensorCloud(
+        seen_points(points_mm.reshape(-1, 3), "a cloud")[0], stamp_of(message.header)
+    )
 
 
 def _place(field: Any, step: int) -> tuple[int, str]:
