@@ -86,14 +86,6 @@ def locate(tumortrack: str, model: Path, points_mm: np.ndarray) -> dict:
         return json.loads(Path(folder, "out", "report.json").read_text())["parts"]
 
 
-def centre_error(part: dict, truth_mm: np.ndarray) -> str:
-    """Between the centres of the two boxes, mm."""
-    if not part["found"]:
-        return "not found"
-    centre = (truth_mm.min(0) + truth_mm.max(0)) / 2
-    return f"{np.linalg.norm(np.array(part['center_mm']) - centre):.1f}"
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -114,7 +106,11 @@ def main() -> None:
             points = cast_cloud(kidney_camera, faces)
             parts = locate(options.tumortrack, model, points)
             truths = {"kidney": kidney_camera, "tumor_1": tumor_camera}
-            errors = [centre_error(parts[name], truth) for name, truth in truths.items()]
+            errors = []  # between the centres of the two boxes
+            for name, truth in truths.items():
+                middle = (truth.min(0) + truth.max(0)) / 2
+                off = np.array(parts[name].get("center_mm", np.nan)) - middle
+                errors.append(f"{np.linalg.norm(off):.1f}" if parts[name]["found"] else "not found")
             ml = f"{parts['tumor_1'].get('volume_ml', float('nan')):.1f}"
             row = map(str, (model, seed, len(points), *errors, ml))
             print(f"| {' | '.join(row)} |", flush=True)

@@ -15,8 +15,8 @@ from pathlib import Path
 import numpy as np
 
 from tumortrack.simulate.scene_folder import list_scenes, read_scene
+from tumortrack_lab.peers.base import matched_vertices
 from tumortrack_lab.peers.kinds import peer_kinds
-from tumortrack_lab.peers.rigid import matched_vertices
 from tumortrack_lab.study.methods import peer_method, study_case
 
 

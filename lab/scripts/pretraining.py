@@ -12,8 +12,9 @@ from __future__ import annotations
 import os
 import shlex
 import sys
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, partial
 from itertools import product
 from pathlib import Path
 
@@ -95,12 +96,8 @@ def main(options: Options) -> None:
             "steps": list(options.steps),
             "scenes": options.scenes,
         }
-        path = options.out / f"{name}_{seed}.json"
-        curve = trainings.kept(
-            path,
-            about,
-            lambda: _curve(made[name], scenes(name), start, seed, options.steps),  # noqa: B023
-        )
+        measure = partial(_curve, made[name], partial(scenes, name), start, seed, options.steps)
+        curve = trainings.kept(options.out / f"{name}_{seed}.json", about, measure)
         rows += [{"case": name, "seed": seed, **row} for row in curve]
     command = shlex.join(["make", "headstart", f"ARGS={shlex.join(sys.argv[1:])}"])
     about = store.read_manifest(options.start, "pretrained")["provenance"]
@@ -108,11 +105,7 @@ def main(options: Options) -> None:
 
 
 def _curve(
-    case: Case,
-    scenes: ValidationScenes,
-    start: PretrainedWeights,
-    seed: int,
-    lengths: tuple[int, ...],
+    case: Case, scenes: Callable, start: PretrainedWeights, seed: int, lengths: tuple[int, ...]
 ) -> list[dict]:
     """All trainings of one case and seed, side by side over the same batches."""
     device, config = torch.device("cpu"), clinic(case.anatomy)
@@ -133,7 +126,7 @@ def _curve(
         for (length, pretrained), state in states.items():
             if length == steps:
                 method = Registration(state.average.eval(), shape, config.refine)
-                row = {"steps": steps, "pretrained": pretrained, **_errors(method, shape, scenes)}
+                row = {"steps": steps, "pretrained": pretrained, **_errors(method, shape, scenes())}
                 figures = (f"{key}={round(row[key], 2)}" for key in TITLES)
                 say(f"steps={steps} pretrained={pretrained} {' '.join(figures)}")
                 rows.append(row)
@@ -160,13 +153,11 @@ def _errors(method: Registration, shape: RestShape, scenes: ValidationScenes) ->
         inside = points_ct[labels > 0], points_mm[labels > 0]
         first.append(_error_mm(starts[0], *inside))
         refined.append(_error_mm(motions[-1], *inside))
-    numbers = [f(errors) for errors in (first, refined) for f in (np.median, _worst)]
+    numbers = [
+        f(errors) for errors in (first, refined) for f in (np.median, partial(np.percentile, q=90))
+    ]
     numbers.append(trainings.placed_miou(motions, shape, scenes))
     return dict(zip(TITLES, map(float, numbers), strict=True))
-
-
-def _worst(errors: list[float]) -> float:
-    return np.percentile(errors, 90)
 
 
 def _error_mm(motion: ElasticMotion, points_ct: np.ndarray, points_mm: np.ndarray) -> float:

@@ -15,7 +15,7 @@ import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Annotated
 
@@ -35,20 +35,25 @@ from tumortrack_lab.study.bound import BOUNDS, Bound
 from tumortrack_lab.study.document import ReportWriter
 from tumortrack_lab.study.measure import Job, MeasurementStore, StudyStatus, measure
 from tumortrack_lab.study.methods import (
+    CLINIC,
+    MODELS,
     Method,
     Network,
+    Presets,
     StudyCase,
+    Trainer,
     named_folders,
     peer_method,
     phantom_case,
     study_case,
 )
-from tumortrack_lab.study.models import CLINIC, MODELS, Presets, Trainer
 from tumortrack_lab.study.report import gallery_block, section_blocks
 from tumortrack_lab.study.resection import cut_one
 from tumortrack_lab.study.trainings import make_command, run
 
 EVERY_S = 15.0  # between lines of progress
+TRAINING = ": step {now.step}/{now.end}, {now.samples_per_s:.0f} samples/s, {left}"
+MEASURING = ": {now.done}/{now.total}, {now.seconds_each:.1f} s each, {left} ({now.name})"
 
 
 @dataclass(frozen=True)
@@ -98,7 +103,7 @@ def main(options: Options) -> None:
         say(f"== {section}")
         jobs = studies.jobs_of(plan, section, cases, methods)
         one = cut_one if section == "resection" else None
-        measured = measure(jobs, kept, _measuring(section), one)
+        measured = measure(jobs, kept, partial(_lines(), section + MEASURING), one)
         writer.write(section_blocks(section, measured, cases, writer))
         say(f"{section}: {len(measured)} measurements, block written to {document}")
     if "peers" in options.sections:
@@ -113,7 +118,11 @@ def main(options: Options) -> None:
 
 def _methods(options: Options, plan: studies.StudyPlan, out: Path) -> studies.Methods:
     """Each is trained, or made ready, once."""
-    trainer = Trainer(out / "models", Presets(quick, clinic), options.device, report=_training())
+    line = _lines()
+    trainer = Trainer(
+        out / "models", Presets(quick, clinic), options.device,
+        report=lambda name, now: line(name + TRAINING, now),
+    )  # fmt: skip
     bcpd = options.bcpd if options.bcpd.is_file() else None
 
     def model(case: StudyCase, name: str, seed: int) -> Network:
@@ -152,38 +161,20 @@ def _scenes(case: StudyCase, variants: tuple[str, ...], views: tuple[str, ...]) 
         raise TumortrackError(f"the scenes of {case.name} could not be made (see above).")
 
 
-def _lines() -> Callable[[str, float, bool], None]:
+def _lines() -> Callable[[str, TrainingStatus | StudyStatus], None]:
     """Progress with the seconds left, as lines: one now and then, and the last."""
     last_s = -EVERY_S
 
-    def line(text: str, left_s: float, last: bool) -> None:
+    def line(text: str, now: TrainingStatus | StudyStatus) -> None:
         nonlocal last_s
+        training = isinstance(now, TrainingStatus)
+        last = now.step == now.end if training else now.done == now.total
         if last or time.monotonic() - last_s >= EVERY_S:
-            s = int(left_s)
-            say(text.format(left=f"{s // 3600}:{s // 60 % 60:02d}:{s % 60:02d} left"))
+            s = int(now.seconds_left)
+            say(text.format(now=now, left=f"{s // 3600}:{s // 60 % 60:02d}:{s % 60:02d} left"))
             last_s = time.monotonic()
 
     return line
-
-
-def _training() -> Callable[[str, TrainingStatus], None]:
-    line = _lines()
-
-    def show(name: str, now: TrainingStatus) -> None:
-        text = f"{name}: step {now.step}/{now.end}, {now.samples_per_s:.0f} samples/s, {{left}}"
-        line(text, now.seconds_left, now.step == now.end)
-
-    return show
-
-
-def _measuring(section: str) -> Callable[[StudyStatus], None]:
-    line = _lines()
-
-    def show(now: StudyStatus) -> None:
-        text = f"{section}: {now.done}/{now.total}, {now.seconds_each:.1f} s each, {{left}}"
-        line(f"{text} ({now.name})", now.seconds_left, now.done == now.total)
-
-    return show
 
 
 if __name__ == "__main__":

@@ -32,12 +32,10 @@ def main() -> int:
     options = parser.parse_args()
     with tempfile.TemporaryDirectory(prefix="tumortrack-soak-") as folder:
         report = options.report or Path(folder) / "report.json"
-        command = [
-            *(sys.executable, "-m", "tumortrack.cli.main", "track"),
-            *(str(options.model), f"virtual:{options.case}?fps={options.fps:g}", *options.sinks),
-            *("--seconds", str(60 * options.minutes), "--report", str(report)),
-            *("--stale", str(options.stale)),
-        ]
+        source = f"virtual:{options.case}?fps={options.fps:g}"
+        command = [sys.executable, "-m", "tumortrack.cli.main", "track", options.model, source]
+        command += [*options.sinks, "--seconds", 60 * options.minutes, "--report", report]
+        command = [*map(str, command), "--stale", str(options.stale)]
         print(" ".join(command), flush=True)
         if subprocess.run(command).returncode:
             return 1

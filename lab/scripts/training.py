@@ -12,9 +12,9 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
@@ -37,7 +37,7 @@ from tumortrack.report.drawing import new_figure, save
 from tumortrack.simulate.scene import body_for
 from tumortrack.training.presets import PRESETS
 from tumortrack.training.state import TrainingRun, TrainingState, settle_end
-from tumortrack.training.task import label_miou, task_of
+from tumortrack.training.task import ValidationScenes, label_miou, task_of
 from tumortrack_lab.study import trainings
 from tumortrack_lab.study.document import ReportWriter, table
 from tumortrack_lab.study.methods import phantom_case
@@ -113,19 +113,15 @@ def main(options: Options) -> None:
     keep_freed_memory()
     folder = phantom_case(options.out / "phantom", PhantomParameters())
     case, rows = load_case(folder), []
-    judge = cache(lambda preset: Judge(case, preset, options.scenes))
+    judge = cache(partial(judge_of, case, count=options.scenes))
     for setting in settings(case, options):
         about = {
             "setting": asdict(setting),
             "case_sha256": store.sha256_of(folder / store.MANIFEST),
             **{name: getattr(options, name) for name in ("seconds", "scenes", "looks")},
         }
-        path = options.out / f"{setting.name}.json"
-        curve = trainings.kept(
-            path,
-            about,
-            lambda: _curve(case, setting, judge(setting.preset), options),  # noqa: B023
-        )
+        measure = partial(_curve, case, setting, judge, options)
+        curve = trainings.kept(options.out / f"{setting.name}.json", about, measure)
         rows += [{**asdict(setting), **row} for row in curve]
         say(f"{setting.name}: " + " ".join(f"{k}={round(v, 3)}" for k, v in curve[-1].items()))
     frame = pd.DataFrame(rows)
@@ -133,56 +129,51 @@ def main(options: Options) -> None:
     _write(frame, options, ReportWriter(options.document, trainings.make_command(BLOCK)))
 
 
-def _curve(case: Case, setting: Setting, judge: Judge, options: Options) -> list[dict]:
+def _curve(case: Case, setting: Setting, judges: Callable, options: Options) -> list[dict]:
     """A training of so many seconds; judging does not count."""
+    judge = judges(setting.preset)
     config, minutes = setting.config(case), options.seconds / 60
     training = TrainingRun(case.anatomy, case.up_lps, "", config, setting.seed, minutes=minutes)
     task, state = task_of(training, CPU), TrainingState(training, CPU)
     state.initialize(task.initialize)
     progress, curve, spent = state.progress, [], 0.0
-    made = trainings.training_batches(training, task, 10**9)
-    began = time.perf_counter()
-    for batch in made:
-        state.step(batch)
+    batches, began = trainings.training_batches(training, task, 10**9), time.perf_counter()
+    while progress.step != progress.end:
+        state.step(next(batches))
         progress.elapsed_s = spent + time.perf_counter() - began
         settle_end(config, progress, training.minutes)
-        done = progress.step == progress.end
-        if done or progress.elapsed_s >= options.seconds * (len(curve) + 1) / options.looks:
+        look_s = options.seconds * (len(curve) + 1) / options.looks
+        if progress.step == progress.end or progress.elapsed_s >= look_s:
             spent = progress.elapsed_s
             row = {"seconds": spent, "samples": progress.step * setting.batch}
-            curve.append({**row, **judge.figures(state.average)})
+            curve.append({**row, **judge(state.average)})
             began = time.perf_counter()
-        if done:
-            break
     return curve
 
 
-class Judge:
-    """Scenes of one case: of the kinds that a preset trains on, and of another kind."""
+def judge_of(case: Case, preset: str, count: int) -> Callable[[Network], dict[str, float]]:
+    """Mean IoU over the parts, on scenes of the kinds that a preset trains on and on those of
+    another kind; of ``clinic`` as the network places the organ, before the refinement, which makes
+    up for much that was not learnt."""
+    own = PRESETS[preset](case.anatomy, "limited")
+    other = PRESETS["clinic" if preset == "quick" else "quick"](case.anatomy, "limited")
+    scene = replace(own.scene, deform=other.scene.deform[-1:])
+    sets = {
+        "miou": trainings.unseen_scenes(case, own, count),
+        "other_miou": trainings.unseen_scenes(case, replace(own, scene=scene), count),
+    }
+    body = body_for(case.anatomy, case.up_lps, own.scene, 0)
+    shape = None if body is None else shape_of(case.anatomy, body)
 
-    def __init__(self, case: Case, preset: str, scenes: int) -> None:
-        own = PRESETS[preset](case.anatomy, "limited")
-        other = PRESETS["clinic" if preset == "quick" else "quick"](case.anatomy, "limited")
-        scene = replace(own.scene, deform=other.scene.deform[-1:])
-        self._parts = len(case.anatomy.parts) + 1
-        self._sets = {
-            "miou": trainings.unseen_scenes(case, own, scenes),
-            "other_miou": trainings.unseen_scenes(case, replace(own, scene=scene), scenes),
-        }
-        body = body_for(case.anatomy, case.up_lps, own.scene, 0)
-        self._shape = None if body is None else shape_of(case.anatomy, body)
-
-    def figures(self, network: Network) -> dict[str, float]:
-        """Mean IoU over the parts, on either kind of scenes; of ``clinic`` as the network places
-        the organ, before the refinement, which makes up for much that was not learnt."""
+    def miou(network: Network, scenes: ValidationScenes) -> float:
         network.eval()
         if isinstance(network, OccupancyNetwork):
-            return {k: label_miou(network, s, self._parts, CPU) for k, s in self._sets.items()}
-        method, figures = Registration(network, self._shape, GaussNewtonConfig()), {}
-        for name, scenes in self._sets.items():
-            motions = (method.propose(cloud)[0] for cloud in scenes.clouds_mm)
-            figures[name] = trainings.placed_miou(motions, self._shape, scenes)
-        return figures
+            return label_miou(network, scenes, len(case.anatomy.parts) + 1, CPU)
+        method = Registration(network, shape, GaussNewtonConfig())
+        motions = (method.propose(cloud)[0] for cloud in scenes.clouds_mm)
+        return trainings.placed_miou(motions, shape, scenes)
+
+    return lambda network: {name: miou(network, scenes) for name, scenes in sets.items()}
 
 
 def _write(frame: pd.DataFrame, options: Options, writer: ReportWriter) -> None:
@@ -190,9 +181,9 @@ def _write(frame: pd.DataFrame, options: Options, writer: ReportWriter) -> None:
     groups = sorted(last.groupby(SETTING, sort=False), key=lambda g: (g[0][0], -g[1].both.mean()))
     body = []
     for (preset, batch, per_side, rate), seeds in groups:
-        speed = (seeds.samples / seeds.seconds).mean()
         each = [" / ".join(f"{v:.3f}" for v in seeds[key]) for key in ("miou", "other_miou")]
-        sides = str(per_side) if preset == "quick" else "-"
+        speed, sides = (seeds.samples / seeds.seconds).mean(), f"{per_side}"
+        sides = sides if preset == "quick" else "-"
         body.append([preset, str(batch), sides, f"{rate:g}", f"{speed:.0f}", *each])
     image = writer.image("training_speed")
     _draw(frame, image)

@@ -46,6 +46,7 @@ def locates_its_organ(case: Path, folder: Path) -> None:
     assert np.linalg.norm(np.array(kidney["center_mm"]) - truth) < 25
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("patient", PATIENTS)
 def test_label_map_to_located_organ(patient, prepared, tmp_path):
     case = prepared(patient)
@@ -57,6 +58,7 @@ def test_label_map_to_located_organ(patient, prepared, tmp_path):
         locates_its_organ(case, tmp_path)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("patient", PATIENTS)
 def test_virtual_ct_gives_back_the_anatomy(patient, prepared, tmp_path):
     patients = load_case(prepared(patient))
@@ -72,6 +74,7 @@ def test_virtual_ct_gives_back_the_anatomy(patient, prepared, tmp_path):
         locates_its_organ(tmp_path / "ct_case", tmp_path)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("side", ["left", "right"])
 def test_a_kidney_without_tumor_from_a_mask(side, shared_data, tmp_path):
     source = shared_data / "totalsegmentator" / f"kidney_{side}.nii.gz"
@@ -86,12 +89,14 @@ def test_a_kidney_without_tumor_from_a_mask(side, shared_data, tmp_path):
     assert np.abs(anatomy.organ.vertices_mm.mean(0) - centre).max() < 6
 
 
+@pytest.mark.slow
 def test_a_body_ct_by_thresholds_is_refused_with_advice(shared_data, tmp_path):
     ct = shared_data / "totalsegmentator" / "example_ct.nii.gz"
     assert "--labels" in refusal(tumortrack("prepare", ct, tmp_path / "case"))
     assert not (tmp_path / "case").exists()
 
 
+@pytest.mark.slow
 def test_real_compressed_dicom_is_read_and_refused_for_what_it_is(shared_data, tmp_path):
     """20 slices of an abdomen hold no whole kidney: read, then told so; nothing is written."""
     folder: Path = shared_data / "totalsegmentator" / "example_ct_dicom"

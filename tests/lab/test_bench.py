@@ -4,7 +4,6 @@ import json
 import sys
 from pathlib import Path
 
-import msgspec
 import numpy as np
 import pytest
 import torch
@@ -19,10 +18,11 @@ from tumortrack.models.normalisation import CloudBox
 from tumortrack.occupancy.network import MlpDecoder, OccupancyNetwork
 from tumortrack.training.presets import quick_network
 from tumortrack_lab.bench import rows as interleaving
-from tumortrack_lab.bench.forms import module_flops
+from tumortrack_lab.bench import run as running
 from tumortrack_lab.bench.machine import forget_peak, peak_bytes
 from tumortrack_lab.bench.naive import NaiveOccupancy, flowed
-from tumortrack_lab.bench.report import BLOCKS, draw_growth, write_bench
+from tumortrack_lab.bench.occupancy import module_flops
+from tumortrack_lab.bench.report import BLOCKS, GOALS, draw_growth, goals_table, write_bench
 from tumortrack_lab.bench.rows import (
     BenchResult,
     BenchRow,
@@ -36,8 +36,6 @@ from tumortrack_lab.bench.rows import (
 )
 from tumortrack_lab.bench.run import GROUPS, Task, TaskMessage, carry_out, tasks_of
 from tumortrack_lab.bench.subject import BenchSubject
-from tumortrack_lab.bench.tables import GOALS, goals_table
-from tumortrack_lab.cli import bench as benching
 from tumortrack_lab.cli.bench import Bench
 from tumortrack_lab.study.document import closing, opening
 
@@ -89,9 +87,10 @@ def test_arithmetic_is_that_of_the_layers() -> None:
 
 def test_floors_follow_from_the_rates() -> None:
     peaks = Peaks(threads=1, gemm={"fp32": 1e9, "bf16": 4e9}, triad=2e9)
-    assert peaks.floor_s(Work(flops=4e9, bytes=1.0, precision="bf16")) == 1.0
-    assert peaks.floor_s(Work(flops=1.0, bytes=4e9)) == 2.0
-    assert peaks.floor_s(Work(flops=3e9, bytes=0.0, precision="int8")) == 3.0  # not offered: fp32
+    assert peaks.least_s(Work(flops=4e9, bytes=1.0, precision="bf16")) == (1.0, 5e-10)
+    assert peaks.least_s(Work(flops=1.0, bytes=4e9)) == (1e-9, 2.0)
+    # Not offered: fp32.
+    assert peaks.least_s(Work(flops=3e9, bytes=0.0, precision="int8")) == (3.0, 0.0)
 
 
 def normed_network() -> NetworkConfig:
@@ -115,7 +114,7 @@ def test_the_naive_network_is_the_network(config: NetworkConfig) -> None:
     with torch.no_grad():
         for training in (True, False):  # the first settles the norms' statistics
             network.train(training)
-            plain = NaiveOccupancy(network, training=False)
+            plain = NaiveOccupancy(network)
             if training:
                 network(clouds, queries)
                 continue
@@ -223,11 +222,10 @@ def small_subject(folder: Path) -> BenchSubject:
 
 
 def test_a_process_measures_a_part(tmp_path) -> None:
-    messages_of_trainings: list[TaskMessage] = []
-    task = Task(threads=1, folder=str(tmp_path), describe=True, peaks=True, quick=True)
-    task = msgspec.structs.replace(task, groups=("generator",))
-    messages = list(carry_out(task, small_subject(tmp_path), messages_of_trainings.append))
-    assert not messages_of_trainings
+    parts = (("machine",), ("peaks",), ("group", "generator"))
+    task = Task(threads=1, folder=str(tmp_path), parts=parts, quick=True)
+    messages: list[TaskMessage] = []
+    carry_out(task, small_subject(tmp_path), messages.append)
     (row,) = [one.row for one in messages if one.row is not None]
     ours, naive = row.ours, row.naive
     assert naive is not None
@@ -256,21 +254,22 @@ task = json.loads(sys.argv[-1])
 assert os.environ["OMP_NUM_THREADS"] == str(task["threads"])
 print("a library's chatter")
 print(json.dumps({"begins": "something"}))
-if task["describe"]:
+parts = [tuple(part) for part in task["parts"]]
+if ("machine",) in parts:
     print(json.dumps({"machine": {"date": "today"}}))
-for group in task["groups"]:
+for group in (name for kind, *names in parts for name in names):
     time = dict(best_s=1.0, median_s=2.0, low_s=1.5, high_s=3.0, turns=3)
     row = dict(name=group, what="", threads=1, item="pair", ours=time)
     if group == "planning":
         row["naive"] = {**time, "median_s": 4.0}
     print(json.dumps({"row": row}))
-if "encoder" in task["groups"]:
+if ("group", "encoder") in parts:
     sys.exit("the encoder is broken")
 """
 
 
 def test_the_command_gathers_what_processes_find(tmp_path, monkeypatch, capfd) -> None:
-    monkeypatch.setattr(benching, "_WORKER", [sys.executable, "-c", WORKER])
+    monkeypatch.setattr(running, "WORKER", [sys.executable, "-c", WORKER])
     out = tmp_path / "new" / "found.json"
     Bench(only=("generator", "planning"), quick=True, out=out).run()
     found = json.loads(out.read_text())
@@ -293,14 +292,15 @@ def test_each_process_has_its_own_threads_and_only_needed_models_are_trained(tmp
     common = Task(threads=1, folder=str(tmp_path))
     groups = ("generator", "frame", "tracking")
     first, one, two, *curves = tasks_of(common, groups, ("grid",), cores=4)
-    assert (first.threads, first.train) == (2, ("clinic", "paper", "quick"))
-    assert first.describe
-    assert (one.threads, one.groups) == (1, ("generator", "frame", "tracking"))
-    assert (two.threads, two.groups) == (2, ("frame", "tracking"))
-    assert [task.curve for task in curves] == [("grid", p) for p in ("clinic", "quick", "paper")]
+    trained = tuple(("train", preset) for preset in ("clinic", "paper", "quick"))
+    assert (first.threads, first.parts) == (2, (("machine",), *trained))
+    assert (one.threads, one.parts[1:]) == (1, tuple(("group", name) for name in groups))
+    assert (two.threads, two.parts[1:]) == (2, tuple(("group", name) for name in groups[1:]))
+    assert one.parts[0] == two.parts[0] == ("peaks",)
+    every = [(("curve", "grid", preset),) for preset in ("clinic", "quick", "paper")]
+    assert [task.parts for task in curves] == every
     (alone,) = tasks_of(common, ("generator",), (), cores=1)
-    assert alone.describe
-    assert alone.train == ()
+    assert alone.parts == (("machine",), ("peaks",), ("group", "generator"))
 
 
 def test_what_cannot_be_measured_is_refused(tmp_path) -> None:

@@ -7,7 +7,9 @@ import pytest
 
 from clock import Clock
 from tumortrack.training.presets import PRESETS, quick
-from tumortrack_lab.bench import curves, networks, rows, training
+from tumortrack_lab.bench import curves, occupancy, rows, training
+from tumortrack_lab.bench import subject as subjects
+from tumortrack_lab.bench.report import goals_table
 from tumortrack_lab.bench.rows import (
     DECODER,
     ENCODER,
@@ -24,7 +26,6 @@ from tumortrack_lab.bench.rows import (
     timing_of,
 )
 from tumortrack_lab.bench.subject import BenchSubject
-from tumortrack_lab.bench.tables import goals_table
 
 
 def test_long_calls_have_three_turns_the_first_among_them(monkeypatch) -> None:
@@ -70,8 +71,8 @@ def test_goals_of_a_gpu_are_judged_where_there_is_one() -> None:
 
 def test_rows_of_a_gpu_are_measured_on_any_device(quick_model, tmp_path, monkeypatch) -> None:
     monkeypatch.setattr(training, "LABELLING", ("quick",))
-    for name, small in (("GRID", 24), ("_SLAB", 99), ("QUERIES", 999)):
-        monkeypatch.setattr(networks, name, small)
+    for name, small in (("GRID", 24), ("SLAB", 99), ("QUERIES", 999)):
+        monkeypatch.setattr(occupancy, name, small)
     presets = {"quick": lambda anatomy: quick(anatomy, "limited")}
     subject = BenchSubject(presets, tmp_path)
     shutil.copytree(quick_model, tmp_path / "quick")
@@ -84,11 +85,11 @@ def test_rows_of_a_gpu_are_measured_on_any_device(quick_model, tmp_path, monkeyp
 
 @pytest.mark.slow
 def test_every_workload_becomes_a_row(quick_model, clinic_model, tmp_path, monkeypatch) -> None:
-    for module in (networks, training):
-        monkeypatch.setattr(module, "LABELLING", ("quick",))
-    small = {"GRID": 24, "_SLAB": 99, "QUERIES": 999, "_DECODED": (100, 200), "IN_ONE_PIECE": 100}
+    monkeypatch.setattr(subjects, "LABELLING", ("quick",))
+    monkeypatch.setattr(subjects, "PRESETS", ("clinic", "quick"))
+    small = {"GRID": 24, "SLAB": 99, "QUERIES": 999, "DECODED": (100, 200), "IN_ONE_PIECE": 100}
     for name, value in small.items():
-        monkeypatch.setattr(networks, name, value)
+        monkeypatch.setattr(occupancy, name, value)
     monkeypatch.setattr(training, "_SAMPLES", {"clinic": 2, "quick": 2})
     presets = {name: partial(PRESETS[name], rotations="limited") for name in ("clinic", "quick")}
     for name, folder in (("clinic", clinic_model), ("quick", quick_model)):
@@ -97,11 +98,11 @@ def test_every_workload_becomes_a_row(quick_model, clinic_model, tmp_path, monke
     rows = [
         row
         for source in (
-            networks.encoders,
-            networks.decoders,
-            networks.frames,
-            networks.tracking,
-            networks.volumes,
+            subjects.encoders,
+            subjects.decoders,
+            subjects.frames,
+            subjects.tracking,
+            subjects.volumes,
             training.elastic,
             training.steps,
         )

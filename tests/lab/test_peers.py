@@ -13,7 +13,15 @@ from tumortrack.core.types import Anatomy, Mesh, SensorCloud
 from tumortrack.report.protocol import compare
 from tumortrack.sense.render import Visibility
 from tumortrack.simulate.scene_folder import Scene
-from tumortrack_lab.peers.base import Fit, estimate_of, rigid_carry
+from tumortrack_lab.peers.base import (
+    Fit,
+    Rigid,
+    RigidBound,
+    estimate_of,
+    fit_over_volume,
+    matched_vertices,
+    rigid_carry,
+)  # fmt: skip
 from tumortrack_lab.peers.elastic import (
     ElasticPeer,
     ElasticPeerConfig,
@@ -23,7 +31,6 @@ from tumortrack_lab.peers.elastic import (
 from tumortrack_lab.peers.kinds import peer_kinds
 from tumortrack_lab.peers.point_drift import Bcpd, BcpdConfig, Cpd, CpdConfig
 from tumortrack_lab.peers.pose_search import RigidConfig, seen_from, surface_points
-from tumortrack_lab.peers.rigid import Rigid, RigidBound, fit_over_volume, matched_vertices
 from tumortrack_lab.study.measure import StudyCase
 from tumortrack_lab.study.methods import peer_method
 from tumortrack_lab.tets import tetrahedralise

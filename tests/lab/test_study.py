@@ -41,8 +41,17 @@ from tumortrack_lab.study.measure import (
     measure,
     point_errors,
 )
-from tumortrack_lab.study.methods import Answer, Method, StudyCase, peer_method, study_case
-from tumortrack_lab.study.models import ABLATED, Presets, Trainer, train_config
+from tumortrack_lab.study.methods import (
+    ABLATED,
+    Answer,
+    Method,
+    Presets,
+    StudyCase,
+    Trainer,
+    peer_method,
+    study_case,
+    train_config,
+)
 from tumortrack_lab.study.plan import FULL, QUICK, SECTIONS, Methods, StudyPlan, jobs_of
 from tumortrack_lab.study.report import gallery_block, section_blocks
 from tumortrack_lab.study.tables import NOT_FOUND, by_seed, text, tidy
@@ -376,6 +385,7 @@ def test_each_model_of_the_ablation_lacks_its_piece_alone(phantom):
         train_config("clinical", phantom, PRESETS)
 
 
+@pytest.mark.slow
 def test_end_to_end_twice_gives_the_same_document(phantom, tmp_path):
     plan = StudyPlan(
         name="tiny",
@@ -416,7 +426,7 @@ def test_end_to_end_twice_gives_the_same_document(phantom, tmp_path):
 
     told, trained = run()
     assert len(told) == 1 + 4 + 2  # peers: the networks' are those of accuracy
-    assert len(trained) == 1
+    assert len(set(trained)) == 1  # it is told of every few seconds
     first = document.read_text()
     assert first.startswith("mine\n")
     assert first.endswith("yours\n")

@@ -133,7 +133,7 @@ def test_obstacles_measure_true_distances() -> None:
     rng = np.random.default_rng(1)
     points = rng.uniform(-20, 20, (400, 3))
     plate = ContactPlate((1.0, -2.0, 3.0), (8.0, 12.0, 5.0), 2.0)
-    rod = Rod((0.0, 0.0, -5.0), (0.0, 0.6, 0.8), 4.0)
+    rod = Rod(np.array([0.0, 0.0, -5.0]), np.array([0.0, 0.6, 0.8]), 4.0)
     packing = Support(points[:, 2] - np.linspace(-3, 3, 400))
     np.testing.assert_allclose(packing.distance(points)[0], np.linspace(-3, 3, 400), atol=1e-12)
     for obstacle in (plate, rod, Support(2.0)):

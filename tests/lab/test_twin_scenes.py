@@ -33,7 +33,7 @@ from tumortrack_lab.twin import dataset
 from tumortrack_lab.twin.apparatus import State
 from tumortrack_lab.twin.dataset import TwinRun, make_scenes
 from tumortrack_lab.twin.equilibrium import Rod
-from tumortrack_lab.twin.faults import FAULTS, faulty
+from tumortrack_lab.twin.faults import FAULTS, disturbed
 from tumortrack_lab.twin.occluders import rod_mesh, shaft_over
 from tumortrack_lab.twin.views import (
     VARIANTS,
@@ -252,7 +252,7 @@ def test_what_a_rod_hides_lies_behind_it():
 
 
 def test_a_rod_has_its_size():
-    solid = rod_mesh(Rod((1.0, 2.0, 90.0), (0.6, 0.0, -0.8), 4.0, 60.0))
+    solid = rod_mesh(Rod(np.array([1.0, 2.0, 90.0]), np.array([0.6, 0.0, -0.8]), 4.0, 60.0))
     mesh = trimesh.Trimesh(solid.vertices_mm, solid.faces)
     assert mesh.is_watertight
     along = (solid.vertices_mm - [1, 2, 90]) @ [0.6, 0, -0.8]
@@ -295,12 +295,12 @@ def test_scenes_replay_bit_for_bit(view):
 
 def test_clean_is_the_scene_itself():
     clean, _ = scene()
-    assert faulty(clean, "clean", 0) is clean
+    assert disturbed(clean, "clean", 0) is clean
 
 
 def test_an_offset_moves_points_towards_the_camera_along_their_rays():
     clean, _ = scene()
-    moved = faulty(clean, "offset", 0)
+    moved = disturbed(clean, "offset", 0)
     before, after = deproject(clean.depth).astype(float), deproject(moved.depth).astype(float)
     assert np.allclose(before[:, 2] - after[:, 2], 2, atol=1e-4)
     assert np.allclose(after[:, :2] / after[:, 2:], before[:, :2] / before[:, 2:], atol=1e-6)
@@ -311,7 +311,7 @@ def test_an_offset_moves_points_towards_the_camera_along_their_rays():
 
 def test_a_registration_fault_moves_the_truth_by_one_millimetre_and_one_degree():
     clean, _ = scene()
-    moved = faulty(clean, "registration", 7)
+    moved = disturbed(clean, "registration", 7)
     assert moved.cloud is clean.cloud
     motion = np.array(moved.meta["registration"])
     for before, after in zip(clean.reference.parts, moved.reference.parts, strict=True):
@@ -320,37 +320,39 @@ def test_a_registration_fault_moves_the_truth_by_one_millimetre_and_one_degree()
     assert np.linalg.norm(transform_points(motion, centre[None])[0] - centre) == pytest.approx(1)
     angle = np.degrees(np.arccos((np.trace(motion[:3, :3]) - 1) / 2))
     assert angle == pytest.approx(1, abs=1e-6)
-    assert not np.allclose(motion, np.array(faulty(clean, "registration", 8).meta["registration"]))
+    assert not np.allclose(
+        motion, np.array(disturbed(clean, "registration", 8).meta["registration"])
+    )
 
 
 def test_noise_and_distortion_have_their_size():
     clean, _ = scene()
     z = clean.depth.depth_mm
     seen = np.isfinite(z)
-    noisy = faulty(clean, "noise", 0).depth.depth_mm
+    noisy = disturbed(clean, "noise", 0).depth.depth_mm
     assert np.array_equal(np.isfinite(noisy), seen)
     expected = 0.2 * (z[seen] / 150) ** 2
     assert np.std((noisy - z)[seen] / expected) == pytest.approx(1, abs=0.06)  # with 0.1 mm steps
-    slow = (faulty(clean, "distortion", 0).depth.depth_mm - z)[seen]
+    slow = (disturbed(clean, "distortion", 0).depth.depth_mm - z)[seen]
     assert 0.1 < np.abs(slow).max() <= 1.0001
-    rough = np.diff(faulty(clean, "distortion", 0).depth.depth_mm - z, axis=1)
+    rough = np.diff(disturbed(clean, "distortion", 0).depth.depth_mm - z, axis=1)
     assert np.nanmax(np.abs(rough)) < 0.03  # no step between neighbours
 
 
 def test_occlusion_and_outliers_are_as_in_the_views():
     clean, _ = scene()
     seen = np.isfinite(clean.depth.depth_mm)
-    hidden = np.isfinite(faulty(clean, "occlusion", 0).depth.depth_mm)
+    hidden = np.isfinite(disturbed(clean, "occlusion", 0).depth.depth_mm)
     assert (hidden <= seen).all()
     assert 0.02 < 1 - hidden.sum() / seen.sum() < 0.3
-    more = np.isfinite(faulty(clean, "outliers", 0).depth.depth_mm)
+    more = np.isfinite(disturbed(clean, "outliers", 0).depth.depth_mm)
     assert (more >= seen).all()
     assert 1 - seen.sum() / more.sum() == pytest.approx(0.03, abs=1e-4)
 
 
 def test_all_has_every_fault_and_faults_replay():
     clean, _ = scene()
-    alone = {fault: faulty(clean, fault, 5) for fault in FAULTS}
+    alone = {fault: disturbed(clean, fault, 5) for fault in FAULTS}
     together = alone["all"]
     assert together.meta["registration"] == alone["registration"].meta["registration"]
     assert np.array_equal(
@@ -364,7 +366,7 @@ def test_all_has_every_fault_and_faults_replay():
     steps = z[np.isfinite(z)] / 0.1
     assert np.abs(steps - np.rint(steps)).max() < 1e-2
     for fault in FAULTS:
-        again = faulty(clean, fault, 5)
+        again = disturbed(clean, fault, 5)
         assert np.array_equal(again.cloud.points_mm, alone[fault].cloud.points_mm)
     clouds = [s.cloud.points_mm for s in alone.values()]
     different = [not np.array_equal(clouds[0], c) for c in clouds]
@@ -374,10 +376,14 @@ def test_all_has_every_fault_and_faults_replay():
 def test_faults_want_a_clean_scene_and_a_known_name():
     clean, _ = scene()
     with pytest.raises(InputError, match=r"'none' is not known; allowed: clean, noise"):
-        faulty(clean, "none", 0)
-    for wrong in (scene("D0", "shaft")[0], faulty(clean, "noise", 0), replace(clean, depth=None)):
+        disturbed(clean, "none", 0)
+    for wrong in (
+        scene("D0", "shaft")[0],
+        disturbed(clean, "noise", 0),
+        replace(clean, depth=None),
+    ):
         with pytest.raises(InputError, match="clean scenes of the twin"):
-            faulty(wrong, "offset", 0)
+            disturbed(wrong, "offset", 0)
 
 
 # --- targets ---

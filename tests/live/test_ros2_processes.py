@@ -208,6 +208,7 @@ def publish_until(sink: Sink, other: Other, update: TrackingResult) -> dict[str,
         thread.join()
 
 
+@pytest.mark.slow
 def test_subscribers_that_hang_die_and_come_late_hold_up_nobody() -> None:
     """40,000 points at 30 Hz go on whatever subscribers do."""
     sink = SinkRos2(mesh_hz=10.0).open(small_setting())

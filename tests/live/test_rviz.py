@@ -76,6 +76,7 @@ def all_there(count: dict[str, int]) -> bool:
     return tumors > 4000 and count["kidney"] > 15_000 and count["kidney's points"] > 400
 
 
+@pytest.mark.slow
 def test_rviz_shows_the_tumors_through_the_kidney_and_nothing_without_an_estimate(tmp_path):
     """With TUMORTRACK_PICTURES=docs/images it also makes the picture in the documentation."""
     ros1_graph()
@@ -118,6 +119,7 @@ def seen_of_the_cell(screen: Screen) -> dict[str, np.ndarray]:
     }
 
 
+@pytest.mark.slow
 def test_rviz_shows_arms_at_work_and_nothing_of_them_when_nothing_is_known(tmp_path):
     ros1_graph()
     update = phantom_update(tmp_path)

@@ -410,6 +410,7 @@ def orange(picture: np.ndarray) -> int:
     return int(((r > 80) & (r > 1.4 * g) & (g > 2 * b)).sum())
 
 
+@pytest.mark.slow
 def test_page_in_a_browser(sinks, monkeypatch):
     # A feed that a loaded machine holds up for seconds isn't stale yet.
     monkeypatch.setattr("tumortrack.live.sinks.viewer._STALE_S", 5.0)

@@ -130,6 +130,7 @@ def test_nothing_jumps_between_frames():
     assert np.ptp(np.array(places)[:, :, 2], axis=0).min() > 1.5  # and all moves
 
 
+@pytest.mark.slow
 def test_depth_is_what_rays_find_of_organ_table_and_instrument():
     theatre = small_theatre(width=160, height=90, noise=CLEAN)
     for t_s in HELD_S:

@@ -92,6 +92,7 @@ def known(request) -> Learnt:
     return learnt(wide() if request.param == "wide" else quick_network(3, 50.0))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("numbers", possible(CPU))
 def test_fast_arithmetic_gives_the_labels_of_single_precision(numbers, known):
     inference = Inference(known.network, Arithmetic(numbers=numbers, chunk=1024))

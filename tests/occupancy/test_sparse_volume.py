@@ -59,6 +59,7 @@ def both(field, grid, start_mm=START_MM):
     return sparse, dense, few, field.asked, camera_from_index
 
 
+@pytest.mark.slow
 @given(st.integers(0, 10**6), st.sampled_from([93, 130]))
 @settings(max_examples=4, deadline=None, derandomize=True)
 def test_voxels_are_those_of_the_dense_volume(seed, grid):
@@ -69,6 +70,7 @@ def test_voxels_are_those_of_the_dense_volume(seed, grid):
     assert few < many / 2
 
 
+@pytest.mark.slow
 def test_at_the_paper_s_grid_most_questions_are_saved():
     (_, labels), (_, all_labels), few, many, _ = both(Field(3), 200)
     assert np.array_equal(labels, all_labels)

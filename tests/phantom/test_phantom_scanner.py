@@ -39,6 +39,7 @@ def scanned_labels(ct, labels):
     return at, deep
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("which", ["ct", "oblique"])
 def test_hu_and_noise_of_each_class(which, labels, request):
     volume = request.getfixturevalue(which)
@@ -188,6 +189,7 @@ def test_scanner_refuses_nothing_and_too_much(labels):
         scan(big, ScannerParameters(), 0)
 
 
+@pytest.mark.slow
 def test_a_patients_label_map_can_be_scanned(shared_data):
     import nibabel
 

@@ -294,6 +294,7 @@ def test_the_same_every_time(motions):
         assert np.array_equal(one.times_s, other.times_s)
 
 
+@pytest.mark.slow
 def test_a_cut_round_the_cup_is_made_from_several_sides(cell):
     ring = plan()
     above = ring.cuts[0].path_mm + [0.0, 0.0, 8.0 + ring.grasp_mm[2] - ring.cuts[0].height_mm]
@@ -387,6 +388,7 @@ def test_a_way_round_is_found_and_the_same_for_the_same_seed(cell):
             assert touch.collisions(joints) is None
 
 
+@pytest.mark.slow
 def test_places_for_the_bases_are_searched():
     shift = (0.0, 150.0, 0.0)
     far = Base(position_mm=(-900.0, -380.0, 150.0), yaw_deg=180.0)

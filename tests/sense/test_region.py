@@ -204,6 +204,7 @@ def test_stray_points_go():
     assert (found.taken == 0)[np.isfinite(frame.depth_mm)].mean() > 0.97
 
 
+@pytest.mark.slow
 def test_order_of_a_cloud_does_not_matter(kidneys):
     scene = make_scene(kidneys[1], TOOLS, np.random.default_rng(11))
     cloud = deproject(scene.frame)
@@ -280,6 +281,7 @@ def test_found_in_random_scenes(difficulty, kidneys):
     assert (precision > 0.85).mean() >= least_good
 
 
+@pytest.mark.slow
 def test_found_of_a_real_kidney_among_hands(real_kidney):
     precision, recall = measured([real_kidney], HANDS, range(6)).T
     assert precision.mean() > 0.94

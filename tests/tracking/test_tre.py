@@ -36,7 +36,7 @@ from tumortrack.simulate.scene_folder import (
     read_scene,
     read_targets,
 )
-from tumortrack_lab.twin.faults import faulty
+from tumortrack_lab.twin.faults import disturbed
 from tumortrack_lab.twin.views import ViewConfig
 
 
@@ -184,12 +184,12 @@ def test_a_registration_fault_moves_the_targets_with_the_truth():
     depth = DepthFrame(np.full((240, 424), 130.0, np.float32), camera)
     meta = {"view": "clean", "view_config": to_builtins(ViewConfig())}
     clean = replace(scene(), depth=depth, meta=meta)
-    moved = faulty(clean, "registration", 3)
+    moved = disturbed(clean, "registration", 3)
     camera_from_camera = np.array(moved.meta["registration"])
     expected = transform_points(camera_from_camera, clean.targets.points_mm)
     np.testing.assert_allclose(moved.targets.points_mm, expected, atol=1e-12)
     assert np.linalg.norm(moved.targets.points_mm - clean.targets.points_mm, axis=1).min() > 0.1
-    np.testing.assert_array_equal(faulty(clean, "noise", 3).targets.points_mm,
+    np.testing.assert_array_equal(disturbed(clean, "noise", 3).targets.points_mm,
                                   clean.targets.points_mm)  # fmt: skip
 
 

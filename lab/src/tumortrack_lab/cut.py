@@ -11,15 +11,16 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, Float64, Int, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 
 from tumortrack.core.errors import InputError
-from tumortrack.core.types import ORGAN, Anatomy, Mesh
+from tumortrack.core.types import ORGAN, Anatomy
 from tumortrack.imaging.raster import expand, label_grid
 from tumortrack.plan.values import Cut, CutLayer, ResectionPlan
 from tumortrack.report.metrics import distance_to_surface
 
 Flat = Float[np.ndarray, "_ 2"]
+Points = Float[np.ndarray, "_ 3"]
 Mask = Bool[np.ndarray, "i j"]
 Voxels = Bool[np.ndarray, "i j k"]
 
@@ -32,9 +33,6 @@ _SAME_MM = 1e-6  # of heights
 _BESIDE_MM = 0.5  # an outline this close to a stroke is cut: its chords leave it by less
 _TEARS_MM2 = 2.0  # a thinner bridge tears when the piece is lifted
 _ML = 1e-3  # of a mm3
-
-Points = Float[np.ndarray, "_ 3"]
-Box = Float64[np.ndarray, "2 3"]
 
 
 class Severed:
@@ -66,8 +64,12 @@ def within(rings: tuple[Flat, ...], shape: tuple[int, int]) -> Mask:
     repeated) by the even-odd rule."""
     counts = np.zeros((shape[0] + 1, shape[1]), int)
     for ring in rings:
-        counts += _crossings(np.concatenate([ring, ring[:1]]) + _ASIDE, shape)
+        counts += _crossings(_closed(ring) + _ASIDE, shape)
     return np.cumsum(counts, axis=0)[:-1] % 2 == 1
+
+
+def _closed(ring: Flat) -> Flat:
+    return np.concatenate([ring, ring[:1]])
 
 
 def _crossings(path: Flat, shape: tuple[int, int]) -> Int[np.ndarray, "i j"]:
@@ -86,8 +88,7 @@ def _crossings(path: Flat, shape: tuple[int, int]) -> Int[np.ndarray, "i j"]:
 
 
 def pieces_of(tissue: Voxels, severed: Severed) -> Int[np.ndarray, "i j k"]:
-    """Pieces connected over faces that are not severed: 1 is the largest, then 2, 3, ...; 0 where
-    there is no tissue."""
+    """Pieces connected over faces that are not severed: 1 is the largest; 0: no tissue."""
     from scipy.ndimage import label
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
@@ -112,16 +113,14 @@ def pieces_of(tissue: Voxels, severed: Severed) -> Int[np.ndarray, "i j k"]:
     _, whole = connected_components(graph, directed=False)
     of_voxel = whole[pieces]
     sizes = np.bincount(of_voxel[tissue], minlength=total)
-    rank = np.empty(total, int)
-    rank[np.argsort(-sizes, kind="stable")] = 1 + np.arange(total)
+    rank = np.argsort(np.argsort(-sizes, kind="stable")) + 1
     return np.where(tissue, rank[of_voxel], 0)
 
 
 def _ends(axis: int) -> tuple[tuple[slice, ...], tuple[slice, ...]]:
     """The voxels below and above each face along an axis."""
-    low, high = [slice(None)] * 3, [slice(None)] * 3
-    low[axis], high[axis] = slice(None, -1), slice(1, None)
-    return tuple(low), tuple(high)
+    before = (slice(None),) * axis
+    return (*before, slice(None, -1)), (*before, slice(1, None))
 
 
 @dataclass(frozen=True)
@@ -172,6 +171,11 @@ def cut(truth: Anatomy, plan: ResectionPlan, voxel_mm: float = VOXEL_MM) -> CutR
     surface = cutting.surface()
     found = cutting.at(surface)
     surface, found = surface[found > 0], found[found > 0]
+    deep, margin_mm = surface[found == ORGAN + number], None
+    if len(deep):
+        margin_mm = -float(distance_to_surface(deep, truth.parts[number]).max())
+    elif len(surface):
+        margin_mm = float(distance_to_surface(surface, truth.parts[number]).min())
     voxel_ml = voxel_mm**3 * _ML
     return CutResult(
         tumor_ml=float(tumor.sum()) * voxel_ml,
@@ -182,10 +186,10 @@ def cut(truth: Anatomy, plan: ResectionPlan, voxel_mm: float = VOXEL_MM) -> CutR
         piece_ml=float(piece.sum()) * voxel_ml,
         detached=largest > 1,
         bridge_mm2=bridge_mm2,
-        margin_mm=_margin_mm(surface, found == ORGAN + number, truth.parts[number]),
+        margin_mm=margin_mm,
         hurt=tuple(
-            name
-            for n, name in enumerate(truth.names[1:], start=1)
+            truth.names[n]
+            for n in range(1, len(truth.names))
             if n != number and (found == ORGAN + n).any()
         ),
     )
@@ -193,16 +197,15 @@ def cut(truth: Anatomy, plan: ResectionPlan, voxel_mm: float = VOXEL_MM) -> CutR
 
 class _Cutting:
     """A plan in the true anatomy, whose voxel (i, j, k) lies at low_mm + voxel_mm (i, j, k).
-
-    The lowest layer's bottom lies midway between two levels, so that half a voxel all over the
-    largest sheet is no bias of the volumes. ``walls``: each stroke along an outline, with the layer
-    whose wall it cuts; ``box_mm``: of the organ, beyond which nothing is looked at.
-    """
+    ``walls``: strokes along outlines, with the layer whose wall each cuts; ``box_mm``: of the
+    organ, beyond which nothing is looked at."""
 
     def __init__(self, truth: Anatomy, plan: ResectionPlan, voxel_mm: float) -> None:
         self.layers, self.box_mm, self.voxel_mm = plan.layers, truth.organ.box_mm, voxel_mm
         corners = np.concatenate([part.box_mm for part in truth.parts])
         self.low_mm = low_mm = corners.min(0) - voxel_mm
+        # The lowest layer's bottom lies midway between two levels, so that half a voxel all over
+        # the largest sheet is no bias of the volumes.
         bottom_mm = min(layer.bottom_mm for layer in plan.layers) + voxel_mm / 2
         low_mm[2] = bottom_mm - voxel_mm * np.ceil((bottom_mm - low_mm[2]) / voxel_mm)
         i, j, k = (np.ceil((corners.max(0) - low_mm) / voxel_mm) + 2).astype(int).tolist()
@@ -219,13 +222,13 @@ class _Cutting:
                 )
             self.walls.append((stroke, here[0]))
 
-    def rings(self, layer: CutLayer) -> tuple[Flat, ...]:
-        """A layer's rings in voxels."""
-        return tuple((ring - self.low_mm[:2]) / self.voxel_mm for ring in layer.rings_mm)
+    def flat(self, path_mm: np.ndarray) -> Flat:
+        """A line in voxels."""
+        return (path_mm[:, :2] - self.low_mm[:2]) / self.voxel_mm
 
     def columns(self, layer: CutLayer) -> Mask:
         """Which columns of voxels lie within a layer."""
-        return within(self.rings(layer), self.labels.shape[:2])
+        return within(tuple(map(self.flat, layer.rings_mm)), self.labels.shape[:2])
 
     def levels(self, layer: CutLayer) -> tuple[int, int]:
         """First level of a layer and first beyond it, by the voxels' centres."""
@@ -249,11 +252,10 @@ class _Cutting:
 
         near, severed = np.ones((3, 3), bool), Severed(self.labels.shape)
         for stroke, layer in self.walls:
-            path = (stroke.path_mm[:, :2] - self.low_mm[:2]) / self.voxel_mm
-            severed.wall(path, *self.levels(layer))
+            severed.wall(self.flat(stroke.path_mm), *self.levels(layer))
         for layer in self.layers:
-            for ring in self.rings(layer) if torn else ():
-                severed.wall(np.concatenate([ring, ring[:1]]), *self.levels(layer))
+            for ring in layer.rings_mm if torn else ():
+                severed.wall(self.flat(_closed(ring)), *self.levels(layer))
             sheet = binary_dilation(self.columns(layer), near)
             for lower in self._below(layer):
                 sheet &= ~binary_erosion(self.columns(lower), near)
@@ -261,7 +263,6 @@ class _Cutting:
         return severed
 
     def enclosed(self) -> Voxels:
-        """What lies within the layers."""
         inside = np.zeros(self.labels.shape, bool)
         for layer in self.layers:
             inside[:, :, slice(*self.levels(layer))] |= self.columns(layer)[:, :, None]
@@ -282,7 +283,7 @@ class _Cutting:
         for layer in self.layers:
             strokes = [_even(s.path_mm[:, :2]) for s, wall in self.walls if wall is layer]
             for ring in layer.rings_mm:
-                points = self._curtain(np.concatenate([ring, ring[:1]]), layer)
+                points = self._curtain(_closed(ring), layer)
                 points = points[self.at(points) > 0]
                 if strokes and len(points):
                     beside = cKDTree(np.concatenate(strokes)).query(points[:, :2])[0]
@@ -325,15 +326,6 @@ def _even(path: Flat) -> Flat:
     way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
     at = np.append(np.arange(0, way[-1], SAMPLES_MM), way[-1])
     return np.column_stack([np.interp(at, way, axis) for axis in path.T])
-
-
-def _margin_mm(surface: Points, inside: Bool[np.ndarray, " n"], tumor: Mesh) -> float | None:
-    """Signed distance of the nearest, or else the deepest, of the cut's points."""
-    if not len(surface):
-        return None
-    if inside.any():
-        return -float(distance_to_surface(surface[inside], tumor).max())
-    return float(distance_to_surface(surface, tumor).min())
 
 
 def _share(of: Voxels, whole: Voxels) -> float:

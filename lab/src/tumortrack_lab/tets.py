@@ -50,12 +50,10 @@ def tet_volumes(
 
 
 def tetrahedralise(surface: Mesh, edge_mm: float, envelope: float = 2e-3) -> TetMesh:
-    """Fill a closed surface with tetrahedra (Hu et al. 2020, doi 10.1145/3386569.3392385).
-
-    The mesh's own surface keeps within ``envelope`` times the diagonal (0.002: about 0.3 mm on a
-    kidney) of the given one. fTetWild is not reproducible even on one thread: keep the mesh where
-    results must be. Raises InputError: nothing could be filled (an open or inverted surface).
-    """
+    """Fill a closed surface, which the mesh's own leaves by up to ``envelope`` times its diagonal
+    (0.002: about 0.3 mm on a kidney); Hu et al. 2020, doi 10.1145/3386569.3392385. fTetWild is not
+    reproducible even on one thread: keep the mesh where results must be. Raises InputError: nothing
+    could be filled (an open or inverted surface)."""
     import pytetwild
 
     # fTetWild leaves a file of its own in the working folder.
@@ -81,8 +79,7 @@ def factorised(matrix: spmatrix) -> Callable[[np.ndarray], np.ndarray]:
     from scipy.sparse.linalg import splu
 
     options = {"SymmetricMode": True}
-    factors = splu(matrix.tocsc(), "MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options)
-    return factors.solve
+    return splu(matrix.tocsc(), "MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options).solve
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,7 +90,6 @@ class Embedding:
     weights: Float64[np.ndarray, "m 4"]
 
     def carry(self, nodes_mm: Float[np.ndarray, "n 3"]) -> Float64[np.ndarray, "m 3"]:
-        """The points where the nodes lie now."""
         return np.einsum("mi,mij->mj", self.weights, nodes_mm[self.nodes])
 
 

@@ -5,15 +5,12 @@ from __future__ import annotations
 import subprocess
 import sys
 import tempfile
-import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import NamedTuple
 
 from tumortrack.core.errors import TumortrackError
 from tumortrack.sense.ply import write_cloud_ply
-from tumortrack_lab.bench.machine import status_bytes
 from tumortrack_lab.bench.rows import (
     BEFORE_TORCH,
     COMMAND,
@@ -27,30 +24,27 @@ from tumortrack_lab.bench.subject import BenchSubject
 
 _GRIDS = {COMMAND: 160, LARGE: 400}
 _FEWEST = 3
-# Runs the command line and notes when torch is first asked for. Written out, so that nothing of
-# ours is imported before the command line is.
+# Runs the command line; notes when torch is first asked for, and the process's peak memory (what
+# the system tells of ended children counts the memory of the parent that they were born of).
+# Written out, so that nothing of ours is imported before the command line is.
 _PROBE = """
-import importlib.abc, sys, time
-report = sys.argv.pop()
+import importlib.abc, os, sys, time
+report, leave = open(sys.argv.pop(), "w"), os._exit
 class Watch(importlib.abc.MetaPathFinder):
     def find_spec(self, name, path=None, target=None):
         if name == "torch":
             sys.meta_path.remove(self)
-            with open(report, "w") as out:
-                out.write(str(time.monotonic()))
+            print("torch", time.monotonic(), file=report, flush=True)
+def tell_and_leave(code):
+    if os.path.exists("/proc/self/status"):
+        print(*(line for line in open("/proc/self/status") if "VmHWM" in line), file=report)
+    report.close()
+    leave(code)
 sys.meta_path.insert(0, Watch())
+os._exit = tell_and_leave  # which is how `locate` ends
 from tumortrack.cli.main import main
 main()
 """
-_LOOK_EVERY_S = 0.02  # at the process's peak memory
-
-
-class CommandRun(NamedTuple):
-    """One run of the command: seconds in all and before torch was imported, peak memory."""
-
-    seconds: float
-    before_torch_s: float
-    peak_bytes: int
 
 
 def workloads(subject: BenchSubject, budget_s: float) -> Iterator[Workload]:
@@ -67,7 +61,7 @@ def workloads(subject: BenchSubject, budget_s: float) -> Iterator[Workload]:
 
 
 def _workload(name: str, preset: str, arguments: list[str], budget_s: float) -> Workload:
-    runs: list[CommandRun] = []
+    runs: list[tuple[float, float, int]] = []
     begun = time.perf_counter()
     while len(runs) < _FEWEST or (
         (time.perf_counter() - begun) * (len(runs) + 1) / len(runs) < budget_s
@@ -82,34 +76,21 @@ def _workload(name: str, preset: str, arguments: list[str], budget_s: float) -> 
     return Workload(name, preset, "run", timing_of([*seconds]), facts=lambda: facts)
 
 
-def run_command(arguments: list[str]) -> CommandRun:
-    """Run `tumortrack` with these arguments in a process of its own. Raises TumortrackError: the
-    command failed, the message says its last words."""
+def run_command(arguments: list[str]) -> tuple[float, float, int]:
+    """Run `tumortrack` with these arguments in a process of its own: seconds in all and before
+    torch was imported, peak memory in bytes (0: the system does not say). Raises TumortrackError:
+    the command failed, the message says its last words."""
     with tempfile.TemporaryDirectory() as folder:
         report = Path(folder) / "imported.txt"
-        command = [sys.executable, "-c", _PROBE, *arguments, str(report)]
-        start, held = time.monotonic(), [0]
-        process = subprocess.Popen(
-            command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
-        )
-        looker = threading.Thread(target=_look, args=(process, held))
-        looker.start()
-        output = process.communicate()[0]
+        start = time.monotonic()
+        done = subprocess.run(
+            [sys.executable, "-c", _PROBE, *arguments, str(report)],
+            stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, check=False,
+        )  # fmt: skip
         seconds = time.monotonic() - start
-        looker.join()
-        if process.returncode != 0:
-            words = output.strip().splitlines()[-1:] or ["nothing was said"]
+        if done.returncode != 0:
+            words = done.stdout.strip().splitlines()[-1:] or ["nothing was said"]
             raise TumortrackError(f"`tumortrack {' '.join(arguments)}` failed: {words[0]}")
-        before = float(report.read_text()) - start if report.exists() else seconds
-    return CommandRun(seconds, before, held[0])
-
-
-def _look(process: subprocess.Popen[str], held: list[int]) -> None:
-    """Note a process's peak memory until its end. What the system tells of ended children
-    (``ru_maxrss``) counts the memory of the parent that they were born of."""
-    while process.poll() is None:
-        try:
-            held[0] = max(held[0], status_bytes("VmHWM", process.pid))
-        except OSError:  # ended meanwhile, or no Linux
-            return
-        time.sleep(_LOOK_EVERY_S)
+        found = dict(line.split()[:2] for line in report.read_text().splitlines() if line)
+    before_s = float(found["torch"]) - start if "torch" in found else seconds
+    return seconds, before_s, 1024 * int(found.get("VmHWM:", 0))

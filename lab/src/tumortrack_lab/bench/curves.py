@@ -16,8 +16,8 @@ from tumortrack.occupancy.inference import Inference
 from tumortrack.occupancy.network import OccupancyNetwork
 from tumortrack.simulate.occupancy import OccupancyPool, contains
 from tumortrack.simulate.scene import SceneConfig, SceneRecipe, Simulator
-from tumortrack_lab.bench.forms import CountedQueries
 from tumortrack_lab.bench.machine import forget_peak, peak_bytes
+from tumortrack_lab.bench.occupancy import CountedQueries, OccupancyForms
 from tumortrack_lab.bench.rows import Call, Point, interleaved
 from tumortrack_lab.bench.subject import SEED, UP, BenchSubject
 from tumortrack_lab.bench.training import training_state
@@ -58,26 +58,21 @@ def _points(subject: BenchSubject, preset: str) -> Calls:
 def _tumors(subject: BenchSubject, _: str) -> Calls:
     """An organ with so many tumors: a training pair, a labelled volume, labels of queries by an
     untrained network of so many classes (which takes as long as a trained one)."""
-    forms = subject.occupancy("quick")
-    queries = forms.queries(40_000)
+    forms, config, recipe = subject.forms("quick"), SceneConfig(), SceneRecipe(SEED, "train", 0)
+    assert isinstance(forms, OccupancyForms)
     for size in _TUMORS:
-        anatomy, config = with_tumors(subject.anatomy, size), SceneConfig()
+        anatomy = _with_tumors(subject.anatomy, size)
         pool = OccupancyPool(anatomy, config.occupancy, SEED)
-        recipe = SceneRecipe(SEED, "train", 0)
         yield "training pair", size, partial(Simulator(anatomy, UP, config).pair, recipe, pool)
         grid = grid_over(anatomy.organ.vertices_mm, _TUMOR_GRID)
         yield f"clinic, {_TUMOR_GRID}^3 labels", size, partial(label_grid, anatomy, *grid)
         torch.manual_seed(SEED)
         network = OccupancyNetwork(subject.presets["quick"](anatomy).network)
         logits = CountedQueries(Inference(network.eval()), forms.points_mm)
-        yield "quick, 40,000 queries", size, partial(_labels, logits, queries)
+        yield "quick, 40,000 queries", size, partial(logits.labels, forms.queries(40_000))
 
 
-def _labels(logits: CountedQueries, queries: np.ndarray) -> None:
-    logits(queries).argmax(-1)
-
-
-def with_tumors(anatomy: Anatomy, count: int) -> Anatomy:
+def _with_tumors(anatomy: Anatomy, count: int) -> Anatomy:
     """The organ with so many tumors: its first one, made smaller, at places inside."""
     organ, tumor = anatomy.organ, anatomy.tumors[0]
     lower, upper = organ.box_mm
@@ -91,10 +86,9 @@ def _batches(subject: BenchSubject, preset: str) -> Calls:
     """One training step of so many samples."""
     keep_freed_memory()
     for size in _BATCHES:
-        if preset == "paper" and size > _MOST_PAPER:
-            return
-        state, batches = training_state(subject, preset, size, batches=1)
-        yield preset, size, partial(state.step, batches[0])
+        if preset != "paper" or size <= _MOST_PAPER:
+            state, (batch,) = training_state(subject, preset, size, batches=1)
+            yield preset, size, partial(state.step, batch)
 
 
 _CURVES = {

@@ -7,6 +7,7 @@ import gc
 import os
 import platform
 from collections.abc import Callable
+from contextlib import suppress
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
@@ -58,21 +59,23 @@ def cpu_name() -> str:
 def _cpu_info() -> dict[str, str]:
     """Of the first core, as Linux tells it."""
     text = _CPU_INFO.read_text(encoding="utf-8") if _CPU_INFO.exists() else ""
-    first = [line.partition(":") for line in text.partition("\n\n")[0].splitlines()]
-    return {key.strip(): value.strip() for key, _, value in first}
+    return _fields(text.partition("\n\n")[0])
+
+
+def _fields(text: str) -> dict[str, str]:
+    lines = (line.partition(":") for line in text.splitlines())
+    return {key.strip(): value.strip() for key, _, value in lines}
 
 
 def _caches() -> str:
     """Level and size of the first core's caches, as Linux tells them."""
-    found = []
-    for folder in sorted(Path("/sys/devices/system/cpu/cpu0/cache").glob("index*")):
-        level, kind, size = (
-            (folder / name).read_text(encoding="utf-8").strip()
-            for name in ("level", "type", "size")
-        )
-        if kind != "Instruction":
-            found.append(f"L{level} {size}")
-    return ", ".join(found) or "not known"
+    folders = sorted(Path("/sys/devices/system/cpu/cpu0/cache").glob("index*"))
+    found = [
+        [(folder / name).read_text(encoding="utf-8").strip() for name in ("level", "type", "size")]
+        for folder in folders
+    ]
+    data = ", ".join(f"L{level} {size}" for level, kind, size in found if kind != "Instruction")
+    return data or "not known"
 
 
 def measure_peaks(threads: int, budget_s: float) -> Peaks:
@@ -105,11 +108,9 @@ def _products() -> dict[str, Callable[[], object]]:
     }
     offered = {}
     for name, call in calls.items():
-        try:
+        with suppress(RuntimeError):  # not made for this processor
             call()
-        except RuntimeError:  # not made for this processor
-            continue
-        offered[name] = call
+            offered[name] = call
     return offered
 
 
@@ -119,25 +120,20 @@ def forget_peak() -> int | None:
     gc.collect()
     if not _CLEAR.exists():
         return None
-    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
-    if trim is not None:
+    if trim := getattr(ctypes.CDLL(None), "malloc_trim", None):
         trim(0)
     try:
         _CLEAR.write_text(_RESET_PEAK, encoding="ascii")
     except PermissionError:  # a container may forbid it
         return None
-    return status_bytes("VmRSS")
+    return _status_bytes("VmRSS")
 
 
 def peak_bytes() -> int:
-    """The most that was resident since ``forget_peak``. Raises OSError: the system does not say."""
-    return status_bytes("VmHWM")
+    """The most that was resident since ``forget_peak``."""
+    return _status_bytes("VmHWM")
 
 
-def status_bytes(name: str, process: int | str = "self") -> int:
-    """What Linux tells of a process's memory. Raises OSError: no such process, or no Linux."""
-    status = Path(f"/proc/{process}/status")
-    for line in status.read_text(encoding="ascii").splitlines():
-        if line.startswith(name + ":"):
-            return int(line.split()[1]) * 1024
-    raise OSError(f"{status} does not tell {name}.")
+def _status_bytes(name: str) -> int:
+    found = _fields(Path("/proc/self/status").read_text(encoding="ascii"))
+    return int(found[name].split()[0]) * 1024

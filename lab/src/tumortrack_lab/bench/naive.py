@@ -2,9 +2,9 @@
 
 The occupancy network as PointNet++ and occupancy networks are usually written: single precision;
 farthest points by a Python loop, neighbours by sorting a whole matrix, batch norms apart, the
-latent joined to every query, everything in one piece. It reads a network's weights and
-configuration and nothing else of it, so that it is also an independent reference. Source: the forms
-of github.com/yanx27/Pointnet_Pointnet2_pytorch and of Mescheder et al., CVPR 2019.
+latent joined to every query, everything in one piece. Of a network it takes single layers and the
+configuration and nothing else, so that it is also an independent reference. Source: the forms of
+github.com/yanx27/Pointnet_Pointnet2_pytorch and of Mescheder et al., CVPR 2019.
 
 A training pair: NumPy, a ray for each pixel, inside tests. A registration frame by the same method
 as ours, with nearest vertices by a tree and SciPy: the placements both ways round, each fitted to
@@ -14,7 +14,7 @@ the end, the better one kept, every query tested against the surfaces.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -37,7 +37,7 @@ from tumortrack.models.normalisation import (
     turned,
     without_strays,
 )
-from tumortrack.occupancy.network import OccupancyNetwork, octave_features
+from tumortrack.occupancy.network import Latent, OccupancyNetwork, octave_features
 from tumortrack.registration.model import RegistrationModel
 from tumortrack.simulate.deform.drag import Drags
 from tumortrack.simulate.deform.elastic import ElasticDeformation
@@ -49,30 +49,18 @@ FLOW_STEPS = 12
 _Fit = tuple[float, np.ndarray, np.ndarray, np.ndarray]  # cost, rotation, centre, coefficients
 
 
-@dataclass(frozen=True, eq=False)
-class Encoded:
-    """Latents (B, L), and what their queries are normalised by."""
-
-    latent: Tensor
-    centre_mm: Tensor
-    scale_mm: Tensor
-    turn: Tensor | None
-
-
 class NaiveOccupancy:
-    """``encode`` clouds, ``logits`` of queries. ``training``: norms take the batch's statistics."""
+    """``encode`` clouds, ``logits`` of queries, in the mode that the network is in."""
 
-    def __init__(self, network: OccupancyNetwork, training: bool = False) -> None:
+    def __init__(self, network: OccupancyNetwork) -> None:
         encoder, decoder = network.config.encoder, network.config.decoder
         assert isinstance(encoder, PointNet2Config)
         assert isinstance(decoder, MlpDecoderConfig)
-        self._encoder, self._decoder = encoder, decoder
-        self._normalisation, self._training = network.config.normalisation, training
-        self._weights = {**dict(network.named_buffers()), **dict(network.named_parameters())}
+        self._encoder, self._decoder, self._network = encoder, decoder, network
 
-    def encode(self, points_mm: Tensor) -> Encoded:
+    def encode(self, points_mm: Tensor) -> Latent:
         """Clouds (B, N, 3), mm."""
-        kind = self._normalisation
+        kind = self._network.config.normalisation
         if not isinstance(kind, CloudBox):
             points_mm = without_strays(points_mm, kind.reach * kind.scale_mm)
         centre, scale = normalisation(points_mm, kind)
@@ -80,14 +68,19 @@ class NaiveOccupancy:
         if isinstance(kind, Aligned):
             turn = alignment(points)
             points = turned(points, turn)
-        return Encoded(self._latent(points), centre, scale, turn)
+        return Latent(self._latent(points), centre, scale, turn, ())
 
-    def logits(self, encoded: Encoded, queries_mm: Tensor) -> Tensor:
-        """Queries (B, Q, 3), mm -> (B, Q, classes)."""
-        queries = (queries_mm - encoded.centre_mm) / encoded.scale_mm
-        if encoded.turn is not None:
-            queries = turned(queries, encoded.turn)
-        return self._decoded(encoded.latent, queries)
+    def logits(self, encoded: Latent, queries_mm: Tensor) -> Tensor:
+        """Queries (B, Q, 3), mm -> (B, Q, classes), the latent beside each."""
+        config, latent = self._decoder, encoded.vector
+        given = octave_features(encoded.normalised(queries_mm), config.octaves)
+        given = torch.cat([given, latent[:, None].expand(-1, given.shape[1], -1)], -1)
+        hidden = given
+        for number in range(1, config.hidden_layers + 1):
+            if number == config.skip_layer and number > 1:
+                hidden = torch.cat([hidden, given], -1)
+            hidden = self._layer(f"decoder.layers.{number - 1}", hidden)
+        return self._network.decoder.output(hidden)
 
     def _latent(self, points: Tensor) -> Tensor:
         config = self._encoder
@@ -113,34 +106,10 @@ class NaiveOccupancy:
             out = self._layer(f"encoder.summary.{layer}", out)
         return out.max(1).values
 
-    def _decoded(self, latent: Tensor, queries: Tensor) -> Tensor:
-        """The latent beside each normalised query."""
-        config = self._decoder
-        given = octave_features(queries, config.octaves)
-        given = torch.cat([given, latent[:, None].expand(-1, given.shape[1], -1)], -1)
-        hidden = given
-        for number in range(1, config.hidden_layers + 1):
-            if number == config.skip_layer and number > 1:
-                hidden = torch.cat([hidden, given], -1)
-            hidden = self._layer(f"decoder.layers.{number - 1}", hidden)
-        return functional.linear(
-            hidden, self._weights["decoder.output.weight"], self._weights["decoder.output.bias"]
-        )
-
     def _layer(self, name: str, x: Tensor) -> Tensor:
         """Linear, batch norm where there is one, ReLU."""
-        weights = self._weights
-        out = functional.linear(x, weights[f"{name}.linear.weight"], weights[f"{name}.linear.bias"])
-        if f"{name}.norm.weight" in weights:
-            mean, variance, gain, shift = (
-                weights[f"{name}.norm.{key}"]
-                for key in ("running_mean", "running_var", "weight", "bias")
-            )
-            flat = functional.batch_norm(
-                out.flatten(0, -2), mean, variance, gain, shift, training=self._training
-            )
-            out = flat.view(out.shape)
-        return functional.relu(out)
+        layer: Any = self._network.get_submodule(name)
+        return functional.relu(layer.normalise(layer.linear(x)))
 
 
 def farthest_points(points: Tensor, k: int) -> Tensor:
@@ -193,23 +162,18 @@ def plain_pair(anatomy_ct: Anatomy, stage: RenderedScene, labels: int) -> np.nda
 
 
 def _carried(stage: RenderedScene, points_ct: np.ndarray) -> np.ndarray:
-    deformation = stage.deformation
-    if isinstance(deformation, Drags):
-        moved = _dragged(deformation, points_ct)
-    else:
-        assert isinstance(deformation, ElasticDeformation)
+    deformation, moved = stage.deformation, points_ct.copy()
+    if isinstance(deformation, ElasticDeformation):
         moved = flowed(deformation.body, deformation.coefficients, points_ct)
+    else:
+        assert isinstance(deformation, Drags)
+        drags = zip(
+            deformation.centres_ct, deformation.shifts_mm, deformation.sigmas_mm, strict=True
+        )
+        for centre, shift, sigma in drags:
+            square = ((moved - centre) ** 2).sum(1)
+            moved += np.exp(-0.5 * square / sigma**2)[:, None] * shift
     return transform_points(stage.camera_from_ct, moved)
-
-
-def _dragged(drags: Drags, points_ct: np.ndarray) -> np.ndarray:
-    moved = points_ct.copy()
-    for centre, shift, sigma in zip(
-        drags.centres_ct, drags.shifts_mm, drags.sigmas_mm, strict=True
-    ):
-        square = ((moved - centre) ** 2).sum(1)
-        moved += np.exp(-0.5 * square / sigma**2)[:, None] * shift
-    return moved
 
 
 def flowed(body: ElasticBody, coefficients: np.ndarray, points: np.ndarray) -> np.ndarray:
@@ -249,17 +213,14 @@ class NaiveRegistration:
             found = self._network.flip_hypotheses(torch.tensor(points_mm)[None])
         parts = (found.rotation, found.centre_mm, found.coefficients)
         starts = zip(*(part.double().numpy() for part in parts), strict=True)
-        best = min((self._refined(points_mm, *start) for start in starts), key=lambda fit: fit[0])
-        return self._labelled(best, queries_mm)
+        fits = (self._refined(points_mm, *start) for start in starts)
+        _, rotation, centre, coefficients = min(fits, key=lambda fit: fit[0])
+        moved = (queries_mm - centre) @ rotation + self.body.center_ct
+        return self.labels_where(flowed(self.body, -coefficients, moved))
 
     def labels_where(self, motion_back: np.ndarray) -> np.ndarray:
         """Of places in the CT (n, 3): inside tests on its surfaces."""
         return labels_of(self._anatomy, motion_back.astype(np.float32))
-
-    def _labelled(self, fit: _Fit, queries_mm: np.ndarray) -> np.ndarray:
-        _, rotation, centre, coefficients = fit
-        moved = (queries_mm - centre) @ rotation + self.body.center_ct
-        return self.labels_where(flowed(self.body, -coefficients, moved))
 
     def _refined(
         self, points: np.ndarray, rotation: np.ndarray, centre: np.ndarray, state: np.ndarray

@@ -86,16 +86,16 @@ def on_its_stand(anatomy_ct: Anatomy) -> Located:
     turn = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])  # LPS, its front up
     organ = anatomy_ct.organ.vertices_mm @ turn.T
     x, y, _ = -(organ.min(0) + organ.max(0)) / 2
-    table_from_ct = rigid(turn, np.array([x, y, STAND_MM - organ[:, 2].min()]))
-    placed = moved(anatomy_ct, table_from_ct)
-    meshes = dict(zip(placed.names, placed.parts, strict=True))
-    low = meshes["kidney"].box_mm[0] - 2
+    placed = moved(anatomy_ct, rigid(turn, np.array([x, y, STAND_MM - organ[:, 2].min()])))
+    low = placed.organ.box_mm[0] - 2
     table_from_index = np.eye(4)
     table_from_index[:3, 3] = low
-    i, j, k = (int(n) for n in np.ceil(np.ptp(meshes["kidney"].box_mm, axis=0) + 4))
+    i, j, k = (int(n) for n in np.ceil(np.ptp(placed.organ.box_mm, axis=0) + 4))
     grid = label_grid(placed, table_from_index, (i, j, k))
     rng = np.random.default_rng(0)
     cells = np.argwhere(grid > 0)
     chosen = cells[rng.integers(len(cells), size=_POINTS)]
     points = chosen + rng.uniform(-0.5, 0.5, chosen.shape) + low
-    return Located(points, grid[tuple(chosen.T)], meshes)
+    return Located(
+        points, grid[tuple(chosen.T)], dict(zip(placed.names, placed.parts, strict=True))
+    )

@@ -61,7 +61,10 @@ def interleaved(*versions: Call, budget_s: float, fewest: int = _FEWEST) -> list
     call that took more than a second counts as a turn: a median of three bears a cold one. Where
     time is up, those that have had the fewest turns leave the last to the others."""
     begun = time.perf_counter()
-    warmed = [_warm(version) for version in versions]
+    warmed = []
+    for version in versions:
+        first = _turn(version, 1)
+        warmed.append(first if first[0] > _LONG_S else _turn(version, 1))
     repeats = [max(1, math.ceil(_LEAST_S / max(took_s, 1e-7))) for took_s, _ in warmed]
     seconds = [[counted_s] if took_s > _LONGER_S else [] for took_s, counted_s in warmed]
     for done in range(_MOST):
@@ -86,17 +89,10 @@ def _turn(version: Call, repeat: int) -> tuple[float, float]:
 
 
 def timing_of(seconds: list[float]) -> InterleavedTiming:
-    """Median and quartiles of the turns' seconds."""
-    low, middle, high = (float(np.quantile(seconds, q)) for q in (0.25, 0.5, 0.75))
+    low, middle, high = np.quantile(seconds, (0.25, 0.5, 0.75)).tolist()
     return InterleavedTiming(
         best_s=min(seconds), median_s=middle, low_s=low, high_s=high, turns=len(seconds)
     )
-
-
-def _warm(version: Call) -> tuple[float, float]:
-    """Of the last call of those that warm it up."""
-    first = _turn(version, 1)
-    return first if first[0] > _LONG_S else _turn(version, 1)
 
 
 class Work(Config, frozen=True):
@@ -167,10 +163,10 @@ class Workload:
         calls = [call for call in (*(f.ours for f in forms), self.naive) if callable(call)]
         seconds = interleaved(*calls, budget_s=budget_s)
         timed: dict[object, Any] = dict(zip(calls, seconds, strict=True))
-        self.naive = timed.get(self.naive, self.naive)
+        self.naive = known = timed.get(self.naive, self.naive)
+        naive = None if known is None else known.times(self.naive_share)
         for form in forms:
             ours = timed.get(form.ours, form.ours).times(1 / form.calls)
-            naive = self.naive and self.naive.times(self.naive_share)
             yield BenchRow(
                 name=form.name, what=form.what, threads=threads, item=form.item, ours=ours,
                 naive=naive, naive_is=self.naive_is, **form.facts(),
@@ -185,14 +181,11 @@ class Peaks(Config, frozen=True):
     gemm: dict[str, float]
     triad: float
 
-    def floor_s(self, work: Work) -> float:
-        """The least time: arithmetic at the measured rate or bytes at the measured bandwidth,
-        whichever takes longer."""
-        return max(work.flops / self.rate(work.precision), work.bytes / self.triad)
-
-    def rate(self, precision: Precision) -> float:
-        """FLOP/s of matrix products; single precision's where the other is not offered."""
-        return self.gemm.get(precision, self.gemm["fp32"])
+    def least_s(self, work: Work) -> tuple[float, float]:
+        """The arithmetic at the measured rate (single precision's where the other is not offered)
+        and the bytes at the measured bandwidth; whichever takes longer is the floor."""
+        rate = self.gemm.get(work.precision, self.gemm["fp32"])
+        return work.flops / rate, work.bytes / self.triad
 
 
 class Point(Config, frozen=True):

@@ -12,15 +12,14 @@ from __future__ import annotations
 import hashlib
 import math
 import shutil
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from functools import cache, cached_property
+from functools import cache, cached_property, partial
 from pathlib import Path
 
 import numpy as np
 import torch
 from msgspec.structs import replace
-from torch import Tensor
 from torch.nn.functional import cross_entropy
 
 from tumortrack.core.errors import ArtifactError, InputError
@@ -43,8 +42,9 @@ from tumortrack.simulate.scene import RenderedScene, SceneConfig, SceneRecipe, S
 from tumortrack.training.model import load_model, save_model
 from tumortrack.training.state import TrainingRun
 from tumortrack.training.train import TrainingStatus, train
-from tumortrack_lab.bench.forms import OccupancyForms, RegistrationForms
-from tumortrack_lab.bench.rows import PRESETS
+from tumortrack_lab.bench.occupancy import OccupancyForms
+from tumortrack_lab.bench.registration import RegistrationForms
+from tumortrack_lab.bench.rows import PRESETS, Workload
 
 _PER_SIDE = 600  # points in and outside of each part in a step
 _RATE = 1.5e-3
@@ -56,75 +56,6 @@ LABELLING = ("quick", "paper")  # the presets that label points
 _STEPS = {"clinic": 240, "quick": 500, "paper": 300}  # about a minute on two cores each
 _VALIDATED = 16  # scenes
 _VOXEL_MM = 1.5  # of the phantom
-
-
-def overfit_scene(
-    anatomy: Anatomy,
-    seen: tuple[RenderedScene, SensorCloud],
-    config: TrainConfig,
-    folder: Path,
-    steps: int,
-) -> None:
-    """Write a model folder whose network labels points of one scene, seen as this cloud."""
-    scene, cloud = seen
-    pool = OccupancyPool(anatomy, OccupancyConfig(per_side=_PER_SIDE), 0)
-    rng = np.random.default_rng(0)
-    torch.manual_seed(0)
-    network = OccupancyNetwork(config.network)
-    points = torch.tensor(cloud.points_mm)[None]
-    fixed = _settled(network, points)
-    optimizer = torch.optim.Adam(network.decoder.parameters(), _RATE)
-    decay = torch.optim.lr_scheduler.LambdaLR(
-        optimizer, lambda step: 0.5 * (1 + math.cos(math.pi * step / steps))
-    )
-    with torch.no_grad():
-        latent = network.encode(points)
-    fast = has_fast_bfloat16(torch.device("cpu"))
-    network.decoder.train()
-    for _ in range(steps):
-        points_ct, labels = pool.draw(rng)
-        places = torch.from_numpy(scene.carry(points_ct).astype(np.float32))[None]
-        queries = (places - latent.centre_mm) / latent.scale_mm
-        with torch.autocast("cpu", torch.bfloat16, enabled=fast):
-            logits = network.decoder(network.decoder.prepare(latent.vector), queries)
-        loss = cross_entropy(logits[0].float(), torch.from_numpy(labels).long())
-        optimizer.zero_grad()
-        loss.backward()
-        for weight in fixed:
-            assert weight.grad is not None
-            weight.grad[:, -latent.vector.shape[1] :] = 0.0
-        optimizer.step()
-        decay.step()
-    every = InDistributionRange(spread_mm=(0.0, 1e3), fit_mm=1e3)  # nothing is refused
-    about = {"steps": steps, "loss": round(float(loss.detach()), 4), "scenes": 1}
-    folder.mkdir(parents=True, exist_ok=True)
-    organ = scene.carry(anatomy.organ.vertices_mm) - np.median(cloud.points_mm, axis=0)
-    box = np.array([organ.min(0), organ.max(0)], float)
-    model = OccupancyModel(
-        network=network.eval(), config=config, parts=anatomy.names, query_box_mm=box,
-        in_distribution=every, provenance=about,
-    )  # fmt: skip
-    save_model(model, folder)
-
-
-def _settled(network: OccupancyNetwork, cloud: Tensor) -> list[Tensor]:
-    """Statistics of the encoder's norms from the cloud, small weights on the latent; returns the
-    decoder's weights that hold them."""
-    latent = network.config.encoder.latent_size
-    weights: list[Tensor] = [
-        weight
-        for name, weight in network.decoder.named_parameters()
-        # With columns for the latent: no other is so wide.
-        if name.endswith("weight") and weight.dim() == 2 and weight.shape[1] > latent
-    ]
-    with torch.no_grad():
-        network.encoder.train()
-        for _ in range(_SETTLED):
-            network.encode(cloud)
-        for weight in weights:
-            weight[:, -latent:] *= _LATENT_SHARE
-    network.encoder.eval()
-    return weights
 
 
 @dataclass(eq=False)
@@ -155,14 +86,15 @@ class BenchSubject:
         return Simulator(self.anatomy, UP, config).render(SceneRecipe(SEED, "test", 0))
 
     def model(self, preset: str) -> Model:
-        """The trained model of a preset, on the CPU."""
+        """The trained or given model of a preset, on the CPU. Raises ArtifactError: there is no
+        whole model of this version."""
         return _loaded(self.model_folder(preset))
 
     def cloud(self, preset: str) -> SensorCloud:
         """1,000 points that the preset's model is asked about: of the given cloud, or of a view of
         ``scene``."""
-        theirs = self.given is not None and preset == self._given_preset
-        seen = read_cloud(self.given[1])[0] if self.given and theirs else self.scene.cloud
+        given = self.given is not None and preset == self._given_preset
+        seen = read_cloud(self.given[1])[0] if self.given and given else self.scene.cloud
         return thin_cloud(seen, 1000, np.random.default_rng(SEED))
 
     @cache  # noqa: B019 (a subject lives as long as its process)
@@ -172,21 +104,9 @@ class BenchSubject:
         if isinstance(model, RegistrationModel):
             return RegistrationForms(model, cloud)
         assert isinstance(model, OccupancyModel)
-        return OccupancyForms(model, cloud.points_mm)
-
-    def occupancy(self, preset: str) -> OccupancyForms:
-        forms = self.forms(preset)
-        assert isinstance(forms, OccupancyForms)
-        return forms
-
-    @property
-    def registration(self) -> RegistrationForms:
-        forms = self.forms("clinic")
-        assert isinstance(forms, RegistrationForms)
-        return forms
+        return OccupancyForms(preset, model, cloud.points_mm)
 
     def model_folder(self, preset: str) -> Path:
-        """Of the trained or given model of a preset."""
         if self.given is not None and preset == self._given_preset:
             return self.given[0]
         return self.folder / preset
@@ -218,8 +138,7 @@ class BenchSubject:
         folder, config = self.model_folder(preset), self.presets[preset](self.anatomy)
         shutil.rmtree(folder, ignore_errors=True)
         if preset == "paper":
-            seen = self.scene, self.cloud(preset)
-            overfit_scene(self.anatomy, seen, config, folder, _STEPS[preset])
+            _overfit(self, config, folder)
             return
         name = hashlib.sha256(b"the bench's phantom").hexdigest()
         short = replace(config, validation_pairs=_VALIDATED)
@@ -227,7 +146,65 @@ class BenchSubject:
         train(run, folder, report)
 
 
-@cache
-def _loaded(folder: Path) -> Model:
-    """On the CPU. Raises ArtifactError: no whole model of this version."""
-    return load_model(folder, "cpu")
+_loaded = cache(partial(load_model, device="cpu"))
+
+
+def _workloads(kind: str, subject: BenchSubject, _: float) -> Iterator[Workload]:
+    presets = {"encoders": (*LABELLING, "clinic"), "decoders": LABELLING}
+    for preset in presets.get(kind, PRESETS):
+        yield from getattr(subject.forms(preset), kind)()
+
+
+encoders, decoders, frames, tracking, volumes = (
+    partial(_workloads, kind) for kind in ("encoders", "decoders", "frames", "tracking", "volumes")
+)
+
+
+def _overfit(subject: BenchSubject, config: TrainConfig, folder: Path) -> None:
+    """Write a model folder whose network labels points of the subject's scene."""
+    anatomy, scene, cloud = subject.anatomy, subject.scene, subject.cloud("paper")
+    steps, pool = _STEPS["paper"], OccupancyPool(anatomy, OccupancyConfig(per_side=_PER_SIDE), 0)
+    rng = np.random.default_rng(0)
+    torch.manual_seed(0)
+    network = OccupancyNetwork(config.network)
+    encoder, decoder = network.encoder, network.decoder
+    points, size = torch.tensor(cloud.points_mm)[None], config.network.encoder.latent_size
+    # With columns for the latent: no other is so wide.
+    wide = [w for n, w in decoder.named_parameters() if w.dim() == 2 and w.shape[1] > size]
+    with torch.no_grad():
+        encoder.train()
+        for _ in range(_SETTLED):
+            network.encode(points)
+        encoder.eval()
+        for weight in wide:
+            weight[:, -size:] *= _LATENT_SHARE
+        latent = network.encode(points)
+    optimizer = torch.optim.Adam(decoder.parameters(), _RATE)
+    decay = torch.optim.lr_scheduler.LambdaLR(
+        optimizer, lambda step: 0.5 * (1 + math.cos(math.pi * step / steps))
+    )
+    fast = has_fast_bfloat16(torch.device("cpu"))
+    decoder.train()
+    for _ in range(steps):
+        points_ct, labels = pool.draw(rng)
+        places = torch.from_numpy(scene.carry(points_ct).astype(np.float32))[None]
+        queries = (places - latent.centre_mm) / latent.scale_mm
+        with torch.autocast("cpu", torch.bfloat16, enabled=fast):
+            logits = decoder(decoder.prepare(latent.vector), queries)
+        loss = cross_entropy(logits[0].float(), torch.from_numpy(labels).long())
+        optimizer.zero_grad()
+        loss.backward()
+        for weight in wide:
+            assert weight.grad is not None
+            weight.grad[:, -size:] = 0.0
+        optimizer.step()
+        decay.step()
+    organ = scene.carry(anatomy.organ.vertices_mm) - np.median(cloud.points_mm, axis=0)
+    folder.mkdir(parents=True, exist_ok=True)
+    model = OccupancyModel(
+        network=network.eval(), config=config, parts=anatomy.names,
+        query_box_mm=np.array([organ.min(0), organ.max(0)], float),
+        in_distribution=InDistributionRange(spread_mm=(0.0, 1e3), fit_mm=1e3),  # all is accepted
+        provenance={"steps": steps, "loss": round(float(loss.detach()), 4), "scenes": 1},
+    )  # fmt: skip
+    save_model(model, folder)

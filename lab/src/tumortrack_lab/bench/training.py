@@ -26,9 +26,9 @@ from tumortrack.simulate.scene import SceneConfig, SceneRecipe, SceneStream, Sim
 from tumortrack.training.model import load_model
 from tumortrack.training.state import TrainingRun, TrainingState
 from tumortrack.training.train import TrainingStatus, train
-from tumortrack_lab.bench.forms import OccupancyForms, flow_flops, module_flops, weight_bytes
 from tumortrack_lab.bench.naive import NaiveOccupancy, plain_pair
-from tumortrack_lab.bench.networks import occupancy_frames, occupancy_volume
+from tumortrack_lab.bench.occupancy import OccupancyForms, module_flops, weight_bytes
+from tumortrack_lab.bench.registration import flow_flops
 from tumortrack_lab.bench.rows import GENERATOR, STEP, TRAINING, Work, Workload, timing_of
 from tumortrack_lab.bench.subject import LABELLING, SEED, UP, BenchSubject
 
@@ -47,17 +47,17 @@ Batch = tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]
 
 def drags(subject: BenchSubject, _: float) -> Iterator[Workload]:
     """A pair of depth image (424 x 240) and 2,000 labels, by the paper's drags."""
-    yield _generator(subject, "drags", DragConfig(), None)
+    return _generator(subject, "drags", DragConfig(), None)
 
 
 def elastic(subject: BenchSubject, _: float) -> Iterator[Workload]:
     """States of the organ's elastic body."""
-    yield _generator(subject, "elastic", ElasticConfig(), subject.body)
+    return _generator(subject, "elastic", ElasticConfig(), subject.body)
 
 
 def _generator(
     subject: BenchSubject, what: str, deform: DragConfig | ElasticConfig, body: ElasticBody | None
-) -> Workload:
+) -> Iterator[Workload]:
     anatomy, config = subject.anatomy, OccupancyConfig(per_side=283)
     simulator = Simulator(anatomy, UP, SceneConfig(occupancy=config, deform=(deform,)), body)
     pool, index = OccupancyPool(anatomy, config, SEED), count()
@@ -69,12 +69,12 @@ def _generator(
     def naive() -> None:
         plain_pair(anatomy, simulator.render(SceneRecipe(SEED, "train", next(index))), _LABELS)
 
-    facts = {
-        "work": _generator_work(simulator, body),
-        "note": "one thread whatever there is: workers are processes",
-    }
+    def facts() -> dict:
+        note = "one thread whatever there is: workers are processes"
+        return {"work": _generator_work(simulator, body), "note": note}
+
     naive_is = "NumPy, a ray a pixel, inside tests on deformed surfaces"
-    return Workload(GENERATOR, what, "pair", ours, naive, naive_is, _PAIRS, facts=lambda: facts)
+    yield Workload(GENERATOR, what, "pair", ours, naive, naive_is, _PAIRS, facts=facts)
 
 
 def _generator_work(simulator: Simulator, body: ElasticBody | None) -> Work:
@@ -119,7 +119,7 @@ def _step_facts(state: TrainingState, batch: Batch, samples: int) -> dict:
     clouds, *truth = batch
     forward = module_flops(lambda: state.network.loss(clouds, *truth))
     # Backward costs twice the forward pass; Adam reads and writes weights and two moments.
-    moved = 7 * weight_bytes(state.network, 4) + 3 * sum(t.nbytes for t in batch)
+    moved = 7 * weight_bytes(state.network) + 3 * sum(t.nbytes for t in batch)
     precision: Literal["bf16", "fp32"] = "bf16" if has_fast_bfloat16(CPU) else "fp32"
     work = Work(flops=3 * forward, bytes=moved, precision=precision)
     return {"work": work, "per_call": samples, "note": f"{samples} samples a step"}
@@ -156,9 +156,7 @@ def naive_step(state: TrainingState) -> Callable[[Batch], None]:
     """One step in the plain way, on weights of its own."""
     network = copy.deepcopy(state.network).train()
     optimizer = torch.optim.Adam(network.parameters(), 1e-4, foreach=False)
-    plain = None
-    if isinstance(network, OccupancyNetwork):
-        plain = NaiveOccupancy(network, training=True)
+    plain = NaiveOccupancy(network) if isinstance(network, OccupancyNetwork) else None
 
     def step(batch: Batch) -> None:
         clouds, points, labels, poses = batch
@@ -184,10 +182,9 @@ def _whole_training(
 ) -> Workload:
     """A preset as a user trains it: workers, or the GPU itself, make scenes, the network learns
     them."""
-    anatomy = subject.anatomy
-    config = replace(subject.presets[preset](anatomy), validation_pairs=4)
+    config = replace(subject.presets[preset](subject.anatomy), validation_pairs=4)
+    run = TrainingRun(subject.anatomy, UP, "", config, SEED, minutes=budget_s / 60, device=device)
     seen: list[tuple[float, TrainingStatus]] = []
-    run = TrainingRun(anatomy, UP, "", config, SEED, minutes=budget_s / 60, device=device)
     with tempfile.TemporaryDirectory() as folder:
         train(run, Path(folder) / "model", lambda now: seen.append((time.perf_counter(), now)))
     # Between reports, and so without the start; where the end was the first, by the last's word.
@@ -207,17 +204,16 @@ def _whole_training(
 
 def on_gpu(subject: BenchSubject, budget_s: float) -> Iterator[Workload]:
     """Those of ``on_device``, if PyTorch sees a GPU; else none."""
-    if torch.cuda.is_available():
-        yield from on_device(subject, "cuda", budget_s)
+    return on_device(subject, "cuda", budget_s) if torch.cuda.is_available() else iter(())
 
 
 def on_device(subject: BenchSubject, device: Device, budget_s: float) -> Iterator[Workload]:
     """Frame and volume of the presets that label points, and a training of each, generator
-    included. Both forms bring their labels back to the host, which waits for the device."""
+    included."""
     for preset in LABELLING:
         model = load_model(subject.model_folder(preset), device)
         assert isinstance(model, OccupancyModel)
-        forms = OccupancyForms(model, subject.cloud(preset).points_mm, device)
-        yield from occupancy_frames(forms, preset)
-        yield occupancy_volume(forms, preset)
+        forms = OccupancyForms(preset, model, subject.cloud(preset).points_mm, device)
+        yield from forms.frames()
+        yield from forms.volumes()
         yield _whole_training(subject, preset, device, budget_s)

@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-import os
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
 from rich.console import Console
 
-from tumortrack.core.errors import InputError, TumortrackError
+from tumortrack.core.errors import InputError
 
 TRAINED = Path("runs/bench")  # models trained to be measured
 _WIDE = 150  # characters of a table that goes to a file
-_WORKER = [sys.executable, "-m", "tumortrack_lab.cli.bench"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,9 +48,8 @@ class Bench:
         document without its markers."""
         from tumortrack.cli.console import console, say
         from tumortrack.core.process import available_cores
-        from tumortrack_lab.bench.report import BLOCKS, write_bench
+        from tumortrack_lab.bench.report import BLOCKS, line, rich_table, write_bench
         from tumortrack_lab.bench.run import CURVES, GROUPS, Task, measure, tasks_of
-        from tumortrack_lab.bench.tables import line, rich_table
         from tumortrack_lab.study.document import ReportWriter
 
         if (self.model is None) != (self.cloud is None):
@@ -71,36 +67,8 @@ class Bench:
         tasks = tasks_of(common, self.only or tuple(GROUPS), curves, available_cores())
         with console.status("starting ...") as status:
             report = status.update if console.is_terminal else say
-            found = measure(tasks, _WORKER, command, report, lambda row, left: say(line(row, left)))
+            found = measure(tasks, command, report, lambda row, left: say(line(row, left)))
         shown = console if console.is_terminal else Console(width=_WIDE)
         shown.print(rich_table(found))
         for path in write_bench(found, self.out, self.document):
             say(f"written to {path}")
-
-
-def _work(task_json: str) -> None:
-    """A process of the bench: carries one task out and writes each result as a line of JSON."""
-    import msgspec
-
-    from tumortrack.core.config import from_builtins
-    from tumortrack_lab.bench.run import Task, TaskMessage, carry_out
-
-    task = from_builtins(msgspec.json.decode(task_json), Task, "the bench's task")
-    if hasattr(os, "sched_setaffinity"):  # Linux alone has it; before libraries start threads
-        os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[: task.threads])
-    from tumortrack.training.presets import PRESETS
-    from tumortrack_lab.bench.subject import BenchSubject
-
-    def tell(message: TaskMessage) -> None:
-        print(msgspec.json.encode(message).decode(), flush=True)
-
-    given = task.given and (Path(task.given[0]), Path(task.given[1]))
-    for message in carry_out(task, BenchSubject(PRESETS, Path(task.folder), given), tell):
-        tell(message)
-
-
-if __name__ == "__main__":
-    try:
-        _work(sys.argv[1])
-    except TumortrackError as error:
-        sys.exit(str(error))  # one line on the standard error, for the process that asked

@@ -1,6 +1,6 @@
-"""What a peer is: a method that moves the pre-operative anatomy onto one observed cloud.
+"""What a peer is, and the rigid ones.
 
-A peer is made for one patient (the work that does not need the cloud is done and timed there) and
+A peer moves the pre-operative anatomy onto one observed cloud: it is made for one patient and
 fitted to scenes one by one. Its answer is a map of points, from which organ, tumors and labels
 follow; so peers and network are compared by the same ``report.protocol.compare``.
 """
@@ -12,21 +12,24 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from types import SimpleNamespace
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Float64
 
 import tumortrack
 from tumortrack.core.errors import InputError
 from tumortrack.core.estimate import Estimate
-from tumortrack.core.geometry import transform_points
-from tumortrack.core.types import Anatomy, CameraLabels, OccupancyCloud
+from tumortrack.core.geometry import rigid, transform_points
+from tumortrack.core.types import Anatomy, CameraLabels, Mesh, OccupancyCloud
 from tumortrack.imaging.raster import label_grid
 from tumortrack.models.report import describe_parts, grid_over
 from tumortrack.simulate.scene_folder import Scene
 from tumortrack_lab.peers.pose_search import Direction, Points, PoseSearch, Transform
 
+# Barycentric points of a tetrahedron that integrate quadratics exactly (Keast 1986, 4 points).
+_NEAR, _FAR = 0.1381966011250105, 0.5854101966249685
 CLOUD_POINTS = 40_000  # of an estimate, as many as the tracker asks for
 
 Carry = Callable[[Float[np.ndarray, "n 3"]], Float[np.ndarray, "n 3"]]
@@ -55,9 +58,35 @@ class Peer(Protocol):
 
     def fit(self, scene: Scene) -> Fit:
         """Locate the anatomy in a scene. All but the bound use ``scene.cloud`` alone. Raises
-        NoEstimate: the cloud has too little information; InputError: the cloud or the peer's
-        settings cannot be used."""
-        ...
+        NoEstimate: the cloud has too little information, such as fewer than 20 points; InputError:
+        the cloud or the peer's settings cannot be used."""
+
+
+class TimedPeer(ABC):
+    """What our own peers share: their preparation and each fit are timed."""
+
+    name: str
+    config: Any
+
+    def __init__(self, anatomy_ct: Anatomy, up_lps: Direction, config: Any = None) -> None:
+        self.config = config
+        with stopwatch() as watch:
+            self._prepare(anatomy_ct, up_lps)
+        self.prepare_s = watch.seconds
+
+    def fit(self, scene: Scene) -> Fit:
+        """See ``Peer.fit``."""
+        with stopwatch() as watch:
+            carry, report = self._fit(scene)
+        return Fit(carry, watch.seconds, report)
+
+    @abstractmethod
+    def _prepare(self, anatomy_ct: Anatomy, up_lps: Direction) -> None:
+        """What can be done before a cloud is seen."""
+
+    @abstractmethod
+    def _fit(self, scene: Scene) -> tuple[Carry, dict]:
+        """The map of a fit, and its report."""
 
 
 def rigid_carry(camera_from_ct: Transform) -> Carry:
@@ -66,9 +95,8 @@ def rigid_carry(camera_from_ct: Transform) -> Carry:
 
 
 def estimate_of(fit: Fit, anatomy_ct: Anatomy, stamp_ns: int = 0, grid: int = 160) -> Estimate:
-    """A fit of a patient's anatomy as the tracker's value: surfaces moved, labels voxelised from
-    them with ``grid`` voxels along the longest side; ``stamp_ns``: of the cloud. Raises InputError:
-    the fit carries points to NaN or infinity."""
+    """A fit as the tracker's value: surfaces moved, labels voxelised from them with ``grid`` voxels
+    along the longest side. Raises InputError: the fit carries points to NaN or infinity."""
     carried = [np.asarray(fit.carry(part.vertices_mm)) for part in anatomy_ct.parts]
     if not all(np.isfinite(points_mm).all() for points_mm in carried):
         raise InputError("the fit diverged: it carries points to NaN or infinity.")
@@ -96,57 +124,109 @@ def estimate_of(fit: Fit, anatomy_ct: Anatomy, stamp_ns: int = 0, grid: int = 16
     return Estimate(cloud, CameraLabels(labels, camera_from_index), meshes, report)
 
 
-class Stopwatch:
-    """Seconds spent in a ``with`` block."""
-
-    seconds = 0.0
-
-
 @contextmanager
-def stopwatch() -> Iterator[Stopwatch]:
-    watch, start = Stopwatch(), time.perf_counter()
+def stopwatch() -> Iterator[SimpleNamespace]:
+    """Its ``seconds`` are those spent in the ``with`` block."""
+    watch, start = SimpleNamespace(), time.perf_counter()
     yield watch
     watch.seconds = time.perf_counter() - start
 
 
-@dataclass(frozen=True, eq=False)
-class Candidate:
-    """A fit from one pose: its map, the error by which fits are compared (any unit), its report."""
+class DeformablePeer(TimedPeer):
+    """A peer that fits from each of the best rigid poses and keeps the fit of least error. Its
+    configuration has ``rigid`` (of the pose search) and ``starts`` (how many poses)."""
 
-    carry: Carry
-    error: float
-    report: dict
+    def _prepare(self, anatomy_ct: Anatomy, up_lps: Direction) -> None:
+        self._search = PoseSearch(anatomy_ct, up_lps, self.config.rigid)
 
-
-class DeformablePeer(ABC):
-    """A peer that fits from each of the best rigid poses and keeps the fit of least error.
-
-    Its configuration has ``rigid`` (of the pose search) and ``starts`` (how many poses).
-    """
-
-    name: str
-    config: Any
-
-    def __init__(self, anatomy_ct: Anatomy, up_lps: Direction, config: Any) -> None:
-        self.config = config
-        with stopwatch() as watch:
-            self._search = PoseSearch(anatomy_ct, up_lps, config.rigid)
-            self._prepare(anatomy_ct)
-        self.prepare_s = watch.seconds
-
-    def fit(self, scene: Scene) -> Fit:
-        """See ``Peer.fit``; NoEstimate for fewer than 20 points."""
+    def _fit(self, scene: Scene) -> tuple[Carry, dict]:
         cloud = scene.cloud.points_mm.astype(float)
-        with stopwatch() as watch:
-            poses = self._search.poses(scene.cloud)[: self.config.starts]
-            fits = [self._fit_from(pose.camera_from_ct, cloud) for pose in poses]
-            best = int(np.argmin([fit.error for fit in fits]))
-        report = {"start": poses[best].start, **fits[best].report}
-        return Fit(fits[best].carry, watch.seconds, report)
-
-    def _prepare(self, anatomy_ct: Anatomy) -> None:  # noqa: B027, nothing by default
-        """What else can be done before a cloud is seen."""
+        poses = self._search.poses(scene.cloud)[: self.config.starts]
+        fits = [(pose.start, *self._fit_from(pose.camera_from_ct, cloud)) for pose in poses]
+        start, _, carry, report = min(fits, key=lambda fit: fit[1])
+        return carry, {"start": start, **report}
 
     @abstractmethod
-    def _fit_from(self, camera_from_ct: Transform, cloud: Points) -> Candidate:
-        """The fit from one pose to the cloud (camera frame, mm)."""
+    def _fit_from(self, camera_from_ct: Transform, cloud: Points) -> tuple[float, Carry, dict]:
+        """The fit from one pose to the cloud (camera frame, mm): the error by which fits are
+        compared (any unit), the map, its report."""
+
+
+class Rigid(TimedPeer):
+    """The pose of least error as a peer."""
+
+    def _prepare(self, anatomy_ct: Anatomy, up_lps: Direction) -> None:
+        self.name = "rigid" if self.config.orientation == "facing" else "rigid_any_rotation"
+        self._search = PoseSearch(anatomy_ct, up_lps, self.config)
+
+    def _fit(self, scene: Scene) -> tuple[Carry, dict]:
+        best = self._search.poses(scene.cloud)[0]
+        report = {"start": best.start, "residual_mm": best.error_mm}
+        return rigid_carry(best.camera_from_ct), report
+
+
+class RigidBound(TimedPeer):
+    """The best rigid pose there is, found with the truth in hand: least squares over the organ's
+    whole volume, from the truth's own correspondence. Not a method anyone could use; no rigid
+    method can beat it in that norm. Errors as of ``matched_vertices``."""
+
+    name = "rigid_bound"
+
+    def _prepare(self, anatomy_ct: Anatomy, up_lps: Direction) -> None:
+        self._organ = anatomy_ct.organ
+
+    def _fit(self, scene: Scene) -> tuple[Carry, dict]:
+        reference = self._organ.moved(matched_vertices(self._organ, scene.reference.organ))
+        camera_from_ct, residual_mm = fit_over_volume(self._organ, reference)
+        return rigid_carry(camera_from_ct), {"residual_mm": residual_mm, "start": "truth"}
+
+
+def matched_vertices(rest: Mesh, moved: Mesh) -> Points:
+    """Where each vertex of ``rest`` lies in ``moved``, the same triangles in the same order: read
+    meshes lose the order of their vertices (equal ones are merged), but never that of their
+    triangles. Raises InputError: ``moved`` has other triangles."""
+    vertex = np.full(len(rest.vertices_mm), -1)
+    same = rest.faces.shape == moved.faces.shape
+    if same:
+        vertex[rest.faces.reshape(-1)] = moved.faces.reshape(-1)
+        same = bool((vertex[rest.faces] == moved.faces).all() and (vertex >= 0).all())
+    if not same:
+        raise InputError(
+            "the rigid bound needs a scene made from this case: its kidney.ply must have the "
+            "same triangles as the case's. Make scenes with this case, or leave the bound out."
+        )
+    return moved.vertices_mm[vertex]
+
+
+def fit_over_volume(source: Mesh, target: Mesh) -> tuple[Transform, float]:
+    """``target_from_source`` with the least squared displacement over the source's volume, and the
+    root mean square displacement that it leaves, mm. Exact for a displacement that is linear in
+    each tetrahedron of a triangle and the vertices' mean."""
+    from_mm, weights = _volume_points(source, source)
+    to_mm, _ = _volume_points(source, target)
+    transform = kabsch(from_mm, to_mm, weights)
+    left2 = ((transform_points(transform, from_mm) - to_mm) ** 2).sum(1)
+    return transform, float(np.sqrt(max(np.average(left2, weights=weights), 0.0)))
+
+
+def _volume_points(rest: Mesh, moved: Mesh) -> tuple[Points, Float64[np.ndarray, " n"]]:
+    """Quadrature points carried along with ``moved``; their signed weights from ``rest``."""
+    corners = rest.vertices_mm[rest.faces] - rest.vertices_mm.mean(0)
+    volume = np.einsum("ij,ij->i", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) / 6
+    apex = np.broadcast_to(moved.vertices_mm.mean(0), (len(volume), 1, 3))
+    tetrahedra = np.concatenate([apex, moved.vertices_mm[moved.faces]], axis=1)
+    shares = np.full((4, 4), _NEAR) + (_FAR - _NEAR) * np.eye(4)
+    points = np.einsum("qc,tcx->tqx", shares, tetrahedra).reshape(-1, 3)
+    return points, np.repeat(volume / 4, 4)
+
+
+def kabsch(source_mm: Points, target_mm: Points, weights: Float[np.ndarray, " n"]) -> Transform:
+    """The rigid transform that carries source points to target points best, in weighted squares
+    (Kabsch 1976, doi 10.1107/S0567739476001873)."""
+    share = weights / weights.sum()
+    source_centre, target_centre = share @ source_mm, share @ target_mm
+    spread = (source_mm - source_centre).T @ (share[:, None] * (target_mm - target_centre))
+    u, _, vt = np.linalg.svd(spread)
+    mirror = np.diag([1.0, 1.0, np.sign(np.linalg.det(vt.T @ u.T))])
+    rotation = vt.T @ mirror @ u.T
+    return rigid(rotation, target_centre - rotation @ source_centre)

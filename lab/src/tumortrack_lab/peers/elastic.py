@@ -22,9 +22,10 @@ from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.types import Anatomy
-from tumortrack_lab.peers.base import Candidate, DeformablePeer
+from tumortrack_lab.peers.base import Carry, DeformablePeer
 from tumortrack_lab.peers.pose_search import (
     CROP_PERCENT,
+    Direction,
     Points,
     PoseSearch,
     RigidConfig,
@@ -71,7 +72,7 @@ class PeerElasticBody:
     def displacement(
         self, points_mm: Float[np.ndarray, "m 3"], amplitudes: Float[np.ndarray, " modes"]
     ) -> Float64[np.ndarray, "m 3"]:
-        """Displacement of the given points (undeformed, mm), interpolated in their elements."""
+        """The modes' displacement of the given points (undeformed, mm)."""
         element, shapes = self._shapes(points_mm)
         moved = self.modes @ amplitudes
         return np.einsum("mk,mkc->mc", shapes, moved[self.nodes[element]])
@@ -104,13 +105,11 @@ def stiffness_matrix(tets: TetMesh, poisson: float) -> tuple[Any, Any]:
 
 
 def elastic_body(tets: TetMesh, poisson: float, modes: int) -> PeerElasticBody:
-    """The body with its softest surface modes, rigid motions left out.
-
-    Modes solve K u = s M u with K the stiffness and M the mass of the *surface* (Steklov's
-    problem): among all fields with a given surface displacement they have the least strain energy
-    inside, so a few hundred stand for every way in which forces on the surface deform the organ.
-    Raises InputError: more modes than the mesh's surface has, or the mesh is in pieces.
-    """
+    """The body with its softest surface modes, rigid motions left out: solutions of K u = s M u,
+    K the stiffness, M the mass of the *surface* (Steklov's problem). Among all fields with a
+    given surface displacement they have the least strain energy inside, so a few hundred stand for
+    every way in which forces on the surface deform the organ. Raises InputError: more modes than
+    the mesh's surface has, or the mesh is in pieces."""
     from scipy.sparse.linalg import LinearOperator, eigsh
     from skfem import BilinearForm, FacetBasis
     from skfem.helpers import dot
@@ -145,13 +144,10 @@ def elastic_body(tets: TetMesh, poisson: float, modes: int) -> PeerElasticBody:
 
 
 class ElasticPeerConfig(Config, frozen=True):
-    """Settings of the elastic fit.
-
-    The weight of strain energy against data is not tuned but stated in mm: among the
+    """The weight of strain energy against data is not tuned but stated in mm: among the
     displacements that the energy makes likely (Gaussian, variance inverse to stiffness) the root
     mean square over the surface is ``displacement_mm``; a point lies ``noise_mm`` off the
-    surface. Points far off, by more than ``outlier_mm`` at the end, do not count (Tukey).
-    """
+    surface. Points off by more than ``outlier_mm`` at the end do not count (Tukey)."""
 
     rigid: RigidConfig = RigidConfig()
     starts: int = 4  # the best rigid poses, each fitted
@@ -165,8 +161,7 @@ class ElasticPeerConfig(Config, frozen=True):
     iterations: int = 30
 
 
-@dataclass(frozen=True, eq=False)
-class _State:
+class _State(NamedTuple):
     """Where the body lies and how it is deformed: camera = pose (ct + modes @ amplitudes)."""
 
     camera_from_ct: Transform
@@ -183,19 +178,18 @@ class _Pairs(NamedTuple):
 
 
 class ElasticPeer(DeformablePeer):
-    """The elastic surface fit as a peer."""
-
     name = "elastic"
     config: ElasticPeerConfig
 
-    def _prepare(self, anatomy_ct: Anatomy) -> None:
+    def _prepare(self, anatomy_ct: Anatomy, up_lps: Direction) -> None:
+        super()._prepare(anatomy_ct, up_lps)
         mesh = tetrahedralise(anatomy_ct.organ, self.config.edge_mm, _ENVELOPE)
         self.body = elastic_body(mesh, self.config.poisson, self.config.modes)
         self._surface = EmbeddedSurface(self.body, self._search)
         variance = self.config.displacement_mm**2 * self.body.area_mm2
         self._precision = self.body.stiffness * (1 / self.body.stiffness).sum() / variance
 
-    def _fit_from(self, camera_from_ct: Transform, cloud: Points) -> Candidate:
+    def _fit_from(self, camera_from_ct: Transform, cloud: Points) -> tuple[float, Carry, dict]:
         """The limit beyond which points are outliers shrinks during the iteration."""
         config = self.config
         state = _State(camera_from_ct, np.zeros(len(self._precision)))
@@ -210,7 +204,9 @@ class ElasticPeer(DeformablePeer):
                 break
         return self._candidate(state, cloud, iteration + 1)
 
-    def _candidate(self, state: _State, cloud: Points, iterations: int) -> Candidate:
+    def _candidate(
+        self, state: _State, cloud: Points, iterations: int
+    ) -> tuple[float, Carry, dict]:
         """Starts are compared by the cost (data, Tukey's, and strain energy); the residual is the
         root mean square distance of the points that count."""
 
@@ -230,7 +226,7 @@ class ElasticPeer(DeformablePeer):
             "residual_mm": float(residual),
             "displacement_mm": self._surface_rms(state.amplitudes),
         }
-        return Candidate(carry, report["cost"], report)
+        return report["cost"], carry, report
 
     def _pairs(self, state: _State, points: Points, outlier_mm: float) -> _Pairs:
         """Cloud points and the surface points nearest to them; then the other way round, for the
@@ -297,10 +293,8 @@ class EmbeddedSurface:
     def seen(
         self, shape: SurfacePoints, camera_from_ct: Transform, deepest_mm: float
     ) -> Int[np.ndarray, " m"]:
-        """Some of the points that the camera should see above a depth, evenly spread.
-
-        Occlusion is that of the undeformed organ; orientation is that of the deformed one.
-        """
+        """Some of the points that the camera should see above a depth, evenly spread; occlusion is
+        that of the undeformed organ, orientation that of the deformed one."""
         seen = seen_from(self._visibility, self._rest, camera_from_ct)
         seen &= shape.faces(np.linalg.inv(camera_from_ct)[:3, 3])
         axis = camera_from_ct[2]

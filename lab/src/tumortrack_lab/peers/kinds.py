@@ -1,8 +1,5 @@
-"""Peers by name: ours, and those of other installed packages.
-
-Another package adds a peer by an entry point of the group ``tumortrack.peers`` that names a
-``PeerKind``; nothing changes here.
-"""
+"""Peers by name: ours, and those of other installed packages: each is an entry point of the group
+``tumortrack.peers`` that names a ``PeerKind``."""
 
 from __future__ import annotations
 
@@ -16,16 +13,17 @@ from tumortrack.core import store
 from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError
 from tumortrack.core.types import Anatomy
-from tumortrack_lab.peers.base import Peer
-from tumortrack_lab.peers.pose_search import Direction
+from tumortrack_lab.peers.base import Peer, Rigid, RigidBound
+from tumortrack_lab.peers.elastic import ElasticPeer, ElasticPeerConfig
+from tumortrack_lab.peers.point_drift import Bcpd, BcpdConfig, Cpd, CpdConfig
+from tumortrack_lab.peers.pose_search import Direction, RigidConfig
 
 GROUP = "tumortrack.peers"
 
 
 @dataclass(frozen=True)
 class PeerKind:
-    """How a peer is made for a patient. Answers depend on the settings, on the versions of the
-    packages and on an outside program."""
+    """How a peer is made for a patient, and what its answers depend on."""
 
     # make(anatomy_ct, up_lps, config), or make(anatomy_ct, up_lps) without config, gives a Peer.
     make: Callable[..., Any]
@@ -46,11 +44,6 @@ class PeerKind:
 def peer_kinds(bcpd: Path | None = None) -> dict[str, PeerKind]:
     """Every peer there is; ``bcpd`` only with its program. Raises InputError: the program does not
     exist, an entry point that names no ``PeerKind``, or takes the name of a peer of ours."""
-    from tumortrack_lab.peers.elastic import ElasticPeer, ElasticPeerConfig
-    from tumortrack_lab.peers.point_drift import Bcpd, BcpdConfig, Cpd, CpdConfig
-    from tumortrack_lab.peers.pose_search import RigidConfig
-    from tumortrack_lab.peers.rigid import Rigid, RigidBound
-
     kinds = {
         "rigid_bound": PeerKind(RigidBound),
         "rigid": PeerKind(Rigid, RigidConfig(), ("small_gicp",)),
@@ -63,11 +56,7 @@ def peer_kinds(bcpd: Path | None = None) -> dict[str, PeerKind]:
             raise InputError(f"{bcpd} does not exist; give the built program of BCPD, or none.")
         config = BcpdConfig(program=str(bcpd))
         kinds["bcpd"] = PeerKind(Bcpd, config, ("small_gicp",), store.sha256_of(bcpd))
-    return kinds | _others({*kinds, "bcpd"})
-
-
-def _others(ours: set[str]) -> dict[str, PeerKind]:
-    kinds = {}
+    ours = {*kinds, "bcpd"}
     for point in entry_points(group=GROUP):
         kind, origin = point.load(), point.dist.name if point.dist else point.value
         if point.name in ours:

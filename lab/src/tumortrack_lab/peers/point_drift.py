@@ -14,7 +14,6 @@ from __future__ import annotations
 import subprocess
 import tempfile
 from abc import abstractmethod
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -26,7 +25,7 @@ from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.types import Anatomy
-from tumortrack_lab.peers.base import Candidate, DeformablePeer
+from tumortrack_lab.peers.base import Carry, DeformablePeer
 from tumortrack_lab.peers.pose_search import Direction, Points, RigidConfig, Transform, trimmed_mean
 
 _KEPT = 0.9  # of the distances
@@ -34,66 +33,38 @@ _PATIENCE_S = 120.0
 
 
 class CpdConfig(Config, frozen=True):
-    """Settings of CPD, lengths in mm.
-
-    ``kernel_mm`` is the paper's beta, the distance over which points move together; ``smooth``
-    its lambda, the weight of smoothness (of points scaled to a spread of 1, as the paper scales
-    them); ``outliers`` its w. ``first_sigma_mm`` starts the annealing at the error that a rigid
-    pose leaves, instead of at the size of the cloud.
-    """
+    """Settings of CPD, lengths in mm; the paper's name of each in brackets."""
 
     rigid: RigidConfig = RigidConfig()
     starts: int = 2  # the best rigid poses, each fitted
-    kernel_mm: float = 50.0
-    smooth: float = 1000.0
-    outliers: float = 0.1
-    first_sigma_mm: float = 6.0
+    kernel_mm: float = 50.0  # distance over which points move together (beta)
+    smooth: float = 1000.0  # weight of smoothness, of points scaled to a spread of 1 (lambda)
+    outliers: float = 0.1  # (w)
+    first_sigma_mm: float = 6.0  # annealing starts at the error that a rigid pose leaves
     iterations: int = 60
     points: int = 400  # of the visible surface
 
 
 class BcpdConfig(Config, frozen=True):
-    """Settings of BCPD under the names of its options; lengths in units of the cloud's spread
-    (the root mean square of its coordinates about their mean).
+    """Settings of BCPD, the paper's name of each in brackets; lengths in units of the cloud's
+    spread (the root mean square of its coordinates about their mean)."""
 
-    ``program`` is the path of the built binary. ``kernel`` (beta) is the reach of the Gaussian
-    over which points move together; ``length`` (lambda): the expected displacement is
-    sqrt(3 / lambda); ``outliers`` (omega); ``near`` (gamma): small where the start is good.
-    """
-
-    program: str = ""
+    program: str = ""  # path of the built binary
     rigid: RigidConfig = RigidConfig()
     starts: int = 3  # the best rigid poses, each fitted
-    kernel: float = 1.2
-    length: float = 50.0
-    outliers: float = 0.1
-    near: float = 0.1
+    kernel: float = 1.2  # reach of the Gaussian over which points move together (beta)
+    length: float = 50.0  # the expected displacement is sqrt(3 / length) (lambda)
+    outliers: float = 0.1  # (omega)
+    near: float = 0.1  # small where the start is good (gamma)
     iterations: int = 300
     points: int = 700  # of the visible surface
     ridge: float = 1e-2  # of the interpolation of displacements into the depth
 
 
-@dataclass(frozen=True, eq=False)
-class Drift:
-    """Displacements that drift coherently, v(z) = sum over n of G(z, y_n) w_n, and a similarity
-    after them; camera frame, mm."""
-
-    points_mm: Float64[np.ndarray, "n 3"]
-    weights: Float64[np.ndarray, "n 3"]
-    kernel_mm: float
-    matrix: Float64[np.ndarray, "3 3"] | None = None  # none: displacements alone
-    shift_mm: Float64[np.ndarray, " 3"] | None = None
-
-    def __call__(self, at_mm: Points) -> Points:
-        """The mapped points."""
-        moved = at_mm + _gaussian(at_mm, self.points_mm, self.kernel_mm) @ self.weights
-        return moved if self.matrix is None else moved @ self.matrix.T + self.shift_mm
-
-
 class _PointDrift(DeformablePeer):
     config: CpdConfig | BcpdConfig
 
-    def _fit_from(self, camera_from_ct: Transform, cloud: Points) -> Candidate:
+    def _fit_from(self, camera_from_ct: Transform, cloud: Points) -> tuple[float, Carry, dict]:
         source = self._search.seen(cloud, camera_from_ct)
         source = source[:: max(1, len(source) // self.config.points)]
         drift, iterations = self._drift(source, cloud)
@@ -102,22 +73,19 @@ class _PointDrift(DeformablePeer):
         both = (moved, cloud), (cloud, moved)
         error_mm = sum(trimmed_mean(cKDTree(to).query(at)[0], _KEPT) for to, at in both) / 2
         report = {"iterations": iterations, "residual_mm": error_mm}
-        return Candidate(
-            lambda points_ct: drift(transform_points(camera_from_ct, points_ct)), error_mm, report
-        )
+        return error_mm, lambda ct: drift(transform_points(camera_from_ct, ct)), report
 
     @abstractmethod
-    def _drift(self, source: Points, cloud: Points) -> tuple[Drift, int]:
-        """The drift of a rigidly placed surface onto a cloud, and the iterations it took."""
+    def _drift(self, source: Points, cloud: Points) -> tuple[Carry, int]:
+        """The drift of a rigidly placed surface onto a cloud, v(z) = sum over n of G(z, y_n) w_n,
+        and the iterations it took."""
 
 
 class Cpd(_PointDrift):
-    """Coherent point drift as a peer."""
-
     name = "cpd"
     config: CpdConfig
 
-    def _drift(self, source: Points, cloud: Points) -> tuple[Drift, int]:
+    def _drift(self, source: Points, cloud: Points) -> tuple[Carry, int]:
         from pycpd import DeformableRegistration
 
         config = self.config
@@ -131,7 +99,8 @@ class Cpd(_PointDrift):
             max_iterations=config.iterations,
         )
         registration.register()
-        return Drift(source, registration.W, config.kernel_mm), int(registration.iteration)
+        carry = _coherent(source, registration.W, config.kernel_mm)
+        return carry, int(registration.iteration)
 
 
 class Bcpd(_PointDrift):
@@ -141,16 +110,16 @@ class Bcpd(_PointDrift):
     name = "bcpd"
     config: BcpdConfig
 
-    def __init__(self, anatomy_ct: Anatomy, up_lps: Direction, config: BcpdConfig) -> None:
-        if not Path(config.program).is_file():
+    def _prepare(self, anatomy_ct: Anatomy, up_lps: Direction) -> None:
+        if not Path(self.config.program).is_file():
             raise InputError(
-                f"BCPD's program {config.program!r} does not exist. Get the source from "
+                f"BCPD's program {self.config.program!r} does not exist. Get the source from "
                 "https://github.com/ohirose/bcpd, install OpenBLAS, run make, and give the path "
                 "of the binary that it builds."
             )
-        super().__init__(anatomy_ct, up_lps, config)
+        super()._prepare(anatomy_ct, up_lps)
 
-    def _drift(self, source: Points, cloud: Points) -> tuple[Drift, int]:
+    def _drift(self, source: Points, cloud: Points) -> tuple[Carry, int]:
         """The program's displacements v, interpolated by its own Gaussian process (Hirose 2021b,
         doi 10.1109/TPAMI.2020.3043769), then the similarity that carries y + v to its shape y'.
         Raises NoEstimate: the program failed on these points."""
@@ -161,7 +130,8 @@ class Bcpd(_PointDrift):
         weights = np.linalg.solve(kernel, displacement)
         moved = np.pad(source + displacement, ((0, 0), (0, 1)), constant_values=1)
         affine = np.linalg.lstsq(moved, shape, rcond=None)[0]
-        return Drift(source, weights, kernel_mm, affine[:3].T, affine[3]), loops
+        carry = _coherent(source, weights, kernel_mm)
+        return lambda at_mm: carry(at_mm) @ affine[:3] + affine[3], loops
 
     def _run(self, source: Points, cloud: Points) -> tuple[Points, Points, int]:
         """One run of the program: its displacements v and shape y, and its count of loops."""
@@ -189,6 +159,10 @@ class Bcpd(_PointDrift):
             lines = info.read_text().splitlines() if info.is_file() else []
             loops = (int(line.split()[1]) for line in lines if line.startswith("loops"))
             return displacement, shape, next(loops, 0)
+
+
+def _coherent(source: Points, weights: Points, kernel_mm: float) -> Carry:
+    return lambda at_mm: at_mm + _gaussian(at_mm, source, kernel_mm) @ weights
 
 
 def _gaussian(

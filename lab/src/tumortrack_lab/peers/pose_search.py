@@ -7,7 +7,7 @@ nearest minimum only, so the starts cover the rotations that the surgeon's knowl
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Float64
@@ -35,12 +35,10 @@ Direction = tuple[float, float, float]
 
 
 class RigidConfig(Config, frozen=True):
-    """How a rigid pose is searched.
+    """How a rigid pose is searched."""
 
-    ``facing``: the side that faces the camera is known, the turn about the camera's axis is not
-    (the paper's M_lim). ``unknown``: any rotation (its M_full).
-    """
-
+    # facing: the side that faces the camera is known, the turn about the camera's axis is not (the
+    # paper's M_lim); unknown: any rotation (its M_full)
     orientation: Literal["facing", "unknown"] = "facing"
     turns: int = 24  # about the camera's axis
     tilt_deg: float = 12.0  # four more starts of each turn, tilted by this (facing)
@@ -62,7 +60,6 @@ class SurfacePoints:
     normals: Float64[np.ndarray, "n 3"]
 
     def faces(self, eye_mm: Point) -> Bool[np.ndarray, " n"]:
-        """Which points are turned towards an eye."""
         return np.einsum("ij,ij->i", self.normals, eye_mm - self.points_mm) > 0
 
 
@@ -96,9 +93,8 @@ def trimmed_mean(values: Float[np.ndarray, " n"], kept_share: float) -> float:
     return float(np.partition(values, count - 1)[:count].mean())
 
 
-@dataclass(frozen=True, eq=False)
-class Pose:
-    """A rigid candidate: ``error_mm`` is that of ``PoseSearch.error_mm``."""
+class Pose(NamedTuple):
+    """A rigid candidate; ``error_mm``: of ``PoseSearch.error_mm``."""
 
     camera_from_ct: Transform
     error_mm: float
@@ -258,6 +254,5 @@ def _rotations(config: RigidConfig, up_lps: Point) -> list[Rotation3]:
 def _directions(count: int) -> Points:
     """Unit vectors spread evenly over the sphere (Fibonacci lattice)."""
     z = 1 - (2 * np.arange(count) + 1) / count
-    angle = _GOLDEN_ANGLE * np.arange(count)
-    ring = np.sqrt(1 - z**2)
+    angle, ring = _GOLDEN_ANGLE * np.arange(count), np.sqrt(1 - z**2)
     return np.stack([ring * np.cos(angle), ring * np.sin(angle), z], 1)

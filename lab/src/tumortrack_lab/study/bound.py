@@ -25,8 +25,7 @@ from tumortrack.sense.camera import project
 from tumortrack.sense.render import Visibility
 from tumortrack.simulate.elastic.body import BodyConfig, ElasticBody, build_body
 from tumortrack.simulate.scene_folder import Scene
-from tumortrack_lab.peers.base import Fit, stopwatch
-from tumortrack_lab.peers.rigid import kabsch, matched_vertices
+from tumortrack_lab.peers.base import Fit, kabsch, matched_vertices, stopwatch
 from tumortrack_lab.study.methods import Answer, Method, StudyCase, answer_of, code_sha256
 
 BoundName = Literal["visible_bound", "basis_bound"]
@@ -35,14 +34,13 @@ _FEWEST = 10  # known points
 
 
 class BoundConfig(Config, frozen=True):
-    """``sigma_mm``: of a known point, for modes cannot follow exactly; ``n_effective``: independent
-    points that the known ones are worth, against the library of states as prior. Both as in
-    ``registration.gauss_newton``: on the phantom 0.3 mm or 2,000 points double the inner error."""
+    """As in ``registration.gauss_newton``: on the phantom 0.3 mm or 2,000 points double the inner
+    error."""
 
     body: BodyConfig = BodyConfig()
     seed: int = 0  # of the body
-    sigma_mm: float = 1.0
-    n_effective: float = 300.0
+    sigma_mm: float = 1.0  # of a known point, for modes cannot follow exactly
+    n_effective: float = 300.0  # independent points that the known ones are worth
     steps: int = 12
 
 
@@ -82,7 +80,7 @@ class Bound(Method):
         }
 
     @property
-    def prepare_s(self) -> float | None:
+    def prepare_s(self) -> float | None:  # type: ignore[override]
         return _body_of(self.case, self.config)[1]
 
     def locate(self, scene: Scene, grid: int) -> Answer:
@@ -109,8 +107,7 @@ class Bound(Method):
 
 
 def seen_vertices(organ_camera: Mesh, scene: Scene) -> Bool[np.ndarray, " v"]:
-    """Which vertices the camera sees: nothing of the organ lies before them, and where the scene
-    has a picture they lie in it. Sensor faults and foreign things hide nothing here."""
+    """Which vertices the camera sees, but for sensor faults and foreign things."""
     points = organ_camera.vertices_mm
     seen = Visibility(organ_camera)(points, np.zeros(3))
     if scene.depth is not None:
@@ -127,9 +124,9 @@ def laid_on(
     known_mm: Float[np.ndarray, "n 3"],
     config: BoundConfig,
 ) -> BoundMotion:
-    """The pose and state that carry known points of the CT to their places most likely, by
-    Gauss-Newton from the best rigid pose and the library's mean. As ``registration.gauss_newton``,
-    but points' partners are known: residuals are vectors, and the pose needs no prior."""
+    """The pose and state that carry known points of the CT to their places most likely. As
+    ``registration.gauss_newton``, but points' partners are known: residuals are vectors, and the
+    pose needs no prior."""
     modes = len(body.mean)
     pose = kabsch(known_ct, known_mm, np.ones(len(known_ct)))
     rotation = pose[:3, :3]
@@ -155,7 +152,7 @@ def laid_on(
 
 @cache
 def _body_of(case: StudyCase, config: BoundConfig) -> tuple[ElasticBody, float]:
-    """The case's elastic body, and the seconds that it took; one for both bounds."""
+    """And the seconds that it took; one for both bounds."""
     with stopwatch() as watch:
         body = build_body(case.anatomy_ct, case.up_lps, config.body, config.seed)
     return body, watch.seconds

@@ -30,8 +30,8 @@ def closing(name: str) -> str:
 
 
 def fill(document: str, blocks: dict[str, str]) -> str:
-    """The document with the text between each block's markers replaced; the rest stays. Raises
-    InputError: a marker is missing, double or out of order."""
+    """The document with the text between each block's markers replaced. Raises InputError: a marker
+    is missing, double or out of order."""
     for name, text in blocks.items():
         if document.count(opening(name)) != 1 or document.count(closing(name)) != 1:
             raise InputError(
@@ -48,8 +48,7 @@ def fill(document: str, blocks: dict[str, str]) -> str:
 
 @dataclass(frozen=True)
 class ReportWriter:
-    """A document with markers, and the command that its blocks name. Its pictures lie in the
-    folder ``images`` beside it."""
+    """A document with markers, and the command that its blocks name."""
 
     document: Path
     command: str
@@ -70,13 +69,12 @@ class ReportWriter:
             raise InputError(f"{self.document} cannot be read: {error.strerror}.") from error
 
     def image(self, name: str) -> Path:
-        """Where a picture goes; its folder is made. Raises StorageError: the disk refused."""
+        """Where a picture goes; its folder is made."""
         folder = self.document.parent / "images"
         make_folder(folder)
         return folder / f"{name}.png"
 
     def link(self, image: Path, words: str) -> str:
-        """Markdown that shows a picture."""
         return f"![{words}]({image.relative_to(self.document.parent)})"
 
 

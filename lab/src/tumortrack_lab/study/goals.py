@@ -15,7 +15,7 @@ from typing import get_args
 import pandas as pd
 
 from tumortrack_lab.study.document import table
-from tumortrack_lab.study.models import CLINIC
+from tumortrack_lab.study.methods import CLINIC
 from tumortrack_lab.study.paper import Kind, Lie, hausdorff
 from tumortrack_lab.study.tables import EMPTY, NOT_FOUND, NOTHING, label_of, names, scenes, tumors
 
@@ -37,8 +37,8 @@ _TRAINING_MIN = {"cpu": 15.0, "H100": 2.0}  # by device
 
 @dataclass(frozen=True)
 class StudyGoal:
-    """One figure: how it is read from one method's rows (infinite: not found; NaN: nothing was
-    measured), and what it should be at most (or at least, ``high``)."""
+    """One figure: how it is read from one method's rows (infinite: not found; NaN: not measured),
+    and what it should be at most (or at least, ``high``)."""
 
     text: str
     read: Callable[[pd.DataFrame], float]
@@ -47,7 +47,6 @@ class StudyGoal:
     high: bool = False
 
     def value(self, frame: pd.DataFrame) -> str:
-        """The number, to two digits."""
         value = self.read(frame)
         if not math.isfinite(value):
             return NOTHING if math.isnan(value) else NOT_FOUND
@@ -102,8 +101,10 @@ def goals_of(own: pd.DataFrame) -> list[StudyGoal]:
         *goals,
         StudyGoal("tumor centre, worst variant of any case",
                   lambda f: _per_scene(tumors(_noisy(f)), "center_mm").max(), 2.5, "< 10"),
-        StudyGoal("mIoU, deformed variants", lambda f: _miou(deformed(f)), 0.90, "0.71", high=True),
-        StudyGoal("mIoU, all variants", lambda f: _miou(_noisy(f)), 0.90, high=True),
+        StudyGoal("mIoU, deformed variants",
+                  lambda f: _per_scene(scenes(deformed(f)), "miou").median(), 0.90, "0.71", True),
+        StudyGoal("mIoU, all variants",
+                  lambda f: _per_scene(scenes(_noisy(f)), "miou").median(), 0.90, high=True),
         StudyGoal("target error, deformed variants", lambda f: _targets(deformed(f)).median(), 2.0),
         StudyGoal("target error, all variants", lambda f: _targets(_noisy(f)).median(), 2.0),
         StudyGoal("target error, worst variant of any case", lambda f: _targets(_noisy(f)).max()),
@@ -137,12 +138,7 @@ def _distance(frame: pd.DataFrame, variant: str, kind: str, key: str) -> float:
     return _per_scene(here[(here.variant == variant) & (here.lie == kind)], key).median()
 
 
-def _miou(frame: pd.DataFrame) -> float:
-    return _per_scene(scenes(frame), "miou").median()
-
-
 def _targets(frame: pd.DataFrame) -> pd.Series:
-    """None where the method carries no points."""
     return _per_scene(scenes(frame if frame.carries.any() else frame[:0]), "target_mm")
 
 

@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+import pandas as pd
 from jaxtyping import Float
 
 import tumortrack
@@ -32,8 +33,8 @@ from tumortrack.report.protocol import evaluate_scene
 from tumortrack.sense.camera import deproject
 from tumortrack.simulate.scene_folder import read_scene
 from tumortrack_lab.bench.machine import cpu_name
-from tumortrack_lab.peers.rigid import kabsch
-from tumortrack_lab.study.document import make_folder
+from tumortrack_lab.peers.base import kabsch
+from tumortrack_lab.study import document
 from tumortrack_lab.study.methods import Answer, Method, StudyCase
 
 CLEAN_VIEW = "clean"
@@ -75,15 +76,15 @@ class MeasurementStore:
         return self.folder / spec.case / method / file
 
     def read(self, spec: MeasurementSpec) -> dict | None:
-        """What was measured with exactly this specification; None where nothing was. Raises
-        ArtifactError: its file is damaged."""
+        """What was measured with exactly this specification, if anything. Raises ArtifactError:
+        its file is damaged."""
         path = self.path(spec)
         measurement = store.read_json(path) if path.exists() else {}
         return measurement if measurement.get("spec") == to_builtins(spec) else None
 
     def write(self, spec: MeasurementSpec, measured: dict) -> dict:
         """Keep a measurement, in one step. Raises StorageError: the disk refused."""
-        make_folder(self.path(spec).parent)
+        document.make_folder(self.path(spec).parent)
         measurement = {"spec": to_builtins(spec), **measured}
         store.write_json(self.path(spec), measurement)
         return measurement
@@ -108,7 +109,7 @@ class Job:
 
 
 class StudyStatus(NamedTuple):
-    """Where the measuring stands, after each measurement."""
+    """Where the measuring stands."""
 
     done: int
     total: int
@@ -131,25 +132,22 @@ def measure(
     specs = [spec_of(job, hashed) for job in jobs]
     known = {spec.digest: kept.read(spec) for spec in specs}
     todo = {d: (s, j) for s, j in zip(specs, jobs, strict=True) if known[d := s.digest] is None}
-    kinds = [_kind_of(spec) for spec, _ in todo.values()]
-    spent: dict[str, list[float]] = {}  # seconds, by kind
+    kinds = [f"{s.case} {s.method['name']} {s.grid}" for s, _ in todo.values()]
+    seconds: list[float] = []
     for number, (digest, (spec, job)) in enumerate(todo.items(), start=1):
         start = time.perf_counter()
         known[digest] = kept.write(spec, (one or measure_one)(job))
-        spent.setdefault(_kind_of(spec), []).append(time.perf_counter() - start)
+        seconds.append(time.perf_counter() - start)
         if report:
             done = len(known) - len(todo) + number
             name = f"{spec.case} {spec.method['name']} {spec.scene} {spec.fault}"
-            mean = float(np.mean([s for each in spent.values() for s in each]))
+            spent = pd.Series(seconds, kinds[:number]).groupby(level=0).mean()
             # A kind that was not measured yet counts with the mean of all.
-            left = float(sum(np.mean(spent.get(kind, mean)) for kind in kinds[number:]))
+            mean = float(np.mean(seconds))
+            left = float(sum(spent.get(kind, mean) for kind in kinds[number:]))
             name = name.removesuffix(" none")
             report(StudyStatus(done, len(known), number, name, mean, left))
     return [found for spec in specs if (found := known[spec.digest]) is not None]
-
-
-def _kind_of(spec: MeasurementSpec) -> str:
-    return f"{spec.case} {spec.method['name']} {spec.grid}"
 
 
 def spec_of(job: Job, hashed: Callable[[Path], str] = store.sha256_of) -> MeasurementSpec:
@@ -171,14 +169,6 @@ def spec_of(job: Job, hashed: Callable[[Path], str] = store.sha256_of) -> Measur
         fault=job.fault,
         fault_seed=job.fault_seed,
     )
-
-
-def by_method(jobs: Iterable[Job]) -> list[Job]:
-    """Jobs sorted so that each method's follow one another (a model is loaded once)."""
-    groups: dict[int, list[Job]] = {}
-    for job in jobs:
-        groups.setdefault(id(job.method), []).append(job)
-    return [job for group in groups.values() for job in group]
 
 
 def about_answer(job: Job, answer: Answer | None) -> dict:
@@ -240,11 +230,9 @@ def point_errors(
     """By tumor that was found: depth, displacement and error of points of its true surface, mm.
 
     A network gives no correspondence, so the error of a point is its distance to the estimated
-    surface, for every method alike. Depth is the distance to the nearest visible point;
-    displacement is what is left of a point's way after the best rigid motion of the whole organ,
-    and absent where the scene's surfaces are not the case's. ``truth``: camera frame; face n of a
-    part is face n of ``rest_ct``, the undeformed anatomy, CT frame; ``visible_mm``: the visible
-    surface without noise, camera frame; ``meshes``: the estimate, by part name.
+    surface (``meshes``, by part), for every method alike. Depth is the distance to the nearest
+    point of ``visible_mm``, the visible surface without noise; displacement is that of
+    ``displacements``. Camera frame but ``rest_ct``.
     """
     from scipy.spatial import cKDTree
 
@@ -265,11 +253,8 @@ def point_errors(
 
 
 def displacements(truth: Anatomy, rest_ct: Anatomy) -> dict[str, Float[np.ndarray, " n"]]:
-    """How far the corner of each face lies from its place under the best rigid motion, mm.
-
-    Corners, because a file's vertices may come back in another order; its faces do not. Empty
-    where the surfaces are not the case's own.
-    """
+    """How far the corner of each face lies from its place under the organ's best rigid motion, mm;
+    nothing where the surfaces are not the case's. A file keeps the order of faces, not vertices."""
     if [len(part.faces) for part in truth.parts] != [len(part.faces) for part in rest_ct.parts]:
         return {}
     now, before = (

@@ -1,7 +1,8 @@
 """What can be measured: cases with their scenes; trained models and peers, as methods that locate.
 
 A method has an identity, and turns a scene's cloud into an estimate. Nothing heavy is made or
-loaded before a measurement needs it.
+loaded before a measurement needs it. Models are trained by a preset's rules for a fixed number of
+steps, and kept.
 """
 
 from __future__ import annotations
@@ -10,12 +11,13 @@ import ast
 import hashlib
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from typing import NamedTuple
 
-import msgspec
+from msgspec.structs import replace as changed
 
 import tumortrack
 import tumortrack_lab.peers
@@ -26,17 +28,33 @@ from tumortrack.core.estimate import Estimate, OneWay
 from tumortrack.core.types import Anatomy
 from tumortrack.imaging.case import Case, load_case, save_case
 from tumortrack.imaging.surface import surfaces
+from tumortrack.models.config import TrainConfig
+from tumortrack.models.folder import is_finished
 from tumortrack.models.model import Model
 from tumortrack.phantom.digital import PhantomParameters, phantom_labels
 from tumortrack.registration.model import RegistrationModel
+from tumortrack.sense.clutter import ClutterConfig
+from tumortrack.sense.noise import CalibrationConfig
+from tumortrack.sense.occlusion import OcclusionConfig
+from tumortrack.simulate.deform import DragConfig
+from tumortrack.simulate.deform.drag import CONFIGURATIONS
 from tumortrack.simulate.scene_folder import Scene
 from tumortrack.tracking.tracker import Tracker
 from tumortrack.training.model import load_model
+from tumortrack.training.train import TrainingRun, TrainingStatus, train
 from tumortrack_lab.peers.base import Fit, Peer, estimate_of
 from tumortrack_lab.peers.kinds import PeerKind, peer_kinds
 
 _UP_LPS = (0.0, -1.0, 0.0)
 _VOXEL_MM = 0.8  # of the phantoms' labels
+# A preset: anatomy and rotations (limited, full) -> training configuration.
+Preset = Callable[[Anatomy, str], TrainConfig]
+Report = Callable[[str, TrainingStatus], None]
+MODELS = {"M_lim": "limited", "M_full": "full"}  # of the preset quick
+CLINIC = "clinic"
+UNREFINED = "_unrefined"  # how the names of models end whose warps are not laid on the cloud
+ABLATED = ("clinic_drags", "clinic_clean", "clinic_pointnet", "quick_elastic")
+_DRAGS = 10  # kinds of drags beside one elastic kind, all with equal chance
 _LIVE_STAGES = ("encode", "coarse", "refine", "fine")  # of a live frame: without the dense volume
 
 
@@ -56,13 +74,13 @@ class StudyCase:
 
 
 def study_case(name: str, folder: Path, scenes: Path, is_paper: bool = False) -> StudyCase:
-    """A case folder and its scenes; ArtifactError where the folder is no case, or damaged."""
+    """Raises ArtifactError: the folder is no case, or damaged."""
     case = load_case(folder)
     return StudyCase(name, folder, scenes, case.anatomy, case.up_lps, is_paper)
 
 
 def phantom_case(folder: Path, parameters: PhantomParameters) -> Path:
-    """Write a phantom's case folder from its exact labels; one that is there stays."""
+    """Write a phantom's case folder; one that is there stays."""
     if not folder.exists():
         labels = phantom_labels(parameters, _VOXEL_MM)
         case = Case(surfaces(labels)[0], labels, _UP_LPS, {"kind": "phantom"})
@@ -72,8 +90,7 @@ def phantom_case(folder: Path, parameters: PhantomParameters) -> Path:
 
 
 def named_folders(texts: Iterable[str], taken: Iterable[str]) -> dict[str, Path]:
-    """Folders by name, of options that read NAME=FOLDER; InputError for a name that is none, or
-    stands twice."""
+    """Folders by name, of options NAME=FOLDER; InputError for a name that is none, or double."""
     folders: dict[str, Path] = {}
     for text in texts:
         name, _, folder = text.partition("=")
@@ -83,8 +100,7 @@ def named_folders(texts: Iterable[str], taken: Iterable[str]) -> dict[str, Path]
     return folders
 
 
-@dataclass(frozen=True)
-class Answer:
+class Answer(NamedTuple):
     """An estimate, and what a live frame of it costs."""
 
     estimate: Estimate
@@ -96,15 +112,13 @@ class Method(ABC):
 
     device: str = "cpu"
 
+    # Spent once for a patient, before the first frame: training, or a peer's own work.
+    prepare_s: float | None
+
     @property
     @abstractmethod
     def identity(self) -> dict:
         """``kind``, ``name`` and everything else that decides the answers (JSON)."""
-
-    @property
-    @abstractmethod
-    def prepare_s(self) -> float | None:
-        """Spent once for a patient, before the first frame: training, or a peer's own work."""
 
     @property
     def about(self) -> dict:
@@ -118,7 +132,6 @@ class Method(ABC):
 
 
 def answer_of(fit: Fit, anatomy_ct: Anatomy, scene: Scene, grid: int) -> Answer:
-    """The answer of a method that carries the CT's points."""
     estimate = estimate_of(fit, anatomy_ct, scene.cloud.stamp_ns, grid)
     return Answer(replace(estimate, motion=OneWay(fit.carry)), fit.seconds)
 
@@ -160,12 +173,11 @@ class Network(Method):
         return str(next(self._tracker.model.network.parameters()).device.type)
 
     @property
-    def prepare_s(self) -> float | None:
+    def prepare_s(self) -> float | None:  # type: ignore[override]
         return self._provenance["training_s"]
 
     @property
     def about(self) -> dict:
-        """Of the training: seed, steps, seconds, device, validation mIoU."""
         keys = ("seed", "steps", "training_s", "device", "validation_miou")
         return {key: self._provenance[key] for key in keys}
 
@@ -181,19 +193,17 @@ def without_refinement(model: Model) -> RegistrationModel:
     validation knew refined ones. Raises InputError: the model is no warp."""
     if not isinstance(model, RegistrationModel):
         raise InputError("only warps are refined; an occupancy model has no unrefined form.")
-    change = msgspec.structs.replace
     return replace(
         model,
-        config=change(model.config, refine=change(model.config.refine, steps=0)),
-        in_distribution=change(model.in_distribution, fit_mm=math.inf),
-        calibration=change(model.calibration, usual_cost=math.inf),
+        config=changed(model.config, refine=changed(model.config.refine, steps=0)),
+        in_distribution=changed(model.in_distribution, fit_mm=math.inf),
+        calibration=changed(model.calibration, usual_cost=math.inf),
     )
 
 
 @dataclass(frozen=True, eq=False)
 class PeerMethod(Method):
-    """A peer of one patient as a method. Its identity names its settings, the peers' code by its
-    sha256, and the versions of the packages it rests on."""
+    """A peer of one patient as a method."""
 
     name: str
     kind: PeerKind
@@ -215,11 +225,10 @@ class PeerMethod(Method):
 
     @cached_property
     def peer(self) -> Peer:
-        """Made ready for the patient."""
         return self.kind.made_for(self.case.anatomy_ct, self.case.up_lps)
 
     @property
-    def prepare_s(self) -> float | None:
+    def prepare_s(self) -> float | None:  # type: ignore[override]
         return self.peer.prepare_s
 
     def locate(self, scene: Scene, grid: int) -> Answer:
@@ -248,3 +257,85 @@ def peer_method(name: str, case: StudyCase, bcpd: Path | None = None) -> PeerMet
     if name not in kinds:
         raise InputError(f"peer {name!r} is unknown. Allowed: {', '.join(kinds)}.")
     return PeerMethod(name, kinds[name], case)
+
+
+class Presets(NamedTuple):
+    quick: Preset
+    clinic: Preset
+
+
+def train_config(name: str, case: StudyCase, presets: Presets) -> TrainConfig:
+    """How the model of a name is trained. Raises InputError: no such model."""
+    quick = presets.quick(case.anatomy_ct, MODELS.get(name, "limited"))
+    if name in MODELS:
+        return quick
+    drags = {number: DragConfig(steps=steps) for number, steps in CONFIGURATIONS.items()}
+    if name.startswith("configuration_"):
+        return _with_scene(quick, deform=(drags[int(name.rpartition("_")[2])],))
+    own = presets.clinic(case.anatomy_ct, "limited")
+    match name:
+        case "clinic":
+            return own
+        case "clinic_drags":
+            # Some stay elastic: the body's modes and its library of states must be known.
+            both = (drags[3], drags[6]) * (_DRAGS // 2)
+            return _with_scene(own, deform=(*both, *own.scene.deform))
+        case "clinic_clean":
+            clean = {"occlusion": OcclusionConfig(), "clutter": ClutterConfig()}
+            return _with_scene(own, **clean, calibration=CalibrationConfig())
+        case "clinic_pointnet":
+            return changed(own, network=changed(own.network, encoder=quick.network.encoder))
+        case "quick_elastic":
+            return changed(quick, scene=changed(own.scene, occupancy=quick.scene.occupancy))
+    raise InputError(
+        f"model {name!r} is unknown. Allowed: {', '.join((*MODELS, CLINIC, *ABLATED))}, each "
+        f"warp also with {UNREFINED}, and configuration_1 to {max(CONFIGURATIONS)}."
+    )
+
+
+def _with_scene(config: TrainConfig, **fields: object) -> TrainConfig:
+    return changed(config, scene=changed(config.scene, **fields))
+
+
+@dataclass(frozen=True)
+class Trainer:
+    """Trains what is not trained yet, or was killed. Steps decide the end, not minutes: a loaded
+    machine gives the same model, only later."""
+
+    folder: Path
+    presets: Presets
+    device: str = "auto"
+    workers: int | None = None
+    report: Report = lambda *_: None
+
+    def steps_for(self, case: StudyCase, name: str, scenes: int) -> int:
+        """Steps after which a model has seen so many scenes."""
+        config = train_config(name.removesuffix(UNREFINED), case, self.presets)
+        return max(1, scenes // config.batch_size)
+
+    def model(self, case: StudyCase, name: str, seed: int, steps: int) -> Network:
+        """The model under FOLDER/CASE/NAME-seed-steps; an unrefined one is the refined one's.
+        Raises InputError: no such model; ArtifactError: what lies there belongs to another case or
+        configuration; StorageError: the disk refused; Interrupted: Ctrl-C, the state is saved."""
+        import torch
+
+        trained = name.removesuffix(UNREFINED)
+        folder = self.folder / case.name / f"{trained}-seed{seed}-{steps}steps"
+        run = TrainingRun(
+            anatomy_ct=case.anatomy_ct,
+            up_lps=case.up_lps,
+            case_sha256=store.sha256_of(case.folder / store.MANIFEST),
+            config=train_config(trained, case, self.presets),
+            seed=seed,
+            steps=steps,
+            device=self.device,  # type: ignore[arg-type]
+            workers=self.workers,
+        )
+        # A finished model of another run is refused by training, with a clear text.
+        about = store.read_json(folder / store.MANIFEST) if is_finished(folder) else {}
+        if about.get("provenance", {}).get("run_sha256") != run.identity:
+            threads = torch.get_num_threads()
+            label = f"{case.name} {trained} seed {seed}"
+            train(run, folder, lambda status: self.report(label, status))
+            torch.set_num_threads(threads)  # training leaves some cores to its workers
+        return Network(name, folder, self.device, unrefined=trained != name)

@@ -7,7 +7,6 @@ is the text's "approximately", "less than or equal to" and "less than".
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -63,11 +62,9 @@ EXPOSED_MM = 0.5  # a tumor's surface this close to the organ's is the organ's s
 EXOPHYTIC_SHARE = 0.05
 
 
-@dataclass(frozen=True)
-class Lie:
-    """How a tumor lies in the organ: the share of its surface that is the organ's own surface
-    (within 0.5 mm), and the least parenchyma above it, mm. It counts as exophytic from a
-    share of 5 %."""
+class Lie(NamedTuple):
+    """How a tumor lies in the organ: the share of its surface that is the organ's own, and the
+    least parenchyma above it, mm."""
 
     exposed_share: float
     cover_mm: float
@@ -75,6 +72,9 @@ class Lie:
     @property
     def kind(self) -> Kind:
         return "exophytic" if self.exposed_share >= EXOPHYTIC_SHARE else "endophytic"
+
+    def text(self, tumor: str) -> str:
+        return f"{tumor.rpartition('_')[2]}, {self.kind}"
 
 
 def tumor_lies(anatomy: Anatomy) -> dict[str, Lie]:

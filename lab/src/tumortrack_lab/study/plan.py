@@ -8,9 +8,8 @@ from typing import Literal, NamedTuple, TypeVar, get_args
 
 from tumortrack.core.config import Config
 from tumortrack_lab.study.bound import BOUNDS
-from tumortrack_lab.study.measure import CLEAN_VIEW, Job, by_method
-from tumortrack_lab.study.methods import Method, Network, StudyCase
-from tumortrack_lab.study.models import CLINIC, UNREFINED
+from tumortrack_lab.study.measure import CLEAN_VIEW, Job
+from tumortrack_lab.study.methods import CLINIC, UNREFINED, Method, Network, StudyCase
 from tumortrack_lab.study.resection import Truth, cutting
 
 VARIANTS = ("D0", "D1", "D2", "D3", "Rot90", "Rot180", "Rot270", "G1", "P1")
@@ -157,7 +156,9 @@ def jobs_of(
                 made, block.views, block.faults, block.variants
             ):
                 jobs.append(Job(case, one, variant, view, block.grid, *fault, also))
-    return by_method(jobs)
+    # Each method's follow one another: a model is loaded once.
+    methods_in_order = list(dict.fromkeys(id(job.method) for job in jobs))
+    return sorted(jobs, key=lambda job: methods_in_order.index(id(job.method)))
 
 
 def scenes_of(

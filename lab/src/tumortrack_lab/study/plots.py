@@ -6,6 +6,7 @@ its own, so that the plots read in grey.
 
 from __future__ import annotations
 
+import contextlib
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -19,19 +20,9 @@ from tumortrack.report.pictures import FROM_SIDE, draw_solid_view, scene_legend
 from tumortrack.report.protocol import compare
 from tumortrack.simulate.scene_folder import Scene, read_scene
 from tumortrack_lab.study import paper
+from tumortrack_lab.study import tables as of
 from tumortrack_lab.study.measure import Job
-from tumortrack_lab.study.tables import (
-    FALLING,
-    ORGAN,
-    SEVERITIES,
-    by_seed,
-    groups,
-    label_of,
-    levels_of,
-    names,
-    spaced,
-    tumors,
-)
+from tumortrack_lab.study.tables import by_seed, groups, label_of, names, spaced, tumors
 from tumortrack_lab.twin.faults import KINDS
 
 if TYPE_CHECKING:
@@ -67,9 +58,7 @@ def _style(method: str) -> dict[str, Any]:
 def error_against(frame: pd.DataFrame, key: str, path: Path) -> bool:
     """Error of points of the tumors' true surfaces against ``depth_mm`` or ``displacement_mm``:
     medians of groups of equally many points, the middle half shaded for the first two methods.
-
-    Returns False, and draws nothing, where no measurement has such points.
-    """
+    False, and nothing drawn, where no measurement has such points."""
     known = frame[frame[key].notna()]
     curves = {
         method: (np.concatenate([*mine[key]]), np.concatenate([*mine.error_mm]))
@@ -94,10 +83,9 @@ def error_against(frame: pd.DataFrame, key: str, path: Path) -> bool:
     axes.set_ylim(0, highest)  # bands may go beyond: a bad method must not flatten the others
     axes.set_xlim(left=0)
     _tidy(axes)
-    title = "median of each eighth of the points\n(band: middle half)"
     axes.legend(
-        loc="upper left", bbox_to_anchor=(1.02, 1.0), frameon=False, fontsize=9.5, title=title,
-        title_fontsize=9, alignment="left",
+        loc="upper left", bbox_to_anchor=(1.02, 1.0), frameon=False, fontsize=9.5, alignment="left",
+        title="median of each eighth of the points\n(band: middle half)", title_fontsize=9,
     )  # fmt: skip
     axes.set_title(f"Tumor error against {_ALONG[key]}", loc="left", fontsize=12)
     save(drawing, path)
@@ -167,22 +155,25 @@ def _open_mark(style: dict[str, Any]) -> dict[str, Any]:
 
 
 def _variant_legend(models: list[str]) -> list[Line2D]:
+    lines: dict[str, dict[str, Any]] = {}
+    for model in models:
+        lines[f"{model}, here"] = {"markersize": 7, "lw": 1.6, **_style(model)}
+        lines[f"{model}, paper (hydrogel)"] = _open_mark(_style(model))
+    most = {"color": "0.4", "markersize": 9, "lw": 1.6, "marker": r"$\downarrow$"}
+    return _handles({**lines, "paper: at most": most})
+
+
+def _handles(lines: dict[str, dict[str, Any]]) -> list[Line2D]:
+    """Of a legend: by their labels."""
     from matplotlib.lines import Line2D
 
-    handles = []
-    for model in models:
-        here, there = f"{model}, here", f"{model}, paper (hydrogel)"
-        handles.append(Line2D([], [], markersize=7, lw=1.6, label=here, **_style(model)))
-        handles.append(Line2D([], [], label=there, **_open_mark(_style(model))))
-    most: dict[str, Any] = {"marker": r"$\downarrow$", "label": "paper: at most"}
-    return [*handles, Line2D([], [], color="0.4", markersize=9, lw=1.6, **most)]
+    return [Line2D([], [], label=label, **style) for label, style in lines.items()]
 
 
 def severity_curves(frame: pd.DataFrame, path: Path) -> None:
-    """Hausdorff distance of each tumor against each kind's level, a panel for each kind, by the
-    rule of the table. Errors are on a logarithmic scale: what matters is by which factor they
-    grow."""
-    kinds = [kind for kind in KINDS if levels_of(frame, kind)]
+    """Hausdorff distance of each tumor against each kind's level, by the rule of the table. Errors
+    are on a logarithmic scale: what matters is by which factor they grow."""
+    kinds = [kind for kind in KINDS if of.levels_of(frame, kind)]
     columns = min(4, max(len(kinds), 1))
     rows = -(-max(len(kinds), 1) // columns)
     width, height = 3.1 * columns, rows * 2.75 + 0.45
@@ -195,12 +186,12 @@ def severity_curves(frame: pd.DataFrame, path: Path) -> None:
     dashes = [*zip(names(tumors(frame), "part"), _DASHES, strict=False)]
     for axes, kind in zip(panels.flat, kinds, strict=False):
         for (method,), mine in groups(frame, "method"):
-            levels = levels_of(mine, kind)
+            levels = of.levels_of(mine, kind)
             for tumor, dash in dashes:
                 here = [(level, rows[rows.part == tumor]) for level, rows in levels]
                 _severity_curve(axes, here, {**_style(method), "linestyle": dash})
-        axes.set_xlabel(SEVERITIES[kind])
-        if kind in FALLING:
+        axes.set_xlabel(of.SEVERITIES[kind])
+        if kind in of.FALLING:
             axes.invert_xaxis()
         _tidy(axes)
     for axes in panels.flat[len(kinds) :]:
@@ -213,9 +204,11 @@ def severity_curves(frame: pd.DataFrame, path: Path) -> None:
     first.set_ylim(min(low, 0.9), max(high, 11.0))
     for row in panels:
         row[0].set_ylabel("tumor Hausdorff distance, mm")
+    lines = {label_of(method): _style(method) for method in names(frame, "method")}
+    lines |= {spaced(tumor): {"color": "0.3", "linestyle": dash} for tumor, dash in dashes}
     drawing.legend(
-        handles=_severity_legend(frame, dashes), loc="upper left", bbox_to_anchor=(0.04, 1.0),
-        ncols=4, frameon=False, fontsize=10,
+        handles=_handles({label: {"lw": 1.6, **style} for label, style in lines.items()}),
+        loc="upper left", bbox_to_anchor=(0.04, 1.0), ncols=4, frameon=False, fontsize=10,
     )  # fmt: skip
     save(drawing, path)
 
@@ -240,14 +233,6 @@ def _severity_curve(
     axes.plot(lost, [0.97] * len(lost), transform=axes.get_xaxis_transform(), **cross)
 
 
-def _severity_legend(frame: pd.DataFrame, dashes: list[tuple[str, Any]]) -> list[Line2D]:
-    from matplotlib.lines import Line2D
-
-    styles = {label_of(method): _style(method) for method in names(frame, "method")}
-    styles |= {spaced(tumor): {"color": "0.3", "linestyle": dash} for tumor, dash in dashes}
-    return [Line2D([], [], lw=1.6, label=label, **style) for label, style in styles.items()]
-
-
 def gallery(jobs: list[Job], path: Path) -> None:
     """The estimate over the truth, seen from the side: a row for each variant, a column for each
     method of these jobs of one case. Raises InputError: a scene cannot be read."""
@@ -267,10 +252,9 @@ def gallery(jobs: list[Job], path: Path) -> None:
         scene = read_scene(jobs[0].case.scene(variant, view))
         row[0].set_ylabel(variant, fontsize=13, **bold)
         for axes, method in zip(row, methods, strict=True):
-            try:
+            estimate = None
+            with contextlib.suppress(NoEstimate, InputError):
                 estimate = method.locate(scene, jobs[0].grid).estimate
-            except (NoEstimate, InputError):
-                estimate = None
             title = _numbers(estimate, scene) if estimate else "nothing found"
             draw_solid_view(axes, scene, estimate, FROM_SIDE)
             axes.set_title(title, fontsize=9.5)
@@ -282,12 +266,11 @@ def gallery(jobs: list[Job], path: Path) -> None:
 
 
 def _numbers(estimate: Estimate, scene: Scene) -> str:
-    each = [
+    parts = {name: part for name, part in compare(estimate, scene).items() if name != of.ORGAN}
+    return "Hausdorff: " + ", ".join(
         f"{spaced(name)} " + (f"{part['hausdorff_mm']:.1f} mm" if part["found"] else "not found")
-        for name, part in compare(estimate, scene).items()
-        if name != ORGAN
-    ]
-    return "Hausdorff: " + ", ".join(each)
+        for name, part in parts.items()
+    )
 
 
 def _tidy(axes: Axes) -> None:

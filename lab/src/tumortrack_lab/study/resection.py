@@ -92,12 +92,11 @@ PLANNERS = tuple(Planner(method=m, sigmas=s) for m in ("published", "margin") fo
 class Truth(Method):
     """Answers what is so: the bound of every planner."""
 
-    name: str = TRUTH
     prepare_s: float | None = None
 
     @property
     def identity(self) -> dict:
-        return {"kind": "bound", "name": self.name, "tumortrack": tumortrack.__version__}
+        return {"kind": "bound", "name": TRUTH, "tumortrack": tumortrack.__version__}
 
     def locate(self, scene: Scene, grid: int) -> Answer:
         still = Fit(lambda points: points, 0.0)
@@ -122,8 +121,7 @@ def scattered(estimate: Estimate) -> Estimate:
 
 @cache
 def cutting() -> dict:
-    """What else decides a measurement whose estimate is planned on and cut: such are apart from
-    those of a method's accuracy."""
+    """What else decides a measurement whose estimate is planned on and cut."""
     planning = (Path(tumortrack.__file__).parent / "plan").glob("*.py")
     code = code_sha256([*planning, Path(tumortrack_lab.cut.__file__)])
     planners = [to_builtins(planner) for planner in PLANNERS]
@@ -131,8 +129,8 @@ def cutting() -> dict:
 
 
 def cut_one(job: Job) -> dict:
-    """One measurement: ``plans`` by tumor and planner; what the cut did, or why there is none.
-    Raises InputError: a scene that does not say where the table is."""
+    """One measurement: ``plans`` by tumor and planner. Raises InputError: a scene that does not say
+    where the table is."""
     scene = read_scene(job.scene)
     if "camera_from_bench" not in scene.meta:
         raise InputError(
@@ -174,7 +172,6 @@ def _planned_and_cut(truth: Anatomy, found: Located, planner: Planner, tumor: st
 
 @cache
 def exophytic_tumors(case: StudyCase) -> tuple[str, ...]:
-    """Parts' names, by the rule of the tables of accuracy."""
     lies = tumor_lies(case.anatomy_ct)
     return tuple(name for name, lie in lies.items() if lie.kind == "exophytic")
 
@@ -220,33 +217,21 @@ def tables_of(measurements: list[dict]) -> str:
 
 
 def _rows(frame: pd.DataFrame) -> list[list[str]]:
-    return [
-        [method, _label(planner), *_texts(plans)]
-        for (method, planner), plans in groups(frame, "method", "planner")
-    ]
+    rows = []
+    for (method, planner), plans in groups(frame, "method", "planner"):
+        made = plans[plans.refused.isna()]
+        free, removed = made[made.detached.astype(bool)], 100 * made.removed_share
+        row = [method, _label(planner), f"{len(made)} of {len(plans)}"]
+        row += [f"{n} of {len(made)}" for n in (len(free), (made.removed_share >= _WHOLE).sum())]
+        row += [_text(share, down=True) for share in (removed.median(), removed.min())]
+        row.append(_text(made.left_ml.max(), digits=2))
+        margins = made.margin_mm.median(), made.margin_mm.min()
+        rows.append([*row, *map(_text, (*margins, free.healthy_ml.mean()))])
+    return rows
 
 
 def _label(planner: str) -> str:
-    """For readers."""
     return planner.replace("published", "the paper's", 1).replace("margin", "ours", 1)
-
-
-def _texts(plans: pd.DataFrame) -> list[str]:
-    """One planner on the estimates of one method."""
-    made = plans[plans.refused.isna()]
-    free = made[made.detached.astype(bool)]
-    removed = 100 * made.removed_share
-    return [
-        f"{len(made)} of {len(plans)}",
-        f"{len(free)} of {len(made)}",
-        f"{(made.removed_share >= _WHOLE).sum()} of {len(made)}",
-        _text(removed.median(), down=True),
-        _text(removed.min(), down=True),
-        _text(made.left_ml.max(), digits=2),
-        _text(made.margin_mm.median()),
-        _text(made.margin_mm.min()),
-        _text(free.healthy_ml.mean()),
-    ]
 
 
 def _text(value: float, digits: int = 1, down: bool = False) -> str:

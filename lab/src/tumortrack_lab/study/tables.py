@@ -15,7 +15,7 @@ import pandas as pd
 
 from tumortrack_lab.study import paper
 from tumortrack_lab.study.document import table
-from tumortrack_lab.study.models import CLINIC
+from tumortrack_lab.study.methods import CLINIC
 from tumortrack_lab.twin.faults import KINDS, clean_level, parse
 
 NOT_FOUND, NOTHING, EMPTY = "not found", "–", ""
@@ -157,30 +157,27 @@ def change(here: pd.Series, base: pd.Series) -> str:
 
 
 def label_of(method: str) -> str:
-    """How a table names a method."""
     return METHODS.get(method, method)
 
 
 def accuracy(frame: pd.DataFrame, lies: Lies, is_paper: bool) -> str:
     """The paper's table of results for one case: a row for each variant, model and tumor."""
     head = ["variant", "model", "tumor", *_KEYS, *_WHOLE[1::-1]]
-    if is_paper:
-        head[4:4] = ["paper"]
-        head[8:8] = ["paper"]
     rows = []
     for (variant, model), mine in groups(frame, "variant", "method"):
         target, miou, _ = _whole(mine)
         for number, ((tumor,), part) in enumerate(groups(tumors(mine), "part")):
-            kind = lies[tumor].kind
-            row = [*_once(number, variant, model), _tumor_text(tumor, lies), *_distances(part)]
+            row = [*_once(number, variant, model), lies[tumor].text(tumor), *_distances(part)]
             row += _once(number, miou, target)
             if is_paper:
-                for at, figure in (
-                    (4, paper.hausdorff(variant, model, kind)),
-                    (8, paper.center(variant, model)),
-                ):
-                    row[at:at] = [EMPTY if figure is None else figure.text]
+                theirs = paper.hausdorff(variant, model, lies[tumor].kind)
+                row.insert(4, theirs.text if theirs else EMPTY)
+                center = paper.center(variant, model)
+                row.insert(8, center.text if center else EMPTY)
             rows.append(row)
+    if is_paper:
+        head.insert(4, "paper")
+        head.insert(8, "paper")
     return table(head, rows, left=3)
 
 
@@ -189,13 +186,12 @@ def methods(frame: pd.DataFrame, lies: Lies) -> str:
     head = ["method", "tumor", *_KEYS, "mIoU", "target error", "failed", "s a frame"]
     rows = []
     for (method,), mine in groups(frame, "method"):
-        frame_s = by_seed(scenes(mine), "frame_s")
-        slow = 1 <= frame_s.mean() < float("inf")
+        frame_s, prepare_s = (by_seed(scenes(mine), key) for key in ("frame_s", "prepare_s"))
+        digits = 1 if 1 <= frame_s.mean() < np.inf else 3
         target, miou, failed = _whole(mine)
-        whole = [miou, target, failed, text(frame_s, 1 if slow else 3)]
-        whole.append(text(by_seed(scenes(mine), "prepare_s")))
+        whole = [miou, target, failed, text(frame_s, digits), text(prepare_s)]
         for number, ((tumor,), part) in enumerate(groups(tumors(mine), "part")):
-            row = [*_once(number, label_of(method)), _tumor_text(tumor, lies), *_distances(part)]
+            row = [*_once(number, label_of(method)), lies[tumor].text(tumor), *_distances(part)]
             rows.append(row + _once(number, *whole))
     return table([*head, "preparation, s"], rows, left=2)
 
@@ -212,15 +208,14 @@ def deformation(frame: pd.DataFrame) -> str:
 
 
 def conditions(frame: pd.DataFrame, field: str, base: str) -> str:
-    """One row for each method and condition (``field``: fault or view): medians over the
-    scenes, and in brackets the change against ``base``."""
+    """One row for each method and condition (``field``: fault or view): medians over the scenes, in
+    brackets the change against ``base``."""
     keys, first = ("HD", "centre"), "view" if field == "view" else "error source"
     rows = []
     for (method,), mine in groups(frame, "method"):
         reference = mine[mine[field] == base]
         for number, ((condition,), here) in enumerate(groups(mine, field)):
-            row = _once(number, label_of(method))
-            row.append(CONDITIONS[field].get(condition, condition))
+            row = [*_once(number, label_of(method)), CONDITIONS[field].get(condition, condition)]
             for tumor in names(tumors(frame), "part"):
                 parts = [some[some.part == tumor] for some in (here, reference)]
                 row += [change(*(by_seed(part, _KEYS[key]) for part in parts)) for key in keys]
@@ -244,8 +239,7 @@ def severities(frame: pd.DataFrame) -> str:
 
 
 def levels_of(frame: pd.DataFrame, kind: str) -> list[tuple[float, pd.DataFrame]]:
-    """The rows of each level of a kind of fault, from mild to severe, the clean scene among
-    them."""
+    """The rows of each level of a kind of fault, mild to severe, the clean scene among them."""
     levels = {}
     for (fault,), here in groups(frame, "fault"):
         severity = parse(fault)
@@ -258,8 +252,8 @@ def levels_of(frame: pd.DataFrame, kind: str) -> list[tuple[float, pd.DataFrame]
 
 
 def ablation(frame: pd.DataFrame) -> str:
-    """What each piece of the preset brought: one row for each model of one case; a group of
-    columns for each view. Medians over scenes and tumors."""
+    """One row for each model of one case, a group of columns for each view; medians over scenes and
+    tumors."""
     views = names(frame, "view")
     head = ["model", "training, s", "frame, s"]
     for view in views:
@@ -281,7 +275,6 @@ def ablation(frame: pd.DataFrame) -> str:
 
 
 def lies_text(case: str, lies: Lies) -> str:
-    """Which tumor of a case is exophytic, and by what measure."""
     each = [
         f"{spaced(name)} is {lie.kind} ({100 * lie.exposed_share:.0f} % of its surface "
         f"is the organ's own, least cover {lie.cover_mm:.1f} mm)"
@@ -292,10 +285,6 @@ def lies_text(case: str, lies: Lies) -> str:
 
 def spaced(part: str) -> str:
     return part.replace("_", " ")
-
-
-def _tumor_text(tumor: str, lies: Lies) -> str:
-    return f"{tumor.rpartition('_')[2]}, {lies[tumor].kind}"
 
 
 def _whole(frame: pd.DataFrame) -> list[str]:
@@ -319,13 +308,12 @@ def _once(number: int, *texts: str) -> list[str]:
 
 
 def caption(measurements: list[dict], command: str) -> str:
-    """What stands below a block: command, scenes, models with their steps and training time,
-    device, load (seconds mean little without it), grid; from the measurements."""
+    """What stands below a block; seconds mean little without the machine and its load."""
     about = pd.json_normalize(
         [{k: one[k] for k in ("spec", "method", "provenance")} for one in measurements]
     )
-    scene = ("case", "scene", "fault", "fault_seed")
-    scenes = about.drop_duplicates([f"spec.{key}" for key in scene])
+    scene = [f"spec.{key}" for key in ("case", "scene", "fault", "fault_seed")]
+    scenes = about.drop_duplicates(scene)
     loads = about["provenance.load"].dropna()
     busy = f"average {loads.min():.1f} to {loads.max():.1f}" if len(loads) else "not known"
     models = about[about["spec.method.kind"] == "network"]
@@ -338,7 +326,6 @@ def caption(measurements: list[dict], command: str) -> str:
 
 
 def _training(about: pd.DataFrame) -> str:
-    """One sentence about the models."""
     models = about.drop_duplicates("spec.method.model_sha256", keep="last")
     minutes = models["method.training_s"] / 60
     return (
@@ -350,9 +337,8 @@ def _training(about: pd.DataFrame) -> str:
 
 
 def _device(about: dict) -> str:
-    if about["device"] != "cpu":
-        return f"{about['device']} beside {about['cpu']}"
-    return f"{about['cpu']} ({about['cores']} cores, PyTorch on {about['threads']})"
+    on_cpu = "{cpu} ({cores} cores, PyTorch on {threads})"
+    return (on_cpu if about["device"] == "cpu" else "{device} beside {cpu}").format(**about)
 
 
 def _listed(items: Iterable[object], form: str = "{}") -> str:

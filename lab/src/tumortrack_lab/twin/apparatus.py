@@ -31,17 +31,8 @@ from tumortrack.core.types import Anatomy, Mesh
 from tumortrack.imaging.raster import label_grid
 from tumortrack.report.metrics import surface_samples
 from tumortrack_lab.tets import TetMesh, embed, tetrahedralise
-from tumortrack_lab.twin.equilibrium import (
-    Contact,
-    ContactPlate,
-    Convergence,
-    EquilibriumProblem,
-    Hold,
-    Obstacles,
-    Rod,
-    Support,
-    settle,
-)
+from tumortrack_lab.twin import equilibrium
+from tumortrack_lab.twin.equilibrium import Contact, ContactPlate, Nodes, Obstacles, Rod, Support
 from tumortrack_lab.twin.solid import NeoHookeanSolid
 
 GRAVITY_KPA_PER_MM = 9.81e-6  # of 1 kg/m^3
@@ -51,7 +42,6 @@ _LARGEST_VOLUME_CHANGE = 0.02
 _SINK_STEPS = 15
 _SINK_TOLERANCE_MM = 0.4
 
-Nodes = Float64[np.ndarray, "n 3"]
 Step = Callable[..., Nodes]  # of the load: nodes, obstacles, text, added weight -> nodes at rest
 
 
@@ -74,7 +64,7 @@ class ApparatusConfig(Config, frozen=True, kw_only=True):
 
     def __post_init__(self) -> None:
         for name in self.__struct_fields__:
-            if not 0 < getattr(self, name) < float("inf"):
+            if not 0 < getattr(self, name) < np.inf:
                 raise InputError(f"bench {name} is {getattr(self, name)}; it must be positive.")
         if not self.poisson <= 0.495:
             raise InputError(f"bench poisson is {self.poisson}; it must be at most 0.495.")
@@ -90,8 +80,6 @@ class State:
 
 
 class Apparatus:
-    """The apparatus with one case on it."""
-
     def __init__(
         self, anatomy_ct: Anatomy, up_lps: tuple[float, float, float], config: ApparatusConfig
     ) -> None:
@@ -102,7 +90,11 @@ class Apparatus:
         ratio = 1 + (config.tumor_ratio - 1) * _tumor_share(self.mesh, self.anatomy)
         shear_kpa = config.youngs_kpa * ratio / (2 * (1 + config.poisson))
         self.solid = NeoHookeanSolid(self.mesh, shear_kpa, config.poisson)
-        points_mm, areas_mm2 = _contact_points(self.anatomy.organ)
+        # One point of the surface per cube of 1 mm that it passes, and the area there.
+        points_mm, areas_mm2, _ = surface_samples(self.anatomy.organ, 1.0)
+        cubes = np.floor(points_mm).astype(int)
+        _, first, cube = np.unique(cubes, axis=0, return_index=True, return_inverse=True)
+        points_mm, areas_mm2 = points_mm[first], np.bincount(cube.ravel(), areas_mm2)
         self.contact = Contact(embed(self.mesh, points_mm), areas_mm2, config.contact_kpa_mm)
         volumes = self.solid.node_volumes_mm3
         self._weight_mn = config.density_kg_m3 * GRAVITY_KPA_PER_MM * volumes
@@ -110,7 +102,7 @@ class Apparatus:
         surface = embed(self.mesh, points_mm[under])
         packing = Contact(surface, areas_mm2[under], config.packing_kpa_mm)
         self._packing = packing, (Support(points_mm[under, 2]),)
-        self._hold = Hold(self.mesh.nodes_mm, volumes / volumes.sum())
+        self._hold = equilibrium.Hold(self.mesh.nodes_mm, volumes / volumes.sum())
 
     def carry(
         self, state: State, points_ct: Float[np.ndarray, "m 3"]
@@ -122,13 +114,13 @@ class Apparatus:
 
     def settle(
         self, nodes_mm: np.ndarray, obstacles: Obstacles, weight: float = 0.0
-    ) -> tuple[np.ndarray, Convergence]:
+    ) -> tuple[np.ndarray, equilibrium.Convergence]:
         """One load step: the nodes at rest in their bed among obstacles, under so many weights more
         than in the CT. Raises TumortrackError: no equilibrium was found."""
         contacts = ((self.contact, (Support(), *obstacles)), self._packing)
         load_mn = weight * self._weight_mn
-        problem = EquilibriumProblem(self.solid, contacts, load_mn, self._hold)
-        return settle(problem, nodes_mm)
+        problem = equilibrium.EquilibriumProblem(self.solid, contacts, load_mn, self._hold)
+        return equilibrium.settle(problem, nodes_mm)
 
     def midsection(self, nodes_mm: np.ndarray, axis: int = 2) -> tuple[float, float]:
         """Lowest and highest z (or y) of the surface under the middle half of the plate, mm."""
@@ -136,11 +128,6 @@ class Apparatus:
         in_middle = np.abs(at_rest[:, 0]) < self.config.plate_mm / 4
         there = self.contact.surface.carry(nodes_mm)[in_middle, axis]
         return float(there.min()), float(there.max())
-
-    def sides_outwards_mm(self, nodes_mm: np.ndarray) -> tuple[float, float]:
-        """How far the midsection's two lateral edges have moved outwards."""
-        before, after = (self.midsection(nodes, 1) for nodes in (self.mesh.nodes_mm, nodes_mm))
-        return before[0] - after[0], after[1] - before[1]
 
 
 def moved(anatomy: Anatomy, b_from_a: Float64[np.ndarray, "4 4"]) -> Anatomy:
@@ -164,16 +151,6 @@ def _bench_from_ct(organ_ct: Mesh, up_lps: tuple[float, float, float]) -> np.nda
     turned = organ_ct.vertices_mm @ rotation.T
     box = np.stack([turned.min(0), turned.max(0)])
     return rigid(rotation, -np.array([*box.mean(0)[:2], box[0, 2]]))
-
-
-def _contact_points(
-    organ: Mesh, spacing_mm: float = 1.0
-) -> tuple[Float64[np.ndarray, "m 3"], Float64[np.ndarray, " m"]]:
-    """One point of the surface per cube of this size that it passes, and the area there."""
-    points_mm, areas_mm2, _ = surface_samples(organ, spacing_mm)
-    cubes = np.floor(points_mm / spacing_mm).astype(int)
-    _, first, cube = np.unique(cubes, axis=0, return_index=True, return_inverse=True)
-    return points_mm[first], np.bincount(cube.ravel(), areas_mm2)
 
 
 def _faces_down(
@@ -209,14 +186,12 @@ def solve(
     progress: Callable[[str], None] = lambda line: None,
 ) -> State:
     """Bring the organ into a state. ``warm``: for D2 and D3, a state of less compression to go on
-    from (the answer is the same); ``progress``: called with a line after each load step.
-
-    Raises InputError: no such state; TumortrackError: no equilibrium, or the organ's volume changed
-    by over 2 %.
-    """
+    from (the answer is the same); ``progress``: called with a line after each load step. Raises
+    InputError: no such state; TumortrackError: no equilibrium, or the organ's volume changed by
+    over 2 %."""
     if name not in STATES:
         raise InputError(f"state {name!r} is not known; allowed: {', '.join(STATES)}.")
-    start, log = time.perf_counter(), list[Convergence]()
+    start, log = time.perf_counter(), list[equilibrium.Convergence]()
     if name == "D0":
         return State(name, bench.mesh.nodes_mm, {"state": name, "volume_change": 0.0})
 
@@ -226,21 +201,20 @@ def solve(
         progress(f"{text}: {convergence.iterations} iterations")
         return nodes
 
-    if name == "G1":
-        nodes, about = _sink(bench, step)
-    elif name == "P1":
-        nodes, about = _poke(bench, step)
-    else:
+    if name in COMPRESSION_MM:
         nodes, about = _compress(bench, step, COMPRESSION_MM[name], warm)
+    else:
+        nodes, about = (_sink if name == "G1" else _poke)(bench, step)
     stretch = bench.solid.stretch(nodes)
     change = float(np.average(stretch, weights=bench.mesh.volumes_mm3) - 1)
     if abs(change) > _LARGEST_VOLUME_CHANGE:
         raise TumortrackError(f"{name}: the organ's volume changed by {change:.1%}, over 2 %.")
     moved_mm = np.linalg.norm(nodes - bench.mesh.nodes_mm, axis=1)
+    left, right = np.subtract(bench.midsection(nodes, 1), bench.midsection(bench.mesh.nodes_mm, 1))
     report = {
         "state": name,
         **about,
-        "sides_outwards_mm": list(bench.sides_outwards_mm(nodes)),
+        "sides_outwards_mm": [-float(left), float(right)],
         "volume_change": change,
         "least_stretch": float(stretch.min()),
         "largest_displacement_mm": float(moved_mm.max()),
@@ -276,11 +250,9 @@ def _compress(bench: Apparatus, step: Step, by_mm: float, warm: State | None) ->
 
 
 def _sink(bench: Apparatus, step: Step) -> tuple[Nodes, dict]:
-    """Weight over stiffness grows until the midsection has sunk as far as wanted.
-
-    Tissue softer by a factor and weight multiplied by it are the same problem; the second keeps
-    the factorised stiffness. One weight of it is borne already, as the CT shows.
-    """
+    """Weight over stiffness grows until the midsection has sunk as far as wanted. Softer tissue and
+    more weight are the same problem; the second keeps the factorised stiffness. One weight of it is
+    borne already, as the CT shows."""
     wanted, nodes = bench.config.sink_mm, bench.mesh.nodes_mm
     height, added, sunk = bench.midsection(nodes)[1], 4.0, 0.0
     less, more = (0.0, 0.0), (np.inf, np.inf)  # weights added, and how far it sank
@@ -308,22 +280,22 @@ def _sink(bench: Apparatus, step: Step) -> tuple[Nodes, dict]:
 def _poke(bench: Apparatus, step: Step) -> tuple[Nodes, dict]:
     config, nodes = bench.config, bench.mesh.nodes_mm
     radius = config.poke_diameter_mm / 2
-    x, y, z = _poke_point(bench).tolist()
+    point, up = _poke_point(bench), np.array([0.0, 0.0, 1.0])
     for depth in _increments(0.0, config.poke_mm, config.load_step_mm / 2):
-        rod = Rod((x, y, z - depth), (0.0, 0.0, 1.0), radius)
+        rod = Rod(point - depth * up, up, radius)
         nodes = step(nodes, (rod,), f"rod pressed in by {depth:.1f} mm")
     load_n = -float(bench.contact.load_mn(nodes, rod)[2]) / 1000
     if load_n <= 0:
         raise TumortrackError("P1: the surface slipped past the rod; take a finer mesh (edge_mm).")
     return nodes, {
-        "poke": {"tip_mm": list(rod.tip_mm), "axis": list(rod.axis), "radius_mm": radius},
+        "poke": {"tip_mm": rod.tip_mm.tolist(), "axis": up.tolist(), "radius_mm": radius},
         "poke_load_n": load_n,
         "sunk_in_mm": bench.contact.depth_mm(nodes, (Support(), rod)),
     }
 
 
 def _poke_point(bench: Apparatus) -> Float64[np.ndarray, " 3"]:
-    """Where the surface faces up and is farthest from every tumor and from the organ's rim."""
+    """Where the surface faces up, farthest from every tumor and from the organ's rim."""
     from scipy.spatial import cKDTree
 
     middle, normal = triangles(bench.anatomy.organ)

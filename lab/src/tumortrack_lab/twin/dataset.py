@@ -13,7 +13,6 @@ import hashlib
 import json
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -64,12 +63,8 @@ def make_scenes(
     views: Sequence[viewing.View] = VIEWS,
     report: Callable[[TwinStatus], None] = lambda status: None,
 ) -> list[Path]:
-    """The scenes of these variants in these views; those that are there already stay.
-
-    A state is solved once and kept; a run that is killed loses the state or scene at work.
-
-    Returns:
-        The scenes' folders.
+    """The scenes' folders, of these variants in these views; those that are there already stay. A
+    state is solved once and kept; a run that is killed loses the state or scene at work.
 
     Raises InputError: no case, an unknown variant or view, ``out`` holds something else, or scenes
     made from another case, seed or configuration; ArtifactError: a kept state is damaged;
@@ -77,7 +72,7 @@ def make_scenes(
     """
     wanted = [(v, w) for v in _known(variants, VARIANTS) for w in _known(views, VIEWS)]
     case = load_case(run.case_folder)
-    targets = draw_targets(case.anatomy, run.seed)
+    targets, rest_ct = draw_targets(case.anatomy, run.seed), case.anatomy.organ
     identity = _claim(run, out)
     todo = [(v, w) for v, w in wanted if not (out / f"{v}-{w}").exists()]
     states = list(dict.fromkeys(VARIANTS[v].state for v, _ in todo))
@@ -95,7 +90,15 @@ def make_scenes(
             say(f"{name}: settled")
         for variant, view in todo:
             if VARIANTS[variant].state == name:
-                _write(out / f"{variant}-{view}", state, run, targets, case.anatomy, identity)
+                height_mm = float(np.ptp(rest_ct.vertices_mm @ state.bench_from_ct[2, :3]))
+                config = viewing.for_organ(run.view, height_mm)
+                scene, targets_mm = viewing.make_scene(state, variant, view, config, run.seed)
+                meta = {**identity, **scene.meta}
+                scene = replace(scene, meta=meta, targets=targets.at(targets_mm))
+                rest = rest_ct.moved(transform_points(state.bench_from_ct, rest_ct.vertices_mm))
+                with store.new_folder(out / f"{variant}-{view}") as aside:
+                    write_scene_files(aside, scene)
+                    twin_picture(scene, state, rest, aside / "scene.png")
                 done += 1.0
                 say(f"{variant}-{view}")
     names = [f"{variant}-{view}" for variant in VARIANTS for view in VIEWS]
@@ -141,38 +144,15 @@ def _claim(run: TwinRun, out: Path) -> dict:
     return identity
 
 
-def _write(
-    folder: Path,
-    state: EquilibriumState,
-    run: TwinRun,
-    targets: InnerPoints,
-    anatomy_ct: Anatomy,
-    identity: dict,
-) -> None:
-    """One scene's folder with targets and picture, all or nothing."""
-    variant, _, view = folder.name.partition("-")
-    rest = anatomy_ct.organ
-    config = viewing.for_organ(
-        run.view, float(np.ptp(rest.vertices_mm @ state.bench_from_ct[2, :3]))
-    )
-    scene, targets_mm = viewing.make_scene(state, variant, view, config, run.seed)  # type: ignore[arg-type]
-    scene = replace(scene, meta={**identity, **scene.meta}, targets=targets.at(targets_mm))
-    rest = rest.moved(transform_points(state.bench_from_ct, rest.vertices_mm))
-    with store.new_folder(folder) as aside:
-        write_scene_files(aside, scene)
-        twin_picture(scene, state, rest, aside / "scene.png")
-
-
 class StateCache:
-    """The states of one case on disk, one file each, so that none is solved twice; the apparatus
-    is built when the first one is needed."""
+    """The states of one case on disk, one file each, so that none is solved twice."""
 
     def __init__(self, folder: Path, run: TwinRun, case: Case, targets: InnerPoints) -> None:
         self._folder, self._run, self._case, self._targets = folder, run, case, targets
+        self._bench: Any = None  # built when the first state is solved
         self._parts = dict(zip(case.anatomy.names, case.anatomy.parts, strict=True))
 
     def has(self, name: str) -> bool:
-        """Is it solved already?"""
         return self._path(name).exists()
 
     def get(self, name: str, say: Callable[[str], None]) -> EquilibriumState:
@@ -184,27 +164,22 @@ class StateCache:
         targets_mm, bench_from_ct = tensors["targets"], tensors["bench_from_ct"]
         return EquilibriumState(name, Anatomy(parts), targets_mm, bench_from_ct, report)
 
-    @cached_property
-    def _bench(self) -> Any:
-        return self._run.build(self._case.anatomy, self._case.up_lps, self._run.bench)
-
     def _solve(self, name: str, say: Callable[[str], None]) -> None:
         from safetensors.numpy import save
 
-        if "_bench" not in self.__dict__:
+        if self._bench is None:
             say("bench: filling the organ with tetrahedra")
+            self._bench = self._run.build(self._case.anatomy, self._case.up_lps, self._run.bench)
         bench, warm = self._bench, None
         mesh = hashlib.sha256(np.ascontiguousarray(bench.mesh.nodes_mm).tobytes()).hexdigest()
         if (before := _GOES_ON_FROM.get(name)) and self.has(before):
             tensors, report, of = self._read(before)
             warm = State(before, tensors["nodes"], report) if of == mesh else None
         solved = self._run.solve(bench, name, warm, lambda line: say(f"{name}: {line}"))
-        tensors = {
-            **{key: bench.carry(solved, part.vertices_mm) for key, part in self._parts.items()},
-            "targets": bench.carry(solved, self._targets.points_ct),
-            "bench_from_ct": bench.bench_from_ct,
-            "nodes": solved.nodes_mm,
-        }
+        points = {key: part.vertices_mm for key, part in self._parts.items()}
+        points["targets"] = self._targets.points_ct
+        tensors = {key: bench.carry(solved, some) for key, some in points.items()}
+        tensors |= {"bench_from_ct": bench.bench_from_ct, "nodes": solved.nodes_mm}
         metadata = {"report": json.dumps(solved.report, allow_nan=False), "mesh": mesh}
         contiguous = {key: np.ascontiguousarray(array) for key, array in tensors.items()}
         store.write_atomically(self._path(name), save(contiguous, metadata))

@@ -12,7 +12,7 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Protocol, runtime_checkable
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float64
@@ -25,9 +25,6 @@ if TYPE_CHECKING:
     from scipy.sparse import csr_matrix
 
 _TOUCHING_MM = 1e-6  # what only touches counts in the stiffness
-
-Points = Float64[np.ndarray, "n 3"]
-Distances = Float64[np.ndarray, " n"]
 TOLERANCE = 1e-3  # largest unbalanced force (2-norm over nodes), share of the load
 _LEAST_LOAD_MN = 1.0  # a tenth of a gram: less is no load
 _ITERATIONS = 1500
@@ -35,26 +32,18 @@ _REFRESH_AFTER = 60  # iterations: by then other points touch than when it was f
 _MEMORY = 10
 _LONGEST_MM, _SHORTEST_MM = 2.0, 1e-9  # step of any node
 
+Points = Float64[np.ndarray, "n 3"]
 Nodes = Float64[np.ndarray, "n 3"]
+Distances = Float64[np.ndarray, " n"]
 Pairs = deque[tuple[np.ndarray, np.ndarray]]  # steps, and what the gradient changed by
 Solve = Callable[[np.ndarray], np.ndarray]
 
 
-@runtime_checkable
-class ContactSurface(Protocol):
-    """A rigid body; frame and unit are the bench's (mm)."""
-
-    def distance(self, points_mm: Points) -> tuple[Distances, Points]:
-        """Distance (negative inside) and its gradient: outwards, of length 1 where it is true."""
-
-
-Obstacles = tuple[ContactSurface, ...]
-
-
+# Rigid bodies in the bench's frame, mm. Each gives its ``distance`` (negative inside) and that
+# one's gradient: outwards, of length 1 where it is true.
 @dataclass(frozen=True, eq=False)
 class Support:
-    """Everything below z = height: a plane, or packing that bears each point of a surface at the
-    height where it lay (one height a point)."""
+    """Everything below z = height: a plane, or packing (one height a point)."""
 
     height_mm: float | Distances = 0.0
 
@@ -81,28 +70,25 @@ class ContactPlate:
         return distance, normal * np.where(offset < 0, -1.0, 1.0)
 
 
-def three(vector: Float64[np.ndarray, " 3"]) -> tuple[float, float, float]:
-    """A point or direction as a ``Rod`` holds it."""
-    x, y, z = vector.tolist()
-    return x, y, z
-
-
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Rod:
     """A rod with a hemispherical end: the tip touches ``tip_mm``, the unit vector ``axis`` points
     away from it along the rod. For contact it is endless."""
 
-    tip_mm: tuple[float, float, float]
-    axis: tuple[float, float, float]
+    tip_mm: Float64[np.ndarray, " 3"]
+    axis: Float64[np.ndarray, " 3"]
     radius_mm: float
     length_mm: float = 250.0
 
     def distance(self, points_mm: Points) -> tuple[Distances, Points]:
-        axis = np.array(self.axis)
-        offset = points_mm - (np.array(self.tip_mm) + self.radius_mm * axis)
-        offset -= np.maximum(offset @ axis, 0)[:, None] * axis
+        offset = points_mm - (self.tip_mm + self.radius_mm * self.axis)
+        offset -= np.maximum(offset @ self.axis, 0)[:, None] * self.axis
         length = np.linalg.norm(offset, axis=1)
         return length - self.radius_mm, offset / np.maximum(length, 1e-12)[:, None]
+
+
+Obstacle = Support | ContactPlate | Rod
+Obstacles = tuple[Obstacle, ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,7 +113,7 @@ class Contact:
             np.add.at(gradient, self.surface.nodes[hit], force)
         return energy, gradient
 
-    def load_mn(self, nodes_mm: Points, obstacle: ContactSurface) -> Float64[np.ndarray, " 3"]:
+    def load_mn(self, nodes_mm: Points, obstacle: Obstacle) -> Float64[np.ndarray, " 3"]:
         """Total force on the body by one obstacle, mN."""
         distance, normal = obstacle.distance(self.surface.carry(nodes_mm))
         push = self.stiffness_kpa_mm * self.areas_mm2 * np.minimum(distance, 0)
@@ -159,12 +145,9 @@ class Contact:
 
 @dataclass(frozen=True, eq=False)
 class Hold:
-    """Keeps the body from sliding sideways and from rolling, without deforming it.
-
-    The mean sideways displacement and the mean rotation are held by stiff springs whose forces
-    are spread over the whole mass as a rigid motion is (inertia relief): packing in the operating
-    room, the phantom's bed in the laboratory. Without it an organ rolls to its next stable side.
-    """
+    """Keeps the body from sliding sideways and from rolling to its next stable side, without
+    deforming it: stiff springs hold the mean sideways displacement and the mean rotation, their
+    forces spread over the whole mass as a rigid motion is (inertia relief)."""
 
     rest_mm: Nodes
     share: Float64[np.ndarray, " n"]  # of the volume at each node
@@ -186,18 +169,14 @@ class Hold:
 
 @dataclass(frozen=True, eq=False)
 class EquilibriumProblem:
-    """A solid among obstacles under its weight. Units: mm, kPa, mN, uJ.
-
-    ``contacts``: surfaces (of a stiffness each) and the obstacles that push them back.
-    """
+    """A solid among obstacles under its weight. Units: mm, kPa, mN, uJ."""
 
     solid: NeoHookeanSolid
-    contacts: tuple[tuple[Contact, Obstacles], ...]
+    contacts: tuple[tuple[Contact, Obstacles], ...]  # surfaces, and what pushes them back
     weight_mn: Float64[np.ndarray, " n"]  # along -z
     hold: Hold | None = None
 
     def energy(self, nodes_mm: Nodes) -> tuple[float, Nodes]:
-        """Potential energy and its gradient."""
         energy, gradient = self.solid.energy(nodes_mm)
         if not np.isfinite(energy):
             return energy, gradient
@@ -251,12 +230,12 @@ def settle(problem: EquilibriumProblem, start_mm: Nodes) -> tuple[Nodes, Converg
                 break
             share /= 2
             if share * longest < _SHORTEST_MM:
-                raise TumortrackError(_stuck(iteration, residual))
+                raise _stuck(iteration, residual)
         moved, turned = (share * step).ravel(), (trial_gradient - gradient).ravel()
         if moved @ turned > 1e-10 * np.linalg.norm(moved) * np.linalg.norm(turned):
             pairs.append((moved, turned))
         nodes, energy, gradient = trial, trial_energy, trial_gradient
-    raise TumortrackError(_stuck(_ITERATIONS, residual))
+    raise _stuck(_ITERATIONS, residual)
 
 
 def _two_loop(gradient: np.ndarray, pairs: Pairs, precondition: Solve) -> np.ndarray:
@@ -284,8 +263,8 @@ def _factorised(problem: EquilibriumProblem, nodes: Nodes) -> Solve:
     return factorised(matrix + ground * eye(matrix.shape[0]))
 
 
-def _stuck(iteration: int, residual: float) -> str:
-    return (
+def _stuck(iteration: int, residual: float) -> TumortrackError:
+    return TumortrackError(
         f"the finite-element solver found no equilibrium: after {iteration} iterations "
         f"{residual:.1e} of the load is unbalanced (wanted: {TOLERANCE:g}). Load in smaller steps, "
         "or take a finer mesh."

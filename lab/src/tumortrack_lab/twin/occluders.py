@@ -18,7 +18,7 @@ from tumortrack.core.geometry import rotation_onto
 from tumortrack.core.types import DepthFrame, Mesh
 from tumortrack.sense.camera import deproject
 from tumortrack.sense.render import render_depth
-from tumortrack_lab.twin.equilibrium import Rod, three
+from tumortrack_lab.twin.equilibrium import Rod
 
 SHAFT_CLEARANCE_MM = 3.0  # between a shaft's tip and the organ, towards the camera
 SHAFT_RISE_DEGREES = 30.0  # of a shaft above the image plane
@@ -43,8 +43,7 @@ def rod_mesh(rod: Rod) -> Mesh:
     """The rod's closed surface."""
     import trimesh
 
-    tip, axis = np.array(rod.tip_mm), np.array(rod.axis)
-    length = rod.length_mm
+    tip, axis, length = rod.tip_mm, rod.axis, rod.length_mm
     if axis[2] < 0:  # towards the camera's plane
         length = min(length, max((_LAST_DEPTH_MM - tip[2]) / axis[2], 3 * rod.radius_mm))
     angle = np.linspace(0, np.pi / 2, 9)
@@ -88,29 +87,23 @@ def shaft_over(frame: DepthFrame, radius_mm: float, rng: Generator) -> Rod:
     angle, rise = rng.uniform(0, 2 * np.pi), np.deg2rad(SHAFT_RISE_DEGREES)
     axis = np.array([np.cos(angle) * np.cos(rise), np.sin(angle) * np.cos(rise), -np.sin(rise)])
     tip = target - [0, 0, SHAFT_CLEARANCE_MM]
-    rod = Rod(three(tip), three(axis), radius_mm)
-    while rod.distance(points[::7])[0].min() < _TOUCH_MM:
+    while Rod(tip, axis, radius_mm).distance(points[::7])[0].min() < _TOUCH_MM:
         tip[2] -= 1.0
-        rod = replace(rod, tip_mm=three(tip))
-    return rod
+    return Rod(tip, axis, radius_mm)
 
 
 def add_background(
     frame: DepthFrame, share: float, support_mm: float, rng: Generator
 ) -> tuple[DepthFrame, float]:
     """The frame with background in pixels without return: ``share`` of all returns, to the nearest
-    pixel; and what share that is. ``support_mm``: depth of the support plane.
-
-    Two thirds are the top of a lump of fat that lies on the support beside the organ, one third is
-    the end of an instrument there, which a segmentation has left. Both are nearer than the support,
-    so a crop by depth keeps them. What the organ covers stays covered. Raises InputError: the image
-    has no room beside the organ.
-    """
+    pixel; and what share that is. ``support_mm``: depth of the support plane. Two thirds are the
+    top of a lump of fat that lies on the support beside the organ, one third is the end of an
+    instrument there; a crop by depth keeps both. Raises InputError: no room beside the organ."""
     organ = _returns(frame)
     count = round(share / (1 - share) * organ)
-    lump, out = round(_LUMP_SHARE * count), frame
-    for solids, pixels, nearest in ((_lumps, lump, True), (_tips, count - lump, False)):
-        out = _filled(out, solids(out, support_mm, rng), pixels, support_mm, nearest)
+    lump = round(_LUMP_SHARE * count)
+    out = _filled(frame, _lumps(frame, support_mm, rng), lump, support_mm, nearest=True)
+    out = _filled(out, _tips(out, support_mm, rng), count - lump, support_mm, nearest=False)
     got = _returns(out) - organ
     return out, got / (got + organ)
 
@@ -135,7 +128,7 @@ def _tips(frame: DepthFrame, support_mm: float, rng: Generator) -> Iterator[Mesh
             depth = support_mm - rng.uniform(0.3, 0.9) * max(height_mm, 5.0)
             tip = np.array([*_beside(frame, angle, depth, radius_mm), depth])
             lean = np.array([0.7 * np.cos(angle), 0.7 * np.sin(angle), -1.0])
-            yield rod_mesh(Rod(three(tip), three(lean / np.linalg.norm(lean)), radius_mm))
+            yield rod_mesh(Rod(tip, lean / np.linalg.norm(lean), radius_mm))
 
 
 def _filled(
@@ -177,14 +170,11 @@ def _beside(frame: DepthFrame, angle: float, depth_mm: float, gap_mm: float) -> 
 
 def hide_share(
     frame: DepthFrame, share: float, shaft_radius_mm: float, rng: Generator
-) -> tuple[DepthFrame, float]:
+) -> DepthFrame:
     """The frame with that share of its returns hidden by a shaft, a lump of fat and the edge of a
-    drape, one after another; and the share that it has become.
-
-    The occluders keep their places and directions from one share to another with the same
-    generator; only how far they reach differs. They add up: what one hides the next need not.
-    Raises InputError: a share outside 0..0.9, or a frame without returns.
-    """
+    drape, one after another. With the same generator they keep their places and directions from
+    one share to another; only how far they reach differs. Raises InputError: a share outside
+    0..0.9, or a frame without returns."""
     if not 0 <= share <= LARGEST_SHARE:
         raise InputError(f"a share of {share:g} cannot be hidden; allowed: 0 to {LARGEST_SHARE:g}.")
     total, out = _returns(frame), frame
@@ -193,7 +183,7 @@ def hide_share(
     occluders = (_shaft(frame, shaft_radius_mm, rng), _lump(frame, rng), _drape(frame, rng))
     for occluder, part in zip(occluders, _PARTS, strict=True):
         out = _reached(out, occluder, total - round(part * share * total))
-    return out, 1 - _returns(out) / total
+    return out
 
 
 def _reached(frame: DepthFrame, occluder: Occluder, fewest: int) -> DepthFrame:
@@ -216,11 +206,8 @@ def _shaft(frame: DepthFrame, radius_mm: float, rng: Generator) -> Occluder:
     """The shaft of the views, drawn back along itself."""
     rod = shaft_over(frame, radius_mm, rng)
 
-    def solid(number: float) -> Mesh:
-        tip = np.array(rod.tip_mm) + (1 - number) * _PULLED_BACK_MM * np.array(rod.axis)
-        return rod_mesh(replace(rod, tip_mm=three(tip)))
-
-    return solid
+    back = _PULLED_BACK_MM
+    return lambda number: rod_mesh(replace(rod, tip_mm=rod.tip_mm + (1 - number) * back * rod.axis))
 
 
 def _lump(frame: DepthFrame, rng: Generator) -> Occluder:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -30,7 +30,7 @@ _PLATE_SHOWN_MM = 9.0
 
 def twin_picture(scene: Scene, state: EquilibriumState, rest_organ: Mesh, path: Path) -> None:
     """Depth image, cloud over truth, and two side views of the bench with the undeformed organ's
-    outline; a PNG, written atomically. The scene is in the camera frame, the rest on the bench."""
+    outline. The scene is in the camera frame, the rest on the bench."""
     figure = drawing.new_figure(14.0, 9.6)
     figure.subplots_adjust(left=0.02, right=0.985, top=0.875, bottom=0.03)
     grid = figure.add_gridspec(2, 2, hspace=0.13, wspace=0.05)
@@ -75,21 +75,18 @@ def _depth_view(axes: Axes, scene: Scene) -> None:
     bar.set_label("depth, mm", fontsize=9)
     bar.ax.invert_yaxis()
     bar.ax.tick_params(labelsize=8)
-    axes.set_title(
-        f"depth image, {width} x {height}, cropped to {near:g} .. {far:g} mm", fontsize=11
-    )
+    title = f"depth image, {width} x {height}, cropped to {near:g} .. {far:g} mm"
+    axes.set_title(title, fontsize=11)
 
 
 def _cloud_view(axes: Axes, scene: Scene) -> None:
-    points_mm = scene.cloud.points_mm.astype(float)
+    flat = FROM_CAMERA.project(scene.cloud.points_mm.astype(float))
     frame = FROM_CAMERA.frame_around(scene.reference.organ.vertices_mm, _AROUND_MM).widened(1.6)
     _paint(axes, scene.reference, FROM_CAMERA, frame)
-    flat = FROM_CAMERA.project(points_mm)
-    axes.scatter(
-        flat[:, 0], flat[:, 1], s=2.0, color=drawing.OBSERVED, alpha=0.5, linewidths=0, zorder=3
-    )
+    dot: dict[str, Any] = {"s": 2.0, "color": drawing.OBSERVED, "alpha": 0.5, "linewidths": 0}
+    axes.scatter(flat[:, 0], flat[:, 1], zorder=3, **dot)
     drawing.finish_view(axes, frame)
-    axes.set_title(f"{FROM_CAMERA.name}: {len(points_mm)} points over the truth", fontsize=11)
+    axes.set_title(f"{FROM_CAMERA.name}: {len(flat)} points over the truth", fontsize=11)
 
 
 def _bench_view(axes: Axes, state: EquilibriumState, rest_organ: Mesh, view: ParallelView) -> None:
@@ -106,11 +103,8 @@ def _bench_view(axes: Axes, state: EquilibriumState, rest_organ: Mesh, view: Par
 
 
 def _paint(axes: Axes, anatomy: Anatomy, view: ParallelView, frame: Frame) -> None:
-    bodies = [
-        *(Body(tumor, drawing.TRUE) for tumor in anatomy.tumors),
-        Body(anatomy.organ, drawing.KIDNEY, 0.4),
-    ]
-    picture = view.draw(bodies, frame)
+    bodies = [Body(tumor, drawing.TRUE) for tumor in anatomy.tumors]
+    picture = view.draw([*bodies, Body(anatomy.organ, drawing.KIDNEY, 0.4)], frame)
     axes.imshow(picture, extent=frame.extent, zorder=2, interpolation="bilinear")
 
 
@@ -130,12 +124,10 @@ def _apparatus(axes: Axes, report: dict, view: ParallelView) -> None:
         )  # fmt: skip
         axes.add_patch(shape)
     if "poke" in report:
-        tip, axis = np.array(report["poke"]["tip_mm"]), np.array(report["poke"]["axis"])
-        radius = report["poke"]["radius_mm"]
+        tip, axis, radius = (np.array(report["poke"][k]) for k in ("tip_mm", "axis", "radius_mm"))
         end = view.project(np.stack([tip + radius * axis, tip + _ROD_SHOWN_MM * axis]))[:, :2]
         along = end[1] - end[0]
-        length = np.linalg.norm(along)
-        along = along / max(length, 1e-9)
+        along = along / max(np.linalg.norm(along), 1e-9)
         angle = np.linspace(np.pi / 2, 3 * np.pi / 2, 24)
         across = np.array([-along[1], along[0]])
         cap = radius * (np.outer(np.cos(angle), along) + np.outer(np.sin(angle), across))

@@ -43,8 +43,6 @@ class _RestElements(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class NeoHookeanSolid:
-    """An unloaded mesh and its stiffness."""
-
     mesh: TetMesh  # at rest, free of stress
     shear_kpa: Float[np.ndarray, " t"]  # of each tetrahedron: Young's modulus / (2 (1 + poisson))
     poisson: float = 0.49  # near 0.5; 0.49 makes the bulk modulus 50 times the shear modulus

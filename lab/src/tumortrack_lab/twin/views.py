@@ -19,7 +19,7 @@ from tumortrack.sense.noise import D405_NOISE, NoiseConfig, add_noise
 from tumortrack.sense.render import render_depth
 from tumortrack.simulate.scene_folder import Scene
 from tumortrack_lab.twin.apparatus import moved
-from tumortrack_lab.twin.equilibrium import Rod, three
+from tumortrack_lab.twin.equilibrium import Rod
 from tumortrack_lab.twin.occluders import add_background, occlude, shaft_over
 
 View = Literal["clean", "noise", "shaft", "clutter"]
@@ -110,7 +110,7 @@ def make_scene(
     if poke := state.report.get("poke"):  # the bench's rod
         tip_mm = transform_points(to_camera, np.array([poke["tip_mm"]], float))[0]
         axis = to_camera[:3, :3] @ np.array(poke["axis"], float)
-        rod = Rod(three(tip_mm), three(axis), float(poke["radius_mm"]))
+        rod = Rod(tip_mm, axis, float(poke["radius_mm"]))
         frame, seen["rod_covers_share"] = occlude(frame, rod)
     rng = np.random.default_rng([seed, list(VARIANTS).index(name), VIEWS.index(view)])
     if view == "noise":
