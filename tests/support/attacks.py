@@ -500,6 +500,19 @@ def _dicom_compressed_claims_much(folder: Path, base: Path) -> Made:
 
 
 @attack
+def _dicom_elements_of_no_type(folder: Path, base: Path) -> Made:
+    """An element whose type no reader knows: some take its length for gigabytes."""
+
+    def change(slices: list[Any]) -> None:
+        for n, (dataset, path) in enumerate(slices):
+            dataset.save_as(path)
+            path.write_bytes(path.read_bytes().replace(b"\x02\0UI\x1a\0", b"\x02\0UA\x1a\0"))
+            slices[n] = (None, path)
+
+    return dicom(folder, change)
+
+
+@attack
 def _dicom_cut_files(folder: Path, base: Path) -> Made:
     def change(slices: list[Any]) -> None:
         for n, (dataset, path) in enumerate(slices):

@@ -21,11 +21,6 @@ from tumortrack.imaging.grid import GZIP_BEST, RawVolume, check_affine, check_si
 MIN_SLICES = 10
 _MAX_FILES = 20_000
 _NO_SLICE, _MULTI_FRAME = "no DICOM slices", "multi-frame DICOM objects"
-_TAGS = [
-    "SeriesInstanceUID", "SeriesDescription", "Modality", "ImageType", "Rows", "Columns",
-    "NumberOfFrames", "PixelSpacing", "ImagePositionPatient", "ImageOrientationPatient",
-    "SamplesPerPixel", "BitsAllocated", "RescaleSlope", "RescaleIntercept",
-]  # fmt: skip
 _CT = "1.2.840.10008.5.1.4.1.1.2"  # SOP class of CT images
 _UNDEFINED = 0xFFFFFFFF  # length of compressed pixels
 _DEFLATED = "1.2.840.10008.1.2.1.99"  # a transfer syntax in which pixels have no place of their own
@@ -180,6 +175,7 @@ def _groups(folder: Path) -> tuple[list[list[_Slice]], tuple[str, ...]]:
 def _read_tags(path: Path) -> _Slice | str:
     """The tags of one slice, or why the file is none (``_NO_SLICE``, ``_MULTI_FRAME``)."""
     import pydicom
+    from pydicom.valuerep import STANDARD_VR
 
     tags: Any = None
     with warnings.catch_warnings(), path.open("rb") as stream:
@@ -187,12 +183,15 @@ def _read_tags(path: Path) -> _Slice | str:
         is_dicom = stream.read(132)[128:] == b"DICM"
         stream.seek(0)
         try:
-            tags = pydicom.dcmread(stream, stop_before_pixels=True, specific_tags=_TAGS)
+            tags = pydicom.dcmread(stream, stop_before_pixels=True)
+            types = {element.VR for part in (tags.file_meta, tags) for element in part.values()}
+            if strange := types - STANDARD_VR - {None}:  # GDCM takes their lengths for gigabytes
+                raise ValueError(f"elements of the type {sorted(strange)[0]!r}")
             if int(tags.get("NumberOfFrames") or 1) > 1:
                 return _MULTI_FRAME
             uid, description, modality = (
                 "".join(c if c.isprintable() else "?" for c in str(tags.get(tag) or ""))
-                for tag in _TAGS[:3]
+                for tag in ("SeriesInstanceUID", "SeriesDescription", "Modality")
             )
             slope, intercept = tags.get("RescaleSlope"), tags.get("RescaleIntercept")
             return _Slice(
