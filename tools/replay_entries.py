@@ -193,8 +193,17 @@ def followed(follower: Follower, cloud: SensorCloud) -> Entries:
 
 def plan() -> Entries:
     located()
-    yield from ran("margin", "plan", "run", "margin")
-    yield from ran("published", "plan", "run", "published", "--method", "published", "--no-arms")
+    yield from ran("margin", "plan", "run", "margin", "--accept-poor")
+    yield from ran(
+        "published",
+        "plan",
+        "run",
+        "published",
+        "--method",
+        "published",
+        "--no-arms",
+        "--accept-poor",
+    )
 
 
 def quick() -> Entries:

@@ -53,7 +53,8 @@ def write_run(folder):
         name: {"label": label, "found": True, "volume_ml": mesh.volume_mm3 / 1000}
         for label, (name, mesh) in enumerate(camera.items(), start=1)
     }
-    report = {"units": "mm", "parts": parts, "model": {"case_sha256": CASE}}
+    quality = {"verdict": "good", "reason": ""}
+    report = {"units": "mm", "parts": parts, "model": {"case_sha256": CASE}, "quality": quality}
     write_estimate(folder, Estimate(cloud, volume, camera, report))
     return seen
 
@@ -149,6 +150,7 @@ NEEDS = {
     "plan": "a plan that says which case",
     "frame": "--frame FILE (this one's frame is invented)",
     "cell": "--cell FILE that gives both bases",
+    "good": "a plan made on a good estimate",
     "speed": "--speed up to 1, not 2",
     "moved": "--moved up to the margin, 5 mm",
     "person": "a person at a terminal",
@@ -210,6 +212,21 @@ def test_a_run_of_an_unknown_case_moves_no_real_arm(story, given, tmp_path):
     store.seal(plan, "plan", {}, "base_link")
     done = tumortrack("resect", plan, REAL, "--live", given / "model", "realsense")
     assert missing(done) == {"plan", "person"}
+
+
+def test_a_plan_on_a_poor_estimate_moves_no_real_arm(story, given, tmp_path):
+    folder, _ = story
+    run = tmp_path / "run"
+    shutil.copytree(folder / "run", run)
+    report = json.loads((run / "report.json").read_text())
+    report["quality"] = {"verdict": "poor", "reason": "it lies elsewhere"}
+    (run / "report.json").write_text(json.dumps(report))
+    store.seal(run, "run", {}, "camera")
+    command = ("plan", run, tmp_path / "plan", "--frame", given / "frame.json")
+    command += ("--cell", given / "cell.json", "--accept-poor")
+    assert "PLANNED ON A POOR ESTIMATE: it lies elsewhere" in succeeded(tumortrack(*command))
+    done = tumortrack("resect", tmp_path / "plan", REAL, "--live", given / "model", "realsense")
+    assert missing(done) == {"good", "person"}
 
 
 @pytest.mark.parametrize("typed", ["127.0.0.1", "yes", ""])
@@ -384,7 +401,8 @@ def test_a_live_world_that_lies_elsewhere_is_planned_anew_and_cut(
     succeeded(
         tumortrack("locate", clinic_model, tmp_path / "cloud.ply", tmp_path / "run", "--grid", 32)
     )
-    succeeded(tumortrack("plan", tmp_path / "run", tmp_path / "plan", "--method", "published"))
+    command = ("plan", tmp_path / "run", tmp_path / "plan", "--method", "published")
+    succeeded(tumortrack(*command, "--accept-poor"))  # so short a training is sure of nothing
     world = f"virtual:{phantom_case}?breathing=false&instrument=false&camera_motion=false&fps=10"
     report = tmp_path / "report.json"
     said = succeeded(

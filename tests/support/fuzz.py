@@ -23,6 +23,7 @@ import tempfile
 import time
 import traceback
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -176,7 +177,10 @@ def _artifacts() -> dict[str, Target]:
 
     point = {"id": "1", "label": "a", "position": [1.0, 2.0, 3.0]}
     markups = {"markups": [{"coordinateSystem": "LPS", "controlPoints": [point]}]}
-    fcsv = b"# Markups fiducial file version = 4.11\n# CoordinateSystem = LPS\n# columns = id,x,y,z\n1,1,2,3,0,0,0,1,1,1,0,a,,\n"
+    head = (
+        "# Markups fiducial file version = 4.11\n# CoordinateSystem = LPS\n# columns = id,x,y,z\n"
+    )
+    fcsv = f"{head}1,1,2,3,0,0,0,1,1,1,0,a,,\n".encode()
     return {
         "json": ([json.dumps({"a": [1, 2, {"b": "c"}]}).encode()], of_file(".json", read_json)),
         "points csv": ([b"x,y,z\n1,2,3\n4,5,6\n"], of_file(".csv", read_points)),
@@ -386,10 +390,8 @@ def _led_by_coverage(name: str, inputs: int) -> None:
         (corpus / str(n)).write_bytes(seed)
 
     def one(content: bytes) -> None:
-        try:
+        with suppress(TumortrackError):
             read(content)
-        except TumortrackError:
-            pass
 
     options = [f"-runs={inputs}", f"-timeout={SECONDS}", f"-rss_limit_mb={4 * MEGABYTES}"]
     atheris.Setup([sys.argv[0], *options, str(corpus)], one)
