@@ -231,6 +231,8 @@ def _pixel_fault(tags: Any, stream: BinaryIO) -> str:
         return ""
     start, head = stream.tell(), stream.read(12)
     implicit, little = tags.original_encoding
+    if head and not implicit and head[4:6] not in (b"OB", b"OW", b"OF", b"OD"):
+        return "its pixels are of no known type"
     size = 8 if implicit else 12  # of the element's head, which ends with the length
     length = int.from_bytes(head[size - 4 : size], "little" if little else "big")
     there = os.fstat(stream.fileno()).st_size - start - size
