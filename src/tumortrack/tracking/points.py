@@ -24,6 +24,7 @@ from jaxtyping import Float, Float64
 
 from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.estimate import Motion
+from tumortrack.core.store import read_file
 
 FAR_MM = 100.0  # from the organ's box: such a point is hardly meant
 _NEAR_MM = 20.0  # a point about the organ, where another reading of the file is weighed
@@ -62,12 +63,7 @@ def read_points(path: Path) -> PointTable:
         InputError: no such file, another format or unit, no points, a value that is no finite
             number, or a Slicer file whose coordinate system is neither LPS nor RAS.
     """
-    try:
-        if path.stat().st_size > _MOST_BYTES:
-            raise InputError(f"{path} is larger than 64 MiB; give the points in several files.")
-        content = path.read_bytes()
-    except OSError as error:
-        raise InputError(f"{path} cannot be read: {error.strerror}.") from error
+    content = read_file(path, _MOST_BYTES, "Give the points in several files.")
     name = path.name.lower()
     parse = next((parse for end, parse in _PARSERS.items() if name.endswith(end)), None)
     if parse is None:
