@@ -265,10 +265,10 @@ def test_garbage_and_defects_are_said_and_survived(tracker, stages, monkeypatch)
 
 def test_a_defect_is_kept_for_the_report(tracker, stages):
     class Broken(Tracker):
-        def follow(self, cloud, last=None, how=Following()):  # noqa: B008
+        def follow(self, cloud, last=None, how=Following(), seen=None):  # noqa: B008
             if cloud.stamp_ns == clouds[1].stamp_ns:
                 raise ZeroDivisionError("a defect")
-            return super().follow(cloud, last, how)
+            return super().follow(cloud, last, how, seen)
 
     clouds = moving(stages[0], 3)
     updates, told = play(Broken(tracker.model), clouds)
@@ -308,10 +308,10 @@ def test_stale_frames_are_refused(tracker, stages, clock):
 
 def test_an_answer_that_comes_too_late_is_none_and_yet_a_start(tracker, stages, clock):
     class Slow(Tracker):
-        def follow(self, cloud, last=None, how=Following()):  # noqa: B008
+        def follow(self, cloud, last=None, how=Following(), seen=None):  # noqa: B008
             helped.append(last is not None)
             clock.sleep(21 if len(helped) == 1 else 0)
-            return super().follow(cloud, last, how)
+            return super().follow(cloud, last, how, seen)
 
     helped, sink = [], Notes()
     now = clock.time_ns()

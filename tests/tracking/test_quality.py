@@ -118,8 +118,9 @@ def test_a_cloud_tells_what_lies_behind_the_organ_and_what_it_does_not_show(
     assert doubted(estimate, SensorCloud(half.astype(np.float32))).quality == "poor"
     beyond = points_mm * np.where(points_mm[:, :1] > ends, 1.0, 1.4)  # a table shines through
     assert shares(beyond)[0] == pytest.approx(0.4, abs=0.1)
-    with pytest.raises(NoEstimate, match="sees through"):
-        doubted(estimate, SensorCloud(beyond.astype(np.float32)))
+    found = doubted(estimate, SensorCloud(beyond.astype(np.float32)))
+    assert found.quality == "poor"
+    assert "sees through" in found.reason
     hand = np.concatenate([half, points_mm[points_mm[:, 0] <= ends] * 0.8])  # hides, proves nothing
     assert shares(hand)[1] < 0.06
 

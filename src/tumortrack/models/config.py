@@ -10,6 +10,8 @@ from tumortrack.models.encoders import EncoderConfig
 from tumortrack.models.normalisation import Aligned, CloudBox, FixedScale
 from tumortrack.simulate.scene import SceneConfig
 
+_WIDEST = 4096  # of a layer: far beyond use, and a layer's weights still have room
+
 
 class MlpDecoderConfig(Config, frozen=True, tag="mlp"):
     """``hidden_layers`` of ``width`` with ReLU, then one linear layer to the classes' logits.
@@ -25,12 +27,13 @@ class MlpDecoderConfig(Config, frozen=True, tag="mlp"):
     octaves: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
+        self.check_between("decoder", width=(1, _WIDEST), hidden_layers=(1, 32))
         allowed = range(1, self.hidden_layers + 1)
         named = (*self.norm_layers, *(() if self.skip_layer is None else (self.skip_layer,)))
-        if self.n_classes < 2 or self.width < 1 or not set(named) <= set(allowed):
+        if self.n_classes < 2 or not set(named) <= set(allowed):
             raise InputError(
-                f"decoder: layers {named} must lie in 1..{self.hidden_layers}, the width must be "
-                "positive and there must be at least 2 classes."
+                f"decoder: layers {named} must lie in 1..{self.hidden_layers}, and there must be "
+                "at least 2 classes."
             )
 
 
@@ -43,8 +46,8 @@ class RegistrationHeadConfig(Config, frozen=True, tag="warp"):
     points: int = 96
 
     def __post_init__(self) -> None:
-        if min(self.modes, self.width, self.points) < 1:
-            raise InputError("warp: modes, width and points must be positive.")
+        sizes = (1, _WIDEST)
+        self.check_between("warp", modes=sizes, width=sizes, points=(1, 10**6))
 
 
 class NetworkConfig(Config, frozen=True):

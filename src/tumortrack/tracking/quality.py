@@ -43,7 +43,8 @@ def judged(estimate: Estimate, seen: DepthFrame | SensorCloud) -> Estimate:
         seen: all that the camera saw, not the organ's points alone, where it is known.
 
     Raises:
-        NoEstimate: the camera sees through so much of it that the organ cannot lie there.
+        NoEstimate: a depth image sees through so much of it that the organ cannot lie there. Clouds
+            refuse nothing: they may be joined from several views.
     """
     organ, unseen = next(iter(estimate.meshes.values())), 0.0
     if isinstance(seen, DepthFrame):
@@ -53,7 +54,7 @@ def judged(estimate: Estimate, seen: DepthFrame | SensorCloud) -> Estimate:
         estimate.report["unseen"] = unseen
     estimate.report["seen_through"] = through
     doubtful, impossible = _LIMITS if estimate.motion is not None else _ROUGH_LIMITS
-    if through > impossible:
+    if through > impossible and isinstance(seen, DepthFrame):
         raise NoEstimate(
             f"the camera sees through {100 * through:.0f} % of where the organ would lie: what "
             "was taken for it is something else, or lies as no organ in training did."

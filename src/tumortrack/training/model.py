@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from safetensors.torch import load, save
 from torch import Tensor, nn
 
@@ -87,13 +86,7 @@ def load_model(folder: Path, device: str = "auto") -> Model:
 
 
 def _filled(kind: type[Model], config: NetworkConfig, weights: dict[str, Tensor]) -> Network:
-    """The network with these weights; ValueError for others, before room is made for them."""
-    with torch.device("meta"):
-        needed = kind.new_network(config).state_dict()
-    for name in needed.keys() | weights.keys():
-        sizes = [tuple(one[name].shape) if name in one else None for one in (needed, weights)]
-        if sizes[0] != sizes[1]:
-            raise ValueError(f"{name} is {sizes[1]} and must be {sizes[0]}")
+    """The network with these weights; RuntimeError for others."""
     network = kind.new_network(config)
     network.load_state_dict(weights)
     return network
