@@ -23,6 +23,7 @@ from tumortrack.core.errors import InputError, NoEstimate, TumortrackError
 from tumortrack.core.estimate import Quality
 from tumortrack.core.types import DepthFrame, Intrinsics, SensorCloud
 from tumortrack.live import values as live
+from tumortrack.live.frames import FrameCheck
 from tumortrack.live.meter import RunStatistics
 from tumortrack.live.stamps import StampCheck
 from tumortrack.live.values import Observation, SourceLost, TrackingResult
@@ -37,7 +38,8 @@ _PICK_S = 3.0  # without the organ: a pick is forgotten
 class LoopConfig(Config, frozen=True, kw_only=True):
     """``stale_s``: no frame for so long, or one that old, gives 'no estimate'. ``give_up_s``: the
     loop ends where no frame came for so long. ``intrinsics``: of depth images, instead of what the
-    source says. ``seconds``: the loop ends so long after the first frame; 0: never."""
+    source says. ``frozen_s``: an image that repeats bit for bit for so long is an old one; 0: it
+    may repeat. ``seconds``: the loop ends so long after the first frame; 0: never."""
 
     region: RegionConfig = RegionConfig()
     follower: FollowerConfig = FollowerConfig()
@@ -45,6 +47,7 @@ class LoopConfig(Config, frozen=True, kw_only=True):
     stale_s: float = 0.5
     give_up_s: float = 60.0
     seconds: float = 0.0
+    frozen_s: float = 0.25
 
     def __post_init__(self) -> None:
         if not 0 < self.stale_s < self.give_up_s:
@@ -54,6 +57,8 @@ class LoopConfig(Config, frozen=True, kw_only=True):
             )
         if not self.seconds >= 0:
             raise InputError(f"seconds is {self.seconds:g}; it must be 0 (no end) or more.")
+        if not self.frozen_s >= 0:
+            raise InputError(f"frozen_s is {self.frozen_s:g}; it must be 0 (any) or more.")
 
 
 class _TooLate(NoEstimate):
@@ -73,7 +78,7 @@ class Loop:
     ) -> None:
         self._config, self._context, self._arms = config, context, arms
         self._follower = Follower(tracker, config.follower)
-        self._stamps = StampCheck(config.stale_s)
+        self._stamps, self._frames = StampCheck(config.stale_s), FrameCheck(config.frozen_s)
         self._stop = threading.Event()
         self._sequence = itertools.count()
         self._picked: Float64[np.ndarray, " 3"] | None = None  # by the user
@@ -117,10 +122,11 @@ class Loop:
 
     def _results(self, source_worker: SourceWorker) -> Iterator[TrackingResult]:
         fresh_s = time.monotonic()
-        ends_s = math.inf
+        ends_s, old_s = math.inf, fresh_s + self._config.stale_s  # then what is shown is stale
         while not self._stop.is_set():
-            got = source_worker.take(self._config.stale_s)
+            got = source_worker.take(max(old_s - time.monotonic(), 0.0))
             now_s = time.monotonic()
+            old_s = now_s + self._config.stale_s
             if isinstance(got, Observation):
                 got = self._calibrated(got)
             if isinstance(got, Observation):
@@ -128,7 +134,11 @@ class Loop:
                 if self._config.seconds and ends_s == math.inf:
                     ends_s = now_s + self._config.seconds
                 hurry = source_worker.latency_from != "taking"
-                yield self._answer(got, source_worker.born_ns(got), hurry)
+                result = self._answer(got, source_worker.born_ns(got), hurry)
+                old_s = time.monotonic() + self._config.stale_s
+                if hurry and result.estimate is not None and result.latency_ms is not None:
+                    old_s -= result.latency_ms / 1000
+                yield result
             elif got is None and source_worker.ended:
                 return
             else:
@@ -155,10 +165,12 @@ class Loop:
             if self._stamps.check(seen.stamp_ns, _age_s(born_ns), other_clock):
                 self.statistics.clock_jumps += 1
                 self._follower.forget()
+            self._frames.same_camera(seen.content)
             with _timed(seconds, "organ"):
                 rng = np.random.default_rng((self._config.follower.seed, seen.stamp_ns))
                 hints = self._hints(seen)
                 organ = organ_points(seen.content, self._config.region, hints, rng).cloud
+            self._frames.new(seen.content)  # that it shows nothing would be said before
             with _timed(seconds, "locate"):
                 estimate = self._follower.locate(organ, seen.content)
             seconds |= {f"locate.{k}": v for k, v in estimate.report["timings"].items()}
