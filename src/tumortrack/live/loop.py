@@ -20,7 +20,7 @@ from jaxtyping import Float64
 
 from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError, NoEstimate, TumortrackError
-from tumortrack.core.estimate import Quality
+from tumortrack.core.estimate import Estimate, Quality
 from tumortrack.core.types import DepthFrame, Intrinsics, SensorCloud
 from tumortrack.live import values as live
 from tumortrack.live.frames import FrameCheck
@@ -33,6 +33,7 @@ from tumortrack.sense.region import Hints, RegionConfig, organ_points
 from tumortrack.tracking.tracker import Follower, FollowerConfig, Tracker
 
 _PICK_S = 3.0  # without the organ: a pick is forgotten
+_SURE_AFTER = 3  # good estimates in a row after doubt: single frames of something else may pass
 
 
 class LoopConfig(Config, frozen=True, kw_only=True):
@@ -84,6 +85,7 @@ class Loop:
         self._picked: Float64[np.ndarray, " 3"] | None = None  # by the user
         self._place_mm: Float64[np.ndarray, " 3"] | None = None  # where that is by now
         self._found_s = time.monotonic()
+        self._in_a_row = _SURE_AFTER  # good estimates since the last doubt
         self._stamp: tuple[int, int] | None = None  # of the last frame, and when that was here
         self.statistics = RunStatistics()
 
@@ -159,12 +161,14 @@ class Loop:
         seconds: dict[str, float] = {}
         organ, estimate, reason, warning = None, None, "", ""
         quality: Quality = "none"
+        timely = False
         try:
             # What is simulated has this computer's clock, and so has the moment of arrival.
             other_clock = born_ns == seen.stamp_ns and seen.truth is None
             if self._stamps.check(seen.stamp_ns, _age_s(born_ns), other_clock):
                 self.statistics.clock_jumps += 1
                 self._follower.forget()
+            timely = True
             self._frames.same_camera(seen.content)
             with _timed(seconds, "organ"):
                 rng = np.random.default_rng((self._config.follower.seed, seen.stamp_ns))
@@ -174,7 +178,7 @@ class Loop:
             with _timed(seconds, "locate"):
                 estimate = self._follower.locate(organ, seen.content)
             seconds |= {f"locate.{k}": v for k, v in estimate.report["timings"].items()}
-            quality, warning = estimate.quality, estimate.reason
+            quality, warning = self._confirmed(estimate)
             self._follow_pick(organ)
             if hurry and _age_s(born_ns) > self._config.stale_s:
                 raise _TooLate(f"the answer came too late: {_age_s(born_ns):.2f} s after the frame")
@@ -182,6 +186,7 @@ class Loop:
             estimate, reason, quality, warning = None, str(error), "none", ""
             if not isinstance(error, _TooLate):  # that is the best place to start the next search
                 self._follower.forget()
+                self._in_a_row = 0 if timely else self._in_a_row
             if not isinstance(error, TumortrackError):  # a defect of ours: the next frame is tried
                 self.statistics.add_defect(error)
                 reason = f"internal error, {type(error).__name__}: {error}"
@@ -199,6 +204,13 @@ class Loop:
             seconds,
             latency_ms=1000 * _age_s(born_ns),
         )
+
+    def _confirmed(self, estimate: Estimate) -> tuple[Quality, str]:
+        """Its quality and warning: after doubt, good is what stays good."""
+        self._in_a_row = self._in_a_row + 1 if estimate.quality == "good" else 0
+        if 0 < self._in_a_row < _SURE_AFTER:
+            return "poor", f"good again for {self._in_a_row} of {_SURE_AFTER} frames"
+        return estimate.quality, estimate.reason
 
     def _without_frame(self, reason: str) -> TrackingResult:
         """The result where there is no frame; its stamp is now, by the source's clock as far as it

@@ -97,9 +97,11 @@ class Schedule:
 
 @dataclass(frozen=True, eq=False)
 class Staged(Observation):
-    """With what the loop cannot know: when its image was taken (``time.time_ns``)."""
+    """With what the loop cannot know: when its image was taken (``time.time_ns``), and what was
+    done to it."""
 
     exposed_ns: int = 0
+    fault: str = ""
 
 
 class FaultyCamera:
@@ -154,7 +156,7 @@ class FaultyCamera:
     def _spoilt(self, fault: Fault) -> Observation | None:
         if fault.kind == "source gone":
             raise SourceLost("the camera is unplugged")
-        true = self._staged(self._real)
+        true = replace(self._staged(self._real), fault=fault.kind)
         if fault.kind == "frames late":
             self._waiting.append(true)
             due_ns = time.time_ns() - int(1.4e9 * self._schedule.stale_s)

@@ -57,7 +57,7 @@ class Judge:
         self.counts[result.quality] += 1
         fault = self.schedule.now()
         if result.quality == "good":
-            self._check(result, fault)
+            self._check(result)
         if result.estimate is not None and result.latency_ms is not None:
             self.latency.add(result.latency_ms)
         for begun in self.schedule.faults:
@@ -66,7 +66,7 @@ class Judge:
         if not np.isnan(self._begin_s) and now_s - self._begin_s >= 10 * len(self.memory_mb):
             self.memory_mb.append((now_s - self._begin_s, resident_mb()))
 
-    def _check(self, result: TrackingResult, fault: Fault | None) -> None:
+    def _check(self, result: TrackingResult) -> None:
         seen = result.observation
         if not isinstance(seen, Staged) or seen.truth is None or result.latency_ms is None:
             raise TypeError("a good estimate without a frame of the camera's")
@@ -81,8 +81,8 @@ class Judge:
         for kind, is_so in (("stale", age_s > self.stale_s), ("wrong", off_mm > self.wrong_mm)):
             if is_so:
                 self.counts[kind] += 1
-                during = fault.kind if fault is not None else "no fault"
-                self.wrong.append(f"{kind}: {off_mm:.1f} mm off, {age_s:.2f} s old, in {during}")
+                told = f"{off_mm:.1f} mm off, {age_s:.2f} s old, frame {seen.fault or 'as it was'}"
+                self.wrong.append(f"{kind} at {self._since_s():.1f} s: {told}")
                 del self.wrong[_KEPT:]
 
     def _answer(self, fault: Fault, is_on: bool, result: TrackingResult, now_s: float) -> None:
@@ -97,6 +97,9 @@ class Judge:
                 said = [worker.trouble for worker in self.workers if worker.name == fault.victim]
             if found := next((text for text in said if re.search(FAULTS[fault.kind], text)), ""):
                 answer.named_s, answer.words = now_s - fault.begun_s, found
+
+    def _since_s(self) -> float:
+        return time.monotonic() - self._begin_s
 
     def problems(self) -> list[str]:
         """Violations; none if all is well."""
