@@ -5,7 +5,7 @@
 A simulated case in motion is tracked by `track`'s own loop into four sinks: viewer, recorder, ROS 2
 and OpenIGTLink (with a client that reads). At random moments faults are injected, of the kinds in
 `tumortrack_lab/soak/faults.py`. It fails if an estimate that was called good was stale or wrong, a
-fault was not named in its words in time (--stale), no good estimate came after it, memory grew by
+fault was not named in its words in time, no good estimate came after it, memory grew by
 over 20 MB after the first minute, an internal error was met, or a tape that a full disk cut off
 cannot be read to its last second.
 """
@@ -28,7 +28,8 @@ def main() -> int:
     parser.add_argument("--minutes", type=float, default=60.0)
     parser.add_argument("--fps", type=float, default=30.0)
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--stale", type=float, default=0.5, help="s; answers must come as soon")
+    parser.add_argument("--stale", type=float, default=0.5, help="older frames are refused, s")
+    parser.add_argument("--within", type=float, default=0.5, help="a fault must be named, s")
     parser.add_argument("--wrong", type=float, default=5.0, help="a part so far off is wrong, mm")
     parser.add_argument("--kinds", nargs="*", default=[], help="of faults alone, by their names")
     parser.add_argument("--table", type=Path, help="the Markdown tables, also printed")
@@ -42,6 +43,7 @@ def main() -> int:
         seed=given.seed,
         stale_s=given.stale,
         wrong_mm=given.wrong,
+        within_s=given.within,
         kinds=tuple(given.kinds),
     )
     with tempfile.TemporaryDirectory(prefix="tumortrack-soak-") as folder:

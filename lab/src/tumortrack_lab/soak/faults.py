@@ -66,17 +66,17 @@ class Schedule:
         rng = np.random.default_rng([seed, 0x50A])
         self.stale_s, self.faults = stale_s, list[Fault]()
         self._origin_s = np.inf
-        at_s = 4 + 4 * stale_s
+        at_s = 4.0
         while True:
             for kind in rng.permutation(kinds).tolist():
                 lasts_s = stale_s * float(rng.uniform(3.0, 6.0))
-                if at_s + lasts_s + 4 * stale_s > seconds:
+                if at_s + lasts_s + 3.0 > seconds:
                     return
                 victim = "recording" if kind == "disk full" else str(rng.choice(sinks))
                 victim = victim if kind in SINK_FAULTS else ""
                 other = float(rng.random())
                 self.faults.append(Fault(kind, at_s, lasts_s, victim, other=other))
-                at_s += lasts_s + stale_s * float(rng.uniform(6.0, 18.0))
+                at_s += lasts_s + float(rng.uniform(2.0, 6.0))
 
     def start(self) -> None:
         """The first frame is here."""

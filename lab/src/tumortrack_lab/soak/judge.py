@@ -42,6 +42,7 @@ class Judge:
     workers: list[SinkWorker]
     stale_s: float
     wrong_mm: float
+    within_s: float  # a fault must be named
     answers: dict[int, Answer] = field(default_factory=dict)
     counts: Counter[str] = field(default_factory=Counter)
     wrong: list[str] = field(default_factory=list)
@@ -108,7 +109,7 @@ class Judge:
             kind, at_s = answer.fault.kind, answer.fault.planned_s
             if np.isnan(answer.named_s):
                 found.append(f"{kind} at {at_s:.0f} s was never named")
-            elif answer.named_s > self.stale_s:
+            elif answer.named_s > self.within_s:
                 found.append(f"{kind} at {at_s:.0f} s was named after {answer.named_s:.2f} s")
             if np.isnan(answer.back_s):
                 found.append(f"{kind} at {at_s:.0f} s: no good estimate came after it")

@@ -39,8 +39,8 @@ while peer.recv(1 << 20):
 
 @dataclass(frozen=True, kw_only=True)
 class SoakConfig:
-    """``stale_s``: how soon a fault must be answered; ``wrong_mm``: a part so far off is wrong;
-    ``kinds``: of faults, empty: all."""
+    """``stale_s``: as of `track`; faults last 3 to 6 times as long. ``wrong_mm``: a part so far off
+    is wrong. ``within_s``: how soon a fault must be named. ``kinds``: of faults, empty: all."""
 
     model: Path
     case: Path
@@ -49,6 +49,7 @@ class SoakConfig:
     seed: int = 0
     stale_s: float = 0.5
     wrong_mm: float = 5.0
+    within_s: float = 0.5
     kinds: tuple[str, ...] = ()
 
 
@@ -73,7 +74,7 @@ def soak(config: SoakConfig, folder: Path) -> tuple[str, list[str]]:
         _sinks(context, schedule, folder) as (workers, tapes),
         closing(SourceWorker(camera.open)) as reader,
     ):
-        judge = Judge(schedule, workers, config.stale_s, config.wrong_mm)
+        judge = Judge(schedule, workers, config.stale_s, config.wrong_mm, config.within_s)
         loop.run(reader, workers, judge.see)
         found = summary(loop, reader, workers)
     problems = judge.problems()
