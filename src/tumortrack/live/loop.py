@@ -33,6 +33,7 @@ from tumortrack.sense.region import Hints, RegionConfig, organ_points
 from tumortrack.tracking.tracker import Follower, FollowerConfig, Tracker
 
 _PICK_S = 3.0  # without the organ: a pick is forgotten
+_QUIET = 0.8  # of stale_s: silence is said while what is shown still holds
 _SURE_AFTER = 3  # good estimates in a row after doubt: single frames of something else may pass
 
 
@@ -124,11 +125,11 @@ class Loop:
 
     def _results(self, source_worker: SourceWorker) -> Iterator[TrackingResult]:
         fresh_s = time.monotonic()
-        ends_s, old_s = math.inf, fresh_s + self._config.stale_s  # then what is shown is stale
+        quiet_s = _QUIET * self._config.stale_s
+        ends_s, told_s = math.inf, fresh_s  # by when what is shown came to be
         while not self._stop.is_set():
-            got = source_worker.take(max(old_s - time.monotonic(), 0.0))
-            now_s = time.monotonic()
-            old_s = now_s + self._config.stale_s
+            got = source_worker.take(max(told_s + quiet_s - time.monotonic(), 0.0))
+            now_s = told_s = time.monotonic()
             if isinstance(got, Observation):
                 got = self._calibrated(got)
             if isinstance(got, Observation):
@@ -137,9 +138,9 @@ class Loop:
                     ends_s = now_s + self._config.seconds
                 hurry = source_worker.latency_from != "taking"
                 result = self._answer(got, source_worker.born_ns(got), hurry)
-                old_s = time.monotonic() + self._config.stale_s
+                told_s = time.monotonic()
                 if hurry and result.estimate is not None and result.latency_ms is not None:
-                    old_s -= result.latency_ms / 1000
+                    told_s -= result.latency_ms / 1000
                 yield result
             elif got is None and source_worker.ended:
                 return

@@ -29,7 +29,7 @@ _DEFECTS = 5  # tracebacks that are kept
 _STOP_S = 2.0  # how long close waits for a source that hangs
 _CLOSE_S = 10.0  # for a sink to write what waits, and flush
 _SILENT_S = 2.0  # without a word from the loop: what a sink shows holds no longer
-_SLOW_S = 0.3  # at one result: what a sink shows lags by as much
+_SLOW_S = 0.25  # at one result: what a sink shows lags by as much
 
 
 class SourceWorker:
