@@ -1,11 +1,13 @@
 """Damaged input for every reader of files and of bytes from the wire.
 
-python tests/support/fuzz.py [--inputs N] [--target NAME] [--seed N] [--atheris]
+python tests/support/fuzz.py [--inputs N] [--target NAME] [--seed N] [--artifacts] [--atheris]
 
 Valid inputs are changed at random places; a reader may read what comes of it or refuse it with a
 ``TumortrackError``. Any other exception, a crash of the process, 5 s for one input, or memory over
 1 GB is a fault; the input that did it is written to runs/fuzz/. The same seed gives the same
-inputs. With --atheris (a package of its own) the inputs are led by the code that they reach.
+inputs; fast readers get more of them. What was done is kept in runs/fuzz/done.json: the same
+command goes on there. With --artifacts also folders of models, runs and plans, which are made
+first. With --atheris (a package of its own) the inputs are led by the code that they reach.
 """
 
 from __future__ import annotations
@@ -13,6 +15,7 @@ from __future__ import annotations
 import argparse
 import hashlib
 import json
+import math
 import mmap
 import os
 import resource
@@ -28,7 +31,10 @@ from typing import Any
 
 import numpy as np
 
+from fuzz_targets import Target, targets
+
 SECONDS, MEGABYTES = 5, 1024
+_BLOCK = 20_000  # inputs between two notes of what was done
 _NUMBERS = [0, 1, -1, 127, 128, 255, 256, 32767, 65535, 2**31 - 1, -(2**31), 2**32 - 1]
 _WORDS = [b"nan", b"inf", b"-1", b"1e308", b"99999999999999999999", b"\n", b" ", b"\0", b"{", b'"']
 
@@ -110,11 +116,11 @@ def _attack(
             os._exit(3)
 
 
-def fuzz(name: str, target: Target, inputs: int, seed: int, keep: Path) -> list[tuple[str, str]]:
+def fuzz(name: str, target: Target, indices: range, seed: int, keep: Path) -> list[tuple[str, str]]:
     """Faults as (what, where), each kind once; the input that did it is kept."""
-    at, start, found = mmap.mmap(-1, 16), 0, {}
+    at, start, found = mmap.mmap(-1, 16), indices.start, {}
     devnull = os.open(os.devnull, os.O_WRONLY)
-    while start < inputs:
+    while start < indices.stop:
         with tempfile.TemporaryFile("w+") as faults:
             child = os.fork()
             if not child:
@@ -125,7 +131,7 @@ def fuzz(name: str, target: Target, inputs: int, seed: int, keep: Path) -> list[
                 struct.pack_into("<d", at, 8, peak)
                 code = 2
                 try:
-                    _attack(name, target, seed, range(start, inputs), at, faults)
+                    _attack(name, target, seed, range(start, indices.stop), at, faults)
                     code = 0
                 finally:
                     os._exit(code)
@@ -142,7 +148,7 @@ def fuzz(name: str, target: Target, inputs: int, seed: int, keep: Path) -> list[
                 time.sleep(0.02)
             faults.seek(0)
             told = [json.loads(line) for line in faults]
-        start = inputs
+        start = indices.stop
         if status:
             last = struct.unpack_from("<q", at, 0)[0]
             code = os.waitstatus_to_exitcode(status)
@@ -179,27 +185,64 @@ def _led_by_coverage(name: str, inputs: int) -> None:
     atheris.Fuzz()
 
 
+def shares(chosen: dict[str, Target], inputs: int, seed: int, keep: Path) -> dict[str, int]:
+    """Inputs for each, by the square root of its speed: slow readers get fewer, but no few."""
+    weights = {}
+    for name, target in chosen.items():
+        fuzz(name, target, range(1), seed, keep)  # compiles what is compiled
+        started = time.perf_counter()
+        fuzz(name, target, range(50), seed, keep)
+        weights[name] = (time.perf_counter() - started) ** -0.5
+    whole = sum(weights.values())
+    return {name: math.ceil(inputs * weight / whole) for name, weight in weights.items()}
+
+
+def go_on(chosen: dict[str, Target], inputs: int, seed: int, keep: Path) -> int:
+    """Up to so many inputs over all targets, from where the last call ended; the faults."""
+    keep.mkdir(parents=True, exist_ok=True)
+    path, run = keep / "done.json", f"{inputs} inputs, seed {seed}, {len(chosen)} targets"
+    state = json.loads(path.read_text()) if path.is_file() else {}
+    if state.get("run") != run:
+        counts = shares(chosen, inputs, seed, keep)
+        done = {name: {"of": n, "inputs": 0, "faults": []} for name, n in counts.items()}
+        state = {"run": run, "targets": done}
+    for name, one in state["targets"].items():
+        started, before = time.perf_counter(), one["inputs"]
+        while one["inputs"] < one["of"]:
+            indices = range(one["inputs"], min(one["inputs"] + _BLOCK, one["of"]))
+            found = fuzz(name, chosen[name], indices, seed, keep)
+            one["faults"] += [list(fault) for fault in found if list(fault) not in one["faults"]]
+            one["inputs"] = indices.stop
+            path.write_text(json.dumps(state, indent=1))
+        rate = (one["inputs"] - before) / (time.perf_counter() - started)
+        print(f"{name:24} {one['inputs']:9,} inputs {rate:8,.0f} a second", flush=True)
+        for what, where in one["faults"]:
+            print(f"    {what[:110]}  {where}", flush=True)
+    total = sum(one["inputs"] for one in state["targets"].values())
+    wrong = sum(len(one["faults"]) for one in state["targets"].values())
+    print(f"{total:,} inputs, {len(chosen)} targets, {wrong} faults")
+    return wrong
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description="damaged input for every reader")
     parser.add_argument("--inputs", type=int, default=1_000_000, help="over all targets")
     parser.add_argument("--target", default="", help="this one alone")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--artifacts", action="store_true", help="those that need a model, too")
     parser.add_argument("--atheris", action="store_true", help="led by coverage; needs --target")
     parser.add_argument("--keep", type=Path, default=Path("runs/fuzz"))
     given = parser.parse_args()
     if given.atheris:
         _led_by_coverage(given.target, given.inputs)
-    chosen = {k: v for k, v in targets().items() if given.target in ("", k)}
-    wrong = 0
-    for name, target in chosen.items():
-        started, share = time.perf_counter(), given.inputs // len(chosen)
-        found = fuzz(name, target, share, given.seed, given.keep)
-        seconds, wrong = time.perf_counter() - started, wrong + len(found)
-        print(f"{name:20} {share:8,} inputs {share / seconds:8,.0f} a second", flush=True)
-        for what, where in found:
-            print(f"    {what[:110]}  {where}", flush=True)
-    print(f"{wrong} faults")
-    return bool(wrong)
+    base = given.keep.resolve() / "base" if given.artifacts else None
+    if base is not None and not base.exists():
+        from attacks import make_base
+
+        base.mkdir(parents=True)
+        make_base(base)
+    chosen = {k: v for k, v in targets(base).items() if given.target in ("", k)}
+    return bool(go_on(chosen, given.inputs, given.seed, given.keep))
 
 
 if __name__ == "__main__":

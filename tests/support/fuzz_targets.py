@@ -230,6 +230,7 @@ def _configurations() -> dict[str, Target]:
     from tumortrack.plan.arms.config import CellConfig
     from tumortrack.plan.values import ResectionConfig
     from tumortrack.training.presets import PRESETS
+    from warp_objects import ANATOMY
 
     def written(kind: type, value: object) -> Target:
         def read(path: Path) -> object:
@@ -241,7 +242,7 @@ def _configurations() -> dict[str, Target]:
     frame = {"frame_id": "base_link", "unit": "m", "robot_from_camera": turn}
     marker = {**frame, "camera_from_marker": turn, "robot_from_marker": turn}
     del marker["robot_from_camera"]
-    clinic = PRESETS["clinic"]()
+    clinic = PRESETS["clinic"](ANATOMY)
     return {
         "calibration": (
             [json.dumps(frame).encode(), json.dumps(marker).encode()],
