@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import struct
+import zlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -127,6 +128,27 @@ def _dicom_compressed_claims_much(folder: Path, base: Path) -> Made:
             dataset.Rows = dataset.Columns = 30000
 
     return dicom(folder, change)
+
+
+@attack
+def _dicom_deflated_bomb(folder: Path, base: Path) -> Made:
+    """A slice of 2 MB, deflated as a whole, that unpacks to 2 GB in front of its pixels."""
+    import pydicom
+    from pydicom.uid import DeflatedExplicitVRLittleEndian
+
+    made = dicom(folder, lambda slices: None)
+    path = sorted((folder / "series").iterdir())[3]
+    dataset = pydicom.dcmread(path)
+    dataset.file_meta.TransferSyntaxUID = DeflatedExplicitVRLittleEndian
+    del dataset.PixelData
+    dataset.save_as(path)
+    pack = zlib.compressobj(9, zlib.DEFLATED, -15)
+    head = struct.pack("<HH2sHI", 0x0009, 0x0010, b"UN", 0, 2_000_000_000)
+    bomb = pack.compress(head) + b"".join(pack.compress(bytes(1_000_000)) for _ in range(2000))
+    content = path.read_bytes()
+    start = 132 + 12 + struct.unpack_from("<I", content, 140)[0]  # behind the file's meta group
+    path.write_bytes(content[:start] + bomb + pack.flush())
+    return made
 
 
 @attack
