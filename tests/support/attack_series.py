@@ -165,6 +165,15 @@ def _dicom_elements_of_no_type(folder: Path, base: Path) -> Made:
 
 
 @attack
+def _dicom_garbage_behind_the_pixels(folder: Path, base: Path) -> Made:
+    """An element of no type behind the pixels: GDCM makes room for 1.4 GB, as it reads its type."""
+    made = dicom(folder, lambda slices: None)
+    path = sorted((folder / "series").iterdir())[3]
+    path.write_bytes(path.read_bytes() + struct.pack("<HH4s", 0x5945, 0x18, b"P\0DS") + bytes(90))
+    return made
+
+
+@attack
 def _dicom_cut_files(folder: Path, base: Path) -> Made:
     def change(slices: list[Any]) -> None:
         for n, (dataset, path) in enumerate(slices):

@@ -175,7 +175,7 @@ def _groups(folder: Path) -> tuple[list[list[_Slice]], tuple[str, ...]]:
 def _read_tags(path: Path) -> _Slice | str:
     """The tags of one slice, or why the file is none (``_NO_SLICE``, ``_MULTI_FRAME``)."""
     import pydicom
-    from pydicom.filereader import read_file_meta_info
+    from pydicom.filereader import read_dataset, read_file_meta_info
     from pydicom.valuerep import STANDARD_VR
 
     tags: Any = None
@@ -188,7 +188,11 @@ def _read_tags(path: Path) -> _Slice | str:
                 tags = pydicom.FileDataset(path, {}, file_meta=meta)
                 raise ValueError("deflated as a whole, which is not read")
             tags = pydicom.dcmread(stream, stop_before_pixels=True)
-            types = {element.VR for part in (tags.file_meta, tags) for element in part.values()}
+            start = stream.tell()  # of the pixels; long values from there on are not read
+            rest = read_dataset(stream, *tags.original_encoding, defer_size=1024)
+            stream.seek(start)
+            parts = (tags.file_meta, tags, rest)
+            types = {element.VR for part in parts for element in part.values()}
             if strange := types - STANDARD_VR - {None}:  # GDCM takes their lengths for gigabytes
                 raise ValueError(f"elements of the type {sorted(strange)[0]!r}")
             if int(tags.get("NumberOfFrames") or 1) > 1:
