@@ -557,3 +557,17 @@ def test_close_ends_a_read_that_waits(tmp_path, monkeypatch):
     with pytest.raises(SourceLost):
         source.read(10 * PATIENCE_S)
     assert time.monotonic() - start < PATIENCE_S
+
+
+@pytest.mark.parametrize("form", ["mcap", "files"])
+def test_the_second_of_two_that_begin_to_record_into_one_folder_is_refused(
+    tmp_path, monkeypatch, form
+):
+    """Both looked before either had made it."""
+    monkeypatch.setattr("tumortrack.live.sinks.recording._make_room", lambda *_: None)
+    first = RecordTo(path=tmp_path / "tape", format=form).open(small_setting())
+    with pytest.raises((InputError, StorageError), match="exists"):
+        RecordTo(path=tmp_path / "tape", format=form).open(small_setting())
+    first.publish(update_number(0))
+    first.close()
+    assert stamps(play(tmp_path / "tape")) == [frame_number(0).stamp_ns]
