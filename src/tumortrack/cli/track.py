@@ -232,6 +232,7 @@ class _Screen:
         kind = re.sub(r"\d", "", state)  # numbers change with every frame
         if (cell := result.workcell) is not None:
             state += f"; arms: {cell.state}" + (f" ({cell.halted})" if cell.halted else "")
+            state += "" if cell.left_mm is None else f"; {cell.left_mm:.1f} mm of the margin left"
             kind += cell.state + re.sub(r"\d", "", cell.halted)
         now = time.monotonic()
         if kind != self._state and now - self._changed >= _SAY_S:

@@ -129,6 +129,7 @@ class Workcell:
 
     ``state``: of the procedure: approach, grasp, hold, sweep 1, ... ``halted``: why the arms stand
     still before their end; empty: they do not. ``joints_rad``: angle by the joint's name.
+    ``left_mm``: of the planned margin, once all errors of the moment are taken off; None: unknown.
     """
 
     state: str
@@ -136,6 +137,7 @@ class Workcell:
     joints_rad: Mapping[str, float] = field(default_factory=dict)
     shapes: tuple[RigidShape, ...] = ()
     lines: tuple[Polyline, ...] = ()
+    left_mm: float | None = None
 
     @property
     def drawn_lines(self) -> list[Polyline]:

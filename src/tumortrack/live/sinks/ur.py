@@ -25,6 +25,8 @@ UR_JOINTS = (
 )
 _WATCHDOG_S = SILENT_S = 0.2  # of silence: the controller stops the arm by itself, and the sink
 OFF_DEG = 2.0  # between the arm and the plan, before it may move
+# Between the tool's tip and its target on a cut: at 10 mm/s servoing is 1.3 mm late.
+OFF_MM = 2.0
 _STOP_M_S2 = 10.0  # servoStop's deceleration: ur_rtde's own
 # Of UR5, UR5e, UR10 and UR10e (data sheets): a turn either way; the larger ones' first two joints
 # are the slower ones, and their limits hold for all here.

@@ -308,4 +308,6 @@ def replan(located: Located, joints_rad: Joints, progress: ResectionProgress) ->
         raise NoPlan("the organ's surface was not found")
     from_sweep = progress.first_sweep(plan, located.meshes[plan.tumor])
     motions = plan_motions(plan, cell, organ, start_rad=joints_rad, from_sweep=from_sweep)
-    return Planned(plan, located.meshes, motions)
+    planned = Planned(plan, located.meshes, motions)
+    _ = planned.kept_mm  # which takes time: here, not in the live loop
+    return planned
