@@ -195,6 +195,7 @@ class Resect:
         from tumortrack.core.config import to_builtins
         from tumortrack.live.values import PublishedFrame
         from tumortrack.plan.arms import procedure
+        from tumortrack.plan.arms.cell import tip_places
         from tumortrack.plan.live_budget import LiveBudget
         from tumortrack.plan.located import located
 
@@ -243,7 +244,9 @@ class Resect:
                 model=model, source=source, sinks=self.sinks, range=self.range, box=self.box,
                 whole=self.whole, intrinsics=self.intrinsics, report=self.report,
                 device=self.device,
-            ).run(track.Arms(operation, frames, {"plan_config": to_builtins(config)}))  # fmt: skip
+            ).run(track.Arms(
+                operation, frames, {"plan_config": to_builtins(config)}, tip_places(cell.config)
+            ))  # fmt: skip
         _say_end(operation, arms)
 
     def _execute(

@@ -39,6 +39,7 @@ class Arms:
     companion: Operation
     frames: PublishedFrame
     about: dict[str, Any]
+    tip_mm: Any  # as ``SinkContext``'s
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -115,7 +116,10 @@ class Track:
         say_notes(model.notes)
         tracker = Tracker(model)
         config = self._loop_config(model)
-        context = SinkContext(model.parts, frames, tracker.anatomy_ct, Controls(), arms is not None)
+        tip_mm = None if arms is None else arms.tip_mm
+        context = SinkContext(
+            model.parts, frames, tracker.anatomy_ct, Controls(), arms is not None, tip_mm
+        )
         companion = None if arms is None else arms.companion
         loop = Loop(tracker, context, config, companion)
 

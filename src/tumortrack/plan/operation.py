@@ -195,7 +195,8 @@ class Operation:
         state = f"{execution.state} ({self._note})" if self._note else execution.state
         now = None if self._budget is None else self._budget.now
         left_mm = None if now is None else now.left_mm
-        return Workcell(state, execution.halted, named, shapes, tuple(lines), left_mm)
+        cutting = execution.cutting
+        return Workcell(state, execution.halted, named, shapes, tuple(lines), left_mm, cutting)
 
     @property
     def _note(self) -> str:
