@@ -102,9 +102,7 @@ class CellConfig(Config, frozen=True, kw_only=True):
                 allowed = f"{low or 'over 0'} to {high}"
                 raise InputError(f"cell: {name} is {value:g}; allowed: {allowed}.")
         if self.tool_error_mm is not None and not 0 < self.tool_error_mm <= 50:
-            raise InputError(
-                f"cell: tool_error_mm is {self.tool_error_mm:g}; allowed: 0 to 50."
-            )
+            raise InputError(f"cell: tool_error_mm is {self.tool_error_mm:g}; allowed: 0 to 50.")
         if not all(100 <= side <= 10_000 for side in self.table_mm):
             raise InputError(f"cell: table_mm is {self.table_mm}; allowed: 100 to 10000 each.")
         places = (*self.middle_mm, *self.camera_mm, *self.home_rad)
