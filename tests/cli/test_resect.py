@@ -14,6 +14,7 @@ import pytest
 from PIL import Image
 from safetensors import safe_open
 
+import tumortrack as tt
 from plan_objects import Deviating, located
 from stories import (
     COMMAND,
@@ -25,6 +26,7 @@ from stories import (
     tumortrack,
 )
 from tumortrack.core import store
+from tumortrack.core.errors import NoPlan
 from tumortrack.core.estimate import Estimate
 from tumortrack.core.types import CameraLabels, OccupancyCloud
 from tumortrack.imaging.case import load_case
@@ -122,6 +124,13 @@ def test_a_margin_that_does_not_hold_the_errors_is_no_plan_unless_a_person_accep
     assert "7.5 mm would hold them (--margin, margin_mm)" in line
     assert not (tmp_path / "plan").exists()
     succeeded(tumortrack(*plan, "--margin", 7.5))
+    # From Python the same: the same table, the same errors.
+    with pytest.raises(NoPlan, match=r"7\.1 mm of error"):
+        tt.plan_resection(folder / "run")
+    here, stored = tt.plan_resection(folder / "run", margin_mm=8.0), read_plan(folder / "plan").plan
+    assert here.grasp_mm == pytest.approx(stored.grasp_mm)
+    assert here.notes == stored.notes
+    assert tt.plan_resection(folder / "run", accept_budget=True).notes[-1].startswith("PLANNED")
     assert "no margin below the tumor" in refusal(tumortrack(*plan, "--method", "published"))
     # With less motion that is allowed for, the paper's margin is still too little.
     assert "against a margin of 4.9" in refusal(tumortrack(*plan, "--moved", 0.5))
@@ -299,7 +308,8 @@ def test_a_plan_on_a_poor_estimate_moves_no_real_arm(story, given, tmp_path):
 def test_a_person_types_the_address_of_the_arm_that_will_move(given, typed):
     terminal, stdin = pty.openpty()
     os.write(terminal, b"127.0.0.1\n")  # before it is asked for: does not count
-    arguments = ("resect", given / "plan", REAL, "--live", given / "model", "realsense")
+    sinks = (REAL, "ur:10.0.0.9?arm=holder")
+    arguments = ("resect", given / "plan", *sinks, "--live", given / "model", "realsense")
     process = subprocess.Popen(
         [*COMMAND, *map(str, arguments)], stdin=stdin, stdout=subprocess.PIPE,
         stderr=subprocess.PIPE, text=True, env=environment(),
@@ -309,11 +319,13 @@ def test_a_person_types_the_address_of_the_arm_that_will_move(given, typed):
     while not said.endswith("to let it begin: "):
         said += process.stdout.read(1)
     os.write(terminal, f"{typed}\n".encode())
-    _, error = process.communicate(timeout=300)
+    rest, error = process.communicate(timeout=300)
     os.close(terminal)
     os.close(stdin)
     assert "The cutter at 127.0.0.1 is about to move: as soon as an estimate is good" in said
     assert ("127.0.0.1 was not confirmed" in error) == (typed != "127.0.0.1")
+    dry = "DRY RUN of the holder at 10.0.0.9: it is not connected"
+    assert rest.count(dry) == (2 if typed == "127.0.0.1" else 0)
     assert process.returncode == 2  # confirmed: the model has nothing but its case
 
 

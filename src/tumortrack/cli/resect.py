@@ -116,7 +116,7 @@ class Resect:
             return
         _confirm(moving)
         carry_out = self._execute if self.live is None else self._follow
-        with _dry_run(bool(arms) and not moving):
+        with _dry_run([arm for arm in arms if not arm.execute], moving):
             carry_out(stored, cell, config, arms)
 
     def _check_real(self, stored: PlanFolder, arms: Sequence[UrSinkConfig]) -> None:
@@ -245,7 +245,8 @@ class Resect:
                 whole=self.whole, intrinsics=self.intrinsics, report=self.report,
                 device=self.device,
             ).run(track.Arms(
-                operation, frames, {"plan_config": to_builtins(config)}, tip_places(cell.config)
+                operation, frames, {"plan_config": to_builtins(config)}, tip_places(cell.config),
+                bool(arms),
             ))  # fmt: skip
         _say_end(operation, arms)
 
@@ -284,8 +285,7 @@ class Resect:
                     sink.put(result)
                 track.say_failures(sinks, errors)
                 assert result.workcell is not None
-                text = result.workcell.state
-                text = "the way back" if arms and text == "home" else text
+                text = track.stage_words(result.workcell.state, bool(arms))
                 text += f": {result.workcell.halted}" if result.workcell.halted else ""
                 if text != shown:
                     say(shown := text)
@@ -338,15 +338,18 @@ def _confirm(arms: Sequence[UrSinkConfig]) -> None:
 
 
 @contextmanager
-def _dry_run(dry: bool) -> Iterator[None]:
-    """Say first and last that no arm is connected, if so."""
-    if dry:
-        say(_DRY_RUN)
+def _dry_run(dry: Sequence[UrSinkConfig], moving: Sequence[UrSinkConfig]) -> Iterator[None]:
+    """Say first and last which arms are not connected."""
+    lines = [_DRY_RUN] if dry and not moving else []
+    if moving:
+        lines = [f"DRY RUN of the {one.arm} at {one.host}: it is not connected" for one in dry]
+    for line in lines:
+        say(line)
     try:
         yield
     finally:
-        if dry:
-            say(_DRY_RUN)
+        for line in lines:
+            say(line)
 
 
 def _operation(
