@@ -116,7 +116,7 @@ def test_a_margin_that_does_not_hold_the_errors_is_no_plan_unless_a_person_accep
         "  motion     2.0", "  lag        0.0",
     ]  # fmt: skip
     assert "note: 0.8 mm of the margin are left after 7.1 mm of error." in lines
-    plan = ("plan", folder / "run", tmp_path / "plan", "--no-arms")
+    plan = ("plan", folder / "run", tmp_path / "plan", "--no-arms", "--overwrite")
     done = tumortrack(*plan)
     assert done.returncode == 3
     line = refusal(done)
@@ -134,7 +134,7 @@ def test_a_margin_that_does_not_hold_the_errors_is_no_plan_unless_a_person_accep
     assert "no margin below the tumor" in refusal(tumortrack(*plan, "--method", "published"))
     # With less motion that is allowed for, the paper's margin is still too little.
     assert "against a margin of 4.9" in refusal(tumortrack(*plan, "--moved", 0.5))
-    done = tumortrack(*plan, "--accept-budget", "--overwrite")
+    done = tumortrack(*plan, "--accept-budget")
     assert "PLANNED OVER ITS ERROR BUDGET: 7.1 mm of error" in succeeded(done)
     data = json.loads((tmp_path / "plan" / "plan.json").read_text())
     assert data["budget"]["tracking_mm"] == pytest.approx(3.6)
@@ -403,7 +403,7 @@ def test_a_film_is_an_animation(story, tmp_path):
         (["--cell", "CELL"], "unknown field `legs`"),
         (["--frame", "FRAME"], "must have camera_from_robot"),
         (["--cell", "LOOSE"], "tool_error_mm is -1; allowed: 0 to 50"),
-        (["--moved", -1], "motion is -1 mm; allowed: 0 or more"),
+        (["--moved", 0], "moved_mm is 0; allowed: over 0 to 100"),
     ],
 )
 def test_what_cannot_be_planned_is_said_in_one_line_and_nothing_is_written(

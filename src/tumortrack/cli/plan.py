@@ -74,10 +74,12 @@ class Plan:
         from tumortrack.plan.budget import heeded
         from tumortrack.plan.files import INVENTED, KIND, PlanFolder, write_plan
         from tumortrack.plan.located import notes_of_doubt, read_run
+        from tumortrack.plan.operation import OperationConfig
         from tumortrack.plan.resection import plan_resection
         from tumortrack.report.plan_pictures import draw_plan
 
         config = self._resection_config()
+        OperationConfig(moved_mm=self.moved)  # what is allowed is said now, not by `resect`
         store.check_place(self.plan, KIND, self.overwrite)
         cell_config = self._cell_config()
         if self.arms:

@@ -59,7 +59,7 @@ class OperationConfig(Config, frozen=True, kw_only=True):
     def __post_init__(self) -> None:
         for name in ("moved_mm", "settled_mm", "settled_s"):
             if not 0 < getattr(self, name) <= 100:
-                raise InputError(f"{name} is {getattr(self, name):g}; allowed: 0 to 100.")
+                raise InputError(f"{name} is {getattr(self, name):g}; allowed: over 0 to 100.")
         if not 0 < self.speed <= 20:
             raise InputError(f"speed is {self.speed:g}; allowed: more than 0, up to 20.")
 
