@@ -92,6 +92,20 @@ def test_an_abort_stops_the_arms_smoothly_from_every_state_and_for_good(state):
     assert np.array_equal(execution.joints_rad, joints[-1])
 
 
+def test_a_cut_is_one_once_an_arm_has_had_the_time_to_come_up_with_it():
+    execution, cutting = Execution(motions()), []
+    while execution.state != DONE:
+        cutting.append((execution.state, execution.cutting))
+        execution.step(0.01)
+    for state in STATES:
+        found = [is_cut for name, is_cut in cutting if name == state]
+        first = found.index(True) if any(found) else len(found)
+        assert all(found[first:])
+        # All of these sweeps is cut: but for their first 0.3 s, by the samples 0.1 s apart.
+        assert (25 <= first <= 42) == state.startswith("sweep")
+    assert not execution.cutting
+
+
 @given(st.lists(st.tuples(st.booleans(), st.floats(0, 0.7)), min_size=1, max_size=30))
 @settings(max_examples=60, deadline=None)
 def test_halts_only_delay(orders):
