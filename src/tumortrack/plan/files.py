@@ -21,6 +21,7 @@ from tumortrack.core.errors import ArtifactError, InputError, NoPlan
 from tumortrack.core.mesh_files import read_mesh, write_mesh
 from tumortrack.core.types import Mesh
 from tumortrack.plan.arms.config import CellConfig
+from tumortrack.plan.budget import ErrorBudget
 from tumortrack.plan.motions import JOINTS, Motions, MotionStage
 from tumortrack.plan.values import Located, ResectionConfig, ResectionPlan
 from tumortrack.sense.ply import cloud_ply
@@ -38,7 +39,8 @@ class PlanFolder:
     """What a plan's folder holds. ``cell``: the workcell's configuration that the motions are for,
     as JSON; motions and cell are None where no arms were planned. ``case_sha256``: of the case that
     the organ was located by; empty where unknown. ``frame_source``, ``cell_source``: the sha256 of
-    the user's file that gave the frame, and the places of the arms; or ``INVENTED``."""
+    the user's file that gave the frame, and the places of the arms; or ``INVENTED``. ``budget``:
+    None in plans of older versions."""
 
     plan: ResectionPlan
     config: ResectionConfig
@@ -50,6 +52,7 @@ class PlanFolder:
     case_sha256: str = ""
     frame_source: str = INVENTED
     cell_source: str = INVENTED
+    budget: ErrorBudget | None = None
 
 
 def write_plan(
@@ -80,6 +83,7 @@ def write_plan(
         "frame_source": content.frame_source,
         "cell_source": content.cell_source,
         "plan": as_builtins(plan),
+        "budget": content.budget and to_builtins(content.budget),
         "cell": content.cell,
         "seconds": motions and motions.seconds,
     }
@@ -117,9 +121,10 @@ def read_plan(folder: Path) -> PlanFolder:
             cell = from_builtins(data["cell"], CellConfig, str(folder / _NAME))
             for fault in _faults(motions, cell, plan.sweeps):
                 raise ArtifactError(f"{path} can't be carried out: {fault}. Plan again.")
+        budget, where = data.get("budget"), str(folder / _NAME)
         return PlanFolder(
             plan=plan,
-            config=from_builtins(data["config"], ResectionConfig, str(folder / _NAME)),
+            config=from_builtins(data["config"], ResectionConfig, where),
             table_from_camera=np.array(data["table_from_camera"], float),
             frame_id=str(data["frame_id"]),
             meshes=meshes,
@@ -128,6 +133,7 @@ def read_plan(folder: Path) -> PlanFolder:
             case_sha256=str(data["case_sha256"] or ""),
             frame_source=str(data.get("frame_source", INVENTED)),
             cell_source=str(data.get("cell_source", INVENTED)),
+            budget=None if budget is None else from_builtins(budget, ErrorBudget, where),
         )
     except ArtifactError:
         raise
