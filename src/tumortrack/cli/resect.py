@@ -115,10 +115,10 @@ class Resect(StatedPatient):
                 raise InputError("--film shows the stored plan; give it without sinks and --live.")
             _write_film(stored, cell, self.film)
             return
-        say(str(stored.patient))
         _confirm(moving, stored.patient)
         carry_out = self._execute if self.live is None else self._follow
         with _dry_run(bool(arms) and not moving):
+            say(str(stored.patient))
             carry_out(stored, cell, config, arms)
 
     def _check_real(self, stored: PlanFolder, arms: Sequence[UrSinkConfig]) -> None:
