@@ -181,7 +181,7 @@ def qc_picture(
     dropped = len(order) > _MOST_ROWS
     more = f" (slices through the {_MOST_ROWS} largest of {len(order)} tumors)" if dropped else ""
     title = f"Prepared case over its {what}{more}" + (f": {whose}" if whose else "")
-    figure.suptitle(title, x=0.015, ha="left", fontweight="bold")
+    figure.suptitle(title, x=0.015, ha="left", fontweight="bold", parse_math=False)
     handles = [
         Patch(facecolor=color, label=f"{name.replace('_', ' ')} {part.volume_mm3 / 1000:.1f} ml")
         for color, name, part in zip(colors, anatomy.names, anatomy.parts, strict=True)

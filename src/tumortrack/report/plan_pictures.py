@@ -187,7 +187,9 @@ def _words(figure: Figure, plan: ResectionPlan, patient: Patient) -> None:
     ml, tumor = plan.volumes_ml, plan.tumor.replace("_", " ")
     sweeps = f"{plan.sweeps} sweep" + ("s" if plan.sweeps > 1 else "")
     title = f"Resection of {tumor}, {patient}: {_METHODS[plan.method]}, {sweeps}"
-    figure.suptitle(title, x=0.014, y=0.975, ha="left", fontsize=13, fontweight="bold")
+    figure.suptitle(
+        title, x=0.014, y=0.975, ha="left", fontsize=13, fontweight="bold", parse_math=False
+    )
     share = ml["healthy"] / ml["parenchyma"]
     line = (
         f"{ml['piece']:.1f} ml come away: {ml['tumor']:.1f} ml tumor and {ml['healthy']:.1f} ml "
