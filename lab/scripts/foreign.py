@@ -54,6 +54,7 @@ KINDS = {
 }
 VERDICTS = ("refused", "poor", "good")
 VIEWS = {"table": "on a table", "nothing": "nothing seen behind", "cloud": "cloud alone"}
+WORST = 4  # of each view, in the last table
 
 
 @dataclass(frozen=True)
@@ -253,7 +254,9 @@ def _write(
     ]
     passed = (rows[[*VIEWS]] == "good").any(axis=1)
     wrong = rows[(rows.kind != "own") & passed]
-    worst = wrong.sort_values("tumor_mm", ascending=False, na_position="last").head(8)
+    by_error = wrong.sort_values("tumor_mm", ascending=False, na_position="last")
+    worst = pd.concat([by_error[by_error[view] == "good"].head(WORST) for view in VIEWS])
+    worst = worst[~worst.index.duplicated()]
     furthest = [
         [
             one.model, one.organ, one.state,
@@ -267,7 +270,8 @@ def _write(
         table(head, body, 3),
         f"Called good, by model ({', '.join(VIEWS.values())}; of all):",
         table(["model", "ml", *KINDS.values()], each),
-        f"The worst of the {len(wrong)} that any view called good and that are not the organ:",
+        f"Of the {len(wrong)} that any view called good and that are not the organ, the "
+        f"{WORST} worst of each view:",
         table([*worst_head, "points off, mm", "cost / usual"], furthest, 4),
         f"`{writer.command}`: models of {options.steps:,} steps of the preset clinic each, seed "
         f"{options.seed}; D405 noise. Intervals are Wilson's. Tumor off: between the middles of "

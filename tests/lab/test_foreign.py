@@ -72,5 +72,5 @@ def test_the_block_counts_what_was_called_good(script, tmp_path):
     assert "| another's kidney | all | on a table | 2 | 2 | 0 | 0 | 0 (0 to 66) |" in said
     assert "| another's kidney | all | nothing seen behind | 2 | 0 | 1 | 1 | 50 (9 to 91) |" in said
     assert "| m | 150 | 1/1/1 of 1 | – | – | 0/1/0 of 2 |" in said
-    assert "The worst of the 1 that any view called good" in said
+    assert "Of the 1 that any view called good and that are not the organ" in said
     assert "| m | o | undeformed | nothing seen behind | 44.0 | – | 0.50 |" in said
