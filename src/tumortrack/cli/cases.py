@@ -62,6 +62,8 @@ class Prepare:
         case = api.prepare(self.input, self.case, overwrite=self.overwrite, **options)
         say_notes(case.report.get("notes", []))
         say(str(case.patient))
+        if not case.patient.known:
+            say_notes(["state both (--patient ID --side left|right): no real arm moves without"])
         for name, part in zip(case.anatomy.names, case.anatomy.parts, strict=True):
             say(f"{name}: {part.volume_mm3 / 1000:.1f} ml")
         say(f"case written to {self.case}; look at {self.case / 'qc.png'} before you rely on it.")
