@@ -121,7 +121,12 @@ class Track(StatedPatient):
         config = self._loop_config(model)
         tip_mm = None if arms is None else arms.tip_mm
         context = SinkContext(
-            model.parts, frames, tracker.anatomy_ct, Controls(), arms is not None, model.patient,
+            model.parts,
+            frames,
+            tracker.anatomy_ct,
+            Controls(),
+            arms is not None,
+            model.patient,
             tip_mm,
         )
         companion = None if arms is None else arms.companion
