@@ -14,7 +14,7 @@ ORGAN: Colour = (225, 230, 235)
 REGION: Colour = (64, 70, 82)
 PICKED: Colour = (255, 80, 200)
 
-GOOD: Colour = (46, 160, 67)
+GOOD: Colour = (88, 100, 114)  # no green: it would say that it is safe to cut
 POOR: Colour = (210, 140, 0)
 NONE: Colour = (205, 20, 30)
 STALE: Colour = (110, 60, 160)

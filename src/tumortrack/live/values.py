@@ -23,6 +23,9 @@ from tumortrack.core.estimate import Estimate, Quality
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.types import Anatomy, DepthFrame, Mesh, SensorCloud
 
+# What people read where ``quality`` is ``good``: that word alone would say more than is known.
+NO_CHECK_FAILED, UNVERIFIED = "fit: no check failed", "its place is not verified"
+
 
 class SourceLost(TumortrackError):
     """The source is gone for now: unplugged, killed, unreadable. It is opened again."""
@@ -208,10 +211,12 @@ class TrackingResult:
         return transform_points(self.published_frame.published_from_camera, center_mm)[0]
 
     def describe(self) -> str:
-        """How good the estimate is, or why there is none."""
+        """How good the estimate is, in words for people, or why there is none."""
         if self.estimate is None:
             return f"no estimate: {self.reason}"
-        return f"{self.quality}: {self.warning}" if self.warning else self.quality
+        if self.quality == "good":
+            return f"{NO_CHECK_FAILED}; {UNVERIFIED}"
+        return f"{self.quality} estimate: {self.warning}"
 
 
 @runtime_checkable
