@@ -228,7 +228,7 @@ class _Screen:
 
     def show(self, result: TrackingResult) -> None:
         """Called with every result."""
-        state = result.reason or result.warning or "good"
+        state = result.describe()
         kind = re.sub(r"\d", "", state)  # numbers change with every frame
         if (cell := result.workcell) is not None:
             state += f"; arms: {cell.state}" + (f" ({cell.halted})" if cell.halted else "")
@@ -236,7 +236,7 @@ class _Screen:
         now = time.monotonic()
         if kind != self._state and now - self._changed >= _SAY_S:
             self._state, self._changed = kind, now
-            say(f"{result.quality}: {state}")
+            say(state)
         say_failures(self.sinks, self._errors)
         if now - self._shown >= (_SAY_S if console.is_terminal else _SAY_PLAIN_S):
             self._line(now)

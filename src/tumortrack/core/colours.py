@@ -20,8 +20,6 @@ NONE: Colour = (205, 20, 30)
 STALE: Colour = (110, 60, 160)
 ARMS: Colour = (45, 95, 165)
 BACKGROUND: Colour = (22, 24, 29)
-BACKGROUND_NONE: Colour = (74, 8, 12)
-BACKGROUND_STALE: Colour = (48, 24, 72)
 
 _SWEEPS = ((0, 120, 240), (90, 60, 220), (205, 0, 130))
 

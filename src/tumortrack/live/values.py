@@ -19,12 +19,9 @@ from jaxtyping import Bool, Float32, Float64, UInt8
 
 from tumortrack.core.config import Config
 from tumortrack.core.errors import TumortrackError
-from tumortrack.core.estimate import Estimate, Quality
+from tumortrack.core.estimate import NO_CHECK_FAILED, UNVERIFIED, Estimate, Quality
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.types import Anatomy, DepthFrame, Mesh, SensorCloud
-
-# What people read where ``quality`` is ``good``: that word alone would say more than is known.
-NO_CHECK_FAILED, UNVERIFIED = "fit: no check failed", "its place is not verified"
 
 
 class SourceLost(TumortrackError):

@@ -15,7 +15,8 @@ from jaxtyping import UInt8
 
 from tumortrack.core import colours
 from tumortrack.core.colours import Colour, css, part_colour
-from tumortrack.live.values import NO_CHECK_FAILED, UNVERIFIED, TrackingResult, Workcell
+from tumortrack.core.estimate import NO_CHECK_FAILED, UNVERIFIED
+from tumortrack.live.values import TrackingResult, Workcell
 from tumortrack.live.viewer.look import View
 from tumortrack.live.viewer.scene import DisplayOptions
 from tumortrack.live.viewer.slices import ORIENTATIONS

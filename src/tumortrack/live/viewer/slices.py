@@ -105,8 +105,8 @@ def slice_picture(
     note: str = "",
 ) -> UInt8[np.ndarray, "h w 3"] | None:
     """The CT in a plane before the camera, over it the outlines of surfaces (camera frame) in
-    their colour and width (pixels), a bar of 10 mm, and ``note`` in the corner. None where ``motion`` knows no way back.
-    """
+    their colour and width (pixels), a bar of 10 mm, and ``note`` in the corner. None where
+    ``motion`` knows no way back."""
     from PIL import Image, ImageDraw
 
     sampled = pixels // _COARSER
