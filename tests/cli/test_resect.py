@@ -149,6 +149,7 @@ NEEDS = {
     "same": "a model of the case that was planned on",
     "plan": "a plan that says which case",
     "frame": "--frame FILE (this one's frame is invented)",
+    "camera": "--frame FILE that has camera_frame_id",
     "cell": "--cell FILE that gives both bases",
     "good": "a plan made on a good estimate",
     "speed": "--speed up to 1, not 2",
@@ -197,7 +198,7 @@ def test_a_real_arm_moves_only_with_all_that_it_needs_and_nothing_is_connected_b
     assert resect(given / "anywhere", REAL) == {"live", "cell", "person"}
     live = (plan, REAL, "--live")
     assert resect(*live, given / "unknown", "realsense") == {"model", "person"}
-    assert resect(*live, given / "other", "ros2:/depth") == {"same", "person"}
+    assert resect(*live, given / "other", "ros2:/depth") == {"same", "camera", "person"}
     for source in (f"virtual:{given}", "recording:seen", "realsense:seen.bag",
                    "realsense?device=seen.bag"):  # fmt: skip
         assert resect(*live, given / "model", source) == {"source", "person"}

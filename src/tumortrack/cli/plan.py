@@ -15,10 +15,8 @@ from tumortrack.core import store
 from tumortrack.core.errors import InputError, NoPlan
 
 if TYPE_CHECKING:
-    import numpy as np
-    from jaxtyping import Float64
-
     from tumortrack.core.types import Mesh
+    from tumortrack.live.values import PublishedFrame
     from tumortrack.plan.arms.config import CellConfig
     from tumortrack.plan.located import LocatedRun
     from tumortrack.plan.values import ResectionConfig, ResectionPlan
@@ -77,7 +75,8 @@ class Plan:
             check_arms_installed()
         run = read_run(self.run_folder)
         doubts = notes_of_doubt(run.doubt, self.accept_poor)
-        frame_id, table_from_camera = self._frame(run, cell_config.stand_mm)
+        frames = self._frame(run, cell_config.stand_mm)
+        frame_id, table_from_camera = frames.frame_id, frames.published_from_camera
         located = run.located(table_from_camera)
         organ = located.meshes.get("kidney")
         if self.arms and organ is None:
@@ -109,6 +108,7 @@ class Plan:
             resection, config, table_from_camera, frame_id, located.meshes, cell_used, motions,
             str(model.get("case_sha256") or "") if isinstance(model, dict) else "",
             store.sha256_of(self.frame) if self.frame else INVENTED, cell_source,
+            frames.camera_frame_id, frames.table_in_camera,
         )  # fmt: skip
 
         def pictures(aside: Path) -> None:
@@ -151,16 +151,16 @@ class Plan:
             return INVENTED
         return store.sha256_of(self.cell)
 
-    def _frame(self, run: LocatedRun, stand_mm: float) -> tuple[str, Float64[np.ndarray, "4 4"]]:
-        """Frame id and ``table_from_camera``: of the calibration, or of a camera that looks
-        down."""
+    def _frame(self, run: LocatedRun, stand_mm: float) -> PublishedFrame:
+        """The table's frame: of the calibration, or of a camera that looks down."""
         from tumortrack.live.calibration_file import read_frames
+        from tumortrack.live.values import PublishedFrame
         from tumortrack.plan.located import table_below
 
         if self.frame is None:
             kidney = run.meshes.get("kidney")
             points_mm = run.cloud.points_mm if kidney is None else kidney.vertices_mm
-            return "table", table_below(points_mm, stand_mm)
+            return PublishedFrame("table", table_below(points_mm, stand_mm))
         frames = read_frames(self.frame)
         if frames.published_from_camera[2, 2] >= 0:  # cuts are planned from above
             raise InputError(
@@ -173,7 +173,7 @@ class Plan:
                 "--frame: where do the arms stand in that frame? Say it with --cell FILE "
                 "(docs/resection.md), or plan the cuts alone with --no-arms."
             )
-        return frames.frame_id, frames.published_from_camera
+        return frames
 
 
 def check_arms_installed() -> None:

@@ -23,6 +23,7 @@ from tumortrack.core.errors import InputError, NoEstimate, TumortrackError
 from tumortrack.core.estimate import Quality
 from tumortrack.core.types import DepthFrame, Intrinsics, SensorCloud
 from tumortrack.live import values as live
+from tumortrack.live.frames import FrameCheck
 from tumortrack.live.meter import RunStatistics
 from tumortrack.live.stamps import StampCheck
 from tumortrack.live.values import Observation, SourceLost, TrackingResult
@@ -74,6 +75,7 @@ class Loop:
         self._config, self._context, self._arms = config, context, arms
         self._follower = Follower(tracker, config.follower)
         self._stamps = StampCheck(config.stale_s)
+        self.frames = FrameCheck(context.published_frame, config.region)
         self._stop = threading.Event()
         self._sequence = itertools.count()
         self._picked: Float64[np.ndarray, " 3"] | None = None  # by the user
@@ -155,6 +157,8 @@ class Loop:
             if self._stamps.check(seen.stamp_ns, _age_s(born_ns), other_clock):
                 self.statistics.clock_jumps += 1
                 self._follower.forget()
+            with _timed(seconds, "frame"):
+                doubt = self.frames.check(seen)
             with _timed(seconds, "organ"):
                 rng = np.random.default_rng((self._config.follower.seed, seen.stamp_ns))
                 hints = self._hints(seen)
@@ -163,6 +167,8 @@ class Loop:
                 estimate = self._follower.locate(organ, seen.content)
             seconds |= {f"locate.{k}": v for k, v in estimate.report["timings"].items()}
             quality, warning = estimate.quality, estimate.reason
+            if doubt and quality == "good":
+                quality, warning = "poor", doubt
             self._follow_pick(organ)
             if hurry and _age_s(born_ns) > self._config.stale_s:
                 raise _TooLate(f"the answer came too late: {_age_s(born_ns):.2f} s after the frame")

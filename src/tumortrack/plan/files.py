@@ -20,6 +20,7 @@ from tumortrack.core.config import from_builtins, to_builtins
 from tumortrack.core.errors import ArtifactError, InputError, NoPlan
 from tumortrack.core.mesh_files import read_mesh, write_mesh
 from tumortrack.core.types import Mesh
+from tumortrack.live.values import PublishedFrame
 from tumortrack.plan.arms.config import CellConfig
 from tumortrack.plan.motions import JOINTS, Motions, MotionStage
 from tumortrack.plan.values import Located, ResectionConfig, ResectionPlan
@@ -38,7 +39,8 @@ class PlanFolder:
     """What a plan's folder holds. ``cell``: the workcell's configuration that the motions are for,
     as JSON; motions and cell are None where no arms were planned. ``case_sha256``: of the case that
     the organ was located by; empty where unknown. ``frame_source``, ``cell_source``: the sha256 of
-    the user's file that gave the frame, and the places of the arms; or ``INVENTED``."""
+    the user's file that gave the frame, and the places of the arms; or ``INVENTED``.
+    ``camera_frame_id``, ``table_in_camera``: as ``PublishedFrame`` has them."""
 
     plan: ResectionPlan
     config: ResectionConfig
@@ -50,6 +52,19 @@ class PlanFolder:
     case_sha256: str = ""
     frame_source: str = INVENTED
     cell_source: str = INVENTED
+    camera_frame_id: str = ""
+    table_in_camera: tuple[float, float, float, float] | None = None
+
+    @property
+    def frames(self) -> PublishedFrame:
+        """Where a live run publishes that carries the plan out."""
+        return PublishedFrame(
+            self.frame_id,
+            self.table_from_camera,
+            self.frame_source != INVENTED,
+            self.camera_frame_id,
+            self.table_in_camera,
+        )
 
 
 def write_plan(
@@ -79,6 +94,8 @@ def write_plan(
         "case_sha256": content.case_sha256,
         "frame_source": content.frame_source,
         "cell_source": content.cell_source,
+        "camera_frame_id": content.camera_frame_id,
+        "table_in_camera": content.table_in_camera,
         "plan": as_builtins(plan),
         "cell": content.cell,
         "seconds": motions and motions.seconds,
@@ -128,6 +145,10 @@ def read_plan(folder: Path) -> PlanFolder:
             case_sha256=str(data["case_sha256"] or ""),
             frame_source=str(data.get("frame_source", INVENTED)),
             cell_source=str(data.get("cell_source", INVENTED)),
+            camera_frame_id=str(data.get("camera_frame_id", "")),
+            table_in_camera=msgspec.convert(
+                data.get("table_in_camera"), tuple[float, float, float, float] | None
+            ),
         )
     except ArtifactError:
         raise
