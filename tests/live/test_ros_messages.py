@@ -195,6 +195,18 @@ def test_depth_images_of_any_encoding_give_the_same_frame(encoding, dtype, scale
     assert frame.stamp_ns == STAMP_NS
 
 
+def test_a_camera_info_of_another_camera_or_of_none_is_refused():
+    image = image_message(np.full((2, 3), 150, "<u2"), "16UC1")
+    nameless, other = (HUMBLE.header(STAMP_NS, name) for name in ("", "leg"))
+    assert depth_of(image, info_message(header=nameless)).stamp_ns == STAMP_NS
+    with pytest.raises(InputError, match=r"in the frame 'arm' .* camera_info of 'leg'"):
+        depth_of(image, info_message(header=other))
+    for focal in (0.2, 16.0, 600.0):  # of 3 pixels: 0.3 to 15
+        k = np.array([focal, 0, 1.25, 0, 6.5, 0.5, 0, 0, 1])
+        with pytest.raises(InputError, match="no depth camera's of 3 x 2"):
+            depth_of(image, info_message(k=k))
+
+
 def test_no_return_in_float_images_and_steps_of_another_unit():
     metres = np.array([[np.nan, np.inf, -0.1], [0, 3e38, 0.15]], np.float32)
     frame = depth_of(image_message(metres, "32FC1"), info_message())
