@@ -11,7 +11,7 @@ import socket
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -35,6 +35,7 @@ if TYPE_CHECKING:
 _STALE_S = 1.0
 _TICK_S = 0.2  # the status grows older, and slices are renewed, this often
 _SLICE_PIXELS = 320
+_PARKED_S = 1.0  # for viser's thread to stand still, else what changes may arrive in pieces
 
 
 class ViewerSinkConfig(SinkConfig, frozen=True, kw_only=True, tag="viewer"):
@@ -151,8 +152,9 @@ class ViewerSink:
             go_on.wait()
 
         with self._lock:
-            self._server.get_event_loop().call_soon_threadsafe(park)
-            parked.wait(_TICK_S)
+            with suppress(RuntimeError):  # it has ended: nobody is looking
+                self._server.get_event_loop().call_soon_threadsafe(park)
+                parked.wait(_PARKED_S)
             try:
                 yield
             finally:

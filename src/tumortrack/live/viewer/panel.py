@@ -51,8 +51,8 @@ _PAGE = Template(files(__package__).joinpath("status.html").read_text("utf-8")).
 # popover it lies above all, where the panel has been dimmed too.
 _SILENCE = (
     '<div class="tumortrack-silence" onanimationend="this.popover = \'manual\'; '
-    f'this.showPopover()"><div>STALE<small>tumortrack has been silent for {SILENCE_S} s; what you '
-    "see is old</small></div></div>"
+    f'this.showPopover()"><div>STALE<small>tumortrack has been silent for {SILENCE_S} s, or its '
+    "panel was closed; what is said here is old</small></div></div>"
 )
 
 
@@ -95,7 +95,7 @@ class StatusPanel:
 
     def _over_scene(self) -> str:
         """A banner with the reason; where it is alarming the whole page in its colour; the page's
-        watch. Read with the panel closed too."""
+        watch."""
         heading, colour = _HEADINGS[self.state]
         tint, size = "", 16 if self.state == "good" else 20
         if self.alarming:

@@ -17,8 +17,9 @@ from tumortrack.sense.camera import deproject_pixels
 from tumortrack.sense.region.picture import RegionConfig, picture_of_cloud, picture_of_frame
 from tumortrack.sense.region.plane import Plane, find_plane
 
-_PIXELS = 1500  # of an image that are looked at; of a cloud, as many cells of a fixed picture
-_EVERY = 2  # a look each so many frames
+# Of an image that are looked at; of a cloud, as many cells of a fixed picture, and points in each.
+_PIXELS, _PER_CELL = 1500, 6
+_EVERY, _SELDOM = 2, 30  # a look each so many frames; where there was no table so far
 _LOOKS = 7  # whose median counts: noise, and hands that come and go
 _LEARNED = 15  # looks whose median is the table at the start: a second at 30 Hz
 # Without motion the median wavers by up to 0.3 mm (docs/live.md); the least shift that counts is
@@ -55,13 +56,13 @@ class TableWatch:
 
     @property
     def blind(self) -> bool:
-        return self._table is None and self._frames > _EVERY * _LEARNED
+        return self._table is None and not self._first and self._frames > _EVERY * _LEARNED
 
     def check(self, content: DepthFrame | SensorCloud) -> str:
         """A doubt about this frame, or nothing. Raises NoEstimate, with this frame and all that
         follow, once camera or table have moved."""
         self._frames += 1
-        if not self._moved and self._frames % _EVERY == 0:
+        if not self._moved and self._frames % (_SELDOM if self.blind else _EVERY) == 0:
             self._look(content)
         if self._moved:
             raise NoEstimate(self._moved)
@@ -160,7 +161,8 @@ def _points(content: DepthFrame | SensorCloud) -> Float[np.ndarray, "n 3"]:
     cloud of each cell of a picture as a camera at its origin takes it."""
     if isinstance(content, SensorCloud):
         side = int(np.sqrt(_PIXELS))
-        seen = content.points_mm[content.points_mm[:, 2] > 1].astype(np.float64)
+        some = content.points_mm[:: max(1, len(content.points_mm) // (_PER_CELL * _PIXELS))]
+        seen = some[some[:, 2] > 1].astype(np.float64)
         cells = np.floor((seen[:, :2] / seen[:, 2:] + 1) * (side / 2)).astype(int)
         inside = ((cells >= 0) & (cells < side)).all(1)
         points_mm = np.full((side * side, 3), np.nan)
