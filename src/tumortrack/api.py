@@ -411,6 +411,7 @@ def plan_resection(
     picture: StrPath | None = None,
     stand_mm: float | None = None,
     accept_poor: bool = False,
+    accept_budget: bool = False,
     **options: Any,
 ) -> ResectionPlan:
     """Where to cut a tumor out; nothing moves. `tumortrack plan` also plans the arms' motions.
@@ -421,6 +422,8 @@ def plan_resection(
         picture: PNG file to draw the plan into.
         stand_mm: height of the organ's lowest point over the table.
         accept_poor: plan on a poor estimate; the plan's notes say so.
+        accept_budget: plan though the margin does not hold the errors that are to be expected
+            (docs/resection.md); the plan's notes say so.
         options: fields of ``plan.values.ResectionConfig``: ``tumor``, ``method`` (``margin`` or
             ``published``), ``margin_mm``, ``sigmas`` and others.
 
@@ -428,20 +431,20 @@ def plan_resection(
         The plan: cuts, layers, grasp point; table frame, mm, z up.
 
     Raises:
-        NoPlan: nothing to cut, or not as asked; says why.
+        NoPlan: nothing to cut, or not as asked, or the margin is less than the errors; says why.
         InputError: a poor estimate; no such tumor, or an option that is not allowed.
     """
     from dataclasses import replace
 
     from tumortrack.core.config import from_builtins
+    from tumortrack.plan import budget, resection
     from tumortrack.plan import located as places
-    from tumortrack.plan import resection
     from tumortrack.plan.values import ResectionConfig
 
     config = from_builtins(options, ResectionConfig, "plan_resection")
     run = located if isinstance(located, Estimate) else places.read_run(Path(located))
     stand_mm = places.STAND_MM if stand_mm is None else stand_mm
-    table_from_camera = places.table_below(run.cloud.points_mm, stand_mm)
+    table_from_camera = places.table_under(run.cloud, run.meshes, stand_mm)
     if isinstance(run, Estimate):
         doubt = "" if run.quality == "good" else run.reason
         seen = places.located(run.cloud, run.meshes, run.motion, table_from_camera)
@@ -450,6 +453,7 @@ def plan_resection(
     notes = places.notes_of_doubt(doubt, accept_poor)
     plan = resection.plan_resection(seen, config)
     plan = replace(plan, notes=(*notes, *plan.notes))
+    plan = budget.heeded(plan, budget.planned_budget(plan, seen), accept_budget)
     if picture is not None:
         from tumortrack.report.plan_pictures import draw_plan
 

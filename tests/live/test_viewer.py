@@ -374,6 +374,9 @@ def test_status_says_why_and_no_old_numbers():
     stale = StatusPanel("stale", small_update(), 3.21, 8)
     assert "3.2 s" in stale.stage()
     assert "0.75" in StatusPanel("good", small_update(), 0.1, 8).numbers()
+    cell = replace(workcell(), left_mm=1.23)
+    arms = StatusPanel("good", replace(small_update(), workcell=cell), 0.1, 9, arms=True)
+    assert "1.2 mm of the margin are left" in arms.flag()
     assert "0.75" not in stale.numbers()
 
 

@@ -57,7 +57,8 @@ class Resect:
         whole: as in `track`.
         intrinsics: as in `track`.
         speed: of the arms' time; 2 is twice as fast.
-        moved: the tumor has moved if its surface has by so many mm (root mean square).
+        moved: the tumor has moved if its surface has by so many mm (root mean square; default: what
+            the plan allows for).
         film: write an animated GIF of the stored plan instead.
         report: file for states, halts and what else there was (default: runs/resect-TIME.json).
         device: auto takes CUDA where it is.
@@ -72,7 +73,7 @@ class Resect:
     whole: bool = False
     intrinsics: Path | None = None
     speed: float = 1.0
-    moved: float = 2.0
+    moved: float | None = None
     film: Path | None = None
     report: Path | None = None
     device: Device = "auto"
@@ -92,7 +93,9 @@ class Resect:
         if lacking := sorted({"kidney", stored.plan.tumor} - stored.meshes.keys()):
             raise ArtifactError(f"{self.plan} lacks {lacking[0]}.ply. Plan again.")
         sinks = api.named_sinks(self.sinks).values()  # wrong: said before all that takes long
-        config = OperationConfig(speed=self.speed, moved_mm=self.moved, replan_cut=self.replan_cut)
+        config = OperationConfig(
+            speed=self.speed, moved_mm=self._moved_mm(stored), replan_cut=self.replan_cut
+        )
         cell_config = from_builtins(stored.cell, CellConfig, str(self.plan))
         arms = [sink for sink in sinks if isinstance(sink, UrSinkConfig)]
         moving = [arm for arm in arms if arm.execute]
@@ -113,7 +116,7 @@ class Resect:
             return
         _confirm(moving)
         carry_out = self._execute if self.live is None else self._follow
-        with _dry_run(bool(arms) and not moving):
+        with _dry_run([arm for arm in arms if not arm.execute], moving):
             carry_out(stored, cell, config, arms)
 
     def _check_real(self, stored: PlanFolder, arms: Sequence[UrSinkConfig]) -> None:
@@ -122,7 +125,8 @@ class Resect:
         from tumortrack.plan.located import POOR_ESTIMATE
 
         model, source = self.live or (None, "")
-        case, margin_mm = model and _case_of(model), stored.plan.margin_mm
+        case, budget, moved_mm = model and _case_of(model), stored.budget, self._moved_mm(stored)
+        assumed = () if budget is None else budget.assumed
         needs = {
             "--live MODEL SOURCE, so that they stop where the tumor moves": model,
             f"a source that shows the present ({', '.join(_LIVE)}; not {source})": (
@@ -150,12 +154,32 @@ class Resect:
                 stored.cell_source != INVENTED
             ),
             f"--speed up to 1, not {self.speed:g}": self.speed <= 1,
-            f"--moved up to the margin, {margin_mm:g} mm": self.moved <= margin_mm,
+            "a plan whose margin holds its errors (plan again with a wider one)": (
+                budget is not None and budget.left_mm >= 0
+            ),
+            "a plan by a model that says how unsure it is (preset clinic)": (
+                "tracking" not in assumed
+            ),
+            "a plan with the calibration's error (error_mm in the --frame file)": (
+                "hand-eye" not in assumed
+            ),
+            "a plan with the tools' error (tool_error_mm in the --cell file)": (
+                "tool" not in assumed
+            ),
+            f"--moved as planned with, not {moved_mm:g}": (
+                budget is None or moved_mm <= budget.motion_mm
+            ),
             "a person at a terminal who confirms it": sys.stdin.isatty(),
         }
         if lacking := [what for what, met in needs.items() if not met]:
             names = " and ".join(arm.host for arm in arms)
             raise InputError(f"the arm at {names} may not move. It needs: {'; '.join(lacking)}.")
+
+    def _moved_mm(self, stored: PlanFolder) -> float:
+        from tumortrack.plan.budget import MOVED_MM
+
+        planned_mm = MOVED_MM if stored.budget is None else stored.budget.motion_mm
+        return planned_mm if self.moved is None else self.moved
 
     def _follow(
         self,
@@ -173,6 +197,8 @@ class Resect:
 
         from tumortrack.core.config import to_builtins
         from tumortrack.plan.arms import procedure
+        from tumortrack.plan.arms.cell import tip_places
+        from tumortrack.plan.live_budget import LiveBudget
         from tumortrack.plan.located import located
 
         assert self.live is not None
@@ -210,13 +236,19 @@ class Resect:
             begun = planner.submit(procedure.warm_up)
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
             begun.result()
-            operation = _operation(stored, cell, config, locate=locate, replan=replan)
+            late_s = max((arm.lookahead_s for arm in arms), default=0.0)
+            budget = LiveBudget(stored.budget, late_s) if stored.budget else None
+            operation = _operation(
+                stored, cell, config, locate=locate, replan=replan, budget=budget
+            )
             track.Track(
                 model=model, source=source, sinks=self.sinks, range=self.range, box=self.box,
                 whole=self.whole, intrinsics=self.intrinsics, report=self.report,
                 device=self.device,
-            ).run(track.Arms(operation, stored.frames, {"plan_config": to_builtins(config)}),
-            )  # fmt: skip
+            ).run(track.Arms(
+                operation, stored.frames, {"plan_config": to_builtins(config)},
+                tip_places(cell.config), bool(arms),
+            ))  # fmt: skip
         _say_end(operation, arms)
 
     def _execute(
@@ -254,8 +286,7 @@ class Resect:
                     sink.put(result)
                 track.say_failures(sinks, errors)
                 assert result.workcell is not None
-                text = result.workcell.state
-                text = "the way back" if arms and text == "home" else text
+                text = track.stage_words(result.workcell.state, bool(arms))
                 text += f": {result.workcell.halted}" if result.workcell.halted else ""
                 if text != shown:
                     say(shown := text)
@@ -313,15 +344,18 @@ def _confirm(arms: Sequence[UrSinkConfig]) -> None:
 
 
 @contextmanager
-def _dry_run(dry: bool) -> Iterator[None]:
-    """Say first and last that no arm is connected, if so."""
-    if dry:
-        say(_DRY_RUN)
+def _dry_run(dry: Sequence[UrSinkConfig], moving: Sequence[UrSinkConfig]) -> Iterator[None]:
+    """Say first and last which arms are not connected."""
+    lines = [_DRY_RUN] if dry and not moving else []
+    if moving:
+        lines = [f"DRY RUN of the {one.arm} at {one.host}: it is not connected" for one in dry]
+    for line in lines:
+        say(line)
     try:
         yield
     finally:
-        if dry:
-            say(_DRY_RUN)
+        for line in lines:
+            say(line)
 
 
 def _operation(

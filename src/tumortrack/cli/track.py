@@ -39,6 +39,8 @@ class Arms:
     companion: Operation
     frames: PublishedFrame
     about: dict[str, Any]
+    tip_mm: Any  # as ``SinkContext``'s
+    ur: bool  # sinks of real arms, connected or not
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -115,7 +117,10 @@ class Track:
         say_notes(model.notes)
         tracker = Tracker(model)
         config = self._loop_config(model)
-        context = SinkContext(model.parts, frames, tracker.anatomy_ct, Controls(), arms is not None)
+        tip_mm = None if arms is None else arms.tip_mm
+        context = SinkContext(
+            model.parts, frames, tracker.anatomy_ct, Controls(), arms is not None, tip_mm
+        )
         companion = None if arms is None else arms.companion
         loop = Loop(tracker, context, config, companion)
 
@@ -143,7 +148,8 @@ class Track:
             api.open_sinks(named, context) as sinks,
             closing(SourceWorker(source_config.open)) as source,
         ):
-            screen = _Screen(loop, source, sinks, report, about, companion)
+            ur = arms is not None and arms.ur
+            screen = _Screen(loop, source, sinks, report, about, companion, ur)
             ending.callback(screen.end)  # once all workers have flushed
             say(f"tracking {self.source} in frame {frames.frame_id!r}; Ctrl-C ends it.")
             loop.run(source, sinks, screen.show)
@@ -163,6 +169,12 @@ class Track:
             give_up_s=self.give_up,
             seconds=self.seconds,
         )
+
+
+def stage_words(state: str, ur: bool) -> str:
+    """A stage for the screen. ``ur``: there are sinks of real arms, and nobody knows that those are
+    home."""
+    return state.replace("home", "the way back", 1) if ur else state
 
 
 def say_failures(sinks: list[SinkWorker], known: dict[str, str]) -> None:
@@ -219,6 +231,7 @@ class _Screen:
     report: Path
     about: dict[str, Any]
     arms: Operation | None
+    ur: bool
 
     def __post_init__(self) -> None:
         self._started = self._shown = self._stored = time.monotonic()
@@ -232,7 +245,9 @@ class _Screen:
         state = result.describe()
         kind = re.sub(r"\d", "", state)  # numbers change with every frame
         if (cell := result.workcell) is not None:
-            state += f"; arms: {cell.state}" + (f" ({cell.halted})" if cell.halted else "")
+            stage = stage_words(cell.state, self.ur)
+            state += f"; arms: {stage}" + (f" ({cell.halted})" if cell.halted else "")
+            state += "" if cell.left_mm is None else f"; {cell.left_mm:.1f} mm of the margin left"
             kind += cell.state + re.sub(r"\d", "", cell.halted)
         now = time.monotonic()
         if kind != self._state and now - self._changed >= _SAY_S:

@@ -22,6 +22,7 @@ from tumortrack.core.mesh_files import read_mesh, write_mesh
 from tumortrack.core.types import Mesh
 from tumortrack.live.values import PublishedFrame
 from tumortrack.plan.arms.config import CellConfig
+from tumortrack.plan.budget import ErrorBudget
 from tumortrack.plan.motions import JOINTS, Motions, MotionStage
 from tumortrack.plan.values import Located, ResectionConfig, ResectionPlan
 from tumortrack.sense.ply import cloud_ply
@@ -39,8 +40,9 @@ class PlanFolder:
     """What a plan's folder holds. ``cell``: the workcell's configuration that the motions are for,
     as JSON; motions and cell are None where no arms were planned. ``case_sha256``: of the case that
     the organ was located by; empty where unknown. ``frame_source``, ``cell_source``: the sha256 of
-    the user's file that gave the frame, and the places of the arms; or ``INVENTED``.
-    ``camera_frame_id``, ``table_in_camera``: as ``PublishedFrame`` has them."""
+    the user's file that gave the frame, and the places of the arms; or ``INVENTED``. ``budget``:
+    None in plans of older versions. ``camera_frame_id``, ``table_in_camera``: as ``PublishedFrame``
+    has them."""
 
     plan: ResectionPlan
     config: ResectionConfig
@@ -52,6 +54,7 @@ class PlanFolder:
     case_sha256: str = ""
     frame_source: str = INVENTED
     cell_source: str = INVENTED
+    budget: ErrorBudget | None = None
     camera_frame_id: str = ""
     table_in_camera: tuple[float, float, float, float] | None = None
 
@@ -97,6 +100,7 @@ def write_plan(
         "camera_frame_id": content.camera_frame_id,
         "table_in_camera": content.table_in_camera,
         "plan": as_builtins(plan),
+        "budget": content.budget and to_builtins(content.budget),
         "cell": content.cell,
         "seconds": motions and motions.seconds,
     }
@@ -134,9 +138,10 @@ def read_plan(folder: Path) -> PlanFolder:
             cell = from_builtins(data["cell"], CellConfig, str(folder / _NAME))
             for fault in _faults(motions, cell, plan.sweeps):
                 raise ArtifactError(f"{path} can't be carried out: {fault}. Plan again.")
+        budget, where = data.get("budget"), str(folder / _NAME)
         return PlanFolder(
             plan=plan,
-            config=from_builtins(data["config"], ResectionConfig, str(folder / _NAME)),
+            config=from_builtins(data["config"], ResectionConfig, where),
             table_from_camera=np.array(data["table_from_camera"], float),
             frame_id=str(data["frame_id"]),
             meshes=meshes,
@@ -145,6 +150,7 @@ def read_plan(folder: Path) -> PlanFolder:
             case_sha256=str(data["case_sha256"] or ""),
             frame_source=str(data.get("frame_source", INVENTED)),
             cell_source=str(data.get("cell_source", INVENTED)),
+            budget=None if budget is None else from_builtins(budget, ErrorBudget, where),
             camera_frame_id=str(data.get("camera_frame_id", "")),
             table_in_camera=msgspec.convert(
                 data.get("table_in_camera"), tuple[float, float, float, float] | None

@@ -35,6 +35,14 @@ def table_below(points_mm: Float[np.ndarray, "n 3"], stand_mm: float) -> Float64
     return rigid(np.diag([1.0, -1.0, -1.0]), np.array([-x, y, high[2] + stand_mm]))
 
 
+def table_under(
+    cloud: OccupancyCloud, meshes: Mapping[str, Mesh], stand_mm: float
+) -> Float64[np.ndarray, "4 4"]:
+    """``table_below`` the organ's surface or, without one, its points."""
+    kidney = meshes.get("kidney")
+    return table_below(cloud.points_mm if kidney is None else kidney.vertices_mm, stand_mm)
+
+
 def located(
     cloud: OccupancyCloud,
     meshes: Mapping[str, Mesh],

@@ -116,10 +116,9 @@ class StatusPanel:
             return _box("ARMS: nothing is known of them", colours.STALE), ""
         colour = colours.NONE if cell.halted else colours.ARMS
         text = f"{cell.state}: HALTED" if cell.halted else cell.state
-        return (
-            _box(f"ARMS: {text}", colour, cell.halted),
-            _over("bottom", 20, colour, text, cell.halted),
-        )
+        left = "" if cell.left_mm is None else f"{cell.left_mm:.1f} mm of the margin are left"
+        box = _box(f"ARMS: {text}", colour, cell.halted or left)
+        return box, _over("bottom", 20, colour, text, cell.halted)
 
     def _reason(self) -> str:
         if self.state == "waiting":

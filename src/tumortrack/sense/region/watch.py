@@ -77,7 +77,8 @@ class TableWatch:
         if self._table is None:
             self._learn(content, points_mm)
             return
-        shift = self._shift(points_mm)
+        same = len(points_mm) == len(self._heights)  # else images of another size
+        shift = self._shift(points_mm) if same else None
         self._hidden = 0 if shift is not None else self._hidden + 1
         if shift is None:
             return
@@ -99,7 +100,8 @@ class TableWatch:
         plane = find_plane(picture, self._config, np.random.default_rng(self._frames))
         if plane is None:
             return
-        self._first.append((plane, points_mm))
+        same = [one for one in self._first if one[1].shape == points_mm.shape]
+        self._first = [*same, (plane, points_mm)]
         if len(self._first) < _LEARNED:
             return
         planes, seen = [one for one, _ in self._first], np.array([one for _, one in self._first])
