@@ -290,6 +290,21 @@ def test_a_run_of_an_unknown_case_moves_no_real_arm(story, given, tmp_path):
     assert missing(done) == {"plan", "person"}
 
 
+def test_a_ros_camera_moves_a_real_arm_only_if_the_calibration_names_its_frame(given, tmp_path):
+    live = ("--live", given / "model", "ros2:/depth")
+    assert "camera" in missing(tumortrack("resect", given / "plan", REAL, *live))
+    data = json.loads((given / "plan" / "plan.json").read_text())
+    plan = tmp_path / "plan"
+    shutil.copytree(given / "plan", plan)
+    named = {"camera_frame_id": "left", "table_in_camera": [0.0, 0.0, -1.0, -180.0]}
+    (plan / "plan.json").write_text(json.dumps(data | named))
+    store.seal(plan, "plan", {}, "base_link")
+    assert missing(tumortrack("resect", plan, REAL, *live)) == {"person"}
+    frames = read_plan(plan).frames
+    assert (frames.calibrated, frames.camera_frame_id) == (True, "left")
+    assert frames.table_in_camera == (0.0, 0.0, -1.0, -180.0)
+
+
 def test_a_plan_on_a_poor_estimate_moves_no_real_arm(story, given, tmp_path):
     folder, _ = story
     run = tmp_path / "run"
