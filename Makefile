@@ -6,7 +6,7 @@ SETUP := .venv/.installed
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: help setup debian demo test test-hard check attack fuzz replay bench soak wheel results headstart training-speed clean
+.PHONY: help setup debian demo test test-hard check attack fuzz replay bench soak wheel results headstart training-speed foreign clean
 
 help:  ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 10
@@ -62,6 +62,9 @@ headstart: setup  ## accuracy against training steps from pretrained weights (AR
 
 training-speed: setup  ## accuracy reached per second, by batch, learning rate and queries (half an hour)
 	$(BIN)/python lab/scripts/training.py $(ARGS)
+
+foreign: setup  ## how often another kidney, or a mirrored one, is called good (an hour)
+	$(BIN)/python lab/scripts/foreign.py $(ARGS)
 
 wheel: setup  ## build the wheels of product and laboratory into dist/
 	$(BIN)/pip wheel --quiet --no-deps --wheel-dir dist . ./lab

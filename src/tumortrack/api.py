@@ -51,9 +51,10 @@ def scan_phantom(folder: StrPath, seed: int = 1) -> Path:
 
     folder = Path(folder)
     if not folder.exists():
-        labels = digital.phantom_labels(digital.PhantomParameters())
+        phantom = digital.PhantomParameters()
         parameters = scanner.ScannerParameters(spacing_mm=(1.2, 1.2, 1.5))
-        dicom.write_dicom_series(scanner.scan(labels, parameters, seed), folder)
+        ct = scanner.scan(digital.phantom_labels(phantom), parameters, seed)
+        dicom.write_dicom_series(ct, folder, side=phantom.side)
     return folder
 
 
@@ -67,7 +68,7 @@ def prepare(
         overwrite: replace a case that lies there.
         options: fields of ``imaging.prepare.PrepareOptions``: ``kidney_hu``, ``tumor_hu``,
             ``labels``, ``side``, ``organ``, ``tumor``, ``up``, ``series``, ``unit``,
-            ``min_tumor_ml``.
+            ``min_tumor_ml``, ``patient``.
 
     Returns:
         The case: anatomy as closed surfaces, labels and CT; CT frame, mm.
@@ -89,7 +90,8 @@ def prepare(
         from tumortrack.report.pictures import qc_picture
 
         with store.new_folder(Path(folder), overwrite) as aside:
-            qc_picture(case.labels, case.ct, case.anatomy, aside / "qc.png")
+            whose = str(case.patient)
+            qc_picture(case.labels, case.ct, case.anatomy, aside / "qc.png", whose)
             save_case(case, aside)
     return case
 
@@ -189,7 +191,7 @@ def train(
     run = training.TrainingRun(
         anatomy_ct=of.anatomy, up_lps=of.up_lps,
         case_sha256=store.sha256_of(Path(case) / store.MANIFEST),
-        config=config or PRESETS[preset](of.anatomy, "limited"),
+        config=config or PRESETS[preset](of.anatomy, "limited"), patient=of.patient,
         seed=seed, steps=steps, minutes=minutes, device=device, workers=workers,
     )  # fmt: skip
     return training.train(run, Path(folder), report or (lambda status: None))
@@ -345,8 +347,9 @@ def track(
 
     config = SOURCES.parse(source) if isinstance(source, str) else source
     named = named_sinks(sinks)
-    context = SinkContext(tracker.model.parts, PublishedFrame(), tracker.anatomy_ct)
-    region = region_for(tracker.model, range_mm=range_mm)
+    model, frames = tracker.model, PublishedFrame()
+    context = SinkContext(model.parts, frames, tracker.anatomy_ct, patient=model.patient)
+    region = region_for(model, range_mm=range_mm)
     loop = Loop(tracker, context, LoopConfig(region=region, seconds=seconds))
     loop.warm()
 
@@ -448,6 +451,7 @@ def plan_resection(
     if isinstance(run, Estimate):
         doubt = "" if run.quality == "good" else run.reason
         seen = places.located(run.cloud, run.meshes, run.motion, table_from_camera)
+        seen = replace(seen, patient=run.patient)
     else:
         doubt, seen = run.doubt, run.located(table_from_camera)
     notes = places.notes_of_doubt(doubt, accept_poor)

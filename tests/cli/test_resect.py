@@ -39,6 +39,8 @@ pytestmark = pytest.mark.slow
 
 CASE = "c" * 64
 WIDE = ("--margin", 8)
+CASE, WHOSE = "c" * 64, {"id": "P1", "side": "left"}
+STATED = ("--patient", "P1", "--side", "left")
 CAMERA_FROM_TABLE = np.array([[1.0, 0, 0, 5.0], [0, -1, 0, -8.0], [0, 0, -1, 300.0], [0, 0, 0, 1]])
 
 
@@ -58,6 +60,7 @@ def write_run(folder, motion=None):
     }
     quality = {"verdict": "good", "reason": ""}
     report = {"units": "mm", "parts": parts, "model": {"case_sha256": CASE}, "quality": quality}
+    report["patient"] = WHOSE
     write_estimate(folder, Estimate(cloud, volume, camera, report, motion))
     return seen
 
@@ -204,6 +207,10 @@ NEEDS = {
     "unsure": "a plan by a model that says how unsure it is",
     "moved": "--moved as planned with, not 7",
     "person": "a person at a terminal",
+    "stated": "--patient ID and --side, as you know them",
+    "whose": "a plan that says whose organ it is",
+    "model's": "a model that says whose organ it is",
+    "theirs": "a model of the plan's patient and side",
 }
 
 
@@ -213,9 +220,10 @@ def missing(done):
     return {name for name, said in NEEDS.items() if said in line}
 
 
-def model_of(folder, case):
+def model_of(folder, case, whose):
     folder.mkdir()
-    (folder / "manifest.json").write_text(json.dumps({"provenance": {"case_sha256": case}}))
+    about = {"provenance": {"case_sha256": case, "patient": whose}}
+    (folder / "manifest.json").write_text(json.dumps(about))
     return folder
 
 
@@ -235,7 +243,10 @@ def given(story, tmp_path_factory):
         command = ("plan", folder / "run", place / name, "--frame", place / "frame.json")
         succeeded(tumortrack(*command, "--cell", place / f"{cell}.json", *WIDE))
     for name, case in (("model", CASE), ("other", "d" * 64), ("unknown", "")):
-        model_of(place / name, case)
+        model_of(place / name, case, WHOSE)
+    model_of(place / "nobody", CASE, None)
+    for name, whose in (("patient", {**WHOSE, "id": "P2"}), ("side", {**WHOSE, "side": "right"})):
+        model_of(place / name, CASE, whose)
     return place
 
 
@@ -245,9 +256,16 @@ def test_a_real_arm_moves_only_with_all_that_it_needs_and_nothing_is_connected_b
     resect = lambda *rest: missing(tumortrack("resect", *rest))  # noqa: E731
     everything = resect(folder / "plan", REAL, "--speed", 2, "--moved", 7)
     unstated = {"calibration", "tool"}
-    assert everything == {"live", "frame", "cell", "speed", "moved", "person"} | unstated
-    assert resect(given / "anywhere", REAL) == {"live", "cell", "person", "tool"}
-    live = (plan, REAL, "--live")
+    asked = {"live", "frame", "cell", "speed", "moved", "person", "stated"}
+    assert everything == asked | unstated
+    assert resect(given / "anywhere", REAL, *STATED) == {"live", "cell", "person", "tool"}
+    for half in (STATED[:2], STATED[2:]):
+        found = resect(given / "anywhere", REAL, *half)
+        assert found == {"live", "cell", "person", "tool", "stated"}
+    live = (plan, REAL, *STATED, "--live")
+    assert resect(*live, given / "nobody", "realsense") == {"model's", "person"}
+    for name in ("patient", "side"):
+        assert resect(*live, given / name, "realsense") == {"theirs", "person"}
     assert resect(*live, given / "unknown", "realsense") == {"model", "person"}
     assert resect(*live, given / "other", "ros2:/depth") == {"same", "camera", "person"}
     for source in (f"virtual:{given}", "recording:seen", "realsense:seen.bag",
@@ -286,12 +304,12 @@ def test_a_run_of_an_unknown_case_moves_no_real_arm(story, given, tmp_path):
     shutil.copytree(given / "plan", plan)
     (plan / "plan.json").write_text(json.dumps({**data, "case_sha256": ""}))
     store.seal(plan, "plan", {}, "base_link")
-    done = tumortrack("resect", plan, REAL, "--live", given / "model", "realsense")
+    done = tumortrack("resect", plan, REAL, *STATED, "--live", given / "model", "realsense")
     assert missing(done) == {"plan", "person"}
 
 
 def test_a_ros_camera_moves_a_real_arm_only_if_the_calibration_names_its_frame(given, tmp_path):
-    live = ("--live", given / "model", "ros2:/depth")
+    live = ("--live", given / "model", "ros2:/depth", *STATED)
     assert "camera" in missing(tumortrack("resect", given / "plan", REAL, *live))
     data = json.loads((given / "plan" / "plan.json").read_text())
     plan = tmp_path / "plan"
@@ -305,6 +323,25 @@ def test_a_ros_camera_moves_a_real_arm_only_if_the_calibration_names_its_frame(g
     assert frames.table_in_camera == (0.0, 0.0, -1.0, -180.0)
 
 
+def test_a_plan_of_nobody_moves_no_real_arm_and_one_of_another_nothing(story, given, tmp_path):
+    data = json.loads((given / "plan" / "plan.json").read_text())
+    plan = tmp_path / "plan"
+    shutil.copytree(given / "plan", plan)
+    del data["patient"]  # as a version wrote it that knew none
+    (plan / "plan.json").write_text(json.dumps(data))
+    store.seal(plan, "plan", {}, "base_link")
+    live = ("--live", given / "model", "realsense")
+    assert missing(tumortrack("resect", plan, REAL, *live)) == {"whose", "stated", "person"}
+    assert "is of patient unknown" in refusal(tumortrack("resect", plan, REAL, *STATED, *live))
+    for stated in (("--patient", "P2"), ("--side", "right")):  # nor virtual ones
+        line = refusal(tumortrack("resect", given / "plan", *stated))
+        assert "is of patient P1, left side; stated was patient" in line
+    for name in ("patient", "side"):
+        line = refusal(tumortrack("resect", given / "plan", "--live", given / name, "virtual:x"))
+        assert "is of patient P" in line
+        assert "the plan of patient P1, left side" in line
+
+
 def test_a_plan_on_a_poor_estimate_moves_no_real_arm(story, given, tmp_path):
     folder, _ = story
     run = tmp_path / "run"
@@ -316,7 +353,8 @@ def test_a_plan_on_a_poor_estimate_moves_no_real_arm(story, given, tmp_path):
     command = ("plan", run, tmp_path / "plan", "--frame", given / "frame.json")
     command += ("--cell", given / "cell.json", "--accept-poor", *WIDE)
     assert "PLANNED ON A POOR ESTIMATE: it lies elsewhere" in succeeded(tumortrack(*command))
-    done = tumortrack("resect", tmp_path / "plan", REAL, "--live", given / "model", "realsense")
+    live = ("--live", given / "model", "realsense")
+    done = tumortrack("resect", tmp_path / "plan", REAL, *STATED, *live)
     assert missing(done) == {"good", "person"}
 
 
@@ -324,7 +362,7 @@ def test_a_plan_on_a_poor_estimate_moves_no_real_arm(story, given, tmp_path):
 def test_a_person_types_the_address_of_the_arm_that_will_move(given, typed):
     terminal, stdin = pty.openpty()
     os.write(terminal, b"127.0.0.1\n")  # before it is asked for: does not count
-    sinks = (REAL, "ur:10.0.0.9?arm=holder")
+    sinks = (REAL, "ur:10.0.0.9?arm=holder", *STATED)
     arguments = ("resect", given / "plan", *sinks, "--live", given / "model", "realsense")
     process = subprocess.Popen(
         [*COMMAND, *map(str, arguments)], stdin=stdin, stdout=subprocess.PIPE,
@@ -339,6 +377,7 @@ def test_a_person_types_the_address_of_the_arm_that_will_move(given, typed):
     os.close(terminal)
     os.close(stdin)
     assert "The cutter at 127.0.0.1 is about to move: as soon as an estimate is good" in said
+    assert "It cuts in patient P1, left side: is that who lies here?" in said
     assert ("127.0.0.1 was not confirmed" in error) == (typed != "127.0.0.1")
     dry = "DRY RUN of the holder at 10.0.0.9: it is not connected"
     assert rest.count(dry) == (2 if typed == "127.0.0.1" else 0)

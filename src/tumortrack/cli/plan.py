@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Literal
 from tyro.conf import Positional
 
 from tumortrack.cli.console import say, say_notes
+from tumortrack.cli.stated import StatedPatient
 from tumortrack.core import store
 from tumortrack.core.errors import InputError, NoPlan
 
@@ -29,7 +30,7 @@ _BASES = ("cutter_base", "holder_base")
 
 
 @dataclass(frozen=True, kw_only=True)
-class Plan:
+class Plan(StatedPatient):
     """Plan how to cut a located tumor out, and how two arms do it.
 
     Attributes:
@@ -86,6 +87,8 @@ class Plan:
         if self.arms:
             check_arms_installed()
         run = read_run(self.run_folder)
+        run.patient.check_is(self.stated, str(self.run_folder))
+        say(str(run.patient))
         doubts = notes_of_doubt(run.doubt, self.accept_poor)
         frames = self._frame(run, cell_config.stand_mm)
         frame_id, table_from_camera = frames.frame_id, frames.published_from_camera
@@ -123,8 +126,8 @@ class Plan:
         content = PlanFolder(
             resection, config, table_from_camera, frame_id, located.meshes, cell_used, motions,
             str(model.get("case_sha256") or "") if isinstance(model, dict) else "",
-            store.sha256_of(self.frame) if self.frame else INVENTED, cell_source, budget,
-            frames.camera_frame_id, frames.table_in_camera,
+            store.sha256_of(self.frame) if self.frame else INVENTED, cell_source, run.patient,
+            budget, frames.camera_frame_id, frames.table_in_camera,
         )  # fmt: skip
 
         def pictures(aside: Path) -> None:

@@ -17,8 +17,11 @@ from tyro.conf import Positional
 from tumortrack.cli import track
 from tumortrack.cli.console import Device, progress_bar, say
 from tumortrack.cli.plan import check_arms_installed
+from tumortrack.cli.stated import StatedPatient
 from tumortrack.core import store
+from tumortrack.core.config import to_builtins
 from tumortrack.core.errors import Aborted, ArtifactError, InputError
+from tumortrack.core.patient import NOBODY, Patient
 
 if TYPE_CHECKING:
     from concurrent.futures import Future
@@ -41,7 +44,7 @@ _LIVE = ("realsense", "ros2", "ros1")  # sources that show the present
 
 
 @dataclass(frozen=True, kw_only=True)
-class Resect:
+class Resect(StatedPatient):
     """Carry a plan out with virtual arms, seen by sinks as those of `track`.
 
     Attributes:
@@ -88,6 +91,7 @@ class Resect:
 
         check_arms_installed()
         stored = read_plan(self.plan)
+        stored.patient.check_is(self.stated, str(self.plan))
         if stored.motions is None or stored.cell is None:
             raise InputError(f"{self.plan} was planned with --no-arms; plan again without it.")
         if lacking := sorted({"kidney", stored.plan.tumor} - stored.meshes.keys()):
@@ -114,9 +118,10 @@ class Resect:
                 raise InputError("--film shows the stored plan; give it without sinks and --live.")
             _write_film(stored, cell, self.film)
             return
-        _confirm(moving)
+        _confirm(moving, stored.patient)
         carry_out = self._execute if self.live is None else self._follow
         with _dry_run([arm for arm in arms if not arm.execute], moving):
+            say(str(stored.patient))
             carry_out(stored, cell, config, arms)
 
     def _check_real(self, stored: PlanFolder, arms: Sequence[UrSinkConfig]) -> None:
@@ -125,7 +130,8 @@ class Resect:
         from tumortrack.plan.located import POOR_ESTIMATE
 
         model, source = self.live or (None, "")
-        case, budget, moved_mm = model and _case_of(model), stored.budget, self._moved_mm(stored)
+        case, whose = _case_of(model) if model else ("", NOBODY)
+        budget, moved_mm = stored.budget, self._moved_mm(stored)
         assumed = () if budget is None else budget.assumed
         needs = {
             "--live MODEL SOURCE, so that they stop where the tumor moves": model,
@@ -140,6 +146,14 @@ class Resect:
             ),
             f"a model of the case that was planned on ({model} is of another)": (
                 not (case and stored.case_sha256) or case == stored.case_sha256
+            ),
+            "--patient ID and --side, as you know them": self.stated.known,
+            f"a plan that says whose organ it is (this one's: {stored.patient})": (
+                stored.patient.known
+            ),
+            f"a model that says whose organ it is ({model}: {whose})": model is None or whose.known,
+            f"a model of the plan's patient and side ({model}: {whose})": (
+                not whose.differs(stored.patient)
             ),
             "a plan made on a good estimate (this one's was poor)": (
                 not any(note.startswith(POOR_ESTIMATE) for note in stored.plan.notes)
@@ -195,7 +209,6 @@ class Resect:
 
         import msgspec
 
-        from tumortrack.core.config import to_builtins
         from tumortrack.plan.arms import procedure
         from tumortrack.plan.arms.cell import tip_places
         from tumortrack.plan.live_budget import LiveBudget
@@ -203,9 +216,11 @@ class Resect:
 
         assert self.live is not None
         model, source = self.live
-        case = _case_of(model)
+        case, whose = _case_of(model)
+        if whose.differs(stored.patient):  # it would find another tumor, or none
+            raise InputError(f"{model} is of {whose}, the plan of {stored.patient}.")
         if stored.case_sha256 and case and case != stored.case_sha256:
-            raise InputError(  # it would find another patient's tumor
+            raise InputError(  # likewise
                 f"{model} was trained for another case than the one that was planned on. Give a "
                 "model of that case, or plan on what this model locates."
             )
@@ -244,7 +259,7 @@ class Resect:
             track.Track(
                 model=model, source=source, sinks=self.sinks, range=self.range, box=self.box,
                 whole=self.whole, intrinsics=self.intrinsics, report=self.report,
-                device=self.device,
+                device=self.device, patient=self.patient, side=self.side,
             ).run(track.Arms(
                 operation, stored.frames, {"plan_config": to_builtins(config)},
                 tip_places(cell.config), bool(arms),
@@ -268,7 +283,7 @@ class Resect:
         report = track.report_path(self.report, "resect")
         frames = stored.frames
         controls = Controls()
-        context = SinkContext(tuple(stored.meshes), frames, None, controls, arms=True)
+        context = SinkContext(tuple(stored.meshes), frames, None, controls, True, stored.patient)
         stop = track.stopping(lambda: operation.abort(track.STOPPED))
         with stop, api.open_sinks(api.named_sinks(self.sinks), context) as sinks:
             say(f"{stored.motions.seconds / config.speed:.0f} s in frame {frames.frame_id!r}; "
@@ -294,6 +309,7 @@ class Resect:
                     break
                 time.sleep(max(0.0, started + (sequence + 1) / _FPS - time.monotonic()))
         content = {
+            "patient": to_builtins(stored.patient),
             "plan": {"tumor": stored.plan.tumor, "method": stored.plan.method},
             "frame": stored.frame_id,
             "resection": operation.summary(),
@@ -319,13 +335,16 @@ def _names_frames(source: str) -> bool:
     return source.partition(":")[0] in ("ros1", "ros2")
 
 
-def _case_of(model: Path) -> str:
-    """The case that a model was trained for, by its digest; empty where unknown."""
+def _case_of(model: Path) -> tuple[str, Patient]:
+    """The case that a model was trained for, by its digest (empty where unknown), and whose."""
+    from tumortrack.models.folder import patient_of
+
     manifest = store.read_json(model / store.MANIFEST) if model.is_dir() else {}
-    return str(manifest.get("provenance", {}).get("case_sha256") or "")
+    case = str(manifest.get("provenance", {}).get("case_sha256") or "")
+    return case, patient_of(manifest, model)
 
 
-def _confirm(arms: Sequence[UrSinkConfig]) -> None:
+def _confirm(arms: Sequence[UrSinkConfig], patient: Patient) -> None:
     """A person at the terminal types each arm's address; InputError: something else."""
     for arm in arms:
         import termios  # not on Windows, where no terminal would be found above
@@ -333,7 +352,8 @@ def _confirm(arms: Sequence[UrSinkConfig]) -> None:
         termios.tcflush(sys.stdin, termios.TCIFLUSH)  # what was typed before it was asked for
         say(
             f"The {arm.arm} at {arm.host} is about to move: as soon as an estimate is good, and "
-            "again after every pause. Nobody in its reach, a hand at the emergency stop?"
+            f"again after every pause. It cuts in {patient}: is that who lies here? "
+            "Nobody in its reach, a hand at the emergency stop?"
         )
         try:
             typed = input("Type its address to let it begin: ")

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 from tyro.conf import Positional
 
 from tumortrack.cli.console import Device, console, keep_loaded, say, say_notes
+from tumortrack.cli.stated import StatedPatient
 from tumortrack.core import store
 from tumortrack.core.errors import InputError, StorageError
 
@@ -44,7 +45,7 @@ class Arms:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Track:
+class Track(StatedPatient):
     """Follow kidney and tumors live, from a camera to viewers, recordings and robots.
 
     Sources and sinks are written kind:target?option=value&option=value. Sources: virtual:CASE,
@@ -97,14 +98,15 @@ class Track:
         from tumortrack.live.calibration_file import read_frames
         from tumortrack.live.spec import SOURCES
         from tumortrack.live.values import Controls, PublishedFrame, SinkContext
-        from tumortrack.models.folder import read_model_manifest
+        from tumortrack.models.folder import patient_of, read_model_manifest
 
         source_config = SOURCES.parse(self.source)
         named = api.named_sinks(self.sinks)
         frames = read_frames(self.frame) if self.frame else PublishedFrame()
         if arms is not None:
             frames = arms.frames
-        read_model_manifest(self.model)  # report what is wrong before PyTorch's seconds
+        manifest = read_model_manifest(self.model)  # what is wrong, before PyTorch's seconds
+        patient_of(manifest, self.model).check_is(self.stated, str(self.model))
         report = report_path(self.report, "track")
 
         from tumortrack.live.loop import Loop
@@ -119,7 +121,13 @@ class Track:
         config = self._loop_config(model)
         tip_mm = None if arms is None else arms.tip_mm
         context = SinkContext(
-            model.parts, frames, tracker.anatomy_ct, Controls(), arms is not None, tip_mm
+            model.parts,
+            frames,
+            tracker.anatomy_ct,
+            Controls(),
+            arms is not None,
+            model.patient,
+            tip_mm,
         )
         companion = None if arms is None else arms.companion
         loop = Loop(tracker, context, config, companion)
@@ -133,6 +141,7 @@ class Track:
         loop.warm()
         way = frames.published_from_camera
         about = {
+            "patient": to_builtins(model.patient),
             "model": model.provenance,
             "notes": list(model.notes),
             "model_sha256": store.sha256_of(self.model / store.MANIFEST),
@@ -151,7 +160,8 @@ class Track:
             ur = arms is not None and arms.ur
             screen = _Screen(loop, source, sinks, report, about, companion, ur)
             ending.callback(screen.end)  # once all workers have flushed
-            say(f"tracking {self.source} in frame {frames.frame_id!r}; Ctrl-C ends it.")
+            say(f"{model.patient}: tracking {self.source} in frame {frames.frame_id!r}; "
+                "Ctrl-C ends it.")  # fmt: skip
             loop.run(source, sinks, screen.show)
 
     def _loop_config(self, model: Model) -> LoopConfig:

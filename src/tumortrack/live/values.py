@@ -21,6 +21,7 @@ from tumortrack.core.config import Config
 from tumortrack.core.errors import TumortrackError
 from tumortrack.core.estimate import NO_CHECK_FAILED, UNVERIFIED, Estimate, Quality
 from tumortrack.core.geometry import transform_points
+from tumortrack.core.patient import NOBODY, Patient
 from tumortrack.core.types import Anatomy, DepthFrame, Mesh, SensorCloud
 
 
@@ -259,14 +260,16 @@ class Controls:
 class SinkContext:
     """What a sink knows when it is opened. ``parts``: the model's, the organ first. ``anatomy_ct``:
     the organ in the CT (LPS, mm), if the model has it: estimates then have a motion, and their
-    meshes its triangles. ``arms``: results may have a workcell. ``tip_mm``: where the tool's tip
-    of an arm (cutter, holder) is, by the arm's six joints; published frame."""
+    meshes its triangles. ``arms``: results may have a workcell. ``patient``: whose organ the model
+    is of. ``tip_mm``: where the tool's tip of an arm (cutter, holder) is, by the arm's six joints;
+    published frame."""
 
     parts: tuple[str, ...]
     published_frame: PublishedFrame
     anatomy_ct: Anatomy | None = None
     controls: Controls = field(default_factory=Controls)
     arms: bool = False
+    patient: Patient = NOBODY
     tip_mm: Callable[[str, Float64[np.ndarray, " 6"]], Float64[np.ndarray, " 3"]] | None = None
 
 

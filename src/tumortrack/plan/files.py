@@ -19,6 +19,7 @@ from tumortrack.core import store
 from tumortrack.core.config import from_builtins, to_builtins
 from tumortrack.core.errors import ArtifactError, InputError, NoPlan
 from tumortrack.core.mesh_files import read_mesh, write_mesh
+from tumortrack.core.patient import NOBODY, Patient, patient_in
 from tumortrack.core.types import Mesh
 from tumortrack.live.values import PublishedFrame
 from tumortrack.plan.arms.config import CellConfig
@@ -40,9 +41,9 @@ class PlanFolder:
     """What a plan's folder holds. ``cell``: the workcell's configuration that the motions are for,
     as JSON; motions and cell are None where no arms were planned. ``case_sha256``: of the case that
     the organ was located by; empty where unknown. ``frame_source``, ``cell_source``: the sha256 of
-    the user's file that gave the frame, and the places of the arms; or ``INVENTED``. ``budget``:
-    None in plans of older versions. ``camera_frame_id``, ``table_in_camera``: as ``PublishedFrame``
-    has them."""
+    the user's file that gave the frame, and the places of the arms; or ``INVENTED``. ``patient``:
+    whose organ, as far as it is known. ``budget``: None in plans of older versions.
+    ``camera_frame_id``, ``table_in_camera``: as ``PublishedFrame`` has them."""
 
     plan: ResectionPlan
     config: ResectionConfig
@@ -54,6 +55,7 @@ class PlanFolder:
     case_sha256: str = ""
     frame_source: str = INVENTED
     cell_source: str = INVENTED
+    patient: Patient = NOBODY
     budget: ErrorBudget | None = None
     camera_frame_id: str = ""
     table_in_camera: tuple[float, float, float, float] | None = None
@@ -95,6 +97,7 @@ def write_plan(
         "table_from_camera": content.table_from_camera.tolist(),
         "config": to_builtins(content.config),
         "case_sha256": content.case_sha256,
+        "patient": to_builtins(content.patient),
         "frame_source": content.frame_source,
         "cell_source": content.cell_source,
         "camera_frame_id": content.camera_frame_id,
@@ -118,7 +121,8 @@ def write_plan(
 def as_located(content: PlanFolder) -> Located:
     """What the plan was made on, without its cloud: for pictures."""
     points, labels = np.zeros((0, 3)), np.zeros(0, np.uint8)
-    return Located(points, labels, content.meshes, stamp_ns=content.plan.stamp_ns)
+    stamp_ns, patient = content.plan.stamp_ns, content.patient
+    return Located(points, labels, content.meshes, stamp_ns=stamp_ns, patient=patient)
 
 
 def read_plan(folder: Path) -> PlanFolder:
@@ -150,6 +154,7 @@ def read_plan(folder: Path) -> PlanFolder:
             case_sha256=str(data["case_sha256"] or ""),
             frame_source=str(data.get("frame_source", INVENTED)),
             cell_source=str(data.get("cell_source", INVENTED)),
+            patient=patient_in(data.get("patient"), where),
             budget=None if budget is None else from_builtins(budget, ErrorBudget, where),
             camera_frame_id=str(data.get("camera_frame_id", "")),
             table_in_camera=msgspec.convert(

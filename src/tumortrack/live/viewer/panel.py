@@ -16,6 +16,7 @@ from jaxtyping import UInt8
 from tumortrack.core import colours
 from tumortrack.core.colours import Colour, css, part_colour
 from tumortrack.core.estimate import NO_CHECK_FAILED, UNVERIFIED
+from tumortrack.core.patient import NOBODY
 from tumortrack.live.values import TrackingResult, Workcell
 from tumortrack.live.viewer.look import View
 from tumortrack.live.viewer.scene import DisplayOptions
@@ -193,15 +194,21 @@ def _parts(parts: Mapping[str, dict[str, Any]]) -> str:
 
 class Panel:
     """The elements, shared by all clients; whoever made it says what they do. ``slices``: with the
-    CT; ``arms``: with what they do."""
+    CT; ``arms``: with what they do; ``whose``: organ it is, in words."""
 
     def __init__(
-        self, server: ViserServer, parts: tuple[str, ...], slices: bool = False, arms: bool = False
+        self,
+        server: ViserServer,
+        parts: tuple[str, ...],
+        slices: bool = False,
+        arms: bool = False,
+        whose: str = str(NOBODY),
     ) -> None:
         gui = server.gui
         gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
         gui.main_panel.dock_right()
         gui.main_panel.set_width(_WIDTH)
+        self.whose = gui.add_html(f"<div style='padding:4px 12px'><b>{escape(whose)}</b></div>")
         gui.add_html(_PAGE)  # of one height: what is to be clicked must not jump
         self.stage = gui.add_html("")
         self.pick = gui.add_button(
