@@ -108,7 +108,8 @@ class OpenIgtLinkSink:
 
     def _statuses(self, result: TrackingResult, code: int) -> Iterator[_Content]:
         found = result.estimate is not None
-        name, text = (result.quality, result.warning) if found else ("no estimate", result.reason)
+        name = result.quality if found else "no estimate"
+        text = result.describe() if found else result.reason
         more = {"quality": str(result.quality)}
         if result.latency_ms is not None:
             more["latency_ms"] = f"{result.latency_ms:.1f}"

@@ -11,7 +11,7 @@ import socket
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -35,6 +35,7 @@ if TYPE_CHECKING:
 _STALE_S = 1.0
 _TICK_S = 0.2  # the status grows older, and slices are renewed, this often
 _SLICE_PIXELS = 320
+_PARKED_S = 1.0  # for viser's thread to stand still, else what changes may arrive in pieces
 
 
 class ViewerSinkConfig(SinkConfig, frozen=True, kw_only=True, tag="viewer"):
@@ -81,14 +82,15 @@ class ViewerSink:
         self._back = np.linalg.inv(context.published_frame.published_from_camera)
         self._lock = threading.RLock()  # round every change of the page
         self._result: TrackingResult | None = None  # the last that came
-        self._shown: TrackingResult | None = None  # whose estimate is visible
+        self._told: TrackingResult | None = None  # the page is of this one, all of it
+        self._shown: TrackingResult | None = None  # the same, if its estimate is visible
         self._came = self._drawn = -np.inf
         self._hidden_count = 0  # a slice made before the last hiding is void
         self._counter = 0
         self._fault: BaseException | None = None  # for the next publish to raise
         self._picking = False
         self._state: State = "waiting"
-        self._behind: tuple[State, bool] | None = None
+        self._server.scene.set_background_image(np.full((4, 4, 3), colours.BACKGROUND, np.uint8))
         self._scene = ViewerScene(self._server, context, config.margin_mm)
         whose, slices = str(context.patient), self._ct is not None
         self._panel = Panel(self._server, context.parts, slices, context.arms, whose)
@@ -119,18 +121,15 @@ class ViewerSink:
                     self._scene.look.turn(event.client, event.target.value)
 
     def publish(self, result: TrackingResult) -> None:
-        """Show it: without an estimate at once, with one not more often than ``hz``; arms each
-        time."""
+        """Show it, all of it at once and not more often than ``hz``; a change of the quality, and
+        arms that halt or go on, without delay."""
         if self._closing.is_set():
             return
         now = time.monotonic()
         with self._page():
-            before, self._result, self._came = self._result, result, now
-            if result.estimate is None:
-                self._hide()
-            self._draw_cell(result)
-            changed = before is None or self._shown is None or before.quality != result.quality
-            if changed or now - self._drawn >= 1 / self._config.hz:
+            self._result, self._came = result, now
+            changed = self._told is None or _kind(self._told) != _kind(result)
+            if changed or self._state == "stale" or now - self._drawn >= 1 / self._config.hz:
                 self._drawn = now
                 self._draw(result)
         fault, self._fault = self._fault, None
@@ -145,14 +144,30 @@ class ViewerSink:
 
     @contextmanager
     def _page(self) -> Iterator[None]:
-        """What is changed inside arrives at clients together."""
-        with self._lock, self._server.atomic():
-            yield
+        """What is changed inside arrives at clients together. viser's thread stands still
+        meanwhile: its own ``atomic`` cuts what it is sending where the next change begins."""
+        parked, go_on = threading.Event(), threading.Event()
+
+        def park() -> None:
+            parked.set()
+            go_on.wait()
+
+        with self._lock:
+            with suppress(RuntimeError):  # it has ended: nobody is looking
+                self._server.get_event_loop().call_soon_threadsafe(park)
+                parked.wait(_PARKED_S)
+            try:
+                yield
+            finally:
+                go_on.set()
 
     def _draw(self, result: TrackingResult) -> None:
+        self._told = result
+        self._draw_cell(result)
         try:
             self._scene.observe(result)
             if result.estimate is None:
+                self._hide()
                 self._scene.apply()
             else:
                 self._scene.show(result)
@@ -161,7 +176,7 @@ class ViewerSink:
         except Exception as error:
             self._hide()
             reason = f"this estimate cannot be shown ({error!r})"
-            self._result = replace(result, estimate=None, quality="none", reason=reason)
+            self._told = replace(result, estimate=None, quality="none", reason=reason)
             self._say("none")
             raise
 
@@ -181,14 +196,11 @@ class ViewerSink:
     def _say(self, state: State) -> None:
         self._state = state
         self._counter += 1
-        result = self._result
+        result = self._told
         late_s = 0.0 if result is None else (result.latency_ms or 0.0) / 1000
-        age_s = 0.0 if result is None else time.monotonic() - self._came + late_s
-        status = StatusPanel(state, result, age_s, self._counter, self._context.arms)
-        if (behind := (state, status.alarming)) != self._behind:
-            self._behind = behind
-            self._server.scene.set_background_image(status.backdrop())
-        self._panel.say(status)
+        since_s = self._came if state == "stale" else self._drawn
+        age_s = 0.0 if result is None else time.monotonic() - since_s + late_s
+        self._panel.say(StatusPanel(state, result, age_s, self._counter, self._context.arms))
 
     def _keep_watch(self) -> None:
         """Says how old the last frame is, hides what got too old, renews the slice."""
@@ -217,7 +229,8 @@ class ViewerSink:
         motion, picture = result.estimate.motion, None
         if plane is not None and motion is not None:
             outlines = self._outlines(result)
-            picture = slice_picture(self._ct, motion, plane, outlines, _SLICE_PIXELS)
+            number = f"frame no. {result.sequence}"
+            picture = slice_picture(self._ct, motion, plane, outlines, _SLICE_PIXELS, number)
         with self._page():
             if hidden_count == self._hidden_count:
                 self._panel.put_slice(picture)
@@ -274,6 +287,12 @@ class ViewerSink:
             self._panel.abort.label, self._panel.abort.disabled = ABORTED, True
 
 
+def _kind(result: TrackingResult) -> tuple[str, str, bool]:
+    """What a page must not be late to say."""
+    cell = result.workcell
+    return result.quality, "" if cell is None else cell.state, cell is None or bool(cell.halted)
+
+
 def _opened(host: str, port: int) -> ViserServer:
     """A running server with an empty scene, where it was asked for; port 0: any free one."""
     try:
@@ -299,6 +318,8 @@ def _opened(host: str, port: int) -> ViserServer:
     logging.getLogger("websockets.server").addFilter(_is_no_refusal)
     with _silence():
         server = viser.ViserServer(host=host, port=port, label="tumortrack", verbose=False)
+    # One change may be more messages than viser sends in one piece, 128; a visitor's first too.
+    server._websock_server._broadcast_buffer.max_window_size = 10_000
     if port not in (0, server.get_port()):
         _close(server)
         raise InputError(taken)
