@@ -143,6 +143,7 @@ class Track:
             api.open_sinks(named, context) as sinks,
             closing(SourceWorker(source_config.open)) as source,
         ):
+            say_opened(sinks)
             screen = _Screen(loop, source, sinks, report, about, companion)
             ending.callback(screen.end)  # once all workers have flushed
             say(f"tracking {self.source} in frame {frames.frame_id!r}; Ctrl-C ends it.")
@@ -163,6 +164,13 @@ class Track:
             give_up_s=self.give_up,
             seconds=self.seconds,
         )
+
+
+def say_opened(sinks: list[SinkWorker]) -> None:
+    """Where each sink is to be found, and who can reach it."""
+    for sink in sinks:
+        for note in sink.notes:
+            say(f"sink {sink.name}: {note}")
 
 
 def say_failures(sinks: list[SinkWorker], known: dict[str, str]) -> None:
