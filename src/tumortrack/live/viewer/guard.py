@@ -37,8 +37,8 @@ from tumortrack.live.network import Pace, is_loopback
 MOST_CONNECTIONS = 64  # at a time, those that only fetch the page included
 MOST_PAGES = 8  # each gets every surface: 8 at 15 Hz are some 100 MB/s
 LARGEST_MESSAGE = 2**14  # bytes; what a page sends has a few hundred
-_MESSAGES_PER_S = 200.0  # a page that is turned and whose sliders are moved sends 100
-_BYTES_PER_S, _PIECE = 2**17, 2**12
+_FRAMES_PER_S, _BURST_S = 200.0, 5.0  # a page that is turned sends 50 a second, after a pause more
+_BYTES_PER_S, _PIECE = 2**15, 2**10
 _OPENING_S = 5.0  # for a request to come whole
 _PING_S = 10.0  # a page that takes and answers nothing for twice as long is gone
 _FARTHEST_MM = 1e6  # of a camera from the scene
@@ -214,7 +214,7 @@ class GuardedConnection(ServerConnection):
     def __init__(self, guard: Guard, *arguments: Any, **options: Any) -> None:
         super().__init__(*arguments, **options)
         self._guard = guard
-        self._messages, self._bytes = Pace(_MESSAGES_PER_S), Pace(_BYTES_PER_S)
+        self._frames, self._bytes = Pace(_FRAMES_PER_S, _BURST_S), Pace(_BYTES_PER_S, _BURST_S)
         self.may_change, self.told_until_s = False, 0.0
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
@@ -236,17 +236,16 @@ class GuardedConnection(ServerConnection):
                 super().data_received(piece)
 
     def process_event(self, event: Any) -> None:
-        if getattr(event, "opcode", None) is Opcode.PING:  # no browser's page sends any
+        ping = getattr(event, "opcode", None) is Opcode.PING  # no browser's page sends any
+        if ping or self._frames.wait_s():
             self.transport.abort()
         else:
             super().process_event(event)
 
     async def recv(self, decode: bool | None = None) -> Any:
-        """The next message that passes; those that come too fast wait in the sender."""
+        """The next message that passes."""
         while True:
             data = await super().recv(decode)
-            if wait_s := self._messages.wait_s():
-                await asyncio.sleep(wait_s)
             try:
                 if self._guard.passes(self, data):
                     return data
