@@ -504,6 +504,7 @@ def _turn(arm: FakeArm) -> None:
 ARM_FAULTS = {
     "protective": (lambda arm: setattr(arm, "safety_mode", 3), "in a protective stop"),
     "emergency": (lambda arm: setattr(arm, "safety_mode", 7), "in an emergency stop"),
+    "unknown mode": (lambda arm: setattr(arm, "safety_mode", 12), "in no mode in which it may be"),
     "program": (lambda arm: setattr(arm, "running", False), "no program"),
     "force": (_push, r"the tool meets 41 N; allowed: 40"),
     "elsewhere": (_turn, r"4\.0 degrees from the plan; allowed: 2"),

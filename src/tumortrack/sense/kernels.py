@@ -70,14 +70,15 @@ def seen_pixels(depth_mm):  # type: ignore[no-untyped-def]
 
 
 @_jit
-def lose_grazing(true_mm, depths_mm, seen, key, grazing):  # type: ignore[no-untyped-def]
+def lose_grazing(true_mm, depths_mm, seen, key, grazing, pinhole):  # type: ignore[no-untyped-def]
     """Drop pixels that see a surface at grazing angles; ``grazing``: (share that is dropped, from
-    how many degrees between the normal and the line of sight, fx, fy, cx, cy).
+    how many degrees between the normal and the line of sight).
 
     With the depth's slopes (p, q) per pixel the surface normal is n = (fx p, fy q,
     -(z + (u - cx) p + (v - cy) q)), and its product with the line of sight r is -z.
     """
-    share, degrees, fx, fy, cx, cy = grazing
+    share, degrees = grazing
+    fx, fy, cx, cy = pinhole
     pixels, starts = seen
     height, width = true_mm.shape
     cosine = math.cos(math.radians(degrees))
@@ -107,11 +108,20 @@ def _slope(before, here, after):  # type: ignore[no-untyped-def]
     return here - before if math.isnan(after) else (after - before) * np.float32(0.5)
 
 
+class Flying(NamedTuple):
+    """Flying pixels: the share of edge pixels, how far behind the edge they end up at most, and
+    what is an edge: within ``near_px`` the depth falls back by ``step_mm`` or more, or ends."""
+
+    share: float
+    reach_mm: float
+    near_px: int
+    step_mm: float
+
+
 @_jit
 def fly(true_mm, depths_mm, seen, key, flying):  # type: ignore[no-untyped-def]
-    """Send edge pixels backwards. ``flying``: the share of edge pixels, how far behind the edge
-    they end up at most, and what is an edge: within so many pixels the depth falls back by so many
-    mm or more, or ends. The image's own border is no edge: what it cuts off continues outside."""
+    """Send edge pixels backwards, as ``Flying`` states. The image's own border is no edge: what it
+    cuts off continues outside."""
     share, flying_mm, near, step_mm = flying
     pixels, starts = seen
     height, width = true_mm.shape

@@ -153,11 +153,13 @@ def _disturb(
 
     true_mm, shape = frame.depth_mm, frame.depth_mm.shape
     if config.flying_share:
-        flying = (config.flying_share, config.flying_mm, config.edge_px, config.edge_mm)
+        edge = config.edge_px, config.edge_mm
+        flying = kernels.Flying(config.flying_share, config.flying_mm, *edge)
         kernels.fly(true_mm, depths_mm, seen, seed + 1, flying)
     if config.grazing_share:
-        grazing = (config.grazing_share, config.grazing_degrees, *pinhole_of(frame.intrinsics))
-        kernels.lose_grazing(true_mm, depths_mm, seen, seed + 2, grazing)
+        grazing = config.grazing_share, config.grazing_degrees
+        pinhole = pinhole_of(frame.intrinsics)
+        kernels.lose_grazing(true_mm, depths_mm, seen, seed + 2, grazing, pinhole)
     if config.distortion_mm:
         rng = np.random.default_rng((seed, 1))
         field, scale = kernels.slow_shape(shape, config.distortion_mm * rng.random(), rng)

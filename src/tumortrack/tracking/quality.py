@@ -24,6 +24,7 @@ _THROUGH_MM = 6.0  # behind the estimated surface: what is seen there lies behin
 _UNSURE = 0.6  # mean probability of a tumor's points
 _PIXEL_MM = 1.5  # of the picture that a cloud is compared in
 _MOST_PIXELS = 1024  # along a side
+_MOST_POINTS = 20_000  # of a cloud that tell enough: a frame must not wait for all of 400,000
 # Share of the organ's picture where a cloud has no point: up to 0.03 where the whole side that the
 # camera sees was scanned (80 scenes, two kinds of deformation); more, and there is no telling what
 # lies there: an organ upside down reaches so far beyond the points that it fits.
@@ -114,7 +115,8 @@ def cloud_shares(organ: Mesh, cloud: SensorCloud) -> tuple[float, float]:
         return 0.0, 1.0
     camera = Intrinsics(width, height, focal, focal, *(-low).tolist())
     organ_mm = render_depth(organ.vertices_mm, organ.faces, camera).depth_mm
-    points_mm = cloud.points_mm[cloud.points_mm[:, 2] > 0].astype(np.float64)
+    points_mm = cloud.points_mm[:: len(cloud.points_mm) // _MOST_POINTS + 1]
+    points_mm = points_mm[points_mm[:, 2] > 0].astype(np.float64)
     column, row = np.rint(focal * points_mm[:, :2] / points_mm[:, 2:] - low).astype(int).T
     within = (column >= 0) & (column < width) & (row >= 0) & (row < height)
     column, row, z_mm = column[within], row[within], points_mm[within, 2]

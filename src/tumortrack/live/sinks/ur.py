@@ -33,7 +33,9 @@ SPEED_RAD_S = np.radians([120.0, 120.0, 180.0, 180.0, 180.0, 180.0])
 
 _TICK_S = 0.02  # of the watchdog
 _MUTE_S = 0.1  # without news from the arm, which sends its state 125 times a second or more
-# Safety modes of the controller (RTDE guide of the maker); in 1 and 2 it follows.
+# Safety modes of the controller (RTDE guide of the maker). It follows in normal and reduced mode;
+# every other one stops, those of a later controller too.
+_FOLLOWS = 1, 2
 _SAFETY = {
     3: "in a protective stop",
     4: "in recovery",
@@ -56,7 +58,8 @@ class UrSinkConfig(SinkConfig, frozen=True, kw_only=True, tag="ur"):
         arm: whose joints: ``cutter_shoulder_pan_joint``, ...
         execute: false: say what would be sent. true: move it.
         jump_deg: the largest step of a joint from one target to the next.
-        force_n: at the tool; more of it stops the arms. Tissue gives way at a few newtons.
+        force_n: at the tool; more of it stops the arms. 40 is an own choice, above what a tool's
+            weight and the sensor's offset read; it is no limit for tissue, which may tear at less.
         lookahead_s, gain: of servoJ: longer and less is smoother and later.
     """
 
@@ -72,7 +75,7 @@ class UrSinkConfig(SinkConfig, frozen=True, kw_only=True, tag="ur"):
 
     def __post_init__(self) -> None:
         servo = (("lookahead_s", 0.03, 0.2), ("gain", 100.0, 2000.0))  # servoJ's own limits
-        ours = (("jump_deg", 0.1, 20.0), ("force_n", 5.0, 150.0))  # controllers end at 150 N
+        ours = (("jump_deg", 0.1, 20.0), ("force_n", 5.0, 150.0))
         for name, low, high in (*ours, *servo):
             value = getattr(self, name)
             if not low <= value <= high:
@@ -296,7 +299,8 @@ class UrLink:
             self._heard = stamp_s, now_s
         if not self._receive.isConnected() or now_s - self._heard[1] > _MUTE_S:
             raise TumortrackError("nothing is heard of the arm; is its network well?")
-        if fault := _SAFETY.get(mode := self._receive.getSafetyMode()):
+        if (mode := self._receive.getSafetyMode()) not in _FOLLOWS:
+            fault = _SAFETY.get(mode, "in no mode in which it may be moved")
             raise TumortrackError(f"the arm is {fault} (safety mode {mode}); release it there")
         if not self._control.isProgramRunning():
             raise TumortrackError("the arm runs no program any more; start again")
