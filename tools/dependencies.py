@@ -171,7 +171,10 @@ def is_allowed(expression: str) -> bool:
     def holds(text: str) -> bool:
         return all(part.strip("() ") in ALLOWED for part in re.split(r"\bAND\b|\bWITH\b", text))
 
-    return bool(expression) and any(holds(way) for way in re.split(r"\bOR\b", expression))
+    ways = re.split(r"\bOR\b", expression)
+    if "(" in expression:  # not taken apart: all must be allowed
+        return all(map(holds, ways))
+    return any(map(holds, ways))
 
 
 def table() -> str:

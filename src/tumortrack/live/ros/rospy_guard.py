@@ -18,6 +18,7 @@ from tumortrack.live.network import is_loopback
 
 _HANDSHAKE_S = 5.0
 _IDLE_S = 30.0  # an XML-RPC client that keeps its connection asks again within that time, or anew
+_WAITING = 1024  # connections that the system holds until they are accepted
 _LARGEST_HEADER = 2**16  # bytes; one holds a type's definition, some kilobytes
 _LARGEST_CALL = 2**20
 MOST_CALLERS = 32  # at a time: of XML-RPC, and with an unfinished header; the oldest makes room
@@ -53,6 +54,14 @@ def guard_node(rospy: Any, master_host: str) -> None:
     tcpros_base.read_ros_handshake_header = lambda sock, buffer, size: decode(
         _read_header(sock, buffer, size, error)
     )
+    listen = tcpros_base.TCPServer._create_server_sock
+
+    def listen_to_many(server: Any) -> Any:
+        sock = listen(server)
+        sock.listen(_WAITING)  # 5 in rospy: a crowd at the door kept everybody out for seconds
+        return sock
+
+    tcpros_base.TCPServer._create_server_sock = listen_to_many
     accept = tcpros_base.TCPROSServer._tcp_server_callback
     tcpros_base.TCPROSServer._tcp_server_callback = _Peers(accept)
 

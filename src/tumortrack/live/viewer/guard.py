@@ -123,7 +123,8 @@ class Guard:
                 "ping_interval": _PING_S, "ping_timeout": _PING_S, "logger": _SILENT,
                 "create_connection": lambda *a, **k: GuardedConnection(self, *a, **k),
             }  # fmt: skip
-            return theirs(*arguments, process_request=answer, **options)
+            options["process_request"] = answer
+            return theirs(*arguments, **options)
 
         with _patching:
             websockets_server.serve = guarded  # type: ignore[assignment,misc]
@@ -201,8 +202,8 @@ class Guard:
                 free()
             allowed = connection.may_change or free is not None
         else:
-            numbers = (*asked.ray_origin, *asked.ray_direction)
-            allowed = connection.may_change and all(map(_plausible, numbers))
+            ray = (*asked.ray_origin, *asked.ray_direction)
+            allowed = connection.may_change and all(map(_plausible, ray))
         if not allowed:
             self.on_refused(connection)
         return allowed
