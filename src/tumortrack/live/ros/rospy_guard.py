@@ -91,6 +91,11 @@ class _Callers:
 
     _room = _Room()
 
+    socket: Any
+
+    def server_activate(self) -> None:
+        self.socket.listen(_WAITING)
+
     def process_request(self, request: Any, client_address: Any) -> None:
         self._room.enter(request)
         super().process_request(request, client_address)  # type: ignore[misc]
