@@ -8,7 +8,7 @@ INSTALL := pip install --quiet --disable-pip-version-check --no-compile --no-dep
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: help setup debian demo test test-hard check attack fuzz replay bench soak wheel lock licences audit results headstart training-speed clean
+.PHONY: help setup debian demo test test-hard check attack fuzz replay bench soak wheel lock licences audit results headstart training-speed foreign clean
 
 help:  ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 10
@@ -76,6 +76,9 @@ headstart: setup  ## accuracy against training steps from pretrained weights (AR
 
 training-speed: setup  ## accuracy reached per second, by batch, learning rate and queries (half an hour)
 	$(BIN)/python lab/scripts/training.py $(ARGS)
+
+foreign: setup  ## how often another kidney, or a mirrored one, is called good (an hour)
+	$(BIN)/python lab/scripts/foreign.py $(ARGS)
 
 wheel: setup  ## build the wheels of product and laboratory into dist/, with what they need (SBOM)
 	$(BIN)/pip wheel --quiet --no-deps --no-build-isolation --wheel-dir dist . ./lab

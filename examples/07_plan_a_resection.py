@@ -25,9 +25,14 @@ def main(out: Path) -> None:
     except tt.errors.NoPlan as error:
         print("no plan:", error)
 
+    try:  # nothing is known of this estimate's errors: 8 mm are assumed, and 5 don't hold them
+        tt.plan_resection(seen)
+    except tt.errors.NoPlan as error:
+        print("no plan:", error)
+
     for method in ("published", "margin"):
         picture = out / f"plan_{method}.png"
-        plan = tt.plan_resection(seen, method=method, margin_mm=5.0, picture=picture)
+        plan = tt.plan_resection(seen, method=method, picture=picture, accept_budget=True)
         length = sum(stroke.length_mm for stroke in plan.cuts)
         print(
             f"{method}: {plan.tumor}, {len(plan.cuts)} strokes in {plan.sweeps} sweeps, "

@@ -193,7 +193,7 @@ def followed(follower: Follower, cloud: SensorCloud) -> Entries:
 
 def plan() -> Entries:
     located()
-    yield from ran("margin", "plan", "run", "margin", "--accept-poor")
+    yield from ran("margin", "plan", "run", "margin", "--accept-poor", "--accept-budget")
     yield from ran(
         "published",
         "plan",
@@ -203,6 +203,7 @@ def plan() -> Entries:
         "published",
         "--no-arms",
         "--accept-poor",
+        "--accept-budget",
     )
 
 

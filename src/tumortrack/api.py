@@ -52,9 +52,10 @@ def scan_phantom(folder: StrPath, seed: int = 1) -> Path:
 
     folder = Path(folder)
     if not folder.exists():
-        labels = digital.phantom_labels(digital.PhantomParameters())
+        phantom = digital.PhantomParameters()
         parameters = scanner.ScannerParameters(spacing_mm=(1.2, 1.2, 1.5))
-        dicom.write_dicom_series(scanner.scan(labels, parameters, seed), folder)
+        ct = scanner.scan(digital.phantom_labels(phantom), parameters, seed)
+        dicom.write_dicom_series(ct, folder, side=phantom.side)
     return folder
 
 
@@ -68,7 +69,7 @@ def prepare(
         overwrite: replace a case that lies there.
         options: fields of ``imaging.prepare.PrepareOptions``: ``kidney_hu``, ``tumor_hu``,
             ``labels``, ``side``, ``organ``, ``tumor``, ``up``, ``series``, ``unit``,
-            ``min_tumor_ml``.
+            ``min_tumor_ml``, ``patient``.
 
     Returns:
         The case: anatomy as closed surfaces, labels and CT; CT frame, mm.
@@ -90,7 +91,8 @@ def prepare(
         from tumortrack.report.pictures import qc_picture
 
         with store.new_folder(Path(folder), overwrite) as aside:
-            qc_picture(case.labels, case.ct, case.anatomy, aside / "qc.png")
+            whose = str(case.patient)
+            qc_picture(case.labels, case.ct, case.anatomy, aside / "qc.png", whose)
             save_case(case, aside)
     return case
 
@@ -190,7 +192,7 @@ def train(
     run = training.TrainingRun(
         anatomy_ct=of.anatomy, up_lps=of.up_lps,
         case_sha256=store.sha256_of(Path(case) / store.MANIFEST),
-        config=config or PRESETS[preset](of.anatomy, "limited"),
+        config=config or PRESETS[preset](of.anatomy, "limited"), patient=of.patient,
         seed=seed, steps=steps, minutes=minutes, device=device, workers=workers,
     )  # fmt: skip
     return training.train(run, Path(folder), report or (lambda status: None))
@@ -346,8 +348,9 @@ def track(
 
     config = SOURCES.parse(source) if isinstance(source, str) else source
     named = named_sinks(sinks)
-    context = SinkContext(tracker.model.parts, PublishedFrame(), tracker.anatomy_ct)
-    region = region_for(tracker.model, range_mm=range_mm)
+    model, frames = tracker.model, PublishedFrame()
+    context = SinkContext(model.parts, frames, tracker.anatomy_ct, patient=model.patient)
+    region = region_for(model, range_mm=range_mm)
     loop = Loop(tracker, context, LoopConfig(region=region, seconds=seconds))
     loop.warm()
 
@@ -415,6 +418,7 @@ def plan_resection(
     picture: StrPath | None = None,
     stand_mm: float | None = None,
     accept_poor: bool = False,
+    accept_budget: bool = False,
     **options: Any,
 ) -> ResectionPlan:
     """Where to cut a tumor out; nothing moves. `tumortrack plan` also plans the arms' motions.
@@ -425,6 +429,8 @@ def plan_resection(
         picture: PNG file to draw the plan into.
         stand_mm: height of the organ's lowest point over the table.
         accept_poor: plan on a poor estimate; the plan's notes say so.
+        accept_budget: plan though the margin does not hold the errors that are to be expected
+            (docs/resection.md); the plan's notes say so.
         options: fields of ``plan.values.ResectionConfig``: ``tumor``, ``method`` (``margin`` or
             ``published``), ``margin_mm``, ``sigmas`` and others.
 
@@ -432,28 +438,30 @@ def plan_resection(
         The plan: cuts, layers, grasp point; table frame, mm, z up.
 
     Raises:
-        NoPlan: nothing to cut, or not as asked; says why.
+        NoPlan: nothing to cut, or not as asked, or the margin is less than the errors; says why.
         InputError: a poor estimate; no such tumor, or an option that is not allowed.
     """
     from dataclasses import replace
 
     from tumortrack.core.config import from_builtins
+    from tumortrack.plan import budget, resection
     from tumortrack.plan import located as places
-    from tumortrack.plan import resection
     from tumortrack.plan.values import ResectionConfig
 
     config = from_builtins(options, ResectionConfig, "plan_resection")
     run = located if isinstance(located, Estimate) else places.read_run(Path(located))
     stand_mm = places.STAND_MM if stand_mm is None else stand_mm
-    table_from_camera = places.table_below(run.cloud.points_mm, stand_mm)
+    table_from_camera = places.table_under(run.cloud, run.meshes, stand_mm)
     if isinstance(run, Estimate):
         doubt = "" if run.quality == "good" else run.reason
         seen = places.located(run.cloud, run.meshes, run.motion, table_from_camera)
+        seen = replace(seen, patient=run.patient)
     else:
         doubt, seen = run.doubt, run.located(table_from_camera)
     notes = places.notes_of_doubt(doubt, accept_poor)
     plan = resection.plan_resection(seen, config)
     plan = replace(plan, notes=(*notes, *plan.notes))
+    plan = budget.heeded(plan, budget.planned_budget(plan, seen), accept_budget)
     if picture is not None:
         from tumortrack.report.plan_pictures import draw_plan
 

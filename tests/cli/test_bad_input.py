@@ -141,7 +141,7 @@ def test_an_existing_case_is_kept_unless_told(tmp_path):
         (["--up", "0,0,0"], "three numbers"),
         (["--organ", "300"], "1..255"),
         (["--kidney-hu", "300", "-300"], "low < high"),
-        (["--side", "left"], "--side means nothing"),
+        (["--patient", " "], "is no identifier"),
         (["--organ", "2", "--tumor", "0"], "--organ, --tumor means nothing"),
         (["--unit", "m"], "--unit means nothing"),
         (["--series", "1"], "--series means nothing"),
@@ -165,7 +165,6 @@ def test_options_of_other_inputs_are_refused(tmp_path):
         (labels, {"series": "1"}),
         (meshes, {"kidney_hu": (0.0, 200.0)}),
         (meshes, {"labels": True}),
-        (meshes, {"side": "left"}),
         (meshes, {"series": "1"}),
         (meshes, {"min_tumor_ml": 1.0}),
     ):

@@ -29,6 +29,8 @@ def test_the_demo_tells_the_whole_story(tmp_path):
         names == [entry["name"] for entry in report["scenes"]] == ["dragged-0000", "elastic-0000"]
     )
     assert report["model_sha256"] == store.sha256_of(out / "model" / store.MANIFEST)
+    assert report["patient"] == {"id": "PHANTOM", "side": "right"}  # of the scanner's DICOM tags
+    assert "patient PHANTOM, right side. 2 scenes" in (out / "index.html").read_text()
     assert report["model"]["case_sha256"] == store.sha256_of(out / "case" / store.MANIFEST)
     assert any("warp" in line and "--map" in line for line in describe(out / "model"))
     assert report["summary"]["tre_mm"]["scenes"] == 2  # the default preset knows correspondences

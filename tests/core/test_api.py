@@ -17,7 +17,8 @@ SIGNATURES = {
     "find_organ": "content model=None range_mm=None box_mm=None mask=None picked_mm=None seed=0",
     "load_case": "folder",
     "load_model": "folder device='auto'",
-    "plan_resection": "located picture=None stand_mm=None accept_poor=False options",
+    "plan_resection": "located picture=None stand_mm=None accept_poor=False accept_budget=False "
+    "options",
     "prepare": "source folder=None overwrite=False options",
     "read_cloud": "path unit='mm'",
     "save_estimate": "estimate folder overwrite=False",

@@ -14,6 +14,7 @@ from imaging_objects import kidney_labels, write_dicom, write_nifti, write_nrrd
 from tumortrack.core import store
 from tumortrack.core.errors import ArtifactError, InputError
 from tumortrack.core.mesh_files import write_anatomy
+from tumortrack.core.patient import Patient
 from tumortrack.core.types import LabelVolume, Volume
 from tumortrack.imaging.case import load_case, save_case
 from tumortrack.imaging.prepare import PrepareOptions, prepare
@@ -73,6 +74,50 @@ def test_a_case_survives_the_disk_and_notices_changes(tmp_path):
     (tmp_path / "case" / "tumor_1.ply").write_bytes(b"ply")
     with pytest.raises(ArtifactError, match=r"tumor_1\.ply was changed"):
         load_case(tmp_path / "case")
+
+
+def tagged(folder, **tags):
+    """A DICOM CT of a kidney; the tags of every slice, or of the first if they are lists."""
+    import pydicom
+
+    truth = kidney_labels((1.5, 1.5, 1.5))
+    for number, path in enumerate(write_dicom(folder, ct_of(truth), truth.lps_from_index)):
+        data = pydicom.dcmread(path)
+        for name, value in tags.items():
+            value = value[min(number, len(value) - 1)] if isinstance(value, list) else value
+            setattr(data, name, value)
+        data.save_as(path)
+    return folder
+
+
+def test_patient_and_side_come_from_the_tags_or_the_user(tmp_path):
+    plain = tagged(tmp_path / "plain", PatientName="Doe^Jane", PatientBirthDate="19500101")
+    assert prepare(plain).patient == Patient()
+    stated = PrepareOptions(patient="P7", side="left")
+    assert prepare(plain, stated).patient == Patient("P7", "left")
+    ct = tagged(tmp_path / "ct", PatientID=" 4711 ", PatientName="Doe^Jane", Laterality="L")
+    case = prepare(ct)
+    assert case.patient == Patient("4711", "left")
+    with store.new_folder(tmp_path / "case") as aside:
+        save_case(case, aside)
+    assert load_case(tmp_path / "case").patient == case.patient
+    assert prepare(ct, PrepareOptions(patient="study-3")).patient == Patient("study-3", "left")
+    with pytest.raises(InputError, match=r"states the left side .* the right one was selected"):
+        prepare(ct, PrepareOptions(side="right"))
+    said = (tmp_path / "case" / "manifest.json").read_text()
+    assert "Doe" not in said
+    assert "4711" in said
+    by_image = tagged(tmp_path / "image", ImageLaterality="R")
+    assert prepare(by_image).patient == Patient(side="right")
+    pair = tagged(tmp_path / "pair", ImageLaterality="B")  # both kidneys: says nothing of this one
+    assert prepare(pair, PrepareOptions(side="right")).patient == Patient(side="right")
+
+
+def test_a_folder_of_two_patients_is_refused(tmp_path):
+    mixed = tagged(tmp_path / "mixed", PatientID=["A", "B"])
+    for series in (None, "1.2.3"):
+        with pytest.raises(InputError, match=r"images of 2 patients \(PatientID A, B\)"):
+            prepare(mixed, PrepareOptions(series=series))
 
 
 def test_missing_empty_and_foreign_inputs(tmp_path):

@@ -115,14 +115,27 @@ def test_side_is_the_patients():
     assert centre_x(select_labels(mirrored, "left")[0]) == pytest.approx(60, abs=1)
 
 
+def test_the_side_is_known_where_the_map_has_two_kidneys_or_somebody_says_it():
+    assert [select_labels(two_kidneys(*tumors))[2] for tumors in ((2, 1), (1, 2))] == [
+        "left", "right",
+    ]  # fmt: skip
+    assert select_labels(two_kidneys(2, 2), "right")[2] == "right"
+    alone = LabelVolume(two_kidneys(2, 0).labels[100:], np.eye(4))  # cut: its middle says nothing
+    assert select_labels(alone)[2] == "unknown"
+    assert select_labels(alone, "left")[2] == "left"
+    both = two_kidneys(2, 2).labels
+    torn = LabelVolume(np.concatenate([both[:62], both[128:]]), np.eye(4))
+    assert select_labels(torn)[2] == "unknown"  # two pieces, no two kidneys
+
+
 def test_the_tumor_bearing_side_is_the_default():
-    chosen, notes = select_labels(two_kidneys(1, 2))
+    chosen, notes, _ = select_labels(two_kidneys(1, 2))
     assert centre_x(chosen) == pytest.approx(-60, abs=1)
     assert any("right kidney" in note for note in notes)
     assert any("2 specks" in note for note in notes)
     with pytest.raises(InputError, match="--side"):
         select_labels(two_kidneys(1, 1))
-    alone, notes = select_labels(two_kidneys(1, 1), "left")
+    alone, notes, _ = select_labels(two_kidneys(1, 1), "left")
     assert alone.labels.max() == 1
     assert "no tumor in this kidney" in notes
 
@@ -131,17 +144,17 @@ def test_tumor_numbers_are_kept_split_and_closed_up():
     truth = kidney_labels()
     large_first = volumes(truth)
     assert large_first[2] > large_first[3]
-    kept, notes = select_labels(truth)
+    kept, notes, _ = select_labels(truth)
     assert volumes(kept)[2:] == pytest.approx(large_first[2:])
     assert notes == []
     swapped = LabelVolume(np.array([0, 1, 3, 2])[truth.labels], truth.lps_from_index)
     assert volumes(select_labels(swapped)[0])[2:] == pytest.approx(large_first[:1:-1])
     gap = LabelVolume(np.array([0, 1, 7, 4])[truth.labels], truth.lps_from_index)
-    closed, notes = select_labels(gap)
+    closed, notes, _ = select_labels(gap)
     assert volumes(closed)[2:] == pytest.approx(large_first[:1:-1])
     assert "tumor label 7 is now 3" in notes
     one = LabelVolume(np.minimum(truth.labels, 2), truth.lps_from_index)
-    split, notes = select_labels(one)
+    split, notes, _ = select_labels(one)
     assert volumes(split)[2:] == pytest.approx(large_first[2:])
     assert any("2 separate pieces" in note for note in notes)
 
@@ -149,7 +162,7 @@ def test_tumor_numbers_are_kept_split_and_closed_up():
 def test_chosen_numbers_and_missing_labels():
     truth = kidney_labels()
     other = LabelVolume(np.array([0, 9, 5, 6])[truth.labels], truth.lps_from_index)
-    chosen, _ = select_labels(other, organ=9, tumor=6)
+    chosen, _, _ = select_labels(other, organ=9, tumor=6)
     assert volumes(chosen)[2] == pytest.approx(volumes(truth)[3])
     assert select_labels(other, organ=9, tumor=0)[0].labels.max() == 1
     with pytest.raises(InputError, match=r"no organ label 1; it has \[5, 6, 9\]"):
@@ -179,7 +192,7 @@ def test_a_tumor_behind_a_thin_gap_belongs_to_its_kidney(gap, radius_mm):
     """Also one larger than 10 ml (radius 16 mm), which is no kidney of its own."""
     truth = beside(gap, radius_mm)
     before = volumes(truth)
-    found, notes = select_labels(truth)
+    found, notes, _ = select_labels(truth)
     after = volumes(found)
     assert after[2] == before[2]  # the tumor is whole
     assert 0 < after[1] - before[1] < 0.3  # and the gap is filled, no wider than it is
@@ -191,10 +204,10 @@ def test_a_tumor_behind_a_thin_gap_belongs_to_its_kidney(gap, radius_mm):
 
 
 def test_a_gap_is_closed_at_fine_voxels_too_and_touching_tumors_need_none():
-    found, _ = select_labels(beside(4, 9.0, 0.7))
+    found, _, _ = select_labels(beside(4, 9.0, 0.7))
     assert found.labels.max() == 2
     touching = beside(0)
-    found, notes = select_labels(touching)
+    found, notes, _ = select_labels(touching)
     assert volumes(found)[1:] == pytest.approx(volumes(touching)[1:])
     assert notes == []
 
@@ -203,13 +216,13 @@ def test_a_tumor_far_off_is_refused_or_loudly_left_out():
     far = beside(8, 16.0)
     with pytest.raises(InputError, match=r"the only tumor \(1\d\.\d ml\) lies more than 3 mm"):
         select_labels(far)
-    alone, _ = select_labels(far, tumor=0)
+    alone, _, _ = select_labels(far, tumor=0)
     assert alone.labels.max() == 1
     labels = far.labels.copy()
     middle = np.argwhere(labels == 1).mean(0)
     ball = ((np.indices(labels.shape) - middle[:, None, None, None]) ** 2).sum(0) < 9**2
     labels[ball] = 2
-    found, notes = select_labels(LabelVolume(labels, far.lps_from_index))
+    found, notes, _ = select_labels(LabelVolume(labels, far.lps_from_index))
     assert volumes(found)[2] == pytest.approx(float(ball.sum()) / 1000)
     assert any(note.startswith("LEFT OUT: tumor of 17.") for note in notes), notes
 
@@ -220,7 +233,7 @@ def test_a_kidney_mostly_tumor_is_a_kidney_still():
     distance = np.sqrt(x**2 + y**2 + z**2)
     labels = np.where(distance < 22.8, 2, np.where(distance < 23.6, 1, 0)).astype(np.uint8)
     labels[:2, :2, :2] = 1
-    found, _ = select_labels(LabelVolume(labels, np.eye(4)))
+    found, _, _ = select_labels(LabelVolume(labels, np.eye(4)))
     assert 3 < volumes(found)[1] < 10
     assert volumes(found)[2] == pytest.approx(49.6, abs=0.5)
 

@@ -57,6 +57,7 @@ def test_an_update_arrives_where_slicer_has_our_files(opened) -> None:
     assert unpack_status(status.content) == IgtlStatus(1, "good", "")
     assert status.metadata == {
         "frame_id": "camera", "sequence": "7", "quality": "good", "latency_ms": "12.5",
+        "patient": "P1", "side": "left",
     }  # fmt: skip
     anatomy = small_anatomy()
     for name, mesh in zip(anatomy.names, anatomy.parts, strict=True):

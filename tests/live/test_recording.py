@@ -152,6 +152,7 @@ def test_plain_files_hold_what_was_seen_and_said(tmp_path):
     assert (report["estimate"], report["reason"]) == (None, "the drape hides it")
     about = json.loads((path / "recording.json").read_text())
     assert (about["kind"], about["parts"]) == ("recording", list(PARTS))
+    assert about["patient"] == {"id": "P1", "side": "left"}
 
 
 def test_depths_beyond_sixteen_bits_are_left_out_of_files(tmp_path):

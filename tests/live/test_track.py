@@ -163,6 +163,10 @@ def test_a_robot_gets_its_own_frame(world, tmp_path):
     assert found["frame"]["published_from_camera"][2][3] == pytest.approx(700)
     about = told(out / "recording.json")
     assert (about["frame_id"], about["estimate_frame"]) == ("base_link", "camera")
+    whose = {"id": "P1", "side": "right"}
+    assert about["patient"] == found["patient"] == whose
+    frame = next(p for p in sorted((out / "frames").iterdir()) if (p / "estimate").is_dir())
+    assert told(frame / "report.json")["estimate"]["patient"] == whose
 
 
 def test_a_report_that_cannot_be_written_ends_nothing(world, tmp_path):

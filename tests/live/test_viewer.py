@@ -25,6 +25,7 @@ from stories import COMMAND, environment, live_resection
 from tumortrack.core.colours import TUMORS, part_colour
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import rigid, transform_points
+from tumortrack.core.patient import Patient
 from tumortrack.core.store import new_folder
 from tumortrack.core.types import Anatomy, LabelVolume, Mesh, Volume
 from tumortrack.imaging.case import Case, save_case
@@ -300,6 +301,13 @@ def test_case_gives_slices_and_an_exact_margin_that_moves_along(sinks, clock, tm
     sink.publish(empty_update())
     assert not sink._panel.slice.visible
 
+    assert "patient unknown, side unknown" in sink._panel.whose.content
+    known = sinks(replace(setting, patient=Patient("P1", "left")), case=str(tmp_path / "case"))
+    assert "patient P1, left side" in known._panel.whose.content
+    with new_folder(tmp_path / "other") as folder:
+        save_case(replace(case, patient=Patient("P2")), folder)
+    with pytest.raises(InputError, match=r"is of patient P2, .* the model of patient P1"):
+        sinks(replace(setting, patient=Patient("P1")), case=str(tmp_path / "other"))
     with pytest.raises(InputError, match="is not the case that the model was trained on"):
         sinks(replace(setting, anatomy_ct=small_anatomy()), case=str(tmp_path / "case"))
     with pytest.raises(InputError, match="have no motion"):
@@ -366,6 +374,9 @@ def test_status_says_why_and_no_old_numbers():
     stale = StatusPanel("stale", small_update(), 3.21, 8)
     assert "3.2 s" in stale.flag()
     assert "0.75" in StatusPanel("good", small_update(), 0.1, 8).numbers()
+    cell = replace(workcell(), left_mm=1.23)
+    arms = StatusPanel("good", replace(small_update(), workcell=cell), 0.1, 9, arms=True)
+    assert "1.2 mm of the margin are left" in arms.flag()
     assert "0.75" not in stale.numbers()
 
 

@@ -462,6 +462,27 @@ def test_an_arm_elsewhere_is_not_moved(arm, moving):
     assert arm.what() == ["servo"]
 
 
+def test_on_a_cut_the_tools_tip_is_where_it_should_be_to_2_mm(arm, moving):
+    """A tenth of a degree at the shoulder, a metre away, are 1.75 mm, and far within 2 degrees."""
+
+    def cutting(number, yes):
+        result = working(number)
+        return replace(result, workcell=replace(result.workcell, cutting=yes))
+
+    sink = moving()
+    arm.actual[5] += np.radians(1.1)  # the tool alone turns: 100 mm, so 1.9 mm
+    sink.publish(cutting(0, True))
+    arm.follows = False
+    arm.actual = angles(0.0)
+    arm.actual[0] += np.radians(0.1)
+    sink.publish(cutting(1, True))
+    arm.actual[0] += np.radians(0.05)
+    sink.publish(cutting(2, False))
+    with pytest.raises(TumortrackError, match=r"tip is 2\.6 mm from where it should cut; .* 2"):
+        sink.publish(cutting(3, True))
+    assert arm.what() == ["servo", "servo", "servo", "stop"]
+
+
 @pytest.mark.parametrize("why", ["halted", "no arms", "jump"])
 def test_an_arm_is_stopped_and_begins_again_only_where_it_stands(arm, moving, why):
     sink = moving()

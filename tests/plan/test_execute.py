@@ -14,9 +14,11 @@ from scipy.spatial.transform import Rotation
 
 from clock import PATIENCE_S
 from live_objects import small_update
-from plan_objects import MIDDLE_MM, RADIUS_MM, TUMOR_MM, located, sphere
+from plan_objects import MIDDLE_MM, RADIUS_MM, TUMOR_MM, Deviating, located, sphere
 from tumortrack.core.errors import InputError, NoPlan
 from tumortrack.live.values import TrackingResult
+from tumortrack.plan.budget import ErrorBudget
+from tumortrack.plan.live_budget import LiveBudget
 from tumortrack.plan.motions import ABORTED, DONE, JOINTS, Execution, Motions, MotionStage
 from tumortrack.plan.operation import (
     CUT_NOTE,
@@ -90,6 +92,20 @@ def test_an_abort_stops_the_arms_smoothly_from_every_state_and_for_good(state):
     assert np.array_equal(execution.joints_rad, joints[-1])
 
 
+def test_a_cut_is_one_once_an_arm_has_had_the_time_to_come_up_with_it():
+    execution, cutting = Execution(motions()), []
+    while execution.state != DONE:
+        cutting.append((execution.state, execution.cutting))
+        execution.step(0.01)
+    for state in STATES:
+        found = [is_cut for name, is_cut in cutting if name == state]
+        first = found.index(True) if any(found) else len(found)
+        assert all(found[first:])
+        # All of these sweeps is cut: but for their first 0.3 s, by the samples 0.1 s apart.
+        assert (25 <= first <= 42) == state.startswith("sweep")
+    assert not execution.cutting
+
+
 @given(st.lists(st.tuples(st.booleans(), st.floats(0, 0.7)), min_size=1, max_size=30))
 @settings(max_examples=60, deadline=None)
 def test_halts_only_delay(orders):
@@ -155,9 +171,9 @@ def plain(cell):
 class World:
     """An organ that the tests move, an operation on it, and a clock."""
 
-    def __init__(self, replan=None, config=None):
+    def __init__(self, replan=None, config=None, plan=PLAN, budget=None):
         self.seen = SEEN
-        self.planned = Planned(PLAN, self.seen.meshes, motions())
+        self.planned = Planned(plan, self.seen.meshes, motions())
         self.calls = []
         self.made = replan or self.replan
         self.pool = ThreadPoolExecutor(1)
@@ -168,6 +184,7 @@ class World:
             lambda joints: (),
             self.locate,
             self.begin,
+            budget,
         )
         self.now_s = 100.0
         self.shift = np.zeros(3)
@@ -184,7 +201,9 @@ class World:
         return self.plans[-1]
 
     def replan(self, seen, joints_rad, progress):
-        plan = plan_resection(seen, ResectionConfig(method="published"))
+        before = self.planned.plan
+        config = ResectionConfig(method=before.method, margin_mm=before.margin_mm)
+        plan = plan_resection(seen, config)
         sweep = progress.first_sweep(plan, seen.meshes["tumor_1"])
         self.calls.append((seen.meshes["tumor_1"].box_mm.mean(0), sweep))
         states = STATES if sweep is None else STATES[STATES.index(f"sweep {sweep}") :]
@@ -392,6 +411,51 @@ def test_a_tumor_that_keeps_moving_is_waited_for_and_its_return_is_enough():
     world.shift = np.zeros(3)
     assert world.frames(2).halted == ""
     world.until(DONE)
+
+
+def budgeted(margin_mm, deviation_mm=0.5):
+    """A world whose arms heed an error budget, and how unsure its estimates are."""
+    plan = plan_resection(SEEN, ResectionConfig(margin_mm=margin_mm))
+    unsure = Deviating(deviation_mm)
+    planned = ErrorBudget(margin_mm=margin_mm, tracking_mm=3.6, hand_eye_mm=1.0, tool_mm=2.0)
+    world = World(plan=plan, budget=LiveBudget(planned))
+    changes = {"estimate": replace(GOOD.estimate, motion=unsure), "latency_ms": 50.0}
+    return world, unsure, changes
+
+
+def test_arms_stand_while_the_errors_exceed_the_margin_and_go_on_when_they_shrink():
+    world, unsure, changes = budgeted(10.0)
+    cell = world.until("grasp", **changes)
+    assert cell.left_mm == pytest.approx(world.planned.kept_mm - np.hypot(3.6, np.sqrt(5)))
+    unsure.deviation_mm = 4.0
+    cell = world.frames(15, **changes)
+    assert cell.halted.startswith("12.2 mm of error, most of it tracking (12.0), against a margin")
+    assert cell.left_mm < 0
+    assert world.frame(**changes).joints_rad == cell.joints_rad
+    assert not world.plans  # a new plan would not help
+    unsure.deviation_mm = 1.5
+    assert world.frames(2, **changes).halted == ""
+    world.until(DONE, **changes)
+    found = world.operation.summary()["budget"]
+    assert found["planned"]["sum_mm"] == pytest.approx(np.hypot(3.6, np.sqrt(5)))
+    assert found["worst"]["tracking_mm"] == 4.5  # of those on which the arms went on
+    assert found["worst"]["left_mm"] > 0
+    (halt,) = world.operation.halts
+    assert halt == " mm of error, most of it tracking (), against a margin of  mm"
+
+
+def test_less_motion_than_allowed_can_be_too_much_and_is_planned_anew():
+    world, _, changes = budgeted(5.0)
+    world.until("approach", **changes)
+    world.shift = np.array([1.5, 0.0, 0.0])  # 2 mm are allowed
+    cell = world.frames(3, **changes)
+    assert cell.halted.startswith("5.7 mm of error, most of it tracking (3.6)")
+    for _ in range(200):
+        cell = world.frame(**changes)
+        if world.calls and not cell.halted:
+            break
+    assert world.calls[0][0] == pytest.approx(TUMOR_MM + world.shift, abs=0.1)
+    assert cell.left_mm > 0
 
 
 def test_after_the_last_sweep_the_tumor_may_go():

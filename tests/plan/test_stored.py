@@ -13,10 +13,11 @@ from safetensors import safe_open
 from safetensors.numpy import load_file, save_file
 
 from arm_objects import organ, plan
-from plan_objects import RADIUS_MM, TUMOR_MM, sphere
+from plan_objects import RADIUS_MM, TUMOR_MM, located, sphere
 from tumortrack.core import store
 from tumortrack.core.config import to_builtins
 from tumortrack.core.errors import ArtifactError, NoPlan
+from tumortrack.plan.arms import procedure
 from tumortrack.plan.arms.cell import ArmCell, PlanningGroup
 from tumortrack.plan.arms.config import CellConfig
 from tumortrack.plan.arms.kinematics import level_pose
@@ -24,6 +25,7 @@ from tumortrack.plan.arms.procedure import plan_motions
 from tumortrack.plan.arms.trajectory import first_hit
 from tumortrack.plan.files import INVENTED, PlanFolder, read_plan, write_plan
 from tumortrack.plan.motions import CUTTER, JOINTS, Motions
+from tumortrack.plan.operation import ResectionProgress
 from tumortrack.plan.values import ResectionConfig
 
 CONFIG = CellConfig()
@@ -166,6 +168,19 @@ def test_collisions_are_looked_for_again_before_motions_are_carried_out(content)
     assert "organ" in first_hit(motions, CONFIG, organ((0.0, 0.0, 40.0)))
     base = msgspec.structs.replace(CONFIG.cutter_base, position_mm=(700.0, 0.0, 100.0))
     assert first_hit(motions, msgspec.structs.replace(CONFIG, cutter_base=base), organ())
+
+
+def test_motions_planned_beside_the_live_loop_are_tested_for_collisions_too(content, monkeypatch):
+    monkeypatch.setattr(procedure, "plan_motions", lambda *_, **__: content.motions)
+    base = msgspec.structs.replace(CONFIG.cutter_base, position_mm=(700.0, 0.0, 100.0))
+    elsewhere = msgspec.structs.replace(CONFIG, cutter_base=base)
+    seen = replace(located(), meshes=content.meshes)
+    call = seen, np.array(CONFIG.home_rad), ResectionProgress()
+    monkeypatch.setattr(procedure, "_setting", [(ResectionConfig(), ArmCell(CONFIG))])
+    assert procedure.replan(*call).motions is content.motions
+    monkeypatch.setattr(procedure, "_setting", [(ResectionConfig(), ArmCell(elsewhere))])
+    with pytest.raises(NoPlan, match="would meet"):
+        procedure.replan(*call)
 
 
 def test_the_electrode_goes_through_the_organ_only_as_slowly_as_it_cuts(content):

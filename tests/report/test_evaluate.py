@@ -314,7 +314,8 @@ def test_qc_picture_shows_outlines(tmp_path, with_ct):
     lps_from_index[:3, 3] = (-30, -30, 100)
     labels = label_grid(parts, lps_from_index, (60, 60, 60))
     ct = Volume(np.where(labels, 50.0 * labels, -80.0), lps_from_index) if with_ct else None
-    qc_picture(LabelVolume(labels, lps_from_index), ct, parts, tmp_path / "qc.png")
+    whose = r"patient $\frac$, left side"  # no formula
+    qc_picture(LabelVolume(labels, lps_from_index), ct, parts, tmp_path / "qc.png", whose)
     flat = imread(tmp_path / "qc.png")[..., :3].reshape(-1, 3)
     for color in ((1.0, 0.62, 0.45), (0.97, 0.88, 0.22)):
         assert (np.abs(flat - color) < 0.03).all(1).sum() > 300

@@ -12,6 +12,7 @@ from PIL import Image
 from tumortrack.core.colours import sweep_colour
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import rigid
+from tumortrack.core.patient import Patient
 from tumortrack.core.types import Mesh
 from tumortrack.imaging.meshes import mesh_of, solid_of
 from tumortrack.live.values import Polyline, RigidShape, Workcell
@@ -129,6 +130,10 @@ def test_the_same_plan_is_the_same_file(
         draw_plan(replace(plan, notes=("as it is",)), bare, tmp_path / name)
     assert (tmp_path / "one.png").read_bytes() == (tmp_path / "two.png").read_bytes()
     assert Image.open(tmp_path / "one.png").size == (1200, 600)
+    odd = replace(located, patient=Patient(r"$\frac$", "left"))  # no formula
+    draw_plan(plan, odd, tmp_path / "odd.png")
+    figure = plan_figure(plan, odd)
+    assert r"tumor 1, patient $\frac$, left side" in figure.get_suptitle()
     with pytest.raises(InputError, match="was not located"):
         draw_plan(replace(plan, label=3, tumor="tumor_2"), located, tmp_path / "none.png")
 

@@ -1183,7 +1183,7 @@ def make_base(folder: Path) -> None:
         ("train", here["case"], here["model"], *preset),
         ("simulate", here["case"], here["scenes"], "--scenes", 1),
         ("locate", here["model"], here["scenes"] / "0000" / "cloud.ply", folder / "run"),
-        ("plan", folder / "run", folder / "plan", "--accept-poor"),
+        ("plan", folder / "run", folder / "plan", "--accept-poor", "--accept-budget"),
     ):
         code, output, *_ = run([str(argument) for argument in arguments], folder, 300)
         if code:

@@ -6,6 +6,7 @@ import numpy as np
 import trimesh
 
 from tumortrack.core.estimate import Estimate
+from tumortrack.core.patient import Patient
 from tumortrack.core.types import (
     Anatomy,
     DepthFrame,
@@ -100,4 +101,4 @@ def empty_update(sequence: int = 1, reason: str = "only 12 points lie in range")
 
 
 def small_setting() -> SinkContext:
-    return SinkContext(parts=PARTS, published_frame=PublishedFrame())
+    return SinkContext(PARTS, PublishedFrame(), patient=Patient("P1", "left"))

@@ -45,3 +45,19 @@ def located(*tumors, n=40_000, seed=0, meshes=True, std_mm=None):
     }  # fmt: skip
     surfaces = {"kidney": organ, **named} if meshes else {}
     return Located(points[inside], labels[inside], surfaces, deviations)
+
+
+class Deviating:
+    """A motion that leaves points where they are, everywhere as unsure as the tests say."""
+
+    def __init__(self, deviation_mm=0.5):
+        self.deviation_mm = deviation_mm
+
+    def carry(self, points):
+        return points
+
+    def back(self, points):
+        return points
+
+    def std_mm(self, points):
+        return np.full(len(points), self.deviation_mm)

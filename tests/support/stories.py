@@ -11,6 +11,7 @@ import numpy as np
 
 import warm
 from tumortrack.core import store
+from tumortrack.core.patient import Patient
 from tumortrack.imaging.case import Case, save_case
 from tumortrack.imaging.surface import surfaces
 from tumortrack.phantom.digital import PhantomParameters, phantom_labels
@@ -56,7 +57,7 @@ def write_phantom_case(folder: Path) -> Case:
     """The built-in phantom on coarse voxels, as a case folder."""
     labels = phantom_labels(PhantomParameters(), voxel_mm=1.5)
     anatomy, _ = surfaces(labels)
-    case = Case(anatomy, labels, (0.0, -1.0, 0.0))
+    case = Case(anatomy, labels, (0.0, -1.0, 0.0), patient=Patient("P1", "right"))
     with store.new_folder(folder) as aside:
         save_case(case, aside)
     return case

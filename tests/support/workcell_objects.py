@@ -108,4 +108,12 @@ def virtual(sequence: int = 0, progress: float = 0.0, halted: str = "") -> Track
 
 
 def with_arms() -> SinkContext:
-    return replace(small_setting(), published_frame=TABLE, arms=True)
+    return replace(small_setting(), published_frame=TABLE, arms=True, tip_mm=tip_mm)
+
+
+def tip_mm(arm: str, joints_rad: np.ndarray) -> np.ndarray:
+    """Of an arm that reaches a metre from its shoulder, and turns about that and its wrist."""
+    pan, wrist = joints_rad[0], joints_rad[0] + joints_rad[5]
+    return 900 * np.array([np.cos(pan), np.sin(pan), 0]) + 100 * np.array(
+        [np.cos(wrist), np.sin(wrist), 0]
+    )

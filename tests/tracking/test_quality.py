@@ -152,7 +152,7 @@ def test_locate_says_its_verdict_and_plan_heeds_it(tmp_path, phantom_case, clini
             assert "--accept-poor" in line
             assert not out.exists()
             command = (*command, "--accept-poor")
-        said = succeeded(tumortrack(*command))
+        said = succeeded(tumortrack(*command, "--accept-budget"))
         notes = store.read_json(out / "plan.json")["plan"]["notes"]
         assert ("PLANNED ON A POOR ESTIMATE: the organ hides" in said) == (verdict == "poor")
         assert any("POOR ESTIMATE" in note for note in notes) == (verdict == "poor")

@@ -24,6 +24,7 @@ from imaging_objects import (
 from live_objects import small_estimate
 from tumortrack.core.errors import InputError
 from tumortrack.core.mesh_files import read_mesh, write_mesh
+from tumortrack.core.patient import Patient
 from tumortrack.core.types import CameraLabels, LabelVolume, Mesh, Volume
 from tumortrack.imaging.case import Case, save_case
 from tumortrack.imaging.meshes import read_mesh_folder
@@ -300,12 +301,16 @@ def test_export_writes_both(tmp_path: Path, capsys: pytest.CaptureFixture) -> No
 
     labels = kidney_labels((2.0, 2.0, 2.0))
     anatomy, _ = surfaces(labels)
-    case = Case(anatomy, labels, (0.0, -1.0, 0.0), {"options": {"side": "left", "series": None}})
+    whose = Patient("P1", "left")
+    case = Case(anatomy, labels, (0.0, -1.0, 0.0), patient=whose)
     (tmp_path / "case").mkdir()
     save_case(case, tmp_path / "case")
     hu = np.where(labels.labels > 0, 100, -100).astype(np.float32)
     write_dicom_series(Volume(hu, labels.lps_from_index), tmp_path / "ct")
-    Export(case=tmp_path / "case", out=tmp_path / "out", dicom=tmp_path / "ct").run()
+    with pytest.raises(InputError, match=r"is of patient PHANTOM, .* are of patient P1, left side"):
+        Export(case=tmp_path / "case", out=tmp_path / "out", dicom=tmp_path / "ct").run()
+    asked = {"case": tmp_path / "case", "dicom": tmp_path / "ct", "patient": "PHANTOM"}
+    Export(out=tmp_path / "out", **asked).run()
     assert "segmentation.dcm" in capsys.readouterr().out
     again = read_labels(tmp_path / "out" / "case.seg.nrrd")
     np.testing.assert_array_equal(again.labels, labels.labels)

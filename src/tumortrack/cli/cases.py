@@ -26,13 +26,16 @@ class Prepare:
         kidney_hu: HU window of the kidney in a CT: low (inclusive) and high.
         tumor_hu: HU window of the tumors in a CT.
         labels: INPUT is a label map (recognised by itself where that is plain).
-        side: the patient's kidney to take; default: the one with the largest tumor.
+        side: the patient's kidney to take from a label map (default: the one with the largest
+            tumor); of a CT or meshes, which one it is.
         organ: label number of the kidney.
         tumor: label number of the tumors; default: every label from 2 up. 0: none.
         up: patient direction that faces the camera: anterior, left, ... or "x,y,z" in LPS.
         series: which DICOM series, if the folder holds several (UID or number in the list).
         unit: of mesh files.
         min_tumor_ml: smaller tumors are reported and dropped.
+        patient: whose organ it is (default: DICOM's PatientID). It is stored in every folder and
+            message that follows; a pseudonym keeps the PatientID out of them.
         overwrite: replace CASE if it exists.
     """
 
@@ -48,6 +51,7 @@ class Prepare:
     series: str | None = None
     unit: Literal["mm", "m"] | None = None
     min_tumor_ml: float = 0.2
+    patient: str | None = None
     overwrite: bool = False
 
     def run(self) -> None:
@@ -57,6 +61,9 @@ class Prepare:
         options = {field.name: getattr(self, field.name) for field in fields(PrepareOptions)}
         case = api.prepare(self.input, self.case, overwrite=self.overwrite, **options)
         say_notes(case.report.get("notes", []))
+        say(str(case.patient))
+        if not case.patient.known:
+            say_notes(["state both (--patient ID --side left|right): no real arm moves without"])
         for name, part in zip(case.anatomy.names, case.anatomy.parts, strict=True):
             say(f"{name}: {part.volume_mm3 / 1000:.1f} ml")
         say(f"case written to {self.case}; look at {self.case / 'qc.png'} before you rely on it.")
@@ -71,25 +78,26 @@ class Export:
         out: folder to write: case.seg.nrrd and, with --dicom, segmentation.dcm.
         dicom: folder of the CT's slices that the case's voxels come from.
         series: which of its series, if the folder holds several (UID or number in the list).
+        patient: the PatientID of --dicom, where the case has a pseudonym.
     """
 
     case: Positional[Path]
     out: Positional[Path]
     dicom: Path | None = None
     series: str | None = None
+    patient: str | None = None
 
     def run(self) -> None:
         from tumortrack import api
+        from tumortrack.core.patient import Patient
         from tumortrack.imaging import segmentation
 
         if self.series is not None and self.dicom is None:
             raise InputError("--series says which series of --dicom; give that folder too.")
         case = api.load_case(self.case)
         options = case.report.get("options", {})
-        side = options.get("side")
-        parts = segmentation.segments(
-            case.anatomy.names, side if side in segmentation.SIDES else None
-        )
+        patient = case.patient
+        parts = segmentation.segments(case.anatomy.names, patient.side)
         labels = case.labels
         notes: tuple[str, ...] = ()
         with store.new_folder(self.out) as aside:
@@ -99,7 +107,8 @@ class Export:
             if self.dicom is not None:
                 series = self.series or options.get("series")
                 file = aside / "segmentation.dcm"
-                notes = segmentation.write_dicom_seg(file, labels, parts, self.dicom, series)
+                whose = Patient(self.patient or patient.id, patient.side)
+                notes = segmentation.write_dicom_seg(file, labels, parts, self.dicom, series, whose)
         say_notes(notes)
         say(f"written to {self.out}: {', '.join(sorted(p.name for p in self.out.iterdir()))}.")
 

@@ -44,9 +44,10 @@ class Demo:
         out = self.out
         _clear(out)
         say("1/5 scanning the built-in kidney phantom (virtual CT, DICOM)")
-        labels = digital.phantom_labels(digital.PhantomParameters())
+        phantom = digital.PhantomParameters()
+        labels = digital.phantom_labels(phantom)
         ct = scanner.scan(labels, scanner.ScannerParameters(), _CT_SEED)
-        dicom.write_dicom_series(ct, out / "ct_dicom")
+        dicom.write_dicom_series(ct, out / "ct_dicom", side=phantom.side)
         say("2/5 segmenting the CT, making surfaces")
         Prepare(input=out / "ct_dicom", case=out / "case").run()
         say(f"3/5 training for {self.minutes:g} minutes")

@@ -10,7 +10,9 @@ from typing import TYPE_CHECKING, Literal
 from tyro.conf import Positional
 
 from tumortrack.cli.console import Device, console, keep_loaded, progress_bar, say, say_notes
+from tumortrack.cli.stated import StatedPatient
 from tumortrack.core import store
+from tumortrack.core.config import to_builtins
 from tumortrack.core.errors import InputError
 
 if TYPE_CHECKING:
@@ -21,7 +23,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Locate:
+class Locate(StatedPatient):
     """Locate kidney and tumors in one cloud or depth image.
 
     Attributes:
@@ -65,6 +67,7 @@ class Locate:
 
         keep_loaded()
         model = load_model(self.model, self.device)
+        say(str(model.patient))
         tracker, notes = Tracker(model), (*notes, *model.notes)
         if points is not None:
             assert tracker.anatomy_ct is not None  # a model with a shape
@@ -105,10 +108,11 @@ class Locate:
 
     def _points(self) -> PointTable | None:
         """The points of --map; what is wrong with them or the model is said before a wait."""
-        from tumortrack.models.folder import has_shape, read_model_manifest
+        from tumortrack.models.folder import has_shape, patient_of, read_model_manifest
         from tumortrack.tracking.points import read_points
 
         manifest = read_model_manifest(self.model)
+        patient_of(manifest, self.model).check_is(self.stated, str(self.model))
         if self.map is None:
             return None
         if not has_shape(manifest):
@@ -193,7 +197,9 @@ class Evaluate:
         keep_loaded()
         model = load_model(self.model, self.device)
         check_case(model, folders)
+        say(str(model.patient))
         about = {
+            "patient": to_builtins(model.patient),
             "model": model.provenance,
             "model_sha256": store.sha256_of(self.model / store.MANIFEST),
             "scenes_folder": str(self.variants),

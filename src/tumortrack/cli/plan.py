@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Literal
 from tyro.conf import Positional
 
 from tumortrack.cli.console import say, say_notes
+from tumortrack.cli.stated import StatedPatient
 from tumortrack.core import store
 from tumortrack.core.errors import InputError, NoPlan
 
@@ -20,14 +21,15 @@ if TYPE_CHECKING:
 
     from tumortrack.core.types import Mesh
     from tumortrack.plan.arms.config import CellConfig
+    from tumortrack.plan.budget import ErrorBudget
     from tumortrack.plan.located import LocatedRun
-    from tumortrack.plan.values import ResectionConfig, ResectionPlan
+    from tumortrack.plan.values import Located, ResectionConfig, ResectionPlan
 
 _BASES = ("cutter_base", "holder_base")
 
 
 @dataclass(frozen=True, kw_only=True)
-class Plan:
+class Plan(StatedPatient):
     """Plan how to cut a located tumor out, and how two arms do it.
 
     Attributes:
@@ -45,7 +47,10 @@ class Plan:
         stand: height of the organ's lowest point over the table in mm, where no frame is given.
         cell: JSON file with arms, tools, table and their places (docs/resection.md).
         arms: also plan the motions of both arms.
+        moved: the tumor may have moved by so many mm before the arms stand: the margin has to hold
+            it (docs/resection.md).
         accept_poor: plan on an estimate that `locate` called poor; the plan says so everywhere.
+        accept_budget: plan though the margin does not hold the errors; the plan says so everywhere.
         overwrite: replace PLAN if it exists.
     """
 
@@ -60,22 +65,29 @@ class Plan:
     stand: float | None = None
     cell: Path | None = None
     arms: bool = True
+    moved: float = 2.0
     accept_poor: bool = False
+    accept_budget: bool = False
     overwrite: bool = False
 
     def run(self) -> None:
         from tumortrack.core.config import to_builtins
+        from tumortrack.plan.budget import heeded
         from tumortrack.plan.files import INVENTED, KIND, PlanFolder, write_plan
         from tumortrack.plan.located import notes_of_doubt, read_run
+        from tumortrack.plan.operation import OperationConfig
         from tumortrack.plan.resection import plan_resection
         from tumortrack.report.plan_pictures import draw_plan
 
         config = self._resection_config()
+        OperationConfig(moved_mm=self.moved)  # what is allowed is said now, not by `resect`
         store.check_place(self.plan, KIND, self.overwrite)
         cell_config = self._cell_config()
         if self.arms:
             check_arms_installed()
         run = read_run(self.run_folder)
+        run.patient.check_is(self.stated, str(self.run_folder))
+        say(str(run.patient))
         doubts = notes_of_doubt(run.doubt, self.accept_poor)
         frame_id, table_from_camera = self._frame(run, cell_config.stand_mm)
         located = run.located(table_from_camera)
@@ -86,6 +98,10 @@ class Plan:
             )
         resection = plan_resection(located, config)
         resection = replace(resection, notes=(*doubts, *resection.notes))
+        budget = self._budget(resection, located, table_from_camera, cell_config)
+        for line in budget.table():
+            say(line)
+        resection = heeded(resection, budget, self.accept_budget)
         _say_plan(resection)
         motions, cell_used, cell_source = None, None, INVENTED
         if self.arms and organ is not None:
@@ -108,7 +124,8 @@ class Plan:
         content = PlanFolder(
             resection, config, table_from_camera, frame_id, located.meshes, cell_used, motions,
             str(model.get("case_sha256") or "") if isinstance(model, dict) else "",
-            store.sha256_of(self.frame) if self.frame else INVENTED, cell_source,
+            store.sha256_of(self.frame) if self.frame else INVENTED, cell_source, run.patient,
+            budget,
         )  # fmt: skip
 
         def pictures(aside: Path) -> None:
@@ -133,6 +150,25 @@ class Plan:
         given = {key: value for key, value in options.items() if value is not None}
         return from_builtins({**written, **given}, ResectionConfig, str(self.config or "options"))
 
+    def _budget(
+        self,
+        resection: ResectionPlan,
+        located: Located,
+        table_from_camera: Float64[np.ndarray, "4 4"],
+        cell: CellConfig,
+    ) -> ErrorBudget:
+        """What the margin has to hold; the camera's place at the tumor's far side."""
+        import numpy as np
+
+        from tumortrack.live.calibration_file import read_error_mm
+        from tumortrack.plan.budget import planned_budget, tumor_points
+
+        error_mm = None
+        if self.frame is not None:
+            off_mm = tumor_points(resection, located) - table_from_camera[:3, 3]
+            error_mm = read_error_mm(self.frame, float(np.linalg.norm(off_mm, axis=1).max()))
+        return planned_budget(resection, located, error_mm, cell.tool_error_mm, self.moved)
+
     def _cell_config(self) -> CellConfig:
         from msgspec.structs import replace
 
@@ -155,12 +191,10 @@ class Plan:
         """Frame id and ``table_from_camera``: of the calibration, or of a camera that looks
         down."""
         from tumortrack.live.calibration_file import read_frames
-        from tumortrack.plan.located import table_below
+        from tumortrack.plan.located import table_under
 
         if self.frame is None:
-            kidney = run.meshes.get("kidney")
-            points_mm = run.cloud.points_mm if kidney is None else kidney.vertices_mm
-            return "table", table_below(points_mm, stand_mm)
+            return "table", table_under(run.cloud, run.meshes, stand_mm)
         frames = read_frames(self.frame)
         if frames.published_from_camera[2, 2] >= 0:  # cuts are planned from above
             raise InputError(

@@ -17,8 +17,11 @@ from tyro.conf import Positional
 from tumortrack.cli import track
 from tumortrack.cli.console import Device, progress_bar, say
 from tumortrack.cli.plan import check_arms_installed
+from tumortrack.cli.stated import StatedPatient
 from tumortrack.core import store
+from tumortrack.core.config import to_builtins
 from tumortrack.core.errors import Aborted, ArtifactError, InputError
+from tumortrack.core.patient import NOBODY, Patient
 
 if TYPE_CHECKING:
     from concurrent.futures import Future
@@ -41,7 +44,7 @@ _LIVE = ("realsense", "ros2", "ros1")  # sources that show the present
 
 
 @dataclass(frozen=True, kw_only=True)
-class Resect:
+class Resect(StatedPatient):
     """Carry a plan out with virtual arms, seen by sinks as those of `track`.
 
     Attributes:
@@ -57,7 +60,8 @@ class Resect:
         whole: as in `track`.
         intrinsics: as in `track`.
         speed: of the arms' time; 2 is twice as fast.
-        moved: the tumor has moved if its surface has by so many mm (root mean square).
+        moved: the tumor has moved if its surface has by so many mm (root mean square; default: what
+            the plan allows for).
         film: write an animated GIF of the stored plan instead.
         report: file for states, halts and what else there was (default: runs/resect-TIME.json).
         device: auto takes CUDA where it is.
@@ -72,7 +76,7 @@ class Resect:
     whole: bool = False
     intrinsics: Path | None = None
     speed: float = 1.0
-    moved: float = 2.0
+    moved: float | None = None
     film: Path | None = None
     report: Path | None = None
     device: Device = "auto"
@@ -87,12 +91,15 @@ class Resect:
 
         check_arms_installed()
         stored = read_plan(self.plan)
+        stored.patient.check_is(self.stated, str(self.plan))
         if stored.motions is None or stored.cell is None:
             raise InputError(f"{self.plan} was planned with --no-arms; plan again without it.")
         if lacking := sorted({"kidney", stored.plan.tumor} - stored.meshes.keys()):
             raise ArtifactError(f"{self.plan} lacks {lacking[0]}.ply. Plan again.")
         sinks = api.named_sinks(self.sinks).values()  # wrong: said before all that takes long
-        config = OperationConfig(speed=self.speed, moved_mm=self.moved, replan_cut=self.replan_cut)
+        config = OperationConfig(
+            speed=self.speed, moved_mm=self._moved_mm(stored), replan_cut=self.replan_cut
+        )
         cell_config = from_builtins(stored.cell, CellConfig, str(self.plan))
         arms = [sink for sink in sinks if isinstance(sink, UrSinkConfig)]
         moving = [arm for arm in arms if arm.execute]
@@ -111,9 +118,10 @@ class Resect:
                 raise InputError("--film shows the stored plan; give it without sinks and --live.")
             _write_film(stored, cell, self.film)
             return
-        _confirm(moving)
+        _confirm(moving, stored.patient)
         carry_out = self._execute if self.live is None else self._follow
-        with _dry_run(bool(arms) and not moving):
+        with _dry_run([arm for arm in arms if not arm.execute], moving):
+            say(str(stored.patient))
             carry_out(stored, cell, config, arms)
 
     def _check_real(self, stored: PlanFolder, arms: Sequence[UrSinkConfig]) -> None:
@@ -122,7 +130,9 @@ class Resect:
         from tumortrack.plan.located import POOR_ESTIMATE
 
         model, source = self.live or (None, "")
-        case, margin_mm = model and _case_of(model), stored.plan.margin_mm
+        case, whose = _case_of(model) if model else ("", NOBODY)
+        budget, moved_mm = stored.budget, self._moved_mm(stored)
+        assumed = () if budget is None else budget.assumed
         needs = {
             "--live MODEL SOURCE, so that they stop where the tumor moves": model,
             f"a source that shows the present ({', '.join(_LIVE)}; not {source})": (
@@ -137,6 +147,14 @@ class Resect:
             f"a model of the case that was planned on ({model} is of another)": (
                 not (case and stored.case_sha256) or case == stored.case_sha256
             ),
+            "--patient ID and --side, as you know them": self.stated.known,
+            f"a plan that says whose organ it is (this one's: {stored.patient})": (
+                stored.patient.known
+            ),
+            f"a model that says whose organ it is ({model}: {whose})": model is None or whose.known,
+            f"a model of the plan's patient and side ({model}: {whose})": (
+                not whose.differs(stored.patient)
+            ),
             "a plan made on a good estimate (this one's was poor)": (
                 not any(note.startswith(POOR_ESTIMATE) for note in stored.plan.notes)
             ),
@@ -147,12 +165,32 @@ class Resect:
                 stored.cell_source != INVENTED
             ),
             f"--speed up to 1, not {self.speed:g}": self.speed <= 1,
-            f"--moved up to the margin, {margin_mm:g} mm": self.moved <= margin_mm,
+            "a plan whose margin holds its errors (plan again with a wider one)": (
+                budget is not None and budget.left_mm >= 0
+            ),
+            "a plan by a model that says how unsure it is (preset clinic)": (
+                "tracking" not in assumed
+            ),
+            "a plan with the calibration's error (error_mm in the --frame file)": (
+                "hand-eye" not in assumed
+            ),
+            "a plan with the tools' error (tool_error_mm in the --cell file)": (
+                "tool" not in assumed
+            ),
+            f"--moved as planned with, not {moved_mm:g}": (
+                budget is None or moved_mm <= budget.motion_mm
+            ),
             "a person at a terminal who confirms it": sys.stdin.isatty(),
         }
         if lacking := [what for what, met in needs.items() if not met]:
             names = " and ".join(arm.host for arm in arms)
             raise InputError(f"the arm at {names} may not move. It needs: {'; '.join(lacking)}.")
+
+    def _moved_mm(self, stored: PlanFolder) -> float:
+        from tumortrack.plan.budget import MOVED_MM
+
+        planned_mm = MOVED_MM if stored.budget is None else stored.budget.motion_mm
+        return planned_mm if self.moved is None else self.moved
 
     def _follow(
         self,
@@ -168,16 +206,19 @@ class Resect:
 
         import msgspec
 
-        from tumortrack.core.config import to_builtins
         from tumortrack.live.values import PublishedFrame
         from tumortrack.plan.arms import procedure
+        from tumortrack.plan.arms.cell import tip_places
+        from tumortrack.plan.live_budget import LiveBudget
         from tumortrack.plan.located import located
 
         assert self.live is not None
         model, source = self.live
-        case = _case_of(model)
+        case, whose = _case_of(model)
+        if whose.differs(stored.patient):  # it would find another tumor, or none
+            raise InputError(f"{model} is of {whose}, the plan of {stored.patient}.")
         if stored.case_sha256 and case and case != stored.case_sha256:
-            raise InputError(  # it would find another patient's tumor
+            raise InputError(  # likewise
                 f"{model} was trained for another case than the one that was planned on. Give a "
                 "model of that case, or plan on what this model locates."
             )
@@ -208,13 +249,20 @@ class Resect:
             begun = planner.submit(procedure.warm_up)
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
             begun.result()
-            operation = _operation(stored, cell, config, locate=locate, replan=replan)
+            late_s = max((arm.lookahead_s for arm in arms), default=0.0)
+            budget = LiveBudget(stored.budget, late_s) if stored.budget else None
+            operation = _operation(
+                stored, cell, config, locate=locate, replan=replan, budget=budget
+            )
             frames = PublishedFrame(stored.frame_id, stored.table_from_camera)
             track.Track(
                 model=model, source=source, sinks=self.sinks, range=self.range, box=self.box,
                 whole=self.whole, intrinsics=self.intrinsics, report=self.report,
-                device=self.device,
-            ).run(track.Arms(operation, frames, {"plan_config": to_builtins(config)}))  # fmt: skip
+                device=self.device, patient=self.patient, side=self.side,
+            ).run(track.Arms(
+                operation, frames, {"plan_config": to_builtins(config)}, tip_places(cell.config),
+                bool(arms),
+            ))  # fmt: skip
         _say_end(operation, arms)
 
     def _execute(
@@ -234,7 +282,7 @@ class Resect:
         report = track.report_path(self.report, "resect")
         frames = PublishedFrame(stored.frame_id, stored.table_from_camera)
         controls = Controls()
-        context = SinkContext(tuple(stored.meshes), frames, None, controls, arms=True)
+        context = SinkContext(tuple(stored.meshes), frames, None, controls, True, stored.patient)
         stop = track.stopping(lambda: operation.abort(track.STOPPED))
         with stop, api.open_sinks(api.named_sinks(self.sinks), context) as sinks:
             track.say_opened(sinks)
@@ -253,8 +301,7 @@ class Resect:
                     sink.put(result)
                 track.say_failures(sinks, errors)
                 assert result.workcell is not None
-                text = result.workcell.state
-                text = "the way back" if arms and text == "home" else text
+                text = track.stage_words(result.workcell.state, bool(arms))
                 text += f": {result.workcell.halted}" if result.workcell.halted else ""
                 if text != shown:
                     say(shown := text)
@@ -262,6 +309,7 @@ class Resect:
                     break
                 time.sleep(max(0.0, started + (sequence + 1) / _FPS - time.monotonic()))
         content = {
+            "patient": to_builtins(stored.patient),
             "plan": {"tumor": stored.plan.tumor, "method": stored.plan.method},
             "frame": stored.frame_id,
             "resection": operation.summary(),
@@ -282,13 +330,16 @@ def _shows_the_present(source: str) -> bool:
     return kind in _LIVE and not Path(getattr(config, "device", "")).suffix
 
 
-def _case_of(model: Path) -> str:
-    """The case that a model was trained for, by its digest; empty where unknown."""
+def _case_of(model: Path) -> tuple[str, Patient]:
+    """The case that a model was trained for, by its digest (empty where unknown), and whose."""
+    from tumortrack.models.folder import patient_of
+
     manifest = store.read_json(model / store.MANIFEST) if model.is_dir() else {}
-    return str(manifest.get("provenance", {}).get("case_sha256") or "")
+    case = str(manifest.get("provenance", {}).get("case_sha256") or "")
+    return case, patient_of(manifest, model)
 
 
-def _confirm(arms: Sequence[UrSinkConfig]) -> None:
+def _confirm(arms: Sequence[UrSinkConfig], patient: Patient) -> None:
     """A person at the terminal types each arm's address; InputError: something else."""
     for arm in arms:
         import termios  # not on Windows, where no terminal would be found above
@@ -296,7 +347,8 @@ def _confirm(arms: Sequence[UrSinkConfig]) -> None:
         termios.tcflush(sys.stdin, termios.TCIFLUSH)  # what was typed before it was asked for
         say(
             f"The {arm.arm} at {arm.host} is about to move: as soon as an estimate is good, and "
-            "again after every pause. Nobody in its reach, a hand at the emergency stop?"
+            f"again after every pause. It cuts in {patient}: is that who lies here? "
+            "Nobody in its reach, a hand at the emergency stop?"
         )
         try:
             typed = input("Type its address to let it begin: ")
@@ -307,15 +359,18 @@ def _confirm(arms: Sequence[UrSinkConfig]) -> None:
 
 
 @contextmanager
-def _dry_run(dry: bool) -> Iterator[None]:
-    """Say first and last that no arm is connected, if so."""
-    if dry:
-        say(_DRY_RUN)
+def _dry_run(dry: Sequence[UrSinkConfig], moving: Sequence[UrSinkConfig]) -> Iterator[None]:
+    """Say first and last which arms are not connected."""
+    lines = [_DRY_RUN] if dry and not moving else []
+    if moving:
+        lines = [f"DRY RUN of the {one.arm} at {one.host}: it is not connected" for one in dry]
+    for line in lines:
+        say(line)
     try:
         yield
     finally:
-        if dry:
-            say(_DRY_RUN)
+        for line in lines:
+            say(line)
 
 
 def _operation(

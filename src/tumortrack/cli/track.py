@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 from tyro.conf import Positional
 
 from tumortrack.cli.console import Device, console, keep_loaded, say, say_notes
+from tumortrack.cli.stated import StatedPatient
 from tumortrack.core import store
 from tumortrack.core.errors import InputError, StorageError
 
@@ -39,10 +40,12 @@ class Arms:
     companion: Operation
     frames: PublishedFrame
     about: dict[str, Any]
+    tip_mm: Any  # as ``SinkContext``'s
+    ur: bool  # sinks of real arms, connected or not
 
 
 @dataclass(frozen=True, kw_only=True)
-class Track:
+class Track(StatedPatient):
     """Follow kidney and tumors live, from a camera to viewers, recordings and robots.
 
     Sources and sinks are written kind:target?option=value&option=value. Sources: virtual:CASE,
@@ -95,14 +98,15 @@ class Track:
         from tumortrack.live.calibration_file import read_frames
         from tumortrack.live.spec import SOURCES
         from tumortrack.live.values import Controls, PublishedFrame, SinkContext
-        from tumortrack.models.folder import read_model_manifest
+        from tumortrack.models.folder import patient_of, read_model_manifest
 
         source_config = SOURCES.parse(self.source)
         named = api.named_sinks(self.sinks)
         frames = read_frames(self.frame) if self.frame else PublishedFrame()
         if arms is not None:
             frames = arms.frames
-        read_model_manifest(self.model)  # report what is wrong before PyTorch's seconds
+        manifest = read_model_manifest(self.model)  # what is wrong, before PyTorch's seconds
+        patient_of(manifest, self.model).check_is(self.stated, str(self.model))
         report = report_path(self.report, "track")
 
         from tumortrack.live.loop import Loop
@@ -115,7 +119,16 @@ class Track:
         say_notes(model.notes)
         tracker = Tracker(model)
         config = self._loop_config(model)
-        context = SinkContext(model.parts, frames, tracker.anatomy_ct, Controls(), arms is not None)
+        tip_mm = None if arms is None else arms.tip_mm
+        context = SinkContext(
+            model.parts,
+            frames,
+            tracker.anatomy_ct,
+            Controls(),
+            arms is not None,
+            model.patient,
+            tip_mm,
+        )
         companion = None if arms is None else arms.companion
         loop = Loop(tracker, context, config, companion)
 
@@ -128,6 +141,7 @@ class Track:
         loop.warm()
         way = frames.published_from_camera
         about = {
+            "patient": to_builtins(model.patient),
             "model": model.provenance,
             "notes": list(model.notes),
             "model_sha256": store.sha256_of(self.model / store.MANIFEST),
@@ -144,9 +158,11 @@ class Track:
             closing(SourceWorker(source_config.open)) as source,
         ):
             say_opened(sinks)
-            screen = _Screen(loop, source, sinks, report, about, companion)
+            ur = arms is not None and arms.ur
+            screen = _Screen(loop, source, sinks, report, about, companion, ur)
             ending.callback(screen.end)  # once all workers have flushed
-            say(f"tracking {self.source} in frame {frames.frame_id!r}; Ctrl-C ends it.")
+            say(f"{model.patient}: tracking {self.source} in frame {frames.frame_id!r}; "
+                "Ctrl-C ends it.")  # fmt: skip
             loop.run(source, sinks, screen.show)
 
     def _loop_config(self, model: Model) -> LoopConfig:
@@ -171,6 +187,12 @@ def say_opened(sinks: list[SinkWorker]) -> None:
     for sink in sinks:
         for note in sink.notes:
             say(f"sink {sink.name}: {note}")
+
+
+def stage_words(state: str, ur: bool) -> str:
+    """A stage for the screen. ``ur``: there are sinks of real arms, and nobody knows that those are
+    home."""
+    return state.replace("home", "the way back", 1) if ur else state
 
 
 def say_failures(sinks: list[SinkWorker], known: dict[str, str]) -> None:
@@ -227,6 +249,7 @@ class _Screen:
     report: Path
     about: dict[str, Any]
     arms: Operation | None
+    ur: bool
 
     def __post_init__(self) -> None:
         self._started = self._shown = self._stored = time.monotonic()
@@ -239,7 +262,9 @@ class _Screen:
         state = result.reason or result.warning or "good"
         kind = re.sub(r"\d", "", state)  # numbers change with every frame
         if (cell := result.workcell) is not None:
-            state += f"; arms: {cell.state}" + (f" ({cell.halted})" if cell.halted else "")
+            stage = stage_words(cell.state, self.ur)
+            state += f"; arms: {stage}" + (f" ({cell.halted})" if cell.halted else "")
+            state += "" if cell.left_mm is None else f"; {cell.left_mm:.1f} mm of the margin left"
             kind += cell.state + re.sub(r"\d", "", cell.halted)
         now = time.monotonic()
         if kind != self._state and now - self._changed >= _SAY_S:

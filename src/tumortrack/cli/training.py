@@ -79,7 +79,7 @@ class Train:
             config=PRESETS[self.preset](case.anatomy, self.rotations), seed=self.seed,
             steps=self.steps, minutes=self.minutes, device=self.device, workers=self.workers,
             checkpoint_every_s=self.checkpoint_every,
-            start=None if self.start is None else load_start(self.start),
+            start=None if self.start is None else load_start(self.start), patient=case.patient,
         )  # fmt: skip
         if is_finished(self.model):
             done = load_model(self.model).provenance

@@ -12,6 +12,7 @@ from jaxtyping import Float
 from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import Points
+from tumortrack.core.patient import NOBODY, Patient
 from tumortrack.core.types import CameraLabels, Mesh, OccupancyCloud
 
 LARGEST_GRID = 400
@@ -75,6 +76,7 @@ class Estimate:
         motion: where every point of the CT is, if the method knows that; ``unsmoothed``: before the
             mean over past frames: the next frame's search starts from it.
         quality: ``good`` or ``poor``, and the ``reason``: see ``tracking.quality.judged``.
+        patient: whose organ the model is of; that this one lies there nothing verifies.
     """
 
     cloud: OccupancyCloud
@@ -85,3 +87,4 @@ class Estimate:
     unsmoothed: Motion | None = None
     quality: Quality = "poor"
     reason: str = "it was not judged"
+    patient: Patient = NOBODY

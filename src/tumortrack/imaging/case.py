@@ -7,8 +7,10 @@ from pathlib import Path
 from typing import Any
 
 from tumortrack.core import store
-from tumortrack.core.errors import ArtifactError, StorageError
+from tumortrack.core.config import to_builtins
+from tumortrack.core.errors import ArtifactError, InputError, StorageError
 from tumortrack.core.mesh_files import read_anatomy, write_anatomy
+from tumortrack.core.patient import NOBODY, Patient, patient_in
 from tumortrack.core.types import Anatomy, LabelVolume, Volume
 from tumortrack.imaging.nifti import write_nifti, write_volume_nifti
 from tumortrack.imaging.volume import read_labels, read_volume
@@ -26,6 +28,7 @@ class Case:
         up_lps: unit vector, the patient direction that faces the camera.
         report: JSON types: volumes, smoothing, what was dropped, notes, source, options.
         ct: the CT on the labels' crop, where the input was one.
+        patient: whose organ it is, as far as it is known.
     """
 
     anatomy: Anatomy
@@ -33,6 +36,7 @@ class Case:
     up_lps: tuple[float, float, float]
     report: dict[str, Any] = field(default_factory=dict)
     ct: Volume | None = None
+    patient: Patient = NOBODY
 
 
 def save_case(case: Case, folder: Path) -> None:
@@ -54,6 +58,7 @@ def save_case(case: Case, folder: Path) -> None:
     content = {
         "parts": list(case.anatomy.names),
         "up_lps": [float(x) for x in case.up_lps],
+        "patient": to_builtins(case.patient),
         "report": case.report,
     }
     store.seal(folder, KIND, content, frame="lps")
@@ -73,6 +78,11 @@ def load_case(folder: Path) -> Case:
     anatomy = read_anatomy(folder)
     if list(anatomy.names) != parts:
         raise ArtifactError(f"{folder} lacks parts: {parts} expected, {list(anatomy.names)} found.")
+    try:
+        patient = patient_in(manifest.get("patient"), str(folder / store.MANIFEST))
+    except InputError as error:
+        raise ArtifactError(f"{error} Run prepare again.") from error
     labels, ct = read_labels(folder / "labels.nii.gz"), folder / "ct.nii.gz"
     x, y, z = up
-    return Case(anatomy, labels, (x, y, z), report, read_volume(ct) if ct.exists() else None)
+    volume = read_volume(ct) if ct.exists() else None
+    return Case(anatomy, labels, (x, y, z), report, volume, patient)

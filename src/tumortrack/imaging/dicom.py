@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Float
 
 from tumortrack.core.errors import InputError
+from tumortrack.core.patient import NOBODY, UNKNOWN, Patient, Side
 from tumortrack.imaging.grid import GZIP_BEST, RawVolume, check_affine, check_size
 
 MIN_SLICES = 10
@@ -40,6 +41,8 @@ class _Slice:
     scale: tuple[float, float]  # stored number -> HU: slope, intercept
     samples: int  # of a pixel
     pixel_fault: str  # what is wrong with the length of the pixels; "": nothing
+    patient_id: str
+    laterality: str  # L, R or something else
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,6 +56,7 @@ class Series:
     shape: tuple[int, int, int]
     lps_from_index: Float[np.ndarray, "4 4"]
     notes: tuple[str, ...] = ()
+    patient: Patient = NOBODY
 
 
 def find_series(folder: Path, series: str | None = None) -> Series:
@@ -62,7 +66,7 @@ def find_series(folder: Path, series: str | None = None) -> Series:
     orientation. Otherwise ``series`` must name one: its UID or its number in the error's list.
 
     Raises:
-        InputError: no series, several, a missing, double or stray slice.
+        InputError: no series, several, a missing, double or stray slice; images of two patients.
     """
     groups, notes = _groups(folder)
     slices = _choose(folder, groups, series)
@@ -86,7 +90,8 @@ def find_series(folder: Path, series: str | None = None) -> Series:
         notes += (f"{others} images of other series, sizes or orientations left out",)
     if not first.uid:
         notes += ("the slices have no SeriesInstanceUID: taken as one series",)
-    return Series(tuple(s.path for s in slices), shape, lps_from_index, notes)
+    files, patient = tuple(s.path for s in slices), _patient(folder, groups, slices)
+    return Series(files, shape, lps_from_index, notes, patient)
 
 
 def read_dicom(folder: Path, series: str | None = None) -> RawVolume:
@@ -109,7 +114,21 @@ def read_dicom(folder: Path, series: str | None = None) -> RawVolume:
         raise InputError(f"{folder}: the slices' pixels cannot be decoded: {last}.") from error
     if array.shape != found.shape:
         raise InputError(f"{folder}: the pixels are {array.shape}, the tags say {found.shape}.")
-    return RawVolume(array, found.lps_from_index, found.notes)
+    return RawVolume(array, found.lps_from_index, found.notes, found.patient)
+
+
+def _patient(folder: Path, groups: list[list[_Slice]], slices: list[_Slice]) -> Patient:
+    """Whom the chosen slices show; InputError where the folder mixes patients."""
+    ids = sorted({one.patient_id for group in groups for one in group} - {""})
+    if len(ids) > 1:
+        raise InputError(
+            f"{folder} holds images of {len(ids)} patients (PatientID {', '.join(ids[:3])}"
+            f"{', ...' if len(ids) > 3 else ''}). Give a folder that holds one patient's alone."
+        )
+    sides: dict[str, Side] = {"L": "left", "R": "right"}
+    said = {one.laterality for one in slices}
+    side: Side = sides.get(said.pop(), UNKNOWN) if len(said) == 1 else UNKNOWN
+    return Patient(ids[0] if ids else UNKNOWN, side)
 
 
 def _check_tags(folder: Path, slices: list[_Slice]) -> None:
@@ -189,9 +208,9 @@ def _read_tags(path: Path) -> _Slice | str:
                 raise ValueError(f"elements of the type {sorted(strange)[0]!r}")
             if int(tags.get("NumberOfFrames") or 1) > 1:
                 return _MULTI_FRAME
-            uid, description, modality = (
+            uid, description, modality, patient_id = (
                 "".join(c if c.isprintable() else "?" for c in str(tags.get(tag) or ""))
-                for tag in ("SeriesInstanceUID", "SeriesDescription", "Modality")
+                for tag in ("SeriesInstanceUID", "SeriesDescription", "Modality", "PatientID")
             )
             slope, intercept = tags.get("RescaleSlope"), tags.get("RescaleIntercept")
             return _Slice(
@@ -209,6 +228,8 @@ def _read_tags(path: Path) -> _Slice | str:
                 ),
                 samples=int(tags.get("SamplesPerPixel") or 1),
                 pixel_fault=_pixel_fault(tags, stream),
+                patient_id=patient_id.strip()[:64].strip(),  # as long as the standard allows
+                laterality=str(tags.get("ImageLaterality") or tags.get("Laterality") or ""),
             )
         except Exception as error:  # pydicom raises anything on a foreign or damaged file
             if is_dicom and _should_be_slice(tags):

@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float, Int32, Int64, UInt8
 
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import spacing_mm
+from tumortrack.core.patient import NOBODY, Patient
 from tumortrack.core.types import LabelVolume
 
 Box = tuple[slice, slice, slice]
@@ -29,12 +30,13 @@ _AT_ONCE = 2**16  # labels: counting makes eight bytes of each
 class RawVolume:
     """Voxels in the file's own number type; axes (i, j, k); ``lps_from_index``: index -> LPS mm.
 
-    ``notes`` name what was beside them and was left out.
+    ``notes`` name what was beside them and was left out; ``patient`` is whom the file names.
     """
 
     array: np.ndarray
     lps_from_index: Float[np.ndarray, "4 4"]
     notes: tuple[str, ...] = ()
+    patient: Patient = NOBODY
 
 
 def check_size(

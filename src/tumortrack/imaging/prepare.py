@@ -12,6 +12,7 @@ from tumortrack.core import store
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import direction_lps, spacing_mm
 from tumortrack.core.mesh_files import SUFFIXES
+from tumortrack.core.patient import UNKNOWN, Patient, Side
 from tumortrack.core.types import ORGAN, LabelVolume, Volume
 from tumortrack.imaging.case import Case
 from tumortrack.imaging.grid import grown_box, voxel_ml
@@ -22,7 +23,7 @@ from tumortrack.imaging.surface import surfaces
 from tumortrack.imaging.volume import is_label_map, labels_of, read_raw, volume_of
 
 # Options that only one kind of input uses.
-_OF_CT, _OF_LABELS = ("kidney_hu", "tumor_hu"), ("labels", "side", "organ", "tumor")
+_OF_CT, _OF_LABELS = ("kidney_hu", "tumor_hu"), ("labels", "organ", "tumor")
 _UP_LPS = (0.0, -1.0, 0.0)  # until ``prepare`` sets what was asked for
 _LEAST_ORGAN_OUTSIDE = 0.02  # of the outer surface
 _MOST_CHANGE_PERCENT = 1.0  # of a part's volume, by smoothing; more is noted
@@ -35,12 +36,14 @@ class PrepareOptions:
     Attributes:
         kidney_hu, tumor_hu: half-open HU windows [low, high) for a CT.
         labels: the volume is a label map (recognised without this where it is plain).
-        side: the patient's ``left`` or ``right``; None takes the tumor-bearing kidney.
+        side: the patient's ``left`` or ``right``: of a label map, the kidney to take (None: the
+            tumor-bearing one); of a CT by HU windows or meshes, which one it is.
         organ, tumor: label numbers; tumor None takes every label from 2 up, 0 none.
         up: the patient direction that faces the camera: a name, or three numbers in LPS.
         series: UID or number of one DICOM series among several.
         unit: of meshes, ``mm`` or ``m``; None: mm, and metres are refused with an explanation.
         min_tumor_ml: smaller tumors are reported and dropped.
+        patient: an identifier, instead of the DICOM PatientID; None: that, or unknown.
     """
 
     kidney_hu: tuple[float, float] = KIDNEY_HU
@@ -53,6 +56,7 @@ class PrepareOptions:
     series: str | None = None
     unit: str | None = None
     min_tumor_ml: float = MIN_TUMOR_ML
+    patient: str | None = None
 
     def __post_init__(self) -> None:
         if not (np.isfinite(self.min_tumor_ml) and self.min_tumor_ml >= 0):
@@ -63,6 +67,12 @@ class PrepareOptions:
             raise InputError(f"side {self.side!r} is not allowed: left or right (the patient's).")
         if self.unit not in (None, "mm", "m"):
             raise InputError(f"unit {self.unit!r} is not allowed: mm or m.")
+        if self.patient is not None:
+            Patient(self.patient)
+
+    @property
+    def stated_side(self) -> Side:
+        return "left" if self.side == "left" else "right" if self.side == "right" else UNKNOWN
 
 
 def prepare(input: Path, options: PrepareOptions | None = None) -> Case:
@@ -118,14 +128,14 @@ def _from_volume(path: Path, options: PrepareOptions) -> Case:
         _refuse_unused(f"{path} is one file", options, "series")
     raw = read_raw(path, options.series)
     as_labels = options.labels or (path.is_file() and is_label_map(raw))
-    ct, notes = None, list(raw.notes)
+    ct, notes, stated, side = None, list(raw.notes), raw.patient, options.stated_side
     if as_labels:
         _refuse_unused(f"{path} is read as a label map", options, *_OF_CT, "unit")
         if not options.labels:
             notes.append("few distinct whole numbers: read as a label map, not as a CT")
         source = labels_of(raw, path)
         del raw  # the largest maps are gigabytes: one copy is enough
-        labels, more = select_labels(
+        labels, more, side = select_labels(
             source, options.side, options.organ, options.tumor, options.min_tumor_ml
         )
     else:
@@ -144,7 +154,19 @@ def _from_volume(path: Path, options: PrepareOptions) -> Case:
         if abs(change) > _MOST_CHANGE_PERCENT
     ]
     report = {"kind": "label map" if as_labels else "ct", "notes": notes}
-    return Case(anatomy, labels, _UP_LPS, {**report, **_measured(labels, surface)}, ct)
+    patient = _patient(path, stated, options.patient, side)
+    return Case(anatomy, labels, _UP_LPS, {**report, **_measured(labels, surface)}, ct, patient)
+
+
+def _patient(path: Path, stated: Patient, given: str | None, side: Side) -> Patient:
+    """Whose organ it is: ``stated`` by the file; ``given`` by the user, instead; on the ``side``
+    that was selected or given. InputError where the file says the other side."""
+    if stated.differs(Patient(side=side)):
+        raise InputError(
+            f"{path} states the {stated.side} side (DICOM Laterality), and the {side} one was "
+            "selected. Check --side, and that these are the right images."
+        )
+    return Patient(given or stated.id, stated.side if side == UNKNOWN else side)
 
 
 def _from_meshes(folder: Path, options: PrepareOptions) -> Case:
@@ -154,7 +176,9 @@ def _from_meshes(folder: Path, options: PrepareOptions) -> Case:
     labels = label_meshes(anatomy)
     mesh_ml = [part.volume_mm3 / 1000 for part in anatomy.parts]
     measured = _measured(labels, {"names": list(anatomy.names), "mesh_ml": mesh_ml})
-    return Case(anatomy, labels, _UP_LPS, {"kind": "meshes", "notes": notes, **measured})
+    patient = Patient(options.patient or UNKNOWN, options.stated_side)
+    report = {"kind": "meshes", "notes": notes, **measured}
+    return Case(anatomy, labels, _UP_LPS, report, patient=patient)
 
 
 def _measured(labels: LabelVolume, surface: dict[str, list[Any]]) -> dict[str, Any]:

@@ -13,7 +13,7 @@ import hashlib
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, UInt8
@@ -22,6 +22,7 @@ import tumortrack
 from tumortrack.core.colours import part_colour
 from tumortrack.core.errors import InputError, StorageError
 from tumortrack.core.geometry import transform_points
+from tumortrack.core.patient import NOBODY, UNKNOWN, Patient, Side
 from tumortrack.core.store import write_atomically
 from tumortrack.core.types import FIRST_TUMOR, ORGAN, LabelVolume
 from tumortrack.imaging.dicom import Series, find_series
@@ -30,8 +31,6 @@ from tumortrack.imaging.nifti import GZIP_LEVEL
 
 if TYPE_CHECKING:
     from pydicom.dataset import Dataset
-
-Side = Literal["left", "right"]
 
 _OFF_GRID = 0.05  # of a voxel: rounding of positions in files, and nothing else
 _SERIES_NUMBER = 900
@@ -51,7 +50,7 @@ class Term(NamedTuple):
 STRUCTURE = Term("123037004", "SCT", "Anatomical Structure")
 ALTERED = Term("49755003", "SCT", "Morphologically Altered Structure")
 KIDNEY, MASS = Term("64033007", "SCT", "Kidney"), Term("4147007", "SCT", "Mass")
-SIDES: dict[Side, Term] = {
+_SIDES: dict[Side, Term] = {
     "left": Term("7771000", "SCT", "Left"),
     "right": Term("24028007", "SCT", "Right"),
 }
@@ -66,7 +65,7 @@ class Segment:
 
     label: int
     name: str
-    side: Side | None = None
+    side: Side = UNKNOWN
 
     @property
     def is_organ(self) -> bool:
@@ -84,7 +83,7 @@ class Segment:
     @property
     def terminology(self) -> str:
         """As Slicer writes it: category, type and its modifier; region and its modifier."""
-        side = str(SIDES[self.side]) if self.side else "^^"
+        side = str(_SIDES.get(self.side, "^^"))
         where, region = (side, "^^~^^") if self.is_organ else ("^^", f"{KIDNEY}~{side}")
         category, kind = self.terms
         return (
@@ -93,7 +92,7 @@ class Segment:
         )
 
 
-def segments(names: Iterable[str], side: Side | None = None) -> tuple[Segment, ...]:
+def segments(names: Iterable[str], side: Side = UNKNOWN) -> tuple[Segment, ...]:
     """The segments of parts named kidney, tumor_1, ..., labelled 1, 2, ..."""
     return tuple(Segment(label, name, side) for label, name in enumerate(names, ORGAN))
 
@@ -155,6 +154,7 @@ def write_dicom_seg(
     parts: Sequence[Segment],
     folder: Path,
     series: str | None = None,
+    patient: Patient = NOBODY,
 ) -> tuple[str, ...]:
     """Write ``labels`` as a binary segmentation on the slices in ``folder``: viewers overlay it.
 
@@ -162,18 +162,24 @@ def write_dicom_seg(
         parts: as many as there are labels, in their order.
         folder, series: the CT, as for ``read_dicom``. It need not be what the labels were made
             from, but their voxels must coincide (axes may be turned or run the other way).
+        patient: whose labels these are.
 
     Returns:
         Notes on what else was in the folder.
 
     Raises:
-        InputError: no such series; another grid; slices that lack what a segmentation must repeat;
-            highdicom is not installed.
+        InputError: no such series; another patient's; another grid; slices that lack what a
+            segmentation must repeat; highdicom is not installed.
         StorageError: the disk refused.
     """
     import pydicom
 
     found = find_series(folder, series)
+    if patient.differs(found.patient):
+        raise InputError(
+            f"{folder} is of {found.patient}, the labels are of {patient}. Give the CT of that "
+            "patient; if the case has a pseudonym, say whom its CT names: --patient PATIENTID."
+        )
     pixels = _labels_on(found, labels, str(folder))
     slices = [pydicom.dcmread(file, stop_before_pixels=True) for file in found.files]
     dataset = _segmentation(slices, pixels, parts)
@@ -261,8 +267,8 @@ def _description(part: Segment) -> Any:
         anatomic_regions=None if part.is_organ else [Code(*KIDNEY)],
         display_color=hd.color.CIELabColor.from_rgb(*part.rgb),
     )
-    if part.side is not None:
-        side = [hd.sr.CodedConcept(*SIDES[part.side])]
+    if part.side in _SIDES:
+        side = [hd.sr.CodedConcept(*_SIDES[part.side])]
         if part.is_organ:
             what = described.SegmentedPropertyTypeCodeSequence[0]
             what.SegmentedPropertyTypeModifierCodeSequence = side

@@ -10,6 +10,7 @@ from jaxtyping import Float, Int32, UInt8
 
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import spacing_mm
+from tumortrack.core.patient import UNKNOWN, Side
 from tumortrack.core.types import FIRST_TUMOR, ORGAN, LabelVolume
 from tumortrack.imaging import grid
 
@@ -17,6 +18,7 @@ MIN_TUMOR_ML = 0.2
 _GAP_MM = 3.0  # annotators and resampling leave such gaps; a thicker slice counts as one voxel
 _MIN_KIDNEY_ML, _MAX_KIDNEY_ML = 10.0, 2500.0  # a polycystic kidney can pass 2 litres
 _MIDLINE_MARGIN_MM = 20.0
+_KIDNEYS_APART_MM = 60.0  # their middles, from side to side (usually over 100): no torn kidney's
 _MOST_TUMORS = 254
 _MOST_OF_BORDER = 1 / 3  # of the map's outermost voxels; a kidney cut in half covers a quarter
 _MOST_RUGGED = 60.0  # area of all labels' borders over volume^(2/3); a voxelised ball has 7
@@ -68,7 +70,7 @@ def select_labels(
     organ: int = ORGAN,
     tumor: int | None = None,
     min_tumor_ml: float = MIN_TUMOR_ML,
-) -> tuple[LabelVolume, list[str]]:
+) -> tuple[LabelVolume, list[str], Side]:
     """Keep one kidney (label 1) and its tumors (2, 3, ...), cropped with a margin.
 
     A kidney is a connected piece of organ and tumor voxels with at least 10 ml of organ and a
@@ -84,7 +86,8 @@ def select_labels(
         tumor: the tumor's label; None takes every other label from 2 up, 0 takes none.
 
     Returns:
-        The selected labels and notes on what was dropped or renumbered.
+        The selected labels, notes on what was dropped or renumbered, and the kidney's side: as
+        the map shows it, if it has two kidneys; else what was asked for.
 
     Raises:
         InputError: no organ, no such tumor label, two kidneys without tumor and no ``side``, no
@@ -104,7 +107,7 @@ def select_labels(
     pieces, notes, apart = _attach_tumors(pieces, numbers, min_tumor_ml)
     kidneys = _kidneys(pieces, numbers)
     notes += _left_out(pieces, kidneys, apart, min_tumor_ml)
-    chosen, more = _choose_kidney(kidneys, side, float(middle[0]))
+    chosen, more, found_side = _choose_kidney(kidneys, side, float(middle[0]))
     notes += more
     if not _MIN_KIDNEY_ML <= chosen.ml <= _MAX_KIDNEY_ML:
         raise InputError(
@@ -116,7 +119,7 @@ def select_labels(
     own = np.where(kidney, pieces.labels, 0)[box].astype(np.uint8)
     _check_ruggedness(own, affine)
     out, more = _number_tumors(own, tumors, grid.voxel_ml(affine), min_tumor_ml)
-    return grid.cropped(out, grid.moved_origin(affine, box)), notes + more
+    return grid.cropped(out, grid.moved_origin(affine, box)), notes + more, found_side
 
 
 def _check_border(counted: np.ndarray) -> None:
@@ -280,13 +283,13 @@ def _left_out(
 
 def _choose_kidney(
     kidneys: list[_Kidney], side: str | None, middle_x_mm: float
-) -> tuple[_Kidney, list[str]]:
+) -> tuple[_Kidney, list[str], Side]:
     if side not in (None, "left", "right"):
         raise InputError(f"side {side!r} is not understood. Allowed: left, right (the patient's).")
     best = max(kidneys, key=lambda kidney: (kidney.tumor_ml, kidney.ml))
     alone = len(kidneys) == 1
+    xs = [kidney.x_mm for kidney in kidneys]
     if not alone:
-        xs = [kidney.x_mm for kidney in kidneys]
         middle_x_mm = (min(xs) + max(xs)) / 2
     if side is None:
         if not alone and best.tumor_ml == 0:
@@ -294,9 +297,10 @@ def _choose_kidney(
                 f"the label map holds {len(kidneys)} kidneys and no tumor. Give --side left or "
                 "--side right (the patient's)."
             )
-        name = "left" if best.x_mm > middle_x_mm else "right"
+        name: Side = "left" if best.x_mm > middle_x_mm else "right"
         note = f"the patient's {name} kidney was chosen: it bears most tumor"
-        return best, [] if alone else [note]
+        plain = max(xs) - min(xs) > _KIDNEYS_APART_MM
+        return best, [] if alone else [note], name if plain else UNKNOWN
     sign = 1 if side == "left" else -1
     # With one kidney only the image's midline is known: near it, trust the user.
     slack = _MIDLINE_MARGIN_MM if alone else 0.0
@@ -308,7 +312,7 @@ def _choose_kidney(
         )
     best = max(fitting, key=lambda kidney: (kidney.tumor_ml, kidney.ml))
     note = "only one kidney in the map; its side was checked against the image's middle only"
-    return best, [note] if alone else []
+    return best, [note] if alone else [], "left" if side == "left" else "right"
 
 
 def _number_tumors(

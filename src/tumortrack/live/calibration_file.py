@@ -13,6 +13,7 @@ from tumortrack.core.errors import InputError
 from tumortrack.core.store import read_json
 from tumortrack.live.values import PublishedFrame
 
+_LARGEST_MM, _LARGEST_DEG = 100.0, 10.0  # with more, it is no calibration
 _NOT_RIGID = 1e-3  # largest deviation of a rotation from orthonormal: files have few digits
 
 Rows = tuple[tuple[float, float, float, float], ...]
@@ -22,7 +23,9 @@ class CalibrationFile(Config, frozen=True, kw_only=True):
     """A file that says where the camera is, in one of three ways, each by 4 x 4 rows:
     ``camera_from_robot`` or ``robot_from_camera``, of a hand-eye calibration, or
     ``camera_from_marker`` with ``robot_from_marker``: a marker that both know. ``unit``: of the
-    translations. ``frame_id``: the robot's frame, as ROS calls it."""
+    translations. ``frame_id``: the robot's frame, as ROS calls it. ``error_mm`` and ``error_deg``:
+    bounds of the calibration's error, at the camera and of its direction; without ``error_deg`` the
+    first holds at the organ."""
 
     frame_id: str
     unit: Literal["mm", "m"]
@@ -30,6 +33,16 @@ class CalibrationFile(Config, frozen=True, kw_only=True):
     robot_from_camera: Rows | None = None
     camera_from_marker: Rows | None = None
     robot_from_marker: Rows | None = None
+    error_mm: float | None = None
+    error_deg: float = 0.0
+
+    def __post_init__(self) -> None:
+        if self.error_mm is None and self.error_deg:
+            raise InputError("error_deg needs error_mm beside it: that of the translation.")
+        if self.error_mm is not None and not 0 < self.error_mm <= _LARGEST_MM:
+            raise InputError(f"error_mm is {self.error_mm:g}; allowed: over 0 to {_LARGEST_MM:g}.")
+        if not 0 <= self.error_deg <= _LARGEST_DEG:
+            raise InputError(f"error_deg is {self.error_deg:g}; allowed: 0 to {_LARGEST_DEG:g}.")
 
 
 def read_frames(path: Path) -> PublishedFrame:
@@ -57,6 +70,15 @@ def read_frames(path: Path) -> PublishedFrame:
     if not file.frame_id.strip():
         raise InputError(f"{path}: frame_id is empty; give the robot's frame, base_link say.")
     return PublishedFrame(file.frame_id, robot_from_camera)
+
+
+def read_error_mm(path: Path, distance_mm: float) -> float | None:
+    """The error that a calibration file states, so far from the camera; None: it states none.
+    Raises InputError as ``read_frames``."""
+    file = from_builtins(read_json(path), CalibrationFile, str(path))
+    if file.error_mm is None:
+        return None
+    return file.error_mm + distance_mm * float(np.radians(file.error_deg))
 
 
 def _rigid(rows: Rows, unit: str, where: str) -> Float64[np.ndarray, "4 4"]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import threading
 from abc import abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import ClassVar, Protocol, runtime_checkable
@@ -21,6 +21,7 @@ from tumortrack.core.config import Config
 from tumortrack.core.errors import TumortrackError
 from tumortrack.core.estimate import Estimate, Quality
 from tumortrack.core.geometry import transform_points
+from tumortrack.core.patient import NOBODY, Patient
 from tumortrack.core.types import Anatomy, DepthFrame, Mesh, SensorCloud
 
 
@@ -129,6 +130,8 @@ class Workcell:
 
     ``state``: of the procedure: approach, grasp, hold, sweep 1, ... ``halted``: why the arms stand
     still before their end; empty: they do not. ``joints_rad``: angle by the joint's name.
+    ``left_mm``: of the planned margin, once all errors of the moment are taken off; None: unknown.
+    ``cutting``: the instrument is on a cut.
     """
 
     state: str
@@ -136,6 +139,8 @@ class Workcell:
     joints_rad: Mapping[str, float] = field(default_factory=dict)
     shapes: tuple[RigidShape, ...] = ()
     lines: tuple[Polyline, ...] = ()
+    left_mm: float | None = None
+    cutting: bool = False
 
     @property
     def drawn_lines(self) -> list[Polyline]:
@@ -246,13 +251,17 @@ class Controls:
 class SinkContext:
     """What a sink knows when it is opened. ``parts``: the model's, the organ first. ``anatomy_ct``:
     the organ in the CT (LPS, mm), if the model has it: estimates then have a motion, and their
-    meshes its triangles. ``arms``: results may have a workcell."""
+    meshes its triangles. ``arms``: results may have a workcell. ``patient``: whose organ the model
+    is of. ``tip_mm``: where the tool's tip of an arm (cutter, holder) is, by the arm's six joints;
+    published frame."""
 
     parts: tuple[str, ...]
     published_frame: PublishedFrame
     anatomy_ct: Anatomy | None = None
     controls: Controls = field(default_factory=Controls)
     arms: bool = False
+    patient: Patient = NOBODY
+    tip_mm: Callable[[str, Float64[np.ndarray, " 6"]], Float64[np.ndarray, " 3"]] | None = None
 
 
 @runtime_checkable

@@ -8,6 +8,7 @@ from typing import Any
 
 from tumortrack.core import store
 from tumortrack.core.errors import ArtifactError
+from tumortrack.core.patient import Patient, patient_in
 
 KIND = "model"
 SHAPE = "shape.safetensors"
@@ -45,6 +46,11 @@ def read_tensors(
         if 0 not in tensor.shape and not -largest <= tensor.min() <= tensor.max() <= largest:
             raise ArtifactError(f"{path}: {name} holds numbers that are no trained model's.")
     return tensors
+
+
+def patient_of(manifest: dict[str, Any], folder: Path) -> Patient:
+    """Whose organ a model was trained for; InputError where its manifest says nonsense."""
+    return patient_in(manifest.get("provenance", {}).get("patient"), str(folder))
 
 
 def has_shape(manifest: dict[str, Any]) -> bool:

@@ -14,6 +14,7 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor, nn
 
+from tumortrack.core.patient import Patient, patient_in
 from tumortrack.models.config import TrainConfig
 from tumortrack.models.in_distribution import InDistributionRange
 
@@ -54,6 +55,11 @@ class Model(ABC):
     in_distribution: InDistributionRange
     provenance: dict[str, Any] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
+
+    @property
+    def patient(self) -> Patient:
+        """Whose organ it was trained for, as far as it is known."""
+        return patient_in(self.provenance.get("patient"), "provenance")
 
     def extra_files(self) -> dict[str, bytes]:
         """Files of a model folder besides the weights, by name."""

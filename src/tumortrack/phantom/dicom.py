@@ -10,6 +10,7 @@ import numpy as np
 
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import spacing_mm
+from tumortrack.core.patient import UNKNOWN, Side
 from tumortrack.core.store import new_folder
 from tumortrack.core.types import Volume
 
@@ -22,12 +23,17 @@ _DATE, _TIME = "20250101", "120000"  # fixed, so that the same volume gives the 
 
 
 def write_dicom_series(
-    volume: Volume, folder: Path, seed: int = 0, description: str = "Hydrogel kidney phantom"
+    volume: Volume,
+    folder: Path,
+    seed: int = 0,
+    description: str = "Hydrogel kidney phantom",
+    side: Side = UNKNOWN,
 ) -> None:
     """Write a CT Image Storage series, one uncompressed file a slice (the third array axis).
 
     UIDs follow from the volume and the seed. File names are in random order, so that a reader
-    must sort by ImagePositionPatient. Exposure as in the paper (90 kV, 13.6 mA).
+    must sort by ImagePositionPatient. Exposure as in the paper (90 kV, 13.6 mA). ``side``: of the
+    kidney (Laterality).
 
     Raises:
         InputError: ``folder`` exists; HU not finite or outside -1024..64511; sheared voxels.
@@ -49,6 +55,8 @@ def write_dicom_series(
     with new_folder(Path(folder)) as aside:
         for k, name in enumerate(names):
             dataset = _slice(volume, k, entropy, description)
+            if side != UNKNOWN:
+                dataset.Laterality = side[0].upper()
             dcmwrite(aside / f"CT{name:05d}.dcm", dataset, enforce_file_format=True)
 
 

@@ -19,8 +19,10 @@ from tumortrack.core import store
 from tumortrack.core.config import from_builtins, to_builtins
 from tumortrack.core.errors import ArtifactError, InputError, NoPlan
 from tumortrack.core.mesh_files import read_mesh, write_mesh
+from tumortrack.core.patient import NOBODY, Patient, patient_in
 from tumortrack.core.types import Mesh
 from tumortrack.plan.arms.config import CellConfig
+from tumortrack.plan.budget import ErrorBudget
 from tumortrack.plan.motions import JOINTS, Motions, MotionStage
 from tumortrack.plan.values import Located, ResectionConfig, ResectionPlan
 from tumortrack.sense.ply import cloud_ply
@@ -38,7 +40,8 @@ class PlanFolder:
     """What a plan's folder holds. ``cell``: the workcell's configuration that the motions are for,
     as JSON; motions and cell are None where no arms were planned. ``case_sha256``: of the case that
     the organ was located by; empty where unknown. ``frame_source``, ``cell_source``: the sha256 of
-    the user's file that gave the frame, and the places of the arms; or ``INVENTED``."""
+    the user's file that gave the frame, and the places of the arms; or ``INVENTED``. ``patient``:
+    whose organ, as far as it is known. ``budget``: None in plans of older versions."""
 
     plan: ResectionPlan
     config: ResectionConfig
@@ -50,6 +53,8 @@ class PlanFolder:
     case_sha256: str = ""
     frame_source: str = INVENTED
     cell_source: str = INVENTED
+    patient: Patient = NOBODY
+    budget: ErrorBudget | None = None
 
 
 def write_plan(
@@ -77,9 +82,11 @@ def write_plan(
         "table_from_camera": content.table_from_camera.tolist(),
         "config": to_builtins(content.config),
         "case_sha256": content.case_sha256,
+        "patient": to_builtins(content.patient),
         "frame_source": content.frame_source,
         "cell_source": content.cell_source,
         "plan": as_builtins(plan),
+        "budget": content.budget and to_builtins(content.budget),
         "cell": content.cell,
         "seconds": motions and motions.seconds,
     }
@@ -97,7 +104,8 @@ def write_plan(
 def as_located(content: PlanFolder) -> Located:
     """What the plan was made on, without its cloud: for pictures."""
     points, labels = np.zeros((0, 3)), np.zeros(0, np.uint8)
-    return Located(points, labels, content.meshes, stamp_ns=content.plan.stamp_ns)
+    stamp_ns, patient = content.plan.stamp_ns, content.patient
+    return Located(points, labels, content.meshes, stamp_ns=stamp_ns, patient=patient)
 
 
 def read_plan(folder: Path) -> PlanFolder:
@@ -117,9 +125,10 @@ def read_plan(folder: Path) -> PlanFolder:
             cell = from_builtins(data["cell"], CellConfig, str(folder / _NAME))
             for fault in _faults(motions, cell, plan.sweeps):
                 raise ArtifactError(f"{path} can't be carried out: {fault}. Plan again.")
+        budget, where = data.get("budget"), str(folder / _NAME)
         return PlanFolder(
             plan=plan,
-            config=from_builtins(data["config"], ResectionConfig, str(folder / _NAME)),
+            config=from_builtins(data["config"], ResectionConfig, where),
             table_from_camera=np.array(data["table_from_camera"], float),
             frame_id=str(data["frame_id"]),
             meshes=meshes,
@@ -128,6 +137,8 @@ def read_plan(folder: Path) -> PlanFolder:
             case_sha256=str(data["case_sha256"] or ""),
             frame_source=str(data.get("frame_source", INVENTED)),
             cell_source=str(data.get("cell_source", INVENTED)),
+            patient=patient_in(data.get("patient"), where),
+            budget=None if budget is None else from_builtins(budget, ErrorBudget, where),
         )
     except ArtifactError:
         raise

@@ -14,6 +14,7 @@ from tumortrack.core.errors import ArtifactError, InputError
 from tumortrack.core.estimate import Motion
 from tumortrack.core.geometry import rigid, transform_points
 from tumortrack.core.mesh_files import read_mesh
+from tumortrack.core.patient import NOBODY, Patient, patient_in
 from tumortrack.core.store import read_json, read_manifest
 from tumortrack.core.types import Mesh, OccupancyCloud
 from tumortrack.plan.values import Located, name_of
@@ -33,6 +34,14 @@ def table_below(points_mm: Float[np.ndarray, "n 3"], stand_mm: float) -> Float64
     low, high = points_mm.min(0), points_mm.max(0)
     x, y, _ = (low + high) / 2
     return rigid(np.diag([1.0, -1.0, -1.0]), np.array([-x, y, high[2] + stand_mm]))
+
+
+def table_under(
+    cloud: OccupancyCloud, meshes: Mapping[str, Mesh], stand_mm: float
+) -> Float64[np.ndarray, "4 4"]:
+    """``table_below`` the organ's surface or, without one, its points."""
+    kidney = meshes.get("kidney")
+    return table_below(cloud.points_mm if kidney is None else kidney.vertices_mm, stand_mm)
 
 
 def located(
@@ -61,10 +70,12 @@ class LocatedRun:
     meshes: dict[str, Mesh]
     std_mm: Float64[np.ndarray, " n"] | None
     doubt: str = ""  # why it is poor; empty: it is good
+    patient: Patient = NOBODY
 
     def located(self, table_from_camera: Float[np.ndarray, "4 4"]) -> Located:
         """In the table's frame; a surface's uncertainty is that of the nearest points."""
         found = located(self.cloud, self.meshes, None, table_from_camera)
+        found = replace(found, patient=self.patient)
         if self.std_mm is None:
             return found
         nearest = cKDTree(found.points_mm)
@@ -106,6 +117,10 @@ def read_run(folder: Path) -> LocatedRun:
     if not isinstance(quality, dict):
         quality = {"reason": "an older version located it, which did not judge"}
     doubt = "" if quality.get("verdict") == "good" else str(quality.get("reason") or "unknown")
+    try:
+        patient = patient_in(report.get("patient"), str(folder / "report.json"))
+    except InputError as error:
+        raise ArtifactError(f"{error} Locate again.") from error
     stamp_ns = report.get("stamp_ns", 0)
     stamp_ns = stamp_ns if isinstance(stamp_ns, int) else 0
     cloud = OccupancyCloud(table[:, :3], table[:, 3], table[:, 4], stamp_ns)
@@ -121,4 +136,4 @@ def read_run(folder: Path) -> LocatedRun:
         std_mm = parse_ply_properties(content, str(path), ("std_mm",))[:, 0]
     except InputError:  # a method without uncertainty
         std_mm = None
-    return LocatedRun(cloud, meshes, std_mm, doubt)
+    return LocatedRun(cloud, meshes, std_mm, doubt, patient)

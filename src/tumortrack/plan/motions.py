@@ -20,6 +20,7 @@ JOINTS = tuple(f"{arm}_{joint}" for arm in ARMS for joint in UR_JOINTS)
 DONE, ABORTED = "done", "aborted"
 _BRAKE_RAD_S2 = 4.0  # of the fastest joint, where arms are halted in the middle of a motion
 _SHORTEST_BRAKE_S = 0.1
+_COME_UP_S = 0.3  # three times what servoing looks ahead; the way in to a cut takes longer
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,6 +113,14 @@ class Execution:
         """The holder has been at the grasp point: the state is hold or later."""
         names = [stage.name for stage in self._motions.stages]
         return "hold" not in names or self._number >= names.index("hold")
+
+    @property
+    def cutting(self) -> bool:
+        """The instrument is on a cut, and has been for so long that an arm has come up with it."""
+        times_s, since_s = self._stage.times_s, self._time_s - _COME_UP_S
+        first = int(np.searchsorted(times_s, since_s, side="right")) - 1
+        last = int(np.searchsorted(times_s, self._time_s, side="left"))
+        return first >= 0 and not self._over and bool(self._stage.cutting[first : last + 1].all())
 
     @property
     def joints_rad(self) -> Joints:

@@ -10,9 +10,11 @@ from collections import Counter
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float64
 from scipy.spatial import cKDTree
 
 from tumortrack.core.colours import Colour
@@ -20,6 +22,8 @@ from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError, TumortrackError
 from tumortrack.core.types import Mesh
 from tumortrack.live.values import Polyline, RigidShape, TrackingResult, Workcell
+from tumortrack.plan.budget import MOVED_MM, kept_mm
+from tumortrack.plan.live_budget import LiveBudget
 from tumortrack.plan.motions import ABORTED, JOINTS, Execution, Joints, Motions
 from tumortrack.plan.values import Located, ResectionPlan
 
@@ -46,7 +50,7 @@ class OperationConfig(Config, frozen=True, kw_only=True):
         speed: of the arms' time.
     """
 
-    moved_mm: float = 2.0
+    moved_mm: float = MOVED_MM
     settled_mm: float = 0.7
     settled_s: float = 0.5
     replan_cut: bool = False
@@ -55,7 +59,7 @@ class OperationConfig(Config, frozen=True, kw_only=True):
     def __post_init__(self) -> None:
         for name in ("moved_mm", "settled_mm", "settled_s"):
             if not 0 < getattr(self, name) <= 100:
-                raise InputError(f"{name} is {getattr(self, name):g}; allowed: 0 to 100.")
+                raise InputError(f"{name} is {getattr(self, name):g}; allowed: over 0 to 100.")
         if not 0 < self.speed <= 20:
             raise InputError(f"speed is {self.speed:g}; allowed: more than 0, up to 20.")
 
@@ -67,6 +71,11 @@ class Planned:
     plan: ResectionPlan
     meshes: Mapping[str, Mesh]
     motions: Motions
+
+    @cached_property
+    def kept_mm(self) -> float:
+        """The least distance between the cut and the tumor's surface: the margin as planned."""
+        return kept_mm(self.plan.layers, self.meshes[self.plan.tumor].vertices_mm)
 
 
 @dataclass(frozen=True)
@@ -108,6 +117,7 @@ class Operation:
         locate: an update's estimate in the table's frame; None: a stored plan is carried out
             without regard to estimates.
         replan: begins a new plan in another process, so that the loop goes on meanwhile.
+        budget: adds up the errors of every update; None: they are not looked at.
 
     Attributes:
         planned: what is carried out now.
@@ -122,9 +132,11 @@ class Operation:
         draw: Draw,
         locate: Locate | None = None,
         replan: Replan | None = None,
+        budget: LiveBudget | None = None,
     ) -> None:
         self.planned, self._config = planned, config
         self._draw, self._locate, self._replan = draw, locate, replan
+        self._budget = budget
         self._execution = Execution(planned.motions)
         self._last_s: float | None = None
         self._first_s = 0.0
@@ -181,7 +193,10 @@ class Operation:
         named = dict(zip(JOINTS, joints.tolist(), strict=True))
         shapes = (*self.still_life, *self._draw(joints))
         state = f"{execution.state} ({self._note})" if self._note else execution.state
-        return Workcell(state, execution.halted, named, shapes, tuple(lines))
+        now = None if self._budget is None else self._budget.now
+        left_mm = None if now is None else now.left_mm
+        cutting = execution.cutting
+        return Workcell(state, execution.halted, named, shapes, tuple(lines), left_mm, cutting)
 
     @property
     def _note(self) -> str:
@@ -196,6 +211,7 @@ class Operation:
             "halted": self._execution.halted,
             "halts": dict(self.halts.most_common()),
             "log": self.log,
+            **({} if self._budget is None else {"budget": self._budget.summary()}),
         }
 
     def _advance(self, now_s: float) -> None:
@@ -213,6 +229,8 @@ class Operation:
     def _decide(self, update: TrackingResult, now_s: float) -> None:
         """Go on, or halt and why."""
         execution = self._execution
+        if self._budget is not None:
+            self._budget.forget()
         if self._work is not None:
             self._take_work(self._work, now_s)
         over = execution.ended or execution.state == ABORTED
@@ -240,17 +258,17 @@ class Operation:
             if part not in located.meshes:
                 self._halt_in_doubt(f"{part} was not found")
                 return
-        tumor, far = located.meshes[name], []
-        for part in self.planned.meshes:
-            off_mm = apart_mm(located.meshes[part], self.planned.meshes[part])
-            if off_mm > config.moved_mm * (1.0 if part == name else _OTHERS):
-                far.append((part == name, off_mm, part))
-        if not far:
+        tumor = located.meshes[name]
+        reason, plan_anew = self._objection(update, located)
+        if not reason:
             self._settled = None
             execution.go()
+            if self._budget is not None:
+                self._budget.went_on()
             return
-        _, off_mm, part = max(far)  # the tumor, or else what moved farthest
-        reason = f"{part} has moved by {off_mm:.1f} mm"
+        if not plan_anew:
+            self._halt_in_doubt(reason)
+            return
         if self._cut and not config.replan_cut:
             execution.halt(f"{reason} ({CUT_NOTE}; --replan-cut plans on them anyway)")
             return
@@ -261,6 +279,22 @@ class Operation:
             self._settled = None
             if self._replan is not None:
                 self._work = self._replan(update, execution.joints_rad, self.progress)
+
+    def _objection(self, update: TrackingResult, located: Located) -> tuple[str, bool]:
+        """Why the arms must stand, empty if they need not, and whether a new plan would help."""
+        name, far, over = self.planned.plan.tumor, [], ("", False)
+        for part, mesh in self.planned.meshes.items():
+            off_mm = apart_mm(located.meshes[part], mesh)
+            if off_mm > self._config.moved_mm * (1.0 if part == name else _OTHERS):
+                far.append((part == name, off_mm, part))
+        if self._budget is not None:
+            tumor, kept = located.meshes[name], self.planned.kept_mm
+            motion_mm = float(_distances_mm(tumor, self.planned.meshes[name]).max())
+            over = self._budget.add_up(update, name, tumor, motion_mm, kept)
+        if far:
+            _, off_mm, part = max(far)  # the tumor, or else what moved farthest
+            return f"{part} has moved by {off_mm:.1f} mm", True
+        return over
 
     def _take_work(self, work: Future[Planned], now_s: float) -> None:
         """The new plan, if it is ready; where there is none, stop for good."""
@@ -290,9 +324,12 @@ class Operation:
 def apart_mm(a: Mesh, b: Mesh) -> float:
     """How far a surface has moved, root mean square: of its vertices where both have the same
     triangles, else between the surfaces, for which sliding along itself is no motion."""
+    return float(np.sqrt((_distances_mm(a, b) ** 2).mean()))
+
+
+def _distances_mm(a: Mesh, b: Mesh) -> Float64[np.ndarray, " n"]:
     if np.array_equal(a.faces, b.faces):
-        off = a.vertices_mm - b.vertices_mm
-        return float(np.sqrt((off**2).sum(axis=1).mean()))
+        return np.sqrt(((a.vertices_mm - b.vertices_mm) ** 2).sum(axis=1))
     pairs = (a.vertices_mm, b.vertices_mm), (b.vertices_mm, a.vertices_mm)
     apart = [cKDTree(to).query(of[:: max(1, len(of) // _COMPARED)])[0] for of, to in pairs]
-    return float(np.sqrt((np.concatenate(apart) ** 2).mean()))
+    return np.concatenate(apart)

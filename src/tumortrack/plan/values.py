@@ -14,6 +14,7 @@ from jaxtyping import Float, Float64, UInt8
 
 from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError
+from tumortrack.core.patient import NOBODY, Patient
 from tumortrack.core.types import FIRST_TUMOR, Mesh, part_names
 
 Method = Literal["published", "margin"]
@@ -96,6 +97,7 @@ class Located:
     meshes: dict[str, Mesh] = field(default_factory=dict)
     std_mm: dict[str, Float64[np.ndarray, " v"]] = field(default_factory=dict)
     stamp_ns: int = 0
+    patient: Patient = NOBODY
 
     def of(self, label: int) -> Float[np.ndarray, "m 3"]:
         return self.points_mm[self.labels == label]

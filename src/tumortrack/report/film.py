@@ -134,6 +134,7 @@ class _FramePainter:
         font = f"{matplotlib.get_data_path()}/fonts/ttf/DejaVuSans.ttf"
         self._letters = [ImageFont.truetype(font, size[1] // share) for share in (20, 34)]
         self._tubes: dict[tuple[int, float], tuple[Polyline, Mesh]] = {}
+        self._whose = str(located.patient)
 
     def picture(self, n: int) -> Image.Image:
         """Frame n, in full colour."""
@@ -150,6 +151,7 @@ class _FramePainter:
         draw.text((12, 10), cell.state, fill=BACKGROUND, font=large)
         if cell.halted:
             draw.text((12, 18 + large.size), f"halted: {cell.halted}", fill=NONE, font=small)
+        draw.text((12, self._size[1] - 20 - small.size), self._whose, fill=BACKGROUND, font=small)
         self._draw_progress(draw, n)
         return out
 

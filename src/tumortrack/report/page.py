@@ -15,6 +15,7 @@ from jaxtyping import Float
 from PIL import Image
 
 from tumortrack.core.estimate import Estimate
+from tumortrack.core.patient import patient_in
 from tumortrack.core.store import write_atomically
 from tumortrack.core.types import Mesh
 from tumortrack.simulate.scene_folder import Scene
@@ -64,7 +65,8 @@ def write_page(report: dict[str, Any], scenes: list[dict[str, Any]], path: Path)
     # The texts that are long or hold braces go in by position, never through a formatter.
     page = resources.files("tumortrack.report").joinpath("page.html").read_text("utf-8")
     page = page.replace("@SUMMARY@", _table(part_rows(report["summary"])))
-    page = page.replace("@COUNTS@", html.escape(_counts(report["summary"])))
+    whose = f"{patient_in(report.get('patient'), 'report')}. "
+    page = page.replace("@COUNTS@", html.escape(whose + _counts(report["summary"])))
     page = page.replace("@RULE@", html.escape(report["rule"]))
     head, script = page.split("@PLOTLY@")
     middle, tail = script.split("@DATA@")

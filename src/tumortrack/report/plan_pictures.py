@@ -18,6 +18,7 @@ from scipy.ndimage import gaussian_filter
 
 from tumortrack.core.colours import part_colour, sweep_colour
 from tumortrack.core.errors import InputError
+from tumortrack.core.patient import Patient
 from tumortrack.core.types import ORGAN, Mesh, part_names
 from tumortrack.imaging.meshes import mesh_of, solid_of
 from tumortrack.plan.values import Cut, CutLayer, Located, ResectionPlan
@@ -90,7 +91,7 @@ def plan_figure(plan: ResectionPlan, located: Located) -> Figure:
                 axes.text(u, v, f"tumor {label - ORGAN}", zorder=3, **CENTRED)
         drawing.finish_view(axes, frame, _ARROWS[view])
         axes.set_title(view.name, fontsize=11)
-    _words(figure, plan)
+    _words(figure, plan, located.patient)
     return figure
 
 
@@ -181,12 +182,14 @@ def _draw_grasp(axes: Axes, plan: ResectionPlan, view: ParallelView) -> None:
     axes.annotate("", (u, v - 4.0), (u, v - _APPROACH_MM), arrowprops=arrow, zorder=9)
 
 
-def _words(figure: Figure, plan: ResectionPlan) -> None:
+def _words(figure: Figure, plan: ResectionPlan, patient: Patient) -> None:
     """Title, what comes away, and the legend."""
     ml, tumor = plan.volumes_ml, plan.tumor.replace("_", " ")
     sweeps = f"{plan.sweeps} sweep" + ("s" if plan.sweeps > 1 else "")
-    title = f"Resection of {tumor}: {_METHODS[plan.method]}, {sweeps}"
-    figure.suptitle(title, x=0.014, y=0.975, ha="left", fontsize=13, fontweight="bold")
+    title = f"Resection of {tumor}, {patient}: {_METHODS[plan.method]}, {sweeps}"
+    figure.suptitle(
+        title, x=0.014, y=0.975, ha="left", fontsize=13, fontweight="bold", parse_math=False
+    )
     share = ml["healthy"] / ml["parenchyma"]
     line = (
         f"{ml['piece']:.1f} ml come away: {ml['tumor']:.1f} ml tumor and {ml['healthy']:.1f} ml "

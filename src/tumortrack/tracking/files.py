@@ -36,7 +36,7 @@ def write_estimate(
         write_cloud_ply(aside / "occupancy.ply", cloud.points_mm, **values)
         labels, way = volume.labels, volume.camera_from_index
         write_nifti(aside / "labels.nii.gz", labels, way, lps=False)
-        parts = segments(estimate.report["parts"])
+        parts = segments(estimate.report["parts"], estimate.patient.side)
         write_seg_nrrd(aside / "labels.seg.nrrd", labels, way, parts)
         for name, mesh in estimate.meshes.items():
             write_mesh(aside / f"{name}.ply", mesh)

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float64
 
-from tumortrack.core.config import Config
+from tumortrack.core.config import Config, to_builtins
 from tumortrack.core.errors import InputError
 from tumortrack.core.estimate import Estimate, Following
 from tumortrack.core.process import keep_small_blocks
@@ -40,7 +41,7 @@ class Tracker:
 
     def __init__(self, model: Model) -> None:
         keep_small_blocks()
-        self.model = model
+        self.model, self._patient = model, model.patient
         self._locator = _LOCATORS[type(model)](model)
 
     @property
@@ -88,7 +89,8 @@ class Tracker:
 
     def _judged(self, estimate: Estimate, seen: DepthFrame | SensorCloud) -> Estimate:
         start = time.perf_counter()
-        estimate = judged(estimate, seen)
+        estimate = replace(judged(estimate, seen), patient=self._patient)
+        estimate.report["patient"] = to_builtins(self._patient)
         seconds = estimate.report["timings"]
         seconds["judge"] = time.perf_counter() - start
         seconds["total"] += seconds["judge"]

@@ -63,7 +63,7 @@ def load_model(folder: Path, device: str = "auto") -> Model:
         kind = model_class(config.network)
         network = _filled(kind, config.network, read_tensors(folder / WEIGHTS, load))
         known = from_builtins(manifest["familiar"], InDistributionRange, f"{folder}: familiar")
-        return kind.from_folder(
+        model = kind.from_folder(
             folder,
             manifest,
             network=network.eval().requires_grad_(False).to(where),
@@ -73,6 +73,8 @@ def load_model(folder: Path, device: str = "auto") -> Model:
             in_distribution=known,
             provenance=dict(manifest["provenance"]),
         )
+        model.patient  # noqa: B018 - nonsense is told here
+        return model
     except ArtifactError:
         raise
     except InputError as error:

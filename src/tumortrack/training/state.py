@@ -21,8 +21,9 @@ from safetensors.torch import save
 from torch import Tensor
 
 from tumortrack.core import store
-from tumortrack.core.config import identity
+from tumortrack.core.config import identity, to_builtins
 from tumortrack.core.errors import ArtifactError, InputError, TumortrackError
+from tumortrack.core.patient import NOBODY, Patient
 from tumortrack.core.types import Anatomy
 from tumortrack.models.config import TrainConfig
 from tumortrack.models.hardware import has_fast_bfloat16
@@ -51,6 +52,7 @@ class TrainingRun:
     checkpoint_every_s: float = 30.0
     start: PretrainedWeights | None = None  # of a registration network
     scenes: Literal["auto", "workers", "device"] = "auto"  # who makes them; see ``training.scenes``
+    patient: Patient = NOBODY  # whose organ it is
 
     def __post_init__(self) -> None:
         _check(self, seed=0, steps=1, workers=0)
@@ -134,6 +136,7 @@ def provenance(
         "run_sha256": run.identity,
         "case_sha256": run.case_sha256,
         "up_lps": list(run.up_lps),
+        "patient": to_builtins(run.patient),
     }
     return about if run.start is None else {**about, "start_sha256": run.start.sha256}
 

@@ -25,6 +25,7 @@ from tumortrack.core import store
 from tumortrack.core.config import to_builtins
 from tumortrack.core.errors import InputError
 from tumortrack.core.estimate import Estimate, OneWay
+from tumortrack.core.patient import Patient
 from tumortrack.core.types import Anatomy
 from tumortrack.imaging.case import Case, load_case, save_case
 from tumortrack.imaging.surface import surfaces
@@ -83,7 +84,8 @@ def phantom_case(folder: Path, parameters: PhantomParameters) -> Path:
     """Write a phantom's case folder; one that is there stays."""
     if not folder.exists():
         labels = phantom_labels(parameters, _VOXEL_MM)
-        case = Case(surfaces(labels)[0], labels, _UP_LPS, {"kind": "phantom"})
+        patient = Patient("PHANTOM", parameters.side)
+        case = Case(surfaces(labels)[0], labels, _UP_LPS, {"kind": "phantom"}, patient=patient)
         with store.new_folder(folder) as aside:
             save_case(case, aside)
     return folder
@@ -325,6 +327,7 @@ class Trainer:
             anatomy_ct=case.anatomy_ct,
             up_lps=case.up_lps,
             case_sha256=store.sha256_of(case.folder / store.MANIFEST),
+            patient=load_case(case.folder).patient,
             config=train_config(trained, case, self.presets),
             seed=seed,
             steps=steps,

@@ -96,7 +96,7 @@ class Link:
             await asyncio.sleep(0)
 
     async def _accept(self) -> None:
-        server = await asyncio.start_server(self._serve, sock=self._listener)
+        server = await asyncio.start_server(self._serve, sock=self._listener, backlog=1024)
         await server.serve_forever()
 
     async def _visit(self, host: str) -> None:

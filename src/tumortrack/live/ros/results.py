@@ -13,6 +13,7 @@ from jaxtyping import Float32
 
 from tumortrack.core.colours import GOOD, NONE, POOR, Colour, label_colours, part_colour
 from tumortrack.core.geometry import transform_points
+from tumortrack.core.patient import Patient
 from tumortrack.core.types import Mesh, SensorCloud
 from tumortrack.live.display import MOST_SEEN, seen_points, thinned, wxyz_of
 from tumortrack.live.meter import Rate
@@ -84,7 +85,8 @@ class ResultMessages:
             metres = np.full(3, np.nan) if center_mm is None else center_mm / MM_PER_M
             send(f"{name}/center", PLACE, header=header, point=xyz(metres))
         arms = [_arms_status(result)] if self._context.arms else []
-        send("diagnostics", DIAGNOSTICS, header=header, status=[_estimate_status(result), *arms])
+        status = [_estimate_status(result, self._context.patient), *arms]
+        send("diagnostics", DIAGNOSTICS, header=header, status=status)
         if not self._context.arms:
             return out
         joints = {} if result.workcell is None else result.workcell.joints_rad
@@ -153,8 +155,10 @@ class ResultMessages:
         return points_mm
 
 
-def _estimate_status(result: TrackingResult) -> dict[str, Any]:
+def _estimate_status(result: TrackingResult, patient: Patient) -> dict[str, Any]:
     values: dict[str, Any] = {
+        "patient": patient.id,
+        "side": patient.side,
         "quality": result.quality,
         "sequence": result.sequence,
         "stamp_ns": result.stamp_ns,

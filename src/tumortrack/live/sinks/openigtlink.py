@@ -106,6 +106,7 @@ class OpenIgtLinkSink:
 
     def _send(self, result: TrackingResult, code: int) -> None:
         about = {"frame_id": result.published_frame.frame_id, "sequence": str(result.sequence)}
+        about |= {"patient": self._context.patient.id, "side": self._context.patient.side}
         contents = chain(
             self._statuses(result, code), self._transforms(result), self._surfaces(result)
         )

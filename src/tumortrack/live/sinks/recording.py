@@ -16,6 +16,7 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 
 import tumortrack
+from tumortrack.core.config import to_builtins
 from tumortrack.core.errors import InputError, StorageError
 from tumortrack.core.store import read_json, write_json
 from tumortrack.live.display import wxyz_of
@@ -72,6 +73,7 @@ class RecordingSinkConfig(SinkConfig, frozen=True, kw_only=True, tag="recording"
         about = {
             "kind": _KIND,
             "tumortrack": tumortrack.__version__,
+            "patient": to_builtins(context.patient),
             "format": self.format,
             "parts": list(context.parts),
             "frame_id": frame.frame_id,

@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from tumortrack.core.errors import InputError, TumortrackError
-from tumortrack.live.values import Controls, SinkConfig, SinkContext, TrackingResult
+from tumortrack.live.values import SinkConfig, SinkContext, TrackingResult
 
 UR_JOINTS = (
     *("shoulder_pan_joint", "shoulder_lift_joint", "elbow_joint"),
@@ -25,6 +25,9 @@ UR_JOINTS = (
 )
 _WATCHDOG_S = SILENT_S = 0.2  # of silence: the controller stops the arm by itself, and the sink
 OFF_DEG = 2.0  # between the arm and the plan, before it may move
+# Between the tool's tip and its target on a cut: at 10 mm/s servoing is 1.3 mm late. The joints'
+# tolerance would be 40 mm there.
+OFF_MM = 2.0
 _STOP_M_S2 = 10.0  # servoStop's deceleration: ur_rtde's own
 # Of UR5, UR5e, UR10 and UR10e (data sheets): a turn either way; the larger ones' first two joints
 # are the slower ones, and their limits hold for all here.
@@ -86,7 +89,9 @@ class UrSinkConfig(SinkConfig, frozen=True, kw_only=True, tag="ur"):
         InputError: no arms in this run; with ``execute``: as ``UrLink``."""
         if not context.arms:
             raise InputError("ur: nothing here moves an arm; it is for `tumortrack resect`.")
-        return UrSink(self, UrLink(self.host) if self.execute else None, context.controls)
+        if self.execute and context.tip_mm is None:
+            raise InputError("ur: nothing says where the arm's tool is; use `tumortrack resect`.")
+        return UrSink(self, UrLink(self.host) if self.execute else None, context)
 
 
 class UrSink:
@@ -96,12 +101,15 @@ class UrSink:
     under no safety stop, meets no force, and is where the targets have led it; if not, all arms
     stop for good.
 
-    Whenever it stood still, it begins only where the arm is within 2 degrees of the target. Should
+    Whenever it stood still, it begins only where the arm is within 2 degrees of the target. On a
+    cut, where 2 degrees are centimetres, the tool's tip must be within 2 mm of its target. Should
     this process die, the arm's controller stops it within 0.2 s by itself (setWatchdog).
     """
 
-    def __init__(self, config: UrSinkConfig, link: UrLink | None, controls: Controls) -> None:
-        self._config, self._link, self._controls = config, link, controls
+    def __init__(self, config: UrSinkConfig, link: UrLink | None, context: SinkContext) -> None:
+        self._config, self._link = config, link
+        self._controls, self._tip_mm = context.controls, context.tip_mm
+        self._cutting = False
         self._names = tuple(f"{config.arm}_{joint}" for joint in UR_JOINTS)
         # The last target, when it was sent, its stamp, and how far each joint may be behind it.
         self._last: tuple[Joints, float, int, Joints] | None = None
@@ -135,6 +143,7 @@ class UrSink:
                     self._stop()
                 else:
                     self._heed_silence()
+                    self._cutting = cell.cutting
                     self._go(_target(cell.joints_rad, self._names), result.stamp_ns)
             except TumortrackError as error:
                 self._counts["refused"] += 1
@@ -190,7 +199,15 @@ class UrSink:
         at the last target or, before the first one, at this."""
         link.check(self._config.force_n)
         at, lag_rad = (target, np.zeros(6)) if self._last is None else self._last[::3]
-        link.compare(at, np.radians(OFF_DEG) + lag_rad)
+        joints_rad = link.compare(at, np.radians(OFF_DEG) + lag_rad)
+        if self._cutting and self._tip_mm is not None:
+            ways_mm = (self._tip_mm(self._config.arm, joints) for joints in (joints_rad, at))
+            off_mm = float(np.linalg.norm(np.subtract(*ways_mm)))
+            if not off_mm <= OFF_MM:
+                raise TumortrackError(
+                    f"the tool's tip is {off_mm:.1f} mm from where it should cut; allowed: "
+                    f"{OFF_MM:g}"
+                )
 
     def _stop(self) -> None:
         moving, self._last = self._last is not None, None
@@ -308,9 +325,10 @@ class UrLink:
         if not force <= force_n:
             raise TumortrackError(f"the tool meets {force:.0f} N; allowed: {force_n:g}")
 
-    def compare(self, target: Joints, allowed_rad: Joints) -> None:
-        """Raises TumortrackError where the arm is not where the plan has it."""
-        off_rad = np.abs(np.array(self._receive.getActualQ()) - target)
+    def compare(self, target: Joints, allowed_rad: Joints) -> Joints:
+        """Where the arm is. Raises TumortrackError where that is not where the plan has it."""
+        joints_rad = np.array(self._receive.getActualQ(), float)
+        off_rad = np.abs(joints_rad - target)
         if not (off_rad <= allowed_rad).all():
             joint = int((off_rad - allowed_rad).argmax())
             off_deg, allowed_deg = np.degrees([off_rad[joint], allowed_rad[joint]])
@@ -318,6 +336,7 @@ class UrLink:
                 f"{UR_JOINTS[joint]} is {off_deg:.1f} degrees from the plan; allowed: "
                 f"{allowed_deg:.2g}. Move the arm there first"
             )
+        return joints_rad
 
     def servo(self, target: Joints, follow_s: float, lookahead_s: float, gain: float) -> None:
         if not self._control.servoJ(target.tolist(), 0.0, 0.0, follow_s, lookahead_s, gain):

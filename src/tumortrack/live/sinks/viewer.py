@@ -99,7 +99,8 @@ class ViewerSink:
         self._state: State = "waiting"
         self._behind: tuple[State, bool] | None = None
         self._scene = ViewerScene(self._server, context, config.margin_mm)
-        self._panel = Panel(self._server, context.parts, self._ct is not None, context.arms)
+        whose, slices = str(context.patient), self._ct is not None
+        self._panel = Panel(self._server, context.parts, slices, context.arms, whose)
         self._connect()
         self._say("waiting")
         self._closing = threading.Event()

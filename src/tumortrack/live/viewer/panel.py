@@ -15,6 +15,7 @@ from jaxtyping import UInt8
 
 from tumortrack.core import colours
 from tumortrack.core.colours import Colour, css, part_colour
+from tumortrack.core.patient import NOBODY
 from tumortrack.live.values import TrackingResult, Workcell
 from tumortrack.live.viewer.look import View
 from tumortrack.live.viewer.scene import DisplayOptions
@@ -88,7 +89,8 @@ class StatusPanel:
             return _box("ARMS: nothing is known of them", colours.STALE)
         colour = colours.NONE if cell.halted else colours.ARMS
         text = f"{cell.state}: HALTED" if cell.halted else cell.state
-        box = _box(f"ARMS: {text}", colour, cell.halted)
+        left = "" if cell.left_mm is None else f"{cell.left_mm:.1f} mm of the margin are left"
+        box = _box(f"ARMS: {text}", colour, cell.halted or left)
         return _over("bottom", 20, colour, text, cell.halted) + box
 
     def _reason(self) -> str:
@@ -176,15 +178,21 @@ def _parts(parts: Mapping[str, dict[str, Any]]) -> str:
 
 class Panel:
     """The elements, shared by all clients; whoever made it says what they do. ``slices``: with the
-    CT; ``arms``: with what they do."""
+    CT; ``arms``: with what they do; ``whose``: organ it is, in words."""
 
     def __init__(
-        self, server: ViserServer, parts: tuple[str, ...], slices: bool = False, arms: bool = False
+        self,
+        server: ViserServer,
+        parts: tuple[str, ...],
+        slices: bool = False,
+        arms: bool = False,
+        whose: str = str(NOBODY),
     ) -> None:
         gui = server.gui
         gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
         gui.main_panel.dock_right()
         gui.main_panel.set_width(_WIDTH)
+        self.whose = gui.add_html(f"<div style='padding:4px 12px'><b>{escape(whose)}</b></div>")
         self.flag = gui.add_html("")  # of one height: what is to be clicked must not jump
         self.pick = gui.add_button(
             CLICK, hint="Of several things before the camera, choose the one that is the organ"

@@ -145,6 +145,11 @@ def load_ct(case: str, context: SinkContext) -> CarriedCt:
             "viewer: case= shows the CT at the present position, which this model cannot: its "
             "estimates have no motion. Leave it out, or train with a preset that warps."
         )
+    if context.patient.differs(loaded.patient):
+        raise InputError(
+            f"viewer: {case} is of {loaded.patient}, the model of {context.patient}. Give the case "
+            "that the model was trained on."
+        )
     apart = np.abs(loaded.anatomy.organ.box_mm - context.anatomy_ct.organ.box_mm).max()
     if apart > _SAME_ORGAN_MM:
         raise InputError(

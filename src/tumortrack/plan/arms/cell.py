@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import product
@@ -139,6 +139,21 @@ class ArmCell:
             return self.config.organ_clearance_mm
         tools = pair[0] == TOUCHES[CUTTER] and pair[1].removeprefix("holder/") in TOOLS[HOLDER]
         return self.config.contact_mm if tools and len(touching) == 2 else self.config.clearance_mm
+
+
+def tip_places(
+    config: CellConfig,
+) -> Callable[[str, Float64[np.ndarray, " 6"]], Float64[np.ndarray, " 3"]]:
+    """Where an arm's tip is by its six joints: table frame, mm. Each arm may be asked in a thread
+    of its own."""
+    cells = {arm: ArmCell(config) for arm in ARMS}
+
+    def tip_mm(arm: str, own_rad: Float64[np.ndarray, " 6"]) -> Float64[np.ndarray, " 3"]:
+        joints_rad = cells[arm].home_rad.copy()
+        joints_rad[6 * ARMS.index(arm) :][:6] = own_rad
+        return cells[arm].tips(joints_rad)[arm][:3, 3]
+
+    return tip_mm
 
 
 class Blocked(NoPlan):

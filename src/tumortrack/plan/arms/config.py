@@ -61,6 +61,8 @@ class CellConfig(Config, frozen=True, kw_only=True):
         cutting_mm_s: the tip's maximum speed on a cut and in tissue; ``grasping_mm_s``: on the
             straight path to the grasp and back.
         speed_share: of the maker's maximum joint speeds.
+        tool_error_mm: largest error of a tool's tip where its arm stands as planned, loads
+            included: the arms' accuracy, and what gives way. None: not known.
     """
 
     cutter_model: Literal["ur10e", "ur5"] = "ur10e"
@@ -89,6 +91,7 @@ class CellConfig(Config, frozen=True, kw_only=True):
     cutting_mm_s: float = 10.0
     grasping_mm_s: float = 25.0
     speed_share: float = 0.5
+    tool_error_mm: float | None = None
 
     def __post_init__(self) -> None:
         if len(self.home_rad) != len(JOINTS):
@@ -98,6 +101,8 @@ class CellConfig(Config, frozen=True, kw_only=True):
             if not (0 < value < 1000 and low <= value <= high):
                 allowed = f"{low or 'over 0'} to {high}"
                 raise InputError(f"cell: {name} is {value:g}; allowed: {allowed}.")
+        if self.tool_error_mm is not None and not 0 < self.tool_error_mm <= 50:
+            raise InputError(f"cell: tool_error_mm is {self.tool_error_mm:g}; allowed: 0 to 50.")
         if not all(100 <= side <= 10_000 for side in self.table_mm):
             raise InputError(f"cell: table_mm is {self.table_mm}; allowed: 100 to 10000 each.")
         places = (*self.middle_mm, *self.camera_mm, *self.home_rad)

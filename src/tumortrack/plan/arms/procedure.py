@@ -21,7 +21,7 @@ from tumortrack.plan.arms.config import Base, CellConfig
 from tumortrack.plan.arms.cutting import Surroundings, level_poses
 from tumortrack.plan.arms.kinematics import level_pose, yaw_of
 from tumortrack.plan.arms.paths import connect, follow, out_of_reach
-from tumortrack.plan.arms.trajectory import TrajectoryBuilder, along, together
+from tumortrack.plan.arms.trajectory import TrajectoryBuilder, along, first_hit, together
 from tumortrack.plan.motions import ARMS, CUTTER, HOLDER, JOINTS, Joints, Motions
 from tumortrack.plan.operation import Planned, ResectionProgress
 from tumortrack.plan.resection import plan_resection
@@ -308,4 +308,8 @@ def replan(located: Located, joints_rad: Joints, progress: ResectionProgress) ->
         raise NoPlan("the organ's surface was not found")
     from_sweep = progress.first_sweep(plan, located.meshes[plan.tumor])
     motions = plan_motions(plan, cell, organ, start_rad=joints_rad, from_sweep=from_sweep)
-    return Planned(plan, located.meshes, motions)
+    if hit := first_hit(motions, cell.config, organ, begun=True):
+        raise NoPlan(f"the arms can't carry this out: {hit}")
+    planned = Planned(plan, located.meshes, motions)
+    _ = planned.kept_mm  # which takes time: here, not in the live loop
+    return planned

@@ -195,12 +195,13 @@ def together(
     return times, start_rad + share * (goal_rad - start_rad)
 
 
-def first_hit(motions: Motions, config: CellConfig, organ: Mesh) -> str:
+def first_hit(motions: Motions, config: CellConfig, organ: Mesh, begun: bool = False) -> str:
     """What would meet what, and when, if these motions were carried out; empty: nothing.
 
     Tested as densely as the planner tests, with half of its clearances: between the places that it
     tests, its own motions come nearer than the whole ones. An electrode or cup may touch the organ
-    only where its tip is as slow as it is planned there.
+    only where its tip is as slow as it is planned there. ``begun``: the arms do not come from home;
+    both tools may be at the organ in the first stage, too.
     """
     halves = {
         name: max(getattr(config, name) / 2, 0.5)
@@ -209,8 +210,8 @@ def first_hit(motions: Motions, config: CellConfig, organ: Mesh) -> str:
     cell = ArmCell(msgspec.structs.replace(config, **halves), organ)
     slow_mm_s = _OVER * np.array([config.cutting_mm_s, config.grasping_mm_s])
     levers_mm = cell.levers_mm(np.zeros(len(cell.home_rad)), np.zeros(len(cell.home_rad)))
-    for stage in motions.stages:
-        touching = _TOUCHING.get(stage.name, ARMS)
+    for number, stage in enumerate(motions.stages):
+        touching = ARMS if begun and not number else _TOUCHING.get(stage.name, ARMS)
         turns = np.abs(np.diff(stage.joints_rad, axis=0)) @ levers_mm
         moved_mm = np.concatenate([[0.0], np.cumsum(turns)])  # at most, of any point
         steps = int(np.ceil(moved_mm[-1] / (2 * cell.config.least_clearance_mm(touching))))

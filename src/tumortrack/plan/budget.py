@@ -1,0 +1,187 @@
+"""The error budget: how much nearer to the tumor than planned a cut may come.
+
+Motion and lag are displacements of the tumor against the plan: they point the same way all the
+time, so they add up. Tracking, hand-eye calibration and tool are bounds of independent errors,
+whose directions have nothing to do with each other: they add in quadrature.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import msgspec
+import numpy as np
+import shapely
+from jaxtyping import Float, Float64
+from scipy.spatial import cKDTree
+
+from tumortrack.core.config import Config
+from tumortrack.core.errors import InputError, NoPlan
+from tumortrack.live.sinks.ur import OFF_MM
+from tumortrack.plan.outline import evenly_round, polygon_of
+from tumortrack.plan.resection import inside
+from tumortrack.plan.values import CutLayer, Located, ResectionPlan
+
+# So many standard deviations, but no less than the largest Hausdorff distance of a tumor in the
+# goals of docs/results.md (clinic, phantom, D3): together they cover 30 of the 32 tumors in good
+# estimates of the demo's scenes, half of which have a deformation that training does not know; two
+# deviations alone cover 20. Not calibrated: see docs/resection.md.
+DEVIATIONS, LEAST_TRACKING_MM = 3.0, 3.6
+# Without standard deviations: the largest of M_lim (preset quick) there, P1 of case_00000.
+UNKNOWN_TRACKING_MM = 8.0
+# Calibrations with 3D cameras err by about 0.9 mm and 0.27 degrees (arXiv 2311.01335): 1.9 mm at
+# 200 mm.
+HAND_EYE_MM = 2.0
+# Data sheets state repeatability alone, 0.05 mm (UR10e) and 0.1 mm (UR5); commanded poses of arms
+# that are not calibrated are off by some 20 times that.
+TOOL_MM = 1.0
+MOVED_MM = 2.0  # allowed for at planning: the tumor may move so far before the arms stand
+OVER_BUDGET = "PLANNED OVER ITS ERROR BUDGET"
+TERMS = ("tracking", "hand-eye", "tool", "motion", "lag")
+_SPACING_MM = 0.25  # of points on the planned cut
+
+
+class ErrorBudget(Config, frozen=True, kw_only=True):
+    """Bounds of errors, mm, and the margin that they are taken from.
+
+    Attributes:
+        margin_mm: the least distance between the planned cut and the tumor's located surface;
+            negative where the cut goes through the tumor.
+        tracking_mm: of the tumor's located surface.
+        hand_eye_mm: of the camera's place in the arms' frame, at the tumor.
+        tool_mm: of the tool's tip: the arm's accuracy, what gives way, and how far the arm may be
+            from its target.
+        motion_mm: of the tumor since the plan; when planned, what is allowed for.
+        lag_mm: what the tumor moves until the arms act on an estimate.
+        assumed: terms that nobody measured or stated.
+    """
+
+    margin_mm: float
+    tracking_mm: float = 0.0
+    hand_eye_mm: float = 0.0
+    tool_mm: float = 0.0
+    motion_mm: float = 0.0
+    lag_mm: float = 0.0
+    assumed: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        for name, value in self.terms.items():
+            if not 0 <= value < math.inf:
+                raise InputError(f"error budget: {name} is {value:g} mm; allowed: 0 or more.")
+        if not math.isfinite(self.margin_mm):
+            raise InputError(f"error budget: the margin is {self.margin_mm:g} mm; give a number.")
+
+    @property
+    def terms(self) -> dict[str, float]:
+        """Each term by its name, mm."""
+        return {name: getattr(self, f"{name.replace('-', '_')}_mm") for name in TERMS}
+
+    @property
+    def sum_mm(self) -> float:
+        independent_mm = math.hypot(self.tracking_mm, self.hand_eye_mm, self.tool_mm)
+        return self.motion_mm + self.lag_mm + independent_mm
+
+    @property
+    def left_mm(self) -> float:
+        """Of the margin; negative: the tumor may be cut."""
+        return self.margin_mm - self.sum_mm
+
+    @property
+    def words(self) -> str:
+        terms = self.terms
+        most = max(terms, key=lambda name: terms[name])
+        return (
+            f"{self.sum_mm:.1f} mm of error, most of it {most} ({terms[most]:.1f}), against a "
+            f"margin of {self.margin_mm:.1f} mm"
+        )
+
+    def table(self) -> list[str]:
+        """Lines for the screen."""
+        lines = ["errors that the margin has to hold, mm:"]
+        for name, value in self.terms.items():
+            lines.append(f"  {name:<9}{value:5.1f}{'  assumed' if name in self.assumed else ''}")
+        lines.append(f"  {'together':<9}{self.sum_mm:5.1f}  of a margin of {self.margin_mm:.1f}")
+        return lines
+
+    def seen(self, std_mm: np.ndarray | None, **terms: float) -> ErrorBudget:
+        """With ``margin_mm``, ``motion_mm`` and ``lag_mm`` as they are now, and the tracking of an
+        estimate whose tumor has these standard deviations."""
+        others = tuple(name for name in self.assumed if name != "tracking")
+        if std_mm is None:
+            terms["tracking_mm"], others = UNKNOWN_TRACKING_MM, ("tracking", *others)
+        else:
+            terms["tracking_mm"] = max(DEVIATIONS * float(np.max(std_mm)), LEAST_TRACKING_MM)
+        return msgspec.structs.replace(self, assumed=others, **terms)
+
+
+def planned_budget(
+    plan: ResectionPlan,
+    located: Located,
+    hand_eye_mm: float | None = None,
+    tool_error_mm: float | None = None,
+    moved_mm: float = MOVED_MM,
+) -> ErrorBudget:
+    """The budget of a plan; ``hand_eye_mm`` and ``tool_error_mm`` are assumed where nobody states
+    them. The organ is taken to lie still, apart from ``moved_mm``: there is no lag yet."""
+    stated = {"hand-eye": hand_eye_mm, "tool": tool_error_mm}
+    budget = ErrorBudget(
+        margin_mm=kept_mm(plan.layers, tumor_points(plan, located)),
+        hand_eye_mm=HAND_EYE_MM if hand_eye_mm is None else hand_eye_mm,
+        tool_mm=OFF_MM + (TOOL_MM if tool_error_mm is None else tool_error_mm),
+        motion_mm=moved_mm,
+        assumed=tuple(name for name, value in stated.items() if value is None),
+    )
+    return budget.seen(located.std_mm.get(plan.tumor))
+
+
+def heeded(plan: ResectionPlan, budget: ErrorBudget, accept: bool) -> ResectionPlan:
+    """The plan with a note on its budget. NoPlan: the margin doesn't hold the errors, and nobody
+    said that it is to be planned all the same."""
+    words = f"{budget.left_mm:.1f} mm of the margin are left after {budget.sum_mm:.1f} mm of error"
+    if budget.left_mm < 0:
+        words = f"{OVER_BUDGET}: {budget.words}"
+        if not accept:
+            raise NoPlan(
+                f"the margin does not hold the errors: {budget.words}. {_remedy(plan, budget)} "
+                "Only for a plan that nobody carries out, accept it (--accept-budget, "
+                "accept_budget=True)."
+            )
+    return replace(plan, notes=(*plan.notes, f"{words}."))
+
+
+def kept_mm(layers: tuple[CutLayer, ...], points_mm: Float[np.ndarray, "n 3"]) -> float:
+    """The least distance between the planned cut and a tumor's surface, by points of it; where some
+    are outside the piece, how deep the cut goes into the tumor, negative. What is open at the top
+    is no cut."""
+    nearest_mm = np.full(len(points_mm), np.inf)
+    below = shapely.Polygon()
+    x, y, z = np.asarray(points_mm, float).T
+    for layer in reversed(layers):  # from the floor up
+        lines = [evenly_round(ring, _SPACING_MM) for ring in layer.rings_mm]
+        beside_mm = cKDTree(np.concatenate(lines)).query(np.column_stack([x, y]))[0]
+        beyond_mm = np.clip(z, layer.bottom_mm, layer.top_mm) - z
+        nearest_mm = np.minimum(nearest_mm, np.hypot(beside_mm, beyond_mm))
+        area = polygon_of(layer.rings_mm)
+        ledge = area.difference(below)
+        over = shapely.contains_xy(ledge, x, y)
+        nearest_mm[over] = np.minimum(nearest_mm, np.abs(z - layer.bottom_mm))[over]
+        below = area
+    outside = ~inside(layers, points_mm)
+    return float(-nearest_mm[outside].max() if outside.any() else nearest_mm.min())
+
+
+def tumor_points(plan: ResectionPlan, located: Located) -> Float64[np.ndarray, "n 3"]:
+    """On the tumor's surface, or in it where there is no mesh; table frame, mm."""
+    mesh = located.meshes.get(plan.tumor)
+    return np.asarray(located.of(plan.label) if mesh is None else mesh.vertices_mm, float)
+
+
+def _remedy(plan: ResectionPlan, budget: ErrorBudget) -> str:
+    """A margin that would do, if there is one."""
+    enough_mm = math.ceil(2 * (plan.margin_mm - budget.left_mm) + 0.2) / 2
+    if plan.method != "margin":
+        return "The method keeps no margin below the tumor; take the method margin."
+    if enough_mm > 20:
+        return "Look from nearer, or uncover more of the organ."
+    return f"{enough_mm:g} mm would hold them (--margin, margin_mm)."

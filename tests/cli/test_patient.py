@@ -1,0 +1,84 @@
+"""Patient and side, from the images to the plan: they arrive everywhere, and a mismatch stops."""
+
+from __future__ import annotations
+
+import json
+import shutil
+
+import pytest
+
+from stories import cloud_by_rays, looking_down, refusal, succeeded, tumortrack
+from tumortrack.core import store
+from tumortrack.core.patient import Patient
+from tumortrack.imaging.case import load_case
+from tumortrack.plan.files import read_plan
+from tumortrack.sense.ply import write_cloud_ply
+
+P1 = {"id": "P1", "side": "right"}  # of ``phantom_case``
+OTHERS = (("--patient", "P2"), ("--side", "left"), ("--patient", "P1", "--side", "left"))
+
+
+@pytest.fixture(scope="module")
+def run(phantom_case, clinic_model, tmp_path_factory):
+    """What `locate` writes, told whom it is about."""
+    folder = tmp_path_factory.mktemp("patient")
+    case = load_case(phantom_case)
+    write_cloud_ply(folder / "cloud.ply", cloud_by_rays(case, looking_down(case)))
+    command = ("locate", clinic_model, folder / "cloud.ply", folder / "run", "--grid", 32)
+    said = succeeded(tumortrack(*command, "--patient", "P1", "--side", "right"))
+    assert "patient P1, right side" in said
+    return folder / "run"
+
+
+def test_they_travel_from_the_case_to_model_run_and_plan(phantom_case, clinic_model, run, tmp_path):
+    assert store.read_json(phantom_case / "manifest.json")["patient"] == P1
+    assert store.read_json(clinic_model / "manifest.json")["provenance"]["patient"] == P1
+    assert store.read_json(run / "report.json")["patient"] == P1
+    header = (run / "labels.seg.nrrd").read_bytes()[:4000]
+    assert b"SCT^24028007^Right" in header
+    plan = ("plan", run, tmp_path / "plan", "--no-arms", "--accept-poor", "--method", "published")
+    assert "patient P1, right side" in succeeded(tumortrack(*plan, "--patient", "P1"))
+    assert read_plan(tmp_path / "plan").patient == Patient("P1", "right")
+    said = succeeded(tumortrack("inspect", phantom_case))
+    assert "patient: {'id': 'P1', 'side': 'right'}" in said
+
+
+@pytest.mark.parametrize("stated", OTHERS)
+def test_another_patient_or_side_than_stated_stops(clinic_model, run, tmp_path, stated):
+    cloud, place = run.parent / "cloud.ply", tmp_path / "new"
+    for command in (
+        ("locate", clinic_model, cloud, place),
+        ("track", clinic_model, "virtual:nowhere", f"recording:{place}"),
+        ("plan", run, place, "--no-arms", "--accept-poor"),
+    ):
+        line = refusal(tumortrack(*command, *stated))
+        assert "is of patient P1, right side; stated was patient" in line
+        assert not place.exists()
+
+
+@pytest.mark.parametrize(("stated", "words"), [("", "no identifier"), ("unknown", "is nobody")])
+def test_an_empty_variable_in_a_script_is_no_leave_to_take_anybody(clinic_model, stated, words):
+    track = ("track", clinic_model, "virtual:nowhere")
+    assert words in refusal(tumortrack(*track, "--patient", stated))
+
+
+def test_folders_from_before_know_nobody_and_serve_nobody_in_particular(
+    clinic_model, run, tmp_path
+):
+    model, old = tmp_path / "model", tmp_path / "run"
+    shutil.copytree(clinic_model, model)
+    about = json.loads((model / "manifest.json").read_text())
+    del about["provenance"]["patient"]
+    (model / "manifest.json").write_text(json.dumps(about))
+    shutil.copytree(run, old)
+    report = json.loads((old / "report.json").read_text())
+    del report["patient"]
+    (old / "report.json").write_text(json.dumps(report))
+    store.seal(old, "run", {"report": "report.json"}, "camera")
+    locate = ("locate", model, run.parent / "cloud.ply", tmp_path / "new", "--grid", 32)
+    plan = ("plan", old, tmp_path / "plan", "--no-arms", "--accept-poor", "--method", "published")
+    for command in (locate, plan):
+        line = refusal(tumortrack(*command, "--patient", "P1"))
+        assert "is of patient unknown, side unknown; stated was patient P1" in line
+        assert "prepare --patient ID --side" in line
+        assert "patient unknown, side unknown" in succeeded(tumortrack(*command))

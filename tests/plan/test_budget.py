@@ -1,0 +1,185 @@
+"""The error budget: how errors add up, what a margin keeps, and what the numbers are made of."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from msgspec.structs import replace as with_terms
+
+from live_objects import small_estimate, small_update
+from plan_objects import RADIUS_MM, TUMOR_MM, Deviating, located, sphere
+from tumortrack.core.errors import InputError, NoPlan
+from tumortrack.live.calibration_file import read_error_mm
+from tumortrack.live.sinks.ur import OFF_MM
+from tumortrack.plan.budget import (
+    HAND_EYE_MM,
+    LEAST_TRACKING_MM,
+    OVER_BUDGET,
+    TERMS,
+    TOOL_MM,
+    UNKNOWN_TRACKING_MM,
+    ErrorBudget,
+    heeded,
+    kept_mm,
+    planned_budget,
+)
+from tumortrack.plan.live_budget import LiveBudget
+from tumortrack.plan.resection import plan_resection
+from tumortrack.plan.values import CutLayer, ResectionConfig
+
+NAMES = [f"{name.replace('-', '_')}_mm" for name in TERMS]
+millimetres = st.floats(0, 50)
+
+
+def budget(margin_mm=5.0, **terms):
+    return ErrorBudget(margin_mm=margin_mm, **terms)
+
+
+@given(st.tuples(*[millimetres] * 5), st.sampled_from(NAMES), st.floats(0.01, 20))
+def test_the_sum_grows_with_every_term_and_lies_between_the_largest_and_the_plain_sum(
+    values, name, more
+):
+    terms = dict(zip(NAMES, values, strict=True))
+    found = budget(**terms)
+    assert max(values) - 1e-9 <= found.sum_mm <= sum(values) + 1e-9
+    assert budget(**{**terms, name: terms[name] + more}).sum_mm > found.sum_mm
+    assert found.left_mm == pytest.approx(5 - found.sum_mm)
+
+
+def test_what_always_points_the_same_way_is_added_and_what_is_independent_in_quadrature():
+    assert budget(motion_mm=3, lag_mm=4).sum_mm == 7
+    assert budget(tracking_mm=2, hand_eye_mm=3, tool_mm=6).sum_mm == 7
+    assert budget(tracking_mm=3, hand_eye_mm=4, motion_mm=2).sum_mm == 7
+
+
+@pytest.mark.parametrize("bad", [-0.1, math.nan, math.inf])
+@pytest.mark.parametrize("name", NAMES)
+def test_an_error_that_is_none_is_refused(name, bad):
+    with pytest.raises(InputError, match="allowed: 0 or more"):
+        budget(**{name: bad})
+    with pytest.raises(InputError, match="margin"):
+        budget(math.nan)
+
+
+def test_two_millimetres_of_motion_and_3_6_of_tracking_do_not_go_into_a_margin_of_5():
+    plan = plan_resection(located(), ResectionConfig())
+    over = budget(tracking_mm=3.6, motion_mm=2)
+    with pytest.raises(NoPlan, match=r"5\.6 mm of error, most of it tracking \(3\.6\).* 5\.0 mm"):
+        heeded(plan, over, accept=False)
+    accepted = heeded(plan, over, accept=True)
+    assert accepted.notes[-1].startswith(f"{OVER_BUDGET}: 5.6 mm of error")
+    fits = heeded(plan, with_terms(over, margin_mm=6.0), accept=False)
+    assert fits.notes[-1] == "0.4 mm of the margin are left after 5.6 mm of error."
+
+
+@pytest.mark.parametrize("margin_mm", [2.0, 5.0, 8.0])
+def test_a_plan_keeps_its_margin_and_no_more(margin_mm):
+    plan = plan_resection(located(), ResectionConfig(margin_mm=margin_mm, most_healthy=1.0))
+    fine = sphere(TUMOR_MM, RADIUS_MM, finer=5).vertices_mm
+    assert kept_mm(plan.layers, fine) == pytest.approx(margin_mm, abs=0.3)
+    # Moved towards any side it keeps as much less; a wider margin above holds no cut.
+    for side in np.eye(3)[:2]:
+        moved = kept_mm(plan.layers, fine + 1.5 * side)
+        assert moved == pytest.approx(margin_mm - 1.5, abs=0.4)
+    assert kept_mm(plan.layers, fine - [0, 0, 1.5]) == pytest.approx(margin_mm - 1.5, abs=0.3)
+    assert kept_mm(plan.layers, fine - [0, 0, margin_mm + 2]) == pytest.approx(-2, abs=0.3)
+
+
+def test_of_a_box_of_two_slabs_distances_are_known():
+    square = np.array([[-1.0, -1], [1, -1], [1, 1], [-1, 1]])
+    layers = (
+        CutLayer(10.0, np.inf, (20 * square,)),
+        CutLayer(0.0, 10.0, (8 * square,)),  # a ledge at 10, from 8 out to 20
+    )
+    kept = lambda *point: kept_mm(layers, np.array([point], float))  # noqa: E731
+    assert kept(0, 0, 5) == pytest.approx(5)  # over the floor
+    assert kept(6, 0, 5) == pytest.approx(2)  # beside the wall
+    assert kept(14, 0, 13) == pytest.approx(3)  # over the ledge
+    assert kept(5, 0, 14) == pytest.approx(5, abs=0.01)  # the ledge's inner edge: 3 off, 4 below
+    assert kept(0, 0, 500) == pytest.approx(20, abs=0.01)  # open at the top
+    assert kept(11, 0, 5) == pytest.approx(-3, abs=0.01)  # outside
+    assert kept(0, 0, -4) == pytest.approx(-4)
+    both = np.array([[0, 0, 5], [11, 0, 5.0]])
+    assert kept_mm(layers, both) == pytest.approx(-3, abs=0.01)  # the worst
+
+
+def test_the_papers_method_keeps_nothing_below_the_tumor():
+    plan = plan_resection(located(), ResectionConfig(method="published"))
+    assert planned_budget(plan, located(std_mm=0.5)).margin_mm < 0.5
+
+
+def test_what_nobody_states_is_assumed_and_named():
+    plan = plan_resection(located(), ResectionConfig())
+    bare = planned_budget(plan, located())
+    assert set(bare.assumed) == {"tracking", "hand-eye", "tool"}
+    assert bare.tracking_mm == UNKNOWN_TRACKING_MM
+    assert bare.hand_eye_mm == HAND_EYE_MM
+    assert bare.tool_mm == TOOL_MM + OFF_MM
+    known = planned_budget(plan, located(std_mm=2.0), 0.7, 0.4, moved_mm=1.0)
+    assert known.assumed == ()
+    assert [*known.terms.values()] == pytest.approx([6.0, 0.7, 0.4 + OFF_MM, 1.0, 0.0])
+    sure = planned_budget(plan, located(std_mm=0.1))
+    assert sure.tracking_mm == LEAST_TRACKING_MM  # none is as good as it says
+    assert "  hand-eye   2.0  assumed" in sure.table()
+
+
+def test_a_calibration_states_its_error_at_the_tumor(tmp_path):
+    path = tmp_path / "frame.json"
+    rows = np.eye(4).tolist()
+
+    def stated(**error):
+        frame = {"frame_id": "base", "unit": "m", "robot_from_camera": rows, **error}
+        path.write_text(json.dumps(frame))
+        return read_error_mm(path, 200.0)
+
+    assert stated() is None
+    assert stated(error_mm=1.2) == 1.2
+    assert stated(error_mm=1.0, error_deg=0.5) == pytest.approx(1 + 200 * math.radians(0.5))
+    for error in ({"error_mm": 0}, {"error_mm": -1}, {"error_deg": 0.5},
+                  {"error_mm": 1, "error_deg": 20}):  # fmt: skip
+        with pytest.raises(InputError, match="error_"):
+            stated(**error)
+
+
+def update(number, latency_ms=100.0, smoothing_ms=0.0, std_mm=0.5):
+    estimate = replace(small_estimate(), motion=Deviating(std_mm))
+    estimate.report["smoothing"] = {"lag_ms": smoothing_ms}
+    stamp_ns = small_update().stamp_ns + number * 33_000_000
+    return replace(small_update(), stamp_ns=stamp_ns, estimate=estimate, latency_ms=latency_ms)
+
+
+def test_lag_is_the_tumors_speed_times_all_that_comes_late():
+    live = LiveBudget(budget(20.0, hand_eye_mm=1), servo_s=0.1)
+    tumor = sphere(TUMOR_MM, RADIUS_MM)
+    for frame in range(20):  # 9 mm/s
+        moved = tumor.moved(tumor.vertices_mm + [0.297 * frame, 0, 0])
+        live.add_up(update(frame, 80.0, 120.0), "tumor_1", moved, 0.5, 15.0)
+        if not frame:
+            assert live.now.lag_mm == 0  # nothing is known of a speed
+    assert live.now.lag_mm == pytest.approx(9 * (0.08 + 0.12 + 0.1))
+    assert (live.now.motion_mm, live.now.margin_mm, live.now.hand_eye_mm) == (0.5, 15.0, 1.0)
+    # After a gap, and where the clock was set back, the last place says nothing.
+    live.add_up(update(60), "tumor_1", tumor, 0.5, 15.0)
+    assert live.now.lag_mm == 0
+    live.add_up(update(3), "tumor_1", moved, 0.5, 15.0)
+    assert live.now.lag_mm == 0
+
+
+def test_a_new_plan_helps_where_the_motion_alone_is_too_much():
+    live, tumor = LiveBudget(budget(9.0)), sphere(TUMOR_MM, RADIUS_MM)
+    assert live.add_up(update(0), "tumor_1", tumor, 1.0, 5.0) == ("", False)
+    said, helps = live.add_up(update(1), "tumor_1", tumor, 1.9, 5.0)
+    assert said == "5.5 mm of error, most of it tracking (3.6), against a margin of 5.0 mm"
+    assert helps
+    _, helps = live.add_up(update(2, std_mm=2.0), "tumor_1", tumor, 1.9, 5.0)
+    assert not helps
+    # Accepted by a person when it was planned: added up, and nothing follows.
+    accepted = LiveBudget(budget(1.0, motion_mm=2))
+    assert accepted.add_up(update(0), "tumor_1", tumor, 1.9, 1.0) == ("", False)
+    assert accepted.now.left_mm < 0
