@@ -127,6 +127,7 @@ def test_without_the_token_nothing_changes_and_the_arms_are_stopped(viewer):
     before = panel.options
     with page(viewer, token=False) as stranger:
         look(stranger)
+        until(viewer._server.get_clients, "the page")
         change(stranger, panel._shown["kidney"], 0.1)
         change(stranger, panel.pick, True)
         say(stranger, "ShareUrlRequest")  # viser would publish the server on the internet
