@@ -8,7 +8,7 @@ INSTALL := pip install --quiet --disable-pip-version-check --no-compile --no-dep
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: help setup debian demo test test-hard check attack fuzz replay bench soak wheel lock licences audit results headstart training-speed foreign clean
+.PHONY: help setup debian demo test test-hard check attack fuzz crash replay bench soak wheel lock licences audit results headstart training-speed foreign clean
 
 help:  ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 10
@@ -48,11 +48,15 @@ debian:  ## what tests need of Debian (ROS, RViz, Chromium), where it can be ins
 test: check  ## check, then all tests (those of ROS, RViz and Chromium after `make debian`)
 	OMP_NUM_THREADS=1 $(BIN)/pytest -n 3 --dist loadfile --no-loadscope-reorder
 
-attack: setup  ## hostile files and calls: each must end in one clear line (4 minutes; ARGS=NAME ...: these)
+attack: setup  ## hostile files and calls: each must end in one clear line (3 minutes; ARGS=NAME ...: these)
 	$(BIN)/python tests/support/attacks.py runs/attacks $(ARGS)
 
-fuzz: setup  ## damaged input for every reader (ARGS="--inputs 60000": how many; --target NAME)
-	$(BIN)/python tests/support/fuzz.py $(ARGS)
+fuzz: setup  ## a million damaged inputs for all readers (20 minutes; ARGS="--inputs 60000 --target NAME")
+	$(BIN)/python tests/support/fuzz.py --artifacts $(ARGS)
+
+crash: setup  ## kill -9 at random moments, shortages, two at once (ARGS="--times 20 --only NAME")
+	$(BIN)/python tests/support/crashes.py runs/crashes $(ARGS)
+	$(BIN)/python tests/support/shortages.py runs/crashes
 
 replay: setup  ## has any number changed since runs/replay.json? Without that file: record it (4 minutes; ARGS=--quick)
 	$(BIN)/python tools/replay.py either runs/replay.json $(ARGS)
@@ -65,7 +69,7 @@ test-hard: setup  ## tests on narrow vector units beside two busy processes (ARG
 bench: setup  ## speed of every part beside its naive form; fills docs/performance.md (10 to 13 minutes; ARGS=--quick)
 	$(BIN)/tumortrack bench --curves --document docs/performance.md $(ARGS)
 
-soak: setup  ## an hour of tracking: memory, latency, errors (ARGS="MODEL CASE --minutes 5"; after make demo)
+soak: setup  ## an hour of tracking with faults all round (ARGS="MODEL CASE --minutes 5"; after make demo)
 	$(BIN)/python lab/scripts/soak.py $(ARGS)
 
 results: setup  ## the tables and plots of docs/results.md (hours; ARGS=--quick: minutes)

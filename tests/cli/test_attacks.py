@@ -10,7 +10,15 @@ import pytest
 import attacks
 
 # These take seconds, to be made or to be refused.
-_LONG = ("gzip_bomb", "gzip_goes_on", "gzip_unpacks", "gzip_extension", "labels_of_", "mesh_254")
+_LONG = (
+    "gzip_bomb",
+    "gzip_goes_on",
+    "gzip_unpacks",
+    "gzip_extension",
+    "labels_of_",
+    "mesh_254",
+    "dicom_deflated",
+)
 _NAMES = [
     name
     for name in attacks.ATTACKS

@@ -36,7 +36,7 @@ def test_they_travel_from_the_case_to_model_run_and_plan(phantom_case, clinic_mo
     assert store.read_json(run / "report.json")["patient"] == P1
     header = (run / "labels.seg.nrrd").read_bytes()[:4000]
     assert b"SCT^24028007^Right" in header
-    plan = ("plan", run, tmp_path / "plan", "--no-arms", "--accept-poor", "--method", "published")
+    plan = ("plan", run, tmp_path / "plan", "--no-arms", "--accept-poor", "--accept-budget")
     assert "patient P1, right side" in succeeded(tumortrack(*plan, "--patient", "P1"))
     assert read_plan(tmp_path / "plan").patient == Patient("P1", "right")
     said = succeeded(tumortrack("inspect", phantom_case))
@@ -76,7 +76,7 @@ def test_folders_from_before_know_nobody_and_serve_nobody_in_particular(
     (old / "report.json").write_text(json.dumps(report))
     store.seal(old, "run", {"report": "report.json"}, "camera")
     locate = ("locate", model, run.parent / "cloud.ply", tmp_path / "new", "--grid", 32)
-    plan = ("plan", old, tmp_path / "plan", "--no-arms", "--accept-poor", "--method", "published")
+    plan = ("plan", old, tmp_path / "plan", "--no-arms", "--accept-poor", "--accept-budget")
     for command in (locate, plan):
         line = refusal(tumortrack(*command, "--patient", "P1"))
         assert "is of patient unknown, side unknown; stated was patient P1" in line

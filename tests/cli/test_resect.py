@@ -113,8 +113,8 @@ def test_a_margin_that_does_not_hold_the_errors_is_no_plan_unless_a_person_accep
 ):
     folder, said = story
     lines = said.splitlines()
-    assert lines[0] == "errors that the margin has to hold, mm:"
-    assert lines[1:6] == [
+    assert lines[:2] == ["patient P1, left side", "errors that the margin has to hold, mm:"]
+    assert lines[2:7] == [
         "  tracking   3.6", "  hand-eye   2.0  assumed", "  tool       3.0  assumed",
         "  motion     2.0", "  lag        0.0",
     ]  # fmt: skip
@@ -275,7 +275,7 @@ def test_a_real_arm_moves_only_with_all_that_it_needs_and_nothing_is_connected_b
 
 def test_a_plan_over_its_budget_or_with_assumed_errors_moves_no_real_arm(story, given, tmp_path):
     folder, _ = story
-    live = (REAL, "--live", given / "model", "realsense")
+    live = (REAL, *STATED, "--live", given / "model", "realsense")
     cell = ("--cell", given / "cell.json")
     for name, frame, margin in (("narrow", "frame", 5), ("unstated", "unstated", 8)):
         command = ("plan", folder / "run", tmp_path / name, "--frame", given / f"{frame}.json")

@@ -1,6 +1,7 @@
 """Artifact folders and mesh files: whole or absent, and damage is found."""
 
 import json
+import shutil
 import subprocess
 import sys
 import textwrap
@@ -291,3 +292,20 @@ def test_what_is_no_mesh_is_refused(tmp_path, name, content):
         (tmp_path / name).write_text(content)
     with pytest.raises(InputError):
         read_mesh(tmp_path / name)
+
+
+def test_what_killed_processes_left_is_cleared_and_what_another_writes_is_not(tmp_path):
+    for name in (".run.aaaaaaaa.part", ".run.bbbbbbbb.old"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "file").write_text(name)
+    with pytest.raises(InputError, match="exists already"), store.new_folder(tmp_path / "run"):
+        pass
+    assert (tmp_path / "run" / "file").read_text() == ".run.bbbbbbbb.old"  # it came back
+    (tmp_path / ".run.cccccccc.old").mkdir()  # killed behind the second renaming
+    with store.new_folder(tmp_path / "more") as aside:
+        with store.new_folder(tmp_path / "more"):  # locks are of descriptors: as two processes
+            assert aside.is_dir()
+        with pytest.raises(InputError), store.new_folder(tmp_path / "run"):
+            pass
+        shutil.rmtree(tmp_path / "more")
+    assert {path.name for path in tmp_path.iterdir()} == {"run", "more"}

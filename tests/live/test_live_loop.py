@@ -317,7 +317,7 @@ def test_an_answer_that_comes_too_late_is_none_and_yet_a_start(tracker, stages, 
     now = clock.time_ns()
     clouds = [
         SensorCloud(stages[0].cloud.points_mm, now),
-        SensorCloud(stages[0].cloud.points_mm, now + 600_000_000),
+        SensorCloud(stages[0].cloud.points_mm + np.float32(0.01), now + 600_000_000),
     ]
     config = LoopConfig(region=WHOLE, stale_s=20.0)
     items = [clouds[0], lambda: until(lambda: sink.updates), clouds[1]]

@@ -17,8 +17,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from rosbags.highlevel import AnyReader
-from rosbags.rosbag1 import Writer as Writer1
-from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 
 from clock import PATIENCE_S, Clock
 from depth_files import write_depth_png, write_intrinsics
@@ -31,13 +29,11 @@ from live_objects import (
     small_estimate,
     small_setting,
 )
-from recording_objects import PERIOD_NS, frame_number, record, update_number
+from recording_objects import PERIOD_NS, frame_number, record, update_number, write_bag
 from tumortrack.core.errors import InputError, StorageError
 from tumortrack.core.geometry import rigid
 from tumortrack.core.mesh_files import write_anatomy
 from tumortrack.core.types import DepthFrame, SensorCloud
-from tumortrack.live.ros.messages import Messages
-from tumortrack.live.ros.sensors import messages_seen
 from tumortrack.live.sinks.recording import _CHUNK_S
 from tumortrack.live.sinks.recording import RecordingSinkConfig as RecordTo
 from tumortrack.live.sources.recording import RecordingSourceConfig
@@ -368,32 +364,6 @@ def test_scenes_bring_their_truth(tmp_path):
     assert two.truth.parts[1].volume_mm3 == pytest.approx(volume_mm3, rel=1e-5)
 
 
-def write_bag(path: Path, topics: dict[str, list], kind: str) -> Path:
-    """A foreign bag: per topic messages' suffix in ``messages_seen`` and frames."""
-    messages = Messages("noetic" if kind == "bag" else "humble")
-    plugin = StoragePlugin.MCAP if "mcap" in kind else StoragePlugin.SQLITE3
-    writer = Writer1(path) if kind == "bag" else Writer(path, version=8, storage_plugin=plugin)
-    if kind.startswith("packed"):
-        mode = CompressionMode.STORAGE if "mcap" in kind else CompressionMode.MESSAGE
-        writer.set_compression(mode, CompressionFormat.ZSTD)
-    with writer:
-        connections = {}
-        rows = [
-            (content.stamp_ns, topic, out)
-            for topic, (suffix, contents) in topics.items()
-            for content in contents
-            for out in messages_seen(Observation(content, 0), messages)
-            if out.suffix == suffix
-        ]
-        for stamp_ns, topic, out in sorted(rows, key=lambda row: row[:2]):
-            if topic not in connections:
-                connections[topic] = writer.add_connection(
-                    topic, out.message_type, typestore=messages._store
-                )
-            writer.write(connections[topic], stamp_ns, messages.to_bytes(out.message))
-    return path
-
-
 @pytest.mark.parametrize("kind", ["mcap", "packed mcap", "sqlite3", "packed sqlite3", "bag"])
 def test_bags_of_every_kind_are_played(tmp_path, kind):
     frames = [frame_number(n) for n in range(3)]
@@ -588,3 +558,17 @@ def test_close_ends_a_read_that_waits(tmp_path, monkeypatch):
     with pytest.raises(SourceLost):
         source.read(10 * PATIENCE_S)
     assert time.monotonic() - start < PATIENCE_S
+
+
+@pytest.mark.parametrize("form", ["mcap", "files"])
+def test_the_second_of_two_that_begin_to_record_into_one_folder_is_refused(
+    tmp_path, monkeypatch, form
+):
+    """Both looked before either had made it."""
+    monkeypatch.setattr("tumortrack.live.sinks.recording._make_room", lambda *_: None)
+    first = RecordTo(path=tmp_path / "tape", format=form).open(small_setting())
+    with pytest.raises((InputError, StorageError), match="exists"):
+        RecordTo(path=tmp_path / "tape", format=form).open(small_setting())
+    first.publish(update_number(0))
+    first.close()
+    assert stamps(play(tmp_path / "tape")) == [frame_number(0).stamp_ns]

@@ -1,4 +1,4 @@
-"""Minutes of tracking, mostly spent waiting for frames: a file of its own, for one worker."""
+"""Two minutes with every kind of fault: a file of its own, for one worker."""
 
 from __future__ import annotations
 
@@ -13,25 +13,28 @@ from stories import environment
 pytestmark = pytest.mark.slow
 
 
-def test_minutes_of_tracking_leave_memory_as_it_was(phantom_case, clinic_model):
-    """The hour is `make soak`."""
+def test_every_fault_is_named_and_nothing_wrong_is_called_good(phantom_case, clinic_model):
+    """The hour is `make soak`. On a loaded machine frames may be older, and answers take longer."""
     soak = Path(__file__).parents[2] / "lab" / "scripts" / "soak.py"
-    sinks = ["openigtlink:0", "viewer:0"]
-    options = ["--minutes", "1.5", "--fps", "8", "--error", "6", "--stale", "30"]
+    options = [
+        "--minutes",
+        "1.6",
+        "--seed",
+        "2",
+        "--fps",
+        "8",
+        "--stale",
+        "1",
+        "--within",
+        "20",
+        "--wrong",
+        "12",
+    ]
     done = subprocess.run(
-        [
-            sys.executable,
-            str(soak),
-            str(clinic_model),
-            str(phantom_case),
-            *options,
-            "--sinks",
-            *sinks,
-        ],
+        [sys.executable, str(soak), str(clinic_model), str(phantom_case), *options],
         capture_output=True,
         text=True,
         env=environment(),
-        timeout=600,
+        timeout=900,
     )
     assert done.returncode == 0, done.stdout + done.stderr
-    assert "after a minute" in done.stdout

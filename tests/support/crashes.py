@@ -1,6 +1,6 @@
 """Commands killed (kill -9) at random moments, and what is left.
 
-python tests/support/crashes.py FOLDER [--times 20] [--seed 0] [--only NAME]
+python tests/support/crashes.py FOLDER [--times 20] [--seed 0] [--only NAME]    (`make crash`)
 
 A killed training goes on to the weights of one that was never killed. A killed recording can be
 read to its last second. After a killed `locate` or `compile` there is the old artifact or the new
@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -21,20 +22,26 @@ from pathlib import Path
 import numpy as np
 
 from attacks import make_base
+from clock import until
 from stories import COMMAND, environment
 
+_LOST_S = 1.0  # of a recording, and the longest pause between two of its frames: on a busy machine
 Check = Callable[[], str]  # what is wrong, or nothing
 
 
-def killed(arguments: list[object], after_s: float) -> bool:
-    """Run a command and kill it, and whatever it started, after so long; False: it had ended."""
-    process = subprocess.Popen(
+def started(arguments: list[object]) -> subprocess.Popen[bytes]:
+    return subprocess.Popen(
         [*COMMAND, *map(str, arguments)],
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
         env=environment(),
         start_new_session=True,
     )
+
+
+def killed(arguments: list[object], after_s: float) -> bool:
+    """Run a command and kill it, and whatever it started, after so long; False: it had ended."""
+    process = started(arguments)
     try:
         process.wait(after_s)
         return False
@@ -59,26 +66,29 @@ def strays(folder: Path, *expected: str) -> str:
 
 
 def training(base: Path, folder: Path, times: int, rng: np.random.Generator) -> str:
-    """Killed ``times`` times, then left alone."""
+    """Killed again and again until it ended, the next likewise, ``times`` times in all."""
     from tumortrack.core.store import sha256_of
 
     options = ["--preset", "clinic", "--steps", 300, "--seed", 1, "--workers", 0, "--device", "cpu"]
     takes_s, fault = whole(["train", base / "case", folder / "undisturbed", *options])
     if fault:
         return fault
-    command = ["train", base / "case", folder / "killed", *options]
-    for _ in range(times):
-        if not killed(command, rng.uniform(0.2, 0.5 * takes_s)):
-            break
-    _, fault = whole(command) if not (folder / "killed" / "manifest.json").exists() else (0, "")
-    if fault:
-        return fault
-    names = ("weights.safetensors", "shape.safetensors")
-    same = all(
-        sha256_of(folder / "killed" / name) == sha256_of(folder / "undisturbed" / name)
-        for name in names
-    )
-    return strays(folder, "undisturbed", "killed") or ("" if same else "other weights")
+    kills, names = 0, []
+    while kills < times:
+        names.append(f"killed{len(names)}")
+        command = ["train", base / "case", folder / names[-1], *options]
+        while kills < times and killed(command, rng.uniform(0.2, 0.5 * takes_s)):
+            kills += 1
+        if not (folder / names[-1] / "manifest.json").exists():
+            _, fault = whole(command)
+        for weights in ("weights.safetensors", "shape.safetensors"):
+            if fault:
+                return fault
+            if sha256_of(folder / names[-1] / weights) != sha256_of(
+                folder / "undisturbed" / weights
+            ):
+                return f"other {weights} after {kills} kills"
+    return strays(folder, "undisturbed", *names)
 
 
 def locating(base: Path, folder: Path, times: int, rng: np.random.Generator) -> str:
@@ -88,15 +98,13 @@ def locating(base: Path, folder: Path, times: int, rng: np.random.Generator) -> 
 
 
 def compiling(base: Path, folder: Path, times: int, rng: np.random.Generator) -> str:
-    import shutil
-
     shutil.copytree(base / "quick", folder / "model")
     command: list[object] = ["compile", folder / "model"]
     takes_s, fault = whole(command)
     for _ in range(times):
         if fault:
             return fault
-        (folder / "model" / "compiled.json").unlink(missing_ok=True)
+        shutil.rmtree(folder / "model" / "compiled", ignore_errors=True)
         killed(command, rng.uniform(0.2, takes_s))
         _, fault = whole(["inspect", folder / "model"])
     _, fault = whole(command)
@@ -122,33 +130,64 @@ def _writing(
 
 
 def recording(base: Path, folder: Path, times: int, rng: np.random.Generator) -> str:
-    from tumortrack.core.errors import TumortrackError
-    from tumortrack.live.spec import SOURCES
-    from tumortrack.live.values import SourceEnded
-
     for number in range(times):
         place = folder / f"tape{number}"
-        command: list[object] = ["track", base / "model", f"virtual:{base / 'case'}"]
-        command += [f"recording:{place}", "--device", "cpu", "--report", folder / "report.json"]
-        after_s = rng.uniform(6, 12)
-        killed(command, after_s)
-        tapes = [path for path in (place, *place.rglob("*.mcap")) if path.exists()]
-        if not tapes:
-            continue  # killed before it began to record
-        read, source = 0, SOURCES.parse(f"recording:{place}?rate=0").open()
-        try:
-            while source.read(1.0) is not None:
-                read += 1
-        except SourceEnded:
-            pass
-        except TumortrackError as error:
-            return f"after {after_s:.1f} s and {read} frames: {error}"
-        finally:
-            source.close()
+        command: list[object] = ["track", base / "model", f"virtual:{base / 'case'}?fps=10"]
+        command += [f"recording:{place}", "--device", "cpu", "--stale", 5]
+        process = started([*command, "--report", folder / f"report{number}.json"])
+        _wait_for_chunks(place, process)
+        time.sleep(rng.uniform(0, 6))
+        killed_ns = time.time_ns()
+        if process.poll() is not None:
+            return "it ended by itself"
+        os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
+        stamps = [*stamps_of(place), killed_ns]
+        *pauses_s, lost_s = np.diff(stamps) * 1e-9
+        if lost_s > _LOST_S + max(pauses_s):
+            return f"{place.name} has {len(pauses_s)} frames and lacks the last {lost_s:.1f} s"
+        shutil.rmtree(place)
     return ""
 
 
+def _wait_for_chunks(place: Path, process: subprocess.Popen[bytes]) -> None:
+    """Until the first are on the disk."""
+
+    def there() -> bool:
+        sizes = [path.stat().st_size for path in place.rglob("*.mcap")]
+        return sum(sizes) > 2**20 or process.poll() is not None
+
+    until(there, "a tape")
+
+
+def stamps_of(tape: Path) -> list[int]:
+    """The stamps (ns) of the frames that can be played."""
+    from tumortrack.live.spec import SOURCES
+    from tumortrack.live.values import SourceEnded
+
+    stamps, source = [], SOURCES.parse(f"recording:{tape}?rate=0").open()
+    try:
+        while (seen := source.read(1.0)) is not None:
+            stamps.append(seen.stamp_ns)
+    except SourceEnded:
+        pass
+    finally:
+        source.close()
+    return stamps
+
+
 KINDS = {each.__name__: each for each in (training, locating, compiling, recording)}
+
+
+def make_bases(folder: Path) -> Path:
+    """A case, models of `clinic` and `quick`, a scene, a run and a plan, made once."""
+    base = folder.resolve() / "base"
+    if not base.exists():
+        base.mkdir(parents=True)
+        make_base(base)
+        quick = ["--preset", "quick", "--steps", 20, "--workers", 0, "--device", "cpu"]
+        whole(["train", base / "case", base / "quick", *quick])
+    return base
 
 
 def main() -> int:
@@ -158,13 +197,7 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--only", default="")
     given = parser.parse_args()
-    base = given.folder.resolve() / "base"
-    if not base.exists():
-        base.mkdir(parents=True)
-        make_base(base)
-    if not (base / "quick").exists():
-        quick = ["--preset", "quick", "--steps", 20, "--workers", 0, "--device", "cpu"]
-        whole(["train", base / "case", base / "quick", *quick])
+    base = make_bases(given.folder)
     faults = 0
     for name, kind in KINDS.items():
         if given.only in ("", name):

@@ -6,10 +6,14 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from rosbags.rosbag1 import Writer as Writer1
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 
 from live_objects import STAMP_NS, small_frame, small_setting, small_update
 from tumortrack.core.types import DepthFrame, SensorCloud
 from tumortrack.live import values as live
+from tumortrack.live.ros.messages import Messages
+from tumortrack.live.ros.sensors import messages_seen
 from tumortrack.live.sinks.recording import RecordingSinkConfig as RecordTo
 from tumortrack.live.values import Observation
 
@@ -36,4 +40,30 @@ def record(path: Path, updates: list[live.TrackingResult], **options) -> Path:
         sink.publish(update)
     sink.close()
     sink.close()
+    return path
+
+
+def write_bag(path: Path, topics: dict[str, list], kind: str) -> Path:
+    """A foreign bag: per topic messages' suffix in ``messages_seen`` and frames."""
+    messages = Messages("noetic" if kind == "bag" else "humble")
+    plugin = StoragePlugin.MCAP if "mcap" in kind else StoragePlugin.SQLITE3
+    writer = Writer1(path) if kind == "bag" else Writer(path, version=8, storage_plugin=plugin)
+    if kind.startswith("packed"):
+        mode = CompressionMode.STORAGE if "mcap" in kind else CompressionMode.MESSAGE
+        writer.set_compression(mode, CompressionFormat.ZSTD)
+    with writer:
+        connections = {}
+        rows = [
+            (content.stamp_ns, topic, out)
+            for topic, (suffix, contents) in topics.items()
+            for content in contents
+            for out in messages_seen(Observation(content, 0), messages)
+            if out.suffix == suffix
+        ]
+        for stamp_ns, topic, out in sorted(rows, key=lambda row: row[:2]):
+            if topic not in connections:
+                connections[topic] = writer.add_connection(
+                    topic, out.message_type, typestore=messages._store
+                )
+            writer.write(connections[topic], stamp_ns, messages.to_bytes(out.message))
     return path

@@ -67,6 +67,8 @@ class Track(StatedPatient):
         smoothing: time constant in s of a mean over past estimates; the lag is in the report.
         rescan: every so many s, look for the organ as in a first frame.
         stale: frames older than so many s are refused, and a pause so long is said.
+        frozen: an image that repeats bit for bit for so many s is refused; 0: it may repeat, as
+            of a simulated camera without noise.
         give_up: end after so many s without a frame.
         seconds: end so many s after the first frame; 0: never.
         report: file for latencies, counts and reasons (default: runs/track-TIME.json).
@@ -85,6 +87,7 @@ class Track(StatedPatient):
     smoothing: float = 0.0
     rescan: float = 1.0
     stale: float = 0.5
+    frozen: float = 0.25
     give_up: float = 60.0
     seconds: float = 0.0
     report: Path | None = None
@@ -177,6 +180,7 @@ class Track(StatedPatient):
             follower=follower,
             intrinsics=None if self.intrinsics is None else read_intrinsics(self.intrinsics),
             stale_s=self.stale,
+            frozen_s=self.frozen,
             give_up_s=self.give_up,
             seconds=self.seconds,
         )
@@ -196,11 +200,11 @@ def stage_words(state: str, ur: bool) -> str:
 
 
 def say_failures(sinks: list[SinkWorker], known: dict[str, str]) -> None:
-    """The error of each failing sink, unless it is ``known``, where it is then kept."""
+    """What troubles each sink, unless it is ``known``, where it is then kept."""
     for sink in sinks:
-        if sink.failing and known.get(sink.name) != sink.error:
-            known[sink.name] = sink.error
-            say(f"sink {sink.name}: {sink.error}")
+        if (trouble := sink.trouble) and known.get(sink.name) != trouble:
+            known[sink.name] = trouble
+            say(f"sink {sink.name}: {trouble}")
 
 
 def check_closed(sinks: list[SinkWorker]) -> None:

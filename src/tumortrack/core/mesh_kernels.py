@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import numba
+from tumortrack.core.compiled import numba
 
 
 @numba.njit(cache=True, fastmath=True, nogil=True)

@@ -6,6 +6,8 @@ sha256, the full configuration, units and frame. Nothing here loads pickles or r
 
 from __future__ import annotations
 
+import fcntl
+import glob
 import hashlib
 import json
 import os
@@ -134,13 +136,15 @@ def new_folder(path: Path, overwrite: bool = False) -> Iterator[Path]:
     """Fill a folder aside, then move it to ``path`` in one step; on any error nothing appears. What
     it replaces must be empty or of the kind that the new folder's manifest states: InputError as by
     ``check_place``. StorageError where the disk is full or not writable."""
-    if not overwrite:
-        check_place(path, "", overwrite)
     try:
+        _clear(path)
+        if not overwrite:
+            check_place(path, "", overwrite)
         path.parent.mkdir(parents=True, exist_ok=True)
         aside = Path(tempfile.mkdtemp(prefix=f".{path.name}.", suffix=".part", dir=path.parent))
     except OSError as error:
         raise StorageError(f"cannot write beside {path}: {error.strerror}.") from error
+    ours = _lock(aside)
     try:
         yield aside
         aside.chmod(0o755)
@@ -162,6 +166,35 @@ def new_folder(path: Path, overwrite: bool = False) -> Iterator[Path]:
         raise StorageError(f"cannot write {path}: {error.strerror or error}.") from error
     finally:
         _remove(aside)
+        if ours is not None:
+            os.close(ours)
+
+
+def _lock(folder: Path) -> int | None:
+    """Make a folder this process's own, until the descriptor is closed or the process ends, however
+    that happens. None: another has it, or the file system knows no locks."""
+    descriptor = None
+    try:
+        descriptor = os.open(folder, os.O_RDONLY)
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        if descriptor is not None:
+            os.close(descriptor)
+        return None
+    return descriptor
+
+
+def _clear(path: Path) -> None:
+    """Take away what processes that were killed left beside ``path``; what they had moved aside
+    and not replaced comes back."""
+    name = glob.escape(path.name)
+    for stale in path.parent.glob(f".{name}.????????.part"):
+        if (descriptor := _lock(stale)) is not None:
+            _remove(stale)
+            os.close(descriptor)
+    for old in path.parent.glob(f".{name}.????????.old"):
+        if not old.with_suffix(".part").exists():
+            os.rename(old, path) if not path.exists() else _remove(old)
 
 
 def _remove(path: Path) -> None:

@@ -24,7 +24,7 @@ _MAX_FILES = 20_000
 _NO_SLICE, _MULTI_FRAME = "no DICOM slices", "multi-frame DICOM objects"
 _CT = "1.2.840.10008.5.1.4.1.1.2"  # SOP class of CT images
 _UNDEFINED = 0xFFFFFFFF  # length of compressed pixels
-_DEFLATED = "1.2.840.10008.1.2.1.99"  # a transfer syntax in which pixels have no place of their own
+_DEFLATED = "1.2.840.10008.1.2.1.99"  # transfer syntax; readers unpack it before they look at it
 _AGAIN = "Export the series again."
 
 
@@ -194,6 +194,7 @@ def _groups(folder: Path) -> tuple[list[list[_Slice]], tuple[str, ...]]:
 def _read_tags(path: Path) -> _Slice | str:
     """The tags of one slice, or why the file is none (``_NO_SLICE``, ``_MULTI_FRAME``)."""
     import pydicom
+    from pydicom.filereader import read_dataset, read_file_meta_info
     from pydicom.valuerep import STANDARD_VR
 
     tags: Any = None
@@ -202,8 +203,15 @@ def _read_tags(path: Path) -> _Slice | str:
         is_dicom = stream.read(132)[128:] == b"DICM"
         stream.seek(0)
         try:
+            if is_dicom and (meta := read_file_meta_info(path)).TransferSyntaxUID == _DEFLATED:
+                tags = pydicom.FileDataset(path, {}, file_meta=meta)
+                raise ValueError("deflated as a whole, which is not read")
             tags = pydicom.dcmread(stream, stop_before_pixels=True)
-            types = {element.VR for part in (tags.file_meta, tags) for element in part.values()}
+            start = stream.tell()  # of the pixels; long values from there on are not read
+            rest = read_dataset(stream, *tags.original_encoding, defer_size=1024)
+            stream.seek(start)
+            parts = (tags.file_meta, tags, rest)
+            types = {element.VR for part in parts for element in part.values()}
             if strange := types - STANDARD_VR - {None}:  # GDCM takes their lengths for gigabytes
                 raise ValueError(f"elements of the type {sorted(strange)[0]!r}")
             if int(tags.get("NumberOfFrames") or 1) > 1:
@@ -248,8 +256,6 @@ def _should_be_slice(tags: Any) -> bool:
 def _pixel_fault(tags: Any, stream: BinaryIO) -> str:
     """What is wrong with the length of the pixels, to which the stream has come: decoders fill up
     what is missing, and make room for all that is claimed."""
-    if tags.file_meta.get("TransferSyntaxUID") == _DEFLATED:
-        return ""
     start, head = stream.tell(), stream.read(12)
     implicit, little = tags.original_encoding
     if head and not implicit and head[4:6] not in (b"OB", b"OW", b"OF", b"OD"):

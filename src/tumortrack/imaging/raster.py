@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
 from jaxtyping import Bool, Float, Int, Int16, UInt8
 
+from tumortrack.core.compiled import numba
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.types import Anatomy, Mesh

@@ -20,9 +20,10 @@ from jaxtyping import Float64
 
 from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError, NoEstimate, TumortrackError
-from tumortrack.core.estimate import Quality
+from tumortrack.core.estimate import Estimate, Quality
 from tumortrack.core.types import DepthFrame, Intrinsics, SensorCloud
 from tumortrack.live import values as live
+from tumortrack.live.frames import FrameCheck
 from tumortrack.live.meter import RunStatistics
 from tumortrack.live.stamps import StampCheck
 from tumortrack.live.values import Observation, SourceLost, TrackingResult
@@ -32,12 +33,15 @@ from tumortrack.sense.region import Hints, RegionConfig, organ_points
 from tumortrack.tracking.tracker import Follower, FollowerConfig, Tracker
 
 _PICK_S = 3.0  # without the organ: a pick is forgotten
+_QUIET = 0.8  # of stale_s: silence is said while what is shown still holds
+_SURE_AFTER = 3  # good estimates in a row after doubt: single frames of something else may pass
 
 
 class LoopConfig(Config, frozen=True, kw_only=True):
     """``stale_s``: no frame for so long, or one that old, gives 'no estimate'. ``give_up_s``: the
     loop ends where no frame came for so long. ``intrinsics``: of depth images, instead of what the
-    source says. ``seconds``: the loop ends so long after the first frame; 0: never."""
+    source says. ``frozen_s``: an image that repeats bit for bit for so long is an old one; 0: it
+    may repeat. ``seconds``: the loop ends so long after the first frame; 0: never."""
 
     region: RegionConfig = RegionConfig()
     follower: FollowerConfig = FollowerConfig()
@@ -45,6 +49,7 @@ class LoopConfig(Config, frozen=True, kw_only=True):
     stale_s: float = 0.5
     give_up_s: float = 60.0
     seconds: float = 0.0
+    frozen_s: float = 0.25
 
     def __post_init__(self) -> None:
         if not 0 < self.stale_s < self.give_up_s:
@@ -54,6 +59,8 @@ class LoopConfig(Config, frozen=True, kw_only=True):
             )
         if not self.seconds >= 0:
             raise InputError(f"seconds is {self.seconds:g}; it must be 0 (no end) or more.")
+        if not self.frozen_s >= 0:
+            raise InputError(f"frozen_s is {self.frozen_s:g}; it must be 0 (any) or more.")
 
 
 class _TooLate(NoEstimate):
@@ -73,12 +80,13 @@ class Loop:
     ) -> None:
         self._config, self._context, self._arms = config, context, arms
         self._follower = Follower(tracker, config.follower)
-        self._stamps = StampCheck(config.stale_s)
+        self._stamps, self._frames = StampCheck(config.stale_s), FrameCheck(config.frozen_s)
         self._stop = threading.Event()
         self._sequence = itertools.count()
         self._picked: Float64[np.ndarray, " 3"] | None = None  # by the user
         self._place_mm: Float64[np.ndarray, " 3"] | None = None  # where that is by now
         self._found_s = time.monotonic()
+        self._in_a_row = _SURE_AFTER  # good estimates since the last doubt
         self._stamp: tuple[int, int] | None = None  # of the last frame, and when that was here
         self.statistics = RunStatistics()
 
@@ -117,10 +125,11 @@ class Loop:
 
     def _results(self, source_worker: SourceWorker) -> Iterator[TrackingResult]:
         fresh_s = time.monotonic()
-        ends_s = math.inf
+        quiet_s = _QUIET * self._config.stale_s
+        ends_s, told_s = math.inf, fresh_s  # by when what is shown came to be
         while not self._stop.is_set():
-            got = source_worker.take(self._config.stale_s)
-            now_s = time.monotonic()
+            got = source_worker.take(max(told_s + quiet_s - time.monotonic(), 0.0))
+            now_s = told_s = time.monotonic()
             if isinstance(got, Observation):
                 got = self._calibrated(got)
             if isinstance(got, Observation):
@@ -128,7 +137,11 @@ class Loop:
                 if self._config.seconds and ends_s == math.inf:
                     ends_s = now_s + self._config.seconds
                 hurry = source_worker.latency_from != "taking"
-                yield self._answer(got, source_worker.born_ns(got), hurry)
+                result = self._answer(got, source_worker.born_ns(got), hurry)
+                told_s = time.monotonic()
+                if hurry and result.estimate is not None and result.latency_ms is not None:
+                    told_s -= result.latency_ms / 1000
+                yield result
             elif got is None and source_worker.ended:
                 return
             else:
@@ -149,20 +162,24 @@ class Loop:
         seconds: dict[str, float] = {}
         organ, estimate, reason, warning = None, None, "", ""
         quality: Quality = "none"
+        timely = False
         try:
             # What is simulated has this computer's clock, and so has the moment of arrival.
             other_clock = born_ns == seen.stamp_ns and seen.truth is None
             if self._stamps.check(seen.stamp_ns, _age_s(born_ns), other_clock):
                 self.statistics.clock_jumps += 1
                 self._follower.forget()
+            timely = True
+            self._frames.same_camera(seen.content)
             with _timed(seconds, "organ"):
                 rng = np.random.default_rng((self._config.follower.seed, seen.stamp_ns))
                 hints = self._hints(seen)
                 organ = organ_points(seen.content, self._config.region, hints, rng).cloud
+            self._frames.new(seen.content)  # that it shows nothing would be said before
             with _timed(seconds, "locate"):
                 estimate = self._follower.locate(organ, seen.content)
             seconds |= {f"locate.{k}": v for k, v in estimate.report["timings"].items()}
-            quality, warning = estimate.quality, estimate.reason
+            quality, warning = self._confirmed(estimate)
             self._follow_pick(organ)
             if hurry and _age_s(born_ns) > self._config.stale_s:
                 raise _TooLate(f"the answer came too late: {_age_s(born_ns):.2f} s after the frame")
@@ -170,6 +187,7 @@ class Loop:
             estimate, reason, quality, warning = None, str(error), "none", ""
             if not isinstance(error, _TooLate):  # that is the best place to start the next search
                 self._follower.forget()
+                self._in_a_row = 0 if timely else self._in_a_row
             if not isinstance(error, TumortrackError):  # a defect of ours: the next frame is tried
                 self.statistics.add_defect(error)
                 reason = f"internal error, {type(error).__name__}: {error}"
@@ -187,6 +205,13 @@ class Loop:
             seconds,
             latency_ms=1000 * _age_s(born_ns),
         )
+
+    def _confirmed(self, estimate: Estimate) -> tuple[Quality, str]:
+        """Its quality and warning: after doubt, good is what stays good."""
+        self._in_a_row = self._in_a_row + 1 if estimate.quality == "good" else 0
+        if 0 < self._in_a_row < _SURE_AFTER:
+            return "poor", f"good again for {self._in_a_row} of {_SURE_AFTER} frames"
+        return estimate.quality, estimate.reason
 
     def _without_frame(self, reason: str) -> TrackingResult:
         """The result where there is no frame; its stamp is now, by the source's clock as far as it

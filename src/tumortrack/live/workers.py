@@ -3,6 +3,7 @@ none holds up the loop or another."""
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 import traceback
@@ -28,6 +29,7 @@ _DEFECTS = 5  # tracebacks that are kept
 _STOP_S = 2.0  # how long close waits for a source that hangs
 _CLOSE_S = 10.0  # for a sink to write what waits, and flush
 _SILENT_S = 2.0  # without a word from the loop: what a sink shows holds no longer
+_SLOW_S = 0.25  # at one result: what a sink shows lags by as much
 
 
 class SourceWorker:
@@ -163,9 +165,17 @@ class SinkWorker:
         self.unclosed = False  # it failed at its end
         self.delivered = self.dropped = self.errors = 0
         self.failing, self.error = False, ""  # now; the last one there was
+        self._busy_s = math.inf  # since when it has been at one result
         self.latency = Histogram()  # from the stamp (or arrival) to the end of publish
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
         self._thread.start()
+
+    @property
+    def trouble(self) -> str:
+        """What is wrong with it now; empty if nothing is."""
+        if time.monotonic() - self._busy_s > _SLOW_S:
+            return f"slow: at one result for over {_SLOW_S:g} s, so what it shows is old"
+        return self.error if self.failing else ""
 
     def put(self, result: TrackingResult) -> None:
         """Returns at once."""
@@ -223,11 +233,14 @@ class SinkWorker:
             self.unclosed = True
 
     def _publish(self, result: TrackingResult, handed_s: float) -> None:
+        self._busy_s = time.monotonic()
         try:
             self._sink.publish(result)
         except Exception as error:  # whatever a sink raises must not end the loop
             self._failed(_text_of(error))
             return
+        finally:
+            self._busy_s = math.inf
         self.delivered += 1
         self.failing = False
         if result.latency_ms is not None:

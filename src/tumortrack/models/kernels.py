@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-import numba
 import numpy as np
+
+from tumortrack.core.compiled import numba
 
 _MAXIMUM = {"nnan", "nsz"}  # lets a maximum be taken in lanes; sums stay as they are written
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-import numba
 import numpy as np
+
+from tumortrack.core.compiled import numba
 
 
 @numba.njit(nogil=True, inline="always")

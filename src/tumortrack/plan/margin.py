@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-import numba
 import numpy as np
 import shapely
 from jaxtyping import Float, Float64, Int
@@ -17,6 +16,7 @@ from numpy.linalg import norm
 from scipy.ndimage import binary_closing, minimum_filter
 from skimage.measure import find_contours
 
+from tumortrack.core.compiled import numba
 from tumortrack.core.errors import NoPlan
 from tumortrack.plan.outline import arcs, evenly_round, first_in_cell, polygon_of, rings_of
 from tumortrack.plan.values import (

@@ -10,9 +10,9 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-import numba
 import numpy as np
 
+from tumortrack.core.compiled import numba
 from tumortrack.registration.kernels import POSE, DistanceField, Flow, Pose, add_rows
 from tumortrack.simulate.elastic.flow import BLOCK, LatticeField, block, combine, steps_of
 

@@ -9,10 +9,10 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import numba
 import numpy as np
 from scipy.special import ndtr
 
+from tumortrack.core.compiled import numba
 from tumortrack.simulate.elastic.flow import BLOCK, add_modes, block, enter, travel
 
 POSE = 6  # unknowns before the coefficients

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import numba
 import numpy as np
 from jaxtyping import Bool, Float32
+
+from tumortrack.core.compiled import numba
 
 _SHADOW_BIAS = 4.0  # pixels of the shadow's picture: a surface doesn't shade itself
 

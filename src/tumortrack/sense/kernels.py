@@ -13,9 +13,10 @@ import math
 from functools import lru_cache
 from typing import NamedTuple
 
-import numba
 import numpy as np
 from scipy.special import ndtri
+
+from tumortrack.core.compiled import numba
 
 # Quantiles of the normal distribution: a hash's low 14 bits choose one. Scaled to variance 1.
 _QUANTILES = ndtri((np.arange(2**14) + 0.5) / 2**14)

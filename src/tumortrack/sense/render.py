@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 from jaxtyping import Bool, Float
 
+from tumortrack.core.compiled import numba
 from tumortrack.core.types import DepthFrame, Intrinsics, Mesh
 from tumortrack.sense.camera import pinhole_of
 

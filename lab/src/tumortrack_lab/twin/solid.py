@@ -15,10 +15,10 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, NamedTuple
 
-import numba
 import numpy as np
 from jaxtyping import Float, Float64, Int32
 
+from tumortrack.core.compiled import numba
 from tumortrack_lab.tets import TetMesh
 
 if TYPE_CHECKING:

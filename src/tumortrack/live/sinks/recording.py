@@ -116,14 +116,19 @@ class McapFile:
 
     def __init__(self, folder: Path, context: SinkContext, frames: bool, meshes_hz: float) -> None:
         self._messages, self._frames = Messages(), frames
-        from rosbags.rosbag2 import StoragePlugin, Writer
+        from rosbags.rosbag2 import StoragePlugin, Writer, WriterError
 
         self._results = ResultMessages(self._messages, context, meshes_hz, observed=False)
         self._connections: dict[str, Any] = {}
         self._last_ns, self._chunk_s = 0, time.monotonic()
         self._refused = ""
-        writer: Any = Writer(folder, version=8, storage_plugin=StoragePlugin.MCAP)  # 8: Humble's
-        writer.open()
+        try:
+            writer: Any = Writer(
+                folder, version=8, storage_plugin=StoragePlugin.MCAP
+            )  # 8: Humble's
+            writer.open()
+        except WriterError as error:  # another process began to record into it a moment ago
+            raise InputError(f"{folder} exists already. Choose another folder.") from error
         self._writer, self._storage = writer, writer.storage
         self._storage.bio.close()  # what is buffered could not be taken back on a full disk
         self._storage.bio = self._file = _WholeWrites(self._storage.path)

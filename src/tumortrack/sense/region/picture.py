@@ -6,10 +6,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 from jaxtyping import Bool, Float
 
+from tumortrack.core.compiled import numba
 from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError
 from tumortrack.core.types import DepthFrame, SensorCloud

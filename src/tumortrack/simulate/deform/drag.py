@@ -15,10 +15,10 @@ import math
 from dataclasses import dataclass
 from typing import Any, Literal
 
-import numba
 import numpy as np
 from jaxtyping import Float32
 
+from tumortrack.core.compiled import numba
 from tumortrack.core.config import Config
 from tumortrack.core.errors import TumortrackError
 from tumortrack.simulate.deform.base import Points, View

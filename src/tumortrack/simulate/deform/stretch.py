@@ -11,11 +11,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-import numba
 import numpy as np
 from jaxtyping import Float32, Float64
 from scipy.spatial.transform import Rotation
 
+from tumortrack.core.compiled import numba
 from tumortrack.core.config import Config
 from tumortrack.simulate.deform.base import Points, View
 

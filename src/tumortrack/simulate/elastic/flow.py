@@ -10,9 +10,10 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-import numba
 import numpy as np
 from jaxtyping import Float32
+
+from tumortrack.core.compiled import numba
 
 _PER_SLOPE = 10  # steps, times the field's steepest slope: back within 0.01 mm of the start
 _FEWEST, _MOST = 3, 24

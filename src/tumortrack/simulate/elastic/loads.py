@@ -12,11 +12,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-import numba
 import numpy as np
 from jaxtyping import Float64
 from scipy.spatial.transform import Rotation
 
+from tumortrack.core.compiled import numba
 from tumortrack.core.geometry import perpendicular, unit
 from tumortrack.simulate.elastic.modes import ReducedModel
 

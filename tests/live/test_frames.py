@@ -1,0 +1,160 @@
+"""Frames that are old, of another camera, or doubtful: what the loop says of them."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from clock import Clock, until
+from live_objects import CAMERA, STAMP_NS, small_estimate, small_frame, small_setting, small_update
+from tumortrack.core.errors import NoEstimate
+from tumortrack.live.frames import FrameCheck
+from tumortrack.live.loop import Loop, LoopConfig
+from tumortrack.live.values import Observation
+from tumortrack.live.workers import SinkWorker, SourceWorker
+from tumortrack.sense.region import RegionConfig
+from tumortrack.tracking.tracker import Tracker
+
+SECOND_NS = 10**9
+ALL = RegionConfig(plane=False, flying=False, pieces=False)
+
+
+class Located(Tracker):
+    """A tracker that finds the small organ; ``verdicts``: good, poor or none, frame after frame."""
+
+    anatomy_ct = None
+
+    def __init__(self, *verdicts):  # no model
+        self._verdicts = list(verdicts)
+
+    def follow(self, cloud, last=None, how=None, seen=None):
+        verdict = self._verdicts.pop(0) if self._verdicts else "good"
+        if verdict == "none":
+            raise NoEstimate("it does not look like this organ")
+        estimate = small_estimate(cloud.stamp_ns)
+        estimate.report["timings"] = {}
+        return replace(
+            estimate, quality=verdict, reason="" if verdict == "good" else "it is doubtful"
+        )
+
+
+class Frames(SourceWorker):
+    """Hands over what it is given, without a thread."""
+
+    def __init__(self, frames=(), latency_from="taking"):
+        self._left = list(frames)
+        self.latency_from, self.trouble, self.ended, self.failure = latency_from, "", False, None
+
+    def take(self, timeout_s):
+        self.ended = not self._left
+        return self._left.pop(0) if self._left else None
+
+
+def results(frames, tracker=None, config=None):
+    """The loop's result of each frame."""
+    loop, got = Loop(tracker or Located(), small_setting(), config or LoopConfig(region=ALL)), []
+    loop.run(Frames(frames), [], got.append)
+    return got
+
+
+def frame_at(seconds, changed=True):
+    frame = small_frame(STAMP_NS + int(seconds * SECOND_NS))
+    if changed:
+        depth_mm = frame.depth_mm + np.float32(seconds / 100)
+        frame = replace(frame, depth_mm=depth_mm)
+    return Observation(frame, frame.stamp_ns)
+
+
+def test_an_image_that_repeats_under_new_stamps_is_an_old_one():
+    frames = [frame_at(0.1 * n, changed=not 3 <= n < 9) for n in range(1, 12)]
+    told = results(frames)
+    frozen = [n for n, one in enumerate(told, start=1) if "frozen" in one.reason]
+    assert frozen == [6, 7, 8]  # the first of them at 0.3 s is new, and 0.25 s pass
+    assert "the same image for 0.30 s" in told[5].reason
+    assert told[5].estimate is None
+    assert told[-1].estimate is not None
+    allowed = results(frames, config=LoopConfig(region=ALL, frozen_s=0.0))
+    assert all(one.estimate is not None for one in allowed)
+
+
+def test_two_images_without_return_where_they_differ_are_two():
+    one, other = small_frame(), small_frame(STAMP_NS + SECOND_NS)
+    depth_mm = other.depth_mm.copy()
+    depth_mm[0, 0] = np.nan
+    check = FrameCheck(0.25)
+    check.new(one)
+    check.new(replace(other, depth_mm=depth_mm))
+    with pytest.raises(NoEstimate, match="frozen"):
+        check.new(replace(other, depth_mm=depth_mm, stamp_ns=other.stamp_ns + SECOND_NS))
+
+
+def test_a_camera_that_changes_is_refused_until_it_is_back():
+    other = replace(CAMERA, fx=CAMERA.fx * 1.1)
+    frames = [frame_at(0.1 * n) for n in range(6)]
+    for n in (2, 3):
+        frames[n] = replace(frames[n], content=replace(frames[n].content, intrinsics=other))
+    told = results(frames)
+    assert [one.estimate is None for one in told] == [False, False, True, True, False, False]
+    assert "intrinsics changed from 64 x 48 (f 60, 61" in told[2].reason
+    assert "(f 66, 61" in told[2].reason
+
+
+def test_after_doubt_good_is_what_stays_good():
+    verdicts = ["good", "good", "none", "good", "poor", "good", "good", "good", "good"]
+    told = results([frame_at(0.1 * n) for n in range(9)], Located(*verdicts))
+    assert [one.quality for one in told] == [
+        *("good", "good", "none", "poor", "poor", "poor", "poor", "good", "good"),
+    ]
+    assert told[5].warning == "good again for 1 of 3 frames"
+
+
+def test_silence_is_said_before_what_is_shown_is_stale(monkeypatch):
+    """Of four fifths of 0.5 s, 0.1 s are left for a frame that took 0.3 s to answer."""
+    clock, waits = Clock(), []
+    monkeypatch.setattr(sys.modules["tumortrack.live.loop"], "time", clock)
+
+    class Slow(Located):
+        def follow(self, cloud, last=None, how=None, seen=None):
+            clock.sleep(0.3)
+            return super().follow(cloud, last, how, seen)
+
+    class Waiting(Frames):
+        def take(self, timeout_s):
+            waits.append(timeout_s)
+            if len(waits) == 1:
+                return Observation(small_frame(clock.time_ns()), clock.time_ns())
+            clock.sleep(timeout_s)
+            self.ended = len(waits) > 3
+            return None
+
+    told = []
+    Loop(Slow(), small_setting(), LoopConfig(region=ALL)).run(
+        Waiting(latency_from="stamp"), [], told.append
+    )
+    assert waits == pytest.approx([0.4, 0.1, 0.4, 0.4])
+    assert told[0].estimate is not None
+    assert told[1].reason.startswith("no frame for 0.4 s")
+
+
+def test_a_sink_that_hangs_at_a_result_is_in_trouble():
+    inside, free = [], []
+
+    class Hangs:
+        def publish(self, result):
+            inside.append(result)
+            until(lambda: free)
+
+        def close(self):
+            pass
+
+    worker = SinkWorker("it", Hangs(), 1)
+    assert not worker.trouble
+    worker.put(small_update())
+    until(lambda: inside)
+    until(lambda: "slow" in worker.trouble)
+    free.append(True)
+    until(lambda: not worker.trouble)
+    worker.close()
