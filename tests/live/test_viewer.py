@@ -440,7 +440,7 @@ def test_page_in_a_browser(sinks, monkeypatch):
     with Browser(780, 480) as browser:
         feed = Feed(sink, shown)
         try:
-            browser.open(f"http://127.0.0.1:{sink.port}")
+            browser.open(sink.url)
             until(lambda: "NO CHECK FAILED" in browser.text(), "the page")
             until(lambda: greenish(browser.picture()) > 700, "a tumor")
             until(lambda: kidneyish(browser.picture()) > 5000)
@@ -457,7 +457,7 @@ def test_page_in_a_browser(sinks, monkeypatch):
 
             feed.update = hidden
             browser.open("about:blank")
-            browser.open(f"http://127.0.0.1:{sink.port}")  # a second visit sees the present state
+            browser.open(sink.url)  # a second visit sees the present state
             until(lambda: "only 12 points" in browser.text(), "the page again")
             feed.update = replace(shown, quality="poor", warning="it fits only to 3 mm")
             until(lambda: "it fits only to 3 mm" in browser.text(), "the warning")

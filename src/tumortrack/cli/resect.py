@@ -286,6 +286,7 @@ class Resect(StatedPatient):
         context = SinkContext(tuple(stored.meshes), frames, None, controls, True, stored.patient)
         stop = track.stopping(lambda: operation.abort(track.STOPPED))
         with stop, api.open_sinks(api.named_sinks(self.sinks), context) as sinks:
+            track.say_opened(sinks)
             say(f"{stored.motions.seconds / config.speed:.0f} s in frame {frames.frame_id!r}; "
                 "Ctrl-C stops the arms.")  # fmt: skip
             errors: dict[str, str] = {}

@@ -160,6 +160,7 @@ class Track(StatedPatient):
             api.open_sinks(named, context) as sinks,
             closing(SourceWorker(source_config.open)) as source,
         ):
+            say_opened(sinks)
             ur = arms is not None and arms.ur
             screen = _Screen(loop, source, sinks, report, about, companion, ur)
             ending.callback(screen.end)  # once all workers have flushed
@@ -183,6 +184,13 @@ class Track(StatedPatient):
             give_up_s=self.give_up,
             seconds=self.seconds,
         )
+
+
+def say_opened(sinks: list[SinkWorker]) -> None:
+    """Where each sink is to be found, and who can reach it."""
+    for sink in sinks:
+        for note in sink.notes:
+            say(f"sink {sink.name}: {note}")
 
 
 def stage_words(state: str, ur: bool) -> str:

@@ -277,7 +277,7 @@ class SinkContext:
 class Sink(Protocol):
     """An open sink. Both methods are called from one thread of its own, so they may take their
     time. Errors are counted and reported, and the loop goes on. A ``counts: dict[str, int]``, if
-    there is one, goes into the run's report."""
+    there is one, goes into the run's report; ``notes``, lines of text, are told when it is open."""
 
     def publish(self, result: TrackingResult) -> None: ...
 
