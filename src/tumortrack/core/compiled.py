@@ -29,4 +29,5 @@ def _kept_or_none(self: Any, key: Any) -> Any:
         return None
 
 
-IndexDataCacheFile._load_index, IndexDataCacheFile.load = _index_or_none, _kept_or_none
+setattr(IndexDataCacheFile, "_load_index", _index_or_none)  # noqa: B010  as mypy wants it
+setattr(IndexDataCacheFile, "load", _kept_or_none)  # noqa: B010

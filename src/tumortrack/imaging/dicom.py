@@ -203,16 +203,20 @@ def _read_tags(path: Path) -> _Slice | str:
         is_dicom = stream.read(132)[128:] == b"DICM"
         stream.seek(0)
         try:
-            if is_dicom and (meta := read_file_meta_info(path)).TransferSyntaxUID == _DEFLATED:
+            if (
+                is_dicom
+                and (meta := read_file_meta_info(path)).get("TransferSyntaxUID") == _DEFLATED
+            ):
                 tags = pydicom.FileDataset(path, {}, file_meta=meta)
                 raise ValueError("deflated as a whole, which is not read")
             tags = pydicom.dcmread(stream, stop_before_pixels=True)
             start = stream.tell()  # of the pixels; long values from there on are not read
-            rest = read_dataset(stream, *tags.original_encoding, defer_size=1024)
+            implicit, little = tags.original_encoding
+            rest = read_dataset(stream, implicit, little, defer_size=1024)
             stream.seek(start)
             parts = (tags.file_meta, tags, rest)
-            types = {element.VR for part in parts for element in part.values()}
-            if strange := types - STANDARD_VR - {None}:  # GDCM takes their lengths for gigabytes
+            types = {str(element.VR) for part in parts for element in part.values()}
+            if strange := types - STANDARD_VR - {"None"}:  # GDCM takes their lengths for gigabytes
                 raise ValueError(f"elements of the type {sorted(strange)[0]!r}")
             if int(tags.get("NumberOfFrames") or 1) > 1:
                 return _MULTI_FRAME
