@@ -1,32 +1,46 @@
-# Bare `make` lists the targets. Everything is installed into .venv from PyPI, pinned.
+# Bare `make` lists the targets. Everything is installed into .venv from PyPI, by hash.
 PYTHON ?= python3
 BIN := .venv/bin
 SETUP := .venv/.installed
+TOOLS := .tools/.installed
+INSTALL := pip install --quiet --disable-pip-version-check --no-compile --no-deps
 # Whatever the environment says: without kept bytecode every start compiles PyTorch anew, for 4 s.
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: help setup debian demo test test-hard check attack fuzz crash replay bench soak wheel results headstart training-speed foreign clean
+.PHONY: help setup debian demo test test-hard check attack fuzz crash replay bench soak wheel lock licences audit results headstart training-speed foreign clean
 
 help:  ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 10
 
 setup: $(SETUP)  ## install everything into .venv
 
-$(SETUP): pyproject.toml lab/pyproject.toml constraints.txt
+# PyTorch's CPU build is taken where pip knows of it, else PyPI's, which on Linux needs CUDA's packages.
+$(SETUP): pyproject.toml lab/pyproject.toml requirements/lock.txt requirements/cuda.txt requirements/torch-cpu.txt
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "tumortrack needs Python 3.11 or newer; give make PYTHON=python3.11")'
 	$(PYTHON) -m venv .venv
-	$(BIN)/pip install --quiet --disable-pip-version-check --no-compile -c constraints.txt -e '.[dev,report,tensorboard,pcd,live,arms,onnx]' -e lab
+	$(BIN)/$(INSTALL) --require-hashes -r requirements/torch-cpu.txt 2>/dev/null || echo "PyTorch: PyPI's build"
+	$(BIN)/$(INSTALL) --require-hashes -r requirements/lock.txt
+	if $(BIN)/python -c 'from importlib.metadata import requires; print(requires("torch"))' | grep -q nvidia; then \
+	$(BIN)/$(INSTALL) --require-hashes -r requirements/cuda.txt; fi
+	$(BIN)/$(INSTALL) --no-build-isolation -e . -e lab
+	$(BIN)/pip check
+	touch $@
+
+$(TOOLS): requirements/tools.txt
+	$(PYTHON) -m venv .tools
+	.tools/bin/$(INSTALL) --require-hashes -r requirements/tools.txt
 	touch $@
 
 demo: setup  ## CT -> tumors located in unseen deformed scenes (about 5 minutes)
 	$(BIN)/tumortrack demo
 
-check: setup  ## lint, types, import order
+check: setup  ## lint, types, import order, licences
 	$(BIN)/ruff check src lab tests examples tools
 	$(BIN)/ruff format --check src lab tests examples tools
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+	$(BIN)/python tools/dependencies.py licences
 
 debian:  ## what tests need of Debian (ROS, RViz, Chromium), where it can be installed
 	tools/debian.sh
@@ -70,8 +84,21 @@ training-speed: setup  ## accuracy reached per second, by batch, learning rate a
 foreign: setup  ## how often another kidney, or a mirrored one, is called good (an hour)
 	$(BIN)/python lab/scripts/foreign.py $(ARGS)
 
-wheel: setup  ## build the wheels of product and laboratory into dist/
-	$(BIN)/pip wheel --quiet --no-deps --wheel-dir dist . ./lab
+wheel: setup  ## build the wheels of product and laboratory into dist/, with what they need (SBOM)
+	$(BIN)/pip wheel --quiet --no-deps --no-build-isolation --wheel-dir dist . ./lab
+	$(BIN)/python tools/dependencies.py sbom dist/tumortrack-*.whl dist/tumortrack_lab-*.whl
+
+lock: setup $(TOOLS)  ## pin the dependencies by hash (ARGS=--upgrade: newest; "--upgrade-package NAME")
+	PATH="$(CURDIR)/.tools/bin:$$PATH" $(BIN)/python tools/dependencies.py lock $(ARGS)
+
+licences: setup  ## list the dependencies' licences in docs/dependencies.md; fails on one not allowed
+	$(BIN)/python tools/dependencies.py table
+	$(BIN)/python tools/dependencies.py licences
+
+audit: $(TOOLS)  ## known vulnerabilities of all that is pinned; fails too where PyPI does not answer
+	@.tools/bin/pip-audit --strict --progress-spinner off --disable-pip --require-hashes \
+	$(foreach name,lock cuda ur tools,-r requirements/$(name).txt) || { echo \
+	"audit: not passed: there are vulnerabilities (listed above), or PyPI could not be asked" >&2; exit 1; }
 
 clean:  ## remove .venv and caches (runs/ stays)
-	rm -rf .venv .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache
+	rm -rf .venv .tools .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache

@@ -7,6 +7,7 @@ everywhere; the CT frame is LPS, the camera frame x right, y down, z forward. Al
 
 from __future__ import annotations
 
+import logging
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing, contextmanager
@@ -358,6 +359,9 @@ def track(
             loop.stop()
 
     with open_sinks(named, context) as workers, closing(SourceWorker(config.open)) as reader:
+        for worker in workers:
+            for note in worker.notes:  # a viewer's address, or that others can see it
+                logging.getLogger("tumortrack").warning("sink %s: %s", worker.name, note)
         loop.run(reader, workers, seen)
     return summary(loop, reader, workers)
 

@@ -197,6 +197,7 @@ NEEDS = {
     "same": "a model of the case that was planned on",
     "plan": "a plan that says which case",
     "frame": "--frame FILE (this one's frame is invented)",
+    "camera": "--frame FILE that has camera_frame_id",
     "cell": "--cell FILE that gives both bases",
     "good": "a plan made on a good estimate",
     "speed": "--speed up to 1, not 2",
@@ -266,7 +267,7 @@ def test_a_real_arm_moves_only_with_all_that_it_needs_and_nothing_is_connected_b
     for name in ("patient", "side"):
         assert resect(*live, given / name, "realsense") == {"theirs", "person"}
     assert resect(*live, given / "unknown", "realsense") == {"model", "person"}
-    assert resect(*live, given / "other", "ros2:/depth") == {"same", "person"}
+    assert resect(*live, given / "other", "ros2:/depth") == {"same", "camera", "person"}
     for source in (f"virtual:{given}", "recording:seen", "realsense:seen.bag",
                    "realsense?device=seen.bag"):  # fmt: skip
         assert resect(*live, given / "model", source) == {"source", "person"}
@@ -305,6 +306,21 @@ def test_a_run_of_an_unknown_case_moves_no_real_arm(story, given, tmp_path):
     store.seal(plan, "plan", {}, "base_link")
     done = tumortrack("resect", plan, REAL, *STATED, "--live", given / "model", "realsense")
     assert missing(done) == {"plan", "person"}
+
+
+def test_a_ros_camera_moves_a_real_arm_only_if_the_calibration_names_its_frame(given, tmp_path):
+    live = ("--live", given / "model", "ros2:/depth", *STATED)
+    assert "camera" in missing(tumortrack("resect", given / "plan", REAL, *live))
+    data = json.loads((given / "plan" / "plan.json").read_text())
+    plan = tmp_path / "plan"
+    shutil.copytree(given / "plan", plan)
+    named = {"camera_frame_id": "left", "table_in_camera": [0.0, 0.0, -1.0, -180.0]}
+    (plan / "plan.json").write_text(json.dumps(data | named))
+    store.seal(plan, "plan", {}, "base_link")
+    assert missing(tumortrack("resect", plan, REAL, *live)) == {"person"}
+    frames = read_plan(plan).frames
+    assert (frames.calibrated, frames.camera_frame_id) == (True, "left")
+    assert frames.table_in_camera == (0.0, 0.0, -1.0, -180.0)
 
 
 def test_a_plan_of_nobody_moves_no_real_arm_and_one_of_another_nothing(story, given, tmp_path):

@@ -13,7 +13,7 @@ from live_objects import CAMERA, STAMP_NS, small_estimate, small_frame, small_se
 from tumortrack.core.errors import NoEstimate
 from tumortrack.live.frames import FrameCheck
 from tumortrack.live.loop import Loop, LoopConfig
-from tumortrack.live.values import Observation
+from tumortrack.live.values import Observation, PublishedFrame
 from tumortrack.live.workers import SinkWorker, SourceWorker
 from tumortrack.sense.region import RegionConfig
 from tumortrack.tracking.tracker import Tracker
@@ -84,11 +84,11 @@ def test_two_images_without_return_where_they_differ_are_two():
     one, other = small_frame(), small_frame(STAMP_NS + SECOND_NS)
     depth_mm = other.depth_mm.copy()
     depth_mm[0, 0] = np.nan
-    check = FrameCheck(0.25)
-    check.new(one)
-    check.new(replace(other, depth_mm=depth_mm))
+    check = FrameCheck(PublishedFrame(), ALL, 0.25)
+    check.check_new(one)
+    check.check_new(replace(other, depth_mm=depth_mm))
     with pytest.raises(NoEstimate, match="frozen"):
-        check.new(replace(other, depth_mm=depth_mm, stamp_ns=other.stamp_ns + SECOND_NS))
+        check.check_new(replace(other, depth_mm=depth_mm, stamp_ns=other.stamp_ns + SECOND_NS))
 
 
 def test_a_camera_that_changes_is_refused_until_it_is_back():

@@ -102,10 +102,10 @@ class Notes:
         pass
 
 
-def play(tracker, items, config=None, sink=None, **script):
+def play(tracker, items, config=None, sink=None, published=None, **script):
     """Run the loop over items; the updates, and the summary."""
-    sink = sink or Notes()
-    setting = SinkContext(tracker.model.parts, PublishedFrame(), tracker.anatomy_ct, Controls())
+    sink, published = sink or Notes(), published or PublishedFrame()
+    setting = SinkContext(tracker.model.parts, published, tracker.anatomy_ct, Controls())
     loop = Loop(tracker, setting, config or LoopConfig(region=WHOLE, stale_s=PATIENCE_S / 2))
     outlets = [SinkWorker("notes", sink, 1000)]
     scripts = iter([Script(items, **script)])
@@ -246,6 +246,17 @@ def test_what_is_no_organ_gives_no_estimate_and_no_old_one(tracker, stages):
     assert "at least 200" in updates[4].reason
     assert told["no_estimate"] == 2
     assert sum(told["reasons"].values()) == 2
+
+
+def test_another_cameras_frame_is_published_nowhere(tracker, stages):
+    here = PublishedFrame("base", calibrated=True, camera_frame_id="left")
+    names = ["left", "right", "left", "left"]
+    clouds = moving(stages[0], len(names))
+    items = [Observation(one, 0, frame_id=n) for one, n in zip(clouds, names, strict=True)]
+    updates, _ = play(tracker, items, published=here)
+    assert [one.estimate is not None for one in updates] == [n == "left" for n in names]
+    assert "the calibration is for 'left'" in updates[1].reason
+    assert updates[1].transformed is None
 
 
 def test_garbage_and_defects_are_said_and_survived(tracker, stages, monkeypatch):

@@ -54,7 +54,7 @@ def test_an_update_arrives_where_slicer_has_our_files(opened) -> None:
     sink.publish(small_update(sequence=7))
     heard = hear_all(sock, ALL)
     status = heard["STATUS", "tumortrack"]
-    assert unpack_status(status.content) == IgtlStatus(1, "good", "")
+    assert unpack_status(status.content) == IgtlStatus(1, "good", small_update().describe())
     assert status.metadata == {
         "frame_id": "camera", "sequence": "7", "quality": "good", "latency_ms": "12.5",
         "patient": "P1", "side": "left",

@@ -400,7 +400,7 @@ with rosbag.Bag(sys.argv[1], "w", compression=sys.argv[2], chunk_threshold=100) 
         image = Image(header=header, height=2, width=3, encoding="16UC1", step=6)
         image.data = struct.pack("<6H", 120 + n, 0, 130, 140, 150, 160)
         info = CameraInfo(header=header, height=2, width=3, D=[0.0] * 5)
-        info.K = [60.0, 0, 1.25, 0, 61, 0.5, 0, 0, 1]
+        info.K = [6.0, 0, 1.25, 0, 6.5, 0.5, 0, 0, 1]
         bag.write("/arm/depth/image_raw", image, header.stamp)
         bag.write("/arm/depth/camera_info", info, header.stamp)
 """

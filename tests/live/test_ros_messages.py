@@ -108,8 +108,8 @@ def info_message(messages: Messages = HUMBLE, **changes) -> object:
         "height": 2,
         "width": 3,
         "d": np.zeros(5),
-        "k": np.array([60.0, 0, 1.25, 0, 61, 0.5, 0, 0, 1]),
-        "p": np.array([50.0, 0, 1, 0, 0, 51, 0.75, 0, 0, 0, 1, 0]),
+        "k": np.array([6.0, 0, 1.25, 0, 6.5, 0.5, 0, 0, 1]),
+        "p": np.array([5.0, 0, 1, 0, 0, 5.5, 0.75, 0, 0, 0, 1, 0]),
     }
     return messages.make(CAMERA_INFO, **(given | changes))
 
@@ -190,9 +190,21 @@ def test_depth_images_of_any_encoding_give_the_same_frame(encoding, dtype, scale
     frame = depth_of(image, info_message())
     expected = np.where(depth_mm > 0, depth_mm, np.nan)
     np.testing.assert_allclose(frame.depth_mm, expected, rtol=1e-6)
-    assert (frame.intrinsics.fx, frame.intrinsics.cx) == (60.0, 1.25)
-    assert (frame.intrinsics.fy, frame.intrinsics.cy) == (61.0, 0.5)
+    assert (frame.intrinsics.fx, frame.intrinsics.cx) == (6.0, 1.25)
+    assert (frame.intrinsics.fy, frame.intrinsics.cy) == (6.5, 0.5)
     assert frame.stamp_ns == STAMP_NS
+
+
+def test_a_camera_info_of_another_camera_or_of_none_is_refused():
+    image = image_message(np.full((2, 3), 150, "<u2"), "16UC1")
+    nameless, other = (HUMBLE.header(STAMP_NS, name) for name in ("", "leg"))
+    assert depth_of(image, info_message(header=nameless)).stamp_ns == STAMP_NS
+    with pytest.raises(InputError, match=r"in the frame 'arm' .* camera_info of 'leg'"):
+        depth_of(image, info_message(header=other))
+    for focal in (0.2, 16.0, 600.0):  # of 3 pixels: 0.3 to 15
+        k = np.array([focal, 0, 1.25, 0, 6.5, 0.5, 0, 0, 1])
+        with pytest.raises(InputError, match="no depth camera's of 3 x 2"):
+            depth_of(image, info_message(k=k))
 
 
 def test_no_return_in_float_images_and_steps_of_another_unit():
@@ -208,7 +220,7 @@ def test_a_rectified_image_has_the_camera_of_p_in_either_ros():
     image = image_message(np.ones((2, 3), np.uint16), "16UC1")
     for messages in (HUMBLE, NOETIC):
         info = info_message(messages, d=np.array([0.1, 0, 0, 0, 0]))
-        assert depth_of(image, info, rectified=True).intrinsics.fx == 50.0
+        assert depth_of(image, info, rectified=True).intrinsics.fx == 5.0
         with pytest.raises(InputError, match="distortion"):
             depth_of(image, info)
 
@@ -347,7 +359,7 @@ def test_an_estimate_is_sent_in_metres_in_the_published_frame():
         assert meshes[name].type == meshes[name].TRIANGLE_LIST
     assert meshes["kidney"].color.a < 0.5 < meshes["tumor_1"].color.a
     assert all(marker.lifetime.sec > 0 for marker in meshes.values())
-    assert meshes["quality"].text == "good"
+    assert meshes["quality"].text == "fit: no check failed; its place is not verified"
 
     point = out["tumor_1/center"].point
     middle = small_anatomy().parts[1].box_mm.mean(0)
@@ -454,7 +466,7 @@ cloud = point_cloud2.create_cloud_xyz32(header, [(0.01, -0.02, 0.125), (0.003, 0
 image = Image(header=header, height=2, width=3, encoding="16UC1", step=6)
 image.data = struct.pack("<6H", 120, 0, 130, 140, 150, 160)
 info = CameraInfo(header=header, height=2, width=3, D=[0.0] * 5)
-info.K = [60.0, 0, 1.25, 0, 61, 0.5, 0, 0, 1]
+info.K = [6.0, 0, 1.25, 0, 6.5, 0.5, 0, 0, 1]
 for name, message in (("cloud", cloud), ("image", image), ("info", info)):
     with open(sys.argv[1] + "/" + name, "wb") as stream:
         message.serialize(stream)

@@ -25,6 +25,7 @@ from tumortrack.live.ros.rospy_node import Master, rospy_module
 
 PEER = Path(__file__).with_name("ros1_peer.py")
 PYTHON = "/usr/bin/python3"
+HERE = {"ROS_IP": "127.0.0.1"}  # of other nodes: ours are on this machine alone unasked
 T = TypeVar("T")
 
 
@@ -84,7 +85,6 @@ class Graph:
         self.master = Master(f"http://127.0.0.1:{self.port}")
         os.environ |= {
             "ROS_MASTER_URI": self.master.uri,
-            "ROS_IP": "127.0.0.1",
             "ROS_HOME": str(self._folder),
             "ROS_LOG_DIR": str(self._folder),
         }
@@ -99,6 +99,7 @@ class Graph:
                 stdout=subprocess.DEVNULL,
                 stderr=subprocess.DEVNULL,
                 start_new_session=True,
+                env=os.environ | HERE,
             )
             eventually(lambda: self.master.call("getPid"), "roscore")
 
@@ -168,5 +169,8 @@ def listener(namespace: str, folder: Path, name: str = "heard") -> Iterator[List
 
 def _peer(command: str, given: dict, stdout: Any) -> subprocess.Popen:
     return subprocess.Popen(
-        [PYTHON, str(PEER), command, json.dumps(given)], stdout=stdout, start_new_session=True
+        [PYTHON, str(PEER), command, json.dumps(given)],
+        stdout=stdout,
+        start_new_session=True,
+        env=os.environ | HERE,
     )

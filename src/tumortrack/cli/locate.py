@@ -60,6 +60,7 @@ class Locate(StatedPatient):
         points = self._points()
         seen, notes = self._read()  # report what is wrong so far before PyTorch's seconds
 
+        from tumortrack.core.estimate import NO_CHECK_FAILED, UNVERIFIED
         from tumortrack.tracking.files import write_estimate
         from tumortrack.tracking.points import check_near_organ
         from tumortrack.tracking.tracker import Tracker
@@ -101,7 +102,7 @@ class Locate(StatedPatient):
             file = self.out / "points.csv"
             say(f"{len(points.points_ct)} points of the CT: their places are in {file}")
         good = estimate.quality == "good"
-        say("GOOD: it fits as in validation; this does not verify it." if good
+        say(f"{NO_CHECK_FAILED}; {UNVERIFIED}." if good
             else f"POOR: {estimate.reason}. Do not rely on it.")  # fmt: skip
         seconds = estimate.report["timings"]["total"]
         say(f"written to {self.out} (camera frame, mm) in {seconds:.2f} s.")

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from jaxtyping import Float64
 
     from tumortrack.core.types import Mesh
+    from tumortrack.live.values import PublishedFrame
     from tumortrack.plan.arms.config import CellConfig
     from tumortrack.plan.budget import ErrorBudget
     from tumortrack.plan.located import LocatedRun
@@ -89,7 +90,8 @@ class Plan(StatedPatient):
         run.patient.check_is(self.stated, str(self.run_folder))
         say(str(run.patient))
         doubts = notes_of_doubt(run.doubt, self.accept_poor)
-        frame_id, table_from_camera = self._frame(run, cell_config.stand_mm)
+        frames = self._frame(run, cell_config.stand_mm)
+        frame_id, table_from_camera = frames.frame_id, frames.published_from_camera
         located = run.located(table_from_camera)
         organ = located.meshes.get("kidney")
         if self.arms and organ is None:
@@ -125,7 +127,7 @@ class Plan(StatedPatient):
             resection, config, table_from_camera, frame_id, located.meshes, cell_used, motions,
             str(model.get("case_sha256") or "") if isinstance(model, dict) else "",
             store.sha256_of(self.frame) if self.frame else INVENTED, cell_source, run.patient,
-            budget,
+            budget, frames.camera_frame_id, frames.table_in_camera,
         )  # fmt: skip
 
         def pictures(aside: Path) -> None:
@@ -187,14 +189,14 @@ class Plan(StatedPatient):
             return INVENTED
         return store.sha256_of(self.cell)
 
-    def _frame(self, run: LocatedRun, stand_mm: float) -> tuple[str, Float64[np.ndarray, "4 4"]]:
-        """Frame id and ``table_from_camera``: of the calibration, or of a camera that looks
-        down."""
+    def _frame(self, run: LocatedRun, stand_mm: float) -> PublishedFrame:
+        """The table's frame: of the calibration, or of a camera that looks down."""
         from tumortrack.live.calibration_file import read_frames
+        from tumortrack.live.values import PublishedFrame
         from tumortrack.plan.located import table_under
 
         if self.frame is None:
-            return "table", table_under(run.cloud, run.meshes, stand_mm)
+            return PublishedFrame("table", table_under(run.cloud, run.meshes, stand_mm))
         frames = read_frames(self.frame)
         if frames.published_from_camera[2, 2] >= 0:  # cuts are planned from above
             raise InputError(
@@ -207,7 +209,7 @@ class Plan(StatedPatient):
                 "--frame: where do the arms stand in that frame? Say it with --cell FILE "
                 "(docs/resection.md), or plan the cuts alone with --no-arms."
             )
-        return frames.frame_id, frames.published_from_camera
+        return frames
 
 
 def check_arms_installed() -> None:

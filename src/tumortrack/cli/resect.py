@@ -161,6 +161,9 @@ class Resect(StatedPatient):
             "a plan made with --frame FILE (this one's frame is invented)": (
                 stored.frame_source != INVENTED
             ),
+            "a plan made with --frame FILE that has camera_frame_id, as this source has": (
+                model is None or stored.camera_frame_id or not _names_frames(source)
+            ),
             "a plan made with --cell FILE that gives both bases, and keeps to them": (
                 stored.cell_source != INVENTED
             ),
@@ -206,7 +209,6 @@ class Resect(StatedPatient):
 
         import msgspec
 
-        from tumortrack.live.values import PublishedFrame
         from tumortrack.plan.arms import procedure
         from tumortrack.plan.arms.cell import tip_places
         from tumortrack.plan.live_budget import LiveBudget
@@ -254,14 +256,13 @@ class Resect(StatedPatient):
             operation = _operation(
                 stored, cell, config, locate=locate, replan=replan, budget=budget
             )
-            frames = PublishedFrame(stored.frame_id, stored.table_from_camera)
             track.Track(
                 model=model, source=source, sinks=self.sinks, range=self.range, box=self.box,
                 whole=self.whole, intrinsics=self.intrinsics, report=self.report,
                 device=self.device, patient=self.patient, side=self.side,
             ).run(track.Arms(
-                operation, frames, {"plan_config": to_builtins(config)}, tip_places(cell.config),
-                bool(arms),
+                operation, stored.frames, {"plan_config": to_builtins(config)},
+                tip_places(cell.config), bool(arms),
             ))  # fmt: skip
         _say_end(operation, arms)
 
@@ -274,17 +275,18 @@ class Resect(StatedPatient):
     ) -> None:
         """Without a camera: the stored motions in real time."""
         from tumortrack import api
-        from tumortrack.live.values import Controls, PublishedFrame, SinkContext, TrackingResult
+        from tumortrack.live.values import Controls, SinkContext, TrackingResult
 
         assert stored.motions is not None
         operation = _operation(stored, cell, config)
         operation.still_life = _organ_shapes(stored)
         report = track.report_path(self.report, "resect")
-        frames = PublishedFrame(stored.frame_id, stored.table_from_camera)
+        frames = stored.frames
         controls = Controls()
         context = SinkContext(tuple(stored.meshes), frames, None, controls, True, stored.patient)
         stop = track.stopping(lambda: operation.abort(track.STOPPED))
         with stop, api.open_sinks(api.named_sinks(self.sinks), context) as sinks:
+            track.say_opened(sinks)
             say(f"{stored.motions.seconds / config.speed:.0f} s in frame {frames.frame_id!r}; "
                 "Ctrl-C stops the arms.")  # fmt: skip
             errors: dict[str, str] = {}
@@ -327,6 +329,11 @@ def _shows_the_present(source: str) -> bool:
     config = SOURCES.parse(source)
     kind = config.__struct_config__.tag
     return kind in _LIVE and not Path(getattr(config, "device", "")).suffix
+
+
+def _names_frames(source: str) -> bool:
+    """Its frames come with the name of the camera's."""
+    return source.partition(":")[0] in ("ros1", "ros2")
 
 
 def _case_of(model: Path) -> tuple[str, Patient]:

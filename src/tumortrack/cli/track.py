@@ -160,6 +160,7 @@ class Track(StatedPatient):
             api.open_sinks(named, context) as sinks,
             closing(SourceWorker(source_config.open)) as source,
         ):
+            say_opened(sinks)
             ur = arms is not None and arms.ur
             screen = _Screen(loop, source, sinks, report, about, companion, ur)
             ending.callback(screen.end)  # once all workers have flushed
@@ -183,6 +184,13 @@ class Track(StatedPatient):
             give_up_s=self.give_up,
             seconds=self.seconds,
         )
+
+
+def say_opened(sinks: list[SinkWorker]) -> None:
+    """Where each sink is to be found, and who can reach it."""
+    for sink in sinks:
+        for note in sink.notes:
+            say(f"sink {sink.name}: {note}")
 
 
 def stage_words(state: str, ur: bool) -> str:
@@ -251,11 +259,12 @@ class _Screen:
         self._started = self._shown = self._stored = time.monotonic()
         self._before, self._state, self._changed, self._unwritten = 0, "", 0.0, ""
         self._errors: dict[str, str] = {}
+        self._notes = 0  # of those about the camera's frame, that were said
         self._memory_mb = {"start": round(_resident_mb(), 1)}
 
     def show(self, result: TrackingResult) -> None:
         """Called with every result."""
-        state = result.reason or result.warning or "good"
+        state = result.describe()
         kind = re.sub(r"\d", "", state)  # numbers change with every frame
         if (cell := result.workcell) is not None:
             stage = stage_words(cell.state, self.ur)
@@ -265,7 +274,10 @@ class _Screen:
         now = time.monotonic()
         if kind != self._state and now - self._changed >= _SAY_S:
             self._state, self._changed = kind, now
-            say(f"{result.quality}: {state}")
+            say(state)
+        for note in self.loop.frames.notes[self._notes :]:
+            say(f"note: {note}.")
+        self._notes = len(self.loop.frames.notes)
         say_failures(self.sinks, self._errors)
         if now - self._shown >= (_SAY_S if console.is_terminal else _SAY_PLAIN_S):
             self._line(now)
@@ -317,10 +329,13 @@ class _Screen:
         self._memory_mb["now"] = now_mb = round(_resident_mb(), 1)
         if self._stored - self._started > _SETTLED_S:
             self._memory_mb.setdefault("settled", now_mb)
+        frames, watch = self.loop.frames, self.loop.frames.watch
         content = {
             **self.about,
             "seconds": round(self._stored - self._started, 2),
             "memory_mb": self._memory_mb,
+            "table_in_camera": watch and watch.table_in_camera,
+            "frame_notes": frames.notes,
             **summary(self.loop, self.source, self.sinks),
             **({} if self.arms is None else {"resection": self.arms.summary()}),
         }

@@ -14,14 +14,12 @@ ORGAN: Colour = (225, 230, 235)
 REGION: Colour = (64, 70, 82)
 PICKED: Colour = (255, 80, 200)
 
-GOOD: Colour = (46, 160, 67)
+GOOD: Colour = (88, 100, 114)  # no green: it would say that it is safe to cut
 POOR: Colour = (210, 140, 0)
 NONE: Colour = (205, 20, 30)
 STALE: Colour = (110, 60, 160)
 ARMS: Colour = (45, 95, 165)
 BACKGROUND: Colour = (22, 24, 29)
-BACKGROUND_NONE: Colour = (74, 8, 12)
-BACKGROUND_STALE: Colour = (48, 24, 72)
 
 _SWEEPS = ((0, 120, 240), (90, 60, 220), (205, 0, 130))
 

@@ -17,6 +17,8 @@ from tumortrack.core.types import CameraLabels, Mesh, OccupancyCloud
 
 LARGEST_GRID = 400
 Quality = Literal["good", "poor", "none"]  # none: there is no estimate
+# What people read where it is good: that word would say more than is known.
+NO_CHECK_FAILED, UNVERIFIED = "fit: no check failed", "its place is not verified"
 
 
 @runtime_checkable

@@ -16,6 +16,8 @@ from tumortrack.live.values import PublishedFrame
 _LARGEST_MM, _LARGEST_DEG = 100.0, 10.0  # with more, it is no calibration
 _NOT_RIGID = 1e-3  # largest deviation of a rotation from orthonormal: files have few digits
 
+_MATRICES = ("camera_from_robot", "robot_from_camera", "camera_from_marker", "robot_from_marker")
+
 Rows = tuple[tuple[float, float, float, float], ...]
 
 
@@ -23,9 +25,11 @@ class CalibrationFile(Config, frozen=True, kw_only=True):
     """A file that says where the camera is, in one of three ways, each by 4 x 4 rows:
     ``camera_from_robot`` or ``robot_from_camera``, of a hand-eye calibration, or
     ``camera_from_marker`` with ``robot_from_marker``: a marker that both know. ``unit``: of the
-    translations. ``frame_id``: the robot's frame, as ROS calls it. ``error_mm`` and ``error_deg``:
-    bounds of the calibration's error, at the camera and of its direction; without ``error_deg`` the
-    first holds at the organ."""
+    translations, and of a plane's offset. ``frame_id``: the robot's frame, as ROS calls it;
+    ``camera_frame_id``: the camera's optical frame, as the source's messages call it;
+    ``table_in_camera``: the table's plane in the camera's frame, unit normal (3) and offset.
+    ``error_mm`` and ``error_deg``: bounds of the calibration's error, at the camera and of its
+    direction; without ``error_deg`` the first holds at the organ."""
 
     frame_id: str
     unit: Literal["mm", "m"]
@@ -33,6 +37,8 @@ class CalibrationFile(Config, frozen=True, kw_only=True):
     robot_from_camera: Rows | None = None
     camera_from_marker: Rows | None = None
     robot_from_marker: Rows | None = None
+    camera_frame_id: str = ""
+    table_in_camera: tuple[float, float, float, float] | None = None
     error_mm: float | None = None
     error_deg: float = 0.0
 
@@ -52,8 +58,8 @@ def read_frames(path: Path) -> PublishedFrame:
     file = from_builtins(read_json(path), CalibrationFile, str(path))
     matrices = {
         name: _rigid(rows, file.unit, f"{path}: {name}")
-        for name in CalibrationFile.__struct_fields__
-        if isinstance(rows := getattr(file, name), tuple)
+        for name in _MATRICES
+        if (rows := getattr(file, name)) is not None
     }
     match list(matrices.items()):
         case [("robot_from_camera", robot_from_camera)]:
@@ -69,7 +75,15 @@ def read_frames(path: Path) -> PublishedFrame:
             )
     if not file.frame_id.strip():
         raise InputError(f"{path}: frame_id is empty; give the robot's frame, base_link say.")
-    return PublishedFrame(file.frame_id, robot_from_camera)
+    table, camera = file.table_in_camera, file.camera_frame_id.strip().removeprefix("/")
+    if table is not None:
+        if not abs(np.linalg.norm(table[:3]) - 1) < _NOT_RIGID or not np.isfinite(table[3]):
+            raise InputError(
+                f"{path}: table_in_camera must be a unit normal (3 numbers) and the plane's offset "
+                f"in {file.unit}, camera frame, as a run's report says it."
+            )
+        table = (*table[:3], table[3] * (1000 if file.unit == "m" else 1))
+    return PublishedFrame(file.frame_id, robot_from_camera, True, camera, table)
 
 
 def read_error_mm(path: Path, distance_mm: float) -> float | None:

@@ -1,4 +1,5 @@
-"""Whether a frame shows something new, and comes from the camera that the run began with."""
+"""Whether a frame shows something new, and is of the camera that results are placed by: by its
+name, its intrinsics, and a table that stands still."""
 
 from __future__ import annotations
 
@@ -6,36 +7,70 @@ import numpy as np
 
 from tumortrack.core.errors import NoEstimate
 from tumortrack.core.types import DepthFrame, Intrinsics, SensorCloud
+from tumortrack.live.values import Observation, PublishedFrame
+from tumortrack.sense.region.picture import RegionConfig
+from tumortrack.sense.region.watch import TableWatch
 
-Content = DepthFrame | SensorCloud
+UNNAMED = (
+    "the calibration names no camera_frame_id: nobody checks that frames come from the camera that "
+    "it is for"
+)
+_NAMELESS = "the source does not say whose frames it sends: nobody checks it"
+_BLIND = "no table is seen: nobody notices if the camera moves"
+_SLIDING = (
+    "the table's plane is watched; a camera that slides along it, or turns about its normal, is "
+    "not noticed"
+)
 
 
 class FrameCheck:
-    """Refuses images that repeat and intrinsics that change.
+    """Of one run. ``notes``: what nobody can check, said once each, as it turns out. The table is
+    watched only where places depend on where the camera stands: in the frame of a calibration.
 
     A sensor's noise never repeats bit for bit: an image that does is an old one, whatever its
     stamp says. A camera that is replaced, zoomed or set to another mode in between may stand
     elsewhere too, so its frames are refused until the run is started again.
     """
 
-    def __init__(self, frozen_s: float) -> None:
-        self._frozen_s = frozen_s
+    def __init__(self, published: PublishedFrame, config: RegionConfig, frozen_s: float) -> None:
+        self._published, self._frozen_s = published, frozen_s
         self._values: np.ndarray | None = None
         self._since_ns = 0
         self._camera: Intrinsics | None = None
+        self._name: str | None = None  # of the first frame
+        self.watch = TableWatch(config, published.table_in_camera) if published.calibrated else None
+        self.notes: list[str] = []
+        if published.calibrated and not published.camera_frame_id:
+            self.notes.append(UNNAMED)
 
-    def same_camera(self, content: Content) -> None:
-        """Raises NoEstimate for other intrinsics than the first frame had."""
-        if not isinstance(content, DepthFrame):
-            return
-        self._camera = self._camera or content.intrinsics
-        if content.intrinsics != self._camera:
+    def check(self, seen: Observation) -> str:
+        """A doubt about this frame, or nothing. Raises NoEstimate for a frame of another camera
+        than the calibration or the first frame was of, and once camera or table have moved."""
+        name, wanted = seen.frame_id, self._published.camera_frame_id
+        if self._name is None:
+            self._name = name
+            if wanted and not name:
+                self.notes.append(_NAMELESS)
+        if wanted and name and name != wanted:
             raise NoEstimate(
-                f"the camera's intrinsics changed from {_text(self._camera)} to "
-                f"{_text(content.intrinsics)}. If that is meant, start again."
+                f"the frame is in {name!r}, and the calibration is for {wanted!r}. Give the "
+                "calibration of this camera, or its camera's topic"
             )
+        if name != self._name:
+            raise NoEstimate(
+                f"the source's frame changed from {self._name!r} to {name!r}: another camera, or "
+                "another setting of it. Restart to accept it"
+            )
+        if isinstance(seen.content, DepthFrame):
+            self._same_intrinsics(seen.content.intrinsics)
+        if self.watch is None:
+            return ""
+        doubt = self.watch.check(seen.content)
+        self._note(_SLIDING, self.watch.table_in_camera is not None)
+        self._note(_BLIND, self.watch.blind)
+        return doubt
 
-    def new(self, content: Content) -> None:
+    def check_new(self, content: DepthFrame | SensorCloud) -> None:
         """Raises NoEstimate where the same image has been coming for too long."""
         values = content.depth_mm if isinstance(content, DepthFrame) else content.points_mm
         if self._values is None or not _same(values, self._values):
@@ -47,6 +82,18 @@ class FrameCheck:
                 f"the source is frozen: the same image for {same_s:.2f} s. Look at the camera; a "
                 "simulated one without noise needs --frozen 0."
             )
+
+    def _same_intrinsics(self, camera: Intrinsics) -> None:
+        self._camera = self._camera or camera
+        if camera != self._camera:
+            raise NoEstimate(
+                f"the camera's intrinsics changed from {_text(self._camera)} to {_text(camera)}. "
+                "If that is meant, start again."
+            )
+
+    def _note(self, note: str, now: bool) -> None:
+        if now and note not in self.notes:
+            self.notes.append(note)
 
 
 def _same(one: np.ndarray, other: np.ndarray) -> bool:

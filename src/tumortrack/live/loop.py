@@ -80,7 +80,8 @@ class Loop:
     ) -> None:
         self._config, self._context, self._arms = config, context, arms
         self._follower = Follower(tracker, config.follower)
-        self._stamps, self._frames = StampCheck(config.stale_s), FrameCheck(config.frozen_s)
+        self._stamps = StampCheck(config.stale_s)
+        self.frames = FrameCheck(context.published_frame, config.region, config.frozen_s)
         self._stop = threading.Event()
         self._sequence = itertools.count()
         self._picked: Float64[np.ndarray, " 3"] | None = None  # by the user
@@ -170,16 +171,17 @@ class Loop:
                 self.statistics.clock_jumps += 1
                 self._follower.forget()
             timely = True
-            self._frames.same_camera(seen.content)
+            with _timed(seconds, "frame"):
+                doubt = self.frames.check(seen)
             with _timed(seconds, "organ"):
                 rng = np.random.default_rng((self._config.follower.seed, seen.stamp_ns))
                 hints = self._hints(seen)
                 organ = organ_points(seen.content, self._config.region, hints, rng).cloud
-            self._frames.new(seen.content)  # that it shows nothing would be said before
+            self.frames.check_new(seen.content)  # that it shows nothing would be said before
             with _timed(seconds, "locate"):
                 estimate = self._follower.locate(organ, seen.content)
             seconds |= {f"locate.{k}": v for k, v in estimate.report["timings"].items()}
-            quality, warning = self._confirmed(estimate)
+            quality, warning = self._confirmed(estimate, doubt)
             self._follow_pick(organ)
             if hurry and _age_s(born_ns) > self._config.stale_s:
                 raise _TooLate(f"the answer came too late: {_age_s(born_ns):.2f} s after the frame")
@@ -206,12 +208,16 @@ class Loop:
             latency_ms=1000 * _age_s(born_ns),
         )
 
-    def _confirmed(self, estimate: Estimate) -> tuple[Quality, str]:
-        """Its quality and warning: after doubt, good is what stays good."""
-        self._in_a_row = self._in_a_row + 1 if estimate.quality == "good" else 0
+    def _confirmed(self, estimate: Estimate, doubt: str) -> tuple[Quality, str]:
+        """Its quality and warning, with a doubt about its frame; after doubt, good is what stays
+        good."""
+        quality, warning = estimate.quality, estimate.reason
+        if doubt and quality == "good":
+            quality, warning = "poor", doubt
+        self._in_a_row = self._in_a_row + 1 if quality == "good" else 0
         if 0 < self._in_a_row < _SURE_AFTER:
             return "poor", f"good again for {self._in_a_row} of {_SURE_AFTER} frames"
-        return estimate.quality, estimate.reason
+        return quality, warning
 
     def _without_frame(self, reason: str) -> TrackingResult:
         """The result where there is no frame; its stamp is now, by the source's clock as far as it

@@ -19,7 +19,7 @@ from jaxtyping import Bool, Float32, Float64, UInt8
 
 from tumortrack.core.config import Config
 from tumortrack.core.errors import TumortrackError
-from tumortrack.core.estimate import Estimate, Quality
+from tumortrack.core.estimate import NO_CHECK_FAILED, UNVERIFIED, Estimate, Quality
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.patient import NOBODY, Patient
 from tumortrack.core.types import Anatomy, DepthFrame, Mesh, SensorCloud
@@ -43,13 +43,15 @@ class Observation:
 
     ``content`` has the ``stamp_ns`` of its exposure. ``arrived_ns``: when it reached this program,
     by ``time.time_ns``. ``mask``: of a depth image: True where the organ may be. ``truth``: the
-    true surfaces, where the source simulates them.
+    true surfaces, where the source simulates them. ``frame_id``: what the source calls the camera's
+    frame; empty: nothing.
     """
 
     content: DepthFrame | SensorCloud
     arrived_ns: int
     mask: Bool[np.ndarray, "h w"] | None = None
     truth: Anatomy | None = None
+    frame_id: str = ""
 
     @property
     def stamp_ns(self) -> int:
@@ -85,10 +87,15 @@ class Source(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class PublishedFrame:
-    """Where results are published."""
+    """Where results are published. Of a calibration also (``calibrated``), as far as its file
+    says it: ``camera_frame_id``, what sources call the camera's frame; ``table_in_camera``: unit
+    normal and offset (mm) of the table's plane, ``normal @ point = offset``, when it was made."""
 
     frame_id: str = "camera"
     published_from_camera: Float64[np.ndarray, "4 4"] = field(default_factory=lambda: np.eye(4))
+    calibrated: bool = False
+    camera_frame_id: str = ""
+    table_in_camera: tuple[float, float, float, float] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -213,10 +220,12 @@ class TrackingResult:
         return transform_points(self.published_frame.published_from_camera, center_mm)[0]
 
     def describe(self) -> str:
-        """How good the estimate is, or why there is none."""
+        """How good the estimate is, in words for people, or why there is none."""
         if self.estimate is None:
             return f"no estimate: {self.reason}"
-        return f"{self.quality}: {self.warning}" if self.warning else self.quality
+        if self.quality == "good":
+            return f"{NO_CHECK_FAILED}; {UNVERIFIED}"
+        return f"{self.quality} estimate: {self.warning}"
 
 
 @runtime_checkable
@@ -268,7 +277,7 @@ class SinkContext:
 class Sink(Protocol):
     """An open sink. Both methods are called from one thread of its own, so they may take their
     time. Errors are counted and reported, and the loop goes on. A ``counts: dict[str, int]``, if
-    there is one, goes into the run's report."""
+    there is one, goes into the run's report; ``notes``, lines of text, are told when it is open."""
 
     def publish(self, result: TrackingResult) -> None: ...
 

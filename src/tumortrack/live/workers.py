@@ -158,6 +158,7 @@ class SinkWorker:
     def __init__(self, name: str, sink: Sink, waiting: int) -> None:
         self.name = name
         self._sink = sink
+        self.notes: tuple[str, ...] = getattr(sink, "notes", ())
         self._waiting: deque[tuple[TrackingResult, float]] = deque(maxlen=waiting)
         self._lock = threading.Condition()
         self._stop = False

@@ -21,6 +21,7 @@ from tumortrack.core.errors import ArtifactError, InputError, NoPlan
 from tumortrack.core.mesh_files import read_mesh, write_mesh
 from tumortrack.core.patient import NOBODY, Patient, patient_in
 from tumortrack.core.types import Mesh
+from tumortrack.live.values import PublishedFrame
 from tumortrack.plan.arms.config import CellConfig
 from tumortrack.plan.budget import ErrorBudget
 from tumortrack.plan.motions import JOINTS, Motions, MotionStage
@@ -41,7 +42,8 @@ class PlanFolder:
     as JSON; motions and cell are None where no arms were planned. ``case_sha256``: of the case that
     the organ was located by; empty where unknown. ``frame_source``, ``cell_source``: the sha256 of
     the user's file that gave the frame, and the places of the arms; or ``INVENTED``. ``patient``:
-    whose organ, as far as it is known. ``budget``: None in plans of older versions."""
+    whose organ, as far as it is known. ``budget``: None in plans of older versions.
+    ``camera_frame_id``, ``table_in_camera``: as ``PublishedFrame`` has them."""
 
     plan: ResectionPlan
     config: ResectionConfig
@@ -55,6 +57,19 @@ class PlanFolder:
     cell_source: str = INVENTED
     patient: Patient = NOBODY
     budget: ErrorBudget | None = None
+    camera_frame_id: str = ""
+    table_in_camera: tuple[float, float, float, float] | None = None
+
+    @property
+    def frames(self) -> PublishedFrame:
+        """Where a live run publishes that carries the plan out."""
+        return PublishedFrame(
+            self.frame_id,
+            self.table_from_camera,
+            self.frame_source != INVENTED,
+            self.camera_frame_id,
+            self.table_in_camera,
+        )
 
 
 def write_plan(
@@ -85,6 +100,8 @@ def write_plan(
         "patient": to_builtins(content.patient),
         "frame_source": content.frame_source,
         "cell_source": content.cell_source,
+        "camera_frame_id": content.camera_frame_id,
+        "table_in_camera": content.table_in_camera,
         "plan": as_builtins(plan),
         "budget": content.budget and to_builtins(content.budget),
         "cell": content.cell,
@@ -139,6 +156,10 @@ def read_plan(folder: Path) -> PlanFolder:
             cell_source=str(data.get("cell_source", INVENTED)),
             patient=patient_in(data.get("patient"), where),
             budget=None if budget is None else from_builtins(budget, ErrorBudget, where),
+            camera_frame_id=str(data.get("camera_frame_id", "")),
+            table_in_camera=msgspec.convert(
+                data.get("table_in_camera"), tuple[float, float, float, float] | None
+            ),
         )
     except ArtifactError:
         raise

@@ -39,6 +39,23 @@ def d405(width: int = 848, height: int = 480) -> Intrinsics:
     return Intrinsics(width, height, fx, fy, cx=(width - 1) / 2, cy=(height - 1) / 2)
 
 
+def plausible(camera: Intrinsics, where: str) -> Intrinsics:
+    """The same, if it can be a depth camera's; else InputError, which ``where`` opens."""
+    side = max(camera.width, camera.height)
+    if not all(0.1 * side < focal < 5 * side for focal in (camera.fx, camera.fy)):
+        raise InputError(
+            f"{where}: focal lengths {camera.fx:g}, {camera.fy:g} px are no depth camera's of "
+            f"{camera.width} x {camera.height}; 0.1 to 5 times the longer side are allowed (fields "
+            "of view of 11 to 157 degrees). Give those of the image's own size, in pixels."
+        )
+    if not all(-side < middle < 2 * side for middle in (camera.cx, camera.cy)):
+        raise InputError(
+            f"{where}: the optical axis at {camera.cx:g}, {camera.cy:g} px lies far off an image "
+            f"of {camera.width} x {camera.height}. Give it in pixels of this image."
+        )
+    return camera
+
+
 class Pinhole(NamedTuple):
     """The numbers of ``Intrinsics`` that project a point, as compiled kernels take them; px."""
 

@@ -19,6 +19,7 @@ import numpy as np
 from tumortrack.core.errors import InputError
 from tumortrack.core.store import read_file, read_json
 from tumortrack.core.types import DepthFrame, Intrinsics, SensorCloud
+from tumortrack.sense.camera import plausible
 from tumortrack.sense.cloud import seen_points
 from tumortrack.sense.ply import parse_ply_properties
 
@@ -179,19 +180,7 @@ def _camera(path: Path) -> tuple[Intrinsics, dict[str, Any]]:
         if not values[key].is_integer():
             raise InputError(f"{path}: {key} is {values[key]}; it must be a whole number.")
     camera = Intrinsics(int(values.pop("width")), int(values.pop("height")), **values)
-    side = max(camera.width, camera.height)
-    if not all(0.1 * side < focal < 5 * side for focal in (camera.fx, camera.fy)):
-        raise InputError(
-            f"{path}: focal lengths {camera.fx:g}, {camera.fy:g} px are no depth camera's of "
-            f"{camera.width} x {camera.height}; 0.1 to 5 times the longer side are allowed (fields "
-            "of view of 11 to 157 degrees). Give those of the image's own size, in pixels."
-        )
-    if not all(-side < middle < 2 * side for middle in (camera.cx, camera.cy)):
-        raise InputError(
-            f"{path}: the optical axis at {camera.cx:g}, {camera.cy:g} px lies far off an image of "
-            f"{camera.width} x {camera.height}. Give it in pixels of this image."
-        )
-    return camera, data
+    return plausible(camera, str(path)), data
 
 
 def _numbers(value: object, key: str, path: Path) -> list[float]:

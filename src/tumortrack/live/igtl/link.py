@@ -17,8 +17,11 @@ from collections.abc import Callable
 from tumortrack.core.errors import InputError
 from tumortrack.live.igtl import message as igtl
 from tumortrack.live.igtl.message import Header, Message, ProtocolError, pack
+from tumortrack.live.network import Pace
 
 _LARGEST_REQUEST = 2**16  # bytes; what a receiver sends is small
+MOST_RECEIVERS = 16  # further ones are turned away: each may hold half a megabyte
+_REQUESTS_PER_S = 100.0
 _MOST_ANSWERS = 100  # that wait for a receiver: one that only asks gets no more
 _STALLED_S = 10.0  # a receiver that takes nothing for so long is gone
 _RETRY_S = 1.0  # between tries to connect
@@ -93,7 +96,7 @@ class Link:
             await asyncio.sleep(0)
 
     async def _accept(self) -> None:
-        server = await asyncio.start_server(self._serve, sock=self._listener)
+        server = await asyncio.start_server(self._serve, sock=self._listener, backlog=1024)
         await server.serve_forever()
 
     async def _visit(self, host: str) -> None:
@@ -106,6 +109,9 @@ class Link:
 
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         """One connection, until it ends."""
+        if len(self.receivers) >= MOST_RECEIVERS:
+            writer.transport.abort()
+            return
         writer.get_extra_info("socket").setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _BUFFER)
         writer.transport.set_write_buffer_limits(high=0)  # ``drain`` waits for the socket itself
         receiver = _Receiver(writer, self._newest)
@@ -121,7 +127,9 @@ class Link:
             writer.transport.abort()
 
     async def _receive(self, reader: asyncio.StreamReader, receiver: _Receiver) -> None:
+        pace = Pace(_REQUESTS_PER_S)
         while True:
+            await asyncio.sleep(pace.wait_s())
             header = igtl.unpack_header(await reader.readexactly(igtl.HEADER_SIZE))
             if header.body_size > _LARGEST_REQUEST:
                 raise ProtocolError(f"a request of {header.body_size} bytes is refused.")

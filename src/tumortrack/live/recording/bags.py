@@ -85,10 +85,11 @@ class BagRecording:
         if isinstance(message, InputError):
             raise message
         if info is None:
-            return Observation(sensors.cloud_of(message), 0)
+            return Observation(sensors.cloud_of(message), 0, frame_id=sensors.frame_of(message))
         frame = sensors.depth_of(message, info, self._rectified, self._unit_mm)
         here = mask is not None and stamp_of(mask.header) == frame.stamp_ns
-        return Observation(frame, 0, sensors.mask_of(mask) if here else None)
+        seen = sensors.mask_of(mask) if here else None
+        return Observation(frame, 0, seen, frame_id=sensors.frame_of(message))
 
     def _all(self, topics: set[str]) -> Iterator[tuple[str, Any]]:
         """Topic and message in the order of their recording; without a topic an InputError, where

@@ -49,9 +49,10 @@ class Subscriber:
 @runtime_checkable
 class Bus(Protocol):
     """A participant of the graph. Used by one thread; ``close`` perhaps from another, and twice.
-    ``messages``: the types that travel there."""
+    ``messages``: the types that travel there; ``note``: who can reach it, in words."""
 
     messages: Messages
+    note: str
 
     def publisher(self, topic: str, kind: str) -> Publisher: ...
 

@@ -89,6 +89,12 @@ class DdsBus:
                 "programs are in that domain."
             ) from error
         self._member: Any = member
+        self.note = "on this machine alone"
+        if not _stays_here():
+            self.note = (
+                "anyone in this network can see the patient's organ, and publish under these "
+                "names; ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST keeps it on this machine"
+            )
 
     def publisher(self, topic: str, kind: str) -> Publisher:
         reliable, volatile = Policy.Reliability.Reliable(_BLOCKED_NS), Policy.Durability.Volatile
@@ -192,11 +198,16 @@ def _set_up(domain: int) -> None:
             "ROS_AUTOMATIC_DISCOVERY_RANGE is OFF: no topic would ever be found. Allowed here: "
             "LOCALHOST, SUBNET, SYSTEM_DEFAULT, or not set."
         )
-    local = os.environ.get("ROS_LOCALHOST_ONLY") == "1" or reach == "LOCALHOST"
     with _setting_up:
         if domain not in _domains:
-            parts = (_TUNING, _LOCAL if local else "", os.environ.get("CYCLONEDDS_URI", ""))
+            local = _LOCAL if _stays_here() else ""
+            parts = (_TUNING, local, os.environ.get("CYCLONEDDS_URI", ""))
             _domains[domain] = Domain(domain, ",".join(filter(None, parts)))
+
+
+def _stays_here() -> bool:
+    reach = os.environ.get("ROS_AUTOMATIC_DISCOVERY_RANGE", "").upper()
+    return os.environ.get("ROS_LOCALHOST_ONLY") == "1" or reach == "LOCALHOST"
 
 
 def _error_text(code: int) -> str:

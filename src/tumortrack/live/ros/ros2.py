@@ -53,6 +53,7 @@ class RclpyBus:
         self._executor.add_node(self._node)
         self._lock = threading.Lock()  # held while spinning: nothing is taken apart under it
         self._closed = False
+        self.note = "as far as the sourced ROS 2 reaches, whoever is there can see and publish"
 
     def publisher(self, topic: str, kind: str) -> Publisher:
         from rclpy.duration import Duration

@@ -24,6 +24,7 @@ from urllib.parse import urlsplit
 from tumortrack.core.errors import InputError
 from tumortrack.live.ros.bus import Publisher, Subscriber
 from tumortrack.live.ros.messages import Messages
+from tumortrack.live.ros.rospy_guard import guard_node, is_open
 from tumortrack.live.values import SourceLost
 
 _DEBIAN = "/usr/lib/python3/dist-packages"
@@ -132,6 +133,7 @@ def _join() -> tuple[ModuleType, Master]:
         rospy = rospy_module()
         Master(uri).call("getPid")  # rospy would wait for it for ever
         if not rospy.core.is_initialized():
+            guard_node(rospy, str(parts.hostname))
             _start(rospy)
         _joined = uri
         return rospy, Master(uri, rospy.get_name())
@@ -147,7 +149,8 @@ def _start(rospy: ModuleType) -> None:
     finally:
         rospy.core.configure_logging = configure
     # Its warnings go to whoever listens to Python's logging, and are not printed.
-    logging.getLogger("rosout").addHandler(logging.NullHandler())
+    for name in ("rosout", "rospy", "xmlrpc"):
+        logging.getLogger(name).addHandler(logging.NullHandler())
 
 
 class RospyBus:
@@ -164,6 +167,9 @@ class RospyBus:
         self._handles: list[Any] = []  # those, and rospy's subscribers
         self._subscribers: list[RospySubscriber] = []
         self._closed = False
+        self.note = "on this machine alone; for others set ROS_IP to this machine's address"
+        if is_open(urlsplit(self.master.uri).hostname or ""):
+            self.note = "anyone in this network can see the patient's organ, and stop this node"
 
     def publisher(self, topic: str, kind: str) -> Publisher:
         message_class = _raw_class(kind)

@@ -16,6 +16,7 @@ from tumortrack.core.errors import InputError
 from tumortrack.core.types import DepthFrame, Intrinsics, SensorCloud
 from tumortrack.live.ros.messages import MM_PER_M, Messages, Outgoing, stamp_of
 from tumortrack.live.values import Observation
+from tumortrack.sense.camera import plausible
 from tumortrack.sense.cloud import seen_points
 
 CLOUD = "sensor_msgs/msg/PointCloud2"
@@ -91,6 +92,12 @@ def depth_of(image: Any, info: Any, rectified: bool = False, unit_mm: float = 1.
             out of it. Otherwise its camera is K, and D must be zero.
         unit_mm: of one step of a 16-bit image; ROS says 1 mm (REP 118).
     """
+    names = frame_of(image), frame_of(info)
+    if all(names) and names[0] != names[1]:
+        raise InputError(
+            f"a depth image in the frame {names[0]!r} came with a camera_info of {names[1]!r}, "
+            "which is another camera's. Name the camera_info of this very image."
+        )
     intrinsics = _intrinsics_of(info, rectified)
     values = _pixels(image, DEPTHS, "a depth image")
     if values.shape != (intrinsics.height, intrinsics.width):
@@ -103,6 +110,11 @@ def depth_of(image: Any, info: Any, rectified: bool = False, unit_mm: float = 1.
         depth_mm *= np.float32(unit_mm if values.dtype.kind == "u" else 1000)
     depth_mm[~((depth_mm > 0) & (depth_mm < np.inf))] = np.nan
     return DepthFrame(depth_mm, intrinsics, stamp_of(image.header))
+
+
+def frame_of(message: Any) -> str:
+    """The frame that a message says it is in; empty: none. ROS 1 wrote some with a slash."""
+    return str(message.header.frame_id).strip().removeprefix("/")
 
 
 def mask_of(image: Any) -> Bool[np.ndarray, "h w"]:
@@ -134,7 +146,8 @@ def _intrinsics_of(info: Any, rectified: bool) -> Intrinsics:
     if matrix[0, 1] != 0:
         raise InputError("a camera_info came whose pixels are skewed, which is not supported.")
     fx, cx, fy, cy = matrix[0, 0], matrix[0, 2], matrix[1, 1], matrix[1, 2]
-    return Intrinsics(width, height, float(fx), float(fy), float(cx), float(cy))
+    camera = Intrinsics(width, height, float(fx), float(fy), float(cx), float(cy))
+    return plausible(camera, "a camera_info came")
 
 
 def _pixels(image: Any, allowed: dict[str, str], what: str) -> np.ndarray:

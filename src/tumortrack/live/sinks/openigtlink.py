@@ -20,6 +20,7 @@ from tumortrack.live.igtl import message as igtl
 from tumortrack.live.igtl.link import Link
 from tumortrack.live.igtl.message import Message, Polydata
 from tumortrack.live.meter import Rate
+from tumortrack.live.network import is_loopback
 from tumortrack.live.values import SinkConfig, SinkContext, TrackingResult
 
 STATUS_DEVICE, CT_DEVICE, CLOUD_DEVICE, ARMS_DEVICE = "tumortrack", "ct", "occupancy", "arms"
@@ -33,7 +34,7 @@ class OpenIgtLinkSinkConfig(SinkConfig, frozen=True, kw_only=True, tag="openigtl
 
     Attributes:
         port: the protocol's own is 18944; 0 takes a free one.
-        host: which of this machine's addresses to serve; 0.0.0.0: all.
+        host: which of this machine's addresses to serve; 0.0.0.0: all, for other machines.
         connect: host of a server to go to instead.
         mesh_hz: surfaces at most so often; 0: none.
         cloud_hz: the labelled cloud at most so often; 0: none.
@@ -80,6 +81,16 @@ class OpenIgtLinkSink:
         self._tips: set[str] = set()  # that ever were
         self._next, self._closed = 0, False
 
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Where it serves, and who else can receive."""
+        host, port = self._config.host, self.link.port
+        if self._config.connect:
+            return ()
+        if is_loopback(host):
+            return (f"serving on {host}:{port}, this machine alone",)
+        return (f"anyone in this network can see the patient's organ on port {port} of {host}",)
+
     def publish(self, result: TrackingResult) -> None:
         self._send(result, igtl.OK if result.estimate is not None else igtl.NOT_FOUND)
         self._next = result.sequence + 1
@@ -108,7 +119,8 @@ class OpenIgtLinkSink:
 
     def _statuses(self, result: TrackingResult, code: int) -> Iterator[_Content]:
         found = result.estimate is not None
-        name, text = (result.quality, result.warning) if found else ("no estimate", result.reason)
+        name = result.quality if found else "no estimate"
+        text = result.describe() if found else result.reason
         more = {"quality": str(result.quality)}
         if result.latency_ms is not None:
             more["latency_ms"] = f"{result.latency_ms:.1f}"

@@ -59,7 +59,7 @@ class RosSink:
     whenever there is no estimate, all topics say so."""
 
     def __init__(self, config: RosSinkConfig, context: SinkContext, bus: Bus) -> None:
-        self._bus = bus
+        self._bus, self.notes = bus, (bus.note,)
         self._results = ResultMessages(bus.messages, context, config.mesh_hz)
         self._last: TrackingResult | None = None
         nothing = TrackingResult(sequence=0, stamp_ns=0, published_frame=context.published_frame)

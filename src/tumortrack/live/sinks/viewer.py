@@ -1,17 +1,18 @@
 """A web page that shows each estimate: ``viewer:8080?case=CASE_FOLDER&margin_mm=5``.
 
+Who may see it and who may change anything is the affair of ``viewer.guard``.
+
 The page says how good the estimate is, how old, and why there is none; without one, or after a
 second of silence, nothing of an older one stays visible.
 """
 
 from __future__ import annotations
 
-import logging
 import socket
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -23,6 +24,7 @@ from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.types import Mesh
 from tumortrack.live.display import seen_points
+from tumortrack.live.network import is_loopback
 from tumortrack.live.values import SinkConfig, SinkContext, TrackingResult
 from tumortrack.live.viewer.look import point_under
 from tumortrack.live.viewer.panel import ABORTED, CANCEL, CLICK, Panel, State, StatusPanel
@@ -32,17 +34,23 @@ from tumortrack.live.viewer.slices import load_ct, plane_through, slice_picture
 if TYPE_CHECKING:
     from viser import GuiEvent, SceneClickEvent, ViserServer
 
+    from tumortrack.live.viewer.guard import Guard, GuardedConnection
+
 _STALE_S = 1.0
 _TICK_S = 0.2  # the status grows older, and slices are renewed, this often
 _SLICE_PIXELS = 320
+_PARKED_S = 1.0  # for viser's thread to stand still, else what changes may arrive in pieces
+_TOLD_S = 5.0  # between two notices to a visitor who may only watch
 
 
 class ViewerSinkConfig(SinkConfig, frozen=True, kw_only=True, tag="viewer"):
-    """A page at ``http://host:port``.
+    """A page at ``http://host:port``. What its visitors change needs the address with the token,
+    which is said at the start.
 
     Attributes:
         port: 0: any free one.
-        host: who may look: 127.0.0.1, this machine; 0.0.0.0, whoever can reach it.
+        host: who may look, and stop arms: 127.0.0.1, this machine; 0.0.0.0, whoever can reach it;
+            a name of this machine, by which the page may then be called.
         case: folder of the patient's case: its CT (its labels, where it has none) is shown in
             slices.
         margin_mm: distance of the shell round each tumor; 0: none.
@@ -71,24 +79,27 @@ class ViewerSinkConfig(SinkConfig, frozen=True, kw_only=True, tag="viewer"):
 
 
 class ViewerSink:
-    """See ``live.values.Sink``. ``port``: where the page is."""
+    """See ``live.values.Sink``. ``port``: where the page is; ``url``: its address for those who may
+    change something."""
 
     def __init__(self, config: ViewerSinkConfig, context: SinkContext) -> None:
         self._ct = load_ct(config.case, context) if config.case else None
         self._config, self._context = config, context
-        self._server = _opened(config.host, config.port)
+        self._server, self._guard = _opened(config.host, config.port)
         self.port: int = self._server.get_port()
+        self.url = f"{self._page_url()}/{self._guard.token}"
         self._back = np.linalg.inv(context.published_frame.published_from_camera)
         self._lock = threading.RLock()  # round every change of the page
         self._result: TrackingResult | None = None  # the last that came
-        self._shown: TrackingResult | None = None  # whose estimate is visible
+        self._told: TrackingResult | None = None  # the page is of this one, all of it
+        self._shown: TrackingResult | None = None  # the same, if its estimate is visible
         self._came = self._drawn = -np.inf
         self._hidden_count = 0  # a slice made before the last hiding is void
         self._counter = 0
         self._fault: BaseException | None = None  # for the next publish to raise
         self._picking = False
         self._state: State = "waiting"
-        self._behind: tuple[State, bool] | None = None
+        self._server.scene.set_background_image(np.full((4, 4, 3), colours.BACKGROUND, np.uint8))
         self._scene = ViewerScene(self._server, context, config.margin_mm)
         whose, slices = str(context.patient), self._ct is not None
         self._panel = Panel(self._server, context.parts, slices, context.arms, whose)
@@ -110,8 +121,10 @@ class ViewerSink:
             switch.on_update(changed)
         panel.pick.on_click(lambda _: self._toggle_picking())
         panel.forget.on_click(lambda _: self._mark(None))
+        self._guard.on_refused = self._refused
         if self._context.arms:
             panel.abort.on_click(lambda _: self._abort())
+            self._guard.free[panel.abort._impl.uuid] = self._context.controls.aborted.set
 
             @panel.views.on_click
             def _(event: GuiEvent[Any]) -> None:
@@ -119,18 +132,15 @@ class ViewerSink:
                     self._scene.look.turn(event.client, event.target.value)
 
     def publish(self, result: TrackingResult) -> None:
-        """Show it: without an estimate at once, with one not more often than ``hz``; arms each
-        time."""
+        """Show it, all of it at once and not more often than ``hz``; a change of the quality, and
+        arms that halt or go on, without delay."""
         if self._closing.is_set():
             return
         now = time.monotonic()
         with self._page():
-            before, self._result, self._came = self._result, result, now
-            if result.estimate is None:
-                self._hide()
-            self._draw_cell(result)
-            changed = before is None or self._shown is None or before.quality != result.quality
-            if changed or now - self._drawn >= 1 / self._config.hz:
+            self._result, self._came = result, now
+            changed = self._told is None or _kind(self._told) != _kind(result)
+            if changed or self._state == "stale" or now - self._drawn >= 1 / self._config.hz:
                 self._drawn = now
                 self._draw(result)
         fault, self._fault = self._fault, None
@@ -143,16 +153,63 @@ class ViewerSink:
             self._watch.join(5)
             _close(self._server)
 
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Where the page is, and who else can see it."""
+        said = f"open {self.url}"
+        if is_loopback(self._config.host):
+            return (said,)
+        power = "see the patient's organ" + (" and stop the arms" if self._context.arms else "")
+        return said, (
+            f"anyone in this network can {power} at {self._page_url()}; nothing is encrypted. "
+            "Whoever has the longer address can change what is shown and tracked."
+        )
+
+    def _page_url(self) -> str:
+        host = self._config.host
+        if host in ("0.0.0.0", "::"):
+            host = socket.gethostname()
+        return f"http://{f'[{host}]' if ':' in host else host}:{self.port}"
+
+    def _refused(self, connection: GuardedConnection) -> None:
+        """Tell a visitor without the token, but not at each movement of a slider."""
+        now = time.monotonic()
+        for client in self._server.get_clients().values():
+            known = self._server._websock_server._live_connections
+            if known.get(client.client_id) is connection and now >= connection.told_until_s:
+                connection.told_until_s = now + _TOLD_S
+                client.add_notification(
+                    "This page only watches",
+                    "Use the address that tumortrack printed at its start to change something."
+                    + (" Stopping the arms works here too." if self._context.arms else ""),
+                )
+
     @contextmanager
     def _page(self) -> Iterator[None]:
-        """What is changed inside arrives at clients together."""
-        with self._lock, self._server.atomic():
-            yield
+        """What is changed inside arrives at clients together. viser's thread stands still
+        meanwhile: its own ``atomic`` cuts what it is sending where the next change begins."""
+        parked, go_on = threading.Event(), threading.Event()
+
+        def park() -> None:
+            parked.set()
+            go_on.wait()
+
+        with self._lock:
+            with suppress(RuntimeError):  # it has ended: nobody is looking
+                self._server.get_event_loop().call_soon_threadsafe(park)
+                parked.wait(_PARKED_S)
+            try:
+                yield
+            finally:
+                go_on.set()
 
     def _draw(self, result: TrackingResult) -> None:
+        self._told = result
+        self._draw_cell(result)
         try:
             self._scene.observe(result)
             if result.estimate is None:
+                self._hide()
                 self._scene.apply()
             else:
                 self._scene.show(result)
@@ -161,7 +218,7 @@ class ViewerSink:
         except Exception as error:
             self._hide()
             reason = f"this estimate cannot be shown ({error!r})"
-            self._result = replace(result, estimate=None, quality="none", reason=reason)
+            self._told = replace(result, estimate=None, quality="none", reason=reason)
             self._say("none")
             raise
 
@@ -181,14 +238,11 @@ class ViewerSink:
     def _say(self, state: State) -> None:
         self._state = state
         self._counter += 1
-        result = self._result
+        result = self._told
         late_s = 0.0 if result is None else (result.latency_ms or 0.0) / 1000
-        age_s = 0.0 if result is None else time.monotonic() - self._came + late_s
-        status = StatusPanel(state, result, age_s, self._counter, self._context.arms)
-        if (behind := (state, status.alarming)) != self._behind:
-            self._behind = behind
-            self._server.scene.set_background_image(status.backdrop())
-        self._panel.say(status)
+        since_s = self._came if state == "stale" else self._drawn
+        age_s = 0.0 if result is None else time.monotonic() - since_s + late_s
+        self._panel.say(StatusPanel(state, result, age_s, self._counter, self._context.arms))
 
     def _keep_watch(self) -> None:
         """Says how old the last frame is, hides what got too old, renews the slice."""
@@ -217,7 +271,8 @@ class ViewerSink:
         motion, picture = result.estimate.motion, None
         if plane is not None and motion is not None:
             outlines = self._outlines(result)
-            picture = slice_picture(self._ct, motion, plane, outlines, _SLICE_PIXELS)
+            number = f"frame no. {result.sequence}"
+            picture = slice_picture(self._ct, motion, plane, outlines, _SLICE_PIXELS, number)
         with self._page():
             if hidden_count == self._hidden_count:
                 self._panel.put_slice(picture)
@@ -274,10 +329,18 @@ class ViewerSink:
             self._panel.abort.label, self._panel.abort.disabled = ABORTED, True
 
 
-def _opened(host: str, port: int) -> ViserServer:
+def _kind(result: TrackingResult) -> tuple[str, str, bool]:
+    """What a page must not be late to say."""
+    cell = result.workcell
+    return result.quality, "" if cell is None else cell.state, cell is None or bool(cell.halted)
+
+
+def _opened(host: str, port: int) -> tuple[ViserServer, Guard]:
     """A running server with an empty scene, where it was asked for; port 0: any free one."""
     try:
         import viser
+
+        from tumortrack.live.viewer.guard import Guard
     except ImportError as error:
         raise InputError("the viewer needs viser: pip install 'tumortrack[live]'.") from error
     taken = (
@@ -296,24 +359,24 @@ def _opened(host: str, port: int) -> ViserServer:
         ) from error
     except OSError as error:
         raise InputError(f"{taken} ({error.strerror})") from error
-    logging.getLogger("websockets.server").addFilter(_is_no_refusal)
-    with _silence():
+    guard = Guard(host, f"viser-v{viser.__version__}")
+    with _silence(), guard.around_start():
         server = viser.ViserServer(host=host, port=port, label="tumortrack", verbose=False)
+    # One change may be more messages than viser sends in one piece, 128; a visitor's first too.
+    server._websock_server._broadcast_buffer.max_window_size = 10_000
+    if not guard.installed:
+        _close(server)
+        raise InputError(f"viser {viser.__version__} cannot be guarded. Install viser 1.1.1.")
     if port not in (0, server.get_port()):
         _close(server)
         raise InputError(taken)
-    return server
+    return server, guard
 
 
 def _close(server: ViserServer) -> None:
     """Stop it, its threads and its connections; browsers have up to 6 s to say goodbye."""
     with _silence():
         server.stop()
-
-
-def _is_no_refusal(record: logging.LogRecord) -> bool:
-    """Browsers open connections in advance and drop them, which websockets logs as an error."""
-    return record.getMessage() != "opening handshake failed"
 
 
 @contextmanager

@@ -20,6 +20,7 @@ import numpy as np
 from tumortrack.core.errors import InputError
 from tumortrack.core.types import DepthFrame, Intrinsics
 from tumortrack.live.values import Observation, SourceConfig, SourceEnded, SourceLost
+from tumortrack.sense.camera import plausible
 
 _RECORDINGS = (".db3", ".bag")
 _LAST_S = 0.2  # after a recording's end: its last frame may still be on its way
@@ -108,7 +109,8 @@ class RealSenseSource:
                 "a rectified stream is needed. Calibrate the camera."
             )
         focal, center = (given.fx, given.fy), (given.ppx, given.ppy)
-        self._intrinsics = Intrinsics(given.width, given.height, *focal, *center)
+        camera = Intrinsics(given.width, given.height, *focal, *center)
+        self._intrinsics = plausible(camera, "the RealSense")
         self._unit_mm = float(f"{self._sensor.get_option(rs.option.depth_units) * 1000:.6g}")
         if self._playback is None:
             _set_up(rs, self._sensor, config)

@@ -15,7 +15,15 @@ from tumortrack.live.ros.bus import Bus, Subscriber, check_topic
 from tumortrack.live.ros.messages import stamp_of
 from tumortrack.live.ros.ros2 import Via, open_bus
 from tumortrack.live.ros.rospy_node import RospyBus
-from tumortrack.live.ros.sensors import CAMERA_INFO, CLOUD, IMAGE, cloud_of, depth_of, mask_of
+from tumortrack.live.ros.sensors import (
+    CAMERA_INFO,
+    CLOUD,
+    IMAGE,
+    cloud_of,
+    depth_of,
+    frame_of,
+    mask_of,
+)
 from tumortrack.live.values import Observation, SourceConfig, SourceLost
 
 _KINDS = {"image": IMAGE, "cloud": CLOUD}
@@ -181,7 +189,7 @@ class RosSource:
             self._clock = "known"
             self.host_clock = abs(arrived_ns - stamp_of(message.header)) < _SAME_CLOCK_NS
         if self._kind == CLOUD:
-            return Observation(cloud_of(message), arrived_ns)
+            return Observation(cloud_of(message), arrived_ns, frame_id=frame_of(message))
         info = self._latest.get(CAMERA_INFO)
         if info is None:
             raise InputError(
@@ -189,7 +197,8 @@ class RosSource:
                 f"Name its topic: {self._name}?info=/.../camera_info."
             )
         frame = depth_of(message, info, self._config.rectified, self._config.unit_mm)
-        return Observation(frame, arrived_ns, self._mask_for(frame) if self._config.mask else None)
+        mask = self._mask_for(frame) if self._config.mask else None
+        return Observation(frame, arrived_ns, mask, frame_id=frame_of(message))
 
     def _mask_for(self, frame: DepthFrame) -> Bool[np.ndarray, "h w"]:
         """The newest mask, held against the frame that it goes with."""

@@ -15,6 +15,7 @@ from jaxtyping import UInt8
 
 from tumortrack.core import colours
 from tumortrack.core.colours import Colour, css, part_colour
+from tumortrack.core.estimate import NO_CHECK_FAILED, UNVERIFIED
 from tumortrack.core.patient import NOBODY
 from tumortrack.live.values import TrackingResult, Workcell
 from tumortrack.live.viewer.look import View
@@ -31,28 +32,35 @@ ABORT, ABORTED = "Stop the arms for good", "The arms were stopped for good"
 CLICK, CANCEL = "Click the organ", "Now click on the organ (again: cancel)"
 SILENCE_S = 2  # without a word from the server the page itself says so
 
-# In the panel, over the scene, in colour.
-_HEADINGS: dict[State, tuple[str, str, Colour]] = {
-    "waiting": ("WAITING", "WAITING", colours.STALE),
-    "good": ("GOOD", "", colours.GOOD),
-    "poor": ("POOR", "POOR ESTIMATE", colours.POOR),
-    "none": ("NO ESTIMATE", "NO ESTIMATE", colours.NONE),
-    "stale": ("STALE", "STALE", colours.STALE),
+# What stands in the panel, and unless all is well over the scene too; its colour.
+_HEADINGS: dict[State, tuple[str, Colour]] = {
+    "waiting": ("WAITING", colours.STALE),
+    "good": (NO_CHECK_FAILED.upper(), colours.GOOD),
+    "poor": ("POOR ESTIMATE", colours.POOR),
+    "none": ("NO ESTIMATE", colours.NONE),
+    "stale": ("STALE", colours.STALE),
 }
 _EMPTY: tuple[State, ...] = ("waiting", "none", "stale")
 
-# The styles, and the page's own watch: every message replaces this element and so restarts its
-# clock. When none comes (the program was killed, the network is gone) it shows itself, by the
-# browser alone; as a popover it lies above all, where the panel has been dimmed too.
+# Styles, where the status is shown, and how it gets there. Surfaces reach the screen one frame
+# after the message that brought them, so what a message says waits as long (status.html).
 _PAGE = Template(files(__package__).joinpath("status.html").read_text("utf-8")).substitute(
     stale=css(colours.STALE), silence_s=SILENCE_S, right=_WIDTH + 18
+)
+# The page's own watch: every message replaces this element and so restarts its clock. When none
+# comes (the program was killed, the network is gone) it shows itself, by the browser alone; as a
+# popover it lies above all, where the panel has been dimmed too.
+_SILENCE = (
+    '<div class="tumortrack-silence" onanimationend="this.popover = \'manual\'; '
+    f'this.showPopover()"><div>STALE<small>tumortrack has been silent for {SILENCE_S} s, or its '
+    "panel was closed; what is said here is old</small></div></div>"
 )
 
 
 @dataclass(frozen=True, eq=False)
 class StatusPanel:
-    """What the panel says now. ``result``: the last; ``age_s``: since its frame; ``counter``:
-    another with each message; ``arms``: there may be some."""
+    """What is said of the result that is shown. ``age_s``: since its frame; ``counter``: another
+    with each message; ``arms``: there may be some."""
 
     state: State
     result: TrackingResult | None
@@ -74,24 +82,44 @@ class StatusPanel:
             return None
         return self.result.workcell
 
-    def flag(self) -> str:
-        """How good, in one line; over the page a banner with the reason, and the page's watch."""
-        text, heading, colour = _HEADINGS[self.state]
-        size = 44 if self.alarming else 20  # big where there is nothing to see
-        banner = heading and _over("top", size, colour, heading, self._reason())
-        arms = self._arms() if self.arms else ""
-        return f"<i hidden>{self.counter}</i>{_PAGE}{banner}{_box(text, colour)}{arms}"
+    def stage(self) -> str:
+        """All that is said, in one piece that the page shows at once: in the panel (``flag``,
+        ``numbers``) and over everything (``over``)."""
+        parts = {"flag": self.flag(), "numbers": self.numbers(), "over": self._over_scene()}
+        inside = "".join(f'<div class="{name}">{html}</div>' for name, html in parts.items())
+        return f'<div class="tumortrack-stage" hidden data-n="{self.counter}">{inside}</div>'
 
-    def _arms(self) -> str:
+    def flag(self) -> str:
+        """How good, of which frame; what the arms do."""
+        text, colour = _HEADINGS[self.state]
+        return _box(text, colour, self._number()) + (self._arms()[0] if self.arms else "")
+
+    def _over_scene(self) -> str:
+        """A banner with the reason; where it is alarming the whole page in its colour; the page's
+        watch."""
+        heading, colour = _HEADINGS[self.state]
+        tint, size = "", 16 if self.state == "good" else 20
+        if self.alarming:
+            size = 44  # big where there is nothing to see
+            style = f"background:{css(colour)}48;color:{css(colour)}"
+            tint = f"<div class='tumortrack-tint' style='{style}'></div>"
+        why = f"{self._number()}: {self._reason()}"
+        banner = _over("top", size, colour, heading, why.removeprefix(": "))
+        return tint + banner + (self._arms()[1] if self.arms else "") + _SILENCE
+
+    def _number(self) -> str:
+        return "" if self.result is None else f"frame no. {self.result.sequence}"
+
+    def _arms(self) -> tuple[str, str]:
         """What they do: in the panel, and over the scene; where they stand still, why."""
         cell = self._cell
         if cell is None:
-            return _box("ARMS: nothing is known of them", colours.STALE)
+            return _box("ARMS: nothing is known of them", colours.STALE), ""
         colour = colours.NONE if cell.halted else colours.ARMS
         text = f"{cell.state}: HALTED" if cell.halted else cell.state
         left = "" if cell.left_mm is None else f"{cell.left_mm:.1f} mm of the margin are left"
         box = _box(f"ARMS: {text}", colour, cell.halted or left)
-        return _over("bottom", 20, colour, text, cell.halted) + box
+        return box, _over("bottom", 20, colour, text, cell.halted)
 
     def _reason(self) -> str:
         if self.state == "waiting":
@@ -99,6 +127,8 @@ class StatusPanel:
         if self.state == "stale":
             return f"nothing has come for {self.age_s:.1f} s; the last estimate is hidden"
         assert self.result is not None
+        if self.state == "good":
+            return UNVERIFIED
         return self.result.reason if self.state == "none" else self.result.warning
 
     def numbers(self) -> str:
@@ -119,24 +149,10 @@ class StatusPanel:
             f"<div class='tumortrack-numbers'>{parts}"
             "<div style='display:flex;justify-content:space-between;margin-top:6px'>"
             f"<span>latency <b>{latency}</b></span><span>last frame <b>{self.age_s:.1f} s</b> ago"
-            f"</span><span>no. {result.sequence}</span></div>"
+            "</span></div>"
             "<div style='opacity:0.65;font-size:12px;min-height:36px'>"
             f"{times and 'stages, ms: '}{times}</div></div>"
         )
-
-    def backdrop(self) -> UInt8[np.ndarray, "h w 3"]:
-        """What lies behind the scene: dark; where it is alarming, a warning colour and the word, so
-        that it is read with the panel closed too."""
-        from PIL import Image, ImageDraw
-
-        if not self.alarming:
-            return np.full((4, 4, 3), colours.BACKGROUND, np.uint8)
-        dark = colours.BACKGROUND_NONE if self.state == "none" else colours.BACKGROUND_STALE
-        image = Image.new("RGB", (960, 800), dark)
-        fill = tuple(min(255, 2 * channel + 30) for channel in dark)
-        heading = _HEADINGS[self.state][1]
-        ImageDraw.Draw(image).text((480, 730), heading, fill=fill, font_size=84, anchor="mm")
-        return np.asarray(image)
 
 
 def _over(edge: str, size: int, colour: Colour, text: str, why: str) -> str:
@@ -193,7 +209,8 @@ class Panel:
         gui.main_panel.dock_right()
         gui.main_panel.set_width(_WIDTH)
         self.whose = gui.add_html(f"<div style='padding:4px 12px'><b>{escape(whose)}</b></div>")
-        self.flag = gui.add_html("")  # of one height: what is to be clicked must not jump
+        gui.add_html(_PAGE)  # of one height: what is to be clicked must not jump
+        self.stage = gui.add_html("")
         self.pick = gui.add_button(
             CLICK, hint="Of several things before the camera, choose the one that is the organ"
         )
@@ -203,7 +220,7 @@ class Panel:
                 ABORT, color="red", hint="The arms stop, and move no more in this run"
             )
             self.views = gui.add_button_group("Look at", get_args(View))
-        self._numbers = gui.add_html("")
+        gui.add_html('<div id="tumortrack-numbers"></div>')
         self.slice = None
         default = DisplayOptions()
         shown: dict[str, Any] = {}  # by the option's name
@@ -231,9 +248,7 @@ class Panel:
         return DisplayOptions(**{name: element.value for name, element in self._shown.items()})
 
     def say(self, status: StatusPanel) -> None:
-        # Both before either: an error leaves the page as it was.
-        flag, numbers = status.flag(), status.numbers()
-        self.flag.content, self._numbers.content = flag, numbers
+        self.stage.content = status.stage()
 
     def put_slice(self, picture: UInt8[np.ndarray, "h w 3"] | None) -> None:
         if self.slice is not None:

@@ -81,7 +81,7 @@ class ViewerScene:
         self._picked = nodes.add_icosphere(
             "/picked", radius=1.5, color=colours.PICKED, visible=False, cast_shadow=False
         )
-        self._estimate = nodes.add_frame("/estimate", show_axes=False, visible=False)
+        nodes.add_frame("/estimate", show_axes=False)
         self._shells, self._parts = {}, {}
         for label, name in enumerate(context.parts, start=1):
             look = {"color": colours.part_colour(label), "visible": False}
@@ -133,19 +133,23 @@ class ViewerScene:
         assert placed is not None
         self._put_labelled(placed)
         self.margins = self._margins_of(result, placed)
-        for name, mesh in placed.meshes.items():
-            if name in self._parts:
-                shown = self.look.last_drawn(self._bare(mesh)) if name == "kidney" else mesh
-                _put_mesh(self._parts[name], shown)
-        for name, mesh in self.margins.items():
-            _put_mesh(self._shells[name], mesh)
+        for name, node in self._parts.items():
+            mesh = placed.meshes.get(name, _NOTHING)
+            shown = self.look.last_drawn(self._bare(mesh)) if name == "kidney" else mesh
+            _put_mesh(node, shown)
+        for name, node in self._shells.items():
+            _put_mesh(node, self.margins.get(name, _NOTHING))
         self._placed = placed
         self.apply()
 
     def hide(self) -> None:
-        """Nothing of any estimate stays visible."""
+        """Nothing of any estimate stays. Surfaces are emptied, not made invisible: browsers show
+        the one a frame later than the other, and old surfaces could not come back."""
+        for node in (*self._parts.values(), *self._shells.values()):
+            _put_mesh(node, _NOTHING)
+        self._points.points, self._points.colors = _NO_POINTS, _NO_POINTS.astype(np.uint8)
         self._placed = None
-        self._has_slice = self._estimate.visible = False
+        self._has_slice = self._slice.visible = False
         self.margins = {}
 
     def apply(self) -> None:
@@ -157,15 +161,14 @@ class ViewerScene:
         if placed is None:
             return
         for name, node in self._parts.items():
-            node.visible = name in placed.meshes and (name != "kidney" or options.kidney > 0)
+            node.visible = name != "kidney" or options.kidney > 0
             if name != "kidney":  # solid, unless points are to be seen in it
                 node.opacity = None if options.points == "none" else _TUMOR_WITH_POINTS
-        for name, node in self._shells.items():
-            node.visible = options.margin and name in self.margins
+        for node in self._shells.values():
+            node.visible = options.margin
         self._parts["kidney"].opacity = options.kidney
         self._points.visible = options.points != "none"
         self._slice.visible = options.slice_plane and self._has_slice
-        self._estimate.visible = True
 
     def change(self, options: DisplayOptions) -> None:
         """What the user wants to see is another."""

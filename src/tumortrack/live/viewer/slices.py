@@ -102,10 +102,11 @@ def slice_picture(
     plane: SlicePlane,
     outlines: Iterable[tuple[Mesh, Colour, int]],
     pixels: int,
+    note: str = "",
 ) -> UInt8[np.ndarray, "h w 3"] | None:
     """The CT in a plane before the camera, over it the outlines of surfaces (camera frame) in
-    their colour and width (pixels), and a bar of 10 mm. None where ``motion`` knows no way back.
-    """
+    their colour and width (pixels), a bar of 10 mm, and ``note`` in the corner. None where
+    ``motion`` knows no way back."""
     from PIL import Image, ImageDraw
 
     sampled = pixels // _COARSER
@@ -123,6 +124,7 @@ def slice_picture(
     edge, foot = fine / 32, fine - fine / 32
     draw.line((edge, foot, edge + _BAR_MM * per_mm, foot), fill="white", width=_FINER * 3)
     draw.text((edge, foot - 17 * _FINER), f"{_BAR_MM} mm", fill="white", font_size=12 * _FINER)
+    draw.text((fine - edge, foot), note, fill="white", font_size=12 * _FINER, anchor="rb")
     return np.asarray(image.resize((pixels, pixels), Image.Resampling.BOX))
 
 

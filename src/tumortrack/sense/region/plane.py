@@ -8,6 +8,8 @@ little behind a plane speak against it.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from tumortrack.sense.region.picture import NO_RETURN, PLANE, Picture, RegionConfig, jit
@@ -22,24 +24,41 @@ _MOST_BEHIND = 0.03  # of the points on the plane: more is a cavity, and the org
 _NARROWEST_MM = 120.0  # extent of a background across its long side
 
 
+class Plane(NamedTuple):
+    """``normal @ point = offset``, mm; the unit normal points to the camera. ``half_mm``: what lies
+    so far from it is still the plane. ``middle``, ``wide_mm``: of what is seen of it."""
+
+    normal: np.ndarray
+    offset: float
+    half_mm: float
+    middle: np.ndarray
+    wide_mm: float
+
+
 def remove_plane(picture: Picture, config: RegionConfig, rng: np.random.Generator) -> None:
-    """Take the background plane, looked for in all pixels (also those that other steps have taken),
-    and what lies behind it, where there is one."""
+    """Take the background plane, and what lies behind it, where there is one."""
+    if (found := find_plane(picture, config, rng)) is not None:
+        normal, offset, half_mm = found[:3]
+        _take_below(picture.depth_mm, picture.taken, picture.pinhole, normal, offset, half_mm)
+
+
+def find_plane(picture: Picture, config: RegionConfig, rng: np.random.Generator) -> Plane | None:
+    """The background plane, looked for in all pixels, also those that a step has taken."""
     points = _some_points(picture, config.crop.far_mm + _BEYOND_MM, rng)
     if len(points) < 50:
-        return
+        return None
     # Uneven, and noisy: three standard deviations.
     most_mm = config.plane_mm + 3 * config.noise_mm * float(np.median(points[:, 2]) / 150) ** 2
     triples = rng.integers(len(points), size=(_TRIES, 3))
     score, normal, offset = _consensus(points, triples, most_mm)
     if score < config.plane_share / 2 * len(points):
-        return
+        return None
     half_mm = most_mm
     for _ in range(3):
         height = points @ normal - offset
         inliers = points[np.abs(height) < half_mm]
         if len(inliers) < 20:
-            return
+            return None
         middle = inliers.mean(0)
         apart = inliers - middle
         spreads, axes = np.linalg.eigh(apart.T @ apart / len(apart))
@@ -53,12 +72,12 @@ def remove_plane(picture: Picture, config: RegionConfig, rng: np.random.Generato
     # A strip or disc of even density is sqrt(12) or 4 standard deviations wide.
     wide_mm = np.sqrt(12 * spreads[1])
     if (
-        on >= config.plane_share * len(points)
-        and behind <= _MOST_BEHIND * on
-        and wide_mm >= _NARROWEST_MM
+        on < config.plane_share * len(points)
+        or behind > _MOST_BEHIND * on
+        or wide_mm < _NARROWEST_MM
     ):
-        normal = normal.astype(np.float64)
-        _take_below(picture.depth_mm, picture.taken, picture.pinhole, normal, offset, half_mm)
+        return None
+    return Plane(normal.astype(np.float64), offset, half_mm, middle.astype(np.float64), wide_mm)
 
 
 def _some_points(picture: Picture, far_mm: float, rng: np.random.Generator) -> np.ndarray:

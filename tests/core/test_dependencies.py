@@ -1,0 +1,88 @@
+"""What the package stands on: locked as pyproject.toml says, under licences that are allowed."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import tomllib
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
+
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.fixture(scope="module")
+def tool() -> ModuleType:
+    spec = importlib.util.spec_from_file_location("dependencies", ROOT / "tools/dependencies.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def asked_for() -> list[Requirement]:
+    lines: list[str] = []
+    for folder in (ROOT, ROOT / "lab"):
+        project = tomllib.loads((folder / "pyproject.toml").read_text("utf-8"))["project"]
+        lines += project["dependencies"]
+        for extra in project.get("optional-dependencies", {}).values():
+            lines += extra
+    return [Requirement(line) for line in lines if not line.startswith("tumortrack")]
+
+
+def test_every_range_is_locked_to_a_version_in_it_by_hash(tool):
+    locked = tool.versions()
+    assert len(asked_for()) > 45
+    for requirement in asked_for():
+        version, digests = locked[canonicalize_name(requirement.name)]
+        assert version in requirement.specifier, f"{requirement}: run make lock"
+        assert digests
+    assert all(digests for _, digests in locked.values())
+    cpu = tool.pinned((ROOT / "requirements/torch-cpu.txt").read_text("utf-8"))["torch"]
+    assert cpu.startswith(f"torch=={locked['torch'][0]}+cpu")
+
+
+def test_what_is_installed_is_what_is_locked_and_its_licences_are_listed(tool):
+    locked = tool.versions()
+    for name, package in tool.everything().items():
+        assert package.version.split("+")[0] == locked[name][0], f"{name}: run make setup"
+    assert tool.main(["licences"]) == 0
+    assert tool.TABLE.read_text("utf-8") == tool.table(), "run make licences"
+
+
+@pytest.mark.parametrize(
+    ("expression", "allowed"),
+    [
+        ("MIT", True),
+        ("Apache-2.0 WITH LLVM-exception AND MIT", True),
+        ("GPL-3.0-only OR MIT", True),
+        ("(Apache-2.0 OR GPL-2.0) AND MIT", False),  # not taken apart so far: a person looks
+        ("GPL-3.0-only", False),
+        ("AGPL-3.0-or-later", False),
+        ("MIT AND GPL-2.0-only", False),
+        ("GNU General Public License v3 (GPLv3)", False),
+        ("", False),
+        ("whatever", False),
+    ],
+)
+def test_which_licences_are_allowed(tool, expression, allowed):
+    assert tool.is_allowed(expression) == allowed
+
+
+def test_a_wheel_comes_with_what_it_needs(tool, tmp_path):
+    wheel = tmp_path / "tumortrack-0.2.0-py3-none-any.whl"
+    assert tool.main(["sbom", str(wheel)]) == 0
+    bom = json.loads((tmp_path / "tumortrack-0.2.0-py3-none-any.cdx.json").read_text("utf-8"))
+    assert (bom["bomFormat"], bom["specVersion"]) == ("CycloneDX", "1.6")
+    parts = {part["bom-ref"]: part for part in bom["components"]}
+    version, digests = tool.versions()["websockets"]  # not asked for itself: viser brings it
+    assert parts["websockets"]["purl"] == f"pkg:pypi/websockets@{version}"
+    (reference,) = parts["websockets"]["externalReferences"]
+    assert {one["content"] for one in reference["hashes"]} == set(digests)
+    assert "ruff" not in parts  # developers' own
+    assert "tumortrack" not in parts

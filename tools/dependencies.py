@@ -1,0 +1,274 @@
+"""The packages that this one stands on: locked by hash, their licences, what a wheel brings along.
+
+tools/dependencies.py lock [--upgrade]   requirements/*.txt, of pyproject.toml's ranges
+tools/dependencies.py licences           refuses a licence that is not allowed
+tools/dependencies.py table              docs/dependencies.md
+tools/dependencies.py sbom WHEEL         CycloneDX 1.6 beside a wheel: WHEEL.cdx.json
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import subprocess
+import sys
+import tempfile
+import tomllib
+from importlib.metadata import Distribution, PackageNotFoundError, distribution
+from pathlib import Path
+from typing import Any
+
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
+
+ROOT = Path(__file__).parents[1]
+LOCKS = ROOT / "requirements"
+TABLE = ROOT / "docs" / "dependencies.md"
+OWN = ("tumortrack", "tumortrack-lab")
+_APART = {"ur-rtde": "ur"}  # in a file of its own: `make setup` leaves it out
+
+# Licences that ask for no more than to be named, and those that bind only changes of the package
+# itself (MPL, EPL) or its own exchange (LGPL): all of them are imported, none is copied.
+ALLOWED = {
+    "0BSD", "Apache-2.0", "BSD-2-Clause", "BSD-3-Clause", "BSD", "BSL-1.0", "CC0-1.0", "EPL-2.0",
+    "LGPL", "LLVM-exception", "MIT", "MIT-CMU", "MPL-2.0", "PSF-2.0", "Unlicense", "Zlib",
+}  # fmt: skip
+# What packages say that say it otherwise, as found in their metadata or, with the reason, in their
+# licence file.
+SAID = {
+    "apache software license": "Apache-2.0",
+    "bsd license": "BSD",
+    "3-clause bsd license": "BSD-3-Clause",
+    "mit license": "MIT",
+    "mozilla public license 2.0 (mpl 2.0)": "MPL-2.0",
+    "python software foundation license": "PSF-2.0",
+    "epl-2.0, bsd-3-clause": "EPL-2.0 OR BSD-3-Clause",
+    "osi approved": "",
+}
+STATED = {
+    "apsw": "Zlib",  # "any-OSI" in its metadata; LICENSE: the zlib licence among others
+    "cmeel-qhull": "BSD",  # nothing in its metadata; Qhull's COPYING: free, with attribution
+    "embreex": "BSD-2-Clause",  # its metadata holds the licence's text
+}
+
+
+def lock(upgrade: list[str]) -> None:
+    """Resolve everything for every platform, and keep what is pinned unless told to upgrade."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
+    extras = ",".join(project["optional-dependencies"])
+    everything = f"-e {ROOT}[{extras}]\n-e {ROOT / 'lab'}\n"
+    pins = pinned(_resolved(everything, "".join(_locks().values()), upgrade))
+    files: dict[str, list[str]] = {name: [] for name in _ABOUT}
+    for name, text in pins.items():
+        cuda = re.match(r"nvidia-|cuda-|triton$", name)
+        files["cuda" if cuda else _APART.get(name, "lock")].append(text)
+    for name, texts in files.items():
+        head = f"# {_ABOUT[name]} Made by `make lock`; ranges are in pyproject.toml.\n"
+        (LOCKS / f"{name}.txt").write_text(head + "".join(texts), "utf-8")
+
+    tools = LOCKS / "tools.txt"
+    kept = tools.read_text("utf-8") if tools.exists() else ""
+    tools.write_text(_resolved("uv\npip-audit\n", kept, upgrade), "utf-8")
+
+
+def _resolved(wanted: str, kept: str, upgrade: list[str]) -> str:
+    """A lock file of these requirements, its versions as in ``kept`` where that is possible."""
+    own = [word for name in OWN for word in ("--no-emit-package", name)]
+    options = ["--universal", "--python-version", "3.11", "--generate-hashes", "--no-header"]
+    with tempfile.TemporaryDirectory() as folder:
+        source, made = Path(folder) / "in.txt", Path(folder) / "out.txt"
+        source.write_text(wanted, "utf-8")
+        made.write_text(kept, "utf-8")
+        command = ["uv", "pip", "compile", str(source), "-o", str(made), "--quiet", "--no-annotate"]
+        subprocess.run([*command, *options, *own, *upgrade], check=True, cwd=ROOT)
+        return made.read_text("utf-8")
+
+
+_ABOUT = {
+    "lock": "Everything that `make setup` installs, by hash.",
+    "cuda": "What PyPI's PyTorch for Linux needs besides; its CPU build does not.",
+    "ur": "For real arms: pip install --require-hashes --no-deps -r requirements/ur.txt",
+}
+
+
+def _locks() -> dict[str, str]:
+    paths = {name: LOCKS / f"{name}.txt" for name in _ABOUT}
+    return {name: path.read_text("utf-8") for name, path in paths.items() if path.exists()}
+
+
+def pinned(text: str) -> dict[str, str]:
+    """Each package's lines in a lock file, by its canonical name."""
+    found: dict[str, str] = {}
+    for block in re.findall(r"^[A-Za-z0-9].*\n(?:    .*\n)*", text, re.MULTILINE):
+        requirement = Requirement(re.split(r"\s*\\?\n", block)[0].rstrip(" \\"))
+        found[canonicalize_name(requirement.name)] = block
+    return found
+
+
+def versions() -> dict[str, tuple[str, list[str]]]:
+    """Version and SHA-256 digests of everything locked, by canonical name."""
+    found = {}
+    for text in _locks().values():
+        for name, block in pinned(text).items():
+            requirement = Requirement(block.splitlines()[0].rstrip(" \\"))
+            version = next(iter(requirement.specifier)).version
+            found[name] = version, re.findall(r"--hash=sha256:([0-9a-f]{64})", block)
+    return found
+
+
+def needed(
+    name: str, extras: set[str], seen: dict[str, Distribution] | None = None
+) -> dict[str, Distribution]:
+    """What is installed of all that a package needs here, directly or not, by canonical name."""
+    seen = {} if seen is None else seen
+    try:
+        found = distribution(name)
+    except PackageNotFoundError:
+        return seen  # for another platform, or of an extra that is not installed
+    key = canonicalize_name(name)
+    if key in seen and not extras:
+        return seen
+    seen[key] = found
+    for requirement in map(Requirement, found.requires or ()):
+        marker = requirement.marker
+        holds = marker is None or any(marker.evaluate({"extra": one}) for one in ("", *extras))
+        if holds and (canonicalize_name(requirement.name) not in seen or requirement.extras):
+            needed(requirement.name, set(requirement.extras), seen)
+    return seen
+
+
+def everything() -> dict[str, Distribution]:
+    """All that is installed of what is locked."""
+    found = {}
+    for name in versions():
+        try:
+            found[name] = distribution(name)
+        except PackageNotFoundError:
+            continue  # for another platform, or not part of `make setup`
+    return found
+
+
+def licence(package: Distribution) -> str:
+    """An SPDX expression, or whatever the package says; empty: it says nothing."""
+    about = package.metadata
+    name = canonicalize_name(about["Name"])
+    if name in STATED:
+        return STATED[name]
+    if expression := about.get("License-Expression"):
+        return str(expression)
+    prefix = "License :: "
+    classes = [
+        one.split(" :: ")[-1] for one in about.get_all("Classifier") or [] if one.startswith(prefix)
+    ]
+    words = classes or [str(about.get("License") or "").strip().partition("\n")[0]]
+    said = [SAID.get(word.lower(), word) for word in words]
+    return " AND ".join(dict.fromkeys(filter(None, said)))
+
+
+def is_allowed(expression: str) -> bool:
+    """Whether each licence of an expression is allowed, or one of each OR."""
+
+    def holds(text: str) -> bool:
+        return all(part.strip("() ") in ALLOWED for part in re.split(r"\bAND\b|\bWITH\b", text))
+
+    ways = re.split(r"\bOR\b", expression)
+    if "(" in expression:  # not taken apart: all must be allowed
+        return all(map(holds, ways))
+    return any(map(holds, ways))
+
+
+def table() -> str:
+    rows = [
+        f"| {package.metadata['Name']} | {package.version.split('+')[0]} | {licence(package)} |"
+        for _, package in sorted(everything().items())
+    ]
+    return _TABLE + "\n".join(rows) + "\n"
+
+
+_TABLE = """# Dependencies
+
+What `make setup` installs, and under which licence; made by `make licences`, which fails on one
+that is not allowed. Allowed are licences that ask for no more than to be named, and those that bind
+changes of the package itself (MPL, EPL) or its exchange (LGPL): packages are imported, not copied.
+GPL, AGPL and packages that say nothing are refused.
+
+| package | version | licence |
+|---|---|---|
+"""
+
+
+def sbom(wheel: Path) -> dict[str, Any]:
+    """A software bill of materials of a built wheel: what it needs, with all extras (CycloneDX
+    1.6, https://cyclonedx.org/docs/1.6/json/)."""
+    name, version = wheel.name.split("-")[:2]
+    name, locked = canonicalize_name(name), versions()
+    extras = set(distribution(name).metadata.get_all("Provides-Extra") or ()) - {"dev"}
+    packages = needed(name, extras)
+    packages.pop(name)
+    components = [_component(key, package, locked) for key, package in sorted(packages.items())]
+    top = {
+        "type": "library", "name": name, "version": version, "bom-ref": name,
+        "purl": f"pkg:pypi/{name}@{version}", "licenses": [{"expression": "Apache-2.0"}],
+    }  # fmt: skip
+    return {
+        "bomFormat": "CycloneDX",
+        "specVersion": "1.6",
+        "version": 1,
+        "metadata": {"component": top},
+        "components": components,
+        "dependencies": [
+            {"ref": name, "dependsOn": [one["bom-ref"] for one in components]},
+        ],
+    }
+
+
+def _component(
+    key: str, package: Distribution, locked: dict[str, tuple[str, list[str]]]
+) -> dict[str, Any]:
+    version = package.version.split("+")[0]
+    digests = locked[key][1] if key in locked else []
+    return {
+        "type": "library",
+        "name": package.metadata["Name"],
+        "version": version,
+        "bom-ref": key,
+        "purl": f"pkg:pypi/{key}@{version}",
+        "licenses": [{"license": {"name": licence(package)}}],
+        "externalReferences": [
+            {
+                "type": "distribution",
+                "url": f"https://pypi.org/project/{key}/{version}/",
+                "hashes": [{"alg": "SHA-256", "content": digest} for digest in digests],
+            }
+        ],
+    }
+
+
+def main(arguments: list[str]) -> int:
+    match arguments:
+        case ["lock", *upgrade]:
+            lock(upgrade)
+        case ["licences"]:
+            wrong = {
+                name: licence(package)
+                for name, package in everything().items()
+                if not is_allowed(licence(package))
+            }
+            for name, said in wrong.items():
+                print(f"{name}: the licence {said or 'is not stated, which'!r} is not allowed")
+            return len(wrong) > 0
+        case ["table"]:
+            TABLE.write_text(table(), "utf-8")
+        case ["sbom", *wheels] if wheels:
+            for wheel in map(Path, wheels):
+                made = wheel.with_suffix(".cdx.json")
+                made.write_text(json.dumps(sbom(wheel), indent=1) + "\n", "utf-8")
+                print(made)
+        case _:
+            print(__doc__, file=sys.stderr)
+            return 2
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
