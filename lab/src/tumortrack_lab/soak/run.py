@@ -28,7 +28,7 @@ from tumortrack_lab.soak.table import document, memory_marks
 
 _GROWN_MB = 20.0
 _OTHERS = range(11, 19)  # seeds of other kidneys
-_LOST_S = 1.0  # of a tape before the disk was full: half of it waits for its chunk
+_LOST_S = 1.0  # of a tape before the disk was full
 _READER = """
 import socket, sys
 peer = socket.create_connection(("127.0.0.1", int(sys.argv[1])))

@@ -28,7 +28,7 @@ from tumortrack.live.values import SinkConfig, SinkContext, TrackingResult
 
 _ABOUT = "recording.json"
 _KIND = "recording"
-_CHUNK_S = 0.5  # a killed program loses what is in no chunk yet
+_CHUNK_S = 0.25  # a killed program loses what is in no chunk yet
 _STRING, _TRANSFORMS = "std_msgs/msg/String", "tf2_msgs/msg/TFMessage"
 
 
