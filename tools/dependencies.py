@@ -31,7 +31,7 @@ _APART = {"ur-rtde": "ur"}  # in a file of its own: `make setup` leaves it out
 # itself (MPL, EPL) or its own exchange (LGPL): all of them are imported, none is copied.
 ALLOWED = {
     "0BSD", "Apache-2.0", "BSD-2-Clause", "BSD-3-Clause", "BSD", "BSL-1.0", "CC0-1.0", "EPL-2.0",
-    "LGPL", "LLVM-exception", "MIT", "MIT-CMU", "MPL-2.0", "PSF-2.0", "Unlicense", "Zlib",
+    "LGPL", "LLVM-exception", "MIT", "MIT-CMU", "MPL-2.0", "PSF-2.0", "Qhull", "Unlicense", "Zlib",
 }  # fmt: skip
 # What packages say that say it otherwise, as found in their metadata or, with the reason, in their
 # licence file.
@@ -46,8 +46,8 @@ SAID = {
     "osi approved": "",
 }
 STATED = {
-    "apsw": "Zlib",  # "any-OSI" in its metadata; LICENSE: the zlib licence among others
-    "cmeel-qhull": "BSD",  # nothing in its metadata; Qhull's COPYING: free, with attribution
+    "apsw": "Zlib",  # "any-OSI" in its metadata; LICENSE: the zlib licence
+    "cmeel-qhull": "Qhull",  # nothing in its metadata; COPYING.txt: free, with attribution
     "embreex": "BSD-2-Clause",  # its metadata holds the licence's text
 }
 
