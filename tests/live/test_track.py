@@ -102,7 +102,7 @@ def test_a_recording_is_played_back_to_the_same_estimates(world, tmp_path):
 def test_ctrl_c_ends_cleanly_and_flushes(world, tmp_path):
     folder, report = tmp_path / "kept", tmp_path / "report.json"
     process = start(world, virtual(world, fps=10), f"recording:{folder}", "--report", report)
-    _wait_for(process, "good|poor")
+    _wait_for(process, "no check failed|poor")
     process.send_signal(signal.SIGINT)
     said, _ = process.communicate(timeout=300)
     assert process.returncode == 0, said

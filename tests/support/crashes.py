@@ -17,12 +17,13 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
 
 from attacks import make_base
-from clock import until
+from clock import PATIENCE_S, until
 from stories import COMMAND, environment
 
 _LOST_S = 1.0  # of a recording, and the longest pause between two of its frames: on a busy machine
@@ -135,13 +136,16 @@ def recording(base: Path, folder: Path, times: int, rng: np.random.Generator) ->
         command: list[object] = ["track", base / "model", f"virtual:{base / 'case'}?fps=10"]
         command += [f"recording:{place}", "--device", "cpu", "--stale", 5]
         process = started([*command, "--report", folder / f"report{number}.json"])
-        _wait_for_chunks(place, process)
-        time.sleep(rng.uniform(0, 6))
-        killed_ns = time.time_ns()
-        if process.poll() is not None:
-            return "it ended by itself"
-        os.killpg(process.pid, signal.SIGKILL)
-        process.wait()
+        try:
+            _wait_for_chunks(place, process)
+            time.sleep(rng.uniform(0, 6))
+            killed_ns = time.time_ns()
+            if process.poll() is not None:
+                return "it ended by itself"
+        finally:
+            with suppress(ProcessLookupError):
+                os.killpg(process.pid, signal.SIGKILL)
+            process.wait()
         stamps = [*stamps_of(place), killed_ns]
         *pauses_s, lost_s = np.diff(stamps) * 1e-9
         if lost_s > _LOST_S + max(pauses_s):
@@ -157,7 +161,7 @@ def _wait_for_chunks(place: Path, process: subprocess.Popen[bytes]) -> None:
         sizes = [path.stat().st_size for path in place.rglob("*.mcap")]
         return sum(sizes) > 2**20 or process.poll() is not None
 
-    until(there, "a tape")
+    until(there, "a tape", 5 * PATIENCE_S)
 
 
 def stamps_of(tape: Path) -> list[int]:
