@@ -25,7 +25,7 @@ class Prepare:
         case: folder to write.
         kidney_hu: HU window of the kidney in a CT: low (inclusive) and high.
         tumor_hu: HU window of the tumors in a CT.
-        labels: INPUT is a label map (recognised by itself where that is plain).
+        labels: the input is a label map (mostly recognised by itself).
         side: the patient's kidney to take from a label map (default: the one with the largest
             tumor); of a CT or meshes, which one it is.
         organ: label number of the kidney.
