@@ -335,7 +335,7 @@ def test_a_plan_of_nobody_moves_no_real_arm_and_one_of_another_nothing(story, gi
     assert "is of patient unknown" in refusal(tumortrack("resect", plan, REAL, *STATED, *live))
     for stated in (("--patient", "P2"), ("--side", "right")):  # nor virtual ones
         line = refusal(tumortrack("resect", given / "plan", *stated))
-        assert "is of patient P1, left side; stated was patient" in line
+        assert "is of patient P1, left side; you stated patient" in line
     for name in ("patient", "side"):
         line = refusal(tumortrack("resect", given / "plan", "--live", given / name, "virtual:x"))
         assert "is of patient P" in line
