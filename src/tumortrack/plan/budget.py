@@ -36,7 +36,7 @@ HAND_EYE_MM = 2.0
 # Data sheets state repeatability alone, 0.05 mm (UR10e) and 0.1 mm (UR5); commanded poses of arms
 # that are not calibrated are off by some 20 times that.
 TOOL_MM = 1.0
-MOVED_MM = 2.0  # allowed for at planning: the tumor may move so far before the arms stand
+MOVED_MM = 2.0  # allowed for at planning: the tumor may move so far before the arms halt
 OVER_BUDGET = "PLANNED OVER ITS ERROR BUDGET"
 TERMS = ("tracking", "hand-eye", "tool", "motion", "lag")
 _SPACING_MM = 0.25  # of points on the planned cut
