@@ -63,7 +63,7 @@ class Prepare:
         say_notes(case.report.get("notes", []))
         say(str(case.patient))
         if not case.patient.known:
-            say_notes(["state both (--patient ID --side left|right): no real arm moves without"])
+            say_notes(["state both (--patient ID --side left|right): real arms need them"])
         for name, part in zip(case.anatomy.names, case.anatomy.parts, strict=True):
             say(f"{name}: {part.volume_mm3 / 1000:.1f} ml")
         say(f"case written to {self.case}; look at {self.case / 'qc.png'} before you rely on it.")
