@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -195,10 +196,16 @@ def test_a_calibration_names_the_camera_and_the_table(tmp_path):
             read_frames(path)
 
 
-def test_a_recorded_bag_keeps_the_name_of_its_camera(tmp_path):
-    path = record(tmp_path / "bag", [update_number(n) for n in range(2)])
+@pytest.mark.parametrize(
+    "published", [PublishedFrame(), PublishedFrame("base", np.diag([-1, -1, 1, 1.0]))]
+)
+@pytest.mark.parametrize(("name", "kept"), [("left_optical", "left_optical"), ("", "camera")])
+def test_a_recorded_bag_keeps_the_name_of_its_camera(tmp_path, published, name, kept):
+    """By which the calibration knows it, when the recording is played."""
+    updates = [update_number(n, frame_id=name) for n in range(2)]
+    path = record(tmp_path / "bag", [replace(one, published_frame=published) for one in updates])
     source = RecordingSourceConfig(path=path, rate=0).open()
     got = source.read(1.0)
     source.close()
     assert got is not None
-    assert got.frame_id == "camera"
+    assert got.frame_id == kept
