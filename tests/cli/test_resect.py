@@ -473,7 +473,7 @@ def test_a_film_is_an_animation(story, tmp_path):
         (["--cell", "NARROW"], "clearance_mm is -8; allowed: 0.5 to 100"),
         (["--cell", "CELL"], "unknown field `legs`"),
         (["--frame", "FRAME"], "must have camera_from_robot"),
-        (["--cell", "LOOSE"], "tool_error_mm is -1; allowed: 0 to 50"),
+        (["--cell", "LOOSE"], "tool_error_mm is -1; allowed: over 0 to 50"),
         (["--moved", 0], "moved_mm is 0; allowed: over 0 to 100"),
     ],
 )
