@@ -113,6 +113,18 @@ def test_what_a_plane_cannot_show_is_not_noticed_and_said():
     assert any("no table is seen" in note for note in check.notes)
 
 
+def test_a_table_that_is_seen_too_seldom_to_be_learned_is_none():
+    watch = TableWatch(CONFIG)
+    organ = np.where(np.hypot(RAY_X, RAY_Y) < 0.1, scene(0).depth_mm, np.nan).astype(np.float32)
+    for n in range(70):
+        watch.check(scene(n) if n < 10 else DepthFrame(organ, CAMERA, STAMP_NS + n))
+    assert watch.blind
+    for n in range(70, 90):  # there it is: it is learned as quickly as ever
+        watch.check(scene(n))
+    assert watch.table_in_camera is not None
+    assert not watch.blind
+
+
 def test_a_table_that_stays_hidden_is_doubted():
     watch = TableWatch(CONFIG)
     doubts = [watch.check(frame) for frame in still()]
