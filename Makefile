@@ -32,7 +32,7 @@ $(TOOLS): requirements/tools.txt
 	.tools/bin/$(INSTALL) --require-hashes -r requirements/tools.txt
 	touch $@
 
-demo: setup  ## CT -> tumors located in unseen deformed scenes (about 5 minutes)
+demo: setup  ## CT -> tumors located in unseen deformed scenes (about 4 minutes once installed)
 	$(BIN)/tumortrack demo
 
 check: setup  ## lint, types, import order, licences
@@ -42,7 +42,7 @@ check: setup  ## lint, types, import order, licences
 	$(BIN)/lint-imports
 	$(BIN)/python tools/dependencies.py licences
 
-debian:  ## what tests need of Debian (ROS, RViz, Chromium), where it can be installed
+debian:  ## install what tests need from Debian (ROS, RViz, Chromium)
 	tools/debian.sh
 
 test: check  ## check, then all tests (those of ROS, RViz and Chromium after `make debian`)
@@ -51,7 +51,7 @@ test: check  ## check, then all tests (those of ROS, RViz and Chromium after `ma
 attack: setup  ## hostile files and calls: each must end in one clear line (3 minutes; ARGS=NAME ...: these)
 	$(BIN)/python tests/support/attacks.py runs/attacks $(ARGS)
 
-fuzz: setup  ## a million damaged inputs for all readers (20 minutes; ARGS="--inputs 60000 --target NAME")
+fuzz: setup  ## a million damaged inputs over all readers (20 minutes; ARGS="--inputs 60000 --target NAME")
 	$(BIN)/python tests/support/fuzz.py --artifacts $(ARGS)
 
 crash: setup  ## kill -9 at random moments, shortages, two at once (ARGS="--times 20 --only NAME")
@@ -69,7 +69,7 @@ test-hard: setup  ## tests on narrow vector units beside two busy processes (ARG
 bench: setup  ## speed of every part beside its naive form; fills docs/performance.md (10 to 13 minutes; ARGS=--quick)
 	$(BIN)/tumortrack bench --curves --document docs/performance.md $(ARGS)
 
-soak: setup  ## an hour of tracking with faults all round (ARGS="MODEL CASE --minutes 5"; after make demo)
+soak: setup  ## an hour of tracking with faults of eleven kinds (ARGS="MODEL CASE --minutes 5"; after make demo)
 	$(BIN)/python lab/scripts/soak.py $(ARGS)
 
 results: setup  ## the tables and plots of docs/results.md (hours; ARGS=--quick: minutes)
@@ -84,18 +84,18 @@ training-speed: setup  ## accuracy reached per second, by batch, learning rate a
 foreign: setup  ## how often another kidney, or a mirrored one, is called good (an hour)
 	$(BIN)/python lab/scripts/foreign.py $(ARGS)
 
-wheel: setup  ## build the wheels of product and laboratory into dist/, with what they need (SBOM)
+wheel: setup  ## build the wheels of product and laboratory into dist/, with their dependencies (SBOM)
 	$(BIN)/pip wheel --quiet --no-deps --no-build-isolation --wheel-dir dist . ./lab
 	$(BIN)/python tools/dependencies.py sbom dist/tumortrack-*.whl dist/tumortrack_lab-*.whl
 
-lock: setup $(TOOLS)  ## pin the dependencies by hash (ARGS=--upgrade: newest; "--upgrade-package NAME")
+lock: setup $(TOOLS)  ## pin the dependencies by hash (ARGS=--upgrade: newest; ARGS="--upgrade-package NAME")
 	PATH="$(CURDIR)/.tools/bin:$$PATH" $(BIN)/python tools/dependencies.py lock $(ARGS)
 
 licences: setup  ## list the dependencies' licences in docs/dependencies.md; fails on one not allowed
 	$(BIN)/python tools/dependencies.py table
 	$(BIN)/python tools/dependencies.py licences
 
-audit: $(TOOLS)  ## known vulnerabilities of all that is pinned; fails too where PyPI does not answer
+audit: $(TOOLS)  ## known vulnerabilities of all that is pinned; fails also if PyPI does not answer
 	@.tools/bin/pip-audit --strict --progress-spinner off --disable-pip --require-hashes \
 	$(foreach name,lock cuda ur tools,-r requirements/$(name).txt) || { echo \
 	"audit: not passed: there are vulnerabilities (listed above), or PyPI could not be asked" >&2; exit 1; }

@@ -1,7 +1,7 @@
 """Where to cut a tumor out of an organ that lies on the table.
 
 Run after 01: python examples/07_plan_a_resection.py [FOLDER]
-From the command line, with the motions of two arms: tumortrack plan RUN PLAN
+From the command line, with the motions of two arms: tumortrack plan RUN PLAN --margin 8
 """
 
 import sys
@@ -25,7 +25,7 @@ def main(out: Path) -> None:
     except tt.errors.NoPlan as error:
         print("no plan:", error)
 
-    try:  # nothing is known of this estimate's errors: 8 mm are assumed, and 5 don't hold them
+    try:  # nothing is known of this estimate's errors: 8 mm are assumed, and 5 don't cover them
         tt.plan_resection(seen)
     except tt.errors.NoPlan as error:
         print("no plan:", error)

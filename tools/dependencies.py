@@ -188,9 +188,9 @@ def table() -> str:
 _TABLE = """# Dependencies
 
 What `make setup` installs, and under which licence; made by `make licences`, which fails on one
-that is not allowed. Allowed are licences that ask for no more than to be named, and those that bind
-changes of the package itself (MPL, EPL) or its exchange (LGPL): packages are imported, not copied.
-GPL, AGPL and packages that say nothing are refused.
+that is not allowed. Allowed are licences that ask only for attribution, and those whose terms
+concern changes to the package itself (MPL, EPL) or that it can be replaced (LGPL): packages are
+imported, not copied. GPL, AGPL and packages that state no licence are refused.
 
 | package | version | licence |
 |---|---|---|

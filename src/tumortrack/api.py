@@ -429,7 +429,7 @@ def plan_resection(
         picture: PNG file to draw the plan into.
         stand_mm: height of the organ's lowest point over the table.
         accept_poor: plan on a poor estimate; the plan's notes say so.
-        accept_budget: plan though the margin does not hold the errors that are to be expected
+        accept_budget: plan though the margin does not cover the errors that are to be expected
             (docs/resection.md); the plan's notes say so.
         options: fields of ``plan.values.ResectionConfig``: ``tumor``, ``method`` (``margin`` or
             ``published``), ``margin_mm``, ``sigmas`` and others.

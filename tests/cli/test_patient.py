@@ -52,7 +52,7 @@ def test_another_patient_or_side_than_stated_stops(clinic_model, run, tmp_path, 
         ("plan", run, place, "--no-arms", "--accept-poor"),
     ):
         line = refusal(tumortrack(*command, *stated))
-        assert "is of patient P1, right side; stated was patient" in line
+        assert "is of patient P1, right side; you stated patient" in line
         assert not place.exists()
 
 
@@ -79,6 +79,6 @@ def test_folders_from_before_know_nobody_and_serve_nobody_in_particular(
     plan = ("plan", old, tmp_path / "plan", "--no-arms", "--accept-poor", "--accept-budget")
     for command in (locate, plan):
         line = refusal(tumortrack(*command, "--patient", "P1"))
-        assert "is of patient unknown, side unknown; stated was patient P1" in line
+        assert "is of patient unknown, side unknown; you stated patient P1" in line
         assert "prepare --patient ID --side" in line
         assert "patient unknown, side unknown" in succeeded(tumortrack(*command))

@@ -108,12 +108,12 @@ def test_a_plan_is_written_in_the_tables_frame(story):
     assert "a plan" in described
 
 
-def test_a_margin_that_does_not_hold_the_errors_is_no_plan_unless_a_person_accepts_it(
+def test_a_margin_that_does_not_cover_the_errors_is_no_plan_unless_a_person_accepts_it(
     story, tmp_path
 ):
     folder, said = story
     lines = said.splitlines()
-    assert lines[:2] == ["patient P1, left side", "errors that the margin has to hold, mm:"]
+    assert lines[:2] == ["patient P1, left side", "errors that the margin has to cover, mm:"]
     assert lines[2:7] == [
         "  tracking   3.6", "  hand-eye   2.0  assumed", "  tool       3.0  assumed",
         "  motion     2.0", "  lag        0.0",
@@ -124,7 +124,7 @@ def test_a_margin_that_does_not_hold_the_errors_is_no_plan_unless_a_person_accep
     assert done.returncode == 3
     line = refusal(done)
     assert "7.1 mm of error, most of it tracking (3.6), against a margin of 4.9 mm" in line
-    assert "7.5 mm would hold them (--margin, margin_mm)" in line
+    assert "7.5 mm would cover them (--margin, margin_mm)" in line
     assert not (tmp_path / "plan").exists()
     succeeded(tumortrack(*plan, "--margin", 7.5))
     # From Python the same: the same table, the same errors.
@@ -201,7 +201,7 @@ NEEDS = {
     "cell": "--cell FILE that gives both bases",
     "good": "a plan made on a good estimate",
     "speed": "--speed up to 1, not 2",
-    "budget": "a plan whose margin holds its errors",
+    "budget": "a plan whose margin covers its errors",
     "calibration": "the calibration's error (error_mm in the --frame file)",
     "tool": "the tools' error (tool_error_mm in the --cell file)",
     "unsure": "a plan by a model that says how unsure it is",
@@ -351,7 +351,7 @@ def test_a_plan_of_nobody_moves_no_real_arm_and_one_of_another_nothing(story, gi
     assert "is of patient unknown" in refusal(tumortrack("resect", plan, REAL, *STATED, *live))
     for stated in (("--patient", "P2"), ("--side", "right")):  # nor virtual ones
         line = refusal(tumortrack("resect", given / "plan", *stated))
-        assert "is of patient P1, left side; stated was patient" in line
+        assert "is of patient P1, left side; you stated patient" in line
     for name in ("patient", "side"):
         line = refusal(tumortrack("resect", given / "plan", "--live", given / name, "virtual:x"))
         assert "is of patient P" in line

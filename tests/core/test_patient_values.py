@@ -32,7 +32,7 @@ def test_whoever_is_stated_must_be_known_to_be_meant():
     for stated in (NOBODY, Patient("A"), Patient(side="left"), A):
         A.check_is(stated, "MODEL")
     for stated in (B, Patient("B"), Patient("A", "right"), Patient(side="right")):
-        with pytest.raises(InputError, match="MODEL is of patient A, left side; stated was"):
+        with pytest.raises(InputError, match="MODEL is of patient A, left side; you stated"):
             A.check_is(stated, "MODEL")
     for found in (NOBODY, Patient("A"), Patient(side="left")):
         with pytest.raises(InputError, match="unknown"):

@@ -25,7 +25,7 @@ class Prepare:
         case: folder to write.
         kidney_hu: HU window of the kidney in a CT: low (inclusive) and high.
         tumor_hu: HU window of the tumors in a CT.
-        labels: INPUT is a label map (recognised by itself where that is plain).
+        labels: the input is a label map (mostly recognised by itself).
         side: the patient's kidney to take from a label map (default: the one with the largest
             tumor); of a CT or meshes, which one it is.
         organ: label number of the kidney.
@@ -63,7 +63,7 @@ class Prepare:
         say_notes(case.report.get("notes", []))
         say(str(case.patient))
         if not case.patient.known:
-            say_notes(["state both (--patient ID --side left|right): no real arm moves without"])
+            say_notes(["state both (--patient ID --side left|right): real arms need them"])
         for name, part in zip(case.anatomy.names, case.anatomy.parts, strict=True):
             say(f"{name}: {part.volume_mm3 / 1000:.1f} ml")
         say(f"case written to {self.case}; look at {self.case / 'qc.png'} before you rely on it.")

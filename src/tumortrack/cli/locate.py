@@ -32,13 +32,13 @@ class Locate(StatedPatient):
         out: folder to write.
         grid: voxels along the longest side of the labelled volume, up to 400.
         seed: of the random points and queries.
-        range: keep depths between NEAR and FAR mm; a cloud is else used as it is, a depth image
-            cropped by the range the model was trained for.
+        range: keep depths between NEAR and FAR mm. By default a cloud is used as it is, and a depth
+            image is cropped to the range that the model was trained for.
         unit: of the cloud's numbers.
         intrinsics: JSON with width, height, fx, fy, cx, cy in pixels.
-        map: points of the CT, to be found before the camera (OUT/points.csv): a .csv with columns
+        map: points of the CT whose present places to write (OUT/points.csv): a .csv with columns
             x,y,z (LPS, mm), or 3D Slicer's .mrk.json or .fcsv. Needs a model of preset clinic.
-        device: auto takes CUDA where it is.
+        device: auto takes CUDA if there is a GPU.
         overwrite: replace OUT if it exists.
     """
 
@@ -169,7 +169,7 @@ class Evaluate:
         report: folder to write: report.json, index.html, pictures.
         grid: voxels along the longest side of the labelled volume.
         seed: of the random points and queries.
-        device: auto takes CUDA where it is.
+        device: auto takes CUDA if there is a GPU.
     """
 
     model: Positional[Path]

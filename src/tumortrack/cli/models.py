@@ -26,7 +26,7 @@ class Compile:
 
     Attributes:
         model: folder that `train` wrote; what is found fastest is kept in MODEL/compiled.
-        device: auto takes CUDA where it is.
+        device: auto takes CUDA if there is a GPU.
     """
 
     model: Positional[Path]

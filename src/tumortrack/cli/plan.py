@@ -39,19 +39,21 @@ class Plan(StatedPatient):
         method: margin (default) keeps the margin in all directions; published is the paper's
             planner.
         tumor: which one (tumor_1, ...; default: the one that lies farthest out of the organ).
-        margin: least distance between tumor and cut in mm (default 5).
-        sigmas: add so many standard deviations of the estimate's own uncertainty to the margin
+        margin: least distance between tumor and cut in mm (default 5, the paper's; ordinary
+            estimates need about 8, docs/resection.md).
+        sigmas: add this many standard deviations of the estimate's own uncertainty to the margin
             (default 0).
         config: JSON file with these and all other choices of the planner (docs/resection.md).
         frame: JSON file that says where the camera is; the plan is then in the robot's frame, whose
-            z must point up. Without, the camera looks straight down.
+            z must point up. Without it, the camera is taken to look straight down.
         stand: height of the organ's lowest point over the table in mm, where no frame is given.
         cell: JSON file with arms, tools, table and their places (docs/resection.md).
         arms: also plan the motions of both arms.
-        moved: the tumor may have moved by so many mm before the arms stand: the margin has to hold
-            it (docs/resection.md).
+        moved: how far, in mm, the tumor may move before the arms halt; the margin has to cover it
+            (docs/resection.md).
         accept_poor: plan on an estimate that `locate` called poor; the plan says so everywhere.
-        accept_budget: plan though the margin does not hold the errors; the plan says so everywhere.
+        accept_budget: plan even though the margin does not cover the errors; the plan says so
+            everywhere.
         overwrite: replace PLAN if it exists.
     """
 
@@ -159,7 +161,7 @@ class Plan(StatedPatient):
         table_from_camera: Float64[np.ndarray, "4 4"],
         cell: CellConfig,
     ) -> ErrorBudget:
-        """What the margin has to hold; the camera's place at the tumor's far side."""
+        """What the margin has to cover; the camera's place at the tumor's far side."""
         import numpy as np
 
         from tumortrack.live.calibration_file import read_error_mm

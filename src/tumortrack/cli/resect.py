@@ -45,26 +45,26 @@ _LIVE = ("realsense", "ros2", "ros1")  # sources that show the present
 
 @dataclass(frozen=True, kw_only=True)
 class Resect(StatedPatient):
-    """Carry a plan out with virtual arms, seen by sinks as those of `track`.
+    """Carry a plan out with virtual arms, shown by the same sinks as `track`.
 
     Attributes:
         plan: folder that `plan` wrote.
         sinks: where arms, cuts and estimates go; see `track`. ur:ADDRESS is a real arm, and only
             says what it would do unless told execute=true; docs/resection.md has what that needs.
-        live: MODEL SOURCE: follow the organ meanwhile, as `track` does. Arms stand while there is
-            no good estimate, and it is planned anew where the tumor has moved.
-        replan_cut: plan anew even once the first sweep has begun, though the model knows only the
-            intact organ; otherwise the arms stand then.
-        range: of depths, as in `track`.
+        live: MODEL SOURCE: follow the organ meanwhile, as `track` does. The arms halt while there
+            is no good estimate, and the plan is made anew once the tumor has moved.
+        replan_cut: plan anew even after the first sweep has begun, though the model knows only the
+            intact organ; otherwise the arms halt instead.
+        range: as in `track`.
         box: as in `track`.
         whole: as in `track`.
         intrinsics: as in `track`.
-        speed: of the arms' time; 2 is twice as fast.
-        moved: the tumor has moved if its surface has by so many mm (root mean square; default: what
-            the plan allows for).
+        speed: of the arms; 2 is twice as fast as planned.
+        moved: the tumor counts as moved once its surface is so many mm from where it was planned
+            (root mean square; default: what the plan allows for).
         film: write an animated GIF of the stored plan instead.
-        report: file for states, halts and what else there was (default: runs/resect-TIME.json).
-        device: auto takes CUDA where it is.
+        report: file for states, halts and the budget of errors (default: runs/resect-TIME.json).
+        device: auto takes CUDA if there is a GPU.
     """
 
     plan: Positional[Path]
@@ -168,7 +168,7 @@ class Resect(StatedPatient):
                 stored.cell_source != INVENTED
             ),
             f"--speed up to 1, not {self.speed:g}": self.speed <= 1,
-            "a plan whose margin holds its errors (plan again with a wider one)": (
+            "a plan whose margin covers its errors (plan again with a wider one)": (
                 budget is not None and budget.left_mm >= 0
             ),
             "a plan by a model that says how unsure it is (preset clinic)": (

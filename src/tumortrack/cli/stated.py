@@ -14,8 +14,8 @@ class StatedPatient:
     """Options of commands that work on one patient.
 
     Attributes:
-        patient: whom you mean; what belongs to another or an unknown patient is refused.
-        side: the patient's side that you mean; the other or an unknown one is refused.
+        patient: the patient you mean; what belongs to another or an unknown one is refused.
+        side: the side you mean, the patient's own; the other or an unknown one is refused.
     """
 
     patient: str | None = None

@@ -51,7 +51,7 @@ class Track(StatedPatient):
     Sources and sinks are written kind:target?option=value&option=value. Sources: virtual:CASE,
     recording:PATH, realsense[:SERIAL|FILE], ros2:TOPIC, ros1:TOPIC. Sinks: viewer[:PORT],
     recording:FOLDER, ros2[:TOPIC], ros1[:TOPIC], openigtlink[:PORT], and for `resect` ur:HOST.
-    Installed packages can add sources and sinks. A wrong one is answered with its options.
+    Installed packages can add sources and sinks. A wrong one is answered with what is allowed.
     docs/live.md has examples.
 
     Attributes:
@@ -65,15 +65,15 @@ class Track(StatedPatient):
         intrinsics: JSON with the camera's width, height, fx, fy, cx, cy in pixels, instead of what
             the source says.
         smoothing: time constant in s of a mean over past estimates; the lag is in the report.
-        rescan: every so many s, look for the organ as in a first frame.
-        stale: frames older than so many s are refused, and a pause so long is said.
+        rescan: every so many s, search for the organ as in a first frame.
+        stale: frames older than so many s are refused; a pause is reported after four fifths of it.
         frozen: an image that repeats bit for bit for so many s is refused; 0: it may repeat, as
             of a simulated camera without noise.
         give_up: end after so many s without a frame.
         seconds: end so many s after the first frame; 0: never.
         report: file for latencies, counts and reasons (default: runs/track-TIME.json).
         seed: of the random points.
-        device: auto takes CUDA where it is.
+        device: auto takes CUDA if there is a GPU.
     """
 
     model: Positional[Path]

@@ -36,7 +36,7 @@ class Train:
         minutes: stop after about so long (default: the preset's end).
         steps: stop after exactly so many steps.
         seed: of weights and scenes.
-        device: auto takes CUDA where it is.
+        device: auto takes CUDA if there is a GPU.
         workers: processes that make scenes (default: as the machine allows).
         checkpoint_every: seconds; a crash loses at most the steps since.
         start: folder that `pretrain` wrote: learn the patient from there (preset clinic).
@@ -107,7 +107,7 @@ class Pretrain:
         anatomies: how many random kidneys.
         steps: stop after exactly so many steps.
         seed: of kidneys, weights and scenes.
-        device: auto takes CUDA where it is.
+        device: auto takes CUDA if there is a GPU.
         workers: processes that make scenes (default: as the machine allows).
         checkpoint_every: seconds; a crash loses at most the steps since.
     """

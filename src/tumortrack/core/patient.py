@@ -51,8 +51,8 @@ class Patient(Config, frozen=True):
         pairs = (stated.id, self.id), (stated.side, self.side)
         if any(wanted not in (UNKNOWN, mine) for wanted, mine in pairs):
             raise InputError(
-                f"{what} is of {self}; stated was {stated}. Give what belongs to that patient and "
-                "side. Who is unknown is stated when the case is made: tumortrack prepare "
+                f"{what} is of {self}; you stated {stated}. Give what belongs to that patient and "
+                "side. If it is unknown, say whose it is when the case is made: tumortrack prepare "
                 "--patient ID --side left|right."
             )
 

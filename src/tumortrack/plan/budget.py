@@ -36,7 +36,7 @@ HAND_EYE_MM = 2.0
 # Data sheets state repeatability alone, 0.05 mm (UR10e) and 0.1 mm (UR5); commanded poses of arms
 # that are not calibrated are off by some 20 times that.
 TOOL_MM = 1.0
-MOVED_MM = 2.0  # allowed for at planning: the tumor may move so far before the arms stand
+MOVED_MM = 2.0  # allowed for at planning: the tumor may move so far before the arms halt
 OVER_BUDGET = "PLANNED OVER ITS ERROR BUDGET"
 TERMS = ("tracking", "hand-eye", "tool", "motion", "lag")
 _SPACING_MM = 0.25  # of points on the planned cut
@@ -98,7 +98,7 @@ class ErrorBudget(Config, frozen=True, kw_only=True):
 
     def table(self) -> list[str]:
         """Lines for the screen."""
-        lines = ["errors that the margin has to hold, mm:"]
+        lines = ["errors that the margin has to cover, mm:"]
         for name, value in self.terms.items():
             lines.append(f"  {name:<9}{value:5.1f}{'  assumed' if name in self.assumed else ''}")
         lines.append(f"  {'together':<9}{self.sum_mm:5.1f}  of a margin of {self.margin_mm:.1f}")
@@ -136,14 +136,14 @@ def planned_budget(
 
 
 def heeded(plan: ResectionPlan, budget: ErrorBudget, accept: bool) -> ResectionPlan:
-    """The plan with a note on its budget. NoPlan: the margin doesn't hold the errors, and nobody
+    """The plan with a note on its budget. NoPlan: the margin doesn't cover the errors, and nobody
     said that it is to be planned all the same."""
     words = f"{budget.left_mm:.1f} mm of the margin are left after {budget.sum_mm:.1f} mm of error"
     if budget.left_mm < 0:
         words = f"{OVER_BUDGET}: {budget.words}"
         if not accept:
             raise NoPlan(
-                f"the margin does not hold the errors: {budget.words}. {_remedy(plan, budget)} "
+                f"the margin does not cover the errors: {budget.words}. {_remedy(plan, budget)} "
                 "Only for a plan that nobody carries out, accept it (--accept-budget, "
                 "accept_budget=True)."
             )
@@ -184,4 +184,4 @@ def _remedy(plan: ResectionPlan, budget: ErrorBudget) -> str:
         return "The method keeps no margin below the tumor; take the method margin."
     if enough_mm > 20:
         return "Look from nearer, or uncover more of the organ."
-    return f"{enough_mm:g} mm would hold them (--margin, margin_mm)."
+    return f"{enough_mm:g} mm would cover them (--margin, margin_mm)."

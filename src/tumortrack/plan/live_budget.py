@@ -23,13 +23,13 @@ class LiveBudget:
     """Adds up the errors of every update.
 
     Args:
-        planned: of the plan. Where the margin did not hold those, and a person accepted that, the
+        planned: of the plan. Where the margin did not cover those, and a person accepted that, the
             errors are added up, and nothing follows from them.
         servo_s: the arms come so much later than they are told.
 
     Attributes:
         now: of the last estimate; ``worst``: the one that left the least of the margin and did not
-            make the arms stand.
+            make the arms halt.
     """
 
     def __init__(self, planned: ErrorBudget, servo_s: float = 0.0) -> None:
