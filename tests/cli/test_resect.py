@@ -274,6 +274,22 @@ def test_a_real_arm_moves_only_with_all_that_it_needs_and_nothing_is_connected_b
     assert resect(*live, given / "model", "realsense") == {"person"}
 
 
+@pytest.mark.parametrize(
+    ("second", "once"),
+    [
+        ("ur:10.0.0.9?execute=true", False),  # two cutters: the default
+        ("ur:127.0.0.1?execute=true&arm=holder", False),
+        ("ur:10.0.0.9?execute=true&arm=holder", True),
+        ("ur:10.0.0.9", True),  # which moves nothing
+    ],
+)
+def test_no_two_real_arms_follow_one_arms_joints(given, second, once):
+    live = ("--live", given / "model", "realsense")
+    line = refusal(tumortrack("resect", given / "plan", REAL, second, *STATED, *live))
+    assert ("each arm once, at an address of its own" not in line) == once
+    assert "a person at a terminal" in line
+
+
 def test_a_plan_over_its_budget_or_with_assumed_errors_moves_no_real_arm(story, given, tmp_path):
     folder, _ = story
     live = (REAL, *STATED, "--live", given / "model", "realsense")
@@ -457,7 +473,7 @@ def test_a_film_is_an_animation(story, tmp_path):
         (["--cell", "NARROW"], "clearance_mm is -8; allowed: 0.5 to 100"),
         (["--cell", "CELL"], "unknown field `legs`"),
         (["--frame", "FRAME"], "must have camera_from_robot"),
-        (["--cell", "LOOSE"], "tool_error_mm is -1; allowed: 0 to 50"),
+        (["--cell", "LOOSE"], "tool_error_mm is -1; allowed: over 0 to 50"),
         (["--moved", 0], "moved_mm is 0; allowed: over 0 to 100"),
     ],
 )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -112,6 +113,18 @@ def test_what_a_plane_cannot_show_is_not_noticed_and_said():
     assert any("no table is seen" in note for note in check.notes)
 
 
+def test_a_table_that_is_seen_too_seldom_to_be_learned_is_none():
+    watch = TableWatch(CONFIG)
+    organ = np.where(np.hypot(RAY_X, RAY_Y) < 0.1, scene(0).depth_mm, np.nan).astype(np.float32)
+    for n in range(70):
+        watch.check(scene(n) if n < 10 else DepthFrame(organ, CAMERA, STAMP_NS + n))
+    assert watch.blind
+    for n in range(70, 90):  # there it is: it is learned as quickly as ever
+        watch.check(scene(n))
+    assert watch.table_in_camera is not None
+    assert not watch.blind
+
+
 def test_a_table_that_stays_hidden_is_doubted():
     watch = TableWatch(CONFIG)
     doubts = [watch.check(frame) for frame in still()]
@@ -195,10 +208,16 @@ def test_a_calibration_names_the_camera_and_the_table(tmp_path):
             read_frames(path)
 
 
-def test_a_recorded_bag_keeps_the_name_of_its_camera(tmp_path):
-    path = record(tmp_path / "bag", [update_number(n) for n in range(2)])
+@pytest.mark.parametrize(
+    "published", [PublishedFrame(), PublishedFrame("base", np.diag([-1, -1, 1, 1.0]))]
+)
+@pytest.mark.parametrize(("name", "kept"), [("left_optical", "left_optical"), ("", "camera")])
+def test_a_recorded_bag_keeps_the_name_of_its_camera(tmp_path, published, name, kept):
+    """By which the calibration knows it, when the recording is played."""
+    updates = [update_number(n, frame_id=name) for n in range(2)]
+    path = record(tmp_path / "bag", [replace(one, published_frame=published) for one in updates])
     source = RecordingSourceConfig(path=path, rate=0).open()
     got = source.read(1.0)
     source.close()
     assert got is not None
-    assert got.frame_id == "camera"
+    assert got.frame_id == kept

@@ -29,11 +29,12 @@ from tumortrack.core.patient import Patient
 from tumortrack.core.store import new_folder
 from tumortrack.core.types import Anatomy, LabelVolume, Mesh, Volume
 from tumortrack.imaging.case import Case, save_case
+from tumortrack.live.sinks import viewer
 from tumortrack.live.sinks.viewer import ViewerSink, ViewerSinkConfig
 from tumortrack.live.values import PublishedFrame, SinkContext, TrackingResult
 from tumortrack.live.viewer.look import point_under
 from tumortrack.live.viewer.panel import StatusPanel
-from tumortrack.live.viewer.slices import CarriedCt, SlicePlane, slice_picture
+from tumortrack.live.viewer.slices import CarriedCt, SlicePlane, plane_through, slice_picture
 from tumortrack.live.viewer.surfaces import bare_faces, exact_margin, rough_margin
 from workcell_objects import REASON, virtual, with_arms, workcell, working
 
@@ -81,16 +82,16 @@ def sloped_case(with_ct: bool = True) -> Case:
     return Case(anatomy, volume, (0.0, -1.0, 0.0), ct=ct if with_ct else None)
 
 
-def carried_update(case: Case) -> TrackingResult:
-    """An update whose estimate is the case's anatomy, moved by ``MOTION``."""
+def carried_update(case: Case, motion: Turned = MOTION) -> TrackingResult:
+    """An update whose estimate is the case's anatomy, moved by ``motion``."""
     update = small_update()
     assert update.estimate is not None
     names = ("kidney", "tumor_1")
     meshes = {
-        name: part.moved(MOTION.carry(part.vertices_mm))
+        name: part.moved(motion.carry(part.vertices_mm))
         for name, part in zip(names, case.anatomy.parts, strict=True)
     }
-    return replace(update, estimate=replace(update.estimate, meshes=meshes, motion=MOTION))
+    return replace(update, estimate=replace(update.estimate, meshes=meshes, motion=motion))
 
 
 @pytest.fixture
@@ -317,6 +318,36 @@ def test_case_gives_slices_and_an_exact_margin_that_moves_along(sinks, clock, tm
         sinks(replace(setting, anatomy_ct=small_anatomy()), case=str(tmp_path / "case"))
     with pytest.raises(InputError, match="have no motion"):
         sinks(replace(setting, anatomy_ct=None), case=str(tmp_path / "case"))
+
+
+def test_what_is_drawn_into_a_slice_is_of_one_frame(sinks, monkeypatch, tmp_path):
+    case = sloped_case()
+    with new_folder(tmp_path / "case") as folder:
+        save_case(case, folder)
+    parts, frame = PARTS[:2], PublishedFrame()
+    setting = SinkContext(parts=parts, published_frame=frame, anatomy_ct=case.anatomy)
+    sink = sinks(setting, case=str(tmp_path / "case"), hz=60)
+    aside = Turned(rigid(TURN, np.array([23.0, -2.0, 130.0])))
+    later = replace(carried_update(case, aside), quality="poor")  # shown without delay
+    sink.publish(carried_update(case))
+    drawn_mm, this = [], threading.current_thread()
+
+    def plane(*arguments):
+        if threading.current_thread() is this:
+            sink.publish(later)  # it comes while the slice is made
+        return plane_through(*arguments)
+
+    def picture(ct, motion, plane, outlines, *rest):
+        outlines = list(outlines)
+        if threading.current_thread() is this:
+            drawn_mm.extend(mesh.box_mm.mean(0) for mesh, *_ in outlines)
+        return slice_picture(ct, motion, plane, outlines, *rest)
+
+    monkeypatch.setattr(viewer, "plane_through", plane)
+    monkeypatch.setattr(viewer, "slice_picture", picture)
+    sink._renew_slice()
+    _, tumor_mm, margin_mm = drawn_mm
+    assert margin_mm == pytest.approx(tumor_mm, abs=0.1)
 
 
 def test_arms_move_without_being_sent_again_and_what_is_gone_is_removed(sinks, clock):

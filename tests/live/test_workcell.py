@@ -462,13 +462,13 @@ def test_an_arm_elsewhere_is_not_moved(arm, moving):
     assert arm.what() == ["servo"]
 
 
+def cutting(number, yes):
+    result = working(number)
+    return replace(result, workcell=replace(result.workcell, cutting=yes))
+
+
 def test_on_a_cut_the_tools_tip_is_where_it_should_be_to_2_mm(arm, moving):
     """A tenth of a degree at the shoulder, a metre away, are 1.75 mm, and far within 2 degrees."""
-
-    def cutting(number, yes):
-        result = working(number)
-        return replace(result, workcell=replace(result.workcell, cutting=yes))
-
     sink = moving()
     arm.actual[5] += np.radians(1.1)  # the tool alone turns: 100 mm, so 1.9 mm
     sink.publish(cutting(0, True))
@@ -476,11 +476,23 @@ def test_on_a_cut_the_tools_tip_is_where_it_should_be_to_2_mm(arm, moving):
     arm.actual = angles(0.0)
     arm.actual[0] += np.radians(0.1)
     sink.publish(cutting(1, True))
+    sink.publish(cutting(2, False))  # before it is off: the watch looks at any moment
     arm.actual[0] += np.radians(0.05)
-    sink.publish(cutting(2, False))
+    sink.publish(cutting(3, False))
     with pytest.raises(TumortrackError, match=r"tip is 2\.6 mm from where it should cut; .* 2"):
-        sink.publish(cutting(3, True))
-    assert arm.what() == ["servo", "servo", "servo", "stop"]
+        sink.publish(cutting(4, True))
+    assert arm.what() == ["servo", "servo", "servo", "servo", "stop"]
+
+
+def test_an_arm_that_stood_still_on_a_cut_begins_there_whatever_comes_next(arm, moving):
+    """A plan made anew in the middle of a cut begins with a way that is no cut."""
+    sink = moving()
+    sink.publish(cutting(0, True))
+    sink.publish(working(1, 0.0, "the tumor has moved"))
+    arm.actual[0] += np.radians(0.15)
+    with pytest.raises(TumortrackError, match=r"tip is 2\.6 mm from where it should cut"):
+        sink.publish(cutting(2, False))
+    assert arm.what() == ["servo", "stop"]
 
 
 @pytest.mark.parametrize("why", ["halted", "no arms", "jump"])

@@ -171,6 +171,14 @@ def test_lag_is_the_tumors_speed_times_all_that_comes_late():
     assert live.now.lag_mm == 0
 
 
+def test_a_camera_whose_clock_is_ahead_takes_nothing_off_the_lag():
+    live, tumor = LiveBudget(budget(20.0)), sphere(TUMOR_MM, RADIUS_MM)
+    for frame in range(10):  # 9 mm/s, stamped 50 ms too late: more than the loop takes
+        moved = tumor.moved(tumor.vertices_mm + [0.297 * frame, 0, 0])
+        live.add_up(update(frame, -50.0, 120.0), "tumor_1", moved, 0.5, 15.0)
+    assert live.now.lag_mm == pytest.approx(9 * 0.12)
+
+
 def test_a_new_plan_helps_where_the_motion_alone_is_too_much():
     live, tumor = LiveBudget(budget(9.0)), sphere(TUMOR_MM, RADIUS_MM)
     assert live.add_up(update(0), "tumor_1", tumor, 1.0, 5.0) == ("", False)

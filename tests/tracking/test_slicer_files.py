@@ -323,5 +323,8 @@ def test_export_writes_both(tmp_path: Path, capsys: pytest.CaptureFixture) -> No
     assert [p.name for p in (tmp_path / "plain").iterdir()] == ["case.seg.nrrd"]
     with pytest.raises(InputError, match="exists already"):
         Export(case=tmp_path / "case", out=tmp_path / "out").run()
-    with pytest.raises(InputError, match="--series"):
-        Export(case=tmp_path / "case", out=tmp_path / "new", series="1").run()
+    for option in ({"series": "1"}, {"patient": "PHANTOM"}):
+        with pytest.raises(InputError, match=f"--{next(iter(option))}"):
+            Export(case=tmp_path / "case", out=tmp_path / "new", **option).run()
+    with pytest.raises(InputError, match="is no identifier"):  # of an empty variable, say
+        Export(out=tmp_path / "new", **{**asked, "patient": ""}).run()

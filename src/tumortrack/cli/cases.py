@@ -92,8 +92,8 @@ class Export:
         from tumortrack.core.patient import Patient
         from tumortrack.imaging import segmentation
 
-        if self.series is not None and self.dicom is None:
-            raise InputError("--series says which series of --dicom; give that folder too.")
+        if self.dicom is None and (self.series, self.patient) != (None, None):
+            raise InputError("--series and --patient are those of --dicom; give that folder too.")
         case = api.load_case(self.case)
         options = case.report.get("options", {})
         patient = case.patient
@@ -107,7 +107,8 @@ class Export:
             if self.dicom is not None:
                 series = self.series or options.get("series")
                 file = aside / "segmentation.dcm"
-                whose = Patient(self.patient or patient.id, patient.side)
+                named = patient.id if self.patient is None else self.patient
+                whose = Patient(named, patient.side)
                 notes = segmentation.write_dicom_seg(file, labels, parts, self.dicom, series, whose)
         say_notes(notes)
         say(f"written to {self.out}: {', '.join(sorted(p.name for p in self.out.iterdir()))}.")

@@ -183,6 +183,9 @@ class Resect(StatedPatient):
             f"--moved as planned with, not {moved_mm:g}": (
                 budget is None or moved_mm <= budget.motion_mm
             ),
+            "each arm once, at an address of its own": (
+                len(arms) == len({arm.arm for arm in arms}) == len({arm.host for arm in arms})
+            ),
             "a person at a terminal who confirms it": sys.stdin.isatty(),
         }
         if lacking := [what for what, met in needs.items() if not met]:

@@ -53,8 +53,8 @@ class FrameCheck:
                 self.notes.append(_NAMELESS)
         if wanted and name and name != wanted:
             raise NoEstimate(
-                f"the frame is in {name!r}, and the calibration is for {wanted!r}. Give the "
-                "calibration of this camera, or its camera's topic"
+                f"the frame is in {name!r}, and the calibration is for {wanted!r}. Give "
+                "this camera's calibration, or the topic of the calibrated camera"
             )
         if name != self._name:
             raise NoEstimate(

@@ -51,7 +51,7 @@ class LiveBudget:
         """
         estimate = update.estimate
         assert estimate is not None
-        late_ms = update.latency_ms or 0.0
+        late_ms = max(update.latency_ms or 0.0, 0.0)  # a camera's clock may be ahead
         late_ms += estimate.report.get("smoothing", {}).get("lag_ms", 0.0)
         std_mm, motion = None, estimate.motion
         if motion is not None:

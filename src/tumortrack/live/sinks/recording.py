@@ -170,11 +170,14 @@ class McapFile:
         if not self._frames or result.observation is None:
             return out
         same = np.array_equal(frame.published_from_camera, np.eye(4))
-        camera = CAMERA_FRAME if frame.frame_id != CAMERA_FRAME else f"{CAMERA_FRAME}_optical"
-        camera = frame.frame_id if same else camera
+        other = CAMERA_FRAME if frame.frame_id != CAMERA_FRAME else f"{CAMERA_FRAME}_optical"
+        # As the source calls it: a calibration may know the camera by that when this is played.
+        camera = result.observation.frame_id or (frame.frame_id if same else other)
+        if camera == frame.frame_id and not same:
+            camera = other
         seen = messages_seen(result.observation, self._messages, camera)
         out = [*(one._replace(suffix=f"/camera/{one.suffix}") for one in seen), *out]
-        if not same:  # the camera's pose in the published frame
+        if camera != frame.frame_id:  # the camera's pose in the published frame
             way = frame.published_from_camera
             stamped = {
                 "header": self._messages.header(result.stamp_ns, frame.frame_id),

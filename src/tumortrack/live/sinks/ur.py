@@ -143,7 +143,8 @@ class UrSink:
                     self._stop()
                 else:
                     self._heed_silence()
-                    self._cutting = cell.cutting
+                    # Where it stood still on a cut, what follows begins there, cut or not.
+                    self._cutting = cell.cutting or (self._cutting and self._last is None)
                     self._go(_target(cell.joints_rad, self._names), result.stamp_ns)
             except TumortrackError as error:
                 self._counts["refused"] += 1

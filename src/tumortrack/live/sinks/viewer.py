@@ -264,13 +264,14 @@ class ViewerSink:
             return
         with self._lock:
             result, hidden_count = self._shown, self._hidden_count
+            margins = self._scene.margins  # of that result; a later one brings its own
             part, orientation = self._panel.through.value, self._panel.plane.value
         if result is None or result.estimate is None:
             return
         plane = plane_through(result.estimate.meshes, part, orientation)
         motion, picture = result.estimate.motion, None
         if plane is not None and motion is not None:
-            outlines = self._outlines(result)
+            outlines = self._outlines(result, margins)
             number = f"frame no. {result.sequence}"
             picture = slice_picture(self._ct, motion, plane, outlines, _SLICE_PIXELS, number)
         with self._page():
@@ -279,13 +280,15 @@ class ViewerSink:
                 if picture is not None and plane is not None:
                     self._scene.put_slice(picture, plane)
 
-    def _outlines(self, result: TrackingResult) -> Iterator[tuple[Mesh, colours.Colour, int]]:
+    def _outlines(
+        self, result: TrackingResult, margins: dict[str, Mesh]
+    ) -> Iterator[tuple[Mesh, colours.Colour, int]]:
         assert result.estimate is not None
         for label, name in enumerate(self._context.parts, start=1):
             colour = colours.part_colour(label)
             if (mesh := result.estimate.meshes.get(name)) is not None:
                 yield mesh, colour, 2 if label > 1 else 1
-            if (margin := self._scene.margins.get(name)) is not None:
+            if (margin := margins.get(name)) is not None:
                 yield margin.moved(transform_points(self._back, margin.vertices_mm)), colour, 1
 
     def _toggle_picking(self) -> None:

@@ -22,6 +22,7 @@ _ALLOWED: dict[str, tuple[float, float]] = {
     **dict.fromkeys(_LENGTHS, (0, 1000)),
     **dict.fromkeys(("clearance_mm", "organ_clearance_mm", "contact_mm"), (0.5, 100)),
     "speed_share": (0, 1),
+    "tool_error_mm": (0, 50),
 }
 
 
@@ -98,11 +99,9 @@ class CellConfig(Config, frozen=True, kw_only=True):
             raise InputError(f"home has {len(self.home_rad)} joints; give {len(JOINTS)} angles.")
         for name, (low, high) in _ALLOWED.items():
             value = getattr(self, name)
-            if not (0 < value < 1000 and low <= value <= high):
+            if value is not None and not (0 < value < 1000 and low <= value <= high):
                 allowed = f"{low or 'over 0'} to {high}"
                 raise InputError(f"cell: {name} is {value:g}; allowed: {allowed}.")
-        if self.tool_error_mm is not None and not 0 < self.tool_error_mm <= 50:
-            raise InputError(f"cell: tool_error_mm is {self.tool_error_mm:g}; allowed: 0 to 50.")
         if not all(100 <= side <= 10_000 for side in self.table_mm):
             raise InputError(f"cell: table_mm is {self.table_mm}; allowed: 100 to 10000 each.")
         places = (*self.middle_mm, *self.camera_mm, *self.home_rad)

@@ -34,7 +34,7 @@ _HIDDEN_LOOKS = 45  # 3 s at 30 Hz
 class TableWatch:
     """Compares the table's plane, frame by frame, with that of the first frames, or with ``known``:
     unit normal and offset in mm, camera frame. ``table_in_camera``: the one that counts; None until
-    there is one. ``blind``: no table has been found so far."""
+    there is one. ``blind``: none has been found so far, or too seldom."""
 
     def __init__(
         self, config: RegionConfig, known: tuple[float, float, float, float] | None = None
@@ -56,13 +56,15 @@ class TableWatch:
 
     @property
     def blind(self) -> bool:
-        return self._table is None and not self._first and self._frames > _EVERY * _LEARNED
+        enough = _EVERY * _LEARNED * (2 if self._first else 1)
+        return self._table is None and self._frames > enough
 
     def check(self, content: DepthFrame | SensorCloud) -> str:
         """A doubt about this frame, or nothing. Raises NoEstimate, with this frame and all that
         follow, once camera or table have moved."""
         self._frames += 1
-        if not self._moved and self._frames % (_SELDOM if self.blind else _EVERY) == 0:
+        every = _SELDOM if self.blind and not self._first else _EVERY
+        if not self._moved and self._frames % every == 0:
             self._look(content)
         if self._moved:
             raise NoEstimate(self._moved)
