@@ -349,6 +349,7 @@ def track(
     config = SOURCES.parse(source) if isinstance(source, str) else source
     named = named_sinks(sinks)
     model, frames = tracker.model, PublishedFrame()
+    config.patient().check_shown(model.patient, "the source")
     context = SinkContext(model.parts, frames, tracker.anatomy_ct, patient=model.patient)
     region = region_for(model, range_mm=range_mm)
     loop = Loop(tracker, context, LoopConfig(region=region, seconds=seconds))

@@ -56,6 +56,22 @@ def test_another_patient_or_side_than_stated_stops(clinic_model, run, tmp_path, 
         assert not place.exists()
 
 
+def test_a_recording_of_another_patient_is_not_played(clinic_model, run, tmp_path):
+    place = tmp_path / "seen"
+    place.mkdir()
+    shutil.copy(run.parent / "cloud.ply", place)
+    about, report = place / "recording.json", tmp_path / "report.json"
+    track = ("track", clinic_model, f"recording:{place}", "--report", report)
+    about.write_text(json.dumps({"patient": {"id": "P2", "side": "right"}}))
+    line = refusal(tumortrack(*track))
+    assert "shows patient P2, right side; the model is of patient P1, right side" in line
+    assert not report.exists()
+    for whose in ({"id": "P1", "side": "right"}, {"id": "unknown", "side": "unknown"}):
+        about.write_text(json.dumps({"patient": whose}))
+        succeeded(tumortrack(*track))
+        report.unlink()
+
+
 @pytest.mark.parametrize(("stated", "words"), [("", "no identifier"), ("unknown", "is nobody")])
 def test_an_empty_variable_in_a_script_is_no_leave_to_take_anybody(clinic_model, stated, words):
     track = ("track", clinic_model, "virtual:nowhere")

@@ -155,7 +155,7 @@ def test_results_in_the_cameras_own_frame_let_the_camera_move():
 # Names of frames
 
 
-def seen(name: str) -> Observation:
+def seen(name: str | None) -> Observation:
     return Observation(small_frame(), 0, frame_id=name)
 
 
@@ -166,6 +166,8 @@ def test_frames_of_another_camera_give_no_estimate():
     assert check.check(seen("left")) == ""
     with pytest.raises(NoEstimate, match="in 'right', and the calibration is for 'left'"):
         check.check(seen("right"))
+    with pytest.raises(NoEstimate, match="in '', and the calibration is for 'left'"):
+        check.check(seen(""))  # a ROS message may leave it out
     assert check.check(seen("left")) == ""
     assert check.notes == []
 
@@ -184,7 +186,7 @@ def test_a_frame_that_changes_in_the_middle_gives_no_estimate(published):
 def test_what_nobody_checks_is_said_once():
     check = FrameCheck(PublishedFrame("b", calibrated=True, camera_frame_id="left"), CONFIG, 0.25)
     for _ in range(3):
-        check.check(seen(""))
+        check.check(seen(None))
     assert len(check.notes) == 1
     assert "does not say whose frames" in check.notes[0]
 

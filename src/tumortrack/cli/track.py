@@ -109,7 +109,9 @@ class Track(StatedPatient):
         if arms is not None:
             frames = arms.frames
         manifest = read_model_manifest(self.model)  # what is wrong, before PyTorch's seconds
-        patient_of(manifest, self.model).check_is(self.stated, str(self.model))
+        patient = patient_of(manifest, self.model)
+        patient.check_is(self.stated, str(self.model))
+        source_config.patient().check_shown(patient, self.source)
         report = report_path(self.report, "track")
 
         from tumortrack.live.loop import Loop

@@ -45,6 +45,11 @@ class Patient(Config, frozen=True):
         pairs = (self.id, other.id), (self.side, other.side)
         return any(one != two for one, two in pairs if UNKNOWN not in (one, two))
 
+    def check_shown(self, model: Patient, what: str) -> None:
+        """Raises InputError where what is shown is known to be of another than the model."""
+        if self.differs(model):
+            raise InputError(f"{what} shows {self}; the model is of {model}. Give what is of one.")
+
     def check_is(self, stated: Patient, what: str) -> None:
         """Raises InputError where this, the patient of ``what``, is not known to be the stated
         one, in all that was stated."""

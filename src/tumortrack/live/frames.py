@@ -37,6 +37,7 @@ class FrameCheck:
         self._values: np.ndarray | None = None
         self._since_ns = 0
         self._camera: Intrinsics | None = None
+        self._begun = False
         self._name: str | None = None  # of the first frame
         self.watch = TableWatch(config, published.table_in_camera) if published.calibrated else None
         self.notes: list[str] = []
@@ -47,11 +48,11 @@ class FrameCheck:
         """A doubt about this frame, or nothing. Raises NoEstimate for a frame of another camera
         than the calibration or the first frame was of, and once camera or table have moved."""
         name, wanted = seen.frame_id, self._published.camera_frame_id
-        if self._name is None:
-            self._name = name
-            if wanted and not name:
+        if not self._begun:
+            self._begun, self._name = True, name
+            if wanted and name is None:
                 self.notes.append(_NAMELESS)
-        if wanted and name and name != wanted:
+        if wanted and name not in (None, wanted):
             raise NoEstimate(
                 f"the frame is in {name!r}, and the calibration is for {wanted!r}. Give "
                 "this camera's calibration, or the topic of the calibrated camera"

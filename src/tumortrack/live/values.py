@@ -44,14 +44,14 @@ class Observation:
     ``content`` has the ``stamp_ns`` of its exposure. ``arrived_ns``: when it reached this program,
     by ``time.time_ns``. ``mask``: of a depth image: True where the organ may be. ``truth``: the
     true surfaces, where the source simulates them. ``frame_id``: what the source calls the camera's
-    frame; empty: nothing.
+    frame; None: it is of a kind that calls it nothing.
     """
 
     content: DepthFrame | SensorCloud
     arrived_ns: int
     mask: Bool[np.ndarray, "h w"] | None = None
     truth: Anatomy | None = None
-    frame_id: str = ""
+    frame_id: str | None = None
 
     @property
     def stamp_ns(self) -> int:
@@ -292,6 +292,11 @@ class SourceConfig(Config, frozen=True, kw_only=True, tag_field="kind"):
     ``kind:target?key=value``; empty: there is none."""
 
     target: ClassVar[str] = ""
+
+    def patient(self) -> Patient:
+        """Whose organ it shows, as far as it says so. Raises TumortrackError: what it says cannot
+        be read."""
+        return NOBODY
 
     @abstractmethod
     def open(self) -> Source:

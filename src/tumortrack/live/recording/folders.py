@@ -26,6 +26,7 @@ from tumortrack.sense.ply import cloud_ply
 TIMES, INTRINSICS = "times.csv", "intrinsics.json"
 FRAMES, DEPTH, CLOUD, MASK = "frames", "depth.png", "cloud.ply", "mask.png"
 REPORT, META = "report.json", "meta.json"
+ABOUT = "recording.json"  # of what the sink wrote, frames or bag
 INDEX, SHAPES, WORKCELL = "index.jsonl", "shapes", "workcell.json"
 _ESTIMATE = "estimate"  # apart from what was seen: these surfaces are no truth
 _STAMP_DIGITS = 12  # a name with fewer digits is a number of a frame, no time in ns

@@ -20,13 +20,12 @@ from tumortrack.core.config import to_builtins
 from tumortrack.core.errors import InputError, StorageError
 from tumortrack.core.store import read_json, write_json
 from tumortrack.live.display import wxyz_of
-from tumortrack.live.recording.folders import FRAMES, INDEX, SHAPES, FrameFolders, report
+from tumortrack.live.recording.folders import ABOUT, FRAMES, INDEX, SHAPES, FrameFolders, report
 from tumortrack.live.ros.messages import MM_PER_M, Messages, Outgoing, xyz
 from tumortrack.live.ros.results import ResultMessages
 from tumortrack.live.ros.sensors import CAMERA_FRAME, messages_seen
 from tumortrack.live.values import SinkConfig, SinkContext, TrackingResult
 
-_ABOUT = "recording.json"
 _KIND = "recording"
 _CHUNK_S = 0.25  # a killed program loses what is in no chunk yet
 _STRING, _TRANSFORMS = "std_msgs/msg/String", "tf2_msgs/msg/TFMessage"
@@ -81,7 +80,7 @@ class RecordingSinkConfig(SinkConfig, frozen=True, kw_only=True, tag="recording"
             # Plain files lie beside their depth images; messages are as they were published.
             "estimate_frame": "camera" if self.format == "files" else frame.frame_id,
         }
-        write_json(self.path / _ABOUT, about)
+        write_json(self.path / ABOUT, about)
         return sink
 
 
@@ -95,8 +94,8 @@ def _make_room(path: Path, overwrite: bool) -> None:
             "recording."
         )
     inside = {p.name for p in path.iterdir()} if path.is_dir() else {path.name}
-    ours = {_ABOUT, INDEX, FRAMES, SHAPES, "metadata.yaml", f"{path.name}.mcap"}
-    is_ours = _ABOUT in inside and read_json(path / _ABOUT).get("kind") == _KIND
+    ours = {ABOUT, INDEX, FRAMES, SHAPES, "metadata.yaml", f"{path.name}.mcap"}
+    is_ours = ABOUT in inside and read_json(path / ABOUT).get("kind") == _KIND
     if inside and (inside - ours or not is_ours or not path.is_dir()):
         raise InputError(
             f"{path} is no recording of tumortrack's, or holds something else too, so it is not "

@@ -11,8 +11,10 @@ from pathlib import Path
 from typing import ClassVar, Literal
 
 from tumortrack.core.errors import InputError
+from tumortrack.core.patient import NOBODY, Patient, patient_in
+from tumortrack.core.store import read_json
 from tumortrack.live.recording.bags import BagRecording, bag_files
-from tumortrack.live.recording.folders import RecordedFrame, folder_frames
+from tumortrack.live.recording.folders import ABOUT, RecordedFrame, folder_frames
 from tumortrack.live.values import Observation, SourceConfig, SourceEnded, SourceLost
 
 Frames = Callable[[], Iterator[RecordedFrame]]
@@ -58,6 +60,12 @@ class RecordingSourceConfig(SourceConfig, frozen=True, kw_only=True, tag="record
             raise InputError(f"recording: fps is {self.fps:g}; it must lie in 0.01..1000.")
         if not 0 < self.unit_mm <= 100:
             raise InputError(f"recording: unit_mm is {self.unit_mm:g}; it must lie in 0..100 mm.")
+
+    def patient(self) -> Patient:
+        about = (self.path if self.path.is_dir() else self.path.parent) / ABOUT
+        return (
+            patient_in(read_json(about).get("patient"), str(about)) if about.is_file() else NOBODY
+        )
 
     def open(self) -> RecordingSource:
         """Find the frames; none is read yet. Raises InputError if there are none to play."""
