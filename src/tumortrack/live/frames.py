@@ -35,7 +35,7 @@ class FrameCheck:
     def __init__(self, published: PublishedFrame, config: RegionConfig, frozen_s: float) -> None:
         self._published, self._frozen_s = published, frozen_s
         self._values: np.ndarray | None = None
-        self._since_ns = 0
+        self._since_ns = self._last_ns = 0  # an image may have come since; the last frame
         self._camera: Intrinsics | None = None
         self._begun = False
         self._name: str | None = None  # of the first frame
@@ -74,14 +74,17 @@ class FrameCheck:
     def check_new(self, content: DepthFrame | SensorCloud) -> None:
         """Raises NoEstimate where the same image has been coming for too long."""
         values = content.depth_mm if isinstance(content, DepthFrame) else content.points_mm
+        before_ns, self._last_ns = self._last_ns, content.stamp_ns
         if self._values is None or not _same(values, self._values):
-            self._values, self._since_ns = values, content.stamp_ns
+            # It may have come right after the last frame that was taken: others were dropped.
+            self._since_ns = content.stamp_ns if self._values is None else before_ns
+            self._values = values
             return
         same_s = (content.stamp_ns - self._since_ns) * 1e-9
         if 0 < self._frozen_s <= same_s:
             raise NoEstimate(
-                f"the source is frozen: the same image for {same_s:.2f} s. Look at the camera; a "
-                "simulated one without noise needs --frozen 0."
+                f"the source is frozen: the same image for up to {same_s:.2f} s. Look at the "
+                "camera; a simulated one without noise needs --frozen 0."
             )
 
     def _same_intrinsics(self, camera: Intrinsics) -> None:

@@ -187,9 +187,10 @@ class Loop:
                 raise _TooLate(f"the answer came too late: {_age_s(born_ns):.2f} s after the frame")
         except Exception as error:
             estimate, reason, quality, warning = None, str(error), "none", ""
-            if not isinstance(error, _TooLate):  # that is the best place to start the next search
+            # The last place is the best one to start the next search, if only time was wrong.
+            if timely and not isinstance(error, _TooLate):
                 self._follower.forget()
-                self._in_a_row = 0 if timely else self._in_a_row
+                self._in_a_row = 0
             if not isinstance(error, TumortrackError):  # a defect of ours: the next frame is tried
                 self.statistics.add_defect(error)
                 reason = f"internal error, {type(error).__name__}: {error}"
