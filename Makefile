@@ -24,7 +24,7 @@ $(SETUP): pyproject.toml lab/pyproject.toml requirements/lock.txt requirements/c
 	if $(BIN)/python -c 'from importlib.metadata import requires; print(requires("torch"))' | grep -q nvidia; then \
 	$(BIN)/$(INSTALL) --require-hashes -r requirements/cuda.txt; fi
 	$(BIN)/$(INSTALL) --no-build-isolation -e . -e lab
-	$(BIN)/pip check
+	$(BIN)/python -I -m pip check  # -I: what PYTHONPATH names, as ROS sets it, is none of ours
 	touch $@
 
 $(TOOLS): requirements/tools.txt
