@@ -10,7 +10,6 @@ a model makes of them. `--disturb strays fat ...` makes scenes that should be me
 
 from __future__ import annotations
 
-import json
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,6 +22,7 @@ import tyro
 from tumortrack import api
 from tumortrack.cli.console import say
 from tumortrack.core import store
+from tumortrack.core.config import to_builtins
 from tumortrack.core.errors import InputError, NoEstimate, TumortrackError
 from tumortrack.core.geometry import transform_points
 from tumortrack.imaging.case import load_case
@@ -79,7 +79,7 @@ def main(options: Options) -> None:
     names = {n: "-".join((f"{n:05d}", *world.recipe(n))) for n in range(options.count)}
     todo = [n for n, name in names.items() if name not in failures]
     todo = [n for n in todo if not (options.out / names[n]).exists()]
-    start = time.monotonic()
+    start, used = time.monotonic(), time.process_time()
     for done, number in enumerate(todo, start=1):
         try:
             world.scene(number).write(options.out / names[number])
@@ -87,7 +87,11 @@ def main(options: Options) -> None:
             failures[names[number]] = f"{type(error).__name__}: {error}"
             store.write_json(failures_path, failures)
         left_min = (time.monotonic() - start) / done * (len(todo) - done) / 60
-        say(f"{done}/{len(todo)} {names[number]} {left_min:.0f} min left, {len(failures)} failed")
+        each_s = (time.process_time() - used) / done
+        say(
+            f"{done}/{len(todo)} {names[number]}: {left_min:.0f} min left, {each_s:.1f} s of one "
+            f"core a scene, {len(failures)} failed"
+        )
     if options.model is not None:
         made = [name for name in names.values() if (options.out / name).exists()]
         rows = _measured(options.model, world, options.out, made)
@@ -103,7 +107,7 @@ def _open(options: Options, config: WorldConfig) -> World:
     case, out = load_case(options.case), options.out
     identity = {
         "case_sha256": store.sha256_of(options.case / store.MANIFEST),
-        "config": json.loads(json.dumps(_about(config))),
+        "config": to_builtins(config),
     }
     path, tets = out / "world.json", out / "tets.safetensors"
     if path.exists():
@@ -119,12 +123,6 @@ def _open(options: Options, config: WorldConfig) -> World:
     store.write_atomically(tets, save({"nodes_mm": mesh.nodes_mm, "tets": mesh.tets}))
     store.write_json(path, identity)
     return world
-
-
-def _about(config: WorldConfig) -> dict:
-    from tumortrack.core.config import to_builtins
-
-    return to_builtins(config)
 
 
 def _measured(model: Path, world: World, out: Path, names: list[str]) -> pd.DataFrame:

@@ -12,7 +12,7 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float64
@@ -167,6 +167,7 @@ class Hold:
         return self.stiffness_mn_mm * float(amounts @ amounts) / 2, gradient
 
 
+@runtime_checkable
 class Equilibrium(Protocol):
     """What ``settle`` brings to rest: an energy (uJ) with its gradient (mN), an approximate
     Hessian (3 n, 3 n; mN/mm), and the load (mN) that unbalanced forces are measured against."""

@@ -8,7 +8,6 @@ and has a capsule. Ranges are assumptions, wide on purpose, where no source stan
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -374,11 +373,11 @@ class Deformed:
 def solve(organ: Organ, family: str, seed: int) -> Deformed:
     """One state of a family, all of it drawn from the seed. Raises TumortrackError: no equilibrium
     was found, or the organ's volume changed by more than tissue's does."""
-    rng, start = np.random.default_rng([seed, list(FAMILIES).index(family)]), time.process_time()
+    rng = np.random.default_rng([seed, list(FAMILIES).index(family)])
     loading, height = FAMILIES[family], organ.size_mm[2]
     if loading is None:
         rim = rng.uniform(0.1, 0.4) * height
-        return Deformed(organ, organ.mesh.nodes_mm, organ.mesh.tets, rim, None, {"seconds": 0.0})
+        return Deformed(organ, organ.mesh.nodes_mm, organ.mesh.tets, rim, None, {})
     wound = cut_open(organ.mesh, _random_slit(organ, rng)) if family == "cut" else None
     mesh = wound.mesh if wound else organ.mesh
     material, solid = _random_tissue(organ, mesh, rng)
@@ -418,7 +417,6 @@ def solve(organ: Organ, family: str, seed: int) -> Deformed:
         "least_stretch": float(stretch.min()),
         "iterations": iterations,
         "steps": steps,
-        "seconds": time.process_time() - start,
     }
     return Deformed(organ, nodes, mesh.tets, rim, wound, about)
 

@@ -6,7 +6,7 @@ rest. Units: mm, kPa, mN.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float, Float64, Int
@@ -26,6 +26,7 @@ _STICK_MM = 0.2  # a smaller slip meets less than full friction: keeps the energ
 _GRID_MM, _GRID_ROOM_MM = 2.5, 25.0
 
 
+@runtime_checkable
 class Force(Protocol):
     """``energy`` with its gradient (n, 3); ``stiffness``: (3 n, 3 n)."""
 
@@ -33,6 +34,7 @@ class Force(Protocol):
     def stiffness(self, nodes_mm: Nodes) -> csr_matrix: ...
 
 
+@runtime_checkable
 class Obstacle(Protocol):
     """A rigid body: the distance of points (negative inside), and its gradient, outwards."""
 
@@ -94,7 +96,8 @@ class Touch:
         points = self.rows @ nodes_mm
         distance, normal = self.obstacle.distance(points)
         limit = self.friction * self.stiffness_kpa_mm * self.areas_mm2 * np.maximum(-distance, 0)
-        self._last = (points, normal, limit) if self.friction > 0 else None
+        upright = normal / np.linalg.norm(normal, axis=1, keepdims=True)
+        self._last = (points, upright, limit) if self.friction > 0 else None
 
     def stiffness(self, nodes_mm: Nodes) -> csr_matrix:
         distance, normal = self.obstacle.distance(self.rows @ nodes_mm)

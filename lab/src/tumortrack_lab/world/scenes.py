@@ -8,7 +8,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 from jaxtyping import Float64
 
-from tumortrack.core.config import Config, to_builtins
+from tumortrack.core.config import Config
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.types import Anatomy, Mesh, SensorCloud
 from tumortrack.imaging.case import Case
@@ -19,7 +19,7 @@ from tumortrack_lab.tets import TetMesh, tetrahedralise
 from tumortrack_lab.twin.apparatus import bench_from_ct, moved
 from tumortrack_lab.world import segmentation
 from tumortrack_lab.world.families import FAMILIES, Deformed, Organ, solve
-from tumortrack_lab.world.views import View, joined, look, lump, organ_cloud
+from tumortrack_lab.world.views import View, look, lump, organ_cloud
 
 Disturbance = Literal[
     "none", "strays", "fat", "white", "scale", "side", "mirrored", "foreign", "nothing"
@@ -102,6 +102,8 @@ class World:
         cloud, on_organ = organ_cloud(view, truth.organ, rng)
         if disturbance == "strays":
             cloud, how = _with_strays(cloud, rng)
+        elif disturbance == "white":
+            view, cloud, how = _with_white_noise(view, cloud, rng)
         reference = moved(truth, view.camera_from_bench)
         seen = cloud.points_mm[:, None]
         tumor_mm = [
@@ -124,9 +126,6 @@ class World:
         targets = self.targets.at(transform_points(view.camera_from_bench, points))
         known = targets if disturbance not in OTHERS else None
         return Scene(cloud, reference, view.frame, meta, known)
-
-    def about(self) -> dict[str, Any]:
-        return to_builtins(self.config)
 
 
 def _simpler(part: Mesh, name: str) -> Mesh:
@@ -158,7 +157,7 @@ def _replaced(
         edge = truth.organ.vertices_mm[(truth.organ.vertices_mm @ way).argmax()]
         place = edge + 0.3 * half.mean() * way
         place[2] = low[2] + rng.uniform(0.5, 0.9) * (high[2] - low[2]) - 0.7 * half[2]
-        return state, truth, (joined([lump(place, half)]),)
+        return state, truth, (lump(place, half),)
     return state, truth, ()
 
 
@@ -167,10 +166,7 @@ def _disturbed_frame(
 ) -> tuple[View, dict[str, Any]]:
     """The view through a sensor out of order, and by how much."""
     depth = view.frame.depth_mm
-    if kind == "white":
-        how = {"std_mm": rng.uniform(1.0, 2.0)}
-        depth = depth + rng.normal(0, how["std_mm"], depth.shape)
-    elif kind == "scale":
+    if kind == "scale":
         how = {
             "scale": 1 + rng.choice([-1, 1]) * rng.uniform(0.02, 0.1),
             "offset_mm": rng.uniform(-8.0, 8.0),
@@ -190,6 +186,18 @@ def _disturbed_frame(
     else:
         return view, {}
     return replace(view, frame=view.frame.with_depth(depth.astype(np.float32))), how
+
+
+def _with_white_noise(
+    view: View, cloud: SensorCloud, rng: Generator
+) -> tuple[View, SensorCloud, dict[str, Any]]:
+    """1 to 2 mm along each ray, in image and points alike; the organ was found without it."""
+    std_mm, depth = rng.uniform(1.0, 2.0), view.frame.depth_mm
+    noisy = depth + rng.normal(0, std_mm, depth.shape).astype(np.float32)
+    z = cloud.points_mm[:, 2:].astype(float)
+    points = cloud.points_mm * (1 + rng.normal(0, std_mm, z.shape) / z)
+    view = replace(view, frame=view.frame.with_depth(noisy))
+    return view, SensorCloud(points.astype(np.float32), cloud.stamp_ns), {"std_mm": std_mm}
 
 
 def _with_strays(cloud: SensorCloud, rng: Generator) -> tuple[SensorCloud, dict[str, Any]]:
