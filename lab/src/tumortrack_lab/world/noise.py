@@ -180,8 +180,7 @@ def _normals(depth_mm: Image, camera: Intrinsics) -> tuple[np.ndarray, np.ndarra
     """Unit normals towards the camera, and unit vectors to it; a plane's where nothing is seen."""
     points = _points(depth_mm, camera)
     to_camera = -points / np.linalg.norm(points, axis=-1, keepdims=True)
-    along = [_slope(points, axis) for axis in (0, 1)]
-    normal = np.cross(*along)
+    normal = np.cross(_slope(points, 0), _slope(points, 1))
     normal /= np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-12)
     bad = ~np.isfinite(normal).all(-1)
     normal[bad] = to_camera[bad]
