@@ -85,6 +85,7 @@ class RegistrationLocator:
         few = [_SAMPLES // 2, *[64] * len(anatomy.tumors)]
         some = [v[:: max(1, len(v) // count)] for v, count in zip(vertices, few, strict=True)]
         self._samples_ct = np.concatenate(some)
+        self._sample_ends = np.cumsum([len(one) for one in some])[:-1]  # of each part's
         self._nearest_sample = nearest_lookup(self._samples_ct)
         self._middles_ct = np.array([part.box_mm.mean(0) for part in anatomy.parts])
         self._carried: _OrganPoints | None = None
@@ -169,8 +170,11 @@ class RegistrationLocator:
     ) -> dict[str, Any]:
         fit, motion = placed.fit, placed.motion
         parts = describe_parts(self._model.parts, placed.meshes, inside)
-        for part, std_mm in zip(parts.values(), placed.middle_std_mm, strict=True):
-            part["center_std_mm"] = float(std_mm)
+        surfaces = np.split(placed.sample_std_mm, self._sample_ends)
+        known = zip(parts.values(), placed.middle_std_mm, surfaces, strict=True)
+        for part, center_std_mm, surface_std_mm in known:
+            part["center_std_mm"] = float(center_std_mm)
+            part["surface_std_mm"] = float(surface_std_mm.max())
         more["fit_cost"] = {"now": fit.cost, "usual": self._calibration.usual_cost}
         more["motion"] = {
             "camera_from_ct": motion.camera_from_ct.tolist(),

@@ -1,0 +1,381 @@
+"""Calibration of margins: scenes of known truth -> a table, a line a state -> ``ModelMargins``.
+
+The unit is the physical state: one scene of each counts. docs/trust.md says what is promised.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import os
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+import numpy as np
+from jaxtyping import Float
+from msgspec import field
+
+import tumortrack
+from tumortrack.core import store
+from tumortrack.core.config import Config, from_builtins, to_builtins
+from tumortrack.core.errors import InputError, NoEstimate, StorageError
+from tumortrack.core.estimate import Estimate
+from tumortrack.core.types import SensorCloud
+from tumortrack.models import conformal
+from tumortrack.models.margins import (
+    METHOD,
+    Group,
+    Kind,
+    ModelMargins,
+    Radius,
+    Shells,
+    exceeded,
+    measured,
+)
+from tumortrack.report.metrics import outward_miss
+from tumortrack.simulate.scene_folder import Scene, list_scenes
+
+CONFIDENCES = (0.9, 0.95)
+SHARES = (1 / 3, 2 / 3)  # of visible surface, that part the groups
+# Limits are tried at these quantiles of the figures of the states that they are chosen on.
+_LEVELS = (0.7, 0.8, 0.9, 0.95, 1.0)
+_OFFSETS_MM = (0.1, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
+# What a state is for: choosing form and limits, testing limits, finding radii. Of each group's
+# states, drawn by the seed, in turn.
+_TURNS = ("test", "calibrate", "choose", "test", "calibrate")
+_Turn = Literal["choose", "test", "calibrate"]
+_Miss = tuple[float, float | None]  # outward miss or distance (mm), and s (mm)
+
+
+class Row(Config, frozen=True):
+    """One state, located. ``doubt``: why there is no good estimate; ``misses``: of every tumor, of
+    the kidney's surface, and of the target that is farthest off."""
+
+    scene: str
+    sha256: str
+    label: tuple[str, str, str]
+    doubt: str = ""
+    measured: dict[str, float] = field(default_factory=dict)
+    misses: dict[Kind, tuple[_Miss, ...]] = field(default_factory=dict)
+
+    def score(self, kind: Kind, offset_mm: float | None) -> float:
+        """Largest miss, over (offset + s) where an offset is given."""
+        misses = self.misses[kind]
+        if offset_mm is None:
+            return max(miss for miss, _ in misses)
+        return max(miss / (offset_mm + (s or 0.0)) for miss, s in misses)
+
+
+@dataclass(frozen=True)
+class Listed:
+    """A scene that counts: its folder, and family, visible share and organ."""
+
+    folder: Path
+    label: tuple[str, str, str]
+
+
+def list_states(folders: Sequence[Path], seed: int) -> list[Listed]:
+    """One scene of every state, drawn by the seed. Meta.json names ``family``, ``visible_share``
+    and ``state``; scenes without are of the family of their deformation, of unknown share, and a
+    state each. InputError: no scenes, or a share that is none."""
+    scenes = [scene for folder in folders for scene in list_scenes(folder)]
+    first: dict[tuple[str, ...], Listed] = {}
+    for n in np.random.default_rng(seed).permutation(len(scenes)):
+        path = scenes[n] / "meta.json"
+        meta = store.read_json(path) if path.is_file() else {}
+        family = meta.get("family") or (meta.get("deformation") or {}).get("kind") or "unknown"
+        organ, share = str(meta.get("case_sha256") or "unknown"), meta.get("visible_share")
+        if not (share is None or (isinstance(share, int | float) and 0 <= share <= 1)):
+            raise InputError(f"{path}: visible_share is {share!r}; allowed: 0 to 1.")
+        words = "unknown" if share is None else _WORDS[int(np.searchsorted(SHARES, share))]
+        one = Listed(scenes[n], (str(family), words, organ[:12]))
+        state = str(meta.get("state") or scenes[n].resolve())
+        first.setdefault((*one.label[::2], state), one)
+    return sorted(first.values(), key=lambda one: str(one.folder))
+
+
+_WORDS = ("under 1/3", "1/3 to 2/3", "over 2/3")
+
+
+def row_of(locate: Callable[[SensorCloud], Estimate], scene: Scene, listed: Listed) -> Row:
+    """One state's line; ``locate`` must state no margins of its own."""
+    head = {
+        "scene": str(listed.folder.resolve()),
+        "sha256": store.sha256_of(listed.folder),
+        "label": listed.label,
+    }
+    try:
+        estimate = locate(scene.cloud)
+    except (NoEstimate, InputError) as error:
+        return Row(**head, doubt=str(error))
+    if estimate.quality != "good":
+        return Row(**head, doubt=estimate.reason)
+    parts, misses = estimate.report["parts"], {}
+    unsure = {name: part.get("surface_std_mm") for name, part in parts.items()}
+    for n, (name, truth) in enumerate(
+        zip(scene.reference.names, scene.reference.parts, strict=True)
+    ):
+        if name not in estimate.meshes:
+            raise InputError(f"{listed.folder} has a {name}, which this model does not know.")
+        miss = outward_miss(estimate.meshes[name], truth), unsure[name]
+        misses.setdefault("tumor" if n else "kidney", []).append(miss)
+    if estimate.motion is not None and scene.targets is not None:
+        off_mm = estimate.motion.carry(scene.targets.points_ct) - scene.targets.points_mm
+        largest = float(np.linalg.norm(off_mm, axis=1).max())
+        misses["map"] = [(largest, unsure[scene.reference.names[0]])]
+    return Row(**head, measured=measured(estimate.report), misses=_tuples(misses))
+
+
+def _tuples(misses: dict[Any, list[_Miss]]) -> dict[Kind, tuple[_Miss, ...]]:
+    return {kind: tuple(some) for kind, some in misses.items()}
+
+
+@contextmanager
+def open_table(
+    path: Path, head: dict[str, Any]
+) -> Iterator[tuple[list[Row], Callable[[Row], None]]]:
+    """The rows that are in a table already, and a function that adds one: on the disk before it
+    returns. A line that a killed process left unfinished is dropped.
+
+    Raises:
+        InputError: it was begun with another ``head``, or another process fills it.
+        StorageError: the disk refused.
+    """
+    try:
+        stream = path.open("a+b")
+    except OSError as error:
+        raise StorageError(f"cannot write {path}: {error.strerror}.") from error
+    with stream:
+        try:
+            fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            raise InputError(f"{path} is being filled by another process.") from error
+        stream.seek(0)
+        content = stream.read()
+        whole = content[: content.rfind(b"\n") + 1]
+        stream.truncate(len(whole))
+
+        def add(data: object) -> None:
+            try:
+                stream.write(json.dumps(data, allow_nan=False).encode() + b"\n")
+                stream.flush()
+                os.fsync(stream.fileno())
+            except OSError as error:
+                raise StorageError(f"cannot write {path}: {error.strerror}.") from error
+
+        if not whole:
+            add(head)
+        known_head, rows = (head, []) if not whole else _parsed(whole, path)
+        if differ := [name for name in head if known_head.get(name) != head[name]]:
+            raise InputError(
+                f"{path} was begun with another {' and '.join(differ)}. Remove it, or give another "
+                "--out."
+            )
+        yield rows, lambda row: add(to_builtins(row))
+
+
+def read_table(path: Path) -> tuple[dict[str, Any], list[Row]]:
+    """Head and rows; InputError where it is none."""
+    return _parsed(store.read_file(path, 2**30), path)
+
+
+def _parsed(content: bytes, path: Path) -> tuple[dict[str, Any], list[Row]]:
+    try:
+        head, *lines = [json.loads(line) for line in content.splitlines()]
+        return dict(head), [from_builtins(line, Row, str(path)) for line in lines]
+    except (ValueError, TypeError) as error:
+        raise InputError(f"{path} is no table of `tumortrack margins`: {error}.") from error
+
+
+def head_of(model_sha256: str, seed: int) -> dict[str, Any]:
+    """What every row of a table depends on besides its scene."""
+    return {"model_sha256": model_sha256, "method": METHOD, "seed": seed}
+
+
+def margins_of(
+    rows: Sequence[Row],
+    table_sha256: str,
+    confidences: Sequence[float] = CONFIDENCES,
+    seed: int = 0,
+) -> ModelMargins:
+    """The margins that these states give; see docs/trust.md.
+
+    Raises:
+        InputError: a family with too few states, or limits that hold their risk nowhere; says how
+            many there are and how many it takes.
+    """
+    highest = max(confidences)
+    turns = _dealt([row.label for row in rows], seed)
+    some: dict[_Turn, list[Row]] = {turn: [] for turn in get_args(_Turn)}
+    for row, turn in zip(rows, turns, strict=True):
+        some[turn].append(row)
+    good = [row for row in some["choose"] if not row.doubt]
+    if not good:
+        raise InputError(
+            f"no good estimate among {len(some['choose'])} states to choose limits on."
+        )
+    located = [row for row in rows if not row.doubt]
+    kinds: list[Kind] = [kind for kind in get_args(Kind) if all(kind in r.misses for r in located)]
+    rules = _rules(good)
+    strict = [row for row in good if not exceeded(rules[0], row.measured)] or good
+    forms = {kind: _form(strict, kind, highest) for kind in kinds}
+    number, bound = _tested(rules, some["test"], kinds[0], forms[kinds[0]], 1 - highest)
+    accepted = {turn: [row for row in some[turn] if _accepted(row, rules[number])] for turn in some}
+    shells, joined = [], {}
+    for confidence in sorted(confidences):
+        radii = {}
+        for kind in kinds:
+            radii[kind], small = _radius(accepted["calibrate"], kind, forms[kind], confidence)
+            joined |= small
+        shells.append(Shells(confidence=confidence, radii=radii))
+    last = shells[-1].radii[kinds[0]]
+    missed = sum(_missed(row, kinds[0], last) for row in accepted["test"])
+    return ModelMargins(
+        method=METHOD,
+        tumortrack=tumortrack.__version__,
+        model_sha256="",
+        table_sha256=table_sha256,
+        seed=seed,
+        limits=rules[number],
+        shells=tuple(shells),
+        groups=tuple(_counts(rows, turns, rules[number])),
+        joined=joined,
+        risk_bound=bound,
+        accepted=len(accepted["test"]) / len(some["test"]),
+        missed=missed / len(some["test"]),
+    )
+
+
+def _dealt(labels: Sequence[conformal.Label], seed: int) -> list[_Turn]:
+    """What each state is for; drawn within its group."""
+    turns, seen = {}, dict.fromkeys(labels, 0)
+    for n in np.random.default_rng(seed).permutation(len(labels)):
+        turns[n] = _TURNS[seen[labels[n]] % len(_TURNS)]
+        seen[labels[n]] += 1
+    return [turns[n] for n in range(len(labels))]
+
+
+def _rules(good: Sequence[Row]) -> list[dict[str, float]]:
+    """Limits, the strictest first; none that lets pass what is worse than all that was seen."""
+    names = [name for name in good[0].measured if all(name in row.measured for row in good)]
+    figures = {name: np.array([row.measured[name] for row in good]) for name in names}
+    return [
+        {name: float(np.quantile(some, level, method="higher")) for name, some in figures.items()}
+        for level in _LEVELS
+    ]
+
+
+def _accepted(row: Row, limits: dict[str, float]) -> bool:
+    return not row.doubt and not exceeded(limits, row.measured)
+
+
+def _form(rows: Sequence[Row], kind: Kind, confidence: float) -> Radius:
+    """The form with the smaller mean radius, with provisional factors that half as many states
+    miss as may: what limits are tested with."""
+    beyond = (1 + confidence) / 2
+
+    def factor(offset_mm: float | None) -> float:
+        scores = [row.score(kind, offset_mm) for row in rows]
+        return float(np.quantile(scores, beyond, method="higher"))
+
+    constant = factor(None)
+    deviations = [s for row in rows for _, s in row.misses[kind]]
+    if None in deviations:
+        return Radius(used="constant", constant_mm=constant)
+    mean = float(np.mean([s for s in deviations if s is not None]))
+    width, offset = min((factor(a) * (a + mean), a) for a in _OFFSETS_MM)
+    used: Literal["scaled", "constant"] = "scaled" if width < constant else "constant"
+    return Radius(used=used, constant_mm=constant, scaled=factor(offset), offset_mm=offset)
+
+
+def _missed(row: Row, kind: Kind, radius: Radius) -> bool:
+    """Whether a tumor is not within its radius."""
+    radii = [(miss, radius.at(s)) for miss, s in row.misses[kind]]
+    return any(at is None or miss > at for miss, at in radii)
+
+
+def _tested(
+    rules: list[dict[str, float]], rows: Sequence[Row], kind: Kind, form: Radius, risk: float
+) -> tuple[int, float]:
+    """The number of the loosest limits that hold the risk, and its bound in the worst group."""
+    least, tables = conformal.least_tested(risk), []
+    for limits in rules:
+        taken = [row for row in rows if _accepted(row, limits)]
+        groups = _grouped(taken, least)[0] if taken else {"none": []}
+        misses = [(sum(_missed(row, kind, form) for row in of), len(of)) for of in groups.values()]
+        tables.append(misses)
+    number = conformal.loosest_rule(tables, risk)
+    if number is None:
+        said = ", ".join(f"{missed} of {count}" for missed, count in tables[0])
+        raise InputError(
+            f"no limits hold the risk: of the accepted states in each group {said} lie outside the "
+            f"margin. {least} without any would show {100 * risk:.3g} %; give more scenes of each "
+            "family (2.5 times as many, as others choose and calibrate), or a lower --confidence."
+        )
+    return number, max(conformal.risk_bound(*one) for one in tables[number])
+
+
+def _grouped(rows: Sequence[Row], least: int) -> tuple[dict[str, list[Row]], dict[str, str]]:
+    """The members of each group; which were too small to stand alone, and who speaks for them."""
+    labels = [row.label for row in rows]
+    found = {
+        ", ".join(label): [rows[n] for n in members]
+        for label, members in conformal.groups_of(labels, least).items()
+    }
+    names = {", ".join(label): label for label in labels}
+    joined = {}
+    for name, label in names.items():
+        if name not in found:
+            whole = [", ".join(label[:n]) for n in (2, 1)]
+            joined[name] = next(one for one in whole if one in found)
+    return found, joined
+
+
+def _radius(
+    rows: Sequence[Row], kind: Kind, form: Radius, confidence: float
+) -> tuple[Radius, dict[str, str]]:
+    """The form with the greatest of the groups' quantiles."""
+    least = conformal.least_scores(confidence)
+    groups, joined = _grouped(rows, least)
+    few = [f"{len(of)} of {name}" for name, of in groups.items() if len(of) < least]
+    if few or not groups:
+        raise InputError(
+            f"{100 * confidence:g} % needs {least} accepted states of each family to calibrate "
+            f"with (2.5 times as many in all); there are {', '.join(few) or 'none'}. Give more "
+            "scenes, or a lower --confidence."
+        )
+
+    def greatest(offset_mm: float | None) -> float:
+        return max(
+            conformal.conformal_quantile(_scores(of, kind, offset_mm), confidence)
+            for of in groups.values()
+        )
+
+    scaled = None if form.scaled is None else greatest(form.offset_mm)
+    radius = Radius(
+        used=form.used, constant_mm=greatest(None), scaled=scaled, offset_mm=form.offset_mm
+    )
+    return radius, joined
+
+
+def _scores(rows: Sequence[Row], kind: Kind, offset: float | None) -> Float[np.ndarray, " n"]:
+    return np.array([row.score(kind, offset) for row in rows])
+
+
+def _counts(
+    rows: Sequence[Row], turns: Sequence[_Turn], limits: dict[str, float]
+) -> Iterator[Group]:
+    for label in sorted({row.label for row in rows}):
+        mine = [(row, turn) for row, turn in zip(rows, turns, strict=True) if row.label == label]
+        taken = [turn for row, turn in mine if _accepted(row, limits)]
+        yield Group(
+            label=label,
+            states=len(mine),
+            good=sum(not row.doubt for row, _ in mine),
+            accepted=len(taken),
+            tested=taken.count("test"),
+            calibrated=taken.count("calibrate"),
+        )
