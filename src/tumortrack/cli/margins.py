@@ -132,8 +132,8 @@ def described(margins: ModelMargins) -> list[str]:
     return [
         *lines,
         f"no answer where one of these is exceeded: {limits}",
-        f"of all states {100 * margins.accepted:.0f} % have an answer, {100 * margins.missed:.1f} % "
-        "one that is outside the margin",
+        f"of all states {100 * margins.accepted:.0f} % have an answer, "
+        f"{100 * margins.missed:.1f} % one that is outside the margin",
     ]
 
 

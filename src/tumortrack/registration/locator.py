@@ -55,19 +55,20 @@ class _OrganPoints:
 
 @dataclass(frozen=True, eq=False)
 class _Registered:
-    """A fit that can be this organ's: its motion, the moved surfaces (camera frame), and one
-    standard deviation (mm) at the samples and at the middle of each part's box."""
+    """A fit that can be this organ's: its motion, the moved surfaces (camera frame), and the
+    covariance (mm^2) at the samples and at the middle of each part's box."""
 
     fit: RegistrationResult
     motion: ElasticMotion
     meshes: dict[str, Mesh]
-    sample_std_mm: Float[np.ndarray, " k"]
-    middle_std_mm: Float[np.ndarray, " parts"]
+    sample_mm2: Float[np.ndarray, "k 3 3"]
+    middle_mm2: Float[np.ndarray, "parts 3 3"]
 
     def probability(self, mine: _OrganPoints) -> Float32[np.ndarray, " n"]:
         """The chance that each point lies on the side of the nearest surface where it was found,
         if errors are normal."""
-        per_std = 1 / np.hypot(self.sample_std_mm, _FIELD_MM)
+        variances = np.trace(self.sample_mm2, axis1=1, axis2=2) / 3
+        per_std = 1 / np.sqrt(variances + _FIELD_MM**2)
         return kernels.probabilities(mine.margin_mm, per_std, mine.sample)
 
 
@@ -160,21 +161,23 @@ class RegistrationLocator:
         ends = np.cumsum([len(part.vertices_mm) for part in anatomy.parts])[:-1]
         parts = zip(anatomy.names, anatomy.parts, np.split(moved, ends), strict=True)
         meshes = {name: part.moved(places) for name, part, places in parts}
-        deviation = motion.std_mm(np.concatenate([self._samples_ct, self._middles_ct]))
-        assert deviation is not None
+        known_mm2 = motion.covariance_mm2(np.concatenate([self._samples_ct, self._middles_ct]))
+        assert known_mm2 is not None
         count = len(self._samples_ct)
-        return _Registered(fit, motion, meshes, deviation[:count], deviation[count:])
+        return _Registered(fit, motion, meshes, known_mm2[:count], known_mm2[count:])
 
     def _report(
         self, frame: Frame, placed: _Registered, inside: OccupancyCloud, **more: Any
     ) -> dict[str, Any]:
         fit, motion = placed.fit, placed.motion
         parts = describe_parts(self._model.parts, placed.meshes, inside)
-        surfaces = np.split(placed.sample_std_mm, self._sample_ends)
-        known = zip(parts.values(), placed.middle_std_mm, surfaces, strict=True)
-        for part, center_std_mm, surface_std_mm in known:
-            part["center_std_mm"] = float(center_std_mm)
-            part["surface_std_mm"] = float(surface_std_mm.max())
+        surfaces = np.split(placed.sample_mm2, self._sample_ends)
+        for part, mm2, its_mm2 in zip(parts.values(), placed.middle_mm2, surfaces, strict=True):
+            squares, axes = np.linalg.eigh(mm2)
+            part["center_std_mm"] = float(np.sqrt(squares.mean()))
+            part["center_axes_std_mm"] = np.sqrt(squares[::-1]).tolist()
+            part["center_axes"] = axes.T[::-1].tolist()
+            part["surface_std_mm"] = float(np.sqrt(np.linalg.eigvalsh(its_mm2).max()))
         more["fit_cost"] = {"now": fit.cost, "usual": self._calibration.usual_cost}
         more["motion"] = {
             "camera_from_ct": motion.camera_from_ct.tolist(),
