@@ -133,7 +133,8 @@ def described(margins: ModelMargins) -> list[str]:
         *lines,
         f"no answer where one of these is exceeded: {limits}",
         f"of all states {100 * margins.accepted:.0f} % have an answer, "
-        f"{100 * margins.missed:.1f} % one that is outside the margin",
+        f"{100 * margins.missed:.1f} % one that is outside the widest margin; of the worst group's "
+        f"answers these are no more than {100 * margins.risk_bound:.1f} %, with 95 % confidence",
     ]
 
 

@@ -1,13 +1,13 @@
 """Conformal quantiles, and rules of acceptance that are tested before they are used.
 
 Sources: Vovk et al., Algorithmic Learning in a Random World, 2005 (quantile); Clopper and Pearson,
-Biometrika 26:404, 1934 (bound); Angelopoulos et al., Learn then Test, arXiv 2110.01052 (sequence).
+Biometrika 26:404, 1934 (bound); Angelopoulos et al., Learn then Test, arXiv 2110.01052 (rules).
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Float, Int64
@@ -31,32 +31,36 @@ def conformal_quantile(scores: Float[np.ndarray, " n"], confidence: float) -> fl
     return float(np.sort(scores)[rank - 1]) if rank <= len(scores) else math.inf
 
 
-def least_tested(risk: float, error: float = ERROR) -> int:
-    """So many cases without a miss show that the risk is no larger."""
-    return math.ceil(math.log(error) / math.log1p(-risk) - _ROUNDING)
-
-
 def risk_bound(misses: int, cases: int, error: float = ERROR) -> float:
     """Clopper and Pearson's upper bound of the share of misses; too low with chance ``error``."""
     return 1.0 if misses >= cases else float(betaincinv(misses + 1, cases - misses, 1 - error))
 
 
+def least_tested(risk: float, error: float = ERROR, misses: int = 0) -> int:
+    """So many cases with so few misses show that the risk is no larger."""
+    cases = misses + 1
+    while risk_bound(misses, cases, error) > risk:
+        cases += 1
+    return cases
+
+
 def loosest_rule(
-    counts: Iterable[Sequence[tuple[int, int]]], risk: float, error: float = ERROR
+    rules: Sequence[Sequence[tuple[int, int]]], risk: float, error: float = ERROR
 ) -> int | None:
-    """The number of the last rule that holds its risk, None where the first does not.
+    """The number of the last rule that holds its risk in every group, None where none does.
 
     Args:
-        counts: of each rule, the strictest first, (misses, accepted cases) of each group. Rules are
-            tested one after the other, each in all groups, up to the first that fails: the chance
-            that the rule returned has a larger risk in any group is at most ``error``.
+        rules: of each rule, the strictest first, (misses, accepted cases) of each group. Each is
+            tested with its share of ``error`` (Bonferroni), which is then the largest chance that
+            the one returned has a larger risk in any group.
     """
-    last = None
-    for number, groups in enumerate(counts):
-        if any(risk_bound(misses, cases, error) > risk for misses, cases in groups):
-            break
-        last = number
-    return last
+    each = error / len(rules)
+    held = [
+        number
+        for number, groups in enumerate(rules)
+        if all(risk_bound(misses, cases, each) <= risk for misses, cases in groups)
+    ]
+    return max(held, default=None)
 
 
 def groups_of(labels: Sequence[Label], least: int) -> dict[Label, Int64[np.ndarray, " m"]]:

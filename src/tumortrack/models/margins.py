@@ -81,8 +81,8 @@ class ModelMargins(Config, frozen=True):
         shells: by rising confidence.
         groups: what was calibrated on, as it was given; ``joined``: of those, the ones that were
             too small to stand alone, and the larger one that spoke for each.
-        risk_bound: of the share of accepted answers outside the margin that the limits were tested
-            with, in the worst group, with 95 % confidence.
+        risk_bound: upper bound of the share of accepted answers outside the widest margin of a
+            tumor, in the worst group of the tested states, with 95 % confidence.
         accepted, missed: shares of all tested states: accepted; accepted and outside the margin.
     """
 
@@ -208,14 +208,24 @@ class StatedRadius(msgspec.Struct, frozen=True):
 
 
 def stated_radius(
-    report: dict[str, Any], name: str, confidence: float | None = None
+    said: dict[str, Any] | None, name: str, confidence: float | None = None
 ) -> StatedRadius | None:
-    """Of a part, or of ``map``, as a report states it, with this or else the highest confidence;
-    None: it states none."""
-    for one in reversed(report.get("margin", {}).get("stated", [])):
+    """Of a part, or of ``map``, by the entry ``margin`` of a report, with this or else the highest
+    confidence; None: it states none."""
+    for one in reversed((said or {}).get("stated", [])):
         if confidence in (None, one["confidence"]) and name in one["mm"]:
             return StatedRadius(one["confidence"], one["mm"][name])
     return None
+
+
+def margin_words(said: dict[str, Any] | None) -> str:
+    """The tumors' margins for people, or that there are none."""
+    stated = (said or {}).get("stated")
+    if not stated:
+        return f"no margin is stated: {(said or {}).get('reason', UNKNOWN)}"
+    radii = {name: mm for name, mm in stated[-1]["mm"].items() if name.startswith("tumor_")}
+    sizes = ", ".join(f"{name} {mm:.1f} mm" for name, mm in radii.items())
+    return f"{100 * stated[-1]['confidence']:g} % margin: {sizes}"
 
 
 def keep_margins(folder: Path, margins: ModelMargins) -> Path:

@@ -41,11 +41,16 @@ from tumortrack.simulate.scene_folder import Scene, list_scenes
 CONFIDENCES = (0.9, 0.95)
 SHARES = (1 / 3, 2 / 3)  # of visible surface, that part the groups
 # Limits are tried at these quantiles of the figures of the states that they are chosen on.
-_LEVELS = (0.7, 0.8, 0.9, 0.95, 1.0)
+_LEVELS = (0.8, 0.9, 0.95, 1.0)
 _OFFSETS_MM = (0.1, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
 # What a state is for: choosing form and limits, testing limits, finding radii. Of each group's
 # states, drawn by the seed, in turn.
 _TURNS = ("test", "calibrate", "choose", "test", "calibrate")
+# What limits must keep out. With the radius itself, which a few of 100 miss anyhow, hundreds of
+# states in each group would be needed to tell these from lies.
+_GROSS = 2.0
+_WORTH = 0.95  # of the constant radius: nothing less pays for one that varies
+_LEAST_CHOOSING = 10  # states of a group; of fewer the next larger one speaks
 _Turn = Literal["choose", "test", "calibrate"]
 _Miss = tuple[float, float | None]  # outward miss or distance (mm), and s (mm)
 
@@ -222,7 +227,7 @@ def margins_of(
     rules = _rules(good)
     strict = [row for row in good if not exceeded(rules[0], row.measured)] or good
     forms = {kind: _form(strict, kind, highest) for kind in kinds}
-    number, bound = _tested(rules, some["test"], kinds[0], forms[kinds[0]], 1 - highest)
+    number = _tested(rules, some["test"], kinds[0], forms[kinds[0]], 1 - highest)
     accepted = {turn: [row for row in some[turn] if _accepted(row, rules[number])] for turn in some}
     shells, joined = [], {}
     for confidence in sorted(confidences):
@@ -231,8 +236,10 @@ def margins_of(
             radii[kind], small = _radius(accepted["calibrate"], kind, forms[kind], confidence)
             joined |= small
         shells.append(Shells(confidence=confidence, radii=radii))
-    last = shells[-1].radii[kinds[0]]
-    missed = sum(_missed(row, kinds[0], last) for row in accepted["test"])
+    each, tested = conformal.ERROR / len(rules), accepted["test"]
+    last, least = shells[-1].radii[kinds[0]], conformal.least_tested(1 - highest, each, misses=1)
+    groups = _grouped(tested, least)[0].values()
+    bounds = [conformal.risk_bound(_misses(of, kinds[0], last), len(of), each) for of in groups]
     return ModelMargins(
         method=METHOD,
         tumortrack=tumortrack.__version__,
@@ -243,9 +250,9 @@ def margins_of(
         shells=tuple(shells),
         groups=tuple(_counts(rows, turns, rules[number])),
         joined=joined,
-        risk_bound=bound,
-        accepted=len(accepted["test"]) / len(some["test"]),
-        missed=missed / len(some["test"]),
+        risk_bound=max(bounds),
+        accepted=len(tested) / len(some["test"]),
+        missed=_misses(tested, kinds[0], last) / len(some["test"]),
     )
 
 
@@ -273,13 +280,13 @@ def _accepted(row: Row, limits: dict[str, float]) -> bool:
 
 
 def _form(rows: Sequence[Row], kind: Kind, confidence: float) -> Radius:
-    """The form with the smaller mean radius, with provisional factors that half as many states
-    miss as may: what limits are tested with."""
-    beyond = (1 + confidence) / 2
+    """The form with the smaller mean radius, constant where they are about equal; with provisional
+    factors, beyond which half as many states of each group lie as may."""
+    beyond, groups = (1 + confidence) / 2, _grouped(rows, _LEAST_CHOOSING)[0].values()
 
     def factor(offset_mm: float | None) -> float:
-        scores = [row.score(kind, offset_mm) for row in rows]
-        return float(np.quantile(scores, beyond, method="higher"))
+        scores = (_scores(of, kind, offset_mm) for of in groups)
+        return max(float(np.quantile(some, beyond, method="higher")) for some in scores)
 
     constant = factor(None)
     deviations = [s for row in rows for _, s in row.misses[kind]]
@@ -287,35 +294,42 @@ def _form(rows: Sequence[Row], kind: Kind, confidence: float) -> Radius:
         return Radius(used="constant", constant_mm=constant)
     mean = float(np.mean([s for s in deviations if s is not None]))
     width, offset = min((factor(a) * (a + mean), a) for a in _OFFSETS_MM)
-    used: Literal["scaled", "constant"] = "scaled" if width < constant else "constant"
+    used: Literal["scaled", "constant"] = "scaled" if width < _WORTH * constant else "constant"
     return Radius(used=used, constant_mm=constant, scaled=factor(offset), offset_mm=offset)
 
 
-def _missed(row: Row, kind: Kind, radius: Radius) -> bool:
-    """Whether a tumor is not within its radius."""
-    radii = [(miss, radius.at(s)) for miss, s in row.misses[kind]]
-    return any(at is None or miss > at for miss, at in radii)
+def _misses(rows: Sequence[Row], kind: Kind, radius: Radius) -> int:
+    """How many have a tumor that is not within its radius."""
+    radii = [[(miss, radius.at(s)) for miss, s in row.misses[kind]] for row in rows]
+    return sum(any(at is None or miss > at for miss, at in some) for some in radii)
 
 
 def _tested(
     rules: list[dict[str, float]], rows: Sequence[Row], kind: Kind, form: Radius, risk: float
-) -> tuple[int, float]:
-    """The number of the loosest limits that hold the risk, and its bound in the worst group."""
-    least, tables = conformal.least_tested(risk), []
+) -> int:
+    """The number of the loosest limits under which no more answers than the risk are gross misses:
+    beyond a radius ``_GROSS`` times as wide as the provisional one."""
+    each, tables = conformal.ERROR / len(rules), []
+    least = conformal.least_tested(risk, each, misses=1)
+    form = Radius(
+        used=form.used,
+        constant_mm=_GROSS * form.constant_mm,
+        scaled=None if form.scaled is None else _GROSS * form.scaled,
+        offset_mm=form.offset_mm,
+    )
     for limits in rules:
         taken = [row for row in rows if _accepted(row, limits)]
         groups = _grouped(taken, least)[0] if taken else {"none": []}
-        misses = [(sum(_missed(row, kind, form) for row in of), len(of)) for of in groups.values()]
-        tables.append(misses)
+        tables.append([(_misses(of, kind, form), len(of)) for of in groups.values()])
     number = conformal.loosest_rule(tables, risk)
     if number is None:
-        said = ", ".join(f"{missed} of {count}" for missed, count in tables[0])
+        said = ", ".join(f"{missed} of {count}" for missed, count in tables[-1])
         raise InputError(
-            f"no limits hold the risk: of the accepted states in each group {said} lie outside the "
-            f"margin. {least} without any would show {100 * risk:.3g} %; give more scenes of each "
+            f"no limits hold the risk: of the accepted states in each group {said} lie far outside "
+            f"the margin. {least} with one would show {100 * risk:.3g} %; give more scenes of each "
             "family (2.5 times as many, as others choose and calibrate), or a lower --confidence."
         )
-    return number, max(conformal.risk_bound(*one) for one in tables[number])
+    return number
 
 
 def _grouped(rows: Sequence[Row], least: int) -> tuple[dict[str, list[Row]], dict[str, str]]:
