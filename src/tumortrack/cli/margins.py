@@ -30,6 +30,7 @@ class Margins:
         scenes: folders of scene folders whose truth is known; without any, the generic calibration
             that comes with this version, if one does.
         confidence: the shares of cases in which the margins are to hold.
+        widest: answers that miss by more mm than this are to be kept out.
         out: file for what was found scene by scene; what is in it already is not located again
             (default: MODEL/margins.jsonl).
         seed: of the scene that stands for each state, and of what it is used for.
@@ -39,6 +40,7 @@ class Margins:
     model: Positional[Path]
     scenes: Positional[tuple[Path, ...]] = ()
     confidence: tuple[float, ...] = (0.9, 0.95)
+    widest: float = 8.0
     out: Path | None = None
     seed: int = 0
     device: Device = "auto"
@@ -49,6 +51,8 @@ class Margins:
 
         if not self.confidence or not all(0.5 <= one <= 0.99 for one in self.confidence):
             raise InputError("--confidence: give shares from 0.5 to 0.99, as 0.9 0.95.")
+        if not 0.5 <= self.widest <= 20:
+            raise InputError(f"--widest {self.widest:g} is not allowed; choose 0.5 to 20 mm.")
         if self.seed < 0:
             raise InputError(f"--seed {self.seed} must be 0 or more.")
         read_model_manifest(self.model)
@@ -67,7 +71,7 @@ class Margins:
         with calibration.open_table(table, calibration.head_of(digest, self.seed)) as (known, add):
             rows = self._located(listed, known, add)
         of = store.sha256_of(table)
-        return calibration.margins_of(rows, of, self.confidence, self.seed)
+        return calibration.margins_of(rows, of, self.confidence, self.widest, self.seed)
 
     def _located(
         self, listed: list[Listed], known: list[Row], add: Callable[[Row], None]

@@ -77,7 +77,8 @@ class ModelMargins(Config, frozen=True):
     Attributes:
         model_sha256: of the manifest of the model that they are of; empty in a generic calibration.
         table_sha256: of the calibration's results, scene by scene.
-        limits: an estimate has a margin only where none of these is exceeded (``measured``).
+        limits: an estimate has a margin only where none of these is exceeded (``measured``); of
+            those that pass, no more than may miss by more than ``widest_mm``, with 95 % confidence.
         shells: by rising confidence.
         groups: what was calibrated on, as it was given; ``joined``: of those, the ones that were
             too small to stand alone, and the larger one that spoke for each.
@@ -91,6 +92,7 @@ class ModelMargins(Config, frozen=True):
     model_sha256: str
     table_sha256: str
     seed: int
+    widest_mm: float
     limits: dict[str, float]
     shells: tuple[Shells, ...]
     groups: tuple[Group, ...]

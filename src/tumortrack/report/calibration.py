@@ -39,6 +39,7 @@ from tumortrack.report.metrics import outward_miss
 from tumortrack.simulate.scene_folder import Scene, list_scenes
 
 CONFIDENCES = (0.9, 0.95)
+WIDEST_MM = 8.0  # what plans assume of estimates that say nothing of their error
 SHARES = (1 / 3, 2 / 3)  # of visible surface, that part the groups
 # Limits are tried at these quantiles of the figures of the states that they are chosen on.
 _LEVELS = (0.8, 0.9, 0.95, 1.0)
@@ -46,11 +47,7 @@ _OFFSETS_MM = (0.1, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
 # What a state is for: choosing form and limits, testing limits, finding radii. Of each group's
 # states, drawn by the seed, in turn.
 _TURNS = ("test", "calibrate", "choose", "test", "calibrate")
-# What limits must keep out. With the radius itself, which a few of 100 miss anyhow, hundreds of
-# states in each group would be needed to tell these from lies.
-_GROSS = 2.0
 _WORTH = 0.95  # of the constant radius: nothing less pays for one that varies
-_LEAST_CHOOSING = 10  # states of a group; of fewer the next larger one speaks
 _Turn = Literal["choose", "test", "calibrate"]
 _Miss = tuple[float, float | None]  # outward miss or distance (mm), and s (mm)
 
@@ -85,12 +82,18 @@ class Listed:
 def list_states(folders: Sequence[Path], seed: int) -> list[Listed]:
     """One scene of every state, drawn by the seed. Meta.json names ``family``, ``visible_share``
     and ``state``; scenes without are of the family of their deformation, of unknown share, and a
-    state each. InputError: no scenes, or a share that is none."""
+    state each. Left out is what shows no organ of the model's (``model_organ`` false).
+
+    Raises:
+        InputError: no scenes, or a share that is none.
+    """
     scenes = [scene for folder in folders for scene in list_scenes(folder)]
     first: dict[tuple[str, ...], Listed] = {}
     for n in np.random.default_rng(seed).permutation(len(scenes)):
         path = scenes[n] / "meta.json"
         meta = store.read_json(path) if path.is_file() else {}
+        if meta.get("model_organ") is False:
+            continue  # something else in its place: nothing true can be said
         family = meta.get("family") or (meta.get("deformation") or {}).get("kind") or "unknown"
         organ, share = str(meta.get("case_sha256") or "unknown"), meta.get("visible_share")
         if not (share is None or (isinstance(share, int | float) and 0 <= share <= 1)):
@@ -204,9 +207,11 @@ def margins_of(
     rows: Sequence[Row],
     table_sha256: str,
     confidences: Sequence[float] = CONFIDENCES,
+    widest_mm: float = WIDEST_MM,
     seed: int = 0,
 ) -> ModelMargins:
-    """The margins that these states give; see docs/trust.md.
+    """The margins that these states give; see docs/trust.md. Answers that miss by more than
+    ``widest_mm`` are to be kept out by limits.
 
     Raises:
         InputError: a family with too few states, or limits that hold their risk nowhere; says how
@@ -225,10 +230,9 @@ def margins_of(
     located = [row for row in rows if not row.doubt]
     kinds: list[Kind] = [kind for kind in get_args(Kind) if all(kind in r.misses for r in located)]
     rules = _rules(good)
-    strict = [row for row in good if not exceeded(rules[0], row.measured)] or good
-    forms = {kind: _form(strict, kind, highest) for kind in kinds}
-    number = _tested(rules, some["test"], kinds[0], forms[kinds[0]], 1 - highest)
+    number = _tested(rules, some["test"], kinds[0], widest_mm, 1 - highest)
     accepted = {turn: [row for row in some[turn] if _accepted(row, rules[number])] for turn in some}
+    forms = {kind: _form(accepted["choose"] or good, kind, highest) for kind in kinds}
     shells, joined = [], {}
     for confidence in sorted(confidences):
         radii = {}
@@ -246,6 +250,7 @@ def margins_of(
         model_sha256="",
         table_sha256=table_sha256,
         seed=seed,
+        widest_mm=widest_mm,
         limits=rules[number],
         shells=tuple(shells),
         groups=tuple(_counts(rows, turns, rules[number])),
@@ -280,13 +285,11 @@ def _accepted(row: Row, limits: dict[str, float]) -> bool:
 
 
 def _form(rows: Sequence[Row], kind: Kind, confidence: float) -> Radius:
-    """The form with the smaller mean radius, constant where they are about equal; with provisional
-    factors, beyond which half as many states of each group lie as may."""
-    beyond, groups = (1 + confidence) / 2, _grouped(rows, _LEAST_CHOOSING)[0].values()
+    """The form with the smaller mean radius; constant where they are about equal. Its factors are
+    provisional."""
 
     def factor(offset_mm: float | None) -> float:
-        scores = (_scores(of, kind, offset_mm) for of in groups)
-        return max(float(np.quantile(some, beyond, method="higher")) for some in scores)
+        return float(np.quantile(_scores(rows, kind, offset_mm), confidence, method="higher"))
 
     constant = factor(None)
     deviations = [s for row in rows for _, s in row.misses[kind]]
@@ -298,38 +301,40 @@ def _form(rows: Sequence[Row], kind: Kind, confidence: float) -> Radius:
     return Radius(used=used, constant_mm=constant, scaled=factor(offset), offset_mm=offset)
 
 
+def _tested(
+    rules: list[dict[str, float]], rows: Sequence[Row], kind: Kind, widest_mm: float, risk: float
+) -> int:
+    """The number of the loosest limits under which no more of the answers than the risk miss by
+    more than ``widest_mm``, in any group."""
+    each, tables = conformal.ERROR / len(rules), []
+    least = conformal.least_tested(risk, each, misses=1)
+    for limits in rules:
+        taken = [row for row in rows if _accepted(row, limits)]
+        groups = _grouped(taken, least)[0]
+        tables.append(
+            {name: (_beyond(of, kind, widest_mm), len(of)) for name, of in groups.items()}
+        )
+    number = conformal.loosest_rule([list(table.values()) for table in tables], risk)
+    if number is None:
+        said = "; ".join(f"{m} of {n} of {name}" for name, (m, n) in tables[-1].items())
+        none = conformal.least_tested(risk, each)
+        raise InputError(
+            f"no limits hold {100 * risk:.3g} %: of the answers in each group, {said or 'none'} "
+            f"miss by more than {widest_mm:g} mm. It takes {none} without such a one, {least} with "
+            "one, and 2.5 times as many states in all. Give more scenes of each family, a wider "
+            "--widest, or a lower --confidence."
+        )
+    return number
+
+
+def _beyond(rows: Sequence[Row], kind: Kind, widest_mm: float) -> int:
+    return sum(row.score(kind, None) > widest_mm for row in rows)
+
+
 def _misses(rows: Sequence[Row], kind: Kind, radius: Radius) -> int:
     """How many have a tumor that is not within its radius."""
     radii = [[(miss, radius.at(s)) for miss, s in row.misses[kind]] for row in rows]
     return sum(any(at is None or miss > at for miss, at in some) for some in radii)
-
-
-def _tested(
-    rules: list[dict[str, float]], rows: Sequence[Row], kind: Kind, form: Radius, risk: float
-) -> int:
-    """The number of the loosest limits under which no more answers than the risk are gross misses:
-    beyond a radius ``_GROSS`` times as wide as the provisional one."""
-    each, tables = conformal.ERROR / len(rules), []
-    least = conformal.least_tested(risk, each, misses=1)
-    form = Radius(
-        used=form.used,
-        constant_mm=_GROSS * form.constant_mm,
-        scaled=None if form.scaled is None else _GROSS * form.scaled,
-        offset_mm=form.offset_mm,
-    )
-    for limits in rules:
-        taken = [row for row in rows if _accepted(row, limits)]
-        groups = _grouped(taken, least)[0] if taken else {"none": []}
-        tables.append([(_misses(of, kind, form), len(of)) for of in groups.values()])
-    number = conformal.loosest_rule(tables, risk)
-    if number is None:
-        said = ", ".join(f"{missed} of {count}" for missed, count in tables[-1])
-        raise InputError(
-            f"no limits hold the risk: of the accepted states in each group {said} lie far outside "
-            f"the margin. {least} with one would show {100 * risk:.3g} %; give more scenes of each "
-            "family (2.5 times as many, as others choose and calibrate), or a lower --confidence."
-        )
-    return number
 
 
 def _grouped(rows: Sequence[Row], least: int) -> tuple[dict[str, list[Row]], dict[str, str]]:
