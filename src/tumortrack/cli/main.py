@@ -38,7 +38,8 @@ _COMMANDS: tuple[type[Command], ...] = (
 )
 _ORDER = (
     *("demo", "prepare", "export", "train", "pretrain", "locate", "track", "plan", "resect"),
-    *("simulate", "twin", "evaluate", "margins", "bench", "compile", "onnx", "inspect", "doctor"),
+    *("simulate", "twin", "evaluate", "margins", "generic-margins", "bench"),
+    *("compile", "onnx", "inspect", "doctor"),
 )
 _OBJECTS_A_COLLECTION = 20_000
 _LEFT_AT_ONCE = ["locate"]  # holds nothing open in the end, and is waited for

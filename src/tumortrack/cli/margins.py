@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from tyro.conf import Positional
 
@@ -55,8 +55,8 @@ class Margins:
             raise InputError(f"--widest {self.widest:g} is not allowed; choose 0.5 to 20 mm.")
         if self.seed < 0:
             raise InputError(f"--seed {self.seed} must be 0 or more.")
-        read_model_manifest(self.model)
-        margins = self._calibrated() if self.scenes else _generic()
+        manifest = read_model_manifest(self.model)
+        margins = self._calibrated() if self.scenes else _generic(manifest)
         path = keep_margins(self.model, margins)
         for line in described(margins):
             say(line)
@@ -106,13 +106,19 @@ class Margins:
         return [done[str(one.folder.resolve())] for one in listed]
 
 
-def _generic() -> ModelMargins:
+def _generic(manifest: dict[str, Any]) -> ModelMargins:
+    from tumortrack.models.folder import has_shape
     from tumortrack.models.margins import GENERIC, read_sealed
 
     if not GENERIC.is_file():
         raise InputError(
             "no margin is known: this version comes without a generic calibration. Give folders of "
             "scenes: tumortrack margins MODEL SCENES."
+        )
+    if not has_shape(manifest):
+        raise InputError(
+            "no margin is known: the generic calibration is of models of the preset clinic. Give "
+            "folders of scenes: tumortrack margins MODEL SCENES."
         )
     return read_sealed(GENERIC)
 
