@@ -17,6 +17,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 from jaxtyping import Float
 from msgspec import field
+from msgspec.structs import replace
 
 import tumortrack
 from tumortrack.core import store
@@ -38,6 +39,8 @@ from tumortrack.models.margins import (
 from tumortrack.report.metrics import outward_miss
 from tumortrack.simulate.scene_folder import Scene, list_scenes
 
+_Turn = Literal["choose", "test", "calibrate"]
+_Miss = tuple[float, float | None]  # outward miss or distance (mm), and s (mm)
 CONFIDENCES = (0.9, 0.95)
 WIDEST_MM = 8.0  # what plans assume of estimates that say nothing of their error
 SHARES = (1 / 3, 2 / 3)  # of visible surface, that part the groups
@@ -46,10 +49,8 @@ _LEVELS = (0.8, 0.9, 0.95, 1.0)
 _OFFSETS_MM = (0.1, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
 # What a state is for: choosing form and limits, testing limits, finding radii. Of each group's
 # states, drawn by the seed, in turn.
-_TURNS = ("test", "calibrate", "choose", "test", "calibrate")
+_TURNS: tuple[_Turn, ...] = ("test", "calibrate", "choose", "test", "calibrate")
 _WORTH = 0.95  # of the constant radius: nothing less pays for one that varies
-_Turn = Literal["choose", "test", "calibrate"]
-_Miss = tuple[float, float | None]  # outward miss or distance (mm), and s (mm)
 
 
 class Row(Config, frozen=True):
@@ -110,18 +111,19 @@ _WORDS = ("under 1/3", "1/3 to 2/3", "over 2/3")
 
 def row_of(locate: Callable[[SensorCloud], Estimate], scene: Scene, listed: Listed) -> Row:
     """One state's line; ``locate`` must state no margins of its own."""
-    head = {
-        "scene": str(listed.folder.resolve()),
-        "sha256": store.sha256_of(listed.folder),
-        "label": listed.label,
-    }
+    row = Row(
+        scene=str(listed.folder.resolve()),
+        sha256=store.sha256_of(listed.folder),
+        label=listed.label,
+    )
     try:
         estimate = locate(scene.cloud)
     except (NoEstimate, InputError) as error:
-        return Row(**head, doubt=str(error))
+        return replace(row, doubt=str(error))
     if estimate.quality != "good":
-        return Row(**head, doubt=estimate.reason)
-    parts, misses = estimate.report["parts"], {}
+        return replace(row, doubt=estimate.reason)
+    parts: dict[str, Any] = estimate.report["parts"]
+    misses: dict[Kind, list[_Miss]] = {}
     unsure = {name: part.get("surface_std_mm") for name, part in parts.items()}
     for n, (name, truth) in enumerate(
         zip(scene.reference.names, scene.reference.parts, strict=True)
@@ -134,11 +136,8 @@ def row_of(locate: Callable[[SensorCloud], Estimate], scene: Scene, listed: List
         off_mm = estimate.motion.carry(scene.targets.points_ct) - scene.targets.points_mm
         largest = float(np.linalg.norm(off_mm, axis=1).max())
         misses["map"] = [(largest, unsure[scene.reference.names[0]])]
-    return Row(**head, measured=measured(estimate.report), misses=_tuples(misses))
-
-
-def _tuples(misses: dict[Any, list[_Miss]]) -> dict[Kind, tuple[_Miss, ...]]:
-    return {kind: tuple(some) for kind, some in misses.items()}
+    found = {kind: tuple(some) for kind, some in misses.items()}
+    return replace(row, measured=measured(estimate.report), misses=found)
 
 
 @contextmanager
@@ -233,7 +232,8 @@ def margins_of(
     number = _tested(rules, some["test"], kinds[0], widest_mm, 1 - highest)
     accepted = {turn: [row for row in some[turn] if _accepted(row, rules[number])] for turn in some}
     forms = {kind: _form(accepted["choose"] or good, kind, highest) for kind in kinds}
-    shells, joined = [], {}
+    shells: list[Shells] = []
+    joined: dict[str, str] = {}
     for confidence in sorted(confidences):
         radii = {}
         for kind in kinds:
@@ -263,7 +263,8 @@ def margins_of(
 
 def _dealt(labels: Sequence[conformal.Label], seed: int) -> list[_Turn]:
     """What each state is for; drawn within its group."""
-    turns, seen = {}, dict.fromkeys(labels, 0)
+    turns: dict[int, _Turn] = {}
+    seen = dict.fromkeys(labels, 0)
     for n in np.random.default_rng(seed).permutation(len(labels)):
         turns[n] = _TURNS[seen[labels[n]] % len(_TURNS)]
         seen[labels[n]] += 1
