@@ -65,7 +65,12 @@ class LiveBudget:
             motion_mm=motion_mm,
             lag_mm=self._speed_mm_s(update.stamp_ns, tumor) * (late_ms / 1000 + self._servo_s),
         )
-        if self._planned.left_mm < 0 or now.left_mm >= 0:
+        if self._planned.left_mm < 0:
+            return "", False
+        if self._planned.confidence > now.confidence:
+            sure = f"{100 * self._planned.confidence:g} %"
+            return f"the estimate states no {sure} margin, with which it was planned", False
+        if now.left_mm >= 0:
             return "", False
         return now.words, msgspec.structs.replace(now, motion_mm=0.0).left_mm >= 0
 
