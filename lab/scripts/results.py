@@ -106,12 +106,12 @@ def main(options: Options) -> None:
         measured = measure(jobs, kept, partial(_lines(), section + MEASURING), one)
         writer.write(section_blocks(section, measured, cases, writer))
         say(f"{section}: {len(measured)} measurements, block written to {document}")
-    if "peers" in options.sections:
+    if "accuracy" in options.sections:
         case, seed = studied[0], plan.seeds[0]
         chosen: list[Method] = [methods.model(case, name, seed) for name in plan.models]
         chosen += [methods.peer("elastic", case)] * ("elastic" in plan.peers)
         scenes = [variant for variant in plan.variants if not variant.startswith("Rot")]
-        shown = [Job(case, m, v, plan.view, plan.coarse_grid) for m in chosen for v in scenes]
+        shown = [Job(case, m, v, plan.view, plan.grid) for m in chosen for v in scenes]
         writer.write(gallery_block(shown, seed, writer, out / "gallery.json"))
     say(f"done; {document} is up to date.")
 
