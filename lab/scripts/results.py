@@ -96,7 +96,9 @@ def main(options: Options) -> None:
     methods = _methods(options, plan, out)
     for section in options.sections:
         cases = (second,) if section == "deformation" else studied
-        if section in ("faults", "views", "severity"):
+        if section in ("accuracy", "goals"):  # for its endophytic tumors
+            cases = (*studied, second)
+        elif section in ("faults", "views", "severity"):
             cases = studied[:1]
         for case in cases:
             _scenes(case, *studies.scenes_of(plan, section, case))

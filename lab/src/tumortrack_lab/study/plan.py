@@ -138,7 +138,8 @@ def jobs_of(
     """The jobs of one section, grouped by method. Models that are not trained yet are trained.
 
     ``cases``: for ``deformation`` the second phantom; for faults, views and severities, which have
-    the first seed alone, the paper's phantom; for all others every case.
+    the first seed alone, the paper's phantom; for accuracy and goals every case and the second
+    phantom; for all others every case.
     """
     model = methods.ablated if section == "ablation" else methods.model
     jobs = []
