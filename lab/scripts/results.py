@@ -147,7 +147,7 @@ def _cases(options: Options, out: Path) -> tuple[tuple[StudyCase, ...], StudyCas
     folders = {n: phantom_case(out / "cases" / n, shape) for n, shape in phantoms.items()}
     folders |= named_folders(options.case, folders)
     phantom, second, *given = (
-        study_case(name, folder, out / "scenes" / name, is_paper=name == "phantom")
+        study_case(name, folder, out / "scenes" / name, is_paper=name in phantoms)
         for name, folder in folders.items()
     )
     return (phantom, *given), second

@@ -32,7 +32,7 @@ RULE = (
     "as infinitely far. Deformed variants are those that are neither turned only nor at rest. HD "
     "is the symmetric distance. Beside each: that of the best rigid pose, an oracle. Numbers are "
     "rounded up (mIoU: down), and goals judged by the unrounded ones. Hidden surface: median error "
-    "with 40 % of the visible surface hidden over the median error without, both on clean depth."
+    "with 40 % of the visible surface hidden over that without, of the first seed on clean depth."
 )
 RIGID = "rigid_bound"
 _GOALS_MM = {"exophytic": (1.5, 2.0, 3.0), "endophytic": (2.0, 3.0, 4.0)}

@@ -198,7 +198,7 @@ def _blocks(plan: StudyPlan, section: Section, case: StudyCase) -> list[_Block]:
         "accuracy": [
             _Block(trained(plan.models), for_case(plan.peers, plan.case_peers), *usual, grid)
         ],
-        "goals": [_Block(own, (RIGID,), *usual, grid), disturbed(own, (), (_HIDDEN,))],
+        "goals": [_Block(own, (RIGID,), *usual, grid), disturbed(own[:1], (), (_HIDDEN,))],
         "ablation": [ablation] * (case.name in plan.ablation_cases),
         "deformation": [
             _Block(trained(configurations, of), (), plan.configuration_variants,
