@@ -29,7 +29,7 @@ from tumortrack.simulate.scene_folder import Scene
 from tumortrack.training.presets import clinic, quick
 from tumortrack_lab.peers.base import Fit, estimate_of, rigid_carry
 from tumortrack_lab.peers.kinds import peer_kinds
-from tumortrack_lab.study import lies, tables
+from tumortrack_lab.study import tables, tumor_sites
 from tumortrack_lab.study.bound import BOUNDS, Bound, BoundConfig, BoundMotion, laid_on
 from tumortrack_lab.study.document import ReportWriter, closing, fill, opening, table
 from tumortrack_lab.study.goals import goal_table
@@ -155,8 +155,8 @@ def test_a_killed_study_goes_on_and_measures_nothing_twice(case, tmp_path):
     assert again == resumed
     assert len(method.calls) == 1
     whole = measure(jobs(case, Shifted()), MeasurementStore(tmp_path / "others"))
-    lie = lies.tumor_lies(anatomy())
-    assert tables.accuracy(tidy(whole), lie) == tables.accuracy(tidy(resumed), lie)
+    sites = tumor_sites.tumor_sites_of(anatomy())
+    assert tables.accuracy(tidy(whole), sites) == tables.accuracy(tidy(resumed), sites)
 
 
 def test_what_decides_a_measurement_makes_it_another_one(case, tmp_path):
@@ -187,7 +187,7 @@ def test_known_errors_reach_the_table(case, tmp_path):
         {**one, "spec": {**one["spec"], "variant": "Rot90"}}
         for one in measure(jobs(case, Shifted(shift_mm=9.0)), kept)
     ]
-    written = tables.accuracy(tidy([*found, *turned]), lies.tumor_lies(anatomy()))
+    written = tables.accuracy(tidy([*found, *turned]), tumor_sites.tumor_sites_of(anatomy()))
     rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in written.splitlines()]
     deep = "tumor 1, endophytic: centre"
     assert rows[0] == ["state", "figure", "slim network, limited turns"]
@@ -209,7 +209,7 @@ def test_shares_are_by_nearest_rank_and_never_in_our_favour():
 def test_seconds_say_whether_the_machine_was_busy(case, tmp_path, load, shown):
     found = measure(jobs(case, Shifted()), MeasurementStore(tmp_path / "cells"))
     found = [{**one, "provenance": {**one["provenance"], "load": load}} for one in found]
-    written = tables.accuracy(tidy(found), lies.tumor_lies(anatomy()))
+    written = tables.accuracy(tidy(found), tumor_sites.tumor_sites_of(anatomy()))
     assert f"|  | s a frame | {shown} |" in written
 
 
@@ -238,7 +238,7 @@ def test_parts_that_were_not_found_follow_the_rule(case, tmp_path):
     assert text(by_seed(first, "center_mm")) == "2.0 (2 of 3)"
     assert text(by_seed(second, "center_mm")) == NOT_FOUND
     assert by_seed(second, "iou")[2] == 0.0
-    written = tables.accuracy(frame, lies.tumor_lies(anatomy()))
+    written = tables.accuracy(frame, tumor_sites.tumor_sites_of(anatomy()))
     assert "| scenes with a part not found | 4 |" in written
     assert "| tumor 2, endophytic: HD | not found / not found / not found / not found |" in written
     seeds = pd.DataFrame({"seed": [0, 0, 0, 1, 1], "mm": [1.0, np.inf, 3.0, 1.0, np.inf]})
@@ -278,11 +278,11 @@ def test_point_errors_know_depth_displacement_and_distance():
 
 
 def test_how_a_tumor_lies():
-    deep = lies.tumor_lies(anatomy())
-    assert {lie.kind for lie in deep.values()} == {"endophytic"}
+    deep = tumor_sites.tumor_sites_of(anatomy())
+    assert {site.kind for site in deep.values()} == {"endophytic"}
     assert deep["tumor_2"].cover_mm == pytest.approx(9, abs=0.2)
     # Half of this organ's surface is the tumor's: two caps of one ball.
-    outer = lies.tumor_lies(Anatomy((ball(30), ball(30))))["tumor_1"]
+    outer = tumor_sites.tumor_sites_of(Anatomy((ball(30), ball(30))))["tumor_1"]
     assert (outer.kind, outer.exposed_share) == ("exophytic", pytest.approx(1.0))
 
 
@@ -500,7 +500,10 @@ def goal_measurement(method, variant, hd, **spec):
 
 
 def test_goals_are_judged_by_the_worst_seed_and_never_rounded_in_our_favour():
-    lie = {"one": {"tumor_1": lies.Lie(0.0, 5.0)}, "two": {"tumor_1": lies.Lie(0.5, 0.0)}}
+    sites = {
+        "one": {"tumor_1": tumor_sites.TumorSite(0.0, 5.0)},
+        "two": {"tumor_1": tumor_sites.TumorSite(0.5, 0.0)},
+    }
     found = [goal_measurement("clinic", "D1", hd, seed=n) for n, hd in enumerate((1.0, 2.0001))]
     found += [goal_measurement("clinic", "D2", 2.9999), goal_measurement("clinic", "Rot90", 0.1)]
     found += [goal_measurement("rigid_bound", "D1", 1.994)]
@@ -508,7 +511,7 @@ def test_goals_are_judged_by_the_worst_seed_and_never_rounded_in_our_favour():
     found += [goal_measurement("clinic", "D2", 2.0, fault="clean")]
     hidden = {"fault": "visible=60"}
     found += [goal_measurement("clinic", "D2", 2.7, **hidden, fault_seed=n) for n in (0, 1)]
-    lines = goal_table(tidy(found), lie).splitlines()
+    lines = goal_table(tidy(found), sites).splitlines()
     assert lines[0] == "| figure | goal | one: clinic / rigid | two: clinic / rigid |"
     rows = {line.split("|")[1].strip(): line for line in lines}
     assert "| ≤ 2 | 2.01 (no) / 2.00 | – / – |" in rows["tumor HD, D1, endophytic"]
@@ -520,7 +523,7 @@ def test_goals_are_judged_by_the_worst_seed_and_never_rounded_in_our_favour():
     assert "| ≤ 1.3 | 1.35 (no) / – |" in rows["hidden surface: tumor HD, times"]
 
     lost = [*found, goal_measurement("clinic", "D3", None)]
-    worst = next(line for line in goal_table(tidy(lost), lie).splitlines() if "worst" in line)
+    worst = next(line for line in goal_table(tidy(lost), sites).splitlines() if "worst" in line)
     assert "| ≤ 2.5 | not found (no) / " in worst
 
 

@@ -14,7 +14,6 @@ from typing import Literal, get_args
 import pandas as pd
 
 from tumortrack_lab.study.document import table
-from tumortrack_lab.study.lies import Kind, Lie
 from tumortrack_lab.study.methods import CLINIC
 from tumortrack_lab.study.tables import (
     EMPTY,
@@ -25,6 +24,7 @@ from tumortrack_lab.study.tables import (
     scenes,
     tumors,
 )
+from tumortrack_lab.study.tumor_sites import Kind, TumorSite
 
 RULE = (
     "Distances in mm; of the seeds, and of a case's tumors of a kind, the worst counts in every "
@@ -62,12 +62,12 @@ class StudyGoal:
         return shown, "yes" if met and finite else "no"
 
 
-def goal_table(frame: pd.DataFrame, lies: dict[str, dict[str, Lie]]) -> str:
+def goal_table(frame: pd.DataFrame, sites: dict[str, dict[str, TumorSite]]) -> str:
     """Every goal beside clinic and the best rigid pose on each case, never pooled: organs differ.
-    ``lies``: by case and tumor."""
-    kinds = [lies[case][part].kind if part in lies[case] else EMPTY
+    ``sites``: by case and tumor."""
+    kinds = [sites[case][part].kind if part in sites[case] else EMPTY
              for case, part in zip(frame.case, frame.part, strict=True)]  # fmt: skip
-    frame = frame.assign(lie=kinds)
+    frame = frame.assign(site=kinds)
     own, rigid = (frame[frame.method == name] for name in (CLINIC, RIGID))
     cases, rows = names(own, "case"), []
     for goal in GOALS:
@@ -95,7 +95,7 @@ def _per_scene(frame: pd.DataFrame, column: str, worst: Literal["min", "max"] = 
 def _distance(frame: pd.DataFrame, variant: str, kind: str) -> float:
     """Of a case's tumors of a kind in a variant: the worst."""
     here = _noisy(frame)
-    of_kind = here[(here.variant == variant) & (here.lie == kind)]
+    of_kind = here[(here.variant == variant) & (here.site == kind)]
     return _per_scene(of_kind, "hausdorff_mm").max()
 
 

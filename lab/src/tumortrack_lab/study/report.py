@@ -12,11 +12,11 @@ from tumortrack.core import store
 from tumortrack.report.protocol import RULE
 from tumortrack_lab.study import goals, plots, resection, tables
 from tumortrack_lab.study.document import ReportWriter
-from tumortrack_lab.study.lies import tumor_lies
 from tumortrack_lab.study.measure import Job, spec_of
 from tumortrack_lab.study.methods import StudyCase
 from tumortrack_lab.study.plan import Section
 from tumortrack_lab.study.tables import tidy
+from tumortrack_lab.study.tumor_sites import tumor_sites_of
 
 _MEDIANS = RULE.replace("written as null", "written as not found")
 _OVER_SCENES = f"Distances in mm. {_MEDIANS} ± is the standard deviation over the seeds."
@@ -51,8 +51,8 @@ def section_blocks(
 ) -> dict[str, str]:
     """The block of one section, its pictures drawn: name -> Markdown."""
     if section == "goals":
-        lies = {case.name: tumor_lies(case.anatomy_ct) for case in cases}
-        texts = [goals.goal_table(tidy(measurements), lies)]
+        sites = {case.name: tumor_sites_of(case.anatomy_ct) for case in cases}
+        texts = [goals.goal_table(tidy(measurements), sites)]
     elif section == "resection":
         texts = [resection.tables_of(measurements)]
     else:
@@ -69,8 +69,8 @@ def section_blocks(
 
 
 def _accuracy(frame: pd.DataFrame, case: StudyCase, writer: ReportWriter) -> list[str]:
-    lies = tumor_lies(case.anatomy_ct)
-    texts = [tables.lies_text(case.name, lies), tables.accuracy(frame, lies)]
+    sites = tumor_sites_of(case.anatomy_ct)
+    texts = [tables.sites_text(case.name, sites), tables.accuracy(frame, sites)]
     for key in ("depth", "displacement"):
         image = writer.image(f"results_{key}_{case.name}")
         if plots.error_against(frame[tables.is_deformed(frame)], f"{key}_mm", image):

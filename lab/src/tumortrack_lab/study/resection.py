@@ -27,10 +27,10 @@ from tumortrack.simulate.scene_folder import Scene, read_scene
 from tumortrack_lab.cut import VOXEL_MM, cut
 from tumortrack_lab.peers.base import Fit, estimate_of
 from tumortrack_lab.study.document import table
-from tumortrack_lab.study.lies import tumor_lies
 from tumortrack_lab.study.measure import Job, about_answer
 from tumortrack_lab.study.methods import Answer, Method, StudyCase, code_sha256
 from tumortrack_lab.study.tables import EMPTY, NOTHING, groups, label_of, names, ordered
+from tumortrack_lab.study.tumor_sites import tumor_sites_of
 from tumortrack_lab.twin.apparatus import moved
 
 TRUTH = "truth"
@@ -172,8 +172,8 @@ def _planned_and_cut(truth: Anatomy, found: Located, planner: Planner, tumor: st
 
 @cache
 def exophytic_tumors(case: StudyCase) -> tuple[str, ...]:
-    lies = tumor_lies(case.anatomy_ct)
-    return tuple(name for name, lie in lies.items() if lie.kind == "exophytic")
+    sites = tumor_sites_of(case.anatomy_ct)
+    return tuple(name for name, site in sites.items() if site.kind == "exophytic")
 
 
 def tidy_plans(measurements: list[dict]) -> pd.DataFrame:

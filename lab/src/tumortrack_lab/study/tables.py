@@ -14,8 +14,8 @@ import numpy as np
 import pandas as pd
 
 from tumortrack_lab.study.document import table
-from tumortrack_lab.study.lies import Lie
 from tumortrack_lab.study.methods import CLINIC
+from tumortrack_lab.study.tumor_sites import TumorSite
 from tumortrack_lab.twin.faults import KINDS, clean_level, parse
 
 NOT_FOUND, NOTHING, EMPTY = "not found", "–", ""
@@ -80,7 +80,7 @@ _KEYS = {
     "centre": "center_mm",
 }
 _WHOLE = ("target error", "mIoU", "failed")
-Lies = dict[str, Lie]
+Sites = dict[str, TumorSite]
 
 
 def tidy(measurements: list[dict]) -> pd.DataFrame:
@@ -178,7 +178,7 @@ def spread(values: pd.Series, digits: int = 1, high: bool = False) -> str:
     return " / ".join(NOT_FOUND if np.isinf(v) else f"{v:.{digits}f}" for v in figures)
 
 
-def accuracy(frame: pd.DataFrame, lies: Lies) -> str:
+def accuracy(frame: pd.DataFrame, sites: Sites) -> str:
     """One case: a row for each state, tumor and figure, a column for each method; each scene of
     each seed counts."""
     rows: list[list[str]] = []
@@ -186,20 +186,20 @@ def accuracy(frame: pd.DataFrame, lies: Lies) -> str:
         each = [frame[mine & (frame.method == method)] for method in names(frame, "method")]
         if not mine.any():
             continue
-        for number, (figure, cell) in enumerate(_figures(frame, lies).items()):
+        for number, (figure, cell) in enumerate(_figures(frame, sites).items()):
             rows.append([*_once(number, state), figure, *map(cell, each)])
     head = ["state", "figure", *map(label_of, names(frame, "method"))]
     return table(head, rows, left=2)
 
 
-def _figures(frame: pd.DataFrame, lies: Lies) -> dict[str, Callable[[pd.DataFrame], str]]:
+def _figures(frame: pd.DataFrame, sites: Sites) -> dict[str, Callable[[pd.DataFrame], str]]:
     def distance(tumor: str, key: str) -> Callable[[pd.DataFrame], str]:
         return lambda mine: spread(mine[mine.part == tumor][key])
 
     figures = {"scenes x seeds": lambda mine: f"{mine.scene.nunique()} x {mine.seed.nunique()}"}
     for tumor in names(tumors(frame), "part"):
         for words, key in (("HD", "hausdorff_mm"), ("centre", "center_mm")):
-            figures[f"tumor {lies[tumor].text(tumor)}: {words}"] = distance(tumor, key)
+            figures[f"tumor {sites[tumor].text(tumor)}: {words}"] = distance(tumor, key)
     return figures | {
         "target error": lambda mine: spread(scenes(mine[mine.carries]).target_mm),
         "mIoU": lambda mine: spread(scenes(mine).miou, 2, high=True),
@@ -291,11 +291,11 @@ def ablation(frame: pd.DataFrame) -> str:
     return table(head, rows)
 
 
-def lies_text(case: str, lies: Lies) -> str:
+def sites_text(case: str, sites: Sites) -> str:
     each = [
-        f"{spaced(name)} is {lie.kind} ({100 * lie.exposed_share:.0f} % of its surface "
-        f"is the organ's own, least cover {lie.cover_mm:.1f} mm)"
-        for name, lie in lies.items()
+        f"{spaced(name)} is {site.kind} ({100 * site.exposed_share:.0f} % of its surface "
+        f"is the organ's own, least cover {site.cover_mm:.1f} mm)"
+        for name, site in sites.items()
     ]
     return f"{case}: " + "; ".join(each) + "."
 

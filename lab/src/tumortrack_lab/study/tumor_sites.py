@@ -15,7 +15,7 @@ EXPOSED_MM = 0.5  # a tumor's surface this close to the organ's is the organ's s
 EXOPHYTIC_SHARE = 0.05
 
 
-class Lie(NamedTuple):
+class TumorSite(NamedTuple):
     """How a tumor lies in the organ: the share of its surface that is the organ's own, and the
     least parenchyma above it, mm."""
 
@@ -30,12 +30,12 @@ class Lie(NamedTuple):
         return f"{tumor.rpartition('_')[2]}, {self.kind}"
 
 
-def tumor_lies(anatomy: Anatomy) -> dict[str, Lie]:
+def tumor_sites_of(anatomy: Anatomy) -> dict[str, TumorSite]:
     """By part name; any frame."""
-    lies = {}
+    sites = {}
     for name, tumor in zip(anatomy.names[1:], anatomy.tumors, strict=True):
         points, area, _ = surface_samples(tumor)
         distance = distance_to_surface(points, anatomy.organ)
         share = float(area[distance < EXPOSED_MM].sum() / area.sum())
-        lies[name] = Lie(share, float(np.min(distance)))
-    return lies
+        sites[name] = TumorSite(share, float(np.min(distance)))
+    return sites
