@@ -123,6 +123,9 @@ def test_too_few_states_are_refused_with_their_number_and_small_groups_join():
     margins = margins_of(uneven, "", (0.9,))
     assert margins.joined == {"plate, near, z": "plate, near"}
     assert {group.label[2]: group.states for group in margins.groups}["z"] == 3
+    mute = [replace(row, doubt="poor") for row in drawn(rng, 50, groups=[("cut", "near", "z")])]
+    with pytest.raises(InputError, match=r"0 of 0 of cut miss"):  # nothing is known of its answers
+        margins_of(uneven + mute, "", (0.9,))
     with pytest.raises(InputError, match=r"of 1 of poke"):
         margins_of(uneven + drawn(rng, 3, groups=[("poke", "near", "z")]), "", (0.9,))
 

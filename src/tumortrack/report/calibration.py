@@ -8,7 +8,7 @@ from __future__ import annotations
 import fcntl
 import json
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -232,12 +232,13 @@ def margins_of(
     number = _tested(rules, some["test"], kinds[0], widest_mm, 1 - highest)
     accepted = {turn: [row for row in some[turn] if _accepted(row, rules[number])] for turn in some}
     forms = {kind: _form(accepted["choose"] or good, kind, highest) for kind in kinds}
+    families, theirs = {row.label[0] for row in rows}, accepted["calibrate"]
     shells: list[Shells] = []
     joined: dict[str, str] = {}
     for confidence in sorted(confidences):
         radii = {}
         for kind in kinds:
-            radii[kind], small = _radius(accepted["calibrate"], kind, forms[kind], confidence)
+            radii[kind], small = _radius(theirs, kind, forms[kind], confidence, families)
             joined |= small
         shells.append(Shells(confidence=confidence, radii=radii))
     each, tested = conformal.ERROR / len(rules), accepted["test"]
@@ -308,10 +309,10 @@ def _tested(
     """The number of the loosest limits under which no more of the answers than the risk miss by
     more than ``widest_mm``, in any group."""
     each, tables = conformal.ERROR / len(rules), []
-    least = conformal.least_tested(risk, each, misses=1)
+    least, families = conformal.least_tested(risk, each, misses=1), {row.label[0] for row in rows}
     for limits in rules:
         taken = [row for row in rows if _accepted(row, limits)]
-        groups = _grouped(taken, least)[0]
+        groups = _grouped(taken, least, families)[0]
         tables.append(
             {name: (_beyond(of, kind, widest_mm), len(of)) for name, of in groups.items()}
         )
@@ -320,7 +321,7 @@ def _tested(
         said = "; ".join(f"{m} of {n} of {name}" for name, (m, n) in tables[-1].items())
         none = conformal.least_tested(risk, each)
         raise InputError(
-            f"no limits hold {100 * risk:.3g} %: of the answers in each group, {said or 'none'} "
+            f"no limits hold {100 * risk:.3g} %: of the answers in each group, {said} "
             f"miss by more than {widest_mm:g} mm. It takes {none} without such a one, {least} with "
             "one, and 2.5 times as many states in all. Give more scenes of each family, a wider "
             "--widest, or a lower --confidence."
@@ -338,13 +339,17 @@ def _misses(rows: Sequence[Row], kind: Kind, radius: Radius) -> int:
     return sum(any(at is None or miss > at for miss, at in some) for some in radii)
 
 
-def _grouped(rows: Sequence[Row], least: int) -> tuple[dict[str, list[Row]], dict[str, str]]:
-    """The members of each group; which were too small to stand alone, and who speaks for them."""
+def _grouped(
+    rows: Sequence[Row], least: int, families: Collection[str] = ()
+) -> tuple[dict[str, list[Row]], dict[str, str]]:
+    """The members of each group; which were too small to stand alone, and who speaks for them. One
+    of the ``families`` without any member is a group of none."""
     labels = [row.label for row in rows]
     found = {
         ", ".join(label): [rows[n] for n in members]
         for label, members in conformal.groups_of(labels, least).items()
     }
+    found |= {family: [] for family in families if family not in {label[0] for label in labels}}
     names = {", ".join(label): label for label in labels}
     joined = {}
     for name, label in names.items():
@@ -355,16 +360,16 @@ def _grouped(rows: Sequence[Row], least: int) -> tuple[dict[str, list[Row]], dic
 
 
 def _radius(
-    rows: Sequence[Row], kind: Kind, form: Radius, confidence: float
+    rows: Sequence[Row], kind: Kind, form: Radius, confidence: float, families: Collection[str]
 ) -> tuple[Radius, dict[str, str]]:
     """The form with the greatest of the groups' quantiles."""
     least = conformal.least_scores(confidence)
-    groups, joined = _grouped(rows, least)
+    groups, joined = _grouped(rows, least, families)
     few = [f"{len(of)} of {name}" for name, of in groups.items() if len(of) < least]
-    if few or not groups:
+    if few:
         raise InputError(
             f"{100 * confidence:g} % needs {least} accepted states of each family to calibrate "
-            f"with (2.5 times as many in all); there are {', '.join(few) or 'none'}. Give more "
+            f"with (2.5 times as many in all); there are {', '.join(few)}. Give more "
             "scenes, or a lower --confidence."
         )
 
