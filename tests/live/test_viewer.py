@@ -563,12 +563,7 @@ def check_arms(browser: Browser, feed: Feed, shown: TrackingResult, setting: Sin
 
 def check_click(browser: Browser, setting: SinkContext) -> None:
     """A click on the scene gives the seen point under it, in the camera's frame."""
-    rect = browser.call(
-        "Runtime.evaluate",
-        expression="(r => [r.x, r.y, r.width, r.height])"
-        "(document.querySelector('canvas').getBoundingClientRect())",
-        returnByValue=True,
-    )["result"]["value"]
+    rect = browser.box("canvas")
     browser.click_text("Click the organ")
     until(lambda: "Now click" in browser.text(), "being asked to click")
     column, row = 40, -25  # pixels from the middle of the view
