@@ -15,7 +15,8 @@ from tumortrack.core.errors import ArtifactError, InputError
 from tumortrack.core.types import SensorCloud
 from tumortrack.models import margins as stored
 from tumortrack.models.margins import ModelMargins, exceeded, stated_margin, stated_radius
-from tumortrack.report.calibration import Row, head_of, list_states, margins_of, open_table
+from tumortrack.report.calibration import list_states, margins_of
+from tumortrack.report.calibration_table import Row, head_of, open_table
 from tumortrack.report.metrics import outward_miss
 from tumortrack.tracking.quality import with_margin
 
