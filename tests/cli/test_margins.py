@@ -61,10 +61,11 @@ def test_margins_are_found_stated_and_planned_with(clinic_model, scenes, tmp_pat
     shell, tumor = (read_mesh(run / f"{name}.ply") for name in ("tumor_1_margin", "tumor_1"))
     assert outward_miss(tumor, shell) == pytest.approx(radius, abs=0.2)
 
-    plan = ("plan", run, tmp_path / "plan", "--no-arms", "--tumor", "tumor_1", "--confidence")
-    assert "states no 95 % margin of tumor_1" in refusal(tumortrack(*plan, 0.95))
+    plan = ("plan", run, tmp_path / "plan", "--no-arms", "--confidence")
+    assert "states no 95 % margin of tumor_2" in refusal(tumortrack(*plan, 0.95))
     said = succeeded(tumortrack(*plan, 0.6, "--margin", 2))
     budget = store.read_json(tmp_path / "plan" / "plan.json")["budget"]
+    radius = radii[1]["mm"]["tumor_2"]
     assert budget["tracking_mm"] == radius
     assert budget["confidence"] == 0.6
     assert f"tracking {radius:5.1f}  60 % margin" in said

@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 
 import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from live_objects import ball
+from live_objects import ball, small_estimate
 from tumortrack.core import store
 from tumortrack.core.errors import ArtifactError, InputError
+from tumortrack.core.types import SensorCloud
 from tumortrack.models import margins as stored
 from tumortrack.models.margins import ModelMargins, exceeded, stated_margin, stated_radius
-from tumortrack.report.calibration import Row, head_of, list_states, margins_of, open_table
+from tumortrack.report.calibration import list_states, margins_of
+from tumortrack.report.calibration_table import Row, head_of, open_table
 from tumortrack.report.metrics import outward_miss
+from tumortrack.tracking.quality import with_margin
 
 GROUPS = [(f, share, o) for f in ("plate", "poke") for share in ("far", "near") for o in ("x", "y")]
 
@@ -120,6 +124,9 @@ def test_too_few_states_are_refused_with_their_number_and_small_groups_join():
     margins = margins_of(uneven, "", (0.9,))
     assert margins.joined == {"plate, near, z": "plate, near"}
     assert {group.label[2]: group.states for group in margins.groups}["z"] == 3
+    mute = [replace(row, doubt="poor") for row in drawn(rng, 50, groups=[("cut", "near", "z")])]
+    with pytest.raises(InputError, match=r"0 of 0 of cut miss"):  # nothing is known of its answers
+        margins_of(uneven + mute, "", (0.9,))
     with pytest.raises(InputError, match=r"of 1 of poke"):
         margins_of(uneven + drawn(rng, 3, groups=[("poke", "near", "z")]), "", (0.9,))
 
@@ -213,3 +220,31 @@ def test_one_scene_of_each_state_counts(tmp_path):
     store.write_json(tmp_path / "0" / "meta.json", {"visible_share": 70})
     with pytest.raises(InputError, match="visible_share is 70; allowed: 0 to 1"):
         list_states([tmp_path], 0)
+
+
+def test_an_estimate_beyond_a_limit_is_poor_and_says_which():
+    margins = margins_of(drawn(np.random.default_rng(2), 60), "", (0.8, 0.9), 20.0)
+    rare = replace(margins, limits={"rarity": 1.0, "unseen": 0.5})
+    shell = {"surface_std_mm": 1.0}
+
+    def judged(rarity, cloud, quality="good"):
+        estimate = dataclasses.replace(small_estimate(), quality=quality, reason="")
+        parts = {name: {**part, **shell} for name, part in estimate.report["parts"].items()}
+        report = {**estimate.report, "parts": parts, "motion": {"rarity": rarity}}
+        return with_margin(dataclasses.replace(estimate, report=report), cloud, rare)
+
+    organ = small_estimate().meshes["kidney"].vertices_mm
+    whole = SensorCloud(organ.astype(np.float32))
+    fine = judged(0.9, whole)
+    assert (fine.quality, len(fine.report["margin"]["stated"])) == ("good", 2)
+    far = judged(1.2, whole)
+    assert (far.quality, far.report["margin"]["stated"]) == ("poor", [])
+    assert far.reason == "rarity is 1.2; margins are known up to 1"
+    assert far.report["quality"] == {"verdict": "poor", "reason": far.reason}
+    end = SensorCloud(organ[organ[:, 0] < np.quantile(organ[:, 0], 0.2)].astype(np.float32))
+    assert "unseen is 0." in judged(0.9, end).reason  # worked out here: an image was judged
+    before = judged(0.9, whole, "poor")
+    assert before.report["margin"] == {"stated": [], "reason": "a poor estimate has no margin"}
+    without = with_margin(dataclasses.replace(small_estimate(), quality="good"), whole, None)
+    assert without.quality == "good"
+    assert without.report["margin"]["reason"].startswith("no margin is known")

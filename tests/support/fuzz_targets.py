@@ -326,7 +326,7 @@ def of_member(folder: Path, name: str, read: Callable[[Path], object]) -> Target
 
 def _margins() -> dict[str, Target]:
     from tumortrack.models import margins
-    from tumortrack.report.calibration import head_of, read_table
+    from tumortrack.report.calibration_table import head_of, read_table
 
     shells = margins.Shells(
         confidence=0.9, radii={"tumor": margins.Radius(used="constant", constant_mm=3.0)}

@@ -16,7 +16,8 @@ from tumortrack.core.errors import InputError
 
 if TYPE_CHECKING:
     from tumortrack.models.margins import ModelMargins
-    from tumortrack.report.calibration import Listed, Row
+    from tumortrack.report.calibration import Listed
+    from tumortrack.report.calibration_table import Row
 
 _GRID = 8  # voxels: the labelled volume is not looked at
 
@@ -63,12 +64,13 @@ class Margins:
         say(f"written to {path}; `locate`, `track` and `plan` state them from now on.")
 
     def _calibrated(self) -> ModelMargins:
-        from tumortrack.report import calibration
+        from tumortrack.report import calibration, calibration_table
 
         listed = calibration.list_states(self.scenes, self.seed)  # before PyTorch's seconds
         digest = store.sha256_of(self.model / store.MANIFEST)
         table = self.out or self.model / "margins.jsonl"
-        with calibration.open_table(table, calibration.head_of(digest, self.seed)) as (known, add):
+        head = calibration_table.head_of(digest, self.seed)
+        with calibration_table.open_table(table, head) as (known, add):
             rows = self._located(listed, known, add)
         of = store.sha256_of(table)
         return calibration.margins_of(rows, of, self.confidence, self.widest, self.seed)

@@ -1,28 +1,22 @@
-"""Calibration of margins: scenes of known truth -> a table, a line a state -> ``ModelMargins``.
+"""Calibration of margins: scenes of known truth -> a line a state -> ``ModelMargins``.
 
 The unit is the physical state: one scene of each counts. docs/trust.md says what is promised.
 """
 
 from __future__ import annotations
 
-import fcntl
-import json
-import os
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, get_args
 
 import numpy as np
 from jaxtyping import Float
-from msgspec import field
 from msgspec.structs import replace
 
 import tumortrack
 from tumortrack.core import store
-from tumortrack.core.config import Config, from_builtins, to_builtins
-from tumortrack.core.errors import InputError, NoEstimate, StorageError
+from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.estimate import Estimate
 from tumortrack.core.types import SensorCloud
 from tumortrack.models import conformal
@@ -36,11 +30,11 @@ from tumortrack.models.margins import (
     exceeded,
     measured,
 )
+from tumortrack.report.calibration_table import Miss, Row
 from tumortrack.report.metrics import outward_miss
 from tumortrack.simulate.scene_folder import Scene, list_scenes
 
 _Turn = Literal["choose", "test", "calibrate"]
-_Miss = tuple[float, float | None]  # outward miss or distance (mm), and s (mm)
 CONFIDENCES = (0.9, 0.95)
 WIDEST_MM = 8.0  # what plans assume of estimates that say nothing of their error
 SHARES = (1 / 3, 2 / 3)  # of visible surface, that part the groups
@@ -51,25 +45,6 @@ _OFFSETS_MM = (0.1, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
 # states, drawn by the seed, in turn.
 _TURNS: tuple[_Turn, ...] = ("test", "calibrate", "choose", "test", "calibrate")
 _WORTH = 0.95  # of the constant radius: nothing less pays for one that varies
-
-
-class Row(Config, frozen=True):
-    """One state, located. ``doubt``: why there is no good estimate; ``misses``: of every tumor, of
-    the kidney's surface, and of the target that is farthest off."""
-
-    scene: str
-    sha256: str
-    label: tuple[str, str, str]
-    doubt: str = ""
-    measured: dict[str, float] = field(default_factory=dict)
-    misses: dict[Kind, tuple[_Miss, ...]] = field(default_factory=dict)
-
-    def score(self, kind: Kind, offset_mm: float | None) -> float:
-        """Largest miss, over (offset + s) where an offset is given."""
-        misses = self.misses[kind]
-        if offset_mm is None:
-            return max(miss for miss, _ in misses)
-        return max(miss / (offset_mm + (s or 0.0)) for miss, s in misses)
 
 
 @dataclass(frozen=True)
@@ -123,7 +98,7 @@ def row_of(locate: Callable[[SensorCloud], Estimate], scene: Scene, listed: List
     if estimate.quality != "good":
         return replace(row, doubt=estimate.reason)
     parts: dict[str, Any] = estimate.report["parts"]
-    misses: dict[Kind, list[_Miss]] = {}
+    misses: dict[Kind, list[Miss]] = {}
     unsure = {name: part.get("surface_std_mm") for name, part in parts.items()}
     for n, (name, truth) in enumerate(
         zip(scene.reference.names, scene.reference.parts, strict=True)
@@ -138,68 +113,6 @@ def row_of(locate: Callable[[SensorCloud], Estimate], scene: Scene, listed: List
         misses["map"] = [(largest, unsure[scene.reference.names[0]])]
     found = {kind: tuple(some) for kind, some in misses.items()}
     return replace(row, measured=measured(estimate.report), misses=found)
-
-
-@contextmanager
-def open_table(
-    path: Path, head: dict[str, Any]
-) -> Iterator[tuple[list[Row], Callable[[Row], None]]]:
-    """The rows that are in a table already, and a function that adds one: on the disk before it
-    returns. A line that a killed process left unfinished is dropped.
-
-    Raises:
-        InputError: it was begun with another ``head``, or another process fills it.
-        StorageError: the disk refused.
-    """
-    try:
-        stream = path.open("a+b")
-    except OSError as error:
-        raise StorageError(f"cannot write {path}: {error.strerror}.") from error
-    with stream:
-        try:
-            fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
-            raise InputError(f"{path} is being filled by another process.") from error
-        stream.seek(0)
-        content = stream.read()
-        whole = content[: content.rfind(b"\n") + 1]
-        stream.truncate(len(whole))
-
-        def add(data: object) -> None:
-            try:
-                stream.write(json.dumps(data, allow_nan=False).encode() + b"\n")
-                stream.flush()
-                os.fsync(stream.fileno())
-            except OSError as error:
-                raise StorageError(f"cannot write {path}: {error.strerror}.") from error
-
-        if not whole:
-            add(head)
-        known_head, rows = (head, []) if not whole else _parsed(whole, path)
-        if differ := [name for name in head if known_head.get(name) != head[name]]:
-            raise InputError(
-                f"{path} was begun with another {' and '.join(differ)}. Remove it, or give another "
-                "--out."
-            )
-        yield rows, lambda row: add(to_builtins(row))
-
-
-def read_table(path: Path) -> tuple[dict[str, Any], list[Row]]:
-    """Head and rows; InputError where it is none."""
-    return _parsed(store.read_file(path, 2**30), path)
-
-
-def _parsed(content: bytes, path: Path) -> tuple[dict[str, Any], list[Row]]:
-    try:
-        head, *lines = [json.loads(line) for line in content.splitlines()]
-        return dict(head), [from_builtins(line, Row, str(path)) for line in lines]
-    except (ValueError, TypeError) as error:
-        raise InputError(f"{path} is no table of `tumortrack margins`: {error}.") from error
-
-
-def head_of(model_sha256: str, seed: int) -> dict[str, Any]:
-    """What every row of a table depends on besides its scene."""
-    return {"model_sha256": model_sha256, "method": METHOD, "seed": seed}
 
 
 def margins_of(
@@ -232,12 +145,13 @@ def margins_of(
     number = _tested(rules, some["test"], kinds[0], widest_mm, 1 - highest)
     accepted = {turn: [row for row in some[turn] if _accepted(row, rules[number])] for turn in some}
     forms = {kind: _form(accepted["choose"] or good, kind, highest) for kind in kinds}
+    families, theirs = {row.label[0] for row in rows}, accepted["calibrate"]
     shells: list[Shells] = []
     joined: dict[str, str] = {}
     for confidence in sorted(confidences):
         radii = {}
         for kind in kinds:
-            radii[kind], small = _radius(accepted["calibrate"], kind, forms[kind], confidence)
+            radii[kind], small = _radius(theirs, kind, forms[kind], confidence, families)
             joined |= small
         shells.append(Shells(confidence=confidence, radii=radii))
     each, tested = conformal.ERROR / len(rules), accepted["test"]
@@ -308,10 +222,10 @@ def _tested(
     """The number of the loosest limits under which no more of the answers than the risk miss by
     more than ``widest_mm``, in any group."""
     each, tables = conformal.ERROR / len(rules), []
-    least = conformal.least_tested(risk, each, misses=1)
+    least, families = conformal.least_tested(risk, each, misses=1), {row.label[0] for row in rows}
     for limits in rules:
         taken = [row for row in rows if _accepted(row, limits)]
-        groups = _grouped(taken, least)[0]
+        groups = _grouped(taken, least, families)[0]
         tables.append(
             {name: (_beyond(of, kind, widest_mm), len(of)) for name, of in groups.items()}
         )
@@ -320,7 +234,7 @@ def _tested(
         said = "; ".join(f"{m} of {n} of {name}" for name, (m, n) in tables[-1].items())
         none = conformal.least_tested(risk, each)
         raise InputError(
-            f"no limits hold {100 * risk:.3g} %: of the answers in each group, {said or 'none'} "
+            f"no limits hold {100 * risk:.3g} %: of the answers in each group, {said} "
             f"miss by more than {widest_mm:g} mm. It takes {none} without such a one, {least} with "
             "one, and 2.5 times as many states in all. Give more scenes of each family, a wider "
             "--widest, or a lower --confidence."
@@ -338,13 +252,17 @@ def _misses(rows: Sequence[Row], kind: Kind, radius: Radius) -> int:
     return sum(any(at is None or miss > at for miss, at in some) for some in radii)
 
 
-def _grouped(rows: Sequence[Row], least: int) -> tuple[dict[str, list[Row]], dict[str, str]]:
-    """The members of each group; which were too small to stand alone, and who speaks for them."""
+def _grouped(
+    rows: Sequence[Row], least: int, families: Collection[str] = ()
+) -> tuple[dict[str, list[Row]], dict[str, str]]:
+    """The members of each group; which were too small to stand alone, and who speaks for them. One
+    of the ``families`` without any member is a group of none."""
     labels = [row.label for row in rows]
     found = {
         ", ".join(label): [rows[n] for n in members]
         for label, members in conformal.groups_of(labels, least).items()
     }
+    found |= {family: [] for family in families if family not in {label[0] for label in labels}}
     names = {", ".join(label): label for label in labels}
     joined = {}
     for name, label in names.items():
@@ -355,16 +273,16 @@ def _grouped(rows: Sequence[Row], least: int) -> tuple[dict[str, list[Row]], dic
 
 
 def _radius(
-    rows: Sequence[Row], kind: Kind, form: Radius, confidence: float
+    rows: Sequence[Row], kind: Kind, form: Radius, confidence: float, families: Collection[str]
 ) -> tuple[Radius, dict[str, str]]:
     """The form with the greatest of the groups' quantiles."""
     least = conformal.least_scores(confidence)
-    groups, joined = _grouped(rows, least)
+    groups, joined = _grouped(rows, least, families)
     few = [f"{len(of)} of {name}" for name, of in groups.items() if len(of) < least]
-    if few or not groups:
+    if few:
         raise InputError(
             f"{100 * confidence:g} % needs {least} accepted states of each family to calibrate "
-            f"with (2.5 times as many in all); there are {', '.join(few) or 'none'}. Give more "
+            f"with (2.5 times as many in all); there are {', '.join(few)}. Give more "
             "scenes, or a lower --confidence."
         )
 

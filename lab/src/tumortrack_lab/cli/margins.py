@@ -13,7 +13,8 @@ from tumortrack.cli.margins import described
 from tumortrack.core import store
 from tumortrack.core.errors import InputError
 from tumortrack.models.margins import GENERIC, METHOD, write_sealed
-from tumortrack.report.calibration import CONFIDENCES, WIDEST_MM, Row, margins_of, read_table
+from tumortrack.report.calibration import CONFIDENCES, WIDEST_MM, margins_of
+from tumortrack.report.calibration_table import Row, read_table
 
 
 @dataclass(frozen=True, kw_only=True)

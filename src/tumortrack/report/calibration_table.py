@@ -1,0 +1,101 @@
+"""The table of a calibration: a line a state, on the disk before the next is located."""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import os
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from msgspec import field
+
+from tumortrack.core import store
+from tumortrack.core.config import Config, from_builtins, to_builtins
+from tumortrack.core.errors import InputError, StorageError
+from tumortrack.models.margins import METHOD, Kind
+
+Miss = tuple[float, float | None]  # outward miss or distance (mm), and s (mm)
+
+
+class Row(Config, frozen=True):
+    """One state, located. ``doubt``: why there is no good estimate; ``misses``: of every tumor, of
+    the kidney's surface, and of the target that is farthest off."""
+
+    scene: str
+    sha256: str
+    label: tuple[str, str, str]
+    doubt: str = ""
+    measured: dict[str, float] = field(default_factory=dict)
+    misses: dict[Kind, tuple[Miss, ...]] = field(default_factory=dict)
+
+    def score(self, kind: Kind, offset_mm: float | None) -> float:
+        """Largest miss, over (offset + s) where an offset is given."""
+        misses = self.misses[kind]
+        if offset_mm is None:
+            return max(miss for miss, _ in misses)
+        return max(miss / (offset_mm + (s or 0.0)) for miss, s in misses)
+
+
+@contextmanager
+def open_table(
+    path: Path, head: dict[str, Any]
+) -> Iterator[tuple[list[Row], Callable[[Row], None]]]:
+    """The rows that are in a table already, and a function that adds one: on the disk before it
+    returns. A line that a killed process left unfinished is dropped.
+
+    Raises:
+        InputError: it was begun with another ``head``, or another process fills it.
+        StorageError: the disk refused.
+    """
+    try:
+        stream = path.open("a+b")
+    except OSError as error:
+        raise StorageError(f"cannot write {path}: {error.strerror}.") from error
+    with stream:
+        try:
+            fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            raise InputError(f"{path} is being filled by another process.") from error
+        stream.seek(0)
+        content = stream.read()
+        whole = content[: content.rfind(b"\n") + 1]
+        stream.truncate(len(whole))
+
+        def add(data: object) -> None:
+            try:
+                stream.write(json.dumps(data, allow_nan=False).encode() + b"\n")
+                stream.flush()
+                os.fsync(stream.fileno())
+            except OSError as error:
+                raise StorageError(f"cannot write {path}: {error.strerror}.") from error
+
+        if not whole:
+            add(head)
+        known_head, rows = (head, []) if not whole else _parsed(whole, path)
+        if differ := [name for name in head if known_head.get(name) != head[name]]:
+            raise InputError(
+                f"{path} was begun with another {' and '.join(differ)}. Remove it, or give another "
+                "--out."
+            )
+        yield rows, lambda row: add(to_builtins(row))
+
+
+def read_table(path: Path) -> tuple[dict[str, Any], list[Row]]:
+    """Head and rows; InputError where it is none."""
+    return _parsed(store.read_file(path, 2**30), path)
+
+
+def _parsed(content: bytes, path: Path) -> tuple[dict[str, Any], list[Row]]:
+    try:
+        head, *lines = [json.loads(line) for line in content.splitlines()]
+        return dict(head), [from_builtins(line, Row, str(path)) for line in lines]
+    except (ValueError, TypeError) as error:
+        raise InputError(f"{path} is no table of `tumortrack margins`: {error}.") from error
+
+
+def head_of(model_sha256: str, seed: int) -> dict[str, Any]:
+    """What every row of a table depends on besides its scene."""
+    return {"model_sha256": model_sha256, "method": METHOD, "seed": seed}
