@@ -126,6 +126,11 @@ class Sure:
     def std_mm(self, points_ct, /):
         return np.full(len(points_ct), self.std)
 
+    largest_std_mm = std_mm
+
+    def covariance_mm2(self, points_ct, /):
+        return self.std**2 * np.tile(np.eye(3), (len(points_ct), 1, 1))
+
 
 @pytest.fixture(scope="module")
 def case(tmp_path_factory):

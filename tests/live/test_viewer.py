@@ -57,6 +57,8 @@ class Turned:
     def std_mm(self, points_ct: np.ndarray, /) -> None:
         return None
 
+    largest_std_mm = covariance_mm2 = std_mm
+
 
 MOTION = Turned(rigid(TURN, np.array([3.0, -2.0, 130.0])))
 

@@ -6,6 +6,7 @@ And a steady loop.
 from __future__ import annotations
 
 import tracemalloc
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -214,8 +215,8 @@ def test_the_best_of_many_starts_wins_wherever_it_stands(unchecked):
     alone = refine(shape(), points, near, GaussNewtonConfig())
     for starts in ([near, *far], [*far, near]):
         fit = Registration(None, shape(), GaussNewtonConfig()).best_fit(points, starts)
-        assert fit.cost == alone.cost
-        assert fit.steps == alone.steps
+        # A little less where a start beside it ends nearer to the minimum.
+        assert 0.97 * alone.cost < fit.cost <= alone.cost
 
 
 def test_starts_that_are_far_behind_are_given_up(monkeypatch, unchecked):
@@ -233,7 +234,7 @@ def test_starts_that_are_far_behind_are_given_up(monkeypatch, unchecked):
     steady = GaussNewtonConfig(enough_mm=0)  # never settles
     Registration(None, shape(), steady).best_fit(points, [far, near])
     most = {}
-    for descent, steps in gone:
+    for descent, steps in gone[:3]:  # the two hypotheses; the rest begins beside the better one
         most[descent] = max(steps, most.get(descent, 0))
     assert sorted(most.values()) == [6, steady.steps]
     assert min(most, key=lambda descent: descent.cost) is max(most, key=most.__getitem__)
@@ -265,7 +266,7 @@ def test_the_nearest_place_is_nearest_but_for_a_nodes_width():
     assert np.mean(own == np.arange(200)) > 0.9
 
 
-def test_deviations_are_those_of_plain_products():
+def test_covariances_are_those_of_plain_products():
     rng = np.random.default_rng(2)
     base, points = placed(), about(300, 3, 0.9)
     mixed = rng.normal(size=(26, 26)) * 0.05
@@ -280,13 +281,43 @@ def test_deviations_are_those_of_plain_products():
     steps = steps_for(velocity, base.shape.body.spacing_mm)
     places, middle = plainly_followed(velocity, points, steps)
     offsets, modes = places - base.shape.body.center_ct, base.shape.body.modes_at(middle)
-    variance = np.zeros(len(points))
+    rows = np.empty((len(points), 3, 26))
     for axis, along in enumerate(np.eye(3)):
-        turn = np.cross(offsets, np.tile(along, (len(points), 1)))
-        row = np.column_stack([np.tile(along, (len(points), 1)), turn, modes[:, axis]])
-        variance += np.einsum("nk,kl,nl->n", row, motion.covariance, row)
-    assert np.ptp(variance) > 0.1
-    np.testing.assert_allclose(motion.std_mm(points), np.sqrt(variance / 3), rtol=1e-3)
+        tiled = np.tile(along, (len(points), 1))
+        rows[:, axis] = np.column_stack([tiled, np.cross(offsets, tiled), modes[:, axis]])
+    rows = base.rotation @ rows
+    covariance = rows @ motion.covariance @ rows.transpose(0, 2, 1)
+    variances = np.linalg.eigvalsh(covariance)
+    assert np.ptp(variances) > 0.1
+    np.testing.assert_allclose(
+        motion.covariance_mm2(points), covariance, atol=1e-3 * variances.max()
+    )
+    np.testing.assert_allclose(motion.std_mm(points), np.sqrt(variances.mean(1)), rtol=1e-3)
+    np.testing.assert_allclose(motion.largest_std_mm(points), np.sqrt(variances[:, 2]), rtol=1e-3)
+
+
+def test_covariances_follow_from_where_small_changes_take_points():
+    """Finite differences of ``carry`` by each unknown; modes halfway are of first order."""
+    points, mixed = about(60, 4, 0.9), np.random.default_rng(3).normal(size=(26, 26)) * 0.05
+    base = replace(placed(share=0.3), covariance=mixed @ mixed.T)
+    slopes, small = [], 1e-2
+    for unit in np.eye(26) * small:
+        ahead, behind = (
+            replace(
+                base,
+                rotation=base.rotation @ Rotation.from_rotvec(sign * unit[3:6]).as_matrix(),
+                centre_mm=base.centre_mm + sign * base.rotation @ unit[:3],
+                coefficients=base.coefficients + sign * unit[6:],
+            ).carry(points)
+            for sign in (1, -1)
+        )
+        slopes.append((ahead - behind) / (2 * small))
+    expected = np.einsum("pna,pq,qnb->nab", slopes, base.covariance, slopes)
+    found = base.covariance_mm2(points)
+    apart = np.linalg.norm(found - expected, axis=(1, 2)) / np.linalg.norm(expected, axis=(1, 2))
+    assert apart.max() < 0.05
+    across = np.abs(expected[:, [0, 0, 1], [1, 2, 2]])
+    assert across.max() > 0.2 * np.trace(expected, axis1=1, axis2=2).max() / 3
 
 
 def test_chances_are_the_normal_distributions():

@@ -23,10 +23,10 @@ from tumortrack.core.types import Mesh
 from tumortrack.models.config import GaussNewtonConfig
 from tumortrack.models.encoders.heightmap import HeightMapConfig, _spread, picture
 from tumortrack.occupancy.network import OccupancyNetwork
-from tumortrack.registration.gauss_newton import _prior, refine
+from tumortrack.registration.gauss_newton import GaussNewton, _prior, refine
 from tumortrack.registration.motion import ElasticMotion
 from tumortrack.registration.network import PoseHypothesis, RegistrationNetwork
-from tumortrack.registration.registration import Registration
+from tumortrack.registration.registration import Registration, _beside
 from tumortrack.registration.rest_shape import RestShape, distance_of
 from tumortrack.simulate.occupancy import labels_of, surface_distance
 from tumortrack.training.presets import quick_network
@@ -278,7 +278,29 @@ def test_every_step_lowers_the_cost_and_enough_steps_end(unchecked):
     best = Registration(None, shape(), steady).best_fit(
         points, [nudged(placed(), [0, 0, 60], [0, 0, 0]), START]
     )
-    assert best.cost == refine(shape(), points, START, steady).cost
+    alone = refine(shape(), points, START, steady)
+    assert 0.97 * alone.cost < best.cost <= alone.cost
+
+
+def test_starts_beside_a_fit_are_as_unlikely_as_was_asked_and_lead_back_to_it(unchecked):
+    points = surface(placed(), 500)
+    fit = refine(shape(), points, START, GaussNewtonConfig())
+    starts = _beside(fit)
+    precision = np.linalg.inv(fit.motion.covariance)
+    turns = []
+    for start, moved in starts:
+        turn = Rotation.from_matrix(fit.motion.rotation.T @ start.rotation).as_rotvec()
+        shift = fit.motion.rotation.T @ (start.centre_mm - fit.motion.centre_mm)
+        off = np.concatenate([shift, turn, start.coefficients - fit.motion.coefficients])
+        assert np.sqrt(off @ precision @ off) == pytest.approx(4.5)
+        np.testing.assert_allclose(moved - fit.moved, off[:6], atol=1e-9)
+        turns.append(turn)
+        again = GaussNewton(shape(), points, start, GaussNewtonConfig(), moved)
+        again.run(20)
+        assert again.cost == pytest.approx(fit.cost, rel=0.03)
+    turns = np.array(turns)
+    np.testing.assert_allclose(turns[::2], -turns[1::2], atol=1e-9)
+    assert np.linalg.matrix_rank(turns, tol=1e-3) == 3
 
 
 def test_a_slow_general_optimiser_finds_the_same():

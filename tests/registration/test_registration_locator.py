@@ -109,6 +109,13 @@ def test_meshes_are_the_cts_carried_along(estimate):
         told = estimate.report["parts"][name]
         assert told["volume_ml"] == pytest.approx(part.volume_mm3 / 1000, rel=0.15)
         assert 0 < told["center_std_mm"] < 30
+        axes, along = np.array(told["center_axes"]), np.array(told["center_axes_std_mm"])
+        np.testing.assert_allclose(axes @ axes.T, np.eye(3), atol=1e-9)
+        assert along[0] > 1.05 * along[2] > 0
+        assert np.sqrt((along**2).mean()) == pytest.approx(told["center_std_mm"])
+        part = estimate.motion.shape.anatomy_ct.parts[told["label"] - 1]
+        known = estimate.motion.covariance_mm2(part.box_mm.mean(0)[None])[0]
+        np.testing.assert_allclose(axes @ known @ axes.T, np.diag(along**2), atol=1e-4)
 
 
 def test_labels_of_points_and_voxels_agree_with_the_meshes(estimate):

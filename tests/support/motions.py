@@ -34,3 +34,10 @@ class Wave:
 
     def std_mm(self, points_ct):
         return 0.5 + np.abs(points_ct[:, 0]) / 100 if self.sure else None
+
+    largest_std_mm = std_mm
+
+    def covariance_mm2(self, points_ct):
+        if not self.sure:
+            return None
+        return self.std_mm(points_ct)[:, None, None] ** 2 * np.eye(3)

@@ -61,3 +61,8 @@ class Deviating:
 
     def std_mm(self, points):
         return np.full(len(points), self.deviation_mm)
+
+    largest_std_mm = std_mm
+
+    def covariance_mm2(self, points):
+        return self.deviation_mm**2 * np.tile(np.eye(3), (len(points), 1, 1))

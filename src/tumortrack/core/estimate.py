@@ -36,6 +36,12 @@ class Motion(Protocol):
         """Uncertainty of ``carry`` at each point: one standard deviation along any axis, mm; None
         where the method does not know it."""
 
+    def largest_std_mm(self, points_ct: Points, /) -> Float[np.ndarray, " n"] | None:
+        """The same along the axis that is least sure."""
+
+    def covariance_mm2(self, points_ct: Points, /) -> Float[np.ndarray, "n 3 3"] | None:
+        """The same as a whole covariance, camera frame, mm^2."""
+
 
 @dataclass(frozen=True, eq=False)
 class OneWay:
@@ -48,6 +54,8 @@ class OneWay:
 
     def std_mm(self, points_ct: Points, /) -> None:
         return None
+
+    largest_std_mm = covariance_mm2 = std_mm
 
 
 class Following(Config, frozen=True, kw_only=True):

@@ -31,12 +31,14 @@ from tumortrack.simulate.elastic.flow import LatticeField
 
 @dataclass(frozen=True, eq=False)
 class RegistrationResult:
-    """A motion, its cost (robust data term and prior), and the residuals (signed distances, mm)."""
+    """A motion, its cost (robust data term and prior), and the residuals (signed distances, mm).
+    ``moved``: shift (mm) and turn (rad) from where the prior has the pose."""
 
     motion: ElasticMotion
     cost: float
     distances_mm: Float[np.ndarray, " n"]
     steps: int
+    moved: Float64[np.ndarray, " 6"]
 
 
 def refine(
@@ -51,10 +53,16 @@ def refine(
 class GaussNewton:
     """A refinement that can be stopped on its way and continued. ``cost``: of the present state, as
     in ``RegistrationResult``; infinite before the first step. ``steps``: taken so far;
-    ``converged``: more would not move it."""
+    ``converged``: more would not move it. ``moved``: the start's, as in ``RegistrationResult``;
+    None: the prior has the pose where it starts."""
 
     def __init__(
-        self, rest: RestShape, points_mm: Points, start: ElasticMotion, config: GaussNewtonConfig
+        self,
+        rest: RestShape,
+        points_mm: Points,
+        start: ElasticMotion,
+        config: GaussNewtonConfig,
+        moved: Float64[np.ndarray, " 6"] | None = None,
     ) -> None:
         body, count, precision = rest.body, len(points_mm), _prior(rest, config)
         self._rest = rest
@@ -75,7 +83,8 @@ class GaussNewton:
         given = start.rotation, start.centre_mm, start.coefficients
         rotation, centre_mm, coefficients = (np.array(part, float, order="C") for part in given)
         left = np.empty(count, np.float32), np.empty_like(precision), np.empty(len(precision))
-        self._state = kernels.State(rotation, centre_mm, coefficients, np.zeros(6), *left)
+        already = np.zeros(6) if moved is None else np.array(moved, float)
+        self._state = kernels.State(rotation, centre_mm, coefficients, already, *left)
         self.cost, self.steps, self.converged = np.inf, 0, False
 
     def run(self, steps: int) -> None:
@@ -91,7 +100,7 @@ class GaussNewton:
         covariance = np.linalg.inv(state.curvature)
         placed = state.rotation, state.centre_mm, state.coefficients
         motion = ElasticMotion(self._rest, *placed, covariance)
-        return RegistrationResult(motion, self.cost, state.distances_mm, self.steps)
+        return RegistrationResult(motion, self.cost, state.distances_mm, self.steps, state.moved)
 
 
 def _prior(rest: RestShape, config: GaussNewtonConfig) -> Float64[np.ndarray, "p p"]:

@@ -87,13 +87,13 @@ def back(flow, pose, points, out):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, fastmath=True, nogil=True)
-def variances(flow, modes, center, root, points, out):  # type: ignore[no-untyped-def]
-    """The mean over x, y, z of each point's variance (n,), if ``root @ root.T`` (p, p) is the
-    covariance of the unknowns: their effects times the root, squared. All float32."""
+def covariances(flow, modes, center, root, points, out):  # type: ignore[no-untyped-def]
+    """Each point's covariance (n, 3, 3) in the organ's axes, if ``root @ root.T`` (p, p) is that of
+    the unknowns: their effects times the root, times the same transposed. All float32."""
     velocity, origin, spacing, steps = flow
     places, speeds, middles = block()
     along = np.eye(3, dtype=np.float32)
-    row, mixed = np.empty(len(root), np.float32), np.empty(len(root), np.float32)
+    row, mixed = np.empty(len(root), np.float32), np.empty((3, len(root)), np.float32)
     for first in range(0, len(points), BLOCK):
         some = points[first : first + BLOCK]
         enter(some, origin, spacing, places)
@@ -104,7 +104,7 @@ def variances(flow, modes, center, root, points, out):  # type: ignore[no-untype
                 origin[1] + spacing * places[1, p] - center[1],
                 origin[2] + spacing * places[2, p] - center[2],
             )
-            out[first + p] = 0
+            mixed[:] = 0
             for axis in range(3):
                 row[:] = 0
                 row[axis] = 1
@@ -113,13 +113,15 @@ def variances(flow, modes, center, root, points, out):  # type: ignore[no-untype
                 row[3 + before] = -offset[after]
                 x, y, z = middles[0, p], middles[1, p], middles[2, p]
                 add_modes(modes, x, y, z, along[axis], row[POSE:])
-                mixed[:] = 0
                 for n in range(len(root)):
                     for m in range(n + 1):  # the root is lower triangular
-                        mixed[m] += row[n] * root[n, m]
-                for m in range(len(root)):
-                    out[first + p] += mixed[m] ** 2
-            out[first + p] /= 3
+                        mixed[axis, m] += row[n] * root[n, m]
+                for other in range(axis + 1):
+                    total = np.float32(0)
+                    for m in range(len(root)):
+                        total += mixed[axis, m] * mixed[other, m]
+                    out[first + p, axis, other] = total
+                    out[first + p, other, axis] = total
 
 
 @numba.njit(cache=True, fastmath=True, nogil=True, inline="always")

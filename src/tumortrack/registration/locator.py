@@ -56,13 +56,14 @@ class _OrganPoints:
 @dataclass(frozen=True, eq=False)
 class _Registered:
     """A fit that can be this organ's: its motion, the moved surfaces (camera frame), and one
-    standard deviation (mm) at the samples and at the middle of each part's box."""
+    standard deviation (mm) at the samples, and the covariance (mm^2) at the middle of each part's
+    box."""
 
     fit: RegistrationResult
     motion: ElasticMotion
     meshes: dict[str, Mesh]
     sample_std_mm: Float[np.ndarray, " k"]
-    middle_std_mm: Float[np.ndarray, " parts"]
+    middle_mm2: Float[np.ndarray, "parts 3 3"]
 
     def probability(self, mine: _OrganPoints) -> Float32[np.ndarray, " n"]:
         """The chance that each point lies on the side of the nearest surface where it was found,
@@ -159,18 +160,22 @@ class RegistrationLocator:
         ends = np.cumsum([len(part.vertices_mm) for part in anatomy.parts])[:-1]
         parts = zip(anatomy.names, anatomy.parts, np.split(moved, ends), strict=True)
         meshes = {name: part.moved(places) for name, part, places in parts}
-        deviation = motion.std_mm(np.concatenate([self._samples_ct, self._middles_ct]))
-        assert deviation is not None
+        known_mm2 = motion.covariance_mm2(np.concatenate([self._samples_ct, self._middles_ct]))
+        assert known_mm2 is not None
         count = len(self._samples_ct)
-        return _Registered(fit, motion, meshes, deviation[:count], deviation[count:])
+        deviation = np.sqrt(np.trace(known_mm2[:count], axis1=1, axis2=2) / 3)
+        return _Registered(fit, motion, meshes, deviation, known_mm2[count:])
 
     def _report(
         self, frame: Frame, placed: _Registered, inside: OccupancyCloud, **more: Any
     ) -> dict[str, Any]:
         fit, motion = placed.fit, placed.motion
         parts = describe_parts(self._model.parts, placed.meshes, inside)
-        for part, std_mm in zip(parts.values(), placed.middle_std_mm, strict=True):
-            part["center_std_mm"] = float(std_mm)
+        for part, mm2 in zip(parts.values(), placed.middle_mm2, strict=True):
+            squares, axes = np.linalg.eigh(mm2)
+            part["center_std_mm"] = float(np.sqrt(squares.mean()))
+            part["center_axes_std_mm"] = np.sqrt(squares[::-1]).tolist()
+            part["center_axes"] = axes.T[::-1].tolist()
         more["fit_cost"] = {"now": fit.cost, "usual": self._calibration.usual_cost}
         more["motion"] = {
             "camera_from_ct": motion.camera_from_ct.tolist(),

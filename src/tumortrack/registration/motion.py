@@ -61,17 +61,28 @@ class ElasticMotion:
         return self._moved(kernels.back, opposite, points_camera)
 
     def std_mm(self, points_ct: Points, /) -> Float64[np.ndarray, " n"] | None:
-        """One standard deviation along any axis, mm: the pose's and the state's, to first order."""
+        """One standard deviation along any axis, mm: the root of the mean over three of them."""
+        covariance = self.covariance_mm2(points_ct)
+        return None if covariance is None else np.sqrt(np.trace(covariance, axis1=1, axis2=2) / 3)
+
+    def largest_std_mm(self, points_ct: Points, /) -> Float64[np.ndarray, " n"] | None:
+        """One standard deviation along the axis that is least sure, mm."""
+        covariance = self.covariance_mm2(points_ct)
+        return None if covariance is None else np.sqrt(np.linalg.eigvalsh(covariance)[:, -1])
+
+    def covariance_mm2(self, points_ct: Points, /) -> Float64[np.ndarray, "n 3 3"] | None:
+        """Of the places to which ``carry`` takes points, in the camera's axes: the pose's and the
+        state's, to first order."""
         if self.covariance is None:
             return None
         body, points = self.shape.body, np.ascontiguousarray(points_ct, np.float32)
         root = np.linalg.cholesky(self.covariance).astype(np.float32)
         known = self._flow, body.modes, body.center_ct.astype(np.float32), root
-        variance = np.empty(len(points), np.float32)
+        out = np.empty((len(points), 3, 3), np.float32)
         parallel_for(
-            lambda part: kernels.variances(*known, points[part], variance[part]), len(points), _FEW
+            lambda part: kernels.covariances(*known, points[part], out[part]), len(points), _FEW
         )
-        return self.std_scale * np.sqrt(variance.astype(float))
+        return self.std_scale**2 * (self.rotation @ out.astype(float) @ self.rotation.T)
 
     def _moved(self, kernel: Callable[..., None], flow: Flow, points_mm: Points) -> Moved:
         points, out = np.ascontiguousarray(points_mm, np.float32), np.empty((len(points_mm), 3))
