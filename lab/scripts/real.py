@@ -50,8 +50,8 @@ class Options:
     """Folder of your own copies of the data."""
     parts: tuple[Part, ...] = get_args(Part)
     """Which tables to make."""
-    kidneys: int = 2 * kidneys.EACH
-    """How many of the frozen list get a model, both kinds in turn; all are prepared and checked."""
+    kidneys: tuple[int, ...] = tuple(row["case"] for row in kidneys.frozen())
+    """Which of the frozen list get a model, by case number; all are prepared and checked."""
     trained: tuple[str, ...] = ()
     """More organs for the lungs' deformations, each NAME=FOLDER with case/ and model/ in it."""
     choose: bool = False
@@ -110,16 +110,19 @@ def main(options: Options) -> None:
     writer.check([f"real-{part}" for part in options.parts])
     options.out.mkdir(parents=True, exist_ok=True)
     rows = kidneys.frozen()
-    if not 1 <= options.kidneys <= len(rows):
-        raise InputError(f"--kidneys {options.kidneys} must be 1 to {len(rows)}.")
+    if unknown := set(options.kidneys) - {row["case"] for row in rows}:
+        raise InputError(f"--kidneys {min(unknown)} is not in the list; see docs/real.md.")
     if options.choose and kidneys.choose(options.data, options.out / "cases") != rows:
         raise InputError(f"the rule gives other kidneys than {kidneys.FROZEN} lists.")
-    folders = kidneys.check(options.data, options.out / "cases", rows)
+    folders = {}
+    if {"kidneys", "lungs"} & {*options.parts}:
+        folders = kidneys.check(options.data, options.out / "cases", rows)
     kinds = {kidneys.name_of(row["case"]): row["kind"] for row in rows}
     chosen = [
-        Organ(name, folder, options.out / "models" / name, kinds[name], options)
-        for name, folder in folders.items()
-    ][: options.kidneys]
+        Organ(name, folders[name], options.out / "models" / name, kinds[name], options)
+        for name in map(kidneys.name_of, options.kidneys)
+        if name in folders
+    ]
     more = [
         Organ(name, folder / "case", folder / "model", "other", options)
         for name, folder in named_folders(options.trained, kinds).items()
@@ -293,7 +296,7 @@ def silicone_block(options: Options) -> str:
         up = ",".join(map(str, silicone.UP))
         api.prepare(folder / "meshes", folder / "case", up=up, patient="silicone")
     organ = Organ("silicone", folder / "case", folder / "model", "silicone", options)
-    scans = {cast: data / "silicone" / name for cast, name in silicone.BENT.items()}
+    scans = {cast: silicone.file(data, name) for cast, name in silicone.BENT.items()}
     about = organ.about() | {cast: store.sha256_of(path) for cast, path in scans.items()}
 
     def measure() -> list[dict]:

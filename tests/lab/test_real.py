@@ -8,6 +8,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
+import pandas as pd
 import pytest
 from scipy.io import savemat
 from scipy.spatial.transform import Rotation
@@ -66,6 +67,15 @@ def test_a_case_that_is_set_aside_is_not_loaded_and_a_missing_one_says_where_it_
         kidneys.label_map(tmp_path, 91)
     with pytest.raises(InputError, match=r"put a copy of .*neheller/kits19"):
         kidneys.label_map(tmp_path, 1)
+
+
+def test_a_label_map_of_another_hash_is_refused(tmp_path):
+    row = kidneys.frozen()[0]
+    path = tmp_path / "kits19" / kidneys.name_of(row["case"]) / "segmentation.nii.gz"
+    path.parent.mkdir(parents=True)
+    path.write_bytes(b"another")
+    with pytest.raises(InputError, match="is not the file in the list"):
+        kidneys.check(tmp_path, tmp_path / "cases", [row])
 
 
 def test_the_outer_share_counts_the_tumors_surface_that_is_near_the_organs():
@@ -156,5 +166,27 @@ def test_a_slab_is_closed_by_its_walls_and_its_underside():
     columns = 6.0 - bump[under]
     wanted = (columns[[0, 2, 3]].mean(0) + columns[[0, 1, 2]].mean(0)).sum() / 2
     assert solid.volume_mm3 == pytest.approx(wanted)
+    with pytest.raises(InputError, match="vu-arma-dev/cpd-registration"):
+        silicone.read_surface(Path("nowhere"), silicone.REST)
     pose = silicone.facing_pose(top, np.random.default_rng(0))
     assert pose[2, :3] @ [0, 0, -1] < -0.9  # the outer side looks back at the camera
+
+
+def test_a_table_counts_verdicts_and_gives_errors_of_answers_and_of_what_was_called_good():
+    def row(verdict, middle_mm):
+        tumor = {"rigid_middle_mm": 2.0, "rigid_hausdorff_mm": 3.0}
+        if middle_mm is not None:
+            tumor |= {"middle_mm": middle_mm, "hausdorff_mm": 2 * middle_mm, "std_mm": 0.5}
+        return {"verdict": verdict, "tumors": [tumor]}
+
+    rows = [row("good", 1.0), row("good", 3.0), row("poor", 9.0), row("refused", None)]
+    rows.append({"verdict": "folded", "tumors": []})
+    line = runpy.run_path(str(SCRIPT))["_table"]("what", {"all": pd.DataFrame(rows)}).splitlines()[
+        2
+    ]
+    cells = [cell.strip() for cell in line.strip("|").split("|")]
+    assert cells[:5] == ["all", "5", "2", "1", "1"]
+    assert cells[5] == "3.0 / 7.8 / 8.4 / 9.0"  # linear between 3 and 9
+    assert cells[6] == "2.0 / 2.0 / 2.0 / 2.0"
+    assert cells[9] == "2.0 / 2.8 / 2.9 / 3.0"
+    assert cells[10] == "6.0 / 15.6 / 16.8 / 18.0"

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from tumortrack.core.errors import InputError, NoEstimate
-from tumortrack.core.geometry import transform_points
+from tumortrack.core.geometry import Points, transform_points
 from tumortrack.core.mesh_files import read_mesh
 from tumortrack.core.types import Anatomy, Mesh, SensorCloud
 from tumortrack.models.report import Frame
@@ -44,11 +44,16 @@ SHARES = (1.0, 0.7, 0.5)  # of the scanned surface that the camera is given
 WHERE = "https://github.com/vu-arma-dev/cpd-registration"
 
 
-def read_surface(data: Path, name: str) -> Mesh:
+def file(data: Path, name: str) -> Path:
+    """The user's copy. Raises InputError: it is missing."""
     path = data / "silicone" / name
     if not path.is_file():
         raise InputError(f"{path} is missing: put a copy of {WHERE} at {data / 'silicone'}.")
-    return read_mesh(path)
+    return path
+
+
+def read_surface(data: Path, name: str) -> Mesh:
+    return read_mesh(file(data, name))
 
 
 def closed(top: Mesh, bottom_z_mm: float) -> Mesh:
@@ -77,40 +82,44 @@ def facing_pose(scan: Mesh, rng: np.random.Generator) -> np.ndarray:
 def measured(
     tracker: Tracker, case: Anatomy, top: Mesh, scan: Mesh, rng: np.random.Generator
 ) -> list[dict[str, Any]]:
-    """A row a share of the picture that the camera is given (one side of a line through it): what
-    is said, and how far the scan lies from the estimated and the best rigid top surface, where it
-    was seen and where not (median, 95 %, worst; mm).
+    """A row a share of the scan that the camera is given (one side of a line through the picture):
+    what is said, and how far the estimated and the best rigid top surface lie from the scan, where
+    the camera saw and where not (median, 95 %, worst; mm).
 
     The rigid pose is the best for the whole scan. Where the tracker refuses, the errors are those
-    of the fit that it refused.
+    of the fit that it refused. Not from the scan to the surface: the casts' rims reach farther.
     """
     there = scan.moved(transform_points(facing_pose(scan, rng), scan.vertices_mm))
     frame = add_noise(render_depth(there.vertices_mm, there.faces, CAMERA), D405_NOISE, rng)
-    points_mm, area_mm2, _ = surface_samples(there, 3.0)
-    points_mm = points_mm[area_mm2 > 0]
-    pose = PoseSearch(case, UP, RigidConfig()).poses(SensorCloud(points_mm))[0].camera_from_ct
-    rigid_mm = distance_to_surface(points_mm, top.moved(transform_points(pose, top.vertices_mm)))
     angle = rng.uniform(0, 2 * np.pi)
     along = np.array([np.cos(angle), np.sin(angle)])
-    place = points_mm[:, :2] / points_mm[:, 2:] @ along
     row, column = np.indices(frame.depth_mm.shape)
-    rays = np.stack([(column - CAMERA.cx) / CAMERA.fx, (row - CAMERA.cy) / CAMERA.fy], -1)
+    rays = np.stack([(column - CAMERA.cx) / CAMERA.fx, (row - CAMERA.cy) / CAMERA.fy], -1) @ along
+    whole = surface_samples(there, 3.0)[0]
+    pose = PoseSearch(case, UP, RigidConfig()).poses(SensorCloud(whole))[0].camera_from_ct
+    rigid = top.moved(transform_points(pose, top.vertices_mm))
     rows = []
     for share in SHARES:
-        limit = np.quantile(place, share)
-        seen = frame.with_depth(np.where(rays @ along <= limit, frame.depth_mm, np.float32("nan")))
+        limit = np.quantile(_places(whole, along), share)
+        seen = frame.with_depth(np.where(rays <= limit, frame.depth_mm, np.float32("nan")))
         cloud = cloud_from_depth(seen, CloudConfig(near_mm=1.0, far_mm=1e4), rng)
         said, motion = located(tracker, cloud)
-        off_mm = distance_to_surface(points_mm, top.moved(motion.carry(top.vertices_mm)))
-        errors = {
-            f"{method}{part}_mm": [float(mm) for mm in np.percentile(all_mm[which], [50, 95, 100])]
-            for part, which in {"seen": place <= limit, "unseen": place > limit}.items()
-            for method, all_mm in {"": off_mm, "rigid_": rigid_mm}.items()
-            if which.any()
-        }
         std_mm = float(np.median(motion.std_mm(top.vertices_mm)))
-        rows.append({"share": share, **said, "std_mm": std_mm, **errors})
+        found = {"share": share, **said, "std_mm": std_mm}
+        for name, mesh in {"": top.moved(motion.carry(top.vertices_mm)), "rigid_": rigid}.items():
+            points_mm = surface_samples(mesh, 3.0)[0]
+            off_mm = distance_to_surface(points_mm, there)
+            hidden = _places(points_mm, along) > limit if share < 1 else np.zeros(len(off_mm), bool)
+            for part, which in {"seen": ~hidden, "unseen": hidden}.items():
+                if which.any():
+                    found[f"{name}{part}_mm"] = np.percentile(off_mm[which], [50, 95, 100]).tolist()
+        rows.append(found)
     return rows
+
+
+def _places(points_mm: Points, along: np.ndarray) -> np.ndarray:
+    """Along a direction of the picture."""
+    return points_mm[:, :2] / points_mm[:, 2:] @ along
 
 
 def located(tracker: Tracker, cloud: SensorCloud) -> tuple[dict[str, Any], Any]:
