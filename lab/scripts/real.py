@@ -39,6 +39,7 @@ Part = Literal["kidneys", "lungs", "silicone"]
 DRAGGED = SceneConfig(
     deform=(ChainConfig(links=(DragConfig(), StretchConfig())),), noise=D405_NOISE
 )
+KINDS = (*kidneys.KINDS, "between")  # of tumors
 ERRORS = "median / 90 / 95 / worst, mm"
 
 
@@ -75,7 +76,6 @@ class Organ:
     name: str
     case_folder: Path
     model_folder: Path
-    kind: str
     options: Options
 
     @property
@@ -90,6 +90,15 @@ class Organ:
                 self.case_folder, self.model_folder, steps=options.steps, seed=options.seed,
                 device="cpu", workers=0,
             )  # fmt: skip
+
+    def by_kind(self, rows: list[dict]) -> list[dict]:
+        """The rows, and of each tumor its kind."""
+        organ, *tumors = self.case.anatomy.parts
+        kinds = [kidneys.kind_of(kidneys.outer_share(tumor, organ)) for tumor in tumors]
+        for row in rows:
+            for tumor, kind in zip(row["tumors"], kinds, strict=False):
+                tumor["kind"] = kind
+        return rows
 
     def tracker(self) -> Tracker:
         return Tracker(api.load_model(self.model_folder, "cpu"))
@@ -117,15 +126,14 @@ def main(options: Options) -> None:
     folders = {}
     if {"kidneys", "lungs"} & {*options.parts}:
         folders = kidneys.check(options.data, options.out / "cases", rows)
-    kinds = {kidneys.name_of(row["case"]): row["kind"] for row in rows}
     chosen = [
-        Organ(name, folders[name], options.out / "models" / name, kinds[name], options)
+        Organ(name, folders[name], options.out / "models" / name, options)
         for name in map(kidneys.name_of, options.kidneys)
         if name in folders
     ]
     more = [
-        Organ(name, folder / "case", folder / "model", "other", options)
-        for name, folder in named_folders(options.trained, kinds).items()
+        Organ(name, folder / "case", folder / "model", options)
+        for name, folder in named_folders(options.trained, folders).items()
     ]
     made = {
         "kidneys": lambda: kidneys_block(rows, chosen),
@@ -140,7 +148,7 @@ def main(options: Options) -> None:
 
 def kidneys_block(listed: list[dict], organs: list[Organ]) -> str:
     """The frozen list, and how well the kidneys are found dragged, squeezed and bent."""
-    found = {organ.name: pd.DataFrame(_dragged(organ)) for organ in organs}
+    found = {organ.name: organ.by_kind(_dragged(organ)) for organ in organs}
     head = ["case", "side", "kind", "tumor's outer share", "kidney, ml", "tumors, ml", "slices, mm"]
     body = [
         [
@@ -150,11 +158,15 @@ def kidneys_block(listed: list[dict], organs: list[Organ]) -> str:
         ]
         for row in sorted(listed, key=lambda row: row["case"])
     ]  # fmt: skip
-    both = pd.concat([rows.assign(name=name) for name, rows in found.items()])
-    kinds = {organ.name: organ.kind for organ in organs}
-    groups = {name: both[both.name == name] for name in sorted(kinds)}
-    groups |= {f"all {kind}": both[both.name.map(kinds) == kind] for kind in kidneys.KINDS}
+    every = [row for rows in found.values() for row in rows]
+    groups = dict(sorted(found.items())) | {f"all {kind}": _of(kind, every) for kind in KINDS}
     return "\n\n".join([table(head, body, 3), _table("kidney", groups)])
+
+
+def _of(kind: str, rows: list[dict]) -> list[dict]:
+    """What the rows say of tumors of this kind."""
+    some = [{**row, "tumors": [t for t in row["tumors"] if t["kind"] == kind]} for row in rows]
+    return [row for row in some if row["tumors"]]
 
 
 def _dragged(organ: Organ) -> list[dict]:
@@ -184,9 +196,8 @@ def lungs_block(organs: list[Organ], options: Options) -> str:
     for organ in organs:
         organ.train()
         for patient in lungs.PATIENTS:
-            rows += _breathed(organ, patient, field, options)
+            rows += organ.by_kind(_breathed(organ, patient, field, options))
     both = pd.DataFrame(rows)
-    seen = both[both.verdict != "folded"]
     body = []
     for patient, given in pairs.items():
         rng = np.random.default_rng([options.seed, patient])
@@ -204,21 +215,24 @@ def lungs_block(organs: list[Organ], options: Options) -> str:
     head = ["patient", "pairs", "mean motion", "left-out pairs: median", "95 %"]
     head += [f"rms, {name}" for name in lungs.VARIANTS]
     head += ["volume by point, least to most", "folded, refused", "smallest scale"]
-    groups = {name: seen[seen.variant == name] for name in lungs.VARIANTS}
-    groups |= {
-        f"{name}, {kind}": seen[(seen.variant == name) & (seen.kind == kind)]
-        for name in lungs.VARIANTS
-        for kind in dict.fromkeys(organ.kind for organ in organs)
+    seen = [row for row in rows if row["verdict"] != "folded"]
+    by_variant = {name: [r for r in seen if r["variant"] == name] for name in lungs.VARIANTS}
+    groups = {
+        f"{name}, {kind}": _of(kind, some) for kind in KINDS for name, some in by_variant.items()
     }
     each = {
-        f"{patient}, {name}": seen[(seen.patient == patient) & (seen.variant == name)]
+        f"{patient}, {name}": [row for row in some if row["patient"] == patient]
         for patient in pairs
-        for name in lungs.VARIANTS
+        for name, some in by_variant.items()
     }
-    by_organ = {organ.name: seen[seen.organ == organ.name] for organ in organs}
+    by_organ = {
+        f"{organ.name}, {name}": [row for row in some if row["organ"] == organ.name]
+        for organ in organs
+        for name, some in by_variant.items()
+    }
     return "\n\n".join([
-        table(head, body), _table("deformation", groups), _table("patient, deformation", each),
-        _table("organ", by_organ),
+        table(head, body), _table("deformation, tumors", groups), _table("organ", by_organ),
+        _table("patient", each),
     ])  # fmt: skip
 
 
@@ -248,7 +262,7 @@ def _states(organ: Organ, patient: int, field: lungs.Field) -> Iterator[dict]:
         moved = state.apply(surface.vertices_mm)
         off_mm = np.linalg.norm(moved - surface.vertices_mm, axis=1)
         row = {
-            "organ": organ.name, "kind": organ.kind, "patient": patient, "variant": name,
+            "organ": organ.name, "patient": patient, "variant": name,
             "scale": round(float(np.cbrt(np.linalg.det(state.lung_from_ct[:3, :3]))), 3),
             "rms_mm": float(np.sqrt((off_mm**2).mean())), "most_mm": float(off_mm.max()),
             "volume": surface.moved(moved).volume_mm3 / surface.volume_mm3,
@@ -262,7 +276,7 @@ def _states(organ: Organ, patient: int, field: lungs.Field) -> Iterator[dict]:
         say(f"{organ.name} as lung {patient}, {name}: done")
 
 
-def _table(what: str, groups: dict[str, pd.DataFrame]) -> str:
+def _table(what: str, groups: dict[str, list[dict]]) -> str:
     """Verdicts and errors by group; errors of what was called good, and of every answer."""
     head = [
         what, "scenes", "good", "poor", "refused", f"middle of tumors, {ERRORS}", "best rigid pose",
@@ -270,15 +284,15 @@ def _table(what: str, groups: dict[str, pd.DataFrame]) -> str:
     ]  # fmt: skip
     body = []
     for name, rows in groups.items():
-        if rows.empty:
+        if not rows:
             continue
-        lines, counts = by_tumor(rows.to_dict("records")), rows.verdict.value_counts()
+        lines, verdicts = by_tumor(rows), [row["verdict"] for row in rows]
         good = lines[lines.verdict == "good"]
         answered = lines[lines.verdict != "refused"]
         ratio = answered.middle_mm / answered.std_mm
         body.append([
             name, str(len(rows)),
-            *(str(counts.get(verdict, 0)) for verdict in ("good", "poor", "refused")),
+            *(str(verdicts.count(verdict)) for verdict in ("good", "poor", "refused")),
             quantiles(answered.middle_mm), quantiles(answered.rigid_middle_mm),
             quantiles(answered.hausdorff_mm), quantiles(answered.rigid_hausdorff_mm),
             quantiles(good.middle_mm), quantiles(ratio),
@@ -295,7 +309,7 @@ def silicone_block(options: Options) -> str:
         write_mesh(folder / "meshes" / "kidney.ply", silicone.closed(top, silicone.UNDERSIDE_MM))
         up = ",".join(map(str, silicone.UP))
         api.prepare(folder / "meshes", folder / "case", up=up, patient="silicone")
-    organ = Organ("silicone", folder / "case", folder / "model", "silicone", options)
+    organ = Organ("silicone", folder / "case", folder / "model", options)
     scans = {cast: silicone.file(data, name) for cast, name in silicone.BENT.items()}
     about = organ.about() | {cast: store.sha256_of(path) for cast, path in scans.items()}
 

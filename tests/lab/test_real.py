@@ -8,7 +8,6 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
-import pandas as pd
 import pytest
 from scipy.io import savemat
 from scipy.spatial.transform import Rotation
@@ -139,7 +138,7 @@ def test_an_organ_lies_among_landmarks_or_is_refused():
 def test_folded_states_are_refused_and_counted_before_anything_is_located():
     script, anatomy = runpy.run_path(str(SCRIPT)), small_anatomy()
     organ = SimpleNamespace(
-        name="o", kind="other", options=SimpleNamespace(seed=0), tracker=lambda: None,
+        name="o", options=SimpleNamespace(seed=0), tracker=lambda: None,
         case=SimpleNamespace(anatomy=anatomy, up_lps=(0.0, -1.0, 0.0)),
     )  # fmt: skip
     points_mm = np.random.default_rng(1).uniform(-60, 60, (2500, 3))
@@ -181,9 +180,7 @@ def test_a_table_counts_verdicts_and_gives_errors_of_answers_and_of_what_was_cal
 
     rows = [row("good", 1.0), row("good", 3.0), row("poor", 9.0), row("refused", None)]
     rows.append({"verdict": "folded", "tumors": []})
-    line = runpy.run_path(str(SCRIPT))["_table"]("what", {"all": pd.DataFrame(rows)}).splitlines()[
-        2
-    ]
+    line = runpy.run_path(str(SCRIPT))["_table"]("what", {"all": rows}).splitlines()[2]
     cells = [cell.strip() for cell in line.strip("|").split("|")]
     assert cells[:5] == ["all", "5", "2", "1", "1"]
     assert cells[5] == "3.0 / 7.8 / 8.4 / 9.0"  # linear between 3 and 9
