@@ -154,7 +154,7 @@ def kidneys_block(listed: list[dict], organs: list[Organ]) -> str:
         [
             kidneys.name_of(row["case"]), row["side"], row["kind"], f"{row['outer_share']:.2f}",
             f"{row['organ_ml']:.0f}", ", ".join(f"{ml:.1f}" for ml in row["tumors_ml"]),
-            f"{max(row['spacing_mm']):g}",
+            f"{row['spacing_mm'][0]:g}",
         ]
         for row in sorted(listed, key=lambda row: row["case"])
     ]  # fmt: skip

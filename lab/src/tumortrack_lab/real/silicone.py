@@ -41,6 +41,7 @@ BENT = {
 UNDERSIDE_MM = 3.0  # z, of kidney_and_base.stl
 UP = (0.0, 0.0, -1.0)  # out of the plate, where the kidney sticks out
 SHARES = (1.0, 0.7, 0.5)  # of the scanned surface that the camera is given
+POINTS = 2000  # of a whole scan, for the best rigid pose
 WHERE = "https://github.com/vu-arma-dev/cpd-registration"
 
 
@@ -96,6 +97,7 @@ def measured(
     row, column = np.indices(frame.depth_mm.shape)
     rays = np.stack([(column - CAMERA.cx) / CAMERA.fx, (row - CAMERA.cy) / CAMERA.fy], -1) @ along
     whole = surface_samples(there, 3.0)[0]
+    whole = whole[:: len(whole) // POINTS + 1]
     pose = PoseSearch(case, UP, RigidConfig()).poses(SensorCloud(whole))[0].camera_from_ct
     rigid = top.moved(transform_points(pose, top.vertices_mm))
     rows = []
