@@ -325,7 +325,7 @@ def silicone_block(options: Options) -> str:
         return rows
 
     rows = trainings.kept(folder / "rows.json", about, measure)
-    head = ["cast", "picture seen", "verdict", "cost / usual", "stated deviation, mm"]
+    head = ["cast", "scan seen", "verdict", "cost / usual", "stated deviation, mm"]
     head += [
         f"{which}{where}, mm" for where in ("seen", "unseen") for which in ("", "best rigid, ")
     ]
