@@ -1,0 +1,139 @@
+"""A silicone kidney on its plate, bent over a stand and scanned by CT: one side in, the rest out.
+
+vu-arma-dev/cpd-registration states no licence: the files stay with the user, who looks and
+measures. Of six casts of one mould there is the bent top surface (STL, mm), cut out of a CT; of the
+mould the flat top surface (PLY, mm; flat down to z = -7, the kidney up to z = -19). How thick the
+plate is is not said; ``kidney_and_base.stl`` has 10 mm. Spheres and arteries inside some casts have
+no known place in the flat state, and the fiducials are the stand's: no point is known twice.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tumortrack.core.errors import InputError, NoEstimate
+from tumortrack.core.geometry import Points, transform_points
+from tumortrack.core.mesh_files import read_mesh
+from tumortrack.core.types import Anatomy, Mesh, SensorCloud
+from tumortrack.models.report import Frame
+from tumortrack.registration.model import RegistrationModel
+from tumortrack.report.metrics import distance_to_surface, surface_samples
+from tumortrack.sense.cloud import CloudConfig, cloud_from_depth
+from tumortrack.sense.noise import D405_NOISE, add_noise
+from tumortrack.sense.render import render_depth
+from tumortrack.simulate.scene import PoseConfig, sample_pose
+from tumortrack.tracking.tracker import Tracker
+from tumortrack_lab.peers.pose_search import PoseSearch, RigidConfig
+from tumortrack_lab.real.judging import CAMERA
+
+REST = "psm_data/PLY/kidney_and_base_2mm_aligned.ply"
+BENT = {
+    cast: f"userstudy_data/STL/Kidney{name}.stl"
+    for cast, name in {
+        "10": "10_top",
+        **{letter: f"{letter}_TopOnly_Reduced" for letter in "BCEF"},
+        "D": "D_TopOnly_reduced",
+    }.items()
+}
+UNDERSIDE_MM = 3.0  # z, of kidney_and_base.stl
+UP = (0.0, 0.0, -1.0)  # out of the plate, where the kidney sticks out
+SHARES = (1.0, 0.7, 0.5)  # of the scanned surface that the camera is given
+POINTS = 2000  # of a whole scan, for the best rigid pose
+WHERE = "https://github.com/vu-arma-dev/cpd-registration"
+
+
+def file(data: Path, name: str) -> Path:
+    """The user's copy. Raises InputError: it is missing."""
+    path = data / "silicone" / name
+    if not path.is_file():
+        raise InputError(f"{path} is missing: put a copy of {WHERE} at {data / 'silicone'}.")
+    return path
+
+
+def read_surface(data: Path, name: str) -> Mesh:
+    return read_mesh(file(data, name))
+
+
+def closed(top: Mesh, bottom_z_mm: float) -> Mesh:
+    """An open surface over a plane, and all below it down to ``bottom_z_mm``, as one solid."""
+    vertices, faces = top.vertices_mm, top.faces
+    below = vertices * [1, 1, 0] + [0, 0, bottom_z_mm]
+    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    _, where, count = np.unique(
+        np.sort(edges, axis=1), axis=0, return_inverse=True, return_counts=True
+    )
+    a, b = edges[count[where.reshape(-1)] == 1].T  # along the rim
+    n = len(vertices)
+    walls = np.concatenate([np.stack([b, a, a + n], 1), np.stack([b, a + n, b + n], 1)])
+    return Mesh(
+        np.concatenate([vertices, below]), np.concatenate([faces, faces[:, ::-1] + n, walls])
+    )
+
+
+def facing_pose(scan: Mesh, rng: np.random.Generator) -> np.ndarray:
+    """``camera_from_scan``, its outer side to the camera."""
+    a, b, c = (scan.vertices_mm[scan.faces[:, corner]] for corner in range(3))
+    x, y, z = np.cross(b - a, c - a).sum(0)
+    return sample_pose(PoseConfig(), scan, (x, y, z), PoseConfig().nearest_mm, rng)
+
+
+def measured(
+    tracker: Tracker, case: Anatomy, top: Mesh, scan: Mesh, rng: np.random.Generator
+) -> list[dict[str, Any]]:
+    """A row a share of the scan that the camera is given (one side of a line through the picture):
+    what is said, and how far the estimated and the best rigid top surface lie from the scan, where
+    the camera saw and where not (median, 95 %, worst; mm).
+
+    The rigid pose is the best for the whole scan. Where the tracker refuses, the errors are those
+    of the fit that it refused. Not from the scan to the surface: the casts' rims reach farther.
+    """
+    there = scan.moved(transform_points(facing_pose(scan, rng), scan.vertices_mm))
+    frame = add_noise(render_depth(there.vertices_mm, there.faces, CAMERA), D405_NOISE, rng)
+    angle = rng.uniform(0, 2 * np.pi)
+    along = np.array([np.cos(angle), np.sin(angle)])
+    row, column = np.indices(frame.depth_mm.shape)
+    rays = np.stack([(column - CAMERA.cx) / CAMERA.fx, (row - CAMERA.cy) / CAMERA.fy], -1) @ along
+    whole = surface_samples(there, 3.0)[0]
+    whole = whole[:: len(whole) // POINTS + 1]
+    pose = PoseSearch(case, UP, RigidConfig()).poses(SensorCloud(whole))[0].camera_from_ct
+    rigid = top.moved(transform_points(pose, top.vertices_mm))
+    rows = []
+    for share in SHARES:
+        limit = np.quantile(_places(whole, along), share)
+        seen = frame.with_depth(np.where(rays <= limit, frame.depth_mm, np.float32("nan")))
+        cloud = cloud_from_depth(seen, CloudConfig(near_mm=1.0, far_mm=1e4), rng)
+        said, motion = located(tracker, cloud)
+        std_mm = float(np.median(motion.std_mm(top.vertices_mm)))
+        found = {"share": share, **said, "std_mm": std_mm}
+        for name, mesh in {"": top.moved(motion.carry(top.vertices_mm)), "rigid_": rigid}.items():
+            points_mm = surface_samples(mesh, 3.0)[0]
+            off_mm = distance_to_surface(points_mm, there)
+            hidden = _places(points_mm, along) > limit if share < 1 else np.zeros(len(off_mm), bool)
+            for part, which in {"seen": ~hidden, "unseen": hidden}.items():
+                if which.any():
+                    found[f"{name}{part}_mm"] = np.percentile(off_mm[which], [50, 95, 100]).tolist()
+        rows.append(found)
+    return rows
+
+
+def _places(points_mm: Points, along: np.ndarray) -> np.ndarray:
+    """Along a direction of the picture."""
+    return points_mm[:, :2] / points_mm[:, 2:] @ along
+
+
+def located(tracker: Tracker, cloud: SensorCloud) -> tuple[dict[str, Any], Any]:
+    """Verdict, reason and cost, and the motion, also where it is refused."""
+    try:
+        estimate = tracker.follow(cloud)
+    except NoEstimate as error:
+        model = tracker.model
+        assert isinstance(model, RegistrationModel)
+        frame = Frame(model, cloud, 0, np.random.default_rng(0))
+        usual = model.calibration.usual_cost
+        fit = model.registration().register(frame.points_mm, usual, frame.stage)
+        return {"verdict": "refused", "reason": str(error), "cost": fit.cost / usual}, fit.motion
+    cost = estimate.report["fit_cost"]["now"] / estimate.report["fit_cost"]["usual"]
+    return {"verdict": estimate.quality, "reason": estimate.reason, "cost": cost}, estimate.motion
