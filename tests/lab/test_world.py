@@ -21,9 +21,10 @@ from tumortrack_lab.tets import TetMesh, tetrahedralise
 from tumortrack_lab.twin.equilibrium import Rod, settle
 from tumortrack_lab.twin.solid import NeoHookeanSolid
 from tumortrack_lab.world import segmentation
-from tumortrack_lab.world.families import FAMILIES, Deformed, Organ, Slit, Stage, cut_open, solve
+from tumortrack_lab.world.families import FAMILIES, Deformed, solve
 from tumortrack_lab.world.forces import Bed, Capsule, LoadedBody, Springs, Touch, Weight
 from tumortrack_lab.world.noise import StereoCamera, StereoConfig
+from tumortrack_lab.world.organ import Organ, Slit, Stage, cut_open
 from tumortrack_lab.world.scenes import World, WorldConfig
 
 CAMERA = d405(424, 240)

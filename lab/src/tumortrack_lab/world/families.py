@@ -13,34 +13,28 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float64, Int
+from jaxtyping import Float64, Int
 
-from tumortrack.core.errors import InputError, TumortrackError
+from tumortrack.core.errors import TumortrackError
 from tumortrack.core.geometry import perpendicular, unit
-from tumortrack.core.types import Anatomy
-from tumortrack.report.metrics import surface_samples
 from tumortrack_lab.tets import Embedding, TetMesh, find
 from tumortrack_lab.twin import equilibrium
-from tumortrack_lab.twin.apparatus import GRAVITY_KPA_PER_MM, tumor_share
+from tumortrack_lab.twin.apparatus import GRAVITY_KPA_PER_MM
 from tumortrack_lab.twin.equilibrium import ContactPlate, Nodes, Points, Rod
 from tumortrack_lab.twin.solid import NeoHookeanSolid
 from tumortrack_lab.world.forces import (
-    Bed,
     Capsule,
     Force,
     LoadedBody,
-    Obstacle,
     Springs,
     Steady,
-    Touch,
     Turned,
     Weight,
     rows_of,
 )
+from tumortrack_lab.world.organ import Generator, Organ, Slit, Stage, Vector, Wound, cut_open
 
 LARGEST_CHANGE, NEARLY_NONE = 0.05, 0.02  # of volume; from Poisson's ratio 0.49 on the second
-_SAMPLE_MM = 3.0  # one point of contact per cube of this size
-_HARD_KPA_MM = 150.0  # of plates, rods
 _BED_DEPTH_MM = 15.0  # of fat under the organ: what turns the bed's modulus into stiffness
 _GRIP_MN_MM = 4000.0  # of a grip, over all its points
 _STEP_MM = 6.0  # of a load, at a time
@@ -48,135 +42,9 @@ _GRAVITY = 1050.0 * GRAVITY_KPA_PER_MM  # of soft tissue, mN/mm3
 _ITERATIONS = 400  # a step: one that needs more mostly finds none
 _CLEAR_MM = 6.0  # between a slit and every tumor: as wide as a tetrahedron
 
-Generator = np.random.Generator
-Vector = Float64[np.ndarray, " 3"]
-
 
 def log_uniform(rng: Generator, low: float, high: float) -> float:
     return float(np.exp(rng.uniform(np.log(low), np.log(high))))
-
-
-class Slit(NamedTuple):
-    """A plane patch across which tetrahedra are parted: a disc about a point of the surface."""
-
-    middle_mm: Vector
-    normal: Vector
-    radius_mm: float
-
-
-class Wound(NamedTuple):
-    """A mesh with a slit: ``side`` of each tetrahedron (True: where the normal points), and the
-    ``walls``: triangles of nodes that were inside and now face the gap, turned outward."""
-
-    mesh: TetMesh
-    side: Bool[np.ndarray, " t"]
-    walls: Int[np.ndarray, "w 3"]
-    slit: Slit
-
-
-def cut_open(mesh: TetMesh, slit: Slit) -> Wound:
-    """Part the mesh: nodes that lie inside the slit are doubled. Raises InputError: the slit meets
-    no face between tetrahedra."""
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.csgraph import connected_components
-
-    middles = mesh.nodes_mm[mesh.tets].mean(1)
-    side = (middles - slit.middle_mm) @ slit.normal > 0
-    faces = mesh.tets[:, [[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]]].reshape(-1, 3)
-    owner = np.repeat(np.arange(len(mesh.tets)), 4)
-    _, pair = np.unique(np.sort(faces, axis=1), axis=0, return_inverse=True)
-    order = np.argsort(pair, kind="stable")
-    twice = np.flatnonzero(np.diff(pair[order]) == 0)
-    first, second = order[twice], order[twice + 1]
-    near = np.linalg.norm(mesh.nodes_mm[faces[first]].mean(1) - slit.middle_mm, axis=1)
-    parted = (side[owner[first]] != side[owner[second]]) & (near < slit.radius_mm)
-    if not parted.any():
-        raise InputError("the slit meets no face between tetrahedra; make it larger.")
-    # A corner is one node's in one tetrahedron; whole faces sew the corners of two together.
-    tets, corner = mesh.tets, np.arange(mesh.tets.size).reshape(-1, 4)
-    a, b = owner[first[~parted]], owner[second[~parted]]
-    same = tets[a][:, :, None] == tets[b][:, None]
-    which, i, j = np.nonzero(same)
-    links = corner[a[which], i], corner[b[which], j]
-    graph = coo_matrix((np.ones(len(which), bool), links), (tets.size, tets.size))
-    _, node = connected_components(graph, directed=False)
-    nodes_mm = np.empty((node.max() + 1, 3))
-    nodes_mm[node] = mesh.nodes_mm[tets.ravel()]
-    parted_tets = node.reshape(-1, 4).astype(np.int32)
-    new = parted_tets[:, [[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]]].reshape(-1, 3)
-    walls = new[np.concatenate([first[parted], second[parted]])]
-    return Wound(TetMesh(nodes_mm, parted_tets), side, walls, slit)
-
-
-@dataclass(frozen=True, eq=False)
-class Organ:
-    """A case on the bench (frame of ``twin.apparatus``) with its tetrahedra."""
-
-    anatomy: Anatomy
-    mesh: TetMesh
-    bed: Bed
-    in_tumor: Float64[np.ndarray, " t"]  # share of each tetrahedron
-    points_mm: Points  # of the surface, for contact
-    areas_mm2: Float64[np.ndarray, " m"]
-    owner: Int[np.ndarray, " m"]  # tetrahedron and weights that hold each point
-    weights: Float64[np.ndarray, "m 4"]
-
-    @classmethod
-    def of(cls, anatomy: Anatomy, mesh: TetMesh) -> Organ:
-        points, areas, _ = surface_samples(anatomy.organ, _SAMPLE_MM / 2)
-        _, first, cube = np.unique(
-            np.floor(points / _SAMPLE_MM), axis=0, return_index=True, return_inverse=True
-        )
-        points, areas = points[first], np.bincount(cube.ravel(), areas)
-        share = tumor_share(mesh, anatomy) if anatomy.tumors else np.zeros(len(mesh.tets))
-        held = find(mesh.nodes_mm[mesh.tets], points)
-        return cls(anatomy, mesh, Bed.of(anatomy.organ), share, points, areas, *held)
-
-    @property
-    def size_mm(self) -> Vector:
-        return np.ptp(self.anatomy.organ.box_mm, axis=0)
-
-    @property
-    def middle_mm(self) -> Vector:
-        return self.anatomy.organ.vertices_mm.mean(0)
-
-    def place(self, rng: Generator, up: float = -1.0) -> Vector:
-        """A random point of the surface, whose direction from the middle has at least that z."""
-        out = self.points_mm - self.middle_mm
-        out /= np.linalg.norm(out, axis=1, keepdims=True)
-        return self.points_mm[rng.choice(np.flatnonzero(out[:, 2] >= up))]
-
-    @property
-    def hilum_mm(self) -> Vector:
-        """Where vessels enter: the place of the surface that lies nearest to the middle."""
-        return self.points_mm[np.linalg.norm(self.points_mm - self.middle_mm, axis=1).argmin()]
-
-
-@dataclass(frozen=True, eq=False)
-class Stage:
-    """An organ of one material, perhaps slit, before it is loaded."""
-
-    organ: Organ
-    solid: NeoHookeanSolid
-    wound: Wound | None = None
-
-    def rows(self, points: Any = slice(None)) -> Any:
-        """The matrix that carries the solid's nodes to points of the surface."""
-        held = Embedding(self.solid.mesh.tets[self.organ.owner[points]], self.organ.weights[points])
-        return rows_of(held, len(self.solid.mesh.nodes_mm))
-
-    def touch(self, obstacle: Obstacle, kpa_mm: float = _HARD_KPA_MM, friction: float = 0) -> Touch:
-        return Touch(self.rows(), self.organ.areas_mm2, obstacle, kpa_mm, friction)
-
-    def patch(self, middle_mm: Vector, radius_mm: float) -> Int[np.ndarray, " p"]:
-        """Points of the surface so near; at least the nearest eight."""
-        far = np.linalg.norm(self.organ.points_mm - middle_mm, axis=1)
-        return np.flatnonzero(far <= max(radius_mm, np.sort(far)[7]))
-
-    def grip(self, points: np.ndarray, shift_mm: np.ndarray, mn_mm: float) -> Springs:
-        """Points of the surface held where a shift (one, or one each) brings them."""
-        places = self.organ.points_mm[points] + shift_mm
-        return Springs(self.rows(points), places, np.full(len(points), mn_mm / len(points)))
 
 
 class Load(NamedTuple):
@@ -366,6 +234,9 @@ class Deformed:
     def carry(self, points_mm: Points) -> Points:
         """Points in or on the organ at rest at their place now."""
         owner, weights = find(self.organ.mesh.nodes_mm[self.organ.mesh.tets], points_mm)
+        if self.wound is not None:  # lips are strained: what lies outside them moves as they do
+            weights = np.maximum(weights, 0)
+            weights /= weights.sum(1, keepdims=True)
         moved = self.nodes_mm[self.tets] - self.organ.mesh.nodes_mm[self.organ.mesh.tets]
         return points_mm + np.einsum("mi,mij->mj", weights, moved[owner])
 

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from scipy.sparse import csr_matrix
 
 _STICK_MM = 0.2  # a smaller slip meets less than full friction: keeps the energy smooth
+FACES = np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]])  # of a tetrahedron, outward
 _GRID_MM, _GRID_ROOM_MM = 2.5, 25.0
 
 
@@ -138,7 +139,7 @@ class Capsule:
 
     @classmethod
     def of(cls, mesh: TetMesh, springs_mn_mm: float) -> Capsule:
-        faces = mesh.tets[:, [[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]]].reshape(-1, 3)
+        faces = mesh.tets[:, FACES].reshape(-1, 3)
         _, first, count = np.unique(
             np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True
         )

@@ -18,7 +18,8 @@ from tumortrack.simulate.scene_folder import InnerPoints, Scene, draw_targets
 from tumortrack_lab.tets import TetMesh, tetrahedralise
 from tumortrack_lab.twin.apparatus import bench_from_ct, moved
 from tumortrack_lab.world import segmentation
-from tumortrack_lab.world.families import FAMILIES, Deformed, Organ, solve
+from tumortrack_lab.world.families import FAMILIES, Deformed, solve
+from tumortrack_lab.world.organ import Organ
 from tumortrack_lab.world.views import View, look, lump, organ_cloud
 
 Disturbance = Literal[
