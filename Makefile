@@ -8,7 +8,7 @@ INSTALL := pip install --quiet --disable-pip-version-check --no-compile --no-dep
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: help setup debian demo test test-hard check attack fuzz crash replay bench soak wheel lock licences audit results headstart training-speed foreign clean
+.PHONY: help setup debian demo test test-hard check attack fuzz crash replay bench soak wheel lock licences audit results headstart training-speed foreign world clean
 
 help:  ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 10
@@ -83,6 +83,9 @@ training-speed: setup  ## accuracy reached per second, by batch, learning rate a
 
 foreign: setup  ## how often another kidney, or a mirrored one, is called good (an hour)
 	$(BIN)/python lab/scripts/foreign.py $(ARGS)
+
+world: setup  ## scenes of wider physics, noise and views, and how a model does in them (ARGS="CASE OUT --model MODEL")
+	$(BIN)/python lab/scripts/world.py $(ARGS)
 
 wheel: setup  ## build the wheels of product and laboratory into dist/, with their dependencies (SBOM)
 	$(BIN)/pip wheel --quiet --no-deps --no-build-isolation --wheel-dir dist . ./lab

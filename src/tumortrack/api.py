@@ -420,6 +420,7 @@ def plan_resection(
     stand_mm: float | None = None,
     accept_poor: bool = False,
     accept_budget: bool = False,
+    confidence: float | None = None,
     **options: Any,
 ) -> ResectionPlan:
     """Where to cut a tumor out; nothing moves. `tumortrack plan` also plans the arms' motions.
@@ -432,6 +433,8 @@ def plan_resection(
         accept_poor: plan on a poor estimate; the plan's notes say so.
         accept_budget: plan though the margin does not cover the errors that are to be expected
             (docs/resection.md); the plan's notes say so.
+        confidence: the margin is of healthy tissue, beyond all errors, with the tumor's place as
+            sure as this, which the model's margins must state (docs/trust.md).
         options: fields of ``plan.values.ResectionConfig``: ``tumor``, ``method`` (``margin`` or
             ``published``), ``margin_mm``, ``sigmas`` and others.
 
@@ -456,13 +459,18 @@ def plan_resection(
     if isinstance(run, Estimate):
         doubt = "" if run.quality == "good" else run.reason
         seen = places.located(run.cloud, run.meshes, run.motion, table_from_camera)
-        seen = replace(seen, patient=run.patient)
+        seen = replace(seen, patient=run.patient, margin=run.report.get("margin"))
     else:
         doubt, seen = run.doubt, run.located(table_from_camera)
     notes = places.notes_of_doubt(doubt, accept_poor)
     plan = resection.plan_resection(seen, config)
+    if confidence is not None:
+        errors = budget.planned_budget(plan, seen, confidence=confidence)
+        notes = (*notes, budget.beyond_errors(config.margin_mm, errors))
+        plan = resection.plan_resection(seen, budget.widened(config, errors))
     plan = replace(plan, notes=(*notes, *plan.notes))
-    plan = budget.heeded(plan, budget.planned_budget(plan, seen), accept_budget)
+    errors = budget.planned_budget(plan, seen, confidence=confidence)
+    plan = budget.heeded(plan, errors, accept_budget)
     if picture is not None:
         from tumortrack.report.plan_pictures import draw_plan
 

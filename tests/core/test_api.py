@@ -18,7 +18,7 @@ SIGNATURES = {
     "load_case": "folder",
     "load_model": "folder device='auto'",
     "plan_resection": "located picture=None stand_mm=None accept_poor=False accept_budget=False "
-    "options",
+    "confidence=None options",
     "prepare": "source folder=None overwrite=False options",
     "read_cloud": "path unit='mm'",
     "save_estimate": "estimate folder overwrite=False",

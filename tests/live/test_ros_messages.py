@@ -359,7 +359,10 @@ def test_an_estimate_is_sent_in_metres_in_the_published_frame():
         assert meshes[name].type == meshes[name].TRIANGLE_LIST
     assert meshes["kidney"].color.a < 0.5 < meshes["tumor_1"].color.a
     assert all(marker.lifetime.sec > 0 for marker in meshes.values())
-    assert meshes["quality"].text == "fit: no check failed; its place is not verified"
+    assert meshes["quality"].text == (
+        "fit: no check failed; its place is not verified; no margin is stated: no margin is known "
+        "for this model (tumortrack margins)"
+    )
 
     point = out["tumor_1/center"].point
     middle = small_anatomy().parts[1].box_mm.mean(0)

@@ -35,7 +35,8 @@ from tumortrack.live.values import PublishedFrame, SinkContext, TrackingResult
 from tumortrack.live.viewer.look import point_under
 from tumortrack.live.viewer.panel import StatusPanel
 from tumortrack.live.viewer.slices import CarriedCt, SlicePlane, plane_through, slice_picture
-from tumortrack.live.viewer.surfaces import bare_faces, exact_margin, rough_margin
+from tumortrack.live.viewer.surfaces import bare_faces
+from tumortrack.tracking.shells import exact_margin, rough_margin
 from workcell_objects import REASON, virtual, with_arms, workcell, working
 
 TURN = Rotation.from_euler("xyz", [20, -35, 50], degrees=True).as_matrix()
@@ -260,8 +261,32 @@ def test_without_estimate_nothing_stays_and_with_one_it_is_back_at_once(sinks, c
     assert (nodes("/estimate/kidney").vertices == first).all()
 
 
-def test_part_that_was_not_found_is_not_shown(sinks, clock):
+def test_the_shell_is_the_stated_margin_and_without_one_there_is_none(sinks, clock):
     sink = sinks(hz=60)
+    nodes = sink._server.scene.get_handle_by_name
+    update = small_update(0)
+    assert update.estimate is not None
+    sink.publish(update)
+    assert drawn(sink, "tumor_1")
+    assert not drawn(sink, "margin_tumor_1")
+    assert "no margin is stated" in sink._panel.stage.content
+    radii = [
+        {"confidence": 0.9, "mm": {"tumor_1": 2.0}},
+        {"confidence": 0.95, "mm": {"tumor_1": 3}},
+    ]
+    report = {**update.estimate.report, "margin": {"stated": radii, "reason": ""}}
+    clock.sleep(1 / 60)
+    sink.publish(replace(update, estimate=replace(update.estimate, report=report)))
+    tumor, shell = (nodes(f"/estimate/{n}").vertices for n in ("tumor_1", "margin_tumor_1"))
+    off_mm = np.linalg.norm(shell - tumor, axis=1)
+    assert off_mm == pytest.approx(3.0, abs=1e-3)
+    assert not drawn(sink, "margin_tumor_2")  # of which none is stated
+    assert "95 % margin 3.0 mm" in sink._panel.stage.content
+    assert "±" not in sink._panel.stage.content
+
+
+def test_part_that_was_not_found_is_not_shown(sinks, clock):
+    sink = sinks(hz=60, margin_mm=5.0)
     update = small_update(0)
     assert update.estimate is not None
     sink.publish(update)
@@ -298,7 +323,7 @@ def test_case_gives_slices_and_an_exact_margin_that_moves_along(sinks, clock, tm
     setting = SinkContext(
         parts=PARTS[:2], published_frame=PublishedFrame(), anatomy_ct=case.anatomy
     )
-    sink = sinks(setting, case=str(tmp_path / "case"))
+    sink = sinks(setting, case=str(tmp_path / "case"), margin_mm=5.0)
     sink.publish(carried_update(case))
     until(lambda: sink._panel.slice.visible, "a slice")
     picture = sink._panel.slice.image
@@ -328,7 +353,7 @@ def test_what_is_drawn_into_a_slice_is_of_one_frame(sinks, monkeypatch, tmp_path
         save_case(case, folder)
     parts, frame = PARTS[:2], PublishedFrame()
     setting = SinkContext(parts=parts, published_frame=frame, anatomy_ct=case.anatomy)
-    sink = sinks(setting, case=str(tmp_path / "case"), hz=60)
+    sink = sinks(setting, case=str(tmp_path / "case"), hz=60, margin_mm=5.0)
     aside = Turned(rigid(TURN, np.array([23.0, -2.0, 130.0])))
     later = replace(carried_update(case, aside), quality="poor")  # shown without delay
     sink.publish(carried_update(case))
@@ -538,12 +563,7 @@ def check_arms(browser: Browser, feed: Feed, shown: TrackingResult, setting: Sin
 
 def check_click(browser: Browser, setting: SinkContext) -> None:
     """A click on the scene gives the seen point under it, in the camera's frame."""
-    rect = browser.call(
-        "Runtime.evaluate",
-        expression="(r => [r.x, r.y, r.width, r.height])"
-        "(document.querySelector('canvas').getBoundingClientRect())",
-        returnByValue=True,
-    )["result"]["value"]
+    rect = browser.box("canvas")
     browser.click_text("Click the organ")
     until(lambda: "Now click" in browser.text(), "being asked to click")
     column, row = 40, -25  # pixels from the middle of the view

@@ -25,9 +25,11 @@ from tumortrack.plan.budget import (
     TOOL_MM,
     UNKNOWN_TRACKING_MM,
     ErrorBudget,
+    beyond_errors,
     heeded,
     kept_mm,
     planned_budget,
+    widened,
 )
 from tumortrack.plan.live_budget import LiveBudget
 from tumortrack.plan.resection import plan_resection
@@ -191,3 +193,55 @@ def test_a_new_plan_helps_where_the_motion_alone_is_too_much():
     accepted = LiveBudget(budget(1.0, motion_mm=2))
     assert accepted.add_up(update(0), "tumor_1", tumor, 1.9, 1.0) == ("", False)
     assert accepted.now.left_mm < 0
+
+
+def stating(**mm):
+    """Located, by an estimate that states these margins with 90 and 95 %."""
+    said = [{"confidence": 0.9, "mm": {name: r - 1 for name, r in mm.items()}}]
+    said.append({"confidence": 0.95, "mm": mm})
+    return replace(located(std_mm=0.2), margin={"stated": said, "reason": ""})
+
+
+def test_a_calibrated_margin_is_the_tracking_term():
+    plan, seen = plan_resection(located(), ResectionConfig()), stating(tumor_1=4.5)
+    highest = planned_budget(plan, seen)
+    assert (highest.tracking_mm, highest.confidence) == (4.5, 0.95)
+    assert "  tracking   4.5  95 % margin" in highest.table()
+    chosen = planned_budget(plan, seen, confidence=0.9)
+    assert (chosen.tracking_mm, chosen.confidence) == (3.5, 0.9)
+    without = planned_budget(plan, located(std_mm=0.2))
+    assert (without.tracking_mm, without.confidence) == (LEAST_TRACKING_MM, 0)
+    assert "  tracking   3.6  not calibrated" in without.table()
+    for none in (located(std_mm=0.2), stating(tumor_2=3.0)):
+        with pytest.raises(InputError, match="states no 95 % margin of tumor_1"):
+            planned_budget(plan, none, confidence=0.95)
+
+
+def test_healthy_tissue_is_kept_beyond_all_errors():
+    seen, config = stating(tumor_1=2.0), ResectionConfig(margin_mm=3.0, most_healthy=1.0)
+    first = planned_budget(plan_resection(seen, config), seen, 0.5, 0.0, 1.0, confidence=0.95)
+    wide = widened(config, first)
+    assert wide.margin_mm == pytest.approx(3 + 1 + math.hypot(2.0, 0.5, OFF_MM))
+    plan = plan_resection(seen, wide)
+    budget = planned_budget(plan, seen, 0.5, 0.0, 1.0, confidence=0.95)
+    assert budget.left_mm == pytest.approx(3.0, abs=0.3)
+    assert "3 mm of healthy tissue" in beyond_errors(3.0, budget)
+    assert "within 2.0 mm of its estimate in 95 of 100" in beyond_errors(3.0, budget)
+    with pytest.raises(NoPlan, match=r"allowed are 20"):
+        widened(ResectionConfig(margin_mm=18.0), first)
+    for twice in (ResectionConfig(method="published"), ResectionConfig(sigmas=1.0)):
+        with pytest.raises(InputError, match="needs the method margin"):
+            widened(twice, first)
+
+
+def test_live_the_margin_of_the_moment_counts():
+    live = LiveBudget(budget(20.0, confidence=0.9))
+    of = update(0, std_mm=0.1)
+    said = stating(tumor_1=6.0).margin
+    of.estimate.report["margin"] = said
+    assert live.add_up(of, "tumor_1", sphere(TUMOR_MM, RADIUS_MM), 0.0, 20.0) == ("", False)
+    assert (live.now.tracking_mm, live.now.confidence) == (5.0, 0.9)
+    of.estimate.report["margin"] = {"stated": [], "reason": "poor"}
+    why, _ = live.add_up(of, "tumor_1", sphere(TUMOR_MM, RADIUS_MM), 0.0, 20.0)
+    assert why == "the estimate states no 90 % margin, with which it was planned"
+    assert (live.now.tracking_mm, live.now.confidence) == (LEAST_TRACKING_MM, 0)

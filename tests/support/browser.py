@@ -117,6 +117,14 @@ class Browser:
         data = self.call("Page.captureScreenshot", format="png")["data"]
         return np.asarray(Image.open(io.BytesIO(base64.b64decode(data))).convert("RGB"))
 
+    def box(self, selector: str) -> tuple[float, float, float, float]:
+        """Where the first such element is: left, top, width, height, in pixels of the page."""
+        script = f"""(r => [r.x, r.y, r.width, r.height])(
+            document.querySelector({json.dumps(selector)}).getBoundingClientRect())"""
+        found = self.call("Runtime.evaluate", expression=script, returnByValue=True)
+        left, top, width, height = found["result"]["value"]
+        return left, top, width, height
+
     def click(self, x: float, y: float) -> None:
         for kind, buttons in (("mouseMoved", 0), ("mousePressed", 1), ("mouseReleased", 0)):
             self.call(

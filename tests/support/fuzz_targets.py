@@ -324,6 +324,27 @@ def of_member(folder: Path, name: str, read: Callable[[Path], object]) -> Target
     return [content], of_bytes
 
 
+def _margins() -> dict[str, Target]:
+    from tumortrack.models import margins
+    from tumortrack.report.calibration import head_of, read_table
+
+    shells = margins.Shells(
+        confidence=0.9, radii={"tumor": margins.Radius(used="constant", constant_mm=3.0)}
+    )
+    valid = margins.ModelMargins(
+        method=margins.METHOD, tumortrack="0", model_sha256="", table_sha256="", seed=0,
+        widest_mm=8.0, limits={"rarity": 1.0}, shells=(shells,), groups=(), joined={},
+        risk_bound=0.1, accepted=1.0, missed=0.0,
+    )  # fmt: skip
+    margins.write_sealed(path := scratch() / "margins.json", valid)
+    row = {"scene": "s", "sha256": "", "label": ["a", "b", "c"], "misses": {"tumor": [[1.0, None]]}}
+    table = "\n".join(map(json.dumps, (head_of("", 0), row))).encode()
+    return {
+        "margins": ([path.read_bytes()], of_file(".json", margins.read_sealed)),
+        "margins table": ([table], of_file(".jsonl", read_table)),
+    }
+
+
 def of_base(base: Path) -> dict[str, Target]:
     """Case, scene, model, run and plan, as ``attacks.make_base`` makes them."""
     from tumortrack.imaging.case import load_case
@@ -358,7 +379,7 @@ def targets(base: Path | None = None) -> dict[str, Target]:
     found: dict[str, Target] = {}
     for make in (
         *(_cloud_files, _images, _volumes, _dicom, _meshes, _artifacts, _texts, _wire),
-        *(_configurations, _recordings),
+        *(_configurations, _recordings, _margins),
     ):
         found |= make()
     return found | (of_base(base) if base is not None else {})

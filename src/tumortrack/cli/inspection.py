@@ -159,6 +159,8 @@ def _artifact(folder: Path) -> list[str]:
             verdict = f"CHANGED or missing since they were sealed: {changed}"
         return [*lines, f"  {len(scenes)} scenes: {', '.join(scenes)}", f"  {verdict}"]
     if kind == "model":
+        from tumortrack.cli.margins import described
+        from tumortrack.models.margins import UNKNOWN, read_margins
         from tumortrack.occupancy import model  # PyTorch takes a second
 
         network = manifest.get("config", {}).get("network", {})
@@ -168,6 +170,8 @@ def _artifact(folder: Path) -> list[str]:
             does = "places the organ of the CT; `locate --map` says where points of the CT are"
         lines.append(f"  {encoder} + {decoder}: {does}")
         lines += [f"  {line}" for line in model.describe(folder)]
+        margins = read_margins(folder)
+        lines += [f"  {line}" for line in (described(margins) if margins else [UNKNOWN])]
     skip = {"kind", "schema", "tumortrack", "units", "frame", "files", "config"}
     lines += [f"  {key}: {value}" for key, value in manifest.items() if key not in skip]
     return [*lines, f"  files: {', '.join(manifest['files'])}"]

@@ -61,6 +61,7 @@ class Locate(StatedPatient):
         seen, notes = self._read()  # report what is wrong so far before PyTorch's seconds
 
         from tumortrack.core.estimate import NO_CHECK_FAILED, UNVERIFIED
+        from tumortrack.models.margins import margin_words, stated_radius
         from tumortrack.tracking.files import write_estimate
         from tumortrack.tracking.points import check_near_organ
         from tumortrack.tracking.tracker import Tracker
@@ -92,15 +93,24 @@ class Locate(StatedPatient):
         )
         write_estimate(self.out, estimate, self.overwrite, points)
         say_notes(notes)
+        margin = estimate.report.get("margin", {})
         for name, part in estimate.report["parts"].items():
             if part["found"]:
                 x, y, z = part["center_mm"]
-                say(f"{name}: {part['volume_ml']:.1f} ml, centre ({x:.1f}, {y:.1f}, {z:.1f}) mm")
+                radius = stated_radius(margin, name)
+                say(
+                    f"{name}: {part['volume_ml']:.1f} ml, centre ({x:.1f}, {y:.1f}, {z:.1f}) mm"
+                    + (f", {radius.words}" if radius else "")
+                )
             else:
                 say(f"{name}: not found")
         if points is not None:
             file = self.out / "points.csv"
-            say(f"{len(points.points_ct)} points of the CT: their places are in {file}")
+            radius = stated_radius(margin, "map")
+            said = f"; {radius.words} for all of them" if radius else ""
+            say(f"{len(points.points_ct)} points of the CT: their places are in {file}{said}")
+        if not margin.get("stated"):
+            say(margin_words(margin))
         good = estimate.quality == "good"
         say(f"{NO_CHECK_FAILED}; {UNVERIFIED}." if good
             else f"POOR: {estimate.reason}. Do not rely on it.")  # fmt: skip

@@ -16,6 +16,7 @@ from tumortrack.cli.cases import Export, Prepare, Simulate
 from tumortrack.cli.demo import Demo
 from tumortrack.cli.inspection import Doctor, Inspect
 from tumortrack.cli.locate import Evaluate, Locate
+from tumortrack.cli.margins import Margins
 from tumortrack.cli.models import Compile, Onnx
 from tumortrack.cli.plan import Plan
 from tumortrack.cli.resect import Resect
@@ -33,11 +34,12 @@ class Command(Protocol):
 
 _COMMANDS: tuple[type[Command], ...] = (
     *(Demo, Prepare, Export, Train, Pretrain, Locate, Track, Plan, Resect),
-    *(Simulate, Evaluate, Compile, Onnx, Inspect, Doctor),
+    *(Simulate, Evaluate, Margins, Compile, Onnx, Inspect, Doctor),
 )
 _ORDER = (
     *("demo", "prepare", "export", "train", "pretrain", "locate", "track", "plan", "resect"),
-    *("simulate", "twin", "evaluate", "bench", "compile", "onnx", "inspect", "doctor"),
+    *("simulate", "twin", "evaluate", "margins", "generic-margins", "bench"),
+    *("compile", "onnx", "inspect", "doctor"),
 )
 _OBJECTS_A_COLLECTION = 20_000
 _LEFT_AT_ONCE = ["locate"]  # holds nothing open in the end, and is waited for

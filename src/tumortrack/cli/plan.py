@@ -43,6 +43,8 @@ class Plan(StatedPatient):
             estimates need about 8, docs/resection.md).
         sigmas: add this many standard deviations of the estimate's own uncertainty to the margin
             (default 0).
+        confidence: the margin is of healthy tissue, beyond all errors, with the tumor's place as
+            sure as this: 0.95, say (`tumortrack margins`; docs/trust.md).
         config: JSON file with these and all other choices of the planner (docs/resection.md).
         frame: JSON file that says where the camera is; the plan is then in the robot's frame, whose
             z must point up. Without it, the camera is taken to look straight down.
@@ -63,6 +65,7 @@ class Plan(StatedPatient):
     tumor: str | None = None
     margin: float | None = None
     sigmas: float | None = None
+    confidence: float | None = None
     config: Path | None = None
     frame: Path | None = None
     stand: float | None = None
@@ -75,7 +78,7 @@ class Plan(StatedPatient):
 
     def run(self) -> None:
         from tumortrack.core.config import to_builtins
-        from tumortrack.plan.budget import heeded
+        from tumortrack.plan.budget import beyond_errors, heeded, widened
         from tumortrack.plan.files import INVENTED, KIND, PlanFolder, write_plan
         from tumortrack.plan.located import notes_of_doubt, read_run
         from tumortrack.plan.operation import OperationConfig
@@ -101,8 +104,13 @@ class Plan(StatedPatient):
                 "the run has no kidney.ply, so arms can't keep clear of it; give --no-arms."
             )
         resection = plan_resection(located, config)
-        resection = replace(resection, notes=(*doubts, *resection.notes))
         budget = self._budget(resection, located, table_from_camera, cell_config)
+        if self.confidence is not None:
+            healthy_mm, config = config.margin_mm, widened(config, budget)
+            resection = plan_resection(located, config)
+            budget = self._budget(resection, located, table_from_camera, cell_config)
+            doubts = (*doubts, beyond_errors(healthy_mm, budget))
+        resection = replace(resection, notes=(*doubts, *resection.notes))
         for line in budget.table():
             say(line)
         resection = heeded(resection, budget, self.accept_budget)
@@ -171,7 +179,8 @@ class Plan(StatedPatient):
         if self.frame is not None:
             off_mm = tumor_points(resection, located) - table_from_camera[:3, 3]
             error_mm = read_error_mm(self.frame, float(np.linalg.norm(off_mm, axis=1).max()))
-        return planned_budget(resection, located, error_mm, cell.tool_error_mm, self.moved)
+        tool_mm, sure = cell.tool_error_mm, self.confidence
+        return planned_budget(resection, located, error_mm, tool_mm, self.moved, sure)
 
     def _cell_config(self) -> CellConfig:
         from msgspec.structs import replace

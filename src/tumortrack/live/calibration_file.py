@@ -82,7 +82,9 @@ def read_frames(path: Path) -> PublishedFrame:
                 f"{path}: table_in_camera must be a unit normal (3 numbers) and the plane's offset "
                 f"in {file.unit}, camera frame, as a run's report says it."
             )
-        table = (*table[:3], table[3] * (1000 if file.unit == "m" else 1))
+        unit = float(np.linalg.norm(table[:3]))  # but for the file's few digits
+        x, y, z, offset = (number / unit for number in table)
+        table = x, y, z, offset * (1000 if file.unit == "m" else 1)
     return PublishedFrame(file.frame_id, robot_from_camera, True, camera, table)
 
 

@@ -23,6 +23,7 @@ from tumortrack.core.estimate import NO_CHECK_FAILED, UNVERIFIED, Estimate, Qual
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.patient import NOBODY, Patient
 from tumortrack.core.types import Anatomy, DepthFrame, Mesh, SensorCloud
+from tumortrack.models.margins import margin_words
 
 
 class SourceLost(TumortrackError):
@@ -224,7 +225,8 @@ class TrackingResult:
         if self.estimate is None:
             return f"no estimate: {self.reason}"
         if self.quality == "good":
-            return f"{NO_CHECK_FAILED}; {UNVERIFIED}"
+            margins = margin_words(self.estimate.report.get("margin"))
+            return f"{NO_CHECK_FAILED}; {UNVERIFIED}; {margins}"
         return f"{self.quality} estimate: {self.warning}"
 
 

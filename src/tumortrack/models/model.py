@@ -17,6 +17,7 @@ from torch import Tensor, nn
 from tumortrack.core.patient import Patient, patient_in
 from tumortrack.models.config import TrainConfig
 from tumortrack.models.in_distribution import InDistributionRange
+from tumortrack.models.margins import ModelMargins
 
 _OPSET = 18  # of ONNX files
 
@@ -43,7 +44,8 @@ class Network(nn.Module):
 class Model(ABC):
     """A network in evaluation mode and what it was trained for. ``query_box_mm``: where the organ
     can lie (lower and upper corner), relative to the median of the observed points, camera frame;
-    ``provenance``: seeds, steps, hashes; ``notes``: for the user, about this machine."""
+    ``provenance``: seeds, steps, hashes; ``notes``: for the user, about this machine; ``margins``:
+    None where it was not calibrated."""
 
     # From a NetworkConfig, with weights from torch's global generator (``torch.manual_seed``).
     new_network: ClassVar[type[Network]]
@@ -55,6 +57,7 @@ class Model(ABC):
     in_distribution: InDistributionRange
     provenance: dict[str, Any] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
+    margins: ModelMargins | None = None
 
     @property
     def patient(self) -> Patient:

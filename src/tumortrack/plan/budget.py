@@ -19,9 +19,10 @@ from scipy.spatial import cKDTree
 from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError, NoPlan
 from tumortrack.live.sinks.ur import OFF_MM
+from tumortrack.models.margins import StatedRadius, margin_words, stated_radius
 from tumortrack.plan.outline import evenly_round, polygon_of
 from tumortrack.plan.resection import inside
-from tumortrack.plan.values import CutLayer, Located, ResectionPlan
+from tumortrack.plan.values import MARGIN_MM, CutLayer, Located, ResectionConfig, ResectionPlan
 
 # So many standard deviations, but no less than the largest Hausdorff distance of a tumor in the
 # goals of docs/results.md (clinic, phantom, D3): together they cover 30 of the 32 tumors in good
@@ -55,6 +56,7 @@ class ErrorBudget(Config, frozen=True, kw_only=True):
         motion_mm: of the tumor since the plan; when planned, what is allowed for.
         lag_mm: what the tumor moves until the arms act on an estimate.
         assumed: terms that nobody measured or stated.
+        confidence: of the tracking term, where that is a calibrated margin; 0: it is not.
     """
 
     margin_mm: float
@@ -64,6 +66,7 @@ class ErrorBudget(Config, frozen=True, kw_only=True):
     motion_mm: float = 0.0
     lag_mm: float = 0.0
     assumed: tuple[str, ...] = ()
+    confidence: float = 0.0
 
     def __post_init__(self) -> None:
         for name, value in self.terms.items():
@@ -100,15 +103,25 @@ class ErrorBudget(Config, frozen=True, kw_only=True):
         """Lines for the screen."""
         lines = ["errors that the margin has to cover, mm:"]
         for name, value in self.terms.items():
-            lines.append(f"  {name:<9}{value:5.1f}{'  assumed' if name in self.assumed else ''}")
+            how = "  assumed" if name in self.assumed else ""
+            if name == "tracking" and not how:
+                sure = f"{100 * self.confidence:g} % margin"
+                how = f"  {sure if self.confidence else 'not calibrated'}"
+            lines.append(f"  {name:<9}{value:5.1f}{how}")
         lines.append(f"  {'together':<9}{self.sum_mm:5.1f}  of a margin of {self.margin_mm:.1f}")
         return lines
 
-    def seen(self, std_mm: np.ndarray | None, **terms: float) -> ErrorBudget:
+    def seen(
+        self, std_mm: np.ndarray | None, stated: StatedRadius | None = None, **terms: float
+    ) -> ErrorBudget:
         """With ``margin_mm``, ``motion_mm`` and ``lag_mm`` as they are now, and the tracking of an
-        estimate whose tumor has these standard deviations."""
+        estimate that states this margin of the tumor or, where it states none, whose tumor has
+        these standard deviations."""
         others = tuple(name for name in self.assumed if name != "tracking")
-        if std_mm is None:
+        terms["confidence"] = stated.confidence if stated else 0.0
+        if stated is not None:
+            terms["tracking_mm"] = stated.mm
+        elif std_mm is None:
             terms["tracking_mm"], others = UNKNOWN_TRACKING_MM, ("tracking", *others)
         else:
             terms["tracking_mm"] = max(DEVIATIONS * float(np.max(std_mm)), LEAST_TRACKING_MM)
@@ -121,9 +134,17 @@ def planned_budget(
     hand_eye_mm: float | None = None,
     tool_error_mm: float | None = None,
     moved_mm: float = MOVED_MM,
+    confidence: float | None = None,
 ) -> ErrorBudget:
     """The budget of a plan; ``hand_eye_mm`` and ``tool_error_mm`` are assumed where nobody states
-    them. The organ is taken to lie still, apart from ``moved_mm``: there is no lag yet."""
+    them. The organ is taken to lie still, apart from ``moved_mm``: there is no lag yet. The tumor's
+    margin is the one with this or else the highest ``confidence``. InputError: none has it."""
+    stated_mm = stated_radius(located.margin, plan.tumor, confidence)
+    if confidence is not None and stated_mm is None:
+        raise InputError(
+            f"the estimate states no {100 * confidence:g} % margin of {plan.tumor}: "
+            f"{margin_words(located.margin)}."
+        )
     stated = {"hand-eye": hand_eye_mm, "tool": tool_error_mm}
     budget = ErrorBudget(
         margin_mm=kept_mm(plan.layers, tumor_points(plan, located)),
@@ -132,7 +153,25 @@ def planned_budget(
         motion_mm=moved_mm,
         assumed=tuple(name for name, value in stated.items() if value is None),
     )
-    return budget.seen(located.std_mm.get(plan.tumor))
+    return budget.seen(located.std_mm.get(plan.tumor), stated_mm)
+
+
+def widened(config: ResectionConfig, budget: ErrorBudget) -> ResectionConfig:
+    """With the margin of healthy tissue that ``config`` asks for beyond all errors.
+
+    Raises:
+        InputError: the method keeps no margin below the tumor, or ``sigmas`` count errors twice.
+        NoPlan: it is wider than any that is planned.
+    """
+    if config.method != "margin" or config.sigmas > 0:
+        raise InputError("--confidence needs the method margin, and no --sigmas.")
+    wide_mm = config.margin_mm + budget.sum_mm
+    if wide_mm > MARGIN_MM[1]:
+        raise NoPlan(
+            f"{config.margin_mm:g} mm of healthy tissue and {budget.sum_mm:.1f} mm of error are "
+            f"{wide_mm:.1f} mm; allowed are {MARGIN_MM[1]:g}. Look from nearer, or uncover more."
+        )
+    return msgspec.structs.replace(config, margin_mm=wide_mm)
 
 
 def heeded(plan: ResectionPlan, budget: ErrorBudget, accept: bool) -> ResectionPlan:
@@ -148,6 +187,15 @@ def heeded(plan: ResectionPlan, budget: ErrorBudget, accept: bool) -> ResectionP
                 "accept_budget=True)."
             )
     return replace(plan, notes=(*plan.notes, f"{words}."))
+
+
+def beyond_errors(healthy_mm: float, budget: ErrorBudget) -> str:
+    """A note on what a widened margin is made of."""
+    return (
+        f"the margin is {healthy_mm:g} mm of healthy tissue and {budget.sum_mm:.1f} mm of error, "
+        f"with the tumor within {budget.tracking_mm:.1f} mm of its estimate in "
+        f"{100 * budget.confidence:g} of 100 such cases."
+    )
 
 
 def kept_mm(layers: tuple[CutLayer, ...], points_mm: Float[np.ndarray, "n 3"]) -> float:
@@ -182,6 +230,6 @@ def _remedy(plan: ResectionPlan, budget: ErrorBudget) -> str:
     enough_mm = math.ceil(2 * (plan.margin_mm - budget.left_mm) + 0.2) / 2
     if plan.method != "margin":
         return "The method keeps no margin below the tumor; take the method margin."
-    if enough_mm > 20:
+    if enough_mm > MARGIN_MM[1]:
         return "Look from nearer, or uncover more of the organ."
     return f"{enough_mm:g} mm would cover them (--margin, margin_mm)."

@@ -12,6 +12,7 @@ from jaxtyping import Float64
 from tumortrack.core.config import to_builtins
 from tumortrack.core.types import Mesh
 from tumortrack.live.values import TrackingResult
+from tumortrack.models.margins import stated_radius
 from tumortrack.plan.budget import ErrorBudget
 
 _SPEED_S = 0.3  # that a speed is taken over: estimates jitter from frame to frame
@@ -59,11 +60,17 @@ class LiveBudget:
             std_mm = None if places is None else motion.std_mm(places)
         self.now = now = self._planned.seen(
             std_mm,
+            stated_radius(estimate.report.get("margin"), part, self._planned.confidence or None),
             margin_mm=margin_mm,
             motion_mm=motion_mm,
             lag_mm=self._speed_mm_s(update.stamp_ns, tumor) * (late_ms / 1000 + self._servo_s),
         )
-        if self._planned.left_mm < 0 or now.left_mm >= 0:
+        if self._planned.left_mm < 0:
+            return "", False
+        if self._planned.confidence > now.confidence:
+            sure = f"{100 * self._planned.confidence:g} %"
+            return f"the estimate states no {sure} margin, with which it was planned", False
+        if now.left_mm >= 0:
             return "", False
         return now.words, msgspec.structs.replace(now, motion_mm=0.0).left_mm >= 0
 

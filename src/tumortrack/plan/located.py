@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Float64
@@ -19,6 +20,7 @@ from tumortrack.core.store import read_json, read_manifest
 from tumortrack.core.types import Mesh, OccupancyCloud
 from tumortrack.plan.values import Located, name_of
 from tumortrack.sense.ply import parse_ply_properties
+from tumortrack.tracking.files import MARGIN
 
 STAND_MM = 120.0  # the organ's lowest point over the table, where it is not known
 POOR_ESTIMATE = "PLANNED ON A POOR ESTIMATE"
@@ -71,11 +73,12 @@ class LocatedRun:
     std_mm: Float64[np.ndarray, " n"] | None
     doubt: str = ""  # why it is poor; empty: it is good
     patient: Patient = NOBODY
+    margin: dict[str, Any] | None = None  # as in its report
 
     def located(self, table_from_camera: Float[np.ndarray, "4 4"]) -> Located:
         """In the table's frame; a surface's uncertainty is that of the nearest points."""
         found = located(self.cloud, self.meshes, None, table_from_camera)
-        found = replace(found, patient=self.patient)
+        found = replace(found, patient=self.patient, margin=self.margin)
         if self.std_mm is None:
             return found
         nearest = cKDTree(found.points_mm)
@@ -125,6 +128,7 @@ def read_run(folder: Path) -> LocatedRun:
     stamp_ns = stamp_ns if isinstance(stamp_ns, int) else 0
     cloud = OccupancyCloud(table[:, :3], table[:, 3], table[:, 4], stamp_ns)
     surfaces = {Path(file).stem for file in manifest["files"] if file.endswith(".ply")}
+    surfaces = {name for name in surfaces if not name.endswith(MARGIN)}
     meshes = {name: read_mesh(folder / f"{name}.ply") for name in sorted(surfaces - {path.stem})}
     found = [name_of(label) for label in np.unique(cloud.labels) if label]
     lacking = [name for name in found if name not in meshes]
@@ -136,4 +140,4 @@ def read_run(folder: Path) -> LocatedRun:
         std_mm = parse_ply_properties(content, str(path), ("std_mm",))[:, 0]
     except InputError:  # a method without uncertainty
         std_mm = None
-    return LocatedRun(cloud, meshes, std_mm, doubt, patient)
+    return LocatedRun(cloud, meshes, std_mm, doubt, patient, report.get("margin"))

@@ -7,7 +7,7 @@ All in the ``table`` frame, mm: z up against gravity, its origin on the table's 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float, Float64, UInt8
@@ -21,8 +21,9 @@ Method = Literal["published", "margin"]
 Direction = Literal["shortest", "clockwise", "anticlockwise"]
 StrokeKind = Literal["wall", "floor"]
 Rings = tuple[Float64[np.ndarray, "_ 2"], ...]
+MARGIN_MM = (1.0, 20.0)  # allowed
 _ALLOWED = {
-    "margin_mm": (1.0, 20.0),
+    "margin_mm": MARGIN_MM,
     "sigmas": (0.0, 10.0),
     "spacing_mm": (0.2, 10.0),
     "layer_mm": (1.0, 20.0),
@@ -90,6 +91,7 @@ class Located:
         meshes: closed surfaces, as far as known: kidney (tumors included), tumor_1, ...
         std_mm: per tumor, the standard deviation of each of its mesh's vertices along any axis;
             left out where the estimate has none.
+        margin: what margins the estimate states (``models.margins``).
     """
 
     points_mm: Float[np.ndarray, "n 3"]
@@ -98,6 +100,7 @@ class Located:
     std_mm: dict[str, Float64[np.ndarray, " v"]] = field(default_factory=dict)
     stamp_ns: int = 0
     patient: Patient = NOBODY
+    margin: dict[str, Any] | None = None
 
     def of(self, label: int) -> Float[np.ndarray, "m 3"]:
         return self.points_mm[self.labels == label]

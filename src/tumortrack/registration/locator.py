@@ -57,20 +57,20 @@ class _OrganPoints:
 
 @dataclass(frozen=True, eq=False)
 class _Registered:
-    """A fit that can be this organ's: its motion, the moved surfaces (camera frame), and one
-    standard deviation (mm) at the samples, and the covariance (mm^2) at the middle of each part's
-    box."""
+    """A fit that can be this organ's: its motion, the moved surfaces (camera frame), and the
+    covariance (mm^2) at the samples and at the middle of each part's box."""
 
     fit: RegistrationResult
     motion: ElasticMotion
     meshes: dict[str, Mesh]
-    sample_std_mm: Float[np.ndarray, " k"]
+    sample_mm2: Float[np.ndarray, "k 3 3"]
     middle_mm2: Float[np.ndarray, "parts 3 3"]
 
     def probability(self, mine: _OrganPoints) -> Float32[np.ndarray, " n"]:
         """The chance that each point lies on the side of the nearest surface where it was found,
         if errors are normal."""
-        per_std = 1 / np.hypot(self.sample_std_mm, _FIELD_MM)
+        variances = np.trace(self.sample_mm2, axis1=1, axis2=2) / 3
+        per_std = 1 / np.sqrt(variances + _FIELD_MM**2)
         return kernels.probabilities(mine.margin_mm, per_std, mine.sample)
 
 
@@ -88,6 +88,7 @@ class RegistrationLocator:
         few = [_SAMPLES // 2, *[64] * len(anatomy.tumors)]
         some = [v[:: max(1, len(v) // count)] for v, count in zip(vertices, few, strict=True)]
         self._samples_ct = np.concatenate(some)
+        self._sample_ends = np.cumsum([len(one) for one in some])[:-1]  # of each part's
         self._nearest_sample = nearest_lookup(self._samples_ct)
         self._carried: _OrganPoints | None = None
 
@@ -171,19 +172,20 @@ class RegistrationLocator:
         )
         assert known_mm2 is not None
         count = len(self._samples_ct)
-        deviation = np.sqrt(np.trace(known_mm2[:count], axis1=1, axis2=2) / 3)
-        return _Registered(fit, motion, meshes, deviation, known_mm2[count:])
+        return _Registered(fit, motion, meshes, known_mm2[:count], known_mm2[count:])
 
     def _report(
         self, frame: Frame, placed: _Registered, inside: OccupancyCloud, **more: Any
     ) -> dict[str, Any]:
         fit, motion, process = placed.fit, placed.motion, placed.motion.discrepancy
         parts = describe_parts(self._model.parts, placed.meshes, inside)
-        for part, mm2 in zip(parts.values(), placed.middle_mm2, strict=True):
+        surfaces = np.split(placed.sample_mm2, self._sample_ends)
+        for part, mm2, its_mm2 in zip(parts.values(), placed.middle_mm2, surfaces, strict=True):
             squares, axes = np.linalg.eigh(mm2)
             part["center_std_mm"] = float(np.sqrt(squares.mean()))
             part["center_axes_std_mm"] = np.sqrt(squares[::-1]).tolist()
             part["center_axes"] = axes.T[::-1].tolist()
+            part["surface_std_mm"] = float(np.sqrt(np.linalg.eigvalsh(its_mm2).max()))
         others = [
             {"more": rival.cost - fit.cost, "apart_mm": self._apart_mm(fit.motion, rival.motion)}
             for rival in fit.rivals

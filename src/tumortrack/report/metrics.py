@@ -18,6 +18,7 @@ from tumortrack.core.estimate import Motion
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.types import Anatomy, CameraLabels, Mesh
 from tumortrack.imaging.raster import expand, label_grid
+from tumortrack.simulate.occupancy import contains
 from tumortrack.simulate.scene_folder import Targets
 
 # Vertices are sampled too, so the maximum misses at most s^2 / (8 R) where a flat piece of size s
@@ -145,6 +146,14 @@ def distance_to_surface(
         distance = triangle_distance(points_mm[new], triangles[faces[new, column]])
         best[new] = np.minimum(best[new], distance)
     return best
+
+
+def outward_miss(estimate: Mesh, reference: Mesh) -> float:
+    """The largest distance, mm, by which the reference sticks out of the estimate's closed surface:
+    a shell as wide about the estimate holds all of the reference. 0: it sticks out nowhere."""
+    points_mm = surface_samples(reference)[0]
+    outside = points_mm[~contains(estimate, points_mm)]
+    return float(distance_to_surface(outside, estimate).max()) if len(outside) else 0.0
 
 
 def weighted_percentile(

@@ -11,8 +11,12 @@ from tumortrack.core.estimate import Estimate
 from tumortrack.core.mesh_files import write_mesh
 from tumortrack.imaging.nifti import write_nifti
 from tumortrack.imaging.segmentation import segments, write_seg_nrrd
+from tumortrack.models.margins import stated_radius
 from tumortrack.sense.ply import write_cloud_ply
 from tumortrack.tracking.points import PointTable, camera_table
+from tumortrack.tracking.shells import exact_margin
+
+MARGIN = "_margin"  # ends the names of shells
 
 
 def write_estimate(
@@ -20,8 +24,9 @@ def write_estimate(
 ) -> None:
     """occupancy.ply (points with label and probability and, where the estimate knows the way
     back, their place in the CT), labels.nii.gz (voxel -> camera frame, mm), labels.seg.nrrd (the
-    same for 3D Slicer), kidney.ply, tumor_1.ply, ... and report.json; points.csv, the given
-    ``points`` of the CT and where they are now; all or nothing.
+    same for 3D Slicer), kidney.ply, tumor_1.ply, ... and report.json; tumor_1_margin.ply, ...,
+    the shells of the highest confidence, where margins are stated; points.csv, the given ``points``
+    of the CT and where they are now; all or nothing.
 
     Raises:
         InputError: the folder exists and ``overwrite`` is False; points without a motion.
@@ -30,6 +35,7 @@ def write_estimate(
     """
     cloud, volume = estimate.cloud, estimate.volume
     assert volume is not None  # live estimates are the recording sink's
+    organ = next(iter(estimate.meshes), "")
     with store.new_folder(folder, overwrite) as aside:
         values = {"label": cloud.labels, "probability": cloud.probability}
         values |= _places_in_ct(estimate)
@@ -40,6 +46,9 @@ def write_estimate(
         write_seg_nrrd(aside / "labels.seg.nrrd", labels, way, parts)
         for name, mesh in estimate.meshes.items():
             write_mesh(aside / f"{name}.ply", mesh)
+            margin = stated_radius(estimate.report.get("margin"), name)
+            if margin is not None and name != organ:
+                write_mesh(aside / f"{name}{MARGIN}.ply", exact_margin(mesh, margin.mm))
         if points is not None:
             table = camera_table(points, estimate.motion)
             store.write_atomically(aside / "points.csv", table)

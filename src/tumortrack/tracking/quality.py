@@ -10,6 +10,7 @@ from scipy.ndimage import distance_transform_edt
 from tumortrack.core.errors import NoEstimate
 from tumortrack.core.estimate import Estimate, Quality
 from tumortrack.core.types import DepthFrame, Intrinsics, Mesh, SensorCloud
+from tumortrack.models.margins import ModelMargins, exceeded, measured, stated_margin
 from tumortrack.sense.render import render_depth
 
 # Standard deviation of a tumor's middle, and how far from it another fit, nearly as likely, may
@@ -70,6 +71,24 @@ def judged(estimate: Estimate, seen: DepthFrame | SensorCloud) -> Estimate:
     quality: Quality = "poor" if reason else "good"
     estimate.report["quality"] = {"verdict": quality, "reason": reason}
     return replace(estimate, quality=quality, reason=reason)
+
+
+def with_margin(estimate: Estimate, cloud: SensorCloud, margins: ModelMargins | None) -> Estimate:
+    """The estimate with what its model's ``margins`` say in its report; where they say nothing of
+    such a one it is ``poor``: within the margin, or no answer.
+
+    Args:
+        cloud: in which it was located.
+    """
+    report, organ = estimate.report, next(iter(estimate.meshes.values()))
+    if margins is not None and estimate.quality == "good":
+        if "unseen" not in report:
+            report["unseen"] = cloud_shares(organ, cloud)[1]
+        if reason := exceeded(margins.limits, measured(report)):
+            report["quality"] = {"verdict": "poor", "reason": reason}
+            estimate = replace(estimate, quality="poor", reason=reason)
+    report["margin"] = stated_margin(report, margins, estimate.quality == "good")
+    return estimate
 
 
 def _doubt(estimate: Estimate) -> str:

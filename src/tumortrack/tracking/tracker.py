@@ -22,7 +22,7 @@ from tumortrack.registration.locator import RegistrationLocator
 from tumortrack.registration.model import RegistrationModel
 from tumortrack.sense.cloud import CloudConfig
 from tumortrack.sense.region import RegionConfig
-from tumortrack.tracking.quality import judged
+from tumortrack.tracking.quality import judged, with_margin
 
 _ALONE = Following()
 
@@ -69,7 +69,7 @@ class Tracker:
         """
         if seed < 0:
             raise InputError(f"the seed is {seed}; it must be 0 or more.")
-        return self._judged(self._locator.locate(cloud, grid, seed), seen or cloud)
+        return self._judged(self._locator.locate(cloud, grid, seed), cloud, seen or cloud)
 
     def follow(
         self,
@@ -85,11 +85,14 @@ class Tracker:
             NoEstimate: as ``locate``.
             InputError: the cloud is in metres.
         """
-        return self._judged(self._locator.follow(cloud, last, how), seen or cloud)
+        return self._judged(self._locator.follow(cloud, last, how), cloud, seen or cloud)
 
-    def _judged(self, estimate: Estimate, seen: DepthFrame | SensorCloud) -> Estimate:
+    def _judged(
+        self, estimate: Estimate, cloud: SensorCloud, seen: DepthFrame | SensorCloud
+    ) -> Estimate:
         start = time.perf_counter()
-        estimate = replace(judged(estimate, seen), patient=self._patient)
+        estimate = with_margin(judged(estimate, seen), cloud, self.model.margins)
+        estimate = replace(estimate, patient=self._patient)
         estimate.report["patient"] = to_builtins(self._patient)
         seconds = estimate.report["timings"]
         seconds["judge"] = time.perf_counter() - start

@@ -19,6 +19,7 @@ from tumortrack.models.config import NetworkConfig, RegistrationHeadConfig, Trai
 from tumortrack.models.folder import KIND, WEIGHTS, read_model_manifest, read_tensors
 from tumortrack.models.hardware import choose_device
 from tumortrack.models.in_distribution import InDistributionRange
+from tumortrack.models.margins import read_margins
 from tumortrack.models.model import Model, Network
 from tumortrack.models.normalisation import Aligned
 from tumortrack.occupancy.model import OccupancyModel
@@ -49,11 +50,15 @@ def save_model(model: Model, folder: Path) -> None:
     store.seal(folder, KIND, content, frame="camera")
 
 
-def load_model(folder: Path, device: str = "auto") -> Model:
+def load_model(folder: Path, device: str = "auto", with_margins: bool = True) -> Model:
     """Read a model folder.
 
+    Args:
+        with_margins: and its margins, where it was calibrated.
+
     Raises:
-        ArtifactError: missing, of another schema, damaged, or weights changed since training.
+        ArtifactError: missing, of another schema, damaged, or weights changed since training; its
+            margins are another model's, or of another version of the method.
         InputError: CUDA is requested where there is none.
     """
     manifest = read_model_manifest(folder)
@@ -72,6 +77,7 @@ def load_model(folder: Path, device: str = "auto") -> Model:
             query_box_mm=_query_box(manifest["query_box_mm"]),
             in_distribution=known,
             provenance=dict(manifest["provenance"]),
+            margins=read_margins(folder) if with_margins else None,
         )
         model.patient  # noqa: B018 - nonsense is told here
         return model

@@ -84,10 +84,10 @@ class Apparatus:
         self, anatomy_ct: Anatomy, up_lps: tuple[float, float, float], config: ApparatusConfig
     ) -> None:
         self.config = config
-        self.bench_from_ct = _bench_from_ct(anatomy_ct.organ, up_lps)
+        self.bench_from_ct = bench_from_ct(anatomy_ct.organ, up_lps)
         self.anatomy = moved(anatomy_ct, self.bench_from_ct)
         self.mesh = tetrahedralise(self.anatomy.organ, config.edge_mm)
-        ratio = 1 + (config.tumor_ratio - 1) * _tumor_share(self.mesh, self.anatomy)
+        ratio = 1 + (config.tumor_ratio - 1) * tumor_share(self.mesh, self.anatomy)
         shear_kpa = config.youngs_kpa * ratio / (2 * (1 + config.poisson))
         self.solid = NeoHookeanSolid(self.mesh, shear_kpa, config.poisson)
         # One point of the surface per cube of 1 mm that it passes, and the area there.
@@ -143,7 +143,7 @@ def triangles(mesh: Mesh) -> tuple[Float64[np.ndarray, "f 3"], Float64[np.ndarra
     return (a + b + c) / 3, np.cross(b - a, c - a)
 
 
-def _bench_from_ct(organ_ct: Mesh, up_lps: tuple[float, float, float]) -> np.ndarray:
+def bench_from_ct(organ_ct: Mesh, up_lps: tuple[float, float, float]) -> np.ndarray:
     upright = rotation_onto(np.array(up_lps), np.array([0.0, 0.0, 1.0]))
     flat = (organ_ct.vertices_mm - organ_ct.vertices_mm.mean(0)) @ upright.T
     x, y = np.linalg.eigh(np.cov(flat[:, :2].T))[1][:, 1]
@@ -164,7 +164,7 @@ def _faces_down(
     return np.asarray(down[cKDTree(middle).query(points_mm)[1]])
 
 
-def _tumor_share(mesh: TetMesh, anatomy: Anatomy) -> Float64[np.ndarray, " t"]:
+def tumor_share(mesh: TetMesh, anatomy: Anatomy) -> Float64[np.ndarray, " t"]:
     """Share of each tetrahedron that lies in a tumor, by a voxel grid of 1 mm."""
     low = np.floor(anatomy.organ.box_mm[0]) - 1
     shape = np.ceil(anatomy.organ.box_mm[1] - low).astype(int) + 2

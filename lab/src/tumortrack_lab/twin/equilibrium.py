@@ -12,7 +12,7 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float64
@@ -167,6 +167,16 @@ class Hold:
         return self.stiffness_mn_mm * float(amounts @ amounts) / 2, gradient
 
 
+@runtime_checkable
+class Equilibrium(Protocol):
+    """What ``settle`` brings to rest: an energy (uJ) with its gradient (mN), an approximate
+    Hessian (3 n, 3 n; mN/mm), and the load (mN) that unbalanced forces are measured against."""
+
+    def energy(self, nodes_mm: Nodes) -> tuple[float, Nodes]: ...
+    def stiffness(self, nodes_mm: Nodes) -> csr_matrix: ...
+    def load_mn(self, nodes_mm: Nodes) -> float: ...
+
+
 @dataclass(frozen=True, eq=False)
 class EquilibriumProblem:
     """A solid among obstacles under its weight. Units: mm, kPa, mN, uJ."""
@@ -190,6 +200,13 @@ class EquilibriumProblem:
             gradient += slope
         return energy, gradient
 
+    def stiffness(self, nodes_mm: Nodes) -> csr_matrix:
+        """Of the solid at rest, and of the contacts as they are now."""
+        matrix = self.solid.rest_stiffness
+        for contact, obstacles in self.contacts:
+            matrix = matrix + contact.stiffness(nodes_mm, obstacles)
+        return matrix
+
     def load_mn(self, nodes_mm: Nodes) -> float:
         """What unbalanced forces are measured against: weight and contact forces, summed."""
         pushes = [c.load_mn(nodes_mm, obstacle) for c, some in self.contacts for obstacle in some]
@@ -203,14 +220,16 @@ class Convergence:
     residual: float  # unbalanced force / load
 
 
-def settle(problem: EquilibriumProblem, start_mm: Nodes) -> tuple[Nodes, Convergence]:
+def settle(
+    problem: Equilibrium, start_mm: Nodes, most: int = _ITERATIONS
+) -> tuple[Nodes, Convergence]:
     """Nodes at rest, from a start in which no element is turned over. Raises TumortrackError: no
-    equilibrium within 1,500 iterations."""
+    equilibrium within so many iterations."""
     nodes, evaluations = start_mm, 0
     energy, gradient = problem.energy(nodes)
     precondition = _factorised(problem, nodes)
     pairs: Pairs = deque(maxlen=_MEMORY)
-    for iteration in range(_ITERATIONS):
+    for iteration in range(most):
         residual = float(np.linalg.norm(gradient)) / max(problem.load_mn(nodes), _LEAST_LOAD_MN)
         if residual < TOLERANCE:
             return nodes, Convergence(iteration, evaluations, residual)
@@ -235,7 +254,7 @@ def settle(problem: EquilibriumProblem, start_mm: Nodes) -> tuple[Nodes, Converg
         if moved @ turned > 1e-10 * np.linalg.norm(moved) * np.linalg.norm(turned):
             pairs.append((moved, turned))
         nodes, energy, gradient = trial, trial_energy, trial_gradient
-    raise _stuck(_ITERATIONS, residual)
+    raise _stuck(most, residual)
 
 
 def _two_loop(gradient: np.ndarray, pairs: Pairs, precondition: Solve) -> np.ndarray:
@@ -251,15 +270,13 @@ def _two_loop(gradient: np.ndarray, pairs: Pairs, precondition: Solve) -> np.nda
     return out
 
 
-def _factorised(problem: EquilibriumProblem, nodes: Nodes) -> Solve:
-    """Solves with the rest stiffness and the contacts as they are now."""
+def _factorised(problem: Equilibrium, nodes: Nodes) -> Solve:
+    """Solves with the stiffness as it is now."""
     from scipy.sparse import eye
 
-    matrix = problem.solid.rest_stiffness
+    matrix = problem.stiffness(nodes)
     # A little on the diagonal stands for the hold: it alone has no motion free of force.
     ground = 1e-3 * matrix.diagonal().mean()
-    for contact, obstacles in problem.contacts:
-        matrix = matrix + contact.stiffness(nodes, obstacles)
     return factorised(matrix + ground * eye(matrix.shape[0]))
 
 

@@ -1,4 +1,4 @@
-"""A web page that shows each estimate: ``viewer:8080?case=CASE_FOLDER&margin_mm=5``.
+"""A web page that shows each estimate: ``viewer:8080?case=CASE_FOLDER``.
 
 Who may see it and who may change anything is the affair of ``viewer.guard``.
 
@@ -53,7 +53,8 @@ class ViewerSinkConfig(SinkConfig, frozen=True, kw_only=True, tag="viewer"):
             a name of this machine, by which the page may then be called.
         case: folder of the patient's case: its CT (its labels, where it has none) is shown in
             slices.
-        margin_mm: distance of the shell round each tumor; 0: none.
+        margin_mm: a fixed distance of the shell round each tumor; 0: no shell. By default it is
+            the margin that the model states for each estimate, and no shell where it states none.
         hz: how often clouds and surfaces are sent at the most.
     """
 
@@ -62,11 +63,13 @@ class ViewerSinkConfig(SinkConfig, frozen=True, kw_only=True, tag="viewer"):
     port: int = 8080
     host: str = "127.0.0.1"
     case: str = ""
-    margin_mm: float = 5.0
+    margin_mm: float | None = None
     hz: float = 15.0
 
     def __post_init__(self) -> None:
-        self.check_ranges("viewer:", "0", port=65535, margin_mm=50)
+        self.check_ranges("viewer:", "0", port=65535)
+        if self.margin_mm is not None:
+            self.check_ranges("viewer:", "0 (no shell)", margin_mm=50)
         if not 0 < self.hz <= 60:
             raise InputError(f"viewer: hz={self.hz:g}; allowed are more than 0 and up to 60.")
         if self.case and not Path(self.case).is_dir():

@@ -63,9 +63,9 @@ class RecordingSourceConfig(SourceConfig, frozen=True, kw_only=True, tag="record
 
     def patient(self) -> Patient:
         about = (self.path if self.path.is_dir() else self.path.parent) / ABOUT
-        return (
-            patient_in(read_json(about).get("patient"), str(about)) if about.is_file() else NOBODY
-        )
+        if not about.is_file():
+            return NOBODY
+        return patient_in(read_json(about).get("patient"), str(about))
 
     def open(self) -> RecordingSource:
         """Find the frames; none is read yet. Raises InputError if there are none to play."""

@@ -21,6 +21,7 @@ from tumortrack.live.values import TrackingResult, Workcell
 from tumortrack.live.viewer.look import View
 from tumortrack.live.viewer.scene import DisplayOptions
 from tumortrack.live.viewer.slices import ORIENTATIONS
+from tumortrack.models.margins import margin_words, stated_radius
 
 if TYPE_CHECKING:
     from viser import ViserServer
@@ -140,7 +141,7 @@ class StatusPanel:
         parts = ""
         if result.estimate is not None and self.state in ("good", "poor"):
             report = result.estimate.report
-            parts = _parts(report.get("parts", {}))
+            parts = _parts(report)
             lag_ms = report.get("smoothing", {}).get("lag_ms", 0.0)
             latency += f" + {lag_ms:.0f} smoothing" if lag_ms >= 0.5 else ""
         stages = {k: v for k, v in result.seconds.items() if "." not in k}  # "a.b" is a part of a
@@ -171,25 +172,27 @@ def _box(text: str, colour: Colour, why: str = "") -> str:
     )
 
 
-def _parts(parts: Mapping[str, dict[str, Any]]) -> str:
-    """A row per part: colour, name, probability as a bar and number, volume, deviation."""
-    rows = []
-    for name, part in parts.items():
+def _parts(report: Mapping[str, Any]) -> str:
+    """A row per part: colour, name, probability as a bar and number, volume, margin; and why there
+    is no margin."""
+    rows, said = [], report.get("margin", {})
+    for name, part in report.get("parts", {}).items():
         swatch = f"background:{css(part_colour(part['label']))}"
         probability = part.get("probability")
         if not part.get("found") or probability is None:
             rest = "<td colspan=4 style='opacity:0.7'>not found</td>"
         else:
-            deviation = part.get("center_std_mm")
+            margin = stated_radius(said, name)
             bar = f"<div style='{swatch};width:{100 * probability:.0f}%'></div>"
             rest = (
                 f"<td><div class='tumortrack-bar'>{bar}</div></td><td>{probability:.2f}</td>"
                 f"<td>{part['volume_ml']:.1f} ml</td>"
-                f"<td>{'' if deviation is None else f'± {deviation:.1f} mm'}</td>"
+                f"<td>{margin.words if margin else ''}</td>"
             )
         label = escape(name.replace("_", " "))
         rows.append(f"<tr><td><i style='{swatch}'></i>{label}</td>{rest}</tr>")
-    return f"<table>{''.join(rows)}</table>"
+    none = f"<div>{escape(margin_words(said))}</div>" if not said.get("stated") else ""
+    return f"<table>{''.join(rows)}</table>{none}"
 
 
 class Panel:

@@ -22,7 +22,9 @@ from tumortrack.live.display import MOST_SEEN, seen_points, thinned, wxyz_of
 from tumortrack.live.values import TrackingResult, TransformedEstimate
 from tumortrack.live.viewer.look import Look
 from tumortrack.live.viewer.slices import SlicePlane
-from tumortrack.live.viewer.surfaces import bare_faces, exact_margin, rough_margin
+from tumortrack.live.viewer.surfaces import bare_faces
+from tumortrack.models.margins import stated_radius
+from tumortrack.tracking.shells import exact_margin, rough_margin
 
 if TYPE_CHECKING:
     from viser import MeshHandle, PointCloudHandle, ViserServer
@@ -53,13 +55,15 @@ class DisplayOptions:
 class ViewerScene:
     """viser's nodes, and what goes into them."""
 
-    def __init__(self, server: ViserServer, context: live.SinkContext, margin_mm: float) -> None:
+    def __init__(
+        self, server: ViserServer, context: live.SinkContext, margin_mm: float | None
+    ) -> None:
         self._nodes, self._margin_mm = server.scene, margin_mm
         self._way = context.published_frame.published_from_camera
         self._at_rest, self._margins_ct = context.anatomy_ct, None
         if self._at_rest is not None:
             self._bare_faces = bare_faces(self._at_rest)
-            if margin_mm > 0:
+            if margin_mm:
                 self._margins_ct = [exact_margin(part, margin_mm) for part in self._at_rest.tumors]
         self.options = DisplayOptions()
         self.margins: dict[str, Mesh] = {}  # of the shown estimate, published frame
@@ -85,7 +89,7 @@ class ViewerScene:
         self._shells, self._parts = {}, {}
         for label, name in enumerate(context.parts, start=1):
             look = {"color": colours.part_colour(label), "visible": False}
-            if label > 1 and self._margin_mm > 0:
+            if label > 1 and self._margin_mm != 0:
                 # Its far half: the near one would cover the organ that it reaches out of.
                 path = f"/estimate/margin_{name}"
                 self._shells[name] = self._mesh(path, _NOTHING, opacity=0.3, side="back", **look)
@@ -255,6 +259,10 @@ class ViewerScene:
         assert result.estimate is not None
         tumors = {n: m for n, m in placed.meshes.items() if n in self._shells}
         motion = result.estimate.motion
+        if self._margin_mm is None:
+            said = result.estimate.report.get("margin")
+            radii = {name: stated_radius(said, name) for name in tumors}
+            return {n: rough_margin(tumors[n], radius.mm) for n, radius in radii.items() if radius}
         if self._margins_ct is None or motion is None:
             return {name: rough_margin(mesh, self._margin_mm) for name, mesh in tumors.items()}
         return {

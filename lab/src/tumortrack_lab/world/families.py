@@ -1,0 +1,441 @@
+"""One organ on the bench and the states that it is brought into: families of loads, each state one
+random draw of material, bed and load.
+
+What the twin's bench does not do: soft to hard beds with a rim, friction, an organ that is free to
+roll, vessels, grips that twist, clamp or pull, a slit that is pulled open, tissue that is uneven
+and has a capsule. Ranges are assumptions, wide on purpose, where no source stands beside them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float64, Int
+
+from tumortrack.core.errors import InputError, TumortrackError
+from tumortrack.core.geometry import perpendicular, unit
+from tumortrack.core.types import Anatomy
+from tumortrack.report.metrics import surface_samples
+from tumortrack_lab.tets import Embedding, TetMesh, find
+from tumortrack_lab.twin import equilibrium
+from tumortrack_lab.twin.apparatus import GRAVITY_KPA_PER_MM, tumor_share
+from tumortrack_lab.twin.equilibrium import ContactPlate, Nodes, Points, Rod
+from tumortrack_lab.twin.solid import NeoHookeanSolid
+from tumortrack_lab.world.forces import (
+    Bed,
+    Capsule,
+    Force,
+    LoadedBody,
+    Obstacle,
+    Springs,
+    Steady,
+    Touch,
+    Turned,
+    Weight,
+    rows_of,
+)
+
+LARGEST_CHANGE, NEARLY_NONE = 0.05, 0.02  # of volume; from Poisson's ratio 0.49 on the second
+_SAMPLE_MM = 3.0  # one point of contact per cube of this size
+_HARD_KPA_MM = 150.0  # of plates, rods
+_BED_DEPTH_MM = 15.0  # of fat under the organ: what turns the bed's modulus into stiffness
+_GRIP_MN_MM = 4000.0  # of a grip, over all its points
+_STEP_MM = 6.0  # of a load, at a time
+_GRAVITY = 1050.0 * GRAVITY_KPA_PER_MM  # of soft tissue, mN/mm3
+_ITERATIONS = 400  # a step: one that needs more mostly finds none
+_CLEAR_MM = 6.0  # between a slit and every tumor: as wide as a tetrahedron
+
+Generator = np.random.Generator
+Vector = Float64[np.ndarray, " 3"]
+
+
+def log_uniform(rng: Generator, low: float, high: float) -> float:
+    return float(np.exp(rng.uniform(np.log(low), np.log(high))))
+
+
+class Slit(NamedTuple):
+    """A plane patch across which tetrahedra are parted: a disc about a point of the surface."""
+
+    middle_mm: Vector
+    normal: Vector
+    radius_mm: float
+
+
+class Wound(NamedTuple):
+    """A mesh with a slit: ``side`` of each tetrahedron (True: where the normal points), and the
+    ``walls``: triangles of nodes that were inside and now face the gap, turned outward."""
+
+    mesh: TetMesh
+    side: Bool[np.ndarray, " t"]
+    walls: Int[np.ndarray, "w 3"]
+    slit: Slit
+
+
+def cut_open(mesh: TetMesh, slit: Slit) -> Wound:
+    """Part the mesh: nodes that lie inside the slit are doubled. Raises InputError: the slit meets
+    no face between tetrahedra."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    middles = mesh.nodes_mm[mesh.tets].mean(1)
+    side = (middles - slit.middle_mm) @ slit.normal > 0
+    faces = mesh.tets[:, [[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]]].reshape(-1, 3)
+    owner = np.repeat(np.arange(len(mesh.tets)), 4)
+    _, pair = np.unique(np.sort(faces, axis=1), axis=0, return_inverse=True)
+    order = np.argsort(pair, kind="stable")
+    twice = np.flatnonzero(np.diff(pair[order]) == 0)
+    first, second = order[twice], order[twice + 1]
+    near = np.linalg.norm(mesh.nodes_mm[faces[first]].mean(1) - slit.middle_mm, axis=1)
+    parted = (side[owner[first]] != side[owner[second]]) & (near < slit.radius_mm)
+    if not parted.any():
+        raise InputError("the slit meets no face between tetrahedra; make it larger.")
+    # A corner is one node's in one tetrahedron; whole faces sew the corners of two together.
+    tets, corner = mesh.tets, np.arange(mesh.tets.size).reshape(-1, 4)
+    a, b = owner[first[~parted]], owner[second[~parted]]
+    same = tets[a][:, :, None] == tets[b][:, None]
+    which, i, j = np.nonzero(same)
+    links = corner[a[which], i], corner[b[which], j]
+    graph = coo_matrix((np.ones(len(which), bool), links), (tets.size, tets.size))
+    _, node = connected_components(graph, directed=False)
+    nodes_mm = np.empty((node.max() + 1, 3))
+    nodes_mm[node] = mesh.nodes_mm[tets.ravel()]
+    parted_tets = node.reshape(-1, 4).astype(np.int32)
+    new = parted_tets[:, [[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]]].reshape(-1, 3)
+    walls = new[np.concatenate([first[parted], second[parted]])]
+    return Wound(TetMesh(nodes_mm, parted_tets), side, walls, slit)
+
+
+@dataclass(frozen=True, eq=False)
+class Organ:
+    """A case on the bench (frame of ``twin.apparatus``) with its tetrahedra."""
+
+    anatomy: Anatomy
+    mesh: TetMesh
+    bed: Bed
+    in_tumor: Float64[np.ndarray, " t"]  # share of each tetrahedron
+    points_mm: Points  # of the surface, for contact
+    areas_mm2: Float64[np.ndarray, " m"]
+    owner: Int[np.ndarray, " m"]  # tetrahedron and weights that hold each point
+    weights: Float64[np.ndarray, "m 4"]
+
+    @classmethod
+    def of(cls, anatomy: Anatomy, mesh: TetMesh) -> Organ:
+        points, areas, _ = surface_samples(anatomy.organ, _SAMPLE_MM / 2)
+        _, first, cube = np.unique(
+            np.floor(points / _SAMPLE_MM), axis=0, return_index=True, return_inverse=True
+        )
+        points, areas = points[first], np.bincount(cube.ravel(), areas)
+        share = tumor_share(mesh, anatomy) if anatomy.tumors else np.zeros(len(mesh.tets))
+        held = find(mesh.nodes_mm[mesh.tets], points)
+        return cls(anatomy, mesh, Bed.of(anatomy.organ), share, points, areas, *held)
+
+    @property
+    def size_mm(self) -> Vector:
+        return np.ptp(self.anatomy.organ.box_mm, axis=0)
+
+    @property
+    def middle_mm(self) -> Vector:
+        return self.anatomy.organ.vertices_mm.mean(0)
+
+    def place(self, rng: Generator, up: float = -1.0) -> Vector:
+        """A random point of the surface, whose direction from the middle has at least that z."""
+        out = self.points_mm - self.middle_mm
+        out /= np.linalg.norm(out, axis=1, keepdims=True)
+        return self.points_mm[rng.choice(np.flatnonzero(out[:, 2] >= up))]
+
+    @property
+    def hilum_mm(self) -> Vector:
+        """Where vessels enter: the place of the surface that lies nearest to the middle."""
+        return self.points_mm[np.linalg.norm(self.points_mm - self.middle_mm, axis=1).argmin()]
+
+
+@dataclass(frozen=True, eq=False)
+class Stage:
+    """An organ of one material, perhaps slit, before it is loaded."""
+
+    organ: Organ
+    solid: NeoHookeanSolid
+    wound: Wound | None = None
+
+    def rows(self, points: Any = slice(None)) -> Any:
+        """The matrix that carries the solid's nodes to points of the surface."""
+        held = Embedding(self.solid.mesh.tets[self.organ.owner[points]], self.organ.weights[points])
+        return rows_of(held, len(self.solid.mesh.nodes_mm))
+
+    def touch(self, obstacle: Obstacle, kpa_mm: float = _HARD_KPA_MM, friction: float = 0) -> Touch:
+        return Touch(self.rows(), self.organ.areas_mm2, obstacle, kpa_mm, friction)
+
+    def patch(self, middle_mm: Vector, radius_mm: float) -> Int[np.ndarray, " p"]:
+        """Points of the surface so near; at least the nearest eight."""
+        far = np.linalg.norm(self.organ.points_mm - middle_mm, axis=1)
+        return np.flatnonzero(far <= max(radius_mm, np.sort(far)[7]))
+
+    def grip(self, points: np.ndarray, shift_mm: np.ndarray, mn_mm: float) -> Springs:
+        """Points of the surface held where a shift (one, or one each) brings them."""
+        places = self.organ.points_mm[points] + shift_mm
+        return Springs(self.rows(points), places, np.full(len(points), mn_mm / len(points)))
+
+
+class Load(NamedTuple):
+    """``at``: the forces at a share 0..1 of the load; ``reach_mm``: how far it goes; ``free``:
+    nothing but bed and load holds the organ; ``rim``: of the bed, shares of the organ's height."""
+
+    at: Callable[[float], list[Force]]
+    reach_mm: float
+    about: dict[str, Any]
+    free: bool = False
+    rim: tuple[float, float] = (0.1, 0.4)
+    smooth: bool = False  # the bed has no friction
+
+
+def _plate(stage: Stage, rng: Generator) -> Load:
+    """A plate from any side above, up to 70 degrees oblique."""
+    tilt, turn = rng.uniform(0, np.deg2rad(70)), rng.uniform(0, 2 * np.pi)
+    out = np.array([np.sin(tilt) * np.cos(turn), np.sin(tilt) * np.sin(turn), np.cos(tilt)])
+    width, deep = rng.uniform(12, 60), rng.uniform(3, 0.3 * stage.organ.size_mm[2])
+    target = stage.organ.place(rng, 0.0)
+    axes = _axes(out, rng)
+
+    def at(share: float) -> list[Force]:
+        return [stage.touch(_pressed(stage, axes, target, width, share * deep))]
+
+    return Load(at, deep, {"plate_tilt_degrees": np.rad2deg(tilt), "width_mm": width, "mm": deep})
+
+
+def _clamp(stage: Stage, rng: Generator) -> Load:
+    """Two plates from opposite sides, about level."""
+    turn, width = rng.uniform(0, 2 * np.pi), rng.uniform(15, 60)
+    out = unit(np.array([np.cos(turn), np.sin(turn), rng.uniform(-0.2, 0.2)]))
+    thick = float(np.ptp(stage.organ.points_mm @ out))
+    deep = rng.uniform(2.0, 0.14 * min(thick, 80.0), 2)
+    target, axes = stage.organ.place(rng), _axes(out, rng)
+    back = axes * [-1.0, 1.0, -1.0]
+
+    def at(share: float) -> list[Force]:
+        sides = zip((axes, back), deep, strict=True)
+        plates = [_pressed(stage, way, target, width, share * mm) for way, mm in sides]
+        return [stage.touch(plate) for plate in plates]
+
+    return Load(at, float(deep.sum()), {"width_mm": width, "mm": deep.tolist()})
+
+
+def _twist(stage: Stage, rng: Generator) -> Load:
+    """Both ends are held and turned about the long axis, oppositely."""
+    from scipy.spatial.transform import Rotation
+
+    x, angle = stage.organ.points_mm[:, 0], rng.uniform(10.0, 50.0) * rng.choice([-1, 1])
+    ends = np.flatnonzero(x < np.quantile(x, 0.12)), np.flatnonzero(x > np.quantile(x, 0.88))
+    middles = [stage.organ.points_mm[end].mean(0) for end in ends]
+
+    def at(share: float) -> list[Force]:
+        grips: list[Force] = []
+        for end, middle, sign in zip(ends, middles, (-0.5, 0.5), strict=True):
+            turn = Rotation.from_rotvec([sign * share * angle, 0, 0], degrees=True)
+            arm = stage.organ.points_mm[end] - middle
+            grips.append(stage.grip(end, turn.apply(arm) - arm, _GRIP_MN_MM))
+        return grips
+
+    return Load(at, abs(np.deg2rad(angle)) * 20, {"degrees": angle})
+
+
+def _pull(stage: Stage, rng: Generator) -> Load:
+    """A tumor is pulled aside or up (a place of the surface, where the organ has none)."""
+    mesh, organ = stage.solid.mesh, stage.organ
+    inside = np.unique(mesh.tets[organ.in_tumor > 0.5])
+    if organ.anatomy.tumors and len(inside):
+        middle = organ.anatomy.tumors[rng.integers(len(organ.anatomy.tumors))].vertices_mm.mean(0)
+        far = np.linalg.norm(mesh.nodes_mm[inside] - middle, axis=1)
+        held = inside[far < np.sort(far)[min(24, len(far) - 1)]]
+    else:
+        middle = organ.place(rng, 0.3)
+        held = np.argsort(np.linalg.norm(mesh.nodes_mm - middle, axis=1))[:12]
+    out = unit(unit(middle - organ.middle_mm) + rng.normal(0, 0.6, 3) + [0, 0, 0.4])
+    far_mm, one = rng.uniform(4.0, 16.0), np.zeros((len(held), 4))
+    one[:, 0] = 1.0
+    rows = rows_of(
+        Embedding(np.tile(held[:, None], (1, 4)).astype(np.int32), one), len(mesh.nodes_mm)
+    )
+
+    def at(share: float) -> list[Force]:
+        places = mesh.nodes_mm[held] + share * far_mm * out
+        return [Springs(rows, places, np.full(len(held), _GRIP_MN_MM / 2 / len(held)))]
+
+    return Load(at, far_mm, {"mm": far_mm, "direction": out.tolist()})
+
+
+def _tether(stage: Stage, rng: Generator) -> Load:
+    """Vessels at the hilum hold and draw the organ, a rod pushes it; nothing else holds it."""
+    organ, pull = stage.organ, rng.uniform(0.0, 12.0)
+    patch = stage.patch(organ.hilum_mm, rng.uniform(10.0, 20.0))
+    springs, out = log_uniform(rng, 60.0, 1500.0), unit(organ.hilum_mm - organ.middle_mm)
+    out = unit(out + rng.normal(0, 0.4, 3))
+    point, radius, deep = organ.place(rng, 0.2), rng.uniform(4.0, 12.0), rng.uniform(2.0, 12.0)
+    axis = unit(unit(point - organ.middle_mm) + rng.normal(0, 0.3, 3))
+
+    def at(share: float) -> list[Force]:
+        rod = Rod(point - share * deep * axis, axis, radius)
+        return [stage.grip(patch, share * pull * out, springs), stage.touch(rod)]
+
+    about = {"tether_mn_mm": springs, "drawn_mm": pull, "rod_mm": deep, "rod_radius_mm": radius}
+    return Load(at, max(pull, deep), about, free=True)
+
+
+def _roll(stage: Stage, rng: Generator) -> Load:
+    """A flank is drawn sideways over a slippery bed: the organ is free to roll about its length."""
+    organ, far_mm = stage.organ, rng.uniform(5.0, 18.0)
+    out = unit(np.array([rng.normal(0, 0.2), rng.choice([-1.0, 1.0]), rng.uniform(0.3, 1.0)]))
+    flank = organ.points_mm[(organ.points_mm @ out).argmax()]
+    patch, way = stage.patch(flank, rng.uniform(10.0, 18.0)), np.cross(out, [1.0, 0.0, 0.0])
+    way = unit(way if way[2] < 0 else -way)  # over the side and down
+
+    def at(share: float) -> list[Force]:
+        return [stage.grip(patch, share * far_mm * way, 600.0)]
+
+    return Load(at, far_mm, {"mm": far_mm}, free=True, rim=(0.25, 0.5), smooth=True)
+
+
+def _cut(stage: Stage, rng: Generator) -> Load:
+    """The lips of the slit are pulled apart, the farther the nearer to its middle."""
+    assert stage.wound is not None
+    (middle, normal, radius), organ = stage.wound.slit, stage.organ
+    far = np.linalg.norm(organ.points_mm - middle, axis=1) / radius
+    lips = np.flatnonzero((far < 0.7) & (np.abs((organ.points_mm - middle) @ normal) < 8.0))
+    side = np.where(stage.wound.side[organ.owner[lips]], 0.5, -0.5)
+    open_mm = rng.uniform(5.0, 18.0)
+    apart = (side * (1 - far[lips] ** 2) * open_mm)[:, None] * normal
+
+    def at(share: float) -> list[Force]:
+        return [stage.grip(lips, share * apart, _GRIP_MN_MM)]
+
+    return Load(at, open_mm, {"open_mm": open_mm, "slit_radius_mm": radius})
+
+
+def _axes(out: Vector, rng: Generator) -> Float64[np.ndarray, "3 3"]:
+    """A frame whose z is that direction, turned about it at random."""
+    side = perpendicular(out)
+    angle = rng.uniform(0, 2 * np.pi)
+    x = np.cos(angle) * side + np.sin(angle) * np.cross(out, side)
+    return np.stack([x, np.cross(out, x), out], axis=1)
+
+
+def _pressed(
+    stage: Stage, axes: np.ndarray, target_mm: Vector, width_mm: float, deep_mm: float
+) -> Turned:
+    """A plate across the z of ``axes`` over a target, so deep from where it first touches."""
+    local = (stage.organ.points_mm - target_mm) @ axes
+    under = (np.abs(local[:, 0]) < width_mm / 2) & (np.abs(local[:, 1]) < 100.0)
+    height = float(local[under, 2].max()) - deep_mm
+    half = (width_mm / 2, 100.0, 10.0)
+    return Turned(ContactPlate((0.0, 0.0, height + half[2]), half, 4.0), axes, target_mm)
+
+
+def _random_slit(organ: Organ, rng: Generator) -> Slit:
+    """From above into the organ, clear of every tumor. Raises TumortrackError: no room."""
+    for _ in range(300):
+        middle = organ.place(rng, 0.3)
+        normal = unit(np.cross(middle - organ.middle_mm, rng.normal(size=3)))
+        slit = Slit(middle, normal, rng.uniform(12.0, 20.0))
+        tumors = [tumor.vertices_mm - middle for tumor in organ.anatomy.tumors]
+        along = [np.maximum(np.linalg.norm(v, axis=1) - slit.radius_mm, 0) for v in tumors]
+        gaps = [np.hypot(v @ normal, a).min() for v, a in zip(tumors, along, strict=True)]
+        if min(gaps, default=np.inf) > _CLEAR_MM:
+            return slit
+    raise TumortrackError("the tumors leave no room for a slit.")
+
+
+FAMILIES: dict[str, Callable[[Stage, Generator], Load] | None] = {
+    "rest": None, "plate": _plate, "clamp": _clamp, "twist": _twist, "pull": _pull,
+    "tether": _tether, "roll": _roll, "cut": _cut,
+}  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class Deformed:
+    """A state: where the organ's tissue lies now (bench frame, mm)."""
+
+    organ: Organ
+    nodes_mm: Nodes
+    tets: Int[np.ndarray, "t 4"]  # in the order of the organ's own
+    rim_mm: float  # of the bed
+    wound: Wound | None
+    about: dict[str, Any]
+
+    def carry(self, points_mm: Points) -> Points:
+        """Points in or on the organ at rest at their place now."""
+        owner, weights = find(self.organ.mesh.nodes_mm[self.organ.mesh.tets], points_mm)
+        moved = self.nodes_mm[self.tets] - self.organ.mesh.nodes_mm[self.organ.mesh.tets]
+        return points_mm + np.einsum("mi,mij->mj", weights, moved[owner])
+
+
+def solve(organ: Organ, family: str, seed: int) -> Deformed:
+    """One state of a family, all of it drawn from the seed. Raises TumortrackError: no equilibrium
+    was found, or the organ's volume changed by more than tissue's does."""
+    rng = np.random.default_rng([seed, list(FAMILIES).index(family)])
+    loading, height = FAMILIES[family], organ.size_mm[2]
+    if loading is None:
+        rim = rng.uniform(0.1, 0.4) * height
+        return Deformed(organ, organ.mesh.nodes_mm, organ.mesh.tets, rim, None, {})
+    wound = cut_open(organ.mesh, _random_slit(organ, rng)) if family == "cut" else None
+    mesh = wound.mesh if wound else organ.mesh
+    material, solid = _random_tissue(organ, mesh, rng)
+    stage = Stage(organ, solid, wound)
+    load = loading(stage, rng)
+    rim = rng.uniform(*load.rim) * height
+    bed_kpa, friction = log_uniform(rng, 0.3, 40.0), rng.choice([0.0, rng.uniform(0.1, 0.8)])
+    friction = 0.0 if load.smooth else friction
+    bed = stage.touch(organ.bed.under(organ.points_mm, rim), bed_kpa / _BED_DEPTH_MM, friction)
+    down = np.array([*rng.normal(0, 0.3, 2), -1.0]) * log_uniform(rng, 0.2, 3.0)
+    steady: list[Force] = [bed, Weight(_GRAVITY * solid.node_volumes_mm3[:, None] * down)]
+    if not load.free:
+        share = solid.node_volumes_mm3 / solid.node_volumes_mm3.sum()
+        steady.append(Steady(mesh.nodes_mm, share))
+        if rng.uniform() < 0.5:
+            patch = stage.patch(organ.hilum_mm, 15.0)
+            material["vessels_mn_mm"] = log_uniform(rng, 30.0, 600.0)
+            steady.append(stage.grip(patch, np.zeros(3), material["vessels_mn_mm"]))
+    if material["capsule_mn_mm"] > 0:
+        steady.append(Capsule.of(mesh, material["capsule_mn_mm"]))
+    nodes, iterations = mesh.nodes_mm, 0
+    steps = max(1, int(np.ceil(load.reach_mm / _STEP_MM)))
+    for step in range(1, steps + 1):
+        bed.remember(nodes)
+        problem = LoadedBody(solid, (*steady, *load.at(step / steps)))
+        nodes, convergence = equilibrium.settle(problem, nodes, _ITERATIONS)
+        iterations += convergence.iterations
+    stretch = solid.stretch(nodes)
+    change = float(np.average(stretch, weights=mesh.volumes_mm3) - 1)
+    limit = LARGEST_CHANGE if solid.poisson < 0.49 else NEARLY_NONE
+    if abs(change) > limit:
+        raise TumortrackError(f"the organ's volume changed by {change:.1%}, over {limit:.0%}.")
+    about = {
+        "material": {**material, "bed_kpa": bed_kpa, "friction": friction, "rim_mm": rim},
+        "load": load.about,
+        "volume_change": change,
+        "least_stretch": float(stretch.min()),
+        "iterations": iterations,
+        "steps": steps,
+    }
+    return Deformed(organ, nodes, mesh.tets, rim, wound, about)
+
+
+def _random_tissue(
+    organ: Organ, mesh: TetMesh, rng: Generator
+) -> tuple[dict[str, float], NeoHookeanSolid]:
+    """Kidneys: 3 to 40 kPa; tumors one to ten times as stiff; up to a factor of two either way in
+    smooth gradients; in half of them a capsule."""
+    drawn = {
+        "youngs_kpa": log_uniform(rng, 3.0, 40.0),
+        "poisson": rng.uniform(0.45, 0.495),
+        "tumor_ratio": log_uniform(rng, 1.0, 10.0),
+        "gradient": rng.uniform(0.0, np.log(2.0)),
+        "capsule_mn_mm": float(rng.choice([0.0, log_uniform(rng, 5.0, 300.0)])),
+    }
+    middles = (mesh.nodes_mm[mesh.tets].mean(1) - organ.middle_mm) / (organ.size_mm.max() / 2)
+    phases = middles @ rng.normal(0, 1.5, (3, 3)) + rng.uniform(0, 2 * np.pi, 3)
+    uneven = np.exp(drawn["gradient"] * np.sin(phases).mean(1) * np.sqrt(2))
+    ratio = 1 + (drawn["tumor_ratio"] - 1) * organ.in_tumor
+    shear = drawn["youngs_kpa"] / (2 * (1 + drawn["poisson"])) * ratio * uneven
+    return drawn, NeoHookeanSolid(mesh, shear, drawn["poisson"])

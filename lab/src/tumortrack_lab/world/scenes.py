@@ -1,0 +1,211 @@
+"""A world's scenes, by number: state, true anatomy, view, cloud, and what disturbs it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any, Literal, get_args
+
+import numpy as np
+from jaxtyping import Float64
+
+from tumortrack.core.config import Config
+from tumortrack.core.geometry import transform_points
+from tumortrack.core.types import Anatomy, Mesh, SensorCloud
+from tumortrack.imaging.case import Case
+from tumortrack.imaging.meshes import mesh_of, solid_of
+from tumortrack.phantom.kidneys import random_anatomy
+from tumortrack.simulate.scene_folder import InnerPoints, Scene, draw_targets
+from tumortrack_lab.tets import TetMesh, tetrahedralise
+from tumortrack_lab.twin.apparatus import bench_from_ct, moved
+from tumortrack_lab.world import segmentation
+from tumortrack_lab.world.families import FAMILIES, Deformed, Organ, solve
+from tumortrack_lab.world.views import View, look, lump, organ_cloud
+
+Disturbance = Literal[
+    "none", "strays", "fat", "white", "scale", "side", "mirrored", "foreign", "nothing"
+]
+DISTURBANCES: tuple[Disturbance, ...] = get_args(Disturbance)
+OTHERS = ("mirrored", "foreign", "nothing")  # not the model's organ: nothing true can be said
+_FINE_MM, _EDGE_MM = (
+    0.1,
+    7.0,
+)  # surfaces are simplified by this, edges halved beyond: scenes are many
+
+Generator = np.random.Generator
+
+
+class WorldConfig(Config, frozen=True, kw_only=True):
+    """``edge_mm``, ``envelope``: of the tetrahedra. ``hidden``: share of scenes with a hand or
+    instruments, which hide up to ``most_hidden``. ``segmentation``: share of scenes whose truth
+    differs from the case as CT segmentations err; 0 switches that off."""
+
+    seed: int = 0
+    edge_mm: float = 8.0
+    envelope: float = 0.01
+    hidden: float = 0.5
+    most_hidden: float = 0.7
+    segmentation: float = 0.6
+    families: tuple[str, ...] = tuple(FAMILIES)
+    disturbances: tuple[Disturbance, ...] = ("none",)
+
+
+@dataclass(frozen=True, eq=False)
+class World:
+    """A case on the bench. ``anatomy_ct``: the case's, simplified by 0.1 mm."""
+
+    config: WorldConfig
+    anatomy_ct: Anatomy
+    bench_from_ct: Float64[np.ndarray, "4 4"]
+    organ: Organ
+    targets: InnerPoints
+    slices_axis: Float64[np.ndarray, " 3"]  # of the CT, bench frame
+
+    @classmethod
+    def of(cls, case: Case, config: WorldConfig, mesh: TetMesh | None = None) -> World:
+        """``mesh``: the tetrahedra (bench frame) of a world that goes on: filling an organ is not
+        reproducible."""
+        to_bench = bench_from_ct(case.anatomy.organ, case.up_lps)
+        pairs = zip(case.anatomy.names, case.anatomy.parts, strict=True)
+        few = Anatomy(tuple(_simpler(part, name) for name, part in pairs))
+        there, axes = moved(few, to_bench), case.labels.lps_from_index[:3, :3]
+        spacing = np.linalg.norm(axes, axis=0)
+        if mesh is None:
+            mesh = tetrahedralise(there.organ, config.edge_mm, config.envelope)
+        thick = axes[:, spacing.argmax()] / spacing.max()
+        return cls(
+            config, few, to_bench, Organ.of(there, mesh), draw_targets(few, config.seed),
+            to_bench[:3, :3] @ thick,
+        )  # fmt: skip
+
+    def recipe(self, number: int) -> tuple[str, Disturbance]:
+        """Family and disturbance of a scene: all pairs in turn."""
+        family = self.config.families[number % len(self.config.families)]
+        turn = number // len(self.config.families)
+        return family, self.config.disturbances[turn % len(self.config.disturbances)]
+
+    def scene(self, number: int) -> Scene:
+        """The same number, the same scene. Raises TumortrackError: its state has no equilibrium, or
+        the organ is not found in its image (NoEstimate)."""
+        (family, disturbance), config = self.recipe(number), self.config
+        rng = np.random.default_rng([config.seed, number, 1])
+        state = solve(self.organ, family, config.seed * 1_000_003 + number)
+        kind: segmentation.Kind = "none"
+        if rng.uniform() < config.segmentation:
+            kind = segmentation.KINDS[1 + rng.integers(len(segmentation.KINDS) - 1)]
+        true, segmented = segmentation.perturbed(self.organ.anatomy, kind, self.slices_axis, rng)
+        truth = Anatomy(tuple(part.moved(state.carry(part.vertices_mm)) for part in true.parts))
+        points = state.carry(transform_points(self.bench_from_ct, self.targets.points_ct))
+        state, truth, beside = _replaced(disturbance, state, truth, rng)
+        hidden = rng.uniform(0.05, config.most_hidden) * (rng.uniform() < config.hidden)
+        view = look(state, truth.organ, hidden, rng, beside)
+        view, how = _disturbed_frame(disturbance, view, truth.organ, rng)
+        cloud, on_organ = organ_cloud(view, truth.organ, rng)
+        if disturbance == "strays":
+            cloud, how = _with_strays(cloud, rng)
+        elif disturbance == "white":
+            view, cloud, how = _with_white_noise(view, cloud, rng)
+        reference = moved(truth, view.camera_from_bench)
+        seen = cloud.points_mm[:, None]
+        tumor_mm = [
+            float(np.linalg.norm(seen - part.vertices_mm.mean(0), axis=2).min())
+            for part in reference.tumors
+        ]
+        meta = {
+            "world": {"number": number, "seed": config.seed},
+            "family": family,
+            "disturbance": {"kind": disturbance, **how},
+            "model_organ": disturbance not in OTHERS,
+            "segmentation": segmented,
+            **state.about,
+            **view.about,
+            "cloud_on_organ": on_organ,
+            "tumor_centre_to_cloud_mm": tumor_mm,
+            "camera_from_bench": view.camera_from_bench.tolist(),
+            "bench_from_ct": self.bench_from_ct.tolist(),
+        }
+        targets = self.targets.at(transform_points(view.camera_from_bench, points))
+        known = targets if disturbance not in OTHERS else None
+        return Scene(cloud, reference, view.frame, meta, known)
+
+
+def _simpler(part: Mesh, name: str) -> Mesh:
+    return mesh_of(solid_of(part, name).simplify(_FINE_MM).refine_to_length(_EDGE_MM))
+
+
+def _replaced(
+    kind: Disturbance, state: Deformed, truth: Anatomy, rng: Generator
+) -> tuple[Deformed, Anatomy, tuple[Mesh, ...]]:
+    """The state with something else in the organ's place, or beside it."""
+    low, high = truth.organ.box_mm
+    if kind == "mirrored":
+        flip = [1.0, -1.0, 1.0]
+        parts = (Mesh(part.vertices_mm * flip, part.faces[:, ::-1]) for part in truth.parts)
+        return replace(state, wound=None), Anatomy(tuple(parts)), ()
+    if kind == "foreign":
+        other, up = random_anatomy(int(rng.integers(1 << 31)))
+        return replace(state, wound=None), moved(other, bench_from_ct(other.organ, up)), ()
+    if kind == "nothing":
+        half = (high - low) / 2 * rng.uniform(0.6, 1.1, 3)
+        ball = lump(np.zeros(3), np.ones(3))
+        waves = rng.normal(0, 1.5, (3, 8))
+        bumps = np.cos(ball.vertices_mm @ waves + rng.uniform(0, 6.3, 8)).mean(1, keepdims=True)
+        thing = Mesh((ball.vertices_mm * (1 + 0.5 * bumps)) * half + [0, 0, half[2]], ball.faces)
+        return replace(state, wound=None), Anatomy((thing,)), ()
+    if kind == "fat":
+        angle, half = rng.uniform(0, 2 * np.pi), rng.uniform([12, 12, 15], [35, 35, 30])
+        way = np.array([np.cos(angle), np.sin(angle), 0.0])
+        edge = truth.organ.vertices_mm[(truth.organ.vertices_mm @ way).argmax()]
+        place = edge + 0.3 * half.mean() * way
+        place[2] = low[2] + rng.uniform(0.5, 0.9) * (high[2] - low[2]) - 0.7 * half[2]
+        return state, truth, (lump(place, half),)
+    return state, truth, ()
+
+
+def _disturbed_frame(
+    kind: Disturbance, view: View, organ: Mesh, rng: Generator
+) -> tuple[View, dict[str, Any]]:
+    """The view through a sensor out of order, and by how much."""
+    depth = view.frame.depth_mm
+    if kind == "scale":
+        how = {
+            "scale": 1 + rng.choice([-1, 1]) * rng.uniform(0.02, 0.1),
+            "offset_mm": rng.uniform(-8.0, 8.0),
+        }
+        depth = depth * how["scale"] + how["offset_mm"]
+    elif kind == "side":
+        there, camera = (
+            transform_points(view.camera_from_bench, organ.vertices_mm),
+            view.frame.intrinsics,
+        )
+        pixels = there[:, :2] / there[:, 2:] * [camera.fx, camera.fy] + [camera.cx, camera.cy]
+        angle, share = rng.uniform(0, 2 * np.pi), rng.uniform(0.35, 0.65)
+        way = np.array([np.cos(angle), np.sin(angle)])
+        v, u = np.indices(depth.shape)
+        lost = u * way[0] + v * way[1] > np.quantile(pixels @ way, 1 - share)
+        how, depth = {"lost_share": share}, np.where(lost, np.nan, depth)
+    else:
+        return view, {}
+    return replace(view, frame=view.frame.with_depth(depth.astype(np.float32))), how
+
+
+def _with_white_noise(
+    view: View, cloud: SensorCloud, rng: Generator
+) -> tuple[View, SensorCloud, dict[str, Any]]:
+    """1 to 2 mm along each ray, in image and points alike; the organ was found without it."""
+    std_mm, depth = rng.uniform(1.0, 2.0), view.frame.depth_mm
+    noisy = depth + rng.normal(0, std_mm, depth.shape).astype(np.float32)
+    z = cloud.points_mm[:, 2:].astype(float)
+    points = cloud.points_mm * (1 + rng.normal(0, std_mm, z.shape) / z)
+    view = replace(view, frame=view.frame.with_depth(noisy))
+    return view, SensorCloud(points.astype(np.float32), cloud.stamp_ns), {"std_mm": std_mm}
+
+
+def _with_strays(cloud: SensorCloud, rng: Generator) -> tuple[SensorCloud, dict[str, Any]]:
+    """10 to 40 % of the points lie anywhere in the organ's box, a quarter wider."""
+    points = cloud.points_mm.copy()
+    share = rng.uniform(0.1, 0.4)
+    stray = rng.random(len(points)) < share
+    low, high = points.min(0), points.max(0)
+    points[stray] = low + (high - low) * rng.uniform(-0.125, 1.125, (int(stray.sum()), 3))
+    points[:, 2] = np.maximum(points[:, 2], 1.0)
+    return SensorCloud(points.astype(np.float32), cloud.stamp_ns), {"share": share}

@@ -1,0 +1,151 @@
+"""`margins`: how far a tumor may be from where a model says that it is."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from tyro.conf import Positional
+
+from tumortrack.cli.console import Device, keep_loaded, progress_bar, say
+from tumortrack.core import store
+from tumortrack.core.errors import InputError
+
+if TYPE_CHECKING:
+    from tumortrack.models.margins import ModelMargins
+    from tumortrack.report.calibration import Listed, Row
+
+_GRID = 8  # voxels: the labelled volume is not looked at
+
+
+@dataclass(frozen=True, kw_only=True)
+class Margins:
+    """Calibrate a model: the margin that its tumors lie in, in 95 of 100 cases like the scenes.
+
+    Attributes:
+        model: folder that `train` wrote; the margins are kept in it.
+        scenes: folders of scene folders whose truth is known; without any, the generic calibration
+            that comes with this version, if one does.
+        confidence: the shares of cases in which the margins are to hold.
+        widest: answers that miss by more mm than this are to be kept out.
+        out: file for what was found scene by scene; what is in it already is not located again
+            (default: MODEL/margins.jsonl).
+        seed: of the scene that stands for each state, and of what it is used for.
+        device: auto takes CUDA if there is a GPU.
+    """
+
+    model: Positional[Path]
+    scenes: Positional[tuple[Path, ...]] = ()
+    confidence: tuple[float, ...] = (0.9, 0.95)
+    widest: float = 8.0
+    out: Path | None = None
+    seed: int = 0
+    device: Device = "auto"
+
+    def run(self) -> None:
+        from tumortrack.models.folder import read_model_manifest
+        from tumortrack.models.margins import keep_margins
+
+        if not self.confidence or not all(0.5 <= one <= 0.99 for one in self.confidence):
+            raise InputError("--confidence: give shares from 0.5 to 0.99, as 0.9 0.95.")
+        if not 0.5 <= self.widest <= 20:
+            raise InputError(f"--widest {self.widest:g} is not allowed; choose 0.5 to 20 mm.")
+        if self.seed < 0:
+            raise InputError(f"--seed {self.seed} must be 0 or more.")
+        manifest = read_model_manifest(self.model)
+        margins = self._calibrated() if self.scenes else _generic(manifest)
+        path = keep_margins(self.model, margins)
+        for line in described(margins):
+            say(line)
+        say(f"written to {path}; `locate`, `track` and `plan` state them from now on.")
+
+    def _calibrated(self) -> ModelMargins:
+        from tumortrack.report import calibration
+
+        listed = calibration.list_states(self.scenes, self.seed)  # before PyTorch's seconds
+        digest = store.sha256_of(self.model / store.MANIFEST)
+        table = self.out or self.model / "margins.jsonl"
+        with calibration.open_table(table, calibration.head_of(digest, self.seed)) as (known, add):
+            rows = self._located(listed, known, add)
+        of = store.sha256_of(table)
+        return calibration.margins_of(rows, of, self.confidence, self.widest, self.seed)
+
+    def _located(
+        self, listed: list[Listed], known: list[Row], add: Callable[[Row], None]
+    ) -> list[Row]:
+        """A row for every state; those that are known are not located again."""
+        done = {row.scene: row for row in known}
+        for one in listed:
+            row = done.get(str(one.folder.resolve()))
+            if row is not None and row.sha256 != store.sha256_of(one.folder):
+                raise InputError(
+                    f"{one.folder} was changed since it was located. Remove the table, or give "
+                    "another --out."
+                )
+        left = [one for one in listed if str(one.folder.resolve()) not in done]
+        if left:
+            from tumortrack.cli.locate import check_case
+            from tumortrack.report.calibration import row_of
+            from tumortrack.simulate.scene_folder import read_scene
+            from tumortrack.tracking.tracker import Tracker
+            from tumortrack.training.model import load_model
+
+            keep_loaded()
+            model = load_model(self.model, self.device, with_margins=False)
+            check_case(model, [one.folder for one in left])
+            locate = partial(Tracker(model).locate, grid=_GRID, seed=self.seed)
+            with progress_bar("margins", len(left)) as advance:
+                for one in left:
+                    row = row_of(locate, read_scene(one.folder), one)
+                    add(row)
+                    done[row.scene] = row
+                    advance()
+        return [done[str(one.folder.resolve())] for one in listed]
+
+
+def _generic(manifest: dict[str, Any]) -> ModelMargins:
+    from tumortrack.models.folder import has_shape
+    from tumortrack.models.margins import GENERIC, read_sealed
+
+    if not GENERIC.is_file():
+        raise InputError(
+            "no margin is known: this version comes without a generic calibration. Give folders of "
+            "scenes: tumortrack margins MODEL SCENES."
+        )
+    if not has_shape(manifest):
+        raise InputError(
+            "no margin is known: the generic calibration is of models of the preset clinic. Give "
+            "folders of scenes: tumortrack margins MODEL SCENES."
+        )
+    return read_sealed(GENERIC)
+
+
+def described(margins: ModelMargins) -> list[str]:
+    """Lines for the screen: radii, what they rest on, and where there is no answer."""
+    lines = []
+    for shells in margins.shells:
+        for kind, radius in shells.radii.items():
+            size = f"{radius.constant_mm:.1f} mm"
+            if radius.used == "scaled":
+                size = f"{radius.scaled:.2f} x ({radius.offset_mm:g} mm + largest deviation)"
+            lines.append(f"{100 * shells.confidence:g} % margin of {_WHAT[kind]}: {size}")
+    lines += ["family, visible share, organ: states, good, accepted, tested, calibrated"]
+    for group in margins.groups:
+        counts = group.states, group.good, group.accepted, group.tested, group.calibrated
+        lines.append(f"  {', '.join(group.label)}: {', '.join(map(str, counts))}")
+    lines += [f"  {small} is too small: {large} speaks for it" for small, large in
+              margins.joined.items()]  # fmt: skip
+    limits = ", ".join(f"{name} {limit:.3g}" for name, limit in margins.limits.items())
+    return [
+        *lines,
+        f"no answer where one of these is exceeded: {limits}",
+        f"of all states {100 * margins.accepted:.0f} % have an answer, "
+        f"{100 * margins.missed:.1f} % one that is outside the widest margin; of the worst group's "
+        f"answers these are no more than {100 * margins.risk_bound:.1f} %, with 95 % confidence",
+    ]
+
+
+_WHAT = {"tumor": "a tumor's surface", "kidney": "the kidney's surface", "map": "mapped points"}

@@ -1,0 +1,78 @@
+"""Conformal quantiles, and rules of acceptance that are tested before they are used.
+
+Sources: Vovk et al., Algorithmic Learning in a Random World, 2005 (quantile); Clopper and Pearson,
+Biometrika 26:404, 1934 (bound); Angelopoulos et al., Learn then Test, arXiv 2110.01052 (rules).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float, Int64
+from scipy.special import betaincinv
+
+ERROR = 0.05  # the chance that a tested rule fails its risk all the same
+_ROUNDING = 1e-9  # (n + 1) * 0.9 is a little more than a whole number where it should be one
+
+Label = tuple[str, ...]
+
+
+def least_scores(confidence: float) -> int:
+    """So many scores a quantile needs; with fewer it is infinite."""
+    return math.ceil(confidence / (1 - confidence) - _ROUNDING)
+
+
+def conformal_quantile(scores: Float[np.ndarray, " n"], confidence: float) -> float:
+    """The ceil((n + 1) confidence)-th smallest score: a further one, exchangeable with them, is no
+    larger with at least this confidence. Infinite where there are too few."""
+    rank = math.ceil((len(scores) + 1) * confidence - _ROUNDING)
+    return float(np.sort(scores)[rank - 1]) if rank <= len(scores) else math.inf
+
+
+def risk_bound(misses: int, cases: int, error: float = ERROR) -> float:
+    """Clopper and Pearson's upper bound of the share of misses; too low with chance ``error``."""
+    return 1.0 if misses >= cases else float(betaincinv(misses + 1, cases - misses, 1 - error))
+
+
+def least_tested(risk: float, error: float = ERROR, misses: int = 0) -> int:
+    """So many cases with so few misses show that the risk is no larger."""
+    cases = misses + 1
+    while risk_bound(misses, cases, error) > risk:
+        cases += 1
+    return cases
+
+
+def loosest_rule(
+    rules: Sequence[Sequence[tuple[int, int]]], risk: float, error: float = ERROR
+) -> int | None:
+    """The number of the last rule that holds its risk in every group, None where none does.
+
+    Args:
+        rules: of each rule, the strictest first, (misses, accepted cases) of each group. Each is
+            tested with its share of ``error`` (Bonferroni), which is then the largest chance that
+            the one returned has a larger risk in any group.
+    """
+    each = error / len(rules)
+    held = [
+        number
+        for number, groups in enumerate(rules)
+        if all(risk_bound(misses, cases, each) <= risk for misses, cases in groups)
+    ]
+    return max(held, default=None)
+
+
+def groups_of(labels: Sequence[Label], least: int) -> dict[Label, Int64[np.ndarray, " m"]]:
+    """The members of each group, by their numbers. A group with fewer than ``least`` gives way to
+    the one that its label without the last word names, with all who are in that; one that a single
+    word names stays, however small."""
+    found: dict[Label, Int64[np.ndarray, " m"]] = {}
+    for label in sorted(set(labels)):
+        while True:
+            mine = [n for n, other in enumerate(labels) if other[: len(label)] == label]
+            if len(mine) >= least or len(label) == 1:
+                break
+            label = label[:-1]
+        found[label] = np.array(mine, np.int64)
+    return found

@@ -1,0 +1,237 @@
+"""The margins that a model states: radii found by calibration, and all that they rest on."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+from pathlib import Path
+from typing import Any, Literal
+
+import msgspec
+
+from tumortrack.core import store
+from tumortrack.core.config import Config, from_builtins, to_builtins
+from tumortrack.core.errors import ArtifactError, InputError
+
+# Raise it with every change by which the same cloud gives another estimate, or another figure of
+# those in ``measured``: margins that were found before are then refused.
+METHOD = 1
+NAME = "margins.json"
+GENERIC = Path(__file__).with_name("generic_margins.json")  # from many organs; none is shipped yet
+Kind = Literal["tumor", "kidney", "map"]
+UNKNOWN = "no margin is known for this model (tumortrack margins)"
+
+
+class Radius(Config, frozen=True):
+    """A radius: ``scaled`` times (``offset_mm`` + s), or ``constant_mm``, whatever s is; s (mm) is
+    the largest standard deviation over the surface as estimated. ``scaled`` is None where the
+    method knows no s; ``used`` is the one with the smaller mean where that was chosen."""
+
+    used: Literal["scaled", "constant"]
+    constant_mm: float
+    scaled: float | None = None
+    offset_mm: float = 0.0
+
+    def __post_init__(self) -> None:
+        self.check_between("margins:", constant_mm=(0, 1000), offset_mm=(0, 1000))
+        if self.scaled is not None:
+            self.check_between("margins:", scaled=(0, 1e6))
+        elif self.used == "scaled":
+            raise InputError("margins: a scaled radius needs its factor.")
+
+    def at(self, std_mm: float | None) -> float | None:
+        """mm; None where it depends on a standard deviation that is not known."""
+        if self.used == "constant":
+            return self.constant_mm
+        assert self.scaled is not None
+        return None if std_mm is None else self.scaled * (self.offset_mm + std_mm)
+
+
+class Shells(Config, frozen=True):
+    """The radii that hold with one ``confidence``: of each tumor, of the kidney's surface, and of
+    any point that is mapped."""
+
+    confidence: float
+    radii: dict[Kind, Radius]
+
+    def __post_init__(self) -> None:
+        self.check_between("margins:", confidence=(0.5, 0.99))
+
+
+class Group(Config, frozen=True):
+    """States of one family, visible share and organ: all, with a good estimate, accepted; and how
+    many of the accepted ones were left for the test and for the radii."""
+
+    label: tuple[str, str, str]
+    states: int
+    good: int
+    accepted: int
+    tested: int
+    calibrated: int
+
+
+class ModelMargins(Config, frozen=True):
+    """What a model's margins are, and what they rest on.
+
+    Attributes:
+        model_sha256: of the manifest of the model that they are of; empty in a generic calibration.
+        table_sha256: of the calibration's results, scene by scene.
+        limits: an estimate has a margin only where none of these is exceeded (``measured``); of
+            those that pass, no more than may miss by more than ``widest_mm``, with 95 % confidence.
+        shells: by rising confidence.
+        groups: what was calibrated on, as it was given; ``joined``: of those, the ones that were
+            too small to stand alone, and the larger one that spoke for each.
+        risk_bound: upper bound of the share of accepted answers outside the widest margin of a
+            tumor, in the worst group of the tested states, with 95 % confidence.
+        accepted, missed: shares of all tested states: accepted; accepted and outside the margin.
+    """
+
+    method: int
+    tumortrack: str
+    model_sha256: str
+    table_sha256: str
+    seed: int
+    widest_mm: float
+    limits: dict[str, float]
+    shells: tuple[Shells, ...]
+    groups: tuple[Group, ...]
+    joined: dict[str, str]
+    risk_bound: float
+    accepted: float
+    missed: float
+
+    def __post_init__(self) -> None:
+        if not self.shells or not all(map(math.isfinite, self.limits.values())):
+            raise InputError("margins: no radii, or limits that are no numbers.")
+
+
+def write_sealed(path: Path, margins: ModelMargins) -> None:
+    """A file that ``read_sealed`` reads; atomically. Raises StorageError."""
+    content = to_builtins(margins)
+    store.write_json(path, {"sha256": _digest(content), "margins": content})
+
+
+def read_margins(folder: Path) -> ModelMargins | None:
+    """A model's margins; None where it has none. ArtifactError: they were changed, or are another
+    model's or of another version of the method."""
+    path = folder / NAME
+    if not path.exists():
+        return None
+    margins = read_sealed(path)
+    if margins.model_sha256 != store.sha256_of(folder / store.MANIFEST):
+        raise ArtifactError(f"{path} is of another model, or this one was changed. {_AGAIN}")
+    return margins
+
+
+def read_sealed(path: Path) -> ModelMargins:
+    """The same of any file: a generic calibration's."""
+    stored = store.read_json(path)
+    content = stored.get("margins")
+    if not isinstance(content, dict) or stored.get("sha256") != _digest(content):
+        raise ArtifactError(f"{path} was changed after it was written. {_AGAIN}")
+    if content.get("method") != METHOD:
+        raise ArtifactError(
+            f"{path} was found with version {content.get('method')} of the method; this is version "
+            f"{METHOD}, whose estimates differ. {_AGAIN}"
+        )
+    try:
+        return from_builtins(content, ModelMargins, str(path))
+    except InputError as error:
+        raise ArtifactError(f"{error} {_AGAIN}") from error
+
+
+_AGAIN = "Calibrate again (tumortrack margins MODEL SCENES), or remove the file."
+
+
+def _digest(content: dict[str, Any]) -> str:
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+
+
+def measured(report: dict[str, Any]) -> dict[str, float]:
+    """What an estimate's report says of how far it can be trusted; all the larger the worse."""
+    cost, tumors = report.get("fit_cost"), list(report["parts"].values())[1:]
+    unsure = [part["surface_std_mm"] for part in tumors if "surface_std_mm" in part]
+    found = {
+        "fit_cost": cost["now"] / cost["usual"] if cost else None,
+        "rarity": report.get("motion", {}).get("rarity"),
+        "unseen": report.get("unseen"),
+        "seen_through": report.get("seen_through"),
+        "unsure_mm": max(unsure) if unsure else None,
+    }
+    return {name: float(value) for name, value in found.items() if value is not None}
+
+
+def exceeded(limits: dict[str, float], found: dict[str, float]) -> str:
+    """Which limit is exceeded, in words; empty: none."""
+    for name, limit in limits.items():
+        if not (value := found.get(name, math.inf)) <= limit:
+            return f"{name} is {value:.3g}; margins are known up to {limit:.3g}"
+    return ""
+
+
+def stated_margin(
+    report: dict[str, Any], margins: ModelMargins | None, good: bool
+) -> dict[str, Any]:
+    """The entry ``margin`` of a report: ``stated``, by rising confidence, each with the radii in
+    ``mm`` by part, and ``map`` for any mapped point; or none, and the ``reason``. ``good``: no
+    check failed, and none of the ``limits`` is exceeded."""
+    if margins is None:
+        return {"stated": [], "reason": UNKNOWN}
+    if not good:
+        return {"stated": [], "reason": "a poor estimate has no margin"}
+    if report.get("smoothing", {}).get("time_s", 0.0) > 0:
+        return {"stated": [], "reason": "margins are of single clouds, not of smoothed motions"}
+    parts, stated = report["parts"], []
+    kinds: dict[str, Kind] = {name: "tumor" for name in parts}
+    kinds |= {next(iter(parts)): "kidney", "map": "map"}
+    deviations = {name: part.get("surface_std_mm") for name, part in parts.items()}
+    deviations["map"] = next(iter(deviations.values()))
+    for shells in margins.shells:
+        radii = {
+            name: shells.radii[kind].at(deviations[name])
+            for name, kind in kinds.items()
+            if kind in shells.radii
+        }
+        known = {name: radius for name, radius in radii.items() if radius is not None}
+        stated.append({"confidence": shells.confidence, "mm": known})
+    return {"stated": stated, "reason": ""}
+
+
+class StatedRadius(msgspec.Struct, frozen=True):
+    """A radius that holds with this confidence, mm."""
+
+    confidence: float
+    mm: float
+
+    @property
+    def words(self) -> str:
+        return f"{100 * self.confidence:g} % margin {self.mm:.1f} mm"
+
+
+def stated_radius(
+    said: dict[str, Any] | None, name: str, confidence: float | None = None
+) -> StatedRadius | None:
+    """Of a part, or of ``map``, by the entry ``margin`` of a report, with this or else the highest
+    confidence; None: it states none."""
+    for one in reversed((said or {}).get("stated", [])):
+        if confidence in (None, one["confidence"]) and name in one["mm"]:
+            return StatedRadius(one["confidence"], one["mm"][name])
+    return None
+
+
+def margin_words(said: dict[str, Any] | None) -> str:
+    """The tumors' margins for people, or that there are none."""
+    stated = (said or {}).get("stated")
+    if not stated:
+        return f"no margin is stated: {(said or {}).get('reason', UNKNOWN)}"
+    radii = {name: mm for name, mm in stated[-1]["mm"].items() if name.startswith("tumor_")}
+    sizes = ", ".join(f"{name} {mm:.1f} mm" for name, mm in radii.items())
+    return f"{100 * stated[-1]['confidence']:g} % margin: {sizes}"
+
+
+def keep_margins(folder: Path, margins: ModelMargins) -> Path:
+    """Write them as those of the model in this folder. Raises StorageError."""
+    digest = store.sha256_of(folder / store.MANIFEST)
+    write_sealed(folder / NAME, msgspec.structs.replace(margins, model_sha256=digest))
+    return folder / NAME
