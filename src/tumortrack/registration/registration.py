@@ -54,6 +54,7 @@ _MAX_COST_RATIO = 3.0  # to the least cost: hypotheses above are given up
 # the best one's.
 RIVAL_COST = -2 * math.log(0.01)
 _WITHIN = 7.81  # 95 % of chi squared with three degrees of freedom
+_SAME_MM = 0.2  # descents that end in one minimum end within some last steps (enough_mm, 0.02)
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,11 +167,19 @@ def best_of(fits: list[RegistrationResult]) -> RegistrationResult:
 def _elsewhere(other: ElasticMotion, motion: ElasticMotion) -> bool:
     """Whether it puts the middle of a part outside the ellipsoid that holds 95 % of the other's
     covariance."""
+    off = other.coefficients - motion.coefficients, other.centre_mm - motion.centre_mm
+    if max(np.abs(part).max() for part in off) < _SAME_MM and _turned_mm(other, motion) < _SAME_MM:
+        return False  # most are the same minimum, which is quickly said
     middles = motion.shape.middles_ct
     known = replace(motion, rivals=()).covariance_mm2(middles)
     assert known is not None
     away = other.carry(middles) - motion.carry(middles)
     return bool((np.linalg.solve(known, away[..., None])[..., 0] * away).sum(1).max() > _WITHIN)
+
+
+def _turned_mm(other: ElasticMotion, motion: ElasticMotion) -> float:
+    """How far the rotations have a point apart that lies 50 mm from the centre, about."""
+    return float(50 * np.abs(other.rotation - motion.rotation).max())
 
 
 def _cost(fit: RegistrationResult) -> float:
