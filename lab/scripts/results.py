@@ -96,7 +96,9 @@ def main(options: Options) -> None:
     methods = _methods(options, plan, out)
     for section in options.sections:
         cases = (second,) if section == "deformation" else studied
-        if section in ("faults", "views", "severity"):
+        if section in ("accuracy", "goals"):  # for its endophytic tumors
+            cases = (*studied, second)
+        elif section in ("faults", "views", "severity"):
             cases = studied[:1]
         for case in cases:
             _scenes(case, *studies.scenes_of(plan, section, case))
@@ -106,12 +108,12 @@ def main(options: Options) -> None:
         measured = measure(jobs, kept, partial(_lines(), section + MEASURING), one)
         writer.write(section_blocks(section, measured, cases, writer))
         say(f"{section}: {len(measured)} measurements, block written to {document}")
-    if "peers" in options.sections:
+    if "accuracy" in options.sections:
         case, seed = studied[0], plan.seeds[0]
         chosen: list[Method] = [methods.model(case, name, seed) for name in plan.models]
         chosen += [methods.peer("elastic", case)] * ("elastic" in plan.peers)
         scenes = [variant for variant in plan.variants if not variant.startswith("Rot")]
-        shown = [Job(case, m, v, plan.view, plan.coarse_grid) for m in chosen for v in scenes]
+        shown = [Job(case, m, v, plan.view, plan.grid) for m in chosen for v in scenes]
         writer.write(gallery_block(shown, seed, writer, out / "gallery.json"))
     say(f"done; {document} is up to date.")
 
@@ -145,7 +147,7 @@ def _cases(options: Options, out: Path) -> tuple[tuple[StudyCase, ...], StudyCas
     folders = {n: phantom_case(out / "cases" / n, shape) for n, shape in phantoms.items()}
     folders |= named_folders(options.case, folders)
     phantom, second, *given = (
-        study_case(name, folder, out / "scenes" / name, is_paper=name == "phantom")
+        study_case(name, folder, out / "scenes" / name, is_paper=name in phantoms)
         for name, folder in folders.items()
     )
     return (phantom, *given), second

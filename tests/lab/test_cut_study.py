@@ -211,8 +211,8 @@ def test_tables_say_what_was_removed_and_why_not(case, tmp_path):
     best = lines["truth", "ours, 5 mm"]
     assert "| 1 of 1 | 1 of 1 | 1 of 1 | 100.0 | 100.0 | 0.00 |" in best
     assert "| 1 of 1 | 1 of 1 | 0 of 1 |" in lines["clinic", "ours, 5 mm"]
-    assert "| 0 of 1 | 0 of 0 | 0 of 0 | – |" in lines["M_lim", "ours, 5 mm"]
-    assert "1 x M_lim, the paper's, 5 mm: the cloud shows no organ" in text
+    assert "| 0 of 1 | 0 of 0 | 0 of 0 | – |" in lines["slim network, limited turns", "ours, 5 mm"]
+    assert "1 x slim network, limited turns, the paper's, 5 mm: the cloud shows no organ" in text
     block = section_blocks(
         "resection", found, (case,), ReportWriter(tmp_path / "x.md", "make results")
     )

@@ -294,12 +294,13 @@ def test_the_table_has_a_row_for_every_level():
     ]
     assert len(rows) == 2 + 2 + 1 + 2
     first, second = rows[0], rows[1]
-    assert first[:3] == ["M_lim", "sensor noise, times the D405's", "0"]
+    slim = "slim network, limited turns"
+    assert first[:3] == [slim, "sensor noise, times the D405's", "0"]
     assert first[3:9] == ["1.5", "1.5", "1.5", "2.0", "2.0", "2.0"]
     assert second[:3] == ["", "", "2"]
     assert second[-1] == "2 of 3"
     assert [row[:3] for row in rows[2:4]] == [
-        ["M_lim", "visible surface left, %", "100"],
+        [slim, "visible surface left, %", "100"],
         ["", "", "40"],
     ]
     rigid_rows = rows[-2:]

@@ -219,14 +219,15 @@ class Tapes:
     """The recorder: a new tape every 20 s, on a disk that fills when the schedule says so.
 
     No file of this process may then grow (RLIMIT_FSIZE: no rights are needed for it, unlike for a
-    small disk). ``refused`` are the tapes that it cut off, each with its fault.
+    small disk). ``refused`` are the tapes that it cut off, each with its fault
+    and with how many seconds it had run by then.
     """
 
     def __init__(self, folder: Path, context: SinkContext, schedule: Schedule) -> None:
         self._folder, self._context, self._schedule = folder, context, schedule
         self._number, self._full = 0, False
         self._tape = self._open()
-        self.refused: list[tuple[Path, Fault]] = []
+        self.refused: list[tuple[Path, Fault, float]] = []
 
     def publish(self, result: TrackingResult) -> None:
         fault = self._schedule.now()
@@ -235,7 +236,8 @@ class Tapes:
             size = sum(path.stat().st_size for path in self._place.iterdir())
             resource.setrlimit(resource.RLIMIT_FSIZE, (size, _hard()))
             fault.begin()
-            self.refused.append((self._place, fault))
+            ran_s = time.monotonic() - self._opened_s
+            self.refused.append((self._place, fault, ran_s))
         elif not full and (self._full or time.monotonic() - self._opened_s > _TAPE_S):
             resource.setrlimit(resource.RLIMIT_FSIZE, (_hard(), _hard()))
             self._tape.close()

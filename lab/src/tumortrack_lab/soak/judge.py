@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from tumortrack.cli.console import say
 from tumortrack.live.meter import Histogram
 from tumortrack.live.values import TrackingResult
 from tumortrack.live.workers import SinkWorker
@@ -66,6 +67,9 @@ class Judge:
                 self._answer(begun, begun is fault, result, now_s)
         if not np.isnan(self._begin_s) and now_s - self._begin_s >= 10 * len(self.memory_mb):
             self.memory_mb.append((now_s - self._begin_s, resident_mb()))
+            if len(self.memory_mb) % 6 == 1:
+                counts = ", ".join(f"{count:,} {what}" for what, count in self.counts.items())
+                say(f"{self._since_s() / 60:.0f} minutes: {counts}")
 
     def _check(self, result: TrackingResult) -> None:
         seen = result.observation

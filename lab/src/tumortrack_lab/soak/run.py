@@ -8,12 +8,13 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import ExitStack, closing, contextmanager
+from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
 from tumortrack import api
 from tumortrack.cli.console import keep_loaded
+from tumortrack.core.errors import InputError
 from tumortrack.live.loop import Loop, LoopConfig, summary
 from tumortrack.live.sources.virtual import VirtualSourceConfig
 from tumortrack.live.spec import SINKS, SOURCES
@@ -75,10 +76,11 @@ def soak(config: SoakConfig, folder: Path) -> tuple[str, list[str]]:
         closing(SourceWorker(camera.open)) as reader,
     ):
         judge = Judge(schedule, workers, config.stale_s, config.wrong_mm, config.within_s)
-        loop.run(reader, workers, judge.see)
+        with suppress(KeyboardInterrupt):  # what there is until then is judged
+            loop.run(reader, workers, judge.see)
         found = summary(loop, reader, workers)
     problems = judge.problems()
-    problems += [text for tape, fault in tapes.refused if (text := _unread(tape, fault))]
+    problems += [text for cut_off in tapes.refused if (text := _unread(*cut_off))]
     problems += [f"internal error: {defect}" for defect in found["defects"]]
     marks = memory_marks(judge)
     if marks["end"] - marks["1 min"] > _GROWN_MB:
@@ -115,16 +117,16 @@ def _sinks(
         yield workers, tapes
 
 
-def _unread(tape: Path, fault: Fault) -> str:
-    """What is wrong with a tape that a full disk cut off; nothing, if it lasts until then."""
+def _unread(tape: Path, fault: Fault, ran_s: float) -> str:
+    """What is wrong with a tape that a full disk cut off after so long; nothing, if it lasts until
+    then."""
     began_ns = time.time_ns() - int((time.monotonic() - fault.begun_s) * 1e9)
-    last_ns, source = 0, SOURCES.parse(f"recording:{tape}?rate=0").open()
+    last_ns = began_ns - int(ran_s * 1e9)
     try:
-        while (seen := source.read(1.0)) is not None:
-            last_ns = seen.stamp_ns
-    except SourceEnded:
+        with closing(SOURCES.parse(f"recording:{tape}?rate=0").open()) as source:
+            while (seen := source.read(1.0)) is not None:
+                last_ns = seen.stamp_ns
+    except (SourceEnded, InputError):  # the end, or nothing was written yet
         pass
-    finally:
-        source.close()
     lost_s = (began_ns - last_ns) * 1e-9
     return "" if lost_s < _LOST_S else f"{tape.name} lacks {lost_s:.1f} s before the disk was full"

@@ -172,8 +172,8 @@ def spec_of(job: Job, hashed: Callable[[Path], str] = store.sha256_of) -> Measur
 
 
 def about_answer(job: Job, answer: Answer | None) -> dict:
-    """What every measurement says of its method: seconds, training, machine (``load``: how busy
-    it was)."""
+    """What every measurement says of its method: seconds, training, machine, when, and how busy
+    the machine was (``load``)."""
     import torch
 
     return {
@@ -187,6 +187,7 @@ def about_answer(job: Job, answer: Answer | None) -> dict:
             "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 0,
             "threads": torch.get_num_threads(),
             "load": round(os.getloadavg()[0], 2) if hasattr(os, "getloadavg") else None,
+            "when": time.strftime("%Y-%m-%d %H:%M", time.gmtime()),
         },
     }
 

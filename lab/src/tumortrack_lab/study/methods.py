@@ -61,7 +61,7 @@ _LIVE_STAGES = ("encode", "coarse", "refine", "fine")  # of a live frame: withou
 
 @dataclass(frozen=True, eq=False)
 class StudyCase:
-    """A patient or phantom with its scenes; ``is_paper`` where the paper's figures apply."""
+    """A patient or phantom with its scenes; ``is_paper``: a phantom, after the paper's."""
 
     name: str
     folder: Path

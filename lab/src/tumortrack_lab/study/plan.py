@@ -8,6 +8,7 @@ from typing import Literal, NamedTuple, TypeVar, get_args
 
 from tumortrack.core.config import Config
 from tumortrack_lab.study.bound import BOUNDS
+from tumortrack_lab.study.goals import RIGID
 from tumortrack_lab.study.measure import CLEAN_VIEW, Job
 from tumortrack_lab.study.methods import CLINIC, UNREFINED, Method, Network, StudyCase
 from tumortrack_lab.study.resection import Truth, cutting
@@ -32,8 +33,7 @@ _ABLATION = (
     "quick_elastic", "M_lim",
 )  # fmt: skip
 Section = Literal[
-    "accuracy", "goals", "ablation", "deformation", "peers", "faults", "views", "severity",
-    "resection",
+    "accuracy", "goals", "ablation", "deformation", "faults", "views", "severity", "resection",
 ]  # fmt: skip
 SECTIONS: tuple[Section, ...] = get_args(Section)
 T = TypeVar("T")
@@ -44,25 +44,24 @@ class StudyPlan(Config, frozen=True):
     curves. None: the same as the phantom's."""
 
     name: str
-    # In accuracy, peers and views: M_lim, M_full, clinic
+    # In accuracy and views: M_lim, M_full, clinic
     models: tuple[str, ...] = ("M_lim", "M_full", CLINIC)
     steps: int = 12_000  # Of training M_lim and M_full
     clinic_steps: int = 6_000  # Of training clinic (the preset's)
     # Of training in the deformation study (as many as --steps)
     configuration_steps: int | None = None
-    seeds: tuple[int, ...] = (0, 1, 2)  # Of training
+    seeds: tuple[int, ...] = (0, 1, 2)  # Of training: of network, scenes and elastic body
     case_seeds: tuple[int, ...] | None = None  # Of training for --case (the same as the phantom's)
     # Of training in the deformation study (the same as the phantom's)
     configuration_seeds: tuple[int, ...] | None = None
     variants: tuple[str, ...] = VARIANTS  # Of every table that names no others
     view: str = "noise"  # Of every table but those of faults and views
-    grid: int = 400  # Voxels along the longest side, in the table of accuracy
-    case_grid: int | None = None  # The same for --case (as for the phantom)
-    coarse_grid: int = 160  # The same in every other table
+    grid: int = 160  # Voxels along the longest side (the paper's: 400)
     configurations: tuple[int, ...] = (1, 2, 3, 4, 5, 6)  # Rows of the paper's deformation table
     configuration_variants: tuple[str, ...] = ("D0", "D1", "D2", "D3")  # In the deformation study
     configuration_view: str = "noise"  # In the deformation study
-    peers: tuple[str, ...] = ("rigid_bound", "rigid", "cpd", "elastic")  # Methods beside the models
+    # Methods and bounds beside the models
+    peers: tuple[str, ...] = (RIGID, *BOUNDS, "rigid", "cpd", "elastic")
     case_peers: tuple[str, ...] | None = None  # Peers for --case (as for the phantom)
     faults: tuple[str, ...] = FAULTS  # Error sources
     fault_seeds: tuple[int, ...] = (0, 1, 2)  # Of the random part of each fault
@@ -76,8 +75,6 @@ class StudyPlan(Config, frozen=True):
     severity_variants: tuple[str, ...] = ("D2", "G1")  # In the severities
     severity_models: tuple[str, ...] = ("M_lim", CLINIC)  # Models beside the severities' peers
     severity_peers: tuple[str, ...] = ("rigid",)  # Peers in the severities
-    goal_models: tuple[str, ...] = ("M_lim", CLINIC)  # Models in the table of goals
-    goal_peers: tuple[str, ...] = ("elastic",)  # Peers in the table of goals
     # Models whose estimates are planned on and cut, beside the truth
     resection_models: tuple[str, ...] = ("M_lim", CLINIC)
     ablation_models: tuple[str, ...] = _ABLATION  # Rows of the ablation
@@ -98,7 +95,6 @@ QUICK = StudyPlan(
     seeds=(0,),
     variants=("D0", "D2", "G1"),
     grid=96,
-    coarse_grid=96,
     configurations=(1, 3),
     configuration_variants=("D1", "D3"),
     peers=("rigid_bound", "rigid", "elastic"),
@@ -142,7 +138,8 @@ def jobs_of(
     """The jobs of one section, grouped by method. Models that are not trained yet are trained.
 
     ``cases``: for ``deformation`` the second phantom; for faults, views and severities, which have
-    the first seed alone, the paper's phantom; for all others every case.
+    the first seed alone, the paper's phantom; for accuracy and goals every case and the second
+    phantom; for all others every case.
     """
     model = methods.ablated if section == "ablation" else methods.model
     jobs = []
@@ -177,8 +174,7 @@ def _blocks(plan: StudyPlan, section: Section, case: StudyCase) -> list[_Block]:
         return ours if case.is_paper or theirs is None else theirs
 
     seeds = for_case(plan.seeds, plan.case_seeds)
-    coarse, usual = plan.coarse_grid, (plan.variants, (plan.view,))
-    clean = (CLEAN_VIEW,)
+    grid, usual, clean = plan.grid, (plan.variants, (plan.view,)), (CLEAN_VIEW,)
 
     def trained(models: Iterable[str], of: Sequence[int] = seeds) -> list[tuple[str, int]]:
         return list(product(models, of))
@@ -188,38 +184,35 @@ def _blocks(plan: StudyPlan, section: Section, case: StudyCase) -> list[_Block]:
 
     def disturbed(models: list[tuple[str, int]], peers: Sequence[str], levels: tuple) -> _Block:
         draws = (("clean", 0), *product(levels, plan.severity_seeds))
-        return _Block(models, peers, plan.severity_variants, clean, coarse, draws)
+        return _Block(models, peers, plan.severity_variants, clean, grid, draws)
 
-    once, goal_models = seeds[:1], trained(plan.goal_models)
+    once, own = seeds[:1], trained((CLINIC,))
     configurations = [f"configuration_{number}" for number in plan.configurations]
     of = plan.seeds if plan.configuration_seeds is None else plan.configuration_seeds
     draws = [(f, s) for f in plan.faults for s in (plan.fault_seeds if f != "clean" else (0,))]
-    grid, peers = for_case(plan.grid, plan.case_grid), for_case(plan.peers, plan.case_peers)
     ablation = _Block(
         trained(plan.ablation_models, plan.ablation_seeds), (),
-        plan.ablation_variants, plan.ablation_views, coarse,
+        plan.ablation_variants, plan.ablation_views, grid,
     )  # fmt: skip
     blocks: dict[Section, list[_Block]] = {
-        "accuracy": [_Block(trained(plan.models), (), *usual, grid)],
-        "goals": [  # hidden surface is for methods that have to find the organ: bounds see no cloud
-            _Block(goal_models, (*plan.goal_peers, *BOUNDS), *usual, coarse),
-            disturbed(goal_models, plan.goal_peers, (_HIDDEN,)),
+        "accuracy": [
+            _Block(trained(plan.models), for_case(plan.peers, plan.case_peers), *usual, grid)
         ],
+        "goals": [_Block(own, (RIGID,), *usual, grid), disturbed(own[:1], (), (_HIDDEN,))],
         "ablation": [ablation] * (case.name in plan.ablation_cases),
         "deformation": [
             _Block(trained(configurations, of), (), plan.configuration_variants,
-                   (plan.configuration_view,), coarse)
+                   (plan.configuration_view,), grid)
         ],
-        "peers": [_Block(trained(plan.models), peers, *usual, coarse)],
         "faults": [
             _Block(trained(plan.fault_models, once), known(plan.fault_peers),
-                   plan.fault_variants, clean, coarse, draws)
+                   plan.fault_variants, clean, grid, draws)
         ],
-        "views": [_Block(trained(plan.models, once), (), plan.variants, plan.views, coarse)],
+        "views": [_Block(trained(plan.models, once), (), plan.variants, plan.views, grid)],
         "severity": [
             disturbed(trained(plan.severity_models, once), known(plan.severity_peers),
                       plan.severities)
         ],
-        "resection": [_Block(trained(plan.resection_models, once), (), *usual, coarse)],
+        "resection": [_Block(trained(plan.resection_models, once), (), *usual, grid)],
     }  # fmt: skip
     return blocks[section]

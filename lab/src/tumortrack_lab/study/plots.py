@@ -1,4 +1,4 @@
-"""The study's pictures: errors against depth, displacement, variant and severity; a gallery.
+"""The study's pictures: errors against depth, displacement and severity; a gallery.
 
 Colours are Okabe and Ito's (told apart by every colour vision); each method also has a marker of
 its own, so that the plots read in grey.
@@ -19,7 +19,6 @@ from tumortrack.report.drawing import new_figure, save
 from tumortrack.report.pictures import FROM_SIDE, draw_solid_view, scene_legend
 from tumortrack.report.protocol import compare
 from tumortrack.simulate.scene_folder import Scene, read_scene
-from tumortrack_lab.study import paper
 from tumortrack_lab.study import tables as of
 from tumortrack_lab.study.measure import Job
 from tumortrack_lab.study.tables import by_seed, groups, label_of, names, spaced, tumors
@@ -90,77 +89,6 @@ def error_against(frame: pd.DataFrame, key: str, path: Path) -> bool:
     axes.set_title(f"Tumor error against {_ALONG[key]}", loc="left", fontsize=12)
     save(drawing, path)
     return True
-
-
-def error_per_variant(frame: pd.DataFrame, lies: dict[str, paper.Lie], path: Path) -> None:
-    """One-sided Hausdorff distance of each tumor per variant and model, mean and spread over the
-    seeds, with the paper's figures as open marks (a bar with an arrow: its upper bound)."""
-    parts, variants = names(tumors(frame), "part"), names(frame, "variant")
-    models = names(frame, "method")
-    drawing = new_figure(4.6 * len(parts) + 2.4, 4.6)
-    panels = drawing.subplots(1, len(parts), sharey=True, squeeze=False)[0]
-    narrow = len(parts) == 1  # its legend takes two rows
-    drawing.subplots_adjust(
-        left=0.1 if narrow else 0.07, right=0.985, top=0.8 if narrow else 0.85, bottom=0.08,
-        wspace=0.06,
-    )  # fmt: skip
-    for axes, tumor in zip(panels, parts, strict=True):
-        mine, kind = frame[frame.part == tumor], lies[tumor].kind
-        for number, model in enumerate(models):
-            for place, variant in enumerate(variants):
-                here = mine[(mine.method == model) & (mine.variant == variant)]
-                x = place + (number - (len(models) - 1) / 2) * 0.26
-                _seeds(axes, x, by_seed(here, "hausdorff_one_sided_mm"), _style(model))
-                if figure := paper.hausdorff(variant, model, kind):
-                    _paper_mark(axes, x + 0.1, figure, _style(model))
-        axes.set_xticks(range(len(variants)), variants)
-        axes.set_title(f"{spaced(tumor)}, {kind}", loc="left", fontsize=11)
-        for place in range(len(variants) - 1):
-            axes.axvline(place + 0.5, color="0.93", linewidth=0.8, zorder=0)
-        axes.set_xlim(-0.5, len(variants) - 0.5)
-        _tidy(axes)
-    panels[0].set_ylim(bottom=0)  # after all panels: it ends the search for common limits
-    panels[0].set_ylabel("Hausdorff distance, estimate to truth, mm")
-    drawing.legend(
-        handles=_variant_legend(models), loc="upper left", bbox_to_anchor=(0.06, 0.995),
-        ncols=3 if narrow else 5, frameon=False, fontsize=10,
-    )  # fmt: skip
-    save(drawing, path)
-
-
-def _seeds(axes: Axes, x: float, values: pd.Series, style: dict[str, Any]) -> None:
-    finite, color = values[np.isfinite(values)], style["color"]
-    axes.scatter([x] * len(finite), finite, s=14, color=color, alpha=0.45, lw=0)
-    if len(finite) < len(values):
-        axes.annotate("not\nfound", (x, 0), ha="center", va="bottom", fontsize=7.5, color=color)
-    elif len(values):
-        spread = values.std() if len(values) > 1 else None
-        axes.errorbar(x, values.mean(), spread, markersize=7, capsize=3, lw=1.6, **style)
-
-
-def _paper_mark(axes: Axes, x: float, figure: paper.PaperFigure, style: dict[str, Any]) -> None:
-    if figure.sign == "<=":
-        arrow = {"arrowstyle": "->", "color": style["color"], "shrinkA": 0, "shrinkB": 0}
-        axes.plot([x - 0.1, x + 0.1], [figure.value_mm] * 2, color=style["color"], lw=1.6)
-        axes.annotate("", (x, figure.value_mm - 1.4), (x, figure.value_mm), arrowprops=arrow)
-    else:
-        axes.plot(x, figure.value_mm, **_open_mark(style))
-
-
-def _open_mark(style: dict[str, Any]) -> dict[str, Any]:
-    return {
-        "marker": style["marker"], "markersize": 8, "linestyle": "", "markerfacecolor": "white",
-        "markeredgecolor": style["color"], "markeredgewidth": 1.6,
-    }  # fmt: skip
-
-
-def _variant_legend(models: list[str]) -> list[Line2D]:
-    lines: dict[str, dict[str, Any]] = {}
-    for model in models:
-        lines[f"{model}, here"] = {"markersize": 7, "lw": 1.6, **_style(model)}
-        lines[f"{model}, paper (hydrogel)"] = _open_mark(_style(model))
-    most = {"color": "0.4", "markersize": 9, "lw": 1.6, "marker": r"$\downarrow$"}
-    return _handles({**lines, "paper: at most": most})
 
 
 def _handles(lines: dict[str, dict[str, Any]]) -> list[Line2D]:

@@ -27,10 +27,10 @@ from tumortrack.simulate.scene_folder import Scene, read_scene
 from tumortrack_lab.cut import VOXEL_MM, cut
 from tumortrack_lab.peers.base import Fit, estimate_of
 from tumortrack_lab.study.document import table
+from tumortrack_lab.study.lies import tumor_lies
 from tumortrack_lab.study.measure import Job, about_answer
 from tumortrack_lab.study.methods import Answer, Method, StudyCase, code_sha256
-from tumortrack_lab.study.paper import tumor_lies
-from tumortrack_lab.study.tables import EMPTY, NOTHING, groups, names, ordered
+from tumortrack_lab.study.tables import EMPTY, NOTHING, groups, label_of, names, ordered
 from tumortrack_lab.twin.apparatus import moved
 
 TRUTH = "truth"
@@ -205,7 +205,7 @@ def tables_of(measurements: list[dict]) -> str:
         ]
         texts += ["Each case:", table(("case", *_HEAD), each, left=3)]
     refused = Counter(
-        f"{method}, {_label(planner)}: {reason}"
+        f"{label_of(method)}, {_label(planner)}: {reason}"
         for (method, planner), plans in groups(frame, "method", "planner")
         for reason in plans.refused.dropna()
     )
@@ -221,7 +221,7 @@ def _rows(frame: pd.DataFrame) -> list[list[str]]:
     for (method, planner), plans in groups(frame, "method", "planner"):
         made = plans[plans.refused.isna()]
         free, removed = made[made.detached.astype(bool)], 100 * made.removed_share
-        row = [method, _label(planner), f"{len(made)} of {len(plans)}"]
+        row = [label_of(method), _label(planner), f"{len(made)} of {len(plans)}"]
         row += [f"{n} of {len(made)}" for n in (len(free), (made.removed_share >= _WHOLE).sum())]
         row += [_text(share, down=True) for share in (removed.median(), removed.min())]
         row.append(_text(made.left_ml.max(), digits=2))

@@ -122,8 +122,8 @@ class McapFile:
         self._last_ns, self._chunk_s = 0, time.monotonic()
         self._refused = ""
         try:
-            humble = 8  # the version of its bags
-            writer: Any = Writer(folder, version=humble, storage_plugin=StoragePlugin.MCAP)
+            # Version 8 is Humble's.
+            writer: Any = Writer(folder, version=8, storage_plugin=StoragePlugin.MCAP)
             writer.open()
         except WriterError as error:  # another process began to record into it a moment ago
             raise InputError(f"{folder} exists already. Choose another folder.") from error

@@ -1,0 +1,41 @@
+"""How a tumor lies in its organ, by measure: tables never mix the kinds."""
+
+from __future__ import annotations
+
+from typing import Literal, NamedTuple
+
+import numpy as np
+
+from tumortrack.core.types import Anatomy
+from tumortrack.report.metrics import distance_to_surface, surface_samples
+
+Kind = Literal["exophytic", "endophytic"]
+
+EXPOSED_MM = 0.5  # a tumor's surface this close to the organ's is the organ's surface
+EXOPHYTIC_SHARE = 0.05
+
+
+class Lie(NamedTuple):
+    """How a tumor lies in the organ: the share of its surface that is the organ's own, and the
+    least parenchyma above it, mm."""
+
+    exposed_share: float
+    cover_mm: float
+
+    @property
+    def kind(self) -> Kind:
+        return "exophytic" if self.exposed_share >= EXOPHYTIC_SHARE else "endophytic"
+
+    def text(self, tumor: str) -> str:
+        return f"{tumor.rpartition('_')[2]}, {self.kind}"
+
+
+def tumor_lies(anatomy: Anatomy) -> dict[str, Lie]:
+    """By part name; any frame."""
+    lies = {}
+    for name, tumor in zip(anatomy.names[1:], anatomy.tumors, strict=True):
+        points, area, _ = surface_samples(tumor)
+        distance = distance_to_surface(points, anatomy.organ)
+        share = float(area[distance < EXPOSED_MM].sum() / area.sum())
+        lies[name] = Lie(share, float(np.min(distance)))
+    return lies
