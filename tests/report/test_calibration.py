@@ -179,8 +179,10 @@ def test_stored_margins_are_refused_where_anything_differs(tmp_path, monkeypatch
     with pytest.raises(ArtifactError, match="is of another model"):
         stored.read_margins(tmp_path)
     stored.keep_margins(tmp_path, margins)
-    monkeypatch.setattr(stored, "METHOD", stored.METHOD + 1)
-    with pytest.raises(ArtifactError, match="version 1 of the method; this is version 2"):
+    now = stored.METHOD
+    monkeypatch.setattr(stored, "METHOD", now + 1)
+    said = f"version {now} of the method; this is version {now + 1}"
+    with pytest.raises(ArtifactError, match=said):
         stored.read_margins(tmp_path)
 
 

@@ -67,6 +67,11 @@ def test_a_worse_fit_is_flagged(tracker, stages):
     parts = json.loads(json.dumps(good.report["parts"]))
     parts["tumor_1"]["center_std_mm"] = 3.4
     assert "tumor_1 is unsure by 3.4 mm" in doubted(estimate, cloud, parts=parts).reason
+    for apart_mm, verdict in ((2.9, "good"), (5.2, "poor")):
+        others = [{"more": 1.0, "apart_mm": {"kidney": 0.4, "tumor_1": apart_mm}}]
+        rival = doubted(estimate, cloud, fit_cost={"now": 1.0, "usual": 2.0, "others": others})
+        assert rival.quality == verdict
+    assert "tumor_1 may as well lie 5.2 mm away" in rival.reason
 
 
 def test_an_organ_that_the_camera_sees_through_is_refused(tracker, stages):

@@ -16,7 +16,7 @@ shape prior, e.g. Heimann and Meinzer 2009 (doi 10.1016/j.media.2009.05.004).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float, Float64
@@ -24,6 +24,8 @@ from jaxtyping import Float, Float64
 from tumortrack.core.geometry import Points
 from tumortrack.models.config import GaussNewtonConfig
 from tumortrack.registration import gauss_newton_kernels as kernels
+from tumortrack.registration.discrepancy import judge
+from tumortrack.registration.kernels import POSE
 from tumortrack.registration.motion import ElasticMotion
 from tumortrack.registration.rest_shape import RestShape
 from tumortrack.simulate.elastic.flow import LatticeField
@@ -32,13 +34,15 @@ from tumortrack.simulate.elastic.flow import LatticeField
 @dataclass(frozen=True, eq=False)
 class RegistrationResult:
     """A motion, its cost (robust data term and prior), and the residuals (signed distances, mm).
-    ``moved``: shift (mm) and turn (rad) from where the prior has the pose."""
+    ``moved``: shift (mm) and turn (rad) from where the prior has the pose. ``rivals``: other minima
+    that explain the points nearly as well (see ``registration.best_of``)."""
 
     motion: ElasticMotion
     cost: float
     distances_mm: Float[np.ndarray, " n"]
     steps: int
     moved: Float64[np.ndarray, " 6"]
+    rivals: tuple[RegistrationResult, ...] = ()
 
 
 def refine(
@@ -101,6 +105,18 @@ class GaussNewton:
         placed = state.rotation, state.centre_mm, state.coefficients
         motion = ElasticMotion(self._rest, *placed, covariance)
         return RegistrationResult(motion, self.cost, state.distances_mm, self.steps, state.moved)
+
+
+def posterior(motion: ElasticMotion, points_mm: Points, config: GaussNewtonConfig) -> ElasticMotion:
+    """A fitted motion with what its residuals (points: camera frame, mm) leave unsure: see
+    ``discrepancy``."""
+    body = motion.shape.body
+    off = np.concatenate([np.zeros(POSE), body.mean - motion.coefficients])
+    prior = np.diag([config.shift_mm**2] * 3 + [config.turn_rad**2] * 3 + [0.0] * len(body.mean))
+    prior[POSE:, POSE:] = body.covariance
+    rows, rest_ct = motion.residual_rows(points_mm), motion.back(points_mm)
+    covariance, process = judge(rows, rest_ct, prior, off, config.last_mm)
+    return replace(motion, covariance=covariance, discrepancy=process)
 
 
 def _prior(rest: RestShape, config: GaussNewtonConfig) -> Float64[np.ndarray, "p p"]:

@@ -87,41 +87,37 @@ def back(flow, pose, points, out):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, fastmath=True, nogil=True)
-def covariances(flow, modes, center, root, points, out):  # type: ignore[no-untyped-def]
-    """Each point's covariance (n, 3, 3) in the organ's axes, if ``root @ root.T`` (p, p) is that of
-    the unknowns: their effects times the root, times the same transposed. All float32."""
+def effects(flow, modes, center, points, out):  # type: ignore[no-untyped-def]
+    """What each unknown does to the place of each point (n, 3), float32, in the organ's axes, into
+    ``out`` (n, 3, p), float64."""
     velocity, origin, spacing, steps = flow
     places, speeds, middles = block()
-    along = np.eye(3, dtype=np.float32)
-    row, mixed = np.empty(len(root), np.float32), np.empty((3, len(root)), np.float32)
+    along, row = np.eye(3, dtype=np.float32), np.empty(modes.shape[-1], np.float32)
     for first in range(0, len(points), BLOCK):
         some = points[first : first + BLOCK]
         enter(some, origin, spacing, places)
         travel(velocity, spacing, steps, len(some), places, speeds, middles)
         for p in range(len(some)):
-            offset = (
-                origin[0] + spacing * places[0, p] - center[0],
-                origin[1] + spacing * places[1, p] - center[1],
-                origin[2] + spacing * places[2, p] - center[2],
-            )
-            mixed[:] = 0
+            x, y, z = middles[0, p], middles[1, p], middles[2, p]
             for axis in range(3):
-                row[:] = 0
-                row[axis] = 1
                 after, before = (axis + 1) % 3, (axis + 2) % 3
-                row[3 + after] = offset[before]
-                row[3 + before] = -offset[after]
-                x, y, z = middles[0, p], middles[1, p], middles[2, p]
-                add_modes(modes, x, y, z, along[axis], row[POSE:])
-                for n in range(len(root)):
-                    for m in range(n + 1):  # the root is lower triangular
-                        mixed[axis, m] += row[n] * root[n, m]
-                for other in range(axis + 1):
-                    total = np.float32(0)
-                    for m in range(len(root)):
-                        total += mixed[axis, m] * mixed[other, m]
-                    out[first + p, axis, other] = total
-                    out[first + p, other, axis] = total
+                effect = out[first + p, axis]
+                effect[:POSE] = 0
+                effect[axis] = 1
+                effect[3 + after] = origin[before] + spacing * places[before, p] - center[before]
+                effect[3 + before] = center[after] - origin[after] - spacing * places[after, p]
+                row[:] = 0
+                add_modes(modes, x, y, z, along[axis], row)
+                effect[POSE:] = row
+
+
+@numba.njit(cache=True, fastmath=True, nogil=True)
+def residual_rows(modes, field, flow, pose, points, out):  # type: ignore[no-untyped-def]
+    """``add_rows`` of any number of points (n, 3), into ``out`` (n, p + 1), float32."""
+    buffers = block()
+    for first in range(0, len(points), BLOCK):
+        some = points[first : first + BLOCK]
+        add_rows(modes, field, flow, pose, some, buffers, out[first : first + BLOCK])
 
 
 @numba.njit(cache=True, fastmath=True, nogil=True, inline="always")

@@ -12,14 +12,16 @@ from jaxtyping import Float, Float32, Int32, Int64, UInt8
 from scipy.spatial import cKDTree
 
 from tumortrack.core.estimate import Estimate, Following
+from tumortrack.core.geometry import Points
 from tumortrack.core.types import Anatomy, CameraLabels, Mesh, OccupancyCloud, SensorCloud
 from tumortrack.imaging.raster import label_grid
 from tumortrack.models.in_distribution import check_in_distribution, check_likely
 from tumortrack.models.report import Frame, describe_parts, grid_over
 from tumortrack.registration import kernels
-from tumortrack.registration.gauss_newton import RegistrationResult, refine
+from tumortrack.registration.gauss_newton import RegistrationResult, posterior, refine
 from tumortrack.registration.model import RegistrationModel
 from tumortrack.registration.motion import ElasticMotion, blend
+from tumortrack.registration.registration import best_of
 
 QUERIES = 40_000  # as many as the paper asks
 CARRIED = 20_000  # points of the undeformed organ that live estimates carry along
@@ -88,7 +90,6 @@ class RegistrationLocator:
         self._samples_ct = np.concatenate(some)
         self._sample_ends = np.cumsum([len(one) for one in some])[:-1]  # of each part's
         self._nearest_sample = nearest_lookup(self._samples_ct)
-        self._middles_ct = np.array([part.box_mm.mean(0) for part in anatomy.parts])
         self._carried: _OrganPoints | None = None
 
     def locate(self, cloud: SensorCloud, grid: int, seed: int) -> Estimate:
@@ -115,11 +116,12 @@ class RegistrationLocator:
         usual, fits = self._calibration.usual_cost, []
         if isinstance(start, ElasticMotion):
             with frame.stage("follow"):
-                fits.append(refine(self._shape, points, start, self._near))
-        if not fits or how.thorough or fits[0].cost > usual:
+                starts = [start, *(rival for rival, _ in start.rivals)]
+                fits += [refine(self._shape, points, one, self._near) for one in starts]
+        if not fits or how.thorough or min(fit.cost for fit in fits) > usual:
             enough = usual if how.thorough or not fits else np.inf
             fits.append(self._registration.register(points, enough, frame.stage))
-        fit = min(fits, key=lambda fit: fit.cost)
+        fit = best_of(fits)
         unsmoothed, lag_s = fit.motion, 0.0
         if last is not None and isinstance(last.motion, ElasticMotion) and how.smoothing_s > 0:
             past_s = (cloud.stamp_ns - last.cloud.stamp_ns) * 1e-9
@@ -144,7 +146,7 @@ class RegistrationLocator:
         points = Frame(self._model, cloud, 0, np.random.default_rng(0)).points_mm
         self._registration.propose(points)
         fit = refine(self._shape, points, rest, self._near)
-        self._carry(self._moved(fit), 0)
+        self._carry(self._moved(points, fit), 0)
 
     def _checked(self, frame: Frame, fit: RegistrationResult) -> _Registered:
         """What a fit says, if it can be this organ's."""
@@ -152,16 +154,22 @@ class RegistrationLocator:
         check_in_distribution(known, frame.points_mm, distances_mm)
         check_likely(fit.motion.rarity)
         with frame.stage("surfaces"):
-            return self._moved(fit)
+            return self._moved(frame.points_mm, fit)
 
-    def _moved(self, fit: RegistrationResult) -> _Registered:
-        motion = replace(fit.motion, std_scale=self._calibration.std_scale)
+    def _moved(self, points_mm: Points, fit: RegistrationResult) -> _Registered:
+        motion = replace(
+            posterior(fit.motion, points_mm, self._registration.config),
+            calibration=self._model.config.scene.calibration,
+            std_scale=self._calibration.std_scale,
+        )
         anatomy = self._shape.anatomy_ct
         moved = motion.carry(self._vertices_ct)
         ends = np.cumsum([len(part.vertices_mm) for part in anatomy.parts])[:-1]
         parts = zip(anatomy.names, anatomy.parts, np.split(moved, ends), strict=True)
         meshes = {name: part.moved(places) for name, part, places in parts}
-        known_mm2 = motion.covariance_mm2(np.concatenate([self._samples_ct, self._middles_ct]))
+        known_mm2 = motion.covariance_mm2(
+            np.concatenate([self._samples_ct, self._shape.middles_ct])
+        )
         assert known_mm2 is not None
         count = len(self._samples_ct)
         return _Registered(fit, motion, meshes, known_mm2[:count], known_mm2[count:])
@@ -169,7 +177,7 @@ class RegistrationLocator:
     def _report(
         self, frame: Frame, placed: _Registered, inside: OccupancyCloud, **more: Any
     ) -> dict[str, Any]:
-        fit, motion = placed.fit, placed.motion
+        fit, motion, process = placed.fit, placed.motion, placed.motion.discrepancy
         parts = describe_parts(self._model.parts, placed.meshes, inside)
         surfaces = np.split(placed.sample_mm2, self._sample_ends)
         for part, mm2, its_mm2 in zip(parts.values(), placed.middle_mm2, surfaces, strict=True):
@@ -178,14 +186,27 @@ class RegistrationLocator:
             part["center_axes_std_mm"] = np.sqrt(squares[::-1]).tolist()
             part["center_axes"] = axes.T[::-1].tolist()
             part["surface_std_mm"] = float(np.sqrt(np.linalg.eigvalsh(its_mm2).max()))
-        more["fit_cost"] = {"now": fit.cost, "usual": self._calibration.usual_cost}
+        others = [
+            {"more": rival.cost - fit.cost, "apart_mm": self._apart_mm(fit.motion, rival.motion)}
+            for rival in fit.rivals
+        ]
+        usual = self._calibration.usual_cost
+        more["fit_cost"] = {"now": fit.cost, "usual": usual, "others": others}
         more["motion"] = {
             "camera_from_ct": motion.camera_from_ct.tolist(),
             "coefficients": motion.coefficients.tolist(),
             "rarity": motion.rarity,
             "steps": fit.steps,
+            "discrepancy_mm": None if process is None else process.amplitude_mm,
+            "noise_mm": None if process is None else process.noise_mm,
         }
         return frame.report(np.abs(fit.distances_mm), parts, **more)
+
+    def _apart_mm(self, motion: ElasticMotion, rival: ElasticMotion) -> dict[str, float]:
+        """How far from each other the middles of the parts lie."""
+        away = rival.carry(self._shape.middles_ct) - motion.carry(self._shape.middles_ct)
+        apart_mm = np.linalg.norm(away, axis=1).tolist()
+        return dict(zip(self._model.parts, apart_mm, strict=True))
 
     def _drawn(
         self, placed: _Registered, organ: Mesh, stamp_ns: int, rng: np.random.Generator

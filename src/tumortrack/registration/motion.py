@@ -7,19 +7,21 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float32, Float64
 from scipy.spatial.transform import Rotation
 
 from tumortrack.core.geometry import Points, rigid
 from tumortrack.core.process import parallel_for
 from tumortrack.registration import kernels
+from tumortrack.registration.discrepancy import Discrepancy, products
 from tumortrack.registration.kernels import Flow, Pose
 from tumortrack.registration.rest_shape import RestShape
+from tumortrack.sense.noise import CALIBRATED, CalibrationConfig
 from tumortrack.simulate.elastic.flow import steps_for
 
 Moved = Float64[np.ndarray, "n 3"]
 _AT_ONCE = 4096  # points: a thread's part
-_FEW = 64  # as well, where each takes longer
+_FEW = 1024  # as well, where each takes longer
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,6 +32,10 @@ class ElasticMotion:
         rotation, centre_mm: where the organ's axes and centre are before the camera.
         coefficients: of the body's modes; ``covariance``: of shift (mm), turn (rad; both in the
             CT's axes, about the centre) and coefficients, as ``refine`` left it, if it did.
+        discrepancy: what the body's modes cannot do, where it was judged.
+        rivals: other motions that explain the points nearly as well, each with its share of the
+            probability.
+        calibration: the largest errors of the camera's, which no fit can see.
         std_scale: a factor for its standard deviations, found on validation scenes.
     """
 
@@ -38,6 +44,9 @@ class ElasticMotion:
     centre_mm: Float64[np.ndarray, " 3"]
     coefficients: Float64[np.ndarray, " m"]
     covariance: Float64[np.ndarray, "p p"] | None = None
+    discrepancy: Discrepancy | None = None
+    rivals: tuple[tuple[ElasticMotion, float], ...] = ()
+    calibration: CalibrationConfig = CALIBRATED
     std_scale: float = 1.0
 
     @property
@@ -57,8 +66,7 @@ class ElasticMotion:
 
     def back(self, points_camera: Points, /) -> Moved:
         """Camera frame (mm) -> CT (LPS, mm)."""
-        opposite = self._flow._replace(velocity=-self._flow.velocity)
-        return self._moved(kernels.back, opposite, points_camera)
+        return self._moved(kernels.back, self._opposite, points_camera)
 
     def std_mm(self, points_ct: Points, /) -> Float64[np.ndarray, " n"] | None:
         """One standard deviation along any axis, mm: the root of the mean over three of them."""
@@ -71,18 +79,43 @@ class ElasticMotion:
         return None if covariance is None else np.sqrt(np.linalg.eigvalsh(covariance)[:, -1])
 
     def covariance_mm2(self, points_ct: Points, /) -> Float64[np.ndarray, "n 3 3"] | None:
-        """Of the places to which ``carry`` takes points, in the camera's axes: the pose's and the
-        state's, to first order."""
+        """Of the places to which ``carry`` takes points, in the camera's axes: of pose and state to
+        first order, of the discrepancy, the rivals and the camera's calibration."""
         if self.covariance is None:
             return None
-        body, points = self.shape.body, np.ascontiguousarray(points_ct, np.float32)
-        root = np.linalg.cholesky(self.covariance).astype(np.float32)
-        known = self._flow, body.modes, body.center_ct.astype(np.float32), root
-        out = np.empty((len(points), 3, 3), np.float32)
-        parallel_for(
-            lambda part: kernels.covariances(*known, points[part], out[part]), len(points), _FEW
-        )
-        return self.std_scale**2 * (self.rotation @ out.astype(float) @ self.rotation.T)
+        points = np.ascontiguousarray(points_ct, np.float32)
+        out, places_mm = np.empty((len(points), 3, 3)), self.carry(points)
+        parallel_for(lambda part: self._spread(points[part], out[part]), len(points), _FEW)
+        out = self.rotation @ out @ self.rotation.T
+        for rival, share in self.rivals:
+            away = rival.carry(points) - places_mm
+            out += share * away[:, :, None] * away[:, None, :]
+        depth_mm = np.maximum(places_mm[:, 2], 1.0)
+        ray, deep = places_mm / depth_mm[:, None], self.calibration.variance_mm2(depth_mm)
+        return self.std_scale**2 * (out + deep[:, None, None] * ray[:, :, None] * ray[:, None, :])
+
+    def _spread(
+        self, points: Float32[np.ndarray, "n 3"], out: Float64[np.ndarray, "n 3 3"]
+    ) -> None:
+        """The covariance of pose, state and discrepancy, organ's axes, not scaled."""
+        assert self.covariance is not None
+        body, effects = self.shape.body, np.empty((len(points), 3, len(self.covariance)))
+        kernels.effects(self._flow, body.modes, body.center_ct, points, effects)
+        process = self.discrepancy
+        if process is None:
+            out[:] = products(effects, self.covariance)
+        else:
+            out[:] = process.widened(effects, self.covariance, points)
+
+    def residual_rows(self, points_camera: Points) -> Float32[np.ndarray, "n q"]:
+        """What shift, turn and coefficients each do to the signed distance (mm) of points, carried
+        back, to the organ's surface at rest; that distance last."""
+        body, points = self.shape.body, np.ascontiguousarray(points_camera, np.float32)
+        pose = Pose(body.center_ct, self.rotation, self.centre_mm)
+        out = np.empty((len(points), kernels.POSE + len(self.coefficients) + 1), np.float32)
+        known = body.modes, self.shape.distances[0], self._opposite, pose
+        kernels.residual_rows(*known, points, out)
+        return out
 
     def _moved(self, kernel: Callable[..., None], flow: Flow, points_mm: Points) -> Moved:
         points, out = np.ascontiguousarray(points_mm, np.float32), np.empty((len(points_mm), 3))
@@ -97,6 +130,10 @@ class ElasticMotion:
         velocity = body.velocity(self.coefficients)
         steps = steps_for(velocity, body.spacing_mm)
         return Flow(velocity, body.origin_mm, np.float32(body.spacing_mm), steps)
+
+    @property
+    def _opposite(self) -> Flow:
+        return self._flow._replace(velocity=-self._flow.velocity)
 
 
 def blend(a: ElasticMotion, b: ElasticMotion, share: float) -> ElasticMotion:

@@ -5,7 +5,8 @@
    robust kernel; the one that fits best is kept.
 3. The fit is repeated from starts beside it, turned where its turn is least certain: one side
    leaves the turn about the organ's long axis nearly free, and there are local minima on the way.
-4. Where even that fits badly, the undeformed organ is tried in eight turns about the camera's
+4. Other minima that explain the points nearly as well, and put a tumor elsewhere, are kept.
+5. Where even that fits badly, the undeformed organ is tried in eight turns about the camera's
    axis, in the likeliest hypothesis's place: this repairs most hypotheses that are wrong.
 
 The result is a motion (`motion`): any point of the CT, carried to the camera's frame and back,
@@ -48,6 +49,12 @@ _BESIDE = 4.5
 # wrong ways round were above three times.
 _TRIAL_STEPS = 6
 _MAX_COST_RATIO = 3.0  # to the least cost: hypotheses above are given up
+
+# A cost is -2 log of the probability, up to a constant: what costs so much more has a hundredth of
+# the best one's.
+RIVAL_COST = -2 * math.log(0.01)
+_WITHIN = 7.81  # 95 % of chi squared with three degrees of freedom
+_SAME_MM = 0.2  # descents that end in one minimum end within some last steps (enough_mm, 0.02)
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,27 +124,62 @@ class Registration:
         place, at_rest = likeliest.centre_mm, self.rest.body.mean
         rotations = [turn @ likeliest.rotation for turn in turns]
         turned = [ElasticMotion(self.rest, rotation, place, at_rest) for rotation in rotations]
-        return min(fit, self._settle(points_mm, turned), key=_cost)
+        return best_of([fit, self._settle(points_mm, turned)])
 
     def _settle(self, points_mm: Points, starts: list[ElasticMotion]) -> RegistrationResult:
         """The best of the starts, refined, and of the fits from starts beside that."""
-        fit = self._race([self._descent(points_mm, start) for start in starts])
-        beside = [self._descent(points_mm, *start) for start in _beside(fit)]
-        return min(fit, self._race(beside), key=_cost)
+        fits = self._race([self._descent(points_mm, start) for start in starts])
+        beside = _beside(min(fits, key=_cost))
+        return best_of(fits + self._race([self._descent(points_mm, *start) for start in beside]))
 
     def _descent(
         self, points_mm: Points, start: ElasticMotion, moved: np.ndarray | None = None
     ) -> GaussNewton:
         return GaussNewton(self.rest, points_mm, start, self.config, moved)
 
-    def _race(self, descents: list[GaussNewton]) -> RegistrationResult:
+    def _race(self, descents: list[GaussNewton]) -> list[RegistrationResult]:
         """All are refined by a few steps; those that may still win, to the end."""
         trial, steps = min(_TRIAL_STEPS, self.config.steps), self.config.steps
         parallel_for(lambda part: descents[part.start].run(trial), len(descents), 1)
         most = _MAX_COST_RATIO * min(descent.cost for descent in descents)
         left = [descent for descent in descents if descent.cost <= most]
         parallel_for(lambda part: left[part.start].run(steps), len(left), 1)
-        return min(left, key=lambda descent: descent.cost).result()
+        return [descent.result() for descent in left]
+
+
+def best_of(fits: list[RegistrationResult]) -> RegistrationResult:
+    """The fit that costs least of these and their rivals. Its rivals are those that cost at most
+    ``RIVAL_COST`` more and put the middle of a part where neither its covariance nor those of
+    cheaper rivals have it; its motion has their shares of the probability, ``exp(-cost / 2)``."""
+    first, *others = sorted((one for fit in fits for one in (fit, *fit.rivals)), key=_cost)
+    kept = [first]
+    for other in others:
+        if other.cost - first.cost > RIVAL_COST:
+            break
+        if all(_elsewhere(other.motion, one.motion) for one in kept):
+            kept.append(other)
+    odds = [math.exp((first.cost - one.cost) / 2) for one in kept]
+    shares = [one / sum(odds) for one in odds]
+    rivals = tuple(zip((one.motion for one in kept[1:]), shares[1:], strict=True))
+    return replace(first, motion=replace(first.motion, rivals=rivals), rivals=tuple(kept[1:]))
+
+
+def _elsewhere(other: ElasticMotion, motion: ElasticMotion) -> bool:
+    """Whether it puts the middle of a part outside the ellipsoid that holds 95 % of the other's
+    covariance."""
+    off = other.coefficients - motion.coefficients, other.centre_mm - motion.centre_mm
+    if max(np.abs(part).max() for part in off) < _SAME_MM and _turned_mm(other, motion) < _SAME_MM:
+        return False  # most are the same minimum, which is quickly said
+    middles = motion.shape.middles_ct
+    known = replace(motion, rivals=()).covariance_mm2(middles)
+    assert known is not None
+    away = other.carry(middles) - motion.carry(middles)
+    return bool((np.linalg.solve(known, away[..., None])[..., 0] * away).sum(1).max() > _WITHIN)
+
+
+def _turned_mm(other: ElasticMotion, motion: ElasticMotion) -> float:
+    """How far the rotations have a point apart that lies 50 mm from the centre, about."""
+    return float(50 * np.abs(other.rotation - motion.rotation).max())
 
 
 def _cost(fit: RegistrationResult) -> float:

@@ -50,6 +50,11 @@ class RestShape:
         """The organ's longest principal direction, towards its slimmer, farther reaching end."""
         return long_axis_of(self.anatomy_ct.organ)
 
+    @cached_property
+    def middles_ct(self) -> Float64[np.ndarray, "parts 3"]:
+        """Of each part's box."""
+        return np.array([part.box_mm.mean(0) for part in self.anatomy_ct.parts])
+
     def labels_at(
         self, points_ct: Float32[np.ndarray, "n 3"]
     ) -> tuple[UInt8[np.ndarray, " n"], Float32[np.ndarray, " n"]]:

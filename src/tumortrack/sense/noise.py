@@ -15,6 +15,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
+from jaxtyping import Float
 
 from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError
@@ -40,6 +41,10 @@ class CalibrationConfig(Config, frozen=True, kw_only=True):
 
     def __post_init__(self) -> None:
         self.check_ranges("calibration", offset_mm=20.0, scale=0.2)
+
+    def variance_mm2(self, depth_mm: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+        """Of these errors at depths, along the line of sight: a third of the largest squares."""
+        return (self.offset_mm**2 + (self.scale * depth_mm) ** 2) / 3
 
 
 CALIBRATED = CalibrationConfig()

@@ -13,7 +13,9 @@ from tumortrack.core.types import DepthFrame, Intrinsics, Mesh, SensorCloud
 from tumortrack.models.margins import ModelMargins, exceeded, measured, stated_margin
 from tumortrack.sense.render import render_depth
 
-_UNSURE_MM = 3.0  # standard deviation of a tumor's middle
+# Standard deviation of a tumor's middle, and how far from it another fit, nearly as likely, may
+# have it.
+_UNSURE_MM = 3.0
 # Shares of the organ's picture. Right estimates have up to 0.03 (moving and pushed, on tables, in
 # beds and cavities, among instruments and hands), an organ upside down 0.12 to 0.16, one laid on
 # the points of a hand 0.2 to 0.4, a model laid on another patient's kidney mostly 0.1 to 0.24.
@@ -94,6 +96,10 @@ def _doubt(estimate: Estimate) -> str:
     cost = estimate.report.get("fit_cost")
     if cost is not None and cost["now"] > cost["usual"]:
         return "the organ's surface fits the points worse than in most validation scenes"
+    for other in () if cost is None else cost.get("others", ()):
+        name, apart_mm = max(other["apart_mm"].items(), key=lambda item: item[1])
+        if apart_mm > _UNSURE_MM:
+            return f"{name} may as well lie {apart_mm:.1f} mm away: the points fit there too"
     for name, part in estimate.report["parts"].items():
         if not part["found"]:
             return f"{name} was not found"
