@@ -211,7 +211,7 @@ def test_a_calibrated_margin_is_the_tracking_term():
     assert (chosen.tracking_mm, chosen.confidence) == (3.5, 0.9)
     without = planned_budget(plan, located(std_mm=0.2))
     assert (without.tracking_mm, without.confidence) == (LEAST_TRACKING_MM, 0)
-    assert "  tracking   3.6  not calibrated" in without.table()
+    assert f"  tracking {LEAST_TRACKING_MM:5.1f}  not calibrated" in without.table()
     for none in (located(std_mm=0.2), stating(tumor_2=3.0)):
         with pytest.raises(InputError, match="states no 95 % margin of tumor_1"):
             planned_budget(plan, none, confidence=0.95)

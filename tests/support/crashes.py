@@ -148,7 +148,7 @@ def recording(base: Path, folder: Path, times: int, rng: np.random.Generator) ->
             process.wait()
         stamps = [*stamps_of(place), killed_ns]
         *pauses_s, lost_s = np.diff(stamps) * 1e-9
-        if lost_s > _LOST_S + max(pauses_s):
+        if lost_s > _LOST_S + max(pauses_s, default=0.0):
             return f"{place.name} has {len(pauses_s)} frames and lacks the last {lost_s:.1f} s"
         shutil.rmtree(place)
     return ""
