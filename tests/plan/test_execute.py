@@ -417,7 +417,7 @@ def budgeted(margin_mm, deviation_mm=0.5):
     """A world whose arms heed an error budget, and how unsure its estimates are."""
     plan = plan_resection(SEEN, ResectionConfig(margin_mm=margin_mm))
     unsure = Deviating(deviation_mm)
-    planned = ErrorBudget(margin_mm=margin_mm, tracking_mm=3.6, hand_eye_mm=1.0, tool_mm=2.0)
+    planned = ErrorBudget(margin_mm=margin_mm, tracking_mm=4.2, hand_eye_mm=1.0, tool_mm=2.0)
     world = World(plan=plan, budget=LiveBudget(planned))
     changes = {"estimate": replace(GOOD.estimate, motion=unsure), "latency_ms": 50.0}
     return world, unsure, changes
@@ -426,7 +426,7 @@ def budgeted(margin_mm, deviation_mm=0.5):
 def test_arms_stand_while_the_errors_exceed_the_margin_and_go_on_when_they_shrink():
     world, unsure, changes = budgeted(10.0)
     cell = world.until("grasp", **changes)
-    assert cell.left_mm == pytest.approx(world.planned.kept_mm - np.hypot(3.6, np.sqrt(5)))
+    assert cell.left_mm == pytest.approx(world.planned.kept_mm - np.hypot(4.2, np.sqrt(5)))
     unsure.deviation_mm = 4.0
     cell = world.frames(15, **changes)
     assert cell.halted.startswith("12.2 mm of error, most of it tracking (12.0), against a margin")
@@ -437,7 +437,7 @@ def test_arms_stand_while_the_errors_exceed_the_margin_and_go_on_when_they_shrin
     assert world.frames(2, **changes).halted == ""
     world.until(DONE, **changes)
     found = world.operation.summary()["budget"]
-    assert found["planned"]["sum_mm"] == pytest.approx(np.hypot(3.6, np.sqrt(5)))
+    assert found["planned"]["sum_mm"] == pytest.approx(np.hypot(4.2, np.sqrt(5)))
     assert found["worst"]["tracking_mm"] == 4.5  # of those on which the arms went on
     assert found["worst"]["left_mm"] > 0
     (halt,) = world.operation.halts
@@ -445,11 +445,11 @@ def test_arms_stand_while_the_errors_exceed_the_margin_and_go_on_when_they_shrin
 
 
 def test_less_motion_than_allowed_can_be_too_much_and_is_planned_anew():
-    world, _, changes = budgeted(5.0)
+    world, _, changes = budgeted(5.6)
     world.until("approach", **changes)
     world.shift = np.array([1.5, 0.0, 0.0])  # 2 mm are allowed
     cell = world.frames(3, **changes)
-    assert cell.halted.startswith("5.7 mm of error, most of it tracking (3.6)")
+    assert cell.halted.startswith("6.3 mm of error, most of it tracking (4.2)")
     for _ in range(200):
         cell = world.frame(**changes)
         if world.calls and not cell.halted:
