@@ -12,7 +12,7 @@ from scipy.stats import multivariate_normal
 from elastic_objects import CENTER, RADII
 from tumortrack.models.config import GaussNewtonConfig
 from tumortrack.registration import discrepancy_kernels as kernels
-from tumortrack.registration.discrepancy import AMPLITUDES_MM, LENGTH_MM, NOISES_MM, judge
+from tumortrack.registration.discrepancy import AMPLITUDES_MM, LENGTH_MM, NOISES_MM, _grouped, judge
 from tumortrack.registration.gauss_newton import RegistrationResult, posterior, refine
 from tumortrack.registration.registration import RIVAL_COST, best_of
 from tumortrack.sense.noise import CalibrationConfig
@@ -116,12 +116,14 @@ def test_amplitude_and_noise_are_the_most_likely_pair():
 
 def test_groups_are_those_of_the_nearest_of_points_that_lie_far_apart():
     points = np.random.default_rng(3).uniform(0, 50, (400, 3))
-    chosen = [0]
-    for _ in range(19):
+    chosen = [int(np.linalg.norm(points - points.mean(0), axis=1).argmax())]
+    for _ in range(63):
         nearest = np.linalg.norm(points[:, None] - points[chosen], axis=2).min(1)
         chosen.append(int(nearest.argmax()))
     expected = np.linalg.norm(points[:, None] - points[chosen], axis=2).argmin(1)
-    np.testing.assert_array_equal(kernels.group(points, 20), expected)
+    np.testing.assert_array_equal(_grouped(points), expected)
+    twice = np.array([[0.0, 0, 0], [9, 0, 0], [0, 0, 0], [9, 0, 0]])
+    np.testing.assert_array_equal(np.unique(_grouped(twice)), [0, 1])  # none is empty
 
 
 def fit(motion, cost):

@@ -18,9 +18,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float32, Float64
+import torch
+from jaxtyping import Float32, Float64, Int64
+from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
+from tumortrack.models.sampling import farthest_points
 from tumortrack.registration import discrepancy_kernels as kernels
 
 # Of the process. 15 and 30 mm rank and cover the errors of training's and the twin's scenes alike.
@@ -92,13 +95,12 @@ def judge(
         width_mm: of the robust kernel.
     """
     distances = np.abs(rows[:, -1])
-    few = np.partition(distances, min(_GROUPS, len(distances)) - 1)[
-        min(_GROUPS, len(distances)) - 1
-    ]
-    kept = distances <= max(_FARTHEST * width_mm, few)
+    least = min(_GROUPS, len(distances))
+    nearest_mm = np.partition(distances, least - 1)[least - 1]
+    kept = distances <= max(_FARTHEST * width_mm, nearest_mm)
     rows, rest_ct = rows[kept].astype(float), rest_ct[kept]
     weights = 1 / (1 + (rows[:, -1] / width_mm) ** 2) ** 2
-    group = kernels.group(rest_ct, min(_GROUPS, len(rows)))
+    group = _grouped(rest_ct)
     shares = (group == np.arange(group.max() + 1)[:, None]) * weights
     shares /= shares.sum(1, keepdims=True)
     per_noise = (shares**2).sum(1)  # variance of a group's mean, of one point's
@@ -116,6 +118,14 @@ def judge(
     left = prior - cross @ spread.T
     process = Discrepancy(places_ct, normals, amplitude, noise, precision, cross)
     return (left + left.T) / 2, process
+
+
+def _grouped(points_ct: Float64[np.ndarray, "n 3"]) -> Int64[np.ndarray, " n"]:
+    """The number of each point's group: of the nearest of some that lie far apart."""
+    points = torch.from_numpy(points_ct.astype(np.float32))[None]
+    chosen = farthest_points(points, min(_GROUPS, len(points_ct)))[0].numpy()
+    nearest = cKDTree(points_ct[chosen]).query(points_ct)[1]
+    return np.unique(nearest, return_inverse=True)[1]  # where points coincide some have none
 
 
 def _alike(

@@ -1,4 +1,4 @@
-"""Kernels of the discrepancy: points in groups, and the most likely amplitude and noise."""
+"""The kernel of the discrepancy: the most likely amplitude and noise."""
 
 from __future__ import annotations
 
@@ -7,25 +7,6 @@ import math
 import numpy as np
 
 from tumortrack.core.compiled import numba
-
-
-@numba.njit(cache=True, nogil=True)
-def group(points, count):  # type: ignore[no-untyped-def]
-    """The number of the nearest of ``count`` points (n, 3) that lie far apart: each is the farthest
-    from those before it."""
-    out, nearest = np.zeros(len(points), np.int64), np.full(len(points), np.inf)
-    farthest = 0
-    for number in range(count):
-        middle, most = points[farthest], -1.0
-        for p in range(len(points)):
-            square = 0.0
-            for axis in range(3):
-                square += (points[p, axis] - middle[axis]) ** 2
-            if square < nearest[p]:
-                nearest[p], out[p] = square, number
-            if nearest[p] > most:
-                most, farthest = nearest[p], p
-    return out
 
 
 @numba.njit(cache=True, nogil=True)
