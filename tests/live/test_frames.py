@@ -13,7 +13,7 @@ from live_objects import CAMERA, STAMP_NS, small_estimate, small_frame, small_se
 from tumortrack.core.errors import NoEstimate
 from tumortrack.live.frames import FrameCheck
 from tumortrack.live.loop import Loop, LoopConfig
-from tumortrack.live.values import Observation, PublishedFrame
+from tumortrack.live.values import Observation, PublishedFrame, SourceEnded
 from tumortrack.live.workers import SinkWorker, SourceWorker
 from tumortrack.sense.region import RegionConfig
 from tumortrack.tracking.tracker import Tracker
@@ -51,6 +51,23 @@ class Frames(SourceWorker):
     def take(self, timeout_s):
         self.ended = not self._left
         return self._left.pop(0) if self._left else None
+
+
+class Tape:
+    """A source that waits for its reader."""
+
+    host_clock, lossless, dropped = False, True, 0
+
+    def __init__(self, frames):
+        self._left = list(frames)
+
+    def read(self, timeout_s):
+        if not self._left:
+            raise SourceEnded("that was all")
+        return self._left.pop(0)
+
+    def close(self):
+        pass
 
 
 def results(frames, tracker=None, config=None):
@@ -101,7 +118,8 @@ def test_a_frame_that_is_only_late_or_out_of_order_makes_nobody_forget():
             return super().follow(cloud, last, how, seen)
 
     frames = [frame_at(seconds) for seconds in (0.1, 0.3, 0.2, 0.5, 0.4, 0.7, 0.6)]
-    told = results(frames, Watched())
+    loop, told = Loop(Watched(), small_setting(), LoopConfig(region=ALL)), []
+    loop.run(SourceWorker(lambda: Tape(frames)), [], told.append)
     back = ["went back" in one.reason for one in told]
     assert back == [False, False, True, False, True, False, True]
     assert [start is None for start in starts] == [True, False, False, False]

@@ -18,7 +18,7 @@ from tumortrack.core.errors import InputError, NoEstimate, StorageError
 from tumortrack.live.calibration_file import read_frames
 from tumortrack.live.meter import Histogram
 from tumortrack.live.spec import Registry
-from tumortrack.live.stamps import StampCheck
+from tumortrack.live.stamps import StampOrder, check_age
 from tumortrack.live.values import Observation, PublishedFrame, SinkConfig, SourceEnded, SourceLost
 from tumortrack.live.workers import SinkWorker, SourceWorker
 
@@ -112,32 +112,31 @@ def _seen(stamp_ns, arrived_ns=None):
 
 
 def test_a_stale_frame_and_one_from_the_future_are_refused():
-    check = StampCheck(0.5)
     with pytest.raises(NoEstimate, match=r"stale: 0\.60 s old, if the clocks of camera"):
-        check.check(1 * SECOND, 0.6)
+        check_age(0.6, 0.5)
     with pytest.raises(NoEstimate, match=r"stale: 0\.60 s old$"):
-        check.check(1 * SECOND, 0.6, other_clock=False)
+        check_age(0.6, 0.5, other_clock=False)
     with pytest.raises(NoEstimate, match=r"2\.00 s in the future"):
-        check.check(1 * SECOND, -2.0)
-    check.check(1 * SECOND, 0.4)
-    with pytest.raises(NoEstimate, match="must be 0 or more"):
-        check.check(-5, 0.0)
+        check_age(-2.0, 0.5)
+    check_age(0.4, 0.5)
 
 
 def test_a_clock_that_was_set_back_is_believed_when_it_goes_on():
-    check = StampCheck(0.5)
+    order = StampOrder()
     for stamp in (100, 101, 102):
-        check.check(stamp * SECOND, 0.0)
+        order.check(stamp * SECOND)
     with pytest.raises(NoEstimate, match=r"went back by 92\.000 s"):
-        check.check(10 * SECOND, 0.0)
-    assert not check.check(103 * SECOND, 0.0)  # one stray: the old clock goes on
+        order.check(10 * SECOND)
+    order.check(103 * SECOND)  # one stray: the old clock goes on
     for stamp in (20, 21):
         with pytest.raises(NoEstimate, match="went back"):
-            check.check(stamp * SECOND, 0.0)
-    assert check.check(22 * SECOND, 0.0)
-    assert not check.check(23 * SECOND, 0.0)
+            order.check(stamp * SECOND)
+    order.check(22 * SECOND)
+    order.check(23 * SECOND)
     with pytest.raises(NoEstimate, match="went back"):
-        check.check(23 * SECOND, 0.0)  # the same frame again
+        order.check(23 * SECOND)  # the same frame again
+    with pytest.raises(NoEstimate, match="must be 0 or more"):
+        order.check(-5)
 
 
 @pytest.mark.parametrize(
@@ -185,6 +184,16 @@ def test_the_newest_frame_wins_and_the_others_are_counted():
     reader = SourceWorker(lambda: Script(frames))
     until(lambda: reader.dropped == 4)
     assert reader.take(PATIENCE_S).stamp_ns == 5
+    assert reader.take(0.05) is None
+    reader.close()
+
+
+def test_exchanged_frames_are_noticed_by_a_loop_that_is_too_busy_to_see_both():
+    reader = SourceWorker(lambda: Script([_seen(n) for n in (2, 1, 4, 3)]))
+    until(lambda: reader.dropped == 1)  # 2, for 4
+    time.sleep(0.05)  # for the last one to be read
+    assert "went back" in str(reader.take(PATIENCE_S))
+    assert reader.take(PATIENCE_S).stamp_ns == 4  # not 3, which came last
     assert reader.take(0.05) is None
     reader.close()
 

@@ -25,7 +25,7 @@ from tumortrack.core.types import DepthFrame, Intrinsics, SensorCloud
 from tumortrack.live import values as live
 from tumortrack.live.frames import FrameCheck
 from tumortrack.live.meter import RunStatistics
-from tumortrack.live.stamps import StampCheck
+from tumortrack.live.stamps import check_age
 from tumortrack.live.values import Observation, SourceLost, TrackingResult
 from tumortrack.live.workers import SinkWorker, SourceWorker
 from tumortrack.sense.camera import d405
@@ -80,7 +80,6 @@ class Loop:
     ) -> None:
         self._config, self._context, self._arms = config, context, arms
         self._follower = Follower(tracker, config.follower)
-        self._stamps = StampCheck(config.stale_s)
         self.frames = FrameCheck(context.published_frame, config.region, config.frozen_s)
         self._stop = threading.Event()
         self._sequence = itertools.count()
@@ -167,10 +166,11 @@ class Loop:
         try:
             # What is simulated has this computer's clock, and so has the moment of arrival.
             other_clock = born_ns == seen.stamp_ns and seen.truth is None
-            if self._stamps.check(seen.stamp_ns, _age_s(born_ns), other_clock):
+            check_age(_age_s(born_ns), self._config.stale_s, other_clock)
+            timely = True
+            if self._stamp is not None and seen.stamp_ns <= self._stamp[0]:  # set back: see workers
                 self.statistics.clock_jumps += 1
                 self._follower.forget()
-            timely = True
             with _timed(seconds, "frame"):
                 doubt = self.frames.check(seen)
             with _timed(seconds, "organ"):

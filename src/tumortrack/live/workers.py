@@ -11,8 +11,9 @@ from collections import deque
 from collections.abc import Callable
 from typing import Any
 
-from tumortrack.core.errors import InputError, TumortrackError
+from tumortrack.core.errors import InputError, NoEstimate, TumortrackError
 from tumortrack.live.meter import Histogram
+from tumortrack.live.stamps import StampOrder
 from tumortrack.live.values import (
     Observation,
     Sink,
@@ -35,12 +36,15 @@ _SLOW_S = 0.25  # at one result: what a sink shows lags by as much
 class SourceWorker:
     """Opens a source, reads it, and opens it again when it is lost. Of frames that come faster than
     they are taken the newest stays, and the others count as dropped; a ``lossless`` source is read
-    only as they are taken."""
+    only as they are taken. What was wrong with a frame, its order too, is handed over before later
+    frames, however many come."""
 
     def __init__(self, open_source: Callable[[], Source]) -> None:
         self._open = open_source
         self._lock = threading.Condition()
-        self._newest: tuple[Observation | TumortrackError, str] | None = None
+        self._newest: tuple[Observation, str] | None = None
+        self._refused: TumortrackError | None = None  # since the last frame that was taken
+        self._order = StampOrder()
         self._stop = threading.Event()
         self._passed = 0  # replaced before they were taken, or dropped by sources that are closed
         self._source: Source | None = None
@@ -71,9 +75,14 @@ class SourceWorker:
         Raises whatever stopped the reading for good.
         """
         with self._lock:
-            self._lock.wait_for(lambda: self._newest is not None or self._over, timeout_s)
-            newest, self._newest = self._newest, None
+            self._lock.wait_for(lambda: self._waits or self._over, timeout_s)
+            refused, self._refused = self._refused, None
+            newest = None
+            if refused is None:
+                newest, self._newest = self._newest, None
             self._lock.notify_all()
+        if refused is not None:
+            return refused
         if newest is None:
             if self.failure is not None:
                 raise self.failure
@@ -89,6 +98,10 @@ class SourceWorker:
         self._thread.join(_STOP_S)
         if self._thread.is_alive() and (source := self._source) is not None:
             source.close()
+
+    @property
+    def _waits(self) -> bool:
+        return self._newest is not None or self._refused is not None
 
     @property
     def _over(self) -> bool:
@@ -128,7 +141,9 @@ class SourceWorker:
             while not self._stop.is_set():
                 try:
                     got: Observation | TumortrackError | None = source.read(_READ_S)
-                except InputError as error:
+                    if isinstance(got, Observation):
+                        self._order.check(got.stamp_ns)
+                except (InputError, NoEstimate) as error:
                     got = error
                 if got is not None:
                     came = time.monotonic()
@@ -144,10 +159,12 @@ class SourceWorker:
     def _put(self, got: Observation | TumortrackError, counts_from: str) -> None:
         with self._lock:
             if counts_from == "taking":
-                self._lock.wait_for(lambda: self._newest is None or self._stop.is_set())
-            elif self._newest is not None:
-                self._passed += 1
-            self._newest = (got, counts_from)
+                self._lock.wait_for(lambda: not self._waits or self._stop.is_set())
+            if isinstance(got, TumortrackError):
+                self._refused = got
+            else:
+                self._passed += self._newest is not None
+                self._newest = (got, counts_from)
             self._lock.notify_all()
 
 
