@@ -15,7 +15,7 @@ from msgspec.structs import replace as with_terms
 from live_objects import small_estimate, small_update
 from plan_objects import RADIUS_MM, TUMOR_MM, Deviating, located, sphere
 from tumortrack.core.errors import InputError, NoPlan
-from tumortrack.live.calibration_file import read_error_mm
+from tumortrack.live.calibration_file import read_frames
 from tumortrack.live.sinks.ur import OFF_MM
 from tumortrack.plan.budget import (
     HAND_EYE_MM,
@@ -138,7 +138,7 @@ def test_a_calibration_states_its_error_at_the_tumor(tmp_path):
     def stated(**error):
         frame = {"frame_id": "base", "unit": "m", "robot_from_camera": rows, **error}
         path.write_text(json.dumps(frame))
-        return read_error_mm(path, 200.0)
+        return read_frames(path).error_at(200.0)
 
     assert stated() is None
     assert stated(error_mm=1.2) == 1.2
