@@ -462,6 +462,21 @@ def test_an_arm_elsewhere_is_not_moved(arm, moving):
     assert arm.what() == ["servo"]
 
 
+def test_an_arm_that_begins_beside_its_target_joins_the_plan_slowly(arm, moving, monkeypatch):
+    clock = Clock()
+    monkeypatch.setattr("tumortrack.live.sinks.ur.time", clock)
+    sink = moving()
+    arm.actual[0] += np.radians(1.5)
+    sent = []
+    for n in range(61):
+        sink.publish(working(n, 0.002 * n))
+        sent.append(np.degrees(arm.told[-1][1][0] - angles(0.002 * n)[0]))
+        clock.sleep(0.02)
+    assert sent[0] == pytest.approx(1.5)
+    assert np.diff(sent[:51]) == pytest.approx(-0.03)  # 1.5 degrees in a second
+    assert np.array(sent[51:]) == pytest.approx(0.0, abs=1e-9)
+
+
 def cutting(number, yes):
     result = working(number)
     return replace(result, workcell=replace(result.workcell, cutting=yes))
