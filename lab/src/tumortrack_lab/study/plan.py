@@ -56,7 +56,6 @@ class StudyPlan(Config, frozen=True):
     grid: int = 160  # Voxels along the longest side (the paper's: 400)
     configurations: tuple[int, ...] = (1, 2, 3, 4, 5, 6)  # Rows of the paper's deformation table
     configuration_variants: tuple[str, ...] = ("D0", "D1", "D2", "D3")  # In the deformation study
-    configuration_view: str = "noise"  # In the deformation study
     # Methods and bounds beside the models
     peers: tuple[str, ...] = (RIGID, *BOUNDS, "rigid", "cpd", "elastic")
     case_peers: tuple[str, ...] | None = None  # Peers for --case (as for the phantom)
@@ -199,7 +198,7 @@ def _blocks(plan: StudyPlan, section: Section, case: StudyCase) -> list[_Block]:
         "ablation": [ablation] * (case.name in plan.ablation_cases),
         "deformation": [
             _Block(trained(configurations, of), (), plan.configuration_variants,
-                   (plan.configuration_view,), grid)
+                   (plan.view,), grid)
         ],
         "faults": [
             _Block(trained(plan.fault_models, once), known(plan.fault_peers),
