@@ -107,7 +107,7 @@ class Margins:
 
 def _generic(manifest: dict[str, Any]) -> ModelMargins:
     from tumortrack.models.folder import has_shape
-    from tumortrack.models.margins import GENERIC, read_sealed
+    from tumortrack.models.margins import GENERIC, judged_by, read_sealed
 
     if not GENERIC.is_file():
         raise InputError(
@@ -119,7 +119,16 @@ def _generic(manifest: dict[str, Any]) -> ModelMargins:
             "no margin is known: the generic calibration is of models of the preset clinic. Give "
             "folders of scenes: tumortrack margins MODEL SCENES."
         )
-    return read_sealed(GENERIC)
+    margins = read_sealed(GENERIC)
+    for name, figure in judged_by(manifest).items():
+        if figure > margins.models[name]:
+            raise InputError(
+                f"no margin is known: {name} is {figure:.3g}, and at most "
+                f"{margins.models[name]:.3g} in the models of the generic calibration, so this one "
+                "may err by more. Train it longer, or give folders of scenes: tumortrack margins "
+                "MODEL SCENES."
+            )
+    return margins
 
 
 def described(margins: ModelMargins) -> list[str]:

@@ -65,13 +65,13 @@ def loosest_rule(
 
 def groups_of(labels: Sequence[Label], least: int) -> dict[Label, Int64[np.ndarray, " m"]]:
     """The members of each group, by their numbers. A group with fewer than ``least`` gives way to
-    the one that its label without the last word names, with all who are in that; one that a single
-    word names stays, however small."""
+    the one that its label without the last word names, with all who are in that; the last is the
+    empty label's, with everyone, however few."""
     found: dict[Label, Int64[np.ndarray, " m"]] = {}
-    for label in sorted(set(labels)):
+    for label in sorted(set(labels)) or [()]:
         while True:
             mine = [n for n, other in enumerate(labels) if other[: len(label)] == label]
-            if len(mine) >= least or len(label) == 1:
+            if len(mine) >= least or not label:
                 break
             label = label[:-1]
         found[label] = np.array(mine, np.int64)
