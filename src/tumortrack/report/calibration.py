@@ -41,9 +41,14 @@ _Turn = Literal["choose", "test", "calibrate"]
 CONFIDENCES = (0.9, 0.95)
 WIDEST_MM = 8.0  # what plans assume of estimates that say nothing of their error
 SHARES = (1 / 3, 2 / 3)  # of visible surface, that part the groups
-# Limits are tried at these quantiles of the states that they are chosen on: of the size, and of
-# whatever else is reported. The size alone keeps out much at little loss.
-_LEVELS = ((0.8, 0.8), (0.9, 0.9), (0.95, 0.95), (0.9, 1.0), (0.95, 1.0), (1.0, 1.0))
+# Limits are tried at these quantiles of the states that they are chosen on, in two sequences: of
+# all that is reported; and of the size, the largest values of all else. The first may keep out what
+# fits badly; the second keeps out much at little loss.
+_LEVELS = {
+    "all": ((0.8, 0.8), (0.9, 0.9), (0.95, 0.95), (1.0, 1.0)),
+    "size": ((0.8, 1.0), (0.9, 1.0), (0.95, 1.0)),
+}
+_ERROR = conformal.ERROR / len(_LEVELS)
 _OFFSETS_MM = (0.1, 0.5, 1.0, 2.0, 4.0, 8.0)
 _BENDS_MM = (0.0, 2.0, 4.0, 8.0, 16.0)
 # What a state is for: choosing form and limits, testing limits, finding radii. Of each group's
@@ -158,8 +163,8 @@ def margins_of(
     for row, turn in zip(rows, turns, strict=True):
         some[turn].append(row)
     rules = _rules([row for row in some["choose"] if not row.doubt])
-    number = _tested(rules, some["test"], kinds[0], widest_mm, 1 - highest)
-    accepted = {turn: [row for row in some[turn] if _accepted(row, rules[number])] for turn in some}
+    limits = _tested(rules, some["test"], kinds[0], widest_mm, 1 - highest)
+    accepted = {turn: [row for row in some[turn] if _accepted(row, limits)] for turn in some}
     least = conformal.least_scores(highest)  # fewer than the test of limits asks for
     groups, joined = _grouped(accepted["calibrate"], _ALONE * least)
     shells: list[Shells] = []
@@ -168,10 +173,10 @@ def margins_of(
         for kind in kinds:
             radii[kind] = _radius(groups, kind, forms[kind], confidence)
         shells.append(Shells(confidence=confidence, radii=radii))
-    each, tested = conformal.ERROR / len(rules), accepted["test"]
-    last, least = shells[-1].radii[kinds[0]], conformal.least_tested(1 - highest, each, misses=1)
+    tested, last = accepted["test"], shells[-1].radii[kinds[0]]
+    least = conformal.least_tested(1 - highest, _ERROR, misses=1)
     parts = _grouped(tested, least)[0].values()
-    bounds = [conformal.risk_bound(_misses(of, kinds[0], last), len(of), each) for of in parts]
+    bounds = [conformal.risk_bound(_misses(of, kinds[0], last), len(of)) for of in parts]
     return ModelMargins(
         method=METHOD,
         tumortrack=tumortrack.__version__,
@@ -179,9 +184,9 @@ def margins_of(
         table_sha256=table_sha256,
         seed=seed,
         widest_mm=widest_mm,
-        limits=rules[number],
+        limits=limits,
         shells=tuple(shells),
-        groups=tuple(_counts(rows, turns, rules[number])),
+        groups=tuple(_counts(rows, turns, limits)),
         joined=joined,
         risk_bound=max(bounds),
         accepted=len(tested) / len(some["test"]),
@@ -199,16 +204,20 @@ def _dealt(labels: Sequence[conformal.Label], seed: int) -> list[_Turn]:
     return [turns[n] for n in range(len(labels))]
 
 
-def _rules(good: Sequence[Row]) -> list[dict[str, float]]:
-    """Limits, the strictest first; none that lets pass what is worse than all that was seen."""
+def _rules(good: Sequence[Row]) -> list[list[dict[str, float]]]:
+    """Sequences of limits, the strictest first; none that lets pass what is worse than all that was
+    seen."""
     names = [name for name in good[0].measured if all(name in row.measured for row in good)]
     some = {name: np.array([row.measured[name] for row in good]) for name in names}
     return [
-        {
-            name: float(np.quantile(of, size if name == _SIZE else other, method="higher"))
-            for name, of in some.items()
-        }
-        for size, other in _LEVELS
+        [
+            {
+                name: float(np.quantile(of, size if name == _SIZE else other, method="higher"))
+                for name, of in some.items()
+            }
+            for size, other in levels
+        ]
+        for levels in _LEVELS.values()
     ]
 
 
@@ -249,29 +258,34 @@ def _form(rows: Sequence[Row], kind: Kind) -> Radius:
 
 
 def _tested(
-    rules: list[dict[str, float]], rows: Sequence[Row], kind: Kind, widest_mm: float, risk: float
-) -> int:
-    """The number of the loosest limits under which no more of the answers than the risk miss by
+    sequences: list[list[dict[str, float]]],
+    rows: Sequence[Row],
+    kind: Kind,
+    widest_mm: float,
+    risk: float,
+) -> dict[str, float]:
+    """The limits that give most answers of those under which no more of these than the risk miss by
     more than ``widest_mm``, in any group."""
-    each, tables = conformal.ERROR / len(rules), []
-    least = conformal.least_tested(risk, each, misses=1)
-    for limits in rules:
-        taken = [row for row in rows if _accepted(row, limits)]
-        groups = _grouped(taken, least)[0]
-        tables.append(
+    least, held = conformal.least_tested(risk, _ERROR, misses=1), []
+    for rules in sequences:
+        answers = [[row for row in rows if _accepted(row, limits)] for limits in rules]
+        tables = [
             {name: (_beyond(of, kind, widest_mm), len(of)) for name, of in groups.items()}
-        )
-    number = conformal.loosest_rule([list(table.values()) for table in tables], risk)
-    if number is None:
-        said = "; ".join(f"{m} of {n} of {name}" for name, (m, n) in tables[-1].items())
-        none = conformal.least_tested(risk, each)
+            for groups in (_grouped(taken, least)[0] for taken in answers)
+        ]
+        number = conformal.loosest_rule([[*one.values()] for one in tables], risk, _ERROR)
+        if number is not None:
+            held.append((len(answers[number]), rules[number]))
+    if not held:
+        said = "; ".join(f"{m} of {n} of {name}" for name, (m, n) in tables[0].items())
+        none = conformal.least_tested(risk, _ERROR)
         raise InputError(
             f"no limits hold {100 * risk:.3g} %: of the answers in each group, {said} "
             f"miss by more than {widest_mm:g} mm. It takes {none} without such a one, {least} with "
             "one, and 2.5 times as many states in all. Give more scenes, a wider --widest, or a "
             "lower --confidence."
         )
-    return number
+    return max(held, key=itemgetter(0))[1]
 
 
 def _beyond(rows: Sequence[Row], kind: Kind, widest_mm: float) -> int:
