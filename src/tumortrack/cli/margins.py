@@ -54,7 +54,7 @@ class Margins:
         if self.seed < 0:
             raise InputError(f"--seed {self.seed} must be 0 or more.")
         manifest = read_model_manifest(self.model)
-        margins = self._calibrated() if self.scenes else _generic(manifest)
+        margins = self._calibrated() if self.scenes else generic(manifest)
         path = keep_margins(self.model, margins)
         for line in described(margins):
             say(line)
@@ -105,7 +105,9 @@ class Margins:
         return [done[str(one.folder.resolve())] for one in listed]
 
 
-def _generic(manifest: dict[str, Any]) -> ModelMargins:
+def generic(manifest: dict[str, Any]) -> ModelMargins:
+    """The calibration that comes with this version, for a model with this manifest. InputError:
+    there is none, or it says nothing of such a model."""
     from tumortrack.models.folder import has_shape
     from tumortrack.models.margins import GENERIC, judged_by, read_sealed
 
@@ -138,7 +140,10 @@ def described(margins: ModelMargins) -> list[str]:
         for kind, radius in shells.radii.items():
             size = f"{radius.constant_mm:.1f} mm"
             if radius.used == "scaled":
-                size = f"{radius.scaled:.2f} x ({radius.offset_mm:g} mm + largest deviation)"
+                size = f"{radius.offset_mm:g} mm + largest deviation"
+                if radius.bend_mm:
+                    size += f" + {radius.bend_mm:g} mm x root of rarity"
+                size = f"{radius.scaled:.2f} x ({size})"
             lines.append(f"{100 * shells.confidence:g} % margin of {_WHAT[kind]}: {size}")
     lines += ["family, visible share, organ: states, good, accepted, tested, calibrated"]
     for group in margins.groups:

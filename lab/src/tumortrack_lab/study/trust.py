@@ -193,16 +193,19 @@ def reliability_picture(kinds: dict[str, pd.DataFrame], path: Path) -> None:
 def worst_picture(found: pd.DataFrame, tables: Sequence[Table], count: int, path: Path) -> str:
     """The accepted answers that are farthest off, drawn over the truth, a row each; and in words
     what happened: a Markdown table."""
-    from tumortrack import api
+    from tumortrack.training.model import load_model
 
     taken = found[found.accepted.astype(bool)].nlargest(count, "miss")
     models, trackers = {table.organ: table.model for table in tables}, {}
-    drawing = new_figure(11.0, 4.3 * len(taken) + 0.4)
+    height = 3.5 * len(taken) + 0.5
+    drawing = new_figure(11.0, height)
     panels, lines = drawing.subplots(len(taken), 2, squeeze=False), []
-    drawing.subplots_adjust(top=1 - 0.5 / (4.3 * len(taken)), hspace=0.14, wspace=0.03)
+    drawing.subplots_adjust(
+        left=0.04, top=1 - 0.75 / height, bottom=0.1 / height, hspace=0.13, wspace=0.03
+    )
     for number, (row, (_, state)) in enumerate(zip(panels, taken.iterrows(), strict=True), start=1):
         if state.organ not in trackers:
-            model = api.load_model(models[state.organ], "cpu", with_margins=False)
+            model = load_model(models[state.organ], "cpu", with_margins=False)
             trackers[state.organ] = Tracker(model)
         scene = read_scene(Path(state["row"].scene))
         estimate = trackers[state.organ].locate(scene.cloud, 8, 0, scene.depth)
