@@ -263,6 +263,21 @@ def test_a_fifth_of_strays_does_not_matter():
     assert np.abs(fit.distances_mm[strays]).mean() > 10
 
 
+def test_an_end_of_the_organ_is_found_all_around_a_misleading_start():
+    vertices = ORGAN.vertices_mm
+    seen = vertices[(vertices[:, 2] > CENTER[2]) & (placed().carry(vertices)[:, 2] < PLACE_MM[2])]
+    points = placed().carry(seen[np.random.default_rng(9).permutation(len(seen))[:800]])
+    across = Rotation.from_euler("z", 90, degrees=True).as_matrix()
+    middle = points.mean(0) + [0, 0, 15]
+    start = dataclasses.replace(placed(), rotation=across @ TURNED, centre_mm=middle)
+    method = Registration(None, shape(), GaussNewtonConfig())
+    alone, around = (method.best_fit(points, [start], usual) for usual in (np.inf, 0.0))
+    truth = refine(shape(), points, placed(), GaussNewtonConfig())
+    assert alone.cost > 2 * truth.cost
+    assert around.cost < 1.1 * truth.cost
+    assert method.best_fit(points, [placed()], 0.0).cost <= truth.cost
+
+
 def test_every_step_lowers_the_cost_and_enough_steps_end(unchecked):
     points = surface(placed(), 500)
     steady = GaussNewtonConfig(steps=40, first_mm=3.0, last_mm=3.0)

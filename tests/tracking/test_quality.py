@@ -74,6 +74,22 @@ def test_a_worse_fit_is_flagged(tracker, stages):
     assert "tumor_1 may as well lie 5.2 mm away" in rival.reason
 
 
+def test_strays_are_no_part_of_the_fit_that_is_judged(tracker, stages):
+    points, rng = stages[0].cloud.points_mm, np.random.default_rng(8)
+    clean = tracker.follow(stages[0].cloud)
+    low, high = points.min(0), points.max(0)
+    anywhere = low + (high - low) * rng.uniform(-0.1, 1.1, points.shape)
+    spoiled = SensorCloud(np.where(rng.random((len(points), 1)) < 0.35, anywhere, points))
+    found = tracker.follow(spoiled)
+    middles = (found.motion.carry(ANATOMY.organ.vertices_mm[:9]) for found in (clean, found))
+    assert np.linalg.norm(next(middles) - next(middles), axis=1).max() < 2
+    assert 0.15 < found.report["strays"] < 0.35  # the others lie near the surface
+    now, before = (one.report["fit_cost"]["now"] for one in (found, clean))
+    assert now < before + 0.5 * found.report["fit_cost"]["usual"]
+    assert doubted(clean, stages[0].cloud, strays=0.49).quality == "good"
+    assert "51 % of the points" in doubted(clean, stages[0].cloud, strays=0.51).reason
+
+
 def test_an_organ_that_the_camera_sees_through_is_refused(tracker, stages):
     estimate = tracker.follow(stages[0].cloud)
     camera = d405(424, 240)
@@ -81,8 +97,12 @@ def test_an_organ_that_the_camera_sees_through_is_refused(tracker, stages):
     alone = render_depth(organ.vertices_mm, organ.faces, camera)
     behind_mm = np.float32(np.nanmax(alone.depth_mm) + 30)
     table = DepthFrame(np.fmin(alone.depth_mm, behind_mm), camera)
-    assert seen_through(organ, alone) == 0
-    assert seen_through(organ, table) == 0
+    assert seen_through(organ, alone) == (0, 0)
+    assert seen_through(organ, table) == (0, 1)
+    costly = {"now": 3.9, "usual": 2.0}  # borne where a wrong place would be seen through
+    assert doubted(estimate, alone, fit_cost=costly).quality == "poor"
+    assert doubted(estimate, table, fit_cost=costly).quality == "good"
+    assert doubted(estimate, table, fit_cost=costly | {"now": 4.1}).quality == "poor"
     rows = np.flatnonzero(np.isfinite(alone.depth_mm).any(1))
     for share, expected in ((0.07, "poor"), (0.3, "none")):
         area = np.cumsum(np.isfinite(alone.depth_mm[rows]).sum(1))
@@ -90,7 +110,7 @@ def test_an_organ_that_the_camera_sees_through_is_refused(tracker, stages):
         depth_mm = table.depth_mm.copy()
         depth_mm[few] = behind_mm  # the table where the organ is said to be
         holed = DepthFrame(depth_mm, camera)
-        assert seen_through(organ, holed) == pytest.approx(share, abs=0.02)
+        assert seen_through(organ, holed)[0] == pytest.approx(share, abs=0.02)
         if expected == "poor":
             found = doubted(estimate, holed)
             assert found.quality == "poor"
@@ -100,7 +120,7 @@ def test_an_organ_that_the_camera_sees_through_is_refused(tracker, stages):
                 doubted(estimate, holed)
     hidden = table.depth_mm.copy()
     hidden[:, :200] = behind_mm - 90  # a hand before it hides it, and proves nothing
-    assert seen_through(organ, DepthFrame(hidden, camera)) == 0
+    assert seen_through(organ, DepthFrame(hidden, camera))[0] == 0
 
 
 @pytest.mark.parametrize("spacing", [1, 5, 40])

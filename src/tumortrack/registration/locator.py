@@ -95,8 +95,7 @@ class RegistrationLocator:
     def locate(self, cloud: SensorCloud, grid: int, seed: int) -> Estimate:
         """See ``tracking.tracker.Tracker.locate``."""
         frame = Frame(self._model, cloud, seed, np.random.default_rng(seed))
-        usual = self._calibration.usual_cost
-        fit = self._registration.register(frame.points_mm, usual, frame.stage)
+        fit = self._registration.register(frame.points_mm, 0.0, frame.stage)
         placed = self._checked(frame, fit)
         organ = placed.meshes[self._model.parts[0]]
         with frame.stage("fine"):
@@ -119,7 +118,7 @@ class RegistrationLocator:
                 starts = [start, *(rival for rival, _ in start.rivals)]
                 fits += [refine(self._shape, points, one, self._near) for one in starts]
         if not fits or how.thorough or min(fit.cost for fit in fits) > usual:
-            enough = usual if how.thorough or not fits else np.inf
+            enough = 0.0 if not fits else usual if how.thorough else np.inf
             fits.append(self._registration.register(points, enough, frame.stage))
         fit = best_of(fits)
         unsmoothed, lag_s = fit.motion, 0.0
@@ -191,7 +190,8 @@ class RegistrationLocator:
             for rival in fit.rivals
         ]
         usual = self._calibration.usual_cost
-        more["fit_cost"] = {"now": fit.cost, "usual": usual, "others": others}
+        more["fit_cost"] = {"now": fit.cost_of_others, "usual": usual, "others": others}
+        more["strays"] = fit.strays
         more["motion"] = {
             "camera_from_ct": motion.camera_from_ct.tolist(),
             "coefficients": motion.coefficients.tolist(),
