@@ -21,6 +21,8 @@ from tumortrack.tracking.tracker import Tracker
 from tumortrack.training.model import load_model
 from warp_objects import ANATOMY, slim_clinic
 
+COST = {"now": 1.0, "without_strays": 1.0, "usual": 2.0, "strays": 0.0}
+
 
 @pytest.fixture(scope="module")
 def tracker(slim_model):
@@ -40,7 +42,7 @@ def doubted(estimate, seen, **report):
         name: {**part, "probability": 0.9, "center_std_mm": 1.0}
         for name, part in estimate.report["parts"].items()
     }
-    sure = {**estimate.report, "parts": parts, "fit_cost": {"now": 1.0, "usual": 2.0}, **report}
+    sure = {**estimate.report, "parts": parts, "fit_cost": COST, **report}
     found = judged(replace(estimate, report=sure), seen)
     assert found.report["quality"] == {"verdict": found.quality, "reason": found.reason}
     return found
@@ -61,7 +63,7 @@ def test_a_worse_fit_is_flagged(tracker, stages):
     estimate = tracker.follow(cloud)
     good = doubted(estimate, cloud)
     assert (good.quality, good.reason) == ("good", "")
-    worse = doubted(estimate, cloud, fit_cost={"now": 2.1, "usual": 2.0})
+    worse = doubted(estimate, cloud, fit_cost=COST | {"now": 2.1})
     assert worse.quality == "poor"
     assert "worse than in most" in worse.reason
     parts = json.loads(json.dumps(good.report["parts"]))
@@ -69,7 +71,7 @@ def test_a_worse_fit_is_flagged(tracker, stages):
     assert "tumor_1 is unsure by 3.4 mm" in doubted(estimate, cloud, parts=parts).reason
     for apart_mm, verdict in ((2.9, "good"), (5.2, "poor")):
         others = [{"more": 1.0, "apart_mm": {"kidney": 0.4, "tumor_1": apart_mm}}]
-        rival = doubted(estimate, cloud, fit_cost={"now": 1.0, "usual": 2.0, "others": others})
+        rival = doubted(estimate, cloud, fit_cost=COST | {"others": others})
         assert rival.quality == verdict
     assert "tumor_1 may as well lie 5.2 mm away" in rival.reason
 
@@ -83,11 +85,10 @@ def test_strays_are_no_part_of_the_fit_that_is_judged(tracker, stages):
     found = tracker.follow(spoiled)
     middles = (found.motion.carry(ANATOMY.organ.vertices_mm[:9]) for found in (clean, found))
     assert np.linalg.norm(next(middles) - next(middles), axis=1).max() < 2
-    assert 0.15 < found.report["strays"] < 0.35  # the others lie near the surface
-    now, before = (one.report["fit_cost"]["now"] for one in (found, clean))
-    assert now < before + 0.5 * found.report["fit_cost"]["usual"]
-    assert doubted(clean, stages[0].cloud, strays=0.49).quality == "good"
-    assert "51 % of the points" in doubted(clean, stages[0].cloud, strays=0.51).reason
+    cost, before = (one.report["fit_cost"] for one in (found, clean))
+    assert 0.15 < cost["strays"] < 0.35  # the others lie near the surface
+    assert cost["now"] > before["now"] + 0.8 * 300 * cost["strays"]
+    assert cost["without_strays"] < before["without_strays"] + 0.5 * cost["usual"]
 
 
 def test_an_organ_that_the_camera_sees_through_is_refused(tracker, stages):
@@ -99,10 +100,12 @@ def test_an_organ_that_the_camera_sees_through_is_refused(tracker, stages):
     table = DepthFrame(np.fmin(alone.depth_mm, behind_mm), camera)
     assert seen_through(organ, alone) == (0, 0)
     assert seen_through(organ, table) == (0, 1)
-    costly = {"now": 3.9, "usual": 2.0}  # borne where a wrong place would be seen through
+    costly = COST | {"now": 99.0, "without_strays": 3.9, "strays": 0.49}
     assert doubted(estimate, alone, fit_cost=costly).quality == "poor"
-    assert doubted(estimate, table, fit_cost=costly).quality == "good"
-    assert doubted(estimate, table, fit_cost=costly | {"now": 4.1}).quality == "poor"
+    assert doubted(estimate, table, fit_cost=costly).quality == "good"  # a wrong place would show
+    assert doubted(estimate, table, fit_cost=costly | {"without_strays": 4.1}).quality == "poor"
+    many = doubted(estimate, table, fit_cost=costly | {"strays": 0.51})
+    assert "51 % of the points do not lie" in many.reason
     rows = np.flatnonzero(np.isfinite(alone.depth_mm).any(1))
     for share, expected in ((0.07, "poor"), (0.3, "none")):
         area = np.cumsum(np.isfinite(alone.depth_mm[rows]).sum(1))

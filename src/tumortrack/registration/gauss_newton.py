@@ -34,15 +34,15 @@ from tumortrack.simulate.elastic.flow import LatticeField
 @dataclass(frozen=True, eq=False)
 class RegistrationResult:
     """A motion, its cost (robust data term and prior), and the residuals (signed distances, mm).
-    ``strays``: share of the points that lie farther off than ``discrepancy.FARTHEST`` widths, and
-    ``cost_of_others``: the cost if all lay as the others do. ``moved``: shift (mm) and turn (rad)
-    from where the prior has the pose. ``rivals``: other minima that explain the points nearly as
-    well (see ``registration.best_of``)."""
+    ``strays``: share of the points that lie farther off than ``discrepancy.FARTHEST`` widths;
+    ``cost_without_strays``: if all lay as the others do. ``moved``: shift (mm) and turn (rad) from
+    where the prior has the pose. ``rivals``: other minima that explain the points nearly as well
+    (see ``registration.best_of``)."""
 
     motion: ElasticMotion
     cost: float
     strays: float
-    cost_of_others: float
+    cost_without_strays: float
     distances_mm: Float[np.ndarray, " n"]
     steps: int
     moved: Float64[np.ndarray, " 6"]
@@ -113,8 +113,8 @@ class GaussNewton:
         of_strays = (squares / (1 + squares))[far].sum()
         of_strays *= self._problem.weight * self._problem.last_mm**2
         strays = float(far.mean())
-        of_others = (self.cost - of_strays) / max(1 - strays, 1 / len(far))
-        judged = self.cost, strays, float(of_others)
+        without = float(self.cost - of_strays) / max(1 - strays, 1 / len(far))
+        judged = self.cost, strays, without
         return RegistrationResult(motion, *judged, state.distances_mm, self.steps, state.moved)
 
 

@@ -190,8 +190,8 @@ class RegistrationLocator:
             for rival in fit.rivals
         ]
         usual = self._calibration.usual_cost
-        more["fit_cost"] = {"now": fit.cost_of_others, "usual": usual, "others": others}
-        more["strays"] = fit.strays
+        costs = {"now": fit.cost, "without_strays": fit.cost_without_strays, "usual": usual}
+        more["fit_cost"] = {**costs, "strays": fit.strays, "others": others}
         more["motion"] = {
             "camera_from_ct": motion.camera_from_ct.tolist(),
             "coefficients": motion.coefficients.tolist(),

@@ -25,13 +25,12 @@ _LIMITS = 0.05, 0.09  # doubtful, impossible
 _ROUGH_LIMITS = 0.1, 0.2
 _WIDTH = 212  # pixels: so coarse a picture tells
 _THROUGH_MM = 6.0  # behind the estimated surface: what is seen there lies behind, not beside
-# Of the points: no robust estimate bears more (the breakdown point).
-_MOST_STRAYS = 0.5
-# Where the camera sees something round the organ, a wrong place is mostly seen through. A fit may
-# cost ``FIT_FACTOR`` times what is usual there: in a wider world than training's (make world) the
-# cost alone, up to 1.5 times the usual one, spoke against 18 answers, and all were right.
-_TOLD = 0.5
-_RIM = 2  # pixels, some 3 mm
+# Where the camera sees something round the organ, in more than this share of a rim so many pixels
+# (some 3 mm) wide, a wrong place is mostly seen through. Strays are no part of the judged fit then,
+# and it may cost ``FIT_FACTOR`` times what is usual: in a wider world than training's (make world)
+# the cost alone, without strays up to 1.5 times the usual one, spoke against 18 answers, all right.
+_TOLD, _RIM = 0.5, 2
+_MOST_STRAYS = 0.5  # of the points: no robust estimate bears more (the breakdown point)
 _UNSURE = 0.6  # mean probability of a tumor's points
 _PIXEL_MM = 1.5  # of the picture that a cloud is compared in
 _MOST_PIXELS = 1024  # along a side
@@ -71,7 +70,7 @@ def judged(estimate: Estimate, seen: DepthFrame | SensorCloud) -> Estimate:
             f"the camera sees through {100 * through:.0f} % of where the organ would lie: what "
             "was taken for it is something else, or lies as no organ in training did."
         )
-    reason = _doubt(estimate, FIT_FACTOR if told > _TOLD else 1.0)
+    reason = _misfit(estimate, told > _TOLD) or _doubt(estimate)
     if through > doubtful:
         reason = f"the camera sees through {100 * through:.0f} % of where the organ lies"
     elif unseen > _UNSEEN and not reason:
@@ -99,14 +98,22 @@ def with_margin(estimate: Estimate, cloud: SensorCloud, margins: ModelMargins | 
     return estimate
 
 
-def _doubt(estimate: Estimate, times: float) -> str:
-    """What the estimate itself says against it; ``times`` the usual cost is still borne."""
+def _misfit(estimate: Estimate, told: bool) -> str:
+    """What the fit says against it; ``told``: a wrong place would be seen through."""
     cost = estimate.report.get("fit_cost")
-    if cost is not None and cost["now"] > times * cost["usual"]:
+    if cost is None:
+        return ""
+    if told and cost["strays"] > _MOST_STRAYS:
+        return f"{100 * cost['strays']:.0f} % of the points do not lie on the organ's surface"
+    now, most = (cost["without_strays"], FIT_FACTOR) if told else (cost["now"], 1.0)
+    if now > most * cost["usual"]:
         return "the organ's surface fits the points worse than in most validation scenes"
-    if (strays := estimate.report.get("strays", 0.0)) > _MOST_STRAYS:
-        return f"{100 * strays:.0f} % of the points do not lie on the organ's surface"
-    for other in () if cost is None else cost.get("others", ()):
+    return ""
+
+
+def _doubt(estimate: Estimate) -> str:
+    """What else the estimate itself says against it."""
+    for other in estimate.report.get("fit_cost", {}).get("others", ()):
         name, apart_mm = max(other["apart_mm"].items(), key=lambda item: item[1])
         if apart_mm > _UNSURE_MM:
             return f"{name} may as well lie {apart_mm:.1f} mm away: the points fit there too"
