@@ -22,6 +22,7 @@ from tumortrack.training.model import load_model
 from warp_objects import ANATOMY, slim_clinic
 
 COST = {"now": 1.0, "without_strays": 1.0, "usual": 2.0, "strays": 0.0}
+EXACT = {"times": 1.0, "gain": 0.0}
 
 
 @pytest.fixture(scope="module")
@@ -42,7 +43,7 @@ def doubted(estimate, seen, **report):
         name: {**part, "probability": 0.9, "center_std_mm": 1.0}
         for name, part in estimate.report["parts"].items()
     }
-    sure = {**estimate.report, "parts": parts, "fit_cost": COST, **report}
+    sure = {**estimate.report, "parts": parts, "fit_cost": COST, "size": EXACT, **report}
     found = judged(replace(estimate, report=sure), seen)
     assert found.report["quality"] == {"verdict": found.quality, "reason": found.reason}
     return found
@@ -69,6 +70,10 @@ def test_a_worse_fit_is_flagged(tracker, stages):
     parts = json.loads(json.dumps(good.report["parts"]))
     parts["tumor_1"]["center_std_mm"] = 3.4
     assert "tumor_1 is unsure by 3.4 mm" in doubted(estimate, cloud, parts=parts).reason
+    for gain, verdict in ((9.1, "good"), (9.3, "poor")):
+        scaled = doubted(estimate, cloud, size={"times": 1.07, "gain": gain})
+        assert scaled.quality == verdict
+    assert "1.07 times as large" in scaled.reason
     for apart_mm, verdict in ((2.9, "good"), (5.2, "poor")):
         others = [{"more": 1.0, "apart_mm": {"kidney": 0.4, "tumor_1": apart_mm}}]
         rival = doubted(estimate, cloud, fit_cost=COST | {"others": others})

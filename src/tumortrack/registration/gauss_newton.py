@@ -118,6 +118,24 @@ class GaussNewton:
         return RegistrationResult(motion, *judged, state.distances_mm, self.steps, state.moved)
 
 
+def size_of(
+    fit: RegistrationResult, points_mm: Points, config: GaussNewtonConfig
+) -> tuple[float, float]:
+    """How large the points (camera frame, mm) show the organ, times its true size, and how much
+    less it would cost to fit them scaled about the camera by that; to second order, as in Rao's
+    score test."""
+    motion, last_mm = fit.motion, config.last_mm
+    assert motion.covariance is not None
+    rows = motion.residual_rows(points_mm).astype(float)
+    slopes, distances = rows[:, :-1], rows[:, -1]
+    outwards = -(slopes[:, :3] * (points_mm @ motion.rotation)).sum(1)  # of scaling the points
+    weight = min(config.n_effective / len(rows), 1.0) / config.sigma_mm**2
+    weighed = outwards * weight / (1 + (distances / last_mm) ** 2) ** 2
+    cross = slopes.T @ weighed
+    slope, curvature = weighed @ distances, weighed @ outwards - cross @ motion.covariance @ cross
+    return float(1 + slope / curvature), float(slope**2 / curvature)
+
+
 def posterior(motion: ElasticMotion, points_mm: Points, config: GaussNewtonConfig) -> ElasticMotion:
     """A fitted motion with what its residuals (points: camera frame, mm) leave unsure: see
     ``discrepancy``."""

@@ -12,6 +12,7 @@ from tumortrack.core.estimate import Estimate, Quality
 from tumortrack.core.types import DepthFrame, Intrinsics, Mesh, SensorCloud
 from tumortrack.models.in_distribution import FIT_FACTOR
 from tumortrack.models.margins import ModelMargins, exceeded, measured, stated_margin
+from tumortrack.registration.registration import RIVAL_COST
 from tumortrack.sense.render import render_depth
 
 # Standard deviation of a tumor's middle, and how far from it another fit, nearly as likely, may
@@ -113,6 +114,11 @@ def _misfit(estimate: Estimate, told: bool) -> str:
 
 def _doubt(estimate: Estimate) -> str:
     """What else the estimate itself says against it."""
+    size = estimate.report.get("size")
+    if size is not None and size["gain"] > RIVAL_COST:
+        return (
+            f"an organ {size['times']:.2f} times as large fits better: is the camera's scale right?"
+        )
     for other in estimate.report.get("fit_cost", {}).get("others", ()):
         name, apart_mm = max(other["apart_mm"].items(), key=lambda item: item[1])
         if apart_mm > _UNSURE_MM:
