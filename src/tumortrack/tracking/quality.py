@@ -116,9 +116,7 @@ def _doubt(estimate: Estimate) -> str:
     """What else the estimate itself says against it."""
     size = estimate.report.get("size")
     if size is not None and size["gain"] > RIVAL_COST:
-        return (
-            f"an organ {size['times']:.2f} times as large fits better: is the camera's scale right?"
-        )
+        return f"an organ {size['times']:.2f} times as large fits better: check the camera's scale"
     for other in estimate.report.get("fit_cost", {}).get("others", ()):
         name, apart_mm = max(other["apart_mm"].items(), key=lambda item: item[1])
         if apart_mm > _UNSURE_MM:
