@@ -2,6 +2,7 @@
 
 import json
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -29,7 +30,7 @@ from tumortrack.report.pictures import (
     qc_picture,
     slice_volume,
 )
-from tumortrack.report.protocol import evaluate_scenes, summarise, summary_table
+from tumortrack.report.protocol import evaluate_scenes, failure, summarise, summary_table
 from tumortrack.report.renderer import Body, Frame, ParallelView
 from tumortrack.simulate.scene_folder import Scene
 
@@ -127,7 +128,7 @@ def test_what_was_not_found_counts_as_failed(evaluated):
     assert nothing["failed"] == "no <organ> in view"
     assert nothing["miou"] == 0
     summary = evaluated[1]["summary"]
-    assert (summary["failed"], summary["scenes"]) == (2, 4)
+    assert (summary["failed"], summary["far"], summary["scenes"]) == (2, 0, 4)
     assert (summary["kidney"]["found"], summary["tumor_1"]["found"]) == (3, 2)
     # Sorted kidney distances: 0, 1, 3, infinite.
     assert summary["kidney"]["hausdorff_mm"] == pytest.approx(2, abs=0.05)
@@ -156,13 +157,38 @@ def test_a_part_that_is_missed_never_helps():
     assert worse["tumor_1"]["iou"] == 0.0
 
 
+def test_an_answer_that_is_far_off_has_failed_however_it_is_called(tmp_path):
+    """5 mm of the tumor's centre are the limit; the kidney's own centre does not count."""
+    shifts_mm = {"near": 4.9, "far": 5.1, "poor": 30.0}
+    for name in shifts_mm:
+        scene().write(tmp_path / "scenes" / name)
+    answers = {name: estimate_of(anatomy((x, 0, 0))) for name, x in shifts_mm.items()}
+    for name in ("near", "far"):
+        answers[name] = replace(answers[name], quality="good", reason="")
+    locate = Scripted(*(answers[name] for name in sorted(answers)))
+    report = evaluate_scenes(locate, tmp_path / "scenes", tmp_path / "out")
+    failed = {entry["name"]: entry["failed"] for entry in report["scenes"]}
+    assert failed == {
+        "near": None,
+        "far": "far off: the centre of tumor_1 by 5.1 mm",
+        "poor": "far off: the centre of tumor_1 by 30.0 mm",
+    }
+    counts = {"scenes": 3, "good": 2, "poor": 1, "failed": 2, "far": 2, "far_good": 1}
+    assert {name: report["summary"][name] for name in counts} == counts
+    assert "2 failed (2 far off, 1 of them called good)" in summary_table(report).title
+    assert failure({"kidney": {"found": True, "center_mm": 5.1}}).endswith("kidney by 5.1 mm")
+    exophytic = {"kidney": {"found": True, "center_mm": 6.0},
+                 "tumor_1": {"found": True, "center_mm": 4.0}}  # fmt: skip
+    assert failure(exophytic) is None
+
+
 def test_table_shows_every_part(evaluated):
     from rich.console import Console
 
     console = Console(width=120, record=True, file=open("/dev/null", "w"))  # noqa: SIM115
     console.print(summary_table(evaluated[1]))
     text = console.export_text()
-    assert "4 scenes, 2 failed" in text
+    assert "4 scenes, 2 failed (0 far off" in text
     assert re.search(r"kidney\D+3/4\D+2\.0", text)
     assert re.search(r"tumor_1\D+2/4\s+│\s+none", text)
 

@@ -17,6 +17,8 @@ from tumortrack.core.types import CameraLabels, Mesh, OccupancyCloud
 
 LARGEST_GRID = 400
 Quality = Literal["good", "poor", "none"]  # none: there is no estimate
+# An answer with a tumor's centre farther off has failed: the plan's usual margin, all of it.
+FAR_MM = 5.0
 # What people read where it is good: that word would say more than is known.
 NO_CHECK_FAILED, UNVERIFIED = "fit: no check failed", "its place is not verified"
 

@@ -107,9 +107,15 @@ def _base64(content: bytes) -> str:
     return base64.b64encode(content).decode()
 
 
+def counts(summary: dict[str, Any]) -> str:
+    """How many scenes there are, and how many answers are what, in words."""
+    far = f"{summary['far']} far off, {summary['far_good']} of them called good"
+    answers = f"{summary['good']} good, {summary['poor']} poor"
+    return f"{summary['scenes']} scenes, {summary['failed']} failed ({far}), {answers}"
+
+
 def _counts(summary: dict[str, Any]) -> str:
-    counts = f"{summary['scenes']} scenes, {summary['failed']} failed."
-    text = f"{counts} Median mIoU {summary['miou']:.3f}."
+    text = f"{counts(summary)}. Median mIoU {summary['miou']:.3f}."
     if not (errors := summary.get("tre_mm")):
         return text
     mean, p95, largest = (number(errors[key]) for key in ("mean", "p95", "max"))

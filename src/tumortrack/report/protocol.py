@@ -13,20 +13,23 @@ from rich.table import Table
 
 import tumortrack
 from tumortrack.core.errors import InputError, NoEstimate, StorageError
-from tumortrack.core.estimate import Estimate
+from tumortrack.core.estimate import FAR_MM, Estimate
 from tumortrack.core.store import write_json
 from tumortrack.core.types import SensorCloud
 from tumortrack.report import metrics
-from tumortrack.report.page import number, page_scene, part_rows, write_page
+from tumortrack.report.page import counts, number, page_scene, part_rows, write_page
 from tumortrack.report.pictures import scene_picture
 from tumortrack.simulate.scene_folder import Scene, list_scenes, read_scene
 
 DISTANCES = (*(field.name for field in fields(metrics.SurfaceDistances)), "center_mm")
-RULE = (
+MEDIANS = (
     "Medians over all scenes that have the part. A part that was not found counts as infinitely "
-    "far and with IoU 0; a median that is infinite is written as null. A scene with a part "
-    "missing counts as failed; where nothing was found its mIoU is 0 and its target errors are "
-    "infinite."
+    "far and with IoU 0; a median that is infinite is written as null."
+)
+RULE = (
+    f"{MEDIANS} A scene counts as failed where a part was not found, or where the centre of a "
+    f"tumor (without one: of the organ) is over {FAR_MM:g} mm off, whether the answer is called "
+    "good or poor; where nothing was found its mIoU is 0 and its target errors are infinite."
 )
 TARGET_ERRORS = ("mean", "rms", "median", "p95", "max")
 Locate = Callable[[SensorCloud], Estimate]
@@ -100,7 +103,6 @@ def evaluate_scene(
         return (entry if scene.targets is None else {**entry, "tre_mm": None}), None
     seconds = time.perf_counter() - start
     parts = compare(estimate, scene)
-    missing = [name for name, part in parts.items() if not part["found"]]
     entry = {
         "name": name,
         "parts": parts,
@@ -109,11 +111,20 @@ def evaluate_scene(
         "reason": estimate.reason,
         "seconds": seconds,
         "timings": estimate.report.get("timings", {}),
-        "failed": f"not found: {', '.join(missing)}" if missing else None,
+        "failed": failure(parts),
     }
     if estimate.motion is not None and scene.targets is not None:
         entry["tre_mm"] = metrics.target_errors(estimate.motion, scene.targets)
     return entry, estimate
+
+
+def failure(parts: dict[str, dict[str, Any]]) -> str | None:
+    """Why an answer with these metrics counts as failed; None: it does not."""
+    if missing := [name for name, part in parts.items() if not part["found"]]:
+        return f"not found: {', '.join(missing)}"
+    name = max(list(parts)[1:] or parts, key=lambda part: parts[part]["center_mm"])
+    far_mm = parts[name]["center_mm"]
+    return f"far off: the centre of {name} by {far_mm:.1f} mm" if far_mm > FAR_MM else None
 
 
 def compare(estimate: Estimate, scene: Scene) -> dict[str, dict[str, Any]]:
@@ -131,7 +142,9 @@ def compare(estimate: Estimate, scene: Scene) -> dict[str, dict[str, Any]]:
 
 
 def summarise(entries: list[dict[str, Any]]) -> dict[str, Any]:
-    """Medians per part, ``miou`` (median over scenes), ``failed`` and ``scenes`` (counts).
+    """Medians per part, ``miou`` (median over scenes), and counts: ``scenes``; of them ``good``,
+    ``poor``, the others have no answer; and ``failed``; of these ``far`` have an answer that is far
+    off, called good in ``far_good``.
 
     ``tre_mm`` holds the medians of the scenes' target errors and how many ``scenes`` count, where
     the method knows a motion. The rule for parts that were not found is ``RULE``.
@@ -155,8 +168,12 @@ def summarise(entries: list[dict[str, Any]]) -> dict[str, Any]:
         summary["tre_mm"] = {**medians, "scenes": len(errors)}
     summary["miou"] = _median([entry["miou"] for entry in entries])
     summary["miou_mean"] = float(np.mean([entry["miou"] for entry in entries]))
-    summary["poor"] = sum(entry.get("quality") == "poor" for entry in entries)
-    summary["failed"] = sum(entry["failed"] is not None for entry in entries)
+    for quality in ("good", "poor"):
+        summary[quality] = sum(entry.get("quality") == quality for entry in entries)
+    failed = [entry for entry in entries if entry["failed"] is not None]
+    far = [entry for entry in failed if entry["failed"].startswith("far off")]
+    summary["failed"], summary["far"] = len(failed), len(far)
+    summary["far_good"] = sum(entry["quality"] == "good" for entry in far)
     summary["scenes"] = len(entries)
     return summary
 
@@ -166,10 +183,7 @@ def summary_table(report: dict[str, Any]) -> Table:
     summary = report["summary"]
     errors = summary.get("tre_mm")
     targets = f", target error {number(errors['mean'], 1)} mm" if errors else ""
-    table = Table(
-        title=f"{summary['scenes']} scenes, {summary['failed']} failed, {summary['poor']} poor, "
-        f"mIoU {summary['miou']:.3f}{targets} (medians)"
-    )
+    table = Table(title=f"{counts(summary)}, mIoU {summary['miou']:.3f}{targets} (medians)")
     table.add_column("part")
     for head in ("found", "HD mm", "one-sided", "HD95", "surface", "centre", "IoU"):
         table.add_column(head, justify="right")

@@ -9,7 +9,7 @@ from pathlib import Path
 import pandas as pd
 
 from tumortrack.core import store
-from tumortrack.report.protocol import RULE
+from tumortrack.report.protocol import MEDIANS
 from tumortrack_lab.study import goals, plots, resection, tables
 from tumortrack_lab.study.document import ReportWriter
 from tumortrack_lab.study.measure import Job, spec_of
@@ -18,7 +18,10 @@ from tumortrack_lab.study.plan import Section
 from tumortrack_lab.study.tables import tidy
 from tumortrack_lab.study.tumor_sites import tumor_sites_of
 
-_MEDIANS = RULE.replace("written as null", "written as not found")
+_MEDIANS = (
+    f"{MEDIANS.replace('written as null', 'written as not found')} A scene with a part missing "
+    "counts as failed; where nothing was found its mIoU is 0 and its target errors are infinite."
+)
 _OVER_SCENES = f"Distances in mm. {_MEDIANS} ± is the standard deviation over the seeds."
 _TARGETS = "mean over the scene's inner targets, for methods that carry points."
 _RULES: dict[Section, str] = {

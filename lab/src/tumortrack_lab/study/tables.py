@@ -94,7 +94,7 @@ def tidy(measurements: list[dict]) -> pd.DataFrame:
             "kind": method.get("kind"),
             "seed": method.get("seed", 0),
             "device": one.get("method", {}).get("device"),
-            "failed": one["failed"] is not None,
+            "failed": not all(part["found"] for part in one["parts"].values()),
             "busy": (one.get("provenance", {}).get("load") or 0.0) > _BUSY,
             "carries": bool(targets),  # whether the method carries points
             "target_mm": targets["mean"] if targets else None,
