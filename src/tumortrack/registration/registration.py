@@ -55,6 +55,7 @@ _BESIDE = 4.5
 # wrong ways round were above three times.
 _TRIAL_STEPS = 6
 _MAX_COST_RATIO = 3.0  # to the least cost: hypotheses above are given up
+_TURNED_SHARE = 2 / 3  # of that, for turned starts, which a whole fit races
 
 # A cost is -2 log of the probability, up to a constant: what costs so much more has a hundredth of
 # the best one's.
@@ -146,9 +147,10 @@ class Registration:
                 found.append(motion)
         mean = self.rest.body.mean
         starts = [ElasticMotion(self.rest, m.rotation, m.centre_mm, mean) for m in found]
-        others = self._race(points_mm, [(one, None) for one in starts], fit.cost)
+        others = self._race(points_mm, [(one, None) for one in starts], fit.cost * _TURNED_SHARE)
         best = best_of([fit, *others])
-        return best if best.cost == fit.cost else self._settle(points_mm, [fit, *others])
+        elsewhere = _elsewhere(best.motion, fit.motion)
+        return self._settle(points_mm, [fit, *others]) if elsewhere else best
 
     def _settle(self, points_mm: Points, fits: list[RegistrationResult]) -> RegistrationResult:
         """The best of some fits and of those from starts beside the best."""
@@ -162,7 +164,7 @@ class Registration:
         least: float = math.inf,
     ) -> list[RegistrationResult]:
         """All starts are refined by a few steps; those that may still win, against each other and
-        a fit that costs ``least``, to the end."""
+        what costs ``least``, to the end."""
         descents = [
             GaussNewton(self.rest, points_mm, start, self.config, moved) for start, moved in starts
         ]
