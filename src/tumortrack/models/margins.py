@@ -17,7 +17,7 @@ from tumortrack.core.errors import ArtifactError, InputError
 
 # Raise it with every change by which the same cloud gives another estimate, or another figure of
 # those in ``measured``: margins that were found before are then refused.
-METHOD = 2
+METHOD = 3
 NAME = "margins.json"
 GENERIC = Path(__file__).with_name("generic_margins.json")  # from several organs
 Kind = Literal["tumor", "kidney", "map"]
