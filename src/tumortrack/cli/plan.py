@@ -187,8 +187,9 @@ class Plan(StatedPatient):
 
         written = {} if self.cell is None else store.read_json(self.cell)
         config = from_builtins(written, CellConfig, str(self.cell))
-        given = self.cell is not None and written.keys() >= {*_BASES}
-        source = store.sha256_of(self.cell) if given else INVENTED
+        source = INVENTED
+        if self.cell is not None and written.keys() >= {*_BASES}:
+            source = store.sha256_of(self.cell)
         return config if self.stand is None else replace(config, stand_mm=self.stand), source
 
     def _frame(self, run: LocatedRun, stand_mm: float) -> PublishedFrame:
