@@ -172,6 +172,9 @@ def _artifact(folder: Path) -> list[str]:
         lines += [f"  {line}" for line in model.describe(folder)]
         margins = read_margins(folder)
         lines += [f"  {line}" for line in (described(margins) if margins else [UNKNOWN])]
+    if kind == "case":
+        said = manifest.get("report", {}).get("half_turn", {}).get("warning")
+        lines += [f"  WARNING: {said}"] if said else []
     skip = {"kind", "schema", "tumortrack", "units", "frame", "files", "config"}
     lines += [f"  {key}: {value}" for key, value in manifest.items() if key not in skip]
     return [*lines, f"  files: {', '.join(manifest['files'])}"]

@@ -8,6 +8,7 @@
 4. Other minima that explain the points nearly as well, and put a tumor elsewhere, are kept.
 5. Where even that fits badly, the undeformed organ is tried in eight turns about the camera's
    axis, in the likeliest hypothesis's place: this repairs most hypotheses that are wrong.
+6. An organ that looks much the same after half a turn is tried that way round, too.
 
 The result is a motion (`motion`): any point of the CT, carried to the camera's frame and back,
 with its uncertainty. `locator` reads surfaces, labels and numbers off it.
@@ -111,8 +112,10 @@ class Registration:
         """The hypothesis that fits best, refined; give the likeliest one first. Above
         ``usual_cost`` turned starts are tried too."""
         fit = self._settle(points_mm, hypotheses)
-        costly = fit.cost > usual_cost
-        return self.try_turned_starts(points_mm, hypotheses[0], fit) if costly else fit
+        if fit.cost > usual_cost:
+            fit = self.try_turned_starts(points_mm, hypotheses[0], fit)
+        turned = [self._half_turned(fit.motion, turn) for turn in self.rest.half_turns]
+        return best_of([fit, self._settle(points_mm, turned)]) if turned else fit
 
     def try_turned_starts(
         self, points_mm: Points, likeliest: ElasticMotion, fit: RegistrationResult
@@ -125,6 +128,15 @@ class Registration:
         rotations = [turn @ likeliest.rotation for turn in turns]
         turned = [ElasticMotion(self.rest, rotation, place, at_rest) for rotation in rotations]
         return best_of([fit, self._settle(points_mm, turned)])
+
+    def _half_turned(
+        self, motion: ElasticMotion, turn: Float64[np.ndarray, "4 4"]
+    ) -> ElasticMotion:
+        """The undeformed organ in the same place, turned by this motion of the CT."""
+        middle_ct = self.rest.body.center_ct
+        off = motion.rotation @ (turn[:3, :3] @ middle_ct + turn[:3, 3] - middle_ct)
+        rotation, place = motion.rotation @ turn[:3, :3], motion.centre_mm + off
+        return ElasticMotion(self.rest, rotation, place, self.rest.body.mean)
 
     def _settle(self, points_mm: Points, starts: list[ElasticMotion]) -> RegistrationResult:
         """The best of the starts, refined, and of the fits from starts beside that."""

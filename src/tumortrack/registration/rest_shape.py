@@ -11,6 +11,7 @@ from jaxtyping import Float32, Float64, UInt8
 from tumortrack.core.errors import InputError
 from tumortrack.core.process import parallel_for
 from tumortrack.core.types import Anatomy, Mesh
+from tumortrack.imaging.symmetry import alike, half_turns
 from tumortrack.registration.kernels import DistanceField, mark
 from tumortrack.simulate.elastic.body import ElasticBody
 from tumortrack.simulate.occupancy import contains, surface_distance
@@ -49,6 +50,11 @@ class RestShape:
     def long_axis(self) -> Float64[np.ndarray, " 3"]:
         """The organ's longest principal direction, towards its slimmer, farther reaching end."""
         return long_axis_of(self.anatomy_ct.organ)
+
+    @cached_property
+    def half_turns(self) -> list[Float64[np.ndarray, "4 4"]]:
+        """Motions of the CT after which the organ looks much the same; mostly none."""
+        return [one.ct_from_ct for one in alike(half_turns(self.anatomy_ct))]
 
     @cached_property
     def middles_ct(self) -> Float64[np.ndarray, "parts 3"]:

@@ -14,6 +14,7 @@ import torch
 from jaxtyping import Float32, Float64, UInt8
 
 from tumortrack.core.errors import InputError, NoEstimate
+from tumortrack.core.estimate import FAR_MM
 from tumortrack.models.config import RegistrationHeadConfig, TrainConfig
 from tumortrack.models.in_distribution import InDistributionRange, fit_mm, spread_mm
 from tumortrack.models.model import Model
@@ -201,7 +202,11 @@ class RegistrationTask(TrainingTask):
             solved = np.linalg.solve(known_mm2, away[..., None])[..., 0]
             ratios.append(np.sqrt((solved * away).sum(1)))
         std_scale = float(np.quantile(np.concatenate(ratios), _COVERED)) / _RADIUS
-        about = {**provenance, "validation_tre_mm": round(float(np.median(errors)), 3)}
+        about = {
+            **provenance,
+            "validation_tre_mm": round(float(np.median(errors)), 3),
+            "validation_far": float(np.mean(np.array(errors) > FAR_MM)),
+        }
         pairs = zip(scenes.clouds_mm, fits, strict=True)
         ranges = [(spread_mm(cloud), fit_mm(np.abs(fit.distances_mm))) for cloud, fit in pairs]
         return RegistrationModel(
