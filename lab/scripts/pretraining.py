@@ -204,7 +204,7 @@ def _draw(frame: pd.DataFrame, path: Path) -> None:
         axes.set_yscale("log")
         axes.set(title=case, xlabel="training steps", ylabel="median target error (mm)")
         axes.grid(alpha=0.3)
-        axes.legend(fontsize=7)
+        axes.legend(fontsize=8, handlelength=3.5)  # long enough for a dash
     figure.tight_layout()
     save(figure, path)
 

@@ -147,6 +147,15 @@ def test_a_camera_that_changes_is_refused_until_it_is_back():
     assert "(f 66, 61" in told[2].reason
 
 
+def test_given_intrinsics_hold_for_a_camera_that_keeps_its_own():
+    other = replace(CAMERA, fx=CAMERA.fx * 1.1)
+    frames = [frame_at(0.1 * n) for n in range(3)]
+    frames[1] = replace(frames[1], content=replace(frames[1].content, intrinsics=other))
+    told = results(frames, config=LoopConfig(region=ALL, intrinsics=replace(CAMERA, fy=59.0)))
+    assert [one.estimate is None for one in told] == [False, True, False]
+    assert "the camera's own intrinsics changed" in told[1].reason
+
+
 def test_after_doubt_good_is_what_stays_good():
     verdicts = ["good", "good", "none", "good", "poor", "good", "good", "good", "good"]
     told = results([frame_at(0.1 * n) for n in range(9)], Located(*verdicts))

@@ -15,7 +15,7 @@ from msgspec.structs import replace as with_terms
 from live_objects import small_estimate, small_update
 from plan_objects import RADIUS_MM, TUMOR_MM, Deviating, located, sphere
 from tumortrack.core.errors import InputError, NoPlan
-from tumortrack.live.calibration_file import read_error_mm
+from tumortrack.live.calibration_file import read_frames
 from tumortrack.live.sinks.ur import OFF_MM
 from tumortrack.plan.budget import (
     HAND_EYE_MM,
@@ -32,6 +32,7 @@ from tumortrack.plan.budget import (
     widened,
 )
 from tumortrack.plan.live_budget import LiveBudget
+from tumortrack.plan.located import located as placed
 from tumortrack.plan.resection import plan_resection
 from tumortrack.plan.values import CutLayer, ResectionConfig
 
@@ -138,7 +139,7 @@ def test_a_calibration_states_its_error_at_the_tumor(tmp_path):
     def stated(**error):
         frame = {"frame_id": "base", "unit": "m", "robot_from_camera": rows, **error}
         path.write_text(json.dumps(frame))
-        return read_error_mm(path, 200.0)
+        return read_frames(path).error_at(200.0)
 
     assert stated() is None
     assert stated(error_mm=1.2) == 1.2
@@ -171,6 +172,16 @@ def test_lag_is_the_tumors_speed_times_all_that_comes_late():
     assert live.now.lag_mm == 0
     live.add_up(update(3), "tumor_1", moved, 0.5, 15.0)
     assert live.now.lag_mm == 0
+
+
+def test_a_tumor_is_as_unsure_as_along_its_least_sure_axis():
+    live, tumor = LiveBudget(budget(20.0)), sphere(TUMOR_MM, RADIUS_MM)
+    live.add_up(update(0, std_mm=2.0), "tumor_1", tumor, 0.0, 15.0)  # over all axes 1.2
+    assert live.now.tracking_mm == 6.0
+    estimate = update(0, std_mm=2.0).estimate
+    seen = placed(estimate.cloud, estimate.meshes, estimate.motion, np.eye(4))
+    assert {*seen.std_mm} == {"tumor_1"}
+    assert (seen.std_mm["tumor_1"] == 2.0).all()
 
 
 def test_a_camera_whose_clock_is_ahead_takes_nothing_off_the_lag():

@@ -9,16 +9,20 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from live_objects import ball, small_estimate
+from live_objects import CAMERA, ball, small_anatomy, small_estimate
 from tumortrack.core import store
 from tumortrack.core.errors import ArtifactError, InputError
 from tumortrack.core.types import SensorCloud
 from tumortrack.models import margins as stored
 from tumortrack.models.margins import ModelMargins, exceeded, stated_margin, stated_radius
-from tumortrack.report.calibration import list_states, margins_of
+from tumortrack.report.calibration import Listed, list_states, margins_of, row_of
 from tumortrack.report.calibration_table import Row, head_of, open_table
 from tumortrack.report.metrics import outward_miss
-from tumortrack.tracking.quality import with_margin
+from tumortrack.sense.cloud import CloudConfig, cloud_from_depth
+from tumortrack.sense.render import render_depth
+from tumortrack.simulate.scene_folder import Scene
+from tumortrack.tracking.quality import judged, with_margin
+from tumortrack.tracking.tracker import Tracker
 
 GROUPS = [(f, share, o) for f in ("plate", "poke") for share in ("far", "near") for o in ("x", "y")]
 
@@ -109,6 +113,36 @@ def test_poor_answers_count_for_nothing():
     margins = margins_of([*(row for n, row in enumerate(rows) if n % 4), *poor], "", (0.9,))
     assert margins.accepted < 0.76
     assert sum(group.good for group in margins.groups) == 600
+
+
+class _Known(Tracker):
+    """Finds ``small_anatomy`` in any cloud, and judges as every tracker does."""
+
+    def __init__(self):
+        pass
+
+    def locate(self, cloud, grid, seed, seen=None):
+        return judged(small_estimate(), seen or cloud)
+
+
+def test_a_partly_hidden_organ_is_judged_by_the_image_if_there_is_one(tmp_path):
+    truth = small_anatomy()
+    frame = render_depth(truth.organ.vertices_mm, truth.organ.faces, CAMERA)
+    hidden = frame.depth_mm.copy()
+    hidden[:, :32] = 90  # a hand before one half
+    crop = CloudConfig(near_mm=50, far_mm=200, n_points=800)
+    cloud = cloud_from_depth(frame, crop, np.random.default_rng(0))
+    half = SensorCloud(cloud.points_mm[cloud.points_mm[:, 0] > 4])
+    listed = Listed(tmp_path, ("plate", "far", "x"))
+    alone = row_of(_Known(), Scene(half, truth), listed, 0)
+    assert "the cloud has no points" in alone.doubt
+    seen = row_of(_Known(), Scene(half, truth, frame.with_depth(hidden)), listed, 0)
+    assert seen.doubt == ""
+    assert 0.3 < seen.measured["unseen"] < 0.5  # a limit on it can be found all the same
+    assert seen.score("tumor", None) < 1e-6
+    behind = frame.depth_mm + np.where(np.arange(64) < 28, 40, 0).astype(np.float32)
+    through = row_of(_Known(), Scene(half, truth, frame.with_depth(behind)), listed, 0)
+    assert "sees through" in through.doubt
 
 
 def test_too_few_states_are_refused_with_their_number_and_small_groups_join():

@@ -48,7 +48,7 @@ def located(*tumors, n=40_000, seed=0, meshes=True, std_mm=None):
 
 
 class Deviating:
-    """A motion that leaves points where they are, everywhere as unsure as the tests say."""
+    """A motion that leaves points where they are, everywhere as unsure along z as the tests say."""
 
     def __init__(self, deviation_mm=0.5):
         self.deviation_mm = deviation_mm
@@ -60,9 +60,10 @@ class Deviating:
         return points
 
     def std_mm(self, points):
+        return self.largest_std_mm(points) / np.sqrt(3)
+
+    def largest_std_mm(self, points):
         return np.full(len(points), self.deviation_mm)
 
-    largest_std_mm = std_mm
-
     def covariance_mm2(self, points):
-        return self.deviation_mm**2 * np.tile(np.eye(3), (len(points), 1, 1))
+        return self.deviation_mm**2 * np.tile(np.diag([0.0, 0.0, 1.0]), (len(points), 1, 1))

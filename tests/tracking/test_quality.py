@@ -13,13 +13,14 @@ from stories import refusal, succeeded, tumortrack
 from tumortrack.core import store
 from tumortrack.core.errors import NoEstimate
 from tumortrack.core.types import DepthFrame, Mesh, SensorCloud
+from tumortrack.registration.motion import ElasticMotion
 from tumortrack.sense.camera import d405
 from tumortrack.sense.render import render_depth
 from tumortrack.simulate.scene import SceneRecipe, Simulator, body_for
 from tumortrack.tracking.quality import cloud_shares, judged, seen_through
-from tumortrack.tracking.tracker import Tracker
+from tumortrack.tracking.tracker import Follower, FollowerConfig, Tracker
 from tumortrack.training.model import load_model
-from warp_objects import ANATOMY, slim_clinic
+from warp_objects import ANATOMY, PLACE_MM, TURNED, slim_clinic
 
 
 @pytest.fixture(scope="module")
@@ -72,6 +73,33 @@ def test_a_worse_fit_is_flagged(tracker, stages):
         rival = doubted(estimate, cloud, fit_cost={"now": 1.0, "usual": 2.0, "others": others})
         assert rival.quality == verdict
     assert "tumor_1 may as well lie 5.2 mm away" in rival.reason
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_following_goes_on_to_say_that_another_place_fits_as_well(tracker, known, monkeypatch):
+    """The organ is an ellipsoid: turned by half a turn it fits as well, its tumor 16 mm away."""
+    shape, half_turn = tracker.model.shape, np.diag([-1.0, -1.0, 1.0])
+
+    def lies(frame: int, turn: np.ndarray) -> ElasticMotion:
+        place_mm = PLACE_MM + [0.5 * frame, 0.0, 0.0]
+        return ElasticMotion(shape, TURNED @ turn, place_mm, shape.body.mean)
+
+    follower, found = Follower(tracker, FollowerConfig(rescan_s=100.0)), []
+    for frame in range(4):
+        organ = ANATOMY.organ.moved(lies(frame, np.eye(3)).carry(ANATOMY.organ.vertices_mm))
+        points_mm = seen_side(organ, 5).astype(np.float32)
+        found.append(follower.locate(SensorCloud(points_mm, (frame + 1) * 33_000_000)))
+        if frame == 0:  # whatever the first look found
+            rivals = ((lies(0, half_turn), 0.5),) if known else ()
+            start = replace(lies(0, np.eye(3)), rivals=rivals)
+            monkeypatch.setattr(follower, "_last", replace(found[0], unsmoothed=start))
+    for one in found[1:]:
+        others = one.report["fit_cost"]["others"]
+        assert len(others) == known
+        assert ("tumor_1 may as well lie" in one.reason) == known
+        if known:
+            assert one.quality == "poor"
+            assert others[0]["apart_mm"]["tumor_1"] == pytest.approx(16.0, abs=1.5)
 
 
 def test_an_organ_that_the_camera_sees_through_is_refused(tracker, stages):

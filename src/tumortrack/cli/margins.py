@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,8 +17,6 @@ if TYPE_CHECKING:
     from tumortrack.models.margins import ModelMargins
     from tumortrack.report.calibration import Listed
     from tumortrack.report.calibration_table import Row
-
-_GRID = 8  # voxels: the labelled volume is not looked at
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -98,10 +95,10 @@ class Margins:
             keep_loaded()
             model = load_model(self.model, self.device, with_margins=False)
             check_case(model, [one.folder for one in left])
-            locate = partial(Tracker(model).locate, grid=_GRID, seed=self.seed)
+            tracker = Tracker(model)
             with progress_bar("margins", len(left)) as advance:
                 for one in left:
-                    row = row_of(locate, read_scene(one.folder), one)
+                    row = row_of(tracker, read_scene(one.folder), one, self.seed)
                     add(row)
                     done[row.scene] = row
                     advance()

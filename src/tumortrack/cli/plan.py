@@ -16,9 +16,6 @@ from tumortrack.core import store
 from tumortrack.core.errors import InputError, NoPlan
 
 if TYPE_CHECKING:
-    import numpy as np
-    from jaxtyping import Float64
-
     from tumortrack.core.types import Mesh
     from tumortrack.live.values import PublishedFrame
     from tumortrack.plan.arms.config import CellConfig
@@ -40,7 +37,7 @@ class Plan(StatedPatient):
             planner.
         tumor: which one (tumor_1, ...; default: the one that lies farthest out of the organ).
         margin: least distance between tumor and cut in mm (default 5, the paper's; ordinary
-            estimates need about 8, docs/resection.md).
+            estimates need about 10, docs/resection.md).
         sigmas: add this many standard deviations of the estimate's own uncertainty to the margin
             (default 0).
         confidence: the margin is of healthy tissue, beyond all errors, with the tumor's place as
@@ -88,7 +85,7 @@ class Plan(StatedPatient):
         config = self._resection_config()
         OperationConfig(moved_mm=self.moved)  # what is allowed is said now, not by `resect`
         store.check_place(self.plan, KIND, self.overwrite)
-        cell_config = self._cell_config()
+        cell_config, bases_source = self._cell()
         if self.arms:
             check_arms_installed()
         run = read_run(self.run_folder)
@@ -96,19 +93,18 @@ class Plan(StatedPatient):
         say(str(run.patient))
         doubts = notes_of_doubt(run.doubt, self.accept_poor)
         frames = self._frame(run, cell_config.stand_mm)
-        frame_id, table_from_camera = frames.frame_id, frames.published_from_camera
-        located = run.located(table_from_camera)
+        located = run.located(frames.published_from_camera)
         organ = located.meshes.get("kidney")
         if self.arms and organ is None:
             raise NoPlan(
                 "the run has no kidney.ply, so arms can't keep clear of it; give --no-arms."
             )
         resection = plan_resection(located, config)
-        budget = self._budget(resection, located, table_from_camera, cell_config)
+        budget = self._budget(resection, located, frames, cell_config)
         if self.confidence is not None:
             healthy_mm, config = config.margin_mm, widened(config, budget)
             resection = plan_resection(located, config)
-            budget = self._budget(resection, located, table_from_camera, cell_config)
+            budget = self._budget(resection, located, frames, cell_config)
             doubts = (*doubts, beyond_errors(healthy_mm, budget))
         resection = replace(resection, notes=(*doubts, *resection.notes))
         for line in budget.table():
@@ -125,7 +121,7 @@ class Plan(StatedPatient):
             if hit := first_hit(motions, placed.config, organ):
                 raise NoPlan(f"the arms can't carry this out: {hit}. Place the organ otherwise.")
             cell_used = to_builtins(placed.config)
-            cell_source = INVENTED if moved else self._cell_source()
+            cell_source = INVENTED if moved else bases_source
             say(
                 f"arms: {len(motions.stages)} stages, {motions.seconds:.0f} s; planned in "
                 f"{time.perf_counter() - start:.1f} s."
@@ -134,7 +130,8 @@ class Plan(StatedPatient):
                 say(f"note: {moved}")
         model = store.read_json(self.run_folder / "report.json").get("model")
         content = PlanFolder(
-            resection, config, table_from_camera, frame_id, located.meshes, cell_used, motions,
+            resection, config, frames.published_from_camera, frames.frame_id, located.meshes,
+            cell_used, motions,
             str(model.get("case_sha256") or "") if isinstance(model, dict) else "",
             store.sha256_of(self.frame) if self.frame else INVENTED, cell_source, run.patient,
             budget, frames.camera_frame_id, frames.table_in_camera,
@@ -149,7 +146,7 @@ class Plan(StatedPatient):
 
         digest = store.sha256_of(self.run_folder / store.MANIFEST)
         write_plan(self.plan, content, {"run": digest}, pictures, self.overwrite)
-        say(f"written to {self.plan} (frame {frame_id!r}, mm); look at {self.plan / 'plan.png'}.")
+        say(f"written to {self.plan} (frame {frames.frame_id!r}, mm); look at plan.png there.")
 
     def _resection_config(self) -> ResectionConfig:
         """What the file says, and over that what was given on the command line."""
@@ -166,39 +163,33 @@ class Plan(StatedPatient):
         self,
         resection: ResectionPlan,
         located: Located,
-        table_from_camera: Float64[np.ndarray, "4 4"],
+        frames: PublishedFrame,
         cell: CellConfig,
     ) -> ErrorBudget:
         """What the margin has to cover; the camera's place at the tumor's far side."""
         import numpy as np
 
-        from tumortrack.live.calibration_file import read_error_mm
         from tumortrack.plan.budget import planned_budget, tumor_points
 
-        error_mm = None
-        if self.frame is not None:
-            off_mm = tumor_points(resection, located) - table_from_camera[:3, 3]
-            error_mm = read_error_mm(self.frame, float(np.linalg.norm(off_mm, axis=1).max()))
+        off_mm = tumor_points(resection, located) - frames.published_from_camera[:3, 3]
+        error_mm = frames.error_at(float(np.linalg.norm(off_mm, axis=1).max()))
         tool_mm, sure = cell.tool_error_mm, self.confidence
         return planned_budget(resection, located, error_mm, tool_mm, self.moved, sure)
 
-    def _cell_config(self) -> CellConfig:
+    def _cell(self) -> tuple[CellConfig, str]:
+        """Arms, tools and table, and where the arms' places come from, as ``PlanFolder`` holds it:
+        a file that leaves them out gives none."""
         from msgspec.structs import replace
 
         from tumortrack.core.config import from_builtins
         from tumortrack.plan.arms.config import CellConfig
+        from tumortrack.plan.files import INVENTED
 
         written = {} if self.cell is None else store.read_json(self.cell)
         config = from_builtins(written, CellConfig, str(self.cell))
-        return config if self.stand is None else replace(config, stand_mm=self.stand)
-
-    def _cell_source(self) -> str:
-        """As ``PlanFolder`` holds it: a file that leaves the arms' places out gives none."""
-        from tumortrack.plan.files import INVENTED
-
-        if self.cell is None or not store.read_json(self.cell).keys() >= {*_BASES}:
-            return INVENTED
-        return store.sha256_of(self.cell)
+        given = self.cell is not None and written.keys() >= {*_BASES}
+        source = store.sha256_of(self.cell) if given else INVENTED
+        return config if self.stand is None else replace(config, stand_mm=self.stand), source
 
     def _frame(self, run: LocatedRun, stand_mm: float) -> PublishedFrame:
         """The table's frame: of the calibration, or of a camera that looks down."""

@@ -21,7 +21,7 @@ from tumortrack.cli.stated import StatedPatient
 from tumortrack.core import store
 from tumortrack.core.config import to_builtins
 from tumortrack.core.errors import Aborted, ArtifactError, InputError
-from tumortrack.core.patient import NOBODY, Patient
+from tumortrack.core.patient import Patient
 
 if TYPE_CHECKING:
     from concurrent.futures import Future
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from jaxtyping import Float64
 
     from tumortrack.live.sinks.ur import UrSinkConfig
-    from tumortrack.live.values import RigidShape, TrackingResult, Workcell
+    from tumortrack.live.values import RigidShape, SourceConfig, TrackingResult, Workcell
     from tumortrack.plan import operation as operations
     from tumortrack.plan.arms.cell import ArmCell
     from tumortrack.plan.files import PlanFolder
@@ -103,8 +103,9 @@ class Resect(StatedPatient):
         cell_config = from_builtins(stored.cell, CellConfig, str(self.plan))
         arms = [sink for sink in sinks if isinstance(sink, UrSinkConfig)]
         moving = [arm for arm in arms if arm.execute]
+        live = None if self.live is None else _live_of(*self.live, stored)
         if moving:
-            self._check_real(stored, moving)
+            self._check_real(stored, moving, live)
 
         from tumortrack.plan.arms.cell import ArmCell
         from tumortrack.plan.arms.trajectory import first_hit
@@ -119,42 +120,39 @@ class Resect(StatedPatient):
             _write_film(stored, cell, self.film)
             return
         _confirm(moving, stored.patient)
-        carry_out = self._execute if self.live is None else self._follow
         with _dry_run([arm for arm in arms if not arm.execute], moving):
             say(str(stored.patient))
-            carry_out(stored, cell, config, arms)
+            if live is None:
+                self._execute(stored, cell, config, arms)
+            else:
+                self._follow(stored, cell, config, arms, live)
 
-    def _check_real(self, stored: PlanFolder, arms: Sequence[UrSinkConfig]) -> None:
+    def _check_real(
+        self, stored: PlanFolder, arms: Sequence[UrSinkConfig], live: _Live | None
+    ) -> None:
         """Raises InputError that lists what is missing for real arms to move."""
         from tumortrack.plan.files import INVENTED
         from tumortrack.plan.located import POOR_ESTIMATE
 
-        model, source = self.live or (None, "")
-        case, whose = _case_of(model) if model else ("", NOBODY)
+        model, source = self.live or ("", "")
         budget, moved_mm = stored.budget, self._moved_mm(stored)
         assumed = () if budget is None else budget.assumed
         needs = {
-            "--live MODEL SOURCE, so that they stop where the tumor moves": model,
+            "--live MODEL SOURCE, so that they stop where the tumor moves": live,
             f"a source that shows the present ({', '.join(_LIVE)}; not {source})": (
-                model is None or _shows_the_present(source)
+                live is None or live.shows_the_present
             ),
             f"a model that says which case it was trained for ({model} does not)": (
-                model is None or case
+                live is None or live.case
             ),
             "a plan that says which case it was made on (locate and plan again)": (
                 stored.case_sha256
-            ),
-            f"a model of the case that was planned on ({model} is of another)": (
-                not (case and stored.case_sha256) or case == stored.case_sha256
             ),
             "--patient ID and --side, as you know them": self.stated.known,
             f"a plan that says whose organ it is (this one's: {stored.patient})": (
                 stored.patient.known
             ),
-            f"a model that says whose organ it is ({model}: {whose})": model is None or whose.known,
-            f"a model of the plan's patient and side ({model}: {whose})": (
-                not whose.differs(stored.patient)
-            ),
+            f"a model that says whose organ it is (not {model})": live is None or live.whose.known,
             "a plan made on a good estimate (this one's was poor)": (
                 not any(note.startswith(POOR_ESTIMATE) for note in stored.plan.notes)
             ),
@@ -162,7 +160,7 @@ class Resect(StatedPatient):
                 stored.frame_source != INVENTED
             ),
             "a plan made with --frame FILE that has camera_frame_id, as this source has": (
-                model is None or stored.camera_frame_id or not _names_frames(source)
+                live is None or stored.camera_frame_id or live.kind not in ("ros1", "ros2")
             ),
             "a plan made with --cell FILE that gives both bases, and keeps to them": (
                 stored.cell_source != INVENTED
@@ -204,6 +202,7 @@ class Resect(StatedPatient):
         cell: ArmCell,
         config: operations.OperationConfig,
         arms: Sequence[UrSinkConfig],
+        live: _Live,
     ) -> None:
         """Beside the live loop: every estimate is looked at, and planned on where the tumor
         moved."""
@@ -219,14 +218,6 @@ class Resect(StatedPatient):
 
         assert self.live is not None
         model, source = self.live
-        case, whose = _case_of(model)
-        if whose.differs(stored.patient):  # it would find another tumor, or none
-            raise InputError(f"{model} is of {whose}, the plan of {stored.patient}.")
-        if stored.case_sha256 and case and case != stored.case_sha256:
-            raise InputError(  # likewise
-                f"{model} was trained for another case than the one that was planned on. Give a "
-                "model of that case, or plan on what this model locates."
-            )
 
         def locate(result: TrackingResult, unsure: bool = False) -> Located:
             estimate = result.estimate
@@ -264,7 +255,7 @@ class Resect(StatedPatient):
                 whole=self.whole, intrinsics=self.intrinsics, report=self.report,
                 device=self.device, patient=self.patient, side=self.side,
             ).run(track.Arms(
-                operation, stored.frames, {"plan_config": to_builtins(config)},
+                operation, stored.frames, {"plan_config": to_builtins(config)}, live.source,
                 tip_places(cell.config), bool(arms),
             ))  # fmt: skip
         _say_end(operation, arms)
@@ -325,27 +316,40 @@ class Resect(StatedPatient):
         track.check_closed(sinks)
 
 
-def _shows_the_present(source: str) -> bool:
-    """Not a virtual source, nor a recording."""
+@dataclass(frozen=True, eq=False)
+class _Live:
+    """Of --live: the source; the model's case, by its digest (empty where unknown), and whose."""
+
+    source: SourceConfig
+    case: str
+    whose: Patient
+
+    @property
+    def kind(self) -> str:
+        return str(self.source.__struct_config__.tag)
+
+    @property
+    def shows_the_present(self) -> bool:
+        """Not a virtual source, nor a recording."""
+        return self.kind in _LIVE and not Path(getattr(self.source, "device", "")).suffix
+
+
+def _live_of(model: Path, source: str, stored: PlanFolder) -> _Live:
+    """InputError: the model is of another patient or case than the plan."""
     from tumortrack.live.spec import SOURCES
-
-    config = SOURCES.parse(source)
-    kind = config.__struct_config__.tag
-    return kind in _LIVE and not Path(getattr(config, "device", "")).suffix
-
-
-def _names_frames(source: str) -> bool:
-    """Its frames come with the name of the camera's."""
-    return source.partition(":")[0] in ("ros1", "ros2")
-
-
-def _case_of(model: Path) -> tuple[str, Patient]:
-    """The case that a model was trained for, by its digest (empty where unknown), and whose."""
     from tumortrack.models.folder import patient_of
 
     manifest = store.read_json(model / store.MANIFEST) if model.is_dir() else {}
     case = str(manifest.get("provenance", {}).get("case_sha256") or "")
-    return case, patient_of(manifest, model)
+    whose = patient_of(manifest, model)
+    if whose.differs(stored.patient):  # it would find another tumor, or none
+        raise InputError(f"{model} is of {whose}, the plan of {stored.patient}.")
+    if stored.case_sha256 and case and case != stored.case_sha256:  # likewise
+        raise InputError(
+            f"{model} was trained for another case than the one that was planned on. Give a model "
+            "of that case, or plan on what this model locates."
+        )
+    return _Live(SOURCES.parse(source), case, whose)
 
 
 def _confirm(arms: Sequence[UrSinkConfig], patient: Patient) -> None:

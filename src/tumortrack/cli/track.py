@@ -21,7 +21,7 @@ from tumortrack.core.errors import InputError, StorageError
 
 if TYPE_CHECKING:
     from tumortrack.live.loop import Loop, LoopConfig
-    from tumortrack.live.values import PublishedFrame, TrackingResult
+    from tumortrack.live.values import PublishedFrame, SourceConfig, TrackingResult
     from tumortrack.live.workers import SinkWorker, SourceWorker
     from tumortrack.models.model import Model
     from tumortrack.plan.operation import Operation
@@ -40,6 +40,7 @@ class Arms:
     companion: Operation
     frames: PublishedFrame
     about: dict[str, Any]
+    source: SourceConfig
     tip_mm: Any  # as ``SinkContext``'s
     ur: bool  # sinks of real arms, connected or not
 
@@ -103,7 +104,7 @@ class Track(StatedPatient):
         from tumortrack.live.values import Controls, PublishedFrame, SinkContext
         from tumortrack.models.folder import patient_of, read_model_manifest
 
-        source_config = SOURCES.parse(self.source)
+        source_config = SOURCES.parse(self.source) if arms is None else arms.source
         named = api.named_sinks(self.sinks)
         frames = read_frames(self.frame) if self.frame else PublishedFrame()
         if arms is not None:

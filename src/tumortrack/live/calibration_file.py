@@ -85,16 +85,8 @@ def read_frames(path: Path) -> PublishedFrame:
         unit = float(np.linalg.norm(table[:3]))  # but for the file's few digits
         x, y, z, offset = (number / unit for number in table)
         table = x, y, z, offset * (1000 if file.unit == "m" else 1)
-    return PublishedFrame(file.frame_id, robot_from_camera, True, camera, table)
-
-
-def read_error_mm(path: Path, distance_mm: float) -> float | None:
-    """The error that a calibration file states, so far from the camera; None: it states none.
-    Raises InputError as ``read_frames``."""
-    file = from_builtins(read_json(path), CalibrationFile, str(path))
-    if file.error_mm is None:
-        return None
-    return file.error_mm + distance_mm * float(np.radians(file.error_deg))
+    error = file.error_mm, file.error_deg
+    return PublishedFrame(file.frame_id, robot_from_camera, True, camera, table, *error)
 
 
 def _rigid(rows: Rows, unit: str, where: str) -> Float64[np.ndarray, "4 4"]:

@@ -37,8 +37,7 @@ class FrameCheck:
         self._values: np.ndarray | None = None
         self._since_ns = self._last_ns = 0  # an image may have come since; the last frame
         self._camera: Intrinsics | None = None
-        self._begun = False
-        self._name: str | None = None  # of the first frame
+        self._first: Observation | None = None
         self.watch = TableWatch(config, published.table_in_camera) if published.calibrated else None
         self.notes: list[str] = []
         if published.calibrated and not published.camera_frame_id:
@@ -48,18 +47,17 @@ class FrameCheck:
         """A doubt about this frame, or nothing. Raises NoEstimate for a frame of another camera
         than the calibration or the first frame was of, and once camera or table have moved."""
         name, wanted = seen.frame_id, self._published.camera_frame_id
-        if not self._begun:
-            self._begun, self._name = True, name
-            if wanted and name is None:
-                self.notes.append(_NAMELESS)
+        self._first = self._first or seen
+        first = self._first.frame_id
+        self._note(_NAMELESS, bool(wanted) and first is None)
         if wanted and name not in (None, wanted):
             raise NoEstimate(
                 f"the frame is in {name!r}, and the calibration is for {wanted!r}. Give "
                 "this camera's calibration, or the topic of the calibrated camera"
             )
-        if name != self._name:
+        if name != first:
             raise NoEstimate(
-                f"the source's frame changed from {self._name!r} to {name!r}: another camera, or "
+                f"the source's frame changed from {first!r} to {name!r}: another camera, or "
                 "another setting of it. Restart to accept it"
             )
         if isinstance(seen.content, DepthFrame):

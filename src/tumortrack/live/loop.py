@@ -87,6 +87,7 @@ class Loop:
         self._place_mm: Float64[np.ndarray, " 3"] | None = None  # where that is by now
         self._found_s = time.monotonic()
         self._in_a_row = _SURE_AFTER  # good estimates since the last doubt
+        self._says: Intrinsics | None = None  # the source, where others are given
         self._stamp: tuple[int, int] | None = None  # of the last frame, and when that was here
         self.statistics = RunStatistics()
 
@@ -235,7 +236,12 @@ class Loop:
         given, content = self._config.intrinsics, seen.content
         if given is None or not isinstance(content, DepthFrame):
             return seen
-        has = content.intrinsics
+        self._says, has = self._says or content.intrinsics, content.intrinsics
+        if has != self._says:
+            return InputError(
+                "the camera's own intrinsics changed, and those of --intrinsics were for the ones "
+                "before. If that is meant, calibrate it anew and start again."
+            )
         if (has.width, has.height) != (given.width, given.height):
             return InputError(
                 f"the depth images are {has.width} x {has.height}, and --intrinsics is for "

@@ -7,6 +7,7 @@ every result or, if it is slow, the newest. A source or sink is one file: a conf
 
 from __future__ import annotations
 
+import math
 import threading
 from abc import abstractmethod
 from collections.abc import Callable, Mapping
@@ -90,13 +91,21 @@ class Source(Protocol):
 class PublishedFrame:
     """Where results are published. Of a calibration also (``calibrated``), as far as its file
     says it: ``camera_frame_id``, what sources call the camera's frame; ``table_in_camera``: unit
-    normal and offset (mm) of the table's plane, ``normal @ point = offset``, when it was made."""
+    normal and offset (mm) of the table's plane, ``normal @ point = offset``, when it was made;
+    ``error_mm`` and ``error_deg``: bounds of its error, at the camera and of its direction."""
 
     frame_id: str = "camera"
     published_from_camera: Float64[np.ndarray, "4 4"] = field(default_factory=lambda: np.eye(4))
     calibrated: bool = False
     camera_frame_id: str = ""
     table_in_camera: tuple[float, float, float, float] | None = None
+    error_mm: float | None = None
+    error_deg: float = 0.0
+
+    def error_at(self, distance_mm: float) -> float | None:
+        """The calibration's error so far from the camera, mm; None: it states none."""
+        turned_mm = distance_mm * math.radians(self.error_deg)
+        return None if self.error_mm is None else self.error_mm + turned_mm
 
 
 @dataclass(frozen=True, eq=False)

@@ -54,13 +54,15 @@ class LiveBudget:
         assert estimate is not None
         late_ms = max(update.latency_ms or 0.0, 0.0)  # a camera's clock may be ahead
         late_ms += estimate.report.get("smoothing", {}).get("lag_ms", 0.0)
+        said = estimate.report.get("margin")
+        stated = stated_radius(said, part, self._planned.confidence or None)
         std_mm, motion = None, estimate.motion
-        if motion is not None:
+        if stated is None and motion is not None:
             places = motion.back(estimate.meshes[part].vertices_mm[::_EVERY])
-            std_mm = None if places is None else motion.std_mm(places)
+            std_mm = None if places is None else motion.largest_std_mm(places)
         self.now = now = self._planned.seen(
             std_mm,
-            stated_radius(estimate.report.get("margin"), part, self._planned.confidence or None),
+            stated,
             margin_mm=margin_mm,
             motion_mm=motion_mm,
             lag_mm=self._speed_mm_s(update.stamp_ns, tumor) * (late_ms / 1000 + self._servo_s),

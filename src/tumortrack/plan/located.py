@@ -57,7 +57,7 @@ def located(
     for name, mesh in meshes.items():
         moved[name] = mesh.moved(transform_points(table_from_camera, mesh.vertices_mm))
         places = None if motion is None or name == "kidney" else motion.back(mesh.vertices_mm)
-        std_mm = None if motion is None or places is None else motion.std_mm(places)
+        std_mm = None if motion is None or places is None else motion.largest_std_mm(places)
         if std_mm is not None:
             deviations[name] = std_mm
     points_mm = transform_points(table_from_camera, cloud.points_mm)
@@ -66,7 +66,8 @@ def located(
 
 @dataclass(frozen=True, eq=False)
 class LocatedRun:
-    """What `locate` wrote, camera frame, mm. ``std_mm``: of the cloud's points, if it is known."""
+    """What `locate` wrote, camera frame, mm. ``std_mm``: of the cloud's points along the axis that
+    is least sure, if it is known."""
 
     cloud: OccupancyCloud
     meshes: dict[str, Mesh]
@@ -137,7 +138,7 @@ def read_run(folder: Path) -> LocatedRun:
             f"{folder} has points of {', '.join(lacking)} and no {lacking[0]}.ply; locate again."
         )
     try:
-        std_mm = parse_ply_properties(content, str(path), ("std_mm",))[:, 0]
-    except InputError:  # a method without uncertainty
+        std_mm = parse_ply_properties(content, str(path), ("largest_std_mm",))[:, 0]
+    except InputError:  # a method, or an older version, without it
         std_mm = None
     return LocatedRun(cloud, meshes, std_mm, doubt, patient, report.get("margin"))

@@ -5,7 +5,7 @@ The unit is the physical state: one scene of each counts. docs/trust.md says wha
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, get_args
@@ -17,8 +17,6 @@ from msgspec.structs import replace
 import tumortrack
 from tumortrack.core import store
 from tumortrack.core.errors import InputError, NoEstimate
-from tumortrack.core.estimate import Estimate
-from tumortrack.core.types import SensorCloud
 from tumortrack.models import conformal
 from tumortrack.models.margins import (
     METHOD,
@@ -33,6 +31,8 @@ from tumortrack.models.margins import (
 from tumortrack.report.calibration_table import Miss, Row
 from tumortrack.report.metrics import outward_miss
 from tumortrack.simulate.scene_folder import Scene, list_scenes
+from tumortrack.tracking.quality import cloud_shares
+from tumortrack.tracking.tracker import Tracker
 
 _Turn = Literal["choose", "test", "calibrate"]
 CONFIDENCES = (0.9, 0.95)
@@ -44,6 +44,7 @@ _OFFSETS_MM = (0.1, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
 # What a state is for: choosing form and limits, testing limits, finding radii. Of each group's
 # states, drawn by the seed, in turn.
 _TURNS: tuple[_Turn, ...] = ("test", "calibrate", "choose", "test", "calibrate")
+_GRID = 8  # voxels: the labelled volume is not looked at
 _WORTH = 0.95  # of the constant radius: nothing less pays for one that varies
 
 
@@ -84,20 +85,24 @@ def list_states(folders: Sequence[Path], seed: int) -> list[Listed]:
 _WORDS = ("under 1/3", "1/3 to 2/3", "over 2/3")
 
 
-def row_of(locate: Callable[[SensorCloud], Estimate], scene: Scene, listed: Listed) -> Row:
-    """One state's line; ``locate`` must state no margins of its own."""
+def row_of(tracker: Tracker, scene: Scene, listed: Listed, seed: int) -> Row:
+    """One state's line: judged by the depth image, where there is one, as `locate` and `track` do.
+    The tracker's model must have no margins of its own."""
     row = Row(
         scene=str(listed.folder.resolve()),
         sha256=store.sha256_of(listed.folder),
         label=listed.label,
     )
     try:
-        estimate = locate(scene.cloud)
+        estimate = tracker.locate(scene.cloud, _GRID, seed, scene.depth)
     except (NoEstimate, InputError) as error:
         return replace(row, doubt=str(error))
     if estimate.quality != "good":
         return replace(row, doubt=estimate.reason)
     parts: dict[str, Any] = estimate.report["parts"]
+    if scene.depth is not None:  # which says nothing of what lies where the cloud has no points
+        organ = estimate.meshes[scene.reference.names[0]]
+        estimate.report["unseen"] = cloud_shares(organ, scene.cloud)[1]
     misses: dict[Kind, list[Miss]] = {}
     unsure = {name: part.get("surface_std_mm") for name, part in parts.items()}
     for n, (name, truth) in enumerate(

@@ -57,13 +57,15 @@ def write_estimate(
 
 
 def _places_in_ct(estimate: Estimate) -> dict[str, np.ndarray]:
-    """ct_x, ct_y, ct_z (LPS, mm) of the cloud's points and how unsure their places are, std_mm;
-    empty where that is not known."""
+    """ct_x, ct_y, ct_z (LPS, mm) of the cloud's points and how unsure their places are, std_mm
+    and largest_std_mm; empty where that is not known."""
     if estimate.motion is None:
         return {}
     points_ct = estimate.motion.back(estimate.cloud.points_mm.astype(np.float64))
     if points_ct is None:
         return {}
     places = {f"ct_{axis}": points_ct[:, n].astype(np.float32) for n, axis in enumerate("xyz")}
-    std_mm = estimate.motion.std_mm(points_ct)
-    return places if std_mm is None else {**places, "std_mm": std_mm.astype(np.float32)}
+    for name in ("std_mm", "largest_std_mm"):
+        if (deviations := getattr(estimate.motion, name)(points_ct)) is not None:
+            places[name] = deviations.astype(np.float32)
+    return places

@@ -15,7 +15,7 @@ import pandas as pd
 
 from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.estimate import Estimate
-from tumortrack.report.drawing import new_figure, save
+from tumortrack.report.drawing import new_figure, save, show_legend
 from tumortrack.report.pictures import FROM_SIDE, draw_solid_view, scene_legend
 from tumortrack.report.protocol import compare
 from tumortrack.simulate.scene_folder import Scene, read_scene
@@ -166,11 +166,13 @@ def gallery(jobs: list[Job], path: Path) -> None:
     method of these jobs of one case. Raises InputError: a scene cannot be read."""
     methods = list({id(job.method): job.method for job in jobs}.values())
     scenes = list(dict.fromkeys((job.variant, job.view) for job in jobs))
-    total = len(scenes) * 2.75 + 1.0
+    columns = min(4, 2 * len(methods))  # of the legend: each takes up to 2.2 inches
+    top = 0.7 + 0.25 * (4 // columns)
+    total = len(scenes) * 2.75 + top
     drawing = new_figure(4.4 * len(methods) + 0.5, total)
     panels = drawing.subplots(len(scenes), len(methods), squeeze=False)
     drawing.subplots_adjust(
-        left=0.045, right=0.99, top=1 - 0.98 / total, bottom=0.1 / total, wspace=0.04, hspace=0.16
+        left=0.045, right=0.99, top=1 - top / total, bottom=0.1 / total, wspace=0.04, hspace=0.16
     )
     bold: dict[str, Any] = {"fontweight": "bold"}
     for axes, method in zip(panels[0], methods, strict=True):
@@ -186,10 +188,7 @@ def gallery(jobs: list[Job], path: Path) -> None:
             title = _numbers(estimate, scene) if estimate else "nothing found"
             draw_solid_view(axes, scene, estimate, FROM_SIDE)
             axes.set_title(title, fontsize=9.5)
-    drawing.legend(
-        handles=scene_legend(), loc="upper right", ncols=4, frameon=False,
-        bbox_to_anchor=(0.99, 0.999),
-    )  # fmt: skip
+    show_legend(drawing, scene_legend(), columns, (0.99, 0.999))
     save(drawing, path)
 
 

@@ -34,7 +34,9 @@ def is_open(master_host: str) -> bool:
 
 
 def guard_node(rospy: Any, master_host: str) -> None:
-    """Before rospy's node starts: unless it is to be open, it listens on the loopback address."""
+    """Before rospy's node starts: unless it is to be open, it listens on the loopback address.
+    rospy takes none of this as an option; ``ROS_IP`` would do for the address, but also for all
+    programs that this one starts."""
     import rosgraph
     import rosgraph.xmlrpc
     from rospy.impl import tcpros_base

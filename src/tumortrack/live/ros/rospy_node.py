@@ -142,7 +142,7 @@ def _join() -> tuple[ModuleType, Master]:
 def _start(rospy: ModuleType) -> None:
     """rospy's start, without its grip on signals, arguments, the clock and logging."""
     configure = rospy.core.configure_logging
-    rospy.core.configure_logging = lambda *_: None  # it would close everybody's log handlers
+    rospy.core.configure_logging = lambda *_: None  # closes all log handlers; no option
     try:
         without = dict.fromkeys(("disable_signals", "disable_rostime", "disable_rosout"), True)
         rospy.init_node("tumortrack", argv=[], anonymous=True, **without)

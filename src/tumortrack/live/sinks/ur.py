@@ -11,7 +11,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Mapping
-from typing import ClassVar, Literal
+from typing import ClassVar, Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Float64
@@ -28,6 +28,9 @@ OFF_DEG = 2.0  # between the arm and the plan, before it may move
 # Between the tool's tip and its target on a cut: at 10 mm/s servoing is 1.3 mm late. The joints'
 # tolerance would be 40 mm there.
 OFF_MM = 2.0
+# An arm that begins beside its first target joins the plan in this time: 2 degrees at the shoulder
+# are 4 cm at the tool, which it would otherwise make good in 0.1 s.
+EASE_S = 1.0
 _STOP_M_S2 = 10.0  # servoStop's deceleration: ur_rtde's own
 # Of UR5, UR5e, UR10 and UR10e (data sheets): a turn either way; the larger ones' first two joints
 # are the slower ones, and their limits hold for all here.
@@ -94,6 +97,17 @@ class UrSinkConfig(SinkConfig, frozen=True, kw_only=True, tag="ur"):
         return UrSink(self, UrLink(self.host) if self.execute else None, context)
 
 
+class _Sent(NamedTuple):
+    """A target: as planned, as it was sent, when, its stamp, and how far each joint may be behind
+    it."""
+
+    planned: Joints
+    joints: Joints
+    when_s: float
+    stamp_ns: int
+    lag_rad: Joints
+
+
 class UrSink:
     """Sends one arm's joints as they come, and stops it (servoStop) where the arms are halted,
     there is no workcell, a target is refused, 0.2 s pass without a result, or it is closed. With
@@ -101,9 +115,10 @@ class UrSink:
     under no safety stop, meets no force, and is where the targets have led it; if not, all arms
     stop for good.
 
-    Whenever it stood still, it begins only where the arm is within 2 degrees of the target. On a
-    cut, where 2 degrees are centimetres, the tool's tip must be within 2 mm of its target. Should
-    this process die, the arm's controller stops it within 0.2 s by itself (setWatchdog).
+    Whenever it stood still, it begins only where the arm is within 2 degrees of the target, which
+    it then reaches within a second. On a cut, where 2 degrees are centimetres, the tool's tip must
+    be within 2 mm of its target. Should this process die, the arm's controller stops it within
+    0.2 s by itself (setWatchdog).
     """
 
     def __init__(self, config: UrSinkConfig, link: UrLink | None, context: SinkContext) -> None:
@@ -111,8 +126,8 @@ class UrSink:
         self._controls, self._tip_mm = context.controls, context.tip_mm
         self._cutting = False
         self._names = tuple(f"{config.arm}_{joint}" for joint in UR_JOINTS)
-        # The last target, when it was sent, its stamp, and how far each joint may be behind it.
-        self._last: tuple[Joints, float, int, Joints] | None = None
+        self._last: _Sent | None = None  # None: the arm stands still
+        self._ease: tuple[Joints, float] = np.zeros(6), 0.0  # where it began beside its target
         self._lock = threading.Lock()
         self._closed = threading.Event()
         self._counts: Counter[str] = Counter()
@@ -175,40 +190,45 @@ class UrSink:
         if self._link is not None:
             self._controls.aborted.set()
 
-    def _go(self, target: Joints, stamp_ns: int) -> None:
+    def _go(self, planned: Joints, stamp_ns: int) -> None:
         now_s = time.monotonic()
         seconds = _SHORTEST_S
         lag_rad = np.zeros(6)
-        if self._last is not None:
-            before, then_s, then_ns, _ = self._last
-            # Targets are as far apart as their stamps say, or came: a thread may have waited.
-            seconds = max(now_s - then_s, (stamp_ns - then_ns) * 1e-9, _SHORTEST_S)
-            _check_step(target - before, seconds, self._config.jump_deg)
-            # servoJ comes after its targets by the time it looks ahead, and one target.
-            lag_rad = np.abs(target - before) * (1 + self._config.lookahead_s / seconds)
         if self._link is not None:
-            self._look_at(self._link, target)
+            joints_rad = self._look_at(self._link, planned)
             if self._last is None:
+                self._ease = joints_rad - planned, now_s
+        beside_rad, begun_s = self._ease
+        target = planned + beside_rad * max(1 - (now_s - begun_s) / EASE_S, 0.0)
+        if (last := self._last) is not None:
+            # Targets are as far apart as their stamps say, or came: a thread may have waited.
+            seconds = max(now_s - last.when_s, (stamp_ns - last.stamp_ns) * 1e-9, _SHORTEST_S)
+            _check_step(target - last.joints, seconds, self._config.jump_deg)
+            # servoJ comes after its targets by the time it looks ahead, and one target.
+            lag_rad = np.abs(target - last.joints) * (1 + self._config.lookahead_s / seconds)
+        if self._link is not None:
+            if last is None:
                 seconds = _LONGEST_S
             follow_s = float(np.clip(seconds, _SHORTEST_S, _LONGEST_S))
             self._link.servo(target, follow_s, self._config.lookahead_s, self._config.gain)
-        self._last = target, now_s, stamp_ns, lag_rad
+        self._last = _Sent(planned, target, now_s, stamp_ns, lag_rad)
         self._counts["would send" if self._link is None else "sent"] += 1
 
-    def _look_at(self, link: UrLink, target: Joints) -> None:
-        """Raises TumortrackError where the arm cannot follow, meets something, or is elsewhere than
-        at the last target or, before the first one, at this."""
+    def _look_at(self, link: UrLink, planned: Joints) -> Joints:
+        """Where the arm is. Raises TumortrackError where it cannot follow, meets something, or is
+        elsewhere than at the last target or, before the first one, at this."""
         link.check(self._config.force_n)
-        at, lag_rad = (target, np.zeros(6)) if self._last is None else self._last[::3]
-        joints_rad = link.compare(at, np.radians(OFF_DEG) + lag_rad)
+        last = self._last or _Sent(planned, planned, 0.0, 0, np.zeros(6))
+        joints_rad = link.compare(last.joints, np.radians(OFF_DEG) + last.lag_rad)
         if self._cutting and self._tip_mm is not None:
-            ways_mm = (self._tip_mm(self._config.arm, joints) for joints in (joints_rad, at))
+            ways_mm = (self._tip_mm(self._config.arm, at) for at in (joints_rad, last.planned))
             off_mm = float(np.linalg.norm(np.subtract(*ways_mm)))
             if not off_mm <= OFF_MM:
                 raise TumortrackError(
                     f"the tool's tip is {off_mm:.1f} mm from where it should cut; allowed: "
                     f"{OFF_MM:g}"
                 )
+        return joints_rad
 
     def _stop(self) -> None:
         moving, self._last = self._last is not None, None
@@ -219,7 +239,7 @@ class UrSink:
                 self._break(error)
 
     def _heed_silence(self) -> None:
-        if self._last is not None and time.monotonic() - self._last[1] > SILENT_S:
+        if self._last is not None and time.monotonic() - self._last.when_s > SILENT_S:
             self._counts["silences"] += 1
             self._stop()
 
@@ -240,7 +260,7 @@ class UrSink:
                     return
                 try:
                     if self._last is not None:
-                        self._look_at(self._link, self._last[0])
+                        self._look_at(self._link, self._last.planned)
                     self._link.kick()
                 except TumortrackError as error:
                     self._trouble = f"ur {self._config.arm}: {error}"
