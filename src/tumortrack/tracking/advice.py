@@ -8,6 +8,7 @@ from scipy.spatial import cKDTree
 
 from tumortrack.core.estimate import Estimate
 from tumortrack.core.types import Mesh, SensorCloud
+from tumortrack.registration.motion import ElasticMotion
 
 _FACES = 2000  # of the organ, that tell enough
 _FACING = 0.3  # cosine to the line of sight: flatter surfaces return little
@@ -41,12 +42,11 @@ def what_to_do(estimate: Estimate, cloud: SensorCloud) -> str:
 
 def _unsure(estimate: Estimate, centre: Float[np.ndarray, " 3"]) -> Float[np.ndarray, " 3"]:
     """The direction, camera frame, from which more would be known."""
-    organ = next(iter(estimate.meshes.values()))
-    rivals, shape = getattr(estimate.motion, "rivals", ()), getattr(estimate.motion, "shape", None)
-    if rivals and shape is not None:
-        other = rivals[0][0].carry(shape.anatomy_ct.organ.vertices_mm)
-        away = cKDTree(other).query(organ.vertices_mm)[0]
-        return organ.vertices_mm[away.argmax()] - centre
+    motion = estimate.motion
+    if isinstance(motion, ElasticMotion) and motion.rivals:
+        places_mm = next(iter(estimate.meshes.values())).vertices_mm
+        other_mm = motion.rivals[0][0].carry(motion.shape.anatomy_ct.organ.vertices_mm)
+        return places_mm[cKDTree(other_mm).query(places_mm)[0].argmax()] - centre
     tumors = list(estimate.report["parts"].items())[1:]
     known = [(name, part) for name, part in tumors if "center_axes" in part]
     if not known:
