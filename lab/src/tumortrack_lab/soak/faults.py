@@ -28,7 +28,8 @@ SOURCE_FAULTS = {
     "truncated": r"holds \d+ bytes; it is damaged",
     "all holes": "only 0 points",
     "swapped in order": "stamp went back",
-    "another organ's": "sees through|no organ|not look like|fits the points worse|unsure|not found",
+    "another organ's": "sees through|no organ|not look like|fits the points worse|unsure|not found"
+    "|may as well lie",
     "intrinsics changed": "intrinsics changed",
     "source gone": "no frame for|unplugged",
 }
