@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import trimesh
@@ -61,6 +63,15 @@ def test_what_is_least_sure_is_looked_at_along_its_axis_from_the_tumors_side(wor
         assert what_to_do(unsure, seen()) == f"look more from {words}, by about 30 degrees"
     along = what_to_do(estimate(CENTRE), seen())
     assert along == "look more from another side, by about 30 degrees"
+
+
+def test_a_view_of_something_else_and_a_wrong_scale_need_other_help():
+    found = estimate([1, 0, 0])
+    for reason, words in (
+        ("the camera sees through 7 % of where the organ lies", "make sure that this is the organ"),
+        ("an organ 1.10 times as large fits better: check the camera's scale", "calibrate"),
+    ):
+        assert words in what_to_do(replace(found, reason=reason), seen())
 
 
 def test_another_place_is_looked_at_where_it_differs():

@@ -10,6 +10,12 @@ from tumortrack.core.estimate import Estimate
 from tumortrack.core.types import Mesh, SensorCloud
 from tumortrack.registration.motion import ElasticMotion
 
+# Where another view alone would not help: words of the reason, and what does.
+_INSTEAD = {
+    "sees through": "make sure that this is the organ (a click, --box), or look from another side",
+    "the camera's scale": "calibrate it",
+    "do not lie on the organ": "free the organ of what lies on it and beside it",
+}
 _FACES = 2000  # of the organ, that tell enough
 _FACING = 0.3  # cosine to the line of sight: flatter surfaces return little
 _NEAR_MM = 8.0  # of an observed point: seen
@@ -27,8 +33,10 @@ def what_to_do(estimate: Estimate, cloud: SensorCloud) -> str:
     Args:
         cloud: the organ's points, camera frame, in which it was located.
     """
-    organ = next(iter(estimate.meshes.values()))
-    middles, normals = _faces(organ)
+    for words, advice in _INSTEAD.items():
+        if words in estimate.reason:
+            return advice
+    middles, normals = _faces(next(iter(estimate.meshes.values())))
     sight = middles / np.linalg.norm(middles, axis=1, keepdims=True)
     facing = middles[-(normals * sight).sum(1) > _FACING]
     centre = middles.mean(0)
