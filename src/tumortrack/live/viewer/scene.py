@@ -33,6 +33,7 @@ _MOST_LABELLED = 15_000  # points shown
 # Standard deviations of the ellipsoid that holds 95 % of a normal distribution in three dimensions:
 # the root of the 95 % quantile of chi squared with three degrees of freedom.
 _ELLIPSOID = 2.7955
+_ELLIPSOID_COLOUR = 255, 255, 255  # stands out from every part
 _TUMOR_WITH_POINTS = 0.3  # opacity
 _NO_POINTS = np.zeros((0, 3), np.float32)
 _NOTHING = Mesh(np.zeros((3, 3)), np.array([[0, 1, 2]]))
@@ -97,12 +98,13 @@ class ViewerScene:
                 # Its far half: the near one would cover the organ that it reaches out of.
                 path = f"/estimate/margin_{name}"
                 self._shells[name] = self._mesh(path, _NOTHING, opacity=0.3, side="back", **look)
-            if label > 1:
-                path = f"/estimate/ellipsoid_{name}"
-                self._ellipsoids[name] = self._mesh(path, _NOTHING, opacity=0.45, **look)
             opacity = 0.35 if label == 1 else None
             path = f"/estimate/{name}"
             self._parts[name] = self._mesh(path, _NOTHING, opacity=opacity, **look)
+            if label > 1:
+                path = f"/estimate/ellipsoid_{name}"
+                look |= {"color": _ELLIPSOID_COLOUR, "opacity": 0.8}
+                self._ellipsoids[name] = self._mesh(path, _NOTHING, **look)
         self._points = self._cloud("/estimate/points", 0.3, colours.KIDNEY)
         clear = np.zeros((2, 2, 4), np.uint8)
         self._slice = nodes.add_image("/estimate/slice", clear, 1, 1, format="png", **_FLAT)
