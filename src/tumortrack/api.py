@@ -92,7 +92,8 @@ def prepare(
 
         with store.new_folder(Path(folder), overwrite) as aside:
             whose = str(case.patient)
-            qc_picture(case.labels, case.ct, case.anatomy, aside / "qc.png", whose)
+            said, shown = case.report["half_turn"]["warning"], (case.labels, case.ct, case.anatomy)
+            qc_picture(*shown, aside / "qc.png", whose, said)
             save_case(case, aside)
     return case
 

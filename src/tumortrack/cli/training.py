@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from tyro.conf import Positional
 
@@ -90,6 +90,7 @@ class Train:
                     "another MODEL folder."
                 )
             say(f"{self.model} is trained already ({done['steps']} steps).")
+            _warn(done)
             return
         with _training_screen() as show:
             about = train(run, self.model, show).provenance
@@ -97,8 +98,16 @@ class Train:
             f"model written to {self.model}: {about['steps']} steps in {about['training_s']:.0f} "
             f"s, validation mIoU {about['validation_miou']:.3f}."
         )
+        _warn(about)
         if GENERIC.is_file() and self.preset == "clinic":
             say(f"it states no margins yet: tumortrack margins {self.model}")
+
+
+def _warn(provenance: dict[str, Any]) -> None:
+    from tumortrack.models.folder import weakness_of
+
+    if weakness := weakness_of(provenance):
+        say(f"WARNING: {weakness}. Every estimate of this one is poor.")
 
 
 @dataclass(frozen=True, kw_only=True)

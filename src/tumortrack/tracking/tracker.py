@@ -22,7 +22,8 @@ from tumortrack.registration.locator import RegistrationLocator
 from tumortrack.registration.model import RegistrationModel
 from tumortrack.sense.cloud import CloudConfig
 from tumortrack.sense.region import RegionConfig
-from tumortrack.tracking.quality import judged, with_margin
+from tumortrack.tracking.advice import what_to_do
+from tumortrack.tracking.quality import doubted, judged, with_margin
 
 _ALONE = Following()
 
@@ -41,7 +42,7 @@ class Tracker:
 
     def __init__(self, model: Model) -> None:
         keep_small_blocks()
-        self.model, self._patient = model, model.patient
+        self.model, self._patient, self._weakness = model, model.patient, model.weakness
         self._locator = _LOCATORS[type(model)](model)
 
     @property
@@ -91,7 +92,12 @@ class Tracker:
         self, estimate: Estimate, cloud: SensorCloud, seen: DepthFrame | SensorCloud
     ) -> Estimate:
         start = time.perf_counter()
-        estimate = with_margin(judged(estimate, seen), cloud, self.model.margins)
+        estimate = judged(estimate, seen)
+        if self._weakness:
+            estimate = doubted(estimate, self._weakness)
+        estimate = with_margin(estimate, cloud, self.model.margins)
+        if estimate.quality == "poor" and not self._weakness:
+            estimate = doubted(estimate, f"{estimate.reason}; {what_to_do(estimate, cloud)}")
         estimate = replace(estimate, patient=self._patient)
         estimate.report["patient"] = to_builtins(self._patient)
         seconds = estimate.report["timings"]
