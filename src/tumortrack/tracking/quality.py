@@ -11,7 +11,7 @@ from tumortrack.core.errors import NoEstimate
 from tumortrack.core.estimate import Estimate, Quality
 from tumortrack.core.types import DepthFrame, Intrinsics, Mesh, SensorCloud
 from tumortrack.models.in_distribution import FIT_FACTOR
-from tumortrack.models.margins import ModelMargins, exceeded, measured, stated_margin
+from tumortrack.models.margins import ModelMargins, exceeded, figures, stated_margin
 from tumortrack.registration.registration import RIVAL_COST
 from tumortrack.sense.render import render_depth
 
@@ -92,7 +92,7 @@ def with_margin(estimate: Estimate, cloud: SensorCloud, margins: ModelMargins | 
     if margins is not None and estimate.quality == "good":
         if "unseen" not in report:
             report["unseen"] = cloud_shares(organ, cloud)[1]
-        if reason := exceeded(margins.limits, measured(report)):
+        if reason := exceeded(margins.limits, figures(report, margins)):
             report["quality"] = {"verdict": "poor", "reason": reason}
             estimate = replace(estimate, quality="poor", reason=reason)
     report["margin"] = stated_margin(report, margins, estimate.quality == "good")
